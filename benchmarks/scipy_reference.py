@@ -1,0 +1,125 @@
+"""The cardan shaft written plainly with NumPy and SciPy: the oracle of the tests and the baseline of the benchmarks.
+
+Nothing here comes from drivetrain_jax. The equations are the linearised ones in the paper's own coordinates,
+
+    theta'' + E(tau) theta' + P(tau) theta = 0,    u = (theta1, theta2, theta1', theta2'),    period pi,
+
+and the monodromy matrix is the fundamental matrix at tau = pi. Parameters are a mapping of the six names in
+``NAMES`` to scalars or arrays of shape ``(N,)``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+NAMES = ("beta", "Omega", "zeta", "alpha", "mu", "gamma")
+BASE_CASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+PERIOD = np.pi
+
+Parameters = Mapping[str, Any]
+Pair = tuple[tuple[Any, Any], tuple[Any, Any]]
+Matrices = Callable[[float, Parameters], tuple[Pair, Pair]]
+
+
+def speed_ratio(tau: float, c: Any, s2: Any) -> tuple[Any, Any, Any]:
+    """``eta = c/(1 - s2 sin(tau)^2)``, c = cos(beta), s2 = sin(beta)^2, and its first two derivatives in ``tau``."""
+    d = 1 - s2 * math.sin(tau) ** 2
+    # Derivatives of d, then the quotient rule.
+    d1, d2 = -s2 * math.sin(2 * tau), -2 * s2 * math.cos(2 * tau)
+    return c / d, -c * d1 / d**2, c * (2 * d1**2 / d**3 - d2 / d**2)
+
+
+def damping_and_stiffness(tau: float, p: Parameters) -> tuple[Pair, Pair]:
+    """The checked ``E`` and ``P``; the printed ones lack eta'', half of eta' and a sign (docs/validation.md).
+
+    Besides the six parameters ``p`` holds ``cos_beta`` and ``sin2_beta``, computed once and not at every ``tau``.
+    """
+    eta, d1, d2 = speed_ratio(tau, p["cos_beta"], p["sin2_beta"])
+    stiffness, damping = 1 / p["Omega"] ** 2, 2 * p["zeta"] / p["Omega"]
+    alpha, mu, inertia = p["alpha"], p["mu"], eta**2 + 1 / p["gamma"]
+    e = ((damping, -alpha * damping * eta), (2 * d1 - damping * eta, alpha * damping * inertia))
+    k = ((stiffness, -mu * stiffness * eta), (d2 - stiffness * eta, mu * stiffness * inertia))
+    return e, k
+
+
+def monodromy(
+    p: Parameters,
+    method: str = "DOP853",
+    rtol: float = 1e-12,
+    atol: float = 1e-12,
+    matrices: Matrices = damping_and_stiffness,
+) -> np.ndarray:
+    """Monodromy matrix, shape ``(4, 4)``, of one point by any ``method`` of ``scipy.integrate.solve_ivp``."""
+    point = {name: float(p[name]) for name in NAMES}
+    point |= {"cos_beta": math.cos(point["beta"]), "sin2_beta": math.sin(point["beta"]) ** 2}
+    a = np.zeros((4, 4))
+    a[0, 2] = a[1, 3] = 1.0
+
+    lower = a.reshape(-1)[8:]
+
+    # One trajectory of 16 components, Python floats in the coefficients: what a careful user of solve_ivp writes.
+    def field(tau: float, y: np.ndarray) -> np.ndarray:
+        ((e11, e12), (e21, e22)), ((k11, k12), (k21, k22)) = matrices(tau, point)
+        lower[:] = (-k11, -k12, -e11, -e12, -k21, -k22, -e21, -e22)
+        return a.dot(y.reshape(4, 4)).reshape(-1)
+
+    return _solve(field, np.eye(4), method, rtol, atol)
+
+
+def stacked_monodromy(
+    p: Parameters,
+    rtol: float = 1e-10,
+    atol: float = 1e-10,
+    method: str = "DOP853",
+    batch: int = 512,
+    matrices: Matrices = damping_and_stiffness,
+) -> np.ndarray:
+    """Monodromy matrices, shape ``(N, 4, 4)``, of all points, ``batch`` of them at a time as one state of solve_ivp.
+
+    Points are grouped by stiffness (``Omega``, then ``beta``), because a batch steps as its hardest point does.
+    """
+    columns = np.broadcast_arrays(*(np.atleast_1d(np.asarray(p[name], float)) for name in NAMES))
+    out = np.empty((columns[0].size, 4, 4))
+    order = np.lexsort((columns[0], columns[1]))
+    for start in range(0, order.size, batch):
+        chosen = order[start : start + batch]
+        point = {name: column[chosen] for name, column in zip(NAMES, columns, strict=True)}
+        phi = _solve(
+            _stacked_field(point, matrices), np.repeat(np.eye(4)[:, :, None], chosen.size, axis=2), method, rtol, atol
+        )
+        out[chosen] = np.moveaxis(phi, -1, 0)
+    return out
+
+
+def spectral_radius(z: np.ndarray) -> np.ndarray:
+    """Largest modulus of the eigenvalues of ``z``, shape ``(..., 4, 4)`` to ``(...)``; NaN where not finite."""
+    finite = np.isfinite(z).all((-2, -1))
+    moduli = np.abs(np.linalg.eigvals(np.where(finite[..., None, None], z, 0.0)))
+    return np.where(finite, moduli.max(-1), np.nan)
+
+
+def _stacked_field(p: Parameters, matrices: Matrices) -> Callable[[float, np.ndarray], np.ndarray]:
+    point = {**p, "cos_beta": np.cos(p["beta"]), "sin2_beta": np.sin(p["beta"]) ** 2}
+
+    def field(tau: float, y: np.ndarray) -> np.ndarray:
+        theta1, theta2, rate1, rate2 = u = y.reshape(4, 4, -1)
+        ((e11, e12), (e21, e22)), ((k11, k12), (k21, k22)) = matrices(tau, point)
+        out = np.empty_like(u)
+        out[0], out[1] = rate1, rate2
+        out[2] = -(k11 * theta1 + k12 * theta2 + e11 * rate1 + e12 * rate2)
+        out[3] = -(k21 * theta1 + k22 * theta2 + e21 * rate1 + e22 * rate2)
+        return out.reshape(-1)
+
+    return field
+
+
+def _solve(
+    field: Callable[[float, np.ndarray], np.ndarray], start: np.ndarray, method: str, rtol: float, atol: float
+) -> np.ndarray:
+    solution = solve_ivp(field, (0.0, PERIOD), start.reshape(-1), method=method, rtol=rtol, atol=atol, t_eval=(PERIOD,))
+    return solution.y[:, -1].reshape(start.shape) if solution.success else np.full(start.shape, np.nan)

@@ -1,0 +1,257 @@
+"""Cells per second and error of every method on one chart, measured in one run, in turns.
+
+    python -m benchmarks.throughput [--cells 30000] [--repeats 5] [--quick]     # writes results/throughput.csv
+
+Chart: beta in [0, 1.5], Omega in [0.1, 2], zeta 0.001, alpha = mu = 1, gamma = 100; the result is the spectral radius,
+so the eigenvalues are in every time. All methods may use both cores: the package by threads, as its engine does, the
+peers by two spawned processes that are started, and compiled, beforehand. diffrax gets a coarser grid of the same
+chart, SciPy random cells of it. Errors are relative to heyoka at tolerance 1e-15, which is itself compared with SciPy
+and with ``direct``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from benchmarks import peers
+from benchmarks.scipy_reference import BASE_CASE, monodromy, spectral_radius, stacked_monodromy
+from benchmarks.timing import PROCESSES, RESULTS, chart, interleaved, median, spawned_workers, table, take, write_csv
+
+Columns = Mapping[str, np.ndarray]
+
+DIRECT_TOLERANCES = (1e-9, 1e-10)
+HEYOKA_TOLERANCES = (1e-8, 1e-10)
+# Memory and time from nothing to a result, measured in a process of its own.
+_FRESH = """
+import json, resource, sys, time
+start = time.perf_counter()
+import drivetrain_jax as dt
+ds = dt.run(json.loads(sys.argv[1]))
+seconds = time.perf_counter() - start
+megabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+print(json.dumps({"seconds": seconds, "megabytes": megabytes, "cells": ds.outcome.size}))
+"""
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A method: ``job()`` returns the spectral radii of ``columns``, or NaN if it stops short of them."""
+
+    label: str
+    job: Callable[[], np.ndarray]
+    columns: Columns
+    compile_s: float = 0.0
+
+
+def scene(columns: Columns, method: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """The chart as a scene of the package."""
+    axes = {name: {"values": np.unique(columns[name]).tolist()} for name in ("beta", "Omega")}
+    return {
+        "title": "throughput",
+        "system": "cardan",
+        "analysis": "floquet",
+        "outputs": ["spectral_radius"],
+        "axes": axes,
+        "fixed": BASE_CASE,
+        "options": {"method": method, **options},
+    }
+
+
+def package_contender(columns: Columns, method: str, options: Mapping[str, Any]) -> Contender:
+    """The package's engine on the whole chart: its plan, kernels and threads as in ``dt.run``, compiled once.
+
+    (``dt.run`` traces and compiles anew in every call; that is in the time of the fresh process.)
+    """
+    from drivetrain_jax.sweep.assemble import result_variables
+    from drivetrain_jax.sweep.engine import Engine
+    from drivetrain_jax.sweep.executor import run_threads
+    from drivetrain_jax.sweep.kernel import compile_kernel
+    from drivetrain_jax.sweep.scene import load_scene
+
+    engine = Engine(load_scene(scene(columns, method, options)))
+    variables, plan, grid = result_variables(engine.scene), engine.plan, engine.grid
+    start = time.perf_counter()
+    kernels = [compile_kernel(group.solver, grid, group.chunk, variables) for group in plan.groups]
+    compile_s = time.perf_counter() - start
+    costs = plan.costs
+    order = sorted(range(len(costs)), key=lambda number: -costs[number])
+
+    def work(chunk: Any) -> np.ndarray:
+        return kernels[chunk.group](grid.columns(chunk.points), chunk.effort)["spectral_radius"]
+
+    def job() -> np.ndarray:
+        out = np.empty(grid.size)
+        for chunk, radii in run_threads(map(plan.chunk, order), work, PROCESSES):
+            out[chunk.points] = radii
+        return out
+
+    settings = ", ".join(f"{key} {value:g}" for key, value in options.items())
+    return Contender(f"drivetrain_jax {method}, {settings}", job, columns, compile_s)
+
+
+def heyoka_contender(stack: ExitStack, columns: Columns, tolerance: float, eigenvalues: bool = True) -> Contender:
+    """heyoka's batch integrator in its best form (benchmarks.peers) on two processes."""
+    start = time.perf_counter()
+    peers.HeyokaBatch("half", tolerance, 8)
+    compile_s = time.perf_counter() - start
+    pool = stack.enter_context(spawned_workers(peers.prepare_worker, ("half", tolerance, 8)))
+    task = peers.radius_in_worker if eigenvalues else peers.monodromy_in_worker
+    label = f"heyoka batch, tolerance {tolerance:g}" + ("" if eigenvalues else ", without eigenvalues")
+    job = shared_out(pool.map, task, columns, 4 * PROCESSES)
+    return Contender(label, job, columns, compile_s)
+
+
+def scipy_contender(pool: Any, columns: Columns, method: str, rtol: float) -> Contender:
+    """``solve_ivp`` point by point on two processes."""
+    job = shared_out(pool.map, SciPyPoints(method, rtol), columns, 8 * PROCESSES)
+    return Contender(f"scipy {method}, rtol {rtol:g}", job, columns)
+
+
+def stacked_contender(pool: Any, columns: Columns, rtol: float) -> Contender:
+    """``solve_ivp`` with hundreds of points in one state, on two processes."""
+    job = shared_out(pool.map, SciPyStacked(rtol), columns, PROCESSES)
+    return Contender(f"scipy DOP853 stacked, rtol {rtol:g}", job, columns)
+
+
+@dataclass(frozen=True)
+class SciPyPoints:
+    """Spectral radii point by point (a class, so that spawned processes can receive it)."""
+
+    method: str
+    rtol: float
+
+    def __call__(self, columns: Columns) -> np.ndarray:
+        points = ({name: column[i] for name, column in columns.items()} for i in range(columns["beta"].size))
+        return np.array([spectral_radius(monodromy(p, self.method, self.rtol, self.rtol)) for p in points])
+
+
+@dataclass(frozen=True)
+class SciPyStacked:
+    """Spectral radii of all points, 512 to a state."""
+
+    rtol: float
+
+    def __call__(self, columns: Columns) -> np.ndarray:
+        return spectral_radius(stacked_monodromy(columns, self.rtol, self.rtol))
+
+
+def shared_out(
+    mapper: Callable[..., Any], function: Callable[[Columns], np.ndarray], columns: Columns, tasks: int
+) -> Callable[[], np.ndarray]:
+    """A job that deals the cells out to the workers like cards and puts the answers back in order."""
+    deals = [np.arange(start, columns["beta"].size, tasks) for start in range(tasks)]
+    hands = [take(columns, deal) for deal in deals]
+
+    def job() -> np.ndarray:
+        out = np.empty(columns["beta"].size)
+        for deal, answer in zip(deals, mapper(function, hands), strict=True):
+            out[deal] = answer
+        return out
+
+    return job
+
+
+def fresh_process(columns: Columns) -> dict[str, float]:
+    """Seconds from the first import to the result, and peak memory, of the chart in a fresh process."""
+    given = json.dumps(scene(columns, "direct", {"rtol": 1e-10}))
+    done = subprocess.run([sys.executable, "-c", _FRESH, given], check=True, capture_output=True, text=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def contenders(stack: ExitStack, columns: Columns, sample: int) -> list[Contender]:
+    """All methods, warm."""
+    rng = np.random.default_rng(0)
+    size = columns["beta"].size
+    few, some = (take(columns, rng.choice(size, min(n, size), replace=False)) for n in (sample, 16 * sample))
+    coarse = chart(min(size, 15 * sample))
+    pool = stack.enter_context(spawned_workers())
+    return [
+        *(package_contender(columns, "direct", {"rtol": rtol}) for rtol in DIRECT_TOLERANCES),
+        package_contender(coarse, "diffrax", {"rtol": 1e-9}),
+        *(heyoka_contender(stack, columns, tolerance) for tolerance in HEYOKA_TOLERANCES),
+        heyoka_contender(stack, columns, HEYOKA_TOLERANCES[0], eigenvalues=False),
+        scipy_contender(pool, few, "RK45", 1e-9),
+        scipy_contender(pool, few, "DOP853", 1e-9),
+        stacked_contender(pool, some, 1e-9),
+    ]
+
+
+def measure(cells: int, repeats: int, sample: int) -> tuple[list[dict[str, Any]], list[str]]:
+    """Rows of the result table and the notes that belong above it."""
+    columns = chart(cells)
+    with ExitStack() as stack:
+        entries = contenders(stack, columns, sample)
+        answers = {entry.label: entry.job() for entry in entries}  # starts the workers
+        seconds = interleaved({entry.label: entry.job for entry in entries}, repeats)
+    rows = []
+    for entry in entries:
+        error = np.abs(answers[entry.label] / reference_radius(entry.columns) - 1)
+        size = entry.columns["beta"].size
+        rate = size / median(seconds[entry.label])
+        spread = max(seconds[entry.label]) / min(seconds[entry.label])
+        rows.append(
+            {"method": entry.label, "cells": size, "cells_per_s": rate, "slowest_over_fastest": spread}
+            | {
+                "compile_s": entry.compile_s,
+                "max_error": float(np.max(error)),
+                "median_error": float(np.median(error)),
+            }
+        )
+    baseline = next(row["cells_per_s"] for row in rows if row["method"].startswith("scipy RK45"))
+    for row in rows:
+        row["times_scipy_RK45"] = row["cells_per_s"] / baseline
+        row["cells_per_s"] = round(row["cells_per_s"])
+    return rows, notes(columns, repeats, sample)
+
+
+def reference_radius(columns: Columns) -> np.ndarray:
+    """Spectral radii to about 1e-13 (the notes of the result file say how that is checked)."""
+    return spectral_radius(peers.HeyokaBatch("half", 1e-15).monodromy(columns))
+
+
+def notes(columns: Columns, repeats: int, sample: int) -> list[str]:
+    """How far the reference can be trusted, and the package's memory."""
+    import drivetrain_jax as dt
+
+    reference = reference_radius(columns)
+    index = np.random.default_rng(1).choice(columns["beta"].size, min(sample, 60), replace=False)
+    independent = SciPyPoints("DOP853", 1e-13)(take(columns, index))
+    tight = dt.run(scene(columns, "direct", {"rtol": 1e-13})).spectral_radius.values.ravel()
+    fresh = fresh_process(columns)
+    to_scipy = np.abs(independent / reference[index] - 1).max()
+    to_direct = np.nanmax(np.abs(tight / reference - 1))
+    return [
+        f"chart of {columns['beta'].size} cells, medians of {repeats} interleaved repeats, {PROCESSES} cores",
+        f"reference heyoka 1e-15: differs from scipy DOP853 1e-13 by {to_scipy:.1e} ({index.size} cells), "
+        f"from direct 1e-13 by {to_direct:.1e} (all cells)",
+        f"fresh process, direct rtol 1e-10: import to result {fresh['seconds']:.1f} s, "
+        f"peak memory {fresh['megabytes']:.0f} MB",
+    ]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure, write the CSV, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cells", type=int, default=30_000)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--quick", action="store_true", help="3,000 cells, three repeats; writes nothing")
+    options = parser.parse_args(arguments)
+    cells, repeats, sample = (3000, 3, 40) if options.quick else (options.cells, options.repeats, 200)
+    rows, remarks = measure(cells, repeats, sample)
+    if not options.quick:
+        write_csv(RESULTS / "throughput.csv", rows, remarks)
+    print("\n".join(remarks), table(rows), sep="\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""What the benchmarks share: the cells of the chart, spawned workers, interleaved timing, files with provenance."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import io
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from importlib.metadata import PackageNotFoundError, version
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.scipy_reference import BASE_CASE
+
+RESULTS = Path(__file__).parent / "results"
+PROCESSES = 2
+_PACKAGES = ("numpy", "scipy", "jax", "diffrax", "heyoka", "drivetrain_jax")
+
+
+def chart(cells: int) -> dict[str, np.ndarray]:
+    """About ``cells`` cells of the chart beta in [0, 1.5] x Omega in [0.1, 2], base case, as columns, 3:4 in shape."""
+    rows = max(2, round((cells * 3 / 4) ** 0.5))
+    beta, omega = np.linspace(0.0, 1.5, rows), np.linspace(0.1, 2.0, max(2, round(cells / rows)))
+    grid = np.meshgrid(beta, omega, indexing="ij")
+    fixed = {name: np.full(grid[0].size, value) for name, value in BASE_CASE.items()}
+    return {"beta": grid[0].ravel(), "Omega": grid[1].ravel(), **fixed}
+
+
+def take(columns: Mapping[str, np.ndarray], index: Any) -> dict[str, np.ndarray]:
+    """The same columns at ``index``."""
+    return {name: column[index] for name, column in columns.items()}
+
+
+def spawned_workers(
+    initializer: Callable[..., None] | None = None, arguments: Sequence[Any] = ()
+) -> ProcessPoolExecutor:
+    """``PROCESSES`` spawned processes, each prepared once (a fork after jax has started its threads can hang)."""
+    return ProcessPoolExecutor(
+        PROCESSES, mp_context=get_context("spawn"), initializer=initializer, initargs=tuple(arguments)
+    )
+
+
+def interleaved(jobs: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, list[float]]:
+    """Seconds of every job, ``repeats`` of each, taken in turns: a change in the machine's load hits all alike."""
+    seconds: dict[str, list[float]] = {name: [] for name in jobs}
+    for _ in range(repeats):
+        for name, job in jobs.items():
+            start = time.perf_counter()
+            job()
+            seconds[name].append(time.perf_counter() - start)
+    return seconds
+
+
+def median(values: Sequence[float]) -> float:
+    """The median: robust against the one repeat that another process disturbed."""
+    return statistics.median(values)
+
+
+def significant(value: Any, digits: int = 3) -> Any:
+    """A float as text with ``digits`` significant digits; anything else unchanged."""
+    return f"{value:.{digits}g}" if isinstance(value, float) else value
+
+
+def provenance() -> dict[str, str]:
+    """Date, processor, load and versions, for the head of every result file."""
+    return {
+        "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "machine": f"{_processor()}, {os.cpu_count()} cores",
+        "load": ", ".join(f"{load:.2f}" for load in os.getloadavg()) + " (1, 5, 15 min, at the end of the run)",
+        "versions": ", ".join([f"python {platform.python_version()}", *(f"{p} {_version(p)}" for p in _PACKAGES)]),
+    }
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], notes: Sequence[str] = ()) -> None:
+    """Write ``rows`` as CSV under commented lines of provenance and ``notes`` (pandas: ``read_csv(comment="#")``)."""
+    text = io.StringIO()
+    for key, value in provenance().items():
+        text.write(f"# {key}: {value}\n")
+    for note in notes:
+        text.write(f"# {note}\n")
+    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({key: significant(value) for key, value in row.items()} for row in rows)
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text.getvalue())
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """``rows`` as aligned text."""
+    cells = [list(rows[0]), *([str(significant(value)) for value in row.values()] for row in rows)]
+    widths = [max(len(line[i]) for line in cells) for i in range(len(cells[0]))]
+    return "\n".join(
+        "  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip() for line in cells
+    )
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "(source tree)"
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    fields = dict(line.split(":", 1) for line in lines if ":" in line)
+    flags = {key.strip(): value for key, value in fields.items()}
+    simd = (
+        "AVX-512" if "avx512f" in flags.get("flags", "") else "AVX2" if "avx2" in flags.get("flags", "") else "no AVX2"
+    )
+    return f"{flags.get('model name', platform.machine()).strip()} ({simd})"

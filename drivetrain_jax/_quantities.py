@@ -1,0 +1,88 @@
+"""Names with units and ranges: the vocabulary that every layer shares. Free of jax and of files."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """An input of a system or an option of an analysis.
+
+    ``default=None`` means that it must be given. ``lower``/``upper`` are inclusive unless the matching ``open_*``
+    flag is set. ``choices`` makes it a word, ``listed`` a list of numbers of which each entry obeys the range.
+    """
+
+    name: str
+    units: str
+    long_name: str
+    default: float | int | str | tuple[float, ...] | None = None
+    lower: float = -math.inf
+    upper: float = math.inf
+    open_lower: bool = False
+    open_upper: bool = False
+    choices: tuple[str, ...] = ()
+    listed: bool = False
+    integer: bool = False
+
+    @property
+    def allowed(self) -> str:
+        """The admissible values as a reader would write them, e.g. ``0 <= zeta < inf``."""
+        if self.choices:
+            return f"{self.name} is one of {', '.join(self.choices)}"
+        kind = "integer " if self.integer else ""
+        left = f"{self.lower:.10g} {'<' if self.open_lower else '<='} " if self.lower > -math.inf else ""
+        right = f" {'<' if self.open_upper else '<='} {self.upper:.10g}" if self.upper < math.inf else ""
+        if left or right:
+            return f"{kind}{left}{self.name}{'[i]' if self.listed else ''}{right}"
+        return f"{self.name} is a finite {kind or 'number'}".rstrip()
+
+    def check(self, value: object) -> float | int | str | tuple[float, ...]:
+        """Return ``value`` in its stored type, or raise ``ValueError`` with one line that names the range."""
+        if self.choices:
+            if value not in self.choices:
+                raise ValueError(f"{self.name} = {value!r}: allowed is {self.allowed}")
+            return value
+        if self.listed:
+            if not isinstance(value, (list, tuple)) or not value:
+                raise ValueError(f"{self.name} = {value!r}: allowed is a list of numbers, {self.allowed}")
+            return tuple(self._check_number(entry, f"{self.name}[{i}]") for i, entry in enumerate(value))
+        return self._check_number(value, self.name)
+
+    def _check_number(self, value: object, label: str) -> float | int:
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ValueError(f"{label} = {value!r}: allowed is a number, {self.allowed}")
+        below = value <= self.lower if self.open_lower else value < self.lower
+        above = value >= self.upper if self.open_upper else value > self.upper
+        if not math.isfinite(value) or below or above or (self.integer and value != int(value)):
+            raise ValueError(f"{label} = {value!r}: allowed is {self.allowed}")
+        return int(value) if self.integer else float(value)
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """An axis that an analysis adds to its results: its coordinate values and their meaning.
+
+    Empty ``values`` stand for 0, 1, ... as many as the results have.
+    """
+
+    name: str
+    long_name: str
+    values: tuple[int | float | str, ...]
+    units: str = "1"
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A result of an analysis. ``dims`` names the dimensions it has besides those of the sweep.
+
+    ``flags`` gives the meaning of the codes 0, 1, ... of an integer variable.
+    """
+
+    name: str
+    units: str
+    long_name: str
+    dims: tuple[str, ...] = ()
+    dtype: str = "float64"
+    flags: tuple[str, ...] = ()

@@ -1,0 +1,89 @@
+"""What an analysis is: named results of one point (or of one line of a path axis), and the solvers that give them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax.systems import System
+
+
+class Outcome(IntEnum):
+    """What became of a point. From ``NOT_CONVERGED`` on, what could not be computed is NaN."""
+
+    SUCCESS = 0
+    TOLERANCE_NOT_MET = 1  # the value is stored with its error, which exceeds the target
+    NOT_CONVERGED = 2
+    STEP_LIMIT = 3
+    NOT_FINITE = 4
+    LOST = 5  # the process that computed it died every time
+
+    @property
+    def has_value(self) -> bool:
+        return self <= Outcome.TOLERANCE_NOT_MET
+
+
+OUTCOME = Variable(
+    "outcome", "1", "outcome of the computation", dtype="int8", flags=tuple(o.name.lower() for o in Outcome)
+)
+RTOL = Parameter("rtol", "1", "target relative error of the results", default=1e-10, lower=1e-14, upper=1e-2)
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a scene asks of an analysis: the results wanted, its method and options (defaults filled in)."""
+
+    outputs: tuple[str, ...]
+    method: str
+    options: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Solver:
+    """One way to compute the requested results of one point.
+
+    ``solve(values, effort)`` returns every requested variable and ``outcome``. ``values`` holds all parameters of
+    the model: fixed ones as Python numbers, swept ones as scalars, or as arrays of shape ``(N,)`` if ``broadcasts``;
+    results then carry the batch as their LAST axis. The values of a path axis arrive as a whole, shape ``(L,)``.
+    ``effort`` is a traced integer, the largest that ``effort(columns)`` predicts in the batch (columns: NumPy arrays
+    of shape ``(N,)``; a count of steps or the like). The engine gives every point to the solver for which
+    ``effort * unit_cost`` is smallest and runs batches of ``chunk`` points of similar effort. A solver that calls LAPACK
+    must not be ``concurrent``: such calls from several kernels can wait for each other for ever in XLA's thread pool.
+    """
+
+    name: str
+    solve: Callable[[Mapping[str, Any], Array], dict[str, Array]]
+    effort: Callable[[Mapping[str, np.ndarray]], np.ndarray]
+    unit_cost: float = 1.0
+    broadcasts: bool = False
+    chunk: int = 256
+    concurrent: bool = True
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """Named results and how to get them.
+
+    ``methods`` maps each method to the names of the options it uses, the first method being the default; ``options``
+    describes all of them. ``solvers(system, request)`` gives the candidates of the requested method.
+    """
+
+    name: str
+    title: str
+    variables: tuple[Variable, ...]
+    default_outputs: tuple[str, ...]
+    methods: Mapping[str, tuple[str, ...]]
+    options: tuple[Parameter, ...]
+    solvers: Callable[[System, Request], tuple[Solver, ...]]
+    dimensions: tuple[Dimension, ...] = ()
+    path_axis: str | None = None
+
+    def variable(self, name: str) -> Variable:
+        """The result called ``name``; ``KeyError`` if there is none."""
+        return {v.name: v for v in self.variables}[name]

@@ -1,0 +1,216 @@
+"""Forced response: periodic solution of the linearised system, and the nonlinear periodic orbit with its multipliers.
+
+Linear, over one period T from rest, by variational equations: ``y(T; y0) = r + Z y0``, hence ``y0 = (I - Z)^-1 r``.
+Nonlinear: Newton shooting along growing forcing (:func:`~drivetrain_jax.analysis.orbit.shoot`). Where several orbits
+exist it gives the one that this path meets first.
+
+Outcome: ``TOLERANCE_NOT_MET`` if the estimated error of a state exceeds ``rtol`` times its largest entry;
+``NOT_CONVERGED`` if I - Z is singular to working accuracy or no nonlinear orbit was found. Only what could not be
+computed is NaN then: a finite linear response is kept beside an orbit that was not found, and so is ``condition``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._quantities import Dimension, Variable
+from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.amplitude import amplitudes
+from drivetrain_jax.analysis.linear_algebra import eigenvalues, solve, spectral_norm
+from drivetrain_jax.analysis.orbit import (
+    Orbit,
+    Transition,
+    in_units_of,
+    integrate,
+    newton_step,
+    shoot,
+    size_of,
+    transition,
+)
+from drivetrain_jax.systems import ForcedModel, System
+
+STATE = Dimension("state", "component of the state", ("theta1", "theta2", "theta1_rate", "theta2_rate"))
+SHAFT = Dimension("shaft", "shaft", ("driving", "driven"))
+VARIABLES = (
+    Variable("periodic_state", "rad", "periodic solution of the linear system at tau = 0 (rates: d/dtau)", ("state",)),
+    Variable("periodic_state_error", "rad", "estimated absolute error of periodic_state"),
+    Variable("amplitude", "rad", "largest |theta| over the period, linear system", ("shaft",)),
+    Variable("condition", "1", "2-norm condition number of I - Z, linear system"),
+    Variable("orbit_state", "rad", "nonlinear periodic orbit at tau = 0 (rates: d/dtau)", ("state",)),
+    Variable("orbit_state_error", "rad", "estimated absolute error of orbit_state"),
+    Variable("orbit_amplitude", "rad", "largest |theta| over the period, nonlinear orbit", ("shaft",)),
+    Variable("orbit_spectral_radius", "1", "spectral radius of the monodromy matrix about the nonlinear orbit"),
+)
+LINEAR = ("periodic_state", "periodic_state_error", "amplitude", "condition")
+
+Build = Callable[[Mapping[str, Any]], ForcedModel]
+
+# Integrations are sharper than what is asked of the results, the one that closes the period more than the first one.
+TRANSITION_SHARPNESS, CLOSING_SHARPNESS, SHARPEST = 0.1, 0.01, 1e-14
+# Relative error from which a periodic solution counts as not found.
+NOT_FOUND = 1e-2
+FORCING_SAMPLES = 64
+
+
+class Response(NamedTuple):
+    """Periodic solution of the linear system: ``state`` (n,), absolute ``error``, ``amplitude`` (None unless asked for)
+    and the map over one period that it comes from."""
+
+    state: Array
+    error: Array
+    amplitude: Array | None
+    step: Transition
+    outcome: Array
+
+
+def _worst(*outcomes: Array) -> Array:
+    return jnp.max(jnp.stack([jnp.asarray(o) for o in outcomes]))
+
+
+def _sharpness(rtol: float, factor: float) -> float:
+    return max(factor * rtol, SHARPEST)
+
+
+def _mapped(model: ForcedModel, n: int, rtol: float) -> tuple[Transition, Array, Array]:
+    """The map over one period in units of the forcing, its fixed point in those units, and the unit."""
+    rest = jnp.zeros(n)
+    phases = model.period * np.arange(FORCING_SAMPLES) / FORCING_SAMPLES
+    forcing = size_of(jax.vmap(lambda t: model.linear(t, rest))(phases))
+    field = in_units_of(forcing, model.linear)
+    step = transition(field, rest, model.period, _sharpness(rtol, TRANSITION_SHARPNESS))
+    return step, newton_step(step, rest), forcing
+
+
+def linear_response(model: ForcedModel, n: int, rtol: float, with_amplitude: bool) -> Response:
+    """Periodic solution of ``y' = linear(t, y)``; ``n`` is the size of the state.
+
+    ``y0 = (I - Z)^-1 r`` is followed over the period once more, more sharply; how far it fails to close, times
+    (I - Z)^-1, corrects it and is its estimated error.
+    """
+    step, unit, forcing = _mapped(model, n, rtol)
+    # Without a solution there is nothing to follow.
+    found = (step.outcome == Outcome.SUCCESS) & jnp.all(jnp.isfinite(unit))
+    unit = jnp.where(found, unit, 0.0)
+    size = size_of(unit)
+    start, field, sharp = unit / size, in_units_of(size * forcing, model.linear), _sharpness(rtol, CLOSING_SHARPNESS)
+    if with_amplitude:
+        largest, end, closed = amplitudes(field, start, model.period, model.displacements, sharp)
+    else:
+        largest, (end, closed) = None, integrate(field, start, model.period, sharp)
+    correction = newton_step(Transition(end, step.matrix, closed), start)
+    error = jnp.max(jnp.abs(correction))
+    lost = ~found | ~(error <= NOT_FOUND) | ~_regular(step.matrix, rtol)
+    missed = jnp.where(error > rtol, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
+    outcome = _worst(step.outcome, closed, jnp.where(lost, Outcome.NOT_CONVERGED, missed))
+    state, error, largest = jax.tree.map(
+        lambda x: jnp.where(outcome < Outcome.NOT_CONVERGED, size * forcing * x, jnp.nan),
+        (start + correction, error, largest),
+    )
+    return Response(state, error, largest, step, outcome)
+
+
+def _regular(matrix: Array, rtol: float) -> Array:
+    """Whether ``I - Z`` is further from singular than the accuracy of Z."""
+    return _condition(matrix) * _sharpness(rtol, TRANSITION_SHARPNESS) < NOT_FOUND
+
+
+def _condition(matrix: Array) -> Array:
+    """2-norm condition number of ``I - Z``; infinite if it is singular."""
+    difference = jnp.eye(matrix.shape[0]) - matrix
+    inverse = solve(difference, jnp.eye(matrix.shape[0]))
+    condition = spectral_norm(difference) * spectral_norm(jnp.where(jnp.isfinite(inverse), inverse, 0.0))
+    return jnp.where(jnp.all(jnp.isfinite(inverse)), condition, jnp.inf)
+
+
+def nonlinear_orbit(model: ForcedModel, response: Response, rtol: float) -> Orbit:
+    """Nonlinear periodic orbit on the path that starts along ``response``; NaN with its outcome where there is none."""
+    usable = response.outcome < Outcome.NOT_CONVERGED
+    start = jnp.where(usable, response.state, 0.0)
+    # Nonlinearity sets in at states of order one; smaller responses are their own unit.
+    size = jnp.minimum(size_of(start), 1.0)
+    orbit = shoot(in_units_of(size, model.field), start / size, model.period, _sharpness(rtol, TRANSITION_SHARPNESS))
+    outcome = jnp.where(usable, orbit.outcome, response.outcome)
+    missed = orbit.error > rtol * size_of(orbit.state)
+    outcome = _worst(outcome, jnp.where(missed, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS))
+    found = outcome < Outcome.NOT_CONVERGED
+    state, matrix, error = (
+        jnp.where(found, x, jnp.nan) for x in (size * orbit.state, orbit.matrix, size * orbit.error)
+    )
+    return Orbit(state, matrix, error, outcome, orbit.corrections)
+
+
+def _orbit_results(
+    model: ForcedModel, orbit: Orbit, outputs: tuple[str, ...], rtol: float
+) -> tuple[dict[str, Array], Array]:
+    """The requested results of the nonlinear orbit and their outcome."""
+    found = orbit.outcome < Outcome.NOT_CONVERGED
+    results: dict[str, Array] = {"orbit_state": orbit.state, "orbit_state_error": orbit.error}
+    outcome = orbit.outcome
+    if "orbit_amplitude" in outputs:
+        start = jnp.where(found, orbit.state, 0.0)
+        size = size_of(start)
+        field, sharp = in_units_of(size, model.field), _sharpness(rtol, CLOSING_SHARPNESS)
+        largest, _, closed = amplitudes(field, start / size, model.period, model.displacements, sharp)
+        results["orbit_amplitude"] = jnp.where(found & (closed == Outcome.SUCCESS), size * largest, jnp.nan)
+        outcome = _worst(outcome, jnp.where(found, closed, Outcome.SUCCESS))
+    if "orbit_spectral_radius" in outputs:
+        matrix = jnp.where(found, orbit.matrix, jnp.eye(orbit.state.size))
+        radius = jnp.max(jnp.hypot(*eigenvalues(matrix)))
+        results["orbit_spectral_radius"] = jnp.where(found, radius, jnp.nan)
+    return results, outcome
+
+
+def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+    """All requested results of one point; ``effort`` only orders the batches, as every integration is adaptive."""
+    del effort
+    model, rtol = build(values), request.options["rtol"]
+    response = linear_response(model, len(STATE.values), rtol, "amplitude" in request.outputs)
+    results = {"periodic_state": response.state, "periodic_state_error": response.error}
+    results["amplitude"] = response.amplitude
+    outcome = response.outcome
+    if "condition" in request.outputs:
+        results["condition"] = jnp.where(
+            response.step.outcome == Outcome.SUCCESS, _condition(response.step.matrix), jnp.nan
+        )
+    if not set(request.outputs) <= set(LINEAR):
+        of_orbit, orbit_outcome = _orbit_results(model, nonlinear_orbit(model, response, rtol), request.outputs, rtol)
+        results |= of_orbit
+        outcome = _worst(outcome, orbit_outcome)
+    return {name: results[name] for name in request.outputs} | {"outcome": outcome.astype(jnp.int8)}
+
+
+def predicted_steps(build: Build, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Steps of one integration, shape (N,), from the mean spectral radius of the linear field over three phases."""
+    model, n = build(columns), len(STATE.values)
+    count = np.broadcast(*columns.values()).size
+    rates = []
+    for phase in model.period * np.array([0.0, 0.25, 0.5]):
+        rest = np.asarray(model.linear(phase, jnp.zeros((n, count))))
+        unit = np.eye(n)[:, :, None] * np.ones(count)
+        matrix = np.stack([np.asarray(model.linear(phase, jnp.asarray(unit[j]))) - rest for j in range(n)], axis=1)
+        rates.append(np.abs(np.linalg.eigvals(np.moveaxis(matrix, -1, 0))).max(axis=-1))
+    return np.ceil(20 + 2 * model.period * np.mean(rates, axis=0)).astype(np.int64)
+
+
+def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+    build = system.models["forced"].build
+    return (Solver("diffrax", partial(_solve, build, request), partial(predicted_steps, build), chunk=128),)
+
+
+ANALYSIS = Analysis(
+    name="forced",
+    title="forced response",
+    variables=VARIABLES,
+    default_outputs=("periodic_state", "amplitude", "condition"),
+    methods={"shooting": ("rtol",)},
+    options=(RTOL,),
+    solvers=_solvers,
+    dimensions=(STATE, SHAFT),
+)

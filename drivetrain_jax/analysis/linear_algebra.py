@@ -1,0 +1,157 @@
+"""Small dense linear algebra without LAPACK calls: these, made from concurrent kernels, can wait for each other in
+XLA's thread pool for ever (seen with jax 0.10.2 on two cores).
+
+``eigenvalues`` reduces to Hessenberg form by Householder reflections and applies the QR iteration with Wilkinson's
+complex shift, deflating from the bottom (Golub & Van Loan, Matrix Computations, 7.4-7.5): backward stable. All lanes of
+a batch go through the same sweeps, so the arithmetic vectorises. Complex numbers are pairs of real arrays.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+Complex = tuple[Array, Array]
+
+_EPS = np.finfo(float).eps
+_MAX_SWEEPS = 40
+
+
+def matmul(a: Array, b: Array) -> Array:
+    """Product of matrices whose batch axes trail: ``(n, m, ...)`` times ``(m, k, ...)``."""
+    return sum(a[:, j, None] * b[None, j] for j in range(a.shape[1]))
+
+
+def solve(a: Array, b: Array) -> Array:
+    """Solution of ``a x = b`` for one matrix, ``(n, n), (n, m) -> (n, m)``.
+
+    Gauss-Jordan elimination with row pivoting; a singular matrix gives values that are not finite.
+    """
+    n = a.shape[0]
+
+    def eliminate(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        system, pivots = state
+        column = system[:, k]
+        chosen = jnp.arange(n) == jnp.argmax(jnp.where(pivots < n, -1.0, jnp.abs(column)))
+        row = jnp.sum(jnp.where(chosen[:, None], system, 0.0), axis=0)
+        row = row / row[k]
+        rest = system - jnp.where(chosen, 0.0, column)[:, None] * row
+        return jnp.where(chosen[:, None], row, rest), jnp.where(chosen, k, pivots)
+
+    system, pivots = jax.lax.fori_loop(0, n, eliminate, (jnp.concatenate([a, b], axis=1), jnp.full(n, n)))
+    return system[jnp.argsort(pivots), n:]
+
+
+def spectral_norm(a: Array) -> Array:
+    """Largest singular value of one matrix, ``(n, m) -> ()``."""
+    size = jnp.max(jnp.abs(a))
+    scaled = a / jnp.where(size > 0, size, 1.0)
+    return size * jnp.sqrt(jnp.max(eigenvalues(scaled.T @ scaled)[0]))
+
+
+def _multiply(a: Complex, b: Complex) -> Complex:
+    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
+
+
+def _conjugate_multiply(a: Complex, b: Complex) -> Complex:
+    return a[0] * b[0] + a[1] * b[1], a[0] * b[1] - a[1] * b[0]
+
+
+def _square_root(a: Complex) -> Complex:
+    modulus = jnp.hypot(*a)
+    real = jnp.sqrt((modulus + jnp.abs(a[0])) / 2)
+    other = jnp.where(real > 0, jnp.abs(a[1]) / (2 * jnp.where(real > 0, real, 1.0)), 0.0)
+    right = a[0] >= 0
+    return jnp.where(right, real, other), jnp.where(a[1] < 0, -1.0, 1.0) * jnp.where(right, other, real)
+
+
+def hessenberg(a: Array) -> Array:
+    """Upper Hessenberg matrix similar to ``a``, ``(n, n, ...) -> (n, n, ...)``."""
+    n = a.shape[0]
+    for k in range(n - 2):
+        x = a[k + 1 :, k]
+        norm = jnp.sqrt(jnp.sum(x**2, axis=0))
+        v = x.at[0].add(jnp.where(x[0] < 0, -norm, norm))
+        size = jnp.sum(v**2, axis=0)
+        scale = jnp.where(size > 0, 2 / jnp.where(size > 0, size, 1.0), 0.0)
+        a = a.at[k + 1 :].add(-scale * v[:, None] * jnp.sum(v[:, None] * a[k + 1 :], axis=0))
+        a = a.at[:, k + 1 :].add(-scale * jnp.sum(a[:, k + 1 :] * v, axis=1)[:, None] * v)
+    return a
+
+
+def _pair(h: list[list[Complex]], m: int) -> tuple[Complex, Complex]:
+    """Eigenvalues of the trailing 2x2 block that ends at index ``m``; the second is the nearer to ``h[m][m]``."""
+    a, b, c, d = h[m - 1][m - 1], h[m - 1][m], h[m][m - 1], h[m][m]
+    half = ((a[0] - d[0]) / 2, (a[1] - d[1]) / 2)
+    off, square = _multiply(b, c), _multiply(half, half)
+    root = _square_root((square[0] + off[0], square[1] + off[1]))
+    sign = jnp.where(half[0] * root[0] + half[1] * root[1] < 0, -1.0, 1.0)
+    far = (half[0] + sign * root[0], half[1] + sign * root[1])
+    # d - bc/far rather than d + half - root: no cancellation.
+    size = far[0] ** 2 + far[1] ** 2
+    quotient = tuple(x / jnp.where(size > 0, size, 1.0) for x in _conjugate_multiply(far, off))
+    return (d[0] + far[0], d[1] + far[1]), (d[0] - quotient[0], d[1] - quotient[1])
+
+
+def _sweep(h: list[list[Complex]], m: int, shift: Complex) -> list[list[Complex]]:
+    """One QR step on the leading block up to index ``m``."""
+    h = [list(row) for row in h]
+    for i in range(m + 1):
+        h[i][i] = (h[i][i][0] - shift[0], h[i][i][1] - shift[1])
+    rotations = []
+    for k in range(m):
+        a, b = h[k][k], h[k + 1][k]
+        norm = jnp.sqrt(a[0] ** 2 + a[1] ** 2 + b[0] ** 2 + b[1] ** 2)
+        safe = jnp.where(norm > 0, norm, 1.0)
+        c, s = (jnp.where(norm > 0, a[0] / safe, 1.0), a[1] / safe), (b[0] / safe, b[1] / safe)
+        rotations.append((c, s))
+        for j in range(k, m + 1):
+            x, y = h[k][j], h[k + 1][j]
+            p, q = _conjugate_multiply(c, x), _conjugate_multiply(s, y)
+            u, w = _multiply(c, y), _multiply(s, x)
+            h[k][j], h[k + 1][j] = (p[0] + q[0], p[1] + q[1]), (u[0] - w[0], u[1] - w[1])
+    for k, (c, s) in enumerate(rotations):
+        for i in range(min(k + 2, m + 1)):
+            x, y = h[i][k], h[i][k + 1]
+            p, q = _multiply(x, c), _multiply(y, s)
+            u, w = _conjugate_multiply(c, y), _conjugate_multiply(s, x)
+            h[i][k], h[i][k + 1] = (p[0] + q[0], p[1] + q[1]), (u[0] - w[0], u[1] - w[1])
+    for i in range(m + 1):
+        h[i][i] = (h[i][i][0] + shift[0], h[i][i][1] + shift[1])
+    return h
+
+
+def _size(a: Complex) -> Array:
+    return jnp.abs(a[0]) + jnp.abs(a[1])
+
+
+def eigenvalues(a: Array) -> tuple[Array, Array]:
+    """Real and imaginary parts of the eigenvalues of ``a``, ``(n, n, ...) -> (n, ...)`` each, in no particular order.
+
+    Lanes that are not finite give NaN and do not hold up the others.
+    """
+    n = a.shape[0]
+    reduced = hessenberg(a)
+    zero = jnp.zeros(a.shape[2:])
+    h = [[(reduced[i, j] if i <= j + 1 else zero, zero) for j in range(n)] for i in range(n)]
+    found: list[Complex] = []
+    for m in range(n - 1, 1, -1):
+
+        def coupled(state: tuple, m: int = m) -> Array:
+            count, h = state
+            loose = _size(h[m][m - 1]) > _EPS * (_size(h[m][m]) + _size(h[m - 1][m - 1]))
+            return (count < _MAX_SWEEPS) & jnp.any(loose)
+
+        def step(state: tuple, m: int = m) -> tuple:
+            count, h = state
+            shift = _pair(h, m)[1]
+            # Every tenth sweep an arbitrary shift breaks a cycle.
+            kick = jnp.where(count % 10 == 9, 0.75, 0.0) * _size(h[m][m - 1])
+            return count + 1, _sweep(h, m, (shift[0] + kick, shift[1] - kick / 2))
+
+        _, h = jax.lax.while_loop(coupled, step, (jnp.int32(0), h))
+        found.append(h[m][m])
+    found += _pair(h, 1) if n > 1 else [h[0][0]]
+    return jnp.stack([x for x, _ in found]), jnp.stack([y for _, y in found])

@@ -1,0 +1,209 @@
+"""The command ``drivetrain``. Thin: every command imports what it needs, so that ``--help`` is instant."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from drivetrain_jax import __version__
+from drivetrain_jax._errors import InputError
+
+OK, WRONG_INPUT, INCOMPLETE, INTERRUPTED = 0, 2, 3, 130
+
+
+class _Parser(argparse.ArgumentParser):
+    """Usage errors are one line and end with the code for wrong input."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(allow_abbrev=False, **options)
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(WRONG_INPUT, _line(f"{message}; see {self.prog} --help"))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code (0 done, 2 wrong input, 3 incomplete and resumable, 130 interrupted)."""
+    options = _parser().parse_args(arguments)
+    try:
+        code = options.command(options)
+        sys.stdout.flush()
+        return code
+    except InputError as error:
+        sys.stderr.write(_line(str(error)))
+        return WRONG_INPUT
+    except BrokenPipeError:
+        # The reader of our output has gone (``drivetrain list | head``): nobody is left to tell.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+def _line(message: str) -> str:
+    return f"drivetrain: {' '.join(message.split())}\n"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="drivetrain", description="Stability and vibration of drivetrains, from a scene file to a chart."
+    )
+    parser.add_argument("--version", action="version", version=__version__)
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    command = _command(commands, "list", _list, "systems, analyses, parameters and scenes")
+    command.add_argument("system", nargs="?", metavar="SYSTEM", help="describe this one")
+
+    command = _command(commands, "run", _run, "compute a scene, or resume it")
+    _add_scene(command)
+    command.add_argument("--fresh", action="store_true", help="replace a result of another scene or version")
+    command.add_argument("--workers", type=int, metavar="N", help="chunks computed at a time (default: usable cores)")
+    command.add_argument("--quiet", action="store_true", help="no progress, only the last line")
+
+    command = _command(commands, "status", _status, "how much of a scene is computed")
+    _add_scene(command)
+    command.add_argument("--json", action="store_true", help="as one JSON object")
+
+    command = _command(commands, "plot", _plot, "draw the figure that suits a result")
+    command.add_argument("file", metavar="FILE.nc", type=Path)
+    command.add_argument("--out", required=True, metavar="FIGURE", type=Path, help="figure to write (.png, .pdf, .svg)")
+
+    command = _command(commands, "point", _point, "compute one point")
+    command.add_argument("system", metavar="SYSTEM")
+    command.add_argument("analysis", metavar="ANALYSIS")
+    command.add_argument("given", nargs="*", metavar="name=value", help="parameters, options, and outputs=NAME,NAME")
+    command.add_argument("--json", action="store_true", help="as one JSON object")
+    return parser
+
+
+def _command(commands: Any, name: str, function: Any, text: str) -> argparse.ArgumentParser:
+    command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    command.set_defaults(command=function)
+    return command
+
+
+def _add_scene(command: argparse.ArgumentParser) -> None:
+    command.add_argument("scene", metavar="SCENE.toml", type=Path)
+    command.add_argument("--out", required=True, metavar="FILE.nc", type=Path, help="result file")
+    command.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="replace an entry of the scene: fixed.zeta=0.002",
+    )
+
+
+def _assignments(texts: Sequence[str], field: str) -> dict[str, Any]:
+    """``name=value`` pairs, values in TOML or plain text."""
+    from drivetrain_jax.sweep.toml import parse_value
+
+    pairs: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name and equals and value):
+            raise InputError(f"{field} = {text!r}: allowed is name=value")
+        if name in pairs:
+            raise InputError(f"{field} = {text!r}: {name} is given twice; allowed is once")
+        pairs[name] = parse_value(value)
+    return pairs
+
+
+def _list(options: argparse.Namespace) -> int:
+    from drivetrain_jax.sweep.catalogue import describe, overview
+
+    sys.stdout.write(describe(options.system) if options.system else overview())
+    return OK
+
+
+def _run(options: argparse.Namespace) -> int:
+    # Stopped by a scheduler or by the keyboard: both leave the finished chunks behind.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    from drivetrain_jax.sweep.run import Incomplete, Interrupted, run_to_file
+
+    overrides = _assignments(options.set, "--set")
+    with _progress_line(options.quiet) as report:
+        try:
+            progress = run_to_file(
+                options.scene,
+                options.out,
+                overrides=overrides,
+                fresh=options.fresh,
+                workers=options.workers,
+                report=report,
+            )
+            code = OK
+        except Incomplete as error:
+            progress, code, reason = error.progress, INCOMPLETE, str(error)
+        except Interrupted as error:
+            progress, code, reason = error.progress, INTERRUPTED, "interrupted; the same command resumes"
+    if code != OK:
+        sys.stderr.write(_line(reason))
+    sys.stderr.write(f"{progress}\n")
+    if code == INTERRUPTED:
+        # Chunks that are still being computed would hold up a normal exit; their results are not wanted any more.
+        sys.stderr.flush()
+        os._exit(code)
+    return code
+
+
+def _progress_line(quiet: bool) -> Any:
+    from contextlib import nullcontext
+
+    if quiet:
+        return nullcontext()
+    from drivetrain_jax._progress import progress_line
+
+    return progress_line()
+
+
+def _status(options: argparse.Namespace) -> int:
+    import json
+    from dataclasses import asdict
+
+    from drivetrain_jax.sweep.run import status
+
+    found = status(options.scene, options.out, _assignments(options.set, "--set"))
+    if options.json:
+        sys.stdout.write(json.dumps(asdict(found)) + "\n")
+    else:
+        sys.stdout.write(f"{found.state}: {found.done} of {found.total} points done, {found.failed} without a value\n")
+    return OK
+
+
+def _plot(options: argparse.Namespace) -> int:
+    from drivetrain_jax.store.consolidate import open_result
+    from drivetrain_jax.view import plot
+
+    out = options.out
+    if not out.parent.is_dir():
+        raise InputError(f"out = {str(out)!r}: the folder does not exist; allowed is a file in an existing folder")
+    figure = plot(open_result(options.file))
+    kinds = figure.canvas.get_supported_filetypes()
+    if out.suffix[1:].lower() not in kinds:
+        raise InputError(f"out = {str(out)!r}: allowed is a name that ends in .{', .'.join(kinds)}")
+    try:
+        figure.savefig(out)
+    except OSError as error:
+        raise InputError(f"out = {str(out)!r}: {error.strerror}; allowed is a file that can be written") from None
+    return OK
+
+
+def _point(options: argparse.Namespace) -> int:
+    from drivetrain_jax.sweep.point import point
+
+    given = _assignments(options.given, "point")
+    outputs = given.pop("outputs", None)
+    if isinstance(outputs, str):
+        outputs = outputs.split(",")
+    result = point(options.system, options.analysis, outputs=outputs, **given)
+    sys.stdout.write((result.to_json() if options.json else repr(result)) + "\n")
+    return OK
+
+
+if __name__ == "__main__":
+    sys.exit(main())

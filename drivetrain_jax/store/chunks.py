@@ -1,0 +1,153 @@
+"""Unfinished work: the folder ``FILE.nc.parts/`` with finished chunks in files that are complete, verified, or ignored.
+
+A part is one HDF5 image, made in memory and written at once. Its name carries the digest of its content: damage is
+found when it is read, and the chunks in it are computed again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+from filelock import FileLock, Timeout
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.store.files import write_atomic
+
+Arrays = Mapping[str, np.ndarray]
+
+
+class Part:
+    """Finished chunks: their numbers, how many points each has, results with the points as first axis, seconds spent."""
+
+    def __init__(self, chunks: Sequence[int], sizes: Sequence[int], results: Arrays, seconds: float) -> None:
+        self.chunks = np.asarray(chunks, np.int64)
+        self.sizes = np.asarray(sizes, np.int64)
+        self.results = results
+        self.seconds = seconds
+
+    def __iter__(self) -> Iterator[tuple[int, Arrays]]:
+        """Chunk by chunk: number and results."""
+        stops = np.cumsum(self.sizes)
+        for chunk, start, stop in zip(self.chunks, stops - self.sizes, stops, strict=True):
+            yield int(chunk), {name: values[start:stop] for name, values in self.results.items()}
+
+    def to_bytes(self) -> bytes:
+        """The HDF5 image."""
+        with h5py.File("part", "w", driver="core", backing_store=False) as file:
+            file["chunks"], file["sizes"] = self.chunks, self.sizes
+            file.attrs["seconds"] = self.seconds
+            group = file.create_group("results")
+            for name, values in self.results.items():
+                group[name] = values
+            file.flush()
+            return file.id.get_file_image()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Part:
+        """The part in an HDF5 image."""
+        with h5py.File(io.BytesIO(data), "r") as file:
+            results = {name: values[()] for name, values in file["results"].items()}
+            return cls(file["chunks"][()], file["sizes"][()], results, float(file.attrs["seconds"]))
+
+
+class PartsFolder:
+    """The parts of the result ``out``. Writing needs the folder to be open (``open`` .. ``close``), reading does not."""
+
+    def __init__(self, out: Path) -> None:
+        self.path = out.with_name(out.name + ".parts")
+        self._plan = self.path / "plan.json"
+        self._lock: FileLock | None = None
+
+    def plan(self) -> dict[str, str | None]:
+        """What the parts belong to: ``digest``, and ``replaces``, the digest of the result that they will supersede.
+
+        Empty if there is no readable plan.
+        """
+        try:
+            content = json.loads(self._plan.read_text())
+        except (OSError, ValueError):
+            return {}
+        return content if isinstance(content, dict) else {}
+
+    def open(self) -> None:
+        """Create and lock the folder; ``InputError`` if another run holds it. Nothing in it changes yet."""
+        while True:
+            self.path.mkdir(exist_ok=True)
+            lock = FileLock(self.path / "lock", timeout=0)
+            try:
+                lock.acquire()
+            except Timeout:
+                raise InputError(f"out = {str(self.path)!r}: another run is working on it; wait or stop it") from None
+            except FileNotFoundError:
+                continue
+            # The run that held it may have finished and removed the folder between our mkdir and our lock.
+            if os.path.exists(self.path / "lock"):
+                self._lock = lock
+                return
+            lock.release()
+
+    def start(self, plan: Mapping[str, str | None]) -> None:
+        """Forget all parts and begin those of ``plan``."""
+        for entry in self.path.iterdir():
+            if entry.name != "lock":
+                entry.unlink()
+        write_atomic(self._plan, json.dumps(dict(plan)).encode(), self.path / "plan.tmp")
+
+    def close(self, remove: bool = False) -> None:
+        """Release the folder, or delete it with everything in it."""
+        if self._lock is None:
+            return
+        if remove:
+            shutil.rmtree(self.path, ignore_errors=True)
+        self._lock.release()
+        self._lock = None
+
+    def holds_work(self) -> bool:
+        """Whether there is anything to resume or to refuse; a run killed at its very start leaves nothing."""
+        return self._plan.exists() or any(self.path.glob("*.h5"))
+
+    def discard(self) -> None:
+        """Delete what a finished run was killed over before it could; another run's work is left alone."""
+        if self.path.exists():
+            self.open()
+            self.close(remove=True)
+
+    def write(self, part: Part) -> None:
+        """Add finished chunks."""
+        data = part.to_bytes()
+        path = self.path / f"{int(part.chunks[0]):08d}-{_content_digest(data)}.h5"
+        write_atomic(path, data, path.with_suffix(".tmp"))
+
+    def read(self, repair: bool = False) -> Iterator[Part]:
+        """All intact parts. ``repair`` deletes damaged and half-written ones (only while the folder is open)."""
+        for path in sorted(self.path.glob("*-*.h5")):
+            part = _read_intact(path)
+            if part is not None:
+                yield part
+            elif repair:
+                path.unlink(missing_ok=True)
+        if repair:
+            for path in self.path.glob("*.tmp"):
+                path.unlink(missing_ok=True)
+
+
+def _read_intact(path: Path) -> Part | None:
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return None
+    if _content_digest(data) != path.stem.partition("-")[2]:
+        return None
+    return Part.from_bytes(data)
+
+
+def _content_digest(data: bytes) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()

@@ -1,0 +1,1 @@
+"""From a scene to its results: validation, the plan, compiled batches, resumable runs."""

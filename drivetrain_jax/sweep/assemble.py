@@ -1,0 +1,154 @@
+"""From chunks to the labelled result of a scene."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+import drivetrain_jax
+from drivetrain_jax._quantities import Variable
+from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.store import provenance
+from drivetrain_jax.store.schema import Coordinate, build_dataset
+from drivetrain_jax.sweep.grid import Grid
+from drivetrain_jax.sweep.identity import PACKAGES
+from drivetrain_jax.sweep.scene import Scene
+
+# Entries assumed for a dimension whose size depends on the system, when memory is estimated.
+_USUAL_SIZE = 4
+_STORAGE = ("xarray", "h5netcdf", "h5py")
+
+
+class Table:
+    """Results of all points of a grid, filled chunk by chunk. What is never filled counts as step limit reached."""
+
+    def __init__(self, scene: Scene, grid: Grid) -> None:
+        self.variables = result_variables(scene)
+        self._grid = grid
+        self._sizes = {d.name: len(d.values) for d in scene.analysis.dimensions}
+        self._arrays: dict[str, np.ndarray] = {}
+
+    def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
+        """Enter the results of ``points``; the first ones tell the sizes of dimensions that depend on the system."""
+        if not self._arrays:
+            for variable in self.variables:
+                self._sizes |= zip(reversed(variable.dims), reversed(results[variable.name].shape), strict=False)
+            self._allocate()
+        for name, values in results.items():
+            self._arrays[name][points] = values
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """All values of a result: points, then the path if there is one, then its own dimensions."""
+        if not self._arrays:
+            self._allocate()
+        return self._arrays[name]
+
+    def _allocate(self) -> None:
+        path = () if self._grid.path is None else (self._grid.path_length,)
+        for variable in self.variables:
+            shape = (self._grid.size, *path, *(self._sizes[dim] for dim in variable.dims))
+            self._arrays[variable.name] = np.full(shape, _missing(variable), variable.dtype)
+
+
+def failures(outcome: np.ndarray) -> int:
+    """How many outcomes mean that there is no value."""
+    return int(np.count_nonzero(outcome > Outcome.TOLERANCE_NOT_MET))
+
+
+def _missing(variable: Variable) -> float | int:
+    if variable.name == OUTCOME.name:
+        return Outcome.STEP_LIMIT
+    # A flag has no NaN; its last code is the one that claims least (undecided, none).
+    return len(variable.flags) - 1 if variable.flags else 0 if np.dtype(variable.dtype).kind in "iu" else np.nan
+
+
+def result_variables(scene: Scene) -> tuple[Variable, ...]:
+    """The requested results, then the outcome."""
+    return (*(scene.analysis.variable(name) for name in scene.request.outputs), OUTCOME)
+
+
+def bytes_per_point(scene: Scene) -> int:
+    """Memory that one point takes while its scene runs: results twice (the file is made in memory), and the plan."""
+    sizes = {d.name: len(d.values) or _USUAL_SIZE for d in scene.analysis.dimensions}
+    return 32 + 2 * sum(
+        np.dtype(v.dtype).itemsize * math.prod(sizes[dim] for dim in v.dims) for v in result_variables(scene)
+    )
+
+
+def to_dataset(scene: Scene, grid: Grid, table: Table, attrs: Mapping[str, str | float]) -> xr.Dataset:
+    """The labelled result: dimensions are the axes in the order of the scene (or ``point``), then those of the variable."""
+    sweep_dims = ("point",) if scene.zipped else tuple(axis.name for axis in scene.axes)
+    results = [(v, _reshaped(scene, grid, table[v.name])) for v in table.variables]
+    coordinates = [*_axis_coordinates(scene), *_resonances(scene)]
+    return build_dataset(sweep_dims, coordinates, scene.analysis.dimensions, results, _attrs(scene) | dict(attrs))
+
+
+def _reshaped(scene: Scene, grid: Grid, values: np.ndarray) -> np.ndarray:
+    """From ``(points, path, own)`` to the axes in the order of the scene, then own."""
+    if grid.path is None:
+        return values.reshape((*grid.shape, *values.shape[1:]))
+    position = [i for i, axis in enumerate(scene.axes) if axis.name == grid.path_name]
+    if not position:
+        return values.reshape((*grid.shape, *values.shape[2:]))
+    lines = values.reshape((*grid.shape, *values.shape[1:]))
+    return np.ascontiguousarray(np.moveaxis(lines, len(grid.shape), position[0]))
+
+
+def _axis_coordinates(scene: Scene) -> list[Coordinate]:
+    coordinates = [
+        Coordinate(a.name, ("point",) if scene.zipped else (a.name,), a.values, a.parameter.units, a.long_name)
+        for a in scene.axes
+    ]
+    if scene.zipped:
+        numbers = np.arange(len(scene.axes[0].values))
+        coordinates.insert(0, Coordinate("point", ("point",), numbers, "1", "number of the point"))
+    return coordinates
+
+
+def _resonances(scene: Scene) -> list[Coordinate]:
+    """Predicted values of an axis, if the system predicts any: labels, and values over the axes they depend on."""
+    predicted = scene.system.resonances
+    axes = {axis.name: axis.values for axis in scene.axes}
+    if predicted is None or scene.zipped or predicted.axis not in axes:
+        return []
+    if any(name not in axes and name not in scene.fixed for name in predicted.parameters):
+        return []
+    depends = [axis.name for axis in scene.axes if axis.name in predicted.parameters]
+    mesh = dict(zip(depends, np.meshgrid(*(axes[name] for name in depends), indexing="ij"), strict=True))
+    values = np.asarray(
+        predicted.values({name: mesh.get(name, scene.fixed.get(name)) for name in predicted.parameters})
+    )
+    units = scene.system.parameter(predicted.axis).units
+    name = f"resonance_{predicted.axis}"
+    return [
+        Coordinate("resonance", ("resonance",), np.array(predicted.labels), "1", "name of the resonance"),
+        Coordinate(name, (*depends, "resonance"), values, units, predicted.long_name),
+    ]
+
+
+def _attrs(scene: Scene) -> dict[str, str]:
+    """What the result is of and where it comes from, apart from what each run adds."""
+    fixed: dict[str, Any] = {}
+    for name, value in scene.fixed.items():
+        parameter = scene.system.parameter(name)
+        fixed[name] = {"value": value, "units": parameter.units, "long_name": parameter.long_name}
+    installed = provenance.versions((*PACKAGES, *_STORAGE))
+    return {
+        "title": scene.title,
+        "system": scene.system.name,
+        "analysis": scene.analysis.name,
+        "method": scene.request.method,
+        "options": json.dumps(dict(scene.request.options)),
+        "source": scene.system.source,
+        "scene": scene.text,
+        "fixed_parameters": json.dumps(fixed),
+        "drivetrain_jax_version": drivetrain_jax.__version__,
+        "versions": ", ".join(f"{name} {number}" for name, number in installed.items()),
+        "machine": provenance.machine(),
+        "created": provenance.now(),
+    }

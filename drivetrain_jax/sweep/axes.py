@@ -1,0 +1,85 @@
+"""Axes of a scene: how they are written, and their values."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Parameter
+
+MAX_POINTS = 2_000_000_000
+_SCALES = ("lin", "log")
+
+
+class AxisTable(msgspec.Struct, forbid_unknown_fields=True):
+    """The keys of one axis: ``start, stop, num`` and ``scale``, or ``values``."""
+
+    start: float | int | None = None
+    stop: float | int | None = None
+    num: int | None = None
+    scale: str | None = None
+    values: list[float | int] | None = None
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A varying parameter, or entry number ``entry`` of a list-valued one. ``name`` is ``Omega`` or ``length[1]``."""
+
+    name: str
+    parameter: Parameter
+    entry: int | None
+    values: np.ndarray
+
+    @property
+    def long_name(self) -> str:
+        label = self.parameter.long_name
+        return label if self.entry is None else f"{label}, entry {self.entry}"
+
+
+def entry_of(name: str) -> tuple[str, int | None]:
+    """Parameter and position behind the name of an axis: ``length[1]`` is ``("length", 1)``."""
+    match = re.fullmatch(r"(.+)\[(\d+)\]", name)
+    return (match.group(1), int(match.group(2))) if match else (name, None)
+
+
+def check_count(name: str, spec: AxisTable) -> int:
+    """Number of values of an axis, without making them; refuses incomplete and contradictory ones."""
+    field = f"axes.{name}"
+    if spec.values is not None:
+        if any(x is not None for x in (spec.start, spec.stop, spec.num, spec.scale)):
+            raise InputError(
+                f"{field}: values given together with start, stop, num or scale; allowed is one of the two"
+            )
+        if not spec.values:
+            raise InputError(f"{field}.values = []: empty axis; allowed is one value or more")
+        return len(spec.values)
+    for key in ("start", "stop"):
+        if getattr(spec, key) is None:
+            raise InputError(f"{field}.{key}: missing; allowed is start, stop and num, or values")
+    if spec.num is None:
+        raise InputError(f"{field}.num: missing; axes without num need the analysis atlas, which does not exist yet")
+    if spec.num < 1:
+        raise InputError(f"{field}.num = {spec.num}: empty axis; allowed is num >= 1")
+    if spec.scale not in (None, *_SCALES):
+        raise InputError(f"{field}.scale = {spec.scale!r}: allowed is one of {', '.join(_SCALES)}")
+    if spec.scale == "log" and not (spec.start > 0 and spec.stop > 0):
+        key = "stop" if spec.start > 0 else "start"
+        raise InputError(f"{field}.{key} = {getattr(spec, key)}: allowed on a log axis is {key} > 0")
+    return spec.num
+
+
+def spread(spec: AxisTable, field: str) -> np.ndarray:
+    """The values of a checked axis; no value may occur twice."""
+    if spec.values is not None:
+        values = np.array(spec.values, float)
+    else:
+        values = (np.geomspace if spec.scale == "log" else np.linspace)(float(spec.start), float(spec.stop), spec.num)
+    ordered = np.sort(values)
+    double = np.flatnonzero(ordered[1:] == ordered[:-1])
+    if double.size:
+        raise InputError(f"{field}: the value {ordered[double[0]]:.10g} occurs twice; allowed are distinct values")
+    return values

@@ -1,0 +1,84 @@
+"""What there is to compute: systems, their parameters and analyses, and scene files, as plain text."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import drivetrain_jax
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Parameter, Variable
+from drivetrain_jax.analysis import get_analysis
+from drivetrain_jax.systems import System, get_system, system_names
+
+
+def overview() -> str:
+    """Systems with their analyses, and the scenes found here."""
+    lines = ["Systems (drivetrain list SYSTEM describes one)"]
+    for name in system_names():
+        system = get_system(name)
+        lines.append(f"  {name:12} {system.title}; analyses: {', '.join(system.models)}")
+    return "\n".join([*lines, *_scene_lines(None)]) + "\n"
+
+
+def describe(name: str) -> str:
+    """Parameters, presets, analyses with results and options, and scenes of one system."""
+    try:
+        system = get_system(name)
+    except KeyError as error:
+        raise InputError(str(error.args[0])) from None
+    lines = [f"{system.name}: {system.title}", f"  {system.source}", "", "Parameters"]
+    lines += _table([_parameter_row(p) for p in system.parameters])
+    if system.presets:
+        lines += ["", "Presets"]
+        lines += _table([(preset, _assignments(values)) for preset, values in system.presets.items()])
+    for analysis in system.models:
+        lines += ["", *_analysis_lines(analysis)]
+    return "\n".join([*lines, *_scene_lines(system)]) + "\n"
+
+
+def _analysis_lines(name: str) -> list[str]:
+    analysis = get_analysis(name)
+    lines = [f"Analysis {name}: {analysis.title}"]
+    lines += _table([_variable_row(v, v.name in analysis.default_outputs) for v in analysis.variables])
+    lines += [
+        "  (* computed unless outputs says otherwise)",
+        "  Methods and the options they use, the first by default",
+    ]
+    lines += ["  " + line for line in _table([(method, ", ".join(used)) for method, used in analysis.methods.items()])]
+    return [*lines, "  Options", *("  " + line for line in _table([_parameter_row(o) for o in analysis.options]))]
+
+
+def _parameter_row(parameter: Parameter) -> tuple[str, ...]:
+    default = "required" if parameter.default is None else f"default {parameter.default}"
+    return parameter.name, f"[{parameter.units}]", parameter.long_name, default, parameter.allowed
+
+
+def _variable_row(variable: Variable, default: bool) -> tuple[str, ...]:
+    meaning = variable.long_name + (f": {', '.join(variable.flags)}" if variable.flags else "")
+    return f"{variable.name}{'*' if default else ''}", f"[{variable.units}]", meaning, ", ".join(variable.dims)
+
+
+def _table(rows: list[tuple[str, ...]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  " + "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def _assignments(values: Any) -> str:
+    return ", ".join(f"{name} = {value}" for name, value in values.items())
+
+
+def _scene_lines(system: System | None) -> list[str]:
+    """Scene files in ``sweeps/`` of the working folder, or of the checkout that the package is installed from."""
+    folders = (Path("sweeps"), Path(drivetrain_jax.__file__).parents[1] / "sweeps")
+    folder = next((f for f in folders if f.is_dir()), None)
+    rows = []
+    for path in sorted(folder.glob("*.toml")) if folder else ():
+        try:
+            content = tomllib.loads(path.read_text())
+        except (OSError, ValueError):
+            continue
+        if system is None or content.get("system") == system.name:
+            rows.append((f"{folder.name}/{path.name}", str(content.get("title", ""))))
+    return ["", "Scenes", *_table(rows)] if rows else []

@@ -1,0 +1,87 @@
+"""The points of a scene by number: parameter values on demand, so that a grid never exists as a whole."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drivetrain_jax.sweep.axes import Axis
+from drivetrain_jax.sweep.scene import Scene, Value
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Points numbered from 0 in C order of ``axes`` (``shape``), or one point per entry of ``axes`` if ``zipped``.
+
+    With a path axis a point is a whole line: ``axes`` lacks it and ``path`` holds its values.
+    """
+
+    axes: tuple[Axis, ...]
+    zipped: bool
+    fixed: Mapping[str, Value]
+    parameters: tuple[str, ...]
+    path_name: str | None = None
+    path: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, scene: Scene) -> Grid:
+        """The grid of ``scene``; a fixed path parameter makes lines of one value."""
+        parameters = scene.system.models[scene.analysis.name].parameters
+        name = scene.analysis.path_axis
+        if name is None:
+            return cls(scene.axes, scene.zipped, scene.fixed, parameters)
+        along = [axis.values for axis in scene.axes if axis.name == name]
+        path = along[0] if along else np.array([scene.fixed[name]])
+        return cls(tuple(a for a in scene.axes if a.name != name), scene.zipped, scene.fixed, parameters, name, path)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        lengths = tuple(len(axis.values) for axis in self.axes)
+        return lengths[:1] if self.zipped else lengths
+
+    @property
+    def size(self) -> int:
+        """Number of points (lines, if there is a path)."""
+        return math.prod(self.shape)
+
+    @property
+    def path_length(self) -> int:
+        """Number of results along a line, 1 without a path."""
+        return 1 if self.path is None else len(self.path)
+
+    def columns(self, points: np.ndarray) -> dict[str, np.ndarray]:
+        """Values of the varying parameters at ``points``, by name of the axis, each of the shape of ``points``."""
+        if self.zipped:
+            return {axis.name: axis.values[points] for axis in self.axes}
+        # No axis at all is one point, of which unravel_index knows nothing.
+        indices = np.unravel_index(points, self.shape) if self.axes else ()
+        return {axis.name: axis.values[i] for axis, i in zip(self.axes, indices, strict=True)}
+
+    def bind(self, columns: Mapping[str, Any]) -> dict[str, Any]:
+        """All parameters of the model: the fixed ones, ``columns`` of the varying ones, and the path as a whole."""
+        values: dict[str, Any] = dict(self.fixed)
+        for axis in self.axes:
+            name = axis.parameter.name
+            if axis.entry is None:
+                values[name] = columns[axis.name]
+            else:
+                before, after = values[name][: axis.entry], values[name][axis.entry + 1 :]
+                values[name] = (*before, columns[axis.name], *after)
+        if self.path_name is not None:
+            values[self.path_name] = self.path
+        return {name: values[name] for name in self.parameters}
+
+    def arrays(self, points: np.ndarray) -> dict[str, Any]:
+        """Like ``bind`` at ``points``, with every number (and entry of a list) an array of the shape of ``points``."""
+
+        def spread(value: Any) -> Any:
+            if isinstance(value, tuple):
+                return tuple(spread(entry) for entry in value)
+            return value if isinstance(value, str) else np.broadcast_to(value, points.shape)
+
+        bound = self.bind(self.columns(points))
+        return {name: value if name == self.path_name else spread(value) for name, value in bound.items()}

@@ -1,0 +1,104 @@
+"""Who computes what: a solver for every point, points of similar effort together, chunks of one shape per solver."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivetrain_jax.analysis import Solver
+from drivetrain_jax.sweep.grid import Grid
+
+# Points whose effort is predicted at a time.
+_BLOCK = 1 << 18
+_MAX_EFFORT = 2**31 - 1
+# Small scenes are cut into at least this many chunks per solver. Not the number of cores: numbers must not depend on it.
+_MIN_CHUNKS = 2
+_LANES = 16
+
+
+@dataclass(frozen=True)
+class Group:
+    """The points of one solver: ``order`` their numbers by rising effort, cut into ``len(efforts)`` chunks.
+
+    ``efforts`` is the largest effort within each chunk.
+    """
+
+    solver: Solver
+    order: np.ndarray
+    efforts: np.ndarray
+    chunk: int
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Number, solver (position in ``Plan.groups``), points (at most the chunk size of the group) and effort."""
+
+    number: int
+    group: int
+    points: np.ndarray
+    effort: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All chunks, numbered through the groups. Points for which every solver predicts infinite cost are in none."""
+
+    groups: tuple[Group, ...]
+
+    @property
+    def costs(self) -> np.ndarray:
+        """Predicted cost of every chunk, in units of its own."""
+        return np.concatenate([np.empty(0), *(g.efforts * (g.solver.unit_cost * g.chunk) for g in self.groups)])
+
+    def chunk(self, number: int) -> Chunk:
+        """Chunk number ``number``."""
+        first = 0
+        for index, group in enumerate(self.groups):
+            k = number - first
+            if k < len(group.efforts):
+                points = group.order[k * group.chunk : (k + 1) * group.chunk]
+                return Chunk(number, index, points, int(group.efforts[k]))
+            first += len(group.efforts)
+        raise IndexError(number)
+
+
+def chunk_size(largest: int, count: int) -> int:
+    """Points per chunk for ``count`` points, at most ``largest``: fewer in small scenes, so that all cores have work."""
+    if count <= _LANES:
+        return min(largest, 1 << (count - 1).bit_length())
+    share = -(-count // _MIN_CHUNKS)
+    return min(largest, -(-share // _LANES) * _LANES)
+
+
+def make_plan(solvers: Sequence[Solver], grid: Grid) -> Plan:
+    """Give every point to the solver with the smallest predicted cost (the first of equals)."""
+    choice = np.empty(grid.size, np.int8)
+    effort = np.empty(grid.size, np.int64)
+    for start in range(0, grid.size, _BLOCK):
+        points = np.arange(start, min(start + _BLOCK, grid.size))
+        choice[points], effort[points] = _cheapest(solvers, grid, points)
+    groups = []
+    for index, solver in enumerate(solvers):
+        mine = np.flatnonzero(choice == index)
+        if not mine.size:
+            continue
+        order = mine[np.argsort(effort[mine], kind="stable")]
+        size = chunk_size(solver.chunk, order.size)
+        last = np.minimum(np.arange(size, order.size + size, size), order.size) - 1
+        groups.append(Group(solver, order, effort[order[last]], size))
+    return Plan(tuple(groups))
+
+
+def _cheapest(solvers: Sequence[Solver], grid: Grid, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Position of the cheapest solver (-1 if all costs are infinite) and its effort, for each of ``points``."""
+    columns = grid.arrays(points)
+    efforts = np.stack([np.broadcast_to(np.asarray(s.effort(columns), float), points.shape) for s in solvers])
+    efforts = np.where(np.isnan(efforts), np.inf, efforts)
+    with np.errstate(over="ignore"):
+        costs = efforts * np.array([s.unit_cost for s in solvers])[:, None]
+    best = np.argmin(costs, axis=0)
+    lanes = np.arange(points.size)
+    effort = np.ceil(np.clip(efforts[best, lanes], 0, _MAX_EFFORT)).astype(np.int64)
+    return np.where(np.isfinite(costs[best, lanes]), best, -1), effort

@@ -1,0 +1,190 @@
+"""One point: the same path as a sweep, and an answer that can be read."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Parameter, Variable
+from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.sweep import compile_cache
+from drivetrain_jax.sweep.assemble import Table, result_variables
+from drivetrain_jax.sweep.engine import Engine
+from drivetrain_jax.sweep.kernel import Kernel, compile_kernel
+from drivetrain_jax.sweep.plan import Group
+from drivetrain_jax.sweep.scene import load_scene, system_and_analysis
+
+
+@dataclass(frozen=True)
+class PointResult:
+    """Results of one point, by attribute or by name: ``result.spectral_radius`` or ``result["spectral_radius"]``.
+
+    ``outcome`` tells what became of it (results are NaN unless ``outcome.has_value``), ``units`` the units by name.
+    """
+
+    system: str
+    analysis: str
+    method: str
+    parameters: Mapping[str, Any]
+    values: Mapping[str, Any]
+    outcome: Outcome
+    variables: Mapping[str, Variable] = field(repr=False)
+    parameter_units: Mapping[str, str] = field(repr=False)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the results."""
+        return {name: self.variables[name].units for name in self.values}
+
+    def __getitem__(self, name: str) -> Any:
+        return self.values[name]
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name not in self.values:
+            raise AttributeError(f"no result {name!r}; there is {', '.join(self.values)}")
+        return self.values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values)
+
+    def __dir__(self) -> list[str]:
+        return sorted({*super().__dir__(), *self.values})
+
+    def to_json(self) -> str:
+        """The answer as one JSON object; what is not finite is null, a complex value has ``real`` and ``imag``."""
+        values = {n: {"value": _plain(v), "units": self.variables[n].units} for n, v in self.values.items()}
+        parameters = {n: {"value": v, "units": self.parameter_units[n]} for n, v in self.parameters.items()}
+        head = {"system": self.system, "analysis": self.analysis, "method": self.method}
+        answer = {**head, "parameters": parameters, "outcome": self.outcome.name.lower(), "values": values}
+        return json.dumps(answer, allow_nan=False)
+
+    def __repr__(self) -> str:
+        given = ", ".join(
+            _with_units(f"{n} = {_short(v)}", self.parameter_units[n]) for n, v in self.parameters.items()
+        )
+        width = max(map(len, (*self.values, "outcome")))
+        lines = [f"{self.system} {self.analysis} (method {self.method}), {given}"]
+        for name, value in self.values.items():
+            lines.append(
+                f"  {name:{width}} = {_with_units(_text(self.variables[name], value), self.variables[name].units)}"
+            )
+        return "\n".join([*lines, f"  {'outcome':{width}} = {self.outcome.name.lower()}"])
+
+
+def _plain(value: Any) -> Any:
+    """Numbers and lists that JSON knows."""
+    if np.iscomplexobj(value):
+        return {"real": _plain(np.real(value)), "imag": _plain(np.imag(value))}
+    if np.ndim(value):
+        return [_plain(entry) for entry in value]
+    return value.item() if np.isfinite(value) else None
+
+
+def _short(value: Any) -> str:
+    return f"{value:.10g}" if isinstance(value, float) else str(value)
+
+
+def _with_units(text: str, units: str) -> str:
+    return text if units == "1" else f"{text} {units}"
+
+
+def _text(variable: Variable, value: Any) -> str:
+    if variable.flags and np.ndim(value) == 0:
+        return f"{variable.flags[int(value)]} ({int(value)})"
+    if np.ndim(value):
+        return np.array2string(value, precision=10, separator=", ", max_line_width=10_000)
+    return f"{value:.12g}"
+
+
+def point(system: str, analysis: str, *, outputs: Sequence[str] | None = None, **given: Any) -> PointResult:
+    """Compute one point.
+
+    ``given`` holds parameters of the system and options of the analysis (``method``, ``rtol``, ...) by name;
+    ``outputs`` the results wanted, by default those of the analysis.
+    Raises :class:`InputError` with one line naming the field, what was given and what is allowed.
+    """
+    tree = _tree(system, analysis, given)
+    if outputs is not None:
+        tree["outputs"] = list(outputs)
+    try:
+        engine = Engine(load_scene(tree))
+    except InputError as error:
+        # The tables of a scene are no concern of someone who gave none.
+        raise InputError(re.sub(r"^(points|fixed|options)\.", "", str(error))) from None
+    return _result(engine, _compute(engine))
+
+
+def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The scene of one point. Numbers vary, so that another point needs no new compilation; words and lists are fixed."""
+    system, analysis = system_and_analysis(system_name, analysis_name)
+    parameters = {p.name: p for p in system.parameters}
+    tree: dict[str, Any] = {"system": system_name, "analysis": analysis_name, "points": {}, "fixed": {}, "options": {}}
+    names = (*parameters, "method", *(o.name for o in analysis.options))
+    for name, value in given.items():
+        if name not in names:
+            raise InputError(f"{name} = {value!r}: unknown; allowed is {', '.join(names)}")
+        if name not in parameters:
+            tree["options"][name] = value
+        elif _may_vary(parameters[name]) and name != analysis.path_axis:
+            tree["points"][name] = [value]
+        else:
+            tree["fixed"][name] = value
+    return tree
+
+
+def _may_vary(parameter: Parameter) -> bool:
+    return not (parameter.choices or parameter.listed)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What a kernel is compiled for; two jobs are equal if one kernel serves both."""
+
+    identity: tuple[Any, ...]
+    engine: Engine = field(compare=False)
+    group: Group = field(compare=False)
+
+
+@lru_cache(maxsize=64)
+def _kernel(job: _Job) -> Kernel:
+    compile_cache.enable()
+    return compile_kernel(job.group.solver, job.engine.grid, job.group.chunk, result_variables(job.engine.scene))
+
+
+def _compute(engine: Engine) -> Table:
+    scene = engine.scene
+    table = Table(scene, engine.grid)
+    request = scene.request
+    what = (request.outputs, request.method, tuple(request.options.items()), tuple(scene.fixed.items()))
+    names = tuple((axis.name, axis.values.dtype) for axis in scene.axes)
+    for group in engine.plan.groups:
+        identity = (id(scene.system), id(scene.analysis), *what, names, group.solver.name, group.chunk)
+        kernel = _kernel(_Job(identity, engine, group))
+        table.fill(group.order, kernel(engine.grid.columns(group.order), int(group.efforts[0])))
+    return table
+
+
+def _result(engine: Engine, table: Table) -> PointResult:
+    scene = engine.scene
+    first = (0,) if engine.grid.path is None else (0, 0)
+    values = {v.name: table[v.name][first] for v in table.variables}
+    outcome = Outcome(int(values.pop(OUTCOME.name)))
+    parameters = {a.parameter.name: a.values[0].item() for a in scene.axes} | dict(scene.fixed)
+    ordered = {p.name: parameters[p.name] for p in scene.system.parameters if p.name in parameters}
+    return PointResult(
+        system=scene.system.name,
+        analysis=scene.analysis.name,
+        method=scene.request.method,
+        parameters=ordered,
+        values=values,
+        outcome=outcome,
+        variables={v.name: v for v in table.variables},
+        parameter_units={p.name: p.units for p in scene.system.parameters},
+    )

@@ -1,0 +1,265 @@
+"""Runs a scene: in memory, or into a file that is resumed after any interruption and never damaged."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis import OUTCOME
+from drivetrain_jax.store.chunks import Part, PartsFolder
+from drivetrain_jax.store.consolidate import open_result, write_result
+from drivetrain_jax.store.provenance import physical_memory, usable_cores
+from drivetrain_jax.sweep.assemble import Table, bytes_per_point, failures, to_dataset
+from drivetrain_jax.sweep.engine import ChunkError, Engine
+from drivetrain_jax.sweep.plan import Chunk
+from drivetrain_jax.sweep.scene import load_scene
+from drivetrain_jax.sweep.target import Target
+
+# Finished chunks are written together at most this often (seconds): small ones would cost more to write than to compute.
+_WRITE_INTERVAL = 0.25
+
+
+@dataclass
+class Progress:
+    """How far a run is. ``computed`` and ``reused`` and ``failed`` count points; costs are in the plan's units."""
+
+    total: int
+    computed: int = 0
+    reused: int = 0
+    failed: int = 0
+    cost: float = 0.0
+    total_cost: float = 0.0
+
+    def __str__(self) -> str:
+        return f"points: total={self.total} computed={self.computed} reused={self.reused} failed={self.failed}"
+
+
+Report = Callable[[Progress], None]
+
+
+class Incomplete(RuntimeError):
+    """A run stopped before its end; finished chunks are kept. ``progress`` says how far it came."""
+
+    def __init__(self, reason: str, progress: Progress) -> None:
+        super().__init__(reason)
+        self.progress = progress
+
+
+class Interrupted(KeyboardInterrupt):
+    """The user stopped a run; finished chunks are kept. ``progress`` says how far it came."""
+
+    def __init__(self, progress: Progress) -> None:
+        super().__init__("interrupted")
+        self.progress = progress
+
+
+def run(
+    scene: str | Path | Mapping[str, Any],
+    out: str | Path | None = None,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    fresh: bool = False,
+    workers: int | None = None,
+    report: Report | None = None,
+) -> xr.Dataset:
+    """Compute a scene and return its labelled result.
+
+    Without ``out`` everything happens in memory. With it the result is written to that netCDF4/HDF5 file; unfinished
+    work is kept in ``FILE.nc.parts/`` and taken up by the next call, and a complete result is only read.
+
+    :param scene: path of a scene file, or a mapping with the same keys.
+    :param overrides: entries to replace, by dotted key: ``{"fixed.zeta": 0.002}``.
+    :param fresh: replace a result, or drop unfinished work, of another scene or version at ``out``.
+    :param workers: chunks computed at a time (default: the cores this process may use); numbers do not depend on it.
+    :param report: called with the :class:`Progress` after every chunk.
+    :raises InputError: one line naming the field, what was given, what is allowed. Nothing is computed or written.
+    :raises Incomplete: something failed on the way; the same call resumes.
+    """
+    if out is None:
+        return _in_memory(_engine(scene, overrides, workers), workers, report)
+    run_to_file(scene, Path(out), overrides=overrides, fresh=fresh, workers=workers, report=report)
+    return open_result(Path(out))
+
+
+def run_to_file(
+    scene: str | Path | Mapping[str, Any],
+    out: Path,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    fresh: bool = False,
+    workers: int | None = None,
+    report: Report | None = None,
+) -> Progress:
+    """Like :func:`run` with ``out``, but returns the counts instead of the result."""
+    engine = _engine(scene, overrides, workers)
+    target = Target(out, engine.digest)
+    if target.state == "complete" and not fresh:
+        target.parts.discard()
+        return Progress(engine.total, reused=engine.total, failed=target.failed)
+    if target.state == "stale" and not fresh:
+        raise InputError(
+            f"out = {str(out)!r}: holds {target.obstacle} of another scene or version; --fresh replaces it"
+        )
+    parts = target.parts
+    progress = _progress(engine)
+    parts.open()
+    try:
+        if fresh or target.state == "absent":
+            parts.start(target.plan)
+        dataset = _resumed(engine, parts, progress, workers, report)
+        write_result(dataset, out, parts.path / "result.tmp")
+        parts.close(remove=True)
+    except KeyboardInterrupt:
+        raise Interrupted(progress) from None
+    except (ChunkError, OSError, MemoryError) as error:
+        raise Incomplete(f"{error or type(error).__name__}; the same command resumes", progress) from error
+    finally:
+        parts.close()
+    return progress
+
+
+def _engine(
+    scene: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None, workers: int | None = None
+) -> Engine:
+    """The engine of a scene that this machine can run."""
+    if workers is not None and workers < 1:
+        raise InputError(f"workers = {workers}: allowed is workers >= 1")
+    checked = load_scene(scene, overrides)
+    engine = Engine(checked)
+    needed, present = engine.total * bytes_per_point(checked), physical_memory()
+    if needed > present:
+        raise InputError(
+            f"axes: {engine.total} points need {needed / 1e9:.0f} GB of memory; allowed here is up to {present / 1e9:.0f} GB"
+        )
+    return engine
+
+
+def _progress(engine: Engine) -> Progress:
+    """Counts before the first chunk; points that no solver can do are done already, without a value."""
+    hopeless = engine.grid.size - sum(group.order.size for group in engine.plan.groups)
+    points = hopeless * engine.grid.path_length
+    return Progress(engine.total, computed=points, failed=points)
+
+
+def _in_memory(engine: Engine, workers: int | None, report: Report | None) -> xr.Dataset:
+    table, progress, begin = Table(engine.scene, engine.grid), _progress(engine), time.monotonic()
+    try:
+        _compute(engine, range(len(engine.plan.costs)), table, progress, workers, report)
+    except ChunkError as error:
+        raise Incomplete(str(error), progress) from error
+    return _dataset(engine, table, time.monotonic() - begin)
+
+
+def _resumed(
+    engine: Engine, parts: PartsFolder, progress: Progress, workers: int | None, report: Report | None
+) -> xr.Dataset:
+    """The result from the parts that exist and those that are computed and kept now."""
+    table, begin = Table(engine.scene, engine.grid), time.monotonic()
+    missing = set(range(len(engine.plan.costs)))
+    earlier = 0.0
+    for part in parts.read(repair=True):
+        earlier += part.seconds
+        for number, results in part:
+            if number not in missing:
+                continue
+            missing.remove(number)
+            points = engine.plan.chunk(number).points
+            table.fill(points, results)
+            progress.reused += points.size * engine.grid.path_length
+            progress.failed += failures(results[OUTCOME.name])
+    writer = _Writer(parts)
+    try:
+        _compute(engine, sorted(missing), table, progress, workers, report, writer.add)
+    finally:
+        writer.flush()
+    return _dataset(engine, table, earlier + time.monotonic() - begin)
+
+
+def _compute(
+    engine: Engine,
+    numbers: Iterable[int],
+    table: Table,
+    progress: Progress,
+    workers: int | None,
+    report: Report | None,
+    keep: Callable[[Chunk, Mapping[str, np.ndarray]], None] | None = None,
+) -> None:
+    """Compute chunks into ``table``; ``keep`` gets each as soon as it is there."""
+    numbers, costs = list(numbers), engine.plan.costs
+    progress.total_cost = float(costs[numbers].sum())
+    if report:
+        report(progress)
+    # Closed on the way out: after an interrupt no further chunk starts.
+    with closing(engine.compute(numbers, workers or usable_cores())) as finished:
+        for chunk, results in finished:
+            if keep:
+                keep(chunk, results)
+            table.fill(chunk.points, results)
+            progress.computed += chunk.points.size * engine.grid.path_length
+            progress.failed += failures(results[OUTCOME.name])
+            progress.cost += float(costs[chunk.number])
+            if report:
+                report(progress)
+
+
+class _Writer:
+    """Collects finished chunks and writes those of every quarter of a second as one part."""
+
+    def __init__(self, parts: PartsFolder) -> None:
+        self._parts = parts
+        self._waiting: list[tuple[Chunk, Mapping[str, np.ndarray]]] = []
+        self._last = time.monotonic()
+
+    def add(self, chunk: Chunk, results: Mapping[str, np.ndarray]) -> None:
+        self._waiting.append((chunk, results))
+        if time.monotonic() - self._last >= _WRITE_INTERVAL:
+            self.flush()
+
+    def flush(self) -> None:
+        if not self._waiting:
+            return
+        chunks, results = zip(*self._waiting, strict=True)
+        joined = {name: np.concatenate([r[name] for r in results]) for name in results[0]}
+        seconds = time.monotonic() - self._last
+        self._parts.write(Part([c.number for c in chunks], [c.points.size for c in chunks], joined, seconds))
+        self._waiting.clear()
+        self._last = time.monotonic()
+
+
+def _dataset(engine: Engine, table: Table, seconds: float) -> xr.Dataset:
+    attrs = {"digest": engine.digest, "numerics": engine.numerics, "wall_time_s": round(seconds, 3)}
+    return to_dataset(engine.scene, engine.grid, table, attrs)
+
+
+@dataclass(frozen=True)
+class Status:
+    """How much of a scene is at ``out``: counts of points, and absent, partial, complete or stale (of another scene)."""
+
+    total: int
+    done: int
+    failed: int
+    state: str
+
+
+def status(
+    scene: str | Path | Mapping[str, Any], out: str | Path, overrides: Mapping[str, Any] | None = None
+) -> Status:
+    """What a run of ``scene`` into ``out`` would find. Changes nothing and compiles nothing."""
+    engine = Engine(load_scene(scene, overrides))
+    target = Target(Path(out), engine.digest)
+    if target.state == "complete":
+        return Status(engine.total, engine.total, target.failed, target.state)
+    chunks = {n: r[OUTCOME.name] for part in target.parts.read() for n, r in part} if target.state == "partial" else {}
+    done, failed = (
+        sum(outcome.size for outcome in chunks.values()),
+        sum(failures(outcome) for outcome in chunks.values()),
+    )
+    return Status(engine.total, done, failed, target.state)

@@ -1,0 +1,292 @@
+"""A scene: which system, which analysis, which parameters vary and how. Complete and checked before anything is compiled."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Parameter
+from drivetrain_jax.analysis import OUTCOME, Analysis, Request, get_analysis
+from drivetrain_jax.sweep import toml
+from drivetrain_jax.sweep.axes import MAX_POINTS, Axis, AxisTable, check_count, entry_of, spread
+from drivetrain_jax.systems import System, get_system
+
+Value = float | int | str | tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A checked scene.
+
+    ``axes`` vary: as an outer product in this order, or together as one list of points if ``zipped``. ``fixed`` holds
+    the other parameters of the system that are known, defaults included. ``text`` is the scene in TOML.
+    """
+
+    title: str
+    system: System
+    analysis: Analysis
+    request: Request
+    axes: tuple[Axis, ...]
+    zipped: bool
+    fixed: Mapping[str, Value]
+    text: str
+
+
+class _SceneTable(msgspec.Struct, forbid_unknown_fields=True):
+    """The keys of a scene file."""
+
+    system: str
+    analysis: str
+    title: str = ""
+    outputs: list[str] | None = None
+    axes: dict[str, Any] = {}
+    points: dict[str, Any] = {}
+    fixed: dict[str, Any] = {}
+    options: dict[str, Any] = {}
+
+
+def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Scene:
+    """Read and check a scene: a path, or a mapping with the same keys. ``overrides``: see :func:`toml.read`.
+
+    Raises :class:`InputError` with one line that names the field, what was given and what is allowed.
+    """
+    tree, text = toml.read(source, overrides)
+    table = _convert(tree, _SceneTable, "")
+    system, analysis = system_and_analysis(table.system, table.analysis)
+    request = _request(table, analysis)
+    axes, zipped = _axes(table, system, analysis)
+    fixed = _fixed(table, system, analysis, axes)
+    title = table.title or f"{system.title}: {analysis.title}"
+    return Scene(title, system, analysis, request, axes, zipped, fixed, text)
+
+
+def system_and_analysis(system_name: str, analysis_name: str) -> tuple[System, Analysis]:
+    """The system and the analysis called so; ``InputError`` unless both exist and the one has a model for the other."""
+    system, analysis = _lookup(get_system, system_name), _lookup(get_analysis, analysis_name)
+    if analysis.name not in system.models:
+        raise InputError(
+            f"analysis = {analysis.name!r}: allowed for {system.name} is one of {', '.join(system.models)}"
+        )
+    return system, analysis
+
+
+def _convert(given: Any, kind: type, where: str) -> Any:
+    """``given`` as the table ``kind``; ``where`` is the dotted prefix of its fields in messages."""
+    names = [field.name for field in msgspec.structs.fields(kind)]
+    for key in given:
+        if key not in names:
+            raise InputError(f"{where}{key} = {_short(given[key])}: unknown key{_nearest(key, names)}")
+    try:
+        return msgspec.convert(given, kind)
+    except msgspec.ValidationError as error:
+        reason, _, path = str(error).partition(" - at `$.")
+        if missing := re.search(r"missing required field `(\w+)`", reason):
+            name = missing.group(1)
+            raise InputError(f"{where}{name}: missing; {_MISSING.get(name, 'it must be given')}") from None
+        name = re.match(r"\w*", path).group()
+        reason = re.sub(r"`([^`]*)`", _toml_types, reason)
+        raise InputError(
+            f"{where}{name} = {_short(given.get(name))}: {reason.replace('Expected', 'allowed is')}"
+        ) from None
+
+
+_TOML_TYPES = {
+    "object": "table",
+    "array": "list",
+    "str": "text",
+    "int": "integer",
+    "float": "number",
+    "bool": "boolean",
+}
+_MISSING = {"system": "give the name of a system", "analysis": "give the name of an analysis"}
+
+
+def _toml_types(match: re.Match[str]) -> str:
+    """``int | null`` in the words of TOML, in which there is no null."""
+    words = [_TOML_TYPES.get(word, word) for word in match.group(1).split(" | ") if word != "null"]
+    return " or ".join(words) or "nothing"
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _nearest(name: str, allowed: Iterable[str]) -> str:
+    """``; did you mean X? allowed is A, B, ...``"""
+    allowed = list(allowed)
+    match = difflib.get_close_matches(name, allowed, n=1)
+    guess = f" (did you mean {match[0]}?)" if match else ""
+    return f"{guess}; allowed is {', '.join(allowed) if allowed else 'none'}"
+
+
+def _lookup(find: Callable[[str], Any], name: str) -> Any:
+    try:
+        return find(name)
+    except KeyError as error:
+        raise InputError(str(error.args[0])) from None
+
+
+def _request(table: _SceneTable, analysis: Analysis) -> Request:
+    """Outputs, method and options, checked against what the analysis offers."""
+    names = [v.name for v in analysis.variables]
+    outputs = list(analysis.default_outputs) if table.outputs is None else table.outputs
+    for name in outputs:
+        if name not in names and name != OUTCOME.name:
+            raise InputError(f"outputs: {name!r} is not a result of {analysis.name}{_nearest(name, names)}")
+    # The outcome is stored with every result, named or not.
+    outputs = [name for name in outputs if name != OUTCOME.name]
+    if not outputs or len(set(outputs)) < len(outputs):
+        raise InputError(f"outputs = {_short(table.outputs)}: allowed is one or more of {', '.join(names)}, each once")
+    given = dict(table.options)
+    method = given.pop("method", next(iter(analysis.methods)))
+    if not isinstance(method, str) or method not in analysis.methods:
+        raise InputError(f"options.method = {method!r}: allowed is one of {', '.join(analysis.methods)}")
+    used = analysis.methods[method]
+    for key, value in given.items():
+        if key not in used:
+            raise InputError(
+                f"options.{key} = {_short(value)}: not used by method {method}{_nearest(key, ('method', *used))}"
+            )
+    options = {o.name: _option(o, given) for o in analysis.options if o.name in used}
+    return Request(tuple(outputs), method, options)
+
+
+def _option(option: Parameter, given: Mapping[str, Any]) -> Value:
+    if option.name in given:
+        return _checked(option, given[option.name], "options.")
+    if option.default is None:
+        raise InputError(f"options.{option.name}: missing; allowed is {option.allowed}")
+    return option.default
+
+
+def _checked(parameter: Parameter, value: Any, where: str) -> Value:
+    try:
+        return parameter.check(value)
+    except ValueError as error:
+        raise InputError(f"{where}{error}") from None
+    except OverflowError:
+        raise InputError(f"{where}{parameter.name} = {_short(value)}: allowed is {parameter.allowed}") from None
+
+
+def _axes(table: _SceneTable, system: System, analysis: Analysis) -> tuple[tuple[Axis, ...], bool]:
+    """The varying parameters; counted before a single value is made."""
+    if table.axes and table.points:
+        raise InputError("points: given together with axes; allowed is one of the two")
+    for where, name in [("axes", n) for n in table.axes] + [("points", n) for n in table.points]:
+        _swept_parameter(system, where, name)
+    if table.points:
+        return _points(table, system, analysis), True
+    specs = {name: _axis_table(name, value) for name, value in table.axes.items()}
+    total = math.prod(check_count(name, spec) for name, spec in specs.items())
+    if total > MAX_POINTS:
+        raise InputError(f"axes: {total} points; allowed is up to {MAX_POINTS}")
+    return tuple(_axis(system, name, spec) for name, spec in specs.items()), False
+
+
+def _axis_table(name: str, given: Any) -> AxisTable:
+    if not isinstance(given, Mapping):
+        raise InputError(f"axes.{name} = {_short(given)}: allowed is a table {{ start, stop, num }} or {{ values }}")
+    return _convert(given, AxisTable, f"axes.{name}.")
+
+
+def _axis(system: System, name: str, spec: AxisTable) -> Axis:
+    parameter, entry = _swept_parameter(system, "axes", name)
+    scalar = _scalar(parameter, name)
+    for value in spec.values if spec.values is not None else (spec.start, spec.stop):
+        _checked(scalar, value, "axes.")
+    values = spread(spec, f"axes.{name}")
+    if parameter.integer:
+        for value in values:
+            _checked(scalar, float(value), "axes.")
+    return Axis(name, parameter, entry, values.astype(np.int64) if parameter.integer else values)
+
+
+def _points(table: _SceneTable, system: System, analysis: Analysis) -> tuple[Axis, ...]:
+    """Equally long columns of parameter values."""
+    for name, values in table.points.items():
+        if not isinstance(values, list):
+            raise InputError(f"points.{name} = {_short(values)}: allowed is a list of numbers")
+    lengths = {name: len(values) for name, values in table.points.items()}
+    if len(set(lengths.values())) > 1 or not all(lengths.values()):
+        listed = ", ".join(f"{name} has {length}" for name, length in lengths.items())
+        raise InputError(f"points: {listed}; allowed are lists of one length, at least 1")
+    if analysis.path_axis in table.points:
+        raise InputError(
+            f"points.{analysis.path_axis}: {analysis.name} follows it as a path; allowed is an axis or a fixed value"
+        )
+    columns = []
+    for name, values in table.points.items():
+        parameter, entry = _swept_parameter(system, "points", name)
+        checked = [_checked(_scalar(parameter, name), value, "points.") for value in values]
+        columns.append(Axis(name, parameter, entry, np.array(checked)))
+    return tuple(columns)
+
+
+def _scalar(parameter: Parameter, name: str) -> Parameter:
+    """The range of one number of ``parameter``, under the name it is swept by."""
+    return replace(parameter, name=name, listed=False)
+
+
+def _swept_parameter(system: System, where: str, name: str) -> tuple[Parameter, int | None]:
+    """The parameter behind the axis ``name`` and, for one entry of a list, its position."""
+    base, entry = entry_of(name)
+    known = {p.name: p for p in system.parameters}
+    parameter = known.get(base)
+    if parameter is None:
+        raise InputError(f"{where}.{name}: unknown parameter{_nearest(base, known)}")
+    if parameter.choices:
+        raise InputError(f"{where}.{name}: a word cannot vary; allowed is to fix it: {parameter.allowed}")
+    if parameter.listed and entry is None:
+        raise InputError(
+            f'{where}.{name}: a list cannot vary as a whole; allowed is one entry, for example "{name}[0]"'
+        )
+    if entry is not None and not parameter.listed:
+        raise InputError(f"{where}.{name}: {base} is not a list; allowed is {base}")
+    return parameter, entry
+
+
+def _fixed(table: _SceneTable, system: System, analysis: Analysis, axes: tuple[Axis, ...]) -> dict[str, Value]:
+    """The parameters that do not vary: those given, then the defaults of those the analysis uses."""
+    known = {p.name: p for p in system.parameters}
+    whole = {axis.name for axis in axes if axis.entry is None}
+    for name, value in table.fixed.items():
+        if name not in known:
+            raise InputError(f"fixed.{name} = {_short(value)}: unknown parameter{_nearest(name, known)}")
+        if name in whole:
+            where = "points" if table.points else "axes"
+            raise InputError(f"fixed.{name} = {_short(value)}: also in [{where}]; allowed is one of the two")
+    fixed: dict[str, Value] = {}
+    used = system.models[analysis.name].parameters
+    for parameter in system.parameters:
+        if parameter.name in table.fixed:
+            fixed[parameter.name] = _checked(parameter, table.fixed[parameter.name], "fixed.")
+        elif parameter.name in used and parameter.name not in whole:
+            if parameter.default is None:
+                raise InputError(f"fixed.{parameter.name}: missing; allowed is {parameter.allowed}")
+            fixed[parameter.name] = parameter.default
+    for axis in axes:
+        _check_entry(axis, fixed)
+    return fixed
+
+
+def _check_entry(axis: Axis, fixed: Mapping[str, Value]) -> None:
+    """One swept entry needs the whole list beside it, for its length and the other entries."""
+    name = axis.parameter.name
+    if axis.entry is None:
+        return
+    if name not in fixed:
+        raise InputError(
+            f"fixed.{name}: missing; {axis.name} varies one entry of this list; allowed is {axis.parameter.allowed}"
+        )
+    if axis.entry >= len(fixed[name]):
+        raise InputError(f"axes.{axis.name}: allowed is {name}[0] to {name}[{len(fixed[name]) - 1}]")

@@ -1,0 +1,107 @@
+"""Scenes as nested tables: read from TOML, changed by dotted keys, written as TOML."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from drivetrain_jax._errors import InputError
+
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+
+
+def read(
+    source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None
+) -> tuple[dict[str, Any], str]:
+    """The tables of a scene and its TOML text.
+
+    ``source`` is a path or a mapping. ``overrides`` replaces single entries, for example ``{"fixed.zeta": 0.002}``;
+    the text then is that of the changed scene.
+    """
+    if isinstance(source, Mapping):
+        tree, text = _plain(source), None
+    else:
+        text = _text(Path(source))
+        try:
+            tree = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            end = f"at line {len(text.splitlines())}, the end of the file"
+            reason = str(error).replace("at end of document", end)
+            raise InputError(f"scene = {str(source)!r}: not valid TOML: {reason}") from None
+    if overrides:
+        text = None
+        for key, value in overrides.items():
+            _replace(tree, key, _plain(value))
+    return tree, write(tree) if text is None else text
+
+
+def _plain(value: Any) -> Any:
+    """A copy in the types of TOML: NumPy numbers and arrays and tuples become numbers and lists."""
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_bytes().decode()
+    except UnicodeDecodeError:
+        raise InputError(f"scene = {str(path)!r}: not a text file in UTF-8") from None
+    except OSError as error:
+        raise InputError(f"scene = {str(path)!r}: {error.strerror}; give the path of a scene file") from None
+
+
+def _replace(tree: dict[str, Any], key: str, value: Any) -> None:
+    *tables, last = key.split(".")
+    for name in tables:
+        tree = tree.setdefault(name, {})
+        if not isinstance(tree, dict):
+            raise InputError(
+                f"set {key}: {name!r} is not a table of the scene; give table.name, for example fixed.zeta"
+            )
+    tree[last] = value
+
+
+def parse_value(text: str) -> Any:
+    """A TOML value; text that is none is a number in its short form (``.3``) or a plain string (``diffrax``)."""
+    try:
+        content = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        content = {}
+    if list(content) == ["value"]:
+        return content["value"]
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def write(tree: Mapping[str, Any]) -> str:
+    """TOML text of ``tree``: plain entries first, then its tables, whose own tables are written inline."""
+    plain = [f"{_key(name)} = {_value(value)}" for name, value in tree.items() if not isinstance(value, Mapping)]
+    for name, table in tree.items():
+        if isinstance(table, Mapping):
+            plain += ["", f"[{_key(name)}]", *(f"{_key(entry)} = {_value(value)}" for entry, value in table.items())]
+    return "\n".join(plain) + "\n"
+
+
+def _key(name: str) -> str:
+    return name if _BARE_KEY.fullmatch(str(name)) else json.dumps(str(name), ensure_ascii=False)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{_key(name)} = {_value(entry)}" for name, entry in value.items()) + " }"
+    if isinstance(value, Sequence):
+        return "[" + ", ".join(_value(entry) for entry in value) + "]"
+    return repr(value)

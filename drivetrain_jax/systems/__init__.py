@@ -1,0 +1,52 @@
+"""The drivetrain systems, found by name; other packages add theirs through the entry point group
+``drivetrain_jax.systems`` (each entry point names a :class:`~drivetrain_jax.systems._base.System`)."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import entry_points
+
+import jax
+
+# Every module that computes imports this package first, so no array can be made in single precision before this line.
+jax.config.update("jax_enable_x64", True)
+
+from drivetrain_jax.systems._base import (  # noqa: E402
+    FloquetModel,
+    ForcedModel,
+    LinearPeriodic,
+    Model,
+    Resonances,
+    System,
+)
+
+ENTRY_POINT_GROUP = "drivetrain_jax.systems"
+_BUILT_IN = ("cardan",)
+
+__all__ = [
+    "ENTRY_POINT_GROUP",
+    "FloquetModel",
+    "ForcedModel",
+    "LinearPeriodic",
+    "Model",
+    "Resonances",
+    "System",
+    "get_system",
+    "system_names",
+]
+
+
+def system_names() -> tuple[str, ...]:
+    """Names of all systems: the built-in ones, then those of installed packages."""
+    external = sorted(e.name for e in entry_points(group=ENTRY_POINT_GROUP) if e.name not in _BUILT_IN)
+    return (*_BUILT_IN, *external)
+
+
+def get_system(name: str) -> System:
+    """The system called ``name``; ``KeyError`` with the known names if there is none."""
+    if name in _BUILT_IN:
+        return import_module(f"drivetrain_jax.systems.{name}").SYSTEM
+    for entry in entry_points(group=ENTRY_POINT_GROUP):
+        if entry.name == name:
+            return entry.load()
+    raise KeyError(f"system = {name!r}: allowed is one of {', '.join(system_names())}")

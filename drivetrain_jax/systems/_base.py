@@ -1,0 +1,121 @@
+"""What a system is: parameters with units and ranges, and the mathematical models its analyses need.
+
+A system is data. It knows nothing of batches, files or analyses: under the name of each analysis it supports it
+hands over a function from parameter values to the model which that analysis documents, for example a
+:class:`LinearPeriodic` pair for ``floquet``. All model functions broadcast over a trailing axis: a parameter is a
+scalar or an array of shape ``(...)``, and a matrix then has shape ``(n, n, ...)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._quantities import Parameter
+
+Values = Mapping[str, Any]
+Rows = tuple[tuple[Any, ...], ...]
+
+
+@dataclass(frozen=True)
+class LinearPeriodic:
+    """The linear system ``x' = A(t) x`` over one interval ``[0, span]`` of its clock ``t``.
+
+    ``basis(t)`` returns the functions of the clock alone (they are shared by all points of a batch) and
+    ``rows(*basis(t))`` the matrix as nested tuples; an entry that vanishes identically is the integer ``0``.
+    Without ``reversor`` the interval is the period and the monodromy matrix is the propagator ``Phi`` itself.
+    With the reversor ``X`` (``X X = I``) the interval is half the period and the monodromy matrix is similar to
+    ``X Phi^T X Phi``. ``log_determinant()`` is the exact logarithm of its determinant (Liouville's formula), if known.
+    """
+
+    rows: Callable[..., Rows]
+    span: float
+    basis: Callable[[Any], tuple[Any, ...]] = lambda t: (t,)
+    reversor: np.ndarray | None = None
+    log_determinant: Callable[[], Any] | None = None
+
+    @property
+    def size(self) -> int:
+        """Number of states."""
+        return len(self.rows(*self.basis(0.0)))
+
+    def matrix(self, t: Any) -> Array:
+        """``A(t)``, shape ``(n, n, ...)``."""
+        rows = self.rows(*self.basis(t))
+        shape = jnp.broadcast_shapes(*(jnp.shape(entry) for row in rows for entry in row))
+        return jnp.stack([jnp.stack([jnp.broadcast_to(entry, shape) for entry in row]) for row in rows])
+
+
+@dataclass(frozen=True)
+class FloquetModel:
+    """The model of the analysis ``floquet``.
+
+    ``natural`` is the system as published, over its full period in its own time; ``reduced`` is an equivalent form
+    (same multipliers) that is cheaper or better conditioned. They may be the same object. ``explicit_steps(rtol)``
+    predicts, from parameters given as NumPy arrays of shape ``(N,)``, how many steps ``reduced`` needs with the
+    explicit scheme of order 8; None leaves the prediction to the analysis.
+    """
+
+    natural: LinearPeriodic
+    reduced: LinearPeriodic
+    explicit_steps: Callable[[float], np.ndarray] | None = None
+
+
+@dataclass(frozen=True)
+class ForcedModel:
+    """The model of the analysis ``forced``.
+
+    ``field(t, y)`` is the nonlinear system ``y' = field(t, y)`` of period ``period`` and ``linear(t, y)`` its
+    linearisation about ``y = 0``, forcing included. Both act on states of shape ``(n,)``. ``displacements`` are the
+    indices of the components whose amplitude is reported.
+    """
+
+    field: Callable[[Any, Array], Array]
+    linear: Callable[[Any, Array], Array]
+    period: float
+    displacements: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Model:
+    """How a system serves one analysis: ``build(values)`` gives the model from the values of ``parameters``."""
+
+    build: Callable[[Values], Any]
+    parameters: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Resonances:
+    """Predicted values of the parameter ``axis`` at which something is expected, to be drawn over charts.
+
+    ``values(parameters)`` maps the values of ``parameters`` (scalars or arrays of shape ``(...)``) to an array of
+    shape ``(..., len(labels))``.
+    """
+
+    axis: str
+    parameters: tuple[str, ...]
+    labels: tuple[str, ...]
+    values: Callable[[Values], np.ndarray]
+    long_name: str
+
+
+@dataclass(frozen=True)
+class System:
+    """A drivetrain model: see the module's docstring. ``presets`` are named parameter sets of the source."""
+
+    name: str
+    title: str
+    source: str
+    parameters: tuple[Parameter, ...]
+    models: Mapping[str, Model]
+    presets: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    resonances: Resonances | None = None
+
+    def parameter(self, name: str) -> Parameter:
+        """The parameter called ``name``; ``KeyError`` if there is none."""
+        return {p.name: p for p in self.parameters}[name]

@@ -1,0 +1,280 @@
+"""Cardan (Hooke-joint) shaft: two torsionally flexible shafts joined at the angle beta.
+
+Source: M. Soltan Rezaee, M. R. Ghazavi, "Obtaining stable cardan angles in rotating systems and investigating the
+effective parameters on system stability", Modares Mechanical Engineering 14(12), 163-170, 2014. Equation numbers
+are those of docs/theory/cardan.md, which lists where the printed equations had to be corrected.
+
+Nondimensional time tau = Omega0 t; Omega = Omega0 sqrt(J1/k1), zeta = c1/(2 sqrt(k1 J1)), alpha = c2/c1,
+mu = k2/k1, gamma = J2/J1; the prime is d/dtau. All functions broadcast over parameters of any common shape.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._quantities import Parameter
+from drivetrain_jax.systems._base import (
+    FloquetModel,
+    ForcedModel,
+    LinearPeriodic,
+    Model,
+    Resonances,
+    Rows,
+    System,
+    Values,
+)
+
+PARAMETERS = (
+    Parameter("beta", "rad", "joint angle", lower=-math.pi / 2, upper=math.pi / 2, open_lower=True, open_upper=True),
+    Parameter("Omega", "1", "speed of the driving shaft over sqrt(k1/J1)", lower=0.0, open_lower=True),
+    Parameter("zeta", "1", "damping ratio of the driving shaft", lower=0.0),
+    Parameter("alpha", "1", "damping of the driven over the driving shaft, c2/c1", lower=0.0),
+    Parameter("mu", "1", "stiffness of the driven over the driving shaft, k2/k1", lower=0.0, open_lower=True),
+    Parameter("gamma", "1", "inertia of the driven over the driving disk, J2/J1", lower=0.0, open_lower=True),
+)
+NAMES = tuple(p.name for p in PARAMETERS)
+
+_BASE_CASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+PRESETS = {"base": _BASE_CASE, "alpha20": _BASE_CASE | {"alpha": 20.0}, "mu20": _BASE_CASE | {"mu": 20.0}}
+
+# Exchanges q and P: time reversal about the middle of the half period.
+REVERSOR = np.kron(np.array([[0.0, 1.0], [1.0, 0.0]]), np.eye(2))
+
+
+def speed_ratio(beta: Any, phi: Any) -> tuple[Array, Array, Array]:
+    """Transmission ratio ``eta`` and its first and second derivative with respect to the joint's rotation ``phi``.
+
+    Eq. (1): eta = cos(beta) / (1 - sin(beta)^2 sin(phi)^2), period pi.
+    """
+    c, s2 = jnp.cos(beta), jnp.sin(beta) ** 2
+    d = 1 - s2 * jnp.sin(phi) ** 2
+    sine, cosine = jnp.sin(2 * phi), jnp.cos(2 * phi)
+    return c / d, c * s2 * sine / d**2, c * s2 * (2 * cosine / d**2 + 2 * s2 * sine**2 / d**3)
+
+
+def nonlinear_field(tau: Any, y: Array, values: Values) -> Array:
+    """Nonlinear equations of motion, eqs (2)-(3), as ``y' = f(tau, y)`` with ``y = (theta1, theta2, theta1', theta2')``.
+
+    theta1'' = -2 zeta theta1'/Omega + eta (2 alpha zeta theta2'/Omega) - theta1/Omega^2 + eta mu theta2/Omega^2
+    theta2'' = -[eta_phi (1 + theta1')^2 + eta theta1''] - (2 alpha zeta theta2'/Omega + mu theta2/Omega^2)/gamma
+    with eta at phi = tau + theta1. ``y`` has shape ``(4, ...)``.
+    """
+    theta1, theta2, rate1, rate2 = y
+    eta, eta_phi, _ = speed_ratio(values["beta"], tau + theta1)
+    s, damping = 1 / values["Omega"], 2 * values["zeta"] / values["Omega"]
+    torque1 = damping * rate1 + s**2 * theta1
+    torque2 = values["alpha"] * damping * rate2 + values["mu"] * s**2 * theta2
+    acceleration1 = eta * torque2 - torque1
+    acceleration2 = -(eta_phi * (1 + rate1) ** 2 + eta * acceleration1) - torque2 / values["gamma"]
+    return jnp.stack(jnp.broadcast_arrays(rate1, rate2, acceleration1, acceleration2))
+
+
+def damping_and_stiffness(tau: Any, values: Values) -> tuple[Rows, Rows]:
+    """``E`` and ``P`` of the linearised equations theta'' + E theta' + P theta = (0, -eta')^T, eqs (5)-(6)."""
+    eta, d1, d2 = speed_ratio(values["beta"], tau)
+    s, damping = 1 / values["Omega"], 2 * values["zeta"] / values["Omega"]
+    alpha, mu, inertia = values["alpha"], values["mu"], eta**2 + 1 / values["gamma"]
+    e = ((damping, -alpha * damping * eta), (2 * d1 - damping * eta, alpha * damping * inertia))
+    p = ((s**2, -mu * s**2 * eta), (d2 - s**2 * eta, mu * s**2 * inertia))
+    return e, p
+
+
+def linear_rows(tau: Any, values: Values) -> Rows:
+    """``A(tau)`` of ``y' = A y``, ``y = (theta1, theta2, theta1', theta2')``, homogeneous part of eq. (4)."""
+    e, p = damping_and_stiffness(tau, values)
+    return (
+        (0, 0, 1.0, 0),
+        (0, 0, 0, 1.0),
+        *(tuple(-entry for entry in (*p[i], *e[i])) for i in range(2)),
+    )
+
+
+def linear_field(tau: Any, y: Array, values: Values) -> Array:
+    """Right-hand side of the forced linear equations, eq. (4)."""
+    rows = linear_rows(tau, values)
+    forcing = (0.0, 0.0, 0.0, -speed_ratio(values["beta"], tau)[1])
+    return jnp.stack(
+        jnp.broadcast_arrays(
+            *(sum(a * x for a, x in zip(row, y, strict=True)) + f for row, f in zip(rows, forcing, strict=True))
+        )
+    )
+
+
+def absolute_coordinates(beta: Any, gamma: Any, phi: Any = 0.0) -> Array:
+    """``T`` with ``(q, q') = T (theta, theta')`` at joint rotation ``phi``, shape ``(4, 4, ...)``.
+
+    Eq. (8): q = (theta1, sqrt(gamma) (theta2 + eta theta1)).
+    """
+    eta, d1, _ = speed_ratio(beta, phi)
+    root = jnp.sqrt(gamma)
+    zero, one = jnp.zeros_like(eta * root), jnp.ones_like(eta * root)
+    rows = (
+        (one, zero, zero, zero),
+        (root * eta, root * one, zero, zero),
+        (zero, zero, one, zero),
+        (root * d1, zero, root * eta, root * one),
+    )
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def _clock_basis(psi: Any) -> tuple[Array, Array]:
+    return jnp.cos(2 * psi), jnp.sin(2 * psi)
+
+
+def _reduced_rows(cos2psi: Any, sin2psi: Any, values: Values) -> Rows:
+    """``d(q, P)/dpsi = H (q, P)`` in absolute coordinates, P = Omega (q' + C0 q/2), and in the clock psi, eqs (9)-(12).
+
+    Two Landen steps lead from tau to psi: tan(chi) = sqrt(cos beta) tan(tau) spreads the poles of eta near pi/2 over
+    0 and pi/2, tan(2 chi) = kappa tan(2 psi), kappa^2 = 1 - r^2, r = tan(beta/2)^2, moves these away from the axis.
+    """
+    beta, zeta, alpha, mu = (values[name] for name in ("beta", "zeta", "alpha", "mu"))
+    s, g = 1 / values["Omega"], 1 / jnp.sqrt(values["gamma"])
+    c, r = jnp.cos(beta), jnp.tan(beta / 2) ** 2
+    # 1 - r = 2 c/(1 + c), and 1 -+ r cos(2 chi) below are sums of positive terms: no cancellation next to pi/2.
+    one_minus_r = 2 * c / (1 + c)
+    kappa2 = one_minus_r * (1 + r)
+    root = jnp.sqrt(cos2psi**2 + kappa2 * sin2psi**2)
+    # root (1 + |cos 2chi|) and root (1 - |cos 2chi|), then root (1 - r cos 2chi) and root (1 + r cos 2chi).
+    large = root + jnp.abs(cos2psi)
+    small = kappa2 * sin2psi**2 / large
+    first_half = cos2psi > 0
+    minus = one_minus_r * root + r * jnp.where(first_half, small, large)
+    plus = one_minus_r * root + r * jnp.where(first_half, large, small)
+    # One division for eta = minus/plus, w = dtau/dpsi and deta/dpsi.
+    inverse = 1 / (minus * plus * root)
+    inverse_plus = minus * root * inverse
+    eta = minus * inverse_plus
+    w = 2 * jnp.sqrt(c * kappa2) / (1 + c) * plus * inverse
+    deta = 4 * r * kappa2 * sin2psi * inverse_plus * minus * inverse
+
+    w11, w12, w22 = 1 + alpha * eta**2, -alpha * g * eta, alpha * g**2
+    v11, v12, v22 = 1 + mu * eta**2, -mu * g * eta, mu * g**2
+    sw = s * w
+    zs = zeta * sw
+    zzs = zeta * zs
+    gyroscopic = alpha * zeta * g * deta
+    k11 = zzs * (w11**2 + w12**2) - sw * v11
+    k12 = zzs * w12 * (w11 + w22) - sw * v12
+    k22 = zzs * (w12**2 + w22**2) - sw * v22
+    d11, d12, d22 = -zs * w11, -zs * w12, -zs * w22
+    return (
+        (d11, d12, sw, 0),
+        (d12, d22, 0, sw),
+        (k11, k12 - gyroscopic, d11, d12),
+        (k12 + gyroscopic, k22, d12, d22),
+    )
+
+
+def log_determinant(values: Values) -> Array:
+    """Exact ``log det Z`` over the period pi (Liouville).
+
+    Eq. (13): -(2 pi zeta/Omega) [1 + alpha/gamma + alpha (1 + c^2)/(2 c)], c = cos(beta).
+    """
+    c = jnp.cos(values["beta"])
+    mean = 1 + values["alpha"] / values["gamma"] + values["alpha"] * (1 + c**2) / (2 * c)
+    return -2 * math.pi * values["zeta"] / values["Omega"] * mean
+
+
+def explicit_steps(values: Values, rtol: float) -> np.ndarray:
+    """Predicted steps of the order-8 scheme for the reduced form, from NumPy parameters, as floats of the batch's shape.
+
+    log n is a fitted quadratic in the logarithms of x, the phase plus decay that accumulate over the half period (by
+    Simpson's rule), and of 1/cos(beta), the sharpness of the variation; beyond x = 13 n grows like x^1.1. Measured on
+    random points (benchmarks/work_precision.py); it decides the cost and never the accuracy, which is checked.
+    """
+    beta, zeta, alpha, mu = (np.asarray(values[name], float) for name in ("beta", "zeta", "alpha", "mu"))
+    c, soft = np.cos(beta), 1 / np.asarray(values["gamma"], float)
+    ends = 2 / (1 + c)
+    rates = (
+        ends * np.sqrt(1 + mu * (c * c + soft)),
+        np.sqrt(1 + mu * (1 + soft)),
+        ends * np.sqrt(c * c + mu * (1 + c * c * soft)),
+    )
+    decay = zeta * np.maximum(ends * (1 + alpha * (c * c + soft)), ends * (c + alpha * (1 / c + c * soft)))
+    phase = math.pi / 2 / np.asarray(values["Omega"], float) * ((rates[0] + 2 * rates[1] + rates[2]) / 4 + decay)
+    x, sharpness = np.log(phase), -np.log(c)
+    bend = 2.57
+    capped = np.minimum(x, bend)
+    log_steps = (
+        0.59 * capped + 0.1 * capped**2 + 1.1 * (x - capped) + (0.59 - 0.13 * capped - 0.034 * sharpness) * sharpness
+    )
+    return np.exp(log_steps + 1.7 + 0.26 * (-math.log10(rtol) - 9)) + 2
+
+
+def floquet_model(values: Values) -> FloquetModel:
+    """The linearised shaft in its own coordinates and time, and in absolute coordinates over half a period."""
+
+    def exact() -> Array:
+        return log_determinant(values)
+
+    natural = LinearPeriodic(lambda tau: linear_rows(tau, values), math.pi, log_determinant=exact)
+    reduced = LinearPeriodic(
+        lambda cos2psi, sin2psi: _reduced_rows(cos2psi, sin2psi, values),
+        math.pi / 2,
+        basis=_clock_basis,
+        reversor=REVERSOR,
+        log_determinant=exact,
+    )
+    return FloquetModel(natural, reduced, lambda rtol: explicit_steps(values, rtol))
+
+
+def forced_model(values: Values) -> ForcedModel:
+    """The nonlinear shaft, and its linearisation with the forcing (0, -eta')."""
+    return ForcedModel(
+        field=lambda tau, y: nonlinear_field(tau, y, values),
+        linear=lambda tau, y: linear_field(tau, y, values),
+        period=math.pi,
+        displacements=(0, 1),
+    )
+
+
+def natural_frequencies(mu: Any, gamma: Any) -> np.ndarray:
+    """Undamped natural frequencies omega1 < omega2 at beta = 0, in units of sqrt(k1/J1), shape ``(..., 2)``; eq. (14).
+
+    omega^2 = [b -+ sqrt(b^2 - 4 mu/gamma)]/2, b = 1 + mu (1 + 1/gamma).
+    """
+    mu, gamma = np.asarray(mu, float), np.asarray(gamma, float)
+    b = 1 + mu * (1 + 1 / gamma)
+    # b^2 - 4 mu/gamma as a sum of squares, and the smaller root from the product: no cancellation.
+    upper = (b + np.sqrt((1 + mu - mu / gamma) ** 2 + 4 * mu**2 / gamma)) / 2
+    return np.sqrt(np.stack([mu / gamma / upper, upper], axis=-1))
+
+
+_ORDERS = (1, 2, 3)
+RESONANCE_LABELS = (
+    *(f"H{i}{k}" for i in (1, 2) for k in _ORDERS),
+    *(f"S{i}{k}" for i in (1, 2) for k in _ORDERS),
+    *(f"C+{k}" for k in _ORDERS),
+    *(f"C-{k}" for k in _ORDERS),
+)
+
+
+def resonance_speeds(values: Values) -> np.ndarray:
+    """Speeds of parametric resonance, eq. (15), in the order of ``RESONANCE_LABELS``, shape ``(..., 18)``.
+
+    H: omega_i/(2k), S: omega_i/(2k-1), C+-: (omega2 +- omega1)/(2k).
+    """
+    omega = natural_frequencies(values["mu"], values["gamma"])
+    one, two = omega[..., 0], omega[..., 1]
+    harmonic = [w / (2 * k) for w in (one, two) for k in _ORDERS]
+    subharmonic = [w / (2 * k - 1) for w in (one, two) for k in _ORDERS]
+    combination = [w / (2 * k) for w in (two + one, two - one) for k in _ORDERS]
+    return np.stack([*harmonic, *subharmonic, *combination], axis=-1)
+
+
+SYSTEM = System(
+    name="cardan",
+    title="Cardan (Hooke-joint) shaft",
+    source="Soltan Rezaee & Ghazavi, Modares Mechanical Engineering 14(12), 2014, 163-170",
+    parameters=PARAMETERS,
+    models={"floquet": Model(floquet_model, NAMES), "forced": Model(forced_model, NAMES)},
+    presets=PRESETS,
+    resonances=Resonances(
+        "Omega", ("mu", "gamma"), RESONANCE_LABELS, resonance_speeds, "predicted parametric resonance"
+    ),
+)

@@ -1,0 +1,144 @@
+"""The grid of a result as coloured cells: which axes it has, where cells end, what state each is in."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import LinearSegmentedColormap, SymLogNorm
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STATE_HATCHES, STATE_NAMES, STATES
+
+STABLE, UNSTABLE, UNDECIDED, FAILED = range(4)
+# Outcome codes from here on mean that there is no value (CF flags of the variable `outcome`).
+FIRST_FAILURE = 2
+
+
+def prepare(dataset: xr.Dataset) -> xr.Dataset:
+    """``dataset`` with rising axes; axes of one value become scalar coordinates."""
+    single = {name: 0 for name in dataset["outcome"].dims if dataset.sizes[name] == 1}
+    dataset = dataset.isel(single)
+    axes = [name for name in dataset["outcome"].dims if name in dataset.coords]
+    return dataset.sortby(axes) if axes else dataset
+
+
+def sweep_axes(dataset: xr.Dataset) -> list[str]:
+    """Names of the swept axes, in scene order."""
+    return [str(name) for name in dataset["outcome"].dims]
+
+
+def horizontal_axis(dataset: xr.Dataset, names: list[str]) -> str:
+    """The axis for which resonances are predicted, else the speed, else the last one."""
+    predicted = [name for name in names if f"resonance_{name}" in dataset.coords]
+    return next(iter([*predicted, *(name for name in names if name == "Omega"), names[-1]]))
+
+
+def is_logarithmic(values: np.ndarray) -> bool:
+    """Whether ``values`` are spaced by a constant factor rather than by a constant step."""
+    if len(values) < 3 or values[0] <= 0:
+        return False
+    steps, factors = np.diff(values), np.diff(np.log(values))
+    return bool(np.ptp(factors) < 1e-6 * np.abs(factors).max() and np.ptp(steps) > 1e-6 * np.abs(steps).max())
+
+
+def cell_edges(values: np.ndarray) -> np.ndarray:
+    """The ``n + 1`` edges of cells around ``n`` rising values: halfway between neighbours (in the logarithm on a
+    logarithmic axis), the outer cells as wide on both sides of their value."""
+    if is_logarithmic(values):
+        return np.exp(_midway(np.log(values)))
+    return _midway(values)
+
+
+def _midway(values: np.ndarray) -> np.ndarray:
+    if len(values) == 1:
+        half = abs(values[0]) / 2 or 0.5
+        return np.array([values[0] - half, values[0] + half])
+    inner = (values[1:] + values[:-1]) / 2
+    return np.concatenate([[2 * values[0] - inner[0]], inner, [2 * values[-1] - inner[-1]]])
+
+
+def states(dataset: xr.Dataset) -> xr.DataArray:
+    """The verdict of each cell, or ``FAILED`` where the outcome says that there is no value."""
+    return dataset["verdict"].where(dataset["outcome"] < FIRST_FAILURE, FAILED)
+
+
+def draw_cells(axes: Axes, field: xr.DataArray, horizontal: str, vertical: str, **options: object) -> QuadMesh:
+    """``field`` as cells over the two axes; limits and scales of ``axes`` follow the cells."""
+    x, y = (field[name].values.astype(float) for name in (horizontal, vertical))
+    mesh = axes.pcolormesh(
+        cell_edges(x), cell_edges(y), field.transpose(vertical, horizontal).values, rasterized=True, **options
+    )
+    fit_axis(axes, "x", x)
+    fit_axis(axes, "y", y)
+    return mesh
+
+
+def fit_axis(axes: Axes, which: str, values: np.ndarray) -> None:
+    """Scale and limits of one axis from the cells around ``values``; a logarithmic axis shows plain numbers."""
+    edges = cell_edges(values)
+    logarithmic = is_logarithmic(values)
+    axes.set(**{f"{which}scale": "log" if logarithmic else "linear", f"{which}lim": (edges[0], edges[-1])})
+    if logarithmic:
+        plain_decades(axes, which)
+
+
+def plain_decades(axes: Axes, which: str) -> None:
+    """Plain numbers at 1, 2, 5 (at 1 alone if there are many decades) along a logarithmic axis."""
+    low, high = getattr(axes, f"get_{which}lim")()
+    side = getattr(axes, f"{which}axis")
+    side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
+    side.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    side.set_minor_formatter(NullFormatter())
+
+
+def draw_states(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> QuadMesh:
+    """The regions of the verdict."""
+    return draw_cells(axes, states(dataset), horizontal, vertical, cmap=STATES, vmin=-0.5, vmax=3.5)
+
+
+def state_legend(dataset: xr.Dataset) -> list[Patch]:
+    """Legend entries of the states that occur; stable and unstable always, the others with their number of cells."""
+    counts = np.bincount(states(dataset).values.astype(int).ravel(), minlength=len(STATE_NAMES))
+    shown = [code for code in range(len(STATE_NAMES)) if code <= UNSTABLE or counts[code]]
+    return [_state_patch(code, f" ({counts[code]})" if code > UNSTABLE else "") for code in shown]
+
+
+def failure_legend(dataset: xr.Dataset) -> list[Patch]:
+    """The legend entry of cells without a value, if there are any."""
+    count = int((dataset["outcome"] >= FIRST_FAILURE).sum())
+    return [_state_patch(FAILED, f" ({count})")] if count else []
+
+
+def _state_patch(code: int, note: str) -> Patch:
+    colours = {"facecolor": STATE_COLOURS[code], "edgecolor": FRAME_GREY}
+    return Patch(**colours, linewidth=0.6, hatch=STATE_HATCHES[code], label=STATE_NAMES[code] + note)
+
+
+# Growth log10(rho) below this is drawn on a linear scale: narrow tongues differ from 1 by 1e-5 and less.
+LINEAR_GROWTH = 1e-4
+# Position between no growth (0) and the largest (1), colour; the lightness falls all the way, as it does from decay.
+_DECAY, _NEUTRAL = "#ffffff", "#d3e2f0"
+_GROWTH = ((0.25, "#f3b562"), (0.55, "#c8553d"), (1.0, "#2d0a2b"))
+
+
+def draw_growth(axes: Axes, radius: xr.DataArray, horizontal: str, vertical: str) -> tuple[QuadMesh, str, str]:
+    """``log10`` of a spectral radius as cells, and label and ``extend`` of its colour bar.
+
+    Blue decays, orange grows, darker is faster; missing values have the colour of failed cells.
+    """
+    with np.errstate(divide="ignore"):
+        growth = np.log10(radius)
+    finite = growth.values[np.isfinite(growth.values)]
+    high = max(float(finite.max(initial=0.0)), 10 * LINEAR_GROWTH)
+    low = min(max(float(finite.min(initial=0.0)), -1.0), -LINEAR_GROWTH)
+    norm = SymLogNorm(LINEAR_GROWTH, linscale=0.5, vmin=low, vmax=high, base=10)
+    zero = float(norm(0.0))
+    stops = [(0.0, _DECAY), (zero, _NEUTRAL), *((zero + part * (1 - zero), colour) for part, colour in _GROWTH)]
+    cmap = LinearSegmentedColormap.from_list("growth", stops, N=1024)
+    cmap = cmap.with_extremes(bad=STATE_COLOURS[FAILED])
+    mesh = draw_cells(axes, growth, horizontal, vertical, cmap=cmap, norm=norm)
+    extend = "min" if bool((growth < low).any()) else "neither"
+    return mesh, f"$\\log_{{10}}$ of the {radius.attrs.get('long_name', 'spectral radius')} [1]", extend

@@ -1,0 +1,126 @@
+"""Figures whose panels are placed in inches, so that type is as legible in one panel as in nine."""
+
+from __future__ import annotations
+
+import math
+import re
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.figure import Figure
+
+from drivetrain_jax.view.style import FRAME_GREY, caption
+
+WIDTH = 7.0
+DPI = 200
+_LABEL_SIZE = 8.5
+_INCHES_PER_LETTER = 0.068
+_INCHES_PER_ENTRY = 0.45
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Free space around and between the panels, in inches."""
+
+    left: float = 0.75
+    right: float = 0.95
+    top: float = 0.85
+    bottom: float = 0.90
+    between_rows: float = 0.22
+    between_columns: float = 0.20
+
+
+class Panels:
+    """A figure of ``rows x columns`` equal panels with title, caption and legend.
+
+    ``axes[row][column]`` share the horizontal axis, and the vertical one too if ``share_y``.
+    """
+
+    def __init__(
+        self, rows: int = 1, columns: int = 1, *, height: float, margins: Margins | None = None, share_y: bool = True
+    ) -> None:
+        self.margins = m = margins or Margins()
+        width = (WIDTH - m.left - m.right - (columns - 1) * m.between_columns) / columns
+        total = m.top + m.bottom + rows * height + (rows - 1) * m.between_rows
+        self.figure = Figure(figsize=(WIDTH, total), dpi=DPI)
+        self.axes: list[list[Axes]] = []
+        first: Axes | None = None
+        for row in range(rows):
+            bottom = total - m.top - (row + 1) * height - row * m.between_rows
+            self.axes.append([])
+            for column in range(columns):
+                box = self._box(m.left + column * (width + m.between_columns), bottom, width, height)
+                axes = self.figure.add_axes(box, sharex=first, sharey=first if share_y else None)
+                axes.tick_params(labelbottom=row == rows - 1, labelleft=column == 0)
+                first = first or axes
+                self.axes[-1].append(axes)
+
+    def _box(self, left: float, bottom: float, width: float, height: float) -> tuple[float, float, float, float]:
+        total = self.figure.get_figheight()
+        return left / WIDTH, bottom / total, width / WIDTH, height / total
+
+    def colorbar(self, axes: Axes, mapped: ScalarMappable, label: str, **options: object) -> None:
+        """A colour bar in the right margin beside ``axes``."""
+        box = axes.get_position()
+        bar = self.figure.add_axes((box.x1 + 0.10 / WIDTH, box.y0, 0.14 / WIDTH, box.height), label="colour bar")
+        self.figure.colorbar(mapped, cax=bar, label=_wrap(label, box.height * self.figure.get_figheight()), **options)
+        bar.tick_params(labelsize=7.5)
+
+    def label_axes(self, horizontal: str, vertical: str = "") -> None:
+        """One label for all horizontal axes and one for all vertical ones, wrapped to the panels' extent."""
+        first, last = self.axes[0][0].get_position(), self.axes[-1][-1].get_position()
+        x, y = (first.x0 + last.x1) / 2, last.y0 - 0.36 / self.figure.get_figheight()
+        text = _wrap(horizontal, (last.x1 - first.x0) * WIDTH)
+        self.figure.text(x, y, text, ha="center", va="center", size=_LABEL_SIZE)
+        self._label_side(last.y0, first.y1, vertical)
+
+    def label_row(self, axes: Axes, vertical: str) -> None:
+        """A label for the vertical axis of one row."""
+        box = axes.get_position()
+        self._label_side(box.y0, box.y1, vertical)
+
+    def _label_side(self, bottom: float, top: float, text: str) -> None:
+        x = self.axes[0][0].get_position().x0 - 0.44 / WIDTH
+        text = _wrap(text, (top - bottom) * self.figure.get_figheight())
+        self.figure.text(
+            x, (bottom + top) / 2, text, ha="right", va="center", multialignment="center", rotation=90, size=_LABEL_SIZE
+        )
+
+    def titles(self, dataset: xr.Dataset, note: str = "") -> None:
+        """The scene's title and, below it, the fixed parameters (and ``note``)."""
+        total = self.figure.get_figheight()
+        left = self.margins.left / WIDTH
+        self.figure.text(left, 1 - 0.10 / total, dataset.attrs.get("title", ""), va="top", size=10.5, weight="bold")
+        text = "; ".join(part for part in (caption(dataset), note) if part)
+        self.figure.text(left, 1 - 0.32 / total, text, va="top", size=8, color=FRAME_GREY)
+
+    def legend(self, handles: Sequence[Artist]) -> None:
+        """One legend for the whole figure, in the bottom margin: one row, or two if that would be too long."""
+        length = sum(_INCHES_PER_ENTRY + _INCHES_PER_LETTER * len(_plain(handle.get_label())) for handle in handles)
+        rows = 1 if length <= WIDTH - self.margins.left else 2
+        self.figure.legend(
+            handles=handles,
+            loc="lower left",
+            bbox_to_anchor=(self.margins.left / WIDTH, 0.04 / self.figure.get_figheight()),
+            ncols=max(math.ceil(len(handles) / rows), 1),
+            borderaxespad=0.2,
+            borderpad=0.0,
+            columnspacing=1.4,
+            handlelength=2.0,
+        )
+
+
+def _wrap(text: str, inches: float) -> str:
+    # A minus sign stays with its operands.
+    text = text.replace(" - ", "\u00a0-\u00a0")
+    return "\n".join(textwrap.wrap(text, max(int(inches / _INCHES_PER_LETTER), 20), break_long_words=False))
+
+
+def _plain(label: object) -> str:
+    """The letters of a label without the marks of a formula."""
+    return re.sub(r"[$^_{}\\]", "", str(label))

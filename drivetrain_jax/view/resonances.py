@@ -1,0 +1,160 @@
+"""Predicted resonances over a chart: thin lines or curves, labelled at the edge where they leave it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from scipy.optimize import isotonic_regression
+
+from drivetrain_jax.view.style import PREDICTION
+
+# Difference combinations do not appear as tongues of parametric resonance (equal Krein signature).
+_HIDDEN = ("C-",)
+_DASHES = {"H": "-", "S": (0, (5, 2)), "C": (0, (5, 1.5, 1, 1.5))}
+_MEANING = {"H": "harmonic $H$", "S": "subharmonic $S$", "C": "sum combination $C^+$"}
+# Type size of the labels, room for each along the edges, leader and largest shift from the line, in points.
+_FONT = 7.5
+_SPACING_ACROSS = 14.5
+_SPACING_UP = 9.5
+_LEADER = 9.0
+_MAX_SHIFT = 24.0
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """One predicted line: values of the horizontal axis, and of the vertical axis unless it is straight."""
+
+    label: str
+    x: np.ndarray
+    y: np.ndarray | None
+
+    @property
+    def family(self) -> str:
+        """First letter of the label."""
+        return self.label[:1]
+
+    @property
+    def order(self) -> int:
+        """Last digit of the label, 0 if it has none."""
+        digits = re.findall(r"\d", self.label)
+        return int(digits[-1]) if digits else 0
+
+
+def predictions(
+    dataset: xr.Dataset, horizontal: str, vertical: str | None = None, families: tuple[str, ...] = ()
+) -> list[Prediction]:
+    """Predicted lines over ``horizontal`` (all families, or those named); none if the dataset has no predictions."""
+    name = f"resonance_{horizontal}"
+    if name not in dataset.coords:
+        return []
+    lines = []
+    for label in dataset["resonance"].values.astype(str):
+        if label.startswith(_HIDDEN) or (families and label[:1] not in families):
+            continue
+        values = dataset[name].isel(resonance=int(np.flatnonzero(dataset["resonance"].values.astype(str) == label)[0]))
+        curve = vertical is not None and vertical in values.dims
+        lines.append(Prediction(label, np.atleast_1d(values.values), dataset[vertical].values if curve else None))
+    return lines
+
+
+def label_text(label: str) -> str:
+    """``C+1`` as a formula; anything that is not letters, sign, digits stays as it is."""
+    match = re.fullmatch(r"([A-Za-z]+)([+-]?)(\d+)", label)
+    if not match:
+        return label
+    family, sign, index = match.groups()
+    return rf"${family}^{{{sign}}}_{{{index}}}$" if sign else rf"${family}_{{{index}}}$"
+
+
+def draw(axes: Axes, lines: list[Prediction]) -> list[Line2D]:
+    """Draw the lines that cross ``axes``, whose limits are kept; returns one handle a family for the legend."""
+    low, high = axes.get_xlim()
+    handles: dict[str, Line2D] = {}
+    for line in lines:
+        if line.x.max() < low or line.x.min() > high:
+            continue
+        style = {"color": PREDICTION, "linewidth": 0.7, "linestyle": _DASHES.get(line.family, "-"), "alpha": 0.9}
+        if line.y is None:
+            axes.axvline(line.x[0], **style)
+        else:
+            axes.plot(line.x, line.y, scalex=False, scaley=False, **style)
+        handles.setdefault(line.family, Line2D([], [], **style, label=_MEANING.get(line.family, line.family)))
+    return list(handles.values())
+
+
+def label(axes: Axes, lines: list[Prediction]) -> None:
+    """Label lines at the edge where they leave ``axes``: above it or right of it, spread so that none overlap.
+
+    Lines of low order come first; a label that would have to move far from its line is left out.
+    """
+    scale = 72 / axes.figure.dpi
+    for edge, spacing, side in ((_top_exit, _SPACING_ACROSS, 0), (_right_exit, _SPACING_UP, 1)):
+        found = [(line, edge(axes, line)) for line in sorted(lines, key=lambda line: line.order)]
+        ends = [(line, axes.transData.transform(point)) for line, point in found if point is not None]
+        box = axes.bbox
+        limits = (box.xmin, box.xmax) if side == 0 else (box.ymin, box.ymax)
+        # Labels may stand out over the corners by one width.
+        span = (limits[0] * scale - spacing, limits[1] * scale + spacing)
+        kept, positions = _place([end[side] * scale for _, end in ends], spacing, span)
+        for index, position in zip(kept, positions, strict=True):
+            line, end = ends[index]
+            _write(axes, line.label, end, side, position - end[side] * scale)
+
+
+def _place(wanted: list[float], spacing: float, span: tuple[float, float]) -> tuple[list[int], np.ndarray]:
+    """Which labels fit (indices in rising position), and the nearest positions for them at least ``spacing`` apart."""
+    kept: list[int] = []
+    positions = np.empty(0)
+    for index in range(len(wanted)):
+        trial = sorted([*kept, index], key=lambda i: wanted[i])
+        target = np.array([wanted[i] for i in trial])
+        offsets = spacing * np.arange(len(trial))
+        # Positions p with p[i+1] - p[i] >= spacing: isotonic regression after the offsets are taken off.
+        spread = np.clip(isotonic_regression(target - offsets).x, span[0], span[1] - offsets[-1]) + offsets
+        if np.abs(spread - target).max() <= _MAX_SHIFT:
+            kept, positions = trial, spread
+    return kept, positions
+
+
+def _top_exit(axes: Axes, line: Prediction) -> tuple[float, float] | None:
+    """Where the line meets the upper edge, in data coordinates."""
+    left, right = axes.get_xlim()
+    return (float(line.x[-1]), axes.get_ylim()[1]) if left <= line.x[-1] <= right else None
+
+
+def _right_exit(axes: Axes, line: Prediction) -> tuple[float, float] | None:
+    """Where a curve meets the right edge, in data coordinates."""
+    right = axes.get_xlim()[1]
+    crossing = np.flatnonzero((line.x[:-1] <= right) & (line.x[1:] > right))
+    if not crossing.size or line.y is None:
+        return None
+    i = int(crossing[-1])
+    return right, float(np.interp(right, line.x[i : i + 2], line.y[i : i + 2]))
+
+
+def _write(axes: Axes, text: str, end: np.ndarray, side: int, shift: float) -> None:
+    """Text beyond the edge, ``shift`` points along it, joined to ``end`` (pixels) by a thin leader."""
+    axes.annotate(
+        label_text(text),
+        tuple(end),
+        xycoords="figure pixels",
+        xytext=(shift, _LEADER) if side == 0 else (_LEADER, shift),
+        textcoords="offset points",
+        ha="center" if side == 0 else "left",
+        va="bottom" if side == 0 else "center",
+        size=_FONT,
+        color=PREDICTION,
+        arrowprops={
+            "arrowstyle": "-",
+            "linewidth": 0.5,
+            "color": PREDICTION,
+            "relpos": (0.5, 0.0) if side == 0 else (0.0, 0.5),
+            "shrinkA": 1,
+            "shrinkB": 0,
+        },
+    )

@@ -1,0 +1,143 @@
+"""Figures of the analysis ``forced``: how far the shafts twist, and whether the true periodic motion is stable."""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import cells, resonances
+from drivetrain_jax.view.layout import Margins, Panels
+from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STATE_COLOURS, STYLE, axis_label, variable_label
+
+_AMPLITUDES = {"amplitude": ("-", "linear"), "orbit_amplitude": ((0, (4, 1.5)), "nonlinear orbit")}
+_SCALARS = ("orbit_spectral_radius", "condition")
+_HEIGHT = 2.1
+
+
+def plot(dataset: xr.Dataset) -> Figure:
+    """Amplitudes of the shafts, and the orbit's spectral radius and the condition where they are stored.
+
+    Over one axis as curves (full line: linear response, dashed: nonlinear orbit), over two axes as maps. Points
+    without a value stay blank in curves and are marked in maps. Axes of a single value count as fixed. Raises
+    :class:`InputError` for any other number of axes and if none of these variables is stored.
+    """
+    with matplotlib.rc_context(STYLE):
+        dataset = cells.prepare(dataset)
+        shown = [name for name in (*_AMPLITUDES, *_SCALARS) if name in dataset]
+        if not shown:
+            stored = ", ".join(str(name) for name in dataset.data_vars)
+            wanted = ", ".join((*_AMPLITUDES, *_SCALARS))
+            raise InputError(f"outputs = {stored}: nothing to plot; the figure needs one of {wanted}")
+        names = cells.sweep_axes(dataset)
+        if len(names) == 1 and names != ["point"]:
+            return _curves(dataset, names[0])
+        if len(names) == 2:
+            return _maps(dataset, names, shown)
+        raise InputError(
+            f"axes = {', '.join(names) or 'none'}: allowed are one or two axes for a figure of forced response"
+        )
+
+
+def _curves(dataset: xr.Dataset, name: str) -> Figure:
+    amplitudes = [key for key in _AMPLITUDES if key in dataset]
+    scalars = [key for key in _SCALARS if key in dataset]
+    rows = bool(amplitudes) + len(scalars)
+    panels = Panels(rows, height=_HEIGHT, margins=Margins(right=0.3, left=1.0), share_y=False)
+    stack = [row[0] for row in panels.axes]
+    handles: list[Artist] = []
+    if amplitudes:
+        handles += _draw_amplitudes(stack[0], dataset, name, amplitudes)
+    for axes, key in zip(stack[rows - len(scalars) :], scalars, strict=True):
+        axes.plot(dataset[name], dataset[key], color=LINE_COLOURS[0])
+        panels.label_row(axes, variable_label(dataset[key]))
+        if key == "condition":
+            axes.set_yscale("log")
+            cells.plain_decades(axes, "y")
+        else:
+            handles.append(
+                axes.axhline(1, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)), label="limit of stability")
+            )
+    if amplitudes:
+        units = dataset[amplitudes[0]].attrs.get("units", "1")
+        both = f"amplitude of the shafts [{units}]"
+        panels.label_row(stack[0], both if len(amplitudes) > 1 else variable_label(dataset[amplitudes[0]]))
+    cells.fit_axis(stack[0], "x", dataset[name].values)
+    # Forcing has even harmonics of the speed only: it meets natural frequencies at the harmonic speeds.
+    lines = resonances.predictions(dataset, name, families=("H",))
+    for axes in stack:
+        predicted = resonances.draw(axes, lines)
+    resonances.label(stack[0], lines)
+    panels.label_axes(axis_label(dataset[name]))
+    panels.titles(dataset)
+    panels.legend([*handles, *predicted])
+    return panels.figure
+
+
+def _draw_amplitudes(axes: Axes, dataset: xr.Dataset, name: str, keys: list[str]) -> list[Line2D]:
+    handles = []
+    for key in keys:
+        style, meaning = _AMPLITUDES[key]
+        (own,) = (dim for dim in dataset[key].dims if dim != name)
+        for index, colour in zip(range(dataset.sizes[own]), LINE_COLOURS, strict=False):
+            curve = dataset[key].isel({own: index})
+            label = f"{_entry(curve, own, index)}, {meaning}"
+            handles += axes.plot(dataset[name], curve, color=colour, linestyle=style, label=label)
+    axes.set_yscale("log")
+    cells.plain_decades(axes, "y")
+    return handles
+
+
+def _maps(dataset: xr.Dataset, names: list[str], shown: list[str]) -> Figure:
+    horizontal = cells.horizontal_axis(dataset, names)
+    vertical = next(name for name in names if name != horizontal)
+    fields = [field for key in shown for field in _split(dataset[key], names)]
+    panels = Panels(len(fields), height=_HEIGHT, margins=Margins(right=1.15))
+    for (axes,), field in zip(panels.axes, fields, strict=True):
+        if field.name == "orbit_spectral_radius":
+            mesh, label, extend = cells.draw_growth(axes, field, horizontal, vertical)
+            panels.colorbar(axes, mesh, label, extend=extend)
+        else:
+            mesh = _draw_decades(axes, field, horizontal, vertical)
+            panels.colorbar(axes, mesh, variable_label(field))
+    lines = resonances.predictions(dataset, horizontal, vertical, families=("H",))
+    handles = resonances.draw(panels.axes[0][0], lines)
+    resonances.label(panels.axes[0][0], lines)
+    panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
+    panels.titles(dataset)
+    panels.legend([*handles, *cells.failure_legend(dataset)])
+    return panels.figure
+
+
+def _draw_decades(axes: Axes, field: xr.DataArray, horizontal: str, vertical: str) -> QuadMesh:
+    """Positive values on a logarithmic colour scale, darker for larger; beta = 0 has amplitude 0 and stays lightest."""
+    values = field.values[np.isfinite(field.values) & (field.values > 0)]
+    low, high = (values.min(), values.max()) if values.size else (0.1, 1.0)
+    cmap = matplotlib.colormaps["cividis_r"].with_extremes(bad=STATE_COLOURS[cells.FAILED])
+    field = field.where(field.isnull() | (field > low), low)
+    return cells.draw_cells(axes, field, horizontal, vertical, cmap=cmap, norm=LogNorm(low, high))
+
+
+def _split(variable: xr.DataArray, names: list[str]) -> list[xr.DataArray]:
+    """The variable over the axes alone, one for each entry of its own dimension; the entry joins the long name."""
+    own = [dim for dim in variable.dims if dim not in names]
+    if not own:
+        return [variable]
+    parts = [variable.isel({own[0]: index}) for index in range(variable.sizes[own[0]])]
+    return [
+        part.assign_attrs(long_name=f"{part.attrs.get('long_name', part.name)}, {_entry(part, own[0], index)}")
+        for index, part in enumerate(parts)
+    ]
+
+
+def _entry(part: xr.DataArray, dimension: str, index: int) -> str:
+    """``driving shaft`` for a named entry of a dimension, ``shaft 1`` for a numbered one."""
+    entry = part[dimension].item() if dimension in part.coords else index
+    return f"{entry} {dimension}" if isinstance(entry, str) else f"{dimension} {entry}"

@@ -1,0 +1,219 @@
+"""Stability charts of the analysis ``floquet``."""
+
+from __future__ import annotations
+
+from itertools import chain
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import cells, resonances
+from drivetrain_jax.view.layout import Margins, Panels
+from drivetrain_jax.view.style import (
+    FRAME_GREY,
+    LINE_COLOURS,
+    STATE_COLOURS,
+    STATE_NAMES,
+    STYLE,
+    axis_label,
+    value_text,
+    variable_label,
+)
+
+_PANEL = 2.45
+_SMALL_PANEL = 1.35
+
+
+def plot(dataset: xr.Dataset) -> Figure:
+    """The chart of a ``floquet`` result; what it shows depends on the number of swept axes.
+
+    - none: the multipliers in the complex plane;
+    - one: the spectral radius with its error band and the limit 1;
+    - two: regions of the verdict and a map of ``log10(spectral radius)``, whichever are stored;
+    - more: regions of the verdict for the first, middle and last value of two further axes;
+    - ``[points]``: the points coloured by their verdict.
+
+    Axes of a single value count as fixed. Raises :class:`InputError` if the variables needed are not stored.
+    """
+    with matplotlib.rc_context(STYLE):
+        dataset = cells.prepare(dataset)
+        names = cells.sweep_axes(dataset)
+        if names == ["point"]:
+            return _points(dataset)
+        if not names:
+            return _multipliers(dataset)
+        if len(names) == 1:
+            return _curve(dataset, names[0])
+        return _chart(dataset, names) if len(names) == 2 else _small_multiples(dataset, names)
+
+
+def _chart(dataset: xr.Dataset, names: list[str]) -> Figure:
+    horizontal = cells.horizontal_axis(dataset, names)
+    vertical = next(name for name in names if name != horizontal)
+    _require(dataset, ["verdict", "spectral_radius"])
+    shown = [name for name in ("verdict", "spectral_radius") if name in dataset]
+    panels = Panels(len(shown), height=_PANEL, margins=Margins(right=1.15))
+    handles: list[Artist] = []
+    for (axes,), name in zip(panels.axes, shown, strict=True):
+        if name == "verdict":
+            cells.draw_states(axes, dataset, horizontal, vertical)
+            handles += cells.state_legend(dataset)
+        else:
+            radius = dataset[name].where(dataset["outcome"] < cells.FIRST_FAILURE)
+            mesh, label, extend = cells.draw_growth(axes, radius, horizontal, vertical)
+            panels.colorbar(axes, mesh, label, extend=extend)
+    # Over the upper panel only: the map below shows the narrow tongues uncovered.
+    lines = resonances.predictions(dataset, horizontal, vertical)
+    handles += resonances.draw(panels.axes[0][0], lines)
+    resonances.label(panels.axes[0][0], lines)
+    panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
+    panels.titles(dataset)
+    panels.legend(handles)
+    return panels.figure
+
+
+def _curve(dataset: xr.Dataset, name: str, marker: str = "") -> Figure:
+    _require(dataset, ["spectral_radius"])
+    panels = Panels(height=3.0, margins=Margins(right=0.3))
+    axes = panels.axes[0][0]
+    x, radius = dataset[name].values, dataset["spectral_radius"]
+    handles = axes.plot(
+        x, radius, color=LINE_COLOURS[0], marker=marker, markersize=3, label="spectral radius", zorder=3
+    )
+    if "spectral_radius_error" in dataset:
+        error = dataset["spectral_radius_error"]
+        band = axes.fill_between(
+            x, radius - error, radius + error, color=LINE_COLOURS[0], alpha=0.3, linewidth=0, label="error band"
+        )
+        handles.append(band)
+    handles.append(axes.axhline(1, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)), label="limit of stability"))
+    cells.fit_axis(axes, "x", x)
+    if "verdict" in dataset:
+        _draw_strip(axes, dataset, name)
+        handles += cells.state_legend(dataset)
+    lines = resonances.predictions(dataset, name)
+    resonances.draw(axes, lines)
+    resonances.label(axes, lines)
+    panels.label_axes(axis_label(dataset[name]), variable_label(radius))
+    panels.titles(dataset)
+    panels.legend(handles)
+    return panels.figure
+
+
+def _draw_strip(axes: Axes, dataset: xr.Dataset, name: str) -> None:
+    """The verdict as a strip along the foot of the panel."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(low - 0.06 * (high - low), high)
+    axes.pcolormesh(
+        cells.cell_edges(dataset[name].values),
+        [0, 0.035],
+        cells.states(dataset).values[None, :],
+        cmap=cells.STATES,
+        vmin=-0.5,
+        vmax=3.5,
+        transform=axes.get_xaxis_transform(),
+        rasterized=True,
+    )
+    axes.axhline(axes.get_ylim()[0] + 0.035 * np.ptp(axes.get_ylim()), color=FRAME_GREY, linewidth=0.5)
+
+
+def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
+    _require(dataset, ["verdict"])
+    horizontal = cells.horizontal_axis(dataset, names)
+    vertical = max((name for name in names if name != horizontal), key=lambda name: dataset.sizes[name])
+    sliced = [name for name in names if name not in (horizontal, vertical)]
+    # Labels stand over the first row only, so an axis on which the predictions depend runs across.
+    dependent = dataset.coords.get(f"resonance_{horizontal}", xr.DataArray(0)).dims
+    sliced.sort(key=lambda name: name not in dependent)
+    dataset = dataset.isel({name: dataset.sizes[name] // 2 for name in sliced[2:]})
+    across, down = sliced[0], (*sliced[1:2], None)[0]
+    slices = [
+        [dataset.isel({across: column} | ({down: row} if down else {})) for column in _spread(dataset, across)]
+        for row in (_spread(dataset, down) if down else [0])
+    ]
+    margins = Margins(right=0.25, top=1.12, between_rows=0.32, between_columns=0.16)
+    panels = Panels(len(slices), len(slices[0]), height=_SMALL_PANEL, margins=margins)
+    predicted: list[Line2D] = []
+    for panel, axes in zip(chain(*slices), chain(*panels.axes), strict=True):
+        cells.draw_states(axes, panel, horizontal, vertical)
+        lines = resonances.predictions(panel, horizontal, vertical)
+        predicted = max(predicted, resonances.draw(axes, lines), key=len)
+        first_row = axes in panels.axes[0]
+        if first_row:
+            resonances.label(axes, [line for line in lines if line.order == 1])
+        axes.set_title(_slice_text(panel, across, down), pad=24 if first_row and lines else 4)
+    panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
+    panels.titles(dataset)
+    panels.legend([*cells.state_legend(dataset), *predicted])
+    return panels.figure
+
+
+def _slice_text(panel: xr.Dataset, *names: str | None) -> str:
+    return ", ".join(
+        value_text(name, panel[name].item(), panel[name].attrs.get("units", "1")) for name in names if name
+    )
+
+
+def _spread(dataset: xr.Dataset, name: str) -> list[int]:
+    """First, middle and last index of an axis."""
+    return sorted({0, dataset.sizes[name] // 2, dataset.sizes[name] - 1})
+
+
+_MARKERS = ({"marker": "o", "facecolors": "none"}, {"marker": "o"}, {"marker": "D"}, {"marker": "x"})
+
+
+def _points(dataset: xr.Dataset) -> Figure:
+    varying = [
+        str(name)
+        for name, values in dataset.coords.items()
+        if values.dims == ("point",) and name != "point" and np.unique(values).size > 1
+    ]
+    if not varying:
+        raise InputError("points: all points are the same, there is nothing to plot; give points that differ")
+    if len(varying) == 1:
+        return _curve(dataset.swap_dims(point=varying[0]).sortby(varying[0]), varying[0], marker="o")
+    _require(dataset, ["verdict"])
+    horizontal = cells.horizontal_axis(dataset, [name for name in varying if name == "Omega"] or varying[1:2])
+    vertical = next(name for name in varying if name != horizontal)
+    panels = Panels(height=3.4, margins=Margins(right=0.3))
+    axes = panels.axes[0][0]
+    code = cells.states(dataset).values
+    handles = []
+    for state, marker in enumerate(_MARKERS):
+        chosen = dataset.isel(point=code == state)
+        if chosen.sizes["point"]:
+            colour = {"edgecolors": FRAME_GREY} if state == cells.STABLE else {"color": STATE_COLOURS[state]}
+            label = f"{STATE_NAMES[state]} ({chosen.sizes['point']})"
+            handles.append(axes.scatter(chosen[horizontal], chosen[vertical], s=22, label=label, **marker, **colour))
+    panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
+    panels.titles(dataset)
+    panels.legend(handles)
+    return panels.figure
+
+
+def _multipliers(dataset: xr.Dataset) -> Figure:
+    _require(dataset, ["floquet_multiplier"])
+    panels = Panels(height=4.0, margins=Margins(left=1.5, right=1.5))
+    axes = panels.axes[0][0]
+    angle = np.linspace(0, 2 * np.pi, 361)
+    circle = axes.plot(np.cos(angle), np.sin(angle), color=FRAME_GREY, linewidth=0.8, label="unit circle")
+    values = dataset["floquet_multiplier"].values
+    dots = axes.plot(values.real, values.imag, "o", color=LINE_COLOURS[0], markersize=5, label="Floquet multipliers")
+    axes.set_aspect("equal", adjustable="datalim")
+    panels.label_axes("real part of the multiplier [1]", "imaginary part [1]")
+    panels.titles(dataset)
+    panels.legend([*dots, *circle])
+    return panels.figure
+
+
+def _require(dataset: xr.Dataset, wanted: list[str]) -> None:
+    """Raise :class:`InputError` unless at least one of the variables ``wanted`` is stored."""
+    if not any(name in dataset for name in wanted):
+        stored = ", ".join(str(name) for name in dataset.data_vars)
+        raise InputError(f"outputs = {stored}: nothing to plot; the figure needs {' or '.join(wanted)}")

@@ -1,0 +1,96 @@
+"""The look of all figures: type sizes, colours that differ in lightness as well as hue, and how names are written."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import xarray as xr
+from matplotlib.colors import ListedColormap
+
+# Handed to rc_context around every figure, never to the global rcParams.
+STYLE = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "mathtext.fontset": "dejavusans",
+    "font.size": 8.0,
+    "axes.labelsize": 8.5,
+    "axes.titlesize": 8.5,
+    "axes.linewidth": 0.7,
+    "axes.formatter.useoffset": False,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "xtick.direction": "out",
+    "ytick.direction": "out",
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+    "lines.linewidth": 1.2,
+    "hatch.linewidth": 0.5,
+}
+
+# Lightness 100, 27, 76, 50: the four states stay apart in grey.
+STATE_NAMES = ("stable", "unstable", "undecided", "failed")
+STATE_COLOURS = ("#ffffff", "#33415c", "#f2b632", "#d1495b")
+STATE_HATCHES = ("", "", "////", "xxxx")
+STATES = ListedColormap(STATE_COLOURS, name="states")
+
+LINE_COLOURS = ("#1f4e79", "#d1771e")
+FRAME_GREY = "#555555"
+PREDICTION = "#0b84d8"
+
+_GREEK = {
+    *("alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "kappa", "lambda", "mu", "nu", "xi"),
+    *("rho", "sigma", "tau", "phi", "chi", "psi", "omega", "Gamma", "Delta", "Theta", "Lambda", "Phi", "Psi", "Omega"),
+}
+
+
+def symbol(name: str) -> str:
+    """``name`` as it is set in a formula: Greek letters by name, an index as subscript (``k_A``), else unchanged."""
+    if name in _GREEK:
+        return rf"$\{name}$"
+    if match := re.fullmatch(r"([A-Za-z]{1,2}|" + "|".join(_GREEK) + r")_?([A-Za-z]{0,2}\d*)", name):
+        head, index = match.groups()
+        head = rf"\{head}" if head in _GREEK else head
+        return rf"${head}_{{{index}}}$" if index else f"${head}$"
+    return name
+
+
+def axis_label(coordinate: xr.DataArray) -> str:
+    """``long name (symbol) [units]`` of a swept parameter."""
+    return f"{_long_name(coordinate)} ({symbol(str(coordinate.name))}) [{coordinate.attrs.get('units', '1')}]"
+
+
+def variable_label(variable: xr.DataArray) -> str:
+    """``long name [units]`` of a result."""
+    return f"{_long_name(variable)} [{variable.attrs.get('units', '1')}]"
+
+
+def value_text(name: str, value: object, units: str = "1") -> str:
+    """``symbol = value units``; a list is given by its length."""
+    if isinstance(value, (list, tuple)):
+        return f"{symbol(name)}: {len(value)} values"
+    number = f"{value:.6g}" if isinstance(value, (int, float)) else str(value)
+    return f"{symbol(name)} = {number}" + (f" {units}" if units not in ("1", "") else "")
+
+
+def caption(dataset: xr.Dataset) -> str:
+    """One line with the parameters that do not vary: the fixed ones of the scene, then scalar coordinates."""
+    parts = [
+        _fixed_text(name, value) for name, value in json.loads(dataset.attrs.get("fixed_parameters", "{}")).items()
+    ]
+    parts += [
+        value_text(str(name), coordinate.item(), coordinate.attrs.get("units", "1"))
+        for name, coordinate in dataset.coords.items()
+        if coordinate.ndim == 0
+    ]
+    return ", ".join(parts)
+
+
+def _fixed_text(name: str, entry: object) -> str:
+    if isinstance(entry, dict):
+        return value_text(name, entry.get("value"), str(entry.get("units", "1")))
+    return value_text(name, entry)
+
+
+def _long_name(variable: xr.DataArray) -> str:
+    return str(variable.attrs.get("long_name", variable.name))

@@ -1,0 +1,299 @@
+"""Forced response against an independent model: the disks' rotations, NumPy, SciPy's DOP853 and root finder."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import minimize_scalar, root
+
+from drivetrain_jax.analysis import Outcome, Request, get_analysis, orbit
+from drivetrain_jax.analysis.amplitude import amplitudes
+from drivetrain_jax.analysis.orbit import integrate, shoot
+from drivetrain_jax.systems import get_system
+
+ANALYSIS, SYSTEM = get_analysis("forced"), get_system("cardan")
+EVERYTHING = tuple(v.name for v in ANALYSIS.variables)
+BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+UPPER = 1.4159846397203325  # natural frequency omega2 at beta = 0
+
+
+def solver(outputs=EVERYTHING, rtol=1e-10):
+    return ANALYSIS.solvers(SYSTEM, Request(tuple(outputs), "shooting", {"rtol": rtol}))[0]
+
+
+@pytest.fixture(scope="module")
+def point():
+    solve = jax.jit(lambda values: solver().solve(values, jnp.array(0)))
+
+    def at(**given):
+        values = {k: np.float64(v) for k, v in (BASE | given).items()}
+        return {k: np.asarray(v) for k, v in solve(values).items()}
+
+    return at
+
+
+class Disks:
+    """The same machine in the rotations of its disks: theta1 and the driven disk's lag D = angle - tau.
+
+    The joint turns its output by atan(c tan(phi)), so neither eta' nor eta'' appears in the nonlinear equations.
+    """
+
+    def __init__(self, **given):
+        self.p = BASE | given
+        self.c = math.cos(self.p["beta"])
+
+    def ratio(self, phi):
+        return self.c / (math.cos(phi) ** 2 + self.c**2 * math.sin(phi) ** 2)
+
+    def lag(self, phi):
+        s, k = math.sin(phi), math.cos(phi)
+        return -math.atan2((1 - self.c) * s * k, k * k + self.c * s * s)
+
+    def torques(self, x1, x2, v1, v2):
+        p = self.p
+        s, d = 1 / p["Omega"], 2 * p["zeta"] / p["Omega"]
+        return d * v1 + s * s * x1, p["alpha"] * d * v2 + p["mu"] * s * s * x2
+
+    def twist(self, tau, y):
+        phi = tau + y[0]
+        return y[1] - self.lag(phi) - y[0], 1 + y[3] - self.ratio(phi) * (1 + y[2])
+
+    def nonlinear(self, tau, y):
+        twist, rate = self.twist(tau, y)
+        first, second = self.torques(y[0], twist, y[2], rate)
+        return [y[2], y[3], self.ratio(tau + y[0]) * second - first, -second / self.p["gamma"]]
+
+    def linear(self, tau, y):
+        """About theta = 0, ``y[1]`` measured from the lag of the rigid joint, whose second derivative forces."""
+        step = 1e-30
+        eta = self.ratio(tau)
+        slope = _complex_ratio(self.c, tau + 1j * step).imag / step
+        first, second = self.torques(y[0], y[1] - eta * y[0], y[2], y[3] - eta * y[2] - slope * y[0])
+        return [y[2], y[3], eta * second - first, -second / self.p["gamma"] - slope]
+
+    def flow(self, field, start, dense_output=False):
+        return solve_ivp(field, (0, math.pi), start, method="DOP853", rtol=1e-12, atol=1e-15, dense_output=dense_output)
+
+    def periodic_linear(self):
+        ends = [self.flow(self.linear, start).y[:, -1] for start in (np.zeros(4), *np.eye(4))]
+        monodromy = np.array(ends[1:]).T - ends[0][:, None]
+        return np.linalg.solve(np.eye(4) - monodromy, ends[0])
+
+    def periodic_nonlinear(self, guess):
+        found = root(lambda y: self.flow(self.nonlinear, y).y[:, -1] - y, guess, tol=1e-13)
+        assert np.abs(found.fun).max() < 1e-10
+        return found.x
+
+    def spectral_radius(self, start, step=1e-5):
+        def end(y):
+            return self.flow(self.nonlinear, y).y[:, -1]
+
+        columns = [(end(start + step * e) - end(start - step * e)) / (2 * step) for e in np.eye(4)]
+        return np.abs(np.linalg.eigvals(np.array(columns).T)).max()
+
+    def to_angles(self, y):
+        """(theta, theta') at tau = 0."""
+        return np.array([y[0], self.twist(0.0, y)[0], y[2], self.twist(0.0, y)[1]])
+
+    def to_disks(self, theta):
+        phi = theta[0]
+        return np.array(
+            [theta[0], theta[1] + self.lag(phi) + phi, theta[2], theta[3] - 1 + self.ratio(phi) * (1 + theta[2])]
+        )
+
+
+def _complex_ratio(c, phi):
+    return c / (np.cos(phi) ** 2 + c**2 * np.sin(phi) ** 2)
+
+
+def largest(function):
+    grid = np.linspace(0, math.pi, 2001)
+    i = int(np.argmax([abs(function(t)) for t in grid]))
+    left, right = max(grid[i] - 0.002, 0.0), min(grid[i] + 0.002, math.pi)
+    best = minimize_scalar(lambda t: -abs(function(t)), bounds=(left, right), method="bounded", options={"xatol": 1e-9})
+    return -best.fun
+
+
+KNOWN_ORBITS = [
+    (0.8, 1.3, 1.18959556, (-5.14637547e-4, 1.54887525e-4, -6.40359719e-2, 0.348507717), (0.03629, 0.21586)),
+    (0.5236, 1.416, 1.11394778, None, None),
+    (0.5, 0.72, 1.00023, None, None),
+]
+
+
+@pytest.mark.parametrize(("beta", "omega", "radius", "state", "amplitude"), KNOWN_ORBITS)
+def test_known_nonlinear_orbits(point, beta, omega, radius, state, amplitude):
+    result = point(beta=beta, Omega=omega)
+    assert result["outcome"] == Outcome.SUCCESS
+    assert result["orbit_spectral_radius"] == pytest.approx(radius, abs=6e-9 if radius != 1.00023 else 6e-6)
+    if state is not None:
+        np.testing.assert_allclose(result["orbit_state"], state, atol=1e-9)
+        np.testing.assert_allclose(result["orbit_amplitude"], amplitude, atol=6e-6)
+
+
+@pytest.mark.parametrize(
+    ("beta", "omega", "amplitude", "digit"),
+    [(0.3, 1.0, (0.0115, 0.034), (5e-5, 5e-4)), (0.5236, 1.416, (0.012, 0.084), 5e-4), (0.5, 0.72, (0.93, 1.01), 5e-3)],
+)
+def test_known_linear_amplitudes(point, beta, omega, amplitude, digit):
+    assert np.all(np.abs(point(beta=beta, Omega=omega)["amplitude"] - amplitude) <= digit)
+
+
+LINEAR_POINTS = [
+    {"beta": 0.8, "Omega": 1.3},
+    {"beta": 0.5, "Omega": 0.72},
+    {"beta": 1.4, "Omega": 1.0},
+    {"beta": 0.7, "Omega": 0.1, "alpha": 3.0},
+    {"beta": 0.8, "Omega": 50.0},
+    {"beta": 0.01, "Omega": 1.1, "zeta": 0.0},
+    {"beta": 0.8, "Omega": 1.3, "mu": 200.0, "gamma": 0.5},
+]
+LINEAR = ("periodic_state", "periodic_state_error", "amplitude")
+linear_only = jax.jit(lambda values: solver(LINEAR).solve(values, 0))
+
+
+@pytest.mark.parametrize("given", LINEAR_POINTS, ids=str)
+def test_linear_response_against_scipy(given):
+    disks = Disks(**given)
+    result = linear_only({k: np.float64(v) for k, v in (BASE | given).items()})
+    reference = disks.periodic_linear()
+    eta = disks.c
+    theta = np.array([reference[0], reference[1] - eta * reference[0], reference[2], reference[3] - eta * reference[2]])
+    scale = np.abs(theta).max()
+    tolerance = 1e-9 if given["Omega"] < 10 else 1e-7
+    np.testing.assert_allclose(result["periodic_state"], theta, atol=tolerance * scale)
+    path = disks.flow(disks.linear, reference, dense_output=True).sol
+    expected = largest(lambda t: path(t)[0]), largest(lambda t: path(t)[1] - disks.ratio(t) * path(t)[0])
+    np.testing.assert_allclose(result["amplitude"], expected, rtol=10 * tolerance)
+
+
+@pytest.mark.parametrize(
+    ("beta", "omega", "zeta"), [(0.8, 1.3, 0.001), (0.5, 0.72, 0.001), (0.5, 0.709, 0.001), (1.2, 0.8, 0.1)]
+)
+def test_nonlinear_orbit_against_scipy(point, beta, omega, zeta):
+    result = point(beta=beta, Omega=omega, zeta=zeta)
+    disks = Disks(beta=beta, Omega=omega, zeta=zeta)
+    start = disks.periodic_nonlinear(disks.to_disks(result["orbit_state"]) + 1e-4)
+    np.testing.assert_allclose(result["orbit_state"], disks.to_angles(start), atol=2e-9)
+    assert result["orbit_spectral_radius"] == pytest.approx(disks.spectral_radius(start), abs=2e-7)
+    path = disks.flow(disks.nonlinear, start, dense_output=True).sol
+    expected = largest(lambda t: path(t)[0]), largest(lambda t: disks.twist(t, path(t))[0])
+    np.testing.assert_allclose(result["orbit_amplitude"], expected, rtol=1e-8)
+
+
+def test_branch_followed_around_folds(point):
+    """At the forced resonance (linear amplitude 17 rad) several orbits exist; short strides all along give this one."""
+    state = point(beta=0.5, Omega=0.709)["orbit_state"]
+    np.testing.assert_allclose(state, (-0.033234763, 0.029779093, 0.983894762, -0.745979437), atol=2e-9)
+
+
+def test_no_forcing_without_joint_angle(point):
+    result = point(beta=0.0, Omega=1.0)
+    for name in ("periodic_state", "amplitude", "orbit_state", "orbit_amplitude"):
+        assert np.all(result[name] == 0)
+    # Constant coefficients: the exponents are those of the damped two-disk chain.
+    d, inertia = 0.002, 1.01
+    matrix = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [-1, 1, -d, d], [1, -inertia, d, -d * inertia]])
+    expected = np.exp(math.pi * np.linalg.eigvals(matrix).real.max())
+    assert result["orbit_spectral_radius"] == pytest.approx(expected, rel=1e-10)
+    assert result["outcome"] == Outcome.SUCCESS
+
+
+def test_sign_of_the_joint_angle_is_irrelevant(point):
+    plus, minus = point(beta=0.8, Omega=1.3), point(beta=-0.8, Omega=1.3)
+    for name in EVERYTHING:
+        np.testing.assert_array_equal(plus[name], minus[name])
+
+
+def test_resonance_without_damping_is_reported(point):
+    result = point(beta=0.0, Omega=UPPER / 2, zeta=0.0)
+    assert result["outcome"] == Outcome.NOT_CONVERGED
+    assert result["condition"] > 1e9
+    assert np.all(np.isnan(result["periodic_state"])) and np.all(np.isnan(result["orbit_state"]))
+
+
+def test_error_beyond_the_target_is_reported(point):
+    result = point(beta=0.3, Omega=UPPER / 2, zeta=0.0)
+    assert result["outcome"] == Outcome.TOLERANCE_NOT_MET
+    assert result["periodic_state_error"] > 1e-10 * np.abs(result["periodic_state"]).max()
+
+
+def test_lost_orbit_keeps_the_linear_response(point, monkeypatch):
+    """(0.5, 0.72) takes several corrections; with one there is no orbit."""
+    monkeypatch.setattr(orbit, "MAX_CORRECTIONS", 1)
+    solve = jax.jit(lambda v: solver(("periodic_state", "orbit_state", "orbit_state_error")).solve(v, 0))
+    result = solve({k: np.float64(v) for k, v in (BASE | {"beta": 0.5, "Omega": 0.72}).items()})
+    assert result["outcome"] == Outcome.NOT_CONVERGED
+    assert np.all(np.isnan(result["orbit_state"])) and np.isnan(result["orbit_state_error"])
+    expected = point(beta=0.5, Omega=0.72)["periodic_state"]
+    np.testing.assert_allclose(result["periodic_state"], expected, rtol=1e-9)
+
+
+def test_batch_equals_loop(point):
+    rng = np.random.default_rng(2)
+    columns = {"beta": rng.uniform(-1.0, 1.0, 6), "Omega": rng.uniform(0.2, 2, 6), "zeta": np.full(6, 0.01)}
+    columns |= {k: np.full(6, BASE[k]) for k in ("alpha", "mu", "gamma")}
+    outputs = ("amplitude", "condition", "orbit_state", "orbit_spectral_radius")
+    batch = jax.jit(jax.vmap(solver(outputs).solve, in_axes=(0, None)))(columns, jnp.array(0))
+    for i in range(6):
+        alone = point(**{k: v[i] for k, v in columns.items()})
+        for name in (*outputs, "outcome"):
+            np.testing.assert_allclose(batch[name][i], alone[name], rtol=1e-8, atol=1e-11, err_msg=name)
+
+
+def test_only_what_is_asked_for():
+    values = BASE | {"beta": 0.8, "Omega": 1.3}
+
+    def size(*outputs):
+        solve = solver(outputs).solve
+        program, shapes = jax.make_jaxpr(solve, return_shape=True)(values, 0)
+        assert set(shapes) == {*outputs, "outcome"}
+        return len(str(program))
+
+    state, amplitude, nonlinear = size("periodic_state"), size("amplitude"), size("orbit_state")
+    assert state < amplitude and state < nonlinear < size("orbit_state", "orbit_spectral_radius", "orbit_amplitude")
+
+
+def test_effort_grows_with_oscillations():
+    columns = {k: np.full(3, v) for k, v in (BASE | {"beta": 0.8}).items()} | {"Omega": np.array([1.0, 0.1, 0.01])}
+    steps = solver().effort(columns)
+    assert steps.shape == (3,) and np.all(np.diff(steps) > 0)
+
+
+@pytest.mark.parametrize("frequency", [1.0, 7.3, 1000.0])
+def test_peaks_between_steps(frequency):
+    def field(t, y):
+        return jnp.stack([y[1], -(frequency**2) * y[0]])
+
+    start = jnp.array([math.cos(0.4), -frequency * math.sin(0.4)]) / frequency
+    peak, end, outcome = jax.jit(lambda y: amplitudes(field, y, 6.1, (0, 1), 1e-12))(start)
+    assert outcome == Outcome.SUCCESS
+    np.testing.assert_allclose(peak, (1 / frequency, 1.0), rtol=2e-9)
+    assert end[1] == pytest.approx(-math.sin(6.1 * frequency + 0.4), abs=1e-8)
+
+
+def test_field_that_is_not_finite():
+    for broken in (lambda t, y: y * jnp.nan, lambda t, y: y**2):
+        assert integrate(broken, jnp.ones(2), 3.0, 1e-8)[1] == Outcome.NOT_FINITE
+        assert amplitudes(broken, jnp.ones(2), 3.0, (0,), 1e-8)[2] == Outcome.NOT_FINITE
+
+
+def test_no_orbit_without_restoring_force():
+    """y'' = 1 + sin t drifts: the linear problem is singular and Newton has nothing to find."""
+    found = shoot(lambda t, y: jnp.stack([y[1], 1 + jnp.sin(t)]), jnp.array([1.0, 0.0]), 2 * math.pi, 1e-10)
+    assert found.outcome == Outcome.NOT_CONVERGED
+
+
+def test_looser_target_is_met():
+    values = {k: np.float64(v) for k, v in (BASE | {"beta": 0.8, "Omega": 1.3}).items()}
+    loose, sharp = jax.jit(lambda v: solver(LINEAR, rtol=1e-5).solve(v, 0))(values), linear_only(values)
+    assert loose["outcome"] == Outcome.SUCCESS
+    size = jnp.max(jnp.abs(sharp["periodic_state"]))
+    np.testing.assert_allclose(loose["periodic_state"], sharp["periodic_state"], atol=1e-5 * size)
+    np.testing.assert_allclose(loose["amplitude"], sharp["amplitude"], rtol=1e-5)
+    assert np.any(np.asarray(loose["periodic_state"]) != np.asarray(sharp["periodic_state"]))

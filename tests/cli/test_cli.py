@@ -1,0 +1,255 @@
+"""The command line: exit codes, exactly one line for wrong input, nothing written by it."""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+
+import pytest
+import xarray as xr
+
+from drivetrain_jax import __version__
+from drivetrain_jax.cli import main
+
+SCENE = """
+system = "toy"
+analysis = "toy"
+[axes]
+a = { start = 0.0, stop = 10.0, num = 21 }
+[fixed]
+b = 2.0
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(SCENE)
+    return tmp_path
+
+
+@pytest.fixture
+def cli(folder, capsys):
+    """Runs a command; gives exit code, standard output and lines of standard error."""
+
+    def call(*arguments):
+        try:
+            code = main(arguments)
+        except SystemExit as stop:
+            code = stop.code
+        out, err = capsys.readouterr()
+        return code, out, err.splitlines()
+
+    return call
+
+
+def test_run_status_run_again(cli):
+    assert json.loads(cli("status", "scene.toml", "--out", "r.nc", "--json")[1]) == {
+        "total": 21,
+        "done": 0,
+        "failed": 0,
+        "state": "absent",
+    }
+    code, out, err = cli("run", "scene.toml", "--out", "r.nc", "--quiet")
+    assert (code, out, err) == (0, "", ["points: total=21 computed=21 reused=0 failed=2"])
+    code, _, err = cli("run", "scene.toml", "--out", "r.nc")
+    assert (code, err) == (0, ["points: total=21 computed=0 reused=21 failed=2"])
+    found = json.loads(cli("status", "scene.toml", "--out", "r.nc", "--json")[1])
+    assert found == {"total": 21, "done": 21, "failed": 2, "state": "complete"}
+    assert cli("status", "scene.toml", "--out", "r.nc")[1] == "complete: 21 of 21 points done, 2 without a value\n"
+    assert sorted(os.listdir()) == ["r.nc", "scene.toml"]
+
+
+def test_progress_then_the_last_line(cli):
+    code, out, err = cli("run", "scene.toml", "--out", "r.nc")
+    assert code == 0 and out == "" and err[-1] == "points: total=21 computed=21 reused=0 failed=2"
+    assert any("21/21 points" in line and "/s" in line for line in err[:-1])
+
+
+def test_set_replaces_entries(cli):
+    settings = [
+        "--set",
+        "fixed.b=4",
+        "--set",
+        "axes.a.num=3",
+        "--set",
+        "options.method=other",
+        "--set",
+        "fixed.kind=fancy",
+    ]
+    assert cli("run", "scene.toml", "--out", "r.nc", *settings)[0] == 0
+    with xr.open_dataset("r.nc", engine="h5netcdf") as ds:
+        assert ds.sizes["a"] == 3 and ds.attrs["method"] == "other" and float(ds["value"][0]) == 333.5
+    assert json.loads(cli("status", "scene.toml", "--out", "r.nc", *settings, "--json")[1])["state"] == "complete"
+    assert cli("status", "scene.toml", "--out", "r.nc")[1].startswith("stale")
+
+
+def test_other_scene_needs_fresh(cli):
+    assert cli("run", "scene.toml", "--out", "r.nc", "--quiet")[0] == 0
+    before = open("r.nc", "rb").read()
+    code, _, err = cli("run", "scene.toml", "--out", "r.nc", "--set", "fixed.b=3")
+    assert code == 2 and len(err) == 1 and "--fresh" in err[0] and open("r.nc", "rb").read() == before
+    assert cli("run", "scene.toml", "--out", "r.nc", "--set", "fixed.b=3", "--fresh", "--quiet")[0] == 0
+    assert open("r.nc", "rb").read() != before
+
+
+def change(old, new):
+    return lambda: open("scene.toml", "w").write(SCENE.replace(old, new))
+
+
+WRONG_RUNS = {
+    "unknown key": (change("[fixed]", "colour = 1\n[fixed]"), [], "axes.colour"),
+    "unknown table": (change("[fixed]", "[fixd]"), [], "fixd"),
+    "missing key": (change('system = "toy"', ""), [], "system: missing"),
+    "missing parameter": (change("[axes]\na = { start = 0.0, stop = 10.0, num = 21 }", ""), [], "fixed.a: missing"),
+    "unknown parameter": (change("b = 2.0", "bb = 2.0"), [], "fixed.bb"),
+    "wrong type": (change("b = 2.0", 'b = "two"'), [], "b = 'two'"),
+    "out of range": (change("b = 2.0", "b = -2.0"), [], "b = -2.0"),
+    "axis end out of range": (change("stop = 10.0", "stop = 11"), [], "axes.a = 11"),
+    "not a number": (change("b = 2.0", "b = nan"), [], "b = nan"),
+    "empty axis": (change("{ start = 0.0, stop = 10.0, num = 21 }", "{ values = [] }"), [], "empty axis"),
+    "num = 0": (change("num = 21", "num = 0"), [], "num = 0"),
+    "too many points": (change("num = 21", "num = 3000000000"), [], "3000000000 points"),
+    "axis and fixed": (change("b = 2.0", "b = 2.0\na = 1.0"), [], "also in [axes]"),
+    "malformed file": (change("[fixed]", "[fixed"), [], "not valid TOML"),
+    "absent file": (lambda: os.remove("scene.toml"), [], "No such file"),
+    "scene is a folder": (lambda: (os.remove("scene.toml"), os.mkdir("scene.toml")), [], "scene"),
+    "unknown system": (change('"toy"\nanalysis', '"tractor"\nanalysis'), [], "tractor"),
+    "unknown option": (change("[fixed]", "[options]\nspeed = 1\n[fixed]"), [], "options.speed"),
+    "unreadable result": (lambda: open("r.nc", "w").write("rubbish"), [], "not a readable"),
+    "unreadable result, fresh": (lambda: open("r.nc", "w").write("rubbish"), ["--fresh"], "not a readable"),
+    "foreign result": (
+        lambda: xr.Dataset({"x": 1.0}).to_netcdf("r.nc", engine="h5netcdf"),
+        ["--fresh"],
+        "not a result of",
+    ),
+    "result is a folder": (lambda: os.mkdir("r.nc"), [], "is a folder"),
+    "parts are a file": (lambda: open("r.nc.parts", "w").close(), [], "r.nc.parts"),
+    "folder missing": (None, ["--out", "nowhere/r.nc"], "does not exist"),
+    "set without value": (None, ["--set", "fixed.b"], "name=value"),
+    "set twice": (None, ["--set", "fixed.b=1", "--set", "fixed.b=2"], "twice"),
+    "set an unknown key": (None, ["--set", "fixed.zeta=1"], "fixed.zeta"),
+    "set into a value": (None, ["--set", "system.b=1"], "not a table"),
+    "no workers": (None, ["--workers", "0"], "workers = 0"),
+    "workers of the wrong type": (None, ["--workers", "two"], "--workers"),
+    "unknown flag": (None, ["--fast"], "--fast"),
+}
+
+
+def snapshot(folder):
+    return {p.relative_to(folder): p.read_bytes() if p.is_file() else None for p in folder.rglob("*")}
+
+
+@pytest.mark.parametrize("case", WRONG_RUNS)
+def test_wrong_run_is_one_line_and_writes_nothing(cli, folder, case):
+    prepare, extra, part = WRONG_RUNS[case]
+    if prepare:
+        prepare()
+    before = snapshot(folder)
+    code, out, err = cli("run", "scene.toml", "--out", "r.nc", *extra)
+    assert (code, out, len(err)) == (2, "", 1), err
+    assert err[0].startswith("drivetrain: ") and part in err[0]
+    assert snapshot(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        ((), "COMMAND"),
+        (("dance",), "dance"),
+        (("run", "scene.toml"), "--out"),
+        (("status", "nothing.toml", "--out", "r.nc"), "No such file"),
+        (("list", "tractor"), "tractor"),
+        (("point", "toy"), "ANALYSIS"),
+        (("point", "toy", "toy", "a"), "name=value"),
+        (("point", "toy", "toy", "a=11"), "a = 11"),
+        (("point", "toy", "toy", "a=1", "outputs=nothing"), "nothing"),
+        (("plot", "nothing.nc", "--out", "f.png"), "does not exist"),
+        (("plot", "scene.toml", "--out", "f.png"), "not a readable"),
+        (("plot", "scene.toml", "--out", "nowhere/f.png"), "folder"),
+    ],
+)
+def test_wrong_command_is_one_line(cli, folder, arguments, part):
+    before = snapshot(folder)
+    code, out, err = cli(*arguments)
+    assert (code, out, len(err)) == (2, "", 1) and part in err[0] and snapshot(folder) == before
+
+
+def test_failing_chunk_is_incomplete_and_resumable(cli):
+    code, out, err = cli("run", "scene.toml", "--out", "r.nc", "--set", "analysis=broken", "--quiet")
+    assert (code, out, len(err)) == (3, "", 2)
+    assert (
+        "(broken): RuntimeError: no luck today" in err[0] and err[1] == "points: total=21 computed=0 reused=0 failed=0"
+    )
+    assert os.path.isdir("r.nc.parts") and not os.path.exists("r.nc")
+
+
+def test_point(cli):
+    code, out, _ = cli("point", "toy", "toy", "a=.5", "b=1", "outputs=value,sign", "rtol=1e-9")
+    assert code == 0 and "value   = 324.5 m" in out and "sign    = small (0)" in out
+    code, out, _ = cli("point", "toy", "toy", "a=0.5", "kind=fancy", "length=[1, 1]", "method=other", "--json")
+    answer = json.loads(out)
+    assert code == 0 and answer["values"]["value"] == {"value": 18.0, "units": "m"} and answer["method"] == "other"
+
+
+def test_list(cli):
+    code, out, _ = cli("list")
+    assert code == 0 and "cardan" in out and "floquet" in out
+    code, out, _ = cli("list", "cardan")
+    assert code == 0
+    for part in ("beta", "rad", "joint angle", "required", "0 <= zeta", "spectral_radius", "rtol", "default 1e-10"):
+        assert part in out
+
+
+def test_list_shows_the_scenes_of_this_folder(cli, folder):
+    (folder / "sweeps").mkdir()
+    (folder / "sweeps" / "one.toml").write_text('title = "Hello"\nsystem = "cardan"')
+    (folder / "sweeps" / "two.toml").write_text('title = "Other"\nsystem = "toy"')
+    assert "sweeps/one.toml  Hello" in cli("list", "cardan")[1] and "Other" not in cli("list", "cardan")[1]
+    assert "Other" in cli("list")[1]
+
+
+def test_plot_writes_the_figure(cli, monkeypatch):
+    from matplotlib.figure import Figure
+
+    monkeypatch.setattr("drivetrain_jax.view.plot", lambda dataset: Figure())
+    cli("run", "scene.toml", "--out", "r.nc", "--quiet")
+    assert cli("plot", "r.nc", "--out", "f.png")[0] == 0 and open("f.png", "rb").read(4) == b"\x89PNG"
+    code, _, err = cli("plot", "r.nc", "--out", "f.txt")
+    assert code == 2 and len(err) == 1 and ".png" in err[0]
+
+
+def test_version_and_help(cli):
+    assert cli("--version")[1].strip() == __version__
+    code, out, _ = cli("--help")
+    assert code == 0 and all(name in out for name in ("list", "run", "status", "plot", "point"))
+
+
+def median_time(*command):
+    times = []
+    for _ in range(5):
+        begin = time.perf_counter()
+        subprocess.run([sys.executable, *command], check=True, capture_output=True)
+        times.append(time.perf_counter() - begin)
+    return statistics.median(times)
+
+
+def test_help_is_instant():
+    assert median_time("-m", "drivetrain_jax.cli", "--help") < 0.25
+
+
+def test_import_is_light():
+    heavy = "import drivetrain_jax, drivetrain_jax.cli, sys; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", heavy], check=True, capture_output=True, text=True).stdout.split()
+    assert not {"jax", "numpy", "xarray", "h5py", "matplotlib", "rich", "msgspec"} & set(loaded)
+    assert median_time("-c", "import drivetrain_jax") < 0.15
+
+
+def test_a_reader_that_leaves_is_no_error():
+    command = f"{sys.executable} -m drivetrain_jax.cli list cardan | true"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
+    assert done.stderr == ""

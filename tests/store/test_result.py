@@ -1,0 +1,109 @@
+"""Datasets and their file: labels, CF attributes, never half a file."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from drivetrain_jax import InputError
+from drivetrain_jax._quantities import Dimension, Variable
+from drivetrain_jax.store import files, provenance
+from drivetrain_jax.store.consolidate import open_result, read_attribute, write_result
+from drivetrain_jax.store.schema import Coordinate, build_dataset
+
+
+@pytest.fixture
+def dataset():
+    x = Coordinate("x", ("x",), np.array([1.0, 2.0]), "m", "place")
+    time = Coordinate("t0", ("x",), np.array([0.0, 5.0]), "s", "instant")
+    results = [
+        (Variable("z", "1", "complex", ("k",), "complex128"), np.array([[1 + 2j, np.nan], [0, -1j]])),
+        (Variable("f", "s", "duration"), np.array([np.nan, 3.0])),
+        (Variable("v", "1", "flag", dtype="int8", flags=("no", "not at all")), np.array([0, 1], np.int8)),
+    ]
+    dims = (Dimension("k", "number", ("up", "down")), Dimension("unused", "never", (1, 2)))
+    return build_dataset(
+        ("x",), [x, time], dims, results, {"digest": "abc", "scene": "é = 1\n" * 30_000, "wall_time_s": 1.5}
+    )
+
+
+def test_labels(dataset):
+    assert dataset["z"].dims == ("x", "k") and "unused" not in dataset.coords
+    assert dataset["v"].attrs["flag_meanings"] == "no not_at_all" and dataset["v"].attrs["flag_values"].dtype == np.int8
+    assert all(v.attrs["units"] and v.attrs["long_name"] for v in dataset.variables.values())
+
+
+def test_round_trip_by_plain_xarray(dataset, tmp_path):
+    path = tmp_path / "r.nc"
+    write_result(dataset, path, tmp_path / "tmp")
+    with xr.open_dataset(path, engine="h5netcdf") as again:
+        xr.testing.assert_identical(again, dataset)
+        assert again["z"].dtype == complex and again["f"].dtype == float and again["t0"].dtype == float
+        assert "_FillValue" not in again["x"].encoding and again["k"].values.tolist() == ["up", "down"]
+    assert read_attribute(path, "digest") == "abc" and read_attribute(path, "nothing") is None
+    assert os.listdir(tmp_path) == ["r.nc"]
+
+
+def test_two_files_of_one_dataset_are_identical(dataset, tmp_path):
+    for name in ("one", "two"):
+        write_result(dataset, tmp_path / name, tmp_path / "tmp")
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+
+
+@pytest.mark.parametrize("step", ["os.fsync", "os.replace"])
+def test_a_failure_keeps_the_old_file(tmp_path, monkeypatch, step):
+    path = tmp_path / "r"
+    path.write_bytes(b"old")
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(f"drivetrain_jax.store.files.{step}", fail)
+    with pytest.raises(OSError, match="No space"):
+        files.write_atomic(path, b"new", tmp_path / "tmp")
+    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["r"]
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no HDF5 at all", "cut"])
+def test_unreadable_result_is_one_clear_line(tmp_path, dataset, content):
+    path = tmp_path / "r.nc"
+    if content == "cut":
+        write_result(dataset, path, tmp_path / "tmp")
+        content = path.read_bytes()[:2000]
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match="does not exist" if content is None else "not a readable"):
+        open_result(path)
+
+
+def test_digest_of_content():
+    base = {"b": 1.0, "a": [1, "x", None], "v": np.array([1.0, 2.0])}
+    assert provenance.digest(base) == provenance.digest(dict(reversed(base.items())))
+    others = [
+        base | {"b": 1},
+        base | {"v": np.array([1.0, 3.0])},
+        base | {"v": np.array([1, 2])},
+        base | {"a": ["x", 1]},
+    ]
+    assert len({provenance.digest(other) for other in [base, *others]}) == 5
+    with pytest.raises(TypeError, match="no digest of set"):
+        provenance.digest({1, 2})
+
+
+def test_digest_of_sources(tmp_path):
+    (tmp_path / "a.py").write_text("1")
+    (tmp_path / "b.py").write_text("1")
+    one = provenance.source_digest({"x": tmp_path / "a.py"})
+    assert one == provenance.source_digest({"x": tmp_path / "b.py"})
+    assert one != provenance.source_digest({"y": tmp_path / "a.py"})
+    (tmp_path / "b.py").write_text("2")
+    assert one != provenance.source_digest({"x": tmp_path / "b.py"})
+
+
+def test_provenance_tells_machine_and_versions():
+    assert "cores" in provenance.machine() and "/" not in provenance.machine().split("Python")[1]
+    assert provenance.versions(["numpy"]) == {"numpy": np.__version__}
+    assert provenance.usable_cores() >= 1 and provenance.physical_memory() > 1e8

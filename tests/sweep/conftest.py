@@ -1,0 +1,29 @@
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+
+@pytest.fixture(autouse=True)
+def toys(monkeypatch):
+    """The toy system and its analyses, under their names."""
+    import toy
+
+    monkeypatch.setitem(os.environ, "DRIVETRAIN_JAX_CACHE", "0")
+    toy.names(monkeypatch.setattr)
+
+
+@pytest.fixture
+def grid_scene():
+    """A scene with both solvers at work, some points that fail, and a short last chunk."""
+    return {
+        "system": "toy",
+        "analysis": "toy",
+        "outputs": ["value", "wave", "sign", "effort_seen"],
+        "axes": {"b": {"values": [1.0, 3.0, 2.0]}, "a": {"start": 0.0, "stop": 10.0, "num": 41}},
+    }

@@ -1,0 +1,80 @@
+"""What changes the digest of a scene, and what does not."""
+
+from __future__ import annotations
+
+import pytest
+import toy
+
+from drivetrain_jax.sweep import identity
+from drivetrain_jax.sweep.engine import Engine
+from drivetrain_jax.sweep.scene import load_scene
+
+BASE = {"system": "toy", "analysis": "toy", "axes": {"a": {"start": 0, "stop": 1, "num": 3}}}
+
+
+def digest(scene):
+    return Engine(load_scene(scene)).digest
+
+
+@pytest.mark.parametrize(
+    "same",
+    [
+        {"title": "another"},
+        {"axes": {"a": {"values": [0, 0.5, 1]}}},
+        {"fixed": {"b": 2.0}},
+        {"fixed": {"b": 2}},
+        {"options": {"rtol": 1e-10}},
+        {"outputs": ["value"]},
+    ],
+)
+def test_the_same_computation_has_the_same_digest(same):
+    assert digest(BASE | same) == digest(BASE)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"axes": {"a": {"values": [0, 0.5, 1.1]}}},
+        {"axes": {}, "points": {"a": [0, 0.5, 1]}},
+        {"fixed": {"b": 2.1}},
+        {"fixed": {"unused": 1.0}},
+        {"options": {"rtol": 1e-9}},
+        {"options": {"method": "other"}},
+        {"outputs": ["value", "sign"]},
+    ],
+)
+def test_another_computation_has_another_digest(other):
+    assert digest(BASE | other) != digest(BASE)
+
+
+def test_order_of_axes_matters():
+    axes = {"a": {"values": [1, 2]}, "b": {"values": [1, 2]}}
+    assert digest(BASE | {"axes": axes}) != digest(BASE | {"axes": dict(reversed(axes.items()))})
+
+
+def test_numerics_decide(monkeypatch):
+    before = digest(BASE)
+    for name, value in (("instruction_set", lambda: {"z80"}), ("versions", lambda packages: {"jax": "9"})):
+        with monkeypatch.context() as patch:
+            patch.setattr(identity, name, value)
+            assert digest(BASE) != before
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
+    assert digest(BASE) != before
+
+
+def test_source_of_systems_analyses_and_engine_decides(monkeypatch):
+    seen = []
+    monkeypatch.setattr(identity, "source_digest", lambda files: seen.append(files) or "x")
+    digest(BASE)
+    names = set(seen[0])
+    assert {"systems/cardan.py", "analysis/floquet.py", "sweep/kernel.py", "sweep/plan.py", "toy.py"} <= names
+    assert seen[0]["toy.py"].samefile(toy.__file__)
+
+
+def test_chunk_size_decides(monkeypatch):
+    from dataclasses import replace
+
+    scene = load_scene(BASE)
+    engine = Engine(scene)
+    solvers = [replace(solver, chunk=solver.chunk * 2) for solver in engine.solvers]
+    assert identity.scene_digest(scene, solvers, engine.numerics) != engine.digest

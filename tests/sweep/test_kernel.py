@@ -1,0 +1,60 @@
+"""Precision, compiler options and the cache of compiled code."""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from drivetrain_jax.sweep import kernel
+
+
+def test_double_precision():
+    assert jax.config.jax_enable_x64 and jnp.ones(1).dtype == jnp.float64
+
+
+def test_full_vector_width_only_where_there_is_avx512(monkeypatch):
+    monkeypatch.setattr(kernel, "instruction_set", lambda: {"x86_64", "avx2"})
+    assert kernel._compiler_options() is None
+    monkeypatch.setattr(kernel, "instruction_set", lambda: {"x86_64", "avx512f"})
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert kernel._compiler_options() is None
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    assert kernel._compiler_options() == {"xla_cpu_prefer_vector_width": 512}
+
+
+SCRIPT = """
+from drivetrain_jax.sweep import compile_cache
+import jax
+compile_cache.enable()
+print(jax.config.jax_compilation_cache_dir)
+jax.jit(lambda x: x + 1)(1.0)
+"""
+
+
+def folder_used(**environment):
+    keep = {k: v for k, v in os.environ.items() if k not in ("DRIVETRAIN_JAX_CACHE", "XDG_CACHE_HOME")}
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT], env=keep | environment, capture_output=True, text=True, check=True
+    )
+    assert not done.stderr
+    return done.stdout.strip()
+
+
+def test_compiled_code_is_kept_in_a_private_folder(tmp_path):
+    folder = folder_used(XDG_CACHE_HOME=str(tmp_path))
+    assert folder.startswith(str(tmp_path / "drivetrain_jax")) and len(os.listdir(folder)) > 0
+    assert stat.S_IMODE(os.stat(folder).st_mode) == 0o700
+
+
+@pytest.mark.parametrize("setting", ["0", "a file"])
+def test_cache_is_off_if_unwanted_or_impossible(tmp_path, setting):
+    if setting == "a file":
+        (tmp_path / "file").touch()
+        setting = str(tmp_path / "file")
+    assert folder_used(DRIVETRAIN_JAX_CACHE=setting, XDG_CACHE_HOME=str(tmp_path)) == "None"

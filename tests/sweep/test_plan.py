@@ -1,0 +1,84 @@
+"""Which solver computes which points, in which chunks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import toy
+
+from drivetrain_jax.analysis import Solver
+from drivetrain_jax.sweep.engine import Engine
+from drivetrain_jax.sweep.grid import Grid
+from drivetrain_jax.sweep.plan import chunk_size, make_plan
+from drivetrain_jax.sweep.scene import load_scene
+
+
+def engine(scene):
+    return Engine(load_scene(scene))
+
+
+def test_every_point_is_in_exactly_one_chunk_of_the_cheapest_solver(grid_scene):
+    e = engine(grid_scene)
+    chunks = [e.plan.chunk(number) for number in range(len(e.plan.costs))]
+    assert sorted(np.concatenate([c.points for c in chunks])) == list(range(e.total))
+    for chunk in chunks:
+        columns = e.grid.columns(chunk.points)
+        cheap = (columns["a"] <= toy.LARGE) & (10 * columns["a"] <= 200 * columns["b"])
+        name = e.plan.groups[chunk.group].solver.name
+        assert np.all(cheap == (name == "broadcasting"))
+        efforts = 10 * columns["a"] if name == "broadcasting" else 100 * columns["b"]
+        assert chunk.effort == np.ceil(efforts.max())
+
+
+def test_points_of_a_solver_are_sorted_by_effort(grid_scene):
+    for group in engine(grid_scene).plan.groups:
+        assert np.all(np.diff(group.efforts) >= 0)
+
+
+def test_plan_does_not_depend_on_the_block(grid_scene, monkeypatch):
+    whole = engine(grid_scene).plan
+    monkeypatch.setattr("drivetrain_jax.sweep.plan._BLOCK", 7)
+    for a, b in zip(whole.groups, engine(grid_scene).plan.groups, strict=True):
+        assert np.array_equal(a.order, b.order) and np.array_equal(a.efforts, b.efforts)
+
+
+@pytest.mark.parametrize(
+    ("effort", "planned"),
+    [
+        ([2.0**62, 1.0], 1),
+        ([2.0**62, 2.0**62], 0),
+        ([1.0, 2.0**40], 2),
+        ([np.nan, 3.0], 1),
+        ([np.inf, np.inf], 0),
+        ([-1.0, 0.0], 2),
+    ],
+)
+def test_absurd_efforts(effort, planned):
+    """Infinite, overflowing or undefined cost: no solver; efforts stay within what a counter can hold."""
+    grid = Grid.of(load_scene({"system": "toy", "analysis": "toy", "points": {"a": [1.0, 2.0]}}))
+    plan = make_plan([Solver("s", None, lambda columns: np.array(effort), unit_cost=1e291)], grid)
+    assert sum(group.order.size for group in plan.groups) == planned
+    assert all(0 <= e < 2**31 for group in plan.groups for e in group.efforts)
+
+
+@pytest.mark.parametrize(
+    ("largest", "count", "expected"),
+    [(256, 1, 1), (256, 3, 4), (256, 16, 16), (256, 17, 16), (256, 100, 64), (256, 1000, 256), (8, 1000, 8), (1, 5, 1)],
+)
+def test_chunk_size(largest, count, expected):
+    assert chunk_size(largest, count) == expected
+
+
+def test_grid_numbers_points_in_c_order():
+    e = engine({"system": "toy", "analysis": "toy", "axes": {"b": {"values": [1, 3, 2]}, "a": {"values": [0, 1]}}})
+    columns = e.grid.columns(np.arange(6))
+    assert columns["b"].tolist() == [1, 1, 3, 3, 2, 2] and columns["a"].tolist() == [0, 1, 0, 1, 0, 1]
+
+
+def test_a_huge_grid_is_planned_by_number_alone():
+    grid = engine(
+        {"system": "toy", "analysis": "toy", "axes": {n: {"start": 1, "stop": 2, "num": 40_000} for n in ("a", "b")}}
+    ).grid
+    assert grid.size == 1_600_000_000
+    columns = grid.columns(np.array([0, grid.size - 1]))
+    assert columns["a"].tolist() == [1, 2] and columns["b"].tolist() == [1, 2]

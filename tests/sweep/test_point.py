@@ -1,0 +1,96 @@
+"""One point: values, units, a readable answer."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import drivetrain_jax as dt
+from drivetrain_jax.sweep import point as module
+
+
+def test_results_by_attribute_and_name():
+    result = dt.point("toy", "toy", a=1.0, outputs=["value", "wave", "sign"])
+    assert result.value == result["value"] == 328.0 and result.sign == 0
+    assert result.wave.dtype == complex and result.wave.shape == (3,)
+    assert result.units == {"value": "m", "wave": "1", "sign": "1"}
+    assert result.outcome == 0 and result.outcome.has_value and list(result) == ["value", "wave", "sign"]
+    assert result.parameters["b"] == 2.0 and result.parameters["a"] == 1.0
+    with pytest.raises(AttributeError, match="there is value, wave, sign"):
+        result.nothing
+    with pytest.raises(AttributeError):
+        result.value = 3
+
+
+def test_same_value_as_in_a_sweep():
+    ds = dt.run(
+        {"system": "toy", "analysis": "toy", "axes": {"a": {"values": [0.3, 6.1]}, "b": {"values": [1.0, 1.7]}}}
+    )
+    for a, b in [(0.3, 1.7), (6.1, 1.0)]:
+        assert dt.point("toy", "toy", a=a, b=b).value == pytest.approx(float(ds["value"].sel(a=a, b=b)), rel=1e-14)
+
+
+def test_readable():
+    text = repr(dt.point("toy", "toy", a=6.0, b=1.5, outputs=["value", "sign"]))
+    assert text.splitlines() == [
+        "toy toy (method plain), a = 6 m, b = 1.5 s, n = 3, kind = plain, length = (1.0, 2.0, 3.0) m",
+        "  value   = 331.5 m",
+        "  sign    = large (1)",
+        "  outcome = success",
+    ]
+
+
+def test_failed_point_says_so():
+    result = dt.point("toy", "toy", a=9.5)
+    assert np.isnan(result.value) and not result.outcome.has_value and "not_finite" in repr(result)
+    assert json.loads(result.to_json())["values"]["value"] == {"value": None, "units": "m"}
+
+
+def test_json():
+    answer = json.loads(dt.point("toy", "toy", a=0.0, outputs=["wave"]).to_json())
+    assert answer["values"]["wave"]["value"] == {"real": [1.0, 1.0, 1.0], "imag": [0.0, 0.0, 0.0]}
+    assert answer["outcome"] == "success" and answer["parameters"]["a"] == {"value": 0.0, "units": "m"}
+
+
+def test_words_lists_and_options():
+    assert dt.point("toy", "toy", a=1.0, kind="fancy", length=[1.0], method="other", knob=2.0).value == 8.5
+
+
+def test_a_line_of_one_value():
+    assert dt.point("toy", "line", a=2.0, b=3.0).response.tolist() == [6.0, 3.0]
+
+
+def test_another_point_needs_no_new_compilation():
+    dt.point("toy", "toy", a=1.0, b=1.0)
+    before = module._kernel.cache_info()
+    dt.point("toy", "toy", a=2.0, b=1.5)
+    after = module._kernel.cache_info()
+    assert after.hits == before.hits + 1 and after.misses == before.misses
+
+
+@pytest.mark.parametrize(
+    ("given", "part"),
+    [
+        ({"a": 11}, "^a = 11: allowed is 0 <= a <= 10$"),
+        ({"a": "x"}, "^a = 'x': allowed is a number"),
+        ({"a": [1.0]}, "^a = "),
+        ({}, "^a: missing"),
+        ({"a": 1, "c": 2}, "^c = 2: unknown; allowed is a, b"),
+        ({"a": 1, "rtol": 2}, "^rtol = 2"),
+        ({"a": 1, "knob": 2}, "^knob = 2: not used by method plain"),
+        ({"a": 1, "kind": "odd"}, "^kind = 'odd'"),
+        ({"a": 1, "outputs": ["nothing"]}, "^outputs: 'nothing'"),
+    ],
+)
+def test_wrong_input_is_one_clear_line(given, part):
+    with pytest.raises(dt.InputError, match=part):
+        dt.point("toy", "toy", **given)
+
+
+def test_unknown_system_and_analysis():
+    with pytest.raises(dt.InputError, match="system = 'tractor'"):
+        dt.point("tractor", "toy")
+    with pytest.raises(dt.InputError, match="analysis = 'dance'"):
+        dt.point("toy", "dance")

@@ -1,0 +1,348 @@
+"""Running scenes: values and labels in memory, files, resuming."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import netCDF4
+import numpy as np
+import pytest
+import toy
+import xarray as xr
+
+import drivetrain_jax as dt
+from drivetrain_jax.sweep import toml
+from drivetrain_jax.sweep.run import Incomplete, run_to_file, status
+
+
+def expected_value(a, b, n=3, length=(1.0, 2.0, 3.0)):
+    total = a + b * n + length[0] + 10 * length[1] + 100 * length[2]
+    return np.where(a > 9, np.nan, total)
+
+
+def same(one, two):
+    """Arrays, coordinates, attributes of variables: everything but the provenance."""
+    for name in one.variables:
+        a, b = one[name], two[name]
+        assert a.dims == b.dims and a.dtype == b.dtype and a.values.tobytes() == b.values.tobytes(), name
+        assert str(a.attrs) == str(b.attrs)
+    assert list(one.variables) == list(two.variables)
+
+
+def test_grid_values_dims_and_labels(grid_scene):
+    ds = dt.run(grid_scene)
+    a, b = ds["a"], ds["b"]
+    assert ds["value"].dims == ("b", "a") and ds["wave"].dims == ("b", "a", "part")
+    np.testing.assert_allclose(ds["value"], expected_value(a.values[None, :], b.values[:, None]), rtol=1e-15)
+    np.testing.assert_allclose(ds["wave"].isel(b=0), np.exp(1j * a.values[:, None] * np.arange(3)), rtol=1e-14)
+    assert ds["wave"].dtype == complex and ds["sign"].dtype == np.int8 and ds["outcome"].dtype == np.int8
+    assert np.array_equal(ds["sign"].isel(b=1), a > toy.LARGE)
+    assert np.array_equal(ds["outcome"] >= 2, np.isnan(ds["value"])) and int((ds["outcome"] == 4).sum()) == 12
+    assert set(ds.data_vars) == {"value", "wave", "sign", "effort_seen", "outcome"}
+    for variable in ds.variables.values():
+        assert variable.attrs["units"] and variable.attrs["long_name"]
+    assert ds["outcome"].attrs["flag_meanings"].split()[:2] == ["success", "tolerance_not_met"]
+    assert ds["sign"].attrs["flag_values"].tolist() == [0, 1]
+    assert ds["part"].values.tolist() == [0, 1, 2]
+
+
+def test_only_the_requested_results_are_there():
+    ds = dt.run({"system": "toy", "analysis": "toy", "outputs": ["sign"], "axes": {"a": {"values": [1, 8]}}})
+    assert set(ds.data_vars) == {"sign", "outcome"} and "part" not in ds.coords
+
+
+def test_effort_is_the_largest_of_the_chunk(grid_scene):
+    ds = dt.run(grid_scene)
+    seen = ds["effort_seen"].where(ds["a"] <= toy.LARGE)
+    assert bool((seen >= 10 * ds["a"]).where(seen.notnull(), True).all())
+    assert bool((ds["effort_seen"] == 100 * ds["b"]).where(ds["a"] > toy.LARGE, True).isel(b=1).all())
+
+
+def test_batch_equals_loop(grid_scene):
+    ds = dt.run(grid_scene)
+    for i, j in [(0, 0), (1, 13), (2, 20), (0, 21), (2, 40)]:
+        one = dt.run(grid_scene | {"axes": {}, "fixed": {"a": ds["a"].values[j], "b": ds["b"].values[i]}})
+        for name in ("value", "wave", "sign", "outcome"):
+            np.testing.assert_allclose(ds[name].values[i, j], one[name].values, rtol=1e-14)
+
+
+def test_no_axes_is_one_point():
+    ds = dt.run({"system": "toy", "analysis": "toy", "outputs": ["value", "wave"], "fixed": {"a": 1.0}})
+    assert ds["value"].dims == () and float(ds["value"]) == expected_value(1.0, 2.0) and ds["wave"].dims == ("part",)
+
+
+def test_points_are_one_dimension():
+    scene = {"system": "toy", "analysis": "toy", "outputs": ["value", "wave"]}
+    ds = dt.run(scene | {"points": {"a": [1, 8, 1], "b": [1.0, 2.0, 1.0]}})
+    assert ds["value"].dims == ("point",) and ds["wave"].dims == ("point", "part")
+    assert ds["a"].dims == ds["b"].dims == ("point",) and ds["a"].attrs["units"] == "m"
+    np.testing.assert_allclose(ds["value"], expected_value(np.array([1, 8, 1]), np.array([1, 2, 1])))
+
+
+def test_one_entry_of_a_list_is_swept():
+    axes = {"length[1]": {"values": [0.0, 5.0]}, "a": {"values": [1.0, 6.0]}}
+    ds = dt.run({"system": "toy", "analysis": "toy", "axes": axes, "fixed": {"length": [4.0, 1.0, 2.0]}})
+    assert ds["value"].dims == ("length[1]", "a")
+    for i, entry in enumerate((0.0, 5.0)):
+        np.testing.assert_allclose(ds["value"][i], expected_value(ds["a"].values, 2.0, length=(4.0, entry, 2.0)))
+    assert ds["length[1]"].attrs["long_name"] == "lengths, entry 1"
+
+
+def test_axis_that_the_analysis_does_not_use_and_integer_axis():
+    axes = {"unused": {"values": [1.0, 2.0]}, "n": {"start": 1, "stop": 4, "num": 4}}
+    ds = dt.run({"system": "toy", "analysis": "toy", "axes": axes, "fixed": {"a": 1.0}})
+    assert ds["n"].dtype == np.int64 and np.array_equal(ds["value"][0], ds["value"][1])
+    np.testing.assert_allclose(ds["value"][0], expected_value(1.0, 2.0, n=ds["n"].values))
+
+
+def test_a_result_that_nothing_varied_is_spread():
+    ds = dt.run({"system": "toy", "analysis": "toy", "axes": {"unused": {"values": [1.0, 2.0]}}, "fixed": {"a": 1.0}})
+    assert ds["value"].values.tolist() == [expected_value(1.0, 2.0)] * 2
+
+
+@pytest.mark.parametrize("order", [("a", "b", "n"), ("b", "a", "n"), ("a", "n", "b")])
+def test_path_axis_is_never_cut(order):
+    values = {"a": [1.0, 2.0, 3.0], "b": [1.0, 4.0, 9.0, 16.0], "n": [1, 2]}
+    ds = dt.run({"system": "toy", "analysis": "line", "axes": {name: {"values": values[name]} for name in order}})
+    assert ds["response"].dims == (*order, "direction") and ds["outcome"].dims == order
+    assert ds["direction"].values.tolist() == ["up", "down"]
+    up = ds["response"].sel(direction="up").transpose("n", "a", "b").values
+    np.testing.assert_allclose(up[1], np.outer(values["a"], np.cumsum(values["b"])))
+    np.testing.assert_allclose(ds["response"].sel(direction="down").isel(a=2, n=0), [30, 29, 25, 16])
+
+
+def test_fixed_path_parameter_is_a_line_of_one():
+    ds = dt.run({"system": "toy", "analysis": "line", "axes": {"a": {"values": [1.0, 2.0]}}, "fixed": {"b": 5.0}})
+    assert ds["response"].dims == ("a", "direction")
+    assert ds["response"].sel(direction="up").values.tolist() == [5.0, 10.0]
+
+
+def test_points_that_no_solver_can_do_end_as_step_limit(tmp_path):
+    scene = {
+        "system": "toy",
+        "analysis": "toy",
+        "options": {"method": "hopeless"},
+        "axes": {"a": {"values": [1.0, 6.0]}},
+    }
+    ds = dt.run(scene)
+    assert ds["outcome"].values.tolist() == [0, 3] and np.isnan(ds["value"][1])
+    assert str(run_to_file(scene, tmp_path / "r.nc")) == "points: total=2 computed=2 reused=0 failed=1"
+
+
+def test_resonances_depend_on_the_axes_among_their_parameters():
+    ds = dt.run({"system": "toy", "analysis": "toy", "axes": {"a": {"values": [1, 2]}, "b": {"values": [1.0, 3.0]}}})
+    assert ds["resonance_a"].dims == ("b", "resonance") and ds["resonance"].values.tolist() == ["R1", "R2"]
+    assert ds["resonance_a"].values.tolist() == [[1, 0.5], [3, 1.5]] and ds["resonance_a"].attrs["units"] == "m"
+    fixed = dt.run({"system": "toy", "analysis": "toy", "axes": {"a": {"values": [1, 2]}}})
+    assert fixed["resonance_a"].values.tolist() == [2.0, 1.0]
+    assert "resonance_a" not in dt.run({"system": "toy", "analysis": "toy", "points": {"a": [1, 2]}}).coords
+
+
+def test_file_opens_with_xarray_h5py_and_netcdf4(grid_scene, tmp_path):
+    path = tmp_path / "r.nc"
+    written, memory = dt.run(grid_scene, out=path), dt.run(grid_scene)
+    same(written, memory)
+    with xr.open_dataset(path, engine="h5netcdf") as ds:
+        same(ds, memory)
+        assert ds.attrs["Conventions"] == "CF-1.11" and ds.attrs["system"] == "toy"
+        assert json.loads(ds.attrs["fixed_parameters"])["n"]["value"] == 3
+        assert {"title", "digest", "machine", "versions", "wall_time_s", "created", "method", "source"} <= set(ds.attrs)
+    with h5py.File(path) as file:
+        assert np.array_equal(file["wave"][()], memory["wave"]) and file["wave"].dtype == complex
+    with netCDF4.Dataset(path, auto_complex=True) as file:
+        assert np.array_equal(file["outcome"][:], memory["outcome"]) and file["value"].units == "m"
+        assert np.array_equal(file["wave"][:], memory["wave"])
+    assert os.listdir(tmp_path) == ["r.nc"]
+
+
+def test_scene_in_the_file_gives_the_same_result(grid_scene, tmp_path):
+    first = dt.run(grid_scene, out=tmp_path / "r.nc", overrides={"axes.b.values": [2.5]})
+    scene = tmp_path / "again.toml"
+    scene.write_text(first.attrs["scene"])
+    again = dt.run(scene)
+    same(first, again)
+    assert again.attrs["digest"] == first.attrs["digest"]
+
+
+def test_threads_and_repetition_do_not_change_a_bit(grid_scene):
+    first = dt.run(grid_scene, workers=1)
+    for workers in (1, 2, 5):
+        same(first, dt.run(grid_scene, workers=workers))
+
+
+def test_complete_result_is_only_read(grid_scene, tmp_path):
+    path = tmp_path / "r.nc"
+    assert str(run_to_file(grid_scene, path)) == "points: total=123 computed=123 reused=0 failed=12"
+    before = path.read_bytes()
+    assert str(run_to_file(grid_scene, path)) == "points: total=123 computed=0 reused=123 failed=12"
+    assert path.read_bytes() == before and os.listdir(tmp_path) == ["r.nc"]
+    assert str(run_to_file(grid_scene, path, fresh=True)) == "points: total=123 computed=123 reused=0 failed=12"
+    assert status(grid_scene, path).state == "complete"
+
+
+def interrupt_after(chunks):
+    """A report that acts like Ctrl-C after so many chunks."""
+    calls = iter(range(chunks + 1))
+
+    def report(progress):
+        if next(calls, None) is None:
+            raise KeyboardInterrupt
+
+    return report
+
+
+def test_interrupted_and_resumed_equals_uninterrupted(grid_scene, tmp_path):
+    path = tmp_path / "r.nc"
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        run_to_file(grid_scene, path, workers=1, report=interrupt_after(2))
+    done = stopped.value.progress
+    assert 0 < done.computed < 123 and not path.exists()
+    found = status(grid_scene, path)
+    assert (found.total, found.done, found.failed, found.state) == (123, done.computed, done.failed, "partial")
+    resumed = run_to_file(grid_scene, path)
+    assert resumed.reused == done.computed and resumed.computed == 123 - done.computed and resumed.failed == 12
+    same(xr.open_dataset(path, engine="h5netcdf"), dt.run(grid_scene))
+    assert os.listdir(tmp_path) == ["r.nc"]
+
+
+def test_parts_are_not_resumed_by_another_scene(grid_scene, tmp_path):
+    path = tmp_path / "r.nc"
+    with pytest.raises(KeyboardInterrupt):
+        run_to_file(grid_scene, path, workers=1, report=interrupt_after(2))
+    other = grid_scene | {"fixed": {"n": 4}}
+    assert status(other, path).state == "stale"
+    with pytest.raises(dt.InputError, match="unfinished work of another scene"):
+        run_to_file(other, path)
+    assert status(grid_scene, path).state == "partial"
+    assert run_to_file(other, path, fresh=True).computed == 123
+    assert status(grid_scene, path).state == "stale"
+
+
+def test_interrupted_replacement_keeps_the_old_result_and_resumes(grid_scene, tmp_path):
+    path = tmp_path / "r.nc"
+    run_to_file(grid_scene, path)
+    before = path.read_bytes()
+    other = grid_scene | {"fixed": {"n": 4}}
+    with pytest.raises(dt.InputError, match="--fresh"):
+        run_to_file(other, path)
+    with pytest.raises(KeyboardInterrupt):
+        run_to_file(other, path, fresh=True, workers=1, report=interrupt_after(2))
+    assert path.read_bytes() == before and status(other, path).state == "partial"
+    assert run_to_file(other, path).reused > 0
+    assert status(other, path).state == "complete" and os.listdir(tmp_path) == ["r.nc"]
+
+
+def test_corrupted_chunk_is_computed_again(grid_scene, tmp_path):
+    path = tmp_path / "r.nc"
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        run_to_file(grid_scene, path, workers=1, report=interrupt_after(2))
+    for part in Path(f"{path}.parts").glob("*.h5"):
+        data = bytearray(part.read_bytes())
+        data[len(data) // 2] ^= 1
+        part.write_bytes(data)
+    assert stopped.value.progress.computed > 0 and status(grid_scene, path).done == 0
+    assert run_to_file(grid_scene, path).reused == 0
+    same(xr.open_dataset(path, engine="h5netcdf"), dt.run(grid_scene))
+
+
+def test_failing_chunk_leaves_a_resumable_run(tmp_path):
+    scene = {"system": "toy", "analysis": "broken", "axes": {"a": {"values": [1.0, 2.0]}}}
+    with pytest.raises(Incomplete, match=r"chunk 0 \(broken\): RuntimeError: no luck"):
+        run_to_file(scene, tmp_path / "r.nc")
+    assert status(scene, tmp_path / "r.nc").state == "partial" and not (tmp_path / "r.nc").exists()
+    with pytest.raises(Incomplete, match="chunk 0"):
+        dt.run(scene)
+
+
+def test_full_disk_leaves_a_resumable_run(grid_scene, tmp_path, monkeypatch):
+    path = tmp_path / "r.nc"
+    run_to_file(grid_scene, path)
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("drivetrain_jax.store.files.os.fsync", full)
+    with pytest.raises(Incomplete, match="No space left on device"):
+        run_to_file(grid_scene, path, fresh=True)
+    assert path.read_bytes() == before
+    assert not list(Path(f"{path}.parts").glob("*.tmp"))
+
+
+def test_result_too_large_for_the_memory_is_refused_at_once(grid_scene, monkeypatch):
+    monkeypatch.setattr("drivetrain_jax.sweep.run.physical_memory", lambda: 1000.0)
+    with pytest.raises(dt.InputError, match="GB of memory"):
+        dt.run(grid_scene)
+
+
+SLOW = {"system": "toy", "analysis": "slow", "axes": {"a": {"start": 0, "stop": 8, "num": 400}}}
+
+
+@pytest.fixture
+def slow_process(tmp_path):
+    """Starts ``drivetrain run`` on a scene of about 2.5 s in a process of its own."""
+    scene = tmp_path / "slow.toml"
+    scene.write_text(toml.write(SLOW))
+    out = tmp_path / "r.nc"
+    command = [sys.executable, toy.__file__, "run", str(scene), "--out", str(out), "--quiet", "--workers", "1"]
+
+    def start():
+        return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=Path(toy.__file__).parents[2])
+
+    return start, out
+
+
+def wait_for_parts(out, count, process):
+    deadline = time.monotonic() + 30
+    while len(list(Path(f"{out}.parts").glob("*.h5"))) < count:
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < deadline, "no parts appeared"
+        time.sleep(0.01)
+
+
+def test_killed_and_resumed_equals_uninterrupted(slow_process, tmp_path):
+    start, out = slow_process
+    for parts in (1, 3):
+        process = start()
+        wait_for_parts(out, parts, process)
+        process.kill()
+        process.communicate()
+        assert not out.exists()
+    done = status(SLOW, out).done
+    assert 0 < done < 400
+    resumed = run_to_file(SLOW, out)
+    assert (resumed.reused, resumed.computed) == (done, 400 - done)
+    reference = tmp_path / "reference.nc"
+    run_to_file(SLOW, reference)
+    same(xr.open_dataset(out, engine="h5netcdf"), xr.open_dataset(reference, engine="h5netcdf"))
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_signal_stops_promptly_and_loses_nothing(slow_process, sent):
+    start, out = slow_process
+    process = start()
+    wait_for_parts(out, 1, process)
+    process.send_signal(sent)
+    sent_at = time.monotonic()
+    _, stderr = process.communicate(timeout=10)
+    assert process.returncode == 130 and time.monotonic() - sent_at < 1.0
+    lines = stderr.splitlines()
+    found = status(SLOW, out)
+    assert lines[-1] == f"points: total=400 computed={found.done} reused=0 failed=0" and len(lines) == 2
+    assert found.done > 0 and "Traceback" not in stderr
+
+
+def test_second_run_on_the_same_file_is_refused(slow_process):
+    start, out = slow_process
+    process = start()
+    wait_for_parts(out, 1, process)
+    with pytest.raises(dt.InputError, match="another run"):
+        run_to_file(SLOW, out)
+    assert process.wait(timeout=30) == 0 and status(SLOW, out).state == "complete"

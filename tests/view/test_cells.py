@@ -1,0 +1,56 @@
+"""Cells end halfway between their values, on any axis."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivetrain_jax.view import cells, plot
+from tests.view import results
+from tests.view.test_stability import meshes, panels
+
+
+def test_edges_of_uniform_cells():
+    np.testing.assert_allclose(cells.cell_edges(np.array([0.0, 0.1, 0.2])), [-0.05, 0.05, 0.15, 0.25])
+
+
+def test_edges_of_logarithmic_cells_are_geometric_means():
+    np.testing.assert_allclose(cells.cell_edges(np.array([1.0, 10.0, 100.0])), 10.0 ** np.array([-0.5, 0.5, 1.5, 2.5]))
+
+
+def test_edges_of_irregular_cells():
+    np.testing.assert_allclose(cells.cell_edges(np.array([0.0, 1.0, 3.0])), [-0.5, 0.5, 2.0, 4.0])
+
+
+@pytest.mark.parametrize(
+    ("values", "logarithmic"),
+    [
+        (np.geomspace(0.01, 2, 50), True),
+        (np.linspace(0.01, 2, 50), False),
+        ([0.25, 0.5, 1, 5, 20], False),
+        ([1, 2], False),
+    ],
+)
+def test_logarithmic_axes_are_recognised(values, logarithmic):
+    assert cells.is_logarithmic(np.asarray(values, float)) is logarithmic
+
+
+def test_drawn_cells_have_these_edges_and_this_scale():
+    omega = np.geomspace(0.01, 1, 5)
+    dataset = results.grid(np.zeros((3, 5), int), "beta", "Omega")
+    figure = plot(results.with_axes(dataset, beta=np.array([0.0, 0.5, 1.0]), Omega=omega))
+    corners = meshes(figure)[0].get_coordinates()
+    np.testing.assert_allclose(corners[0, :, 0], 10 ** np.linspace(-2.25, 0.25, 6))
+    np.testing.assert_allclose(corners[:, 0, 1], [-0.25, 0.25, 0.75, 1.25])
+    axes = panels(figure)[0]
+    assert axes.get_xscale() == "log"
+    assert axes.get_yscale() == "linear"
+    assert axes.get_xlim() == pytest.approx((10**-2.25, 10**0.25))
+
+
+def test_values_given_out_of_order_are_sorted():
+    code = np.array([[0, 1, 0], [0, 0, 0]])
+    dataset = results.with_axes(
+        results.grid(code, "beta", "Omega"), beta=np.array([0.2, 0.1]), Omega=np.array([3.0, 2.0, 1.0])
+    )
+    np.testing.assert_array_equal(meshes(plot(dataset))[0].get_array(), [[0, 0, 0], [0, 1, 0]])

@@ -1,0 +1,57 @@
+"""Figures of the forced response."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import plot
+from tests.view import results
+from tests.view.test_stability import legend, meshes, panels, texts
+
+OMEGA = np.linspace(0.5, 1.5, 21)
+
+
+def test_amplitude_of_both_shafts_over_one_axis():
+    figure = plot(results.forced(Omega=OMEGA))
+    amplitude, orbit = panels(figure)
+    first, second = (line for line in amplitude.lines if len(line.get_xdata()) == 21)
+    assert set(first.get_ydata()) == {0.1}
+    assert set(second.get_ydata()) == {0.2}
+    assert amplitude.get_yscale() == "log"
+    assert [set(line.get_ydata()) for line in orbit.lines[:2]] == [{1.1}, {1}]
+    assert legend(figure) == ["driving shaft, linear", "driven shaft, linear", "limit of stability", "harmonic $H$"]
+    assert {"amplitude [rad]", "spectral radius of the orbit [1]", "speed ($\\Omega$) [1]"} <= set(texts(figure))
+
+
+def test_only_harmonic_speeds_are_predicted_for_a_response():
+    axes = panels(plot(results.forced(Omega=OMEGA)))[0]
+    assert [text.get_text() for text in axes.texts] == ["$H_{21}$"]
+
+
+def test_two_axes_give_one_map_a_shaft_and_mark_failures():
+    dataset = results.forced(beta=np.linspace(0, 1, 11), Omega=OMEGA)
+    dataset.amplitude[0] = 0
+    dataset.amplitude[3, 4] = np.nan
+    dataset.orbit_spectral_radius[3, 4] = np.nan
+    dataset.outcome[3, 4] = 2
+    figure = plot(dataset)
+    one, two, orbit = (mesh.get_array() for mesh in meshes(figure))
+    assert np.ma.getmaskarray(one).sum() == np.ma.getmaskarray(two).sum() == np.ma.getmaskarray(orbit).sum() == 1
+    assert one[5, 5] == 0.1
+    assert two[5, 5] == 0.2
+    assert orbit[5, 5] == pytest.approx(np.log10(1.1))
+    assert "failed (1)" in legend(figure)
+
+
+def test_nothing_to_plot_is_an_input_error():
+    with pytest.raises(InputError, match="axes = none: allowed are one or two axes"):
+        plot(results.forced(Omega=OMEGA[:1]))
+    with pytest.raises(InputError, match="outputs = outcome: nothing to plot; the figure needs one of amplitude"):
+        plot(results.forced(Omega=OMEGA)[["outcome"]])
+
+
+def test_unknown_analysis_is_an_input_error():
+    with pytest.raises(InputError, match="analysis = 'lyapunov': allowed is one of floquet, forced"):
+        plot(results.forced(Omega=OMEGA).assign_attrs(analysis="lyapunov"))

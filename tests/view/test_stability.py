@@ -1,0 +1,218 @@
+"""Stability charts: what is drawn is what is stored."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import matplotlib
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.collections import PolyCollection, QuadMesh
+from matplotlib.colors import to_hex
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import cells, plot
+from drivetrain_jax.view.style import STATE_COLOURS
+from tests.view import results
+
+
+def meshes(figure) -> list[QuadMesh]:
+    return [artist for axes in panels(figure) for artist in axes.collections if isinstance(artist, QuadMesh)]
+
+
+def panels(figure) -> list:
+    """Axes that are no colour bars."""
+    return [axes for axes in figure.axes if axes.get_label() != "colour bar"]
+
+
+def texts(figure) -> list[str]:
+    return [text.get_text().replace("\n", " ") for text in figure.texts]
+
+
+def legend(figure) -> list[str]:
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_chart_draws_every_cell_in_its_state():
+    dataset = results.chart()
+    figure = plot(dataset)
+    drawn = meshes(figure)[0].get_array()
+    beta, omega = dataset.beta.values, dataset.Omega.values
+    expected = results.unstable(beta[:, None], omega[None]).sum()
+    assert drawn.shape == (21, 41)
+    assert [(drawn == code).sum() for code in range(4)] == [21 * 41 - expected - 3, expected, 2, 1]
+    colours = meshes(figure)[0].to_rgba(np.arange(4.0))
+    assert tuple(to_hex(colour) for colour in colours) == STATE_COLOURS
+
+
+def test_speed_is_horizontal_whatever_the_order_of_the_axes():
+    straight, swapped = (
+        plot(results.chart().transpose(*order, ...)) for order in (("beta", "Omega"), ("Omega", "beta"))
+    )
+    np.testing.assert_array_equal(meshes(straight)[0].get_array(), meshes(swapped)[0].get_array())
+    assert "speed ($\\Omega$) [1]" in texts(swapped)
+    assert "joint angle ($\\beta$) [rad]" in texts(swapped)
+
+
+def test_growth_map_shows_the_logarithm_and_masks_failed_cells():
+    growth = meshes(plot(results.chart()))[1].get_array()
+    assert np.ma.getmaskarray(growth)[1, 0]
+    assert np.ma.getmaskarray(growth).sum() == 1
+    np.testing.assert_allclose(sorted(set(growth.compressed())), np.log10([0.99, 1.0, 1.25]), atol=1e-15)
+
+
+def test_colours_of_growth_darken_all_the_way():
+    dataset = results.chart()
+    mesh = meshes(plot(dataset))[1]
+    rgb = mesh.to_rgba(np.linspace(mesh.norm.vmin, mesh.norm.vmax, 400))[:, :3]
+    lightness = rgb @ [0.2126, 0.7152, 0.0722]
+    assert (np.diff(lightness) <= 1e-9).all()
+    assert lightness[0] - lightness[-1] > 0.8
+
+
+def test_marginal_cells_do_not_look_unstable():
+    """rho = 1 + rounding, as without damping, has the colour of rho = 1."""
+    dataset = results.chart()
+    dataset["spectral_radius"] = xr.where(dataset.spectral_radius < 1, 1 + 1e-12, dataset.spectral_radius)
+    dataset.spectral_radius.attrs["long_name"] = "spectral radius"
+    mesh = meshes(plot(dataset))[1]
+    np.testing.assert_allclose(mesh.to_rgba(np.log10(1 + 1e-12)), mesh.to_rgba(0.0), atol=0.01)
+
+
+def test_only_stored_variables_get_a_panel():
+    assert len(meshes(plot(results.chart().drop_vars("verdict")))) == 1
+    assert len(meshes(plot(results.chart()[["verdict", "outcome"]]))) == 1
+    with pytest.raises(
+        InputError, match="outputs = outcome: nothing to plot; the figure needs verdict or spectral_radius"
+    ):
+        plot(results.chart()[["outcome"]])
+
+
+def test_legend_counts_what_must_not_be_overlooked():
+    assert legend(plot(results.chart()))[:4] == ["stable", "unstable", "undecided (2)", "failed (1)"]
+    clean = results.grid(np.zeros((2, 3), int), "beta", "Omega")
+    assert legend(plot(results.with_axes(clean, beta=np.arange(2.0), Omega=np.arange(1.0, 4)))) == [
+        "stable",
+        "unstable",
+    ]
+
+
+def test_title_and_fixed_parameters():
+    assert {"A tongue", r"$\zeta$ = 0.001, $\gamma$ = 100"} <= set(texts(plot(results.chart())))
+
+
+def test_predicted_lines_inside_the_chart_without_difference_combinations():
+    axes = panels(plot(results.chart()))[0]
+    assert sorted(line.get_xdata()[0] for line in axes.lines) == [0.7, 1.0, 1.02]
+    assert [text.get_text() for text in axes.texts] == ["$H_{21}$", "$S_{21}$", "$C^{+}_{1}$"]
+
+
+def test_labels_of_close_lines_are_kept_apart():
+    axes = panels(plot(results.chart()))[0]
+    across = sorted(text.xy[0] * 72 / axes.figure.dpi + text.xyann[0] for text in axes.texts)
+    assert np.diff(across).min() > 14
+
+
+def test_predictions_that_depend_on_the_other_axis_are_curves_labelled_where_they_leave():
+    mu, omega = np.linspace(1, 4, 7), np.linspace(0.5, 2.0, 16)
+    dataset = results.with_axes(results.grid(np.zeros((7, 16), int), "mu", "Omega"), mu=mu, Omega=omega)
+    dataset = results.with_resonances(dataset, S21=1.2 * np.sqrt(mu), H21=0.6 * np.sqrt(mu))
+    axes = panels(plot(dataset))[0]
+    low, _ = axes.lines
+    np.testing.assert_array_equal(low.get_ydata(), mu)
+    np.testing.assert_allclose(low.get_xdata(), 1.2 * np.sqrt(mu))
+    assert axes.get_xlim() == pytest.approx((0.45, 2.05))
+    assert axes.get_ylim() == pytest.approx((0.75, 4.25))
+    sides = {text.get_text(): text.get_ha() for text in axes.texts}
+    assert sides == {"$H_{21}$": "center", "$S_{21}$": "left"}
+
+
+def test_one_axis_gives_radius_error_band_limit_and_verdict():
+    omega = np.linspace(0.5, 1.5, 101)
+    code = results.unstable(0.5, omega).astype(int)
+    dataset = results.with_axes(results.grid(code, "Omega"), Omega=omega)
+    axes = panels(plot(dataset))[0]
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), dataset.spectral_radius)
+    assert list(axes.lines[1].get_ydata()) == [1, 1]
+    (band,) = (
+        artist for artist in axes.collections if isinstance(artist, PolyCollection) and not isinstance(artist, QuadMesh)
+    )
+    heights = band.get_paths()[0].vertices[:, 1]
+    assert (heights.min(), heights.max()) == pytest.approx((0.989, 1.251))
+    (strip,) = (artist for artist in axes.collections if isinstance(artist, QuadMesh))
+    assert (strip.get_array() == cells.UNSTABLE).sum() == code.sum()
+
+
+def test_axis_of_one_value_counts_as_fixed():
+    omega = np.linspace(0.5, 1.5, 11)
+    dataset = results.grid(np.zeros((1, 11), int), "beta", "Omega")
+    figure = plot(results.with_axes(dataset, beta=np.array([0.3]), Omega=omega))
+    assert len(panels(figure)[0].lines[0].get_xdata()) == 11
+    assert r"$\zeta$ = 0.001, $\gamma$ = 100, $\beta$ = 0.3 rad" in texts(figure)
+
+
+def test_four_axes_give_nine_slices():
+    mu, alpha = np.array([0.5, 1, 2, 4, 8]), np.linspace(0, 20, 5)
+    beta, omega = np.linspace(0, 1, 12), np.linspace(0.5, 1.5, 40)
+    code = np.zeros((12, 40, 5, 5), int)
+    code[..., 2, 4] = 1
+    dataset = results.grid(code, "beta", "Omega", "mu", "alpha")
+    dataset = results.with_axes(dataset, beta=beta, Omega=omega, mu=mu, alpha=alpha)
+    dataset = results.with_resonances(dataset, S21=np.sqrt(mu))
+    figure = plot(dataset)
+    titles = [axes.get_title() for axes in panels(figure)]
+    assert titles == [rf"$\mu$ = {m}, $\alpha$ = {a}" for a in (0, 10, 20) for m in (0.5, 2, 8)]
+    assert [int((mesh.get_array() == 1).sum()) for mesh in meshes(figure)] == [0] * 7 + [480, 0]
+    labelled = [[line.get_xdata()[0] for line in axes.lines] for axes in panels(figure)]
+    assert labelled == [pytest.approx([np.sqrt(m)]) if 0.5 <= np.sqrt(m) <= 1.5 else [] for m in (0.5, 2, 8)] * 3
+
+
+def test_points_are_drawn_by_verdict():
+    code = np.array([0, 1, 1, 2, 3, 0])
+    dataset = results.grid(code, "point").assign_coords(
+        beta=("point", np.arange(6.0), {"units": "rad", "long_name": "joint angle"}),
+        Omega=("point", np.arange(1.0, 7), {"units": "1", "long_name": "speed"}),
+        mu=("point", np.ones(6)),
+    )
+    figure = plot(dataset)
+    offsets = [artist.get_offsets().tolist() for artist in panels(figure)[0].collections]
+    assert offsets == [[[1, 0], [6, 5]], [[2, 1], [3, 2]], [[4, 3]], [[5, 4]]]
+    assert legend(figure) == ["stable (2)", "unstable (2)", "undecided (1)", "failed (1)"]
+
+
+def test_points_along_one_parameter_are_a_curve():
+    dataset = results.grid(np.array([0, 1, 0]), "point").assign_coords(
+        Omega=("point", [3.0, 1.0, 2.0], {"units": "1", "long_name": "speed"}), beta=("point", [0.3, 0.3, 0.3])
+    )
+    line = panels(plot(dataset))[0].lines[0]
+    assert list(line.get_xdata()) == [1, 2, 3]
+    assert list(line.get_ydata()) == [1.25, 0.99, 0.99]
+
+
+def test_single_point_shows_its_multipliers():
+    values = np.array([-1.1, 0.8 + 0.5j, 0.8 - 0.5j, -0.9])
+    point = xr.Dataset(
+        {"floquet_multiplier": ("multiplier", values), "outcome": ((), np.int8(0))}, attrs={"analysis": "floquet"}
+    )
+    circle, dots = panels(plot(point))[0].lines
+    np.testing.assert_allclose(np.hypot(circle.get_xdata(), circle.get_ydata()), 1)
+    np.testing.assert_array_equal(dots.get_xdata() + 1j * dots.get_ydata(), values)
+    with pytest.raises(InputError, match="needs floquet_multiplier"):
+        plot(point.rename(floquet_multiplier="liouville_residual"))
+
+
+def test_global_matplotlib_state_is_untouched():
+    before = dict(matplotlib.rcParams)
+    plot(results.chart())
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_figures_need_neither_jax_nor_pyplot():
+    code = (
+        "import sys; from drivetrain_jax.view import plot, stability, response; "
+        "print(sorted({'jax', 'matplotlib.pyplot', 'drivetrain_jax.systems'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
