@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def progress_line() -> Iterator[Callable[[Progress], None]]:
-    """A bar that the yielded function moves. It grows with the predicted cost, which makes the time left a fair guess."""
+    """A bar that the yielded function moves. It grows with the predicted cost, so the time left is a fair guess."""
     columns = (
         BarColumn(),
         TextColumn("{task.fields[counts]}"),

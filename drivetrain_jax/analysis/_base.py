@@ -53,8 +53,7 @@ class Solver:
     results then carry the batch as their LAST axis. The values of a path axis arrive as a whole, shape ``(L,)``.
     ``effort`` is a traced integer, the largest that ``effort(columns)`` predicts in the batch (columns: NumPy arrays
     of shape ``(N,)``; a count of steps or the like). The engine gives every point to the solver for which
-    ``effort * unit_cost`` is smallest and runs batches of ``chunk`` points of similar effort. A solver that calls LAPACK
-    must not be ``concurrent``: such calls from several kernels can wait for each other for ever in XLA's thread pool.
+    ``effort * unit_cost`` is smallest and runs batches of ``chunk`` points of similar effort.
     """
 
     name: str
@@ -63,7 +62,6 @@ class Solver:
     unit_cost: float = 1.0
     broadcasts: bool = False
     chunk: int = 256
-    concurrent: bool = True
 
 
 @dataclass(frozen=True)

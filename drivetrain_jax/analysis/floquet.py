@@ -98,7 +98,7 @@ def _explicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: fl
 def _implicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
     """Panels of the implicit scheme: it must resolve what oscillates, whereas decay costs it nothing."""
     explicit = _explicit_effort(system, columns, rtol)
-    effort = np.full(explicit.shape, 2**31 - 2, np.int64)
+    effort = np.full(explicit.shape, np.inf)
     stiff = np.flatnonzero(explicit > _STIFF)
     if stiff.size:
         chosen = {name: np.broadcast_to(column, explicit.shape)[stiff] for name, column in columns.items()}
@@ -129,7 +129,7 @@ def _direct_solvers(system: System, request: Request) -> tuple[Solver, ...]:
             lambda values, effort: solve(values, effort, True),
             lambda columns: _explicit_effort(system, columns, rtol),
             broadcasts=True,
-            chunk=1024,
+            chunk=512,
         ),
         Solver(
             "direct: Radau IIA of 8 stages",
@@ -173,7 +173,6 @@ def _diffrax_solvers(system: System, request: Request) -> tuple[Solver, ...]:
             solve,
             lambda columns: _explicit_effort(system, columns, rtol),
             chunk=256,
-            concurrent=not isinstance(method, diffrax.AbstractImplicitSolver),
         ),
     )
 

@@ -81,9 +81,8 @@ def hessenberg(a: Array) -> Array:
     return a
 
 
-def _pair(h: list[list[Complex]], m: int) -> tuple[Complex, Complex]:
-    """Eigenvalues of the trailing 2x2 block that ends at index ``m``; the second is the nearer to ``h[m][m]``."""
-    a, b, c, d = h[m - 1][m - 1], h[m - 1][m], h[m][m - 1], h[m][m]
+def _pair(a: Complex, b: Complex, c: Complex, d: Complex) -> tuple[Complex, Complex]:
+    """Eigenvalues of [[a, b], [c, d]]; the second is the nearer to ``d``."""
     half = ((a[0] - d[0]) / 2, (a[1] - d[1]) / 2)
     off, square = _multiply(b, c), _multiply(half, half)
     root = _square_root((square[0] + off[0], square[1] + off[1]))
@@ -95,32 +94,37 @@ def _pair(h: list[list[Complex]], m: int) -> tuple[Complex, Complex]:
     return (d[0] + far[0], d[1] + far[1]), (d[0] - quotient[0], d[1] - quotient[1])
 
 
-def _sweep(h: list[list[Complex]], m: int, shift: Complex) -> list[list[Complex]]:
-    """One QR step on the leading block up to index ``m``."""
-    h = [list(row) for row in h]
-    for i in range(m + 1):
-        h[i][i] = (h[i][i][0] - shift[0], h[i][i][1] - shift[1])
+def _entry(h: Complex, i: int, j: int) -> Complex:
+    return h[0][i, j], h[1][i, j]
+
+
+def _add_to_diagonal(h: Complex, shift: Complex, sign: float) -> Complex:
+    eye = jnp.eye(h[0].shape[0]).reshape(*h[0].shape[:2], *(1,) * (h[0].ndim - 2))
+    return h[0] + sign * eye * shift[0], h[1] + sign * eye * shift[1]
+
+
+def _sweep(h: Complex, shift: Complex) -> Complex:
+    """One QR step: the rotations that make ``h - shift`` triangular, applied from both sides."""
+    h = _add_to_diagonal(h, shift, -1.0)
+    n = h[0].shape[0]
+    rows: list[Complex] = [(h[0][i], h[1][i]) for i in range(n)]
     rotations = []
-    for k in range(m):
-        a, b = h[k][k], h[k + 1][k]
+    for k in range(n - 1):
+        x, y = rows[k], rows[k + 1]
+        a, b = (x[0][k], x[1][k]), (y[0][k], y[1][k])
         norm = jnp.sqrt(a[0] ** 2 + a[1] ** 2 + b[0] ** 2 + b[1] ** 2)
-        safe = jnp.where(norm > 0, norm, 1.0)
-        c, s = (jnp.where(norm > 0, a[0] / safe, 1.0), a[1] / safe), (b[0] / safe, b[1] / safe)
+        scale = jnp.where(norm > 0, 1 / jnp.where(norm > 0, norm, 1.0), 0.0)
+        c, s = (jnp.where(norm > 0, a[0] * scale, 1.0), a[1] * scale), (b[0] * scale, b[1] * scale)
         rotations.append((c, s))
-        for j in range(k, m + 1):
-            x, y = h[k][j], h[k + 1][j]
-            p, q = _conjugate_multiply(c, x), _conjugate_multiply(s, y)
-            u, w = _multiply(c, y), _multiply(s, x)
-            h[k][j], h[k + 1][j] = (p[0] + q[0], p[1] + q[1]), (u[0] - w[0], u[1] - w[1])
+        p, q, u, w = _conjugate_multiply(c, x), _conjugate_multiply(s, y), _multiply(c, y), _multiply(s, x)
+        rows[k], rows[k + 1] = (p[0] + q[0], p[1] + q[1]), (u[0] - w[0], u[1] - w[1])
+    re, im = (jnp.stack([row[part] for row in rows]) for part in (0, 1))
+    columns: list[Complex] = [(re[:, j], im[:, j]) for j in range(n)]
     for k, (c, s) in enumerate(rotations):
-        for i in range(min(k + 2, m + 1)):
-            x, y = h[i][k], h[i][k + 1]
-            p, q = _multiply(x, c), _multiply(y, s)
-            u, w = _conjugate_multiply(c, y), _conjugate_multiply(s, x)
-            h[i][k], h[i][k + 1] = (p[0] + q[0], p[1] + q[1]), (u[0] - w[0], u[1] - w[1])
-    for i in range(m + 1):
-        h[i][i] = (h[i][i][0] + shift[0], h[i][i][1] + shift[1])
-    return h
+        x, y = columns[k], columns[k + 1]
+        p, q, u, w = _multiply(x, c), _multiply(y, s), _conjugate_multiply(c, y), _conjugate_multiply(s, x)
+        columns[k], columns[k + 1] = (p[0] + q[0], p[1] + q[1]), (u[0] - w[0], u[1] - w[1])
+    return _add_to_diagonal(tuple(jnp.stack([x[part] for x in columns], axis=1) for part in (0, 1)), shift, 1.0)
 
 
 def _size(a: Complex) -> Array:
@@ -132,26 +136,30 @@ def eigenvalues(a: Array) -> tuple[Array, Array]:
 
     Lanes that are not finite give NaN and do not hold up the others.
     """
-    n = a.shape[0]
     reduced = hessenberg(a)
-    zero = jnp.zeros(a.shape[2:])
-    h = [[(reduced[i, j] if i <= j + 1 else zero, zero) for j in range(n)] for i in range(n)]
+    h = (reduced, jnp.zeros_like(reduced))
     found: list[Complex] = []
-    for m in range(n - 1, 1, -1):
-
-        def coupled(state: tuple, m: int = m) -> Array:
-            count, h = state
-            loose = _size(h[m][m - 1]) > _EPS * (_size(h[m][m]) + _size(h[m - 1][m - 1]))
-            return (count < _MAX_SWEEPS) & jnp.any(loose)
-
-        def step(state: tuple, m: int = m) -> tuple:
-            count, h = state
-            shift = _pair(h, m)[1]
-            # Every tenth sweep an arbitrary shift breaks a cycle.
-            kick = jnp.where(count % 10 == 9, 0.75, 0.0) * _size(h[m][m - 1])
-            return count + 1, _sweep(h, m, (shift[0] + kick, shift[1] - kick / 2))
-
-        _, h = jax.lax.while_loop(coupled, step, (jnp.int32(0), h))
-        found.append(h[m][m])
-    found += _pair(h, 1) if n > 1 else [h[0][0]]
+    while h[0].shape[0] > 2:
+        h = _deflate(h)
+        found.append(_entry(h, -1, -1))
+        h = (h[0][:-1, :-1], h[1][:-1, :-1])
+    found += _pair(*(_entry(h, i, j) for i in (0, 1) for j in (0, 1))) if h[0].shape[0] == 2 else [_entry(h, 0, 0)]
     return jnp.stack([x for x, _ in found]), jnp.stack([y for _, y in found])
+
+
+def _deflate(h: Complex) -> Complex:
+    """QR steps until the last row of every lane is decoupled."""
+
+    def coupled(state: tuple) -> Array:
+        count, h = state
+        loose = _size(_entry(h, -1, -2)) > _EPS * (_size(_entry(h, -1, -1)) + _size(_entry(h, -2, -2)))
+        return (count < _MAX_SWEEPS) & jnp.any(loose)
+
+    def step(state: tuple) -> tuple:
+        count, h = state
+        shift = _pair(*(_entry(h, i, j) for i in (-2, -1) for j in (-2, -1)))[1]
+        # Every tenth sweep an arbitrary shift breaks a cycle.
+        kick = jnp.where(count % 10 == 9, 0.75, 0.0) * _size(_entry(h, -1, -2))
+        return count + 1, _sweep(h, (shift[0] + kick, shift[1] - kick / 2))
+
+    return jax.lax.while_loop(coupled, step, (jnp.int32(0), h))[1]

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.propagator import matmul
+from drivetrain_jax.analysis.linear_algebra import matmul
 
 VERDICTS = ("stable", "unstable", "undecided")
 

@@ -25,7 +25,7 @@ Arrays = Mapping[str, np.ndarray]
 
 
 class Part:
-    """Finished chunks: their numbers, how many points each has, results with the points as first axis, seconds spent."""
+    """Finished chunks: their numbers, how many points each has, results (points first), seconds spent."""
 
     def __init__(self, chunks: Sequence[int], sizes: Sequence[int], results: Arrays, seconds: float) -> None:
         self.chunks = np.asarray(chunks, np.int64)
@@ -59,7 +59,7 @@ class Part:
 
 
 class PartsFolder:
-    """The parts of the result ``out``. Writing needs the folder to be open (``open`` .. ``close``), reading does not."""
+    """The parts of the result ``out``. Writing needs the folder to be open (``open``, ``close``), reading does not."""
 
     def __init__(self, out: Path) -> None:
         self.path = out.with_name(out.name + ".parts")

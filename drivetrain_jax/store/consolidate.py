@@ -12,7 +12,7 @@ from drivetrain_jax.store.files import write_atomic
 
 
 def write_result(dataset: xr.Dataset, path: Path, temporary: Path) -> None:
-    """Write ``dataset`` to ``path`` in one step; ``temporary`` is where it grows. A full disk leaves ``path`` as it was.
+    """Write ``dataset`` to ``path`` in one step; ``temporary`` is where it grows. A full disk leaves ``path`` alone.
 
     The file is made in memory first: HDF5 may crash the process when a disk fills up under it.
     """

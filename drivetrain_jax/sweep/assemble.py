@@ -81,7 +81,7 @@ def bytes_per_point(scene: Scene) -> int:
 
 
 def to_dataset(scene: Scene, grid: Grid, table: Table, attrs: Mapping[str, str | float]) -> xr.Dataset:
-    """The labelled result: dimensions are the axes in the order of the scene (or ``point``), then those of the variable."""
+    """The labelled result: dimensions are the axes in scene order (or ``point``), then those of the variable."""
     sweep_dims = ("point",) if scene.zipped else tuple(axis.name for axis in scene.axes)
     results = [(v, _reshaped(scene, grid, table[v.name])) for v in table.variables]
     coordinates = [*_axis_coordinates(scene), *_resonances(scene)]

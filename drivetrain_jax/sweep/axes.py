@@ -36,6 +36,7 @@ class Axis:
 
     @property
     def long_name(self) -> str:
+        """Long name of the parameter, with the position of a swept entry."""
         label = self.parameter.long_name
         return label if self.entry is None else f"{label}, entry {self.entry}"
 

@@ -33,14 +33,17 @@ class Engine:
 
     @cached_property
     def numerics(self) -> str:
+        """Digest of the code and the machine that compute."""
         return numerics(self.scene)
 
     @cached_property
     def digest(self) -> str:
+        """Digest of everything that decides the result."""
         return scene_digest(self.scene, self.solvers, self.numerics)
 
     @cached_property
     def plan(self) -> Plan:
+        """Solver and chunk of every point."""
         return make_plan(self.solvers, self.grid)
 
     @property
@@ -52,10 +55,7 @@ class Engine:
         """Results of the chunks with these numbers, the costliest first; each as soon as it is there."""
         costs = self.plan.costs
         ordered = sorted(numbers, key=lambda number: -costs[number])
-        groups = {self.plan.chunk(number).group for number in ordered}
-        kernels = self._compile(groups)
-        if not all(self.plan.groups[index].solver.concurrent for index in groups):
-            workers = 1
+        kernels = self._compile({self.plan.chunk(number).group for number in ordered})
 
         def work(chunk: Chunk) -> dict[str, np.ndarray]:
             try:

@@ -40,6 +40,7 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, ...]:
+        """Lengths of the axes; one length if they are zipped."""
         lengths = tuple(len(axis.values) for axis in self.axes)
         return lengths[:1] if self.zipped else lengths
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +18,8 @@ from drivetrain_jax.analysis import Solver
 from drivetrain_jax.store.provenance import instruction_set
 from drivetrain_jax.sweep.grid import Grid
 
+_LAPACK = threading.Lock()
+
 
 @dataclass(frozen=True)
 class Kernel:
@@ -25,15 +29,17 @@ class Kernel:
     chunk: int
     batch_last: bool
     variables: tuple[Variable, ...]
+    turn: AbstractContextManager[object]
 
     def __call__(self, columns: Mapping[str, np.ndarray], effort: int) -> dict[str, np.ndarray]:
         """Results of up to ``chunk`` points, the points as first axis; a short chunk is padded with its last point."""
         count = len(next(iter(columns.values()))) if columns else self.chunk
         padded = {name: np.pad(values, (0, self.chunk - count), mode="edge") for name, values in columns.items()}
-        results = self.compiled(padded, np.int64(effort))
+        with self.turn:
+            results = {name: np.asarray(value) for name, value in self.compiled(padded, np.int64(effort)).items()}
         arrays = {}
         for variable in self.variables:
-            values = np.asarray(results[variable.name])
+            values = results[variable.name]
             values = np.moveaxis(values, -1, 0) if self.batch_last else values
             arrays[variable.name] = np.ascontiguousarray(values[:count], dtype=variable.dtype)
         return arrays
@@ -58,7 +64,14 @@ def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[V
     batch = whole if solver.broadcasts else jax.vmap(one, in_axes=(0, None), axis_size=chunk)
     columns = {axis.name: jax.ShapeDtypeStruct((chunk,), axis.values.dtype) for axis in grid.axes}
     lowered = jax.jit(batch).lower(columns, jax.ShapeDtypeStruct((), np.int64))
-    return Kernel(lowered.compile(_compiler_options()), chunk, solver.broadcasts, tuple(variables))
+    compiled = lowered.compile(_compiler_options())
+    return Kernel(compiled, chunk, solver.broadcasts, tuple(variables), _turn(compiled))
+
+
+def _turn(compiled: Any) -> AbstractContextManager[object]:
+    """What a call has to hold while it runs: LAPACK calls of XLA hand work to the thread pool that they run in and wait
+    for it, so that two kernels which make them can wait for each other for ever (seen with jax 0.10.2 on two cores)."""
+    return _LAPACK if 'custom_call_target="lapack_' in compiled.as_text() else nullcontext()
 
 
 def _compiler_options() -> dict[str, Any] | None:

@@ -13,7 +13,8 @@ from drivetrain_jax.sweep.grid import Grid
 # Points whose effort is predicted at a time.
 _BLOCK = 1 << 18
 _MAX_EFFORT = 2**31 - 1
-# Small scenes are cut into at least this many chunks per solver. Not the number of cores: numbers must not depend on it.
+# Small scenes are cut into at least this many chunks per solver. It is not the number of cores: bits must not depend
+# on that.
 _MIN_CHUNKS = 2
 _LANES = 16
 
@@ -65,7 +66,7 @@ class Plan:
 
 
 def chunk_size(largest: int, count: int) -> int:
-    """Points per chunk for ``count`` points, at most ``largest``: fewer in small scenes, so that all cores have work."""
+    """Points per chunk for ``count`` points, at most ``largest``; fewer in small scenes, to give all cores work."""
     if count <= _LANES:
         return min(largest, 1 << (count - 1).bit_length())
     share = -(-count // _MIN_CHUNKS)

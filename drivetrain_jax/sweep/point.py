@@ -122,7 +122,7 @@ def point(system: str, analysis: str, *, outputs: Sequence[str] | None = None, *
 
 
 def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """The scene of one point. Numbers vary, so that another point needs no new compilation; words and lists are fixed."""
+    """The scene of one point. Numbers vary, so that the next one needs no compilation; words and lists are fixed."""
     system, analysis = system_and_analysis(system_name, analysis_name)
     parameters = {p.name: p for p in system.parameters}
     tree: dict[str, Any] = {"system": system_name, "analysis": analysis_name, "points": {}, "fixed": {}, "options": {}}

@@ -23,7 +23,7 @@ from drivetrain_jax.sweep.plan import Chunk
 from drivetrain_jax.sweep.scene import load_scene
 from drivetrain_jax.sweep.target import Target
 
-# Finished chunks are written together at most this often (seconds): small ones would cost more to write than to compute.
+# Finished chunks are written together, this often (seconds): small ones would cost more to write than to compute.
 _WRITE_INTERVAL = 0.25
 
 
@@ -136,9 +136,8 @@ def _engine(
     engine = Engine(checked)
     needed, present = engine.total * bytes_per_point(checked), physical_memory()
     if needed > present:
-        raise InputError(
-            f"axes: {engine.total} points need {needed / 1e9:.0f} GB of memory; allowed here is up to {present / 1e9:.0f} GB"
-        )
+        limit = f"allowed here is up to {present / 1e9:.0f} GB"
+        raise InputError(f"axes: {engine.total} points need {needed / 1e9:.0f} GB of memory; {limit}")
     return engine
 
 
@@ -241,7 +240,7 @@ def _dataset(engine: Engine, table: Table, seconds: float) -> xr.Dataset:
 
 @dataclass(frozen=True)
 class Status:
-    """How much of a scene is at ``out``: counts of points, and absent, partial, complete or stale (of another scene)."""
+    """How much of a scene is at ``out``: counts of points, and absent, partial, complete or stale (another scene)."""
 
     total: int
     done: int

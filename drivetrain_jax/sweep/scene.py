@@ -1,4 +1,4 @@
-"""A scene: which system, which analysis, which parameters vary and how. Complete and checked before anything is compiled."""
+"""A scene: which system, which analysis, which parameters vary and how. Checked before anything is compiled."""
 
 from __future__ import annotations
 

@@ -35,6 +35,7 @@ class Target:
 
     @cached_property
     def state(self) -> str:
+        """See the class."""
         if self.present == self.digest:
             return "complete"
         if self.parts.holds_work():

@@ -58,3 +58,12 @@ def test_cache_is_off_if_unwanted_or_impossible(tmp_path, setting):
         (tmp_path / "file").touch()
         setting = str(tmp_path / "file")
     assert folder_used(DRIVETRAIN_JAX_CACHE=setting, XDG_CACHE_HOME=str(tmp_path)) == "None"
+
+
+def test_kernels_with_lapack_calls_take_turns():
+    """Two of them at a time can wait for each other for ever."""
+    matrix = jax.ShapeDtypeStruct((8, 4, 4), float)
+    with_lapack = jax.jit(jnp.linalg.eigvals).lower(matrix).compile()
+    without = jax.jit(jnp.sin).lower(matrix).compile()
+    assert kernel._turn(with_lapack) is kernel._turn(with_lapack) is kernel._LAPACK
+    assert kernel._turn(without) is not kernel._LAPACK

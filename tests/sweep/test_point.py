@@ -19,7 +19,7 @@ def test_results_by_attribute_and_name():
     assert result.outcome == 0 and result.outcome.has_value and list(result) == ["value", "wave", "sign"]
     assert result.parameters["b"] == 2.0 and result.parameters["a"] == 1.0
     with pytest.raises(AttributeError, match="there is value, wave, sign"):
-        result.nothing
+        result.nothing  # noqa: B018
     with pytest.raises(AttributeError):
         result.value = 3
 
