@@ -1,0 +1,165 @@
+"""Both propagators on systems whose propagator is known in closed form."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import DOP853
+from scipy.linalg import expm
+
+from drivetrain_jax.analysis.direct import assemble
+from drivetrain_jax.analysis.propagator import (
+    EXPLICIT_ORDER,
+    IMPLICIT_ORDER,
+    Propagator,
+    explicit_propagator,
+    implicit_propagator,
+    radau_iia,
+)
+from drivetrain_jax.systems import LinearPeriodic
+
+SPAN = 2.0
+
+
+def rotating(rates: tuple[float, float]) -> LinearPeriodic:
+    """x' = (R' R^-1 + R D R^-1) x with the rotation R by sin(t) and D = diag(rates): Phi = R(SPAN) e^(D SPAN) R(0)^-1."""
+    mean, half = (rates[0] + rates[1]) / 2, (rates[0] - rates[1]) / 2
+
+    def rows(t):
+        cosine, sine = jnp.cos(2 * jnp.sin(t)), jnp.sin(2 * jnp.sin(t))
+        turn = jnp.cos(t)
+        return (mean + half * cosine, half * sine - turn), (half * sine + turn, mean - half * cosine)
+
+    return LinearPeriodic(rows, SPAN)
+
+
+def rotating_exactly(rates: tuple[float, float]) -> np.ndarray:
+    angle = math.sin(SPAN)
+    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    return rotation @ np.diag(np.exp(np.array(rates) * SPAN))
+
+
+def constant(a: np.ndarray, span: float = 1.0) -> LinearPeriodic:
+    return LinearPeriodic(lambda t: tuple(tuple(float(x) + 0 * t for x in row) for row in a), span)
+
+
+def full(propagator: Propagator) -> np.ndarray:
+    return np.asarray(propagator.matrix * jnp.exp(propagator.log_scale))
+
+
+def explicit(system: LinearPeriodic):
+    return jax.jit(lambda steps: explicit_propagator(system, steps, ()))
+
+
+def implicit(system: LinearPeriodic):
+    return jax.jit(lambda steps: implicit_propagator(system, steps))
+
+
+def measured_orders(propagate, exact: np.ndarray, steps: list[int]) -> np.ndarray:
+    errors = np.array([np.abs(full(propagate(jnp.int32(n))) - exact).max() for n in steps])
+    assert errors.min() > 1e-13, errors
+    return np.diff(np.log(errors)) / -np.diff(np.log(steps))
+
+
+def test_explicit_scheme_converges_with_its_order():
+    rates = (-0.5, 1.5)
+    orders = measured_orders(explicit(rotating(rates)), rotating_exactly(rates), [2, 3, 4, 6])
+    assert EXPLICIT_ORDER == 8
+    assert (np.abs(orders[1:] - EXPLICIT_ORDER) < 0.8).all(), orders
+
+
+def test_implicit_scheme_keeps_its_order_on_a_stiff_problem():
+    """The stage order 8 is what is left of the classical 15, and the error estimate of ``compare`` rests on it."""
+    rates = (-1e5, 0.5)
+    propagate, exact = implicit(rotating(rates)), rotating_exactly(rates)
+    assert IMPLICIT_ORDER == 8
+    orders = measured_orders(propagate, exact, [3, 4, 6, 8])
+    assert orders[-1] == pytest.approx(IMPLICIT_ORDER, abs=0.1), orders
+    for n in (1, 2, 3, 4):
+        coarse, fine = full(propagate(jnp.int32(n))), full(propagate(jnp.int32(2 * n)))
+        bound = 4 * np.abs(fine - coarse).max() / (2**IMPLICIT_ORDER - 1)
+        assert np.abs(fine - exact).max() <= bound
+
+
+def test_explicit_scheme_is_one_step_of_dop853():
+    """Stage by stage the tableau of SciPy, which has its own stepping."""
+    rates = (-0.5, 1.5)
+    field = rotating(rates).matrix
+    a, b, c, k = DOP853.A, DOP853.B, DOP853.C, []
+    for i in range(len(b)):
+        state = np.eye(2) + SPAN * sum((a[i, j] * k[j] for j in range(i)), np.zeros((2, 2)))
+        k.append(np.asarray(field(SPAN * c[i])) @ state)
+    expected = np.eye(2) + SPAN * sum(w * x for w, x in zip(b, k, strict=True))
+    np.testing.assert_allclose(full(explicit(rotating(rates))(jnp.int32(1))), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("decay", [1e2, 1e5, 1e8, 1e12])
+def test_implicit_scheme_is_l_stable(decay):
+    """What decays at once must be gone after one panel, not stay with modulus one as in a symmetric scheme."""
+    system = LinearPeriodic(lambda t: ((-decay + 0 * t, 0), (0, -1.0 + 0 * t)), 1.0)
+    phi = full(implicit_propagator(system, jnp.int32(1)))
+    assert abs(phi[0, 0]) <= 10 / decay
+    assert phi[1, 1] == pytest.approx(math.exp(-1), rel=1e-14)
+
+
+@pytest.mark.parametrize("n", [1, 4])
+def test_constant_coefficients(n):
+    a = 2 * np.random.default_rng(n).standard_normal((n, n))
+    expected = expm(a)
+    for propagator in (
+        explicit_propagator(constant(a), jnp.int32(40), ()),
+        implicit_propagator(constant(a), jnp.int32(4)),
+    ):
+        np.testing.assert_allclose(full(propagator), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_batch_and_structural_zeros():
+    """An oscillator of many frequencies; lanes do not know of each other, zeros may be the integer 0."""
+    frequency = np.linspace(0.5, 3.0, 7)
+    system = LinearPeriodic(lambda t: ((0, 1.0), (-(frequency**2), 0)), 1.3)
+    phi = full(explicit_propagator(system, jnp.int32(30), (7,)))
+    c, s = np.cos(1.3 * frequency), np.sin(1.3 * frequency)
+    np.testing.assert_allclose(phi, [[c, s / frequency], [-frequency * s, c]], rtol=0, atol=1e-12)
+
+
+def test_clock_functions_reach_the_rows():
+    """x' = cos(t) x through ``basis``; a wrong node would show at once."""
+    system = LinearPeriodic(lambda cosine: ((cosine,),), SPAN, basis=lambda t: (jnp.cos(t),))
+    for propagator in (explicit_propagator(system, jnp.int32(20), ()), implicit_propagator(system, jnp.int32(3))):
+        assert full(propagator).item() == pytest.approx(math.exp(math.sin(SPAN)), rel=1e-13)
+
+
+def test_log_scale_saves_what_underflows():
+    """e^-2000 is below the smallest float64; the ratio of the two decays survives beside the scale."""
+    system = LinearPeriodic(lambda t: ((-1000.0 + 0 * t, 0), (0, -1000.5 + 0 * t)), 2.0)
+    propagator = implicit_propagator(system, jnp.int32(2000))
+    assert float(jnp.exp(propagator.log_scale)) == 0
+    log_first = math.log(propagator.matrix[0, 0]) + float(propagator.log_scale)
+    log_second = math.log(propagator.matrix[1, 1]) + float(propagator.log_scale)
+    assert log_first == pytest.approx(-2000, rel=1e-12)
+    assert log_second - log_first == pytest.approx(-1, rel=1e-9)
+
+
+def test_radau_coefficients():
+    """Collocation: exact for polynomials up to the stage order; the last node is 1, the last row the quadrature weights."""
+    for stages in (2, 3, 8):
+        a, c = radau_iia(stages)
+        assert c[-1] == 1 and (np.diff(c) > 0).all() and c[0] > 0
+        for k in range(stages):
+            np.testing.assert_allclose(a @ c**k, c ** (k + 1) / (k + 1), rtol=1e-13, atol=1e-15)
+        for k in range(2 * stages - 1):
+            assert a[-1] @ c**k == pytest.approx(1 / (k + 1), rel=1e-13)
+    np.testing.assert_allclose(radau_iia(2)[0], [[5 / 12, -1 / 12], [3 / 4, 1 / 4]], rtol=1e-14)
+
+
+def test_half_period_is_completed_by_the_reversor():
+    """Mathieu's equation is even about the middle of its period: X Phi^T X Phi of a half has its multipliers."""
+    rows = lambda t: ((0, 1.0), (-(1.3 - 2 * 0.4 * jnp.cos(2 * t)), 0))  # noqa: E731
+    exchange = np.array([[0.0, 1.0], [1.0, 0.0]])
+    half, whole = LinearPeriodic(rows, math.pi / 2, reversor=exchange), LinearPeriodic(rows, math.pi)
+    z = [np.asarray(assemble(s, explicit_propagator(s, jnp.int32(60), ()))) for s in (half, whole)]
+    np.testing.assert_allclose(np.poly(z[0]), np.poly(z[1]), rtol=0, atol=1e-12)
