@@ -131,6 +131,7 @@ class SciPyPoints:
     rtol: float
 
     def __call__(self, columns: Columns) -> np.ndarray:
+        """Spectral radii of ``columns``."""
         points = ({name: column[i] for name, column in columns.items()} for i in range(columns["beta"].size))
         return np.array([spectral_radius(monodromy(p, self.method, self.rtol, self.rtol)) for p in points])
 
@@ -142,6 +143,7 @@ class SciPyStacked:
     rtol: float
 
     def __call__(self, columns: Columns) -> np.ndarray:
+        """Spectral radii of ``columns``."""
         return spectral_radius(stacked_monodromy(columns, self.rtol, self.rtol))
 
 
