@@ -3,8 +3,8 @@
 The propagator is computed with m, 2 m, 4 m, ... steps until two successive ones agree. With a scheme of order p the
 error of the finer one is their difference over 2^p - 1; four times that is taken as its bound, measured on the matrix
 and on the coefficients of its characteristic polynomial (the larger counts, so that no accidental zero deceives).
-The determinant is compared with Liouville's exact value, which notices an
-oscillation that both step sizes miss. All functions broadcast over a trailing batch.
+The determinant is compared with Liouville's exact value, which notices an oscillation that both step sizes miss. All
+functions broadcast over a trailing batch.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Monodromy(NamedTuple):
     """``Z = exp(log_scale) matrix`` (up to similarity), ``(n, n, ...)``.
 
     The coefficients a_k of ``matrix``'s characteristic polynomial are wrong by at most ``error`` times the k-th power of
-    its spectral radius; ``met`` says that this is the target or the limit of rounding. ``residual`` is det Z
-    minus its exact value (Liouville), in units of the n-th power of the spectral radius (a lower bound of it); 0 if unknown.
+    its spectral radius; ``met`` says that this is the target or the limit of rounding. ``residual`` is det Z minus its
+    exact value (Liouville) in units of the n-th power of a lower bound of the spectral radius; 0 if that is not known.
     """
 
     matrix: Array
@@ -41,9 +41,8 @@ class Monodromy(NamedTuple):
     residual: Array
 
 
-def assemble(system: LinearPeriodic, propagator: Propagator) -> Array:
-    """The monodromy matrix without its scale: ``Phi``, or ``X Phi^T X Phi`` for a half-period propagator."""
-    phi = propagator.matrix
+def assemble(system: LinearPeriodic, phi: Array) -> Array:
+    """The monodromy matrix, up to similarity, from the propagator over the span: ``Phi``, or ``X Phi^T X Phi``."""
     if system.reversor is None:
         return phi
     x = jnp.asarray(system.reversor).reshape(*system.reversor.shape, *(1,) * (phi.ndim - 2))
@@ -58,8 +57,8 @@ def compare(
     ``reduction`` is the error of ``coarse`` over that of ``fine``, less one.
     """
     halves = 1 if system.reversor is None else 2
-    change = fine.matrix - jnp.exp(coarse.log_scale - fine.log_scale) * coarse.matrix
-    z_fine, z_coarse = (assemble(system, fine._replace(matrix=m)) for m in (fine.matrix, fine.matrix - change))
+    z_fine = assemble(system, fine.matrix)
+    z_coarse = assemble(system, jnp.exp(coarse.log_scale - fine.log_scale) * coarse.matrix)
     a_fine, a_coarse = characteristic_coefficients(z_fine), characteristic_coefficients(z_coarse)
     scale = root_scale(a_fine)
     n = a_fine.shape[0]

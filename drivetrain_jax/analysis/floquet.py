@@ -57,21 +57,22 @@ def _results(z: Monodromy, outputs: tuple[str, ...], rtol: float) -> dict[str, A
     size = jnp.exp(z.log_scale)
     rho = jnp.max(jnp.hypot(real, imaginary), axis=0) * size
     results = {"spectral_radius": rho}
-    outcome = jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE)
+    outcome, met = jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE), z.met
     if "floquet_multiplier" in wanted:
         results["floquet_multiplier"] = sort_multipliers(real, imaginary) * size
     if "liouville_residual" in wanted:
         results["liouville_residual"] = jnp.where(finite, z.residual, jnp.nan)
     if wanted & _NEED_ERROR:
         error = spectral_radius_bound(real, imaginary, z.error) * size
-        outcome = jnp.where(finite & ~(error <= 10 * rtol * rho), Outcome.TOLERANCE_NOT_MET, outcome)
+        met = error <= 10 * rtol * rho
         results |= {"spectral_radius_error": error, "verdict": verdict(rho, error)}
+    outcome = jnp.where(finite & ~met, Outcome.TOLERANCE_NOT_MET, outcome)
     return {name: results[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}
 
 
 def _frequency_phase(form: LinearPeriodic, size: int) -> np.ndarray:
-    """int max |Im lambda(A(t))| dt over the span for ``size`` points, by Gauss quadrature with 12 nodes."""
-    nodes, weights = np.polynomial.legendre.leggauss(12)
+    """int max |Im lambda(A(t))| dt over the span for ``size`` points, by Gauss quadrature with 8 nodes."""
+    nodes, weights = np.polynomial.legendre.leggauss(8)
     samples = [np.asarray(form.matrix((x + 1) * form.span / 2)) for x in nodes]
     frequencies = [
         np.abs(np.linalg.eigvals(np.moveaxis(a.reshape(*a.shape[:2], -1), -1, 0)).imag).max(-1) for a in samples
