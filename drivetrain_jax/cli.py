@@ -6,7 +6,7 @@ import argparse
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -121,12 +121,17 @@ def _list(options: argparse.Namespace) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    # Stopped by a scheduler or by the keyboard: both leave the finished chunks behind.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    check = _stop_on_signals()
     from drivetrain_jax.sweep.run import Incomplete, Interrupted, run_to_file
 
     overrides = _assignments(options.set, "--set")
-    with _progress_line(options.quiet) as report:
+    with _progress_line(options.quiet) as show:
+
+        def report(progress: Any) -> None:
+            check()
+            if show:
+                show(progress)
+
         try:
             progress = run_to_file(
                 options.scene,
@@ -149,6 +154,27 @@ def _run(options: argparse.Namespace) -> int:
         sys.stderr.flush()
         os._exit(code)
     return code
+
+
+def _stop_on_signals() -> Callable[[], None]:
+    """Ctrl-C and a scheduler's SIGTERM raise ``KeyboardInterrupt``, and the returned function does so again.
+
+    The second time is for an exception that a destructor or a C callback has swallowed.
+    """
+    caught: list[int] = []
+
+    def check() -> None:
+        if caught:
+            raise KeyboardInterrupt
+
+    def stop(number: int, frame: object) -> None:
+        del frame
+        caught.append(number)
+        check()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    return check
 
 
 def _progress_line(quiet: bool) -> Any:

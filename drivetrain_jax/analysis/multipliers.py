@@ -75,7 +75,7 @@ def spectral_radius_bound(real: Array, imaginary: Array, error: Array) -> Array:
     rho = jnp.max(modulus, axis=0)
     modulus, x, y = modulus / rho, real / rho, imaginary / rho
     gap = jnp.hypot(x[:, None] - x, y[:, None] - y)
-    closest = jnp.stack([jnp.min(jnp.delete(gap[i], i, axis=0), axis=0) for i in range(n)])
+    closest = jnp.stack([jnp.min(jnp.delete(gap[i], i, axis=0), axis=0, initial=jnp.inf) for i in range(n)])
     ladder = jnp.asarray(_LADDER)
 
     def eps(r: Array) -> Array:

@@ -174,11 +174,13 @@ def _resumed(
             table.fill(points, results)
             progress.reused += points.size * engine.grid.path_length
             progress.failed += failures(results[OUTCOME.name])
-    writer = _Writer(parts)
+    writer, before = _Writer(parts), progress.computed
     try:
         _compute(engine, sorted(missing), table, progress, workers, report, writer.add)
     finally:
         writer.flush()
+        # An interrupt may come between keeping a chunk and counting it: what counts is what was written.
+        progress.computed = before + writer.written * engine.grid.path_length
     return _dataset(engine, table, earlier + time.monotonic() - begin)
 
 
@@ -216,6 +218,7 @@ class _Writer:
         self._parts = parts
         self._waiting: list[tuple[Chunk, Mapping[str, np.ndarray]]] = []
         self._last = time.monotonic()
+        self.written = 0
 
     def add(self, chunk: Chunk, results: Mapping[str, np.ndarray]) -> None:
         self._waiting.append((chunk, results))
@@ -230,6 +233,7 @@ class _Writer:
         seconds = time.monotonic() - self._last
         self._parts.write(Part([c.number for c in chunks], [c.points.size for c in chunks], joined, seconds))
         self._waiting.clear()
+        self.written += sum(c.points.size for c in chunks)
         self._last = time.monotonic()
 
 

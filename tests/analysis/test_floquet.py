@@ -1,0 +1,355 @@
+"""The floquet analysis through its solvers: against SciPy, against itself, and on invariants of the equations."""
+
+from __future__ import annotations
+
+import math
+import sys
+import textwrap
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from floquet_batch import ANALYSIS, BASE, CARDAN, EVERYTHING, STABLE, UNDECIDED, UNSTABLE, FloquetBatch, request
+from scipy.integrate import solve_ivp
+from scipy.special import mathieu_a, mathieu_b
+
+import drivetrain_jax as dt
+from benchmarks.scipy_reference import monodromy, spectral_radius, stacked_monodromy
+from drivetrain_jax.analysis import Outcome
+from drivetrain_jax.analysis.direct import compare
+from drivetrain_jax.analysis.propagator import EXPLICIT_ORDER, explicit_propagator
+from drivetrain_jax.systems import get_system, system_names
+
+RANGES = {"Omega": (0.05, 5), "zeta": (1e-4, 1), "alpha": (0.1, 20), "mu": (0.1, 20), "gamma": (0.1, 1e3)}
+
+
+def random_points(count: int, seed: int) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    points = {name: np.exp(rng.uniform(np.log(a), np.log(b), count)) for name, (a, b) in RANGES.items()}
+    return {"beta": rng.uniform(-1.5, 1.5, count)} | points
+
+
+@pytest.fixture(scope="module")
+def direct():
+    return FloquetBatch("direct")
+
+
+@pytest.fixture(scope="module")
+def diffrax():
+    return FloquetBatch("diffrax", outputs=("spectral_radius", "floquet_multiplier"), chunk=(4,))
+
+
+@pytest.fixture(scope="module")
+def sample(direct):
+    """Random points with their results, and sharper ones to compare with."""
+    points = random_points(2000, 13)
+    return points, direct(points), direct(points, rtol=1e-13)
+
+
+def rows(points: dict[str, np.ndarray]) -> list[dict[str, float]]:
+    return [dict(zip(points, row, strict=True)) for row in zip(*points.values(), strict=True)]
+
+
+def check_three_ways(points: dict[str, np.ndarray], direct: FloquetBatch, diffrax: FloquetBatch) -> None:
+    ours = direct(points)
+    assert (ours["outcome"] <= Outcome.TOLERANCE_NOT_MET).all()
+    general = diffrax(points, rtol=1e-11)
+    oracle = np.array([spectral_radius(monodromy(p, "DOP853", 1e-12, 1e-12)) for p in rows(points)])
+    np.testing.assert_allclose(ours["spectral_radius"], oracle, rtol=1e-9)
+    np.testing.assert_allclose(general["spectral_radius"], oracle, rtol=1e-9)
+    assert (np.abs(ours["spectral_radius"] - oracle) <= ours["spectral_radius_error"] + 1e-10 * oracle).all()
+
+
+def test_direct_diffrax_and_scipy_agree(direct, diffrax):
+    check_three_ways(random_points(12, 11), direct, diffrax)
+
+
+@pytest.mark.full
+def test_direct_diffrax_and_scipy_agree_on_500_points(direct):
+    wide = FloquetBatch("diffrax", outputs=("spectral_radius",), chunk=(64,))
+    check_three_ways(random_points(500, 12), direct, wide)
+
+
+def check_bound(found: dict[str, np.ndarray], sharp: dict[str, np.ndarray]) -> None:
+    rho, exact = found["spectral_radius"], sharp["spectral_radius"]
+    assert (np.abs(rho - exact) <= found["spectral_radius_error"]).all()
+    # Zero would be no bound, and 1e-9 for an easy point no use.
+    assert (found["spectral_radius_error"] >= 4 * np.finfo(float).eps * rho).all()
+    assert np.median(found["spectral_radius_error"] / rho) < 1e-10
+    wrong = (found["verdict"] == STABLE) & (exact > 1) | (found["verdict"] == UNSTABLE) & (exact < 1)
+    assert not wrong.any()
+    assert np.mean(found["verdict"] == UNDECIDED) < 0.01
+    assert np.mean(found["outcome"] == Outcome.SUCCESS) > 0.98
+
+
+def test_error_bound_holds(sample):
+    check_bound(*sample[1:])
+
+
+@pytest.mark.full
+def test_error_bound_holds_on_20000_points(direct):
+    points = random_points(20_000, 14)
+    check_bound(direct(points), direct(points, rtol=1e-13))
+
+
+def test_error_follows_the_tolerance(direct, sample):
+    rtol = 1e-5
+    points, exact = {name: x[:256] for name, x in sample[0].items()}, sample[2]["spectral_radius"][:256]
+    found = direct(points, rtol=rtol)
+    error = np.abs(found["spectral_radius"] - exact)
+    assert (error <= found["spectral_radius_error"] + 1e-12 * exact).all()
+    easy = found["outcome"] == Outcome.SUCCESS
+    assert easy.mean() > 0.9
+    assert (error[easy] <= 10 * rtol * exact[easy]).all()
+
+
+def test_multipliers_and_their_largest_modulus(sample):
+    points, found, _ = sample
+    moduli = np.abs(found["floquet_multiplier"])
+    np.testing.assert_allclose(moduli[:, 0], found["spectral_radius"], rtol=1e-9)
+    assert (np.diff(moduli, axis=1) <= 2e-9 * moduli[:, :1]).all()
+    for p, multipliers in list(zip(rows(points), found["floquet_multiplier"], strict=True))[:3]:
+        z = monodromy(p, "DOP853", 1e-12, 1e-14)
+        expected, computed = np.poly(z)[1:], np.poly(multipliers)[1:]
+        assert np.abs(computed - expected).max() <= 1e-9 * max(1, np.abs(multipliers[0])) ** 4
+
+
+def test_sign_of_the_joint_angle_does_not_matter(direct):
+    points = random_points(64, 17)
+    found, mirrored = direct(points), direct(points | {"beta": -points["beta"]})
+    for name in EVERYTHING:
+        np.testing.assert_array_equal(found[name], mirrored[name])
+
+
+def physical_monodromy(machine: dict[str, float]) -> np.ndarray:
+    """Over half a turn of the flywheel, in seconds: rotations of the two disks instead of the twists of the shafts."""
+    m, beta = machine, machine["beta"]
+
+    def field(t: float, y: np.ndarray) -> np.ndarray:
+        q1, q2, v1, v2 = y.reshape(4, 4)
+        c, s2, phi = math.cos(beta), math.sin(beta) ** 2, m["Omega0"] * t
+        d = 1 - s2 * math.sin(phi) ** 2
+        ratio, rate = c / d, m["Omega0"] * c * s2 * math.sin(2 * phi) / d**2
+        torque = m["k2"] * (q2 - ratio * q1) + m["c2"] * (v2 - ratio * v1 - rate * q1)
+        driving = m["k1"] * q1 + m["c1"] * v1
+        return np.concatenate([v1, v2, (ratio * torque - driving) / m["J1"], -torque / m["J2"]])
+
+    end = math.pi / m["Omega0"]
+    start = np.eye(4).reshape(-1)
+    return solve_ivp(field, (0, end), start, "DOP853", rtol=1e-12, atol=1e-12, t_eval=(end,)).y[:, -1].reshape(4, 4)
+
+
+def test_unit_of_time_does_not_matter(direct):
+    """One machine, its clock running at three rates: J in kg m^2, k in J, c in J s, in units of another time."""
+    machine = {"J1": 0.3, "J2": 4.2, "k1": 55.0, "k2": 80.0, "c1": 0.4, "c2": 0.9, "Omega0": 12.0, "beta": 0.8}
+    groups = {
+        "beta": 0.8,
+        "Omega": 12.0 * math.sqrt(0.3 / 55.0),
+        "zeta": 0.4 / (2 * math.sqrt(55.0 * 0.3)),
+        "alpha": 0.9 / 0.4,
+        "mu": 80.0 / 55.0,
+        "gamma": 4.2 / 0.3,
+    }
+    multipliers = direct(groups)["floquet_multiplier"][0]
+    for unit in (1.0, 60.0, 0.1):
+        powers = {"k1": 2, "k2": 2, "c1": 1, "c2": 1, "Omega0": 1}
+        scaled = {name: value * unit ** powers.get(name, 0) for name, value in machine.items()}
+        expected = np.linalg.eigvals(physical_monodromy(scaled))
+        np.testing.assert_allclose(np.poly(multipliers), np.poly(expected), rtol=0, atol=1e-9)
+
+
+def test_without_damping_nothing_is_called_stable_and_only_tongues_unstable(direct):
+    rng = np.random.default_rng(18)
+    points = BASE | {"zeta": 0.0, "beta": rng.uniform(0.0, 1.4, 384), "Omega": rng.uniform(0.2, 2.0, 384)}
+    rho = spectral_radius(stacked_monodromy(points, 1e-11, 1e-12))
+    inside, outside = rho > 1 + 1e-5, rho < 1 + 1e-8
+    assert inside.sum() > 50 and outside.sum() > 200
+    verdict = direct(points)["verdict"]
+    assert (verdict[inside] == UNSTABLE).all()
+    assert (verdict[outside] == UNDECIDED).all()
+    assert not (verdict == STABLE).any()
+
+
+def test_damping_can_destabilise(direct):
+    found = direct(BASE | {"beta": 1.14, "Omega": 0.6695, "zeta": np.array([0.0, 0.001, 0.01])})
+    assert found["verdict"].tolist() == [UNDECIDED, UNSTABLE, UNSTABLE]
+    assert found["spectral_radius"][1] - 1 == pytest.approx(3.5e-6, abs=5e-8)
+    assert found["spectral_radius"][2] - 1 == pytest.approx(3.04e-5, abs=5e-7)
+
+
+def test_tip_of_the_first_subharmonic_tongue(direct):
+    """S11 begins at beta = 0.0238, where the grids of the paper show nothing; its tip is found by refining a local one."""
+    low, high = 0.02, 0.03
+    for _ in range(4):
+        beta = np.linspace(low, high, 64)
+        found = direct(BASE | {"beta": beta, "Omega": 0.0706222355})
+        first = int(np.argmax(found["verdict"] == UNSTABLE))
+        assert first > 0 and (found["verdict"][first:] == UNSTABLE).all()
+        assert set(found["verdict"][:first].tolist()) <= {STABLE, UNDECIDED}
+        low, high = beta[first - 1], beta[first]
+    assert high == pytest.approx(0.0237682941, abs=1e-6)
+    below = direct(BASE | {"beta": high - np.array([1e-5, 1e-4, 1e-3]), "Omega": 0.0706222355})
+    assert (below["verdict"] == STABLE).all()
+    aside = direct(BASE | {"beta": 0.0238, "Omega": 0.0706222355 * np.array([0.999, 1.001])})
+    assert (aside["verdict"] == STABLE).all()
+
+
+def base_chart(stride: int) -> dict[str, np.ndarray]:
+    beta, speed = np.linspace(0, 1.5, 151)[::stride], np.linspace(0.01, 2.0, 200)[::stride]
+    return BASE | dict(zip(("beta", "Omega"), np.meshgrid(beta, speed, indexing="ij"), strict=True))
+
+
+def test_unstable_part_of_the_base_chart(direct):
+    """Every fourth angle and speed; SciPy's DOP853 (rtol 1e-11) finds 473 of these 1900 cells unstable, none near 1."""
+    found = direct(base_chart(4))
+    assert np.bincount(found["verdict"], minlength=3).tolist() == [1900 - 473, 473, 0]
+
+
+@pytest.mark.full
+def test_unstable_part_of_the_whole_base_chart(direct):
+    verdict = direct(base_chart(1))["verdict"]
+    assert verdict.size == 151 * 200
+    assert np.mean(verdict == UNSTABLE) == pytest.approx(0.256, abs=0.002)
+    assert np.mean(verdict == UNDECIDED) < 1e-3
+
+
+def test_liouville_residual_is_small_where_the_result_is_good(sample):
+    found = sample[1]
+    good = found["outcome"] == Outcome.SUCCESS
+    assert np.abs(found["liouville_residual"][good]).max() < 1e-9
+    assert (np.abs(found["liouville_residual"][good]) > 0).any()
+
+
+def test_liouville_residual_shows_too_few_steps():
+    """Two step sizes that both miss the motion: the determinant tells, and the error is never below what it shows."""
+    values = BASE | {"beta": 1.2, "Omega": 0.1, "zeta": 0.001}
+    form = CARDAN.models["floquet"].build(values).reduced
+
+    @jax.jit
+    def coarse_and_fine(steps):
+        pair = (explicit_propagator(form, n, ()) for n in (steps, 2 * steps))
+        return compare(form, *pair, 2 * steps, 1e-10, 2.0**EXPLICIT_ORDER - 1)
+
+    poor, good = coarse_and_fine(jnp.int32(2)), coarse_and_fine(jnp.int32(128))
+    assert abs(poor.residual) > 1e-2 and not poor.met
+    assert poor.error >= abs(poor.residual)
+    assert abs(good.residual) < 1e-12 and good.met and good.error < 1e-10
+
+
+@pytest.mark.parametrize("method", ["auto", "direct", "diffrax"])
+@pytest.mark.parametrize(
+    "outputs", [("spectral_radius",), ("verdict",), ("floquet_multiplier", "liouville_residual"), EVERYTHING]
+)
+def test_only_what_is_asked_for_is_returned(method, outputs):
+    values = {name: jax.ShapeDtypeStruct((), float) for name in CARDAN.models["floquet"].parameters}
+    for solver in ANALYSIS.solvers(CARDAN, request(method, 1e-10, outputs)):
+        shapes = jax.eval_shape(solver.solve, values, jax.ShapeDtypeStruct((), np.int64))
+        assert set(shapes) == {*outputs, "outcome"}
+        for name, shape in shapes.items():
+            assert shape.shape == ((4,) if name == "floquet_multiplier" else ())
+            assert shape.dtype == {"floquet_multiplier": complex, "verdict": np.int8, "outcome": np.int8}.get(
+                name, float
+            )
+
+
+@pytest.mark.parametrize("solver", ["Tsit5", "Kvaerno5"])
+def test_any_diffrax_solver_gives_the_same(direct, solver):
+    batch = FloquetBatch("diffrax", outputs=("spectral_radius",), chunk=(2,), solver=solver)
+    points = BASE | {"beta": np.array([0.5, 1.1]), "Omega": np.array([1.2, 0.6]), "zeta": np.array([0.001, 0.3])}
+    np.testing.assert_allclose(batch(points, 1e-7)["spectral_radius"], direct(points)["spectral_radius"], rtol=1e-6)
+
+
+def test_what_cannot_be_computed_is_marked(direct):
+    """Overflow in one lane: NaN, undecided and a code, while its neighbour is as good as ever."""
+    points = BASE | {"beta": np.array([0.5, 0.5]), "Omega": np.array([1.2, 1.2]), "mu": np.array([np.nan, 1.0])}
+    padded = {name: np.pad(np.broadcast_to(x, 2), (0, 254), mode="edge") for name, x in points.items()}
+    found = {name: np.asarray(x) for name, x in direct.kernel(0)(padded, np.int64(20), 1e-10).items()}
+    assert found["outcome"][:2].tolist() == [Outcome.NOT_FINITE, Outcome.SUCCESS]
+    assert np.isnan(found["spectral_radius"][0]) and found["verdict"][0] == UNDECIDED
+    exact = direct({name: x[1:2] for name, x in padded.items()})["spectral_radius"][0]
+    assert found["spectral_radius"][1] == pytest.approx(exact, rel=1e-10)
+
+
+# A system of another package, plain in every respect: two states, one form, no reversor, no prediction of steps.
+MATHIEU = '''
+import math
+
+import jax.numpy as jnp
+
+from drivetrain_jax._quantities import Parameter
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic, Model, System
+
+
+def floquet(values):
+    """x'' + 2 d x' + (a - 2 q cos 2t) x = 0."""
+
+    def rows(t):
+        return (0, 1.0), (2 * values["q"] * jnp.cos(2 * t) - values["a"], -2 * values["d"])
+
+    form = LinearPeriodic(rows, math.pi)
+    return FloquetModel(form, form)
+
+
+SYSTEM = System(
+    name="mathieu",
+    title="Damped Mathieu equation",
+    source="DLMF 28",
+    parameters=(Parameter("a", "1", "stiffness"), Parameter("q", "1", "modulation"), Parameter("d", "1", "damping")),
+    models={"floquet": Model(floquet, ("a", "q", "d"))},
+)
+'''
+
+
+@pytest.fixture(scope="module")
+def other_package(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    (folder / "other_shafts.py").write_text(textwrap.dedent(MATHIEU))
+    info = folder / "other_shafts-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other-shafts\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[drivetrain_jax.systems]\nmathieu = other_shafts:SYSTEM\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DRIVETRAIN_JAX_CACHE", "0")
+        patch.syspath_prepend(str(folder))
+        yield "mathieu"
+        sys.modules.pop("other_shafts", None)
+
+
+def test_other_package_adds_a_system(other_package):
+    assert other_package in system_names()
+    assert get_system(other_package).title == "Damped Mathieu equation"
+    with pytest.raises(KeyError, match=r"cardan, .*mathieu"):
+        get_system("nothing of the kind")
+
+
+@pytest.mark.parametrize("method", ["direct", "diffrax"])
+def test_any_linear_periodic_system_is_analysed(other_package, method):
+    """Mathieu's characteristic values bound the tongues; damping d multiplies the multipliers at a - d^2 by e^(-d pi)."""
+    q, d = 1.3, 0.02
+    bands = [(mathieu_a(0, q), mathieu_b(1, q)), (mathieu_a(1, q), mathieu_b(2, q)), (mathieu_a(2, q), mathieu_b(3, q))]
+    stable = [low + x * (high - low) for low, high in bands for x in (0.1, 0.5, 0.9)]
+    tongue = [mathieu_b(1, q) + x * (mathieu_a(1, q) - mathieu_b(1, q)) for x in (0.2, 0.5, 0.8)]
+    edges = [mathieu_b(1, q), mathieu_a(1, q), mathieu_b(2, q)]
+    a = np.array([*stable, *tongue, *edges])
+    points = {"a": [*a, *(a + d * d)], "q": [q] * 2 * len(a), "d": [0.0] * len(a) + [d] * len(a)}
+    scene = {
+        "system": other_package,
+        "analysis": "floquet",
+        "points": {k: list(map(float, v)) for k, v in points.items()},
+    }
+    options = {"method": method, "rtol": 1e-9}
+    ds = dt.run(scene | {"options": options, "outputs": ["spectral_radius", "spectral_radius_error", "verdict"]})
+    rho, bound = (ds[name].values.reshape(2, -1) for name in ("spectral_radius", "spectral_radius_error"))
+    verdict = ds.verdict.values.reshape(2, -1)
+    inside = slice(len(stable), len(stable) + len(tongue))
+    # Undamped: the circle between the tongues, off it inside, double multipliers at the edges.
+    assert (verdict[0, : len(stable)] == UNDECIDED).all()
+    assert (verdict[0, inside] == UNSTABLE).all() and (rho[0, inside] > 1.1).all()
+    assert (verdict[0, inside.stop :] == UNDECIDED).all()
+    marginal = np.r_[: len(stable), inside.stop : len(a)]
+    assert (np.abs(rho[0, marginal] - 1) <= bound[0, marginal]).all()
+    # Damped: every multiplier is smaller by the same factor.
+    assert (verdict[1, marginal] == STABLE).all() and (verdict[1, inside] == UNSTABLE).all()
+    assert (np.abs(rho[1, marginal] - math.exp(-d * math.pi)) <= bound[1, marginal]).all()
+    np.testing.assert_allclose(rho[1, inside], math.exp(-d * math.pi) * rho[0, inside], rtol=1e-8)
