@@ -18,7 +18,7 @@ from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.direct import Monodromy, compare, direct_monodromy
+from drivetrain_jax.analysis.direct import Monodromy, compare, direct_monodromy, stiffness_of
 from drivetrain_jax.analysis.linear_algebra import eigenvalues
 from drivetrain_jax.analysis.monodromy import SOLVERS, state_transition
 from drivetrain_jax.analysis.multipliers import VERDICTS, sort_multipliers, spectral_radius_bound, verdict
@@ -120,8 +120,8 @@ def _direct_solvers(system: System, request: Request) -> tuple[Solver, ...]:
                 return explicit_propagator(form, steps, shape)
             return implicit_propagator(form, steps)
 
-        order = EXPLICIT_ORDER if explicit else IMPLICIT_ORDER
-        z = direct_monodromy(form, propagate, effort, shape, rtol / 4, order)
+        order, stiffness = (EXPLICIT_ORDER, 0.0) if explicit else (IMPLICIT_ORDER, stiffness_of(form))
+        z = direct_monodromy(form, propagate, effort, shape, stiffness, rtol / 4, order)
         return _results(z, request.outputs, rtol)
 
     return (
@@ -163,7 +163,7 @@ def _diffrax_solvers(system: System, request: Request) -> tuple[Solver, ...]:
 
         fine, success = propagate(rtol / 10)
         coarse, success_coarse = propagate(rtol) if needs_error else (fine, success)
-        z = compare(form, coarse, fine, jnp.zeros(()), rtol, _TOLERANCE_GAP)
+        z = compare(form, coarse, fine, jnp.zeros(()), 0.0, rtol, _TOLERANCE_GAP)
         results = _results(z, request.outputs, rtol)
         failed = ~(success & success_coarse)
         return results | {"outcome": jnp.where(failed, jnp.int8(Outcome.STEP_LIMIT), results["outcome"])}

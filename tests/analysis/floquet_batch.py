@@ -44,9 +44,7 @@ class FloquetBatch:
                 return {name: jnp.moveaxis(x, -1, 0) for name, x in results.items()}
             return jax.vmap(one, in_axes=(0, None, None))(values, effort, rtol)
 
-        # The code of the general integrators takes longer to optimise than to run on the few points of a test.
-        options = {"xla_backend_optimization_level": 0} if self.method == "diffrax" else None
-        return self.compiled.setdefault(index, jax.jit(batch, compiler_options=options))
+        return self.compiled.setdefault(index, jax.jit(batch))
 
     def __call__(self, columns: Mapping[str, object], rtol: float = 1e-10) -> dict[str, np.ndarray]:
         given = np.broadcast_arrays(*(np.atleast_1d(np.asarray(columns[name], float)) for name in self.names))

@@ -55,7 +55,8 @@ def check_three_ways(points: dict[str, np.ndarray], direct: FloquetBatch, diffra
     ours = direct(points)
     assert (ours["outcome"] <= Outcome.TOLERANCE_NOT_MET).all()
     general = diffrax(points, rtol=1e-11)
-    oracle = np.array([spectral_radius(monodromy(p, "DOP853", 1e-12, 1e-12)) for p in rows(points)])
+    # Spectral radii reach down to 1e-10 here: a larger absolute tolerance would be what is compared.
+    oracle = spectral_radius(stacked_monodromy(points, 1e-12, 1e-15, batch=25))
     np.testing.assert_allclose(ours["spectral_radius"], oracle, rtol=1e-9)
     np.testing.assert_allclose(general["spectral_radius"], oracle, rtol=1e-9)
     assert (np.abs(ours["spectral_radius"] - oracle) <= ours["spectral_radius_error"] + 1e-10 * oracle).all()
@@ -229,7 +230,7 @@ def test_liouville_residual_shows_too_few_steps():
     @jax.jit
     def coarse_and_fine(steps):
         pair = (explicit_propagator(form, n, ()) for n in (steps, 2 * steps))
-        return compare(form, *pair, 2 * steps, 1e-10, 2.0**EXPLICIT_ORDER - 1)
+        return compare(form, *pair, 2 * steps, 0.0, 1e-10, 2.0**EXPLICIT_ORDER - 1)
 
     poor, good = coarse_and_fine(jnp.int32(2)), coarse_and_fine(jnp.int32(128))
     assert abs(poor.residual) > 1e-2 and not poor.met
@@ -257,7 +258,7 @@ def test_only_what_is_asked_for_is_returned(method, outputs):
 def test_any_diffrax_solver_gives_the_same(direct, solver):
     batch = FloquetBatch("diffrax", outputs=("spectral_radius",), chunk=(2,), solver=solver)
     points = BASE | {"beta": np.array([0.5, 1.1]), "Omega": np.array([1.2, 0.6]), "zeta": np.array([0.001, 0.3])}
-    np.testing.assert_allclose(batch(points, 1e-7)["spectral_radius"], direct(points)["spectral_radius"], rtol=1e-6)
+    np.testing.assert_allclose(batch(points, 1e-6)["spectral_radius"], direct(points)["spectral_radius"], rtol=1e-5)
 
 
 def test_what_cannot_be_computed_is_marked(direct):

@@ -11,7 +11,9 @@ import pytest
 from scipy.integrate import DOP853
 from scipy.linalg import expm
 
-from drivetrain_jax.analysis.direct import assemble
+from drivetrain_jax.analysis.direct import assemble, direct_monodromy, stiffness_of
+from drivetrain_jax.analysis.linear_algebra import eigenvalues
+from drivetrain_jax.analysis.multipliers import spectral_radius_bound
 from drivetrain_jax.analysis.propagator import (
     EXPLICIT_ORDER,
     IMPLICIT_ORDER,
@@ -163,3 +165,23 @@ def test_half_period_is_completed_by_the_reversor():
     half, whole = LinearPeriodic(rows, math.pi / 2, reversor=exchange), LinearPeriodic(rows, math.pi)
     z = [np.asarray(assemble(s, explicit_propagator(s, jnp.int32(60), ()).matrix)) for s in (half, whole)]
     np.testing.assert_allclose(np.poly(z[0]), np.poly(z[1]), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("rates", [(-1e3, 0.5), (-1e6, 0.5), (-1e8, -0.1), (-1e9, 0.5)])
+def test_bound_holds_for_stiff_systems_whose_determinant_is_not_known(rates):
+    system, exact = rotating(rates), np.abs(np.linalg.eigvals(rotating_exactly(rates))).max()
+    z = jax.jit(
+        lambda n: direct_monodromy(
+            system,
+            lambda steps: implicit_propagator(system, steps),
+            n,
+            (),
+            stiffness_of(system),
+            2.5e-11,
+            IMPLICIT_ORDER,
+        )
+    )(jnp.int32(8))
+    real, imaginary = eigenvalues(z.matrix)
+    size = float(jnp.exp(z.log_scale))
+    bound = float(spectral_radius_bound(real, imaginary, z.error)) * size
+    assert abs(float(jnp.max(jnp.hypot(real, imaginary))) * size - exact) < bound < 1e-5
