@@ -29,7 +29,7 @@ from benchmarks.timing import PROCESSES, RESULTS, chart, interleaved, median, sp
 
 Columns = Mapping[str, np.ndarray]
 
-DIRECT_TOLERANCES = (1e-9, 1e-10)
+DIRECT_TOLERANCES = (1e-7, 1e-8, 1e-9, 1e-10)
 HEYOKA_TOLERANCES = (1e-8, 1e-10)
 # Memory and time from nothing to a result, measured in a process of its own.
 _FRESH = """
