@@ -246,6 +246,7 @@ def cheapest(rows: list[dict[str, Any]], tolerance: float = 1e-9) -> list[dict[s
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """Error against evaluations (top) and against time (bottom), one column a point."""
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullFormatter
 
     figure, axes = plt.subplots(2, len(POINTS), figsize=(18, 7.2), sharey=True, layout="constrained")
     for column, index in enumerate(POINTS):
@@ -264,6 +265,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
             ax.axhline(1e-9, color="0.6", lw=0.8)
             ax.set_ylim(3e-17, 30)
             ax.grid(alpha=0.25)
+            ax.xaxis.set_minor_formatter(NullFormatter())
     axes[0, 0].set_ylabel("error of the multipliers / rho")
     axes[1, 0].set_ylabel("error of the multipliers / rho")
     figure.legend(
