@@ -22,8 +22,9 @@ from drivetrain_jax.analysis.multipliers import characteristic_coefficients, roo
 from drivetrain_jax.analysis.propagator import Propagator
 from drivetrain_jax.systems import LinearPeriodic
 
-# Doublings of the predicted number of steps that a batch may take.
+# Doublings of the predicted number of steps that a batch may take, and the steps at which there is no further one.
 _MAX_REFINEMENTS = 6
+_MAX_STEPS = 2**20
 
 
 class Monodromy(NamedTuple):
@@ -111,10 +112,10 @@ def direct_monodromy(
     unknown = Monodromy(blank.matrix, zero, jnp.full(shape, jnp.inf), jnp.zeros(shape, bool), zero)
 
     def unfinished(state: tuple) -> Array:
-        count, _, _, result = state
+        count, current, _, result = state
         finite = jnp.all(jnp.isfinite(result.matrix), axis=(0, 1))
         lagging = jnp.where(finite, count < 2 + _MAX_REFINEMENTS, count < 4) & ~result.met
-        return (count < 2) | jnp.any(lagging)
+        return (count < 2) | ((current <= _MAX_STEPS) & jnp.any(lagging))
 
     def refine(state: tuple) -> tuple:
         count, current, coarse, _ = state

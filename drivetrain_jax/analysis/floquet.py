@@ -43,8 +43,10 @@ VARIABLES = (
 _NEED_ERROR = {"spectral_radius_error", "verdict"}
 # Below this many explicit steps the implicit scheme is never the cheaper one.
 _STIFF = 600
-# Seconds of one implicit panel over those of one explicit step, per point.
-_PANEL_COST = 150.0
+# Seconds of one implicit panel over those of one explicit step, per point: 150 in full batches, less in small ones.
+_PANEL_COST = 50.0
+# Beyond these a scheme does not start: the point is left to the other one, or ends as STEP_LIMIT.
+_MAX_EXPLICIT, _MAX_PANELS = 300_000, 20_000
 # The diffrax error is the difference between two tolerances a decade apart, taken as it is (see `compare`).
 _TOLERANCE_GAP = 4.0
 
@@ -73,11 +75,14 @@ def _results(z: Monodromy, outputs: tuple[str, ...], rtol: float) -> dict[str, A
 def _frequency_phase(form: LinearPeriodic, size: int) -> np.ndarray:
     """int max |Im lambda(A(t))| dt over the span for ``size`` points, by Gauss quadrature with 8 nodes."""
     nodes, weights = np.polynomial.legendre.leggauss(8)
-    samples = [np.asarray(form.matrix((x + 1) * form.span / 2)) for x in nodes]
-    frequencies = [
-        np.abs(np.linalg.eigvals(np.moveaxis(a.reshape(*a.shape[:2], -1), -1, 0)).imag).max(-1) for a in samples
-    ]
-    return np.broadcast_to(form.span / 2 * sum(w * f for w, f in zip(weights, frequencies, strict=True)), size)
+    phase = np.zeros(size)
+    for x, weight in zip(nodes, weights, strict=True):
+        a = np.asarray(form.matrix((x + 1) * form.span / 2))
+        a = np.broadcast_to(np.moveaxis(a.reshape(*a.shape[:2], -1), -1, 0), (size, *a.shape[:2]))
+        finite = np.isfinite(a).all(axis=(1, 2))
+        frequency = np.abs(np.linalg.eigvals(np.where(finite[:, None, None], a, 0.0)).imag).max(-1)
+        phase += weight * form.span / 2 * np.where(finite, frequency, np.inf)
+    return phase
 
 
 def _generic_steps(form: LinearPeriodic, rtol: float) -> np.ndarray:
@@ -93,7 +98,7 @@ def _explicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: fl
     size = max(np.size(column) for column in columns.values())
     steps = model.explicit_steps(rtol) if model.explicit_steps else _generic_steps(model.reduced, rtol)
     # Even, so that the coarse solution has exactly half as many.
-    return np.broadcast_to(2 * np.ceil(np.minimum(steps, 2**30) / 2), size).astype(np.int64)
+    return np.broadcast_to(2 * np.ceil(steps / 2), size)
 
 
 def _implicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
@@ -105,7 +110,11 @@ def _implicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: fl
         chosen = {name: np.broadcast_to(column, explicit.shape)[stiff] for name, column in columns.items()}
         phase = _frequency_phase(system.models["floquet"].build(chosen).reduced, stiff.size)
         effort[stiff] = 2 * np.ceil((8 + phase / 5) * (1e-10 / rtol) ** (1 / 16) / 2)
-    return effort
+    return _up_to(_MAX_PANELS, effort)
+
+
+def _up_to(limit: int, effort: np.ndarray) -> np.ndarray:
+    return np.where(effort <= limit, effort, np.inf)
 
 
 def _direct_solvers(system: System, request: Request) -> tuple[Solver, ...]:
@@ -128,7 +137,7 @@ def _direct_solvers(system: System, request: Request) -> tuple[Solver, ...]:
         Solver(
             "direct: explicit Runge-Kutta of order 8",
             lambda values, effort: solve(values, effort, True),
-            lambda columns: _explicit_effort(system, columns, rtol),
+            lambda columns: _up_to(_MAX_EXPLICIT, _explicit_effort(system, columns, rtol)),
             broadcasts=True,
             chunk=512,
         ),
@@ -172,7 +181,7 @@ def _diffrax_solvers(system: System, request: Request) -> tuple[Solver, ...]:
         Solver(
             f"diffrax: {request.options['solver']}",
             solve,
-            lambda columns: _explicit_effort(system, columns, rtol),
+            lambda columns: np.nan_to_num(_explicit_effort(system, columns, rtol)),
             chunk=256,
         ),
     )

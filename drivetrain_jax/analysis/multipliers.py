@@ -26,8 +26,9 @@ from drivetrain_jax.analysis.linear_algebra import matmul
 
 VERDICTS = ("stable", "unstable", "undecided")
 
-# Radii at which the circles are tried, relative to the spectral radius: four a decade from rounding up to 10.
-_LADDER = 10.0 ** (np.arange(-64, 5) / 4)
+# Radii at which the circles are tried, relative to the spectral radius: four a decade from rounding up to 10, a little
+# below powers of ten, so that the rung that belongs to a decimal tolerance meets it.
+_LADDER = 0.99 * 10.0 ** (np.arange(-64, 5) / 4)
 
 
 def characteristic_coefficients(z: Array) -> Array:

@@ -203,7 +203,8 @@ def explicit_steps(values: Values, rtol: float) -> np.ndarray:
     log_steps = (
         0.59 * capped + 0.1 * capped**2 + 1.1 * (x - capped) + (0.59 - 0.13 * capped - 0.034 * sharpness) * sharpness
     )
-    return np.exp(log_steps + 1.7 + 0.26 * (-math.log10(rtol) - 9)) + 2
+    with np.errstate(over="ignore"):
+        return np.exp(log_steps + 1.7 + 0.26 * (-math.log10(rtol) - 9)) + 2
 
 
 def floquet_model(values: Values) -> FloquetModel:

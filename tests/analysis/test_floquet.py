@@ -354,3 +354,12 @@ def test_any_linear_periodic_system_is_analysed(other_package, method):
     assert (verdict[1, marginal] == STABLE).all() and (verdict[1, inside] == UNSTABLE).all()
     assert (np.abs(rho[1, marginal] - math.exp(-d * math.pi)) <= bound[1, marginal]).all()
     np.testing.assert_allclose(rho[1, inside], math.exp(-d * math.pi) * rho[0, inside], rtol=1e-8)
+
+
+@pytest.mark.parametrize("extreme", [{"zeta": 1e300}, {"Omega": 1e-300}])
+def test_point_beyond_every_scheme_is_an_outcome_not_an_exception(extreme):
+    base = {"beta": 0.5, "Omega": 1.0, "zeta": 0.1, "alpha": 1.0, "mu": 1.0, "gamma": 1.0}
+    point = dt.point("cardan", "floquet", **(base | extreme))
+    assert point.outcome.name == "STEP_LIMIT"
+    assert np.isnan(point.spectral_radius)
+    assert point.verdict == 2
