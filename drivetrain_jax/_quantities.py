@@ -11,7 +11,9 @@ class Parameter:
     """An input of a system or an option of an analysis.
 
     ``default=None`` means that it must be given. ``lower``/``upper`` are inclusive unless the matching ``open_*``
-    flag is set. ``choices`` makes it a word, ``listed`` a list of numbers of which each entry obeys the range.
+    flag is set; ``infinite`` admits infinity. ``choices`` makes it one of these words, ``text`` any word, ``listed`` a
+    list of numbers of which each entry obeys the range (default ``()``: none), ``listed`` with ``broadcast`` such a list
+    or one number that stands for a list of equal entries.
     """
 
     name: str
@@ -24,18 +26,31 @@ class Parameter:
     open_upper: bool = False
     choices: tuple[str, ...] = ()
     listed: bool = False
+    broadcast: bool = False
     integer: bool = False
+    infinite: bool = False
+    text: bool = False
+
+    @property
+    def is_number(self) -> bool:
+        """Whether one number is an admissible kind of value, so that it can vary as a whole."""
+        return not (self.choices or self.text or (self.listed and not self.broadcast))
 
     @property
     def allowed(self) -> str:
         """The admissible values as a reader would write them, e.g. ``0 <= zeta < inf``."""
         if self.choices:
             return f"{self.name} is one of {', '.join(self.choices)}"
+        if self.text:
+            return f"{self.name} is text"
         kind = "integer " if self.integer else ""
         left = f"{self.lower:.10g} {'<' if self.open_lower else '<='} " if self.lower > -math.inf else ""
         right = f" {'<' if self.open_upper else '<='} {self.upper:.10g}" if self.upper < math.inf else ""
+        if self.infinite:
+            right = " <= inf"
+        listed = "" if not self.listed else "[i] (or one number for all)" if self.broadcast and not right else "[i]"
         if left or right:
-            return f"{kind}{left}{self.name}{'[i]' if self.listed else ''}{right}"
+            return f"{kind}{left}{self.name}{listed}{right}"
         return f"{self.name} is a finite {kind or 'number'}".rstrip()
 
     def check(self, value: object) -> float | int | str | tuple[float, ...]:
@@ -44,7 +59,11 @@ class Parameter:
             if value not in self.choices:
                 raise ValueError(f"{self.name} = {value!r}: allowed is {self.allowed}")
             return value
-        if self.listed:
+        if self.text:
+            if not isinstance(value, str):
+                raise ValueError(f"{self.name} = {value!r}: allowed is text")
+            return value
+        if self.listed and not (self.broadcast and not isinstance(value, (list, tuple))):
             if not isinstance(value, (list, tuple)) or not value:
                 raise ValueError(f"{self.name} = {value!r}: allowed is a list of numbers, {self.allowed}")
             return tuple(self._check_number(entry, f"{self.name}[{i}]") for i, entry in enumerate(value))
@@ -55,7 +74,8 @@ class Parameter:
             raise ValueError(f"{label} = {value!r}: allowed is a number, {self.allowed}")
         below = value <= self.lower if self.open_lower else value < self.lower
         above = value >= self.upper if self.open_upper else value > self.upper
-        if not math.isfinite(value) or below or above or (self.integer and value != int(value)):
+        finite = math.isfinite(value) or (self.infinite and value == math.inf)
+        if not finite or below or above or (self.integer and value != int(value)):
             raise ValueError(f"{label} = {value!r}: allowed is {self.allowed}")
         return int(value) if self.integer else float(value)
 

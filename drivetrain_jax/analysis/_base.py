@@ -50,7 +50,8 @@ class Solver:
 
     ``solve(values, effort)`` returns every requested variable and ``outcome``. ``values`` holds all parameters of
     the model: fixed ones as Python numbers, swept ones as scalars, or as arrays of shape ``(N,)`` if ``broadcasts``;
-    results then carry the batch as their LAST axis. The values of a path axis arrive as a whole, shape ``(L,)``.
+    results then carry the batch as their LAST axis. The values of a path axis arrive as a whole, shape ``(L,)``, and
+    results have the path as their FIRST axis; ``chunk`` counts lines then.
     ``effort`` is a traced integer, the largest that ``effort(columns)`` predicts in the batch (columns: NumPy arrays
     of shape ``(N,)``; a count of steps or the like). The engine gives every point to the solver for which
     ``effort * unit_cost`` is smallest and runs batches of ``chunk`` points of similar effort.
@@ -70,6 +71,10 @@ class Analysis:
 
     ``methods`` maps each method to the names of the options it uses, the first method being the default; ``options``
     describes all of them. ``solvers(system, request)`` gives the candidates of the requested method.
+    ``dimensions(system, request, fixed)`` describes the dimensions of the results besides those of the sweep; ``fixed``
+    holds the parameters that do not vary (a list is whole also if one entry varies). It raises
+    :class:`~drivetrain_jax._errors.InputError` where a request and these parameters do not fit together.
+    ``path_axis(request)`` names the axis that is consumed whole, if there is one.
     """
 
     name: str
@@ -79,8 +84,8 @@ class Analysis:
     methods: Mapping[str, tuple[str, ...]]
     options: tuple[Parameter, ...]
     solvers: Callable[[System, Request], tuple[Solver, ...]]
-    dimensions: tuple[Dimension, ...] = ()
-    path_axis: str | None = None
+    dimensions: Callable[[System, Request, Mapping[str, Any]], tuple[Dimension, ...]] = lambda *_: ()
+    path_axis: Callable[[Request], str | None] = lambda _: None
 
     def variable(self, name: str) -> Variable:
         """The result called ``name``; ``KeyError`` if there is none."""

@@ -203,5 +203,5 @@ ANALYSIS = Analysis(
         Parameter("solver", "1", "diffrax solver", default="Dopri8", choices=SOLVERS),
     ),
     solvers=_solvers,
-    dimensions=(Dimension("multiplier", "Floquet multipliers by falling modulus", ()),),
+    dimensions=lambda *_: (Dimension("multiplier", "Floquet multipliers by falling modulus", ()),),
 )

@@ -212,5 +212,5 @@ ANALYSIS = Analysis(
     methods={"shooting": ("rtol",)},
     options=(RTOL,),
     solvers=_solvers,
-    dimensions=(STATE, SHAFT),
+    dimensions=lambda *_: (STATE, SHAFT),
 )

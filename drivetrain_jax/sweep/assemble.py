@@ -30,7 +30,7 @@ class Table:
     def __init__(self, scene: Scene, grid: Grid) -> None:
         self.variables = result_variables(scene)
         self._grid = grid
-        self._sizes = {d.name: len(d.values) for d in scene.analysis.dimensions}
+        self._sizes = {d.name: len(d.values) for d in scene.dimensions}
         self._arrays: dict[str, np.ndarray] = {}
 
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
@@ -74,7 +74,7 @@ def result_variables(scene: Scene) -> tuple[Variable, ...]:
 
 def bytes_per_point(scene: Scene) -> int:
     """Memory that one point takes while its scene runs: results twice (the file is made in memory), and the plan."""
-    sizes = {d.name: len(d.values) or _USUAL_SIZE for d in scene.analysis.dimensions}
+    sizes = {d.name: len(d.values) or _USUAL_SIZE for d in scene.dimensions}
     return 32 + 2 * sum(
         np.dtype(v.dtype).itemsize * math.prod(sizes[dim] for dim in v.dims) for v in result_variables(scene)
     )
@@ -85,14 +85,14 @@ def to_dataset(scene: Scene, grid: Grid, table: Table, attrs: Mapping[str, str |
     sweep_dims = ("point",) if scene.zipped else tuple(axis.name for axis in scene.axes)
     results = [(v, _reshaped(scene, grid, table[v.name])) for v in table.variables]
     coordinates = [*_axis_coordinates(scene), *_resonances(scene)]
-    return build_dataset(sweep_dims, coordinates, scene.analysis.dimensions, results, _attrs(scene) | dict(attrs))
+    return build_dataset(sweep_dims, coordinates, scene.dimensions, results, _attrs(scene) | dict(attrs))
 
 
 def _reshaped(scene: Scene, grid: Grid, values: np.ndarray) -> np.ndarray:
     """From ``(points, path, own)`` to the axes in the order of the scene, then own."""
     if grid.path is None:
         return values.reshape((*grid.shape, *values.shape[1:]))
-    position = [i for i, axis in enumerate(scene.axes) if axis.name == grid.path_name]
+    position = [i for i, axis in enumerate(scene.axes) if axis is grid.path]
     if not position:
         return values.reshape((*grid.shape, *values.shape[2:]))
     lines = values.reshape((*grid.shape, *values.shape[1:]))
@@ -136,7 +136,9 @@ def _attrs(scene: Scene) -> dict[str, str]:
     fixed: dict[str, Any] = {}
     for name, value in scene.fixed.items():
         parameter = scene.system.parameter(name)
-        fixed[name] = {"value": value, "units": parameter.units, "long_name": parameter.long_name}
+        # JSON has no infinity; the word is what every reader of numbers understands.
+        plain = str(value) if value == math.inf else value
+        fixed[name] = {"value": plain, "units": parameter.units, "long_name": parameter.long_name}
     installed = provenance.versions((*PACKAGES, *_STORAGE))
     return {
         "title": scene.title,

@@ -51,8 +51,16 @@ def _analysis_lines(name: str) -> list[str]:
 
 
 def _parameter_row(parameter: Parameter) -> tuple[str, ...]:
-    default = "required" if parameter.default is None else f"default {parameter.default}"
+    default = "required" if parameter.default is None else f"default {_short(parameter.default)}"
     return parameter.name, f"[{parameter.units}]", parameter.long_name, default, parameter.allowed
+
+
+def _short(default: object) -> str:
+    if default == ():
+        return "none"
+    if isinstance(default, tuple):
+        return "[" + ", ".join(f"{entry:.6g}" for entry in default) + "]"
+    return f"{default:.10g}" if isinstance(default, float) else str(default)
 
 
 def _variable_row(variable: Variable, default: bool) -> tuple[str, ...]:

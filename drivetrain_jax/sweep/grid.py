@@ -17,26 +17,27 @@ from drivetrain_jax.sweep.scene import Scene, Value
 class Grid:
     """Points numbered from 0 in C order of ``axes`` (``shape``), or one point per entry of ``axes`` if ``zipped``.
 
-    With a path axis a point is a whole line: ``axes`` lacks it and ``path`` holds its values.
+    With a path axis a point is a whole line: ``axes`` lacks ``path``.
     """
 
     axes: tuple[Axis, ...]
     zipped: bool
     fixed: Mapping[str, Value]
     parameters: tuple[str, ...]
-    path_name: str | None = None
-    path: np.ndarray | None = None
+    path: Axis | None = None
 
     @classmethod
     def of(cls, scene: Scene) -> Grid:
         """The grid of ``scene``; a fixed path parameter makes lines of one value."""
         parameters = scene.system.models[scene.analysis.name].parameters
-        name = scene.analysis.path_axis
+        name = scene.path_axis
         if name is None:
             return cls(scene.axes, scene.zipped, scene.fixed, parameters)
-        along = [axis.values for axis in scene.axes if axis.name == name]
-        path = along[0] if along else np.array([scene.fixed[name]])
-        return cls(tuple(a for a in scene.axes if a.name != name), scene.zipped, scene.fixed, parameters, name, path)
+        path = next((axis for axis in scene.axes if axis.name == name), None)
+        others = tuple(axis for axis in scene.axes if axis is not path)
+        if path is None:
+            path = Axis(name, scene.system.parameter(name), None, np.array([scene.fixed[name]]))
+        return cls(others, scene.zipped, scene.fixed, parameters, path)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -52,7 +53,7 @@ class Grid:
     @property
     def path_length(self) -> int:
         """Number of results along a line, 1 without a path."""
-        return 1 if self.path is None else len(self.path)
+        return 1 if self.path is None else len(self.path.values)
 
     def columns(self, points: np.ndarray) -> dict[str, np.ndarray]:
         """Values of the varying parameters at ``points``, by name of the axis, each of the shape of ``points``."""
@@ -65,15 +66,15 @@ class Grid:
     def bind(self, columns: Mapping[str, Any]) -> dict[str, Any]:
         """All parameters of the model: the fixed ones, ``columns`` of the varying ones, and the path as a whole."""
         values: dict[str, Any] = dict(self.fixed)
-        for axis in self.axes:
+        varying = [(axis, columns[axis.name]) for axis in self.axes]
+        if self.path is not None:
+            varying.append((self.path, self.path.values))
+        for axis, value in varying:
             name = axis.parameter.name
             if axis.entry is None:
-                values[name] = columns[axis.name]
+                values[name] = value
             else:
-                before, after = values[name][: axis.entry], values[name][axis.entry + 1 :]
-                values[name] = (*before, columns[axis.name], *after)
-        if self.path_name is not None:
-            values[self.path_name] = self.path
+                values[name] = (*values[name][: axis.entry], value, *values[name][axis.entry + 1 :])
         return {name: values[name] for name in self.parameters}
 
     def arrays(self, points: np.ndarray) -> dict[str, Any]:
@@ -82,7 +83,7 @@ class Grid:
         def spread(value: Any) -> Any:
             if isinstance(value, tuple):
                 return tuple(spread(entry) for entry in value)
-            return value if isinstance(value, str) else np.broadcast_to(value, points.shape)
+            whole = isinstance(value, str) or (self.path is not None and value is self.path.values)
+            return value if whole else np.broadcast_to(value, points.shape)
 
-        bound = self.bind(self.columns(points))
-        return {name: value if name == self.path_name else spread(value) for name, value in bound.items()}
+        return {name: spread(value) for name, value in self.bind(self.columns(points)).items()}

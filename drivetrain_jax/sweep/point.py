@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._quantities import Parameter, Variable
-from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax._quantities import Variable
+from drivetrain_jax.analysis import OUTCOME, Outcome, Request
 from drivetrain_jax.sweep import compile_cache
 from drivetrain_jax.sweep.assemble import Table, result_variables
 from drivetrain_jax.sweep.engine import Engine
@@ -60,7 +60,7 @@ class PointResult:
     def to_json(self) -> str:
         """The answer as one JSON object; what is not finite is null, a complex value has ``real`` and ``imag``."""
         values = {n: {"value": _plain(v), "units": self.variables[n].units} for n, v in self.values.items()}
-        parameters = {n: {"value": v, "units": self.parameter_units[n]} for n, v in self.parameters.items()}
+        parameters = {n: {"value": _plain(v), "units": self.parameter_units[n]} for n, v in self.parameters.items()}
         head = {"system": self.system, "analysis": self.analysis, "method": self.method}
         answer = {**head, "parameters": parameters, "outcome": self.outcome.name.lower(), "values": values}
         return json.dumps(answer, allow_nan=False)
@@ -79,12 +79,14 @@ class PointResult:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers and lists that JSON knows."""
+    """Words, numbers and lists that JSON knows."""
+    if isinstance(value, str):
+        return value
     if np.iscomplexobj(value):
         return {"real": _plain(np.real(value)), "imag": _plain(np.imag(value))}
     if np.ndim(value):
         return [_plain(entry) for entry in value]
-    return value.item() if np.isfinite(value) else None
+    return np.asarray(value).item() if np.isfinite(value) else None
 
 
 def _short(value: Any) -> str:
@@ -125,6 +127,8 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
     """The scene of one point. Numbers vary, so that the next one needs no compilation; words and lists are fixed."""
     system, analysis = system_and_analysis(system_name, analysis_name)
     parameters = {p.name: p for p in system.parameters}
+    options = {o.name: given.get(o.name, o.default) for o in analysis.options}
+    path = analysis.path_axis(Request((), given.get("method", next(iter(analysis.methods))), options))
     tree: dict[str, Any] = {"system": system_name, "analysis": analysis_name, "points": {}, "fixed": {}, "options": {}}
     names = (*parameters, "method", *(o.name for o in analysis.options))
     for name, value in given.items():
@@ -132,15 +136,11 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
             raise InputError(f"{name} = {value!r}: unknown; allowed is {', '.join(names)}")
         if name not in parameters:
             tree["options"][name] = value
-        elif _may_vary(parameters[name]) and name != analysis.path_axis:
+        elif parameters[name].is_number and not isinstance(value, (list, tuple)) and name != path:
             tree["points"][name] = [value]
         else:
             tree["fixed"][name] = value
     return tree
-
-
-def _may_vary(parameter: Parameter) -> bool:
-    return not (parameter.choices or parameter.listed)
 
 
 @dataclass(frozen=True)

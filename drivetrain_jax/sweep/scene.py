@@ -14,11 +14,11 @@ import msgspec
 import numpy as np
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._quantities import Parameter
+from drivetrain_jax._quantities import Dimension, Parameter
 from drivetrain_jax.analysis import OUTCOME, Analysis, Request, get_analysis
 from drivetrain_jax.sweep import toml
 from drivetrain_jax.sweep.axes import MAX_POINTS, Axis, AxisTable, check_count, entry_of, spread
-from drivetrain_jax.systems import System, get_system
+from drivetrain_jax.systems import Model, System, get_system
 
 Value = float | int | str | tuple[float, ...]
 
@@ -28,7 +28,8 @@ class Scene:
     """A checked scene.
 
     ``axes`` vary: as an outer product in this order, or together as one list of points if ``zipped``. ``fixed`` holds
-    the other parameters of the system that are known, defaults included. ``text`` is the scene in TOML.
+    the other parameters of the system that are known, defaults included. ``dimensions`` are those that the analysis adds
+    to the results, ``path_axis`` is the name of the axis that it consumes whole. ``text`` is the scene in TOML.
     """
 
     title: str
@@ -38,6 +39,8 @@ class Scene:
     axes: tuple[Axis, ...]
     zipped: bool
     fixed: Mapping[str, Value]
+    dimensions: tuple[Dimension, ...]
+    path_axis: str | None
     text: str
 
 
@@ -63,10 +66,12 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
     table = _convert(tree, _SceneTable, "")
     system, analysis = system_and_analysis(table.system, table.analysis)
     request = _request(table, analysis)
-    axes, zipped = _axes(table, system, analysis)
+    axes, zipped = _axes(table, system)
     fixed = _fixed(table, system, analysis, axes)
+    path_axis = _path_axis(analysis, request, axes, zipped, fixed)
+    dimensions = analysis.dimensions(system, request, fixed)
     title = table.title or f"{system.title}: {analysis.title}"
-    return Scene(title, system, analysis, request, axes, zipped, fixed, text)
+    return Scene(title, system, analysis, request, axes, zipped, fixed, dimensions, path_axis, text)
 
 
 def system_and_analysis(system_name: str, analysis_name: str) -> tuple[System, Analysis]:
@@ -178,14 +183,14 @@ def _checked(parameter: Parameter, value: Any, where: str) -> Value:
         raise InputError(f"{where}{parameter.name} = {_short(value)}: allowed is {parameter.allowed}") from None
 
 
-def _axes(table: _SceneTable, system: System, analysis: Analysis) -> tuple[tuple[Axis, ...], bool]:
+def _axes(table: _SceneTable, system: System) -> tuple[tuple[Axis, ...], bool]:
     """The varying parameters; counted before a single value is made."""
     if table.axes and table.points:
         raise InputError("points: given together with axes; allowed is one of the two")
     for where, name in [("axes", n) for n in table.axes] + [("points", n) for n in table.points]:
         _swept_parameter(system, where, name)
     if table.points:
-        return _points(table, system, analysis), True
+        return _points(table, system), True
     specs = {name: _axis_table(name, value) for name, value in table.axes.items()}
     total = math.prod(check_count(name, spec) for name, spec in specs.items())
     if total > MAX_POINTS:
@@ -211,7 +216,7 @@ def _axis(system: System, name: str, spec: AxisTable) -> Axis:
     return Axis(name, parameter, entry, values.astype(np.int64) if parameter.integer else values)
 
 
-def _points(table: _SceneTable, system: System, analysis: Analysis) -> tuple[Axis, ...]:
+def _points(table: _SceneTable, system: System) -> tuple[Axis, ...]:
     """Equally long columns of parameter values."""
     for name, values in table.points.items():
         if not isinstance(values, list):
@@ -220,10 +225,6 @@ def _points(table: _SceneTable, system: System, analysis: Analysis) -> tuple[Axi
     if len(set(lengths.values())) > 1 or not all(lengths.values()):
         listed = ", ".join(f"{name} has {length}" for name, length in lengths.items())
         raise InputError(f"points: {listed}; allowed are lists of one length, at least 1")
-    if analysis.path_axis in table.points:
-        raise InputError(
-            f"points.{analysis.path_axis}: {analysis.name} follows it as a path; allowed is an axis or a fixed value"
-        )
     columns = []
     for name, values in table.points.items():
         parameter, entry = _swept_parameter(system, "points", name)
@@ -234,7 +235,7 @@ def _points(table: _SceneTable, system: System, analysis: Analysis) -> tuple[Axi
 
 def _scalar(parameter: Parameter, name: str) -> Parameter:
     """The range of one number of ``parameter``, under the name it is swept by."""
-    return replace(parameter, name=name, listed=False)
+    return replace(parameter, name=name, listed=False, broadcast=False)
 
 
 def _swept_parameter(system: System, where: str, name: str) -> tuple[Parameter, int | None]:
@@ -244,9 +245,9 @@ def _swept_parameter(system: System, where: str, name: str) -> tuple[Parameter, 
     parameter = known.get(base)
     if parameter is None:
         raise InputError(f"{where}.{name}: unknown parameter{_nearest(base, known)}")
-    if parameter.choices:
+    if parameter.choices or parameter.text:
         raise InputError(f"{where}.{name}: a word cannot vary; allowed is to fix it: {parameter.allowed}")
-    if parameter.listed and entry is None:
+    if not parameter.is_number and entry is None:
         raise InputError(
             f'{where}.{name}: a list cannot vary as a whole; allowed is one entry, for example "{name}[0]"'
         )
@@ -276,7 +277,32 @@ def _fixed(table: _SceneTable, system: System, analysis: Analysis, axes: tuple[A
             fixed[parameter.name] = parameter.default
     for axis in axes:
         _check_entry(axis, fixed)
+    _check_together(system.models[analysis.name], fixed)
     return fixed
+
+
+def _check_together(model: Model, fixed: Mapping[str, Value]) -> None:
+    if model.check is None:
+        return
+    try:
+        model.check(fixed)
+    except ValueError as error:
+        raise InputError(f"fixed.{error}") from None
+
+
+def _path_axis(
+    analysis: Analysis, request: Request, axes: tuple[Axis, ...], zipped: bool, fixed: Mapping[str, Value]
+) -> str | None:
+    """The name of the axis that is consumed whole: an axis of the scene, or a fixed number as a line of one."""
+    name = analysis.path_axis(request)
+    names = [axis.name for axis in axes]
+    if name in names and zipped:
+        raise InputError(f"points.{name}: {analysis.name} follows it as a path; allowed is an axis or a fixed value")
+    if name is not None and name not in names and not isinstance(fixed.get(name), (int, float)):
+        raise InputError(
+            f"options: {name!r} is not an axis of the scene; allowed is one of {', '.join(names) or 'none'}"
+        )
+    return name
 
 
 def _check_entry(axis: Axis, fixed: Mapping[str, Value]) -> None:
@@ -288,5 +314,7 @@ def _check_entry(axis: Axis, fixed: Mapping[str, Value]) -> None:
         raise InputError(
             f"fixed.{name}: missing; {axis.name} varies one entry of this list; allowed is {axis.parameter.allowed}"
         )
+    if not isinstance(fixed[name], tuple):
+        raise InputError(f"fixed.{name} = {fixed[name]}: {axis.name} varies one entry; allowed is a list of numbers")
     if axis.entry >= len(fixed[name]):
         raise InputError(f"axes.{axis.name}: allowed is {name}[0] to {name}[{len(fixed[name]) - 1}]")

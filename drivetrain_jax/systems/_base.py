@@ -83,10 +83,15 @@ class ForcedModel:
 
 @dataclass(frozen=True)
 class Model:
-    """How a system serves one analysis: ``build(values)`` gives the model from the values of ``parameters``."""
+    """How a system serves one analysis: ``build(values)`` gives the model from the values of ``parameters``.
+
+    ``check(fixed)`` raises ``ValueError`` with one line, ``name = value: allowed is ...``, where parameters that are each
+    in range do not fit together. ``fixed`` holds those that do not vary; a list is whole also if one entry varies.
+    """
 
     build: Callable[[Values], Any]
     parameters: tuple[str, ...]
+    check: Callable[[Values], None] | None = None
 
 
 @dataclass(frozen=True)

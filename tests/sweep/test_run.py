@@ -124,6 +124,23 @@ def test_fixed_path_parameter_is_a_line_of_one():
     assert ds["response"].sel(direction="up").values.tolist() == [5.0, 10.0]
 
 
+def test_an_option_names_the_path_and_it_may_be_one_entry_of_a_list():
+    axes = {"b": {"values": [1.0, 2.0, 3.0]}, "length[1]": {"values": [5.0, 7.0]}}
+    scene = {"system": "toy", "analysis": "follow", "axes": axes, "fixed": {"weight": [1.0, 2.0, 3.0]}}
+    ds = dt.run(scene | {"options": {"track": "length[1]"}})
+    assert ds["load"].dims == ("b", "length[1]", "piece") and ds["piece"].values.tolist() == [1, 2, 3]
+    assert ds["load"].values[2].tolist() == [[1.0, 10.0, 9.0], [2.0, 24.0, 18.0]]
+
+
+def test_a_number_may_stand_for_a_list():
+    scene = {"system": "toy", "analysis": "follow", "fixed": {"b": 1.0}, "options": {"track": "weight"}}
+    along = dt.run(scene | {"axes": {"weight": {"values": [2.0, 5.0]}}})
+    assert along["load"].values.tolist() == [[2.0, 4.0, 6.0], [7.0, 14.0, 21.0]]
+    ds = dt.run(scene | {"axes": {"b": {"values": [1.0]}}, "fixed": {"weight": 2.0, "stiffness": float("inf")}})
+    assert ds["load"].values.tolist() == [[2.0, 4.0, 6.0]]
+    assert json.loads(ds.attrs["fixed_parameters"])["stiffness"]["value"] == "inf"
+
+
 def test_points_that_no_solver_can_do_end_as_step_limit(tmp_path):
     scene = {
         "system": "toy",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,11 @@ GOOD = {"system": "toy", "analysis": "toy", "axes": {"a": {"start": 0, "stop": 1
 
 def changed(**changes):
     return GOOD | changes
+
+
+def follow(**changes):
+    axes = {"length[0]": {"values": [1.0, 2.0]}}
+    return {"system": "toy", "analysis": "follow", "axes": axes, "options": {"track": "length[0]"}} | changes
 
 
 def test_defaults_are_filled_in():
@@ -112,6 +119,15 @@ WRONG = {
         "integer",
     ),
     "word as axis": (changed(axes={"kind": {"values": [1]}}), "axes.kind", "fix it"),
+    "list of another length": (follow(fixed={"b": 1.0, "weight": [1, 2]}), "fixed.weight has 2 entries", "equally"),
+    "entry of a number for all": (
+        follow(axes={"weight[0]": {"values": [1]}}, fixed={"b": 1.0}),
+        "fixed.weight = 1.0",
+        "list",
+    ),
+    "path that is no axis": (follow(options={"track": "c"}), "options: 'c'", "allowed is one of length[0]"),
+    "path that is a number": (follow(options={"track": 3}), "options.track = 3", "text"),
+    "no infinity": (changed(fixed={"b": math.inf}), "fixed.b = inf", "0 < b"),
     "whole list as axis": (changed(axes={"length": {"values": [1]}}), "axes.length", '"length[0]"'),
     "entry of a number": (changed(axes={"a[0]": {"values": [1]}}), "axes.a[0]", "not a list"),
     "entry beyond the list": (changed(axes={**GOOD["axes"], "length[3]": {"values": [1]}}), "length[3]", "length[2]"),

@@ -25,10 +25,17 @@ SYSTEM = System(
         Parameter("kind", "1", "sort", default="plain", choices=("plain", "fancy")),
         Parameter("length", "m", "lengths", default=(1.0, 2.0, 3.0), lower=0.0, listed=True),
         Parameter("unused", "1", "not used by any analysis"),
+        Parameter("weight", "N/m", "weights", default=1.0, lower=0.0, listed=True, broadcast=True),
+        Parameter("stiffness", "N/m", "stiffness of the support", default=float("inf"), lower=0.0, infinite=True),
     ),
     models={
         name: Model(lambda values: values, ("a", "b", "n", "kind", "length"))
         for name in ("toy", "slow", "broken", "line")
+    }
+    | {
+        "follow": Model(
+            lambda values: values, ("b", "length", "weight", "stiffness"), lambda f: _lengths_and_weights(f)
+        )
     },
     resonances=Resonances("a", ("b",), ("R1", "R2"), lambda v: np.stack([v["b"] * 1.0, v["b"] / 2], -1), "predicted"),
 )
@@ -101,7 +108,28 @@ def _line_solvers(system: System, request) -> tuple[Solver, ...]:
     return (Solver("line", solve, lambda c: np.full(c["a"].shape, c["b"].size), chunk=4),)
 
 
-def _analysis(name: str, solvers, methods=None, **extra) -> Analysis:
+def _follow_solvers(system: System, request) -> tuple[Solver, ...]:
+    """Sums of ``weight * length`` along the path, the batch as last axis; ``stiffness`` may be infinite."""
+
+    def solve(values: dict, effort) -> dict:
+        pieces, weight = values["length"], values["weight"]
+        weights = weight if isinstance(weight, tuple) else (weight,) * len(pieces)
+        lanes = jnp.asarray(values["b"] + 0 / values["stiffness"])
+        step = [jnp.asarray(x * w, float) for x, w in zip(pieces, weights, strict=True)]
+        path = max(x.size for x in step)
+        load = jnp.stack([jnp.cumsum(jnp.broadcast_to(x, path)) for x in step], axis=1)[..., None] + 0 * lanes
+        return {"load": load, "outcome": jnp.zeros((path, lanes.size), jnp.int8)}
+
+    return (Solver("follow", solve, lambda c: c["b"], broadcasts=True, chunk=4),)
+
+
+def _lengths_and_weights(fixed) -> None:
+    weight = fixed.get("weight")
+    if isinstance(weight, tuple) and len(weight) != len(fixed["length"]):
+        raise ValueError(f"weight has {len(weight)} entries, length {len(fixed['length'])}: allowed is equally many")
+
+
+def _analysis(name: str, solvers, methods=None) -> Analysis:
     return Analysis(
         name=name,
         title="toy analysis",
@@ -110,7 +138,7 @@ def _analysis(name: str, solvers, methods=None, **extra) -> Analysis:
         methods=methods or {"plain": ("rtol",)},
         options=(RTOL, Parameter("knob", "1", "an option", default=1.0)),
         solvers=solvers,
-        dimensions=(Dimension("part", "part of the wave", ()),),
+        dimensions=lambda *_: (Dimension("part", "part of the wave", ()),),
     )
 
 
@@ -126,8 +154,21 @@ ANALYSES = {
         methods={"plain": ()},
         options=(),
         solvers=_line_solvers,
-        dimensions=(Dimension("direction", "direction of the sum", ("up", "down")),),
-        path_axis="b",
+        dimensions=lambda *_: (Dimension("direction", "direction of the sum", ("up", "down")),),
+        path_axis=lambda _: "b",
+    ),
+    "follow": Analysis(
+        name="follow",
+        title="toy whose path is an option",
+        variables=(Variable("load", "N", "weight times length, summed along the path", ("piece",)),),
+        default_outputs=("load",),
+        methods={"plain": ("track",)},
+        options=(Parameter("track", "1", "axis along which the sum runs", default="a", text=True),),
+        solvers=_follow_solvers,
+        dimensions=lambda system, request, fixed: (
+            Dimension("piece", "number of the piece", tuple(range(1, 1 + len(fixed["length"])))),
+        ),
+        path_axis=lambda request: request.options["track"],
     ),
 }
 
