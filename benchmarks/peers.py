@@ -23,7 +23,7 @@ from typing import Any
 import heyoka as hy
 import numpy as np
 
-from benchmarks.scipy_reference import spectral_radius
+from benchmarks.cardan_reference import spectral_radius
 from benchmarks.timing import RESULTS, chart, table, take, write_csv
 
 FORMS = ("full", "half", "chi")

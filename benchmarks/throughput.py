@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import peers
-from benchmarks.scipy_reference import BASE_CASE, monodromy, spectral_radius, stacked_monodromy
+from benchmarks.cardan_reference import BASE_CASE, monodromy, spectral_radius, stacked_monodromy
 from benchmarks.timing import PROCESSES, RESULTS, chart, interleaved, median, spawned_workers, table, take, write_csv
 
 Columns = Mapping[str, np.ndarray]

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.scipy_reference import BASE_CASE
+from benchmarks.cardan_reference import BASE_CASE
 
 RESULTS = Path(__file__).parent / "results"
 PROCESSES = 2

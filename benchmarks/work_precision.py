@@ -32,7 +32,7 @@ import matplotlib
 import numpy as np
 from scipy.integrate import DOP853
 
-from benchmarks.scipy_reference import NAMES
+from benchmarks.cardan_reference import NAMES
 from benchmarks.timing import RESULTS, provenance, write_csv
 
 jax.config.update("jax_enable_x64", True)

@@ -1,6 +1,6 @@
 """The forced cardan shaft with SciPy alone: the linear periodic response and the true nonlinear orbit.
 
-Independent of drivetrain_jax like :mod:`benchmarks.scipy_reference`; states are (theta1, theta2, theta1', theta2').
+Independent of drivetrain_jax like :mod:`benchmarks.cardan_reference`; states are (theta1, theta2, theta1', theta2').
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from benchmarks.scipy_reference import PERIOD, damping_and_stiffness, speed_ratio
+from benchmarks.cardan_reference import PERIOD, damping_and_stiffness, speed_ratio
 
 _TOLERANCES = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14}
 

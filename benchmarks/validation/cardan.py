@@ -1,23 +1,16 @@
-"""docs/validation.md, regenerated: what the paper prints, what this package computes, and why they differ.
-
-    python -m benchmarks.validation [--full]      # --full: the comparison of the equations on all 30,200 cells
-
-Every number of the package is set beside an independent one by NumPy and SciPy where that is feasible.
-"""
+"""The cardan shaft: Soltan Rezaee & Ghazavi 2014 against this package."""
 
 from __future__ import annotations
 
-import argparse
 import math
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 import drivetrain_jax as dt
-from benchmarks.nonlinear_reference import linear_response, nonlinear_orbit
-from benchmarks.scipy_reference import (
+from benchmarks.cardan_orbit_reference import linear_response, nonlinear_orbit
+from benchmarks.cardan_reference import (
     BASE_CASE,
     Matrices,
     Pair,
@@ -27,9 +20,8 @@ from benchmarks.scipy_reference import (
     speed_ratio,
     stacked_monodromy,
 )
-from benchmarks.timing import provenance
+from benchmarks.validation.document import Page, markdown
 
-DOCUMENT = Path(__file__).parents[1] / "docs" / "validation.md"
 PRINTED_FREQUENCIES = (0.072, 1.422)
 # Tables 1 and 2 as printed. The column of Table 2 headed Omega^C holds the difference combinations C-.
 PRINTED_SPEEDS = {
@@ -37,7 +29,6 @@ PRINTED_SPEEDS = {
     "H11": 0.035, "H12": 0.018, "H21": 0.712, "H22": 0.356,
     "C+1": 0.747, "C+2": 0.373, "C-1": 0.675, "C-2": 0.338,
 }  # fmt: skip
-Rows = Sequence[Sequence[str]]
 
 
 def natural_frequencies(mu: float = 1.0, gamma: float = 100.0) -> np.ndarray:
@@ -293,37 +284,11 @@ def _pair(values: Sequence[float]) -> str:
     return f"{values[0]:.5f}, {values[1]:.5f}"
 
 
-def markdown(head: Sequence[str], rows: Rows) -> str:
-    """A Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Compute all sections and write the document."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--full", action="store_true", help="compare the equations on all cells instead of every second row and column"
+def page(full: bool) -> Page:
+    """The page; ``full`` compares the equations on all cells instead of every second row and column."""
+    return Page(
+        "Validation of the cardan shaft",
+        "Soltan Rezaee & Ghazavi 2014 against this package; the corrected equations are derived in "
+        "[theory/cardan.md](../theory/cardan.md).",
+        (frequencies_section(), equations_section(1 if full else 2), trends_section(), forced_section()),
     )
-    stride = 1 if parser.parse_args(arguments).full else 2
-    sections: tuple[Callable[[], str], ...] = (
-        frequencies_section,
-        lambda: equations_section(stride),
-        trends_section,
-        forced_section,
-    )
-    head = (
-        "# Validation of the cardan shaft\n\nSoltan Rezaee & Ghazavi 2014 against this package. "
-        "Written by `python -m benchmarks.validation`"
-        f"{' --full' if stride == 1 else ''}; do not edit.\n"
-        "The corrected equations are derived in [theory/cardan.md](theory/cardan.md).\n"
-    )
-    facts = provenance()
-    DOCUMENT.parent.mkdir(exist_ok=True)
-    DOCUMENT.write_text(
-        "\n".join([head, *(section() for section in sections), f"{facts['machine']}; {facts['versions']}.\n"])
-    )
-
-
-if __name__ == "__main__":
-    main()
