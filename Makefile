@@ -26,7 +26,7 @@ bench: $(VENV)/installed-bench  ## throughput against the peers, work-precision;
 	$(BIN)/python -m benchmarks.throughput
 	$(BIN)/python -m benchmarks.work_precision
 
-validation: $(VENV)/installed  ## regenerates docs/validation.md
+validation: $(VENV)/installed  ## regenerates docs/validation/
 	$(BIN)/python -m benchmarks.validation
 
 $(VENV)/bin/python:

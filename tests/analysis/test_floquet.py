@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import mathieu_a, mathieu_b
 
 import drivetrain_jax as dt
-from benchmarks.scipy_reference import monodromy, spectral_radius, stacked_monodromy
+from benchmarks.cardan_reference import monodromy, spectral_radius, stacked_monodromy
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.direct import compare
 from drivetrain_jax.analysis.propagator import EXPLICIT_ORDER, explicit_propagator

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.validation import PRINTED_FREQUENCIES, PRINTED_SPEEDS, natural_frequencies, predicted_speeds
+from benchmarks.validation.cardan import PRINTED_FREQUENCIES, PRINTED_SPEEDS, natural_frequencies, predicted_speeds
 from drivetrain_jax.systems import cardan
 
 EXACT = (0.070622235012, 1.415984639720)

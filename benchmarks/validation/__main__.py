@@ -1,0 +1,28 @@
+"""Writes the validation pages: see the package's docstring."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from importlib import import_module
+
+import benchmarks.validation
+
+SYSTEMS = ("cardan", "bicardan", "planetary", "rattle")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Compute and write the page of every system named, by default of all."""
+    parser = argparse.ArgumentParser(description=benchmarks.validation.__doc__.splitlines()[0])
+    parser.add_argument("systems", nargs="*", metavar="SYSTEM", help=f"one or more of {', '.join(SYSTEMS)}")
+    parser.add_argument("--full", action="store_true", help="compare whole charts instead of samples")
+    given = parser.parse_args(arguments)
+    if unknown := set(given.systems) - set(SYSTEMS):
+        parser.error(f"SYSTEM = {', '.join(sorted(unknown))}: allowed is {', '.join(SYSTEMS)}")
+    for system in given.systems or SYSTEMS:
+        page = import_module(f"benchmarks.validation.{system}").page(given.full)
+        print(page.write(system, given.full))
+
+
+if __name__ == "__main__":
+    main()

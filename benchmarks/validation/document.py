@@ -1,0 +1,37 @@
+"""A validation page: Markdown made of sections, each with its tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.timing import provenance
+
+FOLDER = Path(__file__).parents[2] / "docs" / "validation"
+Rows = Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Page:
+    """What is compared for one system: ``title`` and ``introduction``, then ``sections`` in Markdown."""
+
+    title: str
+    introduction: str
+    sections: Sequence[str]
+
+    def write(self, system: str, full: bool) -> Path:
+        """Write docs/validation/<system>.md with the machine and the versions that computed it."""
+        command = f"python -m benchmarks.validation {system}{' --full' if full else ''}"
+        head = f"# {self.title}\n\n{self.introduction} Written by `{command}`; do not edit.\n"
+        facts = provenance()
+        path = FOLDER / f"{system}.md"
+        FOLDER.mkdir(parents=True, exist_ok=True)
+        path.write_text("\n".join([head, *self.sections, f"{facts['machine']}; {facts['versions']}.\n"]))
+        return path
+
+
+def markdown(head: Sequence[str], rows: Rows) -> str:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
