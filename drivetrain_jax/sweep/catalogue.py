@@ -52,6 +52,7 @@ def _analysis_lines(name: str) -> list[str]:
 
 def _parameter_row(parameter: Parameter) -> tuple[str, ...]:
     default = "required" if parameter.default is None else f"default {_short(parameter.default)}"
+    default = f"default {parameter.derived}" if parameter.derived else default
     return parameter.name, f"[{parameter.units}]", parameter.long_name, default, parameter.allowed
 
 

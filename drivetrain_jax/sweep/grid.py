@@ -75,7 +75,8 @@ class Grid:
                 values[name] = value
             else:
                 values[name] = (*values[name][: axis.entry], value, *values[name][axis.entry + 1 :])
-        return {name: values[name] for name in self.parameters}
+        # A derived parameter that is not given is the model's own affair.
+        return {name: values[name] for name in self.parameters if name in values}
 
     def arrays(self, points: np.ndarray) -> dict[str, Any]:
         """Like ``bind`` at ``points``, with every number (and entry of a list) an array of the shape of ``points``."""

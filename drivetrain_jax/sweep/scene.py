@@ -271,7 +271,7 @@ def _fixed(table: _SceneTable, system: System, analysis: Analysis, axes: tuple[A
     for parameter in system.parameters:
         if parameter.name in table.fixed:
             fixed[parameter.name] = _checked(parameter, table.fixed[parameter.name], "fixed.")
-        elif parameter.name in used and parameter.name not in whole:
+        elif parameter.name in used and parameter.name not in whole and not parameter.derived:
             if parameter.default is None:
                 raise InputError(f"fixed.{parameter.name}: missing; allowed is {parameter.allowed}")
             fixed[parameter.name] = parameter.default

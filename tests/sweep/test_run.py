@@ -141,6 +141,13 @@ def test_a_number_may_stand_for_a_list():
     assert json.loads(ds.attrs["fixed_parameters"])["stiffness"]["value"] == "inf"
 
 
+def test_a_derived_parameter_may_be_left_out_given_or_swept():
+    scene = {"system": "toy", "analysis": "toy", "axes": {"a": {"values": [1.0]}}}
+    assert dt.run(scene)["value"].values.tolist() == [expected_value(1.0, 2.0)]
+    ds = dt.run(scene | {"axes": scene["axes"] | {"derived": {"values": [2.0, 5.0]}}})
+    assert (ds["value"].values[0] - expected_value(1.0, 2.0)).tolist() == [0.0, 3.0]
+
+
 def test_points_that_no_solver_can_do_end_as_step_limit(tmp_path):
     scene = {
         "system": "toy",

@@ -24,12 +24,13 @@ SYSTEM = System(
         Parameter("n", "1", "count", default=3, lower=1, integer=True),
         Parameter("kind", "1", "sort", default="plain", choices=("plain", "fancy")),
         Parameter("length", "m", "lengths", default=(1.0, 2.0, 3.0), lower=0.0, listed=True),
+        Parameter("derived", "1", "twice a", derived="2 a"),
         Parameter("unused", "1", "not used by any analysis"),
         Parameter("weight", "N/m", "weights", default=1.0, lower=0.0, listed=True, broadcast=True),
         Parameter("stiffness", "N/m", "stiffness of the support", default=float("inf"), lower=0.0, infinite=True),
     ),
     models={
-        name: Model(lambda values: values, ("a", "b", "n", "kind", "length"))
+        name: Model(lambda values: values, ("a", "b", "n", "kind", "length", "derived"))
         for name in ("toy", "slow", "broken", "line")
     }
     | {
@@ -51,6 +52,7 @@ LARGE = 5.0
 def _solve(values: dict, effort, outputs: tuple[str, ...], bonus: float) -> dict:
     """``a > 9`` has no value. The batch, if any, is the last axis."""
     a, b = jnp.asarray(values["a"]), values["b"]
+    bonus = bonus + values.get("derived", 2 * a) - 2 * a
     total = a + b * values["n"] + sum(x * 10.0**k for k, x in enumerate(values["length"])) + bonus
     failed = a > 9
     results = {
