@@ -128,14 +128,14 @@ class PartsFolder:
 
     def read(self, repair: bool = False) -> Iterator[Part]:
         """All intact parts. ``repair`` deletes damaged and half-written ones (only while the folder is open)."""
+        if repair:
+            for path in self.path.glob("*.tmp"):
+                path.unlink(missing_ok=True)
         for path in sorted(self.path.glob("*-*.h5")):
             part = _read_intact(path)
             if part is not None:
                 yield part
             elif repair:
-                path.unlink(missing_ok=True)
-        if repair:
-            for path in self.path.glob("*.tmp"):
                 path.unlink(missing_ok=True)
 
 

@@ -1,22 +1,115 @@
-"""The finished result: one netCDF4/HDF5 file, written whole, read without anything of this package."""
+"""The finished result: one netCDF4/HDF5 file, read without anything of this package."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from pathlib import Path
 
+import h5netcdf
 import h5py
+import numpy as np
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.store.files import write_atomic
+from drivetrain_jax.store.files import move_into_place
+
+
+class ResultFile:
+    """A result that grows on the disk beside its final place, so that memory does not grow with it.
+
+    ``lay_out`` gives its data variables as memory maps of the file ``temporary``, to be filled in any order; ``finish``
+    puts it into place. Leaving the context without that deletes it.
+    """
+
+    def __init__(self, temporary: Path) -> None:
+        self._temporary = temporary
+        self._arrays: dict[str, np.memmap] = {}
+
+    def __enter__(self) -> ResultFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._arrays.clear()
+        self._temporary.unlink(missing_ok=True)
+
+    def lay_out(self, template: xr.Dataset) -> Mapping[str, np.ndarray]:
+        """Room for the data of ``template``, which may have any content (a broadcast zero takes no memory).
+
+        A disk without enough room is an ``OSError`` here, before anything is computed.
+        """
+        _reserve(self._temporary, _write_frame(template, self._temporary))
+        self._arrays |= _map(template, self._temporary)
+        return self._arrays
+
+    def finish(self, path: Path, **attrs: float) -> None:
+        """Change these attributes, flush everything to the disk, and move the file to ``path`` in one step."""
+        for array in self._arrays.values():
+            array.flush()
+        with h5py.File(self._temporary, "r+") as file:
+            for name, value in attrs.items():
+                file.attrs.modify(name, value)
+        move_into_place(self._temporary, path)
 
 
 def write_result(dataset: xr.Dataset, path: Path, temporary: Path) -> None:
-    """Write ``dataset`` to ``path`` in one step; ``temporary`` is where it grows. A full disk leaves ``path`` alone.
+    """Write ``dataset`` to ``path`` in one step; ``temporary`` is where it grows. A full disk leaves ``path`` alone."""
+    with ResultFile(temporary) as file:
+        for name, array in file.lay_out(dataset).items():
+            array[...] = dataset[name].values
+        file.finish(path)
 
-    The file is made in memory first: HDF5 may crash the process when a disk fills up under it.
+
+def _write_frame(template: xr.Dataset, path: Path) -> int:
+    """Write all but the data, whose contiguous room is left blank; returns the size of the file.
+
+    The head is made in memory, and room for what h5netcdf adds to it is reserved before: HDF5 may crash the process when
+    a disk fills up under it.
     """
-    write_atomic(path, dataset.to_netcdf(None, engine="h5netcdf"), temporary)
+    head = template.drop_vars(template.data_vars).to_netcdf(None, engine="h5netcdf")
+    path.write_bytes(head)
+    _reserve(path, len(head) + sum(v.nbytes for v in template.data_vars.values()) + (1 << 16) * len(template.data_vars))
+    with h5netcdf.File(path, "r+") as file:
+        for name, variable in template.data_vars.items():
+            creation = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+            creation.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+            fill = variable.encoding.get("_FillValue")
+            options = {"fillvalue": fill, "dcpl": creation, "fill_time": "never"}
+            created = file.create_variable(str(name), variable.dims, dtype=variable.dtype, **options)
+            if not variable.dims:
+                created[...] = variable.values  # HDF5 gives a scalar its place when it is written
+            for key, value in variable.attrs.items():
+                created.attrs[key] = value
+            if aside := _coordinates_of(template, variable):
+                created.attrs["coordinates"] = aside
+    return path.stat().st_size
+
+
+def _coordinates_of(template: xr.Dataset, variable: xr.DataArray) -> str:
+    """Names of the coordinates that a reader cannot find through the dimensions of ``variable`` (CF, 5)."""
+    return " ".join(
+        str(n) for n, c in template.coords.items() if n not in template.dims and set(c.dims) <= {*variable.dims}
+    )
+
+
+def _reserve(path: Path, size: int) -> None:
+    """Make the disk provide ``size`` bytes; systems that cannot do so find out while they write."""
+    if not hasattr(os, "posix_fallocate"):
+        return
+    handle = os.open(path, os.O_RDWR)
+    try:
+        os.posix_fallocate(handle, 0, size)
+    finally:
+        os.close(handle)
+
+
+def _map(template: xr.Dataset, path: Path) -> dict[str, np.memmap]:
+    with h5py.File(path, "r") as file:
+        places = {str(name): file[str(name)].id.get_offset() for name in template.data_vars}
+    return {
+        name: np.memmap(path, template[name].dtype, "r+", offset, template[name].shape)
+        for name, offset in places.items()
+    }
 
 
 def read_attribute(path: Path, name: str) -> str | None:
@@ -27,6 +120,15 @@ def read_attribute(path: Path, name: str) -> str | None:
     except OSError:
         raise _unreadable(path) from None
     return value.decode() if isinstance(value, bytes) else value
+
+
+def read_variable(path: Path, name: str) -> np.ndarray:
+    """One variable of the result at ``path``, without loading the others; ``InputError`` if it cannot be read."""
+    try:
+        with h5py.File(path, "r") as file:
+            return file[name][()]
+    except (OSError, KeyError):
+        raise _unreadable(path) from None
 
 
 def open_result(path: Path) -> xr.Dataset:

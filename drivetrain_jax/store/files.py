@@ -14,7 +14,16 @@ def write_atomic(path: Path, data: bytes | memoryview, temporary: Path) -> None:
     try:
         with open(temporary, "wb") as file:
             file.write(data)
-            file.flush()
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    move_into_place(temporary, path)
+
+
+def move_into_place(temporary: Path, path: Path) -> None:
+    """Flush the finished file ``temporary`` to the disk and rename it to ``path``; on failure it is deleted."""
+    try:
+        with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:

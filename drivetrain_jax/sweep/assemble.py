@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -21,38 +21,56 @@ from drivetrain_jax.sweep.scene import Scene
 
 # Entries assumed for a dimension whose size depends on the system, when memory is estimated.
 _USUAL_SIZE = 4
+# Bytes of the plan per point.
+_PLANNED = 32
 _STORAGE = ("xarray", "h5netcdf", "h5py")
 
 
 class Table:
-    """Results of all points of a grid, filled chunk by chunk. What is never filled counts as step limit reached."""
+    """Results of all points of a grid, filled chunk by chunk. What is never filled counts as step limit reached.
 
-    def __init__(self, scene: Scene, grid: Grid) -> None:
+    ``arrays`` holds all values: the axes in the order of the scene (or the points), then a result's own dimensions.
+    ``allocate(template)`` gives such arrays for the data variables of a dataset, by default in memory.
+    """
+
+    def __init__(
+        self, scene: Scene, grid: Grid, allocate: Callable[[xr.Dataset], Mapping[str, np.ndarray]] | None = None
+    ) -> None:
         self.variables = result_variables(scene)
-        self._grid = grid
+        self._scene, self._grid = scene, grid
+        self._allocate = allocate or _in_memory
         self._sizes = {d.name: len(d.values) for d in scene.dimensions}
-        self._arrays: dict[str, np.ndarray] = {}
+        self.arrays: Mapping[str, np.ndarray] = {}
 
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
         """Enter the results of ``points``; the first ones tell the sizes of dimensions that depend on the system."""
-        if not self._arrays:
+        if not self.arrays:
             for variable in self.variables:
                 self._sizes |= zip(reversed(variable.dims), reversed(results[variable.name].shape), strict=False)
-            self._allocate()
+            self.lay_out()
+        place = self._grid.place(points)
         for name, values in results.items():
-            self._arrays[name][points] = values
+            array = self.arrays[name]
+            if self._grid.path_position is not None:
+                array = np.moveaxis(array, self._grid.path_position, len(self._grid.shape))
+            # A fixed path parameter is no dimension of the result.
+            array[place] = values[:, 0] if self._grid.path_is_fixed else values
 
-    def __getitem__(self, name: str) -> np.ndarray:
-        """All values of a result: points, then the path if there is one, then its own dimensions."""
-        if not self._arrays:
-            self._allocate()
-        return self._arrays[name]
+    def lay_out(self) -> Mapping[str, np.ndarray]:
+        """The arrays, made if nothing has been filled in yet."""
+        if not self.arrays:
+            sweep = self._grid.result_shape
+            shapes = {v: (*sweep, *(self._sizes[dim] for dim in v.dims)) for v in self.variables}
+            # Broadcast zeros take no memory.
+            blank = {v.name: np.broadcast_to(np.zeros((), v.dtype), shape) for v, shape in shapes.items()}
+            self.arrays = self._allocate(to_dataset(self._scene, blank, {}))
+            for variable in self.variables:
+                self.arrays[variable.name][...] = _missing(variable)
+        return self.arrays
 
-    def _allocate(self) -> None:
-        path = () if self._grid.path is None else (self._grid.path_length,)
-        for variable in self.variables:
-            shape = (self._grid.size, *path, *(self._sizes[dim] for dim in variable.dims))
-            self._arrays[variable.name] = np.full(shape, _missing(variable), variable.dtype)
+
+def _in_memory(template: xr.Dataset) -> dict[str, np.ndarray]:
+    return {str(name): np.empty(v.shape, v.dtype) for name, v in template.data_vars.items()}
 
 
 def failures(outcome: np.ndarray) -> int:
@@ -72,31 +90,22 @@ def result_variables(scene: Scene) -> tuple[Variable, ...]:
     return (*(scene.analysis.variable(name) for name in scene.request.outputs), OUTCOME)
 
 
-def bytes_per_point(scene: Scene) -> int:
-    """Memory that one point takes while its scene runs: results twice (the file is made in memory), and the plan."""
+def bytes_per_point(scene: Scene, on_disk: bool) -> int:
+    """Memory that one point takes while its scene runs: the plan, and the results unless they grow on the disk."""
+    if on_disk:
+        return _PLANNED
     sizes = {d.name: len(d.values) or _USUAL_SIZE for d in scene.dimensions}
-    return 32 + 2 * sum(
+    return _PLANNED + sum(
         np.dtype(v.dtype).itemsize * math.prod(sizes[dim] for dim in v.dims) for v in result_variables(scene)
     )
 
 
-def to_dataset(scene: Scene, grid: Grid, table: Table, attrs: Mapping[str, str | float]) -> xr.Dataset:
+def to_dataset(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str, str | float]) -> xr.Dataset:
     """The labelled result: dimensions are the axes in scene order (or ``point``), then those of the variable."""
     sweep_dims = ("point",) if scene.zipped else tuple(axis.name for axis in scene.axes)
-    results = [(v, _reshaped(scene, grid, table[v.name])) for v in table.variables]
+    results = [(v, arrays[v.name]) for v in result_variables(scene)]
     coordinates = [*_axis_coordinates(scene), *_resonances(scene)]
     return build_dataset(sweep_dims, coordinates, scene.dimensions, results, _attrs(scene) | dict(attrs))
-
-
-def _reshaped(scene: Scene, grid: Grid, values: np.ndarray) -> np.ndarray:
-    """From ``(points, path, own)`` to the axes in the order of the scene, then own."""
-    if grid.path is None:
-        return values.reshape((*grid.shape, *values.shape[1:]))
-    position = [i for i, axis in enumerate(scene.axes) if axis is grid.path]
-    if not position:
-        return values.reshape((*grid.shape, *values.shape[2:]))
-    lines = values.reshape((*grid.shape, *values.shape[1:]))
-    return np.ascontiguousarray(np.moveaxis(lines, len(grid.shape), position[0]))
 
 
 def _axis_coordinates(scene: Scene) -> list[Coordinate]:

@@ -17,7 +17,8 @@ from drivetrain_jax.sweep.scene import Scene, Value
 class Grid:
     """Points numbered from 0 in C order of ``axes`` (``shape``), or one point per entry of ``axes`` if ``zipped``.
 
-    With a path axis a point is a whole line: ``axes`` lacks ``path``.
+    With a path axis a point is a whole line: ``axes`` lacks ``path``, which is number ``path_position`` among the axes
+    of the scene, or None if it is a line of one fixed value.
     """
 
     axes: tuple[Axis, ...]
@@ -25,6 +26,7 @@ class Grid:
     fixed: Mapping[str, Value]
     parameters: tuple[str, ...]
     path: Axis | None = None
+    path_position: int | None = None
 
     @classmethod
     def of(cls, scene: Scene) -> Grid:
@@ -33,11 +35,12 @@ class Grid:
         name = scene.path_axis
         if name is None:
             return cls(scene.axes, scene.zipped, scene.fixed, parameters)
-        path = next((axis for axis in scene.axes if axis.name == name), None)
-        others = tuple(axis for axis in scene.axes if axis is not path)
-        if path is None:
+        position = next((i for i, axis in enumerate(scene.axes) if axis.name == name), None)
+        if position is None:
             path = Axis(name, scene.system.parameter(name), None, np.array([scene.fixed[name]]))
-        return cls(others, scene.zipped, scene.fixed, parameters, path)
+            return cls(scene.axes, scene.zipped, scene.fixed, parameters, path)
+        others = scene.axes[:position] + scene.axes[position + 1 :]
+        return cls(others, scene.zipped, scene.fixed, parameters, scene.axes[position], position)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -55,13 +58,28 @@ class Grid:
         """Number of results along a line, 1 without a path."""
         return 1 if self.path is None else len(self.path.values)
 
+    @property
+    def path_is_fixed(self) -> bool:
+        """Whether the path is a line of one fixed value, and so no dimension of the result."""
+        return self.path is not None and self.path_position is None
+
+    @property
+    def result_shape(self) -> tuple[int, ...]:
+        """Lengths of the axes in the order of the scene, the path among them."""
+        if self.path_position is None:
+            return self.shape
+        return (*self.shape[: self.path_position], self.path_length, *self.shape[self.path_position :])
+
+    def place(self, points: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Indices of ``points`` in an array of shape ``shape``."""
+        # No axis at all is one point, of which unravel_index knows nothing.
+        return np.unravel_index(points, self.shape) if self.shape else (np.newaxis,)
+
     def columns(self, points: np.ndarray) -> dict[str, np.ndarray]:
         """Values of the varying parameters at ``points``, by name of the axis, each of the shape of ``points``."""
         if self.zipped:
             return {axis.name: axis.values[points] for axis in self.axes}
-        # No axis at all is one point, of which unravel_index knows nothing.
-        indices = np.unravel_index(points, self.shape) if self.axes else ()
-        return {axis.name: axis.values[i] for axis, i in zip(self.axes, indices, strict=True)}
+        return {axis.name: axis.values[i] for axis, i in zip(self.axes, self.place(points), strict=False)}
 
     def bind(self, columns: Mapping[str, Any]) -> dict[str, Any]:
         """All parameters of the model: the fixed ones, ``columns`` of the varying ones, and the path as a whole."""

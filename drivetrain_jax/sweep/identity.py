@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 import os
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import jax
@@ -16,17 +18,19 @@ from drivetrain_jax.sweep.scene import Scene
 
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "numpy", "scipy")
 _ROOT = Path(drivetrain_jax.__file__).parent
-_SOURCES = ("_quantities.py", "systems/*.py", "analysis/*.py", "sweep/grid.py", "sweep/plan.py", "sweep/kernel.py")
+_ENGINE = ("sweep/grid.py", "sweep/plan.py", "sweep/kernel.py")
+# What these packages hold decides numbers; what lies above them does not.
+_NUMERIC = ("drivetrain_jax._quantities", "drivetrain_jax.systems", "drivetrain_jax.analysis", "drivetrain_jax.atlas")
 
 
 def numerics(scene: Scene) -> str:
-    """Digest of the code and of the machine's instruction set; versions of everything that computes included."""
-    files = {p.relative_to(_ROOT).as_posix(): p for pattern in _SOURCES for p in sorted(_ROOT.glob(pattern))}
-    # A system or an analysis of another package brings its own source.
+    """Digest of the code that this scene runs and of the machine's instruction set; versions of all that computes
+    included. Code of other systems and analyses may change without making a result stale."""
+    starts = [_ROOT / name for name in _ENGINE]
     for function in (scene.system.models[scene.analysis.name].build, scene.analysis.solvers):
-        source = Path(inspect.getsourcefile(function) or "")
-        if source.is_file() and _ROOT not in source.parents:
-            files[source.name] = source
+        # A partial has no source of its own.
+        starts.append(Path(inspect.getsourcefile(getattr(function, "func", function)) or ""))
+    files = {_label(path): path for path in _imported(starts)}
     return digest(
         {
             "sources": source_digest(files),
@@ -37,6 +41,43 @@ def numerics(scene: Scene) -> str:
             "instructions": sorted(instruction_set()),
         }
     )
+
+
+def _label(path: Path) -> str:
+    return path.relative_to(_ROOT).as_posix() if _ROOT in path.parents else path.name
+
+
+def _imported(starts: Sequence[Path]) -> set[Path]:
+    """The source files ``starts`` and all that they import from the numeric packages, directly or not."""
+    found: set[Path] = set()
+    waiting = [path for path in starts if path.is_file()]
+    while waiting:
+        path = waiting.pop()
+        if path not in found:
+            found.add(path)
+            waiting += [file for name in _imports(path) for file in _files(name)]
+    return found
+
+
+@cache
+def _imports(path: Path) -> tuple[str, ...]:
+    """Dotted names that a source file imports, those of ``from x import y`` as ``x.y``."""
+    names: list[str] = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names += [f"{node.module}.{alias.name}" for alias in node.names]
+    return tuple(names)
+
+
+def _files(name: str) -> list[Path]:
+    """Modules that importing the dotted ``name`` runs, as far as they are numeric code of this package."""
+    if not any(name == package or name.startswith(package + ".") for package in _NUMERIC):
+        return []
+    parts = name.split(".")[1:]
+    stems = [_ROOT.joinpath(*parts[: k + 1]) for k in range(len(parts))]
+    return [file for stem in stems for file in (stem.with_suffix(".py"), stem / "__init__.py") if file.is_file()]
 
 
 def scene_digest(scene: Scene, solvers: Sequence[Solver], numerics: str) -> str:

@@ -173,8 +173,8 @@ def _compute(engine: Engine) -> Table:
 
 def _result(engine: Engine, table: Table) -> PointResult:
     scene = engine.scene
-    first = (0,) if engine.grid.path is None else (0, 0)
-    values = {v.name: table[v.name][first] for v in table.variables}
+    first = (0,) * len(engine.grid.result_shape)
+    values = {v.name: table.lay_out()[v.name][first] for v in table.variables}
     outcome = Outcome(int(values.pop(OUTCOME.name)))
     parameters = {a.parameter.name: a.values[0].item() for a in scene.axes} | dict(scene.fixed)
     ordered = {p.name: parameters[p.name] for p in scene.system.parameters if p.name in parameters}

@@ -15,7 +15,7 @@ import xarray as xr
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.store.chunks import Part, PartsFolder
-from drivetrain_jax.store.consolidate import open_result, write_result
+from drivetrain_jax.store.consolidate import ResultFile, open_result
 from drivetrain_jax.store.provenance import physical_memory, usable_cores
 from drivetrain_jax.sweep.assemble import Table, bytes_per_point, failures, to_dataset
 from drivetrain_jax.sweep.engine import ChunkError, Engine
@@ -84,7 +84,7 @@ def run(
     :raises Incomplete: something failed on the way; the same call resumes.
     """
     if out is None:
-        return _in_memory(_engine(scene, overrides, workers), workers, report)
+        return _in_memory(_engine(scene, overrides, workers, on_disk=False), workers, report)
     run_to_file(scene, Path(out), overrides=overrides, fresh=fresh, workers=workers, report=report)
     return open_result(Path(out))
 
@@ -99,7 +99,7 @@ def run_to_file(
     report: Report | None = None,
 ) -> Progress:
     """Like :func:`run` with ``out``, but returns the counts instead of the result."""
-    engine = _engine(scene, overrides, workers)
+    engine = _engine(scene, overrides, workers, on_disk=True)
     target = Target(out, engine.digest)
     if target.state == "complete" and not fresh:
         target.parts.discard()
@@ -114,8 +114,7 @@ def run_to_file(
     try:
         if fresh or target.state == "absent":
             parts.start(target.plan)
-        dataset = _resumed(engine, parts, progress, workers, report)
-        write_result(dataset, out, parts.path / "result.tmp")
+        _resume(engine, out, parts, progress, workers, report)
         parts.close(remove=True)
     except KeyboardInterrupt:
         raise Interrupted(progress) from None
@@ -127,14 +126,14 @@ def run_to_file(
 
 
 def _engine(
-    scene: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None, workers: int | None = None
+    scene: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None, workers: int | None, on_disk: bool
 ) -> Engine:
     """The engine of a scene that this machine can run."""
     if workers is not None and workers < 1:
         raise InputError(f"workers = {workers}: allowed is workers >= 1")
     checked = load_scene(scene, overrides)
     engine = Engine(checked)
-    needed, present = engine.total * bytes_per_point(checked), physical_memory()
+    needed, present = engine.total * bytes_per_point(checked, on_disk), physical_memory()
     if needed > present:
         limit = f"allowed here is up to {present / 1e9:.0f} GB"
         raise InputError(f"axes: {engine.total} points need {needed / 1e9:.0f} GB of memory; {limit}")
@@ -154,18 +153,33 @@ def _in_memory(engine: Engine, workers: int | None, report: Report | None) -> xr
         _compute(engine, range(len(engine.plan.costs)), table, progress, workers, report)
     except ChunkError as error:
         raise Incomplete(str(error), progress) from error
-    return _dataset(engine, table, time.monotonic() - begin)
+    return to_dataset(engine.scene, table.lay_out(), _attrs(engine, time.monotonic() - begin))
 
 
-def _resumed(
-    engine: Engine, parts: PartsFolder, progress: Progress, workers: int | None, report: Report | None
-) -> xr.Dataset:
-    """The result from the parts that exist and those that are computed and kept now."""
-    table, begin = Table(engine.scene, engine.grid), time.monotonic()
-    missing = set(range(len(engine.plan.costs)))
-    earlier = 0.0
+def _resume(
+    engine: Engine, out: Path, parts: PartsFolder, progress: Progress, workers: int | None, report: Report | None
+) -> None:
+    """Write the result ``out`` from the parts that exist and those that are computed and kept now."""
+    begin = time.monotonic()
+    with ResultFile(parts.path / "result.tmp") as file:
+        table = Table(engine.scene, engine.grid, lambda blank: file.lay_out(blank.assign_attrs(_attrs(engine, 0.0))))
+        missing, earlier = _reuse(engine, parts, table, progress)
+        writer, before = _Writer(parts), progress.computed
+        try:
+            _compute(engine, missing, table, progress, workers, report, writer.add)
+        finally:
+            writer.flush()
+            # An interrupt may come between keeping a chunk and counting it: what counts is what was written.
+            progress.computed = before + writer.written * engine.grid.path_length
+        table.lay_out()
+        file.finish(out, wall_time_s=round(earlier + time.monotonic() - begin, 3))
+
+
+def _reuse(engine: Engine, parts: PartsFolder, table: Table, progress: Progress) -> tuple[list[int], float]:
+    """Enter the chunks that are there; the numbers of those that are not, and the seconds the former took."""
+    missing, seconds = set(range(len(engine.plan.costs))), 0.0
     for part in parts.read(repair=True):
-        earlier += part.seconds
+        seconds += part.seconds
         for number, results in part:
             if number not in missing:
                 continue
@@ -174,14 +188,7 @@ def _resumed(
             table.fill(points, results)
             progress.reused += points.size * engine.grid.path_length
             progress.failed += failures(results[OUTCOME.name])
-    writer, before = _Writer(parts), progress.computed
-    try:
-        _compute(engine, sorted(missing), table, progress, workers, report, writer.add)
-    finally:
-        writer.flush()
-        # An interrupt may come between keeping a chunk and counting it: what counts is what was written.
-        progress.computed = before + writer.written * engine.grid.path_length
-    return _dataset(engine, table, earlier + time.monotonic() - begin)
+    return sorted(missing), seconds
 
 
 def _compute(
@@ -237,9 +244,8 @@ class _Writer:
         self._last = time.monotonic()
 
 
-def _dataset(engine: Engine, table: Table, seconds: float) -> xr.Dataset:
-    attrs = {"digest": engine.digest, "numerics": engine.numerics, "wall_time_s": round(seconds, 3)}
-    return to_dataset(engine.scene, engine.grid, table, attrs)
+def _attrs(engine: Engine, seconds: float) -> dict[str, str | float]:
+    return {"digest": engine.digest, "numerics": engine.numerics, "wall_time_s": round(seconds, 3)}
 
 
 @dataclass(frozen=True)

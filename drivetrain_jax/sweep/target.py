@@ -6,12 +6,10 @@ import os
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.store.chunks import PartsFolder
-from drivetrain_jax.store.consolidate import open_result, read_attribute
+from drivetrain_jax.store.consolidate import read_attribute, read_variable
 from drivetrain_jax.sweep.assemble import failures
 
 
@@ -56,7 +54,7 @@ class Target:
     @property
     def failed(self) -> int:
         """Number of points without a value in the complete result."""
-        return failures(np.asarray(open_result(self.out)[OUTCOME.name]))
+        return failures(read_variable(self.out, OUTCOME.name))
 
 
 def _check_place(out: Path) -> None:

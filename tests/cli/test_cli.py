@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import statistics
 import subprocess
 import sys
-import time
 
 import pytest
 import xarray as xr
@@ -229,24 +227,18 @@ def test_version_and_help(cli):
     assert code == 0 and all(name in out for name in ("list", "run", "status", "plot", "point"))
 
 
-def median_time(*command):
-    times = []
-    for _ in range(5):
-        begin = time.perf_counter()
-        subprocess.run([sys.executable, *command], check=True, capture_output=True)
-        times.append(time.perf_counter() - begin)
-    return statistics.median(times)
+def modules_after(code):
+    code = f"import sys\ntry:\n    {code}\nexcept SystemExit:\n    pass\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    return set(done.stdout.split())
 
 
-def test_help_is_instant():
-    assert median_time("-m", "drivetrain_jax.cli", "--help") < 0.25
-
-
-def test_import_is_light():
-    heavy = "import drivetrain_jax, drivetrain_jax.cli, sys; print(*sys.modules)"
-    loaded = subprocess.run([sys.executable, "-c", heavy], check=True, capture_output=True, text=True).stdout.split()
-    assert not {"jax", "numpy", "xarray", "h5py", "matplotlib", "rich", "msgspec"} & set(loaded)
-    assert median_time("-c", "import drivetrain_jax") < 0.15
+@pytest.mark.parametrize("code", ["import drivetrain_jax", "import drivetrain_jax.cli as c; c.main(['--version'])"])
+def test_import_and_help_are_light(code):
+    """The load of the machine cannot spoil this, as it would a measured time."""
+    loaded = modules_after(code)
+    assert "drivetrain_jax" in loaded
+    assert not {"jax", "numpy", "scipy", "xarray", "h5py", "matplotlib", "rich", "msgspec"} & loaded
 
 
 def test_a_reader_that_leaves_is_no_error():

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
+from pathlib import Path
+
 import pytest
 import toy
 
+import drivetrain_jax as dt
 from drivetrain_jax.sweep import identity
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.scene import load_scene
 
+CARDAN = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 BASE = {"system": "toy", "analysis": "toy", "axes": {"a": {"start": 0, "stop": 1, "num": 3}}}
 
 
@@ -67,7 +72,7 @@ def test_source_of_systems_analyses_and_engine_decides(monkeypatch):
     monkeypatch.setattr(identity, "source_digest", lambda files: seen.append(files) or "x")
     digest(BASE)
     names = set(seen[0])
-    assert {"systems/cardan.py", "analysis/floquet.py", "sweep/kernel.py", "sweep/plan.py", "toy.py"} <= names
+    assert {"analysis/_base.py", "systems/_base.py", "sweep/kernel.py", "sweep/plan.py", "toy.py"} <= names
     assert seen[0]["toy.py"].samefile(toy.__file__)
 
 
@@ -78,3 +83,27 @@ def test_chunk_size_decides(monkeypatch):
     engine = Engine(scene)
     solvers = [replace(solver, chunk=solver.chunk * 2) for solver in engine.solvers]
     assert identity.scene_digest(scene, solvers, engine.numerics) != engine.digest
+
+
+def sources(system, analysis):
+    scene = load_scene(
+        {"system": system, "analysis": analysis, "points": {"beta": [0.1], "Omega": [1.0]}, "fixed": CARDAN}
+    )
+    build, solvers = scene.system.models[analysis].build, scene.analysis.solvers
+    starts = [Path(inspect.getsourcefile(function)) for function in (build, solvers)]
+    return {path.relative_to(Path(dt.__file__).parent).as_posix() for path in identity._imported(starts)}
+
+
+def test_only_code_that_the_scene_runs_decides():
+    of_floquet, of_forced = sources("cardan", "floquet"), sources("cardan", "forced")
+    common = {
+        "systems/cardan.py",
+        "systems/_base.py",
+        "_quantities.py",
+        "analysis/_base.py",
+        "analysis/linear_algebra.py",
+    }
+    assert common <= of_floquet & of_forced
+    assert {"analysis/propagator.py", "analysis/monodromy.py"} <= of_floquet - of_forced
+    assert {"analysis/orbit.py", "analysis/amplitude.py"} <= of_forced - of_floquet
+    assert "systems/rattle.py" not in of_floquet | of_forced

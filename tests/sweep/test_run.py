@@ -306,6 +306,55 @@ def test_result_too_large_for_the_memory_is_refused_at_once(grid_scene, monkeypa
         dt.run(grid_scene)
 
 
+def test_a_disk_without_room_is_told_before_anything_is_computed(grid_scene, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("drivetrain_jax.store.consolidate.os.posix_fallocate", full)
+    with pytest.raises(Incomplete, match="No space left on device") as stopped:
+        run_to_file(grid_scene, tmp_path / "r.nc", workers=1)
+    assert stopped.value.progress.computed < 123 and not (tmp_path / "r.nc").exists()
+    assert not list((tmp_path / "r.nc.parts").glob("*.tmp"))
+
+
+def test_one_point_without_axes_goes_into_a_file(tmp_path):
+    scene = {"system": "toy", "analysis": "toy", "fixed": {"a": 1.0}, "outputs": ["value", "wave"]}
+    ds = dt.run(scene, out=tmp_path / "r.nc")
+    assert ds["value"].dims == () and ds["wave"].dims == ("part",)
+    same(ds, dt.run(scene))
+
+
+MANY = """
+import resource, sys, threading, toy
+from pathlib import Path
+toy.names()
+from drivetrain_jax.sweep.run import run_to_file
+
+def peak():
+    return int(next(l for l in Path("/proc/self/status").read_text().splitlines() if l.startswith("RssAnon")).split()[1])
+
+scene = {"system": "toy", "analysis": "toy", "outputs": ["wave"], "fixed": {"n": 1},
+         "axes": {"a": {"start": 0, "stop": 9, "num": int(sys.argv[2])}, "b": {"start": 1, "stop": 2, "num": 1000}}}
+most = [0]
+run_to_file(scene, Path(sys.argv[1]), report=lambda _: most.__setitem__(0, max(most[0], peak())))
+print(most[0] / 1024)
+"""
+
+
+@pytest.mark.full
+def test_memory_does_not_grow_with_the_results(tmp_path):
+    def megabytes(rows):
+        command = [sys.executable, "-c", MANY, str(tmp_path / f"{rows}.nc"), str(rows)]
+        return float(
+            subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(toy.__file__).parent).stdout
+        )
+
+    small, large = megabytes(100), megabytes(600)
+    # 500,000 more points of 49 bytes would be 24 MB once; the plan takes up to 32 bytes of each.
+    assert large - small < 500_000 * 32 / 2**20
+    assert (tmp_path / "600.nc").stat().st_size > 600_000 * 49
+
+
 SLOW = {"system": "toy", "analysis": "slow", "axes": {"a": {"start": 0, "stop": 8, "num": 400}}}
 
 
