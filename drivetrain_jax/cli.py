@@ -61,7 +61,9 @@ def _parser() -> argparse.ArgumentParser:
     command = _command(commands, "run", _run, "compute a scene, or resume it")
     _add_scene(command)
     command.add_argument("--fresh", action="store_true", help="replace a result of another scene or version")
-    command.add_argument("--workers", type=int, metavar="N", help="chunks computed at a time (default: usable cores)")
+    command.add_argument("--threads", type=int, metavar="N", help="chunks computed at a time (default: usable cores)")
+    command.add_argument("--workers", type=int, metavar="N", help="N processes instead of threads: survive a crash")
+    command.add_argument("--dask", metavar="ADDRESS", help="a Dask cluster instead: tcp://HOST:PORT or local:N")
     command.add_argument("--quiet", action="store_true", help="no progress, only the last line")
 
     command = _command(commands, "status", _status, "how much of a scene is computed")
@@ -122,6 +124,7 @@ def _list(options: argparse.Namespace) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     check = _stop_on_signals()
+    from drivetrain_jax.sweep.executor import Where
     from drivetrain_jax.sweep.run import Incomplete, Interrupted, run_to_file
 
     overrides = _assignments(options.set, "--set")
@@ -138,7 +141,7 @@ def _run(options: argparse.Namespace) -> int:
                 options.out,
                 overrides=overrides,
                 fresh=options.fresh,
-                workers=options.workers,
+                where=Where(options.threads, options.workers, options.dask),
                 report=report,
             )
             code = OK

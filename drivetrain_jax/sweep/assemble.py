@@ -40,6 +40,7 @@ class Table:
         self._scene, self._grid = scene, grid
         self._allocate = allocate or _in_memory
         self._sizes = {d.name: len(d.values) for d in scene.dimensions}
+        self._lost: list[np.ndarray] = []
         self.arrays: Mapping[str, np.ndarray] = {}
 
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
@@ -50,11 +51,24 @@ class Table:
             self.lay_out()
         place = self._grid.place(points)
         for name, values in results.items():
-            array = self.arrays[name]
-            if self._grid.path_position is not None:
-                array = np.moveaxis(array, self._grid.path_position, len(self._grid.shape))
             # A fixed path parameter is no dimension of the result.
-            array[place] = values[:, 0] if self._grid.path_is_fixed else values
+            self._sweep_first(self.arrays[name])[place] = values[:, 0] if self._grid.path_is_fixed else values
+
+    def _sweep_first(self, array: np.ndarray) -> np.ndarray:
+        """``array`` with the path, if it is an axis, behind all other axes of the sweep."""
+        position = self._grid.path_position
+        return array if position is None else np.moveaxis(array, position, len(self._grid.shape))
+
+    def lose(self, points: np.ndarray) -> None:
+        """Record that nobody survived the computation of ``points``."""
+        self._lost.append(points)
+        if self.arrays:
+            self._mark_lost()
+
+    def _mark_lost(self) -> None:
+        for points in self._lost:
+            self._sweep_first(self.arrays[OUTCOME.name])[self._grid.place(points)] = Outcome.LOST
+        self._lost.clear()
 
     def lay_out(self) -> Mapping[str, np.ndarray]:
         """The arrays, made if nothing has been filled in yet."""
@@ -66,6 +80,7 @@ class Table:
             self.arrays = self._allocate(to_dataset(self._scene, blank, {}))
             for variable in self.variables:
                 self.arrays[variable.name][...] = _missing(variable)
+            self._mark_lost()
         return self.arrays
 
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import threading
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
 
 import numpy as np
 
-from drivetrain_jax._quantities import Variable
 from drivetrain_jax.sweep import compile_cache
 from drivetrain_jax.sweep.assemble import result_variables
-from drivetrain_jax.sweep.executor import run_threads
 from drivetrain_jax.sweep.grid import Grid
 from drivetrain_jax.sweep.identity import numerics, scene_digest
 from drivetrain_jax.sweep.kernel import Kernel, compile_kernel
@@ -30,6 +29,8 @@ class Engine:
         self.scene = scene
         self.grid = Grid.of(scene)
         self.solvers = scene.analysis.solvers(scene.system, scene.request)
+        self._kernels: dict[int, Future[Kernel]] = {}
+        self._lock = threading.Lock()
 
     @cached_property
     def numerics(self) -> str:
@@ -51,28 +52,28 @@ class Engine:
         """Number of points, those along a path counted one by one."""
         return self.grid.size * self.grid.path_length
 
-    def compute(self, numbers: Iterable[int], workers: int) -> Iterator[tuple[Chunk, Mapping[str, np.ndarray]]]:
-        """Results of the chunks with these numbers, the costliest first; each as soon as it is there."""
+    def ordered(self, numbers: Iterable[int]) -> list[Chunk]:
+        """The chunks with these numbers, the costliest first."""
         costs = self.plan.costs
-        ordered = sorted(numbers, key=lambda number: -costs[number])
-        kernels = self._compile({self.plan.chunk(number).group for number in ordered})
+        return [self.plan.chunk(number) for number in sorted(numbers, key=lambda number: -costs[number])]
 
-        def work(chunk: Chunk) -> dict[str, np.ndarray]:
-            try:
-                return kernels[chunk.group].result()(self.grid.columns(chunk.points), chunk.effort)
-            except Exception as error:
-                solver = self.plan.groups[chunk.group].solver.name
-                raise ChunkError(f"chunk {chunk.number} ({solver}): {type(error).__name__}: {error}") from error
-
-        yield from run_threads(map(self.plan.chunk, ordered), work, workers)
-
-    def _compile(self, groups: set[int]) -> dict[int, Future[Kernel]]:
-        """Compile the kernels of ``groups`` side by side, without waiting for them."""
+    def prepare(self, groups: Iterable[int]) -> None:
+        """Begin to compile the kernels of these groups of the plan, side by side, without waiting for them."""
         compile_cache.enable()
-        variables: tuple[Variable, ...] = result_variables(self.scene)
-        pool = ThreadPoolExecutor(max(len(groups), 1), thread_name_prefix="compile")
-        try:
-            planned = {index: self.plan.groups[index] for index in groups}
-            return {i: pool.submit(compile_kernel, g.solver, self.grid, g.chunk, variables) for i, g in planned.items()}
-        finally:
+        variables = result_variables(self.scene)
+        with self._lock:
+            missing = [index for index in groups if index not in self._kernels]
+            pool = ThreadPoolExecutor(max(len(missing), 1), thread_name_prefix="compile")
+            for index in missing:
+                group = self.plan.groups[index]
+                self._kernels[index] = pool.submit(compile_kernel, group.solver, self.grid, group.chunk, variables)
             pool.shutdown(wait=False)
+
+    def compute_chunk(self, chunk: Chunk) -> Mapping[str, np.ndarray]:
+        """Results of one chunk; may be called from several threads. Raises :class:`ChunkError`."""
+        self.prepare([chunk.group])
+        try:
+            return self._kernels[chunk.group].result()(self.grid.columns(chunk.points), chunk.effort)
+        except Exception as error:
+            solver = self.plan.groups[chunk.group].solver.name
+            raise ChunkError(f"chunk {chunk.number} ({solver}): {type(error).__name__}: {error}") from error

@@ -1,32 +1,80 @@
-"""Runs tasks side by side. An executor is an iterator of ``(task, result)`` in the order of completion."""
+"""Where chunks are computed: in threads of this process, in processes of their own, or on a Dask cluster."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from typing import TypeVar
+from dataclasses import dataclass
 
-Task = TypeVar("Task")
-Result = TypeVar("Result")
+import numpy as np
 
-# Tasks handed out per worker: one that runs and one that waits, so that none idles while results are stored.
-_IN_FLIGHT = 2
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.store.provenance import usable_cores
+from drivetrain_jax.sweep.engine import Engine
+from drivetrain_jax.sweep.plan import Chunk
+
+Results = Mapping[str, np.ndarray]
+# Chunks handed out per worker: one that is computed and one that waits, so that none idles while results are stored.
+IN_FLIGHT = 2
 
 
-def run_threads(tasks: Iterable[Task], work: Callable[[Task], Result], workers: int) -> Iterator[tuple[Task, Result]]:
+@dataclass(frozen=True)
+class Where:
+    """``workers`` processes, the Dask cluster at ``dask`` (``tcp://host:port`` or ``local:N``), or else ``threads``.
+
+    None of them decides any number. Raises :class:`InputError` where they are out of range or exclude each other.
+    """
+
+    threads: int | None = None
+    workers: int | None = None
+    dask: str | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("threads", "workers"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InputError(f"{name} = {value}: allowed is {name} >= 1")
+        given = [name for name in ("threads", "workers", "dask") if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise InputError(f"{given[0]}: given together with {given[1]}; allowed is one of them")
+
+    def compute(self, engine: Engine, numbers: Iterable[int]) -> Iterator[tuple[Chunk, Results | None]]:
+        """``(chunk, results)`` of the chunks with these numbers in the order of completion, the costliest begun first.
+
+        Results are None for a chunk that killed every process which computed it. What fails otherwise is raised.
+        """
+        chunks = engine.ordered(numbers)
+        if self.workers is None and self.dask is None:
+            engine.prepare({chunk.group for chunk in chunks})
+            return run_threads(chunks, engine.compute_chunk, self.threads or usable_cores())
+        from drivetrain_jax.sweep.worker import Job
+
+        job = Job(engine.scene.text, engine.digest)
+        if self.workers is not None:
+            from drivetrain_jax.sweep.processes import run_processes
+
+            return run_processes(chunks, job, self.workers)
+        from drivetrain_jax.sweep.cluster import run_cluster
+
+        return run_cluster(chunks, job, self.dask)
+
+
+def run_threads(
+    chunks: Iterable[Chunk], work: Callable[[Chunk], Results], threads: int
+) -> Iterator[tuple[Chunk, Results]]:
     """Threads of this process; compiled code runs without the interpreter's lock.
 
-    An exception of a task is raised here. When the iterator is left (also by an interrupt), no further task starts;
+    An exception of a chunk is raised here. When the iterator is left (also by an interrupt), no further chunk starts;
     those that run finish in the background and their results are dropped.
     """
-    pool = ThreadPoolExecutor(workers, thread_name_prefix="chunk")
-    remaining = iter(tasks)
-    running: dict[Future[Result], Task] = {}
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="chunk")
+    remaining = iter(chunks)
+    running: dict[Future[Results], Chunk] = {}
     try:
         while True:
-            for task in remaining:
-                running[pool.submit(work, task)] = task
-                if len(running) >= _IN_FLIGHT * workers:
+            for chunk in remaining:
+                running[pool.submit(work, chunk)] = chunk
+                if len(running) >= IN_FLIGHT * threads:
                     break
             if not running:
                 return

@@ -16,9 +16,10 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.store.chunks import Part, PartsFolder
 from drivetrain_jax.store.consolidate import ResultFile, open_result
-from drivetrain_jax.store.provenance import physical_memory, usable_cores
+from drivetrain_jax.store.provenance import physical_memory
 from drivetrain_jax.sweep.assemble import Table, bytes_per_point, failures, to_dataset
 from drivetrain_jax.sweep.engine import ChunkError, Engine
+from drivetrain_jax.sweep.executor import Where
 from drivetrain_jax.sweep.plan import Chunk
 from drivetrain_jax.sweep.scene import load_scene
 from drivetrain_jax.sweep.target import Target
@@ -67,7 +68,9 @@ def run(
     *,
     overrides: Mapping[str, Any] | None = None,
     fresh: bool = False,
+    threads: int | None = None,
     workers: int | None = None,
+    dask: str | None = None,
     report: Report | None = None,
 ) -> xr.Dataset:
     """Compute a scene and return its labelled result.
@@ -78,14 +81,18 @@ def run(
     :param scene: path of a scene file, or a mapping with the same keys.
     :param overrides: entries to replace, by dotted key: ``{"fixed.zeta": 0.002}``.
     :param fresh: replace a result, or drop unfinished work, of another scene or version at ``out``.
-    :param workers: chunks computed at a time (default: the cores this process may use); numbers do not depend on it.
+    :param threads: chunks computed at a time in threads of this process (default: the cores it may use).
+    :param workers: this many spawned processes instead: one that crashes costs the chunk it was computing. A script that
+        asks for them has to be guarded by ``if __name__ == "__main__"``.
+    :param dask: the Dask cluster at ``tcp://host:port``, or ``local:N`` processes of Dask's own, instead.
     :param report: called with the :class:`Progress` after every chunk.
     :raises InputError: one line naming the field, what was given, what is allowed. Nothing is computed or written.
     :raises Incomplete: something failed on the way; the same call resumes.
     """
+    where = Where(threads, workers, dask)
     if out is None:
-        return _in_memory(_engine(scene, overrides, workers, on_disk=False), workers, report)
-    run_to_file(scene, Path(out), overrides=overrides, fresh=fresh, workers=workers, report=report)
+        return _in_memory(_engine(scene, overrides, on_disk=False), where, report)
+    run_to_file(scene, Path(out), overrides=overrides, fresh=fresh, where=where, report=report)
     return open_result(Path(out))
 
 
@@ -95,11 +102,11 @@ def run_to_file(
     *,
     overrides: Mapping[str, Any] | None = None,
     fresh: bool = False,
-    workers: int | None = None,
+    where: Where = Where(),  # noqa: B008
     report: Report | None = None,
 ) -> Progress:
     """Like :func:`run` with ``out``, but returns the counts instead of the result."""
-    engine = _engine(scene, overrides, workers, on_disk=True)
+    engine = _engine(scene, overrides, on_disk=True)
     target = Target(out, engine.digest)
     if target.state == "complete" and not fresh:
         target.parts.discard()
@@ -114,7 +121,7 @@ def run_to_file(
     try:
         if fresh or target.state == "absent":
             parts.start(target.plan)
-        _resume(engine, out, parts, progress, workers, report)
+        _resume(engine, out, parts, progress, where, report)
         parts.close(remove=True)
     except KeyboardInterrupt:
         raise Interrupted(progress) from None
@@ -125,12 +132,8 @@ def run_to_file(
     return progress
 
 
-def _engine(
-    scene: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None, workers: int | None, on_disk: bool
-) -> Engine:
+def _engine(scene: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None, on_disk: bool) -> Engine:
     """The engine of a scene that this machine can run."""
-    if workers is not None and workers < 1:
-        raise InputError(f"workers = {workers}: allowed is workers >= 1")
     checked = load_scene(scene, overrides)
     engine = Engine(checked)
     needed, present = engine.total * bytes_per_point(checked, on_disk), physical_memory()
@@ -147,17 +150,17 @@ def _progress(engine: Engine) -> Progress:
     return Progress(engine.total, computed=points, failed=points)
 
 
-def _in_memory(engine: Engine, workers: int | None, report: Report | None) -> xr.Dataset:
+def _in_memory(engine: Engine, where: Where, report: Report | None) -> xr.Dataset:
     table, progress, begin = Table(engine.scene, engine.grid), _progress(engine), time.monotonic()
     try:
-        _compute(engine, range(len(engine.plan.costs)), table, progress, workers, report)
+        _compute(engine, range(len(engine.plan.costs)), table, progress, where, report)
     except ChunkError as error:
         raise Incomplete(str(error), progress) from error
     return to_dataset(engine.scene, table.lay_out(), _attrs(engine, time.monotonic() - begin))
 
 
 def _resume(
-    engine: Engine, out: Path, parts: PartsFolder, progress: Progress, workers: int | None, report: Report | None
+    engine: Engine, out: Path, parts: PartsFolder, progress: Progress, where: Where, report: Report | None
 ) -> None:
     """Write the result ``out`` from the parts that exist and those that are computed and kept now."""
     begin = time.monotonic()
@@ -166,7 +169,7 @@ def _resume(
         missing, earlier = _reuse(engine, parts, table, progress)
         writer, before = _Writer(parts), progress.computed
         try:
-            _compute(engine, missing, table, progress, workers, report, writer.add)
+            _compute(engine, missing, table, progress, where, report, writer.add)
         finally:
             writer.flush()
             # An interrupt may come between keeping a chunk and counting it: what counts is what was written.
@@ -196,23 +199,29 @@ def _compute(
     numbers: Iterable[int],
     table: Table,
     progress: Progress,
-    workers: int | None,
+    where: Where,
     report: Report | None,
     keep: Callable[[Chunk, Mapping[str, np.ndarray]], None] | None = None,
 ) -> None:
-    """Compute chunks into ``table``; ``keep`` gets each as soon as it is there."""
+    """Compute chunks into ``table``; ``keep`` gets each as soon as it is there. Lost ones are not kept: a run that is
+    resumed tries them again."""
     numbers, costs = list(numbers), engine.plan.costs
     progress.total_cost = float(costs[numbers].sum())
     if report:
         report(progress)
     # Closed on the way out: after an interrupt no further chunk starts.
-    with closing(engine.compute(numbers, workers or usable_cores())) as finished:
+    with closing(where.compute(engine, numbers)) as finished:
         for chunk, results in finished:
-            if keep:
-                keep(chunk, results)
-            table.fill(chunk.points, results)
-            progress.computed += chunk.points.size * engine.grid.path_length
-            progress.failed += failures(results[OUTCOME.name])
+            count = chunk.points.size * engine.grid.path_length
+            if results is None:
+                table.lose(chunk.points)
+                progress.failed += count
+            else:
+                if keep:
+                    keep(chunk, results)
+                table.fill(chunk.points, results)
+                progress.failed += failures(results[OUTCOME.name])
+            progress.computed += count
             progress.cost += float(costs[chunk.number])
             if report:
                 report(progress)

@@ -19,6 +19,7 @@ import xarray as xr
 
 import drivetrain_jax as dt
 from drivetrain_jax.sweep import toml
+from drivetrain_jax.sweep.executor import Where
 from drivetrain_jax.sweep.run import Incomplete, run_to_file, status
 
 
@@ -196,9 +197,9 @@ def test_scene_in_the_file_gives_the_same_result(grid_scene, tmp_path):
 
 
 def test_threads_and_repetition_do_not_change_a_bit(grid_scene):
-    first = dt.run(grid_scene, workers=1)
+    first = dt.run(grid_scene, threads=1)
     for workers in (1, 2, 5):
-        same(first, dt.run(grid_scene, workers=workers))
+        same(first, dt.run(grid_scene, threads=workers))
 
 
 def test_complete_result_is_only_read(grid_scene, tmp_path):
@@ -225,7 +226,7 @@ def interrupt_after(chunks):
 def test_interrupted_and_resumed_equals_uninterrupted(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt) as stopped:
-        run_to_file(grid_scene, path, workers=1, report=interrupt_after(2))
+        run_to_file(grid_scene, path, where=Where(threads=1), report=interrupt_after(2))
     done = stopped.value.progress
     assert 0 < done.computed < 123 and not path.exists()
     found = status(grid_scene, path)
@@ -239,7 +240,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(grid_scene, tmp_path):
 def test_parts_are_not_resumed_by_another_scene(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt):
-        run_to_file(grid_scene, path, workers=1, report=interrupt_after(2))
+        run_to_file(grid_scene, path, where=Where(threads=1), report=interrupt_after(2))
     other = grid_scene | {"fixed": {"n": 4}}
     assert status(other, path).state == "stale"
     with pytest.raises(dt.InputError, match="unfinished work of another scene"):
@@ -257,7 +258,7 @@ def test_interrupted_replacement_keeps_the_old_result_and_resumes(grid_scene, tm
     with pytest.raises(dt.InputError, match="--fresh"):
         run_to_file(other, path)
     with pytest.raises(KeyboardInterrupt):
-        run_to_file(other, path, fresh=True, workers=1, report=interrupt_after(2))
+        run_to_file(other, path, fresh=True, where=Where(threads=1), report=interrupt_after(2))
     assert path.read_bytes() == before and status(other, path).state == "partial"
     assert run_to_file(other, path).reused > 0
     assert status(other, path).state == "complete" and os.listdir(tmp_path) == ["r.nc"]
@@ -266,7 +267,7 @@ def test_interrupted_replacement_keeps_the_old_result_and_resumes(grid_scene, tm
 def test_corrupted_chunk_is_computed_again(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt) as stopped:
-        run_to_file(grid_scene, path, workers=1, report=interrupt_after(2))
+        run_to_file(grid_scene, path, where=Where(threads=1), report=interrupt_after(2))
     for part in Path(f"{path}.parts").glob("*.h5"):
         data = bytearray(part.read_bytes())
         data[len(data) // 2] ^= 1
@@ -312,7 +313,7 @@ def test_a_disk_without_room_is_told_before_anything_is_computed(grid_scene, tmp
 
     monkeypatch.setattr("drivetrain_jax.store.consolidate.os.posix_fallocate", full)
     with pytest.raises(Incomplete, match="No space left on device") as stopped:
-        run_to_file(grid_scene, tmp_path / "r.nc", workers=1)
+        run_to_file(grid_scene, tmp_path / "r.nc", where=Where(threads=1))
     assert stopped.value.progress.computed < 123 and not (tmp_path / "r.nc").exists()
     assert not list((tmp_path / "r.nc.parts").glob("*.tmp"))
 
@@ -364,7 +365,7 @@ def slow_process(tmp_path):
     scene = tmp_path / "slow.toml"
     scene.write_text(toml.write(SLOW))
     out = tmp_path / "r.nc"
-    command = [sys.executable, toy.__file__, "run", str(scene), "--out", str(out), "--quiet", "--workers", "1"]
+    command = [sys.executable, toy.__file__, "run", str(scene), "--out", str(out), "--quiet", "--threads", "1"]
 
     def start():
         return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=Path(toy.__file__).parents[2])

@@ -1,0 +1,76 @@
+"""Chunks computed on a Dask cluster: this process plans and writes, the workers compute and hand back arrays."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.sweep import worker
+from drivetrain_jax.sweep.engine import ChunkError
+from drivetrain_jax.sweep.executor import IN_FLIGHT, Results
+from drivetrain_jax.sweep.plan import Chunk
+from drivetrain_jax.sweep.worker import Job
+
+_PATIENCE = "10s"
+
+
+def run_cluster(chunks: Iterable[Chunk], job: Job, address: str) -> Iterator[tuple[Chunk, Results | None]]:
+    """``(chunk, results)`` in the order of completion, from the scheduler at ``address`` or from ``local:N`` processes.
+
+    A chunk whose worker died is computed again elsewhere; results are None for one at which too many died (Dask's
+    setting ``distributed.scheduler.allowed-failures``). An exception of a chunk is raised here; a scheduler that
+    vanishes is a :class:`ChunkError`.
+    """
+    distributed = _distributed()
+    with ExitStack() as stack:
+        client = _connect(distributed, address, stack)
+        remaining, running = iter(chunks), {}
+        finished = distributed.as_completed(loop=client.loop)
+        room = IN_FLIGHT * max(sum(client.nthreads().values()), 1)
+        while True:
+            while len(running) < room and (chunk := next(remaining, None)) is not None:
+                future = client.submit(worker.compute, job, chunk.number, key=f"chunk-{chunk.number}-{job.digest}")
+                running[future.key] = chunk
+                finished.add(future)
+            if not running:
+                return
+            future = next(finished)
+            yield running.pop(future.key), _result(distributed, future)
+            future.release()
+
+
+def _result(distributed: Any, future: Any) -> Results | None:
+    try:
+        return future.result()
+    except distributed.KilledWorker:
+        return None
+    except (distributed.CancelledError, OSError) as error:
+        raise ChunkError(f"dask: the scheduler is gone ({type(error).__name__})") from error
+
+
+def _connect(distributed: Any, address: str, stack: ExitStack) -> Any:
+    local = re.fullmatch(r"local:([1-9]\d*)", address)
+    if local:
+        cluster = distributed.LocalCluster(
+            n_workers=int(local.group(1)), threads_per_worker=1, processes=True, dashboard_address=None
+        )
+        address = stack.enter_context(cluster).scheduler_address
+    elif not re.match(r"\w+://", address):
+        raise InputError(f"dask = {address!r}: allowed is tcp://HOST:PORT or local:N with N >= 1")
+    try:
+        return stack.enter_context(distributed.Client(address, timeout=_PATIENCE, set_as_default=False))
+    except (OSError, ValueError) as error:
+        raise InputError(f"dask = {address!r}: no scheduler answers there; {type(error).__name__}") from None
+
+
+def _distributed() -> Any:
+    try:
+        import distributed
+    except ImportError:
+        raise InputError(
+            "dask: the package distributed is not installed; install drivetrain_jax[distributed]"
+        ) from None
+    return distributed

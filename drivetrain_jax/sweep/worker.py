@@ -1,0 +1,46 @@
+"""What another process does for a run: it makes the scene's engine ready once and computes chunks by number."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from drivetrain_jax.sweep.engine import ChunkError, Engine
+from drivetrain_jax.sweep.scene import load_scene
+
+
+class Mismatch(ChunkError):
+    """A worker would compute something else than the run asks for: other code, versions or instruction set."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A scene as text, and the digest of what its driver wants computed."""
+
+    scene: str
+    digest: str
+
+
+@lru_cache(maxsize=1)
+def _engine(job: Job) -> Engine:
+    engine = Engine(load_scene(tomllib.loads(job.scene)))
+    if engine.digest != job.digest:
+        raise Mismatch("code, versions or instruction set differ from those of the run")
+    return engine
+
+
+def prepare(job: Job) -> int:
+    """Make the engine ready; returns the number of this process. Raises :class:`Mismatch`."""
+    _engine(job)
+    return os.getpid()
+
+
+def compute(job: Job, number: int) -> Mapping[str, np.ndarray]:
+    """Results of chunk ``number``. Raises :class:`Mismatch`, or what the computation raises."""
+    engine = _engine(job)
+    return engine.compute_chunk(engine.plan.chunk(number))

@@ -1,0 +1,55 @@
+"""A damped Mathieu oscillator of another package, in whose computation a process can be made to die."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from drivetrain_jax._quantities import Parameter
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic, Model, System
+
+
+def _perhaps_die(deadly: np.ndarray, folder: str) -> np.ndarray:
+    """Dies where ``deadly`` is 1; where it is 2 only once, which a file in ``folder`` remembers."""
+    once = Path(folder) / "died"
+    if np.any(deadly == 1) or (np.any(deadly == 2) and not once.exists()):
+        once.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return np.zeros(())
+
+
+def _model(values) -> FloquetModel:
+    delta, deadly = values["delta"], values["deadly"]
+    zero = 0.0
+    # Compiled code alone is dangerous; plans are made with plain arrays.
+    if isinstance(delta, jax.core.Tracer):
+        folder = os.environ["FRAGILE_FOLDER"]
+        zero = jax.pure_callback(
+            lambda sort: _perhaps_die(sort, folder), jax.ShapeDtypeStruct((), float), jnp.asarray(deadly) + 0 * delta
+        )
+    system = LinearPeriodic(
+        lambda t: ((0, 1.0), (-(delta + zero + values["epsilon"] * jnp.cos(t)), -0.02)),
+        2 * math.pi,
+        log_determinant=lambda: -0.04 * math.pi + 0 * delta,
+    )
+    # The effort keeps deadly points in chunks of their own.
+    return FloquetModel(system, system, lambda rtol: 30 + 10 * (np.asarray(deadly) + 0 * np.asarray(delta)))
+
+
+SYSTEM = System(
+    name="fragile",
+    title="Damped Mathieu oscillator",
+    source="tests",
+    parameters=(
+        Parameter("delta", "1", "mean stiffness"),
+        Parameter("epsilon", "1", "depth of modulation", default=0.3),
+        Parameter("deadly", "1", "what happens", default=0, lower=0, upper=2, integer=True),
+    ),
+    models={"floquet": Model(_model, ("delta", "epsilon", "deadly"))},
+)
