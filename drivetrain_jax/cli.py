@@ -71,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
     command = _command(commands, "plot", _plot, "draw the figure that suits a result")
-    command.add_argument("file", metavar="FILE.nc", type=Path)
+    command.add_argument("files", metavar="FILE.nc", type=Path, nargs="+", help="several methods of one analysis overlay")
     command.add_argument("--out", required=True, metavar="FIGURE", type=Path, help="figure to write (.png, .pdf, .svg)")
 
     command = _command(commands, "point", _point, "compute one point")
@@ -211,7 +211,7 @@ def _plot(options: argparse.Namespace) -> int:
     out = options.out
     if not out.parent.is_dir():
         raise InputError(f"out = {str(out)!r}: the folder does not exist; allowed is a file in an existing folder")
-    figure = plot(open_result(options.file))
+    figure = plot(*map(open_result, options.files))
     kinds = figure.canvas.get_supported_filetypes()
     if out.suffix[1:].lower() not in kinds:
         raise InputError(f"out = {str(out)!r}: allowed is a name that ends in .{', .'.join(kinds)}")
