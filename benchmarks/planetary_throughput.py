@@ -1,0 +1,160 @@
+"""Planetary gears per second: the package against NumPy's batched LAPACK on the same matrices, and a SciPy loop.
+
+    python -m benchmarks.planetary_throughput [--gears 20000] [--repeats 5] [--quick]
+
+Writes results/planetary_throughput.csv. Every gear has its own mesh and bearing stiffness and its own place of the
+second planet; the result is all 9 + 3N frequencies. The package runs as its engine does, compiled beforehand; LAPACK
+gets the finished matrices (their assembly is not in its time) cut into as many parts as there are threads. Both use
+both cores. Errors are relative, the largest over all modes that move, against 50 digits on a few gears.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from benchmarks.planetary_reference import TABLE_2, exact_frequencies, extension_matrix, natural_frequencies
+from benchmarks.timing import PROCESSES, RESULTS, interleaved, median, table, write_csv
+
+COUNTS = (3, 4, 5, 7, 12)
+_CHECKED = 5
+Job = Callable[[], np.ndarray]
+
+
+def gears(planets: int, count: int) -> dict[str, np.ndarray]:
+    """Columns of the swept parameters of ``count`` gears."""
+    rng = np.random.default_rng(planets)
+    second = 2 * math.pi / planets * rng.uniform(0.8, 1.2, count)
+    return {"planet_angle[1]": second, "k_sp": 10 ** rng.uniform(8, 9, count), "k_p": 10 ** rng.uniform(7, 9, count)}
+
+
+def parameters(planets: int, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """All parameters of these gears for the references, in lanes."""
+    angles = [np.full_like(columns["k_p"], angle) for angle in 2 * math.pi * np.arange(planets) / planets]
+    angles[1] = columns["planet_angle[1]"]
+    return TABLE_2 | {"planet_angle": angles, "k_sp": columns["k_sp"], "k_p": columns["k_p"]}
+
+
+def package_job(planets: int, columns: Mapping[str, np.ndarray], method: str) -> Job:
+    """The engine on these gears: its plan, kernels and threads as in ``dt.run``, compiled once."""
+    from drivetrain_jax.sweep.assemble import result_variables
+    from drivetrain_jax.sweep.engine import Engine
+    from drivetrain_jax.sweep.kernel import compile_kernel
+    from drivetrain_jax.sweep.scene import load_scene
+
+    angles = (2 * math.pi * np.arange(planets) / planets).tolist()
+    scene = {
+        "system": "planetary",
+        "analysis": "modes",
+        "outputs": ["natural_frequency"],
+        "options": {"method": method},
+    }
+    points = {name: column.tolist() for name, column in columns.items()}
+    loaded = load_scene(scene | {"title": "throughput", "points": points, "fixed": {"planet_angle": angles}})
+    engine = Engine(loaded)
+    group = engine.plan.groups[0]
+    kernel = compile_kernel(group.solver, engine.grid, group.chunk, result_variables(loaded))
+    parts = [group.order[i : i + group.chunk] for i in range(0, group.order.size, group.chunk)]
+
+    def work(part: np.ndarray) -> np.ndarray:
+        return kernel(engine.grid.columns(part), 1)["natural_frequency"]
+
+    def job() -> np.ndarray:
+        found = np.empty((group.order.size, 9 + 3 * planets))
+        with ThreadPoolExecutor(PROCESSES) as pool:
+            for part, values in zip(parts, pool.map(work, parts), strict=True):
+                found[part] = values
+        return found
+
+    return job
+
+
+def lapack_job(matrices: np.ndarray, solve: Callable[[np.ndarray], np.ndarray]) -> Job:
+    """``solve`` on parts of ``matrices`` in as many threads as there are cores; LAPACK runs outside the interpreter lock."""
+    parts = np.array_split(matrices, 4 * PROCESSES)
+
+    def job() -> np.ndarray:
+        with ThreadPoolExecutor(PROCESSES) as pool:
+            return np.concatenate(list(pool.map(solve, parts)))
+
+    return job
+
+
+def _svd(matrices: np.ndarray) -> np.ndarray:
+    return np.linalg.svd(matrices, compute_uv=False)[:, ::-1] / (2 * math.pi)
+
+
+def _eigvalsh(matrices: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(matrices), 0)) / (2 * math.pi)
+
+
+def one_gear(p: Mapping[str, Any], index: int) -> dict[str, Any]:
+    """The parameters of gear number ``index``."""
+    angles = tuple(float(angle[index]) for angle in p["planet_angle"])
+    single = {name: float(np.ravel(v)[index if np.ndim(v) else 0]) for name, v in p.items() if name != "planet_angle"}
+    return {"planet_angle": angles, **single}
+
+
+def contenders(planets: int, count: int) -> tuple[dict[str, Job], dict[str, int], dict[str, Any]]:
+    """Jobs, gears in each, and the parameters of the gears."""
+    columns = gears(planets, count)
+    p = parameters(planets, columns)
+    factors = extension_matrix(p)
+    squares = np.swapaxes(factors, 1, 2) @ factors
+    few = max(count // 100, 10)
+    jobs = {
+        "package": package_job(planets, columns, "auto"),
+        "package, without the reduction": package_job(planets, columns, "full"),
+        "numpy svd of the same matrices": lapack_job(factors, _svd),
+        "numpy eigvalsh of their squares": lapack_job(squares, _eigvalsh),
+        "scipy eigh, one by one": lambda: np.stack([natural_frequencies(one_gear(p, i)) for i in range(few)]),
+    }
+    return jobs, {name: few if name.startswith("scipy") else count for name in jobs}, p
+
+
+def measure(planets: int, count: int, repeats: int) -> list[dict[str, Any]]:
+    """One row per contender."""
+    jobs, sizes, p = contenders(planets, count)
+    exact = np.array([exact_frequencies(one_gear(p, i)) for i in range(_CHECKED)])
+    found = {name: job()[:_CHECKED] for name, job in jobs.items()}
+    seconds = {name: median(values) for name, values in interleaved(jobs, repeats).items()}
+    rates = {name: sizes[name] / seconds[name] for name in jobs}
+    baseline = rates["numpy svd of the same matrices"]
+    return [
+        {
+            "planets": planets,
+            "method": name,
+            "gears": sizes[name],
+            "gears_per_s": rates[name],
+            "frequencies_per_s": rates[name] * (9 + 3 * planets),
+            "over_numpy_svd": rates[name] / baseline,
+            "error": float(np.abs(found[name][:, 1:] / exact[:, 1:] - 1).max()),
+            "rigid_Hz": float(found[name][:, 0].max()),
+        }
+        for name in jobs
+    ]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--gears", type=int, default=20000)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--quick", action="store_true", help="a few gears, nothing written")
+    given = parser.parse_args(arguments)
+    count, repeats = (2048, 1) if given.quick else (given.gears, given.repeats)
+    counts = COUNTS[1:2] if given.quick else COUNTS
+    rows = [row for planets in counts for row in measure(planets, count, repeats)]
+    print(table(rows))
+    if not given.quick:
+        note = f"{PROCESSES} threads for the package and for LAPACK; the SciPy loop runs on one core"
+        write_csv(RESULTS / "planetary_throughput.csv", rows, [note])
+
+
+if __name__ == "__main__":
+    main()

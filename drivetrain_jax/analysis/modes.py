@@ -1,0 +1,262 @@
+"""Natural frequencies and modes of masses joined by springs: values, families, shapes, and modes followed along an axis.
+
+Frequencies alone come from singular values (:mod:`singular_values`) and need no vectors; everything else from
+:mod:`singular_vectors`. Both work on the factor ``diag(sqrt k) B M^(-1/2)``: the stiffness matrix, which would square
+the condition, is never formed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.lanes import in_blocks, lane_count, with_path
+from drivetrain_jax.analysis.mode_types import CLUSTER, MODE_TYPES, BlockModes, block_modes, clusters, mode_types
+from drivetrain_jax.analysis.singular_values import EPS, Bidiagonal, bidiagonal_form, bidiagonal_values
+from drivetrain_jax.analysis.tracking import follow
+from drivetrain_jax.systems import FAMILIES, Block, SpringSystem, System
+
+Build = Callable[[Mapping[str, Any]], SpringSystem]
+
+VARIABLES = (
+    Variable("natural_frequency", "Hz", "natural frequency", ("mode",)),
+    Variable("natural_frequency_error", "Hz", "estimated bound of the error of natural_frequency", ("mode",)),
+    Variable("mode_type", "1", "type of the mode", ("mode",), "int8", MODE_TYPES),
+    Variable("participation", "1", "share of the mode in each family", ("mode", "family")),
+    Variable("kinetic_energy", "1", "share of the mode's kinetic energy in each body", ("mode", "body")),
+    Variable("mode_shape", "kg-1/2", "mode shape of unit modal mass", ("mode", "dof")),
+    Variable("branch", "1", "number of the branch that the mode continues along the track", ("mode",), "int32"),
+    Variable("mac", "1", "assurance criterion of the mode with its branch at the previous point", ("mode",)),
+)
+_SPECTRUM = {"natural_frequency", "natural_frequency_error"}
+_FOLLOWED = {"branch", "mac"}
+# Chunks of the engine, and lanes that are worked on at a time: these fit into the cache of a core.
+_SPECTRUM_CHUNK, _MODES_CHUNK, _LINES_CHUNK = 1024, 256, 8
+_CACHE = 1 << 16
+
+
+class Modes(NamedTuple):
+    """Modes of the whole system, rising: angular ``frequency`` (n, N), mass-weighted ``vectors`` (dofs, n, N) or None,
+    ``participation`` (n, families, N), ``found`` (N,)."""
+
+    frequency: Array
+    vectors: Array | None
+    participation: Array
+    found: Array
+
+
+def _lanes_at_a_time(blocks: tuple[Block, ...]) -> int:
+    """Lanes whose matrices fill the cache, a multiple of the vector length."""
+    entries = max(block.factor.shape[0] * block.factor.shape[1] for block in blocks)
+    return int(np.clip(_CACHE // entries // 8 * 8, 16, 128))
+
+
+def _blocks(model: SpringSystem, method: str) -> tuple[Block, ...]:
+    return (model.whole,) if method == "full" else model.blocks
+
+
+def _spectrum(build: Build, method: str, values: Mapping[str, Any], lanes: int) -> tuple[Array, Array]:
+    """Angular frequencies (n, N), rising, and whether all were found."""
+    sample = _blocks(build(_first_lane(values)), method)
+    copies = np.concatenate([np.full(block.factor.shape[1], block.copies) for block in sample])
+
+    def reduce(part: Mapping[str, Any], count: int) -> Bidiagonal:
+        factors = (_in_lanes(block.factor, count) for block in _blocks(build(part), method))
+        return bidiagonal_form(*factors)
+
+    found_values, found = bidiagonal_values(in_blocks(reduce, values, lanes, _lanes_at_a_time(sample)))
+    return jnp.sort(jnp.repeat(found_values, copies, axis=0, total_repeat_length=copies.sum()), axis=0), found
+
+
+def _first_lane(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters with the arrays among them reduced to their first entry: enough to see all shapes."""
+
+    def first(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(first(entry) for entry in value)
+        return value if np.ndim(value) == 0 else jnp.ravel(value)[0]
+
+    return {name: first(value) for name, value in values.items()}
+
+
+def _in_lanes(array: Array, lanes: int) -> Array:
+    """``array`` (r, c) or (r, c, N) as (r, c, N)."""
+    array = array if array.ndim == 3 else array[:, :, None]
+    return jnp.broadcast_to(array, (*array.shape[:2], lanes))
+
+
+def largest_frequency(model: SpringSystem, lanes: int) -> Array:
+    """An upper bound of the angular frequencies, (N,), above the largest by a factor of 5 at most: Frobenius norm."""
+    return jnp.sqrt(jnp.sum(_in_lanes(model.whole.factor, lanes) ** 2, axis=(0, 1)))
+
+
+def system_modes(model: SpringSystem, method: str, lanes: int, shapes: bool = True) -> Modes:
+    """Modes of ``model`` for ``lanes`` lanes; method ``full`` does without its decomposition."""
+    largest = largest_frequency(model, lanes)
+    asymmetry = jnp.broadcast_to(model.asymmetry, (lanes,))
+    blocks = [_as_lanes(block, lanes) for block in _blocks(model, method)]
+    parts = [block_modes(block, largest, asymmetry) for block in blocks]
+    repeated = [jnp.repeat(part.frequency, block.copies, axis=0) for block, part in zip(blocks, parts, strict=True)]
+    shares = [jnp.repeat(part.participation, block.copies, axis=0) for block, part in zip(blocks, parts, strict=True)]
+    frequency, participation = jnp.concatenate(repeated), jnp.concatenate(shares)
+    order = jnp.argsort(frequency, axis=0)
+    vectors = None
+    if shapes:
+        lifted = jnp.concatenate([_lift(b, p, lanes) for b, p in zip(blocks, parts, strict=True)], axis=1)
+        vectors = jnp.take_along_axis(lifted, order[None], axis=1)
+    return Modes(
+        jnp.take_along_axis(frequency, order, axis=0),
+        vectors,
+        jnp.take_along_axis(participation, order[:, None], axis=0),
+        jnp.all(jnp.stack([part.found for part in parts]), axis=0),
+    )
+
+
+def _as_lanes(block: Block, lanes: int) -> Block:
+    frame = None if block.frame is None else _in_lanes(block.frame, lanes)
+    return Block(_in_lanes(block.factor, lanes), block.family, block.polar, block.basis, frame)
+
+
+def _lift(block: Block, part: BlockModes, lanes: int) -> Array:
+    """Vectors of a block in the coordinates of the system, (dofs, n * copies, N)."""
+    basis = block.basis if block.basis.ndim == 4 else block.basis[..., None]
+    lifted = sum(basis[:, c, None] * part.vectors[c, :, None] for c in range(basis.shape[1]))
+    lifted = lifted.reshape(basis.shape[0], -1, lifted.shape[-1])
+    return jnp.broadcast_to(lifted, (*lifted.shape[:2], lanes))
+
+
+def _canonical(vectors: Array) -> Array:
+    """The sign by which the largest entry of every column is positive."""
+    largest = jnp.take_along_axis(vectors, jnp.argmax(jnp.abs(vectors) - 1e-9 * _places(vectors), 0)[None], axis=0)
+    return vectors * jnp.where(largest < 0, -1.0, 1.0)
+
+
+def _places(vectors: Array) -> np.ndarray:
+    """Row numbers: of entries that are equal up to rounding, the first counts as the largest."""
+    return np.arange(vectors.shape[0]).reshape(-1, 1, 1)
+
+
+def _results(build: Build, request: Request, values: Mapping[str, Any], lanes: int) -> dict[str, Array]:
+    """The requested results of every lane, except those along a track; for these, mass-weighted vectors."""
+    wanted = set(request.outputs)
+    followed = bool(request.options["track"])
+    if wanted <= _SPECTRUM:
+        frequency, found = _spectrum(build, request.method, values, lanes)
+        return _frequencies(frequency, found, None)
+    shapes = bool(wanted & {"mode_shape", "kinetic_energy"}) or followed
+
+    def compute(part: Mapping[str, Any], count: int) -> dict[str, Array]:
+        model = build(part)
+        modes = system_modes(model, request.method, count, shapes)
+        largest = largest_frequency(model, count)
+        results = _frequencies(modes.frequency, modes.found, modes.participation)
+        results["mode_type"] = jnp.where(
+            modes.found, mode_types(modes.frequency, modes.participation, largest), len(MODE_TYPES) - 1
+        )
+        if shapes:
+            vectors = jnp.where(modes.found, _canonical(modes.vectors), jnp.nan)
+            mass = model.mass[:, None] if model.mass.ndim == 2 else model.mass[:, None, None]
+            results["mode_shape"] = jnp.swapaxes(vectors / jnp.sqrt(mass), 0, 1)
+            results["kinetic_energy"] = _by_body(vectors, model.bodies)
+            results["vectors"] = vectors
+        kept = {*request.outputs, "outcome"} | ({"vectors", "natural_frequency"} if followed else set())
+        return {name: value for name, value in results.items() if name in kept}
+
+    sample = _blocks(build(_first_lane(values)), request.method)
+    return in_blocks(compute, values, lanes, max(_lanes_at_a_time(sample) // 2, 16))
+
+
+def _by_body(vectors: Array, bodies: np.ndarray) -> Array:
+    """Shares of kinetic energy (n, bodies, N) of mass-weighted ``vectors`` (dofs, n, N)."""
+    return jnp.stack([jnp.sum(vectors[bodies == body] ** 2, axis=0) for body in range(bodies.max() + 1)], axis=1)
+
+
+def _frequencies(frequency: Array, found: Array, participation: Array | None) -> dict[str, Array]:
+    """Frequency, its error and outcome; NaN where nothing was found."""
+    value = jnp.where(found, frequency / (2 * math.pi), jnp.nan)
+    # Backward error of orthogonal transformations, in practice a tenth of it; the same for every mode of a point.
+    error = 4 * EPS * math.sqrt(frequency.shape[0]) * value[-1]
+    results = {"natural_frequency": value, "natural_frequency_error": jnp.broadcast_to(error, value.shape)}
+    if participation is not None:
+        results["participation"] = jnp.where(found, participation, jnp.nan)
+    finite = jnp.all(jnp.isfinite(frequency), axis=0)
+    missing = jnp.where(finite, Outcome.NOT_CONVERGED, Outcome.NOT_FINITE)
+    return results | {"outcome": jnp.where(found, Outcome.SUCCESS, missing).astype(jnp.int8)}
+
+
+def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+    """All requested results, lanes last; along a track its points first."""
+    del effort
+    track, lanes = request.options["track"], lane_count(values, request.options["track"])
+    wanted = (*request.outputs, "outcome")
+    if not track:
+        results = _results(build, request, values, lanes)
+        return {name: results[name] for name in wanted}
+    values, length = with_path(values, track, lanes)
+    results = {
+        name: jnp.moveaxis(value.reshape(*value.shape[:-1], length, lanes), -2, 0)
+        for name, value in _results(build, request, values, length * lanes).items()
+    }
+    if _FOLLOWED & set(request.outputs):
+        frequency = results["natural_frequency"]
+        results["branch"], results["mac"] = follow(results["vectors"], _equal(frequency))
+    return {name: results[name] for name in wanted}
+
+
+def _equal(frequency: Array) -> Array:
+    """Which modes share one frequency, (L, n, n, N), from (L, n, N)."""
+    turned = jnp.swapaxes(frequency, 0, 1)
+    return jnp.moveaxis(clusters(turned, CLUSTER * turned[1:]), 2, 0)
+
+
+def _effort(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The same for every point."""
+    return np.ones(1)
+
+
+def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+    chunk = _SPECTRUM_CHUNK if set(request.outputs) <= _SPECTRUM else _MODES_CHUNK
+    chunk = _LINES_CHUNK if request.options["track"] else chunk
+    solve = partial(_solve, system.models["modes"].build, request)
+    return (Solver("singular values", solve, _effort, broadcasts=True, chunk=chunk),)
+
+
+def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    """Modes counted from 1, families, bodies and coordinates."""
+    followed = sorted(_FOLLOWED & set(request.outputs))
+    if followed and not request.options["track"]:
+        raise InputError(f"outputs: {followed[0]!r} needs the option track; allowed is the name of an axis")
+    model = system.models["modes"]
+    # Names and sizes do not depend on what varies.
+    values = {name: fixed.get(name, 1.0) for name in model.parameters}
+    described: list[SpringSystem] = []
+    jax.eval_shape(lambda: described.append(model.build(values)))
+    return (
+        Dimension("mode", "number of the mode", tuple(range(1, len(described[0].dofs) + 1))),
+        Dimension("family", "family of modes", FAMILIES),
+        Dimension("body", "body", described[0].body_names),
+        Dimension("dof", "coordinate", described[0].dofs),
+    )
+
+
+ANALYSIS = Analysis(
+    name="modes",
+    title="natural frequencies and modes",
+    variables=VARIABLES,
+    default_outputs=("natural_frequency", "mode_type"),
+    methods={"auto": ("track",), "full": ("track",)},
+    options=(Parameter("track", "1", "axis along which modes are followed", default="", text=True),),
+    solvers=_solvers,
+    dimensions=_dimensions,
+    path_axis=lambda request: request.options["track"] or None,
+)

@@ -1,0 +1,84 @@
+"""Following modes along a path by the modal assurance criterion (MAC): which mode of a point continues which of the last.
+
+Neighbours in frequency that exchange their order keep their branches; at a veering, where two modes turn into each
+other, the branch goes with the shape. Modes of one frequency are compared as a space.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+# Below this share in the space of its new frequency a shape is not carried on but taken anew.
+_CARRIED = 0.25
+# Among the modes of one space, whose MAC are equal, the nearest vector is taken.
+_OWN = 1e-3
+
+
+def follow(vectors: Array, same: Array) -> tuple[Array, Array]:
+    """``branch`` and ``mac``, both ``(L, n, ...)``, of modes along a path of ``L`` points.
+
+    ``vectors`` (L, m, n, ...): orthonormal shapes as columns (mass-weighted, or sampled so that they are orthonormal);
+    ``same`` (L, n, n, ...): which modes of a point share one frequency. ``branch`` (int32) is the number, from 1, of the
+    mode at the first point that each mode continues; ``mac`` the share, 0 to 1, that the shape of the branch at the
+    previous point has in the space of the mode (1 at the first point). Every branch goes on at every point; pairs are
+    made by falling MAC. Where ``vectors`` are not finite, ``mac`` is NaN and the order by frequency is kept.
+    """
+    n = vectors.shape[2]
+    numbers = jnp.arange(1, n + 1, dtype=jnp.int32).reshape(n, *(1,) * (vectors.ndim - 3))
+    first = jnp.broadcast_to(numbers, (n, *vectors.shape[3:]))
+
+    def advance(reference: Array, point: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+        shapes, equal = point
+        known = jnp.all(jnp.isfinite(shapes), axis=(0, 1))
+        shapes = jnp.where(known, shapes, 0.0)
+        overlap = _overlap(reference, shapes)
+        squares = overlap**2
+        shared = jnp.sum(squares[:, :, None] * equal[None], axis=1)
+        chosen = _pair(jnp.where(known, shared + _OWN * squares, jnp.eye(n).reshape(n, n, *(1,) * (shapes.ndim - 2))))
+        branch = jnp.sum(chosen * first[:, None], axis=0)
+        mac = jnp.sum(chosen * shared, axis=0)
+        carried = _carry(overlap, shapes, equal, chosen)
+        reference = jnp.where(known, carried, reference)
+        return reference, (branch.astype(jnp.int32), jnp.where(known, jnp.minimum(mac, 1.0), jnp.nan))
+
+    start = jnp.where(jnp.isfinite(vectors[0]), vectors[0], 0.0)
+    _, (branch, mac) = lax.scan(advance, start, (vectors[1:], same[1:]))
+    finite = jnp.all(jnp.isfinite(vectors[0]), axis=(0, 1))
+    begin = jnp.where(finite, jnp.ones(first.shape), jnp.nan)
+    return jnp.concatenate([first[None], branch]), jnp.concatenate([begin[None], mac])
+
+
+def _overlap(a: Array, b: Array) -> Array:
+    """``a^T b`` of (m, n, ...) and (m, k, ...)."""
+
+    def add(i: Array, total: Array) -> Array:
+        row, other = (lax.dynamic_index_in_dim(x, i, 0, keepdims=False) for x in (a, b))
+        return total + row[:, None] * other[None]
+
+    return lax.fori_loop(0, a.shape[0], add, jnp.zeros((a.shape[1], *b.shape[1:])))
+
+
+def _pair(score: Array) -> Array:
+    """One-to-one choice (n, n, ...) of 0 and 1 by falling ``score`` (branches, modes, ...)."""
+    n, lanes = score.shape[0], score.shape[2:]
+    number = jnp.arange(n * n).reshape(n, n, *(1,) * len(lanes))
+
+    def take(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        score, chosen = state
+        best = jnp.argmax(score.reshape(n * n, *lanes), axis=0)
+        hit = number == best
+        row, column = jnp.any(hit, axis=1, keepdims=True), jnp.any(hit, axis=0, keepdims=True)
+        return jnp.where(row | column, -1.0, score), chosen + hit
+
+    return lax.fori_loop(0, n, take, (score, jnp.zeros(score.shape)))[1]
+
+
+def _carry(overlap: Array, shapes: Array, equal: Array, chosen: Array) -> Array:
+    """The shapes of the branches at this point: each continued within the space of its mode, as far as it is in there."""
+    inside = jnp.sum(chosen[:, :, None] * equal[None], axis=1) * overlap
+    size = jnp.sum(inside**2, axis=0 + 1)
+    keep = size > _CARRIED
+    continued = inside / jnp.sqrt(jnp.where(keep, size, 1.0))[:, None]
+    weights = jnp.where(keep[:, None], continued, chosen)
+    return _overlap(jnp.swapaxes(shapes, 0, 1), jnp.swapaxes(weights, 0, 1))

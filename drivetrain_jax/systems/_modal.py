@@ -1,0 +1,60 @@
+"""Masses joined by springs: what a system hands to the analysis ``modes``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+# Families of modes, in the order of the codes in ``Block.family``.
+FAMILIES = ("rotational", "translational", "planet")
+
+
+@dataclass(frozen=True)
+class Block:
+    """An invariant part of a spring system: its natural angular frequencies are the singular values of ``factor``.
+
+    ``factor``: shape (rows, n, ...), rows >= n. ``basis`` (dofs, n, copies, ...) embeds the part into the mass-weighted
+    coordinates ``M^(1/2) q``, orthonormally; every frequency occurs ``copies`` times. ``family`` (n,) is the family of
+    each column of the orthonormal ``frame`` (n, n, ...), None for the identity. ``polar`` (n,) marks columns that are
+    motions along x: within pairs of equal frequencies they single out one vector.
+    """
+
+    factor: Array
+    family: np.ndarray
+    polar: np.ndarray
+    basis: Array
+    frame: Array | None = None
+
+    @property
+    def copies(self) -> int:
+        """How often each of its frequencies occurs."""
+        return self.basis.shape[2]
+
+
+@dataclass(frozen=True)
+class SpringSystem:
+    """``M q'' + B^T diag(k) B q = 0`` with the diagonal mass matrix ``M``.
+
+    ``extensions`` (springs, dofs, ...) is ``B``: the extension of each spring per unit of each coordinate; ``stiffness``
+    (springs, ...), ``mass`` (dofs, ...). ``blocks`` are an exact decomposition into invariant parts; ``whole`` is the
+    system as one block. ``asymmetry`` (...), from 0 to 1, measures what couples the families; ``dofs`` and
+    ``body_names`` name coordinates and bodies; ``bodies`` (dofs,) gives the number of the body of each coordinate.
+    """
+
+    extensions: Array
+    stiffness: Array
+    mass: Array
+    blocks: tuple[Block, ...]
+    whole: Block
+    asymmetry: Array
+    dofs: tuple[str, ...]
+    body_names: tuple[str, ...]
+    bodies: np.ndarray
+
+
+def weighted_factor(extensions: Array, stiffness: Array, mass: Array) -> Array:
+    """``diag(sqrt k) B M^(-1/2)``, shape (springs, dofs, ...)."""
+    return jnp.sqrt(stiffness)[:, None] * extensions / jnp.sqrt(mass)

@@ -1,0 +1,147 @@
+"""Figures of the analysis ``modes``: natural frequencies along an axis, and mode shapes drawn as the gear."""
+
+from __future__ import annotations
+
+import json
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import cells
+from drivetrain_jax.view.gear import BODY_COLOURS, draw_gear
+from drivetrain_jax.view.layout import Margins, Panels
+from drivetrain_jax.view.style import STYLE, axis_label, variable_label
+
+TYPE_COLOURS = {
+    "rigid": "#9a9a9a",
+    "rotational": "#16324f",
+    "translational": "#d1771e",
+    "planet": "#6fbf73",
+    "coupled": "#a0308c",
+}
+_CURVES_HEIGHT, _GEAR_HEIGHT = 4.4, 1.62
+_COLUMNS, _MOST_SHAPES = 4, 16
+# Frequencies this near to each other are one multiple frequency, of which one shape is drawn.
+_SAME = 1e-8
+
+
+def plot(dataset: xr.Dataset) -> Figure:
+    """Frequencies over one axis, coloured by the type of the mode, or the mode shapes of a single point.
+
+    Curves follow the stored ``branch`` where there is one, so that they do not change colour where frequencies cross or
+    veer; without it every point is a dot. Zero frequencies do not show on the logarithmic scale. Axes of a single value
+    count as fixed. Raises :class:`InputError` for more than one axis, and if the variables needed are not stored.
+    """
+    with matplotlib.rc_context(STYLE):
+        dataset = cells.prepare(dataset)
+        names = cells.sweep_axes(dataset)
+        if names == []:
+            return _shapes(dataset)
+        if len(names) == 1 and names != ["point"]:
+            return _curves(dataset, names[0])
+        raise InputError(
+            f"axes = {', '.join(names)}: allowed is one axis for a figure of frequencies, or none for mode shapes"
+        )
+
+
+def _need(dataset: xr.Dataset, *names: str) -> None:
+    if missing := [name for name in names if name not in dataset]:
+        stored = ", ".join(str(name) for name in dataset.data_vars)
+        raise InputError(f"outputs = {stored}: the figure needs {', '.join(missing)} too")
+
+
+def _meanings(dataset: xr.Dataset) -> list[str]:
+    return dataset["mode_type"].attrs["flag_meanings"].split()
+
+
+def _types(dataset: xr.Dataset) -> np.ndarray:
+    """Type of every mode by name; without the variable all count as coupled."""
+    if "mode_type" not in dataset:
+        return np.full(dataset["natural_frequency"].shape, "coupled")
+    return np.array(_meanings(dataset))[dataset["mode_type"].values]
+
+
+def _curves(dataset: xr.Dataset, name: str) -> Figure:
+    _need(dataset, "natural_frequency")
+    dataset = dataset.transpose(name, ...)
+    x, frequency, types = dataset[name].values, dataset["natural_frequency"].values, _types(dataset)
+    panels = Panels(1, height=_CURVES_HEIGHT, margins=Margins(right=0.3, left=0.9, top=0.6))
+    axes = panels.axes[0][0]
+    moving = np.where(frequency > 1e-6 * np.nanmax(frequency), frequency, np.nan)
+    if "branch" in dataset:
+        order = np.argsort(dataset["branch"].values, axis=1, kind="stable")
+        branches, kinds = (np.take_along_axis(array, order, axis=1) for array in (moving, types))
+        for curve, kind in zip(branches.T, kinds.T, strict=True):
+            if np.isfinite(curve).any():
+                axes.add_collection(_segments(x, curve, kind))
+    else:
+        for kind, colour in TYPE_COLOURS.items():
+            rows, modes = np.nonzero(types == kind)
+            axes.plot(x[rows], moving[rows, modes], ".", markersize=2.5, color=colour)
+    axes.set(yscale="log", ylim=(0.93 * np.nanmin(moving), 1.07 * np.nanmax(moving)))
+    cells.plain_decades(axes, "y")
+    cells.fit_axis(axes, "x", x)
+    panels.label_axes(axis_label(dataset[name]), variable_label(dataset["natural_frequency"]))
+    panels.titles(dataset)
+    shown = [kind for kind in TYPE_COLOURS if (types[np.isfinite(moving)] == kind).any()]
+    if "mode_type" in dataset:
+        panels.legend([Line2D([], [], color=TYPE_COLOURS[kind], label=kind) for kind in shown])
+    return panels.figure
+
+
+def _segments(x: np.ndarray, curve: np.ndarray, kinds: np.ndarray) -> LineCollection:
+    """One branch; a piece between points of different types has the colour of its end."""
+    points = np.stack([x, curve], axis=-1)
+    return LineCollection(
+        list(np.stack([points[:-1], points[1:]], axis=1)),
+        colors=[TYPE_COLOURS[str(kind)] for kind in kinds[1:]],
+        linewidths=1.1,
+        capstyle="round",
+    )
+
+
+def _angles(dataset: xr.Dataset) -> list[float]:
+    """Angles of the planets, from the fixed parameters or from scalar coordinates of single entries."""
+    fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get("planet_angle")
+    if fixed is None:
+        raise InputError("planet_angle: missing; the figure of mode shapes needs it")
+    angles = list(fixed["value"] if isinstance(fixed, dict) else fixed)
+    for i in range(len(angles)):
+        if f"planet_angle[{i}]" in dataset.coords:
+            angles[i] = float(dataset[f"planet_angle[{i}]"])
+    return angles
+
+
+def _distinct(frequency: np.ndarray) -> list[tuple[int, int]]:
+    """First mode and multiplicity of every frequency."""
+    start = [i for i in range(len(frequency)) if i == 0 or frequency[i] - frequency[i - 1] > _SAME * frequency[i]]
+    return [(i, j - i) for i, j in zip(start, [*start[1:], len(frequency)], strict=True)]
+
+
+def _shapes(dataset: xr.Dataset) -> Figure:
+    _need(dataset, "natural_frequency", "mode_shape")
+    angles, types = _angles(dataset), _types(dataset)
+    frequency = dataset["natural_frequency"].values
+    if not np.isfinite(frequency).all():
+        raise InputError("natural_frequency = nan: nothing to plot; the point has no result")
+    drawn = _distinct(frequency)[:_MOST_SHAPES]
+    rows = -(-len(drawn) // _COLUMNS)
+    margins = Margins(left=0.15, right=0.15, between_rows=0.28, between_columns=0.05, bottom=0.45)
+    panels = Panels(rows, _COLUMNS, height=_GEAR_HEIGHT, margins=margins)
+    flat = [axes for row in panels.axes for axes in row]
+    for axes, (mode, count) in zip(flat, drawn, strict=False):
+        draw_gear(axes, dataset["mode_shape"].transpose("mode", "dof").values[mode], angles)
+        multiple = f" ×{count}" if count > 1 else ""
+        kind = str(types[mode])
+        axes.set_title(f"{frequency[mode]:.1f} Hz{multiple}, {kind}", size=8, color=TYPE_COLOURS[kind], pad=1.5)
+    for axes in flat[len(drawn) :]:
+        axes.axis("off")
+    left_out = len(_distinct(frequency)) - len(drawn)
+    panels.titles(dataset, f"{left_out} higher frequencies not drawn" if left_out else "")
+    panels.legend([Line2D([], [], color=colour, label=body) for body, colour in BODY_COLOURS.items()])
+    return panels.figure

@@ -1,0 +1,105 @@
+"""Derivatives of the natural frequencies against differences of the 50-digit oracle, and identities they obey."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks.planetary_reference import TABLE_2, exact_frequencies
+from drivetrain_jax.analysis.mode_gradients import directional_derivatives, natural_frequencies
+from drivetrain_jax.systems import planetary
+
+ANGLES = (0.1, 1.5, 3.0, 4.9)
+UNEQUAL = TABLE_2 | {"planet_angle": ANGLES, "m_p": (0.6, 0.66, 0.7, 0.75), "k_sp": (4e8, 5e8, 6e8, 5.5e8)}
+EQUAL = TABLE_2 | {"planet_angle": tuple(i * np.pi / 2 for i in range(4))}
+STIFFNESSES = [name for name in TABLE_2 if name.startswith("k_")]
+NAMES = [*STIFFNESSES, "m_p", "m_s", "I_c", "pressure_angle", "planet_angle"]
+
+
+@pytest.fixture(scope="module")
+def frequencies():
+    return jax.jit(lambda p: natural_frequencies(planetary.build, p))
+
+
+@pytest.fixture(scope="module")
+def jacobian():
+    """Of a gear whose planets differ, by reverse mode."""
+    return jax.jit(jax.jacrev(lambda p: natural_frequencies(planetary.build, p)))(UNEQUAL)
+
+
+def moved(p: dict, name: str, entry: int | None, step: float) -> dict:
+    if entry is None:
+        return p | {name: p[name] + step}
+    return p | {name: tuple(x + step * (i == entry) for i, x in enumerate(p[name]))}
+
+
+def difference(p: dict, name: str, entry: int | None) -> np.ndarray:
+    """Central difference of the oracle, of error 1e-9 and less."""
+    value = p[name] if entry is None else p[name][entry]
+    step = 1e4 if value == 0 else 1e-6 * max(abs(value), 1.0 if "angle" in name else 0.0)
+    if value == 0:
+        low, middle, high = (np.array(exact_frequencies(moved(p, name, entry, i * step))) for i in range(3))
+        return (-3 * low + 4 * middle - high) / (2 * step)
+    low, high = (np.array(exact_frequencies(moved(p, name, entry, s * step))) for s in (-1, 1))
+    return (high - low) / (2 * step)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_against_differences(jacobian, name):
+    entry = 1 if isinstance(UNEQUAL[name], tuple) else None
+    ours = np.asarray(jacobian[name] if entry is None else jacobian[name][entry])
+    exact = difference(UNEQUAL, name, entry)
+    # The rigid mode turns into a spring-mass mode, f = sqrt(k)/..., of which there is no derivative at k = 0.
+    np.testing.assert_allclose(ours[1:], exact[1:], rtol=2e-6, atol=2e-7 * np.abs(exact[1:]).max())
+
+
+def test_scaling_of_all_stiffnesses(jacobian, frequencies):
+    """f is homogeneous of degree 1/2 in the stiffnesses: sum k df/dk = f/2."""
+    total = sum(
+        np.tensordot(np.atleast_1d(UNEQUAL[name]), np.asarray(jnp.stack(jax.tree.leaves(jacobian[name]))), 1)
+        for name in STIFFNESSES
+    )
+    np.testing.assert_allclose(total[1:], np.asarray(frequencies(UNEQUAL))[1:] / 2, rtol=1e-11)
+
+
+def test_turning_the_gear_changes_nothing(jacobian, frequencies):
+    total = np.asarray(sum(jacobian["planet_angle"]))
+    assert np.abs(total).max() < 1e-9 * np.asarray(frequencies(UNEQUAL)).max()
+
+
+def test_forward_and_reverse_agree(jacobian):
+    tangent = jax.tree.map(lambda x: 0.0, UNEQUAL) | {"k_p": 1.0}
+    forward = jax.jit(lambda p, d: jax.jvp(lambda q: natural_frequencies(planetary.build, q), (p,), (d,))[1])
+    along = forward(UNEQUAL, tangent)
+    np.testing.assert_allclose(np.asarray(along), np.asarray(jacobian["k_p"]), rtol=1e-10, atol=1e-20)
+
+
+def test_doublets_get_the_derivative_of_their_mean_and_split_along_the_projected_matrix():
+    """Moving one planet splits the translational doublets of equal spacing."""
+    tangent = jax.tree.map(lambda x: 0.0, EQUAL) | {"planet_angle": (0.0, 1.0, 0.0, 0.0)}
+    split = np.asarray(jax.jit(lambda p, d: directional_derivatives(planetary.build, p, d))(EQUAL, tangent))
+    forward = jax.jit(lambda p, d: jax.jvp(lambda q: natural_frequencies(planetary.build, q), (p,), (d,))[1])
+    mean = np.asarray(forward(EQUAL, tangent))
+    step = 1e-5
+    here = np.array(exact_frequencies(EQUAL))
+    there = np.array(exact_frequencies(moved(EQUAL, "planet_angle", 1, step)))
+    ahead = np.array(exact_frequencies(moved(EQUAL, "planet_angle", 1, 2 * step)))
+    one_sided = (-3 * here + 4 * there - ahead) / (2 * step)
+    np.testing.assert_allclose(split[1:], one_sided[1:], rtol=1e-5, atol=1e-2)
+    doublets = np.flatnonzero(np.diff(here) < 1e-6 * here[1:])
+    assert doublets.size == 6
+    np.testing.assert_allclose(mean[doublets], (split[doublets] + split[doublets + 1]) / 2, atol=1e-6)
+    np.testing.assert_allclose(mean[doublets], mean[doublets + 1], atol=1e-9)
+    assert np.abs(split[doublets + 1] - split[doublets]).max() > 10
+
+
+def test_lanes_and_a_rigid_mode():
+    k = jnp.array([1e7, 1e8, 1e9])
+    both = jax.jit(
+        lambda k: jax.jvp(lambda x: natural_frequencies(planetary.build, EQUAL | {"k_p": x}), (k,), (jnp.ones(3),))
+    )
+    value, slope = both(k)
+    assert value.shape == slope.shape == (21, 3)
+    assert (np.asarray(slope)[0] == 0).all() and (np.asarray(value)[0] < 1e-9).all()

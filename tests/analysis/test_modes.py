@@ -1,0 +1,239 @@
+"""The analysis ``modes`` of planetary gears: counts, labels, tracking and degenerate gears."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import drivetrain_jax as dt
+from benchmarks.planetary_reference import TABLE_2, exact_frequencies, matrices, natural_frequencies
+from drivetrain_jax.analysis.mode_types import SYMMETRIC
+
+RIGID, ROTATIONAL, TRANSLATIONAL, PLANET, COUPLED = range(5)
+MODES = ["natural_frequency", "mode_type", "participation"]
+
+
+def run_angles(angles: np.ndarray, outputs: list[str], method: str = "auto", **fixed):
+    """One point per row of ``angles`` (points, N); the same kernel serves every set of rows of one length."""
+    columns = {f"planet_angle[{i}]": angles[:, i].tolist() for i in range(angles.shape[1])}
+    return dt.run(
+        {
+            "system": "planetary",
+            "analysis": "modes",
+            "outputs": outputs,
+            "points": columns,
+            "fixed": {"planet_angle": angles[0].tolist(), **fixed},
+            "options": {"method": method},
+        }
+    )
+
+
+def random_angles(rng: np.random.Generator, count: int, n: int) -> np.ndarray:
+    return np.sort(rng.uniform(0, 2 * math.pi, (count, n)), axis=1)
+
+
+def check_counts(count: int, n: int) -> None:
+    """Three planet modes N - 3 times, one rigid rotation, and nothing pure beside them."""
+    ds = run_angles(random_angles(np.random.default_rng(n), count, n), MODES)
+    types, frequency = ds.mode_type.values, ds.natural_frequency.values
+    assert ((types == PLANET).sum(1) == 3 * (n - 3)).all()
+    assert ((types == RIGID).sum(1) == 1).all() and (types[:, 0] == RIGID).all()
+    assert (frequency[:, 0] < 1e-9).all()
+    if n > 3:
+        alone = np.sort(frequency[types == PLANET].reshape(count, 3, n - 3), axis=1)
+        np.testing.assert_allclose(
+            alone, np.broadcast_to(np.array([1808.18102, 5963.76033, 6981.70503])[:, None], alone.shape), rtol=1e-6
+        )
+
+
+@pytest.mark.parametrize("n", [3, 5])
+def test_random_spacings_have_the_right_count_of_planet_modes(n):
+    check_counts(30, n)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("n", range(3, 13))
+def test_300_random_spacings(n):
+    check_counts(30, n)
+
+
+def test_labels_do_not_flip_with_tiny_changes_of_spacing():
+    """Random changes of 1e-9 to 1e-12 rad, about equal and about balanced unequal spacing of five planets."""
+    rng = np.random.default_rng(5)
+    spacings = np.array([np.arange(5) * 2 * math.pi / 5, np.radians([0, 30, 120, 210, 240])])
+    shifts = rng.uniform(-1, 1, (2, 12, 5)) * np.logspace(-9, -12, 12)[None, :, None]
+    angles = (spacings[:, None] + shifts).reshape(-1, 5)
+    c1 = np.abs(np.exp(1j * angles).mean(1))
+    assert (c1 < SYMMETRIC).all() and c1.max() > 1e-11
+    ds = run_angles(np.concatenate([spacings, angles]), MODES)
+    types = ds.mode_type.values
+    counts = [[(row == kind).sum() for kind in range(5)] for row in types]
+    assert counts == [[1, 5, 12, 6, 0]] * len(counts)
+    for first, rest in zip(types[:2], types[2:].reshape(2, 12, -1), strict=True):
+        assert (rest == first).all()
+
+
+def test_labels_at_an_accidental_crossing_of_families():
+    """Where a rotational and a translational frequency agree to 1e-7, 1e-9 rad mixes their vectors, not their labels."""
+    base = TABLE_2 | {"planet_angle": tuple(np.radians([0, 80, 180, 260]))}
+
+    def distance(k_cu: float) -> float:
+        """From the rising rotational frequency to 1e-7 below the translational one."""
+        below, above = natural_frequencies(base | {"k_cu": k_cu})[2:4]
+        other = 1084.96362568457
+        return (below if abs(above - other) < abs(below - other) else above) - other * (1 - 1e-7)
+
+    k_cu = brentq(distance, 1e9, 1e10, rtol=1e-14)
+    angles = np.radians([0, 80, 180, 260]) + np.array([[0, 0, 0, 0], [0, 1e-9, 0, -1e-9], [0, 1e-12, 1e-12, 0]])
+    ds = run_angles(angles, MODES, k_cu=k_cu)
+    types, frequency = ds.mode_type.values, ds.natural_frequency.values
+    assert 0.9e-7 < frequency[0, 3] / frequency[0, 2] - 1 < 1.1e-7
+    assert all((np.sort(row) == np.sort(types[0])).all() for row in types)
+    assert COUPLED not in types
+
+
+def test_the_papers_odd_claim_is_false_both_ways():
+    """Coupled where it says rotational; and rotational modes as for equal spacing with five unequally spaced planets."""
+    angles = np.radians([[0, 72, 144, 252, 324], [0, 30, 120, 210, 240], [0, 72, 144, 216, 288]])
+    ds = run_angles(angles, MODES)
+    unequal, balanced, equal = ds.mode_type.values
+    assert (unequal == COUPLED).sum() == 17
+    assert ROTATIONAL not in unequal and TRANSLATIONAL not in unequal
+    assert (balanced == ROTATIONAL).sum() == 5 and (balanced == TRANSLATIONAL).sum() == 12
+    frequency = ds.natural_frequency.values
+    np.testing.assert_allclose(frequency[1][balanced == ROTATIONAL], frequency[2][equal == ROTATIONAL], rtol=1e-12)
+
+
+LISTS = {"m_p": [0.6, 0.66, 0.7], "k_p": [1e8, 2e8, 1.5e8], "k_rp": [4e8, 5e8, 6e8]}
+
+
+@pytest.fixture(scope="module")
+def shapes():
+    """Three planets that differ: shapes, participation and energies by the full system."""
+    fixed = {"planet_angle": [0.0, 1.9, 4.0], **LISTS}
+    outputs = ["natural_frequency", "mode_shape", "kinetic_energy", "mode_type", "participation"]
+    return dt.run({"system": "planetary", "analysis": "modes", "outputs": outputs, "fixed": fixed})
+
+
+def test_different_planets_against_the_oracle(shapes):
+    exact = np.array(exact_frequencies(TABLE_2 | {"planet_angle": (0.0, 1.9, 4.0), **LISTS}))
+    np.testing.assert_allclose(shapes.natural_frequency.values[1:], exact[1:], rtol=1e-12)
+
+
+def test_shapes_solve_the_equations_of_motion(shapes):
+    mass, stiffness = matrices(TABLE_2 | {"planet_angle": (0.0, 1.9, 4.0), **LISTS})
+    q, square = shapes.mode_shape.values, (2 * math.pi * shapes.natural_frequency.values) ** 2
+    np.testing.assert_allclose(q * np.array(mass) @ q.T, np.eye(18), atol=1e-13)
+    residual = np.array(stiffness) @ q.T - np.array(mass)[:, None] * q.T * square
+    assert np.abs(residual).max() < 1e-6 * np.abs(np.array(stiffness) @ q.T).max()
+
+
+def test_energies_and_participation_are_shares(shapes):
+    np.testing.assert_allclose(shapes.kinetic_energy.values.sum(-1), 1, rtol=1e-12)
+    np.testing.assert_allclose(shapes.participation.values.sum(-1), 1, rtol=1e-12)
+    planets = [i for i, name in enumerate(shapes.body.values) if str(name).startswith("planet")]
+    assert (shapes.kinetic_energy.values[:, planets].sum(-1) > 0).all()
+
+
+def test_rigid_rotation_turns_everything_alike(shapes):
+    """u of all central bodies is that of the carrier but for the sun and ring, which mesh with freely turning planets."""
+    assert int(shapes.mode_type[0]) == RIGID
+    q = shapes.mode_shape.values[0]
+    assert np.abs(q[[0, 1, 3, 4, 6, 7]]).max() < 1e-9 * np.abs(q).max()
+
+
+def test_equal_lists_are_numbers():
+    angles = np.radians([[0, 80, 180, 260]])
+    listed = run_angles(angles, ["natural_frequency"], k_p=[1e8] * 4).natural_frequency.values
+    single = run_angles(angles, ["natural_frequency"], k_p=1e8).natural_frequency.values
+    np.testing.assert_array_equal(listed, single)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_few_planets(n):
+    angles = random_angles(np.random.default_rng(1), 3, n)
+    found = run_angles(angles, ["natural_frequency"]).natural_frequency.values
+    for row, line in zip(angles, found, strict=True):
+        exact = np.array(exact_frequencies(TABLE_2 | {"planet_angle": tuple(row)}))
+        still = exact < 1e-9 * exact[-1]
+        np.testing.assert_allclose(line[~still], exact[~still], rtol=1e-12)
+        assert (line[still] < 1e-6).all()
+
+
+def test_coincident_planets_and_no_stiffness_at_all():
+    angles = np.array([[0.3, 0.3, 0.3, 2.0], [0.3, 0.3, 0.3, 0.3], [0, 0.5, 2.0, 3.0]])
+    found = run_angles(angles, ["natural_frequency"]).natural_frequency.values
+    for row, line in zip(angles, found, strict=True):
+        exact = np.array(exact_frequencies(TABLE_2 | {"planet_angle": tuple(row)}))
+        still = exact < 1e-9 * exact[-1]
+        np.testing.assert_allclose(line[~still], exact[~still], rtol=1e-12)
+        assert (line[still] < 1e-6).all()
+    springs = {name: 0.0 for name in TABLE_2 if name.startswith("k_")}
+    ds = run_angles(angles, MODES, **springs)
+    assert (ds.natural_frequency.values == 0).all() and (ds.mode_type.values == RIGID).all()
+    assert (ds.outcome.values == 0).all()
+
+
+@pytest.mark.full
+def test_twenty_planets_and_huge_contrasts():
+    rng = np.random.default_rng(2)
+    angles = random_angles(rng, 3, 20)
+    extreme = {"k_sp": 1e16, "k_rp": 1e16, "k_cu": 1e16, "k_s": 1e4, "k_su": 1e2}
+    for springs in ({}, extreme):
+        ds = run_angles(angles, ["natural_frequency", "natural_frequency_error"], **springs)
+        for row, line, bound in zip(
+            angles, ds.natural_frequency.values, ds.natural_frequency_error.values, strict=True
+        ):
+            exact = np.array(exact_frequencies(TABLE_2 | springs | {"planet_angle": tuple(row)}))
+            assert (np.abs(line - exact) <= bound).all()
+            assert np.abs(line[1:] / exact[1:] - 1).max() < (1e-11 if not springs else 1e-8)
+
+
+@pytest.fixture(scope="module")
+def tracked():
+    scene = {
+        "system": "planetary",
+        "analysis": "modes",
+        "outputs": ["natural_frequency", "mode_type", "branch", "mac"],
+        "axes": {"k_p": {"values": [1e8, 1.1e8]}, "k_cu": {"start": 1e8, "stop": 1e10, "num": 41, "scale": "log"}},
+        "fixed": {"planet_angle": np.radians([0, 80, 180, 260]).tolist()},
+        "options": {"track": "k_cu"},
+    }
+    return dt.run(scene)
+
+
+def test_branches_keep_their_type_where_frequencies_cross(tracked):
+    """The rotation of the held carrier rises through translational modes; every branch stays what it is."""
+    types, branch = tracked.mode_type.values, tracked.branch.values
+    for line_types, line_branch in zip(types, branch, strict=True):
+        order = np.argsort(line_branch, axis=1)
+        followed = np.take_along_axis(line_types, order, axis=1)
+        assert (followed == followed[0]).all()
+        assert (np.sort(line_branch, axis=1) == np.arange(1, 22)).all()
+    assert not (branch == np.arange(1, 22)).all()
+
+
+def test_mac_is_high_and_frequencies_stay_rising(tracked):
+    assert (tracked.mac.values > 0.9).all() and (tracked.mac.values <= 1).all()
+    assert (tracked.mac.values[:, 0] == 1).all()
+    assert (np.diff(tracked.natural_frequency.values, axis=-1) >= 0).all()
+    assert tracked.natural_frequency.dims == ("k_p", "k_cu", "mode")
+    assert tracked["mode"].values.tolist() == list(range(1, 22))
+
+
+def refusal(**changes) -> str:
+    scene = {"system": "planetary", "analysis": "modes", "outputs": ["natural_frequency"], "fixed": {}} | changes
+    with pytest.raises(dt.InputError) as error:
+        dt.run(scene)
+    return str(error.value)
+
+
+def test_refusals():
+    assert "track" in refusal(outputs=["branch"])
+    assert "entries" in refusal(fixed={"m_p": [0.6, 0.7]})
+    assert "k_sp" in refusal(fixed={"k_sp": -1.0})
+    assert "m_p[1]" in refusal(fixed={"m_p": [0.6, 0.0, 1.0, 1.0]})
+    assert "not an axis" in refusal(options={"track": "planet_angle[1]"})

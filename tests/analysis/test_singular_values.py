@@ -1,0 +1,140 @@
+"""The batched singular values and vectors against LAPACK and mpmath."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivetrain_jax.analysis.lanes import in_blocks
+from drivetrain_jax.analysis.singular_values import EPS, bidiagonal_form, singular_values
+from drivetrain_jax.analysis.singular_vectors import jacobi_vectors, product
+from drivetrain_jax.analysis.tracking import follow
+
+ROWS, COLUMNS = 12, 9
+
+
+def random_matrices() -> np.ndarray:
+    """(lanes, rows, columns): dense, rank deficient, with double values, zero, graded in rows, with tiny entries."""
+    rng = np.random.default_rng(3)
+    dense = rng.standard_normal((8, ROWS, COLUMNS))
+    deficient = dense @ np.diag([1, 1, 1, 1, 1, 1, 1, 0, 0]) @ np.linalg.qr(rng.standard_normal((COLUMNS, COLUMNS)))[0]
+    u, _, v = np.linalg.svd(dense, full_matrices=False)
+    double = u @ np.diag([5, 5, 5, 3, 3, 2, 1, 1, 1]) @ v
+    graded = dense * np.logspace(0, -6, ROWS)[:, None]
+    separate = dense.copy()
+    separate[:, :6, 4:] = separate[:, 6:, :4] = 0
+    return np.concatenate([dense, deficient, double, graded, separate, 1e-160 * dense, 1e150 * dense, 0 * dense[:1]])
+
+
+@pytest.fixture(scope="module")
+def matrices() -> np.ndarray:
+    return random_matrices()
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    return jax.jit(lambda a: (*singular_values(a), *jacobi_vectors(a)))
+
+
+@pytest.fixture(scope="module")
+def solved(compiled, matrices):
+    return [np.asarray(x) for x in compiled(jnp.asarray(np.moveaxis(matrices, 0, -1)))]
+
+
+def test_values(solved, matrices):
+    exact = np.linalg.svd(matrices, compute_uv=False)[:, ::-1].T
+    values, found, *_ = solved
+    assert found.all()
+    assert (np.diff(values, axis=0) >= 0).all()
+    assert (np.abs(values - exact) <= 30 * EPS * exact[-1]).all()
+
+
+def test_vectors_are_orthonormal_and_reproduce_the_values(solved, matrices):
+    values, _, vectors, found = solved
+    assert found.all()
+    lanes = np.moveaxis(vectors, -1, 0)
+    np.testing.assert_allclose(
+        np.swapaxes(lanes, 1, 2) @ lanes, np.broadcast_to(np.eye(COLUMNS), lanes.shape), atol=2e-14
+    )
+    size = np.maximum(values[-1], 1e-300)
+    lengths = np.sort(np.linalg.norm(matrices / size[:, None, None] @ lanes, axis=1), axis=1)
+    assert (np.abs(lengths - (values / size).T) <= 30 * EPS).all()
+
+
+def test_a_lane_that_is_not_finite_spoils_only_itself(compiled, matrices, solved):
+    spoilt = np.moveaxis(matrices, 0, -1).copy()
+    spoilt[2, 3, 5], spoilt[0, 0, 11] = np.nan, np.inf
+    values, found, _, vectors_found = map(np.asarray, compiled(jnp.asarray(spoilt)))
+    bad = np.isin(np.arange(found.size), [5, 11])
+    assert (found == ~bad).all() and (vectors_found == ~bad).all()
+    assert np.isnan(values[:, bad]).all()
+    np.testing.assert_array_equal(values[:, ~bad], solved[0][:, ~bad])
+
+
+def test_blocks_are_one_matrix(matrices):
+    a, b = (jnp.asarray(np.moveaxis(x, 0, -1)) for x in (matrices[:8], matrices[8:16, :5, :3]))
+    values = np.asarray(jax.jit(lambda a, b: singular_values(a, b)[0])(a, b))
+    separate = [np.linalg.svd(x, compute_uv=False) for x in (matrices[:8], matrices[8:16, :5, :3])]
+    exact = np.sort(np.concatenate(separate, axis=1), axis=1).T
+    assert (np.abs(values - exact) <= 30 * EPS * exact[-1]).all()
+
+
+def test_bidiagonal_form_has_no_entry_after_a_block(matrices):
+    a = jnp.asarray(np.moveaxis(matrices[:2], 0, -1))
+    form = bidiagonal_form(a, a[:4, :2])
+    assert (np.asarray(form.upper)[[COLUMNS - 1, -1]] == 0).all()
+
+
+def test_product():
+    rng = np.random.default_rng(0)
+    a, b = rng.standard_normal((3, 4, 5)), rng.standard_normal((4, 2, 5))
+    np.testing.assert_allclose(np.asarray(product(jnp.asarray(a), jnp.asarray(b))), np.einsum("ikn,kjn->ijn", a, b))
+
+
+def test_in_blocks_gives_what_the_whole_gives():
+    values = {"a": jnp.arange(10.0), "b": 2.0, "c": (3.0, jnp.arange(10.0) ** 2)}
+
+    def function(part, count):
+        assert isinstance(part["b"], float)
+        return jnp.stack([part["a"] * part["b"], part["c"][0] + part["c"][1]])
+
+    np.testing.assert_array_equal(in_blocks(function, values, 10, 4), function(values, 10))
+
+
+def rotating(angles: np.ndarray) -> np.ndarray:
+    """(L, 3, 3): two shapes turn by ``angles``, the third stays."""
+    c, s, o = np.cos(angles), np.sin(angles), 0 * angles
+    return np.stack([np.stack([c, s, o], 1), np.stack([-s, c, o], 1), np.stack([o, o, o + 1], 1)], axis=2)
+
+
+def test_branches_go_with_the_shape_through_a_crossing():
+    """Modes 1 and 3 exchange their order at the third point."""
+    shapes = rotating(np.linspace(0, 0.3, 6))
+    shapes[2:] = shapes[2:][:, :, [2, 1, 0]]
+    same = np.broadcast_to(np.eye(3, dtype=bool), (6, 3, 3))
+    branch, mac = map(np.asarray, follow(jnp.asarray(shapes), jnp.asarray(same)))
+    assert branch[:2].tolist() == [[1, 2, 3]] * 2 and branch[2:].tolist() == [[3, 2, 1]] * 4
+    np.testing.assert_allclose(mac[1:, 1], np.cos(0.06) ** 2)
+    np.testing.assert_allclose(mac[0], 1)
+
+
+def test_branches_pass_a_point_where_two_frequencies_meet_in_arbitrary_vectors():
+    shapes = rotating(np.full(5, 0.2))
+    turn = rotating(np.array([0.9]))[0]
+    shapes[2] = shapes[2] @ turn
+    same = np.broadcast_to(np.eye(3, dtype=bool), (5, 3, 3)).copy()
+    same[2, :2, :2] = True
+    branch, mac = map(np.asarray, follow(jnp.asarray(shapes), jnp.asarray(same)))
+    assert branch[3:].tolist() == [[1, 2, 3]] * 2
+    np.testing.assert_allclose(mac, 1)
+
+
+def test_a_point_without_vectors_does_not_lose_the_branches():
+    shapes = rotating(np.linspace(0, 0.2, 5))
+    shapes[2] = np.nan
+    same = np.broadcast_to(np.eye(3, dtype=bool), (5, 3, 3))
+    branch, mac = map(np.asarray, follow(jnp.asarray(shapes), jnp.asarray(same)))
+    assert branch.tolist() == [[1, 2, 3]] * 5
+    assert np.isnan(mac[2]).all() and np.isfinite(mac[[0, 1, 3, 4]]).all()

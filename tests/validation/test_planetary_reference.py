@@ -1,0 +1,122 @@
+"""Frequencies and types of modes against the reference values, and the oracle of the other tests against them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import drivetrain_jax as dt
+from benchmarks.planetary_reference import case_parameters, exact_frequencies, natural_frequencies
+
+CASES = json.loads((Path(__file__).parents[1] / "reference" / "planetary.json").read_text())
+TYPES = {"R": "rotational", "T": "translational", "P": "planet", "X": "coupled"}
+SPECTRUM = ("natural_frequency", "natural_frequency_error")
+MODES = ("natural_frequency", "mode_type", "participation")
+
+
+def by_count() -> dict[int, list[str]]:
+    groups: dict[int, list[str]] = {}
+    for name, case in CASES.items():
+        groups.setdefault(len(case["psi_deg"]), []).append(name)
+    return groups
+
+
+def run_cases(names: list[str], outputs: tuple[str, ...], method: str = "auto"):
+    """All cases of one number of planets in one run: every parameter and every angle varies."""
+    listed = [case_parameters(CASES[name]) for name in names]
+    columns = {key: [p[key] for p in listed] for key in listed[0] if key != "planet_angle"}
+    columns |= {
+        f"planet_angle[{i}]": [p["planet_angle"][i] for p in listed] for i in range(len(listed[0]["planet_angle"]))
+    }
+    return dt.run(
+        {
+            "system": "planetary",
+            "analysis": "modes",
+            "outputs": list(outputs),
+            "points": columns,
+            "fixed": {"planet_angle": list(listed[0]["planet_angle"])},
+            "options": {"method": method},
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def spectra():
+    found = {}
+    for names in by_count().values():
+        ds = run_cases(names, SPECTRUM)
+        found |= {name: ds.isel(point=i) for i, name in enumerate(names)}
+    return found
+
+
+def check_frequencies(name: str, found: np.ndarray) -> None:
+    exact = np.array([float(f) for f in CASES[name]["f_Hz"]])
+    moving = exact > 0
+    np.testing.assert_allclose(found[moving], exact[moving], rtol=1e-11)
+    assert (found[~moving] < 1e-6).all()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_spectrum(spectra, name):
+    check_frequencies(name, spectra[name].natural_frequency.values)
+    assert int(spectra[name].outcome) == 0
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_error_estimate_holds_and_is_useful(spectra, name):
+    exact = np.array([float(f) for f in CASES[name]["f_Hz"]])
+    bound = spectra[name].natural_frequency_error.values
+    assert (np.abs(spectra[name].natural_frequency.values - exact) <= bound).all()
+    assert (bound <= 1e-14 * exact[-1]).all()
+
+
+def check_modes(names: list[str], method: str) -> None:
+    ds = run_cases(names, MODES, method)
+    meanings = ds.mode_type.attrs["flag_meanings"].split()
+    for i, name in enumerate(names):
+        check_frequencies(name, ds.natural_frequency.values[i])
+        expected = [TYPES[letter] for letter in CASES[name]["types"]]
+        zero = [float(f) == 0 for f in CASES[name]["f_Hz"]]
+        expected = ["rigid" if still else kind for still, kind in zip(zero, expected, strict=True)]
+        assert [meanings[code] for code in ds.mode_type.values[i]] == expected, name
+        np.testing.assert_allclose(ds.participation.values[i].sum(-1), 1, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [3, 4])
+def test_types_and_frequencies_from_vectors(count):
+    check_modes(by_count()[count], "auto")
+
+
+def test_without_the_reduction():
+    check_modes(by_count()[4], "full")
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("method", ["auto", "full"])
+@pytest.mark.parametrize("count", by_count())
+def test_types_of_every_case(count, method):
+    check_modes(by_count()[count], method)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("names", by_count().values())
+def test_spectrum_without_the_reduction(names):
+    ds = run_cases(names, SPECTRUM, "full")
+    for i, name in enumerate(names):
+        check_frequencies(name, ds.natural_frequency.values[i])
+
+
+@pytest.mark.parametrize("name", ["N4_mesh1e16", "N5_unequal_0_72_144_252_324", "N12_random"])
+def test_the_oracle_itself(name):
+    exact = np.array([float(f) for f in CASES[name]["f_Hz"]])
+    np.testing.assert_allclose(exact_frequencies(case_parameters(CASES[name])), exact, rtol=1e-14, atol=1e-12)
+
+
+def test_the_stiffness_matrix_agrees_only_roughly_where_stiffnesses_differ():
+    """What forming K costs: the reason for working with singular values."""
+    case = CASES["N4_mesh1e16"]
+    exact = np.array([float(f) for f in case["f_Hz"]])
+    assert np.abs(natural_frequencies(case_parameters(case))[1:] / exact[1:] - 1).max() > 1e-9

@@ -1,0 +1,91 @@
+"""Figures of modes: what is drawn, in which colour, and what is refused."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.colors import to_hex
+
+from drivetrain_jax import InputError
+from drivetrain_jax.view import plot
+from drivetrain_jax.view.gear import displacements
+from drivetrain_jax.view.modes import TYPE_COLOURS
+
+TYPES = ("rigid", "rotational", "translational", "planet", "coupled")
+FIXED = {"planet_angle": {"value": [0.0, 2.0, 4.0], "units": "rad", "long_name": "angle"}}
+
+
+def result(points: int, **variables) -> xr.Dataset:
+    attrs = {"analysis": "modes", "title": "Modes", "fixed_parameters": json.dumps(FIXED)}
+    flags = {"flag_values": np.arange(5, dtype="int8"), "flag_meanings": " ".join(TYPES), "units": "1"}
+    data = {"outcome": (("k_p",), np.zeros(points, "int8"), {"units": "1"})}
+    for name, values in variables.items():
+        dims = ("k_p", "mode", "dof")[: np.ndim(values)]
+        data[name] = (dims, values, flags if name == "mode_type" else {"units": "Hz", "long_name": name})
+    axis = ("k_p", np.arange(1.0, points + 1), {"units": "N/m", "long_name": "stiffness"})
+    return xr.Dataset(data, coords={"k_p": axis}, attrs=attrs)
+
+
+def crossing() -> xr.Dataset:
+    """A rotational and a translational branch that cross, and a rigid mode."""
+    x = np.arange(6.0)
+    rising, falling = 100 + 10 * x, 140 - 10 * x
+    frequency = np.stack([0 * x, np.minimum(rising, falling), np.maximum(rising, falling)], axis=1)
+    first = rising <= falling
+    kinds = np.stack([0 * x, np.where(first, 1, 2), np.where(first, 2, 1)], axis=1).astype("int8")
+    branch = np.stack([0 * x + 1, np.where(first, 2, 3), np.where(first, 3, 2)], axis=1).astype("int32")
+    return result(6, natural_frequency=frequency, mode_type=kinds, branch=branch)
+
+
+def test_branches_keep_colour_and_direction_through_a_crossing():
+    axes = plot(crossing()).axes[0]
+    curves = axes.collections
+    colours = [{to_hex(colour) for colour in curve.get_colors()} for curve in curves]
+    assert colours == [{TYPE_COLOURS["rotational"]}, {TYPE_COLOURS["translational"]}]
+    slopes = [np.diff(np.array(curve.get_segments())[:, :, 1], axis=1) for curve in curves]
+    np.testing.assert_allclose(slopes[0], 10)
+    np.testing.assert_allclose(slopes[1], -10)
+
+
+def test_without_branches_points_are_dots():
+    axes = plot(crossing().drop_vars("branch")).axes[0]
+    shown = {to_hex(line.get_color()): line.get_xdata().size for line in axes.lines}
+    assert shown[TYPE_COLOURS["rotational"]] == shown[TYPE_COLOURS["translational"]] == 6
+
+
+def shapes(planets: int = 3) -> xr.Dataset:
+    size = 9 + 3 * planets
+    frequency = np.array([[0.0, 5.0, 5.0, *range(10, 10 + size - 3)]], float)
+    kinds = np.full((1, size), 2, "int8")
+    return result(1, natural_frequency=frequency, mode_type=kinds, mode_shape=np.eye(size)[None])
+
+
+def test_one_gear_for_every_frequency():
+    figure = plot(shapes())
+    titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
+    assert titles[:3] == ["0.0 Hz, translational", "5.0 Hz ×2, translational", "10.0 Hz, translational"]
+    assert len(titles) == 16
+    assert any("1 higher frequencies not drawn" in text.get_text() for text in figure.texts)
+
+
+def test_displacements_are_scaled_together():
+    central, planets = displacements([0.0] * 9 + [1.0, 0.0, -2.0] + [0.5] * 3)
+    assert (central == 0).all()
+    assert np.abs(planets).max() == pytest.approx(0.28)
+    assert planets[0, 2] / planets[1, 0] == pytest.approx(-4)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "named"),
+    [
+        (shapes().drop_vars("mode_shape"), "mode_shape"),
+        (crossing().drop_vars("natural_frequency"), "natural_frequency"),
+        (shapes().assign_attrs(fixed_parameters="{}"), "planet_angle"),
+    ],
+)
+def test_refusals(dataset, named):
+    with pytest.raises(InputError, match=named):
+        plot(dataset)
