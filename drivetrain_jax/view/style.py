@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 
 import xarray as xr
 from matplotlib.colors import ListedColormap
@@ -43,9 +44,13 @@ _GREEK = {
     *("rho", "sigma", "tau", "phi", "chi", "psi", "omega", "Gamma", "Delta", "Theta", "Lambda", "Phi", "Psi", "Omega"),
 }
 
+_PRODUCTS = {"EI": "$EI$", "rhoA": r"$\rho A$", "rhoI": r"$\rho I$", "kGA": r"$\kappa GA$"}
+
 
 def symbol(name: str) -> str:
     """``name`` as it is set in a formula: Greek letters by name, an index as subscript (``k_A``), else unchanged."""
+    if name in _PRODUCTS:
+        return _PRODUCTS[name]
     if name in _GREEK:
         return rf"$\{name}$"
     if match := re.fullmatch(r"([A-Za-z]{1,2}|" + "|".join(_GREEK) + r")_?([A-Za-z]{0,2}\d*)", name):
@@ -56,8 +61,10 @@ def symbol(name: str) -> str:
 
 
 def axis_label(coordinate: xr.DataArray) -> str:
-    """``long name (symbol) [units]`` of a swept parameter."""
-    return f"{_long_name(coordinate)} ({symbol(str(coordinate.name))}) [{coordinate.attrs.get('units', '1')}]"
+    """``long name (symbol) [units]`` of a swept parameter; no symbol where the name only repeats the long name."""
+    name, long_name = str(coordinate.name), _long_name(coordinate)
+    mark = "" if name.replace("_", " ") == long_name else f" ({symbol(name)})"
+    return f"{long_name}{mark} [{coordinate.attrs.get('units', '1')}]"
 
 
 def variable_label(variable: xr.DataArray) -> str:
@@ -74,10 +81,13 @@ def value_text(name: str, value: object, units: str = "1") -> str:
 
 
 def caption(dataset: xr.Dataset) -> str:
-    """One line with the parameters that do not vary: the fixed ones of the scene, then scalar coordinates."""
-    parts = [
-        _fixed_text(name, value) for name, value in json.loads(dataset.attrs.get("fixed_parameters", "{}")).items()
-    ]
+    """One line with the parameters that do not vary: those the scene fixes, then scalar coordinates.
+
+    Defaults, of which a system may have twenty, are left to the attributes of the file.
+    """
+    fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}"))
+    named = tomllib.loads(dataset.attrs["scene"]).get("fixed", {}) if "scene" in dataset.attrs else fixed
+    parts = [_fixed_text(name, value) for name, value in fixed.items() if name in named]
     parts += [
         value_text(str(name), coordinate.item(), coordinate.attrs.get("units", "1"))
         for name, coordinate in dataset.coords.items()

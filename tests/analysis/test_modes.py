@@ -189,7 +189,9 @@ def test_twenty_planets_and_huge_contrasts():
         ):
             exact = np.array(exact_frequencies(TABLE_2 | springs | {"planet_angle": tuple(row)}))
             assert (np.abs(line - exact) <= bound).all()
-            assert np.abs(line[1:] / exact[1:] - 1).max() < (1e-11 if not springs else 1e-8)
+            # Orthogonal transformations err by roundings of the largest frequency, here 3e6 times the smallest.
+            assert np.abs(line - exact).max() < 40 * np.finfo(float).eps * exact[-1]
+            assert springs or np.abs(line[1:] / exact[1:] - 1).max() < 1e-11
 
 
 @pytest.fixture(scope="module")

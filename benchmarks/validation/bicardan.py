@@ -1,0 +1,239 @@
+"""The bicardanic shaft: Bulac 2012 against this package."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+import drivetrain_jax as dt
+from benchmarks.bicardan_reference import determinant_roots, finite_elements
+from benchmarks.validation.document import Page, markdown
+from drivetrain_jax.systems.bicardan import PRESETS
+
+Parameters = Mapping[str, Any]
+
+# Section 4: p1, p2 [1/s] and n1, n2 [rpm] as printed.
+PRINTED = {
+    "solid 50, 3 x 0.30 m": ("paper_solid", (748.52, 2519.79), (7151.51, 24074.42)),
+    "tube 50/45, 3 x 0.30 m": ("paper_tube", (1062.53, 4004.91), (10151.56, 38263.47)),
+    "three segments": ("paper_fitted", (876.66, 2827.37), (8375.78, 27013.15)),
+}
+EXACT_MOMENTS = {
+    "paper_solid": (50e-3**4,) * 3,
+    "paper_tube": (50e-3**4 - 45e-3**4,) * 3,
+    "paper_fitted": (50e-3**4, 50e-3**4 - 45e-3**4, 30e-3**4),
+}
+
+
+def solve(parameters: Parameters, outputs: tuple[str, ...] = ("angular_frequency",), **options: Any) -> Any:
+    """The package's result for one shaft."""
+    fixed = {name: list(value) if isinstance(value, tuple) else value for name, value in parameters.items()}
+    scene = {"system": "bicardan", "analysis": "critical_speeds", "outputs": list(outputs)}
+    return dt.run({**scene, "fixed": fixed, "options": options})
+
+
+def frequencies(parameters: Parameters, modes: int = 2) -> np.ndarray:
+    """p of the first modes [rad/s]."""
+    return solve(parameters, modes=modes).angular_frequency.values
+
+
+def section_four() -> str:
+    """The characteristic pulsations and the critical speeds."""
+    rows, speeds = [], []
+    for name, (preset, printed, printed_n) in PRINTED.items():
+        fitted = PRESETS[preset]
+        exact = {**fitted, "EI": tuple(2.1e11 * math.pi / 64 * x for x in EXACT_MOMENTS[preset])}
+        ours, with_exact, fem = frequencies(fitted), frequencies(exact), finite_elements(fitted, 2)
+        for mode in (0, 1):
+            rows.append([f"{name}, p{mode + 1}", f"{printed[mode]:.2f}", f"{ours[mode]:.3f}", f"{fem[mode]:.3f}"])
+            rows[-1] += [f"{with_exact[mode]:.3f}", f"{100 * (ours[mode] / printed[mode] - 1):+.3f} %"]
+            n, n_314 = ours[mode] * 30 / math.pi, printed[mode] * 30 / 3.14
+            speeds.append([f"{name}, n{mode + 1}", f"{printed_n[mode]:.2f}", f"{n:.2f}", f"{n_314:.2f}"])
+    head = ("case [rad/s]", "printed", "ours", "independent", "ours, exact I", "ours over printed")
+    table = markdown(head, rows)
+    second = markdown(("case [rpm]", "printed", "ours, 30 p/pi", "printed p x 30/3.14"), speeds)
+    return f"""## Section 4: pulsations and critical speeds
+
+E and I are not printed. With E = 2.1e11 N/m2, rho = 7800 kg/m3 and the printed areas (A2 = 3.6e-4 m2 is not the area
+of the 50/45 tube, 3.7306e-4), rounded I of 3.055e-7, 1.055e-7, 3.97e-8 m4 and uniform bars of 3 x 0.30 = 0.90 m (not
+0.91) reproduce the printed values; only the solid bar (I = 3.05e-7) keeps a gap of 0.06 %. "Independent" are finite
+elements of high degree (benchmarks/bicardan_reference.py). "Exact I" has the moments of the diameters 50, 50/45, 30 mm.
+
+{table}
+The printed critical speeds follow from the printed pulsations with 3.14 for pi, which makes them 0.05 % too high:
+
+{second}"""
+
+
+def formula_31() -> str:
+    """The 17 % of conclusion 1."""
+    D, d, L = 5.0, 4.5, 91.0
+    rule = 1.21e7 * math.sqrt(D * D + d * d) / L**2
+    ours = float(solve(PRESETS["paper_fitted"], ("critical_speed",), modes=1).critical_speed[0])
+    rows = [
+        ["n of (31), D = 5, d = 4.5, L = 91 cm", "", f"{rule:.2f}", ""],
+        ["its excess over the printed n1 = 8375.78", "17 %", f"{100 * (rule / 8375.78 - 1):.2f} %", ""],
+        ["its excess over the computed n1", "", f"{100 * (rule / ours - 1):.2f} %", "(31) is a uniform pinned tube"],
+    ]
+    return f"## Conclusion 1: formula (31)\n\n{markdown(('quantity', 'printed', 'ours', 'why'), rows)}"
+
+
+def conclusions() -> str:
+    """Conclusions 2 to 5."""
+    soft, base = PRESETS["paper_fitted"], ("critical_speed", "mode_shape")
+    stiff, rigid_A = {**soft, "k_D": 85e6}, {**soft, "k_A": math.inf}
+    results = [solve(p, base, modes=2) for p in (soft, stiff, rigid_A)]
+    ends, middle = [], []
+    for result in results[:2]:
+        shape = result.mode_shape.values[0]
+        at_A = shape / shape[0]
+        ends.append(at_A[-1])
+        middle.append(np.abs(at_A).max())
+    softer = solve({**soft, "k_D": 2e6}, base, modes=2).critical_speed.values
+    n = [result.critical_speed.values for result in results]
+    short = solve({**soft, "length": tuple(0.9 * x for x in soft["length"])}, base, modes=2).critical_speed.values
+    rows = [
+        [
+            "2",
+            "the program determines the influence of the supports",
+            f"rigid A: n1 {n[2][0] / n[0][0] - 1:+.3%}",
+            "yes",
+        ],
+        ["3", "k_D 20e6 to 85e6: amplitude at D drops four times (f_A = 1)", f"{ends[0] / ends[1]:.2f} times", "yes"],
+        [
+            "3",
+            "... and so in the characteristic points",
+            f"largest deflection {middle[0] / middle[1]:.3f} times",
+            "no: at D only",
+        ],
+        [
+            "3",
+            "critical speeds fall with k_D (20e6 to 2e6)",
+            f"n1 {softer[0] / n[0][0] - 1:+.2%}, n2 {softer[1] / n[0][1] - 1:+.2%}",
+            "yes",
+        ],
+        [
+            "4",
+            "n1 low and n2 high is wanted",
+            f"n2/n1 = {n[0][1] / n[0][0]:.3f}",
+            "a wish; n1 above the service range is the usual one",
+        ],
+        [
+            "5",
+            "a shorter shaft raises n2 (here 0.9 of all lengths)",
+            f"n2 {short[1] / n[0][1] - 1:+.2%}",
+            "yes; less than 1/0.81 as the supports stay",
+        ],
+    ]
+    return f"## Conclusions 2 to 5\n\n{markdown(('no.', 'the paper', 'ours', 'holds'), rows)}"
+
+
+def printed_row_of_seven(parameters: Parameters) -> float:
+    """First zero of the determinant with the last row of (7) as printed, [f4 f3 f2 f1]."""
+    p = np.linspace(300.0, 1500.0, 4801)
+    values = np.array([_printed_determinant(x, parameters) for x in p])
+    change = np.flatnonzero(values[1:] * values[:-1] < 0)[0]
+    return float(p[change] - values[change] * (p[1] - p[0]) / (values[change + 1] - values[change]))
+
+
+def _printed_determinant(p: float, parameters: Parameters) -> float:
+    k_A, k_D = parameters["k_A"], parameters["k_D"]
+    state = np.array([[0.0, 1 / k_A], [1.0, 0.0], [0.0, 0.0], [0.0, 1.0]])
+    for length, EI, rhoA in zip(*(parameters[name] for name in ("length", "EI", "rhoA")), strict=True):
+        alpha = (p * p * rhoA / EI) ** 0.25
+        c, s, ch, sh = (f(alpha * length) for f in (math.cos, math.sin, math.cosh, math.sinh))
+        f1, f2, f3, f4 = (ch + c) / 2, (sh + s) / 2, (ch - c) / 2, (sh - s) / 2
+        krylov = np.array([[f1, f2, f3, f4], [f4, f1, f2, f3], [f3, f4, f1, f2], [f4, f3, f2, f1]])
+        scale = np.array([1.0, 1 / alpha, -1 / (alpha**2 * EI), -1 / (alpha**3 * EI)])
+        state = (krylov * scale / scale[:, None]) @ state
+    (r11, r12), _, (r31, r32), (r41, r42) = state
+    return (r31 * r42 - r32 * r41) - k_D * (r11 * r32 - r12 * r31)
+
+
+def printed_errors() -> str:
+    """The errors of print and what they do."""
+    shaft = PRESETS["paper_fitted"]
+    wrong, right = printed_row_of_seven(shaft), float(frequencies(shaft, 1)[0])
+    rows = [
+        [
+            "(7), last row",
+            "[f4 f3 f2 f1]",
+            "[f2 f3 f4 f1]",
+            f"p1 = {wrong:.1f} instead of {right:.1f} (three segments)",
+        ],
+        ["(4)", "f_A = F(0), f_B = F(l)", "f(0), f(l)", "F is the shear force"],
+        ["(25)", "a matrix", "its determinant", ""],
+        ["(26)", "theta_A = -R32/R31", "-k_A R32/R31", "dimension: F_A = k_A for f_A = 1"],
+        ["(30)", "[alpha3] F [alpha3]", "[alpha3]^-1 F [alpha3]", "as in (28)"],
+    ]
+    return f"## Errors of print\n\n{markdown(('place', 'printed', 'right', 'how we know'), rows)}"
+
+
+def numerics() -> str:
+    """The plain determinant against the certified method."""
+    shaft = PRESETS["paper"]
+    ours = frequencies(shaft, 14)
+    plain = solve(shaft, ("angular_frequency", "count_certified"), method="krylov_determinant", modes=14)
+    scan = determinant_roots(shaft, 14)
+    fem = finite_elements(shaft, 14, bubbles=24)
+    rows = [
+        [
+            str(mode + 1),
+            f"{ours[mode]:.6f}",
+            f"{abs(fem[mode] / ours[mode] - 1):.0e}",
+            f"{abs(plain.angular_frequency.values[mode] / ours[mode] - 1):.0e}",
+            f"{abs(scan[mode] / ours[mode] - 1):.0e}",
+            "yes" if plain.count_certified.values[mode] else "no",
+        ]
+        for mode in (0, 3, 6, 8, 9, 10, 11, 12, 13)
+    ]
+    head = (
+        "mode",
+        "certified p [rad/s]",
+        "finite elements",
+        "krylov_determinant",
+        "NumPy, Brent",
+        "certified by the count",
+    )
+    return f"""## How far the determinant carries
+
+Relative differences from the certified method, for the shaft of three segments with exact I. The determinant cancels
+like exp(tau), tau being the sum of all phases; near mode 12 nothing is left, and the count says so.
+
+{markdown(head, rows)}"""
+
+
+def additions() -> str:
+    """What the paper does not have, against finite elements."""
+    tube = PRESETS["paper_tube"]
+    area, moment = 3.6e-4, 1.055e-7
+    thick = {"kGA": (0.53 * 8.1e10 * area,) * 3, "rhoI": (7800 * moment,) * 3}
+    cases = {
+        "tube": {},
+        "shear and rotary inertia": thick,
+        "yokes of 1.5 kg at both joints": {"m_joint": (1.5, 1.5)},
+        "joints of 1e4 N m/rad": {"k_hinge": (1e4, 1e4)},
+        "support of 1e6 N/m at the first joint": {"k_joint": (1e6, 0.0)},
+    }
+    plain = frequencies(tube)
+    rows = []
+    for name, change in cases.items():
+        ours, fem = frequencies({**tube, **change}), finite_elements({**tube, **change}, 2, bubbles=18)
+        rows.append([name, *(f"{x:.4f}" for x in ours), f"{np.abs(fem / ours - 1).max():.0e}"])
+        rows[-1] += [f"{100 * (a / b - 1):+.2f} %" for a, b in zip(ours, plain, strict=True)]
+    head = ("tube 50/45, 3 x 0.30 m, with", "p1", "p2", "finite elements differ by", "p1", "p2")
+    return f"## Beyond the paper\n\n{markdown(head, rows)}"
+
+
+def page(full: bool) -> Page:
+    """The page of the bicardanic shaft."""
+    del full
+    introduction = (
+        "I. Bulac, *Vibrations of the bicardanic transmissions with elastic supports*, Fiabilitate si Durabilitate, "
+        "Supplement 1/2012, computed again."
+    )
+    sections = [section_four(), formula_31(), conclusions(), printed_errors(), numerics(), additions()]
+    return Page("Validation: bicardanic shaft", introduction, sections)

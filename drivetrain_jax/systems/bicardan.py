@@ -1,0 +1,102 @@
+"""Bicardanic shaft: lateral vibration of a stepped shaft on elastic supports.
+
+Source: I. Bulac, "Vibrations of the bicardanic transmissions with elastic supports", Fiabilitate si Durabilitate,
+Supplement 1/2012. Equation numbers are those of docs/theory/bicardan.md, which lists the printed errors.
+
+The paper's model is a Bernoulli-Euler shaft in segments with springs k_A, k_D at its ends. Supports and masses at the
+joints, joints with finite rotational stiffness, masses at the ends, shear and rotary inertia are additions; their
+defaults mean "none".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from drivetrain_jax._quantities import Parameter
+from drivetrain_jax.systems._base import Model, System, Values
+from drivetrain_jax.systems._shaft import Shaft, stack
+
+_LIST = {"listed": True, "lower": 0.0}
+_NONE = {"default": (), "broadcast": True, **_LIST}
+PARAMETERS = (
+    Parameter("length", "m", "lengths of the segments, from A to D", open_lower=True, **_LIST),
+    Parameter("EI", "N m2", "bending stiffness of the segments", open_lower=True, **_LIST),
+    Parameter("rhoA", "kg m-1", "mass per length of the segments", open_lower=True, **_LIST),
+    Parameter("k_A", "N m-1", "stiffness of the support at A", lower=0.0, infinite=True),
+    Parameter("k_D", "N m-1", "stiffness of the support at D", lower=0.0, infinite=True),
+    Parameter("k_joint", "N m-1", "stiffness of supports at the joints between segments", infinite=True, **_NONE),
+    Parameter("m_A", "kg", "lumped mass at A", default=0.0, lower=0.0),
+    Parameter("m_D", "kg", "lumped mass at D", default=0.0, lower=0.0),
+    Parameter("m_joint", "kg", "lumped masses (yokes) at the joints between segments", **_NONE),
+    Parameter("k_hinge", "N m rad-1", "rotational stiffness of the joints, inf: rigid", infinite=True, **_NONE),
+    Parameter("kGA", "N", "shear stiffness of the segments, inf: no shear", open_lower=True, infinite=True, **_NONE),
+    Parameter("rhoI", "kg m", "rotary inertia per length of the segments", **_NONE),
+)
+NAMES = tuple(p.name for p in PARAMETERS)
+_PER_SEGMENT, _PER_JOINT = ("EI", "rhoA", "kGA", "rhoI"), ("k_joint", "m_joint", "k_hinge")
+
+_SUPPORTS = {"k_A": 85e6, "k_D": 20e6}
+_REAL = {"length": (0.07, 0.59, 0.25), "rhoA": (15.288, 2.808, 5.5068), **_SUPPORTS}
+_E = 2.1e11
+PRESETS = {
+    "paper": _REAL | {"EI": tuple(_E * math.pi / 64 * x for x in (50e-3**4, 50e-3**4 - 45e-3**4, 30e-3**4))},
+    "paper_fitted": _REAL | {"EI": (64155.0, 22155.0, 8337.0)},
+    "paper_solid": {"length": (0.3,) * 3, "EI": (64050.0,) * 3, "rhoA": (15.288,) * 3, **_SUPPORTS},
+    "paper_tube": {"length": (0.3,) * 3, "EI": (22155.0,) * 3, "rhoA": (2.808,) * 3, **_SUPPORTS},
+}
+
+
+def check(fixed: Mapping[str, Any]) -> None:
+    """``ValueError`` unless the lists have one entry per segment, or per joint between two segments."""
+    segments = len(fixed["length"])
+    for names, needed, what in ((_PER_SEGMENT, segments, "segment"), (_PER_JOINT, segments - 1, "joint")):
+        for name in names:
+            value = fixed.get(name, ())
+            if isinstance(value, tuple) and value != () and len(value) != needed:
+                raise ValueError(
+                    f"{name} = {list(value)}: {len(value)} entries where length has {segments}; allowed is one per {what}, "
+                    f"{needed}"
+                )
+
+
+def shaft(values: Values) -> Shaft:
+    """The shaft with these parameters (numbers, or arrays of one shape of lanes; lists as tuples of them).
+
+    What is known to have no effect, such as masses of 0, is left out of the computation.
+    """
+    length = values["length"] if isinstance(values["length"], tuple) else (values["length"],)
+    segments = len(length)
+
+    def entries(name: str, count: int, none: float) -> tuple[Any, ...]:
+        value = values.get(name, ())
+        if not isinstance(value, tuple):
+            return (value,) * count
+        return value or (none,) * count
+
+    def unless(items: tuple[Any, ...], none: float) -> Any:
+        return None if all(isinstance(x, (int, float)) and x == none for x in items) else stack(items)
+
+    supports = (values["k_A"], *entries("k_joint", segments - 1, 0.0), values["k_D"])
+    masses = (values.get("m_A", 0.0), *entries("m_joint", segments - 1, 0.0), values.get("m_D", 0.0))
+    return Shaft(
+        stack(length),
+        stack(entries("EI", segments, 0.0)),
+        stack(entries("rhoA", segments, 0.0)),
+        stack(supports),
+        unless(masses, 0.0),
+        unless(entries("k_hinge", segments - 1, math.inf), math.inf),
+        unless(entries("kGA", segments, math.inf), math.inf),
+        unless(entries("rhoI", segments, 0.0), 0.0),
+    ).arrays()
+
+
+SYSTEM = System(
+    name="bicardan",
+    title="Bicardanic shaft on elastic supports",
+    source="Bulac, Fiabilitate si Durabilitate, Supplement 1/2012",
+    parameters=PARAMETERS,
+    models={"critical_speeds": Model(shaft, NAMES, check)},
+    presets=PRESETS,
+)

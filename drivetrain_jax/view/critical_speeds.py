@@ -1,0 +1,198 @@
+"""Figures of critical speeds: curves along one axis (the critical-speed map), maps over two, mode shapes."""
+
+from __future__ import annotations
+
+import textwrap
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib import ticker
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import cells
+from drivetrain_jax.view.layout import Margins, Panels
+from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STYLE, axis_label, variable_label
+
+_FREQUENCIES = ("critical_speed", "natural_frequency", "angular_frequency")
+_HEIGHT, _SHAPE_HEIGHT, _MAP_HEIGHT = 3.4, 1.15, 2.3
+_MOST_SHAPES, _MOST_MAPS = 6, 4
+# Letters of a label along one map.
+_LETTERS = 32
+# Points between the names of two curves.
+_LABEL_HEIGHT = 8.0
+# Modes of zero frequency are drawn nowhere on a logarithmic axis; what is this far below the rest counts as zero.
+_NEGLIGIBLE = 1e-9
+
+
+def plot(dataset: xr.Dataset) -> Figure:
+    """Curves of the frequencies of all modes along one axis, maps of the first modes over two, or the mode shapes.
+
+    Along a logarithmic axis (support stiffness) both axes are logarithmic: the critical-speed map. A list of points is
+    drawn along its first parameter. Frequencies that the count does not certify are crossed. Raises
+    :class:`InputError` for more than two axes and where nothing that could be drawn is stored.
+    """
+    with matplotlib.rc_context(STYLE):
+        dataset = cells.prepare(dataset)
+        names = cells.sweep_axes(dataset)
+        if not names and "mode_shape" in dataset:
+            return _shapes(dataset)
+        shown = next((name for name in _FREQUENCIES if name in dataset), None)
+        if shown is None or not names:
+            stored = ", ".join(str(name) for name in dataset.data_vars)
+            needed = "an axis and one of " + ", ".join(_FREQUENCIES) if names else "mode_shape, or an axis"
+            raise InputError(f"outputs = {stored}: nothing to plot; the figure needs {needed}")
+        if len(names) == 1:
+            return _curves(dataset, names[0], shown)
+        if len(names) == 2:
+            return _maps(dataset, names, shown)
+        raise InputError(f"axes = {', '.join(names)}: allowed are one or two axes for a figure of critical speeds")
+
+
+def _colours(count: int) -> np.ndarray:
+    return matplotlib.colormaps["viridis"](np.linspace(0.0, 0.85, count))
+
+
+def _abscissa(dataset: xr.Dataset, name: str) -> xr.DataArray:
+    """The coordinate along which points are drawn: the axis, or the first parameter of a list of points."""
+    if name in dataset.coords and name != "point":
+        return dataset[name]
+    own = [c for c in dataset.coords.values() if c.dims == (name,) and c.name != name]
+    if not own:
+        raise InputError("points: no parameter varies; the figure needs one")
+    return own[0]
+
+
+def _curves(dataset: xr.Dataset, name: str, shown: str) -> Figure:
+    abscissa = _abscissa(dataset, name)
+    order = np.argsort(abscissa.values, kind="stable")
+    x, y = abscissa.values[order], dataset[shown].transpose("mode", name).values[:, order]
+    logarithmic = cells.is_logarithmic(x)
+    panels = Panels(height=_HEIGHT, margins=Margins(right=0.75, left=1.0))
+    axes = panels.axes[0][0]
+    drawn = np.where(y > _NEGLIGIBLE * np.nanmax(y), y, np.nan) if logarithmic else y
+    for colour, curve, mode in zip(_colours(len(y)), drawn, dataset["mode"].values, strict=True):
+        axes.plot(x, curve, color=colour, marker="o" if len(x) < 12 else None, markersize=3, label=f"mode {mode}")
+    cells.fit_axis(axes, "x", x)
+    axes.set_xlim(x[0], x[-1])
+    if logarithmic:
+        axes.set_yscale("log")
+        cells.plain_decades(axes, "y")
+    else:
+        axes.set_ylim(bottom=0.0)
+    axes.grid(color=FRAME_GREY, alpha=0.2, linewidth=0.5)
+    _label_curves(axes)
+    axes.set_ylabel(variable_label(dataset[shown]))
+    panels.label_axes(_every(dataset, abscissa, name))
+    panels.titles(dataset)
+    panels.legend(_doubtful(axes, dataset, name, x, drawn, order))
+    return panels.figure
+
+
+def _label_curves(axes: Axes) -> None:
+    """The names of the curves beside their right ends, those left out that would lie over another."""
+    taken = -np.inf
+    for line in axes.get_lines():
+        x, y = line.get_data()
+        present = np.flatnonzero(np.isfinite(y))
+        if not present.size:
+            continue
+        end = (x[present[-1]], y[present[-1]])
+        height = axes.transData.transform(end)[1] * 72 / axes.figure.dpi
+        if height > taken + _LABEL_HEIGHT:
+            label, colour = line.get_label(), line.get_color()
+            axes.annotate(label, end, (4, 0), textcoords="offset points", va="center", color=colour)
+            taken = height
+
+
+def _every(dataset: xr.Dataset, abscissa: xr.DataArray, name: str) -> str:
+    """Label of the abscissa; parameters of a list of points that equal it are named with it."""
+    equal = [
+        str(c.name)
+        for c in dataset.coords.values()
+        if c.dims == (name,) and c.name not in (abscissa.name, name) and np.array_equal(c.values, abscissa.values)
+    ]
+    return " = ".join([axis_label(abscissa), *equal])
+
+
+def _doubtful(
+    axes: Axes, dataset: xr.Dataset, name: str, x: np.ndarray, y: np.ndarray, order: np.ndarray
+) -> list[Artist]:
+    """Crosses over the frequencies that are not certified."""
+    if "count_certified" not in dataset:
+        return []
+    doubtful = dataset["count_certified"].transpose("mode", name).values[:, order] == 0
+    if not (doubtful & np.isfinite(y)).any():
+        return []
+    style = {"linestyle": "none", "marker": "x", "color": STATE_COLOURS[cells.FAILED], "markersize": 5}
+    for row, curve in zip(doubtful, y, strict=True):
+        axes.plot(x[row], curve[row], **style)
+    return [Line2D([], [], **style, label="not certified by the count")]
+
+
+def _maps(dataset: xr.Dataset, names: list[str], shown: str) -> Figure:
+    horizontal = cells.horizontal_axis(dataset, names)
+    vertical = next(name for name in names if name != horizontal)
+    modes = [mode for mode in range(dataset.sizes["mode"]) if float(dataset[shown].isel(mode=mode).max()) > 0]
+    modes = modes[:_MOST_MAPS]
+    panels = Panels(len(modes), height=_MAP_HEIGHT, margins=Margins(right=1.25, left=1.0))
+    for (axes,), mode in zip(panels.axes, modes, strict=True):
+        field = dataset[shown].isel(mode=mode)
+        values = field.values[np.isfinite(field.values) & (field.values > 0)]
+        low, high = values.min(), values.max()
+        norm = LogNorm(low, high) if high > 3 * low else Normalize(low, high)
+        cmap = matplotlib.colormaps["viridis"].with_extremes(bad=STATE_COLOURS[cells.FAILED])
+        field = field.where(field.isnull() | (field > low), low)
+        mesh = cells.draw_cells(
+            axes, field.where(field.isnull() | (field > low), low), horizontal, vertical, cmap=cmap, norm=norm
+        )
+        number = dataset["mode"].values[mode]
+        bar_format = ticker.StrMethodFormatter("{x:g}")
+        panels.colorbar(
+            axes, mesh, f"mode {number}: {variable_label(field)}", format=bar_format, ticks=_ticks(low, high)
+        )
+        panels.figure.axes[-1].yaxis.set_minor_formatter(ticker.NullFormatter())
+        axes.set_ylabel(textwrap.fill(axis_label(dataset[vertical]), _LETTERS))
+    panels.label_axes(axis_label(dataset[horizontal]))
+    panels.titles(dataset)
+    panels.legend(cells.failure_legend(dataset))
+    return panels.figure
+
+
+def _ticks(low: float, high: float) -> np.ndarray:
+    """1, 2, 5 and their decades between the two, or round numbers where there are too few."""
+    decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+    marks = np.outer(decades, [1, 2, 5]).ravel()
+    inside = marks[(marks >= low) & (marks <= high)]
+    return inside if len(inside) > 1 else ticker.MaxNLocator(5).tick_values(low, high)
+
+
+def _shapes(dataset: xr.Dataset) -> Figure:
+    count = min(dataset.sizes["mode"], _MOST_SHAPES)
+    panels = Panels(count, height=_SHAPE_HEIGHT, margins=Margins(right=0.3, between_rows=0.12))
+    x = dataset["x"].values
+    for (axes,), index, colour in zip(panels.axes, range(count), _colours(count), strict=True):
+        shape = dataset["mode_shape"].isel(mode=index).values
+        axes.axhline(0.0, color=FRAME_GREY, linewidth=0.6)
+        axes.plot(x, shape, color=colour)
+        axes.fill_between(x, shape, color=colour, alpha=0.15, linewidth=0)
+        axes.set(xlim=(0.0, 1.0), ylim=(-1.25, 1.25), yticks=(-1.0, 0.0, 1.0))
+        axes.annotate(_name(dataset, index), (0.01, 0.05), xycoords="axes fraction", color=FRAME_GREY)
+    panels.label_axes(variable_label(dataset["x"]), "deflection, largest 1 [1]")
+    panels.titles(dataset)
+    return panels.figure
+
+
+def _name(dataset: xr.Dataset, index: int) -> str:
+    """``mode 1: critical speed 8371.54 rpm``, as far as it is stored."""
+    text = f"mode {dataset['mode'].values[index]}"
+    shown = next((name for name in _FREQUENCIES if name in dataset), None)
+    if shown is None:
+        return text
+    field = dataset[shown]
+    return f"{text}: {field.attrs.get('long_name', shown)} {field.values[index]:.6g} {field.attrs.get('units', '')}"

@@ -1,0 +1,337 @@
+"""Critical speeds of stepped shafts against high-precision values, closed forms and finite elements."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+
+from benchmarks.bicardan_reference import complete, finite_elements
+from drivetrain_jax.analysis.critical_speeds import angular_frequencies, separation_margin
+from drivetrain_jax.analysis.shaft_compound import characteristic
+from drivetrain_jax.analysis.shaft_functions import compound, general, sine_cosine
+from drivetrain_jax.analysis.shaft_mechanisms import zero_modes
+from drivetrain_jax.analysis.shaft_roots import find_roots, relative_error
+from drivetrain_jax.analysis.shaft_shapes import mode_shapes
+from drivetrain_jax.systems import Shaft
+from drivetrain_jax.systems.bicardan import PRESETS, shaft
+
+CASES = json.loads((Path(__file__).parents[1] / "reference" / "bicardan.json").read_text())
+PAPER = PRESETS["paper"]
+
+
+@jax.jit
+def thirty(shafts: Shaft):
+    roots = find_roots(shafts, 30)
+    return roots, relative_error(shafts, roots), zero_modes(shafts)
+
+
+@jax.jit
+def eight(shafts: Shaft):
+    return find_roots(shafts, 8), zero_modes(shafts)
+
+
+def lanes(parameters: list[Mapping]) -> Shaft:
+    """Shafts of one number of segments, side by side."""
+    values = [complete(p) for p in parameters]
+
+    def column(name: str) -> np.ndarray:
+        return np.stack([v[name] for v in values], axis=-1)
+
+    k = np.vstack([column("k_A")[None], column("k_joint"), column("k_D")[None]])
+    return Shaft(column("length"), column("EI"), column("rhoA"), k).arrays()
+
+
+def named(case: Mapping) -> dict:
+    names = {"length": "l", "EI": "EI", "rhoA": "rhoA", "k_A": "kA", "k_D": "kD"}
+    return {name: case[key] for name, key in names.items()}
+
+
+@pytest.fixture(scope="module")
+def solved() -> dict[str, tuple]:
+    """Per case: p, certified, estimated error, number of zero modes."""
+    results = {}
+    for segments in {len(case["l"]) for case in CASES.values()}:
+        names = [name for name, case in CASES.items() if len(case["l"]) == segments]
+        roots, error, zeros = thirty(lanes([named(CASES[name]) for name in names]))
+        for i, name in enumerate(names):
+            results[name] = tuple(np.asarray(x)[..., i] for x in (roots.q**2, roots.certified, error, zeros))
+    return results
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_reference_values(solved, name):
+    p, certified, error, zeros = solved[name]
+    expected = {int(mode): float(value) for mode, value in CASES[name]["p_rad_per_s"].items()}
+    assert certified.all()
+    assert zeros == CASES[name]["zero_modes"] and np.all(p[:zeros] == 0.0) and np.all(p[zeros:] > 0)
+    for mode, value in expected.items():
+        assert abs(p[mode - 1] / value - 1) <= 1e-14, mode
+        assert abs(p[mode - 1] / value - 1) <= error[mode - 1], mode
+    assert error.max() <= 1e-13
+
+
+def test_mode_60_of_closed_forms():
+    """Pinned ends: z = n pi. Free ends: cos z ch z = 1, from n = 20 on z = (n + 1/2) pi to the last digit."""
+    shafts = Shaft(
+        jnp.full((1, 2), 1.3), jnp.full((1, 2), 7.0), jnp.full((1, 2), 0.4), jnp.array([[jnp.inf, 0.0], [jnp.inf, 0.0]])
+    )
+    z = np.asarray(jax.jit(lambda s: find_roots(s, 60).q)(shafts)) * 1.3 * (0.4 / 7.0) ** 0.25
+    assert np.abs(z[:, 0] / (np.pi * np.arange(1, 61)) - 1).max() <= 1e-15
+    assert np.abs(z[22:, 1] / (np.pi * (np.arange(23, 61) - 1.5)) - 1).max() <= 1e-15
+
+
+def test_mode_60_of_a_stepped_shaft():
+    """The determinant of the plain transfer matrices, with 150 digits, changes sign within 1e-13 of modes 30, 60."""
+    found = np.asarray(jax.jit(lambda s: find_roots(s, 60).q)(shaft(PAPER))) ** 2
+    for mode in (30, 60):
+        signs = [_exact_determinant(found[mode - 1] * (1 + side * 1e-13)) > 0 for side in (-1, 1)]
+        assert signs[0] != signs[1]
+
+
+def _exact_determinant(p: float) -> mpmath.mpf:
+    with mpmath.workdps(150):
+        k_A, k_D = mpmath.mpf(PAPER["k_A"]), mpmath.mpf(PAPER["k_D"])
+        state = mpmath.matrix([[0, 1 / k_A], [1, 0], [0, 0], [0, 1]])
+        for length, EI, rhoA in zip(PAPER["length"], PAPER["EI"], PAPER["rhoA"], strict=True):
+            alpha = mpmath.root(mpmath.mpf(p) ** 2 * mpmath.mpf(rhoA) / mpmath.mpf(EI), 4)
+            z = alpha * mpmath.mpf(length)
+            c, s, ch, sh = mpmath.cos(z), mpmath.sin(z), mpmath.cosh(z), mpmath.sinh(z)
+            f = ((ch + c) / 2, (sh + s) / 2, (ch - c) / 2, (sh - s) / 2)
+            d = (1, 1 / alpha, -1 / (alpha**2 * EI), -1 / (alpha**3 * EI))
+            state = _krylov(f, d) * state
+        r = state
+        return (r[2, 0] * r[3, 1] - r[2, 1] * r[3, 0]) - k_D * (r[0, 0] * r[2, 1] - r[0, 1] * r[2, 0])
+
+
+def _krylov(f: tuple, d: tuple) -> mpmath.matrix:
+    return mpmath.matrix([[f[(j - i) % 4] * d[j] / d[i] for j in range(4)] for i in range(4)])
+
+
+def random_shaft(rng: np.random.Generator, segments: int) -> dict:
+    """Contrasts to 1e4, supports absent, from 1e2 to 1e14, now and then one at a joint."""
+
+    def support() -> float:
+        return 0.0 if rng.random() < 0.2 else 10 ** rng.uniform(2, 14)
+
+    joints = [10 ** rng.uniform(3, 8) if rng.random() < 0.2 else 0.0 for _ in range(segments - 1)]
+    return {
+        "length": 10 ** rng.uniform(-1, 0, segments),
+        "EI": 10 ** rng.uniform(2, 6, segments),
+        "rhoA": 10 ** rng.uniform(-1, 2, segments),
+        "k_A": support(),
+        "k_D": support(),
+        "k_joint": joints,
+    }
+
+
+def check_random(count: int, segments: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    shafts = [random_shaft(rng, segments) for _ in range(count)]
+    roots, zeros = eight(lanes(shafts))
+    assert bool(roots.certified.all())
+    for i, one in enumerate(shafts):
+        p = np.asarray(roots.q)[:, i] ** 2
+        expected = finite_elements(one, 8, bubbles=18)
+        assert np.count_nonzero(p == 0) == int(zeros[i])
+        assert np.all(expected[p == 0] <= 1e-4 * expected[-1])
+        close = np.abs(p - expected) <= 1e-6 * expected + 1e-7 * expected[-1]
+        assert close[p > 0].all(), (one, p, expected)
+
+
+@pytest.mark.parametrize("segments", [1, 3, 6])
+def test_no_root_is_missed_or_false(segments):
+    check_random(34, segments, seed=segments)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("segments", range(1, 7))
+def test_no_root_is_missed_or_false_at_full_size(segments):
+    check_random(334, segments, seed=100 + segments)
+
+
+AREA, MOMENT = np.array(PAPER["rhoA"]) / 7800, np.array(PAPER["EI"]) / 2.1e11
+SHEAR = {"kGA": tuple(0.53 * 8.1e10 * AREA), "rhoI": tuple(7800 * MOMENT)}
+EXTENSIONS = {
+    "support at a joint": {"k_joint": (0.0, 1e6)},
+    "yokes": {"m_A": 3.0, "m_D": 1.0, "m_joint": (2.0, 5.0)},
+    "elastic joints": {"k_hinge": (1e4, 1e5)},
+    "hinge and elastic joint": {"k_hinge": (0.0, 1e5), "k_joint": (1e7, 0.0)},
+    "three free bars": {"k_hinge": (0.0, 0.0), "k_A": 0.0, "k_D": 0.0, "m_joint": (0.5, 0.2)},
+    "mechanism on one support": {"k_hinge": (0.0, math.inf), "k_joint": (0.0, 3e5), "k_A": 0.0, "k_D": 0.0},
+    "Timoshenko": SHEAR,
+    "Timoshenko with everything": SHEAR
+    | {"k_hinge": (1e4, 0.0), "m_joint": (1.0, 2.0), "k_joint": (0.0, 1e6), "m_A": 0.5},
+    "beyond the cut-off frequency": {"kGA": tuple(1e-3 * np.array(SHEAR["kGA"])), "rhoI": tuple(1e3 * 7800 * MOMENT)},
+}
+
+
+def everything(values: Mapping) -> Shaft:
+    """The shaft with every field present, so that all cases share two kernels."""
+    v = complete(values)
+    slender = "kGA" not in values
+    k, m = (np.r_[v[f"{what}_A"], v[f"{what}_joint"], v[f"{what}_D"]] for what in ("k", "m"))
+    shear = (None, None) if slender else (v["kGA"], v["rhoI"])
+    return Shaft(v["length"], v["EI"], v["rhoA"], k, m, v["k_hinge"], *shear).arrays()
+
+
+@pytest.mark.parametrize("name", EXTENSIONS)
+def test_extensions_against_finite_elements(name):
+    values = PAPER | EXTENSIONS[name]
+    roots, zeros = eight(everything(values))
+    p, expected = np.asarray(roots.q) ** 2, finite_elements(values, 8, bubbles=20)
+    assert bool(roots.certified.all()) and np.count_nonzero(p == 0) == int(zeros)
+    np.testing.assert_allclose(p[p > 0], expected[p > 0], rtol=2e-11)
+    assert np.all(expected[p == 0] < 1e-6 * expected[-1])
+
+
+def test_shear_and_rotary_inertia_lower_the_tube():
+    """About -1 % on the first and -4 % on the second frequency."""
+    tube = PRESETS["paper_tube"]
+    area, moment = 3.6e-4, 1.055e-7
+    slender = np.asarray(eight(shaft(tube))[0].q) ** 2
+    thick = everything(tube | {"kGA": (0.53 * 8.1e10 * area,) * 3, "rhoI": (7800 * moment,) * 3})
+    ratio = np.asarray(eight(thick)[0].q) ** 2 / slender
+    assert -0.015 < ratio[0] - 1 < -0.005 and -0.05 < ratio[1] - 1 < -0.03
+
+
+def test_coinciding_frequencies_are_all_found():
+    """Two equal spans, hinged to each other over a rigid support: every frequency is double, and N jumps by two."""
+    twins = Shaft(jnp.ones(2), jnp.ones(2), jnp.ones(2), jnp.full(3, jnp.inf), None, jnp.zeros(1))
+    roots, _ = eight(twins)
+    z = np.asarray(roots.q)
+    assert bool(roots.certified.all())
+    np.testing.assert_allclose(z, np.pi * np.array([1, 1, 2, 2, 3, 3, 4, 4]), rtol=4e-15)
+
+
+def test_lanes_do_not_disturb_each_other():
+    """A lane without numbers is NaN and not certified; the others have the bits they have without it."""
+    good = [named(CASES[name]) for name in ("paper_real_exactI", "near_pinned_k1e14", "free_free_3seg")]
+    alone = np.asarray(thirty(lanes(good))[0].q)
+    bad = [*good[:2], good[2] | {"EI": [math.nan] * 3}]
+    roots = thirty(lanes(bad))[0]
+    assert np.array_equal(np.asarray(roots.q)[:, :2], alone[:, :2])
+    assert np.isnan(np.asarray(roots.q)[:, 2]).all() and not np.asarray(roots.certified)[:, 2].any()
+
+
+def test_elementary_functions():
+    z = np.concatenate([np.linspace(0, 3, 500), 10 ** np.random.default_rng(0).uniform(0, 4, 500)])
+    sine, cosine = sine_cosine(jnp.asarray(z))
+    assert (
+        np.abs(np.asarray(sine) - np.sin(z)).max() <= 2.3e-16
+        and np.abs(np.asarray(cosine) - np.cos(z)).max() <= 2.3e-16
+    )
+
+
+@pytest.mark.parametrize("z", [1e-3, 0.3, 1.99, 2.01, 7.0, 40.0])
+def test_compound_is_the_exponential(z):
+    """Both forms of the segment against ``exp(z B)`` with 60 digits, entry by entry relative to its column."""
+    for s, t, functions in ((0.0, 0.0, compound), (0.0, 0.0, None), (0.3, 0.1, None), (3.0, 2.0, None)):
+        own = functions(jnp.array(z)) if functions else general(jnp.array(z), jnp.array(s), jnp.array(t))
+        with mpmath.workdps(60):
+            B = mpmath.matrix(
+                [[0, 1, 0, s, 0], [-t, 0, -2, 0, s], [0, 0, 0, -1, 0], [-1, 0, 0, 0, 1], [0, -1, 0, -t, 0]]
+            )
+            exact = mpmath.expm(B * mpmath.mpf(z)) * mpmath.exp(-mpmath.mpf(float(own.growth)))
+        for j in range(5):
+            column = own.propagate(tuple(jnp.array(float(i == j)) for i in range(5)))
+            for i in range(5):
+                if z < 1:
+                    # Small entries matter: soft supports balance them against large ones.
+                    tolerance = 2e-14 * abs(float(exact[i, j])) + 1e-30
+                else:
+                    tolerance = 2e-14 * max(abs(float(exact[k, j])) for k in range(5))
+                assert abs(float(column[i]) - float(exact[i, j])) <= tolerance, (s, t, i, j)
+
+
+def test_count_grows_by_one_through_every_frequency():
+    """Also next to the poles of the segments' stiffness, where the count has nothing to hold on to."""
+    uniform = shaft(PRESETS["paper_tube"])
+    q = eight(uniform)[0].q
+    clamped = jnp.array([4.730040744862704, 7.853204624095838]) / (0.3 * (2.808 / 22155.0) ** 0.25)
+    near = jnp.sort(jnp.concatenate([clamped * (1 + side * 1e-15) for side in (-1, 0, 1)]))
+    count = jax.jit(characteristic)(uniform, jnp.concatenate([q * (1 - 1e-14), q * (1 + 1e-14), near])).count
+    assert np.array_equal(count[:16], [*range(8), *range(1, 9)])
+    assert np.array_equal(count[16:], np.sum(np.asarray(q)[None] < np.asarray(near)[:, None], axis=1))
+
+
+LISTS = ("length", "EI", "rhoA", "k")
+NODES = jnp.array([PAPER["k_A"], 2e6, 0.0, PAPER["k_D"]])
+ARGUMENTS = (*(jnp.array(PAPER[name]) for name in LISTS[:3]), NODES)
+
+
+@jax.jit
+def frequencies(*arguments: jax.Array) -> jax.Array:
+    return angular_frequencies(Shaft(*arguments), 6)
+
+
+@pytest.fixture(scope="module")
+def jacobians() -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """p of six modes and dp/d(length, EI, rhoA, k), by reverse mode."""
+    rows = jax.jit(jax.jacrev(frequencies, argnums=(0, 1, 2, 3)))(*ARGUMENTS)
+    return np.asarray(frequencies(*ARGUMENTS)), tuple(np.asarray(row) for row in rows)
+
+
+def test_gradients_obey_the_sum_identities(jacobians):
+    """p scales like rhoA^(-1/2), like (EI, k)^(1/2), and like length^(-2) if k goes with EI/length^3."""
+    p, (length, EI, rhoA, k) = jacobians
+    logarithmic = [
+        (row * np.asarray(x)).sum(axis=1) / p for row, x in zip((length, EI, rhoA, k), ARGUMENTS, strict=True)
+    ]
+    np.testing.assert_allclose(logarithmic[2], -0.5, atol=1e-13)
+    np.testing.assert_allclose(logarithmic[1] + logarithmic[3], 0.5, atol=1e-13)
+    np.testing.assert_allclose(logarithmic[0] - 3 * logarithmic[3], -2.0, atol=1e-12)
+
+
+def test_gradients_against_finite_differences(jacobians):
+    """Differences of fourth order in the logarithm of each parameter, all perturbed shafts side by side."""
+    p, rows = jacobians
+    h, multiples = 1e-3, np.array([-2, -1, 1, 2])
+    places = [(i, e) for i, x in enumerate(ARGUMENTS) for e in range(len(x)) if float(x[e]) > 0]
+    columns = [np.repeat(np.asarray(x)[:, None], 4 * len(places), axis=1) for x in ARGUMENTS]
+    for number, (i, e) in enumerate(places):
+        columns[i][e, 4 * number : 4 * number + 4] *= np.exp(h * multiples)
+    moved = np.log(np.asarray(frequencies(*(jnp.asarray(c) for c in columns)))).reshape(6, len(places), 4)
+    slopes = moved @ np.array([1, -8, 8, -1]) / (12 * h)
+    for number, (i, e) in enumerate(places):
+        exact = rows[i][:, e] * float(ARGUMENTS[i][e]) / p
+        np.testing.assert_allclose(exact, slopes[:, number], atol=3e-11)
+
+
+def test_gradient_of_a_spring_that_is_not_there(jacobians):
+    """The energy formula dp/dk = f^2/(2 p G) for k = 0, with the mode shape integrated numerically."""
+    p, rows = jacobians
+    x = np.linspace(0.0, 1.0, 9101)
+    f = np.asarray(jax.jit(mode_shapes)(Shaft(*ARGUMENTS), jnp.sqrt(jnp.asarray(p)), jnp.asarray(x)))
+    ends = np.cumsum(PAPER["length"]) / sum(PAPER["length"])
+    per_length = np.asarray(PAPER["rhoA"])[np.minimum(np.searchsorted(ends, x), 2)]
+    G = np.trapezoid(per_length * f**2, x, axis=1) * sum(PAPER["length"])
+    at_joint = f[:, np.argmin(np.abs(x - ends[1]))]
+    np.testing.assert_allclose(rows[3][:, 2], at_joint**2 / (2 * p * G), rtol=3e-4)
+
+
+def test_gradients_of_all_extensions_against_finite_differences():
+    names = ("m_joint", "k_hinge", "kGA", "rhoI", "k_joint")
+    start = {"m_joint": 2.0, "k_hinge": 3e4, "kGA": 2e7, "rhoI": 2e-3, "k_joint": 1e6}
+
+    def first(scales: jax.Array) -> jax.Array:
+        values = {name: start[name] * jnp.exp(scales[i]) for i, name in enumerate(names)}
+        return jnp.log(angular_frequencies(shaft(PAPER | values), 3))
+
+    gradient = np.asarray(jax.jit(jax.jacfwd(first))(jnp.zeros(5)))
+    run, h = jax.jit(first), 1e-3
+    for i in range(5):
+        v = [np.asarray(run(jnp.zeros(5).at[i].set(multiple * h))) for multiple in (-2, -1, 1, 2)]
+        np.testing.assert_allclose(gradient[:, i], (v[0] - 8 * v[1] + 8 * v[2] - v[3]) / (12 * h), atol=3e-12)
+
+
+def test_separation_margin():
+    margin = separation_margin(jnp.array([0.0, 900.0, 1000.0, 1500.0, 2000.0, 3000.0]), 1000.0, 2000.0)
+    np.testing.assert_allclose(margin, [1.0, 0.1, 0.0, 0.0, 0.0, 0.5], rtol=1e-15)

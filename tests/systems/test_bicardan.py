@@ -1,0 +1,145 @@
+"""The bicardanic shaft as a system: what is refused, and how a scene reaches the numbers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import drivetrain_jax as dt
+from benchmarks.bicardan_reference import finite_elements
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.sweep.scene import load_scene
+from drivetrain_jax.systems.bicardan import PRESETS, shaft
+
+FIXED = {name: list(value) if isinstance(value, tuple) else value for name, value in PRESETS["paper_fitted"].items()}
+SCENE = {"system": "bicardan", "analysis": "critical_speeds"}
+
+
+def refusal(**changes) -> str:
+    options = changes.pop("options", {})
+    outputs = changes.pop("outputs", ["critical_speed"])
+    with pytest.raises(InputError) as error:
+        load_scene({**SCENE, "fixed": FIXED | changes, "options": options, "outputs": outputs})
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("name", ["length", "EI", "rhoA"])
+@pytest.mark.parametrize("value", [0.0, -1.0])
+def test_entries_must_be_positive(name, value):
+    message = refusal(**{name: [FIXED[name][0], value, FIXED[name][2]]})
+    assert f"{name}[1] = {value}" in message and f"0 < {name}[i]" in message
+
+
+@pytest.mark.parametrize("name", ["EI", "rhoA", "kGA", "rhoI", "k_joint", "m_joint", "k_hinge"])
+def test_lists_must_fit_the_segments(name):
+    message = refusal(**{name: [1.0] * 5})
+    assert f"fixed.{name} = " in message and "5 entries" in message
+
+
+def test_supports_may_be_absent_or_rigid_but_not_negative():
+    assert "0 <= k_A" in refusal(k_A=-1.0)
+    load_scene({**SCENE, "fixed": FIXED | {"k_A": 0.0, "k_D": math.inf}})
+
+
+def test_the_determinant_knows_no_additions():
+    options = {"method": "krylov_determinant"}
+    assert "allowed is the method certified" in refusal(m_joint=[1.0, 1.0], options=options)
+    assert "finite" in refusal(k_A=math.inf, options=options)
+
+
+def test_a_margin_needs_operating_speeds():
+    assert "options.operating_max" in refusal(outputs=["separation_margin"])
+    assert "operating_min" in refusal(
+        outputs=["separation_margin"], options={"operating_min": 9.0, "operating_max": 5.0}
+    )
+
+
+def test_what_is_absent_is_left_out():
+    plain = shaft(PRESETS["paper"])
+    assert plain.m is None and plain.k_hinge is None and not plain.is_timoshenko
+    assert shaft(PRESETS["paper"] | {"m_D": 1.0}).m is not None
+
+
+@pytest.fixture(scope="module")
+def swept():
+    """k_D swept through 0 and infinity, with everything that can be asked for."""
+    outputs = ["natural_frequency", "angular_frequency", "critical_speed", "count_certified", "relative_error"]
+    return dt.run(
+        {
+            **SCENE,
+            "outputs": [*outputs, "separation_margin", "mode_shape"],
+            "axes": {"k_D": {"values": [0.0, 20e6, 85e6, math.inf]}},
+            "fixed": {name: value for name, value in FIXED.items() if name != "k_D"},
+            "options": {"modes": 8, "operating_min": 600.0, "operating_max": 6000.0},
+        }
+    )
+
+
+def test_units_and_certificates(swept):
+    assert np.all(swept.outcome == 0) and np.all(swept.count_certified == 1)
+    np.testing.assert_allclose(swept.natural_frequency, swept.angular_frequency / (2 * np.pi), rtol=1e-15)
+    np.testing.assert_allclose(swept.critical_speed, swept.natural_frequency * 60, rtol=1e-15)
+    assert list(swept.mode.values) == [*range(1, 9)] and swept.angular_frequency.dims == ("k_D", "mode")
+    assert float(swept.relative_error.max()) < 1e-14
+    np.testing.assert_allclose(swept.separation_margin[1:, 0], swept.critical_speed[1:, 0] / 6000 - 1, rtol=1e-12)
+
+
+def test_section_4(swept):
+    """p1, p2 as printed, and conclusion 3: the amplitude at D for f_A = 1 drops 4.35 times."""
+    np.testing.assert_allclose(swept.angular_frequency[1, :2], [876.66, 2827.37], atol=0.006)
+    at_D = swept.mode_shape[1:3, 0, -1] / swept.mode_shape[1:3, 0, 0]
+    assert abs(float(at_D[0] / at_D[1]) - 4.3476) < 1e-4
+
+
+def test_rising_stiffness_raises_every_frequency(swept):
+    assert np.all(np.diff(swept.angular_frequency.values, axis=0) > 0)
+
+
+def test_mode_shapes(swept):
+    """Mode j has j - 1 nodes, largest deflection 1; without k_D it turns about A, and a rigid support holds D."""
+    shapes = swept.mode_shape.values
+    np.testing.assert_allclose(np.abs(shapes).max(axis=-1), 1.0, rtol=3e-16)
+    changes = (np.diff(np.sign(shapes[1]), axis=-1) != 0).sum(axis=-1)
+    assert np.array_equal(changes, np.arange(8))
+    np.testing.assert_allclose(shapes[0, 0], swept.x.values, atol=1e-15)
+    assert np.abs(shapes[3, :, -1]).max() < 1e-13
+
+
+def test_mode_shapes_are_orthogonal_and_have_their_rayleigh_quotient(swept):
+    """In the mass of the shaft, by numerical integration over the stored stations."""
+    x = swept.x.values
+    ends = np.cumsum(FIXED["length"]) / sum(FIXED["length"])
+    mass = np.array(FIXED["rhoA"])[np.minimum(np.searchsorted(ends, x), 2)]
+    for shapes in swept.mode_shape.values[:, :4]:
+        products = np.trapezoid(mass * shapes[:, None] * shapes[None], x, axis=-1)
+        size = np.sqrt(np.diag(products))
+        assert np.abs(products / np.outer(size, size) - np.eye(4)).max() < 0.03
+
+
+def test_an_entry_and_an_addition_as_axes():
+    axes = {"length[1]": {"values": [0.4, 0.59]}, "k_hinge": {"values": [1e4, 1e6]}}
+    result = dt.run({**SCENE, "outputs": ["angular_frequency"], "axes": axes, "fixed": FIXED, "options": {"modes": 3}})
+    for i, length in enumerate((0.4, 0.59)):
+        for j, k_hinge in enumerate((1e4, 1e6)):
+            values = PRESETS["paper_fitted"] | {"length": (0.07, length, 0.25), "k_hinge": k_hinge}
+            np.testing.assert_allclose(result.angular_frequency[i, j], finite_elements(values, 3), rtol=1e-10)
+
+
+def test_the_determinant_dies_near_mode_12():
+    """It is right for the first modes, and the count exposes what is left of it at mode 13."""
+    result = dt.run(
+        {
+            **SCENE,
+            "outputs": ["angular_frequency", "count_certified"],
+            "fixed": FIXED,
+            "options": {"method": "krylov_determinant", "modes": 13},
+        }
+    )
+    exact = finite_elements(PRESETS["paper_fitted"], 13, bubbles=24)
+    error = np.abs(result.angular_frequency.values / exact - 1)
+    assert error[:5].max() < 1e-11 and error[12] > 1e-5
+    assert np.all(result.count_certified[:6] == 1) and result.count_certified[12] == 0
+    assert result.outcome == 1

@@ -1,0 +1,77 @@
+"""Figures of critical speeds: what is drawn on which scale, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import plot
+
+MODE = ("mode", [1, 2, 3])
+
+
+def result(data: dict, coords: dict) -> xr.Dataset:
+    attrs = {"analysis": "critical_speeds", "title": "A shaft"}
+    described = {
+        name: (dims, values, {"units": "N m-1", "long_name": f"stiffness {name}"})
+        for name, (dims, values) in coords.items()
+    }
+    return xr.Dataset(data, described | {"mode": MODE}, attrs)
+
+
+def speeds(values: np.ndarray, dims: tuple[str, ...]) -> tuple:
+    return dims, values, {"units": "rpm", "long_name": "critical speed"}
+
+
+@pytest.fixture
+def swept() -> xr.Dataset:
+    k = np.geomspace(1e4, 1e10, 25)
+    base = np.sqrt(k / (k + 1e7))[:, None] * np.array([8e3, 3e4, 6e4])
+    certified = np.ones((25, 3), "int8")
+    certified[3, 2] = 0
+    data = {
+        "critical_speed": speeds(base, ("k_D", "mode")),
+        "count_certified": (("k_D", "mode"), certified),
+        "outcome": ("k_D", np.zeros(25, "int8")),
+    }
+    return result(data, {"k_D": ("k_D", k)})
+
+
+def test_the_map_is_logarithmic_and_crosses_what_is_not_certified(swept):
+    figure = plot(swept)
+    axes = figure.axes[0]
+    assert axes.get_xscale() == axes.get_yscale() == "log"
+    curves = [line for line in axes.get_lines() if len(line.get_xdata()) == 25]
+    assert len(curves) == 3
+    np.testing.assert_array_equal(curves[1].get_ydata(), swept.critical_speed[:, 1])
+    crosses = [line for line in axes.get_lines() if line.get_marker() == "x"]
+    assert [list(line.get_xdata()) for line in crosses if len(line.get_xdata())] == [[swept.k_D.values[3]]]
+    assert "not certified by the count" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_two_axes_give_one_map_per_mode(swept):
+    both = swept.critical_speed.values[:, None] + swept.critical_speed.values[None]
+    data = {
+        "critical_speed": speeds(both, ("k_A", "k_D", "mode")),
+        "outcome": (("k_A", "k_D"), np.zeros((25, 25), "int8")),
+    }
+    figure = plot(result(data, {"k_A": ("k_A", swept.k_D.values), "k_D": ("k_D", swept.k_D.values)}))
+    assert len([axes for axes in figure.axes if axes.get_label() != "colour bar"]) == 3
+
+
+def test_mode_shapes_are_named(swept):
+    x = np.linspace(0, 1, 11)
+    data = {
+        "mode_shape": (("mode", "x"), np.sin(np.outer([1, 2, 3], np.pi * x))),
+        "critical_speed": speeds(np.array([8e3, 3e4, 6e4]), ("mode",)),
+        "outcome": ((), np.int8(0)),
+    }
+    figure = plot(result(data, {}).assign_coords(x=("x", x, {"units": "1", "long_name": "distance"})))
+    assert figure.axes[0].texts[0].get_text() == "mode 1: critical speed 8000 rpm"
+
+
+def test_nothing_to_plot(swept):
+    with pytest.raises(InputError, match="nothing to plot"):
+        plot(swept.drop_vars("critical_speed"))
