@@ -25,23 +25,24 @@ def matmul(a: Array, b: Array) -> Array:
 
 
 def solve(a: Array, b: Array) -> Array:
-    """Solution of ``a x = b`` for one matrix, ``(n, n), (n, m) -> (n, m)``.
+    """Solution of ``a x = b``, ``(n, n, ...), (n, m, ...) -> (n, m, ...)``.
 
-    Gauss-Jordan elimination with row pivoting; a singular matrix gives values that are not finite.
+    Gauss-Jordan elimination with row exchanges; a singular matrix gives values that are not finite.
     """
     n = a.shape[0]
+    number = jnp.arange(n).reshape(n, *(1,) * (a.ndim - 2))
 
-    def eliminate(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        system, pivots = state
+    def eliminate(k: Array, system: Array) -> Array:
         column = system[:, k]
-        chosen = jnp.arange(n) == jnp.argmax(jnp.where(pivots < n, -1.0, jnp.abs(column)))
-        row = jnp.sum(jnp.where(chosen[:, None], system, 0.0), axis=0)
-        row = row / row[k]
-        rest = system - jnp.where(chosen, 0.0, column)[:, None] * row
-        return jnp.where(chosen[:, None], row, rest), jnp.where(chosen, k, pivots)
+        pivot = jnp.argmax(jnp.where(number < k, -1.0, jnp.abs(column)), axis=0)
+        row = jnp.take_along_axis(system, pivot[None, None], axis=0)[0]
+        row, displaced = row / row[k], system[k]
+        at_pivot = number == pivot
+        rest = jnp.where(at_pivot[:, None], displaced, system)
+        rest = rest - jnp.where(at_pivot, displaced[k], column)[:, None] * row
+        return jnp.where((number == k)[:, None], row, rest)
 
-    system, pivots = jax.lax.fori_loop(0, n, eliminate, (jnp.concatenate([a, b], axis=1), jnp.full(n, n)))
-    return system[jnp.argsort(pivots), n:]
+    return jax.lax.fori_loop(0, n, eliminate, jnp.concatenate([a, b], axis=1))[:, n:]
 
 
 def spectral_norm(a: Array) -> Array:

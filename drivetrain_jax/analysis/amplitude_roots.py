@@ -1,0 +1,79 @@
+"""Stationary amplitudes of one-term approximations: all of them at a frequency, and those that a slow sweep meets.
+
+Both closed-form approximations of a forced oscillator end in one equation for the amplitude A of the fundamental,
+``residual(A, omega) = 0``, which is negative at A = 0 and positive for large A. The averaged amplitude grows where it
+is negative and falls where it is positive: the first, third, ... root is stable, every second one a saddle.
+Arrays have the batch as their trailing axes ``(...)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+_HALVINGS = 60
+
+
+def refined(omega: np.ndarray, largest: float, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rising frequencies that contain ``omega``, and the position of each entry of ``omega`` in them.
+
+    Steps are at most the fraction ``largest`` of the frequency, with at most ``most`` parts of one interval.
+    """
+    rising = np.unique(omega)
+    ratio = np.log(rising[1:] / rising[:-1])
+    parts = np.clip(np.ceil(ratio / largest), 1, most).astype(int)
+    pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(rising[:-1], rising[1:], parts, strict=True)]
+    fine = np.concatenate([*pieces, rising[-1:]])
+    return fine, np.searchsorted(fine, omega)
+
+
+def bisect(function: Callable[[Array], Array], low: Array, high: Array, halvings: int = _HALVINGS) -> Array:
+    """The point between ``low`` and ``high`` where ``function`` changes from not positive to positive."""
+
+    def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bracket
+        middle = (low + high) / 2
+        above = function(middle) > 0
+        return jnp.where(above, low, middle), jnp.where(above, middle, high)
+
+    low, high = jax.lax.fori_loop(0, halvings, halve, (low, high))
+    return (low + high) / 2
+
+
+def sign_changes(positive: Array, count: int) -> Array:
+    """Which interval holds the n-th change of a sign along the first axis, as a mask ``(count, K - 1, ...)``."""
+    changes = positive[1:] != positive[:-1]
+    rank = jnp.cumsum(changes, axis=0)
+    number = jnp.arange(1, count + 1).reshape(count, *(1,) * changes.ndim)
+    return changes & (rank == number)
+
+
+def take(mask: Array, values: Array, missing: float = np.nan) -> Array:
+    """The entry of ``values`` (K, ...) that each row of ``mask`` (n, K, ...) marks; ``missing`` where it marks none."""
+    picked = jnp.sum(jnp.where(mask, values, 0.0), axis=1)
+    return jnp.where(jnp.any(mask, axis=1), picked, missing)
+
+
+def follow(roots: Array) -> Array:
+    """The root at which a sweep up and a sweep down stand, ``(L, K, ...) -> (L, 2, ...)`` indices.
+
+    ``roots`` are rising along K and filled up with infinity, the frequencies rising along L. A sweep starts from rest.
+    At the next frequency the amplitude moves the way the averaged motion moves it: to the next root above if the
+    residual at the old amplitude is negative, to the next one below if it is positive.
+    """
+    size = roots.shape[1]
+
+    def move(amplitude: Array, at: Array) -> tuple[Array, Array]:
+        below = jnp.sum(at < amplitude, axis=0)
+        index = jnp.minimum(2 * (below // 2), size - 1)
+        reached = jnp.take_along_axis(at, index[None], axis=0)[0]
+        return jnp.where(jnp.isfinite(reached), reached, amplitude), index
+
+    rest = jnp.zeros_like(roots[0, 0])
+    up = jax.lax.scan(move, rest, roots)[1]
+    down = jax.lax.scan(move, rest, roots, reverse=True)[1]
+    return jnp.stack([up, down], axis=1)

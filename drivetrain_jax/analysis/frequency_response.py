@@ -1,0 +1,152 @@
+"""Frequency response of an oscillator with play: what slow sweeps of the drive's frequency, up and down, find.
+
+The frequency ``omega`` is the path: a line of frequencies is followed as a whole. A sweep starts from rest at the lowest
+(up) or highest (down) frequency and stays on its branch until this ceases to exist or to be stable; then it goes where
+the motion goes. Methods: the exact solution, harmonic balance (approximates the motion by a chosen number of
+harmonics), multiple scales (the paper's closed form for a cubic spring) and the describing function (bias and
+fundamental). Every result says what it leaves unbalanced in the equation of motion (``residual``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax.analysis import closed_form_response, exact_response, harmonic_response
+from drivetrain_jax.analysis._base import RTOL, Analysis, Request, Solver
+from drivetrain_jax.analysis.harmonic_balance import Basis
+from drivetrain_jax.analysis.motion import REGIMES, STABILITY
+from drivetrain_jax.systems import PiecewiseLinearOscillator, System
+
+PATH = "omega"
+SWEEP = ("sweep_direction",)
+BRANCH = ("branch",)
+VARIABLES = (
+    Variable("u_max", "m", "largest relative displacement", SWEEP),
+    Variable("u_min", "m", "smallest relative displacement", SWEEP),
+    Variable("u_rms", "m", "root mean square of the relative displacement, mean included", SWEEP),
+    Variable("phase", "rad", "lag of the fundamental behind the drive", SWEEP),
+    Variable("regime", "1", "flanks at which contact is made and lost", SWEEP, dtype="int8", flags=REGIMES),
+    Variable("stability", "1", "stability of the motion", SWEEP, dtype="int8", flags=STABILITY),
+    Variable("spectral_radius", "1", "spectral radius of the transition over the motion's period", SWEEP),
+    Variable("residual", "m/s2", "rms of what the motion leaves unbalanced in the equation of motion", SWEEP),
+    Variable("period_multiple", "1", "periods of the drive in one of the motion, 0: none found", SWEEP, dtype="int32"),
+    Variable("state_error", "m", "estimated error of the motion", SWEEP),
+    Variable("branch_u_max", "m", "largest relative displacement of every motion found", BRANCH),
+    Variable("branch_u_min", "m", "smallest relative displacement of every motion found", BRANCH),
+    Variable("branch_stability", "1", "stability of every motion found", BRANCH, dtype="int8", flags=STABILITY),
+    Variable("peak_amplitude", "m", "largest amplitude of the fundamental over all frequencies"),
+    Variable("peak_frequency", "rad/s", "frequency of the largest amplitude"),
+    Variable("fold_frequency", "rad/s", "frequencies at which branches end, rising", ("fold",)),
+    Variable("backbone_amplitude", "m", "amplitude of the free undamped motion of this frequency"),
+    Variable("fit_range", "m", "range R of the cubic fitted to the spring"),
+)
+OPTIONS = (
+    RTOL,
+    Parameter(
+        "most_periods", "1", "periods waited for a motion to settle", default=1000, lower=32, upper=1e6, integer=True
+    ),
+    Parameter("harmonics", "1", "harmonics of the drive's frequency", default=15, lower=1, upper=200, integer=True),
+    Parameter("subharmonic", "1", "order of the subharmonics kept", default=1, lower=1, upper=8, integer=True),
+    Parameter("samples", "1", "samples per period of the drive, 0: by the harmonics", default=0, lower=0, integer=True),
+    Parameter(
+        "fit_range", "m", "range R of the cubic fit, 0: the peak amplitude that it gives", default=0.0, lower=0.0
+    ),
+)
+METHODS = {
+    "exact": ("rtol", "most_periods"),
+    "harmonic_balance": ("harmonics", "subharmonic", "samples"),
+    "multiple_scales": ("fit_range",),
+    "describing_function": (),
+}
+# Which results are not given by every method.
+_CLOSED = ("multiple_scales", "describing_function")
+_APPROXIMATE = ("harmonic_balance", *_CLOSED)
+_ONLY = {
+    **dict.fromkeys(("period_multiple", "state_error"), ("exact",)),
+    **dict.fromkeys(("residual", "branch_u_max", "branch_u_min", "branch_stability"), _APPROXIMATE),
+    **dict.fromkeys(("peak_amplitude", "peak_frequency", "fold_frequency", "backbone_amplitude"), _CLOSED),
+    "fit_range": ("multiple_scales",),
+}
+_CHUNK = 64
+
+
+def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    """Directions, branches and folds; ``InputError`` for a result that the method does not give."""
+    del system, fixed
+    for name in request.outputs:
+        if request.method not in _ONLY.get(name, (request.method,)):
+            methods = ", ".join(_ONLY[name])
+            raise InputError(f"outputs: method {request.method} does not give {name}; allowed for it is {methods}")
+    branches = closed_form_response.BRANCHES.get(request.method, harmonic_response.BRANCHES)
+    return (
+        Dimension("sweep_direction", "direction of the sweep", ("up", "down")),
+        Dimension("branch", "number of the motion, by rising amplitude", tuple(range(1, branches + 1))),
+        Dimension("fold", "number of the fold", tuple(range(1, closed_form_response.FOLDS + 1))),
+    )
+
+
+def _shape(model: PiecewiseLinearOscillator) -> tuple[int, ...]:
+    """Shape of the batch: of all fields but the frequency."""
+    fields = (model.damping, model.stiffness, model.alpha, model.b, model.B0, model.B1)
+    return jnp.broadcast_shapes(*(jnp.shape(field) for field in fields))
+
+
+def _solve(
+    build: Callable[..., PiecewiseLinearOscillator], request: Request, values: Mapping[str, Any], effort: Array
+) -> dict[str, Array]:
+    """A line; ``effort`` only orders the batches."""
+    del effort
+    model, options = build(values), request.options
+    if request.method == "exact":
+        return _exact(model, request)
+    if request.method == "harmonic_balance":
+        basis = Basis(options["harmonics"], options["subharmonic"], options["samples"])
+        return harmonic_response.response(model, basis, _shape(model), request.outputs)
+    fit_range = options.get("fit_range", 0.0)
+    return closed_form_response.response(model, request.method, fit_range, _shape(model), request.outputs)
+
+
+def _exact(model: PiecewiseLinearOscillator, request: Request) -> dict[str, Array]:
+    """The frequencies in rising order, and back to that of the path."""
+    omega = np.asarray(model.omega)
+    rising, place = np.unique(omega, return_inverse=True)
+    found = exact_response.sweeps(
+        replace(model, omega=rising),
+        most_periods=request.options["most_periods"],
+        rtol=request.options["rtol"],
+        integrals=not exact_response.INTEGRALS.isdisjoint(request.outputs),
+    )
+    results = {name: found[name][place] for name in request.outputs}
+    return results | {"outcome": exact_response.worst(found["outcome"])[place]}
+
+
+def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+    build = system.models["frequency_response"].build
+    return (Solver(request.method, partial(_solve, build, request), _one, broadcasts=True, chunk=_CHUNK),)
+
+
+def _one(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    del columns
+    return np.ones(())
+
+
+ANALYSIS = Analysis(
+    name="frequency_response",
+    title="frequency response",
+    variables=VARIABLES,
+    default_outputs=("u_max", "u_min", "u_rms", "phase", "regime", "stability"),
+    methods=METHODS,
+    options=OPTIONS,
+    solvers=_solvers,
+    dimensions=_dimensions,
+    path_axis=lambda request: PATH,
+)

@@ -1,0 +1,29 @@
+"""What is said about a periodic motion of the oscillator with play, however it was found."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax.systems import PiecewiseLinearOscillator
+
+REGIMES = ("no_separation", "single_sided", "double_sided", "non_periodic")
+STABILITY = ("stable", "unstable", "absent")
+STABLE, UNSTABLE, ABSENT = range(3)
+
+
+def regime(model: PiecewiseLinearOscillator, high: Array, low: Array) -> Array:
+    """Number of flanks (u = b, u = -b) at which contact is made and lost between the extremes, as int8.
+
+    0 is no separation (or, without contact, motion within the play), 1 single-sided, 2 double-sided rattle.
+    """
+    drive_side = (low < model.b) & (model.b < high) & (model.b > 0)
+    back_side = (low < -model.b) & (-model.b < high) & (model.b > 0)
+    return (drive_side.astype(jnp.int8) + back_side.astype(jnp.int8)).astype(jnp.int8)
+
+
+def imbalance(model: PiecewiseLinearOscillator, motion: tuple[Array, Array, Array], drive: Array) -> Array:
+    """Root mean square over the first axis (samples of a period) of what ``(u, u', u'')`` leaves of the drive."""
+    u, rate, acceleration = motion
+    rest = acceleration + model.damping * rate + model.stiffness * model.restoring(u) - drive
+    return jnp.sqrt(jnp.mean(rest**2, axis=0))

@@ -1,0 +1,54 @@
+"""A driven oscillator whose spring has a play: linear in each of three regions, continuous where they meet.
+
+Equation: ``u'' + damping u' + stiffness f_s(u) = B0 + B1 cos(omega t)`` with
+``f_s = u - (1 - alpha) b`` for ``u > b``, ``alpha u`` for ``|u| <= b``, ``u + (1 - alpha) b`` for ``u < -b``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+
+@dataclass(frozen=True)
+class PiecewiseLinearOscillator:
+    """The equation in the module's docstring; every field is a number or an array, all of one common shape ``(...)``.
+
+    ``damping`` is c/I [1/s], ``stiffness`` k/I [1/s^2], ``alpha`` the stiffness within the play over that outside [1],
+    ``b`` half the play [m], ``B0`` and ``B1`` mean and amplitude of the drive [m/s^2], ``omega`` its frequency [rad/s].
+    """
+
+    damping: Any
+    stiffness: Any
+    alpha: Any
+    b: Any
+    B0: Any
+    B1: Any
+    omega: Any
+
+    @property
+    def period(self) -> Any:
+        """``T = 2 pi/omega`` [s]."""
+        return 2 * np.pi / self.omega
+
+    def restoring(self, u: Any) -> Array:
+        """``f_s(u)``, same units as ``u``, shape of ``u`` and the parameters broadcast."""
+        # u minus what the play takes: exact for b = 0 and continuous in floating point.
+        return u - (1 - self.alpha) * jnp.clip(u, -self.b, self.b)
+
+    def field(self, t: Any, state: Array) -> Array:
+        """``(u', u'')`` of ``state = (u, u')``, shape ``(2, ...)``.
+
+        Continuous, but its derivative jumps where :meth:`switching` changes sign: integrators must locate these.
+        """
+        u, v = state
+        drive = self.B0 + self.B1 * jnp.cos(self.omega * t)
+        return jnp.stack(jnp.broadcast_arrays(v, drive - self.damping * v - self.stiffness * self.restoring(u)))
+
+    def switching(self, state: Array) -> Array:
+        """Declared discontinuities of the derivative: distances ``(u - b, u + b)`` to the flanks, shape ``(2, ...)``."""
+        return jnp.stack(jnp.broadcast_arrays(state[0] - self.b, state[0] + self.b))

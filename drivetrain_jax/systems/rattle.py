@@ -1,0 +1,87 @@
+"""Gear rattle: two spur gears meshing with backlash, driven by a mean torque and a harmonic one.
+
+Source: M. Rezaee, A. Farshidianfar, "Solving the nonlinear equations of rattling vibration of two meshing gears with
+damping by multiple scales and averaging" (in Persian). docs/theory/rattle.md lists where the printed equations had to
+be corrected.
+
+``u = r_x theta_x - r_y theta_y`` is the relative displacement along the line of action, ``I = I_x I_y/(I_x r_y^2 +
+I_y r_x^2)`` the equivalent mass, and ``B0 + B1 cos(omega t) = M_x r_x/I_x + M_y r_y/I_y`` an acceleration:
+``u'' + (c/I) u' + (k/I) f_s(u) = B0 + B1 cos(omega t)`` with the spring of
+:class:`~drivetrain_jax.systems.PiecewiseLinearOscillator`. The paper takes u as an angle and b in radians; any
+consistent units of length will do, as the equation is homogeneous in them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from drivetrain_jax._quantities import Parameter
+from drivetrain_jax.systems._base import Model, Resonances, System, Values
+from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator
+
+PARAMETERS = (
+    Parameter("omega", "rad/s", "frequency of the drive", lower=0.0, open_lower=True),
+    Parameter("B0", "m/s2", "mean of the drive"),
+    Parameter("B1", "m/s2", "amplitude of the drive"),
+    Parameter("b", "m", "half the backlash", lower=0.0),
+    Parameter("c", "N s/m", "damping of the mesh", lower=0.0),
+    Parameter("alpha", "1", "stiffness within the backlash over that in contact", lower=0.0),
+    Parameter("k", "N/m", "stiffness in contact", lower=0.0, open_lower=True),
+    Parameter("I", "kg", "equivalent mass", lower=0.0, open_lower=True),
+    Parameter("u0", "m", "relative displacement at t = 0", default=0.0),
+    Parameter("v0", "m/s", "relative velocity at t = 0", default=0.0),
+)
+NAMES = tuple(p.name for p in PARAMETERS[:8])
+
+# Table 1 of the paper: b = 10 deg.
+PRESETS = {"table1": {"B0": 0.05, "B1": 0.03, "b": math.pi / 18, "c": 0.05, "alpha": 0.25, "k": 1.0, "I": 1.0}}
+
+
+def oscillator(values: Values) -> PiecewiseLinearOscillator:
+    """The oscillator of these parameters (scalars or arrays of one shape)."""
+    return PiecewiseLinearOscillator(
+        damping=values["c"] / values["I"],
+        stiffness=values["k"] / values["I"],
+        alpha=values["alpha"],
+        b=values["b"],
+        B0=values["B0"],
+        B1=values["B1"],
+        omega=values["omega"],
+    )
+
+
+def rattle_threshold(values: Values) -> np.ndarray:
+    """Amplitude ``B1`` at which the orbit without separation ceases to exist, shape ``(..., 1)``; NaN if there is none.
+
+    ``B1 = (B0 - alpha b k/I) sqrt((1 - r^2)^2 + (2 zeta r)^2)``, ``r = omega/sqrt(k/I)``, ``zeta = c/(2 sqrt(k I))``,
+    for a mean drive that holds the teeth in contact (either flank). Rattle can coexist with that orbit below it.
+    """
+    mean, b, c, alpha, k, mass, omega = (
+        np.asarray(values[name], float) for name in ("B0", "b", "c", "alpha", "k", "I", "omega")
+    )
+    margin = np.abs(mean) - alpha * b * k / mass
+    r, zeta = omega / np.sqrt(k / mass), c / (2 * np.sqrt(k * mass))
+    threshold = margin * np.hypot(1 - r**2, 2 * zeta * r)
+    return np.where(margin > 0, threshold, np.nan)[..., None]
+
+
+SYSTEM = System(
+    name="rattle",
+    title="gear rattle: a pair of gears with backlash",
+    source="Rezaee & Farshidianfar (in Persian); corrections in docs/theory/rattle.md",
+    parameters=PARAMETERS,
+    models={
+        "frequency_response": Model(oscillator, NAMES),
+        "steady_state": Model(oscillator, (*NAMES, "u0", "v0")),
+    },
+    presets=PRESETS,
+    resonances=Resonances(
+        "B1",
+        ("omega", "B0", "b", "c", "alpha", "k", "I"),
+        ("no separation ends",),
+        rattle_threshold,
+        "amplitude at which the orbit without separation ends",
+    ),
+)

@@ -1,0 +1,215 @@
+"""Figures of the analysis ``frequency_response``: one line by one or several methods, or maps of many lines."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import cells, rattle_maps
+from drivetrain_jax.view.layout import Margins, Panels
+from drivetrain_jax.view.style import FRAME_GREY, STYLE, axis_label
+
+PATH = "omega"
+DASHES = (0, (3, 1.6))
+_HEIGHT = 2.9
+_UNSTABLE = 1
+# A step of a sweep that is a jump: over the range of the values, and over the steps beside it.
+_JUMP, _STEEPER = 0.04, 6.0
+# Motions that meet in a fold are closer than this beside it, over the largest of all.
+_NEAR = 0.15
+
+
+@dataclass(frozen=True)
+class _Look:
+    """How the lines of one method are drawn; the exact solution lies on top, as thin lines with marks."""
+
+    label: str
+    colour: str
+    width: float
+
+
+_DIRECTIONS = {"up": ">", "down": "<"}
+_MARKS = 45
+_MARK_STYLE = {"markeredgecolor": "#111111", "markersize": 3, "fillstyle": "none", "markeredgewidth": 0.6}
+_METHODS = {
+    "multiple_scales": _Look("multiple scales", "#7b3294", 1.3),
+    "describing_function": _Look("describing function", "#2a9d5c", 1.3),
+    "harmonic_balance": _Look("harmonic balance", "#d1771e", 2.6),
+    "exact": _Look("exact", "#111111", 0.8),
+}
+
+
+def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
+    """Half the peak-to-peak displacement over the frequency, and the phase where it is stored; or maps.
+
+    Each of ``dataset`` and ``others`` (results of other methods or parameters) may have the single axis ``omega``:
+    stable motions are full lines, unstable ones dashed, jumps of a sweep dotted. One dataset with a second axis gives
+    maps of both sweeps. Raises :class:`InputError` for other axes and where nothing that is shown is stored.
+    """
+    with matplotlib.rc_context(STYLE):
+        results = [cells.prepare(each) for each in (dataset, *others)]
+        axes = [cells.sweep_axes(each) for each in results]
+        if len(results) == 1 and len(axes[0]) == 2:
+            return rattle_maps.plot(results[0], axes[0])
+        for names in axes:
+            if names != [PATH]:
+                shown = ", ".join(names) or "none"
+                raise InputError(f"axes = {shown}: allowed is {PATH}, with one more axis if it is a single result")
+        for each in results:
+            if "u_max" not in each or "u_min" not in each:
+                stored = ", ".join(str(name) for name in each.data_vars)
+                raise InputError(f"outputs = {stored}: nothing to plot; the figure needs u_max and u_min")
+        return _lines(results)
+
+
+def _lines(results: list[xr.Dataset]) -> Figure:
+    with_phase = all("phase" in each for each in results)
+    panels = Panels(1 + with_phase, height=_HEIGHT, margins=Margins(right=0.25, top=0.62), share_y=False)
+    upper = panels.axes[0][0]
+    order = list(_METHODS)
+    handles = []
+    for each in sorted(results, key=lambda r: order.index(r.attrs.get("method", "exact"))):
+        look = _METHODS[each.attrs.get("method", "exact")]
+        amplitude = (each["u_max"] - each["u_min"]) / 2
+        _draw_branches(upper, each, look)
+        jumps = {str(d): _jumps(amplitude.sel(sweep_direction=d).values) for d in amplitude["sweep_direction"].values}
+        _draw_sweeps(upper, each, amplitude, look, jumps)
+        if with_phase:
+            # Where the motion is opposite to the drive the lag is half a turn, not less than none.
+            _draw_sweeps(panels.axes[1][0], each, each["phase"] % (2 * np.pi), look, jumps)
+        handles += _entries(each, look)
+    backbone = next((r for r in results if "backbone_amplitude" in r), None)
+    upper.set_ylim(0, None)
+    if backbone is not None:
+        handles.append(_draw_backbone(upper, backbone))
+    cells.fit_axis(upper, "x", np.unique(np.concatenate([r[PATH].values for r in results])))
+    panels.label_row(upper, f"half the peak-to-peak displacement [{results[0]['u_max'].attrs.get('units', '1')}]")
+    if with_phase:
+        _angle_axis(panels.axes[1][0])
+        panels.label_row(panels.axes[1][0], "lag of the fundamental [rad]")
+    panels.label_axes(axis_label(results[0][PATH]))
+    panels.titles(results[0])
+    panels.legend([*handles, *_meanings(results)])
+    return panels.figure
+
+
+def _label(result: xr.Dataset, look: _Look) -> str:
+    """The method, with the number of harmonics or the range of the fit."""
+    options = json.loads(result.attrs.get("options", "{}"))
+    if result.attrs.get("method") == "harmonic_balance":
+        count = options.get("harmonics")
+        return f"{look.label}, {count} harmonic{'s' if count != 1 else ''}"
+    if "fit_range" in result:
+        return f"{look.label}, $R$ = {float(result['fit_range'].values.flat[0]):.3g}"
+    return look.label
+
+
+def _draw_sweeps(
+    axes: Axes, result: xr.Dataset, values: xr.DataArray, look: _Look, jumps: dict[str, np.ndarray]
+) -> None:
+    """Both sweeps: stable pieces full, unstable ones dashed, jumps dotted, the exact ones with marks."""
+    omega = result[PATH].values
+    every = max(len(omega) // _MARKS, 1)
+    for direction, mark in _DIRECTIONS.items():
+        y = values.sel(sweep_direction=direction).values
+        unstable = np.zeros(y.shape, bool)
+        if "stability" in result:
+            unstable = result["stability"].sel(sweep_direction=direction).values == _UNSTABLE
+        for kind, style in ((~unstable, "-"), (unstable, DASHES)):
+            broken = _broken(omega, np.where(_grown(kind), y, np.nan), jumps[direction])
+            axes.plot(*broken, color=look.colour, linewidth=look.width, linestyle=style, solid_capstyle="butt")
+        for i in np.flatnonzero(jumps[direction]):
+            axes.plot(omega[i : i + 2], y[i : i + 2], color=look.colour, linewidth=0.7, linestyle=":")
+        if look is _METHODS["exact"]:
+            shown = slice(every // 2 if direction == "down" else 0, None, every)
+            axes.plot(omega[shown], y[shown], mark, **_MARK_STYLE)
+
+
+def _grown(kind: np.ndarray) -> np.ndarray:
+    """``kind`` with one more point on either side, so that pieces of different kind meet."""
+    grown = kind.copy()
+    grown[:-1] |= kind[1:] & ~kind[:-1]
+    return grown
+
+
+def _jumps(y: np.ndarray) -> np.ndarray:
+    """Which steps along a sweep are jumps, shape (L - 1,)."""
+    if y.size < 4 or not np.isfinite(y).any():
+        return np.zeros(max(y.size - 1, 0), bool)
+    step = np.abs(np.diff(y))
+    padded = np.pad(np.where(np.isfinite(step), step, np.inf), 1, constant_values=np.inf)
+    beside = np.minimum(padded[:-2], padded[2:])
+    return (step > _JUMP * np.ptp(y[np.isfinite(y)])) & (step > _STEEPER * beside)
+
+
+def _broken(x: np.ndarray, y: np.ndarray, jumps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The line with a gap at every jump."""
+    places = np.flatnonzero(jumps) + 1
+    return np.insert(x.astype(float), places, np.nan), np.insert(y, places, np.nan)
+
+
+def _draw_branches(axes: Axes, result: xr.Dataset, look: _Look) -> None:
+    """Unstable motions off the sweeps, as dashed lines through the motions of one number."""
+    if not {"branch_u_max", "branch_u_min", "branch_stability"} <= set(result):
+        return
+    amplitude = ((result["branch_u_max"] - result["branch_u_min"]) / 2).transpose(PATH, "branch").values
+    unstable = result["branch_stability"].transpose(PATH, "branch").values == _UNSTABLE
+    for number in range(amplitude.shape[1]):
+        y = np.where(unstable[:, number], amplitude[:, number], np.nan)
+        x, y = _joined(result[PATH].values, y, np.where(unstable, np.nan, amplitude))
+        axes.plot(x, y, color=look.colour, linewidth=min(look.width, 1.3), linestyle=DASHES)
+
+
+def _joined(x: np.ndarray, y: np.ndarray, stable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The pieces of ``y``, each with the nearest of ``stable`` (L, n) added at both ends, where the two meet in a fold."""
+    xs: list[float] = []
+    ys: list[float] = []
+    near = _NEAR * np.nanmax(stable, initial=0.0)
+    for i in range(len(x)):
+        begins, ends = (not np.isfinite(y[k]) if 0 <= k < len(x) else False for k in (i - 1, i + 1))
+        partners = stable[i][np.abs(stable[i] - y[i]) < near]
+        if not np.isfinite(y[i]):
+            xs, ys = [*xs, np.nan], [*ys, np.nan]
+            continue
+        piece = [y[i]]
+        if partners.size:
+            nearest = partners[np.argmin(np.abs(partners - y[i]))]
+            piece = [*([nearest] if begins else []), y[i], *([nearest] if ends else [])]
+        xs, ys = [*xs, *[x[i]] * len(piece)], [*ys, *piece]
+    return np.array(xs), np.array(ys)
+
+
+def _draw_backbone(axes: Axes, result: xr.Dataset) -> Line2D:
+    """Amplitude of free motions against their frequency, within the limits of the axes."""
+    style = {"color": FRAME_GREY, "linewidth": 0.7, "linestyle": (0, (6, 2, 1, 2))}
+    axes.plot(result[PATH], result["backbone_amplitude"], **style, scaley=False)
+    return Line2D([], [], **style, label="backbone")
+
+
+def _meanings(results: list[xr.Dataset]) -> list[Line2D]:
+    """The legend entry of the dashes, if there can be any."""
+    if not any("stability" in r for r in results):
+        return []
+    return [Line2D([], [], color=FRAME_GREY, linewidth=1.2, linestyle=DASHES, label="unstable")]
+
+
+def _entries(result: xr.Dataset, look: _Look) -> list[Line2D]:
+    """Legend entries of one result; the exact sweeps have one each."""
+    style = {"color": look.colour, "linewidth": look.width}
+    if look is not _METHODS["exact"]:
+        return [Line2D([], [], **style, label=_label(result, look))]
+    marks = _DIRECTIONS.items()
+    return [Line2D([], [], **style, **_MARK_STYLE, marker=m, label=f"{look.label}, {d}") for d, m in marks]
+
+
+def _angle_axis(axes: Axes) -> None:
+    axes.set_ylim(-0.1, np.pi + 0.1)
+    axes.set_yticks([0, np.pi / 2, np.pi], ["0", r"$\pi/2$", r"$\pi$"])

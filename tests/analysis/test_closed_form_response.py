@@ -1,0 +1,219 @@
+"""Multiple scales and describing function against quadrature, published values and integration in time."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad, solve_ivp
+
+from drivetrain_jax.analysis import closed_form_response, describing_function, multiple_scales
+from drivetrain_jax.analysis.amplitude_roots import follow, refined
+from drivetrain_jax.systems.rattle import PRESETS, oscillator
+
+TABLE1 = PRESETS["table1"] | {"omega": 1.0}
+MODEL = oscillator(TABLE1)
+OMEGAS = np.array([0.3, 0.5, 0.76, 0.8, 0.84, 0.9, 1.0, 1.3])
+# Cases by lane: Table 1 first, then limits.
+CASES = (
+    {},
+    {"b": 0.0},
+    {"alpha": 1.0},
+    {"alpha": 0.0},
+    {"alpha": 2.0},
+    {"c": 0.0},
+    {"B1": 0.0},
+    {"B1": 1e-4, "B0": 0.3},
+    {"B1": -0.03},
+    {"k": 1e6, "I": 1e6, "c": 5e4},
+)
+OUTPUTS = ("u_max", "u_min", "u_rms", "phase", "stability", "spectral_radius", "residual", "branch_u_max",
+           "branch_u_min", "branch_stability", "peak_amplitude", "peak_frequency", "fold_frequency",
+           "backbone_amplitude")  # fmt: skip
+
+
+def lanes(cases) -> dict[str, np.ndarray]:
+    tables = [TABLE1 | case for case in cases]
+    return {name: np.array([table[name] for table in tables]) for name in TABLE1}
+
+
+def solve(method: str, omegas=OMEGAS, cases=CASES, fit_range: float = 0.0) -> dict[str, np.ndarray]:
+    def run(values):
+        model = oscillator(values | {"omega": omegas})
+        return closed_form_response.response(model, method, fit_range, (len(cases),), OUTPUTS)
+
+    return {name: np.asarray(value) for name, value in jax.jit(run)(lanes(cases)).items()}
+
+
+@pytest.fixture(scope="module")
+def scales():
+    return solve("multiple_scales")
+
+
+@pytest.fixture(scope="module")
+def describing():
+    return solve("describing_function")
+
+
+def linear(values, omega):
+    stiffness, damping = values["k"] / values["I"], values["c"] / values["I"]
+    return abs(values["B1"]) / np.hypot(stiffness - omega**2, damping * omega)
+
+
+def test_cubic_is_the_least_squares_fit():
+    model, reach = MODEL, 0.9
+    fit = multiple_scales.cubic_fit(model, jnp.array(reach))
+    powers = np.array([[2 * reach ** (i + j + 1) / (i + j + 1) for j in (1, 3)] for i in (1, 3)])
+    moments = [
+        2 * quad(lambda u, i=i: float(model.restoring(u)) * u**i, 0, reach, points=[model.b], epsabs=1e-13)[0]
+        for i in (1, 3)
+    ]
+    np.testing.assert_allclose([fit.stiffness, fit.cubic], np.linalg.solve(powers, moments), rtol=1e-10)
+
+
+def test_multiple_scales_of_table_1():
+    fit = multiple_scales.cubic_fit(MODEL, jnp.array(1.0))
+    flow = multiple_scales.slow_flow(MODEL, fit)
+    np.testing.assert_allclose([fit.stiffness, fit.cubic], [0.6441, 0.2692], atol=5e-5)
+    np.testing.assert_allclose(multiple_scales.peak(flow), [0.748, 0.8729], atol=5e-4)
+    np.testing.assert_allclose(multiple_scales.folds(flow)[1], [0.861, 0.8752], atol=3e-4)
+
+
+def test_self_consistent_range_is_the_peak_it_gives(scales):
+    reach = multiple_scales.self_consistent_range(MODEL, ())
+    peak = multiple_scales.peak(multiple_scales.slow_flow(MODEL, multiple_scales.cubic_fit(MODEL, reach)))
+    assert reach == pytest.approx(0.80, abs=2e-3)
+    assert peak[0] == pytest.approx(float(reach), rel=1e-12)
+    assert scales["peak_amplitude"][0, 0] == pytest.approx(float(reach), rel=1e-12)
+
+
+def settled(epsilon: float, sigma: float, start: float) -> float:
+    """Amplitude that the cubic system settles to, from ``start`` in the phase of the averaged motion."""
+    mu, drive = 0.2, 0.5
+
+    def rate(t, y):
+        u, v = y
+        return v, epsilon * (drive * math.cos((1 + epsilon * sigma) * t) - 2 * mu * v - u**3) - u
+
+    span = 12 / (epsilon * mu)
+    late = np.linspace(span - 40, span, 4000)
+    lag = math.asin(min(2 * mu * start / drive, 1.0))
+    lag = lag if sigma < 3 * start**2 / 8 else math.pi - lag
+    first = (start * math.cos(lag), start * math.sin(lag))
+    u = solve_ivp(rate, (0, span), first, "DOP853", late, rtol=1e-9, atol=1e-9).y[0]
+    return (u.max() - u.min()) / 2
+
+
+def test_averaged_amplitudes_are_met_by_the_cubic_system_to_first_order():
+    """Independent of the averaging: errors halve with epsilon, and the middle amplitude divides the others."""
+    sigma, errors = 0.55, []
+    flow = multiple_scales.SlowFlow(jnp.array(0.0), jnp.array(0.2), jnp.array(0.25), jnp.array(0.375))
+    low, middle, high = (float(a) for a in multiple_scales.roots(flow, jnp.array(sigma)))
+    for epsilon in (0.04, 0.02):
+        found = settled(epsilon, sigma, 0.85 * middle), settled(epsilon, sigma, 1.15 * middle)
+        errors.append([found[0] - low, found[1] - high])
+    first, second = np.abs(errors)
+    assert (second < 0.02).all()
+    np.testing.assert_allclose(first / second, 2.0, rtol=0.35)
+
+
+def test_describing_function_against_quadrature():
+    amplitude, bias = 0.4, 0.07
+    point = describing_function.point_at(MODEL, jnp.array(amplitude), jnp.array(bias))
+    angle = 2 * np.pi * (np.arange(200_000) + 0.5) / 200_000
+    force = np.asarray(MODEL.restoring(bias + amplitude * np.cos(angle)))
+    assert float(point.stiffness) == pytest.approx(2 * np.mean(force * np.cos(angle)) / amplitude, rel=1e-8)
+    mean = describing_function._imbalance(MODEL, jnp.array(amplitude), jnp.array(bias))[0] + MODEL.B0 / MODEL.stiffness
+    assert float(mean) == pytest.approx(force.mean(), rel=1e-8)
+    a = 0.4
+    step = 1e-5
+    exact = [
+        describing_function.point_at(MODEL, jnp.array(x), describing_function.bias_of(MODEL, jnp.array(x)))
+        for x in (a - step, a, a + step)
+    ]
+    assert float(exact[1].slope) == pytest.approx(float(exact[2].stiffness - exact[0].stiffness) / (2 * step), rel=1e-6)
+
+
+def test_describing_function_of_table_1(describing):
+    assert 2 * describing["peak_amplitude"][0, 0] == pytest.approx(1.37595, abs=5e-6)
+    assert describing["peak_frequency"][0, 0] == pytest.approx(0.871767, abs=5e-7)
+    np.testing.assert_allclose(describing["fold_frequency"][0, :2, 0], [0.7511, 0.8745], atol=5e-5)
+    assert np.isnan(describing["fold_frequency"][0, 2:, 0]).all()
+
+
+@pytest.mark.parametrize("method", ["multiple_scales", "describing_function"])
+def test_up_and_down_differ_between_the_folds_only(method, request):
+    result = request.getfixturevalue("scales" if method == "multiple_scales" else "describing")
+    folds = result["fold_frequency"][0, :2, 0]
+    between = (folds[0] < OMEGAS) & (folds[1] > OMEGAS)
+    differ = result["u_max"][:, 0, 0] != result["u_max"][:, 1, 0]
+    np.testing.assert_array_equal(differ, between)
+    assert (result["u_max"][between, 0, 0] > result["u_max"][between, 1, 0]).all()
+    assert (result["stability"][..., 0] == 0).all()
+    assert (result["spectral_radius"][..., 0] < 1).all()
+    branches = np.isfinite(result["branch_u_max"][..., 0]).sum(axis=1)
+    np.testing.assert_array_equal(branches, np.where(between, 3, 1))
+    np.testing.assert_array_equal(result["branch_stability"][between][:, :3, 0], [[0, 1, 0]] * between.sum())
+
+
+def test_linear_limits_are_exact(scales, describing):
+    for lane in (1, 2):
+        values = TABLE1 | CASES[lane]
+        for result in (scales, describing):
+            amplitude = (result["u_max"] - result["u_min"])[..., lane] / 2
+            if result is describing:
+                expected = linear(values, OMEGAS)
+                np.testing.assert_allclose(result["residual"][..., lane], 0, atol=1e-12)
+            else:
+                # The averaged response of a linear spring: detuning to first order.
+                expected = abs(values["B1"]) / 2 / np.hypot(OMEGAS - 1, values["c"] / 2)
+            np.testing.assert_allclose(amplitude, np.stack([expected] * 2, axis=1), rtol=1e-12)
+    values = TABLE1 | CASES[7]
+    amplitude = (describing["u_max"] - describing["u_min"])[..., 7] / 2
+    np.testing.assert_allclose(amplitude[:, 0], linear(values, OMEGAS), rtol=1e-12)
+
+
+def test_limits_without_drive_damping_or_stiffness(scales, describing):
+    for result in (scales, describing):
+        assert (result["u_max"][..., 6] == result["u_min"][..., 6]).all()
+        assert np.isfinite(result["u_max"][..., 3]).all()
+        np.testing.assert_allclose(result["u_max"][..., 9], result["u_max"][..., 0], rtol=1e-10)
+        np.testing.assert_array_equal(result["u_max"][..., 8], result["u_max"][..., 0])
+        opposite = np.abs(np.abs(result["phase"][..., 8] - result["phase"][..., 0]) - np.pi)
+        np.testing.assert_allclose(opposite, 0, atol=1e-12)
+    # Without damping: the linear resonance has no steady amplitude; elsewhere the multipliers have modulus one.
+    assert np.isnan(scales["u_max"][6, :, 5]).all()
+    assert scales["outcome"][6, 5] == 2
+    assert (scales["outcome"][[0, 1, 5, 7]][:, 5] == 0).all()
+    np.testing.assert_allclose(describing["spectral_radius"][[0, 1, 7]][..., 5], 1, rtol=1e-12)
+    assert np.isnan(describing["fold_frequency"][0, 1:, 5]).all()
+
+
+def test_softening_bends_down(describing):
+    assert describing["peak_frequency"][0, 4] < math.sqrt(2.0) - 0.02
+
+
+def test_a_line_without_lanes_equals_the_batch(describing):
+    model = oscillator(TABLE1 | {"omega": OMEGAS})
+    alone = closed_form_response.response(model, "describing_function", 0.0, (), ("u_max", "fold_frequency"))
+    np.testing.assert_allclose(alone["u_max"], describing["u_max"][..., 0], rtol=1e-12)
+    assert alone["fold_frequency"].shape == (len(OMEGAS), closed_form_response.FOLDS)
+
+
+def test_sweeps_follow_their_branch():
+    inf = np.inf
+    roots = np.array([[0.9, inf, inf], [1.0, 2.0, 3.0], [1.1, 1.5, 4.0], [5.0, inf, inf], [5.1, inf, inf]])
+    index = np.asarray(follow(jnp.asarray(roots)))
+    reached = np.take_along_axis(roots, index, axis=1)
+    np.testing.assert_array_equal(reached[:, 0], [0.9, 1.0, 1.1, 5.0, 5.1])
+    np.testing.assert_array_equal(reached[:, 1], [0.9, 3.0, 4.0, 5.0, 5.1])
+
+
+def test_refined_contains_the_values():
+    omega = np.array([1.0, 0.5, 0.6])
+    fine, places = refined(omega, 0.05, 4)
+    np.testing.assert_array_equal(fine[places], omega)
+    assert len(fine) == 9

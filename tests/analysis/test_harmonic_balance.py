@@ -1,0 +1,178 @@
+"""Harmonic balance against automatic differentiation, the describing function and the reference motions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivetrain_jax.analysis import harmonic_balance as hb
+from drivetrain_jax.analysis import harmonic_response
+from drivetrain_jax.analysis.closed_form_response import response as closed_form
+from drivetrain_jax.analysis.harmonic_branch import trace
+from drivetrain_jax.analysis.harmonic_stability import half_trace, spectral_radius
+from drivetrain_jax.systems import PiecewiseLinearOscillator
+from drivetrain_jax.systems.rattle import PRESETS, oscillator
+
+TABLE1 = PRESETS["table1"]
+REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "rattle.json").read_text())
+STEADY = {case["name"]: case for case in REFERENCE["steady"]}
+OMEGAS = np.array([0.35, 0.44, 0.6, 0.7, 0.76, 0.8, 0.84, 0.87, 0.9, 1.0])
+OUTPUTS = ("u_max", "u_min", "u_rms", "phase", "stability", "spectral_radius", "residual", "regime",
+           "branch_u_max", "branch_u_min", "branch_stability")  # fmt: skip
+# Table 1, then b = 0, alpha = 1, alpha = 0, alpha > 1, no drive, no separation.
+CASES = ({}, {"b": 0.0}, {"alpha": 1.0}, {"alpha": 0.0}, {"alpha": 1.5}, {"B1": 0.0}, {"B1": 1e-4, "B0": 0.3})
+
+
+def lanes(cases) -> dict[str, np.ndarray]:
+    tables = [TABLE1 | case for case in cases]
+    return {name: np.array([table[name] for table in tables]) for name in TABLE1}
+
+
+def model_of(cases, omega) -> PiecewiseLinearOscillator:
+    return oscillator(lanes(cases) | {"omega": omega})
+
+
+@pytest.fixture(scope="module")
+def swept():
+    def run(values):
+        return harmonic_response.response(oscillator(values | {"omega": OMEGAS}), hb.Basis(7), (len(CASES),), OUTPUTS)
+
+    return {name: np.asarray(value) for name, value in jax.jit(run)(lanes(CASES)).items()}
+
+
+def linear(values, omega):
+    stiffness, damping = values["k"] / values["I"], values["c"] / values["I"]
+    return values["B1"] / np.hypot(stiffness - omega**2, damping * omega)
+
+
+def test_jacobian_is_the_derivative_up_to_the_quadrature():
+    """Weights move with the crossings; that term vanishes with the fourth power of the sample distance."""
+    model, omega, errors = model_of(({},), 0.8), jnp.array([0.8]), []
+    x = jnp.asarray(np.random.default_rng(1).normal(size=(17, 1)) * 0.2)
+    for samples in (256, 1024):
+        basis = hb.Basis(4, 2, samples)
+
+        def force(x, basis=basis):
+            return hb.residual(model, basis, x, omega, hb.contact(model, basis, x))[0]
+
+        ours = hb.jacobian(model, basis, omega, hb.contact(model, basis, x))[..., 0]
+        errors.append(float(jnp.abs(ours - jax.jacfwd(force)(x)[:, 0, :, 0]).max()))
+    assert errors[1] < 1e-6
+    assert errors[1] < errors[0] / 50
+
+
+def test_error_falls_with_the_harmonics():
+    case, errors = STEADY["T1 w.7 double-sided"], []
+    model = model_of(({},), 0.7)
+    for harmonics in (1, 3, 7, 15, 31):
+        basis = hb.Basis(harmonics)
+        start = jnp.zeros((basis.size, 1)).at[0].set(0.06).at[1].set(0.3)
+        found = jax.jit(lambda x, basis=basis: hb.balance(model, basis, x, jnp.array([0.7])))(start)
+        assert bool(found.converged[0])
+        fine = hb.Basis(harmonics, 1, 20_000).values @ np.asarray(found.x[:, 0])
+        errors.append(abs(fine.max() - case["max"]))
+    # The note gives 2e-2, 2e-3, 1e-4, 1e-6, 8e-8.
+    assert (np.array(errors) < [2.5e-2, 2.2e-3, 1.2e-4, 1.3e-6, 8.5e-8]).all()
+    assert (np.diff(errors) < 0).all()
+
+
+def test_stability_is_that_of_the_exact_motion():
+    """Multipliers, 31 harmonics, of the attractor; and of a motion that has lost its stability to a doubled period."""
+    model, basis = model_of(({},), 0.7), hb.Basis(31)
+    case = STEADY["T1 w.7 double-sided"]
+    omega = jnp.array([0.7])
+    start = jnp.zeros((basis.size, 1)).at[0].set(0.06).at[1].set(0.3)
+    x = hb.balance(model, basis, start, omega).x
+    half = half_trace(model, basis, omega, hb.contact(model, basis, x))
+    assert float(spectral_radius(model, basis, omega, half)[0]) == pytest.approx(max(case["floquet_abs"]), rel=1e-6)
+
+
+def test_sweeps_of_table_1(swept):
+    for name, row, direction in (
+        ("T1 w.7 double-sided", 3, 0), ("T1 w.8 high", 5, 0), ("T1 w.8 low", 5, 1),
+        ("T1 w1.0", 9, 0), ("T1 w.6 single-sided", 2, 1),
+    ):  # fmt: skip
+        case = STEADY[name]
+        ours = [swept[key][row, direction, 0] for key in ("u_max", "u_min", "u_rms", "phase")]
+        np.testing.assert_allclose(ours, [case[k] for k in ("max", "min", "rms", "phase_lag_rad")], atol=4e-4)
+        assert swept["stability"][row, direction, 0] == 0
+    between = (OMEGAS > 0.7539) & (OMEGAS < 0.8743)
+    np.testing.assert_array_equal(swept["u_max"][:, 0, 0] - swept["u_max"][:, 1, 0] > 1e-9, between)
+    # The period doubles at 0.44, which a basis without subharmonics can report but not follow.
+    assert swept["stability"][1, 0, 0] == 1
+    assert (swept["outcome"][:, 0] == 0).all()
+    # Every sweep is balanced; the branch of alpha = 0 may be too long to be followed to its end, and says so.
+    assert (swept["outcome"] <= 1).all()
+
+
+def test_branch_passes_the_folds(swept):
+    """The sweeps lie on the continued branch, whose middle motions are unstable."""
+    between = (OMEGAS > 0.7539) & (OMEGAS < 0.8743)
+    count = np.isfinite(swept["branch_u_max"][..., 0]).sum(axis=1)
+    np.testing.assert_array_equal(count, np.where(between, 3, 1))
+    np.testing.assert_array_equal(swept["branch_stability"][between, :4, 0], [[0, 1, 0, 2]] * between.sum())
+    branch = swept["branch_u_max"][between, :, 0]
+    np.testing.assert_allclose(branch[:, [2, 0]], swept["u_max"][between, :, 0], rtol=1e-9)
+
+
+def test_folds_of_the_branch():
+    model, basis = model_of(({},), 0.7), hb.Basis(15)
+    start = jnp.zeros((basis.size, 1)).at[0].set(0.06).at[1].set(0.3)
+
+    @jax.jit
+    def follow(x):
+        begun = hb.balance(model, basis, x, jnp.array([0.7])).x
+        return trace(model, basis, begun, 0.7, 1.0, jnp.array([0.2]))
+
+    branch = follow(start)
+    omega = np.asarray(branch.omega[:, 0])
+    omega = omega[np.isfinite(omega)]
+    turns = np.flatnonzero(np.diff(np.sign(np.diff(omega)))) + 1
+    folds = [np.polynomial.Polynomial.fit([-1, 0, 1], omega[i - 1 : i + 2], 2) for i in turns]
+    found = [float(p(p.deriv().roots()[0])) for p in folds]
+    exact = [s["omega"] for s in REFERENCE["specials"]["table1"] if s["type"] == "fold"][:2]
+    np.testing.assert_allclose(sorted(found), sorted(exact), atol=2e-4)
+    assert bool(branch.complete[0])
+
+
+def test_linear_limits_are_exact(swept):
+    for lane in (1, 2, 6):
+        values = TABLE1 | CASES[lane]
+        amplitude = (swept["u_max"] - swept["u_min"])[..., lane] / 2
+        np.testing.assert_allclose(amplitude, np.stack([linear(values, OMEGAS)] * 2, axis=1), rtol=1e-10)
+        np.testing.assert_allclose(swept["residual"][..., lane], 0, atol=1e-12)
+    np.testing.assert_allclose(swept["u_max"][..., 5], swept["u_min"][..., 5], rtol=1e-12)
+
+
+def test_one_harmonic_is_the_describing_function():
+    """Each balanced motion is one of the closed form; with alpha = 0 several are stable, and rest leads elsewhere."""
+    cases = ({}, {"alpha": 0.0}, {"alpha": 1.5})
+
+    def run(values):
+        model = oscillator(values | {"omega": np.array([0.6, 0.7])})
+        ours = harmonic_response.response(model, hb.Basis(1, 1, 4096), (3,), ("u_max", "u_min"))
+        return ours, closed_form(model, "describing_function", 0.0, (3,), ("branch_u_max", "branch_u_min"))
+
+    ours, closed = jax.jit(run)(lanes(cases))
+    for name in ("u_max", "u_min"):
+        distance = np.abs(np.asarray(closed[f"branch_{name}"]) - np.asarray(ours[name])[:, :1])
+        assert np.nanmin(distance, axis=1).max() < 2e-9
+
+
+def test_subharmonics_follow_a_doubled_period():
+    case = STEADY["T1 P2 w.45"]
+
+    def run(values):
+        model = oscillator(values | {"omega": np.array([0.44, 0.45])})
+        return harmonic_response.response(model, hb.Basis(7, 2), (1,), ("u_max", "u_min", "stability"))
+
+    found = jax.jit(run)(lanes(({},)))
+    np.testing.assert_allclose(
+        [found["u_max"][1, 0, 0], found["u_min"][1, 0, 0]], [case["max"], case["min"]], atol=1e-3
+    )
+    assert (np.asarray(found["stability"]) == 0).all()

@@ -1,0 +1,109 @@
+"""Figures of frequency response: what is drawn full, dashed and dotted, and what is refused."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import frequency_response, plot
+
+OMEGA = np.linspace(0.5, 1.5, 41)
+
+
+def variable(dims, values, units="m", **attrs):
+    return dims, np.asarray(values), {"units": units, "long_name": "displacement", **attrs}
+
+
+def line(method: str = "multiple_scales", branches: bool = True) -> xr.Dataset:
+    """A hardening line: the sweep up jumps down at 1.2, the sweep down jumps up at 0.8, a saddle in between."""
+    up = np.where(OMEGA < 1.2, OMEGA, 0.2)
+    down = np.where(OMEGA < 0.8, OMEGA, 0.2)
+    both = np.stack([up, down], axis=1)
+    dims = ("omega", "sweep_direction")
+    data = {
+        "u_max": variable(dims, both),
+        "u_min": variable(dims, -both),
+        "phase": variable(dims, both, "rad"),
+        "stability": variable(dims, np.zeros(both.shape, "int8"), "1"),
+        "outcome": variable(("omega",), np.zeros(len(OMEGA), "int8"), "1"),
+    }
+    if branches:
+        between = (OMEGA >= 0.8) & (OMEGA < 1.2)
+        saddle = np.where(between, 0.25 + 2.25 * (OMEGA - 0.8), np.nan)
+        number = np.stack([np.where(between, 0.2, up), saddle, np.where(between, up, np.nan)], axis=1)
+        stability = np.stack([0 * OMEGA, np.where(between, 1, 2), np.where(between, 0, 2)], axis=1).astype("int8")
+        own = ("omega", "branch")
+        data |= {
+            "branch_u_max": variable(own, number),
+            "branch_u_min": variable(own, -number),
+            "branch_stability": variable(own, stability, "1"),
+        }
+    attrs = {"analysis": "frequency_response", "title": "A line", "method": method}
+    attrs |= {"fixed_parameters": "{}", "options": json.dumps({"harmonics": 7})}
+    dataset = xr.Dataset(data, attrs=attrs).assign_coords(sweep_direction=["up", "down"])
+    return dataset.assign_coords(omega=("omega", OMEGA, {"units": "rad/s", "long_name": "frequency of the drive"}))
+
+
+def lines_of(axes, style: str) -> list:
+    kinds = {"-": "-", ":": ":"}
+    if style in kinds:
+        return [item for item in axes.lines if item.get_linestyle() == kinds[style]]
+    return [item for item in axes.lines if item.get_linestyle() == "--"]
+
+
+def test_jumps_are_dotted_and_not_bridged():
+    axes = plot(line()).axes[0]
+    dotted = lines_of(axes, ":")
+    steps = sorted((float(np.mean(item.get_xdata())), float(np.ptp(item.get_ydata()))) for item in dotted)
+    assert [round(x, 1) for x, _ in steps] == [0.8, 1.2]
+    assert all(height > 0.5 for _, height in steps)
+    for item in lines_of(axes, "-"):
+        y = item.get_ydata()
+        assert np.nanmax(np.abs(np.diff(y)), initial=0.0) < 0.1
+
+
+def test_saddles_are_dashed_and_reach_the_branches_they_meet():
+    dashed = [item for item in lines_of(plot(line()).axes[0], "--") if np.isfinite(item.get_ydata()).any()]
+    (saddle,) = dashed
+    y = saddle.get_ydata()[np.isfinite(saddle.get_ydata())]
+    # One more point at either end, on the branch that the saddles meet there.
+    assert len(y) == ((OMEGA >= 0.8) & (OMEGA < 1.2)).sum() + 2
+    assert y[0] == pytest.approx(0.2)
+    assert y[-1] == pytest.approx(OMEGA[OMEGA < 1.2][-1])
+
+
+def test_several_methods_share_the_axes():
+    exact = line("exact", branches=False)
+    figure = plot(line(), line("describing_function"), line("harmonic_balance"), exact)
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "harmonic balance, 7 harmonics" in texts
+    assert {"multiple scales", "describing function", "exact, up", "exact, down", "unstable"} <= set(texts)
+    assert len({item.get_color() for item in figure.axes[0].lines}) >= 4
+
+
+def test_map_of_two_axes():
+    single = line(branches=False)
+    pair = xr.concat([single, single], dim="B1", data_vars="all").assign_coords(
+        B1=("B1", [0.1, 0.2], {"units": "m/s2", "long_name": "amplitude of the drive"})
+    )
+    pair["outcome"] = (("B1", "omega"), np.zeros((2, len(OMEGA)), "int8"))
+    flags = {"flag_meanings": "no_separation single_sided double_sided non_periodic"}
+    pair["regime"] = xr.zeros_like(pair["u_max"], dtype="int8").assign_attrs(flags)
+    figure = plot(pair)
+    assert [axes.get_title() for axes in figure.axes[:2]] == ["sweep up", "sweep down"]
+    assert "no separation" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_what_cannot_be_drawn_is_refused():
+    with pytest.raises(InputError, match="needs u_max and u_min"):
+        plot(line().drop_vars("u_min"))
+    with pytest.raises(InputError, match="allowed is omega"):
+        frequency_response.plot(line().rename(omega="beta"))
+    with pytest.raises(InputError, match="several results"):
+        plot(xr.Dataset(attrs={"analysis": "floquet"}), line())
+    with pytest.raises(InputError, match="beside the first result"):
+        plot(line(), xr.Dataset(attrs={"analysis": "floquet"}))
