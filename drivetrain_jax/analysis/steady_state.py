@@ -1,0 +1,116 @@
+"""Steady state of an oscillator with play: the attractor that the motion from given initial conditions ends on.
+
+The motion is exact within rounding (closed form in each linear region), and so are its extremes, multipliers and
+contacts. An orbit found by Newton shooting counts only if the motion has come so near to it that its linearisation
+governs the rest (:mod:`~drivetrain_jax.analysis.attractor`).
+
+Outcome: ``NOT_CONVERGED`` if the motion has neither settled within ``most_periods`` drive periods nor separated from its
+neighbours by a factor of exp(20) over their last three quarters, as only chaos does; ``TOLERANCE_NOT_MET`` if the
+estimated error of the orbit exceeds ``rtol`` times its largest displacement; ``STEP_LIMIT`` if the motion needs more
+events per period than any but a grazing one does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.attractor import attractors
+from drivetrain_jax.analysis.exact_response import INTEGRALS, WIDTH, describe
+from drivetrain_jax.analysis.motion import REGIMES
+from drivetrain_jax.analysis.orbit_history import history
+from drivetrain_jax.systems import PiecewiseLinearOscillator, System
+
+SAMPLES = 512
+DIMENSIONS = (
+    Dimension("state", "component of the state", ("u", "v")),
+    Dimension("flank", "flank of the tooth", ("drive", "back")),
+    Dimension("multiplier", "number of the multiplier, by falling modulus", (1, 2)),
+    Dimension("sample", "part of the motion's period", tuple(k / SAMPLES for k in range(SAMPLES))),
+)
+HISTORIES = frozenset(("u_history", "v_history"))
+_WHOLE = "over the period of the orbit (non-periodic: over 32 drive periods)"
+VARIABLES = (
+    Variable("u_max", "m", "largest relative displacement"),
+    Variable("u_min", "m", "smallest relative displacement"),
+    Variable("u_mean", "m", "mean relative displacement"),
+    Variable("u_rms", "m", "root mean square of the relative displacement, mean included"),
+    Variable("phase", "rad", "lag of the fundamental behind the drive"),
+    Variable("period_multiple", "1", "period multiple (0: non-periodic)", dtype="int32"),
+    Variable("spectral_radius", "1", "spectral radius of the transition over the motion's period"),
+    Variable("floquet_multiplier", "1", "multipliers of the motion over its period", ("multiplier",), "complex128"),
+    Variable("lyapunov_exponent", "1/s", "largest Lyapunov exponent"),
+    Variable("regime", "1", "flanks at which contact is made and lost", dtype="int8", flags=REGIMES),
+    Variable("impacts", "1", f"number of times that a flank is reached {_WHOLE}", ("flank",)),
+    Variable("impact_velocity", "m/s", "largest velocity at which a flank is reached", ("flank",)),
+    Variable("contact_fraction", "1", "part of the time in contact", ("flank",)),
+    Variable("orbit_state", "m, m/s", "state at the start of a drive period", ("state",)),
+    Variable("state_error", "m", "estimated absolute error of the orbit's displacement"),
+    Variable("u_history", "m", "relative displacement", ("sample",)),
+    Variable("v_history", "m/s", "relative velocity", ("sample",)),
+    Variable("periods_settled", "1", "drive periods until the attractor was recognised", dtype="int32"),
+)
+WAIT = Parameter(
+    "most_periods", "1", "drive periods after which a motion is given up", default=4000, lower=64, integer=True
+)
+# Points of a chunk: enough that the last lanes at work, with nothing left in the queue, are few.
+_CHUNK = 4096
+
+
+def _shape(model: PiecewiseLinearOscillator, values: Mapping[str, Any]) -> tuple[int, ...]:
+    shapes = (jnp.shape(x) for x in (*vars(model).values(), values["u0"], values["v0"]))
+    return jnp.broadcast_shapes(*shapes)
+
+
+def _solve(
+    build: Callable[..., PiecewiseLinearOscillator], request: Request, values: Mapping[str, Any], effort: Array
+) -> dict[str, Array]:
+    """The requested results of a batch of points, the batch as last axis; ``effort`` decides nothing."""
+    del effort
+    model = build(values)
+    shape = _shape(model, values)
+    count = int(np.prod(shape, dtype=int))
+    u0, v0 = (jnp.broadcast_to(jnp.asarray(values[name], float), (count,)) for name in ("u0", "v0"))
+    route = jnp.arange(count, dtype=jnp.int32)[:, None]
+    found = attractors(model, route, u0, v0, most_periods=request.options["most_periods"], width=WIDTH)
+    flat = jax.tree.map(lambda x: x[:, 0], found)
+    integrals = not INTEGRALS.isdisjoint(request.outputs)
+    results = describe(model, flat, rtol=request.options["rtol"], integrals=integrals)
+    if not HISTORIES.isdisjoint(request.outputs):
+        known = results["outcome"] < Outcome.NOT_CONVERGED
+        sampled = history(model, flat.u, flat.v, results["period_multiple"], SAMPLES)
+        results |= {
+            name: jnp.where(known, x, jnp.nan) for name, x in zip(("u_history", "v_history"), sampled, strict=True)
+        }
+    wanted = {name: results[name] for name in (*request.outputs, "outcome")}
+    return {name: x.reshape(*x.shape[:-1], *shape) for name, x in wanted.items()}
+
+
+def _effort(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Long periods hold many events: neighbours in 1/omega take about as long."""
+    return np.ceil(100 / np.asarray(columns.get("omega", 1.0), float))
+
+
+def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+    build = system.models["steady_state"].build
+    return (Solver("exact", partial(_solve, build, request), _effort, broadcasts=True, chunk=_CHUNK),)
+
+
+ANALYSIS = Analysis(
+    name="steady_state",
+    title="steady state",
+    variables=VARIABLES,
+    default_outputs=("u_max", "u_min", "u_rms", "period_multiple", "spectral_radius", "regime", "impacts"),
+    methods={"exact": ("rtol", "most_periods")},
+    options=(RTOL, WAIT),
+    solvers=_solvers,
+    dimensions=lambda *_: DIMENSIONS,
+)

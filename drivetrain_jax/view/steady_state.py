@@ -1,0 +1,245 @@
+"""Figures of the analysis ``steady_state``: regimes and amplitudes over parameters, basins, and a single motion."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import textwrap
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap, PowerNorm
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import cells
+from drivetrain_jax.view.layout import WIDTH, Margins, Panels
+from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, PREDICTION, STYLE, axis_label, variable_label
+
+# Lightness falls from no separation to double-sided rattle; what is not periodic and what failed stand apart in hue.
+_COLOURS = ("#ffffff", "#9cc3e0", "#33517c", "#f2b632", "#d1495b")
+_NAMES = ("no separation", "single-sided", "double-sided", "non-periodic", "failed")
+_FAILED = 4
+_HEIGHT, _PORTRAIT = 2.45, 3.1
+# Of the line with the parameters, marks of formulas counted.
+_LETTERS = 110
+# Attractors of a basin map: lightness differs as well as hue. Amplitudes closer than this, relatively, are one.
+_BASINS = ("#33517c", "#f2b632", "#9cc3e0", "#c8553d", "#6a994e", "#d9c5e0", "#2d0a2b", "#8d99ae")
+_SAME = 1e-5
+
+
+def plot(dataset: xr.Dataset) -> Figure:
+    """The figure of a ``steady_state`` result; what it shows depends on the axes.
+
+    - none: time history and phase portrait of the motion (needs ``u_history`` and ``v_history``);
+    - one: extremes, period multiple and growth along it;
+    - ``u0`` and ``v0``: basins of the attractors with the share of each;
+    - any other two: the regime and the largest displacement, with the threshold of rattle where it is predicted.
+
+    Axes of a single value count as fixed. Raises :class:`InputError` for other axes and where variables are missing.
+    """
+    with matplotlib.rc_context(STYLE):
+        dataset = cells.prepare(dataset)
+        names = cells.sweep_axes(dataset)
+        if not names:
+            return _motion(dataset)
+        if len(names) == 1 and names != ["point"]:
+            return _curves(dataset, names[0])
+        if set(names) == {"u0", "v0"}:
+            return _basins(dataset)
+        if len(names) == 2:
+            return _maps(dataset, names)
+        raise InputError(f"axes = {', '.join(names)}: allowed are at most two axes for a figure of steady states")
+
+
+def _titles(panels: Panels, dataset: xr.Dataset) -> None:
+    """Title and parameters, these in two lines where one would not hold them."""
+    panels.titles(dataset)
+    line = panels.figure.texts[-1]
+    # A parameter stays with its value.
+    kept = re.sub(r"(?<!,) ", "\u00a0", line.get_text())
+    line.set_text(textwrap.fill(kept, _LETTERS, break_long_words=False))
+
+
+def _need(dataset: xr.Dataset, wanted: tuple[str, ...]) -> None:
+    if missing := [name for name in wanted if name not in dataset]:
+        raise InputError(f"outputs: {', '.join(missing)} missing; the figure needs {', '.join(wanted)}")
+
+
+def _regimes(dataset: xr.Dataset) -> xr.DataArray:
+    return dataset["regime"].where(dataset["outcome"] < cells.FIRST_FAILURE, _FAILED)
+
+
+def _regime_legend(codes: xr.DataArray) -> list[Artist]:
+    counts = np.bincount(codes.values.astype(int).ravel(), minlength=len(_NAMES))
+    return [
+        Patch(facecolor=_COLOURS[k], edgecolor=FRAME_GREY, linewidth=0.6, label=_NAMES[k])
+        for k in range(len(_NAMES))
+        if counts[k] or k < _FAILED - 1
+    ]
+
+
+def _maps(dataset: xr.Dataset, names: list[str]) -> Figure:
+    horizontal = next((name for name in names if name == "omega"), names[-1])
+    vertical = next(name for name in names if name != horizontal)
+    shown = [name for name in ("regime", "u_max") if name in dataset]
+    if not shown:
+        _need(dataset, ("regime",))
+    panels = Panels(len(shown), height=_HEIGHT, margins=Margins(right=1.15))
+    handles: list[Artist] = []
+    for (axes,), name in zip(panels.axes, shown, strict=True):
+        if name == "regime":
+            codes = _regimes(dataset)
+            cells.draw_cells(axes, codes, horizontal, vertical, cmap=ListedColormap(_COLOURS), vmin=-0.5, vmax=4.5)
+            handles += _regime_legend(codes)
+        else:
+            cmap = matplotlib.colormaps["cividis_r"].with_extremes(bad=_COLOURS[_FAILED])
+            field = dataset[name].where(dataset["outcome"] < cells.FIRST_FAILURE)
+            mesh = cells.draw_cells(axes, field, horizontal, vertical, cmap=cmap, norm=PowerNorm(0.5))
+            panels.colorbar(axes, mesh, variable_label(dataset[name]))
+        handles += _threshold(axes, dataset, horizontal, vertical)[: 1 if axes is panels.axes[-1][0] else 0]
+    panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
+    _titles(panels, dataset)
+    panels.legend(handles)
+    return panels.figure
+
+
+def _threshold(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Line2D]:
+    """The predicted end of the motion without separation, if it is stored as a curve over the horizontal axis."""
+    name = f"resonance_{vertical}"
+    if name not in dataset.coords or horizontal not in dataset[name].dims:
+        return []
+    limits = axes.get_ylim()
+    handles = []
+    for line in dataset[name].transpose("resonance", horizontal):
+        label = str(line["resonance"].item())
+        axes.plot(dataset[horizontal], line, color="#ffffff", linewidth=2.6)
+        handles += axes.plot(dataset[horizontal], line, color=PREDICTION, linewidth=1.3, label=label)
+    axes.set_ylim(limits)
+    return handles
+
+
+def _curves(dataset: xr.Dataset, name: str) -> Figure:
+    extremes = [key for key in ("u_max", "u_min") if key in dataset]
+    scalars = [key for key in ("period_multiple", "spectral_radius", "lyapunov_exponent") if key in dataset]
+    if not extremes:
+        _need(dataset, ("u_max",))
+    panels = Panels(1 + len(scalars), height=1.75, margins=Margins(right=0.3, left=1.0), share_y=False)
+    stack = [row[0] for row in panels.axes]
+    handles: list[Artist] = []
+    periodic = dataset["period_multiple"] > 0 if "period_multiple" in dataset else dataset["outcome"] >= 0
+    for key, colour in zip(extremes, LINE_COLOURS, strict=False):
+        label = dataset[key].attrs.get("long_name", key)
+        handles += _dots(stack[0], dataset[name], dataset[key].where(periodic), colour, label)
+        if not bool(periodic.all()):
+            _dots(stack[0], dataset[name], dataset[key].where(~periodic), _COLOURS[3], "")
+    if not bool(periodic.all()):
+        handles.append(Line2D([], [], linestyle="", marker="o", markersize=3, color=_COLOURS[3], label="non-periodic"))
+    units = dataset[extremes[0]].attrs.get("units", "1")
+    panels.label_row(stack[0], f"extremes of the displacement [{units}]")
+    for axes, key in zip(stack[1:], scalars, strict=True):
+        _dots(axes, dataset[name], dataset[key], LINE_COLOURS[0], "")
+        panels.label_row(axes, variable_label(dataset[key]))
+        limit = {"spectral_radius": 1.0, "lyapunov_exponent": 0.0}.get(key)
+        if limit is not None:
+            axes.axhline(limit, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)))
+    cells.fit_axis(stack[0], "x", dataset[name].values)
+    panels.label_axes(axis_label(dataset[name]))
+    _titles(panels, dataset)
+    panels.legend(handles)
+    return panels.figure
+
+
+def _dots(axes: Axes, x: xr.DataArray, y: xr.DataArray, colour: str, label: str) -> list[Line2D]:
+    return axes.plot(x, y, linestyle="", marker="o", markersize=1.8, color=colour, label=label)
+
+
+def _basins(dataset: xr.Dataset) -> Figure:
+    _need(dataset, ("u_max", "period_multiple"))
+    codes, names = _attractors(dataset)
+    panels = Panels(height=4.2, margins=Margins(right=2.3))
+    axes = panels.axes[0][0]
+    colours = ListedColormap([*_BASINS[: len(names)], _COLOURS[_FAILED]])
+    cells.draw_cells(axes, codes, "u0", "v0", cmap=colours, vmin=-0.5, vmax=len(names) + 0.5)
+    share = [float((codes == k).mean()) for k in range(len(names) + 1)]
+    handles = [
+        Patch(facecolor=colour, edgecolor=FRAME_GREY, linewidth=0.6, label=f"{label}: {part:.1%}")
+        for colour, label, part in zip(colours.colors, [*names, "other or failed"], share, strict=True)
+        if part > 0
+    ]
+    panels.label_axes(axis_label(dataset["u0"]), axis_label(dataset["v0"]))
+    _titles(panels, dataset)
+    panels.legend(handles)
+    return panels.figure
+
+
+def _attractors(dataset: xr.Dataset) -> tuple[xr.DataArray, list[str]]:
+    """The attractors by falling share: number of each point's, and what distinguishes them."""
+    known = (dataset["outcome"] < cells.FIRST_FAILURE).values
+    multiple, high = dataset["period_multiple"].values, dataset["u_max"].values
+    # All non-periodic motions are taken for one attractor.
+    level = np.where(multiple > 0, np.log(np.abs(np.where(known, high, 1.0)) + 1e-300) / _SAME, 0.0)
+    keys = [(int(m), round(float(x))) for m, x in zip(multiple[known], level[known], strict=True)]
+    merged = _merge(keys)
+    kinds, counts = np.unique(merged, return_counts=True)
+    kinds = kinds[np.argsort(-counts)][: len(_BASINS)]
+    codes = np.full(known.shape, len(kinds))
+    flat = np.full(len(merged), len(kinds))
+    names = []
+    for number, kind in enumerate(kinds):
+        flat[merged == kind] = number
+        first = int(np.flatnonzero(merged == kind)[0])
+        m = keys[first][0]
+        size = high[known][first]
+        names.append(f"period {m}, largest u {size:.4g}" if m else "non-periodic")
+    codes[known] = flat
+    return dataset["outcome"].copy(data=codes), names
+
+
+def _merge(keys: list[tuple[int, int]]) -> np.ndarray:
+    """Numbers of classes of ``(multiple, level)`` whose levels form chains of neighbours."""
+    order = sorted(range(len(keys)), key=keys.__getitem__)
+    numbers = np.zeros(len(keys), int)
+    current = 0
+    for before, here in itertools.pairwise(order):
+        near = keys[before][0] == keys[here][0] and keys[here][1] - keys[before][1] <= 1
+        current += not near
+        numbers[here] = current
+    return numbers
+
+
+def _motion(dataset: xr.Dataset) -> Figure:
+    _need(dataset, ("u_history", "v_history"))
+    u, v, part = dataset["u_history"], dataset["v_history"], dataset["sample"]
+    height = 2.6
+    panels = Panels(height=height, margins=Margins(left=0.85, right=_PORTRAIT + 0.3))
+    history = panels.axes[0][0]
+    box = history.get_position()
+    portrait = panels.figure.add_axes((1 - (_PORTRAIT - 0.7) / WIDTH, box.y0, (_PORTRAIT - 0.85) / WIDTH, box.height))
+    handles = history.plot(part, u, color=LINE_COLOURS[0], label="displacement")
+    portrait.plot(np.append(u, u[0]), np.append(v, v[0]), color=LINE_COLOURS[0])
+    portrait.plot(u[0], v[0], "o", markersize=4, color=LINE_COLOURS[1])
+    handles.append(
+        Line2D([], [], linestyle="", marker="o", markersize=4, color=LINE_COLOURS[1], label="start of a drive period")
+    )
+    history.plot(part[0], u[0], "o", markersize=4, color=LINE_COLOURS[1])
+    half = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get("b", {}).get("value")
+    half = dataset["b"].item() if "b" in dataset.coords else half
+    if half is not None:
+        style = {"color": FRAME_GREY, "linewidth": 0.8, "linestyle": (0, (2, 2))}
+        for side in (half, -half):
+            flank = history.axhline(side, label="flanks", **style)
+            portrait.axvline(side, **style)
+        handles.append(flank)
+    history.set_xlim(0, 1)
+    panels.label_axes("part of the motion's period [1]", variable_label(u))
+    portrait.set(xlabel=variable_label(u), ylabel=variable_label(v))
+    _titles(panels, dataset)
+    panels.legend(handles)
+    return panels.figure

@@ -1,0 +1,155 @@
+"""Attractors, their measures, and the branches and special points of exact orbits, against the reference values."""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivetrain_jax.analysis import Outcome, Request, get_analysis
+from drivetrain_jax.analysis.exact_response import sweeps
+from drivetrain_jax.analysis.orbit_branch import doubling_test, fold_test, follow, locate
+from drivetrain_jax.analysis.piecewise_march import march, prepare, start
+from drivetrain_jax.systems import get_system
+from drivetrain_jax.systems.rattle import PRESETS, oscillator
+
+REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "rattle.json").read_text())
+STEADY = REFERENCE["steady"]
+TABLE1 = PRESETS["table1"]
+ANALYSIS = get_analysis("steady_state")
+NAMES = ("omega", "B0", "B1", "b", "c", "alpha", "k", "I", "u0", "v0")
+
+
+def request(**options):
+    defaults = {p.name: p.default for p in ANALYSIS.options}
+    return Request(tuple(v.name for v in ANALYSIS.variables), "exact", defaults | options)
+
+
+@pytest.fixture(scope="module")
+def steady():
+    """The kernel over all parameters, for up to 64 points at a time."""
+    (solver,) = ANALYSIS.solvers(get_system("rattle"), request(most_periods=800))
+    compiled = jax.jit(lambda columns: solver.solve(columns, jnp.int32(1)))
+
+    def solve(cases):
+        count = len(cases)
+        padded = cases + [TABLE1 | {"omega": 2.5}] * (64 - count)
+        results = compiled({name: jnp.array([float(case.get(name, 0.0)) for case in padded]) for name in NAMES})
+        return {name: np.asarray(value)[..., :count] for name, value in results.items()}
+
+    return solve
+
+
+def from_orbits(factor=1.0):
+    return [c["params"] | {"u0": factor * c["z0"][0], "v0": factor * c["z0"][1]} for c in STEADY]
+
+
+def test_every_steady_reference_value(steady):
+    found = steady(from_orbits(1 + 1e-4))
+    assert np.all(found["outcome"] == Outcome.SUCCESS)
+    for i, case in enumerate(STEADY):
+        name = case["name"]
+        assert found["period_multiple"][i] == case["period_multiple"], name
+        for ours, theirs in (("u_max", "max"), ("u_min", "min"), ("u_mean", "mean"), ("u_rms", "rms")):
+            assert found[ours][i] == pytest.approx(case[theirs], abs=1e-9), (name, ours)
+        assert np.cos(found["phase"][i] - case["phase_lag_rad"]) > 1 - 1e-15, name
+        assert found["spectral_radius"][i] == pytest.approx(max(case["floquet_abs"]), abs=1e-8), name
+        np.testing.assert_array_equal(found["impacts"][:, i], [case["drive_impacts"], case["back_impacts"]], name)
+        fractions = [case["frac_drive"], case["frac_back"]]
+        np.testing.assert_allclose(found["contact_fraction"][:, i], fractions, atol=1e-9, err_msg=name)
+        assert found["impact_velocity"][:, i].max() == pytest.approx(case["v_impact_max"], abs=1e-9), name
+
+
+def test_the_error_estimate_covers_the_error(steady):
+    found = steady(from_orbits(1 + 1e-4))
+    single = [i for i, case in enumerate(STEADY) if case["period_multiple"] == 1]
+    error = np.abs(found["orbit_state"][0] - [c["z0"][0] for c in STEADY])[single]
+    assert np.all(error <= found["state_error"][single] + 1e-14)
+    assert found["state_error"].max() < 1e-10
+
+
+def test_multipliers_obey_liouville(steady):
+    found = steady(from_orbits(1 + 1e-4))
+    product = np.prod(found["floquet_multiplier"], axis=0)
+    span = [c["period_multiple"] * 2 * np.pi / c["params"]["omega"] for c in STEADY]
+    exact = np.exp([-c["params"]["c"] * t for c, t in zip(STEADY, span, strict=True)])
+    np.testing.assert_allclose(product, exact, rtol=1e-12)
+
+
+def test_the_attractor_is_the_one_that_the_motion_reaches(steady):
+    """Against the motion itself, followed until nothing changes any more."""
+    rng = np.random.default_rng(5)
+    cases = []
+    for _ in range(48):
+        case = TABLE1 | {"omega": rng.uniform(0.6, 1.5), "B1": rng.uniform(0.01, 0.06), "alpha": rng.uniform(0, 1.5)}
+        cases.append(case | {"u0": rng.uniform(-1, 1), "v0": rng.uniform(-1, 1)})
+    found = steady(cases)
+    table = {name: jnp.array([case[name] for case in cases]) for name in NAMES}
+
+    @jax.jit
+    def settled(values):
+        lanes = prepare(oscillator(values))
+        return march(lanes, start(lanes, values["u0"], values["v0"], jnp.full(48, 480, jnp.int32)), 100_000)
+
+    motion = settled(table)
+    # 480 is a multiple of every short period: the motion is back at the phase of the orbit up to a shift.
+    periodic = np.isin(found["period_multiple"], (1,))
+    assert periodic.sum() > 35
+    assert np.abs(found["orbit_state"][0] - motion.u)[periodic].max() < 1e-6
+    assert np.abs(found["orbit_state"][1] - motion.v)[periodic].max() < 1e-6
+
+
+def test_chaos_is_non_periodic_with_its_exponent(steady):
+    cases = [TABLE1 | {"alpha": 0.0, "B1": 0.2, "omega": w} for w in (1.2, 1.5)]
+    found = steady(cases)
+    np.testing.assert_array_equal(found["period_multiple"], 0)
+    np.testing.assert_array_equal(found["regime"], 3)
+    np.testing.assert_array_equal(found["outcome"], Outcome.SUCCESS)
+    # An average over 600 periods only.
+    np.testing.assert_allclose(found["lyapunov_exponent"], [0.057, 0.097], atol=0.02)
+
+
+def test_a_lane_alone_is_the_lane_in_its_batch(steady):
+    cases = from_orbits()[:12]
+    together, alone = steady(cases), steady(cases[4:5])
+    for name, values in alone.items():
+        np.testing.assert_array_equal(values[..., 0], together[name][..., 4], name)
+
+
+def test_an_undamped_motion_does_not_settle_and_says_so(steady):
+    found = steady([TABLE1 | {"c": 0.0, "omega": 0.7, "B1": 0.001, "u0": 0.3}, TABLE1 | {"omega": 0.7}])
+    assert found["outcome"][0] == Outcome.NOT_CONVERGED and np.isnan(found["u_max"][0])
+    assert found["outcome"][1] == Outcome.SUCCESS
+
+
+def test_sweeps_jump_where_the_folds_are():
+    omega = np.arange(0.74, 0.885, 0.002)
+    found = jax.jit(lambda w: sweeps(oscillator(TABLE1 | {"omega": w})))(omega)
+    assert np.all(found["outcome"] == Outcome.SUCCESS)
+    swing = np.asarray(found["u_max"] - found["u_min"])
+    up, down = (omega[:-1][np.abs(np.diff(swing[:, k])) > 0.2] for k in (0, 1))
+    assert up.shape == down.shape == (1,)
+    assert up[0] < 0.874372741 < up[0] + 0.002 and down[0] < 0.753850046 < down[0] + 0.002
+    peak = np.argmax(swing[:, 0])
+    assert swing[peak, 0] == pytest.approx(1.388317, abs=2e-4) and omega[peak] == pytest.approx(0.8717, abs=2e-3)
+
+
+def test_folds_and_period_doublings_of_the_branch():
+    model = oscillator(TABLE1 | {"omega": 1.0})
+    begin = jnp.array([[0.175188], [0.00034], [2.5]])
+    branch = jax.jit(partial(follow, model, 1, direction=-1.0, points=300, longest=0.03))(begin)
+    known = np.isfinite(np.asarray(branch.x[:, 2, 0]))
+    x, matrix = np.asarray(branch.x)[known], [np.asarray(entry)[known] for entry in branch.matrix]
+    found = []
+    for kind, test in (("fold", fold_test), ("doubling", doubling_test)):
+        sign = np.sign(np.asarray(test(matrix))[:, 0])
+        finder = jax.jit(partial(locate, model, 1, test=kind))
+        found += [float(finder((x[i], x[i + 1]))[0][2, 0]) for i in np.flatnonzero(sign[1:] != sign[:-1])]
+    expected = sorted(point["omega"] for point in REFERENCE["specials"]["table1"])
+    np.testing.assert_allclose(sorted(found), expected, atol=1e-12)
+    # The saddle between the folds is unstable, and on the branch.
+    between = (x[:, 2, 0] > 0.76) & (x[:, 2, 0] < 0.87)
+    assert np.any(fold_test([entry[between] for entry in matrix]) < 0)

@@ -1,0 +1,70 @@
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import plot
+
+FIXED = json.dumps({"b": {"value": 0.17, "units": "m", "long_name": "half the backlash"}})
+
+
+def result(axes, **variables):
+    dims = tuple(axes)
+    shape = tuple(len(values) for values in axes.values())
+    data = {"outcome": (dims, np.zeros(shape, np.int8))}
+    data |= {name: (dims, np.asarray(values)) for name, values in variables.items()}
+    coords = {
+        name: (name, np.asarray(values, float), {"units": "1", "long_name": name}) for name, values in axes.items()
+    }
+    attrs = {"analysis": "steady_state", "title": "a title", "fixed_parameters": FIXED}
+    return xr.Dataset(data, coords, attrs)
+
+
+def labels(figure):
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_a_map_shows_regimes_and_the_threshold():
+    regime = np.array([[0, 1, 2], [1, 2, 3]])
+    dataset = result({"omega": [0.5, 1.0], "B1": [0.1, 0.2, 0.3]}, regime=regime, u_max=regime + 0.5)
+    dataset["outcome"][0, 1] = 2
+    dataset = dataset.assign_coords(
+        resonance=("resonance", ["no separation ends"]), resonance_B1=(("omega", "resonance"), [[0.15], [0.25]])
+    )
+    figure = plot(dataset)
+    shown = labels(figure)
+    assert {"no separation", "double-sided", "non-periodic", "failed", "no separation ends"} <= set(shown)
+    (line,) = [line for line in figure.axes[0].lines if line.get_label() == "no separation ends"]
+    np.testing.assert_allclose(line.get_ydata(), [0.15, 0.25])
+
+
+def test_basins_show_the_share_of_every_attractor():
+    high = np.array([[0.5, 0.5, 0.7], [0.5, 0.7 * (1 + 1e-7), 0.5]])
+    axes = {"u0": [-1.0, 1.0], "v0": [-1.0, 0.0, 1.0]}
+    figure = plot(result(axes, u_max=high, period_multiple=np.ones((2, 3), int)))
+    assert labels(figure) == ["period 1, largest u 0.5: 66.7%", "period 1, largest u 0.7: 33.3%"]
+
+
+def test_curves_mark_what_is_not_periodic():
+    multiple = [1, 0, 2]
+    figure = plot(result({"omega": [0.5, 1.0, 1.5]}, u_max=[1.0, 2.0, 3.0], period_multiple=multiple))
+    assert "non-periodic" in labels(figure)
+    np.testing.assert_array_equal(figure.axes[1].lines[0].get_ydata(), multiple)
+
+
+def test_a_motion_shows_history_and_phase_portrait():
+    part = np.arange(16) / 16
+    dataset = result({"omega": [0.5]}).assign_coords(sample=("sample", part))
+    dataset["u_history"] = (("omega", "sample"), np.sin(2 * np.pi * part)[None])
+    dataset["v_history"] = (("omega", "sample"), np.cos(2 * np.pi * part)[None])
+    figure = plot(dataset)
+    # The portrait is closed.
+    portrait = figure.axes[1].lines[0]
+    assert portrait.get_xdata()[0] == portrait.get_xdata()[-1] and "flanks" in labels(figure)
+
+
+def test_missing_variables_are_named():
+    with pytest.raises(InputError, match="u_history"):
+        plot(result({"omega": [0.5]}, u_max=[1.0]))
