@@ -58,6 +58,8 @@ class Parameter:
     def check(self, value: object) -> float | int | str | tuple[float, ...]:
         """Return ``value`` in its stored type, or raise ``ValueError`` with one line that names the range."""
         if self.choices:
+            # A word that looks like a number may be written without quotes.
+            value = str(value) if isinstance(value, int) and str(value) in self.choices else value
             if value not in self.choices:
                 raise ValueError(f"{self.name} = {value!r}: allowed is {self.allowed}")
             return value

@@ -12,7 +12,8 @@ from drivetrain_jax.analysis import Request, Solver, get_analysis
 from drivetrain_jax.systems import System, get_system
 
 ANALYSIS, CARDAN = get_analysis("floquet"), get_system("cardan")
-EVERYTHING = tuple(v.name for v in ANALYSIS.variables)
+# Cardan has no time in seconds, which exponents need.
+EVERYTHING = tuple(v.name for v in ANALYSIS.variables if v.name != "floquet_exponent")
 BASE = dict(CARDAN.presets["base"])
 STABLE, UNSTABLE, UNDECIDED = 0, 1, 2
 

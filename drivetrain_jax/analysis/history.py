@@ -1,0 +1,187 @@
+"""Time histories: the motion of a flow at requested times, from any initial state.
+
+diffrax integrates adaptively from strobe to strobe and from requested time to requested time, so that every value is
+the end of a step (no interpolation) and the angles of the clocks are taken afresh from whole strobes: they are as exact
+after 50,000 strobes as at the start. Errors are the differences from a run at a tolerance ten times as large.
+
+Outcome: ``TOLERANCE_NOT_MET`` if an error was asked for and exceeds ``rtol`` times the size of the motion;
+``STEP_LIMIT`` if the integrator needed too many steps. Values up to that time are kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.monodromy import SOLVERS
+from drivetrain_jax.systems import Flow, System
+
+VARIABLES = (
+    Variable("phi", "rad", "twist", ("time",)),
+    Variable("velocity", "rad/s", "rate of twist", ("time",)),
+    Variable("phi_error", "rad", "estimated absolute error of phi", ("time",)),
+    Variable("velocity_error", "rad/s", "estimated absolute error of velocity", ("time",)),
+)
+_ERRORS = {"phi_error", "velocity_error"}
+_COMPONENT = {"phi": 0, "velocity": 1}
+
+# Tolerances of the steps over that of the result: errors of steps add up over the memory of the damped motion.
+_SHARPNESS, _COARSER, _SHARPEST = 0.01, 10.0, 1e-15
+# Steps of one segment (at most a strobe) and of a whole history; strobes beyond which none is begun.
+_MAX_SEGMENT, _MAX_STEPS, _MAX_STROBES = 4096, 20_000_000, 2_000_000
+
+
+class _Place(NamedTuple):
+    """Where the integration stands: ``(strobe + fraction) * period``, the state, the steps so far, and if all is well."""
+
+    strobe: Array
+    fraction: Array
+    y: Array
+    steps: Array
+    healthy: Array
+
+
+def requested_times(request: Request) -> tuple[float, ...]:
+    """The times of the options: ``times``, or ``num`` equal steps from 0 to ``stop``, ends included.
+
+    :class:`InputError` if both or neither are given, or ``times`` does not rise.
+    """
+    times, stop, num = (request.options[name] for name in ("times", "stop", "num"))
+    if times and stop:
+        raise InputError(f"options.stop = {stop:g}: given together with times; allowed is one of the two")
+    if not times and not stop:
+        raise InputError("options.times: missing; allowed is times, or stop and num")
+    if times and (np.diff(times) <= 0).any():
+        raise InputError("options.times: allowed are rising times")
+    return tuple(times) if times else tuple(np.linspace(0.0, stop, num).tolist())
+
+
+def size_of(flow: Flow) -> Array:
+    """Scale of the motion in its own components: the initial state, and the way made by it within a radian."""
+    start = jnp.stack([jnp.asarray(x, float) for x in flow.start])
+    rate = flow.vector(0, 0.0, start)
+    fastest = 2 * np.pi / flow.period if flow.fastest is None else flow.fastest
+    return jnp.max(jnp.abs(start)) + jnp.max(jnp.abs(rate)) / fastest
+
+
+def trajectory(flow: Flow, times: Array, tolerance: float, solver: diffrax.AbstractSolver) -> tuple[Array, Array]:
+    """States at the rising ``times``, shape ``(len(times), n)``, and whether the step limit was kept; NaN beyond it.
+
+    ``tolerance`` bounds the error of a step relative to the state and to :func:`size_of`.
+    """
+    controller = diffrax.PIDController(rtol=tolerance, atol=jnp.maximum(tolerance * size_of(flow), 1e-300))
+    turns = times / flow.period
+    strobes = jnp.floor(turns).astype(jnp.int64)
+
+    def segment(place: _Place, end: Array) -> tuple[Array, Array, Array]:
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda s, y, _: flow.period * flow.vector(place.strobe, s, y)),
+            solver,
+            t0=place.fraction,
+            t1=end,
+            dt0=None,
+            y0=place.y,
+            stepsize_controller=controller,
+            saveat=diffrax.SaveAt(t1=True),
+            max_steps=_MAX_SEGMENT,
+            throw=False,
+        )
+        well = solution.result == diffrax.RESULTS.successful
+        return solution.ys[0], solution.stats["num_steps"], well
+
+    def ahead(place: _Place, target: tuple[Array, Array]) -> Array:
+        strobe, fraction = target
+        return place.healthy & ((place.strobe < strobe) | (place.fraction < fraction))
+
+    def advance(place: _Place, target: tuple[Array, Array]) -> _Place:
+        strobe, fraction = target
+        last = place.strobe == strobe
+        # In a batch a lane that has arrived or failed takes part until the others are there: it must not take steps.
+        end = jnp.where(ahead(place, target), jnp.where(last, fraction, 1.0), place.fraction)
+        y, steps, well = segment(place, end)
+        total = place.steps + steps
+        healthy = place.healthy & well & (total <= _MAX_STEPS) & jnp.all(jnp.isfinite(y))
+        return _Place(
+            jnp.where(last, strobe, place.strobe + 1),
+            jnp.where(last, fraction, 0.0),
+            jnp.where(healthy, y, place.y),
+            total,
+            healthy,
+        )
+
+    def to(place: _Place, target: tuple[Array, Array]) -> tuple[_Place, Array]:
+        place = jax.lax.while_loop(lambda p: ahead(p, target), lambda p: advance(p, target), place)
+        return place, jnp.where(place.healthy, place.y, jnp.nan)
+
+    start = jnp.stack([jnp.asarray(x, float) for x in flow.start])
+    # Where the field is not finite there is nothing to integrate.
+    healthy = jnp.all(jnp.isfinite(start)) & jnp.all(jnp.isfinite(flow.vector(0, 0.0, start)))
+    rest = _Place(jnp.int64(0), jnp.zeros(()), start, jnp.int64(0), healthy)
+    place, states = jax.lax.scan(to, rest, (strobes, turns - strobes))
+    return states, place.healthy
+
+
+def _solve(system: System, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+    """All requested results of one point; ``effort`` only orders the batches, as the integration is adaptive."""
+    del effort
+    flow: Flow = system.models["history"].build(values)
+    rtol, solver = request.options["rtol"], getattr(diffrax, request.options["solver"])()
+    times = jnp.asarray(requested_times(request))
+    tolerances = max(_SHARPNESS * rtol, _SHARPEST) * jnp.array([1.0, _COARSER])
+    if _ERRORS.isdisjoint(request.outputs):
+        tolerances = tolerances[:1]
+    # One after the other in one loop: compiled once.
+    runs, healthy = jax.lax.map(lambda tolerance: trajectory(flow, times, tolerance, solver), tolerances)
+    states, error = runs[0], jnp.abs(runs[0] - runs[-1])
+    size = jnp.maximum(size_of(flow), jnp.max(jnp.abs(states)))
+    met = jnp.all(error <= rtol * size)
+    outcome = jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
+    outcome = jnp.where(healthy[0], outcome, Outcome.STEP_LIMIT)
+    scale = jnp.stack([jnp.asarray(s, float) for s in flow.scale or (1.0,) * flow.size])
+    results = {name: (scale * states)[:, i] for name, i in _COMPONENT.items()}
+    results |= {f"{name}_error": (scale * error)[:, i] for name, i in _COMPONENT.items()}
+    return {name: results[name] for name in request.outputs} | {"outcome": outcome.astype(jnp.int8)}
+
+
+def _effort(system: System, request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Predicted segments, shape (N,): strobes and requested times; infinite beyond what is worth beginning."""
+    times = requested_times(request)
+    strobes = times[-1] / np.asarray(system.models["history"].build(columns).period)
+    return np.where(strobes <= _MAX_STROBES, np.ceil(strobes) + len(times), np.inf)
+
+
+def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+    name = f"diffrax: {request.options['solver']}"
+    return (Solver(name, partial(_solve, system, request), partial(_effort, system, request), chunk=16),)
+
+
+def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    return (Dimension("time", "time", requested_times(request), "s"),)
+
+
+ANALYSIS = Analysis(
+    name="history",
+    title="time history",
+    variables=VARIABLES,
+    default_outputs=("phi", "velocity"),
+    methods={"diffrax": ("times", "stop", "num", "rtol", "solver")},
+    options=(
+        Parameter("times", "s", "times at which the state is wanted", default=(), listed=True, lower=0.0),
+        Parameter("stop", "s", "end of the history (0: see times)", default=0.0, lower=0.0),
+        Parameter("num", "1", "number of equally spaced times from 0 to stop", default=1001, lower=2, integer=True),
+        RTOL,
+        Parameter("solver", "1", "diffrax solver", default="Dopri8", choices=SOLVERS),
+    ),
+    solvers=_solvers,
+    dimensions=_dimensions,
+)

@@ -1,0 +1,78 @@
+"""An initial value problem whose explicit time enters through clocks: what is integrated, strobed and judged.
+
+``y' = f(theta_1, theta_2, ..., y)``, where the angle of clock i turns ``turns[i]`` times per strobe. Time is counted as
+``(strobe + fraction) * period`` with an integer strobe, so that the angles are as exact after millions of strobes as at
+the start; an autonomous system has no clock and any interval serves as its strobe.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+Components = tuple[Any, ...]
+# Turns are split at this binary digit: integer multiples of the upper part are exact up to 2^27 turns.
+_SPLIT = 2.0**26
+
+
+@dataclass(frozen=True)
+class Flow:
+    """A vector field with its clocks, its initial state and what is known about it.
+
+    ``field(angles, y)`` gives the components of ``y'`` (per unit of time) from the angles of the clocks [rad] and the
+    components of ``y``; each is a number or an array of shape ``(...)``, so that a batch may be carried as trailing axis.
+
+    - ``start``: components of ``y`` at t = 0.
+    - ``period``: time between two strobes.
+    - ``turns``: turns of each clock per strobe. A clock that defines the strobe has the number 1, its angle is then the
+      same for every member of a batch.
+    - ``scale``: what one unit of each component is in the units that are reported.
+    - ``divergence(angles, y)``: trace of the field's Jacobian in closed form, if known: its mean is the sum of all
+      Lyapunov exponents.
+    - ``phases``: components with a constant rate. Each has the exponent 0 whatever the motion does, so that they are
+      dropped before it is judged. (The clocks are not components.)
+    - ``cyclic``: components that are angles, known up to whole turns: they may grow although the motion is bounded.
+    - ``fastest``: largest angular frequency of the motion, from which step sizes follow, if known.
+    """
+
+    field: Callable[[Components, Sequence[Any]], Components]
+    start: Components
+    period: Any
+    turns: Components = ()
+    scale: tuple[Any, ...] | None = None
+    divergence: Callable[[Components, Sequence[Any]], Any] | None = None
+    phases: tuple[int, ...] = ()
+    cyclic: tuple[int, ...] = ()
+    fastest: Any = None
+
+    @property
+    def size(self) -> int:
+        """Number of components."""
+        return len(self.start)
+
+    def angles(self, strobe: Any, fraction: Any) -> Components:
+        """Angles of the clocks at ``(strobe + fraction) * period``, in [rad], reduced by the whole turns up to ``strobe``.
+
+        ``strobe`` is an integer (array), ``fraction`` a number (array), usually in [0, 1]. The error is that of one
+        rounding of the reduced angle as long as no clock has made more than 2^27 turns.
+        """
+        return tuple(2 * math.pi * (_turned(turns, strobe) + turns * fraction) for turns in self.turns)
+
+    def vector(self, strobe: Any, fraction: Any, y: Array) -> Array:
+        """``y'`` as one array of shape ``(n, ...)`` for ``y`` of that shape."""
+        return jnp.stack(jnp.broadcast_arrays(*self.field(self.angles(strobe, fraction), y)))
+
+
+def _turned(turns: Any, strobe: Any) -> Any:
+    """Fractional part of ``turns * strobe``."""
+    if isinstance(turns, int):
+        return 0.0
+    # The product with the upper part has no rounding, that with the lower part is small.
+    upper = jnp.round(turns * _SPLIT) / _SPLIT
+    whole = upper * strobe
+    return (whole - jnp.floor(whole)) + (turns - upper) * strobe

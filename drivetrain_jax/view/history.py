@@ -1,0 +1,142 @@
+"""Figures of the analysis ``history``: twist and rate of twist over time, and the phase portrait."""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import Axes3D
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import cells
+from drivetrain_jax.view.layout import DPI, WIDTH
+from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, caption, symbol, value_text
+
+_LINE = {"color": LINE_COLOURS[0], "linewidth": 0.6}
+_MOST_ROWS = 8
+# Powers of ten beside the axis, as a product and not as 1e-4.
+_STYLE = {**STYLE, "axes.formatter.use_mathtext": True, "axes.formatter.limits": (-2, 4)}
+
+
+def plot(dataset: xr.Dataset) -> Figure:
+    """Twist and rate over time, phase portrait, and for a single history the curve of both in time (3-D).
+
+    One history: four panels. One axis or ``[points]``: a row of three panels for each of up to eight values. Histories
+    without values keep empty panels that say so. Raises :class:`InputError` for more axes or values, and unless ``phi``
+    and ``velocity`` are stored.
+    """
+    with matplotlib.rc_context(_STYLE):
+        dataset = cells.prepare(dataset)
+        missing = [name for name in ("phi", "velocity") if name not in dataset]
+        if missing:
+            raise InputError(f"outputs: {' and '.join(missing)} missing; the figure needs phi and velocity")
+        names = cells.sweep_axes(dataset)
+        if not names:
+            return _single(dataset)
+        if len(names) == 1 and dataset.sizes[names[0]] <= _MOST_ROWS:
+            return _rows(dataset, names[0])
+        raise InputError(
+            f"axes = {', '.join(names)}: allowed is one axis of up to {_MOST_ROWS} values for a figure of histories"
+        )
+
+
+def _single(dataset: xr.Dataset) -> Figure:
+    height = 6.4
+    figure = _figure(dataset, height)
+    boxes = [(x, y, 2.55, 2.0) for y in (3.4, 0.55) for x in (0.75, 4.15)]
+    twist, rate, portrait = (_add(figure, boxes[k], height) for k in (0, 1, 3))
+    _draw(dataset, twist, rate, portrait)
+    for axes in (twist, rate):
+        axes.set_xlabel(_label(dataset, "time"))
+    space = _add(figure, (0.35, 0.3, 3.1, 2.25), height, projection="3d")
+    assert isinstance(space, Axes3D)
+    _draw_space(dataset, space)
+    for axes, letter in zip((twist, rate, space, portrait), "abcd", strict=True):
+        _letter(axes, letter)
+    return figure
+
+
+def _rows(dataset: xr.Dataset, name: str) -> Figure:
+    count = dataset.sizes[name]
+    row, top, bottom = 1.85, 0.65, 0.35
+    height = top + bottom + count * row
+    figure = _figure(dataset, height)
+    for k in range(count):
+        history = dataset.isel({name: k})
+        y = height - top - (k + 1) * row + 0.3
+        boxes = [(x, y, 1.5, row - 0.6) for x in (0.75, 3.0, 5.3)]
+        twist, rate, portrait = (_add(figure, box, height) for box in boxes)
+        _draw(history, twist, rate, portrait)
+        rate.text(0.5, 1.06, _entry(history, name), transform=rate.transAxes, ha="center", color=FRAME_GREY)
+        for axes in (twist, rate, portrait):
+            axes.set_xlabel(_label(dataset, "phi" if axes is portrait else "time") if k == count - 1 else "")
+    return figure
+
+
+def _draw(history: xr.Dataset, twist: Axes, rate: Axes, portrait: Axes) -> None:
+    phi, velocity = history["phi"].values, history["velocity"].values
+    twist.plot(history["time"], phi, **_LINE)
+    rate.plot(history["time"], velocity, **_LINE)
+    portrait.plot(phi, velocity, **_LINE)
+    twist.set_ylabel(_label(history, "phi"))
+    for axes in (rate, portrait):
+        axes.set_ylabel(_label(history, "velocity"))
+    portrait.set_xlabel(_label(history, "phi"))
+    for axes in (twist, rate):
+        axes.set_xlim(history["time"].values[0], history["time"].values[-1])
+        axes.ticklabel_format(axis="x", scilimits=(-3, 4))
+    if not np.isfinite(phi).any():
+        for axes in (twist, rate, portrait):
+            axes.text(0.5, 0.5, "no values", transform=axes.transAxes, ha="center", va="center", color=FRAME_GREY)
+
+
+def _draw_space(history: xr.Dataset, space: Axes3D) -> None:
+    space.plot(history["phi"].values, history["velocity"].values, history["time"].values, **_LINE)
+    space.set(xlabel=_label(history, "phi"), ylabel=_label(history, "velocity"), zlabel=_label(history, "time"))
+    space.tick_params(labelsize=6.5, pad=-2)
+    for axis in (space.xaxis, space.yaxis, space.zaxis):
+        axis.labelpad = -3
+        axis.label.set_size(7.5)
+        axis.pane.set_facecolor("white")
+    space.locator_params(nbins=4)
+    space.view_init(elev=22, azim=-58)
+    space.set_box_aspect((1, 1, 0.8), zoom=0.92)
+
+
+def _figure(dataset: xr.Dataset, height: float) -> Figure:
+    figure = Figure(figsize=(WIDTH, height), dpi=DPI)
+    left = 0.35 / WIDTH
+    figure.text(left, 1 - 0.10 / height, dataset.attrs.get("title", ""), va="top", size=10.5, weight="bold")
+    figure.text(left, 1 - 0.32 / height, caption(dataset), va="top", size=8, color=FRAME_GREY)
+    return figure
+
+
+def _add(figure: Figure, box: tuple[float, float, float, float], height: float, **options: str) -> Axes:
+    """Axes in the box (left, bottom, width, height) in inches."""
+    x, y, w, h = box
+    return figure.add_axes((x / WIDTH, y / height, w / WIDTH, h / height), **options)
+
+
+def _letter(axes: Axes, letter: str) -> None:
+    place = axes.get_position()
+    figure = axes.get_figure()
+    assert figure is not None
+    figure.text(_LETTER_COLUMN[letter], place.y1 + 0.012, f"({letter})", ha="right", va="bottom", weight="bold")
+
+
+_LETTER_COLUMN = {"a": 0.06, "c": 0.06, "b": 0.55, "d": 0.55}
+_SYMBOLS = {"phi": symbol("phi"), "velocity": r"d$\phi$/d$t$", "time": "$t$"}
+
+
+def _label(dataset: xr.Dataset, name: str) -> str:
+    return f"{_SYMBOLS[name]} [{dataset[name].attrs.get('units', '1')}]"
+
+
+def _entry(history: xr.Dataset, name: str) -> str:
+    """The parameters that tell this row from the others."""
+    if name != "point":
+        return value_text(name, history[name].item(), history[name].attrs.get("units", "1"))
+    own = [c for c in history.coords if history[c].ndim == 0 and c != "point"]
+    return ", ".join(value_text(str(c), history[c].item(), history[c].attrs.get("units", "1")) for c in own)

@@ -1,0 +1,85 @@
+"""Figures of the analysis ``parameters``: constants over one parameter as curves, or as a table."""
+
+from __future__ import annotations
+
+import textwrap
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import cells
+from drivetrain_jax.view.layout import DPI, WIDTH, Margins, Panels
+from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, axis_label, caption, variable_label
+
+_HEIGHT, _MOST_CURVES = 1.8, 8
+# Of the table: inches between lines, and between lines of the caption, and letters of such a line.
+_ROW, _CAPTION, _LETTERS = 0.24, 0.15, 105
+
+
+def plot(dataset: xr.Dataset) -> Figure:
+    """Every stored constant over the one axis of ``dataset``, a panel each; without axes a table of their values.
+
+    Constants with a dimension of their own (natural frequencies by mode) become one curve or one line of the table for
+    each entry. Axes of a single value count as fixed. Raises :class:`InputError` for more axes, for ``[points]`` and for
+    more than eight panels.
+    """
+    with matplotlib.rc_context(STYLE):
+        dataset = cells.prepare(dataset)
+        names = cells.sweep_axes(dataset)
+        shown = [str(name) for name in dataset.data_vars if name != "outcome"]
+        if not names:
+            return _table(dataset, shown)
+        if len(names) > 1 or names == ["point"]:
+            raise InputError(f"axes = {', '.join(names)}: allowed is one axis, or none, for a figure of parameters")
+        if len(shown) > _MOST_CURVES:
+            raise InputError(f"outputs: {len(shown)} constants; allowed are up to {_MOST_CURVES} for curves")
+        return _curves(dataset, names[0], shown)
+
+
+def _curves(dataset: xr.Dataset, name: str, shown: list[str]) -> Figure:
+    panels = Panels(len(shown), height=_HEIGHT, margins=Margins(left=1.05, right=0.3, bottom=0.6), share_y=False)
+    for (axes,), key in zip(panels.axes, shown, strict=True):
+        variable = dataset[key].where(dataset["outcome"] < cells.FIRST_FAILURE).transpose(name, ...)
+        axes.plot(dataset[name], variable.values.reshape(dataset.sizes[name], -1), color=LINE_COLOURS[0])
+        axes.margins(x=0)
+        panels.label_row(axes, variable_label(variable))
+    panels.label_axes(axis_label(dataset[name]))
+    panels.titles(dataset)
+    return panels.figure
+
+
+def _table(dataset: xr.Dataset, shown: list[str]) -> Figure:
+    lines = [line for name in shown for line in _lines(dataset[name])]
+    # Breaks between the parameters only, not within one.
+    entries = ", ".join(entry.replace(" ", "\u00a0") for entry in caption(dataset).split(", "))
+    head = textwrap.wrap(entries, _LETTERS, break_long_words=False)
+    top = 0.55 + _CAPTION * len(head)
+    height = top + 0.1 + _ROW * len(lines)
+    figure = Figure(figsize=(WIDTH, height), dpi=DPI)
+    left, value, units = 0.35 / WIDTH, 0.72, 0.74
+    figure.text(left, 1 - 0.10 / height, dataset.attrs.get("title", ""), va="top", size=10.5, weight="bold")
+    figure.text(left, 1 - 0.32 / height, "\n".join(head), va="top", size=8, color=FRAME_GREY)
+    for k, (label, number, unit) in enumerate(lines):
+        y = 1 - (top + _ROW * k) / height
+        figure.text(left, y, label, va="center")
+        figure.text(value, y, number, va="center", ha="right")
+        figure.text(units, y, unit, va="center", color=FRAME_GREY)
+    return figure
+
+
+def _lines(variable: xr.DataArray) -> list[tuple[str, str, str]]:
+    """Name, value and unit of a constant, one line for each entry of its own dimension."""
+    label = str(variable.attrs.get("long_name", variable.name))
+    units = str(variable.attrs.get("units", "1"))
+    units = "" if units == "1" else units
+    if not variable.dims:
+        return [(label, f"{variable.item():.10g}", units)]
+    (own,) = variable.dims
+    entries = variable[own].values if own in variable.coords else np.arange(variable.size)
+    return [
+        (f"{label}, {own} {entry}", f"{value:.10g}", units)
+        for entry, value in zip(entries, variable.values, strict=True)
+    ]

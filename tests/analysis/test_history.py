@@ -1,0 +1,125 @@
+"""Time histories by diffrax: closed forms, error estimates, drift, lanes that fail."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import drivetrain_jax as dt
+from benchmarks import tripod_reference as oracle
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.sweep.scene import load_scene
+
+NINE_DEGREES = math.radians(9)
+FIXED = {"element": "input", "equation": "25", "beta": NINE_DEGREES}
+TIMES = (0.0, 0.001, 0.004, 0.02)
+# A free linear oscillator; one outside its model (c1 > 1, g < 0); a large swing; the paper's case.
+POINTS = {
+    "chi_n": [0.0, 0.6, 0.3, 0.0026],
+    "zeta": [0.02, 0.02, 0.0016, 0.0073],
+    "phi0": [0.3, math.pi / 2, 0.5, 0.0],
+    "velocity0": [500.0, 0.0, 0.0, 0.0],
+    "M_AEM": [0.0, 2550.0, 2550.0, 2550.0],
+}
+FREE, ENDS, LARGE, PAPER = range(4)
+OUTPUTS = ["phi", "velocity", "phi_error", "velocity_error"]
+
+
+def scene(options: dict, **more: object) -> dict:
+    return {"system": "tripod", "analysis": "history", "outputs": OUTPUTS, "fixed": FIXED, "options": options} | more
+
+
+@pytest.fixture(scope="module")
+def histories():
+    return dt.run(scene({"times": list(TIMES), "rtol": 1e-9}, points=POINTS))
+
+
+def test_free_linear_oscillator_has_its_closed_form(histories):
+    omega, zeta, t = oracle.shaft("input").omega, 0.02, np.array(TIMES)
+    damped = omega * math.sqrt(1 - zeta**2)
+    decay, sine, cosine = np.exp(-zeta * omega * t), np.sin(damped * t), np.cos(damped * t)
+    slope = (500.0 + zeta * omega * 0.3) / damped
+    phi = decay * (0.3 * cosine + slope * sine)
+    velocity = decay * (500.0 * cosine - (zeta * omega * slope + damped * 0.3) * sine)
+    np.testing.assert_allclose(histories.phi[FREE], phi, rtol=0, atol=3e-10)
+    np.testing.assert_allclose(histories.velocity[FREE], velocity, rtol=0, atol=3e-10 * omega)
+
+
+def test_histories_against_scipy(histories):
+    for k in (LARGE, PAPER):
+        start = (POINTS["phi0"][k], 0.0)
+        phi, velocity = oracle.history("25", TIMES, POINTS["zeta"][k], POINTS["chi_n"][k], start=start)
+        size = max(0.5 * start[0], 1e-4)
+        np.testing.assert_allclose(histories.phi[k], phi, rtol=0, atol=3e-9 * size)
+        np.testing.assert_allclose(histories.velocity[k], velocity, rtol=0, atol=3e-9 * size * 1e4)
+
+
+def test_error_estimate_holds_and_is_of_use(histories):
+    for k in (LARGE, PAPER):
+        start = (POINTS["phi0"][k], 0.0)
+        exact = oracle.history("25", TIMES, POINTS["zeta"][k], POINTS["chi_n"][k], start=start)
+        for name, values in zip(("phi", "velocity"), exact, strict=True):
+            error, bound = np.abs(histories[name][k] - values), histories[f"{name}_error"][k]
+            # SciPy's own error, 1e-11 of the size, is the limit of the comparison.
+            assert (error <= bound + 2e-11 * np.abs(values).max()).all()
+            assert bound.max() < 1e-8 * np.abs(values).max()
+            assert bound[-1] > 0
+
+
+def test_one_bad_lane_is_an_outcome_and_spoils_no_other(histories):
+    names = histories.outcome.attrs["flag_meanings"].split()
+    assert [names[i] for i in histories.outcome.values] == ["success", "step_limit", "success", "success"]
+    assert np.isnan(histories.phi[ENDS, 1:]).all()
+    alone = dt.run(
+        scene({"times": list(TIMES), "rtol": 1e-9}, points={name: values[LARGE:] for name, values in POINTS.items()})
+    )
+    np.testing.assert_allclose(alone.phi, histories.phi[LARGE:], rtol=1e-9, atol=1e-15)
+
+
+def check_no_drift(end: float) -> None:
+    """Excitation at 3200 Hz and motor at 300 Hz repeat after 32 strobes: so does the settled motion."""
+    fixed = FIXED | {"equation": "29", "zeta": 0.03, "chi_n": 0.3, "excitation_frequency": 3200.0}
+    options = {"times": [0.5, end], "rtol": 1e-11}
+    ds = dt.run(scene(options, fixed=fixed, outputs=["phi", "velocity"]))
+    assert (end - 0.5) * 3200 % 32 == 0
+    assert float(ds.phi[0]) > 1e-5
+    assert float(ds.phi[1] - ds.phi[0]) == pytest.approx(0, abs=1e-12 * 1e-4)
+    assert float(ds.velocity[1] - ds.velocity[0]) == pytest.approx(0, abs=1e-12 * 1.0)
+
+
+def test_phase_does_not_drift():
+    check_no_drift(0.75)
+
+
+@pytest.mark.full
+def test_phase_does_not_drift_over_51200_strobes():
+    check_no_drift(16.5)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "options.times: missing; allowed is times, or stop and num"),
+        ({"times": [0.1], "stop": 0.2}, "options.stop = 0.2: given together with times"),
+        ({"times": [0.2, 0.1]}, "options.times: allowed are rising times"),
+        ({"times": [-0.1, 0.1]}, r"options.times\[0\] = -0.1: allowed is 0 <= times"),
+        ({"stop": 0.1, "num": 1}, "options.num = 1: allowed is integer 2 <= num"),
+    ],
+)
+def test_times_are_checked(options, message):
+    with pytest.raises(InputError, match=message):
+        load_scene(scene(options, fixed=FIXED | {"zeta": 0.01}))
+
+
+def test_stop_and_num_are_equal_steps():
+    dimension = load_scene(scene({"stop": 0.1, "num": 5}, fixed=FIXED | {"zeta": 0.01})).dimensions[0]
+    assert dimension.values == pytest.approx((0.0, 0.025, 0.05, 0.075, 0.1), rel=1e-15)
+    assert dimension.units == "s"
+
+
+def test_hopelessly_many_strobes_are_not_begun():
+    ds = dt.run(scene({"times": [1e6]}, fixed=FIXED | {"zeta": 0.01}))
+    assert ds.outcome.attrs["flag_meanings"].split()[int(ds.outcome)] == "step_limit"
+    assert np.isnan(ds.phi).all()

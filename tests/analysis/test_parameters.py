@@ -1,0 +1,47 @@
+"""Constants of the elements as a sweep."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+import drivetrain_jax as dt
+from drivetrain_jax.analysis import get_analysis
+
+REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "tripod.json").read_text())
+
+
+def test_every_constant_over_the_joint_angle():
+    rows = REFERENCE["omega_vs_beta"]
+    outputs = [variable.name for variable in get_analysis("parameters").variables]
+    axes = {"beta": {"values": [math.radians(row["beta"]) for row in rows]}}
+    ds = dt.run(
+        {
+            "system": "tripod",
+            "analysis": "parameters",
+            "outputs": outputs,
+            "axes": axes,
+            "fixed": {"element": "output"},
+            "options": {"modes": 5},
+        }
+    )
+    np.testing.assert_allclose(ds.natural_angular_frequency, [row["Omega3"] for row in rows], rtol=1e-12)
+    np.testing.assert_allclose(ds.resonance_frequency, [row["eta3_Hz"] for row in rows], rtol=1e-12)
+    np.testing.assert_allclose(ds.mean_inertia, [row["Ibar3"] for row in rows], rtol=1e-12)
+    expected = REFERENCE["elements9"]["3"]
+    np.testing.assert_allclose(ds.torsional_stiffness[9], expected["kt"], rtol=1e-12)
+    # The midshaft does not know the joint angle, but has a line for each.
+    assert ds.midshaft_frequency.dims == ("beta", "mode")
+    np.testing.assert_allclose(ds.midshaft_frequency, np.tile(REFERENCE["nu_k_Hz"], (10, 1)), rtol=1e-12)
+    assert ds["mode"].values.tolist() == [1, 2, 3, 4, 5]
+    np.testing.assert_allclose(ds.torque_acceleration[9], -4300.254483961879, rtol=1e-12)
+    assert (ds.outcome == 0).all()
+
+
+def test_one_point():
+    point = dt.point("tripod", "parameters", element="input", beta=math.radians(9), modes=2)
+    assert np.isclose(point.natural_angular_frequency, 9633.726700903984, rtol=1e-12)
+    assert len(point.midshaft_frequency) == 2

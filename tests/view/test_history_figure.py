@@ -1,0 +1,75 @@
+"""Figures of histories."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import plot
+
+TIMES = np.linspace(0, 0.01, 101)
+
+
+def history(**axes: list[float]) -> xr.Dataset:
+    """A damped oscillation of 1e-4 rad at 1 kHz, the same at every point."""
+    shape = tuple(len(values) for values in axes.values())
+    angle = 2e3 * np.pi * TIMES
+    phi = np.broadcast_to(1e-4 * np.exp(-100 * TIMES) * np.cos(angle), (*shape, TIMES.size)).copy()
+    dims = (*axes, "time")
+    data = {
+        "phi": (dims, phi, {"units": "rad", "long_name": "twist"}),
+        "velocity": (dims, 5e3 * phi, {"units": "rad/s", "long_name": "rate of twist"}),
+        "outcome": (tuple(axes), np.zeros(shape, "int8")),
+    }
+    coords = {name: (name, values, {"units": "1", "long_name": name}) for name, values in axes.items()}
+    coords["time"] = ("time", TIMES, {"units": "s", "long_name": "time"})
+    attrs = {"analysis": "history", "title": "A twist", "fixed_parameters": json.dumps({"beta": 0.1})}
+    return xr.Dataset(data, coords, attrs)
+
+
+def test_one_history_in_four_panels():
+    dataset = history()
+    figure = plot(dataset)
+    twist, rate, portrait, space = figure.axes
+    assert space.name == "3d"
+    np.testing.assert_array_equal(twist.lines[0].get_ydata(), dataset.phi)
+    np.testing.assert_array_equal(rate.lines[0].get_ydata(), dataset.velocity)
+    np.testing.assert_array_equal(portrait.lines[0].get_xdata(), dataset.phi)
+    np.testing.assert_array_equal(portrait.lines[0].get_ydata(), dataset.velocity)
+    along = space.lines[0].get_data_3d()
+    for found, expected in zip(along, (dataset.phi, dataset.velocity, TIMES), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    texts = [text.get_text() for text in figure.texts]
+    assert {"A twist", r"$\beta$ = 0.1", "(a)", "(b)", "(c)", "(d)"} <= set(texts)
+    assert twist.get_ylabel() == r"$\phi$ [rad]"
+
+
+def test_an_axis_is_a_row_of_panels_for_each_value():
+    figure = plot(history(zeta=[0.01, 0.02]))
+    assert len(figure.axes) == 6
+    labels = [text.get_text() for axes in figure.axes for text in axes.texts]
+    assert labels == [r"$\zeta$ = 0.01", r"$\zeta$ = 0.02"]
+    assert [bool(axes.get_xlabel()) for axes in figure.axes] == [False] * 3 + [True] * 3
+
+
+def test_history_without_values_says_so():
+    dataset = history(zeta=[0.01, 0.02])
+    for name in ("phi", "velocity"):
+        dataset[name][1] = np.nan
+    figure = plot(dataset)
+    texts = [[text.get_text() for text in axes.texts] for axes in figure.axes]
+    assert all("no values" not in panel for panel in texts[:3])
+    assert all("no values" in panel for panel in texts[3:])
+
+
+def test_nothing_to_plot_is_an_input_error():
+    with pytest.raises(InputError, match="velocity missing; the figure needs phi and velocity"):
+        plot(history().drop_vars("velocity"))
+    with pytest.raises(InputError, match="axes = zeta: allowed is one axis of up to 8 values"):
+        plot(history(zeta=np.linspace(0, 1, 9).tolist()))
+    with pytest.raises(InputError, match="axes = zeta, beta: allowed is one axis"):
+        plot(history(zeta=[0.1, 0.2], beta=[0.1, 0.2]))
