@@ -6,7 +6,18 @@ from importlib import import_module
 
 from drivetrain_jax.analysis._base import OUTCOME, RTOL, Analysis, Outcome, Request, Solver
 
-_ANALYSES = {"floquet": "floquet", "forced": "forced"}
+_ANALYSES = {
+    "floquet": "floquet",
+    "forced": "forced",
+    "frequency_response": "frequency_response",
+    "history": "history",
+    "lyapunov": "lyapunov",
+    "poincare": "poincare",
+    "parameters": "parameters",
+    "modes": "modes",
+    "steady_state": "steady_state",
+    "critical_speeds": "critical_speeds",
+}
 
 __all__ = ["OUTCOME", "RTOL", "Analysis", "Outcome", "Request", "Solver", "analysis_names", "get_analysis"]
 

@@ -16,12 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Dimension, Parameter
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.direct import Monodromy, compare, direct_monodromy, stiffness_of
-from drivetrain_jax.analysis.linear_algebra import eigenvalues
+from drivetrain_jax.analysis.direct import compare, direct_monodromy, stiffness_of
+from drivetrain_jax.analysis.floquet_effort import PANEL_COST, explicit_effort, implicit_effort
+from drivetrain_jax.analysis.floquet_results import NEED_ERROR, VARIABLES, results
 from drivetrain_jax.analysis.monodromy import SOLVERS, state_transition
-from drivetrain_jax.analysis.multipliers import VERDICTS, sort_multipliers, spectral_radius_bound, verdict
 from drivetrain_jax.analysis.propagator import (
     EXPLICIT_ORDER,
     IMPLICIT_ORDER,
@@ -29,100 +30,19 @@ from drivetrain_jax.analysis.propagator import (
     explicit_propagator,
     implicit_propagator,
 )
-from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System
+from drivetrain_jax.systems import System
 
-VARIABLES = (
-    Variable("floquet_multiplier", "1", "Floquet multiplier over one period", ("multiplier",), "complex128"),
-    Variable("spectral_radius", "1", "largest modulus of the Floquet multipliers"),
-    Variable("spectral_radius_error", "1", "bound of the absolute error of spectral_radius"),
-    Variable("verdict", "1", "stability of the equilibrium", dtype="int8", flags=VERDICTS),
-    Variable(
-        "liouville_residual", "1", "determinant of the monodromy matrix minus its exact value, over spectral_radius^n"
-    ),
-)
-_NEED_ERROR = {"spectral_radius_error", "verdict"}
-# Below this many explicit steps the implicit scheme is never the cheaper one.
-_STIFF = 600
-# Seconds of one implicit panel over those of one explicit step, per point: 150 in full batches, less in small ones.
-_PANEL_COST = 50.0
-# Beyond these a scheme does not start: the point is left to the other one, or ends as STEP_LIMIT.
-_MAX_EXPLICIT, _MAX_PANELS = 300_000, 20_000
 # The diffrax error is the difference between two tolerances a decade apart, taken as it is (see `compare`).
 _TOLERANCE_GAP = 4.0
-
-
-def _results(z: Monodromy, outputs: tuple[str, ...], rtol: float) -> dict[str, Array]:
-    """The requested variables and the outcome from a monodromy matrix with trailing batch axes."""
-    wanted = set(outputs)
-    finite = jnp.all(jnp.isfinite(z.matrix), axis=(0, 1))
-    real, imaginary = eigenvalues(jnp.where(finite, z.matrix, jnp.nan))
-    size = jnp.exp(z.log_scale)
-    rho = jnp.max(jnp.hypot(real, imaginary), axis=0) * size
-    results = {"spectral_radius": rho}
-    outcome, met = jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE), z.met
-    if "floquet_multiplier" in wanted:
-        results["floquet_multiplier"] = sort_multipliers(real, imaginary) * size
-    if "liouville_residual" in wanted:
-        results["liouville_residual"] = jnp.where(finite, z.residual, jnp.nan)
-    if wanted & _NEED_ERROR:
-        error = spectral_radius_bound(real, imaginary, z.error) * size
-        met = error <= 10 * rtol * rho
-        results |= {"spectral_radius_error": error, "verdict": verdict(rho, error)}
-    outcome = jnp.where(finite & ~met, Outcome.TOLERANCE_NOT_MET, outcome)
-    return {name: results[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}
-
-
-def _frequency_phase(form: LinearPeriodic, size: int) -> np.ndarray:
-    """int max |Im lambda(A(t))| dt over the span for ``size`` points, by Gauss quadrature with 8 nodes."""
-    nodes, weights = np.polynomial.legendre.leggauss(8)
-    phase = np.zeros(size)
-    for x, weight in zip(nodes, weights, strict=True):
-        a = np.asarray(form.matrix((x + 1) * form.span / 2))
-        a = np.broadcast_to(np.moveaxis(a.reshape(*a.shape[:2], -1), -1, 0), (size, *a.shape[:2]))
-        finite = np.isfinite(a).all(axis=(1, 2))
-        frequency = np.abs(np.linalg.eigvals(np.where(finite[:, None, None], a, 0.0)).imag).max(-1)
-        phase += weight * form.span / 2 * np.where(finite, frequency, np.inf)
-    return phase
-
-
-def _generic_steps(form: LinearPeriodic, rtol: float) -> np.ndarray:
-    """Steps of the explicit scheme from the size of A^2 at 16 instants, for systems that predict none."""
-    samples = [np.asarray(form.matrix((k + 0.5) * form.span / 16)) for k in range(16)]
-    rates = [np.sqrt(np.linalg.norm(np.einsum("ij...,jk...->ik...", a, a), axis=(0, 1))) for a in samples]
-    phase = form.span * np.maximum(np.mean(rates, axis=0), np.max(rates, axis=0) / 2)
-    return (4 + 2.5 * phase**1.1) * (1e-9 / rtol) ** (1 / 9)
-
-
-def _explicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
-    model: FloquetModel = system.models["floquet"].build(columns)
-    size = max(np.size(column) for column in columns.values())
-    steps = model.explicit_steps(rtol) if model.explicit_steps else _generic_steps(model.reduced, rtol)
-    # Even, so that the coarse solution has exactly half as many.
-    return np.broadcast_to(2 * np.ceil(steps / 2), size)
-
-
-def _implicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
-    """Panels of the implicit scheme: it must resolve what oscillates, whereas decay costs it nothing."""
-    explicit = _explicit_effort(system, columns, rtol)
-    effort = np.full(explicit.shape, np.inf)
-    stiff = np.flatnonzero(explicit > _STIFF)
-    if stiff.size:
-        chosen = {name: np.broadcast_to(column, explicit.shape)[stiff] for name, column in columns.items()}
-        phase = _frequency_phase(system.models["floquet"].build(chosen).reduced, stiff.size)
-        effort[stiff] = 2 * np.ceil((8 + phase / 5) * (1e-10 / rtol) ** (1 / 16) / 2)
-    return _up_to(_MAX_PANELS, effort)
-
-
-def _up_to(limit: int, effort: np.ndarray) -> np.ndarray:
-    return np.where(effort <= limit, effort, np.inf)
 
 
 def _direct_solvers(system: System, request: Request) -> tuple[Solver, ...]:
     rtol = request.options["rtol"]
 
     def solve(values: Mapping[str, Any], effort: Array, explicit: bool) -> dict[str, Array]:
-        form = system.models["floquet"].build(values).reduced
-        shape = jnp.broadcast_shapes(*(jnp.shape(value) for value in values.values()))
+        model = system.models["floquet"].build(values)
+        form = model.reduced
+        shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in values.values() if not isinstance(x, str)))
 
         def propagate(steps: Array) -> Propagator:
             if explicit:
@@ -131,21 +51,21 @@ def _direct_solvers(system: System, request: Request) -> tuple[Solver, ...]:
 
         order, stiffness = (EXPLICIT_ORDER, 0.0) if explicit else (IMPLICIT_ORDER, stiffness_of(form))
         z = direct_monodromy(form, propagate, effort, shape, stiffness, rtol / 4, order)
-        return _results(z, request.outputs, rtol)
+        return results(z, request.outputs, rtol, model.natural.span)
 
     return (
         Solver(
             "direct: explicit Runge-Kutta of order 8",
             lambda values, effort: solve(values, effort, True),
-            lambda columns: _up_to(_MAX_EXPLICIT, _explicit_effort(system, columns, rtol)),
+            lambda columns: explicit_effort(system, columns, rtol),
             broadcasts=True,
             chunk=512,
         ),
         Solver(
             "direct: Radau IIA of 8 stages",
             lambda values, effort: solve(values, effort, False),
-            lambda columns: _implicit_effort(system, columns, rtol),
-            unit_cost=_PANEL_COST,
+            lambda columns: implicit_effort(system, columns, rtol),
+            unit_cost=PANEL_COST,
             chunk=64,
         ),
     )
@@ -154,7 +74,7 @@ def _direct_solvers(system: System, request: Request) -> tuple[Solver, ...]:
 def _diffrax_solvers(system: System, request: Request) -> tuple[Solver, ...]:
     rtol, atol = request.options["rtol"], request.options["atol"]
     method = getattr(diffrax, request.options["solver"])()
-    needs_error = bool(_NEED_ERROR & set(request.outputs))
+    needs_error = bool(NEED_ERROR & set(request.outputs))
 
     def solve(values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
         form = system.models["floquet"].build(values).natural
@@ -173,15 +93,15 @@ def _diffrax_solvers(system: System, request: Request) -> tuple[Solver, ...]:
         fine, success = propagate(rtol / 10)
         coarse, success_coarse = propagate(rtol) if needs_error else (fine, success)
         z = compare(form, coarse, fine, jnp.zeros(()), 0.0, rtol, _TOLERANCE_GAP)
-        results = _results(z, request.outputs, rtol)
+        found = results(z, request.outputs, rtol, form.span)
         failed = ~(success & success_coarse)
-        return results | {"outcome": jnp.where(failed, jnp.int8(Outcome.STEP_LIMIT), results["outcome"])}
+        return found | {"outcome": jnp.where(failed, jnp.int8(Outcome.STEP_LIMIT), found["outcome"])}
 
     return (
         Solver(
             f"diffrax: {request.options['solver']}",
             solve,
-            lambda columns: np.nan_to_num(_explicit_effort(system, columns, rtol)),
+            lambda columns: np.nan_to_num(explicit_effort(system, columns, rtol)),
             chunk=256,
         ),
     )
@@ -189,6 +109,15 @@ def _diffrax_solvers(system: System, request: Request) -> tuple[Solver, ...]:
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     return (_diffrax_solvers if request.method == "diffrax" else _direct_solvers)(system, request)
+
+
+def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    if "floquet_exponent" in request.outputs and system.time_units != "s":
+        raise InputError(
+            f"outputs: 'floquet_exponent' is a rate in 1/s and the time of {system.name} has no unit; "
+            "allowed is floquet_multiplier"
+        )
+    return (Dimension("multiplier", "Floquet multipliers by falling modulus", ()),)
 
 
 ANALYSIS = Analysis(
@@ -203,5 +132,5 @@ ANALYSIS = Analysis(
         Parameter("solver", "1", "diffrax solver", default="Dopri8", choices=SOLVERS),
     ),
     solvers=_solvers,
-    dimensions=lambda *_: (Dimension("multiplier", "Floquet multipliers by falling modulus", ()),),
+    dimensions=_dimensions,
 )

@@ -25,17 +25,30 @@ from drivetrain_jax.systems._base import (  # noqa: E402
     Resonances,
     System,
 )
+from drivetrain_jax.systems._flow import Flow  # noqa: E402
+from drivetrain_jax.systems._modal import FAMILIES, Block, SpringSystem  # noqa: E402
+from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator  # noqa: E402
+from drivetrain_jax.systems._shaft import Shaft  # noqa: E402
+from drivetrain_jax.systems._smooth import Coordinate, Smoothness  # noqa: E402
 
 ENTRY_POINT_GROUP = "drivetrain_jax.systems"
-_BUILT_IN = ("cardan",)
+_BUILT_IN = ("cardan", "tripod", "rattle", "planetary", "bicardan")
 
 __all__ = [
     "ENTRY_POINT_GROUP",
+    "FAMILIES",
+    "Block",
+    "Coordinate",
     "FloquetModel",
+    "Flow",
     "ForcedModel",
     "LinearPeriodic",
     "Model",
+    "PiecewiseLinearOscillator",
     "Resonances",
+    "Shaft",
+    "Smoothness",
+    "SpringSystem",
     "System",
     "get_system",
     "system_names",

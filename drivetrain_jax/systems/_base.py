@@ -17,6 +17,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._quantities import Parameter
+from drivetrain_jax.systems._smooth import Smoothness
 
 Values = Mapping[str, Any]
 Rows = tuple[tuple[Any, ...], ...]
@@ -58,12 +59,14 @@ class FloquetModel:
     ``natural`` is the system as published, over its full period in its own time; ``reduced`` is an equivalent form
     (same multipliers) that is cheaper or better conditioned. They may be the same object. ``explicit_steps(rtol)``
     predicts, from parameters given as NumPy arrays of shape ``(N,)``, how many steps ``reduced`` needs with the
-    explicit scheme of order 8; None leaves the prediction to the analysis.
+    explicit scheme of order 8; None leaves the prediction to the analysis. ``hamiltonian()`` is true where ``reduced`` is a
+    Hamiltonian system, whose multipliers come in pairs sigma, 1/sigma; None if it never is.
     """
 
     natural: LinearPeriodic
     reduced: LinearPeriodic
     explicit_steps: Callable[[float], np.ndarray] | None = None
+    hamiltonian: Callable[[], Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -87,11 +90,13 @@ class Model:
 
     ``check(fixed)`` raises ``ValueError`` with one line, ``name = value: allowed is ...``, where parameters that are each
     in range do not fit together. ``fixed`` holds those that do not vary; a list is whole also if one entry varies.
+    ``smooth`` tells in which coordinates an atlas of the results is best made; None where there can be none.
     """
 
     build: Callable[[Values], Any]
     parameters: tuple[str, ...]
     check: Callable[[Values], None] | None = None
+    smooth: Smoothness | None = None
 
 
 @dataclass(frozen=True)
@@ -99,7 +104,8 @@ class Resonances:
     """Predicted values of the parameter ``axis`` at which something is expected, to be drawn over charts.
 
     ``values(parameters)`` maps the values of ``parameters`` (scalars or arrays of shape ``(...)``) to an array of
-    shape ``(..., len(labels))``.
+    shape ``(..., len(labels))``. ``multipliers`` says for each label which multiplier meets the unit circle there, ``+1``,
+    ``-1`` or ``pair``, if that is known, and ``up_to(k)`` gives the same predictions for the orders 1 to k.
     """
 
     axis: str
@@ -107,11 +113,16 @@ class Resonances:
     labels: tuple[str, ...]
     values: Callable[[Values], np.ndarray]
     long_name: str
+    multipliers: tuple[str, ...] = ()
+    up_to: Callable[[int], Resonances] | None = None
 
 
 @dataclass(frozen=True)
 class System:
-    """A drivetrain model: see the module's docstring. ``presets`` are named parameter sets of the source."""
+    """A drivetrain model: see the module's docstring. ``presets`` are named parameter sets of the source.
+
+    ``time_units`` is the unit of the time of its equations, ``1`` if that is nondimensional.
+    """
 
     name: str
     title: str
@@ -120,6 +131,7 @@ class System:
     models: Mapping[str, Model]
     presets: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     resonances: Resonances | None = None
+    time_units: str = "1"
 
     def parameter(self, name: str) -> Parameter:
         """The parameter called ``name``; ``KeyError`` if there is none."""

@@ -28,6 +28,7 @@ from drivetrain_jax.systems._base import (
     System,
     Values,
 )
+from drivetrain_jax.systems._smooth import Coordinate, Smoothness
 
 PARAMETERS = (
     Parameter("beta", "rad", "joint angle", lower=-math.pi / 2, upper=math.pi / 2, open_lower=True, open_upper=True),
@@ -221,7 +222,7 @@ def floquet_model(values: Values) -> FloquetModel:
         reversor=REVERSOR,
         log_determinant=exact,
     )
-    return FloquetModel(natural, reduced, lambda rtol: explicit_steps(values, rtol))
+    return FloquetModel(natural, reduced, lambda rtol: explicit_steps(values, rtol), lambda: values["zeta"] == 0)
 
 
 def forced_model(values: Values) -> ForcedModel:
@@ -246,36 +247,66 @@ def natural_frequencies(mu: Any, gamma: Any) -> np.ndarray:
     return np.sqrt(np.stack([mu / gamma / upper, upper], axis=-1))
 
 
-_ORDERS = (1, 2, 3)
-RESONANCE_LABELS = (
-    *(f"H{i}{k}" for i in (1, 2) for k in _ORDERS),
-    *(f"S{i}{k}" for i in (1, 2) for k in _ORDERS),
-    *(f"C+{k}" for k in _ORDERS),
-    *(f"C-{k}" for k in _ORDERS),
-)
+def resonance_speeds(values: Values, orders: int = 3) -> np.ndarray:
+    """Speeds of parametric resonance, eq. (15), up to order ``orders`` of each family, shape ``(..., 6 orders)``.
 
-
-def resonance_speeds(values: Values) -> np.ndarray:
-    """Speeds of parametric resonance, eq. (15), in the order of ``RESONANCE_LABELS``, shape ``(..., 18)``.
-
-    H: omega_i/(2k), S: omega_i/(2k-1), C+-: (omega2 +- omega1)/(2k).
+    H: omega_i/(2k), S: omega_i/(2k-1), C+-: (omega2 +- omega1)/(2k), in the order of the labels of ``resonances``.
     """
     omega = natural_frequencies(values["mu"], values["gamma"])
     one, two = omega[..., 0], omega[..., 1]
-    harmonic = [w / (2 * k) for w in (one, two) for k in _ORDERS]
-    subharmonic = [w / (2 * k - 1) for w in (one, two) for k in _ORDERS]
-    combination = [w / (2 * k) for w in (two + one, two - one) for k in _ORDERS]
+    count = range(1, orders + 1)
+    harmonic = [w / (2 * k) for w in (one, two) for k in count]
+    subharmonic = [w / (2 * k - 1) for w in (one, two) for k in count]
+    combination = [w / (2 * k) for w in (two + one, two - one) for k in count]
     return np.stack([*harmonic, *subharmonic, *combination], axis=-1)
 
+
+def resonances(orders: int = 3) -> Resonances:
+    """The predictions of :func:`resonance_speeds` with their labels (H12: first mode, order 2)."""
+    families = {"H1": "+1", "H2": "+1", "S1": "-1", "S2": "-1", "C+": "pair", "C-": "pair"}
+    return Resonances(
+        "Omega",
+        ("mu", "gamma"),
+        tuple(f"{family}{k}" for family in families for k in range(1, orders + 1)),
+        lambda values: resonance_speeds(values, orders),
+        "predicted parametric resonance",
+        tuple(kind for kind in families.values() for _ in range(orders)),
+        resonances,
+    )
+
+
+RESONANCE_LABELS = resonances().labels
+
+def _inverse_square(x: Any) -> np.ndarray:
+    return 1 / np.asarray(x) ** 2
+
+
+# Phi is entire in 1/Omega, mu, alpha, zeta and 1/sqrt(gamma), and in ln sec(beta) as well: eta has its poles where
+# sin(tau)^2 = 1/sin(beta)^2, which the path of integration can avoid, and cos(beta) = 0 or infinity lies infinitely far off.
+SMOOTH = Smoothness(
+    {
+        "beta": Coordinate(
+            "ln sec(beta)",
+            lambda beta: -np.log1p(-2 * np.sin(np.asarray(beta) / 2) ** 2),
+            lambda x: 2 * np.arcsin(np.sqrt(-np.expm1(-np.asarray(x)) / 2)),
+            np.tan,
+            even=True,
+        ),
+        "Omega": Coordinate(
+            "1/Omega", lambda x: 1 / np.asarray(x), lambda x: 1 / np.asarray(x), lambda x: -_inverse_square(x)
+        ),
+        "gamma": Coordinate(
+            "1/sqrt(gamma)", lambda x: 1 / np.sqrt(x), _inverse_square, lambda x: -0.5 / (np.sqrt(x) * np.asarray(x))
+        ),
+    }
+)
 
 SYSTEM = System(
     name="cardan",
     title="Cardan (Hooke-joint) shaft",
     source="Soltan Rezaee & Ghazavi, Modares Mechanical Engineering 14(12), 2014, 163-170",
     parameters=PARAMETERS,
-    models={"floquet": Model(floquet_model, NAMES), "forced": Model(forced_model, NAMES)},
+    models={"floquet": Model(floquet_model, NAMES, smooth=SMOOTH), "forced": Model(forced_model, NAMES)},
     presets=PRESETS,
-    resonances=Resonances(
-        "Omega", ("mu", "gamma"), RESONANCE_LABELS, resonance_speeds, "predicted parametric resonance"
-    ),
+    resonances=resonances(),
 )

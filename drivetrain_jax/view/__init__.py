@@ -11,19 +11,40 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-_MODULES = {"floquet": "stability", "forced": "response"}
+_MODULES = {
+    "floquet": "stability",
+    "forced": "response",
+    "history": "history",
+    "lyapunov": "lyapunov",
+    "poincare": "poincare",
+    "parameters": "parameters",
+    "modes": "modes",
+    "frequency_response": "frequency_response",
+    "steady_state": "steady_state",
+    "critical_speeds": "critical_speeds",
+}
+# Several results of these analyses may share a figure.
+_OVERLAYS = ("frequency_response",)
 
 __all__ = ["plot"]
 
 
-def plot(dataset: xr.Dataset) -> Figure:
+def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     """The figure that suits the analysis of ``dataset`` (attribute ``analysis``).
 
-    ``floquet`` gives a stability chart, ``forced`` amplitudes of the periodic response. The figure belongs to no
-    window: write it with ``figure.savefig(path)``. Raises :class:`InputError` for an analysis without a figure and
-    for a result in which there is nothing to plot.
+    ``floquet`` gives a stability chart, ``forced`` amplitudes of the periodic response, ``frequency_response`` the
+    response over the frequency, with that of ``others`` (the same analysis by other methods) in the same axes. The
+    figure belongs to no window: write it with ``figure.savefig(path)``. Raises :class:`InputError` for an analysis
+    without a figure, for a result in which there is nothing to plot and for results that cannot share a figure.
     """
     analysis = dataset.attrs.get("analysis")
     if analysis not in _MODULES:
         raise InputError(f"analysis = {analysis!r}: allowed is one of {', '.join(_MODULES)}")
-    return import_module(f"drivetrain_jax.view.{_MODULES[analysis]}").plot(dataset)
+    if others and analysis not in _OVERLAYS:
+        raise InputError(f"analysis = {analysis!r}: several results in one figure; allowed for {', '.join(_OVERLAYS)}")
+    for other in others:
+        if other.attrs.get("analysis") != analysis:
+            raise InputError(
+                f"analysis = {other.attrs.get('analysis')!r}: allowed beside the first result is {analysis}"
+            )
+    return import_module(f"drivetrain_jax.view.{_MODULES[analysis]}").plot(dataset, *others)

@@ -1,0 +1,69 @@
+"""Predicted effort of the two direct solvers of a periodic system, from its parameters alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System
+
+# Below this many explicit steps the implicit scheme is never the cheaper one.
+_STIFF = 600
+# Beyond these a scheme does not start: the point is left to the other one, or ends as STEP_LIMIT.
+_MAX_EXPLICIT, _MAX_PANELS = 300_000, 20_000
+# Seconds of one implicit panel over those of one explicit step, per point: 150 in full batches, less in small ones.
+PANEL_COST = 50.0
+
+
+def explicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
+    """Steps of the explicit scheme, ``(N,)``; inf where there would be too many."""
+    return _up_to(_MAX_EXPLICIT, _explicit_steps(system, columns, rtol))
+
+
+def implicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
+    """Panels of the implicit scheme, ``(N,)``: it must resolve what oscillates, whereas decay costs it nothing."""
+    explicit = _explicit_steps(system, columns, rtol)
+    effort = np.full(explicit.shape, np.inf)
+    stiff = np.flatnonzero(explicit > _STIFF)
+    if stiff.size:
+        chosen = {
+            name: column if isinstance(column, str) else np.broadcast_to(column, explicit.shape)[stiff]
+            for name, column in columns.items()
+        }
+        phase = _frequency_phase(system.models["floquet"].build(chosen).reduced, stiff.size)
+        effort[stiff] = 2 * np.ceil((8 + phase / 5) * (1e-10 / rtol) ** (1 / 16) / 2)
+    return _up_to(_MAX_PANELS, effort)
+
+
+def _explicit_steps(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
+    model: FloquetModel = system.models["floquet"].build(columns)
+    size = max(np.size(column) for column in columns.values())
+    steps = model.explicit_steps(rtol) if model.explicit_steps else _generic_steps(model.reduced, rtol)
+    # Even, so that the coarse solution has exactly half as many.
+    return np.broadcast_to(2 * np.ceil(steps / 2), size)
+
+
+def _frequency_phase(form: LinearPeriodic, size: int) -> np.ndarray:
+    """int max |Im lambda(A(t))| dt over the span for ``size`` points, by Gauss quadrature with 8 nodes."""
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    phase = np.zeros(size)
+    for x, weight in zip(nodes, weights, strict=True):
+        a = np.asarray(form.matrix((x + 1) * form.span / 2))
+        a = np.broadcast_to(np.moveaxis(a.reshape(*a.shape[:2], -1), -1, 0), (size, *a.shape[:2]))
+        finite = np.isfinite(a).all(axis=(1, 2))
+        frequency = np.abs(np.linalg.eigvals(np.where(finite[:, None, None], a, 0.0)).imag).max(-1)
+        phase += weight * form.span / 2 * np.where(finite, frequency, np.inf)
+    return phase
+
+
+def _generic_steps(form: LinearPeriodic, rtol: float) -> np.ndarray:
+    """Steps of the explicit scheme from the size of A^2 at 16 instants, for systems that predict none."""
+    samples = [np.asarray(form.matrix((k + 0.5) * form.span / 16)) for k in range(16)]
+    rates = [np.sqrt(np.linalg.norm(np.einsum("ij...,jk...->ik...", a, a), axis=(0, 1))) for a in samples]
+    phase = form.span * np.maximum(np.mean(rates, axis=0), np.max(rates, axis=0) / 2)
+    return (4 + 2.5 * phase**1.1) * (1e-9 / rtol) ** (1 / 9)
+
+
+def _up_to(limit: int, effort: np.ndarray) -> np.ndarray:
+    return np.where(effort <= limit, effort, np.inf)

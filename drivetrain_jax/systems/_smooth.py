@@ -1,0 +1,42 @@
+"""In which variables the results of a model are smooth: what a system declares for its atlas."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+Function = Callable[[Any], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """A monotone function of one parameter in which polynomials converge fast; NumPy functions of arrays.
+
+    ``forward`` maps the parameter to the coordinate, ``inverse`` back, ``slope`` is the derivative of ``forward``. If
+    ``even``, both signs of the parameter give the same coordinate (and results), and ``inverse`` the positive one.
+    """
+
+    name: str
+    forward: Function
+    inverse: Function
+    slope: Function
+    even: bool = False
+
+
+def identity(name: str) -> Coordinate:
+    """The parameter ``name`` itself."""
+    return Coordinate(name, np.asarray, np.asarray, lambda x: np.ones_like(np.asarray(x, float)))
+
+
+@dataclass(frozen=True)
+class Smoothness:
+    """Coordinates by parameter in which the results of a model are smooth; one that is missing is its own coordinate."""
+
+    coordinates: Mapping[str, Coordinate]
+
+    def coordinate(self, parameter: str) -> Coordinate:
+        """The coordinate of ``parameter``."""
+        return self.coordinates.get(parameter) or identity(parameter)

@@ -1,0 +1,124 @@
+"""Physical data of a cardan shaft in SI and workshop units, converted to the nondimensional parameters of ``cardan``.
+
+    Omega = Omega0 sqrt(J1/k1), zeta = c1/(2 sqrt(k1 J1)), alpha = c2/c1, mu = k2/k1, gamma = J2/J1     eq. (7)
+
+Source: docs/theory/cardan.md. With c1 = 0 alpha has no meaning; it is then 0, and c2 must be 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Parameter
+
+PHYSICAL = (
+    Parameter("J1", "kg m^2", "inertia of the driving disk", lower=0.0, open_lower=True),
+    Parameter("J2", "kg m^2", "inertia of the driven disk", lower=0.0, open_lower=True),
+    Parameter("k1", "N m/rad", "stiffness of the driving shaft", lower=0.0, open_lower=True),
+    Parameter("k2", "N m/rad", "stiffness of the driven shaft", lower=0.0, open_lower=True),
+    Parameter("c1", "N m s/rad", "damping of the driving shaft", lower=0.0),
+    Parameter("c2", "N m s/rad", "damping of the driven shaft", lower=0.0),
+    Parameter("speed", "rpm", "speed of the driving shaft", lower=0.0, open_lower=True),
+    Parameter("angle", "deg", "joint angle", lower=-90.0, upper=90.0, open_lower=True, open_upper=True),
+)
+_RPM = 2 * math.pi / 60
+
+
+@dataclass(frozen=True)
+class PhysicalShaft:
+    """A cardan shaft in physical units: J in kg m^2, k in N m/rad, c in N m s/rad.
+
+    Raises :class:`~drivetrain_jax.InputError` for a value out of range.
+    """
+
+    J1: float
+    J2: float
+    k1: float
+    k2: float
+    c1: float
+    c2: float
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            _check(field.name, getattr(self, field.name))
+        if self.c1 == 0 and self.c2 != 0:
+            raise InputError(f"c2 = {self.c2!r}: allowed is 0 if c1 = 0 (alpha = c2/c1)")
+
+    @property
+    def base_frequency(self) -> float:
+        """sqrt(k1/J1), rad/s: the unit of Omega."""
+        return math.sqrt(self.k1 / self.J1)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """zeta, alpha, mu and gamma."""
+        return {
+            "zeta": self.c1 / (2 * math.sqrt(self.k1 * self.J1)),
+            "alpha": self.c2 / self.c1 if self.c1 else 0.0,
+            "mu": self.k2 / self.k1,
+            "gamma": self.J2 / self.J1,
+        }
+
+    def at(self, speed: float, angle: float) -> dict[str, float]:
+        """All six parameters at ``speed`` in rpm and ``angle`` in degrees."""
+        return {"beta": self.beta(angle), "Omega": self.omega(speed), **self.parameters}
+
+    def omega(self, speed: float) -> float:
+        """Omega of a speed in rpm."""
+        return _check("speed", speed) * _RPM / self.base_frequency
+
+    def beta(self, angle: float) -> float:
+        """beta of an angle in degrees."""
+        return math.radians(_check("angle", angle))
+
+    def speed(self, omega: float) -> float:
+        """Speed in rpm of a value of Omega."""
+        return omega * self.base_frequency / _RPM
+
+    def angle(self, beta: float) -> float:
+        """Angle in degrees of a value of beta."""
+        return math.degrees(beta)
+
+    def damping(self, zeta: float) -> float:
+        """c1 in N m s/rad of a value of zeta."""
+        return zeta * 2 * math.sqrt(self.k1 * self.J1)
+
+    def table(self, speed: float | None = None, angle: float | None = None) -> str:
+        """What was given and what it becomes, line by line with units."""
+        given = {field.name: getattr(self, field.name) for field in fields(self)}
+        given |= {name: value for name, value in (("speed", speed), ("angle", angle)) if value is not None}
+        formulas = {"zeta": "c1/(2 sqrt(k1 J1))", "alpha": "c2/c1", "mu": "k2/k1", "gamma": "J2/J1"}
+        results: dict[str, float] = dict(self.parameters)
+        if speed is not None:
+            results["Omega"] = self.omega(speed)
+            formulas["Omega"] = "speed (2 pi/60)/sqrt(k1/J1)"
+        if angle is not None:
+            results["beta"] = self.beta(angle)
+            formulas["beta"] = "angle pi/180, rad"
+        lines = [f"{p.name:>5} = {given[p.name]:.10g} {p.units}" for p in PHYSICAL if p.name in given]
+        lines += [f"{name:>5} = {value:.10g}  ({formulas[name]})" for name, value in results.items()]
+        return "\n".join(lines)
+
+
+def from_physical(values: Mapping[str, float]) -> dict[str, float]:
+    """The six parameters of ``cardan`` from the eight of ``PHYSICAL`` by name.
+
+    Raises :class:`~drivetrain_jax.InputError` for a name that is missing, unknown or out of range.
+    """
+    names = [p.name for p in PHYSICAL]
+    for name in [*values, *names]:
+        if name not in names or name not in values:
+            raise InputError(f"{name} = {values.get(name)!r}: allowed are all of {', '.join(names)} and no others")
+    shaft = PhysicalShaft(*(values[name] for name in names[:6]))
+    return shaft.at(values["speed"], values["angle"])
+
+
+def _check(name: str, value: float) -> float:
+    parameter = next(p for p in PHYSICAL if p.name == name)
+    try:
+        return float(parameter.check(value))
+    except ValueError as error:
+        raise InputError(str(error)) from None
