@@ -1,0 +1,223 @@
+"""Lyapunov spectra by the variational equations, with everything that tells how far to trust them, and a verdict.
+
+Exponents in natural logarithms per second, in falling order; phases of the flow are left out (their exponents are zero
+whatever happens). The paper's own estimator is offered beside them under its own name.
+
+Outcome: ``SUCCESS``, or ``TOLERANCE_NOT_MET`` if the standard error is above the target at ``max_time``. A motion that
+leaves all bounds is data: its verdict says so, and its exponents are those of the time before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.growth import SEGMENTS, SETTLED, Record, block_mean, record_growth, running_mean, sampled
+from drivetrain_jax.analysis.paper_estimator import paper_estimator
+from drivetrain_jax.analysis.section_measures import period_multiple
+from drivetrain_jax.analysis.variational import batch_shape, divergence, initial_state
+from drivetrain_jax.analysis.verdict import STANDARD_ERRORS, Evidence, Verdict, grows, judge
+from drivetrain_jax.analysis.zero_one_test import largest_k01
+from drivetrain_jax.systems import Flow, System
+
+VARIABLES = (
+    Variable("lyapunov_spectrum", "s-1", "Lyapunov exponent", ("exponent",)),
+    Variable("lyapunov_standard_error", "s-1", "standard error of the exponent, from block means", ("exponent",)),
+    Variable("lyapunov_history", "s-1", "exponent had the run ended here", ("segment", "exponent")),
+    Variable("step_change", "s-1", "change of the exponent when the step is halved", ("exponent",)),
+    Variable("sum_rule_residual", "s-1", "sum of the exponents minus the mean divergence"),
+    Variable("averaging_time", "s", "time over which the exponents are averaged, transient excluded"),
+    Variable("paper_estimator", "s-1", "the paper's (31)-(36) as printed, not a Lyapunov exponent", ("component",)),
+    Variable("chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic"),
+    Variable("period_multiple", "1", "strobes after which the motion repeats, 0 if it does not", dtype="int32"),
+    Variable("verdict", "1", "kind of motion", dtype="int8", flags=tuple(v.name.lower() for v in Verdict)),
+)
+OPTIONS = (
+    Parameter("standard_error", "s-1", "standard error at which a run may end", default=0.0, lower=0.0),
+    Parameter("max_time", "s", "longest time of a run", default=1.0, lower=0.0, open_lower=True),
+    Parameter("steps", "1", "integration steps per strobe", default=48, lower=4, integer=True),
+)
+# Strobes that follow the run for the verdict and the 0-1 test, and the longest period looked for among them.
+SAMPLES, LONGEST = 1024, 512
+_SECTION = {"verdict", "chaos_k01", "period_multiple"}
+_TWO_STEPS = {"verdict", "step_change"}
+# Repetition is judged to this fraction of the motion, or to what is left of the transient if that is more; undecided
+# beyond the second.
+_REPEATED, _UNSETTLED = 1e-9, 1e-4
+_CHUNK = 512
+
+
+class Spectrum(NamedTuple):
+    """Exponents in falling order and their errors, ``(m, ...)``; ``order``: place of each in the record."""
+
+    values: Array
+    errors: Array
+    order: Array
+
+
+def spectrum_of(record: Record) -> Spectrum:
+    """Exponents after the transient. Of a motion that left: means over what there is, errors NaN."""
+    values, errors = block_mean(record.growth, record.used, record.span)
+    partial_mean = running_mean(record.growth, record.used, record.span)
+    last = jnp.arange(SEGMENTS).reshape(-1, *(1,) * values.ndim) == record.used - 1
+    until = jnp.sum(jnp.where(last, partial_mean, 0.0), axis=0)
+    until = jnp.where(record.used > 0, until, jnp.nan)
+    values = jnp.where(record.bounded, values, until)
+    errors = jnp.where(record.bounded, errors, jnp.nan)
+    order = jnp.argsort(-values, axis=0)
+    return Spectrum(*(jnp.take_along_axis(x, order, axis=0) for x in (values, errors)), order)
+
+
+def sum_rule_residual(record: Record, spectrum: Spectrum) -> Array:
+    """Sum of the exponents minus the divergence averaged over the same time; the phases add nothing to either."""
+    mean, _ = block_mean(record.contraction[:, None], record.used, record.span)
+    return jnp.where(record.bounded, jnp.sum(spectrum.values, axis=0) - mean[0], jnp.nan)
+
+
+class Run(NamedTuple):
+    """Records with the step and with twice the step (the latter only where it was asked for)."""
+
+    fine: Record
+    coarse: Record
+
+
+def run_twice(flow: Flow, steps: int, max_time: float, target: float, check: bool | None) -> Run:
+    """The growth with ``steps`` and ``steps // 2`` per strobe; ``check``: run the latter always, never, or (None) for
+    members whose largest exponent is positive beyond its error. One compiled loop serves both."""
+
+    def one(active: Array, steps: Array) -> tuple[Array, Record]:
+        record = record_growth(flow, steps, max_time, target, active)
+        found = spectrum_of(record)
+        candidate = record.bounded & (found.values[0] > STANDARD_ERRORS * found.errors[0])
+        return candidate if check is None else jnp.full_like(candidate, check), record
+
+    start = jnp.ones(batch_shape(flow), bool)
+    count = 1 if check is False else 2
+    _, both = jax.lax.scan(one, start, jnp.array([steps, max(steps // 2, 1)][:count]))
+    return Run(*(jax.tree.map(lambda x, i=i: x[i], both) for i in (0, count - 1)))
+
+
+class Sampling(NamedTuple):
+    """What the strobes after a run show: K of the 0-1 test, the period in strobes, and whether it could be told."""
+
+    k01: Array
+    multiple: Array
+    settled: Array
+
+
+def sample(flow: Flow, steps: int, record: Record, spectrum: Spectrum, k01_for: Array) -> Sampling:
+    """Follow the motion for ``SAMPLES`` strobes; K only if a member of ``k01_for`` needs it, otherwise 0."""
+    states, _ = sampled(flow, steps, record.state, record.strobe, SAMPLES)
+    watched = [i for i in range(flow.size) if i not in (*flow.phases, *flow.cyclic)] or [0]
+    section = states[:, jnp.array(watched)]
+    k01 = jax.lax.cond(jnp.any(k01_for), largest_k01, lambda x: jnp.zeros(x.shape[2:]), section)
+    duration = (record.strobe + SAMPLES // 2) * flow.period
+    left = 10 * jnp.exp(jnp.minimum(spectrum.values[0], 0.0) * duration)
+    decayed = left < _UNSETTLED
+    tolerance = jnp.where(decayed, jnp.maximum(left, _REPEATED), _REPEATED)
+    good = record.bounded & jnp.all(jnp.isfinite(section), axis=(0, 1))
+    multiple = jnp.where(good, period_multiple(section, tolerance, LONGEST), 0)
+    return Sampling(jnp.where(good, k01, jnp.nan), multiple, decayed | (multiple > 0))
+
+
+def evidence_of(flow: Flow, run: Run, spectrum: Spectrum, residual: Array, seen: Sampling) -> Evidence:
+    """What :func:`judge` asks for."""
+    fine, coarse = run.fine, spectrum_of(run.coarse)
+    growing = grows(fine.size, fine.used, fine.span, spectrum.values[0])
+    return Evidence(
+        spectrum.values, spectrum.errors, coarse.values[0], coarse.errors[0], jnp.abs(residual), seen.k01,
+        fine.bounded, growing, seen.multiple, seen.settled,
+    )  # fmt: skip
+
+
+def _solve(system: System, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+    """All requested results of a batch, its axis last; ``effort`` only orders the batches."""
+    del effort
+    return analyse(system.models["lyapunov"].build(values), request)
+
+
+def analyse(flow: Flow, request: Request) -> dict[str, Array]:
+    """The requested results of ``flow`` and ``outcome``, the batch as last axis."""
+    wanted, options = set(request.outputs), request.options
+    steps, max_time, target = options["steps"], options["max_time"], options["standard_error"]
+    results: dict[str, Array] = {}
+    if "paper_estimator" in wanted:
+        results["paper_estimator"] = paper_estimator(flow, steps, max_time)
+    if wanted == {"paper_estimator"}:
+        finite = jnp.all(jnp.isfinite(results["paper_estimator"]), axis=0)
+        return results | {"outcome": jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE).astype(jnp.int8)}
+    check = True if "step_change" in wanted else None if "verdict" in wanted else False
+    run = run_twice(flow, steps, max_time, target, check)
+    spectrum = spectrum_of(run.fine)
+    residual = sum_rule_residual(run.fine, spectrum)
+    results |= _of_spectrum(run, spectrum, residual)
+    if wanted & _SECTION:
+        positive = spectrum.values[0] > STANDARD_ERRORS * spectrum.errors[0]
+        seen = sample(flow, steps, run.fine, spectrum, jnp.ones_like(positive) if "chaos_k01" in wanted else positive)
+        results["verdict"] = judge(evidence_of(flow, run, spectrum, residual, seen), autonomous=not flow.turns)
+        results |= {"chaos_k01": seen.k01, "period_multiple": seen.multiple.astype(jnp.int32)}
+    met = (target == 0) | ~run.fine.bounded | (jnp.max(spectrum.errors, axis=0) <= target)
+    outcome = jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
+    return {name: results[name] for name in request.outputs} | {"outcome": outcome.astype(jnp.int8)}
+
+
+def _of_spectrum(run: Run, spectrum: Spectrum, residual: Array) -> dict[str, Array]:
+    """Results that follow from the records of growth."""
+    fine = run.fine
+    history = running_mean(fine.growth, fine.used, fine.span)
+    return {
+        "lyapunov_spectrum": spectrum.values,
+        "lyapunov_standard_error": spectrum.errors,
+        "lyapunov_history": jnp.take_along_axis(history, spectrum.order[None], axis=1),
+        "step_change": spectrum.values - spectrum_of(run.coarse).values,
+        "sum_rule_residual": residual,
+        "averaging_time": averaging_time(fine),
+    }
+
+
+def averaging_time(record: Record) -> Array:
+    """Duration of the blocks that are averaged, shape (...)."""
+    size = jnp.maximum((record.used - record.used // 4) // 12, 1)
+    return jnp.where(record.bounded, 12 * size * record.span, jnp.nan)
+
+
+def _effort(system: System, request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Predicted steps, shape (N,): those of a whole run, or up to where the mean contraction has settled the motion."""
+    flow, options = system.models["lyapunov"].build(columns), request.options
+    longest = options["max_time"]
+    rate = -np.asarray(divergence(flow, flow.angles(0, 0.0), initial_state(flow))) / flow.size
+    settling = SETTLED / np.maximum(rate, SETTLED / longest) if options["standard_error"] > 0 else longest
+    return np.ceil(options["steps"] * np.clip(settling, longest / 4, longest) / np.asarray(flow.period))
+
+
+def _dimensions(*_: Any) -> tuple[Dimension, ...]:
+    return (
+        Dimension("exponent", "number of the exponent, from the largest", ()),
+        Dimension("segment", "part of max_time", tuple(range(1, SEGMENTS + 1))),
+        Dimension("component", "component of the difference: state, then strobe clock", ()),
+    )
+
+
+def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+    solve, effort = partial(_solve, system, request), partial(_effort, system, request)
+    return (Solver("tangent", solve, effort, broadcasts=True, chunk=_CHUNK),)
+
+
+ANALYSIS = Analysis(
+    name="lyapunov",
+    title="Lyapunov spectrum",
+    variables=VARIABLES,
+    default_outputs=("lyapunov_spectrum", "lyapunov_standard_error", "sum_rule_residual", "verdict"),
+    methods={"benettin": tuple(option.name for option in OPTIONS)},
+    options=OPTIONS,
+    solvers=_solvers,
+    dimensions=_dimensions,
+)

@@ -1,0 +1,159 @@
+"""Poincare sections: the state at every strobe, 50,000 strobes and more, and what tells a curve from a cloud.
+
+Time is a counted strobe plus a fraction of it, so that the angles of the clocks do not drift. The method ``fixed`` takes
+equal steps of order 8. The method ``adaptive`` is there to show what a loose tolerance does: the pair of Dormand &
+Prince of orders 5 and 4 with the control of ``rtol`` and ``atol`` that is usual for it.
+
+Outcome: ``NOT_FINITE`` if the state overflowed: what came before is kept. ``STEP_LIMIT``: the adaptive method needed too
+many steps within a strobe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.growth import discarded, sampled
+from drivetrain_jax.analysis.section_measures import period_multiple, torus_residual
+from drivetrain_jax.analysis.variational import batch_shape
+from drivetrain_jax.analysis.zero_one_test import largest_k01
+from drivetrain_jax.systems import Flow, System
+
+VARIABLES = (
+    Variable("section", "rad, rad s-1", "state at the strobes", ("strobe", "state")),
+    Variable("torus_residual", "1", "largest distance from a smooth curve, over the largest value", ("state",)),
+    Variable("distinct_points", "1", "distinct points of the section, 0 if it does not repeat", dtype="int32"),
+    Variable("chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic"),
+)
+OPTIONS = (
+    Parameter("strobes", "1", "points of the section", default=5000, lower=128, integer=True),
+    Parameter("discard", "1", "strobes before the first point", default=5000, lower=0, integer=True),
+    Parameter("steps", "1", "integration steps per strobe", default=48, lower=4, integer=True),
+    Parameter("rtol", "1", "relative tolerance of a step", default=1e-3, lower=1e-14, upper=1e-1),
+    Parameter("atol", "1", "absolute tolerance of a step", default=1e-6, lower=0.0, open_lower=True),
+)
+# Points closer than this, over the largest value, are one; periods up to this are looked for.
+_DISTINCT, _LONGEST = 1e-9, 8192
+_SAMPLES = 2000
+_MAX_STEPS = 4096
+# Numbers of a chunk's sections, and points of a chunk at most.
+_NUMBERS, _CHUNK = 1 << 23, 512
+Section = tuple[Array, Array]
+
+
+def fixed_section(flow: Flow, request: Request) -> Section:
+    """States at the strobes, shape ``(strobes, n, ...)``, and the outcome, by equal steps."""
+    steps, first = request.options["steps"], request.options["discard"]
+    state = discarded(flow, steps, first)
+    states, _ = sampled(flow, steps, state, jnp.int64(first), request.options["strobes"])
+    return states, jnp.full(states.shape[2:], Outcome.SUCCESS, jnp.int8)
+
+
+def adaptive_section(flow: Flow, request: Request) -> Section:
+    """The same of one point by the adaptive pair; every strobe is the end of a step."""
+    rtol, atol, first = (request.options[name] for name in ("rtol", "atol", "discard"))
+    controller = diffrax.PIDController(rtol=rtol, atol=atol)
+
+    def advance(carry: tuple, strobe: Array) -> tuple:
+        y, well = carry
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda s, y, _: flow.period * flow.vector(strobe, s, y)),
+            diffrax.Dopri5(), 0.0, 1.0, None, y,
+            stepsize_controller=controller, saveat=diffrax.SaveAt(t1=True), max_steps=_MAX_STEPS, throw=False,
+        )  # fmt: skip
+        y = solution.ys[0]
+        return y, well & (solution.result == diffrax.RESULTS.successful)
+
+    start = (jnp.stack([jnp.asarray(x, float) for x in flow.start]), jnp.bool_(True))
+    carry = jax.lax.fori_loop(0, first, lambda k, c: advance(c, k), start)
+
+    def keep(carry: tuple, strobe: Array) -> tuple:
+        carry = advance(carry, strobe)
+        return carry, carry[0]
+
+    (_, well), states = jax.lax.scan(keep, carry, first + jnp.arange(request.options["strobes"]))
+    return states, jnp.where(well, Outcome.SUCCESS, Outcome.STEP_LIMIT).astype(jnp.int8)
+
+
+def measures(flow: Flow, states: Array, request: Request) -> dict[str, Array]:
+    """Torus residual, distinct points and K of the section ``states``, as far as they are requested."""
+    results: dict[str, Array] = {}
+    watched = jnp.array([i for i in range(flow.size) if i not in (*flow.phases, *flow.cyclic)] or [0])
+    if "torus_residual" in request.outputs:
+        strobes = request.options["discard"] + 1 + jnp.arange(len(states))
+        results["torus_residual"] = torus_residual(states, _angle(flow, strobes))
+    if "distinct_points" in request.outputs:
+        longest = min(_LONGEST, len(states) // 2)
+        found = period_multiple(states[:, watched], jnp.float64(_DISTINCT), longest)
+        results["distinct_points"] = found.astype(jnp.int32)
+    if "chaos_k01" in request.outputs:
+        results["chaos_k01"] = largest_k01(states[-_SAMPLES:, watched])
+    return results
+
+
+def _angle(flow: Flow, strobes: Array) -> Array | None:
+    """Angle of the first clock that does not define the strobe, shape ``(T, ...)``; None if there is none."""
+    others = [i for i, turns in enumerate(flow.turns) if not isinstance(turns, int)]
+    if not others:
+        return None
+    column = strobes.reshape(-1, *(1,) * len(batch_shape(flow)))
+    angle = jnp.asarray(flow.angles(column, 0.0)[others[0]])
+    return jnp.broadcast_to(angle, (len(strobes), *batch_shape(flow)))
+
+
+def _solve(system: System, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+    """All requested results, the batch (if any) as last axis; ``effort`` only orders the batches."""
+    del effort
+    flow: Flow = system.models["poincare"].build(values)
+    section = adaptive_section if request.method == "adaptive" else fixed_section
+    states, outcome = section(flow, request)
+    results = measures(flow, states, request)
+    scale = jnp.stack(
+        [jnp.broadcast_to(jnp.asarray(s, float), states.shape[2:]) for s in flow.scale or (1.0,) * flow.size]
+    )
+    finite = jnp.all(jnp.isfinite(states), axis=(0, 1))
+    results["section"] = jnp.where(jnp.isfinite(states), states, jnp.nan) * scale
+    outcome = jnp.where(finite, outcome, jnp.maximum(outcome, Outcome.NOT_FINITE)).astype(jnp.int8)
+    return {name: results[name] for name in request.outputs} | {"outcome": outcome}
+
+
+def _effort(request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Strobes, shape (N,)."""
+    count = np.broadcast(*jax.tree.leaves({k: v for k, v in columns.items() if not isinstance(v, str)})).size
+    return np.full(count, request.options["strobes"] + request.options["discard"])
+
+
+def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+    solve, effort = partial(_solve, system, request), partial(_effort, request)
+    if request.method == "adaptive":
+        return (Solver("adaptive", solve, effort, chunk=16),)
+    chunk = max(1, min(_CHUNK, _NUMBERS // (2 * request.options["strobes"])))
+    return (Solver("fixed", solve, effort, broadcasts=True, chunk=chunk),)
+
+
+def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    first, count = (request.options[name] for name in ("discard", "strobes"))
+    strobes = Dimension("strobe", "number of the strobe", tuple(range(first + 1, first + count + 1)))
+    return (strobes, Dimension("state", "twist, then rate of twist", ()))
+
+
+_COMMON = ("strobes", "discard")
+ANALYSIS = Analysis(
+    name="poincare",
+    title="Poincare section",
+    variables=VARIABLES,
+    default_outputs=("section",),
+    methods={"fixed": (*_COMMON, "steps"), "adaptive": (*_COMMON, "rtol", "atol")},
+    options=OPTIONS,
+    solvers=_solvers,
+    dimensions=_dimensions,
+)

@@ -1,0 +1,165 @@
+"""Figures of the analysis ``lyapunov``: spectra with their errors, how they converge, and what kind of motion it is."""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import cells
+from drivetrain_jax.view.layout import Margins, Panels
+from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, axis_label, value_text, variable_label
+
+# In the order of the flags of the verdict; lightness falls from regular to irregular, undecided is grey.
+KIND_COLOURS = ("#ffffff", "#cfe3f3", "#7fb2d9", "#d1771e", "#5b1020", "#b0b0b0")
+_COLOURS = (*LINE_COLOURS, "#3f8f5f", "#7a4fa0", "#999933", "#333333")
+_HEIGHT = 1.9
+_CURVES = ("lyapunov_spectrum", "paper_estimator", "sum_rule_residual", "chaos_k01")
+_MOST_COLUMNS = 4
+
+
+def plot(dataset: xr.Dataset) -> Figure:
+    """The exponents over one axis, over two axes as maps (a third one of up to four values as columns), or over time.
+
+    Over one axis: spectrum with bands of three standard errors, the paper's estimator, the sum rule's residual and K,
+    as far as they are stored, with the verdict as a coloured strip. For a single point the convergence history. Raises
+    :class:`InputError` if there is nothing of that.
+    """
+    with matplotlib.rc_context(STYLE):
+        dataset = cells.prepare(dataset)
+        names = cells.sweep_axes(dataset)
+        if not names:
+            return _convergence(dataset)
+        if len(names) == 1 and any(name in dataset for name in _CURVES):
+            return _curves(dataset, names[0])
+        columns = [name for name in names if dataset.sizes[name] <= _MOST_COLUMNS]
+        if len(names) == 2 or (len(names) == 3 and columns):
+            return _maps(dataset, names, columns[-1] if len(names) == 3 else None)
+        raise InputError(
+            f"axes = {', '.join(names)}: allowed are one or two axes, or a third one of up to {_MOST_COLUMNS} values"
+        )
+
+
+def _convergence(dataset: xr.Dataset) -> Figure:
+    if "lyapunov_history" not in dataset:
+        raise InputError("outputs: lyapunov_history missing; the figure of a single point shows how it converges")
+    panels = Panels(height=3.0, margins=Margins(right=0.3))
+    axes = panels.axes[0][0]
+    history = dataset["lyapunov_history"]
+    handles: list[Artist] = []
+    for k in range(history.sizes["exponent"]):
+        handles += axes.plot(history["segment"], history.isel(exponent=k), color=_COLOURS[k], label=f"$L_{{{k + 1}}}$")
+        if "lyapunov_standard_error" in dataset:
+            last, error = history.isel(exponent=k).dropna("segment"), dataset["lyapunov_standard_error"][k].item()
+            if last.size:
+                axes.axhspan(last[-1] - 3 * error, last[-1] + 3 * error, color=_COLOURS[k], alpha=0.15, linewidth=0)
+    axes.set_xlim(0, history.sizes["segment"])
+    panels.label_row(axes, variable_label(history))
+    panels.label_axes(f"{axis_label(history['segment'])}; band: three standard errors")
+    panels.titles(dataset)
+    panels.legend(handles)
+    return panels.figure
+
+
+def _curves(dataset: xr.Dataset, name: str) -> Figure:
+    shown = [key for key in _CURVES if key in dataset]
+    panels = Panels(len(shown), height=_HEIGHT, margins=Margins(right=0.3, left=1.0), share_y=False)
+    handles: list[Artist] = []
+    for (axes,), key in zip(panels.axes, shown, strict=True):
+        _draw_curves(axes, dataset, key, name)
+        axes.axhline(0, color=FRAME_GREY, linewidth=0.6, zorder=0)
+        panels.label_row(axes, variable_label(dataset[key]))
+        if key == "lyapunov_spectrum" and "verdict" in dataset:
+            handles = _verdict_strip(axes, dataset, name)
+    cells.fit_axis(panels.axes[0][0], "x", dataset[name].values)
+    panels.label_axes(axis_label(dataset[name]))
+    panels.titles(dataset)
+    panels.legend(handles)
+    return panels.figure
+
+
+def _draw_curves(axes: Axes, dataset: xr.Dataset, key: str, name: str) -> None:
+    variable = dataset[key]
+    own = [dim for dim in variable.dims if dim != name]
+    x = dataset[name].values
+    for k in range(variable.sizes[own[0]] if own else 1):
+        values = variable.isel({own[0]: k}).values if own else variable.values
+        axes.plot(x, values, color=_COLOURS[k], marker=".", markersize=2.5, label=f"{k + 1}" if own else None)
+        if key == "lyapunov_spectrum" and "lyapunov_standard_error" in dataset:
+            band = 3 * dataset["lyapunov_standard_error"].isel({own[0]: k}).values
+            axes.fill_between(x, values - band, values + band, color=_COLOURS[k], alpha=0.2, linewidth=0)
+    if own:
+        axes.legend(title=own[0], ncols=variable.sizes[own[0]], loc="best", fontsize=7.5, title_fontsize=7.5)
+
+
+def _verdict_strip(axes: Axes, dataset: xr.Dataset, name: str) -> list[Artist]:
+    """The verdict along the upper edge of the panel."""
+    edges = cells.cell_edges(dataset[name].values.astype(float))
+    codes = dataset["verdict"].values[None, :]
+    strip = axes.get_xaxis_transform()
+    axes.pcolormesh(
+        edges, [1.0, 1.05], codes, cmap=_kinds(), vmin=-0.5, vmax=len(KIND_COLOURS) - 0.5, transform=strip,
+        clip_on=False, rasterized=True,
+    )  # fmt: skip
+    return _kind_legend(dataset)
+
+
+def _maps(dataset: xr.Dataset, names: list[str], split: str | None) -> Figure:
+    rest = [name for name in names if name != split]
+    horizontal = cells.horizontal_axis(dataset, rest)
+    horizontal = "excitation_frequency" if "excitation_frequency" in rest else horizontal
+    vertical = next(name for name in rest if name != horizontal)
+    rows = [key for key in ("lyapunov_spectrum", "verdict") if key in dataset]
+    parts = [dataset] if split is None else [dataset.isel({split: k}) for k in range(dataset.sizes[split])]
+    panels = Panels(len(rows), len(parts), height=_HEIGHT, margins=Margins(right=1.05))
+    for axes_row, key in zip(panels.axes, rows, strict=True):
+        _map_row(panels, axes_row, parts, key, (horizontal, vertical))
+    if split is not None:
+        for axes, part in zip(panels.axes[0], parts, strict=True):
+            text = value_text(split, part[split].item(), part[split].attrs.get("units", "1"))
+            axes.text(0.5, 1.03, text, transform=axes.transAxes, ha="center", size=8)
+    for axes in panels.axes[-1]:
+        axes.locator_params(axis="x", nbins=4)
+    panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
+    panels.titles(dataset)
+    panels.legend(_kind_legend(dataset) if "verdict" in dataset else [])
+    return panels.figure
+
+
+def _map_row(panels: Panels, row: list[Axes], parts: list[xr.Dataset], key: str, names: tuple[str, str]) -> None:
+    if key == "verdict":
+        for axes, part in zip(row, parts, strict=True):
+            options = {"cmap": _kinds(), "vmin": -0.5, "vmax": len(KIND_COLOURS) - 0.5}
+            cells.draw_cells(axes, part["verdict"], *names, **options)
+        return
+    largest = [part["lyapunov_spectrum"].isel(exponent=0) for part in parts]
+    finite = np.concatenate([field.values[np.isfinite(field.values)] for field in largest])
+    low, high = (finite.min(), finite.max()) if finite.size else (-1.0, 1.0)
+    for axes, field in zip(row, largest, strict=True):
+        mesh = cells.draw_cells(axes, field, *names, cmap="cividis", vmin=low, vmax=high)
+    units = parts[0]["lyapunov_spectrum"].attrs.get("units", "1")
+    panels.colorbar(row[-1], mesh, f"largest Lyapunov exponent [{units}]")
+
+
+def _kinds() -> ListedColormap:
+    return ListedColormap(KIND_COLOURS, name="kinds")
+
+
+def _kind_legend(dataset: xr.Dataset) -> list[Artist]:
+    """Kinds of motion that occur, with their number of points."""
+    meanings = str(dataset["verdict"].attrs.get("flag_meanings", "")).split()
+    counts = np.bincount(dataset["verdict"].values.astype(int).ravel(), minlength=len(meanings))
+    return [
+        Patch(
+            facecolor=KIND_COLOURS[code], edgecolor=FRAME_GREY, linewidth=0.6,
+            label=f"{meaning.replace('_', ' ')} ({counts[code]})",
+        )
+        for code, meaning in enumerate(meanings)
+        if counts[code]
+    ]  # fmt: skip

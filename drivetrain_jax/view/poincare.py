@@ -1,0 +1,75 @@
+"""Figures of the analysis ``poincare``: the points of the section, all of them and the first ones alone."""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import cells
+from drivetrain_jax.view.layout import Margins, Panels
+from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, value_text
+
+_STYLE = {**STYLE, "axes.formatter.use_mathtext": True, "axes.formatter.limits": (-2, 4)}
+_FIRST = 1000
+_MOST_ROWS = 6
+# A section narrower than this, over its distance from zero, is drawn as a point; so are rates of twist that are a
+# thousandth of those of a vibration with this angular frequency [rad/s].
+_NARROW, _RATE = 1e-9, 1e3
+_HEIGHT = 2.6
+
+
+def plot(dataset: xr.Dataset) -> Figure:
+    """The section with all its strobes and with the first 1000 alone, a row for each of up to six values of one axis.
+
+    Raises :class:`InputError` for more axes or values, and unless ``section`` is stored.
+    """
+    with matplotlib.rc_context(_STYLE):
+        dataset = cells.prepare(dataset)
+        if "section" not in dataset:
+            raise InputError("outputs: section missing; the figure shows its points")
+        names = cells.sweep_axes(dataset)
+        if len(names) > 1 or (names and dataset.sizes[names[0]] > _MOST_ROWS):
+            raise InputError(f"axes = {', '.join(names)}: allowed is one axis of up to {_MOST_ROWS} values")
+        parts = [dataset.isel({names[0]: k}) for k in range(dataset.sizes[names[0]])] if names else [dataset]
+        margins = Margins(left=0.95, right=0.35, between_rows=0.55, between_columns=0.35)
+        panels = Panels(len(parts), 2, height=_HEIGHT, margins=margins, share_y=False)
+        for row, part in zip(panels.axes, parts, strict=True):
+            _draw_row(row, part, names[0] if names else None)
+        panels.label_axes("twist at the strobes [rad]", "rate of twist at the strobes [rad/s]")
+        panels.titles(dataset)
+        return panels.figure
+
+
+def _draw_row(row: list[Axes], part: xr.Dataset, name: str | None) -> None:
+    points = part["section"].values
+    row[1].sharey(row[0])
+    for axes, shown in zip(row, (points, points[:_FIRST]), strict=True):
+        size = 0.6 if len(shown) > 2 * _FIRST else 1.5
+        axes.scatter(shown[:, 0], shown[:, 1], s=size, color=LINE_COLOURS[0], linewidths=0, rasterized=True)
+        axes.text(0.98, 0.97, f"{len(shown)} strobes", transform=axes.transAxes, ha="right", va="top", size=7.5)
+        axes.tick_params(labelbottom=True)
+    notes = [value_text(name, part[name].item(), part[name].attrs.get("units", "1"))] if name else []
+    if "torus_residual" in part:
+        notes.append(f"distance from a smooth curve {np.max(part['torus_residual'].values):.1e} of the largest value")
+    if "distinct_points" in part and part["distinct_points"].item():
+        notes.append(f"distinct points: {part['distinct_points'].item()}")
+    row[0].text(0.0, 1.08, "; ".join(notes), transform=row[0].transAxes, color=FRAME_GREY, size=7.5)
+    # Both panels have the same multiplier: written once, clear of the label between them.
+    row[0].xaxis.get_offset_text().set_visible(False)
+    twist = np.nanmax(np.abs(points[:, 0]), initial=0.0)
+    for which, values, least in zip("xy", points.T, (0.0, 1e-3 * _RATE * twist), strict=True):
+        _widen(row[0], which, values[np.isfinite(values)], least)
+
+
+def _widen(axes: Axes, which: str, values: np.ndarray, least: float) -> None:
+    """Limits that do not blow rounding errors up to the height of the panel."""
+    if not values.size:
+        return
+    size = max(_NARROW * np.abs(values).max(), least)
+    if np.ptp(values) < size:
+        middle, half = values.mean(), max(0.05 * np.abs(values).max(), least)
+        axes.set(**{f"{which}lim": (middle - half, middle + half)})

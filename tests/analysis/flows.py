@@ -1,0 +1,75 @@
+"""Small vector fields with known Lyapunov exponents, as flows with a batch of initial states."""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+
+from drivetrain_jax.systems import Flow
+
+
+def spread(lanes: int, *start: float) -> tuple:
+    """Initial states around ``start``, no two alike."""
+    return tuple(jnp.asarray(x + 0.01 * np.cos(np.arange(lanes) * (i + 1.0))) for i, x in enumerate(start))
+
+
+def lorenz(lanes: int) -> Flow:
+    def field(_, y):
+        return 10.0 * (y[1] - y[0]), y[0] * (28.0 - y[2]) - y[1], y[0] * y[1] - 8 / 3 * y[2]
+
+    return Flow(field, spread(lanes, 1.0, 1.0, 20.0), period=0.5)
+
+
+def roessler(lanes: int) -> Flow:
+    def field(_, y):
+        return -y[1] - y[2], y[0] + 0.2 * y[1], 0.2 + y[2] * (y[0] - 5.7)
+
+    # All around the attractor: its phases mix slowly, and members in step would share the error of an unfinished turn.
+    turn = 2 * math.pi * np.arange(lanes) / lanes
+    return Flow(field, (jnp.asarray(6 * np.cos(turn)), jnp.asarray(6 * np.sin(turn)), 0.0), period=2.0)
+
+
+# x'' + damping x' + linear x + cubic x^3 + sine sin x = amplitude cos(frequency t)
+OSCILLATORS = {
+    "ueda": {"damping": 0.05, "cubic": 1.0, "amplitude": 7.5, "frequency": 1.0},
+    "two_wells": {"damping": 0.25, "linear": -1.0, "cubic": 1.0, "amplitude": 0.4, "frequency": 1.0},
+    "pendulum": {"damping": 0.05, "sine": 1.0, "amplitude": 0.6, "frequency": 0.7},
+}
+
+
+def oscillators(lanes: int) -> Flow:
+    """All of ``OSCILLATORS`` in one batch, ``lanes`` of each, one after the other."""
+
+    def column(name: str):
+        return jnp.asarray(np.repeat([p.get(name, 0.0) for p in OSCILLATORS.values()], lanes))
+
+    damping, linear, cubic, sine = (column(name) for name in ("damping", "linear", "cubic", "sine"))
+    amplitude = column("amplitude")
+
+    def field(angles, y):
+        force = linear * y[0] + cubic * y[0] ** 3 + sine * jnp.sin(y[0])
+        return y[1], amplitude * jnp.cos(angles[0]) - damping * y[1] - force
+
+    count = lanes * len(OSCILLATORS)
+    return Flow(field, spread(count, 0.1, 0.1), period=2 * math.pi / column("frequency"), turns=(1,), cyclic=(0,))
+
+
+def linear(damping, stiffness, torque: float = 1.0) -> Flow:
+    """x'' + damping x' + stiffness x = torque, strobed without being forced."""
+    damping, stiffness = jnp.asarray(damping), jnp.asarray(stiffness)
+
+    def field(_, y):
+        return y[1], torque - damping * y[1] - stiffness * y[0]
+
+    return Flow(field, (1.0, 0.5), period=1.0)
+
+
+def van_der_pol(lanes: int) -> Flow:
+    """A limit cycle."""
+
+    def field(_, y):
+        return y[1], (1 - y[0] ** 2) * y[1] - y[0]
+
+    return Flow(field, spread(lanes, 1.0, 1.0), period=1.7)

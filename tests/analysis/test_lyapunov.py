@@ -1,0 +1,207 @@
+"""Lyapunov spectra of systems whose exponents are known, and verdicts on motions whose kind is known."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import flows
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import drivetrain_jax as dt
+from drivetrain_jax.analysis import Request
+from drivetrain_jax.analysis.lyapunov import analyse
+from drivetrain_jax.analysis.verdict import Verdict
+from drivetrain_jax.systems import Flow
+
+OUTPUTS = ("lyapunov_spectrum", "lyapunov_standard_error", "sum_rule_residual", "verdict", "chaos_k01")
+LANES = 16
+LITERATURE = {
+    "lorenz": (0.9056, 0.0, -14.5723),
+    "roessler": (0.0714, 0.0, -5.3943),
+    "ueda": (0.1034, -0.1534),
+    "two_wells": (0.1572, -0.4072),
+    "pendulum": (0.1400, -0.1900),
+}
+
+
+def request(outputs: tuple[str, ...], max_time: float, steps: int, target: float = 0.0) -> Request:
+    return Request(outputs, "benettin", {"standard_error": target, "max_time": max_time, "steps": steps})
+
+
+def results(flow: Flow, *options) -> dict:
+    """Results of ``flow``; ``options`` of ``request``."""
+    return {name: np.asarray(value) for name, value in jax.jit(lambda: analyse(flow, request(*options)))().items()}
+
+
+@cache
+def batch(name: str) -> dict:
+    """Time and steps per strobe as each needs them."""
+    sizes = {"lorenz": (512.0, 16), "roessler": (2048.0, 32), "oscillators": (2000.0, 64)}
+    return results(getattr(flows, name)(LANES), OUTPUTS, *sizes[name])
+
+
+def known(name: str) -> dict:
+    if name not in flows.OSCILLATORS:
+        return batch(name)
+    first = LANES * list(flows.OSCILLATORS).index(name)
+    return {key: value[..., first : first + LANES] for key, value in batch("oscillators").items()}
+
+
+@pytest.mark.parametrize("name", LITERATURE)
+def test_literature_values_within_three_standard_errors(name):
+    """The standard error of the mean over independent members; the literature value is rounded to 4 digits."""
+    spectrum = known(name)["lyapunov_spectrum"]
+    error = spectrum.std(axis=1, ddof=1) / math.sqrt(spectrum.shape[1])
+    np.testing.assert_array_less(np.abs(spectrum.mean(axis=1) - LITERATURE[name]), 3 * error + 1e-4)
+    assert error.max() < 0.01
+
+
+@pytest.mark.parametrize("name", LITERATURE)
+def test_block_error_is_no_smaller_than_the_scatter(name):
+    """Never much too small; larger where the exponents of neighbouring blocks are anticorrelated."""
+    scatter = known(name)["lyapunov_spectrum"].std(axis=1, ddof=1)
+    assert (np.median(known(name)["lyapunov_standard_error"], axis=1) > 0.6 * scatter).all()
+
+
+@pytest.mark.parametrize("name", LITERATURE)
+def test_chaos_is_recognised(name):
+    """Roessler's attractor turns almost evenly: 1024 strobes do not mix its phase, K stays below 0.9, and the rule
+    does not call it chaotic on such evidence. It never calls it regular."""
+    kinds, k01 = known(name)["verdict"], np.median(known(name)["chaos_k01"])
+    if name == "roessler":
+        assert set(kinds.tolist()) <= {Verdict.CHAOTIC, Verdict.UNDECIDED}
+        assert k01 > 0.7
+    else:
+        assert (kinds == Verdict.CHAOTIC).mean() > 0.9
+        assert k01 > 0.97
+
+
+@pytest.mark.parametrize("name", LITERATURE)
+def test_exponents_add_up_to_the_mean_divergence(name):
+    assert np.abs(known(name)["sum_rule_residual"]).max() < 1e-6
+
+
+@pytest.fixture(scope="module")
+def linear():
+    """Results over damping and stiffness, compiled once."""
+    compiled = jax.jit(lambda *p: analyse(flows.linear(*p), request(OUTPUTS, 400.0, 12, 1e-2)))
+    return lambda *p: {name: np.asarray(value) for name, value in compiled(*map(np.asarray, p)).items()}
+
+
+@pytest.fixture(scope="module")
+def linear_motions(linear):
+    """Decay rates -0.1 and -0.9; a complex pair -0.1 +- i; a slow decay; growth that overflows."""
+    return linear([1.0, 0.2, 0.01, -0.5], [0.09, 1.01, 1.0, 1.0])
+
+
+def test_linear_oscillator_under_constant_torque_is_a_fixed_point(linear_motions):
+    np.testing.assert_allclose(linear_motions["lyapunov_spectrum"][:, 0], [-0.1, -0.9], rtol=1e-6)
+    assert linear_motions["verdict"][0] == Verdict.FIXED_POINT
+
+
+def test_degenerate_pair_is_still_a_fixed_point(linear_motions):
+    """A complex pair has one exponent; the two that Gram-Schmidt finds differ, their sum does not."""
+    ours, error = (linear_motions[name][:, 1] for name in ("lyapunov_spectrum", "lyapunov_standard_error"))
+    assert ours.sum() == pytest.approx(-0.2, rel=1e-9)
+    assert (np.abs(ours + 0.1) < 3 * error + 1e-9).all()
+    assert linear_motions["verdict"][1] == Verdict.FIXED_POINT
+
+
+def test_what_leaves_all_bounds_is_unstable_and_stops_nobody(linear_motions):
+    assert linear_motions["verdict"][3] == Verdict.PARAMETRICALLY_UNSTABLE
+    assert np.isnan(linear_motions["lyapunov_standard_error"][:, 3]).all()
+    np.testing.assert_allclose(linear_motions["lyapunov_spectrum"][:, 3], 0.25, atol=0.05)
+    assert (linear_motions["outcome"] == 0).all()
+
+
+def test_members_do_not_depend_on_their_neighbours(linear, linear_motions):
+    """The slow one runs to the end, the others stop before; once more among its like."""
+    alike = linear([0.01] * 4, [1.0] * 4)
+    for name in OUTPUTS:
+        np.testing.assert_array_equal(alike[name][..., 2], linear_motions[name][..., 2])
+
+
+def test_limit_cycle_is_periodic():
+    ours = results(flows.van_der_pol(2), OUTPUTS, 400.0, 24)
+    assert (ours["verdict"] == Verdict.PERIODIC).all()
+    assert np.abs(ours["lyapunov_spectrum"][0]).max() < 1e-3
+
+
+def test_phases_do_not_supply_exponents():
+    """The two-well oscillator with its forcing as a third component has the same two exponents."""
+
+    def field(_, y):
+        return y[1], 0.4 * jnp.cos(y[2]) - 0.25 * y[1] - y[0] ** 3 + y[0], 1.0 + 0.0 * y[2]
+
+    flow = Flow(field, (0.1, 0.1, jnp.zeros(1)), 2 * math.pi, phases=(2,))
+    ours = results(flow, ("lyapunov_spectrum", "sum_rule_residual"), 200.0, 64)
+    assert ours["lyapunov_spectrum"].shape == (2, 1)
+    assert ours["lyapunov_spectrum"].sum() == pytest.approx(-0.25, abs=1e-9)
+
+
+class TestPaperEstimator:
+    """The estimator as printed gives known answers wrongly."""
+
+    def test_it_is_positive_for_a_damped_linear_oscillator(self):
+        ours = results(flows.linear([0.2], [1.0]), ("paper_estimator",), 100.0, 12)["paper_estimator"]
+        assert (ours > 1).all()  # the true exponents are -0.1
+
+    def test_it_is_inversely_proportional_to_the_interval(self):
+        from dataclasses import replace
+
+        values = []
+        for interval in (0.05, 0.5):
+            flow = replace(flows.lorenz(1), period=interval)
+            values.append(results(flow, ("paper_estimator",), 200.0, 12)["paper_estimator"][:, 0])
+        assert (values[0] < 0).all()  # Lorenz' system is chaotic
+        assert abs(values[0] / values[1] - 10).max() < 6
+
+
+@pytest.fixture(scope="module")
+def controls():
+    """(29) at the paper's settings, and homogeneous with chi_n around the parametric threshold."""
+    outputs = [*OUTPUTS[:4], "period_multiple"]
+    points = {"M_AEM": [2550.0, 0.0, 0.0, 0.0], "chi_n": [0.0026, 0.01, 0.025, 0.05]}
+    fixed = {"element": "input", "beta": math.radians(9), "zeta": 0.0016, "excitation_frequency": 3066.5}
+    scene = {"system": "tripod", "analysis": "lyapunov", "outputs": outputs, "points": points, "fixed": fixed}
+    return dt.run(scene | {"options": {"max_time": 1.0, "steps": 12}})
+
+
+def test_no_chaos_at_the_papers_settings(controls):
+    """Exponents of ../shared: Floquet -13.108684, -17.719175; from rest the transient of the frame is still visible."""
+    ours, error = controls.lyapunov_spectrum.values[0], controls.lyapunov_standard_error.values[0]
+    assert (np.abs(ours - [-13.108683687, -17.719175397]) < 3 * error).all()
+    assert ours.sum() == pytest.approx(-30.827859084, abs=1e-6)
+    assert controls.verdict.values[0] == Verdict.QUASI_PERIODIC
+    assert controls.period_multiple.values[0] == 0
+
+
+def test_parametric_threshold_is_bracketed(controls):
+    """The exponents are those of Floquet theory, by SciPy at 1e-12."""
+    np.testing.assert_allclose(
+        controls.lyapunov_spectrum.values[1:, 0], [-6.54835511, 6.73022516, 28.72424293], rtol=2e-4
+    )
+    kinds = [Verdict.FIXED_POINT, Verdict.PARAMETRICALLY_UNSTABLE, Verdict.PARAMETRICALLY_UNSTABLE]
+    assert controls.verdict.values[1:].tolist() == kinds
+
+
+def test_sum_rule_of_the_tripod(controls):
+    assert np.abs(controls.sum_rule_residual).max() < 1e-7
+
+
+@pytest.mark.full
+def test_bounded_chaos_of_the_tripod():
+    """The unphysical control of the theory note: L1 = 1218 +- 12 by an independent computation, K = 0.997."""
+    omega = 9633.726700903984
+    fixed = {"element": "input", "beta": math.radians(9), "zeta": 0.03, "chi_n": 0.3, "M_AEM": 8.4e4 * 2550.0}
+    fixed |= {"chi_AEM": 0.5, "excitation_frequency": omega / math.pi, "motor_order": 0.618 * omega / (100 * math.pi)}
+    scene = {"system": "tripod", "analysis": "lyapunov", "outputs": list(OUTPUTS), "fixed": fixed}
+    ours = dt.run(scene | {"options": {"max_time": 0.3, "steps": 64}})
+    spectrum, error = ours.lyapunov_spectrum.values, ours.lyapunov_standard_error.values
+    assert abs(spectrum[0] - 1218) < 3 * math.hypot(error[0], 12)
+    assert spectrum.sum() == pytest.approx(-558.382, abs=1.0)
+    assert int(ours.verdict) == Verdict.CHAOTIC

@@ -1,0 +1,100 @@
+"""Sections, their measures, and the 0-1 test."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import drivetrain_jax as dt
+from drivetrain_jax.analysis.section_measures import period_multiple, torus_residual
+from drivetrain_jax.analysis.zero_one_test import chaos_k01
+
+FIXED = {"element": "input", "beta": math.radians(9), "zeta": 0.0186, "chi_n": 0.0026}
+# 3000 Hz strobes against a motor torque of 300 Hz close after 10, 3066.5 Hz after 6133.
+FREQUENCIES = [3000.0, 3066.5]
+
+
+def section(outputs: list[str], **options) -> object:
+    scene = {"system": "tripod", "analysis": "poincare", "outputs": outputs, "fixed": FIXED, "options": options}
+    return dt.run(scene | {"axes": {"excitation_frequency": {"values": FREQUENCIES}}})
+
+
+@pytest.fixture(scope="module")
+def motor():
+    """800 strobes are 45 decay times of the transient at this damping."""
+    return section(["section", "torus_residual", "distinct_points", "chaos_k01"], strobes=1024, discard=800, steps=24)
+
+
+def test_input_element_ends_on_a_torus(motor):
+    """A smooth function of the angle of the motor's torque; the periodic case as well."""
+    assert motor.section.dims == ("excitation_frequency", "strobe", "state")
+    assert motor.torus_residual.values[1].max() < 1e-6
+    assert motor.distinct_points.values.tolist() == [10, 0]
+
+
+def test_regular_motion_does_not_diffuse(motor):
+    assert (np.abs(motor.chaos_k01) < 0.1).all()
+
+
+def test_section_repeats_exactly(motor):
+    points = motor.section.values[0]
+    assert np.abs(points[10:] - points[:-10]).max() < 1e-9 * np.abs(points).max()
+    assert len(np.unique(np.round(points[:, 0] / np.abs(points[:, 0]).max(), 7))) == 10
+
+
+def test_loose_tolerances_blur_the_section(motor):
+    """What differs from the equal steps of order 8, over the extent of the section."""
+    extent = np.ptp(motor.section.values[1, :, 0])
+    found = {}
+    for rtol, atol in ((1e-3, 1e-6), (1e-9, 1e-12)):
+        ours = section(["section"], method="adaptive", strobes=128, discard=800, rtol=rtol, atol=atol)
+        assert (ours.outcome == 0).all()
+        found[rtol] = np.abs(ours.section.values[1, :, 0] - motor.section.values[1, :128, 0]).max() / extent
+    assert found[1e-3] > 1
+    assert found[1e-9] < 1e-2
+
+
+class TestZeroOne:
+    """Gottwald & Melbourne 2009: the logistic map on both sides of chaos, and a constant."""
+
+    @staticmethod
+    def logistic(rates) -> np.ndarray:
+        x, series = np.full(len(rates), 0.3), []
+        for _ in range(2500):
+            x = np.asarray(rates) * x * (1 - x)
+            series.append(x)
+        return np.array(series[500:])
+
+    def test_logistic_map(self):
+        values = np.asarray(jax.jit(chaos_k01)(self.logistic([3.55, 3.97, 4.0 - 1e-9])))
+        np.testing.assert_allclose(values, [0.0, 1.0, 1.0], atol=0.02)
+
+    def test_quasi_periodic_and_constant(self):
+        n = np.arange(2000)
+        series = np.stack([np.cos(math.sqrt(2) * n), np.full(2000, 3.7)], axis=1)
+        np.testing.assert_allclose(np.asarray(chaos_k01(jnp.asarray(series))), 0.0, atol=0.05)
+
+    def test_scale_and_offset_do_not_matter(self):
+        series = self.logistic([3.97])
+        np.testing.assert_allclose(chaos_k01(jnp.asarray(1e-4 * series + 5)), chaos_k01(jnp.asarray(series)), atol=1e-6)
+
+
+def test_period_multiple_counts_distinct_points():
+    k = np.arange(1200)
+    rows = [np.cos(2 * np.pi * k * 3 / 7), np.ones(1200), np.cos(math.sqrt(5) * k), np.zeros(1200)]
+    series = jnp.asarray(np.array(rows).T[:, None, :])
+    assert period_multiple(series, jnp.float64(1e-9), 500).tolist() == [7, 1, 0, 1]
+
+
+def test_torus_residual_sees_noise():
+    rng = np.random.default_rng(0)
+    angle = (np.sqrt(2) * np.arange(3000)) % (2 * np.pi)
+    smooth = np.exp(np.cos(angle)) + 0.3 * np.sin(5 * angle)
+    states = np.stack([smooth, smooth + 1e-3 * rng.standard_normal(3000)], axis=1)
+    clean, noisy = np.asarray(torus_residual(jnp.asarray(states), jnp.asarray(angle)))
+    assert clean < 1e-12
+    assert 1e-4 < noisy < 1e-2

@@ -1,0 +1,92 @@
+"""Figures of Lyapunov spectra and Poincare sections, from made-up results."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view import plot
+
+KINDS = "fixed_point periodic quasi_periodic parametrically_unstable chaotic undecided"
+
+
+def lyapunov(**sizes: int) -> xr.Dataset:
+    """Exponents over the axes ``sizes``, one point chaotic and one without values."""
+    axes = tuple(sizes)
+    shape = tuple(sizes.values())
+    spectrum = np.stack([np.full(shape, -1.0), np.full(shape, -2.0)], axis=-1)
+    verdict = np.full(shape, 2, np.int8)
+    if shape:
+        spectrum.reshape(-1, 2)[0] = 3.0
+        spectrum.reshape(-1, 2)[-1] = np.nan
+        verdict.reshape(-1)[0] = 4
+    dataset = xr.Dataset(
+        {
+            "lyapunov_spectrum": ((*axes, "exponent"), spectrum, {"units": "s-1", "long_name": "Lyapunov exponent"}),
+            "lyapunov_standard_error": ((*axes, "exponent"), np.full((*shape, 2), 0.1)),
+            "verdict": (axes, verdict, {"flag_meanings": KINDS}),
+            "outcome": (axes, np.zeros(shape, np.int8)),
+        },
+        coords={name: (name, np.linspace(1.0, 2.0, size)) for name, size in sizes.items()},
+        attrs={"analysis": "lyapunov", "title": "made up"},
+    )
+    history = np.stack([np.linspace(0, -1, 64), np.linspace(0, -2, 64)], axis=-1)
+    return dataset if shape else dataset.assign(
+        lyapunov_history=(("segment", "exponent"), history), segment=("segment", np.arange(1, 65))
+    )  # fmt: skip
+
+
+def legend(figure) -> list[str]:
+    return [text.get_text() for box in figure.legends for text in box.get_texts()]
+
+
+def test_curves_with_bands_and_verdicts():
+    figure = plot(lyapunov(zeta=8))
+    assert legend(figure) == ["quasi periodic (7)", "chaotic (1)"]
+    lines = figure.axes[0].get_lines()
+    np.testing.assert_array_equal(lines[0].get_ydata()[:2], [3.0, -1.0])
+
+
+def test_maps_with_a_column_for_each_value_of_a_third_axis():
+    figure = plot(lyapunov(excitation_frequency=6, zeta=5, chi_n=3))
+    assert legend(figure) == ["quasi periodic (89)", "chaotic (1)"]
+    assert len([axes for axes in figure.axes if axes.get_label() != "colour bar"]) == 6
+
+
+def test_convergence_of_one_point():
+    figure = plot(lyapunov())
+    assert legend(figure) == ["$L_{1}$", "$L_{2}$"]
+
+
+def test_too_many_axes_are_refused():
+    with pytest.raises(InputError, match="axes = "):
+        plot(lyapunov(a=5, b=5, c=5))
+
+
+def section(count: int, spread: float) -> xr.Dataset:
+    turn = np.linspace(0, 20, count)
+    points = np.stack([6e-5 + spread * np.cos(turn), spread * np.sin(turn)], axis=-1)
+    return xr.Dataset(
+        {"section": (("strobe", "state"), points), "outcome": ((), np.int8(0)), "distinct_points": ((), 1)},
+        attrs={"analysis": "poincare", "title": "made up"},
+    )
+
+
+def test_all_strobes_and_the_first_thousand():
+    figure = plot(section(3000, 1e-5))
+    counts = [len(axes.collections[0].get_offsets()) for axes in figure.axes]
+    assert counts == [3000, 1000]
+
+
+def test_a_point_is_drawn_as_a_point():
+    """Rounding errors are not blown up to the height of the panel."""
+    axes = plot(section(300, 1e-17)).axes[0]
+    assert np.ptp(axes.get_xlim()) > 1e-6
+    assert np.ptp(axes.get_ylim()) > 1e-5
+
+
+def test_a_section_must_be_stored():
+    with pytest.raises(InputError, match="section missing"):
+        plot(section(10, 1.0).drop_vars("section"))
