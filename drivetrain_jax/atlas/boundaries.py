@@ -1,0 +1,179 @@
+"""Stability boundaries as curves: zeros of the analytic boundary functions, traced and polished on the surrogate.
+
+Seeds are the tips of all tongues (found by exclusion, so that none is missed), and the crossings with the rim of the
+rectangle and with a few lines across it. Curves are followed through regions that are unstable anyway; ``limiting`` says
+where they bound the stable region.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivetrain_jax.atlas.criteria import Criteria, parameters_at
+from drivetrain_jax.atlas.exclusion import critical_points
+from drivetrain_jax.atlas.growth import growth
+from drivetrain_jax.atlas.panels import Atlas
+from drivetrain_jax.atlas.patches import Patches, patches_of
+from drivetrain_jax.atlas.roots import on_line, roots
+from drivetrain_jax.atlas.tips import polish
+from drivetrain_jax.atlas.tracing import Curve, Field, trace, trace_tips
+from drivetrain_jax.systems import System
+
+# Lines across the rectangle, each way, for seeds.
+_LINES = 8
+# Newton's steps of the last polish and the largest relative shift it may make.
+_POLISH, _LARGEST_SHIFT = 2, 1e-4
+# Growth rate of the largest multiplier up to which a point of the curve bounds the stable region.
+_LIMITING = 1e-6
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """One curve: ``points`` maps the two parameters to arrays ``(n,)``.
+
+    ``error`` maps them to bounds of the error of either parameter if the other is exact (inf where the curve runs along
+    it). ``multiplier`` (``+1``, ``-1`` or ``pair``) crosses the unit circle; ``limiting`` ``(n,)`` is true where no other
+    multiplier lies outside.
+    """
+
+    multiplier: str
+    points: Mapping[str, np.ndarray]
+    error: Mapping[str, np.ndarray]
+    limiting: np.ndarray
+    closed: bool
+
+    def segments(self) -> tuple[dict[str, np.ndarray], ...]:
+        """The parts that bound the stable region, each as ``points``."""
+        marks = np.flatnonzero(np.diff(np.concatenate([[0], self.limiting.astype(int), [0]])))
+        return tuple(
+            {name: values[a:b] for name, values in self.points.items()}
+            for a, b in zip(marks[::2], marks[1::2], strict=True)
+            if b - a > 1
+        )
+
+
+def boundaries(atlas: Atlas, system: System) -> tuple[Boundary, ...]:
+    """All boundary curves within ``atlas``, which has two parameters (``ValueError`` for another number)."""
+    if len(atlas.parameters) != 2:
+        raise ValueError(f"parameters = {', '.join(atlas.parameters)}: allowed are two; slice the atlas first")
+    criteria = Criteria.of(atlas, system)
+    patches = patches_of(criteria)
+    found: list[Boundary] = []
+    horizontal = _horizontal(atlas, system)
+    for number, kind in enumerate(criteria.multipliers):
+        field = Field(patches[number])
+        curves: list[Curve] = []
+        if not criteria.conservative:
+            rough = critical_points(patches, number, horizontal).points
+            fine = polish(criteria, rough, kind, horizontal)[0]
+            near = np.abs(field.to_unit(fine) - field.to_unit(rough)).max(axis=1, initial=0.0) < _LARGEST_SHIFT
+            curves = _distinct(field, np.where(near[:, None], fine, rough), [], horizontal)
+        for seeds in _line_seeds(field):
+            curves = _distinct(field, seeds, curves)
+        found += [_finish(criteria, patches[number], field, kind, curve) for curve in curves]
+    return tuple(found)
+
+
+def _horizontal(atlas: Atlas, system: System) -> int:
+    """The coordinate along which tongues are narrow: the axis of the resonances, else the second one."""
+    axis = system.resonances.axis if system.resonances else ""
+    return atlas.parameters.index(axis) if axis in atlas.parameters else 1
+
+
+def _distinct(field: Field, seeds: np.ndarray, known: list[Curve], horizontal: int | None = None) -> list[Curve]:
+    """``known`` and the curves through those ``seeds`` that are not on them; tips if ``horizontal`` is given."""
+    kept = list(known)
+    on_curve = np.zeros(len(seeds), bool)
+    for curve in kept:
+        on_curve |= _contains(field, curve, seeds)
+    new = seeds[~on_curve].reshape(-1, 2)
+    curves = trace(field, new) if horizontal is None else trace_tips(field, new, horizontal)
+    for seed, curve in zip(new, curves, strict=True):
+        if len(curve.points) > 2 and not any(_contains(field, other, seed[None])[0] for other in kept[len(known) :]):
+            kept.append(curve)
+    return kept
+
+
+def _contains(field: Field, curve: Curve, seeds: np.ndarray) -> np.ndarray:
+    """Whether ``curve`` passes through each of ``seeds`` ``(M, 2)``."""
+    if not len(seeds):
+        return np.zeros(0, bool)
+    y, target = field.to_unit(curve.points), field.to_unit(seeds)
+    step = np.diff(y, axis=0)
+    size = (step**2).sum(axis=1)
+    with np.errstate(all="ignore"):
+        t = np.clip(np.nan_to_num(((target[:, None] - y[:-1]) * step).sum(axis=2) / size), 0.0, 1.0)
+    distance = np.linalg.norm(y[:-1] + t[..., None] * step - target[:, None], axis=2)
+    best = np.argmin(distance, axis=1)
+    distance, t = (a[np.arange(len(seeds)), best] for a in (distance, t))
+    # Chords of steps that turn by less than a quarter stay within a thirtieth of their length from the curve; the other
+    # edge of a narrow tongue may be as near, but has the opposite gradient.
+    _, at_seed = field(target)
+    _, at_curve = field(y[best + (t > 0.5)])
+    near = distance < 0.04 * np.sqrt(size[best]) + 1e-9
+    return near & (((at_seed * at_curve).sum(axis=1) > 0) | (distance < 1e-9))
+
+
+def _line_seeds(field: Field) -> Iterator[np.ndarray]:
+    """Crossings with the four sides of the rim, one after the other, and then with lines across the rectangle."""
+    across = np.arange(1, _LINES) / _LINES
+    for fractions in ([1.0], [0.0], across):
+        for axis in range(2):
+            seeds = []
+            for value in field.lower[axis] + np.array(fractions) * (field.upper[axis] - field.lower[axis]):
+                x = roots(on_line(field.patches, axis, float(value))).x
+                seeds.append(np.insert(x[:, None], axis, value, axis=1))
+            yield np.clip(np.concatenate(seeds), field.lower, field.upper)
+
+
+def _finish(criteria: Criteria, patches: Patches, field: Field, kind: str, curve: Curve) -> Boundary:
+    """Polish the points of a curve with the multiplier itself and attach bounds."""
+    atlas = criteria.atlas
+    x, error = _polish(criteria, field, kind, curve.points)
+    _, gradient = field(field.to_unit(x))
+    place = patches.locate(x)[0]
+    with np.errstate(all="ignore"):
+        fallback = (patches.error[place] / np.abs(gradient.T)).T * (field.upper - field.lower)
+    error = np.where(np.isfinite(error), error, fallback)
+    point = parameters_at(atlas, x)
+    slope = np.stack([np.abs(c.slope(point[:, k])) for k, c in enumerate(atlas.coordinates)], axis=-1)
+    with np.errstate(all="ignore"):
+        error = np.nan_to_num(error / slope, nan=np.inf)
+    return Boundary(
+        kind,
+        dict(zip(atlas.parameters, point.T, strict=True)),
+        dict(zip(atlas.parameters, error.T, strict=True)),
+        np.log(criteria.spectral_radius(x)) <= _LIMITING + _rate_error(criteria, x),
+        curve.closed,
+    )
+
+
+def _rate_error(criteria: Criteria, x: np.ndarray) -> np.ndarray:
+    """Error of the largest multiplier where it may be double: the square root of that of Phi, without damping."""
+    if not criteria.conservative:
+        return np.zeros(len(x))
+    return np.full(len(x), 1e-4)
+
+
+def _polish(criteria: Criteria, field: Field, kind: str, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points with ln|sigma| = 0 and the bounds of either coordinate's error; NaN where the multiplier is not simple."""
+    if criteria.conservative:
+        return x, np.full(x.shape, np.nan)
+    scale = field.upper - field.lower
+    kinds = [kind] * len(x)
+    best = x.copy()
+    for _ in range(_POLISH):
+        rates = growth(criteria, best, kinds)
+        gradient = rates.gradient * scale
+        with np.errstate(all="ignore"):
+            step = (rates.rate / (gradient**2).sum(axis=1))[:, None] * gradient
+        good = np.linalg.norm(step, axis=1) < _LARGEST_SHIFT
+        best = np.clip(np.where(good[:, None], best - step * scale, best), field.lower, field.upper)
+    rates = growth(criteria, best, kinds)
+    good &= np.abs(rates.rate) < 1e-8
+    with np.errstate(all="ignore"):
+        error = (rates.error + np.abs(rates.rate))[:, None] / np.abs(rates.gradient)
+    return np.where(good[:, None], best, x), np.where(good[:, None], error, np.nan)

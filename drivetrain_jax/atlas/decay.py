@@ -1,0 +1,75 @@
+"""How the Chebyshev coefficients of one line fall, and what that says about the function."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from drivetrain_jax.atlas.interpolation import envelope
+
+# A plateau that lies this far below the largest coefficient is rounding or noise of the solves, not an oscillation.
+_NOISE = 1e-6
+
+
+def lobatto(n: int) -> np.ndarray:
+    """The ``n`` extrema of T_(n-1), rising from -1 to 1: every second one belongs to the next finer set."""
+    return -np.cos(np.pi * np.arange(n) / (n - 1))
+
+
+def line_sizes(values: np.ndarray) -> np.ndarray:
+    """Sizes of the coefficients ``(n,)`` from values ``(n, m)`` at the Lobatto points (norm over the m functions)."""
+    n = len(values)
+    # Exact in O(n^2): lines are short.
+    angle = np.pi * np.arange(n) / (n - 1)
+    weights = np.full(n, 1.0)
+    weights[[0, -1]] = 0.5
+    tensor = 2 / (n - 1) * np.cos(np.outer(np.arange(n), np.pi - angle)) @ (weights[:, None] * values)
+    tensor[[0, -1]] /= 2
+    return np.sqrt(np.sum(tensor**2, axis=1))
+
+
+def needed(sizes: np.ndarray, limit: float) -> int | None:
+    """How many polynomials leave out nothing above ``limit``; None if the last three are not below it."""
+    tail = envelope(sizes)
+    if tail[-3] > limit:
+        return None
+    return int(np.argmax(tail <= limit))
+
+
+def is_noise(sizes: np.ndarray) -> bool:
+    """The coefficients have stopped falling far below the first ones: more of them resolve nothing."""
+    tail, n = envelope(sizes), len(sizes)
+    return bool(tail[n // 2] < 4 * tail[-n // 8] and tail[n // 2] < _NOISE * tail[0])
+
+
+def is_algebraic(sizes: np.ndarray) -> bool:
+    """The coefficients fall like a power of their number, as those of a function with a kink or a jump.
+
+    The exponent is measured over n/4..n/2 and n/2..7n/8: for a smooth function it nearly doubles.
+    """
+    tail, n = envelope(sizes), len(sizes)
+    marks = (n // 4, n // 2, 7 * n // 8)
+    a, b, c = (tail[k] for k in marks)
+    if a > 0.3 * tail[0] or c == 0:
+        return False
+    first = math.log(a / b) / math.log(marks[1] / marks[0])
+    second = math.log(b / c) / math.log(marks[2] / marks[1])
+    return second < 1.4 * max(first, 0.5)
+
+
+def remainder(sizes: np.ndarray) -> float:
+    """What the coefficients left out add up to, if they go on falling as the last pairs do; inf if these do not fall."""
+    before, last = max(sizes[-4:-2], default=np.inf), max(sizes[-2:])
+    ratio = last / before if before > 0 else 0.0
+    return float(last * ratio / (1 - ratio)) if ratio < 1 else math.inf
+
+
+def extrapolated(sizes: np.ndarray, limit: float) -> int:
+    """Number of polynomials at which the tail, continued with its present slope, falls below ``limit``."""
+    tail, n = envelope(sizes), len(sizes)
+    start, end = 2 * n // 3, n - 2
+    rate = math.log(max(tail[start], 1e-300) / max(tail[end], 1e-300)) / max(end - start, 1)
+    missing = math.log(max(tail[end], limit) / limit)
+    grown = n + (math.ceil(missing / rate) if rate > 0 else n)
+    return min(max(grown, n + 2), n + max(4, n // 2))

@@ -1,0 +1,225 @@
+"""Design questions answered from an atlas, each answer with a bound of its error and a check by direct solves.
+
+The atlas may have more parameters than a question names: ``at`` gives their values. ``direct`` is the check: a function from
+columns of all parameters, a mapping of names to arrays ``(N,)``, to spectral radii ``(N,)`` computed without the atlas.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drivetrain_jax.atlas.criteria import Criteria
+from drivetrain_jax.atlas.panels import Atlas
+from drivetrain_jax.atlas.windows import Crossing, Interval, Line, narrow, stability_along, stability_over_range
+from drivetrain_jax.systems import System
+
+Direct = Callable[[Mapping[str, np.ndarray]], np.ndarray]
+Range = tuple[float, float]
+
+# A check steps aside from the answer by this many error bounds, and at least by this part of the parameter's range.
+_BOUNDS, _PART = 10.0, 1e-6
+# Points over a range at which a check solves, and those at which the largest spectral radius of a window is sought.
+_SAMPLES, _DENSE = 101, 801
+
+
+@dataclass(frozen=True)
+class Check:
+    """Direct solves beside an answer: the largest spectral radius ``inside`` the range said to be stable, and ``beyond`` it.
+
+    ``beyond`` is NaN where the range ends with the atlas. ``agrees`` if inside < 1 < beyond.
+    """
+
+    inside: float
+    beyond: float
+    solves: int
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the direct solves confirm the answer."""
+        return self.inside < 1 and not self.beyond <= 1
+
+
+@dataclass(frozen=True)
+class Answer:
+    """``value`` of ``parameter`` with a bound of its ``error``; None if no value in the atlas will do.
+
+    ``limit`` is the crossing that sets it (None: the atlas ends first), ``intervals`` lists all stable and unstable
+    ranges, ``undecided`` those that errors leave open; the answer is certain only if none of them is on its safe side.
+    """
+
+    parameter: str
+    value: float | None
+    error: float
+    limit: Crossing | None
+    intervals: tuple[Interval, ...]
+    undecided: tuple[Range, ...]
+    certain: bool
+    check: Check | None = None
+
+
+@dataclass(frozen=True)
+class Window:
+    """A stable range of a parameter; ``safe`` is what the margin leaves of it.
+
+    ``largest`` is the largest spectral radius within ``safe`` (sampled) and ``where`` its place.
+    """
+
+    interval: Interval
+    safe: Range
+    largest: float
+    where: float
+    check: Check | None = None
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """The nearest changes of stability ``below`` and ``above`` a value of ``parameter``; None where the atlas ends first."""
+
+    parameter: str
+    value: float
+    below: Crossing | None
+    above: Crossing | None
+    undecided: tuple[Range, ...]
+
+
+def least_damping(
+    atlas: Atlas,
+    system: System,
+    speeds: Range,
+    at: Mapping[str, float],
+    *,
+    damping: str = "zeta",
+    speed: str = "Omega",
+    direct: Direct | None = None,
+) -> Answer:
+    """The least ``damping`` from which on, up to the atlas's largest, all ``speeds`` are stable."""
+    part = narrow(atlas.slice(at), {speed: speeds})
+    line = stability_over_range(part, system, speed)
+    last = line.intervals[-1]
+    value, limit = (last.lower, last.lower_end) if last.stable else (None, None)
+    certain = value is not None and not any(b >= value for _, b in _apart(line, limit))
+    answer = Answer(damping, value, limit.error if limit else 0.0, limit, line.intervals, line.undecided, certain)
+    return _checked(answer, part, speed, 1.0, direct)
+
+
+def widest_angle(
+    atlas: Atlas,
+    system: System,
+    speeds: Range,
+    at: Mapping[str, float],
+    *,
+    angle: str = "beta",
+    speed: str = "Omega",
+    direct: Direct | None = None,
+) -> Answer:
+    """The widest ``angle`` up to which, from the atlas's smallest on, all ``speeds`` are stable."""
+    part = narrow(atlas.slice(at), {speed: speeds})
+    line = stability_over_range(part, system, speed)
+    first = line.intervals[0]
+    value, limit = (first.upper, first.upper_end) if first.stable else (None, None)
+    certain = value is not None and not any(a <= value for a, _ in _apart(line, limit))
+    answer = Answer(angle, value, limit.error if limit else 0.0, limit, line.intervals, line.undecided, certain)
+    return _checked(answer, part, speed, -1.0, direct)
+
+
+def speed_windows(
+    atlas: Atlas,
+    system: System,
+    at: Mapping[str, float],
+    *,
+    margin: float = 0.0,
+    speed: str = "Omega",
+    direct: Direct | None = None,
+) -> tuple[Window, ...]:
+    """The stable ranges of ``speed`` where the other parameters are ``at``, each shortened by ``margin`` of the speed at
+    both crossings. What a margin leaves nothing of is left out."""
+    part = atlas.slice(at)
+    line = stability_along(part, system)
+    criteria = Criteria.of(part, system)
+    windows = []
+    for interval in line.intervals:
+        low = interval.lower * (1 + margin) + interval.lower_end.error if interval.lower_end else interval.lower
+        high = interval.upper * (1 - margin) - interval.upper_end.error if interval.upper_end else interval.upper
+        if not interval.stable or low >= high:
+            continue
+        values = np.linspace(low, high, _DENSE)
+        rho = criteria.spectral_radius(part.to_coordinates(values[:, None]))
+        k = int(np.argmax(rho))
+        window = Window(interval, (low, high), float(rho[k]), float(values[k]))
+        windows.append(_checked_window(window, part, speed, direct))
+    return tuple(windows)
+
+
+def nearest_boundaries(atlas: Atlas, system: System, point: Mapping[str, float]) -> tuple[Nearest, ...]:
+    """For every parameter of ``atlas`` the nearest changes of stability when it alone is varied from ``point``."""
+    found = []
+    for name in atlas.parameters:
+        others = {other: point[other] for other in atlas.parameters if other != name}
+        line = stability_along(atlas.slice(others), system)
+        value = float(point[name])
+        below = [c for c in line.crossings if c.value <= value]
+        above = [c for c in line.crossings if c.value > value]
+        found.append(
+            Nearest(
+                name,
+                value,
+                replace(below[-1], point={**others, name: below[-1].value}) if below else None,
+                replace(above[0], point={**others, name: above[0].value}) if above else None,
+                line.undecided,
+            )
+        )
+    return tuple(found)
+
+
+def _apart(line: Line, limit: Crossing | None) -> list[Range]:
+    """The undecided ranges that are not merely the surroundings of the answer itself."""
+    reach = _BOUNDS * limit.error if limit else 0.0
+    return [
+        r for r in line.undecided if limit is None or not limit.value - reach <= r[0] <= r[1] <= limit.value + reach
+    ]
+
+
+def _checked(answer: Answer, part: Atlas, speed: str, safe: float, direct: Direct | None) -> Answer:
+    """``answer`` with direct solves over the range of speeds on its safe side, and at the limit beyond it."""
+    if direct is None or answer.value is None:
+        return answer
+    h = part.parameters.index(speed)
+    v = 1 - h
+    span = part.upper[v] - part.lower[v]
+    step = max(_BOUNDS * answer.error, _PART * span)
+    speeds = np.linspace(part.lower[h], part.upper[h], _SAMPLES)
+    inner = float(np.clip(answer.value + safe * step, part.lower[v], part.upper[v]))
+    if answer.limit:
+        speeds = np.append(speeds, answer.limit.point[speed])
+    values = np.append(np.full(len(speeds), inner), answer.value - safe * step)
+    speeds = np.append(speeds, speeds[-1])
+    count = len(speeds) if answer.limit else len(speeds) - 1
+    rho = _solve(direct, part, {speed: speeds[:count], answer.parameter: values[:count]})
+    beyond = float(rho[-1]) if answer.limit else np.nan
+    inside = float(np.max(rho[: len(speeds) - 1]))
+    return replace(answer, check=Check(inside, beyond, count))
+
+
+def _checked_window(window: Window, part: Atlas, speed: str, direct: Direct | None) -> Window:
+    if direct is None:
+        return window
+    span = part.upper[0] - part.lower[0]
+    outer = []
+    for crossing, side in ((window.interval.lower_end, -1.0), (window.interval.upper_end, 1.0)):
+        if crossing:
+            outer.append(crossing.value + side * max(_BOUNDS * crossing.error, _PART * span))
+    # The crossings are part of the window if there is no margin: step inside by as much.
+    step = _PART * span
+    inner = np.linspace(window.safe[0] + step, window.safe[1] - step, _SAMPLES)
+    rho = _solve(direct, part, {speed: np.append(inner, outer)})
+    beyond = float(np.min(rho[_SAMPLES:])) if outer else np.nan
+    return replace(window, check=Check(float(np.max(rho[:_SAMPLES])), beyond, len(rho)))
+
+
+def _solve(direct: Direct, part: Atlas, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    size = len(next(iter(columns.values())))
+    fixed = {name: np.full(size, value) for name, value in part.fixed.items()}
+    return np.asarray(direct({**fixed, **columns}), float)

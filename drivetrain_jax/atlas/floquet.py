@@ -1,0 +1,51 @@
+"""The atlas of the floquet analysis of a system: what to construct, how sharply to solve, how to evaluate it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from drivetrain_jax.atlas.construction import Domain, Rounds, construct
+from drivetrain_jax.atlas.floquet_quantity import floquet_quantity
+from drivetrain_jax.atlas.panels import Atlas
+from drivetrain_jax.atlas.stability import StabilityAtlas
+from drivetrain_jax.systems import Smoothness, System
+
+# Direct solves are to be this much better than the atlas, as far as rounding allows.
+_SHARPER, _FINEST = 1e-2, 1e-13
+
+
+def solve_rtol(tolerance: float) -> float:
+    """``rtol`` of the analysis ``floquet_propagator`` for the solves of an atlas."""
+    return max(_SHARPER * tolerance, _FINEST)
+
+
+def floquet_domain(system: System, ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, float]) -> Domain:
+    """The box ``ranges`` (name to lower and upper value) of ``system`` with the coordinates that the system declares."""
+    smooth = system.models["floquet"].smooth or Smoothness({})
+    names = tuple(ranges)
+    return Domain(
+        names,
+        tuple(float(ranges[name][0]) for name in names),
+        tuple(float(ranges[name][1]) for name in names),
+        tuple(smooth.coordinate(name) for name in names),
+        dict(fixed),
+    )
+
+
+def floquet_rounds(
+    system: System, ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, float], tolerance: float
+) -> Rounds:
+    """The construction of an atlas of the propagator, as :func:`~drivetrain_jax.atlas.construct`.
+
+    It asks for the variable ``propagator`` of the analysis ``floquet_propagator`` with the option
+    ``rtol = solve_rtol(tolerance)``.
+    """
+    domain = floquet_domain(system, ranges, fixed)
+    middle = {name: (a + b) / 2 for name, a, b in zip(domain.parameters, domain.lower, domain.upper, strict=True)}
+    form = system.models["floquet"].build({**fixed, **middle}).reduced
+    return construct(domain, floquet_quantity(form), tolerance)
+
+
+def stability_atlas(atlas: Atlas, system: System, rtol: float) -> StabilityAtlas:
+    """Spectral radius, bound and verdict from an atlas that :func:`floquet_rounds` made; ``rtol`` judges outcomes."""
+    return StabilityAtlas(atlas, system.models["floquet"].build, rtol)

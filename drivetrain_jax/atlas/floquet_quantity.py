@@ -1,0 +1,67 @@
+"""The propagator of a periodic system as the quantity of an atlas, and how cells are judged one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis.direct import Monodromy, assemble
+from drivetrain_jax.analysis.floquet_results import results
+from drivetrain_jax.analysis.linear_algebra import eigenvalues
+from drivetrain_jax.analysis.multipliers import characteristic_coefficients
+from drivetrain_jax.atlas.quantity import Quantity
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic
+
+Build = Callable[[Mapping[str, Any]], FloquetModel]
+
+
+def floquet_quantity(form: LinearPeriodic) -> Quantity:
+    """Entries of ``Phi`` of ``form`` by rows; errors are measured on the monodromy matrix, relative to its size.
+
+    Derived are the coefficients a_k of det(sigma I - Z), all but the last where Liouville's formula gives that one.
+    """
+    n = form.size
+    count = n if form.log_determinant is None else n - 1
+
+    def monodromy(values: np.ndarray) -> np.ndarray:
+        phi = values.reshape(-1, n, n)
+        return phi if form.reversor is None else form.reversor @ np.swapaxes(phi, 1, 2) @ form.reversor @ phi
+
+    def scale(values: np.ndarray) -> np.ndarray:
+        # |dZ| <= 2 |Phi| |dPhi| where Z is a product of two.
+        size = np.linalg.norm(monodromy(values), axis=(1, 2))
+        return size if form.reversor is None else size / (2 * np.linalg.norm(values, axis=1))
+
+    def derived(values: np.ndarray) -> np.ndarray:
+        z = np.moveaxis(monodromy(values), 0, -1)
+        return np.asarray(characteristic_coefficients(z)).T[:, :count]
+
+    return Quantity(n * n, scale, derived)
+
+
+def judge(
+    phi: Array, build: Build, values: Mapping[str, Any], errors: Array, outputs: tuple[str, ...], rtol: float
+) -> dict[str, Array]:
+    """Results of the floquet analysis for lanes of ``Phi``, its entries by rows ``(n n, N)``, by eigenvalues of Z.
+
+    ``values`` holds all parameters, each a number or an array ``(N,)``; ``errors`` ``(k, N)`` the bounds of the a_k.
+    """
+    model = build(values)
+    form, n = model.reduced, model.reduced.size
+    matrix = phi.reshape(n, n, -1)
+    z = assemble(form, matrix)
+    a = characteristic_coefficients(z)
+    rho = jnp.max(jnp.hypot(*eigenvalues(z)), axis=0)
+    relative = jnp.max(jnp.stack([errors[k] / rho ** (k + 1) for k in range(errors.shape[0])]), axis=0)
+    residual = jnp.zeros_like(rho)
+    if form.log_determinant is not None:
+        residual = ((-1) ** n * a[-1] - jnp.exp(form.log_determinant())) / rho**n
+        relative = jnp.maximum(relative, jnp.abs(residual))
+    halves = 1 if form.reversor is None else 2
+    rounding = 4 * np.finfo(float).eps * jnp.sum(matrix**2, axis=(0, 1)) ** (halves / 2) / rho
+    monodromy = Monodromy(z, jnp.zeros_like(rho), relative + rounding, relative <= 10 * rtol, residual)
+    return results(monodromy, outputs, rtol, model.natural.span)

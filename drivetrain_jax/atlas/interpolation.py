@@ -1,0 +1,61 @@
+"""Chebyshev interpolation on tensor grids: nodes, coefficients, tails."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.fft import dctn
+
+from drivetrain_jax.atlas.panels import chebyshev
+
+# Points evaluated at a time.
+_BLOCK = 4096
+
+
+def nodes(n: int) -> np.ndarray:
+    """The ``n`` zeros of T_n, falling."""
+    return np.cos(np.pi * (np.arange(n) + 0.5) / n)
+
+
+def tensor_nodes(degrees: Sequence[int]) -> np.ndarray:
+    """All points of the tensor grid in [-1, 1]^d in C order, ``(prod(degrees), d)``."""
+    grid = np.meshgrid(*(nodes(n) for n in degrees), indexing="ij")
+    return np.stack([x.reshape(-1) for x in grid], axis=-1)
+
+
+def coefficients(values: np.ndarray, degrees: Sequence[int]) -> np.ndarray:
+    """Coefficients ``(n_1, ..., n_d, m)`` from the values at ``tensor_nodes(degrees)``, ``(prod(degrees), m)``."""
+    axes = tuple(range(len(degrees)))
+    tensor = dctn(values.reshape(*degrees, -1), axes=axes) / np.prod(degrees)
+    for axis in axes:
+        first = [slice(None)] * tensor.ndim
+        first[axis] = slice(0, 1)
+        tensor[tuple(first)] /= 2
+    return tensor
+
+
+def evaluate(tensor: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Values ``(N, m)`` at points ``(N, d)`` in [-1, 1]^d."""
+    out = np.empty((len(x), tensor.shape[-1]))
+    for start in range(0, len(x), _BLOCK):
+        part = x[start : start + _BLOCK]
+        # The first contraction is one product of matrices; the others are over what is left of each point.
+        rest = chebyshev(part[:, 0], tensor.shape[0]) @ tensor.reshape(tensor.shape[0], -1)
+        for k in range(1, x.shape[1]):
+            rest = np.einsum(
+                "pn,pnr->pr", chebyshev(part[:, k], tensor.shape[k]), rest.reshape(len(part), tensor.shape[k], -1)
+            )
+        out[start : start + _BLOCK] = rest
+    return out
+
+
+def slabs(tensor: np.ndarray, axis: int) -> np.ndarray:
+    """Size of the coefficients of T_j along ``axis``, ``(n,)``: root of the sum of squares over all others."""
+    others = tuple(k for k in range(tensor.ndim) if k != axis)
+    return np.sqrt(np.sum(tensor**2, axis=others))
+
+
+def envelope(sizes: np.ndarray) -> np.ndarray:
+    """Largest of ``sizes`` from each one on."""
+    return np.maximum.accumulate(sizes[::-1])[::-1]

@@ -1,0 +1,109 @@
+"""How many nodes each coordinate of a box needs, from probes along lines on its edges."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from drivetrain_jax.atlas import decay
+from drivetrain_jax.atlas.box import Parts, Progress
+from drivetrain_jax.atlas.interpolation import envelope
+
+# Points of a line at first; each refinement doubles the intervals.
+_LINE = 17
+# A line is resolved to this fraction of the tolerance, and the tensor has so many nodes more: lines along the edges do
+# not see everything. With three coordinates and more every node counts, and there are more lines.
+_FRACTION, _MARGIN = {1: 1 / 8, 2: 1 / 8}, {1: 2, 2: 2}
+# Most lines at which a coordinate is probed.
+_MAX_LINES = 8
+
+Probe = Generator[np.ndarray, np.ndarray, Parts | list[int]]
+
+
+def _corners(d: int, axis: int) -> list[np.ndarray]:
+    """Ends of the other coordinates at which a line along ``axis`` is probed."""
+    others = [k for k in range(d) if k != axis]
+    corners = []
+    for ends in product((-1.0, 1.0), repeat=len(others)):
+        corner = np.zeros(d)
+        corner[others] = ends
+        corners.append(corner)
+    return corners[:: max(1, len(corners) // _MAX_LINES)]
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A line through the box along ``axis``: values at ``len(values)`` Lobatto points."""
+
+    axis: int
+    corner: np.ndarray
+    values: np.ndarray
+
+    @property
+    def sizes(self) -> np.ndarray:
+        return decay.line_sizes(self.values)
+
+
+def _along(corner: np.ndarray, axis: int, t: np.ndarray) -> np.ndarray:
+    points = np.repeat(corner[None], len(t), axis=0)
+    points[:, axis] = t
+    return points
+
+
+def probe(progress: Progress) -> Probe:
+    """Nodes that each coordinate needs according to lines along the edges, or what becomes of the box instead."""
+    d = len(progress.box.lower)
+    places = [(axis, corner) for axis in range(d) for corner in _corners(d, axis)]
+    t = np.concatenate([_along(corner, axis, decay.lobatto(_LINE)) for axis, corner in places])
+    values = yield from progress.ask(t)
+    if not np.isfinite(values).all():
+        return progress.failed(values)
+    limit = progress.settings.limit(values) * _FRACTION.get(d, 1 / 2)
+    lines = [_Line(*place, v) for place, v in zip(places, np.split(values, len(places)), strict=True)]
+
+    def cost(line: _Line) -> tuple[float, float]:
+        sizes = line.sizes
+        return decay.needed(sizes, limit) or np.inf, envelope(sizes)[-3]
+
+    worst = [max((line for line in lines if line.axis == axis), key=cost) for axis in range(d)]
+    return (yield from _refine(progress, worst, limit))
+
+
+def _refine(progress: Progress, lines: list[_Line], limit: float) -> Probe:
+    """Refine the worst line of each coordinate until all are resolved, or one is hopeless."""
+    while open_lines := [line for line in lines if decay.needed(line.sizes, limit) is None]:
+        for line in open_lines:
+            hopeless = _verdict(line, progress)
+            if hopeless:
+                return hopeless
+        t = [_along(line.corner, line.axis, decay.lobatto(2 * len(line.values) - 1)[1::2]) for line in open_lines]
+        values = yield from progress.ask(np.concatenate(t))
+        if not np.isfinite(values).all():
+            return progress.failed(values)
+        for line, new in zip(open_lines, np.split(values, np.cumsum([len(x) for x in t])[:-1]), strict=True):
+            merged = np.empty((2 * len(line.values) - 1, values.shape[1]))
+            merged[::2], merged[1::2] = line.values, new
+            lines[line.axis] = replace(line, values=merged)
+    degrees = [decay.needed(line.sizes, limit) + _MARGIN.get(len(lines), 0) for line in lines]
+    largest = int(np.argmax(degrees))
+    if degrees[largest] > progress.settings.max_nodes:
+        return progress.split(largest, f"more than {progress.settings.max_nodes} nodes would be needed")
+    return degrees
+
+
+def _verdict(line: _Line, progress: Progress) -> Parts | None:
+    """What becomes of the box if ``line`` is no use refining; None if it is."""
+    if len(line.values) <= 2 * _LINE:
+        return None
+    sizes = line.sizes
+    if decay.is_noise(sizes):
+        level = envelope(sizes)[len(sizes) // 2] / sizes[0]
+        return progress.give_up(f"the direct solves scatter by {level:.0e}, more than the tolerance allows")
+    if decay.is_algebraic(sizes):
+        return progress.trouble("not smooth: the coefficients fall like a power", line.axis)
+    if len(line.values) > progress.settings.max_nodes:
+        return progress.split(line.axis, "not resolved")
+    return None

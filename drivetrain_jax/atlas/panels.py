@@ -1,0 +1,165 @@
+"""An atlas: smooth functions of parameters as Chebyshev tensors over boxes (panels) that tile a domain.
+
+Nothing here knows what the functions mean. Boxes and coefficients are in the atlas's own coordinates (1/Omega, ...),
+one per parameter; parameters are converted at the door. With x in [-1, 1]^d the position within a panel,
+
+    f_e(x) = sum_k coefficients[k_1, ..., k_d, e] T_(k_1)(x_1) ... T_(k_d)(x_d).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drivetrain_jax.systems import Coordinate
+
+# Points that lie outside the domain by rounding of their coordinate alone belong to it.
+_SLACK = 8 * np.finfo(float).eps
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One box ``lower``..``upper``, both ``(d,)`` in the coordinates, with ``coefficients`` ``(n_1, ..., n_d, m)``.
+
+    ``value_error`` bounds the Euclidean norm of the error of the m values, ``derived_error`` ``(k,)`` the absolute
+    errors of the k numbers that the atlas's quantity derives from them (see :class:`~drivetrain_jax.atlas.Quantity`);
+    for the cardan shaft a_1, a_2, a_3 of det(sigma I - Z) = sigma^4 + a_1 sigma^3 + a_2 sigma^2 + a_3 sigma + a_4.
+    The bounds are statistical (from held-out solves), not proved. Rounding at evaluation is not in them.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    coefficients: np.ndarray
+    value_error: float
+    derived_error: np.ndarray
+
+    @property
+    def degrees(self) -> tuple[int, ...]:
+        """Number of Chebyshev polynomials in each coordinate."""
+        return self.coefficients.shape[:-1]
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A box, in the coordinates, without a panel: why the function did not converge there."""
+
+    lower: np.ndarray
+    upper: np.ndarray
+    reason: str
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """Panels over the box ``lower``..``upper`` (in parameters, ``(d,)``) of ``parameters``; the others are ``fixed``.
+
+    ``coordinates`` has one entry per parameter. ``tolerance`` is the aim of the construction, relative to the size of
+    the values; ``solves`` the number of direct solves spent. Panels and gaps together tile the domain.
+    """
+
+    parameters: tuple[str, ...]
+    coordinates: tuple[Coordinate, ...]
+    lower: np.ndarray
+    upper: np.ndarray
+    fixed: Mapping[str, float]
+    panels: tuple[Panel, ...]
+    gaps: tuple[Gap, ...]
+    tolerance: float
+    solves: int
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients of one value over all panels."""
+        return sum(int(np.prod(p.degrees)) for p in self.panels)
+
+    def to_coordinates(self, points: np.ndarray) -> np.ndarray:
+        """Coordinates of points given by their parameters, ``(..., d)``."""
+        points = np.asarray(points, float)
+        columns = [c.forward(points[..., k]) for k, c in enumerate(self.coordinates)]
+        return np.stack(columns, axis=-1) if columns else np.empty(points.shape)
+
+    def to_parameters(self, points: np.ndarray) -> np.ndarray:
+        """Parameters of points given by their coordinates, ``(..., d)``."""
+        columns = [c.inverse(points[..., k]) for k, c in enumerate(self.coordinates)]
+        return np.stack(columns, axis=-1) if columns else np.empty(np.shape(points))
+
+    def find(self, x: np.ndarray) -> np.ndarray:
+        """Number of the panel of each point in coordinates, ``(N, d) -> (N,)``; -1 in a gap or outside the domain."""
+        found = np.full(len(x), -1)
+        for number, panel in reversed(list(enumerate(self.panels))):
+            found[_inside(panel, x)] = number
+        return found
+
+    def slice(self, values: Mapping[str, float]) -> Atlas:
+        """The atlas of the remaining parameters where those in ``values`` have these values.
+
+        Raises ``KeyError`` for a parameter that the atlas lacks and ``ValueError`` for a value outside the domain.
+        """
+        atlas = self
+        for name, value in values.items():
+            atlas = atlas._without(name, float(value))
+        return atlas
+
+    def _without(self, name: str, value: float) -> Atlas:
+        if name not in self.parameters:
+            raise KeyError(f"{name}: the atlas has {', '.join(self.parameters)}")
+        k = self.parameters.index(name)
+        if not self.lower[k] <= value <= self.upper[k]:
+            raise ValueError(f"{name} = {value!r}: allowed is {self.lower[k]:g} to {self.upper[k]:g}")
+        x = float(self.coordinates[k].forward(value))
+        boxes = [box for box in (*self.panels, *self.gaps) if _contains(box, k, x)]
+        # On a common face the first of two neighbours is enough.
+        kept: dict[tuple, Panel | Gap] = {}
+        for box in boxes:
+            reduced = _fix(box, k, x)
+            kept.setdefault((*reduced.lower, *reduced.upper), reduced)
+        return replace(
+            self,
+            parameters=_drop(self.parameters, k),
+            coordinates=_drop(self.coordinates, k),
+            lower=np.delete(self.lower, k),
+            upper=np.delete(self.upper, k),
+            fixed={**self.fixed, name: value},
+            panels=tuple(box for box in kept.values() if isinstance(box, Panel)),
+            gaps=tuple(box for box in kept.values() if isinstance(box, Gap)),
+        )
+
+
+def position(panel: Panel | Gap, x: np.ndarray) -> np.ndarray:
+    """Position in [-1, 1]^d of points given by their coordinates, ``(..., d)``."""
+    span = panel.upper - panel.lower
+    return np.clip(((x - panel.lower) - (panel.upper - x)) / span, -1.0, 1.0)
+
+
+def chebyshev(x: np.ndarray, n: int) -> np.ndarray:
+    """``T_0 .. T_(n-1)`` at ``x`` in [-1, 1], shape ``(*x.shape, n)``."""
+    return np.cos(np.arccos(x)[..., None] * np.arange(n))
+
+
+def _slack(panel: Panel | Gap) -> np.ndarray:
+    return _SLACK * np.maximum(np.abs(panel.lower), np.abs(panel.upper))
+
+
+def _inside(panel: Panel | Gap, x: np.ndarray) -> np.ndarray:
+    slack = _slack(panel)
+    return ((x >= panel.lower - slack) & (x <= panel.upper + slack)).all(axis=-1)
+
+
+def _contains(box: Panel | Gap, k: int, x: float) -> bool:
+    slack = _slack(box)[k]
+    return box.lower[k] - slack <= x <= box.upper[k] + slack
+
+
+def _drop(entries: tuple, k: int) -> tuple:
+    return entries[:k] + entries[k + 1 :]
+
+
+def _fix(box: Panel | Gap, k: int, x: float) -> Panel | Gap:
+    lower, upper = np.delete(box.lower, k), np.delete(box.upper, k)
+    if isinstance(box, Gap):
+        return Gap(lower, upper, box.reason)
+    t = np.clip((2 * x - box.lower[k] - box.upper[k]) / (box.upper[k] - box.lower[k]), -1.0, 1.0)
+    weights = chebyshev(np.asarray(t), box.degrees[k])
+    coefficients = np.tensordot(weights, box.coefficients, axes=(0, k))
+    return replace(box, lower=lower, upper=upper, coefficients=coefficients)

@@ -1,0 +1,313 @@
+"""Boundary functions as Chebyshev polynomials of low degree over many small boxes, and what can be proved of them there.
+
+A patch holds f(x) = sum_k c_k T_(k_1)(t_1) ... T_(k_d)(t_d), t in [-1, 1]^d, for d = 1 or 2, with a bound ``error`` of
+|f - true function| over the patch. All operations act on an array of patches at once. The range of a polynomial lies
+within c_0 -+ sum |other c_k|; that is what every exclusion rests on.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from drivetrain_jax.atlas.criteria import Criteria, on_grid
+from drivetrain_jax.atlas.panels import Panel, chebyshev
+
+# Nodes of a patch in each coordinate, tail of the series relative to its size, and the largest number of patches.
+NODES = 16
+_TAIL = 3e-14
+_MAX_PATCHES = 8_000
+# By how much boxes are enlarged so that a root on a face is inside.
+MARGIN = 0.25
+# Off the middle, so that a root rarely sits on the face between two boxes.
+_CUT = 0.0271
+
+
+@dataclass(frozen=True)
+class Patches:
+    """``coefficients`` ``(n, ..., n, N)`` over boxes ``lower``..``upper`` ``(N, d)``.
+
+    The error is at most ``floor`` ``(N,)`` plus the modulus of a function given by ``lever`` ``(m, ..., m, N)``.
+
+    ``roughness`` ``(N, d)`` bounds how much faster than a polynomial of the patch's degree the error may vary along each
+    coordinate: the error of a derivative is taken as ``error`` times it.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    coefficients: np.ndarray
+    lever: np.ndarray
+    floor: np.ndarray
+    roughness: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.lower)
+
+    @cached_property
+    def error(self) -> np.ndarray:
+        """Bound of the error over each patch, ``(N,)``."""
+        return self.floor + np.abs(self.lever).sum(axis=tuple(range(self.dimension)))
+
+    @property
+    def dimension(self) -> int:
+        """Number of coordinates."""
+        return self.lower.shape[1]
+
+    def take(self, chosen: np.ndarray) -> Patches:
+        """The patches ``chosen`` (a mask or indices)."""
+        return Patches(
+            self.lower[chosen],
+            self.upper[chosen],
+            self.coefficients[..., chosen],
+            self.lever[..., chosen],
+            self.floor[chosen],
+            self.roughness[chosen],
+        )
+
+    def derivative(self, axis: int) -> Patches:
+        """The patches of the derivative along a coordinate."""
+        matrix = _differentiation(self.coefficients.shape[axis])
+        scale = 2 / (self.upper[:, axis] - self.lower[:, axis])
+        coefficients = _apply(matrix, self.coefficients, axis) * scale
+        nothing = np.zeros((*(1,) * self.dimension, len(self)))
+        return replace(self, coefficients=coefficients, lever=nothing, floor=self.error * self.roughness[:, axis])
+
+    def range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bound of the true function over each patch, ``(N,)`` each."""
+        flat = self.coefficients.reshape(math.prod(self.coefficients.shape[:-1]), len(self))
+        rest = np.abs(flat[1:]).sum(axis=0) + self.error
+        return flat[0] - rest, flat[0] + rest
+
+    def __call__(self, t: np.ndarray) -> np.ndarray:
+        """Values at positions ``t`` in [-1, 1]^d, one a patch, ``(N, d) -> (N,)``."""
+        total = self.coefficients
+        for axis in range(self.dimension):
+            total = np.einsum("i...n,ni->...n", total, chebyshev(t[:, axis], total.shape[0]))
+        return total
+
+    def locate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Number of the patch of each point and the position in it, ``(N, d) -> (N,), (N, d)``; the nearest if outside."""
+        point = x[:, None]
+        outside = np.maximum(self.lower - point, point - self.upper) / (self.upper - self.lower)
+        number = np.argmin(np.nan_to_num(np.maximum(outside, 0.0).max(axis=2), nan=np.inf), axis=1)
+        lower, upper = self.lower[number], self.upper[number]
+        return number, ((x - lower) - (upper - x)) / (upper - lower)
+
+    def at(self, number: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Values at positions ``t`` in the patches ``number``, as :meth:`locate` gives them; NaN if far outside."""
+        inside = (np.abs(t) <= 1 + MARGIN).all(axis=1)
+        values = self.take(number)(np.where(inside[:, None], np.clip(t, -1.0, 1.0), 0.0))
+        return np.where(inside, values, np.nan)
+
+    def trim(self) -> Patches:
+        """The same with fewer coefficients, if those left out add less than a hundredth to the error of every patch."""
+        patches = self
+        for axis in range(self.dimension):
+            c = np.moveaxis(np.abs(patches.coefficients), axis, 0)
+            dropped = np.cumsum(c.sum(axis=tuple(range(1, c.ndim - 1)))[::-1], axis=0)[::-1]
+            needed = np.flatnonzero((dropped > patches.error / 100).any(axis=1))
+            n = max(4, needed[-1] + 1 if needed.size else 0)
+            if n < len(c):
+                kept = np.take(patches.coefficients, range(n), axis=axis)
+                patches = replace(patches, coefficients=kept, floor=patches.floor + dropped[n])
+        return patches
+
+    def restrict(self, axis: int, t: np.ndarray) -> Patches:
+        """Patches of the other coordinates where the coordinate ``axis`` is at positions ``t`` ``(N,)``."""
+
+        def contract(c: np.ndarray) -> np.ndarray:
+            weights = np.cos(np.arange(c.shape[axis])[:, None] * np.arccos(np.clip(t, -1.0, 1.0)))
+            return (np.moveaxis(c, axis, 0) * weights.reshape(len(weights), *(1,) * (c.ndim - 2), -1)).sum(axis=0)
+
+        return Patches(
+            np.delete(self.lower, axis, axis=1),
+            np.delete(self.upper, axis, axis=1),
+            contract(self.coefficients),
+            contract(self.lever),
+            self.floor,
+            np.delete(self.roughness, axis, axis=1),
+        )
+
+    def steepest_axis(self) -> np.ndarray:
+        """The coordinate along which each patch varies most, ``(N,)``."""
+        size = np.abs(self.coefficients)
+        axes = tuple(range(self.dimension))
+        return np.argmax([np.delete(size, 0, axis=axis).sum(axis=axes) for axis in axes], axis=0)
+
+    def split(self, axes: np.ndarray) -> Patches:
+        """Each patch in two, across the coordinate ``axes`` ``(N,)``."""
+        return join([half for k in range(self.dimension) for half in self.take(axes == k)._halves(k)])
+
+    def enlarged(self) -> Patches:
+        """The same polynomials over boxes larger by ``MARGIN`` about their centres."""
+        middle, half = (self.lower + self.upper) / 2, (self.upper - self.lower) / 2 * (1 + MARGIN)
+        series = {"coefficients": self.coefficients, "lever": self.lever}
+        for name, c in series.items():
+            for axis in range(self.dimension):
+                c = _apply(_enlargement(c.shape[axis]), c, axis)
+            series[name] = c
+        return replace(self, lower=middle - half, upper=middle + half, **series)
+
+    def _halves(self, axis: int) -> tuple[Patches, Patches]:
+        middle = (self.lower[:, axis] + self.upper[:, axis]) / 2
+        middle = middle + _CUT * (self.upper[:, axis] - self.lower[:, axis]) / 2
+        lower, upper = self.lower.copy(), self.upper.copy()
+        lower[:, axis] = upper[:, axis] = middle
+        parts = []
+        for side, box in enumerate(({"upper": upper}, {"lower": lower})):
+            series = {
+                name: _apply(_restrictions(c.shape[axis])[side], c, axis)
+                for name, c in (("coefficients", self.coefficients), ("lever", self.lever))
+            }
+            parts.append(replace(self, **box, **series))
+        return tuple(parts)
+
+
+def join(parts: list[Patches]) -> Patches:
+    """Several arrays of patches as one."""
+    series = ("coefficients", "lever")
+    return Patches(
+        *(
+            np.concatenate([getattr(p, f.name) for p in parts], axis=-1 if f.name in series else 0)
+            for f in fields(Patches)
+        )
+    )
+
+
+def patches_of(criteria: Criteria) -> tuple[Patches, ...]:
+    """The patches of every function of ``criteria`` over all panels of its atlas (one or two parameters).
+
+    Raises ``ValueError`` if the atlas has no panel.
+    """
+    if not criteria.atlas.panels:
+        reasons = "; ".join(sorted({gap.reason for gap in criteria.atlas.gaps}))
+        raise ValueError(f"atlas without a panel ({reasons}): allowed is one that covers some of its domain")
+    parts = [_cover(criteria, panel) for panel in criteria.atlas.panels]
+    return tuple(join(list(patches)) for patches in zip(*parts, strict=True))
+
+
+def _cover(criteria: Criteria, panel: Panel) -> tuple[Patches, ...]:
+    """Patches over one panel, finer along each coordinate until all series have ended."""
+    counts = [max(1, round(degree / NODES)) for degree in panel.degrees]
+    before = [np.inf] * len(counts)
+    while True:
+        sample = _sample(criteria, panel, counts)
+        tails = [_tail(sample.coefficients, axis) for axis in range(len(counts))]
+        size = np.abs(sample.coefficients).sum(axis=tuple(range(1, len(counts) + 1)))
+        with np.errstate(all="ignore"):
+            excess = [np.nanmax(tail / np.maximum(_TAIL * size, sample.floor / 8)) for tail in tails]
+        # A tail that does not fall with smaller patches is rounding.
+        rough = [e > 1 and e < b / 2 for e, b in zip(excess, before, strict=True)]
+        if not any(rough) or np.prod(counts) * 2 > _MAX_PATCHES:
+            break
+        before = [e if split else b for e, b, split in zip(excess, before, rough, strict=True)]
+        counts = [int(np.ceil(1.5 * count)) if split else count for count, split in zip(counts, rough, strict=True)]
+    # The tail that was cut off is about as large as the last coefficients that were kept.
+    floors = sample.floor + 4 * sum(tails)
+    floors = np.where(np.isfinite(floors), floors, np.inf)
+    roughness = _roughness(panel, sample.lower, sample.upper)
+    return tuple(
+        Patches(sample.lower, sample.upper, np.nan_to_num(c), np.nan_to_num(lever), floor, roughness)
+        for c, lever, floor in zip(sample.coefficients, sample.lever, floors, strict=True)
+    )
+
+
+def _roughness(panel: Panel, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Bernstein's and Markov's inequality for the error of a panel: of twice its degree, as Phi enters quadratically."""
+    half = (panel.upper - panel.lower) / 2
+    reach = np.maximum(np.abs(lower - panel.lower - half), np.abs(upper - panel.lower - half)) / half
+    degree = 2.0 * np.array(panel.degrees)
+    return degree / half * np.minimum(degree, 1 / np.sqrt(np.maximum(1 - reach**2, degree**-2)))
+
+
+class _Sample(NamedTuple):
+    """Series ``(k, n, ..., n, N)`` of the functions and of their errors' levers, floors ``(k, N)``, boxes ``(N, d)``."""
+
+    coefficients: np.ndarray
+    lever: np.ndarray
+    floor: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+def _sample(criteria: Criteria, panel: Panel, counts: list[int]) -> _Sample:
+    """The functions on counts[0] x counts[1] equal patches of one panel."""
+    d = len(counts)
+    edges = [np.linspace(panel.lower[k], panel.upper[k], counts[k] + 1) for k in range(d)]
+    nodes = _nodes(NODES)
+    axes = tuple((e[:-1, None] * (1 - nodes) / 2 + e[1:, None] * (1 + nodes) / 2).reshape(-1) for e in edges)
+    phi = on_grid(panel, axes)
+    log_determinant = criteria.log_determinant(_mesh(axes)).reshape(phi.shape[1:])
+    split = tuple(n for count in counts for n in (count, NODES))
+    order = (0, *range(2, 2 * d + 1, 2), *range(1, 2 * d + 1, 2))
+
+    def by_patch(values: np.ndarray) -> np.ndarray:
+        values = values.reshape(-1, *split).transpose(order)
+        return values.reshape(*values.shape[: d + 1], -1)
+
+    def series(values: np.ndarray) -> np.ndarray:
+        values = by_patch(values)
+        for axis in range(1, d + 1):
+            values = _apply(_analysis(NODES), values, axis)
+        return values
+
+    floor, lever = criteria.errors(panel, phi, log_determinant)
+    return _Sample(
+        series(criteria.derive(phi, log_determinant)),
+        series(lever),
+        by_patch(floor).max(axis=tuple(range(1, d + 1))),
+        _mesh(tuple(e[:-1] for e in edges)),
+        _mesh(tuple(e[1:] for e in edges)),
+    )
+
+
+def _mesh(axes: tuple[np.ndarray, ...]) -> np.ndarray:
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+
+
+def _tail(coefficients: np.ndarray, axis: int) -> np.ndarray:
+    """Sum of the last two slabs of coefficients along a coordinate, ``(k, n, ..., N) -> (k, N)``."""
+    last = np.take(np.abs(coefficients), [-2, -1], axis=axis + 1)
+    return last.sum(axis=tuple(range(1, coefficients.ndim - 1)))
+
+
+def _apply(matrix: np.ndarray, coefficients: np.ndarray, axis: int) -> np.ndarray:
+    return np.moveaxis(np.tensordot(matrix, coefficients, axes=((1,), (axis,))), 0, axis)
+
+
+def _nodes(n: int) -> np.ndarray:
+    return np.cos(np.pi * (np.arange(n) + 0.5) / n)
+
+
+@lru_cache
+def _analysis(n: int) -> np.ndarray:
+    """Matrix from values at the nodes to Chebyshev coefficients."""
+    matrix = 2 / n * chebyshev(_nodes(n), n).T
+    matrix[0] /= 2
+    return matrix
+
+
+@lru_cache
+def _differentiation(n: int) -> np.ndarray:
+    """Matrix from the coefficients of a polynomial to those of its derivative (of the same length)."""
+    matrix = np.zeros((n, n))
+    matrix[: n - 1] = np.polynomial.chebyshev.chebder(np.eye(n), axis=0)
+    return matrix
+
+
+@lru_cache
+def _enlargement(n: int) -> np.ndarray:
+    """Matrix from the coefficients over [-1, 1] to those over an interval larger by ``MARGIN``."""
+    return _analysis(n) @ np.polynomial.chebyshev.chebvander((1 + MARGIN) * _nodes(n), n - 1)
+
+
+@lru_cache
+def _restrictions(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Matrices from the coefficients over [-1, 1] to those over the two parts left and right of the cut."""
+    nodes = _nodes(n)
+    left, right = (_CUT - 1 + (1 + _CUT) * nodes) / 2, (1 + _CUT + (1 - _CUT) * nodes) / 2
+    return tuple(_analysis(n) @ chebyshev(part, n) for part in (left, right))

@@ -1,0 +1,34 @@
+"""What an atlas interpolates, and how its accuracy is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+
+def _norm(values: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.sum(values**2, axis=-1))
+
+
+def _largest(values: np.ndarray) -> np.ndarray:
+    return np.full(len(values), np.max(_norm(values), initial=0.0))
+
+
+def _nothing(values: np.ndarray) -> np.ndarray:
+    return np.empty((len(values), 0))
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """``size`` smooth functions of the parameters. All functions below take values ``(N, size)`` of N points.
+
+    ``scale(values)`` ``(N,)``: an error of the values (Euclidean norm) divided by this is what the tolerance of an atlas
+    limits; by default the largest norm among the points. ``derived(values)`` ``(N, k)``: numbers for whose errors
+    panels vouch as well, because bounds that follow from that of the values would be too wide; by default none.
+    """
+
+    size: int
+    scale: Callable[[np.ndarray], np.ndarray] = _largest
+    derived: Callable[[np.ndarray], np.ndarray] = _nothing

@@ -1,0 +1,263 @@
+"""Stability from an atlas of the propagator: spectral radius with its bound and verdict, on grids and at points.
+
+Most cells are judged in closed form (``quartic``). Those for which that gives too wide a bound or no verdict are judged
+again by the eigenvalues of Z, as every single point is; without damping the verdict is that of ``conservative``.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis import Outcome
+from drivetrain_jax.analysis.floquet_results import VARIABLES
+from drivetrain_jax.atlas import conservative, evaluation, quartic
+from drivetrain_jax.atlas.floquet_quantity import Build, judge
+from drivetrain_jax.atlas.panels import Atlas, Panel
+from drivetrain_jax.systems import FloquetModel
+
+DEFAULT_OUTPUTS = ("spectral_radius", "spectral_radius_error", "verdict")
+_FAST = frozenset(DEFAULT_OUTPUTS)
+_UNDECIDED = 2
+# Cells of a tile. Columns are the lanes, few enough for their fusions not to be cut into parallel tasks.
+_ROWS, _COLUMNS = 64, 512
+_AHEAD = 4
+_SWAP = np.kron(np.array([[0.0, 1.0], [1.0, 0.0]]), np.eye(2))
+
+
+@dataclass(frozen=True)
+class StabilityAtlas:
+    """An atlas whose values are the propagator of the reduced form of ``build(values)``, and what follows from it.
+
+    ``rtol`` is the target by which outcomes are judged.
+    """
+
+    atlas: Atlas
+    build: Build
+    rtol: float
+
+    def slice(self, values: Mapping[str, float]) -> StabilityAtlas:
+        """The same for the remaining parameters; errors as in :meth:`Atlas.slice`."""
+        return StabilityAtlas(self.atlas.slice(values), self.build, self.rtol)
+
+    def at(self, points: np.ndarray, outputs: Sequence[str] = DEFAULT_OUTPUTS) -> dict[str, np.ndarray]:
+        """Results by name at points ``(N, d)`` in the order of ``atlas.parameters``, points first, and ``outcome``.
+
+        Points that no panel covers are NaN, their verdict undecided and their outcome ``LOST``: these are to be solved.
+        """
+        points = np.atleast_2d(np.asarray(points, float))
+        x, found = self.atlas.to_coordinates(points), _blank(outputs, (len(points),), self._multipliers)
+        number, size = self.atlas.find(x), evaluation.block_size(self.atlas)
+        for k in range(len(self.atlas.panels)):
+            mine = np.flatnonzero(number == k)
+            for part in (mine[i : i + size] for i in range(0, len(mine), size)):
+                for name, value in self._judged(k, points[part], x[part], size, tuple(outputs)).items():
+                    found[name][part] = value[: len(part)]
+        return found
+
+    def on_grid(self, axes: Sequence[np.ndarray], outputs: Sequence[str] = DEFAULT_OUTPUTS) -> dict[str, np.ndarray]:
+        """Results by name on the grid of ``axes``, one per parameter of the atlas, in its order, and ``outcome``.
+
+        Cells that no panel covers are marked as in :meth:`at`.
+        """
+        axes = [np.asarray(axis, float) for axis in axes]
+        shape = tuple(len(axis) for axis in axes)
+        if not self._closed_form or not _FAST.issuperset(outputs) or len(axes) < 2:
+            points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+            flat = self.at(points, outputs)
+            return {name: value.reshape(*shape, *value.shape[1:]) for name, value in flat.items()}
+        found = _blank(outputs, shape, self._multipliers)
+        # Tiles are blocks of neighbours, so panels have to cover ranges: axes rise in the atlas's coordinates.
+        orders = [
+            np.argsort(c.forward(axis), kind="stable") for c, axis in zip(self.atlas.coordinates, axes, strict=True)
+        ]
+        self._fill(found, [axis[order] for axis, order in zip(axes, orders, strict=True)], tuple(outputs))
+        for k, order in enumerate(orders):
+            if np.array_equal(order, np.arange(len(order))[::-1]):
+                found = {name: np.flip(value, axis=k) for name, value in found.items()}
+            elif not np.array_equal(order, np.arange(len(order))):
+                found = {name: np.take(value, np.argsort(order), axis=k) for name, value in found.items()}
+        return found
+
+    @property
+    def _multipliers(self) -> int:
+        return round(self.atlas.panels[0].coefficients.shape[-1] ** 0.5) if self.atlas.panels else 0
+
+    @cached_property
+    def _tensors(self) -> list[Array]:
+        """Coefficients of the panels where the kernels want them, converted once."""
+        degrees = evaluation.common_degrees(self.atlas.panels)
+        return [jnp.asarray(evaluation.padded_tensor(panel, degrees)) for panel in self.atlas.panels]
+
+    @cached_property
+    def _closed_form(self) -> bool:
+        middle = dict(zip(self.atlas.parameters, (self.atlas.lower + self.atlas.upper) / 2, strict=True))
+        form = self.build({**self.atlas.fixed, **middle}).reduced
+        known = form.reversor is not None and form.log_determinant is not None
+        return known and np.array_equal(form.reversor, _SWAP)
+
+    def _fill(self, found: dict[str, np.ndarray], axes: list[np.ndarray], outputs: tuple[str, ...]) -> None:
+        """Fill ``found`` tile by tile, then judge again the cells for which the closed form is not good enough."""
+        names = self.atlas.parameters
+        shape = (min(_ROWS, _round_up(len(axes[-2]), 8)), min(_COLUMNS, _round_up(len(axes[-1]), 16)))
+        kernel = _patch_kernel(self.build, names, tuple(sorted(self.atlas.fixed)), self.rtol)
+        coordinates = [c.forward(axis) for c, axis in zip(self.atlas.coordinates, axes, strict=True)]
+        again: list[np.ndarray] = [np.empty((0, len(axes)), int)]
+        pending: deque[tuple[evaluation.Tile, dict[str, Array]]] = deque()
+        for tile in evaluation.tiles(self.atlas, coordinates, shape):
+            values = {name: axis[i] for name, axis, i in zip(names, axes, tile.index, strict=True)}
+            for name, size in zip(names[-2:], shape, strict=True):
+                values[name] = np.pad(values[name], (0, size - len(values[name])), mode="edge")
+            cells = kernel(tile.tensor, tile.rows, tile.columns, _errors(tile.panel), values, self.atlas.fixed)
+            pending.append((tile, cells))
+            # What was asked for last is computed while the results before it are stored.
+            if len(pending) > _AHEAD:
+                again.append(_store(found, *pending.popleft(), outputs))
+        again += [_store(found, *entry, outputs) for entry in pending]
+        self._repair(found, axes, np.concatenate(again), outputs)
+
+    def _repair(
+        self, found: dict[str, np.ndarray], axes: list[np.ndarray], cells: np.ndarray, outputs: tuple[str, ...]
+    ) -> None:
+        for part in (cells[i : i + (1 << 18)] for i in range(0, len(cells), 1 << 18)):
+            points = np.stack([axis[part[:, k]] for k, axis in enumerate(axes)], axis=-1)
+            for name, value in self.at(points, outputs).items():
+                found[name][tuple(part.T)] = value
+
+    def _judged(
+        self, number: int, points: np.ndarray, x: np.ndarray, size: int, outputs: tuple[str, ...]
+    ) -> dict[str, np.ndarray]:
+        panel = self.atlas.panels[number]
+        weights = evaluation.point_weights(panel, x, evaluation.common_degrees(self.atlas.panels), size)
+        columns = np.pad(points, ((0, size - len(points)), (0, 0)), mode="edge")
+        values = {name: columns[:, k] for k, name in enumerate(self.atlas.parameters)}
+        kernel = _point_kernel(self.build, tuple(sorted(self.atlas.fixed)), outputs, self.rtol, self._closed_form)
+        found = kernel(self._tensors[number], weights, _errors(panel), values, self.atlas.fixed)
+        return {name: np.moveaxis(np.asarray(value), -1, 0) for name, value in found.items()}
+
+
+def _blank(outputs: Sequence[str], shape: tuple[int, ...], multipliers: int) -> dict[str, np.ndarray]:
+    """Results of points that nothing is known of."""
+    variables = {v.name: v for v in VARIABLES}
+    found = {}
+    for name in outputs:
+        own = (multipliers,) * len(variables[name].dims)
+        fill = _UNDECIDED if variables[name].dtype == "int8" else np.nan
+        found[name] = np.full((*shape, *own), fill, variables[name].dtype)
+    return found | {"outcome": np.full(shape, Outcome.LOST, np.int8)}
+
+
+def _store(
+    found: dict[str, np.ndarray], tile: evaluation.Tile, cells: Mapping[str, Array], outputs: tuple[str, ...]
+) -> np.ndarray:
+    """Put the results of a tile in their place; the cells to be judged again, as positions along each axis ``(N, d)``."""
+    rows, columns = (len(i) for i in tile.index[-2:])
+    place = tuple(slice(i[0], i[-1] + 1) for i in tile.index)
+    for name in (*outputs, "outcome"):
+        part = found[name][place]
+        part[...] = np.asarray(cells[name])[:rows, :columns].reshape(part.shape)
+    unsure = np.argwhere(np.asarray(cells["unsure"])[:rows, :columns])
+    first = [i[0] for i in tile.index]
+    leading = np.broadcast_to(np.array(first[:-2], int), (len(unsure), len(first) - 2))
+    return np.concatenate([leading, unsure + first[-2:]], axis=1)
+
+
+def _compiler_options(**further: Any) -> dict[str, Any] | None:
+    """Full vector width: XLA uses half of AVX-512 unless told otherwise."""
+    return {"xla_cpu_prefer_vector_width": 512, **further} if jax.default_backend() == "cpu" else None
+
+
+def _errors(panel: Panel) -> np.ndarray:
+    return np.array([panel.value_error, *panel.derived_error])
+
+
+def _round_up(n: int, step: int) -> int:
+    return -(-n // step) * step
+
+
+@lru_cache(maxsize=16)
+def _patch_kernel(build: Build, names: tuple[str, ...], fixed_names: tuple[str, ...], rtol: float) -> Any:
+    """Closed-form results ``(R, C)`` of a tile, and which of its cells are to be judged again."""
+
+    def kernel(tensor, rows, columns, errors, values, fixed):
+        leading = {name: values[name][0] for name in names[:-2]}
+
+        # Row by row: all intermediate results of a row stay in the cache, which makes this three times as fast.
+        def row(inputs):
+            weights, value = inputs
+            model = build({**fixed, **leading, names[-2]: value, names[-1]: values[names[-1]]})
+            return _closed_form(model, weights @ columns, errors, rtol)
+
+        first = evaluation.first_product(tensor, rows)
+        return jax.lax.map(row, (first, values[names[-2]]))
+
+    return jax.jit(kernel, compiler_options=_compiler_options())
+
+
+def _closed_form(model: FloquetModel, entries: Array, errors: Array, rtol: float) -> dict[str, Array]:
+    """Results of lanes of Phi, ``(16, N)``."""
+    phi = quartic.blocks(entries)
+    log_determinant = jnp.broadcast_to(model.reduced.log_determinant(), entries.shape[1:])
+    rho, error, unsure = quartic.spectral_radius(quartic.coefficients(phi, log_determinant, errors[1:]))
+    verdict = jnp.where(rho + error < 1, 0, jnp.where(rho - error > 1, 1, _UNDECIDED)).astype(jnp.int8)
+    rho, error, verdict = _without_damping(model, phi, errors[0], rho, error, verdict)
+    return {
+        "spectral_radius": rho,
+        "spectral_radius_error": error,
+        "verdict": verdict,
+        "outcome": jnp.where(error <= 10 * rtol * rho, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET).astype(jnp.int8),
+        "unsure": (unsure & (error > 4 * quartic.EPS)) | (verdict == _UNDECIDED),
+    }
+
+
+@lru_cache(maxsize=16)
+def _point_kernel(
+    build: Build, fixed_names: tuple[str, ...], outputs: tuple[str, ...], rtol: float, closed_form: bool
+) -> Any:
+    """Results of scattered points by eigenvalues."""
+
+    def kernel(tensor, weights, errors, values, fixed):
+        phi = evaluation.scattered(tensor, weights)
+        everything = {**fixed, **values}
+        lanes = jnp.broadcast_to(errors[1:, None], (len(errors) - 1, phi.shape[-1]))
+        found = judge(phi, build, everything, lanes, outputs, rtol)
+        if closed_form and _FAST & set(outputs):
+            found |= _judged_without_damping(phi, build(everything), errors[0], found, outputs)
+        return found
+
+    # XLA's fusion of several outputs gives wrong results here: it loses some of them where it cuts a fusion into parallel
+    # tasks, which it does from some thousands of lanes on (seen with jax 0.10.2).
+    return jax.jit(kernel, compiler_options=_compiler_options(xla_disable_hlo_passes="cpu_multi_output_fusion"))
+
+
+def _judged_without_damping(phi, model, value_error, found, outputs):
+    blank = jnp.zeros(phi.shape[-1])
+    given = [found.get(name, blank) for name in DEFAULT_OUTPUTS]
+    judged = _without_damping(model, quartic.blocks(phi), value_error, *given)
+    return {name: value for name, value in zip(DEFAULT_OUTPUTS, judged, strict=True) if name in outputs}
+
+
+def _without_damping(model, phi, value_error, rho, error, verdict):
+    """Exact statements where the system is Hamiltonian: a stable one has all multipliers on the unit circle."""
+    if model.hamiltonian is None:
+        return rho, error, verdict
+    applies = jnp.broadcast_to(jnp.asarray(model.hamiltonian()), rho.shape)
+
+    def exact() -> tuple[Array, Array, Array]:
+        judged = conservative.verdict(phi, value_error)
+        stable = applies & (judged == 0)
+        return (
+            jnp.where(stable, 1.0, rho),
+            jnp.where(stable, 4 * quartic.EPS, error),
+            jnp.where(applies, judged, verdict).astype(jnp.int8),
+        )
+
+    return jax.lax.cond(jnp.any(applies), exact, lambda: (rho, error, verdict.astype(jnp.int8)))

@@ -1,0 +1,204 @@
+"""Tips of the tongues of instability: all of them in a rectangle, with names, error bounds and what is left undecided.
+
+A tip is a point of the stability boundary where the boundary function and its derivative along the speed (the axis of the
+system's predicted resonances) vanish. It is found by exclusion (:mod:`~drivetrain_jax.atlas.exclusion`), polished on the
+whole surrogate with the multiplier itself (ln|sigma| = 0, d ln|sigma|/d speed = 0) and named by the resonance at the foot
+of its ridge.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivetrain_jax.atlas.criteria import Criteria, parameters_at
+from drivetrain_jax.atlas.exclusion import Search, critical_points
+from drivetrain_jax.atlas.growth import Growth, growth
+from drivetrain_jax.atlas.panels import Atlas
+from drivetrain_jax.atlas.patches import patches_of
+from drivetrain_jax.atlas.ridges import feet
+from drivetrain_jax.atlas.undamped import undamped_tips
+from drivetrain_jax.systems import Resonances, System
+
+_POLISH = 8
+# Beyond this growth rate of another multiplier a point is inside a region that is unstable anyway.
+_LIMITING = 1e-6
+# How far the foot of a ridge may lie from a prediction, relative; and how much nearer than to the next one.
+_NEAR, _CLEAR = 0.02, 3.0
+_HIGHEST_ORDER = 60
+
+Box = Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Tip:
+    """``point`` maps the two parameters to their values at the tip, ``error`` to bounds of their errors.
+
+    ``name`` is the resonance the tongue grows from, empty if its ridge was lost; ``multiplier`` is ``+1``, ``-1`` or
+    ``pair`` and ``angle`` its argument in rad. ``opens`` tells a tongue's tip from a place where one closes or two meet.
+    """
+
+    name: str
+    multiplier: str
+    angle: float
+    point: Mapping[str, float]
+    error: Mapping[str, float]
+    opens: bool
+
+
+@dataclass(frozen=True)
+class Tips:
+    """All tips, in rising order of the other parameter; ``undecided`` boxes of parameters that may hide further ones.
+
+    ``boxes`` is the number of boxes looked at. At zero damping tongues have no width at their tips: these are then those of
+    the theory, and ``complete`` is false.
+    """
+
+    tips: tuple[Tip, ...]
+    undecided: tuple[Box, ...]
+    boxes: int
+    complete: bool
+
+
+def find_tips(atlas: Atlas, system: System, *, opening: bool = True) -> Tips:
+    """The tips of all tongues within ``atlas`` (two parameters, one of them the axis of the system's resonances).
+
+    With ``opening=False`` also the places where tongues close or meet. Raises ``ValueError`` for other atlases.
+    """
+    horizontal = _horizontal(atlas, system)
+    criteria = Criteria.of(atlas, system)
+    if criteria.conservative:
+        tips = tuple(_named(t, atlas) for t in undamped_tips(criteria, horizontal, _predictions(atlas, system)))
+        return Tips(_sorted(tips, atlas, horizontal), (), 0, False)
+    patches = patches_of(criteria)
+    searches = [critical_points(patches, k, horizontal) for k in range(len(patches))]
+    bottom = float(criteria.atlas.to_coordinates(atlas.lower)[1 - horizontal])
+    tips: list[Tip] = []
+    for kind, patch, search in zip(criteria.multipliers, patches, searches, strict=True):
+        x, rates = polish(criteria, search.points, kind, horizontal)
+        foot = feet(patch, x, horizontal, bottom)
+        tips += _describe(criteria, kind, horizontal, (x, rates, foot), search)
+    undecided = tuple(_box(atlas, box) for search in searches for box in search.undecided)
+    undecided += tuple(_box(atlas, np.stack([gap.lower, gap.upper])) for gap in atlas.gaps)
+    chosen = tuple(tip for tip in tips if tip.opens or not opening)
+    return Tips(_sorted(chosen, atlas, horizontal), undecided, sum(s.boxes for s in searches), not undecided)
+
+
+def polish(criteria: Criteria, x: np.ndarray, kind: str, horizontal: int) -> tuple[np.ndarray, Growth]:
+    """Newton's method for ln|sigma| = 0 and its derivative along ``horizontal``, from ``x`` ``(N, 2)``."""
+    kinds = [kind] * len(x)
+    for _ in range(_POLISH if len(x) else 0):
+        rates = growth(criteria, x, kinds, second=True)
+        jacobian = np.stack([rates.gradient, rates.hessian[:, horizontal]], axis=1)
+        residual = np.stack([rates.rate, rates.gradient[:, horizontal]], axis=-1)
+        with np.errstate(all="ignore"):
+            x = x - _solve(jacobian, residual)
+    return x, growth(criteria, x, kinds, second=True)
+
+
+def _solve(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    determinant = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
+    first = a[:, 1, 1] * b[:, 0] - a[:, 0, 1] * b[:, 1]
+    second = a[:, 0, 0] * b[:, 1] - a[:, 1, 0] * b[:, 0]
+    return np.stack([first, second], axis=-1) / determinant[:, None]
+
+
+def _describe(criteria: Criteria, kind: str, h: int, points: tuple, search: Search) -> list[Tip]:
+    """The tips among the zeros of one function: those where no other multiplier is larger."""
+    x, rates, foot = points
+    atlas, system, v = criteria.atlas, criteria.system, 1 - h
+    largest = np.log(criteria.spectral_radius(x))
+    errors = _errors(rates, h)
+    found = []
+    for i in range(len(x)):
+        if not largest[i] <= _LIMITING:
+            continue
+        point, slope = parameters_at(atlas, x[i]), [c.slope for c in atlas.coordinates]
+        scale = np.array([abs(float(slope[k](point[k]))) for k in range(2)])
+        opens = bool(search.curvature[i] * search.slope[i] < 0)
+        if _rises(criteria, v) < 0:
+            opens = not opens
+        found.append(
+            Tip(
+                _name(atlas, system, kind, h, foot[i]),
+                kind,
+                abs(float(np.angle(rates.multiplier[i]))),
+                dict(zip(atlas.parameters, map(float, point), strict=True)),
+                dict(zip(atlas.parameters, map(float, errors[i] / scale), strict=True)),
+                opens,
+            )
+        )
+    return found
+
+
+def _errors(rates: Growth, h: int) -> np.ndarray:
+    """Bounds of the coordinates' errors: along v that of the rate over its slope, along h what lowers the maximum by it."""
+    v = 1 - h
+    errors = np.empty(rates.gradient.shape)
+    with np.errstate(all="ignore"):
+        errors[:, v] = rates.error / np.abs(rates.gradient[:, v])
+        # An error e of a function over the width w of its peak moves the maximum by e/(w |f''|); w^2 |f''| is about 1.
+        errors[:, h] = rates.error / np.sqrt(np.abs(rates.hessian[:, h, h]))
+        errors[:, h] += np.abs(rates.hessian[:, h, v] / rates.hessian[:, h, h]) * errors[:, v]
+    return errors
+
+
+def _rises(criteria: Criteria, v: int) -> float:
+    """1 if the coordinate v rises with its parameter, else -1."""
+    ends = criteria.atlas.to_coordinates(np.stack([criteria.atlas.lower, criteria.atlas.upper]))[:, v]
+    return 1.0 if ends[1] > ends[0] else -1.0
+
+
+def _horizontal(atlas: Atlas, system: System) -> int:
+    axis = system.resonances.axis if system.resonances else ""
+    if len(atlas.parameters) != 2 or axis not in atlas.parameters:
+        names = ", ".join(atlas.parameters)
+        raise ValueError(f"parameters = {names}: allowed are two, one of them {axis or 'the axis of resonances'}")
+    return atlas.parameters.index(axis)
+
+
+def _predictions(atlas: Atlas, system: System) -> Resonances:
+    """The system's resonances up to the order that the lower end of the axis needs."""
+    basic = system.resonances
+    if basic.up_to is None:
+        return basic
+    values = _predicted(basic, atlas)
+    lowest = atlas.lower[atlas.parameters.index(basic.axis)]
+    order = math.ceil(np.nanmax(values) / max(float(lowest), 1e-300) / 2) + 1
+    return basic.up_to(min(order, _HIGHEST_ORDER))
+
+
+def _predicted(resonances: Resonances, atlas: Atlas) -> np.ndarray:
+    middle = dict(zip(atlas.parameters, (atlas.lower + atlas.upper) / 2, strict=True))
+    return np.asarray(resonances.values({**middle, **atlas.fixed}))
+
+
+def _name(atlas: Atlas, system: System, kind: str, h: int, foot: float) -> str:
+    resonances = _predictions(atlas, system)
+    if not np.isfinite(foot) or not resonances.multipliers:
+        return ""
+    speed = float(atlas.coordinates[h].inverse(np.asarray(foot)))
+    distance = np.abs(_predicted(resonances, atlas) / speed - 1)
+    distance[[m != kind for m in resonances.multipliers]] = np.inf
+    first, second = np.argsort(distance)[:2]
+    clear = distance[first] < _NEAR and distance[second] > _CLEAR * distance[first]
+    return resonances.labels[first] if clear else ""
+
+
+def _named(tip: tuple, atlas: Atlas) -> Tip:
+    name, kind, angle, point = tip
+    nothing = dict.fromkeys(atlas.parameters, 0.0)
+    return Tip(name, kind, angle, dict(zip(atlas.parameters, map(float, point), strict=True)), nothing, True)
+
+
+def _box(atlas: Atlas, box: np.ndarray) -> Box:
+    ends = np.sort(parameters_at(atlas, box), axis=0)
+    return {name: (float(ends[0, k]), float(ends[1, k])) for k, name in enumerate(atlas.parameters)}
+
+
+def _sorted(tips: Sequence[Tip], atlas: Atlas, horizontal: int) -> tuple[Tip, ...]:
+    other = atlas.parameters[1 - horizontal]
+    return tuple(sorted(tips, key=lambda tip: tip.point[other]))

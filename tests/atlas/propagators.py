@@ -1,0 +1,81 @@
+"""Direct solves of the propagator, jitted once for all tolerances and parameter sets: what the engine does, in short."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+
+from drivetrain_jax.analysis import Request
+from drivetrain_jax.analysis.floquet_propagator import ANALYSIS
+from drivetrain_jax.atlas import StabilityAtlas, floquet_rounds, run, solve_rtol, stability_atlas
+from drivetrain_jax.systems import get_system
+
+CARDAN = get_system("cardan")
+BASE = dict(CARDAN.presets["base"])
+NAMES = CARDAN.models["floquet"].parameters
+OUTPUTS = ("propagator", "propagator_error")
+_SIZES = (512, 16)
+
+
+def solvers(rtol):
+    return ANALYSIS.solvers(CARDAN, Request(OUTPUTS, "direct", {"rtol": rtol}))
+
+
+def _batch(index):
+    def batch(values, effort, rtol):
+        solver = solvers(rtol)[index]
+        if solver.broadcasts:
+            return solver.solve(values, effort)["propagator"]
+        return jax.vmap(lambda v: solver.solve(v, effort)["propagator"], out_axes=-1)(values)
+
+    return jax.jit(batch)
+
+
+_KERNELS = (_batch(0), _batch(1))
+
+
+def propagators(columns, rtol=1e-13):
+    """``(N, 16)`` for arrays of parameters, points of similar effort together."""
+    given = np.broadcast_arrays(*(np.atleast_1d(np.asarray(columns[name], float)) for name in NAMES))
+    points = dict(zip(NAMES, given, strict=True))
+    efforts = np.stack([np.asarray(s.effort(points), float) * s.unit_cost for s in solvers(rtol)])
+    choice = np.argmin(efforts, axis=0)
+    out = np.empty((choice.size, 16))
+    for index, size in enumerate(_SIZES):
+        mine = np.flatnonzero(choice == index)
+        mine = mine[np.argsort(efforts[index, mine], kind="stable")]
+        for part in (mine[i : i + size] for i in range(0, mine.size, size)):
+            padded = {name: np.pad(x[part], (0, size - part.size), mode="edge") for name, x in points.items()}
+            effort = np.int64(efforts[index, part].max() / solvers(rtol)[index].unit_cost)
+            out[part] = np.asarray(_KERNELS[index](padded, effort, rtol)).T[: part.size]
+    return out
+
+
+def cardan_atlas(ranges, tolerance, fixed=BASE, rtol=1e-10) -> StabilityAtlas:
+    """An atlas of the cardan shaft."""
+    fixed = {name: value for name, value in fixed.items() if name not in ranges}
+    names = tuple(ranges)
+
+    def solve(points):
+        return propagators({**fixed, **dict(zip(names, points.T, strict=True))}, solve_rtol(tolerance))
+
+    return stability_atlas(run(floquet_rounds(CARDAN, ranges, fixed, tolerance), solve), CARDAN, rtol)
+
+
+def monodromy(phi):
+    """``Z = X Phi^T X Phi`` of ``(N, 16)``, ``(N, 4, 4)``."""
+    x = CARDAN.models["floquet"].build({**BASE, "beta": 0.3, "Omega": 1.0}).reduced.reversor
+    matrix = phi.reshape(-1, 4, 4)
+    return x @ np.swapaxes(matrix, 1, 2) @ x @ matrix
+
+
+def direct_radius(atlas, points, rtol=1e-14):
+    """Spectral radius at ``points`` of a StabilityAtlas by direct solves, and Z."""
+    columns = {**atlas.atlas.fixed, **dict(zip(atlas.atlas.parameters, points.T, strict=True))}
+    z = monodromy(propagators(columns, rtol))
+    return np.abs(np.linalg.eigvals(z)).max(axis=1), z
+
+
+def random_points(atlas, count, seed=0):
+    lower, upper = atlas.atlas.lower, atlas.atlas.upper
+    return lower + (upper - lower) * np.random.default_rng(seed).random((count, len(lower)))

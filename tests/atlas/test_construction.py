@@ -1,0 +1,177 @@
+"""Construction on functions that are known: rounds, panels, splits, and what is not smooth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivetrain_jax.atlas import Domain, Quantity, construct, from_arrays, run, to_arrays
+from drivetrain_jax.atlas.interpolation import evaluate
+from drivetrain_jax.atlas.panels import position
+from drivetrain_jax.systems import Coordinate
+from drivetrain_jax.systems._smooth import identity
+
+TOLERANCE = 1e-10
+SQUARE = Domain(("x", "y"), (-1.0, 0.5), (2.0, 3.0), (identity("x"), identity("y")), {})
+
+
+def values(atlas, points):
+    """``(N, m)``, NaN where there is no panel."""
+    x = atlas.to_coordinates(points)
+    number = atlas.find(x)
+    out = np.full((len(points), atlas.panels[0].coefficients.shape[-1]), np.nan)
+    for k, panel in enumerate(atlas.panels):
+        out[number == k] = evaluate(panel.coefficients, position(panel, x[number == k]))
+    return out
+
+
+def sample(domain, count=2000):
+    lower, upper = np.array(domain.lower), np.array(domain.upper)
+    return lower + (upper - lower) * np.random.default_rng(3).random((count, len(lower)))
+
+
+def waves(p):
+    x, y = p.T
+    return np.stack([np.cos(7 * x * y), np.exp(-(x**2)) / (1 + y**2)], axis=1)
+
+
+def beam(p):
+    """Closed form of det/2 of a cantilever with an elastic end support, cosh cos + 1 + k (cosh sin - sinh cos)/q^3."""
+    q, k = p.T
+    det = np.cosh(q) * np.cos(q) + 1 + k * (np.cosh(q) * np.sin(q) - np.sinh(q) * np.cos(q)) / q**3
+    return det[:, None] / np.cosh(q)[:, None]
+
+
+def test_smooth_function_is_met_within_tolerance_and_bounds():
+    atlas = run(construct(SQUARE, Quantity(2), TOLERANCE), waves)
+    points = sample(SQUARE)
+    error = np.linalg.norm(values(atlas, points) - waves(points), axis=1)
+    assert len(atlas.panels) == 1 and not atlas.gaps
+    assert error.max() < TOLERANCE and error.max() < atlas.panels[0].value_error < 100 * TOLERANCE
+    assert 64 < atlas.solves < 4000
+
+
+def test_determinant_over_frequency_and_support_stiffness():
+    stiffness = Coordinate("ln k", np.log, np.exp, lambda k: 1 / np.asarray(k))
+    domain = Domain(("q", "k"), (0.5, 0.1), (12.0, 50.0), (identity("q"), stiffness), {})
+    atlas = run(construct(domain, Quantity(1), TOLERANCE), beam)
+    points = sample(domain)
+    largest = np.abs(beam(points)).max()
+    assert not atlas.gaps and np.abs(values(atlas, points) - beam(points)).max() < TOLERANCE * largest
+
+
+def test_one_three_and_four_parameters():
+    def f(p):
+        return np.stack([np.cos(p.sum(axis=1)), np.exp(-p.prod(axis=1))], axis=1)
+
+    for d, tolerance in ((1, 1e-12), (3, 1e-8), (4, 1e-6)):
+        names = tuple("abcd"[:d])
+        domain = Domain(names, (0.0,) * d, (1.0,) * d, tuple(map(identity, names)), {})
+        atlas = run(construct(domain, Quantity(2), tolerance), f)
+        points = sample(domain, 500)
+        assert np.linalg.norm(values(atlas, points) - f(points), axis=1).max() < 2 * tolerance
+        if d > 1:
+            slice_ = atlas.slice({"b": 0.3})
+            rest = np.delete(points, 1, axis=1)
+            points[:, 1] = 0.3
+            assert slice_.parameters == (names[0], *names[2:]) and slice_.fixed == {"b": 0.3}
+            assert np.abs(values(slice_, rest) - values(atlas, points)).max() < 1e-13
+
+
+def test_rounds_are_deterministic_and_ask_for_nothing_twice():
+    def questions():
+        asked, rounds = [], construct(SQUARE, Quantity(2), TOLERANCE, max_nodes=20)
+        points = next(rounds)
+        while True:
+            asked.append(points)
+            try:
+                points = rounds.send(waves(points))
+            except StopIteration as end:
+                return asked, end.value
+
+    (first, atlas), (second, again) = questions(), questions()
+    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+    everything = np.concatenate(first)
+    assert len(np.unique(everything, axis=0)) == len(everything) == atlas.solves
+    # Panels no larger than allowed tile the square.
+    assert len(atlas.panels) > 1 and max(max(p.degrees) for p in atlas.panels) <= 30
+    area = sum(np.prod(p.upper - p.lower) for p in atlas.panels)
+    assert area == pytest.approx(7.5, rel=1e-12)
+    assert all(np.array_equal(a.coefficients, b.coefficients) for a, b in zip(atlas.panels, again.panels, strict=True))
+
+
+def test_oscillation_beyond_the_node_limit_is_split():
+    def fast(p):
+        return np.cos(120 * p)
+
+    domain = Domain(("x",), (0.0,), (2.0,), (identity("x"),), {})
+    atlas = run(construct(domain, Quantity(1), 1e-10), fast)
+    points = sample(domain)
+    assert len(atlas.panels) >= 2 and not atlas.gaps
+    assert np.abs(values(atlas, points) - fast(points)).max() < 1e-10
+
+
+def test_kink_leaves_a_gap_that_says_why_and_the_rest_stands():
+    def kinked(p):
+        x, y = p.T
+        return (np.abs(x - 0.3) * np.cos(y))[:, None]
+
+    atlas = run(construct(SQUARE, Quantity(1), 1e-8), kinked)
+    assert atlas.gaps and atlas.panels
+    assert all("not smooth" in gap.reason and gap.lower[0] <= 0.3 <= gap.upper[0] for gap in atlas.gaps)
+    points = sample(SQUARE)
+    got = values(atlas, points)[:, 0]
+    known = np.isfinite(got)
+    assert 0.5 < known.mean() < 1 and np.abs(got - kinked(points)[:, 0])[known].max() < 1e-7
+    assert atlas.solves < 20_000
+
+
+def test_failed_solves_leave_a_gap():
+    def partial(p):
+        out = waves(p)
+        out[(p[:, 0] > 1.5) & (p[:, 1] > 2.0)] = np.nan
+        return out
+
+    atlas = run(construct(SQUARE, Quantity(2), 1e-8), partial)
+    assert atlas.panels and all("solves failed" in gap.reason for gap in atlas.gaps)
+    assert all(gap.upper[0] > 1.5 and gap.upper[1] > 2.0 for gap in atlas.gaps)
+    everywhere = run(construct(SQUARE, Quantity(2), 1e-8), lambda p: np.full((len(p), 2), np.nan))
+    assert not everywhere.panels and len(everywhere.gaps) == 1
+
+
+def test_noise_above_the_tolerance_is_named():
+    rng = np.random.default_rng(0)
+    atlas = run(construct(SQUARE, Quantity(2), 1e-12), lambda p: waves(p) + 1e-9 * rng.standard_normal((len(p), 2)))
+    assert not atlas.panels and "scatter" in atlas.gaps[0].reason
+
+
+def test_limit_of_solves_is_kept():
+    atlas = run(construct(SQUARE, Quantity(2), TOLERANCE, max_solves=200), waves)
+    assert atlas.solves <= 200 and "more than 200 solves" in atlas.gaps[0].reason
+
+
+def test_even_coordinate_folds_the_domain():
+    even = Coordinate("x^2", np.square, np.sqrt, lambda x: 2 * np.asarray(x), even=True)
+    domain = Domain(("x",), (-1.0,), (3.0,), (even,), {})
+    atlas = run(construct(domain, Quantity(1), 1e-11), np.cos)
+    points = sample(domain)
+    assert atlas.panels[0].lower == 0.0 and atlas.panels[0].upper == 9.0
+    assert np.abs(values(atlas, points) - np.cos(points)).max() < 1e-11
+
+
+def test_arrays_and_back():
+    atlas = run(construct(SQUARE, Quantity(2), TOLERANCE, max_nodes=20), waves)
+    arrays = to_arrays(atlas)
+    again = from_arrays(arrays, atlas.parameters, atlas.coordinates, {}, TOLERANCE, atlas.solves)
+    assert len(arrays["coefficients"]) < atlas.size
+    for a, b in zip(atlas.panels, again.panels, strict=True):
+        assert np.array_equal(a.coefficients, b.coefficients) and a.value_error == b.value_error
+    assert np.array_equal(values(again, sample(SQUARE)), values(atlas, sample(SQUARE)))
+
+
+def test_slice_names_what_it_lacks():
+    atlas = run(construct(SQUARE, Quantity(2), 1e-6), waves)
+    with pytest.raises(KeyError, match="z"):
+        atlas.slice({"z": 1.0})
+    with pytest.raises(ValueError, match=r"x = 5\.0: allowed is -1 to 2"):
+        atlas.slice({"x": 5.0})

@@ -1,0 +1,112 @@
+"""Design questions: answers against direct solves and by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from propagators import BASE, CARDAN, cardan_atlas, monodromy, propagators
+
+from drivetrain_jax.atlas.criteria import Criteria
+from drivetrain_jax.atlas.design import least_damping, nearest_boundaries, speed_windows, widest_angle
+from drivetrain_jax.atlas.windows import narrow, stability_along
+
+
+def direct(columns):
+    z = monodromy(propagators(columns, 1e-12))
+    return np.abs(np.linalg.eigvals(z)).max(axis=1)
+
+
+@pytest.fixture(scope="module")
+def atlas():
+    return cardan_atlas({"beta": (0.0, 1.1), "Omega": (0.3, 2.0)}, 1e-11).atlas
+
+
+@pytest.fixture(scope="module")
+def damped():
+    """Speed and damping at beta = 1."""
+    fixed = {**BASE, "beta": 1.0}
+    return cardan_atlas({"Omega": (0.6, 2.0), "zeta": (0.0, 0.1)}, 1e-11, fixed).atlas
+
+
+def test_widest_angle_is_that_of_the_lowest_tip(atlas):
+    answer = widest_angle(atlas, CARDAN, (1.3, 1.5), {}, direct=direct)
+    assert answer.value == pytest.approx(0.1063331213, abs=1e-8)
+    assert answer.limit.multiplier == "-1" and answer.limit.point["Omega"] == pytest.approx(1.4159881603, abs=1e-8)
+    assert answer.certain and answer.check.agrees and answer.error < 1e-7
+
+
+def test_widest_angle_at_the_end_of_the_range(atlas):
+    """Between the tongues the first angle to fail is at an end of the speeds."""
+    answer = widest_angle(atlas, CARDAN, (0.8, 1.3), {}, direct=direct)
+    assert answer.limit.point["Omega"] == 1.3 and answer.check.agrees
+    beta = np.linspace(0.0, 1.1, 2001)
+    unstable = direct({**{k: np.full(2001, v) for k, v in BASE.items()}, "beta": beta, "Omega": np.full(2001, 1.3)}) > 1
+    first = beta[np.argmax(unstable)]
+    assert first - 1.1 / 2000 <= answer.value <= first
+
+
+def test_least_damping(damped):
+    answer = least_damping(damped, CARDAN, (0.7, 0.8), {}, direct=direct)
+    assert answer.certain and answer.check.agrees
+    assert [i.stable for i in answer.intervals] == [False, True]
+    omega = np.linspace(0.7, 0.8, 2001)
+
+    def largest(zeta):
+        fixed = {k: np.full(2001, v) for k, v in {**BASE, "beta": 1.0, "zeta": zeta}.items()}
+        return direct({**fixed, "Omega": omega}).max()
+
+    assert largest(answer.value * (1 - 1e-3)) > 1 > largest(answer.value * (1 + 1e-3))
+
+
+def test_any_damping_will_do_where_there_is_no_tongue(damped):
+    answer = least_damping(damped, CARDAN, (0.9, 1.1), {}, direct=direct)
+    assert answer.value == 0.0 and answer.limit is None and answer.check.agrees
+
+
+def test_no_damping_of_the_atlas_will_do(damped):
+    answer = least_damping(narrow(damped, {"zeta": (0.0, 0.01)}), CARDAN, (1.3, 1.6), {}, direct=direct)
+    assert answer.value is None and answer.check is None and not answer.certain
+
+
+def test_speed_windows_with_a_margin(atlas):
+    windows = speed_windows(atlas, CARDAN, {"beta": 1.0}, margin=0.01, direct=direct)
+    assert all(w.check.agrees for w in windows)
+    for window in windows:
+        assert window.interval.lower <= window.safe[0] < window.safe[1] <= window.interval.upper
+        if window.interval.lower_end:
+            assert window.safe[0] == pytest.approx(1.01 * window.interval.lower, rel=1e-6)
+        assert window.largest < 1
+    # Narrow windows have no room for a wide margin.
+    assert len(speed_windows(atlas, CARDAN, {"beta": 1.0}, margin=0.1)) < len(windows)
+
+
+def test_windows_cover_what_is_stable(atlas):
+    line = stability_along(atlas.slice({"beta": 1.0}), CARDAN)
+    omega = np.linspace(0.3, 2.0, 1201)
+    rho = direct({**{k: np.full(1201, v) for k, v in BASE.items()}, "beta": np.full(1201, 1.0), "Omega": omega})
+    ends = np.array([i.upper for i in line.intervals])
+    expected = np.array([i.stable for i in line.intervals])[np.searchsorted(ends[:-1], omega)]
+    assert (expected == (rho < 1)).all()
+
+
+def test_nearest_boundaries(atlas):
+    found = {n.parameter: n for n in nearest_boundaries(atlas, CARDAN, {"beta": 1.0, "Omega": 0.8})}
+    omega = found["Omega"]
+    assert omega.below.multiplier == "pair" and omega.below.value == pytest.approx(0.7719697, abs=1e-6)
+    assert omega.above.multiplier == "-1" and omega.above.value == pytest.approx(1.2474955, abs=1e-6)
+    assert found["beta"].below is None and found["beta"].above is None
+    for crossing in (omega.below, omega.above):
+        near = crossing.value + np.array([-1e-4, 1e-4])
+        rho = direct({**{k: np.full(2, v) for k, v in BASE.items()}, "beta": np.full(2, 1.0), "Omega": near})
+        assert (rho[0] - 1) * (rho[1] - 1) < 0
+
+
+def test_narrow_keeps_the_function(atlas):
+    part = narrow(atlas, {"beta": (0.3, 0.9), "Omega": (0.5, 0.6)})
+    points = np.array([[0.3, 0.5], [0.61, 0.57], [0.9, 0.6]])
+    values = [Criteria.of(a, CARDAN).propagator(a.to_coordinates(points)) for a in (atlas, part)]
+    assert np.abs(values[0] - values[1]).max() < 1e-11
+    with pytest.raises(ValueError, match=r"beta = 0\.3 to 1\.3: allowed is a range within 0 to 1\.1"):
+        narrow(atlas, {"beta": (0.3, 1.3)})
+    with pytest.raises(KeyError, match="mu"):
+        narrow(atlas, {"mu": (0.3, 1.3)})

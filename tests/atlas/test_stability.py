@@ -1,0 +1,201 @@
+"""Charts of the cardan shaft from an atlas against direct solves."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from propagators import BASE, cardan_atlas, direct_radius, monodromy, propagators, random_points
+
+from drivetrain_jax.analysis import Outcome
+from drivetrain_jax.analysis.floquet_results import VARIABLES
+from drivetrain_jax.atlas import quartic, to_arrays
+from drivetrain_jax.atlas.interpolation import evaluate
+from drivetrain_jax.atlas.panels import position
+
+STABLE, UNSTABLE, UNDECIDED = 0, 1, 2
+ROUNDING = 2e-14
+
+
+def violations(found, radius):
+    return np.abs(found["spectral_radius"] - radius) > found["spectral_radius_error"] + ROUNDING * radius
+
+
+def wrong(found, radius):
+    stable, unstable = found["verdict"] == STABLE, found["verdict"] == UNSTABLE
+    return (stable & (radius > 1 + ROUNDING)) | (unstable & (radius < 1 - ROUNDING))
+
+
+def cells(found, axes, chosen):
+    """The chosen cells of a chart, as points and results."""
+    i, j = np.unravel_index(chosen, found["verdict"].shape)
+    return np.stack([axes[0][i], axes[1][j]], axis=1), {name: value[i, j] for name, value in found.items()}
+
+
+def hardest(found, count):
+    """Cells nearest to rho = 1 (on neither side by decree) and cells with the widest bound."""
+    distance = np.where(found["spectral_radius"] == 1, np.inf, np.abs(found["spectral_radius"] - 1)).reshape(-1)
+    return np.argsort(distance)[:count], np.argsort(-found["spectral_radius_error"].reshape(-1))[:count]
+
+
+def relative_error_of_z(atlas, points):
+    columns = {**atlas.atlas.fixed, **dict(zip(atlas.atlas.parameters, points.T, strict=True))}
+    exact = monodromy(propagators(columns, 1e-14))
+    x = atlas.atlas.to_coordinates(points)
+    number, phi = atlas.atlas.find(x), np.empty((len(points), 16))
+    for k, panel in enumerate(atlas.atlas.panels):
+        phi[number == k] = evaluate(panel.coefficients, position(panel, x[number == k]))
+    return np.linalg.norm(monodromy(phi) - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
+
+
+def test_first_chart_of_the_theory_page(chart):
+    points = random_points(chart, 2000)
+    assert chart.atlas.solves <= 800 and not chart.atlas.gaps
+    assert relative_error_of_z(chart, points).max() < 1e-11
+    found, (radius, _) = chart.at(points), direct_radius(chart, points)
+    error = np.abs(found["spectral_radius"] - radius)
+    assert not violations(found, radius).any() and not wrong(found, radius).any()
+    assert np.quantile(error, 0.999) < 1e-10
+    assert np.median(found["spectral_radius_error"]) < 1e-10 and (found["verdict"] != UNDECIDED).all()
+
+
+def test_grid_equals_points_and_holds_where_it_is_hardest(chart):
+    axes = [np.linspace(0.0, 1.5, 301), np.linspace(0.3, 2.0, 257)]
+    found = chart.on_grid(axes)
+    for chosen in (*hardest(found, 500), np.arange(0, found["verdict"].size, 157)):
+        points, results = cells(found, axes, chosen)
+        radius, _ = direct_radius(chart, points)
+        assert not violations(results, radius).any() and not wrong(results, radius).any()
+        scattered = chart.at(points)
+        both = results["spectral_radius_error"] + scattered["spectral_radius_error"]
+        assert (np.abs(scattered["spectral_radius"] - results["spectral_radius"]) <= both).all()
+        assert (scattered["verdict"] == results["verdict"]).all()
+    assert (found["verdict"] == UNDECIDED).sum() == 0
+
+
+def test_axes_in_any_order_and_negative_angles(chart):
+    beta, omega = np.array([0.7, 0.1, 1.5, 0.4]), np.array([1.9, 0.3, 1.1])
+    found = chart.on_grid([beta, omega])["spectral_radius"]
+    points = np.stack(np.meshgrid(beta, omega, indexing="ij"), axis=-1).reshape(-1, 2)
+    assert found.reshape(-1) == pytest.approx(chart.at(points)["spectral_radius"], rel=1e-11)
+    assert chart.at(points * [-1, 1])["spectral_radius"] == pytest.approx(found.reshape(-1), rel=1e-15)
+
+
+def test_points_outside_are_left_to_direct_solves(chart):
+    found = chart.at(np.array([[0.5, 1.0], [0.5, 2.5]]))
+    assert found["outcome"][1] == Outcome.LOST and found["outcome"][0] <= Outcome.TOLERANCE_NOT_MET
+    assert np.isnan(found["spectral_radius"][1]) and found["verdict"][1] == UNDECIDED
+    grid = chart.on_grid([np.array([0.5, 0.6]), np.array([1.0, 2.5])])
+    assert (grid["outcome"][:, 1] == Outcome.LOST).all() and np.isfinite(grid["spectral_radius"][:, 0]).all()
+
+
+def test_every_result_of_the_analysis(chart):
+    outputs = tuple(v.name for v in VARIABLES if v.name != "floquet_exponent")
+    points = random_points(chart, 300, seed=5)
+    found, (_, z) = chart.at(points, outputs), direct_radius(chart, points)
+    moduli = -np.sort(-np.abs(np.linalg.eigvals(z)), axis=1)
+    assert found["floquet_multiplier"].shape == (300, 4) and np.abs(found["liouville_residual"]).max() < 1e-12
+    assert np.abs(np.abs(found["floquet_multiplier"]) - moduli).max() < 1e-9
+
+
+def test_without_damping_verdicts_are_exact(undamped):
+    axes = [np.linspace(0.0, 1.2, 241), np.linspace(0.3, 2.0, 231)]
+    found = undamped.on_grid(axes)
+    stable = found["verdict"] == STABLE
+    assert (found["spectral_radius"][stable] == 1).all() and (found["verdict"] == UNDECIDED).mean() < 5e-3
+    assert 0.5 < stable.mean() < 0.9
+    points, results = cells(found, axes, np.arange(0, found["verdict"].size, 29))
+    radius, _ = direct_radius(undamped, points)
+    # Rounding moves double multipliers off the circle by its square root.
+    decided = results["verdict"] != UNDECIDED
+    assert (((radius > 1 + 1e-7) == (results["verdict"] == UNSTABLE)) | ~decided | (radius < 1 + 1e-5)).all()
+    unstable = results["verdict"] == UNSTABLE
+    assert not violations(results, radius)[unstable].any()
+
+
+def test_narrow_tongue_without_damping_is_found(undamped):
+    # S_2 opens at omega_2 = 1.415984639720 with a width of about r (omega_2^2 - 1) X_2/omega_2^2, r = tan(beta/2)^2.
+    beta = 1e-3
+    points = np.stack([np.full(3, beta), 1.4159846397197 + np.array([-1e-6, 0.0, 1e-6])], axis=1)
+    assert undamped.at(points)["verdict"].tolist() == [STABLE, UNSTABLE, STABLE]
+
+
+@pytest.mark.parametrize("kind", ["pairs", "real", "combination", "stable"])
+def test_closed_form_on_known_multipliers(kind):
+    rng, n = np.random.default_rng(1), 20_000
+    angle, size = np.pi * rng.random((2, n)), np.exp(rng.normal(0, 0.5, (2, n)))
+    if kind == "stable":
+        size = np.exp(-1e-2 * rng.random((2, n)))
+    if kind == "combination":
+        angle[1], size[1] = angle[0], 0.99 / size[0]
+    sigma = np.concatenate([size * np.exp(1j * angle), size * np.exp(-1j * angle)])
+    if kind == "real":
+        sign = np.where(rng.random(n) < 0.5, 1.0, -1.0)
+        sigma[[0, 2]] = sign * np.exp(rng.normal(0, 1, (2, n)))
+    e1, d = sigma.sum(axis=0).real, sigma.prod(axis=0).real
+    e2 = sum(sigma[i] * sigma[j] for i in range(4) for j in range(i)).real
+    e3 = d * (1 / sigma).sum(axis=0).real
+    errors = tuple(jnp.full(n, 1e-14) * (1 + abs(e)) for e in (e1, e2, e3, d))
+    rho, error, unsure = quartic.spectral_radius(quartic.Coefficients(e1, e2, e3, jnp.asarray(d**0.25), errors))
+    exact = np.abs(sigma).max(axis=0)
+    sure = ~np.asarray(unsure)
+    assert (np.abs(rho - exact) <= error)[sure].all() and sure.mean() > 0.95
+    assert np.median(error / exact) < 1e-11
+
+
+@pytest.mark.parametrize("omega", [1.0, pytest.param(0.05, marks=pytest.mark.full)])
+def test_strong_damping(omega):
+    atlas = cardan_atlas({"beta": (0.0, 1.4), "Omega": (omega, 1.2 * omega)}, 1e-9, {**BASE, "zeta": 0.1})
+    axes = [np.linspace(0.0, 1.4, 41), np.linspace(omega, 1.2 * omega, 31)]
+    found = atlas.on_grid(axes)
+    points, results = cells(found, axes, np.arange(0, 41 * 31, 7))
+    radius, _ = direct_radius(atlas, points)
+    assert not violations(results, radius).any() and not wrong(results, radius).any()
+
+
+FULL = [
+    ({}, 1e-11, (0.1, 2.0), 1.5, 1700),
+    ({}, 1e-9, (0.02, 5.0), 1.55, 13_000),
+    ({"zeta": 0.0}, 1e-11, (0.1, 2.0), 1.5, 1700),
+    ({"zeta": 1e-6}, 1e-11, (0.1, 2.0), 1.5, 1700),
+    ({"zeta": 0.1}, 1e-11, (0.1, 2.0), 1.5, 1700),
+    ({"alpha": 20.0}, 1e-11, (0.1, 2.0), 1.5, 2000),
+    ({"mu": 20.0}, 1e-11, (0.1, 2.0), 1.5, 4000),
+]
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("change", "tolerance", "speeds", "beta", "most"), FULL)
+def test_charts_hold_everywhere(change, tolerance, speeds, beta, most):
+    """10,000 random points, the 10,000 cells nearest rho = 1 and the 10,000 with the widest bound."""
+    atlas = cardan_atlas({"beta": (0.0, beta), "Omega": speeds}, tolerance, {**BASE, **change})
+    assert atlas.atlas.solves <= most and not atlas.atlas.gaps
+    points = random_points(atlas, 10_000)
+    assert relative_error_of_z(atlas, points).max() < tolerance
+    axes = [np.linspace(0.0, beta, 1500), np.linspace(*speeds, 1500)]
+    found = atlas.on_grid(axes)
+    undamped = change.get("zeta") == 0
+    if not change:
+        assert (found["verdict"] == UNDECIDED).mean() <= 1e-6
+    for chosen in (*hardest(found, 10_000), np.random.default_rng(2).integers(0, 1500**2, 10_000)):
+        points, results = cells(found, axes, chosen)
+        radius, _ = direct_radius(atlas, points)
+        exact = (results["spectral_radius"] == 1) if undamped else np.zeros(len(points), bool)
+        decided = results["verdict"] != UNDECIDED
+        assert (
+            not (violations(results, radius) & decided & ~exact).any() and not (wrong(results, radius) & ~exact).any()
+        )
+        assert np.abs(radius - 1)[exact].max(initial=0.0) < 1e-6
+
+
+@pytest.mark.full
+def test_four_parameters():
+    ranges = {"beta": (0.0, 1.3), "Omega": (0.2, 2.5), "mu": (0.2, 20.0), "alpha": (0.1, 20.0)}
+    atlas = cardan_atlas(ranges, 2e-9, rtol=1e-8)
+    assert atlas.atlas.solves <= 180_000 and len(to_arrays(atlas.atlas)["coefficients"]) * 16 * 8 < 10e6
+    points = random_points(atlas, 3000)
+    found, (radius, _) = atlas.at(points), direct_radius(atlas, points)
+    assert not violations(found, radius).any() and not wrong(found, radius).any()
+    chart = atlas.slice({"mu": 3.0, "alpha": 2.0})
+    columns = np.column_stack([points[:, :2], np.full((3000, 2), [3.0, 2.0])])
+    assert chart.at(points[:, :2])["spectral_radius"] == pytest.approx(direct_radius(atlas, columns)[0], rel=1e-6)

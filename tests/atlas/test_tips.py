@@ -1,0 +1,279 @@
+"""Tips of tongues: found by exclusion, polished, named; against independent root finding on direct solves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from propagators import BASE, CARDAN, cardan_atlas, monodromy, propagators
+
+from benchmarks.cardan_reference import monodromy as reference_monodromy
+from drivetrain_jax.atlas.boundaries import boundaries
+from drivetrain_jax.atlas.criteria import Criteria, invariants
+from drivetrain_jax.atlas.exclusion import critical_points
+from drivetrain_jax.atlas.following import follow_tips
+from drivetrain_jax.atlas.growth import growth
+from drivetrain_jax.atlas.patches import patches_of
+from drivetrain_jax.atlas.roots import on_line, roots
+from drivetrain_jax.atlas.sensitivity import atlas_sensitivity, direct_sensitivity
+from drivetrain_jax.atlas.tips import find_tips
+from drivetrain_jax.systems.cardan import natural_frequencies
+
+# By root finding on direct solves (`direct_tip` below, at rtol 1e-14): beta, Omega.
+TIPS = {
+    "S11": (0.0237682936, 0.0706222355),
+    "S21": (0.1063331213, 1.4159881603),
+    "C+2": (0.3732837620, 0.3717671198),
+    "H21": (0.5366555070, 0.7086554714),
+    "C+1": (0.6055301525, 0.7447624308),
+    "C+3": (0.7984822953, 0.2497460274),
+    "C+4": (0.8983636305, 0.1884010878),
+    "H22": (0.9955772900, 0.3607839606),
+    "S22": (1.0051840092, 0.4810633702),
+    "C-1": (1.1217996954, 0.6699469693),
+    "C+5": (1.1344698234, 0.1550015530),
+    "C+6": (1.1691118751, 0.1301021787),
+}
+KINDS = {"S": "-1", "H": "+1", "C": "pair"}
+
+
+@pytest.fixture(scope="module")
+def atlas():
+    """The rectangle of the twelve tips."""
+    return cardan_atlas({"beta": (0.0, 1.2), "Omega": (0.06, 2.0)}, 1e-11).atlas
+
+
+@pytest.fixture(scope="module")
+def tips(atlas):
+    return find_tips(atlas, CARDAN)
+
+
+def rate(beta, omega, **others):
+    """ln of the spectral radius by direct solves."""
+    z = monodromy(propagators({**BASE, **others, "beta": beta, "Omega": omega}, 1e-14))
+    return np.log(np.abs(np.linalg.eigvals(z)).max(axis=1))
+
+
+def direct_tip(beta, omega, shift=1e-5):
+    """The tip near (beta, omega): the largest rate over Omega is 0. Samples and parabolas on direct solves, no atlas."""
+    start, beta = beta, beta * (1 + shift)
+
+    def peak(beta, omega):
+        width = 2e-5 * omega
+        for _ in range(4):
+            x = omega + width * np.linspace(-1, 1, 9)
+            omega, width = x[np.argmax(rate(beta, x))], width / 4
+        x = np.linspace(-2, 2, 9)
+        fit = np.polyfit(x, rate(beta, omega + width * x), 4)
+        stationary = np.roots(np.polyder(fit))
+        top = stationary[np.argmin(np.abs(stationary))].real
+        return omega + width * top, np.polyval(fit, top)
+
+    before = start * (1 - shift)
+    omega, y0 = peak(before, omega)
+    for _ in range(4):
+        omega, y1 = peak(beta, omega)
+        before, beta, y0 = beta, beta - y1 * (beta - before) / (y1 - y0), y1
+        if abs(beta - before) < 1e-12:
+            break
+    return beta, omega
+
+
+def test_all_twelve_tips_and_no_other(tips):
+    assert tips.complete and tips.undecided == ()
+    assert [tip.name for tip in tips.tips] == list(TIPS)
+    for tip in tips.tips:
+        beta, omega = TIPS[tip.name]
+        assert tip.point["beta"] == pytest.approx(beta, abs=1e-8)
+        assert tip.point["Omega"] == pytest.approx(omega, abs=1e-8)
+        assert tip.multiplier == KINDS[tip.name[0]] and tip.opens
+
+
+def test_errors_of_tips_lie_within_their_bounds(tips):
+    for tip in tips.tips:
+        beta, omega = TIPS[tip.name]
+        # The references have ten digits.
+        assert abs(tip.point["beta"] - beta) <= tip.error["beta"] + 1e-10
+        assert tip.error["beta"] < 1e-5
+        if tip.name != "C-1":  # Its two multipliers nearly coincide: Omega of the reference is good to 1e-8 only.
+            assert abs(tip.point["Omega"] - omega) <= tip.error["Omega"] + 1e-10
+
+
+@pytest.mark.parametrize("name", ["H22", "C+2"])
+def test_tips_against_root_finding_on_direct_solves(tips, name):
+    tip = next(tip for tip in tips.tips if tip.name == name)
+    beta, omega = direct_tip(tip.point["beta"], tip.point["Omega"])
+    assert tip.point["beta"] == pytest.approx(beta, abs=1e-9)
+    assert tip.point["Omega"] == pytest.approx(omega, abs=1e-9)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", list(TIPS))
+def test_reference_tips(name):
+    beta, omega = direct_tip(TIPS[name][0], TIPS[name][1])
+    assert TIPS[name] == (pytest.approx(beta, abs=2e-10), pytest.approx(omega, abs=1e-8))
+
+
+def test_boundary_functions_are_products_of_multipliers(atlas):
+    criteria = Criteria.of(atlas, CARDAN)
+    points = atlas.lower + (atlas.upper - atlas.lower) * np.random.default_rng(1).random((200, 2))
+    x = atlas.to_coordinates(points)
+    plus, minus, pair = criteria.values(x)
+    sigma = criteria.eigenvalues(x)
+    product = np.prod([1 - sigma[:, i] * sigma[:, j] for i in range(4) for j in range(i)], axis=0).real
+    d = np.exp(criteria.log_determinant(x))
+    assert np.abs(plus - np.prod(1 - sigma, axis=1).real).max() < 1e-12
+    assert np.abs(minus - np.prod(1 + sigma, axis=1).real).max() < 1e-12
+    assert np.abs(pair - product / (1 - d) ** 2).max() < 1e-9
+    stable = np.abs(sigma).max(axis=1) < 1
+    assert 20 < stable.sum() < 180
+    assert (stable == ((plus > 0) & (minus > 0) & (pair > 0))).all()
+
+
+def test_multipliers_are_those_of_the_paper_equations(atlas):
+    z = reference_monodromy({**BASE, "beta": 0.9, "Omega": 0.71}, rtol=1e-12, atol=1e-12)
+    x = atlas.to_coordinates(np.array([[0.9, 0.71]]))
+    criteria = Criteria.of(atlas, CARDAN)
+    expected = np.poly(np.linalg.eigvals(z)).real
+    found = np.poly(criteria.eigenvalues(x)[0]).real
+    assert found == pytest.approx(expected, abs=1e-9)
+    rows = monodromy(criteria.propagator(x).T)
+    a, b, c = invariants(np.moveaxis(rows, 0, -1))
+    assert [-a[0], b[0], -c[0]] == pytest.approx(list(expected[1:4]), abs=1e-9)
+
+
+def test_derivatives_of_the_growth_rate(atlas):
+    criteria = Criteria.of(atlas, CARDAN)
+    x = atlas.to_coordinates(np.array([[0.7, 0.72], [1.1, 0.3], [0.4, 1.42]]))
+    kinds = ["largest"] * 3
+    exact, h = growth(criteria, x, kinds, second=True), 1e-5
+    for axis in range(2):
+        step = h * np.eye(2)[axis]
+        above, below = growth(criteria, x + step, kinds), growth(criteria, x - step, kinds)
+        assert (above.rate - below.rate) / (2 * h) == pytest.approx(exact.gradient[:, axis], rel=1e-6, abs=1e-9)
+        assert (above.gradient - below.gradient) / (2 * h) == pytest.approx(exact.hessian[:, axis], rel=1e-4, abs=1e-7)
+
+
+def test_exclusion_finds_what_it_should(atlas):
+    """A tongue that is cut off by the lower rim has no tip in the rectangle; one box more and it has."""
+    from drivetrain_jax.atlas.windows import narrow
+
+    for low, expected in ((0.5, 1), (0.54, 0)):
+        part = narrow(atlas, {"beta": (low, 1.0), "Omega": (0.69, 0.73)})
+        found = critical_points(patches_of(Criteria.of(part, CARDAN)), 0, 1)
+        assert len(found.points) == expected and not len(found.undecided)
+
+
+def test_a_large_error_leaves_boxes_undecided(atlas):
+    """The guarantee must notice that the surrogate is too coarse to exclude a tongue."""
+    from dataclasses import replace
+
+    from drivetrain_jax.atlas.windows import narrow
+
+    part = narrow(atlas, {"beta": (0.05, 0.2), "Omega": (1.38, 1.45)})
+    assert [tip.name for tip in find_tips(part, CARDAN).tips] == ["S21"]
+    panels = tuple(replace(p, value_error=1e-2, derived_error=np.full(3, 1e-2)) for p in part.panels)
+    tips = find_tips(replace(part, panels=panels), CARDAN)
+    assert not tips.complete and tips.undecided
+    beta, omega = TIPS["S21"]
+    inside = [
+        b for b in tips.undecided if b["beta"][0] <= beta <= b["beta"][1] and b["Omega"][0] <= omega <= b["Omega"][1]
+    ]
+    assert inside and not tips.tips
+
+
+def test_roots_on_a_line_are_all_sign_changes(atlas):
+    criteria = Criteria.of(atlas, CARDAN)
+    value = float(atlas.to_coordinates(np.array([1.0, 1.0]))[0])
+    omega = 1 / np.linspace(1 / 2.0, 1 / 0.06, 40_001)
+    x = atlas.to_coordinates(np.stack([np.ones_like(omega), omega], axis=-1))
+    signs = criteria.values(x) > 0
+    for k, patches in enumerate(patches_of(criteria)):
+        found = roots(on_line(patches, 0, value))
+        changes = np.flatnonzero(signs[k, 1:] != signs[k, :-1])
+        assert len(found.x) == len(changes) and not len(found.undecided)
+        assert np.all((found.x >= x[changes, 1]) & (found.x <= x[changes + 1, 1]))
+
+
+def test_boundary_curves_are_boundaries(atlas):
+    curves = boundaries(atlas, CARDAN)
+    criteria = Criteria.of(atlas, CARDAN)
+    lowest = []
+    for curve in curves:
+        points = np.stack([curve.points["beta"], curve.points["Omega"]], axis=-1)
+        x = atlas.to_coordinates(points[curve.limiting])
+        assert np.abs(criteria.spectral_radius(x) - 1).max() < 1e-8
+        lowest.append(points[:, 0].min())
+        # Connected: no step is longer than a fiftieth of the rectangle.
+        step = np.diff(atlas.to_coordinates(points), axis=0) / np.ptp(
+            atlas.to_coordinates([atlas.lower, atlas.upper]), axis=0
+        )
+        assert np.abs(step).max() < 0.02
+    # Every tongue has its one curve, through its tip, and none is left over.
+    assert sorted(lowest) == pytest.approx(sorted(beta for beta, _ in TIPS.values()), abs=1e-6)
+
+
+def test_curves_enclose_what_is_unstable(atlas):
+    """Verdicts of random points against the number of curves crossed on the way from beta = 0."""
+    curves = boundaries(atlas, CARDAN)
+    generator = np.random.default_rng(3)
+    points = atlas.lower + (atlas.upper - atlas.lower) * generator.random((300, 2))
+    radius = np.exp(rate(points[:, 0], points[:, 1]))
+    for (beta, omega), rho in zip(points, radius, strict=True):
+        crossings = 0
+        for curve in curves:
+            o, b = curve.points["Omega"], curve.points["beta"]
+            k = np.flatnonzero((o[:-1] < omega) != (o[1:] < omega))
+            height = b[k] + (omega - o[k]) / (o[k + 1] - o[k]) * (b[k + 1] - b[k])
+            crossings += np.count_nonzero(height < beta)
+        if abs(rho - 1) > 1e-4:
+            assert (rho > 1) == bool(crossings % 2)
+
+
+def test_undamped_tongues_start_at_the_resonances(undamped):
+    tips = find_tips(undamped.atlas, CARDAN)
+    omega1, omega2 = natural_frequencies(1.0, 100.0)
+    found = {tip.name: tip for tip in tips.tips}
+    assert set(found) >= {"S21", "H21", "C+1", "C+2", "S22", "H22"}
+    assert not any(name.startswith("C-") for name in found)
+    assert found["S21"].point == {"beta": 0.0, "Omega": pytest.approx(omega2)}
+    assert found["C+2"].point == {"beta": 0.0, "Omega": pytest.approx((omega1 + omega2) / 4)}
+    assert not tips.complete
+
+
+def test_undamped_boundaries_separate_bounded_from_growing_motion(undamped):
+    curves = boundaries(undamped.atlas, CARDAN)
+    curve = max((c for c in curves if c.multiplier == "-1"), key=lambda c: np.ptp(c.points["beta"]))
+    middle = np.argmin(np.abs(curve.points["beta"] - 0.6))
+    beta, omega = curve.points["beta"][middle], curve.points["Omega"][middle]
+    rates = rate(np.full(2, beta), omega * np.array([1 - 1e-6, 1 + 1e-6]), zeta=0.0)
+    assert rates.min() < 1e-9 and rates.max() > 1e-5
+
+
+def test_tips_followed_through_another_parameter():
+    atlas = cardan_atlas({"beta": (0.0, 0.7), "Omega": (0.65, 1.5), "mu": (1.0, 1.1)}, 1e-12).atlas
+    values = np.linspace(1.0, 1.1, 3)
+    paths = {path.tip.name: path for path in follow_tips(atlas, CARDAN, "mu", values)}
+    assert list(paths) == ["S21", "H21", "C+1"]
+    last = {tip.name: tip for tip in find_tips(atlas.slice({"mu": 1.1}), CARDAN).tips}
+    for name, path in paths.items():
+        for axis in ("beta", "Omega"):
+            assert path.points[axis][-1] == pytest.approx(last[name].point[axis], abs=1e-8)
+    # The gradient of a tip: at the tip the radius does not vary along the speed.
+    start = {axis: paths["S21"].points[axis][0] for axis in ("beta", "Omega")}
+    slope = atlas_sensitivity(atlas, CARDAN, {**start, "mu": 1.0}).boundary("beta")["mu"]
+    direct = direct_sensitivity(CARDAN, {**BASE, **start}).boundary("beta")["mu"]
+    assert slope == pytest.approx(direct, rel=1e-7)
+    mu = values - 1
+    difference = np.polyfit(mu, paths["S21"].points["beta"], 2)[1]
+    assert slope == pytest.approx(difference, rel=2e-2)
+
+
+def test_gradients_of_the_radius():
+    point = {**BASE, "beta": 0.9, "Omega": 0.71}
+    found = direct_sensitivity(CARDAN, point)
+    assert found.spectral_radius == pytest.approx(np.exp(rate(0.9, 0.71))[0], rel=1e-12)
+    for name, slope in found.gradient.items():
+        h = 1e-5 * point[name]
+        columns = {**{k: np.full(2, v) for k, v in point.items()}, name: point[name] + np.array([-h, h])}
+        values = np.abs(np.linalg.eigvals(monodromy(propagators(columns, 1e-14)))).max(axis=1)
+        assert slope == pytest.approx((values[1] - values[0]) / (2 * h), rel=1e-5, abs=1e-9)
