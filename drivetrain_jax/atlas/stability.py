@@ -170,9 +170,9 @@ def _store(
     return np.concatenate([leading, unsure + first[-2:]], axis=1)
 
 
-def _compiler_options(**further: Any) -> dict[str, Any] | None:
+def _compiler_options() -> dict[str, Any] | None:
     """Full vector width: XLA uses half of AVX-512 unless told otherwise."""
-    return {"xla_cpu_prefer_vector_width": 512, **further} if jax.default_backend() == "cpu" else None
+    return {"xla_cpu_prefer_vector_width": 512} if jax.default_backend() == "cpu" else None
 
 
 def _errors(panel: Panel) -> np.ndarray:
@@ -233,9 +233,7 @@ def _point_kernel(
             found |= _judged_without_damping(phi, build(everything), errors[0], found, outputs)
         return found
 
-    # XLA's fusion of several outputs gives wrong results here: it loses some of them where it cuts a fusion into parallel
-    # tasks, which it does from some thousands of lanes on (seen with jax 0.10.2).
-    return jax.jit(kernel, compiler_options=_compiler_options(xla_disable_hlo_passes="cpu_multi_output_fusion"))
+    return jax.jit(kernel, compiler_options=_compiler_options())
 
 
 def _judged_without_damping(phi, model, value_error, found, outputs):

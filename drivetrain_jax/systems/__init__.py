@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 from importlib import import_module
 from importlib.metadata import entry_points
 
@@ -11,11 +10,6 @@ import jax
 
 # Every module that computes imports this package first, so no array can be made in single precision before this line.
 jax.config.update("jax_enable_x64", True)
-# Without it XLA's CPU backend computes a value again for each of its users: 3.6 times the operations of a Runge-Kutta
-# step and twice the compilation time. Read when jax first computes; a user who has set this option keeps it.
-if "xla_backend_extra_options" not in os.environ.get("XLA_FLAGS", ""):
-    _OPTION = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion"
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_OPTION}".strip()
 
 from drivetrain_jax.systems._base import (  # noqa: E402
     FloquetModel,
