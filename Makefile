@@ -22,9 +22,13 @@ lint: $(VENV)/installed-test
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
-bench: $(VENV)/installed-bench  ## throughput against the peers, work-precision; results in benchmarks/results/
+bench: $(VENV)/installed-bench  ## throughput and errors against the peers; results in benchmarks/results/
 	$(BIN)/python -m benchmarks.throughput
 	$(BIN)/python -m benchmarks.work_precision
+	$(BIN)/python -m benchmarks.critical_speeds
+	$(BIN)/python -m benchmarks.planetary_throughput
+	$(BIN)/python -m benchmarks.rattle_throughput
+	$(BIN)/python -m benchmarks.chaos
 
 validation: $(VENV)/installed  ## regenerates docs/validation/
 	$(BIN)/python -m benchmarks.validation
