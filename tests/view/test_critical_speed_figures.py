@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import plot
+from drivetrain_jax.view.layout import wrap_caption
 
 MODE = ("mode", [1, 2, 3])
 
@@ -75,3 +79,22 @@ def test_mode_shapes_are_named(swept):
 def test_nothing_to_plot(swept):
     with pytest.raises(InputError, match="nothing to plot"):
         plot(swept.drop_vars("critical_speed"))
+
+
+def test_a_long_caption_stays_on_the_figure_and_above_the_panel(swept):
+    names = ("length", "EI", "rhoA", "k_A", "m_joint", "kGA", "rhoI")
+    fixed = {name: {"value": [12345.0, 2.345e-3, 7.0], "units": "kg m-1"} for name in names}
+    figure = plot(swept.assign_attrs(fixed_parameters=json.dumps(fixed)))
+    FigureCanvasAgg(figure).draw()
+    caption = next(text for text in figure.texts if "length" in text.get_text())
+    box, panel = caption.get_window_extent(), figure.axes[0].get_window_extent()
+    assert "\n" in caption.get_text() and r"m_{\mathrm{joint}}" in caption.get_text()
+    assert box.x1 <= figure.bbox.x1 and box.y0 >= panel.y1
+    assert all(line.count("[") == line.count("]") for line in caption.get_text().split("\n"))
+
+
+def test_what_does_not_fit_gives_way_to_an_ellipsis():
+    text = ", ".join(f"$k_{{{letter}}}$ = [1, 2] N" for letter in "ABCDEFGH")
+    lines = wrap_caption(text, 2.0, 2).split("\n")
+    assert len(lines) == 2 and lines[1].endswith(", …") and lines[0].endswith(",")
+    assert wrap_caption(text, 100.0, 2) == text and wrap_caption("", 2.0, 2) == ""
