@@ -35,8 +35,8 @@ def complete(parameters: Mapping[str, Any]) -> dict[str, Any]:
 def _bubbles(power: int, count: int, x: np.ndarray, derivative: int) -> np.ndarray:
     """Derivatives of the functions whose derivative of the order ``power`` is ``P_k``, k = power, power + 1, ...
 
-    They vanish at both ends with ``power - 1`` derivatives, and their bending (stretching) is orthogonal: after scaling by
-    its diagonal the stiffness matrix is well conditioned, and the low frequencies keep their digits.
+    They vanish at both ends with ``power - 1`` derivatives, and their bending (stretching) is orthogonal: after scaling
+    by its diagonal the stiffness matrix is well conditioned, and the low frequencies keep their digits.
     """
     series = [legendre.legint(row, power - derivative, lbnd=-1) for row in np.eye(count + power)[power:]]
     return np.array([legendre.legval(x, c) for c in series]).reshape(count, -1)

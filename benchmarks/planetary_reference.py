@@ -1,5 +1,5 @@
-"""The planetary gear once more, independently of the package: forces assembled entry by entry with NumPy, eigenvalues by
-SciPy or, to any number of digits, by mpmath. Oracle of the tests and rival of the benchmark.
+"""The planetary gear once more, independently of the package: forces assembled entry by entry with NumPy, eigenvalues
+by SciPy or, to any number of digits, by mpmath. Oracle of the tests and rival of the benchmark.
 
 The stiffness matrix here is the one of the differential equations of motion, written body by body, whereas the package
 works with the extensions of the springs; both agree only if both are right.
@@ -38,7 +38,8 @@ def _per_planet(value: float | Sequence[float], count: int) -> list[float]:
 
 
 def matrices(p: Mapping[str, Any], functions: Any = math) -> tuple[list[float], list[list[Any]]]:
-    """Diagonal of the mass matrix and the stiffness matrix, dofs [x, y, u] of c, r, s, then [xi, eta, u] of each planet.
+    """Diagonal of the mass matrix and the stiffness matrix, dofs [x, y, u] of c, r, s, then [xi, eta, u] of each
+    planet.
 
     Written from the equations of motion (1)-(12) of the paper with their signs corrected: one row per force balance.
     ``functions`` offers ``sin`` and ``cos``: ``math`` or ``mpmath``.

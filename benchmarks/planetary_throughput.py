@@ -75,7 +75,8 @@ def package_job(planets: int, columns: Mapping[str, np.ndarray], method: str) ->
 
 
 def lapack_job(matrices: np.ndarray, solve: Callable[[np.ndarray], np.ndarray]) -> Job:
-    """``solve`` on parts of ``matrices`` in as many threads as there are cores; LAPACK runs outside the interpreter lock."""
+    """``solve`` on parts of ``matrices`` in as many threads as there are cores; LAPACK runs outside the interpreter
+    lock."""
     parts = np.array_split(matrices, 4 * PROCESSES)
 
     def job() -> np.ndarray:

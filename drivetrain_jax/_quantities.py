@@ -50,9 +50,10 @@ class Parameter:
         right = f" {'<' if self.open_upper else '<='} {self.upper:.10g}" if self.upper < math.inf else ""
         if self.infinite:
             right = " <= inf"
-        listed = "" if not self.listed else "[i] (or one number for all)" if self.broadcast and not right else "[i]"
+        listed = "[i]" if self.listed else ""
+        either = " (or one number for all)" if self.listed and self.broadcast else ""
         if left or right:
-            return f"{kind}{left}{self.name}{listed}{right}"
+            return f"{kind}{left}{self.name}{listed}{right}{either}"
         return f"{self.name} is a finite {kind or 'number'}".rstrip()
 
     def check(self, value: object) -> float | int | str | tuple[float, ...]:

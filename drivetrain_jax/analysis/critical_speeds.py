@@ -6,13 +6,13 @@ any mode. Method ``krylov_determinant``: the paper's, which loses all digits nea
 ``count_certified`` tells which of its roots have the number they claim.
 
 Modes are numbered by frequency and are not followed along an axis: the frequencies of a shaft in one plane between
-separated ends are simple (only where a hinge lies on a rigid support, or nearly, do they meet), so curves of equal number
-do not cross and following them would give the same curves.
+separated ends are simple (only where a hinge lies on a rigid support, or nearly, do they meet), so curves of equal
+number do not cross and following them would give the same curves.
 
 Derivatives of the frequencies: :func:`angular_frequencies`.
 
-Outcome: ``NOT_FINITE`` where parameters give no finite equations, ``NOT_CONVERGED`` where a frequency was not found (NaN),
-``TOLERANCE_NOT_MET`` where a root of ``krylov_determinant`` is not certified.
+Outcome: ``NOT_FINITE`` where parameters give no finite equations, ``NOT_CONVERGED`` where a frequency was not found
+(NaN), ``TOLERANCE_NOT_MET`` where a root of ``krylov_determinant`` is not certified.
 """
 
 from __future__ import annotations
@@ -80,20 +80,16 @@ def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> t
     if request.method == "krylov_determinant":
         for name in (name for name in _ADDITIONS if name in {p.name for p in system.parameters}):
             if fixed.get(name) != system.parameter(name).default:
-                given = f"fixed.{name} = {fixed[name]}" if name in fixed else f"axes.{name}"
+                given = f"fixed.{name} = {fixed[name]}" if name in fixed else name
                 raise InputError(
                     f"{given}: not in the equations of krylov_determinant; allowed is the method certified"
                 )
-        for name in ("k_A", "k_D"):
-            if fixed.get(name) == math.inf:
-                raise InputError(f"fixed.{name} = inf: allowed with the method krylov_determinant is a finite number")
-    if "separation_margin" in request.outputs:
-        low, high = options["operating_min"], options["operating_max"]
-        if not high > 0 or high < low:
-            raise InputError(
-                f"options.operating_max = {high:g}: allowed for separation_margin is a speed > 0, at least "
-                f"operating_min = {low:g}"
-            )
+    low, high = options["operating_min"], options["operating_max"]
+    if high < low or (high == 0 and "separation_margin" in request.outputs):
+        raise InputError(
+            f"options.operating_max = {high:g}: allowed for separation_margin is a speed > 0, at least "
+            f"operating_min = {low:g}"
+        )
     dimensions = [Dimension("mode", "number of the mode", tuple(range(1, options["modes"] + 1)))]
     if "mode_shape" in request.outputs:
         x = tuple(float(value) for value in np.linspace(0.0, 1.0, options["stations"]))

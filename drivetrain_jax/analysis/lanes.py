@@ -28,7 +28,8 @@ def lane_count(values: Values, path: str = "") -> int:
 
 
 def with_path(values: Values, path: str, lanes: int) -> tuple[dict[str, Any], int]:
-    """``values`` for every point of the path times every lane, in this order flattened to one axis; length of the path."""
+    """``values`` for every point of the path times every lane, in this order flattened to one axis; length of the
+    path."""
     along = path_entry(values, path)
     length = np.shape(along)[0]
 

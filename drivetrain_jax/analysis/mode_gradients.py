@@ -4,10 +4,11 @@ With the mass-normalised mode u of frequency f the derivative with respect to an
 
     df = u^T (dK - (2 pi f)^2 dM) u / (8 pi^2 f),      for a stiffness:  df/dk_j = (b_j^T u)^2 / (8 pi^2 f),
 
-evaluated spring by spring, so that no stiffness matrix is formed. Frequencies that form a cluster have no derivatives of
-their own: a change of the parameters splits them along the eigenvalues of the matrix u_i^T (dK - (2 pi f)^2 dM) u_j, which
-:func:`directional_derivatives` gives for one direction. What is linear in the direction, and therefore a gradient, is
-their mean: :func:`natural_frequencies` gives every member of a cluster the derivative of the cluster's mean.
+evaluated spring by spring, so that no stiffness matrix is formed. Frequencies that form a cluster have no derivatives
+of their own: a change of the parameters splits them along the eigenvalues of the matrix u_i^T (dK - (2 pi f)^2 dM) u_j,
+which :func:`directional_derivatives` gives for one direction. What is linear in the direction, and therefore a
+gradient, is their mean: :func:`natural_frequencies` gives every member of a cluster the derivative of the cluster's
+mean.
 
 >>> import jax, drivetrain_jax.systems.planetary as planetary
 >>> from drivetrain_jax.analysis.mode_gradients import natural_frequencies
@@ -40,9 +41,9 @@ Build = Callable[[Mapping[str, Any]], SpringSystem]
 def natural_frequencies(build: Build, values: Mapping[str, Any]) -> Array:
     """Natural frequencies in Hz, rising, ``(n,)``, or ``(n, N)`` if some of ``values`` have shape ``(N,)``.
 
-    ``build`` makes the spring system from ``values`` (for the planetary gear ``planetary.build`` and all its parameters,
-    ``planet_angle`` a tuple). Differentiable forwards and backwards with respect to every value; derivatives of clusters
-    are those of their mean, that of a rigid mode is zero. NaN where a value is not finite.
+    ``build`` makes the spring system from ``values`` (for the planetary gear ``planetary.build`` and all its
+    parameters, ``planet_angle`` a tuple). Differentiable forwards and backwards with respect to every value;
+    derivatives of clusters are those of their mean, that of a rigid mode is zero. NaN where a value is not finite.
     """
     return _frequencies_and_vectors(build, values)[0]
 

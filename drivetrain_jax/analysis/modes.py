@@ -1,4 +1,5 @@
-"""Natural frequencies and modes of masses joined by springs: values, families, shapes, and modes followed along an axis.
+"""Natural frequencies and modes of masses joined by springs: values, families, shapes, and modes followed along an
+axis.
 
 Frequencies alone come from singular values (:mod:`singular_values`) and need no vectors; everything else from
 :mod:`singular_vectors`. Both work on the factor ``diag(sqrt k) B M^(-1/2)``: the stiffness matrix, which would square

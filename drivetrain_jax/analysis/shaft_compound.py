@@ -14,12 +14,13 @@ u = (1, 0, 0, 0, 0). With q = sqrt(p), in units that make all matrices free of p
 
 The characteristic function is ``Psi = u4`` behind the last support. It is proportional to the paper's determinant (25).
 
-Count (Wittrick & Williams 1971). Natural frequencies below p: ``N = sum J0 + negative eigenvalues of the pivots`` in the
-block elimination of the dynamic stiffness from left to right. J0 counts the clamped-clamped frequencies of a segment.
-The pivot of the node in front of a segment is ``D = S + K``; its inertia follows from two signs that the propagation
-has at hand, ``sgn det D = sgn(u0 u0' Q)`` and the sign of its trace; that of a joint is ``S22 + k_hinge``, which is negative
-if u0 changes its sign there. At a pole the signs of u0 and of Q may be anything, but each enters twice, so that the
-total is right: there is no frequency at which the count fails, and its parity is the sign of Psi by construction.
+Count (Wittrick & Williams 1971). Natural frequencies below p: ``N = sum J0 + negative eigenvalues of the pivots`` in
+the block elimination of the dynamic stiffness from left to right. J0 counts the clamped-clamped frequencies of a
+segment. The pivot of the node in front of a segment is ``D = S + K``; its inertia follows from two signs that the
+propagation has at hand, ``sgn det D = sgn(u0 u0' Q)`` and the sign of its trace; that of a joint is ``S22 + k_hinge``,
+which is negative if u0 changes its sign there. At a pole the signs of u0 and of Q may be anything, but each enters
+twice, so that the total is right: there is no frequency at which the count fails, and its parity is the sign of Psi by
+construction.
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ class Scales(NamedTuple):
 
 
 class Value(NamedTuple):
-    """The characteristic function at one q, ``psi`` in [-1, 1] (``u4`` over the norm of ``u``), and the number ``count`` of
-    natural frequencies below, zero modes included (None unless asked for)."""
+    """The characteristic function at one q, ``psi`` in [-1, 1] (``u4`` over the norm of ``u``), and the number
+    ``count`` of natural frequencies below, zero modes included (None unless asked for)."""
 
     psi: Array
     count: Array | None
@@ -108,6 +109,19 @@ def characteristic(shaft: Shaft, q: Array, counting: bool = True) -> Value:
 
     state, _ = jax.lax.scan(step, start, segments)
     return _end(state, last, q, counting)
+
+
+def pairings(shaft: Shaft, q: Array) -> Array:
+    """The characteristic function behind every segment, in [-1, 1], shape ``(n, *q.shape)``.
+
+    Where the planes of the states that obey the conditions to the left and right of a section share a line, their
+    product vanishes. At a rigid support with a hinge the parts of the shaft are independent: seen from one, the product
+    is that of its own natural frequencies alone, whereas ``Psi`` behind the last support shows those of the last part.
+    """
+    left = planes(shaft, q)[1]
+    right = tuple(x[::-1] for x in planes(shaft.mirrored(), q)[0])
+    product = 2 * left[2] * right[2] + sum(left[i] * right[4 - i] for i in (0, 1, 3, 4))
+    return product / (_size(left) * _size(right))
 
 
 def planes(shaft: Shaft, q: Array) -> tuple[Plane, Plane, Array, Array]:
@@ -247,7 +261,8 @@ def _count_by_halving(z: Array, whole: General) -> tuple[Array, Array]:
 def _trace(u: Plane, sign: Array, functions: Compound | General, sign_q: Array) -> Array:
     """A number with the sign of the trace of ``D = S + K``, each diagonal entry relative to the size of its terms.
 
-    It is asked for only where det D > 0, so that both entries have this sign: one that cancels does not outvote the other.
+    It is asked for only where det D > 0, so that both entries have this sign: one that cancels does not outvote the
+    other.
     """
     if isinstance(functions, Compound):
         w0, w1, w3 = functions.Q, functions.W, functions.Y

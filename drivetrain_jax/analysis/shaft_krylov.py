@@ -2,8 +2,8 @@
 
     Psi(p) = (R31 R42 - R32 R41) - k_D (R11 R32 - R12 R31),   R = R_n ... R_1 T_A
 
-Each product grows like exp(tau), tau = sum of all phases z, their difference does not: Psi loses exp(tau) in accuracy. At
-tau of about 11 pi, mode 12, all digits are gone and the scan finds roots of the rounding; at 355 it overflows.
+Each product grows like exp(tau), tau = sum of all phases z, their difference does not: Psi loses exp(tau) in accuracy.
+At tau of about 11 pi, mode 12, all digits are gone and the scan finds roots of the rounding; at 355 it overflows.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ _APART = 1e-7
 
 
 def determinant(shaft: Shaft, q: Array) -> Array:
-    """Psi at ``q = sqrt(p)``, over (1 + k_A)(1 + k_D); ``q`` has shape ``(..., *lanes)``, the supports are finite."""
+    """Psi at ``q = sqrt(p)``, over (1 + k_A)(1 + k_D), also in the limit of rigid supports; ``q``: ``(...,
+    *lanes)``."""
     scales = Scales.of(shaft)
-    share = 1 / (1 + shaft.k[0])
-    zero = q * 0 * share
+    (move_A, force_A), (move_D, force_D) = (_shares(k) for k in (shaft.k[0], shaft.k[-1]))
+    zero = q * 0 * move_A
     # Columns for theta_A and F_A/k_A, rows f, theta, M, F; with k_A = 0 the second is a displacement without force.
-    state = ((zero, zero + share), (zero + 1, zero), (zero, zero), (zero, zero + shaft.k[0] * share))
+    state = ((zero, zero + move_A), (zero + 1, zero), (zero, zero), (zero, zero + force_A))
 
     def step(state: Any, segment: tuple[Array, ...]) -> tuple[Any, None]:
         beta, b, EI = segment
@@ -49,8 +50,13 @@ def determinant(shaft: Shaft, q: Array) -> Array:
 
     state, _ = jax.lax.scan(step, state, (scales.beta, scales.b, shaft.EI))
     (r11, r12), _, (r31, r32), (r41, r42) = state
-    k_D = shaft.k[-1]
-    return (r31 * r42 - r32 * r41) / (1 + k_D) - (k_D / (1 + k_D)) * (r11 * r32 - r12 * r31)
+    return (r31 * r42 - r32 * r41) * move_D - force_D * (r11 * r32 - r12 * r31)
+
+
+def _shares(k: Array) -> tuple[Array, Array]:
+    """``1/(1 + k)`` and ``k/(1 + k)``."""
+    move = 1 / (1 + k)
+    return move, 1 - move
 
 
 def find_roots(shaft: Shaft, modes: int) -> Roots:

@@ -42,10 +42,11 @@ def zero_modes(shaft: Shaft) -> Array:
 
 
 def mechanism_shapes(shaft: Shaft, x: Array) -> Array:
-    """Deflections of the zero modes at ``x`` in [0, 1], the distance from A over the whole length, orthogonal in the mass.
+    """Deflections of the zero modes at ``x`` in [0, 1], the distance from A over the whole length, orthogonal in the
+    mass.
 
-    Shape ``(rows, len(x), *lanes)``: the zero modes first, the other rows are 0. A free shaft moves as a whole, then turns
-    about its centre of mass.
+    Shape ``(rows, len(x), *lanes)``: the zero modes first, the other rows are 0. A free shaft moves as a whole, then
+    turns about its centre of mass.
     """
     lanes, shaft = shaft.lanes, shaft.spread()
     ends = jnp.concatenate([jnp.zeros_like(shaft.length[:1]), jnp.cumsum(shaft.length, axis=0)])

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.shaft_compound import Scales, characteristic
+from drivetrain_jax.analysis.shaft_compound import Scales, characteristic, pairings
 from drivetrain_jax.analysis.shaft_mechanisms import zero_modes
 from drivetrain_jax.systems import Shaft
 
@@ -32,11 +32,15 @@ _CLOSED = 4 * np.finfo(float).eps
 # Ratio of the ends up to which a bracket is narrow enough for arithmetic means and for interpolation.
 _NEAR = 4.0
 _TRUNCATION = 0.2
+# Relative distance up to which frequencies count as one; and up to which a zero of Psi is that of the frequency.
+_MULTIPLE = 1e-13
+_ZERO = 1e-9
 
 
 class Roots(NamedTuple):
-    """``q = sqrt(p)`` of the natural frequencies p [rad/s], rising; the relative ``width`` of the brackets of p; whether
-    the count certifies each: ``(modes, *lanes)``. A zero mode has the exact q = 0; what was not found is NaN."""
+    """``q = sqrt(p)`` of the natural frequencies p [rad/s], rising; the relative ``width`` of the brackets of p;
+    whether the count certifies each: ``(modes, *lanes)``. A zero mode has the exact q = 0; what was not found is
+    NaN."""
 
     q: Array
     width: Array
@@ -44,8 +48,8 @@ class Roots(NamedTuple):
 
 
 class _Brackets(NamedTuple):
-    """Ends of the brackets in q, the count and Psi there, the factor of the next lower trial while ``low`` is 0, whether
-    one simple root is left, the width when that was first so, and the reach of interpolation that is left."""
+    """Ends of the brackets in q, the count and Psi there, the factor of the next lower trial while ``low`` is 0,
+    whether one simple root is left, the width when that was first so, and the reach of interpolation that is left."""
 
     low: Array
     high: Array
@@ -148,9 +152,21 @@ def _square_roots_jvp(modes: int, primals: tuple[Shaft], tangents: tuple[Shaft])
     q = square_roots(shaft, modes)
     moving = q > 0
     safe = jnp.where(moving, q, 1.0)
-    _, along_shaft = jax.jvp(lambda s: characteristic(s, safe, counting=False).psi, (shaft,), tangents)
-    _, along_q = jax.jvp(lambda x: characteristic(shaft, x, counting=False).psi, (safe,), (jnp.ones_like(safe),))
-    return q, jnp.where(moving, -along_shaft / along_q, 0.0)
+    psi, along_shaft = jax.jvp(lambda s: pairings(s, safe), (shaft,), tangents)
+    _, along_q = jax.jvp(lambda x: pairings(shaft, x), (safe,), (jnp.ones_like(safe),))
+    # A section that the mode does not reach does not show its frequency as a zero.
+    section = jnp.argmin(jnp.abs(psi / along_q), axis=0)[None]
+    along_shaft, along_q = (jnp.take_along_axis(x, section, axis=0)[0] for x in (along_shaft, along_q))
+    # A factor, so that NaN passes backwards too.
+    slope = -along_shaft / along_q * jnp.where(_multiple(q), jnp.nan, 1.0)
+    return q, jnp.where(moving, slope, 0.0)
+
+
+def _multiple(q: Array) -> Array:
+    """Which frequencies agree with a neighbour to rounding."""
+    near = q[1:] - q[:-1] <= _MULTIPLE * q[1:]
+    none = jnp.zeros_like(q[:1], bool)
+    return jnp.concatenate([none, near]) | jnp.concatenate([near, none])
 
 
 def angular_frequencies(shaft: Shaft, modes: int) -> Array:
@@ -159,7 +175,8 @@ def angular_frequencies(shaft: Shaft, modes: int) -> Array:
     Differentiable with respect to every field of ``shaft``, forwards and backwards and repeatedly. With Psi, the
     closed form of the characteristic function, ``dp = -(dPsi/dshaft) / (dPsi/dp)``: one evaluation more, whatever the
     number of steps that found p. It equals the energy formulas of docs/theory/bicardan.md, (12). A zero mode has the
-    derivative 0, a double frequency has none (NaN or infinite). A frequency that could not be certified is NaN.
+    derivative 0, a multiple frequency has none (NaN; the last of the ``modes`` is not compared with the next one). A
+    frequency that could not be certified is NaN.
 
     >>> import jax
     >>> from drivetrain_jax.analysis.critical_speeds import angular_frequencies
@@ -181,8 +198,11 @@ def relative_error(shaft: Shaft, roots: Roots) -> Array:
     """
     safe = jnp.where(roots.q > 0, roots.q, 1.0)
     mirrored = shaft.mirrored()
-    value, slope = jax.jvp(lambda q: characteristic(mirrored, q, counting=False).psi, (safe,), (jnp.ones_like(safe),))
-    shift = jnp.abs(value / (slope * safe))
+    value, slope = jax.jvp(lambda q: pairings(mirrored, q), (safe,), (jnp.ones_like(safe),))
+    shifts = jnp.abs(value / (slope * safe))
+    shifts = jnp.where(jnp.isfinite(shifts), shifts, jnp.inf)
+    # What is no zero at all belongs to a section that the mode does not reach.
+    shift = jnp.where(shifts[-1] < _ZERO, shifts[-1], jnp.min(shifts, axis=0))
     # Where frequencies cluster Psi is flat and its zero says little: the bracket alone speaks.
     shift = jnp.where(jnp.isfinite(shift), jnp.minimum(shift, 1.0), 0.0)
     return jnp.where(roots.q > 0, 2 * shift + roots.width + 2 * np.finfo(float).eps, 0.0)

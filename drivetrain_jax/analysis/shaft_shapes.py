@@ -49,7 +49,8 @@ def _states(left: Plane, right: Plane) -> Array:
 
 
 def _node_states(shaft: Shaft, q: Array) -> tuple[Array, Array]:
-    """States in front of and behind every segment in its own coordinates, of one scale, signs still open: (4, n, ...)."""
+    """States in front of and behind every segment in its own coordinates, of one scale, signs still open: (4, n,
+    ...)."""
     front, behind, log_front, log_behind = planes(shaft, q)
     from_d, from_d_behind, log_d, log_d_behind = planes(shaft.mirrored(), q)
     left_end = _states(front, tuple(x[::-1] for x in from_d_behind))

@@ -1,4 +1,5 @@
-"""Following modes along a path by the modal assurance criterion (MAC): which mode of a point continues which of the last.
+"""Following modes along a path by the modal assurance criterion (MAC): which mode of a point continues which of the
+last.
 
 Neighbours in frequency that exchange their order keep their branches; at a veering, where two modes turn into each
 other, the branch goes with the shape. Modes of one frequency are compared as a space.
@@ -19,8 +20,8 @@ def follow(vectors: Array, same: Array) -> tuple[Array, Array]:
     """``branch`` and ``mac``, both ``(L, n, ...)``, of modes along a path of ``L`` points.
 
     ``vectors`` (L, m, n, ...): orthonormal shapes as columns (mass-weighted, or sampled so that they are orthonormal);
-    ``same`` (L, n, n, ...): which modes of a point share one frequency. ``branch`` (int32) is the number, from 1, of the
-    mode at the first point that each mode continues; ``mac`` the share, 0 to 1, that the shape of the branch at the
+    ``same`` (L, n, n, ...): which modes of a point share one frequency. ``branch`` (int32) is the number, from 1, of
+    the mode at the first point that each mode continues; ``mac`` the share, 0 to 1, that the shape of the branch at the
     previous point has in the space of the mode (1 at the first point). Every branch goes on at every point; pairs are
     made by falling MAC. Where ``vectors`` are not finite, ``mac`` is NaN and the order by frequency is kept.
     """
@@ -75,7 +76,8 @@ def _pair(score: Array) -> Array:
 
 
 def _carry(overlap: Array, shapes: Array, equal: Array, chosen: Array) -> Array:
-    """The shapes of the branches at this point: each continued within the space of its mode, as far as it is in there."""
+    """The shapes of the branches at this point: each continued within the space of its mode, as far as it is in
+    there."""
     inside = jnp.sum(chosen[:, :, None] * equal[None], axis=1) * overlap
     size = jnp.sum(inside**2, axis=0 + 1)
     keep = size > _CARRIED

@@ -38,10 +38,10 @@ class Block:
 class SpringSystem:
     """``M q'' + B^T diag(k) B q = 0`` with the diagonal mass matrix ``M``.
 
-    ``extensions`` (springs, dofs, ...) is ``B``: the extension of each spring per unit of each coordinate; ``stiffness``
-    (springs, ...), ``mass`` (dofs, ...). ``blocks`` are an exact decomposition into invariant parts; ``whole`` is the
-    system as one block. ``asymmetry`` (...), from 0 to 1, measures what couples the families; ``dofs`` and
-    ``body_names`` name coordinates and bodies; ``bodies`` (dofs,) gives the number of the body of each coordinate.
+    ``extensions`` (springs, dofs, ...) is ``B``: the extension of each spring per unit of each coordinate;
+    ``stiffness`` (springs, ...), ``mass`` (dofs, ...). ``blocks`` are an exact decomposition into invariant parts;
+    ``whole`` is the system as one block. ``asymmetry`` (...), from 0 to 1, measures what couples the families; ``dofs``
+    and ``body_names`` name coordinates and bodies; ``bodies`` (dofs,) gives the number of the body of each coordinate.
     """
 
     extensions: Array

@@ -277,6 +277,7 @@ def resonances(orders: int = 3) -> Resonances:
 
 RESONANCE_LABELS = resonances().labels
 
+
 def _inverse_square(x: Any) -> np.ndarray:
     return 1 / np.asarray(x) ** 2
 

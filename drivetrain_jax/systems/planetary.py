@@ -197,7 +197,8 @@ def identical_planets(values: Values) -> bool:
 
 
 def _reduced_blocks(p: Mapping[str, Array], frame: Array, directions: Array, balanced: bool) -> tuple[Block, ...]:
-    """The blocks of identical planets: rotation with translation (apart if ``balanced``), and the planets alone (8)-(9).
+    """The blocks of identical planets: rotation with translation (apart if ``balanced``), and the planets alone
+    (8)-(9).
 
     ``frame`` (N, N, ...) starts with span{1, cos psi, sin psi}, in which ``directions`` (3, 3, ...) is that basis.
     """

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import xarray as xr
@@ -13,6 +12,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
+from matplotlib.textpath import TextPath
 
 from drivetrain_jax.view.style import FRAME_GREY, caption
 
@@ -21,6 +21,7 @@ DPI = 200
 _LABEL_SIZE = 8.5
 _INCHES_PER_LETTER = 0.068
 _INCHES_PER_ENTRY = 0.45
+_CAPTION_SIZE, _CAPTION_TOP, _CAPTION_LINE = 8, 0.32, 0.14
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,9 @@ class Panels:
         left = self.margins.left / WIDTH
         self.figure.text(left, 1 - 0.10 / total, dataset.attrs.get("title", ""), va="top", size=10.5, weight="bold")
         text = "; ".join(part for part in (caption(dataset), note) if part)
-        self.figure.text(left, 1 - 0.32 / total, text, va="top", size=8, color=FRAME_GREY)
+        room = int((self.margins.top - _CAPTION_TOP) / _CAPTION_LINE)
+        text = wrap_caption(text, WIDTH - self.margins.left - 0.1, max(room, 1))
+        self.figure.text(left, 1 - _CAPTION_TOP / total, text, va="top", size=_CAPTION_SIZE, color=FRAME_GREY)
 
     def legend(self, handles: Sequence[Artist]) -> None:
         """One legend for the whole figure, in the bottom margin: one row, or two if that would be too long."""
@@ -117,10 +120,38 @@ class Panels:
 
 def _wrap(text: str, inches: float) -> str:
     # A minus sign stays with its operands.
-    text = text.replace(" - ", "\u00a0-\u00a0")
-    return "\n".join(textwrap.wrap(text, max(int(inches / _INCHES_PER_LETTER), 20), break_long_words=False))
+    words = text.replace(" - ", "\u00a0-\u00a0").split(" ")
+    return "\n".join(
+        _fill(words, max(inches, 20 * _INCHES_PER_LETTER), lambda line: len(_plain(line)) * _INCHES_PER_LETTER)
+    )
+
+
+def _fill(parts: Sequence[str], inches: float, length: Callable[[str], float]) -> list[str]:
+    """``parts`` in lines of ``inches``, none of them broken."""
+    lines = [parts[0]]
+    for part in parts[1:]:
+        longer = f"{lines[-1]} {part}"
+        if length(longer) <= inches:
+            lines[-1] = longer
+        else:
+            lines.append(part)
+    return lines
+
+
+def wrap_caption(text: str, inches: float, lines: int) -> str:
+    """``text`` in at most ``lines`` lines, broken between its parts (never within a formula); what is left over gives
+    way to an ellipsis."""
+    wrapped = _fill(re.split(r"(?<=[,;]) (?![^\[]*\])", text), inches, _caption_length)
+    if len(wrapped) > lines:
+        wrapped = [*wrapped[: lines - 1], f"{wrapped[lines - 1].rstrip(',;')}, \u2026"]
+    return "\n".join(wrapped)
+
+
+def _caption_length(line: str) -> float:
+    """Length of a line of the caption in inches."""
+    return TextPath((0, 0), line, size=_CAPTION_SIZE).get_extents().width / 72 if line.strip() else 0.0
 
 
 def _plain(label: object) -> str:
     """The letters of a label without the marks of a formula."""
-    return re.sub(r"[$^_{}\\]", "", str(label))
+    return re.sub(r"[$^_{}]|\\(?:mathrm)?", "", str(label))

@@ -15,7 +15,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.gear import BODY_COLOURS, draw_gear
 from drivetrain_jax.view.layout import Margins, Panels
-from drivetrain_jax.view.style import STYLE, axis_label, variable_label
+from drivetrain_jax.view.style import FRAME_GREY, STYLE, axis_label, variable_label
 
 TYPE_COLOURS = {
     "rigid": "#9a9a9a",
@@ -102,6 +102,8 @@ def _segments(x: np.ndarray, curve: np.ndarray, kinds: np.ndarray) -> LineCollec
         colors=[TYPE_COLOURS[str(kind)] for kind in kinds[1:]],
         linewidths=1.1,
         capstyle="round",
+        # Pieces that are moved to whole pixels one by one make steps.
+        snap=False,
     )
 
 
@@ -143,5 +145,6 @@ def _shapes(dataset: xr.Dataset) -> Figure:
         axes.axis("off")
     left_out = len(_distinct(frequency)) - len(drawn)
     panels.titles(dataset, f"{left_out} higher frequencies not drawn" if left_out else "")
-    panels.legend([Line2D([], [], color=colour, label=body) for body, colour in BODY_COLOURS.items()])
+    rest = Line2D([], [], color=FRAME_GREY, linewidth=0.6, linestyle=(0, (3, 2)), label="at rest")
+    panels.legend([*(Line2D([], [], color=colour, label=body) for body, colour in BODY_COLOURS.items()), rest])
     return panels.figure

@@ -44,11 +44,14 @@ _GREEK = {
     *("rho", "sigma", "tau", "phi", "chi", "psi", "omega", "Gamma", "Delta", "Theta", "Lambda", "Phi", "Psi", "Omega"),
 }
 
+# Longer lists are not written out in a caption.
+_MOST_ENTRIES = 6
 _PRODUCTS = {"EI": "$EI$", "rhoA": r"$\rho A$", "rhoI": r"$\rho I$", "kGA": r"$\kappa GA$"}
 
 
 def symbol(name: str) -> str:
-    """``name`` as it is set in a formula: Greek letters by name, an index as subscript (``k_A``), else unchanged."""
+    """``name`` as it is set in a formula: Greek letters by name, an index as subscript (``k_A``, ``k_joint``), else
+    unchanged."""
     if name in _PRODUCTS:
         return _PRODUCTS[name]
     if name in _GREEK:
@@ -57,6 +60,8 @@ def symbol(name: str) -> str:
         head, index = match.groups()
         head = rf"\{head}" if head in _GREEK else head
         return rf"${head}_{{{index}}}$" if index else f"${head}$"
+    if match := re.fullmatch(r"([A-Za-z])_([a-z]{3,})", name):
+        return rf"${match[1]}_{{\mathrm{{{match[2]}}}}}$"
     return name
 
 
@@ -73,9 +78,12 @@ def variable_label(variable: xr.DataArray) -> str:
 
 
 def value_text(name: str, value: object, units: str = "1") -> str:
-    """``symbol = value units``; a list is given by its length."""
+    """``symbol = value units``; a list of more than six entries is given by its length."""
     if isinstance(value, (list, tuple)):
-        return f"{symbol(name)}: {len(value)} values"
+        if len(value) > _MOST_ENTRIES:
+            return f"{symbol(name)}: {len(value)} values"
+        entries = ", ".join(f"{entry:.5g}" if isinstance(entry, (int, float)) else str(entry) for entry in value)
+        return f"{symbol(name)} = [{entries}]" + (f" {units}" if units not in ("1", "") else "")
     number = f"{value:.6g}" if isinstance(value, (int, float)) else str(value)
     return f"{symbol(name)} = {number}" + (f" {units}" if units not in ("1", "") else "")
 
@@ -87,13 +95,23 @@ def caption(dataset: xr.Dataset) -> str:
     """
     fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}"))
     named = tomllib.loads(dataset.attrs["scene"]).get("fixed", {}) if "scene" in dataset.attrs else fixed
-    parts = [_fixed_text(name, value) for name, value in fixed.items() if name in named]
+    parts = [_fixed_text(name, _unless_swept(dataset, name, value)) for name, value in fixed.items() if name in named]
     parts += [
         value_text(str(name), coordinate.item(), coordinate.attrs.get("units", "1"))
         for name, coordinate in dataset.coords.items()
         if coordinate.ndim == 0
     ]
     return ", ".join(parts)
+
+
+def _unless_swept(dataset: xr.Dataset, name: str, entry: object) -> object:
+    """A fixed list with the entries that are axes of their own, such as ``planet_angle[1]``, said to vary."""
+    value = entry.get("value") if isinstance(entry, dict) else entry
+    if not isinstance(value, (list, tuple)):
+        return entry
+    axes = {str(c.name): "varies" if c.ndim else c.item() for c in dataset.coords.values()}
+    shown = [axes.get(f"{name}[{i}]", number) for i, number in enumerate(value)]
+    return {**entry, "value": shown} if isinstance(entry, dict) else shown
 
 
 def _fixed_text(name: str, entry: object) -> str:

@@ -146,7 +146,7 @@ def check_random(count: int, segments: int, seed: int) -> None:
         assert close[p > 0].all(), (one, p, expected)
 
 
-@pytest.mark.parametrize("segments", [1, 3, 6])
+@pytest.mark.parametrize("segments", [3])
 def test_no_root_is_missed_or_false(segments):
     check_random(34, segments, seed=segments)
 
@@ -166,6 +166,7 @@ EXTENSIONS = {
     "hinge and elastic joint": {"k_hinge": (0.0, 1e5), "k_joint": (1e7, 0.0)},
     "three free bars": {"k_hinge": (0.0, 0.0), "k_A": 0.0, "k_D": 0.0, "m_joint": (0.5, 0.2)},
     "mechanism on one support": {"k_hinge": (0.0, math.inf), "k_joint": (0.0, 3e5), "k_A": 0.0, "k_D": 0.0},
+    "overhung bar that turns": {"k_hinge": (math.inf, 0.0), "k_joint": (1e7, 1e7), "k_D": 0.0},
     "Timoshenko": SHEAR,
     "Timoshenko with everything": SHEAR
     | {"k_hinge": (1e4, 0.0), "m_joint": (1.0, 2.0), "k_joint": (0.0, 1e6), "m_A": 0.5},
@@ -193,32 +194,33 @@ def test_extensions_against_finite_elements(name):
 
 
 def test_shear_and_rotary_inertia_lower_the_tube():
-    """About -1 % on the first and -4 % on the second frequency."""
-    tube = PRESETS["paper_tube"]
+    """-1 % on the first and -3.3 % on the second frequency on the paper's supports, -3.9 % on stiff ones."""
     area, moment = 3.6e-4, 1.055e-7
-    slender = np.asarray(eight(shaft(tube))[0].q) ** 2
-    thick = everything(tube | {"kGA": (0.53 * 8.1e10 * area,) * 3, "rhoI": (7800 * moment,) * 3})
-    ratio = np.asarray(eight(thick)[0].q) ** 2 / slender
-    assert -0.015 < ratio[0] - 1 < -0.005 and -0.05 < ratio[1] - 1 < -0.03
+    shear = {"kGA": (0.53 * 8.1e10 * area,) * 3, "rhoI": (7800 * moment,) * 3}
+    for supports, expected in (({}, (-0.00990, -0.03268)), ({"k_A": 1e14, "k_D": 1e14}, (-0.01033, -0.03919))):
+        tube = PRESETS["paper_tube"] | supports
+        thick, slender = (np.asarray(eight(everything(tube | more))[0].q) ** 2 for more in (shear, {}))
+        np.testing.assert_allclose((thick / slender)[:2] - 1, expected, atol=6e-6)
 
 
 def test_coinciding_frequencies_are_all_found():
-    """Two equal spans, hinged to each other over a rigid support: every frequency is double, and N jumps by two."""
-    twins = Shaft(jnp.ones(2), jnp.ones(2), jnp.ones(2), jnp.full(3, jnp.inf), None, jnp.zeros(1))
-    roots, _ = eight(twins)
-    z = np.asarray(roots.q)
+    """Three equal spans, hinged to each other over rigid supports: every frequency is triple, and N jumps by three."""
+    span = {name: (1.0,) * 3 for name in ("length", "EI", "rhoA")}
+    rigid = {"k_A": math.inf, "k_D": math.inf, "k_joint": math.inf, "k_hinge": 0.0}
+    roots, _ = eight(everything(span | rigid))
     assert bool(roots.certified.all())
-    np.testing.assert_allclose(z, np.pi * np.array([1, 1, 2, 2, 3, 3, 4, 4]), rtol=4e-15)
+    np.testing.assert_allclose(np.asarray(roots.q), np.pi * np.array([1, 1, 1, 2, 2, 2, 3, 3]), rtol=4e-15)
 
 
-def test_lanes_do_not_disturb_each_other():
+def test_lanes_do_not_disturb_each_other(solved):
     """A lane without numbers is NaN and not certified; the others have the bits they have without it."""
-    good = [named(CASES[name]) for name in ("paper_real_exactI", "near_pinned_k1e14", "free_free_3seg")]
-    alone = np.asarray(thirty(lanes(good))[0].q)
-    bad = [*good[:2], good[2] | {"EI": [math.nan] * 3}]
+    names = [name for name, case in CASES.items() if len(case["l"]) == 3]
+    bad = [named(CASES[name]) for name in names]
+    bad[-1] |= {"EI": [math.nan] * 3}
     roots = thirty(lanes(bad))[0]
-    assert np.array_equal(np.asarray(roots.q)[:, :2], alone[:, :2])
-    assert np.isnan(np.asarray(roots.q)[:, 2]).all() and not np.asarray(roots.certified)[:, 2].any()
+    q, certified = np.asarray(roots.q), np.asarray(roots.certified)
+    assert np.array_equal(q[:, :-1] ** 2, np.stack([solved[name][0] for name in names[:-1]], axis=-1))
+    assert np.isnan(q[:, -1]).all() and not certified[:, -1].any()
 
 
 def test_elementary_functions():
@@ -254,7 +256,7 @@ def test_compound_is_the_exponential(z):
 def test_count_grows_by_one_through_every_frequency():
     """Also next to the poles of the segments' stiffness, where the count has nothing to hold on to."""
     uniform = shaft(PRESETS["paper_tube"])
-    q = eight(uniform)[0].q
+    q = eight(everything(PRESETS["paper_tube"]))[0].q
     clamped = jnp.array([4.730040744862704, 7.853204624095838]) / (0.3 * (2.808 / 22155.0) ** 0.25)
     near = jnp.sort(jnp.concatenate([clamped * (1 + side * 1e-15) for side in (-1, 0, 1)]))
     count = jax.jit(characteristic)(uniform, jnp.concatenate([q * (1 - 1e-14), q * (1 + 1e-14), near])).count
@@ -262,74 +264,108 @@ def test_count_grows_by_one_through_every_frequency():
     assert np.array_equal(count[16:], np.sum(np.asarray(q)[None] < np.asarray(near)[:, None], axis=1))
 
 
-LISTS = ("length", "EI", "rhoA", "k")
+ABSENT = 2
 NODES = jnp.array([PAPER["k_A"], 2e6, 0.0, PAPER["k_D"]])
-ARGUMENTS = (*(jnp.array(PAPER[name]) for name in LISTS[:3]), NODES)
+ARGUMENTS = {name: jnp.array(PAPER[name]) for name in ("length", "EI", "rhoA")} | {
+    "k": NODES,
+    "m": jnp.array([1.0, 2.0, 0.5, 0.7]),
+    "k_hinge": jnp.array([3e4, 1e5]),
+}
+# Exponents of a length with which a parameter has to grow for similar shafts, and whether it is a stiffness.
+SCALING = {"length": 1, "EI": 0, "rhoA": 0, "k": -3, "m": 1, "k_hinge": -1, "kGA": -2, "rhoI": 2}
+STIFFNESSES, MASSES = ("EI", "k", "k_hinge", "kGA"), ("rhoA", "m", "rhoI")
 
 
 @jax.jit
-def frequencies(*arguments: jax.Array) -> jax.Array:
-    return angular_frequencies(Shaft(*arguments), 6)
+def frequencies(arguments: Mapping[str, jax.Array]) -> jax.Array:
+    return angular_frequencies(Shaft(**arguments), 6)
+
+
+def twice(arguments: Mapping[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    p = angular_frequencies(Shaft(**arguments), 6)
+    return p, p
 
 
 @pytest.fixture(scope="module")
-def jacobians() -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-    """p of six modes and dp/d(length, EI, rhoA, k), by reverse mode."""
-    rows = jax.jit(jax.jacrev(frequencies, argnums=(0, 1, 2, 3)))(*ARGUMENTS)
-    return np.asarray(frequencies(*ARGUMENTS)), tuple(np.asarray(row) for row in rows)
+def jacobians() -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """p of six modes and its derivatives, by reverse mode."""
+    rows, p = jax.jit(jax.jacrev(twice, has_aux=True))(ARGUMENTS)
+    return np.asarray(p), {name: np.asarray(row) for name, row in rows.items()}
+
+
+def check_identities(p: np.ndarray, rows: Mapping[str, np.ndarray], arguments: Mapping[str, jax.Array]) -> None:
+    """p scales like a mass^(-1/2), like a stiffness^(1/2), and like length^(-2) from shaft to similar shaft."""
+    total = {name: (rows[name] * np.asarray(arguments[name])).sum(axis=1) / p for name in rows}
+    np.testing.assert_allclose(sum(total[name] for name in MASSES if name in total), -0.5, atol=1e-12)
+    np.testing.assert_allclose(sum(total[name] for name in STIFFNESSES if name in total), 0.5, atol=1e-12)
+    np.testing.assert_allclose(sum(SCALING[name] * total[name] for name in total), -2.0, atol=1e-11)
+
+
+def check_differences(p: np.ndarray, rows: Mapping[str, np.ndarray], arguments: Mapping[str, jax.Array]) -> None:
+    """Differences of fourth order in the logarithm of each parameter, all perturbed shafts side by side, and a
+    one-sided difference for the spring that is not there."""
+    h, multiples, spring = 1e-3, np.array([-2, -1, 1, 2]), np.array([1e3, 2e3])
+    places = [(name, e) for name, x in arguments.items() for e in range(len(x)) if float(x[e]) > 0]
+    columns = {name: np.repeat(np.asarray(x)[:, None], 4 * len(places) + 2, axis=1) for name, x in arguments.items()}
+    for number, (name, e) in enumerate(places):
+        columns[name][e, 4 * number : 4 * number + 4] *= np.exp(h * multiples)
+    columns["k"][ABSENT, -2:] = spring
+    found = np.asarray(frequencies({name: jnp.asarray(column) for name, column in columns.items()}))
+    slopes = np.log(found[:, :-2]).reshape(6, len(places), 4) @ np.array([1, -8, 8, -1]) / (12 * h)
+    for number, (name, e) in enumerate(places):
+        exact = rows[name][:, e] * float(arguments[name][e]) / p
+        np.testing.assert_allclose(exact, slopes[:, number], atol=3e-11)
+    one_sided = (4 * found[:, -2] - found[:, -1] - 3 * p) / spring[1]
+    np.testing.assert_allclose(rows["k"][:, ABSENT], one_sided, rtol=1e-5)
 
 
 def test_gradients_obey_the_sum_identities(jacobians):
-    """p scales like rhoA^(-1/2), like (EI, k)^(1/2), and like length^(-2) if k goes with EI/length^3."""
-    p, (length, EI, rhoA, k) = jacobians
-    logarithmic = [
-        (row * np.asarray(x)).sum(axis=1) / p for row, x in zip((length, EI, rhoA, k), ARGUMENTS, strict=True)
-    ]
-    np.testing.assert_allclose(logarithmic[2], -0.5, atol=1e-13)
-    np.testing.assert_allclose(logarithmic[1] + logarithmic[3], 0.5, atol=1e-13)
-    np.testing.assert_allclose(logarithmic[0] - 3 * logarithmic[3], -2.0, atol=1e-12)
+    check_identities(*jacobians, ARGUMENTS)
 
 
 def test_gradients_against_finite_differences(jacobians):
-    """Differences of fourth order in the logarithm of each parameter, all perturbed shafts side by side."""
-    p, rows = jacobians
-    h, multiples = 1e-3, np.array([-2, -1, 1, 2])
-    places = [(i, e) for i, x in enumerate(ARGUMENTS) for e in range(len(x)) if float(x[e]) > 0]
-    columns = [np.repeat(np.asarray(x)[:, None], 4 * len(places), axis=1) for x in ARGUMENTS]
-    for number, (i, e) in enumerate(places):
-        columns[i][e, 4 * number : 4 * number + 4] *= np.exp(h * multiples)
-    moved = np.log(np.asarray(frequencies(*(jnp.asarray(c) for c in columns)))).reshape(6, len(places), 4)
-    slopes = moved @ np.array([1, -8, 8, -1]) / (12 * h)
-    for number, (i, e) in enumerate(places):
-        exact = rows[i][:, e] * float(ARGUMENTS[i][e]) / p
-        np.testing.assert_allclose(exact, slopes[:, number], atol=3e-11)
+    check_differences(*jacobians, ARGUMENTS)
 
 
-def test_gradient_of_a_spring_that_is_not_there(jacobians):
-    """The energy formula dp/dk = f^2/(2 p G) for k = 0, with the mode shape integrated numerically."""
-    p, rows = jacobians
+@pytest.mark.full
+def test_gradients_obey_the_energy_formula():
+    """dp/dk = f^2/(2 p G), also for k = 0, with the mode shape integrated numerically."""
+    arguments = {name: ARGUMENTS[name] for name in ("length", "EI", "rhoA", "k")}
+    rows, p = (jax.tree.map(np.asarray, x) for x in jax.jit(jax.jacrev(twice, has_aux=True))(arguments))
     x = np.linspace(0.0, 1.0, 9101)
-    f = np.asarray(jax.jit(mode_shapes)(Shaft(*ARGUMENTS), jnp.sqrt(jnp.asarray(p)), jnp.asarray(x)))
+    f = np.asarray(jax.jit(mode_shapes)(Shaft(**arguments), jnp.sqrt(jnp.asarray(p)), jnp.asarray(x)))
     ends = np.cumsum(PAPER["length"]) / sum(PAPER["length"])
     per_length = np.asarray(PAPER["rhoA"])[np.minimum(np.searchsorted(ends, x), 2)]
     G = np.trapezoid(per_length * f**2, x, axis=1) * sum(PAPER["length"])
-    at_joint = f[:, np.argmin(np.abs(x - ends[1]))]
-    np.testing.assert_allclose(rows[3][:, 2], at_joint**2 / (2 * p * G), rtol=3e-4)
+    for node, place in enumerate([0.0, *ends]):
+        there = f[:, np.argmin(np.abs(x - place))]
+        np.testing.assert_allclose(rows["k"][:, node], there**2 / (2 * p * G), rtol=1e-3)
 
 
-def test_gradients_of_all_extensions_against_finite_differences():
-    names = ("m_joint", "k_hinge", "kGA", "rhoI", "k_joint")
-    start = {"m_joint": 2.0, "k_hinge": 3e4, "kGA": 2e7, "rhoI": 2e-3, "k_joint": 1e6}
+@pytest.mark.full
+def test_gradients_of_a_shaft_with_shear_and_rotary_inertia():
+    """Forwards here, backwards in the fixture."""
+    arguments = ARGUMENTS | {"kGA": jnp.array([4e7, 2e7, 3e7]), "rhoI": jnp.array([2e-3, 1e-3, 3e-3])}
+    rows, p = jax.jit(jax.jacfwd(twice, has_aux=True))(arguments)
+    results = np.asarray(p), {name: np.asarray(row) for name, row in rows.items()}
+    check_identities(*results, arguments)
+    check_differences(*results, arguments)
 
-    def first(scales: jax.Array) -> jax.Array:
-        values = {name: start[name] * jnp.exp(scales[i]) for i, name in enumerate(names)}
-        return jnp.log(angular_frequencies(shaft(PAPER | values), 3))
 
-    gradient = np.asarray(jax.jit(jax.jacfwd(first))(jnp.zeros(5)))
-    run, h = jax.jit(first), 1e-3
-    for i in range(5):
-        v = [np.asarray(run(jnp.zeros(5).at[i].set(multiple * h))) for multiple in (-2, -1, 1, 2)]
-        np.testing.assert_allclose(gradient[:, i], (v[0] - 8 * v[1] + 8 * v[2] - v[3]) / (12 * h), atol=3e-12)
+def test_gradients_of_parts_that_are_independent():
+    """Hinged spans over rigid supports, each with its own p = pi^2 sqrt(EI): no part hides another."""
+
+    def both(EI: jax.Array) -> tuple[jax.Array, jax.Array]:
+        spans = Shaft(jnp.ones(3), EI, jnp.ones(3), jnp.full(4, jnp.inf), None, jnp.zeros(2))
+        p = angular_frequencies(spans, 3)
+        return p, (p, relative_error(spans.arrays(), find_roots(spans.arrays(), 3)))
+
+    derivative = jax.jit(jax.jacrev(both, has_aux=True))
+    rows, (p, error) = derivative(jnp.array([4.0, 1.0, 2.0]))
+    np.testing.assert_allclose(p, np.pi**2 * np.sqrt([1, 2, 4]), rtol=4e-15)
+    np.testing.assert_allclose(rows, np.diag(np.pi**2 / np.sqrt([4, 8, 16]))[:, [2, 0, 1]], atol=1e-12)
+    assert np.all(np.asarray(error) < 1e-14)
+    assert np.isnan(np.asarray(derivative(jnp.array([1.0, 1.0, 2.0]))[0])[:2]).all()
 
 
 def test_separation_margin():

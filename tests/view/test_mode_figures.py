@@ -71,6 +71,11 @@ def test_one_gear_for_every_frequency():
     assert any("1 higher frequencies not drawn" in text.get_text() for text in figure.texts)
 
 
+def test_the_caption_says_which_angle_varies():
+    swept = crossing().rename(k_p="planet_angle[1]")
+    assert "planet_angle = [0, varies, 4] rad" in [text.get_text() for text in plot(swept).texts]
+
+
 def test_displacements_are_scaled_together():
     central, planets = displacements([0.0] * 9 + [1.0, 0.0, -2.0] + [0.5] * 3)
     assert (central == 0).all()
