@@ -299,9 +299,8 @@ def _path_axis(
     if name in names and zipped:
         raise InputError(f"points.{name}: {analysis.name} follows it as a path; allowed is an axis or a fixed value")
     if name is not None and name not in names and not isinstance(fixed.get(name), (int, float)):
-        raise InputError(
-            f"options: {name!r} is not an axis of the scene; allowed is one of {', '.join(names) or 'none'}"
-        )
+        allowed = f"allowed is one of {', '.join(names)}" if names else "the scene has no axes"
+        raise InputError(f"options: {name!r} is not an axis of the scene; {allowed}")
     return name
 
 
