@@ -71,7 +71,9 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
     command = _command(commands, "plot", _plot, "draw the figure that suits a result")
-    command.add_argument("files", metavar="FILE.nc", type=Path, nargs="+", help="several methods of one analysis overlay")
+    command.add_argument(
+        "files", metavar="FILE.nc", type=Path, nargs="+", help="several methods of one analysis overlay"
+    )
     command.add_argument("--out", required=True, metavar="FIGURE", type=Path, help="figure to write (.png, .pdf, .svg)")
 
     command = _command(commands, "point", _point, "compute one point")

@@ -16,6 +16,7 @@ _ANALYSES = {
     "parameters": "parameters",
     "modes": "modes",
     "steady_state": "steady_state",
+    "basins": "basins",
     "critical_speeds": "critical_speeds",
 }
 

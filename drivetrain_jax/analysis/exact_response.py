@@ -15,7 +15,8 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis._base import Outcome
-from drivetrain_jax.analysis.attractor import MOST_PERIODS, Attractors, attractors, take
+from drivetrain_jax.analysis.attractor import Attractors, attractors, take
+from drivetrain_jax.analysis.attractor_lanes import MOST_PERIODS
 from drivetrain_jax.analysis.motion import REGIMES, regime
 from drivetrain_jax.analysis.orbit_measures import Measures, measure
 from drivetrain_jax.analysis.plane_map import spectral_radius
@@ -26,8 +27,9 @@ NON_PERIODIC = REGIMES.index("non_periodic")
 INTEGRALS = frozenset(("u_mean", "u_rms", "phase"))
 # Growth of a tangent (its logarithm) that only chaos explains: shear alone gives the logarithm of the time.
 _WILD = 20.0
-# Lanes that are worked on at a time: enough to fill the vector units, few enough to stay in the cache.
-WIDTH = 256
+# Lanes that are worked on at a time: enough to fill the vector units, few enough to wait little for the slowest. Sweeps
+# are long jobs of very different length.
+WIDTH, _SWEEP_WIDTH = 64, 32
 
 
 def describe(
@@ -127,7 +129,7 @@ def sweeps(
     up = np.arange(length * lanes, dtype=np.int32).reshape(length, lanes).T
     route = np.concatenate([up, up[:, ::-1]])
     rest = jnp.zeros(2 * lanes)
-    found = attractors(points, jnp.asarray(route), rest, rest, most_periods=most_periods, width=WIDTH)
+    found = attractors(points, jnp.asarray(route), rest, rest, most_periods=most_periods, width=_SWEEP_WIDTH)
     flat = jax.tree.map(lambda x: x.reshape(-1), found)
     results = describe(take(points, jnp.asarray(route.reshape(-1))), flat, rtol=rtol, integrals=integrals)
 

@@ -20,8 +20,8 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis import closed_form_response, exact_response, harmonic_response
-from drivetrain_jax.analysis._base import RTOL, Analysis, Request, Solver
+from drivetrain_jax.analysis import closed_form_response, exact_branch, exact_response, harmonic_response
+from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.harmonic_balance import Basis
 from drivetrain_jax.analysis.motion import REGIMES, STABILITY
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System
@@ -46,6 +46,7 @@ VARIABLES = (
     Variable("peak_amplitude", "m", "largest amplitude of the fundamental over all frequencies"),
     Variable("peak_frequency", "rad/s", "frequency of the largest amplitude"),
     Variable("fold_frequency", "rad/s", "frequencies at which branches end, rising", ("fold",)),
+    Variable("doubling_frequency", "rad/s", "frequencies at which periods double, rising", ("doubling",)),
     Variable("backbone_amplitude", "m", "amplitude of the free undamped motion of this frequency"),
     Variable("fit_range", "m", "range R of the cubic fitted to the spring"),
 )
@@ -72,11 +73,15 @@ _CLOSED = ("multiple_scales", "describing_function")
 _APPROXIMATE = ("harmonic_balance", *_CLOSED)
 _ONLY = {
     **dict.fromkeys(("period_multiple", "state_error"), ("exact",)),
-    **dict.fromkeys(("residual", "branch_u_max", "branch_u_min", "branch_stability"), _APPROXIMATE),
-    **dict.fromkeys(("peak_amplitude", "peak_frequency", "fold_frequency", "backbone_amplitude"), _CLOSED),
+    "doubling_frequency": ("exact",),
+    "residual": _APPROXIMATE,
+    "fold_frequency": ("exact", *_CLOSED),
+    **dict.fromkeys(("peak_amplitude", "peak_frequency", "backbone_amplitude"), _CLOSED),
     "fit_range": ("multiple_scales",),
 }
-_CHUNK = 64
+_SPECIAL = frozenset(("fold_frequency", "doubling_frequency"))
+# Lines of a chunk: of a map of 200 lines, as many for either of two cores.
+_CHUNK = 50
 
 
 def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
@@ -87,10 +92,12 @@ def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> t
             methods = ", ".join(_ONLY[name])
             raise InputError(f"outputs: method {request.method} does not give {name}; allowed for it is {methods}")
     branches = closed_form_response.BRANCHES.get(request.method, harmonic_response.BRANCHES)
+    folds = exact_branch.SPECIAL if request.method == "exact" else closed_form_response.FOLDS
     return (
         Dimension("sweep_direction", "direction of the sweep", ("up", "down")),
         Dimension("branch", "number of the motion, by rising amplitude", tuple(range(1, branches + 1))),
-        Dimension("fold", "number of the fold", tuple(range(1, closed_form_response.FOLDS + 1))),
+        Dimension("fold", "number of the fold", tuple(range(1, folds + 1))),
+        Dimension("doubling", "number of the period doubling", tuple(range(1, exact_branch.SPECIAL + 1))),
     )
 
 
@@ -117,16 +124,37 @@ def _solve(
 
 def _exact(model: PiecewiseLinearOscillator, request: Request) -> dict[str, Array]:
     """The frequencies in rising order, and back to that of the path."""
-    omega = np.asarray(model.omega)
-    rising, place = np.unique(omega, return_inverse=True)
+    rising, place = np.unique(np.asarray(model.omega), return_inverse=True)
     found = exact_response.sweeps(
         replace(model, omega=rising),
         most_periods=request.options["most_periods"],
         rtol=request.options["rtol"],
         integrals=not exact_response.INTEGRALS.isdisjoint(request.outputs),
     )
+    outcome = exact_response.worst(found["outcome"])
+    special = not _SPECIAL.isdisjoint(request.outputs)
+    if special or any(name.startswith("branch_") for name in request.outputs):
+        results, complete = _exact_branch(model, rising, found, special)
+        found |= results
+        outcome = jnp.where(~complete & (outcome == Outcome.SUCCESS), Outcome.TOLERANCE_NOT_MET, outcome)
     results = {name: found[name][place] for name in request.outputs}
-    return results | {"outcome": exact_response.worst(found["outcome"])[place]}
+    return results | {"outcome": outcome[place].astype(jnp.int8)}
+
+
+def _exact_branch(
+    model: PiecewiseLinearOscillator, rising: np.ndarray, found: dict[str, Array], special: bool
+) -> tuple[dict[str, Array], Array]:
+    """The branch through the first motion of period one that the sweep up has met, and whether it is complete."""
+    shape = _shape(model)
+    lanes = int(np.prod(shape, dtype=int))
+    single = found["period_multiple"][:, 0].reshape(-1, lanes) == 1
+    first = jnp.argmax(single, axis=0)
+    state = found["orbit_state"][:, 0].reshape(-1, 2, lanes)
+    state = jnp.take_along_axis(state, first[None, None], axis=0)[0]
+    x = jnp.concatenate([state, jnp.asarray(rising)[first][None]])
+    x = jnp.where(jnp.any(single, axis=0), x, jnp.nan)
+    results, complete = exact_branch.branch(model, rising, x, special=special, width=exact_response.WIDTH)
+    return {name: value.reshape(*value.shape[:2], *shape) for name, value in results.items()}, complete.reshape(shape)
 
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax.analysis.amplitude_roots import sign_changes
+from drivetrain_jax.analysis.branch_sections import Course, sections
 from drivetrain_jax.analysis.harmonic_balance import Basis, balance, contact, jacobian, residual
 from drivetrain_jax.analysis.linear_algebra import solve
 from drivetrain_jax.systems import PiecewiseLinearOscillator
@@ -128,22 +128,14 @@ def trace(model: PiecewiseLinearOscillator, basis: Basis, x: Array, start: float
 
 
 def at_frequency(
-    model: PiecewiseLinearOscillator, basis: Basis, branch: Branch, omega: Array, count: int
+    model: PiecewiseLinearOscillator, basis: Basis, branch: Course, omega: Array, count: int
 ) -> tuple[Array, Array]:
     """Up to ``count`` motions of the branch at ``omega``, in its order, balanced: ``(count, n, ...)`` and which exist."""
-    above = branch.omega > omega
-    mask = sign_changes(above, count) & jnp.isfinite(branch.omega[1:])
-    exists = jnp.any(mask, axis=1)
-    place = jnp.argmax(mask, axis=1)
-    ends = [jnp.take_along_axis(branch.omega, place + shift, axis=0) for shift in (0, 1)]
-    motions = [jnp.take_along_axis(branch.x, (place + shift)[:, None], axis=0) for shift in (0, 1)]
-    part = (omega - ends[0]) / jnp.where(ends[1] != ends[0], ends[1] - ends[0], 1.0)
-    guess = motions[0] + part[:, None] * (motions[1] - motions[0])
-    guess = jnp.where(exists[:, None], guess, 0.0)
+    guess, exists = sections(branch, omega, count)
 
     def improved(x: Array) -> tuple[Array, Array]:
         found = balance(model, basis, x, omega + jnp.zeros(x.shape[1:]), _POLISH)
         return found.x, found.converged
 
-    found, converged = jax.lax.map(improved, guess)
+    found, converged = jax.lax.map(improved, guess[:, :-1])
     return found, exists & converged

@@ -14,6 +14,7 @@ from jax import Array
 
 from drivetrain_jax.analysis._base import Outcome
 from drivetrain_jax.analysis.amplitude_roots import refined
+from drivetrain_jax.analysis.branch_sections import course
 from drivetrain_jax.analysis.harmonic_balance import Basis, balance, contact
 from drivetrain_jax.analysis.harmonic_branch import Branch, at_frequency, trace
 from drivetrain_jax.analysis.harmonic_stability import half_trace, spectral_radius
@@ -142,8 +143,12 @@ def _branches(
     scale = jnp.where(scale > 0, scale, 1.0)
     curve: Branch = trace(model, basis, jnp.where(begun.converged, begun.x, jnp.nan), start, stop, scale)
 
+    width = jnp.full((1, *lanes), stop - start)
+    units = jnp.concatenate([jnp.broadcast_to(scale, (basis.size, *lanes)), width])
+    along = course(jnp.concatenate([curve.x, curve.omega[:, None]], axis=1), units)
+
     def at(frequency: Array) -> tuple[Array, Array, Array]:
-        x, exists = at_frequency(model, basis, curve, frequency, BRANCHES)
+        x, exists = at_frequency(model, basis, along, frequency, BRANCHES)
         wide = jnp.broadcast_to(frequency, lanes)
         found = jax.lax.map(lambda pair: describe(model, basis, pair[0], wide, pair[1]), (x, exists))
         order = jnp.argsort(found.u_max, axis=0)

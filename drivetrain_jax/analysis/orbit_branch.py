@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis.piecewise_march import march, prepare, start
@@ -23,13 +24,15 @@ from drivetrain_jax.systems import PiecewiseLinearOscillator
 _CORRECTIONS, _CONVERGED, _DIFFERENCE = 8, 1e-12, 1e-6
 # A step is shortened if it fails and lengthened if it takes few corrections.
 _SHORTER, _LONGER, _FEW = 0.4, 1.4, 4
+_SHORTEST, _CLOSED, _LEAST_COSINE = 1e-7, 1e-9, 0.8
 _MOST_STEPS = 100_000
-_ROOT_STEPS = 40
+# Locating a special point: most steps, and the last one as a part of the chord.
+_ROOT_STEPS, _LOCATED = 40, 1e-13
 
 
 class Branch(NamedTuple):
     """Points along a branch: ``x`` of shape ``(points, 3, N)`` and transition matrices over m periods, entries of
-    shape ``(points, N)``. Where the continuation has stopped, the rest is NaN."""
+    shape ``(points, N)``. After the last point of a lane they are NaN."""
 
     x: Array
     matrix: Matrix
@@ -114,47 +117,77 @@ def _tangent(solved: _Solved, before: Array, scale: Array) -> Array:
     return cross * jnp.where(jnp.sum(cross * before, axis=0) < 0, -1.0, 1.0)
 
 
+def scale_of(model: PiecewiseLinearOscillator, x: Array, highest: float = np.inf) -> Array:
+    """Units in which the branch through ``x`` is measured, ``(3, N)``: size of its state, that times omega, omega.
+
+    A branch up to the frequency ``highest`` is measured with the geometric mean of both, or it would take too many steps.
+    """
+    usual = jnp.sqrt(x[2] * highest) if np.isfinite(highest) else x[2]
+    size = jnp.abs(x[0]) + jnp.abs(x[1]) / x[2] + model.b
+    return jnp.stack([size, size * usual, usual])
+
+
+class _Front(NamedTuple):
+    """The last orbit, the tangent there, the length of the next step, and the number of the orbit on the branch."""
+
+    solved: _Solved
+    tangent: Array
+    length: Array
+    number: Array
+
+
 def follow(
     model: PiecewiseLinearOscillator,
     multiple: int,
     x: Array,
     *,
-    direction: float,
-    points: int,
+    direction: Array,
+    attempts: int,
     longest: float = 0.05,
-    scale: Array | None = None,
+    limits: tuple[float, float] = (0.0, np.inf),
 ) -> Branch:
     """The branch of orbits of ``multiple`` drive periods through ``x = (u, v, omega)``, shape ``(3, N)``.
 
-    ``x`` is a guess for the first point, which has its frequency; ``direction`` (+1, -1) is the way omega goes at
-    first. ``longest`` is the longest step, in units of ``scale``, shape ``(3, N)`` (default: size of the first state,
-    that times omega, omega).
+    ``x`` is a guess for the first point, which has its frequency; ``direction`` (+1, -1), a number or of shape
+    ``(N,)``, is the way omega goes at first. It ends beyond ``limits`` of omega and after ``attempts`` steps, good or
+    bad. ``longest`` is the longest step, in units of :func:`scale_of`.
     """
-    if scale is None:
-        size = jnp.abs(x[0]) + jnp.abs(x[1]) / x[2] + model.b
-        scale = jnp.stack([size, size * x[2], x[2]])
+    scale = scale_of(model, x, limits[1])
     rise = jnp.zeros_like(x).at[2].set(direction)
     first = _on_plane(model, multiple, x, rise, scale)
+    good = first.change <= _CLOSED
+    first = first._replace(x=jnp.where(good, first.x.at[2].set(x[2]), jnp.nan))
+    lanes = jnp.arange(x.shape[1])
+    empty = jnp.full((attempts, 7, x.shape[1]), jnp.nan)
+    store = empty.at[0].set(jnp.concatenate([first.x, jnp.stack(first.matrix)]))
 
-    def step(carry: tuple[_Solved, Array, Array], _: None) -> tuple[tuple, tuple[Array, Matrix]]:
-        here, tangent, length = carry
-        there = _on_plane(model, multiple, here.x + length * tangent * scale, tangent, scale)
+    def step(state: tuple[Array, _Front, Array]) -> tuple[Array, _Front, Array]:
+        count, front, store = state
+        here, tangent = front.solved, front.tangent
+        there = _on_plane(model, multiple, here.x + front.length * tangent * scale, tangent, scale)
         turned = _tangent(there, tangent, scale)
-        good = (there.change <= 1e-9) & (jnp.sum(turned * tangent, axis=0) > 0.8) & (there.x[2] > 0)
-        few = there.corrections <= _FEW
-        longer = jnp.minimum(jnp.where(few, _LONGER, 1.0) * length, longest)
-        length = jnp.where(good, longer, _SHORTER * length)
-        here = jax.tree.map(lambda new, old: jnp.where(good, new, old), there, here)
-        tangent = jnp.where(good, turned, tangent)
-        shown = jax.tree.map(lambda v: jnp.where(good, v, jnp.nan), (here.x, here.matrix))
-        return (here, tangent, length), shown
+        good = (there.change <= _CLOSED) & (jnp.sum(turned * tangent, axis=0) > _LEAST_COSINE) & (there.x[2] > 0)
+        longer = jnp.minimum(jnp.where(there.corrections <= _FEW, _LONGER, 1.0) * front.length, longest)
+        moved = good & going(front)
+        after = _Front(
+            jax.tree.map(lambda new, old: jnp.where(moved, new, old), there, here),
+            jnp.where(moved, turned, tangent),
+            jnp.where(good, longer, _SHORTER * front.length),
+            front.number + moved,
+        )
+        row = jnp.concatenate([after.solved.x, jnp.stack(after.solved.matrix)])
+        return count + 1, after, store.at[after.number, :, lanes].set(row.T)
 
-    begin = (first, _tangent(first, rise, scale), jnp.full(x.shape[1:], longest))
-    _, (rest, matrices) = jax.lax.scan(step, begin, None, length=points - 1)
-    return Branch(
-        jnp.concatenate([first.x[None], rest]),
-        tuple(jnp.concatenate([a[None], b]) for a, b in zip(first.matrix, matrices, strict=True)),
-    )
+    def going(front: _Front) -> Array:
+        omega = front.solved.x[2]
+        return (omega >= limits[0]) & (omega <= limits[1]) & (front.length > _SHORTEST)
+
+    def unfinished(state: tuple[Array, _Front, Array]) -> Array:
+        return (state[0] < attempts) & jnp.any(going(state[1]))
+
+    begin = _Front(first, _tangent(first, rise, scale), jnp.full(lanes.shape, longest), jnp.zeros_like(lanes))
+    *_, store = jax.lax.while_loop(unfinished, step, (jnp.asarray(1), begin, store))
+    return Branch(store[:, :3], tuple(store[:, 3 + k] for k in range(4)))
 
 
 def fold_test(matrix: Matrix) -> Array:
@@ -168,30 +201,34 @@ def doubling_test(matrix: Matrix) -> Array:
 
 
 def locate(
-    model: PiecewiseLinearOscillator, multiple: int, ends: tuple[Array, Array], test: str
-) -> tuple[Array, Matrix]:
-    """The fold (``test = "fold"``) or period doubling (``"doubling"``) between two points of a branch.
+    model: PiecewiseLinearOscillator,
+    multiple: int,
+    ends: tuple[Array, Array],
+    tests: tuple[Array, Array],
+    doubling: Array,
+) -> Array:
+    """``x`` at the folds or (where ``doubling``) period doublings between two points of a branch each.
 
-    ``ends``: x before and after, shape ``(3, N)`` each, between which the test changes sign. By the Illinois variant
-    of the secant method on planes across the chord.
+    ``ends``: x before and after, shape ``(3, N)`` each, between which the test changes sign; ``tests``: its values
+    there. By the Illinois variant of the secant method on planes across the chord; NaN where the ends are.
     """
-    function = {"fold": fold_test, "doubling": doubling_test}[test]
     chord = ends[1] - ends[0]
     scale = jnp.abs(ends[0]) + jnp.abs(ends[1])
     normal = chord / scale
 
-    def at(part: Array) -> tuple[Array, Array, Matrix]:
-        solved = _on_plane(model, multiple, ends[0] + part * chord, normal, scale)
-        return function(solved.matrix), solved.x, solved.matrix
-
-    def narrow(_: Array, state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-        a, fa, b, fb = state
+    def narrow(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        count, a, fa, b, fb, _, _ = state
         part = jnp.where(fb == fa, (a + b) / 2, b - fb * (b - a) / jnp.where(fb == fa, 1.0, fb - fa))
-        f, _, _ = at(part)
+        solved = _on_plane(model, multiple, ends[0] + part * chord, normal, scale)
+        f = jnp.where(doubling, doubling_test(solved.matrix), fold_test(solved.matrix))
         opposite = f * fb < 0
-        return jnp.where(opposite, b, a), jnp.where(opposite, fb, fa / 2), part, f
+        settled = jnp.abs(part - b) <= _LOCATED
+        bracket = (jnp.where(opposite, b, a), jnp.where(opposite, fb, fa / 2), part, f)
+        return count + 1, *bracket, solved.x, settled
 
-    zero, one = jnp.zeros(chord.shape[1]), jnp.ones(chord.shape[1])
-    *_, part, _ = jax.lax.fori_loop(0, _ROOT_STEPS, narrow, (zero, at(zero)[0], one, at(one)[0]))
-    _, x, matrix = at(part)
-    return x, matrix
+    def unfinished(state: tuple[Array, ...]) -> Array:
+        return (state[0] < _ROOT_STEPS) & jnp.any(~state[-1] & jnp.isfinite(state[2] + state[4]))
+
+    zero, lanes = jnp.zeros(chord.shape[1]), jnp.zeros(chord.shape[1], bool)
+    state = (jnp.asarray(0), zero, tests[0], zero + 1, tests[1], ends[0] + jnp.nan, lanes)
+    return jax.lax.while_loop(unfinished, narrow, state)[5]

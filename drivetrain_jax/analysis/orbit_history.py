@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax.analysis.attractor import MOST_PERIODS
+from drivetrain_jax.analysis.attractor_lanes import MOST_PERIODS
 from drivetrain_jax.analysis.piecewise_march import Motion, advance, locate, next_step, prepare, start
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.attractor import MOST_PERIODS, take
+from drivetrain_jax.analysis.attractor import take
+from drivetrain_jax.analysis.attractor_lanes import MOST_PERIODS
 from drivetrain_jax.analysis.piecewise_flow import Bound, certain_span, responses, sine_cosine
 from drivetrain_jax.analysis.piecewise_march import (
     Derivatives,

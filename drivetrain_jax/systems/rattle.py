@@ -7,8 +7,9 @@ be corrected.
 ``u = r_x theta_x - r_y theta_y`` is the relative displacement along the line of action, ``I = I_x I_y/(I_x r_y^2 +
 I_y r_x^2)`` the equivalent mass, and ``B0 + B1 cos(omega t) = M_x r_x/I_x + M_y r_y/I_y`` an acceleration:
 ``u'' + (c/I) u' + (k/I) f_s(u) = B0 + B1 cos(omega t)`` with the spring of
-:class:`~drivetrain_jax.systems.PiecewiseLinearOscillator`. The paper takes u as an angle and b in radians; any
-consistent units of length will do, as the equation is homogeneous in them.
+:class:`~drivetrain_jax.systems.PiecewiseLinearOscillator`. With r in m, u and b are lengths, k, c
+and I the stiffness, damping and mass along the line of action. Table 1 gives b as 10 deg, read as the number pi/18: the
+equation is homogeneous in u, b, B0 and B1, so that any unit of length will do.
 """
 
 from __future__ import annotations
@@ -75,6 +76,7 @@ SYSTEM = System(
     models={
         "frequency_response": Model(oscillator, NAMES),
         "steady_state": Model(oscillator, (*NAMES, "u0", "v0")),
+        "basins": Model(oscillator, NAMES),
     },
     presets=PRESETS,
     resonances=Resonances(

@@ -21,6 +21,7 @@ _MODULES = {
     "modes": "modes",
     "frequency_response": "frequency_response",
     "steady_state": "steady_state",
+    "basins": "basins",
     "critical_speeds": "critical_speeds",
 }
 # Several results of these analyses may share a figure.
@@ -30,12 +31,12 @@ __all__ = ["plot"]
 
 
 def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
-    """The figure that suits the analysis of ``dataset`` (attribute ``analysis``).
+    """The figure that suits the analysis of ``dataset`` (attribute ``analysis``), for example a stability chart.
 
-    ``floquet`` gives a stability chart, ``forced`` amplitudes of the periodic response, ``frequency_response`` the
-    response over the frequency, with that of ``others`` (the same analysis by other methods) in the same axes. The
-    figure belongs to no window: write it with ``figure.savefig(path)``. Raises :class:`InputError` for an analysis
-    without a figure, for a result in which there is nothing to plot and for results that cannot share a figure.
+    ``others`` are results of the same analysis by other methods, drawn into the same axes where that makes sense
+    (``frequency_response``). The figure belongs to no window: write it with ``figure.savefig(path)``. Raises
+    :class:`InputError` for an analysis without a figure, for a result in which there is nothing to plot and for results
+    that cannot share a figure.
     """
     analysis = dataset.attrs.get("analysis")
     if analysis not in _MODULES:

@@ -45,6 +45,8 @@ def _curves(dataset: xr.Dataset, name: str, shown: list[str]) -> Figure:
         variable = dataset[key].where(dataset["outcome"] < cells.FIRST_FAILURE).transpose(name, ...)
         axes.plot(dataset[name], variable.values.reshape(dataset.sizes[name], -1), color=LINE_COLOURS[0])
         axes.margins(x=0)
+        # Few digits: the label stands at a fixed distance.
+        axes.locator_params(axis="y", nbins=4)
         panels.label_row(axes, variable_label(variable))
     panels.label_axes(axis_label(dataset[name]))
     panels.titles(dataset)

@@ -23,7 +23,8 @@ _HEIGHT = 2.6
 
 
 def plot(dataset: xr.Dataset) -> Figure:
-    """The section with all its strobes and with the first 1000 alone, a row for each of up to six values of one axis.
+    """The section with all its strobes and, of more than 1000, with the first 1000 alone; a row for each of up to six
+    values of one axis.
 
     Raises :class:`InputError` for more axes or values, and unless ``section`` is stored.
     """
@@ -36,7 +37,8 @@ def plot(dataset: xr.Dataset) -> Figure:
             raise InputError(f"axes = {', '.join(names)}: allowed is one axis of up to {_MOST_ROWS} values")
         parts = [dataset.isel({names[0]: k}) for k in range(dataset.sizes[names[0]])] if names else [dataset]
         margins = Margins(left=0.95, right=0.35, between_rows=0.55, between_columns=0.35)
-        panels = Panels(len(parts), 2, height=_HEIGHT, margins=margins, share_y=False)
+        columns = 2 if dataset.sizes["strobe"] > _FIRST else 1
+        panels = Panels(len(parts), columns, height=_HEIGHT, margins=margins, share_y=False)
         for row, part in zip(panels.axes, parts, strict=True):
             _draw_row(row, part, names[0] if names else None)
         panels.label_axes("twist at the strobes [rad]", "rate of twist at the strobes [rad/s]")
@@ -46,8 +48,9 @@ def plot(dataset: xr.Dataset) -> Figure:
 
 def _draw_row(row: list[Axes], part: xr.Dataset, name: str | None) -> None:
     points = part["section"].values
-    row[1].sharey(row[0])
-    for axes, shown in zip(row, (points, points[:_FIRST]), strict=True):
+    for axes in row[1:]:
+        axes.sharey(row[0])
+    for axes, shown in zip(row, (points, points[:_FIRST])[: len(row)], strict=True):
         size = 0.6 if len(shown) > 2 * _FIRST else 1.5
         axes.scatter(shown[:, 0], shown[:, 1], s=size, color=LINE_COLOURS[0], linewidths=0, rasterized=True)
         axes.text(0.98, 0.97, f"{len(shown)} strobes", transform=axes.transAxes, ha="right", va="top", size=7.5)
@@ -59,7 +62,7 @@ def _draw_row(row: list[Axes], part: xr.Dataset, name: str | None) -> None:
         notes.append(f"distinct points: {part['distinct_points'].item()}")
     row[0].text(0.0, 1.08, "; ".join(notes), transform=row[0].transAxes, color=FRAME_GREY, size=7.5)
     # Both panels have the same multiplier: written once, clear of the label between them.
-    row[0].xaxis.get_offset_text().set_visible(False)
+    row[0].xaxis.get_offset_text().set_visible(len(row) == 1)
     twist = np.nanmax(np.abs(points[:, 0]), initial=0.0)
     for which, values, least in zip("xy", points.T, (0.0, 1e-3 * _RATE * twist), strict=True):
         _widen(row[0], which, values[np.isfinite(values)], least)

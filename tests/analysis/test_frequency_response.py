@@ -26,15 +26,49 @@ def run(method: str, omegas=OMEGAS, outputs=("u_max", "u_min", "regime"), **opti
     )
 
 
-def test_exact_sweeps_meet_the_reference():
-    exact = run("exact")
+LINE = sorted([*np.linspace(0.163, 2.0, 40).tolist(), 0.187, 0.24, 0.755, 0.873, *OMEGAS])
+BRANCH = ("branch_u_max", "branch_u_min", "branch_stability", "fold_frequency", "doubling_frequency")
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return run("exact", LINE, ("u_max", "u_min", "regime", *BRANCH))
+
+
+def test_exact_sweeps_meet_the_reference(exact):
     for name, omega, direction in (
         ("T1 w.8 high", 0.8, "up"), ("T1 w.8 low", 0.8, "down"), ("T1 w.7 double-sided", 0.7, "up"),
+        ("T1 w.87 high (near fold)", 0.873, "up"),
     ):  # fmt: skip
         at = exact.sel(omega=omega, sweep_direction=direction)
+        assert STEADY[name]["params"]["omega"] == omega
         assert float(at.u_max) == pytest.approx(STEADY[name]["max"], abs=1e-9)
         assert float(at.u_min) == pytest.approx(STEADY[name]["min"], abs=1e-9)
     assert (exact.outcome == 0).all()
+
+
+def test_folds_and_period_doublings_of_the_branch(exact):
+    """Those of the reference, which are all there are on the branch within the line."""
+    for output, kind in (("fold_frequency", "fold"), ("doubling_frequency", "PD")):
+        expected = sorted(s["omega"] for s in REFERENCE["specials"]["table1"] if s["type"] == kind)
+        found = exact[output].values
+        np.testing.assert_allclose(found[:, : len(expected)], np.tile(expected, (len(LINE), 1)), rtol=0, atol=1e-12)
+        assert np.isnan(found[:, len(expected) :]).all()
+
+
+def test_the_exact_branch_has_the_saddles_between_folds(exact):
+    omega = exact.omega.values
+    folds = exact.fold_frequency.values[0, :6].reshape(3, 2)
+    between = np.any([(low < omega) & (omega < high) for low, high in folds], axis=0)
+    np.testing.assert_array_equal(np.isfinite(exact.branch_u_max).sum("branch"), np.where(between, 3, 1))
+    near = exact.sel(omega=[0.755, 0.873])
+    assert near.branch_stability.values[:, :4].tolist() == [[0, 1, 0, 2], [0, 1, 0, 2]]
+    up, down = (near[name].sel(sweep_direction="up") for name in ("u_max", "u_min"))
+    np.testing.assert_allclose(near.branch_u_max.sel(branch=3), up, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(near.branch_u_min.sel(branch=3), down, rtol=0, atol=1e-12)
+    # Where the period has doubled, the simple orbit is unstable and the sweep is elsewhere.
+    doubled = (omega > 1.2425788605) & (omega < 1.9590767455)
+    assert (exact.branch_stability.values[doubled, 0] == 1).all()
 
 
 def test_order_of_the_path_does_not_matter():
@@ -54,7 +88,7 @@ def test_a_range_that_is_given_is_kept():
 @pytest.mark.parametrize(
     ("method", "output", "allowed"),
     [
-        ("exact", "fold_frequency", "multiple_scales, describing_function"),
+        ("exact", "peak_frequency", "multiple_scales, describing_function"),
         ("harmonic_balance", "fit_range", "multiple_scales"),
         ("describing_function", "period_multiple", "exact"),
     ],

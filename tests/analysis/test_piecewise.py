@@ -101,7 +101,7 @@ def random_against_oracle(count, seed):
 
 
 def test_random_cases_against_the_event_solver():
-    error = random_against_oracle(150, seed=0)
+    error = random_against_oracle(200, seed=0)
     assert np.median(error) < 1e-14 and error.max() < 1e-10
 
 

@@ -1,7 +1,6 @@
 """Attractors, their measures, and the branches and special points of exact orbits, against the reference values."""
 
 import json
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -11,7 +10,6 @@ import pytest
 
 from drivetrain_jax.analysis import Outcome, Request, get_analysis
 from drivetrain_jax.analysis.exact_response import sweeps
-from drivetrain_jax.analysis.orbit_branch import doubling_test, fold_test, follow, locate
 from drivetrain_jax.analysis.piecewise_march import march, prepare, start
 from drivetrain_jax.systems import get_system
 from drivetrain_jax.systems.rattle import PRESETS, oscillator
@@ -137,19 +135,28 @@ def test_sweeps_jump_where_the_folds_are():
     assert swing[peak, 0] == pytest.approx(1.388317, abs=2e-4) and omega[peak] == pytest.approx(0.8717, abs=2e-3)
 
 
-def test_folds_and_period_doublings_of_the_branch():
-    model = oscillator(TABLE1 | {"omega": 1.0})
-    begin = jnp.array([[0.175188], [0.00034], [2.5]])
-    branch = jax.jit(partial(follow, model, 1, direction=-1.0, points=300, longest=0.03))(begin)
-    known = np.isfinite(np.asarray(branch.x[:, 2, 0]))
-    x, matrix = np.asarray(branch.x)[known], [np.asarray(entry)[known] for entry in branch.matrix]
-    found = []
-    for kind, test in (("fold", fold_test), ("doubling", doubling_test)):
-        sign = np.sign(np.asarray(test(matrix))[:, 0])
-        finder = jax.jit(partial(locate, model, 1, test=kind))
-        found += [float(finder((x[i], x[i + 1]))[0][2, 0]) for i in np.flatnonzero(sign[1:] != sign[:-1])]
-    expected = sorted(point["omega"] for point in REFERENCE["specials"]["table1"])
-    np.testing.assert_allclose(sorted(found), expected, atol=1e-12)
-    # The saddle between the folds is unstable, and on the branch.
-    between = (x[:, 2, 0] > 0.76) & (x[:, 2, 0] < 0.87)
-    assert np.any(fold_test([entry[between] for entry in matrix]) < 0)
+def test_a_motion_beside_a_period_doubling_is_hastened_and_found(steady):
+    """A doubled period just after it has doubled: left alone, the motion has not arrived after 2,000 periods."""
+    found = steady([TABLE1 | {"omega": 0.1 + 15 * 2.4 / 159, "B1": 0.0005 + 50 * 0.0995 / 79}])
+    assert found["outcome"][0] <= Outcome.TOLERANCE_NOT_MET and found["period_multiple"][0] > 0
+    assert 0.98 < found["spectral_radius"][0] < 1
+
+
+def test_initial_states_lead_where_the_motion_goes(steady):
+    """Beside the fold at .75385 the basin of the low motion is small: against the motions, run for 400 periods."""
+    place = np.linspace(-0.9, 0.9, 8)
+    cases = [TABLE1 | {"omega": 0.76, "u0": float(u), "v0": float(v)} for u in place for v in place]
+    found = steady(cases)
+    table = {name: jnp.array([case[name] for case in cases]) for name in NAMES}
+
+    def end(values):
+        lanes = prepare(oscillator(values))
+        return march(lanes, start(lanes, values["u0"], values["v0"], jnp.full(64, 400, jnp.int32)), 100_000).u
+
+    np.testing.assert_allclose(found["orbit_state"][0], jax.jit(end)(table), rtol=0, atol=1e-5)
+
+
+def test_an_undamped_drive_at_resonance_has_no_value(steady):
+    found = steady([TABLE1 | {"c": 0.0, "omega": 1.0}, TABLE1 | {"c": 0.0, "omega": 0.5}, TABLE1 | {"omega": 0.7}])
+    assert np.all(found["outcome"][:2] == Outcome.NOT_FINITE) and np.isnan(found["u_max"][:2]).all()
+    assert found["outcome"][2] == Outcome.SUCCESS
