@@ -12,6 +12,7 @@ import numpy as np
 
 import drivetrain_jax as dt
 from benchmarks import tripod_reference as oracle
+from benchmarks.validation import tripod_chaos
 from benchmarks.validation.document import Page, markdown
 
 NINE_DEGREES = math.radians(9)
@@ -209,5 +210,5 @@ def page(full: bool) -> Page:
         "Validation of the double-tripod driveshaft",
         "Bugaru & Vasile 2022 against this package; the reconstructed equations are in "
         "[theory/tripod.md](../theory/tripod.md).",
-        sections,
+        (*sections, *tripod_chaos.sections(full)),
     )

@@ -114,11 +114,12 @@ class Sampling(NamedTuple):
 
 
 def sample(flow: Flow, steps: int, record: Record, spectrum: Spectrum, k01_for: Array) -> Sampling:
-    """Follow the motion for ``SAMPLES`` strobes; K only if a member of ``k01_for`` needs it, otherwise 0."""
+    """Follow the motion for ``SAMPLES`` strobes; K of the members of ``k01_for``, otherwise 0."""
     states, _ = sampled(flow, steps, record.state, record.strobe, SAMPLES)
     watched = [i for i in range(flow.size) if i not in (*flow.phases, *flow.cyclic)] or [0]
     section = states[:, jnp.array(watched)]
     k01 = jax.lax.cond(jnp.any(k01_for), largest_k01, lambda x: jnp.zeros(x.shape[2:]), section)
+    k01 = jnp.where(k01_for, k01, 0.0)
     duration = (record.strobe + SAMPLES // 2) * flow.period
     left = 10 * jnp.exp(jnp.minimum(spectrum.values[0], 0.0) * duration)
     decayed = left < _UNSETTLED
@@ -160,8 +161,10 @@ def analyse(flow: Flow, request: Request) -> dict[str, Array]:
     residual = sum_rule_residual(run.fine, spectrum)
     results |= _of_spectrum(run, spectrum, residual)
     if wanted & _SECTION:
-        positive = spectrum.values[0] > STANDARD_ERRORS * spectrum.errors[0]
-        seen = sample(flow, steps, run.fine, spectrum, jnp.ones_like(positive) if "chaos_k01" in wanted else positive)
+        # What nothing forces is judged by K wherever it does not decay.
+        needed = spectrum.values[0] > STANDARD_ERRORS * spectrum.errors[0]
+        needed = jnp.ones_like(needed) if "chaos_k01" in wanted or not flow.turns else needed
+        seen = sample(flow, steps, run.fine, spectrum, needed)
         results["verdict"] = judge(evidence_of(flow, run, spectrum, residual, seen), autonomous=not flow.turns)
         results |= {"chaos_k01": seen.k01, "period_multiple": seen.multiple.astype(jnp.int32)}
     met = (target == 0) | ~run.fine.bounded | (jnp.max(spectrum.errors, axis=0) <= target)

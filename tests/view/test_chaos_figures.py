@@ -80,6 +80,10 @@ def test_all_strobes_and_the_first_thousand():
     assert counts == [3000, 1000]
 
 
+def test_a_short_section_is_drawn_once():
+    assert len(plot(section(1000, 1e-5)).axes) == 1
+
+
 def test_a_point_is_drawn_as_a_point():
     """Rounding errors are not blown up to the height of the panel."""
     axes = plot(section(300, 1e-17)).axes[0]

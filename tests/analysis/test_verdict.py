@@ -1,0 +1,65 @@
+"""The verdict's rule: every piece of evidence counts."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import pytest
+
+from drivetrain_jax.analysis.verdict import Evidence, Verdict, judge
+
+CHAOTIC = Evidence(
+    spectrum=jnp.array([1.0, -3.0]), error=jnp.array([0.1, 0.1]), coarse=jnp.array(1.0), coarse_error=jnp.array(0.1),
+    sum_residual=jnp.array(1e-6), k01=jnp.array(0.99), bounded=jnp.array(True), growing=jnp.array(False),
+    multiple=jnp.array(0), settled=jnp.array(True),
+)  # fmt: skip
+REGULAR = CHAOTIC._replace(spectrum=jnp.array([-1.0, -3.0]), k01=jnp.array(0.0))
+
+
+def verdict(evidence: Evidence, autonomous: bool = False, **changed: object) -> Verdict:
+    changed = {name: jnp.asarray(value) for name, value in changed.items()}
+    return Verdict(int(judge(evidence._replace(**changed), autonomous)))
+
+
+def test_all_evidence_together_is_chaos():
+    assert verdict(CHAOTIC) == Verdict.CHAOTIC
+
+
+@pytest.mark.parametrize(
+    "missing",
+    [{"k01": 0.89}, {"coarse": 0.29}, {"sum_residual": 0.01}, {"error": [0.34, 0.1]}, {"coarse": float("nan")}],
+    ids=lambda changed: next(iter(changed)),
+)
+def test_chaos_needs_every_piece_of_evidence(missing):
+    assert verdict(CHAOTIC, **missing) == Verdict.UNDECIDED
+
+
+@pytest.mark.parametrize("changed", [{"growing": True}, {"bounded": False}])
+def test_growth_is_not_chaos(changed):
+    assert verdict(CHAOTIC, **changed) == Verdict.PARAMETRICALLY_UNSTABLE
+
+
+@pytest.mark.parametrize(
+    ("changed", "kind"),
+    [
+        ({"multiple": 1}, Verdict.FIXED_POINT),
+        ({"multiple": 10}, Verdict.PERIODIC),
+        ({"multiple": 0}, Verdict.QUASI_PERIODIC),
+        ({"settled": False}, Verdict.UNDECIDED),
+        ({"error": [0.4, 0.4]}, Verdict.UNDECIDED),
+    ],
+)
+def test_kinds_of_attracting_motion(changed, kind):
+    assert verdict(REGULAR, **changed) == kind
+
+
+@pytest.mark.parametrize(
+    ("spectrum", "k01", "kind"),
+    [
+        ([-1.0, -3.0], 0.0, Verdict.FIXED_POINT),
+        ([0.0, -3.0], 0.0, Verdict.PERIODIC),
+        ([0.0, 0.0], 0.0, Verdict.QUASI_PERIODIC),
+        ([0.0, -3.0], 0.5, Verdict.UNDECIDED),
+    ],
+)
+def test_kinds_of_unforced_motion(spectrum, k01, kind):
+    assert verdict(REGULAR, autonomous=True, spectrum=spectrum, k01=k01) == kind
