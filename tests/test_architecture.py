@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from drivetrain_jax.analysis import Request, analysis_names, get_analysis
+from drivetrain_jax.analysis import analysis_names, get_analysis
+from drivetrain_jax.sweep.engine import Engine
+from drivetrain_jax.sweep.scene import load_scene
 from drivetrain_jax.systems import get_system, system_names
 
 ROOT = Path(__file__).parents[1]
@@ -69,24 +72,40 @@ for name in {COMPUTING}:
     assert python(code) == ""
 
 
-def solvers() -> list:
-    """All solvers of all analyses of the package's systems, with an explicit and the implicit diffrax solver."""
+def scenes() -> dict[tuple[str, str], dict]:
+    """The first scene of ``sweeps/`` for every analysis of every system of the package, with its default results."""
+    found: dict[tuple[str, str], dict] = {}
+    for path in sorted((ROOT / "sweeps").glob("*.toml")):
+        scene = tomllib.loads(path.read_text())
+        scene.pop("outputs", None)
+        found.setdefault((scene["system"], scene["analysis"]), scene)
+    return found
+
+
+def methods() -> list:
+    """Every method of these scenes' analyses, and the implicit diffrax solver besides the default one."""
     found = []
-    for system in map(get_system, system_names()):
-        for analysis in (get_analysis(name) for name in analysis_names() if name in system.models):
-            outputs = tuple(v.name for v in analysis.variables)
-            for method in set(analysis.methods) - {"auto"}:
-                used = {p.name: p.default for p in analysis.options if p.name in analysis.methods[method]}
-                for options in (used, used | {"solver": "Kvaerno5"}) if "solver" in used else (used,):
-                    for solver in analysis.solvers(system, Request(outputs, method, options)):
-                        found.append(pytest.param(system, analysis, solver, id=f"{system.name} {method} {solver.name}"))
-    return sorted(found, key=lambda parameter: parameter.id)
+    for (system, analysis), scene in scenes().items():
+        for method, used in get_analysis(analysis).methods.items():
+            given = {name: value for name, value in scene.get("options", {}).items() if name in used}
+            variants = [given, given | {"solver": "Kvaerno5"}] if analysis == "floquet" and "solver" in used else [given]
+            for options in variants if method != "auto" else []:
+                label = f"{system} {analysis} {method} {options.get('solver', '')}".strip()
+                found.append(pytest.param(scene | {"options": options | {"method": method}}, id=label))
+    return found
 
 
-@pytest.mark.parametrize(("system", "analysis", "solver"), solvers())
-def test_kernels_do_not_call_lapack(system, analysis, solver):
+def test_every_analysis_of_every_system_has_a_scene():
+    assert set(scenes()) == {(s, a) for s in system_names() for a in get_system(s).models if a in analysis_names()}
+
+
+@pytest.mark.parametrize("scene", methods())
+def test_kernels_do_not_call_lapack(scene):
     """Kernels that call it may not run side by side. Only diffrax's implicit solver needs to: the proof that it shows."""
-    shape = (2,) if solver.broadcasts else ()
-    values = {name: jax.ShapeDtypeStruct(shape, float) for name in system.models[analysis.name].parameters}
-    lowered = jax.jit(solver.solve).lower(values, jax.ShapeDtypeStruct((), np.int64))
-    assert ("lapack" in lowered.as_text().lower()) is ("Kvaerno5" in solver.name)
+    engine = Engine(load_scene(scene))
+    for solver in engine.solvers:
+        shape = (2,) if solver.broadcasts else ()
+        columns = {axis.name: jax.ShapeDtypeStruct(shape, axis.values.dtype) for axis in engine.grid.axes}
+        traced = jax.jit(lambda columns, effort, solve=solver.solve: solve(engine.grid.bind(columns), effort))
+        lowered = traced.lower(columns, jax.ShapeDtypeStruct((), np.int64))
+        assert ("lapack" in lowered.as_text().lower()) is ("Kvaerno5" in solver.name)
