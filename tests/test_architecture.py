@@ -88,7 +88,9 @@ def methods() -> list:
     for (system, analysis), scene in scenes().items():
         for method, used in get_analysis(analysis).methods.items():
             given = {name: value for name, value in scene.get("options", {}).items() if name in used}
-            variants = [given, given | {"solver": "Kvaerno5"}] if analysis == "floquet" and "solver" in used else [given]
+            variants = (
+                [given, given | {"solver": "Kvaerno5"}] if analysis == "floquet" and "solver" in used else [given]
+            )
             for options in variants if method != "auto" else []:
                 label = f"{system} {analysis} {method} {options.get('solver', '')}".strip()
                 found.append(pytest.param(scene | {"options": options | {"method": method}}, id=label))
