@@ -3,8 +3,8 @@
 ``python -m benchmarks.rattle_throughput [lanes]`` writes benchmarks/results/rattle_throughput.csv and .png: the closed
 form, diffrax with and without declared events, and SciPy with and without, on the same motions (Table 1 of the paper,
 omega 0.3 .. 1.5, ten drive periods from rest). The error is the largest over the motions against extended precision
-(NaN where a motion failed). At omega = 0.3 the motion touches a flank for less than a step of the integrators: their
-event location misses it, at every tolerance, and errs by 2.4e-7.
+(NaN where a motion failed). At omega = 0.3 the solvers with events differ from both the closed form and extended precision
+by 2.4e-7 however small the tolerance, which is what a contact that begins and ends within one step would cause.
 """
 
 from __future__ import annotations

@@ -121,6 +121,8 @@ def epsilon_section() -> str:
         "As far as the scanned text can be read, the last term of (50) and (63) is printed B1^2 T^2/(4 omega^2 eps^2), "
         "where B1^2 T^4/(4 eps^2 U^2) follows from (18); (13), (51) and (52) are printed with lambda_1^2 where (9) and "
         "(10) define lambda_1. With these corrected, epsilon cancels. "
+        "If that omega is a misread U, epsilon cancels there too, and a factor T remains wrong: the peak is then "
+        "a = B1 I/c = 0.6 instead of B1 I/(c w0). "
         "Fit range R = 1; amplitude a of the peak and its frequency.\n"
     )
     return (
