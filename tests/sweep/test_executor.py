@@ -65,13 +65,21 @@ def arrays(path):
         return ds.load()
 
 
+def state(pid):
+    """State letter and parent of a process; it may end meanwhile."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return "X", 0
+    return fields[0], int(fields[1])
+
+
 def children(pid):
-    listed = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True).stdout
-    return [int(word) for word in listed.split()]
+    return [n for n in (int(p.name) for p in Path("/proc").iterdir() if p.name.isdigit()) if state(n)[1] == pid]
 
 
 def alive(pid):
-    return Path(f"/proc/{pid}").exists() and ") Z " not in Path(f"/proc/{pid}/stat").read_text()
+    return state(pid)[0] not in "XZ"
 
 
 def wait_until(condition, seconds=60):
