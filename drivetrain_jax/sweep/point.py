@@ -66,8 +66,9 @@ class PointResult:
         return json.dumps(answer, allow_nan=False)
 
     def __repr__(self) -> str:
+        # An empty list is the default "none".
         given = ", ".join(
-            _with_units(f"{n} = {_short(v)}", self.parameter_units[n]) for n, v in self.parameters.items()
+            _with_units(f"{n} = {_short(v)}", self.parameter_units[n]) for n, v in self.parameters.items() if v != ()
         )
         width = max(map(len, (*self.values, "outcome")))
         lines = [f"{self.system} {self.analysis} (method {self.method}), {given}"]
@@ -90,6 +91,8 @@ def _plain(value: Any) -> Any:
 
 
 def _short(value: Any) -> str:
+    if isinstance(value, tuple):
+        return "[" + ", ".join(map(_short, value)) + "]"
     return f"{value:.10g}" if isinstance(value, float) else str(value)
 
 
@@ -100,6 +103,8 @@ def _with_units(text: str, units: str) -> str:
 def _text(variable: Variable, value: Any) -> str:
     if variable.flags and np.ndim(value) == 0:
         return f"{variable.flags[int(value)]} ({int(value)})"
+    if variable.flags and np.ndim(value) == 1:
+        return "[" + ", ".join(variable.flags[int(code)] for code in value) + "]"
     if np.ndim(value):
         return np.array2string(value, precision=10, separator=", ", max_line_width=10_000)
     return f"{value:.12g}"

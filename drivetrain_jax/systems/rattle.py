@@ -70,7 +70,7 @@ def rattle_threshold(values: Values) -> np.ndarray:
 
 SYSTEM = System(
     name="rattle",
-    title="gear rattle: a pair of gears with backlash",
+    title="Gear rattle: a pair of gears with backlash",
     source="Rezaee & Farshidianfar (in Persian); corrections in docs/theory/rattle.md",
     parameters=PARAMETERS,
     models={

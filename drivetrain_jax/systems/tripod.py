@@ -273,7 +273,7 @@ def _motion(build: Callable[[Values], Flow]) -> Model:
 
 SYSTEM = System(
     name="tripod",
-    title="double-tripod driveshaft",
+    title="Double-tripod driveshaft",
     source="Bugaru & Vasile, Applied Sciences 12(12), 6182, 2022; corrections in docs/theory/tripod.md",
     parameters=PARAMETERS,
     models={

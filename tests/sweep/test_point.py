@@ -35,7 +35,7 @@ def test_same_value_as_in_a_sweep():
 def test_readable():
     text = repr(dt.point("toy", "toy", a=6.0, b=1.5, outputs=["value", "sign"]))
     assert text.splitlines() == [
-        "toy toy (method plain), a = 6 m, b = 1.5 s, n = 3, kind = plain, length = (1.0, 2.0, 3.0) m",
+        "toy toy (method plain), a = 6 m, b = 1.5 s, n = 3, kind = plain, length = [1, 2, 3] m",
         "  value   = 331.5 m",
         "  sign    = large (1)",
         "  outcome = success",
