@@ -53,13 +53,13 @@ class Solver:
     results then carry the batch as their LAST axis. The values of a path axis arrive as a whole, shape ``(L,)``, and
     results have the path as their FIRST axis; ``chunk`` counts lines then.
     ``effort`` is a traced integer, the largest that ``effort(columns)`` predicts in the batch (columns: NumPy arrays
-    of shape ``(N,)``; a count of steps or the like). The engine gives every point to the solver for which
-    ``effort * unit_cost`` is smallest and runs batches of ``chunk`` points of similar effort.
+    of shape ``(N,)``; a count of steps or the like; by default the same for all points). The engine gives every point
+    to the solver for which ``effort * unit_cost`` is smallest and runs batches of ``chunk`` points of similar effort.
     """
 
     name: str
     solve: Callable[[Mapping[str, Any], Array], dict[str, Array]]
-    effort: Callable[[Mapping[str, np.ndarray]], np.ndarray]
+    effort: Callable[[Mapping[str, np.ndarray]], np.ndarray] = lambda columns: np.ones(())
     unit_cost: float = 1.0
     broadcasts: bool = False
     chunk: int = 256

@@ -109,12 +109,7 @@ def shares(high: Array, low: Array, multiple: Array, outcome: Array) -> dict[str
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     build = system.models["basins"].build
-    return (Solver("exact", partial(_solve, build, request), _one, broadcasts=True, chunk=_CHUNK),)
-
-
-def _one(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    del columns
-    return np.ones(())
+    return (Solver("exact", partial(_solve, build, request), broadcasts=True, chunk=_CHUNK),)
 
 
 ANALYSIS = Analysis(

@@ -19,16 +19,13 @@ from jax import Array
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.direct import compare, direct_monodromy, stiffness_of
-from drivetrain_jax.analysis.floquet_effort import PANEL_COST, explicit_effort, implicit_effort
+from drivetrain_jax.analysis.direct import compare
+from drivetrain_jax.analysis.direct_solvers import direct_solvers
+from drivetrain_jax.analysis.floquet_effort import explicit_effort
 from drivetrain_jax.analysis.floquet_results import NEED_ERROR, VARIABLES, results
 from drivetrain_jax.analysis.monodromy import SOLVERS, state_transition
 from drivetrain_jax.analysis.propagator import (
-    EXPLICIT_ORDER,
-    IMPLICIT_ORDER,
     Propagator,
-    explicit_propagator,
-    implicit_propagator,
 )
 from drivetrain_jax.systems import System
 
@@ -38,36 +35,12 @@ _TOLERANCE_GAP = 4.0
 
 def _direct_solvers(system: System, request: Request) -> tuple[Solver, ...]:
     rtol = request.options["rtol"]
-
-    def solve(values: Mapping[str, Any], effort: Array, explicit: bool) -> dict[str, Array]:
-        model = system.models["floquet"].build(values)
-        form = model.reduced
-        shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in values.values() if not isinstance(x, str)))
-
-        def propagate(steps: Array) -> Propagator:
-            if explicit:
-                return explicit_propagator(form, steps, shape)
-            return implicit_propagator(form, steps)
-
-        order, stiffness = (EXPLICIT_ORDER, 0.0) if explicit else (IMPLICIT_ORDER, stiffness_of(form))
-        z = direct_monodromy(form, propagate, effort, shape, stiffness, rtol / 4, order)
-        return results(z, request.outputs, rtol, model.natural.span)
-
-    return (
-        Solver(
-            "direct: explicit Runge-Kutta of order 8",
-            lambda values, effort: solve(values, effort, True),
-            lambda columns: explicit_effort(system, columns, rtol),
-            broadcasts=True,
-            chunk=512,
-        ),
-        Solver(
-            "direct: Radau IIA of 8 stages",
-            lambda values, effort: solve(values, effort, False),
-            lambda columns: implicit_effort(system, columns, rtol),
-            unit_cost=PANEL_COST,
-            chunk=64,
-        ),
+    return direct_solvers(
+        system,
+        rtol,
+        rtol / 4,
+        lambda model: model.reduced,
+        lambda model, z: results(z, request.outputs, rtol, model.natural.span),
     )
 
 

@@ -15,15 +15,8 @@ from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.direct import direct_monodromy, stiffness_of
-from drivetrain_jax.analysis.floquet_effort import PANEL_COST, explicit_effort, implicit_effort
-from drivetrain_jax.analysis.propagator import (
-    EXPLICIT_ORDER,
-    IMPLICIT_ORDER,
-    Propagator,
-    explicit_propagator,
-    implicit_propagator,
-)
+from drivetrain_jax.analysis.direct import Monodromy
+from drivetrain_jax.analysis.direct_solvers import direct_solvers
 from drivetrain_jax.systems import LinearPeriodic, System
 
 VARIABLES = (
@@ -42,38 +35,14 @@ def whole_span(form: LinearPeriodic) -> LinearPeriodic:
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     rtol = request.options["rtol"]
-
-    def solve(values: Mapping[str, Any], effort: Array, explicit: bool) -> dict[str, Array]:
-        form = whole_span(system.models["floquet"].build(values).reduced)
-        shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in values.values() if not isinstance(x, str)))
-
-        def propagate(steps: Array) -> Propagator:
-            return explicit_propagator(form, steps, shape) if explicit else implicit_propagator(form, steps)
-
-        order, stiffness = (EXPLICIT_ORDER, 0.0) if explicit else (IMPLICIT_ORDER, stiffness_of(form))
-        phi = direct_monodromy(form, propagate, effort, shape, stiffness, rtol, order)
-        return _results(phi.matrix * jnp.exp(phi.log_scale), phi.error, phi.met, request.outputs)
-
-    return (
-        Solver(
-            "direct: explicit Runge-Kutta of order 8",
-            lambda values, effort: solve(values, effort, True),
-            lambda columns: explicit_effort(system, columns, rtol),
-            broadcasts=True,
-            chunk=512,
-        ),
-        Solver(
-            "direct: Radau IIA of 8 stages",
-            lambda values, effort: solve(values, effort, False),
-            lambda columns: implicit_effort(system, columns, rtol),
-            unit_cost=PANEL_COST,
-            chunk=64,
-        ),
+    return direct_solvers(
+        system, rtol, rtol, lambda model: whole_span(model.reduced), lambda model, phi: _results(phi, request.outputs)
     )
 
 
-def _results(phi: Array, error: Array, met: Array, outputs: tuple[str, ...]) -> dict[str, Array]:
-    entries = phi.reshape(-1, *phi.shape[2:])
+def _results(phi: Monodromy, outputs: tuple[str, ...]) -> dict[str, Array]:
+    matrix, error, met = phi.matrix * jnp.exp(phi.log_scale), phi.error, phi.met
+    entries = matrix.reshape(-1, *matrix.shape[2:])
     finite = jnp.all(jnp.isfinite(entries), axis=0)
     outcome = jnp.where(finite, jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET), Outcome.NOT_FINITE)
     results = {"propagator": jnp.where(finite, entries, jnp.nan), "propagator_error": jnp.where(finite, error, jnp.nan)}

@@ -159,12 +159,7 @@ def _exact_branch(
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     build = system.models["frequency_response"].build
-    return (Solver(request.method, partial(_solve, build, request), _one, broadcasts=True, chunk=_CHUNK),)
-
-
-def _one(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    del columns
-    return np.ones(())
+    return (Solver(request.method, partial(_solve, build, request), broadcasts=True, chunk=_CHUNK),)
 
 
 ANALYSIS = Analysis(

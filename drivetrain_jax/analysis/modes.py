@@ -220,16 +220,11 @@ def _equal(frequency: Array) -> Array:
     return jnp.moveaxis(clusters(turned, CLUSTER * turned[1:]), 2, 0)
 
 
-def _effort(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The same for every point."""
-    return np.ones(1)
-
-
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     chunk = _SPECTRUM_CHUNK if set(request.outputs) <= _SPECTRUM else _MODES_CHUNK
     chunk = _LINES_CHUNK if request.options["track"] else chunk
     solve = partial(_solve, system.models["modes"].build, request)
-    return (Solver("singular values", solve, _effort, broadcasts=True, chunk=chunk),)
+    return (Solver("singular values", solve, broadcasts=True, chunk=chunk),)
 
 
 def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:

@@ -11,7 +11,6 @@ from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
@@ -55,12 +54,8 @@ def _lanes(result: Array, name: str) -> Array:
     return result if name == "midshaft_frequency" else result[None]
 
 
-def _effort(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    return np.ones(np.broadcast_shapes(*(np.shape(column) for column in columns.values())))
-
-
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
-    return (Solver("closed form", partial(_solve, system, request), _effort, broadcasts=True, chunk=4096),)
+    return (Solver("closed form", partial(_solve, system, request), broadcasts=True, chunk=4096),)
 
 
 def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:

@@ -94,14 +94,9 @@ def _solve(
     return {name: x.reshape(*x.shape[:-1], *shape) for name, x in wanted.items()}
 
 
-def _effort(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Long periods hold many events: neighbours in 1/omega take about as long."""
-    return np.ceil(100 / np.asarray(columns.get("omega", 1.0), float))
-
-
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     build = system.models["steady_state"].build
-    return (Solver("exact", partial(_solve, build, request), _effort, broadcasts=True, chunk=_CHUNK),)
+    return (Solver("exact", partial(_solve, build, request), broadcasts=True, chunk=_CHUNK),)
 
 
 ANALYSIS = Analysis(

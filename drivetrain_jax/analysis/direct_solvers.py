@@ -1,0 +1,69 @@
+"""The two solvers of a reduced periodic form: explicit, batched inside the state, and L-stable where that is cheaper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax.analysis._base import Solver
+from drivetrain_jax.analysis.direct import Monodromy, direct_monodromy, stiffness_of
+from drivetrain_jax.analysis.floquet_effort import PANEL_COST, explicit_effort, implicit_effort
+from drivetrain_jax.analysis.propagator import (
+    EXPLICIT_ORDER,
+    IMPLICIT_ORDER,
+    Propagator,
+    explicit_propagator,
+    implicit_propagator,
+)
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System
+
+Form = Callable[[FloquetModel], LinearPeriodic]
+Results = Callable[[FloquetModel, Monodromy], dict[str, Array]]
+
+
+def direct_solvers(system: System, rtol: float, target: float, form: Form, results: Results) -> tuple[Solver, ...]:
+    """Solvers that give ``results(model, monodromy)`` from the monodromy matrix of ``form(model)``.
+
+    ``rtol`` predicts the effort, ``target`` is the error that every point is refined to.
+    """
+    solve = partial(_solve, system, target, form, results)
+    return (
+        Solver(
+            "direct: explicit Runge-Kutta of order 8",
+            lambda values, effort: solve(values, effort, True),
+            lambda columns: explicit_effort(system, columns, rtol),
+            broadcasts=True,
+            chunk=512,
+        ),
+        Solver(
+            "direct: Radau IIA of 8 stages",
+            lambda values, effort: solve(values, effort, False),
+            lambda columns: implicit_effort(system, columns, rtol),
+            unit_cost=PANEL_COST,
+            chunk=64,
+        ),
+    )
+
+
+def _solve(
+    system: System,
+    target: float,
+    form: Form,
+    results: Results,
+    values: Mapping[str, Any],
+    effort: Array,
+    explicit: bool,
+) -> dict[str, Array]:
+    model = system.models["floquet"].build(values)
+    periodic = form(model)
+    shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in values.values() if not isinstance(x, str)))
+
+    def propagate(steps: Array) -> Propagator:
+        return explicit_propagator(periodic, steps, shape) if explicit else implicit_propagator(periodic, steps)
+
+    order, stiffness = (EXPLICIT_ORDER, 0.0) if explicit else (IMPLICIT_ORDER, stiffness_of(periodic))
+    return results(model, direct_monodromy(periodic, propagate, effort, shape, stiffness, target, order))
