@@ -12,14 +12,21 @@ from typing import TYPE_CHECKING, Any
 from drivetrain_jax._errors import InputError
 
 if TYPE_CHECKING:
+    from drivetrain_jax.sweep.atlas_file import open_atlas
+    from drivetrain_jax.sweep.partial import open_result
     from drivetrain_jax.sweep.point import point
     from drivetrain_jax.sweep.run import run
 
 __version__ = "0.1.0"
 
-__all__ = ["InputError", "__version__", "point", "run"]
+__all__ = ["InputError", "__version__", "open_atlas", "open_result", "point", "run"]
 
-_HOME = {"run": "drivetrain_jax.sweep.run", "point": "drivetrain_jax.sweep.point"}
+_HOME = {
+    "open_atlas": "drivetrain_jax.sweep.atlas_file",
+    "open_result": "drivetrain_jax.sweep.partial",
+    "point": "drivetrain_jax.sweep.point",
+    "run": "drivetrain_jax.sweep.run",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -64,22 +64,60 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--threads", type=int, metavar="N", help="chunks computed at a time (default: usable cores)")
     command.add_argument("--workers", type=int, metavar="N", help="N processes instead of threads: survive a crash")
     command.add_argument("--dask", metavar="ADDRESS", help="a Dask cluster instead: tcp://HOST:PORT or local:N")
+    command.add_argument(
+        "--reuse",
+        action="append",
+        default=[],
+        metavar="FILE.nc",
+        type=Path,
+        help="take over the points that this result shares; a smaller result at --out is taken over without it",
+    )
+    command.add_argument(
+        "--store", choices=("hdf5", "zarr"), default="hdf5", help="zarr: a store that the workers write themselves"
+    )
     command.add_argument("--quiet", action="store_true", help="no progress, only the last line")
 
     command = _command(commands, "status", _status, "how much of a scene is computed")
     _add_scene(command)
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
+    command = _command(
+        commands, "verify", _verify, "check every checksum of a result, and what must hold of its numbers"
+    )
+    command.add_argument("file", metavar="FILE.nc", type=Path)
+    command.add_argument("--json", action="store_true", help="as one JSON object")
+
+    command = _command(commands, "export", _export, "write a Zarr store as one HDF5 file")
+    command.add_argument("store", metavar="STORE", type=Path)
+    command.add_argument("file", metavar="FILE.nc", type=Path)
+
     command = _command(commands, "plot", _plot, "draw the figure that suits a result")
     command.add_argument(
         "files", metavar="FILE.nc", type=Path, nargs="+", help="several methods of one analysis overlay"
     )
     command.add_argument("--out", required=True, metavar="FIGURE", type=Path, help="figure to write (.png, .pdf, .svg)")
+    command.add_argument(
+        "--part", nargs="+", default=[], metavar="name=LOW:HIGH", help="of an atlas: ranges to zoom into, or name=value"
+    )
+    command.add_argument("--cells", type=int, default=800, metavar="N", help="of an atlas: cells each way (800)")
 
     command = _command(commands, "point", _point, "compute one point")
     command.add_argument("system", metavar="SYSTEM")
     command.add_argument("analysis", metavar="ANALYSIS")
     command.add_argument("given", nargs="*", metavar="name=value", help="parameters, options, and outputs=NAME,NAME")
+    command.add_argument("--json", action="store_true", help="as one JSON object")
+
+    command = _command(commands, "query", _query, "ask a stored atlas about one point")
+    command.add_argument("file", metavar="FILE.nc", type=Path)
+    command.add_argument("given", nargs="*", metavar="name=value", help="parameters, or the data in physical units")
+    command.add_argument("--json", action="store_true", help="as one JSON object")
+
+    command = _command(commands, "design", _design, "ask a stored atlas what a design has to be")
+    questions = ("least-damping", "widest-angle", "speed-windows")
+    command.add_argument("question", choices=questions, metavar="QUESTION", help=", ".join(questions))
+    command.add_argument("file", metavar="FILE.nc", type=Path)
+    command.add_argument("given", nargs="*", metavar="name=value", help="parameters; a range is name=LOW:HIGH")
+    command.add_argument("--margin", type=float, default=0.0, help="part of the speed kept clear of every boundary")
     command.add_argument("--json", action="store_true", help="as one JSON object")
     return parser
 
@@ -144,6 +182,8 @@ def _run(options: argparse.Namespace) -> int:
                 overrides=overrides,
                 fresh=options.fresh,
                 where=Where(options.threads, options.workers, options.dask),
+                reuse=options.reuse,
+                store=options.store,
                 report=report,
             )
             code = OK
@@ -194,15 +234,37 @@ def _progress_line(quiet: bool) -> Any:
 
 def _status(options: argparse.Namespace) -> int:
     import json
-    from dataclasses import asdict
 
-    from drivetrain_jax.sweep.run import status
+    from drivetrain_jax.sweep.status import status
 
     found = status(options.scene, options.out, _assignments(options.set, "--set"))
     if options.json:
-        sys.stdout.write(json.dumps(asdict(found)) + "\n")
+        sys.stdout.write(json.dumps(found.to_json()) + "\n")
     else:
-        sys.stdout.write(f"{found.state}: {found.done} of {found.total} points done, {found.failed} without a value\n")
+        sys.stdout.write(f"{found}\n")
+    return OK
+
+
+def _verify(options: argparse.Namespace) -> int:
+    import json
+
+    from drivetrain_jax.invariants.verify import verify
+
+    report = verify(options.file)
+    if options.json:
+        state = "damaged" if report.problem else "complete" if report.complete else "partial"
+        sys.stdout.write(json.dumps({"state": state, "problem": report.problem, "checks": report.lines}) + "\n")
+    else:
+        sys.stdout.write("\n".join(report.lines) + "\n")
+    if report.problem:
+        raise InputError(f"file = {str(options.file)!r}: {report.problem}")
+    return OK if report.complete else INCOMPLETE
+
+
+def _export(options: argparse.Namespace) -> int:
+    from drivetrain_jax.sweep.export import export
+
+    sys.stderr.write(f"points: {export(options.store, options.file)} exported\n")
     return OK
 
 
@@ -213,7 +275,14 @@ def _plot(options: argparse.Namespace) -> int:
     out = options.out
     if not out.parent.is_dir():
         raise InputError(f"out = {str(out)!r}: the folder does not exist; allowed is a file in an existing folder")
-    figure = plot(*map(open_result, options.files))
+    results = [open_result(file) if file.exists() else _open_unfinished(file) for file in options.files]
+    if any(result.attrs.get("analysis") == "atlas" for result in results):
+        from drivetrain_jax.sweep.atlas_chart import chart
+
+        results = [chart(result, _ranges(options.part, "--part"), options.cells) for result in results]
+    elif options.part:
+        raise InputError(f"--part = {options.part[0]!r}: a result on a grid is drawn whole; allowed for an atlas")
+    figure = plot(*results)
     kinds = figure.canvas.get_supported_filetypes()
     if out.suffix[1:].lower() not in kinds:
         raise InputError(f"out = {str(out)!r}: allowed is a name that ends in .{', .'.join(kinds)}")
@@ -234,6 +303,54 @@ def _point(options: argparse.Namespace) -> int:
     result = point(options.system, options.analysis, outputs=outputs, **given)
     sys.stdout.write((result.to_json() if options.json else repr(result)) + "\n")
     return OK
+
+
+def _open_unfinished(file: Path) -> Any:
+    """What a run has done so far, if one is at work there."""
+    from drivetrain_jax.store.chunks import PartsFolder
+    from drivetrain_jax.store.consolidate import open_result
+
+    if not PartsFolder(file).holds_work():
+        return open_result(file)
+    from drivetrain_jax.sweep import partial
+
+    return partial.open_result(file)
+
+
+def _query(options: argparse.Namespace) -> int:
+    from drivetrain_jax.sweep.atlas_answers import query
+    from drivetrain_jax.sweep.atlas_file import open_atlas
+
+    reply = query(open_atlas(options.file), _ranges(options.given, "query"))
+    sys.stdout.write((reply.to_json() if options.json else str(reply)) + "\n")
+    return OK
+
+
+def _design(options: argparse.Namespace) -> int:
+    from drivetrain_jax.sweep import atlas_answers
+    from drivetrain_jax.sweep.atlas_file import open_atlas
+
+    atlas, given = open_atlas(options.file), _ranges(options.given, "design")
+    question = getattr(atlas_answers, options.question.replace("-", "_"))
+    extra = {"margin": options.margin} if options.question == "speed-windows" else {}
+    reply = question(atlas, given, **extra)
+    sys.stdout.write((reply.to_json() if options.json else str(reply)) + "\n")
+    return OK
+
+
+def _ranges(texts: Sequence[str], field: str) -> dict[str, Any]:
+    """``name=value`` pairs, values numbers or pairs of them, ``LOW:HIGH``."""
+    return {name: _number_or_range(name, value) for name, value in _assignments(texts, field).items()}
+
+
+def _number_or_range(name: str, value: Any) -> Any:
+    try:
+        if isinstance(value, str):
+            low, high = (float(end) for end in value.split(":"))
+            return low, high
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} = {value!r}: allowed is a number or LOW:HIGH") from None
 
 
 if __name__ == "__main__":

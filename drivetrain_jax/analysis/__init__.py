@@ -8,6 +8,7 @@ from drivetrain_jax.analysis._base import OUTCOME, RTOL, Analysis, Outcome, Requ
 
 _ANALYSES = {
     "floquet": "floquet",
+    "atlas": "atlas",
     "forced": "forced",
     "frequency_response": "frequency_response",
     "history": "history",

@@ -25,7 +25,9 @@ Form = Callable[[FloquetModel], LinearPeriodic]
 Results = Callable[[FloquetModel, Monodromy], dict[str, Array]]
 
 
-def direct_solvers(system: System, rtol: float, target: float, form: Form, results: Results) -> tuple[Solver, ...]:
+def direct_solvers(
+    system: System, rtol: float, target: float, form: Form, results: Results, chunks: tuple[int, int] = (512, 64)
+) -> tuple[Solver, ...]:
     """Solvers that give ``results(model, monodromy)`` from the monodromy matrix of ``form(model)``.
 
     ``rtol`` predicts the effort, ``target`` is the error that every point is refined to.
@@ -37,14 +39,14 @@ def direct_solvers(system: System, rtol: float, target: float, form: Form, resul
             lambda values, effort: solve(values, effort, True),
             lambda columns: explicit_effort(system, columns, rtol),
             broadcasts=True,
-            chunk=512,
+            chunk=chunks[0],
         ),
         Solver(
             "direct: Radau IIA of 8 stages",
             lambda values, effort: solve(values, effort, False),
             lambda columns: implicit_effort(system, columns, rtol),
             unit_cost=PANEL_COST,
-            chunk=64,
+            chunk=chunks[1],
         ),
     )
 

@@ -1,9 +1,10 @@
 """Floquet analysis of a linear periodic system: multipliers, certified spectral radius and verdict of one point.
 
-``direct`` (what ``auto`` means at present) uses the system's reduced form: an explicit scheme of order 8 batched
-inside the state, or an L-stable implicit one where that needs fewer operations. ``diffrax`` integrates the system as
-published over its full period with any adaptive diffrax solver: slower, and independent of the former in coordinates,
-clock and factorisation.
+``direct`` uses the system's reduced form: an explicit scheme of order 8 batched inside the state, or an L-stable
+implicit one where that needs fewer operations. ``atlas`` evaluates a whole scene from polynomials through direct solves
+(see ``drivetrain_jax.atlas``), and what they do not cover directly; ``auto`` does so where it is cheaper. ``diffrax``
+integrates the system as published over its full period with any adaptive diffrax solver: slower, and independent of
+the others in coordinates, clock and factorisation.
 """
 
 from __future__ import annotations
@@ -24,9 +25,7 @@ from drivetrain_jax.analysis.direct_solvers import direct_solvers
 from drivetrain_jax.analysis.floquet_effort import explicit_effort
 from drivetrain_jax.analysis.floquet_results import NEED_ERROR, VARIABLES, results
 from drivetrain_jax.analysis.monodromy import SOLVERS, state_transition
-from drivetrain_jax.analysis.propagator import (
-    Propagator,
-)
+from drivetrain_jax.analysis.propagator import Propagator
 from drivetrain_jax.systems import System
 
 # The diffrax error is the difference between two tolerances a decade apart, taken as it is (see `compare`).
@@ -98,7 +97,7 @@ ANALYSIS = Analysis(
     title="Floquet stability of the equilibrium",
     variables=VARIABLES,
     default_outputs=("spectral_radius", "spectral_radius_error", "verdict"),
-    methods={"auto": ("rtol",), "direct": ("rtol",), "diffrax": ("rtol", "atol", "solver")},
+    methods={"auto": ("rtol",), "atlas": ("rtol",), "direct": ("rtol",), "diffrax": ("rtol", "atol", "solver")},
     options=(
         RTOL,
         Parameter("atol", "1", "absolute tolerance of the integrator", default=1e-12, lower=0.0, upper=1e-2),

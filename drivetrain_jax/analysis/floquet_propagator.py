@@ -25,6 +25,10 @@ VARIABLES = (
 )
 
 
+# An atlas asks for a hundred points at a time: large chunks would leave most lanes, and a core, without work.
+_CHUNKS = (128, 16)
+
+
 def whole_span(form: LinearPeriodic) -> LinearPeriodic:
     """``form`` with its span taken for the period: the monodromy matrix is then the propagator itself."""
     if form.reversor is None or form.log_determinant is None:
@@ -36,7 +40,12 @@ def whole_span(form: LinearPeriodic) -> LinearPeriodic:
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     rtol = request.options["rtol"]
     return direct_solvers(
-        system, rtol, rtol, lambda model: whole_span(model.reduced), lambda model, phi: _results(phi, request.outputs)
+        system,
+        rtol,
+        rtol,
+        lambda model: whole_span(model.reduced),
+        lambda model, phi: _results(phi, request.outputs),
+        _CHUNKS,
     )
 
 
@@ -54,7 +63,7 @@ def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> t
 
 
 ANALYSIS = Analysis(
-    name="floquet_propagator",
+    name="atlas",
     title="Propagator of a linear periodic system, for its atlas",
     variables=VARIABLES,
     default_outputs=("propagator", "propagator_error"),

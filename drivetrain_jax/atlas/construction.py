@@ -28,6 +28,7 @@ from drivetrain_jax.atlas.quantity import Quantity
 from drivetrain_jax.systems import Coordinate
 
 Rounds = Generator[np.ndarray, np.ndarray, Atlas]
+MAX_SOLVES = 400_000
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ class Ledger:
 
 
 def construct(
-    domain: Domain, quantity: Quantity, tolerance: float, *, max_nodes: int = 128, max_solves: int = 400_000
+    domain: Domain, quantity: Quantity, tolerance: float, *, max_nodes: int = 128, max_solves: int = MAX_SOLVES
 ) -> Rounds:
     """An atlas of ``quantity`` over ``domain`` with errors of about ``tolerance`` times its scale.
 

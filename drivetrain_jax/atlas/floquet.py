@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from drivetrain_jax.atlas.construction import Domain, Rounds, construct
+from drivetrain_jax.atlas.construction import MAX_SOLVES, Domain, Rounds, construct
 from drivetrain_jax.atlas.floquet_quantity import floquet_quantity
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.stability import StabilityAtlas
@@ -33,7 +33,11 @@ def floquet_domain(system: System, ranges: Mapping[str, tuple[float, float]], fi
 
 
 def floquet_rounds(
-    system: System, ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, float], tolerance: float
+    system: System,
+    ranges: Mapping[str, tuple[float, float]],
+    fixed: Mapping[str, float],
+    tolerance: float,
+    max_solves: int = MAX_SOLVES,
 ) -> Rounds:
     """The construction of an atlas of the propagator, as :func:`~drivetrain_jax.atlas.construct`.
 
@@ -43,7 +47,7 @@ def floquet_rounds(
     domain = floquet_domain(system, ranges, fixed)
     middle = {name: (a + b) / 2 for name, a, b in zip(domain.parameters, domain.lower, domain.upper, strict=True)}
     form = system.models["floquet"].build({**fixed, **middle}).reduced
-    return construct(domain, floquet_quantity(form), tolerance)
+    return construct(domain, floquet_quantity(form), tolerance, max_solves=max_solves)
 
 
 def stability_atlas(atlas: Atlas, system: System, rtol: float) -> StabilityAtlas:

@@ -11,9 +11,10 @@ functions broadcast; a matrix is a nested list of arrays.
 
 from __future__ import annotations
 
-from functools import reduce
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -21,7 +22,7 @@ from jax import Array
 Matrix = list[list[Array]]
 
 EPS = float(np.finfo(float).eps)
-_NEWTON_STEPS = 9
+_NEWTON_STEPS = 7
 # Roundings in a coefficient, in units of eps times its natural size.
 _ROUNDINGS = 16.0
 
@@ -71,8 +72,8 @@ def _sum(a: Matrix, b: Matrix) -> Matrix:
     return [[a[i][j] + b[i][j] for j in (0, 1)] for i in (0, 1)]
 
 
-def coefficients(phi: Blocks, log_d: Array, derived_error: Array) -> Coefficients:
-    """Characteristic coefficients by principal minors; ``derived_error`` ``(3, ...)`` is that of the interpolation."""
+def invariants(phi: Blocks) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """``e1, e2, e3`` by principal minors and what rounding makes of them."""
     a, b, c, d = phi
     s = _sum(transposed_product(d, a), transposed_product(b, c))
     upper, lower = transposed_product(d, b), transposed_product(c, a)
@@ -84,13 +85,22 @@ def coefficients(phi: Blocks, log_d: Array, derived_error: Array) -> Coefficient
     # Principal minors without the first or the second row; the reversor makes the other two equal to them.
     first = s22 * (s11 * s22 - s12 * s21) - u12 * (v12 * s22 - v22 * s21) + u22 * (v12 * s12 - v22 * s11)
     second = s11 * (s11 * s22 - s12 * s21) - u11 * (v11 * s22 - v12 * s21) + u12 * (v11 * s12 - v12 * s11)
-    e3 = 2 * (first + second)
     size = sum(square_norm(block) for block in phi)
     z = jnp.sqrt(2 * square_norm(s) + u11**2 + 2 * u12**2 + u22**2 + v11**2 + 2 * v12**2 + v22**2)
     rounding = _ROUNDINGS * EPS * size
-    errors = tuple(derived_error[k] + rounding * z**k for k in range(3))
+    return (e1, e2, 2 * (first + second)), (rounding, rounding * z, rounding * z**2)
+
+
+def with_determinant(e: Sequence[Array], errors: Sequence[Array], log_d: Array) -> Coefficients:
+    """The coefficients from ``e1, e2, e3``, bounds of their errors, and log d."""
     kappa = jnp.exp(log_d / 4)
-    return Coefficients(e1, e2, e3, kappa, (*errors, 8 * EPS * (1 + jnp.abs(log_d)) * kappa**4))
+    return Coefficients(*e, kappa, (*errors, 8 * EPS * (1 + jnp.abs(log_d)) * kappa**4))
+
+
+def coefficients(phi: Blocks, log_d: Array, derived_error: Array) -> Coefficients:
+    """Characteristic coefficients of ``phi``; ``derived_error`` ``(3, ...)`` is that of the interpolation."""
+    e, rounding = invariants(phi)
+    return with_determinant(e, [derived_error[k] + rounding[k] for k in range(3)], log_d)
 
 
 def _cubic_root(p2: Array, p1: Array, p0: Array) -> Array:
@@ -108,11 +118,13 @@ def _cubic_root(p2: Array, p1: Array, p0: Array) -> Array:
     root = jnp.sqrt(jnp.maximum(p1**2 - 4 * p2 * p0, 0.0))
     top, bottom = jnp.where(p1 > 0, -2 * p0, root - p1), jnp.where(p1 > 0, p1 + root, 2 * p2)
     bound = jnp.where((p2 > 0) & (top < bound * bottom), top / bottom, bound)
-    w = jnp.where(concave, 0.0, bound)
-    for _ in range(_NEWTON_STEPS):
+
+    def step(_: int, w: Array) -> Array:
         value, slope = ((w + p2) * w + p1) * w + p0, (3 * w + 2 * p2) * w + p1
-        w = jnp.where(slope > 0, jnp.maximum(w - value / slope, 0.0), w)
-    return w
+        return jnp.where(slope > 0, jnp.maximum(w - value / slope, 0.0), w)
+
+    # A loop, not its unrolled steps: the compiler would repeat all earlier ones in each of them.
+    return jax.lax.fori_loop(0, _NEWTON_STEPS, step, jnp.where(concave, 0.0, bound))
 
 
 class _Factor(NamedTuple):
@@ -124,19 +136,22 @@ class _Factor(NamedTuple):
     real: Array
 
     @property
-    def moduli(self) -> tuple[Array, Array]:
-        """Moduli of the two roots, the larger first."""
-        large = jnp.where(self.real, jnp.abs(self.half) + self.gap, self.m)
-        return large, self.m * (self.m / large)
+    def large(self) -> Array:
+        """The larger modulus of the two roots."""
+        return jnp.where(self.real, jnp.abs(self.half) + self.gap, self.m)
 
-    def values_of(self, other: _Factor) -> tuple[Array, Array]:
-        """Modulus of the other factor at the two roots."""
-        slope, offset = 2 * (self.half - other.half), (other.m - self.m) * (other.m + self.m)
-        large, small = self.moduli
-        sign = jnp.where(self.half < 0, -1.0, 1.0)
-        at_pair = jnp.sqrt((slope * self.half + offset) ** 2 + (slope * self.gap) ** 2)
-        real = (jnp.abs(slope * sign * x + offset) for x in (large, small))
-        return tuple(jnp.where(self.real, value, at_pair) for value in real)
+    @property
+    def small(self) -> Array:
+        """The smaller modulus of two real roots."""
+        return jnp.abs(self.half) - self.gap
+
+    def difference(self, other: _Factor) -> tuple[Array, Array]:
+        """``slope, offset``: at a root sigma of this factor the other one has the value slope sigma + offset."""
+        return 2 * (self.half - other.half), (other.m - self.m) * (other.m + self.m)
+
+    def where(self, condition: Array, other: _Factor) -> _Factor:
+        """This factor where ``condition`` holds, else the other."""
+        return _Factor(*(jnp.where(condition, a, b) for a, b in zip(self, other, strict=True)))
 
 
 def factors(c: Coefficients) -> tuple[_Factor, _Factor]:
@@ -168,28 +183,60 @@ def _unexplained(c: Coefficients, one: _Factor, two: _Factor) -> tuple[Array, ..
     return tuple(jnp.abs(miss) + error for miss, error in zip(misses, c.errors, strict=True))
 
 
+def _square_at_pair(factor: _Factor, slope: Array, offset: Array) -> Array:
+    """``|slope sigma + offset|^2`` at the complex roots of a factor."""
+    return (slope * factor.half + offset) ** 2 + (slope * factor.gap) ** 2
+
+
+def _at_real(factor: _Factor, modulus: Array, slope: Array, offset: Array) -> Array:
+    """``|slope sigma + offset|`` at the real root of this modulus."""
+    return jnp.abs(jnp.where(factor.half < 0, -slope, slope) * modulus + offset)
+
+
 def spectral_radius(c: Coefficients) -> tuple[Array, Array, Array]:
     """``rho``, a bound of its error, and whether the bound is much wider than it need be (or not a number).
 
     Smith's discs: with eps(sigma) = sum_k error_k |sigma|^(4-k), the true multipliers lie in the union of the discs about
-    the computed ones s_i with radius 4 eps(s_i)/prod_(j != i) |s_i - s_j|, in each connected part as many as centres.
+    the computed ones s_i with radius 4 eps(s_i)/prod_(j != i) |s_i - s_j|, in each connected part as many as centres. The
+    dominant disc, or the pair of them, must lie further out than the others; then its radius bounds the error.
     """
     one, two = factors(c)
     errors = _unexplained(c, one, two)
-    moduli, radii = [], []
-    for factor, other in ((one, two), (two, one)):
-        for modulus, value in zip(factor.moduli, factor.values_of(other), strict=True):
-            eps = ((errors[0] * modulus + errors[1]) * modulus + errors[2]) * modulus + errors[3]
-            moduli.append(modulus)
-            radii.append(2 * eps / (factor.gap * value))
-    rho = jnp.maximum(moduli[0], moduli[2])
-    upper = reduce(jnp.maximum, (m + r for m, r in zip(moduli, radii, strict=True)))
-    first = moduli[0] >= moduli[2]
-    lower = jnp.where(first, moduli[0] - radii[0], moduli[2] - radii[2])
-    # The dominant disc (with its mirror image) must lie apart from the others to hold a multiplier of its own.
-    sibling = jnp.where(first, one.real & (moduli[1] + radii[1] >= lower), two.real & (moduli[3] + radii[3] >= lower))
-    others = jnp.where(first, *(jnp.maximum(moduli[k] + radii[k], moduli[k + 1] + radii[k + 1]) for k in (2, 0)))
-    error = jnp.where(sibling | (others >= lower), jnp.inf, jnp.maximum(upper - rho, rho - lower) + 4 * EPS * rho)
+    first = one.large >= two.large
+    top, other = one.where(first, two), two.where(first, one)
+    rho, m = top.large, other.large
+    # For all four discs: eps grows with the modulus.
+    eps = 2 * (((errors[0] * rho + errors[1]) * rho + errors[2]) * rho + errors[3])
+    slope, offset = top.difference(other)
+    at_top = jnp.where(top.real, _at_real(top, rho, slope, offset), jnp.sqrt(_square_at_pair(top, slope, offset)))
+    radius = eps / (top.gap * at_top)
+    lower = rho - radius
+    # The discs of the others end below: eps/(gap value) < lower - modulus.
+    room, sibling, least = (lower - m) * other.gap, (lower - top.small) * top.gap, (lower - other.small) * other.gap
+    pair = (room > 0) & (eps**2 < room**2 * _square_at_pair(other, slope, offset))
+    real = (eps < room * _at_real(other, m, slope, offset)) & (
+        eps < least * _at_real(other, other.small, slope, offset)
+    )
+    alone = jnp.where(other.real, real, pair)
+    alone &= ~top.real | (eps < sibling * _at_real(top, top.small, slope, offset))
+    error = jnp.where(alone, radius + 4 * EPS * rho, jnp.inf)
     # A double multiplier cannot be bounded better than by the root of the coefficients' own errors.
     given = ((c.errors[0] * rho + c.errors[1]) * rho + c.errors[2]) * rho + c.errors[3]
-    return rho, error, ~(error**2 < 0.01 * given / rho**2)
+    return rho, error, ~((error * rho) ** 2 < 0.01 * given)
+
+
+def nothing_crosses(c: Coefficients, log_d: Array) -> Array:
+    """Whether no polynomial within the errors has a root on the unit circle: as many lie inside for all of them.
+
+    None of p(1), p(-1) and g = 1 + d - b + a^2/4 - w^2/4, w = (a + a d - 2 c)/(1 - d), may vanish, (a, b, c) = (e1, e2, e3):
+    for p = (sigma^2 - P sigma + 1)(sigma^2 - Q sigma + d) is the same as g = 0, and w = P - Q.
+    """
+    a, b, g, d = c.e1, c.e2, c.e3, jnp.exp(log_d)
+    da, db, dg, dd = c.errors
+    missing = -jnp.expm1(log_d)
+    w, dw = (a + a * d - 2 * g) / missing, ((1 + d) * da + 2 * dg) / missing
+    rounding = 8 * EPS * (1 + jnp.abs(a) + jnp.abs(b) + jnp.abs(g) + d + a**2 + w**2)
+    even, odd = 1 + b + d, a + g
+    real = (jnp.abs(even - odd) > da + db + dg + dd + rounding) & (jnp.abs(even + odd) > da + db + dg + dd + rounding)
+    error = db + dd + (jnp.abs(a) + da / 2) * da / 2 + (jnp.abs(w) + dw / 2) * dw / 2 + rounding
+    return real & (jnp.abs(1 + d - b + a**2 / 4 - w**2 / 4) > error) & (missing > 0)

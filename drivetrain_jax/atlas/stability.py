@@ -6,7 +6,6 @@ again by the eigenvalues of Z, as every single point is; without damping the ver
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -19,17 +18,15 @@ from jax import Array
 
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.floquet_results import VARIABLES
-from drivetrain_jax.atlas import conservative, evaluation, quartic
+from drivetrain_jax.atlas import charts, evaluation, quartic
 from drivetrain_jax.atlas.floquet_quantity import Build, judge
-from drivetrain_jax.atlas.panels import Atlas, Panel
+from drivetrain_jax.atlas.panels import Atlas
+from drivetrain_jax.atlas.tiles import Tile, tiles
 from drivetrain_jax.systems import FloquetModel
 
 DEFAULT_OUTPUTS = ("spectral_radius", "spectral_radius_error", "verdict")
 _FAST = frozenset(DEFAULT_OUTPUTS)
 _UNDECIDED = 2
-# Cells of a tile. Columns are the lanes, few enough for their fusions not to be cut into parallel tasks.
-_ROWS, _COLUMNS = 64, 512
-_AHEAD = 4
 _SWAP = np.kron(np.array([[0.0, 1.0], [1.0, 0.0]]), np.eye(2))
 
 
@@ -106,23 +103,26 @@ class StabilityAtlas:
 
     def _fill(self, found: dict[str, np.ndarray], axes: list[np.ndarray], outputs: tuple[str, ...]) -> None:
         """Fill ``found`` tile by tile, then judge again the cells for which the closed form is not good enough."""
-        names = self.atlas.parameters
-        shape = (min(_ROWS, _round_up(len(axes[-2]), 8)), min(_COLUMNS, _round_up(len(axes[-1]), 16)))
-        kernel = _patch_kernel(self.build, names, tuple(sorted(self.atlas.fixed)), self.rtol)
+        names, undamped = self.atlas.parameters, self._may_be_undamped(axes)
+        shape = (min(charts.ROWS, _round_up(len(axes[-2]), 8)), min(charts.COLUMNS, _round_up(len(axes[-1]), 16)))
         coordinates = [c.forward(axis) for c, axis in zip(self.atlas.coordinates, axes, strict=True)]
-        again: list[np.ndarray] = [np.empty((0, len(axes)), int)]
-        pending: deque[tuple[evaluation.Tile, dict[str, Array]]] = deque()
-        for tile in evaluation.tiles(self.atlas, coordinates, shape):
-            values = {name: axis[i] for name, axis, i in zip(names, axes, tile.index, strict=True)}
-            for name, size in zip(names[-2:], shape, strict=True):
-                values[name] = np.pad(values[name], (0, size - len(values[name])), mode="edge")
-            cells = kernel(tile.tensor, tile.rows, tile.columns, _errors(tile.panel), values, self.atlas.fixed)
-            pending.append((tile, cells))
-            # What was asked for last is computed while the results before it are stored.
-            if len(pending) > _AHEAD:
-                again.append(_store(found, *pending.popleft(), outputs))
-        again += [_store(found, *entry, outputs) for entry in pending]
-        self._repair(found, axes, np.concatenate(again), outputs)
+
+        def kernel(dense: bool) -> Any:
+            kind = "undamped" if undamped else "dense" if dense else "sparse"
+            return charts.tile_kernel(self.build, names, self.rtol, kind)
+
+        cut = tiles(self.atlas, coordinates, shape, dense=not undamped)
+        again = [
+            _store(found, tile, cells, outputs)
+            for tile, cells in charts.judged_tiles(cut, axes, names, self.atlas.fixed, kernel)
+        ]
+        self._repair(found, axes, np.concatenate([np.empty((0, len(axes)), int), *again]), outputs)
+
+    def _may_be_undamped(self, axes: Sequence[np.ndarray]) -> bool:
+        """Whether the system is Hamiltonian in any cell."""
+        open_mesh = np.ix_(*axes)
+        model = self.build({**self.atlas.fixed, **dict(zip(self.atlas.parameters, open_mesh, strict=True))})
+        return model.hamiltonian is not None and bool(np.any(model.hamiltonian()))
 
     def _repair(
         self, found: dict[str, np.ndarray], axes: list[np.ndarray], cells: np.ndarray, outputs: tuple[str, ...]
@@ -140,7 +140,7 @@ class StabilityAtlas:
         columns = np.pad(points, ((0, size - len(points)), (0, 0)), mode="edge")
         values = {name: columns[:, k] for k, name in enumerate(self.atlas.parameters)}
         kernel = _point_kernel(self.build, tuple(sorted(self.atlas.fixed)), outputs, self.rtol, self._closed_form)
-        found = kernel(self._tensors[number], weights, _errors(panel), values, self.atlas.fixed)
+        found = kernel(self._tensors[number], weights, charts.errors_of(panel), values, self.atlas.fixed)
         return {name: np.moveaxis(np.asarray(value), -1, 0) for name, value in found.items()}
 
 
@@ -156,66 +156,22 @@ def _blank(outputs: Sequence[str], shape: tuple[int, ...], multipliers: int) -> 
 
 
 def _store(
-    found: dict[str, np.ndarray], tile: evaluation.Tile, cells: Mapping[str, Array], outputs: tuple[str, ...]
+    found: dict[str, np.ndarray], tile: Tile, cells: Mapping[str, np.ndarray], outputs: tuple[str, ...]
 ) -> np.ndarray:
     """Put the results of a tile in their place; the cells to be judged again, as positions along each axis ``(N, d)``."""
     rows, columns = (len(i) for i in tile.index[-2:])
     place = tuple(slice(i[0], i[-1] + 1) for i in tile.index)
     for name in (*outputs, "outcome"):
         part = found[name][place]
-        part[...] = np.asarray(cells[name])[:rows, :columns].reshape(part.shape)
-    unsure = np.argwhere(np.asarray(cells["unsure"])[:rows, :columns])
+        part[...] = cells[name][:rows, :columns].reshape(part.shape)
+    unsure = np.argwhere(cells["unsure"][:rows, :columns]) if cells["unsure"].any() else np.empty((0, 2), int)
     first = [i[0] for i in tile.index]
     leading = np.broadcast_to(np.array(first[:-2], int), (len(unsure), len(first) - 2))
     return np.concatenate([leading, unsure + first[-2:]], axis=1)
 
 
-def _compiler_options() -> dict[str, Any] | None:
-    """Full vector width: XLA uses half of AVX-512 unless told otherwise."""
-    return {"xla_cpu_prefer_vector_width": 512} if jax.default_backend() == "cpu" else None
-
-
-def _errors(panel: Panel) -> np.ndarray:
-    return np.array([panel.value_error, *panel.derived_error])
-
-
 def _round_up(n: int, step: int) -> int:
     return -(-n // step) * step
-
-
-@lru_cache(maxsize=16)
-def _patch_kernel(build: Build, names: tuple[str, ...], fixed_names: tuple[str, ...], rtol: float) -> Any:
-    """Closed-form results ``(R, C)`` of a tile, and which of its cells are to be judged again."""
-
-    def kernel(tensor, rows, columns, errors, values, fixed):
-        leading = {name: values[name][0] for name in names[:-2]}
-
-        # Row by row: all intermediate results of a row stay in the cache, which makes this three times as fast.
-        def row(inputs):
-            weights, value = inputs
-            model = build({**fixed, **leading, names[-2]: value, names[-1]: values[names[-1]]})
-            return _closed_form(model, weights @ columns, errors, rtol)
-
-        first = evaluation.first_product(tensor, rows)
-        return jax.lax.map(row, (first, values[names[-2]]))
-
-    return jax.jit(kernel, compiler_options=_compiler_options())
-
-
-def _closed_form(model: FloquetModel, entries: Array, errors: Array, rtol: float) -> dict[str, Array]:
-    """Results of lanes of Phi, ``(16, N)``."""
-    phi = quartic.blocks(entries)
-    log_determinant = jnp.broadcast_to(model.reduced.log_determinant(), entries.shape[1:])
-    rho, error, unsure = quartic.spectral_radius(quartic.coefficients(phi, log_determinant, errors[1:]))
-    verdict = jnp.where(rho + error < 1, 0, jnp.where(rho - error > 1, 1, _UNDECIDED)).astype(jnp.int8)
-    rho, error, verdict = _without_damping(model, phi, errors[0], rho, error, verdict)
-    return {
-        "spectral_radius": rho,
-        "spectral_radius_error": error,
-        "verdict": verdict,
-        "outcome": jnp.where(error <= 10 * rtol * rho, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET).astype(jnp.int8),
-        "unsure": (unsure & (error > 4 * quartic.EPS)) | (verdict == _UNDECIDED),
-    }
 
 
 @lru_cache(maxsize=16)
@@ -228,34 +184,22 @@ def _point_kernel(
         phi = evaluation.scattered(tensor, weights)
         everything = {**fixed, **values}
         lanes = jnp.broadcast_to(errors[1:, None], (len(errors) - 1, phi.shape[-1]))
-        found = judge(phi, build, everything, lanes, outputs, rtol)
-        if closed_form and _FAST & set(outputs):
-            found |= _judged_without_damping(phi, build(everything), errors[0], found, outputs)
-        return found
+        if not (closed_form and _FAST & set(outputs)):
+            return judge(phi, build, everything, lanes, outputs, rtol)
+        found = judge(phi, build, everything, lanes, tuple({*outputs, *DEFAULT_OUTPUTS}), rtol)
+        found |= _sharper(phi, build(everything), errors, found)
+        return {name: found[name] for name in (*outputs, "outcome")}
 
-    return jax.jit(kernel, compiler_options=_compiler_options())
-
-
-def _judged_without_damping(phi, model, value_error, found, outputs):
-    blank = jnp.zeros(phi.shape[-1])
-    given = [found.get(name, blank) for name in DEFAULT_OUTPUTS]
-    judged = _without_damping(model, quartic.blocks(phi), value_error, *given)
-    return {name: value for name, value in zip(DEFAULT_OUTPUTS, judged, strict=True) if name in outputs}
+    return jax.jit(kernel, compiler_options=charts.compiler_options())
 
 
-def _without_damping(model, phi, value_error, rho, error, verdict):
-    """Exact statements where the system is Hamiltonian: a stable one has all multipliers on the unit circle."""
-    if model.hamiltonian is None:
-        return rho, error, verdict
-    applies = jnp.broadcast_to(jnp.asarray(model.hamiltonian()), rho.shape)
-
-    def exact() -> tuple[Array, Array, Array]:
-        judged = conservative.verdict(phi, value_error)
-        stable = applies & (judged == 0)
-        return (
-            jnp.where(stable, 1.0, rho),
-            jnp.where(stable, 4 * quartic.EPS, error),
-            jnp.where(applies, judged, verdict).astype(jnp.int8),
-        )
-
-    return jax.lax.cond(jnp.any(applies), exact, lambda: (rho, error, verdict.astype(jnp.int8)))
+def _sharper(phi: Array, model: FloquetModel, errors: Array, found: dict[str, Array]) -> dict[str, Array]:
+    """Verdicts also where the interval of rho holds 1, but no multiplier can cross the unit circle (Schur-Cohn), and the
+    exact results of Hamiltonian lanes."""
+    parts, log_d = quartic.blocks(phi), jnp.broadcast_to(model.reduced.log_determinant(), phi.shape[1:])
+    rho, error, verdict = (found[name] for name in DEFAULT_OUTPUTS)
+    settled = quartic.nothing_crosses(quartic.coefficients(parts, log_d, errors[1:, None]), log_d)
+    verdict = jnp.where((verdict == _UNDECIDED) & settled, jnp.where(rho < 1, 0, 1), verdict).astype(jnp.int8)
+    if model.hamiltonian is not None:
+        rho, error, verdict = charts.exactly(charts.exact_verdict(model, parts, errors[0]), rho, error, verdict)
+    return dict(zip(DEFAULT_OUTPUTS, (rho, error, verdict), strict=True))

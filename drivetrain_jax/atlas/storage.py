@@ -36,7 +36,7 @@ def to_arrays(atlas: Atlas) -> Arrays:
         "panel_upper": table(atlas.panels, "upper"),
         "panel_degrees": np.array([p.degrees for p in atlas.panels], np.int32).reshape(-1, d),
         "value_error": np.array([p.value_error for p in atlas.panels]),
-        "derived_error": np.array([p.derived_error for p in atlas.panels]).reshape(len(atlas.panels), -1),
+        "derived_error": np.array([p.derived_error for p in atlas.panels]) if flat else np.empty((0, 0)),
         "gap_lower": table(atlas.gaps, "lower"),
         "gap_upper": table(atlas.gaps, "upper"),
         "gap_reason": np.array([gap.reason for gap in atlas.gaps], dtype=object),

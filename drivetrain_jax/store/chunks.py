@@ -13,6 +13,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -62,12 +63,15 @@ class PartsFolder:
     """The parts of the result ``out``. Writing needs the folder to be open (``open``, ``close``), reading does not."""
 
     def __init__(self, out: Path) -> None:
-        self.path = out.with_name(out.name + ".parts")
+        self.path = out.parent / f"{out.name}.parts"
+        # Where the result grows until it is complete.
+        self.result = self.path / "result.tmp"
         self._plan = self.path / "plan.json"
         self._lock: FileLock | None = None
 
-    def plan(self) -> dict[str, str | None]:
-        """What the parts belong to: ``digest``, and ``replaces``, the digest of the result that they will supersede.
+    def plan(self) -> dict[str, Any]:
+        """What the parts belong to: ``digest``, ``replaces``, the digest of the result that they will supersede, and what
+        else the run wanted remembered.
 
         Empty if there is no readable plan.
         """
@@ -94,10 +98,12 @@ class PartsFolder:
                 return
             lock.release()
 
-    def start(self, plan: Mapping[str, str | None]) -> None:
+    def start(self, plan: Mapping[str, Any]) -> None:
         """Forget all parts and begin those of ``plan``."""
         for entry in self.path.iterdir():
-            if entry.name != "lock":
+            if entry.is_dir():
+                shutil.rmtree(entry)
+            elif entry.name != "lock":
                 entry.unlink()
         write_atomic(self._plan, json.dumps(dict(plan)).encode(), self.path / "plan.tmp")
 
@@ -126,10 +132,14 @@ class PartsFolder:
         path = self.path / f"{int(part.chunks[0]):08d}-{_content_digest(data)}.h5"
         write_atomic(path, data, path.with_suffix(".tmp"))
 
+    def count(self) -> int:
+        """Number of parts, damaged ones included."""
+        return sum(1 for _ in self.path.glob("*-*.h5"))
+
     def read(self, repair: bool = False) -> Iterator[Part]:
         """All intact parts. ``repair`` deletes damaged and half-written ones (only while the folder is open)."""
         if repair:
-            for path in self.path.glob("*.tmp"):
+            for path in set(self.path.glob("*.tmp")) - {self.result}:
                 path.unlink(missing_ok=True)
         for path in sorted(self.path.glob("*-*.h5")):
             part = _read_intact(path)

@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax.store import checksums
 from drivetrain_jax.store.files import move_into_place
 
 
@@ -43,12 +44,13 @@ class ResultFile:
         return self._arrays
 
     def finish(self, path: Path, **attrs: float) -> None:
-        """Change these attributes, flush everything to the disk, and move the file to ``path`` in one step."""
+        """Change these attributes, add checksums, flush all to the disk, and move the file to ``path`` in one step."""
         for array in self._arrays.values():
             array.flush()
         with h5py.File(self._temporary, "r+") as file:
             for name, value in attrs.items():
                 file.attrs.modify(name, value)
+            checksums.seal(file)
         move_into_place(self._temporary, path)
 
 
@@ -70,6 +72,8 @@ def _write_frame(template: xr.Dataset, path: Path) -> int:
     path.write_bytes(head)
     _reserve(path, len(head) + sum(v.nbytes for v in template.data_vars.values()) + (1 << 16) * len(template.data_vars))
     with h5netcdf.File(path, "r+") as file:
+        for dimension in template.sizes.keys() - file.dimensions.keys():
+            file.dimensions[dimension] = template.sizes[dimension]
         for name, variable in template.data_vars.items():
             creation = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
             creation.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
@@ -82,6 +86,8 @@ def _write_frame(template: xr.Dataset, path: Path) -> int:
                 created.attrs[key] = value
             if aside := _coordinates_of(template, variable):
                 created.attrs["coordinates"] = aside
+    with h5py.File(path, "r+") as file:
+        checksums.reserve(file)
     return path.stat().st_size
 
 
@@ -129,6 +135,18 @@ def read_variable(path: Path, name: str) -> np.ndarray:
             return file[name][()]
     except (OSError, KeyError):
         raise _unreadable(path) from None
+
+
+def map_variable(path: Path, name: str) -> np.ndarray:
+    """Like :func:`read_variable`, but in place, not loaded, where the storage of the variable allows that."""
+    try:
+        with h5py.File(path, "r") as file:
+            variable = file[name]
+            if variable.chunks is None and (offset := variable.id.get_offset()) is not None and variable.size:
+                return np.memmap(path, variable.dtype, "r", offset, variable.shape)
+    except (OSError, KeyError):
+        raise _unreadable(path) from None
+    return read_variable(path, name)
 
 
 def open_result(path: Path) -> xr.Dataset:

@@ -44,20 +44,25 @@ class Table:
         self.arrays: Mapping[str, np.ndarray] = {}
 
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
-        """Enter the results of ``points``; the first ones tell the sizes of dimensions that depend on the system."""
+        """Enter the results of ``points``."""
+        self._lay_out_for(results)
+        place = self._grid.place(points)
+        for name, values in results.items():
+            # A fixed path parameter is no dimension of the result.
+            sweep_first(self.arrays[name], self._grid)[place] = values[:, 0] if self._grid.path_is_fixed else values
+
+    def put(self, block: tuple[slice, ...], results: Mapping[str, np.ndarray]) -> None:
+        """Enter the results of a block of the grid, or of a row of the points."""
+        self._lay_out_for(results)
+        for name, values in results.items():
+            self.arrays[name][block] = values
+
+    def _lay_out_for(self, results: Mapping[str, np.ndarray]) -> None:
+        """Make the arrays; the first results tell the sizes of dimensions that depend on the system."""
         if not self.arrays:
             for variable in self.variables:
                 self._sizes |= zip(reversed(variable.dims), reversed(results[variable.name].shape), strict=False)
             self.lay_out()
-        place = self._grid.place(points)
-        for name, values in results.items():
-            # A fixed path parameter is no dimension of the result.
-            self._sweep_first(self.arrays[name])[place] = values[:, 0] if self._grid.path_is_fixed else values
-
-    def _sweep_first(self, array: np.ndarray) -> np.ndarray:
-        """``array`` with the path, if it is an axis, behind all other axes of the sweep."""
-        position = self._grid.path_position
-        return array if position is None else np.moveaxis(array, position, len(self._grid.shape))
 
     def lose(self, points: np.ndarray) -> None:
         """Record that nobody survived the computation of ``points``."""
@@ -67,7 +72,7 @@ class Table:
 
     def _mark_lost(self) -> None:
         for points in self._lost:
-            self._sweep_first(self.arrays[OUTCOME.name])[self._grid.place(points)] = Outcome.LOST
+            sweep_first(self.arrays[OUTCOME.name], self._grid)[self._grid.place(points)] = Outcome.LOST
         self._lost.clear()
 
     def lay_out(self) -> Mapping[str, np.ndarray]:
@@ -79,9 +84,15 @@ class Table:
             blank = {v.name: np.broadcast_to(np.zeros((), v.dtype), shape) for v, shape in shapes.items()}
             self.arrays = self._allocate(to_dataset(self._scene, blank, {}))
             for variable in self.variables:
-                self.arrays[variable.name][...] = _missing(variable)
+                self.arrays[variable.name][...] = missing_value(variable)
             self._mark_lost()
         return self.arrays
+
+
+def sweep_first(array: np.ndarray, grid: Grid) -> np.ndarray:
+    """``array`` of a result with the path, if it is an axis, behind all other axes of the sweep."""
+    position = grid.path_position
+    return array if position is None else np.moveaxis(array, position, len(grid.shape))
 
 
 def _in_memory(template: xr.Dataset) -> dict[str, np.ndarray]:
@@ -93,7 +104,8 @@ def failures(outcome: np.ndarray) -> int:
     return int(np.count_nonzero(outcome > Outcome.TOLERANCE_NOT_MET))
 
 
-def _missing(variable: Variable) -> float | int:
+def missing_value(variable: Variable) -> float | int:
+    """What stands for a result that is not there."""
     if variable.name == OUTCOME.name:
         return Outcome.STEP_LIMIT
     # A flag has no NaN; its last code is the one that claims least (undecided, none).
@@ -120,7 +132,7 @@ def to_dataset(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[st
     sweep_dims = ("point",) if scene.zipped else tuple(axis.name for axis in scene.axes)
     results = [(v, arrays[v.name]) for v in result_variables(scene)]
     coordinates = [*_axis_coordinates(scene), *_resonances(scene)]
-    return build_dataset(sweep_dims, coordinates, scene.dimensions, results, _attrs(scene) | dict(attrs))
+    return build_dataset(sweep_dims, coordinates, scene.dimensions, results, result_attrs(scene) | dict(attrs))
 
 
 def _axis_coordinates(scene: Scene) -> list[Coordinate]:
@@ -155,7 +167,7 @@ def _resonances(scene: Scene) -> list[Coordinate]:
     ]
 
 
-def _attrs(scene: Scene) -> dict[str, str]:
+def result_attrs(scene: Scene) -> dict[str, str]:
     """What the result is of and where it comes from, apart from what each run adds."""
     fixed: dict[str, Any] = {}
     for name, value in scene.fixed.items():

@@ -12,6 +12,8 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter
 
 MAX_POINTS = 2_000_000_000
+# Parameters of an atlas.
+MAX_RANGES = 4
 _SCALES = ("lin", "log")
 
 
@@ -47,9 +49,14 @@ def entry_of(name: str) -> tuple[str, int | None]:
     return (match.group(1), int(match.group(2))) if match else (name, None)
 
 
-def check_count(name: str, spec: AxisTable) -> int:
-    """Number of values of an axis, without making them; refuses incomplete and contradictory ones."""
+def check_count(name: str, spec: AxisTable, continuous: bool) -> int:
+    """Number of values of an axis, without making them; refuses incomplete and contradictory ones.
+
+    Those of a ``continuous`` axis are its two ends.
+    """
     field = f"axes.{name}"
+    if continuous:
+        return _check_range(field, spec)
     if spec.values is not None:
         if any(x is not None for x in (spec.start, spec.stop, spec.num, spec.scale)):
             raise InputError(
@@ -62,7 +69,7 @@ def check_count(name: str, spec: AxisTable) -> int:
         if getattr(spec, key) is None:
             raise InputError(f"{field}.{key}: missing; allowed is start, stop and num, or values")
     if spec.num is None:
-        raise InputError(f"{field}.num: missing; axes without num need the analysis atlas, which does not exist yet")
+        raise InputError(f"{field}.num: missing; allowed is num >= 1 (a range without num: analysis = 'atlas')")
     if spec.num < 1:
         raise InputError(f"{field}.num = {spec.num}: empty axis; allowed is num >= 1")
     if spec.scale not in (None, *_SCALES):
@@ -73,10 +80,24 @@ def check_count(name: str, spec: AxisTable) -> int:
     return spec.num
 
 
+def _check_range(field: str, spec: AxisTable) -> int:
+    for key in ("values", "num", "scale"):
+        if getattr(spec, key) is not None:
+            raise InputError(f"{field}.{key} = {getattr(spec, key)!r}: an atlas has ranges; allowed is start and stop")
+    for key in ("start", "stop"):
+        if getattr(spec, key) is None:
+            raise InputError(f"{field}.{key}: missing; allowed is start and stop")
+    if not spec.start < spec.stop:
+        raise InputError(f"{field}.stop = {spec.stop!r}: allowed is stop > start = {spec.start!r}")
+    return 2
+
+
 def spread(spec: AxisTable, field: str) -> np.ndarray:
     """The values of a checked axis; no value may occur twice."""
     if spec.values is not None:
         values = np.array(spec.values, float)
+    elif spec.num is None:
+        values = np.array([spec.start, spec.stop], float)
     else:
         values = (np.geomspace if spec.scale == "log" else np.linspace)(float(spec.start), float(spec.stop), spec.num)
     ordered = np.sort(values)

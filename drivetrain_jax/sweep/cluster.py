@@ -32,7 +32,7 @@ def run_cluster(chunks: Iterable[Chunk], job: Job, address: str) -> Iterator[tup
         room = IN_FLIGHT * max(sum(client.nthreads().values()), 1)
         while True:
             while len(running) < room and (chunk := next(remaining, None)) is not None:
-                future = client.submit(worker.compute, job, chunk.number, key=f"chunk-{chunk.number}-{job.digest}")
+                future = client.submit(worker.compute, job, chunk, key=f"chunk-{chunk.number}-{job.digest}")
                 running[future.key] = chunk
                 finished.add(future)
             if not running:

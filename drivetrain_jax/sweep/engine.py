@@ -6,14 +6,15 @@ import threading
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
+from drivetrain_jax.store.provenance import digest
 from drivetrain_jax.sweep import compile_cache
-from drivetrain_jax.sweep.assemble import result_variables
 from drivetrain_jax.sweep.grid import Grid
-from drivetrain_jax.sweep.identity import numerics, scene_digest
-from drivetrain_jax.sweep.kernel import Kernel, compile_kernel
+from drivetrain_jax.sweep.identity import numerics_of, scene_digest
+from drivetrain_jax.sweep.kernel import Kernel, kernel_of
 from drivetrain_jax.sweep.plan import Chunk, Plan, make_plan
 from drivetrain_jax.sweep.scene import Scene
 
@@ -23,19 +24,32 @@ class ChunkError(RuntimeError):
 
 
 class Engine:
-    """Computes the chunks of one scene. Everything costly is made on first use."""
+    """Computes the chunks of one scene. Everything costly is made on first use.
 
-    def __init__(self, scene: Scene) -> None:
+    ``points`` restricts the plan to these points of the grid; ``full_size`` see :func:`make_plan`.
+    """
+
+    def __init__(self, scene: Scene, points: np.ndarray | None = None, *, full_size: bool = False) -> None:
         self.scene = scene
         self.grid = Grid.of(scene)
         self.solvers = scene.analysis.solvers(scene.system, scene.request)
-        self._kernels: dict[int, Future[Kernel]] = {}
+        self._points, self._full_size = points, full_size
+        self._kernels: dict[tuple[int, int], Future[Kernel]] = {}
         self._lock = threading.Lock()
+
+    def only(self, points: np.ndarray) -> Engine:
+        """The same for these points of the grid."""
+        return Engine(self.scene, points, full_size=self._full_size)
 
     @cached_property
     def numerics(self) -> str:
         """Digest of the code and the machine that compute."""
-        return numerics(self.scene)
+        return digest(self.numerics_detail)
+
+    @cached_property
+    def numerics_detail(self) -> dict[str, Any]:
+        """What that digest is of, piece by piece."""
+        return numerics_of(self.scene)
 
     @cached_property
     def digest(self) -> str:
@@ -45,35 +59,36 @@ class Engine:
     @cached_property
     def plan(self) -> Plan:
         """Solver and chunk of every point."""
-        return make_plan(self.solvers, self.grid)
+        return make_plan(self.solvers, self.grid, self._points, full_size=self._full_size)
 
     @property
     def total(self) -> int:
         """Number of points, those along a path counted one by one."""
-        return self.grid.size * self.grid.path_length
+        return (self.grid.size if self._points is None else len(self._points)) * self.grid.path_length
 
     def ordered(self, numbers: Iterable[int]) -> list[Chunk]:
         """The chunks with these numbers, the costliest first."""
         costs = self.plan.costs
         return [self.plan.chunk(number) for number in sorted(numbers, key=lambda number: -costs[number])]
 
-    def prepare(self, groups: Iterable[int]) -> None:
-        """Begin to compile the kernels of these groups of the plan, side by side, without waiting for them."""
-        compile_cache.enable()
-        variables = result_variables(self.scene)
+    def prepare(self, chunks: Iterable[Chunk]) -> None:
+        """Begin to compile the kernels of these chunks, side by side, without waiting for them."""
         with self._lock:
-            missing = [index for index in groups if index not in self._kernels]
-            pool = ThreadPoolExecutor(max(len(missing), 1), thread_name_prefix="compile")
-            for index in missing:
-                group = self.plan.groups[index]
-                self._kernels[index] = pool.submit(compile_kernel, group.solver, self.grid, group.chunk, variables)
+            missing = {(chunk.solver, chunk.size) for chunk in chunks} - self._kernels.keys()
+            if not missing:
+                return
+            compile_cache.enable()
+            pool = ThreadPoolExecutor(len(missing), thread_name_prefix="compile")
+            for solver, size in missing:
+                self._kernels[solver, size] = pool.submit(kernel_of, self.scene, self.grid, self.solvers[solver], size)
             pool.shutdown(wait=False)
 
     def compute_chunk(self, chunk: Chunk) -> Mapping[str, np.ndarray]:
         """Results of one chunk; may be called from several threads. Raises :class:`ChunkError`."""
-        self.prepare([chunk.group])
+        self.prepare([chunk])
         try:
-            return self._kernels[chunk.group].result()(self.grid.columns(chunk.points), chunk.effort)
+            kernel = self._kernels[chunk.solver, chunk.size].result()
+            return kernel(self.grid.columns(chunk.points), chunk.effort)
         except Exception as error:
-            solver = self.plan.groups[chunk.group].solver.name
+            solver = self.solvers[chunk.solver].name
             raise ChunkError(f"chunk {chunk.number} ({solver}): {type(error).__name__}: {error}") from error

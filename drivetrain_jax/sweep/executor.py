@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.store.provenance import usable_cores
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.plan import Chunk
+
+if TYPE_CHECKING:
+    from drivetrain_jax.sweep.worker import Job
 
 Results = Mapping[str, np.ndarray]
 # Chunks handed out per worker: one that is computed and one that waits, so that none idles while results are stored.
@@ -45,11 +49,18 @@ class Where:
         """
         chunks = engine.ordered(numbers)
         if self.workers is None and self.dask is None:
-            engine.prepare({chunk.group for chunk in chunks})
-            return run_threads(chunks, engine.compute_chunk, self.threads or usable_cores())
+            engine.prepare(chunks)
         from drivetrain_jax.sweep.worker import Job
 
-        job = Job(engine.scene.text, engine.digest)
+        return self.each(chunks, engine.compute_chunk, Job(engine.scene.text, engine.digest))
+
+    def each(
+        self, chunks: Iterable[Any], here: Callable[[Any], Results], job: Job
+    ) -> Iterator[tuple[Any, Results | None]]:
+        """``(chunk, results)`` like :meth:`compute` for any numbered pieces of work: done by ``here`` in threads of this
+        process, else by ``job.do`` elsewhere."""
+        if self.workers is None and self.dask is None:
+            return run_threads(chunks, here, self.threads or usable_cores())
         if self.workers is not None:
             from drivetrain_jax.sweep.processes import run_processes
 

@@ -8,6 +8,7 @@ import os
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -23,24 +24,22 @@ _ENGINE = ("sweep/grid.py", "sweep/plan.py", "sweep/kernel.py")
 _NUMERIC = ("drivetrain_jax._quantities", "drivetrain_jax.systems", "drivetrain_jax.analysis", "drivetrain_jax.atlas")
 
 
-def numerics(scene: Scene) -> str:
-    """Digest of the code that this scene runs and of the machine's instruction set; versions of all that computes
-    included. Code of other systems and analyses may change without making a result stale."""
+def numerics_of(scene: Scene) -> dict[str, Any]:
+    """The code that this scene runs, the versions of all that computes, and the machine's instruction set: what decides
+    the bits of its numbers. Code of other systems and analyses may change without making a result stale."""
     starts = [_ROOT / name for name in _ENGINE]
     for function in (scene.system.models[scene.analysis.name].build, scene.analysis.solvers):
         # A partial has no source of its own.
         starts.append(Path(inspect.getsourcefile(getattr(function, "func", function)) or ""))
     files = {_label(path): path for path in _imported(starts)}
-    return digest(
-        {
-            "sources": source_digest(files),
-            "versions": versions(PACKAGES),
-            "x64": bool(jax.config.jax_enable_x64),
-            "backend": jax.default_backend(),
-            "flags": os.environ.get("XLA_FLAGS", ""),
-            "instructions": sorted(instruction_set()),
-        }
-    )
+    return {
+        "sources": {name: source_digest({name: path}) for name, path in sorted(files.items())},
+        "versions": versions(PACKAGES),
+        "x64": bool(jax.config.jax_enable_x64),
+        "backend": jax.default_backend(),
+        "flags": os.environ.get("XLA_FLAGS", ""),
+        "instructions": " ".join(sorted(instruction_set())),
+    }
 
 
 def _label(path: Path) -> str:
@@ -80,19 +79,26 @@ def _files(name: str) -> list[Path]:
     return [file for stem in stems for file in (stem.with_suffix(".py"), stem / "__init__.py") if file.is_file()]
 
 
+def scene_content(scene: Scene) -> dict[str, Any]:
+    """What a scene asks for, its title apart."""
+    request = scene.request
+    return {
+        "system": scene.system.name,
+        "analysis": scene.analysis.name,
+        "outputs": request.outputs,
+        "method": request.method,
+        "options": dict(request.options),
+        "axes": [[axis.name, axis.values] for axis in scene.axes],
+        "zipped": scene.zipped,
+        "fixed": dict(scene.fixed),
+    }
+
+
 def scene_digest(scene: Scene, solvers: Sequence[Solver], numerics: str) -> str:
     """Digest of what is computed: scene (not its title), sizes of chunks, package version, numerics."""
-    request = scene.request
     return digest(
-        {
-            "system": scene.system.name,
-            "analysis": scene.analysis.name,
-            "outputs": request.outputs,
-            "method": request.method,
-            "options": dict(request.options),
-            "axes": [[axis.name, axis.values] for axis in scene.axes],
-            "zipped": scene.zipped,
-            "fixed": dict(scene.fixed),
+        scene_content(scene)
+        | {
             "solvers": [[solver.name, solver.chunk, solver.unit_cost] for solver in solvers],
             "version": drivetrain_jax.__version__,
             "numerics": numerics,

@@ -1,11 +1,12 @@
-"""Compiled batches: the only place where points are batched and compiled."""
+"""Compiled batches: the only place where points are batched and compiled, once for all scenes of a process."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -16,7 +17,9 @@ from jax import Array
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import Solver
 from drivetrain_jax.store.provenance import instruction_set
+from drivetrain_jax.sweep.assemble import result_variables
 from drivetrain_jax.sweep.grid import Grid
+from drivetrain_jax.sweep.scene import Scene
 
 _LAPACK = threading.Lock()
 
@@ -45,11 +48,10 @@ class Kernel:
         return arrays
 
 
-def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[Variable]) -> Kernel:
-    """Compile ``solver`` for chunks of ``chunk`` points of ``grid``.
-
-    Fixed parameters are constants of the compiled code; the varying ones and the effort are its arguments.
-    """
+def _batch(
+    solver: Solver, grid: Grid, chunk: int, variables: Sequence[Variable]
+) -> tuple[Callable[..., dict[str, Array]], dict[str, jax.ShapeDtypeStruct]]:
+    """The function of a whole chunk, and the kinds of its varying parameters."""
     own = {v.name: len(v.dims) + (grid.path is not None) for v in variables}
 
     def one(columns: Mapping[str, Any], effort: Array) -> dict[str, Array]:
@@ -63,9 +65,63 @@ def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[V
 
     batch = whole if solver.broadcasts else jax.vmap(one, in_axes=(0, None), axis_size=chunk)
     columns = {axis.name: jax.ShapeDtypeStruct((chunk,), axis.values.dtype) for axis in grid.axes}
+    return batch, columns
+
+
+def result_shapes(scene: Scene, grid: Grid, solver: Solver) -> dict[str, tuple[int, ...]]:
+    """The shape of every result at one point (or line); nothing is compiled or computed."""
+    variables = result_variables(scene)
+    batch, columns = _batch(solver, grid, 1, variables)
+    shapes = jax.eval_shape(batch, columns, jax.ShapeDtypeStruct((), np.int64))
+    return {v.name: shapes[v.name].shape[:-1] if solver.broadcasts else shapes[v.name].shape[1:] for v in variables}
+
+
+def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[Variable]) -> Kernel:
+    """Compile ``solver`` for chunks of ``chunk`` points of ``grid``.
+
+    Fixed parameters are constants of the compiled code; the varying ones and the effort are its arguments.
+    """
+    batch, columns = _batch(solver, grid, chunk, variables)
     lowered = jax.jit(batch).lower(columns, jax.ShapeDtypeStruct((), np.int64))
     compiled = lowered.compile(_compiler_options())
     return Kernel(compiled, chunk, solver.broadcasts, tuple(variables), _turn(compiled))
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What a kernel is compiled for; two jobs are equal if one kernel serves both."""
+
+    identity: tuple[Any, ...]
+    scene: Scene = field(compare=False)
+    grid: Grid = field(compare=False)
+    solver: Solver = field(compare=False)
+
+
+def kernel_of(scene: Scene, grid: Grid, solver: Solver, size: int) -> Kernel:
+    """The kernel of ``solver`` for chunks of ``size`` points of ``scene``, made if no scene before needed the same."""
+    # What varies is an argument of the kernel, so one value of each axis is enough to keep.
+    axes = tuple(replace(axis, values=axis.values[:1]) for axis in grid.axes)
+    request = scene.request
+    path = None if grid.path is None else (grid.path.name, grid.path.values.tobytes())
+    identity = (
+        # The job keeps both alive, so that no other ones can take over their identities.
+        id(scene.system),
+        id(scene.analysis),
+        request.outputs,
+        request.method,
+        tuple(request.options.items()),
+        tuple(scene.fixed.items()),
+        tuple((axis.name, axis.values.dtype) for axis in axes),
+        path,
+        solver.name,
+        size,
+    )
+    return _compiled(_Job(identity, replace(scene, axes=axes), replace(grid, axes=axes), solver), size)
+
+
+@lru_cache(maxsize=64)
+def _compiled(job: _Job, size: int) -> Kernel:
+    return compile_kernel(job.solver, job.grid, size, result_variables(job.scene))
 
 
 def _turn(compiled: Any) -> AbstractContextManager[object]:

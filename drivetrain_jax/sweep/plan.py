@@ -23,9 +23,10 @@ _LANES = 16
 class Group:
     """The points of one solver: ``order`` their numbers by rising effort, cut into ``len(efforts)`` chunks.
 
-    ``efforts`` is the largest effort within each chunk.
+    ``index`` is the position of the solver, ``efforts`` the largest effort within each chunk.
     """
 
+    index: int
     solver: Solver
     order: np.ndarray
     efforts: np.ndarray
@@ -34,10 +35,14 @@ class Group:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Number, solver (position in ``Plan.groups``), points (at most the chunk size of the group) and effort."""
+    """Number, position of the solver, points, the ``size`` that they are filled up to, and the largest effort.
+
+    It says all that a worker has to know beside the scene.
+    """
 
     number: int
-    group: int
+    solver: int
+    size: int
     points: np.ndarray
     effort: int
 
@@ -56,11 +61,11 @@ class Plan:
     def chunk(self, number: int) -> Chunk:
         """Chunk number ``number``."""
         first = 0
-        for index, group in enumerate(self.groups):
+        for group in self.groups:
             k = number - first
             if k < len(group.efforts):
                 points = group.order[k * group.chunk : (k + 1) * group.chunk]
-                return Chunk(number, index, points, int(group.efforts[k]))
+                return Chunk(number, group.index, group.chunk, points, int(group.efforts[k]))
             first += len(group.efforts)
         raise IndexError(number)
 
@@ -73,22 +78,30 @@ def chunk_size(largest: int, count: int) -> int:
     return min(largest, -(-share // _LANES) * _LANES)
 
 
-def make_plan(solvers: Sequence[Solver], grid: Grid) -> Plan:
-    """Give every point to the solver with the smallest predicted cost (the first of equals)."""
-    choice = np.empty(grid.size, np.int8)
-    effort = np.empty(grid.size, np.int64)
-    for start in range(0, grid.size, _BLOCK):
-        points = np.arange(start, min(start + _BLOCK, grid.size))
-        choice[points], effort[points] = _cheapest(solvers, grid, points)
+def make_plan(
+    solvers: Sequence[Solver], grid: Grid, points: np.ndarray | None = None, *, full_size: bool = False
+) -> Plan:
+    """Give every one of ``points`` (all of ``grid``) to the solver with the smallest predicted cost, the first of equals.
+
+    ``full_size`` keeps the size of chunks where points are few, so that further plans need no other kernels.
+    """
+    count = grid.size if points is None else len(points)
+    choice = np.empty(count, np.int8)
+    effort = np.empty(count, np.int64)
+    for start in range(0, count, _BLOCK):
+        block = slice(start, min(start + _BLOCK, count))
+        chosen = np.arange(block.start, block.stop) if points is None else points[block]
+        choice[block], effort[block] = _cheapest(solvers, grid, chosen)
     groups = []
     for index, solver in enumerate(solvers):
         mine = np.flatnonzero(choice == index)
         if not mine.size:
             continue
-        order = mine[np.argsort(effort[mine], kind="stable")]
-        size = chunk_size(solver.chunk, order.size)
-        last = np.minimum(np.arange(size, order.size + size, size), order.size) - 1
-        groups.append(Group(solver, order, effort[order[last]], size))
+        mine = mine[np.argsort(effort[mine], kind="stable")]
+        size = solver.chunk if full_size else chunk_size(solver.chunk, mine.size)
+        last = np.minimum(np.arange(size, mine.size + size, size), mine.size) - 1
+        order = mine if points is None else points[mine]
+        groups.append(Group(index, solver, order, effort[mine[last]], size))
     return Plan(tuple(groups))
 
 

@@ -6,7 +6,6 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,11 +13,8 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request
-from drivetrain_jax.sweep import compile_cache
-from drivetrain_jax.sweep.assemble import Table, result_variables
+from drivetrain_jax.sweep.assemble import Table
 from drivetrain_jax.sweep.engine import Engine
-from drivetrain_jax.sweep.kernel import Kernel, compile_kernel
-from drivetrain_jax.sweep.plan import Group
 from drivetrain_jax.sweep.scene import load_scene, system_and_analysis
 
 
@@ -148,31 +144,11 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
     return tree
 
 
-@dataclass(frozen=True)
-class _Job:
-    """What a kernel is compiled for; two jobs are equal if one kernel serves both."""
-
-    identity: tuple[Any, ...]
-    engine: Engine = field(compare=False)
-    group: Group = field(compare=False)
-
-
-@lru_cache(maxsize=64)
-def _kernel(job: _Job) -> Kernel:
-    compile_cache.enable()
-    return compile_kernel(job.group.solver, job.engine.grid, job.group.chunk, result_variables(job.engine.scene))
-
-
 def _compute(engine: Engine) -> Table:
-    scene = engine.scene
-    table = Table(scene, engine.grid)
-    request = scene.request
-    what = (request.outputs, request.method, tuple(request.options.items()), tuple(scene.fixed.items()))
-    names = tuple((axis.name, axis.values.dtype) for axis in scene.axes)
-    for group in engine.plan.groups:
-        identity = (id(scene.system), id(scene.analysis), *what, names, group.solver.name, group.chunk)
-        kernel = _kernel(_Job(identity, engine, group))
-        table.fill(group.order, kernel(engine.grid.columns(group.order), int(group.efforts[0])))
+    table = Table(engine.scene, engine.grid)
+    for number in range(len(engine.plan.costs)):
+        chunk = engine.plan.chunk(number)
+        table.fill(chunk.points, engine.compute_chunk(chunk))
     return table
 
 

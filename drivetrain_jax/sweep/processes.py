@@ -78,7 +78,7 @@ class _Slot:
         """Give the process what it has room for."""
         while len(self.running) < IN_FLIGHT and (chunk := waiting.take()) is not None:
             try:
-                self.running[self._pool.submit(worker.compute, self._job, chunk.number)] = chunk
+                self.running[self._pool.submit(worker.compute, self._job, chunk)] = chunk
             except BrokenProcessPool:
                 # It has just died; what it was computing tells so when it is collected.
                 waiting.put_back([chunk])

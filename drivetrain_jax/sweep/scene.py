@@ -16,9 +16,13 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter
 from drivetrain_jax.analysis import OUTCOME, Analysis, Request, get_analysis
+from drivetrain_jax.store.provenance import physical_memory
 from drivetrain_jax.sweep import toml
-from drivetrain_jax.sweep.axes import MAX_POINTS, Axis, AxisTable, check_count, entry_of, spread
+from drivetrain_jax.sweep.axes import MAX_POINTS, MAX_RANGES, Axis, AxisTable, check_count, entry_of, spread
 from drivetrain_jax.systems import Model, System, get_system
+
+# What the plan of a run takes for each point, and so does an axis while it is made and checked.
+_BYTES = 32
 
 Value = float | int | str | tuple[float, ...]
 
@@ -66,7 +70,7 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
     table = _convert(tree, _SceneTable, "")
     system, analysis = system_and_analysis(table.system, table.analysis)
     request = _request(table, analysis)
-    axes, zipped = _axes(table, system)
+    axes, zipped = _axes(table, system, analysis)
     fixed = _fixed(table, system, analysis, axes)
     path_axis = _path_axis(analysis, request, axes, zipped, fixed)
     dimensions = analysis.dimensions(system, request, fixed)
@@ -183,19 +187,32 @@ def _checked(parameter: Parameter, value: Any, where: str) -> Value:
         raise InputError(f"{where}{parameter.name} = {_short(value)}: allowed is {parameter.allowed}") from None
 
 
-def _axes(table: _SceneTable, system: System) -> tuple[tuple[Axis, ...], bool]:
+def _axes(table: _SceneTable, system: System, analysis: Analysis) -> tuple[tuple[Axis, ...], bool]:
     """The varying parameters; counted before a single value is made."""
     if table.axes and table.points:
         raise InputError("points: given together with axes; allowed is one of the two")
+    if analysis.continuous:
+        _check_ranges(table, analysis)
     for where, name in [("axes", n) for n in table.axes] + [("points", n) for n in table.points]:
         _swept_parameter(system, where, name)
     if table.points:
         return _points(table, system), True
     specs = {name: _axis_table(name, value) for name, value in table.axes.items()}
-    total = math.prod(check_count(name, spec) for name, spec in specs.items())
+    total = math.prod(check_count(name, spec, analysis.continuous) for name, spec in specs.items())
     if total > MAX_POINTS:
         raise InputError(f"axes: {total} points; allowed is up to {MAX_POINTS}")
+    needed, present = total * _BYTES, physical_memory()
+    if needed > present:
+        limit = f"allowed here is up to {int(present / _BYTES)} points"
+        raise InputError(f"axes: {total} points need {needed / 1e9:.0f} GB of memory; {limit}")
     return tuple(_axis(system, name, spec) for name, spec in specs.items()), False
+
+
+def _check_ranges(table: _SceneTable, analysis: Analysis) -> None:
+    if table.points:
+        raise InputError(f"points: {analysis.name} is made over ranges; allowed are axes with start and stop")
+    if not 1 <= len(table.axes) <= MAX_RANGES:
+        raise InputError(f"axes: {len(table.axes)} are given; {analysis.name} allows 1 to {MAX_RANGES}")
 
 
 def _axis_table(name: str, given: Any) -> AxisTable:

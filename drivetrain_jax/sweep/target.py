@@ -2,34 +2,51 @@
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME
+from drivetrain_jax.store import shards
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.consolidate import read_attribute, read_variable
 from drivetrain_jax.sweep.assemble import failures
+from drivetrain_jax.sweep.atlas_choice import uses_atlas
+from drivetrain_jax.sweep.engine import Engine
+from drivetrain_jax.sweep.explain import differences
+from drivetrain_jax.sweep.growing import NOTHING, NotReusable, Taken, find, take
 
 
 class Target:
-    """The result file ``out`` and the folder of its parts, seen by a scene with this ``digest``.
+    """The result file ``out`` and the folder of its parts, seen by the scene of ``engine``.
 
     ``state`` is ``absent``, ``partial``, ``complete`` or ``stale`` (a result or parts of another scene or version).
     Raises :class:`InputError` if nothing can be written there, or if a file there is not a result of this package.
     """
 
-    def __init__(self, out: Path, digest: str) -> None:
-        _check_place(out)
+    def __init__(self, out: Path, engine: Engine, store: str | None = None) -> None:
         self.out = out
         self.parts = PartsFolder(out)
+        _restore_former(out, self.parts)
+        self.store = store or self._kind()
+        _check_place(out, self.store)
         if self.parts.path.exists() and not self.parts.path.is_dir():
             raise InputError(
                 f"out = {str(out)!r}: {str(self.parts.path)!r} is in the way; allowed is to move that file away"
             )
-        self.digest = digest
+        self.engine, self.digest = engine, engine.digest
         self.present = _digest_of(out)
+
+    def _kind(self) -> str:
+        """``hdf5`` or ``zarr``, after what is there."""
+        return "zarr" if shards.is_store(self.out) else self.parts.plan().get("store", "hdf5")
 
     @cached_property
     def state(self) -> str:
@@ -38,44 +55,154 @@ class Target:
             return "complete"
         if self.parts.holds_work():
             # Parts that are to replace another result belong to that one alone.
-            return "partial" if self.parts.plan() == self.plan else "stale"
-        return "absent" if self.present is None else "stale"
+            return "partial" if _same(self.parts.plan(), self.plan(), ("digest", "replaces", "store")) else "stale"
+        if self.present is None:
+            return "absent"
+        return "partial" if self._grows else "stale"
 
-    @property
-    def plan(self) -> dict[str, str | None]:
-        """What parts written now belong to."""
-        return {"digest": self.digest, "replaces": self.present}
+    def plan(self, taken: Taken = NOTHING) -> dict[str, Any]:
+        """What parts written now belong to, and what a reader needs to know of them."""
+        return {
+            "digest": self.digest,
+            "replaces": self.present,
+            "store": self.store,
+            "reuses": taken.digest,
+            "reused": int(taken.points.size),
+            "reused_files": [os.path.relpath(source.path, self.out.parent) for source in taken.sources],
+            **provenance_of(self.engine),
+        }
+
+    @cached_property
+    def _grows(self) -> bool:
+        """Whether the result that is there is one of fewer points of this scene, so that replacing it loses none."""
+        if self.engine.scene.analysis.continuous or self.present is None or self.store == "zarr":
+            return False
+        try:
+            return find(self.engine, self.out).is_covered
+        except NotReusable:
+            return False
+
+    def take(self, reuse: Sequence[str | Path], fresh: bool) -> Taken:
+        """The points that a run takes from the results ``reuse`` and, unless it is ``fresh``, from the one in its place.
+
+        Raises :class:`InputError` if unfinished work was begun with others, or if one of ``reuse`` has nothing to give.
+        """
+        scene = self.engine.scene
+        if self.store == "zarr":
+            if reuse:
+                raise InputError("reuse: given together with store = 'zarr'; allowed is one of them")
+            return NOTHING
+        if scene.analysis.continuous or uses_atlas(scene):
+            if reuse:
+                raise InputError("reuse: an atlas is made anew; allowed for a scene that solves every point directly")
+            return NOTHING
+        paths = [Path(path) for path in reuse]
+        taken = take(self.engine, [*paths, self.out] if self._grows and not fresh else paths)
+        if not fresh and self.parts.holds_work() and self.parts.plan().get("reuses") != taken.digest:
+            files = ", ".join(self.parts.plan().get("reused_files") or ["no other result"])
+            raise InputError(
+                f"reuse = {[str(p) for p in paths]}: the unfinished work at {str(self.out)!r} takes points from {files}; "
+                "allowed is the same again, or --fresh"
+            )
+        return taken
+
+    def taken_before(self) -> Taken:
+        """The points that unfinished work takes from other results, or a run would."""
+        if not self.parts.holds_work():
+            return self.take((), fresh=False)
+        names = self.parts.plan().get("reused_files") or ()
+        return take(self.engine, [self.out.parent / name for name in names])
 
     @property
     def obstacle(self) -> str:
-        """What makes it stale."""
-        return "a result" if self.present is not None else "unfinished work"
+        """Why a run is refused, or would be: what is there, and what makes it another one's."""
+        if self.parts.holds_work():
+            stored, what = self.parts.plan(), "unfinished work"
+            if self.present != stored.get("replaces"):
+                return f"{what} beside another result than the one it was begun with"
+            if self.store != stored.get("store"):
+                return f"{what} of --store {stored.get('store')}"
+        else:
+            stored, what = {name: _attribute(self.out, name) for name in provenance_of(self.engine)}, "a result"
+        reasons = differences(stored, self.engine) if stored else ["it cannot be told which"]
+        more = f" and {len(reasons) - 2} more" if len(reasons) > 2 else ""
+        return f"{what} of another scene or version: {'; '.join(reasons[:2]) or 'other sizes of chunks'}{more}"
+
+    @property
+    def outcomes(self) -> np.ndarray:
+        """Outcomes of all points of the complete result."""
+        if self.store == "zarr":
+            return np.concatenate(
+                [a.ravel() for a in shards.finished(self.out, OUTCOME.name)] or [np.empty(0, np.int8)]
+            )
+        return read_variable(self.out, OUTCOME.name)
 
     @property
     def failed(self) -> int:
-        """Number of points without a value in the complete result."""
-        return failures(read_variable(self.out, OUTCOME.name))
+        """Number of points without a value in the complete result. A function of the parameters has no points."""
+        return 0 if self._solves is not None else failures(self.outcomes)
+
+    def points(self, total: int) -> int:
+        """What the complete result took: the ``total`` points of its grid, or the solves behind a function."""
+        return total if self._solves is None else self._solves
+
+    @property
+    def is_function(self) -> bool:
+        """Whether the complete result is a function of the parameters instead of points."""
+        return self._solves is not None
+
+    @property
+    def _solves(self) -> int | None:
+        value = _attribute(self.out, "solves")
+        return None if value is None else int(np.squeeze(value))
 
 
-def _check_place(out: Path) -> None:
+def provenance_of(engine: Engine) -> dict[str, str]:
+    """What tells later why work is not that of a scene."""
+    return {
+        "scene": engine.scene.text,
+        "drivetrain_jax_version": drivetrain_jax.__version__,
+        "numerics": engine.numerics,
+        "numerics_detail": json.dumps(engine.numerics_detail),
+    }
+
+
+def _same(one: Mapping[str, Any], other: Mapping[str, Any], names: Iterable[str]) -> bool:
+    return all(one.get(name) == other.get(name) for name in names)
+
+
+def _restore_former(out: Path, parts: PartsFolder) -> None:
+    """Put a store back that a run was killed over while it replaced it."""
+    former = parts.path / "former"
+    if former.exists() and not out.exists():
+        former.rename(out)
+
+
+def _check_place(out: Path, store: str) -> None:
     folder = out.parent
     if not folder.is_dir():
         raise InputError(
             f"out = {str(out)!r}: the folder {str(folder)!r} does not exist; allowed is a file in an existing folder"
         )
-    if out.is_dir():
+    if out.is_dir() and not (store == "zarr" and shards.is_store(out)):
         raise InputError(f"out = {str(out)!r}: is a folder; allowed is the path of a file")
+    if out.is_file() and store == "zarr":
+        raise InputError(f"out = {str(out)!r}: is a file; allowed for store = 'zarr' is a new path, or such a store")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InputError(
             f"out = {str(out)!r}: the folder {str(folder)!r} is not writable; allowed is a file in a writable folder"
         )
 
 
+def _attribute(out: Path, name: str) -> Any:
+    return shards.attributes(out).get(name) if out.is_dir() else read_attribute(out, name)
+
+
 def _digest_of(out: Path) -> str | None:
     """Digest of the result at ``out``, None if there is no file."""
     if not out.exists():
         return None
-    digest = read_attribute(out, "digest")
+    digest = _attribute(out, "digest")
     if not isinstance(digest, str):
         raise InputError(f"out = {str(out)!r}: not a result of drivetrain_jax; allowed is a new file or such a result")
     return digest

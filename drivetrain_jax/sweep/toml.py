@@ -32,6 +32,8 @@ def read(
             end = f"at line {len(text.splitlines())}, the end of the file"
             reason = str(error).replace("at end of document", end)
             raise InputError(f"scene = {str(source)!r}: not valid TOML: {reason}") from None
+        except RecursionError:
+            raise InputError(f"scene = {str(source)!r}: not valid TOML: nested too deeply") from None
     if overrides:
         text = None
         for key, value in overrides.items():

@@ -1,4 +1,4 @@
-"""What another process does for a run: it makes the scene's engine ready once and computes chunks by number."""
+"""What another process does for a run: it makes the scene's engine ready once and computes chunks."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from drivetrain_jax.sweep.engine import ChunkError, Engine
+from drivetrain_jax.sweep.plan import Chunk
 from drivetrain_jax.sweep.scene import load_scene
 
 
@@ -24,6 +26,10 @@ class Job:
 
     scene: str
     digest: str
+
+    def do(self, engine: Engine, chunk: Any) -> Mapping[str, np.ndarray]:
+        """What is computed for ``chunk`` in the process of a worker."""
+        return engine.compute_chunk(chunk)
 
 
 @lru_cache(maxsize=1)
@@ -40,7 +46,6 @@ def prepare(job: Job) -> int:
     return os.getpid()
 
 
-def compute(job: Job, number: int) -> Mapping[str, np.ndarray]:
-    """Results of chunk ``number``. Raises :class:`Mismatch`, or what the computation raises."""
-    engine = _engine(job)
-    return engine.compute_chunk(engine.plan.chunk(number))
+def compute(job: Job, chunk: Chunk) -> Mapping[str, np.ndarray]:
+    """Results of ``chunk``; nothing is planned here. Raises :class:`Mismatch`, or what the computation raises."""
+    return job.do(_engine(job), chunk)

@@ -121,7 +121,9 @@ class Resonances:
 class System:
     """A drivetrain model: see the module's docstring. ``presets`` are named parameter sets of the source.
 
-    ``time_units`` is the unit of the time of its equations, ``1`` if that is nondimensional.
+    ``time_units`` is the unit of the time of its equations, ``1`` if that is nondimensional. ``physical`` converts data in
+    physical units to nondimensional parameters and back (pattern: ``cardan_units.PhysicalShaft``), None if the parameters
+    have physical units themselves.
     """
 
     name: str
@@ -132,6 +134,7 @@ class System:
     presets: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     resonances: Resonances | None = None
     time_units: str = "1"
+    physical: type | None = None
 
     def parameter(self, name: str) -> Parameter:
         """The parameter called ``name``; ``KeyError`` if there is none."""

@@ -29,6 +29,7 @@ from drivetrain_jax.systems._base import (
     Values,
 )
 from drivetrain_jax.systems._smooth import Coordinate, Smoothness
+from drivetrain_jax.systems.cardan_units import PhysicalShaft
 
 PARAMETERS = (
     Parameter("beta", "rad", "joint angle", lower=-math.pi / 2, upper=math.pi / 2, open_lower=True, open_upper=True),
@@ -307,7 +308,12 @@ SYSTEM = System(
     title="Cardan (Hooke-joint) shaft",
     source="Soltan Rezaee & Ghazavi, Modares Mechanical Engineering 14(12), 2014, 163-170",
     parameters=PARAMETERS,
-    models={"floquet": Model(floquet_model, NAMES, smooth=SMOOTH), "forced": Model(forced_model, NAMES)},
+    models={
+        "floquet": Model(floquet_model, NAMES, smooth=SMOOTH),
+        "atlas": Model(floquet_model, NAMES, smooth=SMOOTH),
+        "forced": Model(forced_model, NAMES),
+    },
     presets=PRESETS,
     resonances=resonances(),
+    physical=PhysicalShaft,
 )

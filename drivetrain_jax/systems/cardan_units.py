@@ -15,8 +15,8 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter
 
 PHYSICAL = (
-    Parameter("J1", "kg m^2", "inertia of the driving disk", lower=0.0, open_lower=True),
-    Parameter("J2", "kg m^2", "inertia of the driven disk", lower=0.0, open_lower=True),
+    Parameter("J1", "kg m2", "inertia of the driving disk", lower=0.0, open_lower=True),
+    Parameter("J2", "kg m2", "inertia of the driven disk", lower=0.0, open_lower=True),
     Parameter("k1", "N m/rad", "stiffness of the driving shaft", lower=0.0, open_lower=True),
     Parameter("k2", "N m/rad", "stiffness of the driven shaft", lower=0.0, open_lower=True),
     Parameter("c1", "N m s/rad", "damping of the driving shaft", lower=0.0),
@@ -85,6 +85,18 @@ class PhysicalShaft:
     def damping(self, zeta: float) -> float:
         """c1 in N m s/rad of a value of zeta."""
         return zeta * 2 * math.sqrt(self.k1 * self.J1)
+
+    def parameter(self, name: str, value: float) -> tuple[str, float]:
+        """What ``speed`` in rpm or ``angle`` in degrees is among the nondimensional parameters."""
+        return ("Omega", self.omega(value)) if name == "speed" else ("beta", self.beta(value))
+
+    def quantity(self, parameter: str, value: float) -> tuple[str, float, str] | None:
+        """Name, value and unit of what Omega, beta or zeta stands for, None for another parameter."""
+        if parameter == "Omega":
+            return "speed", self.speed(value), "rpm"
+        if parameter == "beta":
+            return "angle", self.angle(value), "deg"
+        return ("c1", self.damping(value), "N m s/rad") if parameter == "zeta" else None
 
     def table(self, speed: float | None = None, angle: float | None = None) -> str:
         """What was given and what it becomes, line by line with units."""

@@ -11,9 +11,10 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.view import cells, resonances
+from drivetrain_jax.view import boundaries, cells, resonances
 from drivetrain_jax.view.layout import Margins, Panels
 from drivetrain_jax.view.style import (
     FRAME_GREY,
@@ -28,6 +29,8 @@ from drivetrain_jax.view.style import (
 
 _PANEL = 2.45
 _SMALL_PANEL = 1.35
+# Axes of up to this many values run across a figure of small panels.
+_FEW = 4
 
 
 def plot(dataset: xr.Dataset) -> Figure:
@@ -64,6 +67,7 @@ def _chart(dataset: xr.Dataset, names: list[str]) -> Figure:
         if name == "verdict":
             cells.draw_states(axes, dataset, horizontal, vertical)
             handles += cells.state_legend(dataset)
+            handles += boundaries.draw(axes, dataset, horizontal, vertical)
         else:
             radius = dataset[name].where(dataset["outcome"] < cells.FIRST_FAILURE)
             mesh, label, extend = cells.draw_growth(axes, radius, horizontal, vertical)
@@ -125,7 +129,9 @@ def _draw_strip(axes: Axes, dataset: xr.Dataset, name: str) -> None:
 
 def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
     _require(dataset, ["verdict"])
-    horizontal = cells.horizontal_axis(dataset, names)
+    # Axes of few values run across, if that leaves two.
+    long = [name for name in names if dataset.sizes[name] > _FEW]
+    horizontal = cells.horizontal_axis(dataset, long if len(long) > 1 else names)
     vertical = max((name for name in names if name != horizontal), key=lambda name: dataset.sizes[name])
     sliced = [name for name in names if name not in (horizontal, vertical)]
     # Labels stand over the first row only, so an axis on which the predictions depend runs across.
@@ -137,21 +143,44 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
         [dataset.isel({across: column} | ({down: row} if down else {})) for column in _spread(dataset, across)]
         for row in (_spread(dataset, down) if down else [0])
     ]
-    margins = Margins(right=0.25, top=1.12, between_rows=0.32, between_columns=0.16)
-    panels = Panels(len(slices), len(slices[0]), height=_SMALL_PANEL, margins=margins)
+    # Regions without a boundary are blank: then how far from it they are.
+    plain = "spectral_radius" in dataset and bool((cells.states(dataset) == cells.STABLE).all())
+    margins = Margins(right=1.05 if plain else 0.25, top=1.12, between_rows=0.32, between_columns=0.16)
+    height = _SMALL_PANEL if len(slices) > 1 else _PANEL
+    panels = Panels(len(slices), len(slices[0]), height=height, margins=margins)
     predicted: list[Line2D] = []
     for panel, axes in zip(chain(*slices), chain(*panels.axes), strict=True):
-        cells.draw_states(axes, panel, horizontal, vertical)
+        if plain:
+            _draw_radius(panels, axes, panel, dataset, (horizontal, vertical))
+        else:
+            cells.draw_states(axes, panel, horizontal, vertical)
         lines = resonances.predictions(panel, horizontal, vertical)
         predicted = max(predicted, resonances.draw(axes, lines), key=len)
         first_row = axes in panels.axes[0]
         if first_row:
             resonances.label(axes, [line for line in lines if line.order == 1])
         axes.set_title(_slice_text(panel, across, down), pad=24 if first_row and lines else 4)
+    if not cells.is_logarithmic(dataset[horizontal].values):
+        panels.axes[0][0].set_xticks(_clear_ticks(panels.axes[0][0]))
     panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
-    panels.titles(dataset)
-    panels.legend([*cells.state_legend(dataset), *predicted])
+    panels.titles(dataset, "stable everywhere" if plain else "")
+    panels.legend(predicted if plain else [*cells.state_legend(dataset), *predicted])
     return panels.figure
+
+
+def _clear_ticks(axes: Axes) -> list[float]:
+    """Few ticks, none at the right end: its number would run into the first one of the next panel."""
+    low, high = axes.get_xlim()
+    return [tick for tick in MaxNLocator(4).tick_values(low, high) if low <= tick <= high - 0.08 * (high - low)]
+
+
+def _draw_radius(panels: Panels, axes: Axes, panel: xr.Dataset, whole: xr.Dataset, names: tuple[str, str]) -> None:
+    """Spectral radii below 1 on the scale of the whole result; a colour bar at the end of the row."""
+    radius = whole["spectral_radius"]
+    limits = {"vmin": float(radius.min()), "vmax": float(radius.max())}
+    mesh = cells.draw_cells(axes, panel["spectral_radius"], *names, cmap="cividis", **limits)
+    if any(axes is row[-1] for row in panels.axes):
+        panels.colorbar(axes, mesh, variable_label(radius))
 
 
 def _slice_text(panel: xr.Dataset, *names: str | None) -> str:

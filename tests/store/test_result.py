@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 
 import numpy as np
@@ -40,6 +41,7 @@ def test_round_trip_by_plain_xarray(dataset, tmp_path):
     path = tmp_path / "r.nc"
     write_result(dataset, path, tmp_path / "tmp")
     with xr.open_dataset(path, engine="h5netcdf") as again:
+        assert sorted(json.loads(again.attrs.pop("checksums"))) == ["/", "f", "k", "t0", "v", "x", "z"]
         xr.testing.assert_identical(again, dataset)
         assert again["z"].dtype == complex and again["f"].dtype == float and again["t0"].dtype == float
         assert "_FillValue" not in again["x"].encoding and again["k"].values.tolist() == ["up", "down"]

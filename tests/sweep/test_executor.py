@@ -189,5 +189,5 @@ def _engine():
 
 def test_workers_of_the_python_interface():
     assert dt.run.__kwdefaults__ == {
-        "overrides": None, "fresh": False, "threads": None, "workers": None, "dask": None, "report": None
+        "overrides": None, "fresh": False, "threads": None, "workers": None, "dask": None, "reuse": (), "report": None
     }  # fmt: skip

@@ -71,9 +71,9 @@ def test_source_of_systems_analyses_and_engine_decides(monkeypatch):
     seen = []
     monkeypatch.setattr(identity, "source_digest", lambda files: seen.append(files) or "x")
     digest(BASE)
-    names = set(seen[0])
-    assert {"analysis/_base.py", "systems/_base.py", "sweep/kernel.py", "sweep/plan.py", "toy.py"} <= names
-    assert seen[0]["toy.py"].samefile(toy.__file__)
+    files = {name: path for some in seen for name, path in some.items()}
+    assert {"analysis/_base.py", "systems/_base.py", "sweep/kernel.py", "sweep/plan.py", "toy.py"} <= set(files)
+    assert files["toy.py"].samefile(toy.__file__)
 
 
 def test_chunk_size_decides(monkeypatch):

@@ -24,7 +24,7 @@ def test_every_point_is_in_exactly_one_chunk_of_the_cheapest_solver(grid_scene):
     for chunk in chunks:
         columns = e.grid.columns(chunk.points)
         cheap = (columns["a"] <= toy.LARGE) & (10 * columns["a"] <= 200 * columns["b"])
-        name = e.plan.groups[chunk.group].solver.name
+        name = e.solvers[chunk.solver].name
         assert np.all(cheap == (name == "broadcasting"))
         efforts = 10 * columns["a"] if name == "broadcasting" else 100 * columns["b"]
         assert chunk.effort == np.ceil(efforts.max())

@@ -20,7 +20,8 @@ import xarray as xr
 import drivetrain_jax as dt
 from drivetrain_jax.sweep import toml
 from drivetrain_jax.sweep.executor import Where
-from drivetrain_jax.sweep.run import Incomplete, run_to_file, status
+from drivetrain_jax.sweep.run import Incomplete, run_to_file
+from drivetrain_jax.sweep.status import status
 
 
 def expected_value(a, b, n=3, length=(1.0, 2.0, 3.0)):

@@ -1,0 +1,28 @@
+"""Stability as a function of the parameters: what the file of a scene whose axes are ranges answers.
+
+What is computed are propagators (``floquet_propagator``); the panels that go through them give the results of
+``floquet`` anywhere in the ranges.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from drivetrain_jax.analysis import floquet_propagator
+from drivetrain_jax.analysis._base import Request, Solver
+from drivetrain_jax.analysis.floquet_results import VARIABLES
+from drivetrain_jax.systems import System
+
+
+def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+    return floquet_propagator.ANALYSIS.solvers(system, replace(request, outputs=("propagator",)))
+
+
+ANALYSIS = replace(
+    floquet_propagator.ANALYSIS,
+    title="stability atlas",
+    variables=VARIABLES,
+    default_outputs=("spectral_radius", "spectral_radius_error", "verdict"),
+    solvers=_solvers,
+    continuous=True,
+)

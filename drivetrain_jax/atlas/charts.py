@@ -1,0 +1,170 @@
+"""Closed-form results on grids, tile by tile, on all cores: what makes a chart cheap.
+
+The results of a cell are packed into one complex number: a fused loop of XLA's has one output, and computes what two of
+them share twice.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis import Outcome
+from drivetrain_jax.analysis.multipliers import verdict as verdict_of
+from drivetrain_jax.atlas import conservative, quartic
+from drivetrain_jax.atlas.floquet_quantity import Build
+from drivetrain_jax.atlas.interpolation import nodes
+from drivetrain_jax.atlas.panels import Panel, chebyshev
+from drivetrain_jax.atlas.tiles import NODES, Tile
+from drivetrain_jax.store.provenance import usable_cores
+from drivetrain_jax.systems import FloquetModel
+
+# Cells of a tile. The columns of one row are the lanes of all loops: few enough for them not to be cut into parallel tasks.
+ROWS, COLUMNS = 64, 512
+# Tiles in work per core.
+_AHEAD = 2
+# Interpolation between nodes multiplies their roundings by less than this.
+_SPREAD = 4.0
+
+Results = Mapping[str, np.ndarray]
+
+
+def compiler_options() -> dict[str, Any] | None:
+    """Full vector width: XLA uses half of AVX-512 unless told otherwise."""
+    return {"xla_cpu_prefer_vector_width": 512} if jax.default_backend() == "cpu" else None
+
+
+def errors_of(panel: Panel) -> np.ndarray:
+    """The bounds of a panel as one array: of the values, then of the derived numbers."""
+    return np.array([panel.value_error, *panel.derived_error])
+
+
+def judged_tiles(
+    tiles: Iterator[Tile],
+    axes: Sequence[np.ndarray],
+    names: Sequence[str],
+    fixed: Mapping[str, Any],
+    kernel: Callable[[bool], Any],
+) -> Iterator[tuple[Tile, Results]]:
+    """Every tile with its results, padding included, in order; ``axes`` are those of the grid, in parameters.
+
+    ``kernel(dense)`` is that of :func:`tile_kernel`.
+    """
+
+    def work(tile: Tile) -> Results:
+        cells = tile.columns if tile.spread is None else tile.spread
+        values = {name: axis[i] for name, axis, i in zip(names, axes, tile.index, strict=True)}
+        for name, size in zip(names[-2:], (len(tile.first), cells.shape[1]), strict=True):
+            values[name] = np.pad(values[name], (0, size - len(values[name])), mode="edge")
+        factors = (tile.first, tile.columns) if tile.spread is None else (tile.first, tile.columns, tile.spread)
+        found = kernel(tile.spread is not None)(*factors, errors_of(tile.panel), values, fixed)
+        return {name: np.asarray(value) for name, value in found.items()}
+
+    threads = usable_cores()
+    with ThreadPoolExecutor(threads, thread_name_prefix="tile") as pool:
+        pending: deque[tuple[Tile, Future[Results]]] = deque()
+        for tile in tiles:
+            pending.append((tile, pool.submit(work, tile)))
+            if len(pending) > _AHEAD * threads:
+                done, results = pending.popleft()
+                yield done, results.result()
+        for done, results in pending:
+            yield done, results.result()
+
+
+@lru_cache(maxsize=32)
+def tile_kernel(build: Build, names: tuple[str, ...], rtol: float, kind: str) -> Any:
+    """Closed-form results ``(R, C)`` of a tile, and which of its cells are to be judged again (``unsure``).
+
+    ``kind``: ``dense`` or ``sparse`` as the tile is, ``undamped`` for sparse tiles with cells that may be Hamiltonian.
+    """
+
+    def bind(values: Mapping, fixed: Mapping, row: Array) -> FloquetModel:
+        leading = {name: values[name][0] for name in names[:-2]}
+        return build({**fixed, **leading, names[-2]: row, names[-1]: values[names[-1]]})
+
+    # Row by row: all intermediate results of a row stay in the cache. The last product is made in the loop, not before it:
+    # a row of a larger result would be cut out anew wherever it is used.
+    def sparse(first, columns, errors, values, fixed):
+        def row(inputs: tuple[Array, Array]) -> tuple[Array, ...]:
+            weights, value = inputs
+            model, phi = bind(values, fixed, value), weights @ columns
+            log_d = jnp.broadcast_to(model.reduced.log_determinant(), phi.shape[1:])
+            parts = quartic.blocks(phi)
+            packed = _packed(quartic.coefficients(parts, log_d, errors[1:]))
+            return (packed, exact_verdict(model, parts, errors[0])) if kind == "undamped" else (packed,)
+
+        return _unpacked(*jax.lax.map(row, (first, values[names[-2]])), rtol=rtol)
+
+    def dense(first, columns, spread, errors, values, fixed):
+        parts = quartic.blocks(jnp.moveaxis(first @ columns, 1, 0))
+        at_nodes, rounding = (jnp.stack(x, axis=1) for x in quartic.invariants(parts))
+        bounds = errors[1:] + _SPREAD * jnp.max(rounding, axis=-1) + _left_out(at_nodes)
+
+        def row(inputs: tuple[Array, Array, Array]) -> tuple[Array, ...]:
+            e, bounds, value = inputs
+            lanes = e @ spread
+            log_d = jnp.broadcast_to(bind(values, fixed, value).reduced.log_determinant(), lanes.shape[1:])
+            return (_packed(quartic.with_determinant(lanes, bounds, log_d)),)
+
+        return _unpacked(*jax.lax.map(row, (at_nodes, bounds, values[names[-2]])), rtol=rtol)
+
+    return jax.jit(dense if kind == "dense" else sparse, compiler_options=compiler_options())
+
+
+def _left_out(e: Array) -> Array:
+    """What the interpolation of ``e`` ``(R, 3, NODES)`` leaves out at most, ``(R, 3)``: twice its last coefficients."""
+    last = 2 / NODES * chebyshev(nodes(NODES), NODES)[:, -3:]
+    return 2 * jnp.sum(jnp.abs(e @ last), axis=-1)
+
+
+def _packed(c: quartic.Coefficients) -> Array:
+    """rho + i error of lanes; the error is negative if they are to be judged again."""
+    rho, error, unsure = quartic.spectral_radius(c)
+    # A bound at the limit of rounding cannot be improved.
+    again = (unsure & (error > 4 * quartic.EPS)) | ~(jnp.abs(rho - 1) > error)
+    return jax.lax.complex(rho, jnp.where(again, -error, error))
+
+
+def exact_verdict(model: FloquetModel, phi: quartic.Blocks, value_error: Array) -> Array:
+    """The verdict of Hamiltonian lanes, -1 of others."""
+    shape = phi.a[0][0].shape
+    applies = jnp.broadcast_to(jnp.asarray(model.hamiltonian()), shape)
+    nothing = jnp.full(shape, -1, jnp.int8)
+    return jax.lax.cond(
+        jnp.any(applies), lambda: jnp.where(applies, conservative.verdict(phi, value_error), nothing), lambda: nothing
+    )
+
+
+def _unpacked(packed: Array, exact: Array | None = None, *, rtol: float) -> dict[str, Array]:
+    rho, error = packed.real, jnp.abs(packed.imag)
+    verdict = verdict_of(rho, error)
+    unsure = ~(packed.imag > 0)
+    if exact is not None:
+        rho, error, verdict = exactly(exact, rho, error, verdict)
+        # Cells on the unit circle are settled; for the others eigenvalues may give a better bound.
+        unsure &= exact != 0
+    return {
+        "spectral_radius": rho,
+        "spectral_radius_error": error,
+        "verdict": verdict,
+        "outcome": jnp.where(error <= 10 * rtol * rho, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET).astype(jnp.int8),
+        "unsure": unsure,
+    }
+
+
+def exactly(exact: Array, rho: Array, error: Array, verdict: Array) -> tuple[Array, Array, Array]:
+    """Results with the verdict ``exact`` where that is not negative: a stable Hamiltonian system has rho = 1."""
+    return (
+        jnp.where(exact == 0, 1.0, rho),
+        jnp.where(exact == 0, 4 * quartic.EPS, error),
+        jnp.where(exact >= 0, exact, verdict).astype(jnp.int8),
+    )

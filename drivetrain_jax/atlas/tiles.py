@@ -1,0 +1,149 @@
+"""A grid cut into tiles, each within one panel: the factors whose products are the values of the atlas there.
+
+Where cells are dense along the last axis, what is needed of Phi in a row is smooth over many cells: a tile then asks for it
+at ``NODES`` Chebyshev nodes only, and ``spread`` carries it to the cells. Shapes are fixed, so that one compiled kernel
+serves all tiles of a chart: tiles are padded, and so are the degrees of smaller panels (with coefficients 0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.atlas.evaluation import common_degrees, padded_tensor
+from drivetrain_jax.atlas.interpolation import nodes
+from drivetrain_jax.atlas.panels import Atlas, Panel, chebyshev
+
+# Nodes of a dense tile, and the angle arccos(t) that it may span, times the degree of its panel: the highest polynomial
+# runs through 5.5 rad to either side of the middle, where the 24th coefficient of an oscillation is 1e-13, and those that
+# matter through half of it. What is left out is measured in every tile.
+NODES = 24
+_SPAN = 11.0
+# Part of the width of a tile from which on nodes are worth while: other tiles cost half as much again, but are always full.
+_DENSE = 2 / 3
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A rectangle of a grid within one panel.
+
+    ``index`` are the positions along each axis of the grid: one number for each leading axis, arrays for the last two.
+    ``first`` ``(R, m, n)`` is what is left of the panel's tensor in each row, ``columns`` ``(n, C)`` are T_j at the cells.
+    In a dense tile ``columns`` ``(n, NODES)`` are T_j at the nodes, and ``spread`` ``(NODES, C)`` leads from there to the
+    cells.
+    """
+
+    panel: Panel
+    index: tuple[np.ndarray, ...]
+    first: Array
+    columns: np.ndarray
+    spread: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class _Band:
+    """Cells along the last axis that a tile takes, with its ``columns`` and ``spread``."""
+
+    chosen: np.ndarray
+    columns: np.ndarray
+    spread: np.ndarray | None
+
+
+def tiles(atlas: Atlas, axes: Sequence[np.ndarray], shape: tuple[int, int], *, dense: bool = True) -> Iterator[Tile]:
+    """Tiles of at most ``shape`` cells that cover what panels cover of the grid of ``axes``, two or more, in coordinates.
+
+    ``axes`` rise. A cell on a face that panels share belongs to the last of them. Without ``dense`` no tile has nodes.
+    """
+    if not atlas.panels:
+        return
+    degrees = common_degrees(atlas.panels)[-2:]
+    for panel, groups in _assigned(atlas, axes):
+        bands = list(_bands(panel, axes[-1], groups[-1], degrees[1], shape[1], dense))
+        for leading in np.ndindex(*(len(g) for g in groups[:-2])):
+            fixed = [g[i] for g, i in zip(groups[:-2], leading, strict=True)]
+            tensor = padded_tensor(_reduced(panel, axes, fixed), degrees)
+            for start in range(0, len(groups[-2]), shape[0]):
+                rows = groups[-2][start : start + shape[0]]
+                weights = _padded(chebyshev(_positions(panel, -2, axes[-2][rows]), degrees[0]), shape[0])
+                first = _first_product(weights, tensor)
+                for band in bands:
+                    index = (*(np.array([i]) for i in fixed), rows, band.chosen)
+                    yield Tile(panel, index, first, band.columns, band.spread)
+
+
+@jax.jit
+def _first_product(weights: Array, tensor: Array) -> Array:
+    """``(R, n_1)`` times ``(n_1, m, n)``. Not by NumPy: the threads of its BLAS stand in the way of those that judge."""
+    return (weights @ tensor.reshape(len(tensor), -1)).reshape(-1, *tensor.shape[1:])
+
+
+def _reduced(panel: Panel, axes: Sequence[np.ndarray], fixed: Sequence[int]) -> Panel:
+    """The panel of the last two coordinates where the leading ones are those of the cells ``fixed``."""
+    coefficients = panel.coefficients
+    for k, i in enumerate(fixed):
+        weights = chebyshev(_positions(panel, k, axes[k][i : i + 1]), panel.degrees[k])[0]
+        coefficients = np.tensordot(weights, coefficients, axes=(0, 0))
+    return Panel(panel.lower[-2:], panel.upper[-2:], coefficients, 0.0, np.empty(0))
+
+
+def _bands(panel: Panel, axis: np.ndarray, cells: np.ndarray, degree: int, width: int, dense: bool) -> Iterator[_Band]:
+    """Neighbouring cells by ``width`` at most, those with nodes no further apart than the panel's degree allows."""
+    t = _positions(panel, -1, axis[cells])
+    angle = -np.arccos(t)
+    start = waiting = 0
+    while start < len(cells):
+        reach = np.searchsorted(angle, angle[start] + _SPAN / panel.degrees[-1], side="right") if dense else start + 1
+        end = min(start + width, int(reach))
+        if end - start >= max(_DENSE * width, 2 * NODES):
+            if waiting < start:
+                yield _sparse(cells[waiting:start], t[waiting:start], degree, width)
+            yield _dense(cells[start:end], t[start:end], degree, width)
+            waiting = end
+        elif end - waiting >= width:
+            end = waiting + width
+            yield _sparse(cells[waiting:end], t[waiting:end], degree, width)
+            waiting = end
+        start = end
+    if waiting < len(cells):
+        yield _sparse(cells[waiting:], t[waiting:], degree, width)
+
+
+def _sparse(cells: np.ndarray, t: np.ndarray, degree: int, width: int) -> _Band:
+    return _Band(cells, np.ascontiguousarray(_padded(chebyshev(t, degree), width).T), None)
+
+
+def _dense(cells: np.ndarray, t: np.ndarray, degree: int, width: int) -> _Band:
+    x = nodes(NODES)
+    low, high = t[0], t[-1]
+    place = np.clip(((t - low) - (high - t)) / (high - low), -1.0, 1.0)
+    analysis = 2 / NODES * chebyshev(x, NODES).T
+    analysis[0] /= 2
+    spread = _padded(chebyshev(place, NODES) @ analysis, width).T
+    at_nodes = np.clip((low * (1 - x) + high * (1 + x)) / 2, -1.0, 1.0)
+    return _Band(cells, np.ascontiguousarray(chebyshev(at_nodes, degree).T), np.ascontiguousarray(spread))
+
+
+def _padded(weights: np.ndarray, size: int) -> np.ndarray:
+    return np.pad(weights, ((0, size - len(weights)), (0, 0)), mode="edge")
+
+
+def _positions(panel: Panel, k: int, x: np.ndarray) -> np.ndarray:
+    lower, upper = panel.lower[k], panel.upper[k]
+    return np.clip(((x - lower) - (upper - x)) / (upper - lower), -1.0, 1.0)
+
+
+def _assigned(atlas: Atlas, axes: Sequence[np.ndarray]) -> Iterator[tuple[Panel, list[np.ndarray]]]:
+    """For each panel the positions along each axis that it covers. Panels share faces: these are given to all of them,
+    which does no harm, as they agree there within their bounds."""
+    for panel in atlas.panels:
+        slack = 8 * np.finfo(float).eps * np.maximum(np.abs(panel.lower), np.abs(panel.upper))
+        groups = [
+            np.flatnonzero((x >= panel.lower[k] - slack[k]) & (x <= panel.upper[k] + slack[k]))
+            for k, x in enumerate(axes)
+        ]
+        if all(len(g) for g in groups):
+            yield panel, groups

@@ -1,0 +1,99 @@
+"""What must hold in every result, judged from the file alone: no equation is solved again and no jax is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from drivetrain_jax.invariants.registry import Declared, declared
+from drivetrain_jax.invariants.rules import FIRST_FAILURE, Rule
+
+__all__ = ["Finding", "check"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A rule, how many points it was applied to, how many break it, and where the first of these lies."""
+
+    rule: str
+    points: int
+    broken: int = 0
+    first: str = ""
+
+    def __str__(self) -> str:
+        if not self.broken:
+            return f"{self.rule}: holds at {self.points} points"
+        return f"{self.rule}: broken at {self.broken} of {self.points} points, first at {self.first}"
+
+
+def check(dataset: xr.Dataset) -> list[Finding]:
+    """All rules that the variables of ``dataset`` allow: those of every result, then those of its analysis."""
+    known = declared(str(dataset.attrs.get("analysis")))
+    rules = [*_codes(dataset), *_errors(dataset), *known.rules]
+    if known.has_points:
+        if "outcome" not in dataset:
+            return [Finding("outcome is stored", 1, 1, "the file")]
+        rules += _values(dataset, known)
+    return [_apply(rule, dataset) for rule in rules if all(name in dataset for name in rule.variables)]
+
+
+def _apply(rule: Rule, dataset: xr.Dataset) -> Finding:
+    broken = rule.broken(dataset)
+    if "outcome" in dataset:
+        broken = _somewhere(broken, dataset)
+    count = int(broken.sum())
+    return Finding(rule.text, int(broken.size), count, _place(broken) if count else "")
+
+
+def _place(broken: xr.DataArray) -> str:
+    """Coordinates of the first point that breaks a rule."""
+    if not broken.dims:
+        return "its only point"
+    index = np.unravel_index(int(np.argmax(broken.values)), broken.shape)
+    place = dict(zip(broken.dims, index, strict=True))
+    return ", ".join(f"{dim} = {_text(broken, dim, int(i))}" for dim, i in place.items())
+
+
+def _text(values: xr.DataArray, dim: Hashable, i: int) -> str:
+    """The coordinate of position ``i`` along ``dim``, the position itself where there is none."""
+    value = values[dim].values[i] if dim in values.coords else i
+    return f"{value:.10g}" if isinstance(value, float) else str(value)
+
+
+def _codes(dataset: xr.Dataset) -> Iterator[Rule]:
+    """A flag has one of its values."""
+    for name, variable in dataset.data_vars.items():
+        if "flag_values" in variable.attrs:
+            allowed = np.atleast_1d(variable.attrs["flag_values"])
+            text = f"{name} is one of its {allowed.size} codes"
+            yield Rule(text, (str(name),), lambda ds, name=name, allowed=allowed: ~ds[name].isin(allowed))
+
+
+def _values(dataset: xr.Dataset, known: Declared) -> Iterator[Rule]:
+    """Numbers where the outcome says that there are, and something missing where it says so."""
+    whole = [str(n) for n, v in dataset.data_vars.items() if v.dtype.kind in "fc" and n not in known.gaps]
+    for name in whole:
+        text = f"{name} has a value where outcome says so"
+        yield Rule(text, (name,), lambda ds, name=name: ds[name].isnull() & (ds["outcome"] < FIRST_FAILURE))
+    if not whole:
+        return
+
+    def unfounded(ds: xr.Dataset) -> xr.DataArray:
+        missing = sum(_somewhere(ds[name].isnull(), ds) for name in whole) > 0
+        return (ds["outcome"] >= FIRST_FAILURE) & ~missing
+
+    yield Rule("a value is missing where outcome says so", tuple(whole), unfounded)
+
+
+def _somewhere(condition: xr.DataArray, ds: xr.Dataset) -> xr.DataArray:
+    return condition.any([dim for dim in condition.dims if dim not in ds["outcome"].dims])
+
+
+def _errors(dataset: xr.Dataset) -> Iterator[Rule]:
+    """Bounds and estimates of errors are not negative."""
+    for name in map(str, dataset.data_vars):
+        if name.endswith("_error"):
+            yield Rule(f"{name} >= 0", (name,), lambda ds, name=name: ds[name] < 0)

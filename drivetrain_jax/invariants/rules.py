@@ -1,0 +1,79 @@
+"""Rules that numbers of a result have to obey, each a function of the Dataset alone. NaN obeys every rule of values."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+# CF codes of ``outcome`` from here on mean that there is no value.
+FIRST_FAILURE = 2
+# Relative room for the roundings of a formula that the computation wrote in another order.
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Rule:
+    """``broken(dataset)`` is true where the rule ``text`` does not hold. It needs all of ``variables``."""
+
+    text: str
+    variables: tuple[str, ...]
+    broken: Callable[[xr.Dataset], xr.DataArray]
+
+
+def within(name: str, lower: float = -np.inf, upper: float = np.inf) -> Rule:
+    """``lower <= name <= upper``, up to rounding."""
+    bounds = [f"{lower:g} <= " if lower > -np.inf else "", f" <= {upper:g}" if upper < np.inf else ""]
+    room = ROUNDING * max(abs(x) for x in (lower, upper, 0.0) if np.isfinite(x))
+    return Rule(
+        f"{bounds[0]}{name}{bounds[1]}", (name,), lambda ds: (ds[name] < lower - room) | (ds[name] > upper + room)
+    )
+
+
+def ordered(name: str, dim: str, falling: bool = False, key: Callable = lambda values: values) -> Rule:
+    """``name`` rises (falls) along ``dim``, up to rounding; ``key`` says what of it is compared."""
+
+    def broken(ds: xr.Dataset) -> xr.DataArray:
+        step = key(ds[name]).diff(dim)
+        room = ROUNDING * abs(key(ds[name])).max(dim)
+        return step > room if falling else step < -room
+
+    return Rule(f"{name} {'falls' if falling else 'rises'} along {dim}", (name,), broken)
+
+
+def sums_to_one(name: str, dim: str, others: tuple[str, ...] = ()) -> Rule:
+    """The sum of ``name`` over ``dim``, and of ``others``, is 1 wherever there is a value."""
+
+    def broken(ds: xr.Dataset) -> xr.DataArray:
+        total = ds[name].sum(dim) + sum(ds[other] for other in others)
+        return (abs(total - 1) > ROUNDING) & ds[name].notnull().any(dim)
+
+    return Rule(" + ".join((f"sum of {name} over {dim}", *others)) + " = 1", (name, *others), broken)
+
+
+def in_order(*names: str) -> Rule:
+    """Each of ``names`` is at most the next."""
+
+    def broken(ds: xr.Dataset) -> xr.DataArray:
+        size = sum(abs(ds[name]) for name in names)
+        pairs = [ds[a] > ds[b] + ROUNDING * size for a, b in itertools.pairwise(names)]
+        return xr.concat(pairs, "pair").any("pair")
+
+    return Rule(" <= ".join(names), names, broken)
+
+
+def relation(text: str, variables: tuple[str, ...], broken: Callable[[xr.Dataset], xr.DataArray]) -> Rule:
+    """Any other one."""
+    return Rule(text, variables, broken)
+
+
+def multiple(name: str, factor: float, of: str) -> Rule:
+    """``name = factor * of``."""
+    return Rule(f"{name} = {factor:.6g} {of}", (name, of), lambda ds: _differ(ds[name], factor * ds[of]))
+
+
+def _differ(one: xr.DataArray, other: xr.DataArray) -> xr.DataArray:
+    return abs(one - other) > ROUNDING * (abs(one) + abs(other))

@@ -1,0 +1,64 @@
+"""Whether a result, or unfinished work, is what was written, and whether its numbers can be true."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.invariants import Finding, check
+from drivetrain_jax.store import checksums, shards
+from drivetrain_jax.store.chunks import PartsFolder
+from drivetrain_jax.store.consolidate import open_result
+
+
+@dataclass(frozen=True)
+class Report:
+    """``lines`` for the reader; ``problem`` is the first thing that is wrong, empty if nothing is. ``complete`` is false for
+    unfinished work."""
+
+    lines: tuple[str, ...]
+    problem: str = ""
+    complete: bool = True
+
+
+def verify(path: Path) -> Report:
+    """Check the result at ``path``, or the parts of the unfinished one.
+
+    Raises :class:`InputError` if there is neither, or if the file cannot be read.
+    """
+    parts = PartsFolder(path)
+    if not path.exists() and parts.holds_work():
+        return _verify_parts(path, parts)
+    if shards.is_store(path):
+        return _verify_store(path)
+    if not path.is_file():
+        raise InputError(f"file = {str(path)!r}: does not exist; give a result written by `drivetrain run`")
+    damaged = checksums.damaged(path)
+    if damaged:
+        names = ", ".join("attributes of the file" if name == checksums.FILE else name for name in damaged)
+        problem = f"{names}: not what was written; allowed is to restore the file or to compute it again"
+        return Report((f"checksums: {len(damaged)} differ: {names}",), problem)
+    sealed = "none in this file" if damaged is None else "all agree"
+    findings = check(open_result(path))
+    lines = (f"checksums: {sealed}", *map(str, findings))
+    return Report(lines, _first_broken(findings))
+
+
+def _first_broken(findings: list[Finding]) -> str:
+    return next((f"{finding}; allowed is none" for finding in findings if finding.broken), "")
+
+
+def _verify_store(path: Path) -> Report:
+    wrong, count = shards.damaged(path)
+    problem = f"{wrong} of {count} shards are not what was written; allowed is to compute them again" if wrong else ""
+    return Report((f"checksums: {wrong or 'none'} of {count} shards differ",), problem)
+
+
+def _verify_parts(path: Path, parts: PartsFolder) -> Report:
+    """Damaged parts are no problem of the user's: a run that is resumed computes their chunks again."""
+    present, intact = parts.count(), sum(1 for _ in parts.read())
+    lines = [f"unfinished: {intact} of {present} parts are intact"]
+    if intact < present:
+        lines.append("the run that resumes computes the chunks of the others again")
+    return Report(tuple(lines), complete=False)

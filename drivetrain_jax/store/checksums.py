@@ -1,0 +1,107 @@
+"""Checksums of a finished result: of each variable as a reader sees it, and of the attributes of the file.
+
+They are made once, over the values in place, when the file is complete. HDF5's own filter (fletcher32) would need chunked
+storage, which cannot be mapped into memory, and would leave attributes and labels unguarded.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from drivetrain_jax._errors import InputError
+
+ATTRIBUTE = "checksums"
+# The name of the root group stands for the attributes of the file.
+FILE = "/"
+_BLOCK = 1 << 24
+# What the netCDF library adds to link dimensions and variables; the links themselves are looked at by name.
+_LINKS = frozenset({"DIMENSION_LIST", "REFERENCE_LIST", "CLASS", "NAME", "_Netcdf4Dimid", "_Netcdf4Coordinates"})
+
+
+def reserve(file: h5py.File) -> None:
+    """Make room for the checksums of all that ``file`` holds: filling it in later needs no space on the disk."""
+    blank = json.dumps(dict.fromkeys([FILE, *_variables(file)], "0" * 32))
+    file.attrs.create(ATTRIBUTE, np.bytes_(blank))
+
+
+def seal(file: h5py.File) -> None:
+    """Fill in the checksums of the complete ``file``."""
+    file.attrs.modify(ATTRIBUTE, np.bytes_(json.dumps(checksums(file))))
+
+
+def checksums(file: h5py.File) -> dict[str, str]:
+    """blake2b (128 bits) of each variable, type, dimensions and attributes included, and of the attributes of ``file``."""
+    own = {name: value for name, value in file.attrs.items() if name != ATTRIBUTE}
+    return {FILE: _of_attributes(own).hexdigest()} | {name: _of_variable(file[name]) for name in _variables(file)}
+
+
+def damaged(path: Path) -> list[str] | None:
+    """Names of the variables (``/``: attributes) of the result at ``path`` that are not what was written; None if it has
+    no checksums. Raises :class:`InputError` if the file cannot be read."""
+    try:
+        with h5py.File(path, "r") as file:
+            stored = file.attrs.get(ATTRIBUTE)
+            if stored is None:
+                return None
+            wanted, found = _parsed(stored), checksums(file)
+    # Damage in the structure of a file surfaces in h5py as any of these.
+    except (OSError, KeyError, ValueError, RuntimeError, TypeError, MemoryError, OverflowError):
+        raise InputError(
+            f"file = {str(path)!r}: not a readable netCDF4/HDF5 file, or damaged in its structure"
+        ) from None
+    return sorted(name for name in {*wanted, *found} if wanted.get(name) != found.get(name))
+
+
+def _variables(file: h5py.File) -> list[str]:
+    # Beside them a file may hold the named type of its complex numbers.
+    return sorted(name for name in file if file.get(name, getclass=True) is h5py.Dataset)
+
+
+def _parsed(stored: object) -> dict[str, str]:
+    """The stored table; a damaged one agrees with nothing."""
+    try:
+        table = json.loads(stored)
+    except (ValueError, TypeError):
+        return {}
+    return table if isinstance(table, dict) else {}
+
+
+def _of_variable(variable: h5py.Dataset) -> str:
+    own = {name: value for name, value in variable.attrs.items() if name not in _LINKS}
+    state = _of_attributes(own)
+    dims = [scales[0].name if len(scales) else scales.label for scales in variable.dims]
+    state.update(json.dumps([dims, variable.dtype.str, variable.shape, repr(variable.fillvalue)]).encode())
+    for block in _blocks(variable):
+        state.update(_bytes(block))
+    return state.hexdigest()
+
+
+def _blocks(variable: h5py.Dataset) -> Iterator[np.ndarray]:
+    """The values, some megabytes at a time."""
+    if not variable.shape:
+        yield np.asarray(variable[()])
+        return
+    rows = max(_BLOCK * variable.shape[0] // max(variable.nbytes, 1), 1)
+    for start in range(0, variable.shape[0], rows):
+        yield variable[start : start + rows]
+
+
+def _of_attributes(attributes: dict[str, object]) -> hashlib.blake2b:
+    state = hashlib.blake2b(digest_size=16)
+    for name in sorted(attributes):
+        value = np.asarray(attributes[name])
+        state.update(json.dumps([name, value.dtype.str, value.shape]).encode())
+        state.update(_bytes(value))
+    return state
+
+
+def _bytes(values: np.ndarray) -> memoryview | bytes:
+    if values.dtype.kind == "O":
+        return json.dumps(values.tolist(), default=repr).encode()
+    return np.ascontiguousarray(values).reshape(-1).view(np.uint8).data

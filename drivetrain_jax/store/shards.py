@@ -1,0 +1,165 @@
+"""A Zarr v3 store that many processes write at once: every shard is one file per variable and belongs to one writer.
+
+Rows are points in the order in which they are computed, ``width`` of them a chunk, and the chunks of one group of the plan
+are one Zarr group. The array ``point`` holds the number of each row's point in the grid (-1: padding), and ``done`` a checksum of
+each shard, written after its data, 0 before. Damage is found by that, by the CRC-32C of every chunk, or both.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivetrain_jax._errors import InputError
+
+POINT, DONE = "point", "done"
+_MOST_CHUNKS = 64
+_FEWEST_SHARDS = 8
+
+
+@dataclass(frozen=True)
+class Group:
+    """``count`` chunks of ``width`` rows, ``per_shard`` of them written at once."""
+
+    name: str
+    count: int
+    width: int
+
+    @property
+    def per_shard(self) -> int:
+        """Chunks of a shard: few files, but enough of them to keep many workers busy."""
+        return max(1, min(_MOST_CHUNKS, self.count // _FEWEST_SHARDS))
+
+    @property
+    def shards(self) -> int:
+        """Number of shards."""
+        return -(-self.count // self.per_shard)
+
+
+@dataclass(frozen=True)
+class Field:
+    """A variable: type, and the shape of its results at one row."""
+
+    name: str
+    dtype: str
+    shape: tuple[int, ...]
+
+
+def is_store(path: Path) -> bool:
+    """Whether there is a Zarr v3 group at ``path``."""
+    return (path / "zarr.json").is_file()
+
+
+def create(path: Path, groups: Sequence[Group], fields: Sequence[Field], attrs: Mapping[str, Any]) -> None:
+    """An empty store. Raises ``OSError`` where there is no room for it."""
+    zarr = _zarr()
+    root = zarr.create_group(path, zarr_format=3, attributes=dict(attrs))
+    for group in groups:
+        own = root.create_group(group.name)
+        for field in (*fields, Field(POINT, "int64", ())):
+            own.create_array(
+                field.name,
+                shape=(group.count * group.width, *field.shape),
+                dtype=field.dtype,
+                chunks=(group.width, *(max(n, 1) for n in field.shape)),
+                shards=(group.per_shard * group.width, *(max(n, 1) for n in field.shape)),
+                compressors=zarr.codecs.Crc32cCodec(),
+            )
+        own.create_array(DONE, shape=(group.shards,), dtype="uint64", chunks=(1,), compressors=None)
+
+
+def write(path: Path, group: Group, shard: int, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write shard number ``shard`` of ``group``, all its rows, and mark it done."""
+    own = _zarr().open_group(path, mode="r+")[group.name]
+    rows = _rows(group, shard)
+    for name, values in arrays.items():
+        own[name][rows] = values
+    own[DONE][shard] = _checksum(arrays)
+
+
+def done(path: Path, group: Group) -> np.ndarray:
+    """The shards of ``group`` that are marked done, a flag each."""
+    return _zarr().open_group(path, mode="r")[group.name][DONE][:] != 0
+
+
+def read(path: Path, group: Group, shard: int, names: Sequence[str]) -> dict[str, np.ndarray] | None:
+    """The arrays ``names`` of a shard; None if it is damaged. Its checksum needs all of its arrays to be asked for."""
+    own = _zarr().open_group(path, mode="r")[group.name]
+    rows = _rows(group, shard)
+    try:
+        arrays = {name: own[name][rows] for name in names}
+    # What decoding raises depends on where the damage is.
+    except (ValueError, OSError, KeyError, RuntimeError):
+        return None
+    return arrays if own[DONE][shard] == _checksum(arrays) else None
+
+
+def attributes(path: Path) -> dict[str, Any]:
+    """The attributes of the store; :class:`InputError` if it is none."""
+    try:
+        return dict(_zarr().open_group(path, mode="r").attrs)
+    except (OSError, ValueError, KeyError):
+        raise InputError(f"store = {str(path)!r}: not a readable Zarr store; give one of --store zarr") from None
+
+
+def annotate(path: Path, **attrs: Any) -> None:
+    """Add attributes."""
+    _zarr().open_group(path, mode="r+").attrs.update(attrs)
+
+
+def finished(path: Path, name: str) -> Iterator[np.ndarray]:
+    """The values of one variable at all points that are done, group by group, as they are stored."""
+    root = _zarr().open_group(path, mode="r")
+    for group in groups_of(root.attrs):
+        own = root[group.name]
+        flags = np.repeat(own[DONE][:] != 0, group.per_shard * group.width)[: group.count * group.width]
+        yield own[name][:][flags & (own[POINT][:] >= 0)]
+
+
+def damaged(path: Path) -> tuple[int, int]:
+    """How many shards are marked done but are not what was written, and how many are done."""
+    root = _zarr().open_group(path, mode="r")
+    wrong = count = 0
+    for group in groups_of(root.attrs):
+        names = [name for name in root[group.name].array_keys() if name != DONE]
+        for shard in np.flatnonzero(done(path, group)):
+            count += 1
+            wrong += read(path, group, int(shard), names) is None
+    return wrong, count
+
+
+def groups_of(attrs: Mapping[str, Any]) -> list[Group]:
+    """The groups of a store with these attributes."""
+    return [Group(*entry) for entry in json.loads(attrs["groups"])]
+
+
+def describe(groups: Sequence[Group]) -> str:
+    """The attribute from which :func:`groups_of` finds them again."""
+    return json.dumps([[group.name, group.count, group.width] for group in groups])
+
+
+def _rows(group: Group, shard: int) -> slice:
+    size = group.per_shard * group.width
+    return slice(shard * size, min((shard + 1) * size, group.count * group.width))
+
+
+def _checksum(arrays: Mapping[str, np.ndarray]) -> int:
+    state = hashlib.blake2b(digest_size=8)
+    for name in sorted(arrays):
+        state.update(np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8).data)
+    # 0 stands for "not done".
+    return int.from_bytes(state.digest(), "little") or 1
+
+
+def _zarr() -> Any:
+    try:
+        import zarr
+    except ImportError:
+        raise InputError("store = 'zarr': the package zarr is not installed; install drivetrain_jax[zarr]") from None
+    return zarr

@@ -1,0 +1,290 @@
+"""Questions to an atlas in words: what holds at a point, how far stability reaches, and what a design has to be.
+
+Parameters may be given as those of the atlas, or in the physical units of the system (``drivetrain_jax.systems``:
+``physical``). Every design answer is checked by direct solves.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis import OUTCOME
+from drivetrain_jax.atlas import design
+from drivetrain_jax.atlas.windows import Crossing
+from drivetrain_jax.sweep.atlas_file import StoredAtlas
+
+Range = tuple[float, float]
+# How closely a given parameter has to be what the atlas was made with.
+_SAME = 1e-9
+
+
+@dataclass(frozen=True)
+class Reply:
+    """An answer to be read (``str``) or processed (``data``, plain numbers, words and lists)."""
+
+    text: str
+    data: Mapping[str, Any]
+
+    def __str__(self) -> str:
+        return self.text
+
+    def to_json(self) -> str:
+        """``data`` as one JSON object; what is not finite is null."""
+        return json.dumps(_plain(self.data), allow_nan=False)
+
+
+def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
+    """Results at one point, and the nearest changes of stability along every parameter.
+
+    Raises :class:`InputError` for names and values that the atlas does not cover.
+    """
+    asked = _Asked.of(atlas, given, ranges=())
+    point = asked.values
+    found = atlas(**point)
+    results = {str(name): v.values[()] for name, v in found.data_vars.items()}
+    variables = {v.name: v for v in (*atlas.scene.analysis.variables, OUTCOME)}
+    rows = [f"  {name:<24} {_value(variables[name], value)}" for name, value in results.items()]
+    nearest = design.nearest_boundaries(atlas.stability.atlas, atlas.scene.system, point)
+    lines = [f"{atlas.scene.system.name} atlas, {asked.heading()}", *rows, "nearest change of stability"]
+    for each in nearest:
+        sides = [_side(asked, each.parameter, each.value, c) for c in (each.below, each.above) if c]
+        lines.append(f"  {each.parameter:<24} {'; '.join(sides) or _reach(atlas, each.parameter)}")
+        lines += [f"  {'':<24} undecided from {_number(a)} to {_number(b)}" for a, b in each.undecided]
+    data = {
+        "system": atlas.scene.system.name,
+        "parameters": {**atlas.fixed, **point},
+        "values": results,
+        "nearest": {
+            each.parameter: {
+                "below": _crossing(each.below),
+                "above": _crossing(each.above),
+                "undecided": [list(r) for r in each.undecided],
+            }
+            for each in nearest
+        },
+    }
+    return Reply("\n".join(lines), data)
+
+
+def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Reply:
+    """The least damping from which on a range of speeds is stable. Raises as :func:`query`."""
+    asked = _Asked.of(atlas, given, ranges=("Omega",), free=("zeta",))
+    answer = design.least_damping(
+        atlas.stability.atlas, atlas.scene.system, asked.values["Omega"], asked.numbers(), direct=atlas.radius
+    )
+    return _answered("least damping", "from {} on", asked, answer)
+
+
+def widest_angle(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Reply:
+    """The widest joint angle up to which a range of speeds is stable. Raises as :func:`query`."""
+    asked = _Asked.of(atlas, given, ranges=("Omega",), free=("beta",))
+    answer = design.widest_angle(
+        atlas.stability.atlas, atlas.scene.system, asked.values["Omega"], asked.numbers(), direct=atlas.radius
+    )
+    return _answered("widest angle", "up to {}", asked, answer)
+
+
+def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float = 0.0) -> Reply:
+    """The stable ranges of speed, shortened by ``margin`` of the speed at either end. Raises as :func:`query`."""
+    if not 0 <= margin < 1:
+        raise InputError(f"margin = {margin!r}: allowed is 0 <= margin < 1")
+    asked = _Asked.of(atlas, given, ranges=(), free=("Omega",))
+    windows = design.speed_windows(
+        atlas.stability.atlas, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.radius
+    )
+    lines = [f"safe speeds, {asked.heading()}, margin {margin:g}"]
+    for w in windows:
+        ends = " to ".join(asked.named("Omega", value) for value in w.safe)
+        lines.append(f"  {ends}; largest spectral radius {w.largest:.10g} at Omega = {_number(w.where)}")
+        lines.append(f"    {_checked(w.check)}")
+    data = {
+        "question": "speed_windows",
+        "parameters": {**atlas.fixed, **asked.values},
+        "margin": margin,
+        "windows": [
+            {"safe": list(w.safe), "largest": w.largest, "where": w.where, "check": _check(w.check)} for w in windows
+        ],
+    }
+    return Reply("\n".join(lines if windows else [*lines, "  none within the atlas"]), data)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What was given, as parameters of the atlas (numbers, or ranges), and the physical data behind it."""
+
+    atlas: StoredAtlas
+    values: Mapping[str, Any]
+    shaft: Any
+
+    @classmethod
+    def of(
+        cls, atlas: StoredAtlas, given: Mapping[str, Any], ranges: tuple[str, ...], free: tuple[str, ...] = ()
+    ) -> _Asked:
+        """``ranges`` names the parameters of which a range is wanted, ``free`` those that are the answer."""
+        shaft, values = _nondimensional(atlas, given)
+        for name in (*ranges, *free):
+            if name not in atlas.parameters:
+                raise InputError(
+                    f"file: the atlas does not vary {name}; allowed is one over {', '.join((*ranges, *free))}"
+                )
+        for name, value in values.items():
+            if name in atlas.fixed and name not in free:
+                _check_same(name, value, atlas.fixed[name])
+        own = {name: value for name, value in values.items() if name in atlas.parameters and name not in free}
+        for name in values:
+            if name not in atlas.parameters and name not in atlas.fixed:
+                raise InputError(f"{name}: not a parameter of the atlas; allowed is {', '.join(atlas.parameters)}")
+            if name in free and shaft is None:
+                raise InputError(f"{name} = {values[name]!r}: is what is asked for; allowed is to leave it out")
+        for name in atlas.parameters:
+            if name not in free:
+                _check_range(atlas, name, own.get(name), name in ranges)
+        return cls(atlas, own, shaft)
+
+    def numbers(self) -> dict[str, float]:
+        """The values that are numbers."""
+        return {name: value for name, value in self.values.items() if not isinstance(value, tuple)}
+
+    def heading(self) -> str:
+        everything = {**self.values, **self.atlas.fixed}
+        return ", ".join(
+            f"{name} = {_number(v[0])} to {_number(v[1])}" if isinstance(v, tuple) else f"{name} = {_number(v)}"
+            for name, v in everything.items()
+        )
+
+    def named(self, name: str, value: float) -> str:
+        """``beta = 0.31 (17.76 deg)``"""
+        physical = self.shaft.quantity(name, value) if self.shaft else None
+        aside = f" ({physical[0]} = {_number(physical[1])} {physical[2]})" if physical else ""
+        return f"{name} = {_number(value)}{aside}"
+
+
+def _nondimensional(atlas: StoredAtlas, given: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
+    """The physical data among ``given``, if there are any, and all values as parameters of the system."""
+    physical = atlas.scene.system.physical
+    data = [f.name for f in fields(physical)] if physical else []
+    known = (*data, "speed", "angle") if physical else ()
+    if not any(name in known for name in given):
+        return None, dict(given)
+    missing = [name for name in data if name not in given]
+    if missing:
+        raise InputError(f"{missing[0]}: missing; physical units need all of {', '.join(data)}")
+    shaft = physical(**{name: float(given[name]) for name in data})
+    values = dict(shaft.parameters)
+    for name in given:
+        if name in ("speed", "angle"):
+            ends = given[name] if isinstance(given[name], tuple) else (given[name],)
+            converted = [shaft.parameter(name, end) for end in ends]
+            numbers = tuple(value for _, value in converted)
+            values[converted[0][0]] = numbers if isinstance(given[name], tuple) else numbers[0]
+        elif name not in data:
+            values[name] = given[name]
+    return shaft, values
+
+
+def _check_same(name: str, value: Any, fixed: float) -> None:
+    if isinstance(value, tuple) or not math.isclose(value, fixed, rel_tol=_SAME, abs_tol=_SAME):
+        raise InputError(f"{name} = {value!r}: the atlas is made for {name} = {fixed!r}; allowed is that value")
+
+
+def _check_range(atlas: StoredAtlas, name: str, value: Any, wanted: bool) -> None:
+    low, high = atlas.ranges[name]
+    allowed = f"allowed is {f'{name}=LOW:HIGH within ' if wanted else ''}{low:.10g} <= {name} <= {high:.10g}"
+    if value is None:
+        raise InputError(f"{name}: missing; {allowed}")
+    if isinstance(value, tuple) != wanted:
+        raise InputError(f"{name} = {value!r}: {'a range is needed' if wanted else 'is a range'}; {allowed}")
+    ends = value if wanted else (value,)
+    for end in ends:
+        if isinstance(end, bool) or not isinstance(end, (int, float)) or not low <= end <= high:
+            raise InputError(f"{name} = {end!r}: {allowed}")
+    if wanted and not value[0] < value[1]:
+        raise InputError(f"{name} = {value[0]!r}:{value[1]!r}: allowed is a rising range")
+
+
+def _answered(title: str, phrase: str, asked: _Asked, answer: design.Answer) -> Reply:
+    lines = [f"{title}, {asked.heading()}"]
+    if answer.value is None:
+        lines.append(f"  no {answer.parameter} of the atlas will do")
+    else:
+        bound = f" +- {answer.error:.1e}" if answer.limit else " (the end of the atlas)"
+        lines.append(f"  stable {phrase.format(asked.named(answer.parameter, answer.value))}{bound}")
+        if answer.limit:
+            where = ", ".join(f"{n} = {_number(v)}" for n, v in answer.limit.point.items())
+            lines.append(f"  limit: multiplier {answer.limit.multiplier} at {where}")
+        if not answer.certain:
+            lines.append("  not certain: undecided ranges lie on the stable side")
+        lines.append(f"  {_checked(answer.check)}")
+    lines += [f"  undecided from {_number(a)} to {_number(b)}" for a, b in answer.undecided]
+    data = {
+        "question": title.replace(" ", "_"),
+        "parameters": {**asked.atlas.fixed, **asked.values},
+        "parameter": answer.parameter,
+        "value": answer.value,
+        "error": answer.error,
+        "certain": answer.certain,
+        "limit": _crossing(answer.limit),
+        "undecided": [list(r) for r in answer.undecided],
+        "check": _check(answer.check),
+    }
+    return Reply("\n".join(lines), data)
+
+
+def _side(asked: _Asked, name: str, value: float, crossing: Crossing) -> str:
+    where = "below" if crossing.value <= value else "above"
+    return f"{abs(crossing.value - value):.6g} {where}: {asked.named(name, crossing.value)} +- {crossing.error:.1e}"
+
+
+def _reach(atlas: StoredAtlas, name: str) -> str:
+    low, high = atlas.ranges[name]
+    return f"none from {_number(low)} to {_number(high)}"
+
+
+def _value(variable: Any, value: Any) -> str:
+    if variable.flags:
+        return f"{variable.flags[int(value)]} ({int(value)})"
+    return f"{value:.12g}"
+
+
+def _number(value: float) -> str:
+    return f"{value:.10g}"
+
+
+def _crossing(crossing: Crossing | None) -> dict[str, Any] | None:
+    if crossing is None:
+        return None
+    return {
+        "value": crossing.value,
+        "error": crossing.error,
+        "multiplier": crossing.multiplier,
+        "point": dict(crossing.point),
+    }
+
+
+def _check(check: design.Check | None) -> dict[str, Any] | None:
+    if check is None:
+        return None
+    return {"inside": check.inside, "beyond": check.beyond, "solves": check.solves, "agrees": check.agrees}
+
+
+def _checked(check: design.Check) -> str:
+    beyond = "" if math.isnan(check.beyond) else f", {check.beyond:.10g} beyond it"
+    verdict = "agree" if check.agrees else "DISAGREE"
+    return (
+        f"direct solves {verdict}: spectral radius at most {check.inside:.10g} inside{beyond} ({check.solves} solves)"
+    )
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _plain(v) for name, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if hasattr(value, "item"):
+        return _plain(value.item())
+    return None if isinstance(value, float) and not math.isfinite(value) else value

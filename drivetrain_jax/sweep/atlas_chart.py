@@ -1,0 +1,82 @@
+"""A chart of a stored atlas at any resolution and zoom, with its boundaries and tips as curves and points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.atlas.boundaries import boundaries
+from drivetrain_jax.atlas.tips import find_tips
+from drivetrain_jax.atlas.windows import narrow
+from drivetrain_jax.sweep.atlas_file import StoredAtlas, open_atlas
+from drivetrain_jax.systems import System
+
+# Values of a parameter beside the two of a chart.
+_SLICES = 3
+
+
+def chart(source: xr.Dataset, part: Mapping[str, float | tuple[float, float]], cells: int) -> xr.Dataset:
+    """The ``floquet`` result on ``cells`` values of each of two parameters of the atlas in ``source``.
+
+    ``part`` fixes parameters (numbers) or zooms in (ranges). Of further parameters there are three values. A chart of two
+    parameters also has its stability boundaries (``boundary_NAME``, parts separated by NaN) and the tips of its tongues
+    (``tip_NAME``, with their names). Raises :class:`InputError` for what the atlas does not cover.
+    """
+    if not 2 <= cells <= 20_000:
+        raise InputError(f"cells = {cells}: allowed is 2 <= cells <= 20000")
+    atlas = open_atlas(source)
+    ranges = _ranges(atlas, part)
+    fixed = {name: value for name, value in ranges.items() if not isinstance(value, tuple)}
+    shown = _shown(atlas.scene.system, [name for name in ranges if name not in fixed])
+    axes = {
+        name: np.linspace(*ranges[name], cells if name in shown[:2] else _SLICES)
+        for name in atlas.parameters
+        if name in shown
+    }
+    dataset = atlas.grid(**axes, **fixed)
+    return dataset.assign_coords(_curves(atlas, fixed, {n: ranges[n] for n in shown})) if len(shown) == 2 else dataset
+
+
+def _ranges(atlas: StoredAtlas, part: Mapping[str, Any]) -> dict[str, Any]:
+    for name, value in part.items():
+        if name not in atlas.parameters:
+            raise InputError(f"{name}: not a parameter of the atlas; allowed is {', '.join(atlas.parameters)}")
+        low, high = atlas.ranges[name]
+        rising = not isinstance(value, tuple) or value[0] < value[1]
+        if not rising or not all(low <= end <= high for end in np.atleast_1d(value)):
+            raise InputError(f"{name} = {value!r}: allowed is a number or LOW:HIGH within {low:.10g} to {high:.10g}")
+    return {name: part.get(name, atlas.ranges[name]) for name in atlas.parameters}
+
+
+def _shown(system: System, names: list[str]) -> list[str]:
+    """The two parameters of the chart first, the axis of the resonances among them."""
+    axis = system.resonances.axis if system.resonances else None
+    return sorted(names, key=lambda name: name != axis)
+
+
+def _curves(
+    atlas: StoredAtlas, fixed: Mapping[str, float], ranges: Mapping[str, tuple[float, float]]
+) -> dict[str, tuple[str, np.ndarray, dict[str, str]]]:
+    system = atlas.scene.system
+    panels = narrow(atlas.stability.atlas.slice(fixed), ranges)
+    segments = [segment for curve in boundaries(panels, system) for segment in curve.segments()]
+    coordinates = {}
+    for name in ranges:
+        about = {"units": system.parameter(name).units}
+        parts = [np.append(segment[name], np.nan) for segment in segments]
+        values = np.concatenate(parts) if parts else np.empty(0)
+        coordinates[f"boundary_{name}"] = ("boundary", values, {**about, "long_name": f"boundary of stability, {name}"})
+    if system.resonances is None or system.resonances.axis not in ranges:
+        return coordinates
+    tips = find_tips(panels, system).tips
+    labels = np.array([tip.name for tip in tips], dtype=str)
+    coordinates["tip"] = ("tip", labels, {"units": "1", "long_name": "resonance that the tongue grows from"})
+    for name in ranges:
+        values = np.array([tip.point[name] for tip in tips])
+        about = {"units": system.parameter(name).units, "long_name": f"tip of a tongue, {name}"}
+        coordinates[f"tip_{name}"] = ("tip", values, about)
+    return coordinates

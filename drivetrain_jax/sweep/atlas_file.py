@@ -1,0 +1,225 @@
+"""Atlas files: panels as a Dataset like any other result, and the object that answers from one."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis import Request, get_analysis
+from drivetrain_jax.analysis.atlas import ANALYSIS
+from drivetrain_jax.atlas import StabilityAtlas, from_arrays, stability_atlas, to_arrays
+from drivetrain_jax.atlas.floquet import floquet_domain
+from drivetrain_jax.store.consolidate import open_result
+from drivetrain_jax.sweep import compile_cache
+from drivetrain_jax.sweep.assemble import Table, result_attrs, to_dataset
+from drivetrain_jax.sweep.atlas_choice import atlas_ranges
+from drivetrain_jax.sweep.axes import Axis
+from drivetrain_jax.sweep.engine import Engine
+from drivetrain_jax.sweep.executor import Where
+from drivetrain_jax.sweep.rounds import build_atlas
+from drivetrain_jax.sweep.scene import Scene, load_scene
+from drivetrain_jax.sweep.through_atlas import evaluate
+from drivetrain_jax.sweep.work import Progress, Work
+
+# Name in the file, dimensions, meaning. Boxes are in the coordinates of the atlas, which have the attribute's names.
+_VARIABLES = {
+    "lower": (("parameter",), "lower end of the domain, in the parameter's unit"),
+    "upper": (("parameter",), "upper end of the domain, in the parameter's unit"),
+    "panel_lower": (("panel", "parameter"), "lower corner of a panel, in coordinates"),
+    "panel_upper": (("panel", "parameter"), "upper corner of a panel, in coordinates"),
+    "panel_degrees": (("panel", "parameter"), "number of Chebyshev polynomials of a panel"),
+    "value_error": (("panel",), "bound of the error of the propagator (Frobenius norm)"),
+    "derived_error": (("panel", "derived"), "bounds of the errors of the coefficients of det(sigma I - Z)"),
+    "coefficients": (("coefficient", "entry"), "Chebyshev coefficients that are not 0, panel after panel in C order"),
+    "kept": (("byte",), "bits that say which coefficients are not 0, of all panels together (most significant first)"),
+    "gap_lower": (("gap", "parameter"), "lower corner of a box without a panel, in coordinates"),
+    "gap_upper": (("gap", "parameter"), "upper corner of a box without a panel, in coordinates"),
+}
+
+
+def make_atlas(scene: Scene, work: Work, progress: Progress) -> xr.Dataset:
+    """The file of an atlas scene. ``progress`` counts the solves."""
+    stability, _ = build_atlas(scene, atlas_ranges(scene), work, progress)
+    atlas = stability.atlas
+    arrays = to_arrays(atlas)
+    data = {
+        name: (dims, arrays[name], {"units": "1", "long_name": meaning})
+        for name, (dims, meaning) in _VARIABLES.items()
+        if arrays[name].size
+    }
+    names = {"units": "1", "long_name": "name of the parameter"}
+    coords = {"parameter": (("parameter",), np.array(atlas.parameters), names)}
+    if atlas.gaps:
+        reason = {"units": "1", "long_name": "why there is no panel"}
+        coords["gap_reason"] = (("gap",), arrays["gap_reason"].astype(str), reason)
+    attrs = result_attrs(scene) | {
+        "coordinates_of_panels": json.dumps([c.name for c in atlas.coordinates]),
+        "tolerance": atlas.tolerance,
+        "solves": atlas.solves,
+    }
+    dataset = xr.Dataset(data, coords, attrs)
+    for variable in dataset.variables.values():
+        variable.encoding["_FillValue"] = None
+    return dataset
+
+
+def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
+    """The atlas that the run of a scene with ``analysis = "atlas"`` gave: its file, or the dataset itself.
+
+    Raises :class:`InputError` if it is none, or if its system is not installed or has other coordinates by now.
+    """
+    compile_cache.enable()
+    dataset = source if isinstance(source, xr.Dataset) else open_result(Path(source))
+    label = "dataset" if dataset is source else f"file = {str(source)!r}"
+    if dataset.attrs.get("analysis") != ANALYSIS.name:
+        raise InputError(f"{label}: holds the analysis {dataset.attrs.get('analysis')!r}; allowed is an atlas")
+    scene = load_scene(tomllib.loads(dataset.attrs["scene"]))
+    names = tuple(str(name) for name in dataset["parameter"].values)
+    ranges = dict(zip(names, zip(dataset["lower"].values, dataset["upper"].values, strict=True), strict=True))
+    domain = floquet_domain(scene.system, ranges, scene.fixed)
+    if [c.name for c in domain.coordinates] != json.loads(dataset.attrs["coordinates_of_panels"]):
+        raise InputError(f"{label}: made by another version of {scene.system.name}; allowed is to run its scene again")
+    d, arrays = len(names), {name: dataset[name].values for name in _VARIABLES if name in dataset}
+    if "gap_lower" in dataset:
+        arrays["gap_reason"] = dataset["gap_reason"].values
+    blank = {name: np.empty((0, d)) for name in ("panel_lower", "panel_upper", "gap_lower", "gap_upper")}
+    blank |= {"panel_degrees": np.empty((0, d), int), "gap_reason": np.empty(0), "kept": np.empty(0, np.uint8)}
+    arrays = blank | {"coefficients": np.empty((0, 0))} | arrays
+    used = {name: scene.fixed[name] for name in scene.system.models["atlas"].parameters if name in scene.fixed}
+    tolerance, solves = dataset.attrs["tolerance"], dataset.attrs["solves"]
+    atlas = from_arrays(arrays, names, domain.coordinates, used, tolerance, solves)
+    return StoredAtlas(scene, stability_atlas(atlas, scene.system, scene.request.options["rtol"]))
+
+
+@dataclass(frozen=True)
+class StoredAtlas:
+    """A stability atlas as a function: ``atlas(beta=0.31, Omega=1.2)``.
+
+    ``scene`` is the one that made it, ``stability`` what evaluates its panels. Points in gaps are solved directly.
+    """
+
+    scene: Scene
+    stability: StabilityAtlas
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that may vary."""
+        return self.stability.atlas.parameters
+
+    @property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Least and largest value of each parameter."""
+        atlas = self.stability.atlas
+        ends = zip(atlas.lower.tolist(), atlas.upper.tolist(), strict=True)
+        return dict(zip(atlas.parameters, ends, strict=True))
+
+    @property
+    def fixed(self) -> Mapping[str, Any]:
+        """The other parameters."""
+        return self.stability.atlas.fixed
+
+    def __repr__(self) -> str:
+        ranges = ", ".join(f"{name} {a:g} to {b:g}" for name, (a, b) in self.ranges.items())
+        atlas = self.stability.atlas
+        fixed = ", ".join(f"{name} = {value:g}" for name, value in self.fixed.items())
+        return f"{self.scene.system.name} atlas: {ranges}; {fixed}; {len(atlas.panels)} panels, {len(atlas.gaps)} gaps"
+
+    def __call__(self, **values: Any) -> xr.Dataset:
+        """Results at points: every parameter a number or an array, broadcast against each other.
+
+        Arrays of xarray keep their dimensions, others have the dimension ``point`` (or ``dim_0``, ``dim_1``, ...).
+        Raises :class:`InputError` for a name that is missing or unknown and for a value outside the atlas.
+        """
+        columns = xr.broadcast(*(_labelled(self._checked(name, values)) for name in self._names(values)))
+        columns = dict(zip(self.parameters, columns, strict=True))
+        shape, dims = columns[self.parameters[0]].shape, columns[self.parameters[0]].dims
+        flat = {name: np.asarray(column.values, float).reshape(-1) for name, column in columns.items()}
+        found = self._evaluate(self.stability, flat, zipped=True)
+        own = {name: v.dims[1:] for name, v in found.data_vars.items()}
+        data = {
+            name: ((*dims, *own[name]), v.values.reshape((*shape, *v.shape[1:])), v.attrs)
+            for name, v in found.data_vars.items()
+        }
+        coords = {name: (dims, column.values, found[name].attrs) for name, column in columns.items()}
+        return xr.Dataset(data, coords, found.attrs)
+
+    def grid(self, **values: Any) -> xr.Dataset:
+        """Results on the outer product of arrays, as a scene with these axes would give; numbers fix a parameter.
+
+        The dimensions have the order in which the arrays are given. Raises as a call does.
+        """
+        self._names(values)
+        given = {name: np.asarray(self._checked(name, values), float) for name in values}
+        axes = {name: column for name, column in given.items() if column.ndim}
+        for name, column in axes.items():
+            if column.ndim > 1 or not column.size:
+                raise InputError(f"{name}: an array of shape {column.shape}; allowed is a number or a row of numbers")
+        fixed = {name: float(column) for name, column in given.items() if not column.ndim}
+        return self._evaluate(self.stability.slice(fixed), axes, zipped=False)
+
+    def radius(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Spectral radii ``(N,)`` by direct solves, without the panels; ``columns`` of all parameters."""
+        axes = {name: column for name, column in columns.items() if name in self.parameters}
+        request = Request(("spectral_radius",), "direct", self.scene.request.options)
+        engine = Engine(self._scene(axes, dict(self.fixed), request, zipped=True))
+        table = Table(engine.scene, engine.grid)
+        Work(Where()).do(engine, table, Progress(engine.total))
+        return table.lay_out()["spectral_radius"]
+
+    def _names(self, values: Mapping[str, Any]) -> tuple[str, ...]:
+        for name in values:
+            if name not in self.parameters:
+                raise InputError(f"{name}: not a parameter of the atlas; allowed is {', '.join(self.parameters)}")
+        for name in self.parameters:
+            if name not in values:
+                low, high = self.ranges[name]
+                raise InputError(f"{name}: missing; allowed is {low:g} <= {name} <= {high:g}")
+        return self.parameters
+
+    def _checked(self, name: str, values: Mapping[str, Any]) -> Any:
+        low, high = self.ranges[name]
+        try:
+            numbers = np.asarray(values[name], float)
+        except (TypeError, ValueError):
+            raise InputError(f"{name} = {values[name]!r}: allowed are numbers") from None
+        outside = numbers[~((numbers >= low) & (numbers <= high))]
+        if outside.size:
+            raise InputError(f"{name} = {outside.flat[0]:.10g}: allowed is {low:.10g} <= {name} <= {high:.10g}")
+        return values[name]
+
+    def _evaluate(self, stability: StabilityAtlas, axes: Mapping[str, np.ndarray], zipped: bool) -> xr.Dataset:
+        request = Request(self.scene.request.outputs, "atlas", self.scene.request.options)
+        scene = self._scene(axes, stability.atlas.fixed, request, zipped)
+        engine = Engine(scene)
+        table = Table(scene, engine.grid)
+        evaluate(engine, table, stability, Work(Where()), Progress(engine.total))
+        return to_dataset(scene, table.lay_out(), {})
+
+    def _scene(self, axes: Mapping[str, np.ndarray], fixed: Mapping[str, Any], request: Request, zipped: bool) -> Scene:
+        system, floquet = self.scene.system, get_analysis("floquet")
+        columns = tuple(Axis(name, system.parameter(name), None, np.asarray(v, float)) for name, v in axes.items())
+        fixed = dict(self.scene.fixed) | {name: value for name, value in fixed.items() if name not in axes}
+        return replace(
+            self.scene,
+            analysis=floquet,
+            request=request,
+            axes=columns,
+            zipped=zipped,
+            fixed=fixed,
+            dimensions=floquet.dimensions(system, request, fixed),
+        )
+
+
+def _labelled(values: Any) -> xr.DataArray:
+    if isinstance(values, xr.DataArray):
+        return values
+    array = np.asarray(values, float)
+    return xr.DataArray(array, dims=("point",) if array.ndim == 1 else None)

@@ -1,0 +1,84 @@
+"""An atlas from direct solves: every round of its construction is a plan of chunks, kept and resumed like any others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from drivetrain_jax.analysis import Request
+from drivetrain_jax.analysis.floquet_propagator import ANALYSIS
+from drivetrain_jax.atlas import StabilityAtlas, floquet_rounds, solve_rtol, stability_atlas
+from drivetrain_jax.atlas.construction import MAX_SOLVES
+from drivetrain_jax.sweep.axes import Axis
+from drivetrain_jax.sweep.engine import Engine
+from drivetrain_jax.sweep.executor import Where
+from drivetrain_jax.sweep.scene import Scene
+from drivetrain_jax.sweep.work import Progress, Work
+
+_VALUES = "propagator"
+# Panels are to be this much better than the results that follow from them.
+_SHARPER = 0.1
+
+
+def build_atlas(
+    scene: Scene,
+    ranges: Mapping[str, tuple[float, float]],
+    work: Work,
+    progress: Progress,
+    max_solves: int | None = None,
+) -> tuple[StabilityAtlas, int]:
+    """The atlas of ``scene`` over ``ranges``, and the number of the first chunk that it leaves free.
+
+    ``progress`` counts the solves. Rounds are small, so that threads of this process solve them wherever the run works.
+    """
+    fixed = scene.fixed | {a.name: a.values[0].item() for a in scene.axes if a.name not in ranges}
+    fixed = {name: fixed[name] for name in scene.system.models[ANALYSIS.name].parameters if name in fixed}
+    rtol = scene.request.options["rtol"]
+    tolerance = _SHARPER * rtol
+    rounds = floquet_rounds(scene.system, ranges, fixed, tolerance, max_solves or MAX_SOLVES)
+    first, threads, values = 0, Where(work.where.threads), None
+    while True:
+        try:
+            points = rounds.send(values)
+        except StopIteration as end:
+            return stability_atlas(end.value, scene.system, rtol), first
+        engine = Engine(_solves(scene, fixed, tuple(ranges), points, solve_rtol(tolerance)), full_size=True)
+        answers = _Answers(len(points))
+        progress.total += len(points)
+        work.do(engine, answers, progress, first, threads)
+        first += len(engine.plan.costs)
+        values = answers.values
+
+
+def _solves(scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.ndarray, rtol: float) -> Scene:
+    """The scene of one round."""
+    axes = tuple(
+        Axis(name, scene.system.parameter(name), None, column) for name, column in zip(names, points.T, strict=True)
+    )
+    request = Request((_VALUES,), next(iter(ANALYSIS.methods)), {"rtol": rtol})
+    dimensions = ANALYSIS.dimensions(scene.system, request, fixed)
+    return replace(
+        scene, analysis=ANALYSIS, request=request, axes=axes, zipped=True, fixed=fixed, dimensions=dimensions
+    )
+
+
+class _Answers:
+    """Values ``(N, m)`` of the points of a round, NaN for those that could not be solved."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._values: np.ndarray | None = None
+
+    def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
+        if self._values is None:
+            self._values = np.full((self._count, results[_VALUES].shape[1]), np.nan)
+        self._values[points] = results[_VALUES]
+
+    def lose(self, points: np.ndarray) -> None:
+        """What is not filled in is lost."""
+
+    @property
+    def values(self) -> np.ndarray:
+        return np.full((self._count, 1), np.nan) if self._values is None else self._values

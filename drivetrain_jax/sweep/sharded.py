@@ -1,0 +1,177 @@
+"""Runs whose workers write their results themselves, as whole shards of a Zarr store: nothing passes through the driver."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.store import shards
+from drivetrain_jax.store.chunks import PartsFolder
+from drivetrain_jax.sweep.assemble import failures, missing_value, result_attrs, result_variables
+from drivetrain_jax.sweep.atlas_choice import uses_atlas
+from drivetrain_jax.sweep.engine import Engine
+from drivetrain_jax.sweep.executor import Where
+from drivetrain_jax.sweep.kernel import result_shapes
+from drivetrain_jax.sweep.plan import Chunk
+from drivetrain_jax.sweep.work import Progress, Report
+from drivetrain_jax.sweep.worker import Job
+
+
+@dataclass(frozen=True)
+class Shard:
+    """The ``chunks`` that make up shard ``index`` of ``group``."""
+
+    number: int
+    group: shards.Group
+    index: int
+    chunks: tuple[Chunk, ...]
+
+    @property
+    def points(self) -> int:
+        """How many points it has."""
+        return sum(chunk.points.size for chunk in self.chunks)
+
+
+@dataclass(frozen=True)
+class ShardJob(Job):
+    """Shards of the store at ``path``, which every worker has to see under this name."""
+
+    path: str
+
+    def do(self, engine: Engine, shard: Shard) -> Mapping[str, np.ndarray]:
+        """Compute and write ``shard``; only the outcomes come back."""
+        return _write(self.path, engine, shard, [engine.compute_chunk(chunk) for chunk in shard.chunks])
+
+
+def check(engine: Engine) -> None:
+    """:class:`InputError` for a scene that has no points to compute one by one."""
+    if engine.scene.analysis.continuous or uses_atlas(engine.scene):
+        raise InputError(
+            "store = 'zarr': an atlas is small; allowed is hdf5, or a scene that solves every point directly"
+        )
+
+
+def groups_of(engine: Engine) -> list[shards.Group]:
+    """One for each solver of the plan."""
+    return [shards.Group(f"solver_{g.index}", len(g.efforts), g.chunk) for g in engine.plan.groups]
+
+
+def compute(
+    engine: Engine, out: Path, parts: PartsFolder, progress: Progress, where: Where, report: Report | None
+) -> None:
+    """Fill the store that grows among ``parts``, and put it at ``out`` when it is complete."""
+    path, begin = parts.path / "store", time.monotonic()
+    # Points that no solver can do are done already, without a value.
+    hopeless = engine.total - sum(group.order.size for group in engine.plan.groups) * engine.grid.path_length
+    progress.computed += hopeless
+    progress.failed += hopeless
+    if not shards.is_store(path):
+        _create(engine, path)
+    missing = list(_missing(engine, path, progress))
+    costs = engine.plan.costs
+    progress.total_cost = float(sum(costs[chunk.number] for shard in missing for chunk in shard.chunks))
+    _tell(report, progress)
+    job = ShardJob(engine.scene.text, engine.digest, os.path.abspath(path))
+    with closing(where.each(missing, partial(job.do, engine), job)) as finished:
+        for shard, results in finished:
+            outcome = _one_by_one(engine, where, path, shard) if results is None else results[OUTCOME.name]
+            progress.computed += shard.points * engine.grid.path_length
+            progress.failed += failures(outcome)
+            progress.cost += float(sum(costs[chunk.number] for chunk in shard.chunks))
+            _tell(report, progress)
+    _finish(path, out, parts, round(time.monotonic() - begin, 3))
+
+
+def _tell(report: Report | None, progress: Progress) -> None:
+    if report:
+        report(progress)
+
+
+def _create(engine: Engine, path: Path) -> None:
+    shutil.rmtree(path, ignore_errors=True)
+    groups = groups_of(engine)
+    shapes = result_shapes(engine.scene, engine.grid, engine.solvers[engine.plan.groups[0].index]) if groups else {}
+    fields = [shards.Field(v.name, v.dtype, shapes[v.name]) for v in result_variables(engine.scene)] if groups else []
+    attrs = result_attrs(engine.scene) | {"digest": engine.digest, "numerics": engine.numerics}
+    # Moved in one step: what is there is a whole store.
+    half = path.with_name("half")
+    shutil.rmtree(half, ignore_errors=True)
+    shards.create(half, groups, fields, attrs | {"groups": shards.describe(groups)})
+    half.rename(path)
+
+
+def all_shards(engine: Engine) -> Iterator[Shard]:
+    """The plan in shards."""
+    number = first = 0
+    for group in groups_of(engine):
+        for index in range(group.shards):
+            start = index * group.per_shard
+            numbers = range(first + start, first + min(start + group.per_shard, group.count))
+            yield Shard(number, group, index, tuple(engine.plan.chunk(n) for n in numbers))
+            number += 1
+        first += group.count
+
+
+def _missing(engine: Engine, path: Path, progress: Progress) -> Iterator[Shard]:
+    """Shards that are not there or damaged; the others count as reused."""
+    names = [shards.POINT, *(variable.name for variable in result_variables(engine.scene))]
+    marked = {group.name: shards.done(path, group) for group in groups_of(engine)}
+    for shard in all_shards(engine):
+        present = shards.read(path, shard.group, shard.index, names) if marked[shard.group.name][shard.index] else None
+        if present is None:
+            yield shard
+            continue
+        progress.reused += shard.points * engine.grid.path_length
+        progress.failed += failures(present[OUTCOME.name][present[shards.POINT] >= 0])
+
+
+def _write(
+    path: str | Path, engine: Engine, shard: Shard, results: list[Mapping[str, np.ndarray]]
+) -> dict[str, np.ndarray]:
+    """Write the results of all chunks of ``shard``, padded to whole chunks; returns the outcomes."""
+    width = shard.group.width
+    arrays = {shards.POINT: np.concatenate([_padded(c.points, width, -1) for c in shard.chunks])}
+    for variable in result_variables(engine.scene):
+        blank = missing_value(variable)
+        arrays[variable.name] = np.concatenate([_padded(r[variable.name], width, blank) for r in results])
+    shards.write(Path(path), shard.group, shard.index, arrays)
+    return {OUTCOME.name: arrays[OUTCOME.name][arrays[shards.POINT] >= 0]}
+
+
+def _padded(values: np.ndarray, count: int, blank: float) -> np.ndarray:
+    full = np.full((count, *values.shape[1:]), blank, values.dtype)
+    full[: len(values)] = values
+    return full
+
+
+def _one_by_one(engine: Engine, where: Where, path: Path, shard: Shard) -> np.ndarray:
+    """A shard at which processes die: its chunks alone, so that only the deadly one is lost; the driver writes it."""
+    found = {chunk.number: results for chunk, results in where.compute(engine, [c.number for c in shard.chunks])}
+    shapes = result_shapes(engine.scene, engine.grid, engine.solvers[shard.chunks[0].solver])
+    lost = {
+        v.name: np.full((shard.group.width, *shapes[v.name]), missing_value(v), v.dtype)
+        for v in result_variables(engine.scene)
+    }
+    lost[OUTCOME.name][...] = Outcome.LOST
+    results = [found[c.number] or {n: a[: c.points.size] for n, a in lost.items()} for c in shard.chunks]
+    return _write(path, engine, shard, results)[OUTCOME.name]
+
+
+def _finish(path: Path, out: Path, parts: PartsFolder, seconds: float) -> None:
+    """Put the store into place. A former one is set aside first: a directory cannot be replaced in one step."""
+    shards.annotate(path, wall_time_s=seconds)
+    former = parts.path / "former"
+    if out.exists():
+        shutil.rmtree(former, ignore_errors=True)
+        out.rename(former)
+    path.rename(out)

@@ -1,0 +1,98 @@
+"""A scene computed through an atlas: the same table, filled by evaluating it, and by direct solves where it has gaps."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.atlas import StabilityAtlas
+from drivetrain_jax.sweep.assemble import Table, failures
+from drivetrain_jax.sweep.atlas_choice import atlas_ranges, solves_allowed
+from drivetrain_jax.sweep.engine import Engine
+from drivetrain_jax.sweep.rounds import build_atlas
+from drivetrain_jax.sweep.work import Progress, Work
+
+# Cells evaluated at a time: what they need in memory, and how often progress is told.
+_BLOCK = 1 << 21
+_ROWS = 64
+
+Results = Mapping[str, np.ndarray]
+
+
+def fill_through_atlas(engine: Engine, table: Table, work: Work, progress: Progress) -> dict[str, int]:
+    """All points of ``engine`` into ``table``; returns what the attributes of the result are to say of it."""
+    scene = engine.scene
+    solves = Progress(0, kind="direct solves for the atlas")
+    atlas, first = build_atlas(scene, atlas_ranges(scene), work, solves, solves_allowed(scene))
+    uncovered = evaluate(engine, table, atlas, work, progress, first)
+    return {"atlas_solves": atlas.atlas.solves, "atlas_panels": len(atlas.atlas.panels), "atlas_uncovered": uncovered}
+
+
+def evaluate(
+    engine: Engine, table: Table, atlas: StabilityAtlas, work: Work, progress: Progress, first: int = 0
+) -> int:
+    """All points of ``engine`` into ``table`` from ``atlas``; those that it does not cover are solved and counted.
+
+    A run that is resumed evaluates again, which is faster than reading would be. ``first`` see :meth:`Work.do`.
+    """
+    uncovered: list[np.ndarray] = []
+    blocks = _points(engine, atlas) if engine.scene.zipped else _blocks(engine, atlas)
+    for block, results in blocks:
+        table.put(block, results)
+        outcome = results[OUTCOME.name]
+        lost = np.argwhere(outcome == Outcome.LOST) + [part.start for part in block]
+        uncovered.append(np.ravel_multi_index(tuple(lost.T), engine.grid.shape))
+        progress.computed += outcome.size - len(lost)
+        progress.failed += failures(outcome) - len(lost)
+        if work.report:
+            work.report(progress)
+    rest = np.concatenate(uncovered)
+    if rest.size:
+        work.do(engine.only(rest), table, progress, first)
+    return rest.size
+
+
+def _points(engine: Engine, atlas: StabilityAtlas) -> Iterator[tuple[tuple[slice], Results]]:
+    names = atlas.atlas.parameters
+    for start in range(0, engine.grid.size, _BLOCK):
+        numbers = np.arange(start, min(start + _BLOCK, engine.grid.size))
+        columns = engine.grid.columns(numbers)
+        points = np.stack([columns[name] for name in names], axis=-1)
+        yield (slice(start, start + len(numbers)),), atlas.at(points, engine.scene.request.outputs)
+
+
+def _blocks(engine: Engine, atlas: StabilityAtlas) -> Iterator[tuple[tuple[slice, ...], Results]]:
+    """Place in the grid and results of one block after the other."""
+    axes = {axis.name: axis.values for axis in engine.grid.axes}
+    names = atlas.atlas.parameters
+    for ranges in _cut([len(axes[name]) for name in names]):
+        values = [axes[name][part] for name, part in zip(names, ranges, strict=True)]
+        results = atlas.on_grid(values, engine.scene.request.outputs)
+        place = tuple(dict(zip(names, ranges, strict=True)).get(name, slice(0, 1)) for name in axes)
+        yield place, {n: _in_scene_order(v, names, tuple(axes)) for n, v in results.items()}
+
+
+def _cut(lengths: Sequence[int]) -> Iterator[tuple[slice, ...]]:
+    """Blocks of a grid of at most about ``_BLOCK`` cells, whole along as many of the last axes as possible."""
+    whole = len(lengths) - 1
+    while whole > 0 and math.prod(lengths[whole:]) <= _BLOCK:
+        whole -= 1
+    # Axis number `whole` is cut into pieces, those before it into single values.
+    step = max(1, _BLOCK // max(math.prod(lengths[whole + 1 :]), 1))
+    step = step - step % _ROWS if step > _ROWS else step
+    pieces = [slice(i, min(i + step, lengths[whole])) for i in range(0, lengths[whole], step)]
+    for leading in itertools.product(*(range(n) for n in lengths[:whole])):
+        for piece in pieces:
+            yield (*(slice(i, i + 1) for i in leading), piece, *(slice(0, n) for n in lengths[whole + 1 :]))
+
+
+def _in_scene_order(values: np.ndarray, names: Sequence[str], axes: Sequence[str]) -> np.ndarray:
+    """Results over the parameters ``names`` of an atlas (then dimensions of their own) over the ``axes`` of the scene."""
+    present = [name for name in axes if name in names]
+    order = [names.index(name) for name in present]
+    values = np.transpose(values, (*order, *range(len(names), values.ndim)))
+    return np.expand_dims(values, tuple(k for k, name in enumerate(axes) if name not in names))

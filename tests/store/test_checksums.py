@@ -1,0 +1,92 @@
+"""Checksums of a finished file: whatever changes what a reader sees is found, and named."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+from drivetrain_jax import InputError
+from drivetrain_jax._quantities import Dimension, Variable
+from drivetrain_jax.store import checksums
+from drivetrain_jax.store.consolidate import open_result, write_result
+from drivetrain_jax.store.schema import Coordinate, build_dataset
+
+
+@pytest.fixture
+def path(tmp_path):
+    axis = Coordinate("x", ("x",), np.linspace(0, 1, 40), "m", "place")
+    rng = np.random.default_rng(1)
+    results = [
+        (Variable("z", "1", "complex", ("k",), "complex128"), rng.random((40, 2)) + 1j),
+        (Variable("v", "1", "flag", dtype="int8", flags=("no", "yes")), np.zeros(40, np.int8)),
+    ]
+    dataset = build_dataset(("x",), [axis], (Dimension("k", "number", ("up", "down")),), results, {"title": "one"})
+    write_result(dataset, tmp_path / "r.nc", tmp_path / "tmp")
+    return tmp_path / "r.nc"
+
+
+def test_an_intact_file(path):
+    assert checksums.damaged(path) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda f: f["z"].__setitem__((3, 1), 0), ["z"]),
+        (lambda f: f["x"].__setitem__(0, 1e-300), ["x"]),
+        (lambda f: f["k"].__setitem__(0, "sideways"), ["k"]),
+        (lambda f: f["v"].attrs.modify("units", "m"), ["v"]),
+        (lambda f: f.attrs.modify("title", "two"), ["/"]),
+        (lambda f: f.__delitem__("v"), ["v"]),
+        (lambda f: f.create_dataset("new", data=1.0), ["new"]),
+        (lambda f: f["z"].dims[0].detach_scale(f["x"]), ["z"]),
+        (lambda f: f.attrs.modify("checksums", np.bytes_(b"{}")), ["/", "k", "v", "x", "z"]),
+        (lambda f: f.attrs.modify("checksums", np.bytes_(b"rubbish")), ["/", "k", "v", "x", "z"]),
+    ],
+)
+def test_a_change_is_named(path, change, named):
+    with h5py.File(path, "r+") as file:
+        change(file)
+    assert checksums.damaged(path) == named
+
+
+def test_a_file_of_another_origin_has_none(tmp_path):
+    xr.Dataset({"x": 1.0}).to_netcdf(tmp_path / "f.nc", engine="h5netcdf")
+    assert checksums.damaged(tmp_path / "f.nc") is None
+
+
+def seen(path):
+    """What a reader sees, None if it cannot read; bytes, so that NaN and -0 count."""
+    try:
+        ds = open_result(path)
+    except InputError:
+        return None
+    return {n: (v.dims, v.dtype.str, v.values.tobytes(), str(v.attrs)) for n, v in ds.variables.items()}, str(ds.attrs)
+
+
+def test_every_flipped_bit_that_a_reader_could_see_is_found(path):
+    """Bytes that nothing reads (gaps of the format) may change unnoticed: the contents are what they were."""
+    whole, content = path.read_bytes(), seen(path)
+    rng = np.random.default_rng(7)
+    found = 0
+    for position in rng.integers(0, len(whole), 300):
+        damaged = bytearray(whole)
+        damaged[position] ^= 1 << rng.integers(8)
+        path.write_bytes(damaged)
+        try:
+            noticed = checksums.damaged(path) != []
+        except InputError:
+            noticed = True
+        found += noticed
+        assert noticed or seen(path) == content, position
+    assert found > 30
+
+
+@pytest.mark.parametrize("part", [0.0, 0.3, 0.9, 0.999])
+def test_truncation_is_found(path, part):
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(part * len(whole))])
+    with pytest.raises(InputError, match="not a readable"):
+        checksums.damaged(path)

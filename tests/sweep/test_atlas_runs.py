@@ -1,0 +1,333 @@
+"""Scenes computed through an atlas, atlas files, and the questions they answer."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import drivetrain_jax as dt
+from drivetrain_jax.analysis import Outcome
+from drivetrain_jax.cli import main
+from drivetrain_jax.store.consolidate import write_result
+from drivetrain_jax.sweep import atlas_answers, atlas_choice, rounds
+from drivetrain_jax.sweep.atlas_chart import chart
+from drivetrain_jax.sweep.run import Interrupted, run_to_file
+
+BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+ENDS = " allowed is start and stop"
+BETA, OMEGA = (0.0, 0.6), (1.0, 2.0)
+ATLAS = {
+    "system": "cardan",
+    "analysis": "atlas",
+    "axes": {"beta": {"start": BETA[0], "stop": BETA[1]}, "Omega": {"start": OMEGA[0], "stop": OMEGA[1]}},
+    "fixed": BASE,
+}
+
+
+def floquet(method, axes=None, **more):
+    axes = axes or {
+        "Omega": {"start": OMEGA[1], "stop": OMEGA[0], "num": 41},
+        "mu": {"values": [1.0]},
+        "beta": {"start": BETA[0], "stop": BETA[1], "num": 13},
+    }
+    fixed = {name: value for name, value in BASE.items() if name not in axes}
+    return {
+        "system": "cardan",
+        "analysis": "floquet",
+        "axes": axes,
+        "fixed": fixed,
+        "options": {"method": method},
+        **more,
+    }
+
+
+def same_arrays(a, b):
+    assert set(a.variables) == set(b.variables)
+    for name in a.variables:
+        np.testing.assert_array_equal(a[name].values, b[name].values, err_msg=name)
+
+
+def assert_agree(found, exact):
+    error = np.abs(found["spectral_radius"] - exact["spectral_radius"])
+    bound = found["spectral_radius_error"] + exact["spectral_radius_error"]
+    assert found["spectral_radius"].dims == exact["spectral_radius"].dims
+    assert bool((error <= bound).all()) and float(bound.median()) < 1e-9
+    decided = (found["verdict"] < 2) & (exact["verdict"] < 2)
+    assert bool((found["verdict"] == exact["verdict"]).where(decided, True).all()) and bool(decided.mean() > 0.99)
+
+
+@pytest.fixture(scope="module")
+def direct():
+    return dt.run(floquet("direct"))
+
+
+@pytest.fixture(scope="module")
+def stored():
+    return dt.run(ATLAS)
+
+
+@pytest.fixture(scope="module")
+def atlas(stored):
+    return dt.open_atlas(stored)
+
+
+def test_a_chart_through_an_atlas(direct):
+    found = dt.run(floquet("atlas"))
+    assert_agree(found, direct)
+    assert found.attrs["atlas_uncovered"] == 0 and 100 < found.attrs["atlas_solves"] < 800
+    assert found.sizes["mu"] == 1 and (found["outcome"] <= Outcome.TOLERANCE_NOT_MET).all()
+
+
+def test_points_and_multipliers_through_an_atlas():
+    random = np.random.default_rng(0)
+    points = {"Omega": random.uniform(*OMEGA, 50).tolist(), "beta": random.uniform(*BETA, 50).tolist()}
+    scene = {**floquet("atlas"), "outputs": ["floquet_multiplier", "spectral_radius"], "points": points, "axes": {}}
+    scene["fixed"] = BASE
+    found = dt.run(scene)
+    exact = dt.run({**scene, "options": {"method": "direct"}})
+    assert found["floquet_multiplier"].dims == ("point", "multiplier")
+    np.testing.assert_allclose(found["spectral_radius"], exact["spectral_radius"], rtol=1e-9)
+    modulus = np.abs(found["floquet_multiplier"])
+    np.testing.assert_allclose(modulus.max("multiplier"), found["spectral_radius"], rtol=1e-12)
+
+
+def test_auto_takes_an_atlas_where_points_are_many(monkeypatch, direct):
+    assert "atlas_solves" not in dt.run(floquet("auto")).attrs
+    monkeypatch.setattr(atlas_choice, "_WORTHWHILE", 500)
+    found = dt.run(floquet("auto"))
+    # 533 points allow 66 solves, which is fewer than the first round needs: all of them are solved directly.
+    assert found.attrs["atlas_uncovered"] == 533
+    same_arrays(found, direct)
+    monkeypatch.setattr(atlas_choice, "_POINTS_PER_SOLVE", 1)
+    assert_agree(dt.run(floquet("auto")), direct)
+
+
+def test_what_an_atlas_does_not_cover_is_solved(monkeypatch, direct):
+    monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
+    found = dt.run(floquet("atlas"))
+    assert found.attrs["atlas_uncovered"] == 533 and found.attrs["atlas_panels"] == 0
+    same_arrays(found, direct)
+
+
+def interrupted_run(scene, out, chunks):
+    """A run that is stopped after this many reports."""
+    count = 0
+
+    def report(_):
+        nonlocal count
+        count += 1
+        if count > chunks:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted):
+        run_to_file(scene, out, report=report)
+
+
+@pytest.mark.parametrize("chunks", [1, 2, 3])
+def test_an_interrupted_atlas_is_resumed_with_the_same_bits(tmp_path, stored, chunks):
+    out = tmp_path / "a.nc"
+    interrupted_run(ATLAS, out, chunks)
+    assert not out.exists() and (tmp_path / "a.nc.parts").is_dir()
+    progress = run_to_file(ATLAS, out)
+    assert progress.reused > 0 and progress.reused + progress.computed == progress.total == stored.attrs["solves"]
+    with xr.open_dataset(out, engine="h5netcdf") as found:
+        same_arrays(found, stored)
+    again = run_to_file(ATLAS, out)
+    assert again.computed == 0 and again.reused == stored.attrs["solves"]
+
+
+def test_an_interrupted_chart_is_resumed_with_the_same_bits(tmp_path):
+    out, scene = tmp_path / "a.nc", floquet("atlas")
+    interrupted_run(scene, out, 2)
+    progress = run_to_file(scene, out)
+    assert progress.total == progress.computed == 533 and progress.failed == 0
+    with xr.open_dataset(out, engine="h5netcdf") as found:
+        same_arrays(found, dt.run(scene))
+
+
+def test_the_function_of_the_parameters(atlas, direct):
+    assert atlas.parameters == ("beta", "Omega") and atlas.ranges == {"beta": BETA, "Omega": OMEGA}
+    omega, beta = direct["Omega"].values, direct["beta"].values
+    grid = atlas.grid(Omega=omega, beta=beta)
+    assert grid["spectral_radius"].dims == ("Omega", "beta")
+    assert_agree(grid, direct.isel(mu=0, drop=True))
+    points = atlas(beta=xr.DataArray(beta, dims="b"), Omega=xr.DataArray(omega, dims="w"))
+    assert points["verdict"].dims == ("b", "w")
+    np.testing.assert_allclose(points["spectral_radius"].T, grid["spectral_radius"], atol=1e-9)
+    assert atlas(beta=0.31, Omega=1.2)["spectral_radius"].shape == ()
+    line = atlas.grid(beta=0.31, Omega=omega)
+    assert line["spectral_radius"].dims == ("Omega",) and float(line["beta"] if "beta" in line.coords else 0.31) == 0.31
+
+
+def test_gaps_of_a_stored_atlas_are_solved(monkeypatch):
+    monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
+    atlas = dt.open_atlas(dt.run(ATLAS))
+    assert "0 panels, 1 gaps" in repr(atlas)
+    found, exact = atlas(beta=0.3, Omega=1.3), dt.point("cardan", "floquet", beta=0.3, Omega=1.3, **BASE)
+    assert float(found["spectral_radius"]) == pytest.approx(exact.spectral_radius, rel=1e-12)
+
+
+def test_a_file_of_other_coordinates_is_refused(stored):
+    with pytest.raises(dt.InputError, match="made by another version of cardan"):
+        dt.open_atlas(stored.assign_attrs(coordinates_of_panels='["beta", "Omega"]'))
+    with pytest.raises(dt.InputError, match="holds the analysis 'floquet'; allowed is an atlas"):
+        dt.open_atlas(stored.assign_attrs(analysis="floquet"))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"beta": 0.3}, "Omega: missing; allowed is 1 <= Omega <= 2"),
+        ({"beta": 0.3, "Omega": 2.5}, "Omega = 2.5: allowed is 1 <= Omega <= 2"),
+        ({"beta": [0.3, np.nan], "Omega": 1.5}, "beta = nan: allowed is 0 <= beta <= 0.6"),
+        ({"beta": "wide", "Omega": 1.5}, "beta = 'wide': allowed are numbers"),
+        ({"beta": 0.3, "Omega": 1.5, "mu": 1.0}, "mu: not a parameter of the atlas; allowed is beta, Omega"),
+    ],
+)
+def test_questions_outside_the_atlas(atlas, given, message):
+    with pytest.raises(dt.InputError) as error:
+        atlas(**given)
+    assert str(error.value) == message
+
+
+def test_nearest_boundaries_of_a_point(atlas):
+    reply = atlas_answers.query(atlas, {"beta": 0.31, "Omega": 1.2})
+    data = json.loads(reply.to_json())
+    assert data["values"]["verdict"] == 0 and data["nearest"]["Omega"]["below"] is None
+    omega = data["nearest"]["Omega"]["above"]["value"]
+    radius = [dt.point("cardan", "floquet", beta=0.31, Omega=omega + d, **BASE).spectral_radius for d in (-1e-7, 1e-7)]
+    assert radius[0] < 1 < radius[1]
+    assert f"Omega = {omega:.10g}" in str(reply) and "verdict                  stable (0)" in str(reply)
+
+
+def test_the_same_point_in_physical_units(atlas):
+    stiffness, inertia = 1000.0, 2.0
+    damping = 2 * 0.001 * (stiffness * inertia) ** 0.5
+    rpm = 1.2 * (stiffness / inertia) ** 0.5 * 60 / (2 * np.pi)
+    shaft = {"J1": inertia, "J2": 100 * inertia, "k1": stiffness, "k2": stiffness, "c1": damping, "c2": damping}
+    reply = atlas_answers.query(atlas, {**shaft, "speed": rpm, "angle": np.degrees(0.31)})
+    plain = atlas_answers.query(atlas, {"beta": 0.31, "Omega": 1.2})
+    assert reply.data["values"]["spectral_radius"] == pytest.approx(plain.data["values"]["spectral_radius"], abs=1e-12)
+    assert "rpm" in str(reply) and "rpm" not in str(plain)
+    with pytest.raises(dt.InputError, match=r"^J2: missing; physical units need all of J1, J2, k1, k2, c1, c2$"):
+        atlas_answers.query(atlas, {"J1": 1.0, "speed": 100.0})
+    with pytest.raises(dt.InputError, match=r"^mu = 2\.0: the atlas is made for mu = 1\.0; allowed is that value$"):
+        atlas_answers.query(atlas, {**shaft, "k2": 2000.0, "speed": rpm, "angle": 10.0})
+
+
+def test_design_answers_are_checked_by_direct_solves(atlas):
+    angle = atlas_answers.widest_angle(atlas, {"Omega": (1.3, 1.5)})
+    assert angle.data["value"] == pytest.approx(0.1063331213, abs=1e-8)  # the tip of S21
+    assert angle.data["check"]["agrees"] and "direct solves agree" in str(angle)
+    windows = atlas_answers.speed_windows(atlas, {"beta": 0.31}, margin=0.02).data["windows"]
+    assert len(windows) == 2 and all(w["check"]["agrees"] for w in windows)
+    edge = json.loads(atlas_answers.query(atlas, {"beta": 0.31, "Omega": 1.2}).to_json())["nearest"]["Omega"]["above"]
+    assert windows[0]["safe"][1] == pytest.approx(edge["value"] * 0.98, rel=1e-8)
+    with pytest.raises(dt.InputError, match=r"^file: the atlas does not vary zeta"):
+        atlas_answers.least_damping(atlas, {"Omega": (1.0, 1.2)})
+    with pytest.raises(dt.InputError, match=r"^Omega = 1\.2: a range is needed"):
+        atlas_answers.widest_angle(atlas, {"Omega": 1.2})
+    with pytest.raises(dt.InputError, match=r"^margin = 2: allowed is 0 <= margin < 1$"):
+        atlas_answers.speed_windows(atlas, {"beta": 0.31}, margin=2)
+
+
+def test_least_damping_of_a_range_of_speeds():
+    axes = {"Omega": {"start": 1.3, "stop": 1.6}, "zeta": {"start": 0.0, "stop": 0.05}}
+    fixed = {name: value for name, value in BASE.items() if name != "zeta"}
+    atlas = dt.open_atlas(dt.run({**ATLAS, "axes": axes, "fixed": {**fixed, "beta": 0.2}}))
+    data = atlas_answers.least_damping(atlas, {"Omega": (1.35, 1.5)}).data
+    assert data["certain"] and data["check"]["agrees"]
+
+    def largest(zeta):
+        speeds = {"start": 1.35, "stop": 1.5, "num": 601}
+        scene = floquet("direct", {"Omega": speeds})
+        return float(dt.run({**scene, "fixed": {**fixed, "beta": 0.2, "zeta": zeta}})["spectral_radius"].max())
+
+    assert largest(0.999 * data["value"]) > 1 > largest(1.001 * data["value"])
+
+
+def test_a_chart_of_a_stored_atlas(stored):
+    found = chart(stored, {"Omega": (1.3, 1.5)}, 60)
+    assert found["verdict"].shape == (60, 60) and found["Omega"].values[[0, -1]].tolist() == [1.3, 1.5]
+    assert found["tip"].values.tolist() == ["S21"]
+    assert float(found["tip_beta"][0]) == pytest.approx(0.1063331213, abs=1e-8)
+    on_curve = found["boundary_beta"].dropna("boundary")
+    beta, omega = on_curve.values, found["boundary_Omega"].dropna("boundary").values
+    radius = dt.open_atlas(stored)(beta=beta, Omega=omega)["spectral_radius"]
+    assert len(beta) > 20 and float(np.abs(radius - 1).max()) < 1e-9
+    with pytest.raises(dt.InputError, match=r"^Omega = \(1\.5, 3\.0\): allowed is a number or LOW:HIGH within 1 to 2$"):
+        chart(stored, {"Omega": (1.5, 3.0)}, 60)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"axes": {}}, "axes: 0 are given; atlas allows 1 to 4"),
+        (
+            {"axes": {"beta": {"start": 0.0, "stop": 1.0, "num": 5}}},
+            "axes.beta.num = 5: an atlas has ranges; allowed is start and stop",
+        ),
+        (
+            {"axes": {"beta": {"values": [0.1]}}},
+            "axes.beta.values = [0.1]: an atlas has ranges; allowed is start and stop",
+        ),
+        ({"axes": {"beta": {"start": 1.0, "stop": 1.0}}}, "axes.beta.stop = 1.0: allowed is stop > start = 1.0"),
+        ({"axes": {"beta": {"start": 0.0}}}, "axes.beta.stop: missing; allowed is start and stop"),
+        (
+            {"axes": {}, "points": {"beta": [0.1]}},
+            "points: atlas is made over ranges; allowed are axes with start and stop",
+        ),
+    ],
+)
+def test_wrong_ranges(change, message):
+    with pytest.raises(dt.InputError) as error:
+        dt.run({**ATLAS, **change})
+    assert str(error.value) == message
+
+
+def test_too_many_parameters_for_an_atlas():
+    axes = {n: {"start": 0.5, "stop": 1.0, "num": 2} for n in ("beta", "Omega", "zeta", "alpha", "mu")}
+    with pytest.raises(
+        dt.InputError, match=r"^options\.method = 'atlas': the scene varies 5 parameters; allowed are 4$"
+    ):
+        dt.run({**floquet("atlas", axes), "fixed": {"gamma": 100.0}})
+
+
+@pytest.fixture(scope="module")
+def file(stored, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("atlas")
+    write_result(stored, folder / "atlas.nc", folder / "tmp")
+    return folder / "atlas.nc"
+
+
+def answer(capsys, *arguments):
+    try:
+        code = main([str(a) for a in arguments])
+    except SystemExit as stop:
+        code = stop.code
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_questions_on_the_command_line(file, capsys):
+    code, out, _ = answer(capsys, "query", file, "beta=0.31", "Omega=1.2", "--json")
+    assert code == 0 and json.loads(out)["values"]["verdict"] == 0
+    code, out, _ = answer(capsys, "design", "widest-angle", file, "Omega=1.3:1.5")
+    assert code == 0 and "stable up to beta = 0.10633312" in out and "direct solves agree" in out
+    code, out, err = answer(capsys, "query", file, "beta=0.31", "Omega=wide")
+    assert (code, out, err) == (2, "", "drivetrain: Omega = 'wide': allowed is a number or LOW:HIGH\n")
+    code, _, err = answer(capsys, "design", "narrowest-angle", file)
+    assert code == 2 and "least-damping" in err and err.count("\n") == 1
+
+
+def test_a_zoom_on_the_command_line(file, capsys):
+    figure = file.with_name("zoom.png")
+    code, _, err = answer(
+        capsys, "plot", file, "--out", figure, "--part", "Omega=1.3:1.5", "beta=0:0.3", "--cells", "80"
+    )
+    assert (code, err) == (0, "") and figure.stat().st_size > 20_000
+    code, _, err = answer(capsys, "plot", file, "--out", figure, "--part", "Omega=3")
+    assert code == 2 and err == "drivetrain: Omega = 3.0: allowed is a number or LOW:HIGH within 1 to 2\n"

@@ -1,0 +1,162 @@
+"""Zarr stores that workers write: the same result as the HDF5 file, resumable, damage found."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import drivetrain_jax as dt
+from drivetrain_jax import InputError
+from drivetrain_jax.cli import main
+from drivetrain_jax.invariants.verify import verify
+from drivetrain_jax.store import shards
+from drivetrain_jax.sweep.executor import Where
+from drivetrain_jax.sweep.export import export
+from drivetrain_jax.sweep.run import Interrupted, run_to_file
+from drivetrain_jax.sweep.status import status
+
+pytest.importorskip("zarr")
+
+
+def to_store(scene, path, **options):
+    return run_to_file(scene, path, store="zarr", **options)
+
+
+def opened(path):
+    with xr.open_dataset(path, engine="h5netcdf") as ds:
+        return ds.load()
+
+
+def identical(one, two):
+    for name in one.variables:
+        a, b = one[name], two[name]
+        assert (a.dims, a.dtype, str(a.attrs)) == (b.dims, b.dtype, str(b.attrs)), name
+        assert a.values.tobytes() == b.values.tobytes(), name
+    assert list(one.variables) == list(two.variables) and one.attrs["digest"] == two.attrs["digest"]
+
+
+def large(scene):
+    """Enough chunks for shards of several."""
+    return scene | {"axes": {"b": {"start": 1.0, "stop": 9.0, "num": 40}, "a": {"start": 0.0, "stop": 10.0, "num": 41}}}
+
+
+LINE = {
+    "system": "toy",
+    "analysis": "line",
+    "axes": {"b": {"values": [1.0, 4.0]}, "a": {"start": 0, "stop": 9, "num": 9}},
+}
+ONE = {"system": "toy", "analysis": "toy", "outputs": ["value", "wave"], "fixed": {"a": 1.0}}
+FIXED_PATH = LINE | {"axes": {"a": {"values": [1.0, 2.0]}}, "fixed": {"b": 5.0}}
+POINTS = {"system": "toy", "analysis": "toy", "points": {"a": [1.0, 8.0, 9.5], "b": [1.0, 2.0, 3.0]}}
+
+
+@pytest.mark.parametrize("which", ["grid", "line", "one", "fixed path", "points"])
+def test_export_is_bit_identical_to_the_file(grid_scene, tmp_path, which):
+    scenes = {"grid": large(grid_scene), "line": LINE, "one": ONE, "fixed path": FIXED_PATH, "points": POINTS}
+    scene = scenes[which]
+    direct = run_to_file(scene, tmp_path / "direct.nc")
+    assert str(to_store(scene, tmp_path / "r.zarr")) == str(direct)
+    export(tmp_path / "r.zarr", tmp_path / "exported.nc")
+    identical(opened(tmp_path / "direct.nc"), opened(tmp_path / "exported.nc"))
+    assert verify(tmp_path / "exported.nc").problem == "" == verify(tmp_path / "r.zarr").problem
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["direct.nc", "exported.nc", "r.zarr"]
+    found = status(scene, tmp_path / "r.zarr")
+    assert (found.state, found.done, found.failed) == ("complete", direct.total, direct.failed)
+    assert to_store(scene, tmp_path / "r.zarr").reused == direct.total
+
+
+def stop_after(calls):
+    left = iter(range(calls + 1))
+
+    def report(progress):
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+
+    return report
+
+
+def test_interrupted_damaged_and_resumed(grid_scene, tmp_path):
+    scene, path = large(grid_scene), tmp_path / "r.zarr"
+    with pytest.raises(Interrupted) as stopped:
+        to_store(scene, path, where=Where(threads=1), report=stop_after(3))
+    # In a process of its own the threads would be gone.
+    for thread in threading.enumerate():
+        if thread.name.startswith("chunk"):
+            thread.join()
+    done, found = stopped.value.progress.computed, status(scene, path)
+    assert 0 < done <= found.done < 1640 and found.state == "partial" and not path.exists()
+    with pytest.raises(InputError, match="unfinished work of --store zarr"):
+        run_to_file(scene, path)
+    store = tmp_path / "r.zarr.parts" / "store"
+    group = next(g for g in shards.groups_of(shards.attributes(store)) if shards.done(store, g).any())
+    file = store / group.name / "value" / "c" / str(np.flatnonzero(shards.done(store, group))[0])
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 4
+    file.write_bytes(data)
+    progress = to_store(scene, path)
+    assert 0 < progress.reused < found.done and progress.reused + progress.computed == 1640
+    export(path, tmp_path / "e.nc")
+    run_to_file(scene, tmp_path / "d.nc")
+    identical(opened(tmp_path / "d.nc"), opened(tmp_path / "e.nc"))
+
+
+@pytest.mark.parametrize("name", ["value", "wave", "outcome", "point", "done"])
+def test_damage_of_a_finished_store_is_found(grid_scene, tmp_path, name):
+    path = tmp_path / "r.zarr"
+    to_store(grid_scene, path)
+    file = sorted(path.rglob(f"{name}/c/*"))[0]
+    file = file if file.is_file() else next(p for p in file.rglob("*") if p.is_file())
+    data = bytearray(file.read_bytes())
+    data[len(data) // 3] ^= 1
+    file.write_bytes(data)
+    assert "shards are not what was written" in verify(path).problem
+    with pytest.raises(InputError, match="is damaged"):
+        export(path, tmp_path / "e.nc")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["r.zarr"]
+
+
+def test_a_shard_that_is_gone_is_found(grid_scene, tmp_path):
+    to_store(grid_scene, tmp_path / "r.zarr")
+    next(p for p in (tmp_path / "r.zarr").rglob("value/c/*") if p.is_file()).unlink()
+    assert "not what was written" in verify(tmp_path / "r.zarr").problem
+
+
+def test_fresh_replaces_and_a_kill_between_keeps_the_former(grid_scene, tmp_path, monkeypatch):
+    path, other = tmp_path / "r.zarr", grid_scene | {"fixed": {"n": 4}}
+    to_store(grid_scene, path)
+    with pytest.raises(InputError, match=r"fixed.n is 4, was 3; --fresh replaces it"):
+        to_store(other, path)
+    (tmp_path / "r.zarr.parts").mkdir()
+    path.rename(tmp_path / "r.zarr.parts" / "former")
+    assert status(grid_scene, path).state == "complete"
+    to_store(other, path, fresh=True)
+    assert status(other, path).state == "complete" and [p.name for p in tmp_path.iterdir()] == ["r.zarr"]
+
+
+def test_the_command_line(tmp_path, monkeypatch, capsys):
+    from drivetrain_jax.sweep import toml
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(toml.write(POINTS))
+    assert main(["run", "scene.toml", "--out", "r.zarr", "--store", "zarr", "--quiet"]) == 0
+    assert main(["export", "r.zarr", "e.nc"]) == 0 and main(["verify", "r.zarr"]) == 0
+    assert opened("e.nc").equals(dt.run(POINTS))
+    capsys.readouterr()
+    for arguments, part in [
+        (["export", "nothing", "f.nc"], "not a Zarr store"),
+        (["export", "r.zarr", "e.nc"], "allowed is a new file"),
+        (["export", "r.zarr", "nowhere/e.nc"], "allowed is a new file"),
+        (["run", "scene.toml", "--out", "e.nc", "--store", "zarr"], "is a file"),
+        (["run", "scene.toml", "--out", "r.zarr"], "is a folder"),
+        (["run", "scene.toml", "--out", "f.zarr", "--store", "zarr", "--reuse", "e.nc"], "reuse: given together"),
+    ]:
+        assert main(arguments) == 2
+        assert part in capsys.readouterr().err, arguments
+
+
+def test_shards_are_as_many_as_they_may_be():
+    assert [shards.Group("g", n, 8).per_shard for n in (1, 7, 16, 10_000)] == [1, 1, 2, 64]
+    assert shards.Group("g", 10_000, 8).shards == 157 and np.isclose(157 * 64, 10_000, rtol=0.01)
