@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: atlas test validate bench validation lint clean
+.PHONY: atlas test validate faults bench validation lint clean
 
 atlas: $(VENV)/installed  ## the quickstart atlas and its figure, in out/
 	@mkdir -p $(OUT)
@@ -16,6 +16,9 @@ test: $(VENV)/installed-test lint  ## all tests in their short form
 
 validate: $(VENV)/installed-test  ## the comparisons at full size
 	$(BIN)/python -m pytest -m full
+
+faults: $(VENV)/installed-test  ## real faults at random moments; writes the table of docs/reliability.md
+	$(BIN)/python tests/faults/suite.py
 
 lint: $(VENV)/installed-test
 	$(BIN)/ruff check .
@@ -29,6 +32,7 @@ bench: $(VENV)/installed-bench  ## throughput and errors against the peers; resu
 	$(BIN)/python -m benchmarks.planetary_throughput
 	$(BIN)/python -m benchmarks.rattle_throughput
 	$(BIN)/python -m benchmarks.chaos
+	$(BIN)/python -m benchmarks.scaling
 
 validation: $(VENV)/installed  ## regenerates docs/validation/
 	$(BIN)/python -m benchmarks.validation

@@ -1,12 +1,15 @@
 """Lyapunov time units and strobes per second against SciPy, heyoka.py and pynamicalsys; error against run time.
 
-    python -m benchmarks.chaos [--pynamicalsys PYTHON] [--quick]      # writes results/chaos.csv, chaos_precision.csv
+    python -m benchmarks.chaos [--pynamicalsys PYTHON] [--quick]   # writes results/chaos.csv, chaos_precision.csv and .png
 
-Lorenz (10, 28, 8/3) with three tangent vectors, made orthonormal every half time unit: ours with equal steps, the
-others adaptive. The error is that of state and tangent vectors after one time unit, relative to their size, from 64
-(--quick: 16) points of the attractor, root mean square, against SciPy at 1e-13. Methods are compared at the error that
-SciPy's DOP853 has at tolerance 1e-10. All use both cores: ours by two threads over one compiled function, the others by
-two spawned processes. ``PYTHON`` is an interpreter that has pynamicalsys (it needs other versions than this package).
+Lorenz (10, 28, 8/3) with three tangent vectors, made orthonormal every half time unit, and the double tripod (29) at
+3066.5 Hz with two, made orthonormal at every strobe: ours with equal steps, the others adaptive. What is timed of the
+package is its own march with the divergence and the records of every segment (``record_growth``), 64 members at a time in
+each of two threads; the others run in two spawned processes. Methods take turns, so that a change in the machine's load
+hits all alike; rates are medians. Errors are those of state and tangent vectors after one time unit of Lorenz' system
+(from points of the attractor) and after 16 strobes of the tripod, relative to their size, root mean square, against SciPy
+at 1e-13. Methods are compared at the error that SciPy's DOP853 has at tolerance 1e-10. ``PYTHON`` is an interpreter that
+has pynamicalsys (it needs other versions than this package).
 """
 
 from __future__ import annotations
@@ -18,9 +21,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
+import matplotlib
 import numpy as np
 
 from benchmarks.chaos_reference import (
@@ -32,14 +38,22 @@ from benchmarks.chaos_reference import (
     scipy_spectrum,
     tripod_field,
 )
-from benchmarks.timing import PROCESSES, RESULTS, spawned_workers, table, write_csv
+from benchmarks.timing import PROCESSES, RESULTS, median, spawned_workers, table, write_csv
 
-LANES = 512
-STEPS = (24, 32, 40, 48, 56, 64)
-QUICK_STEPS = (32, 64)
+matplotlib.use("Agg")
+
+LANES = 64
+STEPS = {"Lorenz": (32, 40, 48, 56, 64, 72), "tripod": (6, 8, 12, 16, 24)}
 TOLERANCES = (1e-6, 1e-8, 1e-10, 1e-12)
-QUICK_TOLERANCES = (1e-8, 1e-10)
+QUICK_STEPS, QUICK_TOLERANCES = {"Lorenz": (56, 72), "tripod": (8, 12)}, (1e-8, 1e-10)
+# The tolerance at whose error the methods are compared.
+COMPARED = 1e-10
 TRIPOD = {"zeta": 0.0016, "chi": 0.0026, "frequency": 3066.5}
+CONSTANTS = {
+    "Omega": 9633.726700903984, "c1": 0.005213670937369757, "c2": 0.0016565396527480861,
+    "A_TJ": 3.652758897391374e-05, "F_over_I": 8365.245060248115, "chi_T": 0.05,
+}  # fmt: skip
+STROBES = 16
 _PYNAMICALSYS = """
 import json, sys, time
 from pynamicalsys import ContinuousDynamicalSystem
@@ -52,6 +66,23 @@ start = time.perf_counter()
 spectrum = run(units)
 print(json.dumps({"seconds": time.perf_counter() - start, "spectrum": list(map(float, spectrum))}))
 """
+
+
+@dataclass
+class Contender:
+    """A method with a setting: ``rate()`` in time units or strobes per second; ``rates`` collects its results."""
+
+    case: str
+    method: str
+    setting: str
+    error: float
+    rate: Callable[[], float]
+    rates: list[float] = field(default_factory=list)
+
+    @property
+    def per_s(self) -> float:
+        """Median rate."""
+        return median(self.rates)
 
 
 def _compiled(function: Callable, *arguments: Any) -> Any:
@@ -68,76 +99,93 @@ def lorenz_flow(starts: Any, period: float) -> Any:
     """Lorenz' system of the package's flows from ``starts`` (3, N)."""
     from drivetrain_jax.systems import Flow
 
-    def field(_: Any, y: Any) -> tuple:
+    def rates(_: Any, y: Any) -> tuple:
         return 10.0 * (y[1] - y[0]), y[0] * (28.0 - y[2]) - y[1], y[0] * y[1] - 8 / 3 * y[2]
 
-    return Flow(field, tuple(starts), period)
+    return Flow(rates, tuple(starts), period)
 
 
-def package_flow(starts: np.ndarray, steps: int) -> np.ndarray:
-    """States and tangent vectors after one time unit, shape ``(N, 12)``."""
-    from drivetrain_jax.analysis.variational import initial_frame, strobe_map
+def tripod_flow(starts: Any) -> Any:
+    """(29) of the package from ``starts`` (2, N): twist, and its rate over Omega."""
+    from drivetrain_jax.systems import get_system
 
-    flow = lorenz_flow(starts.T, 1.0)
-    frame = strobe_map(flow, steps)(0, initial_frame(flow)._replace(contraction=None))
-    return np.concatenate([np.stack(frame.state), *(np.stack(v) for v in frame.tangents)]).T
+    system = get_system("tripod")
+    values = {p.name: p.default for p in system.parameters if p.default is not None}
+    values |= {"element": "input", "beta": math.radians(9), "zeta": TRIPOD["zeta"], "chi_n": TRIPOD["chi"]}
+    values |= {"phi0": starts[0], "velocity0": starts[1] * CONSTANTS["Omega"]}
+    return system.models["lyapunov"].build(values | {"excitation_frequency": TRIPOD["frequency"]})
 
 
-def package_spectrum(steps: int, lanes: int) -> Callable[[float], float]:
-    """``rate(intervals)``: Lorenz time units per second by two threads, ``steps`` per time unit."""
+def package_ends(flow: Callable[[Any], Any], strobes: int) -> Callable[[np.ndarray, int], np.ndarray]:
+    """``ends(starts, steps)``: states and tangent vectors ``strobes`` later, one row per start, ``steps`` per strobe."""
     import jax
     import jax.numpy as jnp
 
-    from drivetrain_jax.analysis.variational import Frame, initial_frame, orthonormal, strobe_map
+    from drivetrain_jax.analysis.variational import initial_frame, one_kernel, strobe_map
 
-    def spectrum(starts: Any, count: Any) -> Any:
-        flow = lorenz_flow(starts, INTERVAL)
-        advance = strobe_map(flow, max(round(steps * INTERVAL), 1))
+    @jax.jit
+    def ends(starts: Any, steps: Any) -> Any:
+        built = flow(starts)
+        advance = strobe_map(built, steps)
+        march = one_kernel(built)(lambda frame: jax.lax.fori_loop(0, strobes, advance, frame))
+        frame = march(initial_frame(built)._replace(contraction=None))
+        return jnp.concatenate([jnp.stack(frame.state), *jnp.stack(frame.tangents, axis=1)])
 
-        def body(k: Any, carry: tuple) -> tuple:
-            frame, total = carry
-            frame = advance(k, frame)
-            tangents, logs = orthonormal(frame.tangents)
-            return Frame(frame.state, tangents), total + logs
+    return lambda starts, steps: np.asarray(ends(starts.T, steps)).T
 
-        start = initial_frame(flow)._replace(contraction=None)
-        return jax.lax.fori_loop(0, count, body, (start, jnp.zeros((3, lanes))))[1] / (count * INTERVAL)
 
-    starts = np.resize(attractor(64), (PROCESSES, lanes, 3)).transpose(0, 2, 1) + 1e-3 * np.arange(lanes)
-    run = _compiled(spectrum, starts[0], 1)
+def package_rate(flow: Callable[[Any], Any], starts: np.ndarray, period: float) -> Callable[[int, int], float]:
+    """``rate(steps, strobes)``: strobes per second of all members, ``steps`` per strobe, by two threads."""
+    import jax
+    import jax.numpy as jnp
 
-    def rate(count: int) -> float:
-        start = time.perf_counter()
+    from drivetrain_jax.analysis.growth import record_growth
+
+    def march(starts: Any, steps: Any, time: Any) -> Any:
+        record = record_growth(flow(starts), steps, time, 0.0, jnp.ones(LANES, bool))
+        return record.growth, record.contraction, record.strobe
+
+    parts = np.resize(starts, (PROCESSES, LANES, starts.shape[1])).transpose(0, 2, 1) + 1e-6 * np.arange(LANES)
+    run = _compiled(march, parts[0], 4, 1.0)
+
+    def rate(steps: int, strobes: int) -> float:
+        begin = time.perf_counter()
         with ThreadPoolExecutor(PROCESSES) as pool:
-            for result in pool.map(lambda part: run(part, count), starts):
-                result.block_until_ready()
-        return PROCESSES * lanes * count * INTERVAL / (time.perf_counter() - start)
+            done = list(pool.map(lambda part: jax.block_until_ready(run(part, steps, (strobes - 0.5) * period)), parts))
+        return sum(int(np.sum(result[2])) for result in done) / (time.perf_counter() - begin)
 
-    rate(1)
     return rate
 
 
-def error_of(flow: Callable[[np.ndarray], np.ndarray], starts: np.ndarray, exact: np.ndarray) -> float:
-    """Root mean square over the points of the relative error of state and tangent vectors."""
-    found = flow(starts)
+def relative_error(found: np.ndarray, exact: np.ndarray) -> float:
+    """Root mean square over the rows of the relative error."""
     return float(np.sqrt(np.mean(np.sum((found - exact) ** 2, 1) / np.sum(exact**2, 1))))
 
 
-def scipy_rate(count: int, tolerance: float) -> float:
-    """Time units per second of one process."""
-    start = time.perf_counter()
-    scipy_spectrum(lorenz, np.array([1.0, 1.0, 20.0]), INTERVAL, count, tolerance)
-    return count * INTERVAL / (time.perf_counter() - start)
+def scipy_rate(case: str, count: int, tolerance: float) -> float:
+    """Strobes per second of one process, by Benettin's method."""
+    start, interval = (np.array([1.0, 1.0, 20.0]), INTERVAL) if case == "Lorenz" else (np.zeros(2), _PERIOD)
+    rates = lorenz if case == "Lorenz" else tripod_field(CONSTANTS | TRIPOD)
+    begin = time.perf_counter()
+    scipy_spectrum(rates, start, interval, count, tolerance)
+    return count / (time.perf_counter() - begin)
+
+
+_PERIOD = 1 / TRIPOD["frequency"]
+_heyoka = cache(HeyokaLorenz)
 
 
 def heyoka_rate(count: int, tolerance: float) -> float:
-    """Time units per second of one process."""
-    integrator = HeyokaLorenz(tolerance)
-    starts = np.resize(attractor(8), (integrator.batch, 3))
+    """Intervals per second of one process."""
+    integrator = _heyoka(tolerance)
+    starts = np.resize(attractor_points(8), (integrator.batch, 3))
     integrator.spectrum(starts, 2)
-    start = time.perf_counter()
+    begin = time.perf_counter()
     integrator.spectrum(starts, count)
-    return integrator.batch * count * INTERVAL / (time.perf_counter() - start)
+    return integrator.batch * count / (time.perf_counter() - begin)
+
+
+attractor_points = cache(attractor)
 
 
 def pynamicalsys_rate(python: str, units: float) -> float:
@@ -147,106 +195,132 @@ def pynamicalsys_rate(python: str, units: float) -> float:
     return sum(units / json.loads(process.communicate()[0])["seconds"] for process in processes)
 
 
-def _progress(text: str) -> None:
-    print(f"{time.strftime('%H:%M:%S')} {text}", file=sys.stderr, flush=True)
-
-
-def package_rows(quick: bool, starts: np.ndarray, exact: np.ndarray) -> list[dict[str, Any]]:
-    """Error and rate of the package over the steps per time unit."""
-    rows = []
-    for steps in QUICK_STEPS if quick else STEPS:
-        _progress(f"Lorenz, {steps} steps")
-        error = error_of(lambda s, n=steps: package_flow(s, n), starts, exact)
-        rate = package_spectrum(steps, LANES)(20 if quick else 400)
-        rows.append({"method": "drivetrain_jax", "setting": f"{steps} steps", "error": error, "units_per_s": rate})
-    return rows
-
-
-def rival_rows(quick: bool, starts: np.ndarray, exact: np.ndarray) -> list[dict[str, Any]]:
-    """Error and rate of SciPy and heyoka.py over their tolerance."""
-    rows = []
-    with spawned_workers() as pool:
-        # Both processes import what they need before anything is timed.
-        list(pool.map(scipy_rate, [1] * PROCESSES, [1e-6] * PROCESSES))
-        for tolerance in QUICK_TOLERANCES if quick else TOLERANCES:
-            _progress(f"Lorenz, SciPy and heyoka.py at {tolerance:g}")
-            jobs = {
-                "scipy DOP853": (scipy_rate, 20 if quick else 100, lambda s, t=tolerance: scipy_flow(s, 1.0, t)),
-                "heyoka": (heyoka_rate, 200 if quick else 2000, lambda s, t=tolerance: HeyokaLorenz(t).flow(s, 1.0)),
-            }
-            for name, (job, size, flow) in jobs.items():
-                rate = sum(pool.map(job, [size] * PROCESSES, [tolerance] * PROCESSES))
-                rows.append({"method": name, "setting": f"tolerance {tolerance:g}",
-                             "error": error_of(flow, starts, exact), "units_per_s": rate})  # fmt: skip
-    return rows
-
-
-def precision(quick: bool) -> list[dict[str, Any]]:
-    """Error and rate of every method and setting."""
-    starts = attractor(16 if quick else 64)
+def lorenz_contenders(pool: Executor, quick: bool) -> list[Contender]:
+    """The package, SciPy and heyoka.py over their settings; rates in time units."""
+    starts = attractor_points(8 if quick else 64)
     exact = scipy_flow(starts, 1.0, 1e-13)
-    return package_rows(quick, starts, exact) + rival_rows(quick, starts, exact)
+    ends, rate = (
+        package_ends(lambda s: lorenz_flow(s, 1.0), 1),
+        package_rate(lambda s: lorenz_flow(s, INTERVAL), starts, INTERVAL),
+    )
+    strobes, share = (128, 10) if quick else (1024, 1)
+    found = [
+        Contender("Lorenz", "drivetrain_jax", f"{steps} steps per time unit", relative_error(ends(starts, steps), exact),
+                  lambda n=steps: INTERVAL * rate(round(n * INTERVAL), strobes))
+        for steps in (QUICK_STEPS if quick else STEPS)["Lorenz"]
+    ]  # fmt: skip
+    for tolerance in QUICK_TOLERANCES if quick else TOLERANCES:
+        for name, job, size, flow in (
+            ("SciPy DOP853", _lorenz_by_scipy, 50 // share, lambda s, t=tolerance: scipy_flow(s, 1.0, t)),
+            ("heyoka.py", heyoka_rate, 2000 // share, lambda s, t=tolerance: _heyoka(t).flow(s, 1.0)),
+        ):
+            error = relative_error(flow(starts), exact)
+            found.append(
+                Contender("Lorenz", name, f"tolerance {tolerance:g}", error,
+                          lambda job=job, n=size, t=tolerance: INTERVAL * _by_both(pool, job, n, t))
+            )  # fmt: skip
+    return found
 
 
-def _tripod_scipy(strobes: int) -> float:
-    constants = {
-        "Omega": 9633.726700903984, "c1": 0.005213670937369757, "c2": 0.0016565396527480861,
-        "A_TJ": 3.652758897391374e-05, "F_over_I": 8365.245060248115, "chi_T": 0.05,
-    }  # fmt: skip
-    start = time.perf_counter()
-    scipy_spectrum(tripod_field(constants | TRIPOD), np.zeros(2), 1 / TRIPOD["frequency"], strobes, 1e-10)
-    return strobes / (time.perf_counter() - start)
+def _lorenz_by_scipy(count: int, tolerance: float) -> float:
+    return scipy_rate("Lorenz", count, tolerance)
 
 
-def tripod_rates(quick: bool) -> dict[str, float]:
-    """Strobes per second with two tangent vectors: the package's engine over a batch of damping ratios, and SciPy."""
-    import drivetrain_jax as dt
+def _tripod_by_scipy(count: int, tolerance: float) -> float:
+    return scipy_rate("tripod", count, tolerance)
 
-    _progress("tripod")
-    strobes, points = (2048 if quick else 8192), 2 * LANES
-    scene = {
-        "system": "tripod", "analysis": "lyapunov", "outputs": ["lyapunov_spectrum"],
-        "axes": {"zeta": {"start": 0.0016, "stop": 0.0186, "num": points}},
-        "fixed": {"element": "input", "beta": math.radians(9), "excitation_frequency": TRIPOD["frequency"], "chi_n": 0.0026},
-    }  # fmt: skip
-    seconds, counts = [], (64, 64 + strobes)
-    for count in counts:
-        run = scene | {"options": {"max_time": (count - 0.5) / TRIPOD["frequency"], "steps": 12}}
-        start = time.perf_counter()
-        dt.run(run)
-        seconds.append(time.perf_counter() - start)
-    # The difference of two lengths leaves out what does not grow with the strobes, compilation above all.
-    longer = seconds[1] - seconds[0]
-    ours = points * strobes / longer if longer > 0 else math.nan
-    with spawned_workers() as pool:
-        list(pool.map(_tripod_scipy, [1] * PROCESSES))
-        rival = sum(pool.map(_tripod_scipy, [100] * PROCESSES))
-    return {"drivetrain_jax": ours, "scipy DOP853": rival}
+
+def _by_both(pool: Executor, job: Callable[[int, float], float], count: int, tolerance: float) -> float:
+    return sum(pool.map(job, [count] * PROCESSES, [tolerance] * PROCESSES))
+
+
+def tripod_contenders(pool: Executor, quick: bool) -> list[Contender]:
+    """The package and SciPy over their settings; rates in strobes. Starts of the size of the tangent vectors, so that the
+    error is one of both."""
+    starts = np.random.default_rng(0).uniform(-0.3, 0.3, (8, 2))
+    rates = tripod_field(CONSTANTS | TRIPOD)
+    exact = scipy_flow(starts, STROBES * _PERIOD, 1e-13, rates)
+    ends, rate = package_ends(tripod_flow, STROBES), package_rate(tripod_flow, starts, _PERIOD)
+    strobes = 512 if quick else 4096
+    found = [
+        Contender("tripod", "drivetrain_jax", f"{steps} steps per strobe", relative_error(ends(starts, steps), exact),
+                  lambda n=steps: rate(n, strobes))
+        for steps in (QUICK_STEPS if quick else STEPS)["tripod"]
+    ]  # fmt: skip
+    for tolerance in QUICK_TOLERANCES if quick else TOLERANCES:
+        error = relative_error(scipy_flow(starts, STROBES * _PERIOD, tolerance, rates), exact)
+        found.append(
+            Contender("tripod", "SciPy DOP853", f"tolerance {tolerance:g}", error,
+                      lambda t=tolerance: _by_both(pool, _tripod_by_scipy, 40 if quick else 200, t))
+        )  # fmt: skip
+    return found
+
+
+def compared(contenders: Sequence[Contender]) -> list[dict[str, Any]]:
+    """The best rate of every method at the error of SciPy at the tolerance ``COMPARED``, and how often SciPy's that is."""
+    rows = []
+    for case in dict.fromkeys(c.case for c in contenders):
+        own = [c for c in contenders if c.case == case]
+        peer = next(c for c in own if (c.method, c.setting) == ("SciPy DOP853", f"tolerance {COMPARED:g}"))
+        for method in dict.fromkeys(c.method for c in own):
+            reached = [c.per_s for c in own if c.method == method and c.error <= 1.001 * peer.error]
+            best = max(reached, default=math.nan)
+            rows.append({"case": f"{case} at error <= {peer.error:.1e}", "method": method, "per_s": best,
+                         "times_scipy": best / peer.per_s})  # fmt: skip
+    return rows
+
+
+def draw(contenders: Sequence[Contender]) -> None:
+    """Error against rate, one panel for each case."""
+    from matplotlib.figure import Figure
+
+    cases = list(dict.fromkeys(c.case for c in contenders))
+    figure = Figure(figsize=(9, 3.8), layout="constrained")
+    for axes, case in zip(figure.subplots(1, len(cases), squeeze=False)[0], cases, strict=True):
+        for method in dict.fromkeys(c.method for c in contenders if c.case == case):
+            points = [(c.per_s, c.error) for c in contenders if (c.case, c.method) == (case, method)]
+            axes.loglog(*zip(*sorted(points), strict=True), "o-", label=method, markersize=4)
+        unit = "time units" if case == "Lorenz" else "strobes"
+        axes.set(xlabel=f"{unit} per second, two cores", ylabel="error of state and tangent vectors [1]", title=case)
+        axes.legend(frameon=False)
+    figure.savefig(RESULTS / "chaos_precision.png", dpi=150)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print and write the tables."""
+    """Measure, print, write the tables and the figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pynamicalsys", metavar="PYTHON", help="interpreter that has pynamicalsys")
-    parser.add_argument("--quick", action="store_true", help="small sizes")
+    parser.add_argument("--quick", action="store_true", help="small sizes, one round; writes nothing")
     given = parser.parse_args(arguments)
     import drivetrain_jax.systems  # noqa: F401  double precision, before anything is computed
 
-    rows = precision(given.quick)
-    summary = [{"case": "tripod, strobes with two tangent vectors", "method": name, "per_s": rate}
-               for name, rate in tripod_rates(given.quick).items()]  # fmt: skip
-    target = next(r["error"] for r in rows if (r["method"], r["setting"]) == ("scipy DOP853", "tolerance 1e-10"))
-    for method in ("drivetrain_jax", "scipy DOP853", "heyoka"):
-        reached = [r["units_per_s"] for r in rows if r["method"] == method and r["error"] <= 1.001 * target]
-        summary.append({"case": f"Lorenz, time units at error <= {target:.1e}", "method": method,
-                        "per_s": max(reached, default=math.nan)})  # fmt: skip
-    if given.pynamicalsys:
-        _progress("Lorenz, pynamicalsys")
-        summary.append({"case": "Lorenz, time units at its tolerance 1e-10", "method": "pynamicalsys",
-                        "per_s": pynamicalsys_rate(given.pynamicalsys, 20.0 if given.quick else 500.0)})  # fmt: skip
+    rounds, units = (1, 20.0) if given.quick else (5, 200.0)
+    peer: list[float] = []
+    with spawned_workers() as pool:
+        contenders = [*lorenz_contenders(pool, given.quick), *tripod_contenders(pool, given.quick)]
+        for contender in contenders:  # starts the workers, and compiles
+            contender.rate()
+        for number in range(rounds):
+            print(f"{time.strftime('%H:%M:%S')} round {number + 1} of {rounds}", file=sys.stderr, flush=True)
+            for contender in contenders:
+                contender.rates.append(contender.rate())
+            if given.pynamicalsys:
+                peer.append(pynamicalsys_rate(given.pynamicalsys, units))
+    rows = [
+        {"case": c.case, "method": c.method, "setting": c.setting, "error": c.error, "per_s": c.per_s}
+        for c in contenders
+    ]
+    summary = compared(contenders)
+    if peer:
+        scipy = next(row for row in summary if row["method"] == "SciPy DOP853")["per_s"]
+        summary.append({"case": "Lorenz at its own tolerance 1e-10", "method": "pynamicalsys", "per_s": median(peer),
+                        "times_scipy": median(peer) / scipy})  # fmt: skip
     print(table(rows), table(summary), sep="\n\n")
-    write_csv(RESULTS / "chaos_precision.csv", rows, ("error: see benchmarks/chaos.py",))
-    write_csv(RESULTS / "chaos.csv", summary, ("Per second of wall time, two cores.",))
+    if not given.quick:
+        note = f"Time units (Lorenz) and strobes (tripod) per second, {PROCESSES} cores, medians of {rounds} rounds."
+        write_csv(RESULTS / "chaos_precision.csv", rows, ("error: see benchmarks/chaos.py", note))
+        write_csv(RESULTS / "chaos.csv", summary, (note,))
+        draw(contenders)
 
 
 if __name__ == "__main__":

@@ -33,12 +33,12 @@ def attractor(count: int) -> np.ndarray:
     return np.array(points[10:])
 
 
-def scipy_flow(starts: np.ndarray, duration: float, tolerance: float) -> np.ndarray:
-    """States and tangent vectors (unit vectors at first) after ``duration``, shape ``(N, 12)``, by DOP853."""
+def scipy_flow(starts: np.ndarray, duration: float, tolerance: float, field: Callable = lorenz) -> np.ndarray:
+    """States and tangent vectors (unit vectors at first) after ``duration``, one row per start, by DOP853."""
     ends = []
     for start in starts:
-        w = np.concatenate([start, np.eye(3).ravel()])
-        ends.append(solve_ivp(lorenz, (0, duration), w, method="DOP853", rtol=tolerance, atol=tolerance).y[:, -1])
+        w = np.concatenate([start, np.eye(len(start)).ravel()])
+        ends.append(solve_ivp(field, (0, duration), w, method="DOP853", rtol=tolerance, atol=tolerance).y[:, -1])
     return np.array(ends)
 
 

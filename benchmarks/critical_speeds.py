@@ -82,11 +82,11 @@ def package_job(columns: Mapping[str, np.ndarray], method: str = "certified") ->
     engine = Engine(load_scene(scene))
     variables, plan, grid = result_variables(engine.scene), engine.plan, engine.grid
     start = time.perf_counter()
-    kernels = [compile_kernel(group.solver, grid, group.chunk, variables) for group in plan.groups]
+    kernels = {group.index: compile_kernel(group.solver, grid, group.chunk, variables) for group in plan.groups}
     compile_s = time.perf_counter() - start
 
     def work(chunk: Any) -> np.ndarray:
-        return kernels[chunk.group](grid.columns(chunk.points), chunk.effort)["angular_frequency"]
+        return kernels[chunk.solver](grid.columns(chunk.points), chunk.effort)["angular_frequency"]
 
     def job() -> np.ndarray:
         out = np.empty((grid.size, MODES))

@@ -81,13 +81,13 @@ def package_contender(columns: Columns, method: str, options: Mapping[str, Any])
     engine = Engine(load_scene(scene(columns, method, options)))
     variables, plan, grid = result_variables(engine.scene), engine.plan, engine.grid
     start = time.perf_counter()
-    kernels = [compile_kernel(group.solver, grid, group.chunk, variables) for group in plan.groups]
+    kernels = {group.index: compile_kernel(group.solver, grid, group.chunk, variables) for group in plan.groups}
     compile_s = time.perf_counter() - start
     costs = plan.costs
     order = sorted(range(len(costs)), key=lambda number: -costs[number])
 
     def work(chunk: Any) -> np.ndarray:
-        return kernels[chunk.group](grid.columns(chunk.points), chunk.effort)["spectral_radius"]
+        return kernels[chunk.solver](grid.columns(chunk.points), chunk.effort)["spectral_radius"]
 
     def job() -> np.ndarray:
         out = np.empty(grid.size)

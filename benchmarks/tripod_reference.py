@@ -161,3 +161,25 @@ def critical_nonuniformity(element: str, zeta: float) -> tuple[float, float]:
         edge, bounds=(centre * (1 - zeta), centre * (1 + 0.2 * zeta)), method="bounded", options={"xatol": 1e-3}
     )
     return float(found.fun), float(found.x)
+
+
+def paper_estimator(zeta: float, chi_n: float, frequency: float, strobes: int) -> np.ndarray:
+    """(31)-(33) read literally for (30) from rest, of twist, rate of twist and Theta [1/s].
+
+    Two solutions by DOP853, 1e-6 apart in each of the three at t = 0 (rad, rad/s, rad). Nothing but Theta depends on the
+    time explicitly, so that the second one runs on a clock that is ahead.
+    """
+    s, size = shaft("output", chi_n=chi_n), 1e-6
+    end, ahead = strobes / frequency, size / (2 * math.pi * frequency)
+
+    def field(t: float, y: np.ndarray) -> tuple[float, ...]:
+        first = acceleration(s, "30", zeta, frequency, 0.0, t, y[:2])
+        return y[1], first, y[3], acceleration(s, "30", zeta, frequency, 0.0, t + ahead, y[2:])
+
+    times = np.arange(1, strobes + 1) / frequency
+    tolerance = 1e-17 * np.array([1.0, s.omega, 1.0, s.omega])
+    y = solve_ivp(
+        field, (0, end), (0.0, 0.0, size, size), "DOP853", t_eval=np.minimum(times, end), rtol=3e-14, atol=tolerance
+    ).y
+    delta = np.stack([y[2] - y[0], y[3] - y[1], np.full(strobes, size)])
+    return np.sum(np.log10(np.abs(delta) / np.linalg.norm(delta[:, -1])), axis=1) / end

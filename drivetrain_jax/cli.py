@@ -194,8 +194,9 @@ def _run(options: argparse.Namespace) -> int:
     if code != OK:
         sys.stderr.write(_line(reason))
     sys.stderr.write(f"{progress}\n")
-    if code == INTERRUPTED:
+    if code == INTERRUPTED and options.workers is None:
         # Chunks that are still being computed would hold up a normal exit; their results are not wanted any more.
+        # Processes have been killed by now, and what they shared with this one is given back by a normal exit only.
         sys.stderr.flush()
         os._exit(code)
     return code

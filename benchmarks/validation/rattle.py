@@ -22,6 +22,7 @@ TABLE_1 = {"B0": 0.05, "B1": 0.03, "b": math.pi / 18, "c": 0.05, "alpha": 0.25, 
 # Exact values of the note: main peak at .8717 (peak-to-peak), and the folds of the reference file.
 EXACT_PEAK, EXACT_PEAK_FREQUENCY = 1.388317, 0.8717
 HARMONICS = (1, 3, 7, 15, 31)
+READINGS = ("printed", "U", "corrected")
 CURVES = ["peak_amplitude", "peak_frequency", "fold_frequency"]
 
 
@@ -91,43 +92,42 @@ def _curve_cells(ds: xr.Dataset) -> list[str]:
 
 
 def printed_peak(epsilon: float, reach: float, last: str) -> tuple[float, float]:
-    """Peak amplitude and frequency by (50) as printed, T = 1/l1, U^2 = eps l1^2/l2; ``last``: its last term.
+    """Peak amplitude and frequency by (50), T = 1/l1, U^2 = eps l1^2/l2 (corrected: sqrt(l1) for l1).
 
-    The peak is where the bracket vanishes: ``omega T = 1 + 3 eps a^2/(8 U^2)``.
+    ``last`` is the reading of its last term: "printed" with omega, "U" with U in its place, or "corrected". The peak is
+    where the bracket vanishes: ``omega T = 1 + 3 eps a^2/(8 U^2)``.
     """
     l1, l2 = fitted(reach)
-    root = l1 if last == "printed" else math.sqrt(l1)
+    root = math.sqrt(l1) if last == "corrected" else l1
     period, square = 1 / root, epsilon * root**2 / l2
     damping = TABLE_1["c"] * period / (2 * epsilon * TABLE_1["I"])
 
     def ratio(omega: float) -> float:
+        drive = TABLE_1["B1"] * period / (2 * epsilon)
         if last == "printed":
-            drive = TABLE_1["B1"] * period / (2 * omega * epsilon)
-        else:
-            drive = TABLE_1["B1"] * period**2 / (2 * epsilon * math.sqrt(square))
-        return drive / damping
+            return drive / omega / damping
+        return drive * (period if last == "corrected" else 1.0) / math.sqrt(square) / damping
 
     omega = brentq(lambda w: w * period - 1 - 3 * epsilon / 8 * ratio(w) ** 2, 0.05, 50)
     return ratio(omega) * math.sqrt(square), omega
 
 
 def epsilon_section() -> str:
-    """The response equation as printed, which depends on epsilon, beside the corrected one, which does not."""
+    """The response equation as printed, which depends on epsilon, in two readings, beside the corrected one."""
     rows = []
     for epsilon in (1.0, 0.1, 0.01, 0.001):
-        cells = [f"{a:.4f} at {w:.4f}" for a, w in (printed_peak(epsilon, 1.0, k) for k in ("printed", "corrected"))]
+        cells = [f"{a:.4f} at {w:.4f}" for a, w in (printed_peak(epsilon, 1.0, k) for k in READINGS)]
         rows.append([f"{epsilon:g}", *cells])
     text = (
         "As far as the scanned text can be read, the last term of (50) and (63) is printed B1^2 T^2/(4 omega^2 eps^2), "
         "where B1^2 T^4/(4 eps^2 U^2) follows from (18); (13), (51) and (52) are printed with lambda_1^2 where (9) and "
         "(10) define lambda_1. With these corrected, epsilon cancels. "
-        "If that omega is a misread U, epsilon cancels there too, and a factor T remains wrong: the peak is then "
-        "a = B1 I/c = 0.6 instead of B1 I/(c w0). "
+        "With U in the place of that omega, which the scan may also show, epsilon cancels too, but a factor T is wrong. "
         "Fit range R = 1; amplitude a of the peak and its frequency.\n"
     )
     return (
         "## The printed response equation\n\n" + text + "\n"
-        + markdown(["epsilon (Fig. 2: 0.01)", "as printed", "corrected"], rows)
+        + markdown(["epsilon (Fig. 2: 0.01)", "as printed", "U for omega", "corrected"], rows)
     )  # fmt: skip
 
 

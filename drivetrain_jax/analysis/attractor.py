@@ -6,25 +6,28 @@ that settles slowly, or never, holds up no other one.
 
 A lane settles period by period and now and then tries Newton shooting from where it is: ``z <- z + (1 - M)^-1 (F^m(z) -
 z)`` with the exact transition matrix M over m periods, m being a number after which the recent motion nearly recurs. An
-orbit counts as the attractor only if all its multipliers lie inside the unit circle and the motion is already in its
-linear neighbourhood: ``|F^m(z) - z* - M (z - z*)| <= 0.02 (1 - rho) |z - z*|``, rho the spectral radius.
+orbit counts as the attractor only if all its multipliers lie inside the unit circle and the motion itself, followed on
+from where the search began, is seen to approach it (:mod:`~drivetrain_jax.analysis.attractor_approach`).
 """
 
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax.analysis.attractor_approach import Orbit, attracts, creeps, obeys
 from drivetrain_jax.analysis.attractor_lanes import (
     MOST_PERIODS,
     Lane,
+    approach,
     blank,
     candidates,
+    confirm,
     enter,
     record,
     restart,
@@ -32,17 +35,16 @@ from drivetrain_jax.analysis.attractor_lanes import (
     search,
     select,
     settle,
+    try_line,
 )
 from drivetrain_jax.analysis.piecewise_march import Lanes, few_steps, prepare, usual_steps
-from drivetrain_jax.analysis.plane_map import Matrix, apply, newton_correction, spectral_radius
+from drivetrain_jax.analysis.plane_map import Matrix, newton_correction
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 # Newton: largest number of corrections, relative size at which one is the last, and below which rounding may end it.
-_CORRECTIONS, _CONVERGED, _ROUNDING = 8, 1e-11, 1e-7
-# Remainder of the linearisation that is tolerated, as part of the contraction 1 - rho.
-_REMAINDER = 0.02
-# Distance over size at which the motion has arrived.
-_ARRIVED = 1e-9
+_CORRECTIONS, _CONVERGED, _ROUNDING = 12, 1e-11, 1e-7
+# Largest part of a correction that the next one may be: 2/3 at worst on the way to an orbit whose period is to double.
+_SHRINKING = 0.75
 # A search is a failure beyond so many times the usual velocity, or so many times the steps that settling takes.
 _ASTRAY, _COSTLY = 3.0, 4
 _EPS = np.finfo(float).eps
@@ -77,11 +79,13 @@ def take(oscillator: PiecewiseLinearOscillator, index: Array) -> PiecewiseLinear
 
 
 class _Verdict(NamedTuple):
-    """Outcome of a correction: lanes whose search has found the attractor or has failed, and the error of u."""
+    """Outcome of a correction: lanes whose search has found an orbit that attracts, those whose motion would approach it
+    slowly, the orbit, and lanes whose search has failed."""
 
     found: Array
+    slow: Array
+    orbit: Orbit
     failed: Array
-    error: Array
 
 
 def _speed(local: PiecewiseLinearOscillator, u: Array, v: Array) -> Array:
@@ -104,24 +108,20 @@ def _shoot(lane: Lane, now: Array, local: PiecewiseLinearOscillator, omega: Arra
     size = jnp.abs(guess[0]) + jnp.abs(guess[1]) / omega
     stuck = (change <= _ROUNDING * size) & (change > lane.change / 2)
     converged = (change <= _CONVERGED * size) | stuck
-    rho = spectral_radius(motion.matrix, -local.damping * lane.multiple * 2 * np.pi / omega)
-    away = (lane.latest[0] - guess[0], lane.latest[1] - guess[1])
-    ahead = apply(motion.matrix, *away)
-    rest = jnp.abs(first[0] - guess[0] - ahead[0]) + jnp.abs(first[1] - guess[1] - ahead[1]) / omega
-    distance = jnp.abs(away[0]) + jnp.abs(away[1]) / omega
-    reached = (rest <= _REMAINDER * (1 - rho) * distance) | (distance <= _ARRIVED * size)
-    found = now & converged & (rho < 1) & reached
     astray = ~(_speed(local, *guess) <= _ASTRAY * (_speed(local, *lane.latest) + _usual_speed(local)))
-    going = now & ~converged & (lane.corrections < _CORRECTIONS) & ~astray
+    going = now & ~converged & (lane.corrections < _CORRECTIONS) & ~astray & (change <= _SHRINKING * lane.change)
     # Rounding of the state after m periods, in u and v, as it acts on the u of the orbit.
     by_u, by_v = (newton_correction(motion.matrix, 1.0 - k + 0 * u, k * omega)[0] for k in (0.0, 1.0))
     inverse = jnp.abs(by_u) + jnp.abs(by_v)
-    error = change + 4 * _EPS * size * (1 + inverse) * jnp.sqrt(motion.steps.astype(float))
+    error = change + 32 * _EPS * size * (1 + inverse) * jnp.sqrt(motion.steps.astype(float))
+    orbit = Orbit(*guess, motion.matrix, -local.damping * lane.multiple * 2 * np.pi / omega, error)
+    stable = now & converged & attracts(orbit)
+    slow = stable & creeps(orbit, lane.latest, omega) & ~obeys(orbit, lane.latest, first, omega)[0]
     corrected = lane._replace(
         guess=guess, first=first, change=change, corrections=lane.corrections + now.astype(jnp.int32)
     )
-    lane = restart(select(going | found, corrected, lane), going, *guess, lane.multiple)
-    return lane, _Verdict(found, now & ~going & ~found, error)
+    lane = restart(select(going, corrected, lane), going, *guess, lane.multiple)
+    return lane, _Verdict(stable & ~slow, slow, orbit, now & ~going & ~stable)
 
 
 class _Work(NamedTuple):
@@ -174,26 +174,35 @@ def _tick(task: _Task, work: _Work) -> _Work:
     working = lane.job < total // task.length
     place = jnp.where(working, lane.job, 0) * task.length + lane.place
     local = take(task.oscillator, task.visits[place])
-    lanes = prepare(local)
+    lanes = _stored(prepare(local))
     omega = lanes.omega + jnp.zeros(place.shape)
     lane = lane._replace(motion=few_steps(lanes, lane.motion))
     broken = ~jnp.isfinite(lane.motion.u) | (lane.motion.steps > _most_steps(lane, lanes))
     ready = working & ((lane.motion.left <= 0) | broken)
-    after, verdict = _shoot(lane, ready & lane.searching & ~broken, local, omega)
+    shot, probed = (ready & lane.searching & ~broken & (on == (lane.probing >= 0)) for on in (False, True))
+    after, verdict = _stored(_shoot(lane, shot, local, omega))
     settles = ready & ~lane.searching & ~broken
     after = settle(after, settles, task.most_periods // 4, omega)
+    after, reached = _stored(confirm(_stored(after), settles, history, omega))
     history = record(history, settles, after)
-    first, second = candidates(after, history, omega)
-    after = search(after, settles & (after.count >= after.due), first, second)
-    after, moved = resume(after, verdict.failed | (ready & lane.searching & broken), history, local)
-    history = record(history, moved, after)
+    first, second = _stored(candidates(after, history, omega))
+    after = search(after, settles & (after.held == 0) & (after.count >= after.due), first, second)
+    after = _stored(approach(after, verdict.found, verdict.orbit))
+    after, through, left = _stored(try_line(after, probed | verdict.slow, verdict.orbit, omega))
+    reached |= through
+    after = _stored(resume(after, verdict.failed | left | (ready & lane.searching & broken)))
     stalled = ready & ~lane.searching & broken
-    done = verdict.found | stalled | (settles & (after.count >= task.most_periods))
-    result = _result(lane, after, verdict, stalled, task.most_periods * 2 * np.pi / omega)
+    done = reached | stalled | (settles & (after.count >= task.most_periods))
+    result = _result(after, reached, stalled, task.most_periods * 2 * np.pi / omega)
     rows = jnp.stack(jax.tree.leaves(result)).astype(float)
     store = work.store.at[:, jnp.where(done, place, total)].set(rows, mode="drop")
     lane, queue = _proceed(after, done, result, work.queue, task)
     return _Work(lane, record(history, done, lane), queue, store)
+
+
+def _stored(results: Any) -> Any:
+    """``results``, computed once: XLA would put what leads to them into the expression of everything made of them."""
+    return jax.lax.optimization_barrier(results)
 
 
 def _most_steps(lane: Lane, lanes: Lanes) -> Array:
@@ -202,17 +211,17 @@ def _most_steps(lane: Lane, lanes: Lanes) -> Array:
     return lane.multiple * jnp.where(searching, _COSTLY * lane.cost + 500, usual_steps(lanes))
 
 
-def _result(lane: Lane, after: Lane, verdict: _Verdict, stalled: Array, span: Array) -> Attractors:
+def _result(lane: Lane, reached: Array, stalled: Array, span: Array) -> Attractors:
     """What a lane that is done has found; ``span`` is the longest time it may settle."""
-    motion, found = lane.motion, verdict.found
+    orbit = lane.orbit
     return Attractors(
-        u=jnp.where(found, after.guess[0], motion.u),
-        v=jnp.where(found, after.guess[1], motion.v),
-        multiple=jnp.where(found, lane.multiple, 0),
-        matrix=motion.matrix,
-        error=jnp.where(found, verdict.error, jnp.nan),
-        periods=after.count,
-        exponent=after.growth / (0.75 * span),
+        u=jnp.where(reached, orbit.u, lane.latest[0]),
+        v=jnp.where(reached, orbit.v, lane.latest[1]),
+        multiple=jnp.where(reached, lane.multiple, 0),
+        matrix=orbit.matrix,
+        error=jnp.where(reached, orbit.error, jnp.nan),
+        periods=lane.count,
+        exponent=lane.growth / (0.75 * span),
         stalled=stalled,
     )
 

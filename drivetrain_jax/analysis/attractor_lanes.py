@@ -1,4 +1,4 @@
-"""Lanes on their way to attractors: they settle period by period, hasten along slow approaches, and start searches.
+"""Lanes on their way to attractors: they settle period by period, start searches, and confirm what these find.
 
 A *lane* works on one point at a time. It keeps the states of the last 33 periods, from which the number of periods after
 which the motion recurs is guessed, and counts the growth of a tangent for the Lyapunov exponent.
@@ -13,18 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax.analysis.attractor_approach import PROBES, Orbit, doubled, obeys, probe, pulled, recurrences
 from drivetrain_jax.analysis.piecewise_march import Motion
 from drivetrain_jax.analysis.plane_map import apply
-from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 MOST_PERIODS = 32
 # Recurrences that count as equally good.
 _NEAR, _NARROW = 30.0, 1.5
-# An approach is slow if two displacements in succession differ by less than this part; how much of the way that they
-# predict is taken at once, and the longest way, over the size of the state.
-_SLOW, _PART, _LONGEST = 0.05, 0.5, 0.02
-# Exponent of the decay that is waited for after that, and the most periods.
-_DECAYED, _LONGEST_WAIT = 9.0, 64
+# Recurrences for which an orbit that was found is kept although the motion does not yet obey its linearisation.
+_PATIENCE = 8
 _ROWS = np.arange(MOST_PERIODS + 1, dtype=np.int32)[:, None]
 
 
@@ -36,7 +33,6 @@ class Lane(NamedTuple):
     motion: Motion
     count: Array  # periods settled
     due: Array  # periods after which the next search starts
-    since: Array  # periods settled when the motion was last hastened
     latest: tuple[Array, Array]  # state after these
     tangent: tuple[Array, Array]
     growth: Array  # logarithm of the growth of the tangent
@@ -48,6 +44,11 @@ class Lane(NamedTuple):
     guess: tuple[Array, Array]
     first: tuple[Array, Array]  # F^m of the state the search started from
     change: Array  # size of the last correction
+    approaching: Array
+    orbit: Orbit  # what the motion approaches
+    begun: Array  # periods settled when the approach began
+    held: Array  # recurrences since then
+    probing: Array  # number of the point of the slow line that is tried, -1: none
 
 
 def select(condition: Array, new: Any, old: Any) -> Any:
@@ -62,7 +63,7 @@ def candidates(lane: Lane, history: Array, omega: Array) -> tuple[Array, Array]:
     u, v = lane.latest
     distance = jnp.abs(history[:, : u.size] - u) + jnp.abs(history[:, u.size :] - v) / omega
     age = (lane.count - _ROWS) % (MOST_PERIODS + 1)
-    distance = jnp.where((age > 0) & (age <= lane.count - lane.since), distance, jnp.inf)
+    distance = jnp.where((age > 0) & (age <= lane.count), distance, jnp.inf)
     best = distance.min(axis=0)
     floor = 1e-13 * (jnp.abs(u) + jnp.abs(v) / omega)
 
@@ -70,7 +71,10 @@ def candidates(lane: Lane, history: Array, omega: Array) -> tuple[Array, Array]:
         recurs = distance <= factor * best + floor
         return jnp.where(recurs, age, MOST_PERIODS).min(axis=0).astype(jnp.int32)
 
-    return smallest(_NEAR), smallest(_NARROW)
+    first, second = smallest(_NEAR), smallest(_NARROW)
+    # About an orbit whose period is soon to double the motion alternates: twice the period recurs best, and Newton's
+    # method, which is slow for twice the period, is quick for the period itself.
+    return first, jnp.where((second == first) & (first % 2 == 0), first // 2, second)
 
 
 def record(history: Array, now: Array, lane: Lane) -> Array:
@@ -107,6 +111,8 @@ def search(lane: Lane, now: Array, multiple: Array, second: Array) -> Lane:
     """Start Newton shooting from the latest state in the lanes ``now``, for this period multiple."""
     begun = lane._replace(
         searching=jnp.ones_like(now),
+        approaching=jnp.zeros_like(now),
+        held=jnp.zeros_like(lane.held),
         multiple=multiple,
         second=second,
         corrections=jnp.zeros_like(lane.corrections),
@@ -116,55 +122,61 @@ def search(lane: Lane, now: Array, multiple: Array, second: Array) -> Lane:
     return restart(select(now, begun, lane), now, *lane.latest, multiple)
 
 
-def resume(lane: Lane, failed: Array, history: Array, local: PiecewiseLinearOscillator) -> tuple[Lane, Array]:
-    """After a failed search: the second candidate if there is one, else on with settling, hastened where it is slow.
-
-    Also returns the lanes whose latest state has changed.
-    """
+def resume(lane: Lane, failed: Array) -> Lane:
+    """After a failed search: the second candidate if there is one, else on with settling."""
+    lane = lane._replace(probing=jnp.where(failed, -1, lane.probing))
     again = failed & (lane.second != lane.multiple)
     back = failed & ~again
-    (u, v), slow = _ahead(lane, history, local.omega + jnp.zeros(failed.shape))
-    slow = back & slow
-    # What the state is off the slow direction dies as the determinant does: the next displacements must be free of it.
-    decay = jnp.minimum(_DECAYED / jnp.maximum(local.damping * local.period, 1e-300), _LONGEST_WAIT)
-    wait = jnp.where(
-        slow, 2 * lane.multiple + 1 + decay.astype(jnp.int32), jnp.maximum(4, (lane.count - lane.since) // 3)
-    ).astype(jnp.int32)
-    resumed = lane._replace(
-        searching=jnp.zeros_like(failed),
-        due=lane.count + wait,
-        since=jnp.where(slow, lane.count, lane.since),
-        latest=(jnp.where(slow, u, lane.latest[0]), jnp.where(slow, v, lane.latest[1])),
+    due = jnp.where(back, lane.count + jnp.maximum(4, lane.count // 3), lane.due)
+    lane = restart(lane._replace(searching=lane.searching & ~back, due=due), back, *lane.latest, 1)
+    return search(lane, again, lane.second, lane.second)
+
+
+def approach(lane: Lane, now: Array, orbit: Orbit) -> Lane:
+    """Lanes ``now`` have found an orbit from their latest state: from there the motion itself goes on towards it."""
+    begun = lane._replace(
+        searching=jnp.zeros_like(now),
+        approaching=jnp.ones_like(now),
+        orbit=orbit,
+        begun=lane.count,
+        due=lane.count + jnp.maximum(_PATIENCE * lane.multiple, lane.count // 3),
     )
-    lane = select(back, resumed, lane)
-    lane = restart(lane, back, *lane.latest, 1)
-    return search(lane, again, lane.second, lane.second), slow
+    return restart(select(now, begun, lane), now, *lane.latest, 1)
 
 
-def _ahead(lane: Lane, history: Array, omega: Array) -> tuple[tuple[Array, Array], Array]:
-    """States part of the way on where the motion drifts slowly, and which these are.
+def confirm(lane: Lane, now: Array, history: Array, omega: Array) -> tuple[Lane, Array]:
+    """Lanes ``now``, a period further: those that have approached their orbit for long enough are returned second.
 
-    Next to a fold or a period doubling a motion goes along one direction, by displacements d that change little from
-    one recurrence to the next: ``d' = q d`` with q near 1. What remains of an approach is ``d q/(1 - q)``; half of it
-    at most is taken, so that no fixed point on the way is passed. A departure (q > 1) is taken on likewise.
+    Where the motion does not obey the linearisation about the orbit, counting starts again; a new search may follow.
     """
+    due = now & lane.approaching & (lane.count > lane.begun) & ((lane.count - lane.begun) % lane.multiple == 0)
+    row = (lane.count - lane.multiple) % (MOST_PERIODS + 1)
+    past = jnp.where(jnp.concatenate([row, row]) == _ROWS, history, 0.0).sum(axis=0)
+    ok, arrived = obeys(lane.orbit, (past[: row.size], past[row.size :]), lane.latest, omega)
+    held = jnp.where(due, jnp.where(ok, lane.held + 1, 0), lane.held)
+    return lane._replace(held=held), due & ok & (arrived | (held >= recurrences(lane.orbit)))
 
-    def past(ago: Array) -> Array:
-        row = (lane.count - ago) % (MOST_PERIODS + 1)
-        return jnp.where(jnp.concatenate([row, row]) == _ROWS, history, 0.0).sum(axis=0)
 
-    def size(z: Array) -> Array:
-        return jnp.abs(z[: omega.size]) + jnp.abs(z[omega.size :]) / omega
+def try_line(lane: Lane, now: Array, orbit: Orbit, omega: Array) -> tuple[Lane, Array, Array]:
+    """Lanes ``now`` have found an orbit that their motion creeps towards, or have run from a point of the line to it.
 
-    now, before, first = jnp.concatenate(lane.latest), past(lane.multiple), past(2 * lane.multiple)
-    way = size(now - before)
-    turn = size(now - 2 * before + first)
-    known = 2 * lane.multiple <= jnp.minimum(lane.count - lane.since, MOST_PERIODS)
-    slow = known & (turn <= _SLOW * way) & (way <= _LONGEST * size(now))
-    part = jnp.minimum(_PART * way / jnp.maximum(turn, 1e-300), _LONGEST * size(now) / jnp.maximum(way, 1e-300))
-    part = jnp.where(slow, part, 0.0)
-    ahead = now + jnp.concatenate([part, part]) * (now - before)
-    return (ahead[: omega.size], ahead[omega.size :]), slow
+    They go to the next point. Second: those that all points have led nearer to the orbit; third, those that one has not.
+    """
+    begins = now & (lane.probing < 0)
+    twice, negative = doubled(orbit)
+    negative &= lane.multiple <= MOST_PERIODS // 2
+    multiple = jnp.where(begins & negative, 2 * lane.multiple, lane.multiple)
+    lane = lane._replace(orbit=select(begins, select(negative, twice, orbit), lane.orbit), multiple=multiple)
+    place, _ = probe(lane.orbit, lane.latest, lane.probing)
+    good = pulled(lane.orbit, lane.latest, place, (lane.motion.u, lane.motion.v), omega)
+    number = lane.probing + now.astype(jnp.int32)
+    failed = now & ~begins & ~good
+    through = now & ~begins & good & (number >= PROBES)
+    _, start = probe(lane.orbit, lane.latest, number)
+    # After a failure there is no other candidate.
+    lane = lane._replace(probing=number, second=jnp.where(failed, lane.multiple, lane.second))
+    lane = restart(lane, now & ~failed & ~through, *start, lane.multiple)
+    return lane, through, failed
 
 
 def enter(lane: Lane, now: Array, job: Array, place: Array, u: Array, v: Array, hint: Array) -> Lane:
@@ -175,7 +187,7 @@ def enter(lane: Lane, now: Array, job: Array, place: Array, u: Array, v: Array, 
         place=place,
         count=jnp.zeros_like(lane.count),
         due=jnp.full_like(lane.due, 4),
-        since=jnp.zeros_like(lane.since),
+        probing=jnp.full_like(lane.probing, -1),
         latest=(u, v),
         tangent=(zero + 0.6, zero + 0.8),
         growth=zero,
@@ -195,7 +207,6 @@ def blank(width: int) -> Lane:
         motion=motion,
         count=whole,
         due=whole,
-        since=whole,
         latest=pair,
         tangent=pair,
         growth=real,
@@ -207,4 +218,9 @@ def blank(width: int) -> Lane:
         guess=pair,
         first=pair,
         change=real,
+        approaching=flag,
+        orbit=Orbit(real, real, (real, real, real, real), real, real),
+        begun=whole,
+        held=whole,
+        probing=whole - 1,
     )

@@ -39,7 +39,7 @@ __all__ = ["ANALYSIS", "angular_frequencies", "separation_margin"]
 
 VARIABLES = (
     Variable("natural_frequency", "Hz", "natural frequency", ("mode",)),
-    Variable("angular_frequency", "rad s-1", "natural angular frequency", ("mode",)),
+    Variable("angular_frequency", "rad/s", "natural angular frequency", ("mode",)),
     Variable("critical_speed", "rpm", "critical speed", ("mode",)),
     Variable("relative_error", "1", "estimated relative error of the frequencies", ("mode",)),
     Variable(

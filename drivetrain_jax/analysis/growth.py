@@ -8,13 +8,23 @@ exponents. A record has a fixed number of segments whatever the time, so that me
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax.analysis.variational import Frame, Vector, initial_frame, initial_state, orthonormal, strobe_map
+from drivetrain_jax.analysis.kernels import stored
+from drivetrain_jax.analysis.variational import (
+    Frame,
+    Vector,
+    initial_frame,
+    initial_state,
+    one_kernel,
+    orthonormal,
+    strobe_map,
+)
 from drivetrain_jax.systems import Flow
 
 SEGMENTS = 64
@@ -67,7 +77,7 @@ def strobes_per_segment(flow: Flow, max_time: float) -> Array:
 def state_size(flow: Flow, y: Vector) -> Array:
     """Largest component in absolute value of those that a bounded motion keeps bounded."""
     kept = [abs(x) for i, x in enumerate(y) if i not in (*flow.phases, *flow.cyclic)] or [abs(x) for x in y]
-    return jnp.max(jnp.stack(kept), axis=0)
+    return reduce(jnp.maximum, kept)
 
 
 def record_growth(flow: Flow, steps: Any, max_time: float, target: float, active: Array) -> Record:
@@ -83,13 +93,13 @@ def record_growth(flow: Flow, steps: Any, max_time: float, target: float, active
     active = jnp.broadcast_to(active, shape)
     start = _March(
         frame, jnp.zeros(shape, jnp.int64), active, jnp.ones(shape, bool), jnp.int64(0),
-        jnp.zeros((SEGMENTS, len(frame.tangents), *shape)), record, record, jnp.zeros(shape, jnp.int64),
+        jnp.zeros((SEGMENTS, len(frame.tangents[0]), *shape)), record, record, jnp.zeros(shape, jnp.int64),
     )  # fmt: skip
-    segment = _segment(flow, steps, length)
+    segment = one_kernel(flow)(_segment(flow, steps, length))
     span = length * flow.period
 
     def body(march: _March) -> _March:
-        march = segment(march)
+        march = segment(march, jnp.max(jnp.where(march.alive, length, 0)))
         return jax.lax.cond(
             jnp.any(jnp.asarray(_CHECKS) == march.segment), lambda m: _stopped(m, span, target), lambda m: m, march
         )
@@ -100,16 +110,17 @@ def record_growth(flow: Flow, steps: Any, max_time: float, target: float, active
     )
 
 
-def _segment(flow: Flow, steps: Any, length: Array) -> Callable[[_March], _March]:
+def _segment(flow: Flow, steps: Any, length: Array) -> Callable[[_March, Array], _March]:
+    """The march over one segment, at most ``longest`` strobes; no sums or maxima over an axis: it is one kernel."""
     advance = strobe_map(flow, steps)
 
     def strobe(carry: tuple) -> tuple:
         k, frame, number, alive, bounded, growth, size = carry
         moving = alive & (k < length)
         new = advance(number, frame)
-        tangents, logs = orthonormal(new.tangents)
+        tangents, logs = stored(orthonormal)(new.tangents)
         largest = state_size(flow, new.state)
-        well = (largest < BOUND) & jnp.all(jnp.isfinite(logs), axis=0)
+        well = reduce(jnp.logical_and, map(jnp.isfinite, logs), largest < BOUND)
         moving &= well
         new = Frame(new.state, tangents, new.contraction)
         frame = jax.tree.map(lambda a, b: jnp.where(moving, a, b), new, frame)
@@ -118,10 +129,9 @@ def _segment(flow: Flow, steps: Any, length: Array) -> Callable[[_March], _March
         size = jnp.where(moving, jnp.maximum(size, largest), size)
         return k + 1, frame, number + moving, alive & ~left, bounded & ~left, growth, size
 
-    def segment(march: _March) -> _March:
+    def segment(march: _March, longest: Array) -> _March:
         nothing = jnp.zeros_like(march.size[0])
         frame = march.frame._replace(contraction=nothing)
-        longest = jnp.max(jnp.where(march.alive, length, 0))
         carry = (
             jnp.int64(0),
             frame,
@@ -178,7 +188,7 @@ def running_mean(series: Array, used: Array, span: Array) -> Array:
 
 def sampled(flow: Flow, steps: Any, state: Vector, strobe: Array, count: int) -> tuple[Array, Vector]:
     """States at the ``count`` strobes that follow, shape ``(count, n, ...)``, and the last state as a vector."""
-    advance = strobe_map(flow, steps)
+    advance = one_kernel(flow)(strobe_map(flow, steps))
 
     def body(carry: tuple, _: None) -> tuple:
         frame, number = carry
@@ -192,4 +202,8 @@ def sampled(flow: Flow, steps: Any, state: Vector, strobe: Array, count: int) ->
 def discarded(flow: Flow, steps: Any, count: Any) -> Vector:
     """The state after ``count`` strobes from the start."""
     advance = strobe_map(flow, steps)
-    return jax.lax.fori_loop(0, count, lambda k, frame: advance(k, frame), Frame(initial_state(flow))).state
+
+    def march(frame: Frame, count: Array) -> Frame:
+        return jax.lax.fori_loop(0, count, advance, frame)
+
+    return one_kernel(flow)(march)(Frame(initial_state(flow)), jnp.int64(count)).state

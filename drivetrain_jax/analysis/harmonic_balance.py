@@ -51,7 +51,8 @@ class Basis:
         """Samples of the base period; those asked for are per period of the drive."""
         if self.samples:
             return self.samples * self.order
-        return self.order * max(64, 1 << (10 * self.harmonics - 1).bit_length())
+        # Fewer, and a contact between two samples that comes and goes interrupts the branch.
+        return self.order * max(64, 1 << (20 * self.harmonics - 1).bit_length())
 
     @cached_property
     def orders(self) -> np.ndarray:

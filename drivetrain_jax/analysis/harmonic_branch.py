@@ -95,11 +95,10 @@ def trace(model: PiecewiseLinearOscillator, basis: Basis, x: Array, start: float
     point = jnp.concatenate([x / scale, jnp.full((1, *lanes), start / width)])
     forwards = jnp.zeros_like(point).at[-1].set(1.0 if stop > start else -1.0)
     _, matrix = _bordered(model, basis, units, point, forwards)
-    tangent = _normalised(solve(matrix, forwards[:, None] * jnp.abs(forwards[-1]))[:, 0])
+    tangent = _normalised(solve(matrix, jnp.abs(forwards)[:, None])[:, 0])
     front = _Front(point, tangent, jnp.full(lanes, _FIRST), jnp.zeros(lanes, jnp.int32))
     points = jnp.full((_ATTEMPTS, *point.shape), jnp.nan).at[0].set(point)
     low, high = min(start, stop), max(start, stop)
-    number = jnp.arange(lanes[0])
 
     def attempt(state: tuple[Array, _Front, Array, Array]) -> tuple[Array, _Front, Array, Array]:
         count, front, going, points = state
@@ -112,7 +111,7 @@ def trace(model: PiecewiseLinearOscillator, basis: Basis, x: Array, start: float
             jnp.minimum(length, _LONGEST),
             front.number + moved,
         )
-        points = points.at[after.number, :, number].set(after.point.T)
+        points = points.at[after.number, :, jnp.arange(lanes[0])].set(after.point.T)
         omega = after.point[-1] * width
         inside = (omega >= low * (1 - 1e-9)) & (omega <= high * (1 + 1e-9))
         return count + 1, after, going & inside & (length > _SHORTEST), points

@@ -25,7 +25,7 @@ from drivetrain_jax.systems import PiecewiseLinearOscillator
 BRANCHES = 7
 _LARGEST_STEP, _MOST_PARTS = 0.02, 8
 _EXTREME_STEPS = 3
-# The branch starts a little below the lowest frequency, so that it crosses this.
+# The branch begins a little above the highest frequency and ends below the lowest, so that it crosses both.
 _BEFORE = 0.999
 # Growth below this counts as stable: at a multiplier 1 within rounding.
 _MARGIN = 1e-9
@@ -92,7 +92,7 @@ def response(
     """The requested results of a line of frequencies ``model.omega`` (L,) of oscillators of the batch ``shape``.
 
     Outcome ``NOT_CONVERGED`` where a sweep has no balanced motion, ``TOLERANCE_NOT_MET`` where the branch was asked for
-    and could not be followed to the last frequency.
+    and could not be followed to the lowest frequency.
     """
     omega = np.asarray(model.omega)
     lanes = shape or (1,)
@@ -107,7 +107,8 @@ def response(
     outcome = jnp.where(jnp.all(balanced, axis=1), Outcome.SUCCESS, Outcome.NOT_CONVERGED)
     results = described._asdict()
     if any(name.startswith("branch_") for name in outputs):
-        first = swept_x[int(np.argmin(omega)), 0]
+        # Motions are simplest at the highest frequency.
+        first = swept_x[int(np.argmax(omega)), 1]
         found, complete = _branches(model, basis, omega, first)
         results |= found
         outcome = jnp.where(~complete & (outcome == Outcome.SUCCESS), Outcome.TOLERANCE_NOT_MET, outcome)
@@ -134,16 +135,19 @@ def _sweeps(
 def _branches(
     model: PiecewiseLinearOscillator, basis: Basis, omega: np.ndarray, first: Array
 ) -> tuple[dict[str, Array], Array]:
-    """Extremes and stability ``(L, branch, N)`` of the motions on the branch of ``first``, by rising extremes."""
+    """Extremes and stability ``(L, branch, N)`` of the motions on the branch of ``first``, by rising extremes.
+
+    The branch is followed from the highest frequency to the lowest.
+    """
     lanes = first.shape[1:]
-    start, stop = _BEFORE * float(omega.min()), float(omega.max()) / _BEFORE
+    start, stop = float(omega.max()) / _BEFORE, _BEFORE * float(omega.min())
     begun = balance(model, basis, first, jnp.full(lanes, start))
     size = jnp.sqrt(jnp.sum(begun.x**2, axis=0))
     scale = jnp.maximum(model.b, size)
     scale = jnp.where(scale > 0, scale, 1.0)
     curve: Branch = trace(model, basis, jnp.where(begun.converged, begun.x, jnp.nan), start, stop, scale)
 
-    width = jnp.full((1, *lanes), stop - start)
+    width = jnp.full((1, *lanes), start - stop)
     units = jnp.concatenate([jnp.broadcast_to(scale, (basis.size, *lanes)), width])
     along = course(jnp.concatenate([curve.x, curve.omega[:, None]], axis=1), units)
 

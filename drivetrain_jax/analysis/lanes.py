@@ -65,3 +65,13 @@ def in_blocks(function: Callable[[dict[str, Any], int], Any], values: Values, la
         return whole.reshape(*whole.shape[:-2], count * size)[..., :lanes]
 
     return jax.tree.map(join, lax.map(part, columns))
+
+
+def stored(certain: Array, function: Callable[[], Any]) -> Any:
+    """``function()``, computed once and kept in memory, where XLA for CPUs would compute it again for every entry of
+    every array that depends on it: a conditional is a border that fusion does not cross.
+
+    ``certain`` is a condition that holds whenever it is evaluated, but is not known to the compiler.
+    """
+    shapes = jax.eval_shape(function)
+    return lax.cond(certain, function, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))

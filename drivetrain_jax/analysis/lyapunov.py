@@ -29,19 +29,19 @@ from drivetrain_jax.analysis.zero_one_test import largest_k01
 from drivetrain_jax.systems import Flow, System
 
 VARIABLES = (
-    Variable("lyapunov_spectrum", "s-1", "Lyapunov exponent", ("exponent",)),
-    Variable("lyapunov_standard_error", "s-1", "standard error of the exponent, from block means", ("exponent",)),
-    Variable("lyapunov_history", "s-1", "exponent had the run ended here", ("segment", "exponent")),
-    Variable("step_change", "s-1", "change of the exponent when the step is halved", ("exponent",)),
-    Variable("sum_rule_residual", "s-1", "sum of the exponents minus the mean divergence"),
+    Variable("lyapunov_spectrum", "1/s", "Lyapunov exponent", ("exponent",)),
+    Variable("lyapunov_standard_error", "1/s", "standard error of the exponent, from block means", ("exponent",)),
+    Variable("lyapunov_history", "1/s", "exponent had the run ended here", ("segment", "exponent")),
+    Variable("step_change", "1/s", "change of the exponent when the step is halved", ("exponent",)),
+    Variable("sum_rule_residual", "1/s", "sum of the exponents minus the mean divergence"),
     Variable("averaging_time", "s", "time over which the exponents are averaged, transient excluded"),
-    Variable("paper_estimator", "s-1", "the paper's (31)-(36) as printed, not a Lyapunov exponent", ("component",)),
+    Variable("paper_estimator", "1/s", "the paper's (31)-(36) as printed, not a Lyapunov exponent", ("component",)),
     Variable("chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic"),
     Variable("period_multiple", "1", "strobes after which the motion repeats, 0 if it does not", dtype="int32"),
     Variable("verdict", "1", "kind of motion", dtype="int8", flags=tuple(v.name.lower() for v in Verdict)),
 )
 OPTIONS = (
-    Parameter("standard_error", "s-1", "standard error at which a run may end", default=0.0, lower=0.0),
+    Parameter("standard_error", "1/s", "standard error at which a run may end", default=0.0, lower=0.0),
     Parameter("max_time", "s", "longest time of a run", default=1.0, lower=0.0, open_lower=True),
     Parameter("steps", "1", "integration steps per strobe", default=48, lower=4, integer=True),
 )
@@ -52,7 +52,8 @@ _TWO_STEPS = {"verdict", "step_change"}
 # Repetition is judged to this fraction of the motion, or to what is left of the transient if that is more; undecided
 # beyond the second.
 _REPEATED, _UNSETTLED = 1e-9, 1e-4
-_CHUNK = 512
+# What one step needs of this many members is in the innermost caches.
+_CHUNK = 64
 
 
 class Spectrum(NamedTuple):

@@ -42,7 +42,7 @@ VARIABLES = (
 _SPECTRUM = {"natural_frequency", "natural_frequency_error"}
 _FOLLOWED = {"branch", "mac"}
 # Chunks of the engine, and lanes that are worked on at a time: these fit into the cache of a core.
-_SPECTRUM_CHUNK, _MODES_CHUNK, _LINES_CHUNK = 1024, 256, 8
+_SPECTRUM_CHUNK, _MODES_CHUNK, _LINES_CHUNK = 512, 256, 8
 _CACHE = 1 << 16
 
 

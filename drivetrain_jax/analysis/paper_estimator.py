@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax.analysis.variational import Frame, initial_state, strobe_map
+from drivetrain_jax.analysis.variational import Frame, initial_state, one_kernel, strobe_map
 from drivetrain_jax.systems import Flow
 
 # Initial difference of every component, in the units that are reported.
@@ -43,7 +43,7 @@ def paper_estimator(flow: Flow, steps: Any, max_time: float) -> Array:
         parts = [(b - a) * s for a, b, s in zip(one.state, other.state, scale, strict=True)]
         parts += [zero + PERTURBATION] * bool(flow.turns)
         delta = jnp.stack(parts)
-        norm = jnp.sqrt(jnp.sum(delta**2, axis=0))
+        norm = jnp.sqrt(sum(part**2 for part in parts))
         return jnp.log10(jnp.maximum(jnp.abs(delta), _SMALLEST)), jnp.log10(jnp.maximum(norm, _SMALLEST))
 
     def body(k: Array, carry: tuple) -> tuple:
@@ -53,8 +53,11 @@ def paper_estimator(flow: Flow, steps: Any, max_time: float) -> Array:
         counts = k < strobes
         return new, total + jnp.where(counts, components, 0.0), jnp.where(counts, norm, last)
 
+    def march(start: tuple, count: Array) -> tuple:
+        return jax.lax.fori_loop(0, count, body, start)
+
     start = ((Frame(base), Frame(moved)), jnp.zeros((component_count(flow), *zero.shape)), zero)
-    _, total, last = jax.lax.fori_loop(0, jnp.max(strobes), body, start)
+    _, total, last = one_kernel(flow)(march)(start, jnp.max(strobes))
     return (total - strobes * last) / (strobes * flow.period)
 
 

@@ -29,7 +29,7 @@ from drivetrain_jax.analysis.zero_one_test import largest_k01
 from drivetrain_jax.systems import Flow, System
 
 VARIABLES = (
-    Variable("section", "rad, rad s-1", "state at the strobes", ("strobe", "state")),
+    Variable("section", "rad, rad/s", "state at the strobes", ("strobe", "state")),
     Variable("torus_residual", "1", "largest distance from a smooth curve, over the largest value", ("state",)),
     Variable("distinct_points", "1", "distinct points of the section, 0 if it does not repeat", dtype="int32"),
     Variable("chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic"),
@@ -46,7 +46,7 @@ _DISTINCT, _LONGEST = 1e-9, 8192
 _SAMPLES = 2000
 _MAX_STEPS = 4096
 # Numbers of a chunk's sections, and points of a chunk at most.
-_NUMBERS, _CHUNK = 1 << 23, 512
+_NUMBERS, _CHUNK = 1 << 23, 64
 Section = tuple[Array, Array]
 
 

@@ -5,8 +5,8 @@ N(high), so that no frequency can be missed and none invented. The upper end com
 of the segments, each of which has at least ``z/pi - 1.6`` of them below z, the lower one from falling powers of 4. Once
 a bracket holds one frequency alone, steps follow Psi (interpolation, truncation and projection: Oliveira & Takahashi,
 ACM TOMS 47 (2020) 5, never more than one step worse than bisection); in clusters they bisect. All modes of all lanes go
-through the same steps, at most ``MAX_STEPS``; a lane that has converged stays as it is, so results do not depend on
-the lanes beside it.
+through the same ``COMMON_STEPS``; the few brackets that are open then go on by themselves, to ``MAX_STEPS`` at most. A
+bracket that is closed stays as it is, so results do not depend on the lanes beside it.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ from drivetrain_jax.analysis.shaft_mechanisms import zero_modes
 from drivetrain_jax.systems import Shaft
 
 MAX_STEPS = 90
+# After as many steps some 5 % of the brackets are open.
+COMMON_STEPS = 16
 # A clamped segment has more frequencies below the phase z than z/pi minus this.
 _CLAMPED_DEFICIT = 1.6
 # Relative width at which a bracket in q is closed, and what rounding may add to it.
@@ -32,6 +34,8 @@ _CLOSED = 4 * np.finfo(float).eps
 # Ratio of the ends up to which a bracket is narrow enough for arithmetic means and for interpolation.
 _NEAR = 4.0
 _TRUNCATION = 0.2
+# Share of the brackets that go on at a time, and the smallest number worth it.
+_FEW, _WORTH = 1 / 16, 32
 # Relative distance up to which frequencies count as one; and up to which a zero of Psi is that of the frequency.
 _MULTIPLE = 1e-13
 _ZERO = 1e-9
@@ -117,13 +121,44 @@ def _search(shaft: Shaft, modes: int) -> _Brackets:
     known = (index <= zero_modes(shaft)) | ~jnp.isfinite(brackets.high)
     brackets = brackets._replace(low=jnp.where(known, brackets.high, brackets.low))
 
+    room = int(_FEW * brackets.high.size)
+    if room < _WORTH:
+        return _advance(shaft, index, 0, brackets, MAX_STEPS)
+    return _finish(shaft, _advance(shaft, index, 0, brackets, COMMON_STEPS), room)
+
+
+def _advance(shaft: Shaft, index: Array, count: int, brackets: _Brackets, most: int) -> _Brackets:
+    """Steps ``count`` to ``most`` of all brackets, or until they are closed."""
+
     def open_ones(state: tuple[Array, _Brackets]) -> Array:
-        return (state[0] < MAX_STEPS) & ~jnp.all(_closed(state[1]))
+        return (state[0] < most) & ~jnp.all(_closed(state[1]))
 
     def advance(state: tuple[Array, _Brackets]) -> tuple[Array, _Brackets]:
         return state[0] + 1, _step(shaft, index, state[1])
 
-    return jax.lax.while_loop(open_ones, advance, (jnp.int32(0), brackets))[1]
+    return jax.lax.while_loop(open_ones, advance, (jnp.int32(count), brackets))[1]
+
+
+def _finish(shaft: Shaft, brackets: _Brackets, room: int) -> _Brackets:
+    """The further steps of the open brackets, ``room`` of them at a time, each with its own shaft."""
+    shape = brackets.high.shape
+    lanes = math.prod(shape[1:])
+    fields = jax.tree.map(lambda field: field.reshape(len(field), lanes), shaft.spread())
+
+    def some_left(state: tuple[_Brackets, Array]) -> Array:
+        return jnp.any(state[1])
+
+    def some(state: tuple[_Brackets, Array]) -> tuple[_Brackets, Array]:
+        flat, left = state
+        # Free places are taken by the first of them once more: the same values, written twice.
+        place = jnp.nonzero(left, size=room, fill_value=jnp.argmax(left))[0]
+        own = jax.tree.map(lambda field: field[:, place % lanes], fields)
+        done = _advance(own, place // lanes + 1, COMMON_STEPS, jax.tree.map(lambda x: x[place], flat), MAX_STEPS)
+        return jax.tree.map(lambda x, new: x.at[place].set(new), flat, done), left.at[place].set(False)
+
+    flat = jax.tree.map(lambda x: x.reshape(-1), brackets)
+    flat, _ = jax.lax.while_loop(some_left, some, (flat, ~_closed(flat)))
+    return jax.tree.map(lambda x: x.reshape(shape), flat)
 
 
 def find_roots(shaft: Shaft, modes: int) -> Roots:

@@ -14,13 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from drivetrain_jax.analysis.lanes import stored
+
 EPS = float(np.finfo(float).eps)
 # Matrices are scaled to entries of order one; what is smaller than these has no influence on any digit.
 _TINY, _TINY_SQUARE = 1e-150, 1e-300
 # QR sweeps per singular value: less than two are needed on average, LAPACK allows six per value and column.
 _SWEEPS_PER_VALUE = 12
 # Each stage of the reduction works on the rows and columns that the ones before have left.
-_STAGE = 6
+_STAGE = 9
+# Terms of a sum that are added in one pass over the memory.
+_TERMS = 8
 
 
 class Bidiagonal(NamedTuple):
@@ -54,32 +58,61 @@ def bidiagonal_form(*blocks: Array) -> Bidiagonal:
     return Bidiagonal(*(jnp.concatenate([pair[i] for pair in pairs]) for i in (0, 1)), scale, finite)
 
 
-def _reflector(x: Array, leading: Array, first: Array) -> tuple[Array, Array, Array]:
-    """``v``, ``2/|v|^2`` and the new leading entry of the reflection that clears ``x`` below its leading entry.
+def _reflector(x: Array, place: Array) -> tuple[Array, Array, Array, Array]:
+    """``v``, ``2/|v|^2``, the new leading entry of the reflection that clears ``x`` below its leading entry, and the
+    old one.
 
-    ``x`` (n, N) vanishes above the entry that ``first`` (n, 1) marks and whose value is ``leading``.
+    ``x`` (n, N) vanishes above the entry that ``place`` (n, 1) marks.
     """
+    leading = jnp.sum(jnp.where(place, x, 0.0), axis=0)
     square = jnp.sum(x * x, axis=0)
     norm = jnp.sqrt(square)
     new = jnp.where(leading > 0, -norm, norm)
     half = square - leading * new
     some = half > _TINY_SQUARE
-    return jnp.where(first, x - new, x), jnp.where(some, 1 / jnp.where(some, half, 1.0), 0.0), new
+    return jnp.where(place, x - new, x), jnp.where(some, 1 / jnp.where(some, half, 1.0), 0.0), new, leading
+
+
+def _combination(weights: Array, a: Array, axis: int) -> Array:
+    """``sum_i weights[i] a[i]`` over the rows (``axis`` 0) or columns (1) of ``a`` (m, n, N), weights (m or n, N).
+
+    Some terms at a time: written as a sum of slices it vectorises over the lanes, which a reduction does not; all in
+    one expression would take long to compile.
+    """
+    count = a.shape[axis]
+    rest = count % _TERMS if count >= 2 * _TERMS else count
+
+    def term(i: Any) -> Array:
+        row = lax.dynamic_index_in_dim(weights, i, 0, keepdims=False)
+        return row * lax.dynamic_index_in_dim(a, i, axis, keepdims=False)
+
+    def add(group: Array, total: Array) -> Array:
+        return total + sum(term(rest + group * _TERMS + i) for i in range(_TERMS))
+
+    start = sum((term(i) for i in range(rest)), jnp.zeros((a.shape[1 - axis], a.shape[2])))
+    return lax.fori_loop(0, (count - rest) // _TERMS, add, start)
 
 
 def _reduce_row_and_column(k: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
     """Clear column ``k`` below the diagonal and row ``k`` right of its neighbour, by one combined update."""
     a, diagonal, upper = state
-    rows, columns = jnp.arange(a.shape[0])[:, None], jnp.arange(a.shape[1])[:, None]
-    x = jnp.where(rows >= k, lax.dynamic_index_in_dim(a, k, 1, keepdims=False), 0.0)
-    leading = jnp.sum(jnp.where(rows == k, x, 0.0), axis=0)
-    v, factor, new_diagonal = _reflector(x, leading, rows == k)
-    w = factor * jnp.sum(v[:, None] * a, axis=0)
-    y = lax.dynamic_index_in_dim(a, k, 0, keepdims=False) - (leading - new_diagonal) * w
-    y = jnp.where(columns > k, y, 0.0)
-    neighbour = jnp.sum(jnp.where(columns == k + 1, y, 0.0), axis=0)
-    u, factor, new_upper = _reflector(y, neighbour, columns == k + 1)
-    z = factor * (jnp.sum(a * u, axis=1) - v * jnp.sum(w * u, axis=0))
+    rows, columns, certain = jnp.arange(a.shape[0])[:, None], jnp.arange(a.shape[1])[:, None], k >= 0
+
+    def column() -> tuple[Array, ...]:
+        return _reflector(jnp.where(rows >= k, lax.dynamic_index_in_dim(a, k, 1, keepdims=False), 0.0), rows == k)
+
+    v, factor, new_diagonal, leading = stored(certain, column)
+    w = stored(certain, lambda: factor * _combination(v, a, 0))
+
+    # Stored: where the row has nothing but rounding left, two evaluations of it would give two different reflections.
+    y = stored(certain, lambda: lax.dynamic_index_in_dim(a, k, 0, keepdims=False) - (leading - new_diagonal) * w)
+
+    def row() -> tuple[Array, ...]:
+        u, factor, new, _ = _reflector(jnp.where(columns > k, y, 0.0), columns == k + 1)
+        return u, factor, new, jnp.sum(w * u, axis=0)
+
+    u, factor_u, new_upper, across = stored(certain, row)
+    z = stored(certain, lambda: factor_u * (_combination(u, a, 1) - v * across))
     a = a - v[:, None] * w - z[:, None] * u
     diagonal = lax.dynamic_update_index_in_dim(diagonal, new_diagonal, k, 0)
     return a, diagonal, lax.dynamic_update_index_in_dim(upper, new_upper, k, 0)
@@ -120,21 +153,23 @@ def _split(pairs: Array) -> tuple[Array, Array, Array]:
 
     Row ``j`` of ``pairs`` (n + 1, 2, N) holds the upper entry above the diagonal entry ``j``, and that entry.
     """
-    rows = jnp.arange(pairs.shape[0] - 1)[:, None]
     upper, diagonal = pairs[1:, 0], jnp.abs(pairs[:, 1])
     coupled = jnp.abs(upper) > EPS * (diagonal[:-1] + diagonal[1:])
-    last = jnp.max(jnp.where(coupled, rows + 1, 0), axis=0)
-    first = jnp.max(jnp.where(~coupled & (rows + 1 < last), rows + 1, 0), axis=0)
+    # Row by row: a reduction over the rows would not vectorise over the lanes.
+    last = first = jnp.zeros(pairs.shape[-1], int)
+    for row in range(1, len(coupled) + 1):
+        last = jnp.where(coupled[row - 1], row, last)
+    for row in range(1, len(coupled)):
+        first = jnp.where(~coupled[row - 1] & (row < last), row, first)
     cleared = jnp.stack([jnp.where(coupled, upper, 0.0), pairs[1:, 1]], axis=1)
     return jnp.concatenate([pairs[:1], cleared]), first, last
 
 
 def _shifted_start(pairs: Array, first: Array, last: Array) -> Array:
     """The leading entry of the first rotation: B^T B - shift^2 over its own first diagonal entry's root."""
-    rows = jnp.arange(pairs.shape[0])[:, None]
 
     def entry(column: int, row: Array) -> Array:
-        return jnp.sum(jnp.where(rows == row, pairs[:, column], 0.0), axis=0)
+        return jnp.take_along_axis(pairs[:, column], jnp.maximum(row, 0)[None], axis=0, mode="clip")[0]
 
     shift = _smaller_value(entry(1, last - 1), entry(0, last), entry(1, last))
     top = entry(1, first)
@@ -153,7 +188,7 @@ def _sweep(pairs: Array, first: Array, last: Array) -> Array:
         return lax.dynamic_index_in_dim(array, k, 0, keepdims=False)
 
     def step(k: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        pairs, f, c, s, above, here = state
+        swept, f, c, s, above, here = state
         upper, below = row(pairs, k + 1)
         inside, top = (k >= first) & (k < last), k == first
         f, g, right = jnp.where(top, start, f), jnp.where(top, upper, s * upper), jnp.where(top, upper, c * upper)
@@ -162,14 +197,15 @@ def _sweep(pairs: Array, first: Array, last: Array) -> Array:
         g, f = s * below, c * here + s * right
         right, corner = c * right - s * here, c * below
         c, s, r = _rotation(f, g)
-        pairs = lax.dynamic_update_index_in_dim(pairs, jnp.stack([above, jnp.where(inside, r, here)]), k, 0)
+        swept = lax.dynamic_update_index_in_dim(swept, jnp.stack([above, jnp.where(inside, r, here)]), k, 0)
         f, corner = c * right + s * corner, c * corner - s * right
-        return pairs, f, c, s, jnp.where(inside, f, upper), jnp.where(inside, corner, below)
+        return swept, f, c, s, jnp.where(inside, f, upper), jnp.where(inside, corner, below)
 
     above, here = row(pairs, begin)
     zero = jnp.zeros(lanes)
-    pairs, _, _, _, above, here = lax.fori_loop(begin, end, step, (pairs, zero, zero, zero, above, here))
-    return lax.dynamic_update_index_in_dim(pairs, jnp.stack([above, here]), end, 0)
+    # Read from one array and written to another: one for both would be copied in every step.
+    swept, _, _, _, above, here = lax.fori_loop(begin, end, step, (pairs, zero, zero, zero, above, here))
+    return lax.dynamic_update_index_in_dim(swept, jnp.stack([above, here]), end, 0)
 
 
 def bidiagonal_values(form: Bidiagonal) -> tuple[Array, Array]:

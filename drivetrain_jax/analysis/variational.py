@@ -1,6 +1,7 @@
 """Trajectories of a flow and of vectors tangent to them, by equal steps of the explicit scheme of order 8 (DOP853).
 
-A state is a tuple of components, each of the shape of the batch: XLA then fuses whole stages over the batch. Time
+A state is a tuple of components, each of the shape of the batch. What a stage computes is stored before the next one
+begins (see :mod:`~drivetrain_jax.analysis.kernels`); batches of 32 to 64 members keep that in the innermost caches. Time
 enters through :meth:`Flow.angles` of a counted strobe, so that nothing drifts however long the march is.
 """
 
@@ -14,16 +15,20 @@ import jax.numpy as jnp
 from jax import Array
 from scipy.integrate import DOP853
 
+from drivetrain_jax.analysis.kernels import in_one_kernel, stored, suits_one_kernel
 from drivetrain_jax.systems import Flow
 
 Vector = tuple[Array, ...]
 
 
 class Frame(NamedTuple):
-    """A point of a trajectory, tangent vectors there, and the integral of the divergence since some time."""
+    """A point of a trajectory, tangent vectors there, and the integral of the divergence since some time.
+
+    ``tangents``: components of the m vectors, each ``(m, ...)``; () if there are none.
+    """
 
     state: Vector
-    tangents: tuple[Vector, ...] = ()
+    tangents: Vector = ()
     contraction: Array | None = None
 
 
@@ -47,9 +52,21 @@ def initial_frame(flow: Flow) -> Frame:
     phases supply.
     """
     state = initial_state(flow)
-    zero = jnp.zeros_like(state[0])
-    moving = [i for i in range(flow.size) if i not in flow.phases]
-    return Frame(state, tuple(tuple(zero + float(i == j) for i in range(flow.size)) for j in moving), zero)
+    moving = jnp.array([i for i in range(flow.size) if i not in flow.phases])
+    units = (moving[:, None] == jnp.arange(flow.size)).astype(float).T
+    shape = (len(moving), *state[0].shape)
+    tangents = (jnp.broadcast_to(u.reshape(-1, *(1,) * state[0].ndim), shape) for u in units)
+    return Frame(state, tuple(tangents), jnp.zeros_like(state[0]))
+
+
+def one_kernel(flow: Flow) -> Callable[[Callable], Callable]:
+    """The mark for a march of ``flow``: :func:`in_one_kernel`, or none if the field does what is not possible there."""
+
+    def rates(y: Vector) -> Any:
+        angles = flow.angles(0, 0.0)
+        return flow.field(angles, y), divergence(flow, angles, y)
+
+    return in_one_kernel if suits_one_kernel(rates, initial_state(flow)) else lambda function: function
 
 
 def strobe_map(flow: Flow, steps: Any) -> Callable[[Array, Frame], Frame]:
@@ -71,25 +88,29 @@ def strobe_map(flow: Flow, steps: Any) -> Callable[[Array, Frame], Frame]:
 
 def _step(flow: Flow, angles: Callable[[float], tuple], h: Any, frame: Frame) -> Frame:
     """One step of DOP853 for everything that the frame carries."""
-    rows = [frame.state, *frame.tangents]
-    slopes: list[list[Vector]] = []
-    gathered = frame.contraction
+    slopes: list[Frame] = []
     for stage, (c, b) in enumerate(zip(DOP853.C, DOP853.B, strict=True)):
-        at = [_advanced(row, h, DOP853.A[stage, :stage], [s[k] for s in slopes]) for k, row in enumerate(rows)]
-        clocks = angles(float(c))
-        slopes.append(_slopes(flow, clocks, at))
-        if gathered is not None and b != 0:
-            gathered = gathered + h * float(b) * divergence(flow, clocks, at[0])
-    state, *tangents = (_advanced(row, h, DOP853.B, [s[k] for s in slopes]) for k, row in enumerate(rows))
-    return Frame(state, tuple(tangents), gathered)
+        at = _advanced(frame._replace(contraction=None), h, DOP853.A[stage, :stage], slopes)
+        contracts = frame.contraction is not None and b != 0
+        slopes.append(_slopes(flow, contracts, angles(float(c)), at))
+    return _advanced(frame, h, DOP853.B, slopes)
 
 
-def _advanced(row: Vector, h: Any, weights: Any, slopes: list[Vector]) -> Vector:
-    """``row + h sum(weights * slopes)``, component by component."""
+def _advanced(frame: Frame, h: Any, weights: Any, slopes: list[Frame]) -> Frame:
+    """``frame + h sum(weights * slopes)``, component by component."""
     terms = [(float(w), slope) for w, slope in zip(weights, slopes, strict=True) if w != 0]
     if not terms:
-        return row
-    return tuple(x + h * sum(w * slope[i] for w, slope in terms) for i, x in enumerate(row))
+        return frame
+    factors, slopes = zip(*terms, strict=True)
+
+    def moved(frame: Frame, h: Any, slopes: tuple[Frame, ...]) -> Frame:
+        def along(x: Array, *rates: Array) -> Array:
+            return x + h * sum(w * rate for w, rate in zip(factors, rates, strict=True))
+
+        return jax.tree.map(along, frame, *slopes)
+
+    used = (slope if frame.contraction is not None else slope._replace(contraction=None) for slope in slopes)
+    return stored(moved)(frame, h, tuple(used))
 
 
 def _field(flow: Flow, angles: tuple, shape: tuple[int, ...]) -> Callable[..., Vector]:
@@ -99,13 +120,20 @@ def _field(flow: Flow, angles: tuple, shape: tuple[int, ...]) -> Callable[..., V
     return field
 
 
-def _slopes(flow: Flow, angles: tuple, rows: list[Vector]) -> list[Vector]:
-    """Derivatives of the state ``rows[0]`` and of the tangent vectors ``rows[1:]``."""
-    field = _field(flow, angles, rows[0][0].shape)
-    if len(rows) == 1:
-        return [field(*rows[0])]
-    rates, push = jax.linearize(field, *rows[0])
-    return [rates, *(push(*row) for row in rows[1:])]
+def _slopes(flow: Flow, contracts: bool, angles: tuple, at: Frame) -> Frame:
+    """Derivatives of the state, of the tangent vectors and, if it ``contracts``, of the integral of the divergence."""
+    field = _field(flow, angles, at.state[0].shape)
+    contraction = jnp.broadcast_to(divergence(flow, angles, at.state), at.state[0].shape) if contracts else None
+    if not at.tangents:
+        return Frame(field(*at.state), (), contraction)
+    rates, push = jax.linearize(field, *at.state)
+    # The factors of the linear map are what it shares with the rates and the divergence.
+    linear, factors = jax.closure_convert(push, *at.state)
+
+    def pushed(tangents: Vector, factors: list[Array]) -> Vector:
+        return jax.vmap(lambda *v: linear(*v, *factors))(*tangents)
+
+    return Frame(rates, tuple(stored(pushed)(at.tangents, factors)), contraction)
 
 
 def divergence(flow: Flow, angles: tuple, y: Vector) -> Array:
@@ -117,15 +145,15 @@ def divergence(flow: Flow, angles: tuple, y: Vector) -> Array:
     return sum(push(*(zero + float(i == j) for i in range(flow.size)))[j] for j in range(flow.size))
 
 
-def orthonormal(vectors: tuple[Vector, ...]) -> tuple[tuple[Vector, ...], Array]:
-    """Modified Gram-Schmidt: orthonormal vectors and the logarithms of the lengths, shape ``(len(vectors), ...)``."""
+def orthonormal(tangents: Vector) -> tuple[Vector, Array]:
+    """Modified Gram-Schmidt of m vectors, components ``(m, ...)``: orthonormal ones, logarithms of the lengths (m, ...)."""
     basis: list[Vector] = []
     logs = []
-    for vector in vectors:
+    for vector in zip(*tangents, strict=True):
         for unit in basis:
             along = sum(a * b for a, b in zip(unit, vector, strict=True))
             vector = tuple(b - along * a for a, b in zip(unit, vector, strict=True))
         length = jnp.sqrt(sum(a * a for a in vector))
         basis.append(tuple(a / length for a in vector))
         logs.append(jnp.log(length))
-    return tuple(basis), jnp.stack(logs)
+    return tuple(jnp.stack(component) for component in zip(*basis, strict=True)), jnp.stack(logs)

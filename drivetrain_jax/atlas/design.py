@@ -96,13 +96,7 @@ def least_damping(
     direct: Direct | None = None,
 ) -> Answer:
     """The least ``damping`` from which on, up to the atlas's largest, all ``speeds`` are stable."""
-    part = narrow(atlas.slice(at), {speed: speeds})
-    line = stability_over_range(part, system, speed)
-    last = line.intervals[-1]
-    value, limit = (last.lower, last.lower_end) if last.stable else (None, None)
-    certain = value is not None and not any(b >= value for _, b in _apart(line, limit))
-    answer = Answer(damping, value, limit.error if limit else 0.0, limit, line.intervals, line.undecided, certain)
-    return _checked(answer, part, speed, 1.0, direct)
+    return _extreme(narrow(atlas.slice(at), {speed: speeds}), system, speed, (damping, 1.0), direct)
 
 
 def widest_angle(
@@ -116,13 +110,7 @@ def widest_angle(
     direct: Direct | None = None,
 ) -> Answer:
     """The widest ``angle`` up to which, from the atlas's smallest on, all ``speeds`` are stable."""
-    part = narrow(atlas.slice(at), {speed: speeds})
-    line = stability_over_range(part, system, speed)
-    first = line.intervals[0]
-    value, limit = (first.upper, first.upper_end) if first.stable else (None, None)
-    certain = value is not None and not any(a <= value for a, _ in _apart(line, limit))
-    answer = Answer(angle, value, limit.error if limit else 0.0, limit, line.intervals, line.undecided, certain)
-    return _checked(answer, part, speed, -1.0, direct)
+    return _extreme(narrow(atlas.slice(at), {speed: speeds}), system, speed, (angle, -1.0), direct)
 
 
 def speed_windows(
@@ -172,6 +160,19 @@ def nearest_boundaries(atlas: Atlas, system: System, point: Mapping[str, float])
             )
         )
     return tuple(found)
+
+
+def _extreme(part: Atlas, system: System, speed: str, sought: tuple[str, float], direct: Direct | None) -> Answer:
+    """Up to where, from the last value of ``sought`` (name, side) on that side, all of ``speed`` is stable."""
+    name, side = sought
+    line = stability_over_range(part, system, speed)
+    end = line.intervals[-1] if side > 0 else line.intervals[0]
+    value, limit = (end.lower, end.lower_end) if side > 0 else (end.upper, end.upper_end)
+    if not end.stable:
+        value, limit = None, None
+    certain = value is not None and not any(max(side * a, side * b) >= side * value for a, b in _apart(line, limit))
+    answer = Answer(name, value, limit.error if limit else 0.0, limit, line.intervals, line.undecided, certain)
+    return _checked(answer, part, speed, side, direct)
 
 
 def _apart(line: Line, limit: Crossing | None) -> list[Range]:

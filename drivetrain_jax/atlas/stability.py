@@ -1,7 +1,8 @@
 """Stability from an atlas of the propagator: spectral radius with its bound and verdict, on grids and at points.
 
-Most cells are judged in closed form (``quartic``). Those for which that gives too wide a bound or no verdict are judged
-again by the eigenvalues of Z, as every single point is; without damping the verdict is that of ``conservative``.
+Most cells of a grid are judged in closed form (``charts``). Those for which that gives too wide a bound or no verdict are
+judged again by the eigenvalues of Z, as every single point is, and by the test of Schur and Cohn where the interval of rho
+holds 1; without damping the verdict is that of ``conservative``.
 """
 
 from __future__ import annotations

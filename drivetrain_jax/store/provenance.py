@@ -17,7 +17,11 @@ import numpy as np
 
 def versions(packages: Iterable[str]) -> dict[str, str]:
     """Installed versions by package name."""
-    return {package: version(package) for package in packages}
+    return {package: _version(package) for package in packages}
+
+
+# Reading the metadata of a package takes a millisecond.
+_version = lru_cache(maxsize=None)(version)
 
 
 @lru_cache

@@ -1,8 +1,8 @@
 """A Zarr v3 store that many processes write at once: every shard is one file per variable and belongs to one writer.
 
-Rows are points in the order in which they are computed, ``width`` of them a chunk, and the chunks of one group of the plan
-are one Zarr group. The array ``point`` holds the number of each row's point in the grid (-1: padding), and ``done`` a checksum of
-each shard, written after its data, 0 before. Damage is found by that, by the CRC-32C of every chunk, or both.
+Rows are points in the order in which they are computed, ``width`` of them a chunk; the chunks of one group of the plan
+are one Zarr group. The array ``point`` holds the number of each row's point in the grid (-1: padding), and ``done`` a
+checksum of each shard, written after its data, 0 before. Damage is found by that, by the CRC-32C of every chunk, or both.
 """
 
 from __future__ import annotations

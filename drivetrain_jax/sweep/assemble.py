@@ -22,7 +22,7 @@ from drivetrain_jax.sweep.scene import Scene
 # Entries assumed for a dimension whose size depends on the system, when memory is estimated.
 _USUAL_SIZE = 4
 # Bytes of the plan per point.
-_PLANNED = 32
+_PLANNED = 16
 _STORAGE = ("xarray", "h5netcdf", "h5py")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
@@ -15,6 +16,8 @@ from drivetrain_jax.sweep.plan import Chunk
 from drivetrain_jax.sweep.worker import Job
 
 _PATIENCE = "10s"
+# What these libraries say of their own accord when a scheduler or a worker dies; here that is one line, or no news.
+_TALKATIVE = ("distributed", "tornado", "asyncio")
 
 
 def run_cluster(chunks: Iterable[Chunk], job: Job, address: str) -> Iterator[tuple[Chunk, Results | None]]:
@@ -73,4 +76,7 @@ def _distributed() -> Any:
         raise InputError(
             "dask: the package distributed is not installed; install drivetrain_jax[distributed]"
         ) from None
+    for name in (*_TALKATIVE, *logging.root.manager.loggerDict):
+        if name.split(".")[0] in _TALKATIVE:
+            logging.getLogger(name).setLevel(logging.CRITICAL)
     return distributed

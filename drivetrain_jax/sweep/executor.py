@@ -50,24 +50,28 @@ class Where:
         chunks = engine.ordered(numbers)
         if self.workers is None and self.dask is None:
             engine.prepare(chunks)
-        from drivetrain_jax.sweep.worker import Job
-
-        return self.each(chunks, engine.compute_chunk, Job(engine.scene.text, engine.digest))
+        return self.each(chunks, engine.compute_chunk, lambda: _job(engine))
 
     def each(
-        self, chunks: Iterable[Any], here: Callable[[Any], Results], job: Job
+        self, chunks: Iterable[Any], here: Callable[[Any], Results], job: Callable[[], Job]
     ) -> Iterator[tuple[Any, Results | None]]:
         """``(chunk, results)`` like :meth:`compute` for any numbered pieces of work: done by ``here`` in threads of this
-        process, else by ``job.do`` elsewhere."""
+        process, else by ``job().do`` elsewhere."""
         if self.workers is None and self.dask is None:
             return run_threads(chunks, here, self.threads or usable_cores())
         if self.workers is not None:
             from drivetrain_jax.sweep.processes import run_processes
 
-            return run_processes(chunks, job, self.workers)
+            return run_processes(chunks, job(), self.workers)
         from drivetrain_jax.sweep.cluster import run_cluster
 
-        return run_cluster(chunks, job, self.dask)
+        return run_cluster(chunks, job(), self.dask)
+
+
+def _job(engine: Engine) -> Job:
+    from drivetrain_jax.sweep.worker import Job
+
+    return Job(engine.scene.text, engine.digest)
 
 
 def run_threads(

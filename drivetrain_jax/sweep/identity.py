@@ -15,11 +15,13 @@ import jax
 import drivetrain_jax
 from drivetrain_jax.analysis import Solver
 from drivetrain_jax.store.provenance import digest, instruction_set, source_digest, versions
+from drivetrain_jax.sweep.atlas_choice import uses_atlas
 from drivetrain_jax.sweep.scene import Scene
 
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "numpy", "scipy")
 _ROOT = Path(drivetrain_jax.__file__).parent
 _ENGINE = ("sweep/grid.py", "sweep/plan.py", "sweep/kernel.py")
+_THROUGH_ATLAS = ("atlas/floquet.py", "sweep/rounds.py", "sweep/through_atlas.py")
 # What these packages hold decides numbers; what lies above them does not.
 _NUMERIC = ("drivetrain_jax._quantities", "drivetrain_jax.systems", "drivetrain_jax.analysis", "drivetrain_jax.atlas")
 
@@ -27,7 +29,8 @@ _NUMERIC = ("drivetrain_jax._quantities", "drivetrain_jax.systems", "drivetrain_
 def numerics_of(scene: Scene) -> dict[str, Any]:
     """The code that this scene runs, the versions of all that computes, and the machine's instruction set: what decides
     the bits of its numbers. Code of other systems and analyses may change without making a result stale."""
-    starts = [_ROOT / name for name in _ENGINE]
+    through_atlas = scene.analysis.continuous or uses_atlas(scene)
+    starts = [_ROOT / name for name in (*_ENGINE, *(_THROUGH_ATLAS if through_atlas else ()))]
     for function in (scene.system.models[scene.analysis.name].build, scene.analysis.solvers):
         # A partial has no source of its own.
         starts.append(Path(inspect.getsourcefile(getattr(function, "func", function)) or ""))
@@ -70,6 +73,7 @@ def _imports(path: Path) -> tuple[str, ...]:
     return tuple(names)
 
 
+@cache
 def _files(name: str) -> list[Path]:
     """Modules that importing the dotted ``name`` runs, as far as they are numeric code of this package."""
     if not any(name == package or name.startswith(package + ".") for package in _NUMERIC):

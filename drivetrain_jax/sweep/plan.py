@@ -86,22 +86,29 @@ def make_plan(
     ``full_size`` keeps the size of chunks where points are few, so that further plans need no other kernels.
     """
     count = grid.size if points is None else len(points)
-    choice = np.empty(count, np.int8)
-    effort = np.empty(count, np.int64)
+    # Effort and position in one number, sorted in place: 8 bytes a point are all that the plan of a large scene takes.
+    # Room for all points with every solver is memory only where it is filled.
+    bits = np.uint64(count.bit_length())
+    keys, filled = [np.empty(count, np.uint64) for _ in solvers], [0 for _ in solvers]
     for start in range(0, count, _BLOCK):
-        block = slice(start, min(start + _BLOCK, count))
-        chosen = np.arange(block.start, block.stop) if points is None else points[block]
-        choice[block], effort[block] = _cheapest(solvers, grid, chosen)
+        positions = np.arange(start, min(start + _BLOCK, count))
+        choice, effort = _cheapest(solvers, grid, positions if points is None else points[positions])
+        for index, key in enumerate(keys):
+            mine = np.flatnonzero(choice == index)
+            begin, filled[index] = filled[index], filled[index] + mine.size
+            key[begin : filled[index]] = (effort[mine].astype(np.uint64) << bits) | positions[mine].astype(np.uint64)
     groups = []
     for index, solver in enumerate(solvers):
-        mine = np.flatnonzero(choice == index)
-        if not mine.size:
+        key = keys[index][: filled[index]]
+        if not key.size:
             continue
-        mine = mine[np.argsort(effort[mine], kind="stable")]
-        size = solver.chunk if full_size else chunk_size(solver.chunk, mine.size)
-        last = np.minimum(np.arange(size, mine.size + size, size), mine.size) - 1
-        order = mine if points is None else points[mine]
-        groups.append(Group(index, solver, order, effort[mine[last]], size))
+        key.sort()
+        size = solver.chunk if full_size else chunk_size(solver.chunk, key.size)
+        last = np.minimum(np.arange(size, key.size + size, size), key.size) - 1
+        efforts = (key[last] >> bits).astype(np.int64)
+        key &= (np.uint64(1) << bits) - np.uint64(1)
+        order = key.view(np.int64)
+        groups.append(Group(index, solver, order if points is None else points[order], efforts, size))
     return Plan(tuple(groups))
 
 

@@ -65,6 +65,7 @@ class _Slot:
     def __init__(self, job: Job, core: int | None) -> None:
         self._job, self._core = job, core
         self.running: dict[Future[Results], Chunk] = {}
+        self._stillborn = 0
         self._start()
 
     def _start(self) -> None:
@@ -94,23 +95,28 @@ class _Slot:
             try:
                 yield chunk, future.result()
             except BrokenProcessPool:
-                self._check_ready()
+                ready = self._was_ready()
                 waiting.put_back(self.running.values())
                 self.running.clear()
                 self._pool.shutdown(wait=False)
                 self._start()
-                deaths[chunk.number] += 1
+                deaths[chunk.number] += ready
                 if deaths[chunk.number] < ATTEMPTS:
                     waiting.put_back([chunk])
                 else:
                     yield chunk, None
 
-    def _check_ready(self) -> None:
-        """A process that never got ready for this scene would not do so for another chunk either."""
+    def _was_ready(self) -> bool:
+        """Whether the process died at a chunk. One that dies every time while it gets ready would do so for any."""
         try:
             self._ready.result()
         except BrokenProcessPool:
-            raise ChunkError("a worker process died while it got ready") from None
+            self._stillborn += 1
+            if self._stillborn >= ATTEMPTS:
+                raise ChunkError("worker processes die while they get ready") from None
+            return False
+        self._stillborn = 0
+        return True
 
     def kill(self) -> None:
         """End the process at once; what it was computing is not wanted any more."""

@@ -21,7 +21,7 @@ from drivetrain_jax.sweep import toml
 from drivetrain_jax.sweep.axes import MAX_POINTS, MAX_RANGES, Axis, AxisTable, check_count, entry_of, spread
 from drivetrain_jax.systems import Model, System, get_system
 
-# What the plan of a run takes for each point, and so does an axis while it is made and checked.
+# What an axis takes for each value while it is made and checked.
 _BYTES = 32
 
 Value = float | int | str | tuple[float, ...]
@@ -198,13 +198,14 @@ def _axes(table: _SceneTable, system: System, analysis: Analysis) -> tuple[tuple
     if table.points:
         return _points(table, system), True
     specs = {name: _axis_table(name, value) for name, value in table.axes.items()}
-    total = math.prod(check_count(name, spec, analysis.continuous) for name, spec in specs.items())
+    counts = {name: check_count(name, spec, analysis.continuous) for name, spec in specs.items()}
+    total = math.prod(counts.values())
     if total > MAX_POINTS:
         raise InputError(f"axes: {total} points; allowed is up to {MAX_POINTS}")
-    needed, present = total * _BYTES, physical_memory()
-    if needed > present:
-        limit = f"allowed here is up to {int(present / _BYTES)} points"
-        raise InputError(f"axes: {total} points need {needed / 1e9:.0f} GB of memory; {limit}")
+    most, present = max(counts.values(), default=0), physical_memory()
+    if most * _BYTES > present:
+        name = max(counts, key=lambda name: counts[name])
+        raise InputError(f"axes.{name}.num = {most}: allowed with this memory is up to {int(present / _BYTES)}")
     return tuple(_axis(system, name, spec) for name, spec in specs.items()), False
 
 

@@ -82,7 +82,7 @@ def compute(
     progress.total_cost = float(sum(costs[chunk.number] for shard in missing for chunk in shard.chunks))
     _tell(report, progress)
     job = ShardJob(engine.scene.text, engine.digest, os.path.abspath(path))
-    with closing(where.each(missing, partial(job.do, engine), job)) as finished:
+    with closing(where.each(missing, partial(job.do, engine), lambda: job)) as finished:
         for shard, results in finished:
             outcome = _one_by_one(engine, where, path, shard) if results is None else results[OUTCOME.name]
             progress.computed += shard.points * engine.grid.path_length

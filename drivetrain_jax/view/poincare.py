@@ -51,9 +51,9 @@ def _draw_row(row: list[Axes], part: xr.Dataset, name: str | None) -> None:
     for axes in row[1:]:
         axes.sharey(row[0])
     for axes, shown in zip(row, (points, points[:_FIRST])[: len(row)], strict=True):
-        size = 0.6 if len(shown) > 2 * _FIRST else 1.5
+        size = 14.0 if _is_point(points) else 0.6 if len(shown) > 2 * _FIRST else 1.5
         axes.scatter(shown[:, 0], shown[:, 1], s=size, color=LINE_COLOURS[0], linewidths=0, rasterized=True)
-        axes.text(0.98, 0.97, f"{len(shown)} strobes", transform=axes.transAxes, ha="right", va="top", size=7.5)
+        axes.text(1.0, 1.02, f"{len(shown)} strobes", transform=axes.transAxes, ha="right", va="bottom", size=7.5)
         axes.tick_params(labelbottom=True)
     notes = [value_text(name, part[name].item(), part[name].attrs.get("units", "1"))] if name else []
     if "torus_residual" in part:
@@ -66,6 +66,14 @@ def _draw_row(row: list[Axes], part: xr.Dataset, name: str | None) -> None:
     twist = np.nanmax(np.abs(points[:, 0]), initial=0.0)
     for which, values, least in zip("xy", points.T, (0.0, 1e-3 * _RATE * twist), strict=True):
         _widen(row[0], which, values[np.isfinite(values)], least)
+
+
+def _is_point(points: np.ndarray) -> bool:
+    """Whether all finite points are the same but for rounding."""
+    finite = points[np.isfinite(points).all(axis=1)]
+    twist, rate = np.ptp(finite, axis=0) if len(finite) else (np.inf, np.inf)
+    size = np.abs(finite[:, 0]).max(initial=0.0)
+    return bool(twist <= _NARROW * size and rate <= _NARROW * _RATE * size)
 
 
 def _widen(axes: Axes, which: str, values: np.ndarray, least: float) -> None:

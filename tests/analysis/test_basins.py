@@ -11,6 +11,8 @@ from drivetrain_jax.systems.rattle import PRESETS
 
 # Share of the high branch, initial conditions in [-1, 1]^2.
 NOTE = {0.76: 0.976, 0.80: 0.84, 0.84: 0.67, 0.87: 0.41}
+# Rounding of the note.
+ROUNDING = {0.76: 0.0005, 0.80: 0.005, 0.84: 0.005, 0.87: 0.005}
 
 
 def run(**options):
@@ -27,7 +29,7 @@ def test_shares_of_the_high_branch(found):
     """Within three standard errors, and the rounding of the note."""
     high = found.sel(attractor=1)
     distance = np.abs(high.basin_fraction.values - list(NOTE.values()))
-    assert np.all(distance < 3 * high.basin_error.values + 0.01)
+    assert np.all(distance < 3 * high.basin_error.values + list(ROUNDING.values()))
     np.testing.assert_allclose(found.basin_fraction.sum("attractor"), 1.0, rtol=1e-15)
     assert (found.outcome == 0).all() and (found.unsettled_fraction == 0).all()
     assert (found.attractor_multiple.values[:, :2] == 1).all()

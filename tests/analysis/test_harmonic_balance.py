@@ -15,6 +15,7 @@ from drivetrain_jax.analysis import harmonic_response
 from drivetrain_jax.analysis.closed_form_response import response as closed_form
 from drivetrain_jax.analysis.harmonic_branch import trace
 from drivetrain_jax.analysis.harmonic_stability import half_trace, spectral_radius
+from drivetrain_jax.analysis.harmonic_sweep import settle
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 from drivetrain_jax.systems.rattle import PRESETS, oscillator
 
@@ -138,6 +139,22 @@ def test_folds_of_the_branch():
     exact = [s["omega"] for s in REFERENCE["specials"]["table1"] if s["type"] == "fold"][:2]
     np.testing.assert_allclose(sorted(found), sorted(exact), atol=2e-4)
     assert bool(branch.complete[0])
+
+
+@pytest.mark.parametrize(("begin", "end"), [(0.163, 0.05), (0.05, 0.163)])
+def test_branch_passes_contacts_that_come_and_go(begin, end):
+    """Seven harmonics have several folds near .12, where short contacts appear."""
+    model, basis = model_of(({},), begin), hb.Basis(7)
+
+    @jax.jit
+    def follow():
+        x = settle(model, basis, jnp.zeros((basis.size, 1)), jnp.array([begin]))
+        return trace(model, basis, hb.balance(model, basis, x, jnp.array([begin])).x, begin, end, jnp.array([0.2]))
+
+    branch = follow()
+    omega = np.asarray(branch.omega[:, 0])
+    assert bool(branch.complete[0])
+    np.testing.assert_allclose([np.nanmin(omega), np.nanmax(omega)], [0.05, 0.163], atol=0.02)
 
 
 def test_linear_limits_are_exact(swept):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 from functools import cache
+from pathlib import Path
 
 import flows
 import jax
@@ -12,13 +14,15 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
+from benchmarks import tripod_reference as oracle
 from drivetrain_jax.analysis import Request
 from drivetrain_jax.analysis.lyapunov import analyse
 from drivetrain_jax.analysis.verdict import Verdict
 from drivetrain_jax.systems import Flow
 
+REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "tripod.json").read_text())
 OUTPUTS = ("lyapunov_spectrum", "lyapunov_standard_error", "sum_rule_residual", "verdict", "chaos_k01")
-LANES = 16
+LANES = 32
 LITERATURE = {
     "lorenz": (0.9056, 0.0, -14.5723),
     "roessler": (0.0714, 0.0, -5.3943),
@@ -26,6 +30,9 @@ LITERATURE = {
     "two_wells": (0.1572, -0.4072),
     "pendulum": (0.1400, -0.1900),
 }
+
+# Standard errors of the means that keep the bounds sharp.
+LARGEST_ERROR = {"lorenz": 1.5e-3, "roessler": 1.5e-3, "ueda": 2e-3, "two_wells": 2e-3, "pendulum": 2e-3}
 
 
 def request(outputs: tuple[str, ...], max_time: float, steps: int, target: float = 0.0) -> Request:
@@ -40,7 +47,7 @@ def results(flow: Flow, *options) -> dict:
 @cache
 def batch(name: str) -> dict:
     """Time and steps per strobe as each needs them."""
-    sizes = {"lorenz": (512.0, 16), "roessler": (2048.0, 32), "oscillators": (2000.0, 64)}
+    sizes = {"lorenz": (1024.0, 16), "roessler": (4096.0, 32), "oscillators": (4000.0, 64)}
     return results(getattr(flows, name)(LANES), OUTPUTS, *sizes[name])
 
 
@@ -52,12 +59,16 @@ def known(name: str) -> dict:
 
 
 @pytest.mark.parametrize("name", LITERATURE)
-def test_literature_values_within_three_standard_errors(name):
-    """The standard error of the mean over independent members; the literature value is rounded to 4 digits."""
+def test_literature_values_within_standard_errors(name):
+    """Standard errors of the mean over independent members; the literature value is rounded to 4 digits.
+
+    Chaotic trajectories differ from one processor to the next, so that three standard errors would be exceeded now and
+    then by a mean that is right; five are not.
+    """
     spectrum = known(name)["lyapunov_spectrum"]
     error = spectrum.std(axis=1, ddof=1) / math.sqrt(spectrum.shape[1])
-    np.testing.assert_array_less(np.abs(spectrum.mean(axis=1) - LITERATURE[name]), 3 * error + 1e-4)
-    assert error.max() < 0.01
+    np.testing.assert_array_less(np.abs(spectrum.mean(axis=1) - LITERATURE[name]), 5 * error + 1e-4)
+    assert error.max() < LARGEST_ERROR[name]
 
 
 @pytest.mark.parametrize("name", LITERATURE)
@@ -138,8 +149,42 @@ def test_phases_do_not_supply_exponents():
     assert ours["lyapunov_spectrum"].sum() == pytest.approx(-0.25, abs=1e-9)
 
 
+def damped(time: np.ndarray, omega: float, zeta: float) -> np.ndarray:
+    """Difference 1e-6 (1, 1) of displacement and rate carried along phi'' + 2 zeta omega phi' + omega^2 phi = 0, (2, T)."""
+    rate, decay = omega * math.sqrt(1 - zeta**2), zeta * omega
+    cosine, sine, fall = np.cos(rate * time), np.sin(rate * time), 1e-6 * np.exp(-decay * time)
+    slope = (1 + decay) / rate
+    return fall * np.stack([cosine + slope * sine, cosine - (decay * slope + rate) * sine])
+
+
 class TestPaperEstimator:
-    """The estimator as printed gives known answers wrongly."""
+    """The estimator as printed: equal to what independent computations of (31)-(33) give, and wrong on known answers."""
+
+    def test_it_is_what_is_printed_for_a_damped_linear_oscillator(self):
+        """Closed form of two trajectories of the shaft with constant coefficients: thousands, while the true exponents
+        are -zeta Omega = -15.4 1/s."""
+        omega, zeta, frequency, strobes = oracle.shaft("input", 0.0).omega, 0.0016, 3066.5, 1024
+        fixed = {"element": "input", "beta": 0.0, "zeta": zeta, "chi_n": 0.0, "excitation_frequency": frequency}
+        scene = {"system": "tripod", "analysis": "lyapunov", "outputs": ["paper_estimator"], "fixed": fixed}
+        ours = dt.run(
+            scene | {"options": {"max_time": (strobes - 0.5) / frequency, "steps": 24}}
+        ).paper_estimator.values
+        delta = damped(np.arange(1, strobes + 1) / frequency, omega, zeta)
+        delta = np.concatenate([delta, np.full((1, strobes), 1e-6)])
+        expected = np.sum(np.log10(np.abs(delta) / np.linalg.norm(delta[:, -1])), axis=1) * frequency / strobes
+        np.testing.assert_allclose(ours, expected, rtol=0, atol=2e-4 * abs(expected).max())
+        assert abs(expected).max() > 1000
+        assert expected[1] > 100
+
+    def test_it_is_what_is_printed_for_the_output_element(self):
+        """(30) by SciPy at 3e-14: benchmarks.tripod_reference.paper_estimator, values in the reference file."""
+        case = REFERENCE["paper_estimator"]
+        fixed = {"element": "output", "beta": math.radians(9), "zeta": case["zeta"], "chi_n": case["chi_n"]}
+        fixed |= {"excitation_frequency": case["frequency_Hz"]}
+        scene = {"system": "tripod", "analysis": "lyapunov", "outputs": ["paper_estimator"], "fixed": fixed}
+        options = {"max_time": (case["strobes"] - 0.5) / case["frequency_Hz"], "steps": 24}
+        ours = dt.run(scene | {"options": options}).paper_estimator.values
+        np.testing.assert_allclose(ours, case["L"], rtol=1e-6)
 
     def test_it_is_positive_for_a_damped_linear_oscillator(self):
         ours = results(flows.linear([0.2], [1.0]), ("paper_estimator",), 100.0, 12)["paper_estimator"]

@@ -78,6 +78,16 @@ class TestZeroOne:
         series = np.stack([np.cos(math.sqrt(2) * n), np.full(2000, 3.7)], axis=1)
         np.testing.assert_allclose(np.asarray(chaos_k01(jnp.asarray(series))), 0.0, atol=0.05)
 
+    def test_it_is_its_definition(self):
+        """Walks, mean square displacements and correlations written out with NumPy."""
+        series = self.logistic([3.7, 3.95])[:400, 0]
+        centred, n, values = series - series.mean(), np.arange(1, 401), []
+        for angle in math.pi / 5 + 3 * math.pi / 5 * (np.arange(100) + 0.5) / 100:
+            walk = np.cumsum(centred * np.exp(1j * angle * n))
+            distance = [np.mean(np.abs(walk[k : k + 360] - walk[:360]) ** 2) for k in range(1, 41)]
+            values.append(np.corrcoef(distance, np.arange(1, 41))[0, 1])
+        assert float(chaos_k01(jnp.asarray(series))) == pytest.approx(np.median(values), abs=1e-10)
+
     def test_scale_and_offset_do_not_matter(self):
         series = self.logistic([3.97])
         np.testing.assert_allclose(chaos_k01(jnp.asarray(1e-4 * series + 5)), chaos_k01(jnp.asarray(series)), atol=1e-6)

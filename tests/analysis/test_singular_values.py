@@ -51,6 +51,15 @@ def test_values(solved, matrices):
     assert (np.abs(values - exact) <= 30 * EPS * exact[-1]).all()
 
 
+def test_a_wide_batch():
+    """Some thousand lanes at once: the compiler fuses and cuts loops differently there."""
+    a = np.random.default_rng(4).standard_normal((5000, 7, 5))
+    values, found = map(np.asarray, jax.jit(singular_values)(jnp.asarray(np.moveaxis(a, 0, -1))))
+    exact = np.linalg.svd(a, compute_uv=False)[:, ::-1].T
+    assert found.all()
+    assert (np.abs(values - exact) <= 30 * EPS * exact[-1]).all()
+
+
 def test_vectors_are_orthonormal_and_reproduce_the_values(solved, matrices):
     values, _, vectors, found = solved
     assert found.all()

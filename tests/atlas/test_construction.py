@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivetrain_jax.atlas import Domain, Quantity, construct, from_arrays, run, to_arrays
-from drivetrain_jax.atlas.interpolation import evaluate
-from drivetrain_jax.atlas.panels import position
+from drivetrain_jax.atlas import Domain, Quantity, construct, from_arrays, run, to_arrays, values_at
 from drivetrain_jax.systems import Coordinate
 from drivetrain_jax.systems._smooth import identity
 
@@ -16,13 +14,7 @@ SQUARE = Domain(("x", "y"), (-1.0, 0.5), (2.0, 3.0), (identity("x"), identity("y
 
 
 def values(atlas, points):
-    """``(N, m)``, NaN where there is no panel."""
-    x = atlas.to_coordinates(points)
-    number = atlas.find(x)
-    out = np.full((len(points), atlas.panels[0].coefficients.shape[-1]), np.nan)
-    for k, panel in enumerate(atlas.panels):
-        out[number == k] = evaluate(panel.coefficients, position(panel, x[number == k]))
-    return out
+    return values_at(atlas, points)[0]
 
 
 def sample(domain, count=2000):
@@ -111,19 +103,48 @@ def test_oscillation_beyond_the_node_limit_is_split():
     assert np.abs(values(atlas, points) - fast(points)).max() < 1e-10
 
 
-def test_kink_leaves_a_gap_that_says_why_and_the_rest_stands():
-    def kinked(p):
-        x, y = p.T
-        return (np.abs(x - 0.3) * np.cos(y))[:, None]
+def kinked(p):
+    x, y = p.T
+    return (np.abs(x - 0.3) * np.cos(y))[:, None]
 
-    atlas = run(construct(SQUARE, Quantity(1), 1e-8), kinked)
-    assert atlas.gaps and atlas.panels
+
+def stepped(p):
+    x, y = p.T
+    return (np.where(x > 0.3, 1.0, 0.0) + np.sin(x + y))[:, None]
+
+
+@pytest.mark.parametrize("function", [kinked, stepped])
+def test_what_is_not_smooth_leaves_a_gap_that_says_so_and_is_solved_directly(function):
+    atlas = run(construct(SQUARE, Quantity(1), 1e-8), function)
+    assert atlas.gaps and atlas.panels and atlas.solves < 20_000
+    # The boxes that were given up hold the kink, and are small against the domain.
     assert all("not smooth" in gap.reason and gap.lower[0] <= 0.3 <= gap.upper[0] for gap in atlas.gaps)
     points = sample(SQUARE)
-    got = values(atlas, points)[:, 0]
-    known = np.isfinite(got)
-    assert 0.5 < known.mean() < 1 and np.abs(got - kinked(points)[:, 0])[known].max() < 1e-7
-    assert atlas.solves < 20_000
+    found, bound = values_at(atlas, points)
+    known = np.isfinite(found[:, 0])
+    assert 0.5 < known.mean() < 1 and (np.isfinite(bound) == known).all()
+    asked = []
+
+    def solve(p):
+        asked.append(p)
+        return function(p)
+
+    everything, bound = values_at(atlas, points, solve)
+    assert len(asked) == 1 and len(asked[0]) == (~known).sum()
+    assert np.abs(everything - function(points)).max() < 1e-7 and np.array_equal(everything[known], found[known])
+    assert (bound[~known] == 0).all()
+
+
+def test_nothing_but_gaps():
+    def rough(p):
+        return np.sign(np.sin(40 * p[:, :1])) * np.sign(np.sin(40 * p[:, 1:]))
+
+    atlas = run(construct(SQUARE, Quantity(1), 1e-8), rough)
+    assert not atlas.panels and all("not smooth" in gap.reason for gap in atlas.gaps)
+    points = sample(SQUARE, 50)
+    with pytest.raises(ValueError, match="not smooth"):
+        values_at(atlas, points)
+    assert np.array_equal(values_at(atlas, points, rough)[0], rough(points))
 
 
 def test_failed_solves_leave_a_gap():

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from propagators import BASE, CARDAN, cardan_atlas, monodromy, propagators
 
+from drivetrain_jax.atlas import design
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.design import least_damping, nearest_boundaries, speed_windows, widest_angle
-from drivetrain_jax.atlas.windows import narrow, stability_along
+from drivetrain_jax.atlas.windows import Crossing, Interval, Line, narrow, stability_along
 
 
 def direct(columns):
@@ -110,3 +111,12 @@ def test_narrow_keeps_the_function(atlas):
         narrow(atlas, {"beta": (0.3, 1.3)})
     with pytest.raises(KeyError, match="mu"):
         narrow(atlas, {"mu": (0.3, 1.3)})
+
+
+@pytest.mark.parametrize(("undecided", "certain"), [((0.5, 0.6), True), ((0.05, 0.06), False), ((0.0999, 0.1), True)])
+def test_only_what_is_undecided_on_the_safe_side_leaves_doubt(atlas, monkeypatch, undecided, certain):
+    limit = Crossing(0.1, 1e-4, "-1", {"beta": 0.1, "Omega": 1.4})
+    intervals = (Interval(0.0, 0.1, True, None, limit), Interval(0.1, 1.1, False, limit, None))
+    monkeypatch.setattr(design, "stability_over_range", lambda *_: Line("beta", intervals, (undecided,)))
+    answer = widest_angle(atlas, CARDAN, (1.3, 1.5), {})
+    assert answer.value == 0.1 and answer.certain == certain

@@ -47,6 +47,11 @@ def tips(atlas):
     return find_tips(atlas, CARDAN)
 
 
+@pytest.fixture(scope="module")
+def curves(atlas):
+    return boundaries(atlas, CARDAN)
+
+
 def rate(beta, omega, **others):
     """ln of the spectral radius by direct solves."""
     z = monodromy(propagators({**BASE, **others, "beta": beta, "Omega": omega}, 1e-14))
@@ -194,8 +199,7 @@ def test_roots_on_a_line_are_all_sign_changes(atlas):
         assert np.all((found.x >= x[changes, 1]) & (found.x <= x[changes + 1, 1]))
 
 
-def test_boundary_curves_are_boundaries(atlas):
-    curves = boundaries(atlas, CARDAN)
+def test_boundary_curves_are_boundaries(atlas, curves):
     criteria = Criteria.of(atlas, CARDAN)
     lowest = []
     for curve in curves:
@@ -212,9 +216,8 @@ def test_boundary_curves_are_boundaries(atlas):
     assert sorted(lowest) == pytest.approx(sorted(beta for beta, _ in TIPS.values()), abs=1e-6)
 
 
-def test_curves_enclose_what_is_unstable(atlas):
+def test_curves_enclose_what_is_unstable(atlas, curves):
     """Verdicts of random points against the number of curves crossed on the way from beta = 0."""
-    curves = boundaries(atlas, CARDAN)
     generator = np.random.default_rng(3)
     points = atlas.lower + (atlas.upper - atlas.lower) * generator.random((300, 2))
     radius = np.exp(rate(points[:, 0], points[:, 1]))

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 
+import h5py
 import pytest
 import xarray as xr
 
@@ -57,8 +58,10 @@ def test_run_status_run_again(cli):
     code, _, err = cli("run", "scene.toml", "--out", "r.nc")
     assert (code, err) == (0, ["points: total=21 computed=0 reused=21 failed=2"])
     found = json.loads(cli("status", "scene.toml", "--out", "r.nc", "--json")[1])
-    assert found == {"total": 21, "done": 21, "failed": 2, "state": "complete"}
-    assert cli("status", "scene.toml", "--out", "r.nc")[1] == "complete: 21 of 21 points done, 2 without a value\n"
+    counts = {"total": 21, "done": 21, "failed": 2, "state": "complete"}
+    assert found == counts | {"failed_by_outcome": {"not_finite": 2}}
+    text = "complete: 21 of 21 points done, 2 without a value\n  not_finite: 2\n"
+    assert cli("status", "scene.toml", "--out", "r.nc")[1] == text
     assert sorted(os.listdir()) == ["r.nc", "scene.toml"]
 
 
@@ -93,6 +96,48 @@ def test_other_scene_needs_fresh(cli):
     assert code == 2 and len(err) == 1 and "--fresh" in err[0] and open("r.nc", "rb").read() == before
     assert cli("run", "scene.toml", "--out", "r.nc", "--set", "fixed.b=3", "--fresh", "--quiet")[0] == 0
     assert open("r.nc", "rb").read() != before
+
+
+def test_status_tells_why_a_run_would_be_refused(cli):
+    cli("run", "scene.toml", "--out", "r.nc", "--quiet")
+    code, out, _ = cli("status", "scene.toml", "--out", "r.nc", "--set", "fixed.b=3", "--set", "axes.a.num=5")
+    assert code == 0 and out.startswith("stale: 0 of 5 points done, 0 without a value\n  a run would be refused: ")
+    assert "fixed.b is 3.0, was 2.0; axes.a has 5 values from 0 to 10, had 21 values" in out
+    answer = json.loads(cli("status", "scene.toml", "--out", "r.nc", "--set", "fixed.b=3", "--json")[1])
+    assert (
+        answer["state"] == "stale" and "fixed.b is 3.0, was 2.0" in answer["reason"] and "--fresh" in answer["reason"]
+    )
+
+
+def test_a_larger_scene_takes_over_the_smaller_result(cli):
+    cli("run", "scene.toml", "--out", "r.nc", "--quiet")
+    larger = ("scene.toml", "--out", "r.nc", "--set", "axes.a.num=41")
+    found = json.loads(cli("status", *larger, "--json")[1])
+    assert (found["state"], found["done"]) == ("partial", 21)
+    assert cli("run", *larger, "--quiet")[2] == ["points: total=41 computed=20 reused=21 failed=4"]
+    other = ("scene.toml", "--out", "other.nc", "--set", "axes.a.num=11", "--reuse", "r.nc", "--quiet")
+    assert cli("run", *other)[2] == ["points: total=11 computed=0 reused=11 failed=1"]
+    code, _, err = cli("run", "scene.toml", "--out", "new.nc", "--reuse", "nothing.nc")
+    assert (code, len(err)) == (2, 1) and "reuse = 'nothing.nc': does not exist" in err[0]
+
+
+def test_verify(cli):
+    cli("run", "scene.toml", "--out", "r.nc", "--quiet")
+    code, out, err = cli("verify", "r.nc")
+    assert (code, err) == (0, []) and out.startswith("checksums: all agree\noutcome is one of its 6 codes: holds at 21")
+    with h5py.File("r.nc", "r+") as file:
+        file["value"][3] = 1.0
+    code, _, err = cli("verify", "r.nc", "--json")
+    assert (code, len(err)) == (2, 1) and "value: not what was written" in err[0]
+    answer = json.loads(cli("verify", "r.nc", "--json")[1])
+    assert answer["state"] == "damaged" and answer["checks"] == ["checksums: 1 differ: value"]
+    open("r.nc", "r+").truncate(100)
+    code, _, err = cli("verify", "r.nc")
+    assert (code, len(err)) == (2, 1) and "not a readable" in err[0]
+    cli("run", "scene.toml", "--out", "u.nc", "--set", "analysis=broken", "--quiet")
+    assert cli("verify", "u.nc") == (3, "unfinished: 0 of 0 parts are intact\n", [])
+    code, _, err = cli("verify", "nothing.nc")
+    assert (code, len(err)) == (2, 1) and "does not exist" in err[0]
 
 
 def change(old, new):
@@ -225,7 +270,7 @@ def test_plot_writes_the_figure(cli, monkeypatch):
 def test_version_and_help(cli):
     assert cli("--version")[1].strip() == __version__
     code, out, _ = cli("--help")
-    assert code == 0 and all(name in out for name in ("list", "run", "status", "plot", "point"))
+    assert code == 0 and all(name in out for name in ("list", "run", "status", "verify", "plot", "point"))
 
 
 def test_help_is_light():

@@ -16,7 +16,11 @@ from drivetrain_jax.store.consolidate import write_result
 
 
 def flag(values, count):
-    return ("x", np.array(values, np.int8), {"units": "1", "long_name": "l", "flag_values": np.arange(count, dtype="i1")})
+    return (
+        "x",
+        np.array(values, np.int8),
+        {"units": "1", "long_name": "l", "flag_values": np.arange(count, dtype="i1")},
+    )
 
 
 def real(values, *dims):
@@ -131,9 +135,6 @@ def test_what_is_declared_exists():
         used = {name for rule in known.rules for name in rule.variables} | set(known.gaps)
         assert used <= names, (analysis, used - names)
     assert FIRST_FAILURE == min(o for o in Outcome if not o.has_value)
-
-
-
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
 import os
 import signal
 from pathlib import Path
@@ -22,6 +23,19 @@ def _perhaps_die(deadly: np.ndarray, folder: str) -> np.ndarray:
         once.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return np.zeros(())
+
+
+def _perhaps_die_at_start() -> None:
+    """In a spawned process, the first so many times (``FRAGILE_AT_START``)."""
+    if multiprocessing.parent_process() is not None:
+        starts = Path(os.environ["FRAGILE_FOLDER"]) / "starts"
+        count = len(starts.read_text()) if starts.exists() else 0
+        starts.write_text("x" * (count + 1))
+        if count < int(os.environ.get("FRAGILE_AT_START", "0")):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+_perhaps_die_at_start()
 
 
 def _model(values) -> FloquetModel:

@@ -120,6 +120,14 @@ def test_a_chunk_whose_process_dies_once_is_computed_again(drivetrain, tmp_path)
     np.testing.assert_allclose(once, never, rtol=1e-7)
 
 
+@pytest.mark.parametrize(("deaths", "code"), [("1", 0), ("9", 3)])
+def test_a_process_that_dies_while_it_gets_ready_is_started_again(drivetrain, package, deaths, code):
+    package["FRAGILE_AT_START"] = deaths
+    scene = SCENE | {"axes": {"delta": {"start": 0.1, "stop": 2.0, "num": 40}}}
+    error = finished(drivetrain(scene, "starts", "--workers", "1"), code)
+    assert ("computed=40 reused=0 failed=0" if code == 0 else "die while they get ready") in error
+
+
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL])
 def test_no_process_outlives_the_driver(drivetrain, tmp_path, sent):
     scene = SCENE | {"axes": {"delta": {"start": 0.1, "stop": 2.0, "num": 150_000}}}

@@ -352,8 +352,8 @@ def test_memory_does_not_grow_with_the_results(tmp_path):
         )
 
     small, large = megabytes(100), megabytes(600)
-    # 500,000 more points of 49 bytes would be 24 MB once; the plan takes up to 32 bytes of each.
-    assert large - small < 500_000 * 32 / 2**20
+    # 500,000 more points of 49 bytes would be 24 MB once; the plan takes 8 bytes of each.
+    assert large - small < 500_000 * 16 / 2**20
     assert (tmp_path / "600.nc").stat().st_size > 600_000 * 49
 
 

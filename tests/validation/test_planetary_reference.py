@@ -83,6 +83,11 @@ def test_error_estimate_holds_and_is_useful(name):
     assert (bound <= 1e-14 * exact[-1]).all()
 
 
+def types_by_frequency(frequencies: list[str], types: list[str]) -> list[tuple[str, str]]:
+    """Pairs in rising order; among modes of one frequency, to every digit of the reference, the order means nothing."""
+    return sorted(zip(frequencies, types, strict=True), key=lambda pair: (float(pair[0]), pair[1]))
+
+
 def check_modes(names: list[str], method: str) -> None:
     ds = run_cases(names, MODES, method)
     meanings = ds.mode_type.attrs["flag_meanings"].split()
@@ -91,7 +96,8 @@ def check_modes(names: list[str], method: str) -> None:
         expected = [TYPES[letter] for letter in CASES[name]["types"]]
         zero = [float(f) == 0 for f in CASES[name]["f_Hz"]]
         expected = ["rigid" if still else kind for still, kind in zip(zero, expected, strict=True)]
-        assert [meanings[code] for code in ds.mode_type.values[i]] == expected, name
+        found, reference = [meanings[code] for code in ds.mode_type.values[i]], CASES[name]["f_Hz"]
+        assert types_by_frequency(reference, found) == types_by_frequency(reference, expected), name
         np.testing.assert_allclose(ds.participation.values[i].sum(-1), 1, atol=1e-12)
 
 

@@ -24,7 +24,7 @@ def lyapunov(**sizes: int) -> xr.Dataset:
         verdict.reshape(-1)[0] = 4
     dataset = xr.Dataset(
         {
-            "lyapunov_spectrum": ((*axes, "exponent"), spectrum, {"units": "s-1", "long_name": "Lyapunov exponent"}),
+            "lyapunov_spectrum": ((*axes, "exponent"), spectrum, {"units": "1/s", "long_name": "Lyapunov exponent"}),
             "lyapunov_standard_error": ((*axes, "exponent"), np.full((*shape, 2), 0.1)),
             "verdict": (axes, verdict, {"flag_meanings": KINDS}),
             "outcome": (axes, np.zeros(shape, np.int8)),
@@ -89,6 +89,11 @@ def test_a_point_is_drawn_as_a_point():
     axes = plot(section(300, 1e-17)).axes[0]
     assert np.ptp(axes.get_xlim()) > 1e-6
     assert np.ptp(axes.get_ylim()) > 1e-5
+
+
+def test_a_point_is_large_enough_to_be_seen():
+    sizes = [plot(section(300, spread)).axes[0].collections[0].get_sizes()[0] for spread in (1e-17, 1e-5)]
+    assert sizes[0] > 5 * sizes[1]
 
 
 def test_a_section_must_be_stored():

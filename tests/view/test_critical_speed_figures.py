@@ -19,7 +19,7 @@ MODE = ("mode", [1, 2, 3])
 def result(data: dict, coords: dict) -> xr.Dataset:
     attrs = {"analysis": "critical_speeds", "title": "A shaft"}
     described = {
-        name: (dims, values, {"units": "N m-1", "long_name": f"stiffness {name}"})
+        name: (dims, values, {"units": "N/m", "long_name": f"stiffness {name}"})
         for name, (dims, values) in coords.items()
     }
     return xr.Dataset(data, described | {"mode": MODE}, attrs)
@@ -83,7 +83,7 @@ def test_nothing_to_plot(swept):
 
 def test_a_long_caption_stays_on_the_figure_and_above_the_panel(swept):
     names = ("length", "EI", "rhoA", "k_A", "m_joint", "kGA", "rhoI")
-    fixed = {name: {"value": [12345.0, 2.345e-3, 7.0], "units": "kg m-1"} for name in names}
+    fixed = {name: {"value": [12345.0, 2.345e-3, 7.0], "units": "kg/m"} for name in names}
     figure = plot(swept.assign_attrs(fixed_parameters=json.dumps(fixed)))
     FigureCanvasAgg(figure).draw()
     caption = next(text for text in figure.texts if "length" in text.get_text())

@@ -169,6 +169,25 @@ def test_four_axes_give_nine_slices():
     assert labelled == [pytest.approx([np.sqrt(m)]) if 0.5 <= np.sqrt(m) <= 1.5 else [] for m in (0.5, 2, 8)] * 3
 
 
+def test_a_range_without_a_boundary_shows_how_far_it_is_from_one():
+    """Blank panels would say nothing: the spectral radius, the axis of three values across, ticks clear of each other."""
+    dataset = results.grid(np.zeros((11, 8, 3), int), "speed", "zeta", "chi")
+    axes = {
+        "speed": np.linspace(2950, 3200, 11),
+        "zeta": np.linspace(0.0016, 0.03, 8),
+        "chi": np.array([0.1, 0.2, 0.3]),
+    }
+    dataset = results.with_axes(dataset, **axes)
+    dataset["spectral_radius"] = dataset.spectral_radius - dataset.zeta
+    figure = plot(dataset)
+    assert [axes.get_title() for axes in panels(figure)] == [rf"$\chi$ = {value}" for value in (0.1, 0.2, 0.3)]
+    drawn = meshes(figure)[0].get_array()
+    np.testing.assert_allclose(drawn, np.tile(0.99 - dataset.zeta.values, (11, 1)), rtol=1e-15)
+    assert any("stable everywhere" in text for text in texts(figure))
+    low, high = panels(figure)[0].get_xlim()
+    assert all(low <= tick < high - 0.05 * (high - low) for tick in panels(figure)[0].get_xticks())
+
+
 def test_points_are_drawn_by_verdict():
     code = np.array([0, 1, 1, 2, 3, 0])
     dataset = results.grid(code, "point").assign_coords(

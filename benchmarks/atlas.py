@@ -1,0 +1,197 @@
+"""Cells per second of the atlas from nothing to a file, against rivals on samples of the same cells, in one run.
+
+    python -m benchmarks.atlas [--cells 30000 1000000 4000000 20000000] [--repeats 3]    # writes results/atlas.csv
+
+Chart: that of benchmarks.throughput, beta in [0, 1.5] x Omega in [0.1, 2], base case, spectral radius with its bound and
+verdict. Four times of the package for each number of cells:
+
+    evaluation  the grid from an atlas that is there (its kernels compiled)
+    warm        atlas, grid and result in memory: direct solves included, compilation not
+    file        the same into a file
+    cold        the whole command `drivetrain run`: import, compilation, solves, evaluation, file
+
+Rivals compute a sample of the cells (heyoka 20,000, SciPy 200) on both cores, in turns with the package; their time for
+all cells is extrapolated, which favours none of them: they do not depend on the number of cells. Errors are those of the
+spectral radius relative to heyoka at 1e-15 on the sample, bounds those that the package states there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.cardan_reference import BASE_CASE
+from benchmarks.throughput import Columns, heyoka_contender, reference_radius, scipy_contender
+from benchmarks.timing import RESULTS, chart, interleaved, median, spawned_workers, table, take, write_csv
+
+CELLS = (30_000, 1_000_000, 4_000_000, 20_000_000)
+RTOL = 1e-9
+OUTPUTS = ("spectral_radius", "spectral_radius_error", "verdict")
+_HEYOKA_SAMPLE, _SCIPY_SAMPLE = 20_000, 200
+# Peak memory of the whole command, children included.
+_COLD = """
+import json, resource, subprocess, sys, time
+start = time.perf_counter()
+subprocess.run(sys.argv[1:], check=True, capture_output=True)
+seconds = time.perf_counter() - start
+print(json.dumps([seconds, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024]))
+"""
+
+
+def axes(cells: int) -> dict[str, np.ndarray]:
+    """The axes of a chart of about ``cells`` cells."""
+    columns = chart(cells)
+    return {name: np.unique(columns[name]) for name in ("beta", "Omega")}
+
+
+def scene(cells: int) -> dict[str, Any]:
+    """The chart as a scene of the package."""
+    grid = {n: {"start": float(x[0]), "stop": float(x[-1]), "num": len(x)} for n, x in axes(cells).items()}
+    return {
+        "title": "atlas",
+        "system": "cardan",
+        "analysis": "floquet",
+        "outputs": list(OUTPUTS),
+        "axes": grid,
+        "fixed": BASE_CASE,
+        "options": {"method": "atlas", "rtol": RTOL},
+    }
+
+
+def package_jobs(cells: int, folder: Path) -> dict[str, Callable[[], Any]]:
+    """The warm times of the package."""
+    import drivetrain_jax as dt
+    from drivetrain_jax.sweep.executor import Where
+    from drivetrain_jax.sweep.rounds import build_atlas
+    from drivetrain_jax.sweep.scene import load_scene
+    from drivetrain_jax.sweep.work import Progress, Work
+
+    grid, given = axes(cells), scene(cells)
+    ranges = {name: (float(x[0]), float(x[-1])) for name, x in grid.items()}
+    atlas, _ = build_atlas(load_scene(given), ranges, Work(Where()), Progress(0))
+
+    def to_file() -> None:
+        dt.run(given, out=folder / "chart.nc", fresh=True).close()
+
+    values = list(grid.values())
+    return {"evaluation": lambda: atlas.on_grid(values, OUTPUTS), "warm": lambda: dt.run(given), "file": to_file}
+
+
+def cold(cells: int, folder: Path) -> tuple[float, float]:
+    """Seconds and peak memory (MB) of the command in fresh processes."""
+    path = folder / "scene.toml"
+    path.write_text(_toml(scene(cells)))
+    command = ["-m", "drivetrain_jax.cli", "run", str(path), "--out", str(folder / "cold.nc"), "--fresh"]
+    environment = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    done = subprocess.run(
+        [sys.executable, "-c", _COLD, sys.executable, *command],
+        check=True,
+        capture_output=True,
+        text=True,
+        env=environment,
+    )
+    return tuple(json.loads(done.stdout))
+
+
+def _toml(mapping: dict[str, Any]) -> str:
+    head = [f"{key} = {json.dumps(value)}" for key, value in mapping.items() if not isinstance(value, dict)]
+    for key, part in mapping.items():
+        if isinstance(part, dict):
+            head.append(f"[{key}]")
+            head += [f"{k} = {_value(v)}" for k, v in part.items()]
+    return "\n".join(head) + "\n"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{k} = {json.dumps(v)}" for k, v in value.items()) + " }"
+    return json.dumps(value)
+
+
+def rivals(stack: ExitStack, columns: Columns, rng: np.random.Generator) -> dict[str, tuple[Callable, Columns]]:
+    """Jobs on samples of the cells."""
+    size = columns["beta"].size
+    many, few = (take(columns, rng.choice(size, min(n, size), replace=False)) for n in (_HEYOKA_SAMPLE, _SCIPY_SAMPLE))
+    pool = stack.enter_context(spawned_workers())
+    entries = [
+        *(heyoka_contender(stack, many, tolerance) for tolerance in (1e-8, 1e-10)),
+        *(scipy_contender(pool, few, method, 1e-9) for method in ("RK45", "DOP853")),
+    ]
+    return {entry.label: (entry.job, entry.columns) for entry in entries}
+
+
+def measure(cells: int, repeats: int, folder: Path) -> list[dict[str, Any]]:
+    """Rows of the table for one number of cells."""
+    grid = axes(cells)
+    count, columns = int(np.prod([len(x) for x in grid.values()])), chart(min(cells, 1_000_000))
+    with ExitStack() as stack:
+        others = rivals(stack, columns, np.random.default_rng(0))
+        ours = package_jobs(cells, folder)
+        answers = {label: job() for label, (job, _) in others.items()}
+        for job in ours.values():
+            job()
+        seconds = interleaved({**ours, **{label: job for label, (job, _) in others.items()}}, repeats)
+    rows = [_row(f"atlas, {label}", count, count / median(seconds[label])) for label in ours]
+    in_all, memory = cold(cells, folder)
+    rows.append(_row("atlas, cold command", count, count / in_all) | {"peak_MB": round(memory)})
+    error, bound = _atlas_errors(folder / "cold.nc")
+    rows = [row | {"max_error": error, "median_bound": bound} for row in rows]
+    for label, (_, sample) in others.items():
+        size = sample["beta"].size
+        worst = float(np.nanmax(np.abs(answers[label] / reference_radius(sample) - 1)))
+        rows.append(_row(label, size, size / median(seconds[label])) | {"max_error": worst})
+    best = max(row["cells_per_s"] for row in rows if row["method"].startswith("heyoka"))
+    blank = {"peak_MB": "", "median_bound": ""}
+    return [{**blank, **row, "chart": count, "times_heyoka": row["cells_per_s"] / best} for row in rows]
+
+
+def _row(method: str, cells: int, rate: float) -> dict[str, Any]:
+    return {"method": method, "cells_computed": cells, "cells_per_s": round(rate)}
+
+
+def _atlas_errors(path: Path) -> tuple[float, float]:
+    """Largest relative error on a sample of the cells in a file, and the median relative bound."""
+    import xarray as xr
+
+    with xr.open_dataset(path, engine="h5netcdf") as ds:
+        rng = np.random.default_rng(1)
+        i, j = (rng.integers(0, ds.sizes[name], 3000) for name in ("beta", "Omega"))
+        radius = ds.spectral_radius.values[i, j]
+        bound = ds.spectral_radius_error.values[i, j]
+        given = {"beta": ds.beta.values[i], "Omega": ds.Omega.values[j]}
+    fixed = {name: np.full(len(i), value) for name, value in BASE_CASE.items()}
+    return float(np.abs(radius / reference_radius({**given, **fixed}) - 1).max()), float(np.median(bound / radius))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure, write the CSV, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cells", type=int, nargs="+", default=list(CELLS))
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--quick", action="store_true", help="30,000 cells; writes nothing")
+    options = parser.parse_args(arguments)
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        for cells in [30_000] if options.quick else options.cells:
+            rows += measure(cells, options.repeats, Path(folder))
+    order = ("chart", "method", "cells_computed", "cells_per_s", "times_heyoka", "max_error", "median_bound", "peak_MB")
+    rows = [{name: row[name] for name in order} for row in rows]
+    if not options.quick:
+        write_csv(RESULTS / "atlas.csv", rows, [f"rtol {RTOL:g}; {time.perf_counter() - start:.0f} s in all"])
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()

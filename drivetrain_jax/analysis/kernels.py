@@ -1,0 +1,78 @@
+"""How a march of many small operations is compiled for the CPU.
+
+XLA computes an intermediate value again for every result that needs it, and calls a kernel for each result: a step of a
+Runge-Kutta method is computed several times over, or costs more in calls than in arithmetic. :func:`stored` and
+:func:`in_one_kernel` mark functions for the compiler. The marks change no number beyond rounding; a compiler that does
+not know them ignores them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, ParamSpec, TypeVar
+
+import jax
+from jax.experimental.xla_metadata import set_xla_metadata
+
+P, R = ParamSpec("P"), TypeVar("R")
+
+# A call that is not inlined is not fused with what surrounds it either: its results are computed once and stored.
+_APART = {"inlineable": "false"}
+# What XLA does of its own accord with loops over less than half a kilobyte.
+_ONE_KERNEL = {**_APART, "xla_cpu_small_call": "true"}
+# Operations that may be part of such a kernel. Sorting, scattering, calls of libraries and (by their new emitters) sums
+# and maxima over an axis may not.
+_ELEMENTWISE = """
+    abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy cos cosh
+    div eq erf erfc exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max min mul ne neg not
+    or pow rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor
+"""
+_STRUCTURE = """
+    broadcast_in_dim closed_call concatenate cond custom_jvp_call custom_vjp_call expand_dims iota jit pjit reshape scan
+    slice squeeze transpose while
+"""
+_KNOWN = {*_ELEMENTWISE.split(), *_STRUCTURE.split()}
+
+
+def stored(function: Callable[P, R]) -> Callable[P, R]:
+    """``function`` with its results computed once, whatever uses them."""
+    return _marked(function, _APART)
+
+
+def in_one_kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """``function``, loops and all, as a single kernel: for batches that fit into the innermost cache.
+
+    Everything in it has to pass :func:`suits_one_kernel`.
+    """
+    return _marked(function, _ONE_KERNEL)
+
+
+def suits_one_kernel(function: Callable[..., Any], *arguments: Any) -> bool:
+    """Whether all that ``function`` does with ``arguments`` may be part of a single kernel."""
+    return all(name in _KNOWN for name in _operations(jax.make_jaxpr(function)(*arguments).jaxpr))
+
+
+def _marked(function: Callable, marks: dict[str, str]) -> Callable:
+    if jax.default_backend() != "cpu":
+        return function
+
+    def unmarked(*arguments: Any) -> Any:
+        with set_xla_metadata(**dict.fromkeys(marks)):
+            return function(*arguments)
+
+    def marked(*arguments: Any) -> Any:
+        with set_xla_metadata(**marks):
+            return jax.jit(unmarked)(*arguments)
+
+    return marked
+
+
+def _operations(jaxpr: Any) -> Iterator[str]:
+    """Names of all operations, those of nested functions included."""
+    for equation in jaxpr.eqns:
+        yield equation.primitive.name
+        for value in equation.params.values():
+            for part in value if isinstance(value, (tuple, list)) else (value,):
+                inner = getattr(part, "jaxpr", part)
+                if hasattr(inner, "eqns"):
+                    yield from _operations(inner)

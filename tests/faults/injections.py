@@ -1,0 +1,373 @@
+"""Every kind of fault: a function from a bench to the record of one injection."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, contextmanager, nullcontext
+from pathlib import Path
+
+from harness import Bench, Ended, Record, Run, resume, settle, wait
+
+WORKERS = ["--workers", "2"]
+ZARR = ["--store", "zarr"]
+
+
+def stopped_by(number: int) -> Callable[[Ended], bool]:
+    """Ended by this signal, or already finished."""
+    return lambda ended: ended.code in (-number, 0)
+
+
+def resumable(ended: Ended) -> bool:
+    """Finished, or incomplete with one line that says why."""
+    return ended.code == 0 or (ended.code == 3 and len(ended.lines) == 2)
+
+
+def refused(ended: Ended, why: str = "") -> bool:
+    """Wrong input, said in one line."""
+    return ended.code == 2 and len(ended.lines) == 1 and why in ended.lines[0]
+
+
+def strike(run: Run, out: Path, moment: float, blow: Callable[[], object]) -> bool:
+    """``blow`` at ``moment`` if the run is still at work on ``out`` then."""
+    if not wait(moment, run, out):
+        return False
+    blow()
+    return True
+
+
+def signalled(bench: Bench, kind: str, number: int, options: list[str], allowed: Callable[[Ended], bool]) -> Record:
+    out, moment = bench.place(), bench.moment()
+    run = bench.run(out, options)
+    hit = strike(run, out, moment, lambda: run.process.send_signal(number))
+    ended = run.end()
+    return resume(bench, kind, out, moment, hit, ended, settle(run), options, allowed)
+
+
+def interrupted(ended: Ended) -> bool:
+    return ended.code in (0, 130) and len(ended.lines) <= 2
+
+
+def kill_worker(bench: Bench, kind: str, options: list[str]) -> Record:
+    """One of the spawned processes; the run goes on without help."""
+    out, moment = bench.place(), bench.moment()
+    run = bench.run(out, options)
+    victims: list[int] = []
+
+    def blow() -> None:
+        deadline = time.monotonic() + 60
+        while not victims and run.process.poll() is None and time.monotonic() < deadline:
+            victims.extend(pid for pid in run.others() if is_worker(pid))
+            time.sleep(0.02)
+        if victims:
+            os.kill(int(bench.rng.choice(victims)), signal.SIGKILL)
+
+    hit = strike(run, out, moment, blow) and bool(victims)
+    ended = run.end()
+    return resume(bench, kind, out, moment, hit, ended, settle(run), options, lambda e: e.code == 0)
+
+
+def is_worker(pid: int) -> bool:
+    """A spawned process, not the tracker of resources beside it."""
+    try:
+        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return False
+
+
+def kill_replacing(bench: Bench, kind: str) -> Record:
+    """A former result at the output is whole until the new one is."""
+    out, moment = bench.place(), bench.moment()
+    shutil.copy(bench.reference, out)
+    former = out.read_bytes()
+    run = bench.run(out, ["--fresh", "--set", "options.rtol=1e-8"])
+    hit = strike(run, out, moment, run.process.kill)
+    ended = run.end()
+    settle(run)
+    damaged = hit and ended.code != 0 and out.read_bytes() != former
+    shutil.rmtree(out.with_name(out.name + ".parts"), ignore_errors=True)
+    out.unlink()
+    record = resume(bench, kind, out, moment, hit, ended, 0)
+    record.problem += "the former result was damaged" if damaged else ""
+    return record
+
+
+@contextmanager
+def small_disk(bench: Bench, size: int):
+    """A file system of this size, None where mounting is not permitted."""
+    folder = bench.place().parent
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)], capture_output=True, text=True
+    )
+    if done.returncode:
+        yield None
+        return
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+def full_disk(bench: Bench, kind: str) -> Record:
+    """The disk fills up at some moment; when there is room again the run is resumed."""
+    size, moment = bench.reference.stat().st_size, bench.moment()
+    with small_disk(bench, 6 * size) as folder:
+        if folder is None:
+            return file_limit(bench, kind)
+        out, ballast = folder / "r.nc", folder / "ballast"
+        run = bench.run(out)
+
+        def blow() -> None:
+            with open(ballast, "wb", buffering=0) as file:
+                while True:
+                    try:
+                        file.write(bytes(1 << 16))
+                    except OSError:
+                        return
+
+        hit = strike(run, out, moment, blow)
+        ended = run.end()
+        ballast.unlink(missing_ok=True)
+        return resume(bench, kind, out, moment, hit, ended, settle(run), (), resumable)
+
+
+def file_limit(bench: Bench, kind: str) -> Record:
+    """No file may grow beyond a random size."""
+    out, size = bench.place(), bench.reference.stat().st_size
+    limit = int(bench.rng.uniform(0.02, 0.95) * size)
+    # The shell counts in blocks of 512 bytes.
+    run = bench.run(out, before=["sh", "-c", 'ulimit -f "$0"; exec "$@"', str(limit // 512)])
+    ended = run.end()
+    return resume(bench, kind, out, 0.0, ended.code != 0, ended, settle(run), (), resumable)
+
+
+def read_only(bench: Bench, kind: str) -> Record:
+    """The file system turns read-only at some moment; where mounting is not permitted, the folder is from the start."""
+    moment = bench.moment()
+    with small_disk(bench, 64 << 20) as folder:
+        if folder is None:
+            return read_only_folder(bench, kind)
+        out = folder / "r.nc"
+        run = bench.run(out)
+
+        def blow() -> None:
+            # Open for writing are files of the run itself; a busy file system stays as it is.
+            subprocess.run(["mount", "-o", "remount,ro", str(folder)], capture_output=True)
+
+        hit = strike(run, out, moment, blow)
+        ended = run.end()
+        subprocess.run(["mount", "-o", "remount,rw", str(folder)], check=True)
+        return resume(bench, kind, out, moment, hit, ended, settle(run), (), resumable)
+
+
+def read_only_folder(bench: Bench, kind: str) -> Record:
+    """Who may not write there is told so at once. An administrator may write everywhere but on a read-only file system."""
+    with small_disk(bench, 64 << 20) if os.getuid() == 0 else nullcontext() as folder:
+        out = bench.place() if folder is None else folder / "r.nc"
+        if folder is None:
+            out.parent.chmod(0o555)
+        else:
+            subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True)
+        run = bench.run(out)
+        ended = run.end()
+        if folder is None:
+            out.parent.chmod(0o755)
+        else:
+            subprocess.run(["mount", "-o", "remount,rw", str(folder)], check=True)
+        return resume(bench, kind, out, 0.0, True, ended, settle(run), (), lambda e: refused(e, "not writable"))
+
+
+def vanished(bench: Bench, kind: str, whole: bool) -> Record:
+    """The folder of parts is deleted under the run, or the output's folder with everything in it."""
+    out, moment = bench.place(), bench.moment()
+    run = bench.run(out)
+    gone = out.parent if whole else out.with_name(out.name + ".parts")
+    hit = strike(run, out, moment, lambda: shutil.rmtree(gone, ignore_errors=True))
+    ended = run.end()
+    out.parent.mkdir(exist_ok=True)
+    allowed = (lambda e: resumable(e) or refused(e)) if hit else resumable
+    return resume(bench, kind, out, moment, hit, ended, settle(run), (), allowed)
+
+
+def two_runs(bench: Bench, kind: str) -> Record:
+    """The second of two runs on one output is refused, the first is not disturbed."""
+    out, moment = bench.place(), bench.moment()
+    run = bench.run(out)
+    ended = []
+
+    def blow() -> None:
+        second = bench.run(out)
+        ended.append(second.end())
+
+    hit = strike(run, out, moment, blow)
+    first = run.end()
+
+    def allowed(_: Ended) -> bool:
+        return first.code == 0 and all(e.code == 0 or refused(e, "another run") for e in ended)
+
+    return resume(bench, kind, out, moment, hit, (ended or [first])[0], settle(run), (), allowed)
+
+
+def corrupted(bench: Bench, kind: str, damage: Callable[[bytearray, Bench], bytearray]) -> Record:
+    """A part is damaged after a kill: its chunks are computed again."""
+    out, moment = bench.place(), bench.moment()
+    run = bench.run(out)
+    hit = strike(run, out, moment, run.process.kill)
+    ended = run.end()
+    settle(run)
+    parts = sorted(out.with_name(out.name + ".parts").glob("*-*.h5"))
+    for part in parts[:: max(len(parts) // 3, 1)]:
+        part.write_bytes(damage(bytearray(part.read_bytes()), bench))
+    return resume(bench, kind, out, moment, hit and bool(parts), ended, 0, (), stopped_by(signal.SIGKILL))
+
+
+def flip(data: bytearray, bench: Bench) -> bytearray:
+    """One bit."""
+    data[bench.rng.integers(len(data))] ^= 1 << int(bench.rng.integers(8))
+    return data
+
+
+def cut(data: bytearray, bench: Bench) -> bytearray:
+    """The end is missing."""
+    return data[: bench.rng.integers(len(data))]
+
+
+def damaged_result(bench: Bench, kind: str) -> Record:
+    """One bit of the finished file: ``verify`` finds it, or nothing that a reader sees has changed."""
+    out = bench.place()
+    out.write_bytes(flip(bytearray(bench.reference.read_bytes()), bench))
+    command = [sys.executable, "-m", "drivetrain_jax.cli", "verify", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, env=bench.environment)
+    found = done.returncode == 2 and len(done.stderr.splitlines()) == 1
+    try:
+        same = not bench.wrong(out)
+    except (OSError, RuntimeError, ValueError, KeyError):
+        same = False
+    record = (
+        resume(bench, kind, out, 0.0, True, Ended(done.returncode, done.stderr.splitlines()), 0, ["--fresh"])
+        if (found and "not a readable" not in done.stderr)
+        else Record(kind, 0.0, True, done.returncode, 0, 0, 0, 0, 0)
+    )
+    record.problem += "" if found or same else "not found"
+    return record
+
+
+CLOCK = """
+import os, random, time
+_jump = random.Random(int(os.environ["CLOCK_SEED"]))
+_time, _time_ns = time.time, time.time_ns
+def _offset():
+    return _jump.choice([-1, 1]) * _jump.choice([0, 3600, 86400, 3e8])
+time.time = lambda: _time() + _offset()
+time.time_ns = lambda: _time_ns() + int(_offset() * 1e9)
+"""
+
+
+def clock(bench: Bench, kind: str) -> Record:
+    """The system's clock jumps by up to ten years, both ways, at every look; the run is killed and resumed under it."""
+    out, moment = bench.place(), bench.moment()
+    site = out.parent / "site"
+    site.mkdir()
+    (site / "sitecustomize.py").write_text(CLOCK)
+    path = os.pathsep.join([str(site), bench.environment["PYTHONPATH"]])
+    run = bench.run(out, env={"PYTHONPATH": path, "CLOCK_SEED": str(bench.rng.integers(1 << 30))})
+    hit = strike(run, out, moment, run.process.kill)
+    ended = run.end()
+    settle(run)
+    for file in out.parent.rglob("*"):
+        os.utime(file, times=(when := float(bench.rng.choice([0.0, 4e9])), when))
+    return resume(bench, kind, out, moment, hit, ended, 0, (), stopped_by(signal.SIGKILL))
+
+
+def sharded(bench: Bench, kind: str, victim: str) -> Record:
+    """A run whose workers write a Zarr store; what it exports to is the same file."""
+    out, moment = bench.place().with_name("r.zarr"), bench.moment()
+    run = bench.run(out, [*ZARR, *WORKERS])
+
+    def blow() -> None:
+        workers = [pid for pid in run.others() if is_worker(pid)]
+        os.kill(int(bench.rng.choice(workers)) if victim == "worker" and workers else run.process.pid, signal.SIGKILL)
+
+    hit = strike(run, out, moment, blow)
+    ended = run.end()
+    orphans = settle(run)
+    done = bench.status(out).done
+    again = bench.run(out, [*ZARR, *WORKERS])
+    finished = again.end()
+    orphans += settle(again)
+    counts, exported = finished.counts(), out.with_name("e.nc")
+    command = [sys.executable, "-m", "drivetrain_jax.cli", "export", str(out), str(exported)]
+    code = subprocess.run(command, env=bench.environment, capture_output=True).returncode
+    wrong = bench.wrong(exported) if code == 0 else len(bench.arrays)
+    reused, computed = counts.get("reused", 0), counts.get("computed", 0)
+    problem = "" if finished.code == 0 else f"resume ended with {finished.code}: {finished.lines[-2:]}"
+    return Record(kind, moment, hit, ended.code, reused, computed, max(done - reused, 0), wrong, orphans, problem)
+
+
+def cluster(bench: Bench, kind: str, victim: str) -> Record:
+    """A scheduler and two workers of Dask, started as separate commands on loopback."""
+    out, moment = bench.place(), bench.moment()
+    with ExitStack() as stack:
+        address, processes = start_cluster(bench, out.parent, stack)
+        run = bench.run(out, ["--dask", address])
+        processes["driver"] = run.process
+        hit = strike(run, out, moment, lambda: processes[victim].kill())
+        ended = run.end()
+    return resume(
+        bench, kind, out, moment, hit, ended, settle(run), (), lambda e: e.code in (0, 3, -9) or refused(e, "dask")
+    )
+
+
+def start_cluster(bench: Bench, folder: Path, stack: ExitStack) -> tuple[str, dict[str, subprocess.Popen]]:
+    """Address and processes; they end with ``stack``."""
+    file = folder / "scheduler.json"
+
+    def start(module: str, *options: str) -> subprocess.Popen:
+        command = [sys.executable, "-m", f"distributed.cli.{module}", *options, "--no-dashboard"]
+        process = subprocess.Popen(command, env=bench.environment, stderr=subprocess.DEVNULL, cwd=folder)
+        stack.callback(process.wait)
+        stack.callback(process.kill)
+        return process
+
+    processes = {"scheduler": start("dask_scheduler", "--port", "0", "--scheduler-file", str(file))}
+    common = ("--scheduler-file", str(file), "--nthreads", "1", "--no-nanny", "--local-directory", str(folder / "dask"))
+    processes["worker"], _ = (start("dask_worker", *common) for _ in range(2))
+    deadline = time.monotonic() + 60
+    while not file.exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return json.loads(file.read_text())["address"], processes
+
+
+KILLED = stopped_by(signal.SIGKILL)
+# Name, injection, how often in the full suite, whether it is in the short one.
+KINDS: tuple[tuple[str, Callable[[Bench, str], Record], int, bool], ...] = (
+    ("SIGKILL of the driver, threads", lambda b, k: signalled(b, k, signal.SIGKILL, [], KILLED), 3, True),
+    ("SIGKILL of the driver, processes", lambda b, k: signalled(b, k, signal.SIGKILL, WORKERS, KILLED), 2, False),
+    ("SIGKILL of a worker process", lambda b, k: kill_worker(b, k, WORKERS), 2, True),
+    ("SIGKILL while a former result is replaced", kill_replacing, 1, False),
+    ("Ctrl-C (SIGINT), threads", lambda b, k: signalled(b, k, signal.SIGINT, [], interrupted), 2, True),
+    ("Ctrl-C (SIGINT), processes", lambda b, k: signalled(b, k, signal.SIGINT, WORKERS, interrupted), 1, False),
+    ("SIGTERM, threads", lambda b, k: signalled(b, k, signal.SIGTERM, [], interrupted), 1, False),
+    ("SIGKILL of the Dask scheduler", lambda b, k: cluster(b, k, "scheduler"), 1, False),
+    ("SIGKILL of a Dask worker", lambda b, k: cluster(b, k, "worker"), 1, False),
+    ("SIGKILL of the driver of a Dask cluster", lambda b, k: cluster(b, k, "driver"), 1, False),
+    ("full disk", full_disk, 2, True),
+    ("limit of a file's size", file_limit, 2, False),
+    ("file system turns read-only", read_only, 2, False),
+    ("read-only folder", read_only_folder, 1, False),
+    ("folder of parts vanishes", lambda b, k: vanished(b, k, whole=False), 2, True),
+    ("output's folder vanishes", lambda b, k: vanished(b, k, whole=True), 1, False),
+    ("two runs on one output", two_runs, 2, False),
+    ("bit flips in parts", lambda b, k: corrupted(b, k, flip), 3, True),
+    ("truncated parts", lambda b, k: corrupted(b, k, cut), 2, False),
+    ("bit flip in the finished file", damaged_result, 3, True),
+    ("clock that jumps", clock, 1, False),
+    ("SIGKILL of a worker that writes a Zarr store", lambda b, k: sharded(b, k, "worker"), 1, False),
+    ("SIGKILL of the driver of a Zarr store", lambda b, k: sharded(b, k, "driver"), 1, False),
+)

@@ -1,0 +1,98 @@
+"""``make faults``: all injections, and the table of docs/reliability.md from what they found."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from harness import ROOT, Bench, Record
+from injections import KINDS
+
+from drivetrain_jax.store.provenance import machine, now
+
+BEGIN, END = "<!-- faults: written by `make faults` -->", "<!-- end of faults -->"
+
+
+def main() -> int:
+    """Run the suite; the exit code is 1 if anything was lost or wrong."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--points", type=int, default=600_000, help="size of the chart")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--page", type=Path, default=ROOT / "docs" / "reliability.md")
+    parser.add_argument(
+        "--only", nargs="*", default=[], help="kinds with this in their name; the page stays as it is then"
+    )
+    options = parser.parse_args()
+    # File systems that are mounted come down also when the suite is stopped.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    begin = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="faults-") as folder:
+        bench = Bench(Path(folder), options.points, options.seed)
+        chosen = [k for k in KINDS if not options.only or any(part in k[0] for part in options.only)]
+        # Every kind once, then those again that are to come more often.
+        turns = [k for turn in range(max(k[2] for k in chosen)) for k in chosen if turn < k[2]]
+        records = [inject(bench, kind, function) for kind, function, _, _ in turns]
+        head = heading(bench, records, time.monotonic() - begin)
+    if not options.only:
+        write(options.page, "\n".join([head, "", *table(records)]))
+    bad = [r for r in records if r.lost or r.wrong or r.orphans or r.problem]
+    sys.stderr.write(f"{len(records)} injections, {len(bad)} with a problem\n")
+    return int(bool(bad))
+
+
+def inject(bench: Bench, kind: str, function) -> Record:
+    """One injection, told on standard error."""
+    record = function(bench, kind)
+    text = f"{kind}: at {record.moment:.2f} s, exit {record.code}, reused {record.reused}, {record.problem or 'ok'}"
+    sys.stderr.write(text + "\n")
+    return record
+
+
+def heading(bench: Bench, records: list[Record], seconds: float) -> str:
+    """Where and how the table came about."""
+    hits = sum(r.hit for r in records)
+    total = bench.status(bench.reference).total
+    return (
+        f"{len(records)} injections, {hits} of them while the run was at work; chart of {total} points, "
+        f"{bench.duration:.1f} s undisturbed; seed {bench.seed}; {seconds / 60:.0f} minutes on {machine()}, {now()[:10]}. "
+        "Lost: points that were there after the fault and had to be computed again. Wrong: variables that differ from "
+        "those of an undisturbed run in a bit, a label or their encoding. Orphans: processes left behind."
+    )
+
+
+def table(records: list[Record]) -> list[str]:
+    """One row for each kind, and the sum."""
+    rows = defaultdict(list)
+    for record in records:
+        rows[record.kind].append(record)
+    lines = [
+        "| fault | injections | at work | exit codes | points reused | lost | wrong | orphans | other problems |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    rows = {kind: rows[kind] for kind, *_ in KINDS if kind in rows}
+    for kind, group in [*rows.items(), ("**all**", records)]:
+        codes = " ".join(str(code) for code in sorted({r.code for r in group})) if kind != "**all**" else ""
+        sums = [sum(getattr(r, name) for r in group) for name in ("hit", "reused", "lost", "wrong", "orphans")]
+        problems = sum(bool(r.problem) for r in group)
+        lines.append(
+            f"| {kind} | {len(group)} | {sums[0]} | {codes} | {sums[1]} | {sums[2]} | {sums[3]} | {sums[4]} | {problems} |"
+        )
+    return lines
+
+
+def write(page: Path, content: str) -> None:
+    """Replace what the suite wrote there before."""
+    before, _, rest = page.read_text().partition(BEGIN)
+    after = rest.partition(END)[2]
+    page.write_text(f"{before}{BEGIN}\n\n{content}\n\n{END}{after}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

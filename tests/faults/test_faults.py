@@ -1,0 +1,31 @@
+"""The short form of the fault suite: one injection of the commonest kinds. ``make faults`` runs all of them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from harness import Bench
+from injections import KINDS
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="faults are injected through /proc")
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    return Bench(tmp_path_factory.mktemp("faults"), points=40_000, seed=3)
+
+
+@pytest.mark.parametrize("kind", [name for name, _, _, short in KINDS if short])
+def test_nothing_is_lost_and_nothing_is_wrong(bench, kind):
+    function = next(function for name, function, _, _ in KINDS if name == kind)
+    record = function(bench, kind)
+    assert (record.problem, record.lost, record.wrong, record.orphans) == ("", 0, 0, 0), record
+
+
+def test_the_suite_is_large_enough():
+    assert sum(count for _, _, count, _ in KINDS) >= 30
