@@ -26,10 +26,10 @@ def found():
 
 
 def test_shares_of_the_high_branch(found):
-    """Within three standard errors, and the rounding of the note."""
-    high = found.sel(attractor=1)
-    distance = np.abs(high.basin_fraction.values - list(NOTE.values()))
-    assert np.all(distance < 3 * high.basin_error.values + list(ROUNDING.values()))
+    """Within three standard errors of the expected share, and the rounding of the note."""
+    expected, rounding = np.array(list(NOTE.values())), np.array(list(ROUNDING.values()))
+    distance = np.abs(found.sel(attractor=1).basin_fraction.values - expected)
+    assert np.all(distance < 3 * np.sqrt(expected * (1 - expected) / 1000) + rounding)
     np.testing.assert_allclose(found.basin_fraction.sum("attractor"), 1.0, rtol=1e-15)
     assert (found.outcome == 0).all() and (found.unsettled_fraction == 0).all()
     assert (found.attractor_multiple.values[:, :2] == 1).all()
