@@ -250,7 +250,8 @@ def resume(
         problems.append(f"resume ended with {finished.code}: {' | '.join(finished.lines[-2:])}")
     if out.with_name(out.name + ".parts").exists():
         problems.append("the folder of parts is still there")
-    lost = max(done - counts.get("reused", 0), 0)
+    # A run that is told to start anew gives up what is there.
+    lost = 0 if "--fresh" in options else max(done - counts.get("reused", 0), 0)
     wrong = bench.wrong(out) if out.is_file() else len(bench.arrays)
     reused, computed = counts.get("reused", 0), counts.get("computed", 0)
     if reused + computed != bench.status(out).total:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
-from drivetrain_jax.sweep import point as module
+from drivetrain_jax.sweep import kernel
 
 
 def test_results_by_attribute_and_name():
@@ -64,9 +64,9 @@ def test_a_line_of_one_value():
 
 def test_another_point_needs_no_new_compilation():
     dt.point("toy", "toy", a=1.0, b=1.0)
-    before = module._kernel.cache_info()
+    before = kernel._compiled.cache_info()
     dt.point("toy", "toy", a=2.0, b=1.5)
-    after = module._kernel.cache_info()
+    after = kernel._compiled.cache_info()
     assert after.hits == before.hits + 1 and after.misses == before.misses
 
 
