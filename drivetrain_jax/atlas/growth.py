@@ -54,7 +54,8 @@ def growth(criteria: Criteria, x: np.ndarray, kinds: list[str], *, second: bool 
     size = np.linalg.norm(xr, axis=1) * np.linalg.norm(yl, axis=1)
     scale = np.sqrt((phi**2).sum(axis=0))
     error = 2 * scale * (_value_error(criteria, x) + 8 * np.finfo(float).eps * scale) * size / np.abs(s)
-    return Growth(np.log(np.abs(s)), (ds / s[:, None]).real, hessian, s, error)
+    with np.errstate(invalid="ignore"):
+        return Growth(np.log(np.abs(s)), (ds / s[:, None]).real, hessian, s, error)
 
 
 def _second(criteria: Criteria, x: np.ndarray, phi: np.ndarray, first: list, dz: list, eigen: tuple) -> np.ndarray:

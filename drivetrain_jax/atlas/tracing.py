@@ -17,6 +17,8 @@ from drivetrain_jax.atlas.patches import Patches
 _LONGEST, _SHORTEST, _FIRST = 0.015, 1e-7, 1e-5
 _TURN, _CORRECTION, _GROWTH = 0.25, 0.15, 1.6
 _NEWTON, _MAX_STEPS = 3, 800
+# Distance of neighbours that no step can explain.
+_BROKEN = 4 * _LONGEST
 # Distances from a tip in the other coordinate at which its flanks are entered.
 _APPROACH = 1e-4 * np.array([1 / 64, 1 / 16, 1 / 4, 1.0])
 
@@ -65,7 +67,7 @@ def trace(field: Field, seeds: np.ndarray) -> list[Curve]:
     for i in range(len(start)):
         ahead, behind = paths[i], paths[i + len(start)]
         points = ahead if returned[i] else np.concatenate([behind[::-1], ahead[1:]])
-        curves.append(Curve(field.to_coordinates(points), bool(returned[i])))
+        curves.append(_curve(field, points, returned[i]))
     return curves
 
 
@@ -87,8 +89,16 @@ def trace_tips(field: Field, tips: np.ndarray, horizontal: int) -> list[Curve]:
     for i, point in enumerate(top):
         left, right = (np.concatenate([flanks[k, i], paths[i + k * len(top)][1:]]) for k in range(2))
         points = np.concatenate([left[::-1], point[None], right])
-        curves.append(Curve(field.to_coordinates(points[np.isfinite(points).all(axis=1)]), bool(returned[i])))
+        curves.append(_curve(field, points[np.isfinite(points).all(axis=1)], returned[i]))
     return curves
+
+
+def _curve(field: Field, points: np.ndarray, closed: bool) -> Curve:
+    """The curve through points of the unit square. A point farther from its neighbour than any step can lead, as where a
+    path meets the rim at a grazing angle, ends it: what is kept is the longest part."""
+    far = np.flatnonzero(np.linalg.norm(np.diff(points, axis=0), axis=1) > _BROKEN)
+    part = max(np.split(points, far + 1), key=len)
+    return Curve(field.to_coordinates(part), bool(closed) and not far.size)
 
 
 def _flank(field: Field, top: np.ndarray, h: int, side: float) -> np.ndarray:
