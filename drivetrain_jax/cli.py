@@ -55,9 +55,17 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
 
+    for add in _COMMANDS:
+        add(commands)
+    return parser
+
+
+def _add_list(commands: Any) -> None:
     command = _command(commands, "list", _list, "systems, analyses, parameters and scenes")
     command.add_argument("system", nargs="?", metavar="SYSTEM", help="describe this one")
 
+
+def _add_run(commands: Any) -> None:
     command = _command(commands, "run", _run, "compute a scene, or resume it")
     _add_scene(command)
     command.add_argument("--fresh", action="store_true", help="replace a result of another scene or version")
@@ -77,20 +85,28 @@ def _parser() -> argparse.ArgumentParser:
     )
     command.add_argument("--quiet", action="store_true", help="no progress, only the last line")
 
+
+def _add_status(commands: Any) -> None:
     command = _command(commands, "status", _status, "how much of a scene is computed")
     _add_scene(command)
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
+
+def _add_verify(commands: Any) -> None:
     command = _command(
         commands, "verify", _verify, "check every checksum of a result, and what must hold of its numbers"
     )
     command.add_argument("file", metavar="FILE.nc", type=Path)
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
+
+def _add_export(commands: Any) -> None:
     command = _command(commands, "export", _export, "write a Zarr store as one HDF5 file")
     command.add_argument("store", metavar="STORE", type=Path)
     command.add_argument("file", metavar="FILE.nc", type=Path)
 
+
+def _add_plot(commands: Any) -> None:
     command = _command(commands, "plot", _plot, "draw the figure that suits a result")
     command.add_argument(
         "files", metavar="FILE.nc", type=Path, nargs="+", help="several methods of one analysis overlay"
@@ -101,17 +117,23 @@ def _parser() -> argparse.ArgumentParser:
     )
     command.add_argument("--cells", type=int, default=800, metavar="N", help="of an atlas: cells each way (800)")
 
+
+def _add_point(commands: Any) -> None:
     command = _command(commands, "point", _point, "compute one point")
     command.add_argument("system", metavar="SYSTEM")
     command.add_argument("analysis", metavar="ANALYSIS")
     command.add_argument("given", nargs="*", metavar="name=value", help="parameters, options, and outputs=NAME,NAME")
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
+
+def _add_query(commands: Any) -> None:
     command = _command(commands, "query", _query, "ask a stored atlas about one point")
     command.add_argument("file", metavar="FILE.nc", type=Path)
     command.add_argument("given", nargs="*", metavar="name=value", help="parameters, or the data in physical units")
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
+
+def _add_design(commands: Any) -> None:
     command = _command(commands, "design", _design, "ask a stored atlas what a design has to be")
     questions = ("least-damping", "widest-angle", "speed-windows")
     command.add_argument("question", choices=questions, metavar="QUESTION", help=", ".join(questions))
@@ -119,7 +141,9 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("given", nargs="*", metavar="name=value", help="parameters; a range is name=LOW:HIGH")
     command.add_argument("--margin", type=float, default=0.0, help="part of the speed kept clear of every boundary")
     command.add_argument("--json", action="store_true", help="as one JSON object")
-    return parser
+
+
+_COMMANDS = (_add_list, _add_run, _add_status, _add_verify, _add_export, _add_plot, _add_point, _add_query, _add_design)
 
 
 def _command(commands: Any, name: str, function: Any, text: str) -> argparse.ArgumentParser:

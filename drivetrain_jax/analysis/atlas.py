@@ -15,7 +15,7 @@ from drivetrain_jax.systems import System
 
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
-    return floquet_propagator.ANALYSIS.solvers(system, replace(request, outputs=("propagator",)))
+    return floquet_propagator.ANALYSIS.solvers(system, replace(request, outputs=(floquet_propagator.PROPAGATOR,)))
 
 
 ANALYSIS = replace(

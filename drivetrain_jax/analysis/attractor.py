@@ -13,7 +13,7 @@ from where the search began, is seen to approach it (:mod:`~drivetrain_jax.analy
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -174,23 +174,23 @@ def _tick(task: _Task, work: _Work) -> _Work:
     working = lane.job < total // task.length
     place = jnp.where(working, lane.job, 0) * task.length + lane.place
     local = take(task.oscillator, task.visits[place])
-    lanes = _stored(prepare(local))
+    lanes = prepare(local)
     omega = lanes.omega + jnp.zeros(place.shape)
     lane = lane._replace(motion=few_steps(lanes, lane.motion))
     broken = ~jnp.isfinite(lane.motion.u) | (lane.motion.steps > _most_steps(lane, lanes))
     ready = working & ((lane.motion.left <= 0) | broken)
     shot, probed = (ready & lane.searching & ~broken & (on == (lane.probing >= 0)) for on in (False, True))
-    after, verdict = _stored(_shoot(lane, shot, local, omega))
+    after, verdict = _shoot(lane, shot, local, omega)
     settles = ready & ~lane.searching & ~broken
     after = settle(after, settles, task.most_periods // 4, omega)
-    after, reached = _stored(confirm(_stored(after), settles, history, omega))
+    after, reached = confirm(after, settles, history, omega)
     history = record(history, settles, after)
-    first, second = _stored(candidates(after, history, omega))
+    first, second = candidates(after, history, omega)
     after = search(after, settles & (after.held == 0) & (after.count >= after.due), first, second)
-    after = _stored(approach(after, verdict.found, verdict.orbit))
-    after, through, left = _stored(try_line(after, probed | verdict.slow, verdict.orbit, omega))
+    after = approach(after, verdict.found, verdict.orbit)
+    after, through, left = try_line(after, probed | verdict.slow, verdict.orbit, omega)
     reached |= through
-    after = _stored(resume(after, verdict.failed | left | (ready & lane.searching & broken)))
+    after = resume(after, verdict.failed | left | (ready & lane.searching & broken))
     stalled = ready & ~lane.searching & broken
     done = reached | stalled | (settles & (after.count >= task.most_periods))
     result = _result(after, reached, stalled, task.most_periods * 2 * np.pi / omega)
@@ -198,11 +198,6 @@ def _tick(task: _Task, work: _Work) -> _Work:
     store = work.store.at[:, jnp.where(done, place, total)].set(rows, mode="drop")
     lane, queue = _proceed(after, done, result, work.queue, task)
     return _Work(lane, record(history, done, lane), queue, store)
-
-
-def _stored(results: Any) -> Any:
-    """``results``, computed once: XLA would put what leads to them into the expression of everything made of them."""
-    return jax.lax.optimization_barrier(results)
 
 
 def _most_steps(lane: Lane, lanes: Lanes) -> Array:

@@ -19,8 +19,10 @@ from drivetrain_jax.analysis.direct import Monodromy
 from drivetrain_jax.analysis.direct_solvers import direct_solvers
 from drivetrain_jax.systems import LinearPeriodic, System
 
+# The result that an atlas interpolates.
+PROPAGATOR = "propagator"
 VARIABLES = (
-    Variable("propagator", "1", "entries of the propagator over the span of the reduced form, by rows", ("entry",)),
+    Variable(PROPAGATOR, "1", "entries of the propagator over the span of the reduced form, by rows", ("entry",)),
     Variable("propagator_error", "1", "estimate of its relative error"),
 )
 
@@ -54,7 +56,7 @@ def _results(phi: Monodromy, outputs: tuple[str, ...]) -> dict[str, Array]:
     entries = matrix.reshape(-1, *matrix.shape[2:])
     finite = jnp.all(jnp.isfinite(entries), axis=0)
     outcome = jnp.where(finite, jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET), Outcome.NOT_FINITE)
-    results = {"propagator": jnp.where(finite, entries, jnp.nan), "propagator_error": jnp.where(finite, error, jnp.nan)}
+    results = {PROPAGATOR: jnp.where(finite, entries, jnp.nan), "propagator_error": jnp.where(finite, error, jnp.nan)}
     return {name: results[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}
 
 
@@ -66,7 +68,7 @@ ANALYSIS = Analysis(
     name="atlas",
     title="Propagator of a linear periodic system, for its atlas",
     variables=VARIABLES,
-    default_outputs=("propagator", "propagator_error"),
+    default_outputs=(PROPAGATOR, "propagator_error"),
     methods={"direct": ("rtol",)},
     options=(RTOL,),
     solvers=_solvers,

@@ -67,11 +67,12 @@ def in_blocks(function: Callable[[dict[str, Any], int], Any], values: Values, la
     return jax.tree.map(join, lax.map(part, columns))
 
 
-def stored(certain: Array, function: Callable[[], Any]) -> Any:
+def evaluated_once(certain: Array, function: Callable[[], Any]) -> Any:
     """``function()``, computed once and kept in memory, where XLA for CPUs would compute it again for every entry of
     every array that depends on it: a conditional is a border that fusion does not cross.
 
-    ``certain`` is a condition that holds whenever it is evaluated, but is not known to the compiler.
+    ``certain`` is a condition that holds whenever it is evaluated, but is not known to the compiler. Results may rely on
+    the single evaluation, which the marks of :mod:`~drivetrain_jax.analysis.kernels` do not promise.
     """
     shapes = jax.eval_shape(function)
     return lax.cond(certain, function, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))

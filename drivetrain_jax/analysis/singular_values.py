@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from drivetrain_jax.analysis.lanes import stored
+from drivetrain_jax.analysis.lanes import evaluated_once
 
 EPS = float(np.finfo(float).eps)
 # Matrices are scaled to entries of order one; what is smaller than these has no influence on any digit.
@@ -101,18 +101,20 @@ def _reduce_row_and_column(k: Array, state: tuple[Array, Array, Array]) -> tuple
     def column() -> tuple[Array, ...]:
         return _reflector(jnp.where(rows >= k, lax.dynamic_index_in_dim(a, k, 1, keepdims=False), 0.0), rows == k)
 
-    v, factor, new_diagonal, leading = stored(certain, column)
-    w = stored(certain, lambda: factor * _combination(v, a, 0))
+    v, factor, new_diagonal, leading = evaluated_once(certain, column)
+    w = evaluated_once(certain, lambda: factor * _combination(v, a, 0))
 
-    # Stored: where the row has nothing but rounding left, two evaluations of it would give two different reflections.
-    y = stored(certain, lambda: lax.dynamic_index_in_dim(a, k, 0, keepdims=False) - (leading - new_diagonal) * w)
+    # Once: where the row has nothing but rounding left, two evaluations of it would give two different reflections.
+    y = evaluated_once(
+        certain, lambda: lax.dynamic_index_in_dim(a, k, 0, keepdims=False) - (leading - new_diagonal) * w
+    )
 
     def row() -> tuple[Array, ...]:
         u, factor, new, _ = _reflector(jnp.where(columns > k, y, 0.0), columns == k + 1)
         return u, factor, new, jnp.sum(w * u, axis=0)
 
-    u, factor_u, new_upper, across = stored(certain, row)
-    z = stored(certain, lambda: factor_u * (_combination(u, a, 1) - v * across))
+    u, factor_u, new_upper, across = evaluated_once(certain, row)
+    z = evaluated_once(certain, lambda: factor_u * (_combination(u, a, 1) - v * across))
     a = a - v[:, None] * w - z[:, None] * u
     diagonal = lax.dynamic_update_index_in_dim(diagonal, new_diagonal, k, 0)
     return a, diagonal, lax.dynamic_update_index_in_dim(upper, new_upper, k, 0)

@@ -18,6 +18,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis import Outcome
+from drivetrain_jax.analysis.kernels import compiler_options
 from drivetrain_jax.analysis.multipliers import verdict as verdict_of
 from drivetrain_jax.atlas import conservative, quartic
 from drivetrain_jax.atlas.floquet_quantity import Build
@@ -35,11 +36,6 @@ _AHEAD = 2
 _SPREAD = 4.0
 
 Results = Mapping[str, np.ndarray]
-
-
-def compiler_options() -> dict[str, Any] | None:
-    """Full vector width: XLA uses half of AVX-512 unless told otherwise."""
-    return {"xla_cpu_prefer_vector_width": 512} if jax.default_backend() == "cpu" else None
 
 
 def errors_of(panel: Panel) -> np.ndarray:

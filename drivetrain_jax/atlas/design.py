@@ -1,6 +1,7 @@
 """Design questions answered from an atlas, each answer with a bound of its error and a check by direct solves.
 
-The atlas may have more parameters than a question names: ``at`` gives their values. ``direct`` is the check: a function from
+The atlas may have more parameters than a question names: ``at`` gives their values. Which parameter is the speed, the angle
+or the damping is a matter of the system (``roles``). ``direct`` is the check: a function from
 columns of all parameters, a mapping of names to arrays ``(N,)``, to spectral radii ``(N,)`` computed without the atlas.
 """
 
@@ -91,12 +92,10 @@ def least_damping(
     speeds: Range,
     at: Mapping[str, float],
     *,
-    damping: str = "zeta",
-    speed: str = "Omega",
     direct: Direct | None = None,
 ) -> Answer:
-    """The least ``damping`` from which on, up to the atlas's largest, all ``speeds`` are stable."""
-    return _extreme(narrow(atlas.slice(at), {speed: speeds}), system, speed, (damping, 1.0), direct)
+    """The least damping from which on, up to the atlas's largest, all ``speeds`` are stable."""
+    return _extreme(atlas.slice(at), system, speeds, ("damping", 1.0), direct)
 
 
 def widest_angle(
@@ -105,12 +104,10 @@ def widest_angle(
     speeds: Range,
     at: Mapping[str, float],
     *,
-    angle: str = "beta",
-    speed: str = "Omega",
     direct: Direct | None = None,
 ) -> Answer:
-    """The widest ``angle`` up to which, from the atlas's smallest on, all ``speeds`` are stable."""
-    return _extreme(narrow(atlas.slice(at), {speed: speeds}), system, speed, (angle, -1.0), direct)
+    """The widest angle up to which, from the atlas's smallest on, all ``speeds`` are stable."""
+    return _extreme(atlas.slice(at), system, speeds, ("angle", -1.0), direct)
 
 
 def speed_windows(
@@ -119,10 +116,9 @@ def speed_windows(
     at: Mapping[str, float],
     *,
     margin: float = 0.0,
-    speed: str = "Omega",
     direct: Direct | None = None,
 ) -> tuple[Window, ...]:
-    """The stable ranges of ``speed`` where the other parameters are ``at``, each shortened by ``margin`` of the speed at
+    """The stable ranges of the speed where the other parameters are ``at``, each shortened by ``margin`` of the speed at
     both crossings. What a margin leaves nothing of is left out."""
     part = atlas.slice(at)
     line = stability_along(part, system)
@@ -137,7 +133,7 @@ def speed_windows(
         rho = criteria.spectral_radius(part.to_coordinates(values[:, None]))
         k = int(np.argmax(rho))
         window = Window(interval, (low, high), float(rho[k]), float(values[k]))
-        windows.append(_checked_window(window, part, speed, direct))
+        windows.append(_checked_window(window, part, system.roles["speed"], direct))
     return tuple(windows)
 
 
@@ -162,9 +158,11 @@ def nearest_boundaries(atlas: Atlas, system: System, point: Mapping[str, float])
     return tuple(found)
 
 
-def _extreme(part: Atlas, system: System, speed: str, sought: tuple[str, float], direct: Direct | None) -> Answer:
-    """Up to where, from the last value of ``sought`` (name, side) on that side, all of ``speed`` is stable."""
-    name, side = sought
+def _extreme(atlas: Atlas, system: System, speeds: Range, sought: tuple[str, float], direct: Direct | None) -> Answer:
+    """Up to where, from the last value of ``sought`` (role, side) on that side, all ``speeds`` are stable."""
+    role, side = sought
+    name, speed = system.roles[role], system.roles["speed"]
+    part = narrow(atlas, {speed: speeds})
     line = stability_over_range(part, system, speed)
     end = line.intervals[-1] if side > 0 else line.intervals[0]
     value, limit = (end.lower, end.lower_end) if side > 0 else (end.upper, end.upper_end)

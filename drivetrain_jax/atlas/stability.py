@@ -19,6 +19,7 @@ from jax import Array
 
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.floquet_results import VARIABLES
+from drivetrain_jax.analysis.kernels import compiler_options
 from drivetrain_jax.atlas import charts, evaluation, quartic
 from drivetrain_jax.atlas.floquet_quantity import Build, judge
 from drivetrain_jax.atlas.panels import Atlas
@@ -191,7 +192,7 @@ def _point_kernel(
         found |= _sharper(phi, build(everything), errors, found)
         return {name: found[name] for name in (*outputs, "outcome")}
 
-    return jax.jit(kernel, compiler_options=charts.compiler_options())
+    return jax.jit(kernel, compiler_options=compiler_options())
 
 
 def _sharper(phi: Array, model: FloquetModel, errors: Array, found: dict[str, Array]) -> dict[str, Array]:

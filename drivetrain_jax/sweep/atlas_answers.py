@@ -73,18 +73,20 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
 
 def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Reply:
     """The least damping from which on a range of speeds is stable. Raises as :func:`query`."""
-    asked = _Asked.of(atlas, given, ranges=("Omega",), free=("zeta",))
+    speed, damping = _roles(atlas, "speed", "damping")
+    asked = _Asked.of(atlas, given, ranges=(speed,), free=(damping,))
     answer = design.least_damping(
-        atlas.stability.atlas, atlas.scene.system, asked.values["Omega"], asked.numbers(), direct=atlas.radius
+        atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.radius
     )
     return _answered("least damping", "from {} on", asked, answer)
 
 
 def widest_angle(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Reply:
     """The widest joint angle up to which a range of speeds is stable. Raises as :func:`query`."""
-    asked = _Asked.of(atlas, given, ranges=("Omega",), free=("beta",))
+    speed, angle = _roles(atlas, "speed", "angle")
+    asked = _Asked.of(atlas, given, ranges=(speed,), free=(angle,))
     answer = design.widest_angle(
-        atlas.stability.atlas, atlas.scene.system, asked.values["Omega"], asked.numbers(), direct=atlas.radius
+        atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.radius
     )
     return _answered("widest angle", "up to {}", asked, answer)
 
@@ -93,14 +95,15 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
     """The stable ranges of speed, shortened by ``margin`` of the speed at either end. Raises as :func:`query`."""
     if not 0 <= margin < 1:
         raise InputError(f"margin = {margin!r}: allowed is 0 <= margin < 1")
-    asked = _Asked.of(atlas, given, ranges=(), free=("Omega",))
+    (speed,) = _roles(atlas, "speed")
+    asked = _Asked.of(atlas, given, ranges=(), free=(speed,))
     windows = design.speed_windows(
         atlas.stability.atlas, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.radius
     )
     lines = [f"safe speeds, {asked.heading()}, margin {margin:g}"]
     for w in windows:
-        ends = " to ".join(asked.named("Omega", value) for value in w.safe)
-        lines.append(f"  {ends}; largest spectral radius {w.largest:.10g} at Omega = {_number(w.where)}")
+        ends = " to ".join(asked.named(speed, value) for value in w.safe)
+        lines.append(f"  {ends}; largest spectral radius {w.largest:.10g} at {speed} = {_number(w.where)}")
         lines.append(f"    {_checked(w.check)}")
     data = {
         "question": "speed_windows",
@@ -111,6 +114,15 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
         ],
     }
     return Reply("\n".join(lines if windows else [*lines, "  none within the atlas"]), data)
+
+
+def _roles(atlas: StoredAtlas, *roles: str) -> list[str]:
+    """The parameters with these roles in the system."""
+    system = atlas.scene.system
+    for role in roles:
+        if role not in system.roles:
+            raise InputError(f"file: {system.name} names no {role}; allowed is a system that does")
+    return [system.roles[role] for role in roles]
 
 
 @dataclass(frozen=True)
@@ -168,7 +180,7 @@ def _nondimensional(atlas: StoredAtlas, given: Mapping[str, Any]) -> tuple[Any, 
     """The physical data among ``given``, if there are any, and all values as parameters of the system."""
     physical = atlas.scene.system.physical
     data = [f.name for f in fields(physical)] if physical else []
-    known = (*data, "speed", "angle") if physical else ()
+    known = (*data, *physical.operation) if physical else ()
     if not any(name in known for name in given):
         return None, dict(given)
     missing = [name for name in data if name not in given]
@@ -177,7 +189,7 @@ def _nondimensional(atlas: StoredAtlas, given: Mapping[str, Any]) -> tuple[Any, 
     shaft = physical(**{name: float(given[name]) for name in data})
     values = dict(shaft.parameters)
     for name in given:
-        if name in ("speed", "angle"):
+        if name in physical.operation:
             ends = given[name] if isinstance(given[name], tuple) else (given[name],)
             converted = [shaft.parameter(name, end) for end in ends]
             numbers = tuple(value for _, value in converted)

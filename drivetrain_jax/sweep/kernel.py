@@ -16,7 +16,7 @@ from jax import Array
 
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import Solver
-from drivetrain_jax.store.provenance import instruction_set
+from drivetrain_jax.analysis.kernels import compiler_options
 from drivetrain_jax.sweep.assemble import result_variables
 from drivetrain_jax.sweep.grid import Grid
 from drivetrain_jax.sweep.scene import Scene
@@ -83,7 +83,7 @@ def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[V
     """
     batch, columns = _batch(solver, grid, chunk, variables)
     lowered = jax.jit(batch).lower(columns, jax.ShapeDtypeStruct((), np.int64))
-    compiled = lowered.compile(_compiler_options())
+    compiled = lowered.compile(compiler_options())
     return Kernel(compiled, chunk, solver.broadcasts, tuple(variables), _turn(compiled))
 
 
@@ -128,10 +128,3 @@ def _turn(compiled: Any) -> AbstractContextManager[object]:
     """What a call has to hold while it runs: LAPACK calls of XLA hand work to the thread pool that they run in and wait
     for it, so that two kernels which make them can wait for each other for ever (seen with jax 0.10.2 on two cores)."""
     return _LAPACK if 'custom_call_target="lapack_' in compiled.as_text() else nullcontext()
-
-
-def _compiler_options() -> dict[str, Any] | None:
-    """Full vector width: XLA uses half of AVX-512 unless told otherwise, which costs a factor of 1.6."""
-    if jax.default_backend() == "cpu" and "avx512f" in instruction_set():
-        return {"xla_cpu_prefer_vector_width": 512}
-    return None

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from drivetrain_jax.analysis import Request
-from drivetrain_jax.analysis.floquet_propagator import ANALYSIS
+from drivetrain_jax.analysis.floquet_propagator import ANALYSIS, PROPAGATOR
 from drivetrain_jax.atlas import StabilityAtlas, floquet_rounds, solve_rtol, stability_atlas
 from drivetrain_jax.atlas.construction import MAX_SOLVES
 from drivetrain_jax.sweep.axes import Axis
@@ -17,7 +17,6 @@ from drivetrain_jax.sweep.executor import Where
 from drivetrain_jax.sweep.scene import Scene
 from drivetrain_jax.sweep.work import Progress, Work
 
-_VALUES = "propagator"
 # Panels are to be this much better than the results that follow from them.
 _SHARPER = 0.1
 
@@ -57,7 +56,7 @@ def _solves(scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.nda
     axes = tuple(
         Axis(name, scene.system.parameter(name), None, column) for name, column in zip(names, points.T, strict=True)
     )
-    request = Request((_VALUES,), next(iter(ANALYSIS.methods)), {"rtol": rtol})
+    request = Request((PROPAGATOR,), next(iter(ANALYSIS.methods)), {"rtol": rtol})
     dimensions = ANALYSIS.dimensions(scene.system, request, fixed)
     return replace(
         scene, analysis=ANALYSIS, request=request, axes=axes, zipped=True, fixed=fixed, dimensions=dimensions
@@ -73,8 +72,8 @@ class _Answers:
 
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
         if self._values is None:
-            self._values = np.full((self._count, results[_VALUES].shape[1]), np.nan)
-        self._values[points] = results[_VALUES]
+            self._values = np.full((self._count, results[PROPAGATOR].shape[1]), np.nan)
+        self._values[points] = results[PROPAGATOR]
 
     def lose(self, points: np.ndarray) -> None:
         """What is not filled in is lost."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.analysis.floquet_propagator import PROPAGATOR
 from drivetrain_jax.store import shards
 from drivetrain_jax.sweep.assemble import failures
 from drivetrain_jax.sweep.engine import Engine
@@ -95,7 +96,7 @@ def _outcomes(target: Target) -> Iterator[np.ndarray]:
         continuous, seen = target.engine.scene.analysis.continuous, set[int]()
         for part in target.parts.read():
             # Solves for an atlas are no points of a grid.
-            if continuous or "propagator" not in part.results:
+            if continuous or PROPAGATOR not in part.results:
                 # An interrupt in the middle of writing may have left a chunk in two parts.
                 yield from (results[OUTCOME.name] for number, results in part if number not in seen)
                 seen.update(part.chunks.tolist())

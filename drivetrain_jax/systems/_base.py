@@ -123,7 +123,8 @@ class System:
 
     ``time_units`` is the unit of the time of its equations, ``1`` if that is nondimensional. ``physical`` converts data in
     physical units to nondimensional parameters and back (pattern: ``cardan_units.PhysicalShaft``), None if the parameters
-    have physical units themselves.
+    have physical units themselves. ``roles`` names the parameters that design questions are about: ``speed``, ``angle``
+    and ``damping``, as far as it has them.
     """
 
     name: str
@@ -135,6 +136,7 @@ class System:
     resonances: Resonances | None = None
     time_units: str = "1"
     physical: type | None = None
+    roles: Mapping[str, str] = field(default_factory=dict)
 
     def parameter(self, name: str) -> Parameter:
         """The parameter called ``name``; ``KeyError`` if there is none."""

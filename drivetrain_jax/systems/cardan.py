@@ -316,4 +316,5 @@ SYSTEM = System(
     presets=PRESETS,
     resonances=resonances(),
     physical=PhysicalShaft,
+    roles={"speed": "Omega", "angle": "beta", "damping": "zeta"},
 )

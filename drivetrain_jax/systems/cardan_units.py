@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import ClassVar
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter
@@ -40,6 +41,8 @@ class PhysicalShaft:
     k2: float
     c1: float
     c2: float
+    # How the shaft is run, given beside what it is.
+    operation: ClassVar[tuple[str, ...]] = ("speed", "angle")
 
     def __post_init__(self) -> None:
         for field in fields(self):

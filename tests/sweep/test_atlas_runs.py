@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
+from interrupts import stop_after
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import Outcome
@@ -112,18 +113,10 @@ def test_what_an_atlas_does_not_cover_is_solved(monkeypatch, direct):
     same_arrays(found, direct)
 
 
-def interrupted_run(scene, out, chunks):
+def interrupted_run(scene, out, reports):
     """A run that is stopped after this many reports."""
-    count = 0
-
-    def report(_):
-        nonlocal count
-        count += 1
-        if count > chunks:
-            raise KeyboardInterrupt
-
     with pytest.raises(Interrupted):
-        run_to_file(scene, out, report=report)
+        run_to_file(scene, out, report=stop_after(reports))
 
 
 @pytest.mark.parametrize("chunks", [1, 2, 3])

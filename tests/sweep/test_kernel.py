@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from drivetrain_jax.analysis import kernels
 from drivetrain_jax.sweep import kernel
 
 
@@ -19,13 +20,13 @@ def test_double_precision():
 
 
 def test_full_vector_width_only_where_there_is_avx512(monkeypatch):
-    monkeypatch.setattr(kernel, "instruction_set", lambda: {"x86_64", "avx2"})
-    assert kernel._compiler_options() is None
-    monkeypatch.setattr(kernel, "instruction_set", lambda: {"x86_64", "avx512f"})
+    monkeypatch.setattr(kernels, "instruction_set", lambda: {"x86_64", "avx2"})
+    assert kernels.compiler_options() is None
+    monkeypatch.setattr(kernels, "instruction_set", lambda: {"x86_64", "avx512f"})
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert kernel._compiler_options() is None
+    assert kernels.compiler_options() is None
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
-    assert kernel._compiler_options() == {"xla_cpu_prefer_vector_width": 512}
+    assert kernels.compiler_options() == {"xla_cpu_prefer_vector_width": 512}
 
 
 SCRIPT = """

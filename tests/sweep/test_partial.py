@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from interrupts import stop_after
 
 import drivetrain_jax as dt
 from drivetrain_jax.cli import main
@@ -11,16 +12,6 @@ from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.sweep.executor import Where
 from drivetrain_jax.sweep.partial import PENDING
 from drivetrain_jax.sweep.run import Interrupted, run_to_file
-
-
-def stop_after(calls):
-    left = iter(range(calls + 1))
-
-    def report(progress):
-        if next(left, None) is None:
-            raise KeyboardInterrupt
-
-    return report
 
 
 def compare(partial, whole):

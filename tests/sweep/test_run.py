@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import toy
 import xarray as xr
+from interrupts import stop_after
 
 import drivetrain_jax as dt
 from drivetrain_jax.sweep import toml
@@ -213,21 +214,10 @@ def test_complete_result_is_only_read(grid_scene, tmp_path):
     assert status(grid_scene, path).state == "complete"
 
 
-def interrupt_after(chunks):
-    """A report that acts like Ctrl-C after so many chunks."""
-    calls = iter(range(chunks + 1))
-
-    def report(progress):
-        if next(calls, None) is None:
-            raise KeyboardInterrupt
-
-    return report
-
-
 def test_interrupted_and_resumed_equals_uninterrupted(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt) as stopped:
-        run_to_file(grid_scene, path, where=Where(threads=1), report=interrupt_after(2))
+        run_to_file(grid_scene, path, where=Where(threads=1), report=stop_after(2))
     done = stopped.value.progress
     assert 0 < done.computed < 123 and not path.exists()
     found = status(grid_scene, path)
@@ -241,7 +231,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(grid_scene, tmp_path):
 def test_parts_are_not_resumed_by_another_scene(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt):
-        run_to_file(grid_scene, path, where=Where(threads=1), report=interrupt_after(2))
+        run_to_file(grid_scene, path, where=Where(threads=1), report=stop_after(2))
     other = grid_scene | {"fixed": {"n": 4}}
     assert status(other, path).state == "stale"
     with pytest.raises(dt.InputError, match="unfinished work of another scene"):
@@ -259,7 +249,7 @@ def test_interrupted_replacement_keeps_the_old_result_and_resumes(grid_scene, tm
     with pytest.raises(dt.InputError, match="--fresh"):
         run_to_file(other, path)
     with pytest.raises(KeyboardInterrupt):
-        run_to_file(other, path, fresh=True, where=Where(threads=1), report=interrupt_after(2))
+        run_to_file(other, path, fresh=True, where=Where(threads=1), report=stop_after(2))
     assert path.read_bytes() == before and status(other, path).state == "partial"
     assert run_to_file(other, path).reused > 0
     assert status(other, path).state == "complete" and os.listdir(tmp_path) == ["r.nc"]
@@ -268,7 +258,7 @@ def test_interrupted_replacement_keeps_the_old_result_and_resumes(grid_scene, tm
 def test_corrupted_chunk_is_computed_again(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt) as stopped:
-        run_to_file(grid_scene, path, where=Where(threads=1), report=interrupt_after(2))
+        run_to_file(grid_scene, path, where=Where(threads=1), report=stop_after(2))
     for part in Path(f"{path}.parts").glob("*.h5"):
         data = bytearray(part.read_bytes())
         data[len(data) // 2] ^= 1

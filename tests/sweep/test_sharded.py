@@ -7,6 +7,7 @@ import threading
 import numpy as np
 import pytest
 import xarray as xr
+from interrupts import stop_after
 
 import drivetrain_jax as dt
 from drivetrain_jax import InputError
@@ -66,16 +67,6 @@ def test_export_is_bit_identical_to_the_file(grid_scene, tmp_path, which):
     found = status(scene, tmp_path / "r.zarr")
     assert (found.state, found.done, found.failed) == ("complete", direct.total, direct.failed)
     assert to_store(scene, tmp_path / "r.zarr").reused == direct.total
-
-
-def stop_after(calls):
-    left = iter(range(calls + 1))
-
-    def report(progress):
-        if next(left, None) is None:
-            raise KeyboardInterrupt
-
-    return report
 
 
 def test_interrupted_damaged_and_resumed(grid_scene, tmp_path):
