@@ -155,39 +155,47 @@ def follow(
     scale = scale_of(model, x, limits[1])
     rise = jnp.zeros_like(x).at[2].set(direction)
     first = _on_plane(model, multiple, x, rise, scale)
-    good = first.change <= _CLOSED
-    first = first._replace(x=jnp.where(good, first.x.at[2].set(x[2]), jnp.nan))
+    first = first._replace(x=jnp.where(first.change <= _CLOSED, first.x.at[2].set(x[2]), jnp.nan))
     lanes = jnp.arange(x.shape[1])
-    empty = jnp.full((attempts, 7, x.shape[1]), jnp.nan)
-    store = empty.at[0].set(jnp.concatenate([first.x, jnp.stack(first.matrix)]))
+    store = jnp.full((attempts, 7, x.shape[1]), jnp.nan).at[0].set(_row(first))
 
     def step(state: tuple[Array, _Front, Array]) -> tuple[Array, _Front, Array]:
         count, front, store = state
-        here, tangent = front.solved, front.tangent
-        there = _on_plane(model, multiple, here.x + front.length * tangent * scale, tangent, scale)
-        turned = _tangent(there, tangent, scale)
-        good = (there.change <= _CLOSED) & (jnp.sum(turned * tangent, axis=0) > _LEAST_COSINE) & (there.x[2] > 0)
-        longer = jnp.minimum(jnp.where(there.corrections <= _FEW, _LONGER, 1.0) * front.length, longest)
-        moved = good & going(front)
-        after = _Front(
-            jax.tree.map(lambda new, old: jnp.where(moved, new, old), there, here),
-            jnp.where(moved, turned, tangent),
-            jnp.where(good, longer, _SHORTER * front.length),
-            front.number + moved,
-        )
-        row = jnp.concatenate([after.solved.x, jnp.stack(after.solved.matrix)])
-        return count + 1, after, store.at[after.number, :, lanes].set(row.T)
-
-    def going(front: _Front) -> Array:
-        omega = front.solved.x[2]
-        return (omega >= limits[0]) & (omega <= limits[1]) & (front.length > _SHORTEST)
+        guess = front.solved.x + front.length * front.tangent * scale
+        there = _on_plane(model, multiple, guess, front.tangent, scale)
+        front = _moved(front, there, _tangent(there, front.tangent, scale), longest, limits)
+        return count + 1, front, store.at[front.number, :, lanes].set(_row(front.solved).T)
 
     def unfinished(state: tuple[Array, _Front, Array]) -> Array:
-        return (state[0] < attempts) & jnp.any(going(state[1]))
+        return (state[0] < attempts) & jnp.any(_going(state[1], limits))
 
     begin = _Front(first, _tangent(first, rise, scale), jnp.full(lanes.shape, longest), jnp.zeros_like(lanes))
     *_, store = jax.lax.while_loop(unfinished, step, (jnp.asarray(1), begin, store))
     return Branch(store[:, :3], tuple(store[:, 3 + k] for k in range(4)))
+
+
+def _row(solved: _Solved) -> Array:
+    """What a branch stores of a point, ``(7, N)``."""
+    return jnp.concatenate([solved.x, jnp.stack(solved.matrix)])
+
+
+def _going(front: _Front, limits: tuple[float, float]) -> Array:
+    """Where the branch has not ended."""
+    omega = front.solved.x[2]
+    return (omega >= limits[0]) & (omega <= limits[1]) & (front.length > _SHORTEST)
+
+
+def _moved(front: _Front, there: _Solved, tangent: Array, longest: float, limits: tuple[float, float]) -> _Front:
+    """The front at ``there``, or where that is no good, the old one with a shorter step."""
+    good = (there.change <= _CLOSED) & (jnp.sum(tangent * front.tangent, axis=0) > _LEAST_COSINE) & (there.x[2] > 0)
+    longer = jnp.minimum(jnp.where(there.corrections <= _FEW, _LONGER, 1.0) * front.length, longest)
+    moved = good & _going(front, limits)
+    return _Front(
+        jax.tree.map(lambda new, old: jnp.where(moved, new, old), there, front.solved),
+        jnp.where(moved, tangent, front.tangent),
+        jnp.where(good, longer, _SHORTER * front.length),
+        front.number + moved,
+    )
 
 
 def fold_test(matrix: Matrix) -> Array:

@@ -130,6 +130,28 @@ def _watched(lanes: Lanes, motion: Motion, so_far: Measures, integrals: bool) ->
     )
 
 
+class _Task(NamedTuple):
+    """The motions to be followed; ``first``: u, v, most periods, and whether a recurrence ends them, ``(4, N)``."""
+
+    oscillator: PiecewiseLinearOscillator
+    first: Array
+    integrals: bool
+
+
+class _Work(NamedTuple):
+    """Lanes that each follow the motion ``index``, the next one in the ``queue``, and what is stored of those done.
+
+    ``renewed``: where a lane has just turned to another motion.
+    """
+
+    index: Array
+    queue: Array
+    renewed: Array
+    motion: Motion
+    so_far: Measures
+    store: Array
+
+
 def measure(
     oscillator: PiecewiseLinearOscillator, u: Array, v: Array, multiple: Array, *, width: int, integrals: bool = True
 ) -> Measures:
@@ -140,44 +162,48 @@ def measure(
     """
     count = u.size
     width = min(width, count)
-    store = jnp.zeros((len(jax.tree.leaves(_RESULT)), count))
-    most = jnp.where(multiple > 0, multiple, MOST_PERIODS).astype(jnp.int32)
     recurs = multiple > 0
-    columns = jnp.stack([u, v, most.astype(float), recurs.astype(float)])
-
-    def tick(state: tuple) -> tuple:
-        index, queue, renewed, motion, so_far, store = state
-        working = index < count
-        here = jnp.minimum(index, count - 1)
-        first_u, first_v, periods, closes = columns[:, here]
-        lanes = jax.tree.map(lambda x: x + jnp.zeros(width), prepare(take(oscillator, here)))
-        fresh = start(lanes, first_u, first_v, periods.astype(jnp.int32)), _fresh(first_u)
-        motion, so_far = jax.tree.map(lambda new, old: jnp.where(renewed, new, old), fresh, (motion, so_far))
-
-        def one(_: Array, pair: tuple[Motion, Measures]) -> tuple[Motion, Measures]:
-            motion, so_far = pair
-            moved = _watched(lanes, motion, so_far, integrals)
-            # A lane waits at the end of each period until its recurrence has been looked at.
-            active = (motion.left > periods - 1 - so_far.periods) & jnp.isfinite(motion.u)
-            return jax.tree.map(lambda new, old: jnp.where(active, new, old), moved, pair)
-
-        motion, so_far = jax.lax.fori_loop(0, _FEW, one, (motion, so_far))
-        ended = motion.left <= periods - 1 - so_far.periods
-        so_far = so_far._replace(periods=so_far.periods + ended)
-        distance = jnp.abs(motion.u - first_u) + jnp.abs(motion.v - first_v) / lanes.omega
-        size = jnp.abs(so_far.high) + jnp.abs(so_far.low) + jnp.abs(first_u) + jnp.abs(first_v) / lanes.omega
-        back = (closes > 0) & (distance <= _RECURRENCE * size)
-        broken = ~jnp.isfinite(motion.u) | (motion.steps > 2 * periods * usual_steps(lanes))
-        done = working & (broken | (ended & (back | (motion.left <= 0))))
-        result = so_far._replace(matrix=motion.matrix, complete=jnp.where(broken, 0.0, 1.0))
-        rows = jnp.stack(jax.tree.leaves(result)).astype(float)
-        store = store.at[:, jnp.where(done, here, count)].set(rows, mode="drop")
-        fresh = queue + jnp.cumsum(done.astype(jnp.int32)) - 1
-        return jnp.where(done, fresh, index), queue + done.sum().astype(jnp.int32), done, motion, so_far, store
-
-    index = jnp.arange(width, dtype=jnp.int32)
-    blank = jnp.zeros(width)
+    most = jnp.where(recurs, multiple, MOST_PERIODS)
+    task = _Task(oscillator, jnp.stack([u, v, most.astype(float), recurs.astype(float)]), integrals)
+    index, blank = jnp.arange(width, dtype=jnp.int32), jnp.zeros(width)
     motion = Motion(blank, blank, blank, blank, blank, (blank,) * 4, 0 * index, 0 * index)
-    state = (index, jnp.asarray(width, jnp.int32), index >= 0, motion, _fresh(blank), store)
-    *_, store = jax.lax.while_loop(lambda state: jnp.any(state[0] < count), tick, state)
-    return jax.tree.unflatten(jax.tree.structure(_RESULT), list(store))
+    store = jnp.zeros((len(jax.tree.leaves(_RESULT)), count))
+    work = _Work(index, jnp.asarray(width, jnp.int32), index >= 0, motion, _fresh(blank), store)
+    work = jax.lax.while_loop(lambda work: jnp.any(work.index < count), lambda work: _tick(task, work), work)
+    return jax.tree.unflatten(jax.tree.structure(_RESULT), list(work.store))
+
+
+def _tick(task: _Task, work: _Work) -> _Work:
+    """All lanes a few steps on; those whose motion is done store it and take the next one of the queue."""
+    count = task.first.shape[1]
+    here = jnp.minimum(work.index, count - 1)
+    u, v, periods, recurs = task.first[:, here]
+    lanes = jax.tree.map(lambda x: x + jnp.zeros(work.index.size), prepare(take(task.oscillator, here)))
+    fresh = start(lanes, u, v, periods.astype(jnp.int32)), _fresh(u)
+    pair = jax.tree.map(lambda new, old: jnp.where(work.renewed, new, old), fresh, (work.motion, work.so_far))
+    motion, so_far = _few_steps(lanes, periods, pair, task.integrals)
+    ended = motion.left <= periods - 1 - so_far.periods
+    so_far = so_far._replace(periods=so_far.periods + ended)
+    distance = jnp.abs(motion.u - u) + jnp.abs(motion.v - v) / lanes.omega
+    size = jnp.abs(so_far.high) + jnp.abs(so_far.low) + jnp.abs(u) + jnp.abs(v) / lanes.omega
+    back = (recurs > 0) & (distance <= _RECURRENCE * size)
+    broken = ~jnp.isfinite(motion.u) | (motion.steps > 2 * periods * usual_steps(lanes))
+    done = (work.index < count) & (broken | (ended & (back | (motion.left <= 0))))
+    result = so_far._replace(matrix=motion.matrix, complete=jnp.where(broken, 0.0, 1.0))
+    rows = jnp.stack(jax.tree.leaves(result)).astype(float)
+    store = work.store.at[:, jnp.where(done, here, count)].set(rows, mode="drop")
+    following = work.queue + jnp.cumsum(done.astype(jnp.int32)) - 1
+    index = jnp.where(done, following, work.index)
+    return _Work(index, work.queue + done.sum().astype(jnp.int32), done, motion, so_far, store)
+
+
+def _few_steps(lanes: Lanes, periods: Array, pair: tuple[Motion, Measures], integrals: bool) -> tuple[Motion, Measures]:
+    """Some steps; a lane waits at the end of each period until its recurrence has been looked at."""
+
+    def one(_: Array, pair: tuple[Motion, Measures]) -> tuple[Motion, Measures]:
+        motion, so_far = pair
+        moved = _watched(lanes, motion, so_far, integrals)
+        active = (motion.left > periods - 1 - so_far.periods) & jnp.isfinite(motion.u)
+        return jax.tree.map(lambda new, old: jnp.where(active, new, old), moved, pair)
+
+    return jax.lax.fori_loop(0, _FEW, one, pair)
