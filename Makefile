@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: atlas test validate faults bench validation lint clean
+.PHONY: atlas test validate faults bench validation gallery docs lint clean
 
 atlas: $(VENV)/installed  ## the quickstart atlas and its figure, in out/
 	@mkdir -p $(OUT)
@@ -25,17 +25,18 @@ lint: $(VENV)/installed-test
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
-bench: $(VENV)/installed-bench  ## throughput and errors against the peers; results in benchmarks/results/
-	$(BIN)/python -m benchmarks.throughput
-	$(BIN)/python -m benchmarks.work_precision
-	$(BIN)/python -m benchmarks.critical_speeds
-	$(BIN)/python -m benchmarks.planetary_throughput
-	$(BIN)/python -m benchmarks.rattle_throughput
-	$(BIN)/python -m benchmarks.chaos
-	$(BIN)/python -m benchmarks.scaling
+bench: $(VENV)/installed-bench  ## error against run time, with the peers; writes benchmarks/results/ and docs/benchmarks.md
+	$(BIN)/drivetrain bench
 
 validation: $(VENV)/installed  ## regenerates docs/validation/
 	$(BIN)/python -m benchmarks.validation
+
+gallery: $(VENV)/installed  ## every scene of sweeps/ and its figure, in out/gallery/
+	$(BIN)/python docs/gallery.py $(OUT)/gallery
+
+docs: $(VENV)/installed-docs  ## the documentation site, in out/docs/html: no warnings, links within it checked, examples run
+	$(BIN)/python -m sphinx -q -W --keep-going -b html -d $(OUT)/docs/doctrees docs $(OUT)/docs/html
+	$(BIN)/python -m sphinx -q -W --keep-going -b doctest -d $(OUT)/docs/doctrees docs $(OUT)/docs/doctest
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
@@ -50,6 +51,10 @@ $(VENV)/installed-test: $(VENV)/installed
 
 $(VENV)/installed-bench: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[bench]'
+	@touch $@
+
+$(VENV)/installed-docs: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
 	@touch $@
 
 clean:

@@ -3,12 +3,20 @@
     python -m benchmarks.atlas [--cells 30000 1000000 4000000 20000000] [--repeats 3]    # writes results/atlas.csv
 
 Chart: that of benchmarks.throughput, beta in [0, 1.5] x Omega in [0.1, 2], base case, spectral radius with its bound and
-verdict. Four times of the package for each number of cells:
+verdict. Times of the package for each number of cells:
 
-    evaluation  the grid from an atlas that is there (its kernels compiled)
-    warm        atlas, grid and result in memory: direct solves included, compilation not
-    file        the same into a file
-    cold        the whole command `drivetrain run`: import, compilation, solves, evaluation, file
+    evaluation    the grid from an atlas that is there (its kernels compiled)
+    points        as many cells at random places, one million at most
+    construction  the atlas alone: direct solves and fits. It does not depend on the number of cells
+    warm          atlas, grid and result in memory: direct solves included, compilation not
+    file          the same into a file
+    cold          the whole command `drivetrain run`: import, compilation, solves, evaluation, file
+
+What `warm` takes beyond `construction` and `evaluation` is the checking of the scene, the digest of the code and the
+labelled result. In the construction the rounds (lines along the edges, refined, then the tensor) follow each other, and a
+round of few points keeps one core waiting; a third of every solve is the second step size, which bounds its error.
+
+Last row: an atlas over four parameters (sweeps/cardan_atlas_4d.toml) opened and sliced to a chart of 1000 x 1000 cells.
 
 Rivals compute a sample of the cells (heyoka 20,000, SciPy 200) on both cores, in turns with the package; their time for
 all cells is extrapolated, which favours none of them: they do not depend on the number of cells. Errors are those of the
@@ -17,7 +25,6 @@ spectral radius relative to heyoka at 1e-15 on the sample, bounds those that the
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -33,12 +40,24 @@ import numpy as np
 
 from benchmarks.cardan_reference import BASE_CASE
 from benchmarks.throughput import Columns, heyoka_contender, reference_radius, scipy_contender
-from benchmarks.timing import RESULTS, chart, interleaved, median, spawned_workers, table, take, write_csv
+from benchmarks.timing import (
+    chart,
+    interleaved,
+    median,
+    parser,
+    results_folder,
+    spawned_workers,
+    table,
+    take,
+    write_csv,
+)
 
 CELLS = (30_000, 1_000_000, 4_000_000, 20_000_000)
 RTOL = 1e-9
 OUTPUTS = ("spectral_radius", "spectral_radius_error", "verdict")
+SCENE_4D = Path(__file__).parents[1] / "sweeps" / "cardan_atlas_4d.toml"
 _HEYOKA_SAMPLE, _SCIPY_SAMPLE = 20_000, 200
+_MOST_POINTS = 1_000_000
 # Peak memory of the whole command, children included.
 _COLD = """
 import json, resource, subprocess, sys, time
@@ -79,13 +98,55 @@ def package_jobs(cells: int, folder: Path) -> dict[str, Callable[[], Any]]:
 
     grid, given = axes(cells), scene(cells)
     ranges = {name: (float(x[0]), float(x[-1])) for name, x in grid.items()}
-    atlas, _ = build_atlas(load_scene(given), ranges, Work(Where()), Progress(0))
+    checked = load_scene(given)
+
+    def construct() -> Any:
+        return build_atlas(checked, ranges, Work(Where()), Progress(0))[0]
+
+    atlas = construct()
+    low, high = np.array(list(ranges.values())).T
+    size = min(int(np.prod([len(x) for x in grid.values()])), _MOST_POINTS)
+    points = low + (high - low) * np.random.default_rng(2).random((size, 2))
 
     def to_file() -> None:
         dt.run(given, out=folder / "chart.nc", fresh=True).close()
 
     values = list(grid.values())
-    return {"evaluation": lambda: atlas.on_grid(values, OUTPUTS), "warm": lambda: dt.run(given), "file": to_file}
+    return {
+        "evaluation": lambda: atlas.on_grid(values, OUTPUTS),
+        "points": lambda: atlas.at(points, OUTPUTS),
+        "construction": construct,
+        "warm": lambda: dt.run(given),
+        "file": to_file,
+    }
+
+
+def four_parameters(folder: Path) -> dict[str, Any]:
+    """The row of the atlas over four parameters."""
+    import drivetrain_jax as dt
+
+    path, axes_of_chart = (
+        folder / "four.nc",
+        {"beta": np.linspace(0.0, 1.3, 1000), "Omega": np.linspace(0.2, 2.5, 1000)},
+    )
+    dt.run(SCENE_4D, out=path, fresh=True).close()
+
+    def opened() -> float:
+        start = time.perf_counter()
+        dt.open_atlas(path).grid(**axes_of_chart, mu=3.0, alpha=2.0)
+        return time.perf_counter() - start
+
+    opened()  # compiles
+    cells = 1_000_000
+    return _row(
+        "atlas over four parameters, opened and sliced", cells, cells / median([opened() for _ in range(3)])
+    ) | {
+        "chart": cells,
+        "times_heyoka": "",
+        "max_error": "",
+        "median_bound": "",
+        "peak_MB": "",
+    }
 
 
 def cold(cells: int, folder: Path) -> tuple[float, float]:
@@ -142,7 +203,8 @@ def measure(cells: int, repeats: int, folder: Path) -> list[dict[str, Any]]:
         for job in ours.values():
             job()
         seconds = interleaved({**ours, **{label: job for label, (job, _) in others.items()}}, repeats)
-    rows = [_row(f"atlas, {label}", count, count / median(seconds[label])) for label in ours]
+    done = {label: min(count, _MOST_POINTS) if label == "points" else count for label in ours}
+    rows = [_row(f"atlas, {label}", n, n / median(seconds[label])) for label, n in done.items()]
     in_all, memory = cold(cells, folder)
     rows.append(_row("atlas, cold command", count, count / in_all) | {"peak_MB": round(memory)})
     error, bound = _atlas_errors(folder / "cold.nc")
@@ -176,20 +238,21 @@ def _atlas_errors(path: Path) -> tuple[float, float]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, write the CSV, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--cells", type=int, nargs="+", default=list(CELLS))
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--quick", action="store_true", help="30,000 cells; writes nothing")
-    options = parser.parse_args(arguments)
+    known = parser(__doc__)
+    known.add_argument("--cells", type=int, nargs="+", default=list(CELLS), help="quick: 30,000")
+    known.add_argument("--repeats", type=int, default=3)
+    options = known.parse_args(arguments)
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
         for cells in [30_000] if options.quick else options.cells:
             rows += measure(cells, options.repeats, Path(folder))
+        if not options.quick:
+            rows.append(four_parameters(Path(folder)))
     order = ("chart", "method", "cells_computed", "cells_per_s", "times_heyoka", "max_error", "median_bound", "peak_MB")
     rows = [{name: row[name] for name in order} for row in rows]
-    if not options.quick:
-        write_csv(RESULTS / "atlas.csv", rows, [f"rtol {RTOL:g}; {time.perf_counter() - start:.0f} s in all"])
+    about = f"rtol {RTOL:g}; {time.perf_counter() - start:.0f} s in all"
+    write_csv(results_folder(options) / "atlas.csv", rows, [about])
     print(table(rows))
 
 

@@ -1,5 +1,8 @@
 """Independent references for the stepped shaft: finite elements of high degree, and the paper's determinant.
 
+    (EI f'')'' = p^2 rhoA f in each segment, springs k_A, k_D (k_joint) and masses at its ends; with shear and rotary
+    inertia (kGA (f' - theta))' = -p^2 rhoA f, (EI theta')' + kGA (f' - theta) = -p^2 rhoI theta.
+
 ``finite_elements`` shares nothing with the package: Galerkin's method with one element of high degree per segment, its
 matrices by Gauss quadrature, eigenvalues by LAPACK. ``determinant_roots`` is what one writes from the paper with NumPy
 and SciPy: the product of 4x4 transfer matrices, a scan for changes of sign, Brent's method. Both take the parameters of

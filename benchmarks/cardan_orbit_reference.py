@@ -1,5 +1,9 @@
 """The forced cardan shaft with SciPy alone: the linear periodic response and the true nonlinear orbit.
 
+    theta1'' = eta T - d theta1' - s theta1,   theta2'' = -eta_phi (1 + theta1')^2 - eta theta1'' - T/gamma,
+    T = alpha d theta2' + mu s theta2,   s = 1/Omega^2,   d = 2 zeta/Omega,   eta, eta_phi at phi = tau + theta1;
+
+the linear response is that of the same equations to first order in theta1, theta2 and their rates.
 Independent of drivetrain_jax like :mod:`benchmarks.cardan_reference`; states are (theta1, theta2, theta1', theta2').
 """
 

@@ -51,21 +51,24 @@ def _propagate(point: Mapping[str, float]) -> list[list[int]]:
         end, tau = mpmath.pi, mpmath.mpf(0)
         state = [[_fixed(mpmath.mpf(i == j)) for i in range(4)] for j in range(4)]
         while tau < end:
-            h = min(mpmath.mpf(_step(float(tau), float(s2), float(s), point["mu"])), end - tau)
+            h = min(mpmath.mpf(_step(float(tau), float(s2), float(s), point)), end - tau)
             eta, step = _speed_ratio(tau, h, c, s2), _fixed(h)
             state = [_advance(column, eta, step, constants) for column in state]
             tau += h
     return state
 
 
-def _step(tau: float, s2: float, s: float, mu: float) -> float:
-    """Step at ``tau``: the poles of eta lie at pi/2 (mod pi) +- i arcosh(1/sin beta); stiffness grows like eta^2."""
+def _step(tau: float, s2: float, s: float, point: Mapping[str, float]) -> float:
+    """Step at ``tau``: the poles of eta lie at pi/2 (mod pi) +- i arcosh(1/sin beta); both rates grow with eta."""
     imaginary = math.acosh(1 / math.sqrt(s2)) if s2 > 0 else math.inf
     distance = min(math.hypot(tau - at, imaginary) for at in (-math.pi / 2, math.pi / 2, 3 * math.pi / 2))
     h = min(_PART * distance, 1.0)
     peak = min(max(tau, math.pi / 2), tau + h)
     eta = math.sqrt(1 - s2) / (1 - s2 * math.sin(peak) ** 2)
-    return min(h, _PHASE / (s * math.sqrt(1 + mu * (1 + eta**2))))
+    light = eta**2 + 1 / point["gamma"]
+    oscillation = math.sqrt(1 + point["mu"] * light)
+    decay = 2 * point["zeta"] * (1 + point["alpha"] * light)
+    return min(h, _PHASE / (s * (oscillation + decay)))
 
 
 def _fixed(x: mpmath.mpf) -> int:

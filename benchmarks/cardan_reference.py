@@ -20,6 +20,8 @@ from scipy.integrate import solve_ivp
 NAMES = ("beta", "Omega", "zeta", "alpha", "mu", "gamma")
 BASE_CASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 PERIOD = np.pi
+# Methods of solve_ivp that take a Jacobian.
+IMPLICIT = ("Radau", "BDF", "LSODA")
 
 Parameters = Mapping[str, Any]
 Pair = tuple[tuple[Any, Any], tuple[Any, Any]]
@@ -68,7 +70,12 @@ def monodromy(
         lower[:] = (-k11, -k12, -e11, -e12, -k21, -k22, -e21, -e22)
         return a.dot(y.reshape(4, 4)).reshape(-1)
 
-    return _solve(field, np.eye(4), method, rtol, atol)
+    def jacobian(tau: float, y: np.ndarray) -> np.ndarray:
+        field(tau, y)
+        return np.kron(a, np.eye(4))
+
+    extra = {"jac": jacobian} if method in IMPLICIT else {}
+    return _solve(field, np.eye(4), method, rtol, atol, **extra)
 
 
 def stacked_monodromy(
@@ -119,7 +126,14 @@ def _stacked_field(p: Parameters, matrices: Matrices) -> Callable[[float, np.nda
 
 
 def _solve(
-    field: Callable[[float, np.ndarray], np.ndarray], start: np.ndarray, method: str, rtol: float, atol: float
+    field: Callable[[float, np.ndarray], np.ndarray],
+    start: np.ndarray,
+    method: str,
+    rtol: float,
+    atol: float,
+    **extra: Any,
 ) -> np.ndarray:
-    solution = solve_ivp(field, (0.0, PERIOD), start.reshape(-1), method=method, rtol=rtol, atol=atol, t_eval=(PERIOD,))
+    solution = solve_ivp(
+        field, (0.0, PERIOD), start.reshape(-1), method=method, rtol=rtol, atol=atol, t_eval=(PERIOD,), **extra
+    )
     return solution.y[:, -1].reshape(start.shape) if solution.success else np.full(start.shape, np.nan)

@@ -14,7 +14,6 @@ has pynamicalsys (it needs other versions than this package).
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import subprocess
@@ -24,6 +23,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -38,7 +38,7 @@ from benchmarks.chaos_reference import (
     scipy_spectrum,
     tripod_field,
 )
-from benchmarks.timing import PROCESSES, RESULTS, median, spawned_workers, table, write_csv
+from benchmarks.timing import PROCESSES, median, parser, results_folder, spawned_workers, table, write_csv
 
 matplotlib.use("Agg")
 
@@ -270,7 +270,7 @@ def compared(contenders: Sequence[Contender]) -> list[dict[str, Any]]:
     return rows
 
 
-def draw(contenders: Sequence[Contender]) -> None:
+def draw(contenders: Sequence[Contender], path: Path) -> None:
     """Error against rate, one panel for each case."""
     from matplotlib.figure import Figure
 
@@ -283,15 +283,14 @@ def draw(contenders: Sequence[Contender]) -> None:
         unit = "time units" if case == "Lorenz" else "strobes"
         axes.set(xlabel=f"{unit} per second, two cores", ylabel="error of state and tangent vectors [1]", title=case)
         axes.legend(frameon=False)
-    figure.savefig(RESULTS / "chaos_precision.png", dpi=150)
+    figure.savefig(path, dpi=150)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print, write the tables and the figure."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--pynamicalsys", metavar="PYTHON", help="interpreter that has pynamicalsys")
-    parser.add_argument("--quick", action="store_true", help="small sizes, one round; writes nothing")
-    given = parser.parse_args(arguments)
+    known = parser(__doc__)
+    known.add_argument("--pynamicalsys", metavar="PYTHON", help="interpreter that has pynamicalsys")
+    given = known.parse_args(arguments)
     import drivetrain_jax.systems  # noqa: F401  double precision, before anything is computed
 
     rounds, units = (1, 20.0) if given.quick else (5, 200.0)
@@ -316,11 +315,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         summary.append({"case": "Lorenz at its own tolerance 1e-10", "method": "pynamicalsys", "per_s": median(peer),
                         "times_scipy": median(peer) / scipy})  # fmt: skip
     print(table(rows), table(summary), sep="\n\n")
-    if not given.quick:
-        note = f"Time units (Lorenz) and strobes (tripod) per second, {PROCESSES} cores, medians of {rounds} rounds."
-        write_csv(RESULTS / "chaos_precision.csv", rows, ("error: see benchmarks/chaos.py", note))
-        write_csv(RESULTS / "chaos.csv", summary, (note,))
-        draw(contenders)
+    note = f"Time units (Lorenz) and strobes (tripod) per second, {PROCESSES} cores, medians of {rounds} rounds."
+    folder = results_folder(given)
+    write_csv(folder / "chaos_precision.csv", rows, ("error: see benchmarks/chaos.py", note))
+    write_csv(folder / "chaos.csv", summary, (note,))
+    draw(contenders, folder / "chaos_precision.png")
 
 
 if __name__ == "__main__":

@@ -13,18 +13,27 @@ the gyroscopic effect.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import subprocess
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from benchmarks.bicardan_reference import determinant_roots
-from benchmarks.timing import PROCESSES, RESULTS, interleaved, median, spawned_workers, table, take, write_csv
+from benchmarks.timing import (
+    PROCESSES,
+    interleaved,
+    median,
+    parser,
+    results_folder,
+    spawned_workers,
+    table,
+    take,
+    write_csv,
+)
 from drivetrain_jax.systems.bicardan import PRESETS
 
 MODES = 6
@@ -175,19 +184,18 @@ def measure(shafts: int, repeats: int, sample: int, ross: str | None) -> tuple[l
     return rows, notes
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--shafts", type=int, default=16384)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--sample", type=int, default=60, help="shafts that SciPy solves")
-    parser.add_argument("--ross", metavar="PYTHON", help="interpreter that has ross-rotordynamics; without it: no ROSS")
-    parser.add_argument("--dry", action="store_true", help="print, write nothing")
-    given = parser.parse_args()
-    rows, notes = measure(given.shafts, given.repeats, given.sample, given.ross)
+    known = parser(__doc__)
+    known.add_argument("--shafts", type=int, default=16384)
+    known.add_argument("--repeats", type=int, default=5)
+    known.add_argument("--sample", type=int, default=60, help="shafts that SciPy solves")
+    known.add_argument("--ross", metavar="PYTHON", help="interpreter that has ross-rotordynamics; without it: no ROSS")
+    given = known.parse_args(arguments)
+    shafts, repeats, sample = (2048, 1, 8) if given.quick else (given.shafts, given.repeats, given.sample)
+    rows, notes = measure(shafts, repeats, sample, given.ross)
     print(table(rows))
-    if not given.dry:
-        write_csv(RESULTS / "critical_speeds.csv", rows, notes)
+    write_csv(results_folder(given) / "critical_speeds.csv", rows, notes)
 
 
 if __name__ == "__main__":

@@ -17,14 +17,14 @@ Points are grouped so that the lanes of a batch need similar numbers of steps; t
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import heyoka as hy
 import numpy as np
 
 from benchmarks.cardan_reference import spectral_radius
-from benchmarks.timing import RESULTS, chart, table, take, write_csv
+from benchmarks.timing import chart, parser, results_folder, table, take, write_csv
 
 FORMS = ("full", "half", "chi")
 # Number of heyoka's runtime parameters: cos and sin^2 of beta, 1/Omega^2, 2 zeta/Omega, alpha, mu, 1/gamma; in chi also
@@ -174,10 +174,11 @@ def _similar_effort(p: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.lexsort((phase, np.floor(np.abs(p["beta"]) / 0.1)))
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Rate and error of every form, batch size and tolerance on random cells of the chart, one core."""
+    options = parser(__doc__).parse_args(arguments)
     rng = np.random.default_rng(0)
-    columns = take(chart(30_000), rng.choice(30_000 - 1, 8192, replace=False))
+    columns = take(chart(30_000), rng.choice(30_000 - 1, 1024 if options.quick else 8192, replace=False))
     reference = spectral_radius(HeyokaBatch("half", 1e-15).monodromy(columns))
     cases = [(form, 1e-9, batch) for form in FORMS for batch in (4, 8, 16)]
     cases += [("half", tolerance, 8) for tolerance in (1e-7, 1e-8, 1e-10, 1e-12)]
@@ -194,9 +195,8 @@ def main() -> None:
             | {"monodromies_per_s": round(len(z) / wall), "monodromies_per_cpu_s": round(len(z) / cpu)}
             | {"max_error": float(error.max()), "median_error": float(np.median(error))}
         )
-    write_csv(
-        RESULTS / "heyoka.csv", rows, ["one core; relative error of rho against tolerance 1e-15; eigenvalues not timed"]
-    )
+    note = "one core; relative error of rho against tolerance 1e-15; eigenvalues not timed"
+    write_csv(results_folder(options) / "heyoka.csv", rows, [note])
     print(table(rows))
 
 

@@ -1,6 +1,9 @@
 """The planetary gear once more, independently of the package: forces assembled entry by entry with NumPy, eigenvalues
 by SciPy or, to any number of digits, by mpmath. Oracle of the tests and rival of the benchmark.
 
+    M q'' + K q = 0,  K = sum over springs of k d d^T,  f = sqrt(lambda(K, M))/(2 pi),
+
+with d the extension of a spring per unit of the coordinates q = [x, y, u] of carrier, ring, sun, [xi, eta, u] of planets.
 The stiffness matrix here is the one of the differential equations of motion, written body by body, whereas the package
 works with the extensions of the springs; both agree only if both are right.
 """

@@ -10,7 +10,6 @@ both cores. Errors are relative, the largest over all modes that move, against 5
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.planetary_reference import TABLE_2, exact_frequencies, extension_matrix, natural_frequencies
-from benchmarks.timing import PROCESSES, RESULTS, interleaved, median, table, write_csv
+from benchmarks.timing import PROCESSES, interleaved, median, parser, results_folder, table, write_csv
 
 COUNTS = (3, 4, 5, 7, 12)
 _CHECKED = 5
@@ -59,13 +58,13 @@ def package_job(planets: int, columns: Mapping[str, np.ndarray], method: str) ->
     engine = Engine(loaded)
     group = engine.plan.groups[0]
     kernel = compile_kernel(group.solver, engine.grid, group.chunk, result_variables(loaded))
-    parts = [group.order[i : i + group.chunk] for i in range(0, group.order.size, group.chunk)]
+    parts = [engine.plan.chunk(number).points for number in range(len(group.efforts))]
 
     def work(part: np.ndarray) -> np.ndarray:
         return kernel(engine.grid.columns(part), 1)["natural_frequency"]
 
     def job() -> np.ndarray:
-        found = np.empty((group.order.size, 9 + 3 * planets))
+        found = np.empty((group.size, 9 + 3 * planets))
         with ThreadPoolExecutor(PROCESSES) as pool:
             for part, values in zip(parts, pool.map(work, parts), strict=True):
                 found[part] = values
@@ -143,18 +142,16 @@ def measure(planets: int, count: int, repeats: int) -> list[dict[str, Any]]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--gears", type=int, default=20000)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--quick", action="store_true", help="a few gears, nothing written")
-    given = parser.parse_args(arguments)
+    known = parser(__doc__)
+    known.add_argument("--gears", type=int, default=20000)
+    known.add_argument("--repeats", type=int, default=5)
+    given = known.parse_args(arguments)
     count, repeats = (2048, 1) if given.quick else (given.gears, given.repeats)
     counts = COUNTS[1:2] if given.quick else COUNTS
     rows = [row for planets in counts for row in measure(planets, count, repeats)]
     print(table(rows))
-    if not given.quick:
-        note = f"{PROCESSES} threads for the package and for LAPACK; the SciPy loop runs on one core"
-        write_csv(RESULTS / "planetary_throughput.csv", rows, [note])
+    note = f"{PROCESSES} threads for the package and for LAPACK; the SciPy loop runs on one core"
+    write_csv(results_folder(given) / "planetary_throughput.csv", rows, [note])
 
 
 if __name__ == "__main__":

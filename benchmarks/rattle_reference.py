@@ -1,5 +1,8 @@
 """Independent solvers of the gear-rattle equation: oracle of the tests and rivals of the benchmarks. No jax in here.
 
+    u'' + (c/I) u' + (k/I) f(u) = B0 + B1 cos(omega t),
+    f = u - (1 - alpha) b for u > b, alpha u for |u| <= b, u + (1 - alpha) b for u < -b.
+
 ``extended`` goes from event to event in extended precision (80 bits): the general solution of each region from its
 complex roots, events bracketed by dense samples of u and of its extremes, then bisected. ``scipy_events`` integrates
 each region with SciPy and its event location. ``scipy_plain`` integrates across the kinks.

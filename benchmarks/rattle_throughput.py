@@ -1,10 +1,9 @@
 """Lane-periods per second of the gear-rattle solvers, and their error against run time.
 
-``python -m benchmarks.rattle_throughput`` writes benchmarks/results/rattle_throughput.csv and .png; with ``--quick``, in
-less than a minute, it prints a smaller table and writes nothing. Contenders are the closed form, diffrax with and
-without declared events, and SciPy with and without, on the same motions (Table 1 of the paper, omega 0.3 .. 1.5, ten drive
-periods from rest). The error is the largest over a few motions against extended precision; runs of which a motion failed
-are kept and marked.
+``python -m benchmarks.rattle_throughput`` writes benchmarks/results/rattle_throughput.csv and .png (``--quick``: a smaller
+table in less than a minute). Contenders are the closed form, diffrax with and without declared events, and SciPy with and
+without, on the same motions (Table 1 of the paper, omega 0.3 .. 1.5, ten drive periods from rest). The error is the
+largest over a few motions against extended precision; runs of which a motion failed are kept and marked.
 
 At omega = 0.3 the solvers with events differ by 2.4e-7 however small the tolerance: a contact that lasts 0.073 begins and
 ends within one of their steps at t = 146.9. With steps no longer than 0.05 SciPy finds it, and the error is 2e-15.
@@ -12,9 +11,9 @@ ends within one of their steps at t = 146.9. With steps no longer than 0.05 SciP
 
 from __future__ import annotations
 
-import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.rattle_reference import extended, scipy_events, scipy_plain
-from benchmarks.timing import RESULTS, interleaved, median, provenance, table, write_csv
+from benchmarks.timing import interleaved, median, parser, provenance, results_folder, table, write_csv
 from drivetrain_jax.analysis.piecewise_diffrax import integrate
 from drivetrain_jax.analysis.piecewise_march import march, prepare, start
 from drivetrain_jax.systems.rattle import PRESETS, oscillator
@@ -130,7 +129,7 @@ def ratio(rows: list[dict[str, Any]]) -> str:
     return f"{EVENTS} over {EXACT}, time per lane-period: {', '.join(times)}"
 
 
-def draw(rows: list[dict[str, Any]]) -> None:
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """The figure: error against time, crosses where motions failed."""
     figure = Figure(figsize=(6.5, 4.2), dpi=150)
     axes = figure.add_axes((0.12, 0.17, 0.84, 0.8))
@@ -147,19 +146,17 @@ def draw(rows: list[dict[str, Any]]) -> None:
     axes.legend(frameon=False, fontsize=8)
     known = provenance()
     figure.text(0.01, 0.01, f"{known['machine']}; {known['versions']}", fontsize=4.5)
-    figure.savefig(RESULTS / "rattle_throughput.png")
+    figure.savefig(path)
 
 
-def main() -> None:
-    """Measure all contenders; unless ``--quick``, write table and figure."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="fewer lanes, one tolerance; write nothing")
-    quick = parser.parse_args().quick
-    rows = measure(QUICK if quick else FULL)
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure all contenders, write table and figure."""
+    options = parser(__doc__).parse_args(arguments)
+    rows = measure(QUICK if options.quick else FULL)
     sys.stdout.write(f"{table(rows)}\n{ratio(rows)}\n")
-    if not quick:
-        write_csv(RESULTS / "rattle_throughput.csv", rows, [ratio(rows)])
-        draw(rows)
+    folder = results_folder(options)
+    write_csv(folder / "rattle_throughput.csv", rows, [ratio(rows)])
+    draw(rows, folder / "rattle_throughput.png")
 
 
 if __name__ == "__main__":

@@ -1,19 +1,15 @@
 """What the engine costs beside its kernels, and what large sweeps would cost: measured figures and a small simulation.
 
-``python -m benchmarks.scaling`` measures and writes the tables of docs/scaling.md; ``--points`` makes it smaller.
+``python -m benchmarks.scaling`` measures and writes the tables of docs/scaling.md, and results/ scaling.csv, overhead.csv,
+places.csv and memory.csv; ``--points`` makes it smaller, and with ``--quick`` or ``--out`` the page is left alone.
 """
 
 from __future__ import annotations
 
-import argparse
 import heapq
-import os
 import pickle
-import subprocess
-import sys
 import tempfile
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,100 +17,25 @@ from typing import Any
 import h5py
 import numpy as np
 
-from benchmarks.cardan_reference import BASE_CASE
-from benchmarks.timing import median, provenance, significant, write_csv
+from benchmarks import engine_cost
+from benchmarks.engine_cost import Memory, cpu_seconds, scene
+from benchmarks.timing import RESULTS, median, parser, provenance, results_folder, significant, write_csv
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.chunks import Part
-from drivetrain_jax.sweep import toml
 from drivetrain_jax.sweep.assemble import Table
 from drivetrain_jax.sweep.engine import Engine
-from drivetrain_jax.sweep.executor import IN_FLIGHT, run_threads
-from drivetrain_jax.sweep.run import run_to_file
+from drivetrain_jax.sweep.executor import IN_FLIGHT
 from drivetrain_jax.sweep.scene import load_scene
 
 PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
 BEGIN, END = "<!-- scaling: written by python -m benchmarks.scaling -->", "<!-- end of scaling -->"
-RESULTS = Path(__file__).parent / "results"
-
-
-def scene(points: int) -> dict[str, Any]:
-    """The chart of the README with about this many points, every one solved directly."""
-    rows = max(round((points * 3 / 4) ** 0.5), 2)
-    axes = {
-        "beta": {"start": 0.0, "stop": 1.5, "num": rows},
-        "Omega": {"start": 0.1, "stop": 2.0, "num": max(round(points / rows), 2)},
-    }
-    outputs = ["spectral_radius", "spectral_radius_error", "verdict"]
-    options = {"method": "direct", "rtol": 1e-9}
-    return {
-        "system": "cardan",
-        "analysis": "floquet",
-        "outputs": outputs,
-        "axes": axes,
-        "fixed": dict(BASE_CASE),
-        "options": options,
-    }
-
-
-def seconds(job: Callable[[], Any]) -> float:
-    """How long ``job`` takes."""
-    begin = time.perf_counter()
-    job()
-    return time.perf_counter() - begin
-
-
-def bare(engine: Engine) -> None:
-    """The kernels alone: all chunks in threads, results dropped."""
-    chunks = engine.ordered(range(len(engine.plan.costs)))
-    for _ in run_threads(chunks, engine.compute_chunk, os.cpu_count() or 1):
-        pass
-
-
-@dataclass(frozen=True)
-class Overhead:
-    """Seconds of the engine (scene to file) and of its kernels, in turns, and what the file takes."""
-
-    points: int
-    engine_s: float
-    kernels_s: float
-    bytes_per_point: float
-    resume_s: float
-
-    @property
-    def ratio(self) -> float:
-        """Time of the engine over that of the kernels, minus 1."""
-        return self.engine_s / self.kernels_s - 1
-
-
-def overhead(points: int, repeats: int, folder: Path) -> Overhead:
-    """Kernels are compiled before the clock starts in both; a finished run is resumed in a process of its own."""
-    out, content = folder / "overhead.nc", scene(points)
-    engine = Engine(load_scene(content))
-    bare(Engine(load_scene(scene(4096))))
-    run_to_file(content, out)
-    times: dict[str, list[float]] = {"engine": [], "kernels": []}
-    for _ in range(repeats):
-        times["kernels"].append(seconds(lambda: bare(engine)))
-        times["engine"].append(seconds(lambda: run_to_file(content, out, fresh=True)))
-    (folder / "scene.toml").write_text(toml.write(content))
-    command = [
-        sys.executable,
-        "-m",
-        "drivetrain_jax.cli",
-        "run",
-        str(folder / "scene.toml"),
-        "--out",
-        str(out),
-        "--quiet",
-    ]
-    resumes = [seconds(lambda: subprocess.run(command, check=True, capture_output=True)) for _ in range(3)]
-    size = out.stat().st_size / engine.total
-    return Overhead(engine.total, median(times["engine"]), median(times["kernels"]), size, median(resumes))
+# Points of the sweeps whose memory is looked at; a plan keeps up to 4 million sorted points.
+_MEMORY, _QUICK_MEMORY = (1_000_000, 10_000_000, 100_000_000), (1_000_000, 5_000_000)
 
 
 @dataclass(frozen=True)
 class Costs:
-    """Measured figures of one chunk and one point."""
+    """Measured figures of one chunk and one point; all seconds are those of one core."""
 
     chunk: int
     compute_s: float
@@ -127,16 +48,13 @@ class Costs:
 
 
 def costs(points: int) -> Costs:
-    """One core per chunk, as processes have it."""
+    """CPU seconds: one core per chunk, as processes have it."""
     engine = Engine(load_scene(scene(points)))
-    planning = seconds(lambda: engine.plan)
+    planning = cpu_seconds(lambda: engine.plan)
     chunks = [engine.plan.chunk(n) for n in range(len(engine.plan.costs))]
     sample = [chunks[i] for i in np.linspace(0, len(chunks) - 1, min(len(chunks), 24)).astype(int)]
     results = [engine.compute_chunk(chunk) for chunk in sample]
-    affinity = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(affinity)})
-    computing = [seconds(lambda c=chunk: engine.compute_chunk(c)) for chunk in sample]
-    os.sched_setaffinity(0, affinity)
+    computing = [cpu_seconds(lambda c=chunk: engine.compute_chunk(c)) for chunk in sample]
     sizes = [len(pickle.dumps(dict(result))) for result in results]
     table = Table(engine.scene, engine.grid)
     table.lay_out()
@@ -147,7 +65,7 @@ def costs(points: int) -> Costs:
         joined = {name: np.concatenate([r[name] for r in results]) for name in results[0]}
         Part([c.number for c in sample], [c.points.size for c in sample], joined, 0.0).to_bytes()
 
-    handling = median([seconds(handle) for _ in range(5)]) / len(sample)
+    handling = median([cpu_seconds(handle) for _ in range(5)]) / len(sample)
     per_point = sum(array.itemsize * array[0].size for array in results[0].values())
     return Costs(
         max(c.size for c in sample),
@@ -165,7 +83,7 @@ def hashing() -> float:
     """Seconds for one byte of a result when it is sealed."""
     with h5py.File("hash", "w", driver="core", backing_store=False) as file:
         values = file.create_dataset("x", data=np.random.default_rng(1).random(1 << 22))
-        return median([seconds(lambda: checksums.checksums(file)) for _ in range(3)]) / values.nbytes
+        return median([cpu_seconds(lambda: checksums.checksums(file)) for _ in range(3)]) / values.nbytes
 
 
 @dataclass(frozen=True)
@@ -227,7 +145,6 @@ def rows_of(cost: Costs) -> list[dict[str, str]]:
                 "chunks": f"{points / cost.chunk:.2g}",
                 "result": f"{size / 1e9:,.0f} GB",
                 "over the network": f"{points / cost.chunk * cost.transfer_bytes / 1e9:,.0f} GB",
-                "plan in the driver's memory (8 B a point)": f"{8 * points / 1e9:,.0f} GB",
                 "planning": f"{points * cost.plan_s_per_point / 3600:.2g} h",
                 "checksums": f"{size * cost.checksum_s_per_byte / 3600:.2g} h",
             }
@@ -242,12 +159,11 @@ def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def page(found: Overhead, cost: Costs, simulated: Sequence[Load]) -> str:
-    """The tables, with where they come from."""
+def page(tables: Mapping[str, str], cost: Costs, simulated: Sequence[Load]) -> str:
+    """The ``tables`` of what was measured, those of what follows, and where they come from."""
     where = "; ".join(f"{key}: {value}" for key, value in provenance().items())
     limit = cost.compute_s / cost.handle_s
     chunk_rows = [{"figure": name, "value": value} for name, value in asdict(cost).items()]
-    overhead_rows = [asdict(found) | {"engine over kernels": f"{100 * found.ratio:+.1f} %"}]
     load_rows = [
         {
             "points": f"{load.points:.0e}",
@@ -261,8 +177,7 @@ def page(found: Overhead, cost: Costs, simulated: Sequence[Load]) -> str:
     return "\n\n".join(
         [
             f"{where}.",
-            "### Overhead",
-            markdown(overhead_rows),
+            *(f"### {title}\n\n{table}" for title, table in tables.items()),
             "### One chunk",
             markdown(chunk_rows),
             "### Sweeps: size",
@@ -274,25 +189,52 @@ def page(found: Overhead, cost: Costs, simulated: Sequence[Load]) -> str:
     )
 
 
-def main() -> None:
+def memory_table(found: Sequence[Memory]) -> str:
+    """Memory against points."""
+    rows = [
+        {
+            "points": f"{m.points:,}",
+            "largest resident memory": f"{m.resident_mb:,.0f} MB",
+            "without mapped files": f"{m.own_mb:,.0f} MB",
+            "time": f"{m.seconds:.1f} s",
+        }
+        for m in found
+    ]
+    return (
+        f"{markdown(rows)}\n\nOne output of the cheapest analysis, each sweep in a process of its own. Between the two "
+        f"largest, memory grows by {engine_cost.slope(found):.2g} bytes a point."
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, simulate, write."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--points", type=int, default=1_000_000, help="points of the overhead measurement")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--dry", action="store_true", help="print, write nothing")
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        found = overhead(options.points, options.repeats, Path(folder))
-    cost = costs(min(options.points, 200_000))
+    known = parser(__doc__)
+    known.add_argument("--points", type=int, default=1_000_000, help="points of the overhead measurement")
+    known.add_argument("--repeats", type=int, default=3)
+    options = known.parse_args(arguments)
+    points, repeats = (50_000, 1) if options.quick else (options.points, options.repeats)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        found = engine_cost.overhead(points, repeats, folder)
+        elsewhere = engine_cost.places(min(points, 200_000), repeats, folder)
+        memory = engine_cost.memory(_QUICK_MEMORY if options.quick else _MEMORY, folder)
+    cost = costs(min(points, 200_000))
     simulated = loads(cost)
-    text = page(found, cost, simulated)
+    tables = {
+        "Overhead": markdown(engine_cost.rows_of(found)),
+        "Where chunks are computed": markdown(engine_cost.rows_of_places(elsewhere)),
+        "Memory": memory_table(memory),
+    }
+    text = page(tables, cost, simulated)
     print(text)
-    if not options.dry:
+    results = results_folder(options)
+    write_csv(results / "scaling.csv", [asdict(load) for load in simulated], [f"{asdict(cost)}"])
+    write_csv(results / "overhead.csv", [asdict(found) | {"engine_over_kernels": found.ratio}])
+    write_csv(results / "places.csv", [asdict(place) for place in elsewhere])
+    write_csv(results / "memory.csv", [asdict(m) for m in memory])
+    if results == RESULTS:
         before, _, rest = PAGE.read_text().partition(BEGIN)
         PAGE.write_text(f"{before}{BEGIN}\n\n{text}\n\n{END}{rest.partition(END)[2]}")
-        write_csv(
-            RESULTS / "scaling.csv", [asdict(load) for load in simulated], [f"{asdict(cost)}", f"{asdict(found)}"]
-        )
 
 
 if __name__ == "__main__":

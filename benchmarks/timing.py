@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 import datetime
 import io
 import os
 import platform
 import statistics
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -20,9 +22,27 @@ import numpy as np
 
 from benchmarks.cardan_reference import BASE_CASE
 
-RESULTS = Path(__file__).parent / "results"
+RESULTS = Path(__file__).resolve().parent / "results"
 PROCESSES = 2
 _PACKAGES = ("numpy", "scipy", "jax", "diffrax", "heyoka", "drivetrain_jax")
+
+
+def parser(doc: str) -> argparse.ArgumentParser:
+    """The options of every study: ``--quick`` and ``--out FOLDER``."""
+    options = argparse.ArgumentParser(description=doc.splitlines()[0])
+    options.add_argument("--quick", action="store_true", help="a small form; its files go to a temporary folder")
+    options.add_argument("--out", type=Path, metavar="FOLDER", help="where the files go (benchmarks/results)")
+    return options
+
+
+def results_folder(options: argparse.Namespace) -> Path:
+    """Where the files of a study go: quick figures never replace those of a full run unless that is asked for."""
+    if options.out is None and not options.quick:
+        return RESULTS
+    folder = (options.out or Path(tempfile.mkdtemp(prefix="benchmarks-"))).resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    print(f"results in {folder}")
+    return folder
 
 
 def chart(cells: int) -> dict[str, np.ndarray]:
@@ -75,6 +95,7 @@ def provenance() -> dict[str, str]:
         "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "machine": f"{_processor()}, {os.cpu_count()} cores",
         "load": ", ".join(f"{load:.2f}" for load in os.getloadavg()) + " (1, 5, 15 min, at the end of the run)",
+        "accelerator": "none" if not list(Path("/dev").glob("nvidia[0-9]*")) else "NVIDIA GPU",
         "versions": ", ".join([f"python {platform.python_version()}", *(f"{p} {_version(p)}" for p in _PACKAGES)]),
     }
 

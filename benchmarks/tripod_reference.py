@@ -1,6 +1,9 @@
 """The double-tripod driveshaft written plainly with NumPy and SciPy: the oracle of the tests and the baseline of the
 benchmarks.
 
+    phi'' + 2 zeta Omega sqrt(g) phi' + Omega^2 g phi = (M/I)(1 + chi ripple)(1 - 3 A sin 3 phi)/(1 + chi_n cos 2 phi),
+    g = (1 + c1 x)/((1 + c2 x)(1 + chi_n x)),  x = cos 2 phi in (25), (26), cos Theta in (29), (30), Theta' = 2 pi f.
+
 Nothing here comes from drivetrain_jax. State ``(phi, V)`` in rad and rad/s, time in seconds, the phase Theta taken from
 the time itself. ``k_t/I`` is formed from the moments of area, not from the paper's coefficients c1..c4, unless chi_n is
 prescribed: then the coefficients follow from it.

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
@@ -33,7 +33,7 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from benchmarks.cardan_reference import NAMES
-from benchmarks.timing import RESULTS, provenance, write_csv
+from benchmarks.timing import parser, provenance, results_folder, write_csv
 
 jax.config.update("jax_enable_x64", True)
 matplotlib.use("Agg")
@@ -184,14 +184,14 @@ def check_clock() -> float:
     return float(np.abs(ours - np.asarray(floquet_model(values).reduced.matrix(0.4))).max() / np.abs(ours).max())
 
 
-def measure() -> list[dict[str, Any]]:
+def measure(indices: Sequence[int]) -> list[dict[str, Any]]:
     """One row per candidate, point and number of steps; a method stops once its error no longer falls."""
     points = json.loads(REFERENCE.read_text())["points"]
     rows = []
     for candidate in CANDIDATES:
         example = {name: jnp.full(LANES, float(points[0][name])) for name in NAMES}
         compiled = jax.jit(candidate.propagate).lower(example, jnp.int64(1)).compile()
-        for index in POINTS:
+        for index in indices:
             point = points[index]
             lanes = {name: jnp.full(LANES, float(point[name])) for name in NAMES}
             for steps in (n for n in LADDER if n * candidate.evaluations <= MOST_EVALUATIONS):
@@ -231,7 +231,7 @@ def _timed(compiled: Any, lanes: Values, steps: int) -> tuple[np.ndarray, float]
 def cheapest(rows: list[dict[str, Any]], tolerance: float = 1e-9) -> list[dict[str, Any]]:
     """For every point and method: evaluations and time from which the error stays below ``tolerance``."""
     table = []
-    for index in POINTS:
+    for index in dict.fromkeys(row["point"] for row in rows):
         line: dict[str, Any] = {"point": index}
         for candidate in CANDIDATES:
             mine = [row for row in rows if row["method"] == candidate.label and row["point"] == index]
@@ -248,8 +248,11 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     import matplotlib.pyplot as plt
     from matplotlib.ticker import NullFormatter
 
-    figure, axes = plt.subplots(2, len(POINTS), figsize=(18, 7.2), sharey=True, layout="constrained")
-    for column, index in enumerate(POINTS):
+    indices = list(dict.fromkeys(row["point"] for row in rows))
+    figure, axes = plt.subplots(
+        2, len(indices), figsize=(3 * len(indices), 7.2), sharey=True, squeeze=False, layout="constrained"
+    )
+    for column, index in enumerate(indices):
         point = next(row for row in rows if row["point"] == index)
         for candidate in CANDIDATES:
             mine = [row for row in rows if row["method"] == candidate.label and row["point"] == index]
@@ -277,15 +280,17 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     plt.close(figure)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, write the CSV and the figure, print where every method reaches 1e-9."""
+    options = parser(__doc__).parse_args(arguments)
     difference = check_clock()
     if difference > 1e-13:
         raise RuntimeError(f"the benchmark's H differs from the package's by {difference:.1e}")
-    rows = measure()
+    rows = measure(POINTS[:2] if options.quick else POINTS)
     note = f"error: of the multipliers over rho; rho_error: |rho/reference - 1|; time per point of {LANES}, best of 5"
-    write_csv(RESULTS / "work_precision_cardan.csv", rows, [note])
-    draw(rows, RESULTS / "work_precision_cardan.png")
+    folder = results_folder(options)
+    write_csv(folder / "work_precision_cardan.csv", rows, [note])
+    draw(rows, folder / "work_precision_cardan.png")
     summary = cheapest(rows)
     print("evaluations / microseconds from which the error of the multipliers stays below 1e-9 rho")
     for line in summary:

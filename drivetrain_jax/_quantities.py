@@ -81,7 +81,9 @@ class Parameter:
         above = value >= self.upper if self.open_upper else value > self.upper
         finite = math.isfinite(value) or (self.infinite and value == math.inf)
         if not finite or below or above or (self.integer and value != int(value)):
-            raise ValueError(f"{label} = {value!r}: allowed is {self.allowed}")
+            # A number that is out of range was often meant in another unit.
+            unit = "" if self.units == "1" else f", in {self.units}"
+            raise ValueError(f"{label} = {value!r}: allowed is {self.allowed}{unit}")
         return int(value) if self.integer else float(value)
 
 

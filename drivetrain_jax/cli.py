@@ -6,7 +6,8 @@ import argparse
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -42,6 +43,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return OK
     except KeyboardInterrupt:
         return INTERRUPTED
+    finally:
+        if arguments is None:
+            # The process ends now, and what it has done is done: a signal could only spoil its way out.
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, signal.SIG_IGN)
 
 
 def _line(message: str) -> str:
@@ -143,7 +149,28 @@ def _add_design(commands: Any) -> None:
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
 
-_COMMANDS = (_add_list, _add_run, _add_status, _add_verify, _add_export, _add_plot, _add_point, _add_query, _add_design)
+def _add_bench(commands: Any) -> None:
+    command = _command(commands, "bench", _bench, "measure error and run time against the peers (source checkout only)")
+    command.add_argument("systems", nargs="*", metavar="SYSTEM", help="only the studies of these")
+    command.add_argument(
+        "--quick", action="store_true", help="small forms, minutes; the stored results stay as they are"
+    )
+    command.add_argument("--out", metavar="FOLDER", type=Path, help="where files and page go")
+    command.add_argument("--peers", metavar="PYTHON", help="interpreter of an environment with ROSS and pynamicalsys")
+
+
+_COMMANDS = (
+    _add_list,
+    _add_run,
+    _add_status,
+    _add_verify,
+    _add_export,
+    _add_plot,
+    _add_point,
+    _add_query,
+    _add_design,
+    _add_bench,
+)
 
 
 def _command(commands: Any, name: str, function: Any, text: str) -> argparse.ArgumentParser:
@@ -187,7 +214,11 @@ def _list(options: argparse.Namespace) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    check = _stop_on_signals()
+    with _stop_on_signals() as check:
+        return _compute(options, check)
+
+
+def _compute(options: argparse.Namespace, check: Callable[[], None]) -> int:
     from drivetrain_jax.sweep.executor import Where
     from drivetrain_jax.sweep.run import Incomplete, Interrupted, run_to_file
 
@@ -226,12 +257,15 @@ def _run(options: argparse.Namespace) -> int:
     return code
 
 
-def _stop_on_signals() -> Callable[[], None]:
-    """Ctrl-C and a scheduler's SIGTERM raise ``KeyboardInterrupt``, and the returned function does so again.
+@contextmanager
+def _stop_on_signals() -> Iterator[Callable[[], None]]:
+    """Ctrl-C and a scheduler's SIGTERM raise ``KeyboardInterrupt``, and the function that it gives does so again.
 
-    The second time is for an exception that a destructor or a C callback has swallowed.
+    The second time is for an exception that a destructor or a C callback has swallowed. What these say of it, and of what
+    it left half made, is not shown.
     """
     caught: list[int] = []
+    before = sys.unraisablehook
 
     def check() -> None:
         if caught:
@@ -242,14 +276,22 @@ def _stop_on_signals() -> Callable[[], None]:
         caught.append(number)
         check()
 
+    def hook(unraisable: Any) -> None:
+        if not caught:
+            before(unraisable)
+
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
-    return check
+    sys.unraisablehook = hook
+    try:
+        yield check
+    finally:
+        # After a signal the process is about to end, and what was left half made ends with it.
+        if not caught:
+            sys.unraisablehook = before
 
 
 def _progress_line(quiet: bool) -> Any:
-    from contextlib import nullcontext
-
     if quiet:
         return nullcontext()
     from drivetrain_jax._progress import progress_line
@@ -361,6 +403,20 @@ def _design(options: argparse.Namespace) -> int:
     reply = question(atlas, given, **extra)
     sys.stdout.write((reply.to_json() if options.json else str(reply)) + "\n")
     return OK
+
+
+def _bench(options: argparse.Namespace) -> int:
+    import subprocess
+
+    checkout = Path(__file__).resolve().parents[1]
+    if not (checkout / "benchmarks" / "__main__.py").is_file():
+        raise InputError(
+            f"bench: no folder benchmarks/ beside {str(checkout / 'drivetrain_jax')!r}; allowed is a checkout"
+        )
+    words = [*options.systems, *(["--quick"] if options.quick else [])]
+    words += ["--out", str(options.out.absolute())] if options.out else []
+    words += ["--peers", options.peers] if options.peers else []
+    return subprocess.run([sys.executable, "-m", "benchmarks", *words], cwd=checkout, check=False).returncode
 
 
 def _ranges(texts: Sequence[str], field: str) -> dict[str, Any]:

@@ -12,9 +12,11 @@ from jax import Array
 from drivetrain_jax.analysis._base import Solver
 from drivetrain_jax.analysis.direct import Monodromy, direct_monodromy, stiffness_of
 from drivetrain_jax.analysis.floquet_effort import PANEL_COST, explicit_effort, implicit_effort
+from drivetrain_jax.analysis.lanes import in_blocks
 from drivetrain_jax.analysis.propagator import (
     EXPLICIT_ORDER,
     IMPLICIT_ORDER,
+    LANES,
     Propagator,
     explicit_propagator,
     implicit_propagator,
@@ -64,8 +66,14 @@ def _solve(
     periodic = form(model)
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in values.values() if not isinstance(x, str)))
 
-    def propagate(steps: Array) -> Propagator:
-        return explicit_propagator(periodic, steps, shape) if explicit else implicit_propagator(periodic, steps)
+    def in_lanes(steps: Array) -> Propagator:
+        def block(part: Mapping[str, Any], count: int) -> Propagator:
+            own = form(system.models["floquet"].build(part))
+            return explicit_propagator(own, steps, (count,) if shape else ())
+
+        return in_blocks(block, values, shape[0] if shape else 1, LANES)
+
+    propagate = in_lanes if explicit else partial(implicit_propagator, periodic)
 
     order, stiffness = (EXPLICIT_ORDER, 0.0) if explicit else (IMPLICIT_ORDER, stiffness_of(periodic))
     return results(model, direct_monodromy(periodic, propagate, effort, shape, stiffness, target, order))

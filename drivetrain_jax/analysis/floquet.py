@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -44,6 +43,8 @@ def _direct_solvers(system: System, request: Request) -> tuple[Solver, ...]:
 
 
 def _diffrax_solvers(system: System, request: Request) -> tuple[Solver, ...]:
+    import diffrax  # a quarter of the time in which a process that does not need it is ready
+
     rtol, atol = request.options["rtol"], request.options["atol"]
     method = getattr(diffrax, request.options["solver"])()
     needs_error = bool(NEED_ERROR & set(request.outputs))

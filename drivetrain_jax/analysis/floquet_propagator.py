@@ -28,7 +28,7 @@ VARIABLES = (
 
 
 # An atlas asks for a hundred points at a time: large chunks would leave most lanes, and a core, without work.
-_CHUNKS = (128, 16)
+_CHUNKS = (64, 16)
 
 
 def whole_span(form: LinearPeriodic) -> LinearPeriodic:

@@ -74,6 +74,36 @@ def size_of(flow: Flow) -> Array:
     return jnp.max(jnp.abs(start)) + jnp.max(jnp.abs(rate)) / fastest
 
 
+def _segment(
+    flow: Flow,
+    solver: diffrax.AbstractSolver,
+    controller: diffrax.AbstractStepSizeController,
+    place: _Place,
+    end: Array,
+) -> tuple[Array, Array, Array]:
+    """State at the fraction ``end`` of the strobe, number of steps, and whether the integration went well."""
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda s, y, _: flow.period * flow.vector(place.strobe, s, y)),
+        solver,
+        t0=place.fraction,
+        t1=end,
+        dt0=None,
+        y0=place.y,
+        stepsize_controller=controller,
+        saveat=diffrax.SaveAt(t1=True),
+        max_steps=_MAX_SEGMENT,
+        throw=False,
+    )
+    well = solution.result == diffrax.RESULTS.successful
+    return solution.ys[0], solution.stats["num_steps"], well
+
+
+def _ahead(place: _Place, target: tuple[Array, Array]) -> Array:
+    """Whether the place is before the target."""
+    strobe, fraction = target
+    return place.healthy & ((place.strobe < strobe) | (place.fraction < fraction))
+
+
 def trajectory(flow: Flow, times: Array, tolerance: float, solver: diffrax.AbstractSolver) -> tuple[Array, Array]:
     """States at the rising ``times``, shape ``(len(times), n)``, and whether the step limit was kept; NaN beyond it.
 
@@ -83,32 +113,12 @@ def trajectory(flow: Flow, times: Array, tolerance: float, solver: diffrax.Abstr
     turns = times / flow.period
     strobes = jnp.floor(turns).astype(jnp.int64)
 
-    def segment(place: _Place, end: Array) -> tuple[Array, Array, Array]:
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda s, y, _: flow.period * flow.vector(place.strobe, s, y)),
-            solver,
-            t0=place.fraction,
-            t1=end,
-            dt0=None,
-            y0=place.y,
-            stepsize_controller=controller,
-            saveat=diffrax.SaveAt(t1=True),
-            max_steps=_MAX_SEGMENT,
-            throw=False,
-        )
-        well = solution.result == diffrax.RESULTS.successful
-        return solution.ys[0], solution.stats["num_steps"], well
-
-    def ahead(place: _Place, target: tuple[Array, Array]) -> Array:
-        strobe, fraction = target
-        return place.healthy & ((place.strobe < strobe) | (place.fraction < fraction))
-
     def advance(place: _Place, target: tuple[Array, Array]) -> _Place:
         strobe, fraction = target
         last = place.strobe == strobe
         # In a batch a lane that has arrived or failed takes part until the others are there: it must not take steps.
-        end = jnp.where(ahead(place, target), jnp.where(last, fraction, 1.0), place.fraction)
-        y, steps, well = segment(place, end)
+        end = jnp.where(_ahead(place, target), jnp.where(last, fraction, 1.0), place.fraction)
+        y, steps, well = _segment(flow, solver, controller, place, end)
         total = place.steps + steps
         healthy = place.healthy & well & (total <= _MAX_STEPS) & jnp.all(jnp.isfinite(y))
         return _Place(
@@ -120,7 +130,7 @@ def trajectory(flow: Flow, times: Array, tolerance: float, solver: diffrax.Abstr
         )
 
     def to(place: _Place, target: tuple[Array, Array]) -> tuple[_Place, Array]:
-        place = jax.lax.while_loop(lambda p: ahead(p, target), lambda p: advance(p, target), place)
+        place = jax.lax.while_loop(lambda p: _ahead(p, target), lambda p: advance(p, target), place)
         return place, jnp.where(place.healthy, place.y, jnp.nan)
 
     start = jnp.stack([jnp.asarray(x, float) for x in flow.start])

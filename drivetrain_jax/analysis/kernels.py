@@ -18,6 +18,8 @@ from drivetrain_jax.store.provenance import instruction_set
 
 P, R = ParamSpec("P"), TypeVar("R")
 
+# Numbers in a vector of AVX-512.
+FULL_WIDTH = 8
 # A call that is not inlined is not fused with what surrounds it either: its results are computed once and stored.
 _APART = {"inlineable": "false"}
 # What XLA does of its own accord with loops over less than half a kilobyte.
@@ -36,9 +38,12 @@ _STRUCTURE = """
 _KNOWN = {*_ELEMENTWISE.split(), *_STRUCTURE.split()}
 
 
-def compiler_options() -> dict[str, Any] | None:
-    """Full vector width: XLA uses half of AVX-512 unless told otherwise, which costs a factor of 1.6."""
-    if jax.default_backend() == "cpu" and "avx512f" in instruction_set():
+def compiler_options(lanes: int = FULL_WIDTH) -> dict[str, Any] | None:
+    """Full vector width: XLA uses half of AVX-512 unless told otherwise, which costs a factor of 1.6.
+
+    Not for fewer ``lanes`` than a vector has: a march of four lanes then takes the compiler tens of gigabytes (jax 0.10.2).
+    """
+    if jax.default_backend() == "cpu" and "avx512f" in instruction_set() and lanes >= FULL_WIDTH:
         return {"xla_cpu_prefer_vector_width": 512}
     return None
 

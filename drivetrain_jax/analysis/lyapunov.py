@@ -48,7 +48,6 @@ OPTIONS = (
 # Strobes that follow the run for the verdict and the 0-1 test, and the longest period looked for among them.
 SAMPLES, LONGEST = 1024, 512
 _SECTION = {"verdict", "chaos_k01", "period_multiple"}
-_TWO_STEPS = {"verdict", "step_change"}
 # Repetition is judged to this fraction of the motion, or to what is left of the transient if that is more; undecided
 # beyond the second.
 _REPEATED, _UNSETTLED = 1e-9, 1e-4

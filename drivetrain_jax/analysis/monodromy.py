@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 from jax import Array
+
+if TYPE_CHECKING:
+    import diffrax
 
 Field = Callable[[Any, Array], Array]
 
@@ -38,6 +40,8 @@ def state_transition(
 
     Returns ``(state at span, matrix (n, n), success)``; both are NaN where the integration failed.
     """
+    import diffrax
+
     identity = jnp.eye(state.shape[0])
 
     def variational(t: Any, y: Any, _: Any) -> Any:

@@ -4,8 +4,12 @@ Time is a counted strobe plus a fraction of it, so that the angles of the clocks
 equal steps of order 8. The method ``adaptive`` is there to show what a loose tolerance does: the pair of Dormand &
 Prince of orders 5 and 4 with the control of ``rtol`` and ``atol`` that is usual for it.
 
-Outcome: ``NOT_FINITE`` if the state overflowed: what came before is kept. ``STEP_LIMIT``: the adaptive method needed too
-many steps within a strobe.
+Both methods check themselves: some strobes are taken again by equal steps, twice as many as ``fixed`` takes, and
+``strobe_error`` is the largest change. It is the error of one strobe; the motion carries it on, and forgets it as fast
+as it is damped.
+
+Outcome: ``TOLERANCE_NOT_MET`` if ``strobe_error`` exceeds 1e-6 or ten times ``rtol``. ``NOT_FINITE`` if the state
+overflowed: what came before is kept. ``STEP_LIMIT``: the adaptive method needed too many steps within a strobe.
 """
 
 from __future__ import annotations
@@ -24,7 +28,7 @@ from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.growth import discarded, sampled
 from drivetrain_jax.analysis.section_measures import period_multiple, torus_residual
-from drivetrain_jax.analysis.variational import batch_shape
+from drivetrain_jax.analysis.variational import Frame, batch_shape, one_kernel, strobe_map
 from drivetrain_jax.analysis.zero_one_test import largest_k01
 from drivetrain_jax.systems import Flow, System
 
@@ -33,6 +37,7 @@ VARIABLES = (
     Variable("torus_residual", "1", "largest distance from a smooth curve, over the largest value", ("state",)),
     Variable("distinct_points", "1", "distinct points of the section, 0 if it does not repeat", dtype="int32"),
     Variable("chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic"),
+    Variable("strobe_error", "1", "estimated error made within one strobe, over the largest value"),
 )
 OPTIONS = (
     Parameter("strobes", "1", "points of the section", default=5000, lower=128, integer=True),
@@ -45,6 +50,8 @@ OPTIONS = (
 _DISTINCT, _LONGEST = 1e-9, 8192
 _SAMPLES = 2000
 _MAX_STEPS = 4096
+# Strobes that are taken again, the steps of each after the adaptive method, and the change above which it is said.
+_CHECKED, _CHECKING_STEPS, _TOLERATED = 8, 96, 1e-6
 # Numbers of a chunk's sections, and points of a chunk at most.
 _NUMBERS, _CHUNK = 1 << 23, 64
 Section = tuple[Array, Array]
@@ -84,10 +91,28 @@ def adaptive_section(flow: Flow, request: Request) -> Section:
     return states, jnp.where(well, Outcome.SUCCESS, Outcome.STEP_LIMIT).astype(jnp.int8)
 
 
+def strobe_error(flow: Flow, states: Array, request: Request) -> Array:
+    """Largest change over a strobe, relative to the largest value, when some of the ``states`` (T, n, ...) are carried
+    on to the next one by equal steps; shape ``(...)``."""
+    steps = 2 * request.options.get("steps", _CHECKING_STEPS // 2)
+    begun = np.linspace(0, len(states) - 2, _CHECKED).astype(int)
+    number = jnp.asarray(request.options["discard"] + 1 + begun).reshape(-1, *(1,) * (states.ndim - 2))
+    start = Frame(tuple(jnp.moveaxis(states[begun], 1, 0)))
+    ends = one_kernel(flow)(lambda frame: strobe_map(flow, steps)(number, frame))(start).state
+    watched = _watched(flow)
+    change = jnp.abs(jnp.stack(ends, axis=1) - states[begun + 1])[:, watched]
+    return jnp.max(change, axis=(0, 1)) / jnp.max(jnp.abs(states[:, watched]), axis=(0, 1))
+
+
+def _watched(flow: Flow) -> np.ndarray:
+    """Components that are neither phases nor angles."""
+    return np.array([i for i in range(flow.size) if i not in (*flow.phases, *flow.cyclic)] or [0])
+
+
 def measures(flow: Flow, states: Array, request: Request) -> dict[str, Array]:
     """Torus residual, distinct points and K of the section ``states``, as far as they are requested."""
     results: dict[str, Array] = {}
-    watched = jnp.array([i for i in range(flow.size) if i not in (*flow.phases, *flow.cyclic)] or [0])
+    watched = _watched(flow)
     if "torus_residual" in request.outputs:
         strobes = request.options["discard"] + 1 + jnp.arange(len(states))
         results["torus_residual"] = torus_residual(states, _angle(flow, strobes))
@@ -117,6 +142,10 @@ def _solve(system: System, request: Request, values: Mapping[str, Any], effort: 
     section = adaptive_section if request.method == "adaptive" else fixed_section
     states, outcome = section(flow, request)
     results = measures(flow, states, request)
+    error = results["strobe_error"] = strobe_error(flow, states, request)
+    tolerated = min(_TOLERATED, 10 * request.options.get("rtol", _TOLERATED))
+    missed = jnp.where(error > tolerated, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
+    outcome = jnp.maximum(outcome, missed.astype(jnp.int8))
     scale = jnp.stack(
         [jnp.broadcast_to(jnp.asarray(s, float), states.shape[2:]) for s in flow.scale or (1.0,) * flow.size]
     )

@@ -32,7 +32,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax.analysis.shaft_functions import Compound, General, Plane, compound, general
+from drivetrain_jax.analysis.shaft_functions import Compound, General, Plane, compound, general, sign_of
 from drivetrain_jax.systems import Shaft
 
 # Halvings of a Timoshenko segment: enough for a million half waves.
@@ -101,7 +101,7 @@ def characteristic(shaft: Shaft, q: Array, counting: bool = True) -> Value:
         behind = functions.propagate(u)
         if counting:
             clamped, sign_q = clamped_count(segment, functions, q)
-            positive = _sign(behind[0])
+            positive = sign_of(behind[0])
             count = count + clamped + _negative(positive * sign * sign_q, _trace(u, sign, functions, sign_q))
             sign = positive
         size = _size(behind)
@@ -179,7 +179,7 @@ def _enter(state: _State, segment: _Segment, q: Array) -> _State:
     u, sign, count = state
     if segment.k_hinge is not None:
         u = _across_hinge(u, segment.k_hinge, segment.e1, q)
-        after = _sign(u[0])
+        after = sign_of(u[0])
         count, sign = count + 0.5 * (1 - after * sign), after
     u = _across_support(u, segment.k, segment.m, segment.unit, q)
     u0, u1, u2, u3, u4 = u
@@ -223,7 +223,7 @@ def _end(state: _State, last: tuple[Array, Array | None, Array, Array, Array], q
     psi = u4 / jnp.sqrt(u0**2 + u1**2 + (u2**2 / (e1 * e3)) + u3**2 + u4**2)
     if not counting:
         return Value(psi, None)
-    return Value(psi, state.count + _negative(_sign(u4) * state.sign, (u1 + u3) * state.sign))
+    return Value(psi, state.count + _negative(sign_of(u4) * state.sign, (u1 + u3) * state.sign))
 
 
 def clamped_count(segment: _Segment, functions: Compound | General, q: Array) -> tuple[Array, Array]:
@@ -231,7 +231,7 @@ def clamped_count(segment: _Segment, functions: Compound | General, q: Array) ->
     if isinstance(functions, Compound):
         # The frequencies cos z ch z = 1 lie next to z = (n + 1/2) pi: between them (-1)^floor(z/pi) is far from a jump.
         half_waves = jnp.floor(functions.growth / math.pi)
-        sign = _sign(functions.Q)
+        sign = sign_of(functions.Q)
         parity = 1 - 2 * (half_waves - 2 * jnp.floor(half_waves / 2))
         return half_waves - 0.5 * (1 - parity * sign), sign
     return _count_by_halving(q * segment.beta, functions)
@@ -252,7 +252,7 @@ def _count_by_halving(z: Array, whole: General) -> tuple[Array, Array]:
     def double(level: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         count, sign = state
         w = general(z * 2.0 ** (level - levels), s, t).propagate(clamped)
-        k11, k22 = _sign(w[3]) * sign, _sign(w[1]) * sign
+        k11, k22 = sign_of(w[3]) * sign, sign_of(w[1]) * sign
         return 2 * count + 0.5 * (1 - k11) + 0.5 * (1 - k22), k11 * k22
 
     return jax.lax.fori_loop(0, levels, double, (jnp.zeros_like(z), jnp.ones_like(z)))
@@ -282,7 +282,3 @@ def _negative(determinant: Array, trace: Array) -> Array:
 
 def _size(u: Plane) -> Array:
     return sum(jnp.abs(x) for x in u)
-
-
-def _sign(x: Array) -> Array:
-    return jnp.where(x < 0, -1.0, 1.0)

@@ -43,6 +43,11 @@ def horner(coefficients: tuple[float, ...], x: Array) -> Array:
     return total
 
 
+def sign_of(x: Array) -> Array:
+    """-1 for negative ``x``, else 1, of zero too."""
+    return jnp.where(x < 0, -1.0, 1.0)
+
+
 def sine_cosine(z: Array) -> tuple[Array, Array]:
     """``sin z`` and ``cos z`` to 1 ulp for ``|z| < 1e6``; XLA's own are not vectorised in double precision."""
     quadrant = jnp.round(z * 0.63661977236758134308)

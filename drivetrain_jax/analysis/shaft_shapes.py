@@ -15,7 +15,7 @@ from jax import Array
 
 from drivetrain_jax.analysis.linear_algebra import matmul
 from drivetrain_jax.analysis.shaft_compound import Scales, planes
-from drivetrain_jax.analysis.shaft_functions import Plane, Waves, even_and_odd
+from drivetrain_jax.analysis.shaft_functions import Plane, Waves, even_and_odd, sign_of
 from drivetrain_jax.systems import Shaft
 
 
@@ -95,10 +95,6 @@ def _deflection(front: _Split, behind: _Split, waves: Waves, z: Array, xi: Array
     return trigonometric + jnp.where(long, falling + rising, short)
 
 
-def _sign(x: Array) -> Array:
-    return jnp.where(x < 0, -1.0, 1.0)
-
-
 def mode_shapes(shaft: Shaft, q: Array, x: Array) -> Array:
     """Deflections of the modes ``q = sqrt(p) > 0`` at ``x`` in [0, 1], the distance from A over the whole length.
 
@@ -131,7 +127,7 @@ def _along_segment(front: _Split, behind: _Split, waves: Waves, z: Array) -> Arr
     c, sn, _ = even_and_odd(-waves.trigonometric2, z)
     carried = front.trig * c + front.trig_slope * sn
     turned = front.trig_slope * c - waves.trigonometric2 * front.trig * sn
-    return _sign(carried * behind.trig + turned * behind.trig_slope / waves.trigonometric2)
+    return sign_of(carried * behind.trig + turned * behind.trig_slope / waves.trigonometric2)
 
 
 def _across_joint(shaft: Shaft, scales: Scales, i: int, before: Array, after: Array) -> Array:
@@ -139,7 +135,7 @@ def _across_joint(shaft: Shaft, scales: Scales, i: int, before: Array, after: Ar
     f = before[0] * after[0]
     moment = before[2] * after[2] * scales.e2[i - 1] / scales.e2[i]
     theta = 0.0 if shaft.k_hinge is not None else before[1] * after[1] * scales.b[i - 1] / scales.b[i]
-    return _sign(f + moment + theta)
+    return sign_of(f + moment + theta)
 
 
 def normalised(shape: Array) -> Array:

@@ -7,10 +7,10 @@ them share twice.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -30,12 +30,13 @@ from drivetrain_jax.systems import FloquetModel
 
 # Cells of a tile. The columns of one row are the lanes of all loops: few enough for them not to be cut into parallel tasks.
 ROWS, COLUMNS = 64, 512
-# Tiles in work per core.
+# Pieces of work per core that are under way.
 _AHEAD = 2
 # Interpolation between nodes multiplies their roundings by less than this.
 _SPREAD = 4.0
 
 Results = Mapping[str, np.ndarray]
+T = TypeVar("T")
 
 
 def errors_of(panel: Panel) -> np.ndarray:
@@ -64,11 +65,16 @@ def judged_tiles(
         found = kernel(tile.spread is not None)(*factors, errors_of(tile.panel), values, fixed)
         return {name: np.asarray(value) for name, value in found.items()}
 
+    return in_threads(tiles, work)
+
+
+def in_threads(pieces: Iterable[T], work: Callable[[T], Results]) -> Iterator[tuple[T, Results]]:
+    """Every piece with ``work(piece)``, in order, done on all cores; pieces are taken only as they are needed."""
     threads = usable_cores()
     with ThreadPoolExecutor(threads, thread_name_prefix="tile") as pool:
-        pending: deque[tuple[Tile, Future[Results]]] = deque()
-        for tile in tiles:
-            pending.append((tile, pool.submit(work, tile)))
+        pending: deque[tuple[T, Future[Results]]] = deque()
+        for piece in pieces:
+            pending.append((piece, pool.submit(work, piece)))
             if len(pending) > _AHEAD * threads:
                 done, results = pending.popleft()
                 yield done, results.result()
@@ -95,10 +101,10 @@ def tile_kernel(build: Build, names: tuple[str, ...], rtol: float, kind: str) ->
             model, phi = bind(values, fixed, value), weights @ columns
             log_d = jnp.broadcast_to(model.reduced.log_determinant(), phi.shape[1:])
             parts = quartic.blocks(phi)
-            packed = _packed(quartic.coefficients(parts, log_d, errors[1:]))
+            packed = pack(quartic.coefficients(parts, log_d, errors[1:]))
             return (packed, exact_verdict(model, parts, errors[0])) if kind == "undamped" else (packed,)
 
-        return _unpacked(*jax.lax.map(row, (first, values[names[-2]])), rtol=rtol)
+        return unpack(*jax.lax.map(row, (first, values[names[-2]])), rtol=rtol)
 
     def dense(first, columns, spread, errors, values, fixed):
         parts = quartic.blocks(jnp.moveaxis(first @ columns, 1, 0))
@@ -109,9 +115,9 @@ def tile_kernel(build: Build, names: tuple[str, ...], rtol: float, kind: str) ->
             e, bounds, value = inputs
             lanes = e @ spread
             log_d = jnp.broadcast_to(bind(values, fixed, value).reduced.log_determinant(), lanes.shape[1:])
-            return (_packed(quartic.with_determinant(lanes, bounds, log_d)),)
+            return (pack(quartic.with_determinant(lanes, bounds, log_d)),)
 
-        return _unpacked(*jax.lax.map(row, (at_nodes, bounds, values[names[-2]])), rtol=rtol)
+        return unpack(*jax.lax.map(row, (at_nodes, bounds, values[names[-2]])), rtol=rtol)
 
     return jax.jit(dense if kind == "dense" else sparse, compiler_options=compiler_options())
 
@@ -122,7 +128,7 @@ def _left_out(e: Array) -> Array:
     return 2 * jnp.sum(jnp.abs(e @ last), axis=-1)
 
 
-def _packed(c: quartic.Coefficients) -> Array:
+def pack(c: quartic.Coefficients) -> Array:
     """rho + i error of lanes; the error is negative if they are to be judged again."""
     rho, error, unsure = quartic.spectral_radius(c)
     # A bound at the limit of rounding cannot be improved.
@@ -140,7 +146,8 @@ def exact_verdict(model: FloquetModel, phi: quartic.Blocks, value_error: Array) 
     )
 
 
-def _unpacked(packed: Array, exact: Array | None = None, *, rtol: float) -> dict[str, Array]:
+def unpack(packed: Array, exact: Array | None = None, *, rtol: float) -> dict[str, Array]:
+    """Results by name from those of :func:`pack` and the verdicts of Hamiltonian lanes."""
     rho, error = packed.real, jnp.abs(packed.imag)
     verdict = verdict_of(rho, error)
     unsure = ~(packed.imag > 0)

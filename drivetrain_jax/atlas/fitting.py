@@ -70,13 +70,13 @@ def _judge(
     scale = quantity.scale(np.concatenate([values, checks.values]))
     limit = tolerance * scale.min()
     tails = np.array([decay.remainder(slabs(tensor, k)) for k in range(tensor.ndim - 1)]) / (limit / 2)
-    errors = _distance(evaluate(tensor, t), checks.values)
-    if np.max(errors / scale[len(values) :]) > tolerance / 2 or tails.max() > 1:
-        return None, tails, limit / 2
     tensor = np.where(np.max(np.abs(tensor), axis=-1, keepdims=True) > _NEGLIGIBLE * limit, tensor, 0.0)
     fitted = evaluate(tensor, t)
+    errors = _distance(fitted, checks.values)
+    if np.max(errors / scale[len(values) :]) > tolerance / 2 or tails.max() > 1:
+        return None, tails, limit / 2
     derived = np.abs(quantity.derived(fitted) - quantity.derived(checks.values))
-    bounds = float(_SAFETY * _distance(fitted, checks.values).max()), _SAFETY * derived.max(axis=0, initial=0.0)
+    bounds = float(_SAFETY * errors.max()), _SAFETY * derived.max(axis=0, initial=0.0)
     return Panel(progress.box.lower, progress.box.upper, tensor, *bounds), tails, limit / 2
 
 

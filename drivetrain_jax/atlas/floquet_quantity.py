@@ -24,7 +24,7 @@ def floquet_quantity(form: LinearPeriodic) -> Quantity:
 
     Derived are the coefficients a_k of det(sigma I - Z), all but the last where Liouville's formula gives that one.
     """
-    n = form.size
+    n = form.size if form.reversor is None else len(form.reversor)
     count = n if form.log_determinant is None else n - 1
 
     def monodromy(values: np.ndarray) -> np.ndarray:
@@ -37,10 +37,19 @@ def floquet_quantity(form: LinearPeriodic) -> Quantity:
         return size if form.reversor is None else size / (2 * np.linalg.norm(values, axis=1))
 
     def derived(values: np.ndarray) -> np.ndarray:
-        z = np.moveaxis(monodromy(values), 0, -1)
-        return np.asarray(characteristic_coefficients(z)).T[:, :count]
+        return _characteristic_coefficients(monodromy(values))[:, :count]
 
     return Quantity(n * n, scale, derived)
+
+
+def _characteristic_coefficients(z: np.ndarray) -> np.ndarray:
+    """As :func:`characteristic_coefficients`, ``(N, n, n) -> (N, n)``: without JAX, which would trace every step for few
+    points."""
+    power, found = z, []
+    for k in range(1, z.shape[1] + 1):
+        found.append(-np.trace(power, axis1=1, axis2=2) / k)
+        power = z @ power + found[-1][:, None, None] * z
+    return np.stack(found, axis=-1)
 
 
 def judge(

@@ -49,8 +49,10 @@ def growth(criteria: Criteria, x: np.ndarray, kinds: list[str], *, second: bool 
     dz = [_matrices(a, phi) + _matrices(phi, a) for a in first]
     ds = np.stack([np.einsum("ni,nij,nj->n", yl, a, xr) for a in dz], axis=-1)
     hessian = np.full((n, d, d), np.nan)
+    # What lies outside the panels is NaN here and below.
     if second:
-        hessian = _second(criteria, x, phi, first, dz, (sigma, right, left, chosen, ds))
+        with np.errstate(invalid="ignore"):
+            hessian = _second(criteria, x, phi, first, dz, (sigma, right, left, chosen, ds))
     size = np.linalg.norm(xr, axis=1) * np.linalg.norm(yl, axis=1)
     scale = np.sqrt((phi**2).sum(axis=0))
     error = 2 * scale * (_value_error(criteria, x) + 8 * np.finfo(float).eps * scale) * size / np.abs(s)

@@ -1,8 +1,9 @@
 """Stability from an atlas of the propagator: spectral radius with its bound and verdict, on grids and at points.
 
-Most cells of a grid are judged in closed form (``charts``). Those for which that gives too wide a bound or no verdict are
-judged again by the eigenvalues of Z, as every single point is, and by the test of Schur and Cohn where the interval of rho
-holds 1; without damping the verdict is that of ``conservative``.
+Most cells of a grid and most points are judged in closed form (``charts``, ``points``). Those for which that gives too wide
+a bound or no verdict are judged again by the eigenvalues of Z, and by the test of Schur and Cohn where the interval of
+rho holds 1; without damping the verdict is that of ``conservative``. Results that the closed form does not give come from
+the eigenvalues, as do all results of systems without it.
 """
 
 from __future__ import annotations
@@ -21,8 +22,10 @@ from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.floquet_results import VARIABLES
 from drivetrain_jax.analysis.kernels import compiler_options
 from drivetrain_jax.atlas import charts, evaluation, quartic
+from drivetrain_jax.atlas.expansion import Expansion
 from drivetrain_jax.atlas.floquet_quantity import Build, judge
 from drivetrain_jax.atlas.panels import Atlas
+from drivetrain_jax.atlas.points import judged_cells, point_kernel
 from drivetrain_jax.atlas.tiles import Tile, tiles
 from drivetrain_jax.systems import FloquetModel
 
@@ -53,6 +56,21 @@ class StabilityAtlas:
         Points that no panel covers are NaN, their verdict undecided and their outcome ``LOST``: these are to be solved.
         """
         points = np.atleast_2d(np.asarray(points, float))
+        if not (self._closed_form and _FAST.issuperset(outputs) and self.atlas.panels):
+            return self._by_eigenvalues(points, outputs)
+        x, found = self.atlas.to_coordinates(points), _blank(outputs, (len(points),), 0)
+        kernel = point_kernel(self.build, self.rtol, self._may_be_undamped(points.T))
+        unsure = [np.empty(0, int)]
+        for index, results in judged_cells(self._expansion, points, x, self.atlas, kernel):
+            for name, values in found.items():
+                values[index] = results[name]
+            unsure.append(index[results["unsure"]])
+        again = np.concatenate(unsure)
+        for name, values in self._by_eigenvalues(points[again], outputs).items():
+            found[name][again] = values
+        return found
+
+    def _by_eigenvalues(self, points: np.ndarray, outputs: Sequence[str]) -> dict[str, np.ndarray]:
         x, found = self.atlas.to_coordinates(points), _blank(outputs, (len(points),), self._multipliers)
         number, size = self.atlas.find(x), evaluation.block_size(self.atlas)
         for k in range(len(self.atlas.panels)):
@@ -91,6 +109,10 @@ class StabilityAtlas:
         return round(self.atlas.panels[0].coefficients.shape[-1] ** 0.5) if self.atlas.panels else 0
 
     @cached_property
+    def _expansion(self) -> Expansion:
+        return Expansion(self.atlas)
+
+    @cached_property
     def _tensors(self) -> list[Array]:
         """Coefficients of the panels where the kernels want them, converted once."""
         degrees = evaluation.common_degrees(self.atlas.panels)
@@ -105,7 +127,7 @@ class StabilityAtlas:
 
     def _fill(self, found: dict[str, np.ndarray], axes: list[np.ndarray], outputs: tuple[str, ...]) -> None:
         """Fill ``found`` tile by tile, then judge again the cells for which the closed form is not good enough."""
-        names, undamped = self.atlas.parameters, self._may_be_undamped(axes)
+        names, undamped = self.atlas.parameters, self._may_be_undamped(np.ix_(*axes))
         shape = (min(charts.ROWS, _round_up(len(axes[-2]), 8)), min(charts.COLUMNS, _round_up(len(axes[-1]), 16)))
         coordinates = [c.forward(axis) for c, axis in zip(self.atlas.coordinates, axes, strict=True)]
 
@@ -120,10 +142,9 @@ class StabilityAtlas:
         ]
         self._repair(found, axes, np.concatenate([np.empty((0, len(axes)), int), *again]), outputs)
 
-    def _may_be_undamped(self, axes: Sequence[np.ndarray]) -> bool:
-        """Whether the system is Hamiltonian in any cell."""
-        open_mesh = np.ix_(*axes)
-        model = self.build({**self.atlas.fixed, **dict(zip(self.atlas.parameters, open_mesh, strict=True))})
+    def _may_be_undamped(self, columns: Sequence[np.ndarray]) -> bool:
+        """Whether the system is Hamiltonian in any cell; ``columns`` are broadcast against each other."""
+        model = self.build({**self.atlas.fixed, **dict(zip(self.atlas.parameters, columns, strict=True))})
         return model.hamiltonian is not None and bool(np.any(model.hamiltonian()))
 
     def _repair(
@@ -131,7 +152,7 @@ class StabilityAtlas:
     ) -> None:
         for part in (cells[i : i + (1 << 18)] for i in range(0, len(cells), 1 << 18)):
             points = np.stack([axis[part[:, k]] for k, axis in enumerate(axes)], axis=-1)
-            for name, value in self.at(points, outputs).items():
+            for name, value in self._by_eigenvalues(points, outputs).items():
                 found[name][tuple(part.T)] = value
 
     def _judged(

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from drivetrain_jax.atlas.criteria import Criteria, parameters_at
-from drivetrain_jax.atlas.exclusion import Search, critical_points
+from drivetrain_jax.atlas.exclusion import critical_points
 from drivetrain_jax.atlas.growth import Growth, growth
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.patches import patches_of
@@ -29,6 +29,9 @@ _LIMITING = 1e-6
 # How far the foot of a ridge may lie from a prediction, relative; and how much nearer than to the next one.
 _NEAR, _CLEAR = 0.02, 3.0
 _HIGHEST_ORDER = 60
+# Undecided boxes from which tips are looked for, the largest error of what they lead to as part of the rectangle, and the
+# distance below which two of them are one.
+_MAX_STARTS, _LARGEST_ERROR, _SAME = 200, 0.1, 1e-6
 
 Box = Mapping[str, tuple[float, float]]
 
@@ -39,6 +42,8 @@ class Tip:
 
     ``name`` is the resonance the tongue grows from, empty if its ridge was lost; ``multiplier`` is ``+1``, ``-1`` or
     ``pair`` and ``angle`` its argument in rad. ``opens`` tells a tongue's tip from a place where one closes or two meet.
+    ``proved`` is false for a tip in a box that was left undecided: the surrogate has one there, but within its error
+    bound there may also be none, or several.
     """
 
     name: str
@@ -47,6 +52,7 @@ class Tip:
     point: Mapping[str, float]
     error: Mapping[str, float]
     opens: bool
+    proved: bool = True
 
 
 @dataclass(frozen=True)
@@ -79,8 +85,13 @@ def find_tips(atlas: Atlas, system: System, *, opening: bool = True) -> Tips:
     tips: list[Tip] = []
     for kind, patch, search in zip(criteria.multipliers, patches, searches, strict=True):
         x, rates = polish(criteria, search.points, kind, horizontal)
-        foot = feet(patch, x, horizontal, bottom)
-        tips += _describe(criteria, kind, horizontal, (x, rates, foot), search)
+        opens = (search.curvature * search.slope < 0) == (_rises(criteria, 1 - horizontal) > 0)
+        found = _describe(criteria, kind, horizontal, (x, rates, feet(patch, x, horizontal, bottom)), opens)
+        x, rates = _suspected(criteria, kind, horizontal, search.undecided, x)
+        feet_of = feet(patch, x, horizontal, bottom)
+        opens = rates.gradient[:, 1 - horizontal] * _rises(criteria, 1 - horizontal) > 0
+        likely = _describe(criteria, kind, horizontal, (x, rates, feet_of), opens)
+        tips += [*found, *(replace(tip, proved=False) for tip in likely)]
     undecided = tuple(_box(atlas, box) for search in searches for box in search.undecided)
     undecided += tuple(_box(atlas, np.stack([gap.lower, gap.upper])) for gap in atlas.gaps)
     chosen = tuple(tip for tip in tips if tip.opens or not opening)
@@ -99,6 +110,26 @@ def polish(criteria: Criteria, x: np.ndarray, kind: str, horizontal: int) -> tup
     return x, growth(criteria, x, kinds, second=True)
 
 
+def _suspected(
+    criteria: Criteria, kind: str, h: int, boxes: np.ndarray, known: np.ndarray
+) -> tuple[np.ndarray, Growth]:
+    """Tips to which Newton's method leads from ``undecided`` boxes: none of the ``known`` ones, and with bounds that leave
+    them within the rectangle."""
+    low, high = np.sort(criteria.atlas.to_coordinates([criteria.atlas.lower, criteria.atlas.upper]), axis=0)
+    starts = boxes[np.linspace(0, len(boxes) - 1, min(len(boxes), _MAX_STARTS)).astype(int)].mean(axis=1)
+    x, rates = polish(criteria, starts.reshape(-1, 2), kind, h)
+    with np.errstate(invalid="ignore"):
+        errors = _errors(rates, h)
+        good = (np.abs(rates.rate) <= rates.error) & (rates.hessian[:, h, h] < 0)
+        good &= ((x >= low) & (x <= high) & (errors < _LARGEST_ERROR * (high - low))).all(axis=1)
+    kept: list[int] = []
+    for i in np.flatnonzero(good):
+        others = np.concatenate([known, x[kept]])
+        if not (np.abs(others - x[i]) <= errors[i] + _SAME * (high - low)).all(axis=1).any():
+            kept.append(int(i))
+    return x[kept], growth(criteria, x[kept], [kind] * len(kept), second=True)
+
+
 def _solve(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     determinant = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
     first = a[:, 1, 1] * b[:, 0] - a[:, 0, 1] * b[:, 1]
@@ -106,10 +137,10 @@ def _solve(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.stack([first, second], axis=-1) / determinant[:, None]
 
 
-def _describe(criteria: Criteria, kind: str, h: int, points: tuple, search: Search) -> list[Tip]:
+def _describe(criteria: Criteria, kind: str, h: int, points: tuple, opens: np.ndarray) -> list[Tip]:
     """The tips among the zeros of one function: those where no other multiplier is larger."""
     x, rates, foot = points
-    atlas, system, v = criteria.atlas, criteria.system, 1 - h
+    atlas, system = criteria.atlas, criteria.system
     largest = np.log(criteria.spectral_radius(x))
     errors = _errors(rates, h)
     found = []
@@ -118,9 +149,6 @@ def _describe(criteria: Criteria, kind: str, h: int, points: tuple, search: Sear
             continue
         point, slope = parameters_at(atlas, x[i]), [c.slope for c in atlas.coordinates]
         scale = np.array([abs(float(slope[k](point[k]))) for k in range(2)])
-        opens = bool(search.curvature[i] * search.slope[i] < 0)
-        if _rises(criteria, v) < 0:
-            opens = not opens
         found.append(
             Tip(
                 _name(atlas, system, kind, h, foot[i]),
@@ -128,7 +156,7 @@ def _describe(criteria: Criteria, kind: str, h: int, points: tuple, search: Sear
                 abs(float(np.angle(rates.multiplier[i]))),
                 dict(zip(atlas.parameters, map(float, point), strict=True)),
                 dict(zip(atlas.parameters, map(float, errors[i] / scale), strict=True)),
-                opens,
+                bool(opens[i]),
             )
         )
     return found
@@ -181,7 +209,9 @@ def _name(atlas: Atlas, system: System, kind: str, h: int, foot: float) -> str:
     if not np.isfinite(foot) or not resonances.multipliers:
         return ""
     speed = float(atlas.coordinates[h].inverse(np.asarray(foot)))
-    distance = np.abs(_predicted(resonances, atlas) / speed - 1)
+    # The foot lies where the other parameter is least, and resonances may depend on it.
+    lowest = dict(zip(atlas.parameters, atlas.lower, strict=True))
+    distance = np.abs(np.asarray(resonances.values({**lowest, **atlas.fixed})) / speed - 1)
     distance[[m != kind for m in resonances.multipliers]] = np.inf
     first, second = np.argsort(distance)[:2]
     clear = distance[first] < _NEAR and distance[second] > _CLEAR * distance[first]

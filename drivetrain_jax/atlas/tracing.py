@@ -17,8 +17,6 @@ from drivetrain_jax.atlas.patches import Patches
 _LONGEST, _SHORTEST, _FIRST = 0.015, 1e-7, 1e-5
 _TURN, _CORRECTION, _GROWTH = 0.25, 0.15, 1.6
 _NEWTON, _MAX_STEPS = 3, 800
-# Distance of neighbours that no step can explain.
-_BROKEN = 4 * _LONGEST
 # Distances from a tip in the other coordinate at which its flanks are entered.
 _APPROACH = 1e-4 * np.array([1 / 64, 1 / 16, 1 / 4, 1.0])
 
@@ -67,7 +65,7 @@ def trace(field: Field, seeds: np.ndarray) -> list[Curve]:
     for i in range(len(start)):
         ahead, behind = paths[i], paths[i + len(start)]
         points = ahead if returned[i] else np.concatenate([behind[::-1], ahead[1:]])
-        curves.append(_curve(field, points, returned[i]))
+        curves.append(Curve(field.to_coordinates(points), bool(returned[i])))
     return curves
 
 
@@ -89,16 +87,9 @@ def trace_tips(field: Field, tips: np.ndarray, horizontal: int) -> list[Curve]:
     for i, point in enumerate(top):
         left, right = (np.concatenate([flanks[k, i], paths[i + k * len(top)][1:]]) for k in range(2))
         points = np.concatenate([left[::-1], point[None], right])
-        curves.append(_curve(field, points[np.isfinite(points).all(axis=1)], returned[i]))
+        points = points[np.isfinite(points).all(axis=1)]
+        curves.append(Curve(field.to_coordinates(points), bool(returned[i])))
     return curves
-
-
-def _curve(field: Field, points: np.ndarray, closed: bool) -> Curve:
-    """The curve through points of the unit square. A point farther from its neighbour than any step can lead, as where a
-    path meets the rim at a grazing angle, ends it: what is kept is the longest part."""
-    far = np.flatnonzero(np.linalg.norm(np.diff(points, axis=0), axis=1) > _BROKEN)
-    part = max(np.split(points, far + 1), key=len)
-    return Curve(field.to_coordinates(part), bool(closed) and not far.size)
 
 
 def _flank(field: Field, top: np.ndarray, h: int, side: float) -> np.ndarray:
@@ -125,8 +116,8 @@ def _follow(field: Field, start: np.ndarray, sense: np.ndarray) -> tuple[list[np
     """Paths from ``start`` along the tangent of ``sense``, and which of them returned."""
     y, _, tangent = _correct(field, start, sense)
     step = np.full(len(y), _FIRST)
-    paths = [[point] for point in y]
     first, length = y.copy(), np.zeros(len(y))
+    paths = [[point] for point in first]
     returned = np.zeros(len(y), bool)
     alive = np.isfinite(y).all(axis=1) & np.isfinite(tangent).all(axis=1)
     for _ in range(_MAX_STEPS):
@@ -179,7 +170,8 @@ def _to_rim(field: Field, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     with np.errstate(all="ignore"):
         fractions = np.where(b < 0, a / (a - b), np.where(b > 1, (1 - a) / (b - a), np.inf))
     axis = int(np.argmin(fractions))
-    y = a + fractions[axis] * (b - a)
+    # Along the rim both may lie outside by rounding, and the line through them meets it far away.
+    y = a + np.clip(fractions[axis], 0.0, 1.0) * (b - a)
     y[axis] = float(b[axis] > 1)
     other = 1 - axis
     for _ in range(_NEWTON):

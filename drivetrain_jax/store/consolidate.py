@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import mmap
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import h5netcdf
@@ -19,19 +20,19 @@ from drivetrain_jax.store.files import move_into_place
 class ResultFile:
     """A result that grows on the disk beside its final place, so that memory does not grow with it.
 
-    ``lay_out`` gives its data variables as memory maps of the file ``temporary``, to be filled in any order; ``finish``
+    ``lay_out`` gives its data variables as arrays mapped from the file ``temporary``, to be filled in any order; ``finish``
     puts it into place. Leaving the context without that deletes it.
     """
 
     def __init__(self, temporary: Path) -> None:
         self._temporary = temporary
-        self._arrays: dict[str, np.memmap] = {}
+        self._mapped: mmap.mmap | None = None
 
     def __enter__(self) -> ResultFile:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._arrays.clear()
+        self._mapped = None
         self._temporary.unlink(missing_ok=True)
 
     def lay_out(self, template: xr.Dataset) -> Mapping[str, np.ndarray]:
@@ -40,13 +41,16 @@ class ResultFile:
         A disk without enough room is an ``OSError`` here, before anything is computed.
         """
         _reserve(self._temporary, _write_frame(template, self._temporary))
-        self._arrays |= _map(template, self._temporary)
-        return self._arrays
+        with h5py.File(self._temporary, "r") as file:
+            places = {str(name): file[str(name)].id.get_offset() for name in template.data_vars}
+        with open(self._temporary, "r+b") as file:
+            self._mapped = mmap.mmap(file.fileno(), 0)
+        return {n: np.ndarray(template[n].shape, template[n].dtype, self._mapped, at) for n, at in places.items()}
 
     def finish(self, path: Path, **attrs: float) -> None:
         """Change these attributes, add checksums, flush all to the disk, and move the file to ``path`` in one step."""
-        for array in self._arrays.values():
-            array.flush()
+        if self._mapped:
+            self._mapped.flush()
         with h5py.File(self._temporary, "r+") as file:
             for name, value in attrs.items():
                 file.attrs.modify(name, value)
@@ -109,13 +113,11 @@ def _reserve(path: Path, size: int) -> None:
         os.close(handle)
 
 
-def _map(template: xr.Dataset, path: Path) -> dict[str, np.memmap]:
-    with h5py.File(path, "r") as file:
-        places = {str(name): file[str(name)].id.get_offset() for name in template.data_vars}
-    return {
-        name: np.memmap(path, template[name].dtype, "r+", offset, template[name].shape)
-        for name, offset in places.items()
-    }
+def release(arrays: Iterable[np.ndarray]) -> None:
+    """Give back the memory of the file that ``arrays`` are mapped from, if any; what was written into them stays there."""
+    for mapped in {array.base for array in arrays if isinstance(array.base, mmap.mmap)}:
+        if hasattr(mmap, "MADV_DONTNEED"):
+            mapped.madvise(mmap.MADV_DONTNEED)
 
 
 def read_attribute(path: Path, name: str) -> str | None:

@@ -14,6 +14,7 @@ import drivetrain_jax
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.store import provenance
+from drivetrain_jax.store.consolidate import release
 from drivetrain_jax.store.schema import Coordinate, build_dataset
 from drivetrain_jax.sweep.grid import Grid
 from drivetrain_jax.sweep.identity import PACKAGES
@@ -21,8 +22,10 @@ from drivetrain_jax.sweep.scene import Scene
 
 # Entries assumed for a dimension whose size depends on the system, when memory is estimated.
 _USUAL_SIZE = 4
-# Bytes of the plan per point.
-_PLANNED = 16
+# Bytes of the plan per point, even where chunks are small.
+_PLANNED = 4
+# Bytes of results on the disk that are kept in memory as well, and values that are blanked at a time.
+_RESIDENT, _ROWS = 1 << 26, 1 << 22
 _STORAGE = ("xarray", "h5netcdf", "h5py")
 
 
@@ -41,21 +44,30 @@ class Table:
         self._allocate = allocate or _in_memory
         self._sizes = {d.name: len(d.values) for d in scene.dimensions}
         self._lost: list[np.ndarray] = []
+        self._unreleased = 0
         self.arrays: Mapping[str, np.ndarray] = {}
 
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
         """Enter the results of ``points``."""
         self._lay_out_for(results)
-        place = self._grid.place(points)
         for name, values in results.items():
             # A fixed path parameter is no dimension of the result.
-            sweep_first(self.arrays[name], self._grid)[place] = values[:, 0] if self._grid.path_is_fixed else values
+            enter(self.arrays[name], self._grid, points, values[:, 0] if self._grid.path_is_fixed else values)
+        self._release_after(results)
 
     def put(self, block: tuple[slice, ...], results: Mapping[str, np.ndarray]) -> None:
         """Enter the results of a block of the grid, or of a row of the points."""
         self._lay_out_for(results)
         for name, values in results.items():
             self.arrays[name][block] = values
+        self._release_after(results)
+
+    def _release_after(self, results: Mapping[str, np.ndarray]) -> None:
+        """Let the system have back, from time to time, the memory of what is in a file."""
+        self._unreleased += sum(values.nbytes for values in results.values())
+        if self._unreleased >= _RESIDENT:
+            self._unreleased = 0
+            release(self.arrays.values())
 
     def _lay_out_for(self, results: Mapping[str, np.ndarray]) -> None:
         """Make the arrays; the first results tell the sizes of dimensions that depend on the system."""
@@ -72,7 +84,7 @@ class Table:
 
     def _mark_lost(self) -> None:
         for points in self._lost:
-            sweep_first(self.arrays[OUTCOME.name], self._grid)[self._grid.place(points)] = Outcome.LOST
+            enter(self.arrays[OUTCOME.name], self._grid, points, Outcome.LOST)
         self._lost.clear()
 
     def lay_out(self) -> Mapping[str, np.ndarray]:
@@ -84,9 +96,20 @@ class Table:
             blank = {v.name: np.broadcast_to(np.zeros((), v.dtype), shape) for v, shape in shapes.items()}
             self.arrays = self._allocate(to_dataset(self._scene, blank, {}))
             for variable in self.variables:
-                self.arrays[variable.name][...] = missing_value(variable)
+                rows = self.arrays[variable.name].reshape(-1)
+                for start in range(0, rows.size, _ROWS):
+                    rows[start : start + _ROWS] = missing_value(variable)
+                    release([self.arrays[variable.name]])
             self._mark_lost()
         return self.arrays
+
+
+def enter(array: np.ndarray, grid: Grid, points: np.ndarray, values: np.ndarray | int) -> None:
+    """Put ``values`` of ``points`` into the ``array`` of a result."""
+    if grid.path_position is None:
+        array.reshape(grid.size, *array.shape[len(grid.shape) :])[points] = values
+    else:
+        sweep_first(array, grid)[grid.place(points)] = values
 
 
 def sweep_first(array: np.ndarray, grid: Grid) -> np.ndarray:

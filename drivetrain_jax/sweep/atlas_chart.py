@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import xarray as xr
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.atlas.boundaries import boundaries
-from drivetrain_jax.atlas.tips import find_tips
+from drivetrain_jax.atlas.tips import Tips, find_tips
 from drivetrain_jax.atlas.windows import narrow
 from drivetrain_jax.sweep.atlas_file import StoredAtlas, open_atlas
 from drivetrain_jax.systems import System
@@ -24,7 +24,8 @@ def chart(source: xr.Dataset, part: Mapping[str, float | tuple[float, float]], c
 
     ``part`` fixes parameters (numbers) or zooms in (ranges). Of further parameters there are three values. A chart of two
     parameters also has its stability boundaries (``boundary_NAME``, parts separated by NaN) and the tips of its tongues
-    (``tip_NAME``, with their names). Raises :class:`InputError` for what the atlas does not cover.
+    (``tip_NAME``, with their names, ``tip_NAME_error`` and ``tip_proved``) and the boxes that may hide further ones
+    (``undecided_NAME``). Raises :class:`InputError` for what the atlas does not cover.
     """
     if not 2 <= cells <= 20_000:
         raise InputError(f"cells = {cells}: allowed is 2 <= cells <= 20000")
@@ -37,7 +38,12 @@ def chart(source: xr.Dataset, part: Mapping[str, float | tuple[float, float]], c
         for name in atlas.parameters
         if name in shown
     }
-    dataset = atlas.grid(**axes, **fixed)
+    given = {
+        name: ((), value, {"units": p.units, "long_name": p.long_name})
+        for name, value in fixed.items()
+        for p in [atlas.scene.system.parameter(name)]
+    }
+    dataset = atlas.grid(**axes, **fixed).assign_coords(given)
     return dataset.assign_coords(_curves(atlas, fixed, {n: ranges[n] for n in shown})) if len(shown) == 2 else dataset
 
 
@@ -72,11 +78,33 @@ def _curves(
         coordinates[f"boundary_{name}"] = ("boundary", values, {**about, "long_name": f"boundary of stability, {name}"})
     if system.resonances is None or system.resonances.axis not in ranges:
         return coordinates
-    tips = find_tips(panels, system).tips
-    labels = np.array([tip.name for tip in tips], dtype=str)
-    coordinates["tip"] = ("tip", labels, {"units": "1", "long_name": "resonance that the tongue grows from"})
-    for name in ranges:
-        values = np.array([tip.point[name] for tip in tips])
-        about = {"units": system.parameter(name).units, "long_name": f"tip of a tongue, {name}"}
-        coordinates[f"tip_{name}"] = ("tip", values, about)
+    # Tongues widen with the angle. Along a damping they close, and what closes them is their tip.
+    tips = find_tips(panels, system, opening=system.roles.get("angle") in ranges)
+    return coordinates | _tips(tips, system, ranges)
+
+
+def _tips(
+    found: Tips, system: System, names: Iterable[str]
+) -> dict[str, tuple[str | tuple[str, str], np.ndarray, dict[str, str]]]:
+    """The tips as coordinates: names, whether proved, place and its error; and the boxes that were left undecided."""
+    labels = np.array([tip.name for tip in found.tips], dtype=str)
+    proved = np.array([tip.proved for tip in found.tips], np.int8)
+    meaning = {
+        "units": "1",
+        "long_name": "whether there is exactly one tip here within the bounds of the atlas (1) or not (0)",
+    }
+    coordinates: dict[str, tuple] = {
+        "tip": ("tip", labels, {"units": "1", "long_name": "resonance that the tongue grows from"}),
+        "tip_proved": ("tip", proved, meaning),
+    }
+    for name in names:
+        units = {"units": system.parameter(name).units}
+        values = np.array([tip.point[name] for tip in found.tips])
+        errors = np.array([tip.error[name] for tip in found.tips])
+        coordinates[f"tip_{name}"] = ("tip", values, {**units, "long_name": f"tip of a tongue, {name}"})
+        coordinates[f"tip_{name}_error"] = ("tip", errors, {**units, "long_name": f"bound of the error of tip_{name}"})
+        if found.undecided:
+            boxes = np.array([box[name] for box in found.undecided])
+            about = {**units, "long_name": f"lower and upper {name} of a box that may hide further tips"}
+            coordinates[f"undecided_{name}"] = (("undecided_box", "end"), boxes, about)
     return coordinates

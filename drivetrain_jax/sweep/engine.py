@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Set
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
 from typing import Any
@@ -66,15 +66,19 @@ class Engine:
         """Number of points, those along a path counted one by one."""
         return (self.grid.size if self._points is None else len(self._points)) * self.grid.path_length
 
-    def ordered(self, numbers: Iterable[int]) -> list[Chunk]:
-        """The chunks with these numbers, the costliest first."""
-        costs = self.plan.costs
-        return [self.plan.chunk(number) for number in sorted(numbers, key=lambda number: -costs[number])]
+    @property
+    def hopeless(self) -> int:
+        """Number of points that no solver can do; they are done before anything is computed, without a value."""
+        return self.total - self.plan.size * self.grid.path_length
 
-    def prepare(self, chunks: Iterable[Chunk]) -> None:
-        """Begin to compile the kernels of these chunks, side by side, without waiting for them."""
+    def ordered(self, numbers: Iterable[int]) -> Iterator[Chunk]:
+        """The chunks with these numbers in the order in which they are to be computed, each made when it is asked for."""
+        return map(self.plan.chunk, self.plan.ordered(numbers))
+
+    def prepare(self, kernels: Set[tuple[int, int]]) -> None:
+        """Begin to compile kernels (position of the solver, size of chunks), side by side, without waiting for them."""
         with self._lock:
-            missing = {(chunk.solver, chunk.size) for chunk in chunks} - self._kernels.keys()
+            missing = kernels - self._kernels.keys()
             if not missing:
                 return
             compile_cache.enable()
@@ -85,7 +89,7 @@ class Engine:
 
     def compute_chunk(self, chunk: Chunk) -> Mapping[str, np.ndarray]:
         """Results of one chunk; may be called from several threads. Raises :class:`ChunkError`."""
-        self.prepare([chunk])
+        self.prepare({(chunk.solver, chunk.size)})
         try:
             kernel = self._kernels[chunk.solver, chunk.size].result()
             return kernel(self.grid.columns(chunk.points), chunk.effort)

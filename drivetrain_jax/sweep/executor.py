@@ -47,10 +47,10 @@ class Where:
 
         Results are None for a chunk that killed every process which computed it. What fails otherwise is raised.
         """
-        chunks = engine.ordered(numbers)
+        numbers = np.fromiter(numbers, np.int64)
         if self.workers is None and self.dask is None:
-            engine.prepare(chunks)
-        return self.each(chunks, engine.compute_chunk, lambda: _job(engine))
+            engine.prepare(engine.plan.kernels(numbers))
+        return self.each(engine.ordered(numbers), engine.compute_chunk, lambda: _job(engine))
 
     def each(
         self, chunks: Iterable[Any], here: Callable[[Any], Results], job: Callable[[], Job]

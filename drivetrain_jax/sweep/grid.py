@@ -98,11 +98,10 @@ class Grid:
 
     def arrays(self, points: np.ndarray) -> dict[str, Any]:
         """Like ``bind`` at ``points``, with every number (and entry of a list) an array of the shape of ``points``."""
+        return {name: self._spread(value, points.shape) for name, value in self.bind(self.columns(points)).items()}
 
-        def spread(value: Any) -> Any:
-            if isinstance(value, tuple):
-                return tuple(spread(entry) for entry in value)
-            whole = isinstance(value, str) or (self.path is not None and value is self.path.values)
-            return value if whole else np.broadcast_to(value, points.shape)
-
-        return {name: spread(value) for name, value in self.bind(self.columns(points)).items()}
+    def _spread(self, value: Any, shape: tuple[int, ...]) -> Any:
+        if isinstance(value, tuple):
+            return tuple(self._spread(entry, shape) for entry in value)
+        whole = isinstance(value, str) or (self.path is not None and value is self.path.values)
+        return value if whole else np.broadcast_to(value, shape)

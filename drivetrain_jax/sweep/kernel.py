@@ -37,9 +37,10 @@ class Kernel:
     def __call__(self, columns: Mapping[str, np.ndarray], effort: int) -> dict[str, np.ndarray]:
         """Results of up to ``chunk`` points, the points as first axis; a short chunk is padded with its last point."""
         count = len(next(iter(columns.values()))) if columns else self.chunk
-        padded = {name: np.pad(values, (0, self.chunk - count), mode="edge") for name, values in columns.items()}
+        if count < self.chunk:
+            columns = {name: np.pad(values, (0, self.chunk - count), mode="edge") for name, values in columns.items()}
         with self.turn:
-            results = {name: np.asarray(value) for name, value in self.compiled(padded, np.int64(effort)).items()}
+            results = {name: np.asarray(value) for name, value in self.compiled(columns, np.int64(effort)).items()}
         arrays = {}
         for variable in self.variables:
             values = results[variable.name]
@@ -83,7 +84,7 @@ def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[V
     """
     batch, columns = _batch(solver, grid, chunk, variables)
     lowered = jax.jit(batch).lower(columns, jax.ShapeDtypeStruct((), np.int64))
-    compiled = lowered.compile(compiler_options())
+    compiled = lowered.compile(compiler_options(chunk))
     return Kernel(compiled, chunk, solver.broadcasts, tuple(variables), _turn(compiled))
 
 

@@ -13,7 +13,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.store import consolidate
 from drivetrain_jax.store.chunks import PartsFolder
-from drivetrain_jax.sweep.assemble import Table, sweep_first, to_dataset
+from drivetrain_jax.sweep.assemble import Table, enter, to_dataset
 from drivetrain_jax.sweep.atlas_choice import uses_atlas
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.growing import rest_of
@@ -66,8 +66,7 @@ def _finished(engine: Engine, target: Target) -> Iterator[tuple[np.ndarray, Mapp
 
 def _labelled(engine: Engine, table: Table, done: np.ndarray) -> xr.Dataset:
     arrays = dict(table.lay_out())
-    waiting = engine.grid.place(np.flatnonzero(~done))
-    sweep_first(arrays[OUTCOME.name], engine.grid)[waiting] = PENDING
+    enter(arrays[OUTCOME.name], engine.grid, np.flatnonzero(~done), PENDING)
     count = int(done.sum()) * engine.grid.path_length
     dataset = to_dataset(engine.scene, arrays, {"digest": engine.digest, "points_done": count})
     outcome = dataset[OUTCOME.name].attrs

@@ -1,17 +1,27 @@
-"""Who computes what: a solver for every point, points of similar effort together, chunks of one shape per solver."""
+"""Who computes what: a solver for every point, points of similar effort together, chunks of one shape per solver.
+
+Points are sorted block by block, so that neither memory nor the wait for the first result grows with the grid: a plan
+keeps the efforts of chunks, and sorts a block again when its chunks are wanted.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from drivetrain_jax.analysis import Solver
+from drivetrain_jax.store.provenance import usable_cores
 from drivetrain_jax.sweep.grid import Grid
 
-# Points whose effort is predicted at a time.
-_BLOCK = 1 << 18
+# Points that are sorted together, and those among them whose effort is predicted at a time (few stay in fast memory).
+_BLOCK, _PIECE = 1 << 18, 1 << 15
+# Sorted blocks that are kept.
+_KEPT = 16
+_BITS, _POSITION = np.uint64(32), np.uint64(2**32 - 1)
 _MAX_EFFORT = 2**31 - 1
 # Small scenes are cut into at least this many chunks per solver. It is not the number of cores: bits must not depend
 # on that.
@@ -21,15 +31,18 @@ _LANES = 16
 
 @dataclass(frozen=True)
 class Group:
-    """The points of one solver: ``order`` their numbers by rising effort, cut into ``len(efforts)`` chunks.
+    """The points of one solver, by rising effort in each block, cut into chunks of ``chunk``; the last one of a block may
+    be shorter.
 
-    ``index`` is the position of the solver, ``efforts`` the largest effort within each chunk.
+    ``index`` is the position of the solver, ``size`` the number of points, ``efforts`` the largest effort within each
+    chunk, and ``firsts[b]`` the first chunk of block b (one entry more than blocks).
     """
 
     index: int
     solver: Solver
-    order: np.ndarray
+    size: int
     efforts: np.ndarray
+    firsts: np.ndarray
     chunk: int
 
 
@@ -52,22 +65,119 @@ class Plan:
     """All chunks, numbered through the groups. Points for which every solver predicts infinite cost are in none."""
 
     groups: tuple[Group, ...]
+    blocks: Blocks
 
-    @property
+    @cached_property
     def costs(self) -> np.ndarray:
         """Predicted cost of every chunk, in units of its own."""
         return np.concatenate([np.empty(0), *(g.efforts * (g.solver.unit_cost * g.chunk) for g in self.groups)])
 
+    @property
+    def size(self) -> int:
+        """Number of points in all chunks."""
+        return sum(group.size for group in self.groups)
+
+    @cached_property
+    def _firsts(self) -> np.ndarray:
+        """Number of the first chunk of each group, and of all chunks."""
+        return np.cumsum([0, *(len(group.efforts) for group in self.groups)])
+
+    def kernels(self, numbers: Iterable[int]) -> set[tuple[int, int]]:
+        """Position of the solver and size of the chunks with these numbers."""
+        used = np.unique(np.searchsorted(self._firsts, np.fromiter(numbers, np.int64), side="right") - 1)
+        return {(self.groups[g].index, self.groups[g].chunk) for g in used}
+
+    def ordered(self, numbers: Iterable[int]) -> np.ndarray:
+        """These numbers block by block, in each the costliest first."""
+        chosen = np.fromiter(numbers, np.int64)
+        counts = [np.diff(group.firsts) for group in self.groups]
+        blocks = np.concatenate([np.empty(0, int), *(np.repeat(np.arange(len(n)), n) for n in counts)])
+        return chosen[np.lexsort((-self.costs[chosen], blocks[chosen]))]
+
     def chunk(self, number: int) -> Chunk:
         """Chunk number ``number``."""
-        first = 0
-        for group in self.groups:
-            k = number - first
-            if k < len(group.efforts):
-                points = group.order[k * group.chunk : (k + 1) * group.chunk]
-                return Chunk(number, group.index, group.chunk, points, int(group.efforts[k]))
-            first += len(group.efforts)
-        raise IndexError(number)
+        if not 0 <= number < self._firsts[-1]:
+            raise IndexError(number)
+        g = int(np.searchsorted(self._firsts, number, side="right")) - 1
+        group, k = self.groups[g], number - self._firsts[g]
+        block = int(np.searchsorted(group.firsts, k, side="right")) - 1
+        start = (k - group.firsts[block]) * group.chunk
+        points = self.blocks.points(block, group.index, slice(start, start + group.chunk))
+        return Chunk(int(number), group.index, group.chunk, points, int(group.efforts[k]))
+
+
+class Blocks:
+    """The points of a plan in blocks, each sorted when it is needed."""
+
+    def __init__(self, solvers: Sequence[Solver], grid: Grid, points: np.ndarray | None) -> None:
+        self._solvers, self._grid, self._points = solvers, grid, points
+        self._size = grid.size if points is None else len(points)
+        self.count = -(-self._size // _BLOCK)
+        self._kept: dict[int, tuple[list[np.ndarray], list[np.ndarray]]] = {}
+
+    def efforts(self, block: int) -> Sequence[np.ndarray]:
+        """For each solver the efforts of its points in ``block``, rising."""
+        return self._sorted(block)[1]
+
+    def points(self, block: int, solver: int, part: slice) -> np.ndarray:
+        """A part of these points."""
+        return self._number(self._sorted(block)[0][solver][part].astype(np.int64) + block * _BLOCK)
+
+    def _number(self, positions: np.ndarray) -> np.ndarray:
+        return positions if self._points is None else self._points[positions]
+
+    def _sorted(self, block: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        if block not in self._kept:
+            while len(self._kept) >= _KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[block] = self._sort(block)
+        return self._kept[block]
+
+    def _sort(self, block: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """For each solver its points, numbered through the block, and their efforts."""
+        start, stop = block * _BLOCK, min((block + 1) * _BLOCK, self._size)
+        pieces = [self._number(np.arange(i, min(i + _PIECE, stop))) for i in range(start, stop, _PIECE)]
+        with ThreadPoolExecutor(min(usable_cores(), len(pieces)), thread_name_prefix="plan") as pool:
+            found = list(pool.map(lambda points: _cheapest(self._solvers, self._grid, points), pieces))
+        choice, effort = (np.concatenate(column) for column in zip(*found, strict=True))
+        orders, efforts = [], []
+        for index in range(len(self._solvers)):
+            mine = np.flatnonzero(choice == index).astype(np.uint64)
+            # Effort and position in one number: the fastest of all ways to sort by both.
+            keys = (effort[mine].astype(np.uint64) << _BITS) | mine
+            keys.sort()
+            orders.append((keys & _POSITION).astype(np.uint32))
+            efforts.append((keys >> _BITS).astype(np.int32))
+        return orders, efforts
+
+
+class _Tally:
+    """Efforts of the points of one solver: of each point while chunks might be small, then the largest of each chunk."""
+
+    def __init__(self, solver: Solver) -> None:
+        self._solver = solver
+        self._efforts: list[np.ndarray] = []
+        self.count, self._few = 0, True
+
+    def add(self, efforts: np.ndarray) -> None:
+        """Those of one more block, rising."""
+        self.count += efforts.size
+        self._efforts.append(efforts if self._few else _largest(efforts, self._solver.chunk))
+        if self._few and self.count >= _MIN_CHUNKS * self._solver.chunk:
+            self._few = False
+            self._efforts = [_largest(block, self._solver.chunk) for block in self._efforts]
+
+    def group(self, index: int, full_size: bool) -> Group:
+        """The chunks of all blocks."""
+        size = chunk_size(self._solver.chunk, self.count) if self._few and not full_size else self._solver.chunk
+        efforts = [_largest(block, size) for block in self._efforts] if self._few else self._efforts
+        firsts = np.cumsum([0, *map(len, efforts)])
+        return Group(index, self._solver, self.count, np.concatenate(efforts), firsts, size)
+
+
+def _largest(efforts: np.ndarray, size: int) -> np.ndarray:
+    """The largest effort of each chunk of ``size`` points."""
+    return efforts[np.minimum(np.arange(size, efforts.size + size, size), efforts.size) - 1]
 
 
 def chunk_size(largest: int, count: int) -> int:
@@ -85,31 +195,11 @@ def make_plan(
 
     ``full_size`` keeps the size of chunks where points are few, so that further plans need no other kernels.
     """
-    count = grid.size if points is None else len(points)
-    # Effort and position in one number, sorted in place: 8 bytes a point are all that the plan of a large scene takes.
-    # Room for all points with every solver is memory only where it is filled.
-    bits = np.uint64(count.bit_length())
-    keys, filled = [np.empty(count, np.uint64) for _ in solvers], [0 for _ in solvers]
-    for start in range(0, count, _BLOCK):
-        positions = np.arange(start, min(start + _BLOCK, count))
-        choice, effort = _cheapest(solvers, grid, positions if points is None else points[positions])
-        for index, key in enumerate(keys):
-            mine = np.flatnonzero(choice == index)
-            begin, filled[index] = filled[index], filled[index] + mine.size
-            key[begin : filled[index]] = (effort[mine].astype(np.uint64) << bits) | positions[mine].astype(np.uint64)
-    groups = []
-    for index, solver in enumerate(solvers):
-        key = keys[index][: filled[index]]
-        if not key.size:
-            continue
-        key.sort()
-        size = solver.chunk if full_size else chunk_size(solver.chunk, key.size)
-        last = np.minimum(np.arange(size, key.size + size, size), key.size) - 1
-        efforts = (key[last] >> bits).astype(np.int64)
-        key &= (np.uint64(1) << bits) - np.uint64(1)
-        order = key.view(np.int64)
-        groups.append(Group(index, solver, order if points is None else points[order], efforts, size))
-    return Plan(tuple(groups))
+    blocks, tallies = Blocks(solvers, grid, points), [_Tally(solver) for solver in solvers]
+    for block in range(blocks.count):
+        for tally, efforts in zip(tallies, blocks.efforts(block), strict=True):
+            tally.add(efforts)
+    return Plan(tuple(tally.group(i, full_size) for i, tally in enumerate(tallies) if tally.count), blocks)
 
 
 def _cheapest(solvers: Sequence[Solver], grid: Grid, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request
 from drivetrain_jax.sweep.assemble import Table
 from drivetrain_jax.sweep.engine import Engine
-from drivetrain_jax.sweep.scene import load_scene, system_and_analysis
+from drivetrain_jax.sweep.scene import load_scene, nearest, system_and_analysis
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
     names = (*parameters, "method", *(o.name for o in analysis.options))
     for name, value in given.items():
         if name not in names:
-            raise InputError(f"{name} = {value!r}: unknown; allowed is {', '.join(names)}")
+            raise InputError(f"{name} = {value!r}: unknown{nearest(name, names)}")
         if name not in parameters:
             tree["options"][name] = value
         elif parameters[name].is_number and not isinstance(value, (list, tuple)) and name != path:

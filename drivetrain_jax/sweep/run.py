@@ -106,17 +106,20 @@ def run_to_file(
         return Progress(total, reused=total, failed=target.failed)
     if target.state == "stale" and not fresh:
         raise InputError(f"out = {str(out)!r}: holds {target.obstacle}; --fresh replaces it")
-    taken = target.take(reuse, fresh)
-    parts = target.parts
-    progress = _progress(engine)
+    return _into(target, target.take(reuse, fresh), fresh, where, report)
+
+
+def _into(target: Target, taken: Taken, fresh: bool, where: Where, report: Report | None) -> Progress:
+    """Begin the result of ``target``, or go on with it; ``taken`` is computed already."""
+    engine, parts, progress = target.engine, target.parts, _progress(target.engine)
     try:
         parts.open()
         if fresh or not parts.holds_work():
             parts.start(target.plan(taken))
-        if store == "zarr":
-            sharded.compute(engine, out, parts, progress, where, report)
+        if target.store == "zarr":
+            sharded.compute(engine, target.out, parts, progress, where, report)
         else:
-            _resume(engine, out, parts, progress, where, report, taken)
+            _resume(engine, target.out, parts, progress, where, report, taken)
         parts.close(remove=True)
     except KeyboardInterrupt:
         raise Interrupted(progress) from None

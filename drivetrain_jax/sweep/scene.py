@@ -80,12 +80,12 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
 
 def system_and_analysis(system_name: str, analysis_name: str) -> tuple[System, Analysis]:
     """The system and the analysis called so; ``InputError`` unless both exist and the one has a model for the other."""
-    system, analysis = _lookup(get_system, system_name), _lookup(get_analysis, analysis_name)
-    if analysis.name not in system.models:
+    system = _lookup(get_system, system_name)
+    if analysis_name not in system.models:
         raise InputError(
-            f"analysis = {analysis.name!r}: allowed for {system.name} is one of {', '.join(system.models)}"
+            f"analysis = {analysis_name!r}: allowed for {system.name} is one of {', '.join(system.models)}"
         )
-    return system, analysis
+    return system, _lookup(get_analysis, analysis_name)
 
 
 def _convert(given: Any, kind: type, where: str) -> Any:
@@ -93,7 +93,7 @@ def _convert(given: Any, kind: type, where: str) -> Any:
     names = [field.name for field in msgspec.structs.fields(kind)]
     for key in given:
         if key not in names:
-            raise InputError(f"{where}{key} = {_short(given[key])}: unknown key{_nearest(key, names)}")
+            raise InputError(f"{where}{key} = {_short(given[key])}: unknown key{nearest(key, names)}")
     try:
         return msgspec.convert(given, kind)
     except msgspec.ValidationError as error:
@@ -130,7 +130,7 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _nearest(name: str, allowed: Iterable[str]) -> str:
+def nearest(name: str, allowed: Iterable[str]) -> str:
     """``; did you mean X? allowed is A, B, ...``"""
     allowed = list(allowed)
     match = difflib.get_close_matches(name, allowed, n=1)
@@ -151,7 +151,7 @@ def _request(table: _SceneTable, analysis: Analysis) -> Request:
     outputs = list(analysis.default_outputs) if table.outputs is None else table.outputs
     for name in outputs:
         if name not in names and name != OUTCOME.name:
-            raise InputError(f"outputs: {name!r} is not a result of {analysis.name}{_nearest(name, names)}")
+            raise InputError(f"outputs: {name!r} is not a result of {analysis.name}{nearest(name, names)}")
     # The outcome is stored with every result, named or not.
     outputs = [name for name in outputs if name != OUTCOME.name]
     if not outputs or len(set(outputs)) < len(outputs):
@@ -164,7 +164,7 @@ def _request(table: _SceneTable, analysis: Analysis) -> Request:
     for key, value in given.items():
         if key not in used:
             raise InputError(
-                f"options.{key} = {_short(value)}: not used by method {method}{_nearest(key, ('method', *used))}"
+                f"options.{key} = {_short(value)}: not used by method {method}{nearest(key, ('method', *used))}"
             )
     options = {o.name: _option(o, given) for o in analysis.options if o.name in used}
     return Request(tuple(outputs), method, options)
@@ -262,7 +262,7 @@ def _swept_parameter(system: System, where: str, name: str) -> tuple[Parameter, 
     known = {p.name: p for p in system.parameters}
     parameter = known.get(base)
     if parameter is None:
-        raise InputError(f"{where}.{name}: unknown parameter{_nearest(base, known)}")
+        raise InputError(f"{where}.{name}: unknown parameter{nearest(base, known)}")
     if parameter.choices or parameter.text:
         raise InputError(f"{where}.{name}: a word cannot vary; allowed is to fix it: {parameter.allowed}")
     if not parameter.is_number and entry is None:
@@ -280,7 +280,7 @@ def _fixed(table: _SceneTable, system: System, analysis: Analysis, axes: tuple[A
     whole = {axis.name for axis in axes if axis.entry is None}
     for name, value in table.fixed.items():
         if name not in known:
-            raise InputError(f"fixed.{name} = {_short(value)}: unknown parameter{_nearest(name, known)}")
+            raise InputError(f"fixed.{name} = {_short(value)}: unknown parameter{nearest(name, known)}")
         if name in whole:
             where = "points" if table.points else "axes"
             raise InputError(f"fixed.{name} = {_short(value)}: also in [{where}]; allowed is one of the two")

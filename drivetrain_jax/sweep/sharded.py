@@ -29,17 +29,26 @@ from drivetrain_jax.sweep.worker import Job
 
 @dataclass(frozen=True)
 class Shard:
-    """The ``chunks`` that make up shard ``index`` of ``group``."""
+    """Shard ``index`` of ``group`` is made up of the chunks with these ``numbers``."""
 
     number: int
     group: shards.Group
     index: int
+    numbers: range
+
+
+@dataclass(frozen=True)
+class Task:
+    """A shard and its chunks: all that a worker has to know beside the scene."""
+
+    number: int
+    shard: Shard
     chunks: tuple[Chunk, ...]
 
-    @property
-    def points(self) -> int:
-        """How many points it has."""
-        return sum(chunk.points.size for chunk in self.chunks)
+    @classmethod
+    def of(cls, engine: Engine, shard: Shard) -> Task:
+        """The task of computing ``shard``."""
+        return cls(shard.number, shard, tuple(map(engine.plan.chunk, shard.numbers)))
 
 
 @dataclass(frozen=True)
@@ -48,9 +57,9 @@ class ShardJob(Job):
 
     path: str
 
-    def do(self, engine: Engine, shard: Shard) -> Mapping[str, np.ndarray]:
-        """Compute and write ``shard``; only the outcomes come back."""
-        return _write(self.path, engine, shard, [engine.compute_chunk(chunk) for chunk in shard.chunks])
+    def do(self, engine: Engine, task: Task) -> Mapping[str, np.ndarray]:
+        """Compute and write a shard; only the outcomes come back."""
+        return _write(self.path, engine, task, [engine.compute_chunk(chunk) for chunk in task.chunks])
 
 
 def check(engine: Engine) -> None:
@@ -71,23 +80,23 @@ def compute(
 ) -> None:
     """Fill the store that grows among ``parts``, and put it at ``out`` when it is complete."""
     path, begin = parts.path / "store", time.monotonic()
-    # Points that no solver can do are done already, without a value.
-    hopeless = engine.total - sum(group.order.size for group in engine.plan.groups) * engine.grid.path_length
-    progress.computed += hopeless
-    progress.failed += hopeless
+    progress.computed += engine.hopeless
+    progress.failed += engine.hopeless
     if not shards.is_store(path):
         _create(engine, path)
     missing = list(_missing(engine, path, progress))
     costs = engine.plan.costs
-    progress.total_cost = float(sum(costs[chunk.number] for shard in missing for chunk in shard.chunks))
+    progress.total_cost = float(sum(costs[shard.numbers].sum() for shard in missing))
     _tell(report, progress)
     job = ShardJob(engine.scene.text, engine.digest, os.path.abspath(path))
-    with closing(where.each(missing, partial(job.do, engine), lambda: job)) as finished:
-        for shard, results in finished:
-            outcome = _one_by_one(engine, where, path, shard) if results is None else results[OUTCOME.name]
-            progress.computed += shard.points * engine.grid.path_length
+    # Made when they are handed out: the points of all shards together may be too many for the driver.
+    tasks = map(partial(Task.of, engine), missing)
+    with closing(where.each(tasks, partial(job.do, engine), lambda: job)) as finished:
+        for task, results in finished:
+            outcome = _one_by_one(engine, where, path, task) if results is None else results[OUTCOME.name]
+            progress.computed += outcome.size
             progress.failed += failures(outcome)
-            progress.cost += float(sum(costs[chunk.number] for chunk in shard.chunks))
+            progress.cost += float(costs[task.shard.numbers].sum())
             _tell(report, progress)
     _finish(path, out, parts, round(time.monotonic() - begin, 3))
 
@@ -116,8 +125,7 @@ def all_shards(engine: Engine) -> Iterator[Shard]:
     for group in groups_of(engine):
         for index in range(group.shards):
             start = index * group.per_shard
-            numbers = range(first + start, first + min(start + group.per_shard, group.count))
-            yield Shard(number, group, index, tuple(engine.plan.chunk(n) for n in numbers))
+            yield Shard(number, group, index, range(first + start, first + min(start + group.per_shard, group.count)))
             number += 1
         first += group.count
 
@@ -131,16 +139,17 @@ def _missing(engine: Engine, path: Path, progress: Progress) -> Iterator[Shard]:
         if present is None:
             yield shard
             continue
-        progress.reused += shard.points * engine.grid.path_length
-        progress.failed += failures(present[OUTCOME.name][present[shards.POINT] >= 0])
+        outcome = present[OUTCOME.name][present[shards.POINT] >= 0]
+        progress.reused += outcome.size
+        progress.failed += failures(outcome)
 
 
 def _write(
-    path: str | Path, engine: Engine, shard: Shard, results: list[Mapping[str, np.ndarray]]
+    path: str | Path, engine: Engine, task: Task, results: list[Mapping[str, np.ndarray]]
 ) -> dict[str, np.ndarray]:
-    """Write the results of all chunks of ``shard``, padded to whole chunks; returns the outcomes."""
-    width = shard.group.width
-    arrays = {shards.POINT: np.concatenate([_padded(c.points, width, -1) for c in shard.chunks])}
+    """Write the results of all chunks of a shard, padded to whole chunks; returns the outcomes."""
+    shard, width = task.shard, task.shard.group.width
+    arrays = {shards.POINT: np.concatenate([_padded(c.points, width, -1) for c in task.chunks])}
     for variable in result_variables(engine.scene):
         blank = missing_value(variable)
         arrays[variable.name] = np.concatenate([_padded(r[variable.name], width, blank) for r in results])
@@ -154,17 +163,17 @@ def _padded(values: np.ndarray, count: int, blank: float) -> np.ndarray:
     return full
 
 
-def _one_by_one(engine: Engine, where: Where, path: Path, shard: Shard) -> np.ndarray:
+def _one_by_one(engine: Engine, where: Where, path: Path, task: Task) -> np.ndarray:
     """A shard at which processes die: its chunks alone, so that only the deadly one is lost; the driver writes it."""
-    found = {chunk.number: results for chunk, results in where.compute(engine, [c.number for c in shard.chunks])}
-    shapes = result_shapes(engine.scene, engine.grid, engine.solvers[shard.chunks[0].solver])
+    found = {chunk.number: results for chunk, results in where.compute(engine, task.shard.numbers)}
+    shapes = result_shapes(engine.scene, engine.grid, engine.solvers[task.chunks[0].solver])
     lost = {
-        v.name: np.full((shard.group.width, *shapes[v.name]), missing_value(v), v.dtype)
+        v.name: np.full((task.shard.group.width, *shapes[v.name]), missing_value(v), v.dtype)
         for v in result_variables(engine.scene)
     }
     lost[OUTCOME.name][...] = Outcome.LOST
-    results = [found[c.number] or {n: a[: c.points.size] for n, a in lost.items()} for c in shard.chunks]
-    return _write(path, engine, shard, results)[OUTCOME.name]
+    results = [found[c.number] or {n: a[: c.points.size] for n, a in lost.items()} for c in task.chunks]
+    return _write(path, engine, task, results)[OUTCOME.name]
 
 
 def _finish(path: Path, out: Path, parts: PartsFolder, seconds: float) -> None:

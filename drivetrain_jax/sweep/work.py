@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Protocol
@@ -17,8 +17,11 @@ from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.executor import Where
 from drivetrain_jax.sweep.plan import Chunk
 
-# Finished chunks are written together, this often (seconds): small ones would cost more to write than to compute.
-_WRITE_INTERVAL = 0.25
+# Finished chunks are written together: small ones would cost more to write than to compute. Fewest and most seconds
+# between two parts, and the share of the time that writing may take in between.
+_SHORTEST, _LONGEST, _WRITE_SHARE = 0.25, 2.0, 0.01
+# Bytes of results that wait to be written at most.
+_MOST_WAITING = 1 << 25
 
 
 @dataclass
@@ -64,13 +67,11 @@ class Work:
 
         Lost ones are not kept: a run that is resumed tries them again.
         """
-        # Points that no solver can do are done already, without a value.
-        hopeless = engine.total - sum(group.order.size for group in engine.plan.groups) * engine.grid.path_length
-        progress.computed += hopeless
-        progress.failed += hopeless
-        numbers = range(len(engine.plan.costs))
+        progress.computed += engine.hopeless
+        progress.failed += engine.hopeless
         if self.parts is None:
-            self._compute(engine, numbers, sink, progress, where or self.where, None)
+            everything = np.arange(len(engine.plan.costs))
+            self._compute(engine, everything, sink, progress, where or self.where, None)
             return
         missing = self._reuse(engine, sink, progress, first)
         writer, before = _Writer(self.parts, first), progress.computed
@@ -81,32 +82,33 @@ class Work:
             # An interrupt may come between keeping a chunk and counting it: what counts is what was written.
             progress.computed = before + writer.written * engine.grid.path_length
 
-    def _reuse(self, engine: Engine, sink: Sink, progress: Progress, first: int) -> list[int]:
+    def _reuse(self, engine: Engine, sink: Sink, progress: Progress, first: int) -> np.ndarray:
         """Enter the chunks that are there; the numbers of those that are not."""
-        missing = set(range(len(engine.plan.costs)))
+        missing = np.ones(len(engine.plan.costs), bool)
         for part in self.parts.read(repair=True):
             self.seconds += 0.0 if self._counted else part.seconds
             for number, results in part:
-                if number - first not in missing:
+                # An interrupt in the middle of writing may have left a chunk in two parts.
+                if not (0 <= number - first < missing.size and missing[number - first]):
                     continue
-                missing.remove(number - first)
+                missing[number - first] = False
                 points = engine.plan.chunk(number - first).points
                 sink.fill(points, results)
                 progress.reused += points.size * engine.grid.path_length
                 progress.failed += failures(results[OUTCOME.name])
         self._counted = True
-        return sorted(missing)
+        return np.flatnonzero(missing)
 
     def _compute(
         self,
         engine: Engine,
-        numbers: Iterable[int],
+        numbers: np.ndarray,
         sink: Sink,
         progress: Progress,
         where: Where,
         writer: _Writer | None,
     ) -> None:
-        numbers, costs = list(numbers), engine.plan.costs
+        costs = engine.plan.costs
         progress.cost, progress.total_cost = 0.0, float(costs[numbers].sum())
         self._tell(progress)
         # Closed on the way out: after an interrupt no further chunk starts.
@@ -131,27 +133,31 @@ class Work:
 
 
 class _Writer:
-    """Collects finished chunks and writes those of every quarter of a second as one part."""
+    """Collects finished chunks and writes those of a quarter of a second, on a slow disk of a longer time, as one part."""
 
     def __init__(self, parts: PartsFolder, first: int) -> None:
         self._parts, self._first = parts, first
         self._waiting: list[tuple[Chunk, Mapping[str, np.ndarray]]] = []
-        self._last = time.monotonic()
+        self._bytes = 0
+        self._last, self._interval = time.monotonic(), _SHORTEST
         self.written = 0
 
     def add(self, chunk: Chunk, results: Mapping[str, np.ndarray]) -> None:
         self._waiting.append((chunk, results))
-        if time.monotonic() - self._last >= _WRITE_INTERVAL:
+        self._bytes += sum(values.nbytes for values in results.values())
+        if time.monotonic() - self._last >= self._interval or self._bytes >= _MOST_WAITING:
             self.flush()
 
     def flush(self) -> None:
         if not self._waiting:
             return
         chunks, results = zip(*self._waiting, strict=True)
+        begin = time.monotonic()
         joined = {name: np.concatenate([r[name] for r in results]) for name in results[0]}
-        seconds = time.monotonic() - self._last
         numbers = [self._first + c.number for c in chunks]
-        self._parts.write(Part(numbers, [c.points.size for c in chunks], joined, seconds))
+        self._parts.write(Part(numbers, [c.points.size for c in chunks], joined, begin - self._last))
         self._waiting.clear()
+        self._bytes = 0
         self.written += sum(c.points.size for c in chunks)
         self._last = time.monotonic()
+        self._interval = min(max(_SHORTEST, (self._last - begin) / _WRITE_SHARE), _LONGEST)

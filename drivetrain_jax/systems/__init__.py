@@ -11,6 +11,7 @@ import jax
 # Every module that computes imports this package first, so no array can be made in single precision before this line.
 jax.config.update("jax_enable_x64", True)
 
+from drivetrain_jax._quantities import Parameter  # noqa: E402
 from drivetrain_jax.systems._base import (  # noqa: E402
     FloquetModel,
     ForcedModel,
@@ -38,6 +39,7 @@ __all__ = [
     "ForcedModel",
     "LinearPeriodic",
     "Model",
+    "Parameter",
     "PiecewiseLinearOscillator",
     "Resonances",
     "Shaft",

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import LinearSegmentedColormap, SymLogNorm
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, NullFormatter
 
 from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STATE_HATCHES, STATE_NAMES, STATES
 
@@ -86,11 +86,13 @@ def fit_axis(axes: Axes, which: str, values: np.ndarray) -> None:
 
 
 def plain_decades(axes: Axes, which: str) -> None:
-    """Plain numbers at 1, 2, 5 (at 1 alone if there are many decades) along a logarithmic axis."""
+    """Plain numbers at 1, 2, 5 (at 1 alone if there are many decades) along a logarithmic axis; powers of ten where plain
+    numbers would be long."""
     low, high = getattr(axes, f"get_{which}lim")()
     side = getattr(axes, f"{which}axis")
     side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
-    side.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    side.set_major_formatter(plain if low >= 1e-4 and high < 2e6 else LogFormatterMathtext())
     side.set_minor_formatter(NullFormatter())
 
 

@@ -55,7 +55,8 @@ def plot(dataset: xr.Dataset) -> Figure:
 
 
 def _colours(count: int) -> np.ndarray:
-    return matplotlib.colormaps["viridis"](np.linspace(0.0, 0.85, count))
+    # The yellow end would be too light for lines on white.
+    return matplotlib.colormaps["viridis"](np.linspace(0.0, 0.75, count))
 
 
 def _abscissa(dataset: xr.Dataset, name: str) -> xr.DataArray:

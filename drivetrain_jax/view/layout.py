@@ -26,7 +26,7 @@ _CAPTION_SIZE, _CAPTION_TOP, _CAPTION_LINE = 8, 0.32, 0.14
 
 @dataclass(frozen=True)
 class Margins:
-    """Free space around and between the panels, in inches."""
+    """Free space around and between the panels, and from the panels to the label of their vertical axis, in inches."""
 
     left: float = 0.75
     right: float = 0.95
@@ -34,6 +34,7 @@ class Margins:
     bottom: float = 0.90
     between_rows: float = 0.22
     between_columns: float = 0.20
+    label: float = 0.44
 
 
 class Panels:
@@ -86,7 +87,7 @@ class Panels:
         self._label_side(box.y0, box.y1, vertical)
 
     def _label_side(self, bottom: float, top: float, text: str) -> None:
-        x = self.axes[0][0].get_position().x0 - 0.44 / WIDTH
+        x = self.axes[0][0].get_position().x0 - self.margins.label / WIDTH
         text = _wrap(text, (top - bottom) * self.figure.get_figheight())
         self.figure.text(
             x, (bottom + top) / 2, text, ha="right", va="center", multialignment="center", rotation=90, size=_LABEL_SIZE

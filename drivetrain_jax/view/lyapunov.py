@@ -71,7 +71,7 @@ def _convergence(dataset: xr.Dataset) -> Figure:
 
 def _curves(dataset: xr.Dataset, name: str) -> Figure:
     shown = [key for key in _CURVES if key in dataset]
-    panels = Panels(len(shown), height=_HEIGHT, margins=Margins(right=0.3, left=1.0), share_y=False)
+    panels = Panels(len(shown), height=_HEIGHT, margins=Margins(right=0.3, left=1.05, label=0.52), share_y=False)
     handles: list[Artist] = []
     for (axes,), key in zip(panels.axes, shown, strict=True):
         _draw_curves(axes, dataset, key, name)

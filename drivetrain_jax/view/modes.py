@@ -21,7 +21,7 @@ TYPE_COLOURS = {
     "rigid": "#9a9a9a",
     "rotational": "#16324f",
     "translational": "#d1771e",
-    "planet": "#6fbf73",
+    "planet": "#3f8f5f",
     "coupled": "#a0308c",
 }
 _CURVES_HEIGHT, _GEAR_HEIGHT = 4.4, 1.62

@@ -99,7 +99,7 @@ def caption(dataset: xr.Dataset) -> str:
     parts += [
         value_text(str(name), coordinate.item(), coordinate.attrs.get("units", "1"))
         for name, coordinate in dataset.coords.items()
-        if coordinate.ndim == 0
+        if coordinate.ndim == 0 and name != "point"  # a number in a list tells nothing
     ]
     return ", ".join(parts)
 

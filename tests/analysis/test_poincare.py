@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
+from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.section_measures import period_multiple, torus_residual
 from drivetrain_jax.analysis.zero_one_test import chaos_k01
 
@@ -47,15 +48,29 @@ def test_section_repeats_exactly(motor):
 
 
 def test_loose_tolerances_blur_the_section(motor):
-    """What differs from the equal steps of order 8, over the extent of the section."""
+    """What differs from the equal steps of order 8, over the extent of the section; the loose one says so itself."""
     extent = np.ptp(motor.section.values[1, :, 0])
     found = {}
     for rtol, atol in ((1e-3, 1e-6), (1e-9, 1e-12)):
-        ours = section(["section"], method="adaptive", strobes=128, discard=800, rtol=rtol, atol=atol)
-        assert (ours.outcome == 0).all()
+        options = {"method": "adaptive", "strobes": 128, "discard": 800, "rtol": rtol, "atol": atol}
+        ours = section(["section", "strobe_error"], **options)
+        missed = ours.strobe_error > min(1e-6, 10 * rtol)
+        np.testing.assert_array_equal(ours.outcome, np.where(missed, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS))
+        assert ((ours.strobe_error > 1e-6) == (rtol == 1e-3)).all()
         found[rtol] = np.abs(ours.section.values[1, :, 0] - motor.section.values[1, :128, 0]).max() / extent
     assert found[1e-3] > 1
     assert found[1e-9] < 1e-2
+
+
+def test_steps_that_are_too_long_are_noticed():
+    """Four natural half periods a strobe: the estimate is of the size of the difference from eight times the steps."""
+    scene = {"system": "tripod", "analysis": "poincare", "outputs": ["section", "strobe_error"]}
+    scene |= {"fixed": FIXED | {"excitation_frequency": 1500.0}}
+    coarse, fine = (dt.run(scene | {"options": {"strobes": 128, "discard": 800, "steps": n}}) for n in (6, 48))
+    assert coarse.outcome == Outcome.TOLERANCE_NOT_MET
+    assert fine.outcome == Outcome.SUCCESS
+    difference = float(np.abs(coarse.section - fine.section).max() / np.abs(fine.section).max())
+    assert 0.1 * float(coarse.strobe_error) < difference < 100 * float(coarse.strobe_error)
 
 
 class TestZeroOne:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from propagators import BASE, CARDAN, cardan_atlas, monodromy, propagators
 
 from benchmarks.cardan_reference import monodromy as reference_monodromy
+from drivetrain_jax.atlas import tips as naming
 from drivetrain_jax.atlas.boundaries import boundaries
 from drivetrain_jax.atlas.criteria import Criteria, invariants
 from drivetrain_jax.atlas.exclusion import critical_points
@@ -170,8 +173,6 @@ def test_exclusion_finds_what_it_should(atlas):
 
 def test_a_large_error_leaves_boxes_undecided(atlas):
     """The guarantee must notice that the surrogate is too coarse to exclude a tongue."""
-    from dataclasses import replace
-
     from drivetrain_jax.atlas.windows import narrow
 
     part = narrow(atlas, {"beta": (0.05, 0.2), "Omega": (1.38, 1.45)})
@@ -184,6 +185,39 @@ def test_a_large_error_leaves_boxes_undecided(atlas):
         b for b in tips.undecided if b["beta"][0] <= beta <= b["beta"][1] and b["Omega"][0] <= omega <= b["Omega"][1]
     ]
     assert inside and not tips.tips
+
+
+def test_a_tip_that_cannot_be_proved_is_listed_as_such(atlas):
+    """Newton's method on the multiplier still finds the tip of the surrogate, with a bound of how far off it may be."""
+    from drivetrain_jax.atlas.windows import narrow
+
+    part = narrow(atlas, {"beta": (0.05, 0.2), "Omega": (1.38, 1.45)})
+    panels = tuple(replace(p, value_error=1e-6, derived_error=np.full(3, 1e-6)) for p in part.panels)
+    tips = find_tips(replace(part, panels=panels), CARDAN)
+    (tip,) = tips.tips
+    assert tip.name == "S21" and tip.opens and not tip.proved and not tips.complete
+    assert tip.point == pytest.approx(dict(zip(("beta", "Omega"), TIPS["S21"], strict=True)), abs=1e-9)
+    assert 1e-5 < tip.error["beta"] < 1e-3 and 1e-8 < tip.error["Omega"] < 1e-5
+    assert all(tip.proved for tip in find_tips(part, CARDAN).tips)
+
+
+def test_inside_an_unstable_region_there_is_no_tip(atlas):
+    criteria = Criteria.of(atlas, CARDAN)
+    x = atlas.to_coordinates(np.array([[0.2, 1.0], [0.9, 1.45]]))
+    rates = growth(criteria, x, ["+1", "+1"], second=True)
+    found = naming._describe(criteria, "+1", 1, (x, rates, np.full(2, np.nan)), np.ones(2, bool))
+    assert [tip.point["beta"] for tip in found] == pytest.approx([0.2])
+
+
+def test_a_name_belongs_to_a_resonance_of_the_same_multiplier(atlas):
+    foot = float(atlas.to_coordinates(np.array([0.1, TIPS["S21"][1]]))[1])
+    assert naming._name(atlas, CARDAN, "-1", 1, foot) == "S21"
+    assert naming._name(atlas, CARDAN, "+1", 1, foot) == ""
+    # Over the stiffness ratio, on which the resonances depend, it is that at the foot.
+    fixed = {name: value for name, value in atlas.fixed.items() if name != "mu"} | {"beta": 0.1}
+    lower, upper = np.array([1.0, 0.06]), np.array([20.0, 2.0])
+    other = replace(atlas, parameters=("mu", "Omega"), lower=lower, upper=upper, fixed=fixed)
+    assert naming._name(other, CARDAN, "-1", 1, foot) == "S21"
 
 
 def test_roots_on_a_line_are_all_sign_changes(atlas):
@@ -214,6 +248,18 @@ def test_boundary_curves_are_boundaries(atlas, curves):
         assert np.abs(step).max() < 0.02
     # Every tongue has its one curve, through its tip, and none is left over.
     assert sorted(lowest) == pytest.approx(sorted(beta for beta, _ in TIPS.values()), abs=1e-6)
+
+
+def test_only_what_bounds_the_stable_region_is_limiting(chart):
+    """Where tongues overlap, the boundary of one runs on inside the other."""
+    criteria, inside = Criteria.of(chart.atlas, CARDAN), 0
+    for curve in boundaries(chart.atlas, CARDAN):
+        x = chart.atlas.to_coordinates(np.stack([curve.points["beta"], curve.points["Omega"]], axis=-1))
+        rho = criteria.spectral_radius(x)
+        assert np.abs(rho[curve.limiting] - 1).max(initial=0.0) < 2e-6
+        assert (rho[~curve.limiting] > 1).all()
+        inside += np.sum(~curve.limiting)
+    assert inside > 20
 
 
 def test_curves_enclose_what_is_unstable(atlas, curves):

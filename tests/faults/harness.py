@@ -120,6 +120,7 @@ class Bench:
         cache = str(self.folder / "cache")
         self.environment = os.environ | {"DRIVETRAIN_JAX_CACHE": cache, "PYTHONPATH": install(self.folder / "packages")}
         self.rng = np.random.default_rng(self.seed)
+        self._runs: list[Run] = []
         self.reference = self.folder / "reference.nc"
         self.run(self.reference).end()
         begin = time.monotonic()
@@ -132,7 +133,16 @@ class Bench:
 
     def run(self, out: Path, options: Sequence[str] = (), **how: Any) -> Run:
         """Start a run into ``out``."""
-        return Run(self, out, options, **how)
+        self._runs.append(run := Run(self, out, options, **how))
+        return run
+
+    def __enter__(self) -> Bench:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End what still runs when the suite is stopped."""
+        for run in self._runs:
+            settle(run, 0.0)
 
     def place(self) -> Path:
         """A new output in a folder of its own."""

@@ -1,4 +1,4 @@
-"""Every kind of fault: a function from a bench to the record of one injection."""
+"""Faults of processes, disks and folders: functions from a bench to the record of one injection."""
 
 from __future__ import annotations
 
@@ -214,77 +214,6 @@ def two_runs(bench: Bench, kind: str) -> Record:
     return resume(bench, kind, out, moment, hit, (ended or [first])[0], settle(run), (), allowed)
 
 
-def corrupted(bench: Bench, kind: str, damage: Callable[[bytearray, Bench], bytearray]) -> Record:
-    """A part is damaged after a kill: its chunks are computed again."""
-    out, moment = bench.place(), bench.moment()
-    run = bench.run(out)
-    hit = strike(run, out, moment, run.process.kill)
-    ended = run.end()
-    settle(run)
-    parts = sorted(out.with_name(out.name + ".parts").glob("*-*.h5"))
-    for part in parts[:: max(len(parts) // 3, 1)]:
-        part.write_bytes(damage(bytearray(part.read_bytes()), bench))
-    return resume(bench, kind, out, moment, hit and bool(parts), ended, 0, (), stopped_by(signal.SIGKILL))
-
-
-def flip(data: bytearray, bench: Bench) -> bytearray:
-    """One bit."""
-    data[bench.rng.integers(len(data))] ^= 1 << int(bench.rng.integers(8))
-    return data
-
-
-def cut(data: bytearray, bench: Bench) -> bytearray:
-    """The end is missing."""
-    return data[: bench.rng.integers(len(data))]
-
-
-def damaged_result(bench: Bench, kind: str) -> Record:
-    """One bit of the finished file: ``verify`` finds it, or nothing that a reader sees has changed."""
-    out = bench.place()
-    out.write_bytes(flip(bytearray(bench.reference.read_bytes()), bench))
-    command = [sys.executable, "-m", "drivetrain_jax.cli", "verify", str(out)]
-    done = subprocess.run(command, capture_output=True, text=True, env=bench.environment)
-    found = done.returncode == 2 and len(done.stderr.splitlines()) == 1
-    try:
-        same = not bench.wrong(out)
-    except (OSError, RuntimeError, ValueError, KeyError):
-        same = False
-    record = (
-        resume(bench, kind, out, 0.0, True, Ended(done.returncode, done.stderr.splitlines()), 0, ["--fresh"])
-        if (found and "not a readable" not in done.stderr)
-        else Record(kind, 0.0, True, done.returncode, 0, 0, 0, 0, 0)
-    )
-    record.problem += "" if found or same else "not found"
-    return record
-
-
-CLOCK = """
-import os, random, time
-_jump = random.Random(int(os.environ["CLOCK_SEED"]))
-_time, _time_ns = time.time, time.time_ns
-def _offset():
-    return _jump.choice([-1, 1]) * _jump.choice([0, 3600, 86400, 3e8])
-time.time = lambda: _time() + _offset()
-time.time_ns = lambda: _time_ns() + int(_offset() * 1e9)
-"""
-
-
-def clock(bench: Bench, kind: str) -> Record:
-    """The system's clock jumps by up to ten years, both ways, at every look; the run is killed and resumed under it."""
-    out, moment = bench.place(), bench.moment()
-    site = out.parent / "site"
-    site.mkdir()
-    (site / "sitecustomize.py").write_text(CLOCK)
-    path = os.pathsep.join([str(site), bench.environment["PYTHONPATH"]])
-    run = bench.run(out, env={"PYTHONPATH": path, "CLOCK_SEED": str(bench.rng.integers(1 << 30))})
-    hit = strike(run, out, moment, run.process.kill)
-    ended = run.end()
-    settle(run)
-    for file in out.parent.rglob("*"):
-        os.utime(file, times=(when := float(bench.rng.choice([0.0, 4e9])), when))
-    return resume(bench, kind, out, moment, hit, ended, 0, (), stopped_by(signal.SIGKILL))
-
-
 def sharded(bench: Bench, kind: str, victim: str) -> Record:
     """A run whose workers write a Zarr store; what it exports to is the same file."""
     out, moment = bench.place().with_name("r.zarr"), bench.moment()
@@ -342,32 +271,3 @@ def start_cluster(bench: Bench, folder: Path, stack: ExitStack) -> tuple[str, di
     while not file.exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     return json.loads(file.read_text())["address"], processes
-
-
-KILLED = stopped_by(signal.SIGKILL)
-# Name, injection, how often in the full suite, whether it is in the short one.
-KINDS: tuple[tuple[str, Callable[[Bench, str], Record], int, bool], ...] = (
-    ("SIGKILL of the driver, threads", lambda b, k: signalled(b, k, signal.SIGKILL, [], KILLED), 3, True),
-    ("SIGKILL of the driver, processes", lambda b, k: signalled(b, k, signal.SIGKILL, WORKERS, KILLED), 2, False),
-    ("SIGKILL of a worker process", lambda b, k: kill_worker(b, k, WORKERS), 2, True),
-    ("SIGKILL while a former result is replaced", kill_replacing, 1, False),
-    ("Ctrl-C (SIGINT), threads", lambda b, k: signalled(b, k, signal.SIGINT, [], interrupted), 2, True),
-    ("Ctrl-C (SIGINT), processes", lambda b, k: signalled(b, k, signal.SIGINT, WORKERS, interrupted), 1, False),
-    ("SIGTERM, threads", lambda b, k: signalled(b, k, signal.SIGTERM, [], interrupted), 1, False),
-    ("SIGKILL of the Dask scheduler", lambda b, k: cluster(b, k, "scheduler"), 1, False),
-    ("SIGKILL of a Dask worker", lambda b, k: cluster(b, k, "worker"), 1, False),
-    ("SIGKILL of the driver of a Dask cluster", lambda b, k: cluster(b, k, "driver"), 1, False),
-    ("full disk", full_disk, 2, True),
-    ("limit of a file's size", file_limit, 2, False),
-    ("file system turns read-only", read_only, 2, False),
-    ("read-only folder", read_only_folder, 1, False),
-    ("folder of parts vanishes", lambda b, k: vanished(b, k, whole=False), 2, True),
-    ("output's folder vanishes", lambda b, k: vanished(b, k, whole=True), 1, False),
-    ("two runs on one output", two_runs, 2, False),
-    ("bit flips in parts", lambda b, k: corrupted(b, k, flip), 3, True),
-    ("truncated parts", lambda b, k: corrupted(b, k, cut), 2, False),
-    ("bit flip in the finished file", damaged_result, 3, True),
-    ("clock that jumps", clock, 1, False),
-    ("SIGKILL of a worker that writes a Zarr store", lambda b, k: sharded(b, k, "worker"), 1, False),
-    ("SIGKILL of the driver of a Zarr store", lambda b, k: sharded(b, k, "driver"), 1, False),
-)

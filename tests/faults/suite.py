@@ -8,12 +8,13 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
+from contextlib import ExitStack
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
 from harness import ROOT, Bench, Record
-from injections import KINDS
+from kinds import KINDS
 
 from drivetrain_jax.store.provenance import machine, now
 
@@ -23,7 +24,7 @@ BEGIN, END = "<!-- faults: written by `make faults` -->", "<!-- end of faults --
 def main() -> int:
     """Run the suite; the exit code is 1 if anything was lost or wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--points", type=int, default=600_000, help="size of the chart")
+    parser.add_argument("--points", type=int, default=250_000, help="size of the chart")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--page", type=Path, default=ROOT / "docs" / "reliability.md")
     parser.add_argument(
@@ -33,8 +34,9 @@ def main() -> int:
     # File systems that are mounted come down also when the suite is stopped.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     begin = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix="faults-") as folder:
-        bench = Bench(Path(folder), options.points, options.seed)
+    with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="faults-"))
+        bench = stack.enter_context(Bench(Path(folder), options.points, options.seed))
         chosen = [k for k in KINDS if not options.only or any(part in k[0] for part in options.only)]
         # Every kind once, then those again that are to come more often.
         turns = [k for turn in range(max(k[2] for k in chosen)) for k in chosen if turn < k[2]]

@@ -10,7 +10,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 from harness import Bench
-from injections import KINDS
+from kinds import KINDS
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="faults are injected through /proc")
 

@@ -52,6 +52,16 @@ def test_a_change_is_named(path, change, named):
     assert checksums.damaged(path) == named
 
 
+def test_large_variables_are_checked_to_their_end(path, monkeypatch):
+    """Values are read some at a time; what comes out does not depend on how many."""
+    with h5py.File(path, "r+") as file:
+        whole = checksums.checksums(file)
+        monkeypatch.setattr(checksums, "_BLOCK", 100)
+        assert checksums.checksums(file) == whole
+        file["z"][39, 1] = 0
+    assert checksums.damaged(path) == ["z"]
+
+
 def test_a_file_of_another_origin_has_none(tmp_path):
     xr.Dataset({"x": 1.0}).to_netcdf(tmp_path / "f.nc", engine="h5netcdf")
     assert checksums.damaged(tmp_path / "f.nc") is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import xarray as xr
 from drivetrain_jax import InputError
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.store import files, provenance
-from drivetrain_jax.store.consolidate import open_result, read_attribute, write_result
+from drivetrain_jax.store.consolidate import ResultFile, open_result, read_attribute, release, write_result
 from drivetrain_jax.store.schema import Coordinate, build_dataset
 
 
@@ -53,6 +54,26 @@ def test_two_files_of_one_dataset_are_identical(dataset, tmp_path):
     for name in ("one", "two"):
         write_result(dataset, tmp_path / name, tmp_path / "tmp")
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+
+
+def resident():
+    """Megabytes of this process that are pages of files."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return sum(int(line.split()[1]) / 1024 for line in lines if line.startswith(("RssFile", "RssShmem")))
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory is looked up in /proc")
+def test_what_is_released_takes_no_memory_and_is_not_lost(tmp_path):
+    blank = np.broadcast_to(np.zeros(()), (1 << 22,))
+    template = build_dataset(("x",), [], [], [(Variable("f", "s", "duration"), blank)], {"digest": "abc"})
+    with ResultFile(tmp_path / "tmp") as file:
+        arrays = file.lay_out(template)
+        arrays["f"][:] = 3.0
+        full = resident()
+        release(arrays.values())
+        assert resident() < full - 30
+        assert (arrays["f"] == 3.0).all()
+        release([np.zeros(3)])
 
 
 @pytest.mark.parametrize("step", ["os.fsync", "os.replace"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import toy
@@ -35,11 +37,56 @@ def test_points_of_a_solver_are_sorted_by_effort(grid_scene):
         assert np.all(np.diff(group.efforts) >= 0)
 
 
-def test_plan_does_not_depend_on_the_block(grid_scene, monkeypatch):
-    whole = engine(grid_scene).plan
-    monkeypatch.setattr("drivetrain_jax.sweep.plan._BLOCK", 7)
-    for a, b in zip(whole.groups, engine(grid_scene).plan.groups, strict=True):
-        assert np.array_equal(a.order, b.order) and np.array_equal(a.efforts, b.efforts)
+def chunks_of(scene):
+    plan = engine(scene).plan
+    return [plan.chunk(number) for number in range(len(plan.costs))]
+
+
+def test_plan_does_not_depend_on_how_effort_is_predicted(grid_scene, monkeypatch):
+    whole = chunks_of(grid_scene)
+    monkeypatch.setattr("drivetrain_jax.sweep.plan._PIECE", 7)
+    for a, b in zip(whole, chunks_of(grid_scene), strict=True):
+        assert np.array_equal(a.points, b.points) and a.effort == b.effort
+
+
+def test_blocks_are_sorted_one_by_one(grid_scene, monkeypatch):
+    """Each point once, in the block where it lies and with the solver that it has in one block; chunks are whole but for
+    the last of a block, and come block by block."""
+    whole = chunks_of(grid_scene)
+    solver = {point: chunk.solver for chunk in whole for point in chunk.points}
+    monkeypatch.setattr("drivetrain_jax.sweep.plan._BLOCK", 50)
+    plan = engine(grid_scene).plan
+    chunks = [plan.chunk(number) for number in range(len(plan.costs))]
+    assert sorted(np.concatenate([c.points for c in chunks])) == sorted(solver)
+    assert {point: c.solver for c in chunks for point in c.points} == solver
+    assert (
+        {(c.solver, c.size) for c in chunks} == {(c.solver, c.size) for c in whole} == plan.kernels(range(len(chunks)))
+    )
+    blocks = [set((c.points // 50).tolist()) for c in chunks]
+    assert all(len(block) == 1 for block in blocks) and max(max(block) for block in blocks) > 1
+    order = [(*blocks[number], -plan.costs[number]) for number in plan.ordered(range(len(chunks)))]
+    assert order == sorted(order)
+    for group in plan.groups:
+        counts = np.bincount([point // 50 for point, index in solver.items() if index == group.index], minlength=3)
+        assert np.array_equal(np.diff(group.firsts), -(-counts // group.chunk)) and group.size == counts.sum()
+
+
+def test_a_plan_keeps_little(monkeypatch):
+    """Memory grows by the share that a point has of its chunk, not by the point."""
+    monkeypatch.setattr("drivetrain_jax.sweep.plan._BLOCK", 1 << 12)
+    monkeypatch.setattr("drivetrain_jax.sweep.plan._PIECE", 1 << 10)
+
+    def kept(rows):
+        axes = {"b": {"start": 1, "stop": 2, "num": rows}, "a": {"start": 1, "stop": 2, "num": 1024}}
+        tracemalloc.start()
+        plan = engine({"system": "toy", "analysis": "toy", "axes": axes}).plan
+        assert plan.size == rows * 1024
+        memory = tracemalloc.get_traced_memory()[0]
+        tracemalloc.stop()
+        return memory
+
+    kept(1)
+    assert kept(384) - kept(128) < 256 * 1024 / 2
 
 
 @pytest.mark.parametrize(
@@ -57,7 +104,7 @@ def test_absurd_efforts(effort, planned):
     """Infinite, overflowing or undefined cost: no solver; efforts stay within what a counter can hold."""
     grid = Grid.of(load_scene({"system": "toy", "analysis": "toy", "points": {"a": [1.0, 2.0]}}))
     plan = make_plan([Solver("s", None, lambda columns: np.array(effort), unit_cost=1e291)], grid)
-    assert sum(group.order.size for group in plan.groups) == planned
+    assert plan.size == planned
     assert all(0 <= e < 2**31 for group in plan.groups for e in group.efforts)
 
 

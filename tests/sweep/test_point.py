@@ -73,7 +73,7 @@ def test_another_point_needs_no_new_compilation():
 @pytest.mark.parametrize(
     ("given", "part"),
     [
-        ({"a": 11}, "^a = 11: allowed is 0 <= a <= 10$"),
+        ({"a": 11}, "^a = 11: allowed is 0 <= a <= 10, in m$"),
         ({"a": "x"}, "^a = 'x': allowed is a number"),
         ({"a": [1.0]}, "^a = "),
         ({}, "^a: missing"),

@@ -255,6 +255,20 @@ def test_interrupted_replacement_keeps_the_old_result_and_resumes(grid_scene, tm
     assert status(other, path).state == "complete" and os.listdir(tmp_path) == ["r.nc"]
 
 
+def test_work_is_not_resumed_over_a_result_that_came_meanwhile(grid_scene, tmp_path):
+    path, meanwhile = tmp_path / "r.nc", tmp_path / "s.nc"
+    run_to_file(grid_scene | {"fixed": {"n": 4}}, path)
+    with pytest.raises(KeyboardInterrupt):
+        run_to_file(grid_scene, path, fresh=True, where=Where(threads=1), report=stop_after(2))
+    run_to_file(grid_scene | {"fixed": {"n": 5}}, meanwhile)
+    os.replace(meanwhile, path)
+    before = path.read_bytes()
+    assert status(grid_scene, path).state == "stale"
+    with pytest.raises(dt.InputError, match="beside another result than the one it was begun with"):
+        run_to_file(grid_scene, path)
+    assert path.read_bytes() == before
+
+
 def test_corrupted_chunk_is_computed_again(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt) as stopped:
@@ -320,10 +334,16 @@ MANY = """
 import resource, sys, threading, toy
 from pathlib import Path
 toy.names()
+from drivetrain_jax.sweep import assemble, plan, work
 from drivetrain_jax.sweep.run import run_to_file
 
+# As if the sweep were as many times larger.
+plan._BLOCK, plan._PIECE, assemble._RESIDENT, assemble._ROWS = 1 << 13, 1 << 12, 1 << 20, 1 << 17
+# What waits to be written is not what is looked for.
+work._LONGEST = work._SHORTEST
+
 def peak():
-    return int(next(l for l in Path("/proc/self/status").read_text().splitlines() if l.startswith("RssAnon")).split()[1])
+    return int(next(l for l in Path("/proc/self/status").read_text().splitlines() if l.startswith("VmRSS")).split()[1])
 
 scene = {"system": "toy", "analysis": "toy", "outputs": ["wave"], "fixed": {"n": 1},
          "axes": {"a": {"start": 0, "stop": 9, "num": int(sys.argv[2])}, "b": {"start": 1, "stop": 2, "num": 1000}}}
@@ -342,8 +362,9 @@ def test_memory_does_not_grow_with_the_results(tmp_path):
         )
 
     small, large = megabytes(100), megabytes(600)
-    # 500,000 more points of 49 bytes would be 24 MB once; the plan takes 8 bytes of each.
-    assert large - small < 500_000 * 16 / 2**20
+    # Pages of mapped files included. 500,000 more points of 49 bytes are 24 MB; what is left is the slack of the allocator
+    # and some tens of bytes for each chunk, of 16 or 32 points here and of 512 in large sweeps.
+    assert large - small < 500_000 * 24 / 2**20
     assert (tmp_path / "600.nc").stat().st_size > 600_000 * 49
 
 
@@ -374,7 +395,7 @@ def wait_for_parts(out, count, process):
 
 def test_killed_and_resumed_equals_uninterrupted(slow_process, tmp_path):
     start, out = slow_process
-    for parts in (1, 3):
+    for parts in (1, 2):
         process = start()
         wait_for_parts(out, parts, process)
         process.kill()

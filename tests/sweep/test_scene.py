@@ -78,7 +78,7 @@ WRONG = {
     "unknown key": (changed(axis={}), "axis", "axes"),
     "missing system": ({"analysis": "toy"}, "system", "missing"),
     "unknown system": (changed(system="tooy"), "tooy", "cardan"),
-    "unknown analysis": (changed(analysis="ty"), "ty", "floquet"),
+    "unknown analysis": (changed(analysis="ty"), "ty", "allowed for toy is one of toy, slow"),
     "analysis of another system": (changed(system="cardan", analysis="toy"), "toy", "floquet"),
     "wrong type of a key": (changed(title=3), "title = 3", "text"),
     "wrong type of outputs": (changed(outputs="value"), "outputs", "list"),

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
+from matplotlib.figure import Figure
 
 from drivetrain_jax.view import cells, plot
+from drivetrain_jax.view.style import caption
 from tests.view import results
 from tests.view.test_stability import meshes, panels
 
@@ -54,3 +57,16 @@ def test_values_given_out_of_order_are_sorted():
         results.grid(code, "beta", "Omega"), beta=np.array([0.2, 0.1]), Omega=np.array([3.0, 2.0, 1.0])
     )
     np.testing.assert_array_equal(meshes(plot(dataset))[0].get_array(), [[0, 0, 0], [0, 1, 0]])
+
+
+@pytest.mark.parametrize(("limits", "first"), [((100.0, 2e5), "100"), ((100.0, 1e8), "$\\mathdefault{10^{2}}$")])
+def test_long_numbers_on_a_logarithmic_axis_are_powers_of_ten(limits, first):
+    axes = Figure().add_subplot()
+    axes.set(yscale="log", ylim=limits)
+    cells.plain_decades(axes, "y")
+    assert axes.yaxis.get_major_formatter()(100.0, 0) == first
+
+
+def test_the_caption_gives_parameters_and_not_the_number_of_the_point():
+    dataset = xr.Dataset(coords={"point": 0, "omega": ((), 0.86, {"units": "rad/s"})})
+    assert caption(dataset) == "$\\omega$ = 0.86 rad/s"

@@ -1,0 +1,105 @@
+"""Every study of the benchmarks, one process after the other, and the page that is written from their results.
+
+    python -m benchmarks [--quick] [--out FOLDER] [--peers PYTHON] [SYSTEM ...]
+
+A full run rewrites benchmarks/results/ and docs/benchmarks.md. With ``--quick``, or another ``--out``, files and page go
+to that folder. A study whose peer is not installed is left out, and said so; one that fails does not stop the others.
+``drivetrain bench`` and ``make bench`` run this.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from benchmarks.page import write_page
+from benchmarks.timing import RESULTS, parser, results_folder
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "benchmarks.md"
+SYSTEMS = ("cardan", "bicardan", "planetary", "rattle", "tripod")
+
+
+@dataclass(frozen=True)
+class Study:
+    """A module of benchmarks/: what it is about, the package it cannot do without, its option for an interpreter that has
+    the peers, and its arguments in a full run (chosen so that all studies together stay under half an hour)."""
+
+    module: str
+    system: str
+    needs: str = ""
+    peer_option: str = ""
+    full: tuple[str, ...] = ()
+
+
+STUDIES = (
+    Study("throughput", "cardan", "heyoka"),
+    Study("precision_cardan", "cardan"),
+    Study("work_precision", "cardan"),
+    Study("atlas", "cardan", "heyoka", full=("--repeats", "1")),
+    Study("peers", "cardan", "heyoka"),
+    Study("batches", "cardan"),
+    Study("scaling", "cardan", full=("--repeats", "1")),
+    Study("precision_bicardan", "bicardan"),
+    Study("critical_speeds", "bicardan", peer_option="--ross"),
+    Study("precision_planetary", "planetary"),
+    Study("planetary_throughput", "planetary", full=("--gears", "6000", "--repeats", "3")),
+    Study("precision_rattle", "rattle"),
+    Study("rattle_throughput", "rattle"),
+    Study("precision_tripod", "tripod"),
+    Study("chaos", "tripod", "heyoka", peer_option="--pynamicalsys"),
+)
+
+
+def command(study: Study, quick: bool, folder: Path, peers: str | None) -> list[str]:
+    """The command of one study."""
+    words = [sys.executable, "-m", f"benchmarks.{study.module}", "--out", str(folder)]
+    words += ["--quick"] if quick else study.full
+    return words + ([study.peer_option, peers] if peers and study.peer_option else [])
+
+
+def run(studies: Sequence[Study], quick: bool, folder: Path, peers: str | None) -> int:
+    """Run ``studies``; returns how many failed."""
+    failed = 0
+    begin = time.perf_counter()
+    for number, study in enumerate(studies, 1):
+        clock = f"[{number}/{len(studies)}, {time.perf_counter() - begin:.0f} s]"
+        if study.needs and find_spec(study.needs) is None:
+            print(f"{clock} {study.module}: left out, {study.needs} is not installed", flush=True)
+            continue
+        if study.peer_option and not peers:
+            print(f"{clock} {study.module}: without the peer that --peers PYTHON would give", flush=True)
+        print(f"{clock} {study.module}", flush=True)
+        code = subprocess.run(command(study, quick, folder, peers), cwd=ROOT, check=False).returncode
+        if code:
+            failed += 1
+            print(f"{clock} {study.module}: FAILED with exit code {code}; its files are as they were", flush=True)
+    print(f"{len(studies)} studies in {time.perf_counter() - begin:.0f} s, {failed} failed", flush=True)
+    return failed
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the studies of the systems given, then write the page."""
+    known = parser(__doc__)
+    known.add_argument("systems", nargs="*", metavar="SYSTEM", help=", ".join(SYSTEMS))
+    known.add_argument("--peers", metavar="PYTHON", help="interpreter of an environment with ROSS and pynamicalsys")
+    options = known.parse_args(arguments)
+    if unknown := set(options.systems) - set(SYSTEMS):
+        sys.stderr.write(f"bench: SYSTEM = {min(unknown)!r}: allowed is {', '.join(SYSTEMS)}\n")
+        return 2
+    folder = results_folder(options)
+    chosen = [study for study in STUDIES if not options.systems or study.system in options.systems]
+    failed = run(chosen, options.quick, folder, options.peers)
+    page = PAGE if folder == RESULTS else folder / "benchmarks.md"
+    write_page(folder, page)
+    print(f"page: {page}")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,231 @@
+"""What the engine costs beside its kernels: time, memory, bytes, and the other places where chunks may be computed.
+
+``python -m benchmarks.scaling`` runs all of it and writes docs/scaling.md.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.cardan_reference import BASE_CASE
+from benchmarks.timing import PROCESSES, interleaved, median
+from drivetrain_jax.sweep import toml
+from drivetrain_jax.sweep.engine import Engine
+from drivetrain_jax.sweep.executor import Where, run_threads
+from drivetrain_jax.sweep.run import run_to_file
+from drivetrain_jax.sweep.scene import load_scene
+
+# A sweep of one output, run by a process of its own; prints its largest resident memory in MB, with the pages of mapped
+# files, and without them, and the seconds that it took.
+_ONE_OUTPUT = """
+import sys, time
+from pathlib import Path
+from drivetrain_jax.sweep.run import run_to_file
+
+def resident(field):
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith(field)).split()[1]) / 1024
+
+own, calls = [0.0], [0]
+def report(_):
+    calls[0] += 1
+    if calls[0] % 16 == 1:
+        own[0] = max(own[0], resident("RssAnon"))
+
+begin = time.perf_counter()
+run_to_file(Path(sys.argv[1]), Path(sys.argv[2]), report=report)
+print(resident("VmHWM"), own[0], time.perf_counter() - begin)
+"""
+
+
+def scene(points: int) -> dict[str, Any]:
+    """The chart of the README with about this many points, every one solved directly."""
+    rows = max(round((points * 3 / 4) ** 0.5), 2)
+    axes = {
+        "beta": {"start": 0.0, "stop": 1.5, "num": rows},
+        "Omega": {"start": 0.1, "stop": 2.0, "num": max(round(points / rows), 2)},
+    }
+    return {
+        "system": "cardan",
+        "analysis": "floquet",
+        "outputs": ["spectral_radius", "spectral_radius_error", "verdict"],
+        "axes": axes,
+        "fixed": dict(BASE_CASE),
+        "options": {"method": "direct", "rtol": 1e-9},
+    }
+
+
+def cheap_scene(points: int) -> dict[str, Any]:
+    """The cheapest analysis with one output: what it costs is the engine."""
+    side = max(round(points**0.5), 2)
+    axes = {name: {"start": 0.0, "stop": 1.0, "num": side} for name in ("beta", "velocity0")}
+    fixed = {"element": "input", "zeta": 0.01}
+    return {"system": "tripod", "analysis": "parameters", "outputs": ["c_inertia"], "axes": axes, "fixed": fixed}
+
+
+def seconds(job: Callable[[], Any]) -> float:
+    """How long ``job`` takes."""
+    begin = time.perf_counter()
+    job()
+    return time.perf_counter() - begin
+
+
+def cpu_seconds(job: Callable[[], Any]) -> float:
+    """How long all threads of this process compute for ``job``."""
+    begin = time.process_time()
+    job()
+    return time.process_time() - begin
+
+
+def bare(engine: Engine) -> None:
+    """The kernels alone: all chunks in threads, results dropped."""
+    chunks = engine.ordered(range(len(engine.plan.costs)))
+    for _ in run_threads(chunks, engine.compute_chunk, os.cpu_count() or 1):
+        pass
+
+
+@dataclass(frozen=True)
+class Overhead:
+    """Seconds and CPU seconds of the engine (scene to file) and of its kernels, in turns, bytes of the file, and seconds
+    of a process that finds the run finished."""
+
+    points: int
+    engine_s: float
+    kernels_s: float
+    engine_cpu_s: float
+    kernels_cpu_s: float
+    bytes_per_point: float
+    resume_s: float
+
+    @property
+    def ratio(self) -> float:
+        """Time of the engine over that of the kernels, minus 1."""
+        return self.engine_s / self.kernels_s - 1
+
+    @property
+    def cpu_ratio(self) -> float:
+        """The same of CPU seconds, which the load of the machine changes less."""
+        return self.engine_cpu_s / self.kernels_cpu_s - 1
+
+
+def overhead(points: int, repeats: int, folder: Path) -> Overhead:
+    """Kernels are compiled before the clock starts in both; a finished run is resumed in a process of its own."""
+    out, content = folder / "overhead.nc", scene(points)
+    engine = Engine(load_scene(content))
+    warm = scene(min(points, 50_000))
+    bare(Engine(load_scene(warm)))
+    run_to_file(warm, folder / "warm.nc")
+    wall: dict[str, list[float]] = {"engine": [], "kernels": []}
+    cpu: dict[str, list[float]] = {"engine": [], "kernels": []}
+    jobs = {"kernels": lambda: bare(engine), "engine": lambda: run_to_file(content, out, fresh=True)}
+    # Planned beforehand: planning is work of the engine.
+    _ = engine.plan
+    for _ in range(repeats):
+        for name, job in jobs.items():
+            begin = time.process_time()
+            wall[name].append(seconds(job))
+            cpu[name].append(time.process_time() - begin)
+    (folder / "scene.toml").write_text(toml.write(content))
+    command = [sys.executable, "-m", "drivetrain_jax.cli", "run", str(folder / "scene.toml"), "--out", str(out)]
+    resumes = [seconds(lambda: subprocess.run(command, check=True, capture_output=True)) for _ in range(3)]
+    medians = [median(times[name]) for times in (wall, cpu) for name in ("engine", "kernels")]
+    return Overhead(engine.total, *medians, out.stat().st_size / engine.total, median(resumes))
+
+
+@dataclass(frozen=True)
+class Place:
+    """Seconds of one run into a file, where its chunks are computed, and over those of threads."""
+
+    where: str
+    points: int
+    seconds: float
+    over_threads: float
+
+
+def places(points: int, repeats: int, folder: Path) -> list[Place]:
+    """Threads, processes that the run starts, and a Dask cluster that is there and has compiled; the same cores."""
+    import distributed
+
+    content, out = scene(points), folder / "places.nc"
+    with distributed.LocalCluster(
+        n_workers=PROCESSES, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+
+        def job(where: Where) -> Callable[[], Any]:
+            return lambda: run_to_file(content, out, fresh=True, where=where)
+
+        jobs = {
+            f"{PROCESSES} threads": job(Where(threads=PROCESSES)),
+            f"{PROCESSES} processes, their start included": job(Where(workers=PROCESSES)),
+            f"{PROCESSES} workers of a Dask cluster": job(Where(dask=cluster.scheduler_address)),
+        }
+        for run in jobs.values():
+            run()
+        found = {name: median(times) for name, times in interleaved(jobs, repeats).items()}
+    threads = next(iter(found.values()))
+    return [Place(name, points, value, value / threads - 1) for name, value in found.items()]
+
+
+@dataclass(frozen=True)
+class Memory:
+    """Largest resident memory (MB) of a sweep of one output, with and without pages of mapped files, and its seconds."""
+
+    points: int
+    resident_mb: float
+    own_mb: float
+    seconds: float
+
+
+def memory(counts: Sequence[int], folder: Path) -> list[Memory]:
+    """Each in a process of its own."""
+    found = []
+    for count in counts:
+        content, out = cheap_scene(count), folder / "memory.nc"
+        (folder / "memory.toml").write_text(toml.write(content))
+        command = [sys.executable, "-c", _ONE_OUTPUT, str(folder / "memory.toml"), str(out)]
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        out.unlink()
+        points = content["axes"]["beta"]["num"] ** 2
+        found.append(Memory(points, *(float(word) for word in done.stdout.split())))
+    return found
+
+
+def slope(found: Sequence[Memory]) -> float:
+    """Bytes that the largest resident memory grows by for each point, between the two largest sweeps."""
+    small, large = found[-2:]
+    return (large.resident_mb - small.resident_mb) * 2**20 / (large.points - small.points)
+
+
+def rows_of(found: Overhead) -> list[Mapping[str, Any]]:
+    """For a table."""
+    return [
+        {
+            "points": found.points,
+            "engine": f"{found.engine_s:.1f} s",
+            "kernels alone": f"{found.kernels_s:.1f} s",
+            "engine over kernels": f"{100 * found.ratio:+.1f} %",
+            "the same in CPU seconds": f"{100 * found.cpu_ratio:+.1f} %",
+            "file": f"{found.bytes_per_point:.1f} bytes a point",
+            "finished run resumed": f"{found.resume_s:.2f} s",
+        }
+    ]
+
+
+def rows_of_places(found: Sequence[Place]) -> list[Mapping[str, Any]]:
+    """For a table."""
+    return [
+        {
+            "where": p.where,
+            "points": p.points,
+            "time": f"{p.seconds:.1f} s",
+            "over threads": f"{100 * p.over_threads:+.0f} %",
+        }
+        for p in found
+    ]

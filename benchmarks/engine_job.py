@@ -1,0 +1,55 @@
+"""The package as a contender: a scene on its engine, compiled beforehand, without files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+Results = dict[str, np.ndarray]
+
+
+def columns_scene(
+    system: str, analysis: str, outputs: list[str], columns: Mapping[str, np.ndarray], **rest: Any
+) -> dict[str, Any]:
+    """A scene of listed points; ``rest``: ``fixed``, ``options``."""
+    points = {name: np.asarray(column).tolist() for name, column in columns.items()}
+    return {"system": system, "analysis": analysis, "outputs": outputs, "points": points, **rest}
+
+
+def engine_job(scene: Mapping[str, Any], threads: int = 1) -> Callable[[], Results]:
+    """``job()`` computes every point of ``scene`` as ``dt.run`` does, with ``threads``; results by name, points first.
+
+    The kernels are compiled by this call, unless another scene of the process has had the same.
+    """
+    from drivetrain_jax.sweep.engine import Engine
+    from drivetrain_jax.sweep.executor import run_threads
+    from drivetrain_jax.sweep.kernel import kernel_of
+    from drivetrain_jax.sweep.scene import load_scene
+
+    engine = Engine(load_scene(dict(scene)))
+    grid, plan = engine.grid, engine.plan
+    kernels = {group.index: kernel_of(engine.scene, grid, group.solver, group.chunk) for group in plan.groups}
+
+    def work(chunk: Any) -> Mapping[str, np.ndarray]:
+        return kernels[chunk.solver](grid.columns(chunk.points), chunk.effort)
+
+    def job() -> Results:
+        found: Results = {}
+        for chunk, values in run_threads(map(plan.chunk, range(len(plan.costs))), work, threads):
+            for name, array in values.items():
+                if name not in found:
+                    found[name] = np.full((grid.size, *array.shape[1:]), np.nan if array.dtype.kind in "fc" else 0)
+                    found[name] = found[name].astype(array.dtype)
+                found[name][chunk.points] = array
+        return found
+
+    return job
+
+
+def told(outcome: np.ndarray) -> str:
+    """The outcomes other than success, by name: how the package says that something is wrong."""
+    from drivetrain_jax.analysis import Outcome
+
+    return ", ".join(Outcome(code).name.lower() for code in np.unique(outcome) if code)

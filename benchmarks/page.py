@@ -1,0 +1,327 @@
+"""docs/benchmarks.md from the result files alone: conclusions first, then tables and figures, then where they come from.
+
+    python -m benchmarks.page      # writes docs/benchmarks.md from benchmarks/results/
+
+No number of the page is typed: every sentence takes its figures, and its wording, from the CSV files. A file that is
+missing gives a line that says so.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from benchmarks import page_precision
+from benchmarks.precision import GOAL
+from benchmarks.results_files import (
+    ResultFile,
+    Row,
+    against,
+    count,
+    load,
+    markdown,
+    not_measured,
+    seconds,
+    small,
+    times,
+    whole,
+)
+from benchmarks.timing import RESULTS
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "benchmarks.md"
+NAMES = (
+    "throughput", "precision_cardan", "work_precision_cardan", "atlas", "heyoka", "precision_bicardan", "critical_speeds",
+    "precision_planetary", "planetary_throughput", "precision_rattle", "rattle_throughput", "precision_tripod", "chaos",
+    "chaos_precision", "batches", "outputs", "cold_start", "overhead", "scaling",
+)  # fmt: skip
+# Families of the chart: the label's beginning, and how a sentence names them.
+CHART = {
+    "drivetrain_jax direct": "`direct`",
+    "heyoka batch": "heyoka batch",
+    "scipy DOP853 stacked": "SciPy DOP853 on the stacked grid",
+    "scipy DOP853": "SciPy DOP853 point by point",
+    "scipy RK45": "SciPy RK45 point by point, the paper's method",
+    "drivetrain_jax diffrax": "`diffrax`",
+}
+
+Files = dict[str, ResultFile | None]
+
+
+def write_page(folder: Path = RESULTS, page: Path = PAGE) -> None:
+    """Write ``page`` from the files in ``folder``."""
+    page.write_text(text_of(folder, page))
+
+
+def text_of(folder: Path, page: Path) -> str:
+    """The page."""
+    images = os.path.relpath(folder, page.parent).replace(os.sep, "/") + "/"
+    files = {name: load(folder, name) for name in NAMES}
+    precise = page_precision.load_precision(folder)
+    parts = [
+        "# Error against run time",
+        "Written by `python -m benchmarks` (`make bench`, `drivetrain bench`) from the files in "
+        "`benchmarks/results/`; nothing here is typed by hand. " + _machine(files),
+        "## Conclusions",
+        "\n".join(f"- {line}" for line in conclusions(files, precise)),
+        "## The cardan chart at equal error",
+        _chart_section(files["throughput"]),
+        "## Work-precision and extremes",
+        _METHOD,
+        *(page_precision.section(folder, images, system, precise) for system in page_precision.TITLES),
+        "### Schemes behind `direct`, fixed steps",
+        _figure(files, "work_precision_cardan", images, "Error of the multipliers against evaluations and time"),
+        "## The atlas from nothing to a file",
+        _atlas_section(files["atlas"]),
+        "## Scaling and outputs",
+        _figure(files, "batches", images, "Points per second against batch width, number of points, cores and planets"),
+        *_scaling_sections(files),
+        "## Other peers",
+        *_peer_sections(files, images),
+        "## Where the figures come from",
+        _sources(files),
+    ]
+    return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
+
+
+_METHOD = (
+    "Each region is one point of the parameter space, and neighbours of it. `holds`: an error of at most "
+    f"{GOAL:g} is reached, and every tolerance kept within a factor of 1,000 or the miss said. `degrades`, `fails`: it is "
+    "not, and the user learns of it by what stands in the cell. **SILENT**: wrong by more than 1,000 times the tolerance "
+    "asked for, or lost, and nothing says so. Methods whose name starts with `package` are those of this package."
+)
+
+
+def conclusions(files: Files, precise: dict[str, page_precision.Precision]) -> list[str]:
+    """The sentences at the head of the page."""
+    found = [_chart_sentence(files["throughput"]), _cold_sentence(files["throughput"]), _atlas_sentence(files["atlas"])]
+    found += page_precision.conclusions(precise)
+    found += [
+        _critical_sentence(files["critical_speeds"]),
+        _planetary_sentence(files["planetary_throughput"]),
+        _rattle_sentence(files["rattle_throughput"]),
+        _chaos_sentence(files["chaos"]),
+        _overhead_sentence(files["overhead"]),
+        _accelerator_sentence(files),
+    ]
+    return [sentence for sentence in found if sentence]
+
+
+def family(row: Row) -> str:
+    """The family of a row of throughput.csv; the longest beginning counts."""
+    return max((name for name in CHART if row["method"].startswith(name)), key=len, default="")
+
+
+def at_equal_error(file: ResultFile) -> dict[str, Row]:
+    """The fastest setting with an error of at most 1e-9 of each family, in the order of ``CHART``."""
+    best: dict[str, Row] = {}
+    for name in CHART:
+        rows = [r for r in file.rows if family(r) == name and "without" not in r["method"]]
+        good = [row for row in rows if float(row["max_error"]) <= GOAL]
+        if good:
+            best[name] = max(good, key=lambda row: float(row["cells_per_s"]))
+    return best
+
+
+def _rate(row: Row) -> float:
+    return float(row["cells_per_s"])
+
+
+def _chart_sentence(file: ResultFile | None) -> str:
+    best = at_equal_error(file) if file else {}
+    own = best.get("drivetrain_jax direct")
+    if own is None:
+        return ""
+    rivals = [
+        f"{against(_rate(own) / _rate(row), CHART[name])} ({count(_rate(row))}, error {small(row['max_error'])})"
+        for name, row in best.items()
+        if not name.startswith("drivetrain_jax")
+    ]
+    told = f"{count(_rate(own))} cells/s (largest error {small(own['max_error'])}, with a bound for every cell)"
+    return (
+        f"The chart of the cardan shaft at a largest error of {GOAL:g}: `direct` computes {told}; {', '.join(rivals)}."
+    )
+
+
+def _cold_sentence(file: ResultFile | None) -> str:
+    notes = [note for note in (file.notes if file else ()) if note.startswith("fresh process")]
+    return f"A cold start to the first atlas of {file.rows[0]['cells']} cells: {notes[0]}." if notes else ""
+
+
+def _atlas_sentence(file: ResultFile | None) -> str:
+    if file is None:
+        return ""
+    parts = []
+    for chart in dict.fromkeys(row["chart"] for row in file.rows):
+        rows = {row["method"]: row for row in file.rows if row["chart"] == chart}
+        for name, words in (("warm", "in memory"), ("cold", "as a cold command, with import, compilation and file")):
+            row = next((row for method, row in rows.items() if name in method), None)
+            if row and row["times_heyoka"]:
+                parts.append(f"{count(chart)} cells {words}: {against(float(row['times_heyoka']), 'heyoka batch')}")
+    return f"The chart as an atlas: {'; '.join(parts)}." if parts else ""
+
+
+def _critical_sentence(file: ResultFile | None) -> str:
+    if file is None:
+        return ""
+    ours = {row["method"]: row for row in file.rows}
+    words = []
+    certified, mapped = ours.get("drivetrain_jax certified"), ours.get("drivetrain_jax, the same map")
+    if certified:
+        rate, ratio = (
+            count(certified["shafts_per_s"]),
+            against(float(certified["ratio"]), "scanning and Brent in SciPy"),
+        )
+        words.append(f"six certified critical speeds of {rate} shafts/s, {ratio}")
+    if mapped:
+        words.append(f"a critical-speed map {against(float(mapped['ratio']), 'ROSS')}")
+    return f"Stepped shaft: {'; '.join(words)}." if words else ""
+
+
+def _planetary_sentence(file: ResultFile | None) -> str:
+    rows = [row for row in (file.rows if file else ()) if row["method"] == "package"]
+    if not rows:
+        return ""
+    told = [f"{row['planets']} planets {times(float(row['over_numpy_svd']))}" for row in rows]
+    return (
+        f"Planetary gears, gears per second over NumPy's batched singular values, both on all cores: {', '.join(told)}."
+    )
+
+
+def _rattle_sentence(file: ResultFile | None) -> str:
+    if file is None:
+        return ""
+    own = next(row for row in file.rows if row["solver"] == "exact")
+    rivals = {row["solver"]: row for row in file.rows if row is not own}
+    told = [
+        f"{against(float(row['us_per_lane_period']) / float(own['us_per_lane_period']), name)} at its most exact"
+        f" ({small(row['error'])})"
+        for name, row in rivals.items()
+    ]
+    return f"Gear rattle: {count(own['per_second'])} periods/s at an error of {small(own['error'])}; {', '.join(told)}."
+
+
+def _chaos_sentence(file: ResultFile | None) -> str:
+    if file is None:
+        return ""
+    words = []
+    for case in dict.fromkeys(row["case"] for row in file.rows):
+        rows = {row["method"]: float(row["per_s"]) for row in file.rows if row["case"] == case}
+        own = rows.pop("drivetrain_jax", None)
+        if own is not None:
+            words.append(f"{case}: {', '.join(against(own / rate, name) for name, rate in rows.items())}")
+    return f"Lyapunov spectra at equal error: {'; '.join(words)}." if words else ""
+
+
+def _overhead_sentence(file: ResultFile | None) -> str:
+    if file is None:
+        return ""
+    row = file.rows[0]
+    return (
+        f"From scene to file, {count(row['points'])} points take {100 * float(row['engine_over_kernels']):.1f} % more than "
+        f"the bare kernels; {float(row['bytes_per_point']):.3g} bytes a point; a finished run is resumed in "
+        f"{seconds(row['resume_s'])}."
+    )
+
+
+def _accelerator_sentence(files: Files) -> str:
+    named = {file.facts.get("accelerator", "none") for file in files.values() if file} - {"none"}
+    if named:
+        return f"Accelerators present: {', '.join(sorted(named))}."
+    return "There was no GPU machine: every figure of this page is one of the processor named below."
+
+
+def _chart_section(file: ResultFile | None) -> str:
+    if file is None:
+        return not_measured("throughput")
+    best = list(at_equal_error(file).values())
+    rows = []
+    for row in file.rows:
+        chosen = any(row is one for one in best)
+        cells = [row["method"], count(row["cells_per_s"]), small(row["max_error"]), small(row["median_error"])]
+        cells += [times(float(row["times_scipy_RK45"]))]
+        rows.append([f"**{cell}**" if chosen else cell for cell in cells])
+    head = ["method", "cells/s", "largest error", "median error", "times SciPy RK45"]
+    text = f"In bold the fastest setting of each family with a largest error of at most {GOAL:g}."
+    return f"{'; '.join(file.notes)}.\n\n{text}\n\n{markdown(head, rows)}"
+
+
+def _atlas_section(file: ResultFile | None) -> str:
+    heads = {
+        "chart": "cells", "method": "method", "cells_computed": "computed", "cells_per_s": "cells/s",
+        "times_heyoka": "times heyoka", "max_error": "largest error", "median_bound": "median bound", "peak_MB": "peak MB",
+    }  # fmt: skip
+    return whole(file, "atlas", heads, {"cells_per_s": count, "chart": count, "cells_computed": count})
+
+
+def _scaling_sections(files: Files) -> list[str]:
+    titles = {
+        "batches": "### Batch width, number of points, cores, states",
+        "outputs": "### What each output costs",
+        "cold_start": "### Cold start of a small scene",
+        "overhead": "### The engine beside its kernels",
+    }
+    found: list[str] = []
+    for name, title in titles.items():
+        file = files[name]
+        heads = {column: column.replace("_", " ") for column in file.rows[0]} if file else {}
+        found += [title, whole(file, name, heads, {})]
+    return [*found, "Sweeps of 1e9 and 1e12 points: [scaling](scaling.md)."]
+
+
+def _peer_sections(files: Files, images: str) -> list[str]:
+    shafts = {"method": "method", "shafts_per_s": "shafts/s", "ratio": "times", "max_difference": "largest difference"}
+    gears = {"planets": "planets", "method": "method", "gears_per_s": "gears/s", "over_numpy_svd": "times NumPy svd",
+             "error": "error", "rigid_Hz": "rigid mode / Hz"}  # fmt: skip
+    periods = {
+        "solver": "solver",
+        "rtol": "rtol",
+        "us_per_lane_period": "us a period",
+        "error": "error",
+        "failed": "failed",
+    }
+    chaos = {"case": "case", "method": "method", "per_s": "per s", "times_scipy": "times SciPy"}
+    heyoka = {"form": "form", "tolerance": "tolerance", "batch": "batch", "monodromies_per_s": "monodromies/s",
+              "max_error": "largest error"}  # fmt: skip
+    return [
+        "### Critical speeds: SciPy and ROSS",
+        whole(files["critical_speeds"], "critical_speeds", shafts, {"shafts_per_s": count}),
+        "### Planetary gears: NumPy and SciPy",
+        whole(files["planetary_throughput"], "planetary_throughput", gears, {"gears_per_s": count}),
+        "### Gear rattle: diffrax and SciPy with events",
+        _figure(files, "rattle_throughput", images, "Error against time per period of gear rattle"),
+        whole(files["rattle_throughput"], "rattle_throughput", periods, {}),
+        "### Lyapunov spectra: heyoka, SciPy, pynamicalsys",
+        _figure(files, "chaos_precision", images, "Error against rate of Lyapunov spectra"),
+        whole(files["chaos"], "chaos", chaos, {"per_s": count}),
+        "### heyoka's own forms, batch sizes and tolerances, one core",
+        whole(files["heyoka"], "heyoka", heyoka, {"monodromies_per_s": count}),
+    ]
+
+
+def _figure(files: Files, name: str, images: str, words: str) -> str:
+    return f"![{words}]({images}{name}.png)" if files[name] else not_measured(name)
+
+
+def _machine(files: Files) -> str:
+    machines = sorted({file.facts["machine"] for file in files.values() if file})
+    return f"Machine: {'; '.join(machines)}." if machines else "Nothing has been measured."
+
+
+def _sources(files: Files) -> str:
+    rows = []
+    for name, file in files.items():
+        if file is None:
+            rows.append([f"{name}.csv", "not measured", "", ""])
+        else:
+            load_text = file.facts.get("load", "").partition(" (")[0]
+            rows.append([f"{name}.csv", file.facts["date"], load_text, file.facts["versions"]])
+    return markdown(["file", "date", "load 1, 5, 15 min", "versions"], rows)
+
+
+def main() -> None:
+    """Write the page from the stored results."""
+    write_page()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,177 @@
+"""The work-precision part of the page: who is fastest at an error of 1e-9, and what becomes of whom at the extremes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.precision import GOAL, Judgement, Rung, judge, read
+from benchmarks.results_files import markdown, not_measured, seconds, small, times
+
+# Methods that a user of the package can choose; all others are rivals.
+OWN = "package"
+TITLES = {
+    "cardan": "Cardan shaft: spectral radius",
+    "bicardan": "Stepped shaft: critical speeds",
+    "planetary": "Planetary gear: natural frequencies",
+    "rattle": "Gear rattle: motion with backlash",
+    "tripod": "Double tripod: motion over 1,000 strobes",
+}
+
+
+class Precision:
+    """The rungs of one system, by region and method."""
+
+    def __init__(self, system: str, rungs: Sequence[Rung]) -> None:
+        self.system = system
+        self.regions = list(dict.fromkeys(rung.region for rung in rungs))
+        self.methods = list(dict.fromkeys(rung.method for rung in rungs))
+        self._rungs = rungs
+
+    def ladder(self, region: str, method: str) -> list[Rung]:
+        """All settings of a method in a region."""
+        return [rung for rung in self._rungs if (rung.region, rung.method) == (region, method)]
+
+    def reaching(self, region: str, method: str) -> Rung | None:
+        """The fastest setting of a method whose error is at most 1e-9 at every point."""
+        good = [r for r in self.ladder(region, method) if r.error <= GOAL and not r.failed]
+        return min(good, key=lambda rung: rung.seconds_per_point, default=None)
+
+    def fastest(self, region: str, own: bool) -> Rung | None:
+        """The fastest to reach 1e-9 among the package's methods, or among the rivals."""
+        names = [method for method in self.methods if is_own(method) == own]
+        good = [rung for rung in (self.reaching(region, name) for name in names) if rung]
+        return min(good, key=lambda rung: rung.seconds_per_point, default=None)
+
+    def judgement(self, region: str, method: str) -> Judgement | None:
+        """Holds, degrades, fails or SILENT; None if the method was not tried there."""
+        rungs = self.ladder(region, method)
+        return judge(rungs) if rungs else None
+
+
+def is_own(method: str) -> bool:
+    """Whether a method belongs to the package."""
+    return method.split(",")[0] == OWN
+
+
+def load_precision(folder: Path) -> dict[str, Precision]:
+    """All systems that have been measured."""
+    paths = {system: folder / f"precision_{system}.csv" for system in TITLES}
+    return {system: Precision(system, read(path)) for system, path in paths.items() if path.is_file()}
+
+
+def conclusions(found: dict[str, Precision]) -> list[str]:
+    """Who wins where, losses included, and whether anything fails silently."""
+    return [*(_winners(precision) for precision in found.values()), *(_silence(list(found.values())) if found else [])]
+
+
+def _winners(precision: Precision) -> str:
+    won, lost, alone, nobody = [], [], [], []
+    for region in precision.regions:
+        own, rival = precision.fastest(region, True), precision.fastest(region, False)
+        if own is None and rival is None:
+            nobody.append(region)
+        elif rival is None:
+            alone.append(region)
+        elif own is None:
+            lost.append(f"{region} ({rival.method} alone reaches it)")
+        else:
+            ratio = rival.seconds_per_point / own.seconds_per_point
+            if ratio >= 1:
+                won.append(f"{region} ({times(ratio)} times as fast as {rival.method})")
+            else:
+                lost.append(f"{region} ({rival.method} is {times(1 / ratio)} times as fast)")
+    parts = [
+        f"fastest in {', '.join(won)}" if won else "",
+        f"alone in reaching it: {', '.join(alone)}" if alone else "",
+        f"**behind** in {', '.join(lost)}" if lost else "",
+        f"nobody reaches it: {', '.join(nobody)}" if nobody else "",
+    ]
+    return f"`{precision.system}` at an error of {GOAL:g}, one core: the package is {'; '.join(filter(None, parts))}."
+
+
+def _silence(systems: Sequence[Precision]) -> list[str]:
+    own: list[str] = []
+    rivals: dict[str, list[str]] = {}
+    for precision in systems:
+        for region in precision.regions:
+            for method in precision.methods:
+                judged = precision.judgement(region, method)
+                if judged and judged.word == "SILENT":
+                    if is_own(method):
+                        own.append(f"{precision.system}, {region}, {method}")
+                    else:
+                        rivals.setdefault(method, []).append(f"{precision.system} {region}")
+    if not own:
+        names = ", ".join(f"`{precision.system}`" for precision in systems)
+        first = f"No method of the package fails silently in any region measured ({names})."
+    else:
+        first = f"**The package fails silently** in: {'; '.join(own)}."
+    if not rivals:
+        return [first]
+    listed = "; ".join(f"{method} ({', '.join(where)})" for method, where in rivals.items())
+    return [first, f"Rivals that are wrong without saying so: {listed}."]
+
+
+def section(folder: Path, images: str, system: str, found: dict[str, Precision]) -> str:
+    """Figure, table of times at 1e-9 and table of extremes of one system."""
+    name = f"precision_{system}"
+    title = f"### {TITLES[system]}"
+    if system not in found:
+        return f"{title}\n\n{not_measured(name)}"
+    precision = found[system]
+    return "\n\n".join(
+        [
+            title,
+            f"![Error against time per point, one panel for each region]({images}{name}.png)",
+            f"Time per point at the fastest setting with an error of at most {GOAL:g} at every point, in brackets the "
+            "error; else the smallest error reached. Fastest of each region in bold.",
+            _times_table(precision),
+            "At the extremes:",
+            _extremes_table(precision),
+        ]
+    )
+
+
+def _times_table(precision: Precision) -> str:
+    best = {}
+    for region in precision.regions:
+        both = [rung for rung in (precision.fastest(region, own) for own in (True, False)) if rung]
+        best[region] = min(both, key=lambda rung: rung.seconds_per_point, default=None)
+    rows = []
+    for method in precision.methods:
+        cells = [_time_cell(precision, region, method, best[region]) for region in precision.regions]
+        rows.append([method, *cells])
+    return markdown(["method", *precision.regions], rows)
+
+
+def _time_cell(precision: Precision, region: str, method: str, best: Rung | None) -> str:
+    rung = precision.reaching(region, method)
+    if rung is not None:
+        text = f"{seconds(rung.seconds_per_point)} ({small(rung.error)})"
+        return f"**{text}**" if rung is best else text
+    errors = [rung.error for rung in precision.ladder(region, method) if not math.isnan(rung.error)]
+    return f"only {small(min(errors))}" if errors else "-"
+
+
+def _extremes_table(precision: Precision) -> str:
+    rows = []
+    for method in precision.methods:
+        judged = [precision.judgement(region, method) for region in precision.regions]
+        rows.append([method, *(_extreme_cell(one) for one in judged)])
+    return markdown(["method", *precision.regions], rows)
+
+
+def _extreme_cell(judged: Judgement | None) -> str:
+    if judged is None:
+        return "-"
+    if judged.word == "holds":
+        return f"holds{_notice(judged.how)}"
+    word = f"**{judged.word}**" if judged.word == "SILENT" else judged.word
+    return f"{word}: {judged.how}"
+
+
+def _notice(how: str) -> str:
+    _, _, notice = how.partition("; ")
+    return f" ({notice})" if notice else ""

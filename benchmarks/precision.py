@@ -1,0 +1,215 @@
+"""Error against run time of every method of a system, region by region, and what each does at the extremes.
+
+A study (``benchmarks/precision_<system>.py``) lists contenders: one method at one setting on the points of one region.
+``measure`` prepares all of them first (compile time is kept apart), judges their first answers against the study's
+reference, and then times them in turns. A contender that takes longer than ``ONCE_ABOVE`` seconds is timed once.
+
+    python -m benchmarks.precision_cardan [--quick] [--out FOLDER]     # writes precision_cardan.csv and .png
+
+``error`` is the largest relative error of the points that were answered, NaN if none was; ``failed`` counts points
+without a usable answer; ``noticed`` says how a user learns of the failure: the name of an outcome, a warning, an
+exception. ``judge`` reads a method's rungs in a region and says whether it holds, degrades, fails or is SILENT: wrong
+by more than ``PATIENCE`` times the tolerance that it was given, and nothing says so.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+import sys
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from benchmarks.timing import RESULTS, interleaved, median, parser, results_folder, write_csv
+
+ONCE_ABOVE = 5.0
+# Global errors of a tolerance per step are commonly ten to some hundred tolerances.
+PATIENCE = 1e3
+# What a method without a tolerance (a number of steps) must reach at its finest setting, or say that it did not.
+USELESS = 0.1
+GOAL = 1e-9
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One method at one setting in one region: a line of the CSV."""
+
+    system: str
+    region: str
+    method: str
+    setting: str
+    error: float
+    seconds_per_point: float
+    compile_s: float
+    points: int
+    failed: int
+    noticed: str
+
+
+class Judged(NamedTuple):
+    """Largest relative error of the answered points, number of failed ones, and how a user learns of it."""
+
+    error: float
+    failed: int = 0
+    noticed: str = ""
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A method at a setting: ``prepare`` compiles and returns the job, ``error_of`` judges the job's result."""
+
+    system: str
+    region: str
+    method: str
+    setting: str
+    points: int
+    prepare: Callable[[], Callable[[], Any]]
+    error_of: Callable[[Any], Judged]
+
+
+@dataclass(frozen=True)
+class _Trial:
+    contender: Contender
+    job: Callable[[], Any] | None
+    compile_s: float
+    seconds: float
+    judged: Judged
+
+
+def measure(contenders: Sequence[Contender], repeats: int) -> list[Rung]:
+    """One rung a contender: all compiled and judged first, then timed in turns, medians."""
+    trials = []
+    for number, contender in enumerate(contenders, 1):
+        trial = _try(contender)
+        trials.append(trial)
+        what = f"{contender.region}: {contender.method}, {contender.setting}"
+        sys.stderr.write(f"{number}/{len(contenders)} {what}: {trial.judged.error:.1e}, {trial.seconds:.2g} s\n")
+    jobs = {str(i): t.job for i, t in enumerate(trials) if t.job is not None and t.seconds <= ONCE_ABOVE}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        seconds = interleaved(jobs, repeats)
+    return [_rung(trial, seconds.get(str(i), [trial.seconds])) for i, trial in enumerate(trials)]
+
+
+def _try(contender: Contender) -> _Trial:
+    # An exception or a warning is how the user of that method learns that something is wrong: it is data.
+    start = time.perf_counter()
+    try:
+        job = contender.prepare()
+        compile_s = time.perf_counter() - start
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            start = time.perf_counter()
+            result = job()
+            seconds = time.perf_counter() - start
+    except Exception as error:
+        told = Judged(math.nan, contender.points, type(error).__name__)
+        return _Trial(contender, None, 0.0, time.perf_counter() - start, told)
+    judged = contender.error_of(result)
+    warned = sorted({w.category.__name__ for w in caught if not issubclass(w.category, DeprecationWarning)})
+    if warned and not judged.noticed:
+        judged = judged._replace(noticed=", ".join(warned))
+    return _Trial(contender, job, compile_s, seconds, judged)
+
+
+def _rung(trial: _Trial, seconds: Sequence[float]) -> Rung:
+    c, judged = trial.contender, trial.judged
+    per_point = median(seconds) / c.points
+    error, failed, noticed = float(judged.error), int(judged.failed), judged.noticed
+    return Rung(c.system, c.region, c.method, c.setting, error, per_point, trial.compile_s, c.points, failed, noticed)
+
+
+def tolerance(setting: str) -> float | None:
+    """The tolerance that a setting such as ``rtol=1e-9`` promises; None for a number of steps."""
+    found = re.search(r"tol(?:erance)?=([0-9.e+-]+)", setting)
+    return float(found[1]) if found else None
+
+
+class Judgement(NamedTuple):
+    """``word`` is holds, degrades, fails or SILENT; ``how`` the figures and the notice."""
+
+    word: str
+    how: str
+
+
+def judge(rungs: Sequence[Rung]) -> Judgement:
+    """What a method does in a region, from all its rungs there."""
+    silent = [rung for rung in rungs if is_silent(rung, rungs)]
+    if silent:
+        worst = max(silent, key=lambda rung: math.inf if math.isnan(rung.error) else rung.error)
+        return Judgement("SILENT", f"{_percent(worst)} at {worst.setting}")
+    notices = ", ".join(dict.fromkeys(rung.noticed for rung in rungs if rung.noticed))
+    answered = [rung for rung in rungs if not math.isnan(rung.error) and rung.failed < rung.points]
+    if not answered:
+        return Judgement("fails", notices)
+    best = min(answered, key=lambda rung: (rung.failed > 0, rung.error))
+    told = f"; {notices}" if notices else ""
+    if best.error <= GOAL and not best.failed:
+        return Judgement("holds", f"{best.error:.0e} at {best.setting}{told}")
+    if best.error > USELESS:
+        return Judgement("fails", f"{best.error:.0e} at best{told}")
+    return Judgement("degrades", f"{_percent(best)} at best, {best.setting}{told}")
+
+
+def is_silent(rung: Rung, ladder: Sequence[Rung]) -> bool:
+    """Whether nothing tells the user of ``rung`` that its answer is not what was asked for."""
+    if rung.noticed:
+        return False
+    promised = tolerance(rung.setting)
+    # A coarse step promises nothing; the finest one is the method's word.
+    unpromised = USELESS if rung is ladder[-1] else math.inf
+    allowed = unpromised if promised is None else min(PATIENCE * promised, USELESS)
+    return rung.failed > 0 or not rung.error <= allowed
+
+
+def _percent(rung: Rung) -> str:
+    lost = f", {rung.failed} of {rung.points} points lost" if rung.failed else ""
+    return f"error {rung.error:.0e}{lost}"
+
+
+def write(name: str, rungs: Sequence[Rung], notes: Sequence[str] = (), folder: Path = RESULTS) -> None:
+    """``<folder>/<name>.csv`` with machine, versions, load and date in its head."""
+    write_csv(folder / f"{name}.csv", [asdict(rung) for rung in rungs], notes)
+
+
+def read(path: Path) -> list[Rung]:
+    """The rungs of a CSV written by :func:`write`."""
+    with path.open(newline="") as file:
+        rows = csv.DictReader(line for line in file if not line.startswith("#"))
+        kinds = {field.name: {"float": float, "int": int}.get(str(field.type), str) for field in fields(Rung)}
+        return [Rung(**{name: kinds[name](text) for name, text in row.items()}) for row in rows]
+
+
+Contenders = Callable[[bool], tuple[Sequence[Contender], Sequence[str]]]
+
+
+def study(name: str, doc: str, contenders: Contenders, argv: Sequence[str] | None) -> None:
+    """The ``main`` of a study: ``contenders(quick)`` gives what competes and the notes for the head of the CSV."""
+    from benchmarks.precision_figure import draw
+
+    known = parser(doc)
+    known.add_argument("--repeats", type=int, default=5)
+    options = known.parse_args(argv)
+    folder = results_folder(options)
+    given, notes = contenders(options.quick)
+    repeats = 1 if options.quick else options.repeats
+    rungs = measure(given, repeats)
+    about = f"medians of {repeats} repeats in turns; above {ONCE_ABOVE:g} s once; seconds without compilation"
+    write(name, rungs, [about, *notes], folder)
+    draw(name, rungs, folder)
+    for region, method, word, how in judgements(rungs):
+        print(f"{region:18} {method:32} {word:9} {how}")
+
+
+def judgements(rungs: Sequence[Rung]) -> list[tuple[str, str, str, str]]:
+    """``(region, method, word, how)`` of every pair, in the order of the file."""
+    pairs = dict.fromkeys((rung.region, rung.method) for rung in rungs)
+    return [
+        (region, method, *judge([r for r in rungs if (r.region, r.method) == (region, method)]))
+        for region, method in pairs
+    ]

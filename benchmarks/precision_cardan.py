@@ -1,0 +1,244 @@
+"""Error against run time for the spectral radius of the cardan shaft, from easy to nearly singular points.
+
+    python -m benchmarks.precision_cardan [--quick] [--out FOLDER]     # precision_cardan.csv and .png
+
+A region is a point (beta, Omega) and a grid of 16 x 32 neighbours within 0.5 %; the error is the largest of its centre
+and a corner against 200-bit Taylor series (benchmarks/cardan_precise_reference.py), which SciPy's DOP853 at 1e-13
+confirms (head of the CSV). Every method runs on one core. The package and heyoka take the whole grid, diffrax with
+constant steps and the stacked SciPy 64 of its points, SciPy point by point the two that are compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from benchmarks.cardan_precise_reference import spectral_radius as precise_radius
+from benchmarks.cardan_reference import BASE_CASE, NAMES, monodromy, spectral_radius, stacked_monodromy
+from benchmarks.engine_job import columns_scene, engine_job, told
+from benchmarks.precision import Contender, Judged, study
+from benchmarks.timing import take
+
+Columns = dict[str, np.ndarray]
+REGIONS: dict[str, dict[str, float]] = {
+    "easy": BASE_CASE | {"beta": 0.2, "Omega": 1.416},
+    "typical": BASE_CASE | {"beta": 1.0, "Omega": 0.5},
+    "near boundary": BASE_CASE | {"beta": 1.14, "Omega": 0.6695},
+    "stiff, zeta 10": BASE_CASE | {"beta": 1.0, "Omega": 0.1, "zeta": 10.0},
+    "oscillatory, Omega 0.01": BASE_CASE | {"beta": 1.0, "Omega": 0.01},
+    "nearly singular, beta 1.55": BASE_CASE | {"beta": 1.55, "Omega": 1.0},
+    "ill-conditioned, gamma 1e16": BASE_CASE | {"beta": 1.0, "Omega": 0.5, "gamma": 1e16},
+}
+# beta x Omega: as many as a chunk of the package has lanes.
+SHAPE, WIDTH = (16, 32), 0.005
+SIZE = SHAPE[0] * SHAPE[1]
+CENTRE = SHAPE[0] // 2 * SHAPE[1] + SHAPE[1] // 2
+CHECKED, SOME = 2, 64
+OUTPUTS = ["spectral_radius", "spectral_radius_error", "verdict"]
+# A quick run leaves them out.
+_SLOW = ("stiff, zeta 10", "oscillatory, Omega 0.01")
+SOLVERS = ("Tsit5", "Dopri5", "Dopri8", "Kvaerno5")
+STEPS = (32, 256, 2048)
+
+
+def axes(region: str) -> dict[str, np.ndarray]:
+    """The values of beta and Omega."""
+    around = (1 + WIDTH * (np.arange(count) / (count // 2) - 1) for count in SHAPE)
+    return {name: REGIONS[region][name] * factors for name, factors in zip(("beta", "Omega"), around, strict=True)}
+
+
+def columns_of(region: str, count: int = SIZE) -> Columns:
+    """``count`` points of the grid, the centre and a corner first."""
+    grid = np.meshgrid(*axes(region).values(), indexing="ij")
+    rest = np.setdiff1d(np.arange(SIZE), (0, CENTRE))
+    order = np.r_[CENTRE, 0, np.random.default_rng(0).permutation(rest)]
+    points = {"beta": grid[0].ravel(), "Omega": grid[1].ravel()}
+    fixed = {name: np.full(SIZE, value) for name, value in REGIONS[region].items() if name not in points}
+    return take(points | fixed, order[:count])
+
+
+@cache
+def reference(region: str) -> np.ndarray:
+    """Spectral radii of the first ``CHECKED`` points."""
+    columns = columns_of(region, CHECKED)
+    points = [{name: float(columns[name][i]) for name in NAMES} for i in range(CHECKED)]
+    return np.array([float(precise_radius(point)) for point in points])
+
+
+def error_of(region: str, radii: np.ndarray, notice: str = "") -> Judged:
+    """Of the first points of ``radii``; every point without a number counts as failed."""
+    failed = int(np.sum(~np.isfinite(radii)))
+    told_by = notice or ("nan" if failed else "")
+    errors = np.abs(radii[:CHECKED] / reference(region) - 1)
+    return Judged(float(np.nanmax(errors)) if np.isfinite(errors).any() else np.nan, failed, told_by)
+
+
+def package_error(region: str, rtol: float, results: Mapping[str, np.ndarray]) -> Judged:
+    """The package notices by outcome, and by the bound beside a value that is less exact than asked for."""
+    radii, bounds = results["spectral_radius"], results["spectral_radius_error"]
+    judged = error_of(region, radii, told(results["outcome"]))
+    errors = np.abs(radii - np.pad(reference(region), (0, len(radii) - CHECKED), constant_values=np.nan))[:CHECKED]
+    covered = bool(np.all(errors <= bounds[:CHECKED]))
+    if not judged.noticed and judged.error > rtol and covered:
+        return judged._replace(noticed=f"bound {np.max(bounds[:CHECKED]):.0e}")
+    return judged
+
+
+def package(region: str, method: str, rtol: float, count: int = SIZE, **options: Any) -> Contender:
+    """A method that takes points as they come."""
+    scene = columns_scene(
+        "cardan", "floquet", OUTPUTS, columns_of(region, count), options={"method": method, "rtol": rtol, **options}
+    )
+    name = f"package, diffrax {options['solver']}" if options else f"package, {method}"
+    judged = partial(package_error, region, rtol)
+    return Contender("cardan", region, name, f"rtol={rtol:g}", count, partial(engine_job, scene), judged)
+
+
+def atlas(region: str, rtol: float) -> Contender:
+    """The atlas of the region's box, built and evaluated on its grid."""
+    scene = {
+        "system": "cardan", "analysis": "floquet", "outputs": OUTPUTS,
+        "axes": {name: {"values": values.tolist()} for name, values in axes(region).items()},
+        "fixed": {name: value for name, value in REGIONS[region].items() if name not in ("beta", "Omega")},
+        "options": {"method": "atlas", "rtol": rtol},
+    }  # fmt: skip
+
+    def prepare() -> Callable[[], Any]:
+        import drivetrain_jax as dt
+
+        dt.run(scene)
+        return lambda: dt.run(scene)
+
+    def judged(result: Any) -> Judged:
+        flat = {name: result[name].values.ravel() for name in (*OUTPUTS, "outcome")}
+        first = np.r_[CENTRE, 0, np.setdiff1d(np.arange(SIZE), (0, CENTRE))]
+        return package_error(region, rtol, {name: values[first] for name, values in flat.items()})
+
+    return Contender("cardan", region, "package, atlas", f"rtol={rtol:g}", SIZE, prepare, judged)
+
+
+def constant_steps(region: str, solver: str, steps: int) -> Contender:
+    """diffrax on the equations as published, over the whole period, with equal steps."""
+    columns = columns_of(region, SOME)
+
+    def prepare() -> Callable[[], np.ndarray]:
+        compiled = _constant(solver)
+        return lambda: spectral_radius(np.asarray(compiled(columns, np.pi / steps)))
+
+    judged = partial(error_of, region)
+    return Contender("cardan", region, f"diffrax {solver}, constant", f"steps={steps}", SOME, prepare, judged)
+
+
+@cache
+def _constant(solver: str) -> Callable[[Columns, float], Any]:
+    import diffrax
+    import jax
+    import jax.numpy as jnp
+
+    from drivetrain_jax.analysis.monodromy import state_transition
+    from drivetrain_jax.systems.cardan import linear_rows
+
+    def one(values: Mapping[str, Any], step: Any) -> Any:
+        def field(t: Any, y: Any) -> Any:
+            return jnp.array(linear_rows(t, values)) @ y
+
+        return state_transition(
+            field, np.pi, jnp.zeros(4), solver=getattr(diffrax, solver)(), dt0=step,
+            stepsize_controller=diffrax.ConstantStepSize(), max_steps=2 * max(STEPS), along=False,
+        )[1]  # fmt: skip
+
+    kinds = {name: jax.ShapeDtypeStruct((SOME,), float) for name in NAMES}
+    return jax.jit(jax.vmap(one, in_axes=(0, None))).lower(kinds, jax.ShapeDtypeStruct((), float)).compile()
+
+
+def scipy_points(region: str, method: str, rtol: float) -> Contender:
+    """``solve_ivp`` point by point."""
+    columns = columns_of(region, CHECKED)
+    points = [{name: columns[name][i] for name in NAMES} for i in range(CHECKED)]
+
+    def job() -> np.ndarray:
+        return np.array([spectral_radius(monodromy(point, method, rtol, rtol)) for point in points])
+
+    return Contender(
+        "cardan", region, f"scipy {method}", f"rtol={rtol:g}", CHECKED, lambda: job, partial(error_of, region)
+    )
+
+
+def scipy_stacked(region: str, rtol: float) -> Contender:
+    """``solve_ivp`` with 64 points in one state."""
+    columns = columns_of(region, SOME)
+
+    def job() -> np.ndarray:
+        return spectral_radius(stacked_monodromy(columns, rtol, rtol))
+
+    judged = partial(error_of, region)
+    return Contender("cardan", region, "scipy DOP853, stacked", f"rtol={rtol:g}", SOME, lambda: job, judged)
+
+
+def heyoka_batch(region: str, tolerance: float) -> Contender:
+    """heyoka's batch Taylor integrator in its best form."""
+    columns = columns_of(region)
+
+    def prepare() -> Callable[[], np.ndarray]:
+        from benchmarks.peers import HeyokaBatch
+
+        solver = HeyokaBatch("half", tolerance, 8)
+        return lambda: spectral_radius(solver.monodromy(columns))
+
+    judged = partial(error_of, region)
+    return Contender("cardan", region, "heyoka batch", f"tolerance={tolerance:g}", SIZE, prepare, judged)
+
+
+def tolerances(region: str, method: str, quick: bool) -> tuple[float, ...]:
+    """The ladder of an integrator; implicit ones of order 5 would take minutes a point for more."""
+    if quick:
+        return (1e-9,)
+    if method in ("Radau", "Kvaerno5"):
+        return (1e-3, 1e-5) if region == _SLOW[1] else (1e-5, 1e-7, 1e-9)
+    return (1e-5, 1e-9, 1e-12)
+
+
+def contenders_of(region: str, quick: bool) -> list[Contender]:
+    """All methods in one region."""
+    tight = (1e-9,) if quick else (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
+    found = [package(region, "direct", rtol) for rtol in tight]
+    found += [atlas(region, rtol) for rtol in ((1e-9,) if quick else (1e-7, 1e-9, 1e-11))]
+    for solver in ("Dopri8",) if quick else SOLVERS:
+        found += [package(region, "diffrax", r, SOME, solver=solver) for r in tolerances(region, solver, quick)]
+    for solver in ("Dopri8",) if quick else SOLVERS:
+        found += [constant_steps(region, solver, steps) for steps in ((256,) if quick else STEPS)]
+    for method in ("RK45", "DOP853") if quick else ("RK45", "DOP853", "LSODA", "Radau"):
+        found += [scipy_points(region, method, rtol) for rtol in tolerances(region, method, quick)]
+    found += [scipy_stacked(region, rtol) for rtol in tolerances(region, "DOP853", quick)]
+    if find_spec("heyoka"):
+        found += [heyoka_batch(region, tolerance) for tolerance in tight]
+    return found
+
+
+def contenders(quick: bool) -> tuple[Sequence[Contender], Sequence[str]]:
+    """All methods in all regions, and how far the two references are apart."""
+    regions = [region for region in REGIONS if not quick or region not in _SLOW]
+    notes = [
+        "; ".join(f"{region}: DOP853 at 1e-13 differs from the reference by {_apart(region):.0e}" for region in regions)
+    ]
+    if not find_spec("heyoka"):
+        notes.append("heyoka is not installed: left out")
+    return [contender for region in regions for contender in contenders_of(region, quick)], notes
+
+
+def _apart(region: str) -> float:
+    independent = spectral_radius(stacked_monodromy(columns_of(region, CHECKED), 1e-13, 1e-13))
+    return float(np.abs(independent / reference(region) - 1).max())
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Measure, write the CSV and the figure."""
+    study("precision_cardan", __doc__, contenders, argv)
+
+
+if __name__ == "__main__":
+    main()

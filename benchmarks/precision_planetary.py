@@ -1,0 +1,168 @@
+"""Error against run time for planetary gears: singular values and eigenvalues, of the package, of NumPy and of SciPy.
+
+    python -m benchmarks.precision_planetary [--quick] [--out FOLDER]     # precision_planetary.csv and .png
+
+All frequencies of a gear. Every region is one gear and its neighbours, masses and stiffnesses within 1 %; all points are
+timed, the error is that of the first one, the largest over its modes, against eigenvalues in 50 digits (mpmath) of matrices
+that were assembled another way (benchmarks/planetary_reference.py). A mode of frequency 0 counts by its size over the
+lowest other one. No method has a setting, so that each is one point.
+
+"reduced" is the package's default, which splits the equations of identical planets; "whole" its singular values of the
+whole; "vectors" its Jacobi rotations, which shapes and types come from. "svd" is NumPy's of the very matrix that the
+package decomposes, "eigh" NumPy's of its square; "stiffness and mass" SciPy's generalised eigenvalues gear by gear, and
+"refined" the same with ``|G v|`` of the eigenvectors v in place of the root of the eigenvalue, which puts back what
+forming the square took. Matrices of NumPy's methods are finished before the clock starts.
+
+The package says with every frequency how far it may be off (``natural_frequency_error``); where that is more than 1e-9 of
+a frequency this counts as a notice, unless the true error is larger, which is then stated as silent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+from scipy.linalg import eigh
+
+from benchmarks.engine_job import columns_scene, engine_job, told
+from benchmarks.planetary_reference import TABLE_2, exact_frequencies, extension_matrix, matrices, natural_frequencies
+from benchmarks.precision import GOAL, Contender, Judged, study
+
+_LANES, _FEW = 1024, 8
+# Everything but the angles varies, so that gears of one number of planets share a kernel.
+_VARIED = tuple(TABLE_2)
+_QUICK = ("equal planets", "zero stiffness", "ill-conditioned 1e16")
+
+
+def _gear(planets: int, **changed: Any) -> dict[str, Any]:
+    return TABLE_2 | {"planet_angle": tuple(2 * math.pi * i / planets for i in range(planets)), **changed}
+
+
+_FREE = dict.fromkeys(("k_s", "k_r", "k_c", "k_su", "k_ru", "k_cu"), 0.0)
+_GRADED = {
+    "k_sp": 1e16,
+    "k_rp": 1e12,
+    "k_p": 1e6,
+    "k_s": 1.0,
+    "k_r": 1.0,
+    "k_c": 1.0,
+    "k_ru": 1.0,
+    "m_s": 1e-3,
+    "I_s": 1e-3,
+}
+REGIONS: dict[str, dict[str, Any]] = {
+    "equal planets": _gear(4),
+    "unequal spacing": _gear(5) | {"planet_angle": (0.0, 1.1, 2.4, 3.9, 5.2)},
+    "coincident roots": _gear(6),
+    "zero pressure angle": _gear(8, pressure_angle=0.0),
+    "twelve planets": _gear(12),
+    "zero stiffness": _gear(4, **_FREE),
+    "ill-conditioned 1e16": _gear(4, **_GRADED),
+}
+
+
+@cache
+def reference(region: str) -> np.ndarray:
+    """The frequencies in Hz; those below 1e-20 of the largest are 0."""
+    found = np.array(exact_frequencies(REGIONS[region]))
+    return np.where(found > 1e-20 * found[-1], found, 0.0)
+
+
+def neighbours(region: str, count: int) -> dict[str, np.ndarray]:
+    """Columns of the masses and stiffnesses: those of the region first, then within 1 %."""
+    rng = np.random.default_rng(2)
+    return {name: REGIONS[region][name] * np.r_[1.0, rng.uniform(0.99, 1.01, count - 1)] for name in _VARIED}
+
+
+def error_of(region: str, found: np.ndarray) -> Judged:
+    """The largest relative error of the modes ``found`` of the first gear."""
+    exact = reference(region)
+    largest = float(np.max(np.abs(found - exact) / np.where(exact > 0, exact, exact[exact > 0][0])))
+    return Judged(largest) if math.isfinite(largest) else Judged(math.nan, 1, "nan")
+
+
+_SPECTRUM = ["natural_frequency", "natural_frequency_error"]
+
+
+def package(region: str, name: str, method: str, outputs: list[str], lanes: int) -> Contender:
+    """A method of the package."""
+    fixed, columns = {"planet_angle": list(REGIONS[region]["planet_angle"])}, neighbours(region, lanes)
+    scene = columns_scene("planetary", "modes", outputs, columns, fixed=fixed, options={"method": method})
+
+    def judged(results: Mapping[str, np.ndarray]) -> Judged:
+        found, bound, exact = results["natural_frequency"][0], results["natural_frequency_error"][0], reference(region)
+        largest, failed, _ = error_of(region, found)
+        known = bool(np.all(np.abs(found - exact) <= bound))
+        doubtful = known and bool(np.any(bound > GOAL * np.where(exact > 0, exact, exact[exact > 0][0])))
+        return Judged(largest, failed, told(results["outcome"][:1]) or ("natural_frequency_error" if doubtful else ""))
+
+    return Contender("planetary", region, f"package, {name}", "double", lanes, lambda: engine_job(scene), judged)
+
+
+def _svd(factors: np.ndarray) -> np.ndarray:
+    return np.linalg.svd(factors, compute_uv=False)[:, ::-1] / (2 * math.pi)
+
+
+def _eigh(squares: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(squares), 0)) / (2 * math.pi)
+
+
+def refined_frequencies(gear: Mapping[str, Any]) -> np.ndarray:
+    """Frequencies in Hz from the eigenvectors of SciPy by Rayleigh's quotient in its factored form, rising."""
+    mass, stiffness = matrices(gear)
+    _, vectors = eigh(np.array(stiffness, float), np.diag(mass))
+    # Of unit modal mass, so that the quotient is |G M^(1/2) v|^2, a sum of squares without cancellation.
+    strain = extension_matrix(gear) @ (np.sqrt(mass)[:, None] * vectors)
+    return np.sort(np.linalg.norm(strain, axis=0)) / (2 * math.pi)
+
+
+def rivals(region: str, lanes: int) -> list[Contender]:
+    """NumPy's batched methods and SciPy gear by gear."""
+    gear = REGIONS[region]
+    together = {k: v for k, v in gear.items() if k != "planet_angle"} | neighbours(region, lanes)
+    factors = extension_matrix(together | {"planet_angle": [np.full(lanes, angle) for angle in gear["planet_angle"]]})
+    squares = np.swapaxes(factors, 1, 2) @ factors
+    alone = [gear | {name: float(column[i]) for name, column in neighbours(region, _FEW).items()} for i in range(_FEW)]
+
+    def contender(method: str, points: int, job: Callable[[], Any]) -> Contender:
+        return Contender("planetary", region, method, "double", points, lambda: job, lambda f: error_of(region, f[0]))
+
+    return [
+        contender("numpy, svd", lanes, lambda: _svd(factors)),
+        contender("numpy, eigh", lanes, lambda: _eigh(squares)),
+        contender("scipy, eigh of stiffness and mass", _FEW, lambda: [natural_frequencies(one) for one in alone]),
+        contender("scipy, eigh refined", _FEW, lambda: [refined_frequencies(one) for one in alone]),
+    ]
+
+
+def contenders(quick: bool) -> tuple[Sequence[Contender], Sequence[str]]:
+    """All methods in all regions, and how far NumPy's singular values are from the reference."""
+    lanes = 256 if quick else _LANES
+    regions = _QUICK if quick else tuple(REGIONS)
+    found, distances = [], []
+    for region in regions:
+        found += [
+            package(region, "reduced", "auto", _SPECTRUM, lanes),
+            package(region, "whole", "full", _SPECTRUM, lanes),
+        ]
+        # Shapes take long to compile: one number of planets stands for all.
+        if not quick and region in _QUICK:
+            found.append(package(region, "vectors", "full", [*_SPECTRUM, "mode_type"], lanes))
+        found += rivals(region, lanes)
+        exact = reference(region)
+        singular = _svd(extension_matrix(REGIONS[region])[None])[0]
+        distances.append(f"{region}: {np.abs(singular - exact).max() / exact[-1]:.0e}")
+    note = f"singular values (NumPy) differ from the reference, over the largest frequency, by {'; '.join(distances)}"
+    return found, [note]
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Measure, write the CSV and the figure."""
+    study("precision_planetary", __doc__, contenders, argv)
+
+
+if __name__ == "__main__":
+    main()

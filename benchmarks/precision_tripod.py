@@ -1,0 +1,231 @@
+"""Error against run time for the double tripod: its state after many strobes, by integrators.
+
+    python -m benchmarks.precision_tripod [--quick] [--out FOLDER]     # precision_tripod.csv and .png
+
+(29) of the input element from rest over 1,000 strobes (stiff and slow excitation 128, the chaotic control 40). Times are
+per strobe of one motion; the error is that of (phi, phi'/Omega) at the last strobe over the size of the motion, against
+a Taylor integration by heyoka.py at 1e-17 (SciPy's DOP853 at 3e-14 where heyoka.py is not installed); how far these two
+are apart stands in the head of the CSV.
+
+"fixed steps" is the package's ``poincare``, 64 motions at a time; "adaptive 5(4)" the pair that it offers to show what
+loose tolerances do; "history" its diffrax path, whose rtol is one for the motion and whose steps keep a hundredth of it.
+SciPy and heyoka.py integrate one motion in the dimensionless time Omega t.
+
+Regions: damping 0.05 (easy); the paper's (typical); 1 % below the tip of the principal tongue (chi_n 0.01736); overdamped,
+zeta = 30; damping 1e-12; excitation at 200 Hz, 15 natural periods a strobe; the chaotic control of
+docs/validation/tripod.md.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from benchmarks.engine_job import columns_scene, engine_job, told
+from benchmarks.precision import Contender, Judged, study
+from benchmarks.tripod_reference import NINE_DEGREES, Shaft, shaft
+
+_OMEGA = shaft("input").omega
+# Everything that differs between regions, so that they share kernels.
+_PAPER = {
+    "zeta": 0.0016, "chi_n": 0.0026, "excitation_frequency": 3066.5, "M_AEM": 2550.0, "chi_AEM": 0.05, "motor_order": 6.0,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Region:
+    """Parameters of the package, those of the equation, and the strobe at whose end the state is compared."""
+
+    parameters: Mapping[str, float]
+    strobes: int = 1000
+
+    @property
+    def shaft(self) -> Shaft:
+        """The constants of the equation."""
+        p = self.parameters
+        made = shaft("input", chi_n=p["chi_n"])
+        return replace(made, acceleration=p["M_AEM"] / 2550.0 * made.acceleration, ripple=p["chi_AEM"])
+
+    @property
+    def motor(self) -> float:
+        """Angular frequency of the motor [rad/s]."""
+        return 100 * math.pi * self.parameters["motor_order"]
+
+    @property
+    def period(self) -> float:
+        """Of a strobe, in the time Omega t."""
+        return _OMEGA / self.parameters["excitation_frequency"]
+
+
+_CONTROL = {
+    "zeta": 0.03, "chi_n": 0.3, "M_AEM": 8.4e4 * 2550.0, "chi_AEM": 0.5, "excitation_frequency": _OMEGA / math.pi,
+    "motor_order": 0.618 * _OMEGA / (100 * math.pi),
+}  # fmt: skip
+REGIONS = {
+    "easy": Region(_PAPER | {"zeta": 0.05}),
+    "typical": Region(_PAPER),
+    "near a tongue": Region(_PAPER | {"chi_n": 0.0172}),
+    "stiff, zeta = 30": Region(_PAPER | {"zeta": 30.0}, 128),
+    "no damping": Region(_PAPER | {"zeta": 1e-12}),
+    "slow excitation": Region(_PAPER | {"excitation_frequency": 200.0}, 128),
+    "chaotic control": Region(_CONTROL, 40),
+}
+_LANES, _LEAST = 64, 128
+
+
+def field_of(region: Region) -> Callable[[float, np.ndarray], tuple[float, float]]:
+    """(29) for SciPy in the time x = Omega t, state (phi, phi'/Omega), in plain Python floats."""
+    s, zeta = region.shaft, region.parameters["zeta"]
+    turn, motor = 2 * math.pi / region.period, region.motor / _OMEGA
+    mean, cos, sin, sqrt = s.acceleration / s.omega**2, math.cos, math.sin, math.sqrt
+
+    def field(x: float, y: np.ndarray) -> tuple[float, float]:
+        phi, rate = y.tolist()
+        c = cos(turn * x)
+        g = (1 + s.c1 * c) / ((1 + s.c2 * c) * (1 + s.chi_n * c))
+        a = cos(motor * x)
+        ripple, weight = 0.0, 0.5
+        for _ in range(6):
+            ripple += weight * a
+            a, weight = 2 * a * a - 1, weight / 2
+        torque = mean * (1 + s.ripple * ripple) * (1 - 3 * s.joint * sin(3 * phi)) / (1 + s.chi_n * cos(2 * phi))
+        return rate, torque - 2 * zeta * sqrt(g) * rate - g * phi
+
+    return field
+
+
+def by_scipy(region: Region, method: str, rtol: float) -> np.ndarray:
+    """State at the last strobe; NaN if SciPy gave up."""
+    end, size = region.strobes * region.period, region.shaft.acceleration / _OMEGA**2
+    found = solve_ivp(field_of(region), (0, end), (0.0, 0.0), method, rtol=rtol, atol=0.1 * rtol * size, t_eval=(end,))
+    return found.y[:, -1] if found.success else np.full(2, np.nan)
+
+
+@cache
+def _taylor(tolerance: float) -> Any:
+    """The equation in heyoka.py, its constants being parameters."""
+    import heyoka as hy
+
+    phi, rate = hy.make_vars("phi", "rate")
+    zeta, chi, c1, c2, mean, ripple, joint, turn, motor = (hy.par[i] for i in range(9))
+    c = hy.cos(turn * hy.time)
+    g = (1.0 + c1 * c) / ((1.0 + c2 * c) * (1.0 + chi * c))
+    cosines = [hy.cos(motor * hy.time)]
+    for _ in range(5):
+        cosines.append(2.0 * cosines[-1] * cosines[-1] - 1.0)
+    waves = sum(2.0 ** -(i + 1) * a for i, a in enumerate(cosines))
+    torque = mean * (1.0 + ripple * waves) * (1.0 - 3.0 * joint * hy.sin(3.0 * phi)) / (1.0 + chi * hy.cos(2.0 * phi))
+    equations = [(phi, rate), (rate, torque - 2.0 * zeta * hy.sqrt(g) * rate - g * phi)]
+    return hy.taylor_adaptive(equations, [0.0, 0.0], tol=tolerance, pars=[0.0] * 9)
+
+
+def by_heyoka(region: Region, tolerance: float) -> np.ndarray:
+    """State at the last strobe; NaN if the integration ended early."""
+    integrator, s = _taylor(tolerance), region.shaft
+    integrator.time, integrator.state[:] = 0.0, 0.0
+    integrator.pars[:] = (
+        region.parameters["zeta"], s.chi_n, s.c1, s.c2, s.acceleration / s.omega**2, s.ripple, s.joint,
+        2 * math.pi / region.period, region.motor / _OMEGA,
+    )  # fmt: skip
+    outcome = integrator.propagate_until(region.strobes * region.period)[0]
+    return integrator.state.copy() if outcome.name == "time_limit" else np.full(2, np.nan)
+
+
+@cache
+def reference(name: str) -> tuple[np.ndarray, float]:
+    """State at the last strobe and the size of the motion."""
+    region = REGIONS[name]
+    exact = by_heyoka(region, 1e-17) if find_spec("heyoka") else by_scipy(region, "DOP853", 3e-14)
+    return exact, max(float(np.abs(exact).max()), region.shaft.acceleration / _OMEGA**2)
+
+
+def error_of(name: str, state: np.ndarray) -> Judged:
+    """Of a state (phi, phi'/Omega)."""
+    exact, size = reference(name)
+    error = float(np.max(np.abs(state - exact))) / size
+    return Judged(error) if math.isfinite(error) else Judged(math.nan, 1, "nan")
+
+
+def package(name: str, analysis: str, method: str, setting: str, options: Mapping[str, Any], lanes: int) -> Contender:
+    """A scene of equal motions; the state is that of the last strobe that is compared."""
+    region = REGIONS[name]
+    section = analysis == "poincare"
+    # A section has no fewer strobes than that.
+    first = max(region.strobes - _LEAST, 0)
+    marched = first + _LEAST if section else region.strobes
+    own = (
+        {"strobes": _LEAST, "discard": first}
+        if section
+        else {"times": [region.strobes / region.parameters["excitation_frequency"]]}
+    )
+    outputs = ["section", "strobe_error"] if section else ["phi", "velocity", "phi_error", "velocity_error"]
+    scene = columns_scene(
+        "tripod", analysis, outputs, {key: np.full(lanes, value) for key, value in region.parameters.items()},
+        fixed={"element": "input", "beta": NINE_DEGREES, "equation": "29"},
+        options={"method": method, **own, **options},
+    )  # fmt: skip
+
+    def judged(found: Mapping[str, np.ndarray]) -> Judged:
+        if section:
+            state = found["section"][0, region.strobes - first - 1]
+        else:
+            state = np.array([found["phi"][0, -1], found["velocity"][0, -1]])
+        plain = error_of(name, state / (1.0, _OMEGA))
+        return Judged(plain.error, plain.failed, told(found["outcome"][:1]) or plain.noticed)
+
+    label = {"fixed": "package, fixed steps", "adaptive": "package, adaptive 5(4)", "diffrax": "package, history"}[
+        method
+    ]
+    return Contender("tripod", name, label, setting, lanes * marched, partial(engine_job, scene), judged)
+
+
+def rival(name: str, method: str, setting: str, job: Callable[[], np.ndarray]) -> Contender:
+    """One motion by SciPy or heyoka.py."""
+    return Contender("tripod", name, method, setting, REGIONS[name].strobes, lambda: job, partial(error_of, name))
+
+
+def contenders_of(name: str, quick: bool) -> list[Contender]:
+    """All methods in one region."""
+    region, found = REGIONS[name], []
+    for steps in (12, 48) if quick else (6, 12, 24, 48):
+        found.append(package(name, "poincare", "fixed", f"{steps} steps a strobe", {"steps": steps}, _LANES))
+    if not quick:
+        for rtol in (1e-3, 1e-6, 1e-9):
+            options = {"rtol": rtol, "atol": 1e-3 * rtol}
+            found.append(package(name, "poincare", "adaptive", f"rtol={rtol:g}", options, 4))
+    for rtol in (1e-8,) if quick else (1e-6, 1e-10):
+        found.append(package(name, "history", "diffrax", f"rtol={rtol:g}", {"rtol": rtol}, 4))
+    ladder = {"DOP853": (1e-6, 1e-9, 1e-12), "RK45": (1e-6,), "LSODA": (1e-6, 1e-9)}
+    for method, tolerances in ladder.items():
+        for rtol in tolerances[:1] if quick else tolerances:
+            found.append(rival(name, f"scipy {method}", f"rtol={rtol:g}", partial(by_scipy, region, method, rtol)))
+    if find_spec("heyoka"):
+        for tolerance in (1e-9,) if quick else (1e-6, 1e-9, 1e-12, 1e-15):
+            found.append(rival(name, "heyoka.py", f"tol={tolerance:g}", partial(by_heyoka, region, tolerance)))
+    return found
+
+
+def contenders(quick: bool) -> tuple[Sequence[Contender], Sequence[str]]:
+    """All methods in all regions, and how far the two references are apart."""
+    names = ("typical", "near a tongue") if quick else tuple(REGIONS)
+    notes = [f"{name}: SciPy DOP853 at 3e-14 differs from the reference by "
+             f"{error_of(name, by_scipy(REGIONS[name], 'DOP853', 3e-14)).error:.0e}" for name in names]  # fmt: skip
+    return [contender for name in names for contender in contenders_of(name, quick)], ["; ".join(notes)]
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Measure, write the CSV and the figure."""
+    # A thousand strobes by SciPy are seconds: two repeats unless asked for otherwise.
+    study("precision_tripod", __doc__, contenders, ["--repeats", "2", *(sys.argv[1:] if argv is None else argv)])
+
+
+if __name__ == "__main__":
+    main()

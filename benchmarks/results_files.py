@@ -1,0 +1,99 @@
+"""Result files as the page reads them: rows, the head with its provenance, numbers and tables in Markdown."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+Row = Mapping[str, str]
+_PROVENANCE = ("date", "machine", "load", "versions", "accelerator")
+
+
+@dataclass(frozen=True)
+class ResultFile:
+    """A CSV of results: ``facts`` (date, machine, load, versions), ``notes`` of its head, ``rows``."""
+
+    name: str
+    facts: Mapping[str, str]
+    notes: Sequence[str]
+    rows: Sequence[Row]
+
+
+def load(folder: Path, name: str) -> ResultFile | None:
+    """``<folder>/<name>.csv``, or None if it has not been measured."""
+    path = folder / f"{name}.csv"
+    if not path.is_file():
+        return None
+    lines = path.read_text().splitlines()
+    head = [line[2:] for line in lines if line.startswith("# ")]
+    pairs = [line.partition(": ") for line in head]
+    facts = {key: value for key, _, value in pairs if key in _PROVENANCE}
+    notes = [line for line, (key, _, _) in zip(head, pairs, strict=True) if key not in _PROVENANCE]
+    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
+    return ResultFile(name, facts, notes, rows)
+
+
+def count(value: str | float) -> str:
+    """A rate or a number of things, with thousands separated: two or three significant digits."""
+    number = float(value)
+    if number >= 100:
+        return f"{float(f'{number:.3g}'):,.0f}"
+    return f"{number:.3g}"
+
+
+def small(value: str | float) -> str:
+    """An error: one significant digit and a half, ``2.4e-10``."""
+    number = float(value)
+    if math.isnan(number):
+        return "none"
+    return "0" if number == 0 else f"{number:.1e}"
+
+
+def seconds(value: str | float) -> str:
+    """A time in the unit that suits it."""
+    number = float(value)
+    for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)):
+        if number >= scale or unit == "ns":
+            return f"{number / scale:.3g} {unit}"
+    raise AssertionError
+
+
+def times(ratio: float) -> str:
+    """``1.7`` or ``860``: how many times, two significant digits (three above 100)."""
+    return f"{float(f'{ratio:.2g}'):g}" if ratio < 100 else f"{float(f'{ratio:.3g}'):,.0f}"
+
+
+def against(ratio: float, rival: str) -> str:
+    """A comparison of speeds in words that follow from the figure."""
+    if ratio >= 1.05:
+        return f"{times(ratio)} times as fast as {rival}"
+    if ratio <= 0.95:
+        return f"slower than {rival}, by {times(1 / ratio)} times"
+    return f"as fast as {rival}"
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def whole(file: ResultFile | None, name: str, columns: Mapping[str, str], formats: Mapping[str, object]) -> str:
+    """The columns of a file as they are, under the headings given; ``formats`` name column -> function."""
+    if file is None:
+        return not_measured(name)
+    as_is = dict.fromkeys(columns, str) | dict(formats)
+    rows = [[_cell(row.get(column, ""), as_is[column]) for column in columns] for row in file.rows]
+    return markdown(list(columns.values()), rows)
+
+
+def not_measured(name: str) -> str:
+    """The line in place of a table whose file is missing."""
+    return f"Not measured: `{name}.csv` is missing."
+
+
+def _cell(text: str, form: object) -> str:
+    return form(text) if text and callable(form) else text

@@ -1,0 +1,180 @@
+"""The gallery: every scene of sweeps/ computed (or resumed), drawn, and listed on one page; `make gallery`.
+
+A scene that is complete and a figure that is newer than its result and the code that draws it are left alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+import drivetrain_jax
+from drivetrain_jax import InputError
+from drivetrain_jax._progress import progress_line
+from drivetrain_jax.analysis import Outcome
+from drivetrain_jax.store.consolidate import open_result
+from drivetrain_jax.sweep.atlas_chart import chart
+from drivetrain_jax.sweep.run import Incomplete, run_to_file
+from drivetrain_jax.sweep.status import status
+from drivetrain_jax.systems import get_system, system_names
+from drivetrain_jax.view import plot
+
+SCENES = Path(__file__).parents[1] / "sweeps"
+PACKAGE = Path(drivetrain_jax.__file__).parent
+CELLS = 600
+# Charts of an atlas over more parameters than a figure has: what is fixed in each, as for `drivetrain plot --part`.
+PARTS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
+    "cardan_atlas_4d": {
+        "Figs 2 and 3 from the four-parameter atlas": {"mu": 1.0, "alpha": 1.0},
+        "Fig. 4 from the four-parameter atlas": {"mu": 1.0, "alpha": 20.0},
+        "Fig. 5 from the four-parameter atlas": {"beta": 0.5235987755982988, "mu": 1.0},
+        "Fig. 6 from the four-parameter atlas": {"mu": 20.0, "alpha": 1.0},
+        "Fig. 7 from the four-parameter atlas": {"beta": 0.5235987755982988, "alpha": 1.0},
+    }
+}
+
+
+@dataclass(frozen=True)
+class Item:
+    """One figure: the scenes it shows (several methods of one analysis share a title), and what is fixed of an atlas."""
+
+    title: str
+    system: str
+    scenes: tuple[Path, ...]
+    part: Mapping[str, float] = field(default_factory=dict)
+    number: int = 0
+
+    @property
+    def name(self) -> str:
+        """Name of the figure without its ending."""
+        return self.scenes[0].stem + (f"_{self.number}" if self.number else "")
+
+
+def items(folder: Path) -> list[Item]:
+    """The figures, by system, in the order of the scenes' names."""
+    scenes = {path: tomllib.loads(path.read_text()) for path in sorted(folder.glob("*.toml"))}
+    order = {name: place for place, name in enumerate(system_names())}
+    shared: dict[tuple[str, str, str], list[Path]] = {}
+    for path, scene in scenes.items():
+        shared.setdefault((scene["system"], scene["analysis"], scene["title"]), []).append(path)
+    found = []
+    for (system, _, title), paths in sorted(shared.items(), key=lambda pair: order[pair[0][0]]):
+        parts = PARTS.get(paths[0].stem, {title: {}})
+        several = len(parts) > 1
+        found += [
+            Item(name, system, tuple(paths), part, number if several else 0)
+            for number, (name, part) in enumerate(parts.items(), 1)
+        ]
+    return found
+
+
+def compute(scene: Path, folder: Path) -> Path:
+    """The result of a scene; what other code or another scene has left there is replaced."""
+    out = folder / f"{scene.stem}.nc"
+    with progress_line() as show:
+        run_to_file(scene, out, fresh=status(scene, out).state == "stale", report=show)
+    return out
+
+
+def draw(item: Item, results: Sequence[Path], figure: Path) -> None:
+    """Write the figure unless it is newer than all that it comes from."""
+    code = [*PACKAGE.glob("view/*.py"), Path(__file__)]
+    if any(tomllib.loads(scene.read_text())["analysis"] == "atlas" for scene in item.scenes):
+        code += [*PACKAGE.glob("atlas/*.py"), PACKAGE / "sweep" / "atlas_chart.py"]
+    newest = max(path.stat().st_mtime for path in (*results, *code))
+    if figure.exists() and figure.stat().st_mtime > newest:
+        return
+    datasets = [open_result(path) for path in results]
+    if datasets[0].attrs["analysis"] == "atlas":
+        datasets = [chart(ds, item.part, CELLS).assign_attrs(title=item.title) for ds in datasets]
+    plot(*datasets).savefig(figure)
+
+
+def answered(title: str) -> str:
+    """What of its source a figure answers: the figures, tables and sections that its title names."""
+    return ", ".join(re.findall(r"(?:Figs?\.?|Tables?|section) \d+\w?(?:(?:,| and| to) \d+)*", title))
+
+
+def remarks(scene: Path) -> str:
+    """The comments at the head of a scene."""
+    lines = scene.read_text().splitlines()
+    head = lines[: next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))]
+    return " ".join(line.lstrip("# ") for line in head)
+
+
+def counts(dataset: xr.Dataset) -> str:
+    """Points and time, and how many points are undecided or without a value."""
+    if "outcome" not in dataset:
+        return f"{int(dataset.attrs['solves']):,} direct solves, {dataset.attrs['wall_time_s']:.1f} s"
+    outcome = dataset["outcome"].values
+    parts = [f"{outcome.size:,} points", f"{dataset.attrs['wall_time_s']:.1f} s"]
+    if "undecided" in dataset.get("verdict", xr.DataArray()).attrs.get("flag_meanings", "").split():
+        code = dataset["verdict"].attrs["flag_meanings"].split().index("undecided")
+        parts.append(f"undecided {int((dataset['verdict'] == code).sum()):,}")
+    failed = {o.name.lower(): int((outcome == o).sum()) for o in Outcome if o is not Outcome.SUCCESS}
+    return ", ".join([*parts, *(f"{name} {count:,}" for name, count in failed.items() if count)])
+
+
+def entry(item: Item, results: Sequence[Path], problem: str) -> Iterator[str]:
+    """The page's text for one figure."""
+    source = get_system(item.system).source.partition(";")[0]
+    answer = answered(item.title)
+    yield f"### {item.title}\n"
+    yield (f"Answers: {answer} of {source}." if answer else "Beyond the source.") + "\n"
+    yield "\n\n".join(filter(None, map(remarks, item.scenes))) + "\n"
+    yield f"{problem}\n" if problem else f"![{item.title}]({item.name}.png)\n"
+    runs = [f"$ drivetrain run sweeps/{path.name} --out {path.stem}.nc" for path in item.scenes]
+    files = " ".join(f"{path.stem}.nc" for path in item.scenes)
+    part = "".join(f" {name}={value:.10g}" for name, value in item.part.items())
+    runs.append(f"$ drivetrain plot {files} --out {item.name}.png" + (f" --part{part}" if part else ""))
+    yield "\n".join(["```console", *runs, "```\n"])
+    yield "; ".join(counts(open_result(path)) for path in results if path.exists()) + ".\n"
+
+
+def render(item: Item, folder: Path) -> tuple[list[Path], str]:
+    """Results and figure of one item, and what went wrong, if anything did."""
+    results: list[Path] = []
+    try:
+        results = [compute(scene, folder) for scene in item.scenes]
+    except Incomplete as error:
+        return results, f"Not finished: {error}."
+    try:
+        draw(item, results, folder / f"{item.name}.png")
+    except InputError as error:
+        return results, f"No figure: {error}."
+    return results, ""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compute, draw, write `index.md`; 1 if a scene could not be finished."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, help="where results, figures and index.md go")
+    parser.add_argument("--scenes", type=Path, default=SCENES, help="folder of the scenes")
+    parser.add_argument("names", nargs="*", help="only scenes of these names (without .toml)")
+    given: Any = parser.parse_args(arguments)
+    given.folder.mkdir(parents=True, exist_ok=True)
+    chosen = [i for i in items(given.scenes) if not given.names or {s.stem for s in i.scenes} & set(given.names)]
+    text: list[str] = []
+    unfinished = 0
+    for number, item in enumerate(chosen, 1):
+        sys.stderr.write(f"[{number}/{len(chosen)}] {item.title}\n")
+        if not number - 1 or item.system != chosen[number - 2].system:
+            text.append(f"## {get_system(item.system).title}\n")
+        results, problem = render(item, given.folder)
+        unfinished += problem.startswith("Not finished")
+        text += entry(item, results, problem)
+    if not given.names:
+        (given.folder / "index.md").write_text("\n".join(text))
+    return 1 if unfinished else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,102 @@
+"""Closed-form results at scattered points, box by box, on all cores."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis.kernels import compiler_options, in_one_kernel
+from drivetrain_jax.atlas import quartic
+from drivetrain_jax.atlas.charts import Results, errors_of, exact_verdict, in_threads, pack, unpack
+from drivetrain_jax.atlas.expansion import Cell, Expansion
+from drivetrain_jax.atlas.floquet_quantity import Build
+from drivetrain_jax.atlas.panels import Atlas
+
+# Points of a row, whose intermediate results stay in the cache, and rows of a block.
+LANES, ROWS = 128, 16
+
+
+def judged_cells(
+    expansion: Expansion, points: np.ndarray, x: np.ndarray, atlas: Atlas, kernel: Any
+) -> Iterator[tuple[np.ndarray, Results]]:
+    """Numbers of points and their results, block after block. ``points`` ``(N, d)`` are parameters, ``x`` coordinates;
+    ``kernel`` is that of :func:`point_kernel`."""
+    block = LANES * ROWS
+
+    def work(part: tuple[Cell, int]) -> Results:
+        cell, start = part
+        # The last block is filled up with its last point.
+        numbers = np.minimum(np.arange(start, start + block), cell.index.size - 1)
+        columns = points[cell.index[numbers]].T
+        values, rows = dict(zip(atlas.parameters, columns, strict=True)), -(-(cell.index.size - start) // LANES)
+        found = kernel(
+            cell.tensor,
+            cell.place[:, numbers],
+            np.int32(min(rows, ROWS)),
+            errors_of(cell.panel),
+            cell.left_out,
+            values,
+            atlas.fixed,
+        )
+        return {name: np.asarray(value)[: cell.index.size - start] for name, value in found.items()}
+
+    parts = ((cell, start) for cell in expansion.cells(x) for start in range(0, cell.index.size, block))
+    for (cell, start), found in in_threads(parts, work):
+        yield cell.index[start : start + block], found
+
+
+@lru_cache(maxsize=16)
+def point_kernel(build: Build, rtol: float, undamped: bool) -> Any:
+    """Closed-form results ``(LANES ROWS,)`` of a block of points, those of the first ``rows`` rows, and which of them are to
+    be judged again (``unsure``). ``undamped``: points may be Hamiltonian."""
+
+    def kernel(tensor, place, rows, errors, left_out, values, fixed):
+        count = max((*tensor.shape[:-2], tensor.shape[-1]))
+        polynomials = in_one_kernel(partial(_chebyshev, count=count))
+
+        def row(i: Array, results: tuple[Array, ...]) -> tuple[Array, ...]:
+            def cut(array: Array) -> Array:
+                return jax.lax.dynamic_slice_in_dim(array, i * LANES, LANES, axis=-1)
+
+            phi = _values(tensor, polynomials(cut(place)))
+            model = build({**fixed, **{name: cut(column) for name, column in values.items()}})
+            log_d = jnp.broadcast_to(model.reduced.log_determinant(), (LANES,))
+            parts = quartic.blocks(phi)
+            found = (pack(quartic.coefficients(parts, log_d, errors[1:, None], left_out)),)
+            if undamped:
+                found += (exact_verdict(model, parts, errors[0] + left_out),)
+            return tuple(
+                jax.lax.dynamic_update_slice_in_dim(all_rows, new, i * LANES, axis=0)
+                for all_rows, new in zip(results, found, strict=True)
+            )
+
+        size = place.shape[1]
+        blank = (jnp.zeros(size, complex), jnp.zeros(size, jnp.int8))[: 1 + undamped]
+        return unpack(*jax.lax.fori_loop(0, rows, row, blank), rtol=rtol)
+
+    return jax.jit(kernel, compiler_options=compiler_options())
+
+
+def _chebyshev(x: Array, count: int) -> Array:
+    """``T_0 .. T_(count - 1)`` at ``x``, ``(count, *x.shape)``. Few of them: the recurrence loses no digits that matter."""
+
+    def step(pair: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
+        return (pair[1], 2 * x * pair[1] - pair[0]), pair[0]
+
+    return jax.lax.scan(step, (jnp.ones_like(x), x), None, length=count)[1]
+
+
+def _values(tensor: Array, polynomials: Array) -> Array:
+    """Values ``(m, N)`` from ``tensor`` ``(n_2, ..., n_d, m, n_1)`` and T_j of each coordinate, ``(n, d, N)``."""
+    *others, m, first = tensor.shape
+    values = (tensor.reshape(-1, first) @ polynomials[:first, 0]).reshape(*others, m, -1)
+    for k, n in enumerate(others, start=1):
+        # Term by term: the compiler does not vectorise a sum over an axis in the middle.
+        values = sum(values[j] * polynomials[j, k] for j in range(n))
+    return values

@@ -1,0 +1,69 @@
+"""Signals to the command line: never a traceback, and no answer once the command is over."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+
+import pytest
+
+from drivetrain_jax import cli
+
+NUMBERS = (signal.SIGINT, signal.SIGTERM)
+
+
+@pytest.fixture(autouse=True)
+def handlers(monkeypatch):
+    before = {number: signal.getsignal(number) for number in NUMBERS}
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+class Interrupted:
+    """Its destructor swallows the exception of a signal that comes meanwhile."""
+
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+        for _ in range(1000):
+            pass
+
+
+@pytest.mark.parametrize("disturbed", [True, False])
+def test_a_swallowed_interrupt_is_raised_again_and_not_shown(monkeypatch, disturbed):
+    shown = []
+    monkeypatch.setattr(sys, "unraisablehook", shown.append)
+    with cli._stop_on_signals() as check:
+        if disturbed:
+            Interrupted()
+            with pytest.raises(KeyboardInterrupt):
+                check()
+        else:
+            check()
+    assert shown == [] and (sys.unraisablehook == shown.append) is not disturbed
+
+
+def test_other_errors_in_destructors_are_shown(monkeypatch):
+    class Broken:
+        def __del__(self):
+            raise ValueError
+
+    shown = []
+    monkeypatch.setattr(sys, "unraisablehook", shown.append)
+    with cli._stop_on_signals():
+        Broken()
+    assert len(shown) == 1
+
+
+def test_a_command_that_is_over_cannot_be_stopped(monkeypatch, capsys):
+    """The process is on its way out and its exit code is that of what it did."""
+    monkeypatch.setattr(sys, "argv", ["drivetrain", "list"])
+    assert cli.main() == 0
+    assert [signal.getsignal(number) for number in NUMBERS] == [signal.SIG_IGN] * 2
+    assert "Systems" in capsys.readouterr().out
+    for number in NUMBERS:
+        signal.signal(number, signal.SIG_DFL)
+    assert cli.main(["list"]) == 0
+    assert [signal.getsignal(number) for number in NUMBERS] == [signal.SIG_DFL] * 2

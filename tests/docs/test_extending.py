@@ -1,0 +1,59 @@
+"""The package that docs/extending.md writes: its files are taken from the page, installed, and its commands are run."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from drivetrain_jax.store.consolidate import open_result
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "extending.md").read_text()
+OFFLINE = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--target"]
+# All commands in one process, which imports and compiles once; the folder it runs in is not on its path.
+SEVERAL = "import sys; from drivetrain_jax.cli import main; sys.exit(any(main(eval(line)) for line in sys.argv[1:]))"
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.M | re.S)
+
+
+def test_the_page_is_true(tmp_path):
+    project, installed = tmp_path / "project", tmp_path / "installed"
+    project.mkdir()
+    for content in [*blocks("python"), *blocks("toml")]:
+        (project / re.match(r"# (\S+)\n", content)[1]).write_text(content)
+
+    def python(*arguments: str, **variables: str) -> str:
+        paths = os.pathsep.join([str(installed), str(ROOT)])
+        environment = {**os.environ, "PYTHONPATH": paths, "DRIVETRAIN_JAX_CACHE": str(tmp_path / "cache"), **variables}
+        done = subprocess.run(
+            [sys.executable, *arguments], cwd=project, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout + done.stderr
+
+    install, *commands, test = [
+        shlex.split(line) for line in re.findall(r"^\$ (.*)$", "".join(blocks("console")), re.M)
+    ]
+    assert (install, test[0]) == (["pip", "install", "."], "python") and {c[0] for c in commands} == {"drivetrain"}
+    python("-m", *install, *OFFLINE, str(installed))
+    answers = python("-c", SEVERAL, *(repr(command[1:]) for command in commands), PYTHONSAFEPATH="1")
+    assert "angle of both joints" in answers
+    assert "points: total=4331 computed=4331 reused=0 failed=0" in answers
+    assert "2 passed" in python(*test[1:])
+
+    chart = open_result(project / "chart.nc")
+    unstable = chart["verdict"] == 1
+    at_one = unstable.sel(Omega=1.0, method="nearest")
+    # The tip at beta = 0.1412, between two rows; and nothing unstable far from the predicted speeds.
+    assert chart["beta"].values[at_one.values.argmax()] == pytest.approx(0.16)
+    assert not unstable.sel(Omega=slice(1.75, 2.0)).any() and 0.1 < float(unstable.mean()) < 0.3
+    assert chart["resonance_Omega"].values.tolist() == pytest.approx([1.0, 1 / 2, 1 / 3])
+    assert (project / "chart.png").stat().st_size > 20_000

@@ -1,0 +1,62 @@
+"""The gallery on two scenes that cost nothing, and what it makes of the scenes of the package."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "docs"))
+import gallery  # noqa: E402
+
+SCENE = """# A remark.
+title = "{title}"
+system = "tripod"
+analysis = "parameters"
+outputs = ["natural_angular_frequency"]
+[axes]
+beta = {{ start = 0.0, stop = 0.1, num = {num} }}
+[fixed]
+element = "input"
+"""
+
+
+@pytest.fixture
+def folders(tmp_path):
+    scenes = tmp_path / "scenes"
+    scenes.mkdir()
+    (scenes / "a.toml").write_text(SCENE.format(title="Figs 9 and 10: frequencies", num=3))
+    (scenes / "b.toml").write_text(SCENE.format(title="One cell for each", num=5))
+    return scenes, tmp_path / "out"
+
+
+def state(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_mtime_ns for path in folder.iterdir() if path.suffix != ".md"}
+
+
+def test_what_has_not_changed_is_left_alone_and_what_has_is_made_again(folders, monkeypatch):
+    scenes, out = folders
+    monkeypatch.setenv("DRIVETRAIN_JAX_CACHE", "0")
+    arguments = ["--scenes", str(scenes), str(out)]
+    assert gallery.main(arguments) == 0
+    first = state(out)
+    assert set(first) == {"a.nc", "a.png", "b.nc", "b.png"}
+    page = (out / "index.md").read_text()
+    assert "Answers: Figs 9 and 10 of Bugaru" in page and "Beyond the source." in page and "A remark." in page
+    assert "$ drivetrain plot a.nc --out a.png" in page and "3 points" in page
+    assert gallery.main(arguments) == 0
+    assert state(out) == first
+    (scenes / "b.toml").write_text(SCENE.format(title="One cell for each", num=4))
+    assert gallery.main(arguments) == 0
+    second = state(out)
+    assert {name for name in first if first[name] != second[name]} == {"b.nc", "b.png"}
+
+
+def test_every_scene_has_its_place():
+    items = gallery.items(gallery.SCENES)
+    assert {s.name for item in items for s in item.scenes} == {p.name for p in (ROOT / "sweeps").glob("*.toml")}
+    assert len({item.name for item in items}) == len(items)
+    of_a_paper = [item for item in items if any(mark in item.name for mark in ("_fig", "_table", "_section"))]
+    assert len(of_a_paper) > 40 and all(gallery.answered(item.title) for item in of_a_paper)

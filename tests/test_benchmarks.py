@@ -1,0 +1,113 @@
+"""The benchmarks' page says what their files say; a method that is wrong without saying so is called silent."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from benchmarks.page import PAGE, text_of
+from benchmarks.precision import Contender, Judged, Rung, judge, measure, read, write
+from benchmarks.timing import RESULTS
+from drivetrain_jax import cli
+
+
+def rung(setting="rtol=1e-9", error=1e-10, failed=0, noticed=""):
+    return Rung("cardan", "easy", "method", setting, error, 1e-5, 0.0, 8, failed, noticed)
+
+
+def test_the_page_is_what_the_stored_files_give():
+    text = text_of(RESULTS, PAGE)
+    assert text == PAGE.read_text(), "run `python -m benchmarks.page`"
+    assert "There was no GPU machine" in text
+
+
+@pytest.mark.parametrize(
+    ("error", "verdict"), [(1e-10, "No method of the package fails"), (1.0, "**The package fails")]
+)
+def test_a_silent_failure_stands_at_the_head_of_the_page(tmp_path, error, verdict):
+    rival, own = rung(error=1e-3), replace(rung(error=error), method="package, direct")
+    write("precision_cardan", [own, rival], (), tmp_path)
+    text = text_of(tmp_path, tmp_path / "benchmarks.md")
+    assert f"{verdict} silently" in text and "Rivals that are wrong without saying so: method (cardan easy)" in text
+
+
+def test_a_page_without_any_file_says_so(tmp_path):
+    text = text_of(tmp_path, tmp_path / "benchmarks.md")
+    assert text.count("Not measured") >= 10
+    assert "silently" not in text, "nothing is claimed of what was not measured"
+    assert "not measured" in text and "Nothing has been measured" in text
+
+
+@pytest.mark.parametrize(
+    ("ladder", "word"),
+    [
+        ([rung(error=5e-10), rung("rtol=1e-12", 1e-13)], "holds"),
+        ([rung(error=5e-7, noticed="tolerance_not_met"), rung("rtol=1e-12", 1e-8, 0, "nan")], "degrades"),
+        ([rung(error=2e-6)], "SILENT"),
+        ([rung(error=math.nan)], "SILENT"),
+        ([rung(error=1e-12, failed=3)], "SILENT"),
+        ([rung(error=math.nan, failed=8, noticed="step_limit")], "fails"),
+        ([rung("steps=8", 3.0), rung("steps=64", 1e-11)], "holds"),
+        ([rung("steps=8", 1e-3), rung("steps=64", 3.0)], "SILENT"),
+    ],
+)
+def test_judgement(ladder, word):
+    assert judge(ladder).word == word
+
+
+def test_exceptions_and_warnings_are_how_a_user_notices(tmp_path):
+    def broken():
+        raise FloatingPointError("overflow")
+
+    def warned():
+        warnings.warn("tolerance not reached", RuntimeWarning, stacklevel=1)
+
+    contenders = [
+        Contender("cardan", "stiff", name, "rtol=1e-9", 2, lambda job=job: job, lambda _: Judged(0.5))
+        for name, job in (("broken", broken), ("warned", warned), ("plain", lambda: None))
+    ]
+    rungs = measure(contenders, repeats=2)
+    assert [r.noticed for r in rungs] == ["FloatingPointError", "RuntimeWarning", ""]
+    assert [judge([r]).word for r in rungs] == ["fails", "fails", "SILENT"]
+    assert rungs[0].failed == 2 and math.isnan(rungs[0].error)
+    write("some", rungs, ["a note"], tmp_path)
+    again = read(tmp_path / "some.csv")
+    assert [(r.method, r.noticed, r.failed) for r in again] == [(r.method, r.noticed, r.failed) for r in rungs]
+
+
+def test_bench_outside_a_checkout_is_one_line(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(cli, "__file__", str(tmp_path / "drivetrain_jax" / "cli.py"))
+    assert cli.main(["bench", "--quick"]) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1 and "benchmarks/" in message
+
+
+def test_an_unknown_system_is_refused_before_anything_runs(capfd):
+    assert cli.main(["bench", "bycicle", "--out", str(Path("nowhere"))]) == 2
+    message = capfd.readouterr().err
+    assert message.count("\n") == 1 and "bycicle" in message
+    assert not Path("nowhere").exists()
+
+
+def test_a_missing_peer_or_a_failing_study_does_not_stop_the_page(monkeypatch, tmp_path, capfd):
+    from benchmarks import __main__ as runner
+
+    studies = (runner.Study("throughput", "cardan", "no_such_package"), runner.Study("no_such_study", "cardan"))
+    monkeypatch.setattr(runner, "STUDIES", studies)
+    assert runner.main(["--quick", "--out", str(tmp_path / "results"), "cardan"]) == 1
+    out = capfd.readouterr().out
+    assert "throughput: left out, no_such_package is not installed" in out
+    assert "no_such_study: FAILED" in out and "2 studies" in out and "1 failed" in out
+    assert "Not measured" in (tmp_path / "results" / "benchmarks.md").read_text()
+    assert runner.main(["--quick", "--out", str(tmp_path / "other"), "tripod"]) == 0
+
+
+def test_every_study_is_a_module_of_the_benchmarks():
+    from benchmarks.__main__ import ROOT, STUDIES, SYSTEMS
+
+    assert all((ROOT / "benchmarks" / f"{study.module}.py").is_file() for study in STUDIES)
+    assert {study.system for study in STUDIES} == set(SYSTEMS)
