@@ -121,7 +121,7 @@ def package_ends(flow: Callable[[Any], Any], strobes: int) -> Callable[[np.ndarr
     import jax
     import jax.numpy as jnp
 
-    from drivetrain_jax.analysis.variational import initial_frame, one_kernel, strobe_map
+    from drivetrain_jax.analysis.chaos.variational import initial_frame, one_kernel, strobe_map
 
     @jax.jit
     def ends(starts: Any, steps: Any) -> Any:
@@ -139,7 +139,7 @@ def package_rate(flow: Callable[[Any], Any], starts: np.ndarray, period: float) 
     import jax
     import jax.numpy as jnp
 
-    from drivetrain_jax.analysis.growth import record_growth
+    from drivetrain_jax.analysis.chaos.growth import record_growth
 
     def march(starts: Any, steps: Any, time: Any) -> Any:
         record = record_growth(flow(starts), steps, time, 0.0, jnp.ones(LANES, bool))

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from drivetrain_jax.analysis.critical_speeds import angular_frequencies
-from drivetrain_jax.analysis.shaft_compound import Scales, planes
+from drivetrain_jax.analysis.shafts.compound import Scales, planes
 from drivetrain_jax.atlas import Atlas, Domain, Quantity, construct, run, values_at
 from drivetrain_jax.systems import Coordinate, Shaft, get_system
 

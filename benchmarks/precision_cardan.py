@@ -139,7 +139,7 @@ def _constant(solver: str) -> Callable[[Columns, float], Any]:
     import jax
     import jax.numpy as jnp
 
-    from drivetrain_jax.analysis.monodromy import state_transition
+    from drivetrain_jax.analysis.periodic.monodromy import state_transition
     from drivetrain_jax.systems.cardan import linear_rows
 
     def one(values: Mapping[str, Any], step: Any) -> Any:

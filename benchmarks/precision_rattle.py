@@ -26,11 +26,11 @@ import numpy as np
 
 from benchmarks.precision import Contender, Judged, study
 from benchmarks.rattle_reference import extended, scipy_events, scipy_plain
-from drivetrain_jax.analysis.harmonic_balance import Basis
-from drivetrain_jax.analysis.harmonic_response import describe
-from drivetrain_jax.analysis.harmonic_sweep import sweep
-from drivetrain_jax.analysis.piecewise_diffrax import integrate
-from drivetrain_jax.analysis.piecewise_march import march, prepare, start
+from drivetrain_jax.analysis.approximations.harmonic_balance import Basis
+from drivetrain_jax.analysis.approximations.harmonic_response import describe
+from drivetrain_jax.analysis.approximations.harmonic_sweep import sweep
+from drivetrain_jax.analysis.impacts.piecewise_diffrax import integrate
+from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
 from drivetrain_jax.systems.rattle import PRESETS, oscillator
 
 PERIODS = 10

@@ -23,8 +23,8 @@ from matplotlib.figure import Figure
 
 from benchmarks.rattle_reference import extended, scipy_events, scipy_plain
 from benchmarks.timing import interleaved, median, parser, provenance, results_folder, table, write_csv
-from drivetrain_jax.analysis.piecewise_diffrax import integrate
-from drivetrain_jax.analysis.piecewise_march import march, prepare, start
+from drivetrain_jax.analysis.impacts.piecewise_diffrax import integrate
+from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
 from drivetrain_jax.systems.rattle import PRESETS, oscillator
 
 PERIODS = 10

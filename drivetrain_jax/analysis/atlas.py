@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from drivetrain_jax.analysis import floquet_propagator
 from drivetrain_jax.analysis._base import Request, Solver
-from drivetrain_jax.analysis.floquet_results import VARIABLES
+from drivetrain_jax.analysis.periodic import floquet_propagator
+from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES
 from drivetrain_jax.systems import System
 
 

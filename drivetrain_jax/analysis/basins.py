@@ -21,8 +21,8 @@ from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.attractor import attractors, take
-from drivetrain_jax.analysis.exact_response import WIDTH, describe
+from drivetrain_jax.analysis.impacts.attractor import attractors, take
+from drivetrain_jax.analysis.impacts.exact_response import WIDTH, describe
 from drivetrain_jax.analysis.steady_state import WAIT
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System
 

@@ -1,7 +1,7 @@
 """Critical speeds: natural frequencies of the lateral vibration of a shaft, certified by a count.
 
 The synchronous critical speed of a shaft whose gyroscopic effect is neglected is its natural frequency,
-``n = 30 p/pi`` rpm. Method ``certified`` (default): :mod:`~drivetrain_jax.analysis.shaft_roots`, at full accuracy for
+``n = 30 p/pi`` rpm. Method ``certified`` (default): :mod:`~drivetrain_jax.analysis.shafts.roots`, at full accuracy for
 any mode. Method ``krylov_determinant``: the paper's, which loses all digits near mode 12;
 ``count_certified`` tells which of its roots have the number they claim.
 
@@ -28,11 +28,12 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis import shaft_krylov, shaft_roots
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.shaft_mechanisms import mechanism_shapes, zero_modes
-from drivetrain_jax.analysis.shaft_roots import Roots, angular_frequencies
-from drivetrain_jax.analysis.shaft_shapes import mode_shapes, normalised
+from drivetrain_jax.analysis.shafts import krylov as shaft_krylov
+from drivetrain_jax.analysis.shafts import roots as shaft_roots
+from drivetrain_jax.analysis.shafts.mechanisms import mechanism_shapes, zero_modes
+from drivetrain_jax.analysis.shafts.roots import Roots, angular_frequencies
+from drivetrain_jax.analysis.shafts.shapes import mode_shapes, normalised
 from drivetrain_jax.systems import Shaft, System
 
 __all__ = ["ANALYSIS", "angular_frequencies", "separation_margin"]

@@ -19,12 +19,12 @@ from jax import Array
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.direct import compare
-from drivetrain_jax.analysis.direct_solvers import direct_solvers
-from drivetrain_jax.analysis.floquet_effort import explicit_effort
-from drivetrain_jax.analysis.floquet_results import NEED_ERROR, VARIABLES, results
-from drivetrain_jax.analysis.monodromy import SOLVERS, state_transition
-from drivetrain_jax.analysis.propagator import Propagator
+from drivetrain_jax.analysis.periodic.direct import compare
+from drivetrain_jax.analysis.periodic.direct_solvers import direct_solvers
+from drivetrain_jax.analysis.periodic.floquet_effort import explicit_effort
+from drivetrain_jax.analysis.periodic.floquet_results import NEED_ERROR, VARIABLES, results
+from drivetrain_jax.analysis.periodic.monodromy import SOLVERS, state_transition
+from drivetrain_jax.analysis.periodic.propagator import Propagator
 from drivetrain_jax.systems import System
 
 # The diffrax error is the difference between two tolerances a decade apart, taken as it is (see `compare`).

@@ -1,8 +1,8 @@
 """Forced response: periodic solution of the linearised system, and the nonlinear periodic orbit with its multipliers.
 
 Linear, over one period T from rest, by variational equations: ``y(T; y0) = r + Z y0``, hence ``y0 = (I - Z)^-1 r``.
-Nonlinear: Newton shooting along growing forcing (:func:`~drivetrain_jax.analysis.orbit.shoot`). Where several orbits
-exist it gives the one that this path meets first.
+Nonlinear: Newton shooting along growing forcing (:func:`~drivetrain_jax.analysis.periodic.orbit.shoot`). Where several
+orbits exist it gives the one that this path meets first.
 
 Outcome: ``TOLERANCE_NOT_MET`` if the estimated error of a state exceeds ``rtol`` times its largest entry;
 ``NOT_CONVERGED`` if I - Z is singular to working accuracy or no nonlinear orbit was found. Only what could not be
@@ -22,9 +22,9 @@ from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.amplitude import amplitudes
-from drivetrain_jax.analysis.linear_algebra import eigenvalues, solve, spectral_norm
-from drivetrain_jax.analysis.orbit import (
+from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, solve, spectral_norm
+from drivetrain_jax.analysis.periodic.amplitude import amplitudes
+from drivetrain_jax.analysis.periodic.orbit import (
     Orbit,
     Transition,
     in_units_of,

@@ -20,10 +20,11 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis import closed_form_response, exact_branch, exact_response, harmonic_response
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.harmonic_balance import Basis
-from drivetrain_jax.analysis.motion import REGIMES, STABILITY
+from drivetrain_jax.analysis.approximations import closed_form_response, harmonic_response
+from drivetrain_jax.analysis.approximations.harmonic_balance import Basis
+from drivetrain_jax.analysis.impacts import exact_branch, exact_response
+from drivetrain_jax.analysis.impacts.motion import REGIMES, STABILITY
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System
 
 PATH = "omega"

@@ -23,7 +23,7 @@ from jax import Array
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.monodromy import SOLVERS
+from drivetrain_jax.analysis.periodic.monodromy import SOLVERS
 from drivetrain_jax.systems import Flow, System
 
 VARIABLES = (

@@ -20,12 +20,20 @@ from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.growth import SEGMENTS, SETTLED, Record, block_mean, record_growth, running_mean, sampled
-from drivetrain_jax.analysis.paper_estimator import paper_estimator
-from drivetrain_jax.analysis.section_measures import period_multiple
-from drivetrain_jax.analysis.variational import batch_shape, divergence, initial_state
-from drivetrain_jax.analysis.verdict import STANDARD_ERRORS, Evidence, Verdict, grows, judge
-from drivetrain_jax.analysis.zero_one_test import largest_k01
+from drivetrain_jax.analysis.chaos.growth import (
+    SEGMENTS,
+    SETTLED,
+    Record,
+    block_mean,
+    record_growth,
+    running_mean,
+    sampled,
+)
+from drivetrain_jax.analysis.chaos.paper_estimator import paper_estimator
+from drivetrain_jax.analysis.chaos.section_measures import period_multiple
+from drivetrain_jax.analysis.chaos.variational import batch_shape, divergence, initial_state
+from drivetrain_jax.analysis.chaos.verdict import STANDARD_ERRORS, Evidence, Verdict, grows, judge
+from drivetrain_jax.analysis.chaos.zero_one_test import largest_k01
 from drivetrain_jax.systems import Flow, System
 
 VARIABLES = (

@@ -21,10 +21,17 @@ from jax import Array
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.lanes import in_blocks, lane_count, with_path
-from drivetrain_jax.analysis.mode_types import CLUSTER, MODE_TYPES, BlockModes, block_modes, clusters, mode_types
-from drivetrain_jax.analysis.singular_values import EPS, Bidiagonal, bidiagonal_form, bidiagonal_values
-from drivetrain_jax.analysis.tracking import follow
+from drivetrain_jax.analysis.numerics.lanes import in_blocks, lane_count, with_path
+from drivetrain_jax.analysis.numerics.singular_values import EPS, Bidiagonal, bidiagonal_form, bidiagonal_values
+from drivetrain_jax.analysis.spectra.mode_types import (
+    CLUSTER,
+    MODE_TYPES,
+    BlockModes,
+    block_modes,
+    clusters,
+    mode_types,
+)
+from drivetrain_jax.analysis.spectra.tracking import follow
 from drivetrain_jax.systems import FAMILIES, Block, SpringSystem, System
 
 Build = Callable[[Mapping[str, Any]], SpringSystem]

@@ -26,10 +26,10 @@ from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.growth import discarded, sampled
-from drivetrain_jax.analysis.section_measures import period_multiple, torus_residual
-from drivetrain_jax.analysis.variational import Frame, batch_shape, one_kernel, strobe_map
-from drivetrain_jax.analysis.zero_one_test import largest_k01
+from drivetrain_jax.analysis.chaos.growth import discarded, sampled
+from drivetrain_jax.analysis.chaos.section_measures import period_multiple, torus_residual
+from drivetrain_jax.analysis.chaos.variational import Frame, batch_shape, one_kernel, strobe_map
+from drivetrain_jax.analysis.chaos.zero_one_test import largest_k01
 from drivetrain_jax.systems import Flow, System
 
 VARIABLES = (

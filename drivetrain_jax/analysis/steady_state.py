@@ -2,7 +2,7 @@
 
 The motion is exact within rounding (closed form in each linear region), and so are its extremes, multipliers and
 contacts. An orbit found by Newton shooting counts only if the motion has come so near to it that its linearisation
-governs the rest (:mod:`~drivetrain_jax.analysis.attractor`).
+governs the rest (:mod:`~drivetrain_jax.analysis.impacts.attractor`).
 
 Outcome: ``NOT_CONVERGED`` if the motion has neither settled within ``most_periods`` drive periods nor separated from its
 neighbours by a factor of exp(20) over their last three quarters, as only chaos does; ``TOLERANCE_NOT_MET`` if the
@@ -23,10 +23,10 @@ from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.attractor import attractors
-from drivetrain_jax.analysis.exact_response import INTEGRALS, WIDTH, describe
-from drivetrain_jax.analysis.motion import REGIMES
-from drivetrain_jax.analysis.orbit_history import history
+from drivetrain_jax.analysis.impacts.attractor import attractors
+from drivetrain_jax.analysis.impacts.exact_response import INTEGRALS, WIDTH, describe
+from drivetrain_jax.analysis.impacts.motion import REGIMES
+from drivetrain_jax.analysis.impacts.orbit_history import history
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System
 
 SAMPLES = 512

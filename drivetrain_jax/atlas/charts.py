@@ -18,8 +18,8 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.analysis.kernels import compiler_options
-from drivetrain_jax.analysis.multipliers import verdict as verdict_of
+from drivetrain_jax.analysis.numerics.kernels import compiler_options
+from drivetrain_jax.analysis.periodic.multipliers import verdict as verdict_of
 from drivetrain_jax.atlas import conservative, quartic
 from drivetrain_jax.atlas.floquet_quantity import Build
 from drivetrain_jax.atlas.interpolation import nodes

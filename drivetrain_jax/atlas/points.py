@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.kernels import compiler_options, in_one_kernel
+from drivetrain_jax.analysis.numerics.kernels import compiler_options, in_one_kernel
 from drivetrain_jax.atlas import quartic
 from drivetrain_jax.atlas.charts import Results, errors_of, exact_verdict, in_threads, pack, unpack
 from drivetrain_jax.atlas.expansion import Cell, Expansion

@@ -14,8 +14,8 @@ from functools import lru_cache
 import jax
 import numpy as np
 
-from drivetrain_jax.analysis.direct import assemble
-from drivetrain_jax.analysis.propagator import explicit_propagator
+from drivetrain_jax.analysis.periodic.direct import assemble
+from drivetrain_jax.analysis.periodic.propagator import explicit_propagator
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.growth import growth
 from drivetrain_jax.atlas.panels import Atlas

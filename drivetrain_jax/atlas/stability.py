@@ -19,8 +19,8 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.analysis.floquet_results import VARIABLES
-from drivetrain_jax.analysis.kernels import compiler_options
+from drivetrain_jax.analysis.numerics.kernels import compiler_options
+from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES
 from drivetrain_jax.atlas import charts, evaluation, quartic
 from drivetrain_jax.atlas.expansion import Expansion
 from drivetrain_jax.atlas.floquet_quantity import Build, judge

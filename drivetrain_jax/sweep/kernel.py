@@ -16,7 +16,7 @@ from jax import Array
 
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import Solver
-from drivetrain_jax.analysis.kernels import compiler_options
+from drivetrain_jax.analysis.numerics.kernels import compiler_options
 from drivetrain_jax.sweep.assemble import result_variables
 from drivetrain_jax.sweep.grid import Grid
 from drivetrain_jax.sweep.scene import Scene

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from drivetrain_jax.analysis import Request
-from drivetrain_jax.analysis.floquet_propagator import ANALYSIS, PROPAGATOR
+from drivetrain_jax.analysis.periodic.floquet_propagator import ANALYSIS, PROPAGATOR
 from drivetrain_jax.atlas import StabilityAtlas, floquet_rounds, solve_rtol, stability_atlas
 from drivetrain_jax.atlas.construction import MAX_SOLVES
 from drivetrain_jax.sweep.axes import Axis

@@ -12,7 +12,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.analysis.floquet_propagator import PROPAGATOR
+from drivetrain_jax.analysis.periodic.floquet_propagator import PROPAGATOR
 from drivetrain_jax.store import shards
 from drivetrain_jax.sweep.assemble import failures
 from drivetrain_jax.sweep.engine import Engine

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 
-from drivetrain_jax.analysis import closed_form_response, describing_function, multiple_scales
-from drivetrain_jax.analysis.amplitude_roots import follow, refined
+from drivetrain_jax.analysis.approximations import closed_form_response, describing_function, multiple_scales
+from drivetrain_jax.analysis.numerics.amplitude_roots import follow, refined
 from drivetrain_jax.systems.rattle import PRESETS, oscillator
 
 TABLE1 = PRESETS["table1"] | {"omega": 1.0}

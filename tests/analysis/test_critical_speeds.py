@@ -15,11 +15,11 @@ import pytest
 
 from benchmarks.bicardan_reference import complete, finite_elements
 from drivetrain_jax.analysis.critical_speeds import angular_frequencies, separation_margin
-from drivetrain_jax.analysis.shaft_compound import characteristic
-from drivetrain_jax.analysis.shaft_functions import compound, general, sine_cosine
-from drivetrain_jax.analysis.shaft_mechanisms import zero_modes
-from drivetrain_jax.analysis.shaft_roots import find_roots, relative_error
-from drivetrain_jax.analysis.shaft_shapes import mode_shapes
+from drivetrain_jax.analysis.shafts.compound import characteristic
+from drivetrain_jax.analysis.shafts.functions import compound, general, sine_cosine
+from drivetrain_jax.analysis.shafts.mechanisms import zero_modes
+from drivetrain_jax.analysis.shafts.roots import find_roots, relative_error
+from drivetrain_jax.analysis.shafts.shapes import mode_shapes
 from drivetrain_jax.systems import Shaft
 from drivetrain_jax.systems.bicardan import PRESETS, shaft
 

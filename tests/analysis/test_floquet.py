@@ -17,8 +17,8 @@ from scipy.special import mathieu_a, mathieu_b
 import drivetrain_jax as dt
 from benchmarks.cardan_reference import monodromy, spectral_radius, stacked_monodromy
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.analysis.direct import compare
-from drivetrain_jax.analysis.propagator import EXPLICIT_ORDER, explicit_propagator
+from drivetrain_jax.analysis.periodic.direct import compare
+from drivetrain_jax.analysis.periodic.propagator import EXPLICIT_ORDER, explicit_propagator
 from drivetrain_jax.systems import get_system, system_names
 
 RANGES = {"Omega": (0.05, 5), "zeta": (1e-4, 1), "alpha": (0.1, 20), "mu": (0.1, 20), "gamma": (0.1, 1e3)}

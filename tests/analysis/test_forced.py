@@ -11,9 +11,10 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize_scalar, root
 
-from drivetrain_jax.analysis import Outcome, Request, get_analysis, orbit
-from drivetrain_jax.analysis.amplitude import amplitudes
-from drivetrain_jax.analysis.orbit import integrate, shoot
+from drivetrain_jax.analysis import Outcome, Request, get_analysis
+from drivetrain_jax.analysis.periodic import orbit
+from drivetrain_jax.analysis.periodic.amplitude import amplitudes
+from drivetrain_jax.analysis.periodic.orbit import integrate, shoot
 from drivetrain_jax.systems import get_system
 
 ANALYSIS, SYSTEM = get_analysis("forced"), get_system("cardan")

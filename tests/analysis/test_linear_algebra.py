@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from drivetrain_jax.analysis.linear_algebra import eigenvalues, hessenberg, matmul, solve, spectral_norm
+from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, hessenberg, matmul, solve, spectral_norm
 
 EPS = np.finfo(float).eps
 SIZES = (1, 2, 3, 4, 5, 6)

@@ -16,8 +16,8 @@ import pytest
 import drivetrain_jax as dt
 from benchmarks import tripod_reference as oracle
 from drivetrain_jax.analysis import Request
+from drivetrain_jax.analysis.chaos.verdict import Verdict
 from drivetrain_jax.analysis.lyapunov import analyse
-from drivetrain_jax.analysis.verdict import Verdict
 from drivetrain_jax.systems import Flow
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "tripod.json").read_text())

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.planetary_reference import TABLE_2, exact_frequencies
-from drivetrain_jax.analysis.mode_gradients import directional_derivatives, natural_frequencies
+from drivetrain_jax.analysis.spectra.mode_gradients import directional_derivatives, natural_frequencies
 from drivetrain_jax.systems import planetary
 
 ANGLES = (0.1, 1.5, 3.0, 4.9)

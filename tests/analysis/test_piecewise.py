@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.rattle_reference import extended, random_case
-from drivetrain_jax.analysis.piecewise_flow import piece, responses, sine_cosine
-from drivetrain_jax.analysis.piecewise_march import march, prepare, start, usual_steps
+from drivetrain_jax.analysis.impacts.piecewise_flow import piece, responses, sine_cosine
+from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start, usual_steps
 from drivetrain_jax.systems.rattle import PRESETS, oscillator
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "rattle.json").read_text())

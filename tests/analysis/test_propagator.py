@@ -11,10 +11,10 @@ import pytest
 from scipy.integrate import DOP853
 from scipy.linalg import expm
 
-from drivetrain_jax.analysis.direct import assemble, direct_monodromy, stiffness_of
-from drivetrain_jax.analysis.linear_algebra import eigenvalues
-from drivetrain_jax.analysis.multipliers import spectral_radius_bound
-from drivetrain_jax.analysis.propagator import (
+from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
+from drivetrain_jax.analysis.periodic.direct import assemble, direct_monodromy, stiffness_of
+from drivetrain_jax.analysis.periodic.multipliers import spectral_radius_bound
+from drivetrain_jax.analysis.periodic.propagator import (
     EXPLICIT_ORDER,
     IMPLICIT_ORDER,
     Propagator,

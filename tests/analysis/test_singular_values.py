@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivetrain_jax.analysis.lanes import in_blocks
-from drivetrain_jax.analysis.singular_values import EPS, bidiagonal_form, bidiagonal_values, singular_values
-from drivetrain_jax.analysis.singular_vectors import jacobi_vectors, product
-from drivetrain_jax.analysis.tracking import follow
+from drivetrain_jax.analysis.numerics.lanes import in_blocks
+from drivetrain_jax.analysis.numerics.singular_values import EPS, bidiagonal_form, bidiagonal_values, singular_values
+from drivetrain_jax.analysis.numerics.singular_vectors import jacobi_vectors, product
+from drivetrain_jax.analysis.spectra.tracking import follow
 
 ROWS, COLUMNS = 12, 9
 

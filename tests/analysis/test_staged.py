@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drivetrain_jax.analysis.kernels import _operations
-from drivetrain_jax.analysis.staged import staged
+from drivetrain_jax.analysis.numerics.kernels import _operations
+from drivetrain_jax.analysis.numerics.staged import staged
 
 LANES = 5
 TIMES = jnp.linspace(0.0, 1.0, 3)[:, None]

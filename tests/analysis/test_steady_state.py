@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from drivetrain_jax.analysis import Outcome, Request, get_analysis
-from drivetrain_jax.analysis.exact_response import sweeps
-from drivetrain_jax.analysis.piecewise_march import march, prepare, start
+from drivetrain_jax.analysis.impacts.exact_response import sweeps
+from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
 from drivetrain_jax.systems import get_system
 from drivetrain_jax.systems.rattle import PRESETS, oscillator
 

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from drivetrain_jax.analysis import Request
-from drivetrain_jax.analysis.floquet_propagator import ANALYSIS
+from drivetrain_jax.analysis.periodic.floquet_propagator import ANALYSIS
 from drivetrain_jax.atlas import StabilityAtlas, floquet_rounds, run, solve_rtol, stability_atlas
 from drivetrain_jax.systems import get_system
 

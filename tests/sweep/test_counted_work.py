@@ -17,8 +17,10 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
-from drivetrain_jax.analysis import history, shaft_roots, singular_values
-from drivetrain_jax.analysis.piecewise_march import march, prepare, start
+from drivetrain_jax.analysis import history
+from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
+from drivetrain_jax.analysis.numerics import singular_values
+from drivetrain_jax.analysis.shafts import roots as shaft_roots
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.scene import load_scene
 from drivetrain_jax.systems.rattle import PRESETS, oscillator

@@ -101,9 +101,9 @@ def test_only_code_that_the_scene_runs_decides():
         "systems/_base.py",
         "_quantities.py",
         "analysis/_base.py",
-        "analysis/linear_algebra.py",
+        "analysis/numerics/linear_algebra.py",
     }
     assert common <= of_floquet & of_forced
-    assert {"analysis/propagator.py", "analysis/monodromy.py"} <= of_floquet - of_forced
-    assert {"analysis/orbit.py", "analysis/amplitude.py"} <= of_forced - of_floquet
+    assert {"analysis/periodic/propagator.py", "analysis/periodic/monodromy.py"} <= of_floquet - of_forced
+    assert {"analysis/periodic/orbit.py", "analysis/periodic/amplitude.py"} <= of_forced - of_floquet
     assert "systems/rattle.py" not in of_floquet | of_forced

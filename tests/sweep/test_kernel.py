@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from drivetrain_jax.analysis import kernels
+from drivetrain_jax.analysis.numerics import kernels
 from drivetrain_jax.sweep import kernel
 
 

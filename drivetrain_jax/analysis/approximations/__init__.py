@@ -1,0 +1,1 @@
+"""Approximate responses of oscillators: harmonic balance, describing function, multiple scales."""

@@ -1,0 +1,259 @@
+"""Bias and fundamental of the oscillator with play, ``u = m + A cos(omega t - phi)``, by its describing function.
+
+With ``p = (b - m)/A``, ``q = (b + m)/A`` and the moments h0, h1 of a clipped cosine (:func:`moments`), balance of mean
+and fundamental gives, in units of ``k' = k/I`` and ``c' = c/I``,
+
+    alpha m + (1 - alpha) A [h0(p) - h0(q)] = B0/k'                         the bias m(A), monotone in m
+    kappa(A) = k' [alpha + (1 - alpha) (h1(p) + h1(q))]                     the equivalent stiffness
+    [(kappa - omega^2)^2 + (c' omega)^2] A^2 = B1^2                         the response
+
+For a given A the response is quadratic in omega^2: two arms ``omega^2 = kappa - c'^2/2 -+ sqrt(B1^2/A^2 - c'^2 kappa +
+c'^4/4)`` that meet at the peak, on either side of the backbone ``omega^2 = kappa``. Folds are their turning points.
+The approximation is the harmonic balance with one harmonic, integrals exact. All functions broadcast over a trailing
+batch; ``A`` may have more leading axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax.analysis.numerics.amplitude_roots import bisect, sign_changes, take
+from drivetrain_jax.systems import PiecewiseLinearOscillator
+
+# Amplitudes at which the arms are sampled to find their folds: logarithmic, in units of half the play.
+_NODES, _DECADES = 320, (-2.5, 3.5)
+_FOLDS_PER_ARM = 4
+MOST_ROOTS = 5
+_BIAS_STEPS, _POLISH_STEPS = 24, 5
+_TINY, _HUGE = 1e-300, 1e9
+_ENDS = (slice(None, -1), slice(1, None))
+
+
+class Point(NamedTuple):
+    """Bias ``m``, equivalent stiffness ``kappa`` and its derivative with respect to the amplitude."""
+
+    bias: Array
+    stiffness: Array
+    slope: Array
+
+
+def moments(x: Array) -> tuple[Array, Array]:
+    """Mean h0 and half the fundamental h1 of the part of a cosine above ``x``.
+
+    ``h0 = (sqrt(1 - x^2) - x acos x)/pi`` (``-x`` for x <= -1, 0 for x >= 1), ``h1 = (acos x - x sqrt(1 - x^2))/pi``.
+    """
+    inside = jnp.clip(x, -1.0, 1.0)
+    root, angle = jnp.sqrt(1 - inside**2), jnp.arccos(inside)
+    return (root - inside * angle) / jnp.pi + jnp.maximum(-1 - x, 0.0), (angle - inside * root) / jnp.pi
+
+
+def _imbalance(model: PiecewiseLinearOscillator, amplitude: Array, bias: Array) -> tuple[Array, Array]:
+    """Mean force less mean drive over k', and its derivative with respect to the bias (not negative)."""
+    p, q = (model.b - bias) / amplitude, (model.b + bias) / amplitude
+    beyond, before = moments(p)[0], moments(q)[0]
+    force = model.alpha * bias + (1 - model.alpha) * amplitude * (beyond - before)
+    share = (jnp.arccos(jnp.clip(p, -1.0, 1.0)) + jnp.arccos(jnp.clip(q, -1.0, 1.0))) / jnp.pi
+    return force - model.B0 / model.stiffness, model.alpha + (1 - model.alpha) * share
+
+
+def _improved(model: PiecewiseLinearOscillator, amplitude: Array, bias: Array) -> Array:
+    """One Newton step of the bias; where the mean force does not depend on it (free within the play) it stays."""
+    value, slope = _imbalance(model, amplitude, bias)
+    return bias - jnp.where(slope > 0, value / jnp.where(slope > 0, slope, 1.0), 0.0)
+
+
+def bias_of(model: PiecewiseLinearOscillator, amplitude: Array) -> Array:
+    """The bias at which the mean force balances the mean drive: bisection and Newton steps in turn."""
+    static, reach = model.B0 / model.stiffness, jnp.abs(1 - model.alpha) * model.b
+    reach = reach + jnp.zeros_like(amplitude)
+
+    def step(_: int, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        low, high, guess = state
+        for trial in (guess, (low + high) / 2):
+            value = _imbalance(model, amplitude, trial)[0]
+            low = jnp.where((value <= 0) & (trial > low), trial, low)
+            high = jnp.where((value >= 0) & (trial < high), trial, high)
+        return low, high, jnp.clip(_improved(model, amplitude, (low + high) / 2), low, high)
+
+    low, high, guess = jax.lax.fori_loop(0, _BIAS_STEPS, step, (static - reach, static + reach, static + 0 * reach))
+    return jnp.clip(_improved(model, amplitude, guess), low, high)
+
+
+def point_at(model: PiecewiseLinearOscillator, amplitude: Array, bias: Array) -> Point:
+    """Equivalent stiffness at a balanced ``bias``, and its total derivative along the bias curve m(A)."""
+    p, q = (model.b - bias) / amplitude, (model.b + bias) / amplitude
+    inside = tuple(jnp.clip(x, -1.0, 1.0) for x in (p, q))
+    root_p, root_q = (jnp.sqrt(1 - x**2) for x in inside)
+    soft = 1 - model.alpha
+    stiffness = model.stiffness * (model.alpha + soft * (moments(p)[1] + moments(q)[1]))
+    support = _imbalance(model, amplitude, bias)[1]
+    drift = soft * (root_q - root_p) / jnp.pi / jnp.where(support > 0, support, 1.0)
+    turn = root_p * (drift + p) + root_q * (q - drift)
+    slope = model.stiffness * soft * 2 / jnp.pi * turn / amplitude
+    return Point(bias, stiffness, slope)
+
+
+def _discriminant(model: PiecewiseLinearOscillator, amplitude: Array, stiffness: Array) -> Array:
+    return (model.B1 / amplitude) ** 2 - model.damping**2 * stiffness + model.damping**4 / 4
+
+
+def arm_slope(model: PiecewiseLinearOscillator, amplitude: Array, point: Point, sign: float) -> Array:
+    """``d(omega^2)/dA`` along an arm, times the root in its equation: zero at a fold."""
+    root = jnp.sqrt(jnp.maximum(_discriminant(model, amplitude, point.stiffness), 0.0))
+    half = -((model.B1 / amplitude) ** 2) / amplitude - model.damping**2 * point.slope / 2
+    return point.slope * root + sign * half
+
+
+def arm(model: PiecewiseLinearOscillator, amplitude: Array, point: Point, sign: float) -> Array:
+    """Frequency on an arm; NaN where it does not exist."""
+    square = point.stiffness - model.damping**2 / 2 + sign * jnp.sqrt(_discriminant(model, amplitude, point.stiffness))
+    return jnp.sqrt(square)
+
+
+def peak(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Array:
+    """Largest amplitude, where the arms meet: ``(c'^2 kappa - c'^4/4) A^2 = B1^2``; a huge one if they do not."""
+    unit = jnp.abs(model.B1) + model.b
+
+    def beyond(log_amplitude: Array) -> Array:
+        amplitude = unit * jnp.exp(log_amplitude)
+        point = point_at(model, amplitude, bias_of(model, amplitude))
+        return -_discriminant(model, amplitude, point.stiffness)
+
+    # The unit only centres the bracket.
+    span = jnp.full(shape, 60.0)
+    return unit * jnp.exp(bisect(beyond, -span, span))
+
+
+class Skeleton(NamedTuple):
+    """All that does not depend on the frequency: rising ``amplitudes`` (K, ...) with the ``points`` there, such that
+    either arm is monotone between neighbours; ``peak`` and ``folds`` (8, ...), amplitudes, NaN where there are fewer."""
+
+    amplitudes: Array
+    points: Point
+    peak: Array
+    folds: Array
+
+
+def skeleton(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Skeleton:
+    """The arms of a batch of ``shape``, with their folds."""
+    column = (_NODES, *(1,) * len(shape))
+    unit = jnp.where(model.b > 0, model.b, 1.0)
+    nodes = unit * jnp.logspace(*_DECADES, _NODES).reshape(column) + jnp.zeros(shape)
+    top = peak(model, shape)
+    # The peak takes the place of the first node above it; nothing above it matters.
+    above = nodes >= top
+    first = above & (jnp.cumsum(above, axis=0) == 1)
+    nodes = jnp.where(first, top, nodes)
+    points = point_at(model, nodes, bias_of(model, nodes))
+    folds = []
+    for sign in (-1.0, 1.0):
+        slope = arm_slope(model, nodes, points, sign)
+        # At the peak the root vanishes: the sign of the other term, also in rounding.
+        slope = jnp.where(nodes >= top, -sign, slope)
+        mask = sign_changes(slope > 0, _FOLDS_PER_ARM) & (nodes[:-1] < top)
+        low, high, start = take(mask, nodes[:-1]), take(mask, nodes[1:]), take(mask, slope[:-1])
+        turned = jnp.where(start > 0, -1.0, 1.0)
+
+        def uphill(amplitude: Array, sign: float = sign, turned: Array = turned) -> Array:
+            point = point_at(model, amplitude, bias_of(model, amplitude))
+            return turned * arm_slope(model, amplitude, point, sign)
+
+        folds.append(bisect(uphill, low, high, 45))
+    found = jnp.concatenate(folds)
+    amplitudes = jnp.concatenate([jnp.zeros((1, *shape)), nodes, jnp.where(jnp.isnan(found), _HUGE * unit, found)])
+    amplitudes = jnp.sort(jnp.concatenate([amplitudes, jnp.full((1, *shape), _HUGE) * jnp.maximum(top, unit)]), axis=0)
+    safe = jnp.maximum(amplitudes, _TINY)
+    return Skeleton(amplitudes, point_at(model, safe, bias_of(model, safe)), top, found)
+
+
+def peak_of(model: PiecewiseLinearOscillator, bones: Skeleton) -> tuple[Array, Array]:
+    """Largest amplitude and the frequency ``sqrt(kappa - c'^2/2)`` where it is reached; infinite without damping."""
+    exists = bones.peak < _HUGE * jnp.maximum(model.b, 1.0)
+    point = point_at(model, bones.peak, bias_of(model, bones.peak))
+    frequency = jnp.sqrt(point.stiffness - model.damping**2 / 2)
+    return jnp.where(exists, bones.peak, jnp.inf), frequency
+
+
+def fold_frequencies(model: PiecewiseLinearOscillator, bones: Skeleton) -> Array:
+    """Frequencies of the folds, ``(2 n, ...)``: those of the lower arm, then those of the upper one."""
+    half = bones.folds.shape[0] // 2
+    point = point_at(model, bones.folds, bias_of(model, bones.folds))
+    sides = [arm(model, bones.folds, point, sign) for sign in (-1.0, 1.0)]
+    return jnp.concatenate([sides[0][:half], sides[1][half:]])
+
+
+def backbone(bones: Skeleton, omega: Array) -> Array:
+    """Largest amplitude of the undamped, undriven motion of this frequency, ``kappa(A) = omega^2``; NaN if none."""
+    above = bones.points.stiffness > omega**2
+    mask = sign_changes(above[::-1], 1)[:, ::-1]
+    low, high, stiffness = _interpolated(bones, mask)
+    rising = jnp.where(take(mask, above[1:], 1.0) > 0, 1.0, -1.0)
+    return bisect(lambda a: rising * (stiffness(a) - omega**2), low, high, 45)[0]
+
+
+def response_residual(model: PiecewiseLinearOscillator, omega: Array, amplitude: Array, stiffness: Array) -> Array:
+    """``[(kappa - omega^2)^2 + (c' omega)^2] A^2 - B1^2``."""
+    return ((stiffness - omega**2) ** 2 + (model.damping * omega) ** 2) * amplitude**2 - model.B1**2
+
+
+def _interpolated(bones: Skeleton, mask: Array) -> tuple[Array, Array, Callable[[Array], Array]]:
+    """Bracket that ``mask`` marks, and the equivalent stiffness within it as a cubic through values and slopes."""
+    low, high = take(mask, bones.amplitudes[:-1]), take(mask, bones.amplitudes[1:])
+    ends = [take(mask, part[s]) for part in (bones.points.stiffness, bones.points.slope) for s in _ENDS]
+    k0, k1, d0, d1 = ends
+    width = high - low
+
+    def stiffness(amplitude: Array) -> Array:
+        s = (amplitude - low) / width
+        bend = (1 - s) * (d0 * width - (k1 - k0)) + s * ((k1 - k0) - d1 * width)
+        return k0 + s * (k1 - k0) + s * (1 - s) * bend
+
+    return low, high, stiffness
+
+
+def roots(model: PiecewiseLinearOscillator, bones: Skeleton, omega: Array) -> tuple[Array, Point]:
+    """All amplitudes at one frequency, rising, ``(MOST_ROOTS, ...)``, infinite where there are fewer; and the points."""
+    value = response_residual(model, omega, bones.amplitudes, bones.points.stiffness)
+    # Rest is below every root, also of an oscillator that is not driven.
+    positive = (value > 0) & (bones.amplitudes > 0)
+    mask = sign_changes(positive, MOST_ROOTS)
+    low, high, stiffness = _interpolated(bones, mask)
+    turned = jnp.where(take(mask, positive[1:], 1.0) > 0, 1.0, -1.0)
+    found = bisect(lambda a: turned * response_residual(model, omega, a, stiffness(a)), low, high, 45)
+    found = jnp.maximum(found, _TINY)
+    bias = take(mask, bones.points.bias[:-1])
+    for _ in range(3):
+        bias = _improved(model, found, bias)
+
+    def polish(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        amplitude, bias = state
+        bias = _improved(model, amplitude, bias)
+        point = point_at(model, amplitude, bias)
+        value = response_residual(model, omega, amplitude, point.stiffness)
+        gap = point.stiffness - omega**2
+        slope = 2 * amplitude * (gap**2 + (model.damping * omega) ** 2 + amplitude * gap * point.slope)
+        change = jnp.where(slope != 0, value / jnp.where(slope != 0, slope, 1.0), 0.0)
+        return jnp.clip(amplitude - change, jnp.maximum(low, _TINY), high), bias
+
+    found, bias = jax.lax.fori_loop(0, _POLISH_STEPS, polish, (found, bias))
+    point = point_at(model, found, _improved(model, found, bias))
+    exists = jnp.any(mask, axis=1) & (found < _HUGE * jnp.maximum(model.b, 1.0))
+    amplitude = jnp.where(model.B1 == 0, 0.0 * found, found)
+    return jnp.where(exists, amplitude, jnp.inf), point
+
+
+def decay_rate(model: PiecewiseLinearOscillator, omega: Array, amplitude: Array, point: Point) -> Array:
+    """Largest real part of the eigenvalues ``-c'/2 -+ sqrt(-D (D + A D'))``, D = (omega^2 - kappa)/(2 omega)."""
+    detuning = (omega**2 - point.stiffness) / (2 * omega)
+    product = detuning * (detuning - amplitude * point.slope / (2 * omega))
+    return -model.damping / 2 + jnp.sqrt(jnp.maximum(-product, 0.0))
+
+
+def phase_lag(model: PiecewiseLinearOscillator, omega: Array, point: Point) -> Array:
+    """``phi``: tan(phi) = c' omega/(kappa - omega^2)."""
+    return jnp.arctan2(model.damping * omega * jnp.ones_like(point.stiffness), point.stiffness - omega**2)

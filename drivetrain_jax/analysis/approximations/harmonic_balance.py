@@ -1,0 +1,291 @@
+"""Harmonic balance of the oscillator with play by alternating frequency and time, for batches of oscillators.
+
+``u = x0 + sum_j (x_{2j-1} cos j tau + x_{2j} sin j tau)``, j = 1..J, tau = omega t/m, for harmonics of the drive up to
+J/m and subharmonics of order m. The spring force is evaluated at samples of u and projected on the same functions.
+Plain sampling of a force with kinks is accurate to second order in the sample distance only. Here every flank that is
+crossed between two samples is located on the cubic through their values and rates, and the force is integrated up to it
+with the weights of cubic interpolation (:func:`contact_weights`): third order better, and the Jacobian, which is the
+projection of the contact itself, comes from the same weights. Coefficients have shape ``(n, ...)``, n = 2 J + 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis.numerics.linear_algebra import solve
+from drivetrain_jax.systems import PiecewiseLinearOscillator
+
+_CROSSING_STEPS = 4
+# Integrals over [0, 1] of the cubic interpolation polynomials of the samples -1, 0, 1, 2.
+_WHOLE = (-1 / 24, 13 / 24, 13 / 24, -1 / 24)
+
+
+@dataclass(frozen=True)
+class Basis:
+    """``harmonics`` of the drive with subharmonics of order ``order``, evaluated at ``samples`` points of the period
+    of the subharmonic."""
+
+    harmonics: int
+    order: int = 1
+    samples: int = 0
+
+    @property
+    def highest(self) -> int:
+        """J, the harmonics of the base frequency."""
+        return self.harmonics * self.order
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return 2 * self.highest + 1
+
+    @cached_property
+    def count(self) -> int:
+        """Samples of the base period; those asked for are per period of the drive."""
+        if self.samples:
+            return self.samples * self.order
+        # Fewer, and a contact between two samples that comes and goes interrupts the branch.
+        return self.order * max(64, 1 << (20 * self.harmonics - 1).bit_length())
+
+    @cached_property
+    def orders(self) -> np.ndarray:
+        """The harmonic of each coefficient, shape (n,)."""
+        return (np.arange(self.size) + 1) // 2
+
+    @cached_property
+    def values(self) -> np.ndarray:
+        """The functions at the samples, (M, n)."""
+        return self.at(2 * np.pi * np.arange(self.count) / self.count)
+
+    @cached_property
+    def rates(self) -> np.ndarray:
+        """Their derivatives with respect to tau, (M, n)."""
+        return self.values @ self.derivative
+
+    @cached_property
+    def derivative(self) -> np.ndarray:
+        """The derivative with respect to tau of coefficients, (n, n)."""
+        matrix = np.zeros((self.size, self.size))
+        for j in range(1, self.highest + 1):
+            matrix[2 * j - 1, 2 * j], matrix[2 * j, 2 * j - 1] = j, -j
+        return matrix
+
+    @cached_property
+    def projection(self) -> np.ndarray:
+        """From samples to coefficients, (n, M)."""
+        return self.values.T * np.where(self.orders == 0, 1.0, 2.0)[:, None] / self.count
+
+    @cached_property
+    def products(self) -> tuple[np.ndarray, ...]:
+        """How moments of the contact make up the Jacobian: entry = a p[i] + b p[k], each of shape (n, n)."""
+        j, k = np.meshgrid(self.orders, self.orders, indexing="ij")
+        sine = (np.arange(self.size) % 2 == 0) & (self.orders > 0)
+        row, column = np.meshgrid(sine, sine, indexing="ij")
+        shift = 2 * self.highest + 1
+        mixed = np.where(row != column, shift, 0)
+        difference, total = np.abs(j - k) + mixed, j + k + mixed
+        a = np.where(row == column, 1.0, np.where(row, np.sign(j - k), np.sign(k - j)))
+        b = np.where(row & column, -1.0, 1.0)
+        half = np.where(j == 0, 0.5, 1.0)
+        return difference, total, half * a, half * b
+
+    @cached_property
+    def moments(self) -> np.ndarray:
+        """Means against cos 0..2J and sin 0..2J, (4J + 2, M)."""
+        angle = np.outer(np.arange(2 * self.highest + 1), 2 * np.pi * np.arange(self.count) / self.count)
+        return np.concatenate([np.cos(angle), np.sin(angle)]) / self.count
+
+    def at(self, tau: np.ndarray) -> np.ndarray:
+        """The functions at ``tau`` (M,), shape (M, n)."""
+        angle = np.outer(tau, self.orders)
+        even = np.arange(self.size) % 2 == 0
+        return np.where(even & (self.orders > 0), np.sin(angle), np.cos(angle))
+
+
+class Contact(NamedTuple):
+    """Samples ``u`` of a motion (M, ...), where the flanks ``b`` and ``-b`` are crossed within the interval after each
+    sample (fraction, meaningful where the sign changes), and the weights of either contact."""
+
+    u: Array
+    crossings: tuple[Array, Array]
+    weights: tuple[Array, Array]
+
+
+def _part(theta: Array) -> tuple[Array, ...]:
+    """Integrals over ``[0, theta]`` of the cubic interpolation polynomials of the samples -1, 0, 1, 2."""
+    t2, t3, t4 = theta**2 / 2, theta**3 / 3, theta**4 / 4
+    return (
+        (-t4 + 3 * t3 - 2 * t2) / 6,
+        (t4 - 2 * t3 - t2 + 2 * theta) / 2,
+        (-t4 + t3 + 2 * t2) / 2,
+        (t4 - t2) / 6,
+    )
+
+
+def _crossing(d0: Array, d1: Array, rate0: Array, rate1: Array) -> Array:
+    """Where the cubic with these end values and rates vanishes in [0, 1], by Newton steps from the chord."""
+    change = d1 - d0
+    theta = jnp.clip(d0 / jnp.where(change != 0, -change, 1.0), 0.0, 1.0)
+    a, b = rate0 - change, change - rate1
+
+    def newton(_: int, theta: Array) -> Array:
+        bend = a * (1 - theta) + b * theta
+        value = d0 + change * theta + theta * (1 - theta) * bend
+        slope = change + (1 - 2 * theta) * bend + theta * (1 - theta) * (b - a)
+        return jnp.clip(theta - value / jnp.where(slope != 0, slope, 1.0), 0.0, 1.0)
+
+    # The result of a loop is stored; XLA would compute an expression again for each of the four weights.
+    return jax.lax.fori_loop(0, _CROSSING_STEPS, newton, theta)
+
+
+def contact_weights(distance: Array, rate: Array) -> tuple[Array, Array]:
+    """Weights w, ``mean(w g)`` = mean of g over the part of the period where ``distance > 0``, and the crossings.
+
+    ``distance`` and its ``rate`` per sample are given at the samples (M, ...) of a period.
+    """
+    after, rate_after = jnp.roll(distance, -1, axis=0), jnp.roll(rate, -1, axis=0)
+    theta = _crossing(distance, after, rate, rate_after)
+    starts, ends = distance > 0, after > 0
+    weights = jnp.zeros_like(distance)
+    for offset, whole, part in zip((-1, 0, 1, 2), _WHOLE, _part(theta), strict=True):
+        inside = jnp.where(starts, jnp.where(ends, whole, part), jnp.where(ends, whole - part, 0.0))
+        weights = weights + jnp.roll(inside, offset, axis=0)
+    return weights, theta
+
+
+def contact(model: PiecewiseLinearOscillator, basis: Basis, x: Array) -> Contact:
+    """The motion with coefficients ``x`` at the samples."""
+    u = jnp.tensordot(basis.values, x, 1)
+    rate = jnp.tensordot(basis.rates, x, 1) * (2 * np.pi / basis.count)
+    distances = jnp.stack([u - model.b, -u - model.b], axis=1)
+    weights, crossings = contact_weights(distances, jnp.stack([rate, -rate], axis=1))
+    return Contact(u, (crossings[:, 0], crossings[:, 1]), (weights[:, 0], weights[:, 1]))
+
+
+def linear_part(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array) -> tuple[Array, Array]:
+    """Inertia and damping forces of ``x``, and their derivative with respect to ``omega``."""
+    base = omega / basis.order
+    squares = (basis.orders**2).reshape(-1, *(1,) * (x.ndim - 1))
+    turned = jnp.tensordot(basis.derivative, x, 1)
+    force = model.damping * base * turned - base**2 * squares * x
+    return force, (model.damping * turned - 2 * base * squares * x) / basis.order
+
+
+def residual(
+    model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array, touch: Contact
+) -> tuple[Array, Array]:
+    """Unbalanced coefficients ``(n, ...)`` and their derivative with respect to ``omega``."""
+    above, below = touch.weights
+    beyond = above * (touch.u - model.b) + below * (touch.u + model.b)
+    spring = model.alpha * x + (1 - model.alpha) * jnp.tensordot(basis.projection, beyond, 1)
+    force, by_omega = linear_part(model, basis, x, omega)
+    force = (force + model.stiffness * spring).at[0].add(-model.B0).at[2 * basis.order - 1].add(-model.B1)
+    return force, by_omega
+
+
+def jacobian(model: PiecewiseLinearOscillator, basis: Basis, omega: Array, touch: Contact) -> Array:
+    """Derivative of the residual with respect to the coefficients, ``(n, n, ...)``."""
+    moments = jnp.tensordot(basis.moments, touch.weights[0] + touch.weights[1], 1)
+    tail = (1,) * (moments.ndim - 1)
+    difference, total, a, b = basis.products
+    shape = (basis.size, basis.size, *tail)
+    stiffness = a.reshape(shape) * moments[difference] + b.reshape(shape) * moments[total]
+    eye = np.eye(basis.size).reshape(shape)
+    base = omega / basis.order
+    squares = np.diag(basis.orders**2.0).reshape(shape)
+    linear = model.damping * base * basis.derivative.reshape(shape) - base**2 * squares
+    return linear + model.stiffness * (model.alpha * eye + (1 - model.alpha) * stiffness)
+
+
+class Balanced(NamedTuple):
+    """Coefficients, the last Newton step over their size, and whether it is negligible."""
+
+    x: Array
+    step: Array
+    converged: Array
+
+
+# Relative step that is negligible, and the least part of a Newton step that is tried.
+_TOLERANCE, _LEAST_PART = 1e-11, 1 / 16
+
+
+class _Iteration(NamedTuple):
+    """Best coefficients so far, the Newton step from there, its part that is tried, and the residual there."""
+
+    count: Array
+    best: Array
+    change: Array
+    part: Array
+    unbalanced: Array
+    step: Array
+
+
+def balance(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array, iterations: int = 20) -> Balanced:
+    """Newton iterations from ``x`` at fixed ``omega`` until every lane has converged, at most ``iterations``.
+
+    A step that increases the residual is halved: the Jacobian of a force with kinks may change at once.
+    """
+
+    def norm(v: Array) -> Array:
+        return jnp.sqrt(jnp.sum(v**2, axis=0))
+
+    def improve(state: _Iteration) -> _Iteration:
+        trial = state.best - state.part * state.change
+        touch = contact(model, basis, trial)
+        force, _ = residual(model, basis, trial, omega, touch)
+        unbalanced = norm(force)
+        change = solve(jacobian(model, basis, omega, touch), force[:, None])[:, 0]
+        usable = jnp.all(jnp.isfinite(change), axis=0)
+        # A step so small that the residual is rounding need not decrease it.
+        better = (unbalanced < state.unbalanced) | (state.part <= _LEAST_PART) | (state.step <= 1e-7)
+        size = norm(trial) + norm(change)
+        step = norm(change) / jnp.where(size > 0, size, 1.0)
+        # A lane that has converged, or that is lost, stands still.
+        going, taken = ~(state.step <= _TOLERANCE), better & usable
+        moved = going & taken
+        return _Iteration(
+            state.count + 1,
+            jnp.where(moved, jnp.where(step <= _TOLERANCE, trial - change, trial), state.best),
+            jnp.where(moved, change, state.change),
+            jnp.where(taken, 1.0, state.part / 2),
+            jnp.where(moved, unbalanced, state.unbalanced),
+            jnp.where(moved, step, state.step),
+        )
+
+    def unfinished(state: _Iteration) -> Array:
+        return (state.count < iterations) & jnp.any(~(state.step <= _TOLERANCE))
+
+    infinite = jnp.full(x.shape[1:], jnp.inf)
+    start = _Iteration(jnp.int32(0), x, jnp.zeros_like(x), jnp.ones(x.shape[1:]), infinite, infinite)
+    end = jax.lax.while_loop(unfinished, improve, start)
+    return Balanced(end.best, end.step, end.step <= _TOLERANCE)
+
+
+_DRIFT_STEPS = 40
+
+
+def drift(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array) -> Array:
+    """Coefficients after the slow motion of the balance itself from ``x``: it goes to a balance that is stable.
+
+    Coefficients that vary slowly obey ``(2 omega/m D + c') x' = -residual``, D the derivative with respect to tau;
+    implicit Euler steps of half a drive period. Few harmonics may have their balance elsewhere than where the motion
+    itself settles, too far for Newton iterations.
+    """
+    tail = (1,) * (x.ndim - 1)
+    turn = jnp.asarray(basis.derivative).reshape(basis.size, basis.size, *tail)
+    eye = jnp.eye(basis.size).reshape(turn.shape)
+    inertia = (2 * omega / basis.order * turn + model.damping * eye) * omega / np.pi
+
+    def advance(_: int, x: Array) -> Array:
+        touch = contact(model, basis, x)
+        force, _ = residual(model, basis, x, omega, touch)
+        return x - solve(jacobian(model, basis, omega, touch) + inertia, force[:, None])[:, 0]
+
+    return jax.lax.fori_loop(0, _DRIFT_STEPS, advance, x)

@@ -1,0 +1,1 @@
+"""Growth of perturbations, exponents, sections and the kind of motion they tell."""

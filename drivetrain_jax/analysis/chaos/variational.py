@@ -1,0 +1,159 @@
+"""Trajectories of a flow and of vectors tangent to them, by equal steps of the explicit scheme of order 8 (DOP853).
+
+A state is a tuple of components, each of the shape of the batch. What a stage computes is stored before the next one
+begins (see :mod:`~drivetrain_jax.analysis.numerics.kernels`); batches of 32 to 64 members keep that in the innermost
+caches. Time enters through :meth:`Flow.angles` of a counted strobe, so that nothing drifts however long the march is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from scipy.integrate import DOP853
+
+from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, stored, suits_one_kernel
+from drivetrain_jax.systems import Flow
+
+Vector = tuple[Array, ...]
+
+
+class Frame(NamedTuple):
+    """A point of a trajectory, tangent vectors there, and the integral of the divergence since some time.
+
+    ``tangents``: components of the m vectors, each ``(m, ...)``; () if there are none.
+    """
+
+    state: Vector
+    tangents: Vector = ()
+    contraction: Array | None = None
+
+
+def batch_shape(flow: Flow) -> tuple[int, ...]:
+    """Shape of the batch that the parameters of ``flow`` span."""
+    rates = jax.eval_shape(lambda: [jnp.asarray(r) for r in flow.field(flow.angles(0, 0.0), flow.start)])
+    shapes = [jnp.shape(x) for x in (*flow.start, flow.period, *flow.turns)]
+    return jnp.broadcast_shapes(*(r.shape for r in rates), *shapes)
+
+
+def initial_state(flow: Flow) -> Vector:
+    """``flow.start`` as arrays of the shape of the batch."""
+    shape = batch_shape(flow)
+    return tuple(jnp.broadcast_to(jnp.asarray(x, float), shape) for x in flow.start)
+
+
+def initial_frame(flow: Flow) -> Frame:
+    """The initial state and unit vectors along every component that is not a phase.
+
+    Displacements that leave the phases alone stay so: their exponents are those of the flow without the zeros that the
+    phases supply.
+    """
+    state = initial_state(flow)
+    moving = jnp.array([i for i in range(flow.size) if i not in flow.phases])
+    units = (moving[:, None] == jnp.arange(flow.size)).astype(float).T
+    shape = (len(moving), *state[0].shape)
+    tangents = (jnp.broadcast_to(u.reshape(-1, *(1,) * state[0].ndim), shape) for u in units)
+    return Frame(state, tuple(tangents), jnp.zeros_like(state[0]))
+
+
+def one_kernel(flow: Flow) -> Callable[[Callable], Callable]:
+    """The mark for a march of ``flow``: :func:`in_one_kernel`, or none if the field does what is not possible there."""
+
+    def rates(y: Vector) -> Any:
+        angles = flow.angles(0, 0.0)
+        return flow.field(angles, y), divergence(flow, angles, y)
+
+    return in_one_kernel if suits_one_kernel(rates, initial_state(flow)) else lambda function: function
+
+
+def strobe_map(flow: Flow, steps: Any) -> Callable[[Array, Frame], Frame]:
+    """The map ``(strobe, frame) -> frame one strobe later`` by ``steps`` equal steps (an integer, may be traced).
+
+    ``y' = f(t, y)``, ``v' = (df/dy) v`` for every tangent vector (products with the Jacobian by forward
+    differentiation) and, if the frame carries it, the integral of ``div f``.
+    """
+    h = flow.period / steps
+
+    def advance(strobe: Array, frame: Frame) -> Frame:
+        def step(i: Array, frame: Frame) -> Frame:
+            return _step(flow, lambda c: flow.angles(strobe, (i + c) / steps), h, frame)
+
+        return jax.lax.fori_loop(0, steps, step, frame)
+
+    return advance
+
+
+def _step(flow: Flow, angles: Callable[[float], tuple], h: Any, frame: Frame) -> Frame:
+    """One step of DOP853 for everything that the frame carries."""
+    slopes: list[Frame] = []
+    for stage, (c, b) in enumerate(zip(DOP853.C, DOP853.B, strict=True)):
+        at = _advanced(frame._replace(contraction=None), h, DOP853.A[stage, :stage], slopes)
+        contracts = frame.contraction is not None and b != 0
+        slopes.append(_slopes(flow, contracts, angles(float(c)), at))
+    return _advanced(frame, h, DOP853.B, slopes)
+
+
+def _advanced(frame: Frame, h: Any, weights: Any, slopes: list[Frame]) -> Frame:
+    """``frame + h sum(weights * slopes)``, component by component."""
+    terms = [(float(w), slope) for w, slope in zip(weights, slopes, strict=True) if w != 0]
+    if not terms:
+        return frame
+    factors, slopes = zip(*terms, strict=True)
+
+    def moved(frame: Frame, h: Any, slopes: tuple[Frame, ...]) -> Frame:
+        def along(x: Array, *rates: Array) -> Array:
+            return x + h * sum(w * rate for w, rate in zip(factors, rates, strict=True))
+
+        return jax.tree.map(along, frame, *slopes)
+
+    used = (slope if frame.contraction is not None else slope._replace(contraction=None) for slope in slopes)
+    return stored(moved)(frame, h, tuple(used))
+
+
+def _field(flow: Flow, angles: tuple, shape: tuple[int, ...]) -> Callable[..., Vector]:
+    def field(*y: Array) -> Vector:
+        return tuple(jnp.broadcast_to(jnp.asarray(rate, float), shape) for rate in flow.field(angles, y))
+
+    return field
+
+
+def _slopes(flow: Flow, contracts: bool, angles: tuple, at: Frame) -> Frame:
+    """Derivatives of the state, of the tangent vectors and, if it ``contracts``, of the integral of the divergence."""
+    field = _field(flow, angles, at.state[0].shape)
+    contraction = jnp.broadcast_to(divergence(flow, angles, at.state), at.state[0].shape) if contracts else None
+    if not at.tangents:
+        return Frame(field(*at.state), (), contraction)
+    rates, push = jax.linearize(field, *at.state)
+    # The factors of the linear map are what it shares with the rates and the divergence.
+    linear, factors = jax.closure_convert(push, *at.state)
+
+    def pushed(tangents: Vector, factors: list[Array]) -> Vector:
+        return jax.vmap(lambda *v: linear(*v, *factors))(*tangents)
+
+    return Frame(rates, tuple(stored(pushed)(at.tangents, factors)), contraction)
+
+
+def divergence(flow: Flow, angles: tuple, y: Vector) -> Array:
+    """Trace of the field's Jacobian at ``y``: the closed form of the flow, or by forward differentiation."""
+    if flow.divergence is not None:
+        return jnp.asarray(flow.divergence(angles, y), float)
+    _, push = jax.linearize(_field(flow, angles, y[0].shape), *y)
+    zero = jnp.zeros_like(y[0])
+    return sum(push(*(zero + float(i == j) for i in range(flow.size)))[j] for j in range(flow.size))
+
+
+def orthonormal(tangents: Vector) -> tuple[Vector, Array]:
+    """Modified Gram-Schmidt of m vectors, components ``(m, ...)``: orthonormal ones, logarithms of the lengths (m, ...)."""
+    basis: list[Vector] = []
+    logs = []
+    for vector in zip(*tangents, strict=True):
+        for unit in basis:
+            along = sum(a * b for a, b in zip(unit, vector, strict=True))
+            vector = tuple(b - along * a for a, b in zip(unit, vector, strict=True))
+        length = jnp.sqrt(sum(a * a for a in vector))
+        basis.append(tuple(a / length for a in vector))
+        logs.append(jnp.log(length))
+    return tuple(jnp.stack(component) for component in zip(*basis, strict=True)), jnp.stack(logs)

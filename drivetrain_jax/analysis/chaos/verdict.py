@@ -1,0 +1,107 @@
+"""What kind of motion it is, by a rule that a diffuse picture or one number cannot satisfy.
+
+Chaotic only if the motion is bounded, its largest exponent exceeds three standard errors at two step sizes, the
+exponents add up to the mean divergence, and the 0-1 test gives K > 0.9. Exponents of phases are not among those judged.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax.analysis.chaos.growth import SEGMENTS
+
+STANDARD_ERRORS = 3.0
+CHAOTIC_K = 0.9
+# The exponents add up: residual over the largest exponent.
+_SUM_RULE = 1e-3
+# An exponent that is zero has this size at most, over the largest one, whatever its standard error says.
+_ZERO = 1e-6
+
+
+class Verdict(IntEnum):
+    """Kinds of motion. A fixed point, periodic and quasi-periodic motion are those of the strobes of a forced system
+    (a fixed point of the section is a motion of one strobe period) and of the motion itself if nothing forces it."""
+
+    FIXED_POINT = 0
+    PERIODIC = 1
+    QUASI_PERIODIC = 2
+    PARAMETRICALLY_UNSTABLE = 3
+    CHAOTIC = 4
+    UNDECIDED = 5
+
+
+class Evidence(NamedTuple):
+    """What the verdict rests on; ``m`` exponents, phases apart, in falling order.
+
+    ``spectrum``, ``error`` (m, ...): exponents and standard errors; ``coarse``, ``coarse_error`` (...): the largest one
+    with twice the step; ``sum_residual``: of the sum rule; ``k01``: of the 0-1 test; ``bounded``; ``growing``: see
+    :func:`grows`; ``multiple``: strobes until the motion repeats, 0 if it does not within those looked at; ``settled``:
+    whether the transient is small enough to tell.
+    """
+
+    spectrum: Array
+    error: Array
+    coarse: Array
+    coarse_error: Array
+    sum_residual: Array
+    k01: Array
+    bounded: Array
+    growing: Array
+    multiple: Array
+    settled: Array
+
+
+def grows(size: Array, used: Array, span: Array, largest: Array) -> Array:
+    """Whether the motion grew about as fast as its largest exponent, or stayed at a rest that a disturbance leaves.
+
+    ``size`` (SEGMENTS, ...): largest component in each segment. A bounded attractor has a positive exponent, too, but
+    its size does not follow it.
+    """
+    index = jnp.arange(SEGMENTS).reshape(-1, *(1,) * used.ndim)
+    last = jnp.maximum(used - 1, 0)
+    begin, end = (jnp.sum(jnp.where(index == i, size, 0.0), axis=0) for i in (used // 4, last))
+    time = (last - used // 4) * span
+    ratio = jnp.log(jnp.where((begin > 0) & (end > 0), end / jnp.where(begin > 0, begin, 1.0), 1.0))
+    at_rest = jnp.max(size, axis=0) == 0
+    return at_rest | ((ratio > 0.5 * largest * time) & (largest * time > 1))
+
+
+def significant(evidence: Evidence) -> Array:
+    """Whether the largest exponent is positive beyond three standard errors."""
+    return evidence.spectrum[0] > STANDARD_ERRORS * evidence.error[0] + _floor(evidence)
+
+
+def judge(evidence: Evidence, autonomous: bool) -> Array:
+    """The verdict, int8 of shape (...)."""
+    unstable = ~evidence.bounded | (significant(evidence) & evidence.growing)
+    chaotic = evidence.bounded & significant(evidence) & (evidence.k01 > CHAOTIC_K)
+    chaotic &= evidence.coarse > STANDARD_ERRORS * evidence.coarse_error
+    chaotic &= evidence.sum_residual <= _SUM_RULE * jnp.max(jnp.abs(evidence.spectrum), axis=0)
+    regular = _autonomous(evidence) if autonomous else _forced(evidence)
+    verdict = jnp.where(significant(evidence), jnp.where(chaotic, Verdict.CHAOTIC, Verdict.UNDECIDED), regular)
+    return jnp.where(unstable, Verdict.PARAMETRICALLY_UNSTABLE, verdict).astype(jnp.int8)
+
+
+def _forced(evidence: Evidence) -> Array:
+    """Kind of a motion that attracts: by the strobes after which it repeats."""
+    decays = evidence.spectrum[0] < -STANDARD_ERRORS * evidence.error[0] - _floor(evidence)
+    kind = jnp.where(evidence.multiple > 1, Verdict.PERIODIC, Verdict.QUASI_PERIODIC)
+    kind = jnp.where(evidence.multiple == 1, Verdict.FIXED_POINT, kind)
+    return jnp.where(decays & evidence.settled, kind, Verdict.UNDECIDED)
+
+
+def _autonomous(evidence: Evidence) -> Array:
+    """Kind of a motion that nothing forces: one exponent is zero along any motion that does not rest."""
+    zeros = jnp.abs(evidence.spectrum) <= STANDARD_ERRORS * evidence.error + _floor(evidence)
+    count = jnp.sum(zeros, axis=0)
+    kind = jnp.where(count == 0, Verdict.FIXED_POINT, jnp.where(count == 1, Verdict.PERIODIC, Verdict.QUASI_PERIODIC))
+    sound = ~jnp.isnan(evidence.spectrum[0]) & (~zeros[0] | (evidence.k01 < 1 - CHAOTIC_K))
+    return jnp.where(sound, kind, Verdict.UNDECIDED)
+
+
+def _floor(evidence: Evidence) -> Array:
+    return _ZERO * jnp.max(jnp.abs(evidence.spectrum), axis=0)

@@ -1,0 +1,1 @@
+"""Piecewise linear oscillators: the exact flow, attractors, branches of orbits."""

@@ -1,0 +1,237 @@
+"""From initial conditions to attractors of a piecewise linear oscillator, many points at a time.
+
+A *job* is a sequence of points, each started where the last one ended: a single point for a steady state, a line of
+drive frequencies for an up or down sweep. ``width`` lanes work through the queue of jobs, each at its own pace: a lane
+that settles slowly, or never, holds up no other one.
+
+A lane settles period by period and now and then tries Newton shooting from where it is: ``z <- z + (1 - M)^-1 (F^m(z) -
+z)`` with the exact transition matrix M over m periods, m being a number after which the recent motion nearly recurs. An
+orbit counts as the attractor only if all its multipliers lie inside the unit circle and the motion itself, followed on
+from where the search began, is seen to approach it (:mod:`~drivetrain_jax.analysis.impacts.attractor_approach`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis.impacts.attractor_approach import Orbit, attracts, creeps, obeys
+from drivetrain_jax.analysis.impacts.attractor_lanes import (
+    MOST_PERIODS,
+    Lane,
+    approach,
+    blank,
+    candidates,
+    confirm,
+    enter,
+    record,
+    restart,
+    resume,
+    search,
+    select,
+    settle,
+    try_line,
+)
+from drivetrain_jax.analysis.impacts.piecewise_march import Lanes, few_steps, prepare, usual_steps
+from drivetrain_jax.analysis.impacts.plane_map import Matrix, newton_correction
+from drivetrain_jax.systems import PiecewiseLinearOscillator
+
+# Newton: largest number of corrections, relative size at which one is the last, and below which rounding may end it.
+_CORRECTIONS, _CONVERGED, _ROUNDING = 12, 1e-11, 1e-7
+# Largest part of a correction that the next one may be: 2/3 at worst on the way to an orbit whose period is to double.
+_SHRINKING = 0.75
+# A search is a failure beyond so many times the usual velocity, or so many times the steps that settling takes.
+_ASTRAY, _COSTLY = 3.0, 4
+_EPS = np.finfo(float).eps
+
+
+class Attractors(NamedTuple):
+    """What each point ended on, every field of shape ``(points,)``.
+
+    ``u, v``: state at the start of a drive period; ``multiple``: number of periods m after which it recurs (0 if not
+    within 32); ``matrix``: transition matrix over these; ``error``: estimated absolute error of u; ``periods``: drive
+    periods run; ``exponent``: Lyapunov exponent per unit of time, meaningful if ``multiple`` is 0; ``stalled``: given
+    up because of its number of steps or because it is not finite (1, else 0).
+    """
+
+    u: Array
+    v: Array
+    multiple: Array
+    matrix: Matrix
+    error: Array
+    periods: Array
+    exponent: Array
+    stalled: Array
+
+
+_RESULT = Attractors(0, 0, 0, (0, 0, 0, 0), 0, 0, 0, 0)
+
+
+def take(oscillator: PiecewiseLinearOscillator, index: Array) -> PiecewiseLinearOscillator:
+    """The oscillators number ``index``; fields that are the same for all stay scalars."""
+    chosen = {f.name: getattr(oscillator, f.name) for f in fields(oscillator)}
+    return replace(oscillator, **{name: x[index] if jnp.ndim(x) else x for name, x in chosen.items()})
+
+
+class _Verdict(NamedTuple):
+    """Outcome of a correction: lanes whose search has found an orbit that attracts, those whose motion would approach it
+    slowly, the orbit, and lanes whose search has failed."""
+
+    found: Array
+    slow: Array
+    orbit: Orbit
+    failed: Array
+
+
+def _speed(local: PiecewiseLinearOscillator, u: Array, v: Array) -> Array:
+    """The velocity that the energy of a state in contact is worth, to within a factor of two."""
+    return jnp.abs(v) + jnp.sqrt(local.stiffness) * jnp.maximum(jnp.abs(u) - local.b, 0.0)
+
+
+def _usual_speed(local: PiecewiseLinearOscillator) -> Array:
+    drive = jnp.abs(local.B0) + jnp.abs(local.B1)
+    return local.omega * local.b + drive * (1 / local.omega + 1 / jnp.sqrt(local.stiffness))
+
+
+def _shoot(lane: Lane, now: Array, local: PiecewiseLinearOscillator, omega: Array) -> tuple[Lane, _Verdict]:
+    """One Newton correction in the lanes ``now``, and what it shows."""
+    motion, (u, v) = lane.motion, lane.guess
+    first = select(lane.corrections == 0, (motion.u, motion.v), lane.first)
+    du, dv = newton_correction(motion.matrix, motion.u - u, motion.v - v)
+    guess = (u + du, v + dv)
+    change = jnp.abs(du) + jnp.abs(dv) / omega
+    size = jnp.abs(guess[0]) + jnp.abs(guess[1]) / omega
+    stuck = (change <= _ROUNDING * size) & (change > lane.change / 2)
+    converged = (change <= _CONVERGED * size) | stuck
+    astray = ~(_speed(local, *guess) <= _ASTRAY * (_speed(local, *lane.latest) + _usual_speed(local)))
+    going = now & ~converged & (lane.corrections < _CORRECTIONS) & ~astray & (change <= _SHRINKING * lane.change)
+    # Rounding of the state after m periods, in u and v, as it acts on the u of the orbit.
+    by_u, by_v = (newton_correction(motion.matrix, 1.0 - k + 0 * u, k * omega)[0] for k in (0.0, 1.0))
+    inverse = jnp.abs(by_u) + jnp.abs(by_v)
+    error = change + 32 * _EPS * size * (1 + inverse) * jnp.sqrt(motion.steps.astype(float))
+    orbit = Orbit(*guess, motion.matrix, -local.damping * lane.multiple * 2 * np.pi / omega, error)
+    stable = now & converged & attracts(orbit)
+    slow = stable & creeps(orbit, lane.latest, omega) & ~obeys(orbit, lane.latest, first, omega)[0]
+    corrected = lane._replace(
+        guess=guess, first=first, change=change, corrections=lane.corrections + now.astype(jnp.int32)
+    )
+    lane = restart(select(going, corrected, lane), going, *guess, lane.multiple)
+    return lane, _Verdict(stable & ~slow, slow, orbit, now & ~going & ~stable)
+
+
+class _Work(NamedTuple):
+    """The lanes, their latest states, the number of the next job, and the results so far, one row for each field."""
+
+    lane: Lane
+    history: Array
+    queue: Array
+    store: Array
+
+
+class _Task(NamedTuple):
+    """What there is to do: the points ``visits`` of all jobs in turn, ``length`` of each, from the states ``origin``."""
+
+    oscillator: PiecewiseLinearOscillator
+    visits: Array
+    length: int
+    origin: tuple[Array, Array]
+    most_periods: int
+
+
+def attractors(
+    oscillator: PiecewiseLinearOscillator, route: Array, u0: Array, v0: Array, *, most_periods: int, width: int
+) -> Attractors:
+    """Attractors reached at the points of every job.
+
+    ``oscillator`` holds scalars or arrays over all points; ``route``, shape ``(jobs, length)``, the points that each
+    job visits, in order; ``u0, v0``, shape ``(jobs,)``, the states it starts from. Each next point starts from the
+    state that the last one ended on. Results have the shape ``(jobs, length)``.
+    """
+    jobs, length = route.shape
+    width = min(width, jobs)
+    total = jobs * length
+    task = _Task(oscillator, route.reshape(total), length, (u0, v0), most_periods)
+    # One array for all results: several scatters side by side make XLA's CPU compiler abort (jax 0.10.2).
+    store = jnp.zeros((len(jax.tree.leaves(_RESULT)), total))
+    numbers = jnp.arange(width, dtype=jnp.int32)
+    lane = enter(blank(width), numbers >= 0, numbers, 0 * numbers, u0[:width], v0[:width], 0 * numbers + 1)
+    history = record(jnp.zeros((MOST_PERIODS + 1, 2 * width)), lane.searching, lane)
+    work = _Work(lane, history, jnp.asarray(width, jnp.int32), store)
+    work = jax.lax.while_loop(lambda work: jnp.any(work.lane.job < jobs), lambda work: _tick(task, work), work)
+    rows = jax.tree.unflatten(jax.tree.structure(_RESULT), list(work.store.reshape(-1, jobs, length)))
+    return rows._replace(**{name: getattr(rows, name).astype(jnp.int32) for name in ("multiple", "periods", "stalled")})
+
+
+def _tick(task: _Task, work: _Work) -> _Work:
+    """All lanes a few steps on; those that have ended a period or a search go on to what comes next."""
+    lane, history = work.lane, work.history
+    total = task.visits.size
+    working = lane.job < total // task.length
+    place = jnp.where(working, lane.job, 0) * task.length + lane.place
+    local = take(task.oscillator, task.visits[place])
+    lanes = prepare(local)
+    omega = lanes.omega + jnp.zeros(place.shape)
+    lane = lane._replace(motion=few_steps(lanes, lane.motion))
+    broken = ~jnp.isfinite(lane.motion.u) | (lane.motion.steps > _most_steps(lane, lanes))
+    ready = working & ((lane.motion.left <= 0) | broken)
+    shot, probed = (ready & lane.searching & ~broken & (on == (lane.probing >= 0)) for on in (False, True))
+    after, verdict = _shoot(lane, shot, local, omega)
+    settles = ready & ~lane.searching & ~broken
+    after = settle(after, settles, task.most_periods // 4, omega)
+    after, reached = confirm(after, settles, history, omega)
+    history = record(history, settles, after)
+    first, second = candidates(after, history, omega)
+    after = search(after, settles & (after.held == 0) & (after.count >= after.due), first, second)
+    after = approach(after, verdict.found, verdict.orbit)
+    after, through, left = try_line(after, probed | verdict.slow, verdict.orbit, omega)
+    reached |= through
+    after = resume(after, verdict.failed | left | (ready & lane.searching & broken))
+    stalled = ready & ~lane.searching & broken
+    done = reached | stalled | (settles & (after.count >= task.most_periods))
+    result = _result(after, reached, stalled, task.most_periods * 2 * np.pi / omega)
+    rows = jnp.stack(jax.tree.leaves(result)).astype(float)
+    store = work.store.at[:, jnp.where(done, place, total)].set(rows, mode="drop")
+    lane, queue = _proceed(after, done, result, work.queue, task)
+    return _Work(lane, record(history, done, lane), queue, store)
+
+
+def _most_steps(lane: Lane, lanes: Lanes) -> Array:
+    """Steps after which a lane is given up: it goes from event to event without getting on."""
+    searching = lane.searching & (lane.count > 0)
+    return lane.multiple * jnp.where(searching, _COSTLY * lane.cost + 500, usual_steps(lanes))
+
+
+def _result(lane: Lane, reached: Array, stalled: Array, span: Array) -> Attractors:
+    """What a lane that is done has found; ``span`` is the longest time it may settle."""
+    orbit = lane.orbit
+    return Attractors(
+        u=jnp.where(reached, orbit.u, lane.latest[0]),
+        v=jnp.where(reached, orbit.v, lane.latest[1]),
+        multiple=jnp.where(reached, lane.multiple, 0),
+        matrix=orbit.matrix,
+        error=jnp.where(reached, orbit.error, jnp.nan),
+        periods=lane.count,
+        exponent=lane.growth / (0.75 * span),
+        stalled=stalled,
+    )
+
+
+def _proceed(lane: Lane, done: Array, result: Attractors, queue: Array, task: _Task) -> tuple[Lane, Array]:
+    """Lanes that are done go on to the next point of their job or, at its end, to the next job of the queue."""
+    origin = task.origin
+    jobs = origin[0].size
+    last = done & (lane.place == task.length - 1)
+    fresh = queue + jnp.cumsum(last.astype(jnp.int32)) - 1
+    job = jnp.where(last, fresh, lane.job)
+    place = jnp.where(last, 0, lane.place + 1).astype(jnp.int32)
+    index = jnp.minimum(job, jobs - 1)
+    finite = jnp.isfinite(result.u) & ~last
+    u = jnp.where(finite, result.u, origin[0][index])
+    v = jnp.where(finite, result.v, origin[1][index])
+    hint = jnp.where(last | (result.multiple == 0), 1, result.multiple)
+    return enter(lane, done, job, place, u, v, hint), queue + last.sum().astype(jnp.int32)

@@ -1,0 +1,132 @@
+"""Whether a motion is on its way to a periodic orbit that Newton's method has found from one of its states.
+
+Newton's method may jump to an orbit in whose basin the state does not lie, and that the linearisation about the orbit
+happens to predict one recurrence of the motion proves nothing: the remainder is a vector that passes through zero here
+and there. So the motion itself is followed on. With M the transition matrix about the orbit ``z*``, rho its spectral
+radius and m the period multiple, every recurrence has to obey
+
+    |F^m(z) - z* - M (z - z*)| <= 0.02 (1 - rho) |z - z*|
+
+for so long that the places met enclose the rest of the way. Where the multipliers are complex, with the argument theta,
+the motion comes by all directions within ``max(2 pi/theta, pi/(pi - theta))`` recurrences; the gaps between these
+directions, at most 120 degrees, are as good as closed once the distance has shrunk by ``cos(gap/2)``. Where they are real,
+the faster one has to have reduced its part against the other by a factor of 30. In any case it is enough that the
+distance itself has shrunk by that factor.
+
+Beside a fold or a period doubling rho is nearly 1, and this would take thousands of periods. The motion then creeps
+along one line, the direction of the slow multiplier. That nothing else lies on it is judged by the map itself: started
+at eight points of the line between the orbit and the motion, one recurrence (two if the multiplier is negative) must lead
+nearer to the orbit from each of them.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis.impacts.plane_map import Matrix, apply, spectral_radius
+
+# Remainder of the linearisation that is tolerated, as part of the contraction 1 - rho.
+REMAINDER = 0.02
+# Distance over size at which the motion has arrived.
+_ARRIVED = 1e-9
+_DECAY = np.log(30.0)
+# Slow: modulus of the slow multiplier, of the fast one against it, and part of the distance off the slow line.
+_SLOW, _APART, _OFF = 0.9, 0.9, 0.1
+# Points of the line, and the contraction they must show, as a part of 1 - rho.
+PROBES, _PULL = 8, 0.2
+
+
+class Orbit(NamedTuple):
+    """An orbit through ``u, v``, each field ``(width,)``: its transition ``matrix`` over its period, the logarithm of
+    the determinant of that, and the estimated ``error`` of u."""
+
+    u: Array
+    v: Array
+    matrix: Matrix
+    log_determinant: Array
+    error: Array
+
+
+def attracts(orbit: Orbit) -> Array:
+    """Whether all multipliers lie inside the unit circle."""
+    return spectral_radius(orbit.matrix, orbit.log_determinant) < 1
+
+
+def recurrences(orbit: Orbit) -> Array:
+    """For how many recurrences a motion has to obey the linearisation (module docstring), at least 2."""
+    rho = spectral_radius(orbit.matrix, orbit.log_determinant)
+    half = (orbit.matrix[0] + orbit.matrix[3]) / 2
+    gap = half**2 - jnp.exp(orbit.log_determinant)
+    angle = jnp.arctan2(jnp.sqrt(jnp.maximum(-gap, 0.0)), half)
+    apart = jnp.maximum(2 * jnp.log(rho) - orbit.log_determinant, 1e-300)
+    decay = jnp.maximum(-jnp.log(rho), 1e-300)
+    rest = jnp.maximum(np.pi - angle, 1e-300)
+    turn = jnp.maximum(2 * np.pi / jnp.maximum(angle, 1e-300), np.pi / rest)
+    turn = turn - jnp.log(jnp.cos(jnp.minimum(angle / 2, rest))) / decay
+    needed = jnp.minimum(jnp.where(gap < 0, turn, _DECAY / apart), _DECAY / decay)
+    return jnp.maximum(jnp.ceil(needed), 2.0)
+
+
+def obeys(orbit: Orbit, before: tuple[Array, Array], after: tuple[Array, Array], omega: Array) -> tuple[Array, Array]:
+    """Whether ``after``, one recurrence after ``before``, is where the linearisation has it; whether it has arrived."""
+    rho = spectral_radius(orbit.matrix, orbit.log_determinant)
+    away = (before[0] - orbit.u, before[1] - orbit.v)
+    ahead = apply(orbit.matrix, *away)
+    rest = jnp.abs(after[0] - orbit.u - ahead[0]) + jnp.abs(after[1] - orbit.v - ahead[1]) / omega
+    distance = jnp.abs(away[0]) + jnp.abs(away[1]) / omega
+    size = jnp.abs(orbit.u) + jnp.abs(orbit.v) / omega
+    arrived = distance <= _ARRIVED * size
+    return (rest <= REMAINDER * (1 - rho) * distance) | arrived, arrived
+
+
+def along(orbit: Orbit, away: tuple[Array, Array]) -> tuple[Array, Array]:
+    """The part of ``away`` along the slow line: the projection ``(M - mu_fast)/(mu_slow - mu_fast)`` (real mu only)."""
+    half = (orbit.matrix[0] + orbit.matrix[3]) / 2
+    root = jnp.sqrt(jnp.maximum(half**2 - jnp.exp(orbit.log_determinant), 0.0))
+    slow, fast = jnp.where(half < 0, half - root, half + root), jnp.where(half < 0, half + root, half - root)
+    moved = apply(orbit.matrix, *away)
+    return tuple((m - fast * x) / (slow - fast) for m, x in zip(moved, away, strict=True))
+
+
+def creeps(orbit: Orbit, state: tuple[Array, Array], omega: Array) -> Array:
+    """Whether the motion in ``state`` creeps towards the orbit along the slow line."""
+    half = (orbit.matrix[0] + orbit.matrix[3]) / 2
+    rho, real = spectral_radius(orbit.matrix, orbit.log_determinant), half**2 > jnp.exp(orbit.log_determinant)
+    away = (state[0] - orbit.u, state[1] - orbit.v)
+    part = along(orbit, away)
+    off = jnp.abs(away[0] - part[0]) + jnp.abs(away[1] - part[1]) / omega
+    distance = jnp.abs(away[0]) + jnp.abs(away[1]) / omega
+    apart = jnp.exp(orbit.log_determinant) <= _APART * rho**2
+    return real & (rho > _SLOW) & (rho < 1) & apart & (off <= _OFF * distance)
+
+
+def doubled(orbit: Orbit) -> tuple[Orbit, Array]:
+    """The orbit, over two of its periods where its slow multiplier is negative; whether that is so.
+
+    Over one period a motion beside such an orbit changes sides, and may come nearer from one side only.
+    """
+    a, b, c, d = orbit.matrix
+    negative = a + d < 0
+    square = (a * a + b * c, b * (a + d), c * (a + d), b * c + d * d)
+    matrix = tuple(jnp.where(negative, new, old) for new, old in zip(square, orbit.matrix, strict=True))
+    return orbit._replace(matrix=matrix, log_determinant=jnp.where(negative, 2, 1) * orbit.log_determinant), negative
+
+
+def probe(orbit: Orbit, state: tuple[Array, Array], number: Array) -> tuple[Array, tuple[Array, Array]]:
+    """Point ``number`` of the line, from 0: its place (0 the orbit, 1 ``state``) and its state."""
+    place = (number + 1) / PROBES
+    return place, (orbit.u + place * (state[0] - orbit.u), orbit.v + place * (state[1] - orbit.v))
+
+
+def pulled(orbit: Orbit, state: tuple[Array, Array], place: Array, after: tuple[Array, Array], omega: Array) -> Array:
+    """Whether ``after``, a recurrence after the point ``place`` of the line to ``state``, is nearer on the same side."""
+    rho = spectral_radius(orbit.matrix, orbit.log_determinant)
+    unit = along(orbit, (state[0] - orbit.u, state[1] - orbit.v))
+    there = along(orbit, (after[0] - orbit.u, after[1] - orbit.v))
+    product = there[0] * unit[0] + there[1] * unit[1] / omega**2
+    reached = product / (unit[0] ** 2 + unit[1] ** 2 / omega**2) / place
+    return (reached > 0) & (reached <= 1 - _PULL * (1 - rho))

@@ -1,0 +1,226 @@
+"""Lanes on their way to attractors: they settle period by period, start searches, and confirm what these find.
+
+A *lane* works on one point at a time. It keeps the states of the last 33 periods, from which the number of periods after
+which the motion recurs is guessed, and counts the growth of a tangent for the Lyapunov exponent.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis.impacts.attractor_approach import PROBES, Orbit, doubled, obeys, probe, pulled, recurrences
+from drivetrain_jax.analysis.impacts.piecewise_march import Motion
+from drivetrain_jax.analysis.impacts.plane_map import apply
+
+MOST_PERIODS = 32
+# Recurrences that count as equally good.
+_NEAR, _NARROW = 30.0, 1.5
+# Recurrences for which an orbit that was found is kept although the motion does not yet obey its linearisation.
+_PATIENCE = 8
+_ROWS = np.arange(MOST_PERIODS + 1, dtype=np.int32)[:, None]
+
+
+class Lane(NamedTuple):
+    """State of the lanes, each field ``(width, ...)``: job and place in it, the motion, and the search in progress."""
+
+    job: Array
+    place: Array
+    motion: Motion
+    count: Array  # periods settled
+    due: Array  # periods after which the next search starts
+    latest: tuple[Array, Array]  # state after these
+    tangent: tuple[Array, Array]
+    growth: Array  # logarithm of the growth of the tangent
+    cost: Array  # most steps that a settled period has taken
+    searching: Array
+    multiple: Array
+    corrections: Array
+    second: Array  # candidate to try if this period multiple fails
+    guess: tuple[Array, Array]
+    first: tuple[Array, Array]  # F^m of the state the search started from
+    change: Array  # size of the last correction
+    approaching: Array
+    orbit: Orbit  # what the motion approaches
+    begun: Array  # periods settled when the approach began
+    held: Array  # recurrences since then
+    probing: Array  # number of the point of the slow line that is tried, -1: none
+
+
+def select(condition: Array, new: Any, old: Any) -> Any:
+    """``new`` where the condition holds, else ``old``, for trees of arrays."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def candidates(lane: Lane, history: Array, omega: Array) -> tuple[Array, Array]:
+    """Two guesses at the period multiple: the smallest m after which the motion recurs to within a factor of the best
+    recurrence, for a generous factor and for a narrow one. Row ``n % 33`` of ``history``, shape ``(33, 2 width)``, has
+    displacements and velocities after n periods."""
+    u, v = lane.latest
+    distance = jnp.abs(history[:, : u.size] - u) + jnp.abs(history[:, u.size :] - v) / omega
+    age = (lane.count - _ROWS) % (MOST_PERIODS + 1)
+    distance = jnp.where((age > 0) & (age <= lane.count), distance, jnp.inf)
+    best = distance.min(axis=0)
+    floor = 1e-13 * (jnp.abs(u) + jnp.abs(v) / omega)
+
+    def smallest(factor: float) -> Array:
+        recurs = distance <= factor * best + floor
+        return jnp.where(recurs, age, MOST_PERIODS).min(axis=0).astype(jnp.int32)
+
+    first, second = smallest(_NEAR), smallest(_NARROW)
+    # About an orbit whose period is soon to double the motion alternates: twice the period recurs best, and Newton's
+    # method, which is slow for twice the period, is quick for the period itself.
+    return first, jnp.where((second == first) & (first % 2 == 0), first // 2, second)
+
+
+def record(history: Array, now: Array, lane: Lane) -> Array:
+    """``history`` with the latest state in the lanes ``now``."""
+    row = jnp.where(now, lane.count % (MOST_PERIODS + 1), -1)
+    return jnp.where(jnp.concatenate([row, row]) == _ROWS, jnp.concatenate(lane.latest), history)
+
+
+def restart(lane: Lane, going: Array, u: Array, v: Array, periods: Array) -> Lane:
+    """Lanes ``going`` start anew at the beginning of a period from ``(u, v)``."""
+    one, zero = jnp.ones_like(u), jnp.zeros_like(u)
+    count = jnp.zeros(u.shape, jnp.int32)
+    fresh = Motion(zero, one, zero, u, v, (one, zero, zero, one), jnp.broadcast_to(periods, u.shape) + count, count)
+    return lane._replace(motion=select(going, fresh, lane.motion))
+
+
+def settle(lane: Lane, now: Array, forget: int, omega: Array) -> Lane:
+    """One more period settled in the lanes ``now``; at the period number ``forget`` the growth is counted anew."""
+    motion = lane.motion
+    count = lane.count + 1
+    tangent = apply(motion.matrix, *lane.tangent)
+    size = jnp.abs(tangent[0]) + jnp.abs(tangent[1]) / omega
+    settled = lane._replace(
+        count=count,
+        latest=(motion.u, motion.v),
+        tangent=(tangent[0] / size, tangent[1] / size),
+        growth=jnp.where(count == forget, 0.0, lane.growth + jnp.log(size)),
+        cost=jnp.maximum(lane.cost, motion.steps),
+    )
+    return restart(select(now, settled, lane), now, motion.u, motion.v, 1)
+
+
+def search(lane: Lane, now: Array, multiple: Array, second: Array) -> Lane:
+    """Start Newton shooting from the latest state in the lanes ``now``, for this period multiple."""
+    begun = lane._replace(
+        searching=jnp.ones_like(now),
+        approaching=jnp.zeros_like(now),
+        held=jnp.zeros_like(lane.held),
+        multiple=multiple,
+        second=second,
+        corrections=jnp.zeros_like(lane.corrections),
+        guess=lane.latest,
+        change=jnp.full_like(lane.change, jnp.inf),
+    )
+    return restart(select(now, begun, lane), now, *lane.latest, multiple)
+
+
+def resume(lane: Lane, failed: Array) -> Lane:
+    """After a failed search: the second candidate if there is one, else on with settling."""
+    lane = lane._replace(probing=jnp.where(failed, -1, lane.probing))
+    again = failed & (lane.second != lane.multiple)
+    back = failed & ~again
+    due = jnp.where(back, lane.count + jnp.maximum(4, lane.count // 3), lane.due)
+    lane = restart(lane._replace(searching=lane.searching & ~back, due=due), back, *lane.latest, 1)
+    return search(lane, again, lane.second, lane.second)
+
+
+def approach(lane: Lane, now: Array, orbit: Orbit) -> Lane:
+    """Lanes ``now`` have found an orbit from their latest state: from there the motion itself goes on towards it."""
+    begun = lane._replace(
+        searching=jnp.zeros_like(now),
+        approaching=jnp.ones_like(now),
+        orbit=orbit,
+        begun=lane.count,
+        due=lane.count + jnp.maximum(_PATIENCE * lane.multiple, lane.count // 3),
+    )
+    return restart(select(now, begun, lane), now, *lane.latest, 1)
+
+
+def confirm(lane: Lane, now: Array, history: Array, omega: Array) -> tuple[Lane, Array]:
+    """Lanes ``now``, a period further: those that have approached their orbit for long enough are returned second.
+
+    Where the motion does not obey the linearisation about the orbit, counting starts again; a new search may follow.
+    """
+    due = now & lane.approaching & (lane.count > lane.begun) & ((lane.count - lane.begun) % lane.multiple == 0)
+    row = (lane.count - lane.multiple) % (MOST_PERIODS + 1)
+    past = jnp.where(jnp.concatenate([row, row]) == _ROWS, history, 0.0).sum(axis=0)
+    ok, arrived = obeys(lane.orbit, (past[: row.size], past[row.size :]), lane.latest, omega)
+    held = jnp.where(due, jnp.where(ok, lane.held + 1, 0), lane.held)
+    return lane._replace(held=held), due & ok & (arrived | (held >= recurrences(lane.orbit)))
+
+
+def try_line(lane: Lane, now: Array, orbit: Orbit, omega: Array) -> tuple[Lane, Array, Array]:
+    """Lanes ``now`` have found an orbit that their motion creeps towards, or have run from a point of the line to it.
+
+    They go to the next point. Second: those that all points have led nearer to the orbit; third, those that one has not.
+    """
+    begins = now & (lane.probing < 0)
+    twice, negative = doubled(orbit)
+    negative &= lane.multiple <= MOST_PERIODS // 2
+    multiple = jnp.where(begins & negative, 2 * lane.multiple, lane.multiple)
+    lane = lane._replace(orbit=select(begins, select(negative, twice, orbit), lane.orbit), multiple=multiple)
+    place, _ = probe(lane.orbit, lane.latest, lane.probing)
+    good = pulled(lane.orbit, lane.latest, place, (lane.motion.u, lane.motion.v), omega)
+    number = lane.probing + now.astype(jnp.int32)
+    failed = now & ~begins & ~good
+    through = now & ~begins & good & (number >= PROBES)
+    _, start = probe(lane.orbit, lane.latest, number)
+    # After a failure there is no other candidate.
+    lane = lane._replace(probing=number, second=jnp.where(failed, lane.multiple, lane.second))
+    lane = restart(lane, now & ~failed & ~through, *start, lane.multiple)
+    return lane, through, failed
+
+
+def enter(lane: Lane, now: Array, job: Array, place: Array, u: Array, v: Array, hint: Array) -> Lane:
+    """Lanes ``now`` enter a new point from ``(u, v)`` and search at once for an orbit of ``hint`` periods."""
+    zero = jnp.zeros_like(u)
+    fresh = lane._replace(
+        job=job,
+        place=place,
+        count=jnp.zeros_like(lane.count),
+        due=jnp.full_like(lane.due, 4),
+        probing=jnp.full_like(lane.probing, -1),
+        latest=(u, v),
+        tangent=(zero + 0.6, zero + 0.8),
+        growth=zero,
+        cost=jnp.zeros_like(lane.count),
+    )
+    return search(select(now, fresh, lane), now, hint, hint)
+
+
+def blank(width: int) -> Lane:
+    """Lanes that have entered no point yet."""
+    real, whole = jnp.zeros(width), jnp.zeros(width, jnp.int32)
+    pair, flag = (real, real), jnp.zeros(width, bool)
+    motion = Motion(real, real + 1, real, real, real, (real + 1, real, real, real + 1), whole, whole)
+    return Lane(
+        job=whole,
+        place=whole,
+        motion=motion,
+        count=whole,
+        due=whole,
+        latest=pair,
+        tangent=pair,
+        growth=real,
+        cost=whole,
+        searching=flag,
+        multiple=whole + 1,
+        corrections=whole,
+        second=whole,
+        guess=pair,
+        first=pair,
+        change=real,
+        approaching=flag,
+        orbit=Orbit(real, real, (real, real, real, real), real, real),
+        begun=whole,
+        held=whole,
+        probing=whole - 1,
+    )

@@ -1,0 +1,90 @@
+"""Where a branch of motions, known by points along it, has a given frequency.
+
+Between its points the branch is taken for a cubic (Hermite's, with the slopes of parabolas through three points), cut in
+two where the cubic turns back in frequency. Next to a fold both of its sides are thus met, each near its own motion.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax.analysis.numerics.amplitude_roots import sign_changes
+
+_HALVINGS = 50
+
+
+class Course(NamedTuple):
+    """Points of a branch and slopes per interval at both of its ends; ``nodes``: frequencies at the points and, between
+    them, at the cut of each interval, which is at the part ``cut`` of it."""
+
+    points: Array
+    slopes: tuple[Array, Array]
+    cut: Array
+    nodes: Array
+
+
+def _cubic(ends: tuple[Array, Array], slopes: tuple[Array, Array], part: Array) -> Array:
+    rest = 1 - part
+    values = rest**2 * (1 + 2 * part) * ends[0] + part**2 * (3 - 2 * part) * ends[1]
+    return values + part * rest * (rest * slopes[0] - part * slopes[1])
+
+
+def course(points: Array, scale: Array) -> Course:
+    """The branch through ``points``, shape ``(S, n, N)``, the frequency last among the n, NaN after the last point.
+
+    ``scale``, shape ``(n, N)``, makes the components comparable.
+    """
+    rise = jnp.diff(points, axis=0)
+    length = jnp.sqrt(jnp.sum((rise / scale) ** 2, axis=1, keepdims=True))
+    rate = rise / jnp.where(length > 0, length, 1.0)
+    inner = (length[1:] * rate[:-1] + length[:-1] * rate[1:]) / (length[1:] + length[:-1])
+    # At both ends the slope of the chord.
+    inner = jnp.where(jnp.isfinite(inner), inner, rate[:-1])
+    slope = jnp.concatenate([rate[:1], inner, rate[-1:]])
+    slopes = (slope[:-1] * length, slope[1:] * length)
+    omega = points[:, -1]
+    first, last, total = slopes[0][:, -1], slopes[1][:, -1], rise[:, -1]
+    # Zero of the derivative of the cubic: first + 2 (3 total - 2 first - last) s + 3 (first + last - 2 total) s^2.
+    middle, square = 3 * total - 2 * first - last, 3 * (first + last - 2 * total)
+    root = jnp.sqrt(jnp.maximum(middle**2 - first * square, 0.0))
+    part = -first / (middle + jnp.where(middle < 0, -root, root))
+    other = -(middle + jnp.where(middle < 0, -root, root)) / jnp.where(square == 0, 1.0, square)
+    part = jnp.where((part > 0) & (part < 1), part, other)
+    turns = (first * last < 0) & (part > 0) & (part < 1)
+    cut = jnp.where(turns, part, 0.5)
+    between = _cubic((omega[:-1], omega[1:]), (first, last), cut)
+    nodes = jnp.stack([omega[:-1], between], axis=1).reshape(-1, omega.shape[1])
+    return Course(points, slopes, cut, jnp.concatenate([nodes, omega[-1:]]))
+
+
+def sections(branch: Course, omega: Array, count: int) -> tuple[Array, Array]:
+    """Up to ``count`` places of the branch at ``omega``, in its order: ``(count, n, N)``, and which exist."""
+    changes = sign_changes(branch.nodes > omega, count) & jnp.isfinite(branch.nodes[1:])
+    exists = jnp.any(changes, axis=1)
+    place = jnp.argmax(changes, axis=1)
+    number, second = place // 2, place % 2
+
+    def at(values: Array, shift: int = 0) -> Array:
+        if values.ndim == 2:
+            return jnp.take_along_axis(values, number + shift, axis=0)
+        return jnp.take_along_axis(values, (number + shift)[:, None], axis=0)
+
+    ends = (at(branch.points), at(branch.points, 1))
+    slopes = tuple(at(slope) for slope in branch.slopes)
+    cut = at(branch.cut)
+    low, high = jnp.where(second, cut, 0.0), jnp.where(second, 1.0, cut)
+    start = jnp.take_along_axis(branch.nodes, place, axis=0) > omega
+
+    def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bracket
+        middle = (low + high) / 2
+        here = _cubic((ends[0][:, -1], ends[1][:, -1]), (slopes[0][:, -1], slopes[1][:, -1]), middle) > omega
+        return jnp.where(here == start, middle, low), jnp.where(here == start, high, middle)
+
+    low, high = jax.lax.fori_loop(0, _HALVINGS, halve, (low, high))
+    found = _cubic(ends, slopes, ((low + high) / 2)[:, None])
+    return jnp.where(exists[:, None], found, 0.0), exists

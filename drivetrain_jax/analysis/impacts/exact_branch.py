@@ -1,0 +1,155 @@
+"""All orbits of the drive's period on the branch that a sweep starts on, stable or not, with its folds and doublings.
+
+The branch is followed by arc length through the first motion of period one that the sweep up meets, both ways to the
+ends of the line (:mod:`~drivetrain_jax.analysis.impacts.orbit_branch`); orbits at the frequencies of the line are corrected
+by Newton's method. Orbits of longer periods and branches that are closed in themselves are not on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis.impacts.attractor import take
+from drivetrain_jax.analysis.impacts.branch_sections import course, sections
+from drivetrain_jax.analysis.impacts.motion import ABSENT, STABLE, UNSTABLE
+from drivetrain_jax.analysis.impacts.orbit_branch import Branch, doubling_test, fold_test, follow, locate, scale_of
+from drivetrain_jax.analysis.impacts.orbit_measures import measure
+from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
+from drivetrain_jax.analysis.impacts.plane_map import newton_correction, spectral_radius
+from drivetrain_jax.systems import PiecewiseLinearOscillator
+
+BRANCHES, SPECIAL = 7, 16
+_ATTEMPTS, _LONGEST = 3000, 0.03
+_BLOCK, _CORRECTIONS, _MOST_STEPS, _MARGIN = 64, 6, 100_000, 1e-9
+
+
+def branch(
+    model: PiecewiseLinearOscillator, omega: np.ndarray, first: Array, *, special: bool, width: int
+) -> tuple[dict[str, Array], Array]:
+    """Results of the branches through ``first = (u, v, omega)``, shape ``(3, N)``, over the rising ``omega`` (L,).
+
+    ``branch_u_max, branch_u_min, branch_stability``, shape ``(L, 7, N)``, by rising largest displacement; if
+    ``special``, ``fold_frequency`` and ``doubling_frequency``, shape ``(L, 16, N)``, the largest 16 within the line,
+    rising. Second: whether each branch reaches the highest frequency. NaN in ``first``: no branch.
+    """
+    low, high = float(omega[0]), float(omega[-1])
+    own = {name: jnp.tile(v, 2) for name, v in vars(model).items() if name != "omega" and jnp.ndim(v)}
+    both = replace(model, omega=1.0, **own)
+    twice = jnp.tile(first, (1, 2))
+    way = jnp.repeat(jnp.array([1.0, -1.0]), first.shape[1])
+    limits = (low * (1 - 1e-9), high * (1 + 1e-9))
+    found = follow(both, 1, twice, direction=way, attempts=_ATTEMPTS, longest=_LONGEST, limits=limits)
+    along = course(found.x, scale_of(both, twice, limits[1]))
+    guess, exists = jax.lax.map(lambda w: sections(along, w, BRANCHES), jnp.asarray(omega))
+    lanes = first.shape[1]
+    number = np.broadcast_to(np.arange(omega.size)[:, None, None] * lanes, exists.shape)
+    index = jnp.asarray((number + np.tile(np.arange(lanes), 2)).reshape(-1))
+    points = _points(model, omega, lanes)
+    states = jnp.moveaxis(guess, 2, 0).reshape(3, -1)[:2]
+    results = _described(take(points, index), states, exists.reshape(-1), width)
+    results = _ordered({name: x.reshape(omega.size, 2 * BRANCHES, lanes) for name, x in results.items()})
+    reached = jnp.nanmax(jnp.where(jnp.isfinite(found.x[:, 2]), found.x[:, 2], -jnp.inf), axis=0)
+    complete = reached.reshape(2, lanes).max(axis=0) >= high
+    if special:
+        results |= {name: _along(x, omega) for name, x in _special(both, found, (low, high)).items()}
+    return results, complete
+
+
+def _points(model: PiecewiseLinearOscillator, omega: np.ndarray, lanes: int) -> PiecewiseLinearOscillator:
+    """The oscillators of all points, frequencies first."""
+    own = {k: jnp.tile(v, omega.size) for k, v in vars(model).items() if k != "omega" and jnp.ndim(v)}
+    return replace(model, omega=jnp.asarray(np.repeat(omega, lanes)), **own)
+
+
+def _along(values: Array, omega: np.ndarray) -> Array:
+    return jnp.broadcast_to(values, (omega.size, *values.shape))
+
+
+def _ordered(results: dict[str, Array]) -> dict[str, Array]:
+    """By rising largest displacement along the second axis, those that exist first."""
+    order = jnp.argsort(results["branch_u_max"], axis=1)[:, :BRANCHES]
+    return {name: jnp.take_along_axis(x, order, axis=1) for name, x in results.items()}
+
+
+def _corrected(model: PiecewiseLinearOscillator, states: Array, exists: Array) -> Array:
+    """Orbits ``(u, v)`` and transition matrices, ``(6, K)``, from guesses ``(2, K)``, a block of lanes at a time."""
+    total = exists.size
+    order = jnp.argsort(~exists)
+    order = jnp.concatenate([order, jnp.full(_BLOCK, order[-1])]).astype(jnp.int32)
+    count = jnp.sum(exists)
+
+    def block(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        begin, store = state
+        index = jax.lax.dynamic_slice(order, (begin,), (_BLOCK,))
+        ours = begin + jnp.arange(_BLOCK) < count
+        lanes = jax.tree.map(lambda x: x + jnp.zeros(_BLOCK), prepare(take(model, index)))
+
+        def correct(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+            number, z, _, _ = state
+            end = march(lanes, start(lanes, z[0], z[1], jnp.asarray(1, jnp.int32)), _MOST_STEPS)
+            step = jnp.stack(newton_correction(end.matrix, end.u - z[0], end.v - z[1]))
+            size = jnp.abs(z[0]) + jnp.abs(z[1]) / lanes.omega
+            change = (jnp.abs(step[0]) + jnp.abs(step[1]) / lanes.omega) / size
+            return number + 1, z + step, jnp.stack(end.matrix), change
+
+        def unfinished(state: tuple[Array, Array, Array, Array]) -> Array:
+            return (state[0] < _CORRECTIONS) & jnp.any(ours & (state[3] > 1e-13))
+
+        z = jnp.where(ours, states[:, index], jnp.nan)
+        begun = (jnp.asarray(0), z, jnp.zeros((4, _BLOCK)), jnp.full(_BLOCK, jnp.inf))
+        _, z, matrix, change = jax.lax.while_loop(unfinished, correct, begun)
+        z = jnp.where(change < 1e-9, z, jnp.nan)
+        where = jnp.where(ours, index, total)
+        return begin + _BLOCK, store.at[:, where].set(jnp.concatenate([z, matrix]), mode="drop")
+
+    store = jnp.full((6, total), jnp.nan)
+    return jax.lax.while_loop(lambda state: state[0] < count, block, (jnp.asarray(0), store))[1]
+
+
+def _described(model: PiecewiseLinearOscillator, states: Array, exists: Array, width: int) -> dict[str, Array]:
+    """Extremes and stability of the orbits near ``states`` (2, K)."""
+    found = _corrected(model, states, exists)
+    one = jnp.ones(exists.shape, jnp.int32)
+    seen = measure(model, found[0], found[1], one, width=min(width, exists.size), integrals=False)
+    there = jnp.isfinite(found[0]) & (seen.complete == 1)
+    rho = spectral_radius(tuple(found[2:]), -model.damping * model.period)
+    stability = jnp.where(rho > 1 + _MARGIN, UNSTABLE, STABLE)
+    return {
+        "branch_u_max": jnp.where(there, seen.high, jnp.nan),
+        "branch_u_min": jnp.where(there, seen.low, jnp.nan),
+        "branch_stability": jnp.where(there, stability, ABSENT).astype(jnp.int8),
+    }
+
+
+def _special(model: PiecewiseLinearOscillator, found: Branch, limits: tuple[float, float]) -> dict[str, Array]:
+    """Frequencies of folds and period doublings within the limits, ``(16, N)``, rising, NaN after the last."""
+    tests = jnp.stack([fold_test(found.matrix), doubling_test(found.matrix)])
+    changes = (tests[:, 1:] * tests[:, :-1] < 0).transpose(1, 0, 2)
+    rank = jnp.cumsum(changes, axis=0)
+    lanes = changes.shape[2]
+
+    picked = changes[None] & (rank == jnp.arange(1, SPECIAL + 1).reshape(-1, 1, 1, 1))
+    place, exists = jnp.argmax(picked, axis=1), jnp.any(picked, axis=1)
+    column = jnp.broadcast_to(jnp.arange(lanes), place.shape)
+    kind = jnp.broadcast_to(jnp.arange(2)[:, None], place.shape)
+
+    def at(shift: int) -> tuple[Array, Array]:
+        x = jnp.where(exists[:, :, None], jnp.moveaxis(found.x[place + shift, :, column], -1, 2), jnp.nan)
+        value = jnp.where(exists, tests[kind, place + shift, column], jnp.nan)
+        return jnp.moveaxis(x, 2, 0).reshape(3, -1), value.reshape(-1)
+
+    (before, first), (after, second) = at(0), at(1)
+    flat = column.reshape(-1)
+    x = locate(take(model, flat), 1, (before, after), (first, second), kind.reshape(-1) == 1)
+    omega = x[2].reshape(SPECIAL, 2, 2, lanes // 2)
+    omega = jnp.where((omega >= limits[0]) & (omega <= limits[1]), omega, jnp.nan)
+    # Both ways of the branch together; the highest, then rising.
+    omega = jnp.moveaxis(omega, 2, 0).reshape(2 * SPECIAL, 2, lanes // 2)
+    highest = -jnp.sort(-jnp.where(jnp.isnan(omega), -jnp.inf, omega), axis=0)[:SPECIAL]
+    omega = jnp.sort(jnp.where(jnp.isinf(highest), jnp.nan, highest), axis=0)
+    return {"fold_frequency": omega[:, 0], "doubling_frequency": omega[:, 1]}

@@ -1,0 +1,151 @@
+"""Exact motions of an oscillator with play, described: single points, and sweeps of the drive's frequency up and down.
+
+:func:`sweeps` is what the analysis ``frequency_response`` calls for its method ``exact``: ``model.omega`` has shape
+``(L,)``, the other fields are scalars or have one shape ``(N,)``; the results carry the frequencies first, then the
+direction (up, down), then the lanes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis._base import Outcome
+from drivetrain_jax.analysis.impacts.attractor import Attractors, attractors, take
+from drivetrain_jax.analysis.impacts.attractor_lanes import MOST_PERIODS
+from drivetrain_jax.analysis.impacts.motion import REGIMES, regime
+from drivetrain_jax.analysis.impacts.orbit_measures import Measures, measure
+from drivetrain_jax.analysis.impacts.plane_map import spectral_radius
+from drivetrain_jax.systems import PiecewiseLinearOscillator
+
+NON_PERIODIC = REGIMES.index("non_periodic")
+# Results that need integrals over the motion.
+INTEGRALS = frozenset(("u_mean", "u_rms", "phase"))
+# Growth of a tangent (its logarithm) that only chaos explains: shear alone gives the logarithm of the time.
+_WILD = 20.0
+# Lanes that are worked on at a time: enough to fill the vector units, few enough to wait little for the slowest. Sweeps
+# are long jobs of very different length.
+WIDTH, _SWEEP_WIDTH = 64, 32
+
+
+def describe(
+    oscillator: PiecewiseLinearOscillator, found: Attractors, *, rtol: float, integrals: bool = True
+) -> dict[str, Array]:
+    """Everything said about the motions ``found``, every field of shape ``(N,)`` as those of ``oscillator``.
+
+    Scalars per motion under the names of the analyses' variables, shape ``(N,)``; ``impacts``, ``impact_velocity`` and
+    ``contact_fraction`` of the driving and the back flank, ``orbit_state`` and (complex) ``floquet_multiplier``, shape
+    ``(2, N)``. What is not known is NaN. A motion that recurs after no more than 32 periods is described over its
+    period, one whose tangent has grown by exp(20) over 32 drive periods with ``period_multiple`` 0; any other has not
+    settled. ``outcome`` is TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its size.
+    """
+    seen = measure(oscillator, found.u, found.v, found.multiple, width=WIDTH, integrals=integrals)
+    periodic = found.multiple > 0
+    growth = found.exponent * 0.75 * found.periods * oscillator.period
+    wild = ~periodic & (growth > _WILD)
+    size = jnp.maximum(jnp.abs(seen.high), jnp.abs(seen.low))
+    outcome = jnp.where(periodic & ~(found.error <= rtol * size), Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
+    outcome = jnp.where(periodic | wild, outcome, Outcome.NOT_CONVERGED)
+    outcome = jnp.where((found.stalled > 0) | (seen.complete == 0), Outcome.STEP_LIMIT, outcome)
+    finite = jnp.isfinite(found.u) & jnp.isfinite(seen.high + seen.low)
+    outcome = jnp.where(finite, outcome, Outcome.NOT_FINITE)
+    known = outcome < Outcome.NOT_CONVERGED
+    results = _of_period(oscillator, seen) | _of_stability(oscillator, found, seen, periodic & known)
+    state = jnp.stack([found.u, found.v])
+    results |= {"orbit_state": state, "state_error": jnp.where(periodic, found.error, jnp.nan)}
+    results = {name: jnp.where(known, value, jnp.nan) for name, value in results.items()}
+    kind = jnp.where(periodic, regime(oscillator, seen.high, seen.low), NON_PERIODIC)
+    return results | {
+        "regime": jnp.where(known, kind, NON_PERIODIC).astype(jnp.int8),
+        "stability": (known & ~periodic).astype(jnp.int8),
+        "period_multiple": jnp.where(periodic & known, seen.periods, 0).astype(jnp.int32),
+        "periods_settled": found.periods,
+        "outcome": outcome.astype(jnp.int8),
+    }
+
+
+def _of_period(oscillator: PiecewiseLinearOscillator, seen: Measures) -> dict[str, Array]:
+    """Extremes, means, contacts and impacts over the periods followed."""
+    span = seen.periods * oscillator.period
+    mean, square, cosine, sine = (integral / span for integral in seen.integrals)
+    return {
+        "u_max": seen.high,
+        "u_min": seen.low,
+        "u_mean": mean,
+        "u_rms": jnp.sqrt(square),
+        "phase": jnp.arctan2(sine, cosine),
+        "impacts": jnp.stack(seen.impacts),
+        "impact_velocity": jnp.stack(seen.speed),
+        "contact_fraction": jnp.stack(seen.contact) / span,
+    }
+
+
+def _of_stability(
+    oscillator: PiecewiseLinearOscillator, found: Attractors, seen: Measures, periodic: Array
+) -> dict[str, Array]:
+    """Multipliers over the smallest period, their largest modulus, and the Lyapunov exponent."""
+    span = seen.periods * oscillator.period
+    log_determinant = -oscillator.damping * span
+    half, determinant = (seen.matrix[0] + seen.matrix[3]) / 2, jnp.exp(log_determinant)
+    root = jnp.sqrt((half**2 - determinant).astype(complex))
+    # The larger of both first, the other one from the product.
+    first = half + jnp.where(half < 0, -root, root)
+    multiplier = jnp.stack([first, determinant / first])
+    rho = spectral_radius(seen.matrix, log_determinant)
+    return {
+        "floquet_multiplier": jnp.where(periodic, multiplier, jnp.nan),
+        "spectral_radius": jnp.where(periodic, rho, jnp.nan),
+        "lyapunov_exponent": jnp.where(periodic, jnp.log(rho) / span, found.exponent),
+    }
+
+
+def points_of(model: PiecewiseLinearOscillator, length: int, lanes: int) -> PiecewiseLinearOscillator:
+    """The oscillators of all points, frequencies first: fields of shape ``(length * lanes,)``, or scalars."""
+    omega = jnp.broadcast_to(jnp.asarray(model.omega).reshape(-1, 1), (length, lanes)).reshape(-1)
+    names = ("damping", "stiffness", "alpha", "b", "B0", "B1")
+    own = {name: getattr(model, name) for name in names}
+    tiled = {name: jnp.tile(value, length) for name, value in own.items() if jnp.ndim(value)}
+    return replace(model, omega=omega, **tiled)
+
+
+def sweeps(
+    model: PiecewiseLinearOscillator, *, most_periods: int = 1000, rtol: float = 1e-10, integrals: bool = True
+) -> dict[str, Array]:
+    """Sweeps of the drive's frequency up and down, from rest, each frequency starting on the motion at the last one.
+
+    ``model.omega``: shape ``(L,)``, rising; other fields scalars or ``(N,)``. Gives what :func:`describe` does, in the
+    shape ``(L, 2, N)`` (direction up, down), ``(L, 2, 2, N)`` where that has a leading axis (flank, multiplier, state)
+    of its own; without lanes the last axis is missing. A frequency at which the motion has not settled
+    after ``most_periods`` drive periods hands on the state it is in.
+    """
+    shape = jnp.broadcast_shapes(*(jnp.shape(getattr(model, n)) for n in ("damping", "stiffness", "alpha", "b")))
+    shape = jnp.broadcast_shapes(shape, jnp.shape(model.B0), jnp.shape(model.B1))
+    length, lanes = jnp.size(model.omega), int(np.prod(shape, dtype=int))
+    points = points_of(model, length, lanes)
+    up = np.arange(length * lanes, dtype=np.int32).reshape(length, lanes).T
+    route = np.concatenate([up, up[:, ::-1]])
+    rest = jnp.zeros(2 * lanes)
+    found = attractors(points, jnp.asarray(route), rest, rest, most_periods=most_periods, width=_SWEEP_WIDTH)
+    flat = jax.tree.map(lambda x: x.reshape(-1), found)
+    results = describe(take(points, jnp.asarray(route.reshape(-1))), flat, rtol=rtol, integrals=integrals)
+
+    def arrange(x: Array) -> Array:
+        own = x.shape[:-1]
+        both = x.reshape(*own, 2, lanes, length)
+        both = jnp.stack([both[..., 0, :, :], both[..., 1, :, ::-1]])
+        # (direction, own..., lane, frequency) to (frequency, direction, own..., lane).
+        return jnp.moveaxis(both, -1, 0).reshape(length, 2, *own, *shape)
+
+    return {name: arrange(value) for name, value in results.items()}
+
+
+def worst(outcome: Array) -> Array:
+    """The outcome of both directions together, ``(L, 2, ...) -> (L, ...)``."""
+    return jnp.max(outcome, axis=1)
+
+
+__all__ = ["INTEGRALS", "MOST_PERIODS", "NON_PERIODIC", "WIDTH", "describe", "points_of", "sweeps", "worst"]

@@ -1,0 +1,209 @@
+"""What a motion of a piecewise linear oscillator does over its period: extremes, means, contacts and impacts.
+
+The motion is followed by exact steps that also stop at every reversal of the velocity, so that every extreme is the end
+of a step. Means are Gauss-Legendre sums over the steps, with 8 nodes on at most two radians of the fastest motion.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis.impacts.attractor import take
+from drivetrain_jax.analysis.impacts.attractor_lanes import MOST_PERIODS
+from drivetrain_jax.analysis.impacts.piecewise_flow import Bound, certain_span, responses, sine_cosine
+from drivetrain_jax.analysis.impacts.piecewise_march import (
+    Derivatives,
+    Here,
+    Lanes,
+    Motion,
+    advance,
+    derivatives,
+    flank_bounds,
+    least_step,
+    likely_span,
+    locate,
+    prepare,
+    start,
+    usual_steps,
+)
+from drivetrain_jax.systems import PiecewiseLinearOscillator
+
+_NODES, _WEIGHTS = (x.tolist() for x in np.polynomial.legendre.leggauss(8))
+_LONGEST_ARC = 2.0
+# Relative size of what is no motion but rounding, and of a difference that still counts as recurrence.
+_ROUNDING, _RECURRENCE = 1e-13, 1e-7
+_FEW = 8
+
+
+class Measures(NamedTuple):
+    """Sums over the periods followed, shape ``(N,)`` each; pairs are for the driving and the back flank.
+
+    ``periods``: drive periods followed; ``high, low``: extremes of u; ``integrals``: of u, u^2, u cos(omega t) and
+    u sin(omega t); ``contact``: time in contact; ``impacts``: number of times that a flank is reached; ``speed``:
+    largest velocity at which it is; ``matrix``: transition matrix; ``complete``: 1, or 0 if given up.
+    """
+
+    periods: Array
+    high: Array
+    low: Array
+    integrals: tuple[Array, Array, Array, Array]
+    contact: tuple[Array, Array]
+    impacts: tuple[Array, Array]
+    speed: tuple[Array, Array]
+    matrix: tuple[Array, Array, Array, Array]
+    complete: Array
+
+
+_RESULT = Measures(0, 0, 0, (0,) * 4, (0,) * 2, (0,) * 2, (0,) * 2, (0,) * 4, 0)
+
+
+def _fresh(u: Array) -> Measures:
+    zero = jnp.zeros_like(u)
+    pair = (zero, zero)
+    return Measures(zero, u, u, (zero,) * 4, pair, pair, pair, (zero + 1, zero, zero, zero + 1), zero)
+
+
+def _reversal(motion: Motion, rate: Derivatives, size: Array) -> Bound:
+    """How far the velocity is from changing sign; infinitely far where nothing moves."""
+    v, a = motion.v, rate.acceleration
+    sign = jnp.where(v != 0, jnp.sign(v), jnp.sign(a))
+    still = jnp.abs(v) * size[1] + jnp.abs(a) <= _ROUNDING * size[0]
+    return Bound(jnp.where(still, jnp.inf, jnp.abs(v)), sign * a, sign * rate.jerk, rate.snap_bound)
+
+
+def _integrals(lanes: Lanes, here: Here, motion: Motion, d: Array) -> tuple[Array, Array, Array, Array]:
+    """Integrals of u, u^2, u cos and u sin over the step ``d``."""
+    region = here.region
+    x = motion.u - (region.cosine * motion.cosine + region.sine * motion.sine)
+    y = motion.v - lanes.omega * (region.sine * motion.cosine - region.cosine * motion.sine)
+    pull = here.force - region.stiffness * x
+
+    def node(k: Array, sums: tuple[Array, ...]) -> tuple[Array, ...]:
+        elapsed = d * (1 + jnp.asarray(_NODES)[k]) / 2
+        weight = d * jnp.asarray(_WEIGHTS)[k] / 2
+        step, impulse, _ = responses(region, elapsed)
+        sine, cosine = sine_cosine(lanes.omega * (motion.time + elapsed))
+        u = x + impulse * y + step * pull + (region.cosine * cosine + region.sine * sine)
+        terms = (u, u * u, u * cosine, u * sine)
+        return tuple(total + weight * term for total, term in zip(sums, terms, strict=True))
+
+    return jax.lax.fori_loop(0, len(_NODES), node, (jnp.zeros_like(d),) * 4)
+
+
+def _watched(lanes: Lanes, motion: Motion, so_far: Measures, integrals: bool) -> tuple[Motion, Measures]:
+    """One step that ends at the next event or reversal at the latest, and the measures with it."""
+    here = locate(lanes, motion.u)
+    region = here.region
+    rest = lanes.period - motion.time
+    limit = jnp.minimum(rest, 1.5 / lanes.omega)
+    rate = derivatives(lanes, here, motion, limit)
+    pace = jnp.maximum(region.rate, lanes.omega)
+    extent = jnp.abs(motion.u) + jnp.abs(so_far.high) + jnp.abs(so_far.low)
+    bounds = (*flank_bounds(lanes, here.side, motion, rate), _reversal(motion, rate, (extent * pace**2, pace)))
+    d = certain_span(bounds, likely_span(here), limit)
+    if integrals:
+        x = motion.u - (region.cosine * motion.cosine + region.sine * motion.sine)
+        y = motion.v - lanes.omega * (region.sine * motion.cosine - region.cosine * motion.sine)
+        free = jnp.abs(here.force - region.stiffness * x) + region.rate * jnp.abs(y)
+        moves = free > _ROUNDING * region.rate**2 * extent
+        d = jnp.where(moves, jnp.minimum(d, _LONGEST_ARC / jnp.maximum(region.rate, 1e-300)), d)
+    d = jnp.minimum(jnp.maximum(d, least_step(lanes, here, motion, rate)), rest)
+    moved = advance(lanes, here, motion, d)
+    before, after = here.side, locate(lanes, moved.u).side
+    hits = tuple((after == side) & (before != side) & (before != 2) for side in (1.0, -1.0))
+    # Without backlash the whole line is in contact, with the flank that the mean drive holds.
+    held = (before == 1) | ((before == 2) & (lanes.mean >= 0)), (before == -1) | ((before == 2) & (lanes.mean < 0))
+    speed = jnp.abs(moved.v)
+    added = _integrals(lanes, here, motion, d) if integrals else (jnp.zeros_like(d),) * 4
+    return moved, so_far._replace(
+        high=jnp.maximum(so_far.high, moved.u),
+        low=jnp.minimum(so_far.low, moved.u),
+        integrals=tuple(a + b for a, b in zip(so_far.integrals, added, strict=True)),
+        contact=tuple(t + jnp.where(on, d, 0.0) for t, on in zip(so_far.contact, held, strict=True)),
+        impacts=tuple(n + hit for n, hit in zip(so_far.impacts, hits, strict=True)),
+        speed=tuple(jnp.maximum(s, jnp.where(hit, speed, 0.0)) for s, hit in zip(so_far.speed, hits, strict=True)),
+    )
+
+
+class _Task(NamedTuple):
+    """The motions to be followed; ``first``: u, v, most periods, and whether a recurrence ends them, ``(4, N)``."""
+
+    oscillator: PiecewiseLinearOscillator
+    first: Array
+    integrals: bool
+
+
+class _Work(NamedTuple):
+    """Lanes that each follow the motion ``index``, the next one in the ``queue``, and what is stored of those done.
+
+    ``renewed``: where a lane has just turned to another motion.
+    """
+
+    index: Array
+    queue: Array
+    renewed: Array
+    motion: Motion
+    so_far: Measures
+    store: Array
+
+
+def measure(
+    oscillator: PiecewiseLinearOscillator, u: Array, v: Array, multiple: Array, *, width: int, integrals: bool = True
+) -> Measures:
+    """Measures of the motions that start from ``(u, v)``, shape ``(N,)``.
+
+    A motion is followed until its state recurs, at most for ``multiple`` periods, so that ``periods`` is the smallest
+    period multiple; where ``multiple`` is 0, for 32 periods. ``integrals`` are zero unless asked for.
+    """
+    count = u.size
+    width = min(width, count)
+    recurs = multiple > 0
+    most = jnp.where(recurs, multiple, MOST_PERIODS)
+    task = _Task(oscillator, jnp.stack([u, v, most.astype(float), recurs.astype(float)]), integrals)
+    index, blank = jnp.arange(width, dtype=jnp.int32), jnp.zeros(width)
+    motion = Motion(blank, blank, blank, blank, blank, (blank,) * 4, 0 * index, 0 * index)
+    store = jnp.zeros((len(jax.tree.leaves(_RESULT)), count))
+    work = _Work(index, jnp.asarray(width, jnp.int32), index >= 0, motion, _fresh(blank), store)
+    work = jax.lax.while_loop(lambda work: jnp.any(work.index < count), lambda work: _tick(task, work), work)
+    return jax.tree.unflatten(jax.tree.structure(_RESULT), list(work.store))
+
+
+def _tick(task: _Task, work: _Work) -> _Work:
+    """All lanes a few steps on; those whose motion is done store it and take the next one of the queue."""
+    count = task.first.shape[1]
+    here = jnp.minimum(work.index, count - 1)
+    u, v, periods, recurs = task.first[:, here]
+    lanes = jax.tree.map(lambda x: x + jnp.zeros(work.index.size), prepare(take(task.oscillator, here)))
+    fresh = start(lanes, u, v, periods.astype(jnp.int32)), _fresh(u)
+    pair = jax.tree.map(lambda new, old: jnp.where(work.renewed, new, old), fresh, (work.motion, work.so_far))
+    motion, so_far = _few_steps(lanes, periods, pair, task.integrals)
+    ended = motion.left <= periods - 1 - so_far.periods
+    so_far = so_far._replace(periods=so_far.periods + ended)
+    distance = jnp.abs(motion.u - u) + jnp.abs(motion.v - v) / lanes.omega
+    size = jnp.abs(so_far.high) + jnp.abs(so_far.low) + jnp.abs(u) + jnp.abs(v) / lanes.omega
+    back = (recurs > 0) & (distance <= _RECURRENCE * size)
+    broken = ~jnp.isfinite(motion.u) | (motion.steps > 2 * periods * usual_steps(lanes))
+    done = (work.index < count) & (broken | (ended & (back | (motion.left <= 0))))
+    result = so_far._replace(matrix=motion.matrix, complete=jnp.where(broken, 0.0, 1.0))
+    rows = jnp.stack(jax.tree.leaves(result)).astype(float)
+    store = work.store.at[:, jnp.where(done, here, count)].set(rows, mode="drop")
+    following = work.queue + jnp.cumsum(done.astype(jnp.int32)) - 1
+    index = jnp.where(done, following, work.index)
+    return _Work(index, work.queue + done.sum().astype(jnp.int32), done, motion, so_far, store)
+
+
+def _few_steps(lanes: Lanes, periods: Array, pair: tuple[Motion, Measures], integrals: bool) -> tuple[Motion, Measures]:
+    """Some steps; a lane waits at the end of each period until its recurrence has been looked at."""
+
+    def one(_: Array, pair: tuple[Motion, Measures]) -> tuple[Motion, Measures]:
+        motion, so_far = pair
+        moved = _watched(lanes, motion, so_far, integrals)
+        active = (motion.left > periods - 1 - so_far.periods) & jnp.isfinite(motion.u)
+        return jax.tree.map(lambda new, old: jnp.where(active, new, old), moved, pair)
+
+    return jax.lax.fori_loop(0, _FEW, one, pair)

@@ -1,0 +1,226 @@
+"""Motion of a piecewise linear oscillator over drive periods: every lane goes from event to event at its own pace.
+
+Each pass of the loop advances every lane by one exact step (:mod:`~drivetrain_jax.analysis.impacts.piecewise_flow`) that is
+certain to stay within its linear region. Steps therefore shrink towards a flank like Newton iterates and can neither
+miss a crossing nor hang on a grazing contact: a least step carries the lane over the flank once it is nearer than that.
+The excess, 1e-12 of the shortest time scale, changes the velocity by 1e-24 of itself, as the force is continuous.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis.impacts.piecewise_flow import (
+    Bound,
+    Piece,
+    certain_span,
+    choose,
+    piece,
+    responses,
+    sine_cosine,
+)
+from drivetrain_jax.systems import PiecewiseLinearOscillator
+
+# Least step over the shortest time scale, and over the period (rounding of the time).
+_LEAST_STEP, _LEAST_PART = 1e-12, 1e-15
+# Longest step, as a phase of the drive.
+_LONGEST_PHASE = 1.5
+_LIKELY_ARC = 2.5
+# A lane that moves by less than so many half backlashes in such a part of its own motion is at rest.
+_AT_REST, _RESTING_ARC = 3e-17, 0.1
+_FEW = 8
+
+
+class Lanes(NamedTuple):
+    """An oscillator made ready: regions, flanks and time scales, each of shape ``(N,)``."""
+
+    contact: Piece
+    gap: Piece
+    flank: Array
+    offset: Array
+    mean: Array
+    amplitude: Array
+    omega: Array
+    period: Array
+    least: Array
+
+
+def prepare(oscillator: PiecewiseLinearOscillator) -> Lanes:
+    """Constants of the lanes. Without backlash the flanks are out of reach of |u| and the whole line is in contact."""
+    stiffness, b = jnp.asarray(oscillator.stiffness), jnp.asarray(oscillator.b)
+    contact, gap = piece(oscillator, stiffness), piece(oscillator, oscillator.alpha * stiffness)
+    period = jnp.asarray(oscillator.period)
+    least = jnp.maximum(_LEAST_STEP / jnp.maximum(contact.rate, gap.rate), _LEAST_PART * period)
+    lanes = Lanes(
+        contact,
+        gap,
+        jnp.where(b > 0, b, -1.0),
+        stiffness * (1 - oscillator.alpha) * b,
+        jnp.asarray(oscillator.B0),
+        jnp.asarray(oscillator.B1),
+        jnp.asarray(oscillator.omega),
+        period,
+        least,
+    )
+    shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in jax.tree.leaves(lanes)))
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, shape), lanes)
+
+
+class Motion(NamedTuple):
+    """Where the lanes are: time since the start of the period, cosine and sine of the drive's phase, displacement,
+    velocity, transition matrix so far ``(m11, m12, m21, m22)``, periods still to go, and steps taken."""
+
+    time: Array
+    cosine: Array
+    sine: Array
+    u: Array
+    v: Array
+    matrix: tuple[Array, Array, Array, Array]
+    left: Array
+    steps: Array
+
+
+def start(lanes: Lanes, u: Array, v: Array, periods: Array) -> Motion:
+    """Lanes at the start of a drive period with a unit transition matrix."""
+    zero, one = jnp.zeros_like(lanes.period), jnp.ones_like(lanes.period)
+    count = jnp.zeros(zero.shape, jnp.int32)
+    return Motion(zero, one, zero, u + zero, v + zero, (one, zero, zero, one), periods + count, count)
+
+
+class Here(NamedTuple):
+    """The region a lane is in (``side`` +1, 0, -1; 2 without backlash) with its constants and constant force."""
+
+    side: Array
+    region: Piece
+    force: Array
+
+
+def locate(lanes: Lanes, u: Array) -> Here:
+    """Region of displacement ``u``: outside the flanks in contact, up to and on them in the gap."""
+    linear = lanes.flank < 0
+    side = jnp.where(u > lanes.flank, 1.0, jnp.where(u < -lanes.flank, -1.0, 0.0))
+    region = choose(linear | (side != 0), lanes.contact, lanes.gap)
+    force = lanes.mean + jnp.where(linear, 0.0, side * lanes.offset)
+    return Here(jnp.where(linear, 2.0, side), region, force)
+
+
+class Derivatives(NamedTuple):
+    """Second to fourth derivative of u, and bounds of the third and fourth until the region or ``limit`` ends."""
+
+    acceleration: Array
+    jerk: Array
+    snap: Array
+    jerk_bound: Array
+    snap_bound: Array
+
+
+def derivatives(lanes: Lanes, here: Here, motion: Motion, limit: Array) -> Derivatives:
+    """Derivatives at the present time. ``w = u''`` obeys the same equation with the drive ``-omega^2 B1 cos(omega t)``,
+    so that ``sqrt(w'^2 + K w^2)`` grows by at most ``omega^2 |B1|`` per unit of time; likewise its derivative."""
+    damping, stiffness = 2 * here.region.half_damping, here.region.stiffness
+    omega, drive = lanes.omega, lanes.amplitude
+    a = here.force - damping * motion.v - stiffness * motion.u + drive * motion.cosine
+    j = -damping * a - stiffness * motion.v - drive * omega * motion.sine
+    s = -damping * j - stiffness * a - drive * omega**2 * motion.cosine
+    growth = jnp.abs(drive) * omega**2 * limit
+    jerk = jnp.sqrt(j**2 + stiffness * a**2) + growth
+    return Derivatives(a, j, s, jerk, jnp.sqrt(s**2 + stiffness * j**2) + omega * growth)
+
+
+def flank_bounds(lanes: Lanes, side: Array, motion: Motion, rate: Derivatives) -> tuple[Bound, Bound]:
+    """How far the lane is from leaving its region on either side (infinitely far where there is no flank)."""
+    b, u, v, a, jerk = lanes.flank, motion.u, motion.v, rate.acceleration, rate.jerk_bound
+    inside, sign = side == 0, jnp.where(side == 0, -1.0, side)
+    near = jnp.where(inside, b - u, sign * u - b)
+    near = jnp.where(side == 2, jnp.inf, near)
+    return (
+        Bound(near, jnp.where(side == 2, 0.0, sign * v), sign * a, jerk),
+        Bound(jnp.where(inside, b + u, jnp.inf), jnp.where(inside, v, 0.0), a, jerk),
+    )
+
+
+def advance(lanes: Lanes, here: Here, motion: Motion, d: Array) -> Motion:
+    """``motion`` after the time ``d``, all of it in the region ``here``; a period that ends is counted."""
+    region, omega = here.region, lanes.omega
+    step, impulse, rate = responses(region, d)
+    ends = d >= lanes.period - motion.time
+    time = jnp.where(ends, 0.0, motion.time + d)
+    sine, cosine = sine_cosine(omega * time)
+    x = motion.u - (region.cosine * motion.cosine + region.sine * motion.sine)
+    y = motion.v - omega * (region.sine * motion.cosine - region.cosine * motion.sine)
+    pull = here.force - region.stiffness * x
+    u = x + impulse * y + step * pull + (region.cosine * cosine + region.sine * sine)
+    v = rate * y + impulse * pull + omega * (region.sine * cosine - region.cosine * sine)
+    m11, m12, m21, m22 = motion.matrix
+    p11, p21 = 1 - region.stiffness * step, -region.stiffness * impulse
+    matrix = (p11 * m11 + impulse * m21, p11 * m12 + impulse * m22, p21 * m11 + rate * m21, p21 * m12 + rate * m22)
+    return Motion(time, cosine, sine, u, v, matrix, motion.left - ends, motion.steps + 1)
+
+
+def likely_span(here: Here) -> Array:
+    """A first guess at the length of a step that stays in the region: a good part of its own oscillation."""
+    return _LIKELY_ARC / jnp.maximum(here.region.rate, 1e-300)
+
+
+def stays(lanes: Lanes, here: Here, motion: Motion) -> Array:
+    """Whether the energy of the free motion about the harmonic response is too small for ever leaving the region."""
+    region = here.region
+    x = motion.u - (region.cosine * motion.cosine + region.sine * motion.sine)
+    y = motion.v - lanes.omega * (region.sine * motion.cosine - region.cosine * motion.sine)
+    stiffness = jnp.maximum(region.stiffness, 1e-300)
+    rest = here.force / stiffness
+    reach = jnp.sqrt((x - rest) ** 2 + y**2 / stiffness) + jnp.sqrt(region.cosine**2 + region.sine**2)
+    low, high = rest - reach, rest + reach
+    inside = (high < lanes.flank) & (low > -lanes.flank)
+    outside = jnp.where(here.side > 0, low > lanes.flank, high < -lanes.flank)
+    return jnp.where(here.side == 0, inside, outside) | (here.side == 2)
+
+
+def least_step(lanes: Lanes, here: Here, motion: Motion, rate: Derivatives) -> Array:
+    """The step that is taken whatever lies ahead; a longer one where the lane rests within rounding, as on a flank."""
+    d = _RESTING_ARC / jnp.maximum(here.region.rate, 1e-300)
+    way = d * (jnp.abs(motion.v) + d * (jnp.abs(rate.acceleration) / 2 + d * rate.jerk_bound / 6))
+    return jnp.where(way <= _AT_REST * lanes.flank, jnp.maximum(d, lanes.least), lanes.least)
+
+
+def next_step(lanes: Lanes, here: Here, motion: Motion) -> Array:
+    """The longest step that is certain to stay in the region ``here`` (or the least step) within the period."""
+    rest = lanes.period - motion.time
+    limit = jnp.minimum(rest, _LONGEST_PHASE / lanes.omega)
+    rate = derivatives(lanes, here, motion, limit)
+    d = certain_span(flank_bounds(lanes, here.side, motion, rate), likely_span(here), limit)
+    d = jnp.maximum(d, least_step(lanes, here, motion, rate))
+    return jnp.where(stays(lanes, here, motion), rest, jnp.minimum(d, rest))
+
+
+def step(lanes: Lanes, motion: Motion) -> Motion:
+    """``motion`` one certain step on in the lanes that still have periods to go and are finite."""
+    here = locate(lanes, motion.u)
+    moved = advance(lanes, here, motion, next_step(lanes, here, motion))
+    active = (motion.left > 0) & jnp.isfinite(motion.u)
+    return jax.tree.map(lambda new, old: jnp.where(active, new, old), moved, motion)
+
+
+def few_steps(lanes: Lanes, motion: Motion) -> Motion:
+    """``motion`` a fixed small number of steps on."""
+    return jax.lax.fori_loop(0, _FEW, lambda _, moving: step(lanes, moving), motion)
+
+
+def usual_steps(lanes: Lanes) -> Array:
+    """A number of steps that no drive period needs (measured: 5 for an oscillation, up to 15 for a crossing)."""
+    return 2000 + 100 * lanes.period * jnp.maximum(lanes.contact.rate, lanes.gap.rate) / (2 * np.pi)
+
+
+def march(lanes: Lanes, motion: Motion, most_steps: int) -> Motion:
+    """``motion`` after the periods it has to go. A lane that needs more than ``most_steps`` steps keeps periods
+    ``left``; lanes that are done or not finite wait."""
+
+    def going(motion: Motion) -> Array:
+        return jnp.any((motion.left > 0) & (motion.steps < most_steps) & jnp.isfinite(motion.u))
+
+    return jax.lax.while_loop(going, lambda moving: step(lanes, moving), motion)

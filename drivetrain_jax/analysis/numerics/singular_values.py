@@ -1,0 +1,237 @@
+"""Singular values of many small matrices at once, without LAPACK: matrices of shape ``(m, n, N)``, lanes last.
+
+Householder bidiagonalisation, then the implicit QR iteration on the bidiagonal matrix (Golub & Van Loan, Matrix
+Computations, 8.6; Demmel & Kahan, SIAM J. Sci. Stat. Comput. 11, 873, 1990). The singular values never pass through
+squares, so that small ones keep their digits beside large ones. Every lane works on its own unreduced block; the
+sweeps of all lanes run through the same instructions, which vectorise over the lanes.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from drivetrain_jax.analysis.numerics.lanes import evaluated_once
+
+EPS = float(np.finfo(float).eps)
+# Matrices are scaled to entries of order one; what is smaller than these has no influence on any digit.
+_TINY, _TINY_SQUARE = 1e-150, 1e-300
+# QR sweeps per singular value: less than two are needed on average, LAPACK allows six per value and column.
+_SWEEPS_PER_VALUE = 12
+# Each stage of the reduction works on the rows and columns that the ones before have left.
+_STAGE = 9
+# Terms of a sum that are added in one pass over the memory.
+_TERMS = 8
+
+
+class Bidiagonal(NamedTuple):
+    """Bidiagonal matrices with the singular values of ``scale`` times less: ``diagonal`` and ``upper`` (n, N), the last
+    entry of ``upper`` being zero; ``finite`` (N,) is false where the original had an entry that is not finite."""
+
+    diagonal: Array
+    upper: Array
+    scale: Array
+    finite: Array
+
+
+def singular_values(*blocks: Array) -> tuple[Array, Array]:
+    """Singular values of block-diagonal matrices: ``(n, N)`` rising, and whether every one was found, ``(N,)``.
+
+    ``blocks`` have shapes ``(m_i, n_i, N)`` with ``m_i >= n_i``; ``n`` is the sum of ``n_i``. Backward stable: errors
+    of the order of the rounding unit times the largest singular value. A lane with an entry that is not finite gives
+    NaN and does not hold up the others.
+    """
+    values, found = bidiagonal_values(bidiagonal_form(*blocks))
+    return jnp.sort(values, axis=0), found
+
+
+def bidiagonal_form(*blocks: Array) -> Bidiagonal:
+    """One bidiagonal matrix with the singular values of all ``blocks``, in the rows of each its own."""
+    size = jnp.max(jnp.stack([jnp.max(jnp.abs(block), axis=(0, 1)) for block in blocks]), axis=0)
+    # Said for every entry: a maximum need not carry NaN along.
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(block), axis=(0, 1)) for block in blocks]), axis=0)
+    scale = jnp.where(finite & (size > 0), size, 1.0)
+    pairs = [_bidiagonalise(jnp.where(finite, block / scale, 0.0)) for block in blocks]
+    return Bidiagonal(*(jnp.concatenate([pair[i] for pair in pairs]) for i in (0, 1)), scale, finite)
+
+
+def _reflector(x: Array, place: Array) -> tuple[Array, Array, Array, Array]:
+    """``v``, ``2/|v|^2``, the new leading entry of the reflection that clears ``x`` below its leading entry, and the
+    old one.
+
+    ``x`` (n, N) vanishes above the entry that ``place`` (n, 1) marks.
+    """
+    leading = jnp.sum(jnp.where(place, x, 0.0), axis=0)
+    square = jnp.sum(x * x, axis=0)
+    norm = jnp.sqrt(square)
+    new = jnp.where(leading > 0, -norm, norm)
+    half = square - leading * new
+    some = half > _TINY_SQUARE
+    return jnp.where(place, x - new, x), jnp.where(some, 1 / jnp.where(some, half, 1.0), 0.0), new, leading
+
+
+def _combination(weights: Array, a: Array, axis: int) -> Array:
+    """``sum_i weights[i] a[i]`` over the rows (``axis`` 0) or columns (1) of ``a`` (m, n, N), weights (m or n, N).
+
+    Some terms at a time: written as a sum of slices it vectorises over the lanes, which a reduction does not; all in
+    one expression would take long to compile.
+    """
+    count = a.shape[axis]
+    rest = count % _TERMS if count >= 2 * _TERMS else count
+
+    def term(i: Any) -> Array:
+        row = lax.dynamic_index_in_dim(weights, i, 0, keepdims=False)
+        return row * lax.dynamic_index_in_dim(a, i, axis, keepdims=False)
+
+    def add(group: Array, total: Array) -> Array:
+        return total + sum(term(rest + group * _TERMS + i) for i in range(_TERMS))
+
+    start = sum((term(i) for i in range(rest)), jnp.zeros((a.shape[1 - axis], a.shape[2])))
+    return lax.fori_loop(0, (count - rest) // _TERMS, add, start)
+
+
+def _reduce_row_and_column(k: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    """Clear column ``k`` below the diagonal and row ``k`` right of its neighbour, by one combined update."""
+    a, diagonal, upper = state
+    rows, columns, certain = jnp.arange(a.shape[0])[:, None], jnp.arange(a.shape[1])[:, None], k >= 0
+
+    def column() -> tuple[Array, ...]:
+        return _reflector(jnp.where(rows >= k, lax.dynamic_index_in_dim(a, k, 1, keepdims=False), 0.0), rows == k)
+
+    v, factor, new_diagonal, leading = evaluated_once(certain, column)
+    w = evaluated_once(certain, lambda: factor * _combination(v, a, 0))
+
+    # Once: where the row has nothing but rounding left, two evaluations of it would give two different reflections.
+    y = evaluated_once(
+        certain, lambda: lax.dynamic_index_in_dim(a, k, 0, keepdims=False) - (leading - new_diagonal) * w
+    )
+
+    def row() -> tuple[Array, ...]:
+        u, factor, new, _ = _reflector(jnp.where(columns > k, y, 0.0), columns == k + 1)
+        return u, factor, new, jnp.sum(w * u, axis=0)
+
+    u, factor_u, new_upper, across = evaluated_once(certain, row)
+    z = evaluated_once(certain, lambda: factor_u * (_combination(u, a, 1) - v * across))
+    a = a - v[:, None] * w - z[:, None] * u
+    diagonal = lax.dynamic_update_index_in_dim(diagonal, new_diagonal, k, 0)
+    return a, diagonal, lax.dynamic_update_index_in_dim(upper, new_upper, k, 0)
+
+
+def _bidiagonalise(a: Array) -> tuple[Array, Array]:
+    """Diagonal and upper diagonal, both ``(n, N)``, of a bidiagonal matrix with the singular values of ``a``.
+
+    ``a`` has shape ``(m, n, N)`` with ``m >= n``; the last entry of the upper diagonal is zero.
+    """
+    found = []
+    while a.shape[1]:
+        steps = min(_STAGE, a.shape[1])
+        zero = jnp.zeros((steps, a.shape[2]), a.dtype)
+        a, diagonal, upper = lax.fori_loop(0, steps, _reduce_row_and_column, (a, zero, zero))
+        found.append((diagonal, upper))
+        a = a[steps:, steps:]
+    diagonal, upper = (jnp.concatenate([pair[i] for pair in found]) for i in (0, 1))
+    return diagonal, upper.at[-1].set(0.0)
+
+
+def _smaller_value(f: Array, g: Array, h: Array) -> Array:
+    """The smaller singular value of [[f, g], [0, h]]."""
+    low, high = jnp.minimum(jnp.abs(f), jnp.abs(h)), jnp.maximum(jnp.abs(f), jnp.abs(h))
+    total = jnp.sqrt((high + low) ** 2 + g**2) + jnp.sqrt((high - low) ** 2 + g**2)
+    return 2 * low * (high / jnp.maximum(total, _TINY))
+
+
+def _rotation(f: Array, g: Array) -> tuple[Array, Array, Array]:
+    """``c``, ``s`` and ``r`` with [c, s; -s, c] (f, g) = (r, 0); the identity if both vanish."""
+    square = f * f + g * g + _TINY_SQUARE
+    inverse = lax.rsqrt(square)
+    return (f + _TINY) * inverse, g * inverse, square * inverse
+
+
+def _split(pairs: Array) -> tuple[Array, Array, Array]:
+    """Clear negligible upper entries; first and last row of the lowest unreduced block (both 0 if there is none).
+
+    Row ``j`` of ``pairs`` (n + 1, 2, N) holds the upper entry above the diagonal entry ``j``, and that entry.
+    """
+    upper, diagonal = pairs[1:, 0], jnp.abs(pairs[:, 1])
+    coupled = jnp.abs(upper) > EPS * (diagonal[:-1] + diagonal[1:])
+    # Row by row: a reduction over the rows would not vectorise over the lanes.
+    last = first = jnp.zeros(pairs.shape[-1], int)
+    for row in range(1, len(coupled) + 1):
+        last = jnp.where(coupled[row - 1], row, last)
+    for row in range(1, len(coupled)):
+        first = jnp.where(~coupled[row - 1] & (row < last), row, first)
+    cleared = jnp.stack([jnp.where(coupled, upper, 0.0), pairs[1:, 1]], axis=1)
+    return jnp.concatenate([pairs[:1], cleared]), first, last
+
+
+def _shifted_start(pairs: Array, first: Array, last: Array) -> Array:
+    """The leading entry of the first rotation: B^T B - shift^2 over its own first diagonal entry's root."""
+
+    def entry(column: int, row: Array) -> Array:
+        return jnp.take_along_axis(pairs[:, column], jnp.maximum(row, 0)[None], axis=0, mode="clip")[0]
+
+    shift = _smaller_value(entry(1, last - 1), entry(0, last), entry(1, last))
+    top = entry(1, first)
+    size = jnp.maximum(jnp.abs(top), _TINY)
+    # A shift without influence on the first rotation would only cost accuracy.
+    shift = jnp.where((shift / size) ** 2 < EPS, 0.0, shift)
+    return (size - shift) * (1 + shift / size) * jnp.where(top < 0, -1.0, 1.0)
+
+
+def _sweep(pairs: Array, first: Array, last: Array) -> Array:
+    """One implicit QR step in the block ``first..last`` of every lane (lanes without a block stay as they are)."""
+    start, lanes = _shifted_start(pairs, first, last), pairs.shape[-1]
+    begin, end = jnp.min(jnp.where(last > 0, first, pairs.shape[0] - 1)), jnp.max(last)
+
+    def row(array: Array, k: Any) -> Array:
+        return lax.dynamic_index_in_dim(array, k, 0, keepdims=False)
+
+    def step(k: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        swept, f, c, s, above, here = state
+        upper, below = row(pairs, k + 1)
+        inside, top = (k >= first) & (k < last), k == first
+        f, g, right = jnp.where(top, start, f), jnp.where(top, upper, s * upper), jnp.where(top, upper, c * upper)
+        c, s, r = _rotation(f, g)
+        above = jnp.where(inside & ~top, r, above)
+        g, f = s * below, c * here + s * right
+        right, corner = c * right - s * here, c * below
+        c, s, r = _rotation(f, g)
+        swept = lax.dynamic_update_index_in_dim(swept, jnp.stack([above, jnp.where(inside, r, here)]), k, 0)
+        f, corner = c * right + s * corner, c * corner - s * right
+        return swept, f, c, s, jnp.where(inside, f, upper), jnp.where(inside, corner, below)
+
+    above, here = row(pairs, begin)
+    zero = jnp.zeros(lanes)
+    # Read from one array and written to another: one for both would be copied in every step.
+    swept, _, _, _, above, here = lax.fori_loop(begin, end, step, (pairs, zero, zero, zero, above, here))
+    return lax.dynamic_update_index_in_dim(swept, jnp.stack([above, here]), end, 0)
+
+
+def bidiagonal_values(form: Bidiagonal) -> tuple[Array, Array]:
+    """Singular values ``(n, N)``, those of every block in its own rows but in no order, and whether all were found.
+
+    NaN in lanes where they were not, or that are not finite.
+    """
+    n, lanes = form.diagonal.shape
+    zero = jnp.zeros((1, lanes))
+    # An exact zero would hide the shift from the rows below it.
+    diagonal = jnp.where(jnp.abs(form.diagonal) < _TINY, _TINY, form.diagonal)
+    above = jnp.concatenate([zero, form.upper[:-1], zero])
+    pairs, first, last = _split(jnp.stack([above, jnp.concatenate([diagonal, zero])], axis=1))
+
+    def unfinished(state: tuple[Array, ...]) -> Array:
+        count, _, _, last = state
+        return (count < _SWEEPS_PER_VALUE * n) & jnp.any(last > 0)
+
+    def improve(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        count, pairs, first, last = state
+        return count + 1, *_split(_sweep(pairs, first, last))
+
+    _, pairs, _, last = lax.while_loop(unfinished, improve, (jnp.int32(0), pairs, first, last))
+    found = form.finite & (last == 0)
+    values = jnp.abs(pairs[:n, 1])
+    values = jnp.where(values < n * _TINY, 0.0, values) * form.scale
+    return jnp.where(found, values, jnp.nan), found

@@ -1,0 +1,1 @@
+"""Linear periodic systems: propagators, multipliers with their bound, forced orbits."""

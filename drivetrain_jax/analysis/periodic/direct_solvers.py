@@ -1,0 +1,79 @@
+"""The two solvers of a reduced periodic form: explicit, batched inside the state, and L-stable where that is cheaper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax.analysis._base import Solver
+from drivetrain_jax.analysis.numerics.lanes import in_blocks
+from drivetrain_jax.analysis.periodic.direct import Monodromy, direct_monodromy, stiffness_of
+from drivetrain_jax.analysis.periodic.floquet_effort import PANEL_COST, explicit_effort, implicit_effort
+from drivetrain_jax.analysis.periodic.propagator import (
+    EXPLICIT_ORDER,
+    IMPLICIT_ORDER,
+    LANES,
+    Propagator,
+    explicit_propagator,
+    implicit_propagator,
+)
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System
+
+Form = Callable[[FloquetModel], LinearPeriodic]
+Results = Callable[[FloquetModel, Monodromy], dict[str, Array]]
+
+
+def direct_solvers(
+    system: System, rtol: float, target: float, form: Form, results: Results, chunks: tuple[int, int] = (512, 64)
+) -> tuple[Solver, ...]:
+    """Solvers that give ``results(model, monodromy)`` from the monodromy matrix of ``form(model)``.
+
+    ``rtol`` predicts the effort, ``target`` is the error that every point is refined to.
+    """
+    solve = partial(_solve, system, target, form, results)
+    return (
+        Solver(
+            "direct: explicit Runge-Kutta of order 8",
+            lambda values, effort: solve(values, effort, True),
+            lambda columns: explicit_effort(system, columns, rtol),
+            broadcasts=True,
+            chunk=chunks[0],
+        ),
+        Solver(
+            "direct: Radau IIA of 8 stages",
+            lambda values, effort: solve(values, effort, False),
+            lambda columns: implicit_effort(system, columns, rtol),
+            unit_cost=PANEL_COST,
+            chunk=chunks[1],
+        ),
+    )
+
+
+def _solve(
+    system: System,
+    target: float,
+    form: Form,
+    results: Results,
+    values: Mapping[str, Any],
+    effort: Array,
+    explicit: bool,
+) -> dict[str, Array]:
+    model = system.models["floquet"].build(values)
+    periodic = form(model)
+    shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in values.values() if not isinstance(x, str)))
+
+    def in_lanes(steps: Array) -> Propagator:
+        def block(part: Mapping[str, Any], count: int) -> Propagator:
+            own = form(system.models["floquet"].build(part))
+            return explicit_propagator(own, steps, (count,) if shape else ())
+
+        return in_blocks(block, values, shape[0] if shape else 1, LANES)
+
+    propagate = in_lanes if explicit else partial(implicit_propagator, periodic)
+
+    order, stiffness = (EXPLICIT_ORDER, 0.0) if explicit else (IMPLICIT_ORDER, stiffness_of(periodic))
+    return results(model, direct_monodromy(periodic, propagate, effort, shape, stiffness, target, order))

@@ -1,0 +1,76 @@
+"""The propagator of a linear periodic system over the span of its reduced form: what an atlas interpolates.
+
+``Phi`` is a smooth function of the parameters, which multipliers and spectral radius are not. It is computed by the
+direct solvers of ``floquet`` with two step sizes; the error is relative to a lower bound of the spectral radius of Phi.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax._quantities import Dimension, Variable
+from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.periodic.direct import Monodromy
+from drivetrain_jax.analysis.periodic.direct_solvers import direct_solvers
+from drivetrain_jax.systems import LinearPeriodic, System
+
+# The result that an atlas interpolates.
+PROPAGATOR = "propagator"
+VARIABLES = (
+    Variable(PROPAGATOR, "1", "entries of the propagator over the span of the reduced form, by rows", ("entry",)),
+    Variable("propagator_error", "1", "estimate of its relative error"),
+)
+
+
+# An atlas asks for a hundred points at a time: large chunks would leave most lanes, and a core, without work.
+_CHUNKS = (64, 16)
+
+
+def whole_span(form: LinearPeriodic) -> LinearPeriodic:
+    """``form`` with its span taken for the period: the monodromy matrix is then the propagator itself."""
+    if form.reversor is None or form.log_determinant is None:
+        return replace(form, reversor=None)
+    exact = form.log_determinant
+    return replace(form, reversor=None, log_determinant=lambda: exact() / 2)
+
+
+def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+    rtol = request.options["rtol"]
+    return direct_solvers(
+        system,
+        rtol,
+        rtol,
+        lambda model: whole_span(model.reduced),
+        lambda model, phi: _results(phi, request.outputs),
+        _CHUNKS,
+    )
+
+
+def _results(phi: Monodromy, outputs: tuple[str, ...]) -> dict[str, Array]:
+    matrix, error, met = phi.matrix * jnp.exp(phi.log_scale), phi.error, phi.met
+    entries = matrix.reshape(-1, *matrix.shape[2:])
+    finite = jnp.all(jnp.isfinite(entries), axis=0)
+    outcome = jnp.where(finite, jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET), Outcome.NOT_FINITE)
+    results = {PROPAGATOR: jnp.where(finite, entries, jnp.nan), "propagator_error": jnp.where(finite, error, jnp.nan)}
+    return {name: results[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}
+
+
+def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    return (Dimension("entry", "row times size plus column", ()),)
+
+
+ANALYSIS = Analysis(
+    name="atlas",
+    title="Propagator of a linear periodic system, for its atlas",
+    variables=VARIABLES,
+    default_outputs=(PROPAGATOR, "propagator_error"),
+    methods={"direct": ("rtol",)},
+    options=(RTOL,),
+    solvers=_solvers,
+    dimensions=_dimensions,
+)

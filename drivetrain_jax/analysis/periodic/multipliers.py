@@ -1,0 +1,122 @@
+"""From a monodromy matrix to Floquet multipliers, a certified spectral radius and a verdict.
+
+The bound rests on the characteristic polynomial p(z) = det(z I - Z). Let its coefficients be wrong by at most
+``delta_k``, so that the true polynomial differs from the computed one by at most eps(z) = sum_k delta_k |z|^(n-k).
+By Rouche's theorem a circle on which |p| > eps encloses as many true as computed multipliers. Two families of circles
+bracket the spectral radius rho of the true matrix:
+
+- about the origin with radius rho + r: with s_i the multiplier nearest to z and d_i = rho + r - |s_i| <= |z - s_i|,
+  |p(z)| >= min_i d_i prod_(j != i) max(d_j, |s_i - s_j|/2), where |s_i - s_j| - d_i may replace half the gap if d_i is
+  below 1/32 of the smallest one (the product then grows with |z - s_i|). No true multiplier lies further out;
+- about the dominant multiplier s_1 with radius r, where |p(z)| >= r prod_(j != 1) ||s_1 - s_j| - r|: a true one lies inside.
+
+Near a double multiplier (the edge of every tongue) this gives the honest square root of the coefficients' error.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis.numerics.linear_algebra import matmul
+
+VERDICTS = ("stable", "unstable", "undecided")
+
+# Radii at which the circles are tried, relative to the spectral radius: four a decade from rounding up to 10, a little
+# below powers of ten, so that the rung that belongs to a decimal tolerance meets it.
+_LADDER = 0.99 * 10.0 ** (np.arange(-64, 5) / 4)
+
+
+def characteristic_coefficients(z: Array) -> Array:
+    """Coefficients a_1..a_n of det(s I - Z) = s^n + a_1 s^(n-1) + ..., ``(n, n, ...) -> (n, ...)``.
+
+    By the recursion of Faddeev and Le Verrier.
+    """
+    n = z.shape[0]
+    power, coefficients = z, []
+    for k in range(1, n + 1):
+        a = -sum(power[i, i] for i in range(n)) / k
+        coefficients.append(a)
+        if k < n:
+            power = matmul(z, power) + a * z
+    return jnp.stack(coefficients)
+
+
+def root_scale(coefficients: Array) -> Array:
+    """Lower bound of the largest modulus of the roots: max_k (|a_k| / binomial(n, k))^(1/k), ``(n, ...) -> (...)``."""
+    n = coefficients.shape[0]
+    terms = [(jnp.abs(coefficients[k - 1]) / math.comb(n, k)) ** (1 / k) for k in range(1, n + 1)]
+    return jnp.max(jnp.stack(terms), axis=0)
+
+
+def sort_multipliers(real: Array, imaginary: Array) -> Array:
+    """The multipliers ``real + i imaginary`` by falling modulus, ``(n, ...) -> (n, ...)`` complex.
+
+    Moduli that agree to 1e-9 count as equal and are put in rising order of the argument, so that a conjugate pair does
+    not change places with the last bits.
+    """
+    modulus = jnp.hypot(real, imaginary)
+    rank = jnp.round(-modulus / jnp.max(modulus, axis=0), 9)
+    order = jnp.lexsort((jnp.arctan2(imaginary, real), rank), axis=0)
+    return jnp.take_along_axis(real + 1j * imaginary, order, axis=0)
+
+
+def spectral_radius_bound(real: Array, imaginary: Array, error: Array) -> Array:
+    """Bound of the error of ``rho``, the largest modulus of the multipliers ``real + i imaginary``, ``(n, ...) -> (...)``.
+
+    ``error`` bounds the errors of the coefficients a_k in units of rho^k. The result is at least four roundings of rho,
+    and inf if no circle of the ladder is certified.
+    """
+    n = real.shape[0]
+    modulus = jnp.hypot(real, imaginary)
+    rho = jnp.max(modulus, axis=0)
+    modulus, x, y = modulus / rho, real / rho, imaginary / rho
+    gap = jnp.hypot(x[:, None] - x, y[:, None] - y)
+    closest = jnp.stack([jnp.min(jnp.delete(gap[i], i, axis=0), axis=0, initial=jnp.inf) for i in range(n)])
+    ladder = jnp.asarray(_LADDER)
+
+    def eps(r: Array) -> Array:
+        # Both circles lie within |z| <= 1 + r, where sum_k error |z|^(n-k) <= n error (1 + r)^(n-1).
+        return n * error * (1 + r) ** (n - 1)
+
+    def outside(r: Array) -> Array:
+        reach = 1 + r - modulus
+        margin = jnp.where((reach < closest / 32)[:, None], gap - reach[:, None], gap / 2)
+        products = [
+            reach[i] * math.prod(jnp.maximum(reach[j], margin[i, j]) for j in range(n) if j != i) for i in range(n)
+        ]
+        return jnp.min(jnp.stack(products), axis=0) > eps(r)
+
+    def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+        # The condition is monotone in r: bisection for the first rung that meets it.
+        low, high = bracket
+        middle = (low + high) // 2
+        met = outside(ladder[middle])
+        return jnp.where(met, low, middle), jnp.where(met, middle, high)
+
+    first = jnp.full(rho.shape, -1), jnp.full(rho.shape, ladder.size)
+    rung = jax.lax.fori_loop(0, math.ceil(math.log2(ladder.size)) + 1, halve, first)[1]
+    outer = jnp.where(rung < ladder.size, ladder[jnp.minimum(rung, ladder.size - 1)], jnp.inf)
+
+    x1, y1, top = x[0], y[0], modulus[0]
+    for j in range(1, n):
+        larger = modulus[j] > top
+        x1, y1, top = (jnp.where(larger, new, old) for new, old in ((x[j], x1), (y[j], y1), (modulus[j], top)))
+    # With the dominant multiplier's own distance, which is 0, the product over all j has the factor r.
+    distances = jnp.hypot(x - x1, y - y1)
+
+    def descend(k: int, inner: Array) -> Array:
+        r = ladder[ladder.size - 1 - k]
+        return jnp.where(math.prod(jnp.abs(distances[j] - r) for j in range(n)) > eps(r), r, inner)
+
+    inner = jax.lax.fori_loop(0, ladder.size, descend, jnp.full(rho.shape, jnp.inf))
+    return rho * (jnp.maximum(outer, inner) + 4 * np.finfo(float).eps)
+
+
+def verdict(rho: Array, error: Array) -> Array:
+    """0 stable, 1 unstable, 2 undecided: the interval ``rho +- error`` contains 1, or either is not a number."""
+    return jnp.where(rho + error < 1, 0, jnp.where(rho - error > 1, 1, 2)).astype(jnp.int8)

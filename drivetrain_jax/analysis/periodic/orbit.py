@@ -1,0 +1,223 @@
+"""Periodic orbits of forced systems: transition over a period and Newton shooting with continuation.
+
+Everything is for one point and follows the variational equations, never automatic differentiation through a solver.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax.analysis._base import Outcome
+from drivetrain_jax.analysis.numerics.linear_algebra import solve
+
+Field = Callable[[Any, Array], Array]
+
+MAX_STEPS = 65536
+# Absolute tolerance over relative tolerance, for unknowns of order one. Small, because components of one solution may
+# differ by the ratio of forcing and natural frequency.
+ATOL_RATIO = 1e-6
+# Shortest step over period: a field that is not finite is noticed at once instead of after MAX_STEPS rejections.
+STEP_RATIO = 1e-10
+
+MAX_CORRECTIONS = 300
+SHORTEST_STRIDE = 1e-5
+# Forcing reversed to this multiple: the path is not expected back.
+TURNED_AWAY = -1.0
+# A stride is kept if its first correction is below this part of it and the tangent turns by less than this cosine.
+FIRST_CORRECTION = 0.3
+TURN = 0.8
+# Last correction of an orbit on the way; looser ones leave no room for the strides that sharp bends need.
+WAYPOINT_GOAL = 1e-4
+WAYPOINT_RTOL = 1e-9
+# Corrections this small that no longer shrink have reached the limit of the arithmetic.
+STALLED = 1e-6
+
+
+class Transition(NamedTuple):
+    """State ``end`` (n,) after a period, its derivative ``matrix`` (n, n) by the start, and an ``Outcome``."""
+
+    end: Array
+    matrix: Array
+    outcome: Array
+
+
+class Orbit(NamedTuple):
+    """Periodic orbit: ``state`` (n,) at t = 0, transition ``matrix`` (n, n) about it, absolute ``error`` of the state
+    (its last Newton correction) and an ``Outcome``; ``corrections`` counts the Newton steps."""
+
+    state: Array
+    matrix: Array
+    error: Array
+    outcome: Array
+    corrections: Array
+
+
+def size_of(vector: Array) -> Array:
+    """Largest modulus of the entries, or 1 for the zero vector: the unit in which the vector is of order one."""
+    size = jnp.max(jnp.abs(vector))
+    return jnp.where(size > 0, size, 1.0)
+
+
+def in_units_of(size: Array, field: Field) -> Field:
+    """The field of ``y/size``."""
+    return lambda t, y: field(t, size * y) / size
+
+
+def variational(field: Field) -> Field:
+    """The field of ``[y, V]``, shape ``(n, 1 + m)``: columns ``V`` obey the variational equations V' = (df/dy) V."""
+
+    def lifted(t: Any, columns: Array) -> Array:
+        slope, push = jax.linearize(lambda y: field(t, y), columns[:, 0])
+        return jnp.concatenate([slope[:, None], jax.vmap(push, in_axes=1, out_axes=1)(columns[:, 1:])], axis=1)
+
+    return lifted
+
+
+def controller(period: float, rtol: Array | float) -> diffrax.PIDController:
+    """Step-size control of all integrations here, for unknowns of order one."""
+    return diffrax.PIDController(rtol=rtol, atol=ATOL_RATIO * rtol, dtmin=STEP_RATIO * period, force_dtmin=False)
+
+
+def integrate(field: Field, start: Array, period: float, rtol: Array | float) -> tuple[Array, Array]:
+    """State after one period from ``start`` at t = 0, by Dopri8 with error control, and an ``Outcome``."""
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, _: field(t, y)),
+        diffrax.Dopri8(),
+        0.0,
+        period,
+        None,
+        start,
+        stepsize_controller=controller(period, rtol),
+        adjoint=diffrax.ForwardMode(),
+        max_steps=MAX_STEPS,
+        throw=False,
+    )
+    end = solution.ys[-1]
+    limited = solution.result == diffrax.RESULTS.max_steps_reached
+    failed = (solution.result != diffrax.RESULTS.successful) | ~jnp.all(jnp.isfinite(end))
+    return end, jnp.where(limited, Outcome.STEP_LIMIT, jnp.where(failed, Outcome.NOT_FINITE, Outcome.SUCCESS))
+
+
+def transition(field: Field, start: Array, period: float, rtol: Array | float) -> Transition:
+    """Map over one period about ``start`` (entries of order one) and its derivative, by the variational equations."""
+    columns = jnp.concatenate([start[:, None], jnp.eye(start.size)], axis=1)
+    end, outcome = integrate(variational(field), columns, period, rtol)
+    return Transition(end[:, 0], end[:, 1:], outcome)
+
+
+def newton_step(step: Transition, start: Array) -> Array:
+    """Newton correction of ``start`` towards the fixed point of the map: ``(I - Z)^-1 (end - start)``."""
+    return solve(jnp.eye(start.size) - step.matrix, (step.end - start)[:, None])[:, 0]
+
+
+class _Path(NamedTuple):
+    """State of the loop of :func:`shoot`, points being ``x = (y, lambda)``, shape (n + 1,).
+
+    ``waypoint`` and ``tangent`` are the last orbit found and the direction of the path there, ``stride`` the length to
+    go, ``last`` whether that leads to lambda = 1; ``point`` is the iterate, ``correction`` its last change, ``count``
+    the number of changes since the prediction.
+    """
+
+    waypoint: Array
+    tangent: Array
+    stride: Array
+    last: Array
+    point: Array
+    correction: Array
+    count: Array
+    total: Array
+    matrix: Array
+    found: Array
+
+
+def shoot(field: Field, response: Array, period: float, rtol: float) -> Orbit:
+    """Periodic orbit of ``y' = field(t, y)`` on the path from rest along growing forcing (errors: ``Outcome`` only).
+
+    The orbits of ``y' = field(t, y) - (1 - lambda) field(t, 0)`` form a path (y, lambda) that starts at (0, 0) in the
+    direction ``(response, 1)``, where ``response`` (n,) is the periodic solution of the forced linear system. It is
+    followed by its arc length, hence around folds, until it meets lambda = 1; the first stride leads there at once
+    where the response is small. Newton's method corrects each prediction. A stride is halved when the first
+    correction is not small against it, a later one exceeds half the previous one or the path turns, so that neither
+    another path nor a wild initial state is reached. An orbit that is not on this path is not found. States should be
+    of order one.
+    """
+    n = response.size
+
+    def extended(t: Any, x: Array) -> Array:
+        slope = field(t, x[:n]) - (1 - x[n]) * field(t, jnp.zeros(n))
+        return jnp.append(slope, 0.0)
+
+    def running(s: _Path) -> Array:
+        onwards = (s.last | (s.stride >= SHORTEST_STRIDE)) & (s.waypoint[n] > TURNED_AWAY)
+        return ~s.found & onwards & (s.total < MAX_CORRECTIONS)
+
+    def correct(s: _Path) -> _Path:
+        step = transition(extended, s.point, period, jnp.where(s.last, rtol, WAYPOINT_RTOL))
+        # Either lambda is fixed at 1, or the correction is normal to the path.
+        constraint = jnp.where(s.last, jnp.zeros(n + 1).at[n].set(1.0), s.tangent)
+        system = (jnp.eye(n + 1) - step.matrix).at[n].set(constraint)
+        sides = jnp.stack([(step.end - s.point).at[n].set(0.0), jnp.zeros(n + 1).at[n].set(1.0)], axis=1)
+        delta, direction = solve(system, sides).T
+        return _judge(s, delta, direction / jnp.linalg.norm(direction), step, rtol)
+
+    ahead = jnp.append(response, 1.0)
+    tangent = ahead / jnp.linalg.norm(ahead)
+    stride = jnp.minimum(1 / tangent[n], 1.0 + jnp.sqrt(1.0 * n))
+    first = _predict(jnp.zeros(n + 1), tangent, stride, jnp.zeros((), int), jnp.full((n, n), jnp.nan))
+    s = jax.lax.while_loop(running, correct, first)
+    outcome = jnp.where(s.found, Outcome.SUCCESS, Outcome.NOT_CONVERGED)
+    return Orbit(s.point[:n], s.matrix, s.correction, outcome, s.total)
+
+
+def _predict(waypoint: Array, tangent: Array, stride: Array, total: Array, matrix: Array) -> _Path:
+    """A new stride, not beyond lambda = 1."""
+    left = 1 - waypoint[-1]
+    # A stride that would all but reach lambda = 1 goes there.
+    last = stride * tangent[-1] >= (1 - 1e-6) * left
+    stride = jnp.where(last, left / jnp.where(last, tangent[-1], 1.0), stride)
+    point = waypoint + stride * tangent
+    # On the last stride lambda is 1 exactly, whatever the rounding.
+    point = point.at[-1].set(jnp.where(last, 1.0, point[-1]))
+    return _Path(
+        waypoint,
+        tangent,
+        stride,
+        last,
+        point,
+        2 * FIRST_CORRECTION * stride,
+        jnp.zeros((), int),
+        total,
+        matrix,
+        jnp.array(False),
+    )
+
+
+def _judge(s: _Path, delta: Array, direction: Array, step: Transition, rtol: float) -> _Path:
+    """What follows a correction: another one, the next stride, or a shorter one."""
+    point = s.point + delta
+    change = jnp.max(jnp.abs(delta))
+    shrinking = (change <= 0.5 * s.correction) & (direction @ s.tangent >= TURN)
+    sound = (step.outcome == Outcome.SUCCESS) & jnp.isfinite(change)
+    relative = change / size_of(point[:-1])
+    settled = (relative <= rtol) | ((relative <= STALLED) & ~(change <= 0.1 * s.correction))
+    close = sound & jnp.where(s.last, settled, shrinking & (change <= WAYPOINT_GOAL))
+    n = point.size - 1
+    total, matrix = s.total + 1, step.matrix[:n, :n]
+    # A waypoint beyond lambda = 1 is not kept: it only corrects the direction in which lambda = 1 is sought.
+    beyond = point[n] >= 1
+    secant = (point - s.waypoint) / jnp.linalg.norm(point - s.waypoint)
+    waypoint = jnp.where(close & ~beyond, point, s.waypoint)
+    tangent = jnp.where(close, jnp.where(beyond, secant, direction), s.tangent)
+    stride = jnp.where(close, jnp.where(s.count <= 2, 2.0, 1.0), 0.5) * s.stride
+    restart = _predict(waypoint, tangent, stride, total, matrix)
+    onwards = s._replace(
+        point=point, correction=change, count=s.count + 1, total=total, matrix=matrix, found=close & s.last
+    )
+    again = (close & ~s.last) | ~(close | (sound & shrinking))
+    return jax.tree.map(lambda new, same: jnp.where(again, new, same), restart, onwards)

@@ -1,0 +1,1 @@
+"""Stepped shafts: transfer matrices, certified roots, mode shapes."""

@@ -1,0 +1,1 @@
+"""Modes of discrete systems: types, tracking, gradients."""

@@ -1,0 +1,116 @@
+"""Natural frequencies as a differentiable function, with derivatives in closed form.
+
+With the mass-normalised mode u of frequency f the derivative with respect to any parameter is
+
+    df = u^T (dK - (2 pi f)^2 dM) u / (8 pi^2 f),      for a stiffness:  df/dk_j = (b_j^T u)^2 / (8 pi^2 f),
+
+evaluated spring by spring, so that no stiffness matrix is formed. Frequencies that form a cluster have no derivatives
+of their own: a change of the parameters splits them along the eigenvalues of the matrix u_i^T (dK - (2 pi f)^2 dM) u_j,
+which :func:`directional_derivatives` gives for one direction. What is linear in the direction, and therefore a
+gradient, is their mean: :func:`natural_frequencies` gives every member of a cluster the derivative of the cluster's
+mean.
+
+>>> import jax, drivetrain_jax.systems.planetary as planetary
+>>> from drivetrain_jax.analysis.spectra.mode_gradients import natural_frequencies
+>>> p = {q.name: q.default for q in planetary.PARAMETERS}
+>>> jax.grad(lambda k: natural_frequencies(planetary.build, p | {"k_p": k})[1])(1e8)     # Hz per N/m   # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis.modes import largest_frequency, system_modes
+from drivetrain_jax.analysis.numerics.lanes import lane_count
+from drivetrain_jax.analysis.numerics.singular_vectors import jacobi_vectors, product
+from drivetrain_jax.analysis.spectra.mode_types import CLUSTER, clusters, is_rigid
+from drivetrain_jax.systems import SpringSystem
+
+Build = Callable[[Mapping[str, Any]], SpringSystem]
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def natural_frequencies(build: Build, values: Mapping[str, Any]) -> Array:
+    """Natural frequencies in Hz, rising, ``(n,)``, or ``(n, N)`` if some of ``values`` have shape ``(N,)``.
+
+    ``build`` makes the spring system from ``values`` (for the planetary gear ``planetary.build`` and all its
+    parameters, ``planet_angle`` a tuple). Differentiable forwards and backwards with respect to every value;
+    derivatives of clusters are those of their mean, that of a rigid mode is zero. NaN where a value is not finite.
+    """
+    return _frequencies_and_vectors(build, values)[0]
+
+
+@natural_frequencies.defjvp
+def _jvp(build: Build, primals: tuple[Any], tangents: tuple[Any]) -> tuple[Array, Array]:
+    (values,), (directions,) = primals, tangents
+    frequency, vectors, still = _frequencies_and_vectors(build, values)
+    _, squares = jax.jvp(lambda p: _in_vectors(build(p), vectors), (values,), (directions,))
+    near = _near(frequency)
+    mean = jnp.sum(near * squares[None], axis=1) / jnp.sum(near, axis=1)
+    return frequency, _per_frequency(mean, frequency, still)
+
+
+def directional_derivatives(build: Build, values: Mapping[str, Any], directions: Mapping[str, Any]) -> Array:
+    """Derivatives in Hz of all natural frequencies along one direction, of the shape of the frequencies.
+
+    ``directions`` has the structure of ``values``. In a cluster: the derivatives of the branches that leave it in this
+    direction, rising.
+    """
+    frequency, vectors, still = _frequencies_and_vectors(build, values)
+    lanes = vectors if vectors.ndim == 3 else vectors[:, :, None]
+    near = _near(frequency if frequency.ndim == 2 else frequency[:, None])
+    _, matrix = jax.jvp(lambda p: _in_vectors(build(p), vectors, mixed=True), (dict(values),), (dict(directions),))
+    matrix = jnp.where(near, matrix.reshape(*near.shape), 0.0)
+    # Made positive, its singular vectors are its eigenvectors.
+    lift = jnp.sqrt(jnp.sum(matrix**2, axis=(0, 1)))
+    turned, _ = jacobi_vectors(matrix + lift * jnp.eye(lanes.shape[1])[:, :, None])
+    slopes = jnp.sum(turned * product(matrix, turned), axis=0)
+    number = jnp.argmax(near, axis=1)
+    order = jnp.lexsort((slopes, number), axis=0)
+    slopes = jnp.take_along_axis(slopes, order, axis=0).reshape(frequency.shape)
+    return _per_frequency(slopes, frequency, still)
+
+
+@partial(jax.jit, static_argnums=0)
+def _frequencies_and_vectors(build: Build, values: Mapping[str, Any]) -> tuple[Array, Array, Array]:
+    """Frequencies in Hz (n, ...), mass-weighted vectors (dofs, n, ...) and which modes are rigid (n, ...)."""
+    model, lanes = build(values), lane_count(values)
+    modes = system_modes(model, "auto", lanes)
+    frequency = jnp.where(modes.found, modes.frequency / (2 * math.pi), jnp.nan)
+    still = is_rigid(modes.frequency, largest_frequency(model, lanes))
+    single = all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(dict(values)))
+    results = (frequency, modes.vectors, still)
+    return tuple(x[..., 0] for x in results) if single else results
+
+
+def _in_vectors(model: SpringSystem, vectors: Array, mixed: bool = False) -> Array:
+    """``v^T M^(-1/2) K M^(-1/2) v`` of the columns (n, ...), or of all pairs of them (n, n, ...)."""
+    lanes = vectors.shape[2:]
+
+    def fit(array: Array) -> Array:
+        return array.reshape(*array.shape, *(1,) * (1 + len(lanes) - array.ndim))
+
+    shapes = vectors / jnp.sqrt(fit(model.mass))[:, None]
+    extensions = model.extensions.reshape(*model.extensions.shape, *(1,) * (2 + len(lanes) - model.extensions.ndim))
+    stretched = jnp.sum(extensions[:, :, None] * shapes[None], axis=1)
+    weighted = fit(model.stiffness)[:, None] * stretched
+    if mixed:
+        return jnp.sum(stretched[:, :, None] * weighted[:, None], axis=0)
+    return jnp.sum(stretched * weighted, axis=0)
+
+
+def _near(frequency: Array) -> Array:
+    return clusters(frequency, CLUSTER * frequency[1:] + jnp.finfo(float).eps * frequency[-1:])
+
+
+def _per_frequency(squares: Array, frequency: Array, still: Array) -> Array:
+    """``df`` from ``d (2 pi f)^2``; a rigid mode stays where it is."""
+    return jnp.where(still, 0.0, squares / (8 * math.pi**2 * jnp.where(still, 1.0, frequency)))
