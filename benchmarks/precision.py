@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.timing import RESULTS, interleaved, median, parser, results_folder, write_csv
 
-ONCE_ABOVE = 5.0
+ONCE_ABOVE = 1.0
 # Global errors of a tolerance per step are commonly ten to some hundred tolerances.
 PATIENCE = 1e3
 # What a method without a tolerance (a number of steps) must reach at its finest setting, or say that it did not.
@@ -193,7 +193,7 @@ def study(name: str, doc: str, contenders: Contenders, argv: Sequence[str] | Non
     from benchmarks.precision_figure import draw
 
     known = parser(doc)
-    known.add_argument("--repeats", type=int, default=5)
+    known.add_argument("--repeats", type=int, default=3)
     options = known.parse_args(argv)
     folder = results_folder(options)
     given, notes = contenders(options.quick)

@@ -123,3 +123,21 @@ def test_torus_residual_sees_noise():
     clean, noisy = np.asarray(torus_residual(jnp.asarray(states), jnp.asarray(angle)))
     assert clean < 1e-12
     assert 1e-4 < noisy < 1e-2
+
+
+def test_a_parameter_of_the_field_may_vary():
+    """What the marches for the section and for its error read is then the same array, and the compiler is given it once."""
+    others = {name: value for name, value in FIXED.items() if name != "zeta"}
+    scene = {
+        "system": "tripod",
+        "analysis": "poincare",
+        "outputs": ["section"],
+        "axes": {"zeta": {"start": 0.01, "stop": 0.02, "num": 8}},
+        "fixed": others | {"excitation_frequency": 3066.5},
+    }
+    fixed = dt.run(scene | {"options": {"strobes": 128, "discard": 0, "steps": 24}})
+    pair = dt.run(
+        scene | {"options": {"method": "adaptive", "strobes": 128, "discard": 0, "rtol": 1e-11, "atol": 1e-15}}
+    )
+    assert (fixed.outcome == Outcome.SUCCESS).all()
+    np.testing.assert_allclose(fixed.section, pair.section, rtol=0, atol=1e-7 * float(abs(pair.section).max()))
