@@ -38,8 +38,8 @@ class Study:
 
 
 STUDIES = (
-    Study("throughput", "cardan", "heyoka"),
-    Study("precision_cardan", "cardan"),
+    Study("throughput", "cardan", "heyoka", full=("--repeats", "3")),
+    Study("precision_cardan", "cardan", full=("--repeats", "1")),
     Study("work_precision", "cardan"),
     Study("atlas", "cardan", "heyoka", full=("--repeats", "1")),
     Study("peers", "cardan", "heyoka"),
