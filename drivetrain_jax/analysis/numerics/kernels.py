@@ -9,12 +9,9 @@ not know them ignores them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any, ParamSpec, TypeVar
 
 import jax
-import jax.numpy as jnp
-from jax import Array
 from jax.experimental.xla_metadata import set_xla_metadata
 
 from drivetrain_jax.store.provenance import instruction_set
@@ -59,29 +56,9 @@ def stored(function: Callable[P, R]) -> Callable[P, R]:
 def in_one_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """``function``, loops and all, as a single kernel: for batches that fit into the innermost cache.
 
-    Everything in it has to pass :func:`suits_one_kernel`. What it is given, by arguments or by values of an outer trace,
-    is handed over as one array for each size: a kernel that is given one piece of memory twice, as equal values may be,
-    makes the compiler of jax 0.10.2 abort the process.
+    Everything in it has to pass :func:`suits_one_kernel`.
     """
-
-    def packed(*arguments: Any) -> Any:
-        closed, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
-        run = partial(jax.core.eval_jaxpr, closed.jaxpr)
-        arrays = [jnp.asarray(x) for x in (*closed.consts, *jax.tree.leaves(arguments))]
-        places: dict[Any, list[int]] = {}
-        for place, array in enumerate(arrays):
-            places.setdefault((array.size, array.dtype), []).append(place)
-        packs = [jnp.stack([arrays[i].ravel() for i in group]) for group in places.values()]
-
-        def unpacked(*packs: Array) -> list[Array]:
-            rows = {i: row for group, pack in zip(places.values(), packs, strict=True)
-                    for i, row in zip(group, pack, strict=True)}  # fmt: skip
-            values = [rows[i].reshape(array.shape) for i, array in enumerate(arrays)]
-            return run(values[: len(closed.consts)], *values[len(closed.consts) :])
-
-        return jax.tree.unflatten(jax.tree.structure(shapes), _marked(unpacked, _ONE_KERNEL)(*packs))
-
-    return packed
+    return _marked(function, _ONE_KERNEL)
 
 
 def suits_one_kernel(function: Callable[..., Any], *arguments: Any) -> bool:
