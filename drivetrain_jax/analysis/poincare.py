@@ -60,9 +60,7 @@ Section = tuple[Array, Array]
 def fixed_section(flow: Flow, request: Request) -> Section:
     """States at the strobes, shape ``(strobes, n, ...)``, and the outcome, by equal steps."""
     steps, first = request.options["steps"], request.options["discard"]
-    # Hidden from the compiler: it would see that nothing is discarded, that components of the state are the same zeros,
-    # and abort the process where one kernel is given one piece of memory twice (jax 0.10.2).
-    state = discarded(flow, steps, jax.lax.optimization_barrier(jnp.int64(first)))
+    state = discarded(flow, steps, jnp.int64(first))
     states, _ = sampled(flow, steps, state, jnp.int64(first), request.options["strobes"])
     return states, jnp.full(states.shape[2:], Outcome.SUCCESS, jnp.int8)
 

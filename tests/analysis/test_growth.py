@@ -97,6 +97,18 @@ def test_marked_functions_compute_what_they_are():
         assert jnp.array_equal(jax.jit(mark(lambda x: jnp.where(x > 0.5, x * 2, x)))(x), jnp.where(x > 0.5, x * 2, x))
 
 
+@pytest.mark.parametrize("start", [(jnp.sin, jnp.cos), (jnp.sin, jnp.sin), (jnp.zeros_like, jnp.zeros_like)])
+def test_a_kernel_may_take_no_steps(start):
+    """That its loop does nothing is hidden from the compiler, which aborted the process over it."""
+
+    def march(x, y, z, steps):
+        return jax.lax.fori_loop(0, steps, lambda _, state: (state[0] + z, state[1] * z), (x, y))
+
+    x = jnp.linspace(0.1, 1.0, 8)
+    ends = jax.jit(lambda x: in_one_kernel(march)(start[0](x), start[1](x), 2 * x, 0))(x)
+    np.testing.assert_allclose(ends, [begin(x) for begin in start], rtol=1e-15)
+
+
 def test_a_field_that_sorts_does_without_the_single_kernel():
     """Its operations cannot be part of one: it is slower, and no less right."""
     plain = flows.linear(np.full(3, 0.2), np.ones(3))

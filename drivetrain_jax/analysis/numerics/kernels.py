@@ -56,9 +56,14 @@ def stored(function: Callable[P, R]) -> Callable[P, R]:
 def in_one_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """``function``, loops and all, as a single kernel: for batches that fit into the innermost cache.
 
-    Everything in it has to pass :func:`suits_one_kernel`.
+    Everything in it has to pass :func:`suits_one_kernel`, and a number of steps that may be zero has to be an argument:
+    XLA aborts the process over a kernel whose loop it sees to do nothing (jax 0.10.2). What the arguments are is hidden
+    from it.
     """
-    return _marked(function, _ONE_KERNEL)
+    if jax.default_backend() != "cpu":
+        return function
+    kernel = _marked(function, _ONE_KERNEL)
+    return lambda *arguments: kernel(*jax.lax.optimization_barrier(arguments))
 
 
 def suits_one_kernel(function: Callable[..., Any], *arguments: Any) -> bool:
