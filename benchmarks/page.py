@@ -87,7 +87,9 @@ _METHOD = (
     "Each region is one point of the parameter space, and neighbours of it. `holds`: an error of at most "
     f"{GOAL:g} is reached, and every tolerance kept within a factor of 1,000 or the miss said. `degrades`, `fails`: it is "
     "not, and the user learns of it by what stands in the cell. **SILENT**: wrong by more than 1,000 times the tolerance "
-    "asked for, or lost, and nothing says so. Methods whose name starts with `package` are those of this package."
+    "asked for (or by a tenth), or lost, and nothing says so. A number of steps promises nothing: of such a method only the "
+    "finest setting can be silent, by a tenth. In brackets after `holds`: what the coarser settings say of themselves. `-`: "
+    "not tried there, or no answer. Methods whose name starts with `package` are those of this package."
 )
 
 

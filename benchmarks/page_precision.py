@@ -9,6 +9,8 @@ from pathlib import Path
 from benchmarks.precision import GOAL, Judgement, Rung, judge, read
 from benchmarks.results_files import markdown, not_measured, seconds, small, times
 
+# Times that differ by less are not told apart from one run to the next.
+_LEVEL = 1.05
 # Methods that a user of the package can choose; all others are rivals.
 OWN = "package"
 TITLES = {
@@ -67,7 +69,7 @@ def conclusions(found: dict[str, Precision]) -> list[str]:
 
 
 def _winners(precision: Precision) -> str:
-    won, lost, alone, nobody = [], [], [], []
+    won, level, lost, alone, nobody = [], [], [], [], []
     for region in precision.regions:
         own, rival = precision.fastest(region, True), precision.fastest(region, False)
         if own is None and rival is None:
@@ -78,13 +80,16 @@ def _winners(precision: Precision) -> str:
             lost.append(f"{region} ({rival.method} alone reaches it)")
         else:
             ratio = rival.seconds_per_point / own.seconds_per_point
-            if ratio >= 1:
+            if 1 / _LEVEL < ratio < _LEVEL:
+                level.append(f"{region} ({rival.method})")
+            elif ratio > 1:
                 won.append(f"{region} ({times(ratio)} times as fast as {rival.method})")
             else:
                 lost.append(f"{region} ({rival.method} is {times(1 / ratio)} times as fast)")
     parts = [
         f"fastest in {', '.join(won)}" if won else "",
         f"alone in reaching it: {', '.join(alone)}" if alone else "",
+        f"level within {_LEVEL - 1:.0%} in {', '.join(level)}" if level else "",
         f"**behind** in {', '.join(lost)}" if lost else "",
         f"nobody reaches it: {', '.join(nobody)}" if nobody else "",
     ]

@@ -140,12 +140,14 @@ def _constant(solver: str, count: int) -> Callable[[Columns, float], Any]:
     import diffrax
     import jax
     import jax.numpy as jnp
+    import optimistix
 
     from drivetrain_jax.analysis.periodic.monodromy import state_transition
     from drivetrain_jax.systems.cardan import linear_rows
 
-    # Without a controller to take tolerances from, the root finder of an implicit scheme needs its own.
-    settings = {"root_finder": diffrax.VeryChord(rtol=1e-12, atol=1e-14)} if solver == IMPLICIT else {}
+    # Without a controller to take tolerances from, the root finder of an implicit scheme needs its own. diffrax's usual
+    # one, a chord method, gives up at these: its slope is that of another time.
+    settings = {"root_finder": optimistix.Newton(rtol=1e-10, atol=1e-12)} if solver == IMPLICIT else {}
 
     def one(values: Mapping[str, Any], step: Any) -> Any:
         def field(t: Any, y: Any) -> Any:

@@ -18,8 +18,8 @@ import xarray as xr
 
 import drivetrain_jax
 from drivetrain_jax import InputError
-from drivetrain_jax._progress import progress_line
 from drivetrain_jax.analysis import Outcome
+from drivetrain_jax.cli.progress import progress_line
 from drivetrain_jax.store.consolidate import open_result
 from drivetrain_jax.sweep.atlas_chart import chart
 from drivetrain_jax.sweep.run import Incomplete, run_to_file

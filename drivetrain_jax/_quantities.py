@@ -56,6 +56,11 @@ class Parameter:
             return f"{kind}{left}{self.name}{listed}{right}{either}"
         return f"{self.name} is a finite {kind or 'number'}".rstrip()
 
+    @property
+    def allowed_in_units(self) -> str:
+        """The same with the unit: a number that is out of range was often meant in another one."""
+        return self.allowed if self.units == "1" else f"{self.allowed}, in {self.units}"
+
     def check(self, value: object) -> float | int | str | tuple[float, ...]:
         """Return ``value`` in its stored type, or raise ``ValueError`` with one line that names the range."""
         if self.choices:
@@ -81,9 +86,7 @@ class Parameter:
         above = value >= self.upper if self.open_upper else value > self.upper
         finite = math.isfinite(value) or (self.infinite and value == math.inf)
         if not finite or below or above or (self.integer and value != int(value)):
-            # A number that is out of range was often meant in another unit.
-            unit = "" if self.units == "1" else f", in {self.units}"
-            raise ValueError(f"{label} = {value!r}: allowed is {self.allowed}{unit}")
+            raise ValueError(f"{label} = {value!r}: allowed is {self.allowed_in_units}")
         return int(value) if self.integer else float(value)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import drivetrain_jax
 from benchmarks.page import PAGE, text_of
 from benchmarks.precision import Contender, Judged, Rung, judge, measure, read, write
 from benchmarks.timing import RESULTS
@@ -80,7 +81,7 @@ def test_exceptions_and_warnings_are_how_a_user_notices(tmp_path):
 
 
 def test_bench_outside_a_checkout_is_one_line(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(cli, "__file__", str(tmp_path / "drivetrain_jax" / "cli.py"))
+    monkeypatch.setattr(drivetrain_jax, "__file__", str(tmp_path / "drivetrain_jax" / "__init__.py"))
     assert cli.main(["bench", "--quick"]) == 2
     message = capsys.readouterr().err
     assert message.count("\n") == 1 and "benchmarks/" in message

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from drivetrain_jax.atlas.construction import Domain, Rounds, construct, run
 from drivetrain_jax.atlas.evaluation import values_at
-from drivetrain_jax.atlas.floquet import floquet_domain, floquet_rounds, solve_rtol, stability_atlas
+from drivetrain_jax.atlas.floquet import floquet_domain, floquet_rounds, prepare_judging, solve_rtol, stability_atlas
 from drivetrain_jax.atlas.panels import Atlas, Gap, Panel
 from drivetrain_jax.atlas.quantity import Quantity
 from drivetrain_jax.atlas.stability import StabilityAtlas
@@ -30,6 +30,7 @@ __all__ = [
     "floquet_domain",
     "floquet_rounds",
     "from_arrays",
+    "prepare_judging",
     "run",
     "solve_rtol",
     "stability_atlas",

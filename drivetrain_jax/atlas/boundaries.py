@@ -133,10 +133,10 @@ def _finish(criteria: Criteria, patches: Patches, field: Field, kind: str, curve
     """Polish the points of a curve with the multiplier itself and attach bounds."""
     atlas = criteria.atlas
     x, error = _polish(criteria, field, kind, curve.points)
-    _, gradient = field(field.to_unit(x))
+    value, gradient = field(field.to_unit(x))
     place = patches.locate(x)[0]
     with np.errstate(all="ignore"):
-        fallback = (patches.error[place] / np.abs(gradient.T)).T * (field.upper - field.lower)
+        fallback = ((patches.error[place] + np.abs(value)) / np.abs(gradient.T)).T * (field.upper - field.lower)
     error = np.where(np.isfinite(error), error, fallback)
     point = parameters_at(atlas, x)
     slope = np.stack([np.abs(c.slope(point[:, k])) for k, c in enumerate(atlas.coordinates)], axis=-1)

@@ -19,8 +19,9 @@ from jax import Array
 
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.numerics.kernels import compiler_options
+from drivetrain_jax.analysis.periodic import quartic
 from drivetrain_jax.analysis.periodic.multipliers import verdict as verdict_of
-from drivetrain_jax.atlas import conservative, quartic
+from drivetrain_jax.atlas import conservative
 from drivetrain_jax.atlas.floquet_quantity import Build
 from drivetrain_jax.atlas.interpolation import nodes
 from drivetrain_jax.atlas.panels import Panel, chebyshev

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+
+import numpy as np
 
 from drivetrain_jax.atlas.construction import MAX_SOLVES, Domain, Rounds, construct
 from drivetrain_jax.atlas.floquet_quantity import floquet_quantity
-from drivetrain_jax.atlas.panels import Atlas
+from drivetrain_jax.atlas.panels import Atlas, Panel
 from drivetrain_jax.atlas.stability import StabilityAtlas
-from drivetrain_jax.systems import Smoothness, System
+from drivetrain_jax.systems import LinearPeriodic, Smoothness, System
 
 # Direct solves are to be this much better than the atlas, as far as rounding allows.
 _SHARPER, _FINEST = 1e-2, 1e-13
@@ -45,9 +47,45 @@ def floquet_rounds(
     ``rtol = solve_rtol(tolerance)``.
     """
     domain = floquet_domain(system, ranges, fixed)
+    return construct(domain, floquet_quantity(_form(system, domain)), tolerance, max_solves=max_solves)
+
+
+def prepare_judging(
+    system: System,
+    ranges: Mapping[str, tuple[float, float]],
+    fixed: Mapping[str, float],
+    rtol: float,
+    outputs: Sequence[str],
+) -> None:
+    """Compile what judges single cells of :func:`stability_atlas`, by evaluating an atlas that is zero.
+
+    It takes seconds, in which the solves for the real one can be compiled and made on the other cores.
+    """
+    domain = floquet_domain(system, ranges, fixed)
+    middle = [(a + b) / 2 for a, b in zip(domain.lower, domain.upper, strict=True)]
+    quantity = floquet_quantity(_form(system, domain))
+    nothing = np.zeros((1, quantity.size))
+    box = domain.box()
+    panel = Panel(
+        box.lower, box.upper, nothing.reshape(*[1] * len(middle), -1), 0.0, np.zeros_like(quantity.derived(nothing)[0])
+    )
+    zero = Atlas(
+        parameters=domain.parameters,
+        coordinates=domain.coordinates,
+        lower=np.array(domain.lower),
+        upper=np.array(domain.upper),
+        fixed=domain.fixed,
+        panels=(panel,),
+        gaps=(),
+        tolerance=0.0,
+        solves=0,
+    )
+    stability_atlas(zero, system, rtol).by_eigenvalues(np.array([middle]), tuple(outputs))
+
+
+def _form(system: System, domain: Domain) -> LinearPeriodic:
     middle = {name: (a + b) / 2 for name, a, b in zip(domain.parameters, domain.lower, domain.upper, strict=True)}
-    form = system.models["floquet"].build({**fixed, **middle}).reduced
-    return construct(domain, floquet_quantity(form), tolerance, max_solves=max_solves)
+    return system.models["floquet"].build({**domain.fixed, **middle}).reduced
 
 
 def stability_atlas(atlas: Atlas, system: System, rtol: float) -> StabilityAtlas:

@@ -64,7 +64,8 @@ def judge(
     matrix = phi.reshape(n, n, -1)
     z = assemble(form, matrix)
     a = characteristic_coefficients(z)
-    rho = jnp.max(jnp.hypot(*eigenvalues(z)), axis=0)
+    spectrum = eigenvalues(z)
+    rho = jnp.max(jnp.hypot(*spectrum), axis=0)
     relative = jnp.max(jnp.stack([errors[k] / rho ** (k + 1) for k in range(errors.shape[0])]), axis=0)
     residual = jnp.zeros_like(rho)
     if form.log_determinant is not None:
@@ -73,4 +74,4 @@ def judge(
     halves = 1 if form.reversor is None else 2
     rounding = 4 * np.finfo(float).eps * jnp.sum(matrix**2, axis=(0, 1)) ** (halves / 2) / rho
     monodromy = Monodromy(z, jnp.zeros_like(rho), relative + rounding, relative <= 10 * rtol, residual)
-    return results(monodromy, outputs, rtol, model.natural.span)
+    return results(monodromy, outputs, rtol, model.natural.span, spectrum=spectrum)

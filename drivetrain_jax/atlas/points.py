@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, in_one_kernel
-from drivetrain_jax.atlas import quartic
+from drivetrain_jax.analysis.periodic import quartic
 from drivetrain_jax.atlas.charts import Results, errors_of, exact_verdict, in_threads, pack, unpack
 from drivetrain_jax.atlas.expansion import Cell, Expansion
 from drivetrain_jax.atlas.floquet_quantity import Build

@@ -20,8 +20,9 @@ from jax import Array
 
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.numerics.kernels import compiler_options
+from drivetrain_jax.analysis.periodic import quartic
 from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES
-from drivetrain_jax.atlas import charts, evaluation, quartic
+from drivetrain_jax.atlas import charts, evaluation
 from drivetrain_jax.atlas.expansion import Expansion
 from drivetrain_jax.atlas.floquet_quantity import Build, judge
 from drivetrain_jax.atlas.panels import Atlas
@@ -57,7 +58,7 @@ class StabilityAtlas:
         """
         points = np.atleast_2d(np.asarray(points, float))
         if not (self._closed_form and _FAST.issuperset(outputs) and self.atlas.panels):
-            return self._by_eigenvalues(points, outputs)
+            return self.by_eigenvalues(points, outputs)
         x, found = self.atlas.to_coordinates(points), _blank(outputs, (len(points),), 0)
         kernel = point_kernel(self.build, self.rtol, self._may_be_undamped(points.T))
         unsure = [np.empty(0, int)]
@@ -66,11 +67,12 @@ class StabilityAtlas:
                 values[index] = results[name]
             unsure.append(index[results["unsure"]])
         again = np.concatenate(unsure)
-        for name, values in self._by_eigenvalues(points[again], outputs).items():
+        for name, values in self.by_eigenvalues(points[again], outputs).items():
             found[name][again] = values
         return found
 
-    def _by_eigenvalues(self, points: np.ndarray, outputs: Sequence[str]) -> dict[str, np.ndarray]:
+    def by_eigenvalues(self, points: np.ndarray, outputs: Sequence[str]) -> dict[str, np.ndarray]:
+        """The same as :meth:`at`, all points by the eigenvalues of Z."""
         x, found = self.atlas.to_coordinates(points), _blank(outputs, (len(points),), self._multipliers)
         number, size = self.atlas.find(x), evaluation.block_size(self.atlas)
         for k in range(len(self.atlas.panels)):
@@ -152,7 +154,7 @@ class StabilityAtlas:
     ) -> None:
         for part in (cells[i : i + (1 << 18)] for i in range(0, len(cells), 1 << 18)):
             points = np.stack([axis[part[:, k]] for k, axis in enumerate(axes)], axis=-1)
-            for name, value in self._by_eigenvalues(points, outputs).items():
+            for name, value in self.by_eigenvalues(points, outputs).items():
                 found[name][tuple(part.T)] = value
 
     def _judged(
@@ -163,7 +165,8 @@ class StabilityAtlas:
         columns = np.pad(points, ((0, size - len(points)), (0, 0)), mode="edge")
         values = {name: columns[:, k] for k, name in enumerate(self.atlas.parameters)}
         kernel = _point_kernel(self.build, tuple(sorted(self.atlas.fixed)), outputs, self.rtol, self._closed_form)
-        found = kernel(self._tensors[number], weights, charts.errors_of(panel), values, self.atlas.fixed)
+        phi = _scattered(self._tensors[number], weights)
+        found = kernel(phi, charts.errors_of(panel), values, self.atlas.fixed)
         return {name: np.moveaxis(np.asarray(value), -1, 0) for name, value in found.items()}
 
 
@@ -197,14 +200,16 @@ def _round_up(n: int, step: int) -> int:
     return -(-n // step) * step
 
 
+_scattered = jax.jit(evaluation.scattered, compiler_options=compiler_options())
+
+
 @lru_cache(maxsize=16)
 def _point_kernel(
     build: Build, fixed_names: tuple[str, ...], outputs: tuple[str, ...], rtol: float, closed_form: bool
 ) -> Any:
-    """Results of scattered points by eigenvalues."""
+    """Results of scattered points by eigenvalues, from Phi: takes seconds to compile, so no atlas has one of its own."""
 
-    def kernel(tensor, weights, errors, values, fixed):
-        phi = evaluation.scattered(tensor, weights)
+    def kernel(phi, errors, values, fixed):
         everything = {**fixed, **values}
         lanes = jnp.broadcast_to(errors[1:, None], (len(errors) - 1, phi.shape[-1]))
         if not (closed_form and _FAST & set(outputs)):

@@ -62,7 +62,7 @@ def tiles(atlas: Atlas, axes: Sequence[np.ndarray], shape: tuple[int, int], *, d
         return
     degrees = common_degrees(atlas.panels)[-2:]
     for panel, groups in _assigned(atlas, axes):
-        bands = list(_bands(panel, axes[-1], groups[-1], degrees[1], shape[1], dense))
+        bands = _kinds_first(list(_bands(panel, axes[-1], groups[-1], degrees[1], shape[1], dense)))
         for leading in np.ndindex(*(len(g) for g in groups[:-2])):
             fixed = [g[i] for g, i in zip(groups[:-2], leading, strict=True)]
             tensor = padded_tensor(_reduced(panel, axes, fixed), degrees)
@@ -110,6 +110,12 @@ def _bands(panel: Panel, axis: np.ndarray, cells: np.ndarray, degree: int, width
         start = end
     if waiting < len(cells):
         yield _sparse(cells[waiting:], t[waiting:], degree, width)
+
+
+def _kinds_first(bands: list[_Band]) -> list[_Band]:
+    """One band of each kind first: their kernels are then compiled side by side."""
+    first = list({band.spread is None: band for band in reversed(bands)}.values())
+    return first + [band for band in bands if all(band is not other for other in first)]
 
 
 def _sparse(cells: np.ndarray, t: np.ndarray, degree: int, width: int) -> _Band:

@@ -17,6 +17,11 @@ from drivetrain_jax.atlas.patches import Patches
 _LONGEST, _SHORTEST, _FIRST = 0.015, 1e-7, 1e-5
 _TURN, _CORRECTION, _GROWTH = 0.25, 0.15, 1.6
 _NEWTON, _MAX_STEPS = 3, 800
+# Newton's steps onto a flank: a slanted ridge is wider than its tongue near the tip, and the start is far off.
+_ENTER = 12
+# The largest last step of Newton's method with which a point counts as one of the curve: between the edges of a narrow
+# tongue it converges slowly.
+_SETTLED = 1e-9
 # Distances from a tip in the other coordinate at which its flanks are entered.
 _APPROACH = 1e-4 * np.array([1 / 64, 1 / 16, 1 / 4, 1.0])
 
@@ -105,7 +110,7 @@ def _flank(field: Field, top: np.ndarray, h: int, side: float) -> np.ndarray:
         with np.errstate(all="ignore"):
             y[:, v] -= np.sign(slope * bend) * distance
             y[:, h] += side * np.sqrt(2 * np.abs(slope / bend) * distance)
-            for _ in range(_NEWTON):
+            for _ in range(_ENTER):
                 value, gradient = field(y)
                 y[:, h] -= value / gradient[:, h]
         points[:, k] = y
@@ -147,13 +152,15 @@ def _correct(field: Field, y: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray
     for _ in range(_NEWTON):
         value, gradient = field(new)
         with np.errstate(all="ignore"):
-            new = new - (value / (gradient**2).sum(axis=1))[:, None] * gradient
+            last = (value / (gradient**2).sum(axis=1))[:, None] * gradient
+        new = new - last
     _, gradient = field(new)
     with np.errstate(all="ignore"):
         normal = gradient / np.linalg.norm(gradient, axis=1)[:, None]
     tangent = np.stack([-normal[:, 1], normal[:, 0]], axis=-1) * sense[:, None]
     moved = np.linalg.norm(new - y, axis=1)
-    return new, np.where(np.isfinite(moved), moved, np.inf), tangent
+    settled = np.isfinite(moved) & (np.linalg.norm(last, axis=1) <= _SETTLED)
+    return new, np.where(settled, moved, np.inf), tangent
 
 
 def _passes(first: np.ndarray, a: np.ndarray, b: np.ndarray, length: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +22,14 @@ class Report:
     problem: str = ""
     complete: bool = True
 
+    def __str__(self) -> str:
+        return "\n".join(self.lines)
+
+    def to_json(self) -> str:
+        """The same as one JSON object, with the state in a word."""
+        state = "damaged" if self.problem else "complete" if self.complete else "partial"
+        return json.dumps({"state": state, "problem": self.problem, "checks": self.lines})
+
 
 def verify(path: Path) -> Report:
     """Check the result at ``path``, or the parts of the unfinished one.
@@ -32,6 +41,8 @@ def verify(path: Path) -> Report:
         return _verify_parts(path, parts)
     if shards.is_store(path):
         return _verify_store(path)
+    if path.is_dir():
+        raise InputError(f"file = {str(path)!r}: is a folder; give a result written by `drivetrain run`")
     if not path.is_file():
         raise InputError(f"file = {str(path)!r}: does not exist; give a result written by `drivetrain run`")
     damaged = checksums.damaged(path)

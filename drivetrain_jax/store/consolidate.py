@@ -6,15 +6,17 @@ import mmap
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import h5netcdf
 import h5py
 import numpy as np
-import xarray as xr
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.files import move_into_place
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 class ResultFile:
@@ -72,6 +74,8 @@ def _write_frame(template: xr.Dataset, path: Path) -> int:
     The head is made in memory, and room for what h5netcdf adds to it is reserved before: HDF5 may crash the process when
     a disk fills up under it.
     """
+    import h5netcdf
+
     head = template.drop_vars(template.data_vars).to_netcdf(None, engine="h5netcdf")
     path.write_bytes(head)
     _reserve(path, len(head) + sum(v.nbytes for v in template.data_vars.values()) + (1 << 16) * len(template.data_vars))
@@ -153,6 +157,8 @@ def map_variable(path: Path, name: str) -> np.ndarray:
 
 def open_result(path: Path) -> xr.Dataset:
     """The result at ``path``, loaded; ``InputError`` if there is none or it cannot be read."""
+    import xarray as xr
+
     if not path.exists():
         raise InputError(f"file = {str(path)!r}: does not exist; give a result written by `drivetrain run`")
     read_attribute(path, "digest")

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 
 from drivetrain_jax._quantities import Dimension, Variable
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 CONVENTIONS = "CF-1.11"
 
@@ -37,6 +40,8 @@ def build_dataset(
     (``coordinates``) and for those ``dimensions`` that a result uses; every one has ``units`` and ``long_name``. A
     dimension without values of its own is numbered from 0.
     """
+    import xarray as xr  # half a second with pandas, which a process that only looks at a result does without
+
     results = list(results)
     coords = {c.name: (c.dims, c.values, {"units": c.units, "long_name": c.long_name}) for c in coordinates}
     sizes = {

@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 import drivetrain_jax
 from drivetrain_jax._quantities import Variable
@@ -19,6 +18,9 @@ from drivetrain_jax.store.schema import Coordinate, build_dataset
 from drivetrain_jax.sweep.grid import Grid
 from drivetrain_jax.sweep.identity import PACKAGES
 from drivetrain_jax.sweep.scene import Scene
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 # Entries assumed for a dimension whose size depends on the system, when memory is estimated.
 _USUAL_SIZE = 4

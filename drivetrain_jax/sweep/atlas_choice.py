@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.sweep.axes import MAX_RANGES
 from drivetrain_jax.sweep.grid import Grid
+from drivetrain_jax.sweep.plan import mean_cost
 from drivetrain_jax.sweep.scene import Scene
 
 # Points from which on "auto" tries an atlas: fewer are solved directly in the time that two more kernels take to compile.
 _WORTHWHILE = 100_000
-# What "auto" may spend on it: one solve for so many points of the scene. What is not covered by then is solved directly.
-_POINTS_PER_SOLVE = 8
+# The share of the effort of solving every point that "auto" may spend on it. What is not covered by then is solved directly.
+_SHARE = 1 / 8
+# Solves for each parameter, multiplied with each other, below which none is to be expected (charts of two take 735 up).
+_FEWEST = 26
+# Points whose effort is predicted to tell that of all.
+_SAMPLE = 4096
 # Below this target relative error rounding keeps the panels of an atlas from being accepted.
 _FINEST = 1e-12
 
@@ -43,9 +50,22 @@ def uses_atlas(scene: Scene) -> bool:
         and 0 < count <= MAX_RANGES
         and Grid.of(scene).size >= _WORTHWHILE
         and scene.request.options["rtol"] >= _FINEST
+        and solves_allowed(scene) >= _FEWEST**count
     )
 
 
 def solves_allowed(scene: Scene) -> int | None:
-    """The largest number of direct solves that the atlas of ``scene`` may take, None for its own limit."""
-    return Grid.of(scene).size // _POINTS_PER_SOLVE if scene.request.method == "auto" else None
+    """The largest number of direct solves that the atlas of ``scene`` may take, None for its own limit.
+
+    Nodes cost more than points: they are solved more sharply, and lie evenly in the coordinates of the atlas, such as
+    1/Omega, where points are few and dear.
+    """
+    if scene.request.method != "auto":
+        return None
+    from drivetrain_jax.sweep.rounds import node_engine
+
+    grid, random = Grid.of(scene), np.random.default_rng(0)
+    chosen = random.integers(0, grid.size, _SAMPLE)
+    point = mean_cost(scene.analysis.solvers(scene.system, scene.request), grid, chosen)
+    nodes = node_engine(scene, atlas_ranges(scene), _SAMPLE)
+    return int(grid.size * _SHARE * point / mean_cost(nodes.solvers, nodes.grid, np.arange(_SAMPLE)))

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import drivetrain_jax
-from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter, Variable
+from drivetrain_jax._wording import written
 from drivetrain_jax.analysis import get_analysis
+from drivetrain_jax.sweep.scene import find_system
 from drivetrain_jax.systems import System, get_system, system_names
 
 
@@ -24,10 +25,7 @@ def overview() -> str:
 
 def describe(name: str) -> str:
     """Parameters, presets, analyses with results and options, and scenes of one system."""
-    try:
-        system = get_system(name)
-    except KeyError as error:
-        raise InputError(str(error.args[0])) from None
+    system = find_system(name)
     lines = [f"{system.name}: {system.title}", f"  {system.source}", "", "Parameters"]
     lines += _table([_parameter_row(p) for p in system.parameters])
     if system.presets:
@@ -51,17 +49,10 @@ def _analysis_lines(name: str) -> list[str]:
 
 
 def _parameter_row(parameter: Parameter) -> tuple[str, ...]:
-    default = "required" if parameter.default is None else f"default {_short(parameter.default)}"
+    given = "none" if parameter.default == () else written(parameter.default)
+    default = "required" if parameter.default is None else f"default {given}"
     default = f"default {parameter.derived}" if parameter.derived else default
     return parameter.name, f"[{parameter.units}]", parameter.long_name, default, parameter.allowed
-
-
-def _short(default: object) -> str:
-    if default == ():
-        return "none"
-    if isinstance(default, tuple):
-        return "[" + ", ".join(f"{entry:.6g}" for entry in default) + "]"
-    return f"{default:.10g}" if isinstance(default, float) else str(default)
 
 
 def _variable_row(variable: Variable, default: bool) -> tuple[str, ...]:

@@ -61,8 +61,6 @@ def _connect(distributed: Any, address: str, stack: ExitStack) -> Any:
             n_workers=int(local.group(1)), threads_per_worker=1, processes=True, dashboard_address=None
         )
         address = stack.enter_context(cluster).scheduler_address
-    elif not re.match(r"\w+://", address):
-        raise InputError(f"dask = {address!r}: allowed is tcp://HOST:PORT or local:N with N >= 1")
     try:
         return stack.enter_context(distributed.Client(address, timeout=_PATIENCE, set_as_default=False))
     except (OSError, ValueError) as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
@@ -38,6 +39,8 @@ class Where:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise InputError(f"{name} = {value}: allowed is {name} >= 1")
+        if self.dask is not None and not re.match(r"local:[1-9]\d*$|\w+://", self.dask):
+            raise InputError(f"dask = {self.dask!r}: allowed is tcp://HOST:PORT or local:N with N >= 1")
         given = [name for name in ("threads", "workers", "dask") if getattr(self, name) is not None]
         if len(given) > 1:
             raise InputError(f"{given[0]}: given together with {given[1]}; allowed is one of them")

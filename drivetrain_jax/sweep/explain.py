@@ -11,11 +11,10 @@ import numpy as np
 
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._wording import clipped
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.identity import scene_content
 from drivetrain_jax.sweep.scene import Scene, load_scene
-
-_SHOWN = 60
 
 
 def differences(stored: Mapping[str, Any], engine: Engine, *, points: bool = True) -> list[str]:
@@ -52,7 +51,7 @@ def _of_scenes(theirs: Scene, ours: Scene, points: bool) -> Iterator[str]:
 def _of_tables(table: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
     for name in sorted({*old, *new}):
         if old.get(name) != new.get(name):
-            yield f"{table}.{name} is {_short(new.get(name))}, was {_short(old.get(name))}"
+            yield f"{table}.{name} is {_text(new.get(name))}, was {_text(old.get(name))}"
 
 
 def _of_axes(theirs: Scene, ours: Scene) -> Iterator[str]:
@@ -86,10 +85,9 @@ def _of_numerics(stored: str | None, present: Mapping[str, Any]) -> list[str]:
             elif changed:
                 found.append(f"the code has changed in {', '.join(changed[:3])}{', ...' if len(changed) > 3 else ''}")
         elif value != before:
-            found.append(f"{key} is {_short(value)}, was {_short(before)}")
+            found.append(f"{key} is {_text(value)}, was {_text(before)}")
     return found or ["the code, a version or the machine is another one"]
 
 
-def _short(value: Any) -> str:
-    text = str(list(value) if isinstance(value, tuple) else value)
-    return "not given" if value is None else text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
+def _text(value: Any) -> str:
+    return "not given" if value is None else clipped(str(list(value) if isinstance(value, tuple) else value))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
@@ -19,6 +19,9 @@ from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.growing import rest_of
 from drivetrain_jax.sweep.scene import load_scene
 from drivetrain_jax.sweep.target import Target
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 # The outcome of a point that is still to be computed. No finished file has it.
 PENDING = len(Outcome)

@@ -202,6 +202,13 @@ def make_plan(
     return Plan(tuple(tally.group(i, full_size) for i, tally in enumerate(tallies) if tally.count), blocks)
 
 
+def mean_cost(solvers: Sequence[Solver], grid: Grid, points: np.ndarray) -> float:
+    """Predicted cost of one of these points, in the units of a plan, on average; points that no solver can do are free."""
+    choice, effort = _cheapest(solvers, grid, points)
+    unit = np.array([*(solver.unit_cost for solver in solvers), 0.0])
+    return float(np.mean(effort * unit[choice]))
+
+
 def _cheapest(solvers: Sequence[Solver], grid: Grid, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Position of the cheapest solver (-1 if all costs are infinite) and its effort, for each of ``points``."""
     columns = grid.arrays(points)

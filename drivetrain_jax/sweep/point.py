@@ -12,10 +12,11 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Variable
+from drivetrain_jax._wording import nearest, written
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request
 from drivetrain_jax.sweep.assemble import Table
 from drivetrain_jax.sweep.engine import Engine
-from drivetrain_jax.sweep.scene import load_scene, nearest, system_and_analysis
+from drivetrain_jax.sweep.scene import load_scene, system_and_analysis
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class PointResult:
     def __repr__(self) -> str:
         # An empty list is the default "none".
         given = ", ".join(
-            _with_units(f"{n} = {_short(v)}", self.parameter_units[n]) for n, v in self.parameters.items() if v != ()
+            _with_units(f"{n} = {written(v)}", self.parameter_units[n]) for n, v in self.parameters.items() if v != ()
         )
         width = max(map(len, (*self.values, "outcome")))
         lines = [f"{self.system} {self.analysis} (method {self.method}), {given}"]
@@ -84,12 +85,6 @@ def _plain(value: Any) -> Any:
     if np.ndim(value):
         return [_plain(entry) for entry in value]
     return np.asarray(value).item() if np.isfinite(value) else None
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, tuple):
-        return "[" + ", ".join(map(_short, value)) + "]"
-    return f"{value:.10g}" if isinstance(value, float) else str(value)
 
 
 def _with_units(text: str, units: str) -> str:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from drivetrain_jax.analysis import Request
 from drivetrain_jax.analysis.periodic.floquet_propagator import ANALYSIS, PROPAGATOR
-from drivetrain_jax.atlas import StabilityAtlas, floquet_rounds, solve_rtol, stability_atlas
+from drivetrain_jax.atlas import StabilityAtlas, floquet_domain, floquet_rounds, solve_rtol, stability_atlas
 from drivetrain_jax.atlas.construction import MAX_SOLVES
 from drivetrain_jax.sweep.axes import Axis
 from drivetrain_jax.sweep.engine import Engine
@@ -32,10 +33,9 @@ def build_atlas(
 
     ``progress`` counts the solves. Rounds are small, so that threads of this process solve them wherever the run works.
     """
-    fixed = scene.fixed | {a.name: a.values[0].item() for a in scene.axes if a.name not in ranges}
-    fixed = {name: fixed[name] for name in scene.system.models[ANALYSIS.name].parameters if name in fixed}
+    fixed = fixed_of(scene, ranges)
     rtol = scene.request.options["rtol"]
-    tolerance = _SHARPER * rtol
+    tolerance = _tolerance(scene)
     rounds = floquet_rounds(scene.system, ranges, fixed, tolerance, max_solves or MAX_SOLVES)
     first, threads, values = 0, Where(work.where.threads), None
     while True:
@@ -49,6 +49,25 @@ def build_atlas(
         work.do(engine, answers, progress, first, threads)
         first += len(engine.plan.costs)
         values = answers.values
+
+
+def node_engine(scene: Scene, ranges: Mapping[str, tuple[float, float]], count: int) -> Engine:
+    """The engine of ``count`` solves for an atlas of ``scene``, spread like those of its construction."""
+    fixed = fixed_of(scene, ranges)
+    domain = floquet_domain(scene.system, ranges, fixed)
+    spread = np.cos(np.pi * np.random.default_rng(0).random((count, len(ranges))))
+    points = domain.points(domain.box().place(spread))
+    return Engine(_solves(scene, fixed, tuple(ranges), points, solve_rtol(_tolerance(scene))), full_size=True)
+
+
+def _tolerance(scene: Scene) -> float:
+    return _SHARPER * scene.request.options["rtol"]
+
+
+def fixed_of(scene: Scene, ranges: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+    """The parameters of the propagator that are not in ``ranges``, and their values."""
+    fixed = scene.fixed | {a.name: a.values[0].item() for a in scene.axes if a.name not in ranges}
+    return {name: fixed[name] for name in scene.system.models[ANALYSIS.name].parameters if name in fixed}
 
 
 def _solves(scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.ndarray, rtol: float) -> Scene:

@@ -6,9 +6,7 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-import xarray as xr
+from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME
@@ -24,6 +22,9 @@ from drivetrain_jax.sweep.growing import NOTHING, Taken, rest_of
 from drivetrain_jax.sweep.scene import load_scene
 from drivetrain_jax.sweep.target import Target
 from drivetrain_jax.sweep.work import Progress, Report, Work
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 class Incomplete(RuntimeError):
@@ -112,9 +113,11 @@ def run_to_file(
 def _into(target: Target, taken: Taken, fresh: bool, where: Where, report: Report | None) -> Progress:
     """Begin the result of ``target``, or go on with it; ``taken`` is computed already."""
     engine, parts, progress = target.engine, target.parts, _progress(target.engine)
+    begins = False
     try:
         parts.open()
-        if fresh or not parts.holds_work():
+        begins = fresh or not parts.holds_work()
+        if begins:
             parts.start(target.plan(taken))
         if target.store == "zarr":
             sharded.compute(engine, target.out, parts, progress, where, report)
@@ -123,6 +126,10 @@ def _into(target: Target, taken: Taken, fresh: bool, where: Where, report: Repor
         parts.close(remove=True)
     except KeyboardInterrupt:
         raise Interrupted(progress) from None
+    except InputError:
+        # For example no scheduler at the address: what is refused at its start leaves nothing behind.
+        parts.close(remove=begins and progress.computed == 0)
+        raise
     except (ChunkError, OSError, MemoryError) as error:
         raise Incomplete(f"{error or type(error).__name__}; the same command resumes", progress) from error
     finally:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,12 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter
+from drivetrain_jax._wording import did_you_mean, nearest, shown
 from drivetrain_jax.analysis import OUTCOME, Analysis, Request, get_analysis
 from drivetrain_jax.store.provenance import physical_memory
 from drivetrain_jax.sweep import toml
 from drivetrain_jax.sweep.axes import MAX_POINTS, MAX_RANGES, Axis, AxisTable, check_count, entry_of, spread
-from drivetrain_jax.systems import Model, System, get_system
+from drivetrain_jax.systems import Model, System, get_system, system_names
 
 # What an axis takes for each value while it is made and checked.
 _BYTES = 32
@@ -78,14 +78,22 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
     return Scene(title, system, analysis, request, axes, zipped, fixed, dimensions, path_axis, text)
 
 
+def find_system(name: str) -> System:
+    """The system called so; ``InputError`` with the name that may have been meant if there is none."""
+    try:
+        return get_system(name)
+    except KeyError:
+        raise InputError(f"system = {name!r}: unknown{nearest(name, system_names())}") from None
+
+
 def system_and_analysis(system_name: str, analysis_name: str) -> tuple[System, Analysis]:
     """The system and the analysis called so; ``InputError`` unless both exist and the one has a model for the other."""
-    system = _lookup(get_system, system_name)
+    system = find_system(system_name)
     if analysis_name not in system.models:
-        raise InputError(
-            f"analysis = {analysis_name!r}: allowed for {system.name} is one of {', '.join(system.models)}"
-        )
-    return system, _lookup(get_analysis, analysis_name)
+        guess = did_you_mean(analysis_name, system.models)
+        allowed = f"allowed for {system.name} is one of {', '.join(system.models)}"
+        raise InputError(f"analysis = {analysis_name!r}: unknown{guess}; {allowed}")
+    return system, get_analysis(analysis_name)
 
 
 def _convert(given: Any, kind: type, where: str) -> Any:
@@ -93,7 +101,7 @@ def _convert(given: Any, kind: type, where: str) -> Any:
     names = [field.name for field in msgspec.structs.fields(kind)]
     for key in given:
         if key not in names:
-            raise InputError(f"{where}{key} = {_short(given[key])}: unknown key{nearest(key, names)}")
+            raise InputError(f"{where}{key} = {shown(given[key])}: unknown key{nearest(key, names)}")
     try:
         return msgspec.convert(given, kind)
     except msgspec.ValidationError as error:
@@ -104,7 +112,7 @@ def _convert(given: Any, kind: type, where: str) -> Any:
         name = re.match(r"\w*", path).group()
         reason = re.sub(r"`([^`]*)`", _toml_types, reason)
         raise InputError(
-            f"{where}{name} = {_short(given.get(name))}: {reason.replace('Expected', 'allowed is')}"
+            f"{where}{name} = {shown(given.get(name))}: {reason.replace('Expected', 'allowed is')}"
         ) from None
 
 
@@ -125,26 +133,6 @@ def _toml_types(match: re.Match[str]) -> str:
     return " or ".join(words) or "nothing"
 
 
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def nearest(name: str, allowed: Iterable[str]) -> str:
-    """``; did you mean X? allowed is A, B, ...``"""
-    allowed = list(allowed)
-    match = difflib.get_close_matches(name, allowed, n=1)
-    guess = f" (did you mean {match[0]}?)" if match else ""
-    return f"{guess}; allowed is {', '.join(allowed) if allowed else 'none'}"
-
-
-def _lookup(find: Callable[[str], Any], name: str) -> Any:
-    try:
-        return find(name)
-    except KeyError as error:
-        raise InputError(str(error.args[0])) from None
-
-
 def _request(table: _SceneTable, analysis: Analysis) -> Request:
     """Outputs, method and options, checked against what the analysis offers."""
     names = [v.name for v in analysis.variables]
@@ -155,16 +143,16 @@ def _request(table: _SceneTable, analysis: Analysis) -> Request:
     # The outcome is stored with every result, named or not.
     outputs = [name for name in outputs if name != OUTCOME.name]
     if not outputs or len(set(outputs)) < len(outputs):
-        raise InputError(f"outputs = {_short(table.outputs)}: allowed is one or more of {', '.join(names)}, each once")
+        raise InputError(f"outputs = {shown(table.outputs)}: allowed is one or more of {', '.join(names)}, each once")
     given = dict(table.options)
     method = given.pop("method", next(iter(analysis.methods)))
     if not isinstance(method, str) or method not in analysis.methods:
-        raise InputError(f"options.method = {method!r}: allowed is one of {', '.join(analysis.methods)}")
+        raise InputError(f"options.method = {method!r}: unknown{nearest(str(method), analysis.methods)}")
     used = analysis.methods[method]
     for key, value in given.items():
         if key not in used:
             raise InputError(
-                f"options.{key} = {_short(value)}: not used by method {method}{nearest(key, ('method', *used))}"
+                f"options.{key} = {shown(value)}: not used by method {method}{nearest(key, ('method', *used))}"
             )
     options = {o.name: _option(o, given) for o in analysis.options if o.name in used}
     return Request(tuple(outputs), method, options)
@@ -184,7 +172,7 @@ def _checked(parameter: Parameter, value: Any, where: str) -> Value:
     except ValueError as error:
         raise InputError(f"{where}{error}") from None
     except OverflowError:
-        raise InputError(f"{where}{parameter.name} = {_short(value)}: allowed is {parameter.allowed}") from None
+        raise InputError(f"{where}{parameter.name} = {shown(value)}: allowed is {parameter.allowed}") from None
 
 
 def _axes(table: _SceneTable, system: System, analysis: Analysis) -> tuple[tuple[Axis, ...], bool]:
@@ -218,7 +206,7 @@ def _check_ranges(table: _SceneTable, analysis: Analysis) -> None:
 
 def _axis_table(name: str, given: Any) -> AxisTable:
     if not isinstance(given, Mapping):
-        raise InputError(f"axes.{name} = {_short(given)}: allowed is a table {{ start, stop, num }} or {{ values }}")
+        raise InputError(f"axes.{name} = {shown(given)}: allowed is a table {{ start, stop, num }} or {{ values }}")
     return _convert(given, AxisTable, f"axes.{name}.")
 
 
@@ -238,7 +226,7 @@ def _points(table: _SceneTable, system: System) -> tuple[Axis, ...]:
     """Equally long columns of parameter values."""
     for name, values in table.points.items():
         if not isinstance(values, list):
-            raise InputError(f"points.{name} = {_short(values)}: allowed is a list of numbers")
+            raise InputError(f"points.{name} = {shown(values)}: allowed is a list of numbers")
     lengths = {name: len(values) for name, values in table.points.items()}
     if len(set(lengths.values())) > 1 or not all(lengths.values()):
         listed = ", ".join(f"{name} has {length}" for name, length in lengths.items())
@@ -280,19 +268,21 @@ def _fixed(table: _SceneTable, system: System, analysis: Analysis, axes: tuple[A
     whole = {axis.name for axis in axes if axis.entry is None}
     for name, value in table.fixed.items():
         if name not in known:
-            raise InputError(f"fixed.{name} = {_short(value)}: unknown parameter{nearest(name, known)}")
+            raise InputError(f"fixed.{name} = {shown(value)}: unknown parameter{nearest(name, known)}")
         if name in whole:
             where = "points" if table.points else "axes"
-            raise InputError(f"fixed.{name} = {_short(value)}: also in [{where}]; allowed is one of the two")
+            raise InputError(f"fixed.{name} = {shown(value)}: also in [{where}]; allowed is one of the two")
     fixed: dict[str, Value] = {}
-    used = system.models[analysis.name].parameters
+    used, missing = system.models[analysis.name].parameters, []
     for parameter in system.parameters:
         if parameter.name in table.fixed:
             fixed[parameter.name] = _checked(parameter, table.fixed[parameter.name], "fixed.")
         elif parameter.name in used and parameter.name not in whole and not parameter.derived:
-            if parameter.default is None:
-                raise InputError(f"fixed.{parameter.name}: missing; allowed is {parameter.allowed}")
             fixed[parameter.name] = parameter.default
+            missing += [parameter] if parameter.default is None else []
+    if missing:
+        others = f" (missing too: {', '.join(p.name for p in missing[1:])})" if missing[1:] else ""
+        raise InputError(f"fixed.{missing[0].name}: missing; allowed is {missing[0].allowed_in_units}{others}")
     for axis in axes:
         _check_entry(axis, fixed)
     _check_together(system.models[analysis.name], fixed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -40,11 +41,11 @@ class Status:
         lines += [f"  {name}: {count}" for name, count in self.failed_by_outcome.items()]
         return "\n".join([*lines, *([f"  a run would be refused: {self.reason}"] if self.reason else [])])
 
-    def to_json(self) -> dict[str, Any]:
-        """The counts and the state, and what else there is to say."""
+    def to_json(self) -> str:
+        """The counts and the state, and what else there is to say, as one JSON object."""
         content = {name: getattr(self, name) for name in ("total", "done", "failed", "state")}
         more = {"failed_by_outcome": dict(self.failed_by_outcome), "reason": self.reason}
-        return content | {name: value for name, value in more.items() if value}
+        return json.dumps(content | {name: value for name, value in more.items() if value})
 
 
 def status(

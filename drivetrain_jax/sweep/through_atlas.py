@@ -5,20 +5,23 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.atlas import StabilityAtlas
+from drivetrain_jax.atlas import StabilityAtlas, prepare_judging
 from drivetrain_jax.sweep.assemble import Table, failures
 from drivetrain_jax.sweep.atlas_choice import atlas_ranges, solves_allowed
 from drivetrain_jax.sweep.engine import Engine
-from drivetrain_jax.sweep.rounds import build_atlas
+from drivetrain_jax.sweep.rounds import build_atlas, fixed_of
+from drivetrain_jax.sweep.scene import Scene
 from drivetrain_jax.sweep.work import Progress, Work
 
 # Cells evaluated at a time: what they need in memory, and how often progress is told.
 _BLOCK = 1 << 21
 _ROWS = 64
+_LARGE = 1 << 19
 
 Results = Mapping[str, np.ndarray]
 
@@ -27,9 +30,20 @@ def fill_through_atlas(engine: Engine, table: Table, work: Work, progress: Progr
     """All points of ``engine`` into ``table``; returns what the attributes of the result are to say of it."""
     scene = engine.scene
     solves = Progress(0, kind="direct solves for the atlas")
-    atlas, first = build_atlas(scene, atlas_ranges(scene), work, solves, solves_allowed(scene))
+    with ThreadPoolExecutor(1) as aside:
+        # Of that many cells some have to be judged one by one, by a kernel that takes seconds to compile.
+        large = engine.grid.size >= _LARGE
+        prepared = aside.submit(_prepare, scene) if large else None
+        atlas, first = build_atlas(scene, atlas_ranges(scene), work, solves, solves_allowed(scene))
+    if prepared:
+        prepared.result()
     uncovered = evaluate(engine, table, atlas, work, progress, first)
     return {"atlas_solves": atlas.atlas.solves, "atlas_panels": len(atlas.atlas.panels), "atlas_uncovered": uncovered}
+
+
+def _prepare(scene: Scene) -> None:
+    ranges = atlas_ranges(scene)
+    prepare_judging(scene.system, ranges, fixed_of(scene, ranges), scene.request.options["rtol"], scene.request.outputs)
 
 
 def evaluate(
@@ -77,14 +91,20 @@ def _blocks(engine: Engine, atlas: StabilityAtlas) -> Iterator[tuple[tuple[slice
 
 
 def _cut(lengths: Sequence[int]) -> Iterator[tuple[slice, ...]]:
-    """Blocks of a grid of at most about ``_BLOCK`` cells, whole along as many of the last axes as possible."""
+    """Blocks of a grid of about ``_BLOCK`` cells at most, whole along as many of the last axes as possible.
+
+    What is left over of an axis joins the last block: a narrow one would need kernels of its own.
+    """
     whole = len(lengths) - 1
     while whole > 0 and math.prod(lengths[whole:]) <= _BLOCK:
         whole -= 1
     # Axis number `whole` is cut into pieces, those before it into single values.
     step = max(1, _BLOCK // max(math.prod(lengths[whole + 1 :]), 1))
     step = step - step % _ROWS if step > _ROWS else step
-    pieces = [slice(i, min(i + step, lengths[whole])) for i in range(0, lengths[whole], step)]
+    starts = list(range(0, lengths[whole], step))
+    if len(starts) > 1 and lengths[whole] - starts[-1] < _ROWS <= step:
+        starts.pop()
+    pieces = [slice(*ends) for ends in itertools.pairwise([*starts, lengths[whole]])]
     for leading in itertools.product(*(range(n) for n in lengths[:whole])):
         for piece in pieces:
             yield (*(slice(i, i + 1) for i in leading), piece, *(slice(0, n) for n in lengths[whole + 1 :]))

@@ -31,6 +31,7 @@ def read(
         except tomllib.TOMLDecodeError as error:
             end = f"at line {len(text.splitlines())}, the end of the file"
             reason = str(error).replace("at end of document", end)
+            reason += "; words stand in quotes" if reason.startswith("Invalid value") else ""
             raise InputError(f"scene = {str(source)!r}: not valid TOML: {reason}") from None
         except RecursionError:
             raise InputError(f"scene = {str(source)!r}: not valid TOML: nested too deeply") from None
@@ -61,6 +62,12 @@ def _text(path: Path) -> str:
 
 def _replace(tree: dict[str, Any], key: str, value: Any) -> None:
     *tables, last = key.split(".")
+    if (
+        not tables
+        and last not in tree
+        and (inside := [n for n, t in tree.items() if isinstance(t, dict) and last in t])
+    ):
+        raise InputError(f"set {key}: not a key of the scene itself; did you mean {inside[0]}.{key}?")
     for name in tables:
         tree = tree.setdefault(name, {})
         if not isinstance(tree, dict):

@@ -107,23 +107,6 @@ def linear_field(tau: Any, y: Array, values: Values) -> Array:
     )
 
 
-def absolute_coordinates(beta: Any, gamma: Any, phi: Any = 0.0) -> Array:
-    """``T`` with ``(q, q') = T (theta, theta')`` at joint rotation ``phi``, shape ``(4, 4, ...)``.
-
-    Eq. (8): q = (theta1, sqrt(gamma) (theta2 + eta theta1)).
-    """
-    eta, d1, _ = speed_ratio(beta, phi)
-    root = jnp.sqrt(gamma)
-    zero, one = jnp.zeros_like(eta * root), jnp.ones_like(eta * root)
-    rows = (
-        (one, zero, zero, zero),
-        (root * eta, root * one, zero, zero),
-        (zero, zero, one, zero),
-        (root * d1, zero, root * eta, root * one),
-    )
-    return jnp.stack([jnp.stack(row) for row in rows])
-
-
 def _clock_basis(psi: Any) -> tuple[Array, Array]:
     return jnp.cos(2 * psi), jnp.sin(2 * psi)
 
@@ -274,9 +257,6 @@ def resonances(orders: int = 3) -> Resonances:
         tuple(kind for kind in families.values() for _ in range(orders)),
         resonances,
     )
-
-
-RESONANCE_LABELS = resonances().labels
 
 
 def _inverse_square(x: Any) -> np.ndarray:

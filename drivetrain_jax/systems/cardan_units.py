@@ -8,7 +8,6 @@ Source: docs/theory/cardan.md. With c1 = 0 alpha has no meaning; it is then 0, a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
@@ -116,19 +115,6 @@ class PhysicalShaft:
         lines = [f"{p.name:>5} = {given[p.name]:.10g} {p.units}" for p in PHYSICAL if p.name in given]
         lines += [f"{name:>5} = {value:.10g}  ({formulas[name]})" for name, value in results.items()]
         return "\n".join(lines)
-
-
-def from_physical(values: Mapping[str, float]) -> dict[str, float]:
-    """The six parameters of ``cardan`` from the eight of ``PHYSICAL`` by name.
-
-    Raises :class:`~drivetrain_jax.InputError` for a name that is missing, unknown or out of range.
-    """
-    names = [p.name for p in PHYSICAL]
-    for name in [*values, *names]:
-        if name not in names or name not in values:
-            raise InputError(f"{name} = {values.get(name)!r}: allowed are all of {', '.join(names)} and no others")
-    shaft = PhysicalShaft(*(values[name] for name in names[:6]))
-    return shaft.at(values["speed"], values["angle"])
 
 
 def _check(name: str, value: float) -> float:

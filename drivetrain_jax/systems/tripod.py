@@ -18,7 +18,6 @@ from jax import Array
 
 from drivetrain_jax.systems._base import FloquetModel, LinearPeriodic, Model, Rows, System, Values
 from drivetrain_jax.systems._flow import Components, Flow
-from drivetrain_jax.systems._trigonometry import cos, sin
 from drivetrain_jax.systems._tripod_parameters import (
     EQUATIONS,
     MOTION,
@@ -30,6 +29,7 @@ from drivetrain_jax.systems._tripod_parameters import (
     check_parametric,
     geometry,
 )
+from drivetrain_jax.systems.trigonometry import cos, sin
 
 
 class Element(NamedTuple):

@@ -26,8 +26,7 @@ def plot(dataset: xr.Dataset) -> Figure:
         names = cells.sweep_axes(dataset)
         if len(names) != 1 or names == ["point"]:
             raise InputError(f"axes = {', '.join(names) or 'none'}: allowed is one axis for a figure of basins")
-        if missing := [name for name in _NEEDED if name not in dataset]:
-            raise InputError(f"outputs: {', '.join(missing)} missing; the figure needs {', '.join(_NEEDED)}")
+        cells.require(dataset, *_NEEDED)
         return _curves(dataset, names[0])
 
 

@@ -17,6 +17,13 @@ _MARK = {"marker": "o", "markersize": 3.0, "markerfacecolor": "white", "markered
 _FONT = 7.5
 # Width and height that a name takes, in points.
 _ROOM = (15.0, 9.0)
+# Where it may stand, rightwards and up from its tip, and how it is aligned there.
+_SIDES = {
+    (0, -1): ("center", "top"),
+    (1, 0): ("left", "center"),
+    (0, 1): ("center", "bottom"),
+    (-1, 0): ("right", "center"),
+}
 
 
 def draw(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Artist]:
@@ -37,8 +44,7 @@ def draw(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> lis
         _name(
             axes, dataset["tip"].values.astype(str), *(dataset[f"tip_{name}"].values for name in (horizontal, vertical))
         )
-    # The mark of a tip that is not proved explains the boxes too.
-    return handles if proved.size and not proved.all() else handles + boxes
+    return handles + boxes
 
 
 def _draw_undecided(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Artist]:
@@ -54,18 +60,24 @@ def _draw_undecided(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: 
 
 
 def _name(axes: Axes, names: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
-    """Names below the tips, apart from those that would cover an earlier one."""
-    places = axes.transData.transform(np.stack([x, y], axis=-1)) * 72 / axes.figure.dpi
-    for i, (name, across, up) in enumerate(zip(names, x, y, strict=True)):
-        if (np.abs(places[:i] - places[i]) < _ROOM).all(axis=1).any():
+    """Names below the tips, or beside or above them where they would cover an earlier one; else none."""
+    marks = axes.transData.transform(np.stack([x, y], axis=-1)) * 72 / axes.figure.dpi
+    taken: list[np.ndarray] = []
+    for name, mark, across, up in zip(names, marks, x, y, strict=True):
+        middles = {side: mark + np.array(side) * (0.7 * _ROOM[0], _ROOM[1]) for side in _SIDES}
+        free = (s for s, at in middles.items() if all((np.abs(at - other) >= _ROOM).any() for other in taken))
+        side = next(free, None)
+        if side is None:
             continue
+        taken.append(middles[side])
+        horizontal, vertical = _SIDES[side]
         axes.annotate(
             label_text(name),
             (across, up),
-            xytext=(0, -3.5),
+            xytext=3.5 * np.array(side),
             textcoords="offset points",
-            ha="center",
-            va="top",
+            ha=horizontal,
+            va=vertical,
             size=_FONT,
             color=PREDICTION,
             path_effects=[withStroke(linewidth=2, foreground="white")],

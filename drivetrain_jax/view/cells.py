@@ -10,6 +10,7 @@ from matplotlib.colors import LinearSegmentedColormap, SymLogNorm
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, NullFormatter
 
+from drivetrain_jax._errors import InputError
 from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STATE_HATCHES, STATE_NAMES, STATES
 
 STABLE, UNSTABLE, UNDECIDED, FAILED = range(4)
@@ -28,6 +29,13 @@ def prepare(dataset: xr.Dataset) -> xr.Dataset:
 def sweep_axes(dataset: xr.Dataset) -> list[str]:
     """Names of the swept axes, in scene order."""
     return [str(name) for name in dataset["outcome"].dims]
+
+
+def require(dataset: xr.Dataset, *names: str) -> None:
+    """Raise :class:`InputError` unless all of these variables are stored."""
+    if missing := [name for name in names if name not in dataset]:
+        stored = ", ".join(str(name) for name in dataset.data_vars)
+        raise InputError(f"outputs = {stored}: {' and '.join(missing)} missing; the figure needs {' and '.join(names)}")
 
 
 def horizontal_axis(dataset: xr.Dataset, names: list[str]) -> str:

@@ -64,9 +64,7 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
                 shown = ", ".join(names) or "none"
                 raise InputError(f"axes = {shown}: allowed is {PATH}, with one more axis if it is a single result")
         for each in results:
-            if "u_max" not in each or "u_min" not in each:
-                stored = ", ".join(str(name) for name in each.data_vars)
-                raise InputError(f"outputs = {stored}: nothing to plot; the figure needs u_max and u_min")
+            cells.require(each, "u_max", "u_min")
         return _lines(results)
 
 

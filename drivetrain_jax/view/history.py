@@ -29,9 +29,7 @@ def plot(dataset: xr.Dataset) -> Figure:
     """
     with matplotlib.rc_context(_STYLE):
         dataset = cells.prepare(dataset)
-        missing = [name for name in ("phi", "velocity") if name not in dataset]
-        if missing:
-            raise InputError(f"outputs: {' and '.join(missing)} missing; the figure needs phi and velocity")
+        cells.require(dataset, "phi", "velocity")
         names = cells.sweep_axes(dataset)
         if not names:
             return _single(dataset)

@@ -49,12 +49,6 @@ def plot(dataset: xr.Dataset) -> Figure:
         )
 
 
-def _need(dataset: xr.Dataset, *names: str) -> None:
-    if missing := [name for name in names if name not in dataset]:
-        stored = ", ".join(str(name) for name in dataset.data_vars)
-        raise InputError(f"outputs = {stored}: the figure needs {', '.join(missing)} too")
-
-
 def _meanings(dataset: xr.Dataset) -> list[str]:
     return dataset["mode_type"].attrs["flag_meanings"].split()
 
@@ -67,7 +61,7 @@ def _types(dataset: xr.Dataset) -> np.ndarray:
 
 
 def _curves(dataset: xr.Dataset, name: str) -> Figure:
-    _need(dataset, "natural_frequency")
+    cells.require(dataset, "natural_frequency")
     dataset = dataset.transpose(name, ...)
     x, frequency, types = dataset[name].values, dataset["natural_frequency"].values, _types(dataset)
     panels = Panels(1, height=_CURVES_HEIGHT, margins=Margins(right=0.3, left=0.9, top=0.6))
@@ -126,7 +120,7 @@ def _distinct(frequency: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _shapes(dataset: xr.Dataset) -> Figure:
-    _need(dataset, "natural_frequency", "mode_shape")
+    cells.require(dataset, "natural_frequency", "mode_shape")
     angles, types = _angles(dataset), _types(dataset)
     frequency = dataset["natural_frequency"].values
     if not np.isfinite(frequency).all():

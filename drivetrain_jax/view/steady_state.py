@@ -67,11 +67,6 @@ def _titles(panels: Panels, dataset: xr.Dataset) -> None:
     line.set_text(textwrap.fill(kept, _LETTERS, break_long_words=False))
 
 
-def _need(dataset: xr.Dataset, wanted: tuple[str, ...]) -> None:
-    if missing := [name for name in wanted if name not in dataset]:
-        raise InputError(f"outputs: {', '.join(missing)} missing; the figure needs {', '.join(wanted)}")
-
-
 def _regimes(dataset: xr.Dataset) -> xr.DataArray:
     return dataset["regime"].where(dataset["outcome"] < cells.FIRST_FAILURE, _FAILED)
 
@@ -90,7 +85,7 @@ def _maps(dataset: xr.Dataset, names: list[str]) -> Figure:
     vertical = next(name for name in names if name != horizontal)
     shown = [name for name in ("regime", "u_max") if name in dataset]
     if not shown:
-        _need(dataset, ("regime",))
+        cells.require(dataset, "regime")
     panels = Panels(len(shown), height=_HEIGHT, margins=Margins(right=1.15))
     handles: list[Artist] = []
     for (axes,), name in zip(panels.axes, shown, strict=True):
@@ -129,7 +124,7 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
     extremes = [key for key in ("u_max", "u_min") if key in dataset]
     scalars = [key for key in ("period_multiple", "spectral_radius", "lyapunov_exponent") if key in dataset]
     if not extremes:
-        _need(dataset, ("u_max",))
+        cells.require(dataset, "u_max")
     panels = Panels(1 + len(scalars), height=1.75, margins=Margins(right=0.3, left=1.0), share_y=False)
     stack = [row[0] for row in panels.axes]
     handles: list[Artist] = []
@@ -161,7 +156,7 @@ def _dots(axes: Axes, x: xr.DataArray, y: xr.DataArray, colour: str, label: str)
 
 
 def _basins(dataset: xr.Dataset) -> Figure:
-    _need(dataset, ("u_max", "period_multiple"))
+    cells.require(dataset, "u_max", "period_multiple")
     codes, names = _attractors(dataset)
     panels = Panels(height=4.2, margins=Margins(right=2.3))
     axes = panels.axes[0][0]
@@ -215,7 +210,7 @@ def _merge(keys: list[tuple[int, int]]) -> np.ndarray:
 
 
 def _motion(dataset: xr.Dataset) -> Figure:
-    _need(dataset, ("u_history", "v_history"))
+    cells.require(dataset, "u_history", "v_history")
     u, v, part = dataset["u_history"], dataset["v_history"], dataset["sample"]
     height = 2.6
     panels = Panels(height=height, margins=Margins(left=0.85, right=_PORTRAIT + 0.3))

@@ -16,7 +16,7 @@ import pytest
 from benchmarks.bicardan_reference import complete, finite_elements
 from drivetrain_jax.analysis.critical_speeds import angular_frequencies, separation_margin
 from drivetrain_jax.analysis.shafts.compound import characteristic
-from drivetrain_jax.analysis.shafts.functions import compound, general, sine_cosine
+from drivetrain_jax.analysis.shafts.functions import compound, general
 from drivetrain_jax.analysis.shafts.mechanisms import zero_modes
 from drivetrain_jax.analysis.shafts.roots import find_roots, relative_error
 from drivetrain_jax.analysis.shafts.shapes import mode_shapes
@@ -221,15 +221,6 @@ def test_lanes_do_not_disturb_each_other(solved):
     q, certified = np.asarray(roots.q), np.asarray(roots.certified)
     assert np.array_equal(q[:, :-1] ** 2, np.stack([solved[name][0] for name in names[:-1]], axis=-1))
     assert np.isnan(q[:, -1]).all() and not certified[:, -1].any()
-
-
-def test_elementary_functions():
-    z = np.concatenate([np.linspace(0, 3, 500), 10 ** np.random.default_rng(0).uniform(0, 4, 500)])
-    sine, cosine = sine_cosine(jnp.asarray(z))
-    assert (
-        np.abs(np.asarray(sine) - np.sin(z)).max() <= 2.3e-16
-        and np.abs(np.asarray(cosine) - np.cos(z)).max() <= 2.3e-16
-    )
 
 
 @pytest.mark.parametrize("z", [1e-3, 0.3, 1.99, 2.01, 7.0, 40.0])

@@ -53,10 +53,12 @@ def test_loose_tolerances_blur_the_section(motor):
     found = {}
     for rtol, atol in ((1e-3, 1e-6), (1e-9, 1e-12)):
         options = {"method": "adaptive", "strobes": 128, "discard": 800, "rtol": rtol, "atol": atol}
-        ours = section(["section", "strobe_error"], **options)
-        missed = ours.strobe_error > min(1e-6, 10 * rtol)
+        ours = section(["section", "strobe_error", "section_error"], **options)
+        missed = ours.section_error > min(1e-6, 10 * rtol)
         np.testing.assert_array_equal(ours.outcome, np.where(missed, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS))
         assert ((ours.strobe_error > 1e-6) == (rtol == 1e-3)).all()
+        # Errors of steps have added up over the decay time of the motion.
+        assert (ours.section_error > ours.strobe_error).all()
         found[rtol] = np.abs(ours.section.values[1, :, 0] - motor.section.values[1, :128, 0]).max() / extent
     assert found[1e-3] > 1
     assert found[1e-9] < 1e-2

@@ -9,8 +9,9 @@ from propagators import BASE, cardan_atlas, direct_radius, monodromy, propagator
 
 from benchmarks import cardan_precise_reference as precise
 from drivetrain_jax.analysis import Outcome
+from drivetrain_jax.analysis.periodic import quartic
 from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES
-from drivetrain_jax.atlas import quartic, tiles, to_arrays
+from drivetrain_jax.atlas import tiles, to_arrays
 from drivetrain_jax.atlas.interpolation import evaluate
 from drivetrain_jax.atlas.panels import position
 

@@ -94,6 +94,8 @@ def test_all_twelve_tips_and_no_other(tips):
         assert tip.point["beta"] == pytest.approx(beta, abs=1e-8)
         assert tip.point["Omega"] == pytest.approx(omega, abs=1e-8)
         assert tip.multiplier == KINDS[tip.name[0]] and tip.opens
+        turn = {"+1": 0.0, "-1": np.pi}.get(tip.multiplier)
+        assert 0.01 < tip.angle < np.pi - 0.01 if turn is None else tip.angle == pytest.approx(turn, abs=1e-4)
 
 
 def test_errors_of_tips_lie_within_their_bounds(tips):
@@ -213,6 +215,9 @@ def test_a_name_belongs_to_a_resonance_of_the_same_multiplier(atlas):
     foot = float(atlas.to_coordinates(np.array([0.1, TIPS["S21"][1]]))[1])
     assert naming._name(atlas, CARDAN, "-1", 1, foot) == "S21"
     assert naming._name(atlas, CARDAN, "+1", 1, foot) == ""
+    # Nor does one that is far from all, or as near to C+10 as to C-9.
+    assert naming._name(atlas, CARDAN, "-1", 1, 1.03 * foot) == ""
+    assert naming._name(atlas, CARDAN, "pair", 1, 1 / 0.07454) == ""
     # Over the stiffness ratio, on which the resonances depend, it is that at the foot.
     fixed = {name: value for name, value in atlas.fixed.items() if name != "mu"} | {"beta": 0.1}
     lower, upper = np.array([1.0, 0.06]), np.array([20.0, 2.0])
@@ -296,6 +301,8 @@ def test_undamped_boundaries_separate_bounded_from_growing_motion(undamped):
     beta, omega = curve.points["beta"][middle], curve.points["Omega"][middle]
     rates = rate(np.full(2, beta), omega * np.array([1 - 1e-6, 1 + 1e-6]), zeta=0.0)
     assert rates.min() < 1e-9 and rates.max() > 1e-5
+    z = monodromy(propagators({**BASE, "zeta": 0.0, "beta": beta, "Omega": omega}, 1e-14))
+    assert np.abs(np.linalg.eigvals(z) + 1).min() < 1e-2
 
 
 def test_tips_followed_through_another_parameter():

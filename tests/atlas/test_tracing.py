@@ -2,34 +2,88 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from drivetrain_jax.atlas import exclusion, tracing
-from drivetrain_jax.atlas.patches import Patches
+from drivetrain_jax.atlas import boundaries, exclusion, tracing
+from drivetrain_jax.atlas.patches import Patches, join
 
 
-def one_patch(coefficients):
-    """The polynomial with these coefficients over [-1, 1]^2, without error."""
+def one_patch(coefficients, error=0.0):
+    """The polynomial with these coefficients over [-1, 1]^2, known but for this error."""
     square = np.ones((1, 2))
-    return Patches(-square, square, np.array(coefficients)[..., None], np.zeros((1, 1, 1)), np.zeros(1), square)
+    return Patches(-square, square, np.array(coefficients)[..., None], np.zeros((1, 1, 1)), np.full(1, error), square)
 
 
-def test_a_box_without_a_tip_is_not_one_with_a_single_tip():
-    """f = h^2 - v has its tip at 0; of f = h^2 - v - 2 the whole floor of the valley is negative."""
-    for shift, expected in ((0.0, True), (2.0, False)):
-        bundle = exclusion._Bundle(one_patch([[0.5 - shift, -1.0], [0.0, 0.0], [0.5, 0.0]]), 0)
-        assert bundle.single().tolist() == [expected]
+@pytest.mark.parametrize(
+    ("shift", "error", "expected"),
+    [(0.0, 0.0, True), (0.0, 0.3, True), (2.0, 0.0, False), (0.5, 0.7, False), (-0.5, 0.7, False)],
+)
+def test_a_box_without_a_tip_is_not_one_with_a_single_tip(shift, error, expected):
+    """f = h^2 - v has its tip at 0; of f = h^2 - v - 2 the whole floor of the valley is negative; and it may be where an
+    error is larger than f at either end of the floor."""
+    bundle = exclusion._Bundle(one_patch([[0.5 - shift, -1.0], [0.0, 0.0], [0.5, 0.0]], error), 0)
+    assert bundle.single().tolist() == [expected]
+
+
+@pytest.mark.parametrize(("floor", "error", "expected"), [(0.5, 0.0, True), (0.5, 0.7, False), (-0.5, 0.7, False)])
+def test_a_valley_above_or_below_zero_by_more_than_its_error_is_excluded(floor, error, expected):
+    bundle = exclusion._Bundle(one_patch([[0.5 + floor], [0.0], [0.5]], error), 0)
+    assert bundle.excluded().tolist() == [expected]
+
+
+def test_a_tip_on_the_face_of_two_boxes_is_one_tip():
+    """h^2 - v over v <= 0 and over v >= 0."""
+    halves = [
+        replace(one_patch([[0.5 - middle, -0.5], [0.0, 0.0], [0.5, 0.0]], 1e-6), lower=np.array([[-1.0, middle - 0.5]]))
+        for middle in (-0.5, 0.5)
+    ]
+    halves = [replace(p, upper=p.lower + np.array([[2.0, 1.0]])) for p in halves]
+    found = exclusion.critical_points((join(halves),), 0, 0)
+    assert found.points == pytest.approx(np.zeros((1, 2)), abs=1e-12) and not len(found.undecided)
+
+
+def test_what_trimming_leaves_out_is_added_to_the_error():
+    patch = one_patch([[1.0, 0.5, 0.0, 0.0, 0.0, 1e-4]], 0.1)
+    trimmed = patch.trim()
+    assert trimmed.coefficients.shape[1] < 6
+    assert trimmed.error == pytest.approx([0.1001])
 
 
 def test_a_curve_is_traced_both_ways_from_its_seed():
-    """The parabola h = (2 v^2 - 1)/5 from its vertex to the rim."""
+    """The parabola h = (2 v^2 - 1)/5 from near its vertex to the rim."""
     field = tracing.Field(one_patch([[0.0, 0.0, -0.2], [1.0, 0.0, 0.0]]))
-    (curve,) = tracing.trace(field, np.array([[-0.2, 0.0]]))
+    (curve,) = tracing.trace(field, np.array([[-0.21, 0.0]]))
     h, v = curve.points.T
     assert h == pytest.approx((2 * v**2 - 1) / 5, abs=1e-12) and not curve.closed
     assert np.abs(np.diff(curve.points, axis=0)).max() < 0.04 and (np.diff(v) > 0).all() == (v[0] < 0)
     assert sorted([v[0], v[-1]]) == pytest.approx([-1.0, 1.0])
+
+
+def test_a_closed_curve_ends_where_it_began():
+    """The circle of radius 1/2, from near it."""
+    field = tracing.Field(one_patch([[0.75, 0.0, 0.5], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]))
+    (curve,) = tracing.trace(field, np.array([[0.51, 0.0]]))
+    assert curve.closed and np.array_equal(curve.points[0], curve.points[-1])
+    assert np.linalg.norm(curve.points, axis=1) == pytest.approx(np.full(len(curve.points), 0.5), abs=1e-12)
+
+
+def test_the_other_edge_of_a_narrow_tongue_is_another_curve():
+    """h^2 = 1e-8: the edges are nearer to each other than chords are to curves."""
+    field = tracing.Field(one_patch([[0.5 - 1e-8, 0.0], [0.0, 0.0], [0.5, 0.0]]))
+    v = np.linspace(-1.0, 1.0, 101)
+    edge = tracing.Curve(np.stack([np.full(101, 1e-4), v], axis=-1), False)
+    seeds = np.array([[1e-4, 0.013], [-1e-4, 0.013], [0.5, 0.013]])
+    assert boundaries._contains(field, edge, seeds).tolist() == [True, False, False]
+
+
+def test_parts_that_bound_nothing_are_left_out():
+    points = {"beta": np.arange(5.0), "Omega": np.arange(5.0)}
+    limiting = np.array([True, True, False, True, True])
+    curve = boundaries.Boundary("pair", points, points, limiting, False)
+    assert [part["beta"].tolist() for part in curve.segments()] == [[0.0, 1.0], [3.0, 4.0]]
 
 
 def test_a_path_that_runs_along_the_rim_ends_where_it_is():
@@ -40,3 +94,15 @@ def test_a_path_that_runs_along_the_rim_ends_where_it_is():
 
     end = tracing._to_rim(field, np.array([-1e-9, 0.5]), np.array([-1.0000001e-9, 0.51]))
     assert end == pytest.approx([0.0, 0.5], abs=0.02)
+
+
+def test_points_lie_on_the_edges_of_a_narrow_slanted_tongue():
+    """(h - 0.3 v - 0.3 v^2)^2 = 1e-6 (v + 0.5): slow convergence must not pass for a point of the curve."""
+    t = np.cos(np.pi * (np.arange(8) + 0.5) / 8)
+    analysis = np.linalg.inv(np.polynomial.chebyshev.chebvander(t, 7))
+    h, v = np.meshgrid(t, t, indexing="ij")
+    field = tracing.Field(one_patch(analysis @ ((h - 0.3 * v - 0.3 * v**2) ** 2 - 1e-6 * (v + 0.5)) @ analysis.T))
+    (curve,) = tracing.trace_tips(field, np.array([[-0.075, -0.5]]), 0)
+    value, gradient = field(field.to_unit(curve.points))
+    tip = np.abs(curve.points[:, 1] + 0.5) < 1e-12
+    assert (np.abs(value) / np.linalg.norm(gradient, axis=1))[~tip].max() < 1e-9

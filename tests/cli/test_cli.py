@@ -6,12 +6,13 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import h5py
 import pytest
 import xarray as xr
 
-from drivetrain_jax import __version__
+from drivetrain_jax import InputError, __version__
 from drivetrain_jax.cli import main
 
 SCENE = """
@@ -203,11 +204,27 @@ def test_wrong_run_is_one_line_and_writes_nothing(cli, folder, case):
     ("arguments", "part"),
     [
         ((), "COMMAND"),
-        (("dance",), "dance"),
+        (("dance",), "COMMAND = 'dance': unknown; allowed is list, run"),
+        (("stats", "scene.toml"), "(did you mean status?)"),
+        (
+            ("status", "scene.toml", "--out", "r.nc", "--jsn"),
+            "--jsn: not an argument of this command (did you mean --json?)",
+        ),
+        (("status", "scene.toml", "--out", "r.nc", "more"), "more: not an argument"),
+        (("run", "scene.toml", "--out", "r.nc", "--set", "b=3"), "did you mean fixed.b?"),
+        (("run", "scene.toml", "--out", "r.nc", "--dask", "nowhere"), "tcp://HOST:PORT"),
+        (("run", "scene.toml", "--out", "r.nc", "--set", "system=cardna"), "(did you mean cardan?)"),
+        (
+            ("point", "cardan", "floquet"),
+            "beta: missing; allowed is -1.570796327 < beta < 1.570796327, in rad (missing too",
+        ),
+        (("point", "cardan", "floqet"), "analysis = 'floqet': unknown (did you mean floquet?)"),
+        (("point", "toy"), "required: ANALYSIS;"),
+        (("verify", "."), "is a folder"),
+        (("design", "widest-angle", "r.nc", "--margin", "0.1"), "--margin = 0.1: not used by widest-angle"),
         (("run", "scene.toml"), "--out"),
         (("status", "nothing.toml", "--out", "r.nc"), "No such file"),
         (("list", "tractor"), "tractor"),
-        (("point", "toy"), "ANALYSIS"),
         (("point", "toy", "toy", "a"), "name=value"),
         (("point", "toy", "toy", "a=11"), "a = 11"),
         (("point", "toy", "toy", "a=1", "outputs=nothing"), "nothing"),
@@ -239,6 +256,15 @@ def test_point(cli):
     assert code == 0 and answer["values"]["value"] == {"value": 18.0, "units": "m"} and answer["method"] == "other"
 
 
+def test_a_run_that_is_refused_on_the_way_leaves_nothing(cli, monkeypatch):
+    def nobody(*_):
+        raise InputError("dask = 'tcp://nowhere:1': no scheduler answers there")
+
+    monkeypatch.setattr("drivetrain_jax.sweep.executor.Where.compute", nobody)
+    code, _, err = cli("run", "scene.toml", "--out", "r.nc", "--quiet")
+    assert (code, len(err)) == (2, 1) and "no scheduler" in err[0] and os.listdir() == ["scene.toml"]
+
+
 def test_list(cli):
     code, out, _ = cli("list")
     assert code == 0 and "cardan" in out and "floquet" in out
@@ -263,6 +289,8 @@ def test_plot_writes_the_figure(cli, monkeypatch):
     cli("run", "scene.toml", "--out", "r.nc", "--quiet")
     assert cli("plot", "r.nc", "--out", "f.png")[0] == 0 and open("f.png", "rb").read(4) == b"\x89PNG"
     assert cli("plot", "r.nc", "r.nc", "--out", "two.png")[0] == 0
+    code, _, err = cli("plot", "r.nc", "--out", "f.png", "--cells", "9")
+    assert code == 2 and len(err) == 1 and "--cells = 9" in err[0]
     code, _, err = cli("plot", "r.nc", "--out", "f.txt")
     assert code == 2 and len(err) == 1 and ".png" in err[0]
 
@@ -281,6 +309,18 @@ def test_help_is_light():
     loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
     assert "drivetrain_jax.cli" in loaded
     assert not {"jax", "numpy", "scipy", "xarray", "h5py", "matplotlib", "rich", "msgspec"} & set(loaded)
+
+
+def test_looking_at_a_result_loads_no_integrator_and_no_tables(folder):
+    """What a finished result is recognised with; half of the time until then would go into these packages."""
+    scene = Path(__file__).parents[2] / "sweeps" / "quickstart.toml"
+    code = (
+        "import sys, drivetrain_jax.sweep.run as run; from drivetrain_jax.cli import main\n"
+        f"assert main(['status', {str(scene)!r}, '--out', 'r.nc']) == 0\nprint(*sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert "drivetrain_jax.systems.cardan" in done.stdout
+    assert not {"xarray", "pandas", "scipy.integrate", "diffrax", "matplotlib", "rich"} & set(done.stdout.split())
 
 
 def test_a_reader_that_leaves_is_no_error():

@@ -8,7 +8,8 @@ import sys
 
 import pytest
 
-from drivetrain_jax import cli
+from drivetrain_jax.cli import main
+from drivetrain_jax.cli.signals import stop_on_signals
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
 
@@ -35,7 +36,7 @@ class Interrupted:
 def test_a_swallowed_interrupt_is_raised_again_and_not_shown(monkeypatch, disturbed):
     shown = []
     monkeypatch.setattr(sys, "unraisablehook", shown.append)
-    with cli._stop_on_signals() as check:
+    with stop_on_signals() as check:
         if disturbed:
             Interrupted()
             with pytest.raises(KeyboardInterrupt):
@@ -52,7 +53,7 @@ def test_other_errors_in_destructors_are_shown(monkeypatch):
 
     shown = []
     monkeypatch.setattr(sys, "unraisablehook", shown.append)
-    with cli._stop_on_signals():
+    with stop_on_signals():
         Broken()
     assert len(shown) == 1
 
@@ -60,10 +61,10 @@ def test_other_errors_in_destructors_are_shown(monkeypatch):
 def test_a_command_that_is_over_cannot_be_stopped(monkeypatch, capsys):
     """The process is on its way out and its exit code is that of what it did."""
     monkeypatch.setattr(sys, "argv", ["drivetrain", "list"])
-    assert cli.main() == 0
+    assert main() == 0
     assert [signal.getsignal(number) for number in NUMBERS] == [signal.SIG_IGN] * 2
     assert "Systems" in capsys.readouterr().out
     for number in NUMBERS:
         signal.signal(number, signal.SIG_DFL)
-    assert cli.main(["list"]) == 0
+    assert main(["list"]) == 0
     assert [signal.getsignal(number) for number in NUMBERS] == [signal.SIG_DFL] * 2

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from drivetrain_jax import cli
+from drivetrain_jax.cli.arguments import parser
 from drivetrain_jax.sweep.scene import load_scene
 
 ROOT = Path(__file__).parents[2]
@@ -26,7 +26,7 @@ def test_commands_parse(page, line):
     # What stands after a gap or in brackets is an explanation.
     words = shlex.split(re.split(r"\s{3,}|\s\[", line)[0], comments=True)
     with pytest.raises(SystemExit) if "--help" in words else pytest.MonkeyPatch.context():
-        cli._parser().parse_args([word for word in words if word != "..."])
+        parser().parse_args([word for word in words if word != "..."])
     scenes = [word for word in words if word.startswith("sweeps/")]
     assert all((ROOT / scene).exists() for scene in scenes)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ import drivetrain_jax as dt
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.cli import main
 from drivetrain_jax.store.consolidate import write_result
-from drivetrain_jax.sweep import atlas_answers, atlas_choice, rounds
+from drivetrain_jax.sweep import atlas_answers, atlas_choice, rounds, through_atlas
 from drivetrain_jax.sweep.atlas_chart import chart
 from drivetrain_jax.sweep.run import Interrupted, run_to_file
+from drivetrain_jax.sweep.scene import load_scene
 
 BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 ENDS = " allowed is start and stop"
@@ -98,12 +100,22 @@ def test_points_and_multipliers_through_an_atlas():
 def test_auto_takes_an_atlas_where_points_are_many(monkeypatch, direct):
     assert "atlas_solves" not in dt.run(floquet("auto")).attrs
     monkeypatch.setattr(atlas_choice, "_WORTHWHILE", 500)
+    # An eighth of the effort of 533 points is that of some 30 solves: no atlas of two parameters is to be had for that.
+    assert "atlas_solves" not in dt.run(floquet("auto")).attrs
+    monkeypatch.setattr(atlas_choice, "_FEWEST", 1)
     found = dt.run(floquet("auto"))
-    # 533 points allow 66 solves, which is fewer than the first round needs: all of them are solved directly.
+    # Tried all the same, it stops at the first round, and all points are solved directly.
     assert found.attrs["atlas_uncovered"] == 533
     same_arrays(found, direct)
-    monkeypatch.setattr(atlas_choice, "_POINTS_PER_SOLVE", 1)
+    monkeypatch.setattr(atlas_choice, "_SHARE", 10.0)
     assert_agree(dt.run(floquet("auto")), direct)
+
+
+@pytest.mark.parametrize(("slowest", "tried"), [(0.1, True), (0.005, False)])
+def test_auto_counts_the_effort_of_solves_not_their_number(slowest, tried):
+    """Down to Omega = .005 a node costs some fifty cells: that many cells are cheaper one by one."""
+    axes = {"beta": {"start": 0.0, "stop": 1.5, "num": 400}, "Omega": {"start": slowest, "stop": 2.0, "num": 400}}
+    assert atlas_choice.uses_atlas(load_scene(floquet("auto", axes))) is tried
 
 
 def test_what_an_atlas_does_not_cover_is_solved(monkeypatch, direct):
@@ -324,3 +336,31 @@ def test_a_zoom_on_the_command_line(file, capsys):
     assert (code, err) == (0, "") and figure.stat().st_size > 20_000
     code, _, err = answer(capsys, "plot", file, "--out", figure, "--part", "Omega=3")
     assert code == 2 and err == "drivetrain: Omega = 3.0: allowed is a number or LOW:HIGH within 1 to 2\n"
+
+
+@pytest.mark.parametrize(
+    ("lengths", "rows"), [((3873, 5164), 384), ((173, 174), 173), ((100_000, 100), 20_928), ((5, 3000, 1500), 1344)]
+)
+def test_blocks_of_a_grid_cover_it_once_and_leave_no_narrow_rest(lengths, rows):
+    """A narrow rest would be tiles of another shape, and two more kernels to compile: 3873 = 9 x 384 + 384 + 33."""
+    blocks = list(through_atlas._cut(lengths))
+    places = [tuple(part.start for part in block) for block in blocks]
+    sizes = [[part.stop - part.start for part in block] for block in blocks]
+    assert len(set(places)) == len(places)
+    assert sum(map(math.prod, sizes)) == math.prod(lengths)
+    cut = [size[-2] for size in sizes]
+    assert max(cut) < rows + 64
+    assert min(cut) >= min(rows, 64)
+
+
+def test_what_judges_cells_is_compiled_before_the_atlas_is_there(monkeypatch):
+    """In a large chart, while the solves are compiled; afterwards nothing is left to compile for it."""
+    from drivetrain_jax.atlas import stability
+
+    made = []
+    once = stability._point_kernel.__wrapped__
+    stability._point_kernel.cache_clear()
+    monkeypatch.setattr(stability, "_point_kernel", lambda *key: made.append(key) or once(*key))
+    monkeypatch.setattr(through_atlas, "_LARGE", 1)
+    dt.run(floquet("atlas"))
+    assert len(set(made)) == 1

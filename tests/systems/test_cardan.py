@@ -132,15 +132,6 @@ def test_reduced_form_is_the_transformed_natural_system(point, model_matrices):
         assert relative(model_matrices(POINTS[point], psi=psi)[1], exact_reduced(POINTS[point], psi)) <= 3e-14
 
 
-def test_absolute_coordinates():
-    for v in POINTS[:6]:
-        tau = mp.mpf("0.81")
-        eta, first, _ = exact_ratio(v["beta"], tau)
-        root = math.sqrt(v["gamma"])
-        expected = [[1, 0, 0, 0], [root * eta, root, 0, 0], [0, 0, 1, 0], [root * first, 0, root * eta, root]]
-        assert relative(cardan.absolute_coordinates(v["beta"], v["gamma"], 0.81), expected) <= 1e-14
-
-
 @pytest.mark.parametrize("beta", [0.0, 0.4, -1.2, 1.5, NEAR_PERPENDICULAR])
 def test_clock_runs_through_the_speed_ratio(beta, model_matrices):
     """eta and dtau/dpsi as read off the undamped reduced matrix; they are even about the middle of the half period."""

@@ -10,13 +10,21 @@ from scipy.integrate import solve_ivp
 
 from benchmarks.cardan_reference import monodromy
 from drivetrain_jax import InputError
-from drivetrain_jax.systems.cardan_units import PHYSICAL, PhysicalShaft, from_physical
+from drivetrain_jax.systems.cardan_units import PHYSICAL, PhysicalShaft
 
 DATA = {"J1": 0.5, "J2": 3.0, "k1": 2e4, "k2": 5e3, "c1": 3.0, "c2": 1.5, "speed": 1500.0, "angle": 35.0}
 
 
+def shaft_of(data):
+    return PhysicalShaft(*(data[name] for name in ("J1", "J2", "k1", "k2", "c1", "c2")))
+
+
+def converted(data):
+    return shaft_of(data).at(data["speed"], data["angle"])
+
+
 def test_values():
-    found = from_physical(DATA)
+    found = converted(DATA)
     assert found == pytest.approx(
         {
             "beta": math.radians(35),
@@ -51,19 +59,19 @@ def test_multipliers_are_those_of_the_equations_in_seconds():
 
     z = solve_ivp(field, (0, math.pi / speed), np.eye(4).reshape(-1), rtol=1e-10, atol=1e-12).y[:, -1].reshape(4, 4)
     expected = np.poly(np.linalg.eigvals(z)).real
-    found = np.poly(np.linalg.eigvals(monodromy(from_physical(DATA)))).real
+    found = np.poly(np.linalg.eigvals(monodromy(converted(DATA)))).real
     assert found == pytest.approx(expected, rel=1e-7)
 
 
 def test_way_back():
-    shaft = PhysicalShaft(*(DATA[name] for name in ("J1", "J2", "k1", "k2", "c1", "c2")))
+    shaft = shaft_of(DATA)
     assert shaft.speed(shaft.omega(1234.5)) == pytest.approx(1234.5)
     assert shaft.angle(shaft.beta(-20.0)) == pytest.approx(-20.0)
     assert shaft.damping(shaft.parameters["zeta"]) == pytest.approx(3.0)
 
 
 def test_table_names_all_units():
-    shaft = PhysicalShaft(*(DATA[name] for name in ("J1", "J2", "k1", "k2", "c1", "c2")))
+    shaft = shaft_of(DATA)
     table = shaft.table(1500.0, 35.0)
     assert all(f"{p.name} = {DATA[p.name]:.10g} {p.units}" in table for p in PHYSICAL)
     assert "zeta = 0.015" in table and "Omega = 0.785398" in table
@@ -76,17 +84,14 @@ def test_table_names_all_units():
         ({"angle": 90.0}, "angle = 90.0: allowed is -90 < angle < 90"),
         ({"speed": -1.0}, "speed = -1.0: allowed is 0 < speed"),
         ({"c1": 0.0}, "c2 = 1.5: allowed is 0 if c1 = 0"),
-        ({"k3": 1.0}, "k3 = 1.0: allowed are all of J1, J2"),
         ({"k2": math.nan}, "k2 = nan: allowed is"),
     ],
 )
 def test_wrong_input(change, message):
     with pytest.raises(InputError) as error:
-        from_physical({**DATA, **change})
+        converted({**DATA, **change})
     assert str(error.value).startswith(message) and "\n" not in str(error.value)
 
 
 def test_undamped():
-    assert from_physical({**DATA, "c1": 0.0, "c2": 0.0})["zeta"] == 0.0
-    with pytest.raises(InputError, match="speed = None"):
-        from_physical({name: value for name, value in DATA.items() if name != "speed"})
+    assert converted({**DATA, "c1": 0.0, "c2": 0.0})["zeta"] == 0.0

@@ -15,7 +15,7 @@ from jax import Array
 
 from drivetrain_jax.analysis.impacts.attractor import take
 from drivetrain_jax.analysis.impacts.attractor_lanes import MOST_PERIODS
-from drivetrain_jax.analysis.impacts.piecewise_flow import Bound, certain_span, responses, sine_cosine
+from drivetrain_jax.analysis.impacts.piecewise_flow import Bound, certain_span, responses
 from drivetrain_jax.analysis.impacts.piecewise_march import (
     Derivatives,
     Here,
@@ -32,6 +32,7 @@ from drivetrain_jax.analysis.impacts.piecewise_march import (
     usual_steps,
 )
 from drivetrain_jax.systems import PiecewiseLinearOscillator
+from drivetrain_jax.systems.trigonometry import sincos
 
 _NODES, _WEIGHTS = (x.tolist() for x in np.polynomial.legendre.leggauss(8))
 _LONGEST_ARC = 2.0
@@ -87,7 +88,7 @@ def _integrals(lanes: Lanes, here: Here, motion: Motion, d: Array) -> tuple[Arra
         elapsed = d * (1 + jnp.asarray(_NODES)[k]) / 2
         weight = d * jnp.asarray(_WEIGHTS)[k] / 2
         step, impulse, _ = responses(region, elapsed)
-        sine, cosine = sine_cosine(lanes.omega * (motion.time + elapsed))
+        sine, cosine = sincos(lanes.omega * (motion.time + elapsed))
         u = x + impulse * y + step * pull + (region.cosine * cosine + region.sine * sine)
         terms = (u, u * u, u * cosine, u * sine)
         return tuple(total + weight * term for total, term in zip(sums, terms, strict=True))

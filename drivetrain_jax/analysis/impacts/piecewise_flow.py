@@ -16,35 +16,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from drivetrain_jax.systems import PiecewiseLinearOscillator
+from drivetrain_jax.systems.trigonometry import sincos
 
 _TINY = 1e-150
 # The Taylor series of the step response is used where |root| d is below this, with so many terms.
 _SHORT, _TERMS = 0.5, 14
-# pi/2 in three parts of 33 bits (Cody & Waite), as in fdlibm.
-_HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
-_SINE = (-1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800, 1 / 6227020800, -1 / 1307674368000)
-_COSINE = (-1 / 2, 1 / 24, -1 / 720, 1 / 40320, -1 / 3628800, 1 / 479001600, -1 / 87178291200, 1 / 20922789888000)
-
-
-def sine_cosine(x: Array) -> tuple[Array, Array]:
-    """``sin(x)`` and ``cos(x)`` to 2e-16 for ``|x| < 1e5``; unlike XLA's own they vectorise on CPUs."""
-    quarter = jnp.round(x * (2 / np.pi))
-    r = ((x - quarter * _HALF_PI[0]) - quarter * _HALF_PI[1]) - quarter * _HALF_PI[2]
-    square = r * r
-    sine, cosine = jnp.full_like(r, _SINE[-1]), jnp.full_like(r, _COSINE[-1])
-    for term in _SINE[-2::-1]:
-        sine = sine * square + term
-    for term in _COSINE[-2::-1]:
-        cosine = cosine * square + term
-    sine, cosine = r + r * square * sine, 1 + square * cosine
-    turn = quarter - 4 * jnp.floor(quarter / 4)
-    odd = (turn == 1) | (turn == 3)
-    first, second = jnp.where(odd, cosine, sine), jnp.where(odd, sine, cosine)
-    return jnp.where(turn >= 2, -first, first), jnp.where((turn == 1) | (turn == 2), -second, second)
 
 
 class Piece(NamedTuple):
@@ -97,7 +76,7 @@ def _short_step_response(region: Piece, d: Array) -> Array:
 
 def responses(region: Piece, d: Array) -> tuple[Array, Array, Array]:
     """Step response P, impulse response S and its derivative S' at the time ``d`` after a start from rest."""
-    half_sine, half_cosine = sine_cosine(jnp.where(region.overdamped, 0.0, region.root * d / 2))
+    half_sine, half_cosine = sincos(jnp.where(region.overdamped, 0.0, region.root * d / 2))
     slow, fast = jnp.expm1(region.slow * d), jnp.expm1(region.fast * d)
     # Oscillating: exp(-h d) (sin, cos); the step response through the half angle.
     decay = 1 + slow

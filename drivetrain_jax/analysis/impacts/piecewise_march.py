@@ -22,9 +22,9 @@ from drivetrain_jax.analysis.impacts.piecewise_flow import (
     choose,
     piece,
     responses,
-    sine_cosine,
 )
 from drivetrain_jax.systems import PiecewiseLinearOscillator
+from drivetrain_jax.systems.trigonometry import sincos
 
 # Least step over the shortest time scale, and over the period (rounding of the time).
 _LEAST_STEP, _LEAST_PART = 1e-12, 1e-15
@@ -150,7 +150,7 @@ def advance(lanes: Lanes, here: Here, motion: Motion, d: Array) -> Motion:
     step, impulse, rate = responses(region, d)
     ends = d >= lanes.period - motion.time
     time = jnp.where(ends, 0.0, motion.time + d)
-    sine, cosine = sine_cosine(omega * time)
+    sine, cosine = sincos(omega * time)
     x = motion.u - (region.cosine * motion.cosine + region.sine * motion.sine)
     y = motion.v - omega * (region.sine * motion.cosine - region.cosine * motion.sine)
     pull = here.force - region.stiffness * x

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -35,6 +34,8 @@ def amplitudes(
     Every accepted step of the integration is searched for a peak, so that none is missed however fast the solution
     oscillates; the error is that of the solver's continuous extension, about ``rtol`` for a state of order one.
     """
+    import diffrax
+
     term, solver, control = diffrax.ODETerm(lambda t, y, _: field(t, y)), diffrax.Dopri8(), controller(period, rtol)
     order = solver.error_order(term)
 

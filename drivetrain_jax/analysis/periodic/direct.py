@@ -120,7 +120,11 @@ def direct_monodromy(
     def refine(state: tuple) -> tuple:
         count, current, coarse, _ = state
         fine = propagate(current)
-        return count + 1, 2 * current, fine, compare(system, coarse, fine, current, stiffness, rtol, 2.0**order - 1)
+
+        def compared() -> Monodromy:
+            return compare(system, coarse, fine, current, stiffness, rtol, 2.0**order - 1)
+
+        return count + 1, 2 * current, fine, jax.lax.cond(count > 0, compared, lambda: unknown)
 
     start = (jnp.int32(0), jnp.maximum((steps + 1) // 2, 1), blank, unknown)
     return jax.lax.while_loop(unfinished, refine, start)[-1]

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System
 
@@ -14,6 +19,9 @@ _STIFF = 600
 _MAX_EXPLICIT, _MAX_PANELS = 300_000, 20_000
 # Seconds of one implicit panel over those of one explicit step, per point: 150 in full batches, less in small ones.
 PANEL_COST = 50.0
+# Nodes of the quadrature, and points that are evaluated together.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+_TOGETHER = 2048
 
 
 def explicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
@@ -28,10 +36,10 @@ def implicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: flo
     stiff = np.flatnonzero(explicit > _STIFF)
     if stiff.size:
         chosen = {
-            name: column if isinstance(column, str) else np.broadcast_to(column, explicit.shape)[stiff]
+            name: column if np.ndim(column) == 0 else np.broadcast_to(column, explicit.shape)[stiff]
             for name, column in columns.items()
         }
-        phase = _frequency_phase(system.models["floquet"].build(chosen).reduced, stiff.size)
+        phase = _frequency_phase(system, chosen, stiff.size)
         effort[stiff] = 2 * np.ceil((8 + phase / 5) * (1e-10 / rtol) ** (1 / 16) / 2)
     return _up_to(_MAX_PANELS, effort)
 
@@ -44,17 +52,33 @@ def _explicit_steps(system: System, columns: Mapping[str, np.ndarray], rtol: flo
     return np.broadcast_to(2 * np.ceil(steps / 2), size)
 
 
-def _frequency_phase(form: LinearPeriodic, size: int) -> np.ndarray:
+def _frequency_phase(system: System, columns: Mapping[str, Any], size: int) -> np.ndarray:
     """int max |Im lambda(A(t))| dt over the span for ``size`` points, by Gauss quadrature with 8 nodes."""
-    nodes, weights = np.polynomial.legendre.leggauss(8)
-    phase = np.zeros(size)
-    for x, weight in zip(nodes, weights, strict=True):
-        a = np.asarray(form.matrix((x + 1) * form.span / 2))
-        a = np.broadcast_to(np.moveaxis(a.reshape(*a.shape[:2], -1), -1, 0), (size, *a.shape[:2]))
-        finite = np.isfinite(a).all(axis=(1, 2))
-        frequency = np.abs(np.linalg.eigvals(np.where(finite[:, None, None], a, 0.0)).imag).max(-1)
-        phase += weight * form.span / 2 * np.where(finite, frequency, np.inf)
-    return phase
+    varying = {name: column for name, column in columns.items() if np.ndim(column)}
+    fixed = tuple((name, column) for name, column in columns.items() if name not in varying)
+    matrix = _matrix(system.models["floquet"].build, fixed)
+    phase = np.empty(size)
+    for start in range(0, size, _TOGETHER):
+        part = slice(start, min(start + _TOGETHER, size))
+        count = part.stop - start
+        padded = {n: np.pad(c[part], (0, _TOGETHER - count), mode="edge") for n, c in varying.items()}
+        a = np.stack([np.moveaxis(np.asarray(matrix(padded, x)), -1, 0)[:count] for x in _NODES])
+        finite = np.isfinite(a).all(axis=(2, 3))
+        frequency = np.abs(np.linalg.eigvals(np.where(finite[..., None, None], a, 0.0)).imag).max(-1)
+        phase[part] = np.tensordot(_WEIGHTS, np.where(finite, frequency, np.inf), 1)
+    return phase * system.models["floquet"].build(columns).reduced.span / 2
+
+
+@lru_cache(maxsize=8)
+def _matrix(build: Callable[..., FloquetModel], fixed: tuple[tuple[str, Any], ...]) -> Callable[..., Array]:
+    """``A``, ``(n, n, N)``, at a node in [-1, 1]: compiled for one N, not operation by operation for each."""
+
+    def at_node(varying: Mapping[str, Array], x: Array) -> Array:
+        form = build({**dict(fixed), **varying}).reduced
+        a = form.matrix((x + 1) * form.span / 2)
+        return jnp.broadcast_to(a.reshape(*a.shape[:2], -1), (*a.shape[:2], _TOGETHER))
+
+    return jax.jit(at_node)
 
 
 def _generic_steps(form: LinearPeriodic, rtol: float) -> np.ndarray:

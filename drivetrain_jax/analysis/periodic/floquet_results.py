@@ -11,7 +11,13 @@ from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis._base import Outcome
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
 from drivetrain_jax.analysis.periodic.direct import Monodromy
-from drivetrain_jax.analysis.periodic.multipliers import VERDICTS, sort_multipliers, spectral_radius_bound, verdict
+from drivetrain_jax.analysis.periodic.multipliers import VERDICTS, sort_multipliers, verdict
+from drivetrain_jax.analysis.periodic.radius import (
+    Spectrum,
+    has_closed_form,
+    radius_by_eigenvalues,
+    radius_in_closed_form,
+)
 
 VARIABLES = (
     Variable("floquet_multiplier", "1", "Floquet multiplier over one period", ("multiplier",), "complex128"),
@@ -24,26 +30,43 @@ VARIABLES = (
     ),
 )
 NEED_ERROR = {"spectral_radius_error", "verdict"}
+MULTIPLIERS = {"floquet_multiplier", "floquet_exponent"}
 
 
-def results(z: Monodromy, outputs: tuple[str, ...], rtol: float, period: Any) -> dict[str, Array]:
-    """The requested variables and the outcome from a monodromy matrix with trailing batch axes."""
+def results(
+    z: Monodromy,
+    outputs: tuple[str, ...],
+    rtol: float,
+    period: Any,
+    spectrum: Spectrum | None = None,
+) -> dict[str, Array]:
+    """The requested variables and the outcome from a monodromy matrix with trailing batch axes.
+
+    ``spectrum``: real and imaginary parts of the eigenvalues of ``z.matrix`` where they are known already. Otherwise the
+    spectral radius of four states is found in closed form, and by eigenvalues only where that says too little.
+    """
     wanted = set(outputs)
     finite = jnp.all(jnp.isfinite(z.matrix), axis=(0, 1))
-    real, imaginary = eigenvalues(jnp.where(finite, z.matrix, jnp.nan))
     size = jnp.exp(z.log_scale)
-    rho = jnp.max(jnp.hypot(real, imaginary), axis=0) * size
-    found = {"spectral_radius": rho}
-    outcome, met = jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE), z.met
-    if wanted & {"floquet_multiplier", "floquet_exponent"}:
+
+    def eigen() -> Spectrum:
+        return spectrum or eigenvalues(jnp.where(finite, z.matrix, jnp.nan))
+
+    found: dict[str, Array] = {}
+    if wanted & MULTIPLIERS:
+        real, imaginary = spectrum = eigen()
         multipliers = sort_multipliers(real, imaginary)
         found["floquet_multiplier"] = multipliers * size
         found["floquet_exponent"] = (jnp.log(jnp.abs(multipliers)) + z.log_scale) / period
-    if "liouville_residual" in wanted:
-        found["liouville_residual"] = jnp.where(finite, z.residual, jnp.nan)
+    if spectrum is None and has_closed_form(z.matrix):
+        rho, error = radius_in_closed_form(z.matrix, z.error, size, 10 * rtol)
+    else:
+        rho, error = radius_by_eigenvalues(eigen(), z.error)
+    found |= {"spectral_radius": rho * size, "liouville_residual": jnp.where(finite, z.residual, jnp.nan)}
+    met = z.met
     if wanted & NEED_ERROR:
-        error = spectral_radius_bound(real, imaginary, z.error) * size
         met = error <= 10 * rtol * rho
-        found |= {"spectral_radius_error": error, "verdict": verdict(rho, error)}
-    outcome = jnp.where(finite & ~met, Outcome.TOLERANCE_NOT_MET, outcome)
+        found |= {"spectral_radius_error": error * size, "verdict": verdict(rho * size, error * size)}
+    outcome = jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
+    outcome = jnp.where(finite, outcome, Outcome.NOT_FINITE)
     return {name: found[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}

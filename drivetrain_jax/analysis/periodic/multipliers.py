@@ -16,6 +16,7 @@ Near a double multiplier (the edge of every tongue) this gives the honest square
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -75,13 +76,20 @@ def spectral_radius_bound(real: Array, imaginary: Array, error: Array) -> Array:
     modulus = jnp.hypot(real, imaginary)
     rho = jnp.max(modulus, axis=0)
     modulus, x, y = modulus / rho, real / rho, imaginary / rho
-    gap = jnp.hypot(x[:, None] - x, y[:, None] - y)
-    closest = jnp.stack([jnp.min(jnp.delete(gap[i], i, axis=0), axis=0, initial=jnp.inf) for i in range(n)])
-    ladder = jnp.asarray(_LADDER)
 
     def eps(r: Array) -> Array:
         # Both circles lie within |z| <= 1 + r, where sum_k error |z|^(n-k) <= n error (1 + r)^(n-1).
         return n * error * (1 + r) ** (n - 1)
+
+    radius = jnp.maximum(_circle_around_all(modulus, x, y, eps), _circle_around_largest(modulus, x, y, eps))
+    return rho * (radius + 4 * np.finfo(float).eps)
+
+
+def _circle_around_all(modulus: Array, x: Array, y: Array, eps: Callable[[Array], Array]) -> Array:
+    """Least rung r such that no zero leaves ``|z| <= 1 + r``; the multipliers ``x + i y`` are in units of rho."""
+    n, ladder = len(x), jnp.asarray(_LADDER)
+    gap = jnp.hypot(x[:, None] - x, y[:, None] - y)
+    closest = jnp.stack([jnp.min(jnp.delete(gap[i], i, axis=0), axis=0, initial=jnp.inf) for i in range(n)])
 
     def outside(r: Array) -> Array:
         reach = 1 + r - modulus
@@ -98,10 +106,14 @@ def spectral_radius_bound(real: Array, imaginary: Array, error: Array) -> Array:
         met = outside(ladder[middle])
         return jnp.where(met, low, middle), jnp.where(met, middle, high)
 
-    first = jnp.full(rho.shape, -1), jnp.full(rho.shape, ladder.size)
+    first = jnp.full(modulus.shape[1:], -1), jnp.full(modulus.shape[1:], ladder.size)
     rung = jax.lax.fori_loop(0, math.ceil(math.log2(ladder.size)) + 1, halve, first)[1]
-    outer = jnp.where(rung < ladder.size, ladder[jnp.minimum(rung, ladder.size - 1)], jnp.inf)
+    return jnp.where(rung < ladder.size, ladder[jnp.minimum(rung, ladder.size - 1)], jnp.inf)
 
+
+def _circle_around_largest(modulus: Array, x: Array, y: Array, eps: Callable[[Array], Array]) -> Array:
+    """Least rung r such that a zero stays within r of the largest multiplier."""
+    n, ladder = len(x), jnp.asarray(_LADDER)
     x1, y1, top = x[0], y[0], modulus[0]
     for j in range(1, n):
         larger = modulus[j] > top
@@ -113,8 +125,7 @@ def spectral_radius_bound(real: Array, imaginary: Array, error: Array) -> Array:
         r = ladder[ladder.size - 1 - k]
         return jnp.where(math.prod(jnp.abs(distances[j] - r) for j in range(n)) > eps(r), r, inner)
 
-    inner = jax.lax.fori_loop(0, ladder.size, descend, jnp.full(rho.shape, jnp.inf))
-    return rho * (jnp.maximum(outer, inner) + 4 * np.finfo(float).eps)
+    return jax.lax.fori_loop(0, ladder.size, descend, jnp.full(modulus.shape[1:], jnp.inf))
 
 
 def verdict(rho: Array, error: Array) -> Array:

@@ -6,15 +6,17 @@ Everything is for one point and follows the variational equations, never automat
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from drivetrain_jax.analysis._base import Outcome
 from drivetrain_jax.analysis.numerics.linear_algebra import solve
+
+if TYPE_CHECKING:
+    import diffrax
 
 Field = Callable[[Any, Array], Array]
 
@@ -81,11 +83,15 @@ def variational(field: Field) -> Field:
 
 def controller(period: float, rtol: Array | float) -> diffrax.PIDController:
     """Step-size control of all integrations here, for unknowns of order one."""
+    import diffrax  # a quarter of the time in which a process that does not need it is ready
+
     return diffrax.PIDController(rtol=rtol, atol=ATOL_RATIO * rtol, dtmin=STEP_RATIO * period, force_dtmin=False)
 
 
 def integrate(field: Field, start: Array, period: float, rtol: Array | float) -> tuple[Array, Array]:
     """State after one period from ``start`` at t = 0, by Dopri8 with error control, and an ``Outcome``."""
+    import diffrax
+
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, _: field(t, y)),
         diffrax.Dopri8(),

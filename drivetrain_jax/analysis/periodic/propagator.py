@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.integrate import DOP853
 
 from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, stored, suits_one_kernel
 from drivetrain_jax.analysis.numerics.linear_algebra import solve
@@ -31,7 +30,7 @@ class Propagator(NamedTuple):
     log_scale: Array
 
 
-# Order of the explicit scheme; the tableau is Hairer, Norsett & Wanner's DOP853 as kept by SciPy.
+# Order of the explicit scheme, see `_tableau`.
 EXPLICIT_ORDER = 8
 # Lanes that should march together: what a step reads and writes stays in the innermost caches.
 LANES = 64
@@ -56,7 +55,7 @@ def explicit_propagator(system: LinearPeriodic, steps: Array, shape: tuple[int, 
             if not z
         ]
 
-    times = jnp.zeros((len(DOP853.C), 1))
+    times = jnp.zeros((len(_tableau().C), 1))
     split = staged(entries, *jax.eval_shape(system.basis, times))
     suits = suits_one_kernel(lambda t: system.rows(*system.basis(t)), times)
     mark = in_one_kernel if suits else lambda function: function
@@ -67,6 +66,13 @@ def explicit_propagator(system: LinearPeriodic, steps: Array, shape: tuple[int, 
 
     rows = mark(march)(steps, system.span / steps, split.fixed)
     return Propagator(jnp.stack(rows).reshape(len(zeros), len(zeros), *shape), jnp.zeros(shape))
+
+
+def _tableau() -> Any:
+    """Coefficients A, B, C of Hairer, Norsett & Wanner's DOP853 as kept by SciPy."""
+    from scipy.integrate import DOP853  # loads most of SciPy, which a process that computes nothing does without
+
+    return DOP853
 
 
 def _identity(n: int, lanes: int) -> Rows:
@@ -82,12 +88,13 @@ def _explicit_step(
     y: Rows,
 ) -> Rows:
     """One step from ``number * h``: the entries at all stages first, then stage after stage."""
-    at_stages = entries(*basis((number + jnp.asarray(DOP853.C)[:, None]) * h))
+    scheme = _tableau()
+    at_stages = entries(*basis((number + jnp.asarray(scheme.C)[:, None]) * h))
     slopes: list[Rows] = []
-    for stage, weights in enumerate(DOP853.A[: len(DOP853.C), : len(DOP853.C)]):
+    for stage, weights in enumerate(scheme.A[: len(scheme.C), : len(scheme.C)]):
         state = _advanced(y, h, weights[:stage], slopes)
         slopes.append(stored(partial(_slopes, zeros, stage))(at_stages, state))
-    return _advanced(y, h, DOP853.B, slopes)
+    return _advanced(y, h, scheme.B, slopes)
 
 
 def _slopes(zeros: tuple[tuple[bool, ...], ...], stage: int, at_stages: list[Array], state: Rows) -> Rows:

@@ -18,15 +18,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-Plane = tuple[Array, Array, Array, Array, Array]
+from drivetrain_jax.systems.trigonometry import horner, sincos
 
-# pi/2 as the sum of three numbers, the first two of 33 bits, so that their products with a quadrant are exact
-# (W. J. Cody, W. Waite, Software Manual for the Elementary Functions, 1980; the coefficients are those of fdlibm).
-_HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
-_SINE = (1.58969099521155010221e-10, -2.50507602534068634195e-08, 2.75573137070700676789e-06)
-_SINE += (-1.98412698298579493134e-04, 8.33333333332248946124e-03, -1.66666666666666324348e-01)
-_COSINE = (-1.13596475577881948265e-11, 2.08757232129817482790e-09, -2.75573143513906633035e-07)
-_COSINE += (2.48015872894767294178e-05, -1.38888888888741095749e-03, 4.16666666666666019037e-02)
+Plane = tuple[Array, Array, Array, Array, Array]
 
 # Below this phase the functions are summed as series: their closed forms cancel for z -> 0.
 _SERIES = 2.0
@@ -35,31 +29,9 @@ _TERMS = 8
 _GENERAL_TERMS = 14
 
 
-def horner(coefficients: tuple[float, ...], x: Array) -> Array:
-    """The polynomial with these coefficients, highest power first."""
-    total = jnp.full_like(x, coefficients[0])
-    for coefficient in coefficients[1:]:
-        total = total * x + coefficient
-    return total
-
-
 def sign_of(x: Array) -> Array:
     """-1 for negative ``x``, else 1, of zero too."""
     return jnp.where(x < 0, -1.0, 1.0)
-
-
-def sine_cosine(z: Array) -> tuple[Array, Array]:
-    """``sin z`` and ``cos z`` to 1 ulp for ``|z| < 1e6``; XLA's own are not vectorised in double precision."""
-    quadrant = jnp.round(z * 0.63661977236758134308)
-    r = ((z - quadrant * _HALF_PI[0]) - quadrant * _HALF_PI[1]) - quadrant * _HALF_PI[2]
-    square = r * r
-    sine = r + r * square * horner(_SINE, square)
-    cosine = 1 - (0.5 * square - square * square * horner(_COSINE, square))
-    turn = quadrant - 4 * jnp.floor(quadrant / 4)
-    odd = (turn == 1) | (turn == 3)
-    flip_sine, flip_cosine = turn >= 2, (turn == 1) | (turn == 2)
-    first, second = jnp.where(odd, cosine, sine), jnp.where(odd, sine, cosine)
-    return jnp.where(flip_sine, -first, first), jnp.where(flip_cosine, -second, second)
 
 
 class Compound(NamedTuple):
@@ -110,7 +82,7 @@ def compound(z: Array) -> Compound:
     y = short * horner(_Y_SERIES, fourth)
     w = short * square * horner(_W_SERIES, fourth)
     long = jnp.where(small, _SERIES, z)
-    sine, cosine = sine_cosine(long)
+    sine, cosine = sincos(long)
     square_decay = jnp.where(small, 0.0, decay * decay)
     ch, sh = 0.5 + 0.5 * square_decay, 0.5 - 0.5 * square_decay
     d = ch * cosine
@@ -169,7 +141,7 @@ def even_and_odd(square: Array, z: Array) -> tuple[Array, Array, Array]:
     root = jnp.sqrt(jnp.where(square == 0, 1.0, jnp.abs(square)))
     phase = root * z
     growth = jnp.where(growing, phase, 0.0)
-    sine, cosine = sine_cosine(jnp.where(growing, 0.0, phase))
+    sine, cosine = sincos(jnp.where(growing, 0.0, phase))
     square_decay = jnp.exp(-2 * growth)
     # expm1 keeps the digits of sinh for small phases.
     hyperbolic = -0.5 * jnp.expm1(-2 * growth)

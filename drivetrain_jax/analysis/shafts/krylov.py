@@ -16,10 +16,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from drivetrain_jax.analysis.shafts.compound import Scales, characteristic
-from drivetrain_jax.analysis.shafts.functions import sine_cosine
 from drivetrain_jax.analysis.shafts.mechanisms import zero_modes
 from drivetrain_jax.analysis.shafts.roots import Roots
 from drivetrain_jax.systems import Shaft
+from drivetrain_jax.systems.trigonometry import sincos
 
 POINTS_PER_MODE = 16
 _BISECTIONS = 54
@@ -39,7 +39,7 @@ def determinant(shaft: Shaft, q: Array) -> Array:
     def step(state: Any, segment: tuple[Array, ...]) -> tuple[Any, None]:
         beta, b, EI = segment
         z, alpha = q * beta, q * b
-        (s, c), ch, sh = sine_cosine(z), jnp.cosh(z), jnp.sinh(z)
+        (s, c), ch, sh = sincos(z), jnp.cosh(z), jnp.sinh(z)
         f = ((ch + c) / 2, (sh + s) / 2, (ch - c) / 2, (sh - s) / 2)
         d = (1.0, 1 / alpha, -1 / (alpha**2 * EI), -1 / (alpha**3 * EI))
         scaled = [[d[j] * state[j][column] for column in (0, 1)] for j in range(4)]

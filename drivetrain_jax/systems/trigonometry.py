@@ -38,6 +38,14 @@ _COSINE = (
 )
 
 
+def horner(coefficients: tuple[float, ...], x: Array) -> Array:
+    """The polynomial in ``x`` with these coefficients, highest power first."""
+    total = jnp.full_like(x, coefficients[0])
+    for coefficient in coefficients[1:]:
+        total = total * x + coefficient
+    return total
+
+
 @jax.custom_jvp
 def sincos(x: Any) -> tuple[Array, Array]:
     """``(sin x, cos x)`` of an angle in [rad], any shape; |x| up to 2^20, NaN for NaN and infinity."""
@@ -45,8 +53,8 @@ def sincos(x: Any) -> tuple[Array, Array]:
     quarter = jnp.floor(x * _TWO_OVER_PI + 0.5)
     r = x - quarter * _HALF_PI[0] - quarter * _HALF_PI[1] - quarter * _HALF_PI[2]
     z = r * r
-    sine = r + r * z * _horner(_SINE, z)
-    cosine = 1.0 - (0.5 * z - z * z * _horner(_COSINE, z))
+    sine = r + r * z * horner(_SINE, z)
+    cosine = 1.0 - (0.5 * z - z * z * horner(_COSINE, z))
     # quarter mod 4 in floating point: integer vectors of 64 bits are slower.
     turn = quarter - 4.0 * jnp.floor(0.25 * quarter)
     odd = (turn == 1.0) | (turn == 3.0)
@@ -68,11 +76,3 @@ def sin(x: Any) -> Array:
 def cos(x: Any) -> Array:
     """``cos x``: see :func:`sincos`."""
     return sincos(x)[1]
-
-
-def _horner(coefficients: tuple[float, ...], z: Array) -> Array:
-    """Polynomial in ``z``, highest coefficient first."""
-    value = coefficients[0] * jnp.ones_like(z)
-    for coefficient in coefficients[1:]:
-        value = value * z + coefficient
-    return value

@@ -195,14 +195,16 @@ def _at_real(factor: _Factor, modulus: Array, slope: Array, offset: Array) -> Ar
     return jnp.abs(jnp.where(factor.half < 0, -slope, slope) * modulus + offset)
 
 
-def spectral_radius(c: Coefficients) -> tuple[Array, Array, Array]:
+def spectral_radius(c: Coefficients, split: tuple[_Factor, _Factor] | None = None) -> tuple[Array, Array, Array]:
     """``rho``, a bound of its error, and whether the bound is much wider than it need be (or not a number).
+
+    ``split`` are the :func:`factors` of ``c`` where they are known.
 
     Smith's discs: with eps(sigma) = sum_k error_k |sigma|^(4-k), the true multipliers lie in the union of the discs about
     the computed ones s_i with radius 4 eps(s_i)/prod_(j != i) |s_i - s_j|, in each connected part as many as centres. The
     dominant disc, or the pair of them, must lie further out than the others; then its radius bounds the error.
     """
-    one, two = factors(c)
+    one, two = split or factors(c)
     errors = _unexplained(c, one, two)
     first = one.large >= two.large
     top, other = one.where(first, two), two.where(first, one)

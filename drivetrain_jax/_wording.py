@@ -1,0 +1,40 @@
+"""How messages and tables show values, and which name may have been meant."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+# Characters of a given value that a message repeats.
+_SHOWN = 60
+
+
+def clipped(text: str) -> str:
+    """``text``, its end left out where it is too long for a message."""
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
+
+
+def shown(value: Any) -> str:
+    """What was given, as a message repeats it."""
+    return clipped(repr(value))
+
+
+def written(value: Any) -> str:
+    """A parameter's value: up to ten digits, a list in brackets."""
+    if isinstance(value, tuple):
+        return "[" + ", ".join(map(written, value)) + "]"
+    return f"{value:.10g}" if isinstance(value, float) else str(value)
+
+
+def did_you_mean(name: str, allowed: Iterable[str]) -> str:
+    """``(did you mean X?)`` where a name is close, else nothing."""
+    import difflib
+
+    match = difflib.get_close_matches(name, list(allowed), n=1)
+    return f" (did you mean {match[0]}?)" if match else ""
+
+
+def nearest(name: str, allowed: Iterable[str]) -> str:
+    """``(did you mean X?); allowed is A, B, ...``"""
+    allowed = list(allowed)
+    return f"{did_you_mean(name, allowed)}; allowed is {', '.join(allowed) if allowed else 'none'}"

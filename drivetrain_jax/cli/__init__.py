@@ -1,0 +1,37 @@
+"""The command ``drivetrain``. Thin: every command imports what it needs, so that ``--help`` is instant."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Sequence
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.cli.arguments import parser
+from drivetrain_jax.cli.replies import INTERRUPTED, OK, WRONG_INPUT, one_line
+
+__all__ = ["main"]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code (0 done, 2 wrong input, 3 incomplete and resumable, 130 interrupted)."""
+    options = parser().parse_args(arguments)
+    try:
+        code = options.command(options)
+        sys.stdout.flush()
+        return code
+    except InputError as error:
+        sys.stderr.write(one_line(str(error)))
+        return WRONG_INPUT
+    except BrokenPipeError:
+        # The reader of our output has gone (``drivetrain list | head``): nobody is left to tell.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    finally:
+        if arguments is None:
+            # The process ends now, and what it has done is done: a signal could only spoil its way out.
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, signal.SIG_IGN)

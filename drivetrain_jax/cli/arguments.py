@@ -1,0 +1,181 @@
+"""What the command line accepts: the commands with their arguments, and the text of ``--help``."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import Any, NoReturn
+
+from drivetrain_jax import __version__
+from drivetrain_jax._wording import did_you_mean, nearest
+from drivetrain_jax.cli import commands
+from drivetrain_jax.cli.replies import WRONG_INPUT, one_line
+
+
+class _Parser(argparse.ArgumentParser):
+    """Usage errors are one line and end with the code for wrong input."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(allow_abbrev=False, **options)
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As usual; an unknown option is answered by the command that it was given to."""
+        options, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            first = next((word for word in unknown if word.startswith("-")), unknown[0])
+            known = re.findall(r"--[a-z]+", options.parser.format_help()) if first.startswith("-") else ()
+            options.parser.error(f"{first}: not an argument of this command{did_you_mean(first, known)}")
+        return options
+
+    def error(self, message: str) -> NoReturn:
+        choice = re.fullmatch(r"argument ([\w-]+): invalid choice: '(.*)' \(choose from (.*)\)", message)
+        if choice:
+            field, given, allowed = choice.group(1), choice.group(2), choice.group(3).replace("'", "").split(", ")
+            message = f"{field} = {given!r}: unknown{nearest(given, allowed)}"
+        self.exit(WRONG_INPUT, one_line(f"{message}; see {self.prog} --help"))
+
+
+def parser() -> argparse.ArgumentParser:
+    """The parser of all commands; what it gives has the function of the command as ``command``."""
+    whole = _Parser(
+        prog="drivetrain", description="Stability and vibration of drivetrains, from a scene file to a chart."
+    )
+    whole.add_argument("--version", action="version", version=__version__)
+    subparsers = whole.add_subparsers(metavar="COMMAND", required=True)
+
+    for add in _COMMANDS:
+        add(subparsers)
+    return whole
+
+
+def _add_list(subparsers: Any) -> None:
+    command = _command(subparsers, "list", commands.list_systems, "systems, analyses, parameters and scenes")
+    command.add_argument("system", nargs="?", metavar="SYSTEM", help="describe this one")
+
+
+def _add_run(subparsers: Any) -> None:
+    command = _command(subparsers, "run", commands.run, "compute a scene, or resume it")
+    _add_scene(command)
+    command.add_argument("--fresh", action="store_true", help="replace a result of another scene or version")
+    command.add_argument("--threads", type=int, metavar="N", help="chunks computed at a time (default: usable cores)")
+    command.add_argument("--workers", type=int, metavar="N", help="N processes instead of threads: survive a crash")
+    command.add_argument("--dask", metavar="ADDRESS", help="a Dask cluster instead: tcp://HOST:PORT or local:N")
+    command.add_argument(
+        "--reuse",
+        action="append",
+        default=[],
+        metavar="FILE.nc",
+        type=Path,
+        help="take over the points that this result shares; a smaller result at --out is taken over without it",
+    )
+    command.add_argument(
+        "--store", choices=("hdf5", "zarr"), default="hdf5", help="zarr: a store that the workers write themselves"
+    )
+    command.add_argument("--quiet", action="store_true", help="no progress, only the last line")
+
+
+def _add_status(subparsers: Any) -> None:
+    command = _command(subparsers, "status", commands.status, "how much of a scene is computed")
+    _add_scene(command)
+    command.add_argument("--json", action="store_true", help="as one JSON object")
+
+
+def _add_verify(subparsers: Any) -> None:
+    command = _command(
+        subparsers, "verify", commands.verify, "check every checksum of a result, and what must hold of its numbers"
+    )
+    command.add_argument("file", metavar="FILE.nc", type=Path)
+    command.add_argument("--json", action="store_true", help="as one JSON object")
+
+
+def _add_export(subparsers: Any) -> None:
+    command = _command(subparsers, "export", commands.export, "write a Zarr store as one HDF5 file")
+    command.add_argument("store", metavar="STORE", type=Path)
+    command.add_argument("file", metavar="FILE.nc", type=Path)
+
+
+def _add_plot(subparsers: Any) -> None:
+    command = _command(subparsers, "plot", commands.plot, "draw the figure that suits a result")
+    command.add_argument(
+        "files", metavar="FILE.nc", type=Path, nargs="+", help="several methods of one analysis overlay"
+    )
+    command.add_argument("--out", required=True, metavar="FIGURE", type=Path, help="figure to write (.png, .pdf, .svg)")
+    command.add_argument(
+        "--part", nargs="+", default=[], metavar="name=LOW:HIGH", help="of an atlas: ranges to zoom into, or name=value"
+    )
+    command.add_argument("--cells", type=int, metavar="N", help="of an atlas: cells each way (800)")
+
+
+def _add_point(subparsers: Any) -> None:
+    command = _command(subparsers, "point", commands.point, "compute one point")
+    command.add_argument("system", metavar="SYSTEM")
+    command.add_argument("analysis", metavar="ANALYSIS")
+    _add_given(command, "parameters, options, and outputs=NAME,NAME")
+    command.add_argument("--json", action="store_true", help="as one JSON object")
+
+
+def _add_query(subparsers: Any) -> None:
+    command = _command(subparsers, "query", commands.query, "ask a stored atlas about one point")
+    command.add_argument("file", metavar="FILE.nc", type=Path)
+    _add_given(command, "parameters, or the data in physical units")
+    command.add_argument("--json", action="store_true", help="as one JSON object")
+
+
+def _add_design(subparsers: Any) -> None:
+    command = _command(subparsers, "design", commands.design, "ask a stored atlas what a design has to be")
+    questions = ("least-damping", "widest-angle", "speed-windows")
+    command.add_argument("question", choices=questions, metavar="QUESTION", help=", ".join(questions))
+    command.add_argument("file", metavar="FILE.nc", type=Path)
+    _add_given(command, "parameters; a range is name=LOW:HIGH")
+    command.add_argument("--margin", type=float, help="speed-windows: part of the speed kept clear of every boundary")
+    command.add_argument("--json", action="store_true", help="as one JSON object")
+
+
+def _add_bench(subparsers: Any) -> None:
+    command = _command(
+        subparsers, "bench", commands.bench, "measure error and run time against the peers (source checkout only)"
+    )
+    command.add_argument("systems", nargs="*", default=[], metavar="SYSTEM", help="only the studies of these")
+    command.add_argument(
+        "--quick", action="store_true", help="small forms, minutes; the stored results stay as they are"
+    )
+    command.add_argument("--out", metavar="FOLDER", type=Path, help="where files and page go")
+    command.add_argument("--peers", metavar="PYTHON", help="interpreter of an environment with ROSS and pynamicalsys")
+
+
+_COMMANDS = (
+    _add_list,
+    _add_run,
+    _add_status,
+    _add_verify,
+    _add_export,
+    _add_plot,
+    _add_point,
+    _add_query,
+    _add_design,
+    _add_bench,
+)
+
+
+def _command(subparsers: Any, name: str, function: Any, text: str) -> argparse.ArgumentParser:
+    command = subparsers.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    command.set_defaults(command=function, parser=command)
+    return command
+
+
+def _add_given(command: argparse.ArgumentParser, text: str) -> None:
+    # With a default of its own it is not said to be required.
+    command.add_argument("given", nargs="*", default=[], metavar="name=value", help=text)
+
+
+def _add_scene(command: argparse.ArgumentParser) -> None:
+    command.add_argument("scene", metavar="SCENE.toml", type=Path)
+    command.add_argument("--out", required=True, metavar="FILE.nc", type=Path, help="result file")
+    command.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="replace an entry of the scene: fixed.zeta=0.002",
+    )

@@ -1,0 +1,198 @@
+"""What each command does. Heavy imports stand inside, so that a command loads no more than it needs."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import drivetrain_jax
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.cli.replies import INCOMPLETE, INTERRUPTED, OK, one_line
+from drivetrain_jax.cli.signals import stop_on_signals
+from drivetrain_jax.cli.values import assignments, ranges
+
+# Cells each way in the chart of an atlas.
+_CELLS = 800
+
+
+def list_systems(options: argparse.Namespace) -> int:
+    """What there is, or one system in full."""
+    from drivetrain_jax.sweep.catalogue import describe, overview
+
+    sys.stdout.write(describe(options.system) if options.system else overview())
+    return OK
+
+
+def _answer(reply: Any, options: argparse.Namespace) -> int:
+    sys.stdout.write((reply.to_json() if options.json else str(reply)) + "\n")
+    return OK
+
+
+def run(options: argparse.Namespace) -> int:
+    """Compute a scene, or resume it. Ctrl-C and SIGTERM end it in order."""
+    with stop_on_signals() as check:
+        return _compute(options, check)
+
+
+def _compute(options: argparse.Namespace, check: Callable[[], None]) -> int:
+    from drivetrain_jax.sweep.executor import Where
+    from drivetrain_jax.sweep.run import Incomplete, Interrupted, run_to_file
+
+    overrides = assignments(options.set, "--set")
+    with _progress_line(options.quiet) as show:
+
+        def report(progress: Any) -> None:
+            check()
+            if show:
+                show(progress)
+
+        try:
+            progress = run_to_file(
+                options.scene,
+                options.out,
+                overrides=overrides,
+                fresh=options.fresh,
+                where=Where(options.threads, options.workers, options.dask),
+                reuse=options.reuse,
+                store=options.store,
+                report=report,
+            )
+            code = OK
+        except Incomplete as error:
+            progress, code, reason = error.progress, INCOMPLETE, str(error)
+        except Interrupted as error:
+            progress, code, reason = error.progress, INTERRUPTED, "interrupted; the same command resumes"
+    if code != OK:
+        sys.stderr.write(one_line(reason))
+    sys.stderr.write(f"{progress}\n")
+    if code == INTERRUPTED and options.workers is None:
+        # Chunks that are still being computed would hold up a normal exit; their results are not wanted any more.
+        # Processes have been killed by now, and what they shared with this one is given back by a normal exit only.
+        sys.stderr.flush()
+        os._exit(code)
+    return code
+
+
+def _progress_line(quiet: bool) -> Any:
+    if quiet:
+        return nullcontext()
+    from drivetrain_jax.cli.progress import progress_line
+
+    return progress_line()
+
+
+def status(options: argparse.Namespace) -> int:
+    """How much of a scene is done."""
+    from drivetrain_jax.sweep.status import status
+
+    return _answer(status(options.scene, options.out, assignments(options.set, "--set")), options)
+
+
+def verify(options: argparse.Namespace) -> int:
+    """Checksums and invariants of a result; a damaged one is wrong input."""
+    from drivetrain_jax.invariants.verify import verify
+
+    report = verify(options.file)
+    _answer(report, options)
+    if report.problem:
+        raise InputError(f"file = {str(options.file)!r}: {report.problem}")
+    return OK if report.complete else INCOMPLETE
+
+
+def export(options: argparse.Namespace) -> int:
+    """One HDF5 file from a Zarr store."""
+    from drivetrain_jax.sweep.export import export
+
+    sys.stderr.write(f"points: {export(options.store, options.file)} exported\n")
+    return OK
+
+
+def plot(options: argparse.Namespace) -> int:
+    """The figure of one result, or of several that share one."""
+    from drivetrain_jax.store.consolidate import open_result
+    from drivetrain_jax.view import plot
+
+    out = options.out
+    if not out.parent.is_dir():
+        raise InputError(f"out = {str(out)!r}: the folder does not exist; allowed is a file in an existing folder")
+    results = [open_result(file) if file.exists() else _open_unfinished(file) for file in options.files]
+    if any(result.attrs.get("analysis") == "atlas" for result in results):
+        from drivetrain_jax.sweep.atlas_chart import chart
+
+        cells = _CELLS if options.cells is None else options.cells
+        results = [chart(result, ranges(options.part, "--part"), cells) for result in results]
+    elif options.part or options.cells is not None:
+        field = f"--part = {options.part[0]!r}" if options.part else f"--cells = {options.cells}"
+        raise InputError(f"{field}: a result on a grid is drawn whole; allowed for an atlas")
+    figure = plot(*results)
+    kinds = figure.canvas.get_supported_filetypes()
+    if out.suffix[1:].lower() not in kinds:
+        raise InputError(f"out = {str(out)!r}: allowed is a name that ends in .{', .'.join(kinds)}")
+    try:
+        figure.savefig(out)
+    except OSError as error:
+        raise InputError(f"out = {str(out)!r}: {error.strerror}; allowed is a file that can be written") from None
+    return OK
+
+
+def _open_unfinished(file: Path) -> Any:
+    """What a run has done so far, if one is at work there."""
+    from drivetrain_jax.store.chunks import PartsFolder
+    from drivetrain_jax.store.consolidate import open_result
+
+    if not PartsFolder(file).holds_work():
+        return open_result(file)
+    from drivetrain_jax.sweep import partial
+
+    return partial.open_result(file)
+
+
+def point(options: argparse.Namespace) -> int:
+    """One point."""
+    from drivetrain_jax.sweep.point import point
+
+    given = assignments(options.given, "point")
+    outputs = given.pop("outputs", None)
+    if isinstance(outputs, str):
+        outputs = outputs.split(",")
+    return _answer(point(options.system, options.analysis, outputs=outputs, **given), options)
+
+
+def query(options: argparse.Namespace) -> int:
+    """An atlas at one point."""
+    from drivetrain_jax.sweep.atlas_answers import query
+    from drivetrain_jax.sweep.atlas_file import open_atlas
+
+    return _answer(query(open_atlas(options.file), ranges(options.given, "query")), options)
+
+
+def design(options: argparse.Namespace) -> int:
+    """What a design has to be, after an atlas."""
+    from drivetrain_jax.sweep import atlas_answers
+    from drivetrain_jax.sweep.atlas_file import open_atlas
+
+    extra = {} if options.margin is None else {"margin": options.margin}
+    if extra and options.question != "speed-windows":
+        raise InputError(f"--margin = {options.margin}: not used by {options.question}; allowed for speed-windows")
+    atlas, given = open_atlas(options.file), ranges(options.given, "design")
+    question = getattr(atlas_answers, options.question.replace("-", "_"))
+    return _answer(question(atlas, given, **extra), options)
+
+
+def bench(options: argparse.Namespace) -> int:
+    """The measurements of a checkout, in a process of their own."""
+    import subprocess
+
+    package = Path(drivetrain_jax.__file__).resolve().parent
+    checkout = package.parent
+    if not (checkout / "benchmarks" / "__main__.py").is_file():
+        raise InputError(f"bench: no folder benchmarks/ beside {str(package)!r}; allowed is a checkout")
+    words = [*options.systems, *(["--quick"] if options.quick else [])]
+    words += ["--out", str(options.out.absolute())] if options.out else []
+    words += ["--peers", options.peers] if options.peers else []
+    return subprocess.run([sys.executable, "-m", "benchmarks", *words], cwd=checkout, check=False).returncode

@@ -1,0 +1,38 @@
+"""Values on the command line: ``name=value``, ``name=LOW:HIGH``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from drivetrain_jax._errors import InputError
+
+
+def assignments(texts: Sequence[str], field: str) -> dict[str, Any]:
+    """``name=value`` pairs, values in TOML or plain text."""
+    from drivetrain_jax.sweep.toml import parse_value
+
+    pairs: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name and equals and value):
+            raise InputError(f"{field} = {text!r}: allowed is name=value")
+        if name in pairs:
+            raise InputError(f"{field} = {text!r}: {name} is given twice; allowed is once")
+        pairs[name] = parse_value(value)
+    return pairs
+
+
+def ranges(texts: Sequence[str], field: str) -> dict[str, Any]:
+    """``name=value`` pairs, values numbers or pairs of them, ``LOW:HIGH``."""
+    return {name: _number_or_range(name, value) for name, value in assignments(texts, field).items()}
+
+
+def _number_or_range(name: str, value: Any) -> Any:
+    try:
+        if isinstance(value, str):
+            low, high = (float(end) for end in value.split(":"))
+            return low, high
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} = {value!r}: allowed is a number or LOW:HIGH") from None

@@ -1,0 +1,87 @@
+"""The spectral radius in closed form against eigenvalues, where it is certain and where it is not."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
+from drivetrain_jax.analysis.periodic.radius import has_closed_form, radius_by_eigenvalues, radius_in_closed_form
+
+ERROR, TOLERANCE = 1e-10, 1e-6
+
+
+def matrices(multipliers: np.ndarray, seed: int = 0) -> jnp.ndarray:
+    """Real matrices ``(4, 4, N)`` with the eigenvalues ``(N, 4)``: two conjugate pairs or real ones each."""
+    rng = np.random.default_rng(seed)
+    blocks = np.zeros((len(multipliers), 4, 4))
+    for k in (0, 2):
+        one, two = multipliers[:, k], multipliers[:, k + 1]
+        real = one.imag == 0
+        blocks[:, k, k], blocks[:, k + 1, k + 1] = one.real, two.real
+        blocks[:, k, k + 1], blocks[:, k + 1, k] = np.where(real, 0, one.imag), np.where(real, 0, -one.imag)
+    turn = np.linalg.qr(rng.normal(size=(len(multipliers), 4, 4)))[0]
+    turn = turn + 0.1 * rng.normal(size=turn.shape)
+    return jnp.moveaxis(jnp.asarray(turn @ blocks @ np.linalg.inv(turn)), 0, -1)
+
+
+def samples(count: int = 3000) -> np.ndarray:
+    """Two pairs, a pair and two real ones of one sign, four real ones; moduli from 1e-3 to 3."""
+    rng = np.random.default_rng(1)
+    modulus, angle = 10.0 ** rng.uniform(-3, 0.5, (count, 4)), rng.uniform(0, np.pi, (count, 2))
+    pairs = [modulus[:, k] * np.exp(1j * angle[:, k]) for k in (0, 1)]
+    found = np.stack([pairs[0], pairs[0].conj(), pairs[1], pairs[1].conj()], axis=1)
+    signs = rng.choice([-1.0, 1.0], (count, 2)).repeat(2, axis=1)
+    third = np.arange(count) % 3
+    found[third > 0, 2:] = (signs * modulus)[third > 0, 2:]
+    found[third > 1, :2] = (signs * modulus)[third > 1, :2]
+    return found
+
+
+def radii(z: jnp.ndarray, error: float = ERROR, tolerance: float = TOLERANCE) -> tuple[np.ndarray, np.ndarray]:
+    lanes = z.shape[-1]
+    rho, bound = radius_in_closed_form(z, jnp.full(lanes, error), jnp.ones(lanes), tolerance)
+    return np.asarray(rho), np.asarray(bound)
+
+
+def test_its_bound_holds_and_is_a_few_times_that_of_the_eigenvalues():
+    multipliers = samples()
+    z = matrices(multipliers)
+    exact = np.abs(multipliers).max(axis=1)
+    rho, bound = radii(z)
+    assert (np.abs(rho - exact) <= bound).all()
+    other = radius_by_eigenvalues(eigenvalues(z), jnp.full(len(exact), ERROR))[1]
+    assert np.median(bound / other) < 4
+    assert (bound < TOLERANCE * exact).mean() > 0.99
+
+
+def test_a_negative_determinant_is_left_to_the_eigenvalues():
+    """Two quadratics with positive constants cannot have it."""
+    z = matrices(np.array([[2.0, -0.5, 0.3, 0.1], [2.0, 0.5, 0.3, 0.1]], complex))
+    rho, bound = radii(z)
+    np.testing.assert_allclose(rho, 2.0, rtol=1e-13)
+    assert (bound < 1e-8).all()
+
+
+def test_lanes_do_not_depend_on_each_other():
+    """Nor on whether one of them has to be judged by eigenvalues, or is no number at all."""
+    z = matrices(samples(30))
+    negative = matrices(np.array([[2.0, -0.5, 0.3, 0.1]], complex))
+    alone = radii(z)
+    beside = radii(jnp.concatenate([z, negative, jnp.full((4, 4, 1), jnp.nan)], axis=-1))
+    for one, two in zip(alone, beside, strict=True):
+        assert np.array_equal(one, two[:30])
+    assert np.isnan(beside[0][-1])
+
+
+def test_multipliers_that_meet_have_the_root_of_the_error_as_bound():
+    """A pair on its way to a double multiplier: honest, and not infinite."""
+    for gap in (1e-3, 1e-6, 0.0):
+        rho, bound = radii(matrices(np.array([[1.2 + gap, 1.2 - gap, 0.2 + 0.1j, 0.2 - 0.1j]])))
+        assert abs(rho[0] - 1.2 - gap) <= bound[0] <= 1e-4
+
+
+def test_it_serves_four_states_in_lanes():
+    assert has_closed_form(jnp.zeros((4, 4, 7)))
+    assert not has_closed_form(jnp.zeros((4, 4)))
+    assert not has_closed_form(jnp.zeros((2, 2, 7)))

@@ -1,0 +1,61 @@
+"""Errors of sections: what single strobes are wrong by adds up over the memory of the motion, and grows in chaos."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+from flows import linear, lorenz
+from scipy.linalg import expm
+
+from drivetrain_jax.analysis.chaos.growth import discarded, sampled
+from drivetrain_jax.analysis.chaos.section_error import Steps, section_errors
+
+DAMPING, STIFFNESS, TORQUE = [0.0, 0.01, 2.0], 20.0, 1.0
+FIRST, COUNT = 200, 300
+
+
+def errors_of(flow, steps: int, checks: Steps, first: int, count: int):
+    """The section by equal steps, and what is said of it."""
+
+    def both():
+        states, _ = sampled(flow, steps, discarded(flow, steps, first), first, count)
+        return states, section_errors(flow, states, first, checks, 1e-6)
+
+    states, errors = jax.jit(both)()
+    return np.asarray(states), errors
+
+
+@pytest.fixture(scope="module")
+def oscillators():
+    """Undamped, damped over 200 strobes, damped over one: 8 steps a strobe, checked by 6."""
+    return errors_of(linear(np.array(DAMPING), STIFFNESS, TORQUE), 8, Steps(16, 6), FIRST, COUNT)
+
+
+def exact_section(damping: float) -> np.ndarray:
+    """Powers of the matrix exponential about the equilibrium."""
+    rest = np.array([TORQUE / STIFFNESS, 0.0])
+    propagator = expm(np.array([[0.0, 1.0], [-STIFFNESS, -damping]]))
+    state, found = np.array([1.0, 0.5]) - rest, []
+    for _ in range(FIRST + COUNT):
+        state = propagator @ state
+        found.append(state + rest)
+    return np.array(found[FIRST:])
+
+
+def test_the_estimate_is_the_error_of_the_section(oscillators):
+    states, (strobe, section) = oscillators
+    for i, damping in enumerate(DAMPING[:2]):
+        exact = exact_section(damping)
+        error = np.abs(states[:, :, i] - exact).max() / np.abs(exact).max()
+        assert 0.4 < float(section[i]) / error < 2.5
+    # A thousandth and less of it is made in one strobe without damping; all of it where that forgets at once.
+    assert float(section[0]) > 100 * float(strobe[0])
+    assert float(section[2]) < 10 * max(float(strobe[2]), 1e-15)
+
+
+def test_chaotic_motion_is_lost_though_its_strobes_are_right():
+    """Errors of 1e-8 and less in every strobe grow to the size of the motion, whatever the steps."""
+    _, (strobe, section) = errors_of(lorenz(2), 24, Steps(48, 12, 48), 20, 200)
+    assert (np.asarray(strobe) < 1e-6).all()
+    assert (np.asarray(section) > 0.1).all()

@@ -1,0 +1,85 @@
+"""Errors that are put into an atlas, or left out of an evaluation, must come out as bounds, whichever way is taken."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from propagators import direct_radius, random_points
+
+from drivetrain_jax.analysis.periodic import quartic
+from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES
+from drivetrain_jax.atlas import StabilityAtlas, expansion
+from drivetrain_jax.atlas.criteria import invariants, monodromy
+
+ERROR = 1e-7
+EVERYTHING = tuple(v.name for v in VARIABLES if v.name != "floquet_exponent")
+# Columns dense enough for interpolation between nodes, and too few for it.
+DENSE, SPARSE = np.linspace(1.0, 1.3, 512), np.linspace(0.3, 2.0, 16)
+
+
+def with_error(atlas, error=ERROR):
+    """The same as if its propagator were known to ``error`` only."""
+    panels = tuple(replace(p, value_error=error, derived_error=np.full(3, error)) for p in atlas.atlas.panels)
+    return StabilityAtlas(replace(atlas.atlas, panels=panels), atlas.build, atlas.rtol)
+
+
+@pytest.fixture(scope="module")
+def coarse(chart):
+    return with_error(chart)
+
+
+WAYS = {
+    "dense columns": lambda atlas: atlas.on_grid([np.linspace(0.1, 0.3, 8), DENSE]),
+    "sparse columns": lambda atlas: atlas.on_grid([np.linspace(0.1, 0.3, 8), SPARSE]),
+    "points": lambda atlas: atlas.at(random_points(atlas, 200)),
+    "eigenvalues": lambda atlas: atlas.at(random_points(atlas, 200), EVERYTHING),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_the_error_of_a_panel_comes_out_as_a_bound(chart, coarse, way):
+    sharp, wide = WAYS[way](chart), WAYS[way](coarse)
+    bound = wide["spectral_radius_error"]
+    assert wide["spectral_radius"] == pytest.approx(sharp["spectral_radius"], rel=1e-9)
+    assert (bound >= sharp["spectral_radius_error"]).all() and (bound > ERROR / 10).mean() > 0.99
+
+
+def test_what_an_expansion_leaves_out_comes_out_as_a_bound(chart, monkeypatch):
+    """Of each box fewer polynomials than are needed."""
+    monkeypatch.setattr(expansion, "_PART", 1e4)
+    poor = StabilityAtlas(chart.atlas, chart.build, chart.rtol)
+    points = random_points(chart, 300, seed=3)
+    found, (radius, _) = poor.at(points), direct_radius(chart, points)
+    assert (np.abs(found["spectral_radius"] - radius) <= found["spectral_radius_error"] + 1e-13).all()
+    assert np.median(found["spectral_radius_error"]) > 1e-8
+
+
+def test_on_a_boundary_a_coarse_atlas_does_not_decide(chart, coarse):
+    """The left edge of S21 by bisection, to rounding."""
+    below, above = 1.3, 1.416
+    for _ in range(45):
+        middle = (below + above) / 2
+        unstable = chart.at(np.array([[0.5, middle]]))["spectral_radius"][0] > 1
+        below, above = (below, middle) if unstable else (middle, above)
+    near = np.array([[0.5, below], [0.5, below - 1e-10], [0.5, above + 1e-10]])
+    assert 1.3 < below < 1.416 and (coarse.at(near)["verdict"] == 2).all()
+    assert chart.at(np.array([[0.5, below - 1e-3], [0.5, above + 1e-3]]))["verdict"].tolist() == [0, 1]
+
+
+def test_without_damping_a_tongue_narrower_than_the_error_is_not_decided(undamped):
+    """S21 at beta = 0.001, where an exact atlas finds it."""
+    point = np.array([[1e-3, 1.4159846397197]])
+    assert undamped.at(point)["verdict"].tolist() == [1]
+    assert with_error(undamped, 1e-5).at(point)["verdict"].tolist() == [2]
+
+
+def test_rounding_of_the_coefficients_is_bounded():
+    """The same sums in double precision and in a longer one."""
+    phi = np.random.default_rng(6).normal(size=(16, 2000))
+    found, bounds = quartic.invariants(quartic.blocks(phi))
+    exact = invariants(monodromy(phi.astype(np.longdouble)))
+    for e, bound, true in zip(found, bounds, exact, strict=True):
+        error = np.abs(np.asarray(e) - true)
+        assert (error <= np.asarray(bound)).all() and error.max() > 0
