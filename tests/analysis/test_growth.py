@@ -98,15 +98,21 @@ def test_marked_functions_compute_what_they_are():
 
 
 @pytest.mark.parametrize("start", [(jnp.sin, jnp.cos), (jnp.sin, jnp.sin), (jnp.zeros_like, jnp.zeros_like)])
-def test_a_kernel_may_take_no_steps(start):
-    """That its loop does nothing is hidden from the compiler, which aborted the process over it."""
+@pytest.mark.parametrize("steps", [0, 3])
+def test_a_kernel_may_be_given_what_it_does_not_use(start, steps):
+    """The compiler aborted the process: over the time of a field without a clock, over all of a march of no steps."""
+    unused = jnp.linspace(0.0, 1.0, 8)
 
-    def march(x, y, z, steps):
-        return jax.lax.fori_loop(0, steps, lambda _, state: (state[0] + z, state[1] * z), (x, y))
+    def march(x, y, z, time):
+        def step(_, state):
+            x, y, time = state
+            return x + z, y * z, time + unused
+
+        return jax.lax.fori_loop(0, steps, step, (x, y, time))[:2]
 
     x = jnp.linspace(0.1, 1.0, 8)
-    ends = jax.jit(lambda x: in_one_kernel(march)(start[0](x), start[1](x), 2 * x, 0))(x)
-    np.testing.assert_allclose(ends, [begin(x) for begin in start], rtol=1e-15)
+    ends = jax.jit(lambda x: in_one_kernel(march)(start[0](x), start[1](x), 2 * x, x))(x)
+    np.testing.assert_allclose(ends, [start[0](x) + steps * 2 * x, start[1](x) * (2 * x) ** steps], rtol=1e-15)
 
 
 def test_a_field_that_sorts_does_without_the_single_kernel():

@@ -128,7 +128,7 @@ def test_torus_residual_sees_noise():
 
 
 def test_a_parameter_of_the_field_may_vary():
-    """And nothing be discarded: a march of no steps is a kernel that does nothing (see ``in_one_kernel``)."""
+    """And nothing be discarded: a march of no steps uses nothing that it is given (see ``in_one_kernel``)."""
     others = {name: value for name, value in FIXED.items() if name != "zeta"}
     scene = {
         "system": "tripod",

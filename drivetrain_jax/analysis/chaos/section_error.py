@@ -50,31 +50,37 @@ def section_errors(flow: Flow, states: Array, first: int, steps: Steps, tolerate
     """
     size = jnp.max(jnp.abs(states[:, watched(flow)]), axis=(0, 1))
     size = jnp.where(size == 0, 1.0, size)
-    strobe = _change(flow, states, first, steps.strobe) / size
+    # One loop over the numbers of steps: marches are dear to compile.
+    marches = jnp.array([count for count in steps[1:] if count])
+    strobe, *changes = jax.lax.map(
+        lambda n: _change(flow, states, first, n) / size, jnp.array([steps.strobe, *marches])
+    )
 
-    def whole(count: int) -> Array:
-        distance = _distance(flow, states, first, count) / size
-        change = _change(flow, states, first, count) / size
-        share = jnp.where(change > 0, strobe / change, 1.0)
-        return jnp.where(distance <= _PROPORTIONAL, distance * share, distance)
+    def whole(error: Array, march: tuple[Array, Array]) -> tuple[Array, None]:
+        count, change = march
+        unknown = jnp.isinf(error) | (~(error <= _PROPORTIONAL) & (strobe <= tolerated))
 
-    error = whole(steps.motion)
-    if steps.then:
-        unknown = ~(error <= _PROPORTIONAL) & (strobe <= tolerated)
-        error = jax.lax.cond(jnp.any(unknown), lambda: jnp.where(unknown, whole(steps.then), error), lambda: error)
+        def found() -> Array:
+            distance = _distance(flow, states, first, count) / size
+            share = jnp.where(change > 0, strobe / change, 1.0)
+            return jnp.where(unknown, jnp.where(distance <= _PROPORTIONAL, distance * share, distance), error)
+
+        return jax.lax.cond(jnp.any(unknown), found, lambda: error), None
+
+    error, _ = jax.lax.scan(whole, jnp.full(strobe.shape, jnp.inf), (marches, jnp.stack(changes)))
     return strobe, jnp.where(jnp.isfinite(error), error, jnp.nan)
 
 
-def _change(flow: Flow, states: Array, first: int, steps: int) -> Array:
+def _change(flow: Flow, states: Array, first: int, steps: Array) -> Array:
     """Largest change over a strobe when some of the ``states`` are carried on to the next one, shape ``(...)``."""
     begun = np.linspace(0, len(states) - 2, _TAKEN_AGAIN).astype(int)
     number = jnp.asarray(first + 1 + begun).reshape(-1, *(1,) * (states.ndim - 2))
     start = Frame(tuple(jnp.moveaxis(states[begun], 1, 0)))
-    ends = one_kernel(flow)(lambda frame: strobe_map(flow, steps)(number, frame))(start).state
+    ends = one_kernel(flow)(lambda steps, frame: strobe_map(flow, steps)(number, frame))(steps, start).state
     return jnp.max(jnp.abs(jnp.stack(ends, axis=1) - states[begun + 1])[:, watched(flow)], axis=(0, 1))
 
 
-def _distance(flow: Flow, states: Array, first: int, steps: int) -> Array:
+def _distance(flow: Flow, states: Array, first: int, steps: Array) -> Array:
     """Largest distance of ``states`` from the motion by ``steps`` equal steps a strobe, shape ``(...)``."""
     start = discarded(flow, steps, jnp.int64(first))
     others, _ = sampled(flow, steps, start, jnp.int64(first), len(states))

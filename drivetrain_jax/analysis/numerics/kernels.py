@@ -9,9 +9,12 @@ not know them ignores them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, ParamSpec, TypeVar
 
 import jax
+import jax.numpy as jnp
+from jax import Array
 from jax.experimental.xla_metadata import set_xla_metadata
 
 from drivetrain_jax.store.provenance import instruction_set
@@ -56,14 +59,33 @@ def stored(function: Callable[P, R]) -> Callable[P, R]:
 def in_one_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """``function``, loops and all, as a single kernel: for batches that fit into the innermost cache.
 
-    Everything in it has to pass :func:`suits_one_kernel`, and a number of steps that may be zero has to be an argument:
-    XLA aborts the process over a kernel whose loop it sees to do nothing (jax 0.10.2). What the arguments are is hidden
-    from it.
+    Everything in it has to pass :func:`suits_one_kernel`.
     """
     if jax.default_backend() != "cpu":
         return function
-    kernel = _marked(function, _ONE_KERNEL)
-    return lambda *arguments: kernel(*jax.lax.optimization_barrier(arguments))
+
+    def call(*arguments: Any) -> Any:
+        leaves, tree = jax.tree.flatten(arguments)
+        flat = jax.make_jaxpr(lambda *x: function(*jax.tree.unflatten(tree, x)), return_shape=True)
+        closed, shapes = flat(*leaves)
+        values = jnp.bool_(True), [jnp.asarray(x) for x in (*closed.consts, *leaves)]
+        results = _marked(partial(_using_all, closed), _ONE_KERNEL)(*jax.lax.optimization_barrier(values))
+        return jax.tree.unflatten(jax.tree.structure(shapes), results)
+
+    return call
+
+
+def _using_all(closed: Any, certain: Array, values: list[Array]) -> list[Array]:
+    """Results of ``closed`` for what it captured and its arguments, all of which are read.
+
+    XLA aborts the process over a kernel that is given what it does not use (jax 0.10.2): the time of a march whose field
+    does not depend on it, or everything if the march is seen to take no steps. What the values are is hidden from it, and
+    that ``certain`` is true.
+    """
+    captured = len(closed.consts)
+    first, *others = jax.core.eval_jaxpr(closed.jaxpr, values[:captured], *values[captured:])
+    read = sum(jnp.ravel(x)[0].astype(first.dtype) for x in values if x.size)
+    return [jnp.where(certain, first, read), *others]
 
 
 def suits_one_kernel(function: Callable[..., Any], *arguments: Any) -> bool:
