@@ -14,7 +14,7 @@ from drivetrain_jax.sweep.scene import Scene
 _WORTHWHILE = 100_000
 # The share of the effort of solving every point that "auto" may spend on it. What is not covered by then is solved directly.
 _SHARE = 1 / 8
-# Solves for each parameter, multiplied with each other, below which none is to be expected (charts of two take 735 up).
+# An atlas of d parameters is not to be expected from fewer than this to the power d (charts of two take 735 and more).
 _FEWEST = 26
 # Points whose effort is predicted to tell that of all.
 _SAMPLE = 4096
@@ -68,4 +68,6 @@ def solves_allowed(scene: Scene) -> int | None:
     chosen = random.integers(0, grid.size, _SAMPLE)
     point = mean_cost(scene.analysis.solvers(scene.system, scene.request), grid, chosen)
     nodes = node_engine(scene, atlas_ranges(scene), _SAMPLE)
-    return int(grid.size * _SHARE * point / mean_cost(nodes.solvers, nodes.grid, np.arange(_SAMPLE)))
+    node = mean_cost(nodes.solvers, nodes.grid, np.arange(_SAMPLE))
+    # Nodes that cost nothing are nodes that no solver can do.
+    return int(grid.size * _SHARE * point / node) if node else 0
