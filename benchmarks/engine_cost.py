@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import time
@@ -16,6 +15,7 @@ from typing import Any
 
 from benchmarks.cardan_reference import BASE_CASE
 from benchmarks.timing import PROCESSES, interleaved, median
+from drivetrain_jax.store.provenance import usable_cores
 from drivetrain_jax.sweep import toml
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.executor import Where, run_threads
@@ -87,7 +87,7 @@ def cpu_seconds(job: Callable[[], Any]) -> float:
 def bare(engine: Engine) -> None:
     """The kernels alone: all chunks in threads, results dropped."""
     chunks = engine.ordered(range(len(engine.plan.costs)))
-    for _ in run_threads(chunks, engine.compute_chunk, os.cpu_count() or 1):
+    for _ in run_threads(chunks, engine.compute_chunk, usable_cores()):
         pass
 
 

@@ -210,7 +210,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, simulate, write."""
     known = parser(__doc__)
     known.add_argument("--points", type=int, default=1_000_000, help="points of the overhead measurement")
-    known.add_argument("--repeats", type=int, default=3)
+    known.add_argument("--repeats", type=int, default=5)
     options = known.parse_args(arguments)
     points, repeats = (50_000, 1) if options.quick else (options.points, options.repeats)
     with tempfile.TemporaryDirectory() as name:

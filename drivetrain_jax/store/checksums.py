@@ -9,12 +9,14 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import h5py
 import numpy as np
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax.store.provenance import usable_cores
 
 ATTRIBUTE = "checksums"
 # The name of the root group stands for the attributes of the file.
@@ -38,7 +40,11 @@ def seal(file: h5py.File) -> None:
 def checksums(file: h5py.File) -> dict[str, str]:
     """blake2b (128 bits) of each variable, type, dimensions and attributes included, and of the attributes of ``file``."""
     own = {name: value for name, value in file.attrs.items() if name != ATTRIBUTE}
-    return {FILE: _of_attributes(own).hexdigest()} | {name: _of_variable(file[name]) for name in _variables(file)}
+    names = _variables(file)
+    # Hashing leaves the interpreter's lock to others.
+    with ThreadPoolExecutor(min(usable_cores(), len(names) or 1), thread_name_prefix="hash") as pool:
+        digests = pool.map(lambda name: _of_variable(file[name]), names)
+        return {FILE: _of_attributes(own).hexdigest()} | dict(zip(names, digests, strict=True))
 
 
 def damaged(path: Path) -> list[str] | None:

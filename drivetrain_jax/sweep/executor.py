@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 
 from drivetrain_jax._errors import InputError
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
 Results = Mapping[str, np.ndarray]
 # Chunks handed out per worker: one that is computed and one that waits, so that none idles while results are stored.
 IN_FLIGHT = 2
+# Small chunks are computed faster than results are stored: threads are handed up to this many, and bytes of results.
+_MOST_AHEAD, _BYTES_AHEAD = 32, 1 << 23
 
 
 @dataclass(frozen=True)
@@ -88,16 +92,25 @@ def run_threads(
     pool = ThreadPoolExecutor(threads, thread_name_prefix="chunk")
     remaining = iter(chunks)
     running: dict[Future[Results], Chunk] = {}
+    finished: SimpleQueue[Future[Results]] = SimpleQueue()
+    ahead = IN_FLIGHT
     try:
         while True:
-            for chunk in remaining:
-                running[pool.submit(work, chunk)] = chunk
-                if len(running) >= IN_FLIGHT * threads:
-                    break
+            while len(running) < ahead * threads and (chunk := next(remaining, None)) is not None:
+                future = pool.submit(work, chunk)
+                running[future] = chunk
+                future.add_done_callback(finished.put)
             if not running:
                 return
-            finished, _ = wait(running, return_when=FIRST_COMPLETED)
-            for future in finished:
-                yield running.pop(future), future.result()
+            future = finished.get()
+            results = future.result()
+            ahead = _ahead(results)
+            yield running.pop(future), results
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _ahead(results: Results) -> int:
+    """Chunks like that of ``results`` to be handed out per thread."""
+    size = sum(values.nbytes for values in jax.tree.leaves(results))
+    return min(max(_BYTES_AHEAD // max(size, 1), IN_FLIGHT), _MOST_AHEAD)

@@ -212,11 +212,12 @@ def mean_cost(solvers: Sequence[Solver], grid: Grid, points: np.ndarray) -> floa
 def _cheapest(solvers: Sequence[Solver], grid: Grid, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Position of the cheapest solver (-1 if all costs are infinite) and its effort, for each of ``points``."""
     columns = grid.arrays(points)
-    efforts = np.stack([np.broadcast_to(np.asarray(s.effort(columns), float), points.shape) for s in solvers])
-    efforts = np.where(np.isnan(efforts), np.inf, efforts)
-    with np.errstate(over="ignore"):
-        costs = efforts * np.array([s.unit_cost for s in solvers])[:, None]
-    best = np.argmin(costs, axis=0)
-    lanes = np.arange(points.size)
-    effort = np.ceil(np.clip(efforts[best, lanes], 0, _MAX_EFFORT)).astype(np.int64)
-    return np.where(np.isfinite(costs[best, lanes]), best, -1), effort
+    best, effort, cost = np.full(points.shape, -1), np.zeros(points.shape), np.full(points.shape, np.inf)
+    for index, solver in enumerate(solvers):
+        own = np.broadcast_to(np.asarray(solver.effort(columns), float), points.shape)
+        with np.errstate(over="ignore"):
+            own_cost = own * solver.unit_cost
+        # Neither NaN nor infinity is less.
+        less = own_cost < cost
+        best[less], cost, effort = index, np.where(less, own_cost, cost), np.where(less, own, effort)
+    return best, np.ceil(np.clip(effort, 0, _MAX_EFFORT)).astype(np.int64)

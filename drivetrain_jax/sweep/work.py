@@ -70,22 +70,22 @@ class Work:
         progress.computed += engine.hopeless
         progress.failed += engine.hopeless
         if self.parts is None:
-            everything = np.arange(len(engine.plan.costs))
-            self._compute(engine, everything, sink, progress, where or self.where, None)
-            return
-        missing = self._reuse(engine, sink, progress, first)
-        writer, before = _Writer(self.parts, first), progress.computed
+            missing = np.arange(len(engine.plan.costs))
+        else:
+            missing = self._reuse(engine, self.parts, sink, progress, first)
+        batch, before = _Batch(sink, self.parts, first), progress.computed
         try:
-            self._compute(engine, missing, sink, progress, where or self.where, writer)
+            self._compute(engine, missing, batch, progress, where or self.where)
+            batch.flush()
         finally:
-            writer.flush()
-            # An interrupt may come between keeping a chunk and counting it: what counts is what was written.
-            progress.computed = before + writer.written * engine.grid.path_length
+            batch.keep()
+            # An interrupt may come between keeping a chunk and counting it: what counts is what was kept.
+            progress.computed = before + batch.kept * engine.grid.path_length
 
-    def _reuse(self, engine: Engine, sink: Sink, progress: Progress, first: int) -> np.ndarray:
+    def _reuse(self, engine: Engine, parts: PartsFolder, sink: Sink, progress: Progress, first: int) -> np.ndarray:
         """Enter the chunks that are there; the numbers of those that are not."""
         missing = np.ones(len(engine.plan.costs), bool)
-        for part in self.parts.read(repair=True):
+        for part in parts.read(repair=True):
             self.seconds += 0.0 if self._counted else part.seconds
             for number, results in part:
                 # An interrupt in the middle of writing may have left a chunk in two parts.
@@ -99,15 +99,7 @@ class Work:
         self._counted = True
         return np.flatnonzero(missing)
 
-    def _compute(
-        self,
-        engine: Engine,
-        numbers: np.ndarray,
-        sink: Sink,
-        progress: Progress,
-        where: Where,
-        writer: _Writer | None,
-    ) -> None:
+    def _compute(self, engine: Engine, numbers: np.ndarray, batch: _Batch, progress: Progress, where: Where) -> None:
         costs = engine.plan.costs
         progress.cost, progress.total_cost = 0.0, float(costs[numbers].sum())
         self._tell(progress)
@@ -116,12 +108,10 @@ class Work:
             for chunk, results in finished:
                 count = chunk.points.size * engine.grid.path_length
                 if results is None:
-                    sink.lose(chunk.points)
+                    batch.sink.lose(chunk.points)
                     progress.failed += count
                 else:
-                    if writer:
-                        writer.add(chunk, results)
-                    sink.fill(chunk.points, results)
+                    batch.add(chunk, results)
                     progress.failed += failures(results[OUTCOME.name])
                 progress.computed += count
                 progress.cost += float(costs[chunk.number])
@@ -132,32 +122,48 @@ class Work:
             self.report(progress)
 
 
-class _Writer:
-    """Collects finished chunks and writes those of a quarter of a second, on a slow disk of a longer time, as one part."""
+class _Batch:
+    """Collects finished chunks; those of a quarter of a second, on a slow disk of a longer time, are written as one part
+    (if there are ``parts``) and entered into ``sink`` together, which costs a third of entering them one by one."""
 
-    def __init__(self, parts: PartsFolder, first: int) -> None:
-        self._parts, self._first = parts, first
+    def __init__(self, sink: Sink, parts: PartsFolder | None, first: int) -> None:
+        self.sink, self._parts, self._first = sink, parts, first
         self._waiting: list[tuple[Chunk, Mapping[str, np.ndarray]]] = []
         self._bytes = 0
         self._last, self._interval = time.monotonic(), _SHORTEST
-        self.written = 0
+        self._begun = False
+        self.kept = 0
 
     def add(self, chunk: Chunk, results: Mapping[str, np.ndarray]) -> None:
         self._waiting.append((chunk, results))
         self._bytes += sum(values.nbytes for values in results.values())
+        if not self._begun:
+            # The first results make the room for all: a disk without it is told before more is computed.
+            self._begun = True
+            self.sink.fill(chunk.points, results)
         if time.monotonic() - self._last >= self._interval or self._bytes >= _MOST_WAITING:
             self.flush()
 
     def flush(self) -> None:
-        if not self._waiting:
-            return
-        chunks, results = zip(*self._waiting, strict=True)
-        begin = time.monotonic()
-        joined = {name: np.concatenate([r[name] for r in results]) for name in results[0]}
-        numbers = [self._first + c.number for c in chunks]
-        self._parts.write(Part(numbers, [c.points.size for c in chunks], joined, begin - self._last))
+        """Keep and enter what waits."""
+        chunks, results = self.keep()
+        if chunks:
+            self.sink.fill(np.concatenate([chunk.points for chunk in chunks]), results)
+
+    def keep(self) -> tuple[list[Chunk], dict[str, np.ndarray]]:
+        """Write what waits as one part. Returns it: its chunks, and their results one after the other."""
+        chunks = [chunk for chunk, _ in self._waiting]
+        if not chunks:
+            return [], {}
+        begin, all_results = time.monotonic(), [results for _, results in self._waiting]
+        joined = {name: np.concatenate([results[name] for results in all_results]) for name in all_results[0]}
+        sizes = [chunk.points.size for chunk in chunks]
+        if self._parts:
+            numbers = [self._first + chunk.number for chunk in chunks]
+            self._parts.write(Part(numbers, sizes, joined, begin - self._last))
         self._waiting.clear()
         self._bytes = 0
-        self.written += sum(c.points.size for c in chunks)
+        self.kept += sum(sizes)
         self._last = time.monotonic()
         self._interval = min(max(_SHORTEST, (self._last - begin) / _WRITE_SHARE), _LONGEST)
+        return chunks, joined

@@ -18,7 +18,7 @@ import drivetrain_jax as dt
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.sweep import toml
-from drivetrain_jax.sweep.executor import Where
+from drivetrain_jax.sweep.executor import Where, run_threads
 
 HERE = Path(__file__).parent
 SCENE = {
@@ -167,6 +167,24 @@ def test_scheduler_and_workers_of_their_own(drivetrain, package, tmp_path):
     finished(drivetrain(scene, "threads"))
     one, other = arrays(tmp_path / "cluster.nc"), arrays(tmp_path / "threads.nc")
     assert one.spectral_radius.values.tobytes() == other.spectral_radius.values.tobytes()
+
+
+@pytest.mark.parametrize(("values", "ahead"), [(1, 32), (1 << 20, 2)])
+def test_threads_are_handed_many_chunks_only_where_results_are_small(values, ahead):
+    results, begun = {"value": np.zeros(values)}, []
+
+    def chunks():
+        for number in range(100):
+            begun.append(number)
+            yield number
+
+    finished = run_threads(chunks(), lambda _: results, 1)
+    next(finished)
+    assert len(begun) == 2
+    next(finished)
+    # The first one is done.
+    assert len(begun) == 1 + ahead
+    assert sorted(number for number, _ in finished) == sorted({*range(100)} - {0, 1})
 
 
 @pytest.mark.parametrize(
