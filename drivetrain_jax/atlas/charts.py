@@ -1,7 +1,7 @@
 """Closed-form results on grids, tile by tile, on all cores: what makes a chart cheap.
 
 The results of a cell are packed into one complex number: a fused loop of XLA's has one output, and computes what two of
-them share twice.
+them share twice. NumPy unpacks it straight into the arrays of the chart.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from jax import Array
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.numerics.kernels import compiler_options
 from drivetrain_jax.analysis.periodic import quartic
-from drivetrain_jax.analysis.periodic.multipliers import verdict as verdict_of
 from drivetrain_jax.atlas import conservative
 from drivetrain_jax.atlas.floquet_quantity import Build
 from drivetrain_jax.atlas.interpolation import nodes
@@ -33,11 +32,13 @@ from drivetrain_jax.systems import FloquetModel
 ROWS, COLUMNS = 64, 512
 # Pieces of work per core that are under way.
 _AHEAD = 2
+UNDECIDED = 2
 # Interpolation between nodes multiplies their roundings by less than this.
 _SPREAD = 4.0
 
-Results = Mapping[str, np.ndarray]
-T = TypeVar("T")
+# Of every cell what `pack` makes of it, and the verdict of Hamiltonian ones, if any may be.
+Packed = tuple[np.ndarray, ...]
+T, R = TypeVar("T"), TypeVar("R")
 
 
 def errors_of(panel: Panel) -> np.ndarray:
@@ -51,29 +52,30 @@ def judged_tiles(
     names: Sequence[str],
     fixed: Mapping[str, Any],
     kernel: Callable[[bool], Any],
-) -> Iterator[tuple[Tile, Results]]:
-    """Every tile with its results, padding included, in order; ``axes`` are those of the grid, in parameters.
+) -> Iterator[tuple[Tile, Packed]]:
+    """Every tile with what :func:`unpack` takes, padding included, in order; ``axes`` are those of the grid, in parameters.
 
     ``kernel(dense)`` is that of :func:`tile_kernel`.
     """
 
-    def work(tile: Tile) -> Results:
+    def work(tile: Tile) -> Packed:
         cells = tile.columns if tile.spread is None else tile.spread
         values = {name: axis[i] for name, axis, i in zip(names, axes, tile.index, strict=True)}
         for name, size in zip(names[-2:], (len(tile.first), cells.shape[1]), strict=True):
             values[name] = np.pad(values[name], (0, size - len(values[name])), mode="edge")
         factors = (tile.first, tile.columns) if tile.spread is None else (tile.first, tile.columns, tile.spread)
-        found = kernel(tile.spread is not None)(*factors, errors_of(tile.panel), values, fixed)
-        return {name: np.asarray(value) for name, value in found.items()}
+        return tuple(
+            np.asarray(x) for x in kernel(tile.spread is not None)(*factors, errors_of(tile.panel), values, fixed)
+        )
 
     return in_threads(tiles, work)
 
 
-def in_threads(pieces: Iterable[T], work: Callable[[T], Results]) -> Iterator[tuple[T, Results]]:
+def in_threads(pieces: Iterable[T], work: Callable[[T], R]) -> Iterator[tuple[T, R]]:
     """Every piece with ``work(piece)``, in order, done on all cores; pieces are taken only as they are needed."""
     threads = usable_cores()
     with ThreadPoolExecutor(threads, thread_name_prefix="tile") as pool:
-        pending: deque[tuple[T, Future[Results]]] = deque()
+        pending: deque[tuple[T, Future[R]]] = deque()
         for piece in pieces:
             pending.append((piece, pool.submit(work, piece)))
             if len(pending) > _AHEAD * threads:
@@ -84,8 +86,8 @@ def in_threads(pieces: Iterable[T], work: Callable[[T], Results]) -> Iterator[tu
 
 
 @lru_cache(maxsize=32)
-def tile_kernel(build: Build, names: tuple[str, ...], rtol: float, kind: str) -> Any:
-    """Closed-form results ``(R, C)`` of a tile, and which of its cells are to be judged again (``unsure``).
+def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
+    """Closed-form results ``(R, C)`` of a tile for :func:`unpack`.
 
     ``kind``: ``dense`` or ``sparse`` as the tile is, ``undamped`` for sparse tiles with cells that may be Hamiltonian.
     """
@@ -105,7 +107,7 @@ def tile_kernel(build: Build, names: tuple[str, ...], rtol: float, kind: str) ->
             packed = pack(quartic.coefficients(parts, log_d, errors[1:]))
             return (packed, exact_verdict(model, parts, errors[0])) if kind == "undamped" else (packed,)
 
-        return unpack(*jax.lax.map(row, (first, values[names[-2]])), rtol=rtol)
+        return jax.lax.map(row, (first, values[names[-2]]))
 
     def dense(first, columns, spread, errors, values, fixed):
         parts = quartic.blocks(jnp.moveaxis(first @ columns, 1, 0))
@@ -118,7 +120,7 @@ def tile_kernel(build: Build, names: tuple[str, ...], rtol: float, kind: str) ->
             log_d = jnp.broadcast_to(bind(values, fixed, value).reduced.log_determinant(), lanes.shape[1:])
             return (pack(quartic.with_determinant(lanes, bounds, log_d)),)
 
-        return unpack(*jax.lax.map(row, (at_nodes, bounds, values[names[-2]])), rtol=rtol)
+        return jax.lax.map(row, (at_nodes, bounds, values[names[-2]]))
 
     return jax.jit(dense if kind == "dense" else sparse, compiler_options=compiler_options())
 
@@ -147,28 +149,28 @@ def exact_verdict(model: FloquetModel, phi: quartic.Blocks, value_error: Array) 
     )
 
 
-def unpack(packed: Array, exact: Array | None = None, *, rtol: float) -> dict[str, Array]:
-    """Results by name from those of :func:`pack` and the verdicts of Hamiltonian lanes."""
-    rho, error = packed.real, jnp.abs(packed.imag)
-    verdict = verdict_of(rho, error)
-    unsure = ~(packed.imag > 0)
+def unpack(packed: np.ndarray, exact: np.ndarray | None = None, *, rtol: float) -> dict[str, np.ndarray]:
+    """Results by name from those of :func:`pack` and the verdicts of Hamiltonian lanes, and which lanes are to be judged
+    again (``unsure``). All others are decided: their intervals do not hold 1."""
+    rho, error, unsure = packed.real, np.abs(packed.imag), ~(packed.imag > 0)
+    verdict = np.where(unsure, np.int8(UNDECIDED), rho > 1)
     if exact is not None:
-        rho, error, verdict = exactly(exact, rho, error, verdict)
+        rho, error, verdict = exactly(exact, rho, error, verdict, np.where)
         # Cells on the unit circle are settled; for the others eigenvalues may give a better bound.
         unsure &= exact != 0
     return {
         "spectral_radius": rho,
         "spectral_radius_error": error,
         "verdict": verdict,
-        "outcome": jnp.where(error <= 10 * rtol * rho, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET).astype(jnp.int8),
+        "outcome": np.where(error <= 10 * rtol * rho, np.int8(Outcome.SUCCESS), np.int8(Outcome.TOLERANCE_NOT_MET)),
         "unsure": unsure,
     }
 
 
-def exactly(exact: Array, rho: Array, error: Array, verdict: Array) -> tuple[Array, Array, Array]:
+def exactly(exact: T, rho: T, error: T, verdict: T, where: Callable[..., T] = jnp.where) -> tuple[T, T, T]:
     """Results with the verdict ``exact`` where that is not negative: a stable Hamiltonian system has rho = 1."""
     return (
-        jnp.where(exact == 0, 1.0, rho),
-        jnp.where(exact == 0, 4 * quartic.EPS, error),
-        jnp.where(exact >= 0, exact, verdict).astype(jnp.int8),
+        where(exact == 0, 1.0, rho),
+        where(exact == 0, 4 * quartic.EPS, error),
+        where(exact >= 0, exact, verdict).astype(np.int8),
     )

@@ -13,7 +13,7 @@ from jax import Array
 
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, in_one_kernel
 from drivetrain_jax.analysis.periodic import quartic
-from drivetrain_jax.atlas.charts import Results, errors_of, exact_verdict, in_threads, pack, unpack
+from drivetrain_jax.atlas.charts import Packed, errors_of, exact_verdict, in_threads, pack
 from drivetrain_jax.atlas.expansion import Cell, Expansion
 from drivetrain_jax.atlas.floquet_quantity import Build
 from drivetrain_jax.atlas.panels import Atlas
@@ -24,12 +24,12 @@ LANES, ROWS = 128, 16
 
 def judged_cells(
     expansion: Expansion, points: np.ndarray, x: np.ndarray, atlas: Atlas, kernel: Any
-) -> Iterator[tuple[np.ndarray, Results]]:
-    """Numbers of points and their results, block after block. ``points`` ``(N, d)`` are parameters, ``x`` coordinates;
-    ``kernel`` is that of :func:`point_kernel`."""
+) -> Iterator[tuple[np.ndarray, Packed]]:
+    """Numbers of points and what ``charts.unpack`` takes of them, block after block. ``points`` ``(N, d)`` are parameters,
+    ``x`` coordinates; ``kernel`` is that of :func:`point_kernel`."""
     block = LANES * ROWS
 
-    def work(part: tuple[Cell, int]) -> Results:
+    def work(part: tuple[Cell, int]) -> Packed:
         cell, start = part
         # The last block is filled up with its last point.
         numbers = np.minimum(np.arange(start, start + block), cell.index.size - 1)
@@ -44,7 +44,7 @@ def judged_cells(
             values,
             atlas.fixed,
         )
-        return {name: np.asarray(value)[: cell.index.size - start] for name, value in found.items()}
+        return tuple(np.asarray(x)[: cell.index.size - start] for x in found)
 
     parts = ((cell, start) for cell in expansion.cells(x) for start in range(0, cell.index.size, block))
     for (cell, start), found in in_threads(parts, work):
@@ -52,9 +52,9 @@ def judged_cells(
 
 
 @lru_cache(maxsize=16)
-def point_kernel(build: Build, rtol: float, undamped: bool) -> Any:
-    """Closed-form results ``(LANES ROWS,)`` of a block of points, those of the first ``rows`` rows, and which of them are to
-    be judged again (``unsure``). ``undamped``: points may be Hamiltonian."""
+def point_kernel(build: Build, undamped: bool) -> Any:
+    """Closed-form results ``(LANES ROWS,)`` of a block of points, those of the first ``rows`` rows, for ``charts.unpack``.
+    ``undamped``: points may be Hamiltonian."""
 
     def kernel(tensor, place, rows, errors, left_out, values, fixed):
         count = max((*tensor.shape[:-2], tensor.shape[-1]))
@@ -78,7 +78,7 @@ def point_kernel(build: Build, rtol: float, undamped: bool) -> Any:
 
         size = place.shape[1]
         blank = (jnp.zeros(size, complex), jnp.zeros(size, jnp.int8))[: 1 + undamped]
-        return unpack(*jax.lax.fori_loop(0, rows, row, blank), rtol=rtol)
+        return jax.lax.fori_loop(0, rows, row, blank)
 
     return jax.jit(kernel, compiler_options=compiler_options())
 

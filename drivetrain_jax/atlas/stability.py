@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from threading import Lock
 from typing import Any
 
 import jax
@@ -18,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis import Outcome
+from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.analysis.numerics.kernels import compiler_options
 from drivetrain_jax.analysis.periodic import quartic
 from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES
@@ -32,7 +33,8 @@ from drivetrain_jax.systems import FloquetModel
 
 DEFAULT_OUTPUTS = ("spectral_radius", "spectral_radius_error", "verdict")
 _FAST = frozenset(DEFAULT_OUTPUTS)
-_UNDECIDED = 2
+# A kernel that is asked for while another thread has it compiled would be compiled twice.
+_JUDGING = Lock()
 _SWAP = np.kron(np.array([[0.0, 1.0], [1.0, 0.0]]), np.eye(2))
 
 
@@ -59,10 +61,11 @@ class StabilityAtlas:
         points = np.atleast_2d(np.asarray(points, float))
         if not (self._closed_form and _FAST.issuperset(outputs) and self.atlas.panels):
             return self.by_eigenvalues(points, outputs)
-        x, found = self.atlas.to_coordinates(points), _blank(outputs, (len(points),), 0)
-        kernel = point_kernel(self.build, self.rtol, self._may_be_undamped(points.T))
+        x, found = self.atlas.to_coordinates(points), self.blank((len(points),), outputs)
+        kernel = point_kernel(self.build, self._may_be_undamped(points.T))
         unsure = [np.empty(0, int)]
-        for index, results in judged_cells(self._expansion, points, x, self.atlas, kernel):
+        for index, packed in judged_cells(self._expansion, points, x, self.atlas, kernel):
+            results = charts.unpack(*packed, rtol=self.rtol)
             for name, values in found.items():
                 values[index] = results[name]
             unsure.append(index[results["unsure"]])
@@ -73,7 +76,7 @@ class StabilityAtlas:
 
     def by_eigenvalues(self, points: np.ndarray, outputs: Sequence[str]) -> dict[str, np.ndarray]:
         """The same as :meth:`at`, all points by the eigenvalues of Z."""
-        x, found = self.atlas.to_coordinates(points), _blank(outputs, (len(points),), self._multipliers)
+        x, found = self.atlas.to_coordinates(points), self.blank((len(points),), outputs)
         number, size = self.atlas.find(x), evaluation.block_size(self.atlas)
         for k in range(len(self.atlas.panels)):
             mine = np.flatnonzero(number == k)
@@ -82,28 +85,45 @@ class StabilityAtlas:
                     found[name][part] = value[: len(part)]
         return found
 
-    def on_grid(self, axes: Sequence[np.ndarray], outputs: Sequence[str] = DEFAULT_OUTPUTS) -> dict[str, np.ndarray]:
-        """Results by name on the grid of ``axes``, one per parameter of the atlas, in its order, and ``outcome``.
+    def blank(self, shape: tuple[int, ...], outputs: Sequence[str] = DEFAULT_OUTPUTS) -> dict[str, np.ndarray]:
+        """Results by name, and ``outcome``, of points that nothing is known of."""
+        variables = {v.name: v for v in VARIABLES}
+        own = {name: (self._multipliers,) * len(variables[name].dims) for name in outputs}
+        found = {name: np.empty((*shape, *own[name]), variables[name].dtype) for name in outputs}
+        return _blanked(found | {OUTCOME.name: np.empty(shape, np.int8)})
+
+    def on_grid(
+        self,
+        axes: Sequence[np.ndarray],
+        outputs: Sequence[str] = DEFAULT_OUTPUTS,
+        out: Mapping[str, np.ndarray] | None = None,
+    ) -> dict[str, np.ndarray]:
+        """Results by name on the grid of ``axes``, one per parameter of the atlas, in its order, and ``outcome``; in the
+        arrays ``out``, if they are given.
 
         Cells that no panel covers are marked as in :meth:`at`.
         """
         axes = [np.asarray(axis, float) for axis in axes]
         shape = tuple(len(axis) for axis in axes)
+        found = self.blank(shape, outputs) if out is None else _blanked(out)
         if not self._closed_form or not _FAST.issuperset(outputs) or len(axes) < 2:
             points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
-            flat = self.at(points, outputs)
-            return {name: value.reshape(*shape, *value.shape[1:]) for name, value in flat.items()}
-        found = _blank(outputs, shape, self._multipliers)
+            for name, value in self.at(points, outputs).items():
+                found[name][...] = value.reshape(found[name].shape)
+            return found
         # Tiles are blocks of neighbours, so panels have to cover ranges: axes rise in the atlas's coordinates.
         orders = [
             np.argsort(c.forward(axis), kind="stable") for c, axis in zip(self.atlas.coordinates, axes, strict=True)
         ]
-        self._fill(found, [axis[order] for axis, order in zip(axes, orders, strict=True)], tuple(outputs))
-        for k, order in enumerate(orders):
-            if np.array_equal(order, np.arange(len(order))[::-1]):
-                found = {name: np.flip(value, axis=k) for name, value in found.items()}
-            elif not np.array_equal(order, np.arange(len(order))):
-                found = {name: np.take(value, np.argsort(order), axis=k) for name, value in found.items()}
+        rising = tuple(slice(None, None, -1 if (np.diff(order) < 0).all() else 1) for order in orders)
+        views = {name: values[rising] for name, values in found.items()}
+        shuffled = {k: np.argsort(order) for k, order in enumerate(orders) if len(set(np.diff(order))) > 1}
+        filled = {name: values.copy() for name, values in views.items()} if shuffled else views
+        self._fill(filled, [axis[order] for axis, order in zip(axes, orders, strict=True)])
+        for name, values in filled.items() if shuffled else ():
+            for k, places in shuffled.items():
+                values = np.take(values, places, axis=k)
+            found[name][...] = values
         return found
 
     @property
@@ -127,31 +147,32 @@ class StabilityAtlas:
         known = form.reversor is not None and form.log_determinant is not None
         return known and np.array_equal(form.reversor, _SWAP)
 
-    def _fill(self, found: dict[str, np.ndarray], axes: list[np.ndarray], outputs: tuple[str, ...]) -> None:
+    def _fill(self, found: dict[str, np.ndarray], axes: list[np.ndarray]) -> None:
         """Fill ``found`` tile by tile, then judge again the cells for which the closed form is not good enough."""
         names, undamped = self.atlas.parameters, self._may_be_undamped(np.ix_(*axes))
-        shape = (min(charts.ROWS, _round_up(len(axes[-2]), 8)), min(charts.COLUMNS, _round_up(len(axes[-1]), 16)))
+        # Columns are shared out evenly: what fills up the last tile of a row costs as much as cells.
+        bands = -(-len(axes[-1]) // charts.COLUMNS)
+        shape = (min(charts.ROWS, _round_up(len(axes[-2]), 8)), _round_up(-(-len(axes[-1]) // bands), 16))
         coordinates = [c.forward(axis) for c, axis in zip(self.atlas.coordinates, axes, strict=True)]
 
         def kernel(dense: bool) -> Any:
             kind = "undamped" if undamped else "dense" if dense else "sparse"
-            return charts.tile_kernel(self.build, names, self.rtol, kind)
+            return charts.tile_kernel(self.build, names, kind)
 
         cut = tiles(self.atlas, coordinates, shape, dense=not undamped)
         again = [
-            _store(found, tile, cells, outputs)
-            for tile, cells in charts.judged_tiles(cut, axes, names, self.atlas.fixed, kernel)
+            _store(found, tile, packed, self.rtol)
+            for tile, packed in charts.judged_tiles(cut, axes, names, self.atlas.fixed, kernel)
         ]
-        self._repair(found, axes, np.concatenate([np.empty((0, len(axes)), int), *again]), outputs)
+        self._repair(found, axes, np.concatenate([np.empty((0, len(axes)), int), *again]))
 
     def _may_be_undamped(self, columns: Sequence[np.ndarray]) -> bool:
         """Whether the system is Hamiltonian in any cell; ``columns`` are broadcast against each other."""
         model = self.build({**self.atlas.fixed, **dict(zip(self.atlas.parameters, columns, strict=True))})
         return model.hamiltonian is not None and bool(np.any(model.hamiltonian()))
 
-    def _repair(
-        self, found: dict[str, np.ndarray], axes: list[np.ndarray], cells: np.ndarray, outputs: tuple[str, ...]
-    ) -> None:
+    def _repair(self, found: dict[str, np.ndarray], axes: list[np.ndarray], cells: np.ndarray) -> None:
+        outputs = [name for name in found if name != OUTCOME.name]
         for part in (cells[i : i + (1 << 18)] for i in range(0, len(cells), 1 << 18)):
             points = np.stack([axis[part[:, k]] for k, axis in enumerate(axes)], axis=-1)
             for name, value in self.by_eigenvalues(points, outputs).items():
@@ -166,31 +187,27 @@ class StabilityAtlas:
         values = {name: columns[:, k] for k, name in enumerate(self.atlas.parameters)}
         kernel = _point_kernel(self.build, tuple(sorted(self.atlas.fixed)), outputs, self.rtol, self._closed_form)
         phi = _scattered(self._tensors[number], weights)
-        found = kernel(phi, charts.errors_of(panel), values, self.atlas.fixed)
+        with _JUDGING:
+            found = kernel(phi, charts.errors_of(panel), values, self.atlas.fixed)
         return {name: np.moveaxis(np.asarray(value), -1, 0) for name, value in found.items()}
 
 
-def _blank(outputs: Sequence[str], shape: tuple[int, ...], multipliers: int) -> dict[str, np.ndarray]:
-    """Results of points that nothing is known of."""
-    variables = {v.name: v for v in VARIABLES}
-    found = {}
-    for name in outputs:
-        own = (multipliers,) * len(variables[name].dims)
-        fill = _UNDECIDED if variables[name].dtype == "int8" else np.nan
-        found[name] = np.full((*shape, *own), fill, variables[name].dtype)
-    return found | {"outcome": np.full(shape, Outcome.LOST, np.int8)}
+def _blanked(found: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """``found`` with nothing in it."""
+    for name, values in found.items():
+        values[...] = Outcome.LOST if name == OUTCOME.name else charts.UNDECIDED if values.dtype == np.int8 else np.nan
+    return dict(found)
 
 
-def _store(
-    found: dict[str, np.ndarray], tile: Tile, cells: Mapping[str, np.ndarray], outputs: tuple[str, ...]
-) -> np.ndarray:
+def _store(found: Mapping[str, np.ndarray], tile: Tile, packed: charts.Packed, rtol: float) -> np.ndarray:
     """Put the results of a tile in their place; the cells to be judged again, as positions along each axis ``(N, d)``."""
     rows, columns = (len(i) for i in tile.index[-2:])
     place = tuple(slice(i[0], i[-1] + 1) for i in tile.index)
-    for name in (*outputs, "outcome"):
-        part = found[name][place]
-        part[...] = cells[name][:rows, :columns].reshape(part.shape)
-    unsure = np.argwhere(cells["unsure"][:rows, :columns]) if cells["unsure"].any() else np.empty((0, 2), int)
+    cells = charts.unpack(*(x[:rows, :columns] for x in packed), rtol=rtol)
+    for name, values in found.items():
+        part = values[place]
+        part[...] = cells[name].reshape(part.shape)
+    unsure = np.argwhere(cells["unsure"]) if cells["unsure"].any() else np.empty((0, 2), int)
     first = [i[0] for i in tile.index]
     leading = np.broadcast_to(np.array(first[:-2], int), (len(unsure), len(first) - 2))
     return np.concatenate([leading, unsure + first[-2:]], axis=1)
@@ -227,7 +244,7 @@ def _sharper(phi: Array, model: FloquetModel, errors: Array, found: dict[str, Ar
     parts, log_d = quartic.blocks(phi), jnp.broadcast_to(model.reduced.log_determinant(), phi.shape[1:])
     rho, error, verdict = (found[name] for name in DEFAULT_OUTPUTS)
     settled = quartic.nothing_crosses(quartic.coefficients(parts, log_d, errors[1:, None]), log_d)
-    verdict = jnp.where((verdict == _UNDECIDED) & settled, jnp.where(rho < 1, 0, 1), verdict).astype(jnp.int8)
+    verdict = jnp.where((verdict == charts.UNDECIDED) & settled, jnp.where(rho < 1, 0, 1), verdict).astype(jnp.int8)
     if model.hamiltonian is not None:
         rho, error, verdict = charts.exactly(charts.exact_verdict(model, parts, errors[0]), rho, error, verdict)
     return dict(zip(DEFAULT_OUTPUTS, (rho, error, verdict), strict=True))

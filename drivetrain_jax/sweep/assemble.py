@@ -29,6 +29,8 @@ _PLANNED = 4
 # Bytes of results on the disk that are kept in memory as well, and values that are blanked at a time.
 _RESIDENT, _ROWS = 1 << 26, 1 << 22
 _STORAGE = ("xarray", "h5netcdf", "h5py")
+# A plain number, which arrays are compared with four times as fast.
+_LAST_WITH_VALUE = int(Outcome.TOLERANCE_NOT_MET)
 
 
 class Table:
@@ -55,16 +57,14 @@ class Table:
         for name, values in results.items():
             # A fixed path parameter is no dimension of the result.
             enter(self.arrays[name], self._grid, points, values[:, 0] if self._grid.path_is_fixed else values)
-        self._release_after(results)
+        self.release_after(results)
 
-    def put(self, block: tuple[slice, ...], results: Mapping[str, np.ndarray]) -> None:
-        """Enter the results of a block of the grid, or of a row of the points."""
-        self._lay_out_for(results)
-        for name, values in results.items():
-            self.arrays[name][block] = values
-        self._release_after(results)
+    def block(self, place: tuple[slice, ...], like: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """The arrays of a block of the grid, or of a row of the points, to be filled in. ``like`` are results of a point."""
+        self._lay_out_for(like)
+        return {name: values[place] for name, values in self.arrays.items()}
 
-    def _release_after(self, results: Mapping[str, np.ndarray]) -> None:
+    def release_after(self, results: Mapping[str, np.ndarray]) -> None:
         """Let the system have back, from time to time, the memory of what is in a file."""
         self._unreleased += sum(values.nbytes for values in results.values())
         if self._unreleased >= _RESIDENT:
@@ -126,7 +126,7 @@ def _in_memory(template: xr.Dataset) -> dict[str, np.ndarray]:
 
 def failures(outcome: np.ndarray) -> int:
     """How many outcomes mean that there is no value."""
-    return int(np.count_nonzero(outcome > Outcome.TOLERANCE_NOT_MET))
+    return int(np.count_nonzero(outcome > _LAST_WITH_VALUE))
 
 
 def missing_value(variable: Variable) -> float | int:
@@ -204,6 +204,7 @@ def result_attrs(scene: Scene) -> dict[str, str]:
     return {
         "title": scene.title,
         "system": scene.system.name,
+        "roles": json.dumps(dict(scene.system.roles)),
         "analysis": scene.analysis.name,
         "method": scene.request.method,
         "options": json.dumps(dict(scene.request.options)),

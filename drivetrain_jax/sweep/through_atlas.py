@@ -35,9 +35,9 @@ def fill_through_atlas(engine: Engine, table: Table, work: Work, progress: Progr
         large = engine.grid.size >= _LARGE
         prepared = aside.submit(_prepare, scene) if large else None
         atlas, first = build_atlas(scene, atlas_ranges(scene), work, solves, solves_allowed(scene))
-    if prepared:
-        prepared.result()
-    uncovered = evaluate(engine, table, atlas, work, progress, first)
+        uncovered = evaluate(engine, table, atlas, work, progress, first)
+        if prepared:
+            prepared.result()
     return {"atlas_solves": atlas.atlas.solves, "atlas_panels": len(atlas.atlas.panels), "atlas_uncovered": uncovered}
 
 
@@ -54,9 +54,9 @@ def evaluate(
     A run that is resumed evaluates again, which is faster than reading would be. ``first`` see :meth:`Work.do`.
     """
     uncovered: list[np.ndarray] = []
-    blocks = _points(engine, atlas) if engine.scene.zipped else _blocks(engine, atlas)
-    for block, results in blocks:
-        table.put(block, results)
+    filled = _points if engine.scene.zipped else _blocks
+    for block, results in filled(engine, atlas, table):
+        table.release_after(results)
         outcome = results[OUTCOME.name]
         lost = np.argwhere(outcome == Outcome.LOST) + [part.start for part in block]
         uncovered.append(np.ravel_multi_index(tuple(lost.T), engine.grid.shape))
@@ -70,24 +70,30 @@ def evaluate(
     return rest.size
 
 
-def _points(engine: Engine, atlas: StabilityAtlas) -> Iterator[tuple[tuple[slice], Results]]:
-    names = atlas.atlas.parameters
+def _points(engine: Engine, atlas: StabilityAtlas, table: Table) -> Iterator[tuple[tuple[slice], Results]]:
+    """Places among the points and the arrays of ``table`` there, filled in."""
+    names, outputs = atlas.atlas.parameters, engine.scene.request.outputs
     for start in range(0, engine.grid.size, _BLOCK):
         numbers = np.arange(start, min(start + _BLOCK, engine.grid.size))
         columns = engine.grid.columns(numbers)
         points = np.stack([columns[name] for name in names], axis=-1)
-        yield (slice(start, start + len(numbers)),), atlas.at(points, engine.scene.request.outputs)
+        place = (slice(start, start + len(numbers)),)
+        arrays = table.block(place, atlas.blank((), outputs))
+        for name, values in atlas.at(points, outputs).items():
+            arrays[name][...] = values
+        yield place, arrays
 
 
-def _blocks(engine: Engine, atlas: StabilityAtlas) -> Iterator[tuple[tuple[slice, ...], Results]]:
-    """Place in the grid and results of one block after the other."""
+def _blocks(engine: Engine, atlas: StabilityAtlas, table: Table) -> Iterator[tuple[tuple[slice, ...], Results]]:
+    """Places in the grid, block by block, and the arrays of ``table`` there, filled in."""
     axes = {axis.name: axis.values for axis in engine.grid.axes}
-    names = atlas.atlas.parameters
+    names, outputs = atlas.atlas.parameters, engine.scene.request.outputs
     for ranges in _cut([len(axes[name]) for name in names]):
         values = [axes[name][part] for name, part in zip(names, ranges, strict=True)]
-        results = atlas.on_grid(values, engine.scene.request.outputs)
         place = tuple(dict(zip(names, ranges, strict=True)).get(name, slice(0, 1)) for name in axes)
-        yield place, {n: _in_scene_order(v, names, tuple(axes)) for n, v in results.items()}
+        arrays = table.block(place, atlas.blank((), outputs))
+        atlas.on_grid(values, outputs, {n: _in_atlas_order(a, names, tuple(axes)) for n, a in arrays.items()})
+        yield place, arrays
 
 
 def _cut(lengths: Sequence[int]) -> Iterator[tuple[slice, ...]]:
@@ -110,9 +116,10 @@ def _cut(lengths: Sequence[int]) -> Iterator[tuple[slice, ...]]:
             yield (*(slice(i, i + 1) for i in leading), piece, *(slice(0, n) for n in lengths[whole + 1 :]))
 
 
-def _in_scene_order(values: np.ndarray, names: Sequence[str], axes: Sequence[str]) -> np.ndarray:
-    """Results over the parameters ``names`` of an atlas (then dimensions of their own) over the ``axes`` of the scene."""
+def _in_atlas_order(values: np.ndarray, names: Sequence[str], axes: Sequence[str]) -> np.ndarray:
+    """Results over the ``axes`` of the scene (then dimensions of their own), as a view over the parameters ``names`` of an
+    atlas; the other axes have one value."""
     present = [name for name in axes if name in names]
-    order = [names.index(name) for name in present]
-    values = np.transpose(values, (*order, *range(len(names), values.ndim)))
-    return np.expand_dims(values, tuple(k for k, name in enumerate(axes) if name not in names))
+    order = [present.index(name) for name in names]
+    values = np.squeeze(values, axis=tuple(k for k, name in enumerate(axes) if name not in names))
+    return np.transpose(values, (*order, *range(len(names), values.ndim)))

@@ -13,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax.analysis.numerics.kernels import stored
+
 Complex = tuple[Array, Array]
 
 _EPS = np.finfo(float).eps
@@ -99,33 +101,44 @@ def _entry(h: Complex, i: int, j: int) -> Complex:
     return h[0][i, j], h[1][i, j]
 
 
-def _add_to_diagonal(h: Complex, shift: Complex, sign: float) -> Complex:
-    eye = jnp.eye(h[0].shape[0]).reshape(*h[0].shape[:2], *(1,) * (h[0].ndim - 2))
-    return h[0] + sign * eye * shift[0], h[1] + sign * eye * shift[1]
+def _add_to_diagonal(h: Complex, shift: Complex, active: Array) -> Complex:
+    eye = (jnp.eye(len(active)) * active).reshape(*h[0].shape[:2], *(1,) * (h[0].ndim - 2))
+    return h[0] + eye * shift[0], h[1] + eye * shift[1]
 
 
-def _sweep(h: Complex, shift: Complex) -> Complex:
-    """One QR step: the rotations that make ``h - shift`` triangular, applied from both sides."""
-    h = _add_to_diagonal(h, shift, -1.0)
+def _turn_rows(x: Complex, y: Complex, a: Complex, b: Complex, wanted: Array) -> tuple[Complex, ...]:
+    """The rotation ``c, s`` that makes ``b`` vanish against ``a``, after what it makes of the rows ``x`` and ``y``; none
+    unless ``wanted``."""
+    norm = jnp.sqrt(a[0] ** 2 + a[1] ** 2 + b[0] ** 2 + b[1] ** 2)
+    turns = wanted & (norm > 0)
+    scale = jnp.where(turns, 1 / jnp.where(turns, norm, 1.0), 0.0)
+    c, s = (jnp.where(turns, a[0] * scale, 1.0), a[1] * scale), (b[0] * scale, b[1] * scale)
+    p, q, u, w = _conjugate_multiply(c, x), _conjugate_multiply(s, y), _multiply(c, y), _multiply(s, x)
+    return (p[0] + q[0], p[1] + q[1]), (u[0] - w[0], u[1] - w[1]), c, s
+
+
+def _turn_columns(x: Complex, y: Complex, c: Complex, s: Complex) -> tuple[Complex, Complex]:
+    """The columns ``x`` and ``y`` turned back."""
+    p, q, u, w = _multiply(x, c), _multiply(y, s), _conjugate_multiply(c, y), _conjugate_multiply(s, x)
+    return (p[0] + q[0], p[1] + q[1]), (u[0] - w[0], u[1] - w[1])
+
+
+def _sweep(h: Complex, shift: Complex, size: Array) -> Complex:
+    """One QR step of the leading ``size`` rows: the rotations that make ``h - shift`` triangular, from both sides."""
     n = h[0].shape[0]
-    rows: list[Complex] = [(h[0][i], h[1][i]) for i in range(n)]
-    rotations = []
+    active = jnp.arange(n) < size
+    h = _add_to_diagonal(h, (-shift[0], -shift[1]), active)
+    rows, rotations = [(h[0][i], h[1][i]) for i in range(n)], []
+    # Stored: each rotation would be computed anew for all that follows from it, and compiled as often.
     for k in range(n - 1):
         x, y = rows[k], rows[k + 1]
-        a, b = (x[0][k], x[1][k]), (y[0][k], y[1][k])
-        norm = jnp.sqrt(a[0] ** 2 + a[1] ** 2 + b[0] ** 2 + b[1] ** 2)
-        scale = jnp.where(norm > 0, 1 / jnp.where(norm > 0, norm, 1.0), 0.0)
-        c, s = (jnp.where(norm > 0, a[0] * scale, 1.0), a[1] * scale), (b[0] * scale, b[1] * scale)
-        rotations.append((c, s))
-        p, q, u, w = _conjugate_multiply(c, x), _conjugate_multiply(s, y), _multiply(c, y), _multiply(s, x)
-        rows[k], rows[k + 1] = (p[0] + q[0], p[1] + q[1]), (u[0] - w[0], u[1] - w[1])
+        rows[k], rows[k + 1], *rotation = stored(_turn_rows)(x, y, *((r[0][k], r[1][k]) for r in (x, y)), active[k + 1])
+        rotations.append(rotation)
     re, im = (jnp.stack([row[part] for row in rows]) for part in (0, 1))
-    columns: list[Complex] = [(re[:, j], im[:, j]) for j in range(n)]
-    for k, (c, s) in enumerate(rotations):
-        x, y = columns[k], columns[k + 1]
-        p, q, u, w = _multiply(x, c), _multiply(y, s), _conjugate_multiply(c, y), _conjugate_multiply(s, x)
-        columns[k], columns[k + 1] = (p[0] + q[0], p[1] + q[1]), (u[0] - w[0], u[1] - w[1])
-    return _add_to_diagonal(tuple(jnp.stack([x[part] for x in columns], axis=1) for part in (0, 1)), shift, 1.0)
+    columns = [(re[:, j], im[:, j]) for j in range(n)]
+    for k, rotation in enumerate(rotations):
+        columns[k], columns[k + 1] = stored(_turn_columns)(columns[k], columns[k + 1], *rotation)
+    return _add_to_diagonal(tuple(jnp.stack([x[part] for x in columns], axis=1) for part in (0, 1)), shift, active)
 
 
 def _size(a: Complex) -> Array:
@@ -139,28 +152,36 @@ def eigenvalues(a: Array) -> tuple[Array, Array]:
     """
     reduced = hessenberg(a)
     h = (reduced, jnp.zeros_like(reduced))
-    found: list[Complex] = []
-    while h[0].shape[0] > 2:
-        h = _deflate(h)
-        found.append(_entry(h, -1, -1))
-        h = (h[0][:-1, :-1], h[1][:-1, :-1])
-    found += _pair(*(_entry(h, i, j) for i in (0, 1) for j in (0, 1))) if h[0].shape[0] == 2 else [_entry(h, 0, 0)]
+    n = a.shape[0]
+    if n > 2:
+        h = _deflated(h)
+    found = [_entry(h, i, i) for i in range(min(n, 2), n)]
+    found += _pair(*(_entry(h, i, j) for i in (0, 1) for j in (0, 1))) if n > 1 else [_entry(h, 0, 0)]
     return jnp.stack([x for x, _ in found]), jnp.stack([y for _, y in found])
 
 
-def _deflate(h: Complex) -> Complex:
-    """QR steps until the last row of every lane is decoupled."""
+def _deflated(h: Complex) -> Complex:
+    """``h`` after QR steps that decouple, in every lane, one row after the other from below, down to two.
 
-    def coupled(state: tuple) -> Array:
-        count, h = state
-        loose = _size(_entry(h, -1, -2)) > _EPS * (_size(_entry(h, -1, -1)) + _size(_entry(h, -2, -2)))
-        return (count < _MAX_SWEEPS) & jnp.any(loose)
+    One loop for all sizes: each of its own would be compiled, which takes seconds.
+    """
 
     def step(state: tuple) -> tuple:
-        count, h = state
-        shift = _pair(*(_entry(h, i, j) for i in (-2, -1) for j in (-2, -1)))[1]
-        # Every tenth sweep an arbitrary shift breaks a cycle.
-        kick = jnp.where(count % 10 == 9, 0.75, 0.0) * _size(_entry(h, -1, -2))
-        return count + 1, _sweep(h, (shift[0] + kick, shift[1] - kick / 2))
+        size, count, h = state
+        corner = tuple(jax.lax.dynamic_slice_in_dim(x, size - 2, 2, axis=0) for x in h)
+        corner = tuple(jax.lax.dynamic_slice_in_dim(x, size - 2, 2, axis=1) for x in corner)
+        above, last = _entry(corner, 0, 0), _entry(corner, 1, 1)
+        coupling = _size(_entry(corner, 1, 0))
+        loose = coupling > _EPS * (_size(last) + _size(above))
+        done = (count >= _MAX_SWEEPS) | ~jnp.any(loose)
 
-    return jax.lax.while_loop(coupled, step, (jnp.int32(0), h))[1]
+        def sweep() -> tuple:
+            shift = _pair(*(_entry(corner, i, j) for i in (0, 1) for j in (0, 1)))[1]
+            # Every tenth sweep an arbitrary shift breaks a cycle.
+            kick = jnp.where(count % 10 == 9, 0.75, 0.0) * coupling
+            return size, count + 1, _sweep(h, (shift[0] + kick, shift[1] - kick / 2), size)
+
+        return jax.lax.cond(done, lambda: (size - 1, jnp.int32(0), h), sweep)
+
+    start = (jnp.int32(h[0].shape[0]), jnp.int32(0), h)
+    return jax.lax.while_loop(lambda state: state[0] > 2, step, start)[2]
