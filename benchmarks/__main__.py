@@ -2,9 +2,12 @@
 
     python -m benchmarks [--quick] [--out FOLDER] [--peers PYTHON] [SYSTEM ...]
 
-A full run rewrites benchmarks/results/ and docs/benchmarks.md. With ``--quick``, or another ``--out``, files and page go
-to that folder. A study whose peer is not installed is left out, and said so; one that fails does not stop the others.
-``drivetrain bench`` and ``make bench`` run this.
+A full run rewrites benchmarks/results/, docs/benchmarks.md and the measured part of README.md. With ``--quick``, or
+another ``--out``, files and page go to that folder. A study whose peer is not installed is left out, and said so; one
+that fails does not stop the others. ``drivetrain bench`` and ``make bench`` run this.
+
+``--quick`` takes the chart at equal error and the work-precision of every system, with fewer settings, regions and points;
+all that is about rates alone or sizes it leaves out, unless a SYSTEM is asked for.
 """
 
 from __future__ import annotations
@@ -18,7 +21,10 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from benchmarks.page import write_page
+from benchmarks.readme import write_readme
 from benchmarks.timing import RESULTS, parser, results_folder
+from drivetrain_jax._wording import nearest
+from drivetrain_jax.cli.replies import WRONG_INPUT, one_line
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "benchmarks.md"
@@ -28,31 +34,33 @@ SYSTEMS = ("cardan", "bicardan", "planetary", "rattle", "tripod")
 @dataclass(frozen=True)
 class Study:
     """A module of benchmarks/: what it is about, the package it cannot do without, its option for an interpreter that has
-    the peers, and its arguments in a full run (chosen so that all studies together stay under half an hour)."""
+    the peers, its arguments in a full run (chosen so that all studies together stay under half an hour), and whether a
+    quick run of all systems takes it."""
 
     module: str
     system: str
     needs: str = ""
     peer_option: str = ""
     full: tuple[str, ...] = ()
+    quick: bool = True
 
 
 STUDIES = (
     Study("throughput", "cardan", "heyoka", full=("--repeats", "3")),
-    Study("precision_cardan", "cardan", full=("--repeats", "1")),
-    Study("work_precision", "cardan"),
-    Study("atlas", "cardan", "heyoka", full=("--repeats", "1")),
-    Study("peers", "cardan", "heyoka"),
-    Study("batches", "cardan"),
-    Study("scaling", "cardan", full=("--repeats", "1")),
+    Study("precision_cardan", "cardan"),
+    Study("work_precision", "cardan", quick=False),
+    Study("atlas", "cardan", "heyoka", full=("--repeats", "1"), quick=False),
+    Study("peers", "cardan", "heyoka", quick=False),
+    Study("batches", "cardan", quick=False),
+    Study("scaling", "cardan", full=("--repeats", "1"), quick=False),
     Study("precision_bicardan", "bicardan"),
-    Study("critical_speeds", "bicardan", peer_option="--ross"),
+    Study("critical_speeds", "bicardan", peer_option="--ross", quick=False),
     Study("precision_planetary", "planetary"),
-    Study("planetary_throughput", "planetary", full=("--gears", "6000", "--repeats", "3")),
+    Study("planetary_throughput", "planetary", full=("--gears", "6000", "--repeats", "3"), quick=False),
     Study("precision_rattle", "rattle"),
-    Study("rattle_throughput", "rattle"),
+    Study("rattle_throughput", "rattle", quick=False),
     Study("precision_tripod", "tripod"),
-    Study("chaos", "tripod", "heyoka", peer_option="--pynamicalsys"),
+    Study("chaos", "tripod", "heyoka", peer_option="--pynamicalsys", quick=False),
 )
 
 
@@ -90,13 +98,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     known.add_argument("--peers", metavar="PYTHON", help="interpreter of an environment with ROSS and pynamicalsys")
     options = known.parse_args(arguments)
     if unknown := set(options.systems) - set(SYSTEMS):
-        sys.stderr.write(f"bench: SYSTEM = {min(unknown)!r}: allowed is {', '.join(SYSTEMS)}\n")
-        return 2
+        sys.stderr.write(one_line(f"SYSTEM = {min(unknown)!r}: unknown{nearest(min(unknown), SYSTEMS)}"))
+        return WRONG_INPUT
     folder = results_folder(options)
     chosen = [study for study in STUDIES if not options.systems or study.system in options.systems]
+    if options.quick and not options.systems:
+        print(f"--quick leaves out {', '.join(study.module for study in chosen if not study.quick)}", flush=True)
+        chosen = [study for study in chosen if study.quick]
     failed = run(chosen, options.quick, folder, options.peers)
     page = PAGE if folder == RESULTS else folder / "benchmarks.md"
     write_page(folder, page)
+    if folder == RESULTS:
+        write_readme()
     print(f"page: {page}")
     return 1 if failed else 0
 

@@ -2,13 +2,13 @@
 
     python -m benchmarks.batches [--quick] [--out FOLDER]     # batches.csv, outputs.csv, cold_start.csv and batches.png
 
-"width": points a second of one kernel compiled for chunks of that many points. "points" and "cores": a process of its own
-runs the scene from start to file, twice; the second run counts, peak memory is that of the process. What was not run is
-extrapolated from the last two numbers of points, and says so. "planets": gears a second by number of planets, 3N + 9
-frequencies each. "outputs": time per point with these outputs over that with the first set; kernels take turns. "fixed"
-and "varied" are the same points, all parameters but two being constants of the kernel or columns. "cold start": a small
-scene in a new process, cut into import, compilation, computation and file, with an empty folder of compiled code, with the
-one that this has filled, and with none (``DRIVETRAIN_JAX_CACHE``, docs/sharp_edges.md).
+"width": points a second of one kernel compiled for chunks of that many points, on one core. "points" and "cores": a
+process of its own runs the scene from start to file, twice; the second run counts, peak memory is that of the process.
+What was not run is extrapolated from the last two numbers of points, and says so. "planets": gears a second by number of
+planets, 3N + 9 frequencies each. "outputs": time per point with these outputs over that with the first set; kernels take
+turns. "parameters varied": the same points, all parameters but two being columns of the kernel, not constants. "cold
+start": a small scene in a new process, cut into import, compilation, computation and file, with an empty folder of compiled
+code, with the one that this has filled, and with none (``DRIVETRAIN_JAX_CACHE``, docs/sharp_edges.md).
 """
 
 from __future__ import annotations
@@ -19,18 +19,20 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.batches_figure import draw
-from benchmarks.batches_scenes import COLD, OUTPUTS, WIDTHS, cells, gears, shafts
-from benchmarks.timing import interleaved, median, parser, results_folder, table, write_csv
+from benchmarks.batches_scenes import COLD, FOUR, OUTPUTS, WIDTHS, cells, gears, shafts
+from benchmarks.timing import at_once, interleaved, median, parser, results_folder, table, write_csv
 
 _POINTS, _QUICK_POINTS = (100, 1_000, 10_000, 100_000, 1_000_000), (100, 10_000)
 _EXTRAPOLATED = 10_000_000
-# One process: arguments are the scene, the output, the number of cores, and how often it runs. Prints seconds and MB.
+# One process: arguments are the scene, the output, the number of cores, and how often it runs to a file. If that is once, a
+# first and a second run in memory come before it. Prints seconds and MB.
 _CHILD = """
 import json, os, sys, time
 scene, out, cores, runs = json.loads(sys.argv[1]), sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
@@ -48,10 +50,12 @@ engine = Engine(load_scene(scene))
 for group in engine.plan.groups:
     kernel_of(engine.scene, engine.grid, group.solver, group.chunk)
 compiled = time.perf_counter()
-run(scene)
-ran = time.perf_counter()
-run(scene)
-warm = time.perf_counter()
+ran = warm = compiled
+if runs == 1:
+    run(scene)
+    ran = time.perf_counter()
+    run(scene)
+    warm = time.perf_counter()
 seconds = []
 for number in range(runs):
     begin = time.perf_counter()
@@ -63,9 +67,9 @@ print(json.dumps({"import_s": imported - start, "compile_s": compiled - imported
 """
 
 
-def child(scene: Mapping[str, Any], cores: int, runs: int = 2, cache: str | None = None) -> dict[str, float]:
-    """Seconds and peak memory of a process that runs ``scene`` to a file with these cores."""
-    own = dict(os.environ) | ({} if cache is None else {"DRIVETRAIN_JAX_CACHE": cache})
+def child(scene: Mapping[str, Any], cores: int, cache: str, runs: int = 2) -> dict[str, float]:
+    """Seconds and peak memory of a process that runs ``scene`` to a file with these cores; ``cache``: of compiled code."""
+    own = dict(os.environ) | {"DRIVETRAIN_JAX_CACHE": cache}
     with tempfile.TemporaryDirectory() as folder:
         words = [sys.executable, "-c", _CHILD, json.dumps(scene), f"{folder}/out", str(cores), str(runs)]
         done = subprocess.run(words, check=True, capture_output=True, text=True, env=own)
@@ -92,10 +96,11 @@ def rate_row(what: str, system: str, number: int, per_s: float, how: str, peak: 
 
 
 def timed(scenes: Mapping[tuple, tuple[Mapping[str, Any], int | None]], repeats: int) -> dict[tuple, tuple[float, int]]:
-    """Median seconds and points of one chunk of every scene, taken in turns."""
-    jobs = {key: kernel_job(scene, width) for key, (scene, width) in scenes.items()}
+    """Median seconds and points of one chunk of every scene, taken in turns; the first run only warms up."""
+    made = at_once([partial(kernel_job, scene, width) for scene, width in scenes.values()])
+    jobs = dict(zip(scenes, made, strict=True))
     names = {str(i): key for i, key in enumerate(jobs)}
-    for job, _ in jobs.values():
+    for job, _ in made:
         job()
     seconds = interleaved({name: jobs[key][0] for name, key in names.items()}, repeats)
     return {key: (median(seconds[name]), jobs[key][1]) for name, key in names.items()}
@@ -103,32 +108,37 @@ def timed(scenes: Mapping[tuple, tuple[Mapping[str, Any], int | None]], repeats:
 
 def by_width(quick: bool, repeats: int) -> list[dict[str, Any]]:
     """Points a second against the width of the batch, and gears a second against the number of planets."""
-    widths, systems, counts = (1, 32, 512, 8192), tuple(WIDTHS), (3, 6, 12)
+    widths, counts = {"cardan": (1, 32, 512, 8192), "planetary": (1, 512, 8192), "bicardan": (1, 512, 8192)}, (3, 12)
     if quick:
-        widths, systems, counts = (64, 512), ("bicardan",), ()
-    scenes = {(system, width): (WIDTHS[system], width) for system in systems for width in widths}
+        widths, counts = {"bicardan": (64, 512)}, ()
+    scenes = {(system, width): (WIDTHS[system], width) for system, all_of in widths.items() for width in all_of}
     planets = {("planets", n): (gears(n), 512) for n in counts}
     found = timed(scenes | planets, repeats)
     rows = [rate_row("width", *key, size / s, "kernel") for key, (s, size) in found.items() if key[0] != "planets"]
+    if counts:
+        found["planets", FOUR] = found["planetary", 512]
     return rows + [rate_row("planets", "planetary", key[1], size / s, "kernel")
-                   for key, (s, size) in found.items() if key[0] == "planets"]  # fmt: skip
+                   for key, (s, size) in sorted(found.items()) if key[0] == "planets"]  # fmt: skip
 
 
-def by_points(quick: bool) -> list[dict[str, Any]]:
+def by_points(quick: bool, cache: str) -> list[dict[str, Any]]:
     """Points a second of whole runs against their number, and against the number of cores."""
     rows, spent = [], []
     system, scene = ("bicardan", shafts) if quick else ("cardan", cells)
     for count in _QUICK_POINTS if quick else _POINTS:
-        found = child(scene(count), 2)
+        found = child(scene(count), 2, cache)
         spent.append((count, found["file_s"]))
         rows.append(rate_row("points", system, count, count / found["file_s"], "measured", found["peak_MB"]))
     (n1, t1), (n2, t2) = spent[-2:]
     seconds = t2 + (t2 - t1) / (n2 - n1) * (_EXTRAPOLATED - n2)
     rows.append(rate_row("points", system, _EXTRAPOLATED, _EXTRAPOLATED / seconds, "extrapolated"))
     if not quick:
-        for system, scene, count in (("cardan", cells(100_000), 100_000), ("planetary", gears(4, 50_000), 50_000)):
+        for system, scene, count in (
+            ("cardan", cells(100_000), 100_000),
+            ("planetary", gears(FOUR, 50_000), 50_000),
+        ):
             for cores in (1, 2):
-                found = child(scene, cores)
+                found = child(scene, cores, cache)
                 rows.append(rate_row("cores", system, cores, count / found["file_s"], "measured", found["peak_MB"]))
     return rows
 
@@ -153,7 +163,7 @@ def cold_start(quick: bool) -> list[dict[str, Any]]:
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for name, cache in (("empty", folder), ("filled", folder), ("off", "0"))[: 2 if quick else 3]:
-            found = child(shafts(1000) if quick else COLD, 2, runs=1, cache=cache)
+            found = child(shafts(1000) if quick else COLD, 2, cache, runs=1)
             write, peak = max(found.pop("file_s") - found.pop("warm_s"), 0.0), found.pop("peak_MB")
             rows.append({"compiled_code": name, **found, "write_s": write, "peak_MB": peak})
     return rows
@@ -163,12 +173,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Measure, print and write."""
     options = parser(__doc__).parse_args(argv)
     folder, repeats = results_folder(options), 1 if options.quick else 3
-    batches = by_width(options.quick, repeats) + by_points(options.quick)
+    with tempfile.TemporaryDirectory() as cache:
+        batches = by_width(options.quick, repeats) + by_points(options.quick, cache)
     outputs, cold = by_outputs(options.quick, repeats), cold_start(options.quick)
     write_csv(
         folder / "batches.csv", batches, ["width, planets: one kernel; points, cores: start to file, compiled before"]
     )
-    write_csv(folder / "outputs.csv", outputs, [f"kernels taken in turns, medians of {repeats}"])
+    about = "one kernel on one core, everything that is not asked for left out of it"
+    write_csv(folder / "outputs.csv", outputs, [f"{about}; taken in turns, medians of {repeats}"])
     write_csv(folder / "cold_start.csv", cold, ["seconds in a new process; write: what a run to a file takes more"])
     draw(batches, outputs, cold, Path(folder))
     print(table(batches), table(outputs), table(cold), sep="\n\n")

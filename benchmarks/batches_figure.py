@@ -18,12 +18,13 @@ _PARTS = {"import_s": "import", "compile_s": "compilation", "run_s": "computatio
 def draw(batches: Rows, outputs: Rows, cold: Rows, folder: Path) -> None:
     """``<folder>/batches.png``."""
     figure = Figure(figsize=(13, 8), dpi=120, layout="constrained")
-    axes = figure.subplots(2, 3)
+    above, below = figure.subfigures(2, 1)
     labels = {"width": "points of a batch", "points": "points of a run", "cores": "cores", "planets": "planets"}
-    for ax, (by, label) in zip(axes.flat, labels.items(), strict=False):
+    for ax, (by, label) in zip(above.subplots(1, 4), labels.items(), strict=True):
         _rates(ax, [row for row in batches if row["by"] == by], by, label)
-    _outputs(axes[1, 1], outputs)
-    _cold(axes[1, 2], cold)
+    left, right = below.subplots(1, 2)
+    _outputs(left, outputs)
+    _cold(right, cold)
     facts = provenance()
     figure.supxlabel(f"{facts['machine']}; {facts['versions']}; {facts['date']}", fontsize=6.5, color="0.4")
     figure.savefig(folder / "batches.png")
@@ -38,10 +39,12 @@ def _rates(ax: Any, rows: Rows, by: str, label: str) -> None:
         for row in mine:
             if row["how"] == "extrapolated":
                 ax.plot(row["number"], row["points_per_s"], mfc="white", ls="none", label="extrapolated", **style)
-    ax.set(
-        xlabel=label, ylabel="points per second", yscale="log", xscale="log" if by in ("width", "points") else "linear"
-    )
-    if by in ("cores", "planets"):
+    ax.set(xlabel=label, ylabel="points per second")
+    if by in ("width", "points"):
+        ax.set(xscale="log", yscale="log")
+    else:
+        # From nothing, so that twice as many look twice as high.
+        ax.set_ylim(bottom=0)
         ax.set_xticks(sorted({row["number"] for row in rows}))
     ax.grid(alpha=0.25)
     if rows:

@@ -18,6 +18,7 @@ import math
 import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ import numpy as np
 from benchmarks.bicardan_reference import determinant_roots
 from benchmarks.timing import (
     PROCESSES,
+    at_once,
     interleaved,
     median,
     parser,
@@ -160,8 +162,7 @@ def measure(shafts: int, repeats: int, sample: int, ross: str | None) -> tuple[l
     """Rows of the result table and the notes above it."""
     columns = random_shafts(shafts)
     few = take(columns, np.arange(min(sample, shafts)))
-    ours, compile_s = package_job(columns)
-    grid, grid_compile_s = package_job(map_columns())
+    (ours, compile_s), (grid, grid_compile_s) = at_once([partial(package_job, c) for c in (columns, map_columns())])
     with spawned_workers() as pool:
         theirs = scipy_job(pool, few)
         answers, reference = ours(), theirs()

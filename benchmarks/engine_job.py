@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping
+from threading import Lock
 from typing import Any
 
 import numpy as np
 
 Results = dict[str, np.ndarray]
+# One thread compiles a kernel, others that want the same wait for it.
+_COMPILING: defaultdict[str, Lock] = defaultdict(Lock)
 
 
 def columns_scene(
@@ -30,7 +34,9 @@ def engine_job(scene: Mapping[str, Any], threads: int = 1) -> Callable[[], Resul
 
     engine = Engine(load_scene(dict(scene)))
     grid, plan = engine.grid, engine.plan
-    kernels = {group.index: kernel_of(engine.scene, grid, group.solver, group.chunk) for group in plan.groups}
+    shape = {key: sorted(value) if key == "points" else value for key, value in scene.items()}
+    with _COMPILING[repr((shape, [(group.solver.name, group.chunk) for group in plan.groups]))]:
+        kernels = {group.index: kernel_of(engine.scene, grid, group.solver, group.chunk) for group in plan.groups}
 
     def work(chunk: Any) -> Mapping[str, np.ndarray]:
         return kernels[chunk.solver](grid.columns(chunk.points), chunk.effort)

@@ -1,6 +1,6 @@
 """docs/benchmarks.md from the result files alone: conclusions first, then tables and figures, then where they come from.
 
-    python -m benchmarks.page      # writes docs/benchmarks.md from benchmarks/results/
+    python -m benchmarks.page      # writes docs/benchmarks.md and the measured part of README.md from benchmarks/results/
 
 No number of the page is typed: every sentence takes its figures, and its wording, from the CSV files. A file that is
 missing gives a line that says so.
@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from benchmarks import page_precision
+from benchmarks import page_precision, page_sections
 from benchmarks.precision import GOAL
 from benchmarks.results_files import (
     ResultFile,
@@ -24,7 +24,6 @@ from benchmarks.results_files import (
     seconds,
     small,
     times,
-    whole,
 )
 from benchmarks.timing import RESULTS
 
@@ -32,7 +31,7 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "benchmarks.md"
 NAMES = (
     "throughput", "precision_cardan", "work_precision_cardan", "atlas", "heyoka", "precision_bicardan", "critical_speeds",
     "precision_planetary", "planetary_throughput", "precision_rattle", "rattle_throughput", "precision_tripod", "chaos",
-    "chaos_precision", "batches", "outputs", "cold_start", "overhead", "scaling",
+    "chaos_precision", "damping", "batches", "outputs", "cold_start", "overhead", "scaling",
 )  # fmt: skip
 # Families of the chart: the label's beginning, and how a sentence names them.
 CHART = {
@@ -43,6 +42,7 @@ CHART = {
     "scipy RK45": "SciPy RK45 point by point, the paper's method",
     "drivetrain_jax diffrax": "`diffrax`",
 }
+_FLOWS = {"Lorenz": "Lorenz' system", "tripod": "the double tripod"}
 
 Files = dict[str, ResultFile | None]
 
@@ -60,7 +60,7 @@ def text_of(folder: Path, page: Path) -> str:
     parts = [
         "# Error against run time",
         "Written by `python -m benchmarks` (`make bench`, `drivetrain bench`) from the files in "
-        "`benchmarks/results/`; nothing here is typed by hand. " + _machine(files),
+        "`benchmarks/results/`; nothing here is typed by hand. " + machine(files),
         "## Conclusions",
         "\n".join(f"- {line}" for line in conclusions(files, precise)),
         "## The cardan chart at equal error",
@@ -69,16 +69,20 @@ def text_of(folder: Path, page: Path) -> str:
         _METHOD,
         *(page_precision.section(folder, images, system, precise) for system in page_precision.TITLES),
         "### Schemes behind `direct`, fixed steps",
-        _figure(files, "work_precision_cardan", images, "Error of the multipliers against evaluations and time"),
+        page_sections.figure(
+            files, "work_precision_cardan", images, "Error of the multipliers against evaluations and time"
+        ),
         "## The atlas from nothing to a file",
-        _atlas_section(files["atlas"]),
+        page_sections.atlas(files["atlas"]),
         "## Scaling and outputs",
-        _figure(files, "batches", images, "Points per second against batch width, number of points, cores and planets"),
-        *_scaling_sections(files),
+        page_sections.figure(
+            files, "batches", images, "Points per second against batch width, number of points, cores and planets"
+        ),
+        *page_sections.scaling(files),
         "## Other peers",
-        *_peer_sections(files, images),
+        *page_sections.peers(files, images),
         "## Where the figures come from",
-        _sources(files),
+        page_sections.sources(files),
     ]
     return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
 
@@ -95,14 +99,20 @@ _METHOD = (
 
 def conclusions(files: Files, precise: dict[str, page_precision.Precision]) -> list[str]:
     """The sentences at the head of the page."""
-    found = [_chart_sentence(files["throughput"]), _cold_sentence(files["throughput"]), _atlas_sentence(files["atlas"])]
+    found = [
+        _chart_sentence(files["throughput"]),
+        _cold_sentence(files["throughput"], files["atlas"]),
+        _atlas_sentence(files["atlas"]),
+    ]
     found += page_precision.conclusions(precise)
     found += [
-        _critical_sentence(files["critical_speeds"]),
-        _planetary_sentence(files["planetary_throughput"]),
-        _rattle_sentence(files["rattle_throughput"]),
-        _chaos_sentence(files["chaos"]),
-        _overhead_sentence(files["overhead"]),
+        page_sections.damping_sentence(files["damping"]),
+        critical_sentence(files["critical_speeds"]),
+        planetary_sentence(files["planetary_throughput"]),
+        rattle_sentence(files["rattle_throughput"]),
+        chaos_sentence(files["chaos"]),
+        _outputs_sentence(files["outputs"]),
+        overhead_sentence(files["overhead"]),
         _accelerator_sentence(files),
     ]
     return [sentence for sentence in found if sentence]
@@ -144,25 +154,29 @@ def _chart_sentence(file: ResultFile | None) -> str:
     )
 
 
-def _cold_sentence(file: ResultFile | None) -> str:
+def _cold_sentence(file: ResultFile | None, atlas: ResultFile | None) -> str:
     notes = [note for note in (file.notes if file else ()) if note.startswith("fresh process")]
-    return f"A cold start to the first atlas of {file.rows[0]['cells']} cells: {notes[0]}." if notes else ""
+    told = [f"of {count(file.rows[0]['cells'])} cells, {notes[0]}"] if file and notes else []
+    command = next((row for row in (atlas.rows if atlas else ()) if "cold" in row["method"]), None)
+    if command:
+        spent = float(command["cells_computed"]) / float(command["cells_per_s"])
+        told.append(f"of {count(command['chart'])} cells as an atlas, from the command to the file: {seconds(spent)}")
+    return f"From nothing to a first chart: {'; '.join(told)}." if told else ""
 
 
 def _atlas_sentence(file: ResultFile | None) -> str:
     if file is None:
         return ""
-    parts = []
-    for chart in dict.fromkeys(row["chart"] for row in file.rows):
-        rows = {row["method"]: row for row in file.rows if row["chart"] == chart}
-        for name, words in (("warm", "in memory"), ("cold", "as a cold command, with import, compilation and file")):
-            row = next((row for method, row in rows.items() if name in method), None)
-            if row and row["times_heyoka"]:
-                parts.append(f"{count(chart)} cells {words}: {against(float(row['times_heyoka']), 'heyoka batch')}")
-    return f"The chart as an atlas: {'; '.join(parts)}." if parts else ""
+    told = []
+    for name, words in (("warm", "in memory"), ("cold", "as a cold command, with import, compilation and file")):
+        rows = [row for row in file.rows if name in row["method"] and row["times_heyoka"]]
+        ends = [f"{against(float(row['times_heyoka']), 'heyoka batch')} at {count(row['chart'])} cells" for row in rows]
+        told += [f"{words} {' and '.join(dict.fromkeys([ends[0], ends[-1]]))}"] if ends else []
+    return f"The chart as an atlas is {'; '.join(told)} (what heyoka needs to start is not counted)." if told else ""
 
 
-def _critical_sentence(file: ResultFile | None) -> str:
+def critical_sentence(file: ResultFile | None) -> str:
+    """What the stepped shaft's critical speeds cost beside SciPy and ROSS."""
     if file is None:
         return ""
     ours = {row["method"]: row for row in file.rows}
@@ -179,7 +193,8 @@ def _critical_sentence(file: ResultFile | None) -> str:
     return f"Stepped shaft: {'; '.join(words)}." if words else ""
 
 
-def _planetary_sentence(file: ResultFile | None) -> str:
+def planetary_sentence(file: ResultFile | None) -> str:
+    """Planetary gears beside NumPy."""
     rows = [row for row in (file.rows if file else ()) if row["method"] == "package"]
     if not rows:
         return ""
@@ -189,7 +204,8 @@ def _planetary_sentence(file: ResultFile | None) -> str:
     )
 
 
-def _rattle_sentence(file: ResultFile | None) -> str:
+def rattle_sentence(file: ResultFile | None) -> str:
+    """Periods of gear rattle beside diffrax and SciPy."""
     if file is None:
         return ""
     own = next(row for row in file.rows if row["solver"] == "exact")
@@ -202,7 +218,8 @@ def _rattle_sentence(file: ResultFile | None) -> str:
     return f"Gear rattle: {count(own['per_second'])} periods/s at an error of {small(own['error'])}; {', '.join(told)}."
 
 
-def _chaos_sentence(file: ResultFile | None) -> str:
+def chaos_sentence(file: ResultFile | None) -> str:
+    """Lyapunov spectra beside heyoka and SciPy."""
     if file is None:
         return ""
     words = []
@@ -210,11 +227,26 @@ def _chaos_sentence(file: ResultFile | None) -> str:
         rows = {row["method"]: float(row["per_s"]) for row in file.rows if row["case"] == case}
         own = rows.pop("drivetrain_jax", None)
         if own is not None:
-            words.append(f"{case}: {', '.join(against(own / rate, name) for name, rate in rows.items())}")
-    return f"Lyapunov spectra at equal error: {'; '.join(words)}." if words else ""
+            name, _, error = case.partition(" at error <= ")
+            told = " and ".join(against(own / rate, rival) for rival, rate in rows.items())
+            words.append(f"{_FLOWS.get(name, name)} with an error of at most {error}: {told}")
+    return f"Lyapunov spectra: {'; '.join(words)}." if words else ""
 
 
-def _overhead_sentence(file: ResultFile | None) -> str:
+def _outputs_sentence(file: ResultFile | None) -> str:
+    told: dict[str, list[str]] = {}
+    for row in file.rows if file else ():
+        told.setdefault(row["system"], []).append(f"{times(float(row['times_the_first']))} ({row['outputs']})")
+    words = "; ".join(f"`{system}` {', '.join(sets)}" for system, sets in told.items())
+    return (
+        f"What is not asked for is not computed. Time per point over that of the first outputs: {words}."
+        if told
+        else ""
+    )
+
+
+def overhead_sentence(file: ResultFile | None) -> str:
+    """What the engine adds to its kernels."""
     if file is None:
         return ""
     row = file.rows[0]
@@ -247,82 +279,18 @@ def _chart_section(file: ResultFile | None) -> str:
     return f"{'; '.join(file.notes)}.\n\n{text}\n\n{markdown(head, rows)}"
 
 
-def _atlas_section(file: ResultFile | None) -> str:
-    heads = {
-        "chart": "cells", "method": "method", "cells_computed": "computed", "cells_per_s": "cells/s",
-        "times_heyoka": "times heyoka", "max_error": "largest error", "median_bound": "median bound", "peak_MB": "peak MB",
-    }  # fmt: skip
-    return whole(file, "atlas", heads, {"cells_per_s": count, "chart": count, "cells_computed": count})
-
-
-def _scaling_sections(files: Files) -> list[str]:
-    titles = {
-        "batches": "### Batch width, number of points, cores, states",
-        "outputs": "### What each output costs",
-        "cold_start": "### Cold start of a small scene",
-        "overhead": "### The engine beside its kernels",
-    }
-    found: list[str] = []
-    for name, title in titles.items():
-        file = files[name]
-        heads = {column: column.replace("_", " ") for column in file.rows[0]} if file else {}
-        found += [title, whole(file, name, heads, {})]
-    return [*found, "Sweeps of 1e9 and 1e12 points: [scaling](scaling.md)."]
-
-
-def _peer_sections(files: Files, images: str) -> list[str]:
-    shafts = {"method": "method", "shafts_per_s": "shafts/s", "ratio": "times", "max_difference": "largest difference"}
-    gears = {"planets": "planets", "method": "method", "gears_per_s": "gears/s", "over_numpy_svd": "times NumPy svd",
-             "error": "error", "rigid_Hz": "rigid mode / Hz"}  # fmt: skip
-    periods = {
-        "solver": "solver",
-        "rtol": "rtol",
-        "us_per_lane_period": "us a period",
-        "error": "error",
-        "failed": "failed",
-    }
-    chaos = {"case": "case", "method": "method", "per_s": "per s", "times_scipy": "times SciPy"}
-    heyoka = {"form": "form", "tolerance": "tolerance", "batch": "batch", "monodromies_per_s": "monodromies/s",
-              "max_error": "largest error"}  # fmt: skip
-    return [
-        "### Critical speeds: SciPy and ROSS",
-        whole(files["critical_speeds"], "critical_speeds", shafts, {"shafts_per_s": count}),
-        "### Planetary gears: NumPy and SciPy",
-        whole(files["planetary_throughput"], "planetary_throughput", gears, {"gears_per_s": count}),
-        "### Gear rattle: diffrax and SciPy with events",
-        _figure(files, "rattle_throughput", images, "Error against time per period of gear rattle"),
-        whole(files["rattle_throughput"], "rattle_throughput", periods, {}),
-        "### Lyapunov spectra: heyoka, SciPy, pynamicalsys",
-        _figure(files, "chaos_precision", images, "Error against rate of Lyapunov spectra"),
-        whole(files["chaos"], "chaos", chaos, {"per_s": count}),
-        "### heyoka's own forms, batch sizes and tolerances, one core",
-        whole(files["heyoka"], "heyoka", heyoka, {"monodromies_per_s": count}),
-    ]
-
-
-def _figure(files: Files, name: str, images: str, words: str) -> str:
-    return f"![{words}]({images}{name}.png)" if files[name] else not_measured(name)
-
-
-def _machine(files: Files) -> str:
+def machine(files: Files) -> str:
+    """Where the files were measured."""
     machines = sorted({file.facts["machine"] for file in files.values() if file})
     return f"Machine: {'; '.join(machines)}." if machines else "Nothing has been measured."
 
 
-def _sources(files: Files) -> str:
-    rows = []
-    for name, file in files.items():
-        if file is None:
-            rows.append([f"{name}.csv", "not measured", "", ""])
-        else:
-            load_text = file.facts.get("load", "").partition(" (")[0]
-            rows.append([f"{name}.csv", file.facts["date"], load_text, file.facts["versions"]])
-    return markdown(["file", "date", "load 1, 5, 15 min", "versions"], rows)
-
-
 def main() -> None:
-    """Write the page from the stored results."""
+    """Write the page, and the measured part of the README, from the stored results."""
+    from benchmarks.readme import write_readme
+
     write_page()
+    write_readme()
 
 
 if __name__ == "__main__":

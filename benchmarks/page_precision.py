@@ -7,10 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.precision import GOAL, Judgement, Rung, judge, read
-from benchmarks.results_files import markdown, not_measured, seconds, small, times
+from benchmarks.results_files import LEVEL, is_level, markdown, not_measured, seconds, small, times
 
-# Times that differ by less are not told apart from one run to the next.
-_LEVEL = 1.05
 # Methods that a user of the package can choose; all others are rivals.
 OWN = "package"
 TITLES = {
@@ -80,7 +78,7 @@ def _winners(precision: Precision) -> str:
             lost.append(f"{region} ({rival.method} alone reaches it)")
         else:
             ratio = rival.seconds_per_point / own.seconds_per_point
-            if 1 / _LEVEL < ratio < _LEVEL:
+            if is_level(ratio):
                 level.append(f"{region} ({rival.method})")
             elif ratio > 1:
                 won.append(f"{region} ({times(ratio)} times as fast as {rival.method})")
@@ -89,7 +87,7 @@ def _winners(precision: Precision) -> str:
     parts = [
         f"fastest in {', '.join(won)}" if won else "",
         f"alone in reaching it: {', '.join(alone)}" if alone else "",
-        f"level within {_LEVEL - 1:.0%} in {', '.join(level)}" if level else "",
+        f"level within {LEVEL - 1:.0%} in {', '.join(level)}" if level else "",
         f"**behind** in {', '.join(lost)}" if lost else "",
         f"nobody reaches it: {', '.join(nobody)}" if nobody else "",
     ]
@@ -131,7 +129,8 @@ def section(folder: Path, images: str, system: str, found: dict[str, Precision])
             title,
             f"![Error against time per point, one panel for each region]({images}{name}.png)",
             f"Time per point at the fastest setting with an error of at most {GOAL:g} at every point, in brackets the "
-            "error; else the smallest error reached. Fastest of each region in bold.",
+            "error; else the smallest error reached. In bold the fastest of each region, and what is within "
+            f"{LEVEL - 1:.0%} of it.",
             _times_table(precision),
             "At the extremes:",
             _extremes_table(precision),
@@ -155,7 +154,7 @@ def _time_cell(precision: Precision, region: str, method: str, best: Rung | None
     rung = precision.reaching(region, method)
     if rung is not None:
         text = f"{seconds(rung.seconds_per_point)} ({small(rung.error)})"
-        return f"**{text}**" if rung is best else text
+        return f"**{text}**" if best and is_level(rung.seconds_per_point / best.seconds_per_point) else text
     errors = [rung.error for rung in precision.ladder(region, method) if not math.isnan(rung.error)]
     return f"only {small(min(errors))}" if errors else "-"
 

@@ -1,6 +1,6 @@
 """heyoka.py's batch Taylor integrator on the cardan shaft, as strong as we could make it.
 
-    python -m benchmarks.peers            # formulations, batch sizes and tolerances; writes results/heyoka.csv
+    python -m benchmarks.peers            # formulations, batch sizes and tolerances: results/heyoka.csv, damping.csv
 
 Three forms are offered to it. All integrate the four columns of the fundamental matrix as 16 state variables
 (theta1, theta1', theta2, omega2) per column, where omega2 = theta2' + (eta theta1)' is the absolute speed of the
@@ -23,8 +23,9 @@ from typing import Any
 import heyoka as hy
 import numpy as np
 
-from benchmarks.cardan_reference import spectral_radius
-from benchmarks.timing import chart, parser, results_folder, table, take, write_csv
+from benchmarks.cardan_reference import BASE_CASE, spectral_radius
+from benchmarks.engine_job import columns_scene, engine_job
+from benchmarks.timing import chart, interleaved, median, parser, results_folder, table, take, write_csv
 
 FORMS = ("full", "half", "chi")
 # Number of heyoka's runtime parameters: cos and sin^2 of beta, 1/Omega^2, 2 zeta/Omega, alpha, mu, 1/gamma; in chi also
@@ -174,13 +175,39 @@ def _similar_effort(p: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.lexsort((phase, np.floor(np.abs(p["beta"]) / 0.1)))
 
 
+def against_damping(quick: bool) -> list[dict[str, Any]]:
+    """Microseconds a point of heyoka and of ``direct`` at a few dampings, one core, and how far their radii differ."""
+    rows, size = [], 256
+    heyoka = HeyokaBatch("half", 1e-9, 8)
+    for zeta in (0.1, 10.0) if quick else (0.1, 10.0, 100.0, 1000.0):
+        near = np.linspace(0.995, 1.005, size)
+        columns = {name: np.full(size, value) for name, value in BASE_CASE.items()}
+        columns |= {"beta": near, "Omega": 0.1 * near, "zeta": np.full(size, zeta)}
+        scene = columns_scene(
+            "cardan", "floquet", ["spectral_radius"], columns, options={"method": "direct", "rtol": 1e-9}
+        )
+        direct = engine_job(scene)
+        jobs = {
+            "package, direct, rtol=1e-9": lambda job=direct: job()["spectral_radius"],
+            "heyoka batch, tolerance=1e-9": lambda c=columns: spectral_radius(heyoka.monodromy(c)),
+        }
+        found = {name: job() for name, job in jobs.items()}
+        seconds = interleaved(jobs, 1 if zeta > 100 else 3)
+        ours, theirs = found.values()
+        apart = float(np.nanmax(np.abs(ours / theirs - 1)))
+        rows += [{"zeta": zeta, "method": name, "us_per_point": 1e6 * median(seconds[name]) / size, "difference": apart}
+                 for name in jobs]  # fmt: skip
+    return rows
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Rate and error of every form, batch size and tolerance on random cells of the chart, one core."""
+    """Rate and error of every form, batch size and tolerance on random cells of the chart, and against damping; one
+    core."""
     options = parser(__doc__).parse_args(arguments)
     rng = np.random.default_rng(0)
     columns = take(chart(30_000), rng.choice(30_000 - 1, 1024 if options.quick else 8192, replace=False))
     reference = spectral_radius(HeyokaBatch("half", 1e-15).monodromy(columns))
-    cases = [(form, 1e-9, batch) for form in FORMS for batch in (4, 8, 16)]
+    cases = [(form, 1e-9, batch) for form in FORMS for batch in ((8,) if options.quick else (4, 8, 16))]
     cases += [("half", tolerance, 8) for tolerance in (1e-7, 1e-8, 1e-10, 1e-12)]
     rows = []
     for form, tolerance, batch in cases:
@@ -196,8 +223,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             | {"max_error": float(error.max()), "median_error": float(np.median(error))}
         )
     note = "one core; relative error of rho against tolerance 1e-15; eigenvalues not timed"
-    write_csv(results_folder(options) / "heyoka.csv", rows, [note])
-    print(table(rows))
+    folder, damping = results_folder(options), against_damping(options.quick)
+    write_csv(folder / "heyoka.csv", rows, [note])
+    write_csv(folder / "damping.csv", damping, ["one core; medians of 3 runs in turns, above zeta = 100 one"])
+    print(table(rows), table(damping), sep="\n\n")
 
 
 if __name__ == "__main__":

@@ -13,12 +13,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from benchmarks.planetary_reference import TABLE_2, exact_frequencies, extension_matrix, natural_frequencies
-from benchmarks.timing import PROCESSES, interleaved, median, parser, results_folder, table, write_csv
+from benchmarks.timing import PROCESSES, at_once, interleaved, median, parser, results_folder, table, write_csv
 
 COUNTS = (3, 4, 5, 7, 12)
 _CHECKED = 5
@@ -107,9 +108,10 @@ def contenders(planets: int, count: int) -> tuple[dict[str, Job], dict[str, int]
     factors = extension_matrix(p)
     squares = np.swapaxes(factors, 1, 2) @ factors
     few = max(count // 100, 10)
+    reduced, whole = at_once([partial(package_job, planets, columns, method) for method in ("auto", "full")])
     jobs = {
-        "package": package_job(planets, columns, "auto"),
-        "package, without the reduction": package_job(planets, columns, "full"),
+        "package": reduced,
+        "package, without the reduction": whole,
         "numpy svd of the same matrices": lapack_job(factors, _svd),
         "numpy eigvalsh of their squares": lapack_job(squares, _eigvalsh),
         "scipy eigh, one by one": lambda: np.stack([natural_frequencies(one_gear(p, i)) for i in range(few)]),

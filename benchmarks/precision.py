@@ -1,8 +1,9 @@
 """Error against run time of every method of a system, region by region, and what each does at the extremes.
 
 A study (``benchmarks/precision_<system>.py``) lists contenders: one method at one setting on the points of one region.
-``measure`` prepares all of them first (compile time is kept apart), judges their first answers against the study's
-reference, and then times them in turns. A contender that takes longer than ``ONCE_ABOVE`` seconds is timed once.
+``measure`` prepares all of them first (compile time is kept apart; two are compiled at a time), judges their first answers
+against the study's reference, and then times them in turns: up to ``REPEATS`` times, as often as ``SPENT`` seconds allow,
+so that a slow contender costs its first answer and no more. The CSV says with ``timed`` of how many runs each median is.
 
     python -m benchmarks.precision_cardan [--quick] [--out FOLDER]     # writes precision_cardan.csv and .png
 
@@ -22,12 +23,13 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.timing import RESULTS, interleaved, median, parser, results_folder, write_csv
+from benchmarks.timing import RESULTS, at_once, interleaved, median, parser, results_folder, write_csv
 
-ONCE_ABOVE = 1.0
+REPEATS, SPENT = 9, 0.3
 # Global errors of a tolerance per step are commonly ten to some hundred tolerances.
 PATIENCE = 1e3
 # What a method without a tolerance (a number of steps) must reach at its finest setting, or say that it did not.
@@ -49,6 +51,7 @@ class Rung:
     points: int
     failed: int
     noticed: str
+    timed: int = 1
 
 
 class Judged(NamedTuple):
@@ -81,27 +84,37 @@ class _Trial:
     judged: Judged
 
 
-def measure(contenders: Sequence[Contender], repeats: int) -> list[Rung]:
+def measure(contenders: Sequence[Contender], repeats: int = REPEATS, spent: float = SPENT) -> list[Rung]:
     """One rung a contender: all compiled and judged first, then timed in turns, medians."""
+    prepared = at_once([partial(_prepare, contender) for contender in contenders])
     trials = []
-    for number, contender in enumerate(contenders, 1):
-        trial = _try(contender)
+    for number, (contender, ready) in enumerate(zip(contenders, prepared, strict=True), 1):
+        trial = _try(contender, *ready)
         trials.append(trial)
         what = f"{contender.region}: {contender.method}, {contender.setting}"
         sys.stderr.write(f"{number}/{len(contenders)} {what}: {trial.judged.error:.1e}, {trial.seconds:.2g} s\n")
-    jobs = {str(i): t.job for i, t in enumerate(trials) if t.job is not None and t.seconds <= ONCE_ABOVE}
+    jobs = {str(i): t.job for i, t in enumerate(trials) if t.job is not None and t.seconds <= spent}
+    counts = {name: min(repeats, int(spent / trials[int(name)].seconds)) for name in jobs}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        seconds = interleaved(jobs, repeats)
+        seconds = interleaved(jobs, counts)
     return [_rung(trial, seconds.get(str(i), [trial.seconds])) for i, trial in enumerate(trials)]
 
 
-def _try(contender: Contender) -> _Trial:
+def _prepare(contender: Contender) -> tuple[Callable[[], Any] | Exception, float]:
+    start = time.perf_counter()
+    try:
+        return contender.prepare(), time.perf_counter() - start
+    except Exception as error:
+        return error, time.perf_counter() - start
+
+
+def _try(contender: Contender, job: Callable[[], Any] | Exception, compile_s: float) -> _Trial:
     # An exception or a warning is how the user of that method learns that something is wrong: it is data.
     start = time.perf_counter()
     try:
-        job = contender.prepare()
-        compile_s = time.perf_counter() - start
+        if isinstance(job, Exception):
+            raise job
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             start = time.perf_counter()
@@ -121,7 +134,19 @@ def _rung(trial: _Trial, seconds: Sequence[float]) -> Rung:
     c, judged = trial.contender, trial.judged
     per_point = median(seconds) / c.points
     error, failed, noticed = float(judged.error), int(judged.failed), judged.noticed
-    return Rung(c.system, c.region, c.method, c.setting, error, per_point, trial.compile_s, c.points, failed, noticed)
+    return Rung(
+        c.system,
+        c.region,
+        c.method,
+        c.setting,
+        error,
+        per_point,
+        trial.compile_s,
+        c.points,
+        failed,
+        noticed,
+        len(seconds),
+    )
 
 
 def tolerance(setting: str) -> float | None:
@@ -192,14 +217,12 @@ def study(name: str, doc: str, contenders: Contenders, argv: Sequence[str] | Non
     """The ``main`` of a study: ``contenders(quick)`` gives what competes and the notes for the head of the CSV."""
     from benchmarks.precision_figure import draw
 
-    known = parser(doc)
-    known.add_argument("--repeats", type=int, default=3)
-    options = known.parse_args(argv)
+    options = parser(doc).parse_args(argv)
     folder = results_folder(options)
     given, notes = contenders(options.quick)
-    repeats = 1 if options.quick else options.repeats
-    rungs = measure(given, repeats)
-    about = f"medians of {repeats} repeats in turns; above {ONCE_ABOVE:g} s once; seconds without compilation"
+    repeats, spent = (3, SPENT / 4) if options.quick else (REPEATS, SPENT)
+    rungs = measure(given, repeats, spent)
+    about = f"medians of up to {repeats} runs in turns, as many as {spent:g} s allow ('timed'), without compilation"
     write(name, rungs, [about, *notes], folder)
     draw(name, rungs, folder)
     for region, method, word, how in judgements(rungs):

@@ -34,7 +34,7 @@ from benchmarks.precision import GOAL, Contender, Judged, study
 _LANES, _FEW = 1024, 8
 # Everything but the angles varies, so that gears of one number of planets share a kernel.
 _VARIED = tuple(TABLE_2)
-_QUICK = ("equal planets", "zero stiffness", "ill-conditioned 1e16")
+_FOUR = ("equal planets", "zero stiffness", "ill-conditioned 1e16")
 
 
 def _gear(planets: int, **changed: Any) -> dict[str, Any]:
@@ -141,7 +141,7 @@ def rivals(region: str, lanes: int) -> list[Contender]:
 def contenders(quick: bool) -> tuple[Sequence[Contender], Sequence[str]]:
     """All methods in all regions, and how far NumPy's singular values are from the reference."""
     lanes = 256 if quick else _LANES
-    regions = _QUICK if quick else tuple(REGIONS)
+    regions = _FOUR if quick else tuple(REGIONS)
     found, distances = [], []
     for region in regions:
         found += [
@@ -149,7 +149,7 @@ def contenders(quick: bool) -> tuple[Sequence[Contender], Sequence[str]]:
             package(region, "whole", "full", _SPECTRUM, lanes),
         ]
         # Shapes take long to compile: one number of planets stands for all.
-        if not quick and region in _QUICK:
+        if not quick and region in _FOUR:
             found.append(package(region, "vectors", "full", [*_SPECTRUM, "mode_type"], lanes))
         found += rivals(region, lanes)
         exact = reference(region)

@@ -21,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.rattle_diffrax import integrate
 from benchmarks.rattle_reference import extended, scipy_events, scipy_plain
 from benchmarks.timing import interleaved, median, parser, provenance, results_folder, table, write_csv
-from drivetrain_jax.analysis.impacts.piecewise_diffrax import integrate
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
 from drivetrain_jax.systems.rattle import PRESETS, oscillator
 

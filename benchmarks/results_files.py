@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 Row = Mapping[str, str]
+# Times that differ by less are not told apart from one run to the next.
+LEVEL = 1.1
 _PROVENANCE = ("date", "machine", "load", "versions", "accelerator")
 
 
@@ -44,6 +46,19 @@ def count(value: str | float) -> str:
     return f"{number:.3g}"
 
 
+def plain(text: str) -> str:
+    """A cell as it stands, but ``8,192`` for 8192, ``1,110`` for 1.11e+03, and nothing for a number that there is not."""
+    if text.isdecimal():
+        return f"{int(text):,}"
+    try:
+        number = float(text)
+    except ValueError:
+        return text
+    if math.isnan(number):
+        return ""
+    return count(number) if abs(number) >= 1000 else text
+
+
 def small(value: str | float) -> str:
     """An error: one significant digit and a half, ``2.4e-10``."""
     number = float(value)
@@ -57,7 +72,7 @@ def seconds(value: str | float) -> str:
     number = float(value)
     for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)):
         if number >= scale or unit == "ns":
-            return f"{number / scale:.3g} {unit}"
+            return f"{count(number / scale)} {unit}"
     raise AssertionError
 
 
@@ -66,13 +81,16 @@ def times(ratio: float) -> str:
     return f"{float(f'{ratio:.2g}'):g}" if ratio < 100 else f"{float(f'{ratio:.3g}'):,.0f}"
 
 
+def is_level(ratio: float) -> bool:
+    """Whether two speeds are not told apart: another run may turn such a ratio round."""
+    return 1 / LEVEL < ratio < LEVEL
+
+
 def against(ratio: float, rival: str) -> str:
     """A comparison of speeds in words that follow from the figure."""
-    if ratio >= 1.05:
-        return f"{times(ratio)} times as fast as {rival}"
-    if ratio <= 0.95:
-        return f"slower than {rival}, by {times(1 / ratio)} times"
-    return f"as fast as {rival}"
+    if is_level(ratio):
+        return f"level with {rival}"
+    return f"{times(ratio)} times as fast as {rival}" if ratio > 1 else f"{times(1 / ratio)} times slower than {rival}"
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -82,10 +100,10 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def whole(file: ResultFile | None, name: str, columns: Mapping[str, str], formats: Mapping[str, object]) -> str:
-    """The columns of a file as they are, under the headings given; ``formats`` name column -> function."""
+    """The columns of a file under the headings given, numbers without exponents; ``formats`` name column -> function."""
     if file is None:
         return not_measured(name)
-    as_is = dict.fromkeys(columns, str) | dict(formats)
+    as_is = dict.fromkeys(columns, plain) | dict(formats)
     rows = [[_cell(row.get(column, ""), as_is[column]) for column in columns] for row in file.rows]
     return markdown(list(columns.values()), rows)
 

@@ -11,11 +11,14 @@ import platform
 import statistics
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from functools import cache, wraps
 from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import get_context
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -68,13 +71,34 @@ def spawned_workers(
     )
 
 
-def interleaved(jobs: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, list[float]]:
-    """Seconds of every job, ``repeats`` of each, taken in turns: a change in the machine's load hits all alike."""
+def at_once(makers: Sequence[Callable[[], Any]]) -> list[Any]:
+    """What ``makers`` return, ``PROCESSES`` of them at work at a time: compilation is most of what they do, and it leaves
+    the interpreter."""
+    with ThreadPoolExecutor(PROCESSES) as pool:
+        return list(pool.map(lambda make: make(), makers))
+
+
+def once(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``functools.cache`` for several threads: of two that ask for the same, the second waits instead of making it anew."""
+    kept, locks = cache(function), defaultdict[Any, Lock](Lock)
+
+    @wraps(function)
+    def asked(*arguments: Any) -> Any:
+        with locks[arguments]:
+            return kept(*arguments)
+
+    return asked
+
+
+def interleaved(jobs: Mapping[str, Callable[[], Any]], repeats: int | Mapping[str, int]) -> dict[str, list[float]]:
+    """Seconds of every job, taken in turns: a change in the machine's load hits all alike. ``repeats`` of each, or as many
+    as it says by name."""
+    counts = dict.fromkeys(jobs, repeats) if isinstance(repeats, int) else repeats
     seconds: dict[str, list[float]] = {name: [] for name in jobs}
-    for _ in range(repeats):
-        for name, job in jobs.items():
+    for turn in range(max(counts.values(), default=0)):
+        for name in (name for name in jobs if turn < counts[name]):
             start = time.perf_counter()
-            job()
+            jobs[name]()
             seconds[name].append(time.perf_counter() - start)
     return seconds
 

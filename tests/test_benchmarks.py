@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,8 @@ import pytest
 import drivetrain_jax
 from benchmarks.page import PAGE, text_of
 from benchmarks.precision import Contender, Judged, Rung, judge, measure, read, write
-from benchmarks.timing import RESULTS
+from benchmarks.results_files import against, plain
+from benchmarks.timing import RESULTS, at_once, once
 from drivetrain_jax import cli
 
 
@@ -78,6 +80,60 @@ def test_exceptions_and_warnings_are_how_a_user_notices(tmp_path):
     write("some", rungs, ["a note"], tmp_path)
     again = read(tmp_path / "some.csv")
     assert [(r.method, r.noticed, r.failed) for r in again] == [(r.method, r.noticed, r.failed) for r in rungs]
+
+
+def test_a_slow_contender_is_timed_once_and_a_fast_one_as_often_as_allowed(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
+
+    def job_of(seconds):
+        return lambda: lambda: clock.__setitem__(0, clock[0] + seconds)
+
+    contenders = [
+        Contender("cardan", "easy", name, "rtol=1e-9", 2, job_of(seconds), lambda _: Judged(0.0))
+        for name, seconds in (("slow", 2.0), ("medium", 0.375), ("fast", 0.125))
+    ]
+    rungs = measure(contenders, repeats=4, spent=1.0)
+    assert [r.timed for r in rungs] == [1, 2, 4]
+    assert [r.seconds_per_point for r in rungs] == [1.0, 0.1875, 0.0625]
+
+
+def test_two_threads_that_ask_for_the_same_make_it_once():
+    made = []
+
+    @once
+    def make(key):
+        time.sleep(0.02)
+        made.append(key)
+        return object()
+
+    first, second = at_once([lambda: make("a")] * 2)
+    assert first is second and made == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("ratio", "words"),
+    [(1.09, "level with X"), (0.92, "level with X"), (1.2, "1.2 times as fast as X"), (0.5, "2 times slower than X")],
+)
+def test_speeds_within_a_tenth_are_level(ratio, words):
+    assert against(ratio, "X") == words
+
+
+def test_numbers_of_a_table_have_no_exponents_but_small_ones():
+    cells = {"1.11e+03": "1,110", "8192": "8,192", "1e-06": "1e-06", "0.42": "0.42", "nan": "", "direct": "direct"}
+    assert {text: plain(text) for text in cells} == cells
+
+
+def test_quick_leaves_out_what_is_about_sizes_unless_its_system_is_asked_for(monkeypatch, tmp_path, capfd):
+    from benchmarks import __main__ as runner
+
+    large = runner.Study("scaling", "cardan", "no_such_package", quick=False)
+    monkeypatch.setattr(runner, "STUDIES", (large,))
+    assert runner.main(["--quick", "--out", str(tmp_path)]) == 0
+    out = capfd.readouterr().out
+    assert "--quick leaves out scaling" in out and "0 studies" in out
+    assert runner.main(["--quick", "--out", str(tmp_path), "cardan"]) == 0
+    assert "no_such_package is not installed" in capfd.readouterr().out
 
 
 def test_bench_outside_a_checkout_is_one_line(monkeypatch, tmp_path, capsys):

@@ -1,0 +1,111 @@
+"""The tables of the benchmarks' page beside the work-precision: atlas, scaling, outputs, peers; where files come from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from benchmarks.results_files import ResultFile, against, count, markdown, not_measured, small, whole
+
+Files = Mapping[str, ResultFile | None]
+_DAMPING = (
+    "At (beta, Omega) = (1, 0.1), one core. From some damping on `direct` takes an implicit scheme (Radau IIA), whose cost "
+    "does not depend on the damping; an explicit one, as Taylor series are, needs steps as short as the fastest decay. "
+    "Differences are those of the two spectral radii."
+)
+_SCALING = {
+    "batches": (
+        "### Batch width, number of points, cores, states",
+        "`width` and `planets`: one kernel on one core; `points` and `cores`: a run from its start to a file.",
+    ),
+    "outputs": (
+        "### What each output costs",
+        "Kernels contain what is asked for and nothing else, and what does not vary is a constant of them. Times are those "
+        "of one core, over that of the first set of each system.",
+    ),
+    "cold_start": ("### Cold start of a small scene", "In seconds; `compiled code`: the folder that it is kept in."),
+    "overhead": ("### The engine beside its kernels", ""),
+}
+
+
+def damping_sentence(file: ResultFile | None) -> str:
+    """Who is faster at which damping, and why."""
+    told: list[str] = []
+    rates: dict[str, dict[str, float]] = {}
+    for row in file.rows if file else ():
+        rates.setdefault(row["zeta"], {})[row["method"].partition(",")[0]] = float(row["us_per_point"])
+    for zeta, spent in rates.items():
+        told.append(f"{against(spent['heyoka batch'] / spent['package'], 'heyoka batch')} at zeta = {float(zeta):g}")
+    words = "its implicit scheme, taken where damping is strong, costs the same however strong it is"
+    return f"At Omega = 0.1, `direct` is {', '.join(told)}: {words}." if told else ""
+
+
+def atlas(file: ResultFile | None) -> str:
+    """What an atlas takes, next to heyoka and SciPy."""
+    heads = {
+        "chart": "cells", "method": "method", "cells_computed": "computed", "cells_per_s": "cells/s",
+        "times_heyoka": "times heyoka", "max_error": "largest error", "median_bound": "median bound", "peak_MB": "peak MB",
+    }  # fmt: skip
+    return whole(file, "atlas", heads, {"cells_per_s": count, "chart": count, "cells_computed": count})
+
+
+def scaling(files: Files) -> list[str]:
+    """Batches, outputs, cold start and the engine's own work."""
+    found: list[str] = []
+    for name, (title, words) in _SCALING.items():
+        file = files[name]
+        heads = {column: column.replace("_", " ") for column in file.rows[0]} if file else {}
+        found += [title, *([words] if words and file else []), whole(file, name, heads, {})]
+    return [*found, "Sweeps of 1e9 and 1e12 points: [scaling](scaling.md)."]
+
+
+def peers(files: Files, images: str) -> list[str]:
+    """Every peer that is not part of the work-precision."""
+    shafts = {"method": "method", "shafts_per_s": "shafts/s", "ratio": "times", "max_difference": "largest difference"}
+    gears = {"planets": "planets", "method": "method", "gears_per_s": "gears/s", "over_numpy_svd": "times NumPy svd",
+             "error": "error", "rigid_Hz": "rigid mode / Hz"}  # fmt: skip
+    periods = {
+        "solver": "solver",
+        "rtol": "rtol",
+        "us_per_lane_period": "us a period",
+        "error": "error",
+        "failed": "failed",
+    }
+    chaos = {"case": "case", "method": "method", "setting": "setting", "error": "error", "per_s": "per s",
+             "times_scipy": "times SciPy"}  # fmt: skip
+    damping = {"zeta": "zeta", "method": "method", "us_per_point": "us a point", "difference": "largest difference"}
+    heyoka = {"form": "form", "tolerance": "tolerance", "batch": "batch", "monodromies_per_s": "monodromies/s",
+              "max_error": "largest error"}  # fmt: skip
+    return [
+        "### Critical speeds: SciPy and ROSS",
+        whole(files["critical_speeds"], "critical_speeds", shafts, {"shafts_per_s": count}),
+        "### Planetary gears: NumPy and SciPy",
+        whole(files["planetary_throughput"], "planetary_throughput", gears, {"gears_per_s": count}),
+        "### Gear rattle: diffrax and SciPy with events",
+        figure(files, "rattle_throughput", images, "Error against time per period of gear rattle"),
+        whole(files["rattle_throughput"], "rattle_throughput", periods, {}),
+        "### Lyapunov spectra: heyoka, SciPy, pynamicalsys",
+        figure(files, "chaos_precision", images, "Error against rate of Lyapunov spectra"),
+        whole(files["chaos"], "chaos", chaos, {"per_s": count}),
+        "### heyoka's own forms, batch sizes and tolerances, one core",
+        whole(files["heyoka"], "heyoka", heyoka, {"monodromies_per_s": count}),
+        "### `direct` and heyoka against damping",
+        *([_DAMPING] if files["damping"] else []),
+        whole(files["damping"], "damping", damping, {"difference": small}),
+    ]
+
+
+def figure(files: Files, name: str, images: str, words: str) -> str:
+    """The link to a figure whose file of numbers is there."""
+    return f"![{words}]({images}{name}.png)" if files[name] else not_measured(name)
+
+
+def sources(files: Files) -> str:
+    """Date, load and versions of every file."""
+    rows = []
+    for name, file in files.items():
+        if file is None:
+            rows.append([f"{name}.csv", "not measured", "", ""])
+        else:
+            load_text = file.facts.get("load", "").partition(" (")[0]
+            rows.append([f"{name}.csv", file.facts["date"], load_text, file.facts["versions"]])
+    return markdown(["file", "date", "load 1, 5, 15 min", "versions"], rows)

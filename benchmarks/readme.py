@@ -1,0 +1,108 @@
+"""The measured part of the README, from the result files alone; `python -m benchmarks.page` writes it with the page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks import page
+from benchmarks.precision import GOAL
+from benchmarks.results_files import ResultFile, Row, count, load, markdown, not_measured, seconds, small
+from benchmarks.timing import RESULTS
+
+README = Path(__file__).resolve().parents[1] / "README.md"
+BEGIN = "<!-- Written by `python -m benchmarks.page`; do not edit. -->"
+END = "<!-- End of what is written. -->"
+NAMES = (
+    "throughput", "critical_speeds", "planetary_throughput", "rattle_throughput", "chaos", "atlas", "memory", "overhead",
+)  # fmt: skip
+OWN = "drivetrain_jax direct"
+LABELS = {
+    OWN: "**`direct`**",
+    "heyoka batch": "heyoka, a compiled Taylor integrator",
+    "scipy DOP853 stacked": "SciPy DOP853, the whole grid as one state",
+    "scipy DOP853": "SciPy DOP853, point by point",
+    "scipy RK45": "SciPy RK45, point by point (the paper's method)",
+    "drivetrain_jax diffrax": "`diffrax` under vmap",
+}
+
+
+def section(folder: Path = RESULTS) -> str:
+    """The text between the marks."""
+    files = {name: load(folder, name) for name in NAMES}
+    told = [
+        page.critical_sentence(files["critical_speeds"]),
+        page.planetary_sentence(files["planetary_throughput"]),
+        page.chaos_sentence(files["chaos"]),
+        page.rattle_sentence(files["rattle_throughput"]),
+        _atlas(files["atlas"]),
+        _memory(files["memory"]),
+        page.overhead_sentence(files["overhead"]),
+    ]
+    return "\n\n".join([*_chart(files["throughput"]), "\n".join(f"- {sentence}" for sentence in told if sentence)])
+
+
+def _chart(file: ResultFile | None) -> list[str]:
+    if file is None:
+        return [not_measured("throughput")]
+    good = page.at_equal_error(file)
+    exact = {name: _most_exact(file, name) for name in LABELS}
+    shown = [row for row in file.rows if page.family(row) == OWN or row is good.get(page.family(row))]
+    shown += [row for name, row in exact.items() if row and name not in good and row not in shown]
+    rows = [
+        [_label(row), count(row["cells_per_s"]), small(row["max_error"])]
+        for row in sorted(shown, key=lambda row: -float(row["cells_per_s"]))
+    ]
+    head = (
+        f"Spectral radius on the {file.notes[0]}, compilation apart; of the rivals the fastest setting whose largest error "
+        f"is at most {GOAL:g}, else the most exact. Of these, `direct` alone gives an error bound for every cell. "
+        + page.machine({"throughput": file})
+    )
+    return [head, markdown(["method", "cells/s", "largest error"], rows)]
+
+
+def _label(row: Row) -> str:
+    return f"{LABELS[page.family(row)]}, {row['method'].rpartition(', ')[2]}"
+
+
+def _most_exact(file: ResultFile, name: str) -> Row | None:
+    rows = [row for row in file.rows if page.family(row) == name]
+    return min(rows, key=lambda row: float(row["max_error"]), default=None)
+
+
+def _atlas(file: ResultFile | None) -> str:
+    if file is None:
+        return ""
+    rates = {kind: [] for kind in ("evaluation", "points")}
+    for row in file.rows:
+        kind = row["method"].removeprefix("atlas, ")
+        if kind in rates:
+            rates[kind].append(float(row["cells_per_s"]))
+    told = [f"up to {count(max(rates[kind]))} {what} a second" for kind, what in _KINDS.items() if rates[kind]]
+    sliced = next((row for row in file.rows if "four parameters" in row["method"]), None)
+    if sliced:
+        time = seconds(float(sliced["cells_computed"]) / float(sliced["cells_per_s"]))
+        told.append(f"one over four parameters gives any chart of {count(sliced['cells_computed'])} cells in {time}")
+    return f"An atlas, with bounds and verdicts: {'; '.join(told)}."
+
+
+_KINDS = {"evaluation": "cells of a chart", "points": "points"}
+
+
+def _memory(file: ResultFile | None) -> str:
+    if file is None:
+        return ""
+    row = max(file.rows, key=lambda row: float(row["points"]))
+    took = f"{seconds(row['seconds'])}, {row['resident_mb']} MB of memory"
+    return f"A sweep of {count(row['points'])} points to a file: {took}."
+
+
+def written(text: str, folder: Path = RESULTS) -> str:
+    """``text`` of a README with its measured part made from the files in ``folder``."""
+    before, _, rest = text.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    return f"{before}{BEGIN}\n\n{section(folder)}\n\n{END}{after}"
+
+
+def write_readme() -> None:
+    """Write the measured part of the README anew."""
+    README.write_text(written(README.read_text()))
