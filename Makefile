@@ -25,7 +25,7 @@ lint: $(VENV)/installed-test
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
-bench: $(VENV)/installed-bench  ## error against run time, with the peers; writes benchmarks/results/ and docs/benchmarks.md
+bench: $(VENV)/installed-bench  ## error against run time, with the peers; writes benchmarks/results/, docs/benchmarks.md and the figures of README.md
 	$(BIN)/drivetrain bench
 
 validation: $(VENV)/installed  ## regenerates docs/validation/

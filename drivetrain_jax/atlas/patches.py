@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drivetrain_jax.atlas.criteria import Criteria, on_grid
+from drivetrain_jax.atlas.interpolation import nodes
 from drivetrain_jax.atlas.panels import Panel, chebyshev
 
 # Nodes of a patch in each coordinate, tail of the series relative to its size, and the largest number of patches.
@@ -238,8 +239,8 @@ def _sample(criteria: Criteria, panel: Panel, counts: list[int]) -> _Sample:
     """The functions on counts[0] x counts[1] equal patches of one panel."""
     d = len(counts)
     edges = [np.linspace(panel.lower[k], panel.upper[k], counts[k] + 1) for k in range(d)]
-    nodes = _nodes(NODES)
-    axes = tuple((e[:-1, None] * (1 - nodes) / 2 + e[1:, None] * (1 + nodes) / 2).reshape(-1) for e in edges)
+    t = nodes(NODES)
+    axes = tuple((e[:-1, None] * (1 - t) / 2 + e[1:, None] * (1 + t) / 2).reshape(-1) for e in edges)
     phi = on_grid(panel, axes)
     log_determinant = criteria.log_determinant(_mesh(axes)).reshape(phi.shape[1:])
     split = tuple(n for count in counts for n in (count, NODES))
@@ -279,14 +280,10 @@ def _apply(matrix: np.ndarray, coefficients: np.ndarray, axis: int) -> np.ndarra
     return np.moveaxis(np.tensordot(matrix, coefficients, axes=((1,), (axis,))), 0, axis)
 
 
-def _nodes(n: int) -> np.ndarray:
-    return np.cos(np.pi * (np.arange(n) + 0.5) / n)
-
-
 @lru_cache
 def _analysis(n: int) -> np.ndarray:
     """Matrix from values at the nodes to Chebyshev coefficients."""
-    matrix = 2 / n * chebyshev(_nodes(n), n).T
+    matrix = 2 / n * chebyshev(nodes(n), n).T
     matrix[0] /= 2
     return matrix
 
@@ -302,12 +299,12 @@ def _differentiation(n: int) -> np.ndarray:
 @lru_cache
 def _enlargement(n: int) -> np.ndarray:
     """Matrix from the coefficients over [-1, 1] to those over an interval larger by ``MARGIN``."""
-    return _analysis(n) @ np.polynomial.chebyshev.chebvander((1 + MARGIN) * _nodes(n), n - 1)
+    return _analysis(n) @ np.polynomial.chebyshev.chebvander((1 + MARGIN) * nodes(n), n - 1)
 
 
 @lru_cache
 def _restrictions(n: int) -> tuple[np.ndarray, np.ndarray]:
     """Matrices from the coefficients over [-1, 1] to those over the two parts left and right of the cut."""
-    nodes = _nodes(n)
-    left, right = (_CUT - 1 + (1 + _CUT) * nodes) / 2, (1 + _CUT + (1 - _CUT) * nodes) / 2
+    t = nodes(n)
+    left, right = (_CUT - 1 + (1 + _CUT) * t) / 2, (1 + _CUT + (1 - _CUT) * t) / 2
     return tuple(_analysis(n) @ chebyshev(part, n) for part in (left, right))

@@ -27,20 +27,27 @@ _RTOL, _STEPS = 1e-13, 400
 _SHIFTS = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
 _WEIGHTS = np.array([-1.0, 9.0, -45.0, 45.0, -9.0, 1.0]) / 60
 _STEP, _SMALL = 2e-4, 0.01
+# Moduli that differ by no more than rounding, as those of all multipliers without damping.
+_TIED = 1e-11
 
 
 @dataclass(frozen=True)
 class Sensitivity:
     """``spectral_radius`` at a point, its ``gradient`` by parameter and the dominant ``multiplier``.
 
-    ``gap`` is the distance to the nearest other multiplier that is not its conjugate, relative to it: at 0 the gradient does
-    not exist.
+    ``gap`` is by how much the modulus of the next multiplier, its conjugate apart, is smaller, relative to its own: at 0 the
+    gradient does not exist.
     """
 
     spectral_radius: float
     gradient: Mapping[str, float]
     multiplier: complex
     gap: float
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is a gradient: one multiplier, or a pair, is the largest."""
+        return self.gap > _TIED
 
     def boundary(self, parameter: str) -> dict[str, float]:
         """Derivative of the boundary value of ``parameter`` with respect to every other one, at a point of the boundary.
@@ -65,10 +72,8 @@ def atlas_sensitivity(atlas: Atlas, system: System, point: Mapping[str, float]) 
     radius = float(np.exp(rates.rate[0]))
     gradient = radius * rates.gradient[0] * slope
     sigma = complex(rates.multiplier[0])
-    others = criteria.eigenvalues(x)[0]
-    return Sensitivity(
-        radius, dict(zip(atlas.parameters, map(float, gradient), strict=True)), sigma, _gap(sigma, others)
-    )
+    slopes = dict(zip(atlas.parameters, map(float, gradient), strict=True))
+    return Sensitivity(radius, slopes, sigma, _gap(sigma, criteria.eigenvalues(x)[0]))
 
 
 def direct_sensitivity(system: System, values: Mapping[str, float]) -> Sensitivity:
@@ -81,7 +86,7 @@ def direct_sensitivity(system: System, values: Mapping[str, float]) -> Sensitivi
     predicted = build(columns).explicit_steps
     steps = int(np.ceil(np.max(predicted(_RTOL)))) if predicted else _STEPS
     z = np.asarray(_monodromy(build)(columns, np.int64(steps)))
-    change = z[:, :, 1:].reshape(4, 4, len(names), len(_SHIFTS)) @ _WEIGHTS / size
+    change = z[:, :, 1:].reshape(*z.shape[:2], len(names), len(_SHIFTS)) @ _WEIGHTS / size
     sigma, right = np.linalg.eig(z[:, :, 0])
     k = int(np.argmax(np.abs(sigma)))
     left = np.linalg.inv(right)[k]
@@ -91,13 +96,13 @@ def direct_sensitivity(system: System, values: Mapping[str, float]) -> Sensitivi
     return Sensitivity(radius, gradient, complex(sigma[k]), _gap(complex(sigma[k]), sigma))
 
 
-def _gap(sigma: complex, others: np.ndarray) -> float:
-    distance = np.abs(others - sigma) / abs(sigma)
-    conjugate = np.abs(others - sigma.conjugate()) <= 1e-12 * abs(sigma)
-    distance[int(np.argmin(distance))] = np.inf
-    if abs(sigma.imag) > 1e-12 * abs(sigma):
-        distance[conjugate] = np.inf
-    return float(distance.min())
+def _gap(sigma: complex, multipliers: np.ndarray) -> float:
+    """``gap`` of ``sigma`` among all ``multipliers``, which hold it and, if it is complex, its conjugate."""
+    own = [sigma, sigma.conjugate()] if abs(sigma.imag) > 1e-12 * abs(sigma) else [sigma]
+    others = list(multipliers)
+    for value in own:
+        others.pop(int(np.argmin(np.abs(np.array(others) - value))))
+    return float(1 - np.abs(others).max(initial=0.0) / abs(sigma))
 
 
 @lru_cache

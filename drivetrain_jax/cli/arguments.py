@@ -29,17 +29,28 @@ class _Parser(argparse.ArgumentParser):
         return options
 
     def error(self, message: str) -> NoReturn:
-        choice = re.fullmatch(r"argument ([\w-]+): invalid choice: '(.*)' \(choose from (.*)\)", message)
-        if choice:
-            field, given, allowed = choice.group(1), choice.group(2), choice.group(3).replace("'", "").split(", ")
-            message = f"{field} = {given!r}: unknown{nearest(given, allowed)}"
-        self.exit(WRONG_INPUT, one_line(f"{message}; see {self.prog} --help"))
+        self.exit(WRONG_INPUT, one_line(f"{_reworded(message)}; see {self.prog} --help"))
+
+
+def _reworded(message: str) -> str:
+    """What argparse says in the words of all other messages."""
+    if choice := re.fullmatch(r"argument ([\w-]+): invalid choice: '(.*)' \(choose from (.*)\)", message):
+        field, given, allowed = choice.group(1), choice.group(2), choice.group(3).replace("'", "").split(", ")
+        return f"{field} = {given!r}: unknown{nearest(given, allowed)}"
+    if kind := re.fullmatch(r"argument ([\w-]+): invalid (int|float) value: (.*)", message):
+        return f"{kind.group(1)} = {kind.group(3)}: allowed is {'an integer' if kind.group(2) == 'int' else 'a number'}"
+    if missing := re.fullmatch(r"the following arguments are required: (.*)", message):
+        first, *others = missing.group(1).split(", ")
+        return f"{first}: missing" + (f" (missing too: {', '.join(others)})" if others else "")
+    return message
 
 
 def parser() -> argparse.ArgumentParser:
     """The parser of all commands; what it gives has the function of the command as ``command``."""
     whole = _Parser(
-        prog="drivetrain", description="Stability and vibration of drivetrains, from a scene file to a chart."
+        prog="drivetrain",
+        description="Stability and vibration of drivetrains, from a scene file to a chart.",
+        epilog="Begin with `drivetrain list`; `drivetrain COMMAND --help` describes a command.",
     )
     whole.add_argument("--version", action="version", version=__version__)
     subparsers = whole.add_subparsers(metavar="COMMAND", required=True)
@@ -85,14 +96,14 @@ def _add_verify(subparsers: Any) -> None:
     command = _command(
         subparsers, "verify", commands.verify, "check every checksum of a result, and what must hold of its numbers"
     )
-    command.add_argument("file", metavar="FILE.nc", type=Path)
+    command.add_argument("file", metavar="FILE.nc", type=Path, help="result, finished or not")
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
 
 def _add_export(subparsers: Any) -> None:
     command = _command(subparsers, "export", commands.export, "write a Zarr store as one HDF5 file")
-    command.add_argument("store", metavar="STORE", type=Path)
-    command.add_argument("file", metavar="FILE.nc", type=Path)
+    command.add_argument("store", metavar="STORE", type=Path, help="result of `drivetrain run --store zarr`")
+    command.add_argument("file", metavar="FILE.nc", type=Path, help="file to write")
 
 
 def _add_plot(subparsers: Any) -> None:
@@ -109,15 +120,15 @@ def _add_plot(subparsers: Any) -> None:
 
 def _add_point(subparsers: Any) -> None:
     command = _command(subparsers, "point", commands.point, "compute one point")
-    command.add_argument("system", metavar="SYSTEM")
-    command.add_argument("analysis", metavar="ANALYSIS")
-    _add_given(command, "parameters, options, and outputs=NAME,NAME")
+    command.add_argument("system", metavar="SYSTEM", help="`drivetrain list` names them")
+    command.add_argument("analysis", metavar="ANALYSIS", help="`drivetrain list SYSTEM` names them")
+    _add_given(command, "parameters in the units of `drivetrain list SYSTEM`, options, and outputs=NAME,NAME")
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
 
 def _add_query(subparsers: Any) -> None:
     command = _command(subparsers, "query", commands.query, "ask a stored atlas about one point")
-    command.add_argument("file", metavar="FILE.nc", type=Path)
+    command.add_argument("file", metavar="FILE.nc", type=Path, help='result of a scene with analysis = "atlas"')
     _add_given(command, "parameters, or the data in physical units")
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
@@ -126,9 +137,11 @@ def _add_design(subparsers: Any) -> None:
     command = _command(subparsers, "design", commands.design, "ask a stored atlas what a design has to be")
     questions = ("least-damping", "widest-angle", "speed-windows")
     command.add_argument("question", choices=questions, metavar="QUESTION", help=", ".join(questions))
-    command.add_argument("file", metavar="FILE.nc", type=Path)
+    command.add_argument("file", metavar="FILE.nc", type=Path, help='result of a scene with analysis = "atlas"')
     _add_given(command, "parameters; a range is name=LOW:HIGH")
-    command.add_argument("--margin", type=float, help="speed-windows: part of the speed kept clear of every boundary")
+    command.add_argument(
+        "--margin", type=float, metavar="PART", help="speed-windows: part of the speed kept clear of every boundary"
+    )
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
 
@@ -170,7 +183,7 @@ def _add_given(command: argparse.ArgumentParser, text: str) -> None:
 
 
 def _add_scene(command: argparse.ArgumentParser) -> None:
-    command.add_argument("scene", metavar="SCENE.toml", type=Path)
+    command.add_argument("scene", metavar="SCENE.toml", type=Path, help="`drivetrain list` names some")
     command.add_argument("--out", required=True, metavar="FILE.nc", type=Path, help="result file")
     command.add_argument(
         "--set",

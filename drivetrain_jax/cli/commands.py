@@ -114,12 +114,16 @@ def export(options: argparse.Namespace) -> int:
 
 def plot(options: argparse.Namespace) -> int:
     """The figure of one result, or of several that share one."""
+    from matplotlib.backend_bases import FigureCanvasBase
+
     from drivetrain_jax.store.consolidate import open_result
     from drivetrain_jax.view import plot
 
-    out = options.out
+    out, kinds = options.out, FigureCanvasBase.get_supported_filetypes()
     if not out.parent.is_dir():
         raise InputError(f"out = {str(out)!r}: the folder does not exist; allowed is a file in an existing folder")
+    if out.suffix[1:].lower() not in kinds:
+        raise InputError(f"out = {str(out)!r}: allowed is a name that ends in .{', .'.join(kinds)}")
     results = [open_result(file) if file.exists() else _open_unfinished(file) for file in options.files]
     if any(result.attrs.get("analysis") == "atlas" for result in results):
         from drivetrain_jax.sweep.atlas_chart import chart
@@ -130,9 +134,6 @@ def plot(options: argparse.Namespace) -> int:
         field = f"--part = {options.part[0]!r}" if options.part else f"--cells = {options.cells}"
         raise InputError(f"{field}: a result on a grid is drawn whole; allowed for an atlas")
     figure = plot(*results)
-    kinds = figure.canvas.get_supported_filetypes()
-    if out.suffix[1:].lower() not in kinds:
-        raise InputError(f"out = {str(out)!r}: allowed is a name that ends in .{', .'.join(kinds)}")
     try:
         figure.savefig(out)
     except OSError as error:

@@ -11,6 +11,8 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
+from drivetrain_jax._errors import InputError
+
 if TYPE_CHECKING:
     from drivetrain_jax.sweep.run import Progress
 
@@ -40,6 +42,11 @@ def progress_line() -> Iterator[Callable[[Progress], None]]:
 
     try:
         yield report
+    except InputError:
+        # Wrong input that only the work brings to light, such as a scheduler that does not answer: no bar beside its line.
+        bar.live.transient = True
+        bar.live.stop()
+        raise
     finally:
         if bar.live.is_started:
             bar.stop()

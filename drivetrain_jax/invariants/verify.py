@@ -41,10 +41,9 @@ def verify(path: Path) -> Report:
         return _verify_parts(path, parts)
     if shards.is_store(path):
         return _verify_store(path)
-    if path.is_dir():
-        raise InputError(f"file = {str(path)!r}: is a folder; give a result written by `drivetrain run`")
     if not path.is_file():
-        raise InputError(f"file = {str(path)!r}: does not exist; give a result written by `drivetrain run`")
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise InputError(f"file = {str(path)!r}: {what}; give a result written by `drivetrain run`")
     damaged = checksums.damaged(path)
     if damaged:
         names = ", ".join("attributes of the file" if name == checksums.FILE else name for name in damaged)

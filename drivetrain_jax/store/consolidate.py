@@ -170,6 +170,5 @@ def open_result(path: Path) -> xr.Dataset:
 
 
 def _unreadable(path: Path) -> InputError:
-    return InputError(
-        f"file = {str(path)!r}: not a readable netCDF4/HDF5 file; give a result written by `drivetrain run`"
-    )
+    what = "is a folder" if path.is_dir() else "not a readable netCDF4/HDF5 file"
+    return InputError(f"file = {str(path)!r}: {what}; give a result written by `drivetrain run`")

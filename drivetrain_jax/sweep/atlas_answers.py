@@ -15,8 +15,9 @@ from typing import Any
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.atlas import design
+from drivetrain_jax.atlas.sensitivity import Sensitivity, direct_sensitivity
 from drivetrain_jax.atlas.windows import Crossing
-from drivetrain_jax.sweep.atlas_file import StoredAtlas
+from drivetrain_jax.sweep.atlas_file import StoredAtlas, as_given
 
 Range = tuple[float, float]
 # How closely a given parameter has to be what the atlas was made with.
@@ -39,9 +40,10 @@ class Reply:
 
 
 def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
-    """Results at one point, and the nearest changes of stability along every parameter.
+    """Results at one point, the gradient of its spectral radius, and the nearest changes of stability along every parameter.
 
-    Raises :class:`InputError` for names and values that the atlas does not cover.
+    The gradient is by direct solves and with respect to every parameter of the system. Raises :class:`InputError` for
+    names and values that the atlas does not cover.
     """
     asked = _Asked.of(atlas, given, ranges=())
     point = asked.values
@@ -49,8 +51,10 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
     results = {str(name): v.values[()] for name, v in found.data_vars.items()}
     variables = {v.name: v for v in (*atlas.scene.analysis.variables, OUTCOME)}
     rows = [f"  {name:<24} {_value(variables[name], value)}" for name, value in results.items()]
+    slopes = direct_sensitivity(atlas.scene.system, {**atlas.fixed, **point})
     nearest = design.nearest_boundaries(atlas.stability.atlas, atlas.scene.system, point)
-    lines = [f"{atlas.scene.system.name} atlas, {asked.heading()}", *rows, "nearest change of stability"]
+    lines = [f"{atlas.scene.system.name} atlas, {asked.heading()}", *rows, *_gradient_lines(atlas, slopes)]
+    lines.append("nearest change of stability")
     for each in nearest:
         sides = [_side(asked, each.parameter, each.value, c) for c in (each.below, each.above) if c]
         lines.append(f"  {each.parameter:<24} {'; '.join(sides) or _reach(atlas, each.parameter)}")
@@ -59,6 +63,7 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
         "system": atlas.scene.system.name,
         "parameters": {**atlas.fixed, **point},
         "values": results,
+        "gradient": slopes.gradient if slopes.exists else None,
         "nearest": {
             each.parameter: {
                 "below": _crossing(each.below),
@@ -150,9 +155,10 @@ class _Asked:
         own = {name: value for name, value in values.items() if name in atlas.parameters and name not in free}
         for name in values:
             if name not in atlas.parameters and name not in atlas.fixed:
-                raise InputError(f"{name}: not a parameter of the atlas; allowed is {', '.join(atlas.parameters)}")
+                physical = atlas.scene.system.physical
+                atlas.refuse(name, values[name], *atlas.fixed, *(physical.names if physical else ()))
             if name in free and shaft is None:
-                raise InputError(f"{name} = {values[name]!r}: is what is asked for; allowed is to leave it out")
+                raise InputError(f"{name} = {as_given(values[name])}: is what is asked for; allowed is to leave it out")
         for name in atlas.parameters:
             if name not in free:
                 _check_range(atlas, name, own.get(name), name in ranges)
@@ -179,10 +185,9 @@ class _Asked:
 def _nondimensional(atlas: StoredAtlas, given: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
     """The physical data among ``given``, if there are any, and all values as parameters of the system."""
     physical = atlas.scene.system.physical
-    data = [f.name for f in fields(physical)] if physical else []
-    known = (*data, *physical.operation) if physical else ()
-    if not any(name in known for name in given):
+    if physical is None or not any(name in physical.names for name in given):
         return None, dict(given)
+    data = [f.name for f in fields(physical)]
     missing = [name for name in data if name not in given]
     if missing:
         raise InputError(f"{missing[0]}: missing; physical units need all of {', '.join(data)}")
@@ -201,22 +206,25 @@ def _nondimensional(atlas: StoredAtlas, given: Mapping[str, Any]) -> tuple[Any, 
 
 def _check_same(name: str, value: Any, fixed: float) -> None:
     if isinstance(value, tuple) or not math.isclose(value, fixed, rel_tol=_SAME, abs_tol=_SAME):
-        raise InputError(f"{name} = {value!r}: the atlas is made for {name} = {fixed!r}; allowed is that value")
+        raise InputError(
+            f"{name} = {as_given(value)}: the atlas is made for {name} = {_number(fixed)}; allowed is that value"
+        )
 
 
 def _check_range(atlas: StoredAtlas, name: str, value: Any, wanted: bool) -> None:
     low, high = atlas.ranges[name]
-    allowed = f"allowed is {f'{name}=LOW:HIGH within ' if wanted else ''}{low:.10g} <= {name} <= {high:.10g}"
+    allowed = f"allowed is {f'{name}=LOW:HIGH within ' if wanted else ''}{atlas.allowed(name)}"
     if value is None:
         raise InputError(f"{name}: missing; {allowed}")
     if isinstance(value, tuple) != wanted:
-        raise InputError(f"{name} = {value!r}: {'a range is needed' if wanted else 'is a range'}; {allowed}")
+        needed = "a range is needed" if wanted else "is a range"
+        raise InputError(f"{name} = {as_given(value)}: {needed}; {allowed}")
     ends = value if wanted else (value,)
     for end in ends:
         if isinstance(end, bool) or not isinstance(end, (int, float)) or not low <= end <= high:
-            raise InputError(f"{name} = {end!r}: {allowed}")
+            raise InputError(f"{name} = {as_given(end)}: {allowed}")
     if wanted and not value[0] < value[1]:
-        raise InputError(f"{name} = {value[0]!r}:{value[1]!r}: allowed is a rising range")
+        raise InputError(f"{name} = {as_given(value)}: allowed is a rising range")
 
 
 def _answered(title: str, phrase: str, asked: _Asked, answer: design.Answer) -> Reply:
@@ -245,6 +253,19 @@ def _answered(title: str, phrase: str, asked: _Asked, answer: design.Answer) -> 
         "check": _check(answer.check),
     }
     return Reply("\n".join(lines), data)
+
+
+def _gradient_lines(atlas: StoredAtlas, slopes: Sensitivity) -> list[str]:
+    if not slopes.exists:
+        return ["gradient of spectral_radius", "  none: two multipliers have the largest modulus"]
+    units = {name: atlas.scene.system.parameter(name).units for name in slopes.gradient}
+    return [
+        "gradient of spectral_radius",
+        *(
+            f"  {name:<24} {value:.6g}{'' if units[name] == '1' else f' per {units[name]}'}"
+            for name, value in slopes.gradient.items()
+        ),
+    ]
 
 
 def _side(asked: _Asked, name: str, value: float, crossing: Crossing) -> str:

@@ -12,7 +12,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.atlas.boundaries import boundaries
 from drivetrain_jax.atlas.tips import Tips, find_tips
 from drivetrain_jax.atlas.windows import narrow
-from drivetrain_jax.sweep.atlas_file import StoredAtlas, open_atlas
+from drivetrain_jax.sweep.atlas_file import StoredAtlas, as_given, open_atlas
 from drivetrain_jax.systems import System
 
 # Values of a parameter beside the two of a chart.
@@ -50,17 +50,17 @@ def chart(source: xr.Dataset, part: Mapping[str, float | tuple[float, float]], c
 def _ranges(atlas: StoredAtlas, part: Mapping[str, Any]) -> dict[str, Any]:
     for name, value in part.items():
         if name not in atlas.parameters:
-            raise InputError(f"{name}: not a parameter of the atlas; allowed is {', '.join(atlas.parameters)}")
+            atlas.refuse(name, value)
         low, high = atlas.ranges[name]
         rising = not isinstance(value, tuple) or value[0] < value[1]
         if not rising or not all(low <= end <= high for end in np.atleast_1d(value)):
-            raise InputError(f"{name} = {value!r}: allowed is a number or LOW:HIGH within {low:.10g} to {high:.10g}")
+            raise InputError(f"{name} = {as_given(value)}: allowed is a number or LOW:HIGH, {atlas.allowed(name)}")
     return {name: part.get(name, atlas.ranges[name]) for name in atlas.parameters}
 
 
 def _shown(system: System, names: list[str]) -> list[str]:
-    """The two parameters of the chart first, the axis of the resonances among them."""
-    axis = system.resonances.axis if system.resonances else None
+    """The two parameters of the chart first, the axis of the resonances among them, or the speed if there are none."""
+    axis = system.resonances.axis if system.resonances else system.roles.get("speed")
     return sorted(names, key=lambda name: name != axis)
 
 

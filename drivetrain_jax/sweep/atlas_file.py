@@ -7,12 +7,13 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._wording import did_you_mean, shown
 from drivetrain_jax.analysis import Request, get_analysis
 from drivetrain_jax.analysis.atlas import ANALYSIS
 from drivetrain_jax.atlas import StabilityAtlas, from_arrays, stability_atlas, to_arrays
@@ -126,6 +127,18 @@ class StoredAtlas:
         """The other parameters."""
         return self.stability.atlas.fixed
 
+    def allowed(self, name: str) -> str:
+        """The range of a parameter as messages write it: ``0 <= beta <= 1.5, in rad``."""
+        low, high = self.ranges[name]
+        units = self.scene.system.parameter(name).units
+        return f"{low:.10g} <= {name} <= {high:.10g}" + ("" if units == "1" else f", in {units}")
+
+    def refuse(self, name: str, value: Any, *others: str) -> NoReturn:
+        """Raise :class:`InputError` for a name that is neither a parameter nor one of ``others``."""
+        guess = did_you_mean(name, (*self.parameters, *others))
+        allowed = "; ".join(map(self.allowed, self.parameters))
+        raise InputError(f"{name} = {as_given(value)}: not a parameter of the atlas{guess}; allowed is {allowed}")
+
     def __repr__(self) -> str:
         ranges = ", ".join(f"{name} {a:g} to {b:g}" for name, (a, b) in self.ranges.items())
         atlas = self.stability.atlas
@@ -177,11 +190,10 @@ class StoredAtlas:
     def _names(self, values: Mapping[str, Any]) -> tuple[str, ...]:
         for name in values:
             if name not in self.parameters:
-                raise InputError(f"{name}: not a parameter of the atlas; allowed is {', '.join(self.parameters)}")
+                self.refuse(name, values[name])
         for name in self.parameters:
             if name not in values:
-                low, high = self.ranges[name]
-                raise InputError(f"{name}: missing; allowed is {low:g} <= {name} <= {high:g}")
+                raise InputError(f"{name}: missing; allowed is {self.allowed(name)}")
         return self.parameters
 
     def _checked(self, name: str, values: Mapping[str, Any]) -> Any:
@@ -192,7 +204,7 @@ class StoredAtlas:
             raise InputError(f"{name} = {values[name]!r}: allowed are numbers") from None
         outside = numbers[~((numbers >= low) & (numbers <= high))]
         if outside.size:
-            raise InputError(f"{name} = {outside.flat[0]:.10g}: allowed is {low:.10g} <= {name} <= {high:.10g}")
+            raise InputError(f"{name} = {outside.flat[0]:.10g}: allowed is {self.allowed(name)}")
         return values[name]
 
     def _evaluate(self, stability: StabilityAtlas, axes: Mapping[str, np.ndarray], zipped: bool) -> xr.Dataset:
@@ -216,6 +228,12 @@ class StoredAtlas:
             fixed=fixed,
             dimensions=floquet.dimensions(system, request, fixed),
         )
+
+
+def as_given(value: Any) -> str:
+    """A number or a range as it is given: ``1.3:1.5``."""
+    ends = value if isinstance(value, tuple) else (value,)
+    return ":".join(f"{end:.10g}" if isinstance(end, (int, float)) else shown(end) for end in ends)
 
 
 def _labelled(values: Any) -> xr.DataArray:

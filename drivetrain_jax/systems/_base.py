@@ -123,8 +123,8 @@ class System:
 
     ``time_units`` is the unit of the time of its equations, ``1`` if that is nondimensional. ``physical`` converts data in
     physical units to nondimensional parameters and back (pattern: ``cardan_units.PhysicalShaft``), None if the parameters
-    have physical units themselves. ``roles`` names the parameters that design questions are about: ``speed``, ``angle``
-    and ``damping``, as far as it has them.
+    have physical units themselves. ``roles`` names its ``speed`` (or frequency of excitation), which figures draw
+    horizontally, and the ``angle`` and ``damping`` that design questions are about, as far as it has them.
     """
 
     name: str
@@ -132,7 +132,7 @@ class System:
     source: str
     parameters: tuple[Parameter, ...]
     models: Mapping[str, Model]
-    presets: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     resonances: Resonances | None = None
     time_units: str = "1"
     physical: type | None = None

@@ -111,14 +111,12 @@ def _clock_basis(psi: Any) -> tuple[Array, Array]:
     return jnp.cos(2 * psi), jnp.sin(2 * psi)
 
 
-def _reduced_rows(cos2psi: Any, sin2psi: Any, values: Values) -> Rows:
-    """``d(q, P)/dpsi = H (q, P)`` in absolute coordinates, P = Omega (q' + C0 q/2), and in the clock psi, eqs (9)-(12).
+def _clock(cos2psi: Any, sin2psi: Any, beta: Any) -> tuple[Any, Any, Any]:
+    """``eta``, ``dtau/dpsi`` and ``deta/dpsi`` in the clock psi, eqs (11)-(12).
 
     Two Landen steps lead from tau to psi: tan(chi) = sqrt(cos beta) tan(tau) spreads the poles of eta near pi/2 over
     0 and pi/2, tan(2 chi) = kappa tan(2 psi), kappa^2 = 1 - r^2, r = tan(beta/2)^2, moves these away from the axis.
     """
-    beta, zeta, alpha, mu = (values[name] for name in ("beta", "zeta", "alpha", "mu"))
-    s, g = 1 / values["Omega"], 1 / jnp.sqrt(values["gamma"])
     c, r = jnp.cos(beta), jnp.tan(beta / 2) ** 2
     # 1 - r = 2 c/(1 + c), and 1 -+ r cos(2 chi) below are sums of positive terms: no cancellation next to pi/2.
     one_minus_r = 2 * c / (1 + c)
@@ -135,8 +133,14 @@ def _reduced_rows(cos2psi: Any, sin2psi: Any, values: Values) -> Rows:
     inverse_plus = minus * root * inverse
     eta = minus * inverse_plus
     w = 2 * jnp.sqrt(c * kappa2) / (1 + c) * plus * inverse
-    deta = 4 * r * kappa2 * sin2psi * inverse_plus * minus * inverse
+    return eta, w, 4 * r * kappa2 * sin2psi * inverse_plus * minus * inverse
 
+
+def _reduced_rows(cos2psi: Any, sin2psi: Any, values: Values) -> Rows:
+    """``d(q, P)/dpsi = H (q, P)`` in absolute coordinates, P = Omega (q' + C0 q/2), and in the clock psi, eqs (9)-(10)."""
+    zeta, alpha, mu = (values[name] for name in ("zeta", "alpha", "mu"))
+    s, g = 1 / values["Omega"], 1 / jnp.sqrt(values["gamma"])
+    eta, w, deta = _clock(cos2psi, sin2psi, values["beta"])
     w11, w12, w22 = 1 + alpha * eta**2, -alpha * g * eta, alpha * g**2
     v11, v12, v22 = 1 + mu * eta**2, -mu * g * eta, mu * g**2
     sw = s * w

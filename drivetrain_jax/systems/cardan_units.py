@@ -40,8 +40,9 @@ class PhysicalShaft:
     k2: float
     c1: float
     c2: float
-    # How the shaft is run, given beside what it is.
+    # How the shaft is run, given beside what it is; and the names of all data.
     operation: ClassVar[tuple[str, ...]] = ("speed", "angle")
+    names: ClassVar[tuple[str, ...]] = tuple(p.name for p in PHYSICAL)
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -99,22 +100,6 @@ class PhysicalShaft:
         if parameter == "beta":
             return "angle", self.angle(value), "deg"
         return ("c1", self.damping(value), "N m s/rad") if parameter == "zeta" else None
-
-    def table(self, speed: float | None = None, angle: float | None = None) -> str:
-        """What was given and what it becomes, line by line with units."""
-        given = {field.name: getattr(self, field.name) for field in fields(self)}
-        given |= {name: value for name, value in (("speed", speed), ("angle", angle)) if value is not None}
-        formulas = {"zeta": "c1/(2 sqrt(k1 J1))", "alpha": "c2/c1", "mu": "k2/k1", "gamma": "J2/J1"}
-        results: dict[str, float] = dict(self.parameters)
-        if speed is not None:
-            results["Omega"] = self.omega(speed)
-            formulas["Omega"] = "speed (2 pi/60)/sqrt(k1/J1)"
-        if angle is not None:
-            results["beta"] = self.beta(angle)
-            formulas["beta"] = "angle pi/180, rad"
-        lines = [f"{p.name:>5} = {given[p.name]:.10g} {p.units}" for p in PHYSICAL if p.name in given]
-        lines += [f"{name:>5} = {value:.10g}  ({formulas[name]})" for name, value in results.items()]
-        return "\n".join(lines)
 
 
 def _check(name: str, value: float) -> float:

@@ -86,4 +86,5 @@ SYSTEM = System(
         rattle_threshold,
         "amplitude at which the orbit without separation ends",
     ),
+    roles={"speed": "omega"},
 )

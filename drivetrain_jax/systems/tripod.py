@@ -288,4 +288,5 @@ SYSTEM = System(
         "poincare": _motion(flow_model),
     },
     time_units="s",
+    roles={"speed": "excitation_frequency", "angle": "beta", "damping": "zeta"},
 )

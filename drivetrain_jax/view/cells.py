@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -38,10 +40,23 @@ def require(dataset: xr.Dataset, *names: str) -> None:
         raise InputError(f"outputs = {stored}: {' and '.join(missing)} missing; the figure needs {' and '.join(names)}")
 
 
+def require_any(dataset: xr.Dataset, *names: str) -> list[str]:
+    """Those of ``names`` that are stored; raises :class:`InputError` if none is."""
+    if not (found := [name for name in names if name in dataset]):
+        stored = ", ".join(str(name) for name in dataset.data_vars)
+        raise InputError(f"outputs = {stored}: nothing to plot; the figure needs {' or '.join(names)}")
+    return found
+
+
 def horizontal_axis(dataset: xr.Dataset, names: list[str]) -> str:
-    """The axis for which resonances are predicted, else the speed, else the last one."""
-    predicted = [name for name in names if f"resonance_{name}" in dataset.coords]
-    return next(iter([*predicted, *(name for name in names if name == "Omega"), names[-1]]))
+    """That of ``names`` for which resonances are predicted, else the speed, else the last one."""
+    return next((name for name in names if f"resonance_{name}" in dataset.coords), speed_axis(dataset, names))
+
+
+def speed_axis(dataset: xr.Dataset, names: list[str]) -> str:
+    """That of ``names`` which the system calls its speed (attribute ``roles``), else the last one."""
+    speed = json.loads(dataset.attrs.get("roles", "{}")).get("speed")
+    return speed if speed in names else names[-1]
 
 
 def is_logarithmic(values: np.ndarray) -> bool:

@@ -149,9 +149,7 @@ def _maps(dataset: xr.Dataset, names: list[str], shown: str) -> Figure:
         norm = LogNorm(low, high) if high > 3 * low else Normalize(low, high)
         cmap = matplotlib.colormaps["viridis"].with_extremes(bad=STATE_COLOURS[cells.FAILED])
         field = field.where(field.isnull() | (field > low), low)
-        mesh = cells.draw_cells(
-            axes, field.where(field.isnull() | (field > low), low), horizontal, vertical, cmap=cmap, norm=norm
-        )
+        mesh = cells.draw_cells(axes, field, horizontal, vertical, cmap=cmap, norm=norm)
         number = dataset["mode"].values[mode]
         bar_format = ticker.StrMethodFormatter("{x:g}")
         panels.colorbar(

@@ -115,7 +115,6 @@ def _verdict_strip(axes: Axes, dataset: xr.Dataset, name: str) -> list[Artist]:
 def _maps(dataset: xr.Dataset, names: list[str], split: str | None) -> Figure:
     rest = [name for name in names if name != split]
     horizontal = cells.horizontal_axis(dataset, rest)
-    horizontal = "excitation_frequency" if "excitation_frequency" in rest else horizontal
     vertical = next(name for name in rest if name != horizontal)
     rows = [key for key in ("lyapunov_spectrum", "verdict") if key in dataset]
     parts = [dataset] if split is None else [dataset.isel({split: k}) for k in range(dataset.sizes[split])]

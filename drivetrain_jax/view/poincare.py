@@ -30,8 +30,7 @@ def plot(dataset: xr.Dataset) -> Figure:
     """
     with matplotlib.rc_context(_STYLE):
         dataset = cells.prepare(dataset)
-        if "section" not in dataset:
-            raise InputError("outputs: section missing; the figure shows its points")
+        cells.require_any(dataset, "section")
         names = cells.sweep_axes(dataset)
         if len(names) > 1 or (names and dataset.sizes[names[0]] > _MOST_ROWS):
             raise InputError(f"axes = {', '.join(names)}: allowed is one axis of up to {_MOST_ROWS} values")

@@ -10,12 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.layout import Margins, Panels
 from drivetrain_jax.view.style import FRAME_GREY, PREDICTION, STATE_COLOURS, axis_label, variable_label
 
-HORIZONTAL = "omega"
 # Lightness falls with the number of flanks; what does not repeat stands out in hue.
 REGIME_COLOURS = ("#ffffff", "#b9cde5", "#4a6fa5", "#d1771e", STATE_COLOURS[cells.FAILED])
 _FAILED = len(REGIME_COLOURS) - 1
@@ -28,11 +26,8 @@ def plot(dataset: xr.Dataset, names: list[str]) -> Figure:
     Where results carry a prediction for the other axis (the end of the motion without separation) it is drawn over
     them. Raises :class:`InputError` if neither is stored.
     """
-    shown = [name for name in ("u_max", "regime") if name in dataset]
-    if not shown:
-        stored = ", ".join(str(name) for name in dataset.data_vars)
-        raise InputError(f"outputs = {stored}: nothing to plot; the figure needs one of u_max, regime")
-    horizontal = HORIZONTAL if HORIZONTAL in names else names[-1]
+    shown = cells.require_any(dataset, "u_max", "regime")
+    horizontal = cells.speed_axis(dataset, names)
     vertical = next(name for name in names if name != horizontal)
     panels = Panels(len(shown), 2, height=_HEIGHT, margins=Margins(right=0.95, top=0.8))
     handles: list[Patch | Line2D] = []

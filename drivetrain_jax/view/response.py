@@ -31,11 +31,7 @@ def plot(dataset: xr.Dataset) -> Figure:
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
-        shown = [name for name in (*_AMPLITUDES, *_SCALARS) if name in dataset]
-        if not shown:
-            stored = ", ".join(str(name) for name in dataset.data_vars)
-            wanted = ", ".join((*_AMPLITUDES, *_SCALARS))
-            raise InputError(f"outputs = {stored}: nothing to plot; the figure needs one of {wanted}")
+        shown = cells.require_any(dataset, *_AMPLITUDES, *_SCALARS)
         names = cells.sweep_axes(dataset)
         if len(names) == 1 and names != ["point"]:
             return _curves(dataset, names[0])

@@ -59,8 +59,7 @@ def plot(dataset: xr.Dataset) -> Figure:
 def _chart(dataset: xr.Dataset, names: list[str]) -> Figure:
     horizontal = cells.horizontal_axis(dataset, names)
     vertical = next(name for name in names if name != horizontal)
-    _require(dataset, ["verdict", "spectral_radius"])
-    shown = [name for name in ("verdict", "spectral_radius") if name in dataset]
+    shown = cells.require_any(dataset, "verdict", "spectral_radius")
     panels = Panels(len(shown), height=_PANEL, margins=Margins(right=1.15))
     handles: list[Artist] = []
     for (axes,), name in zip(panels.axes, shown, strict=True):
@@ -83,7 +82,7 @@ def _chart(dataset: xr.Dataset, names: list[str]) -> Figure:
 
 
 def _curve(dataset: xr.Dataset, name: str, marker: str = "") -> Figure:
-    _require(dataset, ["spectral_radius"])
+    cells.require_any(dataset, "spectral_radius")
     panels = Panels(height=3.0, margins=Margins(right=0.3))
     axes = panels.axes[0][0]
     x, radius = dataset[name].values, dataset["spectral_radius"]
@@ -128,7 +127,7 @@ def _draw_strip(axes: Axes, dataset: xr.Dataset, name: str) -> None:
 
 
 def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
-    _require(dataset, ["verdict"])
+    cells.require_any(dataset, "verdict")
     # Axes of few values run across, if that leaves two.
     long = [name for name in names if dataset.sizes[name] > _FEW]
     horizontal = cells.horizontal_axis(dataset, long if len(long) > 1 else names)
@@ -207,8 +206,8 @@ def _points(dataset: xr.Dataset) -> Figure:
         raise InputError("points: all points are the same, there is nothing to plot; give points that differ")
     if len(varying) == 1:
         return _curve(dataset.swap_dims(point=varying[0]).sortby(varying[0]), varying[0], marker="o")
-    _require(dataset, ["verdict"])
-    horizontal = cells.horizontal_axis(dataset, [name for name in varying if name == "Omega"] or varying[1:2])
+    cells.require_any(dataset, "verdict")
+    horizontal = cells.speed_axis(dataset, varying)
     vertical = next(name for name in varying if name != horizontal)
     panels = Panels(height=3.4, margins=Margins(right=0.3))
     axes = panels.axes[0][0]
@@ -227,7 +226,7 @@ def _points(dataset: xr.Dataset) -> Figure:
 
 
 def _multipliers(dataset: xr.Dataset) -> Figure:
-    _require(dataset, ["floquet_multiplier"])
+    cells.require_any(dataset, "floquet_multiplier")
     panels = Panels(height=4.0, margins=Margins(left=1.5, right=1.5))
     axes = panels.axes[0][0]
     angle = np.linspace(0, 2 * np.pi, 361)
@@ -239,10 +238,3 @@ def _multipliers(dataset: xr.Dataset) -> Figure:
     panels.titles(dataset)
     panels.legend([*dots, *circle])
     return panels.figure
-
-
-def _require(dataset: xr.Dataset, wanted: list[str]) -> None:
-    """Raise :class:`InputError` unless at least one of the variables ``wanted`` is stored."""
-    if not any(name in dataset for name in wanted):
-        stored = ", ".join(str(name) for name in dataset.data_vars)
-        raise InputError(f"outputs = {stored}: nothing to plot; the figure needs {' or '.join(wanted)}")

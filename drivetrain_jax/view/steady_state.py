@@ -81,11 +81,9 @@ def _regime_legend(codes: xr.DataArray) -> list[Artist]:
 
 
 def _maps(dataset: xr.Dataset, names: list[str]) -> Figure:
-    horizontal = next((name for name in names if name == "omega"), names[-1])
+    horizontal = cells.speed_axis(dataset, names)
     vertical = next(name for name in names if name != horizontal)
-    shown = [name for name in ("regime", "u_max") if name in dataset]
-    if not shown:
-        cells.require(dataset, "regime")
+    shown = cells.require_any(dataset, "regime", "u_max")
     panels = Panels(len(shown), height=_HEIGHT, margins=Margins(right=1.15))
     handles: list[Artist] = []
     for (axes,), name in zip(panels.axes, shown, strict=True):
@@ -121,10 +119,8 @@ def _threshold(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) 
 
 
 def _curves(dataset: xr.Dataset, name: str) -> Figure:
-    extremes = [key for key in ("u_max", "u_min") if key in dataset]
+    extremes = cells.require_any(dataset, "u_max", "u_min")
     scalars = [key for key in ("period_multiple", "spectral_radius", "lyapunov_exponent") if key in dataset]
-    if not extremes:
-        cells.require(dataset, "u_max")
     panels = Panels(1 + len(scalars), height=1.75, margins=Margins(right=0.3, left=1.0), share_y=False)
     stack = [row[0] for row in panels.axes]
     handles: list[Artist] = []

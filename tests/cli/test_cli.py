@@ -14,6 +14,8 @@ import xarray as xr
 
 from drivetrain_jax import InputError, __version__
 from drivetrain_jax.cli import main
+from drivetrain_jax.cli.progress import progress_line
+from drivetrain_jax.sweep.work import Progress
 
 SCENE = """
 system = "toy"
@@ -70,6 +72,14 @@ def test_progress_then_the_last_line(cli):
     code, out, err = cli("run", "scene.toml", "--out", "r.nc")
     assert code == 0 and out == "" and err[-1] == "points: total=21 computed=21 reused=0 failed=2"
     assert any("21/21 points" in line and "/s" in line for line in err[:-1])
+
+
+def test_no_bar_beside_the_line_of_wrong_input(capsys):
+    """A scheduler that does not answer is found out after the first report."""
+    with pytest.raises(InputError), progress_line() as report:
+        report(Progress(total=21))
+        raise InputError("dask = 'tcp://nowhere:1': no scheduler answers there")
+    assert capsys.readouterr().err == ""
 
 
 def test_set_replaces_entries(cli):
@@ -219,7 +229,9 @@ def test_wrong_run_is_one_line_and_writes_nothing(cli, folder, case):
             "beta: missing; allowed is -1.570796327 < beta < 1.570796327, in rad (missing too",
         ),
         (("point", "cardan", "floqet"), "analysis = 'floqet': unknown (did you mean floquet?)"),
-        (("point", "toy"), "required: ANALYSIS;"),
+        (("point", "toy"), "drivetrain: ANALYSIS: missing; see drivetrain point --help"),
+        (("run",), "SCENE.toml: missing (missing too: --out); see drivetrain run --help"),
+        (("run", "scene.toml", "--out", "r.nc", "--workers", "two"), "--workers = 'two': allowed is an integer;"),
         (("verify", "."), "is a folder"),
         (("design", "widest-angle", "r.nc", "--margin", "0.1"), "--margin = 0.1: not used by widest-angle"),
         (("run", "scene.toml"), "--out"),
@@ -231,6 +243,8 @@ def test_wrong_run_is_one_line_and_writes_nothing(cli, folder, case):
         (("plot", "nothing.nc", "--out", "f.png"), "does not exist"),
         (("plot", "scene.toml", "--out", "f.png"), "not a readable"),
         (("plot", "scene.toml", "--out", "nowhere/f.png"), "folder"),
+        (("plot", "scene.toml", "--out", "f.xyz"), "allowed is a name that ends in ."),
+        (("plot", ".", "--out", "f.png"), "'.': is a folder; give a result"),
     ],
 )
 def test_wrong_command_is_one_line(cli, folder, arguments, part):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -55,5 +56,6 @@ def test_the_page_is_true(tmp_path):
     # The tip at beta = 0.1412, between two rows; and nothing unstable far from the predicted speeds.
     assert chart["beta"].values[at_one.values.argmax()] == pytest.approx(0.16)
     assert not unstable.sel(Omega=slice(1.75, 2.0)).any() and 0.1 < float(unstable.mean()) < 0.3
+    assert json.loads(chart.attrs["roles"])["speed"] == "Omega"
     assert chart["resonance_Omega"].values.tolist() == pytest.approx([1.0, 1 / 2, 1 / 3])
     assert (project / "chart.png").stat().st_size > 20_000

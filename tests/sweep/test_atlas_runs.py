@@ -188,9 +188,17 @@ def test_a_file_of_other_coordinates_is_refused(stored):
     [
         ({"beta": 0.3}, "Omega: missing; allowed is 1 <= Omega <= 2"),
         ({"beta": 0.3, "Omega": 2.5}, "Omega = 2.5: allowed is 1 <= Omega <= 2"),
-        ({"beta": [0.3, np.nan], "Omega": 1.5}, "beta = nan: allowed is 0 <= beta <= 0.6"),
+        ({"beta": [0.3, np.nan], "Omega": 1.5}, "beta = nan: allowed is 0 <= beta <= 0.6, in rad"),
         ({"beta": "wide", "Omega": 1.5}, "beta = 'wide': allowed are numbers"),
-        ({"beta": 0.3, "Omega": 1.5, "mu": 1.0}, "mu: not a parameter of the atlas; allowed is beta, Omega"),
+        (
+            {"beta": 0.3, "Omga": 1.5},
+            "Omga = 1.5: not a parameter of the atlas (did you mean Omega?); "
+            "allowed is 0 <= beta <= 0.6, in rad; 1 <= Omega <= 2",
+        ),
+        (
+            {"beta": 0.3, "Omega": 1.5, "mu": 1.0},
+            "mu = 1: not a parameter of the atlas; allowed is 0 <= beta <= 0.6, in rad; 1 <= Omega <= 2",
+        ),
     ],
 )
 def test_questions_outside_the_atlas(atlas, given, message):
@@ -206,6 +214,9 @@ def test_nearest_boundaries_of_a_point(atlas):
     omega = data["nearest"]["Omega"]["above"]["value"]
     radius = [dt.point("cardan", "floquet", beta=0.31, Omega=omega + d, **BASE).spectral_radius for d in (-1e-7, 1e-7)]
     assert radius[0] < 1 < radius[1]
+    steps = [dt.point("cardan", "floquet", beta=0.31, Omega=1.2 + d, **BASE).spectral_radius for d in (-1e-4, 1e-4)]
+    assert data["gradient"]["Omega"] == pytest.approx((steps[1] - steps[0]) / 2e-4, rel=1e-6)
+    assert set(data["gradient"]) == {"beta", "Omega", *BASE} and "per rad" in str(reply)
     assert f"Omega = {omega:.10g}" in str(reply) and "verdict                  stable (0)" in str(reply)
 
 
@@ -220,7 +231,7 @@ def test_the_same_point_in_physical_units(atlas):
     assert "rpm" in str(reply) and "rpm" not in str(plain)
     with pytest.raises(dt.InputError, match=r"^J2: missing; physical units need all of J1, J2, k1, k2, c1, c2$"):
         atlas_answers.query(atlas, {"J1": 1.0, "speed": 100.0})
-    with pytest.raises(dt.InputError, match=r"^mu = 2\.0: the atlas is made for mu = 1\.0; allowed is that value$"):
+    with pytest.raises(dt.InputError, match=r"^mu = 2: the atlas is made for mu = 1; allowed is that value$"):
         atlas_answers.query(atlas, {**shaft, "k2": 2000.0, "speed": rpm, "angle": 10.0})
 
 
@@ -264,7 +275,7 @@ def test_a_chart_of_a_stored_atlas(stored):
     beta, omega = on_curve.values, found["boundary_Omega"].dropna("boundary").values
     radius = dt.open_atlas(stored)(beta=beta, Omega=omega)["spectral_radius"]
     assert len(beta) > 20 and float(np.abs(radius - 1).max()) < 1e-9
-    with pytest.raises(dt.InputError, match=r"^Omega = \(1\.5, 3\.0\): allowed is a number or LOW:HIGH within 1 to 2$"):
+    with pytest.raises(dt.InputError, match=r"^Omega = 1\.5:3: allowed is a number or LOW:HIGH, 1 <= Omega <= 2$"):
         chart(stored, {"Omega": (1.5, 3.0)}, 60)
 
 
@@ -325,6 +336,8 @@ def test_questions_on_the_command_line(file, capsys):
     assert code == 0 and "stable up to beta = 0.10633312" in out and "direct solves agree" in out
     code, out, err = answer(capsys, "query", file, "beta=0.31", "Omega=wide")
     assert (code, out, err) == (2, "", "drivetrain: Omega = 'wide': allowed is a number or LOW:HIGH\n")
+    code, _, err = answer(capsys, "query", file, "beta=0.31", "spede=1.2")
+    assert code == 2 and err.startswith("drivetrain: spede = 1.2: not a parameter of the atlas (did you mean speed?)")
     code, _, err = answer(capsys, "design", "narrowest-angle", file)
     assert code == 2 and "least-damping" in err and err.count("\n") == 1
 
@@ -336,7 +349,7 @@ def test_a_zoom_on_the_command_line(file, capsys):
     )
     assert (code, err) == (0, "") and figure.stat().st_size > 20_000
     code, _, err = answer(capsys, "plot", file, "--out", figure, "--part", "Omega=3")
-    assert code == 2 and err == "drivetrain: Omega = 3.0: allowed is a number or LOW:HIGH within 1 to 2\n"
+    assert code == 2 and err == "drivetrain: Omega = 3: allowed is a number or LOW:HIGH, 1 <= Omega <= 2\n"
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import xarray as xr
 LONG_NAMES = {"beta": "joint angle", "Omega": "speed", "mu": "stiffness ratio", "alpha": "damping ratio"}
 UNITS = {"beta": "rad"}
 FIXED = {"zeta": 0.001, "gamma": 100.0}
+ROLES = json.dumps({"speed": "Omega"})
 
 
 def unstable(beta: float | np.ndarray, omega: float | np.ndarray) -> np.ndarray:
@@ -28,7 +29,7 @@ def grid(values: np.ndarray, *names: str) -> xr.Dataset:
         "verdict": (names, verdict, {"units": "1", "long_name": "verdict"}),
         "outcome": (names, np.where(code == 3, 2, 0).astype("int8"), {"units": "1", "long_name": "outcome"}),
     }
-    attrs = {"analysis": "floquet", "title": "A tongue", "fixed_parameters": json.dumps(FIXED)}
+    attrs = {"analysis": "floquet", "title": "A tongue", "fixed_parameters": json.dumps(FIXED), "roles": ROLES}
     return xr.Dataset(data, attrs=attrs)
 
 
@@ -71,6 +72,6 @@ def forced(**axes: np.ndarray) -> xr.Dataset:
         ),
         "outcome": (names, np.zeros(shape, "int8"), {"units": "1", "long_name": "outcome"}),
     }
-    attrs = {"analysis": "forced", "title": "Response", "fixed_parameters": json.dumps(FIXED)}
+    attrs = {"analysis": "forced", "title": "Response", "fixed_parameters": json.dumps(FIXED), "roles": ROLES}
     dataset = with_axes(xr.Dataset(data, attrs=attrs), **axes).assign_coords(shaft=("shaft", ["driving", "driven"]))
     return with_resonances(dataset, H21=0.7, S21=1.0)

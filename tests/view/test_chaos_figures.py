@@ -97,5 +97,5 @@ def test_a_point_is_large_enough_to_be_seen():
 
 
 def test_a_section_must_be_stored():
-    with pytest.raises(InputError, match="section missing"):
+    with pytest.raises(InputError, match="needs section"):
         plot(section(10, 1.0).drop_vars("section"))

@@ -48,7 +48,7 @@ def test_two_axes_give_one_map_a_shaft_and_mark_failures():
 def test_nothing_to_plot_is_an_input_error():
     with pytest.raises(InputError, match="axes = none: allowed are one or two axes"):
         plot(results.forced(Omega=OMEGA[:1]))
-    with pytest.raises(InputError, match="outputs = outcome: nothing to plot; the figure needs one of amplitude"):
+    with pytest.raises(InputError, match="outputs = outcome: nothing to plot; the figure needs amplitude or"):
         plot(results.forced(Omega=OMEGA)[["outcome"]])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 
@@ -54,6 +55,17 @@ def test_speed_is_horizontal_whatever_the_order_of_the_axes():
     np.testing.assert_array_equal(meshes(straight)[0].get_array(), meshes(swapped)[0].get_array())
     assert "speed ($\\Omega$) [1]" in texts(swapped)
     assert "joint angle ($\\beta$) [rad]" in texts(swapped)
+
+
+@pytest.mark.parametrize("order", [("beta", "nu"), ("nu", "beta")])
+def test_the_system_says_which_parameter_is_its_speed(order):
+    plain = results.chart().drop_vars(("resonance", "resonance_Omega"))
+    renamed = plain.rename(Omega="nu").assign_attrs(roles=json.dumps({"speed": "nu"}))
+    drawn = meshes(plot(renamed.transpose(*order, ...)))[0].get_array()
+    np.testing.assert_array_equal(drawn, meshes(plot(plain))[0].get_array())
+    points = renamed.stack(point=order).reset_index("point")
+    offsets = panels(plot(points))[0].collections[0].get_offsets()
+    assert offsets[:, 0].max() == 1.5 and offsets[:, 1].max() == 1.0
 
 
 def test_growth_map_shows_the_logarithm_and_masks_failed_cells():

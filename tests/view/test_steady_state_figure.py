@@ -8,6 +8,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import plot
 
 FIXED = json.dumps({"b": {"value": 0.17, "units": "m", "long_name": "half the backlash"}})
+ROLES = json.dumps({"speed": "omega"})
 
 
 def result(axes, **variables):
@@ -18,7 +19,7 @@ def result(axes, **variables):
     coords = {
         name: (name, np.asarray(values, float), {"units": "1", "long_name": name}) for name, values in axes.items()
     }
-    attrs = {"analysis": "steady_state", "title": "a title", "fixed_parameters": FIXED}
+    attrs = {"analysis": "steady_state", "title": "a title", "fixed_parameters": FIXED, "roles": ROLES}
     return xr.Dataset(data, coords, attrs)
 
 

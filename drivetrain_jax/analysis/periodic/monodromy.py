@@ -43,14 +43,8 @@ def state_transition(
     import diffrax
 
     identity = jnp.eye(state.shape[0])
-
-    def variational(t: Any, y: Any, _: Any) -> Any:
-        x, columns = y if along else (state, y)
-        rate = jax.vmap(lambda v: jax.jvp(lambda z: field(t, z), (x,), (v,))[1], in_axes=1, out_axes=1)(columns)
-        return (field(t, x), rate) if along else rate
-
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(variational),
+        diffrax.ODETerm(_variational(field, None if along else state)),
         solver or diffrax.Dopri8(),
         t0=0.0,
         t1=span,
@@ -65,3 +59,14 @@ def state_transition(
     end, matrix = final if along else (state, final)
     success = solution.result == diffrax.RESULTS.successful
     return jnp.where(success, end, jnp.nan), jnp.where(success, matrix, jnp.nan), success
+
+
+def _variational(field: Field, rest: Array | None) -> Callable[[Any, Any, Any], Any]:
+    """The rate of a state and of the columns beside it, or of the columns alone about the fixed point ``rest``."""
+
+    def rate(t: Any, y: Any, _: Any) -> Any:
+        x, columns = y if rest is None else (rest, y)
+        slopes = jax.vmap(lambda v: jax.jvp(lambda z: field(t, z), (x,), (v,))[1], in_axes=1, out_axes=1)(columns)
+        return (field(t, x), slopes) if rest is None else slopes
+
+    return rate
