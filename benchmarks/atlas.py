@@ -53,7 +53,7 @@ from benchmarks.timing import (
 )
 
 CELLS = (30_000, 1_000_000, 4_000_000, 20_000_000)
-RTOL = 1e-9
+RTOL = 3e-8
 OUTPUTS = ("spectral_radius", "spectral_radius_error", "verdict")
 SCENE_4D = Path(__file__).parents[1] / "sweeps" / "cardan_atlas_4d.toml"
 _HEYOKA_SAMPLE, _SCIPY_SAMPLE = 20_000, 200

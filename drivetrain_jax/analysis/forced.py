@@ -201,7 +201,7 @@ def predicted_steps(build: Build, columns: Mapping[str, np.ndarray]) -> np.ndarr
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     build = system.models["forced"].build
-    return (Solver("diffrax", partial(_solve, build, request), partial(predicted_steps, build), chunk=128),)
+    return (Solver("diffrax", partial(_solve, build, request), partial(predicted_steps, build), chunk=128, march=True),)
 
 
 ANALYSIS = Analysis(

@@ -172,7 +172,7 @@ def _effort(system: System, request: Request, columns: Mapping[str, np.ndarray])
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     name = f"diffrax: {request.options['solver']}"
-    return (Solver(name, partial(_solve, system, request), partial(_effort, system, request), chunk=16),)
+    return (Solver(name, partial(_solve, system, request), partial(_effort, system, request), chunk=16, march=True),)
 
 
 def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:

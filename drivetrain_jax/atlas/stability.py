@@ -235,7 +235,7 @@ def _point_kernel(
         found |= _sharper(phi, build(everything), errors, found)
         return {name: found[name] for name in (*outputs, "outcome")}
 
-    return jax.jit(kernel, compiler_options=compiler_options())
+    return jax.jit(kernel, compiler_options=compiler_options(march=True))
 
 
 def _sharper(phi: Array, model: FloquetModel, errors: Array, found: dict[str, Array]) -> dict[str, Array]:

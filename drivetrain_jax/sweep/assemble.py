@@ -60,8 +60,9 @@ class Table:
         self.release_after(results)
 
     def block(self, place: tuple[slice, ...], like: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """The arrays of a block of the grid, or of a row of the points, to be filled in. ``like`` are results of a point."""
-        self._lay_out_for(like)
+        """The arrays of a block of the grid, or of a row of the points: all that is in them is to be overwritten. ``like``
+        are results of a point."""
+        self._lay_out_for(like, blank=False)
         return {name: values[place] for name, values in self.arrays.items()}
 
     def release_after(self, results: Mapping[str, np.ndarray]) -> None:
@@ -71,12 +72,12 @@ class Table:
             self._unreleased = 0
             release(self.arrays.values())
 
-    def _lay_out_for(self, results: Mapping[str, np.ndarray]) -> None:
+    def _lay_out_for(self, results: Mapping[str, np.ndarray], *, blank: bool = True) -> None:
         """Make the arrays; the first results tell the sizes of dimensions that depend on the system."""
         if not self.arrays:
             for variable in self.variables:
                 self._sizes |= zip(reversed(variable.dims), reversed(results[variable.name].shape), strict=False)
-            self.lay_out()
+            self.lay_out(blank=blank)
 
     def lose(self, points: np.ndarray) -> None:
         """Record that nobody survived the computation of ``points``."""
@@ -89,15 +90,15 @@ class Table:
             enter(self.arrays[OUTCOME.name], self._grid, points, Outcome.LOST)
         self._lost.clear()
 
-    def lay_out(self) -> Mapping[str, np.ndarray]:
-        """The arrays, made if nothing has been filled in yet."""
+    def lay_out(self, *, blank: bool = True) -> Mapping[str, np.ndarray]:
+        """The arrays, made if nothing has been filled in yet; without ``blank`` what is in them is anything."""
         if not self.arrays:
             sweep = self._grid.result_shape
             shapes = {v: (*sweep, *(self._sizes[dim] for dim in v.dims)) for v in self.variables}
             # Broadcast zeros take no memory.
-            blank = {v.name: np.broadcast_to(np.zeros((), v.dtype), shape) for v, shape in shapes.items()}
-            self.arrays = self._allocate(to_dataset(self._scene, blank, {}))
-            for variable in self.variables:
+            zeros = {v.name: np.broadcast_to(np.zeros((), v.dtype), shape) for v, shape in shapes.items()}
+            self.arrays = self._allocate(to_dataset(self._scene, zeros, {}))
+            for variable in self.variables if blank else ():
                 rows = self.arrays[variable.name].reshape(-1)
                 for start in range(0, rows.size, _ROWS):
                     rows[start : start + _ROWS] = missing_value(variable)

@@ -84,7 +84,7 @@ def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[V
     """
     batch, columns = _batch(solver, grid, chunk, variables)
     lowered = jax.jit(batch).lower(columns, jax.ShapeDtypeStruct((), np.int64))
-    compiled = lowered.compile(compiler_options(chunk))
+    compiled = lowered.compile(compiler_options(chunk, march=solver.march))
     return Kernel(compiled, chunk, solver.broadcasts, tuple(variables), _turn(compiled))
 
 

@@ -15,7 +15,6 @@ from drivetrain_jax.sweep.assemble import Table, failures
 from drivetrain_jax.sweep.atlas_choice import atlas_ranges, solves_allowed
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.rounds import build_atlas, fixed_of
-from drivetrain_jax.sweep.scene import Scene
 from drivetrain_jax.sweep.work import Progress, Work
 
 # Cells evaluated at a time: what they need in memory, and how often progress is told.
@@ -31,19 +30,22 @@ def fill_through_atlas(engine: Engine, table: Table, work: Work, progress: Progr
     scene = engine.scene
     solves = Progress(0, kind="direct solves for the atlas")
     with ThreadPoolExecutor(1) as aside:
-        # Of that many cells some have to be judged one by one, by a kernel that takes seconds to compile.
-        large = engine.grid.size >= _LARGE
-        prepared = aside.submit(_prepare, scene) if large else None
+        prepared = aside.submit(_prepare, engine, table)
         atlas, first = build_atlas(scene, atlas_ranges(scene), work, solves, solves_allowed(scene))
         uncovered = evaluate(engine, table, atlas, work, progress, first)
-        if prepared:
-            prepared.result()
+        prepared.result()
     return {"atlas_solves": atlas.atlas.solves, "atlas_panels": len(atlas.atlas.panels), "atlas_uncovered": uncovered}
 
 
-def _prepare(scene: Scene) -> None:
-    ranges = atlas_ranges(scene)
-    prepare_judging(scene.system, ranges, fixed_of(scene, ranges), scene.request.options["rtol"], scene.request.outputs)
+def _prepare(engine: Engine, table: Table) -> None:
+    """What can be made ready beside the solves."""
+    scene, ranges = engine.scene, atlas_ranges(engine.scene)
+    if not any(variable.dims for variable in table.variables):
+        table.lay_out(blank=False)
+    # Of that many cells some have to be judged one by one, by a kernel that takes seconds to compile.
+    if engine.grid.size >= _LARGE:
+        fixed, rtol = fixed_of(scene, ranges), scene.request.options["rtol"]
+        prepare_judging(scene.system, ranges, fixed, rtol, scene.request.outputs)
 
 
 def evaluate(

@@ -41,14 +41,19 @@ _STRUCTURE = """
 _KNOWN = {*_ELEMENTWISE.split(), *_STRUCTURE.split()}
 
 
-def compiler_options(lanes: int = FULL_WIDTH) -> dict[str, Any] | None:
+def compiler_options(lanes: int = FULL_WIDTH, *, march: bool = False) -> dict[str, Any]:
     """Full vector width: XLA uses half of AVX-512 unless told otherwise, which costs a factor of 1.6.
 
     Not for fewer ``lanes`` than a vector has: a march of four lanes then takes the compiler tens of gigabytes (jax 0.10.2).
+    A ``march`` is left to the older of two code generators, which takes half the time and makes marches no slower (of
+    charts, of determinants and of impacts it makes code that is up to twice as slow).
     """
-    if jax.default_backend() == "cpu" and "avx512f" in instruction_set() and lanes >= FULL_WIDTH:
-        return {"xla_cpu_prefer_vector_width": 512}
-    return None
+    if jax.default_backend() != "cpu":
+        return {}
+    wide = "avx512f" in instruction_set() and lanes >= FULL_WIDTH
+    return ({"xla_cpu_prefer_vector_width": 512} if wide else {}) | (
+        {"xla_cpu_use_fusion_emitters": False} if march else {}
+    )
 
 
 def stored(function: Callable[P, R]) -> Callable[P, R]:

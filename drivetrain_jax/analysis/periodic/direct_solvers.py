@@ -42,6 +42,7 @@ def direct_solvers(
             lambda columns: explicit_effort(system, columns, rtol),
             broadcasts=True,
             chunk=chunks[0],
+            march=True,
         ),
         Solver(
             "direct: Radau IIA of 8 stages",
@@ -49,6 +50,7 @@ def direct_solvers(
             lambda columns: implicit_effort(system, columns, rtol),
             unit_cost=PANEL_COST,
             chunk=chunks[1],
+            march=True,
         ),
     )
 
