@@ -29,23 +29,29 @@ def fill_through_atlas(engine: Engine, table: Table, work: Work, progress: Progr
     """All points of ``engine`` into ``table``; returns what the attributes of the result are to say of it."""
     scene = engine.scene
     solves = Progress(0, kind="direct solves for the atlas")
+    # Beside the solves.
     with ThreadPoolExecutor(1) as aside:
-        prepared = aside.submit(_prepare, engine, table)
+        prepared = [aside.submit(_lay_out, table), aside.submit(_prepare_judging, engine)]
         atlas, first = build_atlas(scene, atlas_ranges(scene), work, solves, solves_allowed(scene))
+        prepared[0].result()
         uncovered = evaluate(engine, table, atlas, work, progress, first)
-        prepared.result()
+        prepared[1].result()
     return {"atlas_solves": atlas.atlas.solves, "atlas_panels": len(atlas.atlas.panels), "atlas_uncovered": uncovered}
 
 
-def _prepare(engine: Engine, table: Table) -> None:
-    """What can be made ready beside the solves."""
-    scene, ranges = engine.scene, atlas_ranges(engine.scene)
+def _lay_out(table: Table) -> None:
+    """Lay out a table whose size does not depend on results."""
     if not any(variable.dims for variable in table.variables):
         table.lay_out(blank=False)
-    # Of that many cells some have to be judged one by one, by a kernel that takes seconds to compile.
-    if engine.grid.size >= _LARGE:
-        fixed, rtol = fixed_of(scene, ranges), scene.request.options["rtol"]
-        prepare_judging(scene.system, ranges, fixed, rtol, scene.request.outputs)
+
+
+def _prepare_judging(engine: Engine) -> None:
+    """Of so many cells some have to be judged one by one, by a kernel that takes seconds to compile."""
+    if engine.grid.size < _LARGE:
+        return
+    scene, ranges = engine.scene, atlas_ranges(engine.scene)
+    fixed, rtol = fixed_of(scene, ranges), scene.request.options["rtol"]
+    prepare_judging(scene.system, ranges, fixed, rtol, scene.request.outputs)
 
 
 def evaluate(

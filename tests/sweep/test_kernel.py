@@ -21,14 +21,15 @@ def test_double_precision():
 
 def test_full_vector_width_only_where_there_is_avx512(monkeypatch):
     monkeypatch.setattr(kernels, "instruction_set", lambda: {"x86_64", "avx2"})
-    assert kernels.compiler_options() is None
+    assert kernels.compiler_options() == {}
     monkeypatch.setattr(kernels, "instruction_set", lambda: {"x86_64", "avx512f"})
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert kernels.compiler_options() is None
+    assert kernels.compiler_options(march=True) == {}
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     assert kernels.compiler_options() == {"xla_cpu_prefer_vector_width": 512}
     # Four lanes at full width: tens of gigabytes (seen with jax 0.10.2).
-    assert kernels.compiler_options(4) is None
+    assert kernels.compiler_options(4) == {}
+    assert kernels.compiler_options(4, march=True) == {"xla_cpu_use_fusion_emitters": False}
 
 
 SCRIPT = """
