@@ -76,7 +76,6 @@ def _diffrax_solvers(system: System, request: Request) -> tuple[Solver, ...]:
             solve,
             lambda columns: np.nan_to_num(explicit_effort(system, columns, rtol)),
             chunk=256,
-            march=True,
         ),
     )
 

@@ -45,8 +45,8 @@ def compiler_options(lanes: int = FULL_WIDTH, *, march: bool = False) -> dict[st
     """Full vector width: XLA uses half of AVX-512 unless told otherwise, which costs a factor of 1.6.
 
     Not for fewer ``lanes`` than a vector has: a march of four lanes then takes the compiler tens of gigabytes (jax 0.10.2).
-    A ``march`` is left to the older of two code generators, which takes half the time and makes marches no slower (of
-    charts, of determinants and of impacts it makes code that is up to twice as slow).
+    A ``march`` is left to the older of two code generators, which takes half the time and makes most marches no slower
+    (charts, determinants, impacts and adaptive steps in lockstep become slower, by up to a factor of two).
     """
     if jax.default_backend() != "cpu":
         return {}
