@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 
 from harness import Bench, Ended, Record, resume, settle
@@ -16,10 +17,17 @@ def corrupted(bench: Bench, kind: str, damage: Callable[[bytearray, Bench], byte
     """A part is damaged after a kill: its chunks are computed again."""
     out, moment = bench.place(), bench.moment()
     run = bench.run(out)
-    hit = strike(run, out, moment, run.process.kill)
+    folder = out.with_name(out.name + ".parts")
+
+    def kill() -> None:
+        while run.process.poll() is None and not any(folder.glob("*-*.h5")):
+            time.sleep(0.01)
+        run.process.kill()
+
+    hit = strike(run, out, moment, kill)
     ended = run.end()
     settle(run)
-    parts = sorted(out.with_name(out.name + ".parts").glob("*-*.h5"))
+    parts = sorted(folder.glob("*-*.h5"))
     for part in parts[:: max(len(parts) // 3, 1)]:
         part.write_bytes(damage(bytearray(part.read_bytes()), bench))
     return resume(bench, kind, out, moment, hit and bool(parts), ended, 0, (), stopped_by(signal.SIGKILL))

@@ -51,7 +51,9 @@ def signalled(bench: Bench, kind: str, number: int, options: list[str], allowed:
 
 
 def interrupted(ended: Ended) -> bool:
-    return ended.code in (0, 130) and len(ended.lines) <= 2
+    # Started by -m, CPython ends by the signal itself (130 to a shell as well) if that interrupted the code of a string,
+    # such as the methods of a dataclass that is imported, although the interrupt was handled.
+    return ended.code in (0, 130, -signal.SIGINT) and len(ended.lines) <= 2
 
 
 def kill_worker(bench: Bench, kind: str, options: list[str]) -> Record:
