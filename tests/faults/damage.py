@@ -15,7 +15,8 @@ from injections import stopped_by, strike
 
 def corrupted(bench: Bench, kind: str, damage: Callable[[bytearray, Bench], bytearray]) -> Record:
     """A part is damaged after a kill: its chunks are computed again."""
-    out, moment = bench.place(), bench.moment()
+    # Early: a part may have to be waited for, and the run has to be at work still.
+    out, moment = bench.place(), bench.moment() / 2
     run = bench.run(out)
     folder = out.with_name(out.name + ".parts")
 
