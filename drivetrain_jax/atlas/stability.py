@@ -106,25 +106,28 @@ class StabilityAtlas:
         axes = [np.asarray(axis, float) for axis in axes]
         shape = tuple(len(axis) for axis in axes)
         found = self.blank(shape, outputs) if out is None else _blanked(out)
-        if not self._closed_form or not _FAST.issuperset(outputs) or len(axes) < 2:
-            points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
-            for name, value in self.at(points, outputs).items():
-                found[name][...] = value.reshape(found[name].shape)
+        if self._closed_form and _FAST.issuperset(outputs) and len(axes) > 1:
+            self._tile(found, axes)
             return found
-        # Tiles are blocks of neighbours, so panels have to cover ranges: axes rise in the atlas's coordinates.
-        orders = [
-            np.argsort(c.forward(axis), kind="stable") for c, axis in zip(self.atlas.coordinates, axes, strict=True)
-        ]
-        rising = tuple(slice(None, None, -1 if (np.diff(order) < 0).all() else 1) for order in orders)
-        views = {name: values[rising] for name, values in found.items()}
-        shuffled = {k: np.argsort(order) for k, order in enumerate(orders) if len(set(np.diff(order))) > 1}
-        filled = {name: values.copy() for name, values in views.items()} if shuffled else views
-        self._fill(filled, [axis[order] for axis, order in zip(axes, orders, strict=True)])
-        for name, values in filled.items() if shuffled else ():
-            for k, places in shuffled.items():
-                values = np.take(values, places, axis=k)
-            found[name][...] = values
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+        for name, value in self.at(points, outputs).items():
+            found[name][...] = value.reshape(found[name].shape)
         return found
+
+    def _tile(self, found: dict[str, np.ndarray], axes: list[np.ndarray]) -> None:
+        """Fill ``found`` in closed form, the axes being in any order."""
+        # Tiles are blocks of neighbours, so panels have to cover ranges: axes rise in the atlas's coordinates.
+        orders = [np.argsort(c.forward(a), kind="stable") for c, a in zip(self.atlas.coordinates, axes, strict=True)]
+        rising = [axis[order] for axis, order in zip(axes, orders, strict=True)]
+        steps = [set(np.diff(order)) for order in orders]
+        if all(len(each) < 2 for each in steps):
+            turned = tuple(slice(None, None, -1 if each == {-1} else 1) for each in steps)
+            self._fill({name: values[turned] for name, values in found.items()}, rising)
+            return
+        in_order = {name: values.copy() for name, values in found.items()}
+        self._fill(in_order, rising)
+        for name, values in in_order.items():
+            found[name][np.ix_(*orders)] = values
 
     @property
     def _multipliers(self) -> int:

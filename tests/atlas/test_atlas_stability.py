@@ -164,12 +164,26 @@ def test_it_decides_more_than_the_interval_of_the_radius():
     assert quartic.nothing_crosses(c, jnp.log(d))[0]
 
 
-def test_axes_in_any_order_and_negative_angles(chart):
-    beta, omega = np.array([0.7, 0.1, 1.5, 0.4]), np.array([1.9, 0.3, 1.1])
-    found = chart.on_grid([beta, omega])["spectral_radius"]
+ANGLES = {
+    "rise": [0.1, 0.4, 0.7, 1.5],
+    "fall": [1.5, 0.7, 0.4],
+    "any": [0.7, 0.1, 1.5, 0.4],
+    "both signs": [-0.9, -0.2, 0.3],
+}
+SPEEDS = {"rise": [0.3, 1.1, 1.9], "fall": [1.9, 1.1, 0.3], "any": [1.9, 0.3, 1.1], "one": [0.8]}
+
+
+@pytest.mark.parametrize("angles", ANGLES)
+@pytest.mark.parametrize("speeds", SPEEDS)
+def test_axes_in_any_order(chart, angles, speeds):
+    """Each with each: 1/Omega falls where Omega rises, and what is even in beta has negative angles out of order."""
+    beta, omega = np.array(ANGLES[angles]), np.array(SPEEDS[speeds])
     points = np.stack(np.meshgrid(beta, omega, indexing="ij"), axis=-1).reshape(-1, 2)
-    assert found.reshape(-1) == pytest.approx(chart.at(points)["spectral_radius"], rel=1e-11)
-    assert chart.at(points * [-1, 1])["spectral_radius"] == pytest.approx(found.reshape(-1), rel=1e-15)
+    expected = chart.at(np.abs(points))
+    found = chart.on_grid([beta, omega])
+    assert found["spectral_radius"].reshape(-1) == pytest.approx(expected["spectral_radius"], rel=1e-11)
+    assert (found["verdict"].reshape(-1) == expected["verdict"]).all()
+    assert chart.at(points)["spectral_radius"] == pytest.approx(expected["spectral_radius"], rel=1e-15)
 
 
 def test_points_outside_are_left_to_direct_solves(chart):
