@@ -9,8 +9,9 @@ from scipy.fft import dctn
 
 from drivetrain_jax.atlas.panels import chebyshev
 
-# Points evaluated at a time.
-_BLOCK = 4096
+# Points evaluated at a time, if not so few that a product of matrices stays below this many multiplications: larger ones
+# OpenBLAS gives to threads that then spin for a tenth of a second, on cores that solves and charts need.
+_BLOCK, _FEWEST, _ONE_THREAD = 4096, 8, 1 << 18
 
 
 def nodes(n: int) -> np.ndarray:
@@ -38,15 +39,17 @@ def coefficients(values: np.ndarray, degrees: Sequence[int]) -> np.ndarray:
 def evaluate(tensor: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Values ``(N, m)`` at points ``(N, d)`` in [-1, 1]^d."""
     out = np.empty((len(x), tensor.shape[-1]))
-    for start in range(0, len(x), _BLOCK):
-        part = x[start : start + _BLOCK]
+    few = _ONE_THREAD // max(tensor.size, 1)
+    block = min(few, _BLOCK) if few >= _FEWEST else _BLOCK
+    for start in range(0, len(x), block):
+        part = x[start : start + block]
         # The first contraction is one product of matrices; the others are over what is left of each point.
         rest = chebyshev(part[:, 0], tensor.shape[0]) @ tensor.reshape(tensor.shape[0], -1)
         for k in range(1, x.shape[1]):
             rest = np.einsum(
                 "pn,pnr->pr", chebyshev(part[:, k], tensor.shape[k]), rest.reshape(len(part), tensor.shape[k], -1)
             )
-        out[start : start + _BLOCK] = rest
+        out[start : start + block] = rest
     return out
 
 

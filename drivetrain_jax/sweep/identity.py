@@ -36,13 +36,19 @@ def numerics_of(scene: Scene) -> dict[str, Any]:
         starts.append(Path(inspect.getsourcefile(getattr(function, "func", function)) or ""))
     files = {_label(path): path for path in _imported(starts)}
     return {
-        "sources": {name: source_digest({name: path}) for name, path in sorted(files.items())},
+        "sources": {name: _source_digest(name, path) for name, path in sorted(files.items())},
         "versions": versions(PACKAGES),
         "x64": bool(jax.config.jax_enable_x64),
         "backend": jax.default_backend(),
         "flags": os.environ.get("XLA_FLAGS", ""),
         "instructions": " ".join(sorted(instruction_set())),
     }
+
+
+# The code that runs is the one that was there when it was imported, not one that is edited since.
+@cache
+def _source_digest(name: str, path: Path) -> str:
+    return source_digest({name: path})
 
 
 def _label(path: Path) -> str:

@@ -137,8 +137,10 @@ class Blocks:
         """For each solver its points, numbered through the block, and their efforts."""
         start, stop = block * _BLOCK, min((block + 1) * _BLOCK, self._size)
         pieces = [self._number(np.arange(i, min(i + _PIECE, stop))) for i in range(start, stop, _PIECE)]
-        with ThreadPoolExecutor(min(usable_cores(), len(pieces)), thread_name_prefix="plan") as pool:
-            found = list(pool.map(lambda points: _cheapest(self._solvers, self._grid, points), pieces))
+        found = [_cheapest(self._solvers, self._grid, pieces[0])]
+        if len(pieces) > 1:
+            with ThreadPoolExecutor(min(usable_cores(), len(pieces) - 1), thread_name_prefix="plan") as pool:
+                found += pool.map(lambda points: _cheapest(self._solvers, self._grid, points), pieces[1:])
         choice, effort = (np.concatenate(column) for column in zip(*found, strict=True))
         orders, efforts = [], []
         for index in range(len(self._solvers)):
