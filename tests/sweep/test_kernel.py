@@ -32,6 +32,16 @@ def test_full_vector_width_only_where_there_is_avx512(monkeypatch):
     assert kernels.compiler_options(4, march=True) == {"xla_cpu_use_fusion_emitters": False}
 
 
+def test_options_that_another_compiler_does_not_know_are_left_out(monkeypatch):
+    monkeypatch.setattr(kernels.jaxlib, "__version__", "0.99.0")
+    kernels.compiler_knows.cache_clear()
+    # The one that is installed is asked.
+    assert kernels.compiler_knows("xla_cpu_use_fusion_emitters", False)
+    assert not kernels.compiler_knows("xla_cpu_no_such_option", 1)
+    monkeypatch.setattr(kernels, "compiler_knows", lambda option, value: option != "xla_cpu_use_fusion_emitters")
+    assert "xla_cpu_use_fusion_emitters" not in kernels.compiler_options(march=True)
+
+
 SCRIPT = """
 from drivetrain_jax.sweep import compile_cache
 import jax

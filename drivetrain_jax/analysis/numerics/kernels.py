@@ -9,11 +9,12 @@ not know them ignores them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
+import jaxlib
 from jax import Array
 from jax.experimental.xla_metadata import set_xla_metadata
 
@@ -50,10 +51,27 @@ def compiler_options(lanes: int = FULL_WIDTH, *, march: bool = False) -> dict[st
     """
     if jax.default_backend() != "cpu":
         return {}
-    wide = "avx512f" in instruction_set() and lanes >= FULL_WIDTH
-    return ({"xla_cpu_prefer_vector_width": 512} if wide else {}) | (
-        {"xla_cpu_use_fusion_emitters": False} if march else {}
-    )
+    options: dict[str, Any] = {}
+    if "avx512f" in instruction_set() and lanes >= FULL_WIDTH:
+        options["xla_cpu_prefer_vector_width"] = 512
+    if march:
+        options["xla_cpu_use_fusion_emitters"] = False
+    return {option: value for option, value in options.items() if compiler_knows(option, value)}
+
+
+@cache
+def compiler_knows(option: str, value: Any) -> bool:
+    """Whether XLA takes an option, which may go with any release of jaxlib: then kernels are slower, not missing.
+
+    Those of jaxlib 0.10 are known without asking, which takes the time of a small compilation.
+    """
+    if jaxlib.__version__.startswith("0.10."):
+        return True
+    try:
+        jax.jit(lambda: jnp.zeros(())).lower().compile({option: value})
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 def stored(function: Callable[P, R]) -> Callable[P, R]:
