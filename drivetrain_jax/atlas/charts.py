@@ -28,7 +28,7 @@ from drivetrain_jax.atlas.tiles import NODES, Tile
 from drivetrain_jax.store.provenance import usable_cores
 from drivetrain_jax.systems import FloquetModel
 
-# Most rows and columns of a tile. The columns of one row are the lanes of all loops: few enough for them not to be cut into parallel tasks.
+# Most rows and columns of a tile. The columns of a row are the lanes of all loops: so few are not cut into parallel tasks.
 ROWS, COLUMNS = 64, 512
 # Pieces of work per core that are under way.
 _AHEAD = 2
