@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.numerics.kernels import compiler_options, in_one_kernel
+from drivetrain_jax.analysis.numerics.kernels import compiler_options, in_one_kernel, options_for_few
 from drivetrain_jax.analysis.periodic import quartic
 from drivetrain_jax.atlas.charts import Packed, errors_of, exact_verdict, in_threads, pack
 from drivetrain_jax.atlas.expansion import Cell, Expansion
@@ -52,9 +52,9 @@ def judged_cells(
 
 
 @lru_cache(maxsize=16)
-def point_kernel(build: Build, undamped: bool) -> Any:
+def point_kernel(build: Build, undamped: bool, few: bool) -> Any:
     """Closed-form results ``(LANES ROWS,)`` of a block of points, those of the first ``rows`` rows, for ``charts.unpack``.
-    ``undamped``: points may be Hamiltonian."""
+    ``undamped``: points may be Hamiltonian; ``few``: they are of one row at most."""
 
     def kernel(tensor, place, rows, errors, left_out, values, fixed):
         count = max((*tensor.shape[:-2], tensor.shape[-1]))
@@ -80,7 +80,7 @@ def point_kernel(build: Build, undamped: bool) -> Any:
         blank = (jnp.zeros(size, complex), jnp.zeros(size, jnp.int8))[: 1 + undamped]
         return jax.lax.fori_loop(0, rows, row, blank)
 
-    return jax.jit(kernel, compiler_options=compiler_options())
+    return jax.jit(kernel, compiler_options=options_for_few() if few else compiler_options())
 
 
 def _chebyshev(x: Array, count: int) -> Array:

@@ -14,6 +14,7 @@ from functools import lru_cache
 import jax
 import numpy as np
 
+from drivetrain_jax.analysis.numerics.kernels import options_for_few
 from drivetrain_jax.analysis.periodic.direct import assemble
 from drivetrain_jax.analysis.periodic.propagator import explicit_propagator
 from drivetrain_jax.atlas.criteria import Criteria
@@ -114,4 +115,4 @@ def _monodromy(build: Callable) -> Callable:
         shape = next(iter(columns.values())).shape
         return assemble(form, explicit_propagator(form, steps, shape).matrix)
 
-    return jax.jit(monodromy)
+    return jax.jit(monodromy, compiler_options=options_for_few())

@@ -27,7 +27,7 @@ from drivetrain_jax.atlas import charts, evaluation
 from drivetrain_jax.atlas.expansion import Expansion
 from drivetrain_jax.atlas.floquet_quantity import Build, judge
 from drivetrain_jax.atlas.panels import Atlas
-from drivetrain_jax.atlas.points import judged_cells, point_kernel
+from drivetrain_jax.atlas.points import LANES, judged_cells, point_kernel
 from drivetrain_jax.atlas.tiles import Tile, tiles
 from drivetrain_jax.systems import FloquetModel
 
@@ -62,7 +62,7 @@ class StabilityAtlas:
         if not (self._closed_form and _FAST.issuperset(outputs) and self.atlas.panels):
             return self.by_eigenvalues(points, outputs)
         x, found = self.atlas.to_coordinates(points), self.blank((len(points),), outputs)
-        kernel = point_kernel(self.build, self._may_be_undamped(points.T))
+        kernel = point_kernel(self.build, self._may_be_undamped(points.T), len(points) <= LANES)
         unsure = [np.empty(0, int)]
         for index, packed in judged_cells(self._expansion, points, x, self.atlas, kernel):
             results = charts.unpack(*packed, rtol=self.rtol)

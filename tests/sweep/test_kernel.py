@@ -40,6 +40,7 @@ def test_options_that_another_compiler_does_not_know_are_left_out(monkeypatch):
     assert not kernels.compiler_knows("xla_cpu_no_such_option", 1)
     monkeypatch.setattr(kernels, "compiler_knows", lambda option, value: option != "xla_cpu_use_fusion_emitters")
     assert "xla_cpu_use_fusion_emitters" not in kernels.compiler_options(march=True)
+    assert set(kernels.options_for_few()) == {"xla_backend_optimization_level"}
 
 
 SCRIPT = """

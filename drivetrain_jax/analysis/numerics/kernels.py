@@ -59,6 +59,15 @@ def compiler_options(lanes: int = FULL_WIDTH, *, march: bool = False) -> dict[st
     return {option: value for option, value in options.items() if compiler_knows(option, value)}
 
 
+def options_for_few() -> dict[str, Any]:
+    """For kernels of few lanes, which run for milliseconds: compiled without optimising, in a third of the time. They take
+    one to four times as long to run."""
+    if jax.default_backend() != "cpu":
+        return {}
+    options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+    return {option: value for option, value in options.items() if compiler_knows(option, value)}
+
+
 @cache
 def compiler_knows(option: str, value: Any) -> bool:
     """Whether XLA takes an option, which may go with any release of jaxlib: then kernels are slower, not missing.
