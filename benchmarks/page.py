@@ -1,6 +1,7 @@
 """docs/benchmarks.md from the result files alone: conclusions first, then tables and figures, then where they come from.
 
-    python -m benchmarks.page      # writes docs/benchmarks.md and the measured part of README.md from benchmarks/results/
+    python -m benchmarks.page      # writes docs/benchmarks.md and the measured parts of README.md and
+                                   # docs/theory/atlas.md from benchmarks/results/
 
 No number of the page is typed: every sentence takes its figures, and its wording, from the CSV files. A file that is
 missing gives a line that says so.
@@ -286,11 +287,13 @@ def machine(files: Files) -> str:
 
 
 def main() -> None:
-    """Write the page, and the measured part of the README, from the stored results."""
+    """Write the page, and the measured parts of the README and of docs/theory/atlas.md, from the stored results."""
+    from benchmarks import page_atlas
     from benchmarks.readme import write_readme
 
     write_page()
     write_readme()
+    page_atlas.write_page()
 
 
 if __name__ == "__main__":

@@ -6,12 +6,10 @@ from pathlib import Path
 
 from benchmarks import page
 from benchmarks.precision import GOAL
-from benchmarks.results_files import ResultFile, Row, count, load, markdown, not_measured, seconds, small
+from benchmarks.results_files import ResultFile, Row, between_marks, count, load, markdown, not_measured, seconds, small
 from benchmarks.timing import RESULTS
 
 README = Path(__file__).resolve().parents[1] / "README.md"
-BEGIN = "<!-- Written by `python -m benchmarks.page`; do not edit. -->"
-END = "<!-- End of what is written. -->"
 NAMES = (
     "throughput", "critical_speeds", "planetary_throughput", "rattle_throughput", "chaos", "atlas", "memory", "overhead",
 )  # fmt: skip
@@ -98,9 +96,7 @@ def _memory(file: ResultFile | None) -> str:
 
 def written(text: str, folder: Path = RESULTS) -> str:
     """``text`` of a README with its measured part made from the files in ``folder``."""
-    before, _, rest = text.partition(BEGIN)
-    _, _, after = rest.partition(END)
-    return f"{before}{BEGIN}\n\n{section(folder)}\n\n{END}{after}"
+    return between_marks(text, section(folder))
 
 
 def write_readme() -> None:

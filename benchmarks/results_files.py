@@ -11,6 +11,9 @@ from pathlib import Path
 Row = Mapping[str, str]
 # Times that differ by less are not told apart from one run to the next.
 LEVEL = 1.1
+# Around what is written in a page that is otherwise typed.
+BEGIN = "<!-- Written by `python -m benchmarks.page`; do not edit. -->"
+END = "<!-- End of what is written. -->"
 _PROVENANCE = ("date", "machine", "load", "versions", "accelerator")
 
 
@@ -106,6 +109,13 @@ def whole(file: ResultFile | None, name: str, columns: Mapping[str, str], format
     as_is = dict.fromkeys(columns, plain) | dict(formats)
     rows = [[_cell(row.get(column, ""), as_is[column]) for column in columns] for row in file.rows]
     return markdown(list(columns.values()), rows)
+
+
+def between_marks(text: str, section: str) -> str:
+    """``text`` with ``section`` between its marks."""
+    before, _, rest = text.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    return f"{before}{BEGIN}\n\n{section}\n\n{END}{after}"
 
 
 def not_measured(name: str) -> str:

@@ -5,49 +5,34 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from propagators import BASE, cardan_atlas, direct_radius, monodromy, propagators, random_points
 
-from benchmarks import cardan_precise_reference as precise
+from benchmarks.atlas_attack import (
+    CASES,
+    STABLE,
+    UNDECIDED,
+    UNSTABLE,
+    Size,
+    against_precise,
+    attack,
+    hardest,
+    relative_error_of_z,
+    violations,
+    worst,
+    wrong,
+)
+from benchmarks.atlas_direct import BASE, cardan_atlas, direct_radius, random_points
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.periodic import quartic
 from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES
-from drivetrain_jax.atlas import tiles, to_arrays
-from drivetrain_jax.atlas.interpolation import evaluate
-from drivetrain_jax.atlas.panels import position
+from drivetrain_jax.atlas import tiles
 
-STABLE, UNSTABLE, UNDECIDED = 0, 1, 2
-ROUNDING = 2e-14
-
-
-def violations(found, radius):
-    return np.abs(found["spectral_radius"] - radius) > found["spectral_radius_error"] + ROUNDING * radius
-
-
-def wrong(found, radius):
-    stable, unstable = found["verdict"] == STABLE, found["verdict"] == UNSTABLE
-    return (stable & (radius > 1 + ROUNDING)) | (unstable & (radius < 1 - ROUNDING))
+COUNTS = [f"{what}_{by}" for what in ("violations", "wrong") for by in ("direct", "precise")]
 
 
 def cells(found, axes, chosen):
     """The chosen cells of a chart, as points and results."""
     i, j = np.unravel_index(chosen, found["verdict"].shape)
     return np.stack([axes[0][i], axes[1][j]], axis=1), {name: value[i, j] for name, value in found.items()}
-
-
-def hardest(found, count):
-    """Cells nearest to rho = 1 (on neither side by decree) and cells with the widest bound."""
-    distance = np.where(found["spectral_radius"] == 1, np.inf, np.abs(found["spectral_radius"] - 1)).reshape(-1)
-    return np.argsort(distance)[:count], np.argsort(-found["spectral_radius_error"].reshape(-1))[:count]
-
-
-def relative_error_of_z(atlas, points):
-    columns = {**atlas.atlas.fixed, **dict(zip(atlas.atlas.parameters, points.T, strict=True))}
-    exact = monodromy(propagators(columns, 1e-14))
-    x = atlas.atlas.to_coordinates(points)
-    number, phi = atlas.atlas.find(x), np.empty((len(points), 16))
-    for k, panel in enumerate(atlas.atlas.panels):
-        phi[number == k] = evaluate(panel.coefficients, position(panel, x[number == k]))
-    return np.linalg.norm(monodromy(phi) - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
 
 
 def test_first_chart_of_the_theory_page(chart):
@@ -272,79 +257,54 @@ def test_strong_damping(omega):
     assert not violations(results, radius).any() and not wrong(results, radius).any()
 
 
-def precise_radius(atlas, points):
-    """To 30 digits, by a program of its own."""
-    names = atlas.atlas.parameters
-    return np.array(
-        [
-            float(precise.spectral_radius({**atlas.atlas.fixed, **dict(zip(names, p, strict=True))}))
-            for p in points.tolist()
-        ]
-    )
-
-
-def check_against_precise_values(atlas, points, results, radius, count):
-    """The cells whose error is the largest part of their bound, against values without rounding."""
-    ratio = np.abs(results["spectral_radius"] - radius) / results["spectral_radius_error"]
-    worst = np.argsort(-np.where(np.isfinite(ratio), ratio, -1))[:count]
-    exact = precise_radius(atlas, points[worst])
-    found, bound, verdict = (results[name][worst] for name in ("spectral_radius", "spectral_radius_error", "verdict"))
-    assert (np.abs(found - exact) <= bound).all()
-    # Without damping the precise value of a stable cell is 1 to all digits.
-    assert (exact[verdict == STABLE] <= 1).all() and (exact[verdict == UNSTABLE] > 1).all()
-
-
 def test_worst_cells_against_precise_values(chart):
     points = random_points(chart, 1000, seed=7)
     found, (radius, _) = chart.at(points), direct_radius(chart, points)
-    check_against_precise_values(chart, points, found, radius, 4)
+    chosen = worst(found, radius, 4)
+    compared = against_precise(chart, points[chosen], {name: value[chosen] for name, value in found.items()})
+    assert compared.violations == compared.wrong == 0 and 0 < compared.ratio < 1
 
 
-FULL = [
-    ({}, 1e-11, (0.1, 2.0), 1.5, 1700),
-    ({}, 1e-9, (0.02, 5.0), 1.55, 13_000),
-    ({"zeta": 0.0}, 1e-11, (0.1, 2.0), 1.5, 1700),
-    ({"zeta": 1e-6}, 1e-11, (0.1, 2.0), 1.5, 1700),
-    ({"zeta": 0.1}, 1e-11, (0.1, 2.0), 1.5, 1700),
-    ({"alpha": 20.0}, 1e-11, (0.1, 2.0), 1.5, 2000),
-    ({"mu": 20.0}, 1e-11, (0.1, 2.0), 1.5, 4000),
-]
+def test_the_attack_finds_bounds_that_are_too_narrow(chart, monkeypatch):
+    """Bounds a millionth as wide, and verdicts the other way round, are counted; as they are, none is."""
+    case, size = CASES[0], Size(60, 40, 1)
+    row = attack(case, size, chart)
+    assert [row[name] for name in COUNTS] == [0] * 4 and 0 < row["random_precise"] < 1
+    assert row["solves"] == chart.atlas.solves and row["of"] == 1600 and row["z_error"] < case.tolerance
+
+    def spoiled(axes):
+        found = on_grid(axes)
+        narrow = 1e-6 * found["spectral_radius_error"]
+        return {**found, "verdict": 1 - found["verdict"], "spectral_radius_error": narrow}
+
+    on_grid = chart.on_grid
+    monkeypatch.setattr(type(chart), "on_grid", lambda _, axes: spoiled(axes))
+    row = attack(case, size, chart)
+    assert all(row[name] > 0 for name in COUNTS)
+
+
+# The most solves that a case may take.
+MOST = {"narrow": 800, "base": 1700, "wide": 13_000, "zeta=0": 1700, "zeta=1e-6": 1700, "zeta=0.1": 1700, "alpha=20": 2000,
+        "mu=20": 4000, "four": 180_000}  # fmt: skip
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(("change", "tolerance", "speeds", "beta", "most"), FULL)
-def test_charts_hold_everywhere(change, tolerance, speeds, beta, most):
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_charts_hold_everywhere(case):
     """10,000 random points, the 10,000 cells nearest rho = 1 and the 10,000 with the widest bound; of each the 50 worst
     against precise values."""
-    atlas = cardan_atlas({"beta": (0.0, beta), "Omega": speeds}, tolerance, {**BASE, **change})
-    assert atlas.atlas.solves <= most and not atlas.atlas.gaps
-    points = random_points(atlas, 10_000)
-    assert relative_error_of_z(atlas, points).max() < tolerance
-    axes = [np.linspace(0.0, beta, 1500), np.linspace(*speeds, 1500)]
-    found = atlas.on_grid(axes)
-    if not change:
-        assert (found["verdict"] == UNDECIDED).mean() <= 1e-6
-    for chosen in (*hardest(found, 10_000), np.random.default_rng(2).integers(0, 1500**2, 10_000)):
-        points, results = cells(found, axes, chosen)
-        radius, _ = direct_radius(atlas, points)
-        # Direct values of double multipliers on the circle are wrong by the root of rounding: these are left to the others.
-        exact = results["spectral_radius"] == 1
-        decided = results["verdict"] != UNDECIDED
-        assert not (violations(results, radius) & decided & ~exact).any()
-        assert not (wrong(results, radius) & ~exact).any()
-        assert np.abs(radius - 1)[exact].max(initial=0.0) < 1e-6
-        check_against_precise_values(atlas, points, results, radius, 50)
+    row = attack(case, Size(side=1500), case.build())
+    assert row["solves"] <= MOST[case.name] and row["gaps"] == 0 and row["bytes"] < 10e6
+    assert row["z_error"] < case.tolerance
+    if case.name in ("narrow", "base", "wide"):
+        assert row["undecided"] <= 1e-6 * row["of"]
+    assert [row[name] for name in COUNTS] == [0] * 4
 
 
 @pytest.mark.full
-def test_four_parameters():
-    ranges = {"beta": (0.0, 1.3), "Omega": (0.2, 2.5), "mu": (0.2, 20.0), "alpha": (0.1, 20.0)}
-    atlas = cardan_atlas(ranges, 2e-9, rtol=1e-8)
-    assert atlas.atlas.solves <= 180_000 and len(to_arrays(atlas.atlas)["coefficients"]) * 16 * 8 < 10e6
-    assert relative_error_of_z(atlas, random_points(atlas, 10_000, seed=1)).max() < 2e-9
+def test_a_slice_of_four_parameters():
+    atlas = CASES[-1].build()
     points = random_points(atlas, 3000)
-    found, (radius, _) = atlas.at(points), direct_radius(atlas, points)
-    assert not violations(found, radius).any() and not wrong(found, radius).any()
     chart = atlas.slice({"mu": 3.0, "alpha": 2.0})
     columns = np.column_stack([points[:, :2], np.full((3000, 2), [3.0, 2.0])])
     assert chart.at(points[:, :2])["spectral_radius"] == pytest.approx(direct_radius(atlas, columns)[0], rel=1e-6)

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from propagators import direct_radius, random_points
 
+from benchmarks.atlas_direct import direct_radius, random_points
 from drivetrain_jax.analysis.periodic import quartic
 from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES
 from drivetrain_jax.atlas import StabilityAtlas, expansion

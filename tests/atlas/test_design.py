@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from propagators import BASE, CARDAN, cardan_atlas, monodromy, propagators
 
+from benchmarks.atlas_direct import BASE, CARDAN, cardan_atlas, monodromy, propagators
 from drivetrain_jax.atlas import design
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.design import least_damping, nearest_boundaries, speed_windows, widest_angle

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from propagators import BASE, CARDAN, cardan_atlas, monodromy, propagators
 
+from benchmarks.atlas_direct import BASE, CARDAN, cardan_atlas, monodromy, propagators
 from benchmarks.cardan_reference import monodromy as reference_monodromy
 from drivetrain_jax.atlas import tips as naming
 from drivetrain_jax.atlas.boundaries import boundaries
@@ -61,7 +61,7 @@ def rate(beta, omega, **others):
     return np.log(np.abs(np.linalg.eigvals(z)).max(axis=1))
 
 
-def direct_tip(beta, omega, shift=1e-5):
+def direct_tip(beta, omega, shift=1e-5, **others):
     """The tip near (beta, omega): the largest rate over Omega is 0. Samples and parabolas on direct solves, no atlas."""
     start, beta = beta, beta * (1 + shift)
 
@@ -69,9 +69,9 @@ def direct_tip(beta, omega, shift=1e-5):
         width = 2e-5 * omega
         for _ in range(4):
             x = omega + width * np.linspace(-1, 1, 9)
-            omega, width = x[np.argmax(rate(beta, x))], width / 4
+            omega, width = x[np.argmax(rate(beta, x, **others))], width / 4
         x = np.linspace(-2, 2, 9)
-        fit = np.polyfit(x, rate(beta, omega + width * x), 4)
+        fit = np.polyfit(x, rate(beta, omega + width * x, **others), 4)
         stationary = np.roots(np.polyder(fit))
         top = stationary[np.argmin(np.abs(stationary))].real
         return omega + width * top, np.polyval(fit, top)
@@ -207,22 +207,26 @@ def test_inside_an_unstable_region_there_is_no_tip(atlas):
     criteria = Criteria.of(atlas, CARDAN)
     x = atlas.to_coordinates(np.array([[0.2, 1.0], [0.9, 1.45]]))
     rates = growth(criteria, x, ["+1", "+1"], second=True)
-    found = naming._describe(criteria, "+1", 1, (x, rates, np.full(2, np.nan)), np.ones(2, bool))
+    found = naming._describe(criteria, "+1", 1, (x, rates, np.full((2, 2), np.nan)), np.ones(2, bool))
     assert [tip.point["beta"] for tip in found] == pytest.approx([0.2])
 
 
 def test_a_name_belongs_to_a_resonance_of_the_same_multiplier(atlas):
-    foot = float(atlas.to_coordinates(np.array([0.1, TIPS["S21"][1]]))[1])
-    assert naming._name(atlas, CARDAN, "-1", 1, foot) == "S21"
-    assert naming._name(atlas, CARDAN, "+1", 1, foot) == ""
+    foot = atlas.to_coordinates(np.array([0.0, TIPS["S21"][1]]))
+    assert naming._name(atlas, CARDAN, "-1", foot) == "S21"
+    assert naming._name(atlas, CARDAN, "+1", foot) == ""
     # Nor does one that is far from all, or as near to C+10 as to C-9.
-    assert naming._name(atlas, CARDAN, "-1", 1, 1.03 * foot) == ""
-    assert naming._name(atlas, CARDAN, "pair", 1, 1 / 0.07454) == ""
-    # Over the stiffness ratio, on which the resonances depend, it is that at the foot.
-    fixed = {name: value for name, value in atlas.fixed.items() if name != "mu"} | {"beta": 0.1}
-    lower, upper = np.array([1.0, 0.06]), np.array([20.0, 2.0])
-    other = replace(atlas, parameters=("mu", "Omega"), lower=lower, upper=upper, fixed=fixed)
-    assert naming._name(other, CARDAN, "-1", 1, foot) == "S21"
+    assert naming._name(atlas, CARDAN, "-1", foot * [1, 1.03]) == ""
+    assert naming._name(atlas, CARDAN, "pair", np.array([0.0, 1 / 0.07454])) == ""
+    assert naming._name(atlas, CARDAN, "-1", np.array([0.0, np.nan])) == ""
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("mu", "beta", "omega"), [(3.0, 0.3654, 0.52311), (5.5, 0.7509, 0.66445), (12.0, 0.2913, 0.92914)]
+)
+def test_the_tip_over_the_angle_rises_above_that_of_fig_7_between(mu, beta, omega):
+    assert direct_tip(beta, omega, mu=mu) == (pytest.approx(beta, abs=1e-4), pytest.approx(omega, abs=1e-5))
 
 
 def test_roots_on_a_line_are_all_sign_changes(atlas):

@@ -1,6 +1,10 @@
-"""Direct solves of the propagator, jitted once for all tolerances and parameter sets: what the engine does, in short."""
+"""Direct solves of the cardan shaft's propagator, jitted once for all tolerances and parameter sets: what the engine does,
+in short. An atlas from them, and the spectral radius beside it."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,12 +21,13 @@ OUTPUTS = ("propagator", "propagator_error")
 _SIZES = (512, 16)
 
 
-def solvers(rtol):
+def solvers(rtol: float) -> Sequence[Any]:
+    """The solvers of ``direct`` for the propagator."""
     return ANALYSIS.solvers(CARDAN, Request(OUTPUTS, "direct", {"rtol": rtol}))
 
 
-def _batch(index):
-    def batch(values, effort, rtol):
+def _batch(index: int) -> Callable[..., jax.Array]:
+    def batch(values: Mapping[str, Any], effort: Any, rtol: Any) -> jax.Array:
         solver = solvers(rtol)[index]
         if solver.broadcasts:
             return solver.solve(values, effort)["propagator"]
@@ -34,7 +39,7 @@ def _batch(index):
 _KERNELS = (_batch(0), _batch(1))
 
 
-def propagators(columns, rtol=1e-13):
+def propagators(columns: Mapping[str, Any], rtol: float = 1e-13) -> np.ndarray:
     """``(N, 16)`` for arrays of parameters, points of similar effort together."""
     given = np.broadcast_arrays(*(np.atleast_1d(np.asarray(columns[name], float)) for name in NAMES))
     points = dict(zip(NAMES, given, strict=True))
@@ -51,31 +56,37 @@ def propagators(columns, rtol=1e-13):
     return out
 
 
-def cardan_atlas(ranges, tolerance, fixed=BASE, rtol=1e-10) -> StabilityAtlas:
+def cardan_atlas(
+    ranges: Mapping[str, tuple[float, float]],
+    tolerance: float,
+    fixed: Mapping[str, float] = BASE,
+    rtol: float = 1e-10,
+) -> StabilityAtlas:
     """An atlas of the cardan shaft."""
     fixed = {name: value for name, value in fixed.items() if name not in ranges}
     names = tuple(ranges)
 
-    def solve(points):
+    def solve(points: np.ndarray) -> np.ndarray:
         return propagators({**fixed, **dict(zip(names, points.T, strict=True))}, solve_rtol(tolerance))
 
     return stability_atlas(run(floquet_rounds(CARDAN, ranges, fixed, tolerance), solve), CARDAN, rtol)
 
 
-def monodromy(phi):
+def monodromy(phi: np.ndarray) -> np.ndarray:
     """``Z = X Phi^T X Phi`` of ``(N, 16)``, ``(N, 4, 4)``."""
     x = CARDAN.models["floquet"].build({**BASE, "beta": 0.3, "Omega": 1.0}).reduced.reversor
     matrix = phi.reshape(-1, 4, 4)
     return x @ np.swapaxes(matrix, 1, 2) @ x @ matrix
 
 
-def direct_radius(atlas, points, rtol=1e-14):
+def direct_radius(atlas: StabilityAtlas, points: np.ndarray, rtol: float = 1e-14) -> tuple[np.ndarray, np.ndarray]:
     """Spectral radius at ``points`` of a StabilityAtlas by direct solves, and Z."""
     columns = {**atlas.atlas.fixed, **dict(zip(atlas.atlas.parameters, points.T, strict=True))}
     z = monodromy(propagators(columns, rtol))
     return np.abs(np.linalg.eigvals(z)).max(axis=1), z
 
 
-def random_points(atlas, count, seed=0):
+def random_points(atlas: StabilityAtlas, count: int, seed: int = 0) -> np.ndarray:
+    """Points anywhere within the ranges of the atlas."""
     lower, upper = atlas.atlas.lower, atlas.atlas.upper
     return lower + (upper - lower) * np.random.default_rng(seed).random((count, len(lower)))

@@ -1,0 +1,303 @@
+"""Atlases of the cardan shaft attacked where they are weakest: is the true error ever larger than the bound beside it?
+
+    python -m benchmarks.atlas_attack                     # every case; writes results/atlas_attack.csv after each
+    python -m benchmarks.atlas_attack --only base wide    # these anew, the rows of the others stay
+    python -m benchmarks.atlas_attack --quick             # few cells, to a temporary folder; --cells N: of each kind
+
+Of each case: the relative error of Z at random points of its ranges; the error of rho at random cells of a grid, at the
+cells nearest to rho = 1 and at those with the widest bound, against direct solves with rtol = 1e-14; of each the cells
+whose error is the largest part of their bound once more against values to 30 digits, which share no code with the package
+(benchmarks.cardan_precise_reference). An error may exceed its bound by 2e-14 of the value where both sides are rounded,
+and by nothing against 30 digits. With more than two parameters random points stand in for the grid.
+
+Where rho = 1 by decree (no damping) direct solves are wrong by the root of rounding: there they must only come near 1.
+"""
+
+from __future__ import annotations
+
+import datetime
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from benchmarks import cardan_precise_reference as precise
+from benchmarks.cardan_reference import BASE_CASE
+from benchmarks.results_files import load
+from benchmarks.timing import parser, results_folder, spawned_workers, table, write_csv
+
+if TYPE_CHECKING:
+    from drivetrain_jax.atlas import StabilityAtlas
+
+NAME = "atlas_attack"
+STABLE, UNSTABLE, UNDECIDED = 0, 1, 2
+# Of the value: what direct solves and the eigenvalues of their Z may be wrong by themselves.
+ROUNDING = 2e-14
+# How far direct solves may put multipliers off the circle that lie on it.
+_NEAR = 1e-6
+# With more parameters than two: cells of a grid for one random point.
+_PART = 30
+KINDS = ("random", "nearest", "widest")
+# Beside beta and Omega: what some case changes, or has as an axis.
+_OTHERS = ("zeta", "alpha", "mu")
+
+Results = Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Case:
+    """An atlas: ranges of its parameters, its tolerance, and what differs from the base case."""
+
+    name: str
+    ranges: Mapping[str, tuple[float, float]]
+    tolerance: float
+    change: Mapping[str, float] = field(default_factory=dict)
+    rtol: float = 1e-10
+
+    @property
+    def fixed(self) -> dict[str, float]:
+        """The parameters that are not axes."""
+        return {name: value for name, value in {**BASE_CASE, **self.change}.items() if name not in self.ranges}
+
+    def build(self) -> StabilityAtlas:
+        """The atlas, by direct solves."""
+        from benchmarks.atlas_direct import cardan_atlas
+
+        return cardan_atlas(self.ranges, self.tolerance, self.fixed, self.rtol)
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much of a case is tried: cells of each kind, cells of the grid along each axis, cells compared with 30 digits."""
+
+    cells: int = 10_000
+    side: int = 3000
+    worst: int = 50
+
+
+QUICK = Size(500, 200, 2)
+_CHART = {"beta": (0.0, 1.5), "Omega": (0.1, 2.0)}
+CASES = (
+    Case("narrow", {"beta": (0.0, 1.5), "Omega": (0.3, 2.0)}, 1e-11),
+    Case("base", _CHART, 1e-11),
+    Case("wide", {"beta": (0.0, 1.55), "Omega": (0.02, 5.0)}, 1e-9),
+    Case("zeta=0", _CHART, 1e-11, {"zeta": 0.0}),
+    Case("zeta=1e-6", _CHART, 1e-11, {"zeta": 1e-6}),
+    Case("zeta=0.1", _CHART, 1e-11, {"zeta": 0.1}),
+    Case("alpha=20", _CHART, 1e-11, {"alpha": 20.0}),
+    Case("mu=20", _CHART, 1e-11, {"mu": 20.0}),
+    Case(
+        "four",
+        {"beta": (0.0, 1.3), "Omega": (0.2, 2.5), "mu": (0.2, 20.0), "alpha": (0.1, 20.0)},
+        2e-9,
+        rtol=1e-8,
+    ),
+)
+
+
+def violations(found: Results, radius: np.ndarray) -> np.ndarray:
+    """Whether the spectral radius lies further from ``radius`` than its bound, and rounding, allow."""
+    return np.abs(found["spectral_radius"] - radius) > found["spectral_radius_error"] + ROUNDING * radius
+
+
+def wrong(found: Results, radius: np.ndarray) -> np.ndarray:
+    """Whether a verdict contradicts ``radius``."""
+    stable, unstable = found["verdict"] == STABLE, found["verdict"] == UNSTABLE
+    return (stable & (radius > 1 + ROUNDING)) | (unstable & (radius < 1 - ROUNDING))
+
+
+def hardest(found: Results, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Cells nearest to rho = 1 (on neither side by decree) and cells with the widest bound, as indices of the flat array."""
+    radius = found["spectral_radius"].reshape(-1)
+    distance = np.where(radius == 1, np.inf, np.abs(radius - 1))
+    return _smallest(distance, count), _smallest(-found["spectral_radius_error"].reshape(-1), count)
+
+
+def _smallest(values: np.ndarray, count: int) -> np.ndarray:
+    count = min(count, values.size)
+    chosen = np.argpartition(values, count - 1)[:count]
+    return chosen[np.argsort(values[chosen], kind="stable")]
+
+
+def relative_error_of_z(atlas: StabilityAtlas, points: np.ndarray) -> np.ndarray:
+    """Error of Z at ``points`` against direct solves, over its norm."""
+    from benchmarks.atlas_direct import monodromy, propagators
+    from drivetrain_jax.atlas.interpolation import evaluate
+    from drivetrain_jax.atlas.panels import position
+
+    columns = {**atlas.atlas.fixed, **dict(zip(atlas.atlas.parameters, points.T, strict=True))}
+    exact = monodromy(propagators(columns, 1e-14))
+    x = atlas.atlas.to_coordinates(points)
+    number, phi = atlas.atlas.find(x), np.empty((len(points), 16))
+    for k, panel in enumerate(atlas.atlas.panels):
+        phi[number == k] = evaluate(panel.coefficients, position(panel, x[number == k]))
+    return np.linalg.norm(monodromy(phi) - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Cells of a grid, or points, with their results, all flat."""
+
+    place: Callable[[np.ndarray], np.ndarray]
+    found: Results
+
+    def take(self, chosen: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Points and results of the chosen cells."""
+        return self.place(chosen), {name: value[chosen] for name, value in self.found.items()}
+
+
+def candidates(atlas: StabilityAtlas, side: int) -> Candidates:
+    """``side`` x ``side`` cells over the ranges of the atlas, or random points, fewer, as each takes longer."""
+    from benchmarks.atlas_direct import random_points
+
+    if len(atlas.atlas.parameters) > 2:
+        points = random_points(atlas, side**2 // _PART, seed=3)
+        return Candidates(lambda chosen: points[chosen], atlas.at(points))
+    axes = [np.linspace(low, high, side) for low, high in zip(atlas.atlas.lower, atlas.atlas.upper, strict=True)]
+    found = {name: value.reshape(-1) for name, value in atlas.on_grid(axes).items()}
+
+    def place(chosen: np.ndarray) -> np.ndarray:
+        i, j = np.unravel_index(chosen, (side, side))
+        return np.stack([axes[0][i], axes[1][j]], axis=1)
+
+    return Candidates(place, found)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What came of some cells: errors and their largest part of the bound, how many broke a bound or had a wrong verdict."""
+
+    error: np.ndarray
+    ratio: float
+    violations: int
+    wrong: int
+
+
+def against_direct(points: np.ndarray, found: Results, radius: np.ndarray) -> Comparison:
+    """Cells against direct solves."""
+    decreed = found["spectral_radius"] == 1
+    judged = (found["verdict"] != UNDECIDED) & ~decreed
+    error = np.abs(found["spectral_radius"] - radius)
+    beyond = np.maximum(error - ROUNDING * radius, 0.0)[judged] / found["spectral_radius_error"][judged]
+    off = decreed & (np.abs(radius - 1) > _NEAR)
+    return Comparison(
+        error[judged],
+        float(beyond.max(initial=0.0)),
+        int((violations(found, radius) & judged).sum()),
+        int((wrong(found, radius) & ~decreed | off).sum()),
+    )
+
+
+def worst(found: Results, radius: np.ndarray, count: int) -> np.ndarray:
+    """The cells whose error is the largest part of their bound."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.abs(found["spectral_radius"] - radius) / found["spectral_radius_error"]
+    return np.argsort(-np.where(np.isfinite(ratio), ratio, -1))[:count]
+
+
+def precise_radius(point: Mapping[str, float]) -> float:
+    """To 30 digits, by a program of its own."""
+    return float(precise.spectral_radius(point))
+
+
+def against_precise(
+    atlas: StabilityAtlas, points: np.ndarray, found: Results, pool: Executor | None = None
+) -> Comparison:
+    """Cells against values without rounding; nothing is allowed beyond the bound."""
+    names, fixed = atlas.atlas.parameters, atlas.atlas.fixed
+    given = [{**fixed, **dict(zip(names, point, strict=True))} for point in points.tolist()]
+    exact = np.array(list((pool.map if pool else map)(precise_radius, given)))
+    error, bound, verdict = np.abs(found["spectral_radius"] - exact), found["spectral_radius_error"], found["verdict"]
+    # Without damping the precise value of a stable cell is 1 to all digits.
+    contradicted = (verdict == STABLE) & (exact > 1) | (verdict == UNSTABLE) & (exact <= 1)
+    ratio = np.divide(error, bound, out=np.where(error > 0, np.inf, 0.0), where=bound > 0)
+    return Comparison(error, float(ratio.max(initial=0.0)), int((error > bound).sum()), int(contradicted.sum()))
+
+
+def attack(case: Case, size: Size, atlas: StabilityAtlas, pool: Executor | None = None) -> dict[str, Any]:
+    """The row of the file for one case."""
+    from benchmarks.atlas_direct import direct_radius, random_points
+
+    row = description(case, atlas) | {
+        "z_error": float(relative_error_of_z(atlas, random_points(atlas, size.cells)).max())
+    }
+    cells = candidates(atlas, size.side)
+    undecided, total = int((cells.found["verdict"] == UNDECIDED).sum()), cells.found["verdict"].size
+    chosen = (np.random.default_rng(2).integers(0, total, size.cells), *hardest(cells.found, size.cells))
+    direct, exact = {}, {}
+    for kind, index in zip(KINDS, chosen, strict=True):
+        points, found = cells.take(index)
+        radius, _ = direct_radius(atlas, points)
+        direct[kind] = against_direct(points, found, radius)
+        few = worst(found, radius, size.worst)
+        exact[kind] = against_precise(atlas, points[few], {name: value[few] for name, value in found.items()}, pool)
+    row["rho_error"] = float(np.quantile(direct["random"].error, 0.999))
+    row |= {"cells": size.cells, "worst": size.worst}
+    for name, compared in (("direct", direct), ("precise", exact)):
+        row |= {f"{kind}_{name}": compared[kind].ratio for kind in KINDS}
+        row |= {f"{what}_{name}": sum(getattr(c, what) for c in compared.values()) for what in ("violations", "wrong")}
+    return row | {"undecided": undecided, "of": total}
+
+
+def description(case: Case, atlas: StabilityAtlas) -> dict[str, Any]:
+    """What a case is, and what its atlas takes."""
+    from drivetrain_jax.atlas import to_arrays
+
+    ranges = {name: f"{low:g}..{high:g}" for name, (low, high) in case.ranges.items()}
+    fixed = {name: f"{value:g}" for name, value in case.fixed.items()}
+    return {
+        "case": case.name,
+        **{name: (ranges | fixed)[name] for name in ("beta", "Omega", *_OTHERS)},
+        "tolerance": f"{case.tolerance:g}",
+        "panels": " ".join("x".join(map(str, panel.degrees)) for panel in atlas.atlas.panels),
+        "gaps": len(atlas.atlas.gaps),
+        "solves": atlas.atlas.solves,
+        "bytes": sum(np.asarray(array).nbytes for array in to_arrays(atlas.atlas).values()),
+    }
+
+
+def merged(rows: Iterable[Mapping[str, Any]], new: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """``rows`` with ``new`` in place of the one of its case, in the order of the cases."""
+    kept = {row["case"]: row for row in rows} | {new["case"]: new}
+    return [kept[case.name] for case in CASES if case.name in kept]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Attack the cases, writing the CSV after each."""
+    known = parser(__doc__)
+    known.add_argument("--only", nargs="+", choices=[case.name for case in CASES], metavar="CASE", default=None)
+    known.add_argument("--cells", type=int, help=f"of each kind ({Size.cells:,}; quick: {QUICK.cells:,})")
+    options = known.parse_args(arguments)
+    folder, size = results_folder(options), QUICK if options.quick else Size()
+    size = Size(options.cells or size.cells, size.side, size.worst)
+    cases = [case for case in CASES if options.only is None or case.name in options.only]
+    with spawned_workers() as pool:
+        for number, case in enumerate(cases, 1):
+            write(folder, run(case, size, pool, f"[{number}/{len(cases)}]"))
+
+
+def run(case: Case, size: Size, pool: Executor, clock: str) -> dict[str, Any]:
+    """One case, with its progress on the screen."""
+    start = time.perf_counter()
+    print(f"{clock} {case.name}", flush=True)
+    atlas = case.build()
+    print(f"{clock} {case.name}: {atlas.atlas.solves} solves, {time.perf_counter() - start:.0f} s", flush=True)
+    row = attack(case, size, atlas, pool)
+    seconds = round(time.perf_counter() - start)
+    print(table([{name: row[name] for name in row if name not in ("beta", "Omega", *_OTHERS)}]), flush=True)
+    print(f"{clock} {case.name}: {seconds} s", flush=True)
+    return row | {"seconds": seconds, "measured": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}"}
+
+
+def write(folder: Path, row: Mapping[str, Any]) -> None:
+    """Put ``row`` into the file."""
+    before = load(folder, NAME)
+    write_csv(folder / f"{NAME}.csv", merged(before.rows if before else (), row), ["gamma 100"])
+
+
+if __name__ == "__main__":
+    main()
