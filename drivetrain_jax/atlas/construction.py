@@ -28,6 +28,8 @@ from drivetrain_jax.atlas.quantity import Quantity
 from drivetrain_jax.systems import Coordinate
 
 Rounds = Generator[np.ndarray, np.ndarray, Atlas]
+# A box with its exploration and the points that this asks for.
+_Open = tuple[Box, Exploration, np.ndarray]
 MAX_SOLVES = 400_000
 
 
@@ -94,45 +96,52 @@ def construct(
     are still open become gaps.
     """
     settings = Settings(quantity, tolerance, max_nodes)
-    active = [(box := domain.box(), explore(box, settings))]
-    requests = [next(active[0][1])]
-    panels: list[Panel] = []
-    gaps: list[Gap] = []
+    active = [_start(domain.box(), settings)]
+    done: list[Panel | Gap] = []
     ledger = Ledger()
     while active:
+        requests = [request for _, _, request in active]
         points = domain.points(np.concatenate(requests))
         new = ledger.missing(points)
         if len(ledger) + len(new) > max_solves:
-            gaps += [Gap(box.lower, box.upper, f"more than {max_solves} solves would be needed") for box, _ in active]
+            done += [Gap(box.lower, box.upper, f"more than {max_solves} solves would be needed") for box, *_ in active]
             break
         if len(new):
             ledger.add(new, np.asarray((yield new), float))
         answers = np.split(ledger.values(points), np.cumsum([len(x) for x in requests])[:-1])
-        going, requests = [], []
-        for (box, task), answer in zip(active, answers, strict=True):
-            try:
-                requests.append(task.send(answer))
-                going.append((box, task))
-            except StopIteration as end:
-                for part in end.value:
-                    if isinstance(part, Box):
-                        child = explore(part, settings)
-                        requests.append(next(child))
-                        going.append((part, child))
-                    else:
-                        (panels if isinstance(part, Panel) else gaps).append(part)
-        active = going
+        active, finished = _answer(active, answers, settings)
+        done += finished
     return Atlas(
         parameters=domain.parameters,
         coordinates=domain.coordinates,
         lower=np.array(domain.lower, float),
         upper=np.array(domain.upper, float),
         fixed=dict(domain.fixed),
-        panels=tuple(panels),
-        gaps=tuple(gaps),
+        panels=tuple(part for part in done if isinstance(part, Panel)),
+        gaps=tuple(part for part in done if isinstance(part, Gap)),
         tolerance=tolerance,
         solves=len(ledger),
     )
+
+
+def _start(box: Box, settings: Settings) -> _Open:
+    task = explore(box, settings)
+    return box, task, next(task)
+
+
+def _answer(
+    active: list[_Open], answers: list[np.ndarray], settings: Settings
+) -> tuple[list[_Open], list[Panel | Gap]]:
+    """The boxes that are open after their ``answers``, the parts of those that were split among them, and what is done."""
+    going: list[_Open] = []
+    done: list[Panel | Gap] = []
+    for (box, task, _), answer in zip(active, answers, strict=True):
+        try:
+            going.append((box, task, task.send(answer)))
+        except StopIteration as end:
+            going += [_start(part, settings) for part in end.value if isinstance(part, Box)]
+            done += [part for part in end.value if not isinstance(part, Box)]
+    return going, done
 
 
 def explore(box: Box, settings: Settings) -> Exploration:

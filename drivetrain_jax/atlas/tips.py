@@ -3,7 +3,7 @@
 A tip is a point of the stability boundary where the boundary function and its derivative along the speed (the axis of the
 system's predicted resonances) vanish. It is found by exclusion (:mod:`~drivetrain_jax.atlas.exclusion`), polished on the
 whole surrogate with the multiplier itself (ln|sigma| = 0, d ln|sigma|/d speed = 0) and named by the resonance at the foot
-of its ridge.
+of its ridge, or at the tip itself along a parameter that moves the resonances, along which no tongue grows.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from drivetrain_jax.atlas.criteria import Criteria, parameters_at
 from drivetrain_jax.atlas.exclusion import critical_points
 from drivetrain_jax.atlas.growth import Growth, growth
 from drivetrain_jax.atlas.panels import Atlas
-from drivetrain_jax.atlas.patches import patches_of
+from drivetrain_jax.atlas.patches import Patches, patches_of
 from drivetrain_jax.atlas.ridges import feet
 from drivetrain_jax.atlas.undamped import undamped_tips
 from drivetrain_jax.systems import Resonances, System
@@ -40,8 +40,9 @@ Box = Mapping[str, tuple[float, float]]
 class Tip:
     """``point`` maps the two parameters to their values at the tip, ``error`` to bounds of their errors.
 
-    ``name`` is the resonance the tongue grows from, empty if its ridge was lost; ``multiplier`` is ``+1``, ``-1`` or
-    ``pair`` and ``angle`` its argument in rad. ``opens`` tells a tongue's tip from a place where one closes or two meet.
+    ``name`` is the resonance the tongue grows from, empty if its ridge was lost or no resonance is clearly the nearest;
+    ``multiplier`` is ``+1``, ``-1`` or ``pair`` and ``angle`` its argument in rad. ``opens`` tells a tongue's tip from a
+    place where one closes or two meet, as the other parameter rises.
     ``proved`` is false for a tip in a box that was left undecided: the surrogate has one there, but within its error
     bound there may also be none, or several.
     """
@@ -81,16 +82,14 @@ def find_tips(atlas: Atlas, system: System, *, opening: bool = True) -> Tips:
         return Tips(_sorted(tips, atlas, horizontal), (), 0, False)
     patches = patches_of(criteria)
     searches = [critical_points(patches, k, horizontal) for k in range(len(patches))]
-    bottom = float(criteria.atlas.to_coordinates(atlas.lower)[1 - horizontal])
     tips: list[Tip] = []
     for kind, patch, search in zip(criteria.multipliers, patches, searches, strict=True):
         x, rates = polish(criteria, search.points, kind, horizontal)
         opens = (search.curvature * search.slope < 0) == (_rises(criteria, 1 - horizontal) > 0)
-        found = _describe(criteria, kind, horizontal, (x, rates, feet(patch, x, horizontal, bottom)), opens)
+        found = _describe(criteria, kind, horizontal, (x, rates, _named_at(criteria, patch, x, horizontal)), opens)
         x, rates = _suspected(criteria, kind, horizontal, search.undecided, x)
-        feet_of = feet(patch, x, horizontal, bottom)
         opens = rates.gradient[:, 1 - horizontal] * _rises(criteria, 1 - horizontal) > 0
-        likely = _describe(criteria, kind, horizontal, (x, rates, feet_of), opens)
+        likely = _describe(criteria, kind, horizontal, (x, rates, _named_at(criteria, patch, x, horizontal)), opens)
         tips += [*found, *(replace(tip, proved=False) for tip in likely)]
     undecided = tuple(_box(atlas, box) for search in searches for box in search.undecided)
     undecided += tuple(_box(atlas, np.stack([gap.lower, gap.upper])) for gap in atlas.gaps)
@@ -139,7 +138,7 @@ def _solve(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _describe(criteria: Criteria, kind: str, h: int, points: tuple, opens: np.ndarray) -> list[Tip]:
     """The tips among the zeros of one function: those where no other multiplier is larger."""
-    x, rates, foot = points
+    x, rates, compared = points
     atlas, system = criteria.atlas, criteria.system
     largest = np.log(criteria.spectral_radius(x))
     errors = _errors(rates, h)
@@ -151,7 +150,7 @@ def _describe(criteria: Criteria, kind: str, h: int, points: tuple, opens: np.nd
         scale = np.array([abs(float(slope[k](point[k]))) for k in range(2)])
         found.append(
             Tip(
-                _name(atlas, system, kind, h, foot[i]),
+                _name(atlas, system, kind, compared[i]),
                 kind,
                 abs(float(np.angle(rates.multiplier[i]))),
                 dict(zip(atlas.parameters, map(float, point), strict=True)),
@@ -193,25 +192,39 @@ def _predictions(atlas: Atlas, system: System) -> Resonances:
     basic = system.resonances
     if basic.up_to is None:
         return basic
-    values = _predicted(basic, atlas)
+    # Of the two ends of a parameter that moves the resonances one needs the higher order.
+    values = [_predicted(basic, atlas, end) for end in (atlas.lower, atlas.upper)]
     lowest = atlas.lower[atlas.parameters.index(basic.axis)]
     order = math.ceil(np.nanmax(values) / max(float(lowest), 1e-300) / 2) + 1
     return basic.up_to(min(order, _HIGHEST_ORDER))
 
 
-def _predicted(resonances: Resonances, atlas: Atlas) -> np.ndarray:
-    middle = dict(zip(atlas.parameters, (atlas.lower + atlas.upper) / 2, strict=True))
-    return np.asarray(resonances.values({**middle, **atlas.fixed}))
+def _predicted(resonances: Resonances, atlas: Atlas, point: np.ndarray) -> np.ndarray:
+    return np.asarray(resonances.values({**dict(zip(atlas.parameters, point, strict=True)), **atlas.fixed}))
 
 
-def _name(atlas: Atlas, system: System, kind: str, h: int, foot: float) -> str:
+def _named_at(criteria: Criteria, patch: Patches, x: np.ndarray, h: int) -> np.ndarray:
+    """Points ``(N, 2)`` whose speeds are compared with the predictions, for tips ``x``: the feet of their ridges.
+
+    Along a parameter that moves the resonances a tongue has no foot: a tip is where it has shrunk to nothing at the
+    angle of the atlas, and its ridge may leave the rectangle or bend faster than it can be followed. There it is the tip.
+    """
+    atlas, v = criteria.atlas, 1 - h
+    if atlas.parameters[v] in criteria.system.resonances.parameters:
+        return x
+    bottom = float(atlas.to_coordinates(atlas.lower)[v])
+    points = np.full(x.shape, bottom)
+    points[:, h] = feet(patch, x, h, bottom)
+    return points
+
+
+def _name(atlas: Atlas, system: System, kind: str, x: np.ndarray) -> str:
+    """The resonance of this multiplier that is clearly the nearest to ``x`` in coordinates, or nothing."""
     resonances = _predictions(atlas, system)
-    if not np.isfinite(foot) or not resonances.multipliers:
+    if not np.isfinite(x).all() or not resonances.multipliers:
         return ""
-    speed = float(atlas.coordinates[h].inverse(np.asarray(foot)))
-    # The foot lies where the other parameter is least, and resonances may depend on it.
-    lowest = dict(zip(atlas.parameters, atlas.lower, strict=True))
-    distance = np.abs(np.asarray(resonances.values({**lowest, **atlas.fixed})) / speed - 1)
+    point = atlas.to_parameters(x)
+    distance = np.abs(_predicted(resonances, atlas, point) / point[atlas.parameters.index(resonances.axis)] - 1)
     distance[[m != kind for m in resonances.multipliers]] = np.inf
     first, second = np.argsort(distance)[:2]
     clear = distance[first] < _NEAR and distance[second] > _CLEAR * distance[first]

@@ -13,16 +13,16 @@ import numpy as np
 
 from drivetrain_jax.atlas.patches import Patches
 
-# Longest and shortest step, first step, largest turn and correction of a step, growth of the steps.
+# Longest and shortest step, first step, largest turn and correction of a step, growth of the steps. The shortest, the first
+# and the growth only decide how many steps are taken: each is accepted or refused by its turn and its correction.
 _LONGEST, _SHORTEST, _FIRST = 0.015, 1e-7, 1e-5
 _TURN, _CORRECTION, _GROWTH = 0.25, 0.15, 1.6
 _NEWTON, _MAX_STEPS = 3, 800
-# Newton's steps onto a flank: a slanted ridge is wider than its tongue near the tip, and the start is far off.
-_ENTER = 12
 # The largest last step of Newton's method with which a point counts as one of the curve: between the edges of a narrow
 # tongue it converges slowly.
 _SETTLED = 1e-9
-# Distances from a tip in the other coordinate at which its flanks are entered.
+# Distances from a tip in the other coordinate at which its flanks are entered: far enough to step on from, and near enough
+# that they can be joined to the tip by chords; a factor of ten either way changes nothing.
 _APPROACH = 1e-4 * np.array([1 / 64, 1 / 16, 1 / 4, 1.0])
 
 
@@ -99,21 +99,26 @@ def trace_tips(field: Field, tips: np.ndarray, horizontal: int) -> list[Curve]:
 
 def _flank(field: Field, top: np.ndarray, h: int, side: float) -> np.ndarray:
     """Points on one flank of each tip, ``(M, k, 2)``, away from it in the other coordinate like squares."""
-    v = 1 - h
-    size = field.upper - field.lower
-    place = field.patches.locate(field.to_coordinates(top))
-    bend = field.bend(h).at(*place) * size[h] ** 2
-    slope = field.slopes[v].at(*place) * size[v]
+    v, bend = 1 - h, field.bend(h)
+
+    def curvature(y: np.ndarray) -> np.ndarray:
+        return bend.at(*field.patches.locate(field.to_coordinates(y))) * (field.upper - field.lower)[h] ** 2
+
+    inwards = -np.sign(field(top)[1][:, v] * curvature(top))
     points = np.empty((len(top), len(_APPROACH), 2))
+    y = top.copy()
     for k, distance in enumerate(_APPROACH):
-        y = top.copy()
+        y[:, v] = top[:, v] + inwards * distance
         with np.errstate(all="ignore"):
-            y[:, v] -= np.sign(slope * bend) * distance
-            y[:, h] += side * np.sqrt(2 * np.abs(slope / bend) * distance)
-            for _ in range(_ENTER):
-                value, gradient = field(y)
-                y[:, h] -= value / gradient[:, h]
-        points[:, k] = y
+            # A slanted ridge shifts by more than the width of its tongue: from the ridge there, not from the tip.
+            for _ in range(_NEWTON):
+                y[:, h] -= field(y)[1][:, h] / curvature(y)
+            edge = y.copy()
+            edge[:, h] += side * np.sqrt(-2 * field(y)[0] / curvature(y))
+            for _ in range(_NEWTON):
+                value, gradient = field(edge)
+                edge[:, h] -= value / gradient[:, h]
+        points[:, k] = edge
     return points
 
 
@@ -129,13 +134,18 @@ def _follow(field: Field, start: np.ndarray, sense: np.ndarray) -> tuple[list[np
         mine = np.flatnonzero(alive)
         if not mine.size:
             break
-        new, moved, turned = _correct(field, y[mine] + step[mine, None] * tangent[mine], sense[mine])
+        ahead = y[mine] + step[mine, None] * tangent[mine]
+        new, moved, turned = _correct(field, ahead, sense[mine])
+        # Outside there is no curve to correct to.
+        gone = _outside(ahead) | _outside(new)
+        ends = np.where(_outside(ahead)[:, None], ahead, new)[gone]
+        new[gone], moved[gone], turned[gone] = _meet_rim(field, y[mine[gone]], ends, sense[mine[gone]])
         cosine = (turned * tangent[mine]).sum(axis=1)
         good = (moved <= _CORRECTION * step[mine]) & (cosine >= np.cos(_TURN))
-        gone = good & ((new < 0) | (new > 1)).any(axis=1)
+        gone &= good
         home = good & ~gone & _passes(first[mine], y[mine], new, length[mine])
-        for i, a, b, out, back in zip(mine[good], y[mine[good]], new[good], gone[good], home[good], strict=True):
-            paths[i].append(_to_rim(field, a, b) if out else first[i] if back else b)
+        for i, point, back in zip(mine[good], new[good], home[good], strict=True):
+            paths[i].append(first[i] if back else point)
         returned[mine[home]] = True
         length[mine[good]] += step[mine[good]]
         y[mine[good]], tangent[mine[good]] = new[good], turned[good]
@@ -154,21 +164,43 @@ def _correct(field: Field, y: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray
         with np.errstate(all="ignore"):
             last = (value / (gradient**2).sum(axis=1))[:, None] * gradient
         new = new - last
-    _, gradient = field(new)
-    with np.errstate(all="ignore"):
-        normal = gradient / np.linalg.norm(gradient, axis=1)[:, None]
-    tangent = np.stack([-normal[:, 1], normal[:, 0]], axis=-1) * sense[:, None]
+    tangent = _tangent(field(new)[1], sense)
     moved = np.linalg.norm(new - y, axis=1)
     settled = np.isfinite(moved) & (np.linalg.norm(last, axis=1) <= _SETTLED)
     return new, np.where(settled, moved, np.inf), tangent
+
+
+def _tangent(gradient: np.ndarray, sense: np.ndarray) -> np.ndarray:
+    with np.errstate(all="ignore"):
+        normal = gradient / np.linalg.norm(gradient, axis=1)[:, None]
+    return np.stack([-normal[:, 1], normal[:, 0]], axis=-1) * sense[:, None]
+
+
+def _outside(y: np.ndarray) -> np.ndarray:
+    return ((y < 0) | (y > 1)).any(axis=1)
+
+
+def _meet_rim(
+    field: Field, a: np.ndarray, b: np.ndarray, sense: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the curve meets the rim between ``a`` inside and ``b`` outside, as :func:`_correct` gives points."""
+    new = np.array([_to_rim(field, *ends) for ends in zip(a, b, strict=True)]).reshape(-1, 2)
+    value, gradient = field(new)
+    way, step = new - a, b - a
+    with np.errstate(all="ignore"):
+        beside = np.abs(way[:, 0] * step[:, 1] - way[:, 1] * step[:, 0]) / np.linalg.norm(step, axis=1)
+        settled = np.abs(value) <= _SETTLED * np.linalg.norm(gradient, axis=1)
+    return new, np.where(settled, beside, np.inf), _tangent(gradient, sense)
 
 
 def _passes(first: np.ndarray, a: np.ndarray, b: np.ndarray, length: np.ndarray) -> np.ndarray:
     """Whether the step from ``a`` to ``b`` passes the first point again."""
     step = b - a
     size = np.linalg.norm(step, axis=1)
-    along = ((first - a) * step).sum(axis=1) / size
-    across = np.linalg.norm(first - a - (along / size)[:, None] * step, axis=1)
+    # A path that starts on the rim and leads outwards ends where it is.
+    with np.errstate(invalid="ignore"):
+        along = ((first - a) * step).sum(axis=1) / size
+        across = np.linalg.norm(first - a - (along / size)[:, None] * step, axis=1)
     return (length > 4 * size) & (along >= 0) & (along <= size) & (across < 0.1 * size)
 
 

@@ -59,7 +59,7 @@ def test_a_curve_is_traced_both_ways_from_its_seed():
     h, v = curve.points.T
     assert h == pytest.approx((2 * v**2 - 1) / 5, abs=1e-12) and not curve.closed
     assert np.abs(np.diff(curve.points, axis=0)).max() < 0.04 and (np.diff(v) > 0).all() == (v[0] < 0)
-    assert sorted([v[0], v[-1]]) == pytest.approx([-1.0, 1.0])
+    assert sorted([v[0], v[-1]]) == [-1.0, 1.0]
 
 
 def test_a_closed_curve_ends_where_it_began():
@@ -68,6 +68,8 @@ def test_a_closed_curve_ends_where_it_began():
     (curve,) = tracing.trace(field, np.array([[0.51, 0.0]]))
     assert curve.closed and np.array_equal(curve.points[0], curve.points[-1])
     assert np.linalg.norm(curve.points, axis=1) == pytest.approx(np.full(len(curve.points), 0.5), abs=1e-12)
+    # Around once.
+    assert np.linalg.norm(np.diff(curve.points, axis=0), axis=1).sum() == pytest.approx(np.pi, rel=1e-3)
 
 
 def test_the_other_edge_of_a_narrow_tongue_is_another_curve():
@@ -86,6 +88,19 @@ def test_parts_that_bound_nothing_are_left_out():
     assert [part["beta"].tolist() for part in curve.segments()] == [[0.0, 1.0], [3.0, 4.0]]
 
 
+def test_a_path_ends_on_the_rim():
+    """Straight across, both ends are on it; bent, the last step is corrected along it."""
+    (curve,) = tracing.trace(tracing.Field(one_patch([[-0.3, 0.0], [1.0, 0.0]])), np.array([[0.3, 0.1]]))
+    assert sorted(curve.points[[0, -1], 1]) == [-1.0, 1.0]
+
+    def field(y):
+        slope = np.stack([np.ones(len(y)), -0.6 * (y[:, 1] - 1)], axis=-1)
+        return y[:, 0] - 0.5 - 0.3 * (y[:, 1] - 1) ** 2, slope
+
+    end = tracing._to_rim(field, np.array([0.50003, 0.99]), np.array([0.50003, 1.01]))
+    assert end == pytest.approx([0.5, 1.0], abs=1e-12)
+
+
 def test_a_path_that_runs_along_the_rim_ends_where_it_is():
     """Both of its points lie outside by rounding: the line through them meets the rim far away."""
 
@@ -96,13 +111,62 @@ def test_a_path_that_runs_along_the_rim_ends_where_it_is():
     assert end == pytest.approx([0.0, 0.5], abs=0.02)
 
 
-def test_points_lie_on_the_edges_of_a_narrow_slanted_tongue():
-    """(h - 0.3 v - 0.3 v^2)^2 = 1e-6 (v + 0.5): slow convergence must not pass for a point of the curve."""
+@pytest.mark.parametrize(("foot", "width"), [(-0.5, 1e-6), (0.0, 1e-6), (0.0, 1e-7)])
+def test_points_lie_on_the_edges_of_a_narrow_slanted_tongue(foot, width):
+    """(h - 0.3 v - 0.3 v^2)^2 = width (v - foot), slanted at its tip but for the first: slow convergence must not pass for a
+    point of the curve, nor both flanks lie on one edge."""
     t = np.cos(np.pi * (np.arange(8) + 0.5) / 8)
     analysis = np.linalg.inv(np.polynomial.chebyshev.chebvander(t, 7))
     h, v = np.meshgrid(t, t, indexing="ij")
-    field = tracing.Field(one_patch(analysis @ ((h - 0.3 * v - 0.3 * v**2) ** 2 - 1e-6 * (v + 0.5)) @ analysis.T))
-    (curve,) = tracing.trace_tips(field, np.array([[-0.075, -0.5]]), 0)
+    values = (h - 0.3 * v - 0.3 * v**2) ** 2 - width * (v - foot)
+    field = tracing.Field(one_patch(analysis @ values @ analysis.T))
+    (curve,) = tracing.trace_tips(field, np.array([[0.3 * foot + 0.3 * foot**2, foot]]), 0)
     value, gradient = field(field.to_unit(curve.points))
-    tip = np.abs(curve.points[:, 1] + 0.5) < 1e-12
-    assert (np.abs(value) / np.linalg.norm(gradient, axis=1))[~tip].max() < 1e-9
+    h, v = curve.points.T
+    top = np.argmin(np.abs(v - foot))
+    assert (np.abs(value) / np.linalg.norm(gradient, axis=1))[np.arange(len(v)) != top].max() < 1e-9
+    side = np.sign(h - 0.3 * v - 0.3 * v**2)
+    assert (side[:top] == -1).all() and (side[top + 1 :] == 1).all()
+    assert v[0] == v[-1] == 1.0
+
+
+def test_steps_turn_by_what_chords_can_represent():
+    """A circle on which the turn limits the step: no step may turn by more than a quarter, none need turn by far less."""
+    radius = 0.02
+
+    def field(y):
+        return ((y - 0.5) ** 2).sum(axis=1) - radius**2, 2 * (y - 0.5)
+
+    (path,), returned = tracing._follow(field, np.array([[0.5 + radius, 0.5]]), np.ones(1))
+    assert returned.all() and 50 < len(path) < 100
+    angle = np.unwrap(np.arctan2(path[:, 1] - 0.5, path[:, 0] - 0.5))
+    assert abs(angle[-1] - angle[0]) == pytest.approx(2 * np.pi)
+    turns = np.abs(np.diff(angle))[-30:-2]
+    # It grows by 1.6 from below a twelfth of a radian.
+    assert turns.min() > 1 / 12 and turns.max() < 1.65 / 12
+
+
+@pytest.mark.parametrize(("shift", "end"), [(0.0015, 1.0), (0.004, 0.6)])
+def test_a_curve_beside_the_tangent_is_another_one(shift, end):
+    """A straight line that goes on elsewhere from v = 0.6, by a tenth and by a quarter of the longest step: with the same
+    tangent, only the size of the correction tells."""
+
+    def field(y):
+        return y[:, 0] - 0.5 - shift * (y[:, 1] > 0.6), np.tile([1.0, 0.0], (len(y), 1))
+
+    (path,), _ = tracing._follow(field, np.array([[0.5, 0.3]]), np.ones(1))
+    assert path[-1, 1] == pytest.approx(end, abs=1e-6)
+
+
+def test_a_path_ends_where_the_function_does():
+    """Values only below v = 0.7: the step is divided until it is nothing, in few more evaluations."""
+    asked = []
+
+    def field(y):
+        asked.append(len(y))
+        known = np.where(y[:, 1] < 0.7, 1.0, np.nan)
+        return (y[:, 0] - 0.5) * known, np.tile([1.0, 0.0], (len(y), 1)) * known[:, None]
+
+    (path,), returned = tracing._follow(field, np.array([[0.5, 0.3]]), np.ones(1))
+    assert path[-1] == pytest.approx([0.5, 0.7], abs=1e-6) and not returned.any()
+    assert len(asked) < 400
