@@ -55,7 +55,8 @@ class Solver:
     ``effort`` is a traced integer, the largest that ``effort(columns)`` predicts in the batch (columns: NumPy arrays
     of shape ``(N,)``; a count of steps or the like; by default the same for all points). The engine gives every point
     to the solver for which ``effort * unit_cost`` is smallest and runs batches of ``chunk`` points of similar effort.
-    ``march`` marks integrations in time that are compiled otherwise (``numerics.kernels.compiler_options``).
+    ``march`` marks integrations in time that are compiled otherwise (``numerics.kernels.compiler_options``), ``lengthy``
+    those of which one point takes as long as a compilation.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Solver:
     broadcasts: bool = False
     chunk: int = 256
     march: bool = False
+    lengthy: bool = False
 
 
 @dataclass(frozen=True)

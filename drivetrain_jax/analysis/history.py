@@ -172,7 +172,8 @@ def _effort(system: System, request: Request, columns: Mapping[str, np.ndarray])
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     name = f"diffrax: {request.options['solver']}"
-    return (Solver(name, partial(_solve, system, request), partial(_effort, system, request), chunk=16, march=True),)
+    solve, effort = partial(_solve, system, request), partial(_effort, system, request)
+    return (Solver(name, solve, effort, chunk=16, march=True, lengthy=True),)
 
 
 def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:

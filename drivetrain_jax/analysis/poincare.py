@@ -168,9 +168,9 @@ def _effort(request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     solve, effort = partial(_solve, system, request), partial(_effort, request)
     if request.method == "adaptive":
-        return (Solver("adaptive", solve, effort, chunk=16, march=True),)
+        return (Solver("adaptive", solve, effort, chunk=16, march=True, lengthy=True),)
     chunk = max(1, min(_CHUNK, _NUMBERS // (2 * request.options["strobes"])))
-    return (Solver("fixed", solve, effort, broadcasts=True, chunk=chunk, march=True),)
+    return (Solver("fixed", solve, effort, broadcasts=True, chunk=chunk, march=True, lengthy=True),)
 
 
 def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:

@@ -14,7 +14,7 @@ from drivetrain_jax.store.provenance import digest
 from drivetrain_jax.sweep import compile_cache
 from drivetrain_jax.sweep.grid import Grid
 from drivetrain_jax.sweep.identity import numerics_of, scene_digest
-from drivetrain_jax.sweep.kernel import Kernel, kernel_of
+from drivetrain_jax.sweep.kernel import Kernel, kernel_of, of_few
 from drivetrain_jax.sweep.plan import Chunk, Plan, make_plan
 from drivetrain_jax.sweep.scene import Scene
 
@@ -83,8 +83,10 @@ class Engine:
                 return
             compile_cache.enable()
             pool = ThreadPoolExecutor(len(missing), thread_name_prefix="compile")
-            for solver, size in missing:
-                self._kernels[solver, size] = pool.submit(kernel_of, self.scene, self.grid, self.solvers[solver], size)
+            for index, size in missing:
+                solver = self.solvers[index]
+                few = not self._full_size and of_few(self.grid, solver)
+                self._kernels[index, size] = pool.submit(kernel_of, self.scene, self.grid, solver, size, few)
             pool.shutdown(wait=False)
 
     def compute_chunk(self, chunk: Chunk) -> Mapping[str, np.ndarray]:

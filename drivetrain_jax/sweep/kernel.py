@@ -16,12 +16,14 @@ from jax import Array
 
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import Solver
-from drivetrain_jax.analysis.numerics.kernels import compiler_options
+from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
 from drivetrain_jax.sweep.assemble import result_variables
 from drivetrain_jax.sweep.grid import Grid
 from drivetrain_jax.sweep.scene import Scene
 
 _LAPACK = threading.Lock()
+# A scene of so few points is computed in less time than it takes to optimise its kernels.
+_FEW = 128
 
 
 @dataclass(frozen=True)
@@ -77,15 +79,20 @@ def result_shapes(scene: Scene, grid: Grid, solver: Solver) -> dict[str, tuple[i
     return {v.name: shapes[v.name].shape[:-1] if solver.broadcasts else shapes[v.name].shape[1:] for v in variables}
 
 
-def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[Variable]) -> Kernel:
-    """Compile ``solver`` for chunks of ``chunk`` points of ``grid``.
+def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[Variable], few: bool = False) -> Kernel:
+    """Compile ``solver`` for chunks of ``chunk`` points of ``grid``, for ``few`` of them in all without optimising.
 
     Fixed parameters are constants of the compiled code; the varying ones and the effort are its arguments.
     """
     batch, columns = _batch(solver, grid, chunk, variables)
     lowered = jax.jit(batch).lower(columns, jax.ShapeDtypeStruct((), np.int64))
-    compiled = lowered.compile(compiler_options(chunk, march=solver.march))
+    compiled = lowered.compile(options_for_few() if few else compiler_options(chunk, march=solver.march))
     return Kernel(compiled, chunk, solver.broadcasts, tuple(variables), _turn(compiled))
+
+
+def of_few(grid: Grid, solver: Solver) -> bool:
+    """Whether kernels of ``solver`` are not worth optimising: by the whole grid, whatever part of it is computed where."""
+    return grid.size * grid.path_length <= _FEW and not solver.lengthy
 
 
 @dataclass(frozen=True)
@@ -98,8 +105,9 @@ class _Job:
     solver: Solver = field(compare=False)
 
 
-def kernel_of(scene: Scene, grid: Grid, solver: Solver, size: int) -> Kernel:
-    """The kernel of ``solver`` for chunks of ``size`` points of ``scene``, made if no scene before needed the same."""
+def kernel_of(scene: Scene, grid: Grid, solver: Solver, size: int, few: bool = False) -> Kernel:
+    """The kernel of ``solver`` for chunks of ``size`` points of ``scene``, made if no scene before needed the same; ``few``
+    see :func:`compile_kernel`."""
     # What varies is an argument of the kernel, so one value of each axis is enough to keep.
     axes = tuple(replace(axis, values=axis.values[:1]) for axis in grid.axes)
     request = scene.request
@@ -116,13 +124,14 @@ def kernel_of(scene: Scene, grid: Grid, solver: Solver, size: int) -> Kernel:
         path,
         solver.name,
         size,
+        few,
     )
-    return _compiled(_Job(identity, replace(scene, axes=axes), replace(grid, axes=axes), solver), size)
+    return _compiled(_Job(identity, replace(scene, axes=axes), replace(grid, axes=axes), solver), size, few)
 
 
 @lru_cache(maxsize=64)
-def _compiled(job: _Job, size: int) -> Kernel:
-    return compile_kernel(job.solver, job.grid, size, result_variables(job.scene))
+def _compiled(job: _Job, size: int, few: bool) -> Kernel:
+    return compile_kernel(job.solver, job.grid, size, result_variables(job.scene), few)
 
 
 def _turn(compiled: Any) -> AbstractContextManager[object]:

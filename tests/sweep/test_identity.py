@@ -68,10 +68,9 @@ def test_numerics_decide(monkeypatch):
 
 
 def test_source_of_systems_analyses_and_engine_decides(monkeypatch):
-    seen = []
-    monkeypatch.setattr(identity, "source_digest", lambda files: seen.append(files) or "x")
+    files = {}
+    monkeypatch.setattr(identity, "_source_digest", lambda name, path: str(files.setdefault(name, path)))
     digest(BASE)
-    files = {name: path for some in seen for name, path in some.items()}
     assert {"analysis/_base.py", "systems/_base.py", "sweep/kernel.py", "sweep/plan.py", "toy.py"} <= set(files)
     assert files["toy.py"].samefile(toy.__file__)
 

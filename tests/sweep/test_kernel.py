@@ -6,6 +6,7 @@ import os
 import stat
 import subprocess
 import sys
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,8 @@ import pytest
 
 from drivetrain_jax.analysis.numerics import kernels
 from drivetrain_jax.sweep import kernel
+from drivetrain_jax.sweep.engine import Engine
+from drivetrain_jax.sweep.scene import load_scene
 
 
 def test_double_precision():
@@ -82,3 +85,18 @@ def test_kernels_with_lapack_calls_take_turns():
     without = jax.jit(jnp.sin).lower(matrix).compile()
     assert kernel._turn(with_lapack) is kernel._turn(with_lapack) is kernel._LAPACK
     assert kernel._turn(without) is not kernel._LAPACK
+
+
+def test_scenes_of_few_points_are_compiled_without_optimising(monkeypatch):
+    """Not those whose points take long, nor the rounds of an atlas, whose kernels serve further ones."""
+    given = []
+    monkeypatch.setattr(kernel, "compile_kernel", lambda *of: given.append(of[-1]) or object())
+    kernel._compiled.cache_clear()
+    for count, lengthy, full_size in ((128, False, False), (129, False, False), (2, True, False), (2, False, True)):
+        scene = load_scene({"system": "toy", "analysis": "toy", "axes": {"a": {"start": 0, "stop": 1, "num": count}}})
+        engine = Engine(scene, full_size=full_size)
+        engine.solvers = tuple(replace(solver, lengthy=lengthy) for solver in engine.solvers)
+        engine.prepare({(0, 16)})
+        assert all(future.result() for future in engine._kernels.values())
+        kernel._compiled.cache_clear()
+    assert given == [True, False, False, False]
