@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: atlas test validate faults bench validation gallery docs lint clean
+.PHONY: atlas test validate faults lint bench validation gallery docs help clean
 
 atlas: $(VENV)/installed  ## the quickstart atlas and its figure, in out/
 	@mkdir -p $(OUT)
@@ -20,7 +20,7 @@ validate: $(VENV)/installed-test  ## the comparisons at full size
 faults: $(VENV)/installed-test  ## real faults at random moments; writes the table of docs/reliability.md
 	$(BIN)/python tests/faults/suite.py
 
-lint: $(VENV)/installed-test
+lint: $(VENV)/installed-test  ## style, formatting, directions of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
@@ -28,7 +28,7 @@ lint: $(VENV)/installed-test
 bench: $(VENV)/installed-bench  ## error against run time, with the peers; writes benchmarks/results/, docs/benchmarks.md and the figures of README.md
 	$(BIN)/drivetrain bench
 
-validation: $(VENV)/installed  ## regenerates docs/validation/
+validation: $(VENV)/installed-bench  ## regenerates docs/validation/
 	$(BIN)/python -m benchmarks.validation
 
 gallery: $(VENV)/installed  ## every scene of sweeps/ and its figure, in out/gallery/
@@ -57,5 +57,8 @@ $(VENV)/installed-docs: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
 	@touch $@
 
-clean:
+help:  ## this list
+	@sed -n 's/^\([a-z]*\):.*##  *\(.*\)/\1\t\2/p' Makefile | expand -t 12
+
+clean:  ## removes the virtual environment and out/
 	rm -rf $(VENV) $(OUT)

@@ -4,7 +4,8 @@
 
 A full run rewrites benchmarks/results/, docs/benchmarks.md and the measured part of README.md. With ``--quick``, or
 another ``--out``, files and page go to that folder. A study whose peer is not installed is left out, and said so; one
-that fails does not stop the others. ``drivetrain bench`` and ``make bench`` run this.
+that fails does not stop the others. An interrupt leaves the files of unfinished studies, and the page, as they were.
+``drivetrain bench`` and ``make bench`` run this.
 
 ``--quick`` takes the chart at equal error and the work-precision of every system, with fewer settings, regions and points;
 all that is about rates alone or sizes it leaves out, unless a SYSTEM is asked for.
@@ -28,6 +29,8 @@ from drivetrain_jax.cli.replies import WRONG_INPUT, one_line
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "benchmarks.md"
+# What a shell reports of a process that an interrupt ends.
+INTERRUPTED = 130
 SYSTEMS = ("cardan", "bicardan", "planetary", "rattle", "tripod")
 
 
@@ -105,7 +108,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.quick and not options.systems:
         print(f"--quick leaves out {', '.join(study.module for study in chosen if not study.quick)}", flush=True)
         chosen = [study for study in chosen if study.quick]
-    failed = run(chosen, options.quick, folder, options.peers)
+    try:
+        failed = run(chosen, options.quick, folder, options.peers)
+    except KeyboardInterrupt:
+        sys.stderr.write(
+            "interrupted: the files of the studies that ended are new, all others and the page as they were\n"
+        )
+        return INTERRUPTED
     page = PAGE if folder == RESULTS else folder / "benchmarks.md"
     write_page(folder, page)
     if folder == RESULTS:

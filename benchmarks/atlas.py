@@ -14,7 +14,7 @@ verdict. Times of the package for each number of cells:
 
 What `warm` takes beyond `construction` and `evaluation` is the checking of the scene, the digest of the code and the
 labelled result. In the construction the rounds (lines along the edges, refined, then the tensor) follow each other, and a
-round of few points keeps one core waiting; a third of every solve is the second step size, which bounds its error.
+round of few points keeps one core waiting.
 
 Last row: an atlas over four parameters (sweeps/cardan_atlas_4d.toml) opened and sliced to a chart of 1000 x 1000 cells.
 
@@ -240,8 +240,8 @@ def _atlas_errors(path: Path) -> tuple[float, float]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, write the CSV, print the table."""
     known = parser(__doc__)
-    known.add_argument("--cells", type=int, nargs="+", default=list(CELLS), help="quick: 30,000")
-    known.add_argument("--repeats", type=int, default=3)
+    known.add_argument("--cells", type=int, nargs="+", default=list(CELLS), help="sizes of the chart (%(default)s)")
+    known.add_argument("--repeats", type=int, default=3, help="runs of which the median counts (%(default)s)")
     options = known.parse_args(arguments)
     rows = []
     with tempfile.TemporaryDirectory() as folder:

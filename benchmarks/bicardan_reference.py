@@ -11,6 +11,7 @@ the system by name.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -147,36 +148,48 @@ def _lowest(K: np.ndarray, M: np.ndarray, shift: float, modes: int) -> np.ndarra
 
 
 def transfer_determinant(p: float, parameters: Mapping[str, Any]) -> float:
-    """Psi(p) of the paper, (25), from plain transfer matrices; for k_A = 0 too."""
+    """Psi(p) of the paper, (25), from plain transfer matrices; for k_A = 0 too. Parameters are Python's own floats."""
     k_A, k_D = parameters["k_A"], parameters["k_D"]
-    state = np.array([[0.0, 1.0], [1.0, 0.0], [0.0, 0.0], [0.0, k_A]])
+    # The two columns that the left end leaves free, entry by entry: small arrays of NumPy take several times as long.
+    columns = ((0.0, 1.0, 0.0, 0.0), (1.0, 0.0, 0.0, k_A))
     for length, EI, rhoA in zip(parameters["length"], parameters["EI"], parameters["rhoA"], strict=True):
         alpha = (p * p * rhoA / EI) ** 0.25
         z = alpha * length
-        c, s, ch, sh = np.cos(z), np.sin(z), np.cosh(z), np.sinh(z)
-        f = (0.5 * (ch + c), 0.5 * (sh + s), 0.5 * (ch - c), 0.5 * (sh - s))
-        krylov = np.array([[f[(j - i) % 4] for j in range(4)] for i in range(4)])
-        scale = np.array([1.0, 1 / alpha, -1 / (alpha**2 * EI), -1 / (alpha**3 * EI)])
-        state = (krylov * scale / scale[:, None]) @ state
-    (r11, r12), _, (r31, r32), (r41, r42) = state
+        c, s, ch, sh = math.cos(z), math.sin(z), math.cosh(z), math.sinh(z)
+        f0, f1, f2, f3 = 0.5 * (ch + c), 0.5 * (sh + s), 0.5 * (ch - c), 0.5 * (sh - s)
+        moment = alpha * alpha * EI
+        force = alpha * moment
+        moved = []
+        for deflection, slope, bent, sheared in columns:
+            x, y, u, w = deflection, slope / alpha, -bent / moment, -sheared / force
+            moved.append(
+                (
+                    f0 * x + f1 * y + f2 * u + f3 * w,
+                    (f3 * x + f0 * y + f1 * u + f2 * w) * alpha,
+                    -(f2 * x + f3 * y + f0 * u + f1 * w) * moment,
+                    -(f1 * x + f2 * y + f3 * u + f0 * w) * force,
+                )
+            )
+        columns = tuple(moved)
+    (r11, _, r31, r41), (r12, _, r32, r42) = columns
     return (r31 * r42 - r32 * r41) - k_D * (r11 * r32 - r12 * r31)
 
 
 def determinant_roots(parameters: Mapping[str, Any], modes: int, points_per_mode: int = 12) -> np.ndarray:
     """The first ``modes`` natural angular frequencies by a scan of the determinant and Brent's method."""
+    lists = {name: [float(value) for value in parameters[name]] for name in ("length", "EI", "rhoA")}
+    shaft = lists | {name: float(parameters[name]) for name in ("k_A", "k_D")}
     beta = sum(
         length * (rhoA / EI) ** 0.25
-        for length, EI, rhoA in zip(parameters["length"], parameters["EI"], parameters["rhoA"], strict=True)
+        for length, EI, rhoA in zip(shaft["length"], shaft["EI"], shaft["rhoA"], strict=True)
     )
-    step = np.pi / beta / points_per_mode
+    step = math.pi / beta / points_per_mode
     roots: list[float] = []
     q = 1e-3 * step
-    before = transfer_determinant(q * q, parameters)
+    before = transfer_determinant(q * q, shaft)
     while len(roots) < modes:
-        after = transfer_determinant((q + step) ** 2, parameters)
+        after = transfer_determinant((q + step) ** 2, shaft)
         if before * after < 0:
-            roots.append(
-                brentq(transfer_determinant, q * q, (q + step) ** 2, args=(parameters,), xtol=1e-12, rtol=1e-13)
-            )
+            roots.append(brentq(transfer_determinant, q * q, (q + step) ** 2, args=(shaft,), xtol=1e-12, rtol=1e-13))
         q, before = q + step, after
     return np.array(roots)

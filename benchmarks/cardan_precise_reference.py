@@ -14,8 +14,8 @@ a fixed part of the distance to the nearest pole of eta. Numbers are integers ov
 
 from __future__ import annotations
 
+import argparse
 import math
-import sys
 from collections.abc import Mapping
 
 import mpmath
@@ -110,10 +110,17 @@ def _advance(column: list[int], eta: np.ndarray, h: int, constants: list[int]) -
 
 def main() -> None:
     """Print the spectral radius of the point given."""
-    names = ("beta", "Omega", "zeta", "alpha", "mu", "gamma")
-    defaults = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
-    point = defaults | dict(zip(names, map(float, sys.argv[1:]), strict=False))
-    print(mpmath.nstr(spectral_radius(point), 32))
+    known = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    for name, default in (
+        ("beta", None),
+        ("Omega", None),
+        ("zeta", 0.001),
+        ("alpha", 1.0),
+        ("mu", 1.0),
+        ("gamma", 100.0),
+    ):
+        known.add_argument(name, type=float, nargs="?" if default else None, default=default)
+    print(mpmath.nstr(spectral_radius(vars(known.parse_args())), 32))
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ def speed_ratio(tau: float, c: Any, s2: Any) -> tuple[Any, Any, Any]:
 
 
 def damping_and_stiffness(tau: float, p: Parameters) -> tuple[Pair, Pair]:
-    """The checked ``E`` and ``P``; the printed ones lack eta'', half of eta' and a sign (docs/validation.md).
+    """The checked ``E`` and ``P``; the printed ones lack eta'', half of eta' and a sign (docs/validation/cardan.md).
 
     Besides the six parameters ``p`` holds ``cos_beta`` and ``sin2_beta``, computed once and not at every ``tau``.
     """

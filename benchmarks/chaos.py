@@ -5,10 +5,11 @@
 Lorenz (10, 28, 8/3) with three tangent vectors, made orthonormal every half time unit, and the double tripod (29) at
 3066.5 Hz with two, made orthonormal at every strobe: ours with equal steps, the others adaptive. What is timed of the
 package is its own march with the divergence and the records of every segment (``record_growth``), 64 members at a time in
-each of two threads; the others run in two spawned processes. Methods take turns, so that a change in the machine's load
-hits all alike (pynamicalsys comes after them); rates are medians. Errors are those of state and tangent vectors after one
-time unit of Lorenz' system (from points of the attractor) and after 16 strobes of the tripod, relative to their size, root
-mean square, against SciPy at 1e-13. Methods are compared at the error that SciPy's DOP853 has at tolerance 1e-10.
+each of two threads; the others run in two spawned processes, SciPy member by member, heyoka.py eight members in a batch,
+the vectors of 256 made orthonormal together. Methods take turns, so that a change in the machine's load hits all alike
+(pynamicalsys comes after them); rates are medians. Errors are those of state and tangent vectors after one time unit of
+Lorenz' system (from points of the attractor) and after 16 strobes of the tripod, relative to their size, root mean
+square, against SciPy at 1e-13. Methods are compared at the error that SciPy's DOP853 has at tolerance 1e-10.
 ``PYTHON`` is an interpreter that has pynamicalsys (it needs other versions than this package).
 """
 
@@ -19,7 +20,7 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache
@@ -31,8 +32,10 @@ import numpy as np
 
 from benchmarks.chaos_reference import (
     INTERVAL,
-    HeyokaLorenz,
+    HeyokaFlow,
     attractor,
+    heyoka_lorenz,
+    heyoka_tripod,
     lorenz,
     scipy_flow,
     scipy_spectrum,
@@ -43,8 +46,10 @@ from benchmarks.timing import PROCESSES, median, parser, results_folder, spawned
 matplotlib.use("Agg")
 
 LANES = 64
+# heyoka.py's lanes are eight whatever the number of its members; more of them share the cost of NumPy's calls.
+MEMBERS = 256
 STEPS = {"Lorenz": (32, 40, 48, 56, 64, 72), "tripod": (6, 8, 12, 16, 24)}
-TOLERANCES = (1e-6, 1e-8, 1e-10, 1e-12)
+TOLERANCES = (1e-6, 1e-8, 1e-9, 1e-10, 1e-12)
 QUICK_STEPS, QUICK_TOLERANCES = {"Lorenz": (56, 72), "tripod": (8, 12)}, (1e-8, 1e-10)
 # The tolerance at whose error the methods are compared.
 COMPARED = 1e-10
@@ -175,20 +180,22 @@ def scipy_rate(case: str, count: int, tolerance: float) -> float:
 
 
 _PERIOD = 1 / TRIPOD["frequency"]
-_heyoka = cache(HeyokaLorenz)
-
-
-def heyoka_rate(count: int, tolerance: float) -> float:
-    """Intervals per second of one process."""
-    integrator = _heyoka(tolerance)
-    starts = np.resize(attractor_points(8), (integrator.batch, 3))
-    integrator.spectrum(starts, 2)
-    begin = time.perf_counter()
-    integrator.spectrum(starts, count)
-    return integrator.batch * count / (time.perf_counter() - begin)
-
-
 attractor_points = cache(attractor)
+
+
+@cache
+def _heyoka(case: str, tolerance: float) -> HeyokaFlow:
+    return heyoka_lorenz(tolerance) if case == "Lorenz" else heyoka_tripod(CONSTANTS | TRIPOD, tolerance)
+
+
+def heyoka_rate(case: str, count: int, tolerance: float) -> float:
+    """Strobes per second of one process, by Benettin's method."""
+    integrator, interval = _heyoka(case, tolerance), INTERVAL if case == "Lorenz" else _PERIOD
+    starts = np.resize(attractor_points(8) if case == "Lorenz" else np.zeros((8, 2)), (MEMBERS, integrator.n))
+    integrator.spectrum(starts, interval, 2)
+    begin = time.perf_counter()
+    integrator.spectrum(starts, interval, count)
+    return MEMBERS * count / (time.perf_counter() - begin)
 
 
 def pynamicalsys_rate(python: str, units: float, rounds: int) -> float:
@@ -213,34 +220,39 @@ def lorenz_contenders(pool: Executor, quick: bool) -> list[Contender]:
                   lambda n=steps: INTERVAL * rate(round(n * INTERVAL), strobes))
         for steps in (QUICK_STEPS if quick else STEPS)["Lorenz"]
     ]  # fmt: skip
+    flows = {
+        "SciPy DOP853": lambda tolerance: scipy_flow(starts, 1.0, tolerance),
+        "heyoka.py": lambda tolerance: _heyoka("Lorenz", tolerance).flow(starts, 1.0),
+    }
+    return found + peers(pool, "Lorenz", flows, exact, {"SciPy DOP853": 50 // share, "heyoka.py": 150 // share}, quick)
+
+
+def peers(
+    pool: Executor,
+    case: str,
+    flows: Mapping[str, Callable[[float], np.ndarray]],
+    exact: np.ndarray,
+    counts: Mapping[str, int],
+    quick: bool,
+) -> list[Contender]:
+    """SciPy and heyoka.py at their tolerances: ``flows`` for the error, ``counts`` intervals of each for the rate."""
+    jobs, unit = {"SciPy DOP853": scipy_rate, "heyoka.py": heyoka_rate}, INTERVAL if case == "Lorenz" else 1.0
+    found = []
     for tolerance in QUICK_TOLERANCES if quick else TOLERANCES:
-        for name, job, size, flow in (
-            ("SciPy DOP853", _lorenz_by_scipy, 50 // share, lambda s, t=tolerance: scipy_flow(s, 1.0, t)),
-            ("heyoka.py", heyoka_rate, 2000 // share, lambda s, t=tolerance: _heyoka(t).flow(s, 1.0)),
-        ):
-            error = relative_error(flow(starts), exact)
-            found.append(
-                Contender("Lorenz", name, f"tolerance {tolerance:g}", error,
-                          lambda job=job, n=size, t=tolerance: INTERVAL * _by_both(pool, job, n, t))
-            )  # fmt: skip
+        for name, flow in flows.items():
+
+            def rate(job: Callable = jobs[name], count: int = counts[name], tolerance: float = tolerance) -> float:
+                both = zip(*[(case, count, tolerance)] * PROCESSES, strict=True)
+                return unit * sum(pool.map(job, *both))
+
+            error = relative_error(flow(tolerance), exact)
+            found.append(Contender(case, name, f"tolerance {tolerance:g}", error, rate))
     return found
 
 
-def _lorenz_by_scipy(count: int, tolerance: float) -> float:
-    return scipy_rate("Lorenz", count, tolerance)
-
-
-def _tripod_by_scipy(count: int, tolerance: float) -> float:
-    return scipy_rate("tripod", count, tolerance)
-
-
-def _by_both(pool: Executor, job: Callable[[int, float], float], count: int, tolerance: float) -> float:
-    return sum(pool.map(job, [count] * PROCESSES, [tolerance] * PROCESSES))
-
-
 def tripod_contenders(pool: Executor, quick: bool) -> list[Contender]:
-    """The package and SciPy over their settings; rates in strobes. Starts of the size of the tangent vectors, so that the
-    error is one of both."""
+    """The package, SciPy and heyoka.py over their settings; rates in strobes. Starts of the size of the tangent vectors, so
+    that the error is one of both."""
     starts = np.random.default_rng(0).uniform(-0.3, 0.3, (8, 2))
     rates = tripod_field(CONSTANTS | TRIPOD)
     exact = scipy_flow(starts, STROBES * _PERIOD, 1e-13, rates)
@@ -251,13 +263,12 @@ def tripod_contenders(pool: Executor, quick: bool) -> list[Contender]:
                   lambda n=steps: rate(n, strobes))
         for steps in (QUICK_STEPS if quick else STEPS)["tripod"]
     ]  # fmt: skip
-    for tolerance in QUICK_TOLERANCES if quick else TOLERANCES:
-        error = relative_error(scipy_flow(starts, STROBES * _PERIOD, tolerance, rates), exact)
-        found.append(
-            Contender("tripod", "SciPy DOP853", f"tolerance {tolerance:g}", error,
-                      lambda t=tolerance: _by_both(pool, _tripod_by_scipy, 40 if quick else 200, t))
-        )  # fmt: skip
-    return found
+    flows = {
+        "SciPy DOP853": lambda tolerance: scipy_flow(starts, STROBES * _PERIOD, tolerance, rates),
+        "heyoka.py": lambda tolerance: _heyoka("tripod", tolerance).flow(starts, STROBES * _PERIOD),
+    }
+    counts = {"SciPy DOP853": 40 if quick else 200, "heyoka.py": 20 if quick else 200}
+    return found + peers(pool, "tripod", flows, exact, counts, quick)
 
 
 def compared(contenders: Sequence[Contender]) -> list[dict[str, Any]]:

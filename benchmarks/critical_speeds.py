@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.bicardan_reference import determinant_roots
+from benchmarks.engine_job import columns_scene, engine_job
 from benchmarks.timing import (
     PROCESSES,
     at_once,
@@ -76,36 +77,17 @@ def random_shafts(count: int) -> dict[str, np.ndarray]:
 
 def package_job(columns: Mapping[str, np.ndarray], method: str = "certified") -> tuple[Callable[[], np.ndarray], float]:
     """The package's engine on all shafts, and the seconds of its compilation."""
-    from drivetrain_jax.sweep.assemble import result_variables
-    from drivetrain_jax.sweep.engine import Engine
-    from drivetrain_jax.sweep.executor import run_threads
-    from drivetrain_jax.sweep.kernel import compile_kernel
-    from drivetrain_jax.sweep.scene import load_scene
-
-    scene = {
-        "system": "bicardan",
-        "analysis": "critical_speeds",
-        "outputs": ["angular_frequency", "count_certified"],
-        "points": {name: column.tolist() for name, column in columns.items()},
-        "fixed": {name: list(PRESETS["paper"][name]) for name in _LISTS},
-        "options": {"method": method, "modes": MODES},
-    }
-    engine = Engine(load_scene(scene))
-    variables, plan, grid = result_variables(engine.scene), engine.plan, engine.grid
+    scene = columns_scene(
+        "bicardan",
+        "critical_speeds",
+        ["angular_frequency", "count_certified"],
+        columns,
+        fixed={name: list(PRESETS["paper"][name]) for name in _LISTS},
+        options={"method": method, "modes": MODES},
+    )
     start = time.perf_counter()
-    kernels = {group.index: compile_kernel(group.solver, grid, group.chunk, variables) for group in plan.groups}
-    compile_s = time.perf_counter() - start
-
-    def work(chunk: Any) -> np.ndarray:
-        return kernels[chunk.solver](grid.columns(chunk.points), chunk.effort)["angular_frequency"]
-
-    def job() -> np.ndarray:
-        out = np.empty((grid.size, MODES))
-        for chunk, values in run_threads(map(plan.chunk, range(len(plan.costs))), work, PROCESSES):
-            out[chunk.points] = values
-        return out
-
-    return job, compile_s
+    computed = engine_job(scene, PROCESSES)
+    return lambda: computed()["angular_frequency"], time.perf_counter() - start
 
 
 def scipy_roots(columns: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -181,16 +163,18 @@ def measure(shafts: int, repeats: int, sample: int, ross: str | None) -> tuple[l
         difference = float(abs(frequencies / grid()[-1, 0] - 1))
         rows.append(row("ROSS run_ucs, map of 20 supports", 20, median(peer["seconds"]), 0.0, difference, baseline))
         rows.append(row("drivetrain_jax, the same map", 20, median(seconds["map"]), grid_compile_s, 0.0, baseline))
-        notes.append(f"ROSS {peer['version']}; max_difference of its first natural frequency at the stiffest supports")
+        about = "both planes of bending with the gyroscopic effect"
+        difference_of = "max_difference of its first natural frequency at the stiffest supports"
+        notes.append(f"ROSS {peer['version']}, {about}; {difference_of}")
     return rows, notes
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print and write the table."""
     known = parser(__doc__)
-    known.add_argument("--shafts", type=int, default=16384)
-    known.add_argument("--repeats", type=int, default=5)
-    known.add_argument("--sample", type=int, default=60, help="shafts that SciPy solves")
+    known.add_argument("--shafts", type=int, default=16384, help="that the package solves (%(default)s)")
+    known.add_argument("--repeats", type=int, default=5, help="runs of which the median counts (%(default)s)")
+    known.add_argument("--sample", type=int, default=200, help="shafts that SciPy solves (%(default)s)")
     known.add_argument("--ross", metavar="PYTHON", help="interpreter that has ross-rotordynamics; without it: no ROSS")
     given = known.parse_args(arguments)
     shafts, repeats, sample = (2048, 1, 8) if given.quick else (given.shafts, given.repeats, given.sample)

@@ -43,7 +43,7 @@ def engine_job(scene: Mapping[str, Any], threads: int = 1) -> Callable[[], Resul
 
     def job() -> Results:
         found: Results = {}
-        for chunk, values in run_threads(map(plan.chunk, range(len(plan.costs))), work, threads):
+        for chunk, values in run_threads(engine.ordered(range(len(plan.costs))), work, threads):
             for name, array in values.items():
                 if name not in found:
                     found[name] = np.full((grid.size, *array.shape[1:]), np.nan if array.dtype.kind in "fc" else 0)

@@ -11,6 +11,7 @@ frequencies for any k.
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Mapping
 
 import jax
@@ -81,6 +82,7 @@ def natural_frequencies(atlas: Atlas, k: float) -> np.ndarray:
 
 def main() -> None:
     """Build the atlas and print its size, its errors and the frequencies it gives."""
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     atlas = run(construct(domain(), Quantity(1), TOLERANCE), determinant)
     rng = np.random.default_rng(0)
     (low, high), (soft, hard) = RANGES.values()

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.engine_job import columns_scene, engine_job
 from benchmarks.planetary_reference import TABLE_2, exact_frequencies, extension_matrix, natural_frequencies
 from benchmarks.timing import PROCESSES, at_once, interleaved, median, parser, results_folder, table, write_csv
 
@@ -42,36 +43,10 @@ def parameters(planets: int, columns: Mapping[str, np.ndarray]) -> dict[str, Any
 
 def package_job(planets: int, columns: Mapping[str, np.ndarray], method: str) -> Job:
     """The engine on these gears: its plan, kernels and threads as in ``dt.run``, compiled once."""
-    from drivetrain_jax.sweep.assemble import result_variables
-    from drivetrain_jax.sweep.engine import Engine
-    from drivetrain_jax.sweep.kernel import compile_kernel
-    from drivetrain_jax.sweep.scene import load_scene
-
-    angles = (2 * math.pi * np.arange(planets) / planets).tolist()
-    scene = {
-        "system": "planetary",
-        "analysis": "modes",
-        "outputs": ["natural_frequency"],
-        "options": {"method": method},
-    }
-    points = {name: column.tolist() for name, column in columns.items()}
-    loaded = load_scene(scene | {"title": "throughput", "points": points, "fixed": {"planet_angle": angles}})
-    engine = Engine(loaded)
-    group = engine.plan.groups[0]
-    kernel = compile_kernel(group.solver, engine.grid, group.chunk, result_variables(loaded))
-    parts = [engine.plan.chunk(number).points for number in range(len(group.efforts))]
-
-    def work(part: np.ndarray) -> np.ndarray:
-        return kernel(engine.grid.columns(part), 1)["natural_frequency"]
-
-    def job() -> np.ndarray:
-        found = np.empty((group.size, 9 + 3 * planets))
-        with ThreadPoolExecutor(PROCESSES) as pool:
-            for part, values in zip(parts, pool.map(work, parts), strict=True):
-                found[part] = values
-        return found
-
-    return job
+    fixed = {"planet_angle": (2 * math.pi * np.arange(planets) / planets).tolist()}
+    scene = columns_scene("planetary", "modes", ["natural_frequency"], columns, fixed=fixed, options={"method": method})
+    computed = engine_job(scene, PROCESSES)
+    return lambda: computed()["natural_frequency"]
 
 
 def lapack_job(matrices: np.ndarray, solve: Callable[[np.ndarray], np.ndarray]) -> Job:
@@ -145,8 +120,8 @@ def measure(planets: int, count: int, repeats: int) -> list[dict[str, Any]]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and write the table."""
     known = parser(__doc__)
-    known.add_argument("--gears", type=int, default=20000)
-    known.add_argument("--repeats", type=int, default=5)
+    known.add_argument("--gears", type=int, default=20000, help="for every number of planets (%(default)s)")
+    known.add_argument("--repeats", type=int, default=5, help="runs of which the median counts (%(default)s)")
     given = known.parse_args(arguments)
     count, repeats = (2048, 1) if given.quick else (given.gears, given.repeats)
     counts = COUNTS[1:2] if given.quick else COUNTS

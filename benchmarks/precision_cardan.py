@@ -111,8 +111,8 @@ def atlas(region: str, rtol: float) -> Contender:
     def prepare() -> Callable[[], Any]:
         import drivetrain_jax as dt
 
-        dt.run(scene)
-        return lambda: dt.run(scene)
+        dt.run(scene, threads=1)
+        return lambda: dt.run(scene, threads=1)
 
     def judged(result: Any) -> Judged:
         flat = {name: result[name].values.ravel() for name in (*OUTPUTS, "outcome")}

@@ -209,8 +209,8 @@ def memory_table(found: Sequence[Memory]) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, simulate, write."""
     known = parser(__doc__)
-    known.add_argument("--points", type=int, default=1_000_000, help="points of the overhead measurement")
-    known.add_argument("--repeats", type=int, default=5)
+    known.add_argument("--points", type=int, default=1_000_000, help="points of the overhead measurement (%(default)s)")
+    known.add_argument("--repeats", type=int, default=5, help="runs of which the median counts (%(default)s)")
     options = known.parse_args(arguments)
     points, repeats = (50_000, 1) if options.quick else (options.points, options.repeats)
     with tempfile.TemporaryDirectory() as name:

@@ -33,8 +33,12 @@ _PACKAGES = ("numpy", "scipy", "jax", "diffrax", "heyoka", "drivetrain_jax")
 def parser(doc: str) -> argparse.ArgumentParser:
     """The options of every study: ``--quick`` and ``--out FOLDER``."""
     options = argparse.ArgumentParser(description=doc.splitlines()[0])
-    options.add_argument("--quick", action="store_true", help="a small form; its files go to a temporary folder")
-    options.add_argument("--out", type=Path, metavar="FOLDER", help="where the files go (benchmarks/results)")
+    options.add_argument(
+        "--quick", action="store_true", help="a small form; its files go to --out or a temporary folder"
+    )
+    options.add_argument(
+        "--out", type=Path, metavar="FOLDER", help="where the files go (benchmarks/results, if not --quick)"
+    )
     return options
 
 
@@ -135,7 +139,10 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], notes: Sequence[str
     writer.writeheader()
     writer.writerows({key: significant(value) for key, value in row.items()} for row in rows)
     path.parent.mkdir(exist_ok=True)
-    path.write_text(text.getvalue())
+    # Whole or as it was, whenever the study is interrupted.
+    written = path.with_suffix(".csv.part")
+    written.write_text(text.getvalue())
+    os.replace(written, path)
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:

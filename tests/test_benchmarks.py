@@ -8,9 +8,13 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import drivetrain_jax
+from benchmarks.bicardan_precise_reference import determinant
+from benchmarks.bicardan_reference import transfer_determinant
+from benchmarks.chaos_reference import _orthonormalise
 from benchmarks.page import PAGE, text_of
 from benchmarks.precision import Contender, Judged, Rung, judge, measure, read, write
 from benchmarks.results_files import against, plain
@@ -168,3 +172,20 @@ def test_every_study_is_a_module_of_the_benchmarks():
 
     assert all((ROOT / "benchmarks" / f"{study.module}.py").is_file() for study in STUDIES)
     assert {study.system for study in STUDIES} == set(SYSTEMS)
+
+
+def test_rivals_vectors_are_orthonormal_as_lapack_makes_them():
+    vectors = np.random.default_rng(0).normal(size=(2, 3, 3, 5))
+    lapack = np.abs(np.diagonal(np.linalg.qr(vectors.transpose(0, 3, 2, 1))[1], axis1=-2, axis2=-1))
+    lengths = _orthonormalise(vectors)
+    assert np.abs(np.moveaxis(lengths, 0, -1) / lapack - 1).max() < 1e-13
+    products = np.einsum("mica,mjca->maij", vectors, vectors)
+    assert np.abs(products - np.eye(3)).max() < 1e-13
+
+
+def test_the_plain_determinant_is_that_of_many_digits():
+    shaft = {"length": (0.07, 0.59, 0.25), "EI": (64427.2, 22156.5, 8349.76), "rhoA": (15.288, 2.808, 5.5068)}
+    shaft |= {"k_A": 85e6, "k_D": 20e6}
+    for p in (100.0, 1500.0, 9000.0):
+        exact = float(determinant(p**0.5, shaft)) * (1 + shaft["k_A"]) * (1 + shaft["k_D"])
+        assert abs(transfer_determinant(p, shaft) / exact - 1) < 1e-11
