@@ -40,7 +40,7 @@ class Parameter:
 
     @property
     def allowed(self) -> str:
-        """The admissible values as a reader would write them, e.g. ``0 <= zeta < inf``."""
+        """The admissible values as a reader would write them, e.g. ``0 <= zeta``."""
         if self.choices:
             return f"{self.name} is one of {', '.join(self.choices)}"
         if self.text:
@@ -86,7 +86,8 @@ class Parameter:
         above = value >= self.upper if self.open_upper else value > self.upper
         finite = math.isfinite(value) or (self.infinite and value == math.inf)
         if not finite or below or above or (self.integer and value != int(value)):
-            raise ValueError(f"{label} = {value!r}: allowed is {self.allowed_in_units}")
+            finite_too = ", and finite" if math.isinf(value) and "finite" not in self.allowed else ""
+            raise ValueError(f"{label} = {value!r}: allowed is {self.allowed_in_units}{finite_too}")
         return int(value) if self.integer else float(value)
 
 

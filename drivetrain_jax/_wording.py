@@ -30,7 +30,10 @@ def did_you_mean(name: str, allowed: Iterable[str]) -> str:
     """``(did you mean X?)`` where a name is close, else nothing."""
     import difflib
 
-    match = difflib.get_close_matches(name, list(allowed), n=1)
+    allowed = list(allowed)
+    # "Beta" is nearer to beta than to zeta.
+    same = [other for other in allowed if other.lower() == name.lower()]
+    match = same or difflib.get_close_matches(name, allowed, n=1)
     return f" (did you mean {match[0]}?)" if match else ""
 
 

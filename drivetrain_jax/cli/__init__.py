@@ -9,24 +9,26 @@ from collections.abc import Sequence
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.cli.arguments import parser
-from drivetrain_jax.cli.replies import INTERRUPTED, OK, WRONG_INPUT, one_line
+from drivetrain_jax.cli.replies import INTERRUPTED, OK, WRONG_INPUT, drop_output, one_line
 
 __all__ = ["main"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code (0 done, 2 wrong input, 3 incomplete and resumable, 130 interrupted)."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            # Closed by whoever started the process, who wants no answer.
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     options = parser().parse_args(arguments)
     try:
-        code = options.command(options)
-        sys.stdout.flush()
-        return code
+        return options.command(options)
     except InputError as error:
         sys.stderr.write(one_line(str(error)))
         return WRONG_INPUT
     except BrokenPipeError:
         # The reader of our output has gone (``drivetrain list | head``): nobody is left to tell.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        drop_output()
         return OK
     except KeyboardInterrupt:
         return INTERRUPTED

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import errno
+import os
 import re
 from pathlib import Path
 from typing import Any, NoReturn
 
 from drivetrain_jax import __version__
-from drivetrain_jax._wording import did_you_mean, nearest
+from drivetrain_jax._wording import clipped, did_you_mean, nearest
 from drivetrain_jax.cli import commands
 from drivetrain_jax.cli.replies import WRONG_INPUT, one_line
 
@@ -39,10 +41,23 @@ def _reworded(message: str) -> str:
         return f"{field} = {given!r}: unknown{nearest(given, allowed)}"
     if kind := re.fullmatch(r"argument ([\w-]+): invalid (int|float) value: (.*)", message):
         return f"{kind.group(1)} = {kind.group(3)}: allowed is {'an integer' if kind.group(2) == 'int' else 'a number'}"
+    if place := re.fullmatch(r"argument ([\w.-]+): (.*: .*; allowed is a path .*)", message, re.DOTALL):
+        return f"{place.group(1)} = {place.group(2)}"
     if missing := re.fullmatch(r"the following arguments are required: (.*)", message):
         first, *others = missing.group(1).split(", ")
         return f"{first}: missing" + (f" (missing too: {', '.join(others)})" if others else "")
     return message
+
+
+def _path(text: str) -> Path:
+    """A path that the system can look for; whether anything is there is for the command to say."""
+    try:
+        os.stat(text)
+    except OSError as error:
+        if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
+            reason = f"{clipped(text)!r}: {error.strerror}; allowed is a path that the system can open"
+            raise argparse.ArgumentTypeError(reason) from None
+    return Path(text)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -77,7 +92,7 @@ def _add_run(subparsers: Any) -> None:
         action="append",
         default=[],
         metavar="FILE.nc",
-        type=Path,
+        type=_path,
         help="take over the points that this result shares; a smaller result at --out is taken over without it",
     )
     command.add_argument(
@@ -96,22 +111,24 @@ def _add_verify(subparsers: Any) -> None:
     command = _command(
         subparsers, "verify", commands.verify, "check every checksum of a result, and what must hold of its numbers"
     )
-    command.add_argument("file", metavar="FILE.nc", type=Path, help="result, finished or not")
+    command.add_argument("file", metavar="FILE.nc", type=_path, help="result, finished or not")
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
 
 def _add_export(subparsers: Any) -> None:
     command = _command(subparsers, "export", commands.export, "write a Zarr store as one HDF5 file")
-    command.add_argument("store", metavar="STORE", type=Path, help="result of `drivetrain run --store zarr`")
-    command.add_argument("file", metavar="FILE.nc", type=Path, help="file to write")
+    command.add_argument("store", metavar="STORE", type=_path, help="result of `drivetrain run --store zarr`")
+    command.add_argument("file", metavar="FILE.nc", type=_path, help="file to write")
 
 
 def _add_plot(subparsers: Any) -> None:
     command = _command(subparsers, "plot", commands.plot, "draw the figure that suits a result")
     command.add_argument(
-        "files", metavar="FILE.nc", type=Path, nargs="+", help="several methods of one analysis overlay"
+        "files", metavar="FILE.nc", type=_path, nargs="+", help="several methods of one analysis overlay"
     )
-    command.add_argument("--out", required=True, metavar="FIGURE", type=Path, help="figure to write (.png, .pdf, .svg)")
+    command.add_argument(
+        "--out", required=True, metavar="FIGURE", type=_path, help="figure to write (.png, .pdf, .svg)"
+    )
     command.add_argument(
         "--part", nargs="+", default=[], metavar="name=LOW:HIGH", help="of an atlas: ranges to zoom into, or name=value"
     )
@@ -128,7 +145,7 @@ def _add_point(subparsers: Any) -> None:
 
 def _add_query(subparsers: Any) -> None:
     command = _command(subparsers, "query", commands.query, "ask a stored atlas about one point")
-    command.add_argument("file", metavar="FILE.nc", type=Path, help='result of a scene with analysis = "atlas"')
+    command.add_argument("file", metavar="FILE.nc", type=_path, help='result of a scene with analysis = "atlas"')
     _add_given(command, "parameters, or the data in physical units")
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
@@ -137,7 +154,7 @@ def _add_design(subparsers: Any) -> None:
     command = _command(subparsers, "design", commands.design, "ask a stored atlas what a design has to be")
     questions = ("least-damping", "widest-angle", "speed-windows")
     command.add_argument("question", choices=questions, metavar="QUESTION", help=", ".join(questions))
-    command.add_argument("file", metavar="FILE.nc", type=Path, help='result of a scene with analysis = "atlas"')
+    command.add_argument("file", metavar="FILE.nc", type=_path, help='result of a scene with analysis = "atlas"')
     _add_given(command, "parameters; a range is name=LOW:HIGH")
     command.add_argument(
         "--margin", type=float, metavar="PART", help="speed-windows: part of the speed kept clear of every boundary"
@@ -153,7 +170,7 @@ def _add_bench(subparsers: Any) -> None:
     command.add_argument(
         "--quick", action="store_true", help="small forms, minutes; the stored results stay as they are"
     )
-    command.add_argument("--out", metavar="FOLDER", type=Path, help="where files and page go")
+    command.add_argument("--out", metavar="FOLDER", type=_path, help="where files and page go")
     command.add_argument("--peers", metavar="PYTHON", help="interpreter of an environment with ROSS and pynamicalsys")
 
 
@@ -183,8 +200,8 @@ def _add_given(command: argparse.ArgumentParser, text: str) -> None:
 
 
 def _add_scene(command: argparse.ArgumentParser) -> None:
-    command.add_argument("scene", metavar="SCENE.toml", type=Path, help="`drivetrain list` names some")
-    command.add_argument("--out", required=True, metavar="FILE.nc", type=Path, help="result file")
+    command.add_argument("scene", metavar="SCENE.toml", type=_path, help="`drivetrain list` names some")
+    command.add_argument("--out", required=True, metavar="FILE.nc", type=_path, help="result file")
     command.add_argument(
         "--set",
         action="append",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import sys
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from typing import Any
 
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.cli.replies import INCOMPLETE, INTERRUPTED, OK, one_line
+from drivetrain_jax.cli.replies import INCOMPLETE, INTERRUPTED, OK, one_line, say
 from drivetrain_jax.cli.signals import stop_on_signals
 from drivetrain_jax.cli.values import assignments, ranges
 
@@ -24,12 +25,12 @@ def list_systems(options: argparse.Namespace) -> int:
     """What there is, or one system in full."""
     from drivetrain_jax.sweep.catalogue import describe, overview
 
-    sys.stdout.write(describe(options.system) if options.system else overview())
+    say(describe(options.system) if options.system else overview())
     return OK
 
 
 def _answer(reply: Any, options: argparse.Namespace) -> int:
-    sys.stdout.write((reply.to_json() if options.json else str(reply)) + "\n")
+    say((reply.to_json() if options.json else str(reply)) + "\n")
     return OK
 
 
@@ -117,6 +118,7 @@ def plot(options: argparse.Namespace) -> int:
     from matplotlib.backend_bases import FigureCanvasBase
 
     from drivetrain_jax.store.consolidate import open_result
+    from drivetrain_jax.store.files import write_atomic
     from drivetrain_jax.view import plot
 
     out, kinds = options.out, FigureCanvasBase.get_supported_filetypes()
@@ -129,16 +131,34 @@ def plot(options: argparse.Namespace) -> int:
         from drivetrain_jax.sweep.atlas_chart import chart
 
         cells = _CELLS if options.cells is None else options.cells
-        results = [chart(result, ranges(options.part, "--part"), cells) for result in results]
+        results = [chart(file, ranges(options.part, "--part"), cells) for file in options.files]
     elif options.part or options.cells is not None:
         field = f"--part = {options.part[0]!r}" if options.part else f"--cells = {options.cells}"
         raise InputError(f"{field}: a result on a grid is drawn whole; allowed for an atlas")
-    figure = plot(*results)
     try:
-        figure.savefig(out)
+        figure = plot(*results)
+    except InputError:
+        raise
+    except (LookupError, ValueError):
+        _refuse_damaged(options.files)
+        raise
+    image = io.BytesIO()
+    figure.savefig(image, format=out.suffix[1:].lower())
+    try:
+        write_atomic(out, image.getbuffer(), out.with_name(f"{out.name}.tmp"))
     except OSError as error:
         raise InputError(f"out = {str(out)!r}: {error.strerror}; allowed is a file that can be written") from None
     return OK
+
+
+def _refuse_damaged(files: list[Path]) -> None:
+    """:class:`InputError` if one of these results is not what was written: what it lacks may be why there is no figure."""
+    from drivetrain_jax.store import checksums
+
+    for file in files:
+        if file.is_file() and (changed := checksums.damaged(file)):
+            what = f"not what was written ({checksums.named(changed)})"
+            raise InputError(f"file = {str(file)!r}: {what}; allowed is to restore it or to compute it again") from None
 
 
 def _open_unfinished(file: Path) -> Any:
@@ -169,7 +189,8 @@ def query(options: argparse.Namespace) -> int:
     from drivetrain_jax.sweep.atlas_answers import query
     from drivetrain_jax.sweep.atlas_file import open_atlas
 
-    return _answer(query(open_atlas(options.file), ranges(options.given, "query")), options)
+    given = ranges(options.given, "query")
+    return _answer(query(open_atlas(options.file), given), options)
 
 
 def design(options: argparse.Namespace) -> int:
@@ -180,9 +201,9 @@ def design(options: argparse.Namespace) -> int:
     extra = {} if options.margin is None else {"margin": options.margin}
     if extra and options.question != "speed-windows":
         raise InputError(f"--margin = {options.margin}: not used by {options.question}; allowed for speed-windows")
-    atlas, given = open_atlas(options.file), ranges(options.given, "design")
+    given = ranges(options.given, "design")
     question = getattr(atlas_answers, options.question.replace("-", "_"))
-    return _answer(question(atlas, given, **extra), options)
+    return _answer(question(open_atlas(options.file), given, **extra), options)
 
 
 def bench(options: argparse.Namespace) -> int:

@@ -2,7 +2,29 @@
 
 from __future__ import annotations
 
+import os
+import sys
+
+from drivetrain_jax._errors import InputError
+
 OK, WRONG_INPUT, INCOMPLETE, INTERRUPTED = 0, 2, 3, 130
+
+
+def say(text: str) -> None:
+    """``text`` on standard output; one that takes no more (a full disk) is wrong input."""
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        drop_output()
+        raise InputError(f"standard output: {error.strerror}; allowed is one that can be written") from None
+
+
+def drop_output() -> None:
+    """What is still on its way to standard output goes nowhere: at its end Python would try again."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def one_line(message: str) -> str:

@@ -17,6 +17,8 @@ def assignments(texts: Sequence[str], field: str) -> dict[str, Any]:
         name, equals, value = text.partition("=")
         if not (name and equals and value):
             raise InputError(f"{field} = {text!r}: allowed is name=value")
+        if any("\ud800" <= letter <= "\udfff" for letter in text):
+            raise InputError(f"{field} = {text!a}: not text in the locale of this shell; allowed is UTF-8")
         if name in pairs:
             raise InputError(f"{field} = {text!r}: {name} is given twice; allowed is once")
         pairs[name] = parse_value(value)
@@ -33,6 +35,8 @@ def _number_or_range(name: str, value: Any) -> Any:
         if isinstance(value, str):
             low, high = (float(end) for end in value.split(":"))
             return low, high
-        return float(value)
+        if not isinstance(value, bool):
+            return float(value)
     except (TypeError, ValueError):
-        raise InputError(f"{name} = {value!r}: allowed is a number or LOW:HIGH") from None
+        pass
+    raise InputError(f"{name} = {value!r}: allowed is a number or LOW:HIGH")

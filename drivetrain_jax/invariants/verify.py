@@ -46,7 +46,7 @@ def verify(path: Path) -> Report:
         raise InputError(f"file = {str(path)!r}: {what}; give a result written by `drivetrain run`")
     damaged = checksums.damaged(path)
     if damaged:
-        names = ", ".join("attributes of the file" if name == checksums.FILE else name for name in damaged)
+        names = checksums.named(damaged)
         problem = f"{names}: not what was written; allowed is to restore the file or to compute it again"
         return Report((f"checksums: {len(damaged)} differ: {names}",), problem)
     sealed = "none in this file" if damaged is None else "all agree"

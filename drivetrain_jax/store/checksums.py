@@ -64,6 +64,11 @@ def damaged(path: Path) -> list[str] | None:
     return sorted(name for name in {*wanted, *found} if wanted.get(name) != found.get(name))
 
 
+def named(names: list[str]) -> str:
+    """The names that :func:`damaged` gives, as messages write them."""
+    return ", ".join("attributes of the file" if name == FILE else name for name in names)
+
+
 def _variables(file: h5py.File) -> list[str]:
     # Beside them a file may hold the named type of its complex numbers.
     return sorted(name for name in file if file.get(name, getclass=True) is h5py.Dataset)

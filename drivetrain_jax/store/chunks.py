@@ -6,6 +6,7 @@ found when it is read, and the chunks in it are computed again.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import json
@@ -82,9 +83,10 @@ class PartsFolder:
         return content if isinstance(content, dict) else {}
 
     def open(self) -> None:
-        """Create and lock the folder; ``InputError`` if another run holds it. Nothing in it changes yet."""
+        """Create and lock the folder; ``InputError`` if another run holds it or no folder can be made there. Nothing in it
+        changes yet."""
         while True:
-            self.path.mkdir(exist_ok=True)
+            self._make()
             lock = FileLock(self.path / "lock", timeout=0)
             try:
                 lock.acquire()
@@ -97,6 +99,16 @@ class PartsFolder:
                 self._lock = lock
                 return
             lock.release()
+
+    def _make(self) -> None:
+        try:
+            self.path.mkdir(exist_ok=True)
+        except OSError as error:
+            # A full disk may have room later.
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            text = f"out = {str(self.path)!r}: {error.strerror}; allowed is a place where a folder can be made"
+            raise InputError(text) from None
 
     def start(self, plan: Mapping[str, Any]) -> None:
         """Forget all parts and begin those of ``plan``."""

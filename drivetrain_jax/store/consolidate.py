@@ -164,9 +164,12 @@ def open_result(path: Path) -> xr.Dataset:
     read_attribute(path, "digest")
     try:
         with xr.open_dataset(path, engine="h5netcdf") as dataset:
-            return dataset.load()
+            result = dataset.load()
     except (OSError, ValueError, KeyError):
         raise _unreadable(path) from None
+    if "analysis" not in result.attrs:
+        raise InputError(f"file = {str(path)!r}: not a result of drivetrain_jax; give one written by `drivetrain run`")
+    return result
 
 
 def _unreadable(path: Path) -> InputError:

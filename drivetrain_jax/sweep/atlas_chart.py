@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from drivetrain_jax.systems import System
 _SLICES = 3
 
 
-def chart(source: xr.Dataset, part: Mapping[str, float | tuple[float, float]], cells: int) -> xr.Dataset:
+def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, float]], cells: int) -> xr.Dataset:
     """The ``floquet`` result on ``cells`` values of each of two parameters of the atlas in ``source``.
 
     ``part`` fixes parameters (numbers) or zooms in (ranges). Of further parameters there are three values. A chart of two

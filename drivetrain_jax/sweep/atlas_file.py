@@ -18,6 +18,7 @@ from drivetrain_jax.analysis import Request, get_analysis
 from drivetrain_jax.analysis.atlas import ANALYSIS
 from drivetrain_jax.atlas import StabilityAtlas, from_arrays, stability_atlas, to_arrays
 from drivetrain_jax.atlas.floquet import floquet_domain
+from drivetrain_jax.store import checksums
 from drivetrain_jax.store.consolidate import open_result
 from drivetrain_jax.sweep import compile_cache
 from drivetrain_jax.sweep.assemble import Table, result_attrs, to_dataset
@@ -75,13 +76,19 @@ def make_atlas(scene: Scene, work: Work, progress: Progress) -> xr.Dataset:
 def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
     """The atlas that the run of a scene with ``analysis = "atlas"`` gave: its file, or the dataset itself.
 
-    Raises :class:`InputError` if it is none, or if its system is not installed or has other coordinates by now.
+    Raises :class:`InputError` if it is none or its file damaged, or if its system is not installed or has other
+    coordinates by now.
     """
     compile_cache.enable()
     dataset = source if isinstance(source, xr.Dataset) else open_result(Path(source))
     label = "dataset" if dataset is source else f"file = {str(source)!r}"
     if dataset.attrs.get("analysis") != ANALYSIS.name:
         raise InputError(f"{label}: holds the analysis {dataset.attrs.get('analysis')!r}; allowed is an atlas")
+    # Bounds that are carried with the panels hold for panels as they were written: nothing else would tell.
+    if dataset is not source and (changed := checksums.damaged(Path(source))):
+        raise InputError(
+            f"{label}: damaged ({checksums.named(changed)}); allowed is to restore it or to run its scene again"
+        )
     scene = load_scene(tomllib.loads(dataset.attrs["scene"]))
     names = tuple(str(name) for name in dataset["parameter"].values)
     ranges = dict(zip(names, zip(dataset["lower"].values, dataset["upper"].values, strict=True), strict=True))

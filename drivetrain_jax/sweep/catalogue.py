@@ -76,7 +76,7 @@ def _scene_lines(system: System | None) -> list[str]:
     rows = []
     for path in sorted(folder.glob("*.toml")) if folder else ():
         try:
-            content = tomllib.loads(path.read_text())
+            content = tomllib.loads(path.read_text("utf-8"))
         except (OSError, ValueError):
             continue
         if system is None or content.get("system") == system.name:

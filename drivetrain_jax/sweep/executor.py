@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 from drivetrain_jax._errors import InputError
@@ -112,5 +111,5 @@ def run_threads(
 
 def _ahead(results: Results) -> int:
     """Chunks like that of ``results`` to be handed out per thread."""
-    size = sum(values.nbytes for values in jax.tree.leaves(results))
+    size = sum(values.nbytes for values in results.values())
     return min(max(_BYTES_AHEAD // max(size, 1), IN_FLIGHT), _MOST_AHEAD)

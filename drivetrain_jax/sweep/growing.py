@@ -127,6 +127,8 @@ def find(engine: Engine, path: Path) -> Source:
         raise NotReusable(f"reuse = {str(path)!r}: does not exist; allowed is a result written by `drivetrain run`")
     names = ("scene", "digest", "drivetrain_jax_version", "numerics", "numerics_detail")
     attrs = {name: read_attribute(path, name) for name in names}
+    if attrs["digest"] is None:
+        raise NotReusable(f"reuse = {str(path)!r}: not a result of drivetrain_jax; allowed is such a result")
     if reasons := differences(attrs, engine, points=False):
         raise NotReusable(f"reuse = {str(path)!r}: {reasons[0]}; allowed is a result that differs in its points only")
     scene = load_scene(tomllib.loads(str(attrs["scene"])))

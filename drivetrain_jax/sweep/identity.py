@@ -71,7 +71,7 @@ def _imported(starts: Sequence[Path]) -> set[Path]:
 def _imports(path: Path) -> tuple[str, ...]:
     """Dotted names that a source file imports, those of ``from x import y`` as ``x.y``."""
     names: list[str] = []
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_bytes())):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:

@@ -151,9 +151,10 @@ def _request(table: _SceneTable, analysis: Analysis) -> Request:
     used = analysis.methods[method]
     for key, value in given.items():
         if key not in used:
-            raise InputError(
-                f"options.{key} = {shown(value)}: not used by method {method}{nearest(key, ('method', *used))}"
-            )
+            others = [name for name, options in analysis.methods.items() if key in options]
+            guess = f", but by {', '.join(others)}" if others else did_you_mean(key, ("method", *used))
+            allowed = f"allowed is {', '.join(('method', *used))}"
+            raise InputError(f"options.{key} = {shown(value)}: not used by method {method}{guess}; {allowed}")
     options = {o.name: _option(o, given) for o in analysis.options if o.name in used}
     return Request(tuple(outputs), method, options)
 

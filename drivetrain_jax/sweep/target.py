@@ -13,6 +13,7 @@ import numpy as np
 
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._wording import clipped
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.store import shards
 from drivetrain_jax.store.chunks import PartsFolder
@@ -34,6 +35,7 @@ class Target:
     def __init__(self, out: Path, engine: Engine, store: str | None = None) -> None:
         self.out = out
         self.parts = PartsFolder(out)
+        _check_name(out, self.parts)
         _restore_former(out, self.parts)
         self.store = store or self._kind()
         _check_place(out, self.store)
@@ -171,6 +173,16 @@ def _same(one: Mapping[str, Any], other: Mapping[str, Any], names: Iterable[str]
     return all(one.get(name) == other.get(name) for name in names)
 
 
+def _check_name(out: Path, parts: PartsFolder) -> None:
+    """The folder of the parts has the longer name."""
+    try:
+        parts.path.exists()
+    except OSError as error:
+        raise InputError(
+            f"out = {clipped(str(out))!r}: {error.strerror} (with '.parts'); allowed is a shorter name"
+        ) from None
+
+
 def _restore_former(out: Path, parts: PartsFolder) -> None:
     """Put a store back that a run was killed over while it replaced it."""
     former = parts.path / "former"
@@ -202,7 +214,12 @@ def _digest_of(out: Path) -> str | None:
     """Digest of the result at ``out``, None if there is no file."""
     if not out.exists():
         return None
-    digest = _attribute(out, "digest")
+    try:
+        digest, what = _attribute(out, "digest"), "not a result of drivetrain_jax"
+    except InputError:
+        if out.is_dir():
+            raise
+        digest, what = None, "not a readable netCDF4/HDF5 file"
     if not isinstance(digest, str):
-        raise InputError(f"out = {str(out)!r}: not a result of drivetrain_jax; allowed is a new file or such a result")
+        raise InputError(f"out = {str(out)!r}: {what}; allowed is a new file or a result of drivetrain_jax")
     return digest

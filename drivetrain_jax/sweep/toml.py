@@ -53,7 +53,8 @@ def _plain(value: Any) -> Any:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_bytes().decode()
+        # Editors on Windows put a byte order mark first.
+        return path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"scene = {str(path)!r}: not a text file in UTF-8") from None
     except OSError as error:

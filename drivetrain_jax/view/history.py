@@ -11,11 +11,12 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
-from drivetrain_jax.view.layout import DPI, WIDTH
+from drivetrain_jax.view.layout import DPI, WIDTH, wrap_caption
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, caption, symbol, value_text
 
 _LINE = {"color": LINE_COLOURS[0], "linewidth": 0.6}
 _MOST_ROWS = 8
+_CAPTION_LINES = 2
 # Powers of ten beside the axis, as a product and not as 1e-4.
 _STYLE = {**STYLE, "axes.formatter.use_mathtext": True, "axes.formatter.limits": (-2, 4)}
 
@@ -107,7 +108,8 @@ def _figure(dataset: xr.Dataset, height: float) -> Figure:
     figure = Figure(figsize=(WIDTH, height), dpi=DPI)
     left = 0.35 / WIDTH
     figure.text(left, 1 - 0.10 / height, dataset.attrs.get("title", ""), va="top", size=10.5, weight="bold")
-    figure.text(left, 1 - 0.32 / height, caption(dataset), va="top", size=8, color=FRAME_GREY)
+    text = wrap_caption(caption(dataset), WIDTH - 0.35 - 0.1, _CAPTION_LINES)
+    figure.text(left, 1 - 0.32 / height, text, va="top", size=8, color=FRAME_GREY)
     return figure
 
 

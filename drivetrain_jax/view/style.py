@@ -56,7 +56,7 @@ def symbol(name: str) -> str:
         return _PRODUCTS[name]
     if name in _GREEK:
         return rf"$\{name}$"
-    if match := re.fullmatch(r"([A-Za-z]{1,2}|" + "|".join(_GREEK) + r")_?([A-Za-z]{0,2}\d*)", name):
+    if match := re.fullmatch("(" + "|".join(_GREEK) + r"|[A-Za-z]{1,2})_?([A-Za-z]{0,2}\d*)", name):
         head, index = match.groups()
         head = rf"\{head}" if head in _GREEK else head
         return rf"${head}_{{{index}}}$" if index else f"${head}$"

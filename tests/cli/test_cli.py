@@ -181,11 +181,21 @@ WRONG_RUNS = {
         ["--fresh"],
         "not a result of",
     ),
+    "result is the scene": (None, ["--out", "scene.toml", "--fresh"], "out = 'scene.toml': not a readable"),
+    "name too long": (None, ["--out", "r" * 300], "--out = 'rrrr"),
+    "name of the parts too long": (None, ["--out", "r" * 252], "(with '.parts')"),
+    "no folder can be made": (None, ["--out", "/proc/r.nc"], "a place where a folder can be made"),
+    "reuse of a foreign file": (
+        lambda: xr.Dataset({"x": 1.0}).to_netcdf("x.nc", engine="h5netcdf"),
+        ["--reuse", "x.nc"],
+        "reuse = 'x.nc': not a result of",
+    ),
     "result is a folder": (lambda: os.mkdir("r.nc"), [], "is a folder"),
     "parts are a file": (lambda: open("r.nc.parts", "w").close(), [], "r.nc.parts"),
     "folder missing": (None, ["--out", "nowhere/r.nc"], "does not exist"),
     "set without value": (None, ["--set", "fixed.b"], "name=value"),
     "set twice": (None, ["--set", "fixed.b=1", "--set", "fixed.b=2"], "twice"),
+    "set to bytes that are no text": (None, ["--set", "title=\udcce"], "title=\\udcce': not text in the locale"),
     "set an unknown key": (None, ["--set", "fixed.zeta=1"], "fixed.zeta"),
     "set into a value": (None, ["--set", "system.b=1"], "not a table"),
     "no workers": (None, ["--workers", "0"], "workers = 0"),
@@ -245,12 +255,37 @@ def test_wrong_run_is_one_line_and_writes_nothing(cli, folder, case):
         (("plot", "scene.toml", "--out", "nowhere/f.png"), "folder"),
         (("plot", "scene.toml", "--out", "f.xyz"), "allowed is a name that ends in ."),
         (("plot", ".", "--out", "f.png"), "'.': is a folder; give a result"),
+        (("query", "r.nc", "a=true"), "a = True: allowed is a number or LOW:HIGH"),
+        (("plot", "r" * 300, "--out", "f.png"), "FILE.nc = 'rrrr"),
     ],
 )
 def test_wrong_command_is_one_line(cli, folder, arguments, part):
     before = snapshot(folder)
     code, out, err = cli(*arguments)
     assert (code, out, len(err)) == (2, "", 1) and part in err[0] and snapshot(folder) == before
+
+
+def saved(change, attrs=()):
+    """A chart that another program has changed and written again."""
+    chart = xr.load_dataset("r.nc", engine="h5netcdf")
+    change(chart).assign_attrs(attrs).to_netcdf("changed.nc", engine="h5netcdf")
+
+
+DAMAGED = {
+    "of another program": (lambda _: xr.Dataset({"x": 1.0}), {}, "not a result of drivetrain_jax"),
+    "without variables": (lambda ds: ds.drop_vars(list(ds.data_vars)), {}, "not what was written (a"),
+    "without cells": (lambda ds: ds.isel(a=slice(0, 0)), {}, "not what was written (a"),
+    "attributes rubbish": (lambda ds: ds, {"fixed_parameters": "rubbish"}, "not what was written (attributes"),
+    "no atlas": (lambda ds: ds, {"analysis": "atlas"}, "damaged (attributes"),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGED)
+def test_a_changed_file_is_one_line(cli, folder, case):
+    change, attrs, part = DAMAGED[case]
+    cli("run", "scene.toml", "--out", "r.nc", "--quiet")
+    saved(change, {"analysis": "parameters"} | attrs if case != "of another program" else {})
+    test_wrong_command_is_one_line(cli, folder, ("plot", "changed.nc", "--out", "f.png"), part)
 
 
 def test_failing_chunk_is_incomplete_and_resumable(cli):
@@ -303,6 +338,14 @@ def test_plot_writes_the_figure(cli, monkeypatch):
     cli("run", "scene.toml", "--out", "r.nc", "--quiet")
     assert cli("plot", "r.nc", "--out", "f.png")[0] == 0 and open("f.png", "rb").read(4) == b"\x89PNG"
     assert cli("plot", "r.nc", "r.nc", "--out", "two.png")[0] == 0
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr("drivetrain_jax.store.files.os.fsync", full)
+        code, _, err = cli("plot", "r.nc", "--out", "g.png")
+    assert (code, len(err)) == (2, 1) and "No space left" in err[0] and not [n for n in os.listdir() if n[0] == "g"]
     code, _, err = cli("plot", "r.nc", "--out", "f.png", "--cells", "9")
     assert code == 2 and len(err) == 1 and "--cells = 9" in err[0]
     code, _, err = cli("plot", "r.nc", "--out", "f.txt")
@@ -335,6 +378,19 @@ def test_looking_at_a_result_loads_no_integrator_and_no_tables(folder):
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert "drivetrain_jax.systems.cardan" in done.stdout
     assert not {"xarray", "pandas", "scipy.integrate", "diffrax", "matplotlib", "rich"} & set(done.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("where", "code", "said"),
+    [
+        (">/dev/full", 2, "drivetrain: standard output: No space left on device; allowed is one that can be written\n"),
+        (">&-", 0, ""),
+    ],
+)
+def test_an_output_that_takes_nothing(where, code, said):
+    command = f"{sys.executable} -m drivetrain_jax.cli list {where}"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (code, said)
 
 
 def test_a_reader_that_leaves_is_no_error():

@@ -144,7 +144,11 @@ WRONG = {
     "path among points": ({"system": "toy", "analysis": "line", "points": {"a": [1], "b": [1]}}, "points.b", "path"),
     "unknown method": (changed(options={"method": "magic"}), "options.method = 'magic'", "plain, other"),
     "unknown option": (changed(options={"rtl": 1}), "options.rtl = 1", "did you mean rtol?"),
-    "option of another method": (changed(options={"knob": 1.0}), "options.knob", "not used by method plain"),
+    "option of another method": (
+        changed(options={"knob": 1.0}),
+        "options.knob",
+        "not used by method plain, but by other;",
+    ),
     "option out of range": (changed(options={"rtol": 1.0}), "options.rtol = 1.0", "0.01"),
     "too many points": (
         changed(axes={n: {"start": 1, "stop": 2, "num": 10**6} for n in ("a", "b")}),
@@ -173,6 +177,12 @@ def test_wrong_file_is_one_clear_line(tmp_path, content, part):
         path.write_bytes(content)
     with pytest.raises(InputError, match=part):
         load_scene(path)
+
+
+def test_a_byte_order_mark_and_line_ends_of_windows_are_read(tmp_path):
+    path, text = tmp_path / "s.toml", toml.write(GOOD)
+    path.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+    assert load_scene(path).axes[0].values.tolist() == load_scene(GOOD).axes[0].values.tolist()
 
 
 def test_huge_axis_is_refused_before_it_is_made():
