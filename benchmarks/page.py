@@ -190,19 +190,30 @@ def critical_sentence(file: ResultFile | None) -> str:
         )
         words.append(f"six certified critical speeds of {rate} shafts/s, {ratio}")
     if mapped:
-        words.append(f"a critical-speed map {against(float(mapped['ratio']), 'ROSS')}")
+        ross = "ROSS (which computes both planes of bending with the gyroscopic effect)"
+        words.append(f"a critical-speed map {against(float(mapped['ratio']), ross)}")
     return f"Stepped shaft: {'; '.join(words)}." if words else ""
 
 
 def planetary_sentence(file: ResultFile | None) -> str:
-    """Planetary gears beside NumPy."""
-    rows = [row for row in (file.rows if file else ()) if row["method"] == "package"]
-    if not rows:
+    """Planetary gears beside the faster of NumPy's methods."""
+    if file is None:
         return ""
-    told = [f"{row['planets']} planets {times(float(row['over_numpy_svd']))}" for row in rows]
+    told, off = [], 0.0
+    for planets in dict.fromkeys(row["planets"] for row in file.rows):
+        rows = {row["method"]: row for row in file.rows if row["planets"] == planets}
+        rates = {name: float(rows[name]["gears_per_s"]) for name in (*_NUMPY, "package")}
+        rival = max(_NUMPY, key=rates.__getitem__)
+        told.append(f"{planets} planets {against(rates['package'] / rates[rival], _NUMPY[rival])}")
+        off = max(off, float(rows[_SQUARES]["rigid_Hz"]))
+    less = f"these eigenvalues are off by up to {small(off)} Hz where a frequency is 0"
     return (
-        f"Planetary gears, gears per second over NumPy's batched singular values, both on all cores: {', '.join(told)}."
+        f"Planetary gears, all on all cores, beside the faster of NumPy's two batched ways: {', '.join(told)}; {less}."
     )
+
+
+_SQUARES = "numpy eigvalsh of their squares"
+_NUMPY = {"numpy svd of the same matrices": "its singular values", _SQUARES: "its eigenvalues of the squares"}
 
 
 def rattle_sentence(file: ResultFile | None) -> str:

@@ -91,7 +91,7 @@ def _memory(file: ResultFile | None) -> str:
         return ""
     row = max(file.rows, key=lambda row: float(row["points"]))
     took = f"{seconds(row['seconds'])}, {row['resident_mb']} MB of memory"
-    return f"A sweep of {count(row['points'])} points to a file: {took}."
+    return f"A sweep of {count(row['points'])} points of the cheapest analysis, one result each, to a file: {took}."
 
 
 def written(text: str, folder: Path = RESULTS) -> str:

@@ -9,7 +9,6 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from scipy.optimize import isotonic_regression
 
 from drivetrain_jax.view.style import PREDICTION
 
@@ -108,6 +107,8 @@ def label(axes: Axes, lines: list[Prediction]) -> None:
 
 def _place(wanted: list[float], spacing: float, span: tuple[float, float]) -> tuple[list[int], np.ndarray]:
     """Which labels fit (indices in rising position), and the nearest positions for them at least ``spacing`` apart."""
+    from scipy.optimize import isotonic_regression  # takes longer to load than most figures to draw
+
     kept: list[int] = []
     positions = np.empty(0)
     for index in range(len(wanted)):
