@@ -14,7 +14,7 @@ from drivetrain_jax.store.provenance import digest
 from drivetrain_jax.sweep import compile_cache
 from drivetrain_jax.sweep.grid import Grid
 from drivetrain_jax.sweep.identity import numerics_of, scene_digest
-from drivetrain_jax.sweep.kernel import Kernel, kernel_of, of_few
+from drivetrain_jax.sweep.kernel import Kernel, is_small, kernel_of
 from drivetrain_jax.sweep.plan import Chunk, Plan, make_plan
 from drivetrain_jax.sweep.scene import Scene
 
@@ -61,6 +61,10 @@ class Engine:
         """Solver and chunk of every point."""
         return make_plan(self.solvers, self.grid, self._points, full_size=self._full_size)
 
+    @cached_property
+    def _small(self) -> bool:
+        return not self._full_size and is_small(self.grid, self.solvers)
+
     @property
     def total(self) -> int:
         """Number of points, those along a path counted one by one."""
@@ -85,7 +89,7 @@ class Engine:
             pool = ThreadPoolExecutor(len(missing), thread_name_prefix="compile")
             for index, size in missing:
                 solver = self.solvers[index]
-                few = not self._full_size and of_few(self.grid, solver)
+                few = self._small and not solver.lengthy
                 self._kernels[index, size] = pool.submit(kernel_of, self.scene, self.grid, solver, size, few)
             pool.shutdown(wait=False)
 

@@ -19,11 +19,13 @@ from drivetrain_jax.analysis import Solver
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
 from drivetrain_jax.sweep.assemble import result_variables
 from drivetrain_jax.sweep.grid import Grid
+from drivetrain_jax.sweep.plan import make_plan
 from drivetrain_jax.sweep.scene import Scene
 
 _LAPACK = threading.Lock()
-# A scene of so few points is computed in less time than it takes to optimise its kernels.
-_FEW = 128
+# A scene of so few points with so little predicted work, in the units of a plan, is computed in less time than it takes
+# to optimise its kernels.
+_FEW, _LIGHT = 128, 1e5
 
 
 @dataclass(frozen=True)
@@ -90,9 +92,9 @@ def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[V
     return Kernel(compiled, chunk, solver.broadcasts, tuple(variables), _turn(compiled))
 
 
-def of_few(grid: Grid, solver: Solver) -> bool:
-    """Whether kernels of ``solver`` are not worth optimising: by the whole grid, whatever part of it is computed where."""
-    return grid.size * grid.path_length <= _FEW and not solver.lengthy
+def is_small(grid: Grid, solvers: Sequence[Solver]) -> bool:
+    """Whether kernels are not worth optimising: by the whole grid, whatever part of it is computed where."""
+    return grid.size * grid.path_length <= _FEW and make_plan(solvers, grid).costs.sum() <= _LIGHT
 
 
 @dataclass(frozen=True)

@@ -88,15 +88,22 @@ def test_kernels_with_lapack_calls_take_turns():
 
 
 def test_scenes_of_few_points_are_compiled_without_optimising(monkeypatch):
-    """Not those whose points take long, nor the rounds of an atlas, whose kernels serve further ones."""
+    """Not those whose points take long, nor rounds of an atlas: their kernels serve further ones."""
     given = []
     monkeypatch.setattr(kernel, "compile_kernel", lambda *of: given.append(of[-1]) or object())
     kernel._compiled.cache_clear()
-    for count, lengthy, full_size in ((128, False, False), (129, False, False), (2, True, False), (2, False, True)):
+    cases = (
+        (128, {}, False),
+        (129, {}, False),
+        (2, {"lengthy": True}, False),
+        (2, {}, True),
+        (2, {"unit_cost": 1e5}, False),
+    )
+    for count, change, full_size in cases:
         scene = load_scene({"system": "toy", "analysis": "toy", "axes": {"a": {"start": 0, "stop": 1, "num": count}}})
         engine = Engine(scene, full_size=full_size)
-        engine.solvers = tuple(replace(solver, lengthy=lengthy) for solver in engine.solvers)
+        engine.solvers = tuple(replace(solver, **change) for solver in engine.solvers)
         engine.prepare({(0, 16)})
         assert all(future.result() for future in engine._kernels.values())
         kernel._compiled.cache_clear()
-    assert given == [True, False, False, False]
+    assert given == [True, False, False, False, False]
