@@ -111,11 +111,11 @@ def whole(file: ResultFile | None, name: str, columns: Mapping[str, str], format
     return markdown(list(columns.values()), rows)
 
 
-def between_marks(text: str, section: str) -> str:
+def between_marks(text: str, section: str, begin: str = BEGIN, end: str = END) -> str:
     """``text`` with ``section`` between its marks."""
-    before, _, rest = text.partition(BEGIN)
-    _, _, after = rest.partition(END)
-    return f"{before}{BEGIN}\n\n{section}\n\n{END}{after}"
+    before, _, rest = text.partition(begin)
+    _, _, after = rest.partition(end)
+    return f"{before}{begin}\n\n{section}\n\n{end}{after}"
 
 
 def not_measured(name: str) -> str:

@@ -19,6 +19,7 @@ import numpy as np
 
 from benchmarks import engine_cost
 from benchmarks.engine_cost import Memory, cpu_seconds, scene
+from benchmarks.results_files import between_marks
 from benchmarks.timing import RESULTS, median, parser, provenance, results_folder, significant, write_csv
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.chunks import Part
@@ -233,8 +234,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     write_csv(results / "places.csv", [asdict(place) for place in elsewhere])
     write_csv(results / "memory.csv", [asdict(m) for m in memory])
     if results == RESULTS:
-        before, _, rest = PAGE.read_text().partition(BEGIN)
-        PAGE.write_text(f"{before}{BEGIN}\n\n{text}\n\n{END}{rest.partition(END)[2]}")
+        PAGE.write_text(between_marks(PAGE.read_text(), text, BEGIN, END))
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ class Parameter:
 
     @property
     def allowed(self) -> str:
-        """The admissible values as a reader would write them, e.g. ``0 <= zeta``."""
+        """The admissible values as a reader would write them, e.g. ``0 <= zeta < inf``."""
         if self.choices:
             return f"{self.name} is one of {', '.join(self.choices)}"
         if self.text:
@@ -50,6 +50,8 @@ class Parameter:
         right = f" {'<' if self.open_upper else '<='} {self.upper:.10g}" if self.upper < math.inf else ""
         if self.infinite:
             right = " <= inf"
+        elif left and not right and not self.integer:
+            right = " < inf"
         listed = "[i]" if self.listed else ""
         either = " (or one number for all)" if self.listed and self.broadcast else ""
         if left or right:
@@ -86,8 +88,7 @@ class Parameter:
         above = value >= self.upper if self.open_upper else value > self.upper
         finite = math.isfinite(value) or (self.infinite and value == math.inf)
         if not finite or below or above or (self.integer and value != int(value)):
-            finite_too = ", and finite" if math.isinf(value) and "finite" not in self.allowed else ""
-            raise ValueError(f"{label} = {value!r}: allowed is {self.allowed_in_units}{finite_too}")
+            raise ValueError(f"{label} = {value!r}: allowed is {self.allowed_in_units}")
         return int(value) if self.integer else float(value)
 
 

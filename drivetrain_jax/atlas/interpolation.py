@@ -9,9 +9,9 @@ from scipy.fft import dctn
 
 from drivetrain_jax.atlas.panels import chebyshev
 
-# Points evaluated at a time, if not so few that a product of matrices stays below this many multiplications: larger ones
-# OpenBLAS gives to threads that then spin for a tenth of a second, on cores that solves and charts need.
-_BLOCK, _FEWEST, _ONE_THREAD = 4096, 8, 1 << 18
+# Most points evaluated at a time, and multiplications of a product of matrices up to which OpenBLAS starts no threads:
+# these spin on for a tenth of a second, on cores that solves and charts need. Not worth it for fewer points than that.
+_BLOCK, _ONE_THREAD, _FEWEST = 4096, 1 << 18, 8
 
 
 def nodes(n: int) -> np.ndarray:
@@ -39,8 +39,8 @@ def coefficients(values: np.ndarray, degrees: Sequence[int]) -> np.ndarray:
 def evaluate(tensor: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Values ``(N, m)`` at points ``(N, d)`` in [-1, 1]^d."""
     out = np.empty((len(x), tensor.shape[-1]))
-    few = _ONE_THREAD // max(tensor.size, 1)
-    block = min(few, _BLOCK) if few >= _FEWEST else _BLOCK
+    in_one_thread = _ONE_THREAD // tensor.size
+    block = min(in_one_thread, _BLOCK) if in_one_thread >= _FEWEST else _BLOCK
     for start in range(0, len(x), block):
         part = x[start : start + block]
         # The first contraction is one product of matrices; the others are over what is left of each point.

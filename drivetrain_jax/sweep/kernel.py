@@ -25,7 +25,7 @@ from drivetrain_jax.sweep.scene import Scene
 _LAPACK = threading.Lock()
 # A scene of so few points with so little predicted work, in the units of a plan, is computed in less time than it takes
 # to optimise its kernels.
-_FEW, _LIGHT = 128, 1e5
+_FEW, _LIGHT = 128, 3e4
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def is_small(grid: Grid, solvers: Sequence[Solver]) -> bool:
 
 @dataclass(frozen=True)
 class _Job:
-    """What a kernel is compiled for; two jobs are equal if one kernel serves both."""
+    """What a kernel is compiled for; two jobs are equal if one kernel of a size serves both."""
 
     identity: tuple[Any, ...]
     scene: Scene = field(compare=False)
@@ -125,8 +125,6 @@ def kernel_of(scene: Scene, grid: Grid, solver: Solver, size: int, few: bool = F
         tuple((axis.name, axis.values.dtype) for axis in axes),
         path,
         solver.name,
-        size,
-        few,
     )
     return _compiled(_Job(identity, replace(scene, axes=axes), replace(grid, axes=axes), solver), size, few)
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import time
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
 from interrupts import stop_after
 
 import drivetrain_jax as dt
+from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.cli import main
 from drivetrain_jax.store.consolidate import write_result
@@ -354,6 +357,23 @@ def test_a_zoom_on_the_command_line(file, capsys):
     assert (code, err) == (0, "") and figure.stat().st_size > 20_000
     code, _, err = answer(capsys, "plot", file, "--out", figure, "--part", "Omega=3")
     assert code == 2 and err == "drivetrain: Omega = 3: allowed is a number or LOW:HIGH, 1 <= Omega <= 2\n"
+
+
+def test_panels_that_are_not_those_written_answer_nothing(file, tmp_path, capsys):
+    damaged, figure = tmp_path / "damaged.nc", tmp_path / "f.png"
+    shutil.copy(file, damaged)
+    with h5py.File(damaged, "r+") as store:
+        store["coefficients"][0, 0] *= 2
+    for question in (
+        ("query", damaged, "beta=0.31", "Omega=1.2"),
+        ("design", "widest-angle", damaged, "Omega=1.3:1.5"),
+        ("plot", damaged, "--out", figure),
+    ):
+        code, out, err = answer(capsys, *question)
+        assert (code, out, err.count("\n")) == (2, "", 1) and "damaged (coefficients" in err
+    assert not figure.exists()
+    with pytest.raises(InputError, match=r"damaged \(coefficients"):
+        dt.open_atlas(damaged)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ not know them ignores them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache, partial
 from typing import Any, ParamSpec, TypeVar
 
@@ -49,22 +49,22 @@ def compiler_options(lanes: int = FULL_WIDTH, *, march: bool = False) -> dict[st
     A ``march`` is left to the older of two code generators, which takes half the time and makes most marches no slower
     (charts, determinants, impacts and adaptive steps in lockstep become slower, by up to a factor of two).
     """
-    if jax.default_backend() != "cpu":
-        return {}
     options: dict[str, Any] = {}
     if "avx512f" in instruction_set() and lanes >= FULL_WIDTH:
         options["xla_cpu_prefer_vector_width"] = 512
     if march:
         options["xla_cpu_use_fusion_emitters"] = False
-    return {option: value for option, value in options.items() if compiler_knows(option, value)}
+    return _applicable(options)
 
 
 def options_for_few() -> dict[str, Any]:
-    """For kernels of few lanes, which run for milliseconds: compiled without optimising, in a third of the time. They take
-    one to four times as long to run."""
+    """For kernels that run for milliseconds: compiled without optimising. Long ones would run several times as long."""
+    return _applicable({"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False})
+
+
+def _applicable(options: Mapping[str, Any]) -> dict[str, Any]:
     if jax.default_backend() != "cpu":
         return {}
-    options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
     return {option: value for option, value in options.items() if compiler_knows(option, value)}
 
 
