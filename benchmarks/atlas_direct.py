@@ -4,6 +4,7 @@ in short. An atlas from them, and the spectral radius beside it."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import jax
@@ -11,7 +12,7 @@ import numpy as np
 
 from drivetrain_jax.analysis import Request
 from drivetrain_jax.analysis.periodic.floquet_propagator import ANALYSIS
-from drivetrain_jax.atlas import StabilityAtlas, floquet_rounds, run, solve_rtol, stability_atlas
+from drivetrain_jax.atlas import StabilityAtlas, floquet_rounds, run, solve_rtol, span_parts, stability_atlas
 from drivetrain_jax.systems import get_system
 
 CARDAN = get_system("cardan")
@@ -21,14 +22,15 @@ OUTPUTS = ("propagator", "propagator_error")
 _SIZES = (512, 16)
 
 
-def solvers(rtol: float) -> Sequence[Any]:
+def solvers(rtol: float, parts: int = 1) -> Sequence[Any]:
     """The solvers of ``direct`` for the propagator."""
-    return ANALYSIS.solvers(CARDAN, Request(OUTPUTS, "direct", {"rtol": rtol}))
+    return ANALYSIS.solvers(CARDAN, Request(OUTPUTS, "direct", {"rtol": rtol, "parts": parts}))
 
 
-def _batch(index: int) -> Callable[..., jax.Array]:
+@cache
+def _batch(index: int, parts: int) -> Callable[..., jax.Array]:
     def batch(values: Mapping[str, Any], effort: Any, rtol: Any) -> jax.Array:
-        solver = solvers(rtol)[index]
+        solver = solvers(rtol, parts)[index]
         if solver.broadcasts:
             return solver.solve(values, effort)["propagator"]
         return jax.vmap(lambda v: solver.solve(v, effort)["propagator"], out_axes=-1)(values)
@@ -36,23 +38,20 @@ def _batch(index: int) -> Callable[..., jax.Array]:
     return jax.jit(batch)
 
 
-_KERNELS = (_batch(0), _batch(1))
-
-
-def propagators(columns: Mapping[str, Any], rtol: float = 1e-13) -> np.ndarray:
-    """``(N, 16)`` for arrays of parameters, points of similar effort together."""
+def propagators(columns: Mapping[str, Any], rtol: float = 1e-13, parts: int = 1) -> np.ndarray:
+    """``(N, 16 parts)`` for arrays of parameters, points of similar effort together."""
     given = np.broadcast_arrays(*(np.atleast_1d(np.asarray(columns[name], float)) for name in NAMES))
     points = dict(zip(NAMES, given, strict=True))
     efforts = np.stack([np.asarray(s.effort(points), float) * s.unit_cost for s in solvers(rtol)])
     choice = np.argmin(efforts, axis=0)
-    out = np.empty((choice.size, 16))
+    out = np.empty((choice.size, 16 * parts))
     for index, size in enumerate(_SIZES):
         mine = np.flatnonzero(choice == index)
         mine = mine[np.argsort(efforts[index, mine], kind="stable")]
         for part in (mine[i : i + size] for i in range(0, mine.size, size)):
             padded = {name: np.pad(x[part], (0, size - part.size), mode="edge") for name, x in points.items()}
             effort = np.int64(efforts[index, part].max() / solvers(rtol)[index].unit_cost)
-            out[part] = np.asarray(_KERNELS[index](padded, effort, rtol)).T[: part.size]
+            out[part] = np.asarray(_batch(index, parts)(padded, effort, rtol)).T[: part.size]
     return out
 
 
@@ -64,12 +63,13 @@ def cardan_atlas(
 ) -> StabilityAtlas:
     """An atlas of the cardan shaft."""
     fixed = {name: value for name, value in fixed.items() if name not in ranges}
-    names = tuple(ranges)
+    names, parts = tuple(ranges), span_parts(CARDAN, ranges, fixed, tolerance)
 
     def solve(points: np.ndarray) -> np.ndarray:
-        return propagators({**fixed, **dict(zip(names, points.T, strict=True))}, solve_rtol(tolerance))
+        return propagators({**fixed, **dict(zip(names, points.T, strict=True))}, solve_rtol(tolerance), parts)
 
-    return stability_atlas(run(floquet_rounds(CARDAN, ranges, fixed, tolerance), solve), CARDAN, rtol)
+    rounds = floquet_rounds(CARDAN, ranges, fixed, tolerance, parts=parts)
+    return stability_atlas(run(rounds, solve), CARDAN, rtol)
 
 
 def monodromy(phi: np.ndarray) -> np.ndarray:

@@ -12,7 +12,14 @@ from __future__ import annotations
 
 from drivetrain_jax.atlas.construction import Domain, Rounds, construct, run
 from drivetrain_jax.atlas.evaluation import values_at
-from drivetrain_jax.atlas.floquet import floquet_domain, floquet_rounds, prepare_judging, solve_rtol, stability_atlas
+from drivetrain_jax.atlas.floquet import (
+    floquet_domain,
+    floquet_rounds,
+    prepare_judging,
+    solve_rtol,
+    span_parts,
+    stability_atlas,
+)
 from drivetrain_jax.atlas.panels import Atlas, Gap, Panel
 from drivetrain_jax.atlas.quantity import Quantity
 from drivetrain_jax.atlas.stability import StabilityAtlas
@@ -33,6 +40,7 @@ __all__ = [
     "prepare_judging",
     "run",
     "solve_rtol",
+    "span_parts",
     "stability_atlas",
     "to_arrays",
     "values_at",

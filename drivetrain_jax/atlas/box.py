@@ -2,25 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
-from drivetrain_jax.atlas.panels import Gap, Panel
+from drivetrain_jax.atlas.interpolation import nodes, tensor_nodes
+from drivetrain_jax.atlas.panels import Gap, Panel, position_between
 from drivetrain_jax.atlas.quantity import Quantity
 
 # Splits along one coordinate of a box in which something is wrong (failed solves, a kink), and in all of any box.
-_TROUBLED_DEPTH, _MAX_DEPTH = 2, 12
+TROUBLED_DEPTH, _MAX_DEPTH = 2, 12
+
+
+class Source(Protocol):
+    """Where the values at nodes come from if they are not solved."""
+
+    def at(self, x: np.ndarray) -> np.ndarray:
+        """Values at points ``(N, d)`` of one box, in coordinates."""
+
+    def on_grid(self, axes: Sequence[np.ndarray]) -> np.ndarray:
+        """Values at the points of a grid in C order."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What all boxes share."""
+    """What all boxes share. ``value_of`` makes values of the quantity ``(N, m)`` from what is solved; with a ``source`` only
+    held-out points are."""
 
     quantity: Quantity
     tolerance: float
     max_nodes: int
+    value_of: Callable[[np.ndarray], np.ndarray] = lambda solved: solved
+    source: Source | None = None
 
     def limit(self, values: np.ndarray) -> float:
         """Largest admissible error of the values, from a sample ``(N, m)`` of them."""
@@ -49,13 +64,18 @@ class Box:
     splits: tuple[int, ...]
     known: tuple[Sample, ...] = ()
 
+    @classmethod
+    def of(cls, part: Panel | Gap, splits: int = 0) -> Box:
+        """The box of a panel or gap, as if split ``splits`` times along each coordinate."""
+        return cls(part.lower, part.upper, (splits,) * len(part.lower))
+
     def place(self, t: np.ndarray) -> np.ndarray:
         """Coordinates of points ``t`` in [-1, 1]^d."""
         return (self.lower * (1 - t) + self.upper * (1 + t)) / 2
 
     def position(self, x: np.ndarray) -> np.ndarray:
         """Points ``t`` in [-1, 1]^d of coordinates ``x``."""
-        return np.clip(((x - self.lower) - (self.upper - x)) / (self.upper - self.lower), -1.0, 1.0)
+        return position_between(self.lower, self.upper, x)
 
     def halves(self, axis: int, solved: list[Sample]) -> tuple[Box, Box]:
         """The two halves along ``axis``."""
@@ -78,8 +98,26 @@ class Progress:
     settings: Settings
     solved: list[Sample] = field(default_factory=list)
 
-    def ask(self, t: np.ndarray) -> Generator[np.ndarray, np.ndarray, np.ndarray]:
-        """Values at points ``t`` in [-1, 1]^d; those that did not fail are remembered."""
+    def line(self, t: np.ndarray) -> Generator[np.ndarray, np.ndarray, np.ndarray]:
+        """Values at points ``t`` in [-1, 1]^d, which are not held out."""
+        source = self.settings.source
+        return source.at(self.box.place(t)) if source else (yield from self.solve(t))
+
+    def tensor(
+        self, degrees: Sequence[int], held_out: np.ndarray
+    ) -> Generator[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """Values at the nodes of a tensor and at ``held_out`` points in [-1, 1]^d."""
+        source = self.settings.source
+        if source is None:
+            values = yield from self.solve(np.concatenate([tensor_nodes(degrees), held_out]))
+            return np.split(values, [len(values) - len(held_out)])
+        t = [np.broadcast_to(nodes(n)[:, None], (n, len(degrees))) for n in degrees]
+        values = source.on_grid([self.box.place(x)[:, k] for k, x in enumerate(t)])
+        fresh = (yield from self.solve(held_out)) if len(held_out) else np.empty((0, values.shape[1]))
+        return values, fresh
+
+    def solve(self, t: np.ndarray) -> Generator[np.ndarray, np.ndarray, np.ndarray]:
+        """Solved values at points ``t`` in [-1, 1]^d; those that did not fail are remembered."""
         x = self.box.place(t)
         values = yield x
         finite = np.isfinite(values).all(axis=1)
@@ -99,7 +137,7 @@ class Progress:
     def trouble(self, reason: str, axis: int | None = None) -> Parts:
         """Split a troubled box, along ``axis`` or the coordinate that was split least, or give it up."""
         chosen = int(np.argmin(self.box.splits)) if axis is None else axis
-        if self.box.splits[chosen] >= _TROUBLED_DEPTH:
+        if self.box.splits[chosen] >= TROUBLED_DEPTH:
             return self.give_up(reason)
         return self.split(chosen, reason)
 

@@ -9,28 +9,36 @@ that a run can be replayed from stored answers. Every box goes through
 3. acceptance, if the last two slabs of each coordinate and the errors at all held-out points are small enough,
    else growth by the slope of the tail (twice at most), else a split in two halves.
 
+Nodes may come from something cheaper than solves (:func:`construct_from_parts`); held-out points never do.
+
 A box in which solves fail, or whose coefficients fall like a power (a kink), is split three times at most and then left
 as a :class:`~drivetrain_jax.atlas.Gap` that says why.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from drivetrain_jax.atlas.box import Box, Exploration, Progress, Settings
+from drivetrain_jax.atlas.box import TROUBLED_DEPTH, Box, Exploration, Progress, Settings
 from drivetrain_jax.atlas.fitting import fit
 from drivetrain_jax.atlas.lines import probe
 from drivetrain_jax.atlas.panels import Atlas, Gap, Panel
+from drivetrain_jax.atlas.parts import Product, parts_quantity, product
 from drivetrain_jax.atlas.quantity import Quantity
 from drivetrain_jax.systems import Coordinate
 
 Rounds = Generator[np.ndarray, np.ndarray, Atlas]
-# A box with its exploration and the points that this asks for.
+# A box with its exploration and the points that this asks for, or the answer to them (None to begin with).
 _Open = tuple[Box, Exploration, np.ndarray]
+_Told = tuple[Box, Exploration, np.ndarray | None]
 MAX_SOLVES = 400_000
+# Numbers that are kept of all solves with parts.
+_MOST_NUMBERS = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -95,10 +103,45 @@ def construct(
     ``max_nodes`` bounds the polynomials of one coordinate. When the next round would exceed ``max_solves``, the boxes that
     are still open become gaps.
     """
-    settings = Settings(quantity, tolerance, max_nodes)
-    active = [_start(domain.box(), settings)]
-    done: list[Panel | Gap] = []
     ledger = Ledger()
+    settings = Settings(quantity, tolerance, max_nodes)
+    done = yield from _explored([domain.box()], domain, settings, ledger, max_solves)
+    return _atlas(domain, done, tolerance, ledger)
+
+
+def construct_from_parts(
+    domain: Domain,
+    quantity: Quantity,
+    count: int,
+    tolerance: float,
+    *,
+    max_nodes: int = 128,
+    max_solves: int = MAX_SOLVES,
+) -> Rounds:
+    """The same for propagators, from solves that give their ``count`` parts (see :mod:`~drivetrain_jax.atlas.parts`).
+
+    Panels of the parts come first. Those of ``quantity`` lie within them, take their nodes from the product, and are held
+    against solves, in which the errors of both show. Where that fails the nodes are solved.
+    """
+    ledger = Ledger()
+    settings = Settings(parts_quantity(quantity, count, tolerance), tolerance, max_nodes)
+    max_solves = min(max_solves, _MOST_NUMBERS // settings.quantity.size)
+    first = yield from _explored([domain.box()], domain, settings, ledger, max_solves)
+    parts = _atlas(domain, first, tolerance, ledger)
+    solved = Settings(quantity, tolerance, max_nodes, partial(product, count=count))
+    settings = replace(solved, source=Product(parts, count))
+    done = yield from _explored(map(Box.of, parts.panels), domain, settings, ledger, max_solves)
+    whole = _atlas(domain, [*done, *parts.gaps], tolerance, ledger)
+    boxes = [Box.of(gap, TROUBLED_DEPTH) for gap in whole.gaps]
+    done = yield from _explored(boxes, domain, solved, ledger, max_solves)
+    return _atlas(domain, [*whole.panels, *done], tolerance, ledger)
+
+
+def _explored(
+    boxes: Iterable[Box], domain: Domain, settings: Settings, ledger: Ledger, max_solves: int
+) -> Generator[np.ndarray, np.ndarray, list[Panel | Gap]]:
+    """What became of ``boxes``."""
+    active, done = _advanced([(box, explore(box, settings), None) for box in boxes], settings)
     while active:
         requests = [request for _, _, request in active]
         points = domain.points(np.concatenate(requests))
@@ -108,9 +151,30 @@ def construct(
             break
         if len(new):
             ledger.add(new, np.asarray((yield new), float))
-        answers = np.split(ledger.values(points), np.cumsum([len(x) for x in requests])[:-1])
-        active, finished = _answer(active, answers, settings)
+        values = settings.value_of(ledger.values(points))
+        answers = np.split(values, np.cumsum([len(x) for x in requests])[:-1])
+        told = [(box, task, answer) for (box, task, _), answer in zip(active, answers, strict=True)]
+        active, finished = _advanced(told, settings)
         done += finished
+    return done
+
+
+def _advanced(tasks: Iterable[_Told], settings: Settings) -> tuple[list[_Open], list[Panel | Gap]]:
+    """The boxes that are open after their answers, the parts of those that were split among them, and what is done."""
+    waiting = deque(tasks)
+    going: list[_Open] = []
+    done: list[Panel | Gap] = []
+    while waiting:
+        box, task, answer = waiting.popleft()
+        try:
+            going.append((box, task, task.send(answer)))
+        except StopIteration as end:
+            waiting += [(part, explore(part, settings), None) for part in end.value if isinstance(part, Box)]
+            done += [part for part in end.value if not isinstance(part, Box)]
+    return going, done
+
+
+def _atlas(domain: Domain, done: Iterable[Panel | Gap], tolerance: float, ledger: Ledger) -> Atlas:
     return Atlas(
         parameters=domain.parameters,
         coordinates=domain.coordinates,
@@ -122,26 +186,6 @@ def construct(
         tolerance=tolerance,
         solves=len(ledger),
     )
-
-
-def _start(box: Box, settings: Settings) -> _Open:
-    task = explore(box, settings)
-    return box, task, next(task)
-
-
-def _answer(
-    active: list[_Open], answers: list[np.ndarray], settings: Settings
-) -> tuple[list[_Open], list[Panel | Gap]]:
-    """The boxes that are open after their ``answers``, the parts of those that were split among them, and what is done."""
-    going: list[_Open] = []
-    done: list[Panel | Gap] = []
-    for (box, task, _), answer in zip(active, answers, strict=True):
-        try:
-            going.append((box, task, task.send(answer)))
-        except StopIteration as end:
-            going += [_start(part, settings) for part in end.value if isinstance(part, Box)]
-            done += [part for part in end.value if not isinstance(part, Box)]
-    return going, done
 
 
 def explore(box: Box, settings: Settings) -> Exploration:

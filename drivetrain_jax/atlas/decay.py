@@ -10,6 +10,8 @@ from drivetrain_jax.atlas.interpolation import envelope
 
 # A plateau that lies this far below the largest coefficient is rounding or noise of the solves, not an oscillation.
 _NOISE = 1e-6
+# The same for the last coefficients of a tensor, in terms of what may be left out.
+_ROUNDING = 1e-2
 
 
 def lobatto(n: int) -> np.ndarray:
@@ -58,9 +60,14 @@ def is_algebraic(sizes: np.ndarray) -> bool:
     return second < 1.4 * max(first, 0.5)
 
 
-def remainder(sizes: np.ndarray) -> float:
-    """What the coefficients left out add up to, if they go on falling as the last pairs do; inf if these do not fall."""
+def remainder(sizes: np.ndarray, limit: float) -> float:
+    """What the coefficients left out add up to, if they go on falling as the last pairs do; inf if these do not fall.
+
+    Where they stopped falling far below ``limit`` they are rounding, and nothing is left out.
+    """
     before, last = max(sizes[-4:-2], default=np.inf), max(sizes[-2:])
+    if last < _ROUNDING * limit:
+        return float(last)
     ratio = last / before if before > 0 else 0.0
     return float(last * ratio / (1 - ratio)) if ratio < 1 else math.inf
 

@@ -6,8 +6,9 @@ import numpy as np
 
 from drivetrain_jax.atlas import decay
 from drivetrain_jax.atlas.box import Exploration, Parts, Progress, Sample
-from drivetrain_jax.atlas.interpolation import coefficients, evaluate, slabs, tensor_nodes
+from drivetrain_jax.atlas.interpolation import coefficients, evaluate, slabs
 from drivetrain_jax.atlas.panels import Panel
+from drivetrain_jax.atlas.quantity import distance
 
 _HELD_OUT, _MAX_CHECKS = 64, 512
 # Bounds are this many times the largest error at held-out points.
@@ -15,25 +16,26 @@ _SAFETY = 8.0
 # Coefficients below this part of the tolerance are left out: they take up most of the space of a large tensor.
 _NEGLIGIBLE = 1e-3
 _MAX_GROWTHS = 2
-_MAX_TENSOR = 300_000
+# Nodes of a tensor, and numbers at all of them.
+_MAX_TENSOR, _MAX_NUMBERS = 300_000, 30_000_000
 
 
 def fit(progress: Progress, degrees: list[int]) -> Exploration:
     """A panel of about ``degrees`` nodes, or what becomes of the box instead."""
     d = len(degrees)
+    most = min(_MAX_TENSOR, _MAX_NUMBERS // progress.settings.quantity.size)
     for growth in range(_MAX_GROWTHS + 1):
-        if np.prod(degrees, dtype=float) > _MAX_TENSOR:
-            return progress.split(int(np.argmax(degrees)), f"more than {_MAX_TENSOR} nodes would be needed")
-        t = tensor_nodes(degrees)
+        if np.prod(degrees, dtype=float) > most:
+            return progress.split(int(np.argmax(degrees)), f"more than {most} nodes would be needed")
         checks = _checks(progress)
         extra = scattered(_HELD_OUT, d) if growth == 0 else np.empty((0, d))
-        values = yield from progress.ask(np.concatenate([t, extra]))
-        if not np.isfinite(values).all():
-            return progress.failed(values)
-        fresh = Sample(progress.box.place(extra), values[len(t) :])
-        checks = Sample(np.concatenate([checks.x, fresh.x]), np.concatenate([checks.values, fresh.values]))
-        tensor = coefficients(values[: len(t)], degrees)
-        panel, tails, limit = _judge(progress, tensor, values[: len(t)], checks)
+        values, fresh = yield from progress.tensor(degrees, extra)
+        if not np.isfinite(values).all() or not np.isfinite(fresh).all():
+            return progress.failed(np.concatenate([values, fresh]))
+        x = np.concatenate([checks.x, progress.box.place(extra)])
+        checks = Sample(x, np.concatenate([checks.values, fresh]))
+        tensor = coefficients(values, degrees)
+        panel, tails, limit = _judge(progress, tensor, values, checks)
         if panel is not None:
             return (panel,)
         if any(decay.is_noise(slabs(tensor, k)) for k in range(d) if tails[k] > 1 and degrees[k] > 24):
@@ -54,8 +56,9 @@ def scattered(count: int, d: int) -> np.ndarray:
 def _checks(progress: Progress) -> Sample:
     """Solves that are no nodes of the next tensor, evenly thinned out."""
     d = len(progress.box.lower)
-    samples = [*progress.box.known, *progress.solved]
-    x = np.concatenate([s.x for s in samples]).reshape(-1, d)
+    none = Sample(np.empty((0, d)), np.empty((0, progress.settings.quantity.size)))
+    samples = [none, *progress.box.known, *progress.solved]
+    x = np.concatenate([s.x for s in samples])
     values = np.concatenate([s.values for s in samples])
     chosen = np.linspace(0, len(x) - 1, min(len(x), _MAX_CHECKS)).astype(int)
     return Sample(x[chosen], values[chosen])
@@ -69,19 +72,15 @@ def _judge(
     t = progress.box.position(checks.x)
     scale = quantity.scale(np.concatenate([values, checks.values]))
     limit = tolerance * scale.min()
-    tails = np.array([decay.remainder(slabs(tensor, k)) for k in range(tensor.ndim - 1)]) / (limit / 2)
+    tails = np.array([decay.remainder(slabs(tensor, k), limit) for k in range(tensor.ndim - 1)]) / (limit / 2)
     tensor = np.where(np.max(np.abs(tensor), axis=-1, keepdims=True) > _NEGLIGIBLE * limit, tensor, 0.0)
     fitted = evaluate(tensor, t)
-    errors = _distance(fitted, checks.values)
-    if np.max(errors / scale[len(values) :]) > tolerance / 2 or tails.max() > 1:
+    if np.max(quantity.relative_error(fitted, checks.values)) > tolerance / 2 or tails.max() > 1:
         return None, tails, limit / 2
+    errors = distance(fitted, checks.values)
     derived = np.abs(quantity.derived(fitted) - quantity.derived(checks.values))
     bounds = float(_SAFETY * errors.max()), _SAFETY * derived.max(axis=0, initial=0.0)
     return Panel(progress.box.lower, progress.box.upper, tensor, *bounds), tails, limit / 2
-
-
-def _distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.sum((a - b) ** 2, axis=1))
 
 
 def _grown(tensor: np.ndarray, tails: np.ndarray, limit: float) -> list[int]:

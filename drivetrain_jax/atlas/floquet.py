@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from drivetrain_jax.atlas.construction import MAX_SOLVES, Domain, Rounds, construct
+from drivetrain_jax.analysis.periodic.floquet_effort import PANEL_COST, explicit_effort, implicit_effort
+from drivetrain_jax.atlas.construction import MAX_SOLVES, Domain, Rounds, construct, construct_from_parts
 from drivetrain_jax.atlas.floquet_quantity import floquet_quantity
 from drivetrain_jax.atlas.panels import Atlas, Panel
 from drivetrain_jax.atlas.stability import StabilityAtlas
 from drivetrain_jax.systems import LinearPeriodic, Smoothness, System
 
+# Steps of the explicit scheme to a part where they are most; with three parameters and more fewer nodes are worth more.
+_STEPS = {1: 24, 2: 24}
+_STEPS_OF_MANY, _MOST_PARTS = 8, 32
+# How much cheaper the implicit scheme has to be.
+_STIFF = 4
+# Below this tolerance rounding of the parts shows in their product.
+_TOO_FINE = 5e-13
 # Direct solves are to be this much better than the atlas, as far as rounding allows.
 _SHARPER, _FINEST = 1e-2, 1e-13
 
@@ -40,14 +49,39 @@ def floquet_rounds(
     fixed: Mapping[str, float],
     tolerance: float,
     max_solves: int = MAX_SOLVES,
+    parts: int = 1,
 ) -> Rounds:
     """The construction of an atlas of the propagator, as :func:`~drivetrain_jax.atlas.construct`.
 
-    It asks for the variable ``propagator`` of the analysis ``floquet_propagator`` with the option
-    ``rtol = solve_rtol(tolerance)``.
+    It asks for the variable ``propagator`` of the analysis ``floquet_propagator`` with the options
+    ``rtol = solve_rtol(tolerance)`` and ``parts``, for which :func:`span_parts` has a proposal.
     """
     domain = floquet_domain(system, ranges, fixed)
-    return construct(domain, floquet_quantity(_form(system, domain)), tolerance, max_solves=max_solves)
+    quantity = floquet_quantity(_form(system, domain))
+    if parts == 1:
+        return construct(domain, quantity, tolerance, max_solves=max_solves)
+    return construct_from_parts(domain, quantity, parts, tolerance, max_solves=max_solves)
+
+
+def span_parts(
+    system: System, ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, float], tolerance: float
+) -> int:
+    """Into how many parts the span is to be cut: a power of two, by the steps that the slowest corner takes.
+
+    One where a corner is stiff: the product of parts is then small against them, and their rounding shows in it.
+    """
+    if tolerance < _TOO_FINE:
+        return 1
+    domain = floquet_domain(system, ranges, fixed)
+    corners = np.array(list(itertools.product(*zip(domain.lower, domain.upper, strict=True))))
+    columns = {**domain.fixed, **dict(zip(domain.parameters, corners.T, strict=True))}
+    rtol = solve_rtol(tolerance)
+    steps = explicit_effort(system, columns, rtol)
+    if np.any(_STIFF * PANEL_COST * implicit_effort(system, columns, rtol) < steps):
+        return 1
+    most = np.max(steps[np.isfinite(steps)], initial=1.0)
+    parts = most / _STEPS.get(len(ranges), _STEPS_OF_MANY)
+    return int(2 ** np.round(np.log2(np.clip(parts, 1, _MOST_PARTS))))
 
 
 def prepare_judging(

@@ -9,9 +9,9 @@ from scipy.fft import dctn
 
 from drivetrain_jax.atlas.panels import chebyshev
 
-# Most points evaluated at a time, and multiplications of a product of matrices up to which OpenBLAS starts no threads:
-# these spin on for a tenth of a second, on cores that solves and charts need. Not worth it for fewer points than that.
-_BLOCK, _ONE_THREAD, _FEWEST = 4096, 1 << 18, 8
+# Numbers that the first product of a block of points may make, and multiplications up to which OpenBLAS starts no threads:
+# these spin on for a tenth of a second, on cores that solves and charts need.
+_WORKING_SET, _ONE_THREAD = 1 << 22, 1 << 18
 
 
 def nodes(n: int) -> np.ndarray:
@@ -39,17 +39,34 @@ def coefficients(values: np.ndarray, degrees: Sequence[int]) -> np.ndarray:
 def evaluate(tensor: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Values ``(N, m)`` at points ``(N, d)`` in [-1, 1]^d."""
     out = np.empty((len(x), tensor.shape[-1]))
-    in_one_thread = _ONE_THREAD // tensor.size
-    block = min(in_one_thread, _BLOCK) if in_one_thread >= _FEWEST else _BLOCK
+    first = tensor.reshape(tensor.shape[0], -1)
+    block = max(_WORKING_SET // first.shape[1], 1)
     for start in range(0, len(x), block):
         part = x[start : start + block]
         # The first contraction is one product of matrices; the others are over what is left of each point.
-        rest = chebyshev(part[:, 0], tensor.shape[0]) @ tensor.reshape(tensor.shape[0], -1)
+        rest = _product(chebyshev(part[:, 0], tensor.shape[0]), first)
         for k in range(1, x.shape[1]):
             rest = np.einsum(
                 "pn,pnr->pr", chebyshev(part[:, k], tensor.shape[k]), rest.reshape(len(part), tensor.shape[k], -1)
             )
         out[start : start + block] = rest
+    return out
+
+
+def on_grid(tensor: np.ndarray, axes: Sequence[np.ndarray]) -> np.ndarray:
+    """Values ``(m, N_1, ..., N_d)`` on the grid of ``axes``, arrays ``(N_k,)`` in [-1, 1]."""
+    values = tensor
+    for t, n in zip(axes, tensor.shape, strict=False):
+        values = _product(chebyshev(t, n), values.reshape(n, -1)).T
+    return values.reshape(tensor.shape[-1], *map(len, axes))
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """``a @ b`` in this thread."""
+    out = np.empty((len(a), b.shape[1]))
+    block = max(_ONE_THREAD // a.size, 1)
+    for start in range(0, b.shape[1], block):
+        np.matmul(a, b[:, start : start + block], out=out[:, start : start + block])
     return out
 
 

@@ -58,7 +58,7 @@ def probe(progress: Progress) -> Probe:
     d = len(progress.box.lower)
     places = [(axis, corner) for axis in range(d) for corner in _corners(d, axis)]
     t = np.concatenate([_along(corner, axis, decay.lobatto(_LINE)) for axis, corner in places])
-    values = yield from progress.ask(t)
+    values = yield from progress.line(t)
     if not np.isfinite(values).all():
         return progress.failed(values)
     limit = progress.settings.limit(values) * _FRACTION.get(d, 1 / 2)
@@ -80,7 +80,7 @@ def _refine(progress: Progress, lines: list[_Line], limit: float) -> Probe:
             if hopeless:
                 return hopeless
         t = [_along(line.corner, line.axis, decay.lobatto(2 * len(line.values) - 1)[1::2]) for line in open_lines]
-        values = yield from progress.ask(np.concatenate(t))
+        values = yield from progress.line(np.concatenate(t))
         if not np.isfinite(values).all():
             return progress.failed(values)
         for line, new in zip(open_lines, np.split(values, np.cumsum([len(x) for x in t])[:-1]), strict=True):

@@ -128,8 +128,12 @@ class Atlas:
 
 def position(panel: Panel | Gap, x: np.ndarray) -> np.ndarray:
     """Position in [-1, 1]^d of points given by their coordinates, ``(..., d)``."""
-    span = panel.upper - panel.lower
-    return np.clip(((x - panel.lower) - (panel.upper - x)) / span, -1.0, 1.0)
+    return position_between(panel.lower, panel.upper, x)
+
+
+def position_between(lower: np.ndarray, upper: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """-1 where ``x`` is ``lower``, 1 where it is ``upper``."""
+    return np.clip(((x - lower) - (upper - x)) / (upper - lower), -1.0, 1.0)
 
 
 def chebyshev(x: np.ndarray, n: int) -> np.ndarray:

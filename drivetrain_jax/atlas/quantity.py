@@ -16,6 +16,11 @@ def _largest(values: np.ndarray) -> np.ndarray:
     return np.full(len(values), np.max(_norm(values), initial=0.0))
 
 
+def distance(fitted: np.ndarray, exact: np.ndarray) -> np.ndarray:
+    """Euclidean norms of the differences, ``(N, m)`` both, ``(N,)``."""
+    return _norm(fitted - exact)
+
+
 def _nothing(values: np.ndarray) -> np.ndarray:
     return np.empty((len(values), 0))
 
@@ -27,8 +32,15 @@ class Quantity:
     ``scale(values)`` ``(N,)``: an error of the values (Euclidean norm) divided by this is what the tolerance of an atlas
     limits; by default the largest norm among the points. ``derived(values)`` ``(N, k)``: numbers for whose errors
     panels vouch as well, because bounds that follow from that of the values would be too wide; by default none.
+    ``relative(fitted, exact)`` ``(N,)`` is the error that the tolerance limits if that is not the distance over the scale,
+    which then only tells how small coefficients may be left out.
     """
 
     size: int
     scale: Callable[[np.ndarray], np.ndarray] = _largest
     derived: Callable[[np.ndarray], np.ndarray] = _nothing
+    relative: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+
+    def relative_error(self, fitted: np.ndarray, exact: np.ndarray) -> np.ndarray:
+        """What the tolerance limits at every point, ``(N,)``."""
+        return self.relative(fitted, exact) if self.relative else distance(fitted, exact) / self.scale(exact)

@@ -14,8 +14,8 @@ from drivetrain_jax.sweep.scene import Scene
 _WORTHWHILE = 100_000
 # The share of the effort of solving every point that "auto" may spend on it. What is not covered by then is solved directly.
 _SHARE = 1 / 8
-# An atlas of d parameters is not to be expected from fewer than this to the power d (charts of two take 735 and more).
-_FEWEST = 26
+# An atlas of one, two, ... parameters is not to be expected from fewer.
+_FEWEST = (100, 500, 2_000, 8_000)
 # Points whose effort is predicted to tell that of all.
 _SAMPLE = 4096
 # Below this target relative error rounding keeps the panels of an atlas from being accepted.
@@ -50,7 +50,7 @@ def uses_atlas(scene: Scene) -> bool:
         and 0 < count <= MAX_RANGES
         and Grid.of(scene).size >= _WORTHWHILE
         and scene.request.options["rtol"] >= _FINEST
-        and solves_allowed(scene) >= _FEWEST**count
+        and solves_allowed(scene) >= _FEWEST[count - 1]
     )
 
 

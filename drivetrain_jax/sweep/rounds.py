@@ -10,7 +10,14 @@ import numpy as np
 
 from drivetrain_jax.analysis import Request
 from drivetrain_jax.analysis.periodic.floquet_propagator import ANALYSIS, PROPAGATOR
-from drivetrain_jax.atlas import StabilityAtlas, floquet_domain, floquet_rounds, solve_rtol, stability_atlas
+from drivetrain_jax.atlas import (
+    StabilityAtlas,
+    floquet_domain,
+    floquet_rounds,
+    solve_rtol,
+    span_parts,
+    stability_atlas,
+)
 from drivetrain_jax.atlas.construction import MAX_SOLVES
 from drivetrain_jax.sweep.axes import Axis
 from drivetrain_jax.sweep.engine import Engine
@@ -36,14 +43,16 @@ def build_atlas(
     fixed = fixed_of(scene, ranges)
     rtol = scene.request.options["rtol"]
     tolerance = _tolerance(scene)
-    rounds = floquet_rounds(scene.system, ranges, fixed, tolerance, max_solves or MAX_SOLVES)
+    parts = span_parts(scene.system, ranges, fixed, tolerance)
+    rounds = floquet_rounds(scene.system, ranges, fixed, tolerance, max_solves or MAX_SOLVES, parts)
+    options = {"rtol": solve_rtol(tolerance), "parts": parts}
     first, threads, values = 0, Where(work.where.threads), None
     while True:
         try:
             points = rounds.send(values)
         except StopIteration as end:
             return stability_atlas(end.value, scene.system, rtol), first
-        engine = Engine(_solves(scene, fixed, tuple(ranges), points, solve_rtol(tolerance)), full_size=True)
+        engine = Engine(_solves(scene, fixed, tuple(ranges), points, options), full_size=True)
         answers = _Answers(len(points))
         progress.total += len(points)
         work.do(engine, answers, progress, first, threads)
@@ -57,7 +66,8 @@ def node_engine(scene: Scene, ranges: Mapping[str, tuple[float, float]], count: 
     domain = floquet_domain(scene.system, ranges, fixed)
     spread = np.cos(np.pi * np.random.default_rng(0).random((count, len(ranges))))
     points = domain.points(domain.box().place(spread))
-    return Engine(_solves(scene, fixed, tuple(ranges), points, solve_rtol(_tolerance(scene))), full_size=True)
+    options = {"rtol": solve_rtol(_tolerance(scene))}
+    return Engine(_solves(scene, fixed, tuple(ranges), points, options), full_size=True)
 
 
 def _tolerance(scene: Scene) -> float:
@@ -70,12 +80,12 @@ def fixed_of(scene: Scene, ranges: Mapping[str, tuple[float, float]]) -> dict[st
     return {name: fixed[name] for name in scene.system.models[ANALYSIS.name].parameters if name in fixed}
 
 
-def _solves(scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.ndarray, rtol: float) -> Scene:
+def _solves(scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.ndarray, options: Mapping) -> Scene:
     """The scene of one round."""
     axes = tuple(
         Axis(name, scene.system.parameter(name), None, column) for name, column in zip(names, points.T, strict=True)
     )
-    request = Request((PROPAGATOR,), next(iter(ANALYSIS.methods)), {"rtol": rtol})
+    request = Request((PROPAGATOR,), next(iter(ANALYSIS.methods)), dict(options))
     dimensions = ANALYSIS.dimensions(scene.system, request, fixed)
     return replace(
         scene, analysis=ANALYSIS, request=request, axes=axes, zipped=True, fixed=fixed, dimensions=dimensions

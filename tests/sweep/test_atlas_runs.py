@@ -106,7 +106,7 @@ def test_auto_takes_an_atlas_where_points_are_many(monkeypatch, direct):
     monkeypatch.setattr(atlas_choice, "_WORTHWHILE", 500)
     # An eighth of the effort of 533 points is that of some 30 solves: no atlas of two parameters is to be had for that.
     assert "atlas_solves" not in dt.run(floquet("auto")).attrs
-    monkeypatch.setattr(atlas_choice, "_FEWEST", 1)
+    monkeypatch.setattr(atlas_choice, "_FEWEST", (1, 1))
     found = dt.run(floquet("auto"))
     # Tried all the same, it stops at the first round, and all points are solved directly.
     assert found.attrs["atlas_uncovered"] == 533

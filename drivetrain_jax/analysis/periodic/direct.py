@@ -33,6 +33,7 @@ class Monodromy(NamedTuple):
     The coefficients a_k of ``matrix``'s characteristic polynomial are wrong by at most ``error`` times the k-th power of
     its spectral radius; ``met`` says that this is the target or the limit of rounding. ``residual`` is det Z minus its
     exact value (Liouville) in units of the n-th power of a lower bound of the spectral radius; 0 if that is not known.
+    ``parts`` are those of the :class:`Propagator` that it was computed from.
     """
 
     matrix: Array
@@ -40,6 +41,7 @@ class Monodromy(NamedTuple):
     error: Array
     met: Array
     residual: Array
+    parts: Array | None = None
 
 
 def assemble(system: LinearPeriodic, phi: Array) -> Array:
@@ -69,7 +71,7 @@ def compare(
 
     ``reduction`` is the error of ``coarse`` over that of ``fine``, less one. Rounding of the matrix products grows like
     the square root of ``steps``; rounding of the coefficients shifts exponents by the ``stiffness``, the largest rate
-    times the span.
+    times the span. Parts, if there are any, have to agree as well, relative to their own norms.
     """
     halves = 1 if system.reversor is None else 2
     z_fine = assemble(system, fine.matrix)
@@ -80,6 +82,8 @@ def compare(
     log_scale = halves * fine.log_scale
     differences = [jnp.sqrt(jnp.sum((z_fine - z_coarse) ** 2, axis=(0, 1))) / scale]
     differences += [jnp.abs(a_fine[k] - a_coarse[k]) / scale ** (k + 1) for k in range(n)]
+    if fine.parts is not None:
+        differences.append(jnp.max(_relative_difference(fine.parts, coarse.parts), axis=0))
     truncation = 4 * jnp.max(jnp.stack(differences), axis=0) / reduction
     residual = jnp.zeros_like(scale)
     if system.log_determinant is not None:
@@ -89,7 +93,12 @@ def compare(
     norm = jnp.sum(fine.matrix**2, axis=(0, 1)) ** (halves / 2)
     rounding = np.finfo(float).eps * ((4 + jnp.sqrt(steps)) * norm / scale + halves * stiffness)
     met = truncation <= jnp.maximum(rtol, rounding)
-    return Monodromy(z_fine, log_scale, truncation + rounding, met, residual)
+    return Monodromy(z_fine, log_scale, truncation + rounding, met, residual, fine.parts)
+
+
+def _relative_difference(a: Array, b: Array) -> Array:
+    """Of matrices ``(K, n, n, ...)``, in Frobenius' norm."""
+    return jnp.sqrt(jnp.sum((a - b) ** 2, axis=(1, 2)) / jnp.sum(a**2, axis=(1, 2)))
 
 
 def direct_monodromy(
@@ -108,8 +117,8 @@ def direct_monodromy(
     gets two doublings to recover and then no longer holds up the others; after six the error tells what was reached.
     """
     zero = jnp.zeros(shape)
-    blank = Propagator(jnp.zeros((system.size, system.size, *shape)), zero)
-    unknown = Monodromy(blank.matrix, zero, jnp.full(shape, jnp.inf), jnp.zeros(shape, bool), zero)
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape), jax.eval_shape(propagate, steps))
+    unknown = Monodromy(blank.matrix, zero, jnp.full(shape, jnp.inf), jnp.zeros(shape, bool), zero, blank.parts)
 
     def unfinished(state: tuple) -> Array:
         count, current, _, result = state

@@ -28,13 +28,20 @@ Results = Callable[[FloquetModel, Monodromy], dict[str, Array]]
 
 
 def direct_solvers(
-    system: System, rtol: float, target: float, form: Form, results: Results, chunks: tuple[int, int] = (512, 64)
+    system: System,
+    rtol: float,
+    target: float,
+    form: Form,
+    results: Results,
+    chunks: tuple[int, int] = (512, 64),
+    parts: int = 1,
 ) -> tuple[Solver, ...]:
     """Solvers that give ``results(model, monodromy)`` from the monodromy matrix of ``form(model)``.
 
-    ``rtol`` predicts the effort, ``target`` is the error that every point is refined to.
+    ``rtol`` predicts the effort, ``target`` is the error that every point is refined to. With ``parts`` > 1 the propagators
+    over that many parts of the span are kept.
     """
-    solve = partial(_solve, system, target, form, results)
+    solve = partial(_solve, system, target, form, results, parts)
     return (
         Solver(
             "direct: explicit Runge-Kutta of order 8",
@@ -60,6 +67,7 @@ def _solve(
     target: float,
     form: Form,
     results: Results,
+    parts: int,
     values: Mapping[str, Any],
     effort: Array,
     explicit: bool,
@@ -71,11 +79,15 @@ def _solve(
     def in_lanes(steps: Array) -> Propagator:
         def block(part: Mapping[str, Any], count: int) -> Propagator:
             own = form(system.models["floquet"].build(part))
-            return explicit_propagator(own, steps, (count,) if shape else ())
+            return explicit_propagator(own, steps, (count,) if shape else (), parts)
 
         return in_blocks(block, values, shape[0] if shape else 1, LANES)
 
-    propagate = in_lanes if explicit else partial(implicit_propagator, periodic)
+    def one(steps: Array) -> Propagator:
+        return implicit_propagator(periodic, steps, parts)
 
+    # Twice as many in the second round, and as many in every part.
+    effort = -(-effort // (2 * parts)) * (2 * parts) if parts > 1 else effort
+    propagate = in_lanes if explicit else one
     order, stiffness = (EXPLICIT_ORDER, 0.0) if explicit else (IMPLICIT_ORDER, stiffness_of(periodic))
     return results(model, direct_monodromy(periodic, propagate, effort, shape, stiffness, target, order))

@@ -2,6 +2,8 @@
 
 ``Phi`` is a smooth function of the parameters, which multipliers and spectral radius are not. It is computed by the
 direct solvers of ``floquet`` with two step sizes; the error is relative to a lower bound of the spectral radius of Phi.
+What asks for solves of an atlas may ask for ``parts``: the propagators over so many equal parts of the span, one after the
+other, instead of their product.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ VARIABLES = (
 
 
 # An atlas asks for a hundred points at a time: large chunks would leave most lanes, and a core, without work.
-_CHUNKS = (64, 16)
+_CHUNKS = (32, 16)
 
 
 def whole_span(form: LinearPeriodic) -> LinearPeriodic:
@@ -48,12 +50,13 @@ def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
         lambda model: whole_span(model.reduced),
         lambda model, phi: _results(phi, request.outputs),
         _CHUNKS,
+        request.options.get("parts", 1),
     )
 
 
 def _results(phi: Monodromy, outputs: tuple[str, ...]) -> dict[str, Array]:
     matrix, error, met = phi.matrix * jnp.exp(phi.log_scale), phi.error, phi.met
-    entries = matrix.reshape(-1, *matrix.shape[2:])
+    entries = (matrix if phi.parts is None else phi.parts).reshape(-1, *matrix.shape[2:])
     finite = jnp.all(jnp.isfinite(entries), axis=0)
     outcome = jnp.where(finite, jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET), Outcome.NOT_FINITE)
     results = {PROPAGATOR: jnp.where(finite, entries, jnp.nan), "propagator_error": jnp.where(finite, error, jnp.nan)}

@@ -18,16 +18,21 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, stored, suits_one_kernel
-from drivetrain_jax.analysis.numerics.linear_algebra import solve
+from drivetrain_jax.analysis.numerics.linear_algebra import matmul, solve
 from drivetrain_jax.analysis.numerics.staged import staged
 from drivetrain_jax.systems import LinearPeriodic
 
 
 class Propagator(NamedTuple):
-    """``Phi = exp(log_scale) matrix``, shape ``(n, n, ...)``."""
+    """``Phi = exp(log_scale) matrix``, shape ``(n, n, ...)``.
+
+    ``parts`` are the propagators over equal parts of the span, the first one first, ``(K, n, n, ...)``, where these are
+    wanted; ``Phi`` is their product.
+    """
 
     matrix: Array
     log_scale: Array
+    parts: Array | None = None
 
 
 # Order of the explicit scheme, see `_tableau`.
@@ -38,10 +43,10 @@ LANES = 64
 Rows = list[Array]
 
 
-def explicit_propagator(system: LinearPeriodic, steps: Array, shape: tuple[int, ...]) -> Propagator:
+def explicit_propagator(system: LinearPeriodic, steps: Array, shape: tuple[int, ...], parts: int = 1) -> Propagator:
     """``Phi`` by ``steps`` equal steps of the 12-stage Runge-Kutta scheme of order 8 (DOP853), batch shape ``shape``.
 
-    Fastest for batches of up to about ``LANES``.
+    Fastest for batches of up to about ``LANES``. ``steps`` is a multiple of ``parts``.
     """
     zeros: list[list[bool]] = []
 
@@ -60,12 +65,28 @@ def explicit_propagator(system: LinearPeriodic, steps: Array, shape: tuple[int, 
     suits = suits_one_kernel(lambda t: system.rows(*system.basis(t)), times)
     mark = in_one_kernel if suits else lambda function: function
 
-    def march(steps: Array, h: Array, fixed: list[Array]) -> Rows:
+    def march(first: Array, last: Array, h: Array, fixed: list[Array]) -> Rows:
         step = partial(_explicit_step, system.basis, partial(split.moving, fixed), tuple(map(tuple, zeros)), h)
-        return jax.lax.fori_loop(0, steps, step, _identity(len(zeros), shape[0] if shape else 1))
+        return jax.lax.fori_loop(first, last, step, _identity(len(zeros), shape[0] if shape else 1))
 
-    rows = mark(march)(steps, system.span / steps, split.fixed)
-    return Propagator(jnp.stack(rows).reshape(len(zeros), len(zeros), *shape), jnp.zeros(shape))
+    def part(first: Array, last: Array) -> Propagator:
+        rows = mark(march)(first, last, system.span / steps, split.fixed)
+        return Propagator(jnp.stack(rows).reshape(len(zeros), len(zeros), *shape), jnp.zeros(shape))
+
+    return _in_parts(part, steps, parts)
+
+
+def _in_parts(part: Callable[[Array, Array], Propagator], steps: Array, parts: int) -> Propagator:
+    """``part(first, last)`` over all steps, or over ``parts`` equal numbers of them one after the other."""
+    if parts == 1:
+        return part(jnp.zeros_like(steps), steps)
+    each = steps // parts
+    found = jax.lax.map(lambda k: part(k * each, (k + 1) * each), jnp.arange(parts, dtype=steps.dtype))
+    product = found.matrix[0]
+    for k in range(1, parts):
+        product = stored(matmul)(found.matrix[k], product)
+    scale = jnp.exp(found.log_scale)[:, None, None]
+    return Propagator(product, jnp.sum(found.log_scale, axis=0), found.matrix * scale)
 
 
 def _tableau() -> Any:
@@ -147,7 +168,7 @@ STAGES = 8
 IMPLICIT_ORDER = 8
 
 
-def implicit_propagator(system: LinearPeriodic, steps: Array) -> Propagator:
+def implicit_propagator(system: LinearPeriodic, steps: Array, parts: int = 1) -> Propagator:
     """``Phi`` of one point by ``steps`` equal panels of Radau IIA collocation with 8 stages (order 15, L-stable).
 
     The stage values solve ``Y_i - h sum_j a_ij A(t_j) Y_j = I``; the last one is the panel's propagator. The product
@@ -167,4 +188,7 @@ def implicit_propagator(system: LinearPeriodic, steps: Array) -> Propagator:
         size = jnp.where(size > 0, size, 1.0)
         return product / size, log_scale + jnp.log(size)
 
-    return Propagator(*jax.lax.fori_loop(0, steps, body, (jnp.eye(n), jnp.zeros(()))))
+    def part(first: Array, last: Array) -> Propagator:
+        return Propagator(*jax.lax.fori_loop(first, last, body, (jnp.eye(n), jnp.zeros(()))))
+
+    return _in_parts(part, steps, parts)
