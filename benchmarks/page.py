@@ -269,7 +269,7 @@ def _accelerator_sentence(files: Files) -> str:
     named = {file.facts.get("accelerator", "none") for file in files.values() if file} - {"none"}
     if named:
         return f"Accelerators present: {', '.join(sorted(named))}."
-    return "There was no GPU machine: every figure of this page is one of the processor named below."
+    return "There was no GPU machine: every figure of this page is one of a processor named below."
 
 
 def _chart_section(file: ResultFile | None) -> str:

@@ -100,12 +100,12 @@ def figure(files: Files, name: str, images: str, words: str) -> str:
 
 
 def sources(files: Files) -> str:
-    """Date, load and versions of every file."""
+    """Date, machine, load and versions of every file."""
     rows = []
     for name, file in files.items():
         if file is None:
-            rows.append([f"{name}.csv", "not measured", "", ""])
+            rows.append([f"{name}.csv", "not measured", "", "", ""])
         else:
             load_text = file.facts.get("load", "").partition(" (")[0]
-            rows.append([f"{name}.csv", file.facts["date"], load_text, file.facts["versions"]])
-    return markdown(["file", "date", "load 1, 5, 15 min", "versions"], rows)
+            rows.append([f"{name}.csv", file.facts["date"], file.facts["machine"], load_text, file.facts["versions"]])
+    return markdown(["file", "date", "machine", "load 1, 5, 15 min", "versions"], rows)

@@ -21,7 +21,8 @@ from drivetrain_jax.atlas.sensitivity import atlas_sensitivity, direct_sensitivi
 from drivetrain_jax.atlas.tips import find_tips
 from drivetrain_jax.systems.cardan import natural_frequencies
 
-# By root finding on direct solves (`direct_tip` below, at rtol 1e-14): beta, Omega.
+# By root finding on direct solves (`direct_tip` below, at rtol 1e-14): beta, Omega. That of C-1, where two multipliers nearly
+# coincide, by the same on values to 30 digits (benchmarks.cardan_precise_reference).
 TIPS = {
     "S11": (0.0237682936, 0.0706222355),
     "S21": (0.1063331213, 1.4159881603),
@@ -32,7 +33,7 @@ TIPS = {
     "C+4": (0.8983636305, 0.1884010878),
     "H22": (0.9955772900, 0.3607839606),
     "S22": (1.0051840092, 0.4810633702),
-    "C-1": (1.1217996954, 0.6699469693),
+    "C-1": (1.1217996954, 0.6699469751),
     "C+5": (1.1344698234, 0.1550015530),
     "C+6": (1.1691118751, 0.1301021787),
 }
@@ -61,13 +62,13 @@ def rate(beta, omega, **others):
     return np.log(np.abs(np.linalg.eigvals(z)).max(axis=1))
 
 
-def direct_tip(beta, omega, shift=1e-5, **others):
+def direct_tip(beta, omega, shift=1e-5, narrowed=4, **others):
     """The tip near (beta, omega): the largest rate over Omega is 0. Samples and parabolas on direct solves, no atlas."""
     start, beta = beta, beta * (1 + shift)
 
     def peak(beta, omega):
         width = 2e-5 * omega
-        for _ in range(4):
+        for _ in range(narrowed):
             x = omega + width * np.linspace(-1, 1, 9)
             omega, width = x[np.argmax(rate(beta, x, **others))], width / 4
         x = np.linspace(-2, 2, 9)
@@ -104,8 +105,7 @@ def test_errors_of_tips_lie_within_their_bounds(tips):
         # The references have ten digits.
         assert abs(tip.point["beta"] - beta) <= tip.error["beta"] + 1e-10
         assert tip.error["beta"] < 1e-5
-        if tip.name != "C-1":  # Its two multipliers nearly coincide: Omega of the reference is good to 1e-8 only.
-            assert abs(tip.point["Omega"] - omega) <= tip.error["Omega"] + 1e-10
+        assert abs(tip.point["Omega"] - omega) <= tip.error["Omega"] + 1e-10
 
 
 @pytest.mark.parametrize("name", ["H22", "C+2"])
@@ -119,7 +119,8 @@ def test_tips_against_root_finding_on_direct_solves(tips, name):
 @pytest.mark.full
 @pytest.mark.parametrize("name", list(TIPS))
 def test_reference_tips(name):
-    beta, omega = direct_tip(TIPS[name][0], TIPS[name][1])
+    # Next to a double multiplier rates are rounded to 1e-8 or so: the parabola has to be wider than for narrow tongues.
+    beta, omega = direct_tip(TIPS[name][0], TIPS[name][1], narrowed=1 if name == "C-1" else 4)
     assert TIPS[name] == (pytest.approx(beta, abs=2e-10), pytest.approx(omega, abs=1e-8))
 
 
