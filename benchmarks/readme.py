@@ -35,8 +35,15 @@ def section(folder: Path = RESULTS) -> str:
         _atlas(files["atlas"]),
         _memory(files["memory"]),
         page.overhead_sentence(files["overhead"]),
+        _machines(files),
     ]
     return "\n\n".join([*_chart(files["throughput"]), "\n".join(f"- {sentence}" for sentence in told if sentence)])
+
+
+def _machines(files: page.Files) -> str:
+    """That not all was measured on the machine of the chart, if so."""
+    machines = {file.facts["machine"] for file in files.values() if file}
+    return f"{page.machine(files)} docs/benchmarks.md names that of every file." if len(machines) > 1 else ""
 
 
 def _chart(file: ResultFile | None) -> list[str]:

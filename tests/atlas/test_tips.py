@@ -21,8 +21,8 @@ from drivetrain_jax.atlas.sensitivity import atlas_sensitivity, direct_sensitivi
 from drivetrain_jax.atlas.tips import find_tips
 from drivetrain_jax.systems.cardan import natural_frequencies
 
-# By root finding on direct solves (`direct_tip` below, at rtol 1e-14): beta, Omega. That of C-1, where two multipliers nearly
-# coincide, by the same on values to 30 digits (benchmarks.cardan_precise_reference).
+# By root finding on direct solves (`direct_tip` below, at rtol 1e-14): beta, Omega. That of C-1, where two multipliers
+# nearly coincide, by the same on values to 30 digits (benchmarks.cardan_precise_reference).
 TIPS = {
     "S11": (0.0237682936, 0.0706222355),
     "S21": (0.1063331213, 1.4159881603),
