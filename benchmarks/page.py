@@ -287,10 +287,17 @@ def _chart_section(file: ResultFile | None) -> str:
     return f"{'; '.join(file.notes)}.\n\n{text}\n\n{markdown(head, rows)}"
 
 
-def machine(files: Files) -> str:
+def machines(files: Files) -> list[str]:
     """Where the files were measured."""
-    machines = sorted({file.facts["machine"] for file in files.values() if file})
-    return f"Machine: {'; '.join(machines)}." if machines else "Nothing has been measured."
+    return sorted({file.facts["machine"] for file in files.values() if file})
+
+
+def machine(files: Files) -> str:
+    """The same as a sentence."""
+    found = machines(files)
+    return (
+        f"{'Machines' if len(found) > 1 else 'Machine'}: {'; '.join(found)}." if found else "Nothing has been measured."
+    )
 
 
 def main() -> None:

@@ -42,8 +42,8 @@ def section(folder: Path = RESULTS) -> str:
 
 def _machines(files: page.Files) -> str:
     """That not all was measured on the machine of the chart, if so."""
-    machines = {file.facts["machine"] for file in files.values() if file}
-    return f"{page.machine(files)} docs/benchmarks.md names that of every file." if len(machines) > 1 else ""
+    told = f"{page.machine(files)} [The page](docs/benchmarks.md) names that of every file."
+    return told if len(page.machines(files)) > 1 else ""
 
 
 def _chart(file: ResultFile | None) -> list[str]:

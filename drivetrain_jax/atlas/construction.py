@@ -11,8 +11,8 @@ that a run can be replayed from stored answers. Every box goes through
 
 Nodes may come from something cheaper than solves (:func:`construct_from_parts`); held-out points never do.
 
-A box in which solves fail, or whose coefficients fall like a power (a kink), is split three times at most and then left
-as a :class:`~drivetrain_jax.atlas.Gap` that says why.
+A box in which solves fail, or whose coefficients fall like a power (a kink), is halved twice along each coordinate at
+most and then left as a :class:`~drivetrain_jax.atlas.Gap` that says why.
 """
 
 from __future__ import annotations

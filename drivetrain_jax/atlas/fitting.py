@@ -75,7 +75,8 @@ def _judge(
     tails = np.array([decay.remainder(slabs(tensor, k), limit) for k in range(tensor.ndim - 1)]) / (limit / 2)
     tensor = np.where(np.max(np.abs(tensor), axis=-1, keepdims=True) > _NEGLIGIBLE * limit, tensor, 0.0)
     fitted = evaluate(tensor, t)
-    if np.max(quantity.relative_error(fitted, checks.values)) > tolerance / 2 or tails.max() > 1:
+    relative = quantity.relative_error(fitted, checks.values, scale[len(values) :])
+    if relative.max() > tolerance / 2 or tails.max() > 1:
         return None, tails, limit / 2
     errors = distance(fitted, checks.values)
     derived = np.abs(quantity.derived(fitted) - quantity.derived(checks.values))

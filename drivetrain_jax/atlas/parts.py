@@ -41,7 +41,8 @@ def parts_quantity(whole: Quantity, count: int, tolerance: float) -> Quantity:
         return np.maximum(_SHARE * whole.scale(_entries(before[-1])) / np.sqrt(growth), finest)
 
     def relative_error(fitted: np.ndarray, exact: np.ndarray) -> np.ndarray:
-        return whole.relative_error(product(fitted, count), product(exact, count)) / _MEASURED
+        right = product(exact, count)
+        return whole.relative_error(product(fitted, count), right, whole.scale(right)) / _MEASURED
 
     return Quantity(count * whole.size, scale, relative=relative_error)
 

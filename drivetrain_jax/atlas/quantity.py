@@ -41,6 +41,6 @@ class Quantity:
     derived: Callable[[np.ndarray], np.ndarray] = _nothing
     relative: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
 
-    def relative_error(self, fitted: np.ndarray, exact: np.ndarray) -> np.ndarray:
-        """What the tolerance limits at every point, ``(N,)``."""
-        return self.relative(fitted, exact) if self.relative else distance(fitted, exact) / self.scale(exact)
+    def relative_error(self, fitted: np.ndarray, exact: np.ndarray, scale: np.ndarray) -> np.ndarray:
+        """What the tolerance limits at every point, ``(N,)``, of which ``scale`` is the scale."""
+        return self.relative(fitted, exact) if self.relative else distance(fitted, exact) / scale
