@@ -8,6 +8,7 @@ from functools import cache
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from drivetrain_jax.analysis import Request
@@ -18,7 +19,7 @@ from drivetrain_jax.systems import get_system
 CARDAN = get_system("cardan")
 BASE = dict(CARDAN.presets["base"])
 NAMES = CARDAN.models["floquet"].parameters
-OUTPUTS = ("propagator", "propagator_error")
+OUTPUTS = ANALYSIS.default_outputs
 _SIZES = (512, 16)
 
 
@@ -31,20 +32,25 @@ def solvers(rtol: float, parts: int = 1) -> Sequence[Any]:
 def _batch(index: int, parts: int) -> Callable[..., jax.Array]:
     def batch(values: Mapping[str, Any], effort: Any, rtol: Any) -> jax.Array:
         solver = solvers(rtol, parts)[index]
-        if solver.broadcasts:
-            return solver.solve(values, effort)["propagator"]
-        return jax.vmap(lambda v: solver.solve(v, effort)["propagator"], out_axes=-1)(values)
+        solve = solver.solve if solver.broadcasts else jax.vmap(solver.solve, in_axes=(0, None), out_axes=-1)
+        found = solve(values, effort)
+        return jnp.concatenate([found[name] for name in OUTPUTS])
 
     return jax.jit(batch)
 
 
 def propagators(columns: Mapping[str, Any], rtol: float = 1e-13, parts: int = 1) -> np.ndarray:
-    """``(N, 16 parts)`` for arrays of parameters, points of similar effort together."""
+    """``(N, 16 parts)`` for arrays of parameters."""
+    return solves(columns, rtol, parts)[:, : 16 * parts]
+
+
+def solves(columns: Mapping[str, Any], rtol: float, parts: int) -> np.ndarray:
+    """The same with their errors behind them, ``(N, 16 parts + 16)``; points of similar effort are solved together."""
     given = np.broadcast_arrays(*(np.atleast_1d(np.asarray(columns[name], float)) for name in NAMES))
     points = dict(zip(NAMES, given, strict=True))
     efforts = np.stack([np.asarray(s.effort(points), float) * s.unit_cost for s in solvers(rtol)])
     choice = np.argmin(efforts, axis=0)
-    out = np.empty((choice.size, 16 * parts))
+    out = np.empty((choice.size, 16 * parts + 16))
     for index, size in enumerate(_SIZES):
         mine = np.flatnonzero(choice == index)
         mine = mine[np.argsort(efforts[index, mine], kind="stable")]
@@ -66,7 +72,7 @@ def cardan_atlas(
     names, parts = tuple(ranges), span_parts(CARDAN, ranges, fixed, tolerance)
 
     def solve(points: np.ndarray) -> np.ndarray:
-        return propagators({**fixed, **dict(zip(names, points.T, strict=True))}, solve_rtol(tolerance), parts)
+        return solves({**fixed, **dict(zip(names, points.T, strict=True))}, solve_rtol(tolerance), parts)
 
     rounds = floquet_rounds(CARDAN, ranges, fixed, tolerance, parts=parts)
     return stability_atlas(run(rounds, solve), CARDAN, rtol)

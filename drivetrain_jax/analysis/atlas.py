@@ -15,7 +15,8 @@ from drivetrain_jax.systems import System
 
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
-    return floquet_propagator.ANALYSIS.solvers(system, replace(request, outputs=(floquet_propagator.PROPAGATOR,)))
+    solves = floquet_propagator.ANALYSIS
+    return solves.solvers(system, replace(request, outputs=solves.default_outputs))
 
 
 ANALYSIS = replace(

@@ -15,6 +15,7 @@ from drivetrain_jax.atlas.evaluation import values_at
 from drivetrain_jax.atlas.floquet import (
     floquet_domain,
     floquet_rounds,
+    numbers_per_solve,
     prepare_judging,
     solve_rtol,
     span_parts,
@@ -37,6 +38,7 @@ __all__ = [
     "floquet_domain",
     "floquet_rounds",
     "from_arrays",
+    "numbers_per_solve",
     "prepare_judging",
     "run",
     "solve_rtol",

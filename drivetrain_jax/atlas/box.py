@@ -29,13 +29,14 @@ class Source(Protocol):
 @dataclass(frozen=True)
 class Settings:
     """What all boxes share. ``value_of`` makes values of the quantity ``(N, m)`` from what is solved; with a ``source`` only
-    held-out points are."""
+    held-out points are. ``rough`` panels are but a step to others, which are checked again."""
 
     quantity: Quantity
     tolerance: float
     max_nodes: int
     value_of: Callable[[np.ndarray], np.ndarray] = lambda solved: solved
     source: Source | None = None
+    rough: bool = False
 
     def limit(self, values: np.ndarray) -> float:
         """Largest admissible error of the values, from a sample ``(N, m)`` of them."""

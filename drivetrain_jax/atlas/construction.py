@@ -1,11 +1,12 @@
 """Adaptive construction of an atlas, as a coroutine that asks for solves in rounds.
 
 ``construct(...)`` yields arrays of points (parameters, ``(N, d)``) and is sent their values ``(N, m)``, NaN where a solve
-failed; it returns the :class:`~drivetrain_jax.atlas.Atlas`. It is deterministic: the same values give the same questions, so
-that a run can be replayed from stored answers. Every box goes through
+failed; it returns the :class:`~drivetrain_jax.atlas.Atlas`. Solves that know how far they may be wrong, entry by entry, send
+that in further columns, and the bounds of the panels include it. The construction is deterministic: the same values give the
+same questions, so that a run can be replayed from stored answers. Every box goes through
 
 1. probes along lines on its edges, refined until the Chebyshev coefficients of each coordinate are resolved;
-2. a tensor grid with two more nodes per coordinate than the worst line needs, and held-out points;
+2. a tensor grid with some more nodes per coordinate than the worst line needs, and held-out points;
 3. acceptance, if the last two slabs of each coordinate and the errors at all held-out points are small enough,
    else growth by the slope of the tail (twice at most), else a split in two halves.
 
@@ -20,16 +21,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from drivetrain_jax.atlas.box import TROUBLED_DEPTH, Box, Exploration, Progress, Settings
 from drivetrain_jax.atlas.fitting import fit
 from drivetrain_jax.atlas.lines import probe
-from drivetrain_jax.atlas.panels import Atlas, Gap, Panel
+from drivetrain_jax.atlas.panels import Atlas, Gap, Panel, inside
 from drivetrain_jax.atlas.parts import Product, parts_quantity, product
-from drivetrain_jax.atlas.quantity import Quantity
+from drivetrain_jax.atlas.quantity import Quantity, distance
 from drivetrain_jax.systems import Coordinate
 
 Rounds = Generator[np.ndarray, np.ndarray, Atlas]
@@ -39,6 +39,8 @@ _Told = tuple[Box, Exploration, np.ndarray | None]
 MAX_SOLVES = 400_000
 # Numbers that are kept of all solves with parts.
 _MOST_NUMBERS = 50_000_000
+# Solves of a panel, those that are least exact, whose errors are followed into its bounds.
+_MOST_CHANGES = 64
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,7 @@ class Ledger:
 
     def __init__(self) -> None:
         self._values: dict[bytes, np.ndarray] = {}
+        self._rounds: list[tuple[np.ndarray, np.ndarray]] = []
 
     def __len__(self) -> int:
         return len(self._values)
@@ -88,11 +91,18 @@ class Ledger:
 
     def add(self, points: np.ndarray, values: np.ndarray) -> None:
         """Remember the values of ``points``."""
+        self._rounds.append((points, values))
         self._values.update(zip((row.tobytes() for row in points), values, strict=True))
 
     def values(self, points: np.ndarray) -> np.ndarray:
         """Values of known points."""
         return np.stack([self._values[row.tobytes()] for row in points])
+
+    def all(self) -> tuple[np.ndarray, np.ndarray]:
+        """All points whose values are finite, and these."""
+        points, values = map(np.concatenate, zip(*self._rounds, strict=True))
+        finite = np.isfinite(values).all(axis=1)
+        return points[finite], values[finite]
 
 
 def construct(
@@ -104,9 +114,9 @@ def construct(
     are still open become gaps.
     """
     ledger = Ledger()
-    settings = Settings(quantity, tolerance, max_nodes)
+    settings = Settings(quantity, tolerance, max_nodes, lambda solved: solved[:, : quantity.size])
     done = yield from _explored([domain.box()], domain, settings, ledger, max_solves)
-    return _atlas(domain, done, tolerance, ledger)
+    return _vouched(_atlas(domain, done, tolerance, ledger), settings, ledger, quantity.size)
 
 
 def construct_from_parts(
@@ -124,17 +134,19 @@ def construct_from_parts(
     against solves, in which the errors of both show. Where that fails the nodes are solved.
     """
     ledger = Ledger()
-    settings = Settings(parts_quantity(quantity, count, tolerance), tolerance, max_nodes)
-    max_solves = min(max_solves, _MOST_NUMBERS // settings.quantity.size)
+    size = count * quantity.size
+    asked = parts_quantity(quantity, count, tolerance)
+    settings = Settings(asked, tolerance, max_nodes, lambda solved: solved[:, :size], rough=True)
+    max_solves = min(max_solves, _MOST_NUMBERS // size)
     first = yield from _explored([domain.box()], domain, settings, ledger, max_solves)
     parts = _atlas(domain, first, tolerance, ledger)
-    solved = Settings(quantity, tolerance, max_nodes, partial(product, count=count))
+    solved = Settings(quantity, tolerance, max_nodes, lambda solved: product(solved[:, :size], count))
     settings = replace(solved, source=Product(parts, count))
     done = yield from _explored(map(Box.of, parts.panels), domain, settings, ledger, max_solves)
     whole = _atlas(domain, [*done, *parts.gaps], tolerance, ledger)
     boxes = [Box.of(gap, TROUBLED_DEPTH) for gap in whole.gaps]
     done = yield from _explored(boxes, domain, solved, ledger, max_solves)
-    return _atlas(domain, [*whole.panels, *done], tolerance, ledger)
+    return _vouched(_atlas(domain, [*whole.panels, *done], tolerance, ledger), solved, ledger, size)
 
 
 def _explored(
@@ -186,6 +198,32 @@ def _atlas(domain: Domain, done: Iterable[Panel | Gap], tolerance: float, ledger
         tolerance=tolerance,
         solves=len(ledger),
     )
+
+
+def _vouched(atlas: Atlas, settings: Settings, ledger: Ledger, size: int) -> Atlas:
+    """``atlas`` with bounds that include the errors of the solves, which these tell after the first ``size`` columns.
+
+    Held-out points do not show what all solves have in common.
+    """
+    if not atlas.panels:
+        return atlas
+    points, solved = ledger.all()
+    if solved.shape[1] == size:
+        return atlas
+    x, changes = atlas.to_coordinates(points), solved[:, size:]
+    order = np.argsort(-np.sum(changes**2, axis=1), kind="stable")
+
+    def vouched(panel: Panel) -> Panel:
+        chosen = order[inside(panel, x[order])][:_MOST_CHANGES]
+        value, change = settings.value_of(solved[chosen]), changes[chosen]
+        derived = np.abs(settings.quantity.derived(value + change) - settings.quantity.derived(value))
+        return replace(
+            panel,
+            value_error=panel.value_error + float(distance(value + change, value).max(initial=0.0)),
+            derived_error=panel.derived_error + derived.max(axis=0, initial=0.0),
+        )
+
+    return replace(atlas, panels=tuple(map(vouched, atlas.panels)))
 
 
 def explore(box: Box, settings: Settings) -> Exploration:

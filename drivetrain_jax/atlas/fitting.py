@@ -11,6 +11,8 @@ from drivetrain_jax.atlas.panels import Panel
 from drivetrain_jax.atlas.quantity import distance
 
 _HELD_OUT, _MAX_CHECKS = 64, 512
+# Of these for panels that are but a step to others. Nodes whose scale is looked at.
+_ROUGH_CHECKS, _SCALES = 32, 128
 # Bounds are this many times the largest error at held-out points.
 _SAFETY = 8.0
 # Coefficients below this part of the tolerance are left out: they take up most of the space of a large tensor.
@@ -60,7 +62,8 @@ def _checks(progress: Progress) -> Sample:
     samples = [none, *progress.box.known, *progress.solved]
     x = np.concatenate([s.x for s in samples])
     values = np.concatenate([s.values for s in samples])
-    chosen = np.linspace(0, len(x) - 1, min(len(x), _MAX_CHECKS)).astype(int)
+    most = _ROUGH_CHECKS if progress.settings.rough else _MAX_CHECKS
+    chosen = np.linspace(0, len(x) - 1, min(len(x), most)).astype(int)
     return Sample(x[chosen], values[chosen])
 
 
@@ -70,18 +73,19 @@ def _judge(
     """The panel if it is good enough; what each coordinate leaves out over its limit; that limit."""
     quantity, tolerance = progress.settings.quantity, progress.settings.tolerance
     t = progress.box.position(checks.x)
-    scale = quantity.scale(np.concatenate([values, checks.values]))
-    limit = tolerance * scale.min()
-    tails = np.array([decay.remainder(slabs(tensor, k), limit) for k in range(tensor.ndim - 1)]) / (limit / 2)
+    few = values[:: -(-len(values) // _SCALES)]
+    scale = quantity.scale(np.concatenate([few, checks.values]))
+    limit, spare = tolerance * scale.min(), 1.0 if progress.settings.rough else 0.5
+    tails = np.array([decay.remainder(slabs(tensor, k), limit) for k in range(tensor.ndim - 1)]) / (spare * limit)
     tensor = np.where(np.max(np.abs(tensor), axis=-1, keepdims=True) > _NEGLIGIBLE * limit, tensor, 0.0)
     fitted = evaluate(tensor, t)
-    relative = quantity.relative_error(fitted, checks.values, scale[len(values) :])
-    if relative.max() > tolerance / 2 or tails.max() > 1:
-        return None, tails, limit / 2
+    relative = quantity.relative_error(fitted, checks.values, scale[len(few) :])
+    if relative.max() > spare * tolerance or tails.max() > 1:
+        return None, tails, spare * limit
     errors = distance(fitted, checks.values)
     derived = np.abs(quantity.derived(fitted) - quantity.derived(checks.values))
     bounds = float(_SAFETY * errors.max()), _SAFETY * derived.max(axis=0, initial=0.0)
-    return Panel(progress.box.lower, progress.box.upper, tensor, *bounds), tails, limit / 2
+    return Panel(progress.box.lower, progress.box.upper, tensor, *bounds), tails, spare * limit
 
 
 def _grown(tensor: np.ndarray, tails: np.ndarray, limit: float) -> list[int]:

@@ -15,14 +15,14 @@ from drivetrain_jax.atlas.stability import StabilityAtlas
 from drivetrain_jax.systems import LinearPeriodic, Smoothness, System
 
 # Steps of the explicit scheme to a part where they are most; with three parameters and more fewer nodes are worth more.
-_STEPS = {1: 24, 2: 24}
+_STEPS = {1: 18, 2: 18}
 _STEPS_OF_MANY, _MOST_PARTS = 8, 32
 # How much cheaper the implicit scheme has to be.
 _STIFF = 4
 # Below this tolerance rounding of the parts shows in their product.
 _TOO_FINE = 5e-13
 # Direct solves are to be this much better than the atlas, as far as rounding allows.
-_SHARPER, _FINEST = 1e-2, 1e-13
+_SHARPER, _FINEST = 3e-2, 1e-13
 
 
 def solve_rtol(tolerance: float) -> float:
@@ -53,7 +53,7 @@ def floquet_rounds(
 ) -> Rounds:
     """The construction of an atlas of the propagator, as :func:`~drivetrain_jax.atlas.construct`.
 
-    It asks for the variable ``propagator`` of the analysis ``floquet_propagator`` with the options
+    It asks for the variables of the analysis ``floquet_propagator``, side by side, with the options
     ``rtol = solve_rtol(tolerance)`` and ``parts``, for which :func:`span_parts` has a proposal.
     """
     domain = floquet_domain(system, ranges, fixed)
@@ -66,7 +66,7 @@ def floquet_rounds(
 def span_parts(
     system: System, ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, float], tolerance: float
 ) -> int:
-    """Into how many parts the span is to be cut: a power of two, by the steps that the slowest corner takes.
+    """Into how many parts the span is to be cut, by the steps that the slowest corner takes.
 
     One where a corner is stiff: the product of parts is then small against them, and their rounding shows in it.
     """
@@ -80,8 +80,14 @@ def span_parts(
     if np.any(_STIFF * PANEL_COST * implicit_effort(system, columns, rtol) < steps):
         return 1
     most = np.max(steps[np.isfinite(steps)], initial=1.0)
-    parts = most / _STEPS.get(len(ranges), _STEPS_OF_MANY)
-    return int(2 ** np.round(np.log2(np.clip(parts, 1, _MOST_PARTS))))
+    return int(np.clip(np.round(most / _STEPS.get(len(ranges), _STEPS_OF_MANY)), 1, _MOST_PARTS))
+
+
+def numbers_per_solve(
+    system: System, ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, float], parts: int
+) -> int:
+    """How many numbers a solve for :func:`floquet_rounds` gives: entries of the parts, and errors of their product."""
+    return (parts + 1) * floquet_quantity(_form(system, floquet_domain(system, ranges, fixed))).size
 
 
 def prepare_judging(

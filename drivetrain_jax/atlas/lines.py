@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -15,8 +16,9 @@ from drivetrain_jax.atlas.interpolation import envelope
 # Points of a line at first; each refinement doubles the intervals.
 _LINE = 17
 # A line is resolved to this fraction of the tolerance, and the tensor has so many nodes more: lines along the edges do
-# not see everything. With three coordinates and more every node counts, and there are more lines.
-_FRACTION, _MARGIN = {1: 1 / 8, 2: 1 / 8}, {1: 2, 2: 2}
+# not see everything. Less where what is made of the panels is checked, and nodes are solved, and with three coordinates and
+# more, where every node counts and there are more lines.
+_THOROUGH, _ROUGH, _MANY = (1 / 8, 2), (1 / 4, 1), (1 / 2, 0)
 # Most lines at which a coordinate is probed.
 _MAX_LINES = 8
 
@@ -42,7 +44,7 @@ class _Line:
     corner: np.ndarray
     values: np.ndarray
 
-    @property
+    @cached_property
     def sizes(self) -> np.ndarray:
         return decay.line_sizes(self.values)
 
@@ -61,7 +63,8 @@ def probe(progress: Progress) -> Probe:
     values = yield from progress.line(t)
     if not np.isfinite(values).all():
         return progress.failed(values)
-    limit = progress.settings.limit(values) * _FRACTION.get(d, 1 / 2)
+    fraction, margin = _MANY if d > 2 else _ROUGH if progress.settings.rough else _THOROUGH
+    limit = progress.settings.limit(values) * fraction
     lines = [_Line(*place, v) for place, v in zip(places, np.split(values, len(places)), strict=True)]
 
     def cost(line: _Line) -> tuple[float, float]:
@@ -69,12 +72,12 @@ def probe(progress: Progress) -> Probe:
         return decay.needed(sizes, limit) or np.inf, envelope(sizes)[-3]
 
     worst = [max((line for line in lines if line.axis == axis), key=cost) for axis in range(d)]
-    return (yield from _refine(progress, worst, limit))
+    return (yield from _refine(progress, worst, limit, margin))
 
 
-def _refine(progress: Progress, lines: list[_Line], limit: float) -> Probe:
+def _refine(progress: Progress, lines: list[_Line], limit: float, margin: int) -> Probe:
     """Refine the worst line of each coordinate until all are resolved, or one is hopeless."""
-    while open_lines := [line for line in lines if decay.needed(line.sizes, limit) is None]:
+    while open_lines := [line for line in lines if decay.foreseen(line.sizes, limit) is None]:
         for line in open_lines:
             hopeless = _verdict(line, progress)
             if hopeless:
@@ -87,7 +90,7 @@ def _refine(progress: Progress, lines: list[_Line], limit: float) -> Probe:
             merged = np.empty((2 * len(line.values) - 1, values.shape[1]))
             merged[::2], merged[1::2] = line.values, new
             lines[line.axis] = replace(line, values=merged)
-    degrees = [decay.needed(line.sizes, limit) + _MARGIN.get(len(lines), 0) for line in lines]
+    degrees = [decay.foreseen(line.sizes, limit) + margin for line in lines]
     largest = int(np.argmax(degrees))
     if degrees[largest] > progress.settings.max_nodes:
         return progress.split(largest, f"more than {progress.settings.max_nodes} nodes would be needed")

@@ -88,7 +88,7 @@ class Atlas:
         """Number of the panel of each point in coordinates, ``(N, d) -> (N,)``; -1 in a gap or outside the domain."""
         found = np.full(len(x), -1)
         for number, panel in reversed(list(enumerate(self.panels))):
-            found[_inside(panel, x)] = number
+            found[inside(panel, x)] = number
         return found
 
     def slice(self, values: Mapping[str, float]) -> Atlas:
@@ -145,7 +145,8 @@ def _slack(panel: Panel | Gap) -> np.ndarray:
     return _SLACK * np.maximum(np.abs(panel.lower), np.abs(panel.upper))
 
 
-def _inside(panel: Panel | Gap, x: np.ndarray) -> np.ndarray:
+def inside(panel: Panel | Gap, x: np.ndarray) -> np.ndarray:
+    """Whether points given by their coordinates, ``(..., d)``, lie in the box, up to rounding."""
     slack = _slack(panel)
     return ((x >= panel.lower - slack) & (x <= panel.upper + slack)).all(axis=-1)
 

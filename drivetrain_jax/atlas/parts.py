@@ -19,7 +19,7 @@ from drivetrain_jax.atlas.quantity import Quantity
 
 # Of the errors that the product may have the parts take this share, by an estimate, and by comparison of the product itself
 # the next. Coefficients are not asked for beyond a part of the tolerance, nor below rounding, relative to the norm of all.
-_SHARE, _MEASURED, _SHARPEST, _ROUNDING = 0.1, 0.5, 4e-4, 2e-13
+_SHARE, _MEASURED, _SHARPEST, _ROUNDING = 0.1, 0.4, 4e-4, 2e-13
 
 
 def parts_quantity(whole: Quantity, count: int, tolerance: float) -> Quantity:

@@ -153,9 +153,8 @@ class StabilityAtlas:
     def _fill(self, found: dict[str, np.ndarray], axes: list[np.ndarray]) -> None:
         """Fill ``found`` tile by tile, then judge again the cells for which the closed form is not good enough."""
         names, undamped = self.atlas.parameters, self._may_be_undamped(np.ix_(*axes))
-        # Columns are shared out evenly: what fills up the last tile of a row costs as much as cells.
-        bands = -(-len(axes[-1]) // charts.COLUMNS)
-        shape = (min(charts.ROWS, _round_up(len(axes[-2]), 8)), _round_up(-(-len(axes[-1]) // bands), 16))
+        # An even number of rows of tiles: two cores are then done at the same time.
+        shape = (_shared(len(axes[-2]), charts.ROWS, 8, 2), _shared(len(axes[-1]), charts.COLUMNS, 16))
         coordinates = [c.forward(axis) for c, axis in zip(self.atlas.coordinates, axes, strict=True)]
 
         def kernel(dense: bool) -> Any:
@@ -216,8 +215,11 @@ def _store(found: Mapping[str, np.ndarray], tile: Tile, packed: charts.Packed, r
     return np.concatenate([leading, unsure + first[-2:]], axis=1)
 
 
-def _round_up(n: int, step: int) -> int:
-    return -(-n // step) * step
+def _shared(count: int, most: int, step: int, multiple: int = 1) -> int:
+    """The size, a multiple of ``step`` and ``most`` at most, of so many pieces: what fills up the last one costs as much as
+    cells. Their number is a multiple of another."""
+    pieces = -(-count // (most * multiple)) * multiple
+    return -(-count // (pieces * step)) * step
 
 
 _scattered = jax.jit(evaluation.scattered, compiler_options=compiler_options())

@@ -37,7 +37,7 @@ class Table:
     """Results of all points of a grid, filled chunk by chunk. What is never filled counts as step limit reached.
 
     ``arrays`` holds all values: the axes in the order of the scene (or the points), then a result's own dimensions.
-    ``allocate(template)`` gives such arrays for the data variables of a dataset, by default in memory.
+    ``allocate(template)`` gives such arrays for the data variables of a dataset; without it they are in memory.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Table:
     ) -> None:
         self.variables = result_variables(scene)
         self._scene, self._grid = scene, grid
-        self._allocate = allocate or _in_memory
+        self._allocate = allocate
         self._sizes = {d.name: len(d.values) for d in scene.dimensions}
         self._lost: list[np.ndarray] = []
         self._unreleased = 0
@@ -95,9 +95,12 @@ class Table:
         if not self.arrays:
             sweep = self._grid.result_shape
             shapes = {v: (*sweep, *(self._sizes[dim] for dim in v.dims)) for v in self.variables}
-            # Broadcast zeros take no memory.
-            zeros = {v.name: np.broadcast_to(np.zeros((), v.dtype), shape) for v, shape in shapes.items()}
-            self.arrays = self._allocate(to_dataset(self._scene, zeros, {}))
+            if self._allocate is None:
+                self.arrays = {v.name: np.empty(shape, v.dtype) for v, shape in shapes.items()}
+            else:
+                # Broadcast zeros take no memory.
+                zeros = {v.name: np.broadcast_to(np.zeros((), v.dtype), shape) for v, shape in shapes.items()}
+                self.arrays = self._allocate(to_dataset(self._scene, zeros, {}))
             for variable in self.variables if blank else ():
                 rows = self.arrays[variable.name].reshape(-1)
                 for start in range(0, rows.size, _ROWS):
@@ -119,10 +122,6 @@ def sweep_first(array: np.ndarray, grid: Grid) -> np.ndarray:
     """``array`` of a result with the path, if it is an axis, behind all other axes of the sweep."""
     position = grid.path_position
     return array if position is None else np.moveaxis(array, position, len(grid.shape))
-
-
-def _in_memory(template: xr.Dataset) -> dict[str, np.ndarray]:
-    return {str(name): np.empty(v.shape, v.dtype) for name, v in template.data_vars.items()}
 
 
 def failures(outcome: np.ndarray) -> int:

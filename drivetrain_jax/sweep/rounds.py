@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from drivetrain_jax.analysis import Request
-from drivetrain_jax.analysis.periodic.floquet_propagator import ANALYSIS, PROPAGATOR
+from drivetrain_jax.analysis.periodic.floquet_propagator import ANALYSIS
 from drivetrain_jax.atlas import (
     StabilityAtlas,
     floquet_domain,
     floquet_rounds,
+    numbers_per_solve,
     solve_rtol,
     span_parts,
     stability_atlas,
@@ -46,6 +47,7 @@ def build_atlas(
     parts = span_parts(scene.system, ranges, fixed, tolerance)
     rounds = floquet_rounds(scene.system, ranges, fixed, tolerance, max_solves or MAX_SOLVES, parts)
     options = {"rtol": solve_rtol(tolerance), "parts": parts}
+    width = numbers_per_solve(scene.system, ranges, fixed, parts)
     first, threads, values = 0, Where(work.where.threads), None
     while True:
         try:
@@ -53,7 +55,7 @@ def build_atlas(
         except StopIteration as end:
             return stability_atlas(end.value, scene.system, rtol), first
         engine = Engine(_solves(scene, fixed, tuple(ranges), points, options), full_size=True)
-        answers = _Answers(len(points))
+        answers = _Answers(len(points), width)
         progress.total += len(points)
         work.do(engine, answers, progress, first, threads)
         first += len(engine.plan.costs)
@@ -85,7 +87,7 @@ def _solves(scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.nda
     axes = tuple(
         Axis(name, scene.system.parameter(name), None, column) for name, column in zip(names, points.T, strict=True)
     )
-    request = Request((PROPAGATOR,), next(iter(ANALYSIS.methods)), dict(options))
+    request = Request(ANALYSIS.default_outputs, next(iter(ANALYSIS.methods)), dict(options))
     dimensions = ANALYSIS.dimensions(scene.system, request, fixed)
     return replace(
         scene, analysis=ANALYSIS, request=request, axes=axes, zipped=True, fixed=fixed, dimensions=dimensions
@@ -93,20 +95,13 @@ def _solves(scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.nda
 
 
 class _Answers:
-    """Values ``(N, m)`` of the points of a round, NaN for those that could not be solved."""
+    """All results of the points of a round side by side, ``(N, m)``, NaN for those that could not be solved."""
 
-    def __init__(self, count: int) -> None:
-        self._count = count
-        self._values: np.ndarray | None = None
+    def __init__(self, count: int, width: int) -> None:
+        self.values = np.full((count, width), np.nan)
 
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
-        if self._values is None:
-            self._values = np.full((self._count, results[PROPAGATOR].shape[1]), np.nan)
-        self._values[points] = results[PROPAGATOR]
+        self.values[points] = np.concatenate([results[name] for name in ANALYSIS.default_outputs], axis=1)
 
     def lose(self, points: np.ndarray) -> None:
         """What is not filled in is lost."""
-
-    @property
-    def values(self) -> np.ndarray:
-        return np.full((self._count, 1), np.nan) if self._values is None else self._values

@@ -185,3 +185,29 @@ def test_bound_holds_for_stiff_systems_whose_determinant_is_not_known(rates):
     size = float(jnp.exp(z.log_scale))
     bound = float(spectral_radius_bound(real, imaginary, z.error)) * size
     assert abs(float(jnp.max(jnp.hypot(real, imaginary))) * size - exact) < bound < 1e-5
+
+
+@pytest.mark.parametrize(("steps", "parts"), [(24, 0), (24, 1), (30, 7), (48, 6)])
+def test_a_fourfold_coarser_solution_tells_the_same_error(steps, parts):
+    """Both estimates hold and agree; where parts leave no room for the ratio, it is smaller."""
+    system, exact = rotating((-3.0, 0.5)), rotating_exactly((-3.0, 0.5))
+
+    def solve(ratio):
+        return direct_monodromy(
+            system,
+            lambda n: explicit_propagator(system, n, (), parts),
+            jnp.int32(steps),
+            (),
+            0.0,
+            1e-8,
+            EXPLICIT_ORDER,
+            ratio,
+            max(parts, 1),
+        )
+
+    two, four = (jax.jit(solve, static_argnums=0)(ratio) for ratio in (2, 4))
+    assert float(four.error) == pytest.approx(float(two.error), rel=0.5) and bool(two.met) and bool(four.met)
+    for found in (two, four):
+        error = np.linalg.norm(np.asarray(found.matrix) - exact)
+        assert error <= float(found.error) * np.linalg.norm(exact)
+        assert parts == 0 or error <= np.linalg.norm(np.asarray(found.change)) <= 20 * error

@@ -46,14 +46,17 @@ def test_first_chart_of_the_theory_page(chart):
     assert np.median(found["spectral_radius_error"]) < 1e-10 and (found["verdict"] != UNDECIDED).all()
 
 
-def equal_to_rounding(points, grid):
+def equal_to_rounding(points, grid, rtol):
     """The same closed form at points as on a grid without nodes; rounding grows where multipliers are nearly double."""
     rho, error = points["spectral_radius"], points["spectral_radius_error"]
     difference = np.abs(rho - grid["spectral_radius"])
     assert (difference <= error).all() and (difference <= 0.1 * error + 2e-14 * rho).mean() > 0.99
     ratio = error / grid["spectral_radius_error"]
     assert (np.abs(ratio - 1) < 0.02).mean() > 0.99
-    assert (points["verdict"] == grid["verdict"]).all() and (points["outcome"] == grid["outcome"]).all()
+    at_the_limit = np.abs(error / (10 * rtol * rho) - 1) < 0.02
+    assert (points["verdict"] == grid["verdict"]).all() and (
+        (points["outcome"] == grid["outcome"]) | at_the_limit
+    ).all()
 
 
 def test_grid_equals_points_and_holds_where_it_is_hardest(chart):
@@ -63,7 +66,7 @@ def test_grid_equals_points_and_holds_where_it_is_hardest(chart):
         points, results = cells(found, axes, chosen)
         radius, _ = direct_radius(chart, points)
         assert not violations(results, radius).any() and not wrong(results, radius).any()
-        equal_to_rounding(chart.at(points), results)
+        equal_to_rounding(chart.at(points), results, chart.rtol)
     assert (found["verdict"] == UNDECIDED).sum() == 0
 
 

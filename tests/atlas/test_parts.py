@@ -7,10 +7,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from benchmarks.atlas_direct import BASE, CARDAN, propagators
+from benchmarks.atlas_direct import BASE, CARDAN, propagators, solves
 from drivetrain_jax.atlas import Domain, Quantity, construct, run, span_parts, values_at
 from drivetrain_jax.atlas.construction import construct_from_parts
-from drivetrain_jax.atlas.decay import remainder
+from drivetrain_jax.atlas.decay import foreseen, needed, remainder
 from drivetrain_jax.atlas.parts import Product, product
 from drivetrain_jax.systems._smooth import identity
 
@@ -103,8 +103,10 @@ def test_the_solver_gives_the_parts_of_what_it_solves():
     columns = {**BASE, "beta": np.array([0.3, 1.4, 1.2]), "Omega": np.array([1.0, 0.3, 0.06])}
     exact = propagators(columns, 1e-13)
     for rtol in (1e-9, 1e-13):
-        found = product(propagators(columns, rtol, 8), 8)
-        assert np.linalg.norm(found - exact, axis=1) == pytest.approx(0.0, abs=30 * rtol + 1e-12)
+        solved = solves(columns, rtol, 8)
+        error = np.linalg.norm(product(solved[:, :-16], 8) - exact, axis=1)
+        assert error == pytest.approx(0.0, abs=30 * rtol + 1e-12)
+        assert (error <= np.linalg.norm(solved[:, -16:], axis=1) + 1e-12).all()
     stiff = {**BASE, "zeta": 20.0, "beta": np.array([0.5]), "Omega": np.array([0.2])}
     found = product(propagators(stiff, 1e-11, 4), 4)
     assert found == pytest.approx(propagators(stiff, 1e-11), rel=1e-9, abs=1e-12)
@@ -113,7 +115,7 @@ def test_the_solver_gives_the_parts_of_what_it_solves():
 @pytest.mark.parametrize(
     ("ranges", "change", "tolerance", "count"),
     [
-        ({"beta": (0.0, 1.5), "Omega": (0.1, 2.0)}, {}, 1e-11, 16),
+        ({"beta": (0.0, 1.5), "Omega": (0.1, 2.0)}, {}, 1e-11, 23),
         ({"beta": (0.0, 1.5), "Omega": (0.02, 2.0)}, {}, 1e-11, 32),
         ({"beta": (0.0, 0.2), "Omega": (5.0, 9.0)}, {}, 1e-9, 1),
         ({"beta": (0.0, 1.5), "Omega": (0.1, 2.0)}, {}, 1e-13, 1),
@@ -130,3 +132,42 @@ def test_a_tail_of_rounding_leaves_nothing_out():
     assert remainder(falling, 1e-9) == pytest.approx(1e-10 / 99, rel=1e-9)
     flat = np.concatenate([falling, np.full(6, 1e-13)])
     assert remainder(flat, 1e-9) == 1e-13 and remainder(flat, 1e-12) == np.inf
+
+
+def test_all_solves_failing_leaves_one_gap():
+    atlas = run(construct_from_parts(DOMAIN, WHOLE, COUNT, TOLERANCE), lambda points: np.nan * parts(points))
+    assert not atlas.panels and all("direct solves failed" in gap.reason for gap in atlas.gaps)
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_bounds_include_what_all_solves_are_wrong_by(told):
+    """Every part a little too long, which no held-out point can show, but the solves know it of the product."""
+    wrong = (1 + 1e-7) ** (1 / COUNT)
+
+    def off(points):
+        values = wrong * parts(points)
+        return np.concatenate([values, 2 * (whole(points) - product(values, COUNT))], axis=1) if told else values
+
+    quantity = Quantity(4, derived=lambda values: values[:, :1] * values[:, 3:])
+    atlas = run(construct_from_parts(DOMAIN, quantity, COUNT, TOLERANCE), off)
+    points = sample()
+    exact = whole(points)
+    found, bound = values_at(atlas, points)
+    held = np.linalg.norm(found - exact, axis=1) <= bound
+    derived = np.array([atlas.panels[k].derived_error[0] for k in atlas.find(atlas.to_coordinates(points))])
+    derived_held = np.abs(quantity.derived(found) - quantity.derived(exact))[:, 0] <= derived
+    assert not atlas.gaps and bound.max() < 4e-6 and derived.max() < 4e-6
+    assert (held.all(), derived_held.all()) == (told, told)
+
+
+def test_a_little_more_than_a_line_shows_is_foreseen():
+    """Of a geometric fall exactly, of a faster one not below; not of a kink, of noise or of what is far away."""
+    geometric = 0.2 ** np.arange(17.0)
+    assert foreseen(geometric, 0.2**20.5) == 21 == needed(0.2 ** np.arange(40.0), 0.2**20.5)
+    assert foreseen(geometric, 0.2**30) is None
+    assert foreseen(geometric, 0.2**10.5) == 11 == needed(geometric, 0.2**10.5)
+    entire = np.cumprod(4 / np.arange(4.0, 44.0))
+    assert (needed(entire, 1e-9), foreseen(entire[:17], 1e-9)) == (19, 20)
+    assert (needed(entire, 1e-11), foreseen(entire[:17], 1e-11)) == (21, None)
+    assert foreseen(1 / np.arange(1.0, 18.0) ** 2, 1e-4) is None
+    assert foreseen(np.full(17, 1e-9), 1e-10) is None

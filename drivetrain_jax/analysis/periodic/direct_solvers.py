@@ -23,6 +23,9 @@ from drivetrain_jax.analysis.periodic.propagator import (
 )
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System
 
+# The steps of the explicit scheme over those of the coarser solution that tells their error, where all is accurate enough.
+_RATIO, _FINE = 4, 1e-8
+
 Form = Callable[[FloquetModel], LinearPeriodic]
 Results = Callable[[FloquetModel, Monodromy], dict[str, Array]]
 
@@ -34,12 +37,12 @@ def direct_solvers(
     form: Form,
     results: Results,
     chunks: tuple[int, int] = (512, 64),
-    parts: int = 1,
+    parts: int = 0,
 ) -> tuple[Solver, ...]:
     """Solvers that give ``results(model, monodromy)`` from the monodromy matrix of ``form(model)``.
 
-    ``rtol`` predicts the effort, ``target`` is the error that every point is refined to. With ``parts`` > 1 the propagators
-    over that many parts of the span are kept.
+    ``rtol`` predicts the effort, ``target`` is the error that every point is refined to. The propagators over ``parts``
+    equal parts of the span are kept, and how far their product may be wrong; neither if there are none.
     """
     solve = partial(_solve, system, target, form, results, parts)
     return (
@@ -86,8 +89,8 @@ def _solve(
     def one(steps: Array) -> Propagator:
         return implicit_propagator(periodic, steps, parts)
 
-    # Twice as many in the second round, and as many in every part.
-    effort = -(-effort // (2 * parts)) * (2 * parts) if parts > 1 else effort
     propagate = in_lanes if explicit else one
     order, stiffness = (EXPLICIT_ORDER, 0.0) if explicit else (IMPLICIT_ORDER, stiffness_of(periodic))
-    return results(model, direct_monodromy(periodic, propagate, effort, shape, stiffness, target, order))
+    ratio = jnp.where(target <= _FINE, _RATIO, 2) if explicit else 2
+    each = max(parts, 1)
+    return results(model, direct_monodromy(periodic, propagate, effort, shape, stiffness, target, order, ratio, each))

@@ -1,9 +1,8 @@
 """The propagator of a linear periodic system over the span of its reduced form: what an atlas interpolates.
 
 ``Phi`` is a smooth function of the parameters, which multipliers and spectral radius are not. It is computed by the
-direct solvers of ``floquet`` with two step sizes; the error is relative to a lower bound of the spectral radius of Phi.
-What asks for solves of an atlas may ask for ``parts``: the propagators over so many equal parts of the span, one after the
-other, instead of their product.
+direct solvers of ``floquet`` with two step sizes, whose difference tells its error. What asks for solves of an atlas may ask
+for ``parts``: the propagators over so many equal parts of the span, one after the other, instead of their product.
 """
 
 from __future__ import annotations
@@ -21,14 +20,12 @@ from drivetrain_jax.analysis.periodic.direct import Monodromy
 from drivetrain_jax.analysis.periodic.direct_solvers import direct_solvers
 from drivetrain_jax.systems import LinearPeriodic, System
 
-# The result that an atlas interpolates.
-PROPAGATOR = "propagator"
+# The result that an atlas interpolates, and what it may be wrong by.
+PROPAGATOR, CHANGE = "propagator", "propagator_change"
 VARIABLES = (
     Variable(PROPAGATOR, "1", "entries of the propagator over the span of the reduced form, by rows", ("entry",)),
-    Variable("propagator_error", "1", "estimate of its relative error"),
+    Variable(CHANGE, "1", "estimated error of the propagator over the whole span, by rows", ("whole_entry",)),
 )
-
-
 # An atlas asks for a hundred points at a time: large chunks would leave most lanes, and a core, without work.
 _CHUNKS = (32, 16)
 
@@ -55,23 +52,23 @@ def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
 
 
 def _results(phi: Monodromy, outputs: tuple[str, ...]) -> dict[str, Array]:
-    matrix, error, met = phi.matrix * jnp.exp(phi.log_scale), phi.error, phi.met
-    entries = (matrix if phi.parts is None else phi.parts).reshape(-1, *matrix.shape[2:])
-    finite = jnp.all(jnp.isfinite(entries), axis=0)
-    outcome = jnp.where(finite, jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET), Outcome.NOT_FINITE)
-    results = {PROPAGATOR: jnp.where(finite, entries, jnp.nan), "propagator_error": jnp.where(finite, error, jnp.nan)}
+    matrices = {PROPAGATOR: phi.parts, CHANGE: phi.change * jnp.exp(phi.log_scale)}
+    entries = {name: matrix.reshape(-1, *phi.met.shape) for name, matrix in matrices.items()}
+    finite = jnp.all(jnp.isfinite(jnp.concatenate(list(entries.values()))), axis=0)
+    outcome = jnp.where(finite, jnp.where(phi.met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET), Outcome.NOT_FINITE)
+    results = {name: jnp.where(finite, entry, jnp.nan) for name, entry in entries.items()}
     return {name: results[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}
 
 
 def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
-    return (Dimension("entry", "row times size plus column", ()),)
+    return tuple(Dimension(name, "row times size plus column", ()) for name in ("entry", "whole_entry"))
 
 
 ANALYSIS = Analysis(
     name="atlas",
     title="Propagator of a linear periodic system, for its atlas",
     variables=VARIABLES,
-    default_outputs=(PROPAGATOR, "propagator_error"),
+    default_outputs=(PROPAGATOR, CHANGE),
     methods={"direct": ("rtol",)},
     options=(RTOL,),
     solvers=_solvers,

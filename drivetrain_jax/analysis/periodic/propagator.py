@@ -26,8 +26,8 @@ from drivetrain_jax.systems import LinearPeriodic
 class Propagator(NamedTuple):
     """``Phi = exp(log_scale) matrix``, shape ``(n, n, ...)``.
 
-    ``parts`` are the propagators over equal parts of the span, the first one first, ``(K, n, n, ...)``, where these are
-    wanted; ``Phi`` is their product.
+    ``parts`` are the propagators over ``K`` equal parts of the span, the first one first, ``(K, n, n, ...)``, of which
+    ``Phi`` is the product; None for ``K = 0``.
     """
 
     matrix: Array
@@ -43,7 +43,7 @@ LANES = 64
 Rows = list[Array]
 
 
-def explicit_propagator(system: LinearPeriodic, steps: Array, shape: tuple[int, ...], parts: int = 1) -> Propagator:
+def explicit_propagator(system: LinearPeriodic, steps: Array, shape: tuple[int, ...], parts: int = 0) -> Propagator:
     """``Phi`` by ``steps`` equal steps of the 12-stage Runge-Kutta scheme of order 8 (DOP853), batch shape ``shape``.
 
     Fastest for batches of up to about ``LANES``. ``steps`` is a multiple of ``parts``.
@@ -78,8 +78,9 @@ def explicit_propagator(system: LinearPeriodic, steps: Array, shape: tuple[int, 
 
 def _in_parts(part: Callable[[Array, Array], Propagator], steps: Array, parts: int) -> Propagator:
     """``part(first, last)`` over all steps, or over ``parts`` equal numbers of them one after the other."""
-    if parts == 1:
-        return part(jnp.zeros_like(steps), steps)
+    if parts < 2:
+        whole = part(jnp.zeros_like(steps), steps)
+        return whole._replace(parts=(jnp.exp(whole.log_scale) * whole.matrix)[None] if parts else None)
     each = steps // parts
     found = jax.lax.map(lambda k: part(k * each, (k + 1) * each), jnp.arange(parts, dtype=steps.dtype))
     product = found.matrix[0]
@@ -168,7 +169,7 @@ STAGES = 8
 IMPLICIT_ORDER = 8
 
 
-def implicit_propagator(system: LinearPeriodic, steps: Array, parts: int = 1) -> Propagator:
+def implicit_propagator(system: LinearPeriodic, steps: Array, parts: int = 0) -> Propagator:
     """``Phi`` of one point by ``steps`` equal panels of Radau IIA collocation with 8 stages (order 15, L-stable).
 
     The stage values solve ``Y_i - h sum_j a_ij A(t_j) Y_j = I``; the last one is the panel's propagator. The product
