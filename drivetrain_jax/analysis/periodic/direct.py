@@ -1,8 +1,8 @@
 """Monodromy matrix of a linear periodic system with a bound of its error, by two step sizes.
 
-The propagator is computed with m, 2 m, 4 m, ... steps until two successive ones agree. With a scheme of order p the
-error of the finer one is their difference over 2^p - 1; four times that is taken as its bound, measured on the matrix
-and on the coefficients of its characteristic polynomial (the larger counts, so that no accidental zero deceives).
+The propagator is computed with m/r, m, 2 m, 4 m, ... steps until two successive ones agree. With a scheme of order p the
+error of the finer one is their difference over r^p - 1, then 2^p - 1; four times that is taken as its bound, measured on
+the matrix and on the coefficients of its characteristic polynomial (the larger counts, so that no accidental zero deceives).
 The determinant is compared with Liouville's exact value, which notices an oscillation that both step sizes miss. All
 functions broadcast over a trailing batch.
 """
