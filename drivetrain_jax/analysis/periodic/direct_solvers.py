@@ -23,7 +23,8 @@ from drivetrain_jax.analysis.periodic.propagator import (
 )
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System
 
-# The steps of the explicit scheme over those of the coarser solution that tells their error, where all is accurate enough.
+# Steps of the explicit scheme over those of the coarser solution that tells its error, up to this rtol, where the system
+# predicts them itself: of any other one it is not known that the order of the scheme shows with so few.
 _RATIO, _FINE = 4, 1e-8
 
 Form = Callable[[FloquetModel], LinearPeriodic]
@@ -91,6 +92,6 @@ def _solve(
 
     propagate = in_lanes if explicit else one
     order, stiffness = (EXPLICIT_ORDER, 0.0) if explicit else (IMPLICIT_ORDER, stiffness_of(periodic))
-    ratio = jnp.where(target <= _FINE, _RATIO, 2) if explicit else 2
+    ratio = jnp.where(target <= _FINE, _RATIO, 2) if explicit and model.explicit_steps else 2
     each = max(parts, 1)
     return results(model, direct_monodromy(periodic, propagate, effort, shape, stiffness, target, order, ratio, each))
