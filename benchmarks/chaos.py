@@ -291,12 +291,14 @@ def draw(contenders: Sequence[Contender], path: Path) -> None:
     """Error against rate, one panel for each case."""
     from matplotlib.figure import Figure
 
+    from benchmarks.precision_figure import style_of
+
     cases = list(dict.fromkeys(c.case for c in contenders))
     figure = Figure(figsize=(9, 3.8), layout="constrained")
     for axes, case in zip(figure.subplots(1, len(cases), squeeze=False)[0], cases, strict=True):
-        for method in dict.fromkeys(c.method for c in contenders if c.case == case):
+        for number, method in enumerate(dict.fromkeys(c.method for c in contenders if c.case == case)):
             points = [(c.per_s, c.error) for c in contenders if (c.case, c.method) == (case, method)]
-            axes.loglog(*zip(*sorted(points), strict=True), "o-", label=method, markersize=4)
+            axes.loglog(*zip(*sorted(points), strict=True), label=method, **style_of(number))
         unit = "time units" if case == "Lorenz" else "strobes"
         axes.set(xlabel=f"{unit} per second, two cores", ylabel="error of state and tangent vectors [1]", title=case)
         axes.legend(frameon=False)

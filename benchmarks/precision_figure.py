@@ -53,7 +53,7 @@ def draw(name: str, rungs: Sequence[Rung], folder: Path = RESULTS) -> None:
 
 
 def _line(ax: Any, number: int, method: str, mine: Sequence[Rung]) -> None:
-    style = _style(number)
+    style = style_of(number)
     error = np.array([HIGHEST if math.isnan(r.error) else min(max(r.error, LOWEST), HIGHEST) for r in mine])
     seconds = np.array([rung.seconds_per_point for rung in mine])
     failed = np.array([rung.failed > 0 or math.isnan(rung.error) for rung in mine], dtype=bool)
@@ -61,7 +61,8 @@ def _line(ax: Any, number: int, method: str, mine: Sequence[Rung]) -> None:
     ax.plot(error[failed], seconds[failed], ls="none", marker=style["marker"], ms=7, mfc="white", mec=style["color"])
 
 
-def _style(number: int) -> dict[str, Any]:
+def style_of(number: int) -> dict[str, Any]:
+    """Colour, marker and dash of line number ``number``."""
     return {
         "color": COLOURS[number % len(COLOURS)],
         "marker": MARKERS[number % len(MARKERS)],
@@ -83,7 +84,7 @@ def _dress(ax: Any, region: str) -> None:
 def _legend(figure: Any, methods: Sequence[str]) -> None:
     from matplotlib.lines import Line2D
 
-    handles = [Line2D([], [], label=method, **_style(i)) for i, method in enumerate(methods)]
+    handles = [Line2D([], [], label=method, **style_of(i)) for i, method in enumerate(methods)]
     hollow = Line2D([], [], ls="none", marker="o", ms=7, mfc="white", mec="black", label="points failed")
     facts = provenance()
     about = f"{facts['machine']}; {facts['versions']}; {facts['date']}"

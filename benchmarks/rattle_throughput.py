@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.precision_figure import style_of
 from benchmarks.rattle_diffrax import integrate
 from benchmarks.rattle_reference import extended, scipy_events, scipy_plain
 from benchmarks.timing import interleaved, median, parser, provenance, results_folder, table, write_csv
@@ -134,11 +135,11 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """The figure: error against time, crosses where motions failed."""
     figure = Figure(figsize=(6.5, 4.2), dpi=150)
     axes = figure.add_axes((0.12, 0.17, 0.84, 0.8))
-    for name in dict.fromkeys(row["solver"] for row in rows):
+    for number, name in enumerate(dict.fromkeys(row["solver"] for row in rows)):
         own = [row for row in rows if row["solver"] == name]
         # Where all have failed there is no error: at the top.
         points = [(row["us_per_lane_period"], row["error"] if row["error"] > 0 else 1.0, row["failed"]) for row in own]
-        (line,) = axes.loglog(*zip(*((x, y) for x, y, _ in points), strict=True), marker="o", label=name)
+        (line,) = axes.loglog(*zip(*((x, y) for x, y, _ in points), strict=True), label=name, **style_of(number))
         for x, y, failed in points:
             if failed:
                 axes.plot(x, y, marker="x", markersize=12, markeredgewidth=2, color=line.get_color())
