@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ def numerics_of(scene: Scene) -> dict[str, Any]:
         # A partial has no source of its own.
         starts.append(Path(inspect.getsourcefile(getattr(function, "func", function)) or ""))
     return {
-        "sources": _sources(tuple(starts)),
+        "sources": {name: _source_digest(name, path) for name, path in _sources(tuple(starts))},
         "versions": versions(PACKAGES),
         "x64": bool(jax.config.jax_enable_x64),
         "backend": jax.default_backend(),
@@ -46,15 +46,14 @@ def numerics_of(scene: Scene) -> dict[str, Any]:
 
 # The code that runs is the one that was there when it was imported, not one that is edited since.
 @cache
-def _sources(starts: tuple[Path, ...]) -> Mapping[str, str]:
-    """Digests of the files ``starts`` and of all numeric code that they import, by name."""
-    files = {_label(path): path for path in _imported(starts)}
-    return {name: _source_digest(name, path) for name, path in sorted(files.items())}
+def _source_digest(name: str, path: Path) -> str:
+    return source_digest({name: path})
 
 
 @cache
-def _source_digest(name: str, path: Path) -> str:
-    return source_digest({name: path})
+def _sources(starts: tuple[Path, ...]) -> tuple[tuple[str, Path], ...]:
+    """The files ``starts`` and all numeric code that they import, by name."""
+    return tuple(sorted((_label(path), path) for path in _imported(starts)))
 
 
 def _label(path: Path) -> str:
