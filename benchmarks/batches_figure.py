@@ -44,7 +44,7 @@ def _rates(ax: Any, rows: Rows, by: str, label: str) -> None:
         ax.set(xscale="log", yscale="log")
     else:
         # From nothing, so that twice as many look twice as high.
-        ax.set_ylim(bottom=0)
+        ax.set_ylim(0, 1.08 * max((row["points_per_s"] for row in rows), default=1))
         ax.set_xticks(sorted({row["number"] for row in rows}))
     ax.grid(alpha=0.25)
     if rows:

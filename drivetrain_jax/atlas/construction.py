@@ -29,7 +29,7 @@ from drivetrain_jax.atlas.fitting import fit
 from drivetrain_jax.atlas.lines import probe
 from drivetrain_jax.atlas.panels import Atlas, Gap, Panel, inside
 from drivetrain_jax.atlas.parts import Product, parts_quantity, product
-from drivetrain_jax.atlas.quantity import Quantity, distance
+from drivetrain_jax.atlas.quantity import Quantity
 from drivetrain_jax.systems import Coordinate
 
 Rounds = Generator[np.ndarray, np.ndarray, Atlas]
@@ -79,7 +79,6 @@ class Ledger:
 
     def __init__(self) -> None:
         self._values: dict[bytes, np.ndarray] = {}
-        self._rounds: list[tuple[np.ndarray, np.ndarray]] = []
 
     def __len__(self) -> int:
         return len(self._values)
@@ -91,7 +90,6 @@ class Ledger:
 
     def add(self, points: np.ndarray, values: np.ndarray) -> None:
         """Remember the values of ``points``."""
-        self._rounds.append((points, values))
         self._values.update(zip((row.tobytes() for row in points), values, strict=True))
 
     def values(self, points: np.ndarray) -> np.ndarray:
@@ -100,7 +98,8 @@ class Ledger:
 
     def all(self) -> tuple[np.ndarray, np.ndarray]:
         """All points whose values are finite, and these."""
-        points, values = map(np.concatenate, zip(*self._rounds, strict=True))
+        points = np.frombuffer(b"".join(self._values)).reshape(len(self), -1)
+        values = np.stack(list(self._values.values()))
         finite = np.isfinite(values).all(axis=1)
         return points[finite], values[finite]
 
@@ -219,7 +218,7 @@ def _vouched(atlas: Atlas, settings: Settings, ledger: Ledger, size: int) -> Atl
         derived = np.abs(settings.quantity.derived(value + change) - settings.quantity.derived(value))
         return replace(
             panel,
-            value_error=panel.value_error + float(distance(value + change, value).max(initial=0.0)),
+            value_error=panel.value_error + float(np.linalg.norm(change, axis=1).max(initial=0.0)),
             derived_error=panel.derived_error + derived.max(axis=0, initial=0.0),
         )
 

@@ -44,8 +44,8 @@ def needed(sizes: np.ndarray, limit: float) -> int | None:
 
 
 def foreseen(sizes: np.ndarray, limit: float) -> int | None:
-    """As :func:`needed`; by the slope of the last half where it takes less than a third as many again, which was off by one
-    at most for smooth functions. What falls faster and faster is overestimated further on."""
+    """As :func:`needed`; by the slope of the last half where that takes less than a third as many again. What falls faster
+    and faster is overestimated."""
     tail, n = envelope(sizes), len(sizes)
     if tail[-3] <= limit:
         return needed(sizes, limit)

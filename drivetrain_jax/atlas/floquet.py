@@ -15,8 +15,7 @@ from drivetrain_jax.atlas.stability import StabilityAtlas
 from drivetrain_jax.systems import LinearPeriodic, Smoothness, System
 
 # Steps of the explicit scheme to a part where they are most; with three parameters and more fewer nodes are worth more.
-_STEPS = {1: 18, 2: 18}
-_STEPS_OF_MANY, _MOST_PARTS = 8, 32
+_STEPS, _STEPS_OF_MANY, _MOST_PARTS = 18, 8, 32
 # How much cheaper the implicit scheme has to be.
 _STIFF = 4
 # Below this tolerance rounding of the parts shows in their product.
@@ -80,7 +79,8 @@ def span_parts(
     if np.any(_STIFF * PANEL_COST * implicit_effort(system, columns, rtol) < steps):
         return 1
     most = np.max(steps[np.isfinite(steps)], initial=1.0)
-    return int(np.clip(np.round(most / _STEPS.get(len(ranges), _STEPS_OF_MANY)), 1, _MOST_PARTS))
+    each = _STEPS if len(ranges) < 3 else _STEPS_OF_MANY
+    return int(np.clip(np.round(most / each), 1, _MOST_PARTS))
 
 
 def numbers_per_solve(

@@ -6,7 +6,6 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import numpy as np
 
@@ -30,16 +29,13 @@ def fill_through_atlas(engine: Engine, table: Table, work: Work, progress: Progr
     """All points of ``engine`` into ``table``; returns what the attributes of the result are to say of it."""
     scene = engine.scene
     solves = Progress(0, kind="direct solves for the atlas")
-    # What takes time in a large chart is done beside the solves.
-    preparations = (partial(_lay_out, table), partial(_prepare_judging, engine))
+    # Beside the solves.
     with ThreadPoolExecutor(1) as aside:
-        prepared = [aside.submit(step) for step in preparations if engine.grid.size >= _LARGE]
+        prepared = [aside.submit(_lay_out, table), aside.submit(_prepare_judging, engine)]
         atlas, first = build_atlas(scene, atlas_ranges(scene), work, solves, solves_allowed(scene))
-        for laid_out in prepared[:1]:
-            laid_out.result()
+        prepared[0].result()
         uncovered = evaluate(engine, table, atlas, work, progress, first)
-        for judging in prepared[1:]:
-            judging.result()
+        prepared[1].result()
     return {"atlas_solves": atlas.atlas.solves, "atlas_panels": len(atlas.atlas.panels), "atlas_uncovered": uncovered}
 
 
@@ -51,6 +47,8 @@ def _lay_out(table: Table) -> None:
 
 def _prepare_judging(engine: Engine) -> None:
     """Of so many cells some have to be judged one by one, by a kernel that takes seconds to compile."""
+    if engine.grid.size < _LARGE:
+        return
     scene, ranges = engine.scene, atlas_ranges(engine.scene)
     fixed, rtol = fixed_of(scene, ranges), scene.request.options["rtol"]
     prepare_judging(scene.system, ranges, fixed, rtol, scene.request.outputs)
