@@ -44,12 +44,14 @@ def shafts(count: int = _MANY, outputs: tuple[str, ...] = ("natural_frequency",)
     return _scene("bicardan", "critical_speeds", list(outputs), {"k_A": (1e6, 1e9, count)}, _SHAFT | {"k_D": 2e7})
 
 
-def _rattle(outputs: tuple[str, ...]) -> Scene:
-    return _scene("rattle", "steady_state", list(outputs), {"omega": (0.3, 1.5, 1024)}, _RATTLE)
+def rattle(outputs: tuple[str, ...], count: int = 1024) -> Scene:
+    """Gear rattle over the frequency."""
+    return _scene("rattle", "steady_state", list(outputs), {"omega": (0.3, 1.5, count)}, _RATTLE)
 
 
-def _motion(analysis: str, outputs: tuple[str, ...], **options: Any) -> Scene:
-    return _scene("tripod", analysis, list(outputs), {"zeta": (0.01, 0.02, 128)}, _TRIPOD, **options)
+def motion(analysis: str, outputs: tuple[str, ...], count: int = 128, **options: Any) -> Scene:
+    """The double tripod over its damping."""
+    return _scene("tripod", analysis, list(outputs), {"zeta": (0.01, 0.02, count)}, _TRIPOD, **options)
 
 
 # Planets of the gear that the widths are about.
@@ -83,12 +85,12 @@ OUTPUTS: dict[tuple[str, str], dict[str, Scene]] = {
         "and mode_shape": shafts(outputs=("natural_frequency", "mode_shape")),
     },
     ("rattle", "u_max, u_min"): {
-        "u_max, u_min": _rattle(("u_max", "u_min")),
-        "and u_history": _rattle(("u_max", "u_min", "u_history")),
+        "u_max, u_min": rattle(("u_max", "u_min")),
+        "and u_history": rattle(("u_max", "u_min", "u_history")),
     },
     ("tripod", "section, no tangent vectors"): {
-        "section, no tangent vectors": _motion("poincare", ("section",), strobes=512, discard=0, steps=24),
-        "lyapunov_spectrum, with them": _motion("lyapunov", ("lyapunov_spectrum",), max_time=512 / 3066.5, steps=24),
+        "section, no tangent vectors": motion("poincare", ("section",), strobes=512, discard=0, steps=24),
+        "lyapunov_spectrum, with them": motion("lyapunov", ("lyapunov_spectrum",), max_time=512 / 3066.5, steps=24),
     },
 }  # fmt: skip
 COLD = cells(1550)

@@ -33,7 +33,7 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "benchmarks.md"
 NAMES = (
     "throughput", "precision_cardan", "work_precision_cardan", "atlas", "heyoka", "precision_bicardan", "critical_speeds",
     "precision_planetary", "planetary_throughput", "precision_rattle", "rattle_throughput", "precision_tripod", "chaos",
-    "chaos_precision", "damping", "batches", "outputs", "cold_start", "overhead", "scaling",
+    "chaos_precision", "damping", "batches", "outputs", "cold_start", "overhead", "scaling", "accelerator",
 )  # fmt: skip
 # Families of the chart: the label's beginning, and how a sentence names them.
 CHART = {
@@ -115,7 +115,7 @@ def conclusions(files: Files, precise: dict[str, page_precision.Precision]) -> l
         chaos_sentence(files["chaos"]),
         _outputs_sentence(files["outputs"]),
         overhead_sentence(files["overhead"]),
-        _accelerator_sentence(files),
+        _accelerator_sentence(files["accelerator"]),
     ]
     return [sentence for sentence in found if sentence]
 
@@ -265,11 +265,14 @@ def overhead_sentence(file: ResultFile | None) -> str:
     )
 
 
-def _accelerator_sentence(files: Files) -> str:
-    named = {file.facts.get("accelerator", "none") for file in files.values() if file} - {"none"}
-    if named:
-        return f"Accelerators present: {', '.join(sorted(named))}."
-    return "There was no GPU machine: every figure of this page is one of a processor named below."
+def _accelerator_sentence(file: ResultFile | None) -> str:
+    if file is None:
+        return "There was no GPU machine: every figure of this page is one of a processor named below."
+    rates = (
+        f"{row['scene']} {count(row['accelerator_per_s'])} points/s, {against(float(row['times']), 'the cores')}"
+        for row in file.rows
+    )
+    return f"On an accelerator ({file.notes[0]}), beside all cores of its machine: {'; '.join(rates)}."
 
 
 def _chart_section(file: ResultFile | None) -> str:

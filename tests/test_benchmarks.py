@@ -18,7 +18,7 @@ from benchmarks.chaos_reference import _orthonormalise
 from benchmarks.page import PAGE, text_of
 from benchmarks.precision import Contender, Judged, Rung, judge, measure, read, write
 from benchmarks.results_files import against, plain
-from benchmarks.timing import RESULTS, at_once, once
+from benchmarks.timing import RESULTS, at_once, once, write_csv
 from drivetrain_jax import cli
 
 
@@ -30,6 +30,29 @@ def test_the_page_is_what_the_stored_files_give():
     text = text_of(RESULTS, PAGE)
     assert text == PAGE.read_text(), "run `python -m benchmarks.page`"
     assert "There was no GPU machine" in text
+
+
+def test_an_accelerator_is_measured_or_there_was_none(tmp_path, monkeypatch):
+    """Its line is made of its file; without one there is no file, and nothing is measured of the cores either."""
+    import benchmarks.accelerator as accelerator
+
+    page = tmp_path / "benchmarks.md"
+    told = [{"device": "ACME 1"} | {"cardan, chart": {"points": 900, "first_s": 4.0, "seconds": s}} for s in (0.1, 0.3)]
+    for folder, radius in (("a", [1.0, 2.0]), ("b", [1.0, 2.0 + 2e-9])):
+        (tmp_path / folder).mkdir()
+        np.savez(tmp_path / folder / "0.npz", spectral_radius=radius, verdict=np.array([False, True]))
+    line = accelerator.row(0, "cardan, chart", told, [tmp_path / "a", tmp_path / "b"])
+    assert line["difference"] == pytest.approx(1e-9, rel=1e-6) and line["first_s"] == 4.0
+    write_csv(tmp_path / "accelerator.csv", [line], ["ACME 1; warm"])
+    text = text_of(tmp_path, page)
+    assert (
+        "On an accelerator (ACME 1; warm), beside all cores of its machine: cardan, chart 9,000 points/s, 3 times"
+        in text
+    )
+    assert "no GPU machine" not in text
+    monkeypatch.setenv("JAX_PLATFORMS", "")
+    with pytest.raises(SystemExit, match="jax finds none"):
+        accelerator.measure(tmp_path, quick=True)
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from jax import Array
 
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.numerics.kernels import compiler_options
+from drivetrain_jax.analysis.numerics.lanes import by_rows
 from drivetrain_jax.analysis.periodic import quartic
 from drivetrain_jax.atlas import conservative
 from drivetrain_jax.atlas.floquet_quantity import Build
@@ -107,7 +108,7 @@ def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
             packed = pack(quartic.coefficients(parts, log_d, errors[1:]))
             return (packed, exact_verdict(model, parts, errors[0])) if kind == "undamped" else (packed,)
 
-        return jax.lax.map(row, (first, values[names[-2]]))
+        return by_rows(row, (first, values[names[-2]]))
 
     def dense(first, columns, spread, errors, values, fixed):
         parts = quartic.blocks(jnp.moveaxis(first @ columns, 1, 0))
@@ -120,7 +121,7 @@ def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
             log_d = jnp.broadcast_to(bind(values, fixed, value).reduced.log_determinant(), lanes.shape[1:])
             return (pack(quartic.with_determinant(lanes, bounds, log_d)),)
 
-        return jax.lax.map(row, (at_nodes, bounds, values[names[-2]]))
+        return by_rows(row, (at_nodes, bounds, values[names[-2]]))
 
     return jax.jit(dense if kind == "dense" else sparse, compiler_options=compiler_options())
 

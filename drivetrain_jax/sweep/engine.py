@@ -14,7 +14,7 @@ from drivetrain_jax.store.provenance import digest
 from drivetrain_jax.sweep import compile_cache
 from drivetrain_jax.sweep.grid import Grid
 from drivetrain_jax.sweep.identity import numerics_of, scene_digest
-from drivetrain_jax.sweep.kernel import Kernel, is_small, kernel_of
+from drivetrain_jax.sweep.kernel import Kernel, for_device, is_small, kernel_of
 from drivetrain_jax.sweep.plan import Chunk, Plan, make_plan
 from drivetrain_jax.sweep.scene import Scene
 
@@ -32,7 +32,7 @@ class Engine:
     def __init__(self, scene: Scene, points: np.ndarray | None = None, *, full_size: bool = False) -> None:
         self.scene = scene
         self.grid = Grid.of(scene)
-        self.solvers = scene.analysis.solvers(scene.system, scene.request)
+        self.solvers = tuple(map(for_device, scene.analysis.solvers(scene.system, scene.request)))
         self._points, self._full_size = points, full_size
         self._kernels: dict[tuple[int, int], Future[Kernel]] = {}
         self._lock = threading.Lock()

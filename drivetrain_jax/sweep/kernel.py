@@ -16,7 +16,7 @@ from jax import Array
 
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import Solver
-from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
+from drivetrain_jax.analysis.numerics.kernels import compiler_options, on_cpu, options_for_few
 from drivetrain_jax.sweep.assemble import result_variables
 from drivetrain_jax.sweep.grid import Grid
 from drivetrain_jax.sweep.plan import make_plan
@@ -26,6 +26,8 @@ _LAPACK = threading.Lock()
 # A scene of so few points with so little predicted work, in the units of a plan, is computed in less time than it takes
 # to optimise its kernels.
 _FEW, _LIGHT = 128, 3e4
+# Points of a chunk on an accelerator: so many times those that suit a core, up to so many.
+_WIDER, _WIDEST = 64, 1 << 15
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,11 @@ def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[V
     lowered = jax.jit(batch).lower(columns, jax.ShapeDtypeStruct((), np.int64))
     compiled = lowered.compile(options_for_few() if few else compiler_options(chunk, march=solver.march))
     return Kernel(compiled, chunk, solver.broadcasts, tuple(variables), _turn(compiled))
+
+
+def for_device(solver: Solver) -> Solver:
+    """``solver`` with chunks that keep the device of this process busy."""
+    return solver if on_cpu() else replace(solver, chunk=max(solver.chunk, min(_WIDER * solver.chunk, _WIDEST)))
 
 
 def is_small(grid: Grid, solvers: Sequence[Solver]) -> bool:

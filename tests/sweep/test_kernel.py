@@ -12,7 +12,9 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+import drivetrain_jax as dt
 from drivetrain_jax.analysis.numerics import kernels
+from drivetrain_jax.atlas import charts
 from drivetrain_jax.sweep import kernel
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.scene import load_scene
@@ -23,6 +25,8 @@ def test_double_precision():
 
 
 def test_full_vector_width_only_where_there_is_avx512(monkeypatch):
+    # Of jaxlib 0.10; another one is asked, see below.
+    monkeypatch.setattr(kernels, "compiler_knows", lambda option, value: True)
     monkeypatch.setattr(kernels, "instruction_set", lambda: {"x86_64", "avx2"})
     assert kernels.compiler_options() == {}
     monkeypatch.setattr(kernels, "instruction_set", lambda: {"x86_64", "avx512f"})
@@ -39,11 +43,42 @@ def test_options_that_another_compiler_does_not_know_are_left_out(monkeypatch):
     monkeypatch.setattr(kernels.jaxlib, "__version__", "0.99.0")
     kernels.compiler_knows.cache_clear()
     # The one that is installed is asked.
-    assert kernels.compiler_knows("xla_cpu_use_fusion_emitters", False)
+    assert kernels.compiler_knows("xla_backend_optimization_level", 0)
     assert not kernels.compiler_knows("xla_cpu_no_such_option", 1)
     monkeypatch.setattr(kernels, "compiler_knows", lambda option, value: option != "xla_cpu_use_fusion_emitters")
     assert "xla_cpu_use_fusion_emitters" not in kernels.compiler_options(march=True)
     assert set(kernels.options_for_few()) == {"xla_backend_optimization_level"}
+
+
+def chart(method):
+    axes = {"beta": {"start": 0.1, "stop": 1.2, "num": 30}, "Omega": {"start": 0.4, "stop": 2.0, "num": 40}}
+    fixed = {"mu": 3.0, "alpha": 2.0, "zeta": 0.001, "gamma": 1.0}
+    return {"system": "cardan", "analysis": "floquet", "axes": axes, "fixed": fixed, "options": {"method": method}}
+
+
+GEARS = {
+    "system": "planetary",
+    "analysis": "modes",
+    "axes": {"k_sp": {"start": 1e8, "stop": 1e9, "num": 300}},
+    "fixed": {"planet_angle": [0.0, 1.5, 3.1, 4.7]},
+}
+
+
+@pytest.mark.parametrize("scene", [chart("direct"), chart("atlas"), GEARS], ids=["march", "tiles", "matrices"])
+def test_an_accelerator_gets_wide_batches_and_gives_the_same_results(monkeypatch, scene):
+    """What is done otherwise there (chunks, lanes and rows at once, no marks), here by the processor."""
+    expected, solver = dt.run(scene), Engine(load_scene(scene)).solvers[0]
+    caches = kernel._compiled, charts.tile_kernel
+    with monkeypatch.context() as patch:
+        patch.setattr(jax, "default_backend", lambda: "gpu")
+        for cache in caches:
+            cache.cache_clear()
+        assert Engine(load_scene(scene)).solvers[0].chunk == min(64 * solver.chunk, 1 << 15) > solver.chunk
+        found = dt.run(scene)
+    for cache in caches:
+        cache.cache_clear()
+    name = next(iter(expected.data_vars))
+    assert float(abs(found[name] - expected[name]).max()) < 1e-10 * float(abs(expected[name]).max())
 
 
 SCRIPT = """

@@ -42,6 +42,11 @@ _STRUCTURE = """
 _KNOWN = {*_ELEMENTWISE.split(), *_STRUCTURE.split()}
 
 
+def on_cpu() -> bool:
+    """Whether this process computes on a processor's cores. An accelerator needs other batches and takes no such marks."""
+    return jax.default_backend() == "cpu"
+
+
 def compiler_options(lanes: int = FULL_WIDTH, *, march: bool = False) -> dict[str, Any]:
     """Full vector width: XLA uses half of AVX-512 unless told otherwise, which costs a factor of 1.6.
 
@@ -63,7 +68,7 @@ def options_for_few() -> dict[str, Any]:
 
 
 def _applicable(options: Mapping[str, Any]) -> dict[str, Any]:
-    if jax.default_backend() != "cpu":
+    if not on_cpu():
         return {}
     return {option: value for option, value in options.items() if compiler_knows(option, value)}
 
@@ -93,7 +98,7 @@ def in_one_kernel(function: Callable[P, R]) -> Callable[P, R]:
 
     Everything in it has to pass :func:`suits_one_kernel`.
     """
-    if jax.default_backend() != "cpu":
+    if not on_cpu():
         return function
 
     def call(*arguments: Any) -> Any:
@@ -126,7 +131,7 @@ def suits_one_kernel(function: Callable[..., Any], *arguments: Any) -> bool:
 
 
 def _marked(function: Callable, marks: dict[str, str]) -> Callable:
-    if jax.default_backend() != "cpu":
+    if not on_cpu():
         return function
 
     def unmarked(*arguments: Any) -> Any:

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from drivetrain_jax.analysis.numerics.kernels import on_cpu
+
 Values = Mapping[str, Any]
 
 
@@ -44,12 +46,13 @@ def with_path(values: Values, path: str, lanes: int) -> tuple[dict[str, Any], in
 def in_blocks(function: Callable[[dict[str, Any], int], Any], values: Values, lanes: int, size: int) -> Any:
     """``function(values, count)`` of ``lanes`` lanes, ``size`` at a time; its results have the lanes as last axis.
 
-    The arrays among ``values`` are cut; numbers stay the constants that they are.
+    The arrays among ``values`` are cut; numbers stay the constants that they are. The caches of a core are what ``size`` is
+    for: an accelerator does all lanes at once.
     """
     count = -(-lanes // size)
     leaves, tree = jax.tree.flatten(dict(values))
     varying = [i for i, leaf in enumerate(leaves) if np.ndim(leaf)]
-    if count == 1 or not varying:
+    if count == 1 or not varying or not on_cpu():
         return function(dict(values), lanes)
 
     def part(columns: list[Array]) -> Any:
@@ -65,6 +68,12 @@ def in_blocks(function: Callable[[dict[str, Any], int], Any], values: Values, la
         return whole.reshape(*whole.shape[:-2], count * size)[..., :lanes]
 
     return jax.tree.map(join, lax.map(part, columns))
+
+
+def by_rows(function: Callable[[Any], Any], rows: Any) -> Any:
+    """``function`` of every entry along the first axis of ``rows``, one after the other, so that what it makes on the way
+    stays in the caches; on an accelerator all at once."""
+    return lax.map(function, rows) if on_cpu() else jax.vmap(function)(rows)
 
 
 def evaluated_once(certain: Array, function: Callable[[], Any]) -> Any:
