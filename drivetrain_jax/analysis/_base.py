@@ -55,8 +55,8 @@ class Solver:
     ``effort`` is a traced integer, the largest that ``effort(columns)`` predicts in the batch (columns: NumPy arrays
     of shape ``(N,)``; a count of steps or the like; by default the same for all points). The engine gives every point
     to the solver for which ``effort * unit_cost`` is smallest and runs batches of ``chunk`` points of similar effort.
-    ``march`` marks integrations in time that are compiled otherwise (``numerics.kernels.compiler_options``), ``lengthy``
-    those of which one point takes as long as a compilation.
+    ``march`` marks integrations in time and ``short_loops`` what else works through its lanes by some tens: both are compiled
+    otherwise (``numerics.kernels.compiler_options``). One point of a ``lengthy`` solver takes as long as a compilation.
     """
 
     name: str
@@ -66,6 +66,7 @@ class Solver:
     broadcasts: bool = False
     chunk: int = 256
     march: bool = False
+    short_loops: bool = False
     lengthy: bool = False
 
 

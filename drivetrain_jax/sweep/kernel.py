@@ -90,7 +90,8 @@ def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[V
     """
     batch, columns = _batch(solver, grid, chunk, variables)
     lowered = jax.jit(batch).lower(columns, jax.ShapeDtypeStruct((), np.int64))
-    compiled = lowered.compile(options_for_few() if few else compiler_options(chunk, march=solver.march))
+    options = compiler_options(chunk, march=solver.march, short_loops=solver.short_loops)
+    compiled = lowered.compile(options_for_few() if few else options)
     return Kernel(compiled, chunk, solver.broadcasts, tuple(variables), _turn(compiled))
 
 

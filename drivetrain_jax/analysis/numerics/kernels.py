@@ -47,18 +47,23 @@ def on_cpu() -> bool:
     return jax.default_backend() == "cpu"
 
 
-def compiler_options(lanes: int = FULL_WIDTH, *, march: bool = False) -> dict[str, Any]:
+def compiler_options(lanes: int = FULL_WIDTH, *, march: bool = False, short_loops: bool = False) -> dict[str, Any]:
     """Full vector width: XLA uses half of AVX-512 unless told otherwise, which costs a factor of 1.6.
 
     Not for fewer ``lanes`` than a vector has: a march of four lanes then takes the compiler tens of gigabytes (jax 0.10.2).
     A ``march`` is left to the older of two code generators, which takes half the time and makes most marches no slower
     (charts, determinants, impacts and adaptive steps in lockstep become slower, by up to a factor of two).
+
+    Where lanes are worked through by some tens (``short_loops``, every march) the highest level of optimisation unrolls the
+    loops over them into single numbers, before it would make vectors of them, and code that does not fit into its cache.
     """
     options: dict[str, Any] = {}
     if "avx512f" in instruction_set() and lanes >= FULL_WIDTH:
         options["xla_cpu_prefer_vector_width"] = 512
     if march:
         options["xla_cpu_use_fusion_emitters"] = False
+    if march or short_loops:
+        options["xla_backend_optimization_level"] = 1
     return _applicable(options)
 
 

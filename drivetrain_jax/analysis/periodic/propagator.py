@@ -38,7 +38,7 @@ class Propagator(NamedTuple):
 # Order of the explicit scheme, see `_tableau`.
 EXPLICIT_ORDER = 8
 # Lanes that should march together: what a step reads and writes stays in the innermost caches.
-LANES = 64
+LANES = 32
 
 Rows = list[Array]
 
