@@ -196,7 +196,8 @@ def _sweep(pairs: Array, first: Array, last: Array) -> Array:
         f, g, right = jnp.where(top, start, f), jnp.where(top, upper, s * upper), jnp.where(top, upper, c * upper)
         c, s, r = _rotation(f, g)
         above = jnp.where(inside & ~top, r, above)
-        g, f = s * below, c * here + s * right
+        # Once: where f and g are nothing but rounding, two evaluations would give two different rotations.
+        f, g = evaluated_once(k >= 0, lambda: (c * here + s * right, s * below))
         right, corner = c * right - s * here, c * below
         c, s, r = _rotation(f, g)
         swept = lax.dynamic_update_index_in_dim(swept, jnp.stack([above, jnp.where(inside, r, here)]), k, 0)
