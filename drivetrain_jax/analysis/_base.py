@@ -55,7 +55,7 @@ class Solver:
     ``effort`` is a traced integer, the largest that ``effort(columns)`` predicts in the batch (columns: NumPy arrays
     of shape ``(N,)``; a count of steps or the like; by default the same for all points). The engine gives every point
     to the solver for which ``effort * unit_cost`` is smallest and runs batches of ``chunk`` points of similar effort.
-    ``march`` marks integrations in time, ``short_loops`` what else works through its lanes by some tens: both are compiled
+    ``march`` marks integrations in time, ``short_loops`` what works through its lanes by some tens: both are compiled
     otherwise (``numerics.kernels.compiler_options``). One point of a ``lengthy`` solver takes as long as a compilation.
     """
 

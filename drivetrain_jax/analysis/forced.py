@@ -201,7 +201,8 @@ def predicted_steps(build: Build, columns: Mapping[str, np.ndarray]) -> np.ndarr
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     build = system.models["forced"].build
-    return (Solver("diffrax", partial(_solve, build, request), partial(predicted_steps, build), chunk=128, march=True),)
+    steps = partial(predicted_steps, build)
+    return (Solver("diffrax", partial(_solve, build, request), steps, chunk=128, march=True, short_loops=True),)
 
 
 ANALYSIS = Analysis(

@@ -54,15 +54,16 @@ def compiler_options(lanes: int = FULL_WIDTH, *, march: bool = False, short_loop
     A ``march`` is left to the older of two code generators, which takes half the time and makes most marches no slower
     (charts, determinants, impacts and adaptive steps in lockstep become slower, by up to a factor of two).
 
-    Where lanes are worked through by some tens (``short_loops``, every march) the highest level of optimisation unrolls the
-    loops over them into single numbers, before it would make vectors of them, and code that does not fit into its cache.
+    Where lanes are worked through by some tens (``short_loops``) the highest level of optimisation unrolls the loops over
+    them into single numbers, before it would make vectors of them, and code that does not fit into its cache. Marches of
+    tangent vectors keep it: with a few lanes they take the compiler tens of gigabytes at any other level.
     """
     options: dict[str, Any] = {}
     if "avx512f" in instruction_set() and lanes >= FULL_WIDTH:
         options["xla_cpu_prefer_vector_width"] = 512
     if march:
         options["xla_cpu_use_fusion_emitters"] = False
-    if march or short_loops:
+    if short_loops:
         options["xla_backend_optimization_level"] = 1
     return _applicable(options)
 

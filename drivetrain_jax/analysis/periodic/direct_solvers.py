@@ -54,6 +54,7 @@ def direct_solvers(
             broadcasts=True,
             chunk=chunks[0],
             march=True,
+            short_loops=True,
         ),
         Solver(
             "direct: Radau IIA of 8 stages",
@@ -62,6 +63,7 @@ def direct_solvers(
             unit_cost=PANEL_COST,
             chunk=chunks[1],
             march=True,
+            short_loops=True,
         ),
     )
 
