@@ -272,7 +272,8 @@ def _accelerator_sentence(file: ResultFile | None) -> str:
         f"{row['scene']} {count(row['accelerator_per_s'])} points/s, {against(float(row['times']), 'the cores')}"
         for row in file.rows
     )
-    return f"On an accelerator ({file.notes[0]}), beside all cores of its machine: {'; '.join(rates)}."
+    device = file.notes[0].partition(";")[0]
+    return f"On an accelerator ({device}), beside all cores of its machine: {'; '.join(rates)}."
 
 
 def _chart_section(file: ResultFile | None) -> str:
