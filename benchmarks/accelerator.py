@@ -25,6 +25,7 @@ from benchmarks.batches_scenes import FOUR, cells, gears, motion, rattle, shafts
 from benchmarks.timing import median, parser, results_folder, table, write_csv
 
 _REPEATS = 3
+_NOT_COMPARED = ("verdict", "lyapunov_spectrum")
 
 
 def scenes(quick: bool) -> dict[str, dict[str, Any]]:
@@ -65,19 +66,15 @@ def measure(folder: Path, quick: bool) -> None:
 
 
 def difference(first: Path, second: Path) -> float:
-    """The largest difference of two files of results, relative to the largest value of each."""
+    """The largest difference of two files of results, relative to the largest value of each; NaN if none is compared."""
     with np.load(first) as a, np.load(second) as b:
-        return max(
-            float(np.nanmax(np.abs(a[n] * 1.0 - b[n])) / np.nanmax(np.abs(a[n] * 1.0)))
-            for n in a.files
-            if n not in ("verdict", "lyapunov_spectrum")
-        )
+        compared = (name for name in a.files if name not in _NOT_COMPARED)
+        return max((float(np.nanmax(np.abs(a[n] - b[n])) / np.nanmax(np.abs(a[n]))) for n in compared), default=np.nan)
 
 
 def row(number: int, name: str, told: Sequence[dict[str, Any]], folders: Sequence[Path]) -> dict[str, Any]:
     """A line of accelerator.csv from the accelerator's times and results and those of the cores."""
     device, cores = (one[name] for one in told)
-    differs = "lyapunov" not in name.lower()
     return {
         "scene": name,
         "points": cores["points"],
@@ -85,7 +82,7 @@ def row(number: int, name: str, told: Sequence[dict[str, Any]], folders: Sequenc
         "accelerator_per_s": device["points"] / device["seconds"],
         "times": cores["seconds"] / device["seconds"],
         "first_s": device["first_s"],
-        "difference": difference(*(folder / f"{number}.npz" for folder in folders)) if differs else float("nan"),
+        "difference": difference(*(folder / f"{number}.npz" for folder in folders)),
     }
 
 
