@@ -1,8 +1,4 @@
-"""Closed-form results on grids, tile by tile, on all cores: what makes a chart cheap.
-
-The results of a cell are packed into one complex number: a fused loop of XLA's has one output, and computes what two of
-them share twice. NumPy unpacks it straight into the arrays of the chart.
-"""
+"""Closed-form results on grids, tile by tile, on all cores: what makes a chart cheap."""
 
 from __future__ import annotations
 
@@ -18,14 +14,14 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.analysis.numerics.kernels import compiler_options
+from drivetrain_jax.analysis.numerics.kernels import compiler_options, in_one_kernel
 from drivetrain_jax.analysis.numerics.lanes import by_rows
 from drivetrain_jax.analysis.periodic import quartic
 from drivetrain_jax.atlas import conservative
 from drivetrain_jax.atlas.floquet_quantity import Build
 from drivetrain_jax.atlas.interpolation import nodes
 from drivetrain_jax.atlas.panels import Panel, chebyshev
-from drivetrain_jax.atlas.tiles import NODES, Tile
+from drivetrain_jax.atlas.tiles import NODES, Tile, filled_up
 from drivetrain_jax.store.provenance import usable_cores
 from drivetrain_jax.systems import FloquetModel
 
@@ -37,8 +33,8 @@ UNDECIDED = 2
 # Interpolation between nodes multiplies their roundings by less than this.
 _SPREAD = 4.0
 
-# Of every cell what `pack` makes of it, and the verdict of Hamiltonian ones, if any may be.
-Packed = tuple[np.ndarray, ...]
+# Results of cells by name, and which of them are to be judged again (`judged`).
+Cells = dict[str, np.ndarray]
 T, R = TypeVar("T"), TypeVar("R")
 
 
@@ -53,21 +49,24 @@ def judged_tiles(
     names: Sequence[str],
     fixed: Mapping[str, Any],
     kernel: Callable[[bool], Any],
-) -> Iterator[tuple[Tile, Packed]]:
-    """Every tile with what :func:`unpack` takes, padding included, in order; ``axes`` are those of the grid, in parameters.
+    rtol: float,
+) -> Iterator[tuple[Tile, Cells]]:
+    """Every tile with the results of its cells, in order; ``axes`` are those of the grid, in parameters.
 
     ``kernel(dense)`` is that of :func:`tile_kernel`.
     """
 
-    def work(tile: Tile) -> Packed:
+    constants = {name: jnp.asarray(value) for name, value in fixed.items()}
+
+    def work(tile: Tile) -> Cells:
         cells = tile.columns if tile.spread is None else tile.spread
         values = {name: axis[i] for name, axis, i in zip(names, axes, tile.index, strict=True)}
         for name, size in zip(names[-2:], (len(tile.first), cells.shape[1]), strict=True):
-            values[name] = np.pad(values[name], (0, size - len(values[name])), mode="edge")
+            values[name] = filled_up(values[name], size)
         factors = (tile.first, tile.columns) if tile.spread is None else (tile.first, tile.columns, tile.spread)
-        return tuple(
-            np.asarray(x) for x in kernel(tile.spread is not None)(*factors, errors_of(tile.panel), values, fixed)
-        )
+        found = kernel(tile.spread is not None)(*factors, errors_of(tile.panel), values, constants, rtol)
+        rows, columns = (len(i) for i in tile.index[-2:])
+        return {name: np.asarray(x)[:rows, :columns] for name, x in found.items()}
 
     return in_threads(tiles, work)
 
@@ -88,7 +87,7 @@ def in_threads(pieces: Iterable[T], work: Callable[[T], R]) -> Iterator[tuple[T,
 
 @lru_cache(maxsize=32)
 def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
-    """Closed-form results ``(R, C)`` of a tile for :func:`unpack`.
+    """Results ``(R, C)`` of a tile, those of :func:`judged`.
 
     ``kind``: ``dense`` or ``sparse`` as the tile is, ``undamped`` for sparse tiles with cells that may be Hamiltonian.
     """
@@ -99,27 +98,27 @@ def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
 
     # Row by row: all intermediate results of a row stay in the cache. The last product is made in the loop, not before it:
     # a row of a larger result would be cut out anew wherever it is used.
-    def sparse(first, columns, errors, values, fixed):
-        def row(inputs: tuple[Array, Array]) -> tuple[Array, ...]:
+    def sparse(first, columns, errors, values, fixed, rtol):
+        def row(inputs: tuple[Array, Array]) -> dict[str, Array]:
             weights, value = inputs
             model, phi = bind(values, fixed, value), weights @ columns
             log_d = jnp.broadcast_to(model.reduced.log_determinant(), phi.shape[1:])
             parts = quartic.blocks(phi)
-            packed = pack(quartic.coefficients(parts, log_d, errors[1:]))
-            return (packed, exact_verdict(model, parts, errors[0])) if kind == "undamped" else (packed,)
+            exact = exact_verdict(model, parts, errors[0]) if kind == "undamped" else None
+            return judged(quartic.coefficients(parts, log_d, errors[1:]), rtol, exact)
 
         return by_rows(row, (first, values[names[-2]]))
 
-    def dense(first, columns, spread, errors, values, fixed):
+    def dense(first, columns, spread, errors, values, fixed, rtol):
         parts = quartic.blocks(jnp.moveaxis(first @ columns, 1, 0))
         at_nodes, rounding = (jnp.stack(x, axis=1) for x in quartic.invariants(parts))
         bounds = errors[1:] + _SPREAD * jnp.max(rounding, axis=-1) + _left_out(at_nodes)
 
-        def row(inputs: tuple[Array, Array, Array]) -> tuple[Array, ...]:
+        def row(inputs: tuple[Array, Array, Array]) -> dict[str, Array]:
             e, bounds, value = inputs
             lanes = e @ spread
             log_d = jnp.broadcast_to(bind(values, fixed, value).reduced.log_determinant(), lanes.shape[1:])
-            return (pack(quartic.with_determinant(lanes, bounds, log_d)),)
+            return judged(quartic.with_determinant(lanes, bounds, log_d), rtol)
 
         return by_rows(row, (at_nodes, bounds, values[names[-2]]))
 
@@ -132,14 +131,6 @@ def _left_out(e: Array) -> Array:
     return 2 * jnp.sum(jnp.abs(e @ last), axis=-1)
 
 
-def pack(c: quartic.Coefficients) -> Array:
-    """rho + i error of lanes; the error is negative if they are to be judged again."""
-    rho, error, unsure = quartic.spectral_radius(c)
-    # A bound at the limit of rounding cannot be improved.
-    again = (unsure & (error > 4 * quartic.EPS)) | ~(jnp.abs(rho - 1) > error)
-    return jax.lax.complex(rho, jnp.where(again, -error, error))
-
-
 def exact_verdict(model: FloquetModel, phi: quartic.Blocks, value_error: Array) -> Array:
     """The verdict of Hamiltonian lanes, -1 of others."""
     shape = phi.a[0][0].shape
@@ -150,28 +141,38 @@ def exact_verdict(model: FloquetModel, phi: quartic.Blocks, value_error: Array) 
     )
 
 
-def unpack(packed: np.ndarray, exact: np.ndarray | None = None, *, rtol: float) -> dict[str, np.ndarray]:
-    """Results by name from those of :func:`pack` and the verdicts of Hamiltonian lanes, and which lanes are to be judged
-    again (``unsure``). All others are decided: their intervals do not hold 1."""
-    rho, error, unsure = packed.real, np.abs(packed.imag), ~(packed.imag > 0)
-    verdict = np.where(unsure, np.int8(UNDECIDED), rho > 1)
+def judged(c: quartic.Coefficients, rtol: Array, exact: Array | None = None) -> dict[str, Array]:
+    """Results of lanes by name, and which are to be judged again (``unsure``); ``exact`` are verdicts of Hamiltonian ones.
+
+    All others are decided: their intervals do not hold 1. As one kernel: thirty small ones cost half as much again in
+    calls, and repeat what makes the coefficients.
+    """
+    return in_one_kernel(_judged)(c, rtol, exact)
+
+
+def _judged(c: quartic.Coefficients, rtol: Array, exact: Array | None) -> dict[str, Array]:
+    rho, error, unsure = quartic.spectral_radius(c)
+    # A bound at the limit of rounding cannot be improved.
+    unsure = (unsure & (error > 4 * quartic.EPS)) | ~(jnp.abs(rho - 1) > error)
+    verdict = jnp.where(unsure, UNDECIDED, rho > 1).astype(jnp.int8)
     if exact is not None:
-        rho, error, verdict = exactly(exact, rho, error, verdict, np.where)
+        rho, error, verdict = exactly(exact, rho, error, verdict)
         # Cells on the unit circle are settled; for the others eigenvalues may give a better bound.
         unsure &= exact != 0
+    outcome = jnp.where(error <= 10 * rtol * rho, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET).astype(jnp.int8)
     return {
         "spectral_radius": rho,
         "spectral_radius_error": error,
         "verdict": verdict,
-        "outcome": np.where(error <= 10 * rtol * rho, np.int8(Outcome.SUCCESS), np.int8(Outcome.TOLERANCE_NOT_MET)),
+        "outcome": outcome,
         "unsure": unsure,
     }
 
 
-def exactly(exact: T, rho: T, error: T, verdict: T, where: Callable[..., T] = jnp.where) -> tuple[T, T, T]:
+def exactly(exact: Array, rho: Array, error: Array, verdict: Array) -> tuple[Array, Array, Array]:
     """Results with the verdict ``exact`` where that is not negative: a stable Hamiltonian system has rho = 1."""
     return (
-        where(exact == 0, 1.0, rho),
-        where(exact == 0, 4 * quartic.EPS, error),
-        where(exact >= 0, exact, verdict).astype(np.int8),
+        jnp.where(exact == 0, 1.0, rho),
+        jnp.where(exact == 0, 4 * quartic.EPS, error),
+        jnp.where(exact >= 0, exact, verdict).astype(jnp.int8),
     )

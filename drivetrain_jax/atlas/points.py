@@ -13,7 +13,7 @@ from jax import Array
 
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, in_one_kernel, options_for_few
 from drivetrain_jax.analysis.periodic import quartic
-from drivetrain_jax.atlas.charts import Packed, errors_of, exact_verdict, in_threads, pack
+from drivetrain_jax.atlas.charts import Cells, errors_of, exact_verdict, in_threads, judged
 from drivetrain_jax.atlas.expansion import Cell, Expansion
 from drivetrain_jax.atlas.floquet_quantity import Build
 from drivetrain_jax.atlas.panels import Atlas
@@ -23,13 +23,13 @@ LANES, ROWS = 128, 16
 
 
 def judged_cells(
-    expansion: Expansion, points: np.ndarray, x: np.ndarray, atlas: Atlas, kernel: Any
-) -> Iterator[tuple[np.ndarray, Packed]]:
-    """Numbers of points and what ``charts.unpack`` takes of them, block after block. ``points`` ``(N, d)`` are parameters,
-    ``x`` coordinates; ``kernel`` is that of :func:`point_kernel`."""
+    expansion: Expansion, points: np.ndarray, x: np.ndarray, atlas: Atlas, kernel: Any, rtol: float
+) -> Iterator[tuple[np.ndarray, Cells]]:
+    """Numbers of points and their results, block after block. ``points`` ``(N, d)`` are parameters, ``x`` coordinates;
+    ``kernel`` is that of :func:`point_kernel`."""
     block = LANES * ROWS
 
-    def work(part: tuple[Cell, int]) -> Packed:
+    def work(part: tuple[Cell, int]) -> Cells:
         cell, start = part
         # The last block is filled up with its last point.
         numbers = np.minimum(np.arange(start, start + block), cell.index.size - 1)
@@ -43,8 +43,9 @@ def judged_cells(
             cell.left_out,
             values,
             atlas.fixed,
+            rtol,
         )
-        return tuple(np.asarray(x)[: cell.index.size - start] for x in found)
+        return {name: np.asarray(x)[: cell.index.size - start] for name, x in found.items()}
 
     parts = ((cell, start) for cell in expansion.cells(x) for start in range(0, cell.index.size, block))
     for (cell, start), found in in_threads(parts, work):
@@ -53,14 +54,14 @@ def judged_cells(
 
 @lru_cache(maxsize=16)
 def point_kernel(build: Build, undamped: bool, few: bool) -> Any:
-    """Closed-form results ``(LANES ROWS,)`` of a block of points, those of the first ``rows`` rows, for ``charts.unpack``.
+    """Results ``(LANES ROWS,)`` of a block of points, those of the first ``rows`` rows, as :func:`charts.judged` gives them.
     ``undamped``: points may be Hamiltonian; ``few``: they are of one row at most."""
 
-    def kernel(tensor, place, rows, errors, left_out, values, fixed):
+    def kernel(tensor, place, rows, errors, left_out, values, fixed, rtol):
         count = max((*tensor.shape[:-2], tensor.shape[-1]))
         polynomials = in_one_kernel(partial(_chebyshev, count=count))
 
-        def row(i: Array, results: tuple[Array, ...]) -> tuple[Array, ...]:
+        def row(i: Array) -> dict[str, Array]:
             def cut(array: Array) -> Array:
                 return jax.lax.dynamic_slice_in_dim(array, i * LANES, LANES, axis=-1)
 
@@ -68,17 +69,18 @@ def point_kernel(build: Build, undamped: bool, few: bool) -> Any:
             model = build({**fixed, **{name: cut(column) for name, column in values.items()}})
             log_d = jnp.broadcast_to(model.reduced.log_determinant(), (LANES,))
             parts = quartic.blocks(phi)
-            found = (pack(quartic.coefficients(parts, log_d, errors[1:, None], left_out)),)
-            if undamped:
-                found += (exact_verdict(model, parts, errors[0] + left_out),)
-            return tuple(
-                jax.lax.dynamic_update_slice_in_dim(all_rows, new, i * LANES, axis=0)
-                for all_rows, new in zip(results, found, strict=True)
-            )
+            exact = exact_verdict(model, parts, errors[0] + left_out) if undamped else None
+            return judged(quartic.coefficients(parts, log_d, errors[1:, None], left_out), rtol, exact)
 
-        size = place.shape[1]
-        blank = (jnp.zeros(size, complex), jnp.zeros(size, jnp.int8))[: 1 + undamped]
-        return jax.lax.fori_loop(0, rows, row, blank)
+        def store(i: Array, results: dict[str, Array]) -> dict[str, Array]:
+            return {
+                name: jax.lax.dynamic_update_slice_in_dim(results[name], new, i * LANES, axis=0)
+                for name, new in row(i).items()
+            }
+
+        shapes = jax.eval_shape(row, jnp.int32(0))
+        blank = {name: jnp.zeros(place.shape[1], shape.dtype) for name, shape in shapes.items()}
+        return jax.lax.fori_loop(0, rows, store, blank)
 
     return jax.jit(kernel, compiler_options=options_for_few() if few else compiler_options())
 

@@ -64,8 +64,7 @@ class StabilityAtlas:
         x, found = self.atlas.to_coordinates(points), self.blank((len(points),), outputs)
         kernel = point_kernel(self.build, self._may_be_undamped(points.T), len(points) <= LANES)
         unsure = [np.empty(0, int)]
-        for index, packed in judged_cells(self._expansion, points, x, self.atlas, kernel):
-            results = charts.unpack(*packed, rtol=self.rtol)
+        for index, results in judged_cells(self._expansion, points, x, self.atlas, kernel, self.rtol):
             for name, values in found.items():
                 values[index] = results[name]
             unsure.append(index[results["unsure"]])
@@ -87,10 +86,16 @@ class StabilityAtlas:
 
     def blank(self, shape: tuple[int, ...], outputs: Sequence[str] = DEFAULT_OUTPUTS) -> dict[str, np.ndarray]:
         """Results by name, and ``outcome``, of points that nothing is known of."""
+        found = self._empty(shape, outputs)
+        for name, values in found.items():
+            values[...] = _nothing(name, values)
+        return found
+
+    def _empty(self, shape: tuple[int, ...], outputs: Sequence[str]) -> dict[str, np.ndarray]:
         variables = {v.name: v for v in VARIABLES}
         own = {name: (self._multipliers,) * len(variables[name].dims) for name in outputs}
         found = {name: np.empty((*shape, *own[name]), variables[name].dtype) for name in outputs}
-        return _blanked(found | {OUTCOME.name: np.empty(shape, np.int8)})
+        return found | {OUTCOME.name: np.empty(shape, np.int8)}
 
     def on_grid(
         self,
@@ -105,7 +110,7 @@ class StabilityAtlas:
         """
         axes = [np.asarray(axis, float) for axis in axes]
         shape = tuple(len(axis) for axis in axes)
-        found = self.blank(shape, outputs) if out is None else _blanked(out)
+        found = self._empty(shape, outputs) if out is None else dict(out)
         if self._closed_form and _FAST.issuperset(outputs) and len(axes) > 1:
             self._tile(found, axes)
             return found
@@ -153,20 +158,23 @@ class StabilityAtlas:
     def _fill(self, found: dict[str, np.ndarray], axes: list[np.ndarray]) -> None:
         """Fill ``found`` tile by tile, then judge again the cells for which the closed form is not good enough."""
         names, undamped = self.atlas.parameters, self._may_be_undamped(np.ix_(*axes))
-        # An even number of rows of tiles: two cores are then done at the same time.
-        shape = (_shared(len(axes[-2]), charts.ROWS, 8, 2), _shared(len(axes[-1]), charts.COLUMNS, 16))
+        # What no tile covers. To write nothing into all other arrays as well would take a tenth of the time of a chart.
+        found[OUTCOME.name][...] = Outcome.LOST
         coordinates = [c.forward(axis) for c, axis in zip(self.atlas.coordinates, axes, strict=True)]
 
         def kernel(dense: bool) -> Any:
             kind = "undamped" if undamped else "dense" if dense else "sparse"
             return charts.tile_kernel(self.build, names, kind)
 
-        cut = tiles(self.atlas, coordinates, shape, dense=not undamped)
+        cut = tiles(self.atlas, coordinates, (charts.ROWS, charts.COLUMNS), dense=not undamped)
         again = [
-            _store(found, tile, packed, self.rtol)
-            for tile, packed in charts.judged_tiles(cut, axes, names, self.atlas.fixed, kernel)
+            _store(found, tile, cells)
+            for tile, cells in charts.judged_tiles(cut, axes, names, self.atlas.fixed, kernel, self.rtol)
         ]
         self._repair(found, axes, np.concatenate([np.empty((0, len(axes)), int), *again]))
+        if (lost := found[OUTCOME.name] == Outcome.LOST).any():
+            for name, values in found.items():
+                values[lost] = _nothing(name, values)
 
     def _may_be_undamped(self, columns: Sequence[np.ndarray]) -> bool:
         """Whether the system is Hamiltonian in any cell; ``columns`` are broadcast against each other."""
@@ -194,18 +202,14 @@ class StabilityAtlas:
         return {name: np.moveaxis(np.asarray(value), -1, 0) for name, value in found.items()}
 
 
-def _blanked(found: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """``found`` with nothing in it."""
-    for name, values in found.items():
-        values[...] = Outcome.LOST if name == OUTCOME.name else charts.UNDECIDED if values.dtype == np.int8 else np.nan
-    return dict(found)
+def _nothing(name: str, values: np.ndarray) -> float | int:
+    """What stands for no result."""
+    return Outcome.LOST if name == OUTCOME.name else charts.UNDECIDED if values.dtype == np.int8 else np.nan
 
 
-def _store(found: Mapping[str, np.ndarray], tile: Tile, packed: charts.Packed, rtol: float) -> np.ndarray:
+def _store(found: Mapping[str, np.ndarray], tile: Tile, cells: charts.Cells) -> np.ndarray:
     """Put the results of a tile in their place; the cells to be judged again, as positions along each axis ``(N, d)``."""
-    rows, columns = (len(i) for i in tile.index[-2:])
     place = tuple(slice(i[0], i[-1] + 1) for i in tile.index)
-    cells = charts.unpack(*(x[:rows, :columns] for x in packed), rtol=rtol)
     for name, values in found.items():
         part = values[place]
         part[...] = cells[name].reshape(part.shape)
@@ -213,13 +217,6 @@ def _store(found: Mapping[str, np.ndarray], tile: Tile, packed: charts.Packed, r
     first = [i[0] for i in tile.index]
     leading = np.broadcast_to(np.array(first[:-2], int), (len(unsure), len(first) - 2))
     return np.concatenate([leading, unsure + first[-2:]], axis=1)
-
-
-def _shared(count: int, most: int, step: int, multiple: int = 1) -> int:
-    """The size, a multiple of ``step`` and ``most`` at most, of so many pieces: what fills up the last one costs as much as
-    cells. Their number is a multiple of another."""
-    pieces = -(-count // (most * multiple)) * multiple
-    return -(-count // (pieces * step)) * step
 
 
 _scattered = jax.jit(evaluation.scattered, compiler_options=compiler_options())

@@ -25,6 +25,9 @@ NODES = 24
 _SPAN = 11.0
 # Part of the width of a tile from which on nodes are worth while: other tiles cost half as much again, but are always full.
 _DENSE = 2 / 3
+# Widths are multiples of a step. Cost of a cell with and without nodes and of a row of a tile, in cells; how much less a
+# width has to cost than the one that shares the cells out evenly, so that most charts of a size have one kernel.
+_STEP, _COSTS, _ROW, _WORTH = 16, {True: 1.0, False: 1.6}, 100, 0.95
 
 
 @dataclass(frozen=True)
@@ -53,14 +56,16 @@ class _Band:
     spread: np.ndarray | None
 
 
-def tiles(atlas: Atlas, axes: Sequence[np.ndarray], shape: tuple[int, int], *, dense: bool = True) -> Iterator[Tile]:
-    """Tiles of at most ``shape`` cells that cover what panels cover of the grid of ``axes``, two or more, in coordinates.
+def tiles(atlas: Atlas, axes: Sequence[np.ndarray], most: tuple[int, int], *, dense: bool = True) -> Iterator[Tile]:
+    """Tiles of at most ``most`` cells that cover what panels cover of the grid of ``axes``, two or more, in coordinates.
 
     ``axes`` rise. A cell on a face that panels share belongs to the last of them. Without ``dense`` no tile has nodes.
     """
     if not atlas.panels:
         return
     degrees = common_degrees(atlas.panels)[-2:]
+    # An even number of rows of tiles: two cores are then done at the same time.
+    shape = _shared(len(axes[-2]), most[0], 8, 2), _width(atlas, axes[-1], most[1], dense)
     for panel, groups in _assigned(atlas, axes):
         bands = _kinds_first(list(_bands(panel, axes[-1], groups[-1], degrees[1], shape[1], dense)))
         for leading in np.ndindex(*(len(g) for g in groups[:-2])):
@@ -68,7 +73,7 @@ def tiles(atlas: Atlas, axes: Sequence[np.ndarray], shape: tuple[int, int], *, d
             tensor = padded_tensor(_reduced(panel, axes, fixed), degrees)
             for start in range(0, len(groups[-2]), shape[0]):
                 rows = groups[-2][start : start + shape[0]]
-                weights = _padded(chebyshev(_positions(panel, -2, axes[-2][rows]), degrees[0]), shape[0])
+                weights = filled_up(chebyshev(_positions(panel, -2, axes[-2][rows]), degrees[0]), shape[0])
                 first = _first_product(weights, tensor)
                 for band in bands:
                     index = (*(np.array([i]) for i in fixed), rows, band.chosen)
@@ -90,26 +95,51 @@ def _reduced(panel: Panel, axes: Sequence[np.ndarray], fixed: Sequence[int]) -> 
     return Panel(panel.lower[-2:], panel.upper[-2:], coefficients, 0.0, np.empty(0))
 
 
-def _bands(panel: Panel, axis: np.ndarray, cells: np.ndarray, degree: int, width: int, dense: bool) -> Iterator[_Band]:
-    """Neighbouring cells by ``width`` at most, those with nodes no further apart than the panel's degree allows."""
-    t = _positions(panel, -1, axis[cells])
+def _shared(count: int, most: int, step: int, multiple: int = 1) -> int:
+    """The size, a multiple of ``step`` and ``most`` at most, of so many pieces: what fills up the last one costs as much as
+    cells. Their number is a multiple of another."""
+    pieces = -(-count // (most * multiple)) * multiple
+    return -(-count // (pieces * step)) * step
+
+
+def _width(atlas: Atlas, axis: np.ndarray, most: int, dense: bool) -> int:
+    """The width of tiles with which a row of the grid costs least. It depends on the last axis alone: parts of a chart
+    have the same kernels."""
+    even = _shared(len(axis), most, _STEP)
+    panels = {(panel.lower[-1], panel.upper[-1], panel.degrees[-1]): panel for panel in atlas.panels}.values()
+    rooms = [_room(panel, _positions(panel, -1, axis[_covered(panel, -1, axis)])) for panel in panels]
+
+    def cost(width: int) -> float:
+        cuts = (cut for room in rooms for cut in _cuts(room, width, dense))
+        return sum(_COSTS[with_nodes] * width + _ROW for _, _, with_nodes in cuts)
+
+    widths = range(most // 3 // _STEP * _STEP, min(most, even + most // 4) + 1, _STEP)
+    best = min([even, *widths], key=cost)
+    return best if cost(best) < _WORTH * cost(even) else even
+
+
+def _room(panel: Panel, t: np.ndarray) -> np.ndarray:
+    """How many cells from each on are no further apart than nodes allow, by the panel's degree."""
     angle = -np.arccos(t)
-    start = waiting = 0
-    while start < len(cells):
-        reach = np.searchsorted(angle, angle[start] + _SPAN / panel.degrees[-1], side="right") if dense else start + 1
-        end = min(start + width, int(reach))
-        if end - start >= max(_DENSE * width, 2 * NODES):
-            if waiting < start:
-                yield _sparse(cells[waiting:start], t[waiting:start], degree, width)
-            yield _dense(cells[start:end], t[start:end], degree, width)
-            waiting = end
-        elif end - waiting >= width:
-            end = waiting + width
-            yield _sparse(cells[waiting:end], t[waiting:end], degree, width)
-            waiting = end
+    return np.searchsorted(angle, angle + _SPAN / panel.degrees[-1], side="right") - np.arange(len(t))
+
+
+def _cuts(room: np.ndarray, width: int, dense: bool) -> Iterator[tuple[int, int, bool]]:
+    """Neighbouring cells ``start, end`` by ``width`` at most, and whether they have nodes."""
+    count = np.minimum(room, width)
+    with_nodes = dense & (count >= max(_DENSE * width, 2 * NODES))
+    start = 0
+    while start < len(room):
+        end = min(start + int(count[start] if with_nodes[start] else width), len(room))
+        yield start, end, bool(with_nodes[start])
         start = end
-    if waiting < len(cells):
-        yield _sparse(cells[waiting:], t[waiting:], degree, width)
+
+
+def _bands(panel: Panel, axis: np.ndarray, cells: np.ndarray, degree: int, width: int, dense: bool) -> Iterator[_Band]:
+    """The cells of a panel along the last axis, cut."""
+    t = _positions(panel, -1, axis[cells])
+    for start, end, with_nodes in _cuts(_room(panel, t), width, dense):
+        yield (_dense if with_nodes else _sparse)(cells[start:end], t[start:end], degree, width)
 
 
 def _kinds_first(bands: list[_Band]) -> list[_Band]:
@@ -119,7 +149,7 @@ def _kinds_first(bands: list[_Band]) -> list[_Band]:
 
 
 def _sparse(cells: np.ndarray, t: np.ndarray, degree: int, width: int) -> _Band:
-    return _Band(cells, np.ascontiguousarray(_padded(chebyshev(t, degree), width).T), None)
+    return _Band(cells, np.ascontiguousarray(filled_up(chebyshev(t, degree), width).T), None)
 
 
 def _dense(cells: np.ndarray, t: np.ndarray, degree: int, width: int) -> _Band:
@@ -128,13 +158,14 @@ def _dense(cells: np.ndarray, t: np.ndarray, degree: int, width: int) -> _Band:
     place = np.clip(((t - low) - (high - t)) / (high - low), -1.0, 1.0)
     analysis = 2 / NODES * chebyshev(x, NODES).T
     analysis[0] /= 2
-    spread = _padded(chebyshev(place, NODES) @ analysis, width).T
+    spread = filled_up(chebyshev(place, NODES) @ analysis, width).T
     at_nodes = np.clip((low * (1 - x) + high * (1 + x)) / 2, -1.0, 1.0)
     return _Band(cells, np.ascontiguousarray(chebyshev(at_nodes, degree).T), np.ascontiguousarray(spread))
 
 
-def _padded(weights: np.ndarray, size: int) -> np.ndarray:
-    return np.pad(weights, ((0, size - len(weights)), (0, 0)), mode="edge")
+def filled_up(rows: np.ndarray, size: int) -> np.ndarray:
+    """``rows`` with the last one repeated up to ``size`` (``np.pad`` takes the time of a small tile)."""
+    return rows if len(rows) == size else np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), axis=0)])
 
 
 def _positions(panel: Panel, k: int, x: np.ndarray) -> np.ndarray:
@@ -146,10 +177,12 @@ def _assigned(atlas: Atlas, axes: Sequence[np.ndarray]) -> Iterator[tuple[Panel,
     """For each panel the positions along each axis that it covers. Panels share faces: these are given to all of them,
     which does no harm, as they agree there within their bounds."""
     for panel in atlas.panels:
-        slack = 8 * np.finfo(float).eps * np.maximum(np.abs(panel.lower), np.abs(panel.upper))
-        groups = [
-            np.flatnonzero((x >= panel.lower[k] - slack[k]) & (x <= panel.upper[k] + slack[k]))
-            for k, x in enumerate(axes)
-        ]
+        groups = [_covered(panel, k, x) for k, x in enumerate(axes)]
         if all(len(g) for g in groups):
             yield panel, groups
+
+
+def _covered(panel: Panel, k: int, x: np.ndarray) -> np.ndarray:
+    """Positions in ``x``, along the coordinate k, that a panel covers."""
+    slack = 8 * np.finfo(float).eps * max(abs(panel.lower[k]), abs(panel.upper[k]))
+    return np.flatnonzero((x >= panel.lower[k] - slack) & (x <= panel.upper[k] + slack))

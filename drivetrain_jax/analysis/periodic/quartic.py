@@ -19,10 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax.analysis.numerics.kernels import stored
+
 Matrix = list[list[Array]]
 
 EPS = float(np.finfo(float).eps)
-_NEWTON_STEPS = 7
+_NEWTON_STEPS = 9
 # Roundings in a coefficient, in units of eps times its natural size. An error of Phi, in units of |Phi|, weighs no more: by
 # |dZ| <= 2 |Phi| |dPhi| e_1, e_2, e_3 change by at most 4, 10, 12 times |Phi| |dPhi| |Z|^(k-1).
 _ROUNDINGS = 16.0
@@ -94,7 +96,8 @@ def invariants(phi: Blocks, left_out: Array | float = 0.0) -> tuple[tuple[Array,
 
 def with_determinant(e: Sequence[Array], errors: Sequence[Array], log_d: Array) -> Coefficients:
     """The coefficients from ``e1, e2, e3``, bounds of their errors, and log d."""
-    kappa = jnp.exp(log_d / 4)
+    # Not made anew, by an exponential each, wherever a power of it is needed.
+    kappa = stored(jnp.exp)(log_d / 4)
     return Coefficients(*e, kappa, (*errors, 8 * EPS * (1 + jnp.abs(log_d)) * kappa**4))
 
 
@@ -113,10 +116,11 @@ def _cubic_root(p2: Array, p1: Array, p0: Array) -> Array:
     """
     bend = -p2 / 3
     concave = (bend > 0) & (((bend + p2) * bend + p1) * bend + p0 > 0)
-    # Where w >= s, w^2 <= m2 w + m1 - p0/s with the magnitudes m of negative coefficients; if p2 > 0, w^3 may be left out.
+    # Where w >= 1/4, w^2 <= m2 w + m1 - 4 p0 with the magnitudes m of negative coefficients. A step costs less than a
+    # square root or a quotient that would make the bound sharper.
     m2, m1 = jnp.maximum(-p2, 0.0), jnp.maximum(-p1, 0.0)
-    s = jnp.maximum(jnp.maximum(m2, jnp.sqrt(m1)), 0.25)
-    bound = jnp.maximum((m2 + jnp.sqrt(m2**2 + 4 * (m1 - p0 / s))) / 2, s)
+    bound = jnp.maximum((m2 + jnp.sqrt(m2**2 + 4 * (m1 - 4 * p0))) / 2, 0.25)
+    # If p2 > 0, w^3 may be left out.
     root = jnp.sqrt(jnp.maximum(p1**2 - 4 * p2 * p0, 0.0))
     top, bottom = jnp.where(p1 > 0, -2 * p0, root - p1), jnp.where(p1 > 0, p1 + root, 2 * p2)
     bound = jnp.where((p2 > 0) & (top < bound * bottom), top / bottom, bound)
