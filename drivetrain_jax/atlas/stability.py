@@ -102,24 +102,27 @@ class StabilityAtlas:
         axes: Sequence[np.ndarray],
         outputs: Sequence[str] = DEFAULT_OUTPUTS,
         out: Mapping[str, np.ndarray] | None = None,
+        *,
+        rows: int | None = None,
     ) -> dict[str, np.ndarray]:
         """Results by name on the grid of ``axes``, one per parameter of the atlas, in its order, and ``outcome``; in the
         arrays ``out``, if they are given.
 
-        Cells that no panel covers are marked as in :meth:`at`.
+        Cells that no panel covers are marked as in :meth:`at`. If this is a part of a chart, ``rows`` is the length of the
+        chart's last axis but one: all parts then have the same kernels.
         """
         axes = [np.asarray(axis, float) for axis in axes]
         shape = tuple(len(axis) for axis in axes)
         found = self._empty(shape, outputs) if out is None else dict(out)
         if self._closed_form and _FAST.issuperset(outputs) and len(axes) > 1:
-            self._tile(found, axes)
+            self._tile(found, axes, rows)
             return found
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
         for name, value in self.at(points, outputs).items():
             found[name][...] = value.reshape(found[name].shape)
         return found
 
-    def _tile(self, found: dict[str, np.ndarray], axes: list[np.ndarray]) -> None:
+    def _tile(self, found: dict[str, np.ndarray], axes: list[np.ndarray], rows: int | None) -> None:
         """Fill ``found`` in closed form, the axes being in any order."""
         # Tiles are blocks of neighbours, so panels have to cover ranges: axes rise in the atlas's coordinates.
         orders = [np.argsort(c.forward(a), kind="stable") for c, a in zip(self.atlas.coordinates, axes, strict=True)]
@@ -127,10 +130,10 @@ class StabilityAtlas:
         steps = [set(np.diff(order)) for order in orders]
         if all(len(each) < 2 for each in steps):
             turned = tuple(slice(None, None, -1 if each == {-1} else 1) for each in steps)
-            self._fill({name: values[turned] for name, values in found.items()}, rising)
+            self._fill({name: values[turned] for name, values in found.items()}, rising, rows)
             return
         in_order = {name: values.copy() for name, values in found.items()}
-        self._fill(in_order, rising)
+        self._fill(in_order, rising, rows)
         for name, values in in_order.items():
             found[name][np.ix_(*orders)] = values
 
@@ -155,7 +158,7 @@ class StabilityAtlas:
         known = form.reversor is not None and form.log_determinant is not None
         return known and np.array_equal(form.reversor, _SWAP)
 
-    def _fill(self, found: dict[str, np.ndarray], axes: list[np.ndarray]) -> None:
+    def _fill(self, found: dict[str, np.ndarray], axes: list[np.ndarray], rows: int | None) -> None:
         """Fill ``found`` tile by tile, then judge again the cells for which the closed form is not good enough."""
         names, undamped = self.atlas.parameters, self._may_be_undamped(np.ix_(*axes))
         # What no tile covers. To write nothing into all other arrays as well would take a tenth of the time of a chart.
@@ -166,7 +169,7 @@ class StabilityAtlas:
             kind = "undamped" if undamped else "dense" if dense else "sparse"
             return charts.tile_kernel(self.build, names, kind)
 
-        cut = tiles(self.atlas, coordinates, (charts.ROWS, charts.COLUMNS), dense=not undamped)
+        cut = tiles(self.atlas, coordinates, (charts.ROWS, charts.COLUMNS), rows=rows, dense=not undamped)
         again = [
             _store(found, tile, cells)
             for tile, cells in charts.judged_tiles(cut, axes, names, self.atlas.fixed, kernel, self.rtol)

@@ -56,27 +56,30 @@ class _Band:
     spread: np.ndarray | None
 
 
-def tiles(atlas: Atlas, axes: Sequence[np.ndarray], most: tuple[int, int], *, dense: bool = True) -> Iterator[Tile]:
+def tiles(
+    atlas: Atlas, axes: Sequence[np.ndarray], most: tuple[int, int], *, rows: int | None = None, dense: bool = True
+) -> Iterator[Tile]:
     """Tiles of at most ``most`` cells that cover what panels cover of the grid of ``axes``, two or more, in coordinates.
 
-    ``axes`` rise. A cell on a face that panels share belongs to the last of them. Without ``dense`` no tile has nodes.
+    ``axes`` rise. A cell on a face that panels share belongs to the last of them. Without ``dense`` no tile has nodes. A
+    part of a chart of ``rows`` rows has tiles of the same shape as all others.
     """
     if not atlas.panels:
         return
     degrees = common_degrees(atlas.panels)[-2:]
     # An even number of rows of tiles: two cores are then done at the same time.
-    shape = _shared(len(axes[-2]), most[0], 8, 2), _width(atlas, axes[-1], most[1], dense)
+    shape = _shared(rows or len(axes[-2]), most[0], 8, 2), _width(atlas, axes[-1], most[1], dense)
     for panel, groups in _assigned(atlas, axes):
         bands = _kinds_first(list(_bands(panel, axes[-1], groups[-1], degrees[1], shape[1], dense)))
         for leading in np.ndindex(*(len(g) for g in groups[:-2])):
             fixed = [g[i] for g, i in zip(groups[:-2], leading, strict=True)]
             tensor = padded_tensor(_reduced(panel, axes, fixed), degrees)
             for start in range(0, len(groups[-2]), shape[0]):
-                rows = groups[-2][start : start + shape[0]]
-                weights = filled_up(chebyshev(_positions(panel, -2, axes[-2][rows]), degrees[0]), shape[0])
+                chosen = groups[-2][start : start + shape[0]]
+                weights = filled_up(chebyshev(_positions(panel, -2, axes[-2][chosen]), degrees[0]), shape[0])
                 first = _first_product(weights, tensor)
                 for band in bands:
-                    index = (*(np.array([i]) for i in fixed), rows, band.chosen)
+                    index = (*(np.array([i]) for i in fixed), chosen, band.chosen)
                     yield Tile(panel, index, first, band.columns, band.spread)
 
 

@@ -96,11 +96,13 @@ def _blocks(engine: Engine, atlas: StabilityAtlas, table: Table) -> Iterator[tup
     """Places in the grid, block by block, and the arrays of ``table`` there, filled in."""
     axes = {axis.name: axis.values for axis in engine.grid.axes}
     names, outputs = atlas.atlas.parameters, engine.scene.request.outputs
-    for ranges in _cut([len(axes[name]) for name in names]):
+    lengths = [len(axes[name]) for name in names]
+    for ranges in _cut(lengths):
         values = [axes[name][part] for name, part in zip(names, ranges, strict=True)]
         place = tuple(dict(zip(names, ranges, strict=True)).get(name, slice(0, 1)) for name in axes)
         arrays = table.block(place, atlas.blank((), outputs))
-        atlas.on_grid(values, outputs, {n: _in_atlas_order(a, names, tuple(axes)) for n, a in arrays.items()})
+        places = {n: _in_atlas_order(a, names, tuple(axes)) for n, a in arrays.items()}
+        atlas.on_grid(values, outputs, places, rows=lengths[-2] if len(lengths) > 1 else None)
         yield place, arrays
 
 

@@ -127,6 +127,8 @@ def direct_monodromy(
     each = jnp.maximum(-(-steps // parts), 2)
     begin, predicted = parts * -(-each // ratio), parts * each
     zero = jnp.zeros(shape)
+    # Traced once, not for its shapes and again for its values.
+    propagate = jax.jit(propagate)
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape), jax.eval_shape(propagate, steps))
     change = None if blank.parts is None else blank.matrix
     unknown = Monodromy(blank.matrix, zero, jnp.full(shape, jnp.inf), jnp.zeros(shape, bool), zero, blank.parts, change)
