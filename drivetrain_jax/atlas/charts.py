@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from functools import lru_cache
 from typing import Any, TypeVar
 
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax._threads import threads
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, in_one_kernel
 from drivetrain_jax.analysis.numerics.lanes import by_rows
@@ -73,16 +74,21 @@ def judged_tiles(
 
 def in_threads(pieces: Iterable[T], work: Callable[[T], R]) -> Iterator[tuple[T, R]]:
     """Every piece with ``work(piece)``, in order, done on all cores; pieces are taken only as they are needed."""
-    threads = usable_cores()
-    with ThreadPoolExecutor(threads, thread_name_prefix="tile") as pool:
-        pending: deque[tuple[T, Future[R]]] = deque()
+    count = usable_cores()
+    pool = threads(count, "tile")
+    pending: deque[tuple[T, Future[R]]] = deque()
+    try:
         for piece in pieces:
             pending.append((piece, pool.submit(work, piece)))
-            if len(pending) > _AHEAD * threads:
+            if len(pending) > _AHEAD * count:
                 done, results = pending.popleft()
                 yield done, results.result()
-        for done, results in pending:
+        while pending:
+            done, results = pending.popleft()
             yield done, results.result()
+    finally:
+        for _, results in pending:
+            results.cancel()
 
 
 @lru_cache(maxsize=32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._threads import threads
 from drivetrain_jax.store.provenance import usable_cores
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.plan import Chunk
@@ -81,21 +82,21 @@ def _job(engine: Engine) -> Job:
 
 
 def run_threads(
-    chunks: Iterable[Chunk], work: Callable[[Chunk], Results], threads: int
+    chunks: Iterable[Chunk], work: Callable[[Chunk], Results], count: int
 ) -> Iterator[tuple[Chunk, Results]]:
-    """Threads of this process; compiled code runs without the interpreter's lock.
+    """``count`` threads of this process; compiled code runs without the interpreter's lock.
 
     An exception of a chunk is raised here. When the iterator is left (also by an interrupt), no further chunk starts;
     those that run finish in the background and their results are dropped.
     """
-    pool = ThreadPoolExecutor(threads, thread_name_prefix="chunk")
+    pool = threads(count, "chunk")
     remaining = iter(chunks)
     running: dict[Future[Results], Chunk] = {}
     finished: SimpleQueue[Future[Results]] = SimpleQueue()
     ahead = IN_FLIGHT
     try:
         while True:
-            while len(running) < ahead * threads and (chunk := next(remaining, None)) is not None:
+            while len(running) < ahead * count and (chunk := next(remaining, None)) is not None:
                 future = pool.submit(work, chunk)
                 running[future] = chunk
                 future.add_done_callback(finished.put)
@@ -106,7 +107,11 @@ def run_threads(
             ahead = _ahead(results)
             yield running.pop(future), results
     finally:
-        pool.shutdown(wait=False, cancel_futures=True)
+        if running:
+            for future in running:
+                future.cancel()
+            # What still runs is not to be waited for by whoever comes next.
+            threads.cache_clear()
 
 
 def _ahead(results: Results) -> int:

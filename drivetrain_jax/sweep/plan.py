@@ -31,8 +31,8 @@ _LANES = 16
 
 @dataclass(frozen=True)
 class Group:
-    """The points of one solver, by rising effort in each block, cut into chunks of ``chunk``; the last one of a block may
-    be shorter.
+    """The points of one solver, by falling effort in each block, cut into chunks of ``chunk``; the last one of a block may
+    be shorter, and costs as much as a full one: it has the least effort.
 
     ``index`` is the position of the solver, ``size`` the number of points, ``efforts`` the largest effort within each
     chunk, and ``firsts[b]`` the first chunk of block b (one entry more than blocks).
@@ -116,7 +116,7 @@ class Blocks:
         self._kept: dict[int, tuple[list[np.ndarray], list[np.ndarray]]] = {}
 
     def efforts(self, block: int) -> Sequence[np.ndarray]:
-        """For each solver the efforts of its points in ``block``, rising."""
+        """For each solver the efforts of its points in ``block``, falling."""
         return self._sorted(block)[1]
 
     def points(self, block: int, solver: int, part: slice) -> np.ndarray:
@@ -146,10 +146,10 @@ class Blocks:
         for index in range(len(self._solvers)):
             mine = np.flatnonzero(choice == index).astype(np.uint64)
             # Effort and position in one number: the fastest of all ways to sort by both.
-            keys = (effort[mine].astype(np.uint64) << _BITS) | mine
+            keys = ((_MAX_EFFORT - effort[mine]).astype(np.uint64) << _BITS) | mine
             keys.sort()
             orders.append((keys & _POSITION).astype(np.uint32))
-            efforts.append((keys >> _BITS).astype(np.int32))
+            efforts.append(_MAX_EFFORT - (keys >> _BITS).astype(np.int32))
         return orders, efforts
 
 
@@ -162,24 +162,19 @@ class _Tally:
         self.count, self._few = 0, True
 
     def add(self, efforts: np.ndarray) -> None:
-        """Those of one more block, rising."""
+        """Those of one more block, falling."""
         self.count += efforts.size
-        self._efforts.append(efforts if self._few else _largest(efforts, self._solver.chunk))
+        self._efforts.append(efforts if self._few else efforts[:: self._solver.chunk])
         if self._few and self.count >= _MIN_CHUNKS * self._solver.chunk:
             self._few = False
-            self._efforts = [_largest(block, self._solver.chunk) for block in self._efforts]
+            self._efforts = [block[:: self._solver.chunk] for block in self._efforts]
 
     def group(self, index: int, full_size: bool) -> Group:
         """The chunks of all blocks."""
         size = chunk_size(self._solver.chunk, self.count) if self._few and not full_size else self._solver.chunk
-        efforts = [_largest(block, size) for block in self._efforts] if self._few else self._efforts
+        efforts = [block[::size] for block in self._efforts] if self._few else self._efforts
         firsts = np.cumsum([0, *map(len, efforts)])
         return Group(index, self._solver, self.count, np.concatenate(efforts), firsts, size)
-
-
-def _largest(efforts: np.ndarray, size: int) -> np.ndarray:
-    """The largest effort of each chunk of ``size`` points."""
-    return efforts[np.minimum(np.arange(size, efforts.size + size, size), efforts.size) - 1]
 
 
 def chunk_size(largest: int, count: int) -> int:

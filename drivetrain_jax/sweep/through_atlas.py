@@ -107,10 +107,7 @@ def _blocks(engine: Engine, atlas: StabilityAtlas, table: Table) -> Iterator[tup
 
 
 def _cut(lengths: Sequence[int]) -> Iterator[tuple[slice, ...]]:
-    """Blocks of a grid of about ``_BLOCK`` cells at most, whole along as many of the last axes as possible.
-
-    What is left over of an axis joins the last block: a narrow one would need kernels of its own.
-    """
+    """Blocks of a grid of about ``_BLOCK`` cells at most, whole along as many of the last axes as possible."""
     whole = len(lengths) - 1
     while whole > 0 and math.prod(lengths[whole:]) <= _BLOCK:
         whole -= 1
@@ -118,8 +115,6 @@ def _cut(lengths: Sequence[int]) -> Iterator[tuple[slice, ...]]:
     step = max(1, _BLOCK // max(math.prod(lengths[whole + 1 :]), 1))
     step = step - step % _ROWS if step > _ROWS else step
     starts = list(range(0, lengths[whole], step))
-    if len(starts) > 1 and lengths[whole] - starts[-1] < _ROWS <= step:
-        starts.pop()
     pieces = [slice(*ends) for ends in itertools.pairwise([*starts, lengths[whole]])]
     for leading in itertools.product(*(range(n) for n in lengths[:whole])):
         for piece in pieces:

@@ -24,7 +24,7 @@ from benchmarks.atlas_direct import BASE, cardan_atlas, direct_radius, random_po
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.periodic import quartic
 from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES
-from drivetrain_jax.atlas import tiles
+from drivetrain_jax.atlas import charts, tiles
 
 COUNTS = [f"{what}_{by}" for what in ("violations", "wrong") for by in ("direct", "precise")]
 
@@ -76,6 +76,41 @@ def dense_axes(atlas, count):
     coordinates = [np.sort(c.forward(axis)) for c, axis in zip(atlas.atlas.coordinates, axes, strict=True)]
     cut = list(tiles.tiles(atlas.atlas, coordinates, (8, min(512, count))))
     return axes, sum(len(tile.index[1]) for tile in cut if tile.spread is not None) / count
+
+
+@pytest.mark.parametrize(("count", "most"), [(1076, 5), (1367, 5), (2531, 5), (300, 1), (1, 1)])
+def test_tiles_cover_each_column_once_and_are_few(chart, count, most):
+    """Where columns shared out evenly would leave 34 or 51 of them to a tile of their own, as costly as any, tiles are
+    narrower."""
+    coordinates = [np.sort(c.forward(x)) for c, x in zip(chart.atlas.coordinates, ([1.0], speeds(count)), strict=True)]
+    cut = list(tiles.tiles(chart.atlas, coordinates, (64, 512)))
+    widths = {(tile.columns if tile.spread is None else tile.spread).shape[1] for tile in cut}
+    assert np.array_equal(np.sort(np.concatenate([tile.index[1] for tile in cut])), np.arange(count))
+    assert len(cut) <= most and len(widths) == 1 and max(widths) <= 512
+    assert min(len(tile.index[1]) for tile in cut) > 0.5 * max(widths) or count == 1
+
+
+def speeds(count):
+    return np.linspace(0.3, 2.0, count) if count > 1 else np.array([1.0])
+
+
+def test_parts_of_a_chart_have_its_kernels_and_its_bits(chart, monkeypatch):
+    axes = [np.linspace(0.0, 1.5, 150), speeds(1367)]
+    whole, shapes = chart.on_grid(axes), set()
+    kernel = charts.tile_kernel
+
+    def noted(build, names, kind):
+        def call(first, *others):
+            shapes.add((kind, first.shape))
+            return kernel(build, names, kind)(first, *others)
+
+        return call
+
+    monkeypatch.setattr(charts, "tile_kernel", noted)
+    for part in (slice(0, 128), slice(128, 150)):
+        found = chart.on_grid([axes[0][part], axes[1]], rows=150)
+        assert all(np.array_equal(values, whole[name][part]) for name, values in found.items())
+    assert len(shapes) == 2
 
 
 def test_dense_columns_are_interpolated_within_their_bounds(chart):
@@ -180,6 +215,11 @@ def test_points_outside_are_left_to_direct_solves(chart):
     assert np.isnan(found["spectral_radius"][1]) and found["verdict"][1] == UNDECIDED
     grid = chart.on_grid([np.array([0.5, 0.6]), np.array([1.0, 2.5])])
     assert (grid["outcome"][:, 1] == Outcome.LOST).all() and np.isfinite(grid["spectral_radius"][:, 0]).all()
+    assert np.isnan(grid["spectral_radius"][:, 1]).all() and (grid["verdict"][:, 1] == UNDECIDED).all()
+    # Whatever was in the arrays before.
+    out = {name: np.ones_like(values) for name, values in grid.items()}
+    again = chart.on_grid([np.array([0.5, 0.6]), np.array([1.0, 2.5])], out=out)
+    assert all(again[name] is out[name] and np.array_equal(out[name], grid[name], equal_nan=True) for name in grid)
 
 
 def test_every_result_of_the_analysis(chart):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import subprocess
@@ -370,6 +371,12 @@ def test_help_is_light():
     loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
     assert "drivetrain_jax.cli" in loaded
     assert not {"jax", "numpy", "scipy", "xarray", "h5py", "matplotlib", "rich", "msgspec"} & set(loaded)
+
+
+def test_a_call_from_python_leaves_its_garbage_collector_alone(cli):
+    """Only a process that is a command, and ends with it, does without."""
+    before = gc.get_threshold(), gc.get_freeze_count()
+    assert cli("list")[0] == 0 and (gc.get_threshold(), gc.get_freeze_count()) == before
 
 
 def test_looking_at_a_result_loads_no_integrator_and_no_tables(folder):

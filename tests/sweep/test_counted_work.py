@@ -57,7 +57,7 @@ COUNTS = {
     "operations bicardan": 846,
     "operations rattle": 4424,
     # Steps that the plan predicts for the 1,550 cells of the chart, padding included.
-    "predicted steps cardan": 197_632,
+    "predicted steps cardan": 135_168,
     # 144 brackets together, 22 steps until the last of them is closed.
     "evaluations bicardan": 3168,
     # QR sweeps of two chunks, each with its slowest lane: 18 singular values.

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -185,6 +186,25 @@ def test_threads_are_handed_many_chunks_only_where_results_are_small(values, ahe
     # The first one is done.
     assert len(begun) == 1 + ahead
     assert sorted(number for number, _ in finished) == sorted({*range(100)} - {0, 1})
+
+
+def test_threads_are_kept_but_for_those_of_a_run_that_was_left():
+    """A chunk that still runs after an interrupt does not hold up the next run."""
+    result, stop = {"value": np.zeros(1)}, threading.Event()
+
+    def threads_of_a_run():
+        used = set()
+        chunks = run_threads(range(4), lambda _: used.add(threading.current_thread()) or result, 1)
+        assert sorted(number for number, _ in chunks) == [0, 1, 2, 3]
+        return used
+
+    first = threads_of_a_run()
+    assert first == threads_of_a_run() and len(first) == 1
+    left = run_threads(range(2), lambda number: result if number == 0 else stop.wait(60) and result, 1)
+    next(left)
+    left.close()
+    assert threads_of_a_run().isdisjoint(first)
+    stop.set()
 
 
 @pytest.mark.parametrize(
