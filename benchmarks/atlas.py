@@ -9,7 +9,7 @@ verdict. Times of the package for each number of cells:
     points        as many cells at random places, one million at most
     construction  the atlas alone: direct solves and fits. It does not depend on the number of cells
     warm          atlas, grid and result in memory: direct solves included, compilation not
-    file          the same into a file
+    file          the same into a file, flushed to the disk (not read back)
     cold          the whole command `drivetrain run`: import, compilation, solves, evaluation, file
 
 What `warm` takes beyond `construction` and `evaluation` is the checking of the scene, the digest of the code and the
@@ -94,6 +94,7 @@ def package_jobs(cells: int, folder: Path) -> dict[str, Callable[[], Any]]:
     import drivetrain_jax as dt
     from drivetrain_jax.sweep.executor import Where
     from drivetrain_jax.sweep.rounds import build_atlas
+    from drivetrain_jax.sweep.run import run_to_file
     from drivetrain_jax.sweep.scene import load_scene
     from drivetrain_jax.sweep.work import Progress, Work
 
@@ -109,16 +110,13 @@ def package_jobs(cells: int, folder: Path) -> dict[str, Callable[[], Any]]:
     size = min(int(np.prod([len(x) for x in grid.values()])), _MOST_POINTS)
     points = low + (high - low) * np.random.default_rng(2).random((size, 2))
 
-    def to_file() -> None:
-        dt.run(given, out=folder / "chart.nc", fresh=True).close()
-
     values = list(grid.values())
     return {
         "evaluation": lambda: atlas.on_grid(values, OUTPUTS),
         "points": lambda: atlas.at(points, OUTPUTS),
         "construction": construct,
         "warm": lambda: dt.run(given),
-        "file": to_file,
+        "file": lambda: run_to_file(given, folder / "chart.nc", fresh=True),
     }
 
 

@@ -22,6 +22,8 @@ ATTRIBUTE = "checksums"
 # The name of the root group stands for the attributes of the file.
 FILE = "/"
 _BLOCK = 1 << 24
+# Bytes from which on threads are worth their while: they wait for one another except while they hash.
+_LARGE = 1 << 22
 # What the netCDF library adds to link dimensions and variables; the links themselves are looked at by name.
 _LINKS = frozenset({"DIMENSION_LIST", "REFERENCE_LIST", "CLASS", "NAME", "_Netcdf4Dimid", "_Netcdf4Coordinates"})
 
@@ -40,11 +42,14 @@ def seal(file: h5py.File) -> None:
 def checksums(file: h5py.File) -> dict[str, str]:
     """blake2b (128 bits) of each variable, type, dimensions and attributes included, and of the attributes of ``file``."""
     own = {name: value for name, value in file.attrs.items() if name != ATTRIBUTE}
-    names = _variables(file)
-    # Hashing leaves the interpreter's lock to others.
-    with ThreadPoolExecutor(min(usable_cores(), len(names) or 1), thread_name_prefix="hash") as pool:
-        digests = pool.map(lambda name: _of_variable(file[name]), names)
-        return {FILE: _of_attributes(own).hexdigest()} | dict(zip(names, digests, strict=True))
+    variables = {name: file[name] for name in _variables(file)}
+    if sum(variable.nbytes for variable in variables.values()) < _LARGE:
+        digests = [_of_variable(variable) for variable in variables.values()]
+    else:
+        # Hashing leaves the interpreter's lock to others.
+        with ThreadPoolExecutor(min(usable_cores(), len(variables)), thread_name_prefix="hash") as pool:
+            digests = list(pool.map(_of_variable, variables.values()))
+    return {FILE: _of_attributes(own).hexdigest()} | dict(zip(variables, digests, strict=True))
 
 
 def damaged(path: Path) -> list[str] | None:
@@ -84,7 +89,7 @@ def _parsed(stored: object) -> dict[str, str]:
 
 
 def _of_variable(variable: h5py.Dataset) -> str:
-    own = {name: value for name, value in variable.attrs.items() if name not in _LINKS}
+    own = {name: variable.attrs[name] for name in variable.attrs if name not in _LINKS}
     state = _of_attributes(own)
     dims = [scales[0].name if len(scales) else scales.label for scales in variable.dims]
     state.update(json.dumps([dims, variable.dtype.str, variable.shape, repr(variable.fillvalue)]).encode())

@@ -35,6 +35,11 @@ class Part:
         self.results = results
         self.seconds = seconds
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the results."""
+        return sum(values.nbytes for values in self.results.values())
+
     def __iter__(self) -> Iterator[tuple[int, Arrays]]:
         """Chunk by chunk: number and results."""
         stops = np.cumsum(self.sizes)

@@ -185,9 +185,10 @@ def _resume(
 
     temporary = parts.result
     if engine.scene.analysis.continuous:
-        write_result(_atlas(engine, work, progress).assign_attrs(wall_time_s=seconds()), out, temporary)
+        with work:
+            write_result(_atlas(engine, work, progress).assign_attrs(wall_time_s=seconds()), out, temporary)
         return
-    with ResultFile(temporary) as file:
+    with work, ResultFile(temporary) as file:
         table = Table(engine.scene, engine.grid, lambda blank: file.lay_out(blank.assign_attrs(_attrs(engine, 0.0))))
         extra = _fill(engine, table, work, progress, taken)
         table.lay_out()

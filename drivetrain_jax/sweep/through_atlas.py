@@ -20,6 +20,7 @@ from drivetrain_jax.sweep.work import Progress, Work
 # Cells evaluated at a time: what they need in memory, and how often progress is told.
 _BLOCK = 1 << 21
 _ROWS = 64
+# Cells from which on something is done beside the solves.
 _LARGE = 1 << 19
 
 Results = Mapping[str, np.ndarray]
@@ -31,7 +32,7 @@ def fill_through_atlas(engine: Engine, table: Table, work: Work, progress: Progr
     solves = Progress(0, kind="direct solves for the atlas")
     # Beside the solves.
     with ThreadPoolExecutor(1) as aside:
-        prepared = [aside.submit(_lay_out, table), aside.submit(_prepare_judging, engine)]
+        prepared = [aside.submit(_lay_out, engine, table), aside.submit(_prepare_judging, engine)]
         atlas, first = build_atlas(scene, atlas_ranges(scene), work, solves, solves_allowed(scene))
         prepared[0].result()
         uncovered = evaluate(engine, table, atlas, work, progress, first)
@@ -39,9 +40,9 @@ def fill_through_atlas(engine: Engine, table: Table, work: Work, progress: Progr
     return {"atlas_solves": atlas.atlas.solves, "atlas_panels": len(atlas.atlas.panels), "atlas_uncovered": uncovered}
 
 
-def _lay_out(table: Table) -> None:
-    """Lay out a table whose size does not depend on results."""
-    if not any(variable.dims for variable in table.variables):
+def _lay_out(engine: Engine, table: Table) -> None:
+    """Lay out a table whose size does not depend on results; a small one holds the solves up for longer than it takes."""
+    if engine.grid.size >= _LARGE and not any(variable.dims for variable in table.variables):
         table.lay_out(blank=False)
 
 

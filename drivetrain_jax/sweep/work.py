@@ -55,12 +55,23 @@ class Sink(Protocol):
 
 class Work:
     """Computes chunks ``where`` and tells ``report``. With ``parts`` (open) it keeps them there, and computes none that
-    is there already. ``seconds`` is what those took."""
+    is there already. ``seconds`` is what those took.
+
+    As a context it ends with the result that the chunks are for: what has not been written by then is, if that failed.
+    """
 
     def __init__(self, where: Where, report: Report | None = None, parts: PartsFolder | None = None) -> None:
         self.where, self.report, self.parts = where, report, parts
         self.seconds = 0.0
         self._counted = False
+        self._keeper = _Keeper(parts)
+
+    def __enter__(self) -> Work:
+        return self
+
+    def __exit__(self, failure: type[BaseException] | None, *_: object) -> None:
+        if failure:
+            self._keeper.write()
 
     def do(self, engine: Engine, sink: Sink, progress: Progress, first: int = 0, where: Where | None = None) -> None:
         """Enter all chunks of ``engine`` into ``sink``; ``first`` is added to their numbers where they are kept.
@@ -73,7 +84,7 @@ class Work:
             missing = np.arange(len(engine.plan.costs))
         else:
             missing = self._reuse(engine, self.parts, sink, progress, first)
-        batch, before = _Batch(sink, self.parts, first), progress.computed
+        batch, before = _Batch(sink, self._keeper, first), progress.computed
         try:
             self._compute(engine, missing, batch, progress, where or self.where)
             batch.flush()
@@ -122,15 +133,46 @@ class Work:
             self.report(progress)
 
 
-class _Batch:
-    """Collects finished chunks; those of a quarter of a second, on a slow disk of a longer time, are written as one part
-    (if there are ``parts``) and entered into ``sink`` together, which costs a third of entering them one by one."""
+class _Keeper:
+    """Takes finished chunks and writes those of a quarter of a second, on a slow disk of a longer time, together; without
+    ``parts`` it only says when that would be."""
 
-    def __init__(self, sink: Sink, parts: PartsFolder | None, first: int) -> None:
-        self.sink, self._parts, self._first = sink, parts, first
+    def __init__(self, parts: PartsFolder | None) -> None:
+        self._parts = parts
+        self._waiting: list[Part] = []
+        self._taken = self._written = time.monotonic()
+        self._interval = _SHORTEST
+
+    def due(self) -> bool:
+        """Whether it is time to write."""
+        return time.monotonic() - self._written >= self._interval
+
+    def take(self, numbers: list[int], sizes: list[int], results: Mapping[str, np.ndarray]) -> None:
+        """Have these chunks, to be written if the time has come."""
+        now = time.monotonic()
+        if self._parts:
+            self._waiting.append(Part(numbers, sizes, results, now - self._taken))
+        self._taken = now
+        if self.due() or sum(part.nbytes for part in self._waiting) >= _MOST_WAITING:
+            self.write()
+
+    def write(self) -> None:
+        """Write what waits."""
+        begin = time.monotonic()
+        while self._waiting and self._parts:
+            self._parts.write(self._waiting[0])
+            del self._waiting[0]
+        self._written = time.monotonic()
+        self._interval = min(max(_SHORTEST, (self._written - begin) / _WRITE_SHARE), _LONGEST)
+
+
+class _Batch:
+    """Collects finished chunks, which are kept and entered into ``sink`` together: that costs a third of one by one."""
+
+    def __init__(self, sink: Sink, keeper: _Keeper, first: int) -> None:
+        self.sink, self._keeper, self._first = sink, keeper, first
         self._waiting: list[tuple[Chunk, Mapping[str, np.ndarray]]] = []
         self._bytes = 0
-        self._last, self._interval = time.monotonic(), _SHORTEST
         self._begun = False
         self.kept = 0
 
@@ -141,7 +183,7 @@ class _Batch:
             # The first results make the room for all: a disk without it is told before more is computed.
             self._begun = True
             self.sink.fill(chunk.points, results)
-        if time.monotonic() - self._last >= self._interval or self._bytes >= _MOST_WAITING:
+        if self._bytes >= _MOST_WAITING or self._keeper.due():
             self.flush()
 
     def flush(self) -> None:
@@ -151,19 +193,15 @@ class _Batch:
             self.sink.fill(np.concatenate([chunk.points for chunk in chunks]), results)
 
     def keep(self) -> tuple[list[Chunk], dict[str, np.ndarray]]:
-        """Write what waits as one part. Returns it: its chunks, and their results one after the other."""
+        """Hand over what waits. Returns it: its chunks, and their results one after the other."""
         chunks = [chunk for chunk, _ in self._waiting]
         if not chunks:
             return [], {}
-        begin, all_results = time.monotonic(), [results for _, results in self._waiting]
+        all_results = [results for _, results in self._waiting]
         joined = {name: np.concatenate([results[name] for results in all_results]) for name in all_results[0]}
         sizes = [chunk.points.size for chunk in chunks]
-        if self._parts:
-            numbers = [self._first + chunk.number for chunk in chunks]
-            self._parts.write(Part(numbers, sizes, joined, begin - self._last))
+        self._keeper.take([self._first + chunk.number for chunk in chunks], sizes, joined)
         self._waiting.clear()
         self._bytes = 0
         self.kept += sum(sizes)
-        self._last = time.monotonic()
-        self._interval = min(max(_SHORTEST, (self._last - begin) / _WRITE_SHARE), _LONGEST)
         return chunks, joined

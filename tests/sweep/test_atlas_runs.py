@@ -20,7 +20,8 @@ from drivetrain_jax.cli import main
 from drivetrain_jax.store.consolidate import write_result
 from drivetrain_jax.sweep import atlas_answers, atlas_choice, rounds, through_atlas
 from drivetrain_jax.sweep.atlas_chart import chart
-from drivetrain_jax.sweep.run import Interrupted, run_to_file
+from drivetrain_jax.sweep.engine import Engine
+from drivetrain_jax.sweep.run import Incomplete, Interrupted, run_to_file
 from drivetrain_jax.sweep.scene import load_scene
 
 BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
@@ -152,13 +153,27 @@ def test_an_interrupted_atlas_is_resumed_with_the_same_bits(tmp_path, stored, ch
 def test_an_interrupted_chart_is_resumed_with_the_same_bits(tmp_path, monkeypatch):
     out, scene = tmp_path / "a.nc", floquet("atlas")
     interrupted_run(scene, out, 2)
-    lay_out = through_atlas._lay_out
     # The file may be laid out after the last solve is there.
-    monkeypatch.setattr(through_atlas, "_lay_out", lambda table: (time.sleep(1.0), lay_out(table)))
+    slowly = lambda _, table: (time.sleep(1.0), table.lay_out(blank=False))  # noqa: E731
+    monkeypatch.setattr(through_atlas, "_lay_out", slowly)
     progress = run_to_file(scene, out)
     assert progress.total == progress.computed == 533 and progress.failed == 0
     with xr.open_dataset(out, engine="h5netcdf") as found:
         same_arrays(found, dt.run(scene))
+
+
+def test_solves_are_kept_when_a_chart_fails_after_them(tmp_path, monkeypatch):
+    out, scene = tmp_path / "a.nc", floquet("atlas")
+
+    def failing(*_):
+        raise OSError("no luck")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(through_atlas, "evaluate", failing)
+        with pytest.raises(Incomplete, match="no luck"):
+            run_to_file(scene, out)
+    monkeypatch.setattr(Engine, "compute_chunk", failing)
+    assert run_to_file(scene, out).computed == 533
 
 
 def test_the_function_of_the_parameters(atlas, direct):

@@ -19,7 +19,8 @@ import xarray as xr
 from interrupts import stop_after
 
 import drivetrain_jax as dt
-from drivetrain_jax.sweep import toml
+from drivetrain_jax.store.chunks import PartsFolder
+from drivetrain_jax.sweep import toml, work
 from drivetrain_jax.sweep.executor import Where
 from drivetrain_jax.sweep.run import Incomplete, run_to_file
 from drivetrain_jax.sweep.status import status
@@ -304,6 +305,18 @@ def test_full_disk_leaves_a_resumable_run(grid_scene, tmp_path, monkeypatch):
         run_to_file(grid_scene, path, fresh=True)
     assert path.read_bytes() == before
     assert not list(Path(f"{path}.parts").glob("*.tmp"))
+
+
+def test_a_short_run_that_ends_well_keeps_nothing_on_the_way(grid_scene, tmp_path, monkeypatch):
+    written = []
+    monkeypatch.setattr(PartsFolder, "write", lambda _, part: written.append(part))
+    monkeypatch.setattr(work, "_SHORTEST", 60.0)
+    run_to_file(grid_scene, tmp_path / "r.nc")
+    assert not written
+    monkeypatch.setattr("drivetrain_jax.sweep.run.ResultFile.finish", lambda *_, **__: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run_to_file(grid_scene, tmp_path / "s.nc")
+    assert sum(part.sizes.sum() for part in written) == dt.run(grid_scene)["outcome"].size
 
 
 def test_result_too_large_for_the_memory_is_refused_at_once(grid_scene, monkeypatch):
