@@ -38,7 +38,7 @@ def verify(path: Path) -> Report:
     """
     parts = PartsFolder(path)
     if not path.exists() and parts.holds_work():
-        return _verify_parts(path, parts)
+        return _verify_parts(parts)
     if shards.is_store(path):
         return _verify_store(path)
     if not path.is_file():
@@ -62,10 +62,11 @@ def _first_broken(findings: list[Finding]) -> str:
 def _verify_store(path: Path) -> Report:
     wrong, count = shards.damaged(path)
     problem = f"{wrong} of {count} shards are not what was written; allowed is to compute them again" if wrong else ""
-    return Report((f"checksums: {wrong or 'none'} of {count} shards differ",), problem)
+    rules = "rules: applied to the file that `drivetrain export` makes of the store"
+    return Report((f"checksums: {wrong or 'none'} of {count} shards differ", rules), problem)
 
 
-def _verify_parts(path: Path, parts: PartsFolder) -> Report:
+def _verify_parts(parts: PartsFolder) -> Report:
     """Damaged parts are no problem of the user's: a run that is resumed computes their chunks again."""
     present, intact = parts.count(), sum(1 for _ in parts.read())
     lines = [f"unfinished: {intact} of {present} parts are intact"]

@@ -123,14 +123,13 @@ def finished(path: Path, name: str) -> Iterator[np.ndarray]:
 
 
 def damaged(path: Path) -> tuple[int, int]:
-    """How many shards are marked done but are not what was written, and how many are done."""
+    """How many shards of a finished store are not what was written, or not there, and how many it has."""
     root = _zarr().open_group(path, mode="r")
     wrong = count = 0
     for group in groups_of(root.attrs):
         names = [name for name in root[group.name].array_keys() if name != DONE]
-        for shard in np.flatnonzero(done(path, group)):
-            count += 1
-            wrong += read(path, group, int(shard), names) is None
+        count += group.shards
+        wrong += sum(read(path, group, shard, names) is None for shard in range(group.shards))
     return wrong, count
 
 

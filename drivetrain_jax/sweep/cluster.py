@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from typing import Any
@@ -33,9 +34,11 @@ def run_cluster(chunks: Iterable[Chunk], job: Job, address: str) -> Iterator[tup
         remaining, running = iter(chunks), {}
         finished = distributed.as_completed(loop=client.loop)
         room = IN_FLIGHT * max(sum(client.nthreads().values()), 1)
+        # A scheduler gives two tasks of one key one result, and other runs have other points under the same numbers.
+        run = uuid.uuid4().hex
         while True:
             while len(running) < room and (chunk := next(remaining, None)) is not None:
-                future = client.submit(worker.compute, job, chunk, key=f"chunk-{chunk.number}-{job.digest}")
+                future = client.submit(worker.compute, job, chunk, key=f"chunk-{chunk.number}-{run}")
                 running[future.key] = chunk
                 finished.add(future)
             if not running:

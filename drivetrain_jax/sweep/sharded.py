@@ -19,7 +19,7 @@ from drivetrain_jax.store import shards
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.sweep.assemble import failures, missing_value, result_attrs, result_variables
 from drivetrain_jax.sweep.atlas_choice import uses_atlas
-from drivetrain_jax.sweep.engine import Engine
+from drivetrain_jax.sweep.engine import ChunkError, Engine
 from drivetrain_jax.sweep.executor import Where
 from drivetrain_jax.sweep.kernel import result_shapes
 from drivetrain_jax.sweep.plan import Chunk
@@ -98,7 +98,7 @@ def compute(
             progress.failed += failures(outcome)
             progress.cost += float(costs[task.shard.numbers].sum())
             _tell(report, progress)
-    _finish(path, out, parts, round(time.monotonic() - begin, 3))
+    _finish(engine, path, out, parts, round(time.monotonic() - begin, 3))
 
 
 def _tell(report: Report | None, progress: Progress) -> None:
@@ -176,8 +176,14 @@ def _one_by_one(engine: Engine, where: Where, path: Path, task: Task) -> np.ndar
     return _write(path, engine, task, results)[OUTCOME.name]
 
 
-def _finish(path: Path, out: Path, parts: PartsFolder, seconds: float) -> None:
-    """Put the store into place. A former one is set aside first: a directory cannot be replaced in one step."""
+def _finish(engine: Engine, path: Path, out: Path, parts: PartsFolder, seconds: float) -> None:
+    """Put the store into place. A former one is set aside first: a directory cannot be replaced in one step.
+
+    Raises :class:`ChunkError` if a shard is not there, though its worker said that it had been written.
+    """
+    absent = sum(int(np.sum(~shards.done(path, group))) for group in groups_of(engine))
+    if absent:
+        raise ChunkError(f"{absent} shards were written elsewhere; every worker has to see the store as {str(path)!r}")
     shards.annotate(path, wall_time_s=seconds)
     former = parts.path / "former"
     if out.exists():

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,10 @@ import drivetrain_jax as dt
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.sweep import toml
+from drivetrain_jax.sweep.cluster import run_cluster
 from drivetrain_jax.sweep.executor import Where, run_threads
+from drivetrain_jax.sweep.plan import Chunk
+from drivetrain_jax.sweep.worker import Job
 
 HERE = Path(__file__).parent
 SCENE = {
@@ -168,6 +172,29 @@ def test_scheduler_and_workers_of_their_own(drivetrain, package, tmp_path):
     finished(drivetrain(scene, "threads"))
     one, other = arrays(tmp_path / "cluster.nc"), arrays(tmp_path / "threads.nc")
     assert one.spectral_radius.values.tobytes() == other.spectral_radius.values.tobytes()
+
+
+def test_runs_on_one_scheduler_do_not_share_chunks(monkeypatch):
+    """A grown result and the whole scene have one digest, and other points under the same numbers."""
+    distributed = pytest.importorskip("distributed")
+
+    def slow(_, chunk):
+        time.sleep(0.2)
+        return {"points": chunk.points}
+
+    monkeypatch.setattr("drivetrain_jax.sweep.cluster.worker.compute", slow)
+    job = Job("", "digest")
+    options = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": None}
+    with distributed.LocalCluster(**options) as cluster, ThreadPoolExecutor(2) as pool:
+
+        def run(first):
+            chunks = [Chunk(number, 0, 1, np.array([first + number]), 1) for number in range(3)]
+            return [(c.points, results["points"]) for c, results in run_cluster(chunks, job, cluster.scheduler_address)]
+
+        for found in pool.map(run, (0, 100)):
+            assert len(found) == 3
+            for wanted, got in found:
+                np.testing.assert_array_equal(got, wanted)
 
 
 @pytest.mark.parametrize(("values", "ahead"), [(1, 32), (1 << 20, 2)])

@@ -16,7 +16,7 @@ from drivetrain_jax.invariants.verify import verify
 from drivetrain_jax.store import shards
 from drivetrain_jax.sweep.executor import Where
 from drivetrain_jax.sweep.export import export
-from drivetrain_jax.sweep.run import Interrupted, run_to_file
+from drivetrain_jax.sweep.run import Incomplete, Interrupted, run_to_file
 from drivetrain_jax.sweep.status import status
 
 pytest.importorskip("zarr")
@@ -109,10 +109,18 @@ def test_damage_of_a_finished_store_is_found(grid_scene, tmp_path, name):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["r.zarr"]
 
 
-def test_a_shard_that_is_gone_is_found(grid_scene, tmp_path):
+@pytest.mark.parametrize("name", ["value", "done"])
+def test_a_shard_that_is_gone_is_found(grid_scene, tmp_path, name):
     to_store(grid_scene, tmp_path / "r.zarr")
-    next(p for p in (tmp_path / "r.zarr").rglob("value/c/*") if p.is_file()).unlink()
+    next(p for p in (tmp_path / "r.zarr").rglob(f"{name}/c/*") if p.is_file()).unlink()
     assert "not what was written" in verify(tmp_path / "r.zarr").problem
+
+
+def test_a_store_that_workers_wrote_elsewhere_is_not_finished(grid_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(shards, "write", lambda *_: None)
+    with pytest.raises(Incomplete, match=r"1 shards were written elsewhere; every worker has to see the store"):
+        to_store(ONE, tmp_path / "r.zarr")
+    assert not (tmp_path / "r.zarr").exists()
 
 
 def test_fresh_replaces_and_a_kill_between_keeps_the_former(grid_scene, tmp_path, monkeypatch):
