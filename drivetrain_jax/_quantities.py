@@ -42,9 +42,9 @@ class Parameter:
     def allowed(self) -> str:
         """The admissible values as a reader would write them, e.g. ``0 <= zeta < inf``."""
         if self.choices:
-            return f"{self.name} is one of {', '.join(self.choices)}"
+            return f"one of {', '.join(self.choices)}"
         if self.text:
-            return f"{self.name} is text"
+            return "text"
         kind = "integer " if self.integer else ""
         left = f"{self.lower:.10g} {'<' if self.open_lower else '<='} " if self.lower > -math.inf else ""
         right = f" {'<' if self.open_upper else '<='} {self.upper:.10g}" if self.upper < math.inf else ""

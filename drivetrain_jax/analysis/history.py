@@ -5,7 +5,8 @@ the end of a step (no interpolation) and the angles of the clocks are taken afre
 after 50,000 strobes as at the start. Errors are the differences from a run at a tolerance ten times as large.
 
 Outcome: ``TOLERANCE_NOT_MET`` if an error was asked for and exceeds ``rtol`` times the size of the motion;
-``STEP_LIMIT`` if the integrator needed too many steps. Values up to that time are kept.
+``STEP_LIMIT`` if the integrator needed too many steps (values up to that time are kept), ``NOT_FINITE`` if the field
+is not finite at the start.
 """
 
 from __future__ import annotations
@@ -68,10 +69,20 @@ def requested_times(request: Request) -> tuple[float, ...]:
 
 def size_of(flow: Flow) -> Array:
     """Scale of the motion in its own components: the initial state, and the way made by it within a radian."""
-    start = jnp.stack([jnp.asarray(x, float) for x in flow.start])
+    start = _start(flow)
     rate = flow.vector(0, 0.0, start)
     fastest = 2 * np.pi / flow.period if flow.fastest is None else flow.fastest
     return jnp.max(jnp.abs(start)) + jnp.max(jnp.abs(rate)) / fastest
+
+
+def _start(flow: Flow) -> Array:
+    return jnp.stack([jnp.asarray(x, float) for x in flow.start])
+
+
+def _has_finite_start(flow: Flow) -> Array:
+    """Whether there is anything to integrate."""
+    start = _start(flow)
+    return jnp.all(jnp.isfinite(start)) & jnp.all(jnp.isfinite(flow.vector(0, 0.0, start)))
 
 
 def _segment(
@@ -133,10 +144,8 @@ def trajectory(flow: Flow, times: Array, tolerance: float, solver: diffrax.Abstr
         place = jax.lax.while_loop(lambda p: _ahead(p, target), lambda p: advance(p, target), place)
         return place, jnp.where(place.healthy, place.y, jnp.nan)
 
-    start = jnp.stack([jnp.asarray(x, float) for x in flow.start])
-    # Where the field is not finite there is nothing to integrate.
-    healthy = jnp.all(jnp.isfinite(start)) & jnp.all(jnp.isfinite(flow.vector(0, 0.0, start)))
-    rest = _Place(jnp.int64(0), jnp.zeros(()), start, jnp.int64(0), healthy)
+    start = _start(flow)
+    rest = _Place(jnp.int64(0), jnp.zeros(()), start, jnp.int64(0), _has_finite_start(flow))
     place, states = jax.lax.scan(to, rest, (strobes, turns - strobes))
     return states, place.healthy
 
@@ -156,7 +165,8 @@ def _solve(system: System, request: Request, values: Mapping[str, Any], effort: 
     size = jnp.maximum(size_of(flow), jnp.max(jnp.abs(states)))
     met = jnp.all(error <= rtol * size)
     outcome = jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
-    outcome = jnp.where(healthy[0], outcome, Outcome.STEP_LIMIT)
+    failed = jnp.where(_has_finite_start(flow), Outcome.STEP_LIMIT, Outcome.NOT_FINITE)
+    outcome = jnp.where(healthy[0], outcome, failed)
     scale = jnp.stack([jnp.asarray(s, float) for s in flow.scale or (1.0,) * flow.size])
     results = {name: (scale * states)[:, i] for name, i in _COMPONENT.items()}
     results |= {f"{name}_error": (scale * error)[:, i] for name, i in _COMPONENT.items()}

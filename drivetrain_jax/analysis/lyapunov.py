@@ -4,7 +4,8 @@ Exponents in natural logarithms per second, in falling order; phases of the flow
 whatever happens). The paper's own estimator is offered beside them under its own name.
 
 Outcome: ``SUCCESS``, or ``TOLERANCE_NOT_MET`` if the standard error is above the target at ``max_time``. A motion that
-leaves all bounds is data: its verdict says so, and its exponents are those of the time before.
+leaves all bounds is data: its verdict says so, and its exponents are those of the time before, without an error (NaN).
+``NOT_FINITE`` if it leaves so soon that there are none.
 """
 
 from __future__ import annotations
@@ -21,10 +22,12 @@ from jax import Array
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.chaos.growth import (
+    BLOCKS,
     SEGMENTS,
     SETTLED,
     Record,
     block_mean,
+    block_size,
     record_growth,
     running_mean,
     sampled,
@@ -137,7 +140,7 @@ def sample(flow: Flow, steps: int, record: Record, spectrum: Spectrum, k01_for: 
     return Sampling(jnp.where(good, k01, jnp.nan), multiple, decayed | (multiple > 0))
 
 
-def evidence_of(flow: Flow, run: Run, spectrum: Spectrum, residual: Array, seen: Sampling) -> Evidence:
+def evidence_of(run: Run, spectrum: Spectrum, residual: Array, seen: Sampling) -> Evidence:
     """What :func:`judge` asks for."""
     fine, coarse = run.fine, spectrum_of(run.coarse)
     growing = grows(fine.size, fine.used, fine.span, spectrum.values[0])
@@ -173,10 +176,11 @@ def analyse(flow: Flow, request: Request) -> dict[str, Array]:
         needed = spectrum.values[0] > STANDARD_ERRORS * spectrum.errors[0]
         needed = jnp.ones_like(needed) if "chaos_k01" in wanted or not flow.turns else needed
         seen = sample(flow, steps, run.fine, spectrum, needed)
-        results["verdict"] = judge(evidence_of(flow, run, spectrum, residual, seen), autonomous=not flow.turns)
+        results["verdict"] = judge(evidence_of(run, spectrum, residual, seen), autonomous=not flow.turns)
         results |= {"chaos_k01": seen.k01, "period_multiple": seen.multiple.astype(jnp.int32)}
     met = (target == 0) | ~run.fine.bounded | (jnp.max(spectrum.errors, axis=0) <= target)
     outcome = jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
+    outcome = jnp.where(jnp.all(jnp.isfinite(spectrum.values), axis=0), outcome, Outcome.NOT_FINITE)
     return {name: results[name] for name in request.outputs} | {"outcome": outcome.astype(jnp.int8)}
 
 
@@ -196,8 +200,7 @@ def _of_spectrum(run: Run, spectrum: Spectrum, residual: Array) -> dict[str, Arr
 
 def averaging_time(record: Record) -> Array:
     """Duration of the blocks that are averaged, shape (...)."""
-    size = jnp.maximum((record.used - record.used // 4) // 12, 1)
-    return jnp.where(record.bounded, 12 * size * record.span, jnp.nan)
+    return jnp.where(record.bounded, BLOCKS * block_size(record.used) * record.span, jnp.nan)
 
 
 def _effort(system: System, request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:

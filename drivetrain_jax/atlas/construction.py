@@ -39,6 +39,8 @@ _Told = tuple[Box, Exploration, np.ndarray | None]
 MAX_SOLVES = 400_000
 # Numbers that are kept of all solves with parts.
 _MOST_NUMBERS = 50_000_000
+# Width of a box in which a coordinate does not vary, relative to it.
+_THINNEST = 1e-15
 # Solves of a panel, those that are least exact, whose errors are followed into its bounds.
 _MOST_CHANGES = 64
 
@@ -56,7 +58,10 @@ class Domain:
     def box(self) -> Box:
         """The domain in its coordinates."""
         ends = [self._ends(k) for k in range(len(self.parameters))]
-        return Box(np.array([min(e) for e in ends]), np.array([max(e) for e in ends]), (0,) * len(ends))
+        lower, upper = (np.array([of(e) for e in ends], float) for of in (min, max))
+        # Values that differ may have one coordinate.
+        wider = upper + np.maximum(_THINNEST * np.abs(upper), np.finfo(float).tiny)
+        return Box(lower, np.where(upper > lower, upper, wider), (0,) * len(ends))
 
     def points(self, x: np.ndarray) -> np.ndarray:
         """Parameters of points in coordinates, ``(N, d)``, kept inside the domain against rounding."""

@@ -29,7 +29,7 @@ from drivetrain_jax.atlas.floquet_quantity import Build, judge
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.points import LANES, judged_cells, point_kernel
 from drivetrain_jax.atlas.tiles import Tile, tiles
-from drivetrain_jax.systems import FloquetModel
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
 DEFAULT_OUTPUTS = ("spectral_radius", "spectral_radius_error", "verdict")
 _FAST = frozenset(DEFAULT_OUTPUTS)
@@ -93,7 +93,7 @@ class StabilityAtlas:
 
     def _empty(self, shape: tuple[int, ...], outputs: Sequence[str]) -> dict[str, np.ndarray]:
         variables = {v.name: v for v in VARIABLES}
-        own = {name: (self._multipliers,) * len(variables[name].dims) for name in outputs}
+        own = {name: (self._form.size,) * len(variables[name].dims) for name in outputs}
         found = {name: np.empty((*shape, *own[name]), variables[name].dtype) for name in outputs}
         return found | {OUTCOME.name: np.empty(shape, np.int8)}
 
@@ -137,10 +137,6 @@ class StabilityAtlas:
         for name, values in in_order.items():
             found[name][np.ix_(*orders)] = values
 
-    @property
-    def _multipliers(self) -> int:
-        return round(self.atlas.panels[0].coefficients.shape[-1] ** 0.5) if self.atlas.panels else 0
-
     @cached_property
     def _expansion(self) -> Expansion:
         return Expansion(self.atlas)
@@ -152,9 +148,13 @@ class StabilityAtlas:
         return [jnp.asarray(evaluation.padded_tensor(panel, degrees)) for panel in self.atlas.panels]
 
     @cached_property
-    def _closed_form(self) -> bool:
+    def _form(self) -> LinearPeriodic:
         middle = dict(zip(self.atlas.parameters, (self.atlas.lower + self.atlas.upper) / 2, strict=True))
-        form = self.build({**self.atlas.fixed, **middle}).reduced
+        return self.build({**self.atlas.fixed, **middle}).reduced
+
+    @cached_property
+    def _closed_form(self) -> bool:
+        form = self._form
         known = form.reversor is not None and form.log_determinant is not None
         return known and np.array_equal(form.reversor, _SWAP)
 
@@ -198,7 +198,7 @@ class StabilityAtlas:
         weights = evaluation.point_weights(panel, x, evaluation.common_degrees(self.atlas.panels), size)
         columns = np.pad(points, ((0, size - len(points)), (0, 0)), mode="edge")
         values = {name: columns[:, k] for k, name in enumerate(self.atlas.parameters)}
-        kernel = _point_kernel(self.build, tuple(sorted(self.atlas.fixed)), outputs, self.rtol, self._closed_form)
+        kernel = _point_kernel(self.build, outputs, self.rtol, self._closed_form)
         phi = _scattered(self._tensors[number], weights)
         with _JUDGING:
             found = kernel(phi, charts.errors_of(panel), values, self.atlas.fixed)
@@ -226,9 +226,7 @@ _scattered = jax.jit(evaluation.scattered, compiler_options=compiler_options())
 
 
 @lru_cache(maxsize=16)
-def _point_kernel(
-    build: Build, fixed_names: tuple[str, ...], outputs: tuple[str, ...], rtol: float, closed_form: bool
-) -> Any:
+def _point_kernel(build: Build, outputs: tuple[str, ...], rtol: float, closed_form: bool) -> Any:
     """Results of scattered points by eigenvalues, from Phi: takes seconds to compile, so no atlas has one of its own."""
 
     def kernel(phi, errors, values, fixed):

@@ -142,7 +142,9 @@ def _bands(panel: Panel, axis: np.ndarray, cells: np.ndarray, degree: int, width
     """The cells of a panel along the last axis, cut."""
     t = _positions(panel, -1, axis[cells])
     for start, end, with_nodes in _cuts(_room(panel, t), width, dense):
-        yield (_dense if with_nodes else _sparse)(cells[start:end], t[start:end], degree, width)
+        # Cells that are all the same leave no room for nodes.
+        band = _dense if with_nodes and t[end - 1] > t[start] else _sparse
+        yield band(cells[start:end], t[start:end], degree, width)
 
 
 def _kinds_first(bands: list[_Band]) -> list[_Band]:

@@ -37,7 +37,8 @@ def check(dataset: xr.Dataset) -> list[Finding]:
         if "outcome" not in dataset:
             return [Finding("outcome is stored", 1, 1, "the file")]
         rules += _values(dataset, known)
-    return [_apply(rule, dataset) for rule in rules if all(name in dataset for name in rule.variables)]
+    there = {name for name, variable in dataset.variables.items() if variable.size}
+    return [_apply(rule, dataset) for rule in rules if there.issuperset(rule.variables)]
 
 
 def _apply(rule: Rule, dataset: xr.Dataset) -> Finding:
@@ -78,14 +79,15 @@ def _values(dataset: xr.Dataset, known: Declared) -> Iterator[Rule]:
     for name in whole:
         text = f"{name} has a value where outcome says so"
         yield Rule(text, (name,), lambda ds, name=name: ds[name].isnull() & (ds["outcome"] < FIRST_FAILURE))
-    if not whole:
+    lost = [name for name in whole if name not in known.kept]
+    if not lost:
         return
 
     def unfounded(ds: xr.Dataset) -> xr.DataArray:
-        missing = sum(_somewhere(ds[name].isnull(), ds) for name in whole) > 0
+        missing = sum(_somewhere(ds[name].isnull(), ds) for name in lost) > 0
         return (ds["outcome"] >= FIRST_FAILURE) & ~missing
 
-    yield Rule("a value is missing where outcome says so", tuple(whole), unfounded)
+    yield Rule("a value is missing where outcome says so", tuple(lost), unfounded)
 
 
 def _somewhere(condition: xr.DataArray, ds: xr.Dataset) -> xr.DataArray:

@@ -13,13 +13,15 @@ from drivetrain_jax.invariants.rules import Rule, in_order, multiple, ordered, r
 
 @dataclass(frozen=True)
 class Declared:
-    """``rules`` of an analysis; ``gaps`` are the variables that may lack a value although a point has succeeded.
+    """``rules`` of an analysis; ``gaps`` are the variables that may lack a value although a point has succeeded, ``kept``
+    those that may have one although it has failed.
 
     ``has_points`` is false for a function of the parameters: there is no outcome of a point then.
     """
 
     rules: tuple[Rule, ...] = ()
     gaps: tuple[str, ...] = ()
+    kept: tuple[str, ...] = ()
     has_points: bool = True
 
 
@@ -90,7 +92,9 @@ _DECLARED = {
         has_points=False,
     ),
     "floquet": _FLOQUET,
-    "forced": Declared((within("amplitude", 0.0), within("condition", 1.0), within("orbit_amplitude", 0.0))),
+    "forced": Declared(
+        (within("amplitude", 0.0), within("condition", 1.0), within("orbit_amplitude", 0.0)), kept=("condition",)
+    ),
     "lyapunov": Declared(
         (
             ordered("lyapunov_spectrum", "exponent", falling=True),
@@ -98,7 +102,17 @@ _DECLARED = {
             within("averaging_time", 0.0),
             within("chaos_k01", -1.0, 1.0),
             within("period_multiple", 0.0),
-        )
+        ),
+        # A motion that left has exponents only, a run that met its aim early no history beyond.
+        gaps=(
+            "lyapunov_standard_error",
+            "lyapunov_history",
+            "step_change",
+            "sum_rule_residual",
+            "averaging_time",
+            "paper_estimator",
+            "chaos_k01",
+        ),
     ),
     "poincare": Declared((within("distinct_points", 0.0), within("chaos_k01", -1.0, 1.0))),
     "parameters": Declared(
@@ -154,6 +168,7 @@ _DECLARED = {
             "spectral_radius",
             "state_error",
         ),
+        kept=("fit_range",),
     ),
     "basins": Declared(
         (
@@ -163,5 +178,6 @@ _DECLARED = {
         ),
         # As many places as there may be attractors.
         gaps=("basin_fraction", "basin_error", "attractor_u_max", "attractor_u_min"),
+        kept=("unsettled_fraction",),
     ),
 }

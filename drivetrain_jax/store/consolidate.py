@@ -47,7 +47,8 @@ class ResultFile:
             places = {str(name): file[str(name)].id.get_offset() for name in template.data_vars}
         with open(self._temporary, "r+b") as file:
             self._mapped = mmap.mmap(file.fileno(), 0)
-        return {n: np.ndarray(template[n].shape, template[n].dtype, self._mapped, at) for n, at in places.items()}
+        # What has no entries has no place.
+        return {n: np.ndarray(template[n].shape, template[n].dtype, self._mapped, at or 0) for n, at in places.items()}
 
     def finish(self, path: Path, **attrs: float) -> None:
         """Change these attributes, add checksums, flush all to the disk, and move the file to ``path`` in one step."""

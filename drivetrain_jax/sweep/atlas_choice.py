@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis.atlas import ANALYSIS
 from drivetrain_jax.sweep.axes import MAX_RANGES
 from drivetrain_jax.sweep.grid import Grid
 from drivetrain_jax.sweep.plan import mean_cost
@@ -35,16 +36,22 @@ def atlas_ranges(scene: Scene) -> dict[str, tuple[float, float]]:
 def uses_atlas(scene: Scene) -> bool:
     """Whether the points of ``scene`` are evaluated from an atlas: on request, or if ``auto`` finds it worthwhile.
 
-    Raises :class:`InputError` for a scene that asks for one and varies too many parameters.
+    Raises :class:`InputError` for a scene that asks for one and varies too many parameters, or whose system has none.
     """
     if scene.analysis.name != "floquet" or scene.request.method not in ("auto", "atlas"):
         return False
-    count = len(atlas_ranges(scene))
+    count, system = len(atlas_ranges(scene)), scene.system
+    if ANALYSIS.name not in system.models:
+        if scene.request.method == "auto":
+            return False
+        raise InputError(
+            f"options.method = 'atlas': {system.name} has no model for it; allowed is auto, direct, diffrax"
+        )
     if scene.request.method == "atlas":
         if count > MAX_RANGES:
             raise InputError(f"options.method = 'atlas': the scene varies {count} parameters; allowed are {MAX_RANGES}")
         return count > 0
-    model = scene.system.models[scene.analysis.name]
+    model = system.models[scene.analysis.name]
     return (
         model.smooth is not None
         and 0 < count <= MAX_RANGES

@@ -156,10 +156,11 @@ class StoredAtlas:
         """Results at points: every parameter a number or an array, broadcast against each other.
 
         Arrays of xarray keep their dimensions, others have the dimension ``point`` (or ``dim_0``, ``dim_1``, ...).
-        Raises :class:`InputError` for a name that is missing or unknown and for a value outside the atlas.
+        Raises :class:`InputError` for a name that is missing or unknown, for a value outside the atlas, and for arrays that
+        do not fit together.
         """
-        columns = xr.broadcast(*(_labelled(self._checked(name, values)) for name in self._names(values)))
-        columns = dict(zip(self.parameters, columns, strict=True))
+        checked = {name: self._checked(name, values) for name in self._names(values)}
+        columns = dict(zip(checked, _broadcast(checked), strict=True))
         shape, dims = columns[self.parameters[0]].shape, columns[self.parameters[0]].dims
         flat = {name: np.asarray(column.values, float).reshape(-1) for name, column in columns.items()}
         found = self._evaluate(self.stability, flat, zipped=True)
@@ -182,6 +183,8 @@ class StoredAtlas:
         for name, column in axes.items():
             if column.ndim > 1 or not column.size:
                 raise InputError(f"{name}: an array of shape {column.shape}; allowed is a number or a row of numbers")
+        if not axes:
+            return self(**values)
         fixed = {name: float(column) for name, column in given.items() if not column.ndim}
         return self._evaluate(self.stability.slice(fixed), axes, zipped=False)
 
@@ -243,8 +246,13 @@ def as_given(value: Any) -> str:
     return ":".join(f"{end:.10g}" if isinstance(end, (int, float)) else shown(end) for end in ends)
 
 
-def _labelled(values: Any) -> xr.DataArray:
-    if isinstance(values, xr.DataArray):
-        return values
-    array = np.asarray(values, float)
-    return xr.DataArray(array, dims=("point",) if array.ndim == 1 else None)
+def _broadcast(given: Mapping[str, Any]) -> tuple[xr.DataArray, ...]:
+    """Numbers and arrays of one shape: those without labels by their places, then all by the names of their dimensions."""
+    plain = {name: np.asarray(v, float) for name, v in given.items() if not isinstance(v, xr.DataArray)}
+    try:
+        plain = dict(zip(plain, np.broadcast_arrays(*plain.values()), strict=True))
+        labelled = {n: xr.DataArray(v, dims=("point",) if v.ndim == 1 else None) for n, v in plain.items()}
+        return xr.broadcast(*(labelled.get(name, value) for name, value in given.items()))
+    except ValueError:
+        shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in given.items())
+        raise InputError(f"shapes {shapes}: allowed are arrays that broadcast against each other") from None

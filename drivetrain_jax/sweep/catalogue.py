@@ -29,22 +29,24 @@ def describe(name: str) -> str:
     lines = [f"{system.name}: {system.title}", f"  {system.source}", "", "Parameters"]
     lines += _table([_parameter_row(p) for p in system.parameters])
     if system.presets:
-        lines += ["", "Presets"]
+        lines += ["", "Sets of values, to be copied into a scene"]
         lines += _table([(preset, _assignments(values)) for preset, values in system.presets.items()])
     for analysis in system.models:
-        lines += ["", *_analysis_lines(analysis)]
+        lines += ["", *_analysis_lines(analysis, system)]
     return "\n".join([*lines, *_scene_lines(system)]) + "\n"
 
 
-def _analysis_lines(name: str) -> list[str]:
+def _analysis_lines(name: str, system: System) -> list[str]:
     analysis = get_analysis(name)
     lines = [f"Analysis {name}: {analysis.title}"]
-    lines += _table([_variable_row(v, v.name in analysis.default_outputs) for v in analysis.variables])
+    given = [v for v in analysis.variables if v.units != "1/s" or system.time_units == "s"]
+    lines += _table([_variable_row(v, v.name in analysis.default_outputs) for v in given])
     lines += [
         "  (* computed unless outputs says otherwise)",
         "  Methods and the options they use, the first by default",
     ]
-    lines += ["  " + line for line in _table([(method, ", ".join(used)) for method, used in analysis.methods.items()])]
+    methods = [(m, ", ".join(used)) for m, used in analysis.methods.items() if m != "atlas" or "atlas" in system.models]
+    lines += ["  " + line for line in _table(methods)]
     return [*lines, "  Options", *("  " + line for line in _table([_parameter_row(o) for o in analysis.options]))]
 
 

@@ -73,7 +73,7 @@ def evaluate(
         progress.failed += failures(outcome) - len(lost)
         if work.report:
             work.report(progress)
-    rest = np.concatenate(uncovered)
+    rest = np.concatenate([np.empty(0, int), *uncovered])
     if rest.size:
         work.do(engine.only(rest), table, progress, first)
     return rest.size

@@ -15,9 +15,10 @@ import pytest
 
 import drivetrain_jax as dt
 from benchmarks import tripod_reference as oracle
-from drivetrain_jax.analysis import Request
+from drivetrain_jax.analysis import Outcome, Request
 from drivetrain_jax.analysis.chaos.verdict import Verdict
 from drivetrain_jax.analysis.lyapunov import analyse
+from drivetrain_jax.invariants import check
 from drivetrain_jax.systems import Flow
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "tripod.json").read_text())
@@ -33,6 +34,10 @@ LITERATURE = {
 
 # Standard errors of the means that keep the bounds sharp.
 LARGEST_ERROR = {"lorenz": 1.5e-3, "roessler": 1.5e-3, "ueda": 2e-3, "two_wells": 2e-3, "pendulum": 2e-3}
+
+
+def broken(dataset) -> list[str]:
+    return [str(finding) for finding in check(dataset) if finding.broken]
 
 
 def request(outputs: tuple[str, ...], max_time: float, steps: int, target: float = 0.0) -> Request:
@@ -118,6 +123,21 @@ def test_what_leaves_all_bounds_is_unstable_and_stops_nobody(linear_motions):
     assert np.isnan(linear_motions["lyapunov_standard_error"][:, 3]).all()
     np.testing.assert_allclose(linear_motions["lyapunov_spectrum"][:, 3], 0.25, atol=0.05)
     assert (linear_motions["outcome"] == 0).all()
+
+
+def test_what_leaves_at_once_has_no_exponents():
+    """A success would promise a value."""
+    ours = dt.run(
+        {
+            "system": "tripod",
+            "analysis": "lyapunov",
+            "axes": {"chi_n": {"values": [0.01, 0.6]}},
+            "fixed": {"element": "input", "beta": 0.157, "zeta": 0.01},
+            "options": {"max_time": 0.5},
+        }
+    )
+    assert ours["outcome"].values.tolist() == [Outcome.SUCCESS, Outcome.NOT_FINITE]
+    assert np.isnan(ours["lyapunov_spectrum"].values[1]).all() and not broken(ours)
 
 
 def test_members_do_not_depend_on_their_neighbours(linear, linear_motions):

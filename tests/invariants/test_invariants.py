@@ -113,6 +113,24 @@ def test_rules_of_the_analyses(analysis, variables, rule):
     assert rule in broken(dataset)
 
 
+@pytest.mark.parametrize(
+    ("analysis", "outcome", "variables"),
+    [
+        ("basins", 2, {"basin_fraction": real([[np.nan]], "attractor"), "unsettled_fraction": real([1.0])}),
+        ("forced", 2, {"condition": real([1e17])}),
+        (
+            "lyapunov",
+            0,
+            {"lyapunov_spectrum": real([[0.2]], "exponent"), "lyapunov_standard_error": real([[np.nan]], "exponent")},
+        ),
+        ("floquet", 3, {"floquet_multiplier": real(np.empty((1, 0)), "multiplier")}),
+    ],
+)
+def test_what_may_be_missing_or_kept_breaks_nothing(analysis, outcome, variables):
+    dataset = xr.Dataset(variables | {"outcome": flag([outcome], 6)}, {"x": [1.0]}, {"analysis": analysis})
+    assert broken(dataset) == []
+
+
 def test_a_function_has_no_outcome():
     atlas = xr.Dataset({"lower": real([0.0, 2.0]), "upper": real([1.0, 1.0]), "value_error": real([0.0, 0.0])})
     atlas.attrs["analysis"] = "atlas"
@@ -132,7 +150,7 @@ def test_what_is_declared_exists():
             continue
         names = {variable.name for variable in get_analysis(analysis).variables} | {"outcome"}
         known = registry.declared(analysis)
-        used = {name for rule in known.rules for name in rule.variables} | set(known.gaps)
+        used = {name for rule in known.rules for name in rule.variables} | {*known.gaps, *known.kept}
         assert used <= names, (analysis, used - names)
     assert FIRST_FAILURE == min(o for o in Outcome if not o.has_value)
 

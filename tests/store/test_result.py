@@ -56,6 +56,15 @@ def test_two_files_of_one_dataset_are_identical(dataset, tmp_path):
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
 
 
+def test_a_variable_without_entries(tmp_path):
+    axis = Coordinate("x", ("x",), np.array([1.0, 2.0]), "m", "place")
+    results = [(Variable("z", "1", "nothing", ("k",)), np.empty((2, 0))), (Variable("f", "s", "time"), np.ones(2))]
+    dataset = build_dataset(("x",), [axis], (), results, {"digest": "abc"})
+    write_result(dataset, tmp_path / "r.nc", tmp_path / "tmp")
+    with xr.open_dataset(tmp_path / "r.nc", engine="h5netcdf") as again:
+        assert again["z"].shape == (2, 0) and again["f"].values.tolist() == [1.0, 1.0]
+
+
 def resident():
     """Megabytes of this process that are pages of files."""
     lines = Path("/proc/self/status").read_text().splitlines()

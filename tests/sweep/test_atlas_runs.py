@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 import time
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -188,6 +189,59 @@ def test_the_function_of_the_parameters(atlas, direct):
     assert atlas(beta=0.31, Omega=1.2)["spectral_radius"].shape == ()
     line = atlas.grid(beta=0.31, Omega=omega)
     assert line["spectral_radius"].dims == ("Omega",) and float(line["beta"] if "beta" in line.coords else 0.31) == 0.31
+
+
+def test_numbers_for_all_parameters_no_points_and_shapes_that_do_not_fit(atlas):
+    point = atlas.grid(beta=0.31, Omega=1.2)
+    assert point["spectral_radius"].shape == ()
+    assert float(point["spectral_radius"]) == float(atlas(beta=0.31, Omega=1.2)["spectral_radius"])
+    assert dict(atlas(beta=np.empty(0), Omega=1.2).sizes) == {"point": 0}
+    crossed = atlas(beta=np.full((2, 1), 0.31), Omega=np.full((1, 3), 1.2))["spectral_radius"]
+    assert crossed.shape == (2, 3) and (crossed == point["spectral_radius"]).all()
+    with pytest.raises(dt.InputError, match=r"shapes beta \(2,\), Omega \(3,\): allowed are arrays that broadcast"):
+        atlas(beta=[0.1, 0.2], Omega=[1.1, 1.2, 1.3])
+    row = atlas.grid(beta=[0.1, 0.2], Omega=np.full(100, 1.3))["spectral_radius"].values
+    assert np.isfinite(row).all() and (row == row[:, :1]).all()
+
+
+@pytest.mark.parametrize("outputs", [["floquet_multiplier", "verdict"], ["spectral_radius"]])
+def test_an_atlas_without_a_panel_has_all_its_points_solved(monkeypatch, tmp_path, outputs):
+    monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
+    scene = floquet("atlas") | {"outputs": outputs}
+    exact = dt.run(scene | {"options": {"method": "direct"}})
+    for found in (dt.run(scene), dt.run(scene, out=tmp_path / "r.nc")):
+        assert found.attrs["atlas_panels"] == 0
+        same_arrays(found, exact)
+
+
+def test_values_that_are_one_in_the_coordinates_of_an_atlas():
+    """Speeds a rounding apart, and angles whose squares vanish."""
+    for axes in (
+        {"beta": {"values": [0.1, 0.3]}, "Omega": {"values": [1.9, 1.9000000000000001]}},
+        {"beta": {"start": 0.0, "stop": 1e-170, "num": 3}, "Omega": {"values": [1.3, 1.4]}},
+    ):
+        found, exact = (dt.run(floquet(method, axes)) for method in ("atlas", "direct"))
+        assert found.attrs["atlas_panels"] > 0 and (found["outcome"] == 0).all()
+        np.testing.assert_allclose(found["spectral_radius"], exact["spectral_radius"], rtol=1e-11)
+
+
+def test_what_is_not_finite_is_never_called_stable(atlas):
+    """Compiled, the largest of moduli that are all NaN is -inf: less than 1."""
+    panels = tuple(replace(panel, coefficients=np.nan * panel.coefficients) for panel in atlas.stability.atlas.panels)
+    lost = replace(atlas.stability, atlas=replace(atlas.stability.atlas, panels=panels))
+    for outputs in (["spectral_radius", "verdict"], ["spectral_radius", "verdict", "floquet_multiplier"]):
+        found = lost.at(np.array([[0.3, 1.2], [0.4, 1.3]]), outputs)
+        assert (found["outcome"] == Outcome.NOT_FINITE).all() and (found["verdict"] == 2).all()
+        assert all(np.isnan(found[name]).all() for name in outputs if name != "verdict")
+
+
+def test_a_system_without_an_atlas_is_refused_before_anything_is_written(tmp_path, capsys):
+    assert (
+        main(["run", "sweeps/tripod_tongue.toml", "--out", str(tmp_path / "t.nc"), "--set", "options.method=atlas"])
+        == 2
+    )
+    assert "tripod has no model for it; allowed is auto, direct, diffrax" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_gaps_of_a_stored_atlas_are_solved(monkeypatch):

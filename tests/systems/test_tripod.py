@@ -140,7 +140,7 @@ def test_determinant_against_quadrature():
         ("floquet", {"chi_n": 0.0026, "chi_source": "printed_value"}, "chi_n = 0.0026: given together with chi_source"),
         ("floquet", {"beta": math.pi / 2}, "beta = 1.57"),
         ("floquet", {"zeta": 0.0}, "zeta = 0.0: allowed is 0 < zeta"),
-        ("floquet", {"element": "middle"}, "element is one of input, output"),
+        ("floquet", {"element": "middle"}, "allowed is one of input, output"),
     ],
 )
 def test_wrong_input_is_one_line(analysis, given, message):

@@ -31,7 +31,7 @@ SEGMENTS = 64
 # When the standard error is looked at: after a quarter, a half and all of the time.
 _CHECKS = (SEGMENTS // 4, SEGMENTS // 2, SEGMENTS)
 # The first quarter of what has been recorded is transient; the rest is judged in blocks.
-_DISCARD, _BLOCKS = 4, 12
+_DISCARD, BLOCKS = 4, 12
 # A decaying motion is followed until its transient has fallen by e to this power.
 SETTLED = 12.0
 # A component that exceeds this has left.
@@ -160,6 +160,11 @@ def _stopped(march: _March, span: Array, target: float) -> _March:
     return march._replace(alive=march.alive & ~reached)
 
 
+def block_size(used: Array) -> Array:
+    """Segments in each of the ``BLOCKS`` blocks that are averaged."""
+    return jnp.maximum((used - used // _DISCARD) // BLOCKS, 1)
+
+
 def block_mean(series: Array, used: Array, span: Array) -> tuple[Array, Array]:
     """Mean rate of ``series`` (per segment) after the transient and its standard error, both ``(m, ...)``.
 
@@ -168,10 +173,10 @@ def block_mean(series: Array, used: Array, span: Array) -> tuple[Array, Array]:
     """
     index = jnp.arange(SEGMENTS).reshape(-1, *(1,) * (series.ndim - 1))
     first = used // _DISCARD
-    size = jnp.maximum((used - first) // _BLOCKS, 1)
-    block = jnp.where((index >= first) & (index < first + _BLOCKS * size), (index - first) // size, _BLOCKS)
-    means = jnp.stack([jnp.sum(jnp.where(block == b, series, 0.0), axis=0) for b in range(_BLOCKS)]) / (size * span)
-    pairs = means.reshape(_BLOCKS // 2, 2, *means.shape[1:]).mean(axis=1)
+    size = block_size(used)
+    block = jnp.where((index >= first) & (index < first + BLOCKS * size), (index - first) // size, BLOCKS)
+    means = jnp.stack([jnp.sum(jnp.where(block == b, series, 0.0), axis=0) for b in range(BLOCKS)]) / (size * span)
+    pairs = means.reshape(BLOCKS // 2, 2, *means.shape[1:]).mean(axis=1)
     errors = [jnp.std(m, axis=0, ddof=1) / jnp.sqrt(m.shape[0]) for m in (means, pairs)]
     return jnp.mean(means, axis=0), jnp.maximum(*errors)
 

@@ -55,13 +55,15 @@ def results(
     found: dict[str, Array] = {}
     if wanted & MULTIPLIERS:
         real, imaginary = spectrum = eigen()
-        multipliers = sort_multipliers(real, imaginary)
+        multipliers = jnp.where(finite, sort_multipliers(real, imaginary), jnp.nan)
         found["floquet_multiplier"] = multipliers * size
         found["floquet_exponent"] = (jnp.log(jnp.abs(multipliers)) + z.log_scale) / period
     if spectrum is None and has_closed_form(z.matrix):
         rho, error = radius_in_closed_form(z.matrix, z.error, size, 10 * rtol)
     else:
         rho, error = radius_by_eigenvalues(eigen(), z.error)
+    # Compiled, the largest of moduli that are all NaN may be -inf.
+    rho, error = (jnp.where(finite, x, jnp.nan) for x in (rho, error))
     found |= {"spectral_radius": rho * size, "liouville_residual": jnp.where(finite, z.residual, jnp.nan)}
     met = z.met
     if wanted & NEED_ERROR:
