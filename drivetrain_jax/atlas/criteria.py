@@ -25,6 +25,7 @@ from itertools import combinations
 import jax
 import numpy as np
 
+from drivetrain_jax._errors import InputError
 from drivetrain_jax.atlas.panels import Atlas, Panel, chebyshev, position
 from drivetrain_jax.systems import System
 
@@ -34,12 +35,20 @@ _STATES = 4
 _BLOCKS = (64, 512, 4096)
 
 
+def has_boundaries(atlas: Atlas, system: System) -> bool:
+    """Whether the system has four states and a reversor that exchanges two halves of them."""
+    corner = {**atlas.fixed, **dict(zip(atlas.parameters, atlas.lower, strict=True))}
+    reversor = system.models["floquet"].build(corner).reduced.reversor
+    swap = np.kron([[0.0, 1.0], [1.0, 0.0]], np.eye(_STATES // 2))
+    return reversor is not None and np.array_equal(reversor, swap)
+
+
 @dataclass(frozen=True)
 class Criteria:
     """The boundary functions of ``atlas``, whose values are the propagator ``Phi`` of the reduced form of ``system``.
 
     Points are given in the atlas's coordinates, ``(N, d)``. ``conservative`` chooses the functions without dissipation.
-    Raises ``ValueError`` for a system that does not have four states and a reversor that exchanges two halves of them.
+    Raises :class:`InputError` for a system that does not have them (:func:`has_boundaries`).
     """
 
     atlas: Atlas
@@ -47,12 +56,10 @@ class Criteria:
     conservative: bool = False
 
     def __post_init__(self) -> None:
-        corner = self._values(self.atlas.to_coordinates(self.atlas.lower)[None])
-        reversor = self.system.models["floquet"].build(corner).reduced.reversor
-        swap = np.kron([[0.0, 1.0], [1.0, 0.0]], np.eye(_STATES // 2))
-        if reversor is None or reversor.shape != swap.shape or (reversor != swap).any():
-            raise ValueError(
-                f"system = {self.system.name!r}: allowed is one of four states with a half-period propagator"
+        if not has_boundaries(self.atlas, self.system):
+            raise InputError(
+                f"system = {self.system.name!r}: has no boundary functions; allowed for boundaries and what is asked of "
+                "them is one of four states with a half-period propagator"
             )
 
     @classmethod

@@ -14,11 +14,19 @@ import numpy as np
 
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.panels import Atlas
-from drivetrain_jax.atlas.windows import Crossing, Interval, Line, narrow, stability_along, stability_over_range
+from drivetrain_jax.atlas.windows import (
+    Crossing,
+    Interval,
+    Line,
+    Range,
+    decided,
+    narrow,
+    stability_along,
+    stability_over_range,
+)
 from drivetrain_jax.systems import System
 
 Direct = Callable[[Mapping[str, np.ndarray]], np.ndarray]
-Range = tuple[float, float]
 
 # A check steps aside from the answer by this many error bounds, and at least by this part of the parameter's range.
 _BOUNDS, _PART = 10.0, 1e-6
@@ -65,7 +73,8 @@ class Answer:
 class Window:
     """A stable range of a parameter; ``safe`` is what the margin leaves of it.
 
-    ``largest`` is the largest spectral radius within ``safe`` (sampled) and ``where`` its place.
+    Where its ``interval`` has no crossing at an end, the atlas ends there or what follows is undecided. ``largest`` is the
+    largest spectral radius within ``safe`` (sampled) and ``where`` its place.
     """
 
     interval: Interval
@@ -73,6 +82,14 @@ class Window:
     largest: float
     where: float
     check: Check | None = None
+
+
+@dataclass(frozen=True)
+class Windows:
+    """The ``safe`` windows, and the ``undecided`` ranges, which are in none of them."""
+
+    safe: tuple[Window, ...]
+    undecided: tuple[Range, ...]
 
 
 @dataclass(frozen=True)
@@ -117,24 +134,47 @@ def speed_windows(
     *,
     margin: float = 0.0,
     direct: Direct | None = None,
-) -> tuple[Window, ...]:
+) -> Windows:
     """The stable ranges of the speed where the other parameters are ``at``, each shortened by ``margin`` of the speed at
-    both crossings. What a margin leaves nothing of is left out."""
+    both ends, unless the atlas ends there. What a margin leaves nothing of is left out."""
     part = atlas.slice(at)
     line = stability_along(part, system)
     criteria = Criteria.of(part, system)
     windows = []
-    for interval in line.intervals:
-        low = interval.lower * (1 + margin) + interval.lower_end.error if interval.lower_end else interval.lower
-        high = interval.upper * (1 - margin) - interval.upper_end.error if interval.upper_end else interval.upper
-        if not interval.stable or low >= high:
+    for interval in _stable_and_decided(line):
+        low, high = _shortened(interval, part, margin)
+        if low >= high:
             continue
         values = np.linspace(low, high, _DENSE)
         rho = criteria.spectral_radius(part.to_coordinates(values[:, None]))
         k = int(np.argmax(rho))
         window = Window(interval, (low, high), float(rho[k]), float(values[k]))
         windows.append(_checked_window(window, part, system.roles["speed"], direct))
-    return tuple(windows)
+    return Windows(tuple(windows), line.undecided)
+
+
+def _stable_and_decided(line: Line) -> list[Interval]:
+    return [
+        replace(
+            interval,
+            lower=low,
+            upper=high,
+            lower_end=interval.lower_end if low == interval.lower else None,
+            upper_end=interval.upper_end if high == interval.upper else None,
+        )
+        for interval in line.intervals
+        if interval.stable
+        for low, high in decided(interval.lower, interval.upper, line.undecided)
+    ]
+
+
+def _shortened(interval: Interval, part: Atlas, margin: float) -> Range:
+    low, high = interval.lower, interval.upper
+    if low > part.lower[0]:
+        low = low * (1 + margin) + (interval.lower_end.error if interval.lower_end else 0.0)
+    if high < part.upper[0]:
+        high = high * (1 - margin) - (interval.upper_end.error if interval.upper_end else 0.0)
+    return low, high
 
 
 def nearest_boundaries(atlas: Atlas, system: System, point: Mapping[str, float]) -> tuple[Nearest, ...]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +15,8 @@ from drivetrain_jax.atlas.patches import Patches, patches_of
 from drivetrain_jax.atlas.roots import on_line, roots
 from drivetrain_jax.atlas.tips import polish
 from drivetrain_jax.systems import System
+
+Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ class Line:
 
     parameter: str
     intervals: tuple[Interval, ...]
-    undecided: tuple[tuple[float, float], ...]
+    undecided: tuple[Range, ...]
 
     @property
     def crossings(self) -> tuple[Crossing, ...]:
@@ -179,17 +182,32 @@ def _all_stable(criteria: Criteria, patches: tuple[Patches, ...], h: int, value:
     return not any(len(roots(on_line(p, 1 - h, float(x[1 - h]))).x) for p in patches)
 
 
+def decided(lower: float, upper: float, undecided: Iterable[Range]) -> list[Range]:
+    """What ``undecided`` ranges leave of the one from ``lower`` to ``upper``."""
+    left = []
+    for a, b in sorted(undecided):
+        left += [(lower, min(a, upper))] if lower < min(a, upper) else []
+        lower = max(lower, b)
+    return [*left, (lower, upper)] if lower < upper else left
+
+
+def _middle(lower: float, upper: float, undecided: Iterable[Range]) -> float:
+    """The middle of the widest part that is decided."""
+    widest = max(decided(lower, upper, undecided), key=lambda part: part[1] - part[0], default=(lower, upper))
+    return (widest[0] + widest[1]) / 2
+
+
 def _line(name: str, ends: tuple[float, float], changes: list[Crossing], undecided: list, stable) -> Line:
     """Sort candidates, test between them and keep those at which the stability changes."""
     changes = sorted((c for c in changes if ends[0] < c.value < ends[1]), key=lambda c: c.value)
-    edges = np.array([ends[0], *(c.value for c in changes), ends[1]])
-    inside = stable((edges[1:] + edges[:-1]) / 2)
+    edges = [float(ends[0]), *(c.value for c in changes), float(ends[1])]
+    inside = stable(np.array([_middle(a, b, undecided) for a, b in itertools.pairwise(edges)]))
     intervals: list[Interval] = []
-    start, first = float(ends[0]), None
+    start, first = edges[0], None
     for k, change in enumerate([*changes, None]):
         if change is not None and inside[k] == inside[k + 1]:
             continue
-        end = float(ends[1]) if change is None else change.value
+        end = edges[-1] if change is None else change.value
         intervals.append(Interval(start, end, bool(inside[k]), first, change))
         start, first = end, change
     return Line(name, tuple(intervals), tuple(sorted(undecided)))

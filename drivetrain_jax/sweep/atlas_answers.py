@@ -15,6 +15,7 @@ from typing import Any
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.atlas import design
+from drivetrain_jax.atlas.criteria import has_boundaries
 from drivetrain_jax.atlas.sensitivity import Sensitivity, direct_sensitivity
 from drivetrain_jax.atlas.windows import Crossing
 from drivetrain_jax.sweep.atlas_file import StoredAtlas, as_given
@@ -52,9 +53,10 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
     variables = {v.name: v for v in (*atlas.scene.analysis.variables, OUTCOME)}
     rows = [f"  {name:<24} {_value(variables[name], value)}" for name, value in results.items()]
     slopes = direct_sensitivity(atlas.scene.system, {**atlas.fixed, **point})
-    nearest = design.nearest_boundaries(atlas.stability.atlas, atlas.scene.system, point)
-    lines = [f"{atlas.scene.system.name} atlas, {asked.heading()}", *rows, *_gradient_lines(atlas, slopes)]
-    lines.append("nearest change of stability")
+    panels, system = atlas.stability.atlas, atlas.scene.system
+    nearest = design.nearest_boundaries(panels, system, point) if has_boundaries(panels, system) else ()
+    lines = [f"{system.name} atlas, {asked.heading()}", *rows, *_gradient_lines(atlas, slopes)]
+    lines += ["nearest change of stability"] if nearest else []
     for each in nearest:
         sides = [_side(asked, each.parameter, each.value, c) for c in (each.below, each.above) if c]
         lines.append(f"  {each.parameter:<24} {'; '.join(sides) or _reach(atlas, each.parameter)}")
@@ -102,12 +104,20 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
         raise InputError(f"margin = {margin!r}: allowed is 0 <= margin < 1")
     (speed,) = _roles(atlas, "speed")
     asked = _Asked.of(atlas, given, ranges=(), free=(speed,))
-    windows = design.speed_windows(
+    found = design.speed_windows(
         atlas.stability.atlas, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.radius
     )
     lines = [f"safe speeds, {asked.heading()}, margin {margin:g}"]
-    for w in windows:
-        ends = " to ".join(asked.named(speed, value) for value in w.safe)
+    for w in found.safe:
+        ends = " to ".join(
+            f"{asked.named(speed, value)}{_beyond(atlas, speed, end, crossing)}"
+            for value, end, crossing in zip(
+                w.safe,
+                (w.interval.lower, w.interval.upper),
+                (w.interval.lower_end, w.interval.upper_end),
+                strict=True,
+            )
+        )
         lines.append(f"  {ends}; largest spectral radius {w.largest:.10g} at {speed} = {_number(w.where)}")
         lines.append(f"    {_checked(w.check)}")
     data = {
@@ -115,10 +125,20 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
         "parameters": {**atlas.fixed, **asked.values},
         "margin": margin,
         "windows": [
-            {"safe": list(w.safe), "largest": w.largest, "where": w.where, "check": _check(w.check)} for w in windows
+            {"safe": list(w.safe), "largest": w.largest, "where": w.where, "check": _check(w.check)} for w in found.safe
         ],
+        "undecided": [list(r) for r in found.undecided],
     }
-    return Reply("\n".join(lines if windows else [*lines, "  none within the atlas"]), data)
+    lines += [] if found.safe else ["  none within the atlas"]
+    lines += [f"  undecided from {_number(a)} to {_number(b)}" for a, b in found.undecided]
+    return Reply("\n".join(lines), data)
+
+
+def _beyond(atlas: StoredAtlas, name: str, end: float, crossing: Crossing | None) -> str:
+    """What ends a window, if stability does not."""
+    if crossing:
+        return ""
+    return " (the end of the atlas)" if end in atlas.ranges[name] else " (undecided beyond)"
 
 
 def _roles(atlas: StoredAtlas, *roles: str) -> list[str]:

@@ -11,6 +11,7 @@ import xarray as xr
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.atlas.boundaries import boundaries
+from drivetrain_jax.atlas.criteria import has_boundaries
 from drivetrain_jax.atlas.tips import Tips, find_tips
 from drivetrain_jax.atlas.windows import narrow
 from drivetrain_jax.sweep.atlas_file import StoredAtlas, as_given, open_atlas
@@ -24,9 +25,9 @@ def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, flo
     """The ``floquet`` result on ``cells`` values of each of two parameters of the atlas in ``source``.
 
     ``part`` fixes parameters (numbers) or zooms in (ranges). Of further parameters there are three values. A chart of two
-    parameters also has its stability boundaries (``boundary_NAME``, parts separated by NaN) and the tips of its tongues
-    (``tip_NAME``, with their names, ``tip_NAME_error`` and ``tip_proved``) and the boxes that may hide further ones
-    (``undecided_NAME``). Raises :class:`InputError` for what the atlas does not cover.
+    parameters also has, if the system has such, its stability boundaries (``boundary_NAME``, parts separated by NaN) and
+    the tips of its tongues (``tip_NAME``, with their names, ``tip_NAME_error`` and ``tip_proved``) and the boxes that may
+    hide further ones (``undecided_NAME``). Raises :class:`InputError` for what the atlas does not cover.
     """
     if not 2 <= cells <= 20_000:
         raise InputError(f"cells = {cells}: allowed is 2 <= cells <= 20000")
@@ -45,7 +46,9 @@ def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, flo
         for p in [atlas.scene.system.parameter(name)]
     }
     dataset = atlas.grid(**axes, **fixed).assign_coords(given)
-    return dataset.assign_coords(_curves(atlas, fixed, {n: ranges[n] for n in shown})) if len(shown) == 2 else dataset
+    if len(shown) != 2 or not has_boundaries(atlas.stability.atlas, atlas.scene.system):
+        return dataset
+    return dataset.assign_coords(_curves(atlas, fixed, {n: ranges[n] for n in shown}))
 
 
 def _ranges(atlas: StoredAtlas, part: Mapping[str, Any]) -> dict[str, Any]:

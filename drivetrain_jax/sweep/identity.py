@@ -21,7 +21,7 @@ from drivetrain_jax.sweep.scene import Scene
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "numpy", "scipy")
 _ROOT = Path(drivetrain_jax.__file__).parent
 _ENGINE = ("sweep/grid.py", "sweep/plan.py", "sweep/kernel.py")
-_THROUGH_ATLAS = ("atlas/floquet.py", "sweep/rounds.py", "sweep/through_atlas.py")
+_THROUGH_ATLAS = ("atlas/floquet.py", "sweep/atlas_choice.py", "sweep/rounds.py", "sweep/through_atlas.py")
 # What these packages hold decides numbers; what lies above them does not.
 _NUMERIC = ("drivetrain_jax._quantities", "drivetrain_jax.systems", "drivetrain_jax.analysis", "drivetrain_jax.atlas")
 
@@ -57,40 +57,56 @@ def _sources(starts: tuple[Path, ...]) -> tuple[tuple[str, Path], ...]:
 
 
 def _label(path: Path) -> str:
-    return path.relative_to(_ROOT).as_posix() if _ROOT in path.parents else path.name
+    return path.relative_to(_ROOT if _ROOT in path.parents else _home(path)).as_posix()
+
+
+@cache
+def _home(path: Path) -> Path:
+    """The folder that the package of a source file lies in."""
+    folder = path.parent
+    while (folder / "__init__.py").is_file():
+        folder = folder.parent
+    return folder
 
 
 def _imported(starts: Sequence[Path]) -> set[Path]:
-    """The source files ``starts`` and all that they import from the numeric packages, directly or not."""
+    """The source files ``starts`` and what they import, directly or not, from their own packages and the numeric ones."""
     found: set[Path] = set()
     waiting = [path for path in starts if path.is_file()]
     while waiting:
         path = waiting.pop()
         if path not in found:
             found.add(path)
-            waiting += [file for name in _imports(path) for file in _files(name)]
+            waiting += [file for name in _imports(path) for file in _files(name, path)]
     return found
 
 
 @cache
 def _imports(path: Path) -> tuple[str, ...]:
     """Dotted names that a source file imports, those of ``from x import y`` as ``x.y``."""
+    package = path.relative_to(_home(path)).parts[:-1]
     names: list[str] = []
     for node in ast.walk(ast.parse(path.read_bytes())):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names += [f"{node.module}.{alias.name}" for alias in node.names]
-    return tuple(names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else ()
+            module = ".".join((*above, *filter(None, [node.module])))
+            names += [f"{module}.{alias.name}" for alias in node.names]
+    return (*names, ".".join(package)) if package else tuple(names)
 
 
 @cache
-def _files(name: str) -> list[Path]:
-    """Modules that importing the dotted ``name`` runs, as far as they are numeric code of this package."""
-    if not any(name == package or name.startswith(package + ".") for package in _NUMERIC):
+def _files(name: str, importer: Path) -> list[Path]:
+    """Modules that importing the dotted ``name`` runs: numeric code of this package, or code of that of ``importer``."""
+    home, parts, first = _home(importer), name.split("."), 0
+    if parts[0] == drivetrain_jax.__name__:
+        if not any(name == package or name.startswith(package + ".") for package in _NUMERIC):
+            return []
+        home, first = _ROOT.parent, 1
+    elif parts[0] != importer.relative_to(home).with_suffix("").parts[0]:
         return []
-    parts = name.split(".")[1:]
-    stems = [_ROOT.joinpath(*parts[: k + 1]) for k in range(len(parts))]
+    stems = [home.joinpath(*parts[: k + 1]) for k in range(first, len(parts))]
     return [file for stem in stems for file in (stem.with_suffix(".py"), stem / "__init__.py") if file.is_file()]
 
 

@@ -17,9 +17,10 @@ from interrupts import stop_after
 import drivetrain_jax as dt
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import Outcome
+from drivetrain_jax.atlas.criteria import Criteria, has_boundaries
 from drivetrain_jax.cli import main
 from drivetrain_jax.store.consolidate import write_result
-from drivetrain_jax.sweep import atlas_answers, atlas_choice, rounds, through_atlas
+from drivetrain_jax.sweep import atlas_answers, atlas_chart, atlas_choice, rounds, through_atlas
 from drivetrain_jax.sweep.atlas_chart import chart
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.run import Incomplete, Interrupted, run_to_file
@@ -315,8 +316,10 @@ def test_design_answers_are_checked_by_direct_solves(atlas):
     angle = atlas_answers.widest_angle(atlas, {"Omega": (1.3, 1.5)})
     assert angle.data["value"] == pytest.approx(0.1063331213, abs=1e-8)  # the tip of S21
     assert angle.data["check"]["agrees"] and "direct solves agree" in str(angle)
-    windows = atlas_answers.speed_windows(atlas, {"beta": 0.31}, margin=0.02).data["windows"]
+    reply = atlas_answers.speed_windows(atlas, {"beta": 0.31}, margin=0.02)
+    windows = reply.data["windows"]
     assert len(windows) == 2 and all(w["check"]["agrees"] for w in windows)
+    assert "Omega = 1 (the end of the atlas) to " in str(reply) and reply.data["undecided"] == []
     edge = json.loads(atlas_answers.query(atlas, {"beta": 0.31, "Omega": 1.2}).to_json())["nearest"]["Omega"]["above"]
     assert windows[0]["safe"][1] == pytest.approx(edge["value"] * 0.98, rel=1e-8)
     with pytest.raises(dt.InputError, match=r"^file: the atlas does not vary zeta"):
@@ -325,6 +328,25 @@ def test_design_answers_are_checked_by_direct_solves(atlas):
         atlas_answers.widest_angle(atlas, {"Omega": 1.2})
     with pytest.raises(dt.InputError, match=r"^margin = 2: allowed is 0 <= margin < 1$"):
         atlas_answers.speed_windows(atlas, {"beta": 0.31}, margin=2)
+
+
+def test_a_system_without_boundary_functions_has_values_and_charts(atlas, stored, monkeypatch):
+    def of_the_unreduced_form(values):
+        model = build(values)
+        return replace(model, reduced=model.natural)
+
+    system = atlas.scene.system
+    build = system.models["floquet"].build
+    model = replace(system.models["floquet"], build=of_the_unreduced_form)
+    other = replace(system, models={**system.models, "floquet": model})
+    assert has_boundaries(atlas.stability.atlas, system) and not has_boundaries(atlas.stability.atlas, other)
+    with pytest.raises(dt.InputError, match="system = 'cardan': has no boundary functions; allowed for boundaries"):
+        Criteria.of(atlas.stability.atlas, other)
+    for module in (atlas_answers, atlas_chart):
+        monkeypatch.setattr(module, "has_boundaries", lambda *_: False)
+    reply = atlas_answers.query(atlas, {"beta": 0.31, "Omega": 1.2})
+    assert reply.data["nearest"] == {} and "nearest change" not in str(reply)
+    assert not [name for name in chart(stored, {}, 5).coords if name.startswith(("boundary", "tip"))]
 
 
 def test_least_damping_of_a_range_of_speeds():

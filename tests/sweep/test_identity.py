@@ -75,6 +75,28 @@ def test_source_of_systems_analyses_and_engine_decides(monkeypatch):
     assert files["toy.py"].samefile(toy.__file__)
 
 
+def test_what_a_system_of_another_package_imports_from_its_own_decides(tmp_path):
+    """Absolute and relative imports, however deep; its neighbours and libraries do not."""
+    package = tmp_path / "gears"
+    (package / "laws").mkdir(parents=True)
+    texts = {
+        "gears/__init__.py": "",
+        "gears/shaft.py": "import numpy\nimport unrelated\nfrom . import mesh\nfrom gears.laws.stiffness import law\n",
+        "gears/mesh.py": "from drivetrain_jax.systems import System\n",
+        "gears/laws/__init__.py": "",
+        "gears/laws/stiffness.py": "from ..constants import PITCH\nfrom .contact import force\n",
+        "gears/laws/contact.py": "",
+        "gears/constants.py": "",
+        "gears/unused.py": "",
+        "unrelated.py": "",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    found = {identity._label(path) for path in identity._imported([package / "shaft.py"])}
+    assert {name for name in found if name.startswith("gears")} == set(texts) - {"gears/unused.py", "unrelated.py"}
+    assert "systems/_base.py" in found and not any("numpy" in name or "unrelated" in name for name in found)
+
+
 def test_chunk_size_decides(monkeypatch):
     from dataclasses import replace
 
