@@ -5,6 +5,8 @@ The frequency ``omega`` is the path: a line of frequencies is followed as a whol
 the motion goes. Methods: the exact solution, harmonic balance (approximates the motion by a chosen number of
 harmonics), multiple scales (the paper's closed form for a cubic spring) and the describing function (bias and
 fundamental). Every result says what it leaves unbalanced in the equation of motion (``residual``).
+
+Outcome: the worse one of both directions. What the other direction found is kept beside it.
 """
 
 from __future__ import annotations

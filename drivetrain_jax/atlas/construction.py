@@ -7,8 +7,8 @@ same questions, so that a run can be replayed from stored answers. Every box goe
 
 1. probes along lines on its edges, refined until the Chebyshev coefficients of each coordinate are resolved;
 2. a tensor grid with some more nodes per coordinate than the worst line needs, and held-out points;
-3. acceptance, if the last two slabs of each coordinate and the errors at all held-out points are small enough,
-   else growth by the slope of the tail (twice at most), else a split in two halves.
+3. acceptance, if what the coefficients left out add up to (the last pairs of slabs continued) and the errors at all
+   held-out points are small enough, else growth by the slope of the tail (twice at most), else a split in two halves.
 
 Nodes may come from something cheaper than solves (:func:`construct_from_parts`); held-out points never do.
 

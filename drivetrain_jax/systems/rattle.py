@@ -56,7 +56,7 @@ def oscillator(values: Values) -> PiecewiseLinearOscillator:
 def rattle_threshold(values: Values) -> np.ndarray:
     """Amplitude ``B1`` at which the orbit without separation ceases to exist, shape ``(..., 1)``; NaN if there is none.
 
-    ``B1 = (B0 - alpha b k/I) sqrt((1 - r^2)^2 + (2 zeta r)^2)``, ``r = omega/sqrt(k/I)``, ``zeta = c/(2 sqrt(k I))``,
+    ``B1 = (|B0| - alpha b k/I) sqrt((1 - r^2)^2 + (2 zeta r)^2)``, ``r = omega/sqrt(k/I)``, ``zeta = c/(2 sqrt(k I))``,
     for a mean drive that holds the teeth in contact (either flank). Rattle can coexist with that orbit below it.
     """
     mean, b, c, alpha, k, mass, omega = (

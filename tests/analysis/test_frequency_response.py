@@ -10,6 +10,7 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.systems.rattle import PRESETS
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "rattle.json").read_text())
@@ -69,6 +70,20 @@ def test_the_exact_branch_has_the_saddles_between_folds(exact):
     # Where the period has doubled, the simple orbit is unstable and the sweep is elsewhere.
     doubled = (omega > 1.2425788605) & (omega < 1.9590767455)
     assert (exact.branch_stability.values[doubled, 0] == 1).all()
+
+
+def test_a_direction_without_a_motion_is_called_absent_and_the_other_one_kept():
+    """Without a mean torque nothing holds the mass within the play: what the sweep down meets there attracts nothing."""
+    fixed = {"B0": 0.0, "B1": 0.03, "b": 0.05, "alpha": 0.0, "c": 0.05, "k": 1.0, "I": 1.0}
+    axes = {"omega": {"start": 0.7, "stop": 1.0, "num": 7}}
+    outputs = ["u_max", "stability"]
+    found = dt.run(
+        {"system": "rattle", "analysis": "frequency_response", "axes": axes, "fixed": fixed, "outputs": outputs}
+    )
+    known = found["u_max"].notnull().values
+    assert known.sum(axis=0).tolist() == [6, 2]
+    np.testing.assert_array_equal(found["stability"].values, np.where(known, 0, 2))
+    np.testing.assert_array_equal(found["outcome"].values, np.where(known.all(axis=1), 0, Outcome.NOT_CONVERGED))
 
 
 def test_order_of_the_path_does_not_matter():

@@ -17,7 +17,7 @@ from jax import Array
 from drivetrain_jax.analysis._base import Outcome
 from drivetrain_jax.analysis.impacts.attractor import Attractors, attractors, take
 from drivetrain_jax.analysis.impacts.attractor_lanes import MOST_PERIODS
-from drivetrain_jax.analysis.impacts.motion import REGIMES, regime
+from drivetrain_jax.analysis.impacts.motion import ABSENT, REGIMES, STABLE, UNSTABLE, regime
 from drivetrain_jax.analysis.impacts.orbit_measures import Measures, measure
 from drivetrain_jax.analysis.impacts.plane_map import spectral_radius
 from drivetrain_jax.systems import PiecewiseLinearOscillator
@@ -39,9 +39,9 @@ def describe(
 
     Scalars per motion under the names of the analyses' variables, shape ``(N,)``; ``impacts``, ``impact_velocity`` and
     ``contact_fraction`` of the driving and the back flank, ``orbit_state`` and (complex) ``floquet_multiplier``, shape
-    ``(2, N)``. What is not known is NaN. A motion that recurs after no more than 32 periods is described over its
-    period, one whose tangent has grown by exp(20) over 32 drive periods with ``period_multiple`` 0; any other has not
-    settled. ``outcome`` is TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its size.
+    ``(2, N)``. What is not known is NaN (``stability``: absent). A motion that recurs within 32 periods is described over
+    its period. One that does not, but whose tangent has grown by exp(20) over the last three quarters of the run, is
+    non-periodic: ``period_multiple`` 0, described over 32 drive periods. Any other has not settled. ``outcome`` is TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its size.
     """
     seen = measure(oscillator, found.u, found.v, found.multiple, width=WIDTH, integrals=integrals)
     periodic = found.multiple > 0
@@ -61,7 +61,7 @@ def describe(
     kind = jnp.where(periodic, regime(oscillator, seen.high, seen.low), NON_PERIODIC)
     return results | {
         "regime": jnp.where(known, kind, NON_PERIODIC).astype(jnp.int8),
-        "stability": (known & ~periodic).astype(jnp.int8),
+        "stability": jnp.where(known, jnp.where(periodic, STABLE, UNSTABLE), ABSENT).astype(jnp.int8),
         "period_multiple": jnp.where(periodic & known, seen.periods, 0).astype(jnp.int32),
         "periods_settled": found.periods,
         "outcome": outcome.astype(jnp.int8),
