@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
-from matplotlib.colors import LinearSegmentedColormap, SymLogNorm
+from matplotlib.colors import LinearSegmentedColormap, ListedColormap, SymLogNorm
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, NullFormatter
 
@@ -18,6 +18,7 @@ from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STATE_HATCHES, 
 STABLE, UNSTABLE, UNDECIDED, FAILED = range(4)
 # Outcome codes from here on mean that there is no value (CF flags of the variable `outcome`).
 FIRST_FAILURE = 2
+_PENDING, _PENDING_COLOUR = "pending", "#c4c4c4"
 
 
 def prepare(dataset: xr.Dataset) -> xr.Dataset:
@@ -25,7 +26,15 @@ def prepare(dataset: xr.Dataset) -> xr.Dataset:
     single = {name: 0 for name in dataset["outcome"].dims if dataset.sizes[name] == 1}
     dataset = dataset.isel(single)
     axes = [name for name in dataset["outcome"].dims if name in dataset.coords]
-    return dataset.sortby(axes) if axes else dataset
+    return _with_pending(dataset.sortby(axes) if axes else dataset)
+
+
+def _with_pending(dataset: xr.Dataset) -> xr.Dataset:
+    """``dataset`` with the cells that are still to be computed as a coordinate, which goes along with every variable."""
+    outcome = dataset["outcome"]
+    if not outcome.ndim or not str(outcome.attrs.get("flag_meanings", "")).endswith(" pending"):
+        return dataset
+    return dataset.assign_coords({_PENDING: outcome == outcome.attrs["flag_values"][-1]})
 
 
 def sweep_axes(dataset: xr.Dataset) -> list[str]:
@@ -94,6 +103,10 @@ def draw_cells(axes: Axes, field: xr.DataArray, horizontal: str, vertical: str, 
     mesh = axes.pcolormesh(
         cell_edges(x), cell_edges(y), field.transpose(vertical, horizontal).values, rasterized=True, **options
     )
+    if _PENDING in field.coords:
+        waiting = field[_PENDING].transpose(vertical, horizontal).values
+        grey = ListedColormap([_PENDING_COLOUR])
+        axes.pcolormesh(cell_edges(x), cell_edges(y), np.where(waiting, 0.0, np.nan), cmap=grey, rasterized=True)
     fit_axis(axes, "x", x)
     fit_axis(axes, "y", y)
     return mesh
@@ -127,14 +140,19 @@ def draw_states(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str)
 def state_legend(dataset: xr.Dataset) -> list[Patch]:
     """Legend entries of the states that occur; stable and unstable always, the others with their number of cells."""
     counts = np.bincount(states(dataset).values.astype(int).ravel(), minlength=len(STATE_NAMES))
-    shown = [code for code in range(len(STATE_NAMES)) if code <= UNSTABLE or counts[code]]
-    return [_state_patch(code, f" ({counts[code]})" if code > UNSTABLE else "") for code in shown]
+    shown = [code for code in range(FAILED) if code <= UNSTABLE or counts[code]]
+    patches = [_state_patch(code, f" ({counts[code]})" if code > UNSTABLE else "") for code in shown]
+    return [*patches, *failure_legend(dataset)]
 
 
 def failure_legend(dataset: xr.Dataset) -> list[Patch]:
-    """The legend entry of cells without a value, if there are any."""
-    count = int((dataset["outcome"] >= FIRST_FAILURE).sum())
-    return [_state_patch(FAILED, f" ({count})")] if count else []
+    """The legend entries of cells without a value, if there are any: failed, or still to be computed."""
+    waiting = int(dataset[_PENDING].sum()) if _PENDING in dataset.coords else 0
+    failed = int((dataset["outcome"] >= FIRST_FAILURE).sum()) - waiting
+    patches = [_state_patch(FAILED, f" ({failed})")] if failed else []
+    label = f"{_PENDING} ({waiting})"
+    grey = {"facecolor": _PENDING_COLOUR, "edgecolor": FRAME_GREY, "linewidth": 0.6}
+    return [*patches, Patch(**grey, label=label)] if waiting else patches
 
 
 def _state_patch(code: int, note: str) -> Patch:
@@ -145,14 +163,15 @@ def _state_patch(code: int, note: str) -> Patch:
 # Growth log10(rho) below this is drawn on a linear scale: narrow tongues differ from 1 by 1e-5 and less.
 LINEAR_GROWTH = 1e-4
 # Position between no growth (0) and the largest (1), colour; the lightness falls all the way, as it does from decay.
-_DECAY, _NEUTRAL = "#ffffff", "#d3e2f0"
+# White is left to what has no value.
+_DECAY, _NEUTRAL = "#eef4f9", "#d0e0ef"
 _GROWTH = ((0.25, "#f3b562"), (0.55, "#c8553d"), (1.0, "#2d0a2b"))
 
 
 def draw_growth(axes: Axes, radius: xr.DataArray, horizontal: str, vertical: str) -> tuple[QuadMesh, str, str]:
     """``log10`` of a spectral radius as cells, and label and ``extend`` of its colour bar.
 
-    Blue decays, orange grows, darker is faster; missing values have the colour of failed cells.
+    Pale decays, the paler the faster; orange to black grows. Missing values have the colour of failed cells.
     """
     with np.errstate(divide="ignore"):
         growth = np.log10(radius)

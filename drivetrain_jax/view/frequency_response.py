@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells, rattle_maps
 from drivetrain_jax.view.layout import Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, STYLE, axis_label
+from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STYLE, axis_label
 
 PATH = "omega"
 DASHES = (0, (3, 1.6))
@@ -86,6 +86,7 @@ def _lines(results: list[xr.Dataset]) -> Figure:
         handles += _entries(each, look)
     backbone = next((r for r in results if "backbone_amplitude" in r), None)
     upper.set_ylim(0, None)
+    handles += _draw_missing(upper, results)
     if backbone is not None:
         handles.append(_draw_backbone(upper, backbone))
     cells.fit_axis(upper, "x", np.unique(np.concatenate([r[PATH].values for r in results])))
@@ -190,6 +191,18 @@ def _draw_backbone(axes: Axes, result: xr.Dataset) -> Line2D:
     style = {"color": FRAME_GREY, "linewidth": 0.7, "linestyle": (0, (6, 2, 1, 2))}
     axes.plot(result[PATH], result["backbone_amplitude"], **style, scaley=False)
     return Line2D([], [], **style, label="backbone")
+
+
+def _draw_missing(axes: Axes, results: list[xr.Dataset]) -> list[Line2D]:
+    """Crosses on the axis at the frequencies where a sweep has found no motion."""
+    omega = [r[PATH].values[r["u_max"].isnull().any("sweep_direction").values] for r in results]
+    count = sum(map(len, omega))
+    if not count:
+        return []
+    style = {"color": STATE_COLOURS[cells.FAILED], "linestyle": "", "marker": "x", "markersize": 3.5, "clip_on": False}
+    x = np.unique(np.concatenate(omega))
+    axes.plot(x, np.zeros(len(x)), **style, zorder=5)
+    return [Line2D([], [], **style, label=f"no motion found ({count})")]
 
 
 def _meanings(results: list[xr.Dataset]) -> list[Line2D]:

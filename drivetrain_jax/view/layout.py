@@ -12,15 +12,17 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextPath
 
-from drivetrain_jax.view.style import FRAME_GREY, caption
+from drivetrain_jax.view.style import FRAME_GREY, STYLE, caption
 
 WIDTH = 7.0
 DPI = 200
 _LABEL_SIZE = 8.5
 _INCHES_PER_LETTER = 0.068
 _INCHES_PER_ENTRY = 0.45
+_TITLE_SIZE, _SMALLEST_TITLE, _ELLIPSIS = 10.5, 7.0, "\u2026"
 _CAPTION_SIZE, _CAPTION_TOP, _CAPTION_LINE = 8, 0.32, 0.14
 
 
@@ -97,7 +99,7 @@ class Panels:
         """The scene's title and, below it, the fixed parameters (and ``note``)."""
         total = self.figure.get_figheight()
         left = self.margins.left / WIDTH
-        self.figure.text(left, 1 - 0.10 / total, dataset.attrs.get("title", ""), va="top", size=10.5, weight="bold")
+        write_title(self.figure, dataset, self.margins.left)
         text = "; ".join(part for part in (caption(dataset), note) if part)
         room = int((self.margins.top - _CAPTION_TOP) / _CAPTION_LINE)
         text = wrap_caption(text, WIDTH - self.margins.left - 0.1, max(room, 1))
@@ -117,6 +119,22 @@ class Panels:
             columnspacing=1.4,
             handlelength=2.0,
         )
+
+
+def write_title(figure: Figure, dataset: xr.Dataset, left: float) -> None:
+    """The scene's title from ``left`` (inches) on: in smaller type where it would not fit, then cut."""
+    title, room = str(dataset.attrs.get("title", "")), WIDTH - left - 0.1
+    size = max(min(_TITLE_SIZE, _TITLE_SIZE * room / max(_title_length(title), 1e-9)), _SMALLEST_TITLE)
+    while _title_length(title) * size / _TITLE_SIZE > room * 1.001:
+        title = title.rstrip(_ELLIPSIS)[:-1] + _ELLIPSIS
+    figure.text(left / WIDTH, 1 - 0.10 / figure.get_figheight(), title, va="top", size=size, weight="bold")
+
+
+def _title_length(title: str) -> float:
+    """Length of a title of full size in inches, with room for the letters that a screen rounds up."""
+    bold = FontProperties(family=STYLE["font.sans-serif"], weight="bold")
+    length = TextPath((0, 0), title, size=_TITLE_SIZE, prop=bold).get_extents().width if title.strip() else 0.0
+    return 1.05 * length / 72
 
 
 def _wrap(text: str, inches: float) -> str:
@@ -144,7 +162,7 @@ def wrap_caption(text: str, inches: float, lines: int) -> str:
     way to an ellipsis."""
     wrapped = _fill(re.split(r"(?<=[,;]) (?![^\[]*\])", text), inches, _caption_length)
     if len(wrapped) > lines:
-        wrapped = [*wrapped[: lines - 1], f"{wrapped[lines - 1].rstrip(',;')}, \u2026"]
+        wrapped = [*wrapped[: lines - 1], f"{wrapped[lines - 1].rstrip(',;')}, {_ELLIPSIS}"]
     return "\n".join(wrapped)
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
-from drivetrain_jax.view.layout import DPI, WIDTH, Margins, Panels
+from drivetrain_jax.view.layout import DPI, WIDTH, Margins, Panels, write_title
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, axis_label, caption, variable_label
 
 _HEIGHT, _MOST_CURVES = 1.8, 8
@@ -62,7 +62,7 @@ def _table(dataset: xr.Dataset, shown: list[str]) -> Figure:
     height = top + 0.1 + _ROW * len(lines)
     figure = Figure(figsize=(WIDTH, height), dpi=DPI)
     left, value, units = 0.35 / WIDTH, 0.72, 0.74
-    figure.text(left, 1 - 0.10 / height, dataset.attrs.get("title", ""), va="top", size=10.5, weight="bold")
+    write_title(figure, dataset, 0.35)
     figure.text(left, 1 - 0.32 / height, "\n".join(head), va="top", size=8, color=FRAME_GREY)
     for k, (label, number, unit) in enumerate(lines):
         y = 1 - (top + _ROW * k) / height

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import chain
 
 import matplotlib
@@ -136,6 +137,7 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
     # Labels stand over the first row only, so an axis on which the predictions depend runs across.
     dependent = dataset.coords.get(f"resonance_{horizontal}", xr.DataArray(0)).dims
     sliced.sort(key=lambda name: name not in dependent)
+    count = math.prod(dataset.sizes[name] for name in sliced)
     dataset = dataset.isel({name: dataset.sizes[name] // 2 for name in sliced[2:]})
     across, down = sliced[0], (*sliced[1:2], None)[0]
     slices = [
@@ -162,7 +164,12 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
     if not cells.is_logarithmic(dataset[horizontal].values):
         panels.axes[0][0].set_xticks(_clear_ticks(panels.axes[0][0]))
     panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
-    panels.titles(dataset, "stable everywhere" if plain else "")
+    shown = len(slices) * len(slices[0])
+    notes = [
+        *(["stable everywhere"] if plain else []),
+        *([f"{shown} of {count} charts shown"] if shown < count else []),
+    ]
+    panels.titles(dataset, "; ".join(notes))
     panels.legend(predicted if plain else [*cells.state_legend(dataset), *predicted])
     return panels.figure
 

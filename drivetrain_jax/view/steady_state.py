@@ -16,16 +16,13 @@ from matplotlib.colors import ListedColormap, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.view import cells
+from drivetrain_jax.view import cells, regimes
 from drivetrain_jax.view.layout import WIDTH, Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, PREDICTION, STYLE, axis_label, variable_label
+from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STATE_COLOURS, STYLE, axis_label, variable_label
 
-# Lightness falls from no separation to double-sided rattle; what is not periodic and what failed stand apart in hue.
-_COLOURS = ("#ffffff", "#9cc3e0", "#33517c", "#f2b632", "#d1495b")
-_NAMES = ("no separation", "single-sided", "double-sided", "non-periodic", "failed")
-_FAILED = 4
 _HEIGHT, _PORTRAIT = 2.45, 3.1
 # Of the line with the parameters, marks of formulas counted.
 _LETTERS = 110
@@ -67,19 +64,6 @@ def _titles(panels: Panels, dataset: xr.Dataset) -> None:
     line.set_text(textwrap.fill(kept, _LETTERS, break_long_words=False))
 
 
-def _regimes(dataset: xr.Dataset) -> xr.DataArray:
-    return dataset["regime"].where(dataset["outcome"] < cells.FIRST_FAILURE, _FAILED)
-
-
-def _regime_legend(codes: xr.DataArray) -> list[Artist]:
-    counts = np.bincount(codes.values.astype(int).ravel(), minlength=len(_NAMES))
-    return [
-        Patch(facecolor=_COLOURS[k], edgecolor=FRAME_GREY, linewidth=0.6, label=_NAMES[k])
-        for k in range(len(_NAMES))
-        if counts[k] or k < _FAILED - 1
-    ]
-
-
 def _maps(dataset: xr.Dataset, names: list[str]) -> Figure:
     horizontal = cells.speed_axis(dataset, names)
     vertical = next(name for name in names if name != horizontal)
@@ -88,34 +72,18 @@ def _maps(dataset: xr.Dataset, names: list[str]) -> Figure:
     handles: list[Artist] = []
     for (axes,), name in zip(panels.axes, shown, strict=True):
         if name == "regime":
-            codes = _regimes(dataset)
-            cells.draw_cells(axes, codes, horizontal, vertical, cmap=ListedColormap(_COLOURS), vmin=-0.5, vmax=4.5)
-            handles += _regime_legend(codes)
+            regimes.draw(axes, dataset, dataset[name], horizontal, vertical)
+            handles += regimes.legend(dataset)
         else:
-            cmap = matplotlib.colormaps["cividis_r"].with_extremes(bad=_COLOURS[_FAILED])
+            cmap = matplotlib.colormaps["cividis_r"].with_extremes(bad=STATE_COLOURS[cells.FAILED])
             field = dataset[name].where(dataset["outcome"] < cells.FIRST_FAILURE)
             mesh = cells.draw_cells(axes, field, horizontal, vertical, cmap=cmap, norm=PowerNorm(0.5))
             panels.colorbar(axes, mesh, variable_label(dataset[name]))
-        handles += _threshold(axes, dataset, horizontal, vertical)[: 1 if axes is panels.axes[-1][0] else 0]
+        handles += regimes.draw_threshold(axes, dataset, horizontal, vertical)[: 1 if axes is panels.axes[-1][0] else 0]
     panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
     _titles(panels, dataset)
     panels.legend(handles)
     return panels.figure
-
-
-def _threshold(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Line2D]:
-    """The predicted end of the motion without separation, if it is stored as a curve over the horizontal axis."""
-    name = f"resonance_{vertical}"
-    if name not in dataset.coords or horizontal not in dataset[name].dims:
-        return []
-    limits = axes.get_ylim()
-    handles = []
-    for line in dataset[name].transpose("resonance", horizontal):
-        label = str(line["resonance"].item())
-        axes.plot(dataset[horizontal], line, color="#ffffff", linewidth=2.6)
-        handles += axes.plot(dataset[horizontal], line, color=PREDICTION, linewidth=1.3, label=label)
-    axes.set_ylim(limits)
-    return handles
 
 
 def _curves(dataset: xr.Dataset, name: str) -> Figure:
@@ -124,19 +92,32 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
     panels = Panels(1 + len(scalars), height=1.75, margins=Margins(right=0.3, left=1.0), share_y=False)
     stack = [row[0] for row in panels.axes]
     handles: list[Artist] = []
+    other = regimes.COLOURS[regimes.NON_PERIODIC]
     periodic = dataset["period_multiple"] > 0 if "period_multiple" in dataset else dataset["outcome"] >= 0
     for key, colour in zip(extremes, LINE_COLOURS, strict=False):
         label = dataset[key].attrs.get("long_name", key)
         handles += _dots(stack[0], dataset[name], dataset[key].where(periodic), colour, label)
         if not bool(periodic.all()):
-            _dots(stack[0], dataset[name], dataset[key].where(~periodic), _COLOURS[3], "")
+            _dots(stack[0], dataset[name], dataset[key].where(~periodic), other, "")
     if not bool(periodic.all()):
-        handles.append(Line2D([], [], linestyle="", marker="o", markersize=3, color=_COLOURS[3], label="non-periodic"))
+        handles.append(
+            Line2D(
+                [],
+                [],
+                linestyle="",
+                marker="o",
+                markersize=3,
+                color=regimes.COLOURS[regimes.NON_PERIODIC],
+                label="non-periodic",
+            )
+        )
     units = dataset[extremes[0]].attrs.get("units", "1")
     panels.label_row(stack[0], f"extremes of the displacement [{units}]")
     for axes, key in zip(stack[1:], scalars, strict=True):
         _dots(axes, dataset[name], dataset[key], LINE_COLOURS[0], "")
         panels.label_row(axes, variable_label(dataset[key]))
+        if key == "period_multiple":
+            axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         limit = {"spectral_radius": 1.0, "lyapunov_exponent": 0.0}.get(key)
         if limit is not None:
             axes.axhline(limit, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)))
@@ -156,7 +137,7 @@ def _basins(dataset: xr.Dataset) -> Figure:
     codes, names = _attractors(dataset)
     panels = Panels(height=4.2, margins=Margins(right=2.3))
     axes = panels.axes[0][0]
-    colours = ListedColormap([*_BASINS[: len(names)], _COLOURS[_FAILED]])
+    colours = ListedColormap([*_BASINS[: len(names)], STATE_COLOURS[cells.FAILED]])
     cells.draw_cells(axes, codes, "u0", "v0", cmap=colours, vmin=-0.5, vmax=len(names) + 0.5)
     share = [float((codes == k).mean()) for k in range(len(names) + 1)]
     handles = [

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from drivetrain_jax.view import cells, plot
+from drivetrain_jax.view.layout import Panels, write_title
 from drivetrain_jax.view.style import caption
 from tests.view import results
 from tests.view.test_stability import meshes, panels
@@ -65,6 +67,30 @@ def test_long_numbers_on_a_logarithmic_axis_are_powers_of_ten(limits, first):
     axes.set(yscale="log", ylim=limits)
     cells.plain_decades(axes, "y")
     assert axes.yaxis.get_major_formatter()(100.0, 0) == first
+
+
+def test_cells_still_to_be_computed_are_not_failed():
+    codes = np.array([[0, 1, 3], [3, 0, 1]])
+    chart = results.with_axes(results.grid(codes, "beta", "Omega"), beta=np.arange(2.0), Omega=np.arange(3.0))
+    chart["outcome"] = chart["outcome"].assign_attrs(flag_values=np.arange(7), flag_meanings="a b c d e f pending")
+    chart["outcome"][1, 0] = 6
+    chart = cells.prepare(chart)
+    labels = [patch.get_label() for patch in cells.state_legend(chart)]
+    assert labels == ["stable", "unstable", "failed (1)", "pending (1)"]
+    figure = Figure()
+    axes = figure.add_subplot()
+    cells.draw_states(axes, chart, "Omega", "beta")
+    _, over = axes.collections
+    np.testing.assert_array_equal(np.ma.filled(over.get_array(), np.nan), [[np.nan] * 3, [0, np.nan, np.nan]])
+
+
+@pytest.mark.parametrize(("letters", "cut"), [(20, False), (50, False), (300, True)])
+def test_a_title_is_never_wider_than_the_figure(letters, cut):
+    figure = Panels(height=2.0).figure
+    write_title(figure, xr.Dataset(attrs={"title": "W" * letters}), 0.75)
+    (title,) = figure.texts
+    extent = title.get_window_extent(FigureCanvasAgg(figure).get_renderer())
+    assert extent.x1 <= figure.bbox.x1 and title.get_text().endswith("\u2026") == cut
 
 
 def test_the_caption_gives_parameters_and_not_the_number_of_the_point():

@@ -66,6 +66,16 @@ def test_jumps_are_dotted_and_not_bridged():
         assert np.nanmax(np.abs(np.diff(y)), initial=0.0) < 0.1
 
 
+def test_frequencies_without_a_motion_are_marked():
+    dataset = line()
+    dataset["u_max"][3, 1] = np.nan
+    dataset["u_max"][5] = np.nan
+    figure = plot(dataset)
+    (marks,) = [each for each in figure.axes[0].lines if each.get_marker() == "x"]
+    np.testing.assert_array_equal(marks.get_xdata(), dataset["omega"].values[[3, 5]])
+    assert "no motion found (2)" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
 def test_saddles_are_dashed_and_reach_the_branches_they_meet():
     dashed = [item for item in lines_of(plot(line()).axes[0], "--") if np.isfinite(item.get_ydata()).any()]
     (saddle,) = dashed

@@ -36,7 +36,7 @@ def test_a_map_shows_regimes_and_the_threshold():
     )
     figure = plot(dataset)
     shown = labels(figure)
-    assert {"no separation", "double-sided", "non-periodic", "failed", "no separation ends"} <= set(shown)
+    assert {"no separation", "double-sided", "non-periodic", "failed (1)", "no separation ends"} <= set(shown)
     (line,) = [line for line in figure.axes[0].lines if line.get_label() == "no separation ends"]
     np.testing.assert_allclose(line.get_ydata(), [0.15, 0.25])
 

@@ -41,7 +41,8 @@ def describe(
     ``contact_fraction`` of the driving and the back flank, ``orbit_state`` and (complex) ``floquet_multiplier``, shape
     ``(2, N)``. What is not known is NaN (``stability``: absent). A motion that recurs within 32 periods is described over
     its period. One that does not, but whose tangent has grown by exp(20) over the last three quarters of the run, is
-    non-periodic: ``period_multiple`` 0, described over 32 drive periods. Any other has not settled. ``outcome`` is TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its size.
+    non-periodic: ``period_multiple`` 0, described over 32 drive periods. Any other has not settled. ``outcome`` is
+    TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its size.
     """
     seen = measure(oscillator, found.u, found.v, found.multiple, width=WIDTH, integrals=integrals)
     periodic = found.multiple > 0

@@ -1,0 +1,51 @@
+"""Regimes of motion with play as coloured cells: by how many flanks contact is made and lost."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import ListedColormap
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from drivetrain_jax.view import cells
+from drivetrain_jax.view.style import FRAME_GREY, PREDICTION, STATE_COLOURS
+
+# Lightness falls with the number of flanks; what is not periodic and what failed stand apart in hue.
+_NAMES = ("no separation", "single-sided", "double-sided", "non-periodic", "failed")
+COLOURS = ("#ffffff", "#9cc3e0", "#33517c", "#f2b632", STATE_COLOURS[cells.FAILED])
+NON_PERIODIC, FAILED = 3, 4
+
+
+def draw(axes: Axes, dataset: xr.Dataset, field: xr.DataArray, horizontal: str, vertical: str) -> QuadMesh:
+    """The regimes ``field`` of ``dataset``."""
+    codes = field.where(dataset["outcome"] < cells.FIRST_FAILURE, FAILED)
+    cmap = ListedColormap(COLOURS, name="regimes")
+    return cells.draw_cells(axes, codes, horizontal, vertical, cmap=cmap, vmin=-0.5, vmax=FAILED + 0.5)
+
+
+def legend(dataset: xr.Dataset) -> list[Patch]:
+    """Entries of the regimes with contact made and lost at no, one or two flanks, and of all others that occur."""
+    known = (dataset["outcome"] < cells.FIRST_FAILURE).values
+    present = {*range(NON_PERIODIC), *np.unique(dataset["regime"].values[known]).tolist()}
+    patches = [
+        Patch(facecolor=COLOURS[k], edgecolor=FRAME_GREY, linewidth=0.6, label=_NAMES[k]) for k in sorted(present)
+    ]
+    return [*patches, *cells.failure_legend(dataset)]
+
+
+def draw_threshold(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Line2D]:
+    """The predicted end of the motion without separation, if it is stored as a curve over the horizontal axis."""
+    name = f"resonance_{vertical}"
+    if name not in dataset.coords or horizontal not in dataset[name].dims:
+        return []
+    limits = axes.get_xlim(), axes.get_ylim()
+    handles = []
+    for line in dataset[name].transpose("resonance", horizontal):
+        label = str(line["resonance"].item())
+        axes.plot(dataset[horizontal], line, color="#ffffff", linewidth=2.6)
+        handles += axes.plot(dataset[horizontal], line, color=PREDICTION, linewidth=1.3, label=label)
+    axes.set(xlim=limits[0], ylim=limits[1])
+    return handles
