@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from benchmarks.precision import GOAL, Judgement, Rung, judge, read
 from benchmarks.results_files import LEVEL, is_level, markdown, not_measured, seconds, small, times
@@ -66,8 +67,25 @@ def conclusions(found: dict[str, Precision]) -> list[str]:
     return [*(_winners(precision) for precision in found.values()), *(_silence(list(found.values())) if found else [])]
 
 
-def _winners(precision: Precision) -> str:
-    won, level, lost, alone, nobody = [], [], [], [], []
+def losses(found: dict[str, Precision]) -> str:
+    """Where a rival is ahead, in one sentence; empty if nowhere."""
+    behind = {system: _compared(precision).lost for system, precision in found.items()}
+    told = "; ".join(f"`{system}`: {', '.join(regions)}" for system, regions in behind.items() if regions)
+    return f"Behind at an error of {GOAL:g} on one core, of all regions of the page below: {told}." if told else ""
+
+
+class _Compared(NamedTuple):
+    """Regions by who is ahead in them, each with the rival where there is one."""
+
+    won: list[str]
+    level: list[str]
+    lost: list[str]
+    alone: list[str]
+    nobody: list[str]
+
+
+def _compared(precision: Precision) -> _Compared:
+    won, level, lost, alone, nobody = found = _Compared([], [], [], [], [])
     for region in precision.regions:
         own, rival = precision.fastest(region, True), precision.fastest(region, False)
         if own is None and rival is None:
@@ -84,6 +102,11 @@ def _winners(precision: Precision) -> str:
                 won.append(f"{region} ({times(ratio)} times as fast as {rival.method})")
             else:
                 lost.append(f"{region} ({rival.method} is {times(1 / ratio)} times as fast)")
+    return found
+
+
+def _winners(precision: Precision) -> str:
+    won, level, lost, alone, nobody = _compared(precision)
     parts = [
         f"fastest in {', '.join(won)}" if won else "",
         f"alone in reaching it: {', '.join(alone)}" if alone else "",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks import page
+from benchmarks import page, page_precision
 from benchmarks.precision import GOAL
 from benchmarks.results_files import ResultFile, Row, between_marks, count, load, markdown, not_measured, seconds, small
 from benchmarks.timing import RESULTS
@@ -35,6 +35,7 @@ def section(folder: Path = RESULTS) -> str:
         _atlas(files["atlas"]),
         _memory(files["memory"]),
         page.overhead_sentence(files["overhead"]),
+        page_precision.losses(page_precision.load_precision(folder)),
         _machines(files),
     ]
     return "\n\n".join([*_chart(files["throughput"]), "\n".join(f"- {sentence}" for sentence in told if sentence)])

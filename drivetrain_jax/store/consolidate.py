@@ -174,5 +174,9 @@ def open_result(path: Path) -> xr.Dataset:
 
 
 def _unreadable(path: Path) -> InputError:
+    if path.suffix == ".parts":
+        return InputError(f"file = {str(path)!r}: a folder of unfinished work; give {str(path.with_suffix(''))!r}")
+    if (path / "zarr.json").is_file():
+        return InputError(f"file = {str(path)!r}: a Zarr store; give the file that `drivetrain export` makes of it")
     what = "is a folder" if path.is_dir() else "not a readable netCDF4/HDF5 file"
     return InputError(f"file = {str(path)!r}: {what}; give a result written by `drivetrain run`")

@@ -23,7 +23,8 @@ from drivetrain_jax.sweep.scene import load_scene, system_and_analysis
 class PointResult:
     """Results of one point, by attribute or by name: ``result.spectral_radius`` or ``result["spectral_radius"]``.
 
-    ``outcome`` tells what became of it (results are NaN unless ``outcome.has_value``), ``units`` the units by name.
+    ``outcome`` tells what became of it (results are NaN unless ``outcome.has_value``), ``units`` the units by name,
+    ``labels`` the entries of each dimension that a result has.
     """
 
     system: str
@@ -34,6 +35,7 @@ class PointResult:
     outcome: Outcome
     variables: Mapping[str, Variable] = field(repr=False)
     parameter_units: Mapping[str, str] = field(repr=False)
+    labels: Mapping[str, Sequence[Any]] = field(repr=False)
 
     @property
     def units(self) -> dict[str, str]:
@@ -67,13 +69,28 @@ class PointResult:
         given = ", ".join(
             _with_units(f"{n} = {written(v)}", self.parameter_units[n]) for n, v in self.parameters.items() if v != ()
         )
-        width = max(map(len, (*self.values, "outcome")))
+        listed = [n for n, v in self.values.items() if np.ndim(v) == 1]
+        plain = [name for name in self.values if name not in listed]
+        width = max(map(len, (*plain, "outcome")))
         lines = [f"{self.system} {self.analysis} (method {self.method}), {given}"]
-        for name, value in self.values.items():
-            lines.append(
-                f"  {name:{width}} = {_with_units(_text(self.variables[name], value), self.variables[name].units)}"
-            )
-        return "\n".join([*lines, f"  {'outcome':{width}} = {self.outcome.name.lower()}"])
+        for name in plain:
+            text = _text(self.variables[name], self.values[name])
+            lines.append(f"  {name:{width}} = {_with_units(text, self.variables[name].units)}")
+        lines.append(f"  {'outcome':{width}} = {self.outcome.name.lower()}")
+        for (dim,) in dict.fromkeys(self.variables[name].dims for name in listed):
+            lines += self._table(dim, [name for name in listed if self.variables[name].dims == (dim,)])
+        return "\n".join(lines)
+
+    def _table(self, dim: str, names: Sequence[str]) -> list[str]:
+        """Results that are lists over one dimension, side by side."""
+        columns = [[dim, *map(str, self.labels[dim])]]
+        for name in names:
+            variable = self.variables[name]
+            head = name if variable.units == "1" else f"{name} [{variable.units}]"
+            columns.append([head, *(_text(variable, value) for value in self.values[name])])
+        widths = [max(map(len, column)) for column in columns]
+        rows = zip(*columns, strict=True)
+        return ["  " + "  ".join(f"{cell:{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def _plain(value: Any) -> Any:
@@ -94,8 +111,6 @@ def _with_units(text: str, units: str) -> str:
 def _text(variable: Variable, value: Any) -> str:
     if variable.flags and np.ndim(value) == 0:
         return f"{variable.flags[int(value)]} ({int(value)})"
-    if variable.flags and np.ndim(value) == 1:
-        return "[" + ", ".join(variable.flags[int(code)] for code in value) + "]"
     if np.ndim(value):
         return np.array2string(value, precision=10, separator=", ", max_line_width=10_000)
     return f"{value:.12g}"
@@ -110,7 +125,7 @@ def point(system: str, analysis: str, *, outputs: Sequence[str] | None = None, *
     """
     tree = _tree(system, analysis, given)
     if outputs is not None:
-        tree["outputs"] = list(outputs)
+        tree["outputs"] = [outputs] if isinstance(outputs, str) else list(outputs)
     try:
         engine = Engine(load_scene(tree))
     except InputError as error:
@@ -163,4 +178,13 @@ def _result(engine: Engine, table: Table) -> PointResult:
         outcome=outcome,
         variables={v.name: v for v in table.variables},
         parameter_units={p.name: p.units for p in scene.system.parameters},
+        labels=_labels(engine, values, table),
     )
+
+
+def _labels(engine: Engine, values: Mapping[str, Any], table: Table) -> dict[str, Sequence[Any]]:
+    """The entries of every dimension of ``values``: their coordinates, or their numbers."""
+    shown = [v for v in table.variables if v.name in values]
+    sizes = {dim: n for v in shown for dim, n in zip(v.dims, np.shape(values[v.name]), strict=True)}
+    known = {dimension.name: dimension.values for dimension in engine.scene.dimensions}
+    return {dim: known.get(dim) or range(size) for dim, size in sizes.items()}

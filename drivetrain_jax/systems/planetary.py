@@ -40,8 +40,19 @@ def _stiffness(name: str, meaning: str, default: float, of_planets: bool = False
     return Parameter(name, "N/m", meaning, default=default, lower=0.0, **shape)
 
 
+# Two turns, more than anyone needs: angles in degrees are refused.
+_LARGEST_ANGLE = 4 * math.pi
+
 PARAMETERS = (
-    Parameter("planet_angle", "rad", "angle of the planet", tuple(i * math.pi / 2 for i in range(4)), listed=True),
+    Parameter(
+        "planet_angle",
+        "rad",
+        "angle of the planet",
+        default=tuple(i * math.pi / 2 for i in range(4)),
+        lower=-_LARGEST_ANGLE,
+        upper=_LARGEST_ANGLE,
+        listed=True,
+    ),
     _mass("m_s", "mass of the sun", 0.4),
     _mass("m_r", "mass of the ring", 2.35),
     _mass("m_c", "mass of the carrier", 5.43),

@@ -99,6 +99,21 @@ def test_a_failure_keeps_the_old_file(tmp_path, monkeypatch, step):
     assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["r"]
 
 
+@pytest.mark.parametrize(
+    ("name", "file", "told"),
+    [
+        ("r.nc.parts", "plan.json", "a folder of unfinished work; give .*r.nc'$"),
+        ("r.zarr", "zarr.json", "a Zarr store; give the file that `drivetrain export` makes of it$"),
+        ("r", "anything", "is a folder; give a result written by `drivetrain run`$"),
+    ],
+)
+def test_a_folder_is_told_what_it_is(tmp_path, name, file, told):
+    (tmp_path / name).mkdir()
+    (tmp_path / name / file).write_text("{}")
+    with pytest.raises(InputError, match=told):
+        open_result(tmp_path / name)
+
+
 @pytest.mark.parametrize("content", [None, b"", b"no HDF5 at all", "cut"])
 def test_unreadable_result_is_one_clear_line(tmp_path, dataset, content):
     path = tmp_path / "r.nc"

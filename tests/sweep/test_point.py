@@ -42,6 +42,23 @@ def test_readable():
     ]
 
 
+def test_one_output_may_be_a_word():
+    assert list(dt.point("toy", "toy", a=6.0, outputs="sign")) == ["sign"]
+    with pytest.raises(dt.InputError, match="outputs: 'all' is not a result of toy"):
+        dt.point("toy", "toy", a=6.0, outputs="all")
+
+
+def test_lists_stand_side_by_side():
+    result = dt.point("planetary", "modes", outputs=["natural_frequency", "mode_type"])
+    lines = repr(result).splitlines()
+    assert lines[1] == "  outcome = success" and lines[2].split() == ["mode", "natural_frequency", "[Hz]", "mode_type"]
+    assert len(lines) == 3 + 21
+    number, frequency, *kind = lines[8].split()
+    assert (number, kind) == ("6", ["rotational", "(1)"])
+    assert float(frequency) == pytest.approx(float(result.natural_frequency[5]), rel=1e-11)
+    assert list(result.labels["mode"]) == list(range(1, 22))
+
+
 def test_failed_point_says_so():
     result = dt.point("toy", "toy", a=9.5)
     assert np.isnan(result.value) and not result.outcome.has_value and "not_finite" in repr(result)
