@@ -51,7 +51,7 @@ def _analysis_lines(name: str, system: System) -> list[str]:
 
 
 def _parameter_row(parameter: Parameter) -> tuple[str, ...]:
-    given = "none" if parameter.default == () else written(parameter.default)
+    given = "none" if parameter.default in ((), "") else written(parameter.default)
     default = "required" if parameter.default is None else f"default {given}"
     default = f"default {parameter.derived}" if parameter.derived else default
     return parameter.name, f"[{parameter.units}]", parameter.long_name, default, parameter.allowed
