@@ -36,7 +36,7 @@ Rounds = Generator[np.ndarray, np.ndarray, Atlas]
 # A box with its exploration and the points that this asks for, or the answer to them (None to begin with).
 _Open = tuple[Box, Exploration, np.ndarray]
 _Told = tuple[Box, Exploration, np.ndarray | None]
-MAX_SOLVES = 400_000
+MAX_SOLVES, MAX_NODES = 400_000, 128
 # Numbers that are kept of all solves with parts.
 _MOST_NUMBERS = 50_000_000
 # Width of a box in which a coordinate does not vary, relative to it.
@@ -110,7 +110,7 @@ class Ledger:
 
 
 def construct(
-    domain: Domain, quantity: Quantity, tolerance: float, *, max_nodes: int = 128, max_solves: int = MAX_SOLVES
+    domain: Domain, quantity: Quantity, tolerance: float, *, max_nodes: int = MAX_NODES, max_solves: int = MAX_SOLVES
 ) -> Rounds:
     """An atlas of ``quantity`` over ``domain`` with errors of about ``tolerance`` times its scale.
 
@@ -129,7 +129,6 @@ def construct_from_parts(
     count: int,
     tolerance: float,
     *,
-    max_nodes: int = 128,
     max_solves: int = MAX_SOLVES,
 ) -> Rounds:
     """The same for propagators, from solves that give their ``count`` parts (see :mod:`~drivetrain_jax.atlas.parts`).
@@ -140,11 +139,11 @@ def construct_from_parts(
     ledger = Ledger()
     size = count * quantity.size
     asked = parts_quantity(quantity, count, tolerance)
-    settings = Settings(asked, tolerance, max_nodes, lambda solved: solved[:, :size], rough=True)
+    settings = Settings(asked, tolerance, MAX_NODES, lambda solved: solved[:, :size], rough=True)
     max_solves = min(max_solves, _MOST_NUMBERS // size)
     first = yield from _explored([domain.box()], domain, settings, ledger, max_solves)
     parts = _atlas(domain, first, tolerance, ledger)
-    solved = Settings(quantity, tolerance, max_nodes, lambda solved: product(solved[:, :size], count))
+    solved = Settings(quantity, tolerance, MAX_NODES, lambda solved: product(solved[:, :size], count))
     settings = replace(solved, source=Product(parts, count))
     done = yield from _explored(map(Box.of, parts.panels), domain, settings, ledger, max_solves)
     whole = _atlas(domain, [*done, *parts.gaps], tolerance, ledger)

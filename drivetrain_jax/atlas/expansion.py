@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.atlas.interpolation import nodes
+from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
 from drivetrain_jax.atlas.panels import Atlas, Panel, chebyshev, position
 
 # Polynomials of a panel for each of its boxes along a coordinate. With many coordinates the boxes would take up more memory
@@ -125,7 +125,5 @@ class Expansion:
 def _restriction(n: int, lower: float, upper: float) -> np.ndarray:
     """R for [lower, upper] and ``n`` polynomials. It is triangular: what rounding puts elsewhere is left out."""
     y = nodes(n)
-    analysis = 2 / n * chebyshev(y, n).T
-    analysis[0] /= 2
     x = np.clip((lower * (1 - y) + upper * (1 + y)) / 2, -1.0, 1.0)
-    return np.triu(analysis @ chebyshev(x, n))
+    return np.triu(analysis_matrix(n) @ chebyshev(x, n))

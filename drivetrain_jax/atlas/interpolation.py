@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from scipy.fft import dctn
@@ -17,6 +18,14 @@ _WORKING_SET, _ONE_THREAD = 1 << 22, 1 << 18
 def nodes(n: int) -> np.ndarray:
     """The ``n`` zeros of T_n, falling."""
     return np.cos(np.pi * (np.arange(n) + 0.5) / n)
+
+
+@lru_cache(maxsize=256)
+def analysis_matrix(n: int) -> np.ndarray:
+    """Matrix ``(n, n)`` from values at ``nodes(n)`` to Chebyshev coefficients; not to be written to."""
+    matrix = 2 / n * chebyshev(nodes(n), n).T
+    matrix[0] /= 2
+    return matrix
 
 
 def tensor_nodes(degrees: Sequence[int]) -> np.ndarray:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drivetrain_jax.atlas.criteria import Criteria, on_grid
-from drivetrain_jax.atlas.interpolation import nodes
+from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
 from drivetrain_jax.atlas.panels import Panel, chebyshev
 
 # Nodes of a patch in each coordinate, tail of the series relative to its size, and the largest number of patches.
@@ -253,7 +253,7 @@ def _sample(criteria: Criteria, panel: Panel, counts: list[int]) -> _Sample:
     def series(values: np.ndarray) -> np.ndarray:
         values = by_patch(values)
         for axis in range(1, d + 1):
-            values = _apply(_analysis(NODES), values, axis)
+            values = _apply(analysis_matrix(NODES), values, axis)
         return values
 
     floor, lever = criteria.errors(panel, phi, log_determinant)
@@ -281,14 +281,6 @@ def _apply(matrix: np.ndarray, coefficients: np.ndarray, axis: int) -> np.ndarra
 
 
 @lru_cache
-def _analysis(n: int) -> np.ndarray:
-    """Matrix from values at the nodes to Chebyshev coefficients."""
-    matrix = 2 / n * chebyshev(nodes(n), n).T
-    matrix[0] /= 2
-    return matrix
-
-
-@lru_cache
 def _differentiation(n: int) -> np.ndarray:
     """Matrix from the coefficients of a polynomial to those of its derivative (of the same length)."""
     matrix = np.zeros((n, n))
@@ -299,7 +291,7 @@ def _differentiation(n: int) -> np.ndarray:
 @lru_cache
 def _enlargement(n: int) -> np.ndarray:
     """Matrix from the coefficients over [-1, 1] to those over an interval larger by ``MARGIN``."""
-    return _analysis(n) @ np.polynomial.chebyshev.chebvander((1 + MARGIN) * nodes(n), n - 1)
+    return analysis_matrix(n) @ np.polynomial.chebyshev.chebvander((1 + MARGIN) * nodes(n), n - 1)
 
 
 @lru_cache
@@ -307,4 +299,4 @@ def _restrictions(n: int) -> tuple[np.ndarray, np.ndarray]:
     """Matrices from the coefficients over [-1, 1] to those over the two parts left and right of the cut."""
     t = nodes(n)
     left, right = (_CUT - 1 + (1 + _CUT) * t) / 2, (1 + _CUT + (1 - _CUT) * t) / 2
-    return tuple(_analysis(n) @ chebyshev(part, n) for part in (left, right))
+    return tuple(analysis_matrix(n) @ chebyshev(part, n) for part in (left, right))

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.atlas.evaluation import common_degrees, padded_tensor
-from drivetrain_jax.atlas.interpolation import nodes
+from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
 from drivetrain_jax.atlas.panels import Atlas, Panel, chebyshev
 
 # Nodes of a dense tile, and the angle arccos(t) that it may span, times the degree of its panel: the highest polynomial
@@ -161,9 +161,7 @@ def _dense(cells: np.ndarray, t: np.ndarray, degree: int, width: int) -> _Band:
     x = nodes(NODES)
     low, high = t[0], t[-1]
     place = np.clip(((t - low) - (high - t)) / (high - low), -1.0, 1.0)
-    analysis = 2 / NODES * chebyshev(x, NODES).T
-    analysis[0] /= 2
-    spread = filled_up(chebyshev(place, NODES) @ analysis, width).T
+    spread = filled_up(chebyshev(place, NODES) @ analysis_matrix(NODES), width).T
     at_nodes = np.clip((low * (1 - x) + high * (1 + x)) / 2, -1.0, 1.0)
     return _Band(cells, np.ascontiguousarray(chebyshev(at_nodes, degree).T), np.ascontiguousarray(spread))
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from drivetrain_jax.atlas.criteria import Criteria, parameters_at
 from drivetrain_jax.atlas.exclusion import critical_points
-from drivetrain_jax.atlas.panels import Atlas, Gap, Panel, chebyshev
+from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
+from drivetrain_jax.atlas.panels import Atlas, Gap, Panel, chebyshev, position_between
 from drivetrain_jax.atlas.patches import Patches, patches_of
 from drivetrain_jax.atlas.roots import on_line, roots
 from drivetrain_jax.atlas.tips import polish
@@ -134,12 +135,10 @@ def _part(box: Panel | Gap, lower: np.ndarray, upper: np.ndarray) -> Panel | Gap
         return replace(box, lower=low, upper=high)
     coefficients = box.coefficients
     for k, n in enumerate(box.degrees):
-        nodes = np.cos(np.pi * (np.arange(n) + 0.5) / n)
-        x = (low[k] * (1 - nodes) + high[k] * (1 + nodes)) / 2
-        t = np.clip((2 * x - box.lower[k] - box.upper[k]) / (box.upper[k] - box.lower[k]), -1.0, 1.0)
-        analysis = 2 / n * chebyshev(nodes, n).T
-        analysis[0] /= 2
-        coefficients = np.moveaxis(np.tensordot(analysis @ chebyshev(t, n), coefficients, axes=(1, k)), 0, k)
+        y = nodes(n)
+        t = position_between(box.lower[k], box.upper[k], (low[k] * (1 - y) + high[k] * (1 + y)) / 2)
+        matrix = analysis_matrix(n) @ chebyshev(t, n)
+        coefficients = np.moveaxis(np.tensordot(matrix, coefficients, axes=(1, k)), 0, k)
     return replace(box, lower=low, upper=high, coefficients=_without_tail(coefficients, box.value_error / 100))
 
 

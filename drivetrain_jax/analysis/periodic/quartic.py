@@ -236,15 +236,15 @@ def spectral_radius(c: Coefficients, split: tuple[_Factor, _Factor] | None = Non
 def nothing_crosses(c: Coefficients, log_d: Array) -> Array:
     """Whether no polynomial within the errors has a root on the unit circle: as many lie inside for all of them.
 
-    None of p(1), p(-1) and g = 1 + d - b + a^2/4 - w^2/4, w = (a + a d - 2 c)/(1 - d), may vanish, (a, b, c) = (e1, e2, e3):
-    for p = (sigma^2 - P sigma + 1)(sigma^2 - Q sigma + d) is the same as g = 0, and w = P - Q.
+    None of p(1), p(-1) and g = 1 + d - e2 + e1^2/4 - w^2/4, w = (e1 + e1 d - 2 e3)/(1 - d), may vanish:
+    p = (sigma^2 - P sigma + 1)(sigma^2 - Q sigma + d) is the same as g = 0, and w = P - Q.
     """
-    a, b, g, d = c.e1, c.e2, c.e3, jnp.exp(log_d)
-    da, db, dg, dd = c.errors
+    e1, e2, e3, d = c.e1, c.e2, c.e3, jnp.exp(log_d)
+    d1, d2, d3, dd = c.errors
     missing = -jnp.expm1(log_d)
-    w, dw = (a + a * d - 2 * g) / missing, ((1 + d) * da + 2 * dg) / missing
-    rounding = 8 * EPS * (1 + jnp.abs(a) + jnp.abs(b) + jnp.abs(g) + d + a**2 + w**2)
-    even, odd = 1 + b + d, a + g
-    real = (jnp.abs(even - odd) > da + db + dg + dd + rounding) & (jnp.abs(even + odd) > da + db + dg + dd + rounding)
-    error = db + dd + (jnp.abs(a) + da / 2) * da / 2 + (jnp.abs(w) + dw / 2) * dw / 2 + rounding
-    return real & (jnp.abs(1 + d - b + a**2 / 4 - w**2 / 4) > error) & (missing > 0)
+    w, dw = (e1 + e1 * d - 2 * e3) / missing, ((1 + d) * d1 + 2 * d3) / missing
+    rounding = 8 * EPS * (1 + jnp.abs(e1) + jnp.abs(e2) + jnp.abs(e3) + d + e1**2 + w**2)
+    even, odd, every = 1 + e2 + d, e1 + e3, d1 + d2 + d3 + dd + rounding
+    real = (jnp.abs(even - odd) > every) & (jnp.abs(even + odd) > every)
+    error = d2 + dd + (jnp.abs(e1) + d1 / 2) * d1 / 2 + (jnp.abs(w) + dw / 2) * dw / 2 + rounding
+    return real & (jnp.abs(1 + d - e2 + e1**2 / 4 - w**2 / 4) > error) & (missing > 0)

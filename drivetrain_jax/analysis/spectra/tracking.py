@@ -79,7 +79,7 @@ def _carry(overlap: Array, shapes: Array, equal: Array, chosen: Array) -> Array:
     """The shapes of the branches at this point: each continued within the space of its mode, as far as it is in
     there."""
     inside = jnp.sum(chosen[:, :, None] * equal[None], axis=1) * overlap
-    size = jnp.sum(inside**2, axis=0 + 1)
+    size = jnp.sum(inside**2, axis=1)
     keep = size > _CARRIED
     continued = inside / jnp.sqrt(jnp.where(keep, size, 1.0))[:, None]
     weights = jnp.where(keep[:, None], continued, chosen)
