@@ -93,7 +93,7 @@ class StabilityAtlas:
 
     def _empty(self, shape: tuple[int, ...], outputs: Sequence[str]) -> dict[str, np.ndarray]:
         variables = {v.name: v for v in VARIABLES}
-        own = {name: (self._form.size,) * len(variables[name].dims) for name in outputs}
+        own = {name: (self._multipliers,) * len(variables[name].dims) for name in outputs}
         found = {name: np.empty((*shape, *own[name]), variables[name].dtype) for name in outputs}
         return found | {OUTCOME.name: np.empty(shape, np.int8)}
 
@@ -136,6 +136,11 @@ class StabilityAtlas:
         self._fill(in_order, rising, rows)
         for name, values in in_order.items():
             found[name][np.ix_(*orders)] = values
+
+    @property
+    def _multipliers(self) -> int:
+        # Panels tell in no time.
+        return round(self.atlas.panels[0].coefficients.shape[-1] ** 0.5) if self.atlas.panels else self._form.size
 
     @cached_property
     def _expansion(self) -> Expansion:
