@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
+from scipy.fft import dctn
 
 from drivetrain_jax.atlas.panels import chebyshev
 
@@ -39,13 +40,14 @@ def tensor_nodes(degrees: Sequence[int]) -> np.ndarray:
 
 def coefficients(values: np.ndarray, degrees: Sequence[int]) -> np.ndarray:
     """Coefficients ``(n_1, ..., n_d, m)`` from the values at ``tensor_nodes(degrees)``, ``(prod(degrees), m)``."""
-    tensor = values.reshape(*degrees, -1)
-    for axis, n in enumerate(degrees):
-        # Degrees are small: a product takes less time than a fast transform, not to speak of its import.
-        moved = np.moveaxis(tensor, axis, 0)
-        found = _product(analysis_matrix(n), np.ascontiguousarray(moved).reshape(n, -1))
-        tensor = np.moveaxis(found.reshape(moved.shape), 0, axis)
-    return np.ascontiguousarray(tensor)
+    axes = tuple(range(len(degrees)))
+    # Products of matrices take less time, but their larger roundings keep tails from falling: five times the solves at 1e-11.
+    tensor = dctn(values.reshape(*degrees, -1), axes=axes) / np.prod(degrees)
+    for axis in axes:
+        first = [slice(None)] * tensor.ndim
+        first[axis] = slice(0, 1)
+        tensor[tuple(first)] /= 2
+    return tensor
 
 
 def evaluate(tensor: np.ndarray, x: np.ndarray) -> np.ndarray:
