@@ -41,7 +41,7 @@ def tensor_nodes(degrees: Sequence[int]) -> np.ndarray:
 def coefficients(values: np.ndarray, degrees: Sequence[int]) -> np.ndarray:
     """Coefficients ``(n_1, ..., n_d, m)`` from the values at ``tensor_nodes(degrees)``, ``(prod(degrees), m)``."""
     axes = tuple(range(len(degrees)))
-    # Products of matrices take less time, but their larger roundings keep tails from falling: five times the solves at 1e-11.
+    # Products of matrices take less time, but their roundings keep tails from falling: up to five times the solves at 1e-11.
     tensor = dctn(values.reshape(*degrees, -1), axes=axes) / np.prod(degrees)
     for axis in axes:
         first = [slice(None)] * tensor.ndim
