@@ -27,7 +27,7 @@ _HEIGHT, _PORTRAIT = 2.45, 3.1
 # Of the line with the parameters, marks of formulas counted.
 _LETTERS = 110
 # Attractors of a basin map: lightness differs as well as hue. Amplitudes closer than this, relatively, are one.
-_BASINS = ("#33517c", "#f2b632", "#9cc3e0", "#c8553d", "#6a994e", "#d9c5e0", "#2d0a2b", "#8d99ae")
+BASINS = ("#33517c", "#f2b632", "#9cc3e0", "#c8553d", "#6a994e", "#d9c5e0", "#2d0a2b", "#8d99ae")
 _SAME = 1e-5
 
 
@@ -137,7 +137,7 @@ def _basins(dataset: xr.Dataset) -> Figure:
     codes, names = _attractors(dataset)
     panels = Panels(height=4.2, margins=Margins(right=2.3))
     axes = panels.axes[0][0]
-    colours = ListedColormap([*_BASINS[: len(names)], STATE_COLOURS[cells.FAILED]])
+    colours = ListedColormap([*BASINS[: len(names)], STATE_COLOURS[cells.FAILED]])
     cells.draw_cells(axes, codes, "u0", "v0", cmap=colours, vmin=-0.5, vmax=len(names) + 0.5)
     share = [float((codes == k).mean()) for k in range(len(names) + 1)]
     handles = [
@@ -160,7 +160,7 @@ def _attractors(dataset: xr.Dataset) -> tuple[xr.DataArray, list[str]]:
     keys = [(int(m), round(float(x))) for m, x in zip(multiple[known], level[known], strict=True)]
     merged = _merge(keys)
     kinds, counts = np.unique(merged, return_counts=True)
-    kinds = kinds[np.argsort(-counts)][: len(_BASINS)]
+    kinds = kinds[np.argsort(-counts)][: len(BASINS)]
     codes = np.full(known.shape, len(kinds))
     flat = np.full(len(merged), len(kinds))
     names = []

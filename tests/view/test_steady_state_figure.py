@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.view import plot
+from drivetrain_jax.view import basins, plot
 
 FIXED = json.dumps({"b": {"value": 0.17, "units": "m", "long_name": "half the backlash"}})
 ROLES = json.dumps({"speed": "omega"})
@@ -39,6 +39,15 @@ def test_a_map_shows_regimes_and_the_threshold():
     assert {"no separation", "double-sided", "non-periodic", "failed (1)", "no separation ends"} <= set(shown)
     (line,) = [line for line in figure.axes[0].lines if line.get_label() == "no separation ends"]
     np.testing.assert_allclose(line.get_ydata(), [0.15, 0.25])
+
+
+def test_an_attractor_keeps_its_colour_where_a_larger_one_ends():
+    """Results are in order of size: the smaller one is the second, then the first; chaos has no size."""
+    nan = np.nan
+    size = np.array([[0.5, 0.3, nan], [0.55, 0.29, nan], [0.28, nan, nan], [nan, 0.27, nan]])
+    share = np.array([[0.6, 0.4, nan], [0.5, 0.5, nan], [0.9, 0.1, nan], [0.2, 0.8, nan]])
+    branch = basins._followed(size, np.isfinite(share))
+    assert branch.tolist() == [[0, 1, -1], [0, 1, -1], [1, 2, -1], [2, 1, -1]]
 
 
 def test_basins_show_the_share_of_every_attractor():
