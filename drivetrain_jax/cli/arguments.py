@@ -22,8 +22,12 @@ class _Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **options)
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As usual; an unknown option is answered by the command that it was given to."""
+        """As usual, but that values may stand behind options; an unknown one is answered by the command it was given to."""
         options, unknown = self.parse_known_args(args, namespace)
+        if "given" in options:
+            values = [word for word in unknown if "=" in word and not word.startswith("-")]
+            options.given = [*options.given, *values]
+            unknown = [word for word in unknown if word not in values]
         if unknown:
             first = next((word for word in unknown if word.startswith("-")), unknown[0])
             known = re.findall(r"--[a-z]+", options.parser.format_help()) if first.startswith("-") else ()

@@ -302,6 +302,14 @@ def test_failing_chunk_is_incomplete_and_resumable(cli):
     assert os.path.isdir("r.nc.parts") and not os.path.exists("r.nc")
 
 
+def test_values_may_stand_behind_options(cli):
+    before, between = (
+        cli("point", "toy", "toy", *words) for words in (("a=.5", "b=1", "--json"), ("a=.5", "--json", "b=1"))
+    )
+    assert between == before and before[0] == 0
+    assert cli("point", "toy", "toy", "--json", "a=.5", "b=1", "c")[0] == 2
+
+
 def test_point(cli):
     code, out, _ = cli("point", "toy", "toy", "a=.5", "b=1", "outputs=value,sign", "rtol=1e-9")
     assert code == 0 and "value   = 324.5 m" in out and "sign    = small (0)" in out
