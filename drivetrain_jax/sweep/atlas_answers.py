@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -181,7 +181,7 @@ class _Asked:
                 raise InputError(f"{name} = {as_given(values[name])}: is what is asked for; allowed is to leave it out")
         for name in atlas.parameters:
             if name not in free:
-                _check_range(atlas, name, own.get(name), name in ranges)
+                _check_range(_Words.of(atlas, shaft, name), atlas.ranges[name], own.get(name), name in ranges)
         return cls(atlas, own, shaft)
 
     def numbers(self) -> dict[str, float]:
@@ -231,20 +231,42 @@ def _check_same(name: str, value: Any, fixed: float) -> None:
         )
 
 
-def _check_range(atlas: StoredAtlas, name: str, value: Any, wanted: bool) -> None:
-    low, high = atlas.ranges[name]
-    allowed = f"allowed is {f'{name}=LOW:HIGH within ' if wanted else ''}{atlas.allowed(name)}"
+@dataclass(frozen=True)
+class _Words:
+    """How messages name a parameter of the atlas, its range and its values: in the units that were given."""
+
+    name: str
+    allowed: str
+    convert: Callable[[float], float] = lambda value: value
+
+    @classmethod
+    def of(cls, atlas: StoredAtlas, shaft: Any, name: str) -> _Words:
+        physical = [shaft.quantity(name, end) for end in atlas.ranges[name]] if shaft else [None, None]
+        if physical[0] is None or physical[0][0] not in shaft.operation:
+            return cls(name, atlas.allowed(name))
+        (label, low, units), (_, high, _) = physical
+        allowed = f"{low:.10g} <= {label} <= {high:.10g}, in {units}"
+        return cls(label, allowed, lambda value: shaft.quantity(name, value)[1])
+
+    def given(self, value: Any) -> str:
+        """A value or a range as it was given."""
+        ends = value if isinstance(value, tuple) else (value,)
+        shown = tuple(self.convert(end) if isinstance(end, float) else end for end in ends)
+        return as_given(shown if isinstance(value, tuple) else shown[0])
+
+
+def _check_range(words: _Words, ends: Range, value: Any, wanted: bool) -> None:
+    allowed = f"allowed is {f'{words.name}=LOW:HIGH within ' if wanted else ''}{words.allowed}"
     if value is None:
-        raise InputError(f"{name}: missing; {allowed}")
+        raise InputError(f"{words.name}: missing; {allowed}")
     if isinstance(value, tuple) != wanted:
         needed = "a range is needed" if wanted else "is a range"
-        raise InputError(f"{name} = {as_given(value)}: {needed}; {allowed}")
-    ends = value if wanted else (value,)
-    for end in ends:
-        if isinstance(end, bool) or not isinstance(end, (int, float)) or not low <= end <= high:
-            raise InputError(f"{name} = {as_given(end)}: {allowed}")
+        raise InputError(f"{words.name} = {words.given(value)}: {needed}; {allowed}")
+    for end in value if wanted else (value,):
+        if isinstance(end, bool) or not isinstance(end, (int, float)) or not ends[0] <= end <= ends[1]:
+            raise InputError(f"{words.name} = {words.given(end)}: {allowed}")
     if wanted and not value[0] < value[1]:
-        raise InputError(f"{name} = {as_given(value)}: allowed is a rising range")
+        raise InputError(f"{words.name} = {words.given(value)}: allowed is a rising range")
 
 
 def _answered(title: str, phrase: str, asked: _Asked, answer: design.Answer) -> Reply:

@@ -28,6 +28,9 @@ def describe(name: str) -> str:
     system = find_system(name)
     lines = [f"{system.name}: {system.title}", f"  {system.source}", "", "Parameters"]
     lines += _table([_parameter_row(p) for p in system.parameters])
+    if system.physical:
+        lines += ["", "Physical units, instead of these for query and design"]
+        lines += _table([(p.name, f"[{p.units}]", p.long_name, p.allowed) for p in system.physical.quantities])
     if system.presets:
         lines += ["", "Sets of values, to be copied into a scene"]
         lines += _table([(preset, _assignments(values)) for preset, values in system.presets.items()])

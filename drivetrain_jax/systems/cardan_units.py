@@ -42,6 +42,7 @@ class PhysicalShaft:
     c2: float
     # How the shaft is run, given beside what it is; and the names of all data.
     operation: ClassVar[tuple[str, ...]] = ("speed", "angle")
+    quantities: ClassVar[tuple[Parameter, ...]] = PHYSICAL
     names: ClassVar[tuple[str, ...]] = tuple(p.name for p in PHYSICAL)
 
     def __post_init__(self) -> None:

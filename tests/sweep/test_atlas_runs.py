@@ -306,6 +306,10 @@ def test_the_same_point_in_physical_units(atlas):
     plain = atlas_answers.query(atlas, {"beta": 0.31, "Omega": 1.2})
     assert reply.data["values"]["spectral_radius"] == pytest.approx(plain.data["values"]["spectral_radius"], abs=1e-12)
     assert "rpm" in str(reply) and "rpm" not in str(plain)
+    with pytest.raises(dt.InputError, match=r"^speed = 1000: allowed is [\d.]+ <= speed <= [\d.]+, in rpm$"):
+        atlas_answers.query(atlas, {**shaft, "speed": 1000.0, "angle": 10.0})
+    with pytest.raises(dt.InputError, match=r"^angle: missing; allowed is 0 <= angle <= 34\.37\d*, in deg$"):
+        atlas_answers.query(atlas, {**shaft, "speed": rpm})
     with pytest.raises(dt.InputError, match=r"^J2: missing; physical units need all of J1, J2, k1, k2, c1, c2$"):
         atlas_answers.query(atlas, {"J1": 1.0, "speed": 100.0})
     with pytest.raises(dt.InputError, match=r"^mu = 2: the atlas is made for mu = 1; allowed is that value$"):
