@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from drivetrain_jax._errors import InputError
@@ -19,6 +19,7 @@ from drivetrain_jax.atlas.criteria import has_boundaries
 from drivetrain_jax.atlas.sensitivity import Sensitivity, direct_sensitivity
 from drivetrain_jax.atlas.windows import Crossing
 from drivetrain_jax.sweep.atlas_file import StoredAtlas, as_given
+from drivetrain_jax.sweep.physical import nondimensional
 
 Range = tuple[float, float]
 # How closely a given parameter has to be what the atlas was made with.
@@ -163,7 +164,7 @@ class _Asked:
         cls, atlas: StoredAtlas, given: Mapping[str, Any], ranges: tuple[str, ...], free: tuple[str, ...] = ()
     ) -> _Asked:
         """``ranges`` names the parameters of which a range is wanted, ``free`` those that are the answer."""
-        shaft, values = _nondimensional(atlas, given)
+        shaft, values = nondimensional(atlas.scene.system, given)
         for name in (*ranges, *free):
             if name not in atlas.parameters:
                 raise InputError(
@@ -200,28 +201,6 @@ class _Asked:
         physical = self.shaft.quantity(name, value) if self.shaft else None
         aside = f" ({physical[0]} = {_number(physical[1])} {physical[2]})" if physical else ""
         return f"{name} = {_number(value)}{aside}"
-
-
-def _nondimensional(atlas: StoredAtlas, given: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
-    """The physical data among ``given``, if there are any, and all values as parameters of the system."""
-    physical = atlas.scene.system.physical
-    if physical is None or not any(name in physical.names for name in given):
-        return None, dict(given)
-    data = [f.name for f in fields(physical)]
-    missing = [name for name in data if name not in given]
-    if missing:
-        raise InputError(f"{missing[0]}: missing; physical units need all of {', '.join(data)}")
-    shaft = physical(**{name: float(given[name]) for name in data})
-    values = dict(shaft.parameters)
-    for name in given:
-        if name in physical.operation:
-            ends = given[name] if isinstance(given[name], tuple) else (given[name],)
-            converted = [shaft.parameter(name, end) for end in ends]
-            numbers = tuple(value for _, value in converted)
-            values[converted[0][0]] = numbers if isinstance(given[name], tuple) else numbers[0]
-        elif name not in data:
-            values[name] = given[name]
-    return shaft, values
 
 
 def _check_same(name: str, value: Any, fixed: float) -> None:

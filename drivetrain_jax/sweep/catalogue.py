@@ -29,7 +29,7 @@ def describe(name: str) -> str:
     lines = [f"{system.name}: {system.title}", f"  {system.source}", "", "Parameters"]
     lines += _table([_parameter_row(p) for p in system.parameters])
     if system.physical:
-        lines += ["", "Physical units, instead of these for query and design"]
+        lines += ["", "Physical units, instead of these for point, query and design"]
         lines += _table([(p.name, f"[{p.units}]", p.long_name, p.allowed) for p in system.physical.quantities])
     if system.presets:
         lines += ["", "Sets of values, to be copied into a scene"]

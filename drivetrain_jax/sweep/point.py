@@ -16,7 +16,8 @@ from drivetrain_jax._wording import nearest, written
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request
 from drivetrain_jax.sweep.assemble import Table
 from drivetrain_jax.sweep.engine import Engine
-from drivetrain_jax.sweep.scene import load_scene, system_and_analysis
+from drivetrain_jax.sweep.physical import nondimensional
+from drivetrain_jax.sweep.scene import find_system, load_scene, system_and_analysis
 
 
 @dataclass(frozen=True)
@@ -119,11 +120,12 @@ def _text(variable: Variable, value: Any) -> str:
 def point(system: str, analysis: str, *, outputs: Sequence[str] | None = None, **given: Any) -> PointResult:
     """Compute one point.
 
-    ``given`` holds parameters of the system and options of the analysis (``method``, ``rtol``, ...) by name;
+    ``given`` holds parameters of the system (or its data in physical units, as `drivetrain list SYSTEM` names them) and
+    options of the analysis (``method``, ``rtol``, ...) by name;
     ``outputs`` the results wanted, by default those of the analysis.
     Raises :class:`InputError` with one line naming the field, what was given and what is allowed.
     """
-    tree = _tree(system, analysis, given)
+    tree = _tree(system, analysis, nondimensional(find_system(system), given)[1])
     if outputs is not None:
         tree["outputs"] = [outputs] if isinstance(outputs, str) else list(outputs)
     try:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.sweep import kernel
+from drivetrain_jax.systems.cardan_units import PhysicalShaft
 
 
 def test_results_by_attribute_and_name():
@@ -40,6 +42,21 @@ def test_readable():
         "  sign    = large (1)",
         "  outcome = success",
     ]
+
+
+def test_physical_units():
+    data = {"J1": 2.0, "J2": 200.0, "k1": 1000.0, "k2": 1500.0, "c1": 0.1, "c2": 0.05}
+    found = dt.point("cardan", "floquet", **data, speed=300.0, angle=18.0)
+    shaft = PhysicalShaft(**data)
+    exact = dt.point("cardan", "floquet", **shaft.at(300.0, 18.0))
+    assert found.parameters == exact.parameters and found.spectral_radius == exact.spectral_radius
+    for given, message in (
+        ({"J1": 2.0, "speed": 300.0}, "J2: missing; physical units need all of J1, J2, k1, k2, c1, c2"),
+        ({**data, "speed": "fast", "angle": 1.0}, "speed = 'fast': allowed is a number, 0 < speed < inf"),
+        ({**data, "angle": 90.0, "speed": 1.0}, "angle = 90.0: allowed is -90 < angle < 90, in deg"),
+    ):
+        with pytest.raises(dt.InputError, match=f"^{re.escape(message)}$"):
+            dt.point("cardan", "floquet", **given)
 
 
 def test_one_output_may_be_a_word():
