@@ -91,7 +91,8 @@ def methods() -> list:
             variants = (
                 [given, given | {"solver": "Kvaerno5"}] if analysis == "floquet" and "solver" in used else [given]
             )
-            for options in variants if method != "auto" else []:
+            lacking = {"auto", *get_analysis(analysis).lacks(get_system(system))}
+            for options in variants if method not in lacking else []:
                 label = f"{system} {analysis} {method} {options.get('solver', '')}".strip()
                 found.append(pytest.param(scene | {"options": options | {"method": method}}, id=label))
     return found

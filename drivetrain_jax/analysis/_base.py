@@ -79,6 +79,7 @@ class Analysis:
     ``dimensions(system, request, fixed)`` describes the dimensions of the results besides those of the sweep; ``fixed``
     holds the parameters that do not vary (a list is whole also if one entry varies). It raises
     :class:`~drivetrain_jax._errors.InputError` where a request and these parameters do not fit together.
+    ``lacks(system)`` maps the results and methods that cannot be had of a system to what messages say of them.
     ``path_axis(request)`` names the axis that is consumed whole, if there is one. A ``continuous`` analysis takes ranges
     for axes and gives a function of the parameters instead of values on a grid.
     """
@@ -91,6 +92,7 @@ class Analysis:
     options: tuple[Parameter, ...]
     solvers: Callable[[System, Request], tuple[Solver, ...]]
     dimensions: Callable[[System, Request, Mapping[str, Any]], tuple[Dimension, ...]] = lambda *_: ()
+    lacks: Callable[[System], Mapping[str, str]] = lambda _: {}
     path_axis: Callable[[Request], str | None] = lambda _: None
     continuous: bool = False
 

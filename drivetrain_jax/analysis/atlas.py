@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from drivetrain_jax.analysis._base import Request, Solver
 from drivetrain_jax.analysis.periodic import floquet_propagator
-from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES
+from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES, lacks
 from drivetrain_jax.systems import System
 
 
@@ -25,5 +25,6 @@ ANALYSIS = replace(
     variables=VARIABLES,
     default_outputs=("spectral_radius", "spectral_radius_error", "verdict"),
     solvers=_solvers,
+    lacks=lacks,
     continuous=True,
 )

@@ -16,13 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.periodic.direct import compare
 from drivetrain_jax.analysis.periodic.direct_solvers import direct_solvers
 from drivetrain_jax.analysis.periodic.floquet_effort import explicit_effort
-from drivetrain_jax.analysis.periodic.floquet_results import NEED_ERROR, VARIABLES, results
+from drivetrain_jax.analysis.periodic.floquet_results import NEED_ERROR, VARIABLES, lacks, results
 from drivetrain_jax.analysis.periodic.monodromy import SOLVERS, state_transition
 from drivetrain_jax.analysis.periodic.propagator import Propagator
 from drivetrain_jax.systems import System
@@ -84,13 +83,8 @@ def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     return (_diffrax_solvers if request.method == "diffrax" else _direct_solvers)(system, request)
 
 
-def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
-    if "floquet_exponent" in request.outputs and system.time_units != "s":
-        raise InputError(
-            f"outputs: 'floquet_exponent' is a rate in 1/s and the time of {system.name} has no unit; "
-            "allowed is floquet_multiplier"
-        )
-    return (Dimension("multiplier", "Floquet multipliers by falling modulus", ()),)
+def _lacks(system: System) -> dict[str, str]:
+    return lacks(system) | ({} if "atlas" in system.models else {"atlas": f"{system.name} has no model for it"})
 
 
 ANALYSIS = Analysis(
@@ -105,5 +99,6 @@ ANALYSIS = Analysis(
         Parameter("solver", "1", "diffrax solver", default="Dopri8", choices=SOLVERS),
     ),
     solvers=_solvers,
-    dimensions=_dimensions,
+    dimensions=lambda *_: (Dimension("multiplier", "Floquet multipliers by falling modulus", ()),),
+    lacks=_lacks,
 )

@@ -38,9 +38,7 @@ _BLOCKS = (64, 512, 4096)
 def has_boundaries(atlas: Atlas, system: System) -> bool:
     """Whether the system has four states and a reversor that exchanges two halves of them."""
     corner = {**atlas.fixed, **dict(zip(atlas.parameters, atlas.lower, strict=True))}
-    reversor = system.models["floquet"].build(corner).reduced.reversor
-    swap = np.kron([[0.0, 1.0], [1.0, 0.0]], np.eye(_STATES // 2))
-    return reversor is not None and np.array_equal(reversor, swap)
+    return system.models["floquet"].build(corner).reduced.exchanges_halves
 
 
 @dataclass(frozen=True)

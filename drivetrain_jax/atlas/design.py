@@ -73,8 +73,7 @@ class Answer:
 class Window:
     """A stable range of a parameter; ``safe`` is what the margin leaves of it.
 
-    Where its ``interval`` has no crossing at an end, the atlas ends there or what follows is undecided. ``largest`` is the
-    largest spectral radius within ``safe`` (sampled) and ``where`` its place.
+    ``largest`` is the largest spectral radius within ``safe`` (sampled) and ``where`` its place.
     """
 
     interval: Interval
@@ -86,9 +85,9 @@ class Window:
 
 @dataclass(frozen=True)
 class Windows:
-    """The ``safe`` windows, and the ``undecided`` ranges, which are in none of them."""
+    """All ``windows``, and the ``undecided`` ranges, which are in none of them."""
 
-    safe: tuple[Window, ...]
+    windows: tuple[Window, ...]
     undecided: tuple[Range, ...]
 
 

@@ -31,7 +31,7 @@ def solve_rtol(tolerance: float) -> float:
 
 def floquet_domain(system: System, ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, float]) -> Domain:
     """The box ``ranges`` (name to lower and upper value) of ``system`` with the coordinates that the system declares."""
-    smooth = system.models["floquet"].smooth or Smoothness({})
+    smooth = system.models["atlas"].smooth or Smoothness({})
     names = tuple(ranges)
     return Domain(
         names,

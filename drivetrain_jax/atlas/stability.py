@@ -35,7 +35,6 @@ DEFAULT_OUTPUTS = ("spectral_radius", "spectral_radius_error", "verdict")
 _FAST = frozenset(DEFAULT_OUTPUTS)
 # A kernel that is asked for while another thread has it compiled would be compiled twice.
 _JUDGING = Lock()
-_SWAP = np.kron(np.array([[0.0, 1.0], [1.0, 0.0]]), np.eye(2))
 
 
 @dataclass(frozen=True)
@@ -159,9 +158,7 @@ class StabilityAtlas:
 
     @cached_property
     def _closed_form(self) -> bool:
-        form = self._form
-        known = form.reversor is not None and form.log_determinant is not None
-        return known and np.array_equal(form.reversor, _SWAP)
+        return self._form.exchanges_halves and self._form.log_determinant is not None
 
     def _fill(self, found: dict[str, np.ndarray], axes: list[np.ndarray], rows: int | None) -> None:
         """Fill ``found`` tile by tile, then judge again the cells for which the closed form is not good enough."""

@@ -35,13 +35,19 @@ class Crossing:
 
 @dataclass(frozen=True)
 class Interval:
-    """An interval of a parameter; ``lower_end`` and ``upper_end`` are None where it ends with the atlas."""
+    """An interval of a parameter; ``lower_end`` and ``upper_end`` are None where the atlas ends, or what follows is
+    undecided."""
 
     lower: float
     upper: float
     stable: bool
     lower_end: Crossing | None
     upper_end: Crossing | None
+
+    @property
+    def ends(self) -> tuple[tuple[float, Crossing | None], tuple[float, Crossing | None]]:
+        """Both ends, each with its crossing."""
+        return (self.lower, self.lower_end), (self.upper, self.upper_end)
 
 
 @dataclass(frozen=True)

@@ -109,15 +109,10 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
         atlas.stability.atlas, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.radius
     )
     lines = [f"safe speeds, {asked.heading()}, margin {margin:g}"]
-    for w in found.safe:
+    for w in found.windows:
         ends = " to ".join(
-            f"{asked.named(speed, value)}{_beyond(atlas, speed, end, crossing)}"
-            for value, end, crossing in zip(
-                w.safe,
-                (w.interval.lower, w.interval.upper),
-                (w.interval.lower_end, w.interval.upper_end),
-                strict=True,
-            )
+            asked.named(speed, value) + _beyond(atlas, speed, *end)
+            for value, end in zip(w.safe, w.interval.ends, strict=True)
         )
         lines.append(f"  {ends}; largest spectral radius {w.largest:.10g} at {speed} = {_number(w.where)}")
         lines.append(f"    {_checked(w.check)}")
@@ -126,11 +121,12 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
         "parameters": {**atlas.fixed, **asked.values},
         "margin": margin,
         "windows": [
-            {"safe": list(w.safe), "largest": w.largest, "where": w.where, "check": _check(w.check)} for w in found.safe
+            {"safe": list(w.safe), "largest": w.largest, "where": w.where, "check": _check(w.check)}
+            for w in found.windows
         ],
         "undecided": [list(r) for r in found.undecided],
     }
-    lines += [] if found.safe else ["  none within the atlas"]
+    lines += [] if found.windows else ["  none within the atlas"]
     lines += [f"  undecided from {_number(a)} to {_number(b)}" for a, b in found.undecided]
     return Reply("\n".join(lines), data)
 

@@ -36,24 +36,19 @@ def atlas_ranges(scene: Scene) -> dict[str, tuple[float, float]]:
 def uses_atlas(scene: Scene) -> bool:
     """Whether the points of ``scene`` are evaluated from an atlas: on request, or if ``auto`` finds it worthwhile.
 
-    Raises :class:`InputError` for a scene that asks for one and varies too many parameters, or whose system has none.
+    Raises :class:`InputError` for a scene that asks for one and varies too many parameters.
     """
     if scene.analysis.name != "floquet" or scene.request.method not in ("auto", "atlas"):
         return False
-    count, system = len(atlas_ranges(scene)), scene.system
-    if ANALYSIS.name not in system.models:
-        if scene.request.method == "auto":
-            return False
-        raise InputError(
-            f"options.method = 'atlas': {system.name} has no model for it; allowed is auto, direct, diffrax"
-        )
+    count = len(atlas_ranges(scene))
     if scene.request.method == "atlas":
         if count > MAX_RANGES:
             raise InputError(f"options.method = 'atlas': the scene varies {count} parameters; allowed are {MAX_RANGES}")
         return count > 0
-    model = system.models[scene.analysis.name]
+    model = scene.system.models.get(ANALYSIS.name)
     return (
-        model.smooth is not None
+        model is not None
+        and model.smooth is not None
         and 0 < count <= MAX_RANGES
         and Grid.of(scene).size >= _WORTHWHILE
         and scene.request.options["rtol"] >= _FINEST

@@ -41,14 +41,16 @@ def describe(name: str) -> str:
 
 def _analysis_lines(name: str, system: System) -> list[str]:
     analysis = get_analysis(name)
+    lacking = analysis.lacks(system)
     lines = [f"Analysis {name}: {analysis.title}"]
-    given = [v for v in analysis.variables if v.units != "1/s" or system.time_units == "s"]
-    lines += _table([_variable_row(v, v.name in analysis.default_outputs) for v in given])
+    lines += _table(
+        [_variable_row(v, v.name in analysis.default_outputs) for v in analysis.variables if v.name not in lacking]
+    )
     lines += [
         "  (* computed unless outputs says otherwise)",
         "  Methods and the options they use, the first by default",
     ]
-    methods = [(m, ", ".join(used)) for m, used in analysis.methods.items() if m != "atlas" or "atlas" in system.models]
+    methods = [(method, ", ".join(used)) for method, used in analysis.methods.items() if method not in lacking]
     lines += ["  " + line for line in _table(methods)]
     return [*lines, "  Options", *("  " + line for line in _table([_parameter_row(o) for o in analysis.options]))]
 

@@ -70,6 +70,7 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
     table = _convert(tree, _SceneTable, "")
     system, analysis = system_and_analysis(table.system, table.analysis)
     request = _request(table, analysis)
+    _check_offered(analysis, system, request)
     axes, zipped = _axes(table, system, analysis)
     fixed = _fixed(table, system, analysis, axes)
     path_axis = _path_axis(analysis, request, axes, zipped, fixed)
@@ -157,6 +158,18 @@ def _request(table: _SceneTable, analysis: Analysis) -> Request:
             raise InputError(f"options.{key} = {shown(value)}: not used by method {method}{guess}; {allowed}")
     options = {o.name: _option(o, given) for o in analysis.options if o.name in used}
     return Request(tuple(outputs), method, options)
+
+
+def _check_offered(analysis: Analysis, system: System, request: Request) -> None:
+    """Whether the method and the results can be had of this system."""
+    lacking = analysis.lacks(system)
+    for field, name, offered in (
+        ("options.method", request.method, analysis.methods),
+        *(("outputs", name, (v.name for v in analysis.variables)) for name in request.outputs),
+    ):
+        if name in lacking:
+            allowed = ", ".join(other for other in offered if other not in lacking)
+            raise InputError(f"{field} = {name!r}: {lacking[name]}; allowed is {allowed}")
 
 
 def _option(option: Parameter, given: Mapping[str, Any]) -> Value:

@@ -20,6 +20,8 @@ from drivetrain_jax._quantities import Parameter
 from drivetrain_jax.systems._smooth import Smoothness
 
 Values = Mapping[str, Any]
+# The reversor that exchanges the first two of four states with the others.
+SWAP = np.kron(np.array([[0.0, 1.0], [1.0, 0.0]]), np.eye(2))
 Rows = tuple[tuple[Any, ...], ...]
 
 
@@ -44,6 +46,11 @@ class LinearPeriodic:
     def size(self) -> int:
         """Number of states."""
         return len(self.rows(*self.basis(0.0)))
+
+    @property
+    def exchanges_halves(self) -> bool:
+        """Whether there are four states, of which the reversor exchanges the first two with the others."""
+        return self.reversor is not None and np.array_equal(self.reversor, SWAP)
 
     def matrix(self, t: Any) -> Array:
         """``A(t)``, shape ``(n, n, ...)``."""

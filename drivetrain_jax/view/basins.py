@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.layout import Margins, Panels
-from drivetrain_jax.view.steady_state import BASINS as COLOURS
-from drivetrain_jax.view.style import STYLE, axis_label, variable_label
+from drivetrain_jax.view.style import ATTRACTOR_COLOURS, STYLE, axis_label, variable_label
 
 _NEEDED = ("attractor_u_max", "basin_fraction")
 # Change of size from one value of the axis to the next, over the size, within which an attractor is the same.
@@ -64,7 +63,12 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
     for number in range(branch.max(initial=-1) + 1):
         i, k = np.nonzero(branch == number)
         x = dataset[name].values[i]
-        style = {"color": COLOURS[number % len(COLOURS)], "linestyle": "", "marker": "o", "markersize": 2.5}
+        style = {
+            "color": ATTRACTOR_COLOURS[number % len(ATTRACTOR_COLOURS)],
+            "linestyle": "",
+            "marker": "o",
+            "markersize": 2.5,
+        }
         handles += upper.plot(x, size[i, k], **style, label=f"attractor {number + 1}")
         lower.errorbar(x, share[i, k], error[i, k], **style, elinewidth=0.8)
     cells.fit_axis(upper, "x", dataset[name].values)

@@ -21,13 +21,20 @@ from matplotlib.ticker import MaxNLocator
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells, regimes
 from drivetrain_jax.view.layout import WIDTH, Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STATE_COLOURS, STYLE, axis_label, variable_label
+from drivetrain_jax.view.style import (
+    ATTRACTOR_COLOURS,
+    FRAME_GREY,
+    LINE_COLOURS,
+    STATE_COLOURS,
+    STYLE,
+    axis_label,
+    variable_label,
+)
 
 _HEIGHT, _PORTRAIT = 2.45, 3.1
 # Of the line with the parameters, marks of formulas counted.
 _LETTERS = 110
-# Attractors of a basin map: lightness differs as well as hue. Amplitudes closer than this, relatively, are one.
-BASINS = ("#33517c", "#f2b632", "#9cc3e0", "#c8553d", "#6a994e", "#d9c5e0", "#2d0a2b", "#8d99ae")
+# Amplitudes of attractors closer than this, relatively, are one.
 _SAME = 1e-5
 
 
@@ -137,7 +144,7 @@ def _basins(dataset: xr.Dataset) -> Figure:
     codes, names = _attractors(dataset)
     panels = Panels(height=4.2, margins=Margins(right=2.3))
     axes = panels.axes[0][0]
-    colours = ListedColormap([*BASINS[: len(names)], STATE_COLOURS[cells.FAILED]])
+    colours = ListedColormap([*ATTRACTOR_COLOURS[: len(names)], STATE_COLOURS[cells.FAILED]])
     cells.draw_cells(axes, codes, "u0", "v0", cmap=colours, vmin=-0.5, vmax=len(names) + 0.5)
     share = [float((codes == k).mean()) for k in range(len(names) + 1)]
     handles = [
@@ -160,7 +167,7 @@ def _attractors(dataset: xr.Dataset) -> tuple[xr.DataArray, list[str]]:
     keys = [(int(m), round(float(x))) for m, x in zip(multiple[known], level[known], strict=True)]
     merged = _merge(keys)
     kinds, counts = np.unique(merged, return_counts=True)
-    kinds = kinds[np.argsort(-counts)][: len(BASINS)]
+    kinds = kinds[np.argsort(-counts)][: len(ATTRACTOR_COLOURS)]
     codes = np.full(known.shape, len(kinds))
     flat = np.full(len(merged), len(kinds))
     names = []

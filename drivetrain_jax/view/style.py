@@ -36,6 +36,8 @@ STATE_HATCHES = ("", "", "////", "xxxx")
 STATES = ListedColormap(STATE_COLOURS, name="states")
 
 LINE_COLOURS = ("#1f4e79", "#d1771e")
+# Attractors: lightness differs as well as hue.
+ATTRACTOR_COLOURS = ("#33517c", "#f2b632", "#9cc3e0", "#c8553d", "#6a994e", "#d9c5e0", "#2d0a2b", "#8d99ae")
 FRAME_GREY = "#555555"
 PREDICTION = "#0b84d8"
 

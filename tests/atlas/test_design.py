@@ -73,7 +73,7 @@ def test_no_damping_of_the_atlas_will_do(damped):
 
 
 def test_speed_windows_with_a_margin(atlas):
-    windows = speed_windows(atlas, CARDAN, {"beta": 1.0}, margin=0.01, direct=direct).safe
+    windows = speed_windows(atlas, CARDAN, {"beta": 1.0}, margin=0.01, direct=direct).windows
     assert all(w.check.agrees for w in windows)
     for window in windows:
         assert window.interval.lower <= window.safe[0] < window.safe[1] <= window.interval.upper
@@ -81,7 +81,7 @@ def test_speed_windows_with_a_margin(atlas):
             assert window.safe[0] == pytest.approx(1.01 * window.interval.lower, rel=1e-6)
         assert window.largest < 1
     # Narrow windows have no room for a wide margin.
-    assert len(speed_windows(atlas, CARDAN, {"beta": 1.0}, margin=0.1).safe) < len(windows)
+    assert len(speed_windows(atlas, CARDAN, {"beta": 1.0}, margin=0.1).windows) < len(windows)
 
 
 def test_what_is_undecided_is_no_safe_speed(atlas):
@@ -91,11 +91,11 @@ def test_what_is_undecided_is_no_safe_speed(atlas):
     cut = replace(atlas, panels=(*below.panels, *above.panels), gaps=(Gap(*corners, "cut out"),))
     found, whole = (speed_windows(a, CARDAN, {"beta": 1.0}, margin=0.01) for a in (cut, atlas))
     assert found.undecided == (pytest.approx((0.95, 1.1)),) and not whole.undecided
-    (around,) = (w.safe for w in whole.safe if w.safe[0] < 1.0 < w.safe[1])
-    left, right = (w for w in found.safe if around[0] < sum(w.safe) / 2 < around[1])
+    (around,) = (w.safe for w in whole.windows if w.safe[0] < 1.0 < w.safe[1])
+    left, right = (w for w in found.windows if around[0] < sum(w.safe) / 2 < around[1])
     assert left.safe == pytest.approx((around[0], 0.95 * 0.99)) and left.interval.upper_end is None
     assert right.safe == pytest.approx((1.1 * 1.01, around[1])) and right.interval.lower_end is None
-    assert len(found.safe) == len(whole.safe) + 1 and all(w.largest < 1 for w in found.safe)
+    assert len(found.windows) == len(whole.windows) + 1 and all(w.largest < 1 for w in found.windows)
 
 
 def test_windows_cover_what_is_stable(atlas):

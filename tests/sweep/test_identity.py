@@ -97,6 +97,16 @@ def test_what_a_system_of_another_package_imports_from_its_own_decides(tmp_path)
     assert "systems/_base.py" in found and not any("numpy" in name or "unrelated" in name for name in found)
 
 
+def test_the_choice_of_an_atlas_decides():
+    axes = {"beta": {"start": 0.0, "stop": 1.0, "num": 3}, "Omega": {"start": 1.0, "stop": 2.0, "num": 3}}
+    scene = {"system": "cardan", "analysis": "floquet", "axes": axes, "fixed": CARDAN}
+    found, direct = (
+        set(identity.numerics_of(load_scene(scene | {"options": {"method": method}}))["sources"])
+        for method in ("atlas", "direct")
+    )
+    assert found - direct >= {"sweep/atlas_choice.py", "sweep/rounds.py", "atlas/construction.py"}
+
+
 def test_chunk_size_decides(monkeypatch):
     from dataclasses import replace
 

@@ -59,6 +59,11 @@ def test_physical_units():
             dt.point("cardan", "floquet", **given)
 
 
+def test_angles_of_planets_in_degrees_are_refused():
+    with pytest.raises(dt.InputError, match=r"^planet_angle\[1\] = 120: allowed is .*, in rad$"):
+        dt.point("planetary", "modes", planet_angle=[0, 120, 240])
+
+
 def test_one_output_may_be_a_word():
     assert list(dt.point("toy", "toy", a=6.0, outputs="sign")) == ["sign"]
     with pytest.raises(dt.InputError, match="outputs: 'all' is not a result of toy"):

@@ -18,6 +18,7 @@ from drivetrain_jax.analysis.periodic.radius import (
     radius_by_eigenvalues,
     radius_in_closed_form,
 )
+from drivetrain_jax.systems import System
 
 VARIABLES = (
     Variable("floquet_multiplier", "1", "Floquet multiplier over one period", ("multiplier",), "complex128"),
@@ -31,6 +32,13 @@ VARIABLES = (
 )
 NEED_ERROR = {"spectral_radius_error", "verdict"}
 MULTIPLIERS = {"floquet_multiplier", "floquet_exponent"}
+
+
+def lacks(system: System) -> dict[str, str]:
+    """The result that systems whose time has no unit lack, see :class:`~drivetrain_jax.analysis.Analysis`."""
+    if system.time_units == "s":
+        return {}
+    return {"floquet_exponent": f"a rate in 1/s, and the time of {system.name} has no unit"}
 
 
 def results(
