@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -11,6 +9,7 @@ from interrupts import stop_after
 
 import drivetrain_jax as dt
 from drivetrain_jax import InputError
+from drivetrain_jax._threads import threads
 from drivetrain_jax.cli import main
 from drivetrain_jax.invariants.verify import verify
 from drivetrain_jax.store import shards
@@ -70,13 +69,11 @@ def test_export_is_bit_identical_to_the_file(grid_scene, tmp_path, which):
 
 
 def test_interrupted_damaged_and_resumed(grid_scene, tmp_path):
-    scene, path = large(grid_scene), tmp_path / "r.zarr"
+    scene, path, pool = large(grid_scene), tmp_path / "r.zarr", threads(1, "chunk")
     with pytest.raises(Interrupted) as stopped:
         to_store(scene, path, where=Where(threads=1), report=stop_after(3))
-    # In a process of its own the threads would be gone.
-    for thread in threading.enumerate():
-        if thread.name.startswith("chunk"):
-            thread.join()
+    # In a process of its own the thread would be gone.
+    pool.shutdown()
     done, found = stopped.value.progress.computed, status(scene, path)
     assert 0 < done <= found.done < 1640 and found.state == "partial" and not path.exists()
     with pytest.raises(InputError, match="unfinished work of --store zarr"):
