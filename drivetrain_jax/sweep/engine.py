@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Set
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from drivetrain_jax._threads import threads
 from drivetrain_jax.store.provenance import digest
 from drivetrain_jax.sweep import compile_cache
 from drivetrain_jax.sweep.grid import Grid
@@ -17,6 +18,9 @@ from drivetrain_jax.sweep.identity import numerics_of, scene_digest
 from drivetrain_jax.sweep.kernel import Kernel, for_device, is_small, kernel_of
 from drivetrain_jax.sweep.plan import Chunk, Plan, make_plan
 from drivetrain_jax.sweep.scene import Scene
+
+# Kernels that are compiled at a time.
+_SIDE_BY_SIDE = 8
 
 
 class ChunkError(RuntimeError):
@@ -86,12 +90,11 @@ class Engine:
             if not missing:
                 return
             compile_cache.enable()
-            pool = ThreadPoolExecutor(len(missing), thread_name_prefix="compile")
+            pool = threads(_SIDE_BY_SIDE, "compile")
             for index, size in missing:
                 solver = self.solvers[index]
                 few = self._small and not solver.lengthy
                 self._kernels[index, size] = pool.submit(kernel_of, self.scene, self.grid, solver, size, few)
-            pool.shutdown(wait=False)
 
     def compute_chunk(self, chunk: Chunk) -> Mapping[str, np.ndarray]:
         """Results of one chunk; may be called from several threads. Raises :class:`ChunkError`."""

@@ -13,7 +13,7 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax._wording import nearest, written
-from drivetrain_jax.analysis import OUTCOME, Outcome, Request
+from drivetrain_jax.analysis import OUTCOME, Outcome, Request, get_analysis
 from drivetrain_jax.sweep.assemble import Table
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.physical import nondimensional
@@ -139,6 +139,9 @@ def point(system: str, analysis: str, *, outputs: Sequence[str] | None = None, *
 def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """The scene of one point. Numbers vary, so that the next one needs no compilation; words and lists are fixed."""
     system, analysis = system_and_analysis(system_name, analysis_name)
+    if analysis.continuous:
+        others = ", ".join(name for name in system.models if not get_analysis(name).continuous)
+        raise InputError(f"analysis = {analysis_name!r}: is made over ranges; allowed at a point is one of {others}")
     parameters = {p.name: p for p in system.parameters}
     options = {o.name: given.get(o.name, o.default) for o in analysis.options}
     path = analysis.path_axis(Request((), given.get("method", next(iter(analysis.methods))), options))

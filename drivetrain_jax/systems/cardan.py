@@ -175,7 +175,9 @@ def explicit_steps(values: Values, rtol: float) -> np.ndarray:
     random points (benchmarks/work_precision.py); it decides the cost and never the accuracy, which is checked.
     """
     beta, zeta, alpha, mu = (np.asarray(values[name], float) for name in ("beta", "zeta", "alpha", "mu"))
-    c, soft = np.cos(beta), 1 / np.asarray(values["gamma"], float)
+    with np.errstate(over="ignore"):
+        soft = 1 / np.asarray(values["gamma"], float)
+    c = np.cos(beta)
     ends = 2 / (1 + c)
     rates = (
         ends * np.sqrt(1 + mu * (c * c + soft)),
