@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from drivetrain_jax.analysis.periodic.floquet_effort import PANEL_COST, explicit_effort, implicit_effort
+from drivetrain_jax.analysis.periodic.direct import stable_steps
+from drivetrain_jax.analysis.periodic.floquet_effort import explicit_effort
 from drivetrain_jax.atlas.construction import MAX_SOLVES, Domain, Rounds, construct, construct_from_parts
 from drivetrain_jax.atlas.floquet_quantity import floquet_quantity
 from drivetrain_jax.atlas.panels import Atlas, Panel
@@ -16,8 +17,9 @@ from drivetrain_jax.systems import LinearPeriodic, Smoothness, System
 
 # Steps of the explicit scheme to a part where they are most; with three parameters and more fewer nodes are worth more.
 _STEPS, _STEPS_OF_MANY, _MOST_PARTS = 18, 8, 32
-# How much cheaper the implicit scheme has to be.
-_STIFF = 4
+# Steps that decay takes for stability alone: with more of them a corner is stiff, and each counts as so many of those that
+# accuracy takes, since panels have to follow what decays, too.
+_STIFF, _FOLLOWED = 50, 30
 # Below this tolerance rounding of the parts shows in their product.
 _TOO_FINE = 5e-13
 # Direct solves are to be this much better than the atlas, as far as rounding allows.
@@ -65,7 +67,7 @@ def floquet_rounds(
 def span_parts(
     system: System, ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, float], tolerance: float
 ) -> int:
-    """Into how many parts the span is to be cut, by the steps that the slowest corner takes.
+    """Into how many parts the span is to be cut, by the steps that the slowest corner takes and by the largest decay.
 
     One where a corner is stiff: the product of parts is then small against them, and their rounding shows in it.
     """
@@ -75,10 +77,11 @@ def span_parts(
     corners = np.array(list(itertools.product(*zip(domain.lower, domain.upper, strict=True))))
     columns = {**domain.fixed, **dict(zip(domain.parameters, corners.T, strict=True))}
     rtol = solve_rtol(tolerance)
-    steps = explicit_effort(system, columns, rtol)
-    if np.any(_STIFF * PANEL_COST * implicit_effort(system, columns, rtol) < steps):
+    decay = float(stable_steps(system.models["floquet"].build(columns).reduced))
+    if decay > _STIFF:
         return 1
-    most = np.max(steps[np.isfinite(steps)], initial=1.0)
+    steps = explicit_effort(system, columns, rtol)
+    most = np.max(steps[np.isfinite(steps)], initial=1.0) + _FOLLOWED * decay
     each = _STEPS if len(ranges) < 3 else _STEPS_OF_MANY
     return int(np.clip(np.round(most / each), 1, _MOST_PARTS))
 

@@ -170,9 +170,12 @@ def log_determinant(values: Values) -> Array:
 def explicit_steps(values: Values, rtol: float) -> np.ndarray:
     """Predicted steps of the order-8 scheme for the reduced form, from NumPy parameters, as floats of the batch's shape.
 
-    log n is a fitted quadratic in the logarithms of x, the phase plus decay that accumulate over the half period (by
-    Simpson's rule), and of 1/cos(beta), the sharpness of the variation; beyond x = 13 n grows like x^1.1. Measured on
-    random points (benchmarks/work_precision.py); it decides the cost and never the accuracy, which is checked.
+    For what oscillates log n is a fitted quadratic in the logarithms of the phase over the half period (by Simpson's rule)
+    and of 1/cos(beta), the sharpness of the variation; beyond a phase of 13 n grows like its power 1.1. For what decays
+    log n is linear in the logarithm of the largest decay over the half period, with a slope that falls with rtol, as long
+    as the scheme is stable. The two add up like the sides of a right angle. Fitted to 6,000 random points with zeta from
+    1e-4 to 300 and rtol from 1e-5 to 1e-11: 1.6 times what is needed in the median, four times where both matter. It
+    decides the cost and never the accuracy, which is checked.
     """
     beta, zeta, alpha, mu = (np.asarray(values[name], float) for name in ("beta", "zeta", "alpha", "mu"))
     with np.errstate(over="ignore"):
@@ -184,16 +187,24 @@ def explicit_steps(values: Values, rtol: float) -> np.ndarray:
         np.sqrt(1 + mu * (1 + soft)),
         ends * np.sqrt(c * c + mu * (1 + c * c * soft)),
     )
-    decay = zeta * np.maximum(ends * (1 + alpha * (c * c + soft)), ends * (c + alpha * (1 / c + c * soft)))
-    phase = math.pi / 2 / np.asarray(values["Omega"], float) * ((rates[0] + 2 * rates[1] + rates[2]) / 4 + decay)
-    x, sharpness = np.log(phase), -np.log(c)
-    bend = 2.57
-    capped = np.minimum(x, bend)
-    log_steps = (
-        0.59 * capped + 0.1 * capped**2 + 1.1 * (x - capped) + (0.59 - 0.13 * capped - 0.034 * sharpness) * sharpness
-    )
+    time = math.pi / 2 / np.asarray(values["Omega"], float)
+    phase = time * (rates[0] + 2 * rates[1] + rates[2]) / 4
+    decay = time * zeta * np.maximum(ends * (1 + alpha * (c * c + soft)), ends * (c + alpha * (1 / c + c * soft)))
+    digits = -math.log10(rtol) - 9
     with np.errstate(over="ignore"):
-        return np.exp(log_steps + 1.7 + 0.26 * (-math.log10(rtol) - 9)) + 2
+        return np.hypot(_oscillation_steps(phase, -np.log(c), digits), _decay_steps(decay, digits)) + 2
+
+
+def _oscillation_steps(phase: np.ndarray, sharpness: np.ndarray, digits: float) -> np.ndarray:
+    x, bend = np.log(phase), 2.57
+    capped = np.minimum(x, bend)
+    log_steps = 0.59 * capped + 0.1 * capped**2 + 1.1 * (x - capped)
+    return np.exp(log_steps + (0.59 - 0.13 * capped - 0.034 * sharpness) * sharpness + 1.7 + 0.26 * digits)
+
+
+def _decay_steps(decay: np.ndarray, digits: float) -> np.ndarray:
+    accurate = np.exp(1.35 + 0.36 * digits) * decay ** (0.79 - 0.027 * digits)
+    return np.maximum(accurate, decay / 3.2)
 
 
 def floquet_model(values: Values) -> FloquetModel:

@@ -12,7 +12,7 @@ from scipy.integrate import DOP853
 from scipy.linalg import expm
 
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
-from drivetrain_jax.analysis.periodic.direct import assemble, direct_monodromy, stiffness_of
+from drivetrain_jax.analysis.periodic.direct import assemble, direct_monodromy, stable_steps, stiffness_of
 from drivetrain_jax.analysis.periodic.multipliers import spectral_radius_bound
 from drivetrain_jax.analysis.periodic.propagator import (
     EXPLICIT_ORDER,
@@ -211,3 +211,26 @@ def test_a_fourfold_coarser_solution_tells_the_same_error(steps, parts):
         error = np.linalg.norm(np.asarray(found.matrix) - exact)
         assert error <= float(found.error) * np.linalg.norm(exact)
         assert parts == 0 or error <= np.linalg.norm(np.asarray(found.change)) <= 20 * error
+
+
+def test_the_coarser_solution_of_a_damped_system_is_stable():
+    """Else it would tell nothing, and a third propagator would have to."""
+    system, counts = rotating((-300.0, 0.5)), []
+
+    def propagate(steps):
+        jax.debug.callback(lambda n: counts.append(int(n)), steps)
+        return explicit_propagator(system, steps, ())
+
+    def solve(least):
+        return direct_monodromy(system, propagate, jnp.int32(240), (), 0.0, 1e-5, EXPLICIT_ORDER, 4, 1, least)
+
+    least = stable_steps(system)
+    found = jax.jit(solve)(least)
+    jax.effects_barrier()
+    assert counts == [math.ceil(least), 240] and bool(found.met)
+    exact = rotating_exactly((-300.0, 0.5))
+    assert np.linalg.norm(np.asarray(found.matrix) - exact) < float(found.error) * np.linalg.norm(exact)
+    counts.clear()
+    jax.jit(solve)(0.0)
+    jax.effects_barrier()
+    assert counts == [60, 240, 480]

@@ -11,6 +11,8 @@ import pytest
 from mpmath import mp
 from scipy.integrate import quad
 
+from drivetrain_jax.analysis.periodic.direct import assemble, stable_steps
+from drivetrain_jax.analysis.periodic.propagator import explicit_propagator
 from drivetrain_jax.systems import cardan, get_system, system_names
 
 SYSTEM = get_system("cardan")
@@ -255,3 +257,28 @@ def test_systems_are_found_by_name():
     assert set(SYSTEM.models) == {"floquet", "atlas", "forced"}
     with pytest.raises(KeyError, match="allowed is one of cardan"):
         get_system("cardn")
+
+
+@pytest.mark.parametrize(
+    ("point", "rtol"),
+    [
+        ({"beta": 1.0, "Omega": 0.1, "zeta": 10.0}, 1e-9),
+        ({"beta": 0.5, "Omega": 0.1, "zeta": 3.0}, 1e-7),
+        ({"beta": 1.4, "Omega": 0.1, "zeta": 3.0}, 1e-11),
+        ({"beta": 1.0, "Omega": 0.02, "zeta": 10.0}, 1e-5),
+        ({"beta": 0.8, "Omega": 0.5, "zeta": 0.0}, 1e-9),
+    ],
+)
+def test_predicted_steps_are_enough_and_not_many_more(point, rtol):
+    """What decays asks for stability more than for accuracy: it takes no steps like an oscillation as fast as that."""
+    form = cardan.floquet_model({"alpha": 1.0, "mu": 1.0, "gamma": 100.0} | point).reduced
+    predicted = int(cardan.explicit_steps({"alpha": 1.0, "mu": 1.0, "gamma": 100.0} | point, rtol))
+    exact = assemble(form, explicit_propagator(form, jnp.int32(8 * predicted), ()).matrix)
+
+    def error(steps: int) -> float:
+        z = assemble(form, explicit_propagator(form, jnp.int32(steps), ()).matrix)
+        return float(jnp.linalg.norm(z - exact) / jnp.max(jnp.abs(jnp.linalg.eigvals(exact))))
+
+    # Overflow is an error as well.
+    assert error(predicted) < rtol and not error(predicted // 4) <= rtol
+    assert stable_steps(form) < predicted

@@ -25,6 +25,8 @@ from drivetrain_jax.systems import LinearPeriodic
 # Doublings of the predicted number of steps that a batch may take, and the steps at which there is no further one.
 _MAX_REFINEMENTS = 6
 _MAX_STEPS = 2**20
+# The explicit scheme is stable for decays of up to this much in a step.
+_STABLE = 6.0
 
 
 class Monodromy(NamedTuple):
@@ -58,6 +60,12 @@ def stiffness_of(system: LinearPeriodic) -> Array:
     """Largest rate of one point times the span: max |a_ij a_ji|^(1/2) at 16 instants, which no scaling of states changes."""
     a = jax.vmap(system.matrix)((jnp.arange(16) + 0.5) * system.span / 16)
     return system.span * jnp.sqrt(jnp.max(jnp.abs(a * jnp.swapaxes(a, 1, 2))))
+
+
+def stable_steps(system: LinearPeriodic) -> Array:
+    """Steps with which the explicit scheme is stable in all lanes; ``-tr A`` at 9 instants bounds the rates of decay."""
+    trace = jnp.stack([jnp.trace(system.matrix(k * system.span / 8)) for k in range(9)])
+    return jnp.nanmax(-trace, initial=0.0) * system.span / _STABLE
 
 
 def compare(
@@ -115,6 +123,7 @@ def direct_monodromy(
     order: int,
     ratio: int = 2,
     parts: int = 1,
+    least: Array | float = 0.0,
 ) -> Monodromy:
     """Refine from ``steps`` predicted steps (traced integer) until the error of every lane is at most ``rtol``.
 
@@ -122,10 +131,12 @@ def direct_monodromy(
     ``stiffness`` is that of :func:`stiffness_of`, or 0 for a scheme whose steps resolve every rate. A lane that overflows
     gets two doublings to recover and then no longer holds up the others; after six the error tells what was reached.
     The first comparison is with ``ratio`` times fewer steps, as far as there are as many in every one of ``parts`` parts. It
-    costs the less the more that is, but the order of the scheme has to show in both: a small ``rtol`` makes sure of that.
+    costs the less the more that is, but the order of the scheme has to show in both: a small ``rtol`` makes sure of that, as
+    does that they are not fewer than the ``least`` with which it is stable, or than four fifths of the steps.
     """
     each = jnp.maximum(-(-steps // parts), 2)
-    begin, predicted = parts * -(-each // ratio), parts * each
+    stable = jnp.minimum(jnp.ceil(least / parts), each * 4 // 5).astype(each.dtype)
+    begin, predicted = parts * jnp.maximum(stable, -(-each // ratio)), parts * each
     zero = jnp.zeros(shape)
     # Traced once, not for its shapes and again for its values.
     propagate = jax.jit(propagate)

@@ -11,7 +11,7 @@ from jax import Array
 
 from drivetrain_jax.analysis._base import Solver
 from drivetrain_jax.analysis.numerics.lanes import in_blocks
-from drivetrain_jax.analysis.periodic.direct import Monodromy, direct_monodromy, stiffness_of
+from drivetrain_jax.analysis.periodic.direct import Monodromy, direct_monodromy, stable_steps, stiffness_of
 from drivetrain_jax.analysis.periodic.floquet_effort import PANEL_COST, explicit_effort, implicit_effort
 from drivetrain_jax.analysis.periodic.propagator import (
     EXPLICIT_ORDER,
@@ -95,5 +95,6 @@ def _solve(
     propagate = in_lanes if explicit else one
     order, stiffness = (EXPLICIT_ORDER, 0.0) if explicit else (IMPLICIT_ORDER, stiffness_of(periodic))
     ratio = jnp.where(target <= _FINE, _RATIO, 2) if explicit and model.explicit_steps else 2
-    each = max(parts, 1)
-    return results(model, direct_monodromy(periodic, propagate, effort, shape, stiffness, target, order, ratio, each))
+    least = stable_steps(periodic) if explicit else 0.0
+    found = direct_monodromy(periodic, propagate, effort, shape, stiffness, target, order, ratio, max(parts, 1), least)
+    return results(model, found)

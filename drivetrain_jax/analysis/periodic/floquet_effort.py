@@ -14,11 +14,11 @@ from jax import Array
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System
 
 # Below this many explicit steps the implicit scheme is never the cheaper one.
-_STIFF = 600
+_STIFF = 900
 # Beyond these a scheme does not start: the point is left to the other one, or ends as STEP_LIMIT.
 _MAX_EXPLICIT, _MAX_PANELS = 300_000, 20_000
-# Seconds of one implicit panel over those of one explicit step, per point: 150 in full batches, less in small ones.
-PANEL_COST = 50.0
+# Seconds of one implicit panel over those of one explicit step, per point, in full batches.
+PANEL_COST = 150.0
 # Nodes of the quadrature, and points that are evaluated together.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _TOGETHER = 2048
@@ -40,7 +40,8 @@ def implicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: flo
             for name, column in columns.items()
         }
         phase = _frequency_phase(system, chosen, stiff.size)
-        effort[stiff] = 2 * np.ceil((8 + phase / 5) * (1e-10 / rtol) ** (1 / 16) / 2)
+        panels = (12 + 2 * np.sqrt(phase) + phase / 4) * (1e-9 / rtol) ** (1 / 13)
+        effort[stiff] = 2 * np.ceil(panels / 2)
     return _up_to(_MAX_PANELS, effort)
 
 
@@ -48,7 +49,6 @@ def _explicit_steps(system: System, columns: Mapping[str, np.ndarray], rtol: flo
     model: FloquetModel = system.models["floquet"].build(columns)
     size = max(np.size(column) for column in columns.values())
     steps = model.explicit_steps(rtol) if model.explicit_steps else _generic_steps(model.reduced, rtol)
-    # Even, so that the coarse solution has exactly half as many.
     return np.broadcast_to(2 * np.ceil(steps / 2), size)
 
 
