@@ -65,12 +65,14 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
     data = {
         "system": atlas.scene.system.name,
         "parameters": {**atlas.fixed, **point},
+        "physical": asked.physical(point),
         "values": results,
+        "meanings": {n: variables[n].flags[int(v)] for n, v in results.items() if variables[n].flags},
         "gradient": slopes.gradient if slopes.exists else None,
         "nearest": {
             each.parameter: {
-                "below": _crossing(each.below),
-                "above": _crossing(each.above),
+                "below": _crossing(asked, each.parameter, each.below),
+                "above": _crossing(asked, each.parameter, each.above),
                 "undecided": [list(r) for r in each.undecided],
             }
             for each in nearest
@@ -121,7 +123,13 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
         "parameters": {**atlas.fixed, **asked.values},
         "margin": margin,
         "windows": [
-            {"safe": list(w.safe), "largest": w.largest, "where": w.where, "check": _check(w.check)}
+            {
+                "safe": list(w.safe),
+                "physical": asked.physical({speed: w.safe}),
+                "largest": w.largest,
+                "where": w.where,
+                "check": _check(w.check),
+            }
             for w in found.windows
         ],
         "undecided": [list(r) for r in found.undecided],
@@ -161,6 +169,9 @@ class _Asked:
     ) -> _Asked:
         """``ranges`` names the parameters of which a range is wanted, ``free`` those that are the answer."""
         shaft, values = nondimensional(atlas.scene.system, given)
+        for name, value in given.items():
+            if _meant(name, value, shaft) in free:
+                raise InputError(f"{name} = {as_given(value)}: is what is asked for; allowed is to leave it out")
         for name in (*ranges, *free):
             if name not in atlas.parameters:
                 raise InputError(
@@ -174,8 +185,6 @@ class _Asked:
             if name not in atlas.parameters and name not in atlas.fixed:
                 physical = atlas.scene.system.physical
                 atlas.refuse(name, values[name], *atlas.fixed, *(physical.names if physical else ()))
-            if name in free and shaft is None:
-                raise InputError(f"{name} = {as_given(values[name])}: is what is asked for; allowed is to leave it out")
         for name in atlas.parameters:
             if name not in free:
                 _check_range(_Words.of(atlas, shaft, name), atlas.ranges[name], own.get(name), name in ranges)
@@ -197,6 +206,23 @@ class _Asked:
         physical = self.shaft.quantity(name, value) if self.shaft else None
         aside = f" ({physical[0]} = {_number(physical[1])} {physical[2]})" if physical else ""
         return f"{name} = {_number(value)}{aside}"
+
+    def physical(self, values: Mapping[str, float | Range]) -> dict[str, Any]:
+        """``values`` in the units that were given, by their names there; empty where none were."""
+        found = {}
+        for name, value in values.items() if self.shaft else ():
+            ends = [self.shaft.quantity(name, end) for end in (value if isinstance(value, tuple) else (value,))]
+            if ends[0] is not None:
+                numbers = [number for _, number, _ in ends]
+                found[ends[0][0]] = {"value": numbers if isinstance(value, tuple) else numbers[0], "units": ends[0][2]}
+        return found
+
+
+def _meant(name: str, value: Any, shaft: Any) -> str:
+    """The parameter that ``name`` gives, itself or in another unit."""
+    if shaft is None or name not in shaft.operation:
+        return name
+    return shaft.parameter(name, value[0] if isinstance(value, tuple) else value)[0]
 
 
 def _check_same(name: str, value: Any, fixed: float) -> None:
@@ -263,9 +289,10 @@ def _answered(title: str, phrase: str, asked: _Asked, answer: design.Answer) -> 
         "parameters": {**asked.atlas.fixed, **asked.values},
         "parameter": answer.parameter,
         "value": answer.value,
+        "physical": {} if answer.value is None else asked.physical({answer.parameter: answer.value}),
         "error": answer.error,
         "certain": answer.certain,
-        "limit": _crossing(answer.limit),
+        "limit": _crossing(asked, answer.parameter, answer.limit),
         "undecided": [list(r) for r in answer.undecided],
         "check": _check(answer.check),
     }
@@ -305,11 +332,12 @@ def _number(value: float) -> str:
     return f"{value:.10g}"
 
 
-def _crossing(crossing: Crossing | None) -> dict[str, Any] | None:
+def _crossing(asked: _Asked, name: str, crossing: Crossing | None) -> dict[str, Any] | None:
     if crossing is None:
         return None
     return {
         "value": crossing.value,
+        "physical": asked.physical({name: crossing.value}),
         "error": crossing.error,
         "multiplier": crossing.multiplier,
         "point": dict(crossing.point),

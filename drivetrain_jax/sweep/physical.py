@@ -14,7 +14,7 @@ def nondimensional(system: System, given: Mapping[str, Any]) -> tuple[Any, dict[
     """The physical data of ``system`` among ``given`` (None if there are none), and all values as its parameters.
 
     A value is a number or a range, a pair of numbers. Raises :class:`InputError` where some of the data are missing or out
-    of range.
+    of range, or say the same as a parameter that is given too.
     """
     physical = system.physical
     if physical is None or not any(name in physical.names for name in given):
@@ -24,13 +24,15 @@ def nondimensional(system: System, given: Mapping[str, Any]) -> tuple[Any, dict[
     if missing:
         raise InputError(f"{missing[0]}: missing; physical units need all of {', '.join(data)}")
     shaft = physical(**{name: given[name] for name in data})
-    values = dict(shaft.parameters)
-    for name in given:
-        if name in physical.operation:
+    converted = dict(shaft.parameters)
+    for name in physical.operation:
+        if name in given:
             ends = given[name] if isinstance(given[name], tuple) else (given[name],)
-            converted = [shaft.parameter(name, end) for end in ends]
-            numbers = tuple(value for _, value in converted)
-            values[converted[0][0]] = numbers if isinstance(given[name], tuple) else numbers[0]
-        elif name not in data:
-            values[name] = given[name]
-    return shaft, values
+            pairs = [shaft.parameter(name, end) for end in ends]
+            numbers = tuple(value for _, value in pairs)
+            converted[pairs[0][0]] = numbers if isinstance(given[name], tuple) else numbers[0]
+    others = {name: value for name, value in given.items() if name not in physical.names}
+    for name in others:
+        if name in converted:
+            raise InputError(f"{name} = {others[name]!r}: is given in physical units, too; allowed is one of the two")
+    return shaft, {**converted, **others}

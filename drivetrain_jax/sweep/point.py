@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, KeysView, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -54,12 +54,20 @@ class PointResult:
     def __iter__(self) -> Iterator[str]:
         return iter(self.values)
 
+    def keys(self) -> KeysView[str]:
+        """Names of the results, so that ``dict(result)`` holds them."""
+        return self.values.keys()
+
     def __dir__(self) -> list[str]:
         return sorted({*super().__dir__(), *self.values})
 
     def to_json(self) -> str:
-        """The answer as one JSON object; what is not finite is null, a complex value has ``real`` and ``imag``."""
+        """The answer as one JSON object; what is not finite is null, a complex value has ``real`` and ``imag``, a code its
+        ``meaning``."""
         values = {n: {"value": _plain(v), "units": self.variables[n].units} for n, v in self.values.items()}
+        for name, value in self.values.items():
+            if flags := self.variables[name].flags:
+                values[name]["meaning"] = _meaning(flags, value)
         parameters = {n: {"value": _plain(v), "units": self.parameter_units[n]} for n, v in self.parameters.items()}
         head = {"system": self.system, "analysis": self.analysis, "method": self.method}
         answer = {**head, "parameters": parameters, "outcome": self.outcome.name.lower(), "values": values}
@@ -71,7 +79,8 @@ class PointResult:
             _with_units(f"{n} = {written(v)}", self.parameter_units[n]) for n, v in self.parameters.items() if v != ()
         )
         listed = [n for n, v in self.values.items() if np.ndim(v) == 1]
-        plain = [name for name in self.values if name not in listed]
+        matrices = [n for n, v in self.values.items() if np.ndim(v) == 2]
+        plain = [name for name in self.values if name not in (*listed, *matrices)]
         width = max(map(len, (*plain, "outcome")))
         lines = [f"{self.system} {self.analysis} (method {self.method}), {given}"]
         for name in plain:
@@ -80,7 +89,20 @@ class PointResult:
         lines.append(f"  {'outcome':{width}} = {self.outcome.name.lower()}")
         for (dim,) in dict.fromkeys(self.variables[name].dims for name in listed):
             lines += self._table(dim, [name for name in listed if self.variables[name].dims == (dim,)])
+        for name in matrices:
+            lines += self._matrix(name)
         return "\n".join(lines)
+
+    def _matrix(self, name: str) -> list[str]:
+        """A result over two dimensions, the longer one downwards."""
+        variable, values = self.variables[name], np.asarray(self.values[name])
+        rows, columns = variable.dims
+        if values.shape[0] < values.shape[1]:
+            rows, columns, values = columns, rows, values.T
+        head = [rows, *(f"{columns} {written(label)}" for label in self.labels[columns])]
+        named = zip(self.labels[rows], values, strict=True)
+        cells = [[written(label), *(_text(variable, value) for value in row)] for label, row in named]
+        return [f"  {_with_units(name, variable.units)}", *_aligned([head, *cells])]
 
     def _table(self, dim: str, names: Sequence[str]) -> list[str]:
         """Results that are lists over one dimension, side by side."""
@@ -89,9 +111,12 @@ class PointResult:
             variable = self.variables[name]
             head = name if variable.units == "1" else f"{name} [{variable.units}]"
             columns.append([head, *(_text(variable, value) for value in self.values[name])])
-        widths = [max(map(len, column)) for column in columns]
-        rows = zip(*columns, strict=True)
-        return ["  " + "  ".join(f"{cell:{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+        return _aligned(list(zip(*columns, strict=True)))
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  " + "  ".join(f"{cell:{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def _plain(value: Any) -> Any:
@@ -103,6 +128,11 @@ def _plain(value: Any) -> Any:
     if np.ndim(value):
         return [_plain(entry) for entry in value]
     return np.asarray(value).item() if np.isfinite(value) else None
+
+
+def _meaning(flags: Sequence[str], value: Any) -> Any:
+    """The words of codes, in the shape of ``value``."""
+    return [_meaning(flags, each) for each in value] if np.ndim(value) else flags[int(value)]
 
 
 def _with_units(text: str, units: str) -> str:

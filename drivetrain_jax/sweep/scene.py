@@ -80,11 +80,14 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
 
 
 def find_system(name: str) -> System:
-    """The system called so; ``InputError`` with the name that may have been meant if there is none."""
+    """The system called so; ``InputError`` with the name that may have been meant if there is none, or why it fails."""
     try:
         return get_system(name)
     except KeyError:
         raise InputError(f"system = {name!r}: unknown{nearest(name, system_names())}") from None
+    except ImportError as error:
+        # One line, whatever the package had to say.
+        raise InputError(f"system = {name!r}: {' '.join(str(error).split())}") from error
 
 
 def system_and_analysis(system_name: str, analysis_name: str) -> tuple[System, Analysis]:
@@ -264,7 +267,7 @@ def _swept_parameter(system: System, where: str, name: str) -> tuple[Parameter, 
     known = {p.name: p for p in system.parameters}
     parameter = known.get(base)
     if parameter is None:
-        raise InputError(f"{where}.{name}: unknown parameter{nearest(base, known)}")
+        raise InputError(f"{where}.{name}: {_unknown(system, base)}")
     if parameter.choices or parameter.text:
         raise InputError(f"{where}.{name}: a word cannot vary; allowed is to fix it: {parameter.allowed}")
     if not parameter.is_number and entry is None:
@@ -276,13 +279,21 @@ def _swept_parameter(system: System, where: str, name: str) -> tuple[Parameter, 
     return parameter, entry
 
 
+def _unknown(system: System, name: str) -> str:
+    """Why a scene has no parameter ``name``, and what it may have."""
+    known = [p.name for p in system.parameters]
+    if system.physical and name in system.physical.names:
+        return f"physical units are for point, query and design; allowed in a scene is {', '.join(known)}"
+    return f"unknown parameter{nearest(name, known)}"
+
+
 def _fixed(table: _SceneTable, system: System, analysis: Analysis, axes: tuple[Axis, ...]) -> dict[str, Value]:
     """The parameters that do not vary: those given, then the defaults of those the analysis uses."""
     known = {p.name: p for p in system.parameters}
     whole = {axis.name for axis in axes if axis.entry is None}
     for name, value in table.fixed.items():
         if name not in known:
-            raise InputError(f"fixed.{name} = {shown(value)}: unknown parameter{nearest(name, known)}")
+            raise InputError(f"fixed.{name} = {shown(value)}: {_unknown(system, name)}")
         if name in whole:
             where = "points" if table.points else "axes"
             raise InputError(f"fixed.{name} = {shown(value)}: also in [{where}]; allowed is one of the two")

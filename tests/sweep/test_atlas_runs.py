@@ -306,6 +306,13 @@ def test_the_same_point_in_physical_units(atlas):
     plain = atlas_answers.query(atlas, {"beta": 0.31, "Omega": 1.2})
     assert reply.data["values"]["spectral_radius"] == pytest.approx(plain.data["values"]["spectral_radius"], abs=1e-12)
     assert "rpm" in str(reply) and "rpm" not in str(plain)
+    assert reply.data["physical"]["speed"] == {"value": pytest.approx(rpm), "units": "rpm"}
+    assert reply.data["physical"]["angle"]["value"] == pytest.approx(np.degrees(0.31)) and plain.data["physical"] == {}
+    above, per_unit = reply.data["nearest"]["Omega"]["above"], rpm / 1.2
+    assert above["physical"]["speed"]["value"] == pytest.approx(above["value"] * per_unit)
+    assert reply.data["meanings"] == {"verdict": "stable", "outcome": "success"}
+    windows = atlas_answers.speed_windows(atlas, {**shaft, "angle": np.degrees(0.31)}).data["windows"]
+    assert windows[0]["physical"]["speed"]["value"] == pytest.approx([x * per_unit for x in windows[0]["safe"]])
     with pytest.raises(dt.InputError, match=r"^speed = 1000: allowed is [\d.]+ <= speed <= [\d.]+, in rpm$"):
         atlas_answers.query(atlas, {**shaft, "speed": 1000.0, "angle": 10.0})
     with pytest.raises(dt.InputError, match=r"^angle: missing; allowed is 0 <= angle <= 34\.37\d*, in deg$"):
@@ -314,6 +321,21 @@ def test_the_same_point_in_physical_units(atlas):
         atlas_answers.query(atlas, {"J1": 1.0, "speed": 100.0})
     with pytest.raises(dt.InputError, match=r"^mu = 2: the atlas is made for mu = 1; allowed is that value$"):
         atlas_answers.query(atlas, {**shaft, "k2": 2000.0, "speed": rpm, "angle": 10.0})
+    with pytest.raises(
+        dt.InputError, match=r"^beta = 0\.1: is given in physical units, too; allowed is one of the two$"
+    ):
+        atlas_answers.query(atlas, {**shaft, "speed": rpm, "angle": 10.0, "beta": 0.1})
+
+
+def test_what_is_asked_for_is_not_given(atlas):
+    shaft = {"J1": 2.0, "J2": 200.0, "k1": 1000.0, "k2": 1000.0, "c1": 0.0894427191, "c2": 0.0894427191}
+    refused = "is what is asked for; allowed is to leave it out"
+    with pytest.raises(dt.InputError, match=f"^Omega = 1.1:1.2: {refused}$"):
+        atlas_answers.speed_windows(atlas, {"beta": 0.31, "Omega": (1.1, 1.2)})
+    with pytest.raises(dt.InputError, match=f"^speed = 250:260: {refused}$"):
+        atlas_answers.speed_windows(atlas, {**shaft, "angle": 10.0, "speed": (250.0, 260.0)})
+    with pytest.raises(dt.InputError, match=f"^angle = 20: {refused}$"):
+        atlas_answers.widest_angle(atlas, {**shaft, "speed": (250.0, 260.0), "angle": 20.0})
 
 
 def test_design_answers_are_checked_by_direct_solves(atlas):

@@ -10,6 +10,7 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.sweep import kernel
+from drivetrain_jax.sweep.scene import load_scene
 from drivetrain_jax.systems.cardan_units import PhysicalShaft
 
 
@@ -53,6 +54,10 @@ def test_physical_units():
     for given, message in (
         ({"J1": 2.0, "speed": 300.0}, "J2: missing; physical units need all of J1, J2, k1, k2, c1, c2"),
         ({**data, "speed": "fast", "angle": 1.0}, "speed = 'fast': allowed is a number, 0 < speed < inf"),
+        (
+            {**data, "speed": 300.0, "angle": 18.0, "zeta": 0.4},
+            "zeta = 0.4: is given in physical units, too; allowed is one of the two",
+        ),
         ({**data, "angle": 90.0, "speed": 1.0}, "angle = 90.0: allowed is -90 < angle < 90, in deg"),
     ):
         with pytest.raises(dt.InputError, match=f"^{re.escape(message)}$"):
@@ -91,6 +96,9 @@ def test_json():
     answer = json.loads(dt.point("toy", "toy", a=0.0, outputs=["wave"]).to_json())
     assert answer["values"]["wave"]["value"] == {"real": [1.0, 1.0, 1.0], "imag": [0.0, 0.0, 0.0]}
     assert answer["outcome"] == "success" and answer["parameters"]["a"] == {"value": 0.0, "units": "m"}
+    result = dt.point("toy", "toy", a=6.0, outputs=["value", "sign"])
+    assert json.loads(result.to_json())["values"]["sign"] == {"value": 1, "units": "1", "meaning": "large"}
+    assert dict(result) == {"value": result.value, "sign": 1}
 
 
 def test_words_lists_and_options():
@@ -139,3 +147,20 @@ def test_a_function_has_no_value_at_one_point():
     message = "analysis = 'atlas': is made over ranges; allowed at a point is one of floquet, forced"
     with pytest.raises(dt.InputError, match=f"^{message}$"):
         dt.point("cardan", "atlas", beta=0.3)
+
+
+def test_a_matrix_is_printed_with_its_rows_and_columns():
+    shaft = {"length": [0.07, 0.59, 0.25], "EI": [64427.0, 22157.0, 8350.0], "rhoA": [15.3, 2.81, 5.51]}
+    shape = dt.point("bicardan", "critical_speeds", **shaft, k_A=85e6, k_D=2e7, modes=2, outputs=["mode_shape"])
+    lines = repr(shape).splitlines()
+    assert lines[-len(shape.labels["x"]) - 1].split() == ["x", "mode", "1", "mode", "2"]
+    assert [float(cell) for cell in lines[-1].split()] == pytest.approx([shape.labels["x"][-1], *shape.mode_shape[:, -1]])
+
+
+def test_physical_units_in_a_scene_are_refused_with_the_way_out():
+    scene = {"system": "cardan", "analysis": "floquet", "axes": {"angle": {"start": 0.0, "stop": 30.0, "num": 3}}}
+    message = r"^axes\.angle: physical units are for point, query and design; allowed in a scene is beta, Omega, .*gamma$"
+    with pytest.raises(dt.InputError, match=message):
+        load_scene(scene)
+    with pytest.raises(dt.InputError, match=r"^fixed\.k1 = 3: physical units are for point, query and design"):
+        load_scene({**scene, "axes": {"beta": {"start": 0.0, "stop": 0.3, "num": 3}}, "fixed": {"k1": 3}})
