@@ -15,13 +15,15 @@ if TYPE_CHECKING:
     from drivetrain_jax.sweep.atlas_file import open_atlas
     from drivetrain_jax.sweep.partial import open_result
     from drivetrain_jax.sweep.point import point
-    from drivetrain_jax.sweep.run import run
+    from drivetrain_jax.sweep.run import Incomplete, Interrupted, run
 
 __version__ = "0.1.0"
 
-__all__ = ["InputError", "__version__", "open_atlas", "open_result", "point", "run"]
+__all__ = ["Incomplete", "InputError", "Interrupted", "__version__", "open_atlas", "open_result", "point", "run"]
 
 _HOME = {
+    "Incomplete": "drivetrain_jax.sweep.run",
+    "Interrupted": "drivetrain_jax.sweep.run",
     "open_atlas": "drivetrain_jax.sweep.atlas_file",
     "open_result": "drivetrain_jax.sweep.partial",
     "point": "drivetrain_jax.sweep.point",

@@ -112,3 +112,9 @@ def test_kernels_do_not_call_lapack(scene):
         traced = jax.jit(lambda columns, effort, solve=solver.solve: solve(engine.grid.bind(columns), effort))
         lowered = traced.lower(columns, jax.ShapeDtypeStruct((), np.int64))
         assert ("lapack" in lowered.as_text().lower()) is ("Kvaerno5" in solver.name)
+
+
+@pytest.mark.parametrize("name", analysis_names())
+def test_every_method_says_what_it_is(name):
+    analysis = get_analysis(name)
+    assert analysis.method_titles.keys() == analysis.methods.keys()

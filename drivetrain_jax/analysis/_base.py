@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
@@ -75,7 +75,8 @@ class Analysis:
     """Named results and how to get them.
 
     ``methods`` maps each method to the names of the options it uses, the first method being the default; ``options``
-    describes all of them. ``solvers(system, request)`` gives the candidates of the requested method.
+    describes all of them, ``method_titles`` the methods.
+    ``solvers(system, request)`` gives the candidates of the requested method.
     ``dimensions(system, request, fixed)`` describes the dimensions of the results besides those of the sweep; ``fixed``
     holds the parameters that do not vary (a list is whole also if one entry varies). It raises
     :class:`~drivetrain_jax._errors.InputError` where a request and these parameters do not fit together.
@@ -95,6 +96,7 @@ class Analysis:
     lacks: Callable[[System], Mapping[str, str]] = lambda _: {}
     path_axis: Callable[[Request], str | None] = lambda _: None
     continuous: bool = False
+    method_titles: Mapping[str, str] = field(default_factory=dict)
 
     def variable(self, name: str) -> Variable:
         """The result called ``name``; ``KeyError`` if there is none."""

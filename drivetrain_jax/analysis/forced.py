@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, solve, spectral_norm
@@ -189,6 +190,8 @@ def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Ar
 def predicted_steps(build: Build, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Steps of one integration, shape (N,), from the mean spectral radius of the linear field over three phases."""
     model, n = build(columns), len(STATE.values)
+    if len(model.displacements) != len(SHAFT.values):
+        raise InputError(f"system: has {len(model.displacements)} displacements; forced allows two, and {n} states")
     count = np.broadcast(*columns.values()).size
     rates = []
     for phase in model.period * np.array([0.0, 0.25, 0.5]):
@@ -211,6 +214,9 @@ ANALYSIS = Analysis(
     variables=VARIABLES,
     default_outputs=("periodic_state", "amplitude", "condition"),
     methods={"shooting": ("rtol",)},
+    method_titles={
+        "shooting": "periodic orbit by Newton's method over one period",
+    },
     options=(RTOL,),
     solvers=_solvers,
     dimensions=lambda *_: (STATE, SHAFT),

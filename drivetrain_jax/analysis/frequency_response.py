@@ -171,6 +171,12 @@ ANALYSIS = Analysis(
     variables=VARIABLES,
     default_outputs=("u_max", "u_min", "u_rms", "phase", "regime", "stability"),
     methods=METHODS,
+    method_titles={
+        "exact": "exact motion from impact to impact, followed along omega",
+        "harmonic_balance": "a chosen number of harmonics",
+        "multiple_scales": "closed form for a cubic spring, as published",
+        "describing_function": "bias and fundamental alone",
+    },
     options=OPTIONS,
     solvers=_solvers,
     dimensions=_dimensions,

@@ -175,8 +175,12 @@ def _solve(system: System, request: Request, values: Mapping[str, Any], effort: 
 
 def _effort(system: System, request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Predicted segments, shape (N,): strobes and requested times; infinite beyond what is worth beginning."""
-    times = requested_times(request)
-    strobes = times[-1] / np.asarray(system.models["history"].build(columns).period)
+    times, flow = requested_times(request), system.models["history"].build(columns)
+    if flow.size != len(_COMPONENT):
+        raise InputError(
+            f"system = {system.name!r}: has {flow.size} components; history allows two, an angle and its rate"
+        )
+    strobes = times[-1] / np.asarray(flow.period)
     return np.where(strobes <= _MAX_STROBES, np.ceil(strobes) + len(times), np.inf)
 
 
@@ -196,6 +200,9 @@ ANALYSIS = Analysis(
     variables=VARIABLES,
     default_outputs=("phi", "velocity"),
     methods={"diffrax": ("times", "stop", "num", "rtol", "solver")},
+    method_titles={
+        "diffrax": "adaptive steps from strobe to strobe",
+    },
     options=(
         Parameter("times", "s", "times at which the state is wanted", default=(), listed=True, lower=0.0),
         Parameter("stop", "s", "end of the history (0: see times)", default=0.0, lower=0.0),

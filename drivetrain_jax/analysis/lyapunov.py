@@ -49,7 +49,13 @@ VARIABLES = (
     Variable("paper_estimator", "1/s", "the paper's (31)-(36) as printed, not a Lyapunov exponent", ("component",)),
     Variable("chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic"),
     Variable("period_multiple", "1", "strobes after which the motion repeats, 0 if it does not", dtype="int32"),
-    Variable("verdict", "1", "kind of motion", dtype="int8", flags=tuple(v.name.lower() for v in Verdict)),
+    Variable(
+        "verdict",
+        "1",
+        "kind of motion by its strobes (fixed_point repeats at every one)",
+        dtype="int8",
+        flags=tuple(v.name.lower() for v in Verdict),
+    ),
 )
 OPTIONS = (
     Parameter("standard_error", "1/s", "standard error at which a run may end", default=0.0, lower=0.0),
@@ -231,6 +237,9 @@ ANALYSIS = Analysis(
     variables=VARIABLES,
     default_outputs=("lyapunov_spectrum", "lyapunov_standard_error", "sum_rule_residual", "verdict"),
     methods={"benettin": tuple(option.name for option in OPTIONS)},
+    method_titles={
+        "benettin": "the variational equations, orthonormalised again and again (Benettin)",
+    },
     options=OPTIONS,
     solvers=_solvers,
     dimensions=_dimensions,

@@ -258,6 +258,10 @@ ANALYSIS = Analysis(
     variables=VARIABLES,
     default_outputs=("natural_frequency", "mode_type"),
     methods={"auto": ("track",), "full": ("track",)},
+    method_titles={
+        "auto": "by the invariant blocks of a symmetry, if there is one",
+        "full": "always the whole matrix",
+    },
     options=(Parameter("track", "1", "axis along which modes are followed", default="", text=True),),
     solvers=_solvers,
     dimensions=_dimensions,

@@ -76,6 +76,9 @@ ANALYSIS = Analysis(
         "midshaft_frequency",
     ),
     methods={"exact": ("modes",)},
+    method_titles={
+        "exact": "closed forms",
+    },
     options=(Parameter("modes", "1", "modes of the midshaft", default=5, lower=1, upper=1000, integer=True),),
     solvers=_solvers,
     dimensions=_dimensions,

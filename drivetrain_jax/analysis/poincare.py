@@ -186,6 +186,10 @@ ANALYSIS = Analysis(
     variables=VARIABLES,
     default_outputs=("section",),
     methods={"fixed": (*_COMMON, "steps"), "adaptive": (*_COMMON, "rtol", "atol")},
+    method_titles={
+        "fixed": "equal steps of order 8",
+        "adaptive": "adaptive steps of order 5, to show what a loose tolerance does",
+    },
     options=OPTIONS,
     solvers=_solvers,
     dimensions=_dimensions,

@@ -105,6 +105,9 @@ ANALYSIS = Analysis(
     variables=VARIABLES,
     default_outputs=("u_max", "u_min", "u_rms", "period_multiple", "spectral_radius", "regime", "impacts"),
     methods={"exact": ("rtol", "most_periods")},
+    method_titles={
+        "exact": "exact motion from impact to impact, until it repeats",
+    },
     options=(RTOL, WAIT),
     solvers=_solvers,
     dimensions=lambda *_: DIMENSIONS,

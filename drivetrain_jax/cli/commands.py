@@ -19,6 +19,7 @@ from drivetrain_jax.cli.values import assignments, ranges
 
 # Cells each way in the chart of an atlas.
 _CELLS = 800
+_FIGURES = (".png", ".pdf", ".svg")
 
 
 def list_systems(options: argparse.Namespace) -> int:
@@ -115,17 +116,15 @@ def export(options: argparse.Namespace) -> int:
 
 def plot(options: argparse.Namespace) -> int:
     """The figure of one result, or of several that share one."""
-    from matplotlib.backend_bases import FigureCanvasBase
-
     from drivetrain_jax.store.consolidate import open_result
     from drivetrain_jax.store.files import write_atomic
     from drivetrain_jax.view import plot
 
-    out, kinds = options.out, FigureCanvasBase.get_supported_filetypes()
+    out = options.out
     if not out.parent.is_dir():
         raise InputError(f"out = {str(out)!r}: the folder does not exist; allowed is a file in an existing folder")
-    if out.suffix[1:].lower() not in kinds:
-        raise InputError(f"out = {str(out)!r}: allowed is a name that ends in .{', .'.join(kinds)}")
+    if out.suffix.lower() not in _FIGURES:
+        raise InputError(f"out = {str(out)!r}: allowed is a name that ends in {', '.join(_FIGURES)}")
     results = [open_result(file) if file.exists() else _open_unfinished(file) for file in options.files]
     if any(result.attrs.get("analysis") == "atlas" for result in results):
         from drivetrain_jax.sweep.atlas_chart import chart

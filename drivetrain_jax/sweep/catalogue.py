@@ -7,20 +7,26 @@ from pathlib import Path
 from typing import Any
 
 import drivetrain_jax
+from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter, Variable
 from drivetrain_jax._wording import written
 from drivetrain_jax.analysis import get_analysis
 from drivetrain_jax.sweep.scene import find_system
-from drivetrain_jax.systems import System, get_system, system_names
+from drivetrain_jax.systems import System, system_names
 
 
 def overview() -> str:
     """Systems with their analyses, and the scenes found here."""
-    lines = ["Systems (drivetrain list SYSTEM describes one)"]
-    for name in system_names():
-        system = get_system(name)
-        lines.append(f"  {name:12} {system.title}; analyses: {', '.join(system.models)}")
+    lines = ["Systems (drivetrain list SYSTEM describes one)", *_table([_system_row(name) for name in system_names()])]
     return "\n".join([*lines, *_scene_lines(None)]) + "\n"
+
+
+def _system_row(name: str) -> tuple[str, str]:
+    try:
+        system = find_system(name)
+    except InputError as error:
+        return name, str(error).partition(": ")[2]
+    return name, f"{system.title}; analyses: {', '.join(system.models)}"
 
 
 def describe(name: str) -> str:
@@ -50,7 +56,11 @@ def _analysis_lines(name: str, system: System) -> list[str]:
         "  (* computed unless outputs says otherwise)",
         "  Methods and the options they use, the first by default",
     ]
-    methods = [(method, ", ".join(used)) for method, used in analysis.methods.items() if method not in lacking]
+    methods = [
+        (method, analysis.method_titles.get(method, ""), ", ".join(used))
+        for method, used in analysis.methods.items()
+        if method not in lacking
+    ]
     lines += ["  " + line for line in _table(methods)]
     return [*lines, "  Options", *("  " + line for line in _table([_parameter_row(o) for o in analysis.options]))]
 

@@ -106,7 +106,7 @@ def run_to_file(
         total = target.points(engine.total)
         return Progress(total, reused=total, failed=target.failed)
     if target.state == "stale" and not fresh:
-        raise InputError(f"out = {str(out)!r}: holds {target.obstacle}; --fresh replaces it")
+        raise InputError(f"out = {str(out)!r}: holds {target.obstacle}; {target.remedy}")
     return _into(target, target.take(reuse, fresh), fresh, where, report)
 
 
@@ -162,7 +162,7 @@ def _in_memory(engine: Engine, where: Where, report: Report | None) -> xr.Datase
         else:
             table = Table(engine.scene, engine.grid)
             extra = _fill(engine, table, work, progress)
-            dataset = to_dataset(engine.scene, table.lay_out(), _attrs(engine, 0.0) | extra)
+            dataset = to_dataset(engine.scene, table.lay_out(), _attrs(engine) | extra)
     except ChunkError as error:
         raise Incomplete(str(error), progress) from error
     return dataset.assign_attrs(wall_time_s=round(time.monotonic() - begin, 3))
@@ -189,7 +189,7 @@ def _resume(
             write_result(_atlas(engine, work, progress).assign_attrs(wall_time_s=seconds()), out, temporary)
         return
     with work, ResultFile(temporary) as file:
-        table = Table(engine.scene, engine.grid, lambda blank: file.lay_out(blank.assign_attrs(_attrs(engine, 0.0))))
+        table = Table(engine.scene, engine.grid, lambda blank: file.lay_out(blank.assign_attrs(_attrs(engine))))
         extra = _fill(engine, table, work, progress, taken)
         table.lay_out()
         file.finish(out, wall_time_s=seconds(), **extra)
@@ -212,10 +212,11 @@ def _fill(engine: Engine, table: Table, work: Work, progress: Progress, taken: T
 def _atlas(engine: Engine, work: Work, progress: Progress) -> xr.Dataset:
     from drivetrain_jax.sweep.atlas_file import make_atlas
 
-    return make_atlas(engine.scene, work, progress).assign_attrs(_attrs(engine, 0.0))
+    return make_atlas(engine.scene, work, progress).assign_attrs(_attrs(engine))
 
 
-def _attrs(engine: Engine, seconds: float) -> dict[str, str | float]:
+def _attrs(engine: Engine) -> dict[str, str | float]:
+    """Whose result it is; what it took is told at its end."""
     detail = json.dumps(engine.numerics_detail)
     numerics = {"numerics": engine.numerics, "numerics_detail": detail}
-    return {"digest": engine.digest, **numerics, "wall_time_s": round(seconds, 3)}
+    return {"digest": engine.digest, **numerics, "wall_time_s": 0.0}

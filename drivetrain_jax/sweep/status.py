@@ -56,7 +56,7 @@ def status(
     target = Target(Path(out), engine)
     total = 0 if engine.scene.analysis.continuous else engine.total
     if target.state == "stale":
-        reason = f"it holds {target.obstacle}; --fresh replaces it"
+        reason = f"it holds {target.obstacle}; {target.remedy}"
         return Status(total, 0, 0, target.state, reason=reason)
     try:
         found = _counts(target)

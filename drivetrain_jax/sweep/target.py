@@ -22,7 +22,7 @@ from drivetrain_jax.sweep.assemble import failures
 from drivetrain_jax.sweep.atlas_choice import uses_atlas
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.explain import differences
-from drivetrain_jax.sweep.growing import NOTHING, NotReusable, Taken, find, take
+from drivetrain_jax.sweep.growing import NOTHING, NotReusable, Source, Taken, find, take
 
 
 class Target:
@@ -75,14 +75,27 @@ class Target:
         }
 
     @cached_property
+    def _shared(self) -> Source | None:
+        """What the result that is there holds of the points of this scene."""
+        if self.engine.scene.analysis.continuous or self.present is None or self.store == "zarr":
+            return None
+        try:
+            return find(self.engine, self.out)
+        except NotReusable:
+            return None
+
+    @property
     def _grows(self) -> bool:
         """Whether the result that is there is one of fewer points of this scene, so that replacing it loses none."""
-        if self.engine.scene.analysis.continuous or self.present is None or self.store == "zarr":
-            return False
-        try:
-            return find(self.engine, self.out).is_covered
-        except NotReusable:
-            return False
+        return self._shared is not None and self._shared.is_covered
+
+    @property
+    def remedy(self) -> str:
+        """What there is to do about the :attr:`obstacle`."""
+        if self._shared is None or self.parts.holds_work():
+            return "--fresh replaces it"
+        kept = f"--reuse {self.out.name} with another --out takes {self._shared.ours.size} points from it"
+        return f"--fresh replaces it, {kept}"
 
     def take(self, reuse: Sequence[str | Path], fresh: bool) -> Taken:
         """The points that a run takes from the results ``reuse`` and, unless it is ``fresh``, from the one in its place.

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 
 import jax
 
@@ -58,10 +58,22 @@ def system_names() -> tuple[str, ...]:
 
 
 def get_system(name: str) -> System:
-    """The system called ``name``; ``KeyError`` with the known names if there is none."""
+    """The system ``name``; ``KeyError`` with the known names if there is none, ``ImportError`` if its package fails."""
     if name in _BUILT_IN:
         return import_module(f"drivetrain_jax.systems.{name}").SYSTEM
     for entry in entry_points(group=ENTRY_POINT_GROUP):
         if entry.name == name:
-            return entry.load()
+            return _loaded(entry)
     raise KeyError(f"system = {name!r}: allowed is one of {', '.join(system_names())}")
+
+
+def _loaded(entry: EntryPoint) -> System:
+    try:
+        system = entry.load()
+    # Whatever another package raises.
+    except Exception as error:
+        raise ImportError(f"{entry.value} cannot be loaded: {type(error).__name__}: {error}") from error
+    if not isinstance(system, System) or system.name != entry.name:
+        called = f"the system {system.name}" if isinstance(system, System) else f"a {type(system).__name__}"
+        raise ImportError(f"{entry.value} is {called}, not the system {entry.name}")
+    return system

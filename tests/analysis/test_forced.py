@@ -11,11 +11,13 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize_scalar, root
 
+from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import Outcome, Request, get_analysis
+from drivetrain_jax.analysis.forced import predicted_steps
 from drivetrain_jax.analysis.periodic import orbit
 from drivetrain_jax.analysis.periodic.amplitude import amplitudes
 from drivetrain_jax.analysis.periodic.orbit import integrate, shoot
-from drivetrain_jax.systems import get_system
+from drivetrain_jax.systems import ForcedModel, get_system
 
 ANALYSIS, SYSTEM = get_analysis("forced"), get_system("cardan")
 EVERYTHING = tuple(v.name for v in ANALYSIS.variables)
@@ -264,6 +266,12 @@ def test_effort_grows_with_oscillations():
     columns = {k: np.full(3, v) for k, v in (BASE | {"beta": 0.8}).items()} | {"Omega": np.array([1.0, 0.1, 0.01])}
     steps = solver().effort(columns)
     assert steps.shape == (3,) and np.all(np.diff(steps) > 0)
+
+
+def test_a_model_of_one_displacement_is_refused():
+    model = ForcedModel(lambda t, y: y, lambda t, y: y, 1.0, (0,))
+    with pytest.raises(InputError, match=r"^system: has 1 displacements; forced allows two, and 4 states$"):
+        predicted_steps(lambda columns: model, {"a": np.ones(1)})
 
 
 @pytest.mark.parametrize("frequency", [1.0, 7.3, 1000.0])

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from flows import lorenz
 
 import drivetrain_jax as dt
 from benchmarks import tripod_reference as oracle
 from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis import Request, history
 from drivetrain_jax.sweep.scene import load_scene
 
 NINE_DEGREES = math.radians(9)
@@ -123,3 +126,13 @@ def test_hopelessly_many_strobes_are_not_begun():
     ds = dt.run(scene({"times": [1e6]}, fixed=FIXED | {"zeta": 0.01}))
     assert ds.outcome.attrs["flag_meanings"].split()[int(ds.outcome)] == "step_limit"
     assert np.isnan(ds.phi).all()
+
+
+def test_a_flow_of_three_components_is_refused():
+    system = SimpleNamespace(name="lorenz", models={"history": SimpleNamespace(build=lambda columns: lorenz(1))})
+    request = Request(("phi",), "diffrax", {"times": (1.0,), "stop": 0.0, "num": 2, "solver": "Dopri8"})
+    (solver,) = history.ANALYSIS.solvers(system, request)
+    with pytest.raises(
+        InputError, match=r"^system = 'lorenz': has 3 components; history allows two, an angle and its rate$"
+    ):
+        solver.effort({})

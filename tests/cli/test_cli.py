@@ -336,6 +336,23 @@ def test_list(cli):
         assert part in out
 
 
+def test_a_package_that_fails_spoils_no_other_system(cli, tmp_path, monkeypatch):
+    info = tmp_path / "site" / "broken-1.dist-info"
+    info.mkdir(parents=True)
+    (info.parent / "broken_shafts.py").write_text("from drivetrain_jax.systems.cardan import SYSTEM\n1 / 0\n")
+    (info.parent / "renamed_shafts.py").write_text("from drivetrain_jax.systems.cardan import SYSTEM\n")
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1\n")
+    entries = "[drivetrain_jax.systems]\nbroken = broken_shafts:SYSTEM\nrenamed = renamed_shafts:SYSTEM\n"
+    (info / "entry_points.txt").write_text(entries)
+    monkeypatch.syspath_prepend(str(info.parent))
+    code, out, _ = cli("list")
+    fails = "broken_shafts:SYSTEM cannot be loaded: ZeroDivisionError: division by zero"
+    assert code == 0 and "cardan     Cardan" in out and f"broken     {fails}" in out
+    assert "renamed    renamed_shafts:SYSTEM is the system cardan, not the system renamed" in out
+    code, _, err = cli("list", "broken")
+    assert (code, err) == (2, [f"drivetrain: system = 'broken': {fails}"])
+
+
 def test_list_shows_the_scenes_of_this_folder(cli, folder):
     (folder / "sweeps").mkdir()
     (folder / "sweeps" / "one.toml").write_text('title = "Hello"\nsystem = "cardan"')

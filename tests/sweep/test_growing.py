@@ -88,6 +88,7 @@ def test_a_result_that_would_lose_points_is_not_replaced(tmp_path):
     with pytest.raises(InputError, match=r"axes.b has 1 values from 1 to 1, had 2 values from 1 to 3"):
         run_to_file(part, path)
     assert path.read_bytes() == before and status(part, path).state == "stale"
+    assert status(part, path).reason.endswith("--reuse r.nc with another --out takes 11 points from it")
     assert counts(run_to_file(part, tmp_path / "other.nc", reuse=[path])) == (41, 30, 11)
     agree(tmp_path / "other.nc", part)
     assert counts(run_to_file(part, path, fresh=True)) == (41, 41, 0)

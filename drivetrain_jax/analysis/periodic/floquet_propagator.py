@@ -70,6 +70,9 @@ ANALYSIS = Analysis(
     variables=VARIABLES,
     default_outputs=(PROPAGATOR, CHANGE),
     methods={"direct": ("rtol",)},
+    method_titles={
+        "direct": "direct solves of floquet at the nodes of Chebyshev panels",
+    },
     options=(RTOL,),
     solvers=_solvers,
     dimensions=_dimensions,
