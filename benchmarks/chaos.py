@@ -96,7 +96,7 @@ class Contender:
 def _compiled(function: Callable, *arguments: Any) -> Any:
     import jax
 
-    from drivetrain_jax.store.provenance import instruction_set
+    from drivetrain_jax._machine import instruction_set
 
     # As the package's engine compiles.
     options = {"xla_cpu_prefer_vector_width": 512} if "avx512f" in instruction_set() else None

@@ -15,7 +15,7 @@ from typing import Any
 
 from benchmarks.cardan_reference import BASE_CASE
 from benchmarks.timing import PROCESSES, interleaved, median
-from drivetrain_jax.store.provenance import usable_cores
+from drivetrain_jax._machine import usable_cores
 from drivetrain_jax.sweep import toml
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.executor import Where, run_threads

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivetrain_jax.atlas.criteria import Criteria, parameters_at
+from drivetrain_jax.atlas.criteria import LIMITING, Criteria, parameters_at
 from drivetrain_jax.atlas.exclusion import critical_points
-from drivetrain_jax.atlas.growth import growth
+from drivetrain_jax.atlas.growth import growth, monodromy_error
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.patches import Patches, patches_of
 from drivetrain_jax.atlas.roots import on_line, roots
@@ -26,8 +26,6 @@ from drivetrain_jax.systems import System
 _LINES = 8
 # Newton's steps of the last polish and the largest relative shift it may make.
 _POLISH, _LARGEST_SHIFT = 2, 1e-4
-# Growth rate of the largest multiplier up to which a point of the curve bounds the stable region.
-_LIMITING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,7 @@ def boundaries(atlas: Atlas, system: System) -> tuple[Boundary, ...]:
     criteria = Criteria.of(atlas, system)
     patches = patches_of(criteria)
     found: list[Boundary] = []
-    horizontal = _horizontal(atlas, system)
+    horizontal = _narrow_axis(atlas, system)
     for number, kind in enumerate(criteria.multipliers):
         field = Field(patches[number])
         curves: list[Curve] = []
@@ -77,7 +75,7 @@ def boundaries(atlas: Atlas, system: System) -> tuple[Boundary, ...]:
     return tuple(found)
 
 
-def _horizontal(atlas: Atlas, system: System) -> int:
+def _narrow_axis(atlas: Atlas, system: System) -> int:
     """The coordinate along which tongues are narrow: the axis of the resonances, else the second one."""
     axis = system.resonances.axis if system.resonances else ""
     return atlas.parameters.index(axis) if axis in atlas.parameters else 1
@@ -132,7 +130,8 @@ def _line_seeds(field: Field) -> Iterator[np.ndarray]:
 def _finish(criteria: Criteria, patches: Patches, field: Field, kind: str, curve: Curve) -> Boundary:
     """Polish the points of a curve with the multiplier itself and attach bounds."""
     atlas = criteria.atlas
-    x, error = _polish(criteria, field, kind, curve.points)
+    # Newton's method takes points of the rim outside by rounding.
+    x, error = _polish(criteria, field, kind, np.clip(curve.points, field.lower, field.upper))
     value, gradient = field(field.to_unit(x))
     place = patches.locate(x)[0]
     with np.errstate(all="ignore"):
@@ -146,16 +145,16 @@ def _finish(criteria: Criteria, patches: Patches, field: Field, kind: str, curve
         kind,
         dict(zip(atlas.parameters, point.T, strict=True)),
         dict(zip(atlas.parameters, error.T, strict=True)),
-        np.log(criteria.spectral_radius(x)) <= _LIMITING + _rate_error(criteria, x),
+        np.log(criteria.spectral_radius(x)) <= LIMITING + _rate_error(criteria, x),
         curve.closed,
     )
 
 
 def _rate_error(criteria: Criteria, x: np.ndarray) -> np.ndarray:
-    """Error of the largest multiplier where it may be double: the square root of that of Phi, without damping."""
+    """Error of the growth rate where two multipliers are one, without damping: the square root of that of Z."""
     if not criteria.conservative:
         return np.zeros(len(x))
-    return np.full(len(x), 1e-4)
+    return np.sqrt(monodromy_error(criteria, x, criteria.propagator(x)))
 
 
 def _polish(criteria: Criteria, field: Field, kind: str, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -92,7 +92,7 @@ Exploration = Generator[np.ndarray, np.ndarray, Parts]
 
 
 @dataclass
-class Progress:
+class Exploring:
     """A box that is being explored."""
 
     box: Box

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax._machine import usable_cores
 from drivetrain_jax._threads import threads
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, in_one_kernel
@@ -23,7 +24,6 @@ from drivetrain_jax.atlas.floquet_quantity import Build
 from drivetrain_jax.atlas.interpolation import nodes
 from drivetrain_jax.atlas.panels import Panel, chebyshev
 from drivetrain_jax.atlas.tiles import NODES, Tile, filled_up
-from drivetrain_jax.store.provenance import usable_cores
 from drivetrain_jax.systems import FloquetModel
 
 # Most rows and columns of a tile. The columns of a row are the lanes of all loops: so few are not cut into parallel tasks.

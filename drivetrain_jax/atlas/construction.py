@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivetrain_jax.atlas.box import TROUBLED_DEPTH, Box, Exploration, Progress, Settings
+from drivetrain_jax.atlas.box import TROUBLED_DEPTH, Box, Exploration, Exploring, Settings
 from drivetrain_jax.atlas.fitting import fit
 from drivetrain_jax.atlas.lines import probe
 from drivetrain_jax.atlas.panels import Atlas, Gap, Panel, inside
@@ -231,9 +231,9 @@ def _vouched(atlas: Atlas, settings: Settings, ledger: Ledger, size: int) -> Atl
 
 def explore(box: Box, settings: Settings) -> Exploration:
     """Asks for values at points in coordinates; returns what became of the box."""
-    progress = Progress(box, settings)
-    found = yield from probe(progress)
-    return (yield from fit(progress, found)) if isinstance(found, list) else found
+    exploring = Exploring(box, settings)
+    found = yield from probe(exploring)
+    return (yield from fit(exploring, found)) if isinstance(found, list) else found
 
 
 def run(rounds: Rounds, solve: Callable[[np.ndarray], np.ndarray]) -> Atlas:

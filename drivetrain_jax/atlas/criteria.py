@@ -26,10 +26,14 @@ import jax
 import numpy as np
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.atlas.panels import Atlas, Panel, chebyshev, position
+from drivetrain_jax.atlas import interpolation
+from drivetrain_jax.atlas.panels import Atlas, Panel, derivative, position
 from drivetrain_jax.systems import System
 
 PLUS, MINUS, PAIR = "+1", "-1", "pair"
+# A zero bounds the stable region if no multiplier grows faster than this, which rounding makes of none at all; others lie
+# in a region that is unstable anyway.
+LIMITING = 1e-6
 _STATES = 4
 # Points for which the determinant is computed at once: few shapes, hence few compilations.
 _BLOCKS = (64, 512, 4096)
@@ -78,7 +82,8 @@ class Criteria:
         values = np.full((_STATES**2, len(x)), np.nan)
         for number in np.unique(found[found >= 0]):
             mine = found == number
-            values[:, mine] = at_points(self.atlas.panels[number], x[mine], order)
+            panel = self.atlas.panels[number]
+            values[:, mine] = interpolation.evaluate(derivative(panel, order), position(panel, x[mine])).T
         return values
 
     def log_determinant(self, x: np.ndarray) -> np.ndarray:
@@ -162,31 +167,6 @@ def parameters_at(atlas: Atlas, x: np.ndarray) -> np.ndarray:
     """Parameters of points in coordinates, ``(..., d)``, kept inside the domain against rounding; NaN stays NaN."""
     ends = atlas.to_coordinates(np.stack([atlas.lower, atlas.upper]))
     return np.clip(atlas.to_parameters(np.clip(x, ends.min(axis=0), ends.max(axis=0))), atlas.lower, atlas.upper)
-
-
-def at_points(panel: Panel, x: np.ndarray, order: tuple[int, ...] = ()) -> np.ndarray:
-    """Values of a panel at points in coordinates, ``(N, d) -> (m, N)``, or the derivative of ``order`` per coordinate."""
-    coefficients = panel.coefficients
-    for axis, times in enumerate(order):
-        if times:
-            scale = 2 / (panel.upper[axis] - panel.lower[axis])
-            coefficients = np.polynomial.chebyshev.chebder(coefficients, times, scl=scale, axis=axis)
-    t = position(panel, x)
-    # The first axis for all points at once, then one axis after the other point by point.
-    total = np.tensordot(chebyshev(t[:, 0], coefficients.shape[0]), coefficients, axes=1)
-    for axis in range(1, t.shape[1]):
-        total = np.einsum("ni,ni...->n...", chebyshev(t[:, axis], total.shape[1]), total)
-    return np.moveaxis(total, 0, -1)
-
-
-def on_grid(panel: Panel, axes: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Values of a panel on the tensor grid of ``axes`` (in coordinates), ``(m, N_1, ..., N_d)``."""
-    total = np.moveaxis(panel.coefficients, -1, 0)
-    for k, axis in enumerate(axes):
-        t = (2 * axis - panel.lower[k] - panel.upper[k]) / (panel.upper[k] - panel.lower[k])
-        basis = chebyshev(np.clip(t, -1.0, 1.0), panel.degrees[k])
-        total = np.tensordot(total, basis, axes=((1,), (1,)))
-    return total
 
 
 def monodromy(phi: np.ndarray, transposed: np.ndarray | None = None) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drivetrain_jax.atlas import decay
-from drivetrain_jax.atlas.box import Exploration, Parts, Progress, Sample
+from drivetrain_jax.atlas.box import Exploration, Exploring, Parts, Sample
 from drivetrain_jax.atlas.interpolation import coefficients, evaluate, slabs
 from drivetrain_jax.atlas.panels import Panel
 from drivetrain_jax.atlas.quantity import distance
@@ -22,28 +22,28 @@ _MAX_GROWTHS = 2
 _MAX_TENSOR, _MAX_NUMBERS = 300_000, 30_000_000
 
 
-def fit(progress: Progress, degrees: list[int]) -> Exploration:
+def fit(exploring: Exploring, degrees: list[int]) -> Exploration:
     """A panel of about ``degrees`` nodes, or what becomes of the box instead."""
     d = len(degrees)
-    most = min(_MAX_TENSOR, _MAX_NUMBERS // progress.settings.quantity.size)
+    most = min(_MAX_TENSOR, _MAX_NUMBERS // exploring.settings.quantity.size)
     for growth in range(_MAX_GROWTHS + 1):
         if np.prod(degrees, dtype=float) > most:
-            return progress.split(int(np.argmax(degrees)), f"more than {most} nodes would be needed")
-        checks = _checks(progress)
+            return exploring.split(int(np.argmax(degrees)), f"more than {most} nodes would be needed")
+        checks = _checks(exploring)
         extra = scattered(_HELD_OUT, d) if growth == 0 else np.empty((0, d))
-        values, fresh = yield from progress.tensor(degrees, extra)
+        values, fresh = yield from exploring.tensor(degrees, extra)
         if not np.isfinite(values).all() or not np.isfinite(fresh).all():
-            return progress.failed(np.concatenate([values, fresh]))
-        x = np.concatenate([checks.x, progress.box.place(extra)])
+            return exploring.failed(np.concatenate([values, fresh]))
+        x = np.concatenate([checks.x, exploring.box.place(extra)])
         checks = Sample(x, np.concatenate([checks.values, fresh]))
         tensor = coefficients(values, degrees)
-        panel, tails, limit = _judge(progress, tensor, values, checks)
+        panel, tails, limit = _judge(exploring, tensor, values, checks)
         if panel is not None:
             return (panel,)
         if any(decay.is_noise(slabs(tensor, k)) for k in range(d) if tails[k] > 1 and degrees[k] > 24):
-            return progress.give_up("the direct solves scatter more than the tolerance allows")
+            return exploring.give_up("the direct solves scatter more than the tolerance allows")
         degrees = _grown(tensor, tails, limit)
-    return _unresolved(progress, tails)
+    return _unresolved(exploring, tails)
 
 
 def scattered(count: int, d: int) -> np.ndarray:
@@ -55,27 +55,27 @@ def scattered(count: int, d: int) -> np.ndarray:
     return np.cos(np.pi * fractions)
 
 
-def _checks(progress: Progress) -> Sample:
+def _checks(exploring: Exploring) -> Sample:
     """Solves that are no nodes of the next tensor, evenly thinned out."""
-    d = len(progress.box.lower)
-    none = Sample(np.empty((0, d)), np.empty((0, progress.settings.quantity.size)))
-    samples = [none, *progress.box.known, *progress.solved]
+    d = len(exploring.box.lower)
+    none = Sample(np.empty((0, d)), np.empty((0, exploring.settings.quantity.size)))
+    samples = [none, *exploring.box.known, *exploring.solved]
     x = np.concatenate([s.x for s in samples])
     values = np.concatenate([s.values for s in samples])
-    most = _ROUGH_CHECKS if progress.settings.rough else _MAX_CHECKS
+    most = _ROUGH_CHECKS if exploring.settings.rough else _MAX_CHECKS
     chosen = np.linspace(0, len(x) - 1, min(len(x), most)).astype(int)
     return Sample(x[chosen], values[chosen])
 
 
 def _judge(
-    progress: Progress, tensor: np.ndarray, values: np.ndarray, checks: Sample
+    exploring: Exploring, tensor: np.ndarray, values: np.ndarray, checks: Sample
 ) -> tuple[Panel | None, np.ndarray, float]:
     """The panel if it is good enough; what each coordinate leaves out over its limit; that limit."""
-    quantity, tolerance = progress.settings.quantity, progress.settings.tolerance
-    t = progress.box.position(checks.x)
+    quantity, tolerance = exploring.settings.quantity, exploring.settings.tolerance
+    t = exploring.box.position(checks.x)
     few = values[:: -(-len(values) // _SCALES)]
     scale = quantity.scale(np.concatenate([few, checks.values]))
-    limit, spare = tolerance * scale.min(), 1.0 if progress.settings.rough else 0.5
+    limit, spare = tolerance * scale.min(), 1.0 if exploring.settings.rough else 0.5
     tails = np.array([decay.remainder(slabs(tensor, k), limit) for k in range(tensor.ndim - 1)]) / (spare * limit)
     tensor = np.where(np.max(np.abs(tensor), axis=-1, keepdims=True) > _NEGLIGIBLE * limit, tensor, 0.0)
     fitted = evaluate(tensor, t)
@@ -85,7 +85,7 @@ def _judge(
     errors = distance(fitted, checks.values)
     derived = np.abs(quantity.derived(fitted) - quantity.derived(checks.values))
     bounds = float(_SAFETY * errors.max()), _SAFETY * derived.max(axis=0, initial=0.0)
-    return Panel(progress.box.lower, progress.box.upper, tensor, *bounds), tails, spare * limit
+    return Panel(exploring.box.lower, exploring.box.upper, tensor, *bounds), tails, spare * limit
 
 
 def _grown(tensor: np.ndarray, tails: np.ndarray, limit: float) -> list[int]:
@@ -97,6 +97,6 @@ def _grown(tensor: np.ndarray, tails: np.ndarray, limit: float) -> list[int]:
     return [decay.extrapolated(s, limit) if tail > 1 else n for n, s, tail in zip(degrees, sizes, tails, strict=True)]
 
 
-def _unresolved(progress: Progress, tails: np.ndarray) -> Parts:
+def _unresolved(exploring: Exploring, tails: np.ndarray) -> Parts:
     axis = int(np.argmax(tails)) if tails.max() > 1 else None
-    return progress.trouble("not resolved where its edges are: not smooth", axis)
+    return exploring.trouble("not resolved where its edges are: not smooth", axis)

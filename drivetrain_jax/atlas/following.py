@@ -12,12 +12,14 @@ from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.tips import Tip, find_tips, polish
 from drivetrain_jax.systems import System
 
-# Newton's steps on the boundary function, the stencil's steps and the largest shift of a polish, relative to the domain.
+# Newton's steps on the boundary function.
 _NEWTON = 8
 # Into how many pieces a step is divided, one after the other, for the tips that it loses.
 _PIECES = (1, 4, 16)
+# The stencil's steps along the speed and along the other parameter, and the largest shift of a polish, of the domain.
 _ACROSS, _ALONG = 2e-4, 1e-3
 _LARGEST_SHIFT = 1e-3
+# Weights of the first and the second derivative, of order 6.
 _FIRST = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60
 _SECOND = np.array([2.0, -27.0, 270.0, -490.0, 270.0, -27.0, 2.0]) / 180
 

@@ -54,8 +54,7 @@ def growth(criteria: Criteria, x: np.ndarray, kinds: list[str], *, second: bool 
         with np.errstate(invalid="ignore"):
             hessian = _second(criteria, x, phi, first, dz, (sigma, right, left, chosen, ds))
     size = np.linalg.norm(xr, axis=1) * np.linalg.norm(yl, axis=1)
-    scale = np.sqrt((phi**2).sum(axis=0))
-    error = 2 * scale * (_value_error(criteria, x) + 8 * np.finfo(float).eps * scale) * size / np.abs(s)
+    error = monodromy_error(criteria, x, phi) * size / np.abs(s)
     with np.errstate(invalid="ignore"):
         return Growth(np.log(np.abs(s)), (ds / s[:, None]).real, hessian, s, error)
 
@@ -118,7 +117,10 @@ def _derivatives(criteria: Criteria, x: np.ndarray, order: int) -> list | dict:
     return {(i, j): criteria.propagator(x, tuple(int(k == i) + int(k == j) for k in range(d))) for i, j in pairs}
 
 
-def _value_error(criteria: Criteria, x: np.ndarray) -> np.ndarray:
+def monodromy_error(criteria: Criteria, x: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    """Bound of the norm of the error of Z at points where the propagator is ``phi``, ``(N,)``; inf outside the panels."""
     found = criteria.atlas.find(x)
     errors = np.array([panel.value_error for panel in criteria.atlas.panels])
-    return np.where(found >= 0, errors[np.maximum(found, 0)], np.inf)
+    error = np.where(found >= 0, errors[np.maximum(found, 0)], np.inf)
+    size = np.sqrt((phi**2).sum(axis=0))
+    return 2 * size * (error + 8 * np.finfo(float).eps * size)

@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 
 from drivetrain_jax.atlas import decay
-from drivetrain_jax.atlas.box import Parts, Progress
+from drivetrain_jax.atlas.box import Exploring, Parts
 from drivetrain_jax.atlas.interpolation import envelope
 
 # Points of a line at first; each refinement doubles the intervals.
@@ -55,16 +55,16 @@ def _along(corner: np.ndarray, axis: int, t: np.ndarray) -> np.ndarray:
     return points
 
 
-def probe(progress: Progress) -> Probe:
+def probe(exploring: Exploring) -> Probe:
     """Nodes that each coordinate needs according to lines along the edges, or what becomes of the box instead."""
-    d = len(progress.box.lower)
+    d = len(exploring.box.lower)
     places = [(axis, corner) for axis in range(d) for corner in _corners(d, axis)]
     t = np.concatenate([_along(corner, axis, decay.lobatto(_LINE)) for axis, corner in places])
-    values = yield from progress.line(t)
+    values = yield from exploring.line(t)
     if not np.isfinite(values).all():
-        return progress.failed(values)
-    fraction, margin = _MANY if d > 2 else _ROUGH if progress.settings.rough else _THOROUGH
-    limit = progress.settings.limit(values) * fraction
+        return exploring.failed(values)
+    fraction, margin = _MANY if d > 2 else _ROUGH if exploring.settings.rough else _THOROUGH
+    limit = exploring.settings.limit(values) * fraction
     lines = [_Line(*place, v) for place, v in zip(places, np.split(values, len(places)), strict=True)]
 
     def cost(line: _Line) -> tuple[float, float]:
@@ -72,41 +72,41 @@ def probe(progress: Progress) -> Probe:
         return decay.needed(sizes, limit) or np.inf, envelope(sizes)[-3]
 
     worst = [max((line for line in lines if line.axis == axis), key=cost) for axis in range(d)]
-    return (yield from _refine(progress, worst, limit, margin))
+    return (yield from _refine(exploring, worst, limit, margin))
 
 
-def _refine(progress: Progress, lines: list[_Line], limit: float, margin: int) -> Probe:
+def _refine(exploring: Exploring, lines: list[_Line], limit: float, margin: int) -> Probe:
     """Refine the worst line of each coordinate until all are resolved, or one is hopeless."""
     while open_lines := [line for line in lines if decay.foreseen(line.sizes, limit) is None]:
         for line in open_lines:
-            hopeless = _verdict(line, progress)
+            hopeless = _verdict(line, exploring)
             if hopeless:
                 return hopeless
         t = [_along(line.corner, line.axis, decay.lobatto(2 * len(line.values) - 1)[1::2]) for line in open_lines]
-        values = yield from progress.line(np.concatenate(t))
+        values = yield from exploring.line(np.concatenate(t))
         if not np.isfinite(values).all():
-            return progress.failed(values)
+            return exploring.failed(values)
         for line, new in zip(open_lines, np.split(values, np.cumsum([len(x) for x in t])[:-1]), strict=True):
             merged = np.empty((2 * len(line.values) - 1, values.shape[1]))
             merged[::2], merged[1::2] = line.values, new
             lines[line.axis] = replace(line, values=merged)
     degrees = [decay.foreseen(line.sizes, limit) + margin for line in lines]
     largest = int(np.argmax(degrees))
-    if degrees[largest] > progress.settings.max_nodes:
-        return progress.split(largest, f"more than {progress.settings.max_nodes} nodes would be needed")
+    if degrees[largest] > exploring.settings.max_nodes:
+        return exploring.split(largest, f"more than {exploring.settings.max_nodes} nodes would be needed")
     return degrees
 
 
-def _verdict(line: _Line, progress: Progress) -> Parts | None:
+def _verdict(line: _Line, exploring: Exploring) -> Parts | None:
     """What becomes of the box if ``line`` is no use refining; None if it is."""
     if len(line.values) <= 2 * _LINE:
         return None
     sizes = line.sizes
     if decay.is_noise(sizes):
         level = envelope(sizes)[len(sizes) // 2] / sizes[0]
-        return progress.give_up(f"the direct solves scatter by {level:.0e}, more than the tolerance allows")
+        return exploring.give_up(f"the direct solves scatter by {level:.0e}, more than the tolerance allows")
     if decay.is_algebraic(sizes):
-        return progress.trouble("not smooth: the coefficients fall like a power", line.axis)
-    if len(line.values) > progress.settings.max_nodes:
-        return progress.split(line.axis, "not resolved")
+        return exploring.trouble("not smooth: the coefficients fall like a power", line.axis)
+    if len(line.values) > exploring.settings.max_nodes:
+        return exploring.split(line.axis, "not resolved")
     return None

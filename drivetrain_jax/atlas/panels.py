@@ -8,7 +8,7 @@ one per parameter; parameters are converted at the door. With x in [-1, 1]^d the
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -131,9 +131,24 @@ def position(panel: Panel | Gap, x: np.ndarray) -> np.ndarray:
     return position_between(panel.lower, panel.upper, x)
 
 
+def grid_positions(panel: Panel | Gap, axes: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The same for the points of a grid, from its ``axes`` ``(N_k,)``."""
+    return [position_between(*ends) for ends in zip(panel.lower, panel.upper, axes, strict=True)]
+
+
 def position_between(lower: np.ndarray, upper: np.ndarray, x: np.ndarray) -> np.ndarray:
     """-1 where ``x`` is ``lower``, 1 where it is ``upper``."""
     return np.clip(((x - lower) - (upper - x)) / (upper - lower), -1.0, 1.0)
+
+
+def derivative(panel: Panel, order: Sequence[int]) -> np.ndarray:
+    """Coefficients of the derivative of ``order`` per coordinate; no ``order`` leaves the function itself."""
+    coefficients = panel.coefficients
+    for axis, times in enumerate(order):
+        if times:
+            scale = 2 / (panel.upper[axis] - panel.lower[axis])
+            coefficients = np.polynomial.chebyshev.chebder(coefficients, times, scl=scale, axis=axis)
+    return coefficients
 
 
 def chebyshev(x: np.ndarray, n: int) -> np.ndarray:
@@ -164,7 +179,6 @@ def _fix(box: Panel | Gap, k: int, x: float) -> Panel | Gap:
     lower, upper = np.delete(box.lower, k), np.delete(box.upper, k)
     if isinstance(box, Gap):
         return Gap(lower, upper, box.reason)
-    t = np.clip((2 * x - box.lower[k] - box.upper[k]) / (box.upper[k] - box.lower[k]), -1.0, 1.0)
-    weights = chebyshev(np.asarray(t), box.degrees[k])
+    weights = chebyshev(position_between(box.lower[k], box.upper[k], x), box.degrees[k])
     coefficients = np.tensordot(weights, box.coefficients, axes=(0, k))
     return replace(box, lower=lower, upper=upper, coefficients=coefficients)

@@ -14,7 +14,7 @@ from itertools import accumulate
 import numpy as np
 
 from drivetrain_jax.atlas import interpolation
-from drivetrain_jax.atlas.panels import Atlas, Panel, position, position_between
+from drivetrain_jax.atlas.panels import Atlas, Panel, grid_positions, position
 from drivetrain_jax.atlas.quantity import Quantity
 
 # Of the errors that the product may have the parts take this share, by an estimate, and by comparison of the product itself
@@ -89,7 +89,7 @@ class Product:
     def on_grid(self, axes: Sequence[np.ndarray]) -> np.ndarray:
         """The same at all points of a grid, in C order, from its ``axes``."""
         panel = self._panel(np.array([axis.mean() for axis in axes]))
-        t = [position_between(*ends) for ends in zip(panel.lower, panel.upper, axes, strict=True)]
+        t = grid_positions(panel, axes)
         size = panel.coefficients.shape[-1] // self._count
         n = math.isqrt(size)
         parts = (

@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drivetrain_jax.atlas.criteria import Criteria, on_grid
-from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
-from drivetrain_jax.atlas.panels import Panel, chebyshev
+from drivetrain_jax.atlas.criteria import Criteria
+from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes, on_grid
+from drivetrain_jax.atlas.panels import Panel, chebyshev, grid_positions
 
 # Nodes of a patch in each coordinate, tail of the series relative to its size, and the largest number of patches.
 NODES = 16
@@ -241,7 +241,7 @@ def _sample(criteria: Criteria, panel: Panel, counts: list[int]) -> _Sample:
     edges = [np.linspace(panel.lower[k], panel.upper[k], counts[k] + 1) for k in range(d)]
     t = nodes(NODES)
     axes = tuple((e[:-1, None] * (1 - t) / 2 + e[1:, None] * (1 + t) / 2).reshape(-1) for e in edges)
-    phi = on_grid(panel, axes)
+    phi = on_grid(panel.coefficients, grid_positions(panel, axes))
     log_determinant = criteria.log_determinant(_mesh(axes)).reshape(phi.shape[1:])
     split = tuple(n for count in counts for n in (count, NODES))
     order = (0, *range(2, 2 * d + 1, 2), *range(1, 2 * d + 1, 2))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drivetrain_jax.atlas.panels import position_between
 from drivetrain_jax.atlas.patches import MARGIN, Patches
 
 # Smallest interval relative to the whole line; halvings that find a zero to rounding.
@@ -31,10 +32,7 @@ def on_line(patches: Patches, axis: int, value: float) -> Patches:
     lower, upper = patches.lower[:, axis], patches.upper[:, axis]
     top = value >= upper.max()
     crossed = patches.take((upper >= value) & (lower < value) if top else (lower <= value) & (value < upper))
-    t = (2 * value - crossed.lower[:, axis] - crossed.upper[:, axis]) / (
-        crossed.upper[:, axis] - crossed.lower[:, axis]
-    )
-    return crossed.restrict(axis, t)
+    return crossed.restrict(axis, position_between(crossed.lower[:, axis], crossed.upper[:, axis], value))
 
 
 def roots(patches: Patches) -> Roots:

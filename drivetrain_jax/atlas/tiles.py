@@ -16,7 +16,7 @@ from jax import Array
 
 from drivetrain_jax.atlas.evaluation import common_degrees, padded_tensor
 from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
-from drivetrain_jax.atlas.panels import Atlas, Panel, chebyshev
+from drivetrain_jax.atlas.panels import Atlas, Panel, chebyshev, position_between
 
 # Nodes of a dense tile, and the angle arccos(t) that it may span, times the degree of its panel: the highest polynomial
 # runs through 5.5 rad to either side of the middle, where the 24th coefficient of an oscillation is 1e-13, and those that
@@ -172,8 +172,7 @@ def filled_up(rows: np.ndarray, size: int) -> np.ndarray:
 
 
 def _positions(panel: Panel, k: int, x: np.ndarray) -> np.ndarray:
-    lower, upper = panel.lower[k], panel.upper[k]
-    return np.clip(((x - lower) - (upper - x)) / (upper - lower), -1.0, 1.0)
+    return position_between(panel.lower[k], panel.upper[k], x)
 
 
 def _assigned(atlas: Atlas, axes: Sequence[np.ndarray]) -> Iterator[tuple[Panel, list[np.ndarray]]]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivetrain_jax.atlas.criteria import Criteria, parameters_at
+from drivetrain_jax.atlas.criteria import LIMITING, Criteria, parameters_at
 from drivetrain_jax.atlas.exclusion import critical_points
 from drivetrain_jax.atlas.growth import Growth, growth
 from drivetrain_jax.atlas.panels import Atlas
@@ -24,8 +24,6 @@ from drivetrain_jax.atlas.undamped import undamped_tips
 from drivetrain_jax.systems import Resonances, System
 
 _POLISH = 8
-# Beyond this growth rate of another multiplier a point is inside a region that is unstable anyway.
-_LIMITING = 1e-6
 # How far the foot of a ridge may lie from a prediction, relative; and how much nearer than to the next one.
 _NEAR, _CLEAR = 0.02, 3.0
 _HIGHEST_ORDER = 60
@@ -75,7 +73,7 @@ def find_tips(atlas: Atlas, system: System, *, opening: bool = True) -> Tips:
 
     With ``opening=False`` also the places where tongues close or meet. Raises ``ValueError`` for other atlases.
     """
-    horizontal = _horizontal(atlas, system)
+    horizontal = _axis_of_resonances(atlas, system)
     criteria = Criteria.of(atlas, system)
     if criteria.conservative:
         tips = tuple(_named(t, atlas) for t in undamped_tips(criteria, horizontal, _predictions(atlas, system)))
@@ -144,7 +142,7 @@ def _describe(criteria: Criteria, kind: str, h: int, points: tuple, opens: np.nd
     errors = _errors(rates, h)
     found = []
     for i in range(len(x)):
-        if not largest[i] <= _LIMITING:
+        if not largest[i] <= LIMITING:
             continue
         point, slope = parameters_at(atlas, x[i]), [c.slope for c in atlas.coordinates]
         scale = np.array([abs(float(slope[k](point[k]))) for k in range(2)])
@@ -179,7 +177,8 @@ def _rises(criteria: Criteria, v: int) -> float:
     return 1.0 if ends[1] > ends[0] else -1.0
 
 
-def _horizontal(atlas: Atlas, system: System) -> int:
+def _axis_of_resonances(atlas: Atlas, system: System) -> int:
+    """The coordinate of the axis of the system's resonances; ``ValueError`` for an atlas without it."""
     axis = system.resonances.axis if system.resonances else ""
     if len(atlas.parameters) != 2 or axis not in atlas.parameters:
         names = ", ".join(atlas.parameters)

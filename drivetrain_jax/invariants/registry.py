@@ -36,7 +36,8 @@ def _all_multipliers(compare: Callable[[xr.DataArray, xr.Dataset], xr.DataArray]
 
 def _liouville(ds: xr.Dataset) -> xr.DataArray:
     """A coefficient's error ``e`` moves the outermost of n roots by at least ``e / 2^n`` (in units of rho)."""
-    # Of how many roots is known where all multipliers are stored; most systems have four states.
+    # Of how many roots is known where all multipliers are stored. Elsewhere as many as cardan has, the most of any system of
+    # this package (tripod has two): a number too large overlooks more, one too small faults what is right.
     n = ds.sizes.get("multiplier", 4)
     return abs(ds["liouville_residual"]) > 2**n * ds["spectral_radius_error"] / ds["spectral_radius"]
 

@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.store.provenance import usable_cores
+from drivetrain_jax._machine import usable_cores
 
 ATTRIBUTE = "checksums"
 # The name of the root group stands for the attributes of the file.

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import drivetrain_jax
+from drivetrain_jax._machine import machine
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.store import provenance
@@ -213,6 +214,6 @@ def result_attrs(scene: Scene) -> dict[str, str]:
         "fixed_parameters": json.dumps(fixed),
         "drivetrain_jax_version": drivetrain_jax.__version__,
         "versions": ", ".join(f"{name} {number}" for name, number in installed.items()),
-        "machine": provenance.machine(),
+        "machine": machine(),
         "created": provenance.now(),
     }

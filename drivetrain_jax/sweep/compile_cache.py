@@ -8,7 +8,8 @@ from pathlib import Path
 
 import jax
 
-from drivetrain_jax.store.provenance import digest, instruction_set
+from drivetrain_jax._machine import instruction_set
+from drivetrain_jax.store.provenance import digest
 
 _VARIABLE = "DRIVETRAIN_JAX_CACHE"
 _MAX_BYTES = 1 << 29

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._machine import usable_cores
 from drivetrain_jax._threads import threads
-from drivetrain_jax.store.provenance import usable_cores
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.plan import Chunk
 

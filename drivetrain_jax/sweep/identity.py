@@ -13,8 +13,9 @@ from typing import Any
 import jax
 
 import drivetrain_jax
+from drivetrain_jax._machine import instruction_set
 from drivetrain_jax.analysis import Solver
-from drivetrain_jax.store.provenance import digest, instruction_set, source_digest, versions
+from drivetrain_jax.store.provenance import digest, source_digest, versions
 from drivetrain_jax.sweep.atlas_choice import uses_atlas
 from drivetrain_jax.sweep.scene import Scene
 

@@ -13,8 +13,8 @@ from functools import cached_property
 
 import numpy as np
 
+from drivetrain_jax._machine import usable_cores
 from drivetrain_jax.analysis import Solver
-from drivetrain_jax.store.provenance import usable_cores
 from drivetrain_jax.sweep.grid import Grid
 
 # Points that are sorted together, and those among them whose effort is predicted at a time (few stay in fast memory).

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._machine import physical_memory
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.consolidate import ResultFile, open_result, write_result
-from drivetrain_jax.store.provenance import physical_memory
 from drivetrain_jax.sweep import sharded
 from drivetrain_jax.sweep.assemble import Table, bytes_per_point, failures, to_dataset
 from drivetrain_jax.sweep.atlas_choice import uses_atlas

@@ -13,10 +13,10 @@ import msgspec
 import numpy as np
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._machine import physical_memory
 from drivetrain_jax._quantities import Dimension, Parameter
 from drivetrain_jax._wording import did_you_mean, nearest, shown
 from drivetrain_jax.analysis import OUTCOME, Analysis, Request, get_analysis
-from drivetrain_jax.store.provenance import physical_memory
 from drivetrain_jax.sweep import toml
 from drivetrain_jax.sweep.axes import MAX_POINTS, MAX_RANGES, Axis, AxisTable, check_count, entry_of, spread
 from drivetrain_jax.systems import Model, System, get_system, system_names

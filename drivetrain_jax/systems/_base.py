@@ -97,7 +97,8 @@ class Model:
 
     ``check(fixed)`` raises ``ValueError`` with one line, ``name = value: allowed is ...``, where parameters that are each
     in range do not fit together. ``fixed`` holds those that do not vary; a list is whole also if one entry varies.
-    ``smooth`` tells in which coordinates an atlas of the results is best made; None where there can be none.
+    ``smooth`` tells in which coordinates an atlas of the results is best made. None: in the parameters themselves, and only
+    where it is asked for (``method = "auto"`` then makes none).
     """
 
     build: Callable[[Values], Any]
@@ -128,6 +129,8 @@ class Resonances:
 class System:
     """A drivetrain model: see the module's docstring. ``presets`` are named parameter sets of the source.
 
+    An atlas is made of the results of ``floquet``: a model for ``atlas`` without one for it is refused (``ValueError``).
+
     ``time_units`` is the unit of the time of its equations, ``1`` if that is nondimensional. ``physical`` converts data in
     physical units to nondimensional parameters and back (pattern: ``cardan_units.PhysicalShaft``), None if the parameters
     have physical units themselves. ``roles`` names its ``speed`` (or frequency of excitation), which figures draw
@@ -144,6 +147,10 @@ class System:
     time_units: str = "1"
     physical: type | None = None
     roles: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if "atlas" in self.models and "floquet" not in self.models:
+            raise ValueError(f"models of {self.name}: atlas needs floquet as well")
 
     def parameter(self, name: str) -> Parameter:
         """The parameter called ``name``; ``KeyError`` if there is none."""

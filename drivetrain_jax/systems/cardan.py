@@ -222,7 +222,12 @@ def floquet_model(values: Values) -> FloquetModel:
         reversor=SWAP,
         log_determinant=exact,
     )
-    return FloquetModel(natural, reduced, lambda rtol: explicit_steps(values, rtol), lambda: values["zeta"] == 0)
+    return FloquetModel(
+        natural=natural,
+        reduced=reduced,
+        explicit_steps=lambda rtol: explicit_steps(values, rtol),
+        hamiltonian=lambda: values["zeta"] == 0,
+    )
 
 
 def forced_model(values: Values) -> ForcedModel:
@@ -254,10 +259,10 @@ def resonance_speeds(values: Values, orders: int = 3) -> np.ndarray:
     """
     omega = natural_frequencies(values["mu"], values["gamma"])
     one, two = omega[..., 0], omega[..., 1]
-    count = range(1, orders + 1)
-    harmonic = [w / (2 * k) for w in (one, two) for k in count]
-    subharmonic = [w / (2 * k - 1) for w in (one, two) for k in count]
-    combination = [w / (2 * k) for w in (two + one, two - one) for k in count]
+    ks = range(1, orders + 1)
+    harmonic = [w / (2 * k) for w in (one, two) for k in ks]
+    subharmonic = [w / (2 * k - 1) for w in (one, two) for k in ks]
+    combination = [w / (2 * k) for w in (two + one, two - one) for k in ks]
     return np.stack([*harmonic, *subharmonic, *combination], axis=-1)
 
 
@@ -265,13 +270,13 @@ def resonances(orders: int = 3) -> Resonances:
     """The predictions of :func:`resonance_speeds` with their labels (H12: first mode, order 2)."""
     families = {"H1": "+1", "H2": "+1", "S1": "-1", "S2": "-1", "C+": "pair", "C-": "pair"}
     return Resonances(
-        "Omega",
-        ("mu", "gamma"),
-        tuple(f"{family}{k}" for family in families for k in range(1, orders + 1)),
-        lambda values: resonance_speeds(values, orders),
-        "predicted parametric resonance",
-        tuple(kind for kind in families.values() for _ in range(orders)),
-        resonances,
+        axis="Omega",
+        parameters=("mu", "gamma"),
+        labels=tuple(f"{family}{k}" for family in families for k in range(1, orders + 1)),
+        values=lambda values: resonance_speeds(values, orders),
+        long_name="predicted parametric resonance",
+        multipliers=tuple(kind for kind in families.values() for _ in range(orders)),
+        up_to=resonances,
     )
 
 

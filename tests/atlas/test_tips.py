@@ -201,7 +201,8 @@ def test_a_tip_that_cannot_be_proved_is_listed_as_such(atlas):
     assert tip.name == "S21" and tip.opens and not tip.proved and not tips.complete
     assert tip.point == pytest.approx(dict(zip(("beta", "Omega"), TIPS["S21"], strict=True)), abs=1e-9)
     assert 1e-5 < tip.error["beta"] < 1e-3 and 1e-8 < tip.error["Omega"] < 1e-5
-    assert all(tip.proved for tip in find_tips(part, CARDAN).tips)
+    (tip,) = find_tips(part, CARDAN).tips
+    assert tip.proved
 
 
 def test_inside_an_unstable_region_there_is_no_tip(atlas):
@@ -308,6 +309,19 @@ def test_undamped_boundaries_separate_bounded_from_growing_motion(undamped):
     assert rates.min() < 1e-9 and rates.max() > 1e-5
     z = monodromy(propagators({**BASE, "zeta": 0.0, "beta": beta, "Omega": omega}, 1e-14))
     assert np.abs(np.linalg.eigvals(z) + 1).min() < 1e-2
+
+
+def test_what_is_limiting_without_damping_allows_for_a_loose_atlas():
+    """Multipliers that meet on the unit circle leave it by the root of the atlas's error; other tongues lead farther."""
+    fixed = {**BASE, "zeta": 0.0, "gamma": 1.0}
+    atlas = cardan_atlas({"beta": (0.6, 1.5), "Omega": (0.5, 2.0)}, 1e-3, fixed).atlas
+    outside, limiting = [], []
+    for curve in boundaries(atlas, CARDAN):
+        outside.append(rate(curve.points["beta"], curve.points["Omega"], zeta=0.0, gamma=1.0))
+        limiting.append(curve.limiting)
+    outside, limiting = np.concatenate(outside), np.concatenate(limiting)
+    assert outside[limiting].max() < 3e-3 and outside[~limiting].min() > 3e-2
+    assert limiting.sum() > 500 and (~limiting).sum() > 100
 
 
 def test_tips_followed_through_another_parameter():

@@ -16,7 +16,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from harness import ROOT, Bench, Record
 from kinds import KINDS
 
-from drivetrain_jax.store.provenance import machine, now
+from drivetrain_jax._machine import machine
+from drivetrain_jax.store.provenance import now
 
 BEGIN, END = "<!-- faults: written by `make faults` -->", "<!-- end of faults -->"
 

@@ -11,6 +11,7 @@ import pytest
 import xarray as xr
 
 from drivetrain_jax import InputError
+from drivetrain_jax._machine import machine, physical_memory, usable_cores
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.store import files, provenance
 from drivetrain_jax.store.consolidate import ResultFile, open_result, read_attribute, release, write_result
@@ -151,6 +152,6 @@ def test_digest_of_sources(tmp_path):
 
 
 def test_provenance_tells_machine_and_versions():
-    assert "cores" in provenance.machine() and "/" not in provenance.machine().split("Python")[1]
+    assert "cores" in machine() and "/" not in machine().split("Python")[1]
     assert provenance.versions(["numpy"]) == {"numpy": np.__version__}
-    assert provenance.usable_cores() >= 1 and provenance.physical_memory() > 1e8
+    assert usable_cores() >= 1 and physical_memory() > 1e8

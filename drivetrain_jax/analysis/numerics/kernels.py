@@ -18,7 +18,7 @@ import jaxlib
 from jax import Array
 from jax.experimental.xla_metadata import set_xla_metadata
 
-from drivetrain_jax.store.provenance import instruction_set
+from drivetrain_jax._machine import instruction_set
 
 P, R = ParamSpec("P"), TypeVar("R")
 

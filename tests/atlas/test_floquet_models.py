@@ -1,0 +1,35 @@
+"""What a system declares for its atlas: a model of `floquet` beside it, and coordinates, which it may leave out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.atlas_direct import BASE, CARDAN, direct_radius, propagators
+from drivetrain_jax.atlas import floquet_rounds, run, solve_rtol, stability_atlas
+
+
+def test_a_system_with_an_atlas_alone_is_refused():
+    models = {"atlas": CARDAN.models["atlas"]}
+    with pytest.raises(ValueError, match=r"^models of cardan: atlas needs floquet as well$"):
+        replace(CARDAN, models=models)
+    assert set(replace(CARDAN, models={**models, "floquet": CARDAN.models["floquet"]}).models) == {"atlas", "floquet"}
+
+
+def test_without_coordinates_of_its_own_an_atlas_is_made_in_the_parameters():
+    model = replace(CARDAN.models["atlas"], smooth=None)
+    plain = replace(CARDAN, models={**CARDAN.models, "atlas": model})
+    ranges, tolerance = {"beta": (0.3, 0.4), "Omega": (1.0, 1.2)}, 1e-8
+    fixed = {name: value for name, value in BASE.items() if name not in ranges}
+
+    def solve(points):
+        return propagators({**fixed, **dict(zip(ranges, points.T, strict=True))}, solve_rtol(tolerance))
+
+    atlas = stability_atlas(run(floquet_rounds(plain, ranges, fixed, tolerance), solve), plain, 1e-6)
+    assert [c.name for c in atlas.atlas.coordinates] == ["beta", "Omega"]
+    points = np.array([[0.31, 1.01], [0.35, 1.1], [0.39, 1.19]])
+    found, (radius, _) = atlas.at(points), direct_radius(atlas, points)
+    assert found["spectral_radius"] == pytest.approx(radius, abs=1e-7)
+    assert (np.abs(found["spectral_radius"] - radius) <= found["spectral_radius_error"]).all()
