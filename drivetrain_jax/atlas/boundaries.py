@@ -54,7 +54,11 @@ class Boundary:
 
 
 def boundaries(atlas: Atlas, system: System) -> tuple[Boundary, ...]:
-    """All boundary curves within ``atlas``, which has two parameters (``ValueError`` for another number)."""
+    """All boundary curves within ``atlas``, which has two parameters (``ValueError`` for another number).
+
+    Angles are given without their signs.
+    """
+    atlas = atlas.folded()
     if len(atlas.parameters) != 2:
         raise ValueError(f"parameters = {', '.join(atlas.parameters)}: allowed are two; slice the atlas first")
     criteria = Criteria.of(atlas, system)

@@ -40,7 +40,9 @@ _BLOCKS = (64, 512, 4096)
 
 
 def has_boundaries(atlas: Atlas, system: System) -> bool:
-    """Whether the system has four states and a reversor that exchanges two halves of them."""
+    """Whether the system has four states and a reversor that exchanges two halves of them, and ``atlas`` panels."""
+    if not atlas.panels:
+        return False
     corner = {**atlas.fixed, **dict(zip(atlas.parameters, atlas.lower, strict=True))}
     return system.models["floquet"].build(corner).reduced.exchanges_halves
 
@@ -58,6 +60,9 @@ class Criteria:
     conservative: bool = False
 
     def __post_init__(self) -> None:
+        if not self.atlas.panels:
+            reason = self.atlas.gaps[0].reason if self.atlas.gaps else "it covers nothing"
+            raise InputError(f"file: the atlas has no panel ({reason}); allowed is one whose solves converged")
         if not has_boundaries(self.atlas, self.system):
             raise InputError(
                 f"system = {self.system.name!r}: has no boundary functions; allowed for boundaries and what is asked of "

@@ -32,23 +32,29 @@ Direct = Callable[[Mapping[str, np.ndarray]], np.ndarray]
 _BOUNDS, _PART = 10.0, 1e-6
 # Points over a range at which a check solves, and those at which the largest spectral radius of a window is sought.
 _SAMPLES, _DENSE = 101, 801
+# By how much direct solves may miss the unit circle.
+_ON_THE_CIRCLE = 1e-6
 
 
 @dataclass(frozen=True)
 class Check:
     """Direct solves beside an answer: the largest spectral radius ``inside`` the range said to be stable, and ``beyond`` it.
 
-    ``beyond`` is NaN where the range ends with the atlas. ``agrees`` if inside < 1 < beyond.
+    ``beyond`` is NaN where the range ends with the atlas, or a tongue is too narrow to step into. ``agrees`` if
+    inside < 1 < beyond; without damping, where all multipliers of a stable point lie on the circle and two that meet there
+    are known to half the digits, inside is 1.
     """
 
     inside: float
     beyond: float
     solves: int
+    conservative: bool = False
 
     @property
     def agrees(self) -> bool:
         """Whether the direct solves confirm the answer."""
-        return self.inside < 1 and not self.beyond <= 1
+        within = self.inside <= 1 + _ON_THE_CIRCLE if self.conservative else self.inside < 1
+        return within and not self.beyond <= 1
 
 
 @dataclass(frozen=True)
@@ -148,7 +154,8 @@ def speed_windows(
         rho = criteria.spectral_radius(part.to_coordinates(values[:, None]))
         k = int(np.argmax(rho))
         window = Window(interval, (low, high), float(rho[k]), float(values[k]))
-        windows.append(_checked_window(window, part, system.roles["speed"], direct))
+        window = _checked_window(window, part, system.roles["speed"], line, direct)
+        windows.append(replace(window, check=_of_kind(window.check, criteria)))
     return Windows(tuple(windows), line.undecided)
 
 
@@ -201,7 +208,7 @@ def _extreme(atlas: Atlas, system: System, speeds: Range, sought: tuple[str, flo
     """Up to where, from the last value of ``sought`` (role, side) on that side, all ``speeds`` are stable."""
     role, side = sought
     name, speed = system.roles[role], system.roles["speed"]
-    part = narrow(atlas, {speed: speeds})
+    part = narrow(atlas, {speed: speeds}).folded()
     line = stability_over_range(part, system, speed)
     end = line.intervals[-1] if side > 0 else line.intervals[0]
     value, limit = (end.lower, end.lower_end) if side > 0 else (end.upper, end.upper_end)
@@ -209,7 +216,8 @@ def _extreme(atlas: Atlas, system: System, speeds: Range, sought: tuple[str, flo
         value, limit = None, None
     certain = value is not None and not any(max(side * a, side * b) >= side * value for a, b in _apart(line, limit))
     answer = Answer(name, value, limit.error if limit else 0.0, limit, line.intervals, line.undecided, certain)
-    return _checked(answer, part, speed, side, direct)
+    found = _checked(answer, part, speed, side, direct)
+    return replace(found, check=_of_kind(found.check, Criteria.of(part, system)))
 
 
 def _apart(line: Line, limit: Crossing | None) -> list[Range]:
@@ -241,20 +249,26 @@ def _checked(answer: Answer, part: Atlas, speed: str, safe: float, direct: Direc
     return replace(answer, check=Check(inside, beyond, count))
 
 
-def _checked_window(window: Window, part: Atlas, speed: str, direct: Direct | None) -> Window:
+def _checked_window(window: Window, part: Atlas, speed: str, line: Line, direct: Direct | None) -> Window:
     if direct is None:
         return window
     span = part.upper[0] - part.lower[0]
     outer = []
     for crossing, side in ((window.interval.lower_end, -1.0), (window.interval.upper_end, 1.0)):
         if crossing:
-            outer.append(crossing.value + side * max(_BOUNDS * crossing.error, _PART * span))
+            value = crossing.value + side * max(_BOUNDS * crossing.error, _PART * span)
+            # Not where the step leads across a narrow tongue.
+            outer += [value] if any(i.lower < value < i.upper and not i.stable for i in line.intervals) else []
     # The crossings are part of the window if there is no margin: step inside by as much.
     step = _PART * span
     inner = np.linspace(window.safe[0] + step, window.safe[1] - step, _SAMPLES)
     rho = _solve(direct, part, {speed: np.append(inner, outer)})
     beyond = float(np.min(rho[_SAMPLES:])) if outer else np.nan
     return replace(window, check=Check(float(np.max(rho[:_SAMPLES])), beyond, len(rho)))
+
+
+def _of_kind(check: Check | None, criteria: Criteria) -> Check | None:
+    return check and replace(check, conservative=criteria.conservative)
 
 
 def _solve(direct: Direct, part: Atlas, columns: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -44,7 +44,7 @@ def follow_tips(atlas: Atlas, system: System, parameter: str, values: Sequence[f
     there.
     """
     values = np.asarray(values, float)
-    first = atlas.slice({parameter: values[0]})
+    first = atlas.slice({parameter: values[0]}).folded()
     tips = find_tips(first, system).tips
     names = first.parameters
     h = names.index(system.resonances.axis)
@@ -71,7 +71,7 @@ def _advance(atlas: Atlas, system: System, way: tuple, kinds: list[str], start: 
     parameter, values = way
     before, x = start, start
     for value in values[1:]:
-        criteria = Criteria.of(atlas.slice({parameter: value}), system)
+        criteria = Criteria.of(atlas.slice({parameter: value}).folded(), system)
         before, x = x, _step(criteria, kinds, 2 * x - before, h)
     return x
 

@@ -91,6 +91,15 @@ class Atlas:
             found[inside(panel, x)] = number
         return found
 
+    def folded(self) -> Atlas:
+        """The same over the moduli of the parameters that its coordinates know without their signs."""
+        lower, upper = self.lower.copy(), self.upper.copy()
+        for k, coordinate in enumerate(self.coordinates):
+            if coordinate.even and lower[k] < 0:
+                ends = sorted((abs(lower[k]), abs(upper[k])))
+                lower[k], upper[k] = 0.0 if upper[k] > 0 else ends[0], ends[1]
+        return replace(self, lower=lower, upper=upper)
+
     def slice(self, values: Mapping[str, float]) -> Atlas:
         """The atlas of the remaining parameters where those in ``values`` have these values.
 

@@ -1,33 +1,34 @@
 """Gradients of the spectral radius and of stability boundaries with respect to parameters.
 
-Inside an atlas they come from the surrogate; with respect to every parameter of the system, fixed ones included, from a few
-dozen direct solves around the point: differences of order 6 of the monodromy matrix, which is smooth, never of the spectral
-radius. Both use left and right eigenvectors of Z, so that no branch is picked wrongly near a crossing.
+Inside an atlas they come from the surrogate; with respect to every parameter of the system, fixed ones included, from direct
+solves whose steps are differentiated: derivatives of the monodromy matrix, which is smooth, never of the spectral radius.
+Both use left and right eigenvectors of Z, so that no branch is picked wrongly near a crossing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from operator import itemgetter
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from drivetrain_jax.analysis.numerics.kernels import options_for_few
 from drivetrain_jax.analysis.periodic.direct import assemble
-from drivetrain_jax.analysis.periodic.propagator import explicit_propagator
+from drivetrain_jax.analysis.periodic.floquet_effort import PANEL_COST, explicit_effort, implicit_effort
+from drivetrain_jax.analysis.periodic.propagator import explicit_propagator, implicit_propagator
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.growth import growth
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.systems import System
 
-# Relative error of the direct solves, and steps if the system predicts none.
-_RTOL, _STEPS = 1e-13, 400
-# Differences of order 6, their step relative to the parameter, and the value below which it is not smaller.
-_SHIFTS = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
-_WEIGHTS = np.array([-1.0, 9.0, -45.0, 45.0, -9.0, 1.0]) / 60
-_STEP, _SMALL = 2e-4, 0.01
+# Relative error of the direct solves that predicts their steps. These are doubled until derivatives agree to the second
+# number, four times at most.
+_RTOL, _AGREEMENT, _MOST_DOUBLINGS = 1e-12, 1e-8, 4
 # Moduli that differ by no more than rounding, as those of all multipliers without damping.
 _TIED = 1e-11
 
@@ -78,17 +79,41 @@ def atlas_sensitivity(atlas: Atlas, system: System, point: Mapping[str, float]) 
 
 
 def direct_sensitivity(system: System, values: Mapping[str, float]) -> Sensitivity:
-    """The gradient with respect to every parameter of ``system`` (``values`` holds them all) from 37 direct solves."""
-    build, names = system.models["floquet"].build, system.models["floquet"].parameters
-    point = np.array([float(values[name]) for name in names])
-    size = _STEP * np.maximum(np.abs(point), _SMALL)
-    around = point[:, None, None] + np.eye(len(names))[:, :, None] * size[:, None, None] * _SHIFTS
-    columns = dict(zip(names, np.concatenate([point[:, None], around.reshape(len(names), -1)], axis=1), strict=True))
-    predicted = build(columns).explicit_steps
-    steps = int(np.ceil(np.max(predicted(_RTOL)))) if predicted else _STEPS
-    z = np.asarray(_monodromy(build)(columns, np.int64(steps)))
-    change = z[:, :, 1:].reshape(*z.shape[:2], len(names), len(_SHIFTS)) @ _WEIGHTS / size
-    sigma, right = np.linalg.eig(z[:, :, 0])
+    """The gradient with respect to all parameters of ``system``, which ``values`` holds, from direct solves.
+
+    It is NaN where no scheme can take so many steps, or derivatives overflow.
+    """
+    names = system.models["floquet"].parameters
+    columns = {name: np.array([float(values[name])]) for name in names}
+    explicit, implicit = (float(of(system, columns, _RTOL)[0]) for of in (explicit_effort, implicit_effort))
+    steps, scheme = min(
+        (explicit, explicit_propagator), (PANEL_COST * implicit, implicit_propagator), key=itemgetter(0)
+    )
+    if not math.isfinite(steps):
+        return Sensitivity(math.nan, dict.fromkeys(names, math.nan), complex(math.nan), math.nan)
+    solve = _derivatives(system.models["floquet"].build, names, scheme)
+    point, count = (
+        np.array([columns[name][0] for name in names]),
+        int(steps if scheme is explicit_propagator else implicit),
+    )
+    z, change = solve(point, count)
+    for _ in range(_MOST_DOUBLINGS):
+        before, count = change, 2 * count
+        z, change = solve(point, count)
+        if np.all(_norms(change - before) <= _AGREEMENT * _norms(change)):
+            break
+    return _sensitivity(names, z, change)
+
+
+def _norms(change: np.ndarray) -> np.ndarray:
+    """Frobenius norms of the derivatives by each parameter."""
+    return np.sqrt(np.sum(change**2, axis=(0, 1)))
+
+
+def _sensitivity(names: Sequence[str], z: np.ndarray, change: np.ndarray) -> Sensitivity:
+    if not (np.isfinite(z).all() and np.isfinite(change).all()):
+        return Sensitivity(math.nan, dict.fromkeys(names, math.nan), complex(math.nan), math.nan)
+    sigma, right = np.linalg.eig(z)
     k = int(np.argmax(np.abs(sigma)))
     left = np.linalg.inv(right)[k]
     rates = np.einsum("i,ijp,j->p", left, change, right[:, k]) / sigma[k]
@@ -107,12 +132,18 @@ def _gap(sigma: complex, multipliers: np.ndarray) -> float:
 
 
 @lru_cache
-def _monodromy(build: Callable) -> Callable:
-    """Compiled Z of a model for a batch of points, ``(4, 4, N)``."""
+def _derivatives(
+    build: Callable, names: tuple[str, ...], scheme: Callable
+) -> Callable[[np.ndarray, int], tuple[np.ndarray, np.ndarray]]:
+    """Z of a model at a point, ``(n, n)``, and its derivatives by all parameters, ``(n, n, p)``, compiled for any steps."""
 
-    def monodromy(columns: Mapping[str, jax.Array], steps: jax.Array) -> jax.Array:
-        form = build(columns).reduced
-        shape = next(iter(columns.values())).shape
-        return assemble(form, explicit_propagator(form, steps, shape).matrix)
+    def monodromy(point: jax.Array, steps: jax.Array) -> jax.Array:
+        form = build(dict(zip(names, point, strict=True))).reduced
+        phi = scheme(form, steps) if scheme is implicit_propagator else scheme(form, steps, ())
+        return assemble(form, jnp.exp(phi.log_scale) * phi.matrix)
 
-    return jax.jit(monodromy, compiler_options=options_for_few())
+    def both(point: jax.Array, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return monodromy(point, steps), jax.jacfwd(monodromy)(point, steps)
+
+    compiled = jax.jit(both, compiler_options=options_for_few())
+    return lambda point, steps: tuple(map(np.asarray, compiled(point, np.int64(steps))))

@@ -71,8 +71,10 @@ class Tips:
 def find_tips(atlas: Atlas, system: System, *, opening: bool = True) -> Tips:
     """The tips of all tongues within ``atlas`` (two parameters, one of them the axis of the system's resonances).
 
-    With ``opening=False`` also the places where tongues close or meet. Raises ``ValueError`` for other atlases.
+    With ``opening=False`` also the places where tongues close or meet. Angles are given without their signs. Raises
+    ``ValueError`` for other atlases.
     """
+    atlas = atlas.folded()
     horizontal = _axis_of_resonances(atlas, system)
     criteria = Criteria.of(atlas, system)
     if criteria.conservative:

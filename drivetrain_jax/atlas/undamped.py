@@ -23,8 +23,13 @@ _PAIR = 4
 
 
 def undamped_tips(criteria: Criteria, horizontal: int, resonances: Resonances) -> list[tuple]:
-    """(name, multiplier, its angle, parameters) of every resonance from which a tongue of resolved width grows."""
+    """(name, multiplier, its angle, parameters) of every resonance from which a tongue of resolved width grows.
+
+    The resonances are at the angle 0: there are none where the atlas does not begin with it.
+    """
     atlas, h, v = criteria.atlas, horizontal, 1 - horizontal
+    if atlas.parameters[v] != criteria.system.roles.get("angle", atlas.parameters[v]) or atlas.lower[v] > 0:
+        return []
     lower, upper = atlas.lower[h], atlas.upper[h]
     values = np.asarray(resonances.values({**dict.fromkeys(atlas.parameters, np.nan), **atlas.fixed}))
     patches = patches_of(criteria)

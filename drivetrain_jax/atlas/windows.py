@@ -18,6 +18,8 @@ from drivetrain_jax.atlas.tips import polish
 from drivetrain_jax.systems import System
 
 Range = tuple[float, float]
+# A part between two candidates is tested if it is so many times wider than the errors of these: its middle is beyond them.
+_WIDER = 2.0
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,10 @@ class Interval:
 
 @dataclass(frozen=True)
 class Line:
-    """``intervals`` that alternate between stable and unstable, and the ``undecided`` ones among or next to them."""
+    """``intervals`` that alternate between stable and unstable, and the ``undecided`` ones among or next to them.
+
+    Where a change hides in an undecided range one interval ends, and the next one begins, with that range.
+    """
 
     parameter: str
     intervals: tuple[Interval, ...]
@@ -66,6 +71,12 @@ class Line:
 
 def stability_along(atlas: Atlas, system: System) -> Line:
     """The intervals of stability along the one parameter of ``atlas`` (slice the others away)."""
+    folded = atlas.folded()
+    line = _along(folded, system)
+    return line if folded.lower[0] == atlas.lower[0] else _unfolded(line, float(atlas.lower[0]), float(atlas.upper[0]))
+
+
+def _along(atlas: Atlas, system: System) -> Line:
     criteria = Criteria.of(atlas, system)
     changes, undecided = [], []
     for kind, patches in zip(criteria.multipliers, patches_of(criteria), strict=True):
@@ -85,7 +96,11 @@ def stability_along(atlas: Atlas, system: System) -> Line:
 
 
 def stability_over_range(atlas: Atlas, system: System, along: str) -> Line:
-    """The intervals of the other parameter of ``atlas`` (two) in which all values of ``along`` are stable."""
+    """The intervals of the other parameter of ``atlas`` (two) in which all values of ``along`` are stable.
+
+    Angles are given without their signs.
+    """
+    atlas = atlas.folded()
     h = atlas.parameters.index(along)
     v = 1 - h
     criteria = Criteria.of(atlas, system)
@@ -127,7 +142,8 @@ def narrow(atlas: Atlas, bounds: Mapping[str, tuple[float, float]]) -> Atlas:
         if not lower[k] <= a < b <= upper[k]:
             raise ValueError(f"{name} = {a!r} to {b!r}: allowed is a range within {lower[k]:g} to {upper[k]:g}")
         lower[k], upper[k] = a, b
-    ends = np.sort(atlas.to_coordinates(np.stack([lower, upper])), axis=0)
+    part = replace(atlas, lower=lower, upper=upper).folded()
+    ends = np.sort(atlas.to_coordinates(np.stack([part.lower, part.upper])), axis=0)
     panels = tuple(p for panel in atlas.panels if (p := _part(panel, *ends)) is not None)
     gaps = tuple(g for gap in atlas.gaps if (g := _part(gap, *ends)) is not None)
     return replace(atlas, lower=lower, upper=upper, panels=panels, gaps=gaps)
@@ -196,23 +212,77 @@ def decided(lower: float, upper: float, undecided: Iterable[Range]) -> list[Rang
     return [*left, (lower, upper)] if lower < upper else left
 
 
-def _middle(lower: float, upper: float, undecided: Iterable[Range]) -> float:
-    """The middle of the widest part that is decided."""
-    widest = max(decided(lower, upper, undecided), key=lambda part: part[1] - part[0], default=(lower, upper))
-    return (widest[0] + widest[1]) / 2
-
-
 def _line(name: str, ends: tuple[float, float], changes: list[Crossing], undecided: list, stable) -> Line:
-    """Sort candidates, test between them and keep those at which the stability changes."""
+    """Sort candidates, test between them and keep those at which the stability changes.
+
+    Between two candidates every decided part is tested: an undecided range may hide a change. Parts that are too narrow
+    for a test are undecided as well.
+    """
     changes = sorted((c for c in changes if ends[0] < c.value < ends[1]), key=lambda c: c.value)
-    edges = [float(ends[0]), *(c.value for c in changes), float(ends[1])]
-    inside = stable(np.array([_middle(a, b, undecided) for a, b in itertools.pairwise(edges)]))
+    edges = [(float(ends[0]), 0.0), *((c.value, c.error) for c in changes), (float(ends[1]), 0.0)]
+    segments = [_tested(a, b, undecided) for a, b in itertools.pairwise(edges)]
+    parts = [(k, *part) for k, (tested, _) in enumerate(segments) for part in tested]
+    undecided = [*undecided, *(part for _, narrow in segments for part in narrow)]
+    states = stable(np.array([(low + high) / 2 for _, low, high in parts]))
     intervals: list[Interval] = []
-    start, first = edges[0], None
-    for k, change in enumerate([*changes, None]):
-        if change is not None and inside[k] == inside[k + 1]:
+    start, first = edges[0][0], None
+    for (here, _, high), (there, low, _), before, after in zip(parts, parts[1:], states, states[1:], strict=False):
+        if before == after:
             continue
-        end = edges[-1] if change is None else change.value
-        intervals.append(Interval(start, end, bool(inside[k]), first, change))
-        start, first = end, change
+        change = changes[there - 1] if there > here else None
+        intervals.append(Interval(start, change.value if change else high, bool(before), first, change))
+        start, first = (change.value, change) if change else (low, None)
+    intervals.append(Interval(start, edges[-1][0], bool(states[-1]), first, None))
     return Line(name, tuple(intervals), tuple(sorted(undecided)))
+
+
+def _tested(
+    lower: tuple[float, float], upper: tuple[float, float], undecided: Iterable[Range]
+) -> tuple[list[Range], list[Range]]:
+    """The decided parts between two candidates (values, bounds of errors) in which stability is tested, and the others.
+
+    These are no wider than the errors, which belong to them. If all parts are so narrow, the widest is tested.
+    """
+    (a, error), (b, other) = (map(float, np.nan_to_num(end)) for end in (lower, upper))
+    parts = decided(a, b, undecided) or [(a, b)]
+    least = _WIDER * max(error, other, np.finfo(float).eps * max(abs(a), abs(b)))
+    wide = [part for part in parts if part[1] - part[0] > least] or [max(parts, key=lambda part: part[1] - part[0])]
+    narrow = [part for part in parts if part not in wide]
+    return wide, [(low - error * (low == a), high + other * (high == b)) for low, high in narrow]
+
+
+def _unfolded(line: Line, lower: float, upper: float) -> Line:
+    """A line over moduli as that over the parameter from ``lower``, which is negative, to ``upper``."""
+    negative = [_mirrored(interval) for interval in reversed(line.intervals)]
+    both = [*negative, *line.intervals] if upper > 0 else negative
+    parts = [part for interval in both if (part := _clipped(interval, lower, upper)) is not None]
+    joined: list[Interval] = []
+    for part in parts:
+        # At 0 nothing changes.
+        if joined and joined[-1].upper == part.lower == 0.0:
+            last = joined.pop()
+            part = replace(part, lower=last.lower, lower_end=last.lower_end)
+        joined.append(part)
+    ranges = [(-b, -a) for a, b in line.undecided] + (list(line.undecided) if upper > 0 else [])
+    undecided = [(max(a, lower), min(b, upper)) for a, b in ranges if a <= upper and b >= lower]
+    return Line(line.parameter, tuple(joined), tuple(sorted(undecided)))
+
+
+def _mirrored(interval: Interval) -> Interval:
+    ends = [_opposite(end) for end in (interval.upper_end, interval.lower_end)]
+    return Interval(-interval.upper, -interval.lower, interval.stable, *ends)
+
+
+def _opposite(crossing: Crossing | None) -> Crossing | None:
+    if crossing is None:
+        return None
+    return replace(crossing, value=-crossing.value, point={name: -value for name, value in crossing.point.items()})
+
+
+def _clipped(interval: Interval, lower: float, upper: float) -> Interval | None:
+    """What lies between the ends of the atlas."""
+    if interval.upper <= lower or interval.lower >= upper:
+        return None
+    if interval.lower < lower:
+        interval = replace(interval, lower=lower, lower_end=None)
+    return replace(interval, upper=upper, upper_end=None) if interval.upper > upper else interval

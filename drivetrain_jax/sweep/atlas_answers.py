@@ -143,7 +143,7 @@ def _beyond(atlas: StoredAtlas, name: str, end: float, crossing: Crossing | None
     """What ends a window, if stability does not."""
     if crossing:
         return ""
-    return " (the end of the atlas)" if end in atlas.ranges[name] else " (undecided beyond)"
+    return " (the end of the atlas)" if abs(end) in map(abs, atlas.ranges[name]) else " (undecided beyond)"
 
 
 def _roles(atlas: StoredAtlas, *roles: str) -> list[str]:
@@ -275,7 +275,9 @@ def _answered(title: str, phrase: str, asked: _Asked, answer: design.Answer) -> 
     if answer.value is None:
         lines.append(f"  no {answer.parameter} of the atlas will do")
     else:
-        bound = f" +- {answer.error:.1e}" if answer.limit else " (the end of the atlas)"
+        bound = (
+            f" +- {answer.error:.1e}" if answer.limit else _beyond(asked.atlas, answer.parameter, answer.value, None)
+        )
         lines.append(f"  stable {phrase.format(asked.named(answer.parameter, answer.value))}{bound}")
         if answer.limit:
             where = ", ".join(f"{n} = {_number(v)}" for n, v in answer.limit.point.items())
@@ -301,7 +303,9 @@ def _answered(title: str, phrase: str, asked: _Asked, answer: design.Answer) -> 
 
 def _gradient_lines(atlas: StoredAtlas, slopes: Sensitivity) -> list[str]:
     if not slopes.exists:
-        return ["gradient of spectral_radius", "  none: two multipliers have the largest modulus"]
+        tied = math.isfinite(slopes.gap)
+        reason = "two multipliers have the largest modulus" if tied else "direct solves would take too many steps"
+        return ["gradient of spectral_radius", f"  none: {reason}"]
     units = {name: atlas.scene.system.parameter(name).units for name in slopes.gradient}
     return [
         "gradient of spectral_radius",

@@ -1,0 +1,154 @@
+"""Questions to an atlas where it is loose, undamped, without panels, or reaches over the angle 0."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import drivetrain_jax as dt
+from drivetrain_jax.atlas.sensitivity import direct_sensitivity
+from drivetrain_jax.sweep import atlas_answers
+from drivetrain_jax.sweep.atlas_chart import chart
+from drivetrain_jax.sweep.atlas_file import StoredAtlas
+from drivetrain_jax.systems import get_system
+
+S21 = (0.1063331213, 1.4159881603)
+CARDAN = get_system("cardan")
+
+
+@cache
+def panels(beta: tuple, omega: tuple, rtol: float = 1e-9, zeta: float = 0.001) -> xr.Dataset:
+    axes = {"beta": beta, "Omega": omega}
+    return dt.run(
+        {
+            "system": "cardan",
+            "analysis": "atlas",
+            "axes": {name: {"start": low, "stop": high} for name, (low, high) in axes.items()},
+            "fixed": {"zeta": zeta, "alpha": 1.0, "mu": 1.0, "gamma": 100.0},
+            "options": {"rtol": rtol},
+        }
+    )
+
+
+def atlas_of(*given, **more) -> StoredAtlas:
+    return dt.open_atlas(panels(*given, **more))
+
+
+@pytest.mark.parametrize("beta", [(-0.3, 0.0), (-0.3, 0.1), (-0.1, 0.3)])
+def test_the_widest_angle_has_no_sign(beta):
+    answer = atlas_answers.widest_angle(atlas_of(beta, (1.3, 1.5)), {"Omega": (1.35, 1.45)}).data
+    assert answer["value"] == pytest.approx(S21[0], abs=1e-8) and answer["check"]["agrees"]
+
+
+def test_boundaries_lie_on_both_sides_of_the_angle_0():
+    """Stable between the edges of S21 at a speed beside its tip, unstable beyond them, on either side."""
+    atlas, at = atlas_of((-0.2, 0.3), (1.3, 1.5)), {"beta": -0.15, "Omega": 1.42}
+    nearest = atlas_answers.query(atlas, at).data["nearest"]["beta"]
+    below, above = nearest["below"]["value"], nearest["above"]["value"]
+    assert below == pytest.approx(-above, rel=1e-12) and -0.2 < below < -0.15
+    beside = [below - 1e-6, below + 1e-6, above - 1e-6, above + 1e-6]
+    rho = atlas.radius({"beta": np.array(beside), "Omega": np.full(4, 1.42), **columns(4)})
+    assert (rho > 1).tolist() == [True, False, False, True]
+    ends = atlas_answers.query(atlas, {"beta": 0.25, "Omega": 1.42}).data["nearest"]["beta"]
+    assert ends["below"]["value"] == pytest.approx(above, rel=1e-12) and ends["above"] is None
+
+
+def columns(count: int, zeta: float = 0.001) -> dict[str, np.ndarray]:
+    return {name: np.full(count, x) for name, x in {"zeta": zeta, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}.items()}
+
+
+def test_a_chart_over_the_angle_0_has_curves_and_tips_on_both_sides():
+    source = panels((-0.2, 0.3), (1.3, 1.5))
+    drawn = chart(source, {}, 20)
+    assert sorted(drawn["tip_beta"].values) == pytest.approx([-S21[0], S21[0]], abs=1e-8)
+    assert drawn["tip_Omega"].values == pytest.approx([S21[1]] * 2, abs=1e-8)
+    assert (drawn["tip_opens"].values == (drawn["tip_beta"].values > 0)).all()
+    beta, omega = (drawn[f"boundary_{name}"].values for name in ("beta", "Omega"))
+    beta, omega = beta[np.isfinite(beta)], omega[np.isfinite(beta)]
+    assert beta.min() == pytest.approx(-0.2, abs=2e-3) and beta.max() == pytest.approx(0.3, abs=1e-12)
+    rho = dt.open_atlas(source)(beta=beta, Omega=omega).spectral_radius.values
+    np.testing.assert_allclose(rho, 1.0, rtol=0, atol=1e-7)
+    part = chart(source, {"beta": (-0.2, -0.05)}, 20)
+    assert part["tip_beta"].values == pytest.approx([-S21[0]], abs=1e-8)
+    assert np.nanmax(part["boundary_beta"].values) < -0.1
+
+
+@pytest.mark.parametrize(("rtol", "beta"), [(1e-5, 0.894981), (1e-5, 0.788523), (1e-4, 0.549493), (1e-4, 0.871812)])
+def test_an_undecided_range_that_hides_a_change_ends_a_window(rtol, beta):
+    atlas = atlas_of((0.0, 1.3), (0.15, 2.0), rtol=rtol)
+    windows = atlas_answers.speed_windows(atlas, {"beta": beta}).data["windows"]
+    speeds = np.concatenate([np.linspace(*window["safe"], 41)[1:-1] for window in windows])
+    assert len(windows) >= 5 and all(window["check"]["agrees"] for window in windows)
+    assert atlas.radius({"beta": np.full(speeds.size, beta), "Omega": speeds, **columns(speeds.size)}).max() < 1
+
+
+def test_the_nearest_change_beside_an_undecided_range():
+    atlas = atlas_of((0.0, 1.3), (0.15, 2.0), rtol=1e-5)
+    below = atlas_answers.query(atlas, {"beta": 0.894981, "Omega": 0.752}).data["nearest"]["Omega"]["below"]
+    exact = atlas_answers.query(atlas_of((0.0, 1.3), (0.15, 2.0)), {"beta": 0.894981, "Omega": 0.752})
+    assert abs(below["value"] - exact.data["nearest"]["Omega"]["below"]["value"]) < below["error"] < 1e-3
+
+
+def test_answers_without_damping_agree_with_direct_solves():
+    atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
+    assert atlas_answers.widest_angle(atlas, {"Omega": (1.6, 1.9)}).data["check"]["agrees"]
+    windows = atlas_answers.speed_windows(atlas, {"beta": 0.5}).data["windows"]
+    assert len(windows) >= 5 and all(window["check"]["agrees"] for window in windows)
+
+
+def test_without_damping_tips_are_where_the_angle_is_0():
+    source = panels((0.0, 1.2), (0.3, 2.0), zeta=0.0)
+    assert {"S21", "H21", "C+1"} <= set(chart(source, {}, 20)["tip"].values)
+    assert chart(source, {"beta": (0.9, 1.2)}, 20)["tip"].size == 0
+
+
+def test_an_atlas_without_a_panel_answers_what_it_can():
+    source = panels((0.0, 0.5), (0.001, 0.002), rtol=1e-8)
+    atlas = dt.open_atlas(source)
+    assert not atlas.stability.atlas.panels
+    reply = atlas_answers.query(atlas, {"beta": 0.1, "Omega": 0.0015})
+    direct = dt.point(
+        "cardan", "floquet", beta=0.1, Omega=0.0015, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0, rtol=1e-8
+    )
+    assert reply.data["values"]["spectral_radius"] == pytest.approx(direct.spectral_radius, abs=1e-7)
+    assert reply.data["nearest"] == {} and "boundary_beta" not in chart(source, {}, 4).coords
+    with pytest.raises(
+        dt.InputError, match=r"^file: the atlas has no panel \(.*\); allowed is one whose solves converged$"
+    ):
+        atlas_answers.widest_angle(atlas, {"Omega": (0.001, 0.002)})
+
+
+@pytest.mark.parametrize(
+    "point",
+    [
+        {"beta": 1.2, "Omega": 0.001, "zeta": 1e-4},
+        {"beta": 1.569, "Omega": 2.0, "zeta": 0.01},
+        {"beta": 1.0, "Omega": 0.1, "zeta": 10.0},
+        {"beta": 0.4, "Omega": 1.2, "zeta": 1e-7},
+    ],
+)
+def test_gradients_at_extremes(point):
+    """Against differences of direct solves, with steps that are small against the phase and the distance to pi/2."""
+    point = {"alpha": 1.0, "mu": 1.0, "gamma": 100.0} | point
+    gradient = direct_sensitivity(CARDAN, point).gradient
+    for name in ("beta", "Omega", "zeta"):
+        h = 3e-6 * (np.pi / 2 - point["beta"] if name == "beta" else point[name]) * (30 if name == "zeta" else 1)
+        radii = [dt.point("cardan", "floquet", **{**point, name: point[name] + d}, rtol=1e-13) for d in (-h, h)]
+        difference = (radii[1].spectral_radius - radii[0].spectral_radius) / (2 * h)
+        noise = 4e-13 * radii[0].spectral_radius / h
+        assert gradient[name] == pytest.approx(difference, rel=1e-5, abs=noise), name
+
+
+def test_steps_of_a_gradient_are_found_where_the_system_predicts_none():
+    model = CARDAN.models["floquet"]
+    other = replace(model, build=lambda values: replace(model.build(values), explicit_steps=None))
+    system = replace(CARDAN, models={**CARDAN.models, "floquet": other})
+    point = {"beta": 0.3, "Omega": 0.004, "zeta": 1e-4, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+    found, exact = direct_sensitivity(system, point), direct_sensitivity(CARDAN, point)
+    assert found.spectral_radius == pytest.approx(exact.spectral_radius, rel=1e-11)
+    for name, slope in exact.gradient.items():
+        assert found.gradient[name] == pytest.approx(slope, rel=1e-5, abs=1e-9), name
