@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import xarray as xr
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.atlas.boundaries import boundaries
 from drivetrain_jax.atlas.criteria import has_boundaries
+from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.tips import Tips, find_tips
 from drivetrain_jax.atlas.windows import narrow
 from drivetrain_jax.sweep.atlas_file import StoredAtlas, as_given, open_atlas
@@ -26,8 +29,8 @@ def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, flo
 
     ``part`` fixes parameters (numbers) or zooms in (ranges). Of further parameters there are three values. A chart of two
     parameters also has, if the system has such, its stability boundaries (``boundary_NAME``, parts separated by NaN) and
-    the tips of its tongues (``tip_NAME``, with their names, ``tip_NAME_error`` and ``tip_proved``) and the boxes that may
-    hide further ones (``undecided_NAME``). Raises :class:`InputError` for what the atlas does not cover.
+    the tips of its tongues (``tip_NAME``, with their names, ``tip_NAME_error``, ``tip_opens`` and ``tip_proved``) and the
+    boxes that may hide further ones (``undecided_NAME``). Raises :class:`InputError` for what the atlas does not cover.
     """
     if not 2 <= cells <= 20_000:
         raise InputError(f"cells = {cells}: allowed is 2 <= cells <= 20000")
@@ -73,7 +76,13 @@ def _curves(
 ) -> dict[str, tuple[str, np.ndarray, dict[str, str]]]:
     system = atlas.scene.system
     panels = narrow(atlas.stability.atlas.slice(fixed), ranges)
-    segments = [segment for curve in boundaries(panels, system) for segment in curve.segments()]
+    signs = _signs(panels)
+    segments = [
+        _within({name: sign * segment[name] for name, sign in side.items()}, ranges)
+        for curve in boundaries(panels, system)
+        for segment in curve.segments()
+        for side in signs
+    ]
     coordinates = {}
     for name in ranges:
         about = {"units": system.parameter(name).units}
@@ -84,21 +93,53 @@ def _curves(
         return coordinates
     # Tongues widen with the angle. Along a damping they close, and what closes them is their tip.
     tips = find_tips(panels, system, opening=system.roles.get("angle") in ranges)
-    return coordinates | _tips(tips, system, ranges)
+    return coordinates | _tips(_on_all_sides(tips, signs, ranges), system, ranges)
+
+
+def _signs(atlas: Atlas) -> list[dict[str, float]]:
+    """The signs of the parameters with which moduli lie in ``atlas``: both where it reaches over 0."""
+    choices = []
+    for coordinate, low, high in zip(atlas.coordinates, atlas.lower, atlas.upper, strict=True):
+        both = [1.0] if not coordinate.even or high > 0 else []
+        choices.append([*both, -1.0] if coordinate.even and low < 0 else both)
+    return [dict(zip(atlas.parameters, signs, strict=True)) for signs in product(*choices)]
+
+
+def _within(places: Mapping[str, np.ndarray], ranges: Mapping[str, tuple[float, float]]) -> dict[str, np.ndarray]:
+    """``places`` with NaN for those outside ``ranges``."""
+    inside = np.logical_and.reduce([(low <= places[n]) & (places[n] <= high) for n, (low, high) in ranges.items()])
+    return {name: np.where(inside, values, np.nan) for name, values in places.items()}
+
+
+def _on_all_sides(found: Tips, signs: list[dict[str, float]], ranges: Mapping[str, tuple[float, float]]) -> Tips:
+    tips, boxes = [], []
+    for side in signs:
+        for tip in found.tips:
+            point = {name: sign * tip.point[name] for name, sign in side.items()}
+            if all(low <= point[name] <= high for name, (low, high) in ranges.items()):
+                # What opens upwards on one side of 0 opens downwards on the other.
+                tips.append(replace(tip, point=point, opens=tip.opens == (min(side.values()) > 0)))
+        for box in found.undecided:
+            boxes.append({name: tuple(sorted(sign * end for end in box[name])) for name, sign in side.items()})
+    return replace(found, tips=tuple(tips), undecided=tuple(boxes))
 
 
 def _tips(
     found: Tips, system: System, names: Iterable[str]
 ) -> dict[str, tuple[str | tuple[str, str], np.ndarray, dict[str, str]]]:
-    """The tips as coordinates: names, whether proved, place and its error; and the boxes that were left undecided."""
+    """The tips as coordinates: names, whether they open and are proved, place and its error; and the undecided boxes."""
     labels = np.array([tip.name for tip in found.tips], dtype=str)
     proved = np.array([tip.proved for tip in found.tips], np.int8)
     meaning = {
         "units": "1",
         "long_name": "whether there is exactly one tip here within the bounds of the atlas (1) or not (0)",
     }
+    other = next(name for name in names if name != system.resonances.axis)
+    opens = np.array([tip.opens for tip in found.tips], np.int8)
+    direction = {"units": "1", "long_name": f"whether the tongue opens (1) or closes (0) at its tip as {other} rises"}
     coordinates: dict[str, tuple] = {
         "tip": ("tip", labels, {"units": "1", "long_name": "resonance that the tongue grows from"}),
+        "tip_opens": ("tip", opens, direction),
         "tip_proved": ("tip", proved, meaning),
     }
     for name in names:

@@ -40,7 +40,7 @@ class Axis:
     def long_name(self) -> str:
         """Long name of the parameter, with the position of a swept entry."""
         label = self.parameter.long_name
-        return label if self.entry is None else f"{label}, entry {self.entry}"
+        return label if self.entry is None else f"{label}, entry {self.entry + 1} of the list"
 
 
 def entry_of(name: str) -> tuple[str, int | None]:

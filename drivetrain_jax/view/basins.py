@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from string import ascii_uppercase
+
 import matplotlib
 import numpy as np
 import xarray as xr
@@ -15,6 +18,12 @@ from drivetrain_jax.view.style import ATTRACTOR_COLOURS, STYLE, axis_label, vari
 _NEEDED = ("attractor_u_max", "basin_fraction")
 # Change of size from one value of the axis to the next, over the size, within which an attractor is the same.
 _NEAR = 0.2
+# An attractor that is missing at this many values in a row has ended.
+_LOST = 2
+# Smaller sizes are those of rest.
+_REST = 1e-300
+_MARKERS = "os^D"
+_ENTRIES, _ENTRY_HEIGHT = 6, 0.15
 _HEIGHT = 2.2
 
 
@@ -32,44 +41,80 @@ def plot(dataset: xr.Dataset) -> Figure:
         return _curves(dataset, names[0])
 
 
-def _followed(size: np.ndarray, exists: np.ndarray) -> np.ndarray:
+def _followed(x: np.ndarray, size: np.ndarray, exists: np.ndarray, multiple: np.ndarray) -> np.ndarray:
     """Numbers of the branches that attractors ``(values of the axis, attractors)`` belong to, -1 where there is none.
 
-    Results are in order of size, so that the number of an attractor changes where a larger one appears.
+    Results are in order of size, so that the number of an attractor changes where a larger one appears. A branch goes on
+    along its last two sizes to the nearest attractor of its period multiple, and ends where it has none twice.
     """
-    branch, last = np.full(size.shape, -1), {}
+    branch, followed = np.full(size.shape, -1), []
     # Those without a size do not repeat: all of them are one.
     size = np.where(np.isfinite(size), size, np.inf)
     for i, row in enumerate(size):
         here = np.flatnonzero(exists[i])
-        with np.errstate(invalid="ignore"):
-            gaps = {(k, b): 0.0 if row[k] == was else abs(row[k] - was) for k in here for b, was in last.items()}
+        gaps = {}
+        for b, places in enumerate(followed):
+            last, k = places[-1]
+            if i - last <= _LOST:
+                likely = (size[last, k], _ahead(x, size, places, i))
+                gaps |= {(j, b): _gap(row[j], likely) for j in here if multiple[i, j] == multiple[last, k]}
         for (k, b), gap in sorted(gaps.items(), key=lambda item: item[1]):
-            if branch[i, k] < 0 and b not in branch[i] and (gap == 0 or gap <= _NEAR * abs(row[k]) < np.inf):
+            if branch[i, k] < 0 and b not in branch[i] and gap <= _NEAR:
                 branch[i, k] = b
+                followed[b].append((i, k))
         for k in here[branch[i, here] < 0]:
-            branch[i, k] = len(last) + np.count_nonzero(branch[i] >= len(last))
-        last |= {int(branch[i, k]): row[k] for k in here}
+            branch[i, k] = len(followed)
+            followed.append([(i, k)])
     return branch
 
 
+def _ahead(x: np.ndarray, size: np.ndarray, places: list[tuple[int, int]], i: int) -> float:
+    """The size at ``x[i]`` on the straight line through the last two of ``places`` in ``size``, NaN if there is none."""
+    if len(places) < 2:
+        return np.nan
+    (before, _), (last, _) = places[-2:]
+    first, second = (size[place] for place in places[-2:])
+    return second + (second - first) * (x[i] - x[last]) / (x[last] - x[before]) if np.isfinite(second) else np.nan
+
+
+def _gap(size: float, likely: tuple[float, float]) -> float:
+    """Difference from the nearer of the ``likely`` sizes, over the size; 0 between two without a size.
+
+    Both count: beside a peak the straight line overshoots.
+    """
+    if not np.isfinite(size):
+        return 0.0 if size == likely[0] else np.inf
+    return float(np.nanmin(np.abs(size - np.array(likely)))) / max(abs(size), _REST)
+
+
+def _letter(number: int) -> str:
+    return f"{ascii_uppercase[number % 26]}{number // 26 or ''}"
+
+
 def _curves(dataset: xr.Dataset, name: str) -> Figure:
-    panels = Panels(2, height=_HEIGHT, margins=Margins(left=1.0, right=0.3), share_y=False)
-    (upper,), (lower,) = panels.axes
-    handles = []
     size, share = (dataset[each].transpose(name, "attractor").values for each in _NEEDED)
     error = dataset["basin_error"].transpose(name, "attractor").values if "basin_error" in dataset else 0 * share
-    branch = _followed(size, np.isfinite(share))
-    for number in range(branch.max(initial=-1) + 1):
+    exists = np.isfinite(share)
+    # Where it is not stored, attractors with a size are periodic.
+    multiple = np.isfinite(size)
+    if "attractor_multiple" in dataset:
+        multiple = dataset["attractor_multiple"].transpose(name, "attractor").values
+    branch = _followed(dataset[name].values, size, exists, multiple)
+    count = branch.max(initial=-1) + 1
+    further = max(math.ceil(count / _ENTRIES) - 2, 0) * _ENTRY_HEIGHT
+    panels = Panels(2, height=_HEIGHT, margins=Margins(left=1.0, right=0.3, bottom=0.9 + further), share_y=False)
+    (upper,), (lower,) = panels.axes
+    handles = []
+    for number in range(count):
         i, k = np.nonzero(branch == number)
         x = dataset[name].values[i]
         style = {
             "color": ATTRACTOR_COLOURS[number % len(ATTRACTOR_COLOURS)],
             "linestyle": "",
-            "marker": "o",
+            "marker": _MARKERS[number // len(ATTRACTOR_COLOURS) % len(_MARKERS)],
             "markersize": 2.5,
         }
-        handles += upper.plot(x, size[i, k], **style, label=f"attractor {number + 1}")
+        handles += upper.plot(x, size[i, k], **style, label=f"motion {_letter(number)}")
         lower.errorbar(x, share[i, k], error[i, k], **style, elinewidth=0.8)
     cells.fit_axis(upper, "x", dataset[name].values)
     upper.set_ylim(bottom=min(0.0, float(dataset["attractor_u_max"].min())))

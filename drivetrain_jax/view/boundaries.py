@@ -16,13 +16,13 @@ from drivetrain_jax.view.style import FRAME_GREY, PREDICTION, STATE_COLOURS
 _MARK = {"marker": "o", "markersize": 3.0, "markerfacecolor": "white", "markeredgewidth": 0.7, "linestyle": "none"}
 _FONT = 7.5
 # Width and height that a name takes, in points.
-_ROOM = (15.0, 9.0)
-# Where it may stand, rightwards and up from its tip, and how it is aligned there.
+_ROOM = np.array([15.0, 9.0])
+# Where it may stand, rightwards and up from the tip of a tongue that opens upwards, and how it is aligned there.
 _SIDES = {
     (0, -1): ("center", "top"),
     (1, 0): ("left", "center"),
-    (0, 1): ("center", "bottom"),
     (-1, 0): ("right", "center"),
+    (0, 1): ("center", "bottom"),
 }
 
 
@@ -41,9 +41,7 @@ def draw(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> lis
             style = _MARK if label == "tip" else {**_MARK, "marker": "D", "markerfacecolor": STATE_COLOURS[2]}
             handles += axes.plot(x, y, color=PREDICTION, label=label, zorder=4, **style, **keep)
     if proved.size:
-        _name(
-            axes, dataset["tip"].values.astype(str), *(dataset[f"tip_{name}"].values for name in (horizontal, vertical))
-        )
+        _name(axes, dataset, horizontal, vertical)
     return handles + boxes
 
 
@@ -59,25 +57,34 @@ def _draw_undecided(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: 
     return [Patch(facecolor=colour, label="may hide tips")]
 
 
-def _name(axes: Axes, names: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
-    """Names below the tips, or beside or above them where they would cover an earlier one; else none."""
-    marks = axes.transData.transform(np.stack([x, y], axis=-1)) * 72 / axes.figure.dpi
+def _name(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> None:
+    """Names on the side of the tips where no tongue is, or beside them where they would lie over an earlier one or the
+    frame; else none."""
+    x, y = (dataset[f"tip_{name}"].values for name in (horizontal, vertical))
+    # Tongues open upwards in charts that do not tell.
+    opens = dataset["tip_opens"].values if "tip_opens" in dataset.coords else np.ones(len(x))
+    tips, names = np.stack([x, y], axis=-1), dataset["tip"].values.astype(str)
+    scale = 72 / axes.figure.dpi
+    low, high = axes.bbox.min * scale + _ROOM / 2, axes.bbox.max * scale - _ROOM / 2
     taken: list[np.ndarray] = []
-    for name, mark, across, up in zip(names, marks, x, y, strict=True):
-        middles = {side: mark + np.array(side) * (0.7 * _ROOM[0], _ROOM[1]) for side in _SIDES}
-        free = (s for s, at in middles.items() if all((np.abs(at - other) >= _ROOM).any() for other in taken))
+    for name, tip, up in zip(names, tips, opens, strict=True):
+        mark = axes.transData.transform(tip) * scale
+        sides = [(across, rise if up else -rise) for across, rise in _SIDES]
+        middles = {side: mark + np.array(side) * (0.7, 1.0) * _ROOM for side in sides}
+        inside = {side: at for side, at in middles.items() if ((at >= low) & (at <= high)).all()}
+        free = (s for s, at in inside.items() if all((np.abs(at - other) >= _ROOM).any() for other in taken))
         side = next(free, None)
         if side is None:
             continue
         taken.append(middles[side])
-        horizontal, vertical = _SIDES[side]
+        aligned, level = _SIDES[side]
         axes.annotate(
             label_text(name),
-            (across, up),
+            tip,
             xytext=3.5 * np.array(side),
             textcoords="offset points",
-            ha=horizontal,
-            va=vertical,
+            ha=aligned,
+            va=level,
             size=_FONT,
             color=PREDICTION,
             path_effects=[withStroke(linewidth=2, foreground="white")],

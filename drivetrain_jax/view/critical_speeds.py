@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import textwrap
 
 import matplotlib
@@ -13,13 +15,15 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.layout import Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STYLE, axis_label, variable_label
+from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STATE_COLOURS, STYLE, axis_label, variable_label
 
-_FREQUENCIES = ("critical_speed", "natural_frequency", "angular_frequency")
+# Each at a speed of 1 rpm.
+_FREQUENCIES = {"critical_speed": 1.0, "natural_frequency": 1 / 60, "angular_frequency": math.pi / 30}
 _HEIGHT, _SHAPE_HEIGHT, _MAP_HEIGHT = 3.4, 1.15, 2.3
 _MOST_SHAPES, _MOST_MAPS = 6, 4
 # Letters of a label along one map.
@@ -83,16 +87,35 @@ def _curves(dataset: xr.Dataset, name: str, shown: str) -> Figure:
     axes.set_xlim(x[0], x[-1])
     if logarithmic:
         axes.set_yscale("log")
-        cells.plain_decades(axes, "y")
     else:
         axes.set_ylim(bottom=0.0)
+    operating = _draw_range(axes, _operating(dataset, shown))
+    if logarithmic:
+        cells.plain_decades(axes, "y")
     axes.grid(color=FRAME_GREY, alpha=0.2, linewidth=0.5)
     _label_curves(axes)
     axes.set_ylabel(variable_label(dataset[shown]))
     panels.label_axes(_every(dataset, abscissa, name))
     panels.titles(dataset)
-    panels.legend(_doubtful(axes, dataset, name, x, drawn, order))
+    panels.legend([*operating, *_doubtful(axes, dataset, name, x, drawn, order)])
     return panels.figure
+
+
+def _operating(dataset: xr.Dataset, shown: str) -> tuple[float, float] | None:
+    """Lowest and highest operating speed in the units of ``shown``, if the file has them."""
+    options = json.loads(dataset.attrs.get("options", "{}"))
+    low, high = (options.get(f"operating_{end}", 0.0) * _FREQUENCIES[shown] for end in ("min", "max"))
+    return (low, high) if high > 0 else None
+
+
+def _draw_range(axes: Axes, operating: tuple[float, float] | None) -> list[Artist]:
+    """The operating speeds as a band, down to the lower edge of ``axes`` if they begin at standstill."""
+    if operating is None:
+        return []
+    low, high = operating
+    # A logarithmic axis has no zero.
+    low = low or min(axes.get_ylim()[0], high / 10)
+    return [axes.axhspan(low, high, color=LINE_COLOURS[1], alpha=0.2, zorder=0, label="operating speeds")]
 
 
 def _label_curves(axes: Axes) -> None:
@@ -142,6 +165,7 @@ def _maps(dataset: xr.Dataset, names: list[str], shown: str) -> Figure:
     modes = [mode for mode in range(dataset.sizes["mode"]) if float(dataset[shown].isel(mode=mode).max()) > 0]
     modes = modes[:_MOST_MAPS]
     panels = Panels(len(modes), height=_MAP_HEIGHT, margins=Margins(right=1.25, left=1.0))
+    operating: dict[str, Artist] = {}
     for (axes,), mode in zip(panels.axes, modes, strict=True):
         field = dataset[shown].isel(mode=mode)
         values = field.values[np.isfinite(field.values) & (field.values > 0)]
@@ -150,6 +174,9 @@ def _maps(dataset: xr.Dataset, names: list[str], shown: str) -> Figure:
         cmap = matplotlib.colormaps["viridis"].with_extremes(bad=STATE_COLOURS[cells.FAILED])
         field = field.where(field.isnull() | (field > low), low)
         mesh = cells.draw_cells(axes, field, horizontal, vertical, cmap=cmap, norm=norm)
+        operating |= _draw_limits(
+            axes, dataset[shown].isel(mode=mode), (horizontal, vertical), _operating(dataset, shown)
+        )
         number = dataset["mode"].values[mode]
         bar_format = ticker.StrMethodFormatter("{x:g}")
         panels.colorbar(
@@ -159,8 +186,26 @@ def _maps(dataset: xr.Dataset, names: list[str], shown: str) -> Figure:
         axes.set_ylabel(textwrap.fill(axis_label(dataset[vertical]), _LETTERS))
     panels.label_axes(axis_label(dataset[horizontal]))
     panels.titles(dataset)
-    panels.legend(cells.failure_legend(dataset))
+    panels.legend([*operating.values(), *cells.failure_legend(dataset)])
     return panels.figure
+
+
+def _draw_limits(
+    axes: Axes, field: xr.DataArray, names: tuple[str, str], operating: tuple[float, float] | None
+) -> dict[str, Artist]:
+    """Lines where ``field`` is the lowest or the highest operating speed; a legend entry by name for each that exists."""
+    handles: dict[str, Artist] = {}
+    # White beside the black, which is lost on the dark end of the map.
+    style = {"linewidth": 1.0, "path_effects": [withStroke(linewidth=2.4, foreground="white")]}
+    for name, speed, dashes in zip(("lowest", "highest"), operating or (), ("dashed", "solid"), strict=False):
+        if not float(field.min()) < speed < float(field.max()):
+            continue
+        x, y = (field[each] for each in names)
+        lines = axes.contour(x, y, field.transpose(*reversed(names)), [speed], colors="black", linestyles=dashes)
+        lines.set(**style)
+        label = f"{name} operating speed"
+        handles[label] = Line2D([], [], color="black", linestyle=dashes, label=label, **style)
+    return handles
 
 
 def _ticks(low: float, high: float) -> np.ndarray:
@@ -173,7 +218,7 @@ def _ticks(low: float, high: float) -> np.ndarray:
 
 def _shapes(dataset: xr.Dataset) -> Figure:
     count = min(dataset.sizes["mode"], _MOST_SHAPES)
-    panels = Panels(count, height=_SHAPE_HEIGHT, margins=Margins(right=0.3, between_rows=0.12))
+    panels = Panels(count, height=_SHAPE_HEIGHT, margins=Margins(right=0.3, between_rows=0.3))
     x = dataset["x"].values
     for (axes,), index, colour in zip(panels.axes, range(count), _colours(count), strict=True):
         shape = dataset["mode_shape"].isel(mode=index).values
@@ -181,7 +226,7 @@ def _shapes(dataset: xr.Dataset) -> Figure:
         axes.plot(x, shape, color=colour)
         axes.fill_between(x, shape, color=colour, alpha=0.15, linewidth=0)
         axes.set(xlim=(0.0, 1.0), ylim=(-1.25, 1.25), yticks=(-1.0, 0.0, 1.0))
-        axes.annotate(_name(dataset, index), (0.01, 0.05), xycoords="axes fraction", color=FRAME_GREY)
+        axes.set_title(_name(dataset, index), loc="left", pad=3, color=FRAME_GREY, size=8)
     panels.label_axes(variable_label(dataset["x"]), "deflection, largest 1 [1]")
     panels.titles(dataset)
     return panels.figure

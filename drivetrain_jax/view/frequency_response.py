@@ -70,7 +70,7 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
 
 def _lines(results: list[xr.Dataset]) -> Figure:
     with_phase = all("phase" in each for each in results)
-    panels = Panels(1 + with_phase, height=_HEIGHT, margins=Margins(right=0.25, top=0.62), share_y=False)
+    panels = Panels(1 + with_phase, height=_HEIGHT, margins=Margins(right=0.25, top=0.73), share_y=False)
     upper = panels.axes[0][0]
     order = list(_METHODS)
     handles = []

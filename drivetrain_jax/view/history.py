@@ -17,8 +17,6 @@ from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, caption, 
 _LINE = {"color": LINE_COLOURS[0], "linewidth": 0.6}
 _MOST_ROWS = 8
 _CAPTION_LINES = 2
-# Powers of ten beside the axis, as a product and not as 1e-4.
-_STYLE = {**STYLE, "axes.formatter.use_mathtext": True, "axes.formatter.limits": (-2, 4)}
 
 
 def plot(dataset: xr.Dataset) -> Figure:
@@ -28,7 +26,7 @@ def plot(dataset: xr.Dataset) -> Figure:
     without values keep empty panels that say so. Raises :class:`InputError` for more axes or values, and unless ``phi``
     and ``velocity`` are stored.
     """
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
         cells.require(dataset, "phi", "velocity")
         names = cells.sweep_axes(dataset)
@@ -85,7 +83,6 @@ def _draw(history: xr.Dataset, twist: Axes, rate: Axes, portrait: Axes) -> None:
     portrait.set_xlabel(_label(history, "phi"))
     for axes in (twist, rate):
         axes.set_xlim(history["time"].values[0], history["time"].values[-1])
-        axes.ticklabel_format(axis="x", scilimits=(-3, 4))
     if not np.isfinite(phi).any():
         for axes in (twist, rate, portrait):
             axes.text(0.5, 0.5, "no values", transform=axes.transAxes, ha="center", va="center", color=FRAME_GREY)

@@ -21,6 +21,7 @@ WIDTH = 7.0
 DPI = 200
 _LABEL_SIZE = 8.5
 _INCHES_PER_LETTER = 0.068
+_CLEAR = 0.07
 _INCHES_PER_ENTRY = 0.45
 _TITLE_SIZE, _SMALLEST_TITLE, _ELLIPSIS = 10.5, 7.0, "\u2026"
 _CAPTION_SIZE, _CAPTION_TOP, _CAPTION_LINE = 8, 0.32, 0.14
@@ -81,15 +82,20 @@ class Panels:
         x, y = (first.x0 + last.x1) / 2, last.y0 - 0.36 / self.figure.get_figheight()
         text = _wrap(horizontal, (last.x1 - first.x0) * WIDTH)
         self.figure.text(x, y, text, ha="center", va="center", size=_LABEL_SIZE)
-        self._label_side(last.y0, first.y1, vertical)
+        self._label_side([row[0] for row in self.axes], vertical)
+        # All columns have one power of ten: written at the right end, clear of the label in the middle.
+        for row in self.axes:
+            for axes in row[:-1]:
+                axes.xaxis.get_offset_text().set_visible(False)
 
     def label_row(self, axes: Axes, vertical: str) -> None:
         """A label for the vertical axis of one row."""
-        box = axes.get_position()
-        self._label_side(box.y0, box.y1, vertical)
+        self._label_side([axes], vertical)
 
-    def _label_side(self, bottom: float, top: float, text: str) -> None:
-        x = self.axes[0][0].get_position().x0 - self.margins.label / WIDTH
+    def _label_side(self, beside: Sequence[Axes], text: str) -> None:
+        top, bottom = beside[0].get_position().y1, beside[-1].get_position().y0
+        usual = self.axes[0][0].get_position().x0 - self.margins.label / WIDTH
+        x = min(usual, *(_left_of_numbers(axes) for axes in beside))
         text = _wrap(text, (top - bottom) * self.figure.get_figheight())
         self.figure.text(
             x, (bottom + top) / 2, text, ha="right", va="center", multialignment="center", rotation=90, size=_LABEL_SIZE
@@ -106,9 +112,9 @@ class Panels:
         self.figure.text(left, 1 - _CAPTION_TOP / total, text, va="top", size=_CAPTION_SIZE, color=FRAME_GREY)
 
     def legend(self, handles: Sequence[Artist]) -> None:
-        """One legend for the whole figure, in the bottom margin: one row, or two if that would be too long."""
+        """One legend for the whole figure, in the bottom margin, in as many rows as its length needs."""
         length = sum(_INCHES_PER_ENTRY + _INCHES_PER_LETTER * len(_plain(handle.get_label())) for handle in handles)
-        rows = 1 if length <= WIDTH - self.margins.left else 2
+        rows = max(math.ceil(length / (WIDTH - self.margins.left)), 1)
         self.figure.legend(
             handles=handles,
             loc="lower left",
@@ -119,6 +125,12 @@ class Panels:
             columnspacing=1.4,
             handlelength=2.0,
         )
+
+
+def _left_of_numbers(axes: Axes) -> float:
+    """Right end, over the figure's width, of a label that clears the numbers of the vertical axis."""
+    box = axes.yaxis.get_tightbbox()
+    return box.x0 / axes.figure.bbox.width - _CLEAR / WIDTH if box else 1.0
 
 
 def write_title(figure: Figure, dataset: xr.Dataset, left: float) -> None:

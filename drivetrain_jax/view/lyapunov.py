@@ -19,8 +19,6 @@ from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, axis_labe
 # In the order of the flags of the verdict; lightness falls from regular to irregular, undecided is grey.
 KIND_COLOURS = ("#ffffff", "#cfe3f3", "#7fb2d9", "#d1771e", "#5b1020", "#b0b0b0")
 _COLOURS = (*LINE_COLOURS, "#3f8f5f", "#7a4fa0", "#999933", "#333333")
-# Numbers of five digits would run into the label of their axis.
-_STYLE = {**STYLE, "axes.formatter.use_mathtext": True, "axes.formatter.limits": (-3, 4)}
 _HEIGHT = 1.9
 _CURVES = ("lyapunov_spectrum", "paper_estimator", "sum_rule_residual", "chaos_k01")
 _MOST_COLUMNS = 4
@@ -33,7 +31,7 @@ def plot(dataset: xr.Dataset) -> Figure:
     as far as they are stored, with the verdict as a coloured strip. For a single point the convergence history. Raises
     :class:`InputError` if there is nothing of that.
     """
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
         names = cells.sweep_axes(dataset)
         if not names:

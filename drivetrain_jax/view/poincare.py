@@ -13,7 +13,6 @@ from drivetrain_jax.view import cells
 from drivetrain_jax.view.layout import Margins, Panels
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, value_text
 
-_STYLE = {**STYLE, "axes.formatter.use_mathtext": True, "axes.formatter.limits": (-2, 4)}
 _FIRST = 1000
 _MOST_ROWS = 6
 # A section narrower than this, over its distance from zero, is drawn as a point; so are rates of twist that are a
@@ -28,7 +27,7 @@ def plot(dataset: xr.Dataset) -> Figure:
 
     Raises :class:`InputError` for more axes or values, and unless ``section`` is stored.
     """
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
         cells.require_any(dataset, "section")
         names = cells.sweep_axes(dataset)
@@ -60,8 +59,6 @@ def _draw_row(row: list[Axes], part: xr.Dataset, name: str | None) -> None:
     if "distinct_points" in part and part["distinct_points"].item():
         notes.append(f"distinct points: {part['distinct_points'].item()}")
     row[0].text(0.0, 1.08, "; ".join(notes), transform=row[0].transAxes, color=FRAME_GREY, size=7.5)
-    # Both panels have the same multiplier: written once, clear of the label between them.
-    row[0].xaxis.get_offset_text().set_visible(len(row) == 1)
     twist = np.nanmax(np.abs(points[:, 0]), initial=0.0)
     for which, values, least in zip("xy", points.T, (0.0, 1e-3 * _RATE * twist), strict=True):
         _widen(row[0], which, values[np.isfinite(values)], least)

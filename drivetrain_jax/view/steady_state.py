@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import re
-import textwrap
 
 import matplotlib
 import numpy as np
@@ -32,8 +30,6 @@ from drivetrain_jax.view.style import (
 )
 
 _HEIGHT, _PORTRAIT = 2.45, 3.1
-# Of the line with the parameters, marks of formulas counted.
-_LETTERS = 110
 # Amplitudes of attractors closer than this, relatively, are one.
 _SAME = 1e-5
 
@@ -62,15 +58,6 @@ def plot(dataset: xr.Dataset) -> Figure:
         raise InputError(f"axes = {', '.join(names)}: allowed are at most two axes for a figure of steady states")
 
 
-def _titles(panels: Panels, dataset: xr.Dataset) -> None:
-    """Title and parameters, these in two lines where one would not hold them."""
-    panels.titles(dataset)
-    line = panels.figure.texts[-1]
-    # A parameter stays with its value.
-    kept = re.sub(r"(?<!,) ", "\u00a0", line.get_text())
-    line.set_text(textwrap.fill(kept, _LETTERS, break_long_words=False))
-
-
 def _maps(dataset: xr.Dataset, names: list[str]) -> Figure:
     horizontal = cells.speed_axis(dataset, names)
     vertical = next(name for name in names if name != horizontal)
@@ -88,7 +75,7 @@ def _maps(dataset: xr.Dataset, names: list[str]) -> Figure:
             panels.colorbar(axes, mesh, variable_label(dataset[name]))
         handles += regimes.draw_threshold(axes, dataset, horizontal, vertical)[: 1 if axes is panels.axes[-1][0] else 0]
     panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
-    _titles(panels, dataset)
+    panels.titles(dataset)
     panels.legend(handles)
     return panels.figure
 
@@ -130,7 +117,7 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
             axes.axhline(limit, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)))
     cells.fit_axis(stack[0], "x", dataset[name].values)
     panels.label_axes(axis_label(dataset[name]))
-    _titles(panels, dataset)
+    panels.titles(dataset)
     panels.legend(handles)
     return panels.figure
 
@@ -153,7 +140,7 @@ def _basins(dataset: xr.Dataset) -> Figure:
         if part > 0
     ]
     panels.label_axes(axis_label(dataset["u0"]), axis_label(dataset["v0"]))
-    _titles(panels, dataset)
+    panels.titles(dataset)
     panels.legend(handles)
     return panels.figure
 
@@ -218,7 +205,9 @@ def _motion(dataset: xr.Dataset) -> Figure:
         handles.append(flank)
     history.set_xlim(0, 1)
     panels.label_axes("part of the motion's period [1]", variable_label(u))
-    portrait.set(xlabel=variable_label(u), ylabel=variable_label(v))
-    _titles(panels, dataset)
+    # To the left, clear of a power of ten at the right end.
+    portrait.set_xlabel(variable_label(u), loc="left")
+    portrait.set_ylabel(variable_label(v))
+    panels.titles(dataset)
     panels.legend(handles)
     return panels.figure

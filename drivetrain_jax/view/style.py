@@ -19,6 +19,9 @@ STYLE = {
     "axes.titlesize": 8.5,
     "axes.linewidth": 0.7,
     "axes.formatter.useoffset": False,
+    # Numbers of five digits would run into the label of their axis: powers of ten beside it, as a product, not as 1e-4.
+    "axes.formatter.limits": (-3, 4),
+    "axes.formatter.use_mathtext": True,
     "xtick.labelsize": 8.0,
     "ytick.labelsize": 8.0,
     "xtick.direction": "out",
@@ -53,7 +56,15 @@ _PRODUCTS = {"EI": "$EI$", "rhoA": r"$\rho A$", "rhoI": r"$\rho I$", "kGA": r"$\
 
 def symbol(name: str) -> str:
     """``name`` as it is set in a formula: Greek letters by name, an index as subscript (``k_A``, ``k_joint``), else
-    unchanged."""
+    unchanged.
+
+    Entries of a list, which scenes count from 0, are counted from 1 as bodies and modes are: ``m_p[1]`` is m_p,2.
+    """
+    if match := re.fullmatch(r"(.+)\[(\d+)\]", name):
+        head, number = symbol(match[1]), int(match[2]) + 1
+        if head == match[1]:
+            return name
+        return f"{head[:-2]},{number}}}$" if head.endswith("}$") else f"{head[:-1]}_{{{number}}}$"
     if name in _PRODUCTS:
         return _PRODUCTS[name]
     if name in _GREEK:

@@ -154,12 +154,16 @@ def test_a_matrix_is_printed_with_its_rows_and_columns():
     shape = dt.point("bicardan", "critical_speeds", **shaft, k_A=85e6, k_D=2e7, modes=2, outputs=["mode_shape"])
     lines = repr(shape).splitlines()
     assert lines[-len(shape.labels["x"]) - 1].split() == ["x", "mode", "1", "mode", "2"]
-    assert [float(cell) for cell in lines[-1].split()] == pytest.approx([shape.labels["x"][-1], *shape.mode_shape[:, -1]])
+    assert [float(cell) for cell in lines[-1].split()] == pytest.approx(
+        [shape.labels["x"][-1], *shape.mode_shape[:, -1]]
+    )
 
 
 def test_physical_units_in_a_scene_are_refused_with_the_way_out():
     scene = {"system": "cardan", "analysis": "floquet", "axes": {"angle": {"start": 0.0, "stop": 30.0, "num": 3}}}
-    message = r"^axes\.angle: physical units are for point, query and design; allowed in a scene is beta, Omega, .*gamma$"
+    message = (
+        r"^axes\.angle: physical units are for point, query and design; allowed in a scene is beta, Omega, .*gamma$"
+    )
     with pytest.raises(dt.InputError, match=message):
         load_scene(scene)
     with pytest.raises(dt.InputError, match=r"^fixed\.k1 = 3: physical units are for point, query and design"):

@@ -96,7 +96,7 @@ def test_one_entry_of_a_list_is_swept():
     assert ds["value"].dims == ("length[1]", "a")
     for i, entry in enumerate((0.0, 5.0)):
         np.testing.assert_allclose(ds["value"][i], expected_value(ds["a"].values, 2.0, length=(4.0, entry, 2.0)))
-    assert ds["length[1]"].attrs["long_name"] == "lengths, entry 1"
+    assert ds["length[1]"].attrs["long_name"] == "lengths, entry 2 of the list"
 
 
 def test_axis_that_the_analysis_does_not_use_and_integer_axis():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.contour import QuadContourSet
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import plot
@@ -55,6 +56,52 @@ def test_the_map_is_logarithmic_and_crosses_what_is_not_certified(swept):
     assert "not certified by the count" in [text.get_text() for text in figure.legends[0].get_texts()]
 
 
+@pytest.mark.parametrize(
+    ("variable", "low", "drawn"),
+    [
+        ("critical_speed", 3e3, (3e3, 9e3)),
+        ("natural_frequency", 3e3, (50.0, 150.0)),
+        ("critical_speed", 0.0, (None, 9e3)),
+    ],
+)
+def test_operating_speeds_are_a_band(swept, variable, low, drawn):
+    """In the units of what is shown, and down to the lower edge from standstill, which a logarithmic axis cannot show."""
+    options = json.dumps({"operating_min": low, "operating_max": 9e3})
+    figure = plot(swept.rename(critical_speed=variable).assign_attrs(options=options))
+    (band,) = [patch for patch in figure.axes[0].patches if patch.get_label() == "operating speeds"]
+    assert band.get_y() + band.get_height() == pytest.approx(drawn[1])
+    bottom = figure.axes[0].get_ylim()[0]
+    assert band.get_y() == pytest.approx(drawn[0]) if drawn[0] else 0 < band.get_y() <= bottom * 1.5
+    assert "operating speeds" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_without_operating_speeds_there_is_no_band(swept):
+    options = json.dumps({"operating_min": 0.0, "operating_max": 0.0})
+    assert not plot(swept.assign_attrs(options=options)).axes[0].patches
+
+
+def test_maps_show_where_a_mode_meets_the_operating_speeds():
+    """Critical speeds k_A + k_D + 10 mode: mode 1 meets both ends, mode 2 the upper one, mode 3 none."""
+    k = np.linspace(1.0, 9.0, 9)
+    values = k[:, None, None] + k[:, None] + 10 * np.arange(1, 4)
+    data = {
+        "critical_speed": speeds(values, ("k_A", "k_D", "mode")),
+        "outcome": (("k_A", "k_D"), np.zeros((9, 9), "int8")),
+    }
+    dataset = result(data, {"k_A": ("k_A", k), "k_D": ("k_D", k)})
+    figure = plot(dataset.assign_attrs(options=json.dumps({"operating_min": 17.0, "operating_max": 25.0})))
+    found = [
+        [collection for collection in axes.collections if isinstance(collection, QuadContourSet)]
+        for axes in figure.axes
+        if axes.get_label() != "colour bar"
+    ]
+    assert [[float(lines.levels[0]) for lines in each] for each in found] == [[17.0, 25.0], [25.0], []]
+    for lines, total in zip((*found[0], *found[1]), (7.0, 15.0, 5.0), strict=True):
+        np.testing.assert_allclose(np.concatenate(lines.allsegs[0]).sum(axis=1), total)
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names == ["lowest operating speed", "highest operating speed"]
+
+
 def test_two_axes_give_one_map_per_mode(swept):
     both = swept.critical_speed.values[:, None] + swept.critical_speed.values[None]
     data = {
@@ -73,7 +120,10 @@ def test_mode_shapes_are_named(swept):
         "outcome": ((), np.int8(0)),
     }
     figure = plot(result(data, {}).assign_coords(x=("x", x, {"units": "1", "long_name": "distance"})))
-    assert figure.axes[0].texts[0].get_text() == "mode 1: critical speed 8000 rpm"
+    assert figure.axes[0].get_title(loc="left") == "mode 1: critical speed 8000 rpm"
+    FigureCanvasAgg(figure).draw()
+    title = figure.axes[1]._left_title.get_window_extent()
+    assert figure.axes[1].get_window_extent().y1 < title.y0 < title.y1 < figure.axes[0].get_window_extent().y0
 
 
 def test_nothing_to_plot(swept):

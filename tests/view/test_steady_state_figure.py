@@ -46,8 +46,50 @@ def test_an_attractor_keeps_its_colour_where_a_larger_one_ends():
     nan = np.nan
     size = np.array([[0.5, 0.3, nan], [0.55, 0.29, nan], [0.28, nan, nan], [nan, 0.27, nan]])
     share = np.array([[0.6, 0.4, nan], [0.5, 0.5, nan], [0.9, 0.1, nan], [0.2, 0.8, nan]])
-    branch = basins._followed(size, np.isfinite(share))
+    branch = basins._followed(np.arange(4.0), size, np.isfinite(share), np.isfinite(size))
     assert branch.tolist() == [[0, 1, -1], [0, 1, -1], [1, 2, -1], [2, 1, -1]]
+
+
+@pytest.mark.parametrize(
+    ("size", "multiple", "branch"),
+    [
+        ([1.0, np.nan, 1.0], [1, 0, 1], [0, -1, 0]),
+        ([1.0, np.nan, np.nan, 1.0], [1, 0, 0, 1], [0, -1, -1, 1]),
+        ([1.0, 1.0, 1.0], [1, 4, 1], [0, 1, 0]),
+        # A third more each time: only the straight line foresees it.
+        ([1.0, 1.2, 1.55, 2.0], [1, 1, 1, 1], [0, 0, 0, 0]),
+        ([1.0, 1.0, 1.55], [1, 1, 1], [0, 0, 1]),
+        ([0.0, 0.0, 1.0], [1, 1, 1], [0, 0, 1]),
+        # The peak, which the straight line overshoots.
+        ([1.0, 1.2, 1.5, 1.8, 1.6], [1, 1, 1, 1, 1], [0, 0, 0, 0, 0]),
+    ],
+)
+def test_a_branch_goes_on_with_its_period_multiple_and_slope_and_ends_where_it_is_missing_twice(size, multiple, branch):
+    size = np.array(size)[:, None]
+    found = basins._followed(np.arange(len(size)), size, np.isfinite(size), np.array(multiple)[:, None])
+    assert found[:, 0].tolist() == branch
+
+
+def test_slopes_are_over_the_axis_and_not_over_its_numbers():
+    size = np.array([[1.0], [1.2], [1.8]])
+    one = np.ones((3, 1), int)
+    assert basins._followed(np.array([0.0, 1.0, 4.0]), size, one > 0, one)[:, 0].tolist() == [0, 0, 0]
+    assert basins._followed(np.array([0.0, 1.0, 2.0]), size, one > 0, one)[:, 0].tolist() == [0, 0, 1]
+
+
+def basin(multiple):
+    """Four values of omega with one attractor each, of one size."""
+    size = np.full((4, 1), 0.5)
+    dataset = result({"omega": [1.0, 2.0, 3.0, 4.0]}).assign_attrs(analysis="basins")
+    dataset["attractor_u_max"] = (("omega", "attractor"), size, {"units": "m"})
+    dataset["basin_fraction"] = (("omega", "attractor"), np.ones((4, 1)))
+    dataset["attractor_multiple"] = (("omega", "attractor"), np.array(multiple)[:, None])
+    return dataset
+
+
+def test_motions_have_letters_since_their_numbers_are_not_those_of_the_file():
+    assert labels(plot(basin([1, 1, 4, 4]))) == ["motion A", "motion B"]
+    assert labels(plot(basin([1, 1, 1, 1]))) == ["motion A"]
 
 
 def test_basins_show_the_share_of_every_attractor():

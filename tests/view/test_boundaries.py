@@ -1,0 +1,58 @@
+"""Names of the tips of tongues: on which side of them they stand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivetrain_jax.atlas.tips import Tip, Tips
+from drivetrain_jax.sweep.atlas_chart import _tips
+from drivetrain_jax.systems import get_system
+from drivetrain_jax.view import plot
+from tests.view import results
+
+
+def tipped(beta: list[float], opens: list[int] | None, omega: list[float]):
+    """The chart of one tongue, beta upwards from 0 to 1, with tips at these places."""
+    names = [f"S{number}" for number in range(1, len(beta) + 1)]
+    dataset = results.chart().assign_coords(
+        tip=("tip", names),
+        tip_proved=("tip", np.ones(len(beta), np.int8)),
+        tip_beta=("tip", beta),
+        tip_Omega=("tip", omega),
+    )
+    return dataset if opens is None else dataset.assign_coords(tip_opens=("tip", np.array(opens, np.int8)))
+
+
+def sides(dataset) -> dict[tuple[float, float], tuple[int, int]]:
+    """Direction from each named tip to its name."""
+    names = [text for text in plot(dataset).axes[0].texts if text.xycoords == "data"]
+    return {tuple(map(float, name.xy)): tuple(int(np.sign(x)) for x in name.xyann) for name in names}
+
+
+DOWN, UP, RIGHT, LEFT = (0, -1), (0, 1), (1, 0), (-1, 0)
+
+
+@pytest.mark.parametrize(("opens", "side"), [([1], DOWN), (None, DOWN), ([0], UP)])
+def test_a_name_stands_where_the_tongue_is_not(opens, side):
+    assert sides(tipped([0.5], opens, [1.0])) == {(1.0, 0.5): side}
+
+
+@pytest.mark.parametrize(
+    ("place", "opens", "side"), [((1.0, 0.01), 1, RIGHT), ((1.49, 0.01), 1, LEFT), ((1.0, 0.99), 0, RIGHT)]
+)
+def test_a_name_does_not_lie_on_the_frame(place, opens, side):
+    assert sides(tipped([place[1]], [opens], [place[0]])) == {place: side}
+
+
+def test_a_name_does_not_cover_another():
+    found = sides(tipped([0.5, 0.52], [1, 1], [1.0, 1.0]))
+    assert found == {(1.0, 0.5): DOWN, (1.0, 0.52): RIGHT}
+
+
+def test_a_chart_tells_which_way_tongues_open():
+    point, error = {"zeta": 0.01, "Omega": 0.7}, {"zeta": 1e-9, "Omega": 1e-9}
+    tips = tuple(Tip("H21", "+1", 0.0, point, error, opens) for opens in (False, True))
+    found = _tips(Tips(tips, (), 0, True), get_system("cardan"), ("zeta", "Omega"))
+    dims, values, attrs = found["tip_opens"]
+    assert dims == "tip" and values.tolist() == [0, 1] and attrs["long_name"].endswith("as zeta rises")

@@ -1,0 +1,63 @@
+"""Where labels, powers of ten and legends of a figure stand."""
+
+from __future__ import annotations
+
+import matplotlib
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.lines import Line2D
+
+from drivetrain_jax.view.layout import Margins, Panels
+from drivetrain_jax.view.style import STYLE
+
+
+def drawn(panels: Panels) -> Panels:
+    FigureCanvasAgg(panels.figure).draw()
+    return panels
+
+
+@pytest.mark.parametrize("top", [8e-4, 0.012, 0.03, 3.0, 9000.0, 2e5])
+@pytest.mark.parametrize("whole", [True, False])
+def test_the_label_is_clear_of_the_numbers(top, whole):
+    with matplotlib.rc_context(STYLE):
+        panels = Panels(2, height=1.5)
+        for (axes,) in panels.axes:
+            axes.set_ylim(-top, top)
+        panels.label_axes("horizontal", "vertical") if whole else panels.label_row(panels.axes[0][0], "vertical")
+        drawn(panels)
+    label = panels.figure.texts[-1].get_window_extent()
+    numbers = [text for text in panels.axes[0][0].get_yticklabels() if abs(text.get_position()[1]) <= top]
+    assert panels.figure.texts[-1].get_text() == "vertical"
+    assert 0 <= label.x0 and label.x1 < min(text.get_window_extent().x0 for text in numbers) - 0.04 * panels.figure.dpi
+
+
+def test_small_and_large_numbers_have_a_power_of_ten_beside_the_axis():
+    with matplotlib.rc_context(STYLE):
+        panels = Panels(2, height=1.5, share_y=False)
+        for (axes,), top in zip(panels.axes, (8e-4, 0.03), strict=True):
+            axes.set_ylim(0, top)
+        drawn(panels)
+    offsets = [axes.yaxis.get_offset_text().get_text() for (axes,) in panels.axes]
+    assert r"\times" in offsets[0] and "10^{\N{MINUS SIGN}4}" in offsets[0] and offsets[1] == ""
+
+
+def test_the_power_of_ten_of_columns_stands_at_the_right_end():
+    with matplotlib.rc_context(STYLE):
+        panels = Panels(1, 2, height=1.5)
+        panels.axes[0][0].set_xlim(0, 2e4)
+        panels.label_axes("a label that reaches into both of the columns [rad/s]")
+        drawn(panels)
+    left, right = (axes.xaxis.get_offset_text() for axes in panels.axes[0])
+    assert not left.get_visible() and right.get_visible() and "10^{4}" in right.get_text()
+    assert not right.get_window_extent().overlaps(panels.figure.texts[0].get_window_extent())
+
+
+@pytest.mark.parametrize(("count", "rows"), [(2, 1), (8, 2), (16, 3)])
+def test_a_legend_has_the_rows_that_it_needs(count, rows):
+    with matplotlib.rc_context(STYLE):
+        panels = Panels(height=1.5, margins=Margins(bottom=1.2))
+        panels.legend([Line2D([], [], label=f"motion {number}") for number in range(count)])
+        drawn(panels)
+    (legend,) = panels.figure.legends
+    heights = {round(text.get_window_extent().y0) for text in legend.get_texts()}
+    assert len(heights) == rows and legend.get_window_extent().x1 <= panels.figure.bbox.x1
