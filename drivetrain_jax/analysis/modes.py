@@ -1,7 +1,7 @@
 """Natural frequencies and modes of masses joined by springs: values, families, shapes, and modes followed along an
 axis.
 
-Frequencies alone come from singular values (:mod:`singular_values`) and need no vectors; everything else from
+Frequencies come from singular values (:mod:`singular_values`), whatever else is asked for; vectors from
 :mod:`singular_vectors`. Both work on the factor ``diag(sqrt k) B M^(-1/2)``: the stiffness matrix, which would square
 the condition, is never formed.
 """
@@ -55,11 +55,12 @@ _CACHE = 1 << 16
 
 class Modes(NamedTuple):
     """Modes of the whole system, rising: angular ``frequency`` (n, N), mass-weighted ``vectors`` (dofs, n, N) or None,
-    ``participation`` (n, families, N), ``found`` (N,)."""
+    ``participation`` (n, families, N), ``label`` of the family (n, N), ``found`` (N,)."""
 
     frequency: Array
     vectors: Array | None
     participation: Array
+    label: Array
     found: Array
 
 
@@ -114,9 +115,12 @@ def system_modes(model: SpringSystem, method: str, lanes: int, shapes: bool = Tr
     asymmetry = jnp.broadcast_to(model.asymmetry, (lanes,))
     blocks = [_as_lanes(block, lanes) for block in _blocks(model, method)]
     parts = [block_modes(block, largest, asymmetry) for block in blocks]
-    repeated = [jnp.repeat(part.frequency, block.copies, axis=0) for block, part in zip(blocks, parts, strict=True)]
-    shares = [jnp.repeat(part.participation, block.copies, axis=0) for block, part in zip(blocks, parts, strict=True)]
-    frequency, participation = jnp.concatenate(repeated), jnp.concatenate(shares)
+
+    def of_all(name: str) -> Array:
+        pairs = zip(blocks, parts, strict=True)
+        return jnp.concatenate([jnp.repeat(getattr(part, name), block.copies, axis=0) for block, part in pairs])
+
+    frequency = of_all("frequency")
     order = jnp.argsort(frequency, axis=0)
     vectors = None
     if shapes:
@@ -125,7 +129,8 @@ def system_modes(model: SpringSystem, method: str, lanes: int, shapes: bool = Tr
     return Modes(
         jnp.take_along_axis(frequency, order, axis=0),
         vectors,
-        jnp.take_along_axis(participation, order[:, None], axis=0),
+        jnp.take_along_axis(of_all("participation"), order[:, None], axis=0),
+        jnp.take_along_axis(of_all("label"), order, axis=0),
         jnp.all(jnp.stack([part.found for part in parts]), axis=0),
     )
 
@@ -169,7 +174,7 @@ def _results(build: Build, request: Request, values: Mapping[str, Any], lanes: i
         largest = largest_frequency(model, count)
         results = _frequencies(modes.frequency, modes.found, modes.participation)
         results["mode_type"] = jnp.where(
-            modes.found, mode_types(modes.frequency, modes.participation, largest), len(MODE_TYPES) - 1
+            modes.found, mode_types(modes.frequency, modes.label, largest), len(MODE_TYPES) - 1
         )
         if shapes:
             vectors = jnp.where(modes.found, _canonical(modes.vectors), jnp.nan)

@@ -40,8 +40,9 @@ class SpringSystem:
 
     ``extensions`` (springs, dofs, ...) is ``B``: the extension of each spring per unit of each coordinate;
     ``stiffness`` (springs, ...), ``mass`` (dofs, ...). ``blocks`` are an exact decomposition into invariant parts;
-    ``whole`` is the system as one block. ``asymmetry`` (...), from 0 to 1, measures what couples the families; ``dofs``
-    and ``body_names`` name coordinates and bodies; ``bodies`` (dofs,) gives the number of the body of each coordinate.
+    ``whole`` is the system as one block. ``asymmetry`` (...), from 0 to 1, measures all that couples the families;
+    ``dofs`` and ``body_names`` name coordinates and bodies; ``bodies`` (dofs,) gives the number of the body of each
+    coordinate.
     """
 
     extensions: Array

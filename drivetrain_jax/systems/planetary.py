@@ -207,6 +207,15 @@ def identical_planets(values: Values) -> bool:
     return all(alike(values[name]) for name in PER_PLANET)
 
 
+def _inequality(p: Mapping[str, Array]) -> Array:
+    """The largest relative difference between two planets in one parameter, 0 to 1."""
+    lists = jnp.stack([p[name] for name in PER_PLANET])
+    largest = jnp.max(lists, axis=1)
+    return jnp.max(
+        jnp.where(largest > 0, 1 - jnp.min(lists, axis=1) / jnp.where(largest > 0, largest, 1.0), 0.0), axis=0
+    )
+
+
 def _reduced_blocks(p: Mapping[str, Array], frame: Array, directions: Array, balanced: bool) -> tuple[Block, ...]:
     """The blocks of identical planets: rotation with translation (apart if ``balanced``), and the planets alone
     (8)-(9).
@@ -254,7 +263,8 @@ def build(values: Values) -> SpringSystem:
         blocks = _reduced_blocks(p, frame, triangle[:3], balanced)
     names, bodies = coordinate_names(n), np.repeat(np.arange(3 + n), 3)
     body_names = (*BODIES, *(f"planet_{i + 1}" for i in range(n)))
-    return SpringSystem(extensions, stiffness, mass, blocks, whole, spacing(tuple(angles)), names, body_names, bodies)
+    asymmetry = jnp.maximum(spacing(tuple(angles)), _inequality(p))
+    return SpringSystem(extensions, stiffness, mass, blocks, whole, asymmetry, names, body_names, bodies)
 
 
 def coordinate_names(n: int) -> tuple[str, ...]:

@@ -80,6 +80,23 @@ def test_against_differences(jacobian, name):
     np.testing.assert_allclose(ours[1:], exact[1:], rtol=2e-6, atol=2e-7 * np.abs(exact[1:]).max())
 
 
+def test_planets_that_differ_slightly():
+    """Planet modes 1.5e-7 apart, more than a cluster is wide: value and derivative of each are its own."""
+    listed = tuple(1e8 * (1 + 1e-5 * x) for x in (0, 0.3, -0.5, 0.9, -0.2, 0.6))
+    p = TABLE_2 | {"planet_angle": tuple(2 * np.pi * i / 6 for i in range(6)), "k_p": listed}
+    rate = jax.tree.map(lambda x: 0.0, p) | {"k_p": (0.0, 1.0, 0.0, 0.0, 0.0, 0.0)}
+    slope = jax.jit(lambda q, d: jax.jvp(lambda x: natural_frequencies(planetary.build, x), (q,), (d,)))
+    value, ours = map(np.asarray, slope(p, rate))
+    low, here, high = (np.array(exact_frequencies(moved(p, "k_p", 1, step))) for step in (-0.1, 0.0, 0.1))
+    np.testing.assert_allclose(value[1:], here[1:], rtol=1e-13)
+    gaps = np.diff(here, prepend=-np.inf, append=np.inf) / here.clip(1)[np.r_[0 : here.size, -1]]
+    alone = np.minimum(gaps[:-1], gaps[1:]) > 6e-8
+    alone[0] = False
+    close = alone & (np.minimum(gaps[:-1], gaps[1:]) < 5e-7)
+    assert close.sum() > 3
+    np.testing.assert_allclose(ours[alone], ((high - low) / 0.2)[alone], rtol=1e-3, atol=1e-10)
+
+
 def test_scaling_of_all_stiffnesses(jacobian, frequencies):
     """f is homogeneous of degree 1/2 in the stiffnesses: sum k df/dk = f/2."""
     total = sum(

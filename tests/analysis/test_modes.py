@@ -133,6 +133,73 @@ def test_shapes_solve_the_equations_of_motion(shapes):
     assert np.abs(residual).max() < 1e-6 * np.abs(np.array(stiffness) @ q.T).max()
 
 
+SIX = tuple(2 * math.pi * i / 6 for i in range(6))
+ONE_ANGLE = TABLE_2 | {"planet_angle": (0.3,) * 4, "I_p": (0.61, 0.61, 0.6100001, 0.61)}
+FULL = ["natural_frequency", "natural_frequency_error", "mode_shape", "mode_type"]
+
+
+def nearly_equal(name: str, spread: float) -> dict:
+    """Six equally spaced planets that differ in one parameter."""
+    listed = tuple(TABLE_2[name] * (1 + spread * x) for x in (0, 0.3, -0.5, 0.9, -0.2, 0.6))
+    return TABLE_2 | {"planet_angle": SIX, name: listed}
+
+
+def check_modes(p: dict, frequency: np.ndarray, bound: np.ndarray, shapes: np.ndarray) -> None:
+    """Frequencies within their bound of 50 digits; shapes that solve the equations of motion, each one the mode of an
+    independent eigensolution where the gap to its neighbours determines it."""
+    assert (np.abs(frequency - np.array(exact_frequencies(p))) <= bound).all()
+    mass, stiffness = (np.array(x, float) for x in matrices(p))
+    vectors = shapes.T * np.sqrt(mass)[:, None]
+    scaled = stiffness / np.sqrt(np.outer(mass, mass))
+    values, exact = np.linalg.eigh(scaled)
+    np.testing.assert_allclose(vectors.T @ vectors, np.eye(len(mass)), atol=1e-13)
+    assert np.abs(scaled @ vectors - vectors * values).max() < 1e-12 * values[-1]
+    gaps = np.diff(values, prepend=-np.inf, append=np.inf)
+    alone = np.minimum(gaps[:-1], gaps[1:]) > 1e-9 * values[-1]
+    mac = np.sum(vectors * exact, axis=0) ** 2
+    assert alone.sum() > 4 and (mac[alone] > 1 - 1e-8).all()
+
+
+@pytest.mark.parametrize("name", ["k_p", "m_p", "k_sp"])
+def test_planets_that_differ_slightly_have_modes_of_their_own(name):
+    """Planet modes split by less than 5e-5: turned towards their family they would be no modes."""
+    gears = [nearly_equal(name, spread) for spread in (1e-3, 1e-5, 1e-7)]
+    columns = {f"{name}[{i}]": [gear[name][i] for gear in gears] for i in range(6)}
+    scene = {"system": "planetary", "analysis": "modes", "points": columns}
+    fixed = {"fixed": {"planet_angle": list(SIX), name: list(gears[0][name])}}
+    ds = dt.run(scene | fixed | {"outputs": FULL})
+    alone = dt.run(scene | fixed | {"outputs": FULL[:2]})
+    np.testing.assert_array_less(
+        np.abs(ds.natural_frequency.values - alone.natural_frequency.values), alone.natural_frequency_error.values
+    )
+    for i, gear in enumerate(gears):
+        check_modes(gear, *(ds[key].values[i] for key in FULL[:3]))
+    # A spread of 1e-5 puts less than its square outside the family.
+    assert [(ds.mode_type.values[1:] == kind).sum(1).tolist() for kind in (PLANET, RIGID)] == [[9, 9], [1, 1]]
+
+
+def test_unequal_planets_at_one_angle():
+    given = {name: list(value) for name, value in ONE_ANGLE.items() if isinstance(value, tuple)}
+    found = dt.point("planetary", "modes", outputs=FULL, **given).values
+    check_modes(ONE_ANGLE, *(found[key] for key in FULL[:3]))
+
+
+def test_followed_frequencies_are_those_of_each_point():
+    """From equal planets to one that differs by 1e-5."""
+    scene = {
+        "system": "planetary",
+        "analysis": "modes",
+        "outputs": ["natural_frequency", "natural_frequency_error", "branch", "mac"],
+        "axes": {"k_p[1]": {"values": [1e8, 1.00001e8]}},
+        "fixed": {"planet_angle": list(SIX), "k_p": [1e8] * 6},
+        "options": {"track": "k_p[1]"},
+    }
+    ds = dt.run(scene)
+    for i, k_p in enumerate((1e8, 1.00001e8)):
+        exact = np.array(exact_frequencies(TABLE_2 | {"planet_angle": SIX, "k_p": (1e8, k_p, *[1e8] * 4)}))
+        assert (np.abs(ds.natural_frequency.values[i] - exact) <= ds.natural_frequency_error.values[i]).all()
+
+
 def test_energies_and_participation_are_shares(shapes):
     np.testing.assert_allclose(shapes.kinetic_energy.values.sum(-1), 1, rtol=1e-12)
     np.testing.assert_allclose(shapes.participation.values.sum(-1), 1, rtol=1e-12)
