@@ -2,7 +2,8 @@
 
 Initial states are drawn uniformly from the box ``|u0| <= reach_u, |v0| <= reach_v`` by a seeded generator, the same ones
 for every point of a sweep; each is followed to its attractor exactly (analysis ``steady_state``). Motions of one period
-multiple whose extremes agree are one attractor; all non-periodic ones are taken for one.
+multiple whose extremes agree are one attractor. Non-periodic motions are taken for one attractor if there is nothing else.
+Beside a periodic one they count as not settled: they may be transients that end on it after ``most_periods``.
 
 Outcome: ``TOLERANCE_NOT_MET`` if some motions have not settled or belong to a ninth attractor, which
 ``unsettled_fraction`` counts, ``NOT_CONVERGED`` if none has settled.
@@ -34,7 +35,7 @@ VARIABLES = (
     Variable("attractor_u_max", "m", "largest relative displacement on the attractor", OWN),
     Variable("attractor_u_min", "m", "smallest relative displacement on the attractor", OWN),
     Variable("attractor_multiple", "1", "its period multiple (0: non-periodic or no attractor)", OWN, dtype="int32"),
-    Variable("unsettled_fraction", "1", "share of the initial states with no known end"),
+    Variable("unsettled_fraction", "1", "share of initial states with no known end, chaos beside periodic motion too"),
 )
 OPTIONS = (
     Parameter("samples", "1", "number of initial states", default=1024, lower=1, upper=1e6, integer=True),
@@ -77,6 +78,9 @@ def shares(high: Array, low: Array, multiple: Array, outcome: Array) -> dict[str
     """
     count = high.shape[0]
     periodic = multiple > 0
+    settled = outcome < Outcome.NOT_CONVERGED
+    # No finite time tells a chaotic attractor from a chaotic transient to a periodic one.
+    settled &= periodic | ~jnp.any(settled & periodic, axis=0)
     # Extremes of non-periodic motions depend on the time that they are observed for.
     high, low = (jnp.where(periodic, x, jnp.nan) for x in (high, low))
 
@@ -89,12 +93,12 @@ def shares(high: Array, low: Array, multiple: Array, outcome: Array) -> dict[str
         same = left & (multiple == m) & (near | ~periodic)
         return left & ~same, (same.sum(axis=0), top[0], bottom[0], m[0])
 
-    left, (number, top, bottom, m) = jax.lax.scan(next_kind, outcome < Outcome.NOT_CONVERGED, None, length=ATTRACTORS)
+    left, (number, top, bottom, m) = jax.lax.scan(next_kind, settled, None, length=ATTRACTORS)
     exists = number > 0
     order = jnp.argsort(jnp.where(exists, jnp.where(m > 0, -top, jnp.inf), jnp.nan), axis=0)
     number, top, bottom, m, exists = (jnp.take_along_axis(x, order, axis=0) for x in (number, top, bottom, m, exists))
     fraction = number / count
-    lost = (outcome >= Outcome.NOT_CONVERGED).sum(axis=0) + left.sum(axis=0)
+    lost = (~settled | left).sum(axis=0)
     state = jnp.where(lost > 0, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
     return {
         "basin_fraction": jnp.where(exists, fraction, jnp.nan),

@@ -31,6 +31,7 @@ from drivetrain_jax.analysis.chaos.growth import (
     record_growth,
     running_mean,
     sampled,
+    state_size,
 )
 from drivetrain_jax.analysis.chaos.paper_estimator import paper_estimator
 from drivetrain_jax.analysis.chaos.section_measures import period_multiple
@@ -48,7 +49,7 @@ VARIABLES = (
     Variable("averaging_time", "s", "time over which the exponents are averaged, transient excluded"),
     Variable("paper_estimator", "1/s", "the paper's (31)-(36) as printed, not a Lyapunov exponent", ("component",)),
     Variable("chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic"),
-    Variable("period_multiple", "1", "strobes after which the motion repeats, 0 if it does not", dtype="int32"),
+    Variable("period_multiple", "1", "strobes after which the motion repeats, 0: none found", dtype="int32"),
     Variable(
         "verdict",
         "1",
@@ -65,9 +66,15 @@ OPTIONS = (
 # Strobes that follow the run for the verdict and the 0-1 test, and the longest period looked for among them.
 SAMPLES, LONGEST = 1024, 512
 _SECTION = {"verdict", "chaos_k01", "period_multiple"}
-# Repetition is judged to this fraction of the motion, or to what is left of the transient if that is more; undecided
-# beyond the second.
+# Repetition is judged to this fraction of the motion; that a motion does not repeat, only if less than the second is left
+# of its transient.
 _REPEATED, _UNSETTLED = 1e-9, 1e-4
+# The bound on what is left of the transient is so many times as large as its exponent says: of a near-degenerate pair the
+# exponents are known to about the inverse of the time only, whatever the standard error is.
+_MARGIN = 1e3
+# Times that a motion is followed for as many strobes again, where what is left of the transient could hide or feign a
+# repetition.
+_MOST_LOOKS = 16
 # What one step needs of this many members is in the innermost caches.
 _CHUNK = 64
 
@@ -130,20 +137,73 @@ class Sampling(NamedTuple):
     settled: Array
 
 
+class _Look(NamedTuple):
+    """``SAMPLES`` strobes looked at: how many times before, the state after them and its number, the first section of all,
+    and what has been found of every member."""
+
+    number: Array
+    state: tuple
+    strobe: Array
+    first: Array
+    multiple: Array
+    settled: Array
+
+
 def sample(flow: Flow, steps: int, record: Record, spectrum: Spectrum, k01_for: Array) -> Sampling:
-    """Follow the motion for ``SAMPLES`` strobes; K of the members of ``k01_for``, otherwise 0."""
-    states, _ = sampled(flow, steps, record.state, record.strobe, SAMPLES)
+    """Follow the motion for ``SAMPLES`` strobes; K of the members of ``k01_for``, otherwise 0.
+
+    Motions that decay are followed further until their period can be told from what is left of the transient.
+    """
     watched = [i for i in range(flow.size) if i not in (*flow.phases, *flow.cyclic)] or [0]
-    section = states[:, jnp.array(watched)]
-    k01 = jax.lax.cond(jnp.any(k01_for), largest_k01, lambda x: jnp.zeros(x.shape[2:]), section)
+    shape = batch_shape(flow)
+    decays = jnp.zeros(shape, bool)
+    if flow.turns:
+        decays = record.bounded & (spectrum.values[0] < -STANDARD_ERRORS * spectrum.errors[0])
+
+    def look(seen: _Look) -> _Look:
+        states, state = sampled(flow, steps, seen.state, seen.strobe, SAMPLES)
+        section = states[:, jnp.array(watched)]
+        left = transient_left(flow, record, spectrum, seen.strobe + SAMPLES // 2)
+        multiple, settled = repetition(section, left)
+        # What has been told stands: no member's result depends on how long its neighbours are followed.
+        multiple, settled = (
+            jnp.where(seen.settled, *pair) for pair in ((seen.multiple, multiple), (seen.settled, settled))
+        )
+        first = jnp.where(seen.number == 0, section, seen.first)
+        return _Look(seen.number + 1, state, seen.strobe + SAMPLES, first, multiple, settled)
+
+    def unsettled(seen: _Look) -> Array:
+        return (seen.number == 0) | ((seen.number < _MOST_LOOKS) & jnp.any(decays & ~seen.settled))
+
+    blank = jnp.zeros((SAMPLES, len(watched), *shape))
+    nothing = jnp.zeros(shape, jnp.int64)
+    start = _Look(jnp.int64(0), record.state, record.strobe, blank, nothing, jnp.zeros(shape, bool))
+    seen = jax.lax.while_loop(unsettled, look, start)
+    good = record.bounded & jnp.all(jnp.isfinite(seen.first), axis=(0, 1))
+    k01 = jax.lax.cond(jnp.any(k01_for), largest_k01, lambda x: jnp.zeros(x.shape[2:]), seen.first)
     k01 = jnp.where(k01_for, k01, 0.0)
-    duration = (record.strobe + SAMPLES // 2) * flow.period
-    left = 10 * jnp.exp(jnp.minimum(spectrum.values[0], 0.0) * duration)
-    decayed = left < _UNSETTLED
-    tolerance = jnp.where(decayed, jnp.maximum(left, _REPEATED), _REPEATED)
-    good = record.bounded & jnp.all(jnp.isfinite(section), axis=(0, 1))
-    multiple = jnp.where(good, period_multiple(section, tolerance, LONGEST), 0)
-    return Sampling(jnp.where(good, k01, jnp.nan), multiple, decayed | (multiple > 0))
+    return Sampling(jnp.where(good, k01, jnp.nan), jnp.where(good, seen.multiple, 0), seen.settled)
+
+
+def transient_left(flow: Flow, record: Record, spectrum: Spectrum, strobe: Array) -> Array:
+    """Bound on the size that the transient still has at a strobe: a multiple of the largest state, decayed at the slowest
+    rate that the standard error allows."""
+    largest = jnp.maximum(jnp.max(record.size, axis=0), state_size(flow, initial_state(flow)))
+    rate = spectrum.values[0] + STANDARD_ERRORS * spectrum.errors[0]
+    return _MARGIN * largest * jnp.exp(jnp.minimum(rate, 0.0) * strobe * flow.period)
+
+
+def repetition(section: Array, left: Array) -> tuple[Array, Array]:
+    """Strobes after which ``section`` repeats to rounding (0: none), and whether this is more than a transient's doing.
+
+    ``left``: what may be left of the transient. A number of strobes after which the motion repeats to within that only,
+    but not to rounding, may be its period or not: a slow drift along a torus looks the same.
+    """
+    scale = jnp.max(jnp.abs(section), axis=(0, 1))
+    left = left / jnp.where(scale > 0, scale, 1.0)
+    tolerance = jnp.stack([jnp.full_like(left, _REPEATED), jnp.maximum(left, _REPEATED)])
+    strict, loose = period_multiple(section, tolerance, LONGEST)
+    return strict, (strict == loose) & ((strict > 0) | (left < _UNSETTLED))
 
 
 def evidence_of(run: Run, spectrum: Spectrum, residual: Array, seen: Sampling) -> Evidence:

@@ -1,13 +1,17 @@
-"""Steady state of an oscillator with play: the attractor that the motion from given initial conditions ends on.
+"""Steady state of an oscillator with play: the attractor that the motion from given initial conditions ends on, or what
+it does after ``most_periods`` if that is chaotic.
 
 The motion is exact within rounding (closed form in each linear region), and so are its extremes, multipliers and
 contacts. An orbit found by Newton shooting counts only if the motion has come so near to it that its linearisation
 governs the rest (:mod:`~drivetrain_jax.analysis.impacts.attractor`).
 
-Outcome: ``NOT_CONVERGED`` if the motion has neither settled within ``most_periods`` drive periods nor separated from its
-neighbours by a factor of exp(20) over their last three quarters, as only chaos does; ``TOLERANCE_NOT_MET`` if the
-estimated error of the orbit exceeds ``rtol`` times its largest displacement; ``STEP_LIMIT`` if the motion needs more
-events per period than any but a grazing one does.
+A motion that has not settled within ``most_periods`` drive periods, but has separated from its neighbours by a factor of
+exp(20) over their last three quarters, as only chaos does, is a success, too: ``non_periodic``. It may be a chaotic
+attractor or a long transient, which no finite time can tell; more ``most_periods`` may show its end.
+
+Outcome: ``NOT_CONVERGED`` if the motion has done neither; ``TOLERANCE_NOT_MET`` if the estimated error of the orbit exceeds
+``rtol`` times its largest displacement; ``STEP_LIMIT`` if the motion needs more events per period than any but a grazing
+one does.
 """
 
 from __future__ import annotations
@@ -38,17 +42,18 @@ DIMENSIONS = (
 )
 HISTORIES = frozenset(("u_history", "v_history"))
 _WHOLE = "over the period of the orbit (non-periodic: over 32 drive periods)"
+_REGIME = "flanks at which contact is made and lost (non_periodic within most_periods: maybe a transient)"
 VARIABLES = (
     Variable("u_max", "m", "largest relative displacement"),
     Variable("u_min", "m", "smallest relative displacement"),
     Variable("u_mean", "m", "mean relative displacement"),
     Variable("u_rms", "m", "root mean square of the relative displacement, mean included"),
     Variable("phase", "rad", "lag of the fundamental behind the drive"),
-    Variable("period_multiple", "1", "period multiple (0: non-periodic)", dtype="int32"),
+    Variable("period_multiple", "1", "period multiple (0: not periodic within most_periods)", dtype="int32"),
     Variable("spectral_radius", "1", "spectral radius of the transition over the motion's period"),
     Variable("floquet_multiplier", "1", "multipliers of the motion over its period", ("multiplier",), "complex128"),
     Variable("lyapunov_exponent", "1/s", "largest Lyapunov exponent"),
-    Variable("regime", "1", "flanks at which contact is made and lost", dtype="int8", flags=REGIMES),
+    Variable("regime", "1", _REGIME, dtype="int8", flags=REGIMES),
     Variable("impacts", "1", f"number of times that a flank is reached {_WHOLE}", ("flank",)),
     Variable("impact_velocity", "m/s", "largest velocity at which a flank is reached", ("flank",)),
     Variable("contact_fraction", "1", "part of the time in contact", ("flank",)),

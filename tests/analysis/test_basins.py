@@ -41,12 +41,43 @@ def test_the_seed_decides(found):
     assert (other.basin_fraction.values[:, 0] != found.basin_fraction.values[:, 0]).any()
 
 
+# More than a quarter of the motions are chaotic for 4,000 periods, yet all end on motions of three or four periods.
+TRANSIENT = {
+    "omega": 3.092670827609387, "B0": 0.05, "B1": 0.05091904949046652, "b": 0.01, "c": 0.05, "alpha": 0.0,
+    "k": 39.37800020979253, "I": 0.5943969385434771,
+}  # fmt: skip
+
+
+def test_chaos_beside_periodic_motions_may_be_a_transient():
+    """Whatever the time, what has not ended yet is unsettled, and the more time, the less of it."""
+    left = []
+    for periods in (1000, 8000):
+        scene = {"system": "rattle", "analysis": "basins", "fixed": TRANSIENT}
+        found = dt.run(scene | {"options": {"samples": 64, "most_periods": periods}})
+        counted = found.attractor_multiple.values[found.basin_fraction.values > 0]
+        np.testing.assert_array_equal(counted, [3, 4])
+        assert found.outcome == Outcome.TOLERANCE_NOT_MET
+        left.append(float(found.unsettled_fraction))
+    assert left[0] > 2 * left[1] > 0
+
+
+def sorted_motions(high, multiple, outcome):
+    high, multiple, outcome = (jnp.array(x)[:, None] for x in (high, multiple, outcome))
+    return {name: np.asarray(x)[..., 0] for name, x in shares(high, -high, multiple, outcome).items()}
+
+
 def test_motions_are_sorted_into_attractors():
-    high = jnp.array([[1.0], [2.0], [1.0], [5.0], [np.nan], [1.0], [7.0]])
-    multiple = jnp.array([[1], [2], [1], [0], [0], [2], [0]])
-    outcome = jnp.array([[0], [0], [0], [0], [Outcome.NOT_CONVERGED], [0], [0]])
-    sorted_ = {name: np.asarray(x) for name, x in shares(high, -high, multiple, outcome).items()}
-    np.testing.assert_allclose(sorted_["basin_fraction"][:4, 0], np.array([1, 2, 1, 2]) / 7)
-    np.testing.assert_array_equal(sorted_["attractor_multiple"][:4, 0], [2, 1, 2, 0])
-    np.testing.assert_array_equal(sorted_["attractor_u_max"][:3, 0], [2.0, 1.0, 1.0])
-    assert sorted_["unsettled_fraction"][0] == 1 / 7 and sorted_["outcome"][0] == Outcome.TOLERANCE_NOT_MET
+    """One has failed, and the two that are not periodic may end on one of the others."""
+    found = sorted_motions(
+        [1.0, 2.0, 1.0, 5.0, np.nan, 1.0, 7.0], [1, 2, 1, 0, 0, 2, 0], [0, 0, 0, 0, Outcome.NOT_CONVERGED, 0, 0]
+    )
+    np.testing.assert_allclose(found["basin_fraction"], np.array([1, 2, 1] + [np.nan] * 5) / 7)
+    np.testing.assert_array_equal(found["attractor_multiple"], [2, 1, 2] + [0] * 5)
+    np.testing.assert_array_equal(found["attractor_u_max"][:3], [2.0, 1.0, 1.0])
+    assert found["unsettled_fraction"] == 3 / 7 and found["outcome"] == Outcome.TOLERANCE_NOT_MET
+
+
+def test_non_periodic_motions_alone_are_one_attractor():
+    found = sorted_motions([1.0, 2.0, 3.0], [0, 0, 0], [0, 0, 0])
+    np.testing.assert_array_equal(found["basin_fraction"], [1.0] + [np.nan] * 7)
+    assert found["unsettled_fraction"] == 0 and found["outcome"] == Outcome.SUCCESS

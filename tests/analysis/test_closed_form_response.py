@@ -192,6 +192,25 @@ def test_limits_without_drive_damping_or_stiffness(scales, describing):
     assert np.isnan(describing["fold_frequency"][0, 1:, 5]).all()
 
 
+def test_the_peak_is_the_largest_amplitude_also_with_heavy_damping():
+    """Without a resonance the amplitude falls from its static value: of a linear spring B1/k', at the frequency 0."""
+    cases = ({"alpha": 1.0, "c": 1.9}, {"alpha": 1.0, "c": 2.5}, {"c": 1.5}, {"alpha": 0.0, "B0": 0.0, "c": 3.0})
+    cases += ({"c": 0.8}, {"alpha": 3.0, "b": 0.05, "B1": 0.2, "c": 1.0})
+    found = solve("describing_function", np.geomspace(1e-3, 3.0, 400), cases)
+    seen = np.max(found["u_max"] - found["u_min"], axis=(0, 1)) / 2
+    peak, frequency = found["peak_amplitude"][0], found["peak_frequency"][0]
+    assert (seen <= peak * (1 + 1e-12)).all()
+    np.testing.assert_allclose(seen, peak, rtol=1e-4)
+    np.testing.assert_allclose(peak[:2], TABLE1["B1"], rtol=1e-12)
+    np.testing.assert_array_equal(frequency > 0, [False] * 4 + [True] * 2)
+
+
+def test_a_linear_spring_has_no_backbone(scales):
+    """Its free motions have one frequency and any amplitude; at 1.3, above it, there is none."""
+    assert np.isnan(scales["backbone_amplitude"][..., 2]).all()
+    assert np.isfinite(scales["backbone_amplitude"][-1, 0])
+
+
 def test_softening_bends_down(describing):
     assert describing["peak_frequency"][0, 4] < math.sqrt(2.0) - 0.02
 

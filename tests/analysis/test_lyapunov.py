@@ -17,7 +17,7 @@ import drivetrain_jax as dt
 from benchmarks import tripod_reference as oracle
 from drivetrain_jax.analysis import Outcome, Request
 from drivetrain_jax.analysis.chaos.verdict import Verdict
-from drivetrain_jax.analysis.lyapunov import analyse
+from drivetrain_jax.analysis.lyapunov import analyse, repetition
 from drivetrain_jax.invariants import check
 from drivetrain_jax.systems import Flow
 
@@ -247,6 +247,40 @@ def test_parametric_threshold_is_bracketed(controls):
 
 def test_sum_rule_of_the_tripod(controls):
     assert np.abs(controls.sum_rule_residual).max() < 1e-7
+
+
+# Excitation frequency [Hz], chi_AEM, order of the motor's torque (50 Hz each), M_AEM, phi0; verdict and period in strobes.
+_M = 2550.0
+FORCED = (
+    (3000.0, 0.1, 6.0, _M, 0.0, Verdict.PERIODIC, 10),
+    (3066.5, 0.1, 6.133, _M, 0.0, Verdict.PERIODIC, 10),  # its exponents come out too low by 2 in 15
+    (3000.03, 0.1, 6.0, _M, 0.0, Verdict.QUASI_PERIODIC, 0),  # repeats after 100001, nearly after 10
+    (2718.281828, 1e-5, 6.0, _M, 0.0, Verdict.QUASI_PERIODIC, 0),  # a torus thinner than the transient
+    (2718.281828, 0.0, 6.0, _M, 0.0, Verdict.FIXED_POINT, 1),
+    (3000.0, 0.1, 6.0, 0.0, 1e-3, Verdict.UNDECIDED, 0),  # nothing but the transient
+)
+
+
+def test_a_slow_drift_along_a_torus_is_no_period():
+    """Nor is what the transient covers: whether the strobes repeat is known from the frequencies."""
+    names = ("excitation_frequency", "chi_AEM", "motor_order", "M_AEM", "phi0")
+    points = dict(zip(names, map(list, zip(*(case[:5] for case in FORCED), strict=True)), strict=True))
+    fixed = {"element": "input", "beta": math.radians(9), "zeta": 0.0016}
+    scene = {"system": "tripod", "analysis": "lyapunov", "outputs": ["verdict", "period_multiple"], "fixed": fixed}
+    ours = dt.run(scene | {"points": points, "options": {"max_time": 0.6, "steps": 12}})
+    assert ours.verdict.values.tolist() == [case[5] for case in FORCED]
+    assert ours.period_multiple.values.tolist() == [case[6] for case in FORCED]
+
+
+def test_repetition_is_told_from_the_transient_only():
+    """Period 3 exactly; to 1e-6 only; not at all. A transient of 1e-5 may be hiding either of the first two."""
+    k = jnp.arange(1024.0)
+    exact = jnp.cos(2 * jnp.pi * (k % 3) / 3)
+    series = jnp.stack([exact, exact + 1e-6 * jnp.cos(0.1 * k**2), jnp.cos(jnp.sqrt(2.0) * k)], axis=-1)[:, None]
+    found = {left: repetition(series, jnp.full(3, left)) for left in (0.0, 1e-5, 1e-3)}
+    assert [multiple.tolist() for multiple, _ in found.values()] == [[3, 0, 0]] * 3
+    told = [settled.tolist() for _, settled in found.values()]
+    assert told == [[True, True, True], [True, False, True], [True, False, False]]
 
 
 @pytest.mark.full

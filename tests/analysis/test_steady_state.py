@@ -110,6 +110,13 @@ def test_chaos_is_non_periodic_with_its_exponent(steady):
     np.testing.assert_allclose(found["lyapunov_exponent"], [0.057, 0.097], atol=0.02)
 
 
+def test_what_is_said_of_chaos_leaves_room_for_a_transient():
+    """No finite time tells it from an attractor."""
+    said = {variable.name: variable.long_name for variable in ANALYSIS.variables}
+    assert "not periodic within most_periods" in said["period_multiple"]
+    assert "maybe a transient" in said["regime"]
+
+
 def test_a_lane_alone_is_the_lane_in_its_batch(steady):
     cases = from_orbits()[:12]
     together, alone = steady(cases), steady(cases[4:5])

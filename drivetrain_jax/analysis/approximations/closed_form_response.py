@@ -62,7 +62,9 @@ def of_multiple_scales(model: PiecewiseLinearOscillator, shape: tuple[int, ...],
         return OneTerm(0 * finite, amplitude, phase, multiple_scales.decay_rate(flow, omega, finite))
 
     def backbone(omega: Any) -> Array:
-        return jnp.sqrt((omega - flow.frequency) / flow.bend)
+        # A linear spring has free motions of one frequency only, of any amplitude.
+        bends = flow.bend != 0
+        return jnp.where(bends, jnp.sqrt((omega - flow.frequency) / jnp.where(bends, flow.bend, 1.0)), jnp.nan)
 
     return Curves(motions, multiple_scales.peak(flow), multiple_scales.folds(flow)[1], backbone, fit.fit_range)
 

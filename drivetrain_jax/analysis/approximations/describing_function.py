@@ -8,7 +8,9 @@ and fundamental gives, in units of ``k' = k/I`` and ``c' = c/I``,
     [(kappa - omega^2)^2 + (c' omega)^2] A^2 = B1^2                         the response
 
 For a given A the response is quadratic in omega^2: two arms ``omega^2 = kappa - c'^2/2 -+ sqrt(B1^2/A^2 - c'^2 kappa +
-c'^4/4)`` that meet at the peak, on either side of the backbone ``omega^2 = kappa``. Folds are their turning points.
+c'^4/4)`` that meet at the peak, on either side of the backbone ``omega^2 = kappa``. Folds are their turning points. Where
+damping is so heavy (``kappa < c'^2/2``) that they would meet at no real frequency, the upper one ends at omega = 0, at
+the static amplitude ``kappa A = B1``, the largest of all.
 The approximation is the harmonic balance with one harmonic, integrals exact. All functions broadcast over a trailing
 batch; ``A`` may have more leading axes.
 """
@@ -116,17 +118,27 @@ def arm(model: PiecewiseLinearOscillator, amplitude: Array, point: Point, sign: 
 
 
 def peak(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Array:
-    """Largest amplitude, where the arms meet: ``(c'^2 kappa - c'^4/4) A^2 = B1^2``; a huge one if they do not."""
+    """Largest amplitude over all frequencies; a huge one if there is none.
+
+    It is where the smallest value that the response equation takes at any frequency vanishes: where the arms meet, or with
+    heavier damping the static amplitude, which the response approaches as the frequency falls to 0. That value rises with
+    the amplitude, because ``kappa A`` does.
+    """
     unit = jnp.abs(model.B1) + model.b
 
     def beyond(log_amplitude: Array) -> Array:
         amplitude = unit * jnp.exp(log_amplitude)
-        point = point_at(model, amplitude, bias_of(model, amplitude))
-        return -_discriminant(model, amplitude, point.stiffness)
+        stiffness = point_at(model, amplitude, bias_of(model, amplitude)).stiffness
+        return response_residual(model, _resonance(model, stiffness), amplitude, stiffness)
 
     # The unit only centres the bracket.
     span = jnp.full(shape, 60.0)
     return unit * jnp.exp(bisect(beyond, -span, span))
+
+
+def _resonance(model: PiecewiseLinearOscillator, stiffness: Array) -> Array:
+    """Frequency at which the response equation takes its smallest value for an amplitude: 0 with heavy damping."""
+    return jnp.sqrt(jnp.maximum(stiffness - model.damping**2 / 2, 0.0))
 
 
 class Skeleton(NamedTuple):
@@ -153,8 +165,8 @@ def skeleton(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Skelet
     folds = []
     for sign in (-1.0, 1.0):
         slope = arm_slope(model, nodes, points, sign)
-        # At the peak the root vanishes: the sign of the other term, also in rounding.
-        slope = jnp.where(nodes >= top, -sign, slope)
+        # Where the arms meet the root vanishes: the sign of the other term, also in rounding.
+        slope = jnp.where((nodes >= top) & (_resonance(model, points.stiffness) > 0), -sign, slope)
         mask = sign_changes(slope > 0, _FOLDS_PER_ARM) & (nodes[:-1] < top)
         low, high, start = take(mask, nodes[:-1]), take(mask, nodes[1:]), take(mask, slope[:-1])
         turned = jnp.where(start > 0, -1.0, 1.0)
@@ -172,11 +184,13 @@ def skeleton(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Skelet
 
 
 def peak_of(model: PiecewiseLinearOscillator, bones: Skeleton) -> tuple[Array, Array]:
-    """Largest amplitude and the frequency ``sqrt(kappa - c'^2/2)`` where it is reached; infinite without damping."""
+    """Largest amplitude and the frequency ``sqrt(kappa - c'^2/2)`` where it is reached; infinite without damping.
+
+    With damping too heavy for a resonance: the static amplitude and 0.
+    """
     exists = bones.peak < _HUGE * jnp.maximum(model.b, 1.0)
     point = point_at(model, bones.peak, bias_of(model, bones.peak))
-    frequency = jnp.sqrt(point.stiffness - model.damping**2 / 2)
-    return jnp.where(exists, bones.peak, jnp.inf), frequency
+    return jnp.where(exists, bones.peak, jnp.inf), _resonance(model, point.stiffness)
 
 
 def fold_frequencies(model: PiecewiseLinearOscillator, bones: Skeleton) -> Array:

@@ -18,7 +18,7 @@ def period_multiple(section: Array, tolerance: Array, longest: int) -> Array:
 
     ``section`` has shape ``(T, n, ...)`` with T >= longest + 64; the comparison runs over the last 64 strobes. p is the
     number of distinct points of a periodic motion. One scale serves all components, as one of them may vanish at the
-    strobes.
+    strobes. Leading axes of ``tolerance`` before those of the batch are kept: one answer for each.
     """
     scale = jnp.max(jnp.abs(section), axis=(0, 1))
     scale = jnp.where(scale > 0, scale, 1.0)
@@ -33,7 +33,7 @@ def period_multiple(section: Array, tolerance: Array, longest: int) -> Array:
         close = distance(p) <= tolerance
         return jnp.where((found == 0) & close, p, found), None
 
-    none = jnp.zeros(section.shape[2:], jnp.int64)
+    none = jnp.zeros(jnp.broadcast_shapes(jnp.shape(tolerance), section.shape[2:]), jnp.int64)
     return jax.lax.scan(earliest, none, jnp.arange(1, longest + 1))[0]
 
 

@@ -25,7 +25,8 @@ from drivetrain_jax.systems import PiecewiseLinearOscillator
 NON_PERIODIC = REGIMES.index("non_periodic")
 # Results that need integrals over the motion.
 INTEGRALS = frozenset(("u_mean", "u_rms", "phase"))
-# Growth of a tangent (its logarithm) that only chaos explains: shear alone gives the logarithm of the time.
+# Growth of a tangent (its logarithm) that only chaos explains, lasting or transient: shear alone gives the logarithm of
+# the time.
 _WILD = 20.0
 # Lanes that are worked on at a time: enough to fill the vector units, few enough to wait little for the slowest. Sweeps
 # are long jobs of very different length.
@@ -41,7 +42,8 @@ def describe(
     ``contact_fraction`` of the driving and the back flank, ``orbit_state`` and (complex) ``floquet_multiplier``, shape
     ``(2, N)``. What is not known is NaN (``stability``: absent). A motion that recurs within 32 periods is described over
     its period. One that does not, but whose tangent has grown by exp(20) over the last three quarters of the run, is
-    non-periodic: ``period_multiple`` 0, described over 32 drive periods. Any other has not settled. ``outcome`` is
+    non-periodic: ``period_multiple`` 0, described over 32 drive periods. It may still be a transient to a periodic motion,
+    and then has the exponent of the chaos that it is leaving. Any other has not settled. ``outcome`` is
     TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its size.
     """
     seen = measure(oscillator, found.u, found.v, found.multiple, width=WIDTH, integrals=integrals)
