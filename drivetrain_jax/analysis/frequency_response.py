@@ -26,7 +26,7 @@ from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solv
 from drivetrain_jax.analysis.approximations import closed_form_response, harmonic_response
 from drivetrain_jax.analysis.approximations.harmonic_balance import Basis
 from drivetrain_jax.analysis.impacts import exact_branch, exact_response
-from drivetrain_jax.analysis.impacts.motion import REGIMES, STABILITY
+from drivetrain_jax.analysis.impacts.motion import REGIME, REGIMES, STABILITY
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System
 
 PATH = "omega"
@@ -37,7 +37,7 @@ VARIABLES = (
     Variable("u_min", "m", "smallest relative displacement", SWEEP),
     Variable("u_rms", "m", "root mean square of the relative displacement, mean included", SWEEP),
     Variable("phase", "rad", "lag of the fundamental behind the drive", SWEEP),
-    Variable("regime", "1", "flanks at which contact is made and lost", SWEEP, dtype="int8", flags=REGIMES),
+    Variable("regime", "1", REGIME, SWEEP, dtype="int8", flags=REGIMES),
     Variable("stability", "1", "stability of the motion", SWEEP, dtype="int8", flags=STABILITY),
     Variable("spectral_radius", "1", "spectral radius of the transition over the motion's period", SWEEP),
     Variable("residual", "m/s2", "rms of what the motion leaves unbalanced in the equation of motion", SWEEP),
@@ -47,7 +47,7 @@ VARIABLES = (
     Variable("branch_u_min", "m", "smallest relative displacement of every motion found", BRANCH),
     Variable("branch_stability", "1", "stability of every motion found", BRANCH, dtype="int8", flags=STABILITY),
     Variable("peak_amplitude", "m", "largest amplitude of the fundamental over all frequencies"),
-    Variable("peak_frequency", "rad/s", "frequency of the largest amplitude"),
+    Variable("peak_frequency", "rad/s", "frequency of the largest amplitude (0: the static one)"),
     Variable("fold_frequency", "rad/s", "frequencies at which branches end, rising", ("fold",)),
     Variable("doubling_frequency", "rad/s", "frequencies at which periods double, rising", ("doubling",)),
     Variable("backbone_amplitude", "m", "amplitude of the free undamped motion of this frequency"),

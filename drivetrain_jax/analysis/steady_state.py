@@ -29,7 +29,7 @@ from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.impacts.attractor import attractors
 from drivetrain_jax.analysis.impacts.exact_response import INTEGRALS, WIDTH, describe
-from drivetrain_jax.analysis.impacts.motion import REGIMES
+from drivetrain_jax.analysis.impacts.motion import REGIME, REGIMES
 from drivetrain_jax.analysis.impacts.orbit_history import history
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System
 
@@ -42,7 +42,6 @@ DIMENSIONS = (
 )
 HISTORIES = frozenset(("u_history", "v_history"))
 _WHOLE = "over the period of the orbit (non-periodic: over 32 drive periods)"
-_REGIME = "flanks at which contact is made and lost (non_periodic within most_periods: maybe a transient)"
 VARIABLES = (
     Variable("u_max", "m", "largest relative displacement"),
     Variable("u_min", "m", "smallest relative displacement"),
@@ -53,7 +52,7 @@ VARIABLES = (
     Variable("spectral_radius", "1", "spectral radius of the transition over the motion's period"),
     Variable("floquet_multiplier", "1", "multipliers of the motion over its period", ("multiplier",), "complex128"),
     Variable("lyapunov_exponent", "1/s", "largest Lyapunov exponent"),
-    Variable("regime", "1", _REGIME, dtype="int8", flags=REGIMES),
+    Variable("regime", "1", REGIME, dtype="int8", flags=REGIMES),
     Variable("impacts", "1", f"number of times that a flank is reached {_WHOLE}", ("flank",)),
     Variable("impact_velocity", "m/s", "largest velocity at which a flank is reached", ("flank",)),
     Variable("contact_fraction", "1", "part of the time in contact", ("flank",)),

@@ -8,6 +8,7 @@ from jax import Array
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 REGIMES = ("no_separation", "single_sided", "double_sided", "non_periodic")
+REGIME = "flanks at which contact is made and lost (non_periodic in the time given: maybe a transient)"
 STABILITY = ("stable", "unstable", "absent")
 STABLE, UNSTABLE, ABSENT = range(3)
 

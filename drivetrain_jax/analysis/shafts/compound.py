@@ -82,6 +82,7 @@ class _Segment(NamedTuple):
     unit: Array
     m: Array | None
     k_hinge: Array | None
+    turn: Array | None
     shear: Array | None
     rotary: Array | None
 
@@ -129,7 +130,8 @@ def planes(shaft: Shaft, q: Array) -> tuple[Plane, Plane, Array, Array]:
     that belong to them; arrays of shape ``(n, *q.shape)``.
 
     A factor common to all segments is left out: that of the supports and joints, which the plane from the left has
-    passed where the plane from the right has not.
+    passed where the plane from the right has not. It is common because the units of supports and joints are those of
+    both sides: the mirrored shaft has the same.
     """
     segments, _ = _segments(shaft)
     zero = q * 0 * segments.beta[0]
@@ -159,26 +161,33 @@ def functions_of(segment: _Segment, q: Array) -> Compound | General:
 def _segments(shaft: Shaft) -> tuple[_Segment, tuple[Array, Array | None, Array, Array, Array]]:
     """The segments, each with the node in front of it, and the last node: k, m, unit of k and the scales e1, e3."""
     scales = Scales.of(shaft)
-    unit = jnp.concatenate([scales.e3[:1], (scales.e3[1:] + scales.e3[:-1]) / 2, scales.e3[-1:]])
-    hinges = None
+    unit = jnp.concatenate([scales.e3[:1], between(scales.e3), scales.e3[-1:]])
+    hinges = turn = None
     if shaft.k_hinge is not None:
         hinges = jnp.concatenate([jnp.full_like(shaft.k_hinge[:1], jnp.inf), shaft.k_hinge])
+        turn = jnp.concatenate([scales.e1[:1], between(scales.e1)])
     shear = rotary = None
     if shaft.is_timoshenko:
         square = scales.b * scales.b
         shear = jnp.zeros_like(square) if shaft.kGA is None else square * shaft.EI / shaft.kGA
         rotary = jnp.zeros_like(square) if shaft.rhoI is None else square * shaft.rhoI / shaft.rhoA
     m = None if shaft.m is None else shaft.m[:-1]
-    segments = _Segment(scales.beta, scales.e1, scales.e2, scales.e3, shaft.k[:-1], unit[:-1], m, hinges, shear, rotary)
+    own = scales.beta, scales.e1, scales.e2, scales.e3
+    segments = _Segment(*own, shaft.k[:-1], unit[:-1], m, hinges, turn, shear, rotary)
     last = (shaft.k[-1], None if shaft.m is None else shaft.m[-1], unit[-1], scales.e1[-1], scales.e3[-1])
     return segments, last
+
+
+def between(scale: Array) -> Array:
+    """The mean of both sides at every joint."""
+    return (scale[1:] + scale[:-1]) / 2
 
 
 def _enter(state: _State, segment: _Segment, q: Array) -> _State:
     """Across the joint and the support in front of ``segment``, and into its coordinates."""
     u, sign, count = state
     if segment.k_hinge is not None:
-        u = _across_hinge(u, segment.k_hinge, segment.e1, q)
+        u = _across_hinge(u, segment.k_hinge, segment.turn, q)
         after = sign_of(u[0])
         count, sign = count + 0.5 * (1 - after * sign), after
     u = _across_support(u, segment.k, segment.m, segment.unit, q)
@@ -193,24 +202,34 @@ def _out_of(u: Plane, segment: _Segment) -> Plane:
     return u0, u1 * e1, u2 * e2, u3 * e3, u4 * (e1 * e3)
 
 
-def _across_support(u: Plane, k: Array, m: Array | None, unit: Array, q: Array) -> Plane:
-    """S11 += k/q^3 - m q, everything times 1/(1 + |kappa|/unit): a rigid support leaves what is finite."""
+def support_shares(k: Array, m: Array | None, unit: Array, q: Array) -> tuple[Array, Array]:
+    """1 and kappa = k/q^3 - m q, both over 1 + |kappa|/unit: finite for a rigid support too."""
     rigid = jnp.isinf(k)
     kappa = jnp.where(rigid, 0.0, k) / (q * q * q)
     if m is not None:
         kappa = kappa - m * q
     share = 1 / (1 + jnp.abs(kappa) / unit)
-    keep, add = jnp.where(rigid, 0.0, share), jnp.where(rigid, unit, kappa * share)
+    return jnp.where(rigid, 0.0, share), jnp.where(rigid, unit, kappa * share)
+
+
+def hinge_shares(k_hinge: Array, unit: Array, q: Array) -> tuple[Array, Array]:
+    """1 and q/k_hinge, both over 1 + q unit/k_hinge: finite for a free hinge too."""
+    rigid = jnp.isinf(k_hinge)
+    finite = jnp.where(rigid, 0.0, k_hinge)
+    total = finite + q * unit
+    return jnp.where(rigid, 1.0, finite / total), jnp.where(rigid, 0.0, q / total)
+
+
+def _across_support(u: Plane, k: Array, m: Array | None, unit: Array, q: Array) -> Plane:
+    """S11 += k/q^3 - m q, everything times a factor: a rigid support leaves what is finite."""
+    keep, add = support_shares(k, m, unit, q)
     u0, u1, u2, u3, u4 = u
     return keep * u0, keep * u1, keep * u2, keep * u3 + add * u0, keep * u4 + add * u1
 
 
 def _across_hinge(u: Plane, k_hinge: Array, unit: Array, q: Array) -> Plane:
-    """u0 += (q/k_hinge) u1, u3 += (q/k_hinge) u4, everything times 1/(1 + q unit/k_hinge)."""
-    rigid = jnp.isinf(k_hinge)
-    finite = jnp.where(rigid, 0.0, k_hinge)
-    total = finite + q * unit
-    keep, add = jnp.where(rigid, 1.0, finite / total), jnp.where(rigid, 0.0, q / total)
+    """u0 += (q/k_hinge) u1, u3 += (q/k_hinge) u4, everything times a factor."""
+    keep, add = hinge_shares(k_hinge, unit, q)
     u0, u1, u2, u3, u4 = u
     return keep * u0 + add * u1, keep * u1, keep * u2, keep * u3 + add * u4, keep * u4
 

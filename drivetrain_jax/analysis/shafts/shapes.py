@@ -14,9 +14,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from drivetrain_jax.analysis.numerics.linear_algebra import matmul
-from drivetrain_jax.analysis.shafts.compound import Scales, planes
+from drivetrain_jax.analysis.shafts.compound import Scales, between, hinge_shares, planes, support_shares
 from drivetrain_jax.analysis.shafts.functions import Plane, Waves, even_and_odd, sign_of
 from drivetrain_jax.systems import Shaft
+
+# Multiple of its asymmetry up to which the product of two planes is rounding.
+_APART = 30.0
 
 
 def _left(u: Plane) -> Array:
@@ -35,8 +38,13 @@ def _antisymmetric(y12: Array, y13: Array, y14: Array, y24: Array, y34: Array) -
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
-def _states(left: Plane, right: Plane) -> Array:
-    """The state that both planes contain, up to its sign, ``(4, ...)``; its square has the size of ``L w R``."""
+def _states(left: Plane, right: Plane) -> tuple[Array, Array]:
+    """The state that both planes contain, up to its sign, ``(4, ...)``, its square of the size of ``L w R``; and
+    whether it is more than rounding.
+
+    Planes that share no line leave a product that is not symmetric. So they do in a part of the shaft that is at rest,
+    where both are of the order of rounding, and the root of that would not be.
+    """
     # w R: F_v f_w - f_v F_w + theta_v M_w - M_v theta_w.
     R = _right(right)
     product = matmul(_left(left), jnp.stack([-R[3], R[2], -R[1], R[0]]))
@@ -45,7 +53,8 @@ def _states(left: Plane, right: Plane) -> Array:
     chosen = [best == i for i in range(4)]
     column = sum(jnp.where(chosen[i], product[:, i], 0.0) for i in range(4))
     square = sum(jnp.where(chosen[i], jnp.abs(diagonal[i]), 0.0) for i in range(4))
-    return column / jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    moving = square > _APART * jnp.abs(product[0, 3] - product[3, 0])
+    return column / jnp.sqrt(jnp.where(square > 0, square, 1.0)), moving
 
 
 def _node_states(shaft: Shaft, q: Array) -> tuple[Array, Array]:
@@ -53,12 +62,16 @@ def _node_states(shaft: Shaft, q: Array) -> tuple[Array, Array]:
     ...)."""
     front, behind, log_front, log_behind = planes(shaft, q)
     from_d, from_d_behind, log_d, log_d_behind = planes(shaft.mirrored(), q)
-    left_end = _states(front, tuple(x[::-1] for x in from_d_behind))
-    right_end = _states(behind, tuple(x[::-1] for x in from_d))
+    left_end, left_moving = _states(front, tuple(x[::-1] for x in from_d_behind))
+    right_end, right_moving = _states(behind, tuple(x[::-1] for x in from_d))
+    moving = jnp.stack([left_moving, right_moving])
+    # Where parts that do not see each other share a frequency all is rounding, and any amplitudes will do.
+    moving = moving | ~jnp.any(moving, axis=(0, 1))
     logs = jnp.stack([log_front + log_d_behind[::-1], log_behind + log_d[::-1]])
     scale = Scales.of(shaft).e1
     scale = scale.reshape(scale.shape[0], *(1,) * (logs.ndim - 1 - scale.ndim), *scale.shape[1:])
     sizes = jnp.sqrt(scale) * jnp.exp(0.5 * (logs - jnp.max(logs, axis=(0, 1))))
+    sizes = jnp.where(moving, sizes, 0.0)
     return left_end * sizes[0], right_end * sizes[1]
 
 
@@ -111,7 +124,7 @@ def mode_shapes(shaft: Shaft, q: Array, x: Array) -> Array:
         s = square * 0 if shaft.kGA is None else square * shaft.EI[i] / shaft.kGA[i]
         t = square * 0 if shaft.rhoI is None else square * shaft.rhoI[i] / shaft.rhoA[i]
         waves, z = Waves.of(s, t), q * scales.beta[i]
-        a = front[:, i] if before is None else front[:, i] * _across_joint(shaft, scales, i, before, front[:, i])
+        a = front[:, i] if before is None else front[:, i] * _across_joint(shaft, q, i, before, front[:, i])
         entering = _Split.of(a, waves, s, t)
         before = behind[:, i] * _along_segment(entering, _Split.of(behind[:, i], waves, s, t), waves, z)
         leaving = _Split.of(before, waves, s, t)
@@ -130,12 +143,27 @@ def _along_segment(front: _Split, behind: _Split, waves: Waves, z: Array) -> Arr
     return sign_of(carried * behind.trig + turned * behind.trig_slope / waves.trigonometric2)
 
 
-def _across_joint(shaft: Shaft, scales: Scales, i: int, before: Array, after: Array) -> Array:
-    """Sign that makes f, M and, where no hinge interrupts it, theta continuous at the joint in front of segment i."""
-    f = before[0] * after[0]
-    moment = before[2] * after[2] * scales.e2[i - 1] / scales.e2[i]
-    theta = 0.0 if shaft.k_hinge is not None else before[1] * after[1] * scales.b[i - 1] / scales.b[i]
-    return sign_of(f + moment + theta)
+def _across_joint(shaft: Shaft, q: Array, i: int, before: Array, after: Array) -> Array:
+    """Sign with which the state behind the joint in front of segment i continues that in front of the joint.
+
+    Four numbers are the same on both sides, whatever the joint: f, M, the shear force with half the reaction of
+    support and mass, the slope with half the turn of the joint, the last two times what keeps them finite. Each alone
+    can vanish, f and M do in every antisymmetric mode. Where all do, at a free hinge on a rigid support, nothing passes
+    through the joint: the parts are independent, and so are their signs.
+    """
+    scales = Scales.of(shaft)
+    b, e1, e2, e3 = (between(x)[i - 1] for x in scales[1:])
+    m = None if shaft.m is None else shaft.m[i]
+    keep, reaction = support_shares(shaft.k[i], m, e3, q)
+    hold, turn = (1.0, 0.0) if shaft.k_hinge is None else hinge_shares(shaft.k_hinge[i - 1], e1, q)
+
+    def shared(state: Array, side: int, half: float) -> tuple[Array, ...]:
+        f, theta, moment, force = state
+        theta, moment, force = theta * scales.b[side], moment * scales.e2[side], force * scales.e3[side]
+        return f, (hold * theta + half * turn * moment) / b, moment / e2, (keep * force - half * reaction * f) / e3
+
+    pairs = zip(shared(before, i - 1, -0.5), shared(after, i, 0.5), strict=True)
+    return sign_of(sum(left * right for left, right in pairs))
 
 
 def normalised(shape: Array) -> Array:
