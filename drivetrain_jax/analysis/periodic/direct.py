@@ -63,9 +63,14 @@ def stiffness_of(system: LinearPeriodic) -> Array:
 
 
 def stable_steps(system: LinearPeriodic) -> Array:
-    """Steps with which the explicit scheme is stable in all lanes; ``-tr A`` at 9 instants bounds the rates of decay."""
-    trace = jnp.stack([jnp.trace(system.matrix(k * system.span / 8)) for k in range(9)])
-    return jnp.nanmax(-trace, initial=0.0) * system.span / _STABLE
+    """Steps with which the explicit scheme is stable in all lanes; ``-tr A`` at 5 instants bounds the rates of decay."""
+    largest = jnp.zeros(())
+    for k in range(5):
+        # Only the diagonal is computed.
+        rows = system.rows(*system.basis(k * system.span / 4))
+        rate = -sum(jnp.asarray(row[i], float) for i, row in enumerate(rows))
+        largest = jnp.maximum(largest, jnp.nanmax(rate, initial=0.0))
+    return largest * system.span / _STABLE
 
 
 def compare(
