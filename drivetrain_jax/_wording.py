@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 # Characters of a given value that a message repeats.
@@ -24,6 +24,12 @@ def written(value: Any) -> str:
     if isinstance(value, tuple):
         return "[" + ", ".join(map(written, value)) + "]"
     return f"{value:.10g}" if isinstance(value, float) else str(value)
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a table, its columns side by side."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  " + "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def did_you_mean(name: str, allowed: Iterable[str]) -> str:

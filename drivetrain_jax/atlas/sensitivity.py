@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from operator import itemgetter
 
 import jax
 import jax.numpy as jnp
@@ -84,18 +83,11 @@ def direct_sensitivity(system: System, values: Mapping[str, float]) -> Sensitivi
     It is NaN where no scheme can take so many steps, or derivatives overflow.
     """
     names = system.models["floquet"].parameters
-    columns = {name: np.array([float(values[name])]) for name in names}
-    explicit, implicit = (float(of(system, columns, _RTOL)[0]) for of in (explicit_effort, implicit_effort))
-    steps, scheme = min(
-        (explicit, explicit_propagator), (PANEL_COST * implicit, implicit_propagator), key=itemgetter(0)
-    )
-    if not math.isfinite(steps):
-        return Sensitivity(math.nan, dict.fromkeys(names, math.nan), complex(math.nan), math.nan)
-    solve = _derivatives(system.models["floquet"].build, names, scheme)
-    point, count = (
-        np.array([columns[name][0] for name in names]),
-        int(steps if scheme is explicit_propagator else implicit),
-    )
+    point = np.array([float(values[name]) for name in names])
+    scheme, count = _scheme(system, dict(zip(names, point[:, None], strict=True)))
+    if not math.isfinite(count):
+        return _unknown(names)
+    solve, count = _derivatives(system.models["floquet"].build, names, scheme), int(count)
     z, change = solve(point, count)
     for _ in range(_MOST_DOUBLINGS):
         before, count = change, 2 * count
@@ -105,6 +97,18 @@ def direct_sensitivity(system: System, values: Mapping[str, float]) -> Sensitivi
     return _sensitivity(names, z, change)
 
 
+def _scheme(system: System, columns: Mapping[str, np.ndarray]) -> tuple[Callable, float]:
+    """The cheaper scheme for one point, and its predicted steps or panels; infinite if there would be too many of both."""
+    explicit, implicit = (float(of(system, columns, _RTOL)[0]) for of in (explicit_effort, implicit_effort))
+    if PANEL_COST * implicit < explicit:
+        return implicit_propagator, implicit
+    return explicit_propagator, explicit
+
+
+def _unknown(names: Sequence[str]) -> Sensitivity:
+    return Sensitivity(math.nan, dict.fromkeys(names, math.nan), complex(math.nan), math.nan)
+
+
 def _norms(change: np.ndarray) -> np.ndarray:
     """Frobenius norms of the derivatives by each parameter."""
     return np.sqrt(np.sum(change**2, axis=(0, 1)))
@@ -112,7 +116,7 @@ def _norms(change: np.ndarray) -> np.ndarray:
 
 def _sensitivity(names: Sequence[str], z: np.ndarray, change: np.ndarray) -> Sensitivity:
     if not (np.isfinite(z).all() and np.isfinite(change).all()):
-        return Sensitivity(math.nan, dict.fromkeys(names, math.nan), complex(math.nan), math.nan)
+        return _unknown(names)
     sigma, right = np.linalg.eig(z)
     k = int(np.argmax(np.abs(sigma)))
     left = np.linalg.inv(right)[k]

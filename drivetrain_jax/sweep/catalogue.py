@@ -9,7 +9,7 @@ from typing import Any
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter, Variable
-from drivetrain_jax._wording import written
+from drivetrain_jax._wording import aligned, written
 from drivetrain_jax.analysis import get_analysis
 from drivetrain_jax.sweep.scene import find_system
 from drivetrain_jax.systems import System, system_names
@@ -17,7 +17,7 @@ from drivetrain_jax.systems import System, system_names
 
 def overview() -> str:
     """Systems with their analyses, and the scenes found here."""
-    lines = ["Systems (drivetrain list SYSTEM describes one)", *_table([_system_row(name) for name in system_names()])]
+    lines = ["Systems (drivetrain list SYSTEM describes one)", *aligned([_system_row(name) for name in system_names()])]
     return "\n".join([*lines, *_scene_lines(None)]) + "\n"
 
 
@@ -33,13 +33,13 @@ def describe(name: str) -> str:
     """Parameters, presets, analyses with results and options, and scenes of one system."""
     system = find_system(name)
     lines = [f"{system.name}: {system.title}", f"  {system.source}", "", "Parameters"]
-    lines += _table([_parameter_row(p) for p in system.parameters])
+    lines += aligned([_parameter_row(p) for p in system.parameters])
     if system.physical:
         lines += ["", "Physical units, instead of these for point, query and design"]
-        lines += _table([(p.name, f"[{p.units}]", p.long_name, p.allowed) for p in system.physical.quantities])
+        lines += aligned([(p.name, f"[{p.units}]", p.long_name, p.allowed) for p in system.physical.quantities])
     if system.presets:
         lines += ["", "Sets of values, to be copied into a scene"]
-        lines += _table([(preset, _assignments(values)) for preset, values in system.presets.items()])
+        lines += aligned([(preset, _assignments(values)) for preset, values in system.presets.items()])
     for analysis in system.models:
         lines += ["", *_analysis_lines(analysis, system)]
     return "\n".join([*lines, *_scene_lines(system)]) + "\n"
@@ -49,7 +49,7 @@ def _analysis_lines(name: str, system: System) -> list[str]:
     analysis = get_analysis(name)
     lacking = analysis.lacks(system)
     lines = [f"Analysis {name}: {analysis.title}"]
-    lines += _table(
+    lines += aligned(
         [_variable_row(v, v.name in analysis.default_outputs) for v in analysis.variables if v.name not in lacking]
     )
     lines += [
@@ -61,8 +61,8 @@ def _analysis_lines(name: str, system: System) -> list[str]:
         for method, used in analysis.methods.items()
         if method not in lacking
     ]
-    lines += ["  " + line for line in _table(methods)]
-    return [*lines, "  Options", *("  " + line for line in _table([_parameter_row(o) for o in analysis.options]))]
+    lines += ["  " + line for line in aligned(methods)]
+    return [*lines, "  Options", *("  " + line for line in aligned([_parameter_row(o) for o in analysis.options]))]
 
 
 def _parameter_row(parameter: Parameter) -> tuple[str, ...]:
@@ -75,11 +75,6 @@ def _parameter_row(parameter: Parameter) -> tuple[str, ...]:
 def _variable_row(variable: Variable, default: bool) -> tuple[str, ...]:
     meaning = variable.long_name + (f": {', '.join(variable.flags)}" if variable.flags else "")
     return f"{variable.name}{'*' if default else ''}", f"[{variable.units}]", meaning, ", ".join(variable.dims)
-
-
-def _table(rows: list[tuple[str, ...]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  " + "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def _assignments(values: Any) -> str:
@@ -98,4 +93,4 @@ def _scene_lines(system: System | None) -> list[str]:
             continue
         if system is None or content.get("system") == system.name:
             rows.append((f"{folder.name}/{path.name}", str(content.get("title", ""))))
-    return ["", "Scenes", *_table(rows)] if rows else []
+    return ["", "Scenes", *aligned(rows)] if rows else []

@@ -12,7 +12,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Variable
-from drivetrain_jax._wording import nearest, written
+from drivetrain_jax._wording import aligned, nearest, written
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request, get_analysis
 from drivetrain_jax.sweep.assemble import Table
 from drivetrain_jax.sweep.engine import Engine
@@ -102,7 +102,7 @@ class PointResult:
         head = [rows, *(f"{columns} {written(label)}" for label in self.labels[columns])]
         named = zip(self.labels[rows], values, strict=True)
         cells = [[written(label), *(_text(variable, value) for value in row)] for label, row in named]
-        return [f"  {_with_units(name, variable.units)}", *_aligned([head, *cells])]
+        return [f"  {_with_units(name, variable.units)}", *aligned([head, *cells])]
 
     def _table(self, dim: str, names: Sequence[str]) -> list[str]:
         """Results that are lists over one dimension, side by side."""
@@ -111,12 +111,7 @@ class PointResult:
             variable = self.variables[name]
             head = name if variable.units == "1" else f"{name} [{variable.units}]"
             columns.append([head, *(_text(variable, value) for value in self.values[name])])
-        return _aligned(list(zip(*columns, strict=True)))
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  " + "  ".join(f"{cell:{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+        return aligned(list(zip(*columns, strict=True)))
 
 
 def _plain(value: Any) -> Any:
