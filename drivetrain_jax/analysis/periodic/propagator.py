@@ -83,9 +83,7 @@ def _in_parts(part: Callable[[Array, Array], Propagator], steps: Array, parts: i
         return whole._replace(parts=(jnp.exp(whole.log_scale) * whole.matrix)[None] if parts else None)
     each = steps // parts
     found = jax.lax.map(lambda k: part(k * each, (k + 1) * each), jnp.arange(parts, dtype=steps.dtype))
-    product = found.matrix[0]
-    for k in range(1, parts):
-        product = stored(matmul)(found.matrix[k], product)
+    product = jax.lax.fori_loop(1, parts, lambda k, p: stored(matmul)(found.matrix[k], p), found.matrix[0])
     scale = jnp.exp(found.log_scale)[:, None, None]
     return Propagator(product, jnp.sum(found.log_scale, axis=0), found.matrix * scale)
 
