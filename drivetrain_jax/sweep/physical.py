@@ -13,12 +13,13 @@ from drivetrain_jax.systems import System
 def nondimensional(system: System, given: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
     """The physical data of ``system`` among ``given`` (None if there are none), and all values as its parameters.
 
-    A value is a number or a range, a pair of numbers. Raises :class:`InputError` where some of the data are missing or out
-    of range, or say the same as a parameter that is given too.
+    A value is a number (of Python or NumPy) or a range, a pair of numbers. Raises :class:`InputError` where some of the data
+    are missing or out of range, or say the same as a parameter that is given too.
     """
+    given = {name: _plain(value) for name, value in given.items()}
     physical = system.physical
     if physical is None or not any(name in physical.names for name in given):
-        return None, dict(given)
+        return None, given
     data = [f.name for f in fields(physical)]
     missing = [name for name in data if name not in given]
     if missing:
@@ -36,3 +37,9 @@ def nondimensional(system: System, given: Mapping[str, Any]) -> tuple[Any, dict[
         if name in converted:
             raise InputError(f"{name} = {others[name]!r}: is given in physical units, too; allowed is one of the two")
     return shaft, {**converted, **others}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(map(_plain, value))
+    return value.tolist() if hasattr(value, "tolist") else value

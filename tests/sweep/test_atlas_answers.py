@@ -57,6 +57,15 @@ def test_boundaries_lie_on_both_sides_of_the_angle_0():
     assert ends["below"]["value"] == pytest.approx(above, rel=1e-12) and ends["above"] is None
 
 
+@pytest.mark.parametrize("number", [np.float32, np.float64, np.array])
+def test_numbers_of_numpy_are_numbers(number):
+    atlas, speeds = atlas_of((-0.2, 0.3), (1.3, 1.5)), (1.3125, 1.5)
+    found = atlas_answers.query(atlas, {"beta": number(0.25), "Omega": number(1.375)}).data
+    assert found == atlas_answers.query(atlas, {"beta": 0.25, "Omega": 1.375}).data
+    asked = {"Omega": tuple(map(number, speeds))}
+    assert atlas_answers.widest_angle(atlas, asked).data == atlas_answers.widest_angle(atlas, {"Omega": speeds}).data
+
+
 def columns(count: int, zeta: float = 0.001) -> dict[str, np.ndarray]:
     return {name: np.full(count, x) for name, x in {"zeta": zeta, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}.items()}
 
