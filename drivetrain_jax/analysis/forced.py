@@ -24,6 +24,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, solve, spectral_norm
+from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.analysis.periodic.amplitude import amplitudes
 from drivetrain_jax.analysis.periodic.orbit import (
     Orbit,
@@ -189,17 +190,18 @@ def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Ar
 
 def predicted_steps(build: Build, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Steps of one integration, shape (N,), from the mean spectral radius of the linear field over three phases."""
-    model, n = build(columns), len(STATE.values)
+    matrices = np.moveaxis(predicted(_matrices, (build,), columns), -1, 0)
+    rates = np.abs(np.linalg.eigvals(matrices)).max(axis=-1)
+    return np.ceil(20 + 2 * np.mean(rates, axis=-1)).astype(np.int64)
+
+
+def _matrices(build: Build, values: Mapping[str, Any]) -> Array:
+    """The period times the Jacobian of the linear field of one point at three phases, ``(3, n, n)``."""
+    model, n = build(values), len(STATE.values)
     if len(model.displacements) != len(SHAFT.values):
         raise InputError(f"system: has {len(model.displacements)} displacements; forced allows two, and {n} states")
-    count = np.broadcast(*columns.values()).size
-    rates = []
-    for phase in model.period * np.array([0.0, 0.25, 0.5]):
-        rest = np.asarray(model.linear(phase, jnp.zeros((n, count))))
-        unit = np.eye(n)[:, :, None] * np.ones(count)
-        matrix = np.stack([np.asarray(model.linear(phase, jnp.asarray(unit[j]))) - rest for j in range(n)], axis=1)
-        rates.append(np.abs(np.linalg.eigvals(np.moveaxis(matrix, -1, 0))).max(axis=-1))
-    return np.ceil(20 + 2 * model.period * np.mean(rates, axis=0)).astype(np.int64)
+    phases = model.period * jnp.array([0.0, 0.25, 0.5])
+    return model.period * jax.vmap(lambda t: jax.jacfwd(lambda y: model.linear(t, y))(jnp.zeros(n)))(phases)
 
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:

@@ -11,7 +11,7 @@ is not finite at the start.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -24,6 +24,7 @@ from jax import Array
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.analysis.periodic.monodromy import SOLVERS
 from drivetrain_jax.systems import Flow, System
 
@@ -175,13 +176,16 @@ def _solve(system: System, request: Request, values: Mapping[str, Any], effort: 
 
 def _effort(system: System, request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Predicted segments, shape (N,): strobes and requested times; infinite beyond what is worth beginning."""
-    times, flow = requested_times(request), system.models["history"].build(columns)
-    if flow.size != len(_COMPONENT):
-        raise InputError(
-            f"system = {system.name!r}: has {flow.size} components; history allows two, an angle and its rate"
-        )
-    strobes = times[-1] / np.asarray(flow.period)
+    times = requested_times(request)
+    strobes = times[-1] / predicted(_period, (system.models["history"].build, system.name), columns)
     return np.where(strobes <= _MAX_STROBES, np.ceil(strobes) + len(times), np.inf)
+
+
+def _period(build: Callable[..., Flow], name: str, values: Mapping[str, Any]) -> Array:
+    flow = build(values)
+    if flow.size != len(_COMPONENT):
+        raise InputError(f"system = {name!r}: has {flow.size} components; history allows two, an angle and its rate")
+    return jnp.asarray(flow.period)
 
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:

@@ -10,7 +10,7 @@ leaves all bounds is data: its verdict says so, and its exponents are those of t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -38,6 +38,7 @@ from drivetrain_jax.analysis.chaos.section_measures import period_multiple
 from drivetrain_jax.analysis.chaos.variational import batch_shape, divergence, initial_state
 from drivetrain_jax.analysis.chaos.verdict import STANDARD_ERRORS, Evidence, Verdict, grows, judge
 from drivetrain_jax.analysis.chaos.zero_one_test import largest_k01
+from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.systems import Flow, System
 
 VARIABLES = (
@@ -271,11 +272,18 @@ def averaging_time(record: Record) -> Array:
 
 def _effort(system: System, request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Predicted steps, shape (N,): those of a whole run, or up to where the mean contraction has settled the motion."""
-    flow, options = system.models["lyapunov"].build(columns), request.options
-    longest = options["max_time"]
-    rate = -np.asarray(divergence(flow, flow.angles(0, 0.0), initial_state(flow))) / flow.size
+    options, longest = request.options, request.options["max_time"]
+    rate, period = predicted(_contraction, (system.models["lyapunov"].build,), columns)
     settling = SETTLED / np.maximum(rate, SETTLED / longest) if options["standard_error"] > 0 else longest
-    return np.ceil(options["steps"] * np.clip(settling, longest / 4, longest) / np.asarray(flow.period))
+    return np.ceil(options["steps"] * np.clip(settling, longest / 4, longest) / period)
+
+
+def _contraction(build: Callable[..., Flow], values: Mapping[str, Any]) -> Array:
+    """Mean rate of contraction of one point where it starts, and its period."""
+    flow = build(values)
+    return jnp.stack(
+        [-divergence(flow, flow.angles(0, 0.0), initial_state(flow)) / flow.size, jnp.asarray(flow.period)]
+    )
 
 
 def _dimensions(*_: Any) -> tuple[Dimension, ...]:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
 from typing import Any
 
-import jax
 import numpy as np
 from jax import Array
 
+from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.analysis.periodic.direct import stable_steps
 from drivetrain_jax.analysis.periodic.floquet_effort import explicit_effort
 from drivetrain_jax.atlas.construction import MAX_SOLVES, Domain, Rounds, construct, construct_from_parts
@@ -81,9 +80,7 @@ def span_parts(
     corners = np.array(list(itertools.product(*zip(domain.lower, domain.upper, strict=True))))
     columns = {**domain.fixed, **dict(zip(domain.parameters, corners.T, strict=True))}
     rtol = solve_rtol(tolerance)
-    numbers = {name: column for name, column in columns.items() if not isinstance(column, str)}
-    words = tuple((name, column) for name, column in columns.items() if name not in numbers)
-    decay = float(_stable_steps(system.models["floquet"].build, words)(numbers))
+    decay = np.max(predicted(_stable_steps, (system.models["floquet"].build,), columns))
     if decay > _STIFF:
         return 1
     steps = explicit_effort(system, columns, rtol)
@@ -92,12 +89,8 @@ def span_parts(
     return int(np.clip(np.round(most / each), 1, _MOST_PARTS))
 
 
-@lru_cache(maxsize=8)
-def _stable_steps(
-    build: Callable[..., FloquetModel], words: tuple[tuple[str, str], ...]
-) -> Callable[[Mapping[str, Any]], Array]:
-    """:func:`stable_steps` from parameters, compiled: operation by operation it would take a fifth of a small chart."""
-    return jax.jit(lambda numbers: stable_steps(build({**dict(words), **numbers}).reduced))
+def _stable_steps(build: Callable[..., FloquetModel], values: Mapping[str, Any]) -> Array:
+    return stable_steps(build(values).reduced)
 
 
 def numbers_per_solve(

@@ -34,6 +34,8 @@ class Engine:
     """
 
     def __init__(self, scene: Scene, points: np.ndarray | None = None, *, full_size: bool = False) -> None:
+        # Before the first kernel, which may be one that a plan asks for.
+        compile_cache.enable()
         self.scene = scene
         self.grid = Grid.of(scene)
         self.solvers = tuple(map(for_device, scene.analysis.solvers(scene.system, scene.request)))
@@ -89,7 +91,6 @@ class Engine:
             missing = kernels - self._kernels.keys()
             if not missing:
                 return
-            compile_cache.enable()
             pool = threads(_SIDE_BY_SIDE, "compile")
             for index, size in missing:
                 solver = self.solvers[index]

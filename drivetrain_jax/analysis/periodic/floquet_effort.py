@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System
+from drivetrain_jax.analysis.numerics.predictions import Words, predicted, split
+from drivetrain_jax.systems import FloquetModel, System
 
 # Below this many explicit steps the implicit scheme is never the cheaper one.
 _STIFF = 600
@@ -20,9 +21,11 @@ _MAX_EXPLICIT, _MAX_PANELS = 300_000, 20_000
 # Seconds of one implicit panel over those of one explicit step, per point. Full batches would have 150; but few points share
 # a chunk whatever they need, and steps that a point does not need cost it exactness, too.
 PANEL_COST = 50.0
-# Nodes of the quadrature, and points that are evaluated together.
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
-_TOGETHER = 2048
+# Nodes and weights of a quadrature over [0, 1].
+_NODES, _WEIGHTS = ((x + a) / 2 for x, a in zip(np.polynomial.legendre.leggauss(8), (1, 0), strict=True))
+_PLACES = tuple(_NODES.tolist())
+
+Build = Callable[..., FloquetModel]
 
 
 def explicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
@@ -40,7 +43,7 @@ def implicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: flo
             name: column if np.ndim(column) == 0 else np.broadcast_to(column, explicit.shape)[stiff]
             for name, column in columns.items()
         }
-        phase = _frequency_phase(system, chosen, stiff.size)
+        phase = _frequency_phase(system, chosen)
         decaying = (12 + 2 * np.sqrt(phase)) * (1e-9 / rtol) ** (1 / 13)
         oscillating = (8 + phase / 5) * (1e-10 / rtol) ** (1 / 16)
         effort[stiff] = 2 * np.ceil(np.maximum(decaying, oscillating) / 2)
@@ -48,47 +51,51 @@ def implicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: flo
 
 
 def _explicit_steps(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
-    model: FloquetModel = system.models["floquet"].build(columns)
-    size = max(np.size(column) for column in columns.values())
-    steps = model.explicit_steps(rtol) if model.explicit_steps else _generic_steps(model.reduced, rtol)
-    return np.broadcast_to(2 * np.ceil(steps / 2), size)
+    build = system.models["floquet"].build
+    if _predicts_steps(build, columns):
+        steps = build(columns).explicit_steps(rtol)
+    else:
+        # Systems that predict none: from the size of A^2.
+        phase = predicted(_phase, (build,), columns)
+        steps = (4 + 2.5 * phase**1.1) * (1e-9 / rtol) ** (1 / 9)
+    return np.broadcast_to(2 * np.ceil(steps / 2), max(np.size(column) for column in columns.values()))
 
 
-def _frequency_phase(system: System, columns: Mapping[str, Any], size: int) -> np.ndarray:
-    """int max |Im lambda(A(t))| dt over the span for ``size`` points, by Gauss quadrature with 8 nodes."""
-    varying = {name: column for name, column in columns.items() if np.ndim(column)}
-    fixed = tuple((name, column) for name, column in columns.items() if name not in varying)
-    matrix = _matrix(system.models["floquet"].build, fixed)
-    phase = np.empty(size)
-    for start in range(0, size, _TOGETHER):
-        part = slice(start, min(start + _TOGETHER, size))
-        count = part.stop - start
-        padded = {n: np.pad(c[part], (0, _TOGETHER - count), mode="edge") for n, c in varying.items()}
-        a = np.stack([np.moveaxis(np.asarray(matrix(padded, x)), -1, 0)[:count] for x in _NODES])
-        finite = np.isfinite(a).all(axis=(2, 3))
-        frequency = np.abs(np.linalg.eigvals(np.where(finite[..., None, None], a, 0.0)).imag).max(-1)
-        phase[part] = np.tensordot(_WEIGHTS, np.where(finite, frequency, np.inf), 1)
-    return phase * system.models["floquet"].build(columns).reduced.span / 2
+def _predicts_steps(build: Build, columns: Mapping[str, Any]) -> bool:
+    """Whether the model predicts its steps itself, found out without computing anything of it."""
+    words, numbers = split(columns)
+    return _known_to_predict(build, words, frozenset(numbers))
 
 
-@lru_cache(maxsize=8)
-def _matrix(build: Callable[..., FloquetModel], fixed: tuple[tuple[str, Any], ...]) -> Callable[..., Array]:
-    """``A``, ``(n, n, N)``, at a node in [-1, 1]: compiled for one N, not operation by operation for each."""
+@lru_cache(maxsize=32)
+def _known_to_predict(build: Build, words: Words, names: frozenset[str]) -> bool:
+    def model(numbers: Mapping[str, Array]) -> None:
+        known.append(build({**dict(words), **numbers}).explicit_steps is not None)
 
-    def at_node(varying: Mapping[str, Array], x: Array) -> Array:
-        form = build({**dict(fixed), **varying}).reduced
-        a = form.matrix((x + 1) * form.span / 2)
-        return jnp.broadcast_to(a.reshape(*a.shape[:2], -1), (*a.shape[:2], _TOGETHER))
-
-    return jax.jit(at_node)
+    known: list[bool] = []
+    jax.eval_shape(model, dict.fromkeys(names, jax.ShapeDtypeStruct((), float)))
+    return known[0]
 
 
-def _generic_steps(form: LinearPeriodic, rtol: float) -> np.ndarray:
-    """Steps of the explicit scheme from the size of A^2 at 16 instants, for systems that predict none."""
-    samples = [np.asarray(form.matrix((k + 0.5) * form.span / 16)) for k in range(16)]
-    rates = [np.sqrt(np.linalg.norm(np.einsum("ij...,jk...->ik...", a, a), axis=(0, 1))) for a in samples]
-    phase = form.span * np.maximum(np.mean(rates, axis=0), np.max(rates, axis=0) / 2)
-    return (4 + 2.5 * phase**1.1) * (1e-9 / rtol) ** (1 / 9)
+def _phase(build: Build, values: Mapping[str, Any]) -> Array:
+    """The mean of |A^2|^(1/2) dt over the span at 16 instants, or half of the largest."""
+    a = _matrices(build, tuple((k + 0.5) / 16 for k in range(16)), values)
+    rates = jnp.sqrt(jnp.linalg.norm(a @ a, axis=(1, 2)))
+    return jnp.maximum(jnp.mean(rates), jnp.max(rates) / 2)
+
+
+def _frequency_phase(system: System, columns: Mapping[str, Any]) -> np.ndarray:
+    """int max |Im lambda(A(t))| dt over the span, ``(N,)``, by Gauss quadrature with 8 nodes."""
+    a = np.moveaxis(predicted(_matrices, (system.models["floquet"].build, _PLACES), columns), -1, 1)
+    finite = np.isfinite(a).all(axis=(2, 3))
+    frequency = np.abs(np.linalg.eigvals(np.where(finite[..., None, None], a, 0.0)).imag).max(-1)
+    return np.tensordot(_WEIGHTS, np.where(finite, frequency, np.inf), 1)
+
+
+def _matrices(build: Build, places: tuple[float, ...], values: Mapping[str, Any]) -> Array:
+    """The span times ``A`` of one point where the clock is at these ``places`` in [0, 1] of it, ``(K, n, n)``."""
+    form = build(values).reduced
+    return form.span * jax.vmap(form.matrix)(form.span * jnp.array(places))
 
 
 def _up_to(limit: int, effort: np.ndarray) -> np.ndarray:
