@@ -49,3 +49,11 @@ def test_a_result_that_depends_on_no_parameter_is_that_of_every_point():
     np.testing.assert_array_equal(
         predicted(lambda values: jnp.eye(2), (), {"x": np.ones(3)}), np.eye(2)[..., None] * np.ones(3)
     )
+
+
+def test_lists_have_a_number_for_every_point():
+    x = np.arange(40.0)
+    found = predicted(
+        lambda values: values["list"][0] + 10 * values["list"][1], (), {"list": (x, np.full(40, 2.0)), "y": 1.0}
+    )
+    np.testing.assert_array_equal(found, x + 20)

@@ -22,23 +22,42 @@ Columns = Mapping[str, Any]
 def predicted(function: Callable[..., Array], given: tuple[Hashable, ...], columns: Columns) -> np.ndarray:
     """``function(*given, values)`` of every point, shape ``(..., N)``.
 
-    ``columns`` are the values of N points: arrays of shape ``(N,)``, or what all points share; ``values`` are those of one.
-    The function is compiled once for all numbers. Run operation by operation each of these would be compiled, which takes
-    longer than a small scene does. It may raise :class:`InputError`.
+    ``columns`` are the values of N points: numbers as arrays of shape ``(N,)``, or one for all; words; and tuples of
+    numbers. ``values`` are those of one point. The function is compiled once for all numbers: run operation by operation,
+    each of these would be compiled, which takes longer than a small scene does. It may raise :class:`InputError`.
     """
     words, numbers = split(columns)
-    arrays = {name: np.asarray(value) for name, value in numbers.items()}
-    varying = frozenset(name for name, value in arrays.items() if value.ndim)
-    count = np.broadcast(*arrays.values()).size if arrays else 1
+    count = count_of(columns)
     together = _FEW if count <= _FEW else _MANY
-    call = _compiled(function, given, words, varying, together)
+    call = _compiled(function, given, words, together)
     found = []
     for start in range(0, count, together):
-        stop = min(start + together, count)
-        fill = (0, together - (stop - start))
-        block = {n: np.pad(x[start:stop], fill, mode="edge") if n in varying else x for n, x in arrays.items()}
-        found.append(_called(call, block)[..., : stop - start])
+        size = min(together, count - start)
+        # The last block is filled up with its last point.
+        places = np.minimum(np.arange(start, start + together), count - 1)
+        found.append(_called(call, taken(numbers, places))[..., :size])
     return np.concatenate(found, axis=-1)
+
+
+def count_of(columns: Columns) -> int:
+    """The number of points."""
+    return max((np.size(leaf) for leaf in jax.tree.leaves(split(columns)[1])), default=1)
+
+
+def taken(columns: Columns, places: np.ndarray) -> Columns:
+    """The values of the points at ``places``."""
+
+    def at_places(leaf: Any) -> Any:
+        return leaf if isinstance(leaf, str) else np.broadcast_to(leaf, count)[places]
+
+    count = count_of(columns)
+    return jax.tree.map(at_places, columns)
+
+
+def split(columns: Columns) -> tuple[Words, dict[str, Any]]:
+    """The words among values, and the numbers."""
+    numbers = {name: value for name, value in columns.items() if not isinstance(value, str)}
+    return tuple((name, value) for name, value in columns.items() if name not in numbers), numbers
 
 
 def _called(call: Callable[[Columns], Array], block: Columns) -> np.ndarray:
@@ -49,22 +68,11 @@ def _called(call: Callable[[Columns], Array], block: Columns) -> np.ndarray:
         raise InputError(*error.args) from None
 
 
-def split(columns: Columns) -> tuple[Words, dict[str, Any]]:
-    """The words among values, and the numbers."""
-    numbers = {name: value for name, value in columns.items() if not isinstance(value, str)}
-    return tuple((name, value) for name, value in columns.items() if name not in numbers), numbers
-
-
 @lru_cache(maxsize=32)
 def _compiled(
-    function: Callable[..., Array], given: tuple[Hashable, ...], words: Words, varying: frozenset[str], count: int
+    function: Callable[..., Array], given: tuple[Hashable, ...], words: Words, count: int
 ) -> Callable[[Columns], Array]:
-    def one(own: Columns, shared: Columns) -> Array:
-        return function(*given, {**dict(words), **shared, **own})
+    def one(numbers: Columns) -> Array:
+        return function(*given, {**dict(words), **numbers})
 
-    def all_together(block: Columns) -> Array:
-        own = {name: block[name] for name in varying}
-        shared = {name: block[name] for name in block if name not in varying}
-        return jax.vmap(one, (0, None), -1, axis_size=count)(own, shared)
-
-    return jax.jit(all_together)
+    return jax.jit(jax.vmap(one, 0, -1, axis_size=count))

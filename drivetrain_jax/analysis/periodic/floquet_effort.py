@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.numerics.predictions import Words, predicted, split
+from drivetrain_jax.analysis.numerics.predictions import Words, count_of, predicted, split, taken
 from drivetrain_jax.systems import FloquetModel, System
 
 # Below this many explicit steps the implicit scheme is never the cheaper one.
@@ -39,11 +39,7 @@ def implicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: flo
     effort = np.full(explicit.shape, np.inf)
     stiff = np.flatnonzero(explicit > _STIFF)
     if stiff.size:
-        chosen = {
-            name: column if np.ndim(column) == 0 else np.broadcast_to(column, explicit.shape)[stiff]
-            for name, column in columns.items()
-        }
-        phase = _frequency_phase(system, chosen)
+        phase = _frequency_phase(system, taken(columns, stiff))
         decaying = (12 + 2 * np.sqrt(phase)) * (1e-9 / rtol) ** (1 / 13)
         oscillating = (8 + phase / 5) * (1e-10 / rtol) ** (1 / 16)
         effort[stiff] = 2 * np.ceil(np.maximum(decaying, oscillating) / 2)
@@ -58,22 +54,23 @@ def _explicit_steps(system: System, columns: Mapping[str, np.ndarray], rtol: flo
         # Systems that predict none: from the size of A^2.
         phase = predicted(_phase, (build,), columns)
         steps = (4 + 2.5 * phase**1.1) * (1e-9 / rtol) ** (1 / 9)
-    return np.broadcast_to(2 * np.ceil(steps / 2), max(np.size(column) for column in columns.values()))
+    return np.broadcast_to(2 * np.ceil(steps / 2), count_of(columns))
 
 
 def _predicts_steps(build: Build, columns: Mapping[str, Any]) -> bool:
     """Whether the model predicts its steps itself, found out without computing anything of it."""
     words, numbers = split(columns)
-    return _known_to_predict(build, words, frozenset(numbers))
+    leaves, tree = jax.tree.flatten(numbers)
+    return _known_to_predict(build, words, tree, len(leaves))
 
 
 @lru_cache(maxsize=32)
-def _known_to_predict(build: Build, words: Words, names: frozenset[str]) -> bool:
-    def model(numbers: Mapping[str, Array]) -> None:
-        known.append(build({**dict(words), **numbers}).explicit_steps is not None)
+def _known_to_predict(build: Build, words: Words, tree: Any, count: int) -> bool:
+    def model(leaves: list[Array]) -> None:
+        known.append(build({**dict(words), **jax.tree.unflatten(tree, leaves)}).explicit_steps is not None)
 
     known: list[bool] = []
-    jax.eval_shape(model, dict.fromkeys(names, jax.ShapeDtypeStruct((), float)))
+    jax.eval_shape(model, [jax.ShapeDtypeStruct((), float)] * count)
     return known[0]
 
 
