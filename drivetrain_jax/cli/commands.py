@@ -177,6 +177,9 @@ def point(options: argparse.Namespace) -> int:
     from drivetrain_jax.sweep.point import point
 
     given = assignments(options.given, "point")
+    for name in ("system", "analysis"):
+        if name in given:
+            raise InputError(f"{name} = {given[name]!r}: given twice; allowed is once, in front of the values")
     outputs = given.pop("outputs", None)
     if isinstance(outputs, str):
         outputs = outputs.split(",")

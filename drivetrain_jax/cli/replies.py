@@ -12,8 +12,10 @@ OK, WRONG_INPUT, INCOMPLETE, INTERRUPTED = 0, 2, 3, 130
 
 def say(text: str) -> None:
     """``text`` on standard output; one that takes no more (a full disk) is wrong input."""
+    encoding = sys.stdout.encoding or "utf-8"
     try:
-        sys.stdout.write(text)
+        # A terminal may lack letters that a title has.
+        sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding))
         sys.stdout.flush()
     except BrokenPipeError:
         raise

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._wording import clipped
 
 
 def assignments(texts: Sequence[str], field: str) -> dict[str, Any]:
@@ -21,7 +22,10 @@ def assignments(texts: Sequence[str], field: str) -> dict[str, Any]:
             raise InputError(f"{field} = {text!a}: not text in the locale of this shell; allowed is UTF-8")
         if name in pairs:
             raise InputError(f"{field} = {text!r}: {name} is given twice; allowed is once")
-        pairs[name] = parse_value(value)
+        try:
+            pairs[name] = parse_value(value)
+        except RecursionError:
+            raise InputError(f"{field} = {clipped(text)!r}: nested too deeply; allowed is name=value") from None
     return pairs
 
 

@@ -10,7 +10,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.invariants import Finding, check
 from drivetrain_jax.store import checksums, shards
 from drivetrain_jax.store.chunks import PartsFolder
-from drivetrain_jax.store.consolidate import open_result
+from drivetrain_jax.store.consolidate import open_result, read_attribute
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,9 @@ def verify(path: Path) -> Report:
         names = checksums.named(damaged)
         problem = f"{names}: not what was written; allowed is to restore the file or to compute it again"
         return Report((f"checksums: {len(damaged)} differ: {names}",), problem)
+    if damaged is None and read_attribute(path, "digest") is not None:
+        problem = "its checksums are gone; allowed is to restore the file or to compute it again"
+        return Report(("checksums: gone",), problem)
     sealed = "none in this file" if damaged is None else "all agree"
     findings = check(open_result(path))
     lines = (f"checksums: {sealed}", *map(str, findings))
@@ -60,7 +63,12 @@ def _first_broken(findings: list[Finding]) -> str:
 
 
 def _verify_store(path: Path) -> Report:
-    wrong, count = shards.damaged(path)
+    if not shards.is_sealed(path):
+        what = "attributes of the store"
+        problem = f"{what}: not what was written; allowed is to restore them or to compute the store again"
+        return Report((f"checksums: {what} differ",), problem)
+    intact, _, count = shards.tally(path)
+    wrong = count - intact
     problem = f"{wrong} of {count} shards are not what was written; allowed is to compute them again" if wrong else ""
     rules = "rules: applied to the file that `drivetrain export` makes of the store"
     return Report((f"checksums: {wrong or 'none'} of {count} shards differ", rules), problem)
@@ -68,8 +76,12 @@ def _verify_store(path: Path) -> Report:
 
 def _verify_parts(parts: PartsFolder) -> Report:
     """Damaged parts are no problem of the user's: a run that is resumed computes their chunks again."""
-    present, intact = parts.count(), sum(1 for _ in parts.read())
-    lines = [f"unfinished: {intact} of {present} parts are intact"]
+    store = parts.path / shards.UNFINISHED
+    if shards.is_store(store):
+        (intact, present, _), unit = shards.tally(store), "shards"
+    else:
+        present, intact, unit = parts.count(), sum(1 for _ in parts.read()), "parts"
+    lines = [f"unfinished: {intact} of {present} {unit} are intact"]
     if intact < present:
         lines.append("the run that resumes computes the chunks of the others again")
     return Report(tuple(lines), complete=False)

@@ -24,6 +24,8 @@ FILE = "/"
 _BLOCK = 1 << 24
 # Bytes from which on threads are worth their while: they wait for one another except while they hash.
 _LARGE = 1 << 22
+# Damage in the structure of a file surfaces in h5py as any of these.
+BROKEN = (OSError, KeyError, ValueError, RuntimeError, TypeError, OverflowError)
 # What the netCDF library adds to link dimensions and variables; the links themselves are looked at by name.
 _LINKS = frozenset({"DIMENSION_LIST", "REFERENCE_LIST", "CLASS", "NAME", "_Netcdf4Dimid", "_Netcdf4Coordinates"})
 
@@ -61,8 +63,7 @@ def damaged(path: Path) -> list[str] | None:
             if stored is None:
                 return None
             wanted, found = _parsed(stored), checksums(file)
-    # Damage in the structure of a file surfaces in h5py as any of these.
-    except (OSError, KeyError, ValueError, RuntimeError, TypeError, MemoryError, OverflowError):
+    except (*BROKEN, MemoryError):
         raise InputError(
             f"file = {str(path)!r}: not a readable netCDF4/HDF5 file, or damaged in its structure"
         ) from None

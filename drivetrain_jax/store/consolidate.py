@@ -130,9 +130,9 @@ def read_attribute(path: Path, name: str) -> str | None:
     try:
         with h5py.File(path, "r") as file:
             value = file.attrs.get(name)
-    except OSError:
+            return value.decode() if isinstance(value, bytes) else value
+    except checksums.BROKEN:
         raise _unreadable(path) from None
-    return value.decode() if isinstance(value, bytes) else value
 
 
 def read_variable(path: Path, name: str) -> np.ndarray:
@@ -140,7 +140,7 @@ def read_variable(path: Path, name: str) -> np.ndarray:
     try:
         with h5py.File(path, "r") as file:
             return file[name][()]
-    except (OSError, KeyError):
+    except checksums.BROKEN:
         raise _unreadable(path) from None
 
 
@@ -151,7 +151,7 @@ def map_variable(path: Path, name: str) -> np.ndarray:
             variable = file[name]
             if variable.chunks is None and (offset := variable.id.get_offset()) is not None and variable.size:
                 return np.memmap(path, variable.dtype, "r", offset, variable.shape)
-    except (OSError, KeyError):
+    except checksums.BROKEN:
         raise _unreadable(path) from None
     return read_variable(path, name)
 
@@ -166,7 +166,7 @@ def open_result(path: Path) -> xr.Dataset:
     try:
         with xr.open_dataset(path, engine="h5netcdf") as dataset:
             result = dataset.load()
-    except (OSError, ValueError, KeyError):
+    except checksums.BROKEN:
         raise _unreadable(path) from None
     if "analysis" not in result.attrs:
         raise InputError(f"file = {str(path)!r}: not a result of drivetrain_jax; give one written by `drivetrain run`")

@@ -2,7 +2,8 @@
 
 Rows are points in the order in which they are computed, ``width`` of them a chunk; the chunks of one group of the plan
 are one Zarr group. The array ``point`` holds the number of each row's point in the grid (-1: padding), and ``done`` a
-checksum of each shard, written after its data, 0 before. Damage is found by that, by the CRC-32C of every chunk, or both.
+checksum of each shard, written after its data, 0 before. Damage is found by that, by the CRC-32C of every chunk, or both;
+that of the attributes by a digest of them, which a finished store has.
 """
 
 from __future__ import annotations
@@ -17,8 +18,15 @@ from typing import Any
 import numpy as np
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax.store.provenance import digest
 
 POINT, DONE = "point", "done"
+# The folder among the parts of a result that a store grows in.
+UNFINISHED = "store"
+# Attributes that only a store has: what finds its shards and says how many points they hold, and the digest of all others.
+GROUPS, HELD, SEAL = "groups", "held_points", "checksum"
+# What decoding raises depends on where the damage is.
+_BROKEN = (ValueError, OSError, KeyError, RuntimeError, TypeError, AttributeError, IndexError, ArithmeticError)
 _MOST_CHUNKS = 64
 _FEWEST_SHARDS = 8
 
@@ -90,52 +98,86 @@ def done(path: Path, group: Group) -> np.ndarray:
 
 def read(path: Path, group: Group, shard: int, names: Sequence[str]) -> dict[str, np.ndarray] | None:
     """The arrays ``names`` of a shard; None if it is damaged. Its checksum needs all of its arrays to be asked for."""
-    own = _zarr().open_group(path, mode="r")[group.name]
-    rows = _rows(group, shard)
+    zarr, rows = _zarr(), _rows(group, shard)
     try:
+        own = zarr.open_group(path, mode="r")[group.name]
         arrays = {name: own[name][rows] for name in names}
-    # What decoding raises depends on where the damage is.
-    except (ValueError, OSError, KeyError, RuntimeError):
+        return arrays if own[DONE][shard] == _checksum(arrays) else None
+    except _BROKEN:
         return None
-    return arrays if own[DONE][shard] == _checksum(arrays) else None
+
+
+def without_padding(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """The points of a shard and their results."""
+    rows = arrays[POINT] >= 0
+    return arrays[POINT][rows], {name: values[rows] for name, values in arrays.items() if name != POINT}
 
 
 def attributes(path: Path) -> dict[str, Any]:
     """The attributes of the store; :class:`InputError` if it is none."""
+    zarr = _zarr()
     try:
-        return dict(_zarr().open_group(path, mode="r").attrs)
-    except (OSError, ValueError, KeyError):
+        return dict(zarr.open_group(path, mode="r").attrs)
+    except _BROKEN:
         raise InputError(f"store = {str(path)!r}: not a readable Zarr store; give one of --store zarr") from None
 
 
-def annotate(path: Path, **attrs: Any) -> None:
-    """Add attributes."""
-    _zarr().open_group(path, mode="r+").attrs.update(attrs)
+def seal(path: Path, attrs: Mapping[str, Any]) -> None:
+    """Give the finished store its attributes, in place of those it has, and the digest of them."""
+    _zarr().open_group(path, mode="r+").attrs.put({**attrs, SEAL: digest(dict(attrs))})
+
+
+def is_sealed(path: Path) -> bool:
+    """Whether the attributes of a finished store are what was written; :class:`InputError` if it is no result."""
+    attrs = attributes(path)
+    if "digest" not in attrs:
+        raise InputError(f"store = {str(path)!r}: not a result of drivetrain_jax; give one of --store zarr")
+    return attrs.pop(SEAL, None) == digest(attrs)
 
 
 def finished(path: Path, name: str) -> Iterator[np.ndarray]:
     """The values of one variable at all points that are done, group by group, as they are stored."""
-    root = _zarr().open_group(path, mode="r")
-    for group in groups_of(root.attrs):
-        own = root[group.name]
-        flags = np.repeat(own[DONE][:] != 0, group.per_shard * group.width)[: group.count * group.width]
-        yield own[name][:][flags & (own[POINT][:] >= 0)]
+    try:
+        root = _zarr().open_group(path, mode="r")
+        for group in groups_of(root.attrs):
+            own = root[group.name]
+            flags = np.repeat(own[DONE][:] != 0, group.per_shard * group.width)[: group.count * group.width]
+            yield own[name][:][flags & (own[POINT][:] >= 0)]
+    except InputError:
+        raise
+    except _BROKEN:
+        raise InputError(f"store = {str(path)!r}: damaged; allowed is to restore it or to compute it again") from None
 
 
-def damaged(path: Path) -> tuple[int, int]:
-    """How many shards of a finished store are not what was written, or not there, and how many it has."""
-    root = _zarr().open_group(path, mode="r")
-    wrong = count = 0
-    for group in groups_of(root.attrs):
-        names = [name for name in root[group.name].array_keys() if name != DONE]
+def tally(path: Path) -> tuple[int, int, int]:
+    """How many shards are what was written, how many are marked done, and how many a finished store has."""
+    intact = marked = count = 0
+    for group in groups_of(attributes(path)):
+        names = _names(path, group)
         count += group.shards
-        wrong += sum(read(path, group, shard, names) is None for shard in range(group.shards))
-    return wrong, count
+        intact += sum(read(path, group, shard, names) is not None for shard in range(group.shards))
+        marked += _marked(path, group)
+    return intact, marked, count
+
+
+def _names(path: Path, group: Group) -> list[str]:
+    """The arrays of a group that its checksums are made over."""
+    return [file.parent.name for file in (path / group.name).glob("*/zarr.json") if file.parent.name != DONE]
+
+
+def _marked(path: Path, group: Group) -> int:
+    try:
+        return int(done(path, group).sum())
+    except _BROKEN:
+        return 0
 
 
 def groups_of(attrs: Mapping[str, Any]) -> list[Group]:
     """The groups of a store with these attributes."""
-    return [Group(*entry) for entry in json.loads(attrs["groups"])]
+    try:
+        return [Group(*entry) for entry in json.loads(attrs[GROUPS])]
+    except (KeyError, ValueError, TypeError):
+        raise InputError(f"store: its attribute {GROUPS!r} is damaged; allowed is to run its scene again") from None
 
 
 def describe(groups: Sequence[Group]) -> str:

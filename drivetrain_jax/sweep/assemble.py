@@ -80,6 +80,18 @@ class Table:
                 self._sizes |= zip(reversed(variable.dims), reversed(results[variable.name].shape), strict=False)
             self.lay_out(blank=blank)
 
+    def _complete_sizes(self) -> None:
+        """Where no point has a result, the solver tells the sizes of dimensions that depend on the system."""
+        if all(self._sizes[dim] for variable in self.variables for dim in variable.dims):
+            return
+        # It needs this module, and jax.
+        from drivetrain_jax.sweep.kernel import result_shapes
+
+        scene = self._scene
+        shapes = result_shapes(scene, self._grid, scene.analysis.solvers(scene.system, scene.request)[0])
+        for variable in self.variables:
+            self._sizes |= zip(reversed(variable.dims), reversed(shapes[variable.name]), strict=False)
+
     def lose(self, points: np.ndarray) -> None:
         """Record that nobody survived the computation of ``points``."""
         self._lost.append(points)
@@ -94,6 +106,7 @@ class Table:
     def lay_out(self, *, blank: bool = True) -> Mapping[str, np.ndarray]:
         """The arrays, made if nothing has been filled in yet; without ``blank`` what is in them is anything."""
         if not self.arrays:
+            self._complete_sizes()
             sweep = self._grid.result_shape
             shapes = {v: (*sweep, *(self._sizes[dim] for dim in v.dims)) for v in self.variables}
             if self._allocate is None:

@@ -11,13 +11,14 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.store import consolidate
+from drivetrain_jax.store import consolidate, shards
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.sweep.assemble import Table, enter, to_dataset
 from drivetrain_jax.sweep.atlas_choice import uses_atlas
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.growing import rest_of
 from drivetrain_jax.sweep.scene import load_scene
+from drivetrain_jax.sweep.sharded import stored
 from drivetrain_jax.sweep.target import Target
 
 if TYPE_CHECKING:
@@ -59,6 +60,12 @@ def _open_partial(path: Path) -> xr.Dataset:
 
 def _finished(engine: Engine, target: Target) -> Iterator[tuple[np.ndarray, Mapping[str, np.ndarray]]]:
     """Points and results, those taken from other results among them."""
+    if target.store == "zarr":
+        store = target.parts.path / shards.UNFINISHED
+        for _, arrays in stored(engine, store) if shards.is_store(store) else ():
+            if arrays is not None:
+                yield shards.without_padding(arrays)
+        return
     taken = target.taken_before()
     yield from taken.blocks([variable.name for variable in Table(engine.scene, engine.grid).variables])
     plan = rest_of(engine, taken).plan

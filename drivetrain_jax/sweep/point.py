@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, KeysView, Mapping, Sequence
+from collections.abc import Iterable, Iterator, KeysView, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -152,7 +152,8 @@ def point(system: str, analysis: str, *, outputs: Sequence[str] | None = None, *
     """
     tree = _tree(system, analysis, nondimensional(find_system(system), given)[1])
     if outputs is not None:
-        tree["outputs"] = [outputs] if isinstance(outputs, str) else list(outputs)
+        outputs = [outputs] if isinstance(outputs, str) else outputs
+        tree["outputs"] = list(outputs) if isinstance(outputs, Iterable) else outputs
     try:
         engine = Engine(load_scene(tree))
     except InputError as error:

@@ -84,7 +84,7 @@ def find_system(name: str) -> System:
     try:
         return get_system(name)
     except KeyError:
-        raise InputError(f"system = {name!r}: unknown{nearest(name, system_names())}") from None
+        raise InputError(f"system = {name!r}: unknown{nearest(str(name), system_names())}") from None
     except ImportError as error:
         # One line, whatever the package had to say.
         raise InputError(f"system = {name!r}: {' '.join(str(error).split())}") from error
@@ -94,7 +94,7 @@ def system_and_analysis(system_name: str, analysis_name: str) -> tuple[System, A
     """The system and the analysis called so; ``InputError`` unless both exist and the one has a model for the other."""
     system = find_system(system_name)
     if analysis_name not in system.models:
-        guess = did_you_mean(analysis_name, system.models)
+        guess = did_you_mean(str(analysis_name), system.models)
         allowed = f"allowed for {system.name} is one of {', '.join(system.models)}"
         raise InputError(f"analysis = {analysis_name!r}: unknown{guess}; {allowed}")
     return system, get_analysis(analysis_name)

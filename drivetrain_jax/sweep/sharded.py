@@ -79,7 +79,7 @@ def compute(
     engine: Engine, out: Path, parts: PartsFolder, progress: Progress, where: Where, report: Report | None
 ) -> None:
     """Fill the store that grows among ``parts``, and put it at ``out`` when it is complete."""
-    path, begin = parts.path / "store", time.monotonic()
+    path, begin = parts.path / shards.UNFINISHED, time.monotonic()
     progress.computed += engine.hopeless
     progress.failed += engine.hopeless
     if not shards.is_store(path):
@@ -111,12 +111,18 @@ def _create(engine: Engine, path: Path) -> None:
     groups = groups_of(engine)
     shapes = result_shapes(engine.scene, engine.grid, engine.solvers[engine.plan.groups[0].index]) if groups else {}
     fields = [shards.Field(v.name, v.dtype, shapes[v.name]) for v in result_variables(engine.scene)] if groups else []
-    attrs = result_attrs(engine.scene) | {"digest": engine.digest, "numerics": engine.numerics}
     # Moved in one step: what is there is a whole store.
     half = path.with_name("half")
     shutil.rmtree(half, ignore_errors=True)
-    shards.create(half, groups, fields, attrs | {"groups": shards.describe(groups)})
+    shards.create(half, groups, fields, _attrs(engine))
     half.rename(path)
+
+
+def _attrs(engine: Engine) -> dict[str, str | int]:
+    """Whose result it is, and which points its shards hold: those that no solver can do are in none."""
+    whose = {"digest": engine.digest, "numerics": engine.numerics}
+    held = {shards.GROUPS: shards.describe(groups_of(engine)), shards.HELD: engine.plan.size}
+    return result_attrs(engine.scene) | whose | held
 
 
 def all_shards(engine: Engine) -> Iterator[Shard]:
@@ -132,16 +138,22 @@ def all_shards(engine: Engine) -> Iterator[Shard]:
 
 def _missing(engine: Engine, path: Path, progress: Progress) -> Iterator[Shard]:
     """Shards that are not there or damaged; the others count as reused."""
-    names = [shards.POINT, *(variable.name for variable in result_variables(engine.scene))]
-    marked = {group.name: shards.done(path, group) for group in groups_of(engine)}
-    for shard in all_shards(engine):
-        present = shards.read(path, shard.group, shard.index, names) if marked[shard.group.name][shard.index] else None
+    for shard, present in stored(engine, path):
         if present is None:
             yield shard
             continue
-        outcome = present[OUTCOME.name][present[shards.POINT] >= 0]
+        outcome = shards.without_padding(present)[1][OUTCOME.name]
         progress.reused += outcome.size
         progress.failed += failures(outcome)
+
+
+def stored(engine: Engine, path: Path) -> Iterator[tuple[Shard, Mapping[str, np.ndarray] | None]]:
+    """All shards and what the store at ``path`` holds of them: None if one is not there or damaged."""
+    names = [shards.POINT, *(variable.name for variable in result_variables(engine.scene))]
+    marked = {group.name: shards.done(path, group) for group in groups_of(engine)}
+    for shard in all_shards(engine):
+        is_done = marked[shard.group.name][shard.index]
+        yield shard, shards.read(path, shard.group, shard.index, names) if is_done else None
 
 
 def _write(
@@ -184,7 +196,8 @@ def _finish(engine: Engine, path: Path, out: Path, parts: PartsFolder, seconds: 
     absent = sum(int(np.sum(~shards.done(path, group))) for group in groups_of(engine))
     if absent:
         raise ChunkError(f"{absent} shards were written elsewhere; every worker has to see the store as {str(path)!r}")
-    shards.annotate(path, wall_time_s=seconds)
+    # Made anew: what a store has got while it grew is not guarded.
+    shards.seal(path, _attrs(engine) | {"wall_time_s": seconds})
     former = parts.path / "former"
     if out.exists():
         shutil.rmtree(former, ignore_errors=True)

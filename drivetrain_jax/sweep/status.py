@@ -91,7 +91,7 @@ def _outcomes(target: Target) -> Iterator[np.ndarray]:
         # A function of the parameters has no points.
         yield from () if target.is_function else (target.outcomes,)
     elif target.state == "partial" and target.store == "zarr":
-        store = target.parts.path / "store"
+        store = target.parts.path / shards.UNFINISHED
         yield from shards.finished(store, OUTCOME.name) if shards.is_store(store) else ()
     elif target.state == "partial":
         continuous, seen = target.engine.scene.analysis.continuous, set[int]()

@@ -14,7 +14,7 @@ import numpy as np
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import clipped
-from drivetrain_jax.analysis import OUTCOME
+from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.store import shards
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.consolidate import read_attribute, read_variable
@@ -147,9 +147,9 @@ class Target:
     def outcomes(self) -> np.ndarray:
         """Outcomes of all points of the complete result."""
         if self.store == "zarr":
-            return np.concatenate(
-                [a.ravel() for a in shards.finished(self.out, OUTCOME.name)] or [np.empty(0, np.int8)]
-            )
+            held = np.concatenate([np.empty(0, np.int8), *(a.ravel() for a in shards.finished(self.out, OUTCOME.name))])
+            # Points that no solver can do are in no shard.
+            return np.append(held, np.full(max(self.engine.total - held.size, 0), Outcome.STEP_LIMIT, np.int8))
         return read_variable(self.out, OUTCOME.name)
 
     @property

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._wording import shown
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+# What no attribute of a result can hold.
+_NO_TEXT = re.compile("[\0\ud800-\udfff]")
+# Bits of integers that are longer than any number of a scene and shorter than those that Python refuses to write.
+_MOST_BITS = 10_000
 
 
 def read(
@@ -24,6 +31,8 @@ def read(
     """
     if isinstance(source, Mapping):
         tree, text = _plain(source), None
+    elif not isinstance(source, (str, os.PathLike)):
+        raise InputError(f"scene = {shown(source)}: allowed is the path of a scene file, or a table")
     else:
         text = _text(Path(source))
         try:
@@ -33,12 +42,15 @@ def read(
             reason = str(error).replace("at end of document", end)
             reason += "; words stand in quotes" if reason.startswith("Invalid value") else ""
             raise InputError(f"scene = {str(source)!r}: not valid TOML: {reason}") from None
+        except ValueError:
+            raise InputError(f"scene = {str(source)!r}: a number of too many digits; allowed are up to 4300") from None
         except RecursionError:
             raise InputError(f"scene = {str(source)!r}: not valid TOML: nested too deeply") from None
     if overrides:
         text = None
         for key, value in overrides.items():
             _replace(tree, key, _plain(value))
+    _check(tree, "scene")
     return tree, write(tree) if text is None else text
 
 
@@ -51,12 +63,33 @@ def _plain(value: Any) -> Any:
     return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
 
 
+def _check(value: Any, field: str) -> None:
+    """:class:`InputError` unless ``value`` can be written as TOML, and into the attributes of a result."""
+    if isinstance(value, Mapping):
+        for name, entry in value.items():
+            if not isinstance(name, str) or _NO_TEXT.search(name):
+                raise InputError(f"{field}: the key {name!a}; allowed are words")
+            _check(entry, name if field == "scene" else f"{field}.{name}")
+    elif isinstance(value, list):
+        for entry in value:
+            _check(entry, field)
+    elif isinstance(value, str):
+        if _NO_TEXT.search(value):
+            raise InputError(f"{field} = {value!a}: allowed is text without NUL and without halves of characters")
+    elif isinstance(value, int) and value.bit_length() > _MOST_BITS:
+        raise InputError(f"{field}: an integer of {value.bit_length()} bits; allowed are numbers up to 1.8e308")
+    elif not isinstance(value, (int, float, NoneType)):
+        raise InputError(f"{field} = {shown(value)}: allowed is text, a number, true, false, a list or a table")
+
+
 def _text(path: Path) -> str:
     try:
         # Editors on Windows put a byte order mark first.
         return path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"scene = {str(path)!r}: not a text file in UTF-8") from None
+    except ValueError:
+        raise InputError(f"scene = {str(path)!r}: not a path; give the path of a scene file") from None
     except OSError as error:
         raise InputError(f"scene = {str(path)!r}: {error.strerror}; give the path of a scene file") from None
 
@@ -82,7 +115,8 @@ def parse_value(text: str) -> Any:
     """A TOML value; text that is none is a number in its short form (``.3``) or a plain string (``diffrax``)."""
     try:
         content = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+    except ValueError:
+        # No TOML, or a number of too many digits.
         content = {}
     if list(content) == ["value"]:
         return content["value"]
@@ -93,25 +127,35 @@ def parse_value(text: str) -> Any:
 
 
 def write(tree: Mapping[str, Any]) -> str:
-    """TOML text of ``tree``: plain entries first, then its tables, whose own tables are written inline."""
-    plain = [f"{_key(name)} = {_value(value)}" for name, value in tree.items() if not isinstance(value, Mapping)]
+    """TOML text of ``tree``: plain entries first, then its tables, whose own tables are written inline. What is None, which
+    stands for nothing, is left out: TOML has no word for it."""
+    plain = _entries({name: value for name, value in tree.items() if not isinstance(value, Mapping)})
     for name, table in tree.items():
         if isinstance(table, Mapping):
-            plain += ["", f"[{_key(name)}]", *(f"{_key(entry)} = {_value(value)}" for entry, value in table.items())]
+            plain += ["", f"[{_key(name)}]", *_entries(table)]
     return "\n".join(plain) + "\n"
 
 
+def _entries(table: Mapping[str, Any]) -> list[str]:
+    return [f"{_key(name)} = {_value(value)}" for name, value in table.items() if value is not None]
+
+
 def _key(name: str) -> str:
-    return name if _BARE_KEY.fullmatch(str(name)) else json.dumps(str(name), ensure_ascii=False)
+    return name if _BARE_KEY.fullmatch(name) else _quoted(name)
+
+
+def _quoted(text: str) -> str:
+    # TOML wants the one control character escaped that JSON does not.
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _value(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
+        return _quoted(value)
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{_key(name)} = {_value(entry)}" for name, entry in value.items()) + " }"
+        return "{ " + ", ".join(_entries(value)) + " }"
     if isinstance(value, Sequence):
         return "[" + ", ".join(_value(entry) for entry in value) + "]"
     return repr(value)

@@ -251,6 +251,12 @@ def test_wrong_run_is_one_line_and_writes_nothing(cli, folder, case):
         (("point", "toy", "toy", "a"), "name=value"),
         (("point", "toy", "toy", "a=11"), "a = 11"),
         (("point", "toy", "toy", "a=1", "outputs=nothing"), "nothing"),
+        (("point", "toy", "toy", "a=1", "outputs=5"), "outputs = 5: allowed is list"),
+        (("point", "toy", "toy", "a=1", "outputs=true"), "outputs = True: allowed is list"),
+        (("point", "toy", "toy", "a=1", "system=toy"), "system = 'toy': given twice"),
+        (("point", "toy", "toy", "a=1", "analysis=toy"), "analysis = 'toy': given twice"),
+        (("point", "toy", "toy", "a=" + "9" * 5000), "a = inf: allowed is 0 <= a <= 10"),
+        (("point", "toy", "toy", "a=" + "[" * 20_000), "nested too deeply"),
         (("plot", "nothing.nc", "--out", "f.png"), "does not exist"),
         (("plot", "scene.toml", "--out", "f.png"), "not a readable"),
         (("plot", "scene.toml", "--out", "nowhere/f.png"), "folder"),
@@ -334,6 +340,17 @@ def test_list(cli):
     assert code == 0
     for part in ("beta", "rad", "joint angle", "required", "0 <= zeta", "spectral_radius", "rtol", "default 1e-10"):
         assert part in out
+
+
+def test_titles_that_an_output_cannot_write_are_escaped(folder):
+    (folder / "sweeps").mkdir()
+    (folder / "sweeps" / "one.toml").write_text('title = "Gelenk für β"\nsystem = "cardan"', "utf-8")
+    command, ascii_only = (
+        [sys.executable, "-m", "drivetrain_jax.cli", "list"],
+        os.environ | {"PYTHONIOENCODING": "ascii"},
+    )
+    done = subprocess.run(command, env=ascii_only, capture_output=True, text=True, check=True)
+    assert r"sweeps/one.toml  Gelenk f\xfcr \u03b2" in done.stdout and done.stderr == ""
 
 
 def test_a_package_that_fails_spoils_no_other_system(cli, tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -176,6 +177,15 @@ def test_verify_a_file(path, chart):
 def test_verify_a_file_without_checksums(chart, tmp_path):
     chart.to_netcdf(tmp_path / "r.nc", engine="h5netcdf")
     assert verify(tmp_path / "r.nc").lines[0] == "checksums: none in this file"
+
+
+def test_a_result_that_has_lost_its_checksums_is_not_sound(chart, tmp_path):
+    path = tmp_path / "r.nc"
+    write_result(chart.assign_attrs(digest="abc"), path, tmp_path / "tmp")
+    with h5py.File(path, "r+") as file:
+        del file.attrs["checksums"]
+    report = verify(path)
+    assert report.lines == ("checksums: gone",) and "its checksums are gone; allowed is to restore" in report.problem
 
 
 def test_verify_unfinished_work(tmp_path):

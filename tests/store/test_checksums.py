@@ -22,7 +22,9 @@ def path(tmp_path):
         (Variable("z", "1", "complex", ("k",), "complex128"), rng.random((40, 2)) + 1j),
         (Variable("v", "1", "flag", dtype="int8", flags=("no", "yes")), np.zeros(40, np.int8)),
     ]
-    dataset = build_dataset(("x",), [axis], (Dimension("k", "number", ("up", "down")),), results, {"title": "one"})
+    # HDF5 stores more than eight attributes in another way.
+    attrs = {"title": "one", "analysis": "toy"} | {f"attribute_{i}": "some" for i in range(9)}
+    dataset = build_dataset(("x",), [axis], (Dimension("k", "number", ("up", "down")),), results, attrs)
     write_result(dataset, tmp_path / "r.nc", tmp_path / "tmp")
     return tmp_path / "r.nc"
 
@@ -74,6 +76,16 @@ def seen(path):
     except InputError:
         return None
     return {n: (v.dims, v.dtype.str, v.values.tobytes(), str(v.attrs)) for n, v in ds.variables.items()}, str(ds.attrs)
+
+
+def test_a_flipped_bit_in_the_name_of_the_checksums_is_one_line(path):
+    content = path.read_bytes()
+    for bit in range(72):
+        damaged = bytearray(content)
+        damaged[content.index(b"checksums") + bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        with pytest.raises(InputError, match="not a readable"):
+            open_result(path)
 
 
 def test_every_flipped_bit_that_a_reader_could_see_is_found(path):

@@ -129,6 +129,9 @@ def test_another_point_needs_no_new_compilation():
         ({"a": 1, "knob": 2}, "^knob = 2: not used by method plain"),
         ({"a": 1, "kind": "odd"}, "^kind = 'odd'"),
         ({"a": 1, "outputs": ["nothing"]}, "^outputs: 'nothing'"),
+        ({"a": 1, "outputs": 5}, "^outputs = 5: allowed is list"),
+        ({"a": 1, "outputs": True}, "^outputs = True: allowed is list"),
+        ({"a": 1j}, "^a = 1j: allowed is text, a number"),
     ],
 )
 def test_wrong_input_is_one_clear_line(given, part):
@@ -141,6 +144,10 @@ def test_unknown_system_and_analysis():
         dt.point("tractor", "toy")
     with pytest.raises(dt.InputError, match="analysis = 'dance'"):
         dt.point("toy", "dance")
+    with pytest.raises(dt.InputError, match="system = 5"):
+        dt.point(5, "toy")
+    with pytest.raises(dt.InputError, match="analysis = 5"):
+        dt.point("toy", 5)
 
 
 def test_a_function_has_no_value_at_one_point():

@@ -164,6 +164,15 @@ def test_points_that_no_solver_can_do_end_as_step_limit(tmp_path):
     assert str(run_to_file(scene, tmp_path / "r.nc")) == "points: total=2 computed=2 reused=0 failed=1"
 
 
+def test_a_result_without_a_single_value_has_its_dimensions_and_grows(tmp_path):
+    scene = {"system": "toy", "analysis": "toy", "outputs": ["wave"], "options": {"method": "hopeless"}}
+    run_to_file(scene | {"axes": {"a": {"values": [6.0]}}}, tmp_path / "r.nc")
+    assert dt.run(scene, overrides={"fixed.a": 6.0})["wave"].shape == (3,)
+    large = scene | {"axes": {"a": {"values": [6.0, 1.0, 7.0]}}}
+    assert str(run_to_file(large, tmp_path / "r.nc")) == "points: total=3 computed=2 reused=1 failed=2"
+    same(dt.run(large, out=tmp_path / "r.nc"), dt.run(large))
+
+
 def test_resonances_depend_on_the_axes_among_their_parameters():
     ds = dt.run({"system": "toy", "analysis": "toy", "axes": {"a": {"values": [1, 2]}, "b": {"values": [1.0, 3.0]}}})
     assert ds["resonance_a"].dims == ("b", "resonance") and ds["resonance"].values.tolist() == ["R1", "R2"]

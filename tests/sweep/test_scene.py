@@ -66,8 +66,32 @@ def test_text_of_a_changed_scene_gives_that_scene(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("given", "of"),
+    [
+        ({"outputs": None}, lambda s: s.request.outputs == ("value",)),
+        ({"axes": {"a": {"start": 0, "stop": 1, "num": 3, "scale": None, "values": None}}}, lambda s: len(s.axes) == 1),
+        ({"title": "\x7f, \x01 and \t"}, lambda s: s.title == "\x7f, \x01 and \t"),
+    ],
+)
+def test_text_of_a_mapping_gives_its_scene(tmp_path, given, of):
+    """Other processes, and results that grow, have only the text."""
+    path, scene = tmp_path / "s.toml", load_scene(changed(**given))
+    path.write_text(scene.text)
+    assert of(scene) and of(load_scene(path)) and load_scene(path, {"outputs": None}).request == scene.request
+
+
+@pytest.mark.parametrize(
     ("text", "value"),
-    [("0.5", 0.5), (".3", 0.3), ("5", 5), ("[1, 2]", [1, 2]), ('"x"', "x"), ("diffrax", "diffrax"), ("true", True)],
+    [
+        ("0.5", 0.5),
+        (".3", 0.3),
+        ("5", 5),
+        ("[1, 2]", [1, 2]),
+        ('"x"', "x"),
+        ("diffrax", "diffrax"),
+        ("true", True),
+        ("9" * 5000, math.inf),
+    ],
 )
 def test_values_on_the_command_line(text, value):
     parsed = toml.parse_value(text)
@@ -150,6 +174,19 @@ WRONG = {
         "not used by method plain, but by other;",
     ),
     "option out of range": (changed(options={"rtol": 1.0}), "options.rtol = 1.0", "0.01"),
+    "key that is no word": (changed(axes={5: {"values": [1]}}), "axes: the key 5", "words"),
+    "scene with a key that is no word": ({**GOOD, 5: 1}, "scene: the key 5", "words"),
+    "key that is half a character": ({**GOOD, "\ud800": 1}, r"the key '\ud800'", "words"),
+    "set of outputs": (changed(outputs={"value"}), "outputs = {'value'}", "a list"),
+    "bytes": (changed(title=b"x"), "title = b'x'", "text"),
+    "complex number": (changed(fixed={"b": 1j}), "fixed.b = 1j", "a number"),
+    "NUL in the title": (changed(title="a\0b"), r"title = 'a\x00b'", "text without NUL"),
+    "half a character in the title": (changed(title="\ud800"), r"title = '\ud800'", "halves of characters"),
+    "half a character in a list": (changed(outputs=["\udcce"]), r"outputs = '\udcce'", "halves of characters"),
+    "integer of too many digits": (changed(fixed={"b": 10**5000}), "fixed.b: an integer of 16610 bits", "1.8e308"),
+    "number for a scene": (5, "scene = 5", "path of a scene file"),
+    "no path": ("a\0b", r"scene = 'a\x00b'", "path of a scene file"),
+    "nothing": (None, "scene = None", "path of a scene file"),
     "too many points": (
         changed(axes={n: {"start": 1, "stop": 2, "num": 10**6} for n in ("a", "b")}),
         "1000000000000 points",
@@ -169,7 +206,14 @@ def test_wrong_scene_is_one_clear_line(case):
 
 @pytest.mark.parametrize(
     ("content", "part"),
-    [(b"a = [1", "line 1"), (b"\xff\xfe", "UTF-8"), (None, "No such file"), (b"a=1\na=2", "line 2")],
+    [
+        (b"a = " + b"9" * 5000, "a number of too many digits; allowed are up to 4300"),
+        (b'system = "toy"\nanalysis = "toy"\ntitle = "a\\u0000b"', r"title = 'a\\x00b': allowed is text without NUL"),
+        (b"a = [1", "line 1"),
+        (b"\xff\xfe", "UTF-8"),
+        (None, "No such file"),
+        (b"a=1\na=2", "line 2"),
+    ],
 )
 def test_wrong_file_is_one_clear_line(tmp_path, content, part):
     path = tmp_path / "s.toml"

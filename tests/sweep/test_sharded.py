@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import re
+import shutil
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -15,6 +19,7 @@ from drivetrain_jax.invariants.verify import verify
 from drivetrain_jax.store import shards
 from drivetrain_jax.sweep.executor import Where
 from drivetrain_jax.sweep.export import export
+from drivetrain_jax.sweep.partial import PENDING
 from drivetrain_jax.sweep.run import Incomplete, Interrupted, run_to_file
 from drivetrain_jax.sweep.status import status
 
@@ -104,6 +109,120 @@ def test_damage_of_a_finished_store_is_found(grid_scene, tmp_path, name):
     with pytest.raises(InputError, match="is damaged"):
         export(path, tmp_path / "e.nc")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["r.zarr"]
+
+
+@pytest.mark.parametrize("name", ["scene", "groups", "digest", "held_points", "checksum"])
+@pytest.mark.parametrize("how", ["changed", "renamed", "gone"])
+def test_damage_of_the_attributes_is_found(tmp_path, capsys, name, how):
+    path = tmp_path / "r.zarr"
+    to_store(POINTS, path)
+    content = json.loads((path / "zarr.json").read_text())
+    value = content["attributes"].pop(name)
+    if how != "gone":
+        changed = str(value).replace("1", "3")
+        content["attributes"] |= {name + "x": value} if how == "renamed" else {name: changed + " "}
+    (path / "zarr.json").write_text(json.dumps(content))
+    for command in (["verify", str(path)], ["export", str(path), str(tmp_path / "e.nc")]):
+        assert main(command) == 2
+        err = capsys.readouterr().err
+        assert len(err.splitlines()) == 1 and ("attributes" in err or "not a result" in err), err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["r.zarr"]
+
+
+@pytest.mark.parametrize("change", ["fewer", "twice", "beyond"])
+def test_every_planned_point_is_exported_once(grid_scene, tmp_path, change):
+    """Whatever the checksums say: here the store is sealed anew."""
+    path = tmp_path / "r.zarr"
+    to_store(grid_scene, path)
+    attrs = shards.attributes(path)
+    attrs.pop("checksum")
+    groups = json.loads(attrs["groups"])
+    if change == "fewer":
+        attrs["groups"] = json.dumps(groups[:1])
+    elif change == "twice":
+        attrs["groups"] = json.dumps([*groups, groups[0]])
+    else:
+        attrs["scene"] = attrs["scene"].replace("num = 41", "num = 40")
+    shards.seal(path, attrs)
+    with pytest.raises(InputError, match=r"it holds \d+ of 123 points|holds points of another one, or of none"):
+        export(path, tmp_path / "e.nc")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["r.zarr"]
+
+
+def test_attributes_that_were_damaged_while_the_store_grew_are_made_anew(grid_scene, tmp_path):
+    scene, path, pool = large(grid_scene), tmp_path / "r.zarr", threads(1, "chunk")
+    with pytest.raises(Interrupted):
+        to_store(scene, path, where=Where(threads=1), report=stop_after(2))
+    pool.shutdown()
+    file = tmp_path / "r.zarr.parts" / "store" / "zarr.json"
+    file.write_text(file.read_text().replace("stop = 10.0", "stop = 10.5"))
+    to_store(scene, path)
+    export(path, tmp_path / "e.nc")
+    assert opened(tmp_path / "e.nc").equals(dt.run(scene))
+
+
+def test_export_leaves_unfinished_work_alone(grid_scene, tmp_path):
+    to_store(ONE, tmp_path / "r.zarr")
+    with pytest.raises(Interrupted):
+        run_to_file(grid_scene, tmp_path / "e.nc", where=Where(threads=1), report=stop_after(2))
+    done = status(grid_scene, tmp_path / "e.nc").done
+    with pytest.raises(InputError, match=r"out = .*e.nc': unfinished work is in .*e.nc.parts'; allowed is a new file"):
+        export(tmp_path / "r.zarr", tmp_path / "e.nc")
+    assert status(grid_scene, tmp_path / "e.nc").done == done > 0
+
+
+@pytest.mark.parametrize("kind", ["group", "array", "text", "attributes"])
+def test_what_is_no_store_is_one_line(tmp_path, capsys, kind):
+    import zarr
+
+    path = tmp_path / "r.zarr"
+    if kind == "array":
+        zarr.create_array(path, shape=(3,), dtype="f8")
+    else:
+        zarr.create_group(path, attributes={"title": "of another program"})
+    if kind in ("text", "attributes"):
+        (path / "zarr.json").write_text({"text": "{rubbish", "attributes": '{"attributes": 3}'}[kind])
+    for command in (["verify", str(path)], ["export", str(path), str(tmp_path / "e.nc")]):
+        assert main(command) == 2
+        err = capsys.readouterr().err.splitlines()
+        assert len(err) == 1 and ("not a readable Zarr store" in err[0] or "not a result of" in err[0])
+
+
+@pytest.mark.parametrize("place", ["", "outcome", "done"])
+def test_broken_metadata_of_a_finished_store_is_one_line(grid_scene, tmp_path, place):
+    path = tmp_path / "r.zarr"
+    to_store(grid_scene, path)
+    next(path.glob(f"solver_0/{place}/zarr.json" if place else "solver_0/zarr.json")).write_text("{rubbish")
+    assert "not what was written" in verify(path).problem
+    with pytest.raises(InputError, match="is damaged"):
+        export(path, tmp_path / "e.nc")
+    with pytest.raises(InputError, match="damaged; allowed is to restore it"):
+        to_store(grid_scene, path)
+
+
+def test_points_that_no_solver_can_do_are_counted(tmp_path):
+    scene = {"system": "toy", "analysis": "toy", "options": {"method": "hopeless"}}
+    scene["axes"] = {"a": {"start": 0.0, "stop": 10.0, "num": 11}}
+    first = to_store(scene, tmp_path / "r.zarr")
+    found, again = status(scene, tmp_path / "r.zarr"), to_store(scene, tmp_path / "r.zarr")
+    assert (first.failed, again.failed, again.reused) == (5, 5, 11)
+    assert (found.done, found.failed, found.failed_by_outcome) == (11, 5, {"step_limit": 5})
+    assert export(tmp_path / "r.zarr", tmp_path / "e.nc") == 11 and opened(tmp_path / "e.nc").equals(dt.run(scene))
+
+
+def test_unfinished_work_is_opened_and_counted(grid_scene, tmp_path):
+    scene, path, pool = large(grid_scene), tmp_path / "r.zarr", threads(1, "chunk")
+    with pytest.raises(Interrupted):
+        to_store(scene, path, where=Where(threads=1), report=stop_after(3))
+    pool.shutdown()
+    partial, whole, done = dt.open_result(path), dt.run(scene), status(scene, path).done
+    there = (partial["outcome"] != PENDING).values
+    assert 0 < partial.attrs["points_done"] == there.sum() == done < 1640
+    assert partial["wave"].values[there].tobytes() == whole["wave"].values[there].tobytes()
+    report = verify(path)
+    assert not report.complete and re.fullmatch(r"unfinished: ([1-9]\d*) of \1 shards are intact", str(report))
+    shutil.rmtree(next((tmp_path / "r.zarr.parts" / "store").glob("*/value/c")))
+    assert "the run that resumes computes the chunks of the others again" in str(verify(path))
 
 
 @pytest.mark.parametrize("name", ["value", "done"])
