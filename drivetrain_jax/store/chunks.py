@@ -13,6 +13,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.store.files import write_atomic
+from drivetrain_jax.store.files import behind_link, write_atomic
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -69,6 +70,8 @@ class PartsFolder:
     """The parts of the result ``out``. Writing needs the folder to be open (``open``, ``close``), reading does not."""
 
     def __init__(self, out: Path) -> None:
+        # One folder, and so one lock, for all names of a file.
+        out = behind_link(out)
         self.path = out.parent / f"{out.name}.parts"
         # Where the result grows until it is complete.
         self.result = self.path / "result.tmp"
@@ -137,11 +140,17 @@ class PartsFolder:
         """Whether there is anything to resume or to refuse; a run killed at its very start leaves nothing."""
         return self._plan.exists() or any(self.path.glob("*.h5"))
 
-    def discard(self) -> None:
-        """Delete what a finished run was killed over before it could; another run's work is left alone."""
-        if self.path.exists():
-            self.open()
-            self.close(remove=True)
+    def discard(self, digest: str) -> None:
+        """Delete what the run that made the result ``digest`` was killed over before it could.
+
+        The work of another scene is left alone, and so is what is to replace this very result.
+        """
+        plan = self.plan()
+        if self.path.exists() and plan.get("digest") in (None, digest) and plan.get("replaces") != digest:
+            # What cannot be deleted does not keep anybody from reading the result.
+            with suppress(InputError, OSError):
+                self.open()
+                self.close(remove=True)
 
     def write(self, part: Part) -> None:
         """Add finished chunks."""

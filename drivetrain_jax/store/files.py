@@ -6,6 +6,11 @@ import os
 from pathlib import Path
 
 
+def behind_link(path: Path) -> Path:
+    """``path``, or the file that it links to: renaming over the link would replace that instead."""
+    return Path(os.path.realpath(path)) if path.is_symlink() else path
+
+
 def write_atomic(path: Path, data: bytes | memoryview, temporary: Path) -> None:
     """Put ``data`` at ``path``: written to ``temporary`` (same file system), flushed to the disk, then renamed.
 

@@ -45,7 +45,8 @@ class Axis:
 
 def entry_of(name: str) -> tuple[str, int | None]:
     """Parameter and position behind the name of an axis: ``length[1]`` is ``("length", 1)``."""
-    match = re.fullmatch(r"(.+)\[(\d+)\]", name)
+    # One spelling for each entry: two axes of different names never vary the same one.
+    match = re.fullmatch(r"(.+)\[(0|[1-9][0-9]{0,8})\]", name)
     return (match.group(1), int(match.group(2))) if match else (name, None)
 
 
@@ -99,9 +100,18 @@ def spread(spec: AxisTable, field: str) -> np.ndarray:
     elif spec.num is None:
         values = np.array([spec.start, spec.stop], float)
     else:
-        values = (np.geomspace if spec.scale == "log" else np.linspace)(float(spec.start), float(spec.stop), spec.num)
+        values = _between(spec, field)
     ordered = np.sort(values)
     double = np.flatnonzero(ordered[1:] == ordered[:-1])
     if double.size:
         raise InputError(f"{field}: the value {ordered[double[0]]:.10g} occurs twice; allowed are distinct values")
+    return values
+
+
+def _between(spec: AxisTable, field: str) -> np.ndarray:
+    with np.errstate(over="ignore", invalid="ignore"):
+        values = (np.geomspace if spec.scale == "log" else np.linspace)(float(spec.start), float(spec.stop), spec.num)
+    if not np.isfinite(values).all():
+        ends = f"start = {spec.start!r}, stop = {spec.stop!r}"
+        raise InputError(f"{field}: {ends}: not all values between are finite; allowed are ends closer together")
     return values

@@ -17,6 +17,7 @@ from drivetrain_jax.sweep.plan import Chunk
 from drivetrain_jax.sweep.worker import Job
 
 _PATIENCE = "10s"
+_LOCAL = re.compile(r"local:([1-9]\d*)")
 # What these libraries say of their own accord when a scheduler or a worker dies; here that is one line, or no news.
 _TALKATIVE = ("distributed", "tornado", "asyncio")
 
@@ -48,6 +49,14 @@ def run_cluster(chunks: Iterable[Chunk], job: Job, address: str) -> Iterator[tup
             future.release()
 
 
+def check_scheduler(address: str) -> None:
+    """Raises :class:`InputError` if none answers there. One of this process's own is only started when it has work."""
+    distributed = _distributed()
+    if not _LOCAL.fullmatch(address):
+        with ExitStack() as stack:
+            _connect(distributed, address, stack)
+
+
 def _result(distributed: Any, future: Any) -> Results | None:
     try:
         return future.result()
@@ -58,7 +67,7 @@ def _result(distributed: Any, future: Any) -> Results | None:
 
 
 def _connect(distributed: Any, address: str, stack: ExitStack) -> Any:
-    local = re.fullmatch(r"local:([1-9]\d*)", address)
+    local = _LOCAL.fullmatch(address)
     if local:
         cluster = distributed.LocalCluster(
             n_workers=int(local.group(1)), threads_per_worker=1, processes=True, dashboard_address=None

@@ -14,6 +14,7 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._machine import usable_cores
 from drivetrain_jax._threads import threads
+from drivetrain_jax._wording import shown
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.plan import Chunk
 
@@ -41,13 +42,20 @@ class Where:
     def __post_init__(self) -> None:
         for name in ("threads", "workers"):
             value = getattr(self, name)
-            if value is not None and value < 1:
-                raise InputError(f"{name} = {value}: allowed is {name} >= 1")
-        if self.dask is not None and not re.match(r"local:[1-9]\d*$|\w+://", self.dask):
+            if value is not None and not (_is_integer(value) and value >= 1):
+                raise InputError(f"{name} = {shown(value)}: allowed is {name} >= 1, an integer")
+        if self.dask is not None and not re.match(r"local:[1-9]\d*$|\w+://", str(self.dask)):
             raise InputError(f"dask = {self.dask!r}: allowed is tcp://HOST:PORT or local:N with N >= 1")
         given = [name for name in ("threads", "workers", "dask") if getattr(self, name) is not None]
         if len(given) > 1:
             raise InputError(f"{given[0]}: given together with {given[1]}; allowed is one of them")
+
+    def check(self) -> None:
+        """Raises :class:`InputError` if no scheduler answers at the address: before earlier work is given up for a run."""
+        if self.dask is not None:
+            from drivetrain_jax.sweep.cluster import check_scheduler
+
+            check_scheduler(self.dask)
 
     def compute(self, engine: Engine, numbers: Iterable[int]) -> Iterator[tuple[Chunk, Results | None]]:
         """``(chunk, results)`` of the chunks with these numbers in the order of completion, the costliest begun first.
@@ -73,6 +81,10 @@ class Where:
         from drivetrain_jax.sweep.cluster import run_cluster
 
         return run_cluster(chunks, job(), self.dask)
+
+
+def _is_integer(value: object) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
 def _job(engine: Engine) -> Job:

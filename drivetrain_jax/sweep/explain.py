@@ -16,6 +16,9 @@ from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.identity import scene_content
 from drivetrain_jax.sweep.scene import Scene, load_scene
 
+# The file that is among the sources of points that an atlas gives, and of no others.
+_THROUGH_ATLAS = "sweep/through_atlas.py"
+
 
 def differences(stored: Mapping[str, Any], engine: Engine, *, points: bool = True) -> list[str]:
     """What keeps stored work from being that of ``engine``: its ``scene`` (TOML), ``drivetrain_jax_version``, ``numerics``
@@ -79,7 +82,12 @@ def _of_numerics(stored: str | None, present: Mapping[str, Any]) -> list[str]:
     for key, value in present.items():
         before = old.get(key)
         if isinstance(value, Mapping) and isinstance(before, Mapping):
-            changed = [name for name in sorted({*value, *before}) if value.get(name) != before.get(name)]
+            names = {*value, *before}
+            if key == "sources" and (_THROUGH_ATLAS in value) != (_THROUGH_ATLAS in before):
+                found.append(f"points are {_route(value)}, were {_route(before)}")
+                # The files that only one of the two ways runs have not changed.
+                names = {*value} & {*before}
+            changed = [name for name in sorted(names) if value.get(name) != before.get(name)]
             if key == "versions":
                 found += [f"{name} is {value.get(name)}, was {before.get(name)}" for name in changed]
             elif changed:
@@ -87,6 +95,10 @@ def _of_numerics(stored: str | None, present: Mapping[str, Any]) -> list[str]:
         elif value != before:
             found.append(f"{key} is {_text(value)}, was {_text(before)}")
     return found or ["the code, a version or the machine is another one"]
+
+
+def _route(sources: Mapping[str, str]) -> str:
+    return "evaluated through an atlas" if _THROUGH_ATLAS in sources else "solved directly"
 
 
 def _text(value: Any) -> str:

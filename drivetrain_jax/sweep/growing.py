@@ -8,8 +8,8 @@ takes follows from the points that share its chunk.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,10 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.store import checksums
 from drivetrain_jax.store.consolidate import map_variable, read_attribute
 from drivetrain_jax.store.provenance import digest
+from drivetrain_jax.store.shards import is_store
 from drivetrain_jax.sweep.assemble import sweep_first
 from drivetrain_jax.sweep.axes import entry_of
 from drivetrain_jax.sweep.engine import Engine
@@ -36,20 +38,28 @@ class NotReusable(InputError):
     """Why nothing of a result can stand for points of a scene."""
 
 
+class Damaged(NotReusable):
+    """A result is not what was written; ``what`` of it."""
+
+    def __init__(self, path: Path, what: str) -> None:
+        allowed = "allowed is to restore the file or to compute it again"
+        super().__init__(f"reuse = {str(path)!r}: not what was written ({what}); {allowed}")
+        self.what = what
+
+
 @dataclass(frozen=True)
 class Source:
-    """Results in the file ``path`` of another scene: ``theirs[i]`` is the same point as ``ours[i]`` of ours."""
+    """Results in the file ``path`` of another scene: ``theirs[i]`` is the same point as ``ours[i]`` of ours.
+
+    ``is_covered`` says whether all of its points and all of its results are wanted, so that replacing it loses nothing.
+    """
 
     path: Path
     digest: str
     grid: Grid
     theirs: np.ndarray
     ours: np.ndarray
-
-    @property
-    def is_covered(self) -> bool:
-        """Whether every point of it is a point of ours, so that replacing it loses nothing."""
-        return self.theirs.size == self.grid.size
+    is_covered: bool
 
     def blocks(self, names: Sequence[str]) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
         """Our points and their results, some at a time; nothing is loaded as a whole."""
@@ -74,6 +84,11 @@ class Taken:
         return np.sort(np.concatenate([np.empty(0, np.int64), *(source.ours for source in self.sources)]))
 
     @property
+    def count(self) -> int:
+        """How many results they have, those along a path one by one."""
+        return sum(source.ours.size * source.grid.path_length for source in self.sources)
+
+    @property
     def digest(self) -> str | None:
         """Identifies them, None if there are none: the chunks of the others depend on it."""
         if not self.sources:
@@ -85,7 +100,7 @@ class Taken:
         """What a result says of them."""
         if not self.sources:
             return {}
-        return {"reused_points": self.points.size, "reused_from": " ".join(s.digest for s in self.sources)}
+        return {"reused_points": self.count, "reused_from": " ".join(s.digest for s in self.sources)}
 
     def blocks(self, names: Sequence[str]) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
         """Their numbers and the results ``names``, some points at a time."""
@@ -105,18 +120,14 @@ def rest_of(engine: Engine, taken: Taken) -> Engine:
     return engine.only(np.flatnonzero(left))
 
 
-def take(engine: Engine, paths: Sequence[Path]) -> Taken:
-    """The points of ``engine`` that the results at ``paths`` hold, each from the first that has it.
-
-    Raises :class:`NotReusable` for a file that is of other numerics, or that has none of the points.
-    """
+def take(engine: Engine, found: Iterable[Source]) -> Taken:
+    """The points of ``engine`` that these results hold, each from the first that has it."""
     free = np.ones(engine.grid.size, bool)
     sources = []
-    for path in paths:
-        found = find(engine, path)
-        keep = free[found.ours]
-        free[found.ours] = False
-        sources.append(Source(found.path, found.digest, found.grid, found.theirs[keep], found.ours[keep]))
+    for source in found:
+        keep = free[source.ours]
+        free[source.ours] = False
+        sources.append(replace(source, theirs=source.theirs[keep], ours=source.ours[keep]))
     return Taken(tuple(source for source in sources if source.ours.size))
 
 
@@ -124,13 +135,14 @@ def find(engine: Engine, path: Path) -> Source:
     """What the result at ``path`` holds of the points of ``engine``; lost points do not count. Raises
     :class:`NotReusable`, or :class:`InputError` if there is no readable result."""
     if not path.is_file():
-        raise NotReusable(f"reuse = {str(path)!r}: does not exist; allowed is a result written by `drivetrain run`")
+        raise NotReusable(f"reuse = {str(path)!r}: {_no_file(path)}")
     names = ("scene", "digest", "drivetrain_jax_version", "numerics", "numerics_detail")
     attrs = {name: read_attribute(path, name) for name in names}
     if attrs["digest"] is None:
         raise NotReusable(f"reuse = {str(path)!r}: not a result of drivetrain_jax; allowed is such a result")
     if reasons := differences(attrs, engine, points=False):
         raise NotReusable(f"reuse = {str(path)!r}: {reasons[0]}; allowed is a result that differs in its points only")
+    _check_intact(path)
     scene = load_scene(tomllib.loads(str(attrs["scene"])))
     grid = Grid.of(scene)
     theirs, ours = _same_points(scene, grid, engine.scene, engine.grid)
@@ -138,7 +150,29 @@ def find(engine: Engine, path: Path) -> Source:
     kept = ~(outcome == Outcome.LOST).any(axis=tuple(range(1, outcome.ndim)))
     if not kept.any():
         raise NotReusable(f"reuse = {str(path)!r}: holds none of the points; allowed is a result that shares some")
-    return Source(path, str(attrs["digest"]), grid, theirs[kept], ours[kept])
+    theirs, ours = theirs[kept], ours[kept]
+    wanted = set(scene.request.outputs) <= set(engine.scene.request.outputs)
+    # Several of our points may be one of theirs, and the other way round.
+    is_covered = wanted and np.unique(theirs).size == grid.size
+    ours, first = np.unique(ours, return_index=True)
+    return Source(path, str(attrs["digest"]), grid, theirs[first], ours, is_covered)
+
+
+def _no_file(path: Path) -> str:
+    if is_store(path):
+        return "is a Zarr store; allowed is the file that `drivetrain export` makes of it"
+    what = "is a folder" if path.is_dir() else "does not exist"
+    return f"{what}; allowed is a result written by `drivetrain run`"
+
+
+def _check_intact(path: Path) -> None:
+    """Whatever is taken over gets checksums of its own: nobody would find the damage afterwards."""
+    try:
+        wrong = checksums.damaged(path)
+    except InputError:
+        raise Damaged(path, "its structure") from None
+    if wrong or wrong is None:
+        raise Damaged(path, checksums.named(wrong) if wrong else "it has no checksums")
 
 
 def _same_points(scene: Scene, grid: Grid, our_scene: Scene, our_grid: Grid) -> tuple[np.ndarray, np.ndarray]:
@@ -246,13 +280,18 @@ def _positions(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 
 def _same_rows(grid: Grid, other: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Two lists of points: equal rows, if both vary the same parameters."""
+    """Two lists of points: equal rows, if both vary the same parameters. Every row that the other list has is in a pair."""
     names = [axis.name for axis in grid.axes]
     if sorted(names) != sorted(axis.name for axis in other.axes):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    columns = {axis.name: axis.values for axis in other.axes}
-    known = {row: i for i, row in enumerate(zip(*(axis.values.tolist() for axis in grid.axes), strict=True))}
-    rows = zip(*(columns[name].tolist() for name in names), strict=True)
-    pairs = [(known[row], i) for i, row in enumerate(rows) if row in known]
+    theirs, ours = (_rows(one, names) for one in (grid, other))
+    their_place, our_place = ({row: i for i, row in enumerate(rows)} for rows in (theirs, ours))
+    pairs = [(their_place[row], i) for i, row in enumerate(ours) if row in their_place]
+    pairs += [(i, our_place[row]) for i, row in enumerate(theirs) if row in our_place]
     found = np.array(pairs, np.int64).reshape(-1, 2)
     return found[:, 0], found[:, 1]
+
+
+def _rows(grid: Grid, names: Sequence[str]) -> list[tuple[float, ...]]:
+    columns = {axis.name: axis.values.tolist() for axis in grid.axes}
+    return list(zip(*(columns[name] for name in names), strict=True))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._machine import physical_memory
+from drivetrain_jax._wording import shown
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.consolidate import ResultFile, open_result, write_result
@@ -52,7 +53,7 @@ def run(
     threads: int | None = None,
     workers: int | None = None,
     dask: str | None = None,
-    reuse: Sequence[str | Path] = (),
+    reuse: str | Path | Sequence[str | Path] = (),
     report: Report | None = None,
 ) -> xr.Dataset:
     """Compute a scene and return its labelled result.
@@ -62,13 +63,14 @@ def run(
 
     :param scene: path of a scene file, or a mapping with the same keys.
     :param overrides: entries to replace, by dotted key: ``{"fixed.zeta": 0.002}``.
-    :param fresh: replace a result, or drop unfinished work, of another scene or version at ``out``.
+    :param fresh: compute everything anew: replace a result, or drop unfinished work, at ``out``. One that was interrupted is
+        resumed by the same call.
     :param threads: chunks computed at a time in threads of this process (default: the cores it may use).
     :param workers: this many spawned processes instead: one that crashes costs the chunk it was computing. A script that
         asks for them has to be guarded by ``if __name__ == "__main__"``.
     :param dask: the Dask cluster at ``tcp://host:port``, or ``local:N`` processes of Dask's own, instead.
-    :param reuse: results of which the points that this scene shares are taken over; only with ``out``. The result that
-        ``out`` holds is one of them without being named, if all of its points are points of this scene.
+    :param reuse: a result, or several, of which the points that this scene shares are taken over; only with ``out``. The
+        result that ``out`` holds is one of them without being named, if all of its points and results are this scene's.
     :param report: called with the :class:`Progress` after every chunk.
     :raises InputError: one line naming the field, what was given, what is allowed. Nothing is computed or written.
     :raises Incomplete: something failed on the way; the same call resumes.
@@ -89,7 +91,7 @@ def run_to_file(
     overrides: Mapping[str, Any] | None = None,
     fresh: bool = False,
     where: Where = Where(),  # noqa: B008
-    reuse: Sequence[str | Path] = (),
+    reuse: str | Path | Sequence[str | Path] = (),
     store: str = "hdf5",
     report: Report | None = None,
 ) -> Progress:
@@ -101,13 +103,22 @@ def run_to_file(
     if store == "zarr":
         sharded.check(engine)
     target = Target(out, engine, store)
-    if target.state == "complete" and not fresh:
-        target.parts.discard()
+    if not fresh and target.state == "complete":
+        target.parts.discard(target.digest)
         total = target.points(engine.total)
         return Progress(total, reused=total, failed=target.failed)
-    if target.state == "stale" and not fresh:
-        raise InputError(f"out = {str(out)!r}: holds {target.obstacle}; {target.remedy}")
-    return _into(target, target.take(reuse, fresh), fresh, where, report)
+    if not fresh and target.state == "stale":
+        raise target.refusal
+    target.check_writable()
+    where.check()
+    return _into(target, target.take(_paths(reuse), fresh), fresh, where, report)
+
+
+def _paths(reuse: str | Path | Sequence[str | Path]) -> Sequence[str | Path]:
+    paths = [reuse] if isinstance(reuse, (str, Path)) else reuse
+    if not isinstance(paths, Sequence) or not all(isinstance(path, (str, Path)) for path in paths):
+        raise InputError(f"reuse = {shown(reuse)}: allowed is the path of a result, or a list of them")
+    return paths
 
 
 def _into(target: Target, taken: Taken, fresh: bool, where: Where, report: Report | None) -> Progress:
@@ -116,9 +127,10 @@ def _into(target: Target, taken: Taken, fresh: bool, where: Where, report: Repor
     begins = False
     try:
         parts.open()
-        begins = fresh or not parts.holds_work()
+        target.check_unchanged()
+        begins = not target.resumes(taken, fresh)
         if begins:
-            parts.start(target.plan(taken))
+            parts.start(target.plan(taken, fresh))
         if target.store == "zarr":
             sharded.compute(engine, target.out, parts, progress, where, report)
         else:
@@ -128,7 +140,7 @@ def _into(target: Target, taken: Taken, fresh: bool, where: Where, report: Repor
         raise Interrupted(progress) from None
     except InputError:
         # For example no scheduler at the address: what is refused at its start leaves nothing behind.
-        parts.close(remove=begins and progress.computed == 0)
+        parts.close(remove=not parts.holds_work() or (begins and progress.computed == 0))
         raise
     except (ChunkError, OSError, MemoryError) as error:
         raise Incomplete(f"{error or type(error).__name__}; the same command resumes", progress) from error

@@ -18,11 +18,13 @@ from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.store import shards
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.consolidate import read_attribute, read_variable
+from drivetrain_jax.store.files import behind_link
 from drivetrain_jax.sweep.assemble import failures
 from drivetrain_jax.sweep.atlas_choice import uses_atlas
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.explain import differences
-from drivetrain_jax.sweep.growing import NOTHING, NotReusable, Source, Taken, find, take
+from drivetrain_jax.sweep.growing import NOTHING, Damaged, NotReusable, Source, Taken, find, take
+from drivetrain_jax.sweep.layout import rearranged
 
 
 class Target:
@@ -33,7 +35,7 @@ class Target:
     """
 
     def __init__(self, out: Path, engine: Engine, store: str | None = None) -> None:
-        self.out = out
+        self.out = out = behind_link(out)
         self.parts = PartsFolder(out)
         _check_name(out, self.parts)
         _restore_former(out, self.parts)
@@ -45,6 +47,7 @@ class Target:
             )
         self.engine, self.digest = engine, engine.digest
         self.present = _digest_of(out)
+        self._plan_seen = self.parts.plan()
 
     def _kind(self) -> str:
         """``hdf5`` or ``zarr``, after what is there."""
@@ -54,7 +57,7 @@ class Target:
     def state(self) -> str:
         """See the class."""
         if self.present == self.digest:
-            return "complete"
+            return "stale" if self._rearranged else "complete"
         if self.parts.holds_work():
             # Parts that are to replace another result belong to that one alone.
             return "partial" if _same(self.parts.plan(), self.plan(), ("digest", "replaces", "store")) else "stale"
@@ -62,31 +65,64 @@ class Target:
             return "absent"
         return "partial" if self._grows else "stale"
 
-    def plan(self, taken: Taken = NOTHING) -> dict[str, Any]:
+    def plan(self, taken: Taken = NOTHING, fresh: bool = False) -> dict[str, Any]:
         """What parts written now belong to, and what a reader needs to know of them."""
         return {
             "digest": self.digest,
             "replaces": self.present,
             "store": self.store,
+            "fresh": fresh,
             "reuses": taken.digest,
-            "reused": int(taken.points.size),
+            "reused": taken.count,
             "reused_files": [os.path.relpath(source.path, self.out.parent) for source in taken.sources],
             **provenance_of(self.engine),
         }
 
+    def resumes(self, taken: Taken, fresh: bool) -> bool:
+        """Whether a run goes on with the parts that are there. A ``fresh`` one does so with those of its own beginning."""
+        if not fresh:
+            return self.parts.holds_work()
+        names = ("digest", "replaces", "store", "reuses", "fresh")
+        return _same(self.parts.plan(), self.plan(taken, fresh), names)
+
+    def check_unchanged(self) -> None:
+        """Raises :class:`InputError` if another run has come to its end, or begun, since this was made."""
+        if (_digest_of(self.out), self.parts.plan()) != (self.present, self._plan_seen):
+            raise InputError(f"out = {str(self.out)!r}: another run has changed it meanwhile; allowed is to try again")
+
+    def check_writable(self) -> None:
+        """Raises :class:`InputError` if nothing can be written beside what is there."""
+        folder = self.out.parent
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise InputError(
+                f"out = {str(self.out)!r}: the folder {str(folder)!r} is not writable; "
+                "allowed is a file in a writable folder"
+            )
+
     @cached_property
-    def _shared(self) -> Source | None:
-        """What the result that is there holds of the points of this scene."""
+    def _rearranged(self) -> list[str]:
+        """What of the result that is there is not laid out as this scene says."""
+        if self.engine.scene.analysis.continuous or self.store == "zarr":
+            return []
+        return rearranged(self.out, self.engine.scene, self.engine.grid)
+
+    @cached_property
+    def _found(self) -> Source | NotReusable | None:
+        """What the result that is there holds of the points of this scene, or why it is of no use."""
         if self.engine.scene.analysis.continuous or self.present is None or self.store == "zarr":
             return None
         try:
             return find(self.engine, self.out)
-        except NotReusable:
-            return None
+        except NotReusable as error:
+            return error
+
+    @property
+    def _shared(self) -> Source | None:
+        return self._found if isinstance(self._found, Source) else None
 
     @property
     def _grows(self) -> bool:
-        """Whether the result that is there is one of fewer points of this scene, so that replacing it loses none."""
+        """Whether the result that is there is a part of this scene's, so that replacing it loses nothing."""
         return self._shared is not None and self._shared.is_covered
 
     @property
@@ -94,7 +130,7 @@ class Target:
         """What there is to do about the :attr:`obstacle`."""
         if self._shared is None or self.parts.holds_work():
             return "--fresh replaces it"
-        kept = f"--reuse {self.out.name} with another --out takes {self._shared.ours.size} points from it"
+        kept = f"--reuse {self.out.name} with another --out takes {Taken((self._shared,)).count} points from it"
         return f"--fresh replaces it, {kept}"
 
     def take(self, reuse: Sequence[str | Path], fresh: bool) -> Taken:
@@ -112,7 +148,13 @@ class Target:
                 raise InputError("reuse: an atlas is made anew; allowed for a scene that solves every point directly")
             return NOTHING
         paths = [Path(path) for path in reuse]
-        taken = take(self.engine, [*paths, self.out] if self._grows and not fresh else paths)
+        found = [find(self.engine, path) for path in paths]
+        # Work that was begun afresh is resumed as it was begun.
+        if not (fresh or self.parts.plan().get("fresh")):
+            if isinstance(self._found, Damaged):
+                raise self.refusal
+            found += [self._shared] if self._grows else []
+        taken = take(self.engine, found)
         if not fresh and self.parts.holds_work() and self.parts.plan().get("reuses") != taken.digest:
             files = ", ".join(self.parts.plan().get("reused_files") or ["no other result"])
             raise InputError(
@@ -126,11 +168,20 @@ class Target:
         if not self.parts.holds_work():
             return self.take((), fresh=False)
         names = self.parts.plan().get("reused_files") or ()
-        return take(self.engine, [self.out.parent / name for name in names])
+        return take(self.engine, [find(self.engine, self.out.parent / name) for name in names])
+
+    @property
+    def refusal(self) -> InputError:
+        """What a run says that is not to replace what is there."""
+        return InputError(f"out = {str(self.out)!r}: holds {self.obstacle}; {self.remedy}")
 
     @property
     def obstacle(self) -> str:
         """Why a run is refused, or would be: what is there, and what makes it another one's."""
+        if self.present == self.digest:
+            return f"a result that was rearranged after it was written ({', '.join(self._rearranged)})"
+        if isinstance(self._found, Damaged):
+            return f"a result that is not what was written ({self._found.what})"
         if self.parts.holds_work():
             stored, what = self.parts.plan(), "unfinished work"
             if self.present != stored.get("replaces"):
@@ -213,10 +264,6 @@ def _check_place(out: Path, store: str) -> None:
         raise InputError(f"out = {str(out)!r}: is a folder; allowed is the path of a file")
     if out.is_file() and store == "zarr":
         raise InputError(f"out = {str(out)!r}: is a file; allowed for store = 'zarr' is a new path, or such a store")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise InputError(
-            f"out = {str(out)!r}: the folder {str(folder)!r} is not writable; allowed is a file in a writable folder"
-        )
 
 
 def _attribute(out: Path, name: str) -> Any:

@@ -118,6 +118,17 @@ def test_auto_takes_an_atlas_where_points_are_many(monkeypatch, direct):
     assert_agree(dt.run(floquet("auto")), direct)
 
 
+def test_the_way_that_auto_takes_is_named_where_it_keeps_a_result_from_growing(monkeypatch, tmp_path):
+    path = tmp_path / "r.nc"
+    run_to_file(floquet("auto"), path)
+    for name, value in (("_WORTHWHILE", 600), ("_FEWEST", (1, 1))):
+        monkeypatch.setattr(atlas_choice, name, value)
+    large = floquet("auto", floquet("auto")["axes"] | {"beta": {"start": BETA[0], "stop": BETA[1], "num": 25}})
+    with pytest.raises(InputError, match="points are evaluated through an atlas, were solved directly") as refused:
+        run_to_file(large, path)
+    assert "the code has changed" not in str(refused.value)
+
+
 @pytest.mark.parametrize(("slowest", "fastest", "tried"), [(0.1, 2.0, True), (0.005, 2.0, False), (1e-9, 1e-8, False)])
 def test_auto_counts_the_effort_of_solves_not_their_number(slowest, fastest, tried):
     """Down to Omega = .005 a node costs some fifty cells: that many cells are cheaper one by one. Below 1e-8 no solver can

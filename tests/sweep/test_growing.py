@@ -6,10 +6,12 @@ import h5py
 import numpy as np
 import pytest
 import xarray as xr
+from interrupts import stop_after
 
 import drivetrain_jax as dt
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
+from drivetrain_jax.store import checksums
 from drivetrain_jax.sweep.executor import Where
 from drivetrain_jax.sweep.run import Interrupted, run_to_file
 from drivetrain_jax.sweep.status import status
@@ -53,9 +55,8 @@ SMALL = scene({"b": [1.0, 3.0], "a": {"start": 0.0, "stop": 10.0, "num": 11}})
         (scene({"a": {"start": 0.0, "stop": 10.0, "num": 11}, "b": [3.0, 1.0]}), 0),
         (scene(SMALL["axes"] | {"n": [2, 3]}), 22),
         (scene(SMALL["axes"] | {"unused": [5.0]}), 0),
-        (SMALL | {"outputs": ["value"]}, 0),
     ],
-    ids=["longer", "finer", "finer by three", "other order", "one more axis", "an axis that is not used", "less"],
+    ids=["longer", "finer", "finer by three", "other order", "one more axis", "an axis that is not used"],
 )
 def test_only_new_points_are_computed(tmp_path, large, new):
     path = tmp_path / "r.nc"
@@ -64,8 +65,7 @@ def test_only_new_points_are_computed(tmp_path, large, new):
     assert (status(large, path).state, status(large, path).done) == ("partial", 22)
     progress = run_to_file(large, path)
     assert counts(progress) == (total, new, 22) and progress.failed == int((opened(path).outcome >= 2).sum())
-    if large["outputs"] == NAMES:
-        assert agree(path, large).attrs["reused_points"] == 22
+    assert agree(path, large).attrs["reused_points"] == 22
     assert status(large, path).state == "complete"
     assert counts(run_to_file(large, path)) == (total, 0, total)
 
@@ -76,6 +76,7 @@ def test_values_are_taken_not_computed(tmp_path):
     run_to_file(SMALL, path)
     with h5py.File(path, "r+") as file:
         file["value"][1, 3] = -7.0
+        checksums.seal(file)
     run_to_file(scene({"b": [1.0, 3.0, 2.0], "a": {"start": 0.0, "stop": 10.0, "num": 21}}), path)
     assert opened(path)["value"].values[1, 6] == -7.0
 
@@ -140,10 +141,12 @@ def test_lines_are_taken_whole(tmp_path, order):
 
     run_to_file(line(a=[1.0, 2.0], b=b), path)
     large = line(a=[2.0, 3.0, 1.0], b=b)
-    assert counts(run_to_file(large, path)) == (9, 3, 6)
+    assert counts(run_to_file(large, path)) == (9, 3, 6) and opened(path).attrs["reused_points"] == 6
     xr.testing.assert_equal(opened(path), dt.run(large))
     with pytest.raises(InputError, match="another scene"):
         run_to_file(line(a=[1.0, 2.0, 3.0], b=[*b, 16.0]), path)
+    with pytest.raises(InputError, match="takes 3 points from it"):
+        run_to_file(line(a=[1.0], b=b), path)
 
 
 def test_a_line_of_one_fixed_value(tmp_path):
@@ -201,6 +204,7 @@ def test_lost_points_are_computed_again(tmp_path):
     run_to_file(SMALL, path)
     with h5py.File(path, "r+") as file:
         file["outcome"][0, :3] = Outcome.LOST
+        checksums.seal(file)
     with pytest.raises(InputError, match="another scene"):
         run_to_file(LARGE, path)
     assert run_to_file(LARGE, tmp_path / "new.nc", reuse=[path]).reused == 19
@@ -237,8 +241,165 @@ def test_other_numerics_are_refused(tmp_path, monkeypatch):
 
 
 def test_the_former_result_has_to_be_one(tmp_path):
-    for name in ("nothing.nc", "."):
-        with pytest.raises(InputError, match="does not exist"):
+    (tmp_path / "store").mkdir()
+    (tmp_path / "store" / "zarr.json").touch()
+    for name, what in (
+        ("nothing.nc", "does not exist"),
+        (".", "is a folder"),
+        ("store", "is a Zarr store; allowed is"),
+    ):
+        with pytest.raises(InputError, match=what):
             run_to_file(SMALL, tmp_path / "r.nc", reuse=[tmp_path / name])
+    assert not (tmp_path / "r.nc").exists()
     with pytest.raises(InputError, match="reuse: given without out"):
         dt.run(SMALL, reuse=["r.nc"])
+    assert dt.run(SMALL, tmp_path / "small.nc").sizes["a"] == 11
+    for name in ("small.nc", tmp_path / "small.nc"):
+        larger = dt.run(
+            LARGE, tmp_path / "large.nc", reuse=str(tmp_path / name) if name == "small.nc" else name, fresh=True
+        )
+        assert larger.attrs["reused_points"] == 22
+    for wrong in (5, [5], [None]):
+        with pytest.raises(InputError, match=r"reuse = .*: allowed is the path of a result, or a list of them"):
+            dt.run(LARGE, tmp_path / "r.nc", reuse=wrong)
+
+
+def turned(path, **changes):
+    """A copy as xarray writes it, with other points or another order."""
+    opened(path).isel(**changes).to_netcdf(path.with_name("turned.nc"), engine="h5netcdf")
+    return path.with_name("turned.nc")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"a": slice(None, None, -1)},
+        {"a": slice(0, 5)},
+        {"part": slice(None, None, -1)},
+        {"b": 0},
+    ],
+    ids=["mirrored", "cut", "mirrored results", "one value"],
+)
+def test_a_rearranged_copy_is_neither_taken_nor_called_complete(tmp_path, change):
+    run_to_file(SMALL, tmp_path / "r.nc")
+    copy = turned(tmp_path / "r.nc", **change)
+    before = copy.read_bytes()
+    with pytest.raises(InputError, match=r"reuse = '.*turned.nc': not what was written \("):
+        run_to_file(LARGE, tmp_path / "new.nc", reuse=[copy])
+    with pytest.raises(InputError, match=r"holds a result that is not what was written \(.*--fresh replaces it"):
+        run_to_file(LARGE, copy)
+    with pytest.raises(InputError, match=r"holds a result that was rearranged .*--fresh replaces it"):
+        run_to_file(SMALL, copy)
+    assert status(SMALL, copy).state == "stale" and "rearranged" in status(SMALL, copy).reason
+    assert copy.read_bytes() == before and not (tmp_path / "new.nc").exists()
+    assert counts(run_to_file(SMALL, copy, fresh=True)) == (22, 22, 0)
+
+
+def test_a_transposed_copy_is_not_complete(tmp_path):
+    run_to_file(SMALL, tmp_path / "r.nc")
+    opened(tmp_path / "r.nc").transpose("a", "b", ...).to_netcdf(tmp_path / "turned.nc", engine="h5netcdf")
+    with pytest.raises(InputError, match=r"rearranged after it was written \(value, wave, sign, outcome\)"):
+        run_to_file(SMALL, tmp_path / "turned.nc")
+
+
+def test_damaged_values_do_not_enter_another_result(tmp_path):
+    path = tmp_path / "r.nc"
+    run_to_file(SMALL, path)
+    with h5py.File(path, "r+") as file:
+        file["value"][1, 3] = -7.0
+    with pytest.raises(InputError, match=r"holds a result that is not what was written \(value\); --fresh replaces it"):
+        run_to_file(LARGE, path)
+    with pytest.raises(InputError, match=r"r.nc': not what was written \(value\); allowed is to restore"):
+        run_to_file(LARGE, tmp_path / "new.nc", reuse=[path])
+    with h5py.File(path, "r+") as file:
+        del file.attrs["checksums"]
+    with pytest.raises(InputError, match=r"not what was written \(it has no checksums\)"):
+        run_to_file(LARGE, tmp_path / "new.nc", reuse=[path])
+
+
+def test_damage_that_came_during_an_interrupted_growth_is_named(tmp_path):
+    path = tmp_path / "r.nc"
+    run_to_file(SMALL, path)
+    with pytest.raises(Interrupted):
+        run_to_file(LARGE, path, where=Where(threads=1), report=stop_after(2))
+    with h5py.File(path, "r+") as file:
+        file["value"][1, 3] = -7.0
+    assert "not what was written (value)" in status(LARGE, path).reason
+    with pytest.raises(InputError, match=r"not what was written \(value\); --fresh replaces it"):
+        run_to_file(LARGE, path)
+
+
+POINTS = {"system": "toy", "analysis": "toy", "outputs": NAMES, "points": {"a": [1.0, 8.0], "b": [1.0, 2.0]}}
+
+
+@pytest.mark.parametrize(
+    ("small", "large"),
+    [
+        (POINTS, POINTS | {"points": {"a": [1.0, 1.0], "b": [1.0, 1.0]}}),
+        (
+            scene({"a": [1.0, 2.0, 3.0], "b": [1.0, 2.0]}),
+            scene({"a": [1.0, 2.0, 3.0], "unused": [0.0, 1.0]}, {"b": 1.0}),
+        ),
+        (scene({"a": [1.0, 2.0]}), scene({"a": [1.0, 2.0, 3.0]}, outputs=["value"])),
+        (scene({"a": [1.0, 2.0]}), scene({"a": [1.0, 2.0]}, outputs=["value"])),
+    ],
+    ids=["one point twice", "one value under two labels", "fewer results", "fewer results of the same points"],
+)
+def test_what_only_the_former_result_has_is_not_dropped(tmp_path, small, large):
+    path = tmp_path / "r.nc"
+    run_to_file(small, path)
+    before = path.read_bytes()
+    with pytest.raises(InputError, match="--fresh replaces it"):
+        run_to_file(large, path)
+    assert path.read_bytes() == before and status(large, path).state == "stale"
+    assert run_to_file(large, tmp_path / "other.nc", reuse=[path]).reused > 1
+    run_to_file(large, path, fresh=True)
+    assert status(large, path).state == "complete"
+
+
+def test_points_that_are_there_twice(tmp_path):
+    path = tmp_path / "r.nc"
+    run_to_file(POINTS | {"points": {"a": [1.0, 1.0], "b": [1.0, 1.0]}}, path)
+    grid = scene({"a": [1.0, 3.0], "b": [1.0]})
+    assert counts(run_to_file(grid, tmp_path / "grid.nc", reuse=[path])) == (2, 1, 1)
+    large = POINTS | {"points": {"a": [1.0, 1.0, 8.0, 1.0], "b": [1.0, 1.0, 2.0, 1.0]}}
+    assert counts(run_to_file(large, path)) == (4, 1, 3)
+    agree(path, large)
+
+
+def small_and_interrupted(path, **more):
+    """A small result, and unfinished work that is to replace it."""
+    run_to_file(SMALL, path)
+    with pytest.raises(Interrupted) as stopped:
+        run_to_file(LARGE, path, where=Where(threads=1), report=stop_after(2), **more)
+    assert stopped.value.progress.computed > 0
+    return stopped.value.progress.computed
+
+
+@pytest.mark.parametrize("again", [True, False])
+def test_an_interrupted_fresh_run_is_resumed_with_and_without_fresh(tmp_path, again):
+    path = tmp_path / "r.nc"
+    done = small_and_interrupted(path, fresh=True)
+    assert (status(LARGE, path).state, status(LARGE, path).done) == ("partial", done)
+    assert counts(run_to_file(LARGE, path, fresh=again)) == (322, 322 - done, done)
+    # Finished: fresh means anew again.
+    assert counts(run_to_file(LARGE, path, fresh=True)) == (322, 322, 0)
+
+
+def test_fresh_drops_work_that_was_begun_otherwise(tmp_path):
+    path = tmp_path / "r.nc"
+    small_and_interrupted(path)
+    assert counts(run_to_file(LARGE, path, fresh=True)) == (322, 322, 0)
+    run_to_file(SMALL, tmp_path / "s.nc")
+    small_and_interrupted(tmp_path / "t.nc", fresh=True)
+    # Other points would be taken than those that the work was begun with.
+    assert counts(run_to_file(LARGE, tmp_path / "t.nc", fresh=True, reuse=[tmp_path / "s.nc"])) == (322, 300, 22)
+
+
+def test_an_interrupted_fresh_run_of_a_finished_scene_outlives_a_look_at_it(tmp_path):
+    path = tmp_path / "r.nc"
+    run_to_file(LARGE, path)
+    with pytest.raises(Interrupted) as stopped:
+        run_to_file(LARGE, path, fresh=True, where=Where(threads=1), report=stop_after(2))
+    assert counts(run_to_file(LARGE, path)) == (322, 0, 322)
+    assert run_to_file(LARGE, path, fresh=True).reused == stopped.value.progress.computed > 0

@@ -279,6 +279,78 @@ def test_work_is_not_resumed_over_a_result_that_came_meanwhile(grid_scene, tmp_p
     assert path.read_bytes() == before
 
 
+def test_a_finished_result_is_read_beside_unfinished_work_of_another_scene(grid_scene, tmp_path):
+    path, other = tmp_path / "r.nc", grid_scene | {"fixed": {"n": 4}}
+    run_to_file(grid_scene, path)
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        run_to_file(other, path, fresh=True, where=Where(threads=1), report=stop_after(2))
+    assert run_to_file(grid_scene, path).reused == 123
+    assert run_to_file(other, path).reused == stopped.value.progress.computed > 0
+
+
+def test_what_a_finished_run_could_not_delete_is_deleted(grid_scene, tmp_path):
+    path = tmp_path / "r.nc"
+    run_to_file(grid_scene, path)
+    digest = dt.open_result(path).attrs["digest"]
+    for plan in ({"digest": digest, "replaces": None}, None):
+        parts = PartsFolder(path)
+        parts.open()
+        if plan:
+            parts.start(plan)
+        parts.close()
+        run_to_file(grid_scene, path)
+        assert os.listdir(tmp_path) == ["r.nc"]
+
+
+def test_an_address_without_a_scheduler_costs_no_work(grid_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("drivetrain_jax.sweep.cluster._PATIENCE", "1s")
+    path = tmp_path / "r.nc"
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        run_to_file(grid_scene, path, where=Where(threads=1), report=stop_after(2))
+    with pytest.raises(dt.InputError, match="no scheduler answers"):
+        run_to_file(grid_scene, path, fresh=True, where=Where(dask="tcp://127.0.0.1:1"))
+    assert run_to_file(grid_scene, path).reused == stopped.value.progress.computed > 0
+
+
+def test_a_run_that_ends_between_the_look_and_the_lock_is_noticed(grid_scene, tmp_path, monkeypatch):
+    path, other, open_folder = tmp_path / "r.nc", grid_scene | {"fixed": {"n": 4}}, PartsFolder.open
+
+    def late(folder):
+        monkeypatch.setattr(PartsFolder, "open", open_folder)
+        run_to_file(other, path)
+        open_folder(folder)
+
+    monkeypatch.setattr(PartsFolder, "open", late)
+    with pytest.raises(dt.InputError, match="another run has changed it meanwhile"):
+        run_to_file(grid_scene, path)
+    assert status(other, path).state == "complete" and os.listdir(tmp_path) == ["r.nc"]
+
+
+def test_a_finished_result_in_a_folder_without_write_permission_is_read(grid_scene, tmp_path, monkeypatch):
+    path = tmp_path / "r.nc"
+    run_to_file(grid_scene, path)
+    monkeypatch.setattr("drivetrain_jax.sweep.target.os.access", lambda *_: False)
+    assert run_to_file(grid_scene, path).reused == 123 and status(grid_scene, path).state == "complete"
+    same(dt.run(grid_scene, path), dt.run(grid_scene))
+    for fresh, name in ((True, "r.nc"), (False, "new.nc")):
+        with pytest.raises(dt.InputError, match="not writable"):
+            run_to_file(grid_scene, tmp_path / name, fresh=fresh)
+    assert os.listdir(tmp_path) == ["r.nc"]
+
+
+def test_a_link_stays_one_and_has_the_lock_of_its_file(grid_scene, tmp_path):
+    (tmp_path / "data").mkdir()
+    path, link = tmp_path / "data" / "r.nc", tmp_path / "link.nc"
+    link.symlink_to(path)
+    run_to_file(grid_scene, link)
+    assert link.is_symlink() and path.is_file()
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        run_to_file(grid_scene, link, fresh=True, where=Where(threads=1), report=stop_after(2))
+    assert PartsFolder(link).path == PartsFolder(path).path and len(os.listdir(tmp_path)) == 2
+    assert run_to_file(grid_scene, path, fresh=True).reused == stopped.value.progress.computed > 0
+    assert link.is_symlink() and os.listdir(tmp_path / "data") == ["r.nc"]
+
+
 def test_corrupted_chunk_is_computed_again(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt) as stopped:

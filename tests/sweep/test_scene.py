@@ -136,6 +136,18 @@ WRONG = {
     "unknown scale": (changed(axes={"a": {"start": 1, "stop": 2, "num": 3, "scale": "ln"}}), "'ln'", "lin, log"),
     "log axis from zero": (changed(axes={"a": {"start": 0, "stop": 2, "num": 3, "scale": "log"}}), "start = 0", "> 0"),
     "value twice": (changed(axes={"a": {"values": [1, 2, 1]}}), "the value 1", "distinct"),
+    "axis too long to be divided": (
+        changed(axes={**GOOD["axes"], "unused": {"start": -1.7e308, "stop": 1.7e308, "num": 3}}),
+        "axes.unused: start = -1.7e+308, stop = 1.7e+308",
+        "closer together",
+    ),
+    "entry with a leading zero": (
+        changed(axes={**GOOD["axes"], "length[1]": {"values": [1]}, "length[01]": {"values": [2]}}),
+        "axes.length[01]",
+        "unknown parameter",
+    ),
+    "entry in other digits": (changed(axes={"length[\u0661]": {"values": [1]}}), "axes.length[", "unknown parameter"),
+    "entry of many digits": (changed(axes={f"length[{'9' * 5000}]": {"values": [1]}}), "axes.", "unknown parameter"),
     "axis without extent": (changed(axes={"a": {"start": 1, "stop": 1, "num": 2}}), "the value 1", "distinct"),
     "integer axis between integers": (
         changed(axes={**GOOD["axes"], "n": {"start": 1, "stop": 2, "num": 3}}),
