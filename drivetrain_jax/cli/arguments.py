@@ -87,7 +87,9 @@ def _add_list(subparsers: Any) -> None:
 def _add_run(subparsers: Any) -> None:
     command = _command(subparsers, "run", commands.run, "compute a scene, or resume it")
     _add_scene(command)
-    command.add_argument("--fresh", action="store_true", help="compute everything anew: replace a result, drop unfinished work")
+    command.add_argument(
+        "--fresh", action="store_true", help="compute all anew: replace a result, drop unfinished work"
+    )
     command.add_argument("--threads", type=int, metavar="N", help="chunks computed at a time (default: usable cores)")
     command.add_argument("--workers", type=int, metavar="N", help="N processes instead of threads: survive a crash")
     command.add_argument("--dask", metavar="ADDRESS", help="a Dask cluster instead: tcp://HOST:PORT or local:N")
