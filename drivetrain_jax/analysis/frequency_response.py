@@ -26,7 +26,7 @@ from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solv
 from drivetrain_jax.analysis.approximations import closed_form_response, harmonic_response
 from drivetrain_jax.analysis.approximations.harmonic_balance import Basis
 from drivetrain_jax.analysis.impacts import exact_branch, exact_response
-from drivetrain_jax.analysis.impacts.motion import REGIME, REGIMES, STABILITY
+from drivetrain_jax.analysis.impacts.motion import PHASE, REGIME, REGIMES, STABILITY
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System
 
 PATH = "omega"
@@ -36,7 +36,7 @@ VARIABLES = (
     Variable("u_max", "m", "largest relative displacement", SWEEP),
     Variable("u_min", "m", "smallest relative displacement", SWEEP),
     Variable("u_rms", "m", "root mean square of the relative displacement, mean included", SWEEP),
-    Variable("phase", "rad", "lag of the fundamental behind the drive", SWEEP),
+    Variable("phase", "rad", PHASE, SWEEP),
     Variable("regime", "1", REGIME, SWEEP, dtype="int8", flags=REGIMES),
     Variable("stability", "1", "stability of the motion", SWEEP, dtype="int8", flags=STABILITY),
     Variable("spectral_radius", "1", "spectral radius of the transition over the motion's period", SWEEP),

@@ -26,7 +26,7 @@ VARIABLES = (
     Variable("c_stiffness", "1", "nonuniformity of the bell, numerator of g (c1, c3)"),
     Variable("c_inertia", "1", "nonuniformity of the compliance, denominator of g (c2, c4)"),
     Variable("parametric_excitation", "1", "amplitude of the parametric excitation, c1 - c2 - chi_n"),
-    Variable("torsional_stiffness", "N m/rad", "mean torsional stiffness of the element"),
+    Variable("torsional_stiffness", "N m/rad", "torsional stiffness of the element at its mean moment of area"),
     Variable("axle_area_moment", "m4", "moment of area of the axle about the midshaft"),
     Variable("bell_area_moment", "m4", "mean moment of area of the bell about the midshaft"),
     Variable("joint_amplitude", "rad", "amplitude of the kinematic error of the joint (A_TJ)"),

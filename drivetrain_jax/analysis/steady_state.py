@@ -29,7 +29,7 @@ from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.impacts.attractor import attractors
 from drivetrain_jax.analysis.impacts.exact_response import INTEGRALS, WIDTH, describe
-from drivetrain_jax.analysis.impacts.motion import REGIME, REGIMES
+from drivetrain_jax.analysis.impacts.motion import PHASE, REGIME, REGIMES
 from drivetrain_jax.analysis.impacts.orbit_history import history
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System
 
@@ -47,7 +47,7 @@ VARIABLES = (
     Variable("u_min", "m", "smallest relative displacement"),
     Variable("u_mean", "m", "mean relative displacement"),
     Variable("u_rms", "m", "root mean square of the relative displacement, mean included"),
-    Variable("phase", "rad", "lag of the fundamental behind the drive"),
+    Variable("phase", "rad", PHASE),
     Variable("period_multiple", "1", "period multiple (0: not periodic within most_periods)", dtype="int32"),
     Variable("spectral_radius", "1", "spectral radius of the transition over the motion's period"),
     Variable("floquet_multiplier", "1", "multipliers of the motion over its period", ("multiplier",), "complex128"),
@@ -55,7 +55,9 @@ VARIABLES = (
     Variable("regime", "1", REGIME, dtype="int8", flags=REGIMES),
     Variable("impacts", "1", f"number of times that a flank is reached {_WHOLE}", ("flank",)),
     Variable("impact_velocity", "m/s", "largest velocity at which a flank is reached", ("flank",)),
-    Variable("contact_fraction", "1", "part of the time in contact", ("flank",)),
+    Variable(
+        "contact_fraction", "1", "part of the time in contact (b = 0: all with the flank B0 presses on)", ("flank",)
+    ),
     Variable("orbit_state", "m, m/s", "state at the start of a drive period", ("state",)),
     Variable("state_error", "m", "estimated absolute error of the orbit's displacement"),
     Variable("u_history", "m", "relative displacement", ("sample",)),

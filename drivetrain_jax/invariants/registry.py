@@ -115,7 +115,11 @@ _DECLARED = {
             "chaos_k01",
         ),
     ),
-    "poincare": Declared((within("distinct_points", 0.0), within("chaos_k01", -1.0, 1.0))),
+    "poincare": Declared(
+        (within("distinct_points", 0.0), within("chaos_k01", -1.0, 1.0)),
+        # Few strobes that do not repeat tell nothing.
+        gaps=("chaos_k01",),
+    ),
     "parameters": Declared(
         (
             within("natural_angular_frequency", 0.0),
@@ -152,13 +156,14 @@ _DECLARED = {
             within("impacts", 0.0),
             within("contact_fraction", 0.0, 1.0),
         ),
-        # A motion that never repeats has no transition over its period.
-        gaps=("spectral_radius", "floquet_multiplier", "state_error"),
+        # A motion that never repeats has no transition over its period, one at rest no phase.
+        gaps=("phase", "spectral_radius", "floquet_multiplier", "state_error"),
     ),
     "frequency_response": Declared(
         (*_MOTION, in_order("branch_u_min", "branch_u_max"), ordered("fold_frequency", "fold")),
-        # As many places as there may be branches and folds, and no backbone at some frequencies.
+        # As many places as there may be branches and folds, no phase at rest, and no backbone at some frequencies.
         gaps=(
+            "phase",
             "branch_u_max",
             "branch_u_min",
             "fold_frequency",

@@ -48,7 +48,7 @@ class Element(NamedTuple):
     c_inertia: Any
     """c2 or c4 [1]: nonuniformity of the compliance, in the denominator of g."""
     stiffness: Any
-    """Mean torsional stiffness k_t = Omega^2 Ibar [N m/rad]."""
+    """Torsional stiffness k_t = Omega^2 Ibar at the mean moments of area [N m/rad]."""
     frequency: Any
     """Natural angular frequency Omega [rad/s]."""
 

@@ -36,7 +36,9 @@ def plot(dataset: xr.Dataset) -> Figure:
         dataset = cells.prepare(dataset)
         names = cells.sweep_axes(dataset)
         if len(names) != 1 or names == ["point"]:
-            raise InputError(f"axes = {', '.join(names) or 'none'}: allowed is one axis for a figure of basins")
+            raise InputError(
+                f"axes = {cells.described_axes(dataset)}: allowed is one axis of several values for a figure of basins"
+            )
         cells.require(dataset, *_NEEDED)
         return _curves(dataset, names[0])
 

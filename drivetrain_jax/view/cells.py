@@ -9,6 +9,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import LinearSegmentedColormap, ListedColormap, SymLogNorm
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, NullFormatter
 
@@ -19,6 +20,7 @@ STABLE, UNSTABLE, UNDECIDED, FAILED = range(4)
 # Outcome codes from here on mean that there is no value (CF flags of the variable `outcome`).
 FIRST_FAILURE = 2
 _PENDING, _PENDING_COLOUR = "pending", "#c4c4c4"
+_NO_PARAMETERS = ("point", _PENDING)
 
 
 def prepare(dataset: xr.Dataset) -> xr.Dataset:
@@ -40,6 +42,12 @@ def _with_pending(dataset: xr.Dataset) -> xr.Dataset:
 def sweep_axes(dataset: xr.Dataset) -> list[str]:
     """Names of the swept axes, in scene order."""
     return [str(name) for name in dataset["outcome"].dims]
+
+
+def described_axes(dataset: xr.Dataset) -> str:
+    """The axes of a prepared ``dataset`` for a message, those that have but one value too."""
+    single = [f"{name} (one value)" for name, c in dataset.coords.items() if c.ndim == 0 and name not in _NO_PARAMETERS]
+    return ", ".join([*sweep_axes(dataset), *single]) or "none"
 
 
 def require(dataset: xr.Dataset, *names: str) -> None:
@@ -148,11 +156,27 @@ def state_legend(dataset: xr.Dataset) -> list[Patch]:
 def failure_legend(dataset: xr.Dataset) -> list[Patch]:
     """The legend entries of cells without a value, if there are any: failed, or still to be computed."""
     waiting = int(dataset[_PENDING].sum()) if _PENDING in dataset.coords else 0
-    failed = int((dataset["outcome"] >= FIRST_FAILURE).sum()) - waiting
+    failed = int(_failures(dataset).sum())
     patches = [_state_patch(FAILED, f" ({failed})")] if failed else []
     label = f"{_PENDING} ({waiting})"
     grey = {"facecolor": _PENDING_COLOUR, "edgecolor": FRAME_GREY, "linewidth": 0.6}
     return [*patches, Patch(**grey, label=label)] if waiting else patches
+
+
+def _failures(dataset: xr.Dataset) -> xr.DataArray:
+    """Where there is no value although nothing is still to be computed."""
+    failed = dataset["outcome"] >= FIRST_FAILURE
+    return failed & ~dataset[_PENDING] if _PENDING in dataset.coords else failed
+
+
+def draw_failures(axes: Axes, dataset: xr.Dataset, name: str) -> list[Line2D]:
+    """Crosses at the foot of ``axes`` where points along the axis ``name`` have failed, as a handle for the legend."""
+    x = dataset[name].values[_failures(dataset).values]
+    if not x.size:
+        return []
+    style = {"color": STATE_COLOURS[FAILED], "linestyle": "", "marker": "x", "markersize": 3.5, "clip_on": False}
+    label = f"{STATE_NAMES[FAILED]} ({x.size})"
+    return axes.plot(x, np.zeros(x.size), transform=axes.get_xaxis_transform(), **style, zorder=5, label=label)
 
 
 def _state_patch(code: int, note: str) -> Patch:

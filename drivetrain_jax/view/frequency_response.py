@@ -59,10 +59,12 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
         axes = [cells.sweep_axes(each) for each in results]
         if len(results) == 1 and len(axes[0]) == 2:
             return rattle_maps.plot(results[0], axes[0])
-        for names in axes:
+        for each, names in zip(results, axes, strict=True):
             if names != [PATH]:
-                shown = ", ".join(names) or "none"
-                raise InputError(f"axes = {shown}: allowed is {PATH}, with one more axis if it is a single result")
+                raise InputError(
+                    f"axes = {cells.described_axes(each)}: allowed is {PATH} of several values, with one more axis if it is "
+                    "a single result"
+                )
         for each in results:
             cells.require(each, "u_max", "u_min")
         return _lines(results)

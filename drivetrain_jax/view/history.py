@@ -14,7 +14,7 @@ from drivetrain_jax.view import cells
 from drivetrain_jax.view.layout import DPI, WIDTH, wrap_caption, write_title
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, caption, symbol, value_text
 
-_LINE = {"color": LINE_COLOURS[0], "linewidth": 0.6}
+_LINE = {"color": LINE_COLOURS[0], "linewidth": 0.6, "markersize": 3.5}
 _MOST_ROWS = 8
 _CAPTION_LINES = 2
 
@@ -72,16 +72,21 @@ def _rows(dataset: xr.Dataset, name: str) -> Figure:
     return figure
 
 
+def _line(history: xr.Dataset) -> dict[str, object]:
+    """How a history is drawn: a single time has no line."""
+    return _LINE | {"marker": "o" if history.sizes["time"] == 1 else ""}
+
+
 def _draw(history: xr.Dataset, twist: Axes, rate: Axes, portrait: Axes) -> None:
     phi, velocity = history["phi"].values, history["velocity"].values
-    twist.plot(history["time"], phi, **_LINE)
-    rate.plot(history["time"], velocity, **_LINE)
-    portrait.plot(phi, velocity, **_LINE)
+    twist.plot(history["time"], phi, **_line(history))
+    rate.plot(history["time"], velocity, **_line(history))
+    portrait.plot(phi, velocity, **_line(history))
     twist.set_ylabel(_label(history, "phi"))
     for axes in (rate, portrait):
         axes.set_ylabel(_label(history, "velocity"))
     portrait.set_xlabel(_label(history, "phi"))
-    for axes in (twist, rate):
+    for axes in (twist, rate) if history.sizes["time"] > 1 else ():
         axes.set_xlim(history["time"].values[0], history["time"].values[-1])
     if not np.isfinite(phi).any():
         for axes in (twist, rate, portrait):
@@ -89,7 +94,7 @@ def _draw(history: xr.Dataset, twist: Axes, rate: Axes, portrait: Axes) -> None:
 
 
 def _draw_space(history: xr.Dataset, space: Axes3D) -> None:
-    space.plot(history["phi"].values, history["velocity"].values, history["time"].values, **_LINE)
+    space.plot(history["phi"].values, history["velocity"].values, history["time"].values, **_line(history))
     space.set(xlabel=_label(history, "phi"), ylabel=_label(history, "velocity"), zlabel=_label(history, "time"))
     space.tick_params(labelsize=6.5, pad=-2)
     for axis in (space.xaxis, space.yaxis, space.zaxis):

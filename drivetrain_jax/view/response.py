@@ -25,9 +25,9 @@ _HEIGHT = 2.1
 def plot(dataset: xr.Dataset) -> Figure:
     """Amplitudes of the shafts, and the orbit's spectral radius and the condition where they are stored.
 
-    Over one axis as curves (full line: linear response, dashed: nonlinear orbit), over two axes as maps. Points
-    without a value stay blank in curves and are marked in maps. Axes of a single value count as fixed. Raises
-    :class:`InputError` for any other number of axes and if none of these variables is stored.
+    Over one axis as curves (full line: linear response, dashed: nonlinear orbit), over two axes as maps. Failed points
+    are marked: by crosses at the foot of the curves, by a colour of their own in maps. Axes of a single value count as
+    fixed. Raises :class:`InputError` for any other number of axes and if none of these variables is stored.
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
@@ -38,7 +38,8 @@ def plot(dataset: xr.Dataset) -> Figure:
         if len(names) == 2:
             return _maps(dataset, names, shown)
         raise InputError(
-            f"axes = {', '.join(names) or 'none'}: allowed are one or two axes for a figure of forced response"
+            f"axes = {cells.described_axes(dataset)}: allowed are one or two axes of several values for a figure of "
+            "forced response"
         )
 
 
@@ -68,6 +69,7 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
     cells.fit_axis(stack[0], "x", dataset[name].values)
     # Forcing has even harmonics of the speed only: it meets natural frequencies at the harmonic speeds.
     lines = resonances.predictions(dataset, name, families=("H",))
+    handles += cells.draw_failures(stack[0], dataset, name)
     for axes in stack:
         predicted = resonances.draw(axes, lines)
     resonances.label(stack[0], lines)
@@ -86,8 +88,10 @@ def _draw_amplitudes(axes: Axes, dataset: xr.Dataset, name: str, keys: list[str]
             curve = dataset[key].isel({own: index})
             label = f"{_entry(curve, own, index)}, {meaning}"
             handles += axes.plot(dataset[name], curve, color=colour, linestyle=style, label=label)
-    axes.set_yscale("log")
-    cells.plain_decades(axes, "y")
+    # Straight joints have no response at all, which a logarithmic scale has no place for.
+    if any(bool((dataset[key] > 0).any()) for key in keys):
+        axes.set_yscale("log")
+        cells.plain_decades(axes, "y")
     return handles
 
 

@@ -87,13 +87,13 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
     stack = [row[0] for row in panels.axes]
     handles: list[Artist] = []
     other = regimes.COLOURS[regimes.NON_PERIODIC]
-    periodic = dataset["period_multiple"] > 0 if "period_multiple" in dataset else dataset["outcome"] >= 0
+    known = dataset["outcome"] < cells.FIRST_FAILURE
+    wandering = known & (dataset["period_multiple"] == 0) if "period_multiple" in dataset else known & False
     for key, colour in zip(extremes, LINE_COLOURS, strict=False):
         label = dataset[key].attrs.get("long_name", key)
-        handles += _dots(stack[0], dataset[name], dataset[key].where(periodic), colour, label)
-        if not bool(periodic.all()):
-            _dots(stack[0], dataset[name], dataset[key].where(~periodic), other, "")
-    if not bool(periodic.all()):
+        handles += _dots(stack[0], dataset[name], dataset[key].where(known & ~wandering), colour, label)
+        _dots(stack[0], dataset[name], dataset[key].where(wandering), other, "")
+    if bool(wandering.any()):
         handles.append(
             Line2D(
                 [],
@@ -101,14 +101,14 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
                 linestyle="",
                 marker="o",
                 markersize=3,
-                color=regimes.COLOURS[regimes.NON_PERIODIC],
+                color=other,
                 label="non-periodic",
             )
         )
     units = dataset[extremes[0]].attrs.get("units", "1")
     panels.label_row(stack[0], f"extremes of the displacement [{units}]")
     for axes, key in zip(stack[1:], scalars, strict=True):
-        _dots(axes, dataset[name], dataset[key], LINE_COLOURS[0], "")
+        _dots(axes, dataset[name], dataset[key].where(known), LINE_COLOURS[0], "")
         panels.label_row(axes, variable_label(dataset[key]))
         if key == "period_multiple":
             axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
@@ -116,6 +116,7 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
         if limit is not None:
             axes.axhline(limit, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)))
     cells.fit_axis(stack[0], "x", dataset[name].values)
+    handles += cells.draw_failures(stack[0], dataset, name)
     panels.label_axes(axis_label(dataset[name]))
     panels.titles(dataset)
     panels.legend(handles)

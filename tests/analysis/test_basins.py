@@ -81,3 +81,11 @@ def test_non_periodic_motions_alone_are_one_attractor():
     found = sorted_motions([1.0, 2.0, 3.0], [0, 0, 0], [0, 0, 0])
     np.testing.assert_array_equal(found["basin_fraction"], [1.0] + [np.nan] * 7)
     assert found["unsettled_fraction"] == 0 and found["outcome"] == Outcome.SUCCESS
+
+
+def test_gears_at_rest_are_one_attractor():
+    """Whatever the frequency, which nothing moves at."""
+    scene = {"system": "rattle", "analysis": "basins", "fixed": PRESETS["table1"] | {"B1": 0.0}}
+    found = dt.run(scene | {"axes": {"omega": {"values": [0.9, 0.9719, 1.2]}}, "options": {"samples": 128}})
+    assert (found.outcome == Outcome.SUCCESS).all() and (found.unsettled_fraction == 0).all()
+    np.testing.assert_array_equal(found.basin_fraction.sel(attractor=1), 1.0)

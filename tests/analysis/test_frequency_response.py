@@ -116,3 +116,15 @@ def test_results_that_a_method_lacks_are_refused(method, output, allowed):
 def test_options_of_another_method_are_refused():
     with pytest.raises(InputError, match=r"options.fit_range = 1.0: not used by method harmonic_balance"):
         run("harmonic_balance", fit_range=1.0)
+
+
+@pytest.mark.parametrize(
+    ("method", "size"),
+    [("exact", 0.1808996938995747), ("harmonic_balance", 0.1808996938995747), ("multiple_scales", 0.0)],
+)
+def test_a_motion_without_a_fundamental_has_no_phase(method, size):
+    scene = {"system": "rattle", "analysis": "frequency_response", "outputs": ["u_max", "phase"]}
+    scene |= {"fixed": PRESETS["table1"] | {"B1": 0.0}, "options": {"method": method}}
+    found = dt.run(scene | {"axes": {"omega": {"values": [0.6, 0.9, 1.3]}}})
+    assert (found.outcome == Outcome.SUCCESS).all() and found.phase.isnull().all()
+    np.testing.assert_allclose(found.u_max, size, rtol=1e-11)

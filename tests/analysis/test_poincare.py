@@ -41,6 +41,23 @@ def test_regular_motion_does_not_diffuse(motor):
     assert (np.abs(motor.chaos_k01) < 0.1).all()
 
 
+def test_a_section_that_repeats_has_k_zero():
+    """Five points, for which 128 strobes alone give K = 0.94."""
+    scene = {"system": "tripod", "analysis": "poincare", "outputs": ["section", "chaos_k01"]}
+    fixed = {"element": "input", "beta": 0.157, "zeta": 0.05, "chi_n": 0.2, "excitation_frequency": 500.0}
+    found = dt.run(scene | {"fixed": fixed | {"equation": "29"}, "options": {"strobes": 128, "discard": 500}})
+    assert found.outcome == Outcome.SUCCESS
+    assert chaos_k01(jnp.asarray(found.section.values)).max() > 0.9
+    assert found.chaos_k01 == 0
+
+
+def test_few_strobes_that_do_not_repeat_tell_nothing_of_chaos():
+    """A torus, for which 512 strobes suffice and fewer may give any K."""
+    found = [section(["chaos_k01"], strobes=n, discard=800, steps=24).chaos_k01.values for n in (511, 512)]
+    np.testing.assert_array_equal(np.isnan(found), [[False, True], [False, False]])
+    assert found[0][0] == 0 and abs(found[1][1]) < 0.1
+
+
 def test_section_repeats_exactly(motor):
     points = motor.section.values[0]
     assert np.abs(points[10:] - points[:-10]).max() < 1e-9 * np.abs(points).max()

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import drivetrain_jax as dt
 from drivetrain_jax.analysis import Outcome, Request, get_analysis
 from drivetrain_jax.analysis.impacts.exact_response import sweeps
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
@@ -188,3 +189,35 @@ def test_an_undamped_drive_at_resonance_has_no_value(steady):
     found = steady([TABLE1 | {"c": 0.0, "omega": 1.0}, TABLE1 | {"c": 0.0, "omega": 0.5}, TABLE1 | {"omega": 0.7}])
     assert np.all(found["outcome"][:2] == Outcome.NOT_FINITE) and np.isnan(found["u_max"][:2]).all()
     assert found["outcome"][2] == Outcome.SUCCESS
+
+
+@pytest.mark.parametrize("ripple", [0.0, 1e-13, 1e-12])
+def test_gears_at_rest_under_load_are_a_steady_state(steady, ripple):
+    """u = (1 - alpha) b + B0/(k/I), at which the velocity is rounding."""
+    still = TABLE1 | {"B1": ripple}
+    found = steady([still | {"omega": omega} for omega in (1 / 3, *np.linspace(0.1, 5, 60))])
+    assert np.all(found["outcome"] == Outcome.SUCCESS) and np.all(found["period_multiple"] == 1)
+    rest = (1 - TABLE1["alpha"]) * TABLE1["b"] + TABLE1["B0"] * TABLE1["I"] / TABLE1["k"]
+    for name in ("u_max", "u_min", "u_mean", "u_rms"):
+        np.testing.assert_allclose(found[name], rest, atol=1e-13 + 30 * ripple)
+
+
+def test_a_motion_without_a_fundamental_has_no_phase(steady):
+    """A hundredfold of the rounding of a motion at rest is enough of a ripple to tell the phase of."""
+    omegas = np.linspace(0.2, 3.0, 30)
+    none, some = (steady([TABLE1 | {"B1": ripple, "omega": omega} for omega in omegas]) for ripple in (0.0, 1e-11))
+    assert np.isnan(none["phase"]).all() and np.all(none["outcome"] == Outcome.SUCCESS)
+    lag = np.arctan2(TABLE1["c"] * omegas, 1 - omegas**2)
+    np.testing.assert_allclose(some["phase"], lag, atol=1e-3)
+
+
+@pytest.mark.parametrize("outputs", [["impacts"], ["impacts", "u_rms"]])
+def test_every_impact_is_counted_once(outputs):
+    """Against the samples of the motion: a few in a hundred were missed or counted twice, others for other outputs."""
+    scene = {"system": "rattle", "analysis": "steady_state", "fixed": TABLE1}
+    scene |= {"axes": {"omega": {"start": 0.1, "stop": 3.0, "num": 120}}}
+    found, sampled = (dt.run(scene | {"outputs": names}) for names in (outputs, ["u_history"]))
+    u = sampled.u_history.values
+    side = np.where(u > TABLE1["b"], 1, np.where(u < -TABLE1["b"], -1, 0))
+    counted = [np.sum((side == flank) & (np.roll(side, 1, axis=1) != flank), axis=1) for flank in (1, -1)]
+    np.testing.assert_array_equal(found.impacts, np.transpose(counted))

@@ -113,6 +113,8 @@ def test_what_cannot_be_drawn_is_refused():
         plot(line().drop_vars("u_min"))
     with pytest.raises(InputError, match="allowed is omega"):
         frequency_response.plot(line().rename(omega="beta"))
+    with pytest.raises(InputError, match=r"axes = omega \(one value\): allowed is omega of several values"):
+        plot(line().isel(omega=[3]))
     with pytest.raises(InputError, match="several results"):
         plot(xr.Dataset(attrs={"analysis": "floquet"}), line())
     with pytest.raises(InputError, match="beside the first result"):

@@ -49,6 +49,13 @@ def test_one_history_in_four_panels():
     assert twist.get_ylabel() == r"$\phi$ [rad]"
 
 
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_a_single_time_is_a_point():
+    figure = plot(history().isel(time=[50]))
+    assert [axes.lines[0].get_marker() for axes in figure.axes] == ["o"] * 4
+    assert all(axes.lines[0].get_marker() in ("", "None") for axes in plot(history()).axes)
+
+
 def test_an_axis_is_a_row_of_panels_for_each_value():
     figure = plot(history(zeta=[0.01, 0.02]))
     assert len(figure.axes) == 6

@@ -45,9 +45,29 @@ def test_two_axes_give_one_map_a_shaft_and_mark_failures():
     assert "failed (1)" in legend(figure)
 
 
+def test_curves_mark_failed_points():
+    dataset = results.forced(Omega=OMEGA)
+    dataset.amplitude[3:5] = np.nan
+    dataset.outcome[3:5] = 2
+    figure = plot(dataset)
+    assert "failed (2)" in legend(figure)
+    (crosses,) = [line for line in panels(figure)[0].lines if line.get_label() == "failed (2)"]
+    np.testing.assert_array_equal(crosses.get_xdata(), OMEGA[3:5])
+
+
+def test_a_response_of_zero_is_drawn():
+    """A straight joint forces nothing; a logarithmic scale has no zero."""
+    dataset = results.forced(Omega=OMEGA)
+    dataset.amplitude[:] = 0
+    amplitude = panels(plot(dataset))[0]
+    assert amplitude.get_yscale() == "linear" and amplitude.get_ylim()[0] < 0 < amplitude.get_ylim()[1]
+
+
 def test_nothing_to_plot_is_an_input_error():
-    with pytest.raises(InputError, match="axes = none: allowed are one or two axes"):
+    with pytest.raises(InputError, match=r"axes = Omega \(one value\): allowed are one or two axes of several values"):
         plot(results.forced(Omega=OMEGA[:1]))
+    with pytest.raises(InputError, match="axes = none: allowed are one or two axes"):
+        plot(results.forced())
     with pytest.raises(InputError, match="outputs = outcome: nothing to plot; the figure needs amplitude or"):
         plot(results.forced(Omega=OMEGA)[["outcome"]])
 

@@ -106,6 +106,24 @@ def test_curves_mark_what_is_not_periodic():
     np.testing.assert_array_equal(figure.axes[1].lines[0].get_ydata(), multiple)
 
 
+def test_curves_tell_failures_from_motions_that_are_not_periodic():
+    """Failed points have the period multiple 0, too."""
+    dataset = result({"omega": [0.5, 1.0, 1.5]}, u_max=[1.0, 2.0, np.nan], period_multiple=[1, 0, 0])
+    dataset["outcome"][2] = 2
+    figure = plot(dataset)
+    assert labels(figure) == ["u_max", "non-periodic", "failed (1)"]
+    np.testing.assert_array_equal(figure.axes[1].lines[0].get_ydata(), [1, 0, np.nan])
+    (crosses,) = [line for line in figure.axes[0].lines if line.get_label() == "failed (1)"]
+    assert crosses.get_xdata().tolist() == [1.5]
+    dataset["outcome"][:] = 2
+    assert labels(plot(dataset)) == ["u_max", "failed (3)"]
+
+
+def test_a_single_value_of_the_axis_is_said_to_be_one():
+    with pytest.raises(InputError, match=r"axes = omega \(one value\): allowed is one axis of several values"):
+        plot(basin([1, 1, 1, 1]).isel(omega=[0]))
+
+
 def test_a_motion_shows_history_and_phase_portrait():
     part = np.arange(16) / 16
     dataset = result({"omega": [0.5]}).assign_coords(sample=("sample", part))

@@ -125,7 +125,7 @@ def _of_sweeps(
         "u_max": high,
         "u_min": low,
         "u_rms": jnp.sqrt(bias**2 + amplitude**2 / 2),
-        "phase": jnp.where(exists, motion.phase, jnp.nan),
+        "phase": jnp.where(exists & (motion.amplitude > 0), motion.phase, jnp.nan),
         "regime": regime(model, high, low),
         # Every second amplitude is a saddle.
         "stability": jnp.where(exists, index % 2, ABSENT).astype(jnp.int8),

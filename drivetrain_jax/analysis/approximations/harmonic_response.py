@@ -18,7 +18,7 @@ from drivetrain_jax.analysis.approximations.harmonic_branch import Branch, at_fr
 from drivetrain_jax.analysis.approximations.harmonic_stability import half_trace, spectral_radius
 from drivetrain_jax.analysis.approximations.harmonic_sweep import sweep
 from drivetrain_jax.analysis.impacts.branch_sections import course
-from drivetrain_jax.analysis.impacts.motion import ABSENT, STABLE, UNSTABLE, imbalance, regime
+from drivetrain_jax.analysis.impacts.motion import ABSENT, STABLE, UNSTABLE, imbalance, phase_lag, regime
 from drivetrain_jax.analysis.numerics.amplitude_roots import refined
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
@@ -80,8 +80,8 @@ def describe(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Ar
     cosine, sine = x[2 * basis.order - 1], x[2 * basis.order]
     rms = jnp.sqrt(x[0] ** 2 + jnp.sum(x[1:] ** 2, axis=0) / 2)
     stability = jnp.where(radius > 1 + _MARGIN, UNSTABLE, STABLE)
-    floats = (jnp.where(exists, v, jnp.nan) for v in (rms, jnp.arctan2(sine, cosine), radius, unbalanced))
-    rms, phase, radius, unbalanced = floats
+    phase = phase_lag(cosine, sine, jnp.maximum(jnp.abs(high), jnp.abs(low)))
+    rms, phase, radius, unbalanced = (jnp.where(exists, v, jnp.nan) for v in (rms, phase, radius, unbalanced))
     stability = jnp.where(exists, stability, ABSENT).astype(jnp.int8)
     return Described(high, low, rms, phase, regime(model, high, low), stability, radius, unbalanced)
 

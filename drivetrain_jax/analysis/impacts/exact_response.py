@@ -17,7 +17,7 @@ from jax import Array
 from drivetrain_jax.analysis._base import Outcome
 from drivetrain_jax.analysis.impacts.attractor import Attractors, attractors, take
 from drivetrain_jax.analysis.impacts.attractor_lanes import MOST_PERIODS
-from drivetrain_jax.analysis.impacts.motion import ABSENT, REGIMES, STABLE, UNSTABLE, regime
+from drivetrain_jax.analysis.impacts.motion import ABSENT, REGIMES, STABLE, UNSTABLE, phase_lag, regime
 from drivetrain_jax.analysis.impacts.orbit_measures import Measures, measure
 from drivetrain_jax.analysis.impacts.plane_map import spectral_radius
 from drivetrain_jax.systems import PiecewiseLinearOscillator
@@ -75,12 +75,13 @@ def _of_period(oscillator: PiecewiseLinearOscillator, seen: Measures) -> dict[st
     """Extremes, means, contacts and impacts over the periods followed."""
     span = seen.periods * oscillator.period
     mean, square, cosine, sine = (integral / span for integral in seen.integrals)
+    size = jnp.maximum(jnp.abs(seen.high), jnp.abs(seen.low))
     return {
         "u_max": seen.high,
         "u_min": seen.low,
         "u_mean": mean,
         "u_rms": jnp.sqrt(square),
-        "phase": jnp.arctan2(sine, cosine),
+        "phase": phase_lag(2 * cosine, 2 * sine, size),
         "impacts": jnp.stack(seen.impacts),
         "impact_velocity": jnp.stack(seen.speed),
         "contact_fraction": jnp.stack(seen.contact) / span,

@@ -11,6 +11,9 @@ REGIMES = ("no_separation", "single_sided", "double_sided", "non_periodic")
 REGIME = "flanks at which contact is made and lost (non_periodic in the time given: maybe a transient)"
 STABILITY = ("stable", "unstable", "absent")
 STABLE, UNSTABLE, ABSENT = range(3)
+PHASE = "lag of the fundamental behind the drive (NaN where the motion has none)"
+# A fundamental below this part of the displacement is rounding: 1e-14 of it is left of a motion at rest.
+_ROUNDING = 1e-13
 
 
 def regime(model: PiecewiseLinearOscillator, high: Array, low: Array) -> Array:
@@ -21,6 +24,12 @@ def regime(model: PiecewiseLinearOscillator, high: Array, low: Array) -> Array:
     drive_side = (low < model.b) & (model.b < high) & (model.b > 0)
     back_side = (low < -model.b) & (-model.b < high) & (model.b > 0)
     return (drive_side.astype(jnp.int8) + back_side.astype(jnp.int8)).astype(jnp.int8)
+
+
+def phase_lag(cosine: Array, sine: Array, size: Array) -> Array:
+    """Lag of the fundamental ``cosine cos(omega t) + sine sin(omega t)`` of a motion with displacements up to ``size``,
+    NaN where it is rounding."""
+    return jnp.where(jnp.hypot(cosine, sine) > _ROUNDING * size, jnp.arctan2(sine, cosine), jnp.nan)
 
 
 def imbalance(model: PiecewiseLinearOscillator, motion: tuple[Array, Array, Array], drive: Array) -> Array:

@@ -46,7 +46,8 @@ class Measures(NamedTuple):
 
     ``periods``: drive periods followed; ``high, low``: extremes of u; ``integrals``: of u, u^2, u cos(omega t) and
     u sin(omega t); ``contact``: time in contact; ``impacts``: number of times that a flank is reached; ``speed``:
-    largest velocity at which it is; ``matrix``: transition matrix; ``complete``: 1, or 0 if given up.
+    largest velocity at which it is; ``side``: region of the last step; ``matrix``: transition matrix; ``complete``: 1, or
+    0 if given up.
     """
 
     periods: Array
@@ -56,17 +57,18 @@ class Measures(NamedTuple):
     contact: tuple[Array, Array]
     impacts: tuple[Array, Array]
     speed: tuple[Array, Array]
+    side: Array
     matrix: tuple[Array, Array, Array, Array]
     complete: Array
 
 
-_RESULT = Measures(0, 0, 0, (0,) * 4, (0,) * 2, (0,) * 2, (0,) * 2, (0,) * 4, 0)
+_RESULT = Measures(0, 0, 0, (0,) * 4, (0,) * 2, (0,) * 2, (0,) * 2, 0, (0,) * 4, 0)
 
 
-def _fresh(u: Array) -> Measures:
+def _fresh(u: Array, side: Array) -> Measures:
     zero = jnp.zeros_like(u)
     pair = (zero, zero)
-    return Measures(zero, u, u, (zero,) * 4, pair, pair, pair, (zero + 1, zero, zero, zero + 1), zero)
+    return Measures(zero, u, u, (zero,) * 4, pair, pair, pair, side, (zero + 1, zero, zero, zero + 1), zero)
 
 
 def _reversal(motion: Motion, rate: Derivatives, size: Array) -> Bound:
@@ -74,7 +76,9 @@ def _reversal(motion: Motion, rate: Derivatives, size: Array) -> Bound:
     v, a = motion.v, rate.acceleration
     sign = jnp.where(v != 0, jnp.sign(v), jnp.sign(a))
     still = jnp.abs(v) * size[1] + jnp.abs(a) <= _ROUNDING * size[0]
-    return Bound(jnp.where(still, jnp.inf, jnp.abs(v)), sign * a, sign * rate.jerk, rate.snap_bound)
+    # Infinitely far with a slope would be a quotient of infinities.
+    slope = jnp.where(still, 0.0, sign * a)
+    return Bound(jnp.where(still, jnp.inf, jnp.abs(v)), slope, sign * rate.jerk, rate.snap_bound)
 
 
 def _integrals(lanes: Lanes, here: Here, motion: Motion, d: Array) -> tuple[Array, Array, Array, Array]:
@@ -115,11 +119,13 @@ def _watched(lanes: Lanes, motion: Motion, so_far: Measures, integrals: bool) ->
         d = jnp.where(moves, jnp.minimum(d, _LONGEST_ARC / jnp.maximum(region.rate, 1e-300)), d)
     d = jnp.minimum(jnp.maximum(d, least_step(lanes, here, motion, rate)), rest)
     moved = advance(lanes, here, motion, d)
-    before, after = here.side, locate(lanes, moved.u).side
-    hits = tuple((after == side) & (before != side) & (before != 2) for side in (1.0, -1.0))
+    # A flank is reached where a step begins beyond it. Compiled code may round the end of a step in one way to tell its
+    # side and in another to go on from it: counted at the end, an impact was missed or counted twice.
+    before, last = here.side, so_far.side
+    hits = tuple((before == side) & (last != side) for side in (1.0, -1.0))
     # Without backlash the whole line is in contact, with the flank that the mean drive holds.
     held = (before == 1) | ((before == 2) & (lanes.mean >= 0)), (before == -1) | ((before == 2) & (lanes.mean < 0))
-    speed = jnp.abs(moved.v)
+    speed = jnp.abs(motion.v)
     added = _integrals(lanes, here, motion, d) if integrals else (jnp.zeros_like(d),) * 4
     return moved, so_far._replace(
         high=jnp.maximum(so_far.high, moved.u),
@@ -128,6 +134,7 @@ def _watched(lanes: Lanes, motion: Motion, so_far: Measures, integrals: bool) ->
         contact=tuple(t + jnp.where(on, d, 0.0) for t, on in zip(so_far.contact, held, strict=True)),
         impacts=tuple(n + hit for n, hit in zip(so_far.impacts, hits, strict=True)),
         speed=tuple(jnp.maximum(s, jnp.where(hit, speed, 0.0)) for s, hit in zip(so_far.speed, hits, strict=True)),
+        side=before,
     )
 
 
@@ -169,7 +176,7 @@ def measure(
     index, blank = jnp.arange(width, dtype=jnp.int32), jnp.zeros(width)
     motion = Motion(blank, blank, blank, blank, blank, (blank,) * 4, 0 * index, 0 * index)
     store = jnp.zeros((len(jax.tree.leaves(_RESULT)), count))
-    work = _Work(index, jnp.asarray(width, jnp.int32), index >= 0, motion, _fresh(blank), store)
+    work = _Work(index, jnp.asarray(width, jnp.int32), index >= 0, motion, _fresh(blank, blank), store)
     work = jax.lax.while_loop(lambda work: jnp.any(work.index < count), lambda work: _tick(task, work), work)
     return jax.tree.unflatten(jax.tree.structure(_RESULT), list(work.store))
 
@@ -180,7 +187,7 @@ def _tick(task: _Task, work: _Work) -> _Work:
     here = jnp.minimum(work.index, count - 1)
     u, v, periods, recurs = task.first[:, here]
     lanes = jax.tree.map(lambda x: x + jnp.zeros(work.index.size), prepare(take(task.oscillator, here)))
-    fresh = start(lanes, u, v, periods.astype(jnp.int32)), _fresh(u)
+    fresh = start(lanes, u, v, periods.astype(jnp.int32)), _fresh(u, locate(lanes, u).side)
     pair = jax.tree.map(lambda new, old: jnp.where(work.renewed, new, old), fresh, (work.motion, work.so_far))
     motion, so_far = _few_steps(lanes, periods, pair, task.integrals)
     ended = motion.left <= periods - 1 - so_far.periods
