@@ -27,6 +27,7 @@ from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, solve, 
 from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.analysis.periodic.amplitude import amplitudes
 from drivetrain_jax.analysis.periodic.orbit import (
+    Field,
     Orbit,
     Transition,
     in_units_of,
@@ -56,6 +57,13 @@ Build = Callable[[Mapping[str, Any]], ForcedModel]
 
 # Integrations are sharper than what is asked of the results, the one that closes the period more than the first one.
 TRANSITION_SHARPNESS, CLOSING_SHARPNESS, SHARPEST = 0.1, 0.01, 1e-14
+# Errors of two integrations of an orbit are alike: a tenth as large is not enough to tell that of the first.
+ORBIT_CLOSING_SHARPNESS = 0.001
+# Loosest ``rtol`` they are derived from: (I - Z)^-1 multiplies their errors by up to its condition.
+LOOSEST = 1e-6
+# Sharpness that tells I - Z from a singular matrix, unless it is integrated more sharply still: a looser request must
+# not turn an answer into none, as the closing of the period tells its error in any case.
+SINGULAR_SHARPNESS = 1e-11
 # Relative error from which a periodic solution counts as not found.
 NOT_FOUND = 1e-2
 FORCING_SAMPLES = 64
@@ -77,7 +85,7 @@ def _worst(*outcomes: Array) -> Array:
 
 
 def _sharpness(rtol: float, factor: float) -> float:
-    return max(factor * rtol, SHARPEST)
+    return max(factor * min(rtol, LOOSEST), SHARPEST)
 
 
 def _mapped(model: ForcedModel, n: int, rtol: float) -> tuple[Transition, Array, Array]:
@@ -93,8 +101,7 @@ def _mapped(model: ForcedModel, n: int, rtol: float) -> tuple[Transition, Array,
 def linear_response(model: ForcedModel, n: int, rtol: float, with_amplitude: bool) -> Response:
     """Periodic solution of ``y' = linear(t, y)``; ``n`` is the size of the state.
 
-    ``y0 = (I - Z)^-1 r`` is followed over the period once more, more sharply; how far it fails to close, times
-    (I - Z)^-1, corrects it and is its estimated error.
+    ``y0 = (I - Z)^-1 r`` is followed over the period once more; how far it fails to close, times (I - Z)^-1, corrects it.
     """
     step, unit, forcing = _mapped(model, n, rtol)
     # Without a solution there is nothing to follow.
@@ -102,11 +109,7 @@ def linear_response(model: ForcedModel, n: int, rtol: float, with_amplitude: boo
     unit = jnp.where(found, unit, 0.0)
     size = size_of(unit)
     start, field, sharp = unit / size, in_units_of(size * forcing, model.linear), _sharpness(rtol, CLOSING_SHARPNESS)
-    if with_amplitude:
-        largest, end, closed = amplitudes(field, start, model.period, model.displacements, sharp)
-    else:
-        largest, (end, closed) = None, integrate(field, start, model.period, sharp)
-    correction = newton_step(Transition(end, step.matrix, closed), start)
+    largest, correction, closed = _closed(model, field, start, step.matrix, sharp, with_amplitude)
     error = jnp.max(jnp.abs(correction))
     lost = ~found | ~(error <= NOT_FOUND) | ~_regular(step.matrix, rtol)
     missed = jnp.where(error > rtol, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
@@ -118,9 +121,21 @@ def linear_response(model: ForcedModel, n: int, rtol: float, with_amplitude: boo
     return Response(state, error, largest, step, outcome)
 
 
+def _closed(
+    model: ForcedModel, field: Field, start: Array, matrix: Array, sharp: float, with_amplitude: bool
+) -> tuple[Array | None, Array, Array]:
+    """Largest displacements (None unless asked for) on the way from ``start``, of order one, over a period, the correction
+    of ``start`` from how far that fails to close, and the outcome; ``matrix`` is the transition."""
+    if with_amplitude:
+        largest, end, closed = amplitudes(field, start, model.period, model.displacements, sharp)
+    else:
+        largest, (end, closed) = None, integrate(field, start, model.period, sharp)
+    return largest, newton_step(Transition(end, matrix, closed), start), closed
+
+
 def _regular(matrix: Array, rtol: float) -> Array:
     """Whether ``I - Z`` is further from singular than the accuracy of Z."""
-    return _condition(matrix) * _sharpness(rtol, TRANSITION_SHARPNESS) < NOT_FOUND
+    return _condition(matrix) * min(_sharpness(rtol, TRANSITION_SHARPNESS), SINGULAR_SHARPNESS) < NOT_FOUND
 
 
 def _condition(matrix: Array) -> Array:
@@ -131,42 +146,43 @@ def _condition(matrix: Array) -> Array:
     return jnp.where(jnp.all(jnp.isfinite(inverse)), condition, jnp.inf)
 
 
-def nonlinear_orbit(model: ForcedModel, response: Response, rtol: float) -> Orbit:
-    """Nonlinear periodic orbit on the path that starts along ``response``; NaN with its outcome where there is none."""
+def nonlinear_orbit(
+    model: ForcedModel, response: Response, rtol: float, with_amplitude: bool
+) -> tuple[Orbit, Array | None]:
+    """Nonlinear periodic orbit on the path that starts along ``response``, NaN with its outcome where there is none, and
+    its amplitude (None unless asked for)."""
     usable = response.outcome < Outcome.NOT_CONVERGED
     start = jnp.where(usable, response.state, 0.0)
     # Nonlinearity sets in at states of order one; smaller responses are their own unit.
-    size = jnp.minimum(size_of(start), 1.0)
-    orbit = shoot(in_units_of(size, model.field), start / size, model.period, _sharpness(rtol, TRANSITION_SHARPNESS))
+    unit = jnp.minimum(size_of(start), 1.0)
+    orbit = shoot(in_units_of(unit, model.field), start / unit, model.period, _sharpness(rtol, TRANSITION_SHARPNESS))
     outcome = jnp.where(usable, orbit.outcome, response.outcome)
-    missed = orbit.error > rtol * size_of(orbit.state)
-    outcome = _worst(outcome, jnp.where(missed, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS))
-    found = outcome < Outcome.NOT_CONVERGED
-    state, matrix, error = (
-        jnp.where(found, x, jnp.nan) for x in (size * orbit.state, orbit.matrix, size * orbit.error)
+    state = jnp.where(outcome < Outcome.NOT_CONVERGED, unit * orbit.state, 0.0)
+    size = size_of(state)
+    field, sharp = in_units_of(size, model.field), _sharpness(rtol, ORBIT_CLOSING_SHARPNESS)
+    largest, correction, closed = _closed(model, field, state / size, orbit.matrix, sharp, with_amplitude)
+    error = size * jnp.max(jnp.abs(correction)) + unit * orbit.error
+    missed = jnp.where(error <= rtol * size, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
+    outcome = _worst(outcome, jnp.where(outcome < Outcome.NOT_CONVERGED, _worst(closed, missed), outcome))
+    state, matrix, error, largest = jax.tree.map(
+        lambda x: jnp.where(outcome < Outcome.NOT_CONVERGED, x, jnp.nan),
+        (state, orbit.matrix, error, None if largest is None else size * largest),
     )
-    return Orbit(state, matrix, error, outcome, orbit.corrections)
+    return Orbit(state, matrix, error, outcome, orbit.corrections), largest
 
 
 def _orbit_results(
-    model: ForcedModel, orbit: Orbit, outputs: tuple[str, ...], rtol: float
-) -> tuple[dict[str, Array], Array]:
+    model: ForcedModel, response: Response, outputs: tuple[str, ...], rtol: float
+) -> tuple[dict[str, Any], Array]:
     """The requested results of the nonlinear orbit and their outcome."""
+    orbit, largest = nonlinear_orbit(model, response, rtol, "orbit_amplitude" in outputs)
     found = orbit.outcome < Outcome.NOT_CONVERGED
-    results: dict[str, Array] = {"orbit_state": orbit.state, "orbit_state_error": orbit.error}
-    outcome = orbit.outcome
-    if "orbit_amplitude" in outputs:
-        start = jnp.where(found, orbit.state, 0.0)
-        size = size_of(start)
-        field, sharp = in_units_of(size, model.field), _sharpness(rtol, CLOSING_SHARPNESS)
-        largest, _, closed = amplitudes(field, start / size, model.period, model.displacements, sharp)
-        results["orbit_amplitude"] = jnp.where(found & (closed == Outcome.SUCCESS), size * largest, jnp.nan)
-        outcome = _worst(outcome, jnp.where(found, closed, Outcome.SUCCESS))
+    results = {"orbit_state": orbit.state, "orbit_state_error": orbit.error, "orbit_amplitude": largest}
     if "orbit_spectral_radius" in outputs:
         matrix = jnp.where(found, orbit.matrix, jnp.eye(orbit.state.size))
         radius = jnp.max(jnp.hypot(*eigenvalues(matrix)))
         results["orbit_spectral_radius"] = jnp.where(found, radius, jnp.nan)
-    return results, outcome
+    return results, orbit.outcome
 
 
 def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
@@ -182,7 +198,7 @@ def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Ar
             response.step.outcome == Outcome.SUCCESS, _condition(response.step.matrix), jnp.nan
         )
     if not set(request.outputs) <= set(LINEAR):
-        of_orbit, orbit_outcome = _orbit_results(model, nonlinear_orbit(model, response, rtol), request.outputs, rtol)
+        of_orbit, orbit_outcome = _orbit_results(model, response, request.outputs, rtol)
         results |= of_orbit
         outcome = _worst(outcome, orbit_outcome)
     return {name: results[name] for name in request.outputs} | {"outcome": outcome.astype(jnp.int8)}

@@ -15,7 +15,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import Outcome, Request, get_analysis
 from drivetrain_jax.analysis.forced import predicted_steps
 from drivetrain_jax.analysis.periodic import orbit
-from drivetrain_jax.analysis.periodic.amplitude import amplitudes
+from drivetrain_jax.analysis.periodic.amplitude import _cubic_root, amplitudes
 from drivetrain_jax.analysis.periodic.orbit import integrate, shoot
 from drivetrain_jax.systems import ForcedModel, get_system
 
@@ -306,3 +306,52 @@ def test_looser_target_is_met():
     np.testing.assert_allclose(loose["periodic_state"], sharp["periodic_state"], atol=1e-5 * size)
     np.testing.assert_allclose(loose["amplitude"], sharp["amplitude"], rtol=1e-5)
     assert np.any(np.asarray(loose["periodic_state"]) != np.asarray(sharp["periodic_state"]))
+
+
+@pytest.mark.parametrize(
+    "given", [{"Omega": 1.2}, {"Omega": 2.0}, {"Omega": 0.75, "zeta": 0.0, "alpha": 0.0, "gamma": 1.0}], ids=str
+)
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6])
+def test_stated_error_of_the_orbit_bounds_the_true_one(given, rtol):
+    """The last Newton correction, which is no error, is up to 2e5 times smaller."""
+    given = {"beta": 0.3} | given
+    values = {k: np.float64(v) for k, v in (BASE | given).items()}
+    found = jax.jit(lambda v: solver(("orbit_state", "orbit_state_error"), rtol).solve(v, 0))(values)
+    state, stated = np.asarray(found["orbit_state"]), float(found["orbit_state_error"])
+    disks = Disks(**given)
+    reference = disks.to_angles(disks.periodic_nonlinear(disks.to_disks(state)))
+    assert found["outcome"] == Outcome.SUCCESS
+    assert np.abs(state - reference).max() <= 3 * stated + 1e-12
+    assert stated <= rtol * np.abs(reference).max()
+
+
+@pytest.mark.parametrize("omega", [2.64, 3.0])
+def test_amplitude_of_the_smaller_shaft_meets_the_target(omega):
+    """It is some 30 times smaller than the other; read from between the steps it missed by 2e-7 and 1e-8."""
+    values = {k: np.float64(v) for k, v in (BASE | {"beta": 0.3, "Omega": omega}).items()}
+    found = jax.jit(lambda v: solver(("amplitude", "orbit_amplitude", "orbit_state"), 1e-8).solve(v, 0))(values)
+    disks = Disks(beta=0.3, Omega=omega)
+    path = disks.flow(disks.linear, disks.periodic_linear(), dense_output=True).sol
+    expected = largest(lambda t: path(t)[0]), largest(lambda t: path(t)[1] - disks.ratio(t) * path(t)[0])
+    np.testing.assert_allclose(found["amplitude"], expected, rtol=1e-8)
+    start = disks.periodic_nonlinear(disks.to_disks(np.asarray(found["orbit_state"])))
+    path = disks.flow(disks.nonlinear, start, dense_output=True).sol
+    expected = largest(lambda t: path(t)[0]), largest(lambda t: disks.twist(t, path(t))[0])
+    np.testing.assert_allclose(found["orbit_amplitude"], expected, rtol=1e-8)
+
+
+def test_root_of_a_straight_line():
+    """Newton's method is there at once and must stay."""
+    x, inside = _cubic_root(*jnp.array([-1.0, 1.0, 2.0, 2.0]))
+    assert inside and x == 0.5
+
+
+def test_loosest_request_has_an_answer():
+    values = {k: np.float64(v) for k, v in (BASE | {"beta": 0.3, "Omega": 1.2}).items()}
+    found = jax.jit(lambda v: solver(("periodic_state", "orbit_state"), rtol=1e-2).solve(v, 0))(values)
+    disks = Disks(beta=0.3, Omega=1.2)
+    reference, eta = disks.periodic_linear(), disks.c
+    theta = np.array([reference[0], reference[1] - eta * reference[0], reference[2], reference[3] - eta * reference[2]])
+    assert found["outcome"] == Outcome.SUCCESS
+    np.testing.assert_allclose(found["periodic_state"], theta, atol=1e-2 * np.abs(theta).max())
+    assert np.all(np.isfinite(found["orbit_state"]))

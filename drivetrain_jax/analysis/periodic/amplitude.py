@@ -12,13 +12,18 @@ from jax import Array
 from drivetrain_jax.analysis._base import Outcome
 from drivetrain_jax.analysis.periodic.orbit import MAX_STEPS, Field, controller
 
+# Nearer to an end of a step than this part of it, the continuous extension is as accurate as the step.
+EDGE = 0.01
+
 
 class _Peaks(NamedTuple):
-    """State of the loop of :func:`amplitudes`: the step ``[t0, t1]`` to try from ``y`` and the largest so far."""
+    """State of the loop of :func:`amplitudes`: the step ``[t0, t1]`` to try from ``y``, the components ``aimed`` (k,)
+    whose peak it is to end at, and the largest so far."""
 
     t0: Array
     t1: Array
     y: Array
+    aimed: Array
     largest: Array
     count: Array
     made_jump: Any
@@ -32,7 +37,8 @@ def amplitudes(
     """Largest ``|y_i|`` over a period for the components ``indices``, the state at its end, and an ``Outcome``.
 
     Every accepted step of the integration is searched for a peak, so that none is missed however fast the solution
-    oscillates; the error is that of the solver's continuous extension, about ``rtol`` for a state of order one.
+    oscillates. A step with a new largest value is taken again, to end at that peak: the solver's continuous extension
+    is ten to a hundred times less accurate than its steps.
     """
     import diffrax
 
@@ -46,30 +52,46 @@ def amplitudes(
         y1, error, dense, state, _ = solver.step(term, s.t0, s.t1, s.y, None, s.solver, s.made_jump)
         adapted = control.adapt_step_size(s.t0, s.t1, s.y, y1, None, error, order, s.control)
         keep, t0, t1, jump, controlled, result = adapted
-        between = solver.interpolation_cls(t0=s.t0, t1=s.t1, **dense)
-        largest = jnp.maximum(s.largest, _largest_on_step(field, between.evaluate, s.t0, s.t1, s.y, y1, indices))
-        y, state, largest = jax.tree.map(
-            lambda new, old: jnp.where(keep, new, old), (y1, state, largest), (s.y, s.solver, s.largest)
-        )
         # An empty step ends the loop: the controller has given up.
         t1 = jnp.where(result == diffrax.RESULTS.successful, jnp.minimum(t1, period), t0)
-        return _Peaks(t0, t1, y, largest, s.count + 1, jump, state, controlled)
+        between = solver.interpolation_cls(t0=s.t0, t1=s.t1, **dense)
+        found = _peaks_on_step(field, between.evaluate, s.t0, s.t1, s.y, y1, indices)
+        largest = jnp.maximum(s.largest, found.at_end)
+        new = keep & ~jnp.any(s.aimed) & (found.value > largest) & (jnp.abs(found.place - 0.5) < 0.5 - EDGE)
+        nearest = jnp.min(jnp.where(new, found.place, 1.0))
+        again = jnp.any(new)
+        t0, t1 = jnp.where(again, s.t0, t0), jnp.where(again, s.t0 + nearest * (s.t1 - s.t0), t1)
+        largest = jnp.maximum(largest, jnp.where(s.aimed, found.near_end, found.value))
+        y, state, largest = jax.tree.map(
+            lambda new, old: jnp.where(keep & ~again, new, old), (y1, state, largest), (s.y, s.solver, s.largest)
+        )
+        return _Peaks(t0, t1, y, new & (found.place == nearest), largest, s.count + 1, jump, state, controlled)
 
     zero = jnp.zeros(())
     t1, controlled = control.init(term, zero, period, start, None, None, solver.func, order)
     t1 = jnp.minimum(t1, period)
     state = solver.init(term, zero, t1, start, None)
     largest, jump = jnp.abs(start[jnp.array(indices)]), jnp.array(False)
-    first = _Peaks(zero, t1, start, largest, jnp.zeros((), int), jump, state, controlled)
+    first = _Peaks(zero, t1, start, largest < 0, largest, jnp.zeros((), int), jump, state, controlled)
     last = jax.lax.while_loop(unfinished, advance, first)
     stopped = jnp.where(last.count < MAX_STEPS, Outcome.NOT_FINITE, Outcome.STEP_LIMIT)
     return last.largest, last.y, jnp.where(last.t0 < period, stopped, Outcome.SUCCESS)
 
 
-def _largest_on_step(
+class _Found(NamedTuple):
+    """``|y_i|`` on a step: ``at_end``, extrapolated to the peak ``near_end``, and the largest ``value`` in between, at
+    the fraction ``place``, or 0 if there is none."""
+
+    at_end: Array
+    near_end: Array
+    value: Array
+    place: Array
+
+
+def _peaks_on_step(
     field: Field, evaluate: Callable, t0: Array, t1: Array, y0: Array, y1: Array, indices: tuple[int, ...]
-) -> Array:
-    """Largest ``|y_i|`` on a step, at its end or where the derivative changes sign in between.
+) -> _Found:
+    """Largest ``|y_i|`` on a step, at its end and where the derivative changes sign in between.
 
     The derivative is taken as a cubic from y' and y'' at both ends; what this leaves at the point found, y' = d, is
     removed by the parabola y - d^2/(2 y'').
@@ -80,15 +102,25 @@ def _largest_on_step(
         slope = field(t, y)
         return slope, jax.jvp(field, (t, y), (jnp.ones_like(t), slope))[1]
 
-    slopes, curves = zip(derivatives(t0, y0), derivatives(t1, y1), strict=True)
-    largest = []
-    for i in indices:
-        x, inside = _cubic_root(slopes[0][i], slopes[1][i], h * curves[0][i], h * curves[1][i])
+    (slope0, curve0), (slope1, curve1) = derivatives(t0, y0), derivatives(t1, y1)
+
+    def of(i: Array) -> _Found:
+        x, inside = _cubic_root(slope0[i], slope1[i], h * curve0[i], h * curve1[i])
         y = evaluate(t0 + x * h)
         slope, curve = (d[i] for d in derivatives(t0 + x * h, y))
-        correction = jnp.where(curve == 0, 0.0, slope**2 / (2 * jnp.where(curve == 0, 1.0, curve)))
-        largest.append(jnp.where(inside, jnp.abs(y[i] - correction), 0.0))
-    return jnp.maximum(jnp.stack(largest), jnp.abs(y1[jnp.array(indices)]))
+        value, shift = _vertex(y[i], slope, curve)
+        near_end, _ = _vertex(y1[i], slope1[i], curve1[i])
+        return _Found(
+            jnp.abs(y1[i]), jnp.abs(near_end), jnp.where(inside, jnp.abs(value), 0.0), jnp.clip(x + shift / h, 0.0, 1.0)
+        )
+
+    return jax.vmap(of)(jnp.array(indices))
+
+
+def _vertex(y: Array, slope: Array, curve: Array) -> tuple[Array, Array]:
+    """Value at the vertex of the parabola through a point, and how far ahead it is; the point itself on a line."""
+    shift = jnp.where(curve == 0, 0.0, -slope / jnp.where(curve == 0, 1.0, curve))
+    return y + slope * shift / 2, shift
 
 
 def _cubic_root(p0: Array, p1: Array, d0: Array, d1: Array) -> tuple[Array, Array]:
@@ -102,5 +134,5 @@ def _cubic_root(p0: Array, p1: Array, d0: Array, d1: Array) -> tuple[Array, Arra
         same = value * p0 > 0
         left, right = jnp.where(same, x, left), jnp.where(same, right, x)
         newton = x - value / jnp.where(slope == 0, jnp.inf, slope)
-        x = jnp.where((newton > left) & (newton < right), newton, (left + right) / 2)
+        x = jnp.where((newton >= left) & (newton <= right), newton, (left + right) / 2)
     return x, inside

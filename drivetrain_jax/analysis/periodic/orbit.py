@@ -51,7 +51,7 @@ class Transition(NamedTuple):
 
 class Orbit(NamedTuple):
     """Periodic orbit: ``state`` (n,) at t = 0, transition ``matrix`` (n, n) about it, absolute ``error`` of the state
-    (its last Newton correction) and an ``Outcome``; ``corrections`` counts the Newton steps."""
+    (from :func:`shoot`: its last Newton correction) and an ``Outcome``; ``corrections`` counts the Newton steps."""
 
     state: Array
     matrix: Array
