@@ -66,7 +66,7 @@ COUNTS = {
     "sweeps planetary": 27,
     # 16 lanes over ten periods of the drive: 14 steps a period.
     "steps rattle": 2226,
-    # 31 strobes, 23 steps each at the tolerance of a default history; one run, as no error is asked for.
+    # 31 strobes, 23 steps each at the tolerance of a default history and 18 in the run that tells the error.
     "steps tripod": 1294,
     # One kernel, nothing else: shapes, padding and files are NumPy's.
     "compilations bicardan": 1,

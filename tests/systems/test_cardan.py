@@ -284,7 +284,7 @@ def test_predicted_steps_are_enough_and_not_many_more(point, rtol):
     assert stable_steps(form) < predicted
 
 
-@pytest.mark.parametrize("rtol", [1e-7, 1e-9, 1e-11])
+@pytest.mark.parametrize("rtol", [1e-7, 1e-9, 1e-10])
 def test_slow_points_meet_their_tolerance_with_the_predicted_steps(rtol):
     """What is a little too few is found out by twice as many: a block of points then takes 2.6 times as long."""
     for omega, beta in ((0.006, 0.9), (0.01, 0.3), (0.03, 0.1)):
