@@ -94,6 +94,28 @@ def test_error_bound_holds_on_20000_points(direct):
     check_bound(direct(points), direct(points, rtol=1e-13))
 
 
+CROSSING = {
+    "beta": np.array([1.4286756246861043, 0.9151340127635716, 1.2499655001770509]),
+    "Omega": np.array([0.051491953585090705, 0.021584104489659632, 0.029022801274611213]),
+    "zeta": np.array([0.8216350310482179, 1.0118784861123455, 0.4990596490718316]),
+    "alpha": np.array([0.16457759993153423, 0.16887439094976234, 0.14118529541987074]),
+    "mu": np.array([10.976429953601453, 3.5240622328300297, 10.758480824751404]),
+    "gamma": np.array([0.36790064817400686, 0.5100380577939942, 0.7959599064678967]),
+}
+# By benchmarks/cardan_precise_reference.py with BITS = 300 and 400.
+CROSSING_RADIUS = np.array([2.19580758985809508e-18, 1.0515487833445584448e-44, 6.8701943106188223541e-16])
+
+
+@pytest.mark.parametrize("rtol", [1e-7, 1e-10, 1e-12])
+def test_bound_counts_rounding_that_grows_on_the_way(direct, rtol):
+    """One mode survives the first half of the span and another one the second: rounding in between grows 1e4 times."""
+    found = direct(CROSSING, rtol=rtol)
+    error = np.abs(found["spectral_radius"] - CROSSING_RADIUS)
+    assert (error <= found["spectral_radius_error"]).all(), error / found["spectral_radius_error"]
+    assert (error <= 1e-10 * CROSSING_RADIUS + rtol * CROSSING_RADIUS).all()
+    assert (found["spectral_radius_error"] <= 1e-8 * CROSSING_RADIUS + 10 * rtol * CROSSING_RADIUS).all()
+
+
 def test_error_follows_the_tolerance(direct, sample):
     rtol = 1e-5
     points, exact = {name: x[:256] for name, x in sample[0].items()}, sample[2]["spectral_radius"][:256]

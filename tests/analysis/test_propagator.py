@@ -108,6 +108,28 @@ def test_implicit_scheme_is_l_stable(decay):
     assert phi[1, 1] == pytest.approx(math.exp(-1), rel=1e-14)
 
 
+def test_growth_of_what_is_made_on_the_way():
+    """Two modes that decay by e^-24 each, but not at the same time: what one has lost half-way the other one has yet to lose.
+
+    |Phi(T, t)| |Phi(t, 0)|/|Phi(T, 0)| follows from the integral of the rates, 24 (t -+ sin(2 pi t)/(2 pi)).
+    """
+    rate = lambda t, sign: -24 * (1 + sign * jnp.cos(2 * math.pi * t))  # noqa: E731
+    system = LinearPeriodic(lambda t: ((rate(t, 1), 0), (0, rate(t, -1))), 1.0)
+    # The first mode decays fast in the outer quarters, the other one in the middle of the span.
+    lost = lambda t: 24 * np.stack([t + np.sin(2 * np.pi * t) / (2 * np.pi), t - np.sin(2 * np.pi * t) / (2 * np.pi)])  # noqa: E731
+    norm = lambda exponents: np.linalg.norm(np.exp(-exponents), axis=0)  # noqa: E731
+    whole = lost(np.array([1.0]))
+    for pieces in (1, 4, 16):
+        t = np.arange(1, pieces) / pieces
+        squares = (norm(whole - lost(t)) * norm(lost(t)) / norm(whole)) ** 2 / 2
+        expected = math.sqrt((squares.sum() + 1) / pieces)
+        found = explicit_propagator(system, jnp.int32(160), (), 0, pieces)
+        assert float(found.growth) == pytest.approx(expected, rel=1e-6)
+        np.testing.assert_allclose(np.diag(full(found)), np.exp(-24), rtol=1e-9)
+    assert float(implicit_propagator(system, jnp.int32(32)).growth) == pytest.approx(expected, rel=1e-6)
+    assert expected > 100
+
+
 @pytest.mark.parametrize("n", [1, 4])
 def test_constant_coefficients(n):
     a = 2 * np.random.default_rng(n).standard_normal((n, n))

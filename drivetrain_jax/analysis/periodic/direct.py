@@ -81,9 +81,11 @@ def compare(
 ) -> Monodromy:
     """Monodromy matrix of ``fine`` and its error.
 
-    ``reduction`` is the error of ``coarse`` over that of ``fine``, less one. Rounding of the matrix products grows like
-    the square root of ``steps``; rounding of the coefficients shifts exponents by the ``stiffness``, the largest rate
-    times the span. Parts, if there are any, have to agree as well, relative to their own norms.
+    ``reduction`` is the error of ``coarse`` over that of ``fine``, less one. Rounding of the matrix products accumulates
+    like the square root of ``steps``; what is made on the way grows until the end as ``fine`` says, but never by so much
+    that it would not show in ``coarse``, which rounds independently. Rounding of the coefficients shifts exponents by the
+    ``stiffness``, the largest rate times the span. Parts, if there are any, have to agree as well, relative to their own
+    norms.
     """
     halves = 1 if system.reversor is None else 2
     z_fine = assemble(system, fine.matrix)
@@ -98,14 +100,18 @@ def compare(
     if fine.parts is not None:
         change = (4 / reduction) * (z_fine - z_coarse)
         differences.append(jnp.max(_relative_difference(fine.parts, coarse.parts), axis=0))
-    truncation = 4 * jnp.max(jnp.stack(differences), axis=0) / reduction
+    difference = 4 * jnp.max(jnp.stack(differences), axis=0)
+    truncation = difference / reduction
     residual = jnp.zeros_like(scale)
     if system.log_determinant is not None:
         exact = jnp.exp(system.log_determinant() - n * log_scale)
         residual = ((-1) ** n * a_fine[-1] - exact) / scale**n
     truncation = jnp.maximum(truncation, jnp.abs(residual))
     norm = jnp.sum(fine.matrix**2, axis=(0, 1)) ** (halves / 2)
-    rounding = np.finfo(float).eps * ((4 + jnp.sqrt(steps)) * norm / scale + halves * stiffness)
+    growth = 1.0 if fine.growth is None else fine.growth
+    at_the_end = np.finfo(float).eps * (4 + jnp.sqrt(steps)) * norm / scale
+    on_the_way = jnp.minimum((growth - 1) * at_the_end, difference)
+    rounding = at_the_end + on_the_way + np.finfo(float).eps * halves * stiffness
     met = truncation <= jnp.maximum(rtol, rounding)
     return Monodromy(z_fine, log_scale, truncation + rounding, met, residual, fine.parts, change)
 

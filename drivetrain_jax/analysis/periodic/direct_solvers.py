@@ -17,6 +17,7 @@ from drivetrain_jax.analysis.periodic.propagator import (
     EXPLICIT_ORDER,
     IMPLICIT_ORDER,
     LANES,
+    PIECES,
     Propagator,
     explicit_propagator,
     implicit_propagator,
@@ -81,11 +82,14 @@ def _solve(
     model = system.models["floquet"].build(values)
     periodic = form(model)
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in values.values() if not isinstance(x, str)))
+    least = stable_steps(periodic) if explicit else 0.0
+    # Errors grow on the way where modes decay at rates that differ by much, and by other ones later than at first.
+    pieces = jnp.clip(least, 1, PIECES).astype(effort.dtype)
 
     def in_lanes(steps: Array) -> Propagator:
         def block(part: Mapping[str, Any], count: int) -> Propagator:
             own = form(system.models["floquet"].build(part))
-            return explicit_propagator(own, steps, (count,) if shape else (), parts)
+            return explicit_propagator(own, steps, (count,) if shape else (), parts, pieces)
 
         return in_blocks(block, values, shape[0] if shape else 1, LANES)
 
@@ -95,6 +99,5 @@ def _solve(
     propagate = in_lanes if explicit else one
     order, stiffness = (EXPLICIT_ORDER, 0.0) if explicit else (IMPLICIT_ORDER, stiffness_of(periodic))
     ratio = jnp.where(target <= _FINE, _RATIO, 2) if explicit and model.explicit_steps else 2
-    least = stable_steps(periodic) if explicit else 0.0
     found = direct_monodromy(periodic, propagate, effort, shape, stiffness, target, order, ratio, max(parts, 1), least)
     return results(model, found)
