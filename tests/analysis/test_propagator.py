@@ -109,7 +109,7 @@ def test_implicit_scheme_is_l_stable(decay):
 
 
 def test_growth_of_what_is_made_on_the_way():
-    """Two modes that decay by e^-24 each, but not at the same time: what one has lost half-way the other one has yet to lose.
+    """Two modes decay by e^-24 each, but not at the same time: what one lost half-way the other one has yet to lose.
 
     |Phi(T, t)| |Phi(t, 0)|/|Phi(T, 0)| follows from the integral of the rates, 24 (t -+ sin(2 pi t)/(2 pi)).
     """

@@ -28,8 +28,8 @@ class Propagator(NamedTuple):
 
     ``parts`` are the propagators over ``K`` equal parts of the span, the first one first, ``(K, n, n, ...)``, of which
     ``Phi`` is the product; None for ``K = 0``. ``growth`` is how much larger at the end an error is that was made on the way
-    than one made there, the root of the mean square of ``|Phi(T, t)| |Phi(t, 0)| / |Phi(T, 0)|`` (at t = T, taken for 1) over
-    some instants; None if none were looked at.
+    than one made there, the root of the mean square of ``|Phi(T, t)| |Phi(t, 0)| / |Phi(T, 0)|`` (1 at t = T) over some
+    instants; None if none were looked at.
     """
 
     matrix: Array
