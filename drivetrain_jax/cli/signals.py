@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+
+# Seconds that are left to what was stopped, to write down what is finished: further signals do not cut it short.
+_GRACE = 2.0
 
 
 @contextmanager
@@ -14,9 +18,9 @@ def stop_on_signals() -> Iterator[Callable[[], None]]:
     """Ctrl-C and a scheduler's SIGTERM raise ``KeyboardInterrupt``, and the function that it gives does so again.
 
     The second time is for an exception that a destructor or a C callback has swallowed. What these say of it, and of what
-    it left half made, is not shown.
+    it left half made, is not shown. An impatient second signal is ignored while what is finished is written down.
     """
-    caught: list[int] = []
+    caught: list[float] = []
     before = sys.unraisablehook
 
     def check() -> None:
@@ -24,9 +28,10 @@ def stop_on_signals() -> Iterator[Callable[[], None]]:
             raise KeyboardInterrupt
 
     def stop(number: int, frame: object) -> None:
-        del frame
-        caught.append(number)
-        check()
+        del number, frame
+        caught.append(time.monotonic())
+        if len(caught) == 1 or caught[-1] - caught[0] > _GRACE:
+            raise KeyboardInterrupt
 
     def hook(unraisable: Any) -> None:
         if not caught:

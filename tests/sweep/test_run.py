@@ -519,6 +519,21 @@ def test_signal_stops_promptly_and_loses_nothing(slow_process, sent):
     assert found.done > 0 and "Traceback" not in stderr
 
 
+def test_impatient_interrupts_lose_nothing_either(slow_process):
+    """What is finished is written down after the first one, which those that follow at once do not cut short."""
+    start, out = slow_process
+    process = start()
+    wait_for_parts(out, 1, process)
+    time.sleep(0.15)
+    for _ in range(40):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.0005)
+    _, stderr = process.communicate(timeout=10)
+    found = status(SLOW, out)
+    assert process.returncode == 130 and "Traceback" not in stderr
+    assert stderr.splitlines()[-1:] == [f"points: total=400 computed={found.done} reused=0 failed=0"]
+
+
 def test_second_run_on_the_same_file_is_refused(slow_process):
     start, out = slow_process
     process = start()
