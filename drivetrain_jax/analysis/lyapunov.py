@@ -49,7 +49,7 @@ VARIABLES = (
     Variable("sum_rule_residual", "1/s", "sum of the exponents minus the mean divergence"),
     Variable("averaging_time", "s", "time over which the exponents are averaged, transient excluded"),
     Variable("paper_estimator", "1/s", "the paper's (31)-(36) as printed, not a Lyapunov exponent", ("component",)),
-    Variable("chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic"),
+    Variable("chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic; 0 if the section repeats"),
     Variable("period_multiple", "1", "strobes after which the motion repeats, 0: none found", dtype="int32"),
     Variable(
         "verdict",
@@ -244,7 +244,10 @@ def analyse(flow: Flow, request: Request) -> dict[str, Array]:
         needed = jnp.ones_like(needed) if "chaos_k01" in wanted or not flow.turns else needed
         seen = sample(flow, steps, run.fine, spectrum, needed)
         results["verdict"] = judge(evidence_of(run, spectrum, residual, seen), autonomous=not flow.turns)
-        results |= {"chaos_k01": seen.k01, "period_multiple": seen.multiple.astype(jnp.int32)}
+        # K tells nothing of a few points over and over again, nor is it asked to.
+        repeating = seen.multiple > 0
+        results["chaos_k01"] = jnp.where(repeating, 0.0, seen.k01)
+        results["period_multiple"] = seen.multiple.astype(jnp.int32)
     met = (target == 0) | ~run.fine.bounded | (jnp.max(spectrum.errors, axis=0) <= target)
     outcome = jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
     outcome = jnp.where(jnp.all(jnp.isfinite(spectrum.values), axis=0), outcome, Outcome.NOT_FINITE)

@@ -89,7 +89,7 @@ def _scene_lines(system: System | None) -> list[str]:
     for path in sorted(folder.glob("*.toml")) if folder else ():
         try:
             content = tomllib.loads(path.read_text("utf-8"))
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             continue
         if system is None or content.get("system") == system.name:
             rows.append((f"{folder.name}/{path.name}", str(content.get("title", ""))))

@@ -29,6 +29,14 @@ def read(
     ``source`` is a path or a mapping. ``overrides`` replaces single entries, for example ``{"fixed.zeta": 0.002}``;
     the text then is that of the changed scene.
     """
+    try:
+        return _read(source, overrides)
+    except RecursionError:
+        given = "a table" if isinstance(source, Mapping) else repr(str(source))
+        raise InputError(f"scene = {given}: not valid TOML: nested too deeply") from None
+
+
+def _read(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None) -> tuple[dict[str, Any], str]:
     if isinstance(source, Mapping):
         tree, text = _plain(source), None
     elif not isinstance(source, (str, os.PathLike)):
@@ -44,10 +52,12 @@ def read(
             raise InputError(f"scene = {str(source)!r}: not valid TOML: {reason}") from None
         except ValueError:
             raise InputError(f"scene = {str(source)!r}: a number of too many digits; allowed are up to 4300") from None
-        except RecursionError:
-            raise InputError(f"scene = {str(source)!r}: not valid TOML: nested too deeply") from None
     if overrides:
         text = None
+        if not isinstance(overrides, Mapping) or not all(isinstance(key, str) and key for key in overrides):
+            raise InputError(
+                f"overrides = {shown(overrides)}: allowed is a table by dotted keys, {{'fixed.zeta': 0.002}}"
+            )
         for key, value in overrides.items():
             _replace(tree, key, _plain(value))
     _check(tree, "scene")

@@ -374,6 +374,7 @@ def test_list_shows_the_scenes_of_this_folder(cli, folder):
     (folder / "sweeps").mkdir()
     (folder / "sweeps" / "one.toml").write_text('title = "Hello"\nsystem = "cardan"')
     (folder / "sweeps" / "two.toml").write_text('title = "Other"\nsystem = "toy"')
+    (folder / "sweeps" / "deep.toml").write_text("a = " + "[" * 5000 + "]" * 5000)
     assert "sweeps/one.toml  Hello" in cli("list", "cardan")[1] and "Other" not in cli("list", "cardan")[1]
     assert "Other" in cli("list")[1]
 

@@ -225,6 +225,7 @@ def test_wrong_scene_is_one_clear_line(case):
         (b"\xff\xfe", "UTF-8"),
         (None, "No such file"),
         (b"a=1\na=2", "line 2"),
+        (b"a = " + b"[" * 5000 + b"]" * 5000, "nested too deeply"),
     ],
 )
 def test_wrong_file_is_one_clear_line(tmp_path, content, part):
@@ -233,6 +234,19 @@ def test_wrong_file_is_one_clear_line(tmp_path, content, part):
         path.write_bytes(content)
     with pytest.raises(InputError, match=part):
         load_scene(path)
+
+
+def test_a_table_within_itself_is_one_clear_line():
+    tree = {}
+    tree["fixed"] = tree
+    with pytest.raises(InputError, match="scene = a table: not valid TOML: nested too deeply"):
+        load_scene(tree)
+
+
+@pytest.mark.parametrize("overrides", [{5: 1}, {"": 1}, [1], "fixed.a"])
+def test_overrides_that_are_none_are_one_clear_line(overrides):
+    with pytest.raises(InputError, match=r"overrides = .*allowed is a table by dotted keys"):
+        load_scene(GOOD, overrides)
 
 
 def test_a_byte_order_mark_and_line_ends_of_windows_are_read(tmp_path):
