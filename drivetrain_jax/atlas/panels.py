@@ -110,6 +110,28 @@ class Atlas:
             atlas = atlas._without(name, float(value))
         return atlas
 
+    def ordered(self, parameters: Sequence[str]) -> Atlas:
+        """The same with the parameters in this order."""
+        if tuple(parameters) == self.parameters:
+            return self
+        order = [self.parameters.index(name) for name in parameters]
+
+        def turned(box: Panel | Gap) -> Panel | Gap:
+            box = replace(box, lower=box.lower[order], upper=box.upper[order])
+            if isinstance(box, Gap):
+                return box
+            return replace(box, coefficients=np.transpose(box.coefficients, (*order, len(order))))
+
+        return replace(
+            self,
+            parameters=tuple(parameters),
+            coordinates=tuple(self.coordinates[k] for k in order),
+            lower=self.lower[order],
+            upper=self.upper[order],
+            panels=tuple(map(turned, self.panels)),
+            gaps=tuple(map(turned, self.gaps)),
+        )
+
     def _without(self, name: str, value: float) -> Atlas:
         if name not in self.parameters:
             raise KeyError(f"{name}: the atlas has {', '.join(self.parameters)}")

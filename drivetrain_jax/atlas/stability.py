@@ -52,6 +52,10 @@ class StabilityAtlas:
         """The same for the remaining parameters; errors as in :meth:`Atlas.slice`."""
         return StabilityAtlas(self.atlas.slice(values), self.build, self.rtol)
 
+    def ordered(self, parameters: Sequence[str]) -> StabilityAtlas:
+        """The same with the parameters in this order."""
+        return StabilityAtlas(self.atlas.ordered(parameters), self.build, self.rtol)
+
     def at(self, points: np.ndarray, outputs: Sequence[str] = DEFAULT_OUTPUTS) -> dict[str, np.ndarray]:
         """Results by name at points ``(N, d)`` in the order of ``atlas.parameters``, points first, and ``outcome``.
 
@@ -107,8 +111,9 @@ class StabilityAtlas:
         """Results by name on the grid of ``axes``, one per parameter of the atlas, in its order, and ``outcome``; in the
         arrays ``out``, if they are given.
 
-        Cells that no panel covers are marked as in :meth:`at`. If this is a part of a chart, ``rows`` is the length of the
-        chart's last axis but one: all parts then have the same kernels.
+        The last two axes should be the longest: their cells are judged together. Cells that no panel covers are marked as
+        in :meth:`at`. If this is a part of a chart, ``rows`` is the length of the chart's last axis but one: all parts then
+        have the same kernels.
         """
         axes = [np.asarray(axis, float) for axis in axes]
         shape = tuple(len(axis) for axis in axes)

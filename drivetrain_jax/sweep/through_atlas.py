@@ -96,8 +96,12 @@ def _points(engine: Engine, atlas: StabilityAtlas, table: Table) -> Iterator[tup
 def _blocks(engine: Engine, atlas: StabilityAtlas, table: Table) -> Iterator[tuple[tuple[slice, ...], Results]]:
     """Places in the grid, block by block, and the arrays of ``table`` there, filled in."""
     axes = {axis.name: axis.values for axis in engine.grid.axes}
+    lengths = {name: len(axes[name]) for name in atlas.atlas.parameters}
+    longest = sorted(lengths, key=lambda name: lengths[name])[-2:]
+    # Rows and columns of a tile are the last two. Of axes as long as each other their order decides, which stays.
+    atlas = atlas.ordered(sorted(lengths, key=lambda name: name in longest))
     names, outputs = atlas.atlas.parameters, engine.scene.request.outputs
-    lengths = [len(axes[name]) for name in names]
+    lengths = [lengths[name] for name in names]
     for ranges in _cut(lengths):
         values = [axes[name][part] for name, part in zip(names, ranges, strict=True)]
         place = tuple(dict(zip(names, ranges, strict=True)).get(name, slice(0, 1)) for name in axes)

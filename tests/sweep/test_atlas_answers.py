@@ -10,7 +10,9 @@ import pytest
 import xarray as xr
 
 import drivetrain_jax as dt
+from drivetrain_jax.atlas import stability
 from drivetrain_jax.atlas.sensitivity import direct_sensitivity
+from drivetrain_jax.atlas.tiles import tiles
 from drivetrain_jax.sweep import atlas_answers
 from drivetrain_jax.sweep.atlas_chart import chart
 from drivetrain_jax.sweep.atlas_file import StoredAtlas
@@ -55,6 +57,32 @@ def test_boundaries_lie_on_both_sides_of_the_angle_0():
     assert (rho > 1).tolist() == [True, False, False, True]
     ends = atlas_answers.query(atlas, {"beta": 0.25, "Omega": 1.42}).data["nearest"]["beta"]
     assert ends["below"]["value"] == pytest.approx(above, rel=1e-12) and ends["above"] is None
+
+
+@pytest.mark.parametrize("axes", [("Omega", "beta", "mu"), ("mu", "beta", "Omega"), ("beta", "mu", "Omega")])
+def test_tiles_lie_along_the_longest_axes_of_a_chart(monkeypatch, axes):
+    """A chart may have few values of the last two parameters of its atlas: tiles then held as few cells."""
+    ranges = {"beta": (0.2, 0.5), "Omega": (1.3, 1.5), "mu": (1.0, 1.1)}
+    table = {name: dict(zip(("start", "stop"), ranges[name], strict=True)) for name in axes}
+    fixed = {"zeta": 0.001, "alpha": 1.0, "gamma": 100.0}
+    scene = {"system": "cardan", "analysis": "atlas", "axes": table, "fixed": fixed, "options": {"rtol": 1e-8}}
+    atlas, cut = dt.open_atlas(dt.run(scene)), []
+
+    def counted(*given, **more):
+        for tile in tiles(*given, **more):
+            cut.append(tile)
+            yield tile
+
+    monkeypatch.setattr(stability, "tiles", counted)
+    lengths = {"beta": 60, "Omega": 70, "mu": 3}
+    values = {name: np.linspace(*ranges[name], n) for name, n in lengths.items()}
+    found = atlas.grid(**values)
+    assert len(cut) <= 2 * lengths["mu"] * len(atlas.stability.atlas.panels)
+    for mu in values["mu"]:
+        alone, ours = atlas.grid(**{**values, "mu": float(mu)}), found.sel(mu=mu)
+        bound = alone.spectral_radius_error + ours.spectral_radius_error
+        assert (abs(alone.spectral_radius - ours.spectral_radius) <= bound).all()
+        assert (alone.verdict == ours.verdict).all() and (ours.spectral_radius_error < 1e-7).all()
 
 
 @pytest.mark.parametrize("number", [np.float32, np.float64, np.array])
