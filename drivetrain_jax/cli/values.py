@@ -26,6 +26,9 @@ def assignments(texts: Sequence[str], field: str) -> dict[str, Any]:
             pairs[name] = parse_value(value)
         except RecursionError:
             raise InputError(f"{field} = {clipped(text)!r}: nested too deeply; allowed is name=value") from None
+    for name in pairs:
+        if table := next((other for other in pairs if name.startswith(f"{other}.")), None):
+            raise InputError(f"{field} = {name!r}: it is part of {table!r}, which is given too; allowed is one of them")
     return pairs
 
 

@@ -73,6 +73,9 @@ def check_count(name: str, spec: AxisTable, continuous: bool) -> int:
         raise InputError(f"{field}.num: missing; allowed is num >= 1 (a range without num: analysis = 'atlas')")
     if spec.num < 1:
         raise InputError(f"{field}.num = {spec.num}: empty axis; allowed is num >= 1")
+    if spec.num == 1 and spec.start != spec.stop:
+        ends = f"start = {spec.start!r} and stop = {spec.stop!r}"
+        raise InputError(f"{field}.num = 1: {ends} are two values; allowed is num >= 2, or values = [{spec.start!r}]")
     if spec.scale not in (None, *_SCALES):
         raise InputError(f"{field}.scale = {spec.scale!r}: allowed is one of {', '.join(_SCALES)}")
     if spec.scale == "log" and not (spec.start > 0 and spec.stop > 0):

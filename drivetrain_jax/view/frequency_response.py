@@ -50,9 +50,10 @@ _METHODS = {
 def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     """Half the peak-to-peak displacement over the frequency, and the phase where it is stored; or maps.
 
-    Each of ``dataset`` and ``others`` (results of other methods or parameters) may have the single axis ``omega``:
+    Each of ``dataset`` and ``others`` (results for the same parameters by other methods) may have the single axis ``omega``:
     stable motions are full lines, unstable ones dashed, jumps of a sweep dotted. One dataset with a second axis gives
-    maps of both sweeps. Raises :class:`InputError` for other axes and where nothing that is shown is stored.
+    maps of both sweeps. Raises :class:`InputError` for other axes or parameters, for a method that is given twice, and
+    where nothing that is shown is stored.
     """
     with matplotlib.rc_context(STYLE):
         results = [cells.prepare(each) for each in (dataset, *others)]
@@ -67,7 +68,31 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
                 )
         for each in results:
             cells.require(each, "u_max", "u_min")
+        _check_comparable(results)
         return _lines(results)
+
+
+def _check_comparable(results: list[xr.Dataset]) -> None:
+    """:class:`InputError` unless all results are for the same parameters, which the heading tells once, and differ in what
+    the legend tells."""
+    first, *others = (_fixed_values(each) for each in results)
+    for other in others:
+        for name in first | other:
+            if first.get(name) != other.get(name):
+                raise InputError(
+                    f"{name} = {other.get(name)}: allowed beside the first result is its value, {first.get(name)}"
+                )
+    labels = [_label(each, _METHODS[each.attrs.get("method", "exact")]) for each in results]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise InputError(f"files: {label!r} is given twice; allowed is every method once")
+
+
+def _fixed_values(result: xr.Dataset) -> dict[str, object]:
+    """Parameters of ``result`` that do not vary, its axes of a single value among them."""
+    fixed = json.loads(result.attrs.get("fixed_parameters", "{}"))
+    values = {name: entry.get("value") if isinstance(entry, dict) else entry for name, entry in fixed.items()}
+    return values | {str(name): c.item() for name, c in result.coords.items() if c.ndim == 0}
 
 
 def _lines(results: list[xr.Dataset]) -> Figure:

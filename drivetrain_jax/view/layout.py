@@ -20,6 +20,8 @@ from drivetrain_jax.view.style import FRAME_GREY, STYLE, caption
 WIDTH = 7.0
 DPI = 200
 _LABEL_SIZE = 8.5
+# Inches of the page that a line of a label takes, with a margin.
+_LABEL_LINE = 0.16
 _INCHES_PER_LETTER = 0.068
 _CLEAR = 0.07
 _INCHES_PER_ENTRY = 0.45
@@ -78,11 +80,11 @@ class Panels:
 
     def label_axes(self, horizontal: str, vertical: str = "") -> None:
         """One label for all horizontal axes and one for all vertical ones, wrapped to the panels' extent."""
+        self._label_side([row[0] for row in self.axes], vertical)
         first, last = self.axes[0][0].get_position(), self.axes[-1][-1].get_position()
         x, y = (first.x0 + last.x1) / 2, last.y0 - 0.36 / self.figure.get_figheight()
         text = _wrap(horizontal, (last.x1 - first.x0) * WIDTH)
         self.figure.text(x, y, text, ha="center", va="center", size=_LABEL_SIZE)
-        self._label_side([row[0] for row in self.axes], vertical)
         # All columns have one power of ten: written at the right end, clear of the label in the middle.
         for row in self.axes:
             for axes in row[:-1]:
@@ -97,9 +99,22 @@ class Panels:
         usual = self.axes[0][0].get_position().x0 - self.margins.label / WIDTH
         x = min(usual, *(_left_of_numbers(axes) for axes in beside))
         text = _wrap(text, (top - bottom) * self.figure.get_figheight())
+        missing = (text.count("\n") + 1) * _LABEL_LINE / WIDTH - x
+        if text and missing > 0:
+            self._move_left_edge(missing)
+            x += missing
         self.figure.text(
             x, (bottom + top) / 2, text, ha="right", va="center", multialignment="center", rotation=90, size=_LABEL_SIZE
         )
+
+    def _move_left_edge(self, shift: float) -> None:
+        """Make the panels narrower: numbers that are wide would leave no room for their label."""
+        left, right = self.axes[0][0].get_position().x0, self.axes[0][-1].get_position().x1
+        narrower = (right - left - shift) / (right - left)
+        for axes in (axes for row in self.axes for axes in row):
+            box = axes.get_position()
+            x0, x1 = (right - (right - x) * narrower for x in (box.x0, box.x1))
+            axes.set_position((x0, box.y0, x1 - x0, box.height))
 
     def titles(self, dataset: xr.Dataset, note: str = "") -> None:
         """The scene's title and, below it, the fixed parameters (and ``note``)."""

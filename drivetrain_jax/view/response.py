@@ -72,8 +72,8 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
     handles += cells.draw_failures(stack[0], dataset, name)
     for axes in stack:
         predicted = resonances.draw(axes, lines)
-    resonances.label(stack[0], lines)
     panels.label_axes(axis_label(dataset[name]))
+    resonances.label(stack[0], lines)
     panels.titles(dataset)
     panels.legend([*handles, *predicted])
     return panels.figure
@@ -109,8 +109,8 @@ def _maps(dataset: xr.Dataset, names: list[str], shown: list[str]) -> Figure:
             panels.colorbar(axes, mesh, variable_label(field))
     lines = resonances.predictions(dataset, horizontal, vertical, families=("H",))
     handles = resonances.draw(panels.axes[0][0], lines)
-    resonances.label(panels.axes[0][0], lines)
     panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
+    resonances.label(panels.axes[0][0], lines)
     panels.titles(dataset)
     panels.legend([*handles, *cells.failure_legend(dataset)])
     return panels.figure

@@ -75,8 +75,8 @@ def _chart(dataset: xr.Dataset, names: list[str]) -> Figure:
     # Over the upper panel only: the map below shows the narrow tongues uncovered.
     lines = resonances.predictions(dataset, horizontal, vertical)
     handles += resonances.draw(panels.axes[0][0], lines)
-    resonances.label(panels.axes[0][0], lines)
     panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
+    resonances.label(panels.axes[0][0], lines)
     panels.titles(dataset)
     panels.legend(handles)
     return panels.figure
@@ -103,8 +103,8 @@ def _curve(dataset: xr.Dataset, name: str, marker: str = "") -> Figure:
         handles += cells.state_legend(dataset)
     lines = resonances.predictions(dataset, name)
     resonances.draw(axes, lines)
-    resonances.label(axes, lines)
     panels.label_axes(axis_label(dataset[name]), variable_label(radius))
+    resonances.label(axes, lines)
     panels.titles(dataset)
     panels.legend(handles)
     return panels.figure
@@ -150,6 +150,7 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
     height = _SMALL_PANEL if len(slices) > 1 else _PANEL
     panels = Panels(len(slices), len(slices[0]), height=height, margins=margins)
     predicted: list[Line2D] = []
+    labels: list[tuple[Axes, list[resonances.Prediction]]] = []
     for panel, axes in zip(chain(*slices), chain(*panels.axes), strict=True):
         if plain:
             _draw_radius(panels, axes, panel, dataset, (horizontal, vertical))
@@ -159,11 +160,13 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
         predicted = max(predicted, resonances.draw(axes, lines), key=len)
         first_row = axes in panels.axes[0]
         if first_row:
-            resonances.label(axes, [line for line in lines if line.order == 1])
+            labels.append((axes, [line for line in lines if line.order == 1]))
         axes.set_title(_slice_text(panel, across, down), pad=24 if first_row and lines else 4)
     if not cells.is_logarithmic(dataset[horizontal].values):
         panels.axes[0][0].set_xticks(_clear_ticks(panels.axes[0][0]))
     panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
+    for axes, lines in labels:
+        resonances.label(axes, lines)
     shown = len(slices) * len(slices[0])
     notes = [
         *(["stable everywhere"] if plain else []),

@@ -166,6 +166,11 @@ WRONG_RUNS = {
     "out of range": (change("b = 2.0", "b = -2.0"), [], "b = -2.0"),
     "axis end out of range": (change("stop = 10.0", "stop = 11"), [], "axes.a = 11"),
     "not a number": (change("b = 2.0", "b = nan"), [], "b = nan"),
+    "an entry and its table": (
+        lambda: None,
+        ["--set", "axes.a.num=3", "--set", "axes.a={values=[1.0, 2.0]}"],
+        "--set = 'axes.a.num': it is part of 'axes.a', which is given too",
+    ),
     "empty axis": (change("{ start = 0.0, stop = 10.0, num = 21 }", "{ values = [] }"), [], "empty axis"),
     "num = 0": (change("num = 21", "num = 0"), [], "num = 0"),
     "too many points": (change("num = 21", "num = 3000000000"), [], "3000000000 points"),

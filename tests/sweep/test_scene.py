@@ -126,6 +126,11 @@ WRONG = {
     "axis value out of range": (changed(axes={"a": {"values": [1, 11]}}), "axes.a = 11", "a <= 10"),
     "axis with nan": (changed(axes={"a": {"values": [1, float("nan")]}}), "axes.a = nan", "0 <= a"),
     "empty axis": (changed(axes={"a": {"values": []}}), "axes.a.values = []", "one value or more"),
+    "one point of two ends": (
+        changed(axes={"a": {"start": 0, "stop": 1, "num": 1}}),
+        "axes.a.num = 1: start = 0 and stop = 1 are two values",
+        "allowed is num >= 2, or values = [0]",
+    ),
     "no points on an axis": (changed(axes={"a": {"start": 0, "stop": 1, "num": 0}}), "axes.a.num = 0", "num >= 1"),
     "num of the wrong type": (changed(axes={"a": {"start": 0, "stop": 1, "num": 2.5}}), "axes.a.num = 2.5", "integer"),
     "axis without num": (changed(axes={"a": {"start": 0, "stop": 1}}), "axes.a.num", "atlas"),

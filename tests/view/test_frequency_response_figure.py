@@ -55,6 +55,23 @@ def lines_of(axes, style: str) -> list:
     return [item for item in axes.lines if item.get_linestyle() == "--"]
 
 
+def with_fixed(dataset: xr.Dataset, **values: float) -> xr.Dataset:
+    fixed = {name: {"value": value, "units": "1"} for name, value in values.items()}
+    return dataset.assign_attrs(fixed_parameters=json.dumps(fixed))
+
+
+def test_what_shares_a_figure_has_the_same_parameters_and_another_method():
+    """The heading tells the parameters once, and the legend a method."""
+    first = with_fixed(line(), B1=0.03)
+    plot(first, with_fixed(line("exact"), B1=0.03))
+    with pytest.raises(InputError, match=r"B1 = 0\.02: allowed beside the first result is its value, 0\.03"):
+        plot(first, with_fixed(line("exact"), B1=0.02))
+    with pytest.raises(InputError, match=r"B1 = 0\.02: allowed .* 0\.03"):
+        plot(first, line("exact").assign_coords(B1=0.02))
+    with pytest.raises(InputError, match="'multiple scales' is given twice"):
+        plot(first, first)
+
+
 def test_jumps_are_dotted_and_not_bridged():
     axes = plot(line()).axes[0]
     dotted = lines_of(axes, ":")

@@ -25,10 +25,28 @@ def test_the_label_is_clear_of_the_numbers(top, whole):
             axes.set_ylim(-top, top)
         panels.label_axes("horizontal", "vertical") if whole else panels.label_row(panels.axes[0][0], "vertical")
         drawn(panels)
-    label = panels.figure.texts[-1].get_window_extent()
+    (label,) = (text.get_window_extent() for text in panels.figure.texts if text.get_text() == "vertical")
     numbers = [text for text in panels.axes[0][0].get_yticklabels() if abs(text.get_position()[1]) <= top]
-    assert panels.figure.texts[-1].get_text() == "vertical"
     assert 0 <= label.x0 and label.x1 < min(text.get_window_extent().x0 for text in numbers) - 0.04 * panels.figure.dpi
+
+
+@pytest.mark.parametrize("columns", [1, 2])
+def test_wide_numbers_leave_room_for_a_label_of_two_lines(columns):
+    """0.99975 and the like: the panels become narrower, and keep their right end and their gaps."""
+    with matplotlib.rc_context(STYLE):
+        panels, before = (Panels(1, columns, height=1.5) for _ in range(2))
+        panels.axes[0][0].set_ylim(0.99905, 1.00005)
+        panels.label_axes("horizontal", "the largest modulus of all of the multipliers of the shaft [1]")
+        drawn(panels)
+        numbers = [text.get_window_extent().x0 for text in panels.axes[0][0].get_yticklabels() if text.get_text()]
+    label = next(text for text in panels.figure.texts if "modulus" in text.get_text())
+    assert "\n" in label.get_text() and 0 <= label.get_window_extent().x0
+    assert label.get_window_extent().x1 < min(numbers)
+    ends = [[axes.get_position().x1 for axes in each.axes[0]] for each in (panels, before)]
+    assert ends[0][-1] == pytest.approx(ends[1][-1], abs=1e-12)
+    assert panels.axes[0][0].get_position().x0 > before.axes[0][0].get_position().x0
+    widths = [axes.get_position().width for axes in panels.axes[0]]
+    assert widths == pytest.approx([widths[0]] * columns)
 
 
 def test_small_and_large_numbers_have_a_power_of_ten_beside_the_axis():
