@@ -60,7 +60,7 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
     lines += ["nearest change of stability"] if nearest else []
     for each in nearest:
         sides = [_side(asked, each.parameter, each.value, c) for c in (each.below, each.above) if c]
-        lines.append(f"  {each.parameter:<24} {'; '.join(sides) or _reach(atlas, each.parameter)}")
+        lines.append(f"  {each.parameter:<24} {'; '.join(sides) or _reach(atlas, each)}")
         lines += [f"  {'':<24} undecided from {_number(a)} to {_number(b)}" for a, b in each.undecided]
     data = {
         "system": atlas.scene.system.name,
@@ -321,9 +321,11 @@ def _side(asked: _Asked, name: str, value: float, crossing: Crossing) -> str:
     return f"{abs(crossing.value - value):.6g} {where}: {asked.named(name, crossing.value)} +- {crossing.error:.1e}"
 
 
-def _reach(atlas: StoredAtlas, name: str) -> str:
-    low, high = atlas.ranges[name]
-    return f"none from {_number(low)} to {_number(high)}"
+def _reach(atlas: StoredAtlas, nearest: design.Nearest) -> str:
+    low, high = atlas.ranges[nearest.parameter]
+    # Stability may change within a range that is undecided.
+    elsewhere = ", unless where it is undecided:" if nearest.undecided else ""
+    return f"none from {_number(low)} to {_number(high)}{elsewhere}"
 
 
 def _value(variable: Any, value: Any) -> str:

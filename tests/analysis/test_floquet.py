@@ -116,6 +116,46 @@ def test_bound_counts_rounding_that_grows_on_the_way(direct, rtol):
     assert (found["spectral_radius_error"] <= 1e-8 * CROSSING_RADIUS + 10 * rtol * CROSSING_RADIUS).all()
 
 
+# beta, Omega, zeta, alpha, mu, gamma; spectral radius by benchmarks/cardan_precise_reference.py with BITS = 300.
+STIFF_AND_SOFT = (
+    (1.2406405954877202, 0.3171689579416352, 0.52542871630596923),
+    (1.2458283486844648, 0.33150135645386614, 0.99999999999974989),
+    (1.2395863741339859, 0.3324238451657872, 0.99999999999950080),
+)
+
+
+@pytest.mark.parametrize("rtol", [1e-5, 1e-10, 1e-13])
+def test_bound_counts_the_rounding_of_entries_that_both_step_sizes_share(direct, rtol):
+    """The stiffness of a soft mode is the difference of entries five hundred times as large."""
+    beta, omega, exact = map(np.array, zip(*STIFF_AND_SOFT, strict=True))
+    shaft = {"zeta": 0.11912450176186314, "alpha": 45.51311106679596, "mu": 520.8626364709467}
+    found = direct({"beta": beta, "Omega": omega, **shaft, "gamma": 0.9443277346781929}, rtol=rtol)
+    error = np.abs(found["spectral_radius"] - exact)
+    assert (error <= found["spectral_radius_error"]).all(), error / found["spectral_radius_error"]
+    assert (found["spectral_radius_error"] <= 5e-11 + 10 * rtol).all()
+    assert found["verdict"].tolist() == [STABLE, UNDECIDED, UNDECIDED]
+
+
+def test_errors_that_cancel_in_the_product_do_not_deceive():
+    """Z is nearly of rank one here, and with 11 and 22 steps its largest multiplier is wrong by the same amount."""
+    easy = (1.0563183658089397, 2.7349631755532484, 0.5761121672699921, 10.00834660652285, 0.0793118790, 49.2510470811)
+    hard = (1.430161738887235, 2.831786623776442, 0.6559498501124649, 6.079785878549506, 0.07667072270795319)
+    points = np.array([(*hard, 51.92629177049027), easy]).T
+    batch = FloquetBatch("direct", chunk=(2, 1))
+    names = ("beta", "Omega", "zeta", "alpha", "mu", "gamma")
+    loose, sharp = (batch(dict(zip(names, points, strict=True)), rtol=rtol) for rtol in (1e-5, 1e-12))
+    error = np.abs(loose["spectral_radius"] - sharp["spectral_radius"])
+    assert (error <= loose["spectral_radius_error"]).all()
+
+
+def test_what_underflows_is_not_exactly_zero(direct):
+    point = BASE | {"beta": np.array([0.0]), "Omega": 0.001, "zeta": 1.0, "gamma": 1.0}
+    for rtol in (1e-3, 1e-10):
+        found = direct(point, rtol=rtol)
+        assert 0 < found["spectral_radius_error"][0] < 1e-300 and found["verdict"][0] == STABLE
+        assert found["outcome"][0] == Outcome.TOLERANCE_NOT_MET
+
+
 def test_error_follows_the_tolerance(direct, sample):
     rtol = 1e-5
     points, exact = {name: x[:256] for name, x in sample[0].items()}, sample[2]["spectral_radius"][:256]

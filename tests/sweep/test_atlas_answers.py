@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 import drivetrain_jax as dt
-from drivetrain_jax.atlas import stability
+from drivetrain_jax.atlas import design, stability
 from drivetrain_jax.atlas.sensitivity import direct_sensitivity
 from drivetrain_jax.atlas.tiles import tiles
 from drivetrain_jax.sweep import atlas_answers
@@ -128,6 +128,13 @@ def test_the_nearest_change_beside_an_undecided_range():
     below = atlas_answers.query(atlas, {"beta": 0.894981, "Omega": 0.752}).data["nearest"]["Omega"]["below"]
     exact = atlas_answers.query(atlas_of((0.0, 1.3), (0.15, 2.0)), {"beta": 0.894981, "Omega": 0.752})
     assert abs(below["value"] - exact.data["nearest"]["Omega"]["below"]["value"]) < below["error"] < 1e-3
+
+
+def test_a_change_that_may_hide_in_an_undecided_range_is_not_denied():
+    atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
+    nearest = design.Nearest("Omega", 1.0, None, None, ((0.9, 1.1),))
+    assert atlas_answers._reach(atlas, nearest) == "none from 0.3 to 2, unless where it is undecided:"
+    assert atlas_answers._reach(atlas, replace(nearest, undecided=())) == "none from 0.3 to 2"
 
 
 def test_answers_without_damping_agree_with_direct_solves():

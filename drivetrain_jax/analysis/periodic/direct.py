@@ -10,6 +10,7 @@ functions broadcast over a trailing batch.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
 from typing import NamedTuple
 
 import jax
@@ -56,10 +57,13 @@ def assemble(system: LinearPeriodic, phi: Array) -> Array:
     return matmul(matmul(x, matmul(jnp.swapaxes(phi, 0, 1), x)), phi)
 
 
-def stiffness_of(system: LinearPeriodic) -> Array:
-    """Largest rate of one point times the span: max |a_ij a_ji|^(1/2) at 16 instants, which no scaling of states changes."""
-    a = jax.vmap(system.matrix)((jnp.arange(16) + 0.5) * system.span / 16)
-    return system.span * jnp.sqrt(jnp.max(jnp.abs(a * jnp.swapaxes(a, 1, 2))))
+def stiffness_of(system: LinearPeriodic, shape: tuple[int, ...] = ()) -> Array:
+    """Largest rate times the span in every lane, of batch shape ``shape``: max |a_ij a_ji|^(1/2), which no scaling of states
+    changes, in the mean over 16 instants."""
+    rows = system.rows(*system.basis((jnp.arange(16) + 0.5)[:, None] * system.span / 16))
+    pairs = [jnp.abs(jnp.asarray(row[j] * rows[j][i], float)) for i, row in enumerate(rows) for j in range(i + 1)]
+    largest = jnp.broadcast_to(reduce(jnp.maximum, pairs), (16, *(shape or (1,))))
+    return system.span * jnp.mean(jnp.sqrt(largest), axis=0).reshape(shape)
 
 
 def stable_steps(system: LinearPeriodic) -> Array:
@@ -79,23 +83,26 @@ def compare(
     rtol: float,
     reduction: float,
 ) -> Monodromy:
-    """Monodromy matrix of ``fine`` and its error.
+    """Monodromy matrix of ``fine`` and its error; ``stiffness`` as of :func:`stiffness_of`.
 
-    ``reduction`` is the error of ``coarse`` over that of ``fine``, less one. Rounding of the matrix products accumulates
-    like the square root of ``steps``; what is made on the way grows until the end as ``fine`` says, but never by so much
-    that it would not show in ``coarse``, which rounds independently. Rounding of the coefficients shifts exponents by the
-    ``stiffness``, the largest rate times the span. Parts, if there are any, have to agree as well, relative to their own
-    norms.
+    ``reduction`` is the error of ``coarse`` over that of ``fine``, less one. The propagators themselves are compared too,
+    lest the errors of a product that is nearly of rank one are small by accident, and so are parts, if there are any, all
+    relative to their own norms. Rounding of the matrix products accumulates like the square root of ``steps``. What is made
+    on the way grows until the end as ``fine`` says, but never by so much that it would not show in ``coarse``. That of the
+    entries of A is the same in both propagators: it shifts exponents by four units of the
+    ``stiffness``.
     """
     halves = 1 if system.reversor is None else 2
     z_fine = assemble(system, fine.matrix)
-    z_coarse = assemble(system, jnp.exp(coarse.log_scale - fine.log_scale) * coarse.matrix)
+    other = jnp.exp(coarse.log_scale - fine.log_scale) * coarse.matrix
+    z_coarse = assemble(system, other)
     a_fine, a_coarse = characteristic_coefficients(z_fine), characteristic_coefficients(z_coarse)
     scale = root_scale(a_fine)
     n = a_fine.shape[0]
     log_scale = halves * fine.log_scale
     differences = [jnp.sqrt(jnp.sum((z_fine - z_coarse) ** 2, axis=(0, 1))) / scale]
     differences += [jnp.abs(a_fine[k] - a_coarse[k]) / scale ** (k + 1) for k in range(n)]
+    differences.append(_relative_difference(fine.matrix[None], other[None])[0])
     change = None
     if fine.parts is not None:
         change = (4 / reduction) * (z_fine - z_coarse)
@@ -108,10 +115,12 @@ def compare(
         residual = ((-1) ** n * a_fine[-1] - exact) / scale**n
     truncation = jnp.maximum(truncation, jnp.abs(residual))
     norm = jnp.sum(fine.matrix**2, axis=(0, 1)) ** (halves / 2)
-    growth = 1.0 if fine.growth is None else fine.growth
-    at_the_end = np.finfo(float).eps * (4 + jnp.sqrt(steps)) * norm / scale
-    on_the_way = jnp.minimum((growth - 1) * at_the_end, difference)
-    rounding = at_the_end + on_the_way + np.finfo(float).eps * halves * stiffness
+    # Eightfold growth is well within what rounding of the products is taken for.
+    growth = 1.0 if fine.growth is None else jnp.maximum(fine.growth / 8, 1.0)
+    unit = np.finfo(float).eps * norm / scale
+    at_the_end = (4 + jnp.sqrt(steps)) * unit
+    of_entries = 4 * halves * stiffness * np.finfo(float).eps
+    rounding = at_the_end + jnp.minimum((growth - 1) * at_the_end, difference) + of_entries
     met = truncation <= jnp.maximum(rtol, rounding)
     return Monodromy(z_fine, log_scale, truncation + rounding, met, residual, fine.parts, change)
 
@@ -136,8 +145,8 @@ def direct_monodromy(
     """Refine from ``steps`` predicted steps (traced integer) until the error of every lane is at most ``rtol``.
 
     ``propagate(steps)`` gives the propagator of ``system`` with batch shape ``shape``, by a scheme of order ``order``.
-    ``stiffness`` is that of :func:`stiffness_of`, or 0 for a scheme whose steps resolve every rate. A lane that overflows
-    gets two doublings to recover and then no longer holds up the others; after six the error tells what was reached.
+    ``stiffness`` is that of :func:`stiffness_of`. A lane that overflows gets two doublings to recover and then no longer
+    holds up the others; after six the error tells what was reached.
     The first comparison is with ``ratio`` times fewer steps, as far as there are as many in every one of ``parts`` parts. It
     costs the less the more that is, but the order of the scheme has to show in both: a small ``rtol`` makes sure of that, as
     does that they are not fewer than the ``least`` with which it is stable, or than four fifths of the steps.

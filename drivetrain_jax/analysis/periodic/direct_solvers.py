@@ -28,6 +28,9 @@ from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System
 # predicts them itself: of any other one it is not known that the order of the scheme shows with so few.
 _RATIO, _FINE = 4, 1e-8
 
+# The explicit scheme follows every rate, and rounds the entries that belong to it anew at each of its stages.
+_EVERY_RATE = 4.0
+
 Form = Callable[[FloquetModel], LinearPeriodic]
 Results = Callable[[FloquetModel, Monodromy], dict[str, Array]]
 
@@ -97,7 +100,8 @@ def _solve(
         return implicit_propagator(periodic, steps, parts)
 
     propagate = in_lanes if explicit else one
-    order, stiffness = (EXPLICIT_ORDER, 0.0) if explicit else (IMPLICIT_ORDER, stiffness_of(periodic))
+    order = EXPLICIT_ORDER if explicit else IMPLICIT_ORDER
+    stiffness = (_EVERY_RATE if explicit else 1.0) * stiffness_of(periodic, shape)
     ratio = jnp.where(target <= _FINE, _RATIO, 2) if explicit and model.explicit_steps else 2
     found = direct_monodromy(periodic, propagate, effort, shape, stiffness, target, order, ratio, max(parts, 1), least)
     return results(model, found)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from drivetrain_jax._quantities import Variable
@@ -31,6 +32,7 @@ VARIABLES = (
     ),
 )
 NEED_ERROR = {"spectral_radius_error", "verdict"}
+_TINY = np.finfo(float).tiny
 MULTIPLIERS = {"floquet_multiplier", "floquet_exponent"}
 
 
@@ -75,8 +77,10 @@ def results(
     found |= {"spectral_radius": rho * size, "liouville_residual": jnp.where(finite, z.residual, jnp.nan)}
     met = z.met
     if wanted & NEED_ERROR:
-        met = error <= 10 * rtol * rho
-        found |= {"spectral_radius_error": error * size, "verdict": verdict(rho * size, error * size)}
+        # What underflows is not 0: then the smallest number is its bound.
+        met = (error <= 10 * rtol * rho) & (rho * size >= _TINY)
+        bound = jnp.maximum(error * size, _TINY)
+        found |= {"spectral_radius_error": bound, "verdict": verdict(rho * size, bound)}
     outcome = jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
     outcome = jnp.where(finite, outcome, Outcome.NOT_FINITE)
     return {name: found[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}
