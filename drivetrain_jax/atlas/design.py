@@ -99,8 +99,8 @@ class Windows:
 
 @dataclass(frozen=True)
 class Nearest:
-    """The nearest changes of stability ``below`` and ``above`` a value of ``parameter`` whose places are known; None where the
-    atlas ends first. Further ones may lie in the ``undecided`` ranges."""
+    """The nearest changes of stability ``below`` and ``above`` a value of ``parameter`` whose places are known; None where
+    the atlas ends first. Further ones may lie in the ``undecided`` ranges."""
 
     parameter: str
     value: float
