@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Set
 from concurrent.futures import Future
@@ -56,6 +57,11 @@ class Engine:
     def numerics_detail(self) -> dict[str, Any]:
         """What that digest is of, piece by piece."""
         return numerics_of(self.scene)
+
+    @property
+    def numerics_attrs(self) -> dict[str, str]:
+        """Both as a result and a plan keep them."""
+        return {"numerics": self.numerics, "numerics_detail": json.dumps(self.numerics_detail)}
 
     @cached_property
     def digest(self) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -229,6 +228,4 @@ def _atlas(engine: Engine, work: Work, progress: Progress) -> xr.Dataset:
 
 def _attrs(engine: Engine) -> dict[str, str | float]:
     """Whose result it is; what it took is told at its end."""
-    detail = json.dumps(engine.numerics_detail)
-    numerics = {"numerics": engine.numerics, "numerics_detail": detail}
-    return {"digest": engine.digest, **numerics, "wall_time_s": 0.0}
+    return {"digest": engine.digest, **engine.numerics_attrs, "wall_time_s": 0.0}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import time
@@ -121,8 +120,7 @@ def _create(engine: Engine, path: Path) -> None:
 
 def _attrs(engine: Engine) -> dict[str, str | int]:
     """Whose result it is, and which points its shards hold: those that no solver can do are in none."""
-    detail = json.dumps(engine.numerics_detail)
-    whose = {"digest": engine.digest, "numerics": engine.numerics, "numerics_detail": detail}
+    whose = {"digest": engine.digest, **engine.numerics_attrs}
     held = {shards.GROUPS: shards.describe(groups_of(engine)), shards.HELD: engine.plan.size}
     return result_attrs(engine.scene) | whose | held
 

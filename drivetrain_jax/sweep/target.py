@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
@@ -228,8 +227,7 @@ def provenance_of(engine: Engine) -> dict[str, str]:
     return {
         "scene": engine.scene.text,
         "drivetrain_jax_version": drivetrain_jax.__version__,
-        "numerics": engine.numerics,
-        "numerics_detail": json.dumps(engine.numerics_detail),
+        **engine.numerics_attrs,
     }
 
 

@@ -89,8 +89,7 @@ def compare(
     lest the errors of a product that is nearly of rank one are small by accident, and so are parts, if there are any, all
     relative to their own norms. Rounding of the matrix products accumulates like the square root of ``steps``. What is made
     on the way grows until the end as ``fine`` says, but never by so much that it would not show in ``coarse``. That of the
-    entries of A is the same in both propagators: it shifts exponents by four units of the
-    ``stiffness``.
+    entries of A is the same in both propagators: it shifts exponents by four units of the ``stiffness``.
     """
     halves = 1 if system.reversor is None else 2
     z_fine = assemble(system, fine.matrix)

@@ -27,8 +27,8 @@ from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System
 # Steps of the explicit scheme over those of the coarser solution that tells its error, up to this rtol, where the system
 # predicts them itself: of any other one it is not known that the order of the scheme shows with so few.
 _RATIO, _FINE = 4, 1e-8
-
-# The explicit scheme follows every rate, and rounds the entries that belong to it anew at each of its stages.
+# The explicit scheme follows every rate, and rounds the entries that belong to it anew at each of its stages. Where points
+# were sought that break the bound, half of this was too little once.
 _EVERY_RATE = 4.0
 
 Form = Callable[[FloquetModel], LinearPeriodic]
