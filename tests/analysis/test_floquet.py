@@ -116,7 +116,7 @@ def test_bound_counts_rounding_that_grows_on_the_way(direct, rtol):
     assert (found["spectral_radius_error"] <= 1e-8 * CROSSING_RADIUS + 10 * rtol * CROSSING_RADIUS).all()
 
 
-# beta, Omega, zeta, alpha, mu, gamma; spectral radius by benchmarks/cardan_precise_reference.py with BITS = 300.
+# beta, Omega; spectral radius by benchmarks/cardan_precise_reference.py with BITS = 300.
 STIFF_AND_SOFT = (
     (1.2406405954877202, 0.3171689579416352, 0.52542871630596923),
     (1.2458283486844648, 0.33150135645386614, 0.99999999999974989),
@@ -134,6 +134,29 @@ def test_bound_counts_the_rounding_of_entries_that_both_step_sizes_share(direct,
     assert (error <= found["spectral_radius_error"]).all(), error / found["spectral_radius_error"]
     assert (found["spectral_radius_error"] <= 5e-11 + 10 * rtol).all()
     assert found["verdict"].tolist() == [STABLE, UNDECIDED, UNDECIDED]
+
+
+# Columns as above; taken by the implicit scheme at a tolerance of 1e-13.
+TOO_LONG_TO_MARCH = (
+    (1.1752422858416216, 0.1533373642851158, 0.000031524877051342704379),
+    (1.177266820356422, 0.15211986425991417, 0.000036121927451657249321),
+    (1.1833404239008234, 0.15130819757644642, 0.000023066282558911271422),
+    (1.16714414778242, 0.15536653099378517, 0.000040448626806663973144),
+)
+
+
+def test_bound_counts_the_rounding_of_entries_in_the_implicit_scheme_too(direct):
+    beta, omega, exact = map(np.array, zip(*TOO_LONG_TO_MARCH, strict=True))
+    shaft = {
+        "zeta": 1.2355069626811421,
+        "alpha": 3.8571086733775415,
+        "mu": 447.2975440886813,
+        "gamma": 2.6446796826861276,
+    }
+    found = direct({"beta": beta, "Omega": omega, **shaft}, rtol=1e-13)
+    error = np.abs(found["spectral_radius"] - exact)
+    assert (error <= found["spectral_radius_error"]).all(), error / found["spectral_radius_error"]
+    assert (found["spectral_radius_error"] <= 1e-10 * exact).all()
 
 
 def test_errors_that_cancel_in_the_product_do_not_deceive():

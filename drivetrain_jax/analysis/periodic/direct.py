@@ -28,6 +28,8 @@ _MAX_REFINEMENTS = 6
 _MAX_STEPS = 2**20
 # The explicit scheme is stable for decays of up to this much in a step.
 _STABLE = 6.0
+# Rounding of the entries of A, in units of the last place: half of it was too little where points were sought that break it.
+_ENTRIES = 16
 
 
 class Monodromy(NamedTuple):
@@ -89,7 +91,7 @@ def compare(
     lest the errors of a product that is nearly of rank one are small by accident, and so are parts, if there are any, all
     relative to their own norms. Rounding of the matrix products accumulates like the square root of ``steps``. What is made
     on the way grows until the end as ``fine`` says, but never by so much that it would not show in ``coarse``. That of the
-    entries of A is the same in both propagators: it shifts exponents by four units of the ``stiffness``.
+    entries of A is the same in both propagators: it shifts exponents by `_ENTRIES` units of the ``stiffness``.
     """
     halves = 1 if system.reversor is None else 2
     z_fine = assemble(system, fine.matrix)
@@ -118,7 +120,7 @@ def compare(
     growth = 1.0 if fine.growth is None else jnp.maximum(fine.growth / 8, 1.0)
     unit = np.finfo(float).eps * norm / scale
     at_the_end = (4 + jnp.sqrt(steps)) * unit
-    of_entries = 4 * halves * stiffness * np.finfo(float).eps
+    of_entries = _ENTRIES * halves * stiffness * np.finfo(float).eps
     rounding = at_the_end + jnp.minimum((growth - 1) * at_the_end, difference) + of_entries
     met = truncation <= jnp.maximum(rtol, rounding)
     return Monodromy(z_fine, log_scale, truncation + rounding, met, residual, fine.parts, change)

@@ -27,9 +27,6 @@ from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System
 # Steps of the explicit scheme over those of the coarser solution that tells its error, up to this rtol, where the system
 # predicts them itself: of any other one it is not known that the order of the scheme shows with so few.
 _RATIO, _FINE = 4, 1e-8
-# The explicit scheme follows every rate, and rounds the entries that belong to it anew at each of its stages. Where points
-# were sought that break the bound, half of this was too little once.
-_EVERY_RATE = 4.0
 
 Form = Callable[[FloquetModel], LinearPeriodic]
 Results = Callable[[FloquetModel, Monodromy], dict[str, Array]]
@@ -101,7 +98,7 @@ def _solve(
 
     propagate = in_lanes if explicit else one
     order = EXPLICIT_ORDER if explicit else IMPLICIT_ORDER
-    stiffness = (_EVERY_RATE if explicit else 1.0) * stiffness_of(periodic, shape)
+    stiffness = stiffness_of(periodic, shape)
     ratio = jnp.where(target <= _FINE, _RATIO, 2) if explicit and model.explicit_steps else 2
     found = direct_monodromy(periodic, propagate, effort, shape, stiffness, target, order, ratio, max(parts, 1), least)
     return results(model, found)
