@@ -118,3 +118,10 @@ def test_kernels_do_not_call_lapack(scene):
 def test_every_method_says_what_it_is(name):
     analysis = get_analysis(name)
     assert analysis.method_titles.keys() == analysis.methods.keys()
+
+
+@pytest.mark.parametrize("name", analysis_names())
+def test_every_integer_option_ends_where_kernels_can_count(name):
+    """Beyond, a motion was not waited for at all, and labels did not fit into memory."""
+    for option in get_analysis(name).options:
+        assert not option.integer or option.upper < 2**31 or option.name == "seed"

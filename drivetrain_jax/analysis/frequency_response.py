@@ -60,7 +60,15 @@ OPTIONS = (
     ),
     Parameter("harmonics", "1", "harmonics of the drive's frequency", default=15, lower=1, upper=200, integer=True),
     Parameter("subharmonic", "1", "order of the subharmonics kept", default=1, lower=1, upper=8, integer=True),
-    Parameter("samples", "1", "samples per period of the drive, 0: by the harmonics", default=0, lower=0, integer=True),
+    Parameter(
+        "samples",
+        "1",
+        "samples per period of the drive, 0: by the harmonics",
+        default=0,
+        lower=0,
+        upper=1e5,
+        integer=True,
+    ),
     Parameter(
         "fit_range", "m", "range R of the cubic fit, 0: the peak amplitude that it gives", default=0.0, lower=0.0
     ),

@@ -252,7 +252,9 @@ ANALYSIS = Analysis(
     options=(
         Parameter("times", "s", "times at which the state is wanted", default=(), listed=True, lower=0.0),
         Parameter("stop", "s", "end of the history (0: see times)", default=0.0, lower=0.0),
-        Parameter("num", "1", "number of equally spaced times from 0 to stop", default=1001, lower=2, integer=True),
+        Parameter(
+            "num", "1", "number of equally spaced times from 0 to stop", default=1001, lower=2, upper=1e7, integer=True
+        ),
         RTOL,
         Parameter("solver", "1", "diffrax solver", default="Dopri8", choices=SOLVERS),
     ),

@@ -62,7 +62,7 @@ VARIABLES = (
 OPTIONS = (
     Parameter("standard_error", "1/s", "standard error at which a run may end", default=0.0, lower=0.0),
     Parameter("max_time", "s", "longest time of a run", default=1.0, lower=0.0, open_lower=True),
-    Parameter("steps", "1", "integration steps per strobe", default=48, lower=4, integer=True),
+    Parameter("steps", "1", "integration steps per strobe", default=48, lower=4, upper=1e6, integer=True),
 )
 # Strobes that follow the run for the verdict and the 0-1 test, and the longest period looked for among them.
 SAMPLES, LONGEST = 1024, 512

@@ -45,9 +45,9 @@ VARIABLES = (
     Variable("section_error", "1", "estimated error of the section since the start, over the largest value"),
 )
 OPTIONS = (
-    Parameter("strobes", "1", "points of the section", default=5000, lower=128, integer=True),
-    Parameter("discard", "1", "strobes before the first point", default=5000, lower=0, integer=True),
-    Parameter("steps", "1", "integration steps per strobe", default=48, lower=4, integer=True),
+    Parameter("strobes", "1", "points of the section", default=5000, lower=128, upper=1e7, integer=True),
+    Parameter("discard", "1", "strobes before the first point", default=5000, lower=0, upper=1e9, integer=True),
+    Parameter("steps", "1", "integration steps per strobe", default=48, lower=4, upper=1e6, integer=True),
     Parameter("rtol", "1", "relative tolerance of a step", default=1e-3, lower=1e-14, upper=1e-1),
     Parameter("atol", "1", "absolute tolerance of a step", default=1e-6, lower=0.0, open_lower=True),
 )

@@ -65,7 +65,13 @@ VARIABLES = (
     Variable("periods_settled", "1", "drive periods until the attractor was recognised", dtype="int32"),
 )
 WAIT = Parameter(
-    "most_periods", "1", "drive periods after which a motion is given up", default=4000, lower=64, integer=True
+    "most_periods",
+    "1",
+    "drive periods after which a motion is given up",
+    default=4000,
+    lower=64,
+    upper=1e8,
+    integer=True,
 )
 # Points of a chunk: enough that the last lanes at work, with nothing left in the queue, are few.
 _CHUNK = 4096

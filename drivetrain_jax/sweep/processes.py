@@ -81,11 +81,12 @@ class _Slot:
             try:
                 self.running[self._pool.submit(worker.compute, self._job, chunk)] = chunk
             except BrokenProcessPool:
-                # It has just died; what it was computing tells so when it is collected.
                 waiting.put_back([chunk])
-                if not self.running:
-                    self._start()
-                return
+                if self.running:
+                    # It has just died; what it was computing tells so when it is collected.
+                    return
+                self._was_ready()
+                self._restart()
 
     def collect(self, waiting: _Tasks, deaths: Counter[int]) -> Iterator[tuple[Chunk, Results | None]]:
         """Results that are there. The chunk that a dead process was computing is tried again, or given up."""
@@ -98,13 +99,16 @@ class _Slot:
                 ready = self._was_ready()
                 waiting.put_back(self.running.values())
                 self.running.clear()
-                self._pool.shutdown(wait=False)
-                self._start()
+                self._restart()
                 deaths[chunk.number] += ready
                 if deaths[chunk.number] < ATTEMPTS:
                     waiting.put_back([chunk])
                 else:
                     yield chunk, None
+
+    def _restart(self) -> None:
+        self._pool.shutdown(wait=False)
+        self._start()
 
     def _was_ready(self) -> bool:
         """Whether the process died at a chunk. One that dies every time while it gets ready would do so for any."""

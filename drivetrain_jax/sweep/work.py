@@ -13,7 +13,7 @@ import numpy as np
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.store.chunks import Part, PartsFolder
 from drivetrain_jax.sweep.assemble import failures
-from drivetrain_jax.sweep.engine import Engine
+from drivetrain_jax.sweep.engine import ChunkError, Engine
 from drivetrain_jax.sweep.executor import Where
 from drivetrain_jax.sweep.plan import Chunk
 
@@ -57,7 +57,8 @@ class Work:
     """Computes chunks ``where`` and tells ``report``. With ``parts`` (open) it keeps them there, and computes none that
     is there already. ``seconds`` is what those took.
 
-    As a context it ends with the result that the chunks are for: what has not been written by then is, if that failed.
+    Leaving it as a context by an exception writes the finished chunks that are still in memory; leaving it normally drops
+    them, since the result holds them.
     """
 
     def __init__(self, where: Where, report: Report | None = None, parts: PartsFolder | None = None) -> None:
@@ -90,8 +91,8 @@ class Work:
             batch.flush()
         finally:
             batch.keep()
-            # An interrupt may come between keeping a chunk and counting it: what counts is what was kept.
-            progress.computed = before + batch.kept * engine.grid.path_length
+            # An interrupt may come between keeping a chunk and counting it: what counts is what was kept, or is lost.
+            progress.computed = before + (batch.kept + batch.lost) * engine.grid.path_length
 
     def _reuse(self, engine: Engine, parts: PartsFolder, sink: Sink, progress: Progress, first: int) -> np.ndarray:
         """Enter the chunks that are there; the numbers of those that are not."""
@@ -114,12 +115,14 @@ class Work:
         costs = engine.plan.costs
         progress.cost, progress.total_cost = 0.0, float(costs[numbers].sum())
         self._tell(progress)
+        missing = len(numbers)
         # Closed on the way out: after an interrupt no further chunk starts.
         with closing(where.compute(engine, numbers)) as finished:
             for chunk, results in finished:
+                missing -= 1
                 count = chunk.points.size * engine.grid.path_length
                 if results is None:
-                    batch.sink.lose(chunk.points)
+                    batch.lose(chunk)
                     progress.failed += count
                 else:
                     batch.add(chunk, results)
@@ -127,6 +130,8 @@ class Work:
                 progress.computed += count
                 progress.cost += float(costs[chunk.number])
                 self._tell(progress)
+        if missing:
+            raise ChunkError(f"{missing} chunks never came back")
 
     def _tell(self, progress: Progress) -> None:
         if self.report:
@@ -174,7 +179,7 @@ class _Batch:
         self._waiting: list[tuple[Chunk, Mapping[str, np.ndarray]]] = []
         self._bytes = 0
         self._begun = False
-        self.kept = 0
+        self.kept = self.lost = 0
 
     def add(self, chunk: Chunk, results: Mapping[str, np.ndarray]) -> None:
         self._waiting.append((chunk, results))
@@ -185,6 +190,11 @@ class _Batch:
             self.sink.fill(chunk.points, results)
         if self._bytes >= _MOST_WAITING or self._keeper.due():
             self.flush()
+
+    def lose(self, chunk: Chunk) -> None:
+        """Enter that nobody survived the chunk."""
+        self.sink.lose(chunk.points)
+        self.lost += chunk.points.size
 
     def flush(self) -> None:
         """Keep and enter what waits."""

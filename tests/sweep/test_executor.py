@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -113,7 +114,7 @@ def test_a_chunk_that_kills_every_process_is_all_that_is_lost(drivetrain, tmp_pa
     lost = ds.outcome.values == Outcome.LOST
     assert lost[:, 1].any() and np.isnan(ds.spectral_radius.values[lost]).all()
     assert (ds.outcome.values[~lost] == Outcome.SUCCESS).all() and (~lost).any()
-    assert f"failed={lost.sum()}" in error
+    assert f"computed={ds.outcome.size} reused=0 failed={lost.sum()}" in error
 
 
 def test_a_chunk_whose_process_dies_once_is_computed_again(drivetrain, tmp_path):
@@ -264,7 +265,31 @@ def _engine():
     return Engine(load_scene({"system": "cardan", "analysis": "floquet", "fixed": point}))
 
 
-def test_workers_of_the_python_interface():
-    assert dt.run.__kwdefaults__ == {
-        "overrides": None, "fresh": False, "threads": None, "workers": None, "dask": None, "reuse": (), "report": None
-    }  # fmt: skip
+def test_a_process_that_dies_between_two_chunks_is_replaced():
+    """When nothing is in flight nobody's result tells of its death: the points that are left must not be forgotten."""
+    seen = []
+
+    def report(progress):
+        seen.append(progress.computed)
+        if len(seen) == 2:
+            time.sleep(1)  # Both chunks in flight are done by then.
+        elif len(seen) == 3:
+            (worker,) = multiprocessing.active_children()
+            worker.kill()
+            time.sleep(1)
+
+    axes = {"beta": {"start": 0.1, "stop": 1.0, "num": 40}, "Omega": {"start": 0.5, "stop": 2.0, "num": 40}}
+    ds = dt.run(cardan_scene(axes), workers=1, report=report)
+    assert seen[:3] == [0, 512, 1024] and seen[-1] == 1600
+    assert (ds.outcome.values == Outcome.SUCCESS).all()
+
+
+def test_chunks_that_never_come_back_are_missed(monkeypatch):
+    monkeypatch.setattr(Where, "compute", lambda *_: (chunk for chunk in ()))
+    with pytest.raises(dt.Incomplete, match="chunks never came back"):
+        dt.run(cardan_scene({"beta": {"values": [0.1, 0.2]}, "Omega": {"values": [1.0]}}))
+
+
+def cardan_scene(axes):
+    shaft = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+    return {"system": "cardan", "analysis": "floquet", "axes": axes, "fixed": shaft, "options": {"method": "direct"}}
