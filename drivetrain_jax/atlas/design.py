@@ -59,10 +59,11 @@ class Check:
 
 @dataclass(frozen=True)
 class Answer:
-    """``value`` of ``parameter`` with a bound of its ``error``; None if no value in the atlas will do.
+    """``value`` of ``parameter`` with a bound of its ``error``; None if none was found.
 
     ``limit`` is the crossing that sets it (None: the atlas ends first), ``intervals`` lists all stable and unstable
-    ranges, ``undecided`` those that errors leave open; the answer is certain only if none of them is on its safe side.
+    ranges, ``undecided`` those that errors leave open; a value is certain only if none of them is on its safe side, and
+    that no value in the atlas will do only if none reaches the safe end.
     """
 
     parameter: str
@@ -211,14 +212,23 @@ def _extreme(atlas: Atlas, system: System, speeds: Range, sought: tuple[str, flo
     name, speed = system.roles[role], system.roles["speed"]
     part = narrow(atlas, {speed: speeds}).folded()
     line = stability_over_range(part, system, speed)
-    end = line.intervals[-1] if side > 0 else line.intervals[0]
-    value, limit = (end.lower, end.lower_end) if side > 0 else (end.upper, end.upper_end)
-    if not end.stable:
-        value, limit = None, None
-    certain = value is not None and not any(max(side * a, side * b) >= side * value for a, b in _apart(line, limit))
+    value, limit, certain = _from_safe_end(line, part, side)
     answer = Answer(name, value, limit.error if limit else 0.0, limit, line.intervals, line.undecided, certain)
     found = _checked(answer, part, speed, side, direct)
     return replace(found, check=_of_kind(found.check, Criteria.of(part, system)))
+
+
+def _from_safe_end(line: Line, part: Atlas, side: float) -> tuple[float | None, Crossing | None, bool]:
+    """Up to where, and to which crossing, it is stable from the end on that ``side`` on, and whether that is certain."""
+    if not line.intervals:
+        return None, None, False
+    end = line.intervals[-1] if side > 0 else line.intervals[0]
+    v = part.parameters.index(line.parameter)
+    reached = end.upper == part.upper[v] if side > 0 else end.lower == part.lower[v]
+    if not end.stable:
+        return None, None, bool(reached)
+    value, limit = (end.lower, end.lower_end) if side > 0 else (end.upper, end.upper_end)
+    return value, limit, not any(max(side * a, side * b) >= side * value for a, b in _apart(line, limit))
 
 
 def _apart(line: Line, limit: Crossing | None) -> list[Range]:

@@ -68,7 +68,7 @@ def roots(patches: Patches) -> Roots:
     new = np.diff(x, prepend=-np.inf) > 2 * error + 4 * np.finfo(float).eps * np.abs(x)
     new |= np.sign(slope) != np.sign(np.roll(slope, 1))
     new[:1] = True
-    return Roots(x[new], error[new], slope[new], _merge(np.concatenate(undecided)))
+    return Roots(x[new], error[new], slope[new], merge(np.concatenate(undecided)))
 
 
 def _bisect(patches: Patches, slope: Patches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -85,8 +85,8 @@ def _bisect(patches: Patches, slope: Patches) -> tuple[np.ndarray, np.ndarray, n
     return x[inside], (patches.error / np.abs(steepness))[inside], steepness[inside]
 
 
-def _merge(intervals: np.ndarray) -> np.ndarray:
-    """Adjacent intervals joined."""
+def merge(intervals: np.ndarray) -> np.ndarray:
+    """Intervals ``(K, 2)``, those that touch or overlap joined, rising."""
     merged: list[list[float]] = []
     for a, b in intervals[np.argsort(intervals[:, 0])]:
         if merged and a <= merged[-1][1]:

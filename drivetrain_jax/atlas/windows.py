@@ -13,7 +13,7 @@ from drivetrain_jax.atlas.exclusion import critical_points
 from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
 from drivetrain_jax.atlas.panels import Atlas, Gap, Panel, chebyshev, position_between
 from drivetrain_jax.atlas.patches import Patches, patches_of
-from drivetrain_jax.atlas.roots import on_line, roots
+from drivetrain_jax.atlas.roots import merge, on_line, roots
 from drivetrain_jax.atlas.tips import polish
 from drivetrain_jax.systems import System
 
@@ -54,9 +54,10 @@ class Interval:
 
 @dataclass(frozen=True)
 class Line:
-    """``intervals`` that alternate between stable and unstable, and the ``undecided`` ones among or next to them.
+    """``intervals`` that alternate between stable and unstable, and the ``undecided`` ranges within, between or beside them.
 
-    Where a change hides in an undecided range one interval ends, and the next one begins, with that range.
+    Where a change hides in an undecided range one interval ends, and the next one begins, with that range. So do the first
+    and the last one where the range reaches an end of the atlas. No intervals: everything is undecided.
     """
 
     parameter: str
@@ -81,13 +82,7 @@ def _along(atlas: Atlas, system: System) -> Line:
     changes, undecided = [], []
     for kind, patches in zip(criteria.multipliers, patches_of(criteria), strict=True):
         found = roots(patches)
-        values = parameters_at(atlas, found.x[:, None])[:, 0]
-        slopes = np.abs(atlas.coordinates[0].slope(values))
-        point = [{atlas.parameters[0]: float(v)} for v in values]
-        changes += [
-            Crossing(float(v), float(e / s), kind, p)
-            for v, e, s, p in zip(values, found.error, slopes, point, strict=True)
-        ]
+        changes += _crossings(atlas, found.x[:, None], found.error, 0, kind)
         undecided += [tuple(sorted(map(float, parameters_at(atlas, i[:, None])[:, 0]))) for i in found.undecided]
     undecided += [
         tuple(sorted(map(float, parameters_at(atlas, np.stack([g.lower, g.upper]))[:, 0]))) for g in atlas.gaps
@@ -161,26 +156,17 @@ def _part(box: Panel | Gap, lower: np.ndarray, upper: np.ndarray) -> Panel | Gap
         t = position_between(box.lower[k], box.upper[k], (low[k] * (1 - y) + high[k] * (1 + y)) / 2)
         matrix = analysis_matrix(n) @ chebyshev(t, n)
         coefficients = np.moveaxis(np.tensordot(matrix, coefficients, axes=(1, k)), 0, k)
-    return replace(box, lower=low, upper=high, coefficients=_without_tail(coefficients, box.value_error / 100))
-
-
-def _without_tail(coefficients: np.ndarray, limit: float) -> np.ndarray:
-    """Coefficients without those at the end that are below ``limit``: a part of a panel needs fewer than the whole."""
-    size = np.abs(coefficients)
-    for k in range(coefficients.ndim - 1):
-        largest = size.max(axis=tuple(j for j in range(size.ndim) if j != k))
-        kept = np.flatnonzero(largest > max(limit, 64 * np.finfo(float).eps * largest.max()))
-        needed = kept[-1] + 1 if kept.size else 1
-        coefficients = np.take(coefficients, range(needed), axis=k)
-    return coefficients
+    return replace(box, lower=low, upper=high, coefficients=coefficients)
 
 
 def _crossings(atlas: Atlas, x: np.ndarray, error: np.ndarray, v: int, kind: str) -> list[Crossing]:
     points = parameters_at(atlas, x)
-    slope = np.abs(atlas.coordinates[v].slope(points[:, v]))
+    # At an angle of 0 its square says nothing about the error.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        errors = error / np.abs(atlas.coordinates[v].slope(points[:, v]))
     return [
-        Crossing(float(p[v]), float(e / s), kind, dict(zip(atlas.parameters, map(float, p), strict=True)))
-        for p, e, s in zip(points, error, slope, strict=True)
+        Crossing(float(p[v]), float(e), kind, dict(zip(atlas.parameters, map(float, p), strict=True)))
+        for p, e in zip(points, errors, strict=True)
         if np.isfinite(p).all()
     ]
 
@@ -212,43 +198,61 @@ def decided(lower: float, upper: float, undecided: Iterable[Range]) -> list[Rang
     return [*left, (lower, upper)] if lower < upper else left
 
 
-def _line(name: str, ends: tuple[float, float], changes: list[Crossing], undecided: list, stable) -> Line:
+def _line(name: str, ends: Range, changes: list[Crossing], undecided: list[Range], stable) -> Line:
     """Sort candidates, test between them and keep those at which the stability changes.
 
     Between two candidates every decided part is tested: an undecided range may hide a change. Parts that are too narrow
-    for a test are undecided as well.
+    for a test are undecided as well, and so is what lies before the first part that is tested, and after the last one.
     """
     changes = sorted((c for c in changes if ends[0] < c.value < ends[1]), key=lambda c: c.value)
     edges = [(float(ends[0]), 0.0), *((c.value, c.error) for c in changes), (float(ends[1]), 0.0)]
     segments = [_tested(a, b, undecided) for a, b in itertools.pairwise(edges)]
     parts = [(k, *part) for k, (tested, _) in enumerate(segments) for part in tested]
-    undecided = [*undecided, *(part for _, narrow in segments for part in narrow)]
+    ranges = [*undecided, *(part for _, narrow in segments for part in narrow)]
+    joined = tuple((float(a), float(b)) for a, b in merge(np.array(ranges).reshape(-1, 2)))
+    if not parts:
+        return Line(name, (), joined)
     states = stable(np.array([(low + high) / 2 for _, low, high in parts]))
     intervals: list[Interval] = []
-    start, first = edges[0][0], None
+    start, first = parts[0][1], None
     for (here, _, high), (there, low, _), before, after in zip(parts, parts[1:], states, states[1:], strict=False):
         if before == after:
             continue
-        change = changes[there - 1] if there > here else None
+        change = _one_change(changes[here:there])
         intervals.append(Interval(start, change.value if change else high, bool(before), first, change))
         start, first = (change.value, change) if change else (low, None)
-    intervals.append(Interval(start, edges[-1][0], bool(states[-1]), first, None))
-    return Line(name, tuple(intervals), tuple(sorted(undecided)))
+    intervals.append(Interval(start, parts[-1][2], bool(states[-1]), first, None))
+    return Line(name, tuple(intervals), joined)
 
 
-def _tested(
-    lower: tuple[float, float], upper: tuple[float, float], undecided: Iterable[Range]
-) -> tuple[list[Range], list[Range]]:
+def _one_change(candidates: list[Crossing]) -> Crossing | None:
+    """The change of stability somewhere among neighbouring ``candidates``; None if nobody can say at which."""
+    if any(b.value - a.value > _least(_end(a), _end(b)) for a, b in itertools.pairwise(candidates)):
+        return None
+    best = min(candidates, key=lambda c: _end(c)[1], default=None)
+    return best and replace(best, error=float(np.max([abs(c.value - best.value) + c.error for c in candidates])))
+
+
+def _tested(lower: tuple[float, float], upper: tuple[float, float], undecided: Iterable[Range]) -> tuple[list, list]:
     """The decided parts between two candidates (values, bounds of errors) in which stability is tested, and the others.
 
-    These are no wider than the errors, which belong to them. If all parts are so narrow, the widest is tested.
+    These are no wider than the errors, which belong to them.
     """
-    (a, error), (b, other) = (map(float, np.nan_to_num(end)) for end in (lower, upper))
-    parts = decided(a, b, undecided) or [(a, b)]
-    least = _WIDER * max(error, other, np.finfo(float).eps * max(abs(a), abs(b)))
-    wide = [part for part in parts if part[1] - part[0] > least] or [max(parts, key=lambda part: part[1] - part[0])]
-    narrow = [part for part in parts if part not in wide]
+    (a, error), (b, other) = lower, upper = [tuple(map(float, np.nan_to_num(end))) for end in (lower, upper)]
+    least = _least(lower, upper)
+    parts = decided(a, b, undecided)
+    wide = [part for part in parts if part[1] - part[0] > least]
+    narrow = [part for part in parts if part[1] - part[0] <= least]
     return wide, [(low - error * (low == a), high + other * (high == b)) for low, high in narrow]
+
+
+def _end(change: Crossing) -> tuple[float, float]:
+    return change.value, float(np.nan_to_num(change.error))
+
+
+def _least(lower: tuple[float, float], upper: tuple[float, float]) -> float:
+    """The width of a part between two candidates (values, bounds of errors) that is not tested."""
+    return _WIDER * max(lower[1], upper[1], np.finfo(float).eps * max(abs(lower[0]), abs(upper[0])))
 
 
 def _unfolded(line: Line, lower: float, upper: float) -> Line:
@@ -258,8 +262,8 @@ def _unfolded(line: Line, lower: float, upper: float) -> Line:
     parts = [part for interval in both if (part := _clipped(interval, lower, upper)) is not None]
     joined: list[Interval] = []
     for part in parts:
-        # At 0 nothing changes.
-        if joined and joined[-1].upper == part.lower == 0.0:
+        # At 0 nothing changes, nor across an undecided range around it.
+        if joined and joined[-1].upper == -part.lower:
             last = joined.pop()
             part = replace(part, lower=last.lower, lower_end=last.lower_end)
         joined.append(part)

@@ -226,7 +226,7 @@ def _meant(name: str, value: Any, shaft: Any) -> str:
 
 
 def _check_same(name: str, value: Any, fixed: float) -> None:
-    if isinstance(value, tuple) or not math.isclose(value, fixed, rel_tol=_SAME, abs_tol=_SAME):
+    if isinstance(value, tuple) or not math.isclose(value, fixed, rel_tol=_SAME):
         raise InputError(
             f"{name} = {as_given(value)}: the atlas is made for {name} = {_number(fixed)}; allowed is that value"
         )
@@ -273,7 +273,8 @@ def _check_range(words: _Words, ends: Range, value: Any, wanted: bool) -> None:
 def _answered(title: str, phrase: str, asked: _Asked, answer: design.Answer) -> Reply:
     lines = [f"{title}, {asked.heading()}"]
     if answer.value is None:
-        lines.append(f"  no {answer.parameter} of the atlas will do")
+        none = "of the atlas will do" if answer.certain else "found; whether there is one is undecided"
+        lines.append(f"  no {answer.parameter} {none}")
     else:
         bound = (
             f" +- {answer.error:.1e}" if answer.limit else _beyond(asked.atlas, answer.parameter, answer.value, None)

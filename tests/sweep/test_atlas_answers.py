@@ -137,6 +137,24 @@ def test_a_change_that_may_hide_in_an_undecided_range_is_not_denied():
     assert atlas_answers._reach(atlas, replace(nearest, undecided=())) == "none from 0.3 to 2"
 
 
+def test_next_to_no_damping_is_not_none():
+    """Without damping S21 reaches down to the angle 0, with this little of it down to .0001 only."""
+    atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
+    point = {"beta": 0.00005, "Omega": 1.4159846397}
+    assert atlas_answers.query(atlas, point).data["meanings"]["verdict"] == "unstable"
+    with pytest.raises(dt.InputError, match=r"^zeta = 1e-09: the atlas is made for zeta = 0; allowed is that value$"):
+        atlas_answers.query(atlas, {**point, "zeta": 1e-9})
+
+
+def test_only_what_is_certain_is_denied():
+    crowded = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=1e-7)
+    assert "\n  no beta found; whether there is one is undecided\n" in str(
+        atlas_answers.widest_angle(crowded, {"Omega": (1.3, 1.5)})
+    )
+    none = atlas_answers.widest_angle(atlas_of((0.3, 1.2), (0.3, 2.0)), {"Omega": (1.3, 1.5)})
+    assert "\n  no beta of the atlas will do" in str(none) and none.data["certain"]
+
+
 def test_answers_without_damping_agree_with_direct_solves():
     atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
     assert atlas_answers.widest_angle(atlas, {"Omega": (1.6, 1.9)}).data["check"]["agrees"]
