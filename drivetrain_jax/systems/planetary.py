@@ -280,7 +280,7 @@ def check(fixed: Mapping[str, Any]) -> None:
         value = fixed.get(name)
         if isinstance(value, tuple) and angles is not None and len(value) != len(angles):
             raise ValueError(
-                f"{name} has {len(value)} entries, planet_angle has {len(angles)}: "
+                f"{name} = {list(value)}: {len(value)} entries where planet_angle has {len(angles)}; "
                 "allowed is one number, or one entry per planet"
             )
 

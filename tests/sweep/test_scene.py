@@ -160,7 +160,11 @@ WRONG = {
         "integer",
     ),
     "word as axis": (changed(axes={"kind": {"values": [1]}}), "axes.kind", "fix it"),
-    "list of another length": (follow(fixed={"b": 1.0, "weight": [1, 2]}), "fixed.weight has 2 entries", "equally"),
+    "list of another length": (
+        follow(fixed={"b": 1.0, "weight": [1, 2]}),
+        "fixed.weight = [1.0, 2.0]: 2 entries",
+        "equally",
+    ),
     "entry of a number for all": (
         follow(axes={"weight[0]": {"values": [1]}}, fixed={"b": 1.0}),
         "fixed.weight = 1.0",

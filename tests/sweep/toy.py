@@ -128,7 +128,8 @@ def _follow_solvers(system: System, request) -> tuple[Solver, ...]:
 def _lengths_and_weights(fixed) -> None:
     weight = fixed.get("weight")
     if isinstance(weight, tuple) and len(weight) != len(fixed["length"]):
-        raise ValueError(f"weight has {len(weight)} entries, length {len(fixed['length'])}: allowed is equally many")
+        counts = f"{len(weight)} entries where length has {len(fixed['length'])}"
+        raise ValueError(f"weight = {list(weight)}: {counts}; allowed is equally many")
 
 
 def _analysis(name: str, solvers, methods=None) -> Analysis:
