@@ -1,7 +1,7 @@
 """Stability and vibration of drivetrains: batched simulation in JAX, from a scene file to one labelled dataset.
 
-``run`` computes a scene, ``point`` a single parameter set; wrong input raises ``InputError``. Everything heavy is
-imported on first use.
+``run`` computes a scene, ``point`` a single parameter set; wrong input raises ``InputError``, a computation that fails
+``ChunkError`` or, with a file to resume, ``Incomplete``. Everything heavy is imported on first use.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import ChunkError, InputError
 
 if TYPE_CHECKING:
     from drivetrain_jax.sweep.atlas_file import open_atlas
@@ -19,7 +19,17 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-__all__ = ["Incomplete", "InputError", "Interrupted", "__version__", "open_atlas", "open_result", "point", "run"]
+__all__ = [
+    "ChunkError",
+    "Incomplete",
+    "InputError",
+    "Interrupted",
+    "__version__",
+    "open_atlas",
+    "open_result",
+    "point",
+    "run",
+]
 
 _HOME = {
     "Incomplete": "drivetrain_jax.sweep.run",

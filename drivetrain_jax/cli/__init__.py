@@ -8,9 +8,9 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import ChunkError, InputError
 from drivetrain_jax.cli.arguments import parser
-from drivetrain_jax.cli.replies import INTERRUPTED, OK, WRONG_INPUT, drop_output, one_line
+from drivetrain_jax.cli.replies import INCOMPLETE, INTERRUPTED, OK, WRONG_INPUT, drop_output, one_line
 
 __all__ = ["main"]
 
@@ -30,6 +30,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         sys.stderr.write(one_line(str(error)))
         return WRONG_INPUT
+    except ChunkError as error:
+        sys.stderr.write(one_line(str(error)))
+        return INCOMPLETE
     except BrokenPipeError:
         # The reader of our output has gone (``drivetrain list | head``): nobody is left to tell.
         drop_output()

@@ -45,7 +45,7 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
     """Results at one point, the gradient of its spectral radius, and the nearest changes of stability along every parameter.
 
     The gradient is by direct solves and with respect to every parameter of the system. Raises :class:`InputError` for
-    names and values that the atlas does not cover.
+    names and values that the atlas does not cover, :class:`ChunkError` if a direct solve fails.
     """
     asked = _Asked.of(atlas, given, ranges=())
     point = asked.values

@@ -30,7 +30,8 @@ def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, flo
     ``part`` fixes parameters (numbers) or zooms in (ranges). Of further parameters there are three values. A chart of two
     parameters also has, if the system has such, its stability boundaries (``boundary_NAME``, parts separated by NaN) and
     the tips of its tongues (``tip_NAME``, with their names, ``tip_NAME_error``, ``tip_opens`` and ``tip_proved``) and the
-    boxes that may hide further ones (``undecided_NAME``). Raises :class:`InputError` for what the atlas does not cover.
+    boxes that may hide further ones (``undecided_NAME``). Raises :class:`InputError` for what the atlas does not cover,
+    :class:`ChunkError` if a direct solve in a gap fails.
     """
     if not 2 <= cells <= 20_000:
         raise InputError(f"cells = {cells}: allowed is 2 <= cells <= 20000")

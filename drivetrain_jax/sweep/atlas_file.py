@@ -157,7 +157,7 @@ class StoredAtlas:
 
         Arrays of xarray keep their dimensions, others have the dimension ``point`` (or ``dim_0``, ``dim_1``, ...).
         Raises :class:`InputError` for a name that is missing or unknown, for a value outside the atlas, and for arrays that
-        do not fit together.
+        do not fit together; :class:`ChunkError` if a direct solve in a gap fails.
         """
         checked = {name: self._checked(name, values) for name in self._names(values)}
         columns = dict(zip(checked, _broadcast(checked), strict=True))
@@ -189,7 +189,10 @@ class StoredAtlas:
         return self._evaluate(self.stability.slice(fixed), axes, zipped=False)
 
     def radius(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Spectral radii ``(N,)`` by direct solves, without the panels; ``columns`` of all parameters."""
+        """Spectral radii ``(N,)`` by direct solves, without the panels; ``columns`` of all parameters.
+
+        Raises :class:`ChunkError` if a solve fails.
+        """
         axes = {name: column for name, column in columns.items() if name in self.parameters}
         request = Request(("spectral_radius",), "direct", self.scene.request.options)
         engine = Engine(self._scene(axes, dict(self.fixed), request, zipped=True))

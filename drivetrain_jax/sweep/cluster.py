@@ -9,9 +9,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from typing import Any
 
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, Passing
 from drivetrain_jax.sweep import worker
-from drivetrain_jax.sweep.engine import ChunkError
 from drivetrain_jax.sweep.executor import IN_FLIGHT, Results
 from drivetrain_jax.sweep.plan import Chunk
 from drivetrain_jax.sweep.worker import Job
@@ -27,7 +26,7 @@ def run_cluster(chunks: Iterable[Chunk], job: Job, address: str) -> Iterator[tup
 
     A chunk whose worker died is computed again elsewhere; results are None for one at which too many died (Dask's
     setting ``distributed.scheduler.allowed-failures``). An exception of a chunk is raised here; a scheduler that
-    vanishes is a :class:`ChunkError`.
+    vanishes is a :class:`Passing`.
     """
     distributed = _distributed()
     with ExitStack() as stack:
@@ -63,7 +62,7 @@ def _result(distributed: Any, future: Any) -> Results | None:
     except distributed.KilledWorker:
         return None
     except (distributed.CancelledError, OSError) as error:
-        raise ChunkError(f"dask: the scheduler is gone ({type(error).__name__})") from error
+        raise Passing(f"dask: the scheduler is gone ({type(error).__name__})") from error
 
 
 def _connect(distributed: Any, address: str, stack: ExitStack) -> Any:

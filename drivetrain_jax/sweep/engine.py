@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from drivetrain_jax._errors import ChunkError, Passing
 from drivetrain_jax._threads import threads
 from drivetrain_jax.store.provenance import digest
 from drivetrain_jax.sweep import compile_cache
@@ -22,10 +23,6 @@ from drivetrain_jax.sweep.scene import Scene
 
 # Kernels that are compiled at a time.
 _SIDE_BY_SIDE = 8
-
-
-class ChunkError(RuntimeError):
-    """A chunk could not be computed; the message names it and the reason."""
 
 
 class Engine:
@@ -111,4 +108,10 @@ class Engine:
             return kernel(self.grid.columns(chunk.points), chunk.effort)
         except Exception as error:
             solver = self.solvers[chunk.solver].name
-            raise ChunkError(f"chunk {chunk.number} ({solver}): {type(error).__name__}: {error}") from error
+            kind = Passing if _may_pass(error) else ChunkError
+            raise kind(f"chunk {chunk.number} ({solver}): {type(error).__name__}: {error}") from error
+
+
+def _may_pass(error: Exception) -> bool:
+    # XLA says that memory is short with an error of its own.
+    return isinstance(error, (OSError, MemoryError)) or "RESOURCE_EXHAUSTED" in str(error)

@@ -148,7 +148,8 @@ def point(system: str, analysis: str, *, outputs: Sequence[str] | None = None, *
     ``given`` holds parameters of the system (or its data in physical units, as `drivetrain list SYSTEM` names them) and
     options of the analysis (``method``, ``rtol``, ...) by name;
     ``outputs`` the results wanted, by default those of the analysis.
-    Raises :class:`InputError` with one line naming the field, what was given and what is allowed.
+    Raises :class:`InputError` with one line naming the field, what was given and what is allowed, and
+    :class:`ChunkError` if the computation itself fails.
     """
     tree = _tree(system, analysis, nondimensional(find_system(system), given)[1])
     if outputs is not None:

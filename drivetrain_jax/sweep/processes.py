@@ -11,8 +11,8 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 
+from drivetrain_jax._errors import Passing
 from drivetrain_jax.sweep import worker
-from drivetrain_jax.sweep.engine import ChunkError
 from drivetrain_jax.sweep.executor import IN_FLIGHT, Results
 from drivetrain_jax.sweep.plan import Chunk
 from drivetrain_jax.sweep.worker import Job
@@ -117,7 +117,7 @@ class _Slot:
         except BrokenProcessPool:
             self._stillborn += 1
             if self._stillborn >= ATTEMPTS:
-                raise ChunkError("worker processes die while they get ready") from None
+                raise Passing("worker processes die while they get ready") from None
             return False
         self._stillborn = 0
         return True

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import ChunkError, InputError, Passing
 from drivetrain_jax._machine import physical_memory
 from drivetrain_jax._wording import shown
 from drivetrain_jax.analysis import OUTCOME
@@ -16,7 +16,7 @@ from drivetrain_jax.store.consolidate import ResultFile, open_result, write_resu
 from drivetrain_jax.sweep import sharded
 from drivetrain_jax.sweep.assemble import Table, bytes_per_point, failures, to_dataset
 from drivetrain_jax.sweep.atlas_choice import uses_atlas
-from drivetrain_jax.sweep.engine import ChunkError, Engine
+from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.executor import Where
 from drivetrain_jax.sweep.growing import NOTHING, Taken, rest_of
 from drivetrain_jax.sweep.scene import load_scene
@@ -72,7 +72,8 @@ def run(
         result that ``out`` holds is one of them without being named, if all of its points and results are this scene's.
     :param report: called with the :class:`Progress` after every chunk.
     :raises InputError: one line naming the field, what was given, what is allowed. Nothing is computed or written.
-    :raises Incomplete: something failed on the way; the same call resumes.
+    :raises Incomplete: something failed on the way; what is finished is kept. The message says so where the same call may
+        get further (a full disk, too little memory, a worker that died).
     """
     where = Where(threads, workers, dask)
     if out is None:
@@ -141,8 +142,11 @@ def _into(target: Target, taken: Taken, fresh: bool, where: Where, report: Repor
         # For example no scheduler at the address: what is refused at its start leaves nothing behind.
         parts.close(remove=not parts.holds_work() or (begins and progress.computed == 0))
         raise
-    except (ChunkError, OSError, MemoryError) as error:
+    except (Passing, OSError, MemoryError) as error:
         raise Incomplete(f"{error or type(error).__name__}; the same command resumes", progress) from error
+    except ChunkError as error:
+        # The same command would come to it again.
+        raise Incomplete(str(error), progress) from error
     finally:
         parts.close()
     return progress

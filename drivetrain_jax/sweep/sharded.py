@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import ChunkError, InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.store import shards
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.sweep.assemble import failures, missing_value, result_attrs, result_variables
 from drivetrain_jax.sweep.atlas_choice import uses_atlas
-from drivetrain_jax.sweep.engine import ChunkError, Engine
+from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.executor import Where
 from drivetrain_jax.sweep.kernel import result_shapes
 from drivetrain_jax.sweep.plan import Chunk

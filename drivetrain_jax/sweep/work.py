@@ -10,10 +10,11 @@ from typing import Protocol
 
 import numpy as np
 
+from drivetrain_jax._errors import Passing
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.store.chunks import Part, PartsFolder
 from drivetrain_jax.sweep.assemble import failures
-from drivetrain_jax.sweep.engine import ChunkError, Engine
+from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.executor import Where
 from drivetrain_jax.sweep.plan import Chunk
 
@@ -131,7 +132,7 @@ class Work:
                 progress.cost += float(costs[chunk.number])
                 self._tell(progress)
         if missing:
-            raise ChunkError(f"{missing} chunks never came back")
+            raise Passing(f"{missing} chunks never came back")
 
     def _tell(self, progress: Progress) -> None:
         if self.report:

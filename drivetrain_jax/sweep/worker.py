@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from drivetrain_jax.sweep.engine import ChunkError, Engine
+from drivetrain_jax._errors import ChunkError
+from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.plan import Chunk
 from drivetrain_jax.sweep.scene import load_scene
 

@@ -13,7 +13,7 @@ import h5py
 import pytest
 import xarray as xr
 
-from drivetrain_jax import InputError, __version__
+from drivetrain_jax import ChunkError, InputError, __version__
 from drivetrain_jax.cli import main
 from drivetrain_jax.cli.progress import progress_line
 from drivetrain_jax.sweep.work import Progress
@@ -307,10 +307,23 @@ def test_a_changed_file_is_one_line(cli, folder, case):
 def test_failing_chunk_is_incomplete_and_resumable(cli):
     code, out, err = cli("run", "scene.toml", "--out", "r.nc", "--set", "analysis=broken", "--quiet")
     assert (code, out, len(err)) == (3, "", 2)
-    assert (
-        "(broken): RuntimeError: no luck today" in err[0] and err[1] == "points: total=21 computed=0 reused=0 failed=0"
-    )
+    assert err[0].endswith("(broken): RuntimeError: no luck today")
+    assert err[1] == "points: total=21 computed=0 reused=0 failed=0"
     assert os.path.isdir("r.nc.parts") and not os.path.exists("r.nc")
+
+
+def test_a_computation_that_fails_is_one_line(cli):
+    line = ["drivetrain: chunk 0 (broken): RuntimeError: no luck today"]
+    assert cli("point", "toy", "broken", "a=1") == (3, "", line)
+
+
+@pytest.mark.parametrize("words", [("query", "a.nc", "a=1"), ("design", "widest-angle", "a.nc", "a=1:2")])
+def test_a_direct_solve_of_an_atlas_that_fails_is_one_line(cli, monkeypatch, words):
+    def fails(_):
+        raise ChunkError("chunk 3 (direct): MemoryError: ")
+
+    monkeypatch.setattr("drivetrain_jax.sweep.atlas_file.open_atlas", fails)
+    assert cli(*words) == (3, "", ["drivetrain: chunk 3 (direct): MemoryError:"])
 
 
 def test_values_may_stand_behind_options(cli):

@@ -373,6 +373,25 @@ def test_failing_chunk_leaves_a_resumable_run(tmp_path):
         dt.run(scene)
 
 
+@pytest.mark.parametrize(
+    ("error", "passes"),
+    [
+        (OSError(5, "Input/output error"), True),
+        (MemoryError(), True),
+        (RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8 bytes"), True),
+        (ValueError("no such shape"), False),
+    ],
+)
+def test_only_what_may_pass_is_said_to_be_resumed_by_the_same_command(grid_scene, tmp_path, monkeypatch, error, passes):
+    def kernel(*_):
+        raise error
+
+    monkeypatch.setattr("drivetrain_jax.sweep.engine.kernel_of", lambda *_: kernel)
+    with pytest.raises(Incomplete, match=rf"^chunk \d+ \(\w+\): {type(error).__name__}: ") as stopped:
+        run_to_file(grid_scene, tmp_path / "r.nc", where=Where(threads=1))
+    assert str(stopped.value).endswith("; the same command resumes") is passes
+
+
 def test_full_disk_leaves_a_resumable_run(grid_scene, tmp_path, monkeypatch):
     path = tmp_path / "r.nc"
     run_to_file(grid_scene, path)
