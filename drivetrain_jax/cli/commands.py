@@ -127,6 +127,8 @@ def plot(options: argparse.Namespace) -> int:
         raise InputError(f"out = {str(out)!r}: allowed is a name that ends in {', '.join(_FIGURES)}")
     results = [open_result(file) if file.exists() else _open_unfinished(file) for file in options.files]
     if any(result.attrs.get("analysis") == "atlas" for result in results):
+        if len(results) > 1:
+            raise InputError("FILE.nc: an atlas among several results; allowed is an atlas alone")
         from drivetrain_jax.sweep.atlas_chart import chart
 
         cells = _CELLS if options.cells is None else options.cells

@@ -65,6 +65,15 @@ def require_any(dataset: xr.Dataset, *names: str) -> list[str]:
     return found
 
 
+def require_values(variable: xr.DataArray, positive: bool = False) -> None:
+    """Raise :class:`InputError` unless some value of ``variable`` is finite and, if ``positive``, above zero."""
+    finite = variable.values[np.isfinite(variable.values)]
+    largest = finite.max() if finite.size else np.nan
+    if not (largest > 0 if positive else finite.size):
+        kind = "positive" if positive else "finite"
+        raise InputError(f"{variable.name} = {largest:g}: nothing to plot; allowed is a result with a {kind} value")
+
+
 def horizontal_axis(dataset: xr.Dataset, names: list[str]) -> str:
     """That of ``names`` for which resonances are predicted, else the speed, else the last one."""
     return next((name for name in names if f"resonance_{name}" in dataset.coords), speed_axis(dataset, names))

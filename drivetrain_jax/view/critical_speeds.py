@@ -39,7 +39,7 @@ def plot(dataset: xr.Dataset) -> Figure:
 
     Along a logarithmic axis (support stiffness) both axes are logarithmic: the critical-speed map. A list of points is
     drawn along its first parameter. Frequencies that the count does not certify are crossed. Raises
-    :class:`InputError` for more than two axes and where nothing that could be drawn is stored.
+    :class:`InputError` for more than two axes and where nothing that could be drawn is stored, or no value of it.
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
@@ -78,6 +78,7 @@ def _curves(dataset: xr.Dataset, name: str, shown: str) -> Figure:
     order = np.argsort(abscissa.values, kind="stable")
     x, y = abscissa.values[order], dataset[shown].transpose("mode", name).values[:, order]
     logarithmic = cells.is_logarithmic(x)
+    cells.require_values(dataset[shown], positive=logarithmic)
     panels = Panels(height=_HEIGHT, margins=Margins(right=0.75, left=1.0))
     axes = panels.axes[0][0]
     drawn = np.where(y > _NEGLIGIBLE * np.nanmax(y), y, np.nan) if logarithmic else y
@@ -160,6 +161,7 @@ def _doubtful(
 
 
 def _maps(dataset: xr.Dataset, names: list[str], shown: str) -> Figure:
+    cells.require_values(dataset[shown], positive=True)
     horizontal = cells.horizontal_axis(dataset, names)
     vertical = next(name for name in names if name != horizontal)
     modes = [mode for mode in range(dataset.sizes["mode"]) if float(dataset[shown].isel(mode=mode).max()) > 0]

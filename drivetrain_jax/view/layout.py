@@ -154,11 +154,15 @@ def write_title(figure: Figure, dataset: xr.Dataset, left: float) -> None:
     size = max(min(_TITLE_SIZE, _TITLE_SIZE * room / max(_title_length(title), 1e-9)), _SMALLEST_TITLE)
     while _title_length(title) * size / _TITLE_SIZE > room * 1.001:
         title = title.rstrip(_ELLIPSIS)[:-1] + _ELLIPSIS
-    figure.text(left / WIDTH, 1 - 0.10 / figure.get_figheight(), title, va="top", size=size, weight="bold")
+    figure.text(
+        left / WIDTH, 1 - 0.10 / figure.get_figheight(), title, va="top", size=size, weight="bold", parse_math=False
+    )
 
 
 def _title_length(title: str) -> float:
     """Length of a title of full size in inches, with room for the letters that a screen rounds up."""
+    # A title is anybody's text, in which a dollar need not begin a formula.
+    title = title.replace("$", r"\$")
     bold = FontProperties(family=STYLE["font.sans-serif"], weight="bold")
     length = TextPath((0, 0), title, size=_TITLE_SIZE, prop=bold).get_extents().width if title.strip() else 0.0
     return 1.05 * length / 72

@@ -36,7 +36,7 @@ def plot(dataset: xr.Dataset) -> Figure:
         names = cells.sweep_axes(dataset)
         if not names:
             return _convergence(dataset)
-        if len(names) == 1 and any(name in dataset for name in _CURVES):
+        if len(names) == 1:
             return _curves(dataset, names[0])
         columns = [name for name in names if dataset.sizes[name] <= _MOST_COLUMNS]
         if len(names) == 2 or (len(names) == 3 and columns):
@@ -68,7 +68,7 @@ def _convergence(dataset: xr.Dataset) -> Figure:
 
 
 def _curves(dataset: xr.Dataset, name: str) -> Figure:
-    shown = [key for key in _CURVES if key in dataset]
+    shown = cells.require_any(dataset, *_CURVES)
     panels = Panels(len(shown), height=_HEIGHT, margins=Margins(right=0.3, left=1.05, label=0.52), share_y=False)
     handles: list[Artist] = []
     for (axes,), key in zip(panels.axes, shown, strict=True):
@@ -114,7 +114,7 @@ def _maps(dataset: xr.Dataset, names: list[str], split: str | None) -> Figure:
     rest = [name for name in names if name != split]
     horizontal = cells.horizontal_axis(dataset, rest)
     vertical = next(name for name in rest if name != horizontal)
-    rows = [key for key in ("lyapunov_spectrum", "verdict") if key in dataset]
+    rows = cells.require_any(dataset, "lyapunov_spectrum", "verdict")
     parts = [dataset] if split is None else [dataset.isel({split: k}) for k in range(dataset.sizes[split])]
     panels = Panels(len(rows), len(parts), height=_HEIGHT, margins=Margins(right=1.05))
     for axes_row, key in zip(panels.axes, rows, strict=True):

@@ -35,7 +35,8 @@ def plot(dataset: xr.Dataset) -> Figure:
 
     Curves follow the stored ``branch`` where there is one, so that they do not change colour where frequencies cross or
     veer; without it every point is a dot. Zero frequencies do not show on the logarithmic scale. Axes of a single value
-    count as fixed. Raises :class:`InputError` for more than one axis, and if the variables needed are not stored.
+    count as fixed. Raises :class:`InputError` for more than one axis, and if the variables needed are not stored or have no
+    value.
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
@@ -62,6 +63,7 @@ def _types(dataset: xr.Dataset) -> np.ndarray:
 
 def _curves(dataset: xr.Dataset, name: str) -> Figure:
     cells.require(dataset, "natural_frequency")
+    cells.require_values(dataset["natural_frequency"], positive=True)
     dataset = dataset.transpose(name, ...)
     x, frequency, types = dataset[name].values, dataset["natural_frequency"].values, _types(dataset)
     panels = Panels(1, height=_CURVES_HEIGHT, margins=Margins(right=0.3, left=0.9, top=0.6))

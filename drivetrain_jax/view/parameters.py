@@ -23,13 +23,15 @@ def plot(dataset: xr.Dataset) -> Figure:
     """Every stored constant over the one axis of ``dataset``, a panel each; without axes a table of their values.
 
     Constants with a dimension of their own (natural frequencies by mode) become one curve or one line of the table for
-    each entry. Axes of a single value count as fixed. Raises :class:`InputError` for more axes, for ``[points]`` and for
-    more than eight panels.
+    each entry. Axes of a single value count as fixed. Raises :class:`InputError` for more axes, for ``[points]``, for
+    more than eight panels and for none.
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
         names = cells.sweep_axes(dataset)
         shown = [str(name) for name in dataset.data_vars if name != "outcome"]
+        if not shown:
+            raise InputError("outputs = outcome: nothing to plot; the figure needs a constant")
         if not names:
             return _table(dataset, shown)
         if len(names) > 1 or names == ["point"]:

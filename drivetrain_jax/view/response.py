@@ -56,8 +56,7 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
         axes.plot(dataset[name], dataset[key], color=LINE_COLOURS[0])
         panels.label_row(axes, variable_label(dataset[key]))
         if key == "condition":
-            axes.set_yscale("log")
-            cells.plain_decades(axes, "y")
+            _set_decades(axes, dataset[key])
         else:
             handles.append(
                 axes.axhline(1, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)), label="limit of stability")
@@ -88,11 +87,15 @@ def _draw_amplitudes(axes: Axes, dataset: xr.Dataset, name: str, keys: list[str]
             curve = dataset[key].isel({own: index})
             label = f"{_entry(curve, own, index)}, {meaning}"
             handles += axes.plot(dataset[name], curve, color=colour, linestyle=style, label=label)
-    # Straight joints have no response at all, which a logarithmic scale has no place for.
-    if any(bool((dataset[key] > 0).any()) for key in keys):
+    _set_decades(axes, *(dataset[key] for key in keys))
+    return handles
+
+
+def _set_decades(axes: Axes, *shown: xr.DataArray) -> None:
+    """A logarithmic scale, which has no place for the zeros of straight joints and for what has failed, if there is more."""
+    if any((np.isfinite(each.values) & (each.values > 0)).any() for each in shown):
         axes.set_yscale("log")
         cells.plain_decades(axes, "y")
-    return handles
 
 
 def _maps(dataset: xr.Dataset, names: list[str], shown: list[str]) -> Figure:

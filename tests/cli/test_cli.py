@@ -418,6 +418,14 @@ def test_plot_writes_the_figure(cli, monkeypatch):
     assert code == 2 and len(err) == 1 and ".png" in err[0]
 
 
+def test_several_atlases_are_refused_before_one_is_evaluated(cli, monkeypatch):
+    cli("run", "scene.toml", "--out", "r.nc", "--quiet")
+    xr.load_dataset("r.nc", engine="h5netcdf").assign_attrs(analysis="atlas").to_netcdf("a.nc", engine="h5netcdf")
+    monkeypatch.setattr("drivetrain_jax.sweep.atlas_chart.chart", lambda *_: 1 / 0)
+    line = "drivetrain: FILE.nc: an atlas among several results; allowed is an atlas alone"
+    assert cli("plot", "r.nc", "a.nc", "--out", "f.png") == (2, "", [line])
+
+
 def test_version_and_help(cli):
     assert cli("--version")[1].strip() == __version__
     code, out, _ = cli("--help")

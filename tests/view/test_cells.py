@@ -93,6 +93,14 @@ def test_a_title_is_never_wider_than_the_figure(letters, cut):
     assert extent.x1 <= figure.bbox.x1 and title.get_text().endswith("\u2026") == cut
 
 
+@pytest.mark.parametrize("text", [r"cost $\foo$ of a gear", r"from $5 to $6_{", r"a \$ and $\beta$ " + "W" * 300])
+def test_a_title_is_text_and_no_formula(text):
+    figure = Panels(height=2.0).figure
+    write_title(figure, xr.Dataset(attrs={"title": text}), 0.75)
+    FigureCanvasAgg(figure).draw()
+    assert figure.texts[0].get_text()[:20] == text[:20] and not figure.texts[0].get_parse_math()
+
+
 def test_the_caption_gives_parameters_and_not_the_number_of_the_point():
     dataset = xr.Dataset(coords={"point": 0, "omega": ((), 0.86, {"units": "rad/s"})})
     assert caption(dataset) == "$\\omega$ = 0.86 rad/s"

@@ -65,6 +65,14 @@ def test_too_many_axes_are_refused():
         plot(lyapunov(a=5, b=5, c=5))
 
 
+def test_outputs_without_a_figure_are_named():
+    needed = "nothing to plot; the figure needs lyapunov_spectrum or"
+    with pytest.raises(InputError, match=f"^outputs = outcome: {needed} verdict$"):
+        plot(lyapunov(a=5, b=5)[["outcome"]])
+    with pytest.raises(InputError, match=f"^outputs = verdict, outcome: {needed} paper_estimator"):
+        plot(lyapunov(a=5)[["verdict", "outcome"]])
+
+
 def section(count: int, spread: float) -> xr.Dataset:
     turn = np.linspace(0, 20, count)
     points = np.stack([6e-5 + spread * np.cos(turn), spread * np.sin(turn)], axis=-1)

@@ -131,6 +131,16 @@ def test_nothing_to_plot(swept):
         plot(swept.drop_vars("critical_speed"))
 
 
+@pytest.mark.parametrize(("value", "shown"), [(np.nan, "nan"), (0.0, "0")])
+def test_results_without_a_positive_value_are_refused(swept, value, shown):
+    empty = swept.assign(critical_speed=swept.critical_speed.copy(data=np.full((25, 3), value)))
+    line = rf"^critical_speed = {shown}: nothing to plot; allowed is a result with a positive value$"
+    with pytest.raises(InputError, match=line):
+        plot(empty)
+    with pytest.raises(InputError, match=line):
+        plot(empty.isel(k_D=[0, 1]).expand_dims(k_A=[1.0, 2.0]))
+
+
 def test_a_long_caption_stays_on_the_figure_and_above_the_panel(swept):
     names = ("length", "EI", "rhoA", "k_A", "m_joint", "kGA", "rhoI")
     fixed = {name: {"value": [12345.0, 2.345e-3, 7.0], "units": "kg/m"} for name in names}

@@ -89,6 +89,11 @@ def test_displacements_are_scaled_together():
         (shapes().drop_vars("mode_shape"), "mode_shape"),
         (crossing().drop_vars("natural_frequency"), "natural_frequency"),
         (shapes().assign_attrs(fixed_parameters="{}"), "planet_angle"),
+        (
+            result(2, natural_frequency=np.full((2, 3), np.nan)),
+            "^natural_frequency = nan: nothing to plot; allowed is a result with a positive value$",
+        ),
+        (result(2, natural_frequency=np.zeros((2, 3))), "^natural_frequency = 0: nothing to plot"),
     ],
 )
 def test_refusals(dataset, named):

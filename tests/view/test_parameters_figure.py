@@ -62,3 +62,8 @@ def test_caption_leaves_defaults_out():
     dataset = xr.Dataset(attrs={"fixed_parameters": fixed, "scene": "[fixed]\nbeta = 0.1\n"})
     assert caption(dataset) == r"$\beta$ = 0.1 rad"
     assert caption(dataset.assign_attrs(scene="[fixed]\nbeta = 0.1\nrho = 7850.0\n")).endswith("7850 kg/m3")
+
+
+def test_no_constant_at_all_is_an_input_error():
+    with pytest.raises(InputError, match=r"^outputs = outcome: nothing to plot; the figure needs a constant$"):
+        plot(constants("beta")[["outcome"]])

@@ -63,6 +63,14 @@ def test_a_response_of_zero_is_drawn():
     assert amplitude.get_yscale() == "linear" and amplitude.get_ylim()[0] < 0 < amplitude.get_ylim()[1]
 
 
+def test_a_condition_without_values_has_crosses_only():
+    dataset = results.forced(Omega=OMEGA)
+    nothing = dataset.orbit_spectral_radius * np.nan
+    dataset = dataset.assign(condition=nothing).assign(outcome=dataset.outcome + np.int8(2))
+    figure = plot(dataset)
+    assert panels(figure)[-1].get_yscale() == "linear" and f"failed ({OMEGA.size})" in legend(figure)
+
+
 def test_nothing_to_plot_is_an_input_error():
     with pytest.raises(InputError, match=r"axes = Omega \(one value\): allowed are one or two axes of several values"):
         plot(results.forced(Omega=OMEGA[:1]))
