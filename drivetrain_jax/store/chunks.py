@@ -140,13 +140,14 @@ class PartsFolder:
         """Whether there is anything to resume or to refuse; a run killed at its very start leaves nothing."""
         return self._plan.exists() or any(self.path.glob("*.h5"))
 
-    def discard(self, digest: str) -> None:
-        """Delete what the run that made the result ``digest`` was killed over before it could.
+    def discard(self, digest: str, written: int | None = None) -> None:
+        """Delete what is left over from the run that made ``digest``, if it was killed before it could do so itself.
 
-        The work of another scene is left alone, and so is what is to replace this very result.
+        The work of another scene is left alone, and so is what is to replace this very result, ``written`` at this time.
         """
         plan = self.plan()
-        if self.path.exists() and plan.get("digest") in (None, digest) and plan.get("replaces") != digest:
+        replaces = (plan.get("replaces"), plan.get("replaces_written")) == (digest, written)
+        if self.path.exists() and plan.get("digest") in (None, digest) and not replaces:
             # What cannot be deleted does not keep anybody from reading the result.
             with suppress(InputError, OSError):
                 self.open()

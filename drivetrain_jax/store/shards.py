@@ -23,6 +23,8 @@ from drivetrain_jax.store.provenance import digest
 POINT, DONE = "point", "done"
 # The folder among the parts of a result that a store grows in.
 UNFINISHED = "store"
+# The folder among the parts that a store is in for the moment in which another takes its place.
+FORMER = "former"
 # Attributes that only a store has: what finds its shards and says how many points they hold, and the digest of all others.
 GROUPS, HELD, SEAL = "groups", "held_points", "checksum"
 # What decoding raises depends on where the damage is.

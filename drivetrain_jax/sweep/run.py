@@ -103,8 +103,9 @@ def run_to_file(
     if store == "zarr":
         sharded.check(engine)
     target = Target(out, engine, store)
+    target.restore()
     if not fresh and target.state == "complete":
-        target.parts.discard(target.digest)
+        target.parts.discard(target.digest, target.written)
         total = target.points(engine.total)
         return Progress(total, reused=total, failed=target.failed)
     if not fresh and target.state == "stale":

@@ -198,7 +198,7 @@ def _finish(engine: Engine, path: Path, out: Path, parts: PartsFolder, seconds: 
         raise ChunkError(f"{absent} shards were written elsewhere; every worker has to see the store as {str(path)!r}")
     # Made anew: what a store has got while it grew is not guarded.
     shards.seal(path, _attrs(engine) | {"wall_time_s": seconds})
-    former = parts.path / "former"
+    former = parts.path / shards.FORMER
     if out.exists():
         shutil.rmtree(former, ignore_errors=True)
         out.rename(former)

@@ -37,20 +37,46 @@ class Target:
         self.out = out = behind_link(out)
         self.parts = PartsFolder(out)
         _check_name(out, self.parts)
-        _restore_former(out, self.parts)
         self.store = store or self._kind()
-        _check_place(out, self.store)
+        _check_place(out, self._held, self.store)
         if self.parts.path.exists() and not self.parts.path.is_dir():
             raise InputError(
                 f"out = {str(out)!r}: {str(self.parts.path)!r} is in the way; allowed is to move that file away"
             )
         self.engine, self.digest = engine, engine.digest
-        self.present = _digest_of(out)
+        self.present = _digest_of(out, self._held)
         self._plan_seen = self.parts.plan()
 
     def _kind(self) -> str:
         """``hdf5`` or ``zarr``, after what is there."""
-        return "zarr" if shards.is_store(self.out) else self.parts.plan().get("store", "hdf5")
+        return "zarr" if shards.is_store(self._held) else self.parts.plan().get("store", "hdf5")
+
+    @property
+    def _held(self) -> Path:
+        """Where the result that is there lies: a run puts a store aside just before it puts the new one in its place."""
+        former = self.parts.path / shards.FORMER
+        return former if not self.out.exists() and former.exists() else self.out
+
+    @property
+    def written(self) -> int | None:
+        """When the result that is there was written, in the clock of its file system."""
+        held = self._held / "zarr.json" if self.store == "zarr" else self._held
+        return held.stat().st_mtime_ns if held.exists() else None
+
+    def restore(self) -> None:
+        """Put a store back that a run was killed over while it replaced it.
+
+        Raises :class:`InputError` if that run is still at work.
+        """
+        if self._held == self.out:
+            return
+        self.check_writable()
+        self.parts.open()
+        try:
+            if self._held != self.out:
+                self._held.rename(self.out)
+        finally:
+            self.parts.close()
 
     @cached_property
     def state(self) -> str:
@@ -69,6 +95,7 @@ class Target:
         return {
             "digest": self.digest,
             "replaces": self.present,
+            "replaces_written": self.written,
             "store": self.store,
             "fresh": fresh,
             "reuses": taken.digest,
@@ -81,12 +108,13 @@ class Target:
         """Whether a run goes on with the parts that are there. A ``fresh`` one does so with those of its own beginning."""
         if not fresh:
             return self.parts.holds_work()
-        names = ("digest", "replaces", "store", "reuses", "fresh")
+        # Parts that the result was made from already, by a run that was killed before it deleted them, are none of these.
+        names = ("digest", "replaces", "replaces_written", "store", "reuses", "fresh")
         return _same(self.parts.plan(), self.plan(taken, fresh), names)
 
     def check_unchanged(self) -> None:
         """Raises :class:`InputError` if another run has come to its end, or begun, since this was made."""
-        if (_digest_of(self.out), self.parts.plan()) != (self.present, self._plan_seen):
+        if (_digest_of(self.out, self._held), self.parts.plan()) != (self.present, self._plan_seen):
             raise InputError(f"out = {str(self.out)!r}: another run has changed it meanwhile; allowed is to try again")
 
     def check_writable(self) -> None:
@@ -188,7 +216,7 @@ class Target:
             if self.store != stored.get("store"):
                 return f"{what} of --store {stored.get('store')}"
         else:
-            stored, what = {name: _attribute(self.out, name) for name in provenance_of(self.engine)}, "a result"
+            stored, what = {name: _attribute(self._held, name) for name in provenance_of(self.engine)}, "a result"
         reasons = differences(stored, self.engine) if stored else ["it cannot be told which"]
         more = f" and {len(reasons) - 2} more" if len(reasons) > 2 else ""
         return f"{what} of another scene or version: {'; '.join(reasons[:2]) or 'other sizes of chunks'}{more}"
@@ -197,7 +225,9 @@ class Target:
     def outcomes(self) -> np.ndarray:
         """Outcomes of all points of the complete result."""
         if self.store == "zarr":
-            held = np.concatenate([np.empty(0, np.int8), *(a.ravel() for a in shards.finished(self.out, OUTCOME.name))])
+            held = np.concatenate(
+                [np.empty(0, np.int8), *(a.ravel() for a in shards.finished(self._held, OUTCOME.name))]
+            )
             # Points that no solver can do are in no shard.
             return np.append(held, np.full(max(self.engine.total - held.size, 0), Outcome.STEP_LIMIT, np.int8))
         return read_variable(self.out, OUTCOME.name)
@@ -218,7 +248,7 @@ class Target:
 
     @property
     def _solves(self) -> int | None:
-        value = _attribute(self.out, "solves")
+        value = _attribute(self._held, "solves")
         return None if value is None else int(np.squeeze(value))
 
 
@@ -245,37 +275,30 @@ def _check_name(out: Path, parts: PartsFolder) -> None:
         ) from None
 
 
-def _restore_former(out: Path, parts: PartsFolder) -> None:
-    """Put a store back that a run was killed over while it replaced it."""
-    former = parts.path / "former"
-    if former.exists() and not out.exists():
-        former.rename(out)
-
-
-def _check_place(out: Path, store: str) -> None:
+def _check_place(out: Path, held: Path, store: str) -> None:
     folder = out.parent
     if not folder.is_dir():
         raise InputError(
             f"out = {str(out)!r}: the folder {str(folder)!r} does not exist; allowed is a file in an existing folder"
         )
-    if out.is_dir() and not (store == "zarr" and shards.is_store(out)):
+    if held.is_dir() and not (store == "zarr" and shards.is_store(held)):
         raise InputError(f"out = {str(out)!r}: is a folder; allowed is the path of a file")
     if out.is_file() and store == "zarr":
         raise InputError(f"out = {str(out)!r}: is a file; allowed for store = 'zarr' is a new path, or such a store")
 
 
-def _attribute(out: Path, name: str) -> Any:
-    return shards.attributes(out).get(name) if out.is_dir() else read_attribute(out, name)
+def _attribute(held: Path, name: str) -> Any:
+    return shards.attributes(held).get(name) if held.is_dir() else read_attribute(held, name)
 
 
-def _digest_of(out: Path) -> str | None:
-    """Digest of the result at ``out``, None if there is no file."""
-    if not out.exists():
+def _digest_of(out: Path, held: Path) -> str | None:
+    """Digest of the result of ``out``, which lies at ``held``; None if there is none."""
+    if not held.exists():
         return None
     try:
-        digest, what = _attribute(out, "digest"), "not a result of drivetrain_jax"
+        digest, what = _attribute(held, "digest"), "not a result of drivetrain_jax"
     except InputError:
-        if out.is_dir():
+        if held.is_dir():
             raise
         digest, what = None, "not a readable netCDF4/HDF5 file"
     if not isinstance(digest, str):

@@ -407,6 +407,31 @@ def test_full_disk_leaves_a_resumable_run(grid_scene, tmp_path, monkeypatch):
     assert not list(Path(f"{path}.parts").glob("*.tmp"))
 
 
+def test_fresh_does_not_go_on_with_parts_that_the_result_was_made_from(grid_scene, tmp_path, monkeypatch):
+    """The run is killed after it has put the new result into place and before it has deleted its parts."""
+    path = tmp_path / "r.nc"
+    run_to_file(grid_scene, path)
+    close = PartsFolder.close
+
+    def killed(parts, remove=False):
+        if remove:
+            raise KeyboardInterrupt
+        close(parts)
+
+    def fresh_but_for_the_end():
+        with monkeypatch.context() as short:
+            short.setattr(work, "_SHORTEST", 0.0)
+            short.setattr(PartsFolder, "close", killed)
+            with pytest.raises(KeyboardInterrupt):
+                run_to_file(grid_scene, path, fresh=True)
+        assert PartsFolder(path).count()
+
+    fresh_but_for_the_end()
+    assert run_to_file(grid_scene, path, fresh=True).computed == 123
+    fresh_but_for_the_end()
+    assert run_to_file(grid_scene, path).reused == 123 and os.listdir(tmp_path) == ["r.nc"]
+
+
 def test_a_short_run_that_ends_well_keeps_nothing_on_the_way(grid_scene, tmp_path, monkeypatch):
     written = []
     monkeypatch.setattr(PartsFolder, "write", lambda _, part: written.append(part))

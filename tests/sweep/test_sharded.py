@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from drivetrain_jax._threads import threads
 from drivetrain_jax.cli import main
 from drivetrain_jax.invariants.verify import verify
 from drivetrain_jax.store import shards
+from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.sweep.executor import Where
 from drivetrain_jax.sweep.export import export
 from drivetrain_jax.sweep.partial import PENDING
@@ -252,6 +254,38 @@ def test_fresh_replaces_and_a_kill_between_keeps_the_former(grid_scene, tmp_path
     assert status(grid_scene, path).state == "complete"
     to_store(other, path, fresh=True)
     assert status(other, path).state == "complete" and [p.name for p in tmp_path.iterdir()] == ["r.zarr"]
+
+
+def test_looking_while_a_store_is_replaced_moves_nothing(grid_scene, tmp_path, monkeypatch):
+    path, other, seen = tmp_path / "r.zarr", grid_scene | {"fixed": {"n": 4}}, []
+    to_store(grid_scene, path)
+    rename = Path.rename
+
+    def look(self, target):
+        moved = rename(self, target)
+        if Path(target).name == shards.FORMER:
+            seen.append((status(other, path), status(grid_scene, path), dt.open_result(path), verify(path)))
+        return moved
+
+    with monkeypatch.context() as replacing:
+        replacing.setattr(Path, "rename", look)
+        assert to_store(other, path, fresh=True).computed == 123
+    ((ours, former, partial, report),) = seen
+    assert (ours.state, ours.done, former.state) == ("partial", 123, "complete")
+    assert partial.attrs["points_done"] == 123 and str(report) == "unfinished: 6 of 6 shards are intact"
+    assert status(other, path).state == "complete" and [p.name for p in tmp_path.iterdir()] == ["r.zarr"]
+
+
+def test_a_run_puts_a_former_store_back_unless_another_is_at_work(grid_scene, tmp_path):
+    path = tmp_path / "r.zarr"
+    to_store(grid_scene, path)
+    parts = PartsFolder(path)
+    parts.open()
+    path.rename(parts.path / shards.FORMER)
+    with pytest.raises(InputError, match="another run is working on it"):
+        to_store(grid_scene, path)
+    parts.close()
+    assert to_store(grid_scene, path).reused == 123 and [p.name for p in tmp_path.iterdir()] == ["r.zarr"]
 
 
 def test_the_command_line(tmp_path, monkeypatch, capsys):
