@@ -18,7 +18,7 @@ __all__ = ["main"]
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code (0 done, 2 wrong input, 3 incomplete and resumable, 130 interrupted)."""
     if arguments is None:
-        # What a command makes it keeps to its end: looking for garbage in it as often as usual takes a third of a second.
+        # Most objects are needed until the end: usual garbage collection takes a third of a second and frees little.
         gc.set_threshold(50_000)
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
@@ -44,5 +44,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
             # The process ends now, and what it has done is done: a signal could only spoil its way out.
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, signal.SIG_IGN)
-            # Nor is it worth looking for garbage once more, which takes another third.
+            # The garbage collection that Python ends with would take another third of a second.
             gc.freeze()

@@ -38,12 +38,27 @@ def _answer(reply: Any, options: argparse.Namespace) -> int:
 def run(options: argparse.Namespace) -> int:
     """Compute a scene, or resume it. Ctrl-C and SIGTERM end it in order."""
     with stop_on_signals() as check:
-        return _compute(options, check)
+        try:
+            progress, code, reason = _compute(options, check)
+        except KeyboardInterrupt as stop:
+            # There is nothing to count before all that computes is loaded.
+            progress = getattr(stop, "progress", "points: total=0 computed=0 reused=0 failed=0")
+            code, reason = INTERRUPTED, "interrupted; the same command resumes"
+        if code != OK:
+            sys.stderr.write(one_line(reason))
+        sys.stderr.write(f"{progress}\n")
+        if code == INTERRUPTED and options.workers is None:
+            # Chunks that are still being computed would hold up a normal exit; their results are not wanted any more.
+            # Processes have been killed by now, and what they shared with this one is given back by a normal exit only.
+            sys.stderr.flush()
+            os._exit(code)
+    return code
 
 
-def _compute(options: argparse.Namespace, check: Callable[[], None]) -> int:
+def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[Any, int, str]:
+    """Counts, exit code and, if that is not 0, the reason."""
     from drivetrain_jax.sweep.executor import Where
-    from drivetrain_jax.sweep.run import Incomplete, Interrupted, run_to_file
+    from drivetrain_jax.sweep.run import Incomplete, run_to_file
 
     overrides = assignments(options.set, "--set")
     with _progress_line(options.quiet) as show:
@@ -64,20 +79,9 @@ def _compute(options: argparse.Namespace, check: Callable[[], None]) -> int:
                 store=options.store,
                 report=report,
             )
-            code = OK
         except Incomplete as error:
-            progress, code, reason = error.progress, INCOMPLETE, str(error)
-        except Interrupted as error:
-            progress, code, reason = error.progress, INTERRUPTED, "interrupted; the same command resumes"
-    if code != OK:
-        sys.stderr.write(one_line(reason))
-    sys.stderr.write(f"{progress}\n")
-    if code == INTERRUPTED and options.workers is None:
-        # Chunks that are still being computed would hold up a normal exit; their results are not wanted any more.
-        # Processes have been killed by now, and what they shared with this one is given back by a normal exit only.
-        sys.stderr.flush()
-        os._exit(code)
-    return code
+            return error.progress, INCOMPLETE, str(error)
+    return progress, OK, ""
 
 
 def _progress_line(quiet: bool) -> Any:

@@ -15,10 +15,11 @@ _GRACE = 2.0
 
 @contextmanager
 def stop_on_signals() -> Iterator[Callable[[], None]]:
-    """Ctrl-C and a scheduler's SIGTERM raise ``KeyboardInterrupt``, and the function that it gives does so again.
+    """Ctrl-C and a scheduler's SIGTERM raise ``KeyboardInterrupt`` until the context is left.
 
-    The second time is for an exception that a destructor or a C callback has swallowed. What these say of it, and of what
-    it left half made, is not shown. An impatient second signal is ignored while what is finished is written down.
+    It gives a function that raises it once more after a signal, for a destructor or a C callback may have swallowed the
+    first; the traceback that Python prints in that case is not shown. For two seconds further signals are ignored, so that
+    what is finished can be written down.
     """
     caught: list[float] = []
     before = sys.unraisablehook
@@ -37,12 +38,14 @@ def stop_on_signals() -> Iterator[Callable[[], None]]:
         if not caught:
             before(unraisable)
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, stop)
+    handlers = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     sys.unraisablehook = hook
     try:
         yield check
     finally:
+        for number, handler in handlers.items():
+            # Not one of Python's own: nothing that could be set again.
+            signal.signal(number, handler or signal.SIG_DFL)
         # After a signal the process is about to end, and what was left half made ends with it.
         if not caught:
             sys.unraisablehook = before

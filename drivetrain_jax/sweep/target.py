@@ -37,12 +37,9 @@ class Target:
         self.out = out = behind_link(out)
         self.parts = PartsFolder(out)
         _check_name(out, self.parts)
+        _check_parts(out, self.parts.path)
         self.store = store or self._kind()
         _check_place(out, self._held, self.store)
-        if self.parts.path.exists() and not self.parts.path.is_dir():
-            raise InputError(
-                f"out = {str(out)!r}: {str(self.parts.path)!r} is in the way; allowed is to move that file away"
-            )
         self.engine, self.digest = engine, engine.digest
         self.present = _digest_of(out, self._held)
         self._plan_seen = self.parts.plan()
@@ -119,12 +116,12 @@ class Target:
 
     def check_writable(self) -> None:
         """Raises :class:`InputError` if nothing can be written beside what is there."""
-        folder = self.out.parent
-        if not os.access(folder, os.W_OK | os.X_OK):
-            raise InputError(
-                f"out = {str(self.out)!r}: the folder {str(folder)!r} is not writable; "
-                "allowed is a file in a writable folder"
-            )
+        for folder in (self.out.parent, self.parts.path):
+            if folder.exists() and not os.access(folder, os.W_OK | os.X_OK):
+                raise InputError(
+                    f"out = {str(self.out)!r}: the folder {str(folder)!r} is not writable; "
+                    "allowed is a file in a writable folder"
+                )
 
     @cached_property
     def _rearranged(self) -> list[str]:
@@ -273,6 +270,13 @@ def _check_name(out: Path, parts: PartsFolder) -> None:
         raise InputError(
             f"out = {clipped(str(out))!r}: {error.strerror} (with '.parts'); allowed is a shorter name"
         ) from None
+
+
+def _check_parts(out: Path, folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"out = {str(out)!r}: {str(folder)!r} is in the way; allowed is to move that file away")
+    if folder.exists() and not os.access(folder, os.R_OK | os.X_OK):
+        raise InputError(f"out = {str(out)!r}: the folder {str(folder)!r} is not readable; allowed is one that is")
 
 
 def _check_place(out: Path, held: Path, store: str) -> None:

@@ -326,6 +326,28 @@ def test_a_direct_solve_of_an_atlas_that_fails_is_one_line(cli, monkeypatch, wor
     assert cli(*words) == (3, "", ["drivetrain: chunk 3 (direct): MemoryError:"])
 
 
+@pytest.mark.parametrize("needed", ["writable", "readable"])
+def test_parts_that_cannot_be_used_are_wrong_input(cli, monkeypatch, needed):
+    os.mkdir("r.nc.parts")
+    lacking = os.W_OK if needed == "writable" else os.R_OK
+    allows = lambda path, mode: Path(path).suffix != ".parts" or not mode & lacking  # noqa: E731
+    monkeypatch.setattr("drivetrain_jax.sweep.target.os.access", allows)
+    code, _, err = cli("run", "scene.toml", "--out", "r.nc")
+    assert (code, len(err)) == (2, 1) and f"the folder 'r.nc.parts' is not {needed}; allowed is" in err[0]
+
+
+def test_an_interrupt_while_all_is_loaded_counts_nothing(cli, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("drivetrain_jax.sweep.run.load_scene", interrupted)
+    monkeypatch.setattr("drivetrain_jax.cli.commands.os._exit", sys.exit)
+    counts = "points: total=0 computed=0 reused=0 failed=0"
+    line = "drivetrain: interrupted; the same command resumes"
+    assert cli("run", "scene.toml", "--out", "r.nc") == (130, "", [line, counts])
+    assert cli("run", "scene.toml", "--out", "r.nc", "--workers", "1") == (130, "", [line, counts])
+
+
 def test_values_may_stand_behind_options(cli):
     before, between = (
         cli("point", "toy", "toy", *words) for words in (("a=.5", "b=1", "--json"), ("a=.5", "--json", "b=1"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from contextlib import suppress
 
 import pytest
 
@@ -44,6 +45,18 @@ def test_a_swallowed_interrupt_is_raised_again_and_not_shown(monkeypatch, distur
         else:
             check()
     assert shown == [] and (sys.unraisablehook == shown.append) is not disturbed
+
+
+@pytest.mark.parametrize("stopped", [True, False])
+def test_the_handlers_of_before_are_back(stopped):
+    mine = [lambda *_: None, signal.SIG_IGN]
+    for number, handler in zip(NUMBERS, mine, strict=True):
+        signal.signal(number, handler)
+    with suppress(KeyboardInterrupt), stop_on_signals():
+        assert not {signal.getsignal(number) for number in NUMBERS} & set(mine)
+        if stopped:
+            os.kill(os.getpid(), signal.SIGTERM)
+    assert [signal.getsignal(number) for number in NUMBERS] == mine
 
 
 def test_other_errors_in_destructors_are_shown(monkeypatch):
