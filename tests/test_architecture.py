@@ -125,3 +125,10 @@ def test_every_integer_option_ends_where_kernels_can_count(name):
     """Beyond, a motion was not waited for at all, and labels did not fit into memory."""
     for option in get_analysis(name).options:
         assert not option.integer or option.upper < 2**31 or option.name == "seed"
+
+
+@pytest.mark.parametrize("name", analysis_names())
+def test_every_duration_ends_where_kernels_can_count(name):
+    """Beyond, nothing came back, and counts of strobes overflowed."""
+    for option in get_analysis(name).options:
+        assert option.units != "s" or option.upper <= 1e9

@@ -33,6 +33,9 @@ OUTCOME = Variable(
     "outcome", "1", "outcome of the computation", dtype="int8", flags=tuple(o.name.lower() for o in Outcome)
 )
 RTOL = Parameter("rtol", "1", "target relative error of the results", default=1e-10, lower=1e-14, upper=1e-2)
+# Seconds beyond which no motion is asked for, thirty years of it; and steps beyond which none is begun: at a microsecond
+# each they would take eleven days.
+MOST_SECONDS, MOST_STEPS = 1e9, 1e12
 
 
 @dataclass(frozen=True)

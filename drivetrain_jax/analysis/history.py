@@ -24,7 +24,7 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis._base import MOST_SECONDS, RTOL, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.analysis.periodic.monodromy import SOLVERS
 from drivetrain_jax.systems import Flow, System
@@ -250,8 +250,16 @@ ANALYSIS = Analysis(
         "diffrax": "adaptive steps from strobe to strobe",
     },
     options=(
-        Parameter("times", "s", "times at which the state is wanted", default=(), listed=True, lower=0.0),
-        Parameter("stop", "s", "end of the history (0: see times)", default=0.0, lower=0.0),
+        Parameter(
+            "times",
+            "s",
+            "times at which the state is wanted",
+            default=(),
+            listed=True,
+            lower=0.0,
+            upper=MOST_SECONDS,
+        ),
+        Parameter("stop", "s", "end of the history (0: see times)", default=0.0, lower=0.0, upper=MOST_SECONDS),
         Parameter(
             "num", "1", "number of equally spaced times from 0 to stop", default=1001, lower=2, upper=1e7, integer=True
         ),

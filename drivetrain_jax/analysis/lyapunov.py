@@ -5,7 +5,7 @@ whatever happens). The paper's own estimator is offered beside them under its ow
 
 Outcome: ``SUCCESS``, or ``TOLERANCE_NOT_MET`` if the standard error is above the target at ``max_time``. A motion that
 leaves all bounds is data: its verdict says so, and its exponents are those of the time before, without an error (NaN).
-``NOT_FINITE`` if it leaves so soon that there are none.
+``NOT_FINITE`` if it leaves so soon that there are none, ``STEP_LIMIT`` where ``max_time`` is more than 1e12 steps.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis._base import MOST_SECONDS, MOST_STEPS, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.chaos.growth import (
     BLOCKS,
     SEGMENTS,
@@ -61,7 +61,7 @@ VARIABLES = (
 )
 OPTIONS = (
     Parameter("standard_error", "1/s", "standard error at which a run may end", default=0.0, lower=0.0),
-    Parameter("max_time", "s", "longest time of a run", default=1.0, lower=0.0, open_lower=True),
+    Parameter("max_time", "s", "longest time of a run", default=1.0, lower=0.0, upper=MOST_SECONDS, open_lower=True),
     Parameter("steps", "1", "integration steps per strobe", default=48, lower=4, upper=1e6, integer=True),
 )
 # Strobes that follow the run for the verdict and the 0-1 test, and the longest period looked for among them.
@@ -274,11 +274,15 @@ def averaging_time(record: Record) -> Array:
 
 
 def _effort(system: System, request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Predicted steps, shape (N,): those of a whole run, or up to where the mean contraction has settled the motion."""
+    """Predicted steps, shape (N,): those of a whole run, or up to where the mean contraction has settled the motion.
+
+    Infinite where a whole run is not worth beginning.
+    """
     options, longest = request.options, request.options["max_time"]
     rate, period = predicted(_contraction, (system.models["lyapunov"].build,), columns)
     settling = SETTLED / np.maximum(rate, SETTLED / longest) if options["standard_error"] > 0 else longest
-    return np.ceil(options["steps"] * np.clip(settling, longest / 4, longest) / period)
+    steps = np.ceil(options["steps"] * np.clip(settling, longest / 4, longest) / period)
+    return np.where(options["steps"] * longest / period <= MOST_STEPS, steps, np.inf)
 
 
 def _contraction(build: Callable[..., Flow], values: Mapping[str, Any]) -> Array:

@@ -12,7 +12,8 @@ See :mod:`~drivetrain_jax.analysis.chaos.section_error`.
 Outcome: ``TOLERANCE_NOT_MET`` if ``section_error`` exceeds 1e-6 or ten times ``rtol``, or is not known. That is so of
 every long section of a chaotic motion: errors grow until they are as large as the motion, and no section is the motion
 from its start. ``strobe_error`` says whether its strobes are right. ``NOT_FINITE`` if the state overflowed: what came
-before is kept. ``STEP_LIMIT``: the adaptive method needed too many steps within a strobe.
+before is kept. ``STEP_LIMIT``: the adaptive method needed too many steps within a strobe, or all
+strobes are more than 1e12 equal steps.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis._base import MOST_STEPS, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.chaos.growth import discarded, sampled
 from drivetrain_jax.analysis.chaos.section_error import Steps, section_errors, watched
 from drivetrain_jax.analysis.chaos.section_measures import period_multiple, torus_residual
@@ -168,9 +169,10 @@ def _solve(system: System, request: Request, values: Mapping[str, Any], effort: 
 
 
 def _effort(request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Strobes, shape (N,)."""
+    """Strobes, shape (N,); infinite where they are not worth beginning."""
     count = np.broadcast(*jax.tree.leaves({k: v for k, v in columns.items() if not isinstance(v, str)})).size
-    return np.full(count, request.options["strobes"] + request.options["discard"])
+    strobes = request.options["strobes"] + request.options["discard"]
+    return np.full(count, strobes if strobes * request.options["steps"] <= MOST_STEPS else np.inf)
 
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:

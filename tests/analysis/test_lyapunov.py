@@ -227,6 +227,23 @@ def controls():
     return dt.run(scene | {"options": {"max_time": 1.0, "steps": 12}})
 
 
+def test_runs_that_never_end_are_not_begun():
+    fixed = {"element": "input", "beta": 0.1, "zeta": 0.0016}
+    scene = {
+        "system": "tripod",
+        "analysis": "lyapunov",
+        "points": {"excitation_frequency": [1e300, 3e3]},
+        "fixed": fixed,
+    }
+    with pytest.raises(
+        dt.InputError, match=r"^options\.max_time = 1e\+300: allowed is 0 < max_time <= 1000000000, in s$"
+    ):
+        dt.run(scene | {"options": {"max_time": 1e300}})
+    ours = dt.run(scene | {"options": {"max_time": 0.01}, "outputs": ["lyapunov_spectrum"]})
+    assert ours.outcome.values.tolist() == [Outcome.STEP_LIMIT, Outcome.SUCCESS]
+    assert np.isnan(ours.lyapunov_spectrum[0]).all() and np.isfinite(ours.lyapunov_spectrum[1]).all()
+
+
 def test_no_chaos_at_the_papers_settings(controls):
     """Exponents of ../shared: Floquet -13.108684, -17.719175; from rest the transient of the frame is still visible."""
     ours, error = controls.lyapunov_spectrum.values[0], controls.lyapunov_standard_error.values[0]

@@ -160,3 +160,10 @@ def test_a_parameter_of_the_field_may_vary():
     )
     assert (fixed.outcome == Outcome.SUCCESS).all()
     np.testing.assert_allclose(fixed.section, pair.section, rtol=0, atol=1e-7 * float(abs(pair.section).max()))
+
+
+def test_sections_that_never_end_are_not_begun():
+    fixed = {"element": "input", "beta": 0.1, "zeta": 0.0016, "excitation_frequency": 3e3}
+    options = {"strobes": 128, "discard": 1_000_000_000, "steps": 1_000_000}
+    ours = dt.run({"system": "tripod", "analysis": "poincare", "fixed": fixed, "options": options})
+    assert ours.outcome == Outcome.STEP_LIMIT and np.isnan(ours.section).all()
