@@ -72,16 +72,41 @@ def create(path: Path, groups: Sequence[Group], fields: Sequence[Field], attrs: 
     root = zarr.create_group(path, zarr_format=3, attributes=dict(attrs))
     for group in groups:
         own = root.create_group(group.name)
-        for field in (*fields, Field(POINT, "int64", ())):
-            own.create_array(
-                field.name,
-                shape=(group.count * group.width, *field.shape),
-                dtype=field.dtype,
-                chunks=(group.width, *(max(n, 1) for n in field.shape)),
-                shards=(group.per_shard * group.width, *(max(n, 1) for n in field.shape)),
-                compressors=zarr.codecs.Crc32cCodec(),
-            )
-        own.create_array(DONE, shape=(group.shards,), dtype="uint64", chunks=(1,), compressors=None)
+        for name, layout in _layouts(group, fields).items():
+            own.create_array(name, **layout, compressors=None if name == DONE else zarr.codecs.Crc32cCodec())
+
+
+def _layouts(group: Group, fields: Sequence[Field]) -> dict[str, dict[str, Any]]:
+    """Shape, type and pieces of every array of ``group``."""
+    layouts = {}
+    for field in (*fields, Field(POINT, "int64", ())):
+        own = tuple(max(n, 1) for n in field.shape)
+        layouts[field.name] = {
+            "shape": (group.count * group.width, *field.shape),
+            "dtype": field.dtype,
+            "chunks": (group.width, *own),
+            "shards": (group.per_shard * group.width, *own),
+        }
+    return layouts | {DONE: {"shape": (group.shards,), "dtype": "uint64", "chunks": (1,), "shards": None}}
+
+
+def check_layout(path: Path, groups: Sequence[Group], fields: Sequence[Field]) -> None:
+    """Raises :class:`InputError` unless the unfinished store is laid out as :func:`create` does it.
+
+    What would be written into other arrays is lost without a word.
+    """
+    try:
+        root = _zarr().open_group(path, mode="r")
+        same = all(
+            getattr(root[group.name][name], what) == value
+            for group in groups
+            for name, layout in _layouts(group, fields).items()
+            for what, value in layout.items()
+        )
+    except _BROKEN:
+        same = False
+    if not same:
+        raise InputError(f"store = {str(path)!r}: its metadata are damaged; allowed is to restore them, or --fresh")
 
 
 def write(path: Path, group: Group, shard: int, arrays: Mapping[str, np.ndarray]) -> None:

@@ -108,14 +108,18 @@ def _tell(report: Report | None, progress: Progress) -> None:
 
 def _create(engine: Engine, path: Path) -> None:
     shutil.rmtree(path, ignore_errors=True)
-    groups = groups_of(engine)
-    shapes = result_shapes(engine.scene, engine.grid, engine.solvers[engine.plan.groups[0].index]) if groups else {}
-    fields = [shards.Field(v.name, v.dtype, shapes[v.name]) for v in result_variables(engine.scene)] if groups else []
     # Moved in one step: what is there is a whole store.
     half = path.with_name("half")
     shutil.rmtree(half, ignore_errors=True)
-    shards.create(half, groups, fields, _attrs(engine))
+    shards.create(half, groups_of(engine), _fields(engine), _attrs(engine))
     half.rename(path)
+
+
+def _fields(engine: Engine) -> list[shards.Field]:
+    if not engine.plan.groups:
+        return []
+    shapes = result_shapes(engine.scene, engine.grid, engine.solvers[engine.plan.groups[0].index])
+    return [shards.Field(v.name, v.dtype, shapes[v.name]) for v in result_variables(engine.scene)]
 
 
 def _attrs(engine: Engine) -> dict[str, str | int]:
@@ -148,7 +152,11 @@ def _missing(engine: Engine, path: Path, progress: Progress) -> Iterator[Shard]:
 
 
 def stored(engine: Engine, path: Path) -> Iterator[tuple[Shard, Mapping[str, np.ndarray] | None]]:
-    """All shards and what the store at ``path`` holds of them: None if one is not there or damaged."""
+    """All shards and what the store at ``path`` holds of them: None if one is not there or damaged.
+
+    Raises :class:`InputError` if the store itself is damaged.
+    """
+    shards.check_layout(path, groups_of(engine), _fields(engine))
     names = [shards.POINT, *(variable.name for variable in result_variables(engine.scene))]
     marked = {group.name: shards.done(path, group) for group in groups_of(engine)}
     for shard in all_shards(engine):

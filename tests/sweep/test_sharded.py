@@ -230,6 +230,30 @@ def test_unfinished_work_is_opened_and_counted(grid_scene, tmp_path):
     assert "the run that resumes computes the chunks of the others again" in str(verify(path))
 
 
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        (".", lambda file: file.write_text("rubbish")),
+        ("solver_0", lambda file: file.write_text("{}")),
+        ("solver_0/done", lambda file: file.unlink()),
+        ("solver_0/done", lambda file: file.write_text(json.dumps(json.loads(file.read_text()) | {"shape": [1]}))),
+        ("solver_0/point", lambda file: file.write_text(json.dumps(json.loads(file.read_text()) | {"shape": [1]}))),
+        ("solver_1/value", lambda file: file.write_text(file.read_text().replace("float64", "float32"))),
+    ],
+)
+def test_an_unfinished_store_with_damaged_metadata_is_one_line(grid_scene, tmp_path, name, damage):
+    path, scene = tmp_path / "r.zarr", large(grid_scene)
+    with pytest.raises(Interrupted):
+        to_store(scene, path, where=Where(threads=1), report=stop_after(3))
+    store = tmp_path / "r.zarr.parts" / "store"
+    damage(store / name / "zarr.json")
+    line = re.escape(f"store = {str(store)!r}: its metadata are damaged; allowed is to restore them, or --fresh")
+    for look in (lambda: to_store(scene, path), lambda: dt.open_result(path)):
+        with pytest.raises(InputError, match=f"^{line}$"):
+            look()
+    assert to_store(scene, path, fresh=True).computed == 1640 and verify(path).problem == ""
+
+
 @pytest.mark.parametrize("name", ["value", "done"])
 def test_a_shard_that_is_gone_is_found(grid_scene, tmp_path, name):
     to_store(grid_scene, tmp_path / "r.zarr")
