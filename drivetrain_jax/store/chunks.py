@@ -137,8 +137,15 @@ class PartsFolder:
         self._lock = None
 
     def holds_work(self) -> bool:
-        """Whether there is anything to resume or to refuse; a run killed at its very start leaves nothing."""
-        return self._plan.exists() or any(self.path.glob("*.h5"))
+        """Whether there is anything to resume or to refuse; a run killed at its very start leaves nothing.
+
+        Raises :class:`InputError` if the folder may not be looked into.
+        """
+        try:
+            return self._plan.exists() or any(self.path.glob("*.h5"))
+        except PermissionError:
+            text = f"out = {str(self.path)!r}: the folder is not readable; allowed is one that is"
+            raise InputError(text) from None
 
     def discard(self, digest: str, written: int | None = None) -> None:
         """Delete what is left over from the run that made ``digest``, if it was killed before it could do so itself.

@@ -58,7 +58,8 @@ def run(
     """Compute a scene and return its labelled result.
 
     Without ``out`` everything happens in memory. With it the result is written to that netCDF4/HDF5 file; unfinished
-    work is kept in ``FILE.nc.parts/`` and taken up by the next call, and a complete result is only read.
+    work is kept in ``FILE.nc.parts/`` and taken up by the next call, and a complete result is only read. A Zarr store is for
+    results that are too large to be returned, and so the command line's: ``drivetrain run --store zarr``.
 
     :param scene: path of a scene file, or a mapping with the same keys.
     :param overrides: entries to replace, by dotted key: ``{"fixed.zeta": 0.002}``.

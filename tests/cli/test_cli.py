@@ -336,6 +336,19 @@ def test_parts_that_cannot_be_used_are_wrong_input(cli, monkeypatch, needed):
     assert (code, len(err)) == (2, 1) and f"the folder 'r.nc.parts' is not {needed}; allowed is" in err[0]
 
 
+@pytest.mark.parametrize("words", [("verify", "r.nc"), ("plot", "r.nc", "--out", "f.png")])
+def test_parts_that_cannot_be_looked_into_are_one_line(cli, monkeypatch, words):
+    def refuses(path):
+        if path.parent.name == "r.nc.parts":
+            raise PermissionError(13, "Permission denied")
+        return os.path.exists(path)
+
+    os.mkdir("r.nc.parts")
+    monkeypatch.setattr(Path, "exists", refuses)
+    line = "drivetrain: out = 'r.nc.parts': the folder is not readable; allowed is one that is"
+    assert cli(*words) == (2, "", [line])
+
+
 def test_an_interrupt_while_all_is_loaded_counts_nothing(cli, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
