@@ -61,8 +61,9 @@ def tiles(
 ) -> Iterator[Tile]:
     """Tiles of at most ``most`` cells that cover what panels cover of the grid of ``axes``, two or more, in coordinates.
 
-    ``axes`` rise. A cell on a face that panels share belongs to the last of them. Without ``dense`` no tile has nodes. A
-    part of a chart of ``rows`` rows has tiles of the same shape as all others.
+    ``axes`` rise. Tiles overlap on faces that panels share: the last one there is of the panel that
+    :meth:`Atlas.find` gives. Without ``dense`` no tile has nodes. A part of a chart of ``rows`` rows has tiles of the same
+    shape as all others.
     """
     if not atlas.panels:
         return
@@ -176,9 +177,8 @@ def _positions(panel: Panel, k: int, x: np.ndarray) -> np.ndarray:
 
 
 def _assigned(atlas: Atlas, axes: Sequence[np.ndarray]) -> Iterator[tuple[Panel, list[np.ndarray]]]:
-    """For each panel the positions along each axis that it covers. Panels share faces: these are given to all of them,
-    which does no harm, as they agree there within their bounds."""
-    for panel in atlas.panels:
+    """For each panel, the first one last, the positions along each axis that it covers, faces included."""
+    for panel in reversed(atlas.panels):
         groups = [_covered(panel, k, x) for k, x in enumerate(axes)]
         if all(len(g) for g in groups):
             yield panel, groups

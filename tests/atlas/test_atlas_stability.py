@@ -25,6 +25,7 @@ from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.periodic import quartic
 from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES
 from drivetrain_jax.atlas import charts, tiles
+from drivetrain_jax.atlas.panels import Atlas, Panel
 
 COUNTS = [f"{what}_{by}" for what in ("violations", "wrong") for by in ("direct", "precise")]
 
@@ -88,6 +89,24 @@ def test_tiles_cover_each_column_once_and_are_few(chart, count, most):
     assert np.array_equal(np.sort(np.concatenate([tile.index[1] for tile in cut])), np.arange(count))
     assert len(cut) <= most and len(widths) == 1 and max(widths) <= 512
     assert min(len(tile.index[1]) for tile in cut) > 0.5 * max(widths) or count == 1
+
+
+def test_a_cell_on_a_common_face_has_the_panel_of_a_point():
+    """What the tiles leave in each cell, the later ones over the earlier, is the panel that a point finds."""
+    ends = [(0.0, 0.5), (0.5, 1.0)]
+    panels = tuple(
+        Panel(np.array([a, c]), np.array([b, d]), np.zeros((2, 2, 16)), 0.0, np.zeros(3))
+        for a, b in ends
+        for c, d in ends
+    )
+    atlas = Atlas(("a", "b"), (None, None), np.zeros(2), np.ones(2), {}, panels, (), 1e-9, 0)
+    axes = [np.linspace(0.0, 1.0, 5)] * 2
+    left = np.full((5, 5), -1)
+    for tile in tiles.tiles(atlas, axes, (64, 512)):
+        left[np.ix_(*tile.index)] = next(k for k, panel in enumerate(panels) if panel is tile.panel)
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    assert left.tolist() == atlas.find(points.reshape(-1, 2)).reshape(5, 5).tolist()
+    assert left[2].tolist() == [0, 0, 0, 1, 1]
 
 
 def speeds(count):
