@@ -139,7 +139,7 @@ class Atlas:
         if not self.lower[k] <= value <= self.upper[k]:
             raise ValueError(f"{name} = {value!r}: allowed is {self.lower[k]:g} to {self.upper[k]:g}")
         x = float(self.coordinates[k].forward(value))
-        boxes = [box for box in (*self.panels, *self.gaps) if _contains(box, k, x)]
+        boxes = [box for box in (*self.panels, *self.gaps) if between(box.lower[k], box.upper[k], x)]
         # On a common face the first of two neighbours is enough.
         kept: dict[tuple, Panel | Gap] = {}
         for box in boxes:
@@ -187,19 +187,15 @@ def chebyshev(x: np.ndarray, n: int) -> np.ndarray:
     return np.cos(np.arccos(x)[..., None] * np.arange(n))
 
 
-def _slack(panel: Panel | Gap) -> np.ndarray:
-    return _SLACK * np.maximum(np.abs(panel.lower), np.abs(panel.upper))
-
-
 def inside(panel: Panel | Gap, x: np.ndarray) -> np.ndarray:
     """Whether points given by their coordinates, ``(..., d)``, lie in the box, up to rounding."""
-    slack = _slack(panel)
-    return ((x >= panel.lower - slack) & (x <= panel.upper + slack)).all(axis=-1)
+    return between(panel.lower, panel.upper, x).all(axis=-1)
 
 
-def _contains(box: Panel | Gap, k: int, x: float) -> bool:
-    slack = _slack(box)[k]
-    return box.lower[k] - slack <= x <= box.upper[k] + slack
+def between(lower: np.ndarray, upper: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Whether ``x`` lies between ``lower`` and ``upper``, up to rounding."""
+    slack = _SLACK * np.maximum(np.abs(lower), np.abs(upper))
+    return (x >= lower - slack) & (x <= upper + slack)
 
 
 def _drop(entries: tuple, k: int) -> tuple:

@@ -16,7 +16,7 @@ from jax import Array
 
 from drivetrain_jax.atlas.evaluation import common_degrees, padded_tensor
 from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
-from drivetrain_jax.atlas.panels import Atlas, Panel, chebyshev, position_between
+from drivetrain_jax.atlas.panels import Atlas, Panel, between, chebyshev, position_between
 
 # Nodes of a dense tile, and the angle arccos(t) that it may span, times the degree of its panel: the highest polynomial
 # runs through 5.5 rad to either side of the middle, where the 24th coefficient of an oscillation is 1e-13, and those that
@@ -186,5 +186,4 @@ def _assigned(atlas: Atlas, axes: Sequence[np.ndarray]) -> Iterator[tuple[Panel,
 
 def _covered(panel: Panel, k: int, x: np.ndarray) -> np.ndarray:
     """Positions in ``x``, along the coordinate k, that a panel covers."""
-    slack = 8 * np.finfo(float).eps * max(abs(panel.lower[k]), abs(panel.upper[k]))
-    return np.flatnonzero((x >= panel.lower[k] - slack) & (x <= panel.upper[k] + slack))
+    return np.flatnonzero(between(panel.lower[k], panel.upper[k], x))
