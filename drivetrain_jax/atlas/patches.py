@@ -180,13 +180,7 @@ def join(parts: list[Patches]) -> Patches:
 
 
 def patches_of(criteria: Criteria) -> tuple[Patches, ...]:
-    """The patches of every function of ``criteria`` over all panels of its atlas (one or two parameters).
-
-    Raises ``ValueError`` if the atlas has no panel.
-    """
-    if not criteria.atlas.panels:
-        reasons = "; ".join(sorted({gap.reason for gap in criteria.atlas.gaps}))
-        raise ValueError(f"atlas without a panel ({reasons}): allowed is one that covers some of its domain")
+    """The patches of every function of ``criteria`` over all panels of its atlas (one or two parameters)."""
     parts = [_cover(criteria, panel) for panel in criteria.atlas.panels]
     return tuple(join(list(patches)) for patches in zip(*parts, strict=True))
 
