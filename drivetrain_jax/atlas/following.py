@@ -40,10 +40,16 @@ class Path:
 def follow_tips(atlas: Atlas, system: System, parameter: str, values: Sequence[float]) -> tuple[Path, ...]:
     """All tips at the first of ``values`` of ``parameter``, followed through the others in the order given.
 
-    ``atlas`` has ``parameter`` and two more. A step on which a tip is lost is divided; one that leaves the atlas ends
-    there.
+    ``atlas`` has ``parameter`` and two more, one of them the axis of the system's resonances. A step on which a tip is lost
+    is divided; one that leaves the atlas ends there.
+
+    Raises ``KeyError`` if ``atlas`` lacks ``parameter``, ``ValueError`` for a value outside its domain, for no values and
+    for other parameters beside it, :class:`~drivetrain_jax.InputError` for an atlas without panels and a system without
+    boundary functions.
     """
     values = np.asarray(values, float)
+    if not values.size:
+        raise ValueError("values = []: allowed is one value or more")
     first = atlas.slice({parameter: values[0]}).folded()
     tips = find_tips(first, system).tips
     names = first.parameters

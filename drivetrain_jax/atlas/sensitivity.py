@@ -53,7 +53,8 @@ class Sensitivity:
     def boundary(self, parameter: str) -> dict[str, float]:
         """Derivative of the boundary value of ``parameter`` with respect to every other one, at a point of the boundary.
 
-        At a tip it is that of the tip, because there the radius does not vary along the speed.
+        At a tip it is that of the tip, because there the radius does not vary along the speed. NaN where the radius does not
+        vary with ``parameter``. Raises ``KeyError`` for a parameter that ``gradient`` lacks.
         """
         slope = self.gradient[parameter]
         return {
@@ -64,7 +65,11 @@ class Sensitivity:
 
 
 def atlas_sensitivity(atlas: Atlas, system: System, point: Mapping[str, float]) -> Sensitivity:
-    """The gradient with respect to the parameters of ``atlas`` at ``point`` (a value for each), from the surrogate."""
+    """The gradient with respect to the parameters of ``atlas`` at ``point`` (a value for each), from the surrogate.
+
+    It is NaN in a gap and outside the domain. Raises ``KeyError`` if ``point`` lacks a parameter,
+    :class:`~drivetrain_jax.InputError` for an atlas without panels and a system without boundary functions.
+    """
     criteria = Criteria.of(atlas, system)
     values = np.array([[point[name] for name in atlas.parameters]], float)
     x = atlas.to_coordinates(values)
@@ -80,7 +85,8 @@ def atlas_sensitivity(atlas: Atlas, system: System, point: Mapping[str, float]) 
 def direct_sensitivity(system: System, values: Mapping[str, float]) -> Sensitivity:
     """The gradient with respect to all parameters of ``system``, which ``values`` holds, from direct solves.
 
-    It is NaN where no scheme can take so many steps, or derivatives overflow.
+    It is NaN where no scheme can take so many steps, or derivatives overflow. Raises ``KeyError`` if ``values`` lacks a
+    parameter or the system has no model for ``floquet``.
     """
     names = system.models["floquet"].parameters
     point = np.array([float(values[name]) for name in names])

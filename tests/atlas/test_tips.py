@@ -355,3 +355,17 @@ def test_gradients_of_the_radius():
         columns = {**{k: np.full(2, v) for k, v in point.items()}, name: point[name] + np.array([-h, h])}
         values = np.abs(np.linalg.eigvals(monodromy(propagators(columns, 1e-14)))).max(axis=1)
         assert slope == pytest.approx((values[1] - values[0]) / (2 * h), rel=1e-5, abs=1e-9)
+
+
+def test_what_cannot_be_followed_is_said(chart):
+    for parameter, values, error, message in (
+        ("mu", [], ValueError, r"^values = \[\]: allowed is one value or more$"),
+        ("mu", [1.0], KeyError, "mu: the atlas has beta, Omega"),
+        ("beta", [0.1, 1.6], ValueError, "^parameters = Omega: allowed are two, one of them Omega$"),
+    ):
+        with pytest.raises(error, match=message):
+            follow_tips(chart.atlas, CARDAN, parameter, values)
+    outside = atlas_sensitivity(chart.atlas, CARDAN, {"beta": 1.52, "Omega": 1.0})
+    assert np.isnan([outside.spectral_radius, *outside.gradient.values()]).all() and not outside.exists
+    with pytest.raises(KeyError, match="Omega"):
+        atlas_sensitivity(chart.atlas, CARDAN, {"beta": 1.0})
