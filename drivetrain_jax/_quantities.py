@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+# Codes of ``outcome`` from here on mean that there is no value.
+FIRST_FAILURE = 2
+
 
 @dataclass(frozen=True)
 class Parameter:

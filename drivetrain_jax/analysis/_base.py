@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax._quantities import FIRST_FAILURE, Dimension, Parameter, Variable
 from drivetrain_jax.systems import System
 
 
 class Outcome(IntEnum):
-    """What became of a point. From ``NOT_CONVERGED`` on, what could not be computed is NaN."""
+    """What became of a point. From ``NOT_CONVERGED`` (``FIRST_FAILURE``) on, what could not be computed is NaN."""
 
     SUCCESS = 0
     TOLERANCE_NOT_MET = 1  # the value is stored with its error, which exceeds the target
@@ -26,7 +26,7 @@ class Outcome(IntEnum):
 
     @property
     def has_value(self) -> bool:
-        return self <= Outcome.TOLERANCE_NOT_MET
+        return self < FIRST_FAILURE
 
 
 OUTCOME = Variable(

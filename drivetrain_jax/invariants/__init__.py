@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
+from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.invariants.registry import Declared, declared
-from drivetrain_jax.invariants.rules import FIRST_FAILURE, Rule
+from drivetrain_jax.invariants.rules import Rule
 
 __all__ = ["Finding", "check"]
 

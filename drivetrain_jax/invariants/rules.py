@@ -9,8 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-# CF codes of ``outcome`` from here on mean that there is no value.
-FIRST_FAILURE = 2
 # Relative room for the roundings of a formula that the computation wrote in another order.
 ROUNDING = 1e-9
 

@@ -11,7 +11,7 @@ import numpy as np
 
 import drivetrain_jax
 from drivetrain_jax._machine import machine
-from drivetrain_jax._quantities import Variable
+from drivetrain_jax._quantities import FIRST_FAILURE, Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.store import provenance
 from drivetrain_jax.store.consolidate import release
@@ -30,8 +30,6 @@ _PLANNED = 4
 # Bytes of results on the disk that are kept in memory as well, and values that are blanked at a time.
 _RESIDENT, _ROWS = 1 << 26, 1 << 22
 _STORAGE = ("xarray", "h5netcdf", "h5py")
-# A plain number, which arrays are compared with four times as fast.
-_LAST_WITH_VALUE = int(Outcome.TOLERANCE_NOT_MET)
 
 
 class Table:
@@ -140,7 +138,7 @@ def sweep_first(array: np.ndarray, grid: Grid) -> np.ndarray:
 
 def failures(outcome: np.ndarray) -> int:
     """How many outcomes mean that there is no value."""
-    return int(np.count_nonzero(outcome > _LAST_WITH_VALUE))
+    return int(np.count_nonzero(outcome >= FIRST_FAILURE))
 
 
 def missing_value(variable: Variable) -> float | int:
