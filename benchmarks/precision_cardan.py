@@ -150,13 +150,10 @@ def _constant(solver: str, count: int) -> Callable[[Columns, float], Any]:
     settings = {"root_finder": optimistix.Newton(rtol=1e-10, atol=1e-12)} if solver == IMPLICIT else {}
 
     def one(values: Mapping[str, Any], step: Any) -> Any:
-        def field(t: Any, y: Any) -> Any:
-            return jnp.array(linear_rows(t, values)) @ y
-
         return state_transition(
-            field, np.pi, jnp.zeros(4), solver=getattr(diffrax, solver)(**settings), dt0=step,
-            stepsize_controller=diffrax.ConstantStepSize(), max_steps=2 * max(STEPS), along=False,
-        )[1]  # fmt: skip
+            lambda t: jnp.array(linear_rows(t, values)), np.pi, 4, solver=getattr(diffrax, solver)(**settings), dt0=step,
+            stepsize_controller=diffrax.ConstantStepSize(), max_steps=2 * max(STEPS),
+        )[0]  # fmt: skip
 
     kinds = {name: jax.ShapeDtypeStruct((count,), float) for name in NAMES}
     return jax.jit(jax.vmap(one, in_axes=(0, None))).lower(kinds, jax.ShapeDtypeStruct((), float)).compile()

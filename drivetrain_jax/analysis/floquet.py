@@ -53,13 +53,12 @@ def _diffrax_solvers(system: System, request: Request) -> tuple[Solver, ...]:
         form = system.models["floquet"].build(values).natural
 
         def propagate(tolerance: float) -> tuple[Propagator, Array]:
-            _, matrix, success = state_transition(
-                lambda t, y: form.matrix(t) @ y,
+            matrix, success = state_transition(
+                form.matrix,
                 form.span,
-                jnp.zeros(form.size),
+                form.size,
                 solver=method,
                 stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance / rtol * atol),
-                along=False,
             )
             return Propagator(matrix, jnp.zeros(())), success
 
