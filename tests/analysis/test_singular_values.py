@@ -13,8 +13,9 @@ import pytest
 from benchmarks.planetary_reference import case_parameters
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
 from drivetrain_jax.analysis.numerics.lanes import in_blocks
+from drivetrain_jax.analysis.numerics.linear_algebra import looped_matmul
 from drivetrain_jax.analysis.numerics.singular_values import EPS, bidiagonal_form, bidiagonal_values, singular_values
-from drivetrain_jax.analysis.numerics.singular_vectors import jacobi_vectors, product
+from drivetrain_jax.analysis.numerics.singular_vectors import jacobi_vectors
 from drivetrain_jax.analysis.spectra.tracking import follow
 from drivetrain_jax.systems import get_system
 
@@ -117,7 +118,9 @@ def test_blocks_are_one_matrix_without_an_entry_between_them(matrices):
 def test_product():
     rng = np.random.default_rng(0)
     a, b = rng.standard_normal((3, 4, 5)), rng.standard_normal((4, 2, 5))
-    np.testing.assert_allclose(np.asarray(product(jnp.asarray(a), jnp.asarray(b))), np.einsum("ikn,kjn->ijn", a, b))
+    np.testing.assert_allclose(
+        np.asarray(looped_matmul(jnp.asarray(a), jnp.asarray(b))), np.einsum("ikn,kjn->ijn", a, b)
+    )
 
 
 def test_in_blocks_gives_what_the_whole_gives():

@@ -26,6 +26,17 @@ def matmul(a: Array, b: Array) -> Array:
     return sum(a[:, j, None] * b[None, j] for j in range(a.shape[1]))
 
 
+def looped_matmul(a: Array, b: Array) -> Array:
+    """The same for matrices of ten rows and more, for which that would be long to compile."""
+
+    def add(j: Array, total: Array) -> Array:
+        column = jax.lax.dynamic_index_in_dim(a, j, 1, keepdims=False)
+        return total + column[:, None] * jax.lax.dynamic_index_in_dim(b, j, 0, keepdims=False)
+
+    shape = (a.shape[0], b.shape[1], *jnp.broadcast_shapes(a.shape[2:], b.shape[2:]))
+    return jax.lax.fori_loop(0, a.shape[1], add, jnp.zeros(shape))
+
+
 def solve(a: Array, b: Array) -> Array:
     """Solution of ``a x = b``, ``(n, n, ...), (n, m, ...) -> (n, m, ...)``.
 

@@ -70,14 +70,3 @@ def _rotate(top: Array, bottom: Array, m: int, noise: Array) -> tuple[Array, Arr
     s = c * t
     c, s = c[:, None], s[:, None]
     return c * top - s * bottom, s * top + c * bottom, jnp.any(needed, axis=0)
-
-
-def product(a: Array, b: Array) -> Array:
-    """``(m, k, N)`` times ``(k, n, N)``, batch last."""
-
-    def add(k: Array, total: Array) -> Array:
-        column = lax.dynamic_index_in_dim(a, k, 1, keepdims=False)
-        return total + column[:, None] * lax.dynamic_index_in_dim(b, k, 0, keepdims=False)
-
-    shape = (a.shape[0], b.shape[1], *jnp.broadcast_shapes(a.shape[2:], b.shape[2:]))
-    return lax.fori_loop(0, a.shape[1], add, jnp.zeros(shape))

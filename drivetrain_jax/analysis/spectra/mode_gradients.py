@@ -30,7 +30,8 @@ from jax import Array
 
 from drivetrain_jax.analysis.modes import largest_frequency, system_modes
 from drivetrain_jax.analysis.numerics.lanes import lane_count
-from drivetrain_jax.analysis.numerics.singular_vectors import jacobi_vectors, product
+from drivetrain_jax.analysis.numerics.linear_algebra import looped_matmul
+from drivetrain_jax.analysis.numerics.singular_vectors import jacobi_vectors
 from drivetrain_jax.analysis.spectra.mode_types import CLUSTER, clusters, is_rigid
 from drivetrain_jax.systems import SpringSystem
 
@@ -72,7 +73,7 @@ def directional_derivatives(build: Build, values: Mapping[str, Any], directions:
     # Made positive, its singular vectors are its eigenvectors.
     lift = jnp.sqrt(jnp.sum(matrix**2, axis=(0, 1)))
     turned, _ = jacobi_vectors(matrix + lift * jnp.eye(lanes.shape[1])[:, :, None])
-    slopes = jnp.sum(turned * product(matrix, turned), axis=0)
+    slopes = jnp.sum(turned * looped_matmul(matrix, turned), axis=0)
     number = jnp.argmax(near, axis=1)
     order = jnp.lexsort((slopes, number), axis=0)
     slopes = jnp.take_along_axis(slopes, order, axis=0).reshape(frequency.shape)

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from drivetrain_jax.analysis.numerics.linear_algebra import looped_matmul
 from drivetrain_jax.analysis.numerics.singular_values import EPS, singular_values
-from drivetrain_jax.analysis.numerics.singular_vectors import jacobi_vectors, product
+from drivetrain_jax.analysis.numerics.singular_vectors import jacobi_vectors
 from drivetrain_jax.systems import FAMILIES, Block
 
 MODE_TYPES = ("rigid", *FAMILIES, "coupled")
@@ -67,12 +68,12 @@ def block_modes(block: Block, largest: Array, asymmetry: Array) -> BlockModes:
 
 
 def _rising(factor: Array, vectors: Array) -> Array:
-    order = jnp.argsort(jnp.sum(product(factor, vectors) ** 2, axis=0), axis=0)
+    order = jnp.argsort(jnp.sum(looped_matmul(factor, vectors) ** 2, axis=0), axis=0)
     return jnp.take_along_axis(vectors, order[None], axis=1)
 
 
 def _in_frame(block: Block, vectors: Array) -> Array:
-    return vectors if block.frame is None else product(jnp.swapaxes(block.frame, 0, 1), vectors)
+    return vectors if block.frame is None else looped_matmul(jnp.swapaxes(block.frame, 0, 1), vectors)
 
 
 def clusters(frequency: Array, tolerance: Array) -> Array:
@@ -94,8 +95,8 @@ def _turned(block: Block, vectors: Array, near: Array, further: np.ndarray | flo
     def turn() -> Array:
         amplitudes = _in_frame(block, vectors)
         weighted = weights.reshape(-1, 1, *(1,) * (vectors.ndim - 2)) * amplitudes
-        operator = jnp.where(near, product(jnp.swapaxes(amplitudes, 0, 1), weighted), 0.0)
-        return product(vectors, jacobi_vectors(operator)[0])
+        operator = jnp.where(near, looped_matmul(jnp.swapaxes(amplitudes, 0, 1), weighted), 0.0)
+        return looped_matmul(vectors, jacobi_vectors(operator)[0])
 
     # Neighbours suffice: a cluster without two of them has one member. Most gears without symmetry have no others.
     neighbours = jnp.diagonal(near, offset=1)

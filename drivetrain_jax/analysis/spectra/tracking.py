@@ -10,6 +10,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array, lax
 
+from drivetrain_jax.analysis.numerics.linear_algebra import looped_matmul
+
 # Below this share in the space of its new frequency a shape is not carried on but taken anew.
 _CARRIED = 0.25
 # Among the modes of one space, whose MAC are equal, the nearest vector is taken.
@@ -33,7 +35,7 @@ def follow(vectors: Array, same: Array) -> tuple[Array, Array]:
         shapes, equal = point
         known = jnp.all(jnp.isfinite(shapes), axis=(0, 1))
         shapes = jnp.where(known, shapes, 0.0)
-        overlap = _overlap(reference, shapes)
+        overlap = looped_matmul(jnp.swapaxes(reference, 0, 1), shapes)
         squares = overlap**2
         shared = jnp.sum(squares[:, :, None] * equal[None], axis=1)
         chosen = _pair(jnp.where(known, shared + _OWN * squares, jnp.eye(n).reshape(n, n, *(1,) * (shapes.ndim - 2))))
@@ -48,16 +50,6 @@ def follow(vectors: Array, same: Array) -> tuple[Array, Array]:
     finite = jnp.all(jnp.isfinite(vectors[0]), axis=(0, 1))
     begin = jnp.where(finite, jnp.ones(first.shape), jnp.nan)
     return jnp.concatenate([first[None], branch]), jnp.concatenate([begin[None], mac])
-
-
-def _overlap(a: Array, b: Array) -> Array:
-    """``a^T b`` of (m, n, ...) and (m, k, ...)."""
-
-    def add(i: Array, total: Array) -> Array:
-        row, other = (lax.dynamic_index_in_dim(x, i, 0, keepdims=False) for x in (a, b))
-        return total + row[:, None] * other[None]
-
-    return lax.fori_loop(0, a.shape[0], add, jnp.zeros((a.shape[1], *b.shape[1:])))
 
 
 def _pair(score: Array) -> Array:
@@ -83,4 +75,4 @@ def _carry(overlap: Array, shapes: Array, equal: Array, chosen: Array) -> Array:
     keep = size > _CARRIED
     continued = inside / jnp.sqrt(jnp.where(keep, size, 1.0))[:, None]
     weights = jnp.where(keep[:, None], continued, chosen)
-    return _overlap(jnp.swapaxes(shapes, 0, 1), jnp.swapaxes(weights, 0, 1))
+    return looped_matmul(shapes, jnp.swapaxes(weights, 0, 1))
