@@ -13,11 +13,8 @@ import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import clipped
 from drivetrain_jax.sweep.engine import Engine
-from drivetrain_jax.sweep.identity import scene_content
+from drivetrain_jax.sweep.identity import EVALUATES_ATLAS, scene_content
 from drivetrain_jax.sweep.scene import Scene, load_scene
-
-# The file that is among the sources of points that an atlas gives, and of no others.
-_THROUGH_ATLAS = "sweep/through_atlas.py"
 
 
 def differences(stored: Mapping[str, Any], engine: Engine, *, points: bool = True) -> list[str]:
@@ -83,7 +80,7 @@ def _of_numerics(stored: str | None, present: Mapping[str, Any]) -> list[str]:
         before = old.get(key)
         if isinstance(value, Mapping) and isinstance(before, Mapping):
             names = {*value, *before}
-            if key == "sources" and (_THROUGH_ATLAS in value) != (_THROUGH_ATLAS in before):
+            if key == "sources" and (EVALUATES_ATLAS in value) != (EVALUATES_ATLAS in before):
                 found.append(f"points are {_route(value)}, were {_route(before)}")
                 # The files that only one of the two ways runs have not changed.
                 names = {*value} & {*before}
@@ -98,7 +95,7 @@ def _of_numerics(stored: str | None, present: Mapping[str, Any]) -> list[str]:
 
 
 def _route(sources: Mapping[str, str]) -> str:
-    return "evaluated through an atlas" if _THROUGH_ATLAS in sources else "solved directly"
+    return "evaluated through an atlas" if EVALUATES_ATLAS in sources else "solved directly"
 
 
 def _text(value: Any) -> str:

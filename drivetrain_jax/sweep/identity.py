@@ -22,7 +22,9 @@ from drivetrain_jax.sweep.scene import Scene
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "numpy", "scipy")
 _ROOT = Path(drivetrain_jax.__file__).parent
 _ENGINE = ("sweep/grid.py", "sweep/plan.py", "sweep/kernel.py")
-_THROUGH_ATLAS = ("atlas/floquet.py", "sweep/atlas_choice.py", "sweep/rounds.py", "sweep/through_atlas.py")
+# The file that is among the sources of points that an atlas gives, and of no others.
+EVALUATES_ATLAS = "sweep/through_atlas.py"
+_THROUGH_ATLAS = ("atlas/floquet.py", "sweep/atlas_choice.py", "sweep/rounds.py", EVALUATES_ATLAS)
 # What these packages hold decides numbers; what lies above them does not.
 _NUMERIC = ("drivetrain_jax._quantities", "drivetrain_jax.systems", "drivetrain_jax.analysis", "drivetrain_jax.atlas")
 
