@@ -19,6 +19,11 @@ def shown(value: Any) -> str:
     return clipped(repr(value))
 
 
+def counted(count: int, one: str, many: str) -> str:
+    """``1 value``, ``2 values``."""
+    return f"{count} {one if count == 1 else many}"
+
+
 def written(value: Any) -> str:
     """A parameter's value: up to ten digits, a list in brackets."""
     if isinstance(value, tuple):

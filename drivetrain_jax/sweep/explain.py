@@ -11,7 +11,7 @@ import numpy as np
 
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._wording import clipped
+from drivetrain_jax._wording import clipped, counted
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.identity import EVALUATES_ATLAS, scene_content
 from drivetrain_jax.sweep.scene import Scene, load_scene
@@ -66,7 +66,8 @@ def _of_axes(theirs: Scene, ours: Scene) -> Iterator[str]:
 
 
 def _range(values: np.ndarray) -> str:
-    return f"{len(values)} values from {values[0]:.10g} to {values[-1]:.10g}"
+    ends = f"at {values[0]:.10g}" if len(values) == 1 else f"from {values[0]:.10g} to {values[-1]:.10g}"
+    return f"{counted(len(values), 'value', 'values')} {ends}"
 
 
 def _of_numerics(stored: str | None, present: Mapping[str, Any]) -> list[str]:

@@ -15,7 +15,7 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._machine import physical_memory
 from drivetrain_jax._quantities import Dimension, Parameter
-from drivetrain_jax._wording import did_you_mean, nearest, shown
+from drivetrain_jax._wording import clipped, did_you_mean, nearest, shown
 from drivetrain_jax.analysis import OUTCOME, Analysis, Request, get_analysis
 from drivetrain_jax.sweep import toml
 from drivetrain_jax.sweep.axes import MAX_POINTS, MAX_RANGES, Axis, AxisTable, check_count, entry_of, spread
@@ -206,7 +206,7 @@ def _axes(table: _SceneTable, system: System, analysis: Analysis) -> tuple[tuple
     counts = {name: check_count(name, spec, analysis.continuous) for name, spec in specs.items()}
     total = math.prod(counts.values())
     if total > MAX_POINTS:
-        raise InputError(f"axes: {total} points; allowed is up to {MAX_POINTS}")
+        raise InputError(f"axes: {clipped(str(total))} points; allowed is up to {MAX_POINTS}")
     most, present = max(counts.values(), default=0), physical_memory()
     if most * _BYTES > present:
         name = max(counts, key=lambda name: counts[name])
@@ -224,6 +224,9 @@ def _check_ranges(table: _SceneTable, analysis: Analysis) -> None:
 def _axis_table(name: str, given: Any) -> AxisTable:
     if not isinstance(given, Mapping):
         raise InputError(f"axes.{name} = {shown(given)}: allowed is a table {{ start, stop, num }} or {{ values }}")
+    if isinstance(num := given.get("num"), float) and num.is_integer():
+        # As options and parameters take 1e3 for 1000.
+        given = {**given, "num": int(num)}
     return _convert(given, AxisTable, f"axes.{name}.")
 
 

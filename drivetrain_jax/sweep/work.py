@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from drivetrain_jax._errors import Passing
+from drivetrain_jax._wording import counted
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.store.chunks import Part, PartsFolder
 from drivetrain_jax.sweep.assemble import failures
@@ -132,7 +133,7 @@ class Work:
                 progress.cost += float(costs[chunk.number])
                 self._tell(progress)
         if missing:
-            raise Passing(f"{missing} chunks never came back")
+            raise Passing(f"{counted(missing, 'chunk', 'chunks')} never came back")
 
     def _tell(self, progress: Progress) -> None:
         if self.report:

@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from drivetrain_jax._quantities import Parameter
+from drivetrain_jax._wording import counted
 from drivetrain_jax.systems._base import Model, System, Values
 from drivetrain_jax.systems._shaft import Shaft, stack
 
@@ -56,8 +57,8 @@ def check(fixed: Mapping[str, Any]) -> None:
             value = fixed.get(name, ())
             if isinstance(value, tuple) and value != () and len(value) != needed:
                 raise ValueError(
-                    f"{name} = {list(value)}: {len(value)} entries where length has {segments}; allowed is one per {what}, "
-                    f"{needed}"
+                    f"{name} = {list(value)}: {counted(len(value), 'entry', 'entries')} where length has {segments}; "
+                    f"allowed is one per {what}, {needed}"
                 )
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._quantities import Parameter
+from drivetrain_jax._wording import counted
 from drivetrain_jax.systems._base import Model, System, Values
 from drivetrain_jax.systems._modal import Block, SpringSystem, weighted_factor
 
@@ -280,7 +281,7 @@ def check(fixed: Mapping[str, Any]) -> None:
         value = fixed.get(name)
         if isinstance(value, tuple) and angles is not None and len(value) != len(angles):
             raise ValueError(
-                f"{name} = {list(value)}: {len(value)} entries where planet_angle has {len(angles)}; "
+                f"{name} = {list(value)}: {counted(len(value), 'entry', 'entries')} where planet_angle has {len(angles)}; "
                 "allowed is one number, or one entry per planet"
             )
 

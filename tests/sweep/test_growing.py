@@ -86,7 +86,7 @@ def test_a_result_that_would_lose_points_is_not_replaced(tmp_path):
     run_to_file(SMALL, path)
     before = path.read_bytes()
     part = scene({"b": [1.0], "a": {"start": 0.0, "stop": 10.0, "num": 41}})
-    with pytest.raises(InputError, match=r"axes.b has 1 values from 1 to 1, had 2 values from 1 to 3"):
+    with pytest.raises(InputError, match=r"axes.b has 1 value at 1, had 2 values from 1 to 3"):
         run_to_file(part, path)
     assert path.read_bytes() == before and status(part, path).state == "stale"
     assert status(part, path).reason.endswith("--reuse r.nc with another --out takes 11 points from it")

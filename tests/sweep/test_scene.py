@@ -40,6 +40,7 @@ def test_unused_parameter_is_recorded():
     [
         ({"start": 1, "stop": 9, "num": 5}, [1, 3, 5, 7, 9]),
         ({"start": 9, "stop": 1, "num": 3}, [9, 5, 1]),
+        ({"start": 1, "stop": 9, "num": 5.0}, [1, 3, 5, 7, 9]),
         ({"start": 0.01, "stop": 1, "num": 3, "scale": "log"}, [0.01, 0.1, 1.0]),
         ({"values": [3, 1, 2.5]}, [3, 1, 2.5]),
         ({"start": 4, "stop": 4, "num": 1}, [4]),
@@ -132,6 +133,16 @@ WRONG = {
         "allowed is num >= 2, or values = [0]",
     ),
     "no points on an axis": (changed(axes={"a": {"start": 0, "stop": 1, "num": 0}}), "axes.a.num = 0", "num >= 1"),
+    "num of many digits": (
+        changed(axes={"a": {"start": 0, "stop": 1, "num": 1e300}}),
+        "axes: 100000000000000005250476025520442024870446858110815915491... points",
+        "allowed is up to",
+    ),
+    "num not finite": (
+        changed(axes={"a": {"start": 0, "stop": 1, "num": float("inf")}}),
+        "axes.a.num = inf",
+        "integer",
+    ),
     "num of the wrong type": (changed(axes={"a": {"start": 0, "stop": 1, "num": 2.5}}), "axes.a.num = 2.5", "integer"),
     "axis without num": (changed(axes={"a": {"start": 0, "stop": 1}}), "axes.a.num", "atlas"),
     "axis without stop": (changed(axes={"a": {"start": 0, "num": 3}}), "axes.a.stop: missing", "values"),
@@ -164,6 +175,11 @@ WRONG = {
         follow(fixed={"b": 1.0, "weight": [1, 2]}),
         "fixed.weight = [1.0, 2.0]: 2 entries",
         "equally",
+    ),
+    "list of one": (
+        {"system": "planetary", "analysis": "modes", "fixed": {"planet_angle": [0.0, 2.0], "m_p": [1.0]}},
+        "fixed.m_p = [1.0]: 1 entry where planet_angle has 2",
+        "one entry per planet",
     ),
     "entry of a number for all": (
         follow(axes={"weight[0]": {"values": [1]}}, fixed={"b": 1.0}),
