@@ -63,16 +63,65 @@ def kill_worker(bench: Bench, kind: str, options: list[str]) -> Record:
     victims: list[int] = []
 
     def blow() -> None:
-        deadline = time.monotonic() + 60
-        while not victims and run.process.poll() is None and time.monotonic() < deadline:
-            victims.extend(pid for pid in run.others() if is_worker(pid))
-            time.sleep(0.02)
+        victims.extend(workers(run))
         if victims:
             os.kill(int(bench.rng.choice(victims)), signal.SIGKILL)
 
     hit = strike(run, out, moment, blow) and bool(victims)
     ended = run.end()
     return resume(bench, kind, out, moment, hit, ended, settle(run), options, lambda e: e.code == 0)
+
+
+def kill_idle(bench: Bench, kind: str, options: list[str]) -> Record:
+    """All spawned processes, when they have done what they were given and the driver, held still, has not noticed."""
+    out, moment = bench.place(), bench.moment()
+    run = bench.run(out, options)
+    victims: list[int] = []
+
+    def blow() -> None:
+        workers(run)
+        run.process.send_signal(signal.SIGSTOP)
+        try:
+            victims.extend(resting(run))
+            for pid in victims:
+                os.kill(pid, signal.SIGKILL)
+        finally:
+            run.process.send_signal(signal.SIGCONT)
+
+    hit = strike(run, out, moment, blow) and bool(victims)
+    ended = run.end()
+    return resume(bench, kind, out, moment, hit, ended, settle(run), options, lambda e: e.code == 0)
+
+
+def workers(run: Run) -> list[int]:
+    """The spawned processes, once there are any."""
+    deadline = time.monotonic() + 60
+    while run.process.poll() is None and time.monotonic() < deadline:
+        if found := [pid for pid in run.others() if is_worker(pid)]:
+            return found
+        time.sleep(0.02)
+    return []
+
+
+def resting(run: Run) -> list[int]:
+    """The spawned processes, once none of them has used its core for a while."""
+    before, deadline = None, time.monotonic() + 60
+    while time.monotonic() < deadline:
+        used = {pid: cpu_time(pid) for pid in run.others() if is_worker(pid)}
+        if used == before:
+            return list(used)
+        before = used
+        time.sleep(0.3)
+    return []
+
+
+def cpu_time(pid: int) -> int:
+    """What a process has used so far, in ticks of the system."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0
+    return int(fields[11]) + int(fields[12])
 
 
 def is_worker(pid: int) -> bool:
