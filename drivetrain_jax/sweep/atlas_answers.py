@@ -82,7 +82,10 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
 
 
 def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Reply:
-    """The least damping from which on a range of speeds is stable. Raises as :func:`query`."""
+    """The least damping from which on a range of speeds is stable. Raises as :func:`query`.
+
+    Of a cardan shaft in physical units only the ratio ``c2/c1`` of the dampings given is used; the answer is ``c1`` with it.
+    """
     speed, damping = _roles(atlas, "speed", "damping")
     asked = _Asked.of(atlas, given, ranges=(speed,), free=(damping,))
     answer = design.least_damping(
