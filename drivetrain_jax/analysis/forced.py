@@ -61,8 +61,8 @@ TRANSITION_SHARPNESS, CLOSING_SHARPNESS, SHARPEST = 0.1, 0.01, 1e-14
 ORBIT_CLOSING_SHARPNESS = 0.001
 # Loosest ``rtol`` they are derived from: (I - Z)^-1 multiplies their errors by up to its condition.
 LOOSEST = 1e-6
-# Sharpness that tells I - Z from a singular matrix, unless it is integrated more sharply still: a looser request must
-# not turn an answer into none, as the closing of the period tells its error in any case.
+# I - Z counts as singular where its condition times the error of Z reaches ``NOT_FOUND``. That error is taken as this at
+# most: a looser request must not lose an answer, whose error the closing of the period tells in any case.
 SINGULAR_SHARPNESS = 1e-11
 # Relative error from which a periodic solution counts as not found.
 NOT_FOUND = 1e-2

@@ -54,9 +54,9 @@ def compiler_options(lanes: int = FULL_WIDTH, *, march: bool = False, short_loop
     A ``march`` is left to the older of two code generators, which takes half the time and makes most marches no slower
     (charts, determinants, impacts and adaptive steps in lockstep become slower, by up to a factor of two).
 
-    Where lanes are worked through by some tens (``short_loops``) the highest level of optimisation unrolls the loops over
-    them into single numbers, before it would make vectors of them, and code that does not fit into its cache. Marches of
-    tangent vectors keep it: with a few lanes they take the compiler tens of gigabytes at any other level.
+    Loops over some tens of lanes (``short_loops``) are compiled at a lower level of optimisation: the highest one unrolls
+    them into operations on single numbers instead of vectors, and so much code does not fit into the cache. Marches of
+    tangent vectors stay at the highest: with few lanes they take the compiler tens of gigabytes at any other.
     """
     options: dict[str, Any] = {}
     if "avx512f" in instruction_set() and lanes >= FULL_WIDTH:
