@@ -1,6 +1,6 @@
 """Stability as a function of the parameters: what the file of a scene whose axes are ranges answers.
 
-What is computed are propagators (``floquet_propagator``); the panels that go through them give the results of
+What is computed are propagators (``periodic/floquet_propagator.py``); the panels that go through them give the results of
 ``floquet`` anywhere in the ranges.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from drivetrain_jax.analysis._base import Request, Solver
+from drivetrain_jax.analysis._base import RTOL, Request, Solver
 from drivetrain_jax.analysis.periodic import floquet_propagator
 from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES, lacks
 from drivetrain_jax.systems import System
@@ -16,7 +16,8 @@ from drivetrain_jax.systems import System
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     solves = floquet_propagator.ANALYSIS
-    return solves.solvers(system, replace(request, outputs=solves.default_outputs))
+    options = {**request.options, "parts": 1}
+    return solves.solvers(system, replace(request, outputs=solves.default_outputs, options=options))
 
 
 ANALYSIS = replace(
@@ -24,6 +25,9 @@ ANALYSIS = replace(
     title="stability atlas",
     variables=VARIABLES,
     default_outputs=("spectral_radius", "spectral_radius_error", "verdict"),
+    # How many parts a chart needs is found, not given.
+    methods={"direct": ("rtol",)},
+    options=(RTOL,),
     solvers=_solvers,
     lacks=lacks,
     continuous=True,

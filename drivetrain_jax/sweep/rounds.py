@@ -68,7 +68,7 @@ def node_engine(scene: Scene, ranges: Mapping[str, tuple[float, float]], count: 
     domain = floquet_domain(scene.system, ranges, fixed)
     spread = np.cos(np.pi * np.random.default_rng(0).random((count, len(ranges))))
     points = domain.points(domain.box().place(spread))
-    options = {"rtol": solve_rtol(_tolerance(scene))}
+    options = {"rtol": solve_rtol(_tolerance(scene)), "parts": 1}
     return Engine(_solves(scene, fixed, tuple(ranges), points, options), full_size=True)
 
 

@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 
 from benchmarks.atlas_direct import BASE, CARDAN, propagators, solves
+from drivetrain_jax import InputError
+from drivetrain_jax.analysis import Request, get_analysis
+from drivetrain_jax.analysis.periodic import floquet_propagator
 from drivetrain_jax.atlas import Domain, Quantity, construct, run, span_parts, values_at
 from drivetrain_jax.atlas.construction import construct_from_parts
 from drivetrain_jax.atlas.decay import foreseen, needed, remainder
 from drivetrain_jax.atlas.parts import Product, product
+from drivetrain_jax.sweep.scene import load_scene
 from drivetrain_jax.systems._smooth import identity
 
 COUNT, TOLERANCE = 8, 1e-9
@@ -171,3 +175,19 @@ def test_a_little_more_than_a_line_shows_is_foreseen():
     assert (needed(entire, 1e-11), foreseen(entire[:17], 1e-11)) == (21, None)
     assert foreseen(1 / np.arange(1.0, 18.0) ** 2, 1e-4) is None
     assert foreseen(np.full(17, 1e-9), 1e-10) is None
+
+
+def test_parts_are_an_option_of_the_propagator_and_of_no_scene():
+    solves = floquet_propagator.ANALYSIS
+    assert solves.methods == {"direct": ("rtol", "parts")} and [o.default for o in solves.options] == [1e-10, 1]
+    scene = {
+        "system": "cardan",
+        "analysis": "atlas",
+        "axes": {"beta": {"start": 0.0, "stop": 0.3}, "Omega": {"start": 1.3, "stop": 1.5}},
+        "fixed": {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0},
+        "options": {"parts": 2},
+    }
+    with pytest.raises(InputError, match=r"^options.parts = 2: not used by method direct; allowed is method, rtol$"):
+        load_scene(scene)
+    atlas = get_analysis("atlas")
+    assert len(atlas.solvers(CARDAN, Request(atlas.default_outputs, "direct", {"rtol": 1e-9}))) == 2

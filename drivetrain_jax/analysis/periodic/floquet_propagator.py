@@ -1,8 +1,10 @@
 """The propagator of a linear periodic system over the span of its reduced form: what an atlas interpolates.
 
 ``Phi`` is a smooth function of the parameters, which multipliers and spectral radius are not. It is computed by the
-direct solvers of ``floquet`` with two step sizes, whose difference tells its error. What asks for solves of an atlas may ask
-for ``parts``: the propagators over so many equal parts of the span, one after the other, instead of their product.
+direct solvers of ``floquet`` with two step sizes, whose difference tells its error. The option ``parts`` asks for the
+propagators over so many equal parts of the span, one after the other, instead of their product.
+
+Scenes know it only as ``atlas`` (``analysis/atlas.py``), which is why it has that name and the model of that name.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax._quantities import Dimension, Variable
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.periodic.direct import Monodromy
 from drivetrain_jax.analysis.periodic.direct_solvers import direct_solvers
@@ -47,7 +49,7 @@ def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
         lambda model: whole_span(model.reduced),
         lambda model, phi: _results(phi, request.outputs),
         _CHUNKS,
-        request.options.get("parts", 1),
+        request.options["parts"],
     )
 
 
@@ -69,11 +71,11 @@ ANALYSIS = Analysis(
     title="Propagator of a linear periodic system, for its atlas",
     variables=VARIABLES,
     default_outputs=(PROPAGATOR, CHANGE),
-    methods={"direct": ("rtol",)},
+    methods={"direct": ("rtol", "parts")},
     method_titles={
         "direct": "direct solves of floquet at the nodes of Chebyshev panels",
     },
-    options=(RTOL,),
+    options=(RTOL, Parameter("parts", "1", "equal parts of the span", default=1, lower=1, integer=True)),
     solvers=_solvers,
     dimensions=_dimensions,
 )
