@@ -14,11 +14,10 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, NullFormatter
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STATE_HATCHES, STATE_NAMES, STATES
 
 STABLE, UNSTABLE, UNDECIDED, FAILED = range(4)
-# Outcome codes from here on mean that there is no value (CF flags of the variable `outcome`).
-FIRST_FAILURE = 2
 _PENDING, _PENDING_COLOUR = "pending", "#c4c4c4"
 _NO_PARAMETERS = ("point", _PENDING)
 

@@ -10,6 +10,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.layout import DPI, WIDTH, Margins, Panels, write_title
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, axis_label, caption, variable_label
@@ -44,7 +45,7 @@ def plot(dataset: xr.Dataset) -> Figure:
 def _curves(dataset: xr.Dataset, name: str, shown: list[str]) -> Figure:
     panels = Panels(len(shown), height=_HEIGHT, margins=Margins(left=1.05, right=0.3, bottom=0.6), share_y=False)
     for (axes,), key in zip(panels.axes, shown, strict=True):
-        variable = dataset[key].where(dataset["outcome"] < cells.FIRST_FAILURE).transpose(name, ...)
+        variable = dataset[key].where(dataset["outcome"] < FIRST_FAILURE).transpose(name, ...)
         axes.plot(dataset[name], variable.values.reshape(dataset.sizes[name], -1), color=LINE_COLOURS[0])
         axes.margins(x=0)
         # Few digits: the label stands at a fixed distance.

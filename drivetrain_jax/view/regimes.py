@@ -10,6 +10,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.style import FRAME_GREY, PREDICTION, STATE_COLOURS
 
@@ -21,14 +22,14 @@ NON_PERIODIC, FAILED = 3, 4
 
 def draw(axes: Axes, dataset: xr.Dataset, field: xr.DataArray, horizontal: str, vertical: str) -> QuadMesh:
     """The regimes ``field`` of ``dataset``."""
-    codes = field.where(dataset["outcome"] < cells.FIRST_FAILURE, FAILED)
+    codes = field.where(dataset["outcome"] < FIRST_FAILURE, FAILED)
     cmap = ListedColormap(COLOURS, name="regimes")
     return cells.draw_cells(axes, codes, horizontal, vertical, cmap=cmap, vmin=-0.5, vmax=FAILED + 0.5)
 
 
 def legend(dataset: xr.Dataset) -> list[Patch]:
     """Entries of the regimes with contact made and lost at no, one or two flanks, and of all others that occur."""
-    known = (dataset["outcome"] < cells.FIRST_FAILURE).values
+    known = (dataset["outcome"] < FIRST_FAILURE).values
     present = {*range(NON_PERIODIC), *np.unique(dataset["regime"].values[known]).tolist()}
     patches = [
         Patch(facecolor=COLOURS[k], edgecolor=FRAME_GREY, linewidth=0.6, label=_NAMES[k]) for k in sorted(present)

@@ -15,6 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import boundaries, cells, resonances
 from drivetrain_jax.view.layout import Margins, Panels
 from drivetrain_jax.view.style import (
@@ -69,7 +70,7 @@ def _chart(dataset: xr.Dataset, names: list[str]) -> Figure:
             handles += cells.state_legend(dataset)
             handles += boundaries.draw(axes, dataset, horizontal, vertical)
         else:
-            radius = dataset[name].where(dataset["outcome"] < cells.FIRST_FAILURE)
+            radius = dataset[name].where(dataset["outcome"] < FIRST_FAILURE)
             mesh, label, extend = cells.draw_growth(axes, radius, horizontal, vertical)
             panels.colorbar(axes, mesh, label, extend=extend)
     # Over the upper panel only: the map below shows the narrow tongues uncovered.

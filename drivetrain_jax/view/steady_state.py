@@ -17,6 +17,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import cells, regimes
 from drivetrain_jax.view.layout import WIDTH, Margins, Panels
 from drivetrain_jax.view.style import (
@@ -70,7 +71,7 @@ def _maps(dataset: xr.Dataset, names: list[str]) -> Figure:
             handles += regimes.legend(dataset)
         else:
             cmap = matplotlib.colormaps["cividis_r"].with_extremes(bad=STATE_COLOURS[cells.FAILED])
-            field = dataset[name].where(dataset["outcome"] < cells.FIRST_FAILURE)
+            field = dataset[name].where(dataset["outcome"] < FIRST_FAILURE)
             mesh = cells.draw_cells(axes, field, horizontal, vertical, cmap=cmap, norm=PowerNorm(0.5))
             panels.colorbar(axes, mesh, variable_label(dataset[name]))
         handles += regimes.draw_threshold(axes, dataset, horizontal, vertical)[: 1 if axes is panels.axes[-1][0] else 0]
@@ -87,7 +88,7 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
     stack = [row[0] for row in panels.axes]
     handles: list[Artist] = []
     other = regimes.COLOURS[regimes.NON_PERIODIC]
-    known = dataset["outcome"] < cells.FIRST_FAILURE
+    known = dataset["outcome"] < FIRST_FAILURE
     wandering = known & (dataset["period_multiple"] == 0) if "period_multiple" in dataset else known & False
     for key, colour in zip(extremes, LINE_COLOURS, strict=False):
         label = dataset[key].attrs.get("long_name", key)
@@ -148,7 +149,7 @@ def _basins(dataset: xr.Dataset) -> Figure:
 
 def _attractors(dataset: xr.Dataset) -> tuple[xr.DataArray, list[str]]:
     """The attractors by falling share: number of each point's, and what distinguishes them."""
-    known = (dataset["outcome"] < cells.FIRST_FAILURE).values
+    known = (dataset["outcome"] < FIRST_FAILURE).values
     multiple, high = dataset["period_multiple"].values, dataset["u_max"].values
     # All non-periodic motions are taken for one attractor.
     level = np.where(multiple > 0, np.log(np.abs(np.where(known, high, 1.0)) + 1e-300) / _SAME, 0.0)
