@@ -39,6 +39,7 @@ def _direct_solvers(system: System, request: Request) -> tuple[Solver, ...]:
         rtol / 4,
         lambda model: model.reduced,
         lambda model, z: results(z, request.outputs, rtol, model.natural.span),
+        stiff=lambda model: model.stiff or model.reduced,
     )
 
 

@@ -71,7 +71,7 @@ def judge(
     if form.log_determinant is not None:
         residual = ((-1) ** n * a[-1] - jnp.exp(form.log_determinant())) / rho**n
         relative = jnp.maximum(relative, jnp.abs(residual))
-    halves = 1 if form.reversor is None else 2
+    halves = form.halves
     rounding = 4 * np.finfo(float).eps * jnp.sum(matrix**2, axis=(0, 1)) ** (halves / 2) / rho
     monodromy = Monodromy(z, jnp.zeros_like(rho), relative + rounding, relative <= 10 * rtol, residual)
     return results(monodromy, outputs, rtol, model.natural.span, spectrum=spectrum)

@@ -19,6 +19,7 @@ from drivetrain_jax.systems._base import (  # noqa: E402
     Model,
     Resonances,
     System,
+    dense,
 )
 from drivetrain_jax.systems._flow import Flow  # noqa: E402
 from drivetrain_jax.systems._modal import FAMILIES, Block, SpringSystem  # noqa: E402
@@ -46,6 +47,7 @@ __all__ = [
     "Smoothness",
     "SpringSystem",
     "System",
+    "dense",
     "get_system",
     "system_names",
 ]

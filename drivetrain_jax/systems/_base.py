@@ -25,6 +25,12 @@ SWAP = np.kron(np.array([[0.0, 1.0], [1.0, 0.0]]), np.eye(2))
 Rows = tuple[tuple[Any, ...], ...]
 
 
+def dense(rows: Rows) -> Array:
+    """The matrix of these rows, ``(n, n, ...)``."""
+    shape = jnp.broadcast_shapes(*(jnp.shape(entry) for row in rows for entry in row))
+    return jnp.stack([jnp.stack([jnp.broadcast_to(entry, shape) for entry in row]) for row in rows])
+
+
 @dataclass(frozen=True)
 class LinearPeriodic:
     """The linear system ``x' = A(t) x`` over one interval ``[0, span]`` of its clock ``t``.
@@ -33,14 +39,21 @@ class LinearPeriodic:
     ``rows(*basis(t))`` the matrix as nested tuples; an entry that vanishes identically is the integer ``0``.
     Without ``reversor`` the interval is the period and the monodromy matrix is the propagator ``Phi`` itself.
     With the reversor ``X`` (``X X = I``) the interval is half the period and the monodromy matrix is similar to
-    ``X Phi^T X Phi``. ``log_determinant()`` is the exact logarithm of its determinant (Liouville's formula), if known.
+    ``X Phi^T X Phi``; with ``reversal()``, two matrices ``(R0, R1)`` as rows, to ``R0 Phi^T R1 Phi``.
+    ``log_determinant()`` is the exact logarithm of its determinant (Liouville's formula), if known.
     """
 
     rows: Callable[..., Rows]
     span: float
     basis: Callable[[Any], tuple[Any, ...]] = lambda t: (t,)
     reversor: np.ndarray | None = None
+    reversal: Callable[[], tuple[Rows, Rows]] | None = None
     log_determinant: Callable[[], Any] | None = None
+
+    @property
+    def halves(self) -> int:
+        """How many of the interval make the period: 1 or 2."""
+        return 1 if self.reversor is None and self.reversal is None else 2
 
     @property
     def size(self) -> int:
@@ -54,9 +67,7 @@ class LinearPeriodic:
 
     def matrix(self, t: Any) -> Array:
         """``A(t)``, shape ``(n, n, ...)``."""
-        rows = self.rows(*self.basis(t))
-        shape = jnp.broadcast_shapes(*(jnp.shape(entry) for row in rows for entry in row))
-        return jnp.stack([jnp.stack([jnp.broadcast_to(entry, shape) for entry in row]) for row in rows])
+        return dense(self.rows(*self.basis(t)))
 
 
 @dataclass(frozen=True)
@@ -64,7 +75,10 @@ class FloquetModel:
     """The model of the analysis ``floquet``.
 
     ``natural`` is the system as published, over its full period in its own time; ``reduced`` is an equivalent form
-    (same multipliers) that is cheaper or better conditioned. They may be the same object. ``explicit_steps(rtol)``
+    (same multipliers) that is cheaper or better conditioned. They may be the same object. ``stiff`` is another one for
+    strong damping, in which slow modes are no differences of large entries; None if there is no better one than ``reduced``.
+    ``strongly_damped()`` tells, from NumPy arrays like those of ``explicit_steps``, where it takes the place of ``reduced``
+    whatever the scheme; the implicit one always uses it. ``explicit_steps(rtol)``
     predicts, from parameters given as NumPy arrays of shape ``(N,)``, how many steps ``reduced`` needs with the
     explicit scheme of order 8; None leaves the prediction to the analysis. ``hamiltonian()`` is true where ``reduced`` is a
     Hamiltonian system, whose multipliers come in pairs sigma, 1/sigma; None if it never is.
@@ -72,6 +86,8 @@ class FloquetModel:
 
     natural: LinearPeriodic
     reduced: LinearPeriodic
+    stiff: LinearPeriodic | None = None
+    strongly_damped: Callable[[], np.ndarray] | None = None
     explicit_steps: Callable[[float], np.ndarray] | None = None
     hamiltonian: Callable[[], Any] | None = None
 

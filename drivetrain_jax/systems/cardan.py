@@ -41,6 +41,8 @@ PARAMETERS = (
     Parameter("gamma", "1", "inertia of the driven over the driving disk, J2/J1", lower=0.0, open_lower=True),
 )
 NAMES = tuple(p.name for p in PARAMETERS)
+# Decay over half a period from which on the stiff form needs fewer steps than the reduced one, and loses fewer digits.
+_STRONG = 10.0
 
 _BASE_CASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 PRESETS = {"base": _BASE_CASE, "alpha20": _BASE_CASE | {"alpha": 20.0}, "mu20": _BASE_CASE | {"mu": 20.0}}
@@ -157,6 +159,39 @@ def _reduced_rows(cos2psi: Any, sin2psi: Any, values: Values) -> Rows:
     )
 
 
+def _stiff_rows(cos2psi: Any, sin2psi: Any, values: Values) -> Rows:
+    """``d(x, v)/dpsi`` of the twists x = (theta_1, sqrt(mu) theta_2) and v = Omega q', in the clock psi, eq. (13a)."""
+    alpha, root_mu, g = values["alpha"], jnp.sqrt(values["mu"]), 1 / jnp.sqrt(values["gamma"])
+    eta, w, deta = _clock(cos2psi, sin2psi, values["beta"])
+    sw, damping = w / values["Omega"], 2 * values["zeta"]
+    n21, n22, d = -root_mu * eta, root_mu * g, sw * damping
+    # The joint moves the second twist when it turns the first one, and the damper feels it.
+    turned, felt = -root_mu * deta, alpha * damping * deta
+    return (
+        (0, 0, sw, 0),
+        (turned, 0, sw * n21, sw * n22),
+        (-sw - felt * eta, -sw * n21, -d * (1 + alpha * eta**2), d * alpha * eta * g),
+        (felt * g, -sw * n22, d * alpha * eta * g, -d * alpha * g**2),
+    )
+
+
+def _stiff_reversal(values: Values) -> tuple[Rows, Rows]:
+    """``R0`` and ``R1`` of the rows above, eq. (13b): eta is cos(beta) at the start and 1/cos(beta) at the end."""
+    alpha, mu, damping = values["alpha"], values["mu"], 2 * values["zeta"]
+    root_mu, g, eta = jnp.sqrt(mu), 1 / jnp.sqrt(values["gamma"]), jnp.cos(values["beta"])
+    n21, n22 = -root_mu * eta, root_mu * g
+    off = damping * alpha * eta * g
+    start = (
+        (0, 0, 1.0, 0),
+        (0, 0, n21, n22),
+        (1.0, n21, -damping * (1 + alpha * eta**2), off),
+        (0, n22, off, -damping * alpha * g**2),
+    )
+    m21, m22 = 1 / (eta * g), 1 / n22
+    end = ((damping, 0, 1.0, m21), (0, damping * alpha / mu, 0, m22), (1.0, 0, 0, 0), (m21, m22, 0, 0))
+    return start, end
+
+
 def log_determinant(values: Values) -> Array:
     """Exact ``log det Z`` over the period pi (Liouville).
 
@@ -177,7 +212,7 @@ def explicit_steps(values: Values, rtol: float) -> np.ndarray:
     right angle. Fitted to 6,000 random points with zeta from 1e-4 to 300 and rtol from 1e-5 to 1e-11: 1.6 times what is
     needed in the median, four times where both matter. It decides the cost and never the accuracy, which is checked.
     """
-    beta, zeta, alpha, mu = (np.asarray(values[name], float) for name in ("beta", "zeta", "alpha", "mu"))
+    beta, mu = (np.asarray(values[name], float) for name in ("beta", "mu"))
     with np.errstate(over="ignore"):
         soft = 1 / np.asarray(values["gamma"], float)
     c = np.cos(beta)
@@ -189,10 +224,21 @@ def explicit_steps(values: Values, rtol: float) -> np.ndarray:
     )
     time = math.pi / 2 / np.asarray(values["Omega"], float)
     phase = time * (rates[0] + 2 * rates[1] + rates[2]) / 4
-    decay = time * zeta * np.maximum(ends * (1 + alpha * (c * c + soft)), ends * (c + alpha * (1 / c + c * soft)))
+    decay = _decay(values)
     digits = -math.log10(rtol) - 9
     with np.errstate(over="ignore"):
         return np.hypot(_oscillation_steps(phase, -np.log(c), digits), _decay_steps(decay, digits)) + 2
+
+
+def _decay(values: Values) -> np.ndarray:
+    """The largest rate of decay times half the period."""
+    beta, zeta, alpha = (np.asarray(values[name], float) for name in ("beta", "zeta", "alpha"))
+    c = np.cos(beta)
+    ends = 2 / (1 + c)
+    with np.errstate(over="ignore"):
+        soft = 1 / np.asarray(values["gamma"], float)
+        time = math.pi / 2 / np.asarray(values["Omega"], float)
+        return time * zeta * np.maximum(ends * (1 + alpha * (c * c + soft)), ends * (c + alpha * (1 / c + c * soft)))
 
 
 def _oscillation_steps(phase: np.ndarray, sharpness: np.ndarray, digits: float) -> np.ndarray:
@@ -210,7 +256,7 @@ def _decay_steps(decay: np.ndarray, digits: float) -> np.ndarray:
 
 
 def floquet_model(values: Values) -> FloquetModel:
-    """The linearised shaft in its own coordinates and time, and in absolute coordinates over half a period."""
+    """The linearised shaft in its own coordinates and time, and two forms of it over half a period."""
 
     def exact() -> Array:
         return log_determinant(values)
@@ -224,9 +270,18 @@ def floquet_model(values: Values) -> FloquetModel:
         reversor=SWAP,
         log_determinant=exact,
     )
+    stiff = LinearPeriodic(
+        lambda cos2psi, sin2psi: _stiff_rows(cos2psi, sin2psi, values),
+        math.pi / 2,
+        basis=_clock_basis,
+        reversal=lambda: _stiff_reversal(values),
+        log_determinant=exact,
+    )
     return FloquetModel(
         natural=natural,
         reduced=reduced,
+        stiff=stiff,
+        strongly_damped=lambda: _decay(values) > _STRONG,
         explicit_steps=lambda rtol: explicit_steps(values, rtol),
         hamiltonian=lambda: values["zeta"] == 0,
     )

@@ -159,12 +159,33 @@ def test_bound_counts_the_rounding_of_entries_in_the_implicit_scheme_too(direct)
     assert (found["spectral_radius_error"] <= 1e-10 * exact).all()
 
 
+# Strong damping, and the spectral radius in quadruple precision.
+SLOW_BESIDE_FAST = {
+    "beta": (1.1736694503606175, 1.0959683971777907, 1.1451498070596562),
+    "Omega": (0.05214942575131293, 0.08592426831610524, 0.048249976070327494),
+    "zeta": (1.096825186792873, 1.9637207047338443, 1.5548747731845267),
+    "alpha": (2.1594233923939674, 13.05848013763306, 0.012047019004057464),
+    "mu": (181.24532787955954, 490.321446370808, 25.745447314261412),
+    "gamma": (0.4433396358481521, 7.183507557145039, 0.743689598391847),
+}
+RADII = np.array([1.4146604913796845e-19, 1.2510611059620708e-06, 2.7608973440634447e-14])
+
+
+@pytest.mark.parametrize("rtol", [1e-9, 1e-10, 1e-13])
+def test_slow_modes_beside_fast_ones_are_no_difference_of_large_numbers(direct, rtol):
+    """The first was the largest multiple of its bound, 13, among points sought for it in the reduced form."""
+    found = direct({name: np.array(values) for name, values in SLOW_BESIDE_FAST.items()}, rtol=rtol)
+    error, bound = np.abs(found["spectral_radius"] - RADII), found["spectral_radius_error"]
+    assert (error <= bound / 2).all(), error / bound
+    assert (error <= 2e-11 * RADII).all() and (bound <= 2e-10 * RADII).all(), (error / RADII, bound / RADII)
+
+
 def test_errors_that_cancel_in_the_product_do_not_deceive():
     """Z is nearly of rank one here, and with 11 and 22 steps its largest multiplier is wrong by the same amount."""
     easy = (1.0563183658089397, 2.7349631755532484, 0.5761121672699921, 10.00834660652285, 0.0793118790, 49.2510470811)
     hard = (1.430161738887235, 2.831786623776442, 0.6559498501124649, 6.079785878549506, 0.07667072270795319)
     points = np.array([(*hard, 51.92629177049027), easy]).T
-    batch = FloquetBatch("direct", chunk=(2, 1))
+    batch = FloquetBatch("direct", chunk=(2, 1, 2))
     names = ("beta", "Omega", "zeta", "alpha", "mu", "gamma")
     loose, sharp = (batch(dict(zip(names, points, strict=True)), rtol=rtol) for rtol in (1e-5, 1e-12))
     error = np.abs(loose["spectral_radius"] - sharp["spectral_radius"])

@@ -37,12 +37,12 @@ def relative(found, exact) -> float:
 
 @pytest.fixture(scope="module")
 def model_matrices():
-    """``A`` of the natural and of the reduced form at one instant of the clock of each."""
+    """``A`` of the natural, of the reduced and of the stiff form at one instant of the clock of each."""
 
     @jax.jit
     def both(values, tau, psi):
         model = SYSTEM.models["floquet"].build(values)
-        return model.natural.matrix(tau), model.reduced.matrix(psi)
+        return model.natural.matrix(tau), model.reduced.matrix(psi), model.stiff.matrix(psi)
 
     return lambda values, tau=0.0, psi=0.0: tuple(map(np.asarray, both(values, tau, psi)))
 
@@ -79,6 +79,14 @@ def exact_transformation(v, tau):
     return mp.matrix([[1, 0, 0, 0], [0, 1, 0, 0], *rows]) * to_q
 
 
+def exact_twists(v, tau):
+    """``(x, v) = T (theta, theta')``: x = (theta_1, sqrt(mu) theta_2), v = Omega q'."""
+    eta, first, _ = exact_ratio(v["beta"], tau)
+    g, omega = 1 / mp.sqrt(v["gamma"]), mp.mpf(v["Omega"])
+    second = [omega * first / g, 0, omega * eta / g, omega / g]
+    return mp.matrix([[1, 0, 0, 0], [0, mp.sqrt(v["mu"]), 0, 0], [0, 0, omega, 0], second])
+
+
 def exact_time(beta, psi):
     """tau of the clock psi, eqs (11)-(12), for 0 < psi < pi/4 and beyond."""
     c, r = mp.cos(beta), mp.tan(mp.mpf(beta) / 2) ** 2
@@ -86,14 +94,14 @@ def exact_time(beta, psi):
     return mp.atan2(mp.sin(doubled / 2), mp.sqrt(c) * mp.cos(doubled / 2))
 
 
-def exact_reduced(v, psi):
+def exact_form(v, psi, transformation):
     """(T' + T A) T^-1 dtau/dpsi, derivatives by differences in 60 digits."""
     with mp.workdps(60):
         psi = mp.mpf(psi)
         tau, step = exact_time(v["beta"], psi), mp.mpf(10) ** -20
         rate = (exact_time(v["beta"], psi + step) - exact_time(v["beta"], psi - step)) / (2 * step)
-        slope = (exact_transformation(v, tau + step) - exact_transformation(v, tau - step)) / (2 * step)
-        t = exact_transformation(v, tau)
+        slope = (transformation(v, tau + step) - transformation(v, tau - step)) / (2 * step)
+        t = transformation(v, tau)
         return ((slope + t * exact_natural(v, tau)) * t**-1 * rate).tolist()
 
 
@@ -129,9 +137,25 @@ def test_forcing_is_what_the_nonlinear_equations_have_at_rest():
 
 
 @pytest.mark.parametrize("point", range(len(POINTS)))
-def test_reduced_form_is_the_transformed_natural_system(point, model_matrices):
+def test_both_forms_are_the_transformed_natural_system(point, model_matrices):
+    v = POINTS[point]
     for psi in (0.0, 0.1, 0.7, math.pi / 4, 0.9, 1.5):
-        assert relative(model_matrices(POINTS[point], psi=psi)[1], exact_reduced(POINTS[point], psi)) <= 3e-14
+        _, reduced, stiff = model_matrices(v, psi=psi)
+        assert relative(reduced, exact_form(v, psi, exact_transformation)) <= 3e-14
+        assert relative(stiff, exact_form(v, psi, exact_twists)) <= 3e-14
+
+
+@pytest.mark.parametrize("point", range(len(POINTS)))
+def test_the_stiff_form_runs_back_as_the_reduced_one_does(point):
+    """R0 = Y^-1 X Y^-T at the start, R1 = Y^T X Y at the end, with (q, P) = Y (x, v)."""
+    v = POINTS[point]
+    start, end = cardan.floquet_model(v).stiff.reversal()
+    with mp.workdps(60):
+        swap = mp.matrix(cardan.floquet_model(v).reduced.reversor.tolist())
+        first, last = (exact_transformation(v, tau) * exact_twists(v, tau) ** -1 for tau in (mp.mpf(0), mp.pi / 2))
+        exact = first**-1 * swap * (first**-1).T, last.T * swap * last
+        for found, e in zip((start, end), exact, strict=True):
+            assert relative(np.array(found, float), e.tolist()) <= 1e-14
 
 
 @pytest.mark.parametrize("beta", [0.0, 0.4, -1.2, 1.5, NEAR_PERPENDICULAR])

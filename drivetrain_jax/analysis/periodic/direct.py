@@ -21,7 +21,7 @@ from jax import Array
 from drivetrain_jax.analysis.numerics.linear_algebra import matmul
 from drivetrain_jax.analysis.periodic.multipliers import characteristic_coefficients, root_scale
 from drivetrain_jax.analysis.periodic.propagator import Propagator
-from drivetrain_jax.systems import LinearPeriodic
+from drivetrain_jax.systems import LinearPeriodic, dense
 
 # Doublings of the predicted number of steps that a batch may take, and the steps at which there is no further one.
 _MAX_REFINEMENTS = 6
@@ -52,11 +52,44 @@ class Monodromy(NamedTuple):
 
 
 def assemble(system: LinearPeriodic, phi: Array) -> Array:
-    """The monodromy matrix, up to similarity, from the propagator over the span: ``Phi``, or ``X Phi^T X Phi``."""
+    """The monodromy matrix, up to similarity, from the propagator over the span: ``Phi``, ``X Phi^T X Phi`` or
+    ``R0 Phi^T R1 Phi``."""
+    if system.reversal is not None:
+        return _reversed(*map(dense, system.reversal()), phi)
     if system.reversor is None:
         return phi
     x = jnp.asarray(system.reversor).reshape(*system.reversor.shape, *(1,) * (phi.ndim - 2))
     return matmul(matmul(x, matmul(jnp.swapaxes(phi, 0, 1), x)), phi)
+
+
+def _reversed(start: Array, end: Array, phi: Array) -> Array:
+    return matmul(matmul(start, jnp.swapaxes(phi, 0, 1)), matmul(end, phi))
+
+
+def _assembled(system: LinearPeriodic, fine: Array, coarse: Array) -> tuple[Array, Array, Array]:
+    """The monodromy matrices of two propagators, up to one similarity, and the size of what was added up in the first."""
+    z = [assemble(system, fine), assemble(system, coarse)]
+    if system.reversal is None:
+        return *z, jnp.sum(fine**2, axis=(0, 1)) ** (system.halves / 2)
+    size = _reversed(*(jnp.abs(dense(rows)) for rows in system.reversal()), jnp.abs(fine))
+    scales = _balance(size)
+    *z, size = (matrix * scales / scales[:, None] for matrix in (*z, size))
+    return *z, jnp.sqrt(jnp.sum(size**2, axis=(0, 1)))
+
+
+def _balance(size: Array) -> Array:
+    """Scales ``(n, ...)`` of states in which rows and columns of ``size`` ``(n, n, ...)``, not negative, are alike.
+
+    Two sweeps of Osborne's iteration (Parlett & Reinsch, Numer. Math. 13, 1969), in powers of 2.
+    """
+    scales = [jnp.ones(size.shape[2:])] * len(size)
+    for k in 2 * list(range(len(size))):
+        others = [j for j in range(len(size)) if j != k]
+        row = sum(size[k, j] * scales[j] for j in others) / scales[k]
+        column = sum(size[j, k] / scales[j] for j in others) * scales[k]
+        factor = jnp.exp2(jnp.round(jnp.log2(row / column) / 2))
+        scales[k] = scales[k] * jnp.where((row > 0) & (column > 0) & jnp.isfinite(factor), factor, 1.0)
+    return jnp.stack(scales)
 
 
 def stiffness_of(system: LinearPeriodic, shape: tuple[int, ...] = ()) -> Array:
@@ -93,14 +126,12 @@ def compare(
     on the way grows until the end as ``fine`` says, but never by so much that it would not show in ``coarse``. That of the
     entries of A is the same in both propagators: it shifts exponents by `_ENTRIES` units of the ``stiffness``.
     """
-    halves = 1 if system.reversor is None else 2
-    z_fine = assemble(system, fine.matrix)
     other = jnp.exp(coarse.log_scale - fine.log_scale) * coarse.matrix
-    z_coarse = assemble(system, other)
+    z_fine, z_coarse, norm = _assembled(system, fine.matrix, other)
     a_fine, a_coarse = characteristic_coefficients(z_fine), characteristic_coefficients(z_coarse)
     scale = root_scale(a_fine)
     n = a_fine.shape[0]
-    log_scale = halves * fine.log_scale
+    log_scale = system.halves * fine.log_scale
     differences = [jnp.sqrt(jnp.sum((z_fine - z_coarse) ** 2, axis=(0, 1))) / scale]
     differences += [jnp.abs(a_fine[k] - a_coarse[k]) / scale ** (k + 1) for k in range(n)]
     differences.append(_relative_difference(fine.matrix[None], other[None])[0])
@@ -115,12 +146,11 @@ def compare(
         exact = jnp.exp(system.log_determinant() - n * log_scale)
         residual = ((-1) ** n * a_fine[-1] - exact) / scale**n
     truncation = jnp.maximum(truncation, jnp.abs(residual))
-    norm = jnp.sum(fine.matrix**2, axis=(0, 1)) ** (halves / 2)
-    # Eightfold growth is well within what rounding of the products is taken for.
-    growth = 1.0 if fine.growth is None else jnp.maximum(fine.growth / 8, 1.0)
+    # Eightfold growth is well within what rounding of the products is taken for, if their size is only estimated.
+    growth = 1.0 if fine.growth is None else jnp.maximum(fine.growth / (8 if system.reversal is None else 1), 1.0)
     unit = np.finfo(float).eps * norm / scale
     at_the_end = (4 + jnp.sqrt(steps)) * unit
-    of_entries = _ENTRIES * halves * stiffness * np.finfo(float).eps
+    of_entries = _ENTRIES * system.halves * stiffness * np.finfo(float).eps
     rounding = at_the_end + jnp.minimum((growth - 1) * at_the_end, difference) + of_entries
     met = truncation <= jnp.maximum(rtol, rounding)
     return Monodromy(z_fine, log_scale, truncation + rounding, met, residual, fine.parts, change)

@@ -1,4 +1,4 @@
-"""The two solvers of a reduced periodic form: explicit, batched inside the state, and L-stable where that is cheaper."""
+"""The direct solvers of a periodic system: explicit, batched inside the state, and L-stable where that is cheaper."""
 
 from __future__ import annotations
 
@@ -7,12 +7,18 @@ from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis._base import Solver
 from drivetrain_jax.analysis.numerics.lanes import in_blocks
 from drivetrain_jax.analysis.periodic.direct import Monodromy, direct_monodromy, stable_steps, stiffness_of
-from drivetrain_jax.analysis.periodic.floquet_effort import PANEL_COST, explicit_effort, implicit_effort
+from drivetrain_jax.analysis.periodic.floquet_effort import (
+    PANEL_COST,
+    explicit_effort,
+    implicit_effort,
+    strongly_damped,
+)
 from drivetrain_jax.analysis.periodic.propagator import (
     EXPLICIT_ORDER,
     IMPLICIT_ORDER,
@@ -40,41 +46,54 @@ def direct_solvers(
     results: Results,
     chunks: tuple[int, int] = (512, 64),
     parts: int = 0,
+    stiff: Form | None = None,
 ) -> tuple[Solver, ...]:
     """Solvers that give ``results(model, monodromy)`` from the monodromy matrix of ``form(model)``.
 
     ``rtol`` predicts the effort, ``target`` is the error that every point is refined to. The propagators over ``parts``
-    equal parts of the span are kept, and how far their product may be wrong; neither if there are none.
+    equal parts of the span are kept, and how far their product may be wrong; neither if there are none. ``stiff(model)`` is
+    the form for the implicit scheme, and for the explicit one where damping is strong; None if it is no other one.
     """
-    solve = partial(_solve, system, target, form, results, parts)
-    return (
-        Solver(
-            "direct: explicit Runge-Kutta of order 8",
-            lambda values, effort: solve(values, effort, True),
-            lambda columns: explicit_effort(system, columns, rtol),
+    solve = partial(_solve, system, target, results, parts)
+
+    def explicit(name: str, form: Form, effort: Callable[[Mapping[str, Any]], Any]) -> Solver:
+        return Solver(
+            f"direct: explicit Runge-Kutta of order 8{name}",
+            lambda values, steps: solve(form, values, steps, True),
+            effort,
             broadcasts=True,
             chunk=chunks[0],
             march=True,
             short_loops=True,
-        ),
-        Solver(
-            "direct: Radau IIA of 8 stages",
-            lambda values, effort: solve(values, effort, False),
-            lambda columns: implicit_effort(system, columns, rtol),
-            unit_cost=PANEL_COST,
-            chunk=chunks[1],
-            march=True,
-            short_loops=True,
-        ),
+        )
+
+    def steps(damped: bool, columns: Mapping[str, Any]) -> Any:
+        if stiff is None:
+            return explicit_effort(system, columns, rtol)
+        mine = strongly_damped(system, columns) == damped
+        return np.where(mine, explicit_effort(system, columns, rtol) if mine.any() else np.inf, np.inf)
+
+    implicit = Solver(
+        "direct: Radau IIA of 8 stages",
+        lambda values, effort: solve(stiff or form, values, effort, False),
+        lambda columns: implicit_effort(system, columns, rtol),
+        unit_cost=PANEL_COST,
+        chunk=chunks[1],
+        march=True,
+        short_loops=True,
     )
+    plain = explicit("", form, partial(steps, False))
+    if stiff is None:
+        return plain, implicit
+    return plain, implicit, explicit(", form for strong damping", stiff, partial(steps, True))
 
 
 def _solve(
     system: System,
     target: float,
-    form: Form,
     results: Results,
     parts: int,
+    form: Form,
     values: Mapping[str, Any],
     effort: Array,
     explicit: bool,

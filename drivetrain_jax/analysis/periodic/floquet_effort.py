@@ -33,6 +33,13 @@ def explicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: flo
     return _up_to(_MAX_EXPLICIT, _explicit_steps(system, columns, rtol))
 
 
+def strongly_damped(system: System, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Where the explicit scheme uses the ``stiff`` form of the model as well, ``(N,)``."""
+    build = system.models["floquet"].build
+    strong = build(columns).strongly_damped() if _knows(build, "strongly_damped", columns) else False
+    return np.broadcast_to(strong, count_of(columns))
+
+
 def implicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
     """Panels of the implicit scheme, ``(N,)``: it must resolve what oscillates, whereas decay costs it nothing."""
     explicit = _explicit_steps(system, columns, rtol)
@@ -48,7 +55,7 @@ def implicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: flo
 
 def _explicit_steps(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
     build = system.models["floquet"].build
-    if _predicts_steps(build, columns):
+    if _knows(build, "explicit_steps", columns):
         steps = build(columns).explicit_steps(rtol)
     else:
         # Systems that predict none: from the size of A^2.
@@ -57,17 +64,17 @@ def _explicit_steps(system: System, columns: Mapping[str, np.ndarray], rtol: flo
     return np.broadcast_to(2 * np.ceil(steps / 2), count_of(columns))
 
 
-def _predicts_steps(build: Build, columns: Mapping[str, Any]) -> bool:
-    """Whether the model predicts its steps itself, found out without computing anything of it."""
+def _knows(build: Build, fact: str, columns: Mapping[str, Any]) -> bool:
+    """Whether the model tells this ``fact`` itself, found out without computing anything of it."""
     words, numbers = split(columns)
     leaves, tree = jax.tree.flatten(numbers)
-    return _known_to_predict(build, words, tree, len(leaves))
+    return _known(build, fact, words, tree, len(leaves))
 
 
 @lru_cache(maxsize=32)
-def _known_to_predict(build: Build, words: Words, tree: Any, count: int) -> bool:
+def _known(build: Build, fact: str, words: Words, tree: Any, count: int) -> bool:
     def model(leaves: list[Array]) -> None:
-        known.append(build({**dict(words), **jax.tree.unflatten(tree, leaves)}).explicit_steps is not None)
+        known.append(getattr(build({**dict(words), **jax.tree.unflatten(tree, leaves)}), fact) is not None)
 
     known: list[bool] = []
     jax.eval_shape(model, [jax.ShapeDtypeStruct((), float)] * count)
