@@ -3,6 +3,9 @@
 The atlas may have more parameters than a question names: ``at`` gives their values. Which parameter is the speed, the angle
 or the damping is a matter of the system (``roles``). ``direct`` is the check: a function from
 columns of all parameters, a mapping of names to arrays ``(N,)``, to spectral radii ``(N,)`` computed without the atlas.
+
+All raise ``KeyError`` for parameters that the atlas lacks, ``ValueError`` for values outside its domain, and
+:class:`InputError` for an atlas without panels or boundaries, or one that with ``at`` is not over what is asked.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drivetrain_jax._errors import InputError
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.windows import (
@@ -119,7 +123,7 @@ def least_damping(
     direct: Direct | None = None,
 ) -> Answer:
     """The least damping from which on, up to the atlas's largest, all ``speeds`` are stable."""
-    return _extreme(atlas.slice(at), system, speeds, ("damping", 1.0), direct)
+    return _extreme(_over(atlas, system, at, "speed", "damping"), system, speeds, ("damping", 1.0), direct)
 
 
 def widest_angle(
@@ -131,7 +135,7 @@ def widest_angle(
     direct: Direct | None = None,
 ) -> Answer:
     """The widest angle up to which, from the atlas's smallest on, all ``speeds`` are stable."""
-    return _extreme(atlas.slice(at), system, speeds, ("angle", -1.0), direct)
+    return _extreme(_over(atlas, system, at, "speed", "angle"), system, speeds, ("angle", -1.0), direct)
 
 
 def speed_windows(
@@ -144,7 +148,7 @@ def speed_windows(
 ) -> Windows:
     """The stable ranges of the speed where the other parameters are ``at``, each shortened by ``margin`` of the speed at
     both ends, unless the atlas ends there. What a margin leaves nothing of is left out."""
-    part = atlas.slice(at)
+    part = _over(atlas, system, at, "speed")
     line = stability_along(part, system)
     criteria = Criteria.of(part, system)
     windows = []
@@ -159,6 +163,15 @@ def speed_windows(
         window = _checked_window(window, part, system.roles["speed"], line, direct)
         windows.append(replace(window, check=_of_kind(window.check, criteria)))
     return Windows(tuple(windows), line.undecided)
+
+
+def _over(atlas: Atlas, system: System, at: Mapping[str, float], *roles: str) -> Atlas:
+    """``atlas`` where it is ``at``, over the parameters with these ``roles`` and no other."""
+    wanted, part = [system.roles[role] for role in roles], atlas.slice(at)
+    if set(part.parameters) != set(wanted):
+        left = " and ".join(part.parameters) or "nothing"
+        raise InputError(f"at = {dict(at)}: leaves an atlas over {left}; allowed is what leaves {' and '.join(wanted)}")
+    return part
 
 
 def _stable_and_decided(line: Line) -> list[Interval]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from benchmarks.atlas_direct import BASE, CARDAN, cardan_atlas, monodromy, propagators
+from drivetrain_jax import InputError
 from drivetrain_jax.atlas import design
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.design import least_damping, nearest_boundaries, speed_windows, widest_angle
@@ -119,6 +121,20 @@ def test_a_line_of_candidates(changes, undecided, expected):
     ]
     for crossing in line.crossings:
         assert all(abs(c.value - crossing.value) + c.error <= crossing.error for c in changes)
+
+
+@pytest.mark.parametrize(
+    ("ask", "at", "left", "wanted"),
+    [
+        (partial(least_damping, speeds=(1.3, 1.5)), {}, "beta and Omega", "Omega and zeta"),
+        (partial(widest_angle, speeds=(1.3, 1.5)), {"beta": 1.0}, "Omega", "Omega and beta"),
+        (speed_windows, {}, "beta and Omega", "Omega"),
+    ],
+)
+def test_an_atlas_over_other_parameters_is_refused(atlas, ask, at, left, wanted):
+    with pytest.raises(InputError) as error:
+        ask(atlas, CARDAN, at=at)
+    assert str(error.value) == f"at = {at}: leaves an atlas over {left}; allowed is what leaves {wanted}"
 
 
 def test_speed_windows_with_a_margin(atlas):
