@@ -172,7 +172,8 @@ def _effort(request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Strobes, shape (N,); infinite where they are not worth beginning."""
     count = np.broadcast(*jax.tree.leaves({k: v for k, v in columns.items() if not isinstance(v, str)})).size
     strobes = request.options["strobes"] + request.options["discard"]
-    return np.full(count, strobes if strobes * request.options["steps"] <= MOST_STEPS else np.inf)
+    # The adaptive method has a limit of its own.
+    return np.full(count, strobes if strobes * request.options.get("steps", 1) <= MOST_STEPS else np.inf)
 
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
