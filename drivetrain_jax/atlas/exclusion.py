@@ -26,6 +26,8 @@ from drivetrain_jax.atlas.patches import Patches
 _SMALLEST = 2.0**-22
 _MAX_BOXES = 20_000
 _POLISH = 4
+# How far from the domain, relative to it, a point on its rim may be found.
+_RIM = 1e-9
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,8 @@ def critical_points(patches: tuple[Patches, ...], number: int, horizontal: int) 
     ``patches`` holds all functions over the same boxes. Where another one is negative throughout a box the system is
     unstable there anyway, and the box is left out.
     """
-    smallest = _SMALLEST * (patches[0].upper.max(axis=0) - patches[0].lower.min(axis=0))
+    lower, upper = patches[0].lower.min(axis=0), patches[0].upper.max(axis=0)
+    smallest = _SMALLEST * (upper - lower)
     found, undecided, count = [], [], 0
     active, others = patches[number], patches[:number] + patches[number + 1 :]
     while len(active):
@@ -72,6 +75,9 @@ def critical_points(patches: tuple[Patches, ...], number: int, horizontal: int) 
         axes = active.steepest_axis()
         active, others = active.split(axes), tuple(p.split(axes) for p in others)
     points, curvature, slope, boxes = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    # Boxes at the rim are enlarged beyond it.
+    beyond = (np.maximum(lower - points, points - upper) > _RIM * (upper - lower)).any(axis=1)
+    points, curvature, slope, boxes = (part[~beyond] for part in (points, curvature, slope, boxes))
     keep = _distinct(points, boxes)
     return Search(points[keep], curvature[keep], slope[keep], np.concatenate(undecided), count)
 

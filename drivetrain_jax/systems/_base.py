@@ -47,8 +47,8 @@ class LinearPeriodic:
     span: float
     basis: Callable[[Any], tuple[Any, ...]] = lambda t: (t,)
     reversor: np.ndarray | None = None
-    reversal: Callable[[], tuple[Rows, Rows]] | None = None
     log_determinant: Callable[[], Any] | None = None
+    reversal: Callable[[], tuple[Rows, Rows]] | None = None
 
     @property
     def halves(self) -> int:
@@ -75,21 +75,21 @@ class FloquetModel:
     """The model of the analysis ``floquet``.
 
     ``natural`` is the system as published, over its full period in its own time; ``reduced`` is an equivalent form
-    (same multipliers) that is cheaper or better conditioned. They may be the same object. ``stiff`` is another one for
-    strong damping, in which slow modes are no differences of large entries; None if there is no better one than ``reduced``.
-    ``strongly_damped()`` tells, from NumPy arrays like those of ``explicit_steps``, where it takes the place of ``reduced``
-    whatever the scheme; the implicit one always uses it. ``explicit_steps(rtol)``
+    (same multipliers) that is cheaper or better conditioned. They may be the same object. ``explicit_steps(rtol)``
     predicts, from parameters given as NumPy arrays of shape ``(N,)``, how many steps ``reduced`` needs with the
     explicit scheme of order 8; None leaves the prediction to the analysis. ``hamiltonian()`` is true where ``reduced`` is a
     Hamiltonian system, whose multipliers come in pairs sigma, 1/sigma; None if it never is.
+    ``stiff`` is one more form, in which the slow modes of strong damping are no differences of large entries; None if there
+    is no better one than ``reduced``. The implicit scheme always takes it, the explicit one where ``strongly_damped()``
+    says so, from NumPy arrays as well; None if nowhere.
     """
 
     natural: LinearPeriodic
     reduced: LinearPeriodic
-    stiff: LinearPeriodic | None = None
-    strongly_damped: Callable[[], np.ndarray] | None = None
     explicit_steps: Callable[[float], np.ndarray] | None = None
     hamiltonian: Callable[[], Any] | None = None
+    stiff: LinearPeriodic | None = None
+    strongly_damped: Callable[[], np.ndarray] | None = None
 
 
 @dataclass(frozen=True)
