@@ -41,7 +41,8 @@ PARAMETERS = (
     Parameter("gamma", "1", "inertia of the driven over the driving disk, J2/J1", lower=0.0, open_lower=True),
 )
 NAMES = tuple(p.name for p in PARAMETERS)
-# Decay over half a period from which on the stiff form needs fewer steps than the reduced one, and loses fewer digits.
+# Decay over half a period from which on the stiff form has no larger errors than the reduced one, in the median of random
+# points with equal steps; those of rounding are smaller.
 _STRONG = 10.0
 
 _BASE_CASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}

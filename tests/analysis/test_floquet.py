@@ -17,9 +17,9 @@ from scipy.special import mathieu_a, mathieu_b
 import drivetrain_jax as dt
 from benchmarks.cardan_reference import monodromy, spectral_radius, stacked_monodromy
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.analysis.periodic.direct import compare
-from drivetrain_jax.analysis.periodic.propagator import EXPLICIT_ORDER, explicit_propagator
-from drivetrain_jax.systems import get_system, system_names
+from drivetrain_jax.analysis.periodic.direct import assemble, compare
+from drivetrain_jax.analysis.periodic.propagator import EXPLICIT_ORDER, explicit_propagator, implicit_propagator
+from drivetrain_jax.systems import LinearPeriodic, get_system, system_names
 
 RANGES = {"Omega": (0.05, 5), "zeta": (1e-4, 1), "alpha": (0.1, 20), "mu": (0.1, 20), "gamma": (0.1, 1e3)}
 
@@ -51,7 +51,7 @@ def rows(points: dict[str, np.ndarray]) -> list[dict[str, float]]:
     return [dict(zip(points, row, strict=True)) for row in zip(*points.values(), strict=True)]
 
 
-def check_three_ways(points: dict[str, np.ndarray], direct: FloquetBatch, diffrax: FloquetBatch) -> None:
+def assert_three_ways_agree(points: dict[str, np.ndarray], direct: FloquetBatch, diffrax: FloquetBatch) -> None:
     ours = direct(points)
     assert (ours["outcome"] <= Outcome.TOLERANCE_NOT_MET).all()
     general = diffrax(points, rtol=1e-11)
@@ -63,16 +63,16 @@ def check_three_ways(points: dict[str, np.ndarray], direct: FloquetBatch, diffra
 
 
 def test_direct_diffrax_and_scipy_agree(direct, diffrax):
-    check_three_ways(random_points(12, 11), direct, diffrax)
+    assert_three_ways_agree(random_points(12, 11), direct, diffrax)
 
 
 @pytest.mark.full
 def test_direct_diffrax_and_scipy_agree_on_500_points(direct):
     wide = FloquetBatch("diffrax", outputs=("spectral_radius",), chunk=(64,))
-    check_three_ways(random_points(500, 12), direct, wide)
+    assert_three_ways_agree(random_points(500, 12), direct, wide)
 
 
-def check_bound(found: dict[str, np.ndarray], sharp: dict[str, np.ndarray]) -> None:
+def assert_bound_holds(found: dict[str, np.ndarray], sharp: dict[str, np.ndarray]) -> None:
     rho, exact = found["spectral_radius"], sharp["spectral_radius"]
     assert (np.abs(rho - exact) <= found["spectral_radius_error"]).all()
     # Zero would be no bound, and 1e-9 for an easy point no use.
@@ -85,13 +85,13 @@ def check_bound(found: dict[str, np.ndarray], sharp: dict[str, np.ndarray]) -> N
 
 
 def test_error_bound_holds(sample):
-    check_bound(*sample[1:])
+    assert_bound_holds(*sample[1:])
 
 
 @pytest.mark.full
 def test_error_bound_holds_on_20000_points(direct):
     points = random_points(20_000, 14)
-    check_bound(direct(points), direct(points, rtol=1e-13))
+    assert_bound_holds(direct(points), direct(points, rtol=1e-13))
 
 
 CROSSING = {
@@ -178,6 +178,18 @@ def test_slow_modes_beside_fast_ones_are_no_difference_of_large_numbers(direct, 
     error, bound = np.abs(found["spectral_radius"] - RADII), found["spectral_radius_error"]
     assert (error <= bound / 2).all(), error / bound
     assert (error <= 2e-11 * RADII).all() and (bound <= 2e-10 * RADII).all(), (error / RADII, bound / RADII)
+
+
+def test_slow_modes_lose_their_digits_in_the_reduced_form():
+    """The first point by the implicit scheme, whose truncation error is nothing with so many steps."""
+    model = CARDAN.models["floquet"].build({name: values[0] for name, values in SLOW_BESIDE_FAST.items()})
+
+    def error(form: LinearPeriodic) -> float:
+        phi = jax.jit(lambda steps: implicit_propagator(form, steps))(jnp.int64(256))
+        radius = np.abs(np.linalg.eigvals(assemble(form, phi.matrix))).max() * np.exp(2 * phi.log_scale)
+        return abs(radius / RADII[0] - 1)
+
+    assert error(model.stiff) < 2e-11 < 1e-10 < error(model.reduced)
 
 
 def test_errors_that_cancel_in_the_product_do_not_deceive():

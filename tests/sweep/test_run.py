@@ -31,7 +31,7 @@ def expected_value(a, b, n=3, length=(1.0, 2.0, 3.0)):
     return np.where(a > 9, np.nan, total)
 
 
-def same(one, two):
+def assert_same(one, two):
     """Arrays, coordinates, attributes of variables: everything but the provenance."""
     for name in one.variables:
         a, b = one[name], two[name]
@@ -170,7 +170,7 @@ def test_a_result_without_a_single_value_has_its_dimensions_and_grows(tmp_path):
     assert dt.run(scene, overrides={"fixed.a": 6.0})["wave"].shape == (3,)
     large = scene | {"axes": {"a": {"values": [6.0, 1.0, 7.0]}}}
     assert str(run_to_file(large, tmp_path / "r.nc")) == "points: total=3 computed=2 reused=1 failed=2"
-    same(dt.run(large, out=tmp_path / "r.nc"), dt.run(large))
+    assert_same(dt.run(large, out=tmp_path / "r.nc"), dt.run(large))
 
 
 def test_resonances_depend_on_the_axes_among_their_parameters():
@@ -185,9 +185,9 @@ def test_resonances_depend_on_the_axes_among_their_parameters():
 def test_file_opens_with_xarray_h5py_and_netcdf4(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     written, memory = dt.run(grid_scene, out=path), dt.run(grid_scene)
-    same(written, memory)
+    assert_same(written, memory)
     with xr.open_dataset(path, engine="h5netcdf") as ds:
-        same(ds, memory)
+        assert_same(ds, memory)
         assert ds.attrs["Conventions"] == "CF-1.11" and ds.attrs["system"] == "toy"
         assert json.loads(ds.attrs["fixed_parameters"])["n"]["value"] == 3
         assert {"title", "digest", "machine", "versions", "wall_time_s", "created", "method", "source"} <= set(ds.attrs)
@@ -204,14 +204,14 @@ def test_scene_in_the_file_gives_the_same_result(grid_scene, tmp_path):
     scene = tmp_path / "again.toml"
     scene.write_text(first.attrs["scene"])
     again = dt.run(scene)
-    same(first, again)
+    assert_same(first, again)
     assert again.attrs["digest"] == first.attrs["digest"]
 
 
 def test_threads_and_repetition_do_not_change_a_bit(grid_scene):
     first = dt.run(grid_scene, threads=1)
     for workers in (1, 2, 5):
-        same(first, dt.run(grid_scene, threads=workers))
+        assert_same(first, dt.run(grid_scene, threads=workers))
 
 
 def test_complete_result_is_only_read(grid_scene, tmp_path):
@@ -234,7 +234,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(grid_scene, tmp_path):
     assert (found.total, found.done, found.failed, found.state) == (123, done.computed, done.failed, "partial")
     resumed = run_to_file(grid_scene, path)
     assert resumed.reused == done.computed and resumed.computed == 123 - done.computed and resumed.failed == 12
-    same(xr.open_dataset(path, engine="h5netcdf"), dt.run(grid_scene))
+    assert_same(xr.open_dataset(path, engine="h5netcdf"), dt.run(grid_scene))
     assert os.listdir(tmp_path) == ["r.nc"]
 
 
@@ -331,7 +331,7 @@ def test_a_finished_result_in_a_folder_without_write_permission_is_read(grid_sce
     run_to_file(grid_scene, path)
     monkeypatch.setattr("drivetrain_jax.sweep.target.os.access", lambda *_: False)
     assert run_to_file(grid_scene, path).reused == 123 and status(grid_scene, path).state == "complete"
-    same(dt.run(grid_scene, path), dt.run(grid_scene))
+    assert_same(dt.run(grid_scene, path), dt.run(grid_scene))
     for fresh, name in ((True, "r.nc"), (False, "new.nc")):
         with pytest.raises(dt.InputError, match="not writable"):
             run_to_file(grid_scene, tmp_path / name, fresh=fresh)
@@ -361,7 +361,7 @@ def test_corrupted_chunk_is_computed_again(grid_scene, tmp_path):
         part.write_bytes(data)
     assert stopped.value.progress.computed > 0 and status(grid_scene, path).done == 0
     assert run_to_file(grid_scene, path).reused == 0
-    same(xr.open_dataset(path, engine="h5netcdf"), dt.run(grid_scene))
+    assert_same(xr.open_dataset(path, engine="h5netcdf"), dt.run(grid_scene))
 
 
 def test_failing_chunk_leaves_a_resumable_run(tmp_path):
@@ -465,7 +465,7 @@ def test_one_point_without_axes_goes_into_a_file(tmp_path):
     scene = {"system": "toy", "analysis": "toy", "fixed": {"a": 1.0}, "outputs": ["value", "wave"]}
     ds = dt.run(scene, out=tmp_path / "r.nc")
     assert ds["value"].dims == () and ds["wave"].dims == ("part",)
-    same(ds, dt.run(scene))
+    assert_same(ds, dt.run(scene))
 
 
 MANY = """
@@ -545,7 +545,7 @@ def test_killed_and_resumed_equals_uninterrupted(slow_process, tmp_path):
     assert (resumed.reused, resumed.computed) == (done, 400 - done)
     reference = tmp_path / "reference.nc"
     run_to_file(SLOW, reference)
-    same(xr.open_dataset(out, engine="h5netcdf"), xr.open_dataset(reference, engine="h5netcdf"))
+    assert_same(xr.open_dataset(out, engine="h5netcdf"), xr.open_dataset(reference, engine="h5netcdf"))
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
