@@ -121,3 +121,9 @@ class Variable:
     dims: tuple[str, ...] = ()
     dtype: str = "float64"
     flags: tuple[str, ...] = ()
+
+    def written(self, value: complex) -> str:
+        """One value as a reader would write it: the meaning of a code; of a number twelve digits, of an error three."""
+        if self.flags:
+            return f"{self.flags[int(value)]} ({int(value)})"
+        return f"{value:.3g}" if self.name.endswith("_error") else f"{value:.12g}"

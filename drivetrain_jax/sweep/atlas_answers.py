@@ -52,7 +52,7 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
     found = atlas(**point)
     results = {str(name): v.values[()] for name, v in found.data_vars.items()}
     variables = {v.name: v for v in (*atlas.scene.analysis.variables, OUTCOME)}
-    rows = [f"  {name:<24} {_value(variables[name], value)}" for name, value in results.items()]
+    rows = [f"  {name:<24} {variables[name].written(value)}" for name, value in results.items()]
     slopes = direct_sensitivity(atlas.scene.system, {**atlas.fixed, **point})
     panels, system = atlas.stability.atlas, atlas.scene.system
     nearest = design.nearest_boundaries(panels, system, point) if has_boundaries(panels, system) else ()
@@ -330,12 +330,6 @@ def _reach(atlas: StoredAtlas, nearest: design.Nearest) -> str:
     # Stability may change within a range that is undecided.
     elsewhere = ", unless where it is undecided:" if nearest.undecided else ""
     return f"none from {_number(low)} to {_number(high)}{elsewhere}"
-
-
-def _value(variable: Any, value: Any) -> str:
-    if variable.flags:
-        return f"{variable.flags[int(value)]} ({int(value)})"
-    return f"{value:.12g}"
 
 
 def _number(value: float) -> str:

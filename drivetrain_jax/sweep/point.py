@@ -135,11 +135,9 @@ def _with_units(text: str, units: str) -> str:
 
 
 def _text(variable: Variable, value: Any) -> str:
-    if variable.flags and np.ndim(value) == 0:
-        return f"{variable.flags[int(value)]} ({int(value)})"
     if np.ndim(value):
         return np.array2string(value, precision=10, separator=", ", max_line_width=10_000)
-    return f"{value:.12g}"
+    return variable.written(value)
 
 
 def point(system: str, analysis: str, *, outputs: Sequence[str] | None = None, **given: Any) -> PointResult:

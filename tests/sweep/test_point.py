@@ -45,6 +45,12 @@ def test_readable():
     ]
 
 
+def test_errors_have_three_digits():
+    found = dt.point("planetary", "modes", outputs=["natural_frequency", "natural_frequency_error"])
+    first = repr(found).splitlines()[3].split()
+    assert first[1:] == [f"{found.natural_frequency[0]:.12g}", f"{found.natural_frequency_error[0]:.3g}"]
+
+
 def test_physical_units():
     data = {"J1": 2.0, "J2": 200.0, "k1": 1000.0, "k2": 1500.0, "c1": 0.1, "c2": 0.05}
     found = dt.point("cardan", "floquet", **data, speed=300.0, angle=18.0)
