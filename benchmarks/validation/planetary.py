@@ -70,7 +70,7 @@ def _row(
     mode: int, kind: str, found: float, exact: float, printed: float | None, factor: float = PRINTED_PI
 ) -> list[str]:
     shown = "-" if printed is None else f"{printed:.1f}"
-    difference = "-" if printed is None else f"{printed - factor * found:+.2f}"
+    difference = "-" if printed is None else f"{printed - factor * found:+z.2f}"
     return [str(mode), kind, f"{found:.3f}", f"{exact:.3f}", shown, f"{factor * found:.3f}", difference]
 
 
