@@ -151,6 +151,7 @@ def _attractors(dataset: xr.Dataset) -> tuple[xr.DataArray, list[str]]:
     """The attractors by falling share: number of each point's, and what distinguishes them."""
     known = (dataset["outcome"] < FIRST_FAILURE).values
     multiple, high = dataset["period_multiple"].values, dataset["u_max"].values
+    units = dataset["u_max"].attrs.get("units", "")
     # All non-periodic motions are taken for one attractor.
     level = np.where(multiple > 0, np.log(np.abs(np.where(known, high, 1.0)) + 1e-300) / _SAME, 0.0)
     keys = [(int(m), round(float(x))) for m, x in zip(multiple[known], level[known], strict=True)]
@@ -165,7 +166,7 @@ def _attractors(dataset: xr.Dataset) -> tuple[xr.DataArray, list[str]]:
         first = int(np.flatnonzero(merged == kind)[0])
         m = keys[first][0]
         size = high[known][first]
-        names.append(f"period {m}, largest u {size:.4g}" if m else "non-periodic")
+        names.append(f"period {m}, largest u {size:.4g} {units}".rstrip() if m else "non-periodic")
     codes[known] = flat
     return dataset["outcome"].copy(data=codes), names
 

@@ -95,8 +95,10 @@ def test_motions_have_letters_since_their_numbers_are_not_those_of_the_file():
 def test_basins_show_the_share_of_every_attractor():
     high = np.array([[0.5, 0.5, 0.7], [0.5, 0.7 * (1 + 1e-7), 0.5]])
     axes = {"u0": [-1.0, 1.0], "v0": [-1.0, 0.0, 1.0]}
-    figure = plot(result(axes, u_max=high, period_multiple=np.ones((2, 3), int)))
-    assert labels(figure) == ["period 1, largest u 0.5: 66.7%", "period 1, largest u 0.7: 33.3%"]
+    dataset = result(axes, u_max=high, period_multiple=np.ones((2, 3), int))
+    dataset["u_max"].attrs["units"] = "m"
+    figure = plot(dataset)
+    assert labels(figure) == ["period 1, largest u 0.5 m: 66.7%", "period 1, largest u 0.7 m: 33.3%"]
 
 
 def test_curves_mark_what_is_not_periodic():
