@@ -242,6 +242,16 @@ def test_few_planets(n):
         assert (line[still] < 1e-6).all()
 
 
+def test_a_planet_without_bearing_turns_no_frequency():
+    """The bidiagonal form has exact zeros, and entries of nothing but what stands for them."""
+    angles = np.linspace(0, 3, 301)[:, None]
+    ds = run_angles(angles, ["natural_frequency", "natural_frequency_error"], k_p=0.0)
+    exact = np.array(exact_frequencies(TABLE_2 | {"planet_angle": (0.0,), "k_p": 0.0}))
+    moving = exact > 1e-9 * exact[-1]
+    np.testing.assert_allclose(ds.natural_frequency.values[:, moving], exact[moving] + 0 * angles, rtol=1e-12)
+    assert (ds.outcome.values == 0).all()
+
+
 def test_coincident_planets_and_no_stiffness_at_all():
     angles = np.array([[0.3, 0.3, 0.3, 2.0], [0.3, 0.3, 0.3, 0.3], [0, 0.5, 2.0, 3.0]])
     found = run_angles(angles, ["natural_frequency"]).natural_frequency.values

@@ -14,7 +14,13 @@ from benchmarks.planetary_reference import case_parameters
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
 from drivetrain_jax.analysis.numerics.lanes import in_blocks
 from drivetrain_jax.analysis.numerics.linear_algebra import looped_matmul
-from drivetrain_jax.analysis.numerics.singular_values import EPS, bidiagonal_form, bidiagonal_values, singular_values
+from drivetrain_jax.analysis.numerics.singular_values import (
+    EPS,
+    _rotation,
+    bidiagonal_form,
+    bidiagonal_values,
+    singular_values,
+)
 from drivetrain_jax.analysis.numerics.singular_vectors import jacobi_vectors
 from drivetrain_jax.analysis.spectra.tracking import follow
 from drivetrain_jax.systems import get_system
@@ -56,6 +62,14 @@ def test_values(solved, matrices):
     assert found.all()
     assert (np.diff(values, axis=0) >= 0).all()
     assert (np.abs(values - exact) <= 30 * EPS * exact[-1]).all()
+
+
+def test_rotations_are_orthogonal_however_small_the_numbers():
+    f, g = np.meshgrid(*2 * (np.concatenate([[0.0], np.logspace(-307, 150, 2000)]),))
+    c, s, r = (np.asarray(x) for x in jax.jit(_rotation)(f, g))
+    assert np.abs(c**2 + s**2 - 1).max() < 8 * EPS
+    allowed = 8 * EPS * np.hypot(f, g) + 2e-140
+    assert (np.abs(c * f + s * g - r) <= allowed).all() and (np.abs(c * g - s * f) <= allowed).all()
 
 
 @pytest.mark.parametrize("few", [False, True], ids=["optimised", "few"])

@@ -19,6 +19,8 @@ from drivetrain_jax.analysis.numerics.lanes import evaluated_once
 EPS = float(np.finfo(float).eps)
 # Matrices are scaled to entries of order one; what is smaller than these has no influence on any digit.
 _TINY, _TINY_SQUARE = 1e-150, 1e-300
+# Of off-diagonal entries, this is taken for nothing; squares of what is larger do not vanish.
+_NEGLIGIBLE = 1e-140
 # QR sweeps per singular value: less than two are needed on average, LAPACK allows six per value and column.
 _SWEEPS_PER_VALUE = 12
 # Each stage of the reduction works on the rows and columns that the ones before have left.
@@ -144,10 +146,14 @@ def _smaller_value(f: Array, g: Array, h: Array) -> Array:
 
 
 def _rotation(f: Array, g: Array) -> tuple[Array, Array, Array]:
-    """``c``, ``s`` and ``r`` with [c, s; -s, c] (f, g) = (r, 0); the identity if both vanish."""
-    square = f * f + g * g + _TINY_SQUARE
-    inverse = lax.rsqrt(square)
-    return (f + _TINY) * inverse, g * inverse, square * inverse
+    """``c``, ``s`` and ``r`` with [c, s; -s, c] (f, g) = (r, 0); the identity where both are negligible.
+
+    Orthogonal in any case: it turns other numbers, too, which are not.
+    """
+    square = f * f + g * g
+    some = square > _NEGLIGIBLE**2
+    inverse = lax.rsqrt(jnp.where(some, square, 1.0))
+    return jnp.where(some, f * inverse, 1.0), jnp.where(some, g * inverse, 0.0), jnp.where(some, square * inverse, f)
 
 
 def _split(pairs: Array) -> tuple[Array, Array, Array]:
@@ -156,7 +162,7 @@ def _split(pairs: Array) -> tuple[Array, Array, Array]:
     Row ``j`` of ``pairs`` (n + 1, 2, N) holds the upper entry above the diagonal entry ``j``, and that entry.
     """
     upper, diagonal = pairs[1:, 0], jnp.abs(pairs[:, 1])
-    coupled = jnp.abs(upper) > EPS * (diagonal[:-1] + diagonal[1:])
+    coupled = jnp.abs(upper) > EPS * (diagonal[:-1] + diagonal[1:]) + _NEGLIGIBLE
     # Row by row: a reduction over the rows would not vectorise over the lanes.
     last = first = jnp.zeros(pairs.shape[-1], int)
     for row in range(1, len(coupled) + 1):
