@@ -38,7 +38,7 @@ def _direct_solvers(system: System, request: Request) -> tuple[Solver, ...]:
         rtol,
         rtol / 4,
         lambda model: model.reduced,
-        lambda model, z: results(z, request.outputs, rtol, model.natural.span),
+        lambda model, z: results(z, request.outputs, rtol, model.natural),
         stiff=lambda model: model.stiff or model.reduced,
     )
 
@@ -66,7 +66,7 @@ def _diffrax_solvers(system: System, request: Request) -> tuple[Solver, ...]:
         fine, success = propagate(rtol / 10)
         coarse, success_coarse = propagate(rtol) if needs_error else (fine, success)
         z = compare(form, coarse, fine, jnp.zeros(()), 0.0, rtol, _REDUCTION)
-        found = results(z, request.outputs, rtol, form.span)
+        found = results(z, request.outputs, rtol, form)
         failed = ~(success & success_coarse)
         return found | {"outcome": jnp.where(failed, jnp.int8(Outcome.STEP_LIMIT), found["outcome"])}
 

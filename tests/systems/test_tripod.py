@@ -161,6 +161,21 @@ def test_exponents_need_a_time_in_seconds():
         load_scene(scene)
 
 
+@pytest.mark.parametrize("method", ["direct", "diffrax"])
+def test_both_exponents_of_a_strongly_damped_element(method):
+    zetas = np.array([0.5, 1.5, 5.0, 10.0, 100.0])
+    scene = {"system": "tripod", "analysis": "floquet", "outputs": ["floquet_exponent", "floquet_multiplier"]}
+    fixed = {"element": "input", "beta": NINE_DEGREES, "chi_n": 0.0}
+    ds = dt.run({**scene, "points": {"zeta": zetas.tolist()}, "fixed": fixed, "options": {"method": method}})
+    frequency = float(tripod.element_of(INPUT).frequency)
+    root = np.sqrt(zetas[1:] ** 2 - 1)
+    slow = np.append(-0.5, -1 / (zetas[1:] + root)) * frequency
+    fast = np.append(-0.5, -(zetas[1:] + root)) * frequency
+    np.testing.assert_allclose(ds.floquet_exponent, np.stack([slow, fast], axis=1), rtol=1e-8)
+    determinant = np.exp((slow + fast) * math.pi / frequency)
+    np.testing.assert_allclose(np.prod(ds.floquet_multiplier[:4], axis=1), determinant[:4], rtol=1e-8)
+
+
 def test_equation_may_be_a_number():
     fixed = {"element": "input", "beta": 0.1, "zeta": 0.01, "equation": 29}
     assert load_scene({"system": "tripod", "analysis": "floquet", "fixed": fixed}).fixed["equation"] == "29"

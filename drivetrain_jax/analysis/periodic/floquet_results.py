@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+import math
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +19,7 @@ from drivetrain_jax.analysis.periodic.radius import (
     radius_by_eigenvalues,
     radius_in_closed_form,
 )
-from drivetrain_jax.systems import System
+from drivetrain_jax.systems import LinearPeriodic, System
 
 VARIABLES = (
     Variable("floquet_multiplier", "1", "Floquet multiplier over one period", ("multiplier",), "complex128"),
@@ -43,14 +43,25 @@ def lacks(system: System) -> dict[str, str]:
     return {"floquet_exponent": f"a rate in 1/s, and the time of {system.name} has no unit"}
 
 
+def _with_product(multipliers: Array, logarithms: Array, log_product: Array) -> tuple[Array, Array]:
+    """Two multipliers and the logarithms of their moduli, the second ones from those of the product.
+
+    As an eigenvalue the smaller one has the absolute error of the larger one: with strong damping it is nothing but that.
+    """
+    apart = logarithms[0] - logarithms[1] > math.log(2)
+    second = jnp.where(apart, jnp.exp(log_product) / multipliers[0], multipliers[1])
+    other = jnp.where(apart, log_product - logarithms[0], logarithms[1])
+    return jnp.stack([multipliers[0], second]), jnp.stack([logarithms[0], other])
+
+
 def results(
     z: Monodromy,
     outputs: tuple[str, ...],
     rtol: float,
-    period: Any,
+    system: LinearPeriodic,
     spectrum: Spectrum | None = None,
 ) -> dict[str, Array]:
-    """The requested variables and the outcome from a monodromy matrix with trailing batch axes.
+    """The requested variables and the outcome from a monodromy matrix of ``system`` with trailing batch axes.
 
     ``spectrum``: real and imaginary parts of the eigenvalues of ``z.matrix`` where they are known already. Otherwise the
     spectral radius of four states is found in closed form, and by eigenvalues only where that says too little.
@@ -66,8 +77,11 @@ def results(
     if wanted & MULTIPLIERS:
         real, imaginary = spectrum = eigen()
         multipliers = jnp.where(finite, sort_multipliers(real, imaginary), jnp.nan)
+        logarithms = jnp.log(jnp.abs(multipliers))
+        if len(multipliers) == 2 and system.log_determinant is not None:
+            multipliers, logarithms = _with_product(multipliers, logarithms, system.log_determinant() - 2 * z.log_scale)
         found["floquet_multiplier"] = multipliers * size
-        found["floquet_exponent"] = (jnp.log(jnp.abs(multipliers)) + z.log_scale) / period
+        found["floquet_exponent"] = (logarithms + z.log_scale) / system.span
     if spectrum is None and has_closed_form(z.matrix):
         rho, error = radius_in_closed_form(z.matrix, z.error, size, 10 * rtol)
     else:
