@@ -75,13 +75,13 @@ def test_the_exact_branch_has_the_saddles_between_folds(exact):
 def test_a_direction_without_a_motion_is_called_absent_and_the_other_one_kept():
     """Without a mean torque nothing holds the mass within the play: what the sweep down meets there attracts nothing."""
     fixed = {"B0": 0.0, "B1": 0.03, "b": 0.05, "alpha": 0.0, "c": 0.05, "k": 1.0, "I": 1.0}
-    axes = {"omega": {"start": 0.7, "stop": 1.0, "num": 7}}
+    axes = {"omega": {"start": 0.7, "stop": 0.9, "num": 5}}
     outputs = ["u_max", "stability"]
     found = dt.run(
         {"system": "rattle", "analysis": "frequency_response", "axes": axes, "fixed": fixed, "outputs": outputs}
     )
     known = found["u_max"].notnull().values
-    assert known.sum(axis=0).tolist() == [6, 2]
+    assert known.sum(axis=0).tolist() == [5, 2]
     np.testing.assert_array_equal(found["stability"].values, np.where(known, 0, 2))
     np.testing.assert_array_equal(found["outcome"].values, np.where(known.all(axis=1), 0, Outcome.NOT_CONVERGED))
 

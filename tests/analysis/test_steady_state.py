@@ -1,6 +1,7 @@
 """Attractors, their measures, and the branches and special points of exact orbits, against the reference values."""
 
 import json
+import math
 from pathlib import Path
 
 import jax
@@ -209,6 +210,47 @@ def test_a_motion_without_a_fundamental_has_no_phase(steady):
     assert np.isnan(none["phase"]).all() and np.all(none["outcome"] == Outcome.SUCCESS)
     lag = np.arctan2(TABLE1["c"] * omegas, 1 - omegas**2)
     np.testing.assert_allclose(some["phase"], lag, atol=1e-3)
+
+
+GENTLE = {"omega": 1.35, "B0": 0.25, "b": 1.0, "c": 0.02, "alpha": 0.25, "k": 1.0, "I": 1.0}
+
+
+@pytest.mark.parametrize(("drive", "above"), [(1e-5, 4.7868552319e-5), (1e-6, 4.786855232e-6), (1e-7, 4.78685528e-7)])
+def test_a_flank_is_passed_however_gently(drive, above):
+    """About a rest on the flank motions are alike at any scale (Taylor series with 64 bits)."""
+    found = dt.point(
+        "rattle", "steady_state", **GENTLE, B1=drive, u0=1 + 2 * drive, outputs=["u_max", "spectral_radius"]
+    )
+    assert found.outcome == Outcome.SUCCESS
+    assert found.u_max - 1 == pytest.approx(above, rel=1e-7, abs=0)
+    assert found.spectral_radius == pytest.approx(0.91111675664, abs=1e-9)
+
+
+def test_a_motion_far_smaller_than_the_gap_has_its_extremes():
+    outputs = ["u_max", "u_min", "u_rms"]
+    found = dt.point(
+        "rattle", "steady_state", **GENTLE | {"omega": 0.7, "B0": 0.0, "c": 0.1}, B1=1e-16, outputs=outputs
+    )
+    exact = 1e-16 / math.hypot(0.25 - 0.49, 0.07)
+    assert [found.u_max, found.u_min] == pytest.approx([exact, -exact], rel=1e-10, abs=0)
+    assert found.u_rms == pytest.approx(exact / math.sqrt(2), rel=1e-10, abs=0)
+
+
+def test_the_transition_matrix_changes_at_the_flank_and_not_at_the_end_of_a_step():
+    """Stiff contacts after long flights, of which each multiplies what a step is late (128-bit Taylor series)."""
+    stiff = {"omega": 0.16774254954145118, "B0": 0.6614757353230992, "B1": 2.8471279515012524, "b": 2.034211854040951}
+    stiff |= {"c": 0.12066008631247528, "alpha": 0.0, "k": 6027.824857365027, "I": 0.14705915661446092}
+    start = {"u0": 0.4651093238943746, "v0": 0.9787693424178078}
+    found = dt.point("rattle", "steady_state", **stiff, **start, outputs=["spectral_radius"])
+    assert found.spectral_radius == pytest.approx(0.41481220923, abs=7e-8)
+
+
+def test_a_slow_drive_without_a_spring_in_the_gap_owns_up_to_its_rounding():
+    """The response that is taken off is 3e5 times the motion (integrated by Taylor series with 64 bits)."""
+    slow = {"omega": 5e-5, "B0": 0.01, "B1": 0.03, "b": math.pi / 18, "c": 1e-3, "alpha": 0.0, "k": 1.0, "I": 1.0}
+    found = dt.point("rattle", "steady_state", **slow, most_periods=64, outputs=["u_rms", "state_error"])
+    assert abs(found.u_rms - 0.1941257696104358) < found.state_error < 1e-8
+    assert found.outcome == Outcome.TOLERANCE_NOT_MET
 
 
 @pytest.mark.parametrize("outputs", [["impacts"], ["impacts", "u_rms"]])

@@ -37,7 +37,15 @@ from drivetrain_jax.analysis.impacts.attractor_lanes import (
     settle,
     try_line,
 )
-from drivetrain_jax.analysis.impacts.piecewise_march import Lanes, few_steps, prepare, usual_steps
+from drivetrain_jax.analysis.impacts.piecewise_march import (
+    Lanes,
+    Motion,
+    few_steps,
+    locate,
+    prepare,
+    stays,
+    usual_steps,
+)
 from drivetrain_jax.analysis.impacts.plane_map import Matrix, newton_correction
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
@@ -98,7 +106,9 @@ def _usual_speed(local: PiecewiseLinearOscillator) -> Array:
     return local.omega * local.b + drive * (1 / local.omega + 1 / jnp.sqrt(local.stiffness))
 
 
-def _shoot(lane: Lane, now: Array, local: PiecewiseLinearOscillator, omega: Array) -> tuple[Lane, _Verdict]:
+def _shoot(
+    lane: Lane, now: Array, local: PiecewiseLinearOscillator, lanes: Lanes, omega: Array
+) -> tuple[Lane, _Verdict]:
     """One Newton correction in the lanes ``now``, and what it shows."""
     motion, (u, v) = lane.motion, lane.guess
     first = select(lane.corrections == 0, (motion.u, motion.v), lane.first)
@@ -113,7 +123,8 @@ def _shoot(lane: Lane, now: Array, local: PiecewiseLinearOscillator, omega: Arra
     # Rounding of the state after m periods, in u and v, as it acts on the u of the orbit.
     by_u, by_v = (newton_correction(motion.matrix, 1.0 - k + 0 * u, k * omega)[0] for k in (0.0, 1.0))
     inverse = jnp.abs(by_u) + jnp.abs(by_v)
-    error = change + 32 * _EPS * size * (1 + inverse) * jnp.sqrt(motion.steps.astype(float))
+    rounding = 32 * size * jnp.sqrt(motion.steps.astype(float)) + 2 * _taken_off(lanes, motion)
+    error = change + _EPS * rounding * (1 + inverse)
     orbit = Orbit(*guess, motion.matrix, -local.damping * lane.multiple * 2 * np.pi / omega, error)
     stable = now & converged & attracts(orbit)
     slow = stable & creeps(orbit, lane.latest, omega) & ~obeys(orbit, lane.latest, first, omega)[0]
@@ -122,6 +133,13 @@ def _shoot(lane: Lane, now: Array, local: PiecewiseLinearOscillator, omega: Arra
     )
     lane = restart(select(going, corrected, lane), going, *guess, lane.multiple)
     return lane, _Verdict(stable & ~slow, slow, orbit, now & ~going & ~stable)
+
+
+def _taken_off(lanes: Lanes, motion: Motion) -> Array:
+    """The largest harmonic response that is taken off the displacement on the way: a step is as exact as that."""
+    here = locate(lanes, motion.u)
+    own, contact, gap = (jnp.hypot(piece.cosine, piece.sine) for piece in (here.region, lanes.contact, lanes.gap))
+    return jnp.where(stays(lanes, here, motion), own, jnp.maximum(contact, gap))
 
 
 class _Work(NamedTuple):
@@ -180,7 +198,7 @@ def _tick(task: _Task, work: _Work) -> _Work:
     broken = ~jnp.isfinite(lane.motion.u) | (lane.motion.steps > _most_steps(lane, lanes))
     ready = working & ((lane.motion.left <= 0) | broken)
     shot, probed = (ready & lane.searching & ~broken & (on == (lane.probing >= 0)) for on in (False, True))
-    after, verdict = _shoot(lane, shot, local, omega)
+    after, verdict = _shoot(lane, shot, local, lanes, omega)
     settles = ready & ~lane.searching & ~broken
     after = settle(after, settles, task.most_periods // 4, omega)
     after, reached = confirm(after, settles, history, omega)

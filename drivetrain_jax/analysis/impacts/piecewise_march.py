@@ -3,7 +3,8 @@
 Each pass of the loop advances every lane by one exact step (:mod:`~drivetrain_jax.analysis.impacts.piecewise_flow`) that is
 certain to stay within its linear region. Steps therefore shrink towards a flank like Newton iterates and can neither
 miss a crossing nor hang on a grazing contact: a least step carries the lane over the flank once it is nearer than that.
-The excess, 1e-12 of the shortest time scale, changes the velocity by 1e-24 of itself, as the force is continuous.
+The excess, 1e-12 of the shortest time scale, changes the velocity by 1e-24 of itself, as the force is continuous. The
+transition matrix, which it changes by 1e-12, is corrected for it.
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ _LEAST_STEP, _LEAST_PART = 1e-12, 1e-15
 # Longest step, as a phase of the drive.
 _LONGEST_PHASE = 1.5
 _LIKELY_ARC = 2.5
-# A lane that moves by less than so many half backlashes in such a part of its own motion is at rest.
-_AT_REST, _RESTING_ARC = 3e-17, 0.1
+# So near to a flank, in half backlashes, a lane is taken over it; one that rests there moves on by such a part of its own
+# motion.
+_ON_FLANK, _RESTING_ARC = 4e-16, 0.1
 _FEW = 8
 
 
@@ -144,6 +146,17 @@ def flank_bounds(lanes: Lanes, side: Array, motion: Motion, rate: Derivatives) -
     )
 
 
+def _overdue(lanes: Lanes, here: Here, u: Array, v: Array, d: Array) -> Array:
+    """How long a step of length ``d`` that has ended in ``(u, v)`` has stayed in contact in truth where the region ``here``
+    is the gap; less than 0 the other way round."""
+    over = jnp.abs(u) - lanes.flank
+    # A lane that is turned back at the flank may be over it for all of the step; one that rests there is not.
+    late = jnp.minimum(jnp.abs(over) / jnp.maximum(jnp.abs(v), 1e-300), d)
+    late = jnp.where(jnp.abs(over) > _ON_FLANK * lanes.flank, late, 0.0)
+    left = (jnp.abs(here.side) == 1) & (over < 0)
+    return jnp.where((here.side == 0) & (over > 0), late, jnp.where(left, -late, 0.0))
+
+
 def advance(lanes: Lanes, here: Here, motion: Motion, d: Array) -> Motion:
     """``motion`` after the time ``d``, all of it in the region ``here``; a period that ends is counted."""
     region, omega = here.region, lanes.omega
@@ -158,7 +171,14 @@ def advance(lanes: Lanes, here: Here, motion: Motion, d: Array) -> Motion:
     v = rate * y + impulse * pull + omega * (region.sine * cosine - region.cosine * sine)
     m11, m12, m21, m22 = motion.matrix
     p11, p21 = 1 - region.stiffness * step, -region.stiffness * impulse
-    matrix = (p11 * m11 + impulse * m21, p11 * m12 + impulse * m22, p21 * m11 + rate * m21, p21 * m12 + rate * m22)
+    m11, m12, m21, m22 = (
+        p11 * m11 + impulse * m21,
+        p11 * m12 + impulse * m22,
+        p21 * m11 + rate * m21,
+        p21 * m12 + rate * m22,
+    )
+    turned = _overdue(lanes, here, u, v, d) * (lanes.contact.stiffness - lanes.gap.stiffness)
+    matrix = m11, m12, m21 - turned * m11, m22 - turned * m12
     return Motion(time, cosine, sine, u, v, matrix, motion.left - ends, motion.steps + 1)
 
 
@@ -182,10 +202,14 @@ def stays(lanes: Lanes, here: Here, motion: Motion) -> Array:
 
 
 def least_step(lanes: Lanes, here: Here, motion: Motion, rate: Derivatives) -> Array:
-    """The step that is taken whatever lies ahead; a longer one where the lane rests within rounding, as on a flank."""
-    d = _RESTING_ARC / jnp.maximum(here.region.rate, 1e-300)
-    way = d * (jnp.abs(motion.v) + d * (jnp.abs(rate.acceleration) / 2 + d * rate.jerk_bound / 6))
-    return jnp.where(way <= _AT_REST * lanes.flank, jnp.maximum(d, lanes.least), lanes.least)
+    """The step that is taken whatever lies ahead. On a flank, as far as rounding can tell, it is long enough to leave it,
+    however slow the lane: it would stand still there for ever."""
+    way = jnp.maximum(_ON_FLANK * jnp.abs(lanes.flank), 1e-300)
+    longest = _RESTING_ARC / jnp.maximum(here.region.rate, 1e-300)
+    pull = jnp.abs(rate.acceleration) + longest * rate.jerk_bound
+    leaving = longest / (1 + longest * (jnp.abs(motion.v) / way + jnp.sqrt(pull / way)))
+    on_flank = jnp.abs(jnp.abs(motion.u) - lanes.flank) <= way
+    return jnp.where(on_flank, jnp.maximum(leaving, lanes.least), lanes.least)
 
 
 def next_step(lanes: Lanes, here: Here, motion: Motion) -> Array:
