@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivetrain_jax.analysis.chaos.growth import SEGMENTS, block_mean, record_growth
+from drivetrain_jax.analysis.chaos.growth import SEGMENTS, block_mean, drift, record_growth
 from drivetrain_jax.analysis.chaos.variational import one_kernel
 from drivetrain_jax.analysis.lyapunov import spectrum_of, sum_rule_residual
 from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, stored, suits_one_kernel
@@ -47,6 +47,26 @@ def test_transient_is_discarded():
     series = np.where(np.arange(SEGMENTS) < SEGMENTS // 4, 100.0, 1.0)[:, None]
     mean, error = mean_and_error(series)
     assert (mean[0], error[0]) == (1.0 / SPAN, 0.0)
+
+
+def test_growth_in_proportion_to_time_is_within_its_error():
+    """Its exponent is zero, the mean over the last three quarters ln 4/(0.75 T): five standard errors of blocks."""
+    edges = np.log(np.arange(SEGMENTS + 1.0).clip(0.5))
+    mean, error = mean_and_error(np.diff(edges)[:, None])
+    time = SEGMENTS * SPAN
+    assert mean[0] * time == pytest.approx(math.log(4) / 0.75, rel=1e-12)
+    assert error[0] * time == pytest.approx(1.085, abs=0.01)
+
+
+def test_a_drift_is_told_from_scatter():
+    """Independent segments have none of 99 in 100 cases; of a change by ten of its own standard errors most is found."""
+    series = np.random.default_rng(3).standard_normal((SEGMENTS, 4000)) / math.sqrt(48) / SPAN
+    means = series[SEGMENTS // 4 :].reshape(12, 4, -1).mean(axis=1)
+    found = np.asarray(drift(jnp.asarray(means)))
+    assert (found == 0).mean() > 0.99
+    change = 10 * means.std() / math.sqrt(3)
+    stepped = np.asarray(drift(jnp.asarray(means + change * (np.arange(12) < 6)[:, None])))
+    assert 0.6 * change < np.median(stepped) < change
 
 
 def damped(max_time: float, lanes: int = 4):

@@ -32,6 +32,8 @@ SEGMENTS = 64
 _CHECKS = (SEGMENTS // 4, SEGMENTS // 2, SEGMENTS)
 # The first quarter of what has been recorded is transient; the rest is judged in blocks.
 _DISCARD, BLOCKS = 4, 12
+# A change between the halves of so many standard errors of its own is no scatter of the blocks.
+_DRIFTS = 5.0
 # A decaying motion is followed until its transient has fallen by e to this power.
 SETTLED = 12.0
 # A component that exceeds this has left.
@@ -169,7 +171,7 @@ def block_mean(series: Array, used: Array, span: Array) -> tuple[Array, Array]:
     """Mean rate of ``series`` (per segment) after the transient and its standard error, both ``(m, ...)``.
 
     The first quarter of the ``used`` segments is discarded. The rest makes 12 blocks; the error is the larger one of
-    those of 12 and of 6 block means, so that correlation from block to block and a drift both enlarge it.
+    those of 12 and of 6 block means, so that correlation from block to block enlarges it, together with the drift.
     """
     index = jnp.arange(SEGMENTS).reshape(-1, *(1,) * (series.ndim - 1))
     first = used // _DISCARD
@@ -178,7 +180,19 @@ def block_mean(series: Array, used: Array, span: Array) -> tuple[Array, Array]:
     means = jnp.stack([jnp.sum(jnp.where(block == b, series, 0.0), axis=0) for b in range(BLOCKS)]) / (size * span)
     pairs = means.reshape(BLOCKS // 2, 2, *means.shape[1:]).mean(axis=1)
     errors = [jnp.std(m, axis=0, ddof=1) / jnp.sqrt(m.shape[0]) for m in (means, pairs)]
-    return jnp.mean(means, axis=0), jnp.maximum(*errors)
+    return jnp.mean(means, axis=0), jnp.hypot(jnp.maximum(*errors), drift(means))
+
+
+def drift(means: Array) -> Array:
+    """Change from the first half of the block means to the second, without what their scatter from block to block explains.
+
+    Of a vector that grows in proportion to time the rates fall like 1/t, far from their limit by more than they scatter.
+    """
+    half = BLOCKS // 2
+    change = jnp.mean(means[:half], axis=0) - jnp.mean(means[half:], axis=0)
+    # A drift hardly changes neighbours: half the mean square of their differences is the variance of a single block.
+    chance = jnp.mean(jnp.diff(means, axis=0) ** 2, axis=0) / half
+    return jnp.sqrt(jnp.maximum(change**2 - _DRIFTS**2 * chance, 0.0))
 
 
 def running_mean(series: Array, used: Array, span: Array) -> Array:
