@@ -3,9 +3,11 @@
 Exponents in natural logarithms per second, in falling order; phases of the flow are left out (their exponents are zero
 whatever happens). The paper's own estimator is offered beside them under its own name.
 
-Outcome: ``SUCCESS``, or ``TOLERANCE_NOT_MET`` if the standard error is above the target at ``max_time``. A motion that
-leaves all bounds is data: its verdict says so, and its exponents are those of the time before, without an error (NaN).
-``NOT_FINITE`` if it leaves so soon that there are none, ``STEP_LIMIT`` where ``max_time`` is more than 1e12 steps.
+Outcome: ``SUCCESS``, or ``TOLERANCE_NOT_MET`` if the standard error is above the target at ``max_time`` or ``steps`` are
+too few for the motion: the exponents do not add up to the mean divergence, or a positive one is another with half the
+steps. The verdict is ``undecided`` then. A motion that leaves all bounds is data: its verdict says so, and its exponents are
+those of the time before, without an error (NaN). ``NOT_FINITE`` if it leaves so soon that there are none, ``STEP_LIMIT``
+where ``max_time`` is more than 1e12 steps.
 """
 
 from __future__ import annotations
@@ -34,9 +36,10 @@ from drivetrain_jax.analysis.chaos.growth import (
     state_size,
 )
 from drivetrain_jax.analysis.chaos.paper_estimator import paper_estimator
+from drivetrain_jax.analysis.chaos.resolution import STANDARD_ERRORS, resolved
 from drivetrain_jax.analysis.chaos.section_measures import period_multiple
 from drivetrain_jax.analysis.chaos.variational import batch_shape, divergence, initial_state
-from drivetrain_jax.analysis.chaos.verdict import STANDARD_ERRORS, Evidence, Verdict, grows, judge
+from drivetrain_jax.analysis.chaos.verdict import Evidence, Verdict, grows, judge
 from drivetrain_jax.analysis.chaos.zero_one_test import largest_k01
 from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.systems import Flow, System
@@ -90,44 +93,47 @@ class Spectrum(NamedTuple):
 
 def spectrum_of(record: Record) -> Spectrum:
     """Exponents after the transient. Of a motion that left: means over what there is, errors NaN."""
-    values, errors = block_mean(record.growth, record.used, record.span)
-    partial_mean = running_mean(record.growth, record.used, record.span)
-    last = jnp.arange(SEGMENTS).reshape(-1, *(1,) * values.ndim) == record.used - 1
-    until = jnp.sum(jnp.where(last, partial_mean, 0.0), axis=0)
-    until = jnp.where(record.used > 0, until, jnp.nan)
-    values = jnp.where(record.bounded, values, until)
-    errors = jnp.where(record.bounded, errors, jnp.nan)
+    values, errors = mean_rate(record, record.growth)
     order = jnp.argsort(-values, axis=0)
     return Spectrum(*(jnp.take_along_axis(x, order, axis=0) for x in (values, errors)), order)
 
 
+def mean_rate(record: Record, series: Array) -> tuple[Array, Array]:
+    """Mean rate of ``series`` (SEGMENTS, m, ...) after the transient and its error. Of a motion that left: before, NaN."""
+    values, errors = block_mean(series, record.used, record.span)
+    partial_mean = running_mean(series, record.used, record.span)
+    last = jnp.arange(SEGMENTS).reshape(-1, *(1,) * values.ndim) == record.used - 1
+    until = jnp.sum(jnp.where(last, partial_mean, 0.0), axis=0)
+    until = jnp.where(record.used > 0, until, jnp.nan)
+    return jnp.where(record.bounded, values, until), jnp.where(record.bounded, errors, jnp.nan)
+
+
 def sum_rule_residual(record: Record, spectrum: Spectrum) -> Array:
     """Sum of the exponents minus the divergence averaged over the same time; the phases add nothing to either."""
-    mean, _ = block_mean(record.contraction[:, None], record.used, record.span)
-    return jnp.where(record.bounded, jnp.sum(spectrum.values, axis=0) - mean[0], jnp.nan)
+    mean, _ = mean_rate(record, record.contraction[:, None])
+    return jnp.sum(spectrum.values, axis=0) - mean[0]
 
 
 class Run(NamedTuple):
-    """Records with the step and with twice the step (the latter only where it was asked for)."""
+    """Records with the step and with twice the step (empty where that was not needed)."""
 
     fine: Record
     coarse: Record
 
 
-def run_twice(flow: Flow, steps: int, max_time: float, target: float, check: bool | None) -> Run:
-    """The growth with ``steps`` and ``steps // 2`` per strobe; ``check``: run the latter always, never, or (None) for
-    members whose largest exponent is positive beyond its error. One compiled loop serves both."""
+def run_twice(flow: Flow, steps: int, max_time: float, target: float, check: bool) -> Run:
+    """The growth with ``steps`` and ``steps // 2`` per strobe; ``check``: the latter of all members, otherwise of those
+    whose largest exponent is positive beyond its error. One compiled loop serves both."""
 
     def one(active: Array, steps: Array) -> tuple[Array, Record]:
         record = record_growth(flow, steps, max_time, target, active)
         found = spectrum_of(record)
         candidate = record.bounded & (found.values[0] > STANDARD_ERRORS * found.errors[0])
-        return candidate if check is None else jnp.full_like(candidate, check), record
+        return candidate | check, record
 
     start = jnp.ones(batch_shape(flow), bool)
-    count = 1 if check is False else 2
-    _, both = jax.lax.scan(one, start, jnp.array([steps, max(steps // 2, 1)][:count]))
-    return Run(*(jax.tree.map(lambda x, i=i: x[i], both) for i in (0, count - 1)))
+    _, both = jax.lax.scan(one, start, jnp.array([steps, max(steps // 2, 1)]))
+    return Run(*(jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1)))
 
 
 class Sampling(NamedTuple):
@@ -207,13 +213,31 @@ def repetition(section: Array, left: Array) -> tuple[Array, Array]:
     return strict, (strict == loose) & ((strict > 0) | (left < _UNSETTLED))
 
 
-def evidence_of(run: Run, spectrum: Spectrum, residual: Array, seen: Sampling) -> Evidence:
+class Findings(NamedTuple):
+    """What a run gives: the spectrum, that with twice the step where it was run, the residual of the sum rule, and whether
+    the steps resolve the motion."""
+
+    spectrum: Spectrum
+    coarse: Spectrum
+    residual: Array
+    resolved: Array
+
+
+def findings_of(run: Run, period: Any) -> Findings:
+    """The results of both marches, judged by each other."""
+    spectrum, coarse = spectrum_of(run.fine), spectrum_of(run.coarse)
+    residual = sum_rule_residual(run.fine, spectrum)
+    sound = resolved(spectrum.values, spectrum.errors, residual, period, coarse.values[0], coarse.errors[0])
+    return Findings(spectrum, coarse, residual, sound)
+
+
+def evidence_of(fine: Record, found: Findings, seen: Sampling) -> Evidence:
     """What :func:`judge` asks for."""
-    fine, coarse = run.fine, spectrum_of(run.coarse)
+    spectrum, coarse = found.spectrum, found.coarse
     growing = grows(fine.size, fine.used, fine.span, spectrum.values[0])
     return Evidence(
-        spectrum.values, spectrum.errors, coarse.values[0], coarse.errors[0], jnp.abs(residual), seen.k01,
-        fine.bounded, growing, seen.multiple, seen.settled,
+        spectrum.values, spectrum.errors, coarse.values[0], coarse.errors[0], jnp.abs(found.residual), seen.k01,
+        fine.bounded, growing, seen.multiple, seen.settled, found.resolved,
     )  # fmt: skip
 
 
@@ -233,37 +257,42 @@ def analyse(flow: Flow, request: Request) -> dict[str, Array]:
     if wanted == {"paper_estimator"}:
         finite = jnp.all(jnp.isfinite(results["paper_estimator"]), axis=0)
         return results | {"outcome": jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE).astype(jnp.int8)}
-    check = True if "step_change" in wanted else None if "verdict" in wanted else False
-    run = run_twice(flow, steps, max_time, target, check)
-    spectrum = spectrum_of(run.fine)
-    residual = sum_rule_residual(run.fine, spectrum)
-    results |= _of_spectrum(run, spectrum, residual)
+    run = run_twice(flow, steps, max_time, target, "step_change" in wanted)
+    found = findings_of(run, flow.period)
+    spectrum = found.spectrum
+    results |= _of_spectrum(run.fine, found)
     if wanted & _SECTION:
         # What nothing forces is judged by K wherever it does not decay.
         needed = spectrum.values[0] > STANDARD_ERRORS * spectrum.errors[0]
         needed = jnp.ones_like(needed) if "chaos_k01" in wanted or not flow.turns else needed
         seen = sample(flow, steps, run.fine, spectrum, needed)
-        results["verdict"] = judge(evidence_of(run, spectrum, residual, seen), autonomous=not flow.turns)
+        results["verdict"] = judge(evidence_of(run.fine, found, seen), autonomous=not flow.turns)
         # K tells nothing of a few points over and over again, nor is it asked to.
         repeating = seen.multiple > 0
         results["chaos_k01"] = jnp.where(repeating, 0.0, seen.k01)
         results["period_multiple"] = seen.multiple.astype(jnp.int32)
-    met = (target == 0) | ~run.fine.bounded | (jnp.max(spectrum.errors, axis=0) <= target)
+    results["outcome"] = _outcome(run.fine, found, target)
+    return {name: results[name] for name in (*request.outputs, "outcome")}
+
+
+def _outcome(fine: Record, found: Findings, target: float) -> Array:
+    """The outcome of every member, int8."""
+    values, errors, _ = found.spectrum
+    met = found.resolved & ((target == 0) | ~fine.bounded | (jnp.max(errors, axis=0) <= target))
     outcome = jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
-    outcome = jnp.where(jnp.all(jnp.isfinite(spectrum.values), axis=0), outcome, Outcome.NOT_FINITE)
-    return {name: results[name] for name in request.outputs} | {"outcome": outcome.astype(jnp.int8)}
+    return jnp.where(jnp.all(jnp.isfinite(values), axis=0), outcome, Outcome.NOT_FINITE).astype(jnp.int8)
 
 
-def _of_spectrum(run: Run, spectrum: Spectrum, residual: Array) -> dict[str, Array]:
+def _of_spectrum(fine: Record, found: Findings) -> dict[str, Array]:
     """Results that follow from the records of growth."""
-    fine = run.fine
+    spectrum = found.spectrum
     history = running_mean(fine.growth, fine.used, fine.span)
     return {
         "lyapunov_spectrum": spectrum.values,
         "lyapunov_standard_error": spectrum.errors,
         "lyapunov_history": jnp.take_along_axis(history, spectrum.order[None], axis=1),
-        "step_change": spectrum.values - spectrum_of(run.coarse).values,
-        "sum_rule_residual": residual,
+        "step_change": spectrum.values - found.coarse.values,
+        "sum_rule_residual": found.residual,
         "averaging_time": averaging_time(fine),
     }
 

@@ -84,7 +84,9 @@ def _rms_too_large(ds: xr.Dataset) -> xr.DataArray:
 
 
 def _sum_rule(ds: xr.Dataset) -> xr.DataArray:
-    return abs(ds["sum_rule_residual"]) > 1e-2 * abs(ds["lyapunov_spectrum"]).sum("exponent")
+    """What the steps do not resolve does not add up, and is no success."""
+    off = abs(ds["sum_rule_residual"]) > 1e-2 * abs(ds["lyapunov_spectrum"]).sum("exponent")
+    return off & (ds["outcome"] == 0)
 
 
 _DECLARED = {

@@ -140,6 +140,86 @@ def test_what_leaves_at_once_has_no_exponents():
     assert np.isnan(ours["lyapunov_spectrum"].values[1]).all() and not broken(ours)
 
 
+def tripod(points: dict, outputs: tuple = OUTPUTS[:4], fixed: dict | None = None, **options):
+    """Points of the input element, unless ``fixed`` says otherwise."""
+    scene = {"system": "tripod", "analysis": "lyapunov", "outputs": list(outputs), "points": points, "options": options}
+    return dt.run(scene | {"fixed": {"element": "input", "beta": 0.157} | (fixed or {})})
+
+
+# Excitation frequency [Hz] and damping ratio; the sum of the exponents, a closed form (chi_n is 0.0026), and the outcome.
+_UNRESOLVED = (
+    (33.0, 0.0016, -30.83, Outcome.TOLERANCE_NOT_MET),  # the steps feed the oscillation until it leaves
+    (36.0, 0.0016, -30.83, Outcome.TOLERANCE_NOT_MET),  # they damp it
+    (50.0, 0.0016, -30.83, Outcome.TOLERANCE_NOT_MET),
+    (100.0, 0.0016, -30.83, Outcome.TOLERANCE_NOT_MET),
+    (3066.5, 10.0, -192674.6, Outcome.TOLERANCE_NOT_MET),
+    (3066.5, 30.0, -578023.8, Outcome.TOLERANCE_NOT_MET),
+    (20.0, 0.0016, -30.83, Outcome.NOT_FINITE),
+    (3066.5, 50.0, -963373.0, Outcome.NOT_FINITE),
+    (400.0, 0.0016, -30.83, Outcome.SUCCESS),
+)
+
+
+def test_too_few_steps_are_told():
+    """Forty-eight steps for up to 77 periods of the shaft; a decay that is over within the first step."""
+    points = {"excitation_frequency": [case[0] for case in _UNRESOLVED], "zeta": [case[1] for case in _UNRESOLVED]}
+    ours = tripod(points, max_time=1.0)
+    assert ours.outcome.values.tolist() == [case[3] for case in _UNRESOLVED]
+    assert (ours.verdict.values[:-1] == Verdict.UNDECIDED).all()
+    # What is wrong is as much as the residual says, of motions that left, too.
+    found = ours.lyapunov_spectrum.values.sum(axis=1) - [case[2] for case in _UNRESOLVED]
+    given = ours.outcome.values != Outcome.NOT_FINITE
+    np.testing.assert_allclose(ours.sum_rule_residual.values[given], found[given], rtol=1e-3, atol=0.01)
+    assert not broken(ours)
+
+
+# (26) is an autonomous equation for an angle and its rate. Its largest exponent over 0.3 s is 1.96 by an extrapolation
+# method at 1e-12; the fixed steps stir the fast whirl of the start.
+PLANAR = {
+    "excitation_frequency": 2012.7004798698006, "zeta": 0.00019142247356200389, "chi_n": 0.16866322682805285,
+    "phi0": 2.8840525342093706, "M_MS": 610795060.6725879,
+}  # fmt: skip
+
+
+def test_steps_do_not_make_chaos():
+    fixed = {"element": "output", "equation": "26"}
+    ours = tripod({name: [value] for name, value in PLANAR.items()}, OUTPUTS, fixed, max_time=0.3)
+    # What a chaotic motion shows is there.
+    assert ours.lyapunov_spectrum.values[0, 0] > 1000
+    assert abs(ours.sum_rule_residual.values[0]) < 1 and ours.chaos_k01.values[0] > 0.8
+    assert ours.verdict.values.tolist() == [Verdict.UNDECIDED]
+    assert ours.outcome.values.tolist() == [Outcome.TOLERANCE_NOT_MET]
+
+
+@pytest.mark.full
+def test_steps_that_disagree_are_told_whatever_is_asked_for():
+    """The verdict need not be among the outputs."""
+    point = {name: [value] for name, value in PLANAR.items()}
+    ours = tripod(point, OUTPUTS[:1], {"element": "output", "equation": "26"}, max_time=0.05)
+    assert ours.outcome.values.tolist() == [Outcome.TOLERANCE_NOT_MET]
+
+
+# Damping ratio, excitation frequency [Hz], M_AEM, phi0; the largest exponent by the monodromy matrix in quadruple precision.
+_TONGUE_EDGE = (
+    (1e-9, 2851.882955753298, 0.0, 1e-3, -9.311e-6),
+    (1e-4, 2851.87, 0.0, 1e-3, -0.9311025),
+    (1e-4, 2851.87, 0.0, 0.0, -0.9311025),
+    (1.6e-3, 2851.88, 2550.0, 0.0, -13.5106671),
+)
+
+
+@pytest.mark.parametrize("max_time", [pytest.param(0.1, marks=pytest.mark.full), 1.0])
+def test_a_double_multiplier_is_no_instability(max_time):
+    """Vectors grow in proportion to time there, or to time and a decay."""
+    names = ("zeta", "excitation_frequency", "M_AEM", "phi0")
+    points = dict(zip(names, map(list, zip(*(case[:4] for case in _TONGUE_EDGE), strict=True)), strict=True))
+    ours = tripod(points, fixed={"beta": 0.0, "chi_n": 0.3}, max_time=max_time, steps=16)
+    off = ours.lyapunov_spectrum.values[:, 0] - [case[4] for case in _TONGUE_EDGE]
+    assert (np.abs(off) < 2 * ours.lyapunov_standard_error.values[:, 0]).all()
+    assert (ours.verdict.values != Verdict.PARAMETRICALLY_UNSTABLE).all()
+    assert (ours.outcome == Outcome.SUCCESS).all()
+
+
 def test_members_do_not_depend_on_their_neighbours(linear, linear_motions):
     """The slow one runs to the end, the others stop before; once more among its like."""
     alike = linear([0.01] * 4, [1.0] * 4)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import jax.numpy as jnp
 import pytest
 
+from drivetrain_jax.analysis.chaos.resolution import adds_up, same_exponent
 from drivetrain_jax.analysis.chaos.verdict import Evidence, Verdict, judge
 
 CHAOTIC = Evidence(
     spectrum=jnp.array([1.0, -3.0]), error=jnp.array([0.1, 0.1]), coarse=jnp.array(1.0), coarse_error=jnp.array(0.1),
     sum_residual=jnp.array(1e-6), k01=jnp.array(0.99), bounded=jnp.array(True), growing=jnp.array(False),
-    multiple=jnp.array(0), settled=jnp.array(True),
+    multiple=jnp.array(0), settled=jnp.array(True), resolved=jnp.array(True),
 )  # fmt: skip
 REGULAR = CHAOTIC._replace(spectrum=jnp.array([-1.0, -3.0]), k01=jnp.array(0.0))
 
@@ -26,7 +27,14 @@ def test_all_evidence_together_is_chaos():
 
 @pytest.mark.parametrize(
     "missing",
-    [{"k01": 0.89}, {"coarse": 0.29}, {"sum_residual": 0.01}, {"error": [0.34, 0.1]}, {"coarse": float("nan")}],
+    [
+        {"k01": 0.89},
+        {"coarse": 0.29},
+        {"sum_residual": 0.01},
+        {"error": [0.34, 0.1]},
+        {"coarse": float("nan")},
+        {"resolved": False},
+    ],
     ids=lambda changed: next(iter(changed)),
 )
 def test_chaos_needs_every_piece_of_evidence(missing):
@@ -36,6 +44,43 @@ def test_chaos_needs_every_piece_of_evidence(missing):
 @pytest.mark.parametrize("changed", [{"growing": True}, {"bounded": False}])
 def test_growth_is_not_chaos(changed):
     assert verdict(CHAOTIC, **changed) == Verdict.PARAMETRICALLY_UNSTABLE
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"bounded": False, "resolved": False},
+        {"bounded": False, "spectrum": [float("nan")] * 2},
+        {"bounded": False, "spectrum": [-1.0, -3.0]},
+        {"growing": True, "resolved": False},
+        {"spectrum": [-1.0, -3.0], "k01": 0.0, "multiple": 1, "resolved": False},
+        {"spectrum": [-1.0, float("nan")], "k01": 0.0, "multiple": 1},
+    ],
+)
+def test_nothing_is_said_of_what_is_not_resolved(changed):
+    """Nor of exponents that are no numbers; what a torque drives beyond the bounds is not unstable."""
+    assert verdict(CHAOTIC, **changed) == Verdict.UNDECIDED
+
+
+@pytest.mark.parametrize(("error", "residual", "good"), [(1e-3, 2e-3, True), (1e-3, 4e-3, False), (5e-3, 4e-3, True)])
+def test_exponents_add_up_to_their_size_or_error(error, residual, good):
+    """A thousandth of the largest exponent, 3, or the largest standard error."""
+    errors = jnp.array([1e-3, error])
+    assert bool(adds_up(jnp.array([-1.0, -3.0]), errors, jnp.array(-residual), 1.0)) is good
+    assert not adds_up(jnp.array([-1.0, -3.0]), errors, jnp.array(jnp.nan), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("other", "error", "good"), [(1.09, 0.0, True), (1.11, 0.0, False), (1.5, 0.2, True), (1.7, 0.2, False)]
+)
+def test_two_step_sizes_agree_to_a_tenth_or_three_errors(other, error, good):
+    values = (1.0, 0.1 if error else 0.0, other, error)
+    assert bool(same_exponent(*map(jnp.asarray, values))) is good
+
+
+def test_a_motion_that_left_agrees_to_a_tenth():
+    """Its error is not known."""
+    assert [bool(same_exponent(1.0, 0.1, other, jnp.nan)) for other in (1.05, 1.2, jnp.nan)] == [True, False, False]
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,13 @@
 """What kind of motion it is, by a rule that a diffuse picture or one number cannot satisfy.
 
-Chaotic only if the motion is bounded, its largest exponent exceeds three standard errors at two step sizes, the
-exponents add up to the mean divergence, and the 0-1 test gives K > 0.9. Exponents of phases are not among those judged.
+Nothing is said where the steps do not resolve the motion. Chaotic only if the motion is bounded, the largest exponent
+exceeds three standard errors and is the same at two step sizes, the exponents add up to the mean divergence, and the 0-1
+test gives K > 0.9. Exponents of phases are not among those judged.
 """
 
 from __future__ import annotations
 
+import math
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -13,13 +15,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from drivetrain_jax.analysis.chaos.growth import SEGMENTS
+from drivetrain_jax.analysis.chaos.resolution import STANDARD_ERRORS, SUM_RULE, significant, zero_floor
 
-STANDARD_ERRORS = 3.0
 CHAOTIC_K = 0.9
-# The exponents add up: residual over the largest exponent.
-_SUM_RULE = 1e-3
-# An exponent that is zero has this size at most, over the largest one, whatever its standard error says.
-_ZERO = 1e-6
+# What grows in proportion to time, as at a double multiplier, grows by four over the three quarters that are averaged.
+# Growth that is exponential is told from it by twice its logarithm.
+_TELLING = 2 * math.log(4)
 
 
 class Verdict(IntEnum):
@@ -40,7 +41,7 @@ class Evidence(NamedTuple):
     ``spectrum``, ``error`` (m, ...): exponents and standard errors; ``coarse``, ``coarse_error`` (...): the largest one
     with twice the step; ``sum_residual``: of the sum rule; ``k01``: of the 0-1 test; ``bounded``; ``growing``: see
     :func:`grows`; ``multiple``: strobes until the motion repeats, 0 if it does not within those looked at; ``settled``:
-    whether the transient is small enough to tell.
+    whether the transient is small enough to tell; ``resolved``: see :func:`~.resolution.resolved`.
     """
 
     spectrum: Array
@@ -53,13 +54,14 @@ class Evidence(NamedTuple):
     growing: Array
     multiple: Array
     settled: Array
+    resolved: Array
 
 
 def grows(size: Array, used: Array, span: Array, largest: Array) -> Array:
     """Whether the motion grew about as fast as its largest exponent, or stayed at a rest that a disturbance leaves.
 
     ``size`` (SEGMENTS, ...): largest component in each segment. A bounded attractor has a positive exponent, too, but
-    its size does not follow it.
+    its size does not follow it. What growth in proportion to time may reach as well tells nothing.
     """
     index = jnp.arange(SEGMENTS).reshape(-1, *(1,) * used.ndim)
     last = jnp.maximum(used - 1, 0)
@@ -67,28 +69,36 @@ def grows(size: Array, used: Array, span: Array, largest: Array) -> Array:
     time = (last - used // 4) * span
     ratio = jnp.log(jnp.where((begin > 0) & (end > 0), end / jnp.where(begin > 0, begin, 1.0), 1.0))
     at_rest = jnp.max(size, axis=0) == 0
-    return at_rest | ((ratio > 0.5 * largest * time) & (largest * time > 1))
-
-
-def significant(evidence: Evidence) -> Array:
-    """Whether the largest exponent is positive beyond three standard errors."""
-    return evidence.spectrum[0] > STANDARD_ERRORS * evidence.error[0] + _floor(evidence)
+    return (at_rest | (ratio > 0.5 * largest * time)) & (largest * time > _TELLING)
 
 
 def judge(evidence: Evidence, autonomous: bool) -> Array:
     """The verdict, int8 of shape (...)."""
-    unstable = ~evidence.bounded | (significant(evidence) & evidence.growing)
-    chaotic = evidence.bounded & significant(evidence) & (evidence.k01 > CHAOTIC_K)
-    chaotic &= evidence.coarse > STANDARD_ERRORS * evidence.coarse_error
-    chaotic &= evidence.sum_residual <= _SUM_RULE * jnp.max(jnp.abs(evidence.spectrum), axis=0)
     regular = _autonomous(evidence) if autonomous else _forced(evidence)
-    verdict = jnp.where(significant(evidence), jnp.where(chaotic, Verdict.CHAOTIC, Verdict.UNDECIDED), regular)
-    return jnp.where(unstable, Verdict.PARAMETRICALLY_UNSTABLE, verdict).astype(jnp.int8)
+    regular = jnp.where(evidence.bounded, regular, Verdict.UNDECIDED)
+    positive = significant(evidence.spectrum, evidence.error)
+    verdict = jnp.where(positive, jnp.where(_chaotic(evidence), Verdict.CHAOTIC, Verdict.UNDECIDED), regular)
+    verdict = jnp.where(_unstable(evidence), Verdict.PARAMETRICALLY_UNSTABLE, verdict)
+    sound = evidence.resolved & jnp.all(jnp.isfinite(evidence.spectrum), axis=0)
+    return jnp.where(sound, verdict, Verdict.UNDECIDED).astype(jnp.int8)
+
+
+def _unstable(evidence: Evidence) -> Array:
+    """Of what has left, whether it did so by its exponent: a torque may drive what is stable beyond the bounds."""
+    left = ~evidence.bounded & (evidence.spectrum[0] > 0)
+    return left | (significant(evidence.spectrum, evidence.error) & evidence.growing)
+
+
+def _chaotic(evidence: Evidence) -> Array:
+    """All of it, for motions whose largest exponent is positive."""
+    chaotic = evidence.bounded & (evidence.k01 > CHAOTIC_K)
+    chaotic &= evidence.coarse > STANDARD_ERRORS * evidence.coarse_error
+    return chaotic & (evidence.sum_residual <= SUM_RULE * jnp.max(jnp.abs(evidence.spectrum), axis=0))
 
 
 def _forced(evidence: Evidence) -> Array:
     """Kind of a motion that attracts: by the strobes after which it repeats."""
-    decays = evidence.spectrum[0] < -STANDARD_ERRORS * evidence.error[0] - _floor(evidence)
+    decays = evidence.spectrum[0] < -STANDARD_ERRORS * evidence.error[0] - zero_floor(evidence.spectrum)
     kind = jnp.where(evidence.multiple > 1, Verdict.PERIODIC, Verdict.QUASI_PERIODIC)
     kind = jnp.where(evidence.multiple == 1, Verdict.FIXED_POINT, kind)
     return jnp.where(decays & evidence.settled, kind, Verdict.UNDECIDED)
@@ -96,12 +106,8 @@ def _forced(evidence: Evidence) -> Array:
 
 def _autonomous(evidence: Evidence) -> Array:
     """Kind of a motion that nothing forces: one exponent is zero along any motion that does not rest."""
-    zeros = jnp.abs(evidence.spectrum) <= STANDARD_ERRORS * evidence.error + _floor(evidence)
+    zeros = jnp.abs(evidence.spectrum) <= STANDARD_ERRORS * evidence.error + zero_floor(evidence.spectrum)
     count = jnp.sum(zeros, axis=0)
     kind = jnp.where(count == 0, Verdict.FIXED_POINT, jnp.where(count == 1, Verdict.PERIODIC, Verdict.QUASI_PERIODIC))
     sound = ~jnp.isnan(evidence.spectrum[0]) & (~zeros[0] | (evidence.k01 < 1 - CHAOTIC_K))
     return jnp.where(sound, kind, Verdict.UNDECIDED)
-
-
-def _floor(evidence: Evidence) -> Array:
-    return _ZERO * jnp.max(jnp.abs(evidence.spectrum), axis=0)
