@@ -23,6 +23,7 @@ from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import MOST_SECONDS, MOST_STEPS, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.chaos.forcing import may_be_chaotic
 from drivetrain_jax.analysis.chaos.growth import (
     BLOCKS,
     SEGMENTS,
@@ -231,13 +232,13 @@ def findings_of(run: Run, period: Any) -> Findings:
     return Findings(spectrum, coarse, residual, sound)
 
 
-def evidence_of(fine: Record, found: Findings, seen: Sampling) -> Evidence:
+def evidence_of(flow: Flow, fine: Record, found: Findings, seen: Sampling) -> Evidence:
     """What :func:`judge` asks for."""
     spectrum, coarse = found.spectrum, found.coarse
     growing = grows(fine.size, fine.used, fine.span, spectrum.values[0])
     return Evidence(
         spectrum.values, spectrum.errors, coarse.values[0], coarse.errors[0], jnp.abs(found.residual), seen.k01,
-        fine.bounded, growing, seen.multiple, seen.settled, found.resolved,
+        fine.bounded, growing, seen.multiple, seen.settled, found.resolved, may_be_chaotic(flow, fine.state),
     )  # fmt: skip
 
 
@@ -266,7 +267,7 @@ def analyse(flow: Flow, request: Request) -> dict[str, Array]:
         needed = spectrum.values[0] > STANDARD_ERRORS * spectrum.errors[0]
         needed = jnp.ones_like(needed) if "chaos_k01" in wanted or not flow.turns else needed
         seen = sample(flow, steps, run.fine, spectrum, needed)
-        results["verdict"] = judge(evidence_of(run.fine, found, seen), autonomous=not flow.turns)
+        results["verdict"] = judge(evidence_of(flow, run.fine, found, seen), autonomous=not flow.turns)
         # K tells nothing of a few points over and over again, nor is it asked to.
         repeating = seen.multiple > 0
         results["chaos_k01"] = jnp.where(repeating, 0.0, seen.k01)

@@ -16,10 +16,11 @@ import pytest
 import drivetrain_jax as dt
 from benchmarks import tripod_reference as oracle
 from drivetrain_jax.analysis import Outcome, Request
+from drivetrain_jax.analysis.chaos.forcing import may_be_chaotic
 from drivetrain_jax.analysis.chaos.verdict import Verdict
 from drivetrain_jax.analysis.lyapunov import analyse, repetition
 from drivetrain_jax.invariants import check
-from drivetrain_jax.systems import Flow
+from drivetrain_jax.systems import Flow, get_system
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "tripod.json").read_text())
 OUTPUTS = ("lyapunov_spectrum", "lyapunov_standard_error", "sum_rule_residual", "verdict", "chaos_k01")
@@ -197,6 +198,43 @@ def test_steps_that_disagree_are_told_whatever_is_asked_for():
     point = {name: [value] for name, value in PLANAR.items()}
     ours = tripod(point, OUTPUTS[:1], {"element": "output", "equation": "26"}, max_time=0.05)
     assert ours.outcome.values.tolist() == [Outcome.TOLERANCE_NOT_MET]
+
+
+@pytest.mark.parametrize(
+    ("changed", "possible"),
+    [
+        ({"equation": "29"}, True),
+        ({"equation": "25"}, True),
+        ({"equation": "25", "chi_AEM": 0.0}, False),
+        ({"equation": "29", "chi_AEM": 0.0}, True),
+        ({"equation": "29", "chi_AEM": 0.0, "chi_n": 0.0}, False),
+        ({"element": "output", "equation": "26"}, False),
+        ({"element": "output", "equation": "30"}, True),
+    ],
+)
+def test_chaos_needs_a_third_dimension(changed, possible):
+    """A clock that is felt is one."""
+    system = get_system("tripod")
+    values = {p.name: p.default for p in system.parameters if p.default is not None}
+    values |= {
+        "element": "input",
+        "beta": 0.157,
+        "zeta": 0.0016,
+        "chi_n": 0.0026,
+        "excitation_frequency": 3e3,
+    } | changed
+    flow = system.models["lyapunov"].build(values)
+    found = jax.jit(lambda *y: may_be_chaotic(flow, y))(jnp.array([0.1, 1.0]), jnp.array([0.2, 0.0]))
+    assert found.tolist() == [possible] * 2
+
+
+def test_room_for_chaos_is_a_matter_of_each_member():
+    """Three components have it, two that nothing forces have not, nor with a force of no amplitude."""
+    state = (jnp.ones(2), jnp.ones(2))
+    forced = Flow(lambda angles, y: (y[1], jnp.array([0.0, 1e-9]) * jnp.cos(angles[0])), state, 1.0, turns=(1,))
+    assert may_be_chaotic(forced, state).tolist() == [False, True]
+    assert not may_be_chaotic(flows.van_der_pol(2), state).any()
+    assert may_be_chaotic(flows.lorenz(2), (*state, state[0])).all()
 
 
 # Damping ratio, excitation frequency [Hz], M_AEM, phi0; the largest exponent by the monodromy matrix in quadruple precision.

@@ -11,7 +11,7 @@ from drivetrain_jax.analysis.chaos.verdict import Evidence, Verdict, judge
 CHAOTIC = Evidence(
     spectrum=jnp.array([1.0, -3.0]), error=jnp.array([0.1, 0.1]), coarse=jnp.array(1.0), coarse_error=jnp.array(0.1),
     sum_residual=jnp.array(1e-6), k01=jnp.array(0.99), bounded=jnp.array(True), growing=jnp.array(False),
-    multiple=jnp.array(0), settled=jnp.array(True), resolved=jnp.array(True),
+    multiple=jnp.array(0), settled=jnp.array(True), resolved=jnp.array(True), roomy=jnp.array(True),
 )  # fmt: skip
 REGULAR = CHAOTIC._replace(spectrum=jnp.array([-1.0, -3.0]), k01=jnp.array(0.0))
 
@@ -33,6 +33,7 @@ def test_all_evidence_together_is_chaos():
         {"sum_residual": 0.01},
         {"error": [0.34, 0.1]},
         {"coarse": float("nan")},
+        {"roomy": False},
         {"resolved": False},
     ],
     ids=lambda changed: next(iter(changed)),

@@ -1,8 +1,8 @@
 """What kind of motion it is, by a rule that a diffuse picture or one number cannot satisfy.
 
-Nothing is said where the steps do not resolve the motion. Chaotic only if the motion is bounded, the largest exponent
-exceeds three standard errors and is the same at two step sizes, the exponents add up to the mean divergence, and the 0-1
-test gives K > 0.9. Exponents of phases are not among those judged.
+Nothing is said where the steps do not resolve the motion. Chaotic only if the motion is bounded, its field has room for
+chaos, the largest exponent exceeds three standard errors and is the same at two step sizes, the exponents add up to the
+mean divergence, and the 0-1 test gives K > 0.9. Exponents of phases are not among those judged.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ class Evidence(NamedTuple):
     ``spectrum``, ``error`` (m, ...): exponents and standard errors; ``coarse``, ``coarse_error`` (...): the largest one
     with twice the step; ``sum_residual``: of the sum rule; ``k01``: of the 0-1 test; ``bounded``; ``growing``: see
     :func:`grows`; ``multiple``: strobes until the motion repeats, 0 if it does not within those looked at; ``settled``:
-    whether the transient is small enough to tell; ``resolved``: see :func:`~.resolution.resolved`.
+    whether the transient is small enough to tell; ``resolved``: see :func:`~.resolution.resolved`;
+    ``roomy``: whether the field has room for chaos.
     """
 
     spectrum: Array
@@ -55,6 +56,7 @@ class Evidence(NamedTuple):
     multiple: Array
     settled: Array
     resolved: Array
+    roomy: Array
 
 
 def grows(size: Array, used: Array, span: Array, largest: Array) -> Array:
@@ -91,7 +93,7 @@ def _unstable(evidence: Evidence) -> Array:
 
 def _chaotic(evidence: Evidence) -> Array:
     """All of it, for motions whose largest exponent is positive."""
-    chaotic = evidence.bounded & (evidence.k01 > CHAOTIC_K)
+    chaotic = evidence.bounded & evidence.roomy & (evidence.k01 > CHAOTIC_K)
     chaotic &= evidence.coarse > STANDARD_ERRORS * evidence.coarse_error
     return chaotic & (evidence.sum_residual <= SUM_RULE * jnp.max(jnp.abs(evidence.spectrum), axis=0))
 

@@ -1,0 +1,44 @@
+"""Whether a field has room for chaos: two components that nothing forces have none (Poincare and Bendixson).
+
+A clock may turn without being felt: its equation does not contain it, or the amplitude of what it drives is zero.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax.systems import Flow
+
+# Fractions of a strobe at which the clocks are turned; none where the derivative of a harmonic is zero by symmetry.
+_FRACTIONS = tuple((k + 0.37) / 8 for k in range(8))
+# A phase is a clock that is carried as a component.
+_PLANAR = 2
+
+
+def driven(flow: Flow, y: tuple[Array, ...]) -> Array:
+    """Whether the field at ``y`` depends on any of its clocks, shape (...). An amplitude that is small is still one."""
+    felt = [_felt(flow, y, number) for number in range(len(flow.turns))]
+    return jnp.any(jnp.stack([jnp.zeros(jnp.shape(y[0]), bool), *felt]), axis=0)
+
+
+def _felt(flow: Flow, y: tuple[Array, ...], number: int) -> Array:
+    """Whether a turn of one clock changes any rate."""
+    shape = (len(_FRACTIONS), *jnp.shape(y[0]))
+    angles = flow.angles(0, jnp.asarray(_FRACTIONS).reshape(-1, *(1,) * jnp.ndim(y[0])))
+
+    def rates(angle: Array) -> Array:
+        turned = (*angles[:number], angle, *angles[number + 1 :])
+        return jnp.stack([jnp.broadcast_to(jnp.asarray(rate, float), shape) for rate in flow.field(turned, y)])
+
+    angle = jnp.broadcast_to(angles[number], shape)
+    _, change = jax.jvp(rates, (angle,), (jnp.ones_like(angle),))
+    return jnp.any(change != 0, axis=(0, 1))
+
+
+def may_be_chaotic(flow: Flow, y: tuple[Array, ...]) -> Array:
+    """Whether chaos is possible at all, shape (...); ``y`` is a state of the motion."""
+    if flow.size > _PLANAR or flow.phases:
+        return jnp.ones(jnp.shape(y[0]), bool)
+    return driven(flow, y)
