@@ -2,8 +2,9 @@
 
 diffrax integrates adaptively from strobe to strobe and from requested time to requested time, so that every value is
 the end of a step (no interpolation) and the angles of the clocks are taken afresh from whole strobes: they are as exact
-after 50,000 strobes as at the start. Errors are the differences from a run at a tolerance ten times as large, which is
-made whether they are asked for or not; where they exceed ``rtol`` times the size of the motion, sharper runs follow.
+after 50,000 strobes as at the start. Errors are the differences from a run at a tolerance ten times as large whose steps
+may be twice as long, which is made whether they are asked for or not; where they exceed ``rtol`` times the size of the
+motion, the largest component that it reaches, sharper runs follow.
 
 Outcome: ``TOLERANCE_NOT_MET`` if an error exceeds ``rtol`` times the size of the motion all the same;
 ``STEP_LIMIT`` if the integrator needed too many steps (values up to that time are kept), ``NOT_FINITE`` if the field
@@ -26,6 +27,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import MOST_SECONDS, RTOL, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.numerics.predictions import predicted
+from drivetrain_jax.analysis.numerics.watched_steps import WatchedSteps, largest_met
 from drivetrain_jax.analysis.periodic.monodromy import SOLVERS
 from drivetrain_jax.systems import Flow, System
 
@@ -39,6 +41,9 @@ _COMPONENT = {"phi": 0, "velocity": 1}
 
 # Tolerances of the steps over that of the result: errors of steps add up over the memory of the damped motion.
 _SHARPNESS, _COARSER, _SHARPEST = 0.01, 10.0, 1e-15
+# Longest steps of the sharper run over those of the other, which are a segment at first: where one step of a segment is good
+# for both tolerances, both runs would be the same and tell no error. Every further try begins with steps of the last one.
+_PART = 0.5
 # Where that misses rtol, as they add up over a long memory: part of rtol aimed at next, and the sharpest and most tries.
 _RESERVE, _SHARPEST_AGAIN, _MOST_ATTEMPTS = 0.3, 1e-14, 3
 # Steps of one segment (at most a strobe) and of a whole history; strobes beyond which none is begun.
@@ -46,11 +51,13 @@ _MAX_SEGMENT, _MAX_STEPS, _MAX_STROBES = 4096, 20_000_000, 2_000_000
 
 
 class _Place(NamedTuple):
-    """Where the integration stands: ``(strobe + fraction) * period``, the state, the steps so far, and if all is well."""
+    """Where the integration stands: ``(strobe + fraction) * period``, the state, the largest component and the number of
+    the steps so far, and if all is well."""
 
     strobe: Array
     fraction: Array
     y: Array
+    reached: Array
     steps: Array
     healthy: Array
 
@@ -82,7 +89,7 @@ def requested_times(request: Request) -> tuple[float, ...]:
 
 
 def size_of(flow: Flow) -> Array:
-    """Scale of the motion in its own components: the initial state, and the way made by it within a radian."""
+    """What the motion may reach, in its own components: the initial state, and the way made by it within a radian."""
     start = _start(flow)
     rate = flow.vector(0, 0.0, start)
     fastest = 2 * np.pi / flow.period if flow.fastest is None else flow.fastest
@@ -102,11 +109,13 @@ def _has_finite_start(flow: Flow) -> Array:
 def _segment(
     flow: Flow,
     solver: diffrax.AbstractSolver,
-    controller: diffrax.AbstractStepSizeController,
+    controller: diffrax.PIDController,
+    part: Array,
     place: _Place,
     end: Array,
-) -> tuple[Array, Array, Array]:
-    """State at the fraction ``end`` of the strobe, number of steps, and whether the integration went well."""
+) -> tuple[Array, Array, Array, Array]:
+    """State at the fraction ``end`` of the strobe, the largest component and the number of the steps, and whether the
+    integration went well."""
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda s, y, _: flow.period * flow.vector(place.strobe, s, y)),
         solver,
@@ -114,13 +123,13 @@ def _segment(
         t1=end,
         dt0=None,
         y0=place.y,
-        stepsize_controller=controller,
-        saveat=diffrax.SaveAt(t1=True),
+        stepsize_controller=WatchedSteps(controller, part, end - place.fraction),
+        saveat=diffrax.SaveAt(t1=True, controller_state=True),
         max_steps=_MAX_SEGMENT,
         throw=False,
     )
     well = solution.result == diffrax.RESULTS.successful
-    return solution.ys[0], solution.stats["num_steps"], well
+    return solution.ys[0], largest_met(solution), solution.stats["num_steps"], well
 
 
 def _ahead(place: _Place, target: tuple[Array, Array]) -> Array:
@@ -129,10 +138,14 @@ def _ahead(place: _Place, target: tuple[Array, Array]) -> Array:
     return place.healthy & ((place.strobe < strobe) | (place.fraction < fraction))
 
 
-def trajectory(flow: Flow, times: Array, tolerance: float, solver: diffrax.AbstractSolver) -> tuple[Array, Array]:
-    """States at the rising ``times``, shape ``(len(times), n)``, and whether the step limit was kept; NaN beyond it.
+def trajectory(
+    flow: Flow, times: Array, tolerance: Any, part: Any, solver: diffrax.AbstractSolver
+) -> tuple[Array, Array, Array]:
+    """States at the rising ``times``, shape ``(len(times), n)``, the largest component met on the way, and whether the step
+    limit was kept; NaN beyond it.
 
-    ``tolerance`` bounds the error of a step relative to the state and to :func:`size_of`.
+    ``tolerance`` bounds the error of a step relative to the state and to :func:`size_of`, ``part`` its length over that of
+    the segment, which is at most a strobe.
     """
     controller = diffrax.PIDController(rtol=tolerance, atol=jnp.maximum(tolerance * size_of(flow), 1e-300))
     turns = times / flow.period
@@ -143,13 +156,14 @@ def trajectory(flow: Flow, times: Array, tolerance: float, solver: diffrax.Abstr
         last = place.strobe == strobe
         # In a batch a lane that has arrived or failed takes part until the others are there: it must not take steps.
         end = jnp.where(_ahead(place, target), jnp.where(last, fraction, 1.0), place.fraction)
-        y, steps, well = _segment(flow, solver, controller, place, end)
+        y, reached, steps, well = _segment(flow, solver, controller, part, place, end)
         total = place.steps + steps
         healthy = place.healthy & well & (total <= _MAX_STEPS) & jnp.all(jnp.isfinite(y))
         return _Place(
             jnp.where(last, strobe, place.strobe + 1),
             jnp.where(last, fraction, 0.0),
             jnp.where(healthy, y, place.y),
+            jnp.maximum(place.reached, reached),
             total,
             healthy,
         )
@@ -159,22 +173,21 @@ def trajectory(flow: Flow, times: Array, tolerance: float, solver: diffrax.Abstr
         return place, jnp.where(place.healthy, place.y, jnp.nan)
 
     start = _start(flow)
-    rest = _Place(jnp.int64(0), jnp.zeros(()), start, jnp.int64(0), _has_finite_start(flow))
+    rest = _Place(jnp.int64(0), jnp.zeros(()), start, jnp.max(jnp.abs(start)), jnp.int64(0), _has_finite_start(flow))
     place, states = jax.lax.scan(to, rest, (strobes, turns - strobes))
-    return states, place.healthy
+    return states, place.reached, place.healthy
 
 
-def _twice(flow: Flow, times: Array, tolerance: Array, request: Request) -> _Found:
+def _twice(flow: Flow, times: Array, tolerance: Array, attempts: Array, request: Request) -> _Found:
     """The states at ``times``, with their difference from a run at a tolerance ``_COARSER`` times as large."""
     solver = getattr(diffrax, request.options["solver"])()
-    tolerances = tolerance * jnp.array([1.0, _COARSER])
+    settings = tolerance * jnp.array([1.0, _COARSER]), _PART**attempts * jnp.array([_PART, 1.0])
     # One after the other in one loop: compiled once.
-    runs, healthy = jax.lax.map(lambda t: trajectory(flow, times, t, solver), tolerances)
+    runs, reached, healthy = jax.lax.map(lambda setting: trajectory(flow, times, *setting, solver), settings)
     error = jnp.abs(runs[0] - runs[1])
-    size = jnp.maximum(size_of(flow), jnp.max(jnp.abs(runs[0])))
     largest = jnp.max(error)
-    excess = jnp.where(largest == 0, 0.0, largest / (request.options["rtol"] * size))
-    return _Found(tolerance, runs[0], error, excess, healthy[0], jnp.int8(1))
+    excess = jnp.where(largest == 0, 0.0, largest / (request.options["rtol"] * reached[0]))
+    return _Found(tolerance, runs[0], error, excess, healthy[0], attempts + jnp.int8(1))
 
 
 def _integrated(flow: Flow, request: Request) -> _Found:
@@ -190,10 +203,11 @@ def _integrated(flow: Flow, request: Request) -> _Found:
 
     def attempt(found: _Found) -> _Found:
         first = found.attempts == 0
-        new = _twice(flow, times, jnp.where(missed(found) & ~first, sharper(found), found.tolerance), request)
+        tolerance = jnp.where(missed(found) & ~first, sharper(found), found.tolerance)
+        new = _twice(flow, times, tolerance, found.attempts, request)
         better = first | (new.excess < found.excess)
         kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, found)
-        return kept._replace(attempts=found.attempts + 1)
+        return kept._replace(attempts=new.attempts)
 
     nothing = jnp.full((len(times), flow.size), jnp.nan)
     tolerance = jnp.asarray(max(_SHARPNESS * request.options["rtol"], _SHARPEST))

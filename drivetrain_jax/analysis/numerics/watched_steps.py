@@ -1,0 +1,69 @@
+"""Steps of diffrax that are longest a given part of the interval, and the largest state that they meet."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+from jax import Array
+
+# State of the controller of the steps, largest component so far, and the longest step.
+_State = tuple[Any, Array, Array]
+
+
+class WatchedSteps(diffrax.AbstractAdaptiveStepSizeController[_State, None]):
+    """The steps of ``controller``, of which the first is ``part`` of what it would be and the others are at most ``part``
+    of the interval ``length``.
+
+    With ``part`` 1 they are those of ``controller``. With less, they differ from those even where these do not depend on the
+    tolerance: where one step takes the whole interval, or where steps grow as fast as they may.
+    """
+
+    controller: diffrax.PIDController
+    part: Any
+    length: Any
+
+    @property
+    def rtol(self) -> Any:
+        """That of the controller."""
+        return self.controller.rtol
+
+    @property
+    def atol(self) -> Any:
+        """That of the controller."""
+        return self.controller.atol
+
+    @property
+    def norm(self) -> Any:
+        """That of the controller."""
+        return self.controller.norm
+
+    def wrap(self, direction: Any) -> WatchedSteps:
+        """Itself: the steps go forwards."""
+        del direction
+        return self
+
+    def init(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: None, args: Any, func: Any, error_order: Any
+    ) -> tuple[Any, _State]:
+        """End of the first step, and the state."""
+        end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        longest = self.part * self.length
+        return t0 + jnp.minimum(self.part * (end - t0), longest), (state, jnp.max(jnp.abs(y0)), longest)
+
+    def adapt_step_size(
+        self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any, error_order: Any, state: _State
+    ) -> tuple:
+        """Whether the step is kept, the next one, whether it begins at a jump, the state, and the result."""
+        inner, largest, longest = state
+        kept, start, end, jumped, inner, result = self.controller.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, inner
+        )
+        met = jnp.where(kept, jnp.maximum(largest, jnp.max(jnp.abs(y1_candidate))), largest)
+        return kept, start, jnp.minimum(end, start + longest), jumped, (inner, met, longest), result
+
+
+def largest_met(solution: diffrax.Solution) -> Array:
+    """Largest component in absolute value of the states at the ends of the steps; saved with ``controller_state=True``."""
+    return solution.controller_state[1]
