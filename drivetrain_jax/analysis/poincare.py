@@ -4,9 +4,10 @@ Time is a counted strobe plus a fraction of it, so that the angles of the clocks
 equal steps of order 8. The method ``adaptive`` is there to show what a loose tolerance does: the pair of Dormand &
 Prince of orders 5 and 4 with the control of ``rtol`` and ``atol`` that is usual for it.
 
-Both methods check themselves. Some strobes are taken again by finer equal steps (twice as many as ``fixed`` takes, 96
-after ``adaptive``): ``strobe_error``, the error made within one strobe. The whole motion is marched once more by equal
-steps (a quarter as many, 48 after ``adaptive``): ``section_error``, what these errors have added up to since the start.
+Both methods check themselves. Some strobes, the first ones from the start included, are taken again by finer equal steps
+(twice as many as ``fixed`` takes, 96 after ``adaptive``): ``strobe_error``, the error made within one strobe of the section.
+The whole motion is marched once more by equal steps (a quarter as many, 48 after ``adaptive``; after ``fixed`` twice as many
+where these leave doubts): ``section_error``, what these errors have added up to since the start.
 See :mod:`~drivetrain_jax.analysis.chaos.section_error`.
 
 Outcome: ``TOLERANCE_NOT_MET`` if ``section_error`` exceeds 1e-6 or ten times ``rtol``, or is not known. That is so of
@@ -20,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -31,9 +32,9 @@ from jax import Array
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import MOST_STEPS, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.chaos.growth import discarded, sampled
-from drivetrain_jax.analysis.chaos.section_error import Steps, section_errors, watched
+from drivetrain_jax.analysis.chaos.section_error import EARLY, Steps, section_errors, watched
 from drivetrain_jax.analysis.chaos.section_measures import period_multiple, torus_residual
-from drivetrain_jax.analysis.chaos.variational import batch_shape
+from drivetrain_jax.analysis.chaos.variational import batch_shape, initial_state
 from drivetrain_jax.analysis.chaos.zero_one_test import largest_k01
 from drivetrain_jax.systems import Flow, System
 
@@ -65,19 +66,27 @@ _ADAPTIVE_CHECKS = Steps(96, 48)
 _FEWEST = 6
 # Numbers of a chunk's sections, and points of a chunk at most.
 _NUMBERS, _CHUNK = 1 << 23, 64
-Section = tuple[Array, Array]
+
+
+class Section(NamedTuple):
+    """States at the strobes, shape ``(strobes, n, ...)``, those at the first discarded ones, and the outcome."""
+
+    states: Array
+    early: Array
+    outcome: Array
 
 
 def fixed_section(flow: Flow, request: Request) -> Section:
-    """States at the strobes, shape ``(strobes, n, ...)``, and the outcome, by equal steps."""
+    """The section by equal steps."""
     steps, first = request.options["steps"], request.options["discard"]
+    early, _ = sampled(flow, steps, initial_state(flow), jnp.int64(0), min(EARLY, first))
     state = discarded(flow, steps, jnp.int64(first))
     states, _ = sampled(flow, steps, state, jnp.int64(first), request.options["strobes"])
-    return states, jnp.full(states.shape[2:], Outcome.SUCCESS, jnp.int8)
+    return Section(states, early, jnp.full(states.shape[2:], Outcome.SUCCESS, jnp.int8))
 
 
 def adaptive_section(flow: Flow, request: Request) -> Section:
-    """The same of one point by the adaptive pair; every strobe is the end of a step."""
+    """The section of one point by the adaptive pair; every strobe is the end of a step."""
     rtol, atol, first = (request.options[name] for name in ("rtol", "atol", "discard"))
     controller = diffrax.PIDController(rtol=rtol, atol=atol)
 
@@ -91,15 +100,15 @@ def adaptive_section(flow: Flow, request: Request) -> Section:
         y = solution.ys[0]
         return y, well & (solution.result == diffrax.RESULTS.successful)
 
-    start = (jnp.stack([jnp.asarray(x, float) for x in flow.start]), jnp.bool_(True))
-    carry = jax.lax.fori_loop(0, first, lambda k, c: advance(c, k), start)
-
     def keep(carry: tuple, strobe: Array) -> tuple:
         carry = advance(carry, strobe)
         return carry, carry[0]
 
+    start = (jnp.stack([jnp.asarray(x, float) for x in flow.start]), jnp.bool_(True))
+    carry, early = jax.lax.scan(keep, start, jnp.arange(min(EARLY, first)))
+    carry = jax.lax.fori_loop(len(early), first, lambda k, c: advance(c, k), carry)
     (_, well), states = jax.lax.scan(keep, carry, first + jnp.arange(request.options["strobes"]))
-    return states, jnp.where(well, Outcome.SUCCESS, Outcome.STEP_LIMIT).astype(jnp.int8)
+    return Section(states, early, jnp.where(well, Outcome.SUCCESS, Outcome.STEP_LIMIT).astype(jnp.int8))
 
 
 def checking_steps(request: Request) -> Steps:
@@ -152,10 +161,10 @@ def _solve(system: System, request: Request, values: Mapping[str, Any], effort: 
     del effort
     flow: Flow = system.models["poincare"].build(values)
     section = adaptive_section if request.method == "adaptive" else fixed_section
-    states, outcome = section(flow, request)
+    states, early, outcome = section(flow, request)
     results = measures(flow, states, request)
     allowed = tolerated(request)
-    strobe, whole = section_errors(flow, states, request.options["discard"], checking_steps(request), allowed)
+    strobe, whole = section_errors(flow, states, early, request.options["discard"], checking_steps(request), allowed)
     results |= {"strobe_error": strobe, "section_error": whole}
     missed = jnp.where(whole <= allowed, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
     outcome = jnp.maximum(outcome, missed.astype(jnp.int8))

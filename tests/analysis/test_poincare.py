@@ -92,6 +92,48 @@ def test_steps_that_are_too_long_are_noticed():
     assert 0.1 * float(coarse.strobe_error) < difference < 100 * float(coarse.strobe_error)
 
 
+OUTPUT_ELEMENT = {"element": "output", "equation": "26", "M_MS": 4002.639767285174}
+OUTPUT_ELEMENT |= {"excitation_frequency": 4754.933122197243, "zeta": 1.5383755066975724, "chi_n": 0.4978108469450189}
+INPUT_ELEMENT = {"element": "input", "equation": "25"}
+
+
+@pytest.mark.parametrize(
+    ("fixed", "start", "discard"),
+    [
+        (OUTPUT_ELEMENT, (1.0925995030791809, 91428.57142857143), 0),
+        (
+            INPUT_ELEMENT | {"zeta": 0.007724415608099983, "chi_n": 0.335893153586345},
+            (-2.3362162256755377, -128600.2548853408),
+            20,
+        ),
+    ],
+)
+def test_errors_of_a_violent_start_are_told(fixed, start, discard):
+    """They were made in the first strobe, or in discarded ones; all strobes of the section are right to 1e-8."""
+    fixed = fixed | {"beta": 0.157, "phi0": start[0], "velocity0": start[1]}
+    scene = {"system": "tripod", "analysis": "poincare", "outputs": ["section", "section_error"], "fixed": fixed}
+    ours, finer = (dt.run(scene | {"options": {"strobes": 128, "discard": discard, "steps": n}}) for n in (48, 192))
+    element = {name: fixed[name] for name in ("element", "beta", "chi_n")}
+    omega = float(dt.point("tripod", "parameters", **element).natural_angular_frequency)
+    units = np.array([1.0, omega])
+    error = float(np.abs((ours.section - finer.section) / units).max() / np.abs(ours.section / units).max())
+    assert error > 1e-5
+    assert 0.95 < float(ours.section_error) / error < 1.1
+    assert ours.outcome == Outcome.TOLERANCE_NOT_MET
+    assert finer.outcome == Outcome.SUCCESS
+
+
+def test_a_violent_neighbour_does_not_matter():
+    """It asks for a second march, which its neighbour does not take part in."""
+    scene = {"system": "tripod", "analysis": "poincare", "outputs": ["section_error"]}
+    scene |= {"fixed": OUTPUT_ELEMENT | {"beta": 0.157}, "options": {"strobes": 128, "discard": 0, "steps": 24}}
+    speeds = [1e3, 105714.28571428572]
+    both = dt.run(scene | {"axes": {"velocity0": {"values": speeds}}})
+    alone = [float(dt.run(scene | {"axes": {"velocity0": {"values": [v]}}}).section_error[0]) for v in speeds]
+    assert both.outcome.values.tolist() == [Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET]
+    np.testing.assert_allclose(both.section_error, alone, rtol=1e-6, atol=1e-15)
+
+
 class TestZeroOne:
     """Gottwald & Melbourne 2009: the logistic map on both sides of chaos, and a constant."""
 

@@ -9,7 +9,8 @@ from flows import linear, lorenz
 from scipy.linalg import expm
 
 from drivetrain_jax.analysis.chaos.growth import discarded, sampled
-from drivetrain_jax.analysis.chaos.section_error import Steps, section_errors
+from drivetrain_jax.analysis.chaos.section_error import EARLY, Steps, section_errors
+from drivetrain_jax.analysis.chaos.variational import initial_state
 
 DAMPING, STIFFNESS, TORQUE = [0.0, 0.01, 2.0], 20.0, 1.0
 FIRST, COUNT = 200, 300
@@ -19,8 +20,9 @@ def errors_of(flow, steps: int, checks: Steps, first: int, count: int):
     """The section by equal steps, and what is said of it."""
 
     def both():
+        early, _ = sampled(flow, steps, initial_state(flow), 0, min(first, EARLY))
         states, _ = sampled(flow, steps, discarded(flow, steps, first), first, count)
-        return states, section_errors(flow, states, first, checks, 1e-6)
+        return states, section_errors(flow, states, early, first, checks, 1e-6)
 
     states, errors = jax.jit(both)()
     return np.asarray(states), errors

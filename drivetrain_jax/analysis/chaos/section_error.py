@@ -3,8 +3,11 @@
 Errors of strobes are carried on: a damped motion forgets them, an undamped one adds them up, close to a tongue they grow
 for hundreds of strobes. Some strobes are taken again by finer equal steps: the error of one strobe. The whole motion, what
 was discarded included, is marched once more by other equal steps. As long as that stays within a tenth of the section, the
-error of the section is in the same proportion to its distance as the errors of the strobes are, so that few steps will do.
-If it does not, while every strobe is right, more steps are tried.
+error of the section is at most in that proportion to its distance in which the error of a strobe is to what the other steps
+make of the same strobe, so that few steps will do. The proportion is not the same everywhere: a violent start is resolved
+worse than what it settles to, and its errors may be all that there is. Hence the first strobes from the start are among
+those taken again, and the largest proportion counts. Where even so the error may matter, or the other steps lead away
+although every strobe is right, more steps are tried; the distance from these is the error.
 
 Of a chaotic motion every number of steps gives another section: the error of one strobe is all that can be said of it.
 """
@@ -19,18 +22,29 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis.chaos.growth import discarded, sampled
-from drivetrain_jax.analysis.chaos.variational import Frame, one_kernel, strobe_map
+from drivetrain_jax.analysis.chaos.variational import Frame, initial_state, one_kernel, strobe_map
 from drivetrain_jax.systems import Flow
 
-# Strobes that are taken again.
-_TAKEN_AGAIN = 8
+# Strobes of the section and first strobes from the start that are taken again.
+_TAKEN_AGAIN, EARLY = 8, 16
 # Distances from the section up to which errors are in proportion, over its largest value.
 _PROPORTIONAL = 0.1
+# Changes of strobes that are a smaller part of the largest one make no difference to the section: their proportion may be
+# that of roundings. Estimates above this part of what is tolerated are found again by more steps.
+_CONSIDERABLE, _DOUBTFUL = 0.01, 0.1
+
+
+class _Strobes(NamedTuple):
+    """Strobes to be taken again: their numbers, shape ``(K,)``, and the states at their ends, ``(K, n, ...)``."""
+
+    number: np.ndarray
+    begin: Array
+    end: Array
 
 
 class Steps(NamedTuple):
-    """Equal steps a strobe: those of single strobes, those of the whole motion, and those (0: none) that are tried where
-    the latter lead away from the section."""
+    """Equal steps a strobe: those of single strobes, those of the whole motion, and those (0: none), no fewer than of
+    single strobes, of the whole motion where the latter leave doubts."""
 
     strobe: int
     motion: int
@@ -42,42 +56,67 @@ def watched(flow: Flow) -> np.ndarray:
     return np.array([i for i in range(flow.size) if i not in (*flow.phases, *flow.cyclic)] or [0])
 
 
-def section_errors(flow: Flow, states: Array, first: int, steps: Steps, tolerated: float) -> tuple[Array, Array]:
+def section_errors(
+    flow: Flow, states: Array, early: Array, first: int, steps: Steps, tolerated: float
+) -> tuple[Array, Array]:
     """Errors of single strobes and of the whole of ``states``, shape ``(T, n, ...)``, those after the first ``first``
-    strobes from the start, over the largest value (a tenth or more: another section; NaN: not known).
+    strobes from the start, over the largest value (a tenth or more: another section; NaN: not known). ``early``: states
+    after the first ``min(first, EARLY)`` of those strobes, as the section has them.
 
-    A second march is made only of motions whose errors of strobes are within ``tolerated``.
+    A second march is made only of motions whose errors of strobes are within ``tolerated`` or that the first one follows.
     """
     size = jnp.max(jnp.abs(states[:, watched(flow)]), axis=(0, 1))
     size = jnp.where(size == 0, 1.0, size)
+    strobes = _strobes(flow, states, early, first)
     # One loop over the numbers of steps: marches are dear to compile.
-    marches = jnp.array([count for count in steps[1:] if count])
-    strobe, *changes = jax.lax.map(
-        lambda n: _change(flow, states, first, n) / size, jnp.array([steps.strobe, *marches])
-    )
+    errors, changes = jax.lax.map(lambda n: _changes(flow, strobes, n) / size, jnp.array(steps[:2]))
+    strobe = jnp.max(errors[strobes.number >= first], axis=0)
+    share = _share(errors, changes)
+    marches = [(steps.motion, share), (steps.then, jnp.ones_like(share))][: 2 if steps.then else 1]
 
     def whole(error: Array, march: tuple[Array, Array]) -> tuple[Array, None]:
-        count, change = march
-        unknown = jnp.isinf(error) | (~(error <= _PROPORTIONAL) & (strobe <= tolerated))
+        count, share = march
+        followed = error <= _PROPORTIONAL
+        doubtful = ~(error <= _DOUBTFUL * tolerated) & (followed | (strobe <= tolerated))
+        unknown = jnp.isinf(error) | doubtful
 
         def found() -> Array:
             distance = _distance(flow, states, first, count) / size
-            share = jnp.where(change > 0, strobe / change, 1.0)
             return jnp.where(unknown, jnp.where(distance <= _PROPORTIONAL, distance * share, distance), error)
 
         return jax.lax.cond(jnp.any(unknown), found, lambda: error), None
 
-    error, _ = jax.lax.scan(whole, jnp.full(strobe.shape, jnp.inf), (marches, jnp.stack(changes)))
+    counts, shares = zip(*marches, strict=True)
+    error, _ = jax.lax.scan(whole, jnp.full(strobe.shape, jnp.inf), (jnp.array(counts), jnp.stack(shares)))
     return strobe, jnp.where(jnp.isfinite(error), error, jnp.nan)
 
 
-def _change(flow: Flow, states: Array, first: int, steps: Array) -> Array:
-    """Largest change over a strobe when some of the ``states`` are carried on to the next one, shape ``(...)``."""
+def _strobes(flow: Flow, states: Array, early: Array, first: int) -> _Strobes:
+    """The first strobes from the start, and some of the section."""
+    start = jnp.stack(initial_state(flow))[None]
+    known = jnp.concatenate([start, early, states[: EARLY - len(early)]])
     begun = np.linspace(0, len(states) - 2, _TAKEN_AGAIN).astype(int)
-    number = jnp.asarray(first + 1 + begun).reshape(-1, *(1,) * (states.ndim - 2))
-    start = Frame(tuple(jnp.moveaxis(states[begun], 1, 0)))
-    ends = one_kernel(flow)(lambda steps, frame: strobe_map(flow, steps)(number, frame))(steps, start).state
-    return jnp.max(jnp.abs(jnp.stack(ends, axis=1) - states[begun + 1])[:, watched(flow)], axis=(0, 1))
+    return _Strobes(
+        np.concatenate([np.arange(len(known) - 1), first + 1 + begun]),
+        jnp.concatenate([known[:-1], states[begun]]),
+        jnp.concatenate([known[1:], states[begun + 1]]),
+    )
+
+
+def _changes(flow: Flow, strobes: _Strobes, steps: Array) -> Array:
+    """Largest change of each of the ``strobes`` when taken again by ``steps`` equal steps, shape ``(K, ...)``."""
+    number = jnp.asarray(strobes.number).reshape(-1, *(1,) * (strobes.begin.ndim - 2))
+    begin = Frame(tuple(jnp.moveaxis(strobes.begin, 1, 0)))
+    ends = one_kernel(flow)(lambda steps, frame: strobe_map(flow, steps)(number, frame))(steps, begin).state
+    return jnp.max(jnp.abs(jnp.stack(ends, axis=1) - strobes.end)[:, watched(flow)], axis=1)
+
+
+def _share(errors: Array, changes: Array) -> Array:
+    """Largest proportion of ``errors`` to considerable ``changes``, both ``(K, ...)``; 1 if nothing changes."""
+    largest = jnp.max(jnp.where(jnp.isfinite(changes), changes, 0.0), axis=0)
+    considerable = (changes > 0) & (changes >= _CONSIDERABLE * largest)
+    ratio = jnp.where(considerable, errors / jnp.where(considerable, changes, 1.0), 0.0)
+    return jnp.where(largest > 0, jnp.max(ratio, axis=0), 1.0)
 
 
 def _distance(flow: Flow, states: Array, first: int, steps: Array) -> Array:
