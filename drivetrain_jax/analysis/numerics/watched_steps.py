@@ -13,11 +13,11 @@ _State = tuple[Any, Array, Array]
 
 
 class WatchedSteps(diffrax.AbstractAdaptiveStepSizeController[_State, None]):
-    """The steps of ``controller``, of which the first is ``part`` of what it would be and the others are at most ``part``
-    of the interval ``length``.
+    """The steps of ``controller``, which are at most ``part`` of the interval ``length``; a first one of more than half of
+    that is ``part`` of what it would be.
 
     With ``part`` 1 they are those of ``controller``. With less, they differ from those even where these do not depend on the
-    tolerance: where one step takes the whole interval, or where steps grow as fast as they may.
+    tolerance: where one or two steps take the whole interval.
     """
 
     controller: diffrax.PIDController
@@ -49,8 +49,10 @@ class WatchedSteps(diffrax.AbstractAdaptiveStepSizeController[_State, None]):
     ) -> tuple[Any, _State]:
         """End of the first step, and the state."""
         end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        longest = self.part * self.length
-        return t0 + jnp.minimum(self.part * (end - t0), longest), (state, jnp.max(jnp.abs(y0)), longest)
+        longest, step = self.part * self.length, end - t0
+        # A short first step depends on the tolerance, or others do that follow it: to halve it would only cost.
+        step = jnp.where(step < longest / 2, step, jnp.minimum(self.part * step, longest))
+        return t0 + step, (state, jnp.max(jnp.abs(y0)), longest)
 
     def adapt_step_size(
         self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any, error_order: Any, state: _State
