@@ -11,6 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize_scalar, root
 
+import drivetrain_jax as dt
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import Outcome, Request, get_analysis
 from drivetrain_jax.analysis.forced import predicted_steps
@@ -355,3 +356,13 @@ def test_loosest_request_has_an_answer():
     assert found["outcome"] == Outcome.SUCCESS
     np.testing.assert_allclose(found["periodic_state"], theta, atol=1e-2 * np.abs(theta).max())
     assert np.all(np.isfinite(found["orbit_state"]))
+
+
+def test_the_error_covers_what_the_second_integration_is_wrong_by():
+    """A condition of 300 and a loose tolerance (extrapolation in extended precision with two numbers of steps)."""
+    shaft = {"beta": 1.406319971883954, "Omega": 5.025357952450546, "zeta": 0.028807120682004222, "alpha": 0.0}
+    shaft |= {"mu": 1.000570502262628, "gamma": 9.05935896640445}
+    outputs = ["periodic_state", "periodic_state_error", "amplitude"]
+    found = dt.point("cardan", "forced", **shaft, rtol=1e-2, outputs=outputs)
+    exact = [-5.05439250e-05, 7.17251239e-06, -6.41006818e-03, 8.38673975e-01]
+    assert np.abs(found.periodic_state - exact).max() < found.periodic_state_error < 1e-6
