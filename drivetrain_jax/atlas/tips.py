@@ -87,7 +87,7 @@ def find_tips(atlas: Atlas, system: System, *, opening: bool = True) -> Tips:
         x, rates = polish(criteria, search.points, kind, horizontal)
         opens = (search.curvature * search.slope < 0) == (_rises(criteria, 1 - horizontal) > 0)
         found = _describe(criteria, kind, horizontal, (x, rates, _named_at(criteria, patch, x, horizontal)), opens)
-        x, rates = _suspected(criteria, kind, horizontal, search.undecided, x)
+        x, rates = suspected(criteria, kind, horizontal, search.undecided, x)
         opens = rates.gradient[:, 1 - horizontal] * _rises(criteria, 1 - horizontal) > 0
         likely = _describe(criteria, kind, horizontal, (x, rates, _named_at(criteria, patch, x, horizontal)), opens)
         tips += [*found, *(replace(tip, proved=False) for tip in likely)]
@@ -109,9 +109,7 @@ def polish(criteria: Criteria, x: np.ndarray, kind: str, horizontal: int) -> tup
     return x, growth(criteria, x, kinds, second=True)
 
 
-def _suspected(
-    criteria: Criteria, kind: str, h: int, boxes: np.ndarray, known: np.ndarray
-) -> tuple[np.ndarray, Growth]:
+def suspected(criteria: Criteria, kind: str, h: int, boxes: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, Growth]:
     """Tips to which Newton's method leads from ``undecided`` boxes: none of the ``known`` ones, and with bounds that leave
     them within the rectangle."""
     low, high = np.sort(criteria.atlas.to_coordinates([criteria.atlas.lower, criteria.atlas.upper]), axis=0)

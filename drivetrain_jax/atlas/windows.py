@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,12 +15,14 @@ from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
 from drivetrain_jax.atlas.panels import Atlas, Gap, Panel, chebyshev, position_between
 from drivetrain_jax.atlas.patches import Patches, patches_of
 from drivetrain_jax.atlas.roots import merge, on_line, roots
-from drivetrain_jax.atlas.tips import polish
+from drivetrain_jax.atlas.tips import polish, suspected
 from drivetrain_jax.systems import System
 
 Range = tuple[float, float]
 # A part between two candidates is tested if it is so many times wider than the errors of these: its middle is beyond them.
 _WIDER = 2.0
+# The widest undecided range, relative to the whole one, that the error of a change within it may cover.
+_COVERED = 1e-3
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,7 @@ class Crossing:
     """``value`` of a parameter at which the stability changes, with a bound of its error.
 
     ``multiplier`` (``+1``, ``-1`` or ``pair``) crosses the unit circle; ``point`` holds all parameters of the atlas there.
+    In a narrow undecided range another one, at another point, may change it: the error covers the range.
     """
 
     value: float
@@ -51,13 +55,19 @@ class Interval:
         """Both ends, each with its crossing."""
         return (self.lower, self.lower_end), (self.upper, self.upper_end)
 
+    @property
+    def crossings(self) -> tuple[Crossing, ...]:
+        """Those of its ends that are known."""
+        return tuple(end for end in (self.lower_end, self.upper_end) if end)
+
 
 @dataclass(frozen=True)
 class Line:
     """``intervals`` that alternate between stable and unstable, and the ``undecided`` ranges within, between or beside them.
 
-    Where a change hides in an undecided range one interval ends, and the next one begins, with that range. So do the first
-    and the last one where the range reaches an end of the atlas. No intervals: everything is undecided.
+    Where a change hides in an undecided range that no error covers, one interval ends, and the next one begins, with that
+    range. So do the first and the last one where the range reaches an end of the atlas. No intervals: everything is
+    undecided.
     """
 
     parameter: str
@@ -101,6 +111,7 @@ def stability_over_range(atlas: Atlas, system: System, along: str) -> Line:
     criteria = Criteria.of(atlas, system)
     patches = patches_of(criteria)
     changes: list[Crossing] = []
+    suspects: list[Crossing] = []
     undecided: list[tuple[float, float]] = []
     for number, kind in enumerate(criteria.multipliers):
         search = critical_points(patches, number, h)
@@ -109,6 +120,9 @@ def stability_over_range(atlas: Atlas, system: System, along: str) -> Line:
         else:
             x, rates = polish(criteria, search.points, kind, h)
             error = rates.error / np.abs(rates.gradient[:, v])
+            likely, _ = suspected(criteria, kind, h, search.undecided, x)
+            # The range in which they are looked for is their error.
+            suspects += _crossings(atlas, likely, np.zeros(len(likely)), v, kind)
         changes += _crossings(atlas, x, error, v, kind)
         undecided += [tuple(sorted(map(float, parameters_at(atlas, box)[:, v]))) for box in search.undecided]
         for end in atlas.to_coordinates(np.stack([atlas.lower, atlas.upper]))[:, h]:
@@ -124,7 +138,7 @@ def stability_over_range(atlas: Atlas, system: System, along: str) -> Line:
     def stable(values: np.ndarray) -> np.ndarray:
         return np.array([_all_stable(criteria, patches, h, value) for value in values])
 
-    return _line(atlas.parameters[v], (atlas.lower[v], atlas.upper[v]), changes, undecided, stable)
+    return _line(atlas.parameters[v], (atlas.lower[v], atlas.upper[v]), changes, undecided, stable, suspects)
 
 
 def narrow(atlas: Atlas, bounds: Mapping[str, tuple[float, float]]) -> Atlas:
@@ -198,8 +212,16 @@ def decided(lower: float, upper: float, undecided: Iterable[Range]) -> list[Rang
     return [*left, (lower, upper)] if lower < upper else left
 
 
-def _line(name: str, ends: Range, changes: list[Crossing], undecided: list[Range], stable) -> Line:
-    """Sort candidates, test between them and keep those at which the stability changes.
+def _line(
+    name: str,
+    ends: Range,
+    changes: list[Crossing],
+    undecided: list[Range],
+    stable: Callable[[np.ndarray], np.ndarray],
+    suspects: Iterable[Crossing] = (),
+) -> Line:
+    """Sort candidates, test between them and keep those at which the stability changes; ``suspects`` are further ones in
+    undecided ranges.
 
     Between two candidates every decided part is tested: an undecided range may hide a change. Parts that are too narrow
     for a test are undecided as well, and so is what lies before the first part that is tested, and after the last one.
@@ -218,19 +240,33 @@ def _line(name: str, ends: Range, changes: list[Crossing], undecided: list[Range
     for (here, _, high), (there, low, _), before, after in zip(parts, parts[1:], states, states[1:], strict=False):
         if before == after:
             continue
-        change = _one_change(changes[here:there])
+        known = changes[here:there] + [c for c in suspects if high <= c.value <= low]
+        change = _one_change(known, (high, low), bool(after), _COVERED * (ends[1] - ends[0]))
         intervals.append(Interval(start, change.value if change else high, bool(before), first, change))
         start, first = (change.value, change) if change else (low, None)
     intervals.append(Interval(start, parts[-1][2], bool(states[-1]), first, None))
     return Line(name, tuple(intervals), joined)
 
 
-def _one_change(candidates: list[Crossing]) -> Crossing | None:
-    """The change of stability somewhere among neighbouring ``candidates``; None if nobody can say at which."""
-    if any(b.value - a.value > _least(_end(a), _end(b)) for a, b in itertools.pairwise(candidates)):
+def _one_change(candidates: list[Crossing], between: Range, rising: bool, widest: float) -> Crossing | None:
+    """The change of stability ``between`` two tested parts, the upper one stable if ``rising``: the candidate nearest to the
+    stable part, with an error that covers everything between.
+
+    None if there is no candidate, or what is undecided reaches further than the errors of the nearest ones and ``widest``.
+    """
+    if not candidates:
         return None
-    best = min(candidates, key=lambda c: _end(c)[1], default=None)
-    return best and replace(best, error=float(np.max([abs(c.value - best.value) + c.error for c in candidates])))
+    first = (max if rising else min)(candidates, key=lambda c: c.value)
+    near = [c for c in candidates if abs(c.value - first.value) <= _least(_end(c), _end(first))]
+    best = min(near, key=lambda c: _end(c)[1])
+
+    def spread(those: list[Crossing]) -> float:
+        return max(abs(c.value - best.value) + _end(c)[1] for c in those)
+
+    reach = float(max(spread(candidates), best.value - between[0], between[1] - best.value))
+    if reach > max(widest, spread(near)):
+        return None
+    return replace(best, error=math.nan if any(math.isnan(c.error) for c in candidates) else reach)
 
 
 def _tested(lower: tuple[float, float], upper: tuple[float, float], undecided: Iterable[Range]) -> tuple[list, list]:

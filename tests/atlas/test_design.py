@@ -124,6 +124,31 @@ def test_a_line_of_candidates(changes, undecided, expected):
 
 
 @pytest.mark.parametrize(
+    ("undecided", "suspects", "value", "error"),
+    [
+        # The candidate is at the end of what is undecided: the change may be anywhere in it.
+        ((0.3995, 0.4), [], 0.4, 5e-4),
+        ((0.4, 0.4004), [], 0.4, 4e-4),
+        # A likely tip is nearer to the stable part.
+        ((0.3995, 0.4), [0.3998], 0.3998, 3e-4),
+        ((0.3995, 0.4), [0.3, 0.5], 0.4, 5e-4),
+        # Too wide a range: all that is known is where it begins.
+        ((0.39, 0.4), [0.395], None, None),
+    ],
+)
+def test_the_error_of_a_change_covers_what_is_undecided_around_it(undecided, suspects, value, error):
+    given = candidates(0.4), [undecided], lambda values: values < 0.4
+    line = _line("beta", (0.0, 1.0), *given, candidates(*suspects, error=0.0))
+    below, above = line.intervals
+    assert below.stable and not above.stable
+    if value is None:
+        assert (below.upper, above.lower) == undecided and not line.crossings
+    else:
+        (crossing,) = line.crossings
+        assert (crossing.value, crossing.error) == (value, pytest.approx(error))
+
+
+@pytest.mark.parametrize(
     ("ask", "at", "left", "wanted"),
     [
         (partial(least_damping, speeds=(1.3, 1.5)), {}, "beta and Omega", "Omega and zeta"),
