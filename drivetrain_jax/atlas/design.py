@@ -10,12 +10,14 @@ All raise ``KeyError`` for parameters that the atlas lacks, ``ValueError`` for v
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax.atlas.checks import Check, Direct, End, check_ends, check_window
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.windows import (
@@ -30,44 +32,21 @@ from drivetrain_jax.atlas.windows import (
 )
 from drivetrain_jax.systems import System
 
-Direct = Callable[[Mapping[str, np.ndarray]], np.ndarray]
-
-# A check steps aside from the answer by this many error bounds, and at least by this part of the parameter's range.
-_BOUNDS, _PART = 10.0, 1e-6
-# Points over a range at which a check solves, and those at which the largest spectral radius of a window is sought.
-_SAMPLES, _DENSE = 101, 801
-# By how much direct solves may miss the unit circle.
-_ON_THE_CIRCLE = 1e-6
-
-
-@dataclass(frozen=True)
-class Check:
-    """Direct solves beside an answer: the largest spectral radius ``inside`` the range said to be stable, and ``beyond`` it.
-
-    ``beyond`` is NaN where the range ends with the atlas, or a tongue is too narrow to step into. ``agrees`` if
-    inside < 1 < beyond; without damping, where all multipliers of a stable point lie on the circle and two that meet there
-    are known to half the digits, inside is 1.
-    """
-
-    inside: float
-    beyond: float
-    solves: int
-    conservative: bool = False
-
-    @property
-    def agrees(self) -> bool:
-        """Whether the direct solves confirm the answer."""
-        within = self.inside <= 1 + _ON_THE_CIRCLE if self.conservative else self.inside < 1
-        return within and not self.beyond <= 1
+# Points over a range at which the largest spectral radius of a window is sought.
+_DENSE = 801
+# By how much rounding may part the end of an undecided range from that of the error that covers it.
+_ROUNDING = 4 * np.finfo(float).eps
 
 
 @dataclass(frozen=True)
 class Answer:
-    """``value`` of ``parameter`` with a bound of its ``error``; None if none was found.
+    """``value`` of ``parameter`` with a bound of its ``error``; None if the ``safe_end`` of the atlas, from which stability
+    has to reach to the value, is not stable itself: ``stable`` may then hold other intervals.
 
-    ``limit`` is the crossing that sets it (None: the atlas ends first), ``intervals`` lists all stable and unstable
-    ranges, ``undecided`` those that errors leave open; a value is certain only if none of them is on its safe side, and
-    that no value in the atlas will do only if none reaches the safe end.
+    ``limit`` is the crossing that sets the value. It is None where the atlas ends first, with an error of 0, and where an
+    undecided range begins, with one of NaN. ``intervals`` lists all stable and unstable ranges, ``undecided`` those that
+    errors leave open. A value is ``certain`` only if none of these is on its safe side beyond its error; without a value
+    it is certain which intervals are stable only if the errors of their ends cover all of these.
     """
 
     parameter: str
@@ -77,7 +56,13 @@ class Answer:
     intervals: tuple[Interval, ...]
     undecided: tuple[Range, ...]
     certain: bool
+    safe_end: float
     check: Check | None = None
+
+    @property
+    def stable(self) -> tuple[Interval, ...]:
+        """The stable intervals without what is undecided."""
+        return tuple(_stable_and_decided(self.intervals, self.undecided))
 
 
 @dataclass(frozen=True)
@@ -123,7 +108,7 @@ def least_damping(
     direct: Direct | None = None,
 ) -> Answer:
     """The least damping from which on, up to the atlas's largest, all ``speeds`` are stable."""
-    return _extreme(_over(atlas, system, at, "speed", "damping"), system, speeds, ("damping", 1.0), direct)
+    return _extreme(_over(atlas, system, at, "speed", "damping"), system, speeds, 1.0, direct)
 
 
 def widest_angle(
@@ -135,7 +120,7 @@ def widest_angle(
     direct: Direct | None = None,
 ) -> Answer:
     """The widest angle up to which, from the atlas's smallest on, all ``speeds`` are stable."""
-    return _extreme(_over(atlas, system, at, "speed", "angle"), system, speeds, ("angle", -1.0), direct)
+    return _extreme(_over(atlas, system, at, "speed", "angle"), system, speeds, -1.0, direct)
 
 
 def speed_windows(
@@ -152,16 +137,15 @@ def speed_windows(
     line = stability_along(part, system)
     criteria = Criteria.of(part, system)
     windows = []
-    for interval in _stable_and_decided(line):
+    for interval in _stable_and_decided(line.intervals, line.undecided):
         low, high = _shortened(interval, part, margin)
         if low >= high:
             continue
         values = np.linspace(low, high, _DENSE)
         rho = criteria.spectral_radius(part.to_coordinates(values[:, None]))
         k = int(np.argmax(rho))
-        window = Window(interval, (low, high), float(rho[k]), float(values[k]))
-        window = _checked_window(window, part, system.roles["speed"], line, direct)
-        windows.append(replace(window, check=_of_kind(window.check, criteria)))
+        check = direct and check_window((low, high), interval, line, criteria, direct)
+        windows.append(Window(interval, (low, high), float(rho[k]), float(values[k]), check))
     return Windows(tuple(windows), line.undecided)
 
 
@@ -174,7 +158,8 @@ def _over(atlas: Atlas, system: System, at: Mapping[str, float], *roles: str) ->
     return part
 
 
-def _stable_and_decided(line: Line) -> list[Interval]:
+def _stable_and_decided(intervals: Iterable[Interval], undecided: Iterable[Range]) -> list[Interval]:
+    """The stable ones of ``intervals``, cut where it is ``undecided`` unless the errors of their ends cover it."""
     return [
         replace(
             interval,
@@ -183,10 +168,21 @@ def _stable_and_decided(line: Line) -> list[Interval]:
             lower_end=interval.lower_end if low == interval.lower else None,
             upper_end=interval.upper_end if high == interval.upper else None,
         )
-        for interval in line.intervals
+        for interval in intervals
         if interval.stable
-        for low, high in decided(interval.lower, interval.upper, line.undecided)
+        for low, high in decided(interval.lower, interval.upper, _uncovered(undecided, interval.crossings))
     ]
+
+
+def _uncovered(undecided: Iterable[Range], crossings: Iterable[Crossing]) -> list[Range]:
+    """The undecided ranges that the errors of ``crossings`` do not cover."""
+    covered = [(c.value - reach, c.value + reach) for c in crossings for reach in [_reach(c)]]
+    return [(a, b) for a, b in undecided if not any(low <= a and b <= high for low, high in covered)]
+
+
+def _reach(crossing: Crossing) -> float:
+    """How far its error reaches, where it is known, and what rounding takes from that."""
+    return float(np.nan_to_num(crossing.error)) + _ROUNDING * abs(crossing.value)
 
 
 def _shortened(interval: Interval, part: Atlas, margin: float) -> Range:
@@ -219,83 +215,37 @@ def nearest_boundaries(atlas: Atlas, system: System, point: Mapping[str, float])
     return tuple(found)
 
 
-def _extreme(atlas: Atlas, system: System, speeds: Range, sought: tuple[str, float], direct: Direct | None) -> Answer:
-    """Up to where, from the last value of ``sought`` (role, side) on that side, all ``speeds`` are stable."""
-    role, side = sought
-    name, speed = system.roles[role], system.roles["speed"]
+def _extreme(atlas: Atlas, system: System, speeds: Range, side: float, direct: Direct | None) -> Answer:
+    """Up to where, from the end of the other parameter on that ``side`` on, all ``speeds`` are stable."""
+    speed = system.roles["speed"]
     part = narrow(atlas, {speed: speeds}).folded()
     line = stability_over_range(part, system, speed)
-    value, limit, certain = _from_safe_end(line, part, side)
-    answer = Answer(name, value, limit.error if limit else 0.0, limit, line.intervals, line.undecided, certain)
-    found = _checked(answer, part, speed, side, direct)
-    return replace(found, check=_of_kind(found.check, Criteria.of(part, system)))
-
-
-def _from_safe_end(line: Line, part: Atlas, side: float) -> tuple[float | None, Crossing | None, bool]:
-    """Up to where, and to which crossing, it is stable from the end on that ``side`` on, and whether that is certain."""
-    if not line.intervals:
-        return None, None, False
-    end = line.intervals[-1] if side > 0 else line.intervals[0]
-    v = part.parameters.index(line.parameter)
-    reached = end.upper == part.upper[v] if side > 0 else end.lower == part.lower[v]
-    if not end.stable:
-        return None, None, bool(reached)
-    value, limit = (end.lower, end.lower_end) if side > 0 else (end.upper, end.upper_end)
-    return value, limit, not any(max(side * a, side * b) >= side * value for a, b in _apart(line, limit))
-
-
-def _apart(line: Line, limit: Crossing | None) -> list[Range]:
-    """The undecided ranges that are not merely the surroundings of the answer itself."""
-    reach = _BOUNDS * limit.error if limit else 0.0
-    return [
-        r for r in line.undecided if limit is None or not limit.value - reach <= r[0] <= r[1] <= limit.value + reach
-    ]
-
-
-def _checked(answer: Answer, part: Atlas, speed: str, safe: float, direct: Direct | None) -> Answer:
-    """``answer`` with direct solves over the range of speeds on its safe side, and at the limit beyond it."""
-    if direct is None or answer.value is None:
-        return answer
-    h = part.parameters.index(speed)
-    v = 1 - h
-    span = part.upper[v] - part.lower[v]
-    step = max(_BOUNDS * answer.error, _PART * span)
-    speeds = np.linspace(part.lower[h], part.upper[h], _SAMPLES)
-    inner = float(np.clip(answer.value + safe * step, part.lower[v], part.upper[v]))
-    if answer.limit:
-        speeds = np.append(speeds, answer.limit.point[speed])
-    values = np.append(np.full(len(speeds), inner), answer.value - safe * step)
-    speeds = np.append(speeds, speeds[-1])
-    count = len(speeds) if answer.limit else len(speeds) - 1
-    rho = _solve(direct, part, {speed: speeds[:count], answer.parameter: values[:count]})
-    beyond = float(rho[-1]) if answer.limit else np.nan
-    inside = float(np.max(rho[: len(speeds) - 1]))
-    return replace(answer, check=Check(inside, beyond, count))
-
-
-def _checked_window(window: Window, part: Atlas, speed: str, line: Line, direct: Direct | None) -> Window:
+    answer = _from_safe_end(line, part, side)
     if direct is None:
-        return window
-    span = part.upper[0] - part.lower[0]
-    outer = []
-    for crossing, side in ((window.interval.lower_end, -1.0), (window.interval.upper_end, 1.0)):
-        if crossing:
-            value = crossing.value + side * max(_BOUNDS * crossing.error, _PART * span)
-            # Not where the step leads across a narrow tongue.
-            outer += [value] if any(i.lower < value < i.upper and not i.stable for i in line.intervals) else []
-    # The crossings are part of the window if there is no margin: step inside by as much.
-    step = _PART * span
-    inner = np.linspace(window.safe[0] + step, window.safe[1] - step, _SAMPLES)
-    rho = _solve(direct, part, {speed: np.append(inner, outer)})
-    beyond = float(np.min(rho[_SAMPLES:])) if outer else np.nan
-    return replace(window, check=Check(float(np.max(rho[:_SAMPLES])), beyond, len(rho)))
+        return answer
+    # What is stated: where there is a value its limit, otherwise both ends of every stable interval.
+    stated = answer.stable if answer.value is None else (line.intervals[-1 if side > 0 else 0],)
+    sides = (1.0, -1.0) if answer.value is None else (side,)
+    ends = [End.of(interval, inward) for interval in stated for inward in sides]
+    return replace(answer, check=check_ends(ends, line, Criteria.of(part, system), direct))
 
 
-def _of_kind(check: Check | None, criteria: Criteria) -> Check | None:
-    return check and replace(check, conservative=criteria.conservative)
+def _from_safe_end(line: Line, part: Atlas, side: float) -> Answer:
+    """Up to where, and to which crossing, it is stable from the end on that ``side`` on."""
+    k = part.parameters.index(line.parameter)
+    safe, other = (float(x[k]) for x in ((part.upper, part.lower) if side > 0 else (part.lower, part.upper)))
+    answer = Answer(line.parameter, None, math.nan, None, line.intervals, line.undecided, False, safe)
+    if not line.intervals:
+        return answer
+    last = line.intervals[-1 if side > 0 else 0]
+    if not last.stable:
+        return replace(answer, certain=not _uncovered(line.undecided, line.crossings))
+    value, limit = last.ends[0 if side > 0 else 1]
+    error = limit.error if limit else 0.0 if value == other else math.nan
+    return replace(answer, value=value, error=error, limit=limit, certain=not _doubted(line, value, limit, side))
 
 
-def _solve(direct: Direct, part: Atlas, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    size = len(next(iter(columns.values())))
-    fixed = {name: np.full(size, value) for name, value in part.fixed.items()}
-    return np.asarray(direct({**fixed, **columns}), float)
+def _doubted(line: Line, value: float, limit: Crossing | None, side: float) -> bool:
+    """Whether an undecided range reaches the safe side of ``value``, further than its error if a crossing limits it."""
+    reached = max((max(side * a, side * b) for a, b in line.undecided), default=-math.inf)
+    return reached > side * value + _reach(limit) if limit else reached >= side * value

@@ -148,6 +148,71 @@ def test_the_error_of_a_change_covers_what_is_undecided_around_it(undecided, sus
         assert (crossing.value, crossing.error) == (value, pytest.approx(error))
 
 
+# Tips that atlases at rtol 1e-11 have, to some 1e-11.
+H21, S21 = (0.5366555069660, 0.70865547138956), (0.1063331213411, 1.41598816034540)
+
+
+@pytest.mark.parametrize(
+    ("tip", "half", "error"), [(S21, 3e-7, 2e-9), (S21, 3e-6, 1e-7), (H21, 1e-6, 1e-7), (H21, 1e-3, 1e-9)]
+)
+def test_the_widest_angle_between_the_flanks_of_a_tongue(atlas, tip, half, error):
+    """At the ends of so narrow a range of speeds the tongue is no wider than what is undecided at its tip."""
+    answer = widest_angle(atlas, CARDAN, (tip[1] - half, tip[1] + half), {}, direct=direct)
+    assert abs(answer.value - tip[0]) < 1e-10
+    assert 1e-12 < answer.error < error
+    assert answer.certain and answer.check.agrees
+    assert answer.limit.point["Omega"] == pytest.approx(tip[1], abs=1e-10)
+
+
+@pytest.mark.parametrize(("beyond", "agrees"), [(0.0, True), (5e-9, False)])
+def test_a_check_looks_right_inside_the_error(atlas, monkeypatch, beyond, agrees):
+    value = S21[0] + beyond
+    limit = Crossing(value, 1e-9, "-1", {"beta": value, "Omega": S21[1]})
+    intervals = (Interval(0.0, value, True, None, limit), Interval(value, 1.1, False, limit, None))
+    monkeypatch.setattr(design, "stability_over_range", lambda *_: Line("beta", intervals, ()))
+    assert widest_angle(atlas, CARDAN, (1.3, 1.5), {}, direct=direct).check.agrees == agrees
+
+
+@pytest.mark.parametrize(
+    ("ask", "ranges", "fixed", "speeds", "ends", "safe_end"),
+    [
+        (
+            least_damping,
+            {"Omega": (1.3, 1.5), "zeta": (0.1, 20.0)},
+            {"beta": 1.0, "alpha": 0.2, "mu": 2.0, "gamma": 2.0},
+            (1.317, 1.457),
+            (0.219182068, 12.482503512),
+            20.0,
+        ),
+        (
+            widest_angle,
+            {"beta": (0.9, 1.45), "Omega": (0.5, 0.6)},
+            {"zeta": 0.01, "gamma": 1.0},
+            (0.5504, 0.5506),
+            (1.144318298, 1.357177456),
+            0.9,
+        ),
+    ],
+)
+def test_what_is_stable_away_from_an_unstable_safe_end(ask, ranges, fixed, speeds, ends, safe_end):
+    answer = ask(cardan_atlas(ranges, 1e-9, {**BASE, **fixed}).atlas, CARDAN, speeds, {}, direct=direct)
+    assert answer.value is None and np.isnan(answer.error) and answer.certain and answer.safe_end == safe_end
+    (interval,) = answer.stable
+    assert (interval.lower, interval.upper) == pytest.approx(ends, abs=1e-8)
+    assert max(c.error for c in interval.crossings) < 1e-8
+    omega, (low, high) = np.linspace(*speeds, 201), ends
+
+    def largest(value):
+        columns = {k: np.full(201, v) for k, v in {**BASE, **fixed, answer.parameter: value}.items()}
+        return direct({**columns, "Omega": omega}).max()
+
+    inside, outside = (low * 1.0001, (low + high) / 2, high * 0.9999), (low * 0.9999, high * 1.0001, safe_end)
+    assert max(map(largest, inside)) < 1 < min(map(largest, outside))
+    # 101 speeds, that of the crossing and the worst one inside either end, the last two beyond it.
+    assert answer.check.agrees and answer.check.solves == 2 * (103 + 2)
+    assert answer.check.inside < 1 < answer.check.beyond
+
+
 @pytest.mark.parametrize(
     ("ask", "at", "left", "wanted"),
     [
@@ -222,7 +287,9 @@ def test_narrow_keeps_the_function(atlas):
         narrow(atlas, {"mu": (0.3, 1.3)})
 
 
-@pytest.mark.parametrize(("undecided", "certain"), [((0.5, 0.6), True), ((0.05, 0.06), False), ((0.0999, 0.1), True)])
+@pytest.mark.parametrize(
+    ("undecided", "certain"), [((0.5, 0.6), True), ((0.05, 0.06), False), ((0.0999, 0.1), True), ((0.0995, 0.1), False)]
+)
 def test_only_what_is_undecided_on_the_safe_side_leaves_doubt(atlas, monkeypatch, undecided, certain):
     limit = Crossing(0.1, 1e-4, "-1", {"beta": 0.1, "Omega": 1.4})
     intervals = (Interval(0.0, 0.1, True, None, limit), Interval(0.1, 1.1, False, limit, None))

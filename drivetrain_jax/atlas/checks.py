@@ -1,0 +1,126 @@
+"""Checks of design answers by direct solves, which know nothing of the atlas."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivetrain_jax.atlas.criteria import Criteria
+from drivetrain_jax.atlas.panels import Atlas
+from drivetrain_jax.atlas.windows import Crossing, Interval, Line, Range
+
+Direct = Callable[[Mapping[str, np.ndarray]], np.ndarray]
+
+# The check of a window steps aside from its ends by this many error bounds, and at least by this part of the parameter's
+# range; that of the end of an interval by its bound and at least by a part that leaves direct solves the sign of rho - 1.
+_BOUNDS, _PART, _BESIDE = 10.0, 1e-6, 1e-9
+# Points over a range at which a check solves, and those at which it looks for the worst on the surrogate.
+_SAMPLES, _DENSE = 101, 801
+# By how much direct solves may miss the unit circle.
+_ON_THE_CIRCLE = 1e-6
+
+
+@dataclass(frozen=True)
+class Check:
+    """Direct solves beside an answer: the largest spectral radius ``inside`` the range said to be stable, and ``beyond`` it.
+
+    ``beyond`` is NaN where the range ends with the atlas, or a tongue is too narrow to step into. ``agrees`` if
+    inside < 1 < beyond; without damping, where all multipliers of a stable point lie on the circle and two that meet there
+    are known to half the digits, inside is 1.
+    """
+
+    inside: float
+    beyond: float
+    solves: int
+    conservative: bool = False
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the direct solves confirm the answer."""
+        within = self.inside <= 1 + _ON_THE_CIRCLE if self.conservative else self.inside < 1
+        return within and not self.beyond <= 1
+
+
+@dataclass(frozen=True)
+class End:
+    """An end ``value`` of a stable interval, which is ``room`` long and lies on the ``inward`` side (a sign)."""
+
+    value: float
+    crossing: Crossing | None
+    inward: float
+    room: float
+
+    @classmethod
+    def of(cls, interval: Interval, inward: float) -> End:
+        """The lower or the upper end of ``interval``."""
+        return cls(*interval.ends[0 if inward > 0 else 1], inward, interval.upper - interval.lower)
+
+    def step(self, span: float) -> float:
+        """How far aside to check: right outside the error, over a range of length ``span``."""
+        error = self.crossing.error if self.crossing else 0.0
+        return max(error, _BESIDE * span) if math.isfinite(error) else _PART * span
+
+
+def check_ends(ends: list[End], line: Line, criteria: Criteria, direct: Direct) -> Check | None:
+    """Direct solves right inside all ``ends`` of stable intervals of ``line``, over the whole other coordinate, and right
+    beyond, where the crossing is; either also where the surrogate is worst. None without ends."""
+    part = criteria.atlas
+    k = part.parameters.index(line.parameter)
+    other, span = part.parameters[1 - k], float(part.upper[k] - part.lower[k])
+    within = np.linspace(part.lower[1 - k], part.upper[1 - k], _SAMPLES)
+    points, outer = [], []
+    for end in ends:
+        step, at = end.step(span), [end.crossing.point[other]] if end.crossing else []
+        inner, value = end.value + end.inward * min(step, end.room / 2), end.value - end.inward * step
+        points += [(x, inner) for x in (*within, *at, _worst(criteria, k, inner))]
+        if end.crossing and _unstable(line, value):
+            outer += [(x, value) for x in (*at, _worst(criteria, k, value))]
+    if not points:
+        return None
+    columns = np.array(points + outer).T
+    rho = _solve(direct, part, {other: columns[0], line.parameter: columns[1]})
+    inside, beyond = np.split(rho, [len(points)])
+    return _check(inside, beyond.reshape(-1, 2).max(axis=1), criteria, len(rho))
+
+
+def _worst(criteria: Criteria, k: int, value: float) -> float:
+    """Where the surrogate's spectral radius is largest over the other coordinate than ``k``, which has ``value``."""
+    part = criteria.atlas
+    others = np.linspace(part.lower[1 - k], part.upper[1 - k], _DENSE)
+    rho = criteria.spectral_radius(part.to_coordinates(np.insert(others[:, None], k, value, axis=1)))
+    return float(others[np.argmax(np.nan_to_num(rho))])
+
+
+def check_window(safe: Range, interval: Interval, line: Line, criteria: Criteria, direct: Direct) -> Check:
+    """Direct solves within ``safe``, a part of the stable ``interval``, and in the unstable ones of ``line`` beside it."""
+    part = criteria.atlas
+    span = float(part.upper[0] - part.lower[0])
+    outer = []
+    for crossing, side in ((interval.lower_end, -1.0), (interval.upper_end, 1.0)):
+        if crossing:
+            value = crossing.value + side * max(_BOUNDS * crossing.error, _PART * span)
+            outer += [value] if _unstable(line, value) else []
+    # The crossings are part of the window if there is no margin: step inside by as much.
+    step = _PART * span
+    inner = np.linspace(safe[0] + step, safe[1] - step, _SAMPLES)
+    rho = _solve(direct, part, {line.parameter: np.append(inner, outer)})
+    return _check(rho[:_SAMPLES], rho[_SAMPLES:], criteria, len(rho))
+
+
+def _unstable(line: Line, value: float) -> bool:
+    """Whether ``line`` is said to be unstable at ``value``, which a step may have led across a narrow tongue."""
+    return any(i.lower < value < i.upper and not i.stable for i in line.intervals)
+
+
+def _check(inside: np.ndarray, beyond: np.ndarray, criteria: Criteria, solves: int) -> Check:
+    least = float(beyond.min()) if beyond.size else math.nan
+    return Check(float(inside.max()), least, solves, criteria.conservative)
+
+
+def _solve(direct: Direct, part: Atlas, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    size = len(next(iter(columns.values())))
+    fixed = {name: np.full(size, value) for name, value in part.fixed.items()}
+    return np.asarray(direct({**fixed, **columns}), float)
