@@ -17,13 +17,15 @@ from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.atlas import design
 from drivetrain_jax.atlas.criteria import has_boundaries
 from drivetrain_jax.atlas.sensitivity import Sensitivity, direct_sensitivity
-from drivetrain_jax.atlas.windows import Crossing
+from drivetrain_jax.atlas.windows import Crossing, Interval
 from drivetrain_jax.sweep.atlas_file import StoredAtlas, as_given
 from drivetrain_jax.sweep.physical import nondimensional
 
 Range = tuple[float, float]
 # How closely a given parameter has to be what the atlas was made with.
 _SAME = 1e-9
+# What is said of the end of a stable interval that is not a change of stability.
+_BEYOND = {"crossing": "", "atlas": " (the end of the atlas)", "undecided": " (undecided beyond)"}
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,8 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
 
 
 def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Reply:
-    """The least damping from which on a range of speeds is stable. Raises as :func:`query`.
+    """The least damping from which on a range of speeds is stable, or the ranges of damping for which it is where the
+    atlas's largest damping is unstable. Raises as :func:`query`.
 
     Of a cardan shaft in physical units only the ratio ``c2/c1`` of the dampings given is used; the answer is ``c1`` with it.
     """
@@ -91,17 +94,18 @@ def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Rep
     answer = design.least_damping(
         atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.radius
     )
-    return _answered("least damping", "from {} on", asked, answer)
+    return _answered("least damping", "from {} on", "largest", asked, answer)
 
 
 def widest_angle(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Reply:
-    """The widest joint angle up to which a range of speeds is stable. Raises as :func:`query`."""
+    """The widest joint angle up to which a range of speeds is stable, or the ranges of angles for which it is where the
+    atlas's smallest angle is unstable. Raises as :func:`query`."""
     speed, angle = _roles(atlas, "speed", "angle")
     asked = _Asked.of(atlas, given, ranges=(speed,), free=(angle,))
     answer = design.widest_angle(
         atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.radius
     )
-    return _answered("widest angle", "up to {}", asked, answer)
+    return _answered("widest angle", "up to {}", "smallest", asked, answer)
 
 
 def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float = 0.0) -> Reply:
@@ -116,7 +120,7 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
     lines = [f"safe speeds, {asked.heading()}, margin {margin:g}"]
     for w in found.windows:
         ends = " to ".join(
-            asked.named(speed, value) + _beyond(atlas, speed, *end)
+            asked.named(speed, value) + _BEYOND[_kind(atlas, speed, *end)]
             for value, end in zip(w.safe, w.interval.ends, strict=True)
         )
         lines.append(f"  {ends}; largest spectral radius {w.largest:.10g} at {speed} = {_number(w.where)}")
@@ -129,6 +133,7 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
             {
                 "safe": list(w.safe),
                 "physical": asked.physical({speed: w.safe}),
+                "ends": _ends(asked, speed, w.interval),
                 "largest": w.largest,
                 "where": w.where,
                 "check": _check(w.check),
@@ -142,11 +147,32 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
     return Reply("\n".join(lines), data)
 
 
-def _beyond(atlas: StoredAtlas, name: str, end: float, crossing: Crossing | None) -> str:
-    """What ends a window, if stability does not."""
+def _kind(atlas: StoredAtlas, name: str, end: float, crossing: Crossing | None) -> str:
+    """What ends a stable interval: a ``crossing``, the end of the ``atlas``, or what is ``undecided``."""
     if crossing:
-        return ""
-    return " (the end of the atlas)" if abs(end) in map(abs, atlas.ranges[name]) else " (undecided beyond)"
+        return "crossing"
+    low, high = atlas.ranges[name]
+    # Of an angle the modulus counts.
+    return "atlas" if abs(end) in {abs(low), abs(high), *([0.0] if low < 0 < high else [])} else "undecided"
+
+
+def _ends(asked: _Asked, name: str, interval: Interval) -> list[dict[str, Any]]:
+    """Both ends of a stable interval as data; ``error`` and ``multiplier`` are those of a crossing."""
+    return [
+        {
+            "value": value,
+            "kind": _kind(asked.atlas, name, value, crossing),
+            "error": crossing.error if crossing else None,
+            "multiplier": crossing.multiplier if crossing else None,
+        }
+        for value, crossing in interval.ends
+    ]
+
+
+def _bounded(asked: _Asked, name: str, value: float, crossing: Crossing | None) -> str:
+    """An end of a stable interval in words, with its error."""
+    bound = f" +- {crossing.error:.1e}" if crossing else _BEYOND[_kind(asked.atlas, name, value, crossing)]
+    return asked.named(name, value) + bound
 
 
 def _roles(atlas: StoredAtlas, *roles: str) -> list[str]:
@@ -273,36 +299,52 @@ def _check_range(words: _Words, ends: Range, value: Any, wanted: bool) -> None:
         raise InputError(f"{words.name} = {words.given(value)}: allowed is a rising range")
 
 
-def _answered(title: str, phrase: str, asked: _Asked, answer: design.Answer) -> Reply:
+def _answered(title: str, phrase: str, safe: str, asked: _Asked, answer: design.Answer) -> Reply:
+    """``phrase`` says where the value lies, ``safe`` which value of the atlas is the safe end."""
+    name = answer.parameter
     lines = [f"{title}, {asked.heading()}"]
-    if answer.value is None:
-        none = "of the atlas will do" if answer.certain else "found; whether there is one is undecided"
-        lines.append(f"  no {answer.parameter} {none}")
+    if answer.value is not None:
+        lines.append(f"  stable {phrase.format(_bounded(asked, name, answer.value, answer.limit))}")
+    elif answer.stable:
+        lines += _elsewhere(safe, asked, answer)
     else:
-        bound = (
-            f" +- {answer.error:.1e}" if answer.limit else _beyond(asked.atlas, answer.parameter, answer.value, None)
-        )
-        lines.append(f"  stable {phrase.format(asked.named(answer.parameter, answer.value))}{bound}")
-        if answer.limit:
-            where = ", ".join(f"{n} = {_number(v)}" for n, v in answer.limit.point.items())
-            lines.append(f"  limit: multiplier {answer.limit.multiplier} at {where}")
-        if not answer.certain:
-            lines.append("  not certain: undecided ranges lie on the stable side")
+        none = "of the atlas will do" if answer.certain else "found; whether there is one is undecided"
+        lines.append(f"  no {name} {none}")
+    if answer.limit:
+        where = ", ".join(f"{n} = {_number(v)}" for n, v in answer.limit.point.items())
+        lines.append(f"  limit: multiplier {answer.limit.multiplier} at {where}")
+    if answer.check:
+        lines += [] if answer.certain else ["  not certain: undecided ranges reach beyond the errors"]
         lines.append(f"  {_checked(answer.check)}")
     lines += [f"  undecided from {_number(a)} to {_number(b)}" for a, b in answer.undecided]
     data = {
         "question": title.replace(" ", "_"),
         "parameters": {**asked.atlas.fixed, **asked.values},
-        "parameter": answer.parameter,
+        "parameter": name,
         "value": answer.value,
-        "physical": {} if answer.value is None else asked.physical({answer.parameter: answer.value}),
+        "physical": {} if answer.value is None else asked.physical({name: answer.value}),
         "error": answer.error,
         "certain": answer.certain,
-        "limit": _crossing(asked, answer.parameter, answer.limit),
+        "limit": _crossing(asked, name, answer.limit),
+        "intervals": [
+            {"physical": asked.physical({name: (i.lower, i.upper)}), "ends": _ends(asked, name, i)}
+            for i in answer.stable
+        ],
         "undecided": [list(r) for r in answer.undecided],
         "check": _check(answer.check),
     }
     return Reply("\n".join(lines), data)
+
+
+def _elsewhere(safe: str, asked: _Asked, answer: design.Answer) -> list[str]:
+    """That the safe end is not stable, and which intervals are."""
+    name, end = answer.parameter, answer.safe_end
+    unstable = any(i.lower <= end <= i.upper for i in answer.intervals)
+    lines = [f"  {'unstable' if unstable else 'undecided'} at {asked.named(name, end)}, the {safe} of the atlas"]
+    for interval in answer.stable:
+        lower, upper = (_bounded(asked, name, *each) for each in interval.ends)
+        lines.append(f"  stable from {lower} to {upper}")
+    return lines
 
 
 def _gradient_lines(atlas: StoredAtlas, slopes: Sensitivity) -> list[str]:

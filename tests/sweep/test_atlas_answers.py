@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import cache
 
@@ -23,14 +24,14 @@ CARDAN = get_system("cardan")
 
 
 @cache
-def panels(beta: tuple, omega: tuple, rtol: float = 1e-9, zeta: float = 0.001) -> xr.Dataset:
+def panels(beta: tuple, omega: tuple, rtol: float = 1e-9, zeta: float = 0.001, gamma: float = 100.0) -> xr.Dataset:
     axes = {"beta": beta, "Omega": omega}
     return dt.run(
         {
             "system": "cardan",
             "analysis": "atlas",
             "axes": {name: {"start": low, "stop": high} for name, (low, high) in axes.items()},
-            "fixed": {"zeta": zeta, "alpha": 1.0, "mu": 1.0, "gamma": 100.0},
+            "fixed": {"zeta": zeta, "alpha": 1.0, "mu": 1.0, "gamma": gamma},
             "options": {"rtol": rtol},
         }
     )
@@ -153,6 +154,56 @@ def test_only_what_is_certain_is_denied():
     )
     none = atlas_answers.widest_angle(atlas_of((0.3, 1.2), (0.3, 2.0)), {"Omega": (1.3, 1.5)})
     assert "\n  no beta of the atlas will do" in str(none) and none.data["certain"]
+
+
+def test_stable_intervals_away_from_the_safe_end_are_listed():
+    """At beta = .9 a tongue covers all speeds; it closes at 1.144."""
+    atlas = atlas_of((0.9, 1.45), (0.5, 0.6), zeta=0.01, gamma=1.0)
+    reply = atlas_answers.widest_angle(atlas, {"Omega": (0.5504, 0.5506)})
+    assert "\n  unstable at beta = 0.9, the smallest of the atlas\n  stable from beta = 1.144318298 +- " in str(reply)
+    assert " to beta = 1.357177456 +- " in str(reply) and "will do" not in str(reply)
+    assert "\n  direct solves agree" in str(reply)
+    found = json.loads(reply.to_json())
+    assert found["value"] is None and found["error"] is None and found["certain"] and found["check"]["agrees"]
+    ((low, high),) = (interval["ends"] for interval in found["intervals"])
+    assert [low["value"], high["value"]] == pytest.approx([1.1443182976, 1.3571774558], abs=1e-8)
+    assert [low["multiplier"], high["multiplier"]] == ["pair", "-1"] and low["kind"] == high["kind"] == "crossing"
+    assert 0 < max(low["error"], high["error"]) < 1e-8
+    shaft = {"J1": 2.0, "J2": 2.0, "k1": 1000.0, "k2": 1000.0, "c1": 0.894427191, "c2": 0.894427191}
+    degrees = atlas_answers.widest_angle(atlas, {**shaft, "Omega": (0.5504, 0.5506)}).data["intervals"][0]["physical"]
+    assert degrees["angle"]["value"] == pytest.approx([65.564609, 77.760540], abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("speeds", "kind", "value"), [((1.3, 1.5), "crossing", S21[0]), ((1.415, 1.417), "undecided", 0.1062824374)]
+)
+def test_an_answer_says_what_ends_it(speeds, kind, value):
+    """On a loose atlas the tip of S21 is undecided from .10628 to .10640, in a narrow range of speeds to .11255."""
+    reply = atlas_answers.widest_angle(atlas_of((0.0, 1.3), (0.15, 2.0), rtol=1e-5), {"Omega": speeds})
+    found = json.loads(reply.to_json())
+    start, end = found["intervals"][0]["ends"]
+    assert start == {"value": 0.0, "kind": "atlas", "error": None, "multiplier": None} and end["kind"] == kind
+    assert found["value"] == end["value"] == pytest.approx(value, abs=1e-7) and found["error"] == end["error"]
+    decided = kind == "crossing"
+    assert found["certain"] == decided and found["check"]["agrees"]
+    assert (end["multiplier"], found["limit"] is None) == (("-1", False) if decided else (None, True))
+    if decided:
+        assert abs(value - S21[0]) < found["error"] < 1e-4
+    else:
+        assert found["error"] is None and value < S21[0] and " (undecided beyond)\n  not certain" in str(reply)
+
+
+def test_windows_say_what_ends_them():
+    found = atlas_answers.speed_windows(atlas_of((0.0, 1.3), (0.15, 2.0), rtol=1e-5), {"beta": 0.894981})
+    windows = json.loads(found.to_json())["windows"]
+    kinds = [[end["kind"] for end in window["ends"]] for window in windows]
+    assert kinds[0] == ["atlas", "crossing"] and kinds[-1] == ["crossing", "atlas"]
+    assert any("undecided" in both for both in kinds)
+    for window in windows:
+        for safe, end, sign in zip(window["safe"], window["ends"], (1, -1), strict=True):
+            crossed = end["kind"] == "crossing"
+            assert (end["error"] is not None) == (end["multiplier"] is not None) == crossed
+            assert safe == pytest.approx(end["value"] + sign * (end["error"] if crossed else 0.0), abs=1e-12)
 
 
 def test_answers_without_damping_agree_with_direct_solves():
