@@ -14,7 +14,7 @@ import numpy as np
 
 from drivetrain_jax.atlas.criteria import LIMITING, Criteria, parameters_at
 from drivetrain_jax.atlas.exclusion import critical_points
-from drivetrain_jax.atlas.growth import growth, monodromy_error
+from drivetrain_jax.atlas.growth import growth, limiting, monodromy_error
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.patches import Patches, patches_of
 from drivetrain_jax.atlas.roots import on_line, roots
@@ -149,16 +149,18 @@ def _finish(criteria: Criteria, patches: Patches, field: Field, kind: str, curve
         kind,
         dict(zip(atlas.parameters, point.T, strict=True)),
         dict(zip(atlas.parameters, error.T, strict=True)),
-        np.log(criteria.spectral_radius(x)) <= LIMITING + _rate_error(criteria, x),
+        _limiting(criteria, x, kind),
         curve.closed,
     )
 
 
-def _rate_error(criteria: Criteria, x: np.ndarray) -> np.ndarray:
-    """Error of the growth rate where two multipliers are one, without damping: the square root of that of Z."""
+def _limiting(criteria: Criteria, x: np.ndarray, kind: str) -> np.ndarray:
+    """Whether points of a curve bound the stable region."""
     if not criteria.conservative:
-        return np.zeros(len(x))
-    return np.sqrt(monodromy_error(criteria, x, criteria.propagator(x)))
+        return limiting(criteria, x, growth(criteria, x, [kind] * len(x)))
+    # Where two multipliers are one, without damping, the error of the growth rate is the square root of that of Z.
+    error = np.sqrt(monodromy_error(criteria, x, criteria.propagator(x)))
+    return np.log(criteria.spectral_radius(x)) <= LIMITING + error
 
 
 def _polish(criteria: Criteria, field: Field, kind: str, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

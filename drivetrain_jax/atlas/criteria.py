@@ -31,8 +31,8 @@ from drivetrain_jax.atlas.panels import Atlas, Panel, derivative, position
 from drivetrain_jax.systems import System
 
 PLUS, MINUS, PAIR = "+1", "-1", "pair"
-# A zero bounds the stable region if no multiplier grows faster than this, which rounding makes of none at all; others lie
-# in a region that is unstable anyway.
+# A zero bounds the stable region if no multiplier grows; others lie in a region that is unstable anyway. However large the
+# errors of the growth, one that is faster than this is no error.
 LIMITING = 1e-6
 _STATES = 4
 # Points for which the determinant is computed at once: few shapes, hence few compilations.

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivetrain_jax.atlas.criteria import MINUS, PLUS, Criteria, monodromy
+from drivetrain_jax.atlas.criteria import LIMITING, MINUS, PLUS, Criteria, monodromy
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,15 @@ def growth(criteria: Criteria, x: np.ndarray, kinds: list[str], *, second: bool 
     error = monodromy_error(criteria, x, phi) * size / np.abs(s)
     with np.errstate(invalid="ignore"):
         return Growth(np.log(np.abs(s)), (ds / s[:, None]).real, hessian, s, error)
+
+
+def limiting(criteria: Criteria, x: np.ndarray, own: Growth) -> np.ndarray:
+    """Whether at ``x``, where the multipliers of ``own`` are on the unit circle but for their rates, none grows beyond that
+    and the errors, ``(N,)``. With little damping the rates within a tongue are small."""
+    largest = growth(criteria, x, ["largest"] * len(x))
+    with np.errstate(invalid="ignore"):
+        bound = np.fmin(np.abs(own.rate) + own.error + largest.error, LIMITING)
+        return np.log(criteria.spectral_radius(x)) <= bound
 
 
 def _second(criteria: Criteria, x: np.ndarray, phi: np.ndarray, first: list, dz: list, eigen: tuple) -> np.ndarray:

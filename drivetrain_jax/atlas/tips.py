@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivetrain_jax.atlas.criteria import LIMITING, Criteria, parameters_at
+from drivetrain_jax.atlas.criteria import Criteria, parameters_at
 from drivetrain_jax.atlas.exclusion import critical_points
-from drivetrain_jax.atlas.growth import Growth, growth
+from drivetrain_jax.atlas.growth import Growth, growth, limiting
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.patches import Patches, patches_of
 from drivetrain_jax.atlas.ridges import feet
@@ -135,14 +135,14 @@ def _solve(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _describe(criteria: Criteria, kind: str, h: int, points: tuple, opens: np.ndarray) -> list[Tip]:
-    """The tips among the zeros of one function: those where no other multiplier is larger."""
+    """The tips among the zeros of one function: those where no multiplier grows."""
     x, rates, compared = points
     atlas, system = criteria.atlas, criteria.system
-    largest = np.log(criteria.spectral_radius(x))
+    bounding = limiting(criteria, x, rates)
     errors = _errors(rates, h)
     found = []
     for i in range(len(x)):
-        if not largest[i] <= LIMITING:
+        if not bounding[i]:
             continue
         point, slope = parameters_at(atlas, x[i]), [c.slope for c in atlas.coordinates]
         scale = np.array([abs(float(slope[k](point[k]))) for k in range(2)])

@@ -369,3 +369,15 @@ def test_what_cannot_be_followed_is_said(chart):
     assert np.isnan([outside.spectral_radius, *outside.gradient.values()]).all() and not outside.exists
     with pytest.raises(KeyError, match="Omega"):
         atlas_sensitivity(chart.atlas, CARDAN, {"beta": 1.0})
+
+
+def test_with_little_damping_what_lies_in_a_tongue_bounds_nothing():
+    """The edge of the tongue of -1 runs through that of a pair, in which multipliers grow by no more than 7e-8."""
+    fixed = {**BASE, "zeta": 1e-5, "mu": 3.0}
+    atlas = cardan_atlas({"beta": (1.0, 1.2), "Omega": (1.45, 1.6)}, 1e-11, fixed).atlas
+    (minus,) = (b for b in boundaries(atlas, CARDAN) if b.multiplier == "-1")
+    columns = {**{name: np.full(len(minus.limiting), v) for name, v in fixed.items()}, **minus.points}
+    rho = np.abs(np.linalg.eigvals(monodromy(propagators(columns, 1e-13)))).max(axis=1)
+    inside = rho > 1 + 1e-8
+    assert inside.sum() > 30 and rho.max() < 1 + 1e-7 and not minus.limiting[inside].any()
+    assert minus.limiting[rho < 1 + 1e-10].all() and (rho < 1 + 1e-10).sum() > 30
