@@ -22,6 +22,8 @@ from drivetrain_jax.sweep.atlas_file import StoredAtlas, as_given
 from drivetrain_jax.sweep.physical import nondimensional
 
 Range = tuple[float, float]
+# Distance of a spectral radius from 1 that would be lost among its digits.
+_CLOSE = 1e-3
 # How closely a given parameter has to be what the atlas was made with.
 _SAME = 1e-9
 # What is said of the end of a stable interval that is not a change of stability.
@@ -397,11 +399,16 @@ def _check(check: design.Check | None) -> dict[str, Any] | None:
 
 
 def _checked(check: design.Check) -> str:
-    beyond = "" if math.isnan(check.beyond) else f", {check.beyond:.10g} beyond it"
+    inside = f"spectral radius at most {_from_one(check.inside)} inside"
+    beyond = "" if math.isnan(check.beyond) else f", {_from_one(check.beyond)} beyond it"
     verdict = "agree" if check.agrees else "DISAGREE"
-    return (
-        f"direct solves {verdict}: spectral radius at most {check.inside:.10g} inside{beyond} ({check.solves} solves)"
-    )
+    return f"direct solves {verdict}: {inside}{beyond} ({check.solves} solves)"
+
+
+def _from_one(radius: float) -> str:
+    """Next to a boundary the digits of a spectral radius are those of its distance from 1."""
+    apart = radius - 1
+    return f"{radius:.6g}" if not 0 < abs(apart) < _CLOSE else f"1 {'+' if apart > 0 else '-'} {abs(apart):.1e}"
 
 
 def _plain(value: Any) -> Any:

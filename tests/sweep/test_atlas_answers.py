@@ -15,6 +15,7 @@ from drivetrain_jax.atlas import design, stability
 from drivetrain_jax.atlas.sensitivity import direct_sensitivity
 from drivetrain_jax.atlas.tiles import tiles
 from drivetrain_jax.sweep import atlas_answers
+from drivetrain_jax.sweep.atlas_answers import _from_one
 from drivetrain_jax.sweep.atlas_chart import chart
 from drivetrain_jax.sweep.atlas_file import StoredAtlas
 from drivetrain_jax.systems import get_system
@@ -265,3 +266,10 @@ def test_steps_of_a_gradient_are_found_where_the_system_predicts_none():
     assert found.spectral_radius == pytest.approx(exact.spectral_radius, rel=1e-11)
     for name, slope in exact.gradient.items():
         assert found.gradient[name] == pytest.approx(slope, rel=1e-5, abs=1e-9), name
+
+
+@pytest.mark.parametrize(
+    ("radius", "text"), [(1 - 2.04e-10, "1 - 2.0e-10"), (1 + 5e-7, "1 + 5.0e-07"), (0.9, "0.9"), (1.0, "1")]
+)
+def test_distance_from_one_is_not_lost_among_digits(radius, text):
+    assert _from_one(radius) == text
