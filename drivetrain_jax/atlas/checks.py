@@ -18,7 +18,7 @@ Direct = Callable[[Mapping[str, np.ndarray]], np.ndarray]
 # range; that of the end of an interval by its bound and at least by a part that leaves direct solves the sign of rho - 1.
 _BOUNDS, _PART, _BESIDE = 10.0, 1e-6, 1e-9
 # Points over a range at which a check solves, and those at which it looks for the worst on the surrogate.
-_SAMPLES, _DENSE = 101, 801
+_SAMPLES, DENSE = 101, 801
 # By how much direct solves may miss the unit circle.
 _ON_THE_CIRCLE = 1e-6
 
@@ -89,7 +89,7 @@ def check_ends(ends: list[End], line: Line, criteria: Criteria, direct: Direct) 
 def _worst(criteria: Criteria, k: int, value: float) -> float:
     """Where the surrogate's spectral radius is largest over the other coordinate than ``k``, which has ``value``."""
     part = criteria.atlas
-    others = np.linspace(part.lower[1 - k], part.upper[1 - k], _DENSE)
+    others = np.linspace(part.lower[1 - k], part.upper[1 - k], DENSE)
     rho = criteria.spectral_radius(part.to_coordinates(np.insert(others[:, None], k, value, axis=1)))
     return float(others[np.argmax(np.nan_to_num(rho))])
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.atlas.checks import Check, Direct, End, check_ends, check_window
+from drivetrain_jax.atlas.checks import DENSE, Check, Direct, End, check_ends, check_window
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.windows import (
@@ -32,8 +32,6 @@ from drivetrain_jax.atlas.windows import (
 )
 from drivetrain_jax.systems import System
 
-# Points over a range at which the largest spectral radius of a window is sought.
-_DENSE = 801
 # By how much rounding may part the end of an undecided range from that of the error that covers it.
 _ROUNDING = 4 * np.finfo(float).eps
 
@@ -141,7 +139,7 @@ def speed_windows(
         low, high = _shortened(interval, part, margin)
         if low >= high:
             continue
-        values = np.linspace(low, high, _DENSE)
+        values = np.linspace(low, high, DENSE)
         rho = criteria.spectral_radius(part.to_coordinates(values[:, None]))
         k = int(np.argmax(rho))
         check = direct and check_window((low, high), interval, line, criteria, direct)

@@ -1,14 +1,13 @@
-"""Questions to an atlas in words: what holds at a point, how far stability reaches, and what a design has to be.
+"""Answers of an atlas in words: what holds at a point, how far stability reaches, and what a design has to be.
 
-Parameters may be given as those of the atlas, or in the physical units of the system (``drivetrain_jax.systems``:
-``physical``). Every design answer is checked by direct solves.
+Every design answer is checked by direct solves. What may be asked: :mod:`~drivetrain_jax.sweep.atlas_question`.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,14 +17,11 @@ from drivetrain_jax.atlas import design
 from drivetrain_jax.atlas.criteria import has_boundaries
 from drivetrain_jax.atlas.sensitivity import Sensitivity, direct_sensitivity
 from drivetrain_jax.atlas.windows import Crossing, Interval
-from drivetrain_jax.sweep.atlas_file import StoredAtlas, as_given
-from drivetrain_jax.sweep.physical import nondimensional
+from drivetrain_jax.sweep.atlas_file import StoredAtlas
+from drivetrain_jax.sweep.atlas_question import Asked, Range, number, roles_of
 
-Range = tuple[float, float]
 # Distance of a spectral radius from 1 that would be lost among its digits.
 _CLOSE = 1e-3
-# How closely a given parameter has to be what the atlas was made with.
-_SAME = 1e-9
 # What is said of the end of a stable interval that is not a change of stability.
 _BEYOND = {"crossing": "", "atlas": " (the end of the atlas)", "undecided": " (undecided beyond)"}
 
@@ -51,7 +47,7 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
     The gradient is by direct solves and with respect to every parameter of the system. Raises :class:`InputError` for
     names and values that the atlas does not cover, :class:`ChunkError` if a direct solve fails.
     """
-    asked = _Asked.of(atlas, given, ranges=())
+    asked = Asked.of(atlas, given, ranges=())
     point = asked.values
     found = atlas(**point)
     results = {str(name): v.values[()] for name, v in found.data_vars.items()}
@@ -65,7 +61,7 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
     for each in nearest:
         sides = [_side(asked, each.parameter, each.value, c) for c in (each.below, each.above) if c]
         lines.append(f"  {each.parameter:<24} {'; '.join(sides) or _reach(atlas, each)}")
-        lines += [f"  {'':<24} undecided from {_number(a)} to {_number(b)}" for a, b in each.undecided]
+        lines += [f"  {'':<24} undecided from {number(a)} to {number(b)}" for a, b in each.undecided]
     data = {
         "system": atlas.scene.system.name,
         "parameters": {**atlas.fixed, **point},
@@ -91,8 +87,8 @@ def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Rep
 
     Of a cardan shaft in physical units only the ratio ``c2/c1`` of the dampings given is used; the answer is ``c1`` with it.
     """
-    speed, damping = _roles(atlas, "speed", "damping")
-    asked = _Asked.of(atlas, given, ranges=(speed,), free=(damping,))
+    speed, damping = roles_of(atlas, "speed", "damping")
+    asked = Asked.of(atlas, given, ranges=(speed,), free=(damping,))
     answer = design.least_damping(
         atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.radius
     )
@@ -102,8 +98,8 @@ def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Rep
 def widest_angle(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Reply:
     """The widest joint angle up to which a range of speeds is stable, or the ranges of angles for which it is where the
     atlas's smallest angle is unstable. Raises as :func:`query`."""
-    speed, angle = _roles(atlas, "speed", "angle")
-    asked = _Asked.of(atlas, given, ranges=(speed,), free=(angle,))
+    speed, angle = roles_of(atlas, "speed", "angle")
+    asked = Asked.of(atlas, given, ranges=(speed,), free=(angle,))
     answer = design.widest_angle(
         atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.radius
     )
@@ -114,8 +110,8 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
     """The stable ranges of speed, shortened by ``margin`` of the speed at either end. Raises as :func:`query`."""
     if not 0 <= margin < 1:
         raise InputError(f"margin = {margin!r}: allowed is 0 <= margin < 1")
-    (speed,) = _roles(atlas, "speed")
-    asked = _Asked.of(atlas, given, ranges=(), free=(speed,))
+    (speed,) = roles_of(atlas, "speed")
+    asked = Asked.of(atlas, given, ranges=(), free=(speed,))
     found = design.speed_windows(
         atlas.stability.atlas, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.radius
     )
@@ -125,7 +121,7 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
             asked.named(speed, value) + _BEYOND[_kind(atlas, speed, *end)]
             for value, end in zip(w.safe, w.interval.ends, strict=True)
         )
-        lines.append(f"  {ends}; largest spectral radius {w.largest:.10g} at {speed} = {_number(w.where)}")
+        lines.append(f"  {ends}; largest spectral radius {w.largest:.10g} at {speed} = {number(w.where)}")
         lines.append(f"    {_checked(w.check)}")
     data = {
         "question": "speed_windows",
@@ -145,7 +141,7 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
         "undecided": [list(r) for r in found.undecided],
     }
     lines += [] if found.windows else ["  none within the atlas"]
-    lines += [f"  undecided from {_number(a)} to {_number(b)}" for a, b in found.undecided]
+    lines += [f"  undecided from {number(a)} to {number(b)}" for a, b in found.undecided]
     return Reply("\n".join(lines), data)
 
 
@@ -158,7 +154,7 @@ def _kind(atlas: StoredAtlas, name: str, end: float, crossing: Crossing | None) 
     return "atlas" if abs(end) in {abs(low), abs(high), *([0.0] if low < 0 < high else [])} else "undecided"
 
 
-def _ends(asked: _Asked, name: str, interval: Interval) -> list[dict[str, Any]]:
+def _ends(asked: Asked, name: str, interval: Interval) -> list[dict[str, Any]]:
     """Both ends of a stable interval as data; ``error`` and ``multiplier`` are those of a crossing."""
     return [
         {
@@ -171,137 +167,13 @@ def _ends(asked: _Asked, name: str, interval: Interval) -> list[dict[str, Any]]:
     ]
 
 
-def _bounded(asked: _Asked, name: str, value: float, crossing: Crossing | None) -> str:
+def _bounded(asked: Asked, name: str, value: float, crossing: Crossing | None) -> str:
     """An end of a stable interval in words, with its error."""
     bound = f" +- {crossing.error:.1e}" if crossing else _BEYOND[_kind(asked.atlas, name, value, crossing)]
     return asked.named(name, value) + bound
 
 
-def _roles(atlas: StoredAtlas, *roles: str) -> list[str]:
-    """The parameters with these roles in the system."""
-    system = atlas.scene.system
-    for role in roles:
-        if role not in system.roles:
-            raise InputError(f"file: {system.name} names no {role}; allowed is a system that does")
-    return [system.roles[role] for role in roles]
-
-
-@dataclass(frozen=True)
-class _Asked:
-    """What was given, as parameters of the atlas (numbers, or ranges), and the physical data behind it."""
-
-    atlas: StoredAtlas
-    values: Mapping[str, Any]
-    shaft: Any
-
-    @classmethod
-    def of(
-        cls, atlas: StoredAtlas, given: Mapping[str, Any], ranges: tuple[str, ...], free: tuple[str, ...] = ()
-    ) -> _Asked:
-        """``ranges`` names the parameters of which a range is wanted, ``free`` those that are the answer."""
-        shaft, values = nondimensional(atlas.scene.system, given)
-        for name, value in given.items():
-            if _meant(name, value, shaft) in free:
-                raise InputError(f"{name} = {as_given(value)}: is what is asked for; allowed is to leave it out")
-        for name in (*ranges, *free):
-            if name not in atlas.parameters:
-                raise InputError(
-                    f"file: the atlas does not vary {name}; allowed is one over {', '.join((*ranges, *free))}"
-                )
-        for name, value in values.items():
-            if name in atlas.fixed and name not in free:
-                _check_same(name, value, atlas.fixed[name])
-        own = {name: value for name, value in values.items() if name in atlas.parameters and name not in free}
-        for name in values:
-            if name not in atlas.parameters and name not in atlas.fixed:
-                physical = atlas.scene.system.physical
-                atlas.refuse(name, values[name], *atlas.fixed, *(physical.names if physical else ()))
-        for name in atlas.parameters:
-            if name not in free:
-                _check_range(_Words.of(atlas, shaft, name), atlas.ranges[name], own.get(name), name in ranges)
-        return cls(atlas, own, shaft)
-
-    def numbers(self) -> dict[str, float]:
-        """The values that are numbers."""
-        return {name: value for name, value in self.values.items() if not isinstance(value, tuple)}
-
-    def heading(self) -> str:
-        everything = {**self.values, **self.atlas.fixed}
-        return ", ".join(
-            f"{name} = {_number(v[0])} to {_number(v[1])}" if isinstance(v, tuple) else f"{name} = {_number(v)}"
-            for name, v in everything.items()
-        )
-
-    def named(self, name: str, value: float) -> str:
-        """``beta = 0.31 (17.76 deg)``"""
-        physical = self.shaft.quantity(name, value) if self.shaft else None
-        aside = f" ({physical[0]} = {_number(physical[1])} {physical[2]})" if physical else ""
-        return f"{name} = {_number(value)}{aside}"
-
-    def physical(self, values: Mapping[str, float | Range]) -> dict[str, Any]:
-        """``values`` in the units that were given, by their names there; empty where none were."""
-        found = {}
-        for name, value in values.items() if self.shaft else ():
-            ends = [self.shaft.quantity(name, end) for end in (value if isinstance(value, tuple) else (value,))]
-            if ends[0] is not None:
-                numbers = [number for _, number, _ in ends]
-                found[ends[0][0]] = {"value": numbers if isinstance(value, tuple) else numbers[0], "units": ends[0][2]}
-        return found
-
-
-def _meant(name: str, value: Any, shaft: Any) -> str:
-    """The parameter that ``name`` gives, itself or in another unit."""
-    if shaft is None or name not in shaft.operation:
-        return name
-    return shaft.parameter(name, value[0] if isinstance(value, tuple) else value)[0]
-
-
-def _check_same(name: str, value: Any, fixed: float) -> None:
-    if isinstance(value, tuple) or not math.isclose(value, fixed, rel_tol=_SAME):
-        raise InputError(
-            f"{name} = {as_given(value)}: the atlas is made for {name} = {_number(fixed)}; allowed is that value"
-        )
-
-
-@dataclass(frozen=True)
-class _Words:
-    """How messages name a parameter of the atlas, its range and its values: in the units that were given."""
-
-    name: str
-    allowed: str
-    convert: Callable[[float], float] = lambda value: value
-
-    @classmethod
-    def of(cls, atlas: StoredAtlas, shaft: Any, name: str) -> _Words:
-        physical = [shaft.quantity(name, end) for end in atlas.ranges[name]] if shaft else [None, None]
-        if physical[0] is None or physical[0][0] not in shaft.operation:
-            return cls(name, atlas.allowed(name))
-        (label, low, units), (_, high, _) = physical
-        allowed = f"{low:.10g} <= {label} <= {high:.10g}, in {units}"
-        return cls(label, allowed, lambda value: shaft.quantity(name, value)[1])
-
-    def given(self, value: Any) -> str:
-        """A value or a range as it was given."""
-        ends = value if isinstance(value, tuple) else (value,)
-        shown = tuple(self.convert(end) if isinstance(end, float) else end for end in ends)
-        return as_given(shown if isinstance(value, tuple) else shown[0])
-
-
-def _check_range(words: _Words, ends: Range, value: Any, wanted: bool) -> None:
-    allowed = f"allowed is {f'{words.name}=LOW:HIGH within ' if wanted else ''}{words.allowed}"
-    if value is None:
-        raise InputError(f"{words.name}: missing; {allowed}")
-    if isinstance(value, tuple) != wanted:
-        needed = "a range is needed" if wanted else "is a range"
-        raise InputError(f"{words.name} = {words.given(value)}: {needed}; {allowed}")
-    for end in value if wanted else (value,):
-        if isinstance(end, bool) or not isinstance(end, (int, float)) or not ends[0] <= end <= ends[1]:
-            raise InputError(f"{words.name} = {words.given(end)}: {allowed}")
-    if wanted and not value[0] < value[1]:
-        raise InputError(f"{words.name} = {words.given(value)}: allowed is a rising range")
-
-
-def _answered(title: str, phrase: str, safe: str, asked: _Asked, answer: design.Answer) -> Reply:
+def _answered(title: str, phrase: str, safe: str, asked: Asked, answer: design.Answer) -> Reply:
     """``phrase`` says where the value lies, ``safe`` which value of the atlas is the safe end."""
     name = answer.parameter
     lines = [f"{title}, {asked.heading()}"]
@@ -313,12 +185,12 @@ def _answered(title: str, phrase: str, safe: str, asked: _Asked, answer: design.
         none = "of the atlas will do" if answer.certain else "found; whether there is one is undecided"
         lines.append(f"  no {name} {none}")
     if answer.limit:
-        where = ", ".join(f"{n} = {_number(v)}" for n, v in answer.limit.point.items())
+        where = ", ".join(f"{n} = {number(v)}" for n, v in answer.limit.point.items())
         lines.append(f"  limit: multiplier {answer.limit.multiplier} at {where}")
     if answer.check:
         lines += [] if answer.certain else ["  not certain: undecided ranges reach beyond the errors"]
         lines.append(f"  {_checked(answer.check)}")
-    lines += [f"  undecided from {_number(a)} to {_number(b)}" for a, b in answer.undecided]
+    lines += [f"  undecided from {number(a)} to {number(b)}" for a, b in answer.undecided]
     data = {
         "question": title.replace(" ", "_"),
         "parameters": {**asked.atlas.fixed, **asked.values},
@@ -338,7 +210,7 @@ def _answered(title: str, phrase: str, safe: str, asked: _Asked, answer: design.
     return Reply("\n".join(lines), data)
 
 
-def _elsewhere(safe: str, asked: _Asked, answer: design.Answer) -> list[str]:
+def _elsewhere(safe: str, asked: Asked, answer: design.Answer) -> list[str]:
     """That the safe end is not stable, and which intervals are."""
     name, end = answer.parameter, answer.safe_end
     unstable = any(i.lower <= end <= i.upper for i in answer.intervals)
@@ -364,7 +236,7 @@ def _gradient_lines(atlas: StoredAtlas, slopes: Sensitivity) -> list[str]:
     ]
 
 
-def _side(asked: _Asked, name: str, value: float, crossing: Crossing) -> str:
+def _side(asked: Asked, name: str, value: float, crossing: Crossing) -> str:
     where = "below" if crossing.value <= value else "above"
     return f"{abs(crossing.value - value):.6g} {where}: {asked.named(name, crossing.value)} +- {crossing.error:.1e}"
 
@@ -373,14 +245,10 @@ def _reach(atlas: StoredAtlas, nearest: design.Nearest) -> str:
     low, high = atlas.ranges[nearest.parameter]
     # Stability may change within a range that is undecided.
     elsewhere = ", unless where it is undecided:" if nearest.undecided else ""
-    return f"none from {_number(low)} to {_number(high)}{elsewhere}"
+    return f"none from {number(low)} to {number(high)}{elsewhere}"
 
 
-def _number(value: float) -> str:
-    return f"{value:.10g}"
-
-
-def _crossing(asked: _Asked, name: str, crossing: Crossing | None) -> dict[str, Any] | None:
+def _crossing(asked: Asked, name: str, crossing: Crossing | None) -> dict[str, Any] | None:
     if crossing is None:
         return None
     return {

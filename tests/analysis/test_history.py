@@ -141,7 +141,8 @@ def test_outcome_does_not_depend_on_the_outputs():
     assert outcomes == [Outcome.TOLERANCE_NOT_MET] * 2
 
 
-def check_no_drift(end: float) -> None:
+@pytest.mark.parametrize("end", [0.75, pytest.param(16.5, marks=pytest.mark.full)])
+def test_phase_does_not_drift(end):
     """Excitation at 3200 Hz and motor at 300 Hz repeat after 32 strobes: so does the settled motion."""
     fixed = FIXED | {"equation": "29", "zeta": 0.03, "chi_n": 0.3, "excitation_frequency": 3200.0}
     options = {"times": [0.5, end], "rtol": 1e-11}
@@ -150,15 +151,6 @@ def check_no_drift(end: float) -> None:
     assert float(ds.phi[0]) > 1e-5
     assert float(ds.phi[1] - ds.phi[0]) == pytest.approx(0, abs=1e-12 * 1e-4)
     assert float(ds.velocity[1] - ds.velocity[0]) == pytest.approx(0, abs=1e-12 * 1.0)
-
-
-def test_phase_does_not_drift():
-    check_no_drift(0.75)
-
-
-@pytest.mark.full
-def test_phase_does_not_drift_over_51200_strobes():
-    check_no_drift(16.5)
 
 
 @pytest.mark.parametrize(

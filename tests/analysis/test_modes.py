@@ -35,8 +35,10 @@ def random_angles(rng: np.random.Generator, count: int, n: int) -> np.ndarray:
     return np.sort(rng.uniform(0, 2 * math.pi, (count, n)), axis=1)
 
 
-def check_counts(count: int, n: int) -> None:
+@pytest.mark.parametrize("n", [n if n == 5 else pytest.param(n, marks=pytest.mark.full) for n in range(3, 13)])
+def test_random_spacings_have_the_right_count_of_planet_modes(n):
     """Three planet modes N - 3 times, one rigid rotation, and nothing pure beside them."""
+    count = 30
     ds = run_angles(random_angles(np.random.default_rng(n), count, n), MODES)
     types, frequency = ds.mode_type.values, ds.natural_frequency.values
     assert ((types == PLANET).sum(1) == 3 * (n - 3)).all()
@@ -47,17 +49,6 @@ def check_counts(count: int, n: int) -> None:
         np.testing.assert_allclose(
             alone, np.broadcast_to(np.array([1808.18102, 5963.76033, 6981.70503])[:, None], alone.shape), rtol=1e-6
         )
-
-
-@pytest.mark.parametrize("n", [5])
-def test_random_spacings_have_the_right_count_of_planet_modes(n):
-    check_counts(30, n)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("n", range(3, 13))
-def test_300_random_spacings(n):
-    check_counts(30, n)
 
 
 def test_labels_do_not_flip_with_tiny_changes_of_spacing():
