@@ -69,6 +69,8 @@ SINGULAR_SHARPNESS = 1e-11
 # Relative error from which a periodic solution counts as not found.
 NOT_FOUND = 1e-2
 FORCING_SAMPLES = 64
+# Points of a chunk: of the linear response; of orbits, where one that takes hundreds of corrections keeps others waiting.
+CHUNK, ORBITS_CHUNK = 128, 16
 
 
 class Response(NamedTuple):
@@ -231,7 +233,8 @@ def _matrices(build: Build, values: Mapping[str, Any]) -> Array:
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     build = system.models["forced"].build
     steps = partial(predicted_steps, build)
-    return (Solver("diffrax", partial(_solve, build, request), steps, chunk=128, march=True, short_loops=True),)
+    chunk = CHUNK if set(request.outputs) <= set(LINEAR) else ORBITS_CHUNK
+    return (Solver("diffrax", partial(_solve, build, request), steps, chunk=chunk, march=True, short_loops=True),)
 
 
 ANALYSIS = Analysis(

@@ -299,6 +299,33 @@ def test_no_orbit_without_restoring_force():
     assert found.outcome == Outcome.NOT_CONVERGED
 
 
+def test_lanes_that_wait_take_no_steps():
+    """One lane needs few corrections of many steps, the other one many of few: a batch must not take many of many."""
+    calls = []
+
+    def orbit_of(stiffness, force):
+        def field(t, y):
+            jax.debug.callback(lambda _: calls.append(1), t)
+            return jnp.stack([y[1], force * jnp.cos(t) - 0.05 * y[1] - stiffness * y[0] - y[0] ** 3])
+
+        response = jnp.stack([force / (stiffness - 1), 0.0 * force])
+        return shoot(field, response, 2 * math.pi, 1e-10).corrections
+
+    def counted(function, *arguments):
+        calls.clear()
+        corrections = np.asarray(jax.jit(function)(*arguments))
+        jax.effects_barrier()
+        return len(calls), corrections
+
+    stiffness, force = jnp.array([4e3, 1.3]), jnp.array([1.0, 3.0])
+    alone = [counted(orbit_of, a, b) for a, b in zip(stiffness, force, strict=True)]
+    calls_of_both, corrections = counted(jax.vmap(orbit_of), stiffness, force)
+    assert corrections.tolist() == [int(n) for _, n in alone]
+    assert corrections[1] > 10 * corrections[0] and alone[0][0] > alone[1][0]
+    # A batch calls the field for each of its lanes.
+    assert calls_of_both / 2 < 1.1 * sum(n for n, _ in alone)
+
+
 def test_looser_target_is_met():
     values = {k: np.float64(v) for k, v in (BASE | {"beta": 0.8, "Omega": 1.3}).items()}
     loose, sharp = jax.jit(lambda v: solver(LINEAR, rtol=1e-5).solve(v, 0))(values), linear_only(values)

@@ -164,7 +164,9 @@ def shoot(field: Field, response: Array, period: float, rtol: float) -> Orbit:
         return ~s.found & onwards & (s.total < MAX_CORRECTIONS)
 
     def correct(s: _Path) -> _Path:
-        step = transition(extended, s.point, period, jnp.where(s.last, rtol, WAYPOINT_RTOL))
+        # In a batch the loop goes on until the last lane is done: the others wait, and no step is taken for them.
+        span = jnp.where(running(s), period, 0.0)
+        step = transition(extended, s.point, span, jnp.where(s.last, rtol, WAYPOINT_RTOL))
         # Either lambda is fixed at 1, or the correction is normal to the path.
         constraint = jnp.where(s.last, jnp.zeros(n + 1).at[n].set(1.0), s.tangent)
         system = (jnp.eye(n + 1) - step.matrix).at[n].set(constraint)
