@@ -45,6 +45,19 @@ CASES = {
     },
     "elastic joint on a support": EQUAL | SUPPORTED | {"length": (1.498,) * 2, "k_joint": 875.0, "k_hinge": 0.296},
     "Timoshenko": EQUAL | SUPPORTED | SHEAR | {"EI": (1.0, 4.0), "k_hinge": 1.0, "k_joint": 100.0},
+    # At the joint slope and shear force, scaled, are larger than deflection and moment.
+    "soft joint with a heavy mass": EQUAL
+    | {
+        "EI": (10.0, 10.0),
+        "rhoA": (0.1, 10.0),
+        "k_A": 0.1,
+        "k_joint": 1.0,
+        "k_D": INF,
+        "m_joint": 100.0,
+        "k_hinge": 1.0,
+    },
+    "soft joint on a stiff support": EQUAL
+    | {"EI": (1.0, 0.1), "rhoA": (10.0, 0.1), "k_A": 100.0, "k_joint": 1000.0, "k_D": 0.1, "k_hinge": 0.1},
     "one joint of three": FOUR | SUPPORTED | {"k_hinge": (INF, 291.0, INF)},
     "hinges over rigid supports": FOUR | SUPPORTED | {"k_hinge": (0.0, 2.0, 0.0), "k_joint": (0.0, INF, 0.0)},
 }

@@ -162,7 +162,8 @@ def _across_joint(shaft: Shaft, q: Array, i: int, before: Array, after: Array) -
         theta, moment, force = theta * scales.b[side], moment * scales.e2[side], force * scales.e3[side]
         return f, (hold * theta + half * turn * moment) / b, moment / e2, (keep * force - half * reaction * f) / e3
 
-    pairs = zip(shared(before, i - 1, -0.5), shared(after, i, 0.5), strict=True)
+    # In the states of the planes M and F are those of the second and third derivative: theta rises, F falls.
+    pairs = zip(shared(before, i - 1, 0.5), shared(after, i, -0.5), strict=True)
     return sign_of(sum(left * right for left, right in pairs))
 
 
