@@ -24,12 +24,11 @@ from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.numerics.lanes import in_blocks, lane_count, with_path
 from drivetrain_jax.analysis.numerics.singular_values import EPS, Bidiagonal, bidiagonal_form, bidiagonal_values
 from drivetrain_jax.analysis.spectra.mode_types import (
-    CLUSTER,
     MODE_TYPES,
     BlockModes,
     block_modes,
-    clusters,
     mode_types,
+    one_frequency,
 )
 from drivetrain_jax.analysis.spectra.tracking import follow
 from drivetrain_jax.systems import FAMILIES, Block, SpringSystem, System
@@ -182,7 +181,9 @@ def _results(build: Build, request: Request, values: Mapping[str, Any], lanes: i
             results["mode_shape"] = jnp.swapaxes(vectors / jnp.sqrt(mass), 0, 1)
             results["kinetic_energy"] = _by_body(vectors, model.bodies)
             results["vectors"] = vectors
-        kept = {*request.outputs, "outcome"} | ({"vectors", "natural_frequency"} if followed else set())
+        if followed:
+            results["equal"] = one_frequency(modes.frequency, largest)
+        kept = {*request.outputs, "outcome"} | ({"vectors", "equal"} if followed else set())
         return {name: value for name, value in results.items() if name in kept}
 
     sample = _blocks(build(_first_lane(values)), request.method)
@@ -221,15 +222,8 @@ def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Ar
         for name, value in _results(build, request, values, length * lanes).items()
     }
     if _FOLLOWED & set(request.outputs):
-        frequency = results["natural_frequency"]
-        results["branch"], results["mac"] = follow(results["vectors"], _equal(frequency))
+        results["branch"], results["mac"] = follow(results["vectors"], results["equal"])
     return {name: results[name] for name in wanted}
-
-
-def _equal(frequency: Array) -> Array:
-    """Which modes share one frequency, (L, n, n, N), from (L, n, N)."""
-    turned = jnp.swapaxes(frequency, 0, 1)
-    return jnp.moveaxis(clusters(turned, CLUSTER * turned[1:]), 2, 0)
 
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:

@@ -306,6 +306,17 @@ def test_mac_is_high_and_frequencies_stay_rising(tracked):
     assert tracked["mode"].values.tolist() == list(range(1, 22))
 
 
+def test_rigid_modes_are_followed_as_one_space():
+    """A gear without any bearing has 13 of them, whose vectors are arbitrary at every point: the space moves little."""
+    free = dict.fromkeys(("k_p", "k_s", "k_r", "k_c", "k_su", "k_ru", "k_cu"), 0.0)
+    scene = {"system": "planetary", "analysis": "modes", "outputs": ["mode_type", "branch", "mac"]}
+    angles = {"pressure_angle": {"start": 0.1, "stop": 1.2, "num": 9}}
+    fixed = free | {"planet_angle": [0.0, 1.5, 3.1, 4.7]}
+    ds = dt.run(scene | {"axes": angles, "fixed": fixed, "options": {"track": "pressure_angle"}})
+    assert ((ds.mode_type.values == RIGID).sum(1) == 13).all()
+    assert ds.mac.values[:, :13].min() > 0.95
+
+
 def refusal(**changes) -> str:
     scene = {"system": "planetary", "analysis": "modes", "outputs": ["natural_frequency"], "fixed": {}} | changes
     with pytest.raises(dt.InputError) as error:

@@ -4,11 +4,12 @@ With the mass-normalised mode u of frequency f the derivative with respect to an
 
     df = u^T (dK - (2 pi f)^2 dM) u / (8 pi^2 f),      for a stiffness:  df/dk_j = (b_j^T u)^2 / (8 pi^2 f),
 
-evaluated spring by spring, so that no stiffness matrix is formed. Frequencies that form a cluster have no derivatives
-of their own: a change of the parameters splits them along the eigenvalues of the matrix u_i^T (dK - (2 pi f)^2 dM) u_j,
-which :func:`directional_derivatives` gives for one direction. What is linear in the direction, and therefore a
-gradient, is their mean: :func:`natural_frequencies` gives every member of a cluster the derivative of the cluster's
-mean.
+evaluated spring by spring, so that no stiffness matrix is formed. Derivatives by stiffnesses and masses are as exact as
+the mode; those by angles, in which the forces of stiff springs cancel, have errors of eps (f_max/f)^2 f. Frequencies
+that form a cluster have no derivatives of their own: a change of the parameters splits them along the eigenvalues of
+the matrix u_i^T (dK - (2 pi f)^2 dM) u_j, which :func:`directional_derivatives` gives for one direction. What is linear
+in the direction, and therefore a gradient, is their mean: :func:`natural_frequencies` gives every member of a cluster
+the derivative of the cluster's mean.
 
 >>> import jax, drivetrain_jax.systems.planetary as planetary
 >>> from drivetrain_jax.analysis.spectra.mode_gradients import natural_frequencies
@@ -32,7 +33,7 @@ from drivetrain_jax.analysis.modes import largest_frequency, system_modes
 from drivetrain_jax.analysis.numerics.lanes import lane_count
 from drivetrain_jax.analysis.numerics.linear_algebra import looped_matmul
 from drivetrain_jax.analysis.numerics.singular_vectors import jacobi_vectors
-from drivetrain_jax.analysis.spectra.mode_types import CLUSTER, clusters, is_rigid
+from drivetrain_jax.analysis.spectra.mode_types import is_rigid, one_frequency
 from drivetrain_jax.systems import SpringSystem
 
 Build = Callable[[Mapping[str, Any]], SpringSystem]
@@ -44,17 +45,18 @@ def natural_frequencies(build: Build, values: Mapping[str, Any]) -> Array:
 
     ``build`` makes the spring system from ``values`` (for the planetary gear ``planetary.build`` and all its
     parameters, ``planet_angle`` a tuple). Differentiable forwards and backwards with respect to every value;
-    derivatives of clusters are those of their mean, that of a rigid mode is zero. NaN where a value is not finite.
+    derivatives of clusters are those of their mean, that of a rigid mode is zero, also by the stiffness of a spring that
+    holds it, where f grows as sqrt(k) and has none. NaN where a value is not finite.
     """
-    return _frequencies_and_vectors(build, values)[0]
+    return _frequencies_and_shapes(build, values)[0]
 
 
 @natural_frequencies.defjvp
 def _jvp(build: Build, primals: tuple[Any], tangents: tuple[Any]) -> tuple[Array, Array]:
     (values,), (directions,) = primals, tangents
-    frequency, vectors, still = _frequencies_and_vectors(build, values)
-    _, squares = jax.jvp(lambda p: _in_vectors(build(p), vectors), (values,), (directions,))
-    near = _near(frequency)
+    frequency, shapes, largest, still = _frequencies_and_shapes(build, values)
+    _, squares = jax.jvp(lambda p: _excess(build(p), shapes, frequency), (values,), (directions,))
+    near = one_frequency(frequency, largest)
     mean = jnp.sum(near * squares[None], axis=1) / jnp.sum(near, axis=1)
     return frequency, _per_frequency(mean, frequency, still)
 
@@ -65,14 +67,15 @@ def directional_derivatives(build: Build, values: Mapping[str, Any], directions:
     ``directions`` has the structure of ``values``. In a cluster: the derivatives of the branches that leave it in this
     direction, rising.
     """
-    frequency, vectors, still = _frequencies_and_vectors(build, values)
-    lanes = vectors if vectors.ndim == 3 else vectors[:, :, None]
-    near = _near(frequency if frequency.ndim == 2 else frequency[:, None])
-    _, matrix = jax.jvp(lambda p: _in_vectors(build(p), vectors, mixed=True), (dict(values),), (dict(directions),))
+    frequency, shapes, largest, still = _frequencies_and_shapes(build, values)
+    near = one_frequency(frequency, largest).reshape(*frequency.shape[:1] * 2, -1)
+    _, matrix = jax.jvp(
+        lambda p: _excess(build(p), shapes, frequency, mixed=True), (dict(values),), (dict(directions),)
+    )
     matrix = jnp.where(near, matrix.reshape(*near.shape), 0.0)
     # Made positive, its singular vectors are its eigenvectors.
     lift = jnp.sqrt(jnp.sum(matrix**2, axis=(0, 1)))
-    turned, _ = jacobi_vectors(matrix + lift * jnp.eye(lanes.shape[1])[:, :, None])
+    turned, _ = jacobi_vectors(matrix + lift * jnp.eye(len(frequency))[:, :, None])
     slopes = jnp.sum(turned * looped_matmul(matrix, turned), axis=0)
     number = jnp.argmax(near, axis=1)
     order = jnp.lexsort((slopes, number), axis=0)
@@ -81,35 +84,40 @@ def directional_derivatives(build: Build, values: Mapping[str, Any], directions:
 
 
 @partial(jax.jit, static_argnums=0)
-def _frequencies_and_vectors(build: Build, values: Mapping[str, Any]) -> tuple[Array, Array, Array]:
-    """Frequencies in Hz (n, ...), mass-weighted vectors (dofs, n, ...) and which modes are rigid (n, ...)."""
+def _frequencies_and_shapes(build: Build, values: Mapping[str, Any]) -> tuple[Array, Array, Array, Array]:
+    """Frequencies in Hz (n, ...), shapes of unit modal mass (dofs, n, ...), an upper bound of the frequencies (...) and
+    which modes are rigid (n, ...)."""
     model, lanes = build(values), lane_count(values)
     modes = system_modes(model, "auto", lanes)
     frequency = jnp.where(modes.found, modes.frequency / (2 * math.pi), jnp.nan)
-    still = is_rigid(modes.frequency, largest_frequency(model, lanes))
+    largest = largest_frequency(model, lanes)
+    mass = model.mass.reshape(*model.mass.shape[:1], 1, -1)
+    results = (frequency, modes.vectors / jnp.sqrt(mass), largest / (2 * math.pi), is_rigid(modes.frequency, largest))
     single = all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(dict(values)))
-    results = (frequency, modes.vectors, still)
     return tuple(x[..., 0] for x in results) if single else results
 
 
-def _in_vectors(model: SpringSystem, vectors: Array, mixed: bool = False) -> Array:
-    """``v^T M^(-1/2) K M^(-1/2) v`` of the columns (n, ...), or of all pairs of them (n, n, ...)."""
-    lanes = vectors.shape[2:]
+def _excess(model: SpringSystem, shapes: Array, frequency: Array, mixed: bool = False) -> Array:
+    """``u^T (K - (2 pi f)^2 M) u`` of the columns (n, ...) of ``shapes``, or of all pairs of them (n, n, ...).
 
-    def fit(array: Array) -> Array:
-        return array.reshape(*array.shape, *(1,) * (1 + len(lanes) - array.ndim))
+    Zero but for rounding; its derivative at fixed shapes is that of ``(2 pi f)^2``.
+    """
 
-    shapes = vectors / jnp.sqrt(fit(model.mass))[:, None]
-    extensions = model.extensions.reshape(*model.extensions.shape, *(1,) * (2 + len(lanes) - model.extensions.ndim))
-    stretched = jnp.sum(extensions[:, :, None] * shapes[None], axis=1)
-    weighted = fit(model.stiffness)[:, None] * stretched
+    def spread(array: Array, axes: int) -> Array:
+        return array.reshape(*array.shape[:axes], 1, *array.shape[axes:], *(1,) * (shapes.ndim - array.ndim - 2 + axes))
+
+    stretched = jnp.sum(spread(model.extensions, 2) * shapes[None], axis=1)
+    forces, momenta = spread(model.stiffness, 1) * stretched, spread(model.mass, 1) * shapes
+    omega = 2 * math.pi * frequency
     if mixed:
-        return jnp.sum(stretched[:, :, None] * weighted[:, None], axis=0)
-    return jnp.sum(stretched * weighted, axis=0)
+        elastic, inertial = (_products(*pair) for pair in ((stretched, forces), (shapes, momenta)))
+        return elastic - omega[:, None] * omega[None] * inertial
+    return jnp.sum(stretched * forces, axis=0) - omega**2 * jnp.sum(shapes * momenta, axis=0)
 
 
-def _near(frequency: Array) -> Array:
-    return clusters(frequency, CLUSTER * frequency[1:] + jnp.finfo(float).eps * frequency[-1:])
+def _products(a: Array, b: Array) -> Array:
+    """``a^T b`` (n, n, ...) of columns."""
+    return jnp.sum(a[:, :, None] * b[:, None], axis=0)
 
 
 def _per_frequency(squares: Array, frequency: Array, still: Array) -> Array:

@@ -83,6 +83,11 @@ def clusters(frequency: Array, tolerance: Array) -> Array:
     return number[:, None] == number[None]
 
 
+def one_frequency(frequency: Array, largest: Array) -> Array:
+    """Which modes (n, n, ...) count as one cluster of the system whose largest frequency is ``largest`` (...)."""
+    return clusters(frequency, jnp.maximum(CLUSTER * frequency[1:], _ROUNDING * EPS * largest))
+
+
 def _turned(block: Block, vectors: Array, near: Array, further: np.ndarray | float) -> Array:
     """``vectors`` turned within clusters ``near`` until they are as pure as they can be.
 
