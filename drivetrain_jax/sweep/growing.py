@@ -274,9 +274,20 @@ def _positions(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     right = np.clip(np.searchsorted(rising, wanted), 0, len(rising) - 1)
     left = np.maximum(right - 1, 0)
     nearest = np.where(abs(rising[left] - wanted) < abs(rising[right] - wanted), left, right)
-    spacing = np.gradient(rising) if len(rising) > 1 else np.zeros(1)
-    room = _ROUNDINGS * (abs(rising) + len(rising) * spacing)
-    return np.where(abs(rising[nearest] - wanted) <= room[nearest], order[nearest], -1)
+    sought, place = np.unique(np.asarray(wanted, float), return_inverse=True)
+    own, other = _extents(rising)[nearest], _extents(sought)[place]
+    # Only what lies between the ends of an axis is rounded as they are; of two such axes neither may blur the other.
+    extent = np.where((own > 0) & (other > 0), np.minimum(own, other), np.maximum(own, other))
+    room = _ROUNDINGS * (abs(rising[nearest]) + extent)
+    return np.where(abs(rising[nearest] - wanted) <= room, order[nearest], -1)
+
+
+def _extents(rising: np.ndarray) -> np.ndarray:
+    """Length of the even axis on which each of these values would have its nearest neighbour; 0 for both ends, which are
+    exact."""
+    gaps = np.diff(rising)
+    between = np.minimum(gaps[1:], gaps[:-1]) * len(rising)
+    return np.pad(between, 1)[: len(rising)] if len(rising) > 1 else np.zeros(len(rising))
 
 
 def _same_rows(grid: Grid, other: Grid) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,7 @@ from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.store import checksums
 from drivetrain_jax.sweep.executor import Where
+from drivetrain_jax.sweep.growing import _positions
 from drivetrain_jax.sweep.run import Interrupted, run_to_file
 from drivetrain_jax.sweep.status import status
 
@@ -68,6 +69,42 @@ def test_only_new_points_are_computed(tmp_path, large, new):
     assert agree(path, large).attrs["reused_points"] == 22
     assert status(large, path).state == "complete"
     assert counts(run_to_file(large, path)) == (total, 0, total)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "shared"),
+    [
+        ([1e-3, 1e16], [1e-3, 1.0, 1e16], 2),
+        ([1e-3, 1e14], [0.02, 1e14], 1),
+        ([1.0, 2.0, 1e16], [1.0, 2.5, 1e16], 2),
+        ([1.0, 2.0, 1e16], [2.5], 0),
+    ],
+)
+def test_values_far_apart_do_not_blur_small_ones(tmp_path, old, new, shared):
+    path, large = tmp_path / "r.nc", scene({"b": new}, {"a": 1.0})
+    run_to_file(scene({"b": old}, {"a": 1.0}), path)
+    if shared:
+        assert run_to_file(large, tmp_path / "l.nc", reuse=[path]).reused == shared
+        agree(tmp_path / "l.nc", large)
+    else:
+        with pytest.raises(InputError, match="none of the points"):
+            run_to_file(large, tmp_path / "l.nc", reuse=[path])
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (np.linspace(-1, 1, 7), np.linspace(-1, 1, 31)),
+        (np.linspace(0, 1, 11), np.linspace(-1, 1, 21)),
+        (np.linspace(-0.3, 0.6, 10), np.linspace(0.6, -0.3, 91)),
+        (np.geomspace(1e-9, 1e9, 7), np.geomspace(1e-9, 1e9, 37)),
+        (np.linspace(-1, 1, 21), np.array([0.0])),
+    ],
+)
+def test_roundings_of_an_even_axis_are_no_difference(old, new):
+    few, many = sorted((old, new), key=len)
+    assert (_positions(many, few) >= 0).all()
+    assert (_positions(few, many) >= 0).sum() == len(few)
 
 
 def test_values_are_taken_not_computed(tmp_path):
