@@ -359,6 +359,17 @@ def test_gradients_of_parts_that_are_independent():
     assert np.isnan(np.asarray(derivative(jnp.array([1.0, 1.0, 2.0]))[0])[:2]).all()
 
 
+def test_a_multiple_frequency_has_no_derivative_where_the_modes_end_within_it():
+    """Two equal hinged spans over rigid supports: asked for one mode, the second is still there."""
+
+    def first(EI: jax.Array) -> jax.Array:
+        return angular_frequencies(Shaft(jnp.ones(2), EI, jnp.ones(2), jnp.full(3, jnp.inf), None, jnp.zeros(1)), 1)[0]
+
+    slope = jax.jit(jax.grad(first))
+    assert np.isnan(np.asarray(slope(jnp.array([1.0, 1.0])))).all()
+    np.testing.assert_allclose(slope(jnp.array([1.0, 1.0 + 1e-9])), [np.pi**2 / 2, 0.0], atol=1e-5)
+
+
 def test_separation_margin():
     margin = separation_margin(jnp.array([0.0, 900.0, 1000.0, 1500.0, 2000.0, 3000.0]), 1000.0, 2000.0)
     np.testing.assert_allclose(margin, [1.0, 0.1, 0.0, 0.0, 0.0, 0.5], rtol=1e-15)

@@ -193,15 +193,17 @@ def _square_roots_jvp(modes: int, primals: tuple[Shaft], tangents: tuple[Shaft])
     section = jnp.argmin(jnp.abs(psi / along_q), axis=0)[None]
     along_shaft, along_q = (jnp.take_along_axis(x, section, axis=0)[0] for x in (along_shaft, along_q))
     # A factor, so that NaN passes backwards too.
-    slope = -along_shaft / along_q * jnp.where(_multiple(q), jnp.nan, 1.0)
+    slope = -along_shaft / along_q * jnp.where(_multiple(*jax.lax.stop_gradient((shaft, q))), jnp.nan, 1.0)
     return q, jnp.where(moving, slope, 0.0)
 
 
-def _multiple(q: Array) -> Array:
-    """Which frequencies agree with a neighbour to rounding."""
+def _multiple(shaft: Shaft, q: Array) -> Array:
+    """Which frequencies agree with a neighbour to rounding, the one after the last of them among these."""
     near = q[1:] - q[:-1] <= _MULTIPLE * q[1:]
     none = jnp.zeros_like(q[:1], bool)
-    return jnp.concatenate([none, near]) | jnp.concatenate([near, none])
+    above = jnp.where(q[-1:] > 0, q[-1:] * (1 + _MULTIPLE), 1.0)
+    beyond = (q[-1:] > 0) & (characteristic(shaft, above).count > len(q))
+    return jnp.concatenate([none, near]) | jnp.concatenate([near, beyond])
 
 
 def angular_frequencies(shaft: Shaft, modes: int) -> Array:
@@ -210,8 +212,9 @@ def angular_frequencies(shaft: Shaft, modes: int) -> Array:
     Differentiable with respect to every field of ``shaft``, forwards and backwards and repeatedly. With Psi, the
     closed form of the characteristic function, ``dp = -(dPsi/dshaft) / (dPsi/dp)``: one evaluation more, whatever the
     number of steps that found p. It equals the energy formulas of docs/theory/bicardan.md, (12). A zero mode has the
-    derivative 0, a multiple frequency has none (NaN; the last of the ``modes`` is not compared with the next one). A
-    frequency that could not be certified is NaN.
+    derivative 0, also by the stiffness of a spring that would hold it, where p grows as sqrt(k) and has none. A multiple
+    frequency has none (NaN); beside another one at the relative distance d the error is of the order of eps/d. A frequency
+    that could not be certified is NaN.
 
     >>> import jax
     >>> from drivetrain_jax.analysis.critical_speeds import angular_frequencies
