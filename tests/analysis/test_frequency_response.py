@@ -57,6 +57,31 @@ def test_folds_and_period_doublings_of_the_branch(exact):
         assert np.isnan(found[:, len(expected) :]).all()
 
 
+# Table 1 with c = .02: the 16 highest of 28 folds from .05 on, and all doublings; root finding with a flow of its own.
+LIGHTLY_DAMPED = {
+    "fold_frequency": [
+        0.1084329346, 0.1097529355, 0.1272030868, 0.1287217594, 0.1517450130, 0.1539605314, 0.1788804262, 0.1869507587,
+        0.2327749420, 0.2413158083, 0.3421909362, 0.3424009290, 0.3435402888, 0.3440647758, 0.7575930369, 0.9469773899,
+    ],
+    "doubling_frequency": [
+        0.1349864731, 0.1412645359, 0.1771333890, 0.1796209576, 0.2875297488, 0.3015438111, 0.4027082976, 0.4684277383,
+        1.2384267559, 1.9652211413,
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("lowest", "outcome"), [(0.05, Outcome.TOLERANCE_NOT_MET), (0.1, Outcome.SUCCESS)])
+def test_where_the_line_begins_decides_no_fold_or_doubling(lowest, outcome):
+    """Pairs that lie close together are not stepped over; where there are more than 16, these are the highest."""
+    scene = {"system": "rattle", "analysis": "frequency_response", "outputs": list(LIGHTLY_DAMPED)}
+    axes = {"omega": {"start": lowest, "stop": 2.0, "num": 3}}
+    found = dt.run(scene | {"axes": axes, "fixed": PRESETS["table1"] | {"c": 0.02}, "options": {"method": "exact"}})
+    for name, expected in LIGHTLY_DAMPED.items():
+        np.testing.assert_allclose(found[name].values[0, : len(expected)], expected, rtol=0, atol=2e-10)
+        assert np.isnan(found[name].values[0, len(expected) :]).all()
+    assert (found.outcome == outcome).all()
+
+
 def test_the_exact_branch_has_the_saddles_between_folds(exact):
     omega = exact.omega.values
     folds = exact.fold_frequency.values[0, :6].reshape(3, 2)

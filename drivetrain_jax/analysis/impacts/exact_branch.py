@@ -24,7 +24,7 @@ from drivetrain_jax.analysis.impacts.plane_map import newton_correction, spectra
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 BRANCHES, SPECIAL = 7, 16
-_ATTEMPTS, _LONGEST = 3000, 0.03
+_ATTEMPTS, _LONGEST = 3000, 0.04
 _BLOCK, _CORRECTIONS, _MOST_STEPS, _MARGIN = 64, 6, 100_000, 1e-9
 
 
@@ -35,7 +35,8 @@ def branch(
 
     ``branch_u_max, branch_u_min, branch_stability``, shape ``(L, 7, N)``, by rising largest displacement; if
     ``special``, ``fold_frequency`` and ``doubling_frequency``, shape ``(L, 16, N)``, the largest 16 within the line,
-    rising. Second: whether each branch reaches the highest frequency. NaN in ``first``: no branch.
+    rising. Second: whether each branch has been followed out of the line both ways, to the highest frequency at least
+    one way, and has no more folds or doublings than that. NaN in ``first``: no branch.
     """
     low, high = float(omega[0]), float(omega[-1])
     own = {name: jnp.tile(v, 2) for name, v in vars(model).items() if name != "omega" and jnp.ndim(v)}
@@ -53,11 +54,18 @@ def branch(
     states = jnp.moveaxis(guess, 2, 0).reshape(3, -1)[:2]
     results = _described(take(points, index), states, exists.reshape(-1), width)
     results = _ordered({name: x.reshape(omega.size, 2 * BRANCHES, lanes) for name, x in results.items()})
-    reached = jnp.nanmax(jnp.where(jnp.isfinite(found.x[:, 2]), found.x[:, 2], -jnp.inf), axis=0)
-    complete = reached.reshape(2, lanes).max(axis=0) >= high
+    complete = _ended(found.x[:, 2], limits).reshape(2, lanes).all(axis=0)
+    complete &= (found.x[:, 2] >= high).any(axis=0).reshape(2, lanes).any(axis=0)
     if special:
-        results |= {name: _along(x, omega) for name, x in _special(both, found, (low, high)).items()}
+        frequencies, all_found = _special(both, found, (low, high))
+        results |= {name: _along(x, omega) for name, x in frequencies.items()}
+        complete &= all_found
     return results, complete
+
+
+def _ended(omega: Array, limits: tuple[float, float]) -> Array:
+    """Whether a branch has been followed until it left the limits."""
+    return jnp.any((omega > limits[1]) | (omega < limits[0]), axis=0)
 
 
 def _points(model: PiecewiseLinearOscillator, omega: np.ndarray, lanes: int) -> PiecewiseLinearOscillator:
@@ -126,15 +134,20 @@ def _described(model: PiecewiseLinearOscillator, states: Array, exists: Array, w
     }
 
 
-def _special(model: PiecewiseLinearOscillator, found: Branch, limits: tuple[float, float]) -> dict[str, Array]:
-    """Frequencies of folds and period doublings within the limits, ``(16, N)``, rising, NaN after the last."""
+def _special(
+    model: PiecewiseLinearOscillator, found: Branch, limits: tuple[float, float]
+) -> tuple[dict[str, Array], Array]:
+    """Frequencies of folds and period doublings within the limits, ``(16, N)``, rising, NaN after the last; and whether
+    these are all that the branches have there."""
     tests = jnp.stack([fold_test(found.matrix), doubling_test(found.matrix)])
     changes = (tests[:, 1:] * tests[:, :-1] < 0).transpose(1, 0, 2)
-    rank = jnp.cumsum(changes, axis=0)
     lanes = changes.shape[2]
 
-    picked = changes[None] & (rank == jnp.arange(1, SPECIAL + 1).reshape(-1, 1, 1, 1))
-    place, exists = jnp.argmax(picked, axis=1), jnp.any(picked, axis=1)
+    # The highest ones, and one more to tell whether there are more.
+    above = jnp.maximum(found.x[1:, 2], found.x[:-1, 2])[:, None]
+    above = jnp.where(changes, above, -jnp.inf)
+    place = jnp.argsort(-above, axis=0)[: SPECIAL + 1]
+    exists = jnp.take_along_axis(changes, place, axis=0)
     column = jnp.broadcast_to(jnp.arange(lanes), place.shape)
     kind = jnp.broadcast_to(jnp.arange(2)[:, None], place.shape)
 
@@ -146,10 +159,12 @@ def _special(model: PiecewiseLinearOscillator, found: Branch, limits: tuple[floa
     (before, first), (after, second) = at(0), at(1)
     flat = column.reshape(-1)
     x = locate(take(model, flat), 1, (before, after), (first, second), kind.reshape(-1) == 1)
-    omega = x[2].reshape(SPECIAL, 2, 2, lanes // 2)
+    omega = x[2].reshape(place.shape)
+    lost = jnp.any(exists & jnp.isnan(omega), axis=(0, 1)).reshape(2, -1).any(axis=0)
     omega = jnp.where((omega >= limits[0]) & (omega <= limits[1]), omega, jnp.nan)
     # Both ways of the branch together; the highest, then rising.
-    omega = jnp.moveaxis(omega, 2, 0).reshape(2 * SPECIAL, 2, lanes // 2)
-    highest = -jnp.sort(-jnp.where(jnp.isnan(omega), -jnp.inf, omega), axis=0)[:SPECIAL]
-    omega = jnp.sort(jnp.where(jnp.isinf(highest), jnp.nan, highest), axis=0)
-    return {"fold_frequency": omega[:, 0], "doubling_frequency": omega[:, 1]}
+    omega = jnp.moveaxis(omega.reshape(-1, 2, 2, lanes // 2), 2, 0).reshape(-1, 2, lanes // 2)
+    falling = -jnp.sort(-jnp.where(jnp.isnan(omega), -jnp.inf, omega), axis=0)
+    more = jnp.any(jnp.isfinite(falling[SPECIAL]), axis=0)
+    omega = jnp.sort(jnp.where(jnp.isinf(falling[:SPECIAL]), jnp.nan, falling[:SPECIAL]), axis=0)
+    return {"fold_frequency": omega[:, 0], "doubling_frequency": omega[:, 1]}, ~lost & ~more

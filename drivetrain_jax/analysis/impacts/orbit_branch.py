@@ -25,6 +25,11 @@ _CORRECTIONS, _CONVERGED, _DIFFERENCE = 8, 1e-12, 1e-6
 # A step is shortened if it fails and lengthened if it takes few corrections.
 _SHORTER, _LONGER, _FEW = 0.4, 1.4, 4
 _SHORTEST, _CLOSED, _LEAST_COSINE = 1e-7, 1e-9, 0.8
+# How far from its guess, over the step, a point may lie: on an arc that turns by so much it is tan(acos(0.8)/2).
+_ASIDE = 1 / 3
+# Between two points no special point may hide: how far the trace may lie off the line through the last two, over the
+# distance of a multiplier from 1 or -1, that distance at least, and the part of the longest step that need not be tried.
+_BENT, _LEAST_DISTANCE, _FINE = 0.25, 0.02, 0.01
 _MOST_STEPS = 100_000
 # Locating a special point: most steps, and the last one as a part of the chord.
 _ROOT_STEPS, _LOCATED = 40, 1e-13
@@ -128,12 +133,14 @@ def scale_of(model: PiecewiseLinearOscillator, x: Array, highest: float = np.inf
 
 
 class _Front(NamedTuple):
-    """The last orbit, the tangent there, the length of the next step, and the number of the orbit on the branch."""
+    """The last orbit, the tangent there, the length of the next step, the number of the orbit on the branch, and how
+    fast the trace of the transition matrix has changed on the last step."""
 
     solved: _Solved
     tangent: Array
     length: Array
     number: Array
+    slope: Array
 
 
 def follow(
@@ -163,13 +170,21 @@ def follow(
         count, front, store = state
         guess = front.solved.x + front.length * front.tangent * scale
         there = _on_plane(model, multiple, guess, front.tangent, scale)
-        front = _moved(front, there, _tangent(there, front.tangent, scale), longest, limits)
+        aside = jnp.sqrt(jnp.sum(((there.x - guess) / scale) ** 2, axis=0))
+        near = (aside <= _ASIDE * front.length) & ((front.length <= _FINE * longest) | _straight(front, there))
+        front = _moved(front, there, near, _tangent(there, front.tangent, scale), longest, limits)
         return count + 1, front, store.at[front.number, :, lanes].set(_row(front.solved).T)
 
     def unfinished(state: tuple[Array, _Front, Array]) -> Array:
         return (state[0] < attempts) & jnp.any(_going(state[1], limits))
 
-    begin = _Front(first, _tangent(first, rise, scale), jnp.full(lanes.shape, longest), jnp.zeros_like(lanes))
+    begin = _Front(
+        first,
+        _tangent(first, rise, scale),
+        jnp.full(lanes.shape, longest),
+        jnp.zeros_like(lanes),
+        jnp.zeros(lanes.shape),
+    )
     *_, store = jax.lax.while_loop(unfinished, step, (jnp.asarray(1), begin, store))
     return Branch(store[:, :3], tuple(store[:, 3 + k] for k in range(4)))
 
@@ -185,16 +200,33 @@ def _going(front: _Front, limits: tuple[float, float]) -> Array:
     return (omega >= limits[0]) & (omega <= limits[1]) & (front.length > _SHORTEST)
 
 
-def _moved(front: _Front, there: _Solved, tangent: Array, longest: float, limits: tuple[float, float]) -> _Front:
-    """The front at ``there``, or where that is no good, the old one with a shorter step."""
-    good = (there.change <= _CLOSED) & (jnp.sum(tangent * front.tangent, axis=0) > _LEAST_COSINE) & (there.x[2] > 0)
+def _straight(front: _Front, there: _Solved) -> Array:
+    """Whether the trace changes steadily enough for no two special points to hide between the last point and the next."""
+    old, new = front.solved.matrix, there.matrix
+    bent = jnp.abs(new[0] + new[3] - old[0] - old[3] - front.slope * front.length)
+    tests = jnp.stack([test(matrix) for test in (fold_test, doubling_test) for matrix in (old, new)])
+    return bent <= _BENT * jnp.maximum(jnp.min(jnp.abs(tests), axis=0), _LEAST_DISTANCE)
+
+
+def _moved(
+    front: _Front, there: _Solved, near: Array, tangent: Array, longest: float, limits: tuple[float, float]
+) -> _Front:
+    """The front at ``there``, or where that is no good, the old one with a shorter step.
+
+    What is not ``near`` where the tangent leads may lie on another part of the branch, or on another branch.
+    """
+    good = (
+        near & (there.change <= _CLOSED) & (jnp.sum(tangent * front.tangent, axis=0) > _LEAST_COSINE) & (there.x[2] > 0)
+    )
     longer = jnp.minimum(jnp.where(there.corrections <= _FEW, _LONGER, 1.0) * front.length, longest)
     moved = good & _going(front, limits)
+    slope = (there.matrix[0] + there.matrix[3] - front.solved.matrix[0] - front.solved.matrix[3]) / front.length
     return _Front(
         jax.tree.map(lambda new, old: jnp.where(moved, new, old), there, front.solved),
         jnp.where(moved, tangent, front.tangent),
         jnp.where(good, longer, _SHORTER * front.length),
         front.number + moved,
+        jnp.where(moved, slope, front.slope),
     )
 
 
@@ -218,11 +250,13 @@ def locate(
     """``x`` at the folds or (where ``doubling``) period doublings between two points of a branch each.
 
     ``ends``: x before and after, shape ``(3, N)`` each, between which the test changes sign; ``tests``: its values
-    there. By the Illinois variant of the secant method on planes across the chord; NaN where the ends are.
+    there. By the Illinois variant of the secant method on planes across the chord; NaN where the ends are, and where it
+    has led to no orbit between them.
     """
     chord = ends[1] - ends[0]
     scale = jnp.abs(ends[0]) + jnp.abs(ends[1])
     normal = chord / scale
+    span = jnp.sum(normal**2, axis=0)
 
     def narrow(state: tuple[Array, ...]) -> tuple[Array, ...]:
         count, a, fa, b, fb, _, _ = state
@@ -232,7 +266,10 @@ def locate(
         opposite = f * fb < 0
         settled = jnp.abs(part - b) <= _LOCATED
         bracket = (jnp.where(opposite, b, a), jnp.where(opposite, fb, fa / 2), part, f)
-        return count + 1, *bracket, solved.x, settled
+        between = (solved.change <= _CLOSED) & (
+            jnp.sum(((solved.x - ends[0] - part * chord) / scale) ** 2, axis=0) <= span
+        )
+        return count + 1, *bracket, jnp.where(between, solved.x, jnp.nan), settled
 
     def unfinished(state: tuple[Array, ...]) -> Array:
         return (state[0] < _ROOT_STEPS) & jnp.any(~state[-1] & jnp.isfinite(state[2] + state[4]))
