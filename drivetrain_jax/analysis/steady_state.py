@@ -98,10 +98,9 @@ def _solve(
     results = describe(model, flat, rtol=request.options["rtol"], integrals=integrals)
     if not HISTORIES.isdisjoint(request.outputs):
         known = results["outcome"] < Outcome.NOT_CONVERGED
-        sampled = history(model, flat.u, flat.v, results["period_multiple"], SAMPLES)
-        results |= {
-            name: jnp.where(known, x, jnp.nan) for name, x in zip(("u_history", "v_history"), sampled, strict=True)
-        }
+        u, v = (jnp.where(known, x, jnp.nan) for x in (flat.u, flat.v))
+        sampled = history(model, u, v, results["period_multiple"], SAMPLES)
+        results |= dict(zip(("u_history", "v_history"), sampled, strict=True))
     wanted = {name: results[name] for name in (*request.outputs, "outcome")}
     return {name: x.reshape(*x.shape[:-1], *shape) for name, x in wanted.items()}
 

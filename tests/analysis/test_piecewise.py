@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.rattle_reference import extended, random_case
+from drivetrain_jax.analysis.impacts.orbit_history import history
 from drivetrain_jax.analysis.impacts.piecewise_flow import piece, responses
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start, usual_steps
 from drivetrain_jax.systems.rattle import PRESETS, oscillator
@@ -135,3 +136,12 @@ def test_a_lane_that_is_not_finite_does_not_hold_up_the_others():
     motion, _ = run(columns(cases), jnp.zeros(2), jnp.zeros(2), jnp.array([10, 10], jnp.int32))
     assert motion.u[0] == pytest.approx(0.393047067155833, abs=1e-12)
     assert not np.isfinite(motion.u[1])
+
+
+def test_a_history_is_right_however_far_apart_its_times_are():
+    """More than 10,000 steps lie between them; an event solver written for this has -.3245944 after half a period."""
+    slow = oscillator(TABLE1 | {"omega": 1e-4, "c": 1e-3, "alpha": 0.0, "B1": 0.2})
+    u, v, one = jnp.array([0.5]), jnp.array([0.1]), jnp.array([1])
+    far, near = (np.asarray(history(slow, u, v, one, samples)[0])[:, 0] for samples in (2, 64))
+    assert far[1] == pytest.approx(-0.3245944, abs=1e-6)
+    assert far[1] == pytest.approx(near[32], abs=1e-6)
