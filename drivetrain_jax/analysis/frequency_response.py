@@ -26,6 +26,7 @@ from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solv
 from drivetrain_jax.analysis.approximations import closed_form_response, harmonic_response
 from drivetrain_jax.analysis.approximations.harmonic_balance import Basis
 from drivetrain_jax.analysis.impacts import exact_branch, exact_response
+from drivetrain_jax.analysis.impacts.length_unit import measured, restored
 from drivetrain_jax.analysis.impacts.motion import PHASE, REGIME, REGIMES, STABILITY
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System
 
@@ -135,6 +136,7 @@ def _solve(
 
 def _exact(model: PiecewiseLinearOscillator, request: Request) -> dict[str, Array]:
     """The frequencies in rising order, and back to that of the path."""
+    model, unit = measured(model)
     rising, place = np.unique(np.asarray(model.omega), return_inverse=True)
     found = exact_response.sweeps(
         replace(model, omega=rising),
@@ -148,7 +150,7 @@ def _exact(model: PiecewiseLinearOscillator, request: Request) -> dict[str, Arra
         results, complete = _exact_branch(model, rising, found, special)
         found |= results
         outcome = jnp.where(~complete & (outcome == Outcome.SUCCESS), Outcome.TOLERANCE_NOT_MET, outcome)
-    results = {name: found[name][place] for name in request.outputs}
+    results = restored({name: found[name][place] for name in request.outputs}, unit)
     return results | {"outcome": outcome[place].astype(jnp.int8)}
 
 

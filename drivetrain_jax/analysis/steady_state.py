@@ -29,6 +29,7 @@ from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.impacts.attractor import attractors
 from drivetrain_jax.analysis.impacts.exact_response import INTEGRALS, WIDTH, describe
+from drivetrain_jax.analysis.impacts.length_unit import measured, restored
 from drivetrain_jax.analysis.impacts.motion import PHASE, REGIME, REGIMES
 from drivetrain_jax.analysis.impacts.orbit_history import history
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System
@@ -90,7 +91,8 @@ def _solve(
     model = build(values)
     shape = _shape(model, values)
     count = int(np.prod(shape, dtype=int))
-    u0, v0 = (jnp.broadcast_to(jnp.asarray(values[name], float), (count,)) for name in ("u0", "v0"))
+    model, unit = measured(model)
+    u0, v0 = (jnp.broadcast_to(jnp.asarray(values[name], float) / unit, (count,)) for name in ("u0", "v0"))
     route = jnp.arange(count, dtype=jnp.int32)[:, None]
     found = attractors(model, route, u0, v0, most_periods=request.options["most_periods"], width=WIDTH)
     flat = jax.tree.map(lambda x: x[:, 0], found)
@@ -101,7 +103,7 @@ def _solve(
         u, v = (jnp.where(known, x, jnp.nan) for x in (flat.u, flat.v))
         sampled = history(model, u, v, results["period_multiple"], SAMPLES)
         results |= dict(zip(("u_history", "v_history"), sampled, strict=True))
-    wanted = {name: results[name] for name in (*request.outputs, "outcome")}
+    wanted = restored({name: results[name] for name in (*request.outputs, "outcome")}, unit)
     return {name: x.reshape(*x.shape[:-1], *shape) for name, x in wanted.items()}
 
 

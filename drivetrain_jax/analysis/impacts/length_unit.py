@@ -1,0 +1,40 @@
+"""The unit of length in which a motion is computed: a power of two near the lengths of the oscillator itself.
+
+The equation is homogeneous in u, b, B0 and B1, and a power of two rounds nothing. Squares of lengths of 1e-160, which are 0
+in double precision, are thus met no more than those of 1e160.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax.systems import PiecewiseLinearOscillator
+
+# Results that are lengths or velocities.
+_LENGTHS = frozenset((
+    "u_max", "u_min", "u_mean", "u_rms", "impact_velocity", "orbit_state", "state_error", "u_history", "v_history",
+    "branch_u_max", "branch_u_min", "attractor_u_max", "attractor_u_min",
+))  # fmt: skip
+# Beyond these exponents a power of two or its inverse is not a normal number.
+_LARGEST = 1000
+
+
+def measured(model: PiecewiseLinearOscillator) -> tuple[PiecewiseLinearOscillator, Array]:
+    """``model`` with lengths in units of their own, and this unit [m], of the common shape of all fields but omega."""
+    drive = jnp.maximum(jnp.abs(jnp.asarray(model.B0, float)), jnp.abs(jnp.asarray(model.B1, float)))
+    b = jnp.asarray(model.b, float)
+    static = jnp.frexp(drive)[1] - jnp.frexp(jnp.asarray(model.stiffness, float))[1]
+    none = -10 * _LARGEST
+    exponent = jnp.maximum(jnp.where(b > 0, jnp.frexp(b)[1], none), jnp.where(drive > 0, static, none))
+    exponent = jnp.where(exponent == none, 0, jnp.clip(exponent, -_LARGEST, _LARGEST))
+    unit, inverse = (jnp.ldexp(jnp.ones(exponent.shape), power) for power in (exponent, -exponent))
+    return replace(model, b=model.b * inverse, B0=model.B0 * inverse, B1=model.B1 * inverse), unit
+
+
+def restored(results: Mapping[str, Array], unit: Array) -> dict[str, Array]:
+    """``results``, whose last axis is that of ``unit``, with lengths in metres."""
+    return {name: x * unit if name in _LENGTHS else x for name, x in results.items()}

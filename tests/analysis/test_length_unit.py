@@ -1,0 +1,54 @@
+"""The equation of rattle is homogeneous in its lengths: so are the results, however small or large."""
+
+import numpy as np
+import pytest
+
+import drivetrain_jax as dt
+from drivetrain_jax.systems.rattle import PRESETS
+
+TABLE1 = PRESETS["table1"]
+
+
+def of_size(size):
+    return TABLE1 | {name: TABLE1[name] * size for name in ("b", "B0", "B1")}
+
+
+def run(analysis, size, outputs, **scene):
+    return dt.run({"system": "rattle", "analysis": analysis, "fixed": of_size(size), "outputs": outputs} | scene)
+
+
+def agree(found, expected, size, lengths):
+    for name in expected.data_vars:
+        scale = size if name in lengths else 1.0
+        np.testing.assert_allclose(found[name].values / scale, expected[name].values, rtol=1e-12, err_msg=name)
+
+
+SIZES = [2.0**-1000, 2.0**-600, 2.0**-500, 2.0**600, 2.0**900]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_steady_state(size):
+    lengths = ["u_max", "u_min", "u_mean", "u_rms", "impact_velocity", "orbit_state", "u_history", "v_history"]
+    outputs = [*lengths, "phase", "period_multiple", "spectral_radius", "regime", "impacts", "contact_fraction"]
+    found, expected = (run("steady_state", s, outputs, axes={"omega": {"values": [0.45, 0.8]}}) for s in (size, 1.0))
+    agree(found, expected, size, lengths)
+
+
+def test_a_response_and_its_branch():
+    lengths = ["u_max", "u_min", "u_rms", "branch_u_max", "branch_u_min"]
+    scene = {"axes": {"omega": {"start": 0.7, "stop": 0.9, "num": 3}}, "options": {"method": "exact"}}
+    outputs = [*lengths, "phase", "regime", "fold_frequency"]
+    found, expected = (run("frequency_response", size, outputs, **scene) for size in (SIZES[1], 1.0))
+    agree(found, expected, SIZES[1], lengths)
+
+
+def test_basins():
+    lengths, outputs = ["attractor_u_max", "attractor_u_min"], ["basin_fraction", "attractor_multiple"]
+    found, expected = (
+        run(
+            "basins", size, lengths + outputs, axes={"omega": {"values": [0.8]}},
+            options={"samples": 64, "reach_u": size, "reach_v": size},
+        )
+        for size in (SIZES[1], 1.0)
+    )  # fmt: skip
+    agree(found, expected, SIZES[1], lengths)
