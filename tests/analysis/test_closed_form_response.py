@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import jax
@@ -135,6 +136,68 @@ def test_describing_function_against_quadrature():
         for x in (a - step, a, a + step)
     ]
     assert float(exact[1].slope) == pytest.approx(float(exact[2].stiffness - exact[0].stiffness) / (2 * step), rel=1e-6)
+
+
+def balanced_force(values, bias, amplitude):
+    """Mean and fundamental of the spring force by quadrature between the flanks, in units of the stiffness."""
+    crossings = [
+        math.acos(x) for x in ((flank - bias) / amplitude for flank in (values["b"], -values["b"])) if abs(x) < 1
+    ]
+    ends = [0.0, *crossings, math.pi]
+    points, weights = np.polynomial.legendre.leggauss(40)
+    angle = np.concatenate([(a + b) / 2 + (b - a) / 2 * points for a, b in itertools.pairwise(ends)])
+    weight = np.concatenate([(b - a) / 2 * weights for a, b in itertools.pairwise(ends)])
+    u = bias + amplitude * np.cos(angle)
+    force = u - (1 - values["alpha"]) * np.clip(u, -values["b"], values["b"])
+    return np.sum(weight * force) / math.pi, 2 * np.sum(weight * force * np.cos(angle)) / math.pi
+
+
+def assert_balanced(values, omega, bias, amplitude, rtol=1e-9):
+    mean, first = balanced_force(values, bias, amplitude)
+    assert mean == pytest.approx(values["B0"], rel=rtol)
+    size = math.hypot(first - omega**2 * amplitude, values["c"] * omega * amplitude)
+    assert size == pytest.approx(values["B1"], rel=rtol * max(1.0, amplitude / values["B1"]))
+
+
+def test_amplitudes_on_either_side_of_a_narrow_resonance_are_found():
+    """At light damping both arms pass a frequency within a thousandth of an amplitude."""
+    values = {"B0": 0.14, "B1": 1.4e-4, "b": 0.63, "c": 1.2e-4, "alpha": 0.0}
+    omegas = np.array([0.53, 0.59, 0.66, 0.74])
+    found = solve("describing_function", omegas, (values,))
+    high, low = found["branch_u_max"][..., 0], found["branch_u_min"][..., 0]
+    np.testing.assert_array_equal(np.isfinite(high).sum(axis=1), [5, 5, 5, 3])
+    np.testing.assert_array_equal(found["branch_stability"][0, :, 0], [0, 1, 0, 1, 0])
+    amplitude = (high - low) / 2
+    assert ((amplitude[:, 2] - amplitude[:, 1]) / amplitude[:, 1] < 2e-3).all()
+    for omega, row, mean in zip(omegas, amplitude, (high + low) / 2, strict=True):
+        assert (np.diff(row[np.isfinite(row)]) > 0).all()
+        for a, m in zip(row[np.isfinite(row)], mean[np.isfinite(row)], strict=True):
+            assert_balanced(TABLE1 | values, omega, m, a, 1e-8)
+
+
+def test_weak_drives_next_to_a_flank():
+    """At rest on the flank the motions are as large as the drive, however weak: the two stiffnesses of a bilinear spring."""
+    weak = {"B0": 0.05, "b": 0.5, "alpha": 0.1, "c": 0.05}
+    cases = tuple(weak | {"B1": drive} for drive in (1e-3, 1e-4, 1e-5, 1e-7))
+    found = solve("describing_function", np.array([0.3, 0.45, 0.7]), cases)
+    amplitude = (found["u_max"] - found["u_min"])[:, 0] / 2
+    relative = amplitude / [case["B1"] for case in cases]
+    np.testing.assert_allclose(relative, np.stack([relative[:, 0]] * 4, axis=1), rtol=1e-6)
+    bias = (found["u_max"] + found["u_min"])[:, 0] / 2
+    for place, omega in enumerate((0.3, 0.45, 0.7)):
+        assert_balanced(TABLE1 | cases[1], omega, bias[place, 1], amplitude[place, 1])
+
+
+@pytest.mark.parametrize("method", ["multiple_scales", "describing_function"])
+@pytest.mark.parametrize("exponent", [-60, 60])
+def test_units_of_length_do_not_matter(method, exponent):
+    cases = ({}, {"b": 0.0}, {"B1": 0.3, "c": 0.01}, {"c": 0.0})
+    scaled = [{name: 2.0**exponent * (TABLE1 | case)[name] for name in ("b", "B0", "B1")} for case in cases]
+    ours, theirs = solve(method, cases=cases), solve(method, cases=[a | b for a, b in zip(cases, scaled, strict=True)])
+    for name in ("u_max", "branch_u_min", "peak_amplitude"):
+        np.testing.assert_allclose(theirs[name] / 2.0**exponent, ours[name], rtol=1e-11)
+    np.testing.assert_array_equal(theirs["branch_stability"], ours["branch_stability"])
+    np.testing.assert_array_equal(theirs["outcome"], ours["outcome"])
 
 
 def test_describing_function_of_table_1(describing):

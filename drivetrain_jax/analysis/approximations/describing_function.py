@@ -24,15 +24,16 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax.analysis.numerics.amplitude_roots import bisect, sign_changes, take
+from drivetrain_jax.analysis.numerics.amplitude_roots import bisect, first_marks, sign_changes, take
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
-# Amplitudes at which the arms are sampled to find their folds: logarithmic, in units of half the play.
-_NODES, _DECADES = 320, (-2.5, 3.5)
+# Amplitudes at which the arms are sampled to find their folds: logarithmic, within these limits in units of the motions'
+# size, beyond which the play is felt no more or the arms are those of one power; and where there is no amplitude.
+_NODES, _NEAR, _FAR, _HUGE = 320, 1e-9, 1e4, 1e9
 _FOLDS_PER_ARM = 4
 MOST_ROOTS = 5
-_BIAS_STEPS, _POLISH_STEPS = 24, 5
-_TINY, _HUGE = 1e-300, 1e9
+_BIAS_STEPS, _HALVINGS, _POLISH_STEPS = 24, 20, 8
+_TINY = 1e-300
 _ENDS = (slice(None, -1), slice(1, None))
 
 
@@ -117,6 +118,12 @@ def arm(model: PiecewiseLinearOscillator, amplitude: Array, point: Point, sign: 
     return jnp.sqrt(square)
 
 
+def _length(model: PiecewiseLinearOscillator) -> Array:
+    """A length of the size of the motions, positive: half the play and the displacements under static drives."""
+    length = model.b + (jnp.abs(model.B0) + jnp.abs(model.B1)) / model.stiffness
+    return jnp.where(length > 0, length, 1.0)
+
+
 def peak(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Array:
     """Largest amplitude over all frequencies; a huge one if there is none.
 
@@ -124,7 +131,7 @@ def peak(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Array:
     heavier damping the static amplitude, which the response approaches as the frequency falls to 0. That value rises with
     the amplitude, because ``kappa A`` does.
     """
-    unit = jnp.abs(model.B1) + model.b
+    unit = _length(model)
 
     def beyond(log_amplitude: Array) -> Array:
         amplitude = unit * jnp.exp(log_amplitude)
@@ -136,38 +143,59 @@ def peak(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Array:
     return unit * jnp.exp(bisect(beyond, -span, span))
 
 
+def _first_contact(model: PiecewiseLinearOscillator) -> Array:
+    """Amplitude at which the static motion first reaches a flank; below it the oscillator is linear."""
+    force, play = jnp.abs(model.B0) / model.stiffness, model.alpha * model.b
+    within = model.b - force / jnp.where(model.alpha > 0, model.alpha, 1.0)
+    return jnp.where(force <= play, within, force - play)
+
+
 def _resonance(model: PiecewiseLinearOscillator, stiffness: Array) -> Array:
     """Frequency at which the response equation takes its smallest value for an amplitude: 0 with heavy damping."""
     return jnp.sqrt(jnp.maximum(stiffness - model.damping**2 / 2, 0.0))
 
 
 class Skeleton(NamedTuple):
-    """All that does not depend on the frequency: rising ``amplitudes`` (K, ...) with the ``points`` there, such that
-    either arm is monotone between neighbours; ``peak`` and ``folds`` (8, ...), amplitudes, NaN where there are fewer."""
+    """All that does not depend on the frequency: rising ``amplitudes`` (K, ...) from 0 to the ``peak``, with the ``points``
+    and the ``arms`` (omega^2 of the lower and of the upper one) there, such that either arm is monotone between
+    neighbours; ``folds`` (8, ...), amplitudes, NaN where there are fewer; ``limit``, beyond which there is no amplitude."""
 
     amplitudes: Array
     points: Point
+    arms: tuple[Array, Array]
     peak: Array
     folds: Array
+    limit: Array
+
+
+def _nodes(model: PiecewiseLinearOscillator, end: Array) -> Array:
+    """Rising amplitudes from where the play is first felt to ``end``."""
+    unit = _length(model)
+    last = jnp.minimum(end, _FAR * unit)
+    first = jnp.clip(_first_contact(model), _NEAR * unit, last / 2)
+    part = jnp.linspace(0.0, 1.0, _NODES).reshape(_NODES, *(1,) * end.ndim)
+    return jnp.concatenate([first * (last / first) ** part[:-1], last[None], end[None]])
+
+
+def _half_width(model: PiecewiseLinearOscillator, amplitude: Array, stiffness: Array, end: Array) -> Array:
+    """Half the distance of the arms in omega^2: none at the ``end`` where they meet, also in rounding."""
+    half = jnp.sqrt(jnp.maximum(_discriminant(model, amplitude, stiffness), 0.0))
+    return jnp.where((amplitude >= end) & (_resonance(model, stiffness) > 0), 0.0, half)
 
 
 def skeleton(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Skeleton:
     """The arms of a batch of ``shape``, with their folds."""
-    column = (_NODES, *(1,) * len(shape))
-    unit = jnp.where(model.b > 0, model.b, 1.0)
-    nodes = unit * jnp.logspace(*_DECADES, _NODES).reshape(column) + jnp.zeros(shape)
-    top = peak(model, shape)
-    # The peak takes the place of the first node above it; nothing above it matters.
-    above = nodes >= top
-    first = above & (jnp.cumsum(above, axis=0) == 1)
-    nodes = jnp.where(first, top, nodes)
+    top, limit = peak(model, shape), _HUGE * _length(model)
+    end = jnp.minimum(top, limit)
+    nodes = _nodes(model, end)
     points = point_at(model, nodes, bias_of(model, nodes))
+    meet = (nodes >= top) & (_resonance(model, points.stiffness) > 0)
     folds = []
     for sign in (-1.0, 1.0):
         slope = arm_slope(model, nodes, points, sign)
         # Where the arms meet the root vanishes: the sign of the other term, also in rounding.
-        slope = jnp.where((nodes >= top) & (_resonance(model, points.stiffness) > 0), -sign, slope)
-        mask = sign_changes(slope > 0, _FOLDS_PER_ARM) & (nodes[:-1] < top)
+        slope = jnp.where(meet, -sign, slope)
+        mask = sign_changes(slope > 0, _FOLDS_PER_ARM)
         low, high, start = take(mask, nodes[:-1]), take(mask, nodes[1:]), take(mask, slope[:-1])
         turned = jnp.where(start > 0, -1.0, 1.0)
 
@@ -177,10 +205,14 @@ def skeleton(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Skelet
 
         folds.append(bisect(uphill, low, high, 45))
     found = jnp.concatenate(folds)
-    amplitudes = jnp.concatenate([jnp.zeros((1, *shape)), nodes, jnp.where(jnp.isnan(found), _HUGE * unit, found)])
-    amplitudes = jnp.sort(jnp.concatenate([amplitudes, jnp.full((1, *shape), _HUGE) * jnp.maximum(top, unit)]), axis=0)
+    amplitudes = jnp.sort(jnp.concatenate([nodes, jnp.where(jnp.isnan(found), end, found)]), axis=0)
+    amplitudes = jnp.concatenate([jnp.zeros((1, *shape)), amplitudes])
     safe = jnp.maximum(amplitudes, _TINY)
-    return Skeleton(amplitudes, point_at(model, safe, bias_of(model, safe)), top, found)
+    points = point_at(model, safe, bias_of(model, safe))
+    centre, half = points.stiffness - model.damping**2 / 2, _half_width(model, safe, points.stiffness, top)
+    # Rest is below every amplitude, also of an oscillator that is not driven.
+    half = half.at[0].set(jnp.inf)
+    return Skeleton(amplitudes, points, (centre - half, centre + half), top, found, limit)
 
 
 def peak_of(model: PiecewiseLinearOscillator, bones: Skeleton) -> tuple[Array, Array]:
@@ -188,9 +220,9 @@ def peak_of(model: PiecewiseLinearOscillator, bones: Skeleton) -> tuple[Array, A
 
     With damping too heavy for a resonance: the static amplitude and 0.
     """
-    exists = bones.peak < _HUGE * jnp.maximum(model.b, 1.0)
     point = point_at(model, bones.peak, bias_of(model, bones.peak))
-    return jnp.where(exists, bones.peak, jnp.inf), _resonance(model, point.stiffness)
+    amplitude = jnp.where(bones.peak < bones.limit, bones.peak, jnp.inf)
+    return jnp.where(model.B1 == 0, 0.0, amplitude), _resonance(model, point.stiffness)
 
 
 def fold_frequencies(model: PiecewiseLinearOscillator, bones: Skeleton) -> Array:
@@ -230,35 +262,69 @@ def _interpolated(bones: Skeleton, mask: Array) -> tuple[Array, Array, Callable[
     return low, high, stiffness
 
 
+def _arm_gap(
+    model: PiecewiseLinearOscillator, square: Array, amplitude: Array, stiffness: Array, sign: Array
+) -> tuple[Array, Array]:
+    """``omega^2`` less that of the arm at an amplitude, and half the distance of the arms."""
+    half = jnp.sqrt(jnp.maximum(_discriminant(model, amplitude, stiffness), 0.0))
+    return square - stiffness + model.damping**2 / 2 - sign * half, half
+
+
+def _brackets(bones: Skeleton, square: Array) -> tuple[Array, Array, Array]:
+    """Intervals of the skeleton where an arm crosses ``omega^2`` as a mask, which arm (-1, 1), whether the gap rises there.
+
+    Each arm by itself: at light damping both may pass a frequency between the same two amplitudes.
+    """
+    lower, upper = bones.arms
+    # At the peak, where the arms meet, one of the two holds.
+    crossed = jnp.stack([lower >= square, upper < square], axis=1)
+    changes = crossed[1:] != crossed[:-1]
+    both = first_marks(changes.reshape(-1, *changes.shape[2:]), MOST_ROOTS)
+    both = both.reshape(MOST_ROOTS, *changes.shape)
+    sign = jnp.where(jnp.any(both[:, :, 1], axis=1), 1.0, -1.0)
+    becomes = jnp.any(both & crossed[1:], axis=(1, 2))
+    return jnp.any(both, axis=2), sign, jnp.where(becomes, sign, -sign)
+
+
 def roots(model: PiecewiseLinearOscillator, bones: Skeleton, omega: Array) -> tuple[Array, Point]:
     """All amplitudes at one frequency, rising, ``(MOST_ROOTS, ...)``, infinite where there are fewer; and the points."""
-    value = response_residual(model, omega, bones.amplitudes, bones.points.stiffness)
-    # Rest is below every root, also of an oscillator that is not driven.
-    positive = (value > 0) & (bones.amplitudes > 0)
-    mask = sign_changes(positive, MOST_ROOTS)
+    square = omega**2
+    mask, sign, turned = _brackets(bones, square)
     low, high, stiffness = _interpolated(bones, mask)
-    turned = jnp.where(take(mask, positive[1:], 1.0) > 0, 1.0, -1.0)
-    found = bisect(lambda a: turned * response_residual(model, omega, a, stiffness(a)), low, high, 45)
-    found = jnp.maximum(found, _TINY)
-    bias = take(mask, bones.points.bias[:-1])
-    for _ in range(3):
-        bias = _improved(model, found, bias)
 
-    def polish(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        amplitude, bias = state
+    def above(amplitude: Array) -> Array:
+        return turned * _arm_gap(model, square, amplitude, stiffness(amplitude), sign)[0]
+
+    found = jnp.maximum(bisect(above, low, high, _HALVINGS), _TINY)
+    first, last = (take(mask, bones.points.bias[s]) for s in _ENDS)
+    bias = first + (last - first) * (found - low) / jnp.where(high > low, high - low, 1.0)
+    bias = _improved(model, found, bias)
+
+    def polish(_: int, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        low, high, amplitude, bias = state
         bias = _improved(model, amplitude, bias)
         point = point_at(model, amplitude, bias)
-        value = response_residual(model, omega, amplitude, point.stiffness)
-        gap = point.stiffness - omega**2
-        slope = 2 * amplitude * (gap**2 + (model.damping * omega) ** 2 + amplitude * gap * point.slope)
-        change = jnp.where(slope != 0, value / jnp.where(slope != 0, slope, 1.0), 0.0)
-        return jnp.clip(amplitude - change, jnp.maximum(low, _TINY), high), bias
+        gap, half = _arm_gap(model, square, amplitude, point.stiffness, sign)
+        beyond = turned * gap > 0
+        low, high = jnp.where(beyond, low, amplitude), jnp.where(beyond, amplitude, high)
+        bend = model.B1**2 / amplitude**3 + model.damping**2 * point.slope / 2
+        slope = -point.slope + sign * bend / jnp.maximum(half, _TINY)
+        trial = amplitude - gap / jnp.where(slope != 0, slope, jnp.inf)
+        # Converged iterates may leave the bracket by their rounding.
+        slack = 4e-16 * amplitude
+        inside = (trial >= low - slack) & (trial <= high + slack)
+        return low, high, jnp.maximum(jnp.where(inside, trial, (low + high) / 2), _TINY), bias
 
-    found, bias = jax.lax.fori_loop(0, _POLISH_STEPS, polish, (found, bias))
+    _, _, found, bias = jax.lax.fori_loop(0, _POLISH_STEPS, polish, (low, high, found, bias))
+    exists = jnp.any(mask, axis=1) & (found < bones.limit)
+    order = jnp.argsort(jnp.where(exists, found, jnp.inf), axis=0)
+    found, bias, exists = (jnp.take_along_axis(part, order, axis=0) for part in (found, bias, exists))
     point = point_at(model, found, _improved(model, found, bias))
-    exists = jnp.any(mask, axis=1) & (found < _HUGE * jnp.maximum(model.b, 1.0))
-    amplitude = jnp.where(model.B1 == 0, 0.0 * found, found)
-    return jnp.where(exists, amplitude, jnp.inf), point
+    # Without drive there is rest alone.
+    driven = model.B1 != 0
+    number = jnp.arange(MOST_ROOTS).reshape(-1, *(1,) * (found.ndim - 1))
+    amplitude = jnp.where(driven, found, 0.0)
+    return jnp.where(exists & (driven | (number == 0)), amplitude, jnp.inf), point
 
 
 def decay_rate(model: PiecewiseLinearOscillator, omega: Array, amplitude: Array, point: Point) -> Array:

@@ -46,10 +46,14 @@ def bisect(function: Callable[[Array], Array], low: Array, high: Array, halvings
 
 def sign_changes(positive: Array, count: int) -> Array:
     """Which interval holds the n-th change of a sign along the first axis, as a mask ``(count, K - 1, ...)``."""
-    changes = positive[1:] != positive[:-1]
-    rank = jnp.cumsum(changes, axis=0)
-    number = jnp.arange(1, count + 1).reshape(count, *(1,) * changes.ndim)
-    return changes & (rank == number)
+    return first_marks(positive[1:] != positive[:-1], count)
+
+
+def first_marks(marks: Array, count: int) -> Array:
+    """The first ``count`` of the ``marks`` (K, ...) along the first axis, each in a row of its own: ``(count, K, ...)``."""
+    rank = jnp.cumsum(marks, axis=0)
+    number = jnp.arange(1, count + 1).reshape(count, *(1,) * marks.ndim)
+    return marks & (rank == number)
 
 
 def take(mask: Array, values: Array, missing: float = np.nan) -> Array:
