@@ -83,6 +83,52 @@ def test_multiple_scales_of_table_1():
     np.testing.assert_allclose(multiple_scales.folds(flow)[1], [0.861, 0.8752], atol=3e-4)
 
 
+@pytest.mark.parametrize("damping", [1e-8, 1e-11, 1e-14])
+def test_multiple_scales_at_hardly_any_damping(damping):
+    """Away from resonance the amplitude does not feel the damping, however far off the peak is."""
+    cases = ({"c": damping, "alpha": 1.0}, {"c": damping})
+    found = solve("multiple_scales", cases=cases)
+    low = (found["branch_u_max"] - found["branch_u_min"])[:, 0] / 2
+    away = OMEGAS != 1.0
+    expected = TABLE1["B1"] / 2 / np.abs(OMEGAS[away] - 1)
+    np.testing.assert_allclose(low[away, 0], expected, rtol=1e-12)
+    flow = multiple_scales.SlowFlow(*(jnp.array(x) for x in (0.8, damping, 0.02, 0.13)))
+    rho, frequency = multiple_scales.folds(flow)
+    # Without damping F^2 = 4 g^2 rho^3 at the fold, on the arm omega = w0 + g rho + F/sqrt(rho); the other is the peak.
+    assert rho[0] == pytest.approx((0.02**2 / (4 * 0.13**2)) ** (1 / 3), rel=1e-12)
+    assert frequency[0] == pytest.approx(0.8 + 0.13 * float(rho[0]) + 0.02 / math.sqrt(rho[0]), rel=1e-12)
+    assert rho[1] == pytest.approx((0.02 / damping) ** 2, rel=1e-12)
+
+
+def test_folds_and_peak_are_at_frequencies_of_a_drive():
+    """A fitted cubic may bend below zero; there is no drive, and of no damping no second fold."""
+    cases = ({"alpha": 3.0, "c": 0.01, "B1": 1.0}, {"c": 0.0})
+    found = solve("multiple_scales", np.geomspace(1e-6, 3.0, 60), cases, fit_range=0.8)
+    folds = found["fold_frequency"][0]
+    np.testing.assert_array_equal(np.isfinite(folds).sum(axis=0), [1, 1])
+    assert (folds[0] > 0).all()
+    assert found["peak_frequency"][0, 0] == 0
+    assert found["peak_amplitude"][0, 0] == pytest.approx(np.nanmax(found["branch_u_max"][..., 0]), rel=1e-4)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.1, 0.15, 0.2, 0.3])
+def test_the_largest_self_consistent_range_is_taken(alpha):
+    """Against a dense scan from large ranges down, also next to where two of them merge."""
+    for ratio in (0.01, 0.4, 0.55, 0.65, 0.68, 0.69, 0.71, 0.72, 0.8, 0.9, 0.95):
+        stiffness = 1 - (1 - alpha) * float(multiple_scales._share(ratio))
+        if stiffness <= 0:
+            continue
+        model = oscillator(TABLE1 | {"alpha": alpha, "B1": TABLE1["c"] * TABLE1["b"] / ratio * math.sqrt(stiffness)})
+        reach = float(multiple_scales.self_consistent_range(model, ()))
+        r = np.linspace(1e-3, 1, 400_000)
+        excess = (1 - (1 - alpha) * multiple_scales._share(r)) / r**2 - stiffness / ratio**2
+        assert TABLE1["b"] / reach == pytest.approx(r[np.argmax(excess <= 1e-12 / ratio**2)], rel=1e-2)
+        peak = multiple_scales.peak(
+            multiple_scales.slow_flow(model, multiple_scales.cubic_fit(model, jnp.array(reach)))
+        )
+        assert peak[0] == pytest.approx(reach, rel=1e-9)
+
+
 def test_self_consistent_range_is_the_peak_it_gives(scales):
     reach = multiple_scales.self_consistent_range(MODEL, ())
     peak = multiple_scales.peak(multiple_scales.slow_flow(MODEL, multiple_scales.cubic_fit(MODEL, reach)))

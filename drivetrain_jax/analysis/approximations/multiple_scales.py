@@ -16,14 +16,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis.numerics.amplitude_roots import bisect, sign_changes, take
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 MOST_ROOTS = 3
-_RANGES = 96
-_LARGEST = 1e150
+_SMALL_RATIO = 1e-8
 
 
 class Cubic(NamedTuple):
@@ -63,26 +63,45 @@ def cubic_fit(model: PiecewiseLinearOscillator, fit_range: Array) -> Cubic:
     return Cubic(model.stiffness * (1 - soft * _share(r)), cubic, fit_range)
 
 
+def _turning_ratios(model: PiecewiseLinearOscillator) -> Array:
+    """Ratios ``r = b/R`` (2, ...) where ``l1/r^2`` turns: zeros of ``(1 - alpha)(45 r + 50 r^3 - 63 r^5)/16 - 2``.
+
+    The left side is largest at r = 0.8275; where it is negative even there ``l1/r^2`` falls all the way.
+    """
+    soft = 1 - jnp.asarray(model.alpha, float)
+
+    def surplus(r: Array) -> Array:
+        return soft * r * (45 + r**2 * (50 - 63 * r**2)) / 16 - 2
+
+    middle = jnp.full_like(soft, np.sqrt((150 + np.sqrt(79200)) / 630))
+    first = bisect(surplus, jnp.zeros_like(soft), middle)
+    return jnp.stack([first, bisect(lambda r: -surplus(r), middle, jnp.ones_like(soft))])
+
+
 def self_consistent_range(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Array:
     """The range that equals the peak amplitude it gives: ``R c' sqrt(l1(R)) = B1``, infinite without damping.
 
     The largest one where there are several (alpha near 0); NaN where l1 is not positive (alpha = 0 within the play).
     """
     target = jnp.abs(model.B1) / jnp.where(model.damping > 0, model.damping, 1.0) + jnp.zeros(shape)
+    play = jnp.where(model.b > 0, model.b, 1.0)
 
-    def excess(r: Array) -> Array:
-        # q(R) = R^2 l1 in units of b^2, as a function of r = b/R <= 1.
-        stiffness = model.stiffness * (1 - (1 - model.alpha) * _share(r))
-        return stiffness * jnp.where(model.b > 0, model.b, 1.0) ** 2 - (target * r) ** 2
+    def excess(log_r: Array) -> Array:
+        # R^2 l1 in units of b^2, as a function of r = b/R <= 1.
+        r = jnp.exp(log_r)
+        return model.stiffness * (1 - (1 - model.alpha) * _share(r)) - (target / play * r) ** 2
 
-    column = (_RANGES, *(1,) * len(shape))
-    ratio = jnp.concatenate([jnp.zeros((1, *shape)), jnp.logspace(-8, 0, _RANGES).reshape(column) + jnp.zeros(shape)])
-    mask = sign_changes(excess(ratio) > 0, 1)
-    r = bisect(lambda r: -excess(r), take(mask, ratio[:-1]), take(mask, ratio[1:]))[0]
+    # Half of what follows from contact alone is below every solution where r is small.
+    linear = target / jnp.sqrt(model.stiffness * jnp.ones(shape))
+    least = jnp.minimum(_SMALL_RATIO, play / jnp.where(linear > 0, linear, play) / 2)
+    ends = jnp.concatenate([least[None], _turning_ratios(model) + jnp.zeros((2, *shape)), jnp.ones((1, *shape))])
+    log_r = jnp.log(ends)
+    # At rest, r = 0, the excess is that of contact.
+    mask = sign_changes((excess(log_r) > 0).at[0].set(True), 1)
+    r = jnp.exp(bisect(lambda x: -excess(x), take(mask, log_r[:-1]), take(mask, log_r[1:]))[0])
     beyond = model.b / jnp.where(r > 0, r, 1.0)
     # Without a change of sign the peak lies within the play, where the spring is linear.
     within = target / jnp.sqrt(model.stiffness * model.alpha)
-    linear = target / jnp.sqrt(model.stiffness * jnp.ones(shape))
     found = jnp.where(jnp.any(mask, axis=(0, 1)), beyond, within)
     found = jnp.where(model.b > 0, found, linear)
     return jnp.where(model.damping > 0, found, jnp.inf)
@@ -95,30 +114,37 @@ def slow_flow(model: PiecewiseLinearOscillator, fit: Cubic) -> SlowFlow:
 
 
 def peak(flow: SlowFlow) -> tuple[Array, Array]:
-    """Largest amplitude ``F/mu`` (infinite without damping) and the frequency ``w0 + g a^2`` where it is reached."""
+    """Largest amplitude ``F/mu`` (infinite without damping) and the frequency ``w0 + g a^2`` where it is reached.
+
+    A softening spring may put that below 0: then the largest amplitude is that of the limit ``omega -> 0``, and 0.
+    """
     amplitude = jnp.where(flow.decay > 0, flow.drive / jnp.where(flow.decay > 0, flow.decay, 1.0), jnp.inf)
-    return amplitude, flow.frequency + jnp.where(flow.bend != 0, flow.bend * amplitude**2, 0.0)
+    frequency = flow.frequency + jnp.where(flow.bend != 0, flow.bend * amplitude**2, 0.0)
+    below = frequency <= 0
+    slow = roots(flow, jnp.zeros_like(flow.frequency))
+    largest = jnp.max(jnp.where(jnp.isfinite(slow), slow, 0.0), axis=0)
+    return jnp.where(below, largest, amplitude), jnp.where(below, 0.0, frequency)
 
 
 def folds(flow: SlowFlow) -> tuple[Array, Array]:
-    """Squared amplitudes and frequencies ``(2, ...)`` of the folds, NaN where there are none.
+    """Squared amplitudes and frequencies ``(2, ...)`` of the folds, NaN where there are none at a positive frequency.
 
-    ``4 g^2 rho^3 (F^2 - mu^2 rho) = F^4`` has two roots, on either side of rho = 3 F^2/(4 mu^2), or none; the second
-    is infinite without damping.
+    ``4 g^2 rho^3 (F^2 - mu^2 rho) = F^4`` has two roots, on either side of rho = 3 F^2/(4 mu^2), or none. With
+    ``rho = s t``, ``s^3 = F^2/(4 g^2)``, ``p = s mu^2/F^2`` the first is ``t^3 (1 - p t) = 1``, from 1 to 4^(1/3); with
+    ``rho = (1 - y) F^2/mu^2`` the second is ``(1 - y)^3 y = p^3``, from p^3 to (64/27) p^3. Without damping it is infinite.
     """
-    square = flow.drive**2
-    mu2 = flow.decay**2 + jnp.zeros_like(square)
-    ends = jnp.where(mu2 > 0, square / jnp.where(mu2 > 0, mu2, 1.0), _LARGEST ** (1 / 3))
-
-    def surplus(rho: Array) -> Array:
-        return 4 * flow.bend**2 * rho**3 * (square - mu2 * rho) - square**2
-
-    middle = jnp.where(mu2 > 0, 0.75, 1.0) * ends
-    lower = bisect(surplus, jnp.zeros_like(middle), middle)
-    upper = jnp.where(mu2 > 0, bisect(lambda rho: -surplus(rho), middle, ends), jnp.inf)
-    rho = jnp.where(surplus(middle) > 0, jnp.stack([lower, upper]), jnp.nan)
-    half_width = jnp.sqrt(jnp.maximum(square / rho - mu2, 0.0))
-    return rho, flow.frequency + flow.bend * rho + jnp.sign(flow.bend) * half_width
+    bends = (flow.bend != 0) & (flow.drive > 0)
+    square = jnp.where(bends, flow.drive**2, 1.0)
+    size = jnp.cbrt(square / (4 * jnp.where(bends, flow.bend, 1.0) ** 2))
+    part = size * flow.decay**2 / square
+    t = bisect(lambda t: t**3 * (1 - part * t) - 1, jnp.ones_like(size), jnp.full_like(size, 4 ** (1 / 3)))
+    y = part**3 * bisect(lambda z: z * (1 - part**3 * z) ** 3 - 1, jnp.ones_like(size), jnp.full_like(size, 64 / 27))
+    peak_square = square / jnp.where(flow.decay > 0, flow.decay, jnp.nan) ** 2
+    rho = jnp.stack([size * t, peak_square * (1 - y)])
+    half_width = jnp.stack([jnp.sqrt(square / (size * t) * (1 - part * t)), flow.decay * jnp.sqrt(y / (1 - y))])
+    frequency = flow.frequency + flow.bend * rho + jnp.sign(flow.bend) * half_width
+    exists = bends & (part**3 < 27 / 256) & (frequency > 0)
+    return jnp.where(exists, rho, jnp.nan), jnp.where(exists, frequency, jnp.nan)
 
 
 def response_residual(flow: SlowFlow, omega: Array, rho: Array) -> Array:
@@ -129,29 +155,36 @@ def response_residual(flow: SlowFlow, omega: Array, rho: Array) -> Array:
 def roots(flow: SlowFlow, omega: Array) -> Array:
     """All amplitudes at one frequency, rising, ``(MOST_ROOTS, ...)``, infinite where there are fewer.
 
-    The cubic is monotone between its stationary points, known in closed form: one bisection for each piece.
+    The cubic is monotone between its stationary points, known in closed form: one bisection for each piece, of log rho,
+    which may be smaller than its bounds by any factor.
     """
     delta, square = omega - flow.frequency, flow.drive**2
-    bend = jnp.where(flow.bend != 0, flow.bend, 1.0)
+    bends = flow.bend != 0
+    bend = jnp.where(bends, flow.bend, 1.0)
     spread = jnp.sqrt(jnp.maximum(delta**2 - 3 * flow.decay**2, 0.0))
-    stationary = jnp.stack([2 * delta - spread, 2 * delta + spread]) / (3 * bend)
-    stationary = jnp.sort(jnp.where(flow.bend != 0, jnp.maximum(stationary, 0.0), 0.0), axis=0)
-    damped = square / jnp.where(flow.decay > 0, flow.decay, 1.0) ** 2
-    bent = jnp.maximum(2 * jnp.abs(delta / bend), jnp.cbrt(4 * square / bend**2))
-    detuned = square / jnp.where(delta != 0, delta, 1.0) ** 2
-    bound = jnp.where(flow.decay > 0, damped, jnp.where(flow.bend != 0, bent, jnp.where(delta != 0, detuned, jnp.inf)))
-    # The bound is the peak itself on the backbone; stationary points lie below it or do not matter.
-    bound = jnp.where(jnp.isfinite(bound), bound * (1 + 1e-12), _LARGEST)
-    points = jnp.concatenate([jnp.zeros_like(bound)[None], jnp.minimum(stationary, bound), bound[None]])
-    positive = (response_residual(flow, omega, points) > 0) & (points > 0)
+    # The smaller one from the product of both: no digits cancel.
+    far = (2 * delta + jnp.where(delta < 0, -spread, spread)) / (3 * bend)
+    near = (delta**2 + flow.decay**2) / (3 * bend**2) / jnp.where(far != 0, far, 1.0)
+    damped = square / jnp.where(flow.decay > 0, flow.decay, 0.0) ** 2
+    high = jnp.minimum(damped, jnp.maximum(2 * jnp.abs(delta / bend), jnp.cbrt(4 * square / bend**2))) * (1 + 1e-12)
+    low = square / ((jnp.abs(delta) + jnp.abs(bend) * high) ** 2 + flow.decay**2) * (1 - 1e-12)
+    stationary = jnp.sort(jnp.clip(jnp.stack([near, far]), low, high), axis=0)
+    points = jnp.log(jnp.concatenate([low[None], stationary, high[None]]))
+
+    def residual(log_rho: Array) -> Array:
+        return response_residual(flow, omega, jnp.exp(log_rho))
+
+    # The ends hold all roots between them, also in rounding.
+    positive = (residual(points) > 0).at[0].set(False).at[-1].set(True)
     mask = sign_changes(positive, MOST_ROOTS)
     turned = jnp.where(take(mask, positive[1:], 1.0) > 0, 1.0, -1.0)
-    found = bisect(
-        lambda rho: turned * response_residual(flow, omega, rho), take(mask, points[:-1]), take(mask, points[1:]), 90
-    )
-    amplitude = jnp.where(jnp.any(mask, axis=1) & (found < _LARGEST / 2), jnp.sqrt(found), jnp.inf)
-    # Without drive there is rest alone; without a positive l1 nothing.
-    return jnp.where(square == 0, jnp.full_like(amplitude, jnp.inf).at[0].set(0.0), amplitude)
+    found = bisect(lambda x: turned * residual(x), take(mask, points[:-1]), take(mask, points[1:]))
+    amplitude = jnp.where(jnp.any(mask, axis=1), jnp.exp(found / 2), jnp.inf)
+    alone = jnp.full_like(amplitude, jnp.inf)
+    # A linear spring has one amplitude, infinite at resonance without damping; without drive there is rest alone.
+    linear = alone.at[0].set(flow.drive / jnp.hypot(delta, flow.decay))
+    amplitude = jnp.where(bends, amplitude, linear)
+    return jnp.where(square == 0, alone.at[0].set(0.0), amplitude)
 
 
 def decay_rate(flow: SlowFlow, omega: Array, amplitude: Array) -> Array:
