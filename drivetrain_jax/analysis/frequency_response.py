@@ -97,12 +97,16 @@ _CHUNK = 50
 
 
 def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
-    """Directions, branches and folds; ``InputError`` for a result that the method does not give."""
+    """Directions, branches and folds; ``InputError`` for a result that the method does not give, or too few samples."""
     del system, fixed
     for name in request.outputs:
         if request.method not in _ONLY.get(name, (request.method,)):
             methods = ", ".join(_ONLY[name])
             raise InputError(f"outputs: method {request.method} does not give {name}; allowed for it is {methods}")
+    samples, harmonics = (request.options.get(name, 0) for name in ("samples", "harmonics"))
+    if 0 < samples <= 2 * harmonics:
+        allowed = f"0 (by the harmonics) or at least {2 * harmonics + 1}, which tell {harmonics} harmonics apart"
+        raise InputError(f"options.samples = {samples}: allowed is {allowed}")
     branches = closed_form_response.BRANCHES.get(request.method, harmonic_response.BRANCHES)
     folds = exact_branch.SPECIAL if request.method == "exact" else closed_form_response.FOLDS
     return (

@@ -143,6 +143,11 @@ def test_options_of_another_method_are_refused():
         run("harmonic_balance", fit_range=1.0)
 
 
+def test_too_few_samples_for_the_harmonics_are_refused():
+    with pytest.raises(InputError, match=r"options.samples = 10: allowed is 0 \(by the harmonics\) or at least 11"):
+        run("harmonic_balance", harmonics=5, samples=10)
+
+
 @pytest.mark.parametrize(
     ("method", "size"),
     [("exact", 0.1808996938995747), ("harmonic_balance", 0.1808996938995747), ("multiple_scales", 0.0)],

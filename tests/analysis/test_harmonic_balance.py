@@ -181,6 +181,22 @@ def test_one_harmonic_is_the_describing_function():
         assert np.nanmin(distance, axis=1).max() < 2e-9
 
 
+@pytest.mark.parametrize("samples", [63, 100])
+def test_any_number_of_samples(samples):
+    omegas = np.array([0.7, 0.9])
+
+    def run(values):
+        model = oscillator(values | {"omega": omegas})
+        return [
+            harmonic_response.response(model, hb.Basis(5, 1, count), (1,), ("u_max", "spectral_radius"))
+            for count in (samples, 1024)
+        ]
+
+    ours, fine = jax.jit(run)(lanes(({},)))
+    np.testing.assert_allclose(ours["u_max"], fine["u_max"], rtol=1e-5)
+    np.testing.assert_allclose(ours["spectral_radius"], fine["spectral_radius"], rtol=1e-3)
+
+
 def test_subharmonics_follow_a_doubled_period():
     case = STEADY["T1 P2 w.45"]
 

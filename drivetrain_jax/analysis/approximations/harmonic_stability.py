@@ -37,7 +37,7 @@ def _product(later: Rows, earlier: Rows) -> Rows:
 
 
 def _ordered_product(matrices: Rows) -> Rows:
-    """Product of the matrices along the first axis (a multiple of ``_BLOCKS`` long), the last one leftmost.
+    """Product of the matrices along the first axis, the last one leftmost.
 
     In blocks side by side, then the blocks: loops whose results are stored, as XLA would compute the terms of one long
     expression again for every use.
@@ -49,7 +49,12 @@ def _ordered_product(matrices: Rows) -> Rows:
     def multiply(product: Rows, factor: Rows) -> tuple[Rows, None]:
         return _product(factor, product), None
 
-    by_block = tuple(jnp.moveaxis(m.reshape(_BLOCKS, -1, *tail), 0, 1) for m in matrices)
+    filling = -matrices[0].shape[0] % _BLOCKS
+    filled = (
+        jnp.concatenate([m, jnp.broadcast_to(u, (filling, *tail))]) if filling else m
+        for m, u in zip(matrices, unit, strict=True)
+    )
+    by_block = tuple(jnp.moveaxis(m.reshape(_BLOCKS, -1, *tail), 0, 1) for m in filled)
     blocks = jax.lax.scan(multiply, tuple(jnp.broadcast_to(u, (_BLOCKS, *tail)) for u in unit), by_block)[0]
     return jax.lax.scan(multiply, unit, blocks)[0]
 
