@@ -197,6 +197,22 @@ def test_any_number_of_samples(samples):
     np.testing.assert_allclose(ours["spectral_radius"], fine["spectral_radius"], rtol=1e-3)
 
 
+def test_spectral_radius_is_over_the_period_of_the_motion():
+    """However many subharmonics are kept: simple motions at .7 and .9, a doubled period at .45."""
+    omegas = np.array([0.44, 0.45, 0.7, 0.9])
+
+    def run(values, order):
+        return harmonic_response.response(
+            oscillator(values | {"omega": omegas}), hb.Basis(5, order, 128), (1,), ("spectral_radius", "u_max")
+        )
+
+    one, two, four = (jax.jit(lambda values, m=m: run(values, m))(lanes(({},))) for m in (1, 2, 4))
+    np.testing.assert_allclose(two["u_max"][2:], one["u_max"][2:], rtol=1e-6)
+    for kept in (two, four):
+        np.testing.assert_allclose(kept["spectral_radius"][2:], one["spectral_radius"][2:], rtol=1e-5)
+    np.testing.assert_allclose(four["spectral_radius"][1], two["spectral_radius"][1], rtol=1e-5)
+
+
 def test_subharmonics_follow_a_doubled_period():
     case = STEADY["T1 P2 w.45"]
 

@@ -29,6 +29,8 @@ _EXTREME_STEPS = 3
 _BEFORE = 0.999
 # Growth below this counts as stable: at a multiplier 1 within rounding.
 _MARGIN = 1e-9
+# Subharmonics below this part of the largest coefficient are what is left of the iterations.
+_VANISHING = 1e-8
 
 
 class Described(NamedTuple):
@@ -66,11 +68,21 @@ def extreme(basis: Basis, x: Array, samples: Array, sign: float) -> Array:
     return sign * jnp.maximum(sign * value(x, tau), jnp.max(sign * samples, axis=0))
 
 
+def repetitions(basis: Basis, x: Array) -> Array:
+    """How often the motion repeats within the base period: with subharmonics kept it may do without them."""
+    size = jnp.max(jnp.abs(x[1:]), axis=0)
+    times = jnp.ones(x.shape[1:])
+    for count in (n for n in range(2, basis.order + 1) if basis.order % n == 0):
+        others = jnp.max(jnp.abs(x[1:][basis.orders[1:] % count != 0]), axis=0)
+        times = jnp.where(others <= _VANISHING * size, count, times)
+    return times
+
+
 def describe(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array, exists: Array) -> Described:
     """The motion with coefficients ``x`` (n, ...); NaN where it does not exist."""
     touch = contact(model, basis, x)
     half = half_trace(model, basis, omega, touch)
-    radius = spectral_radius(model, basis, omega, half)
+    radius = spectral_radius(model, basis, omega, half) ** (1 / repetitions(basis, x))
     high, low = (jnp.where(exists, extreme(basis, x, touch.u, sign), jnp.nan) for sign in (1.0, -1.0))
     base = omega / basis.order
     rate = jnp.tensordot(basis.rates, x, 1) * base
