@@ -340,6 +340,17 @@ def test_sweeps_follow_their_branch():
     np.testing.assert_array_equal(reached[:, 1], [0.9, 3.0, 4.0, 5.0, 5.1])
 
 
+@pytest.mark.parametrize("case", [{"c": 0.005, "B1": 0.003}, {"c": 0.001, "B1": 6e-4}])
+def test_a_sweep_stays_on_a_steep_branch_up_to_its_fold(case):
+    """A narrow peak bends to higher frequencies: a sweep up has its largest amplitude wherever there are three."""
+    found = solve("multiple_scales", np.linspace(0.4, 1.0, 121), (case,))
+    motions = found["branch_u_max"][..., 0]
+    three = np.isfinite(motions).sum(axis=1) == 3
+    assert three.sum() > 25
+    np.testing.assert_array_equal(found["u_max"][three, 0, 0], motions[three, 2])
+    np.testing.assert_array_equal(found["u_max"][three, 1, 0], motions[three, 0])
+
+
 def test_refined_contains_the_values():
     omega = np.array([1.0, 0.5, 0.6])
     fine, places = refined(omega, 0.05, 4)

@@ -66,18 +66,22 @@ def follow(roots: Array) -> Array:
     """The root at which a sweep up and a sweep down stand, ``(L, K, ...) -> (L, 2, ...)`` indices.
 
     ``roots`` are rising along K and filled up with infinity, the frequencies rising along L. A sweep starts from rest.
-    At the next frequency the amplitude moves the way the averaged motion moves it: to the next root above if the
+    Between folds there are as many roots as before, and it keeps its place among them, however steep they are. At the first
+    frequency past a fold the amplitude moves the way the averaged motion moves it: to the next root above if the
     residual at the old amplitude is negative, to the next one below if it is positive.
     """
     size = roots.shape[1]
 
-    def move(amplitude: Array, at: Array) -> tuple[Array, Array]:
+    def move(state: tuple[Array, Array, Array], at: Array) -> tuple[tuple[Array, Array, Array], Array]:
+        amplitude, place, before = state
         below = jnp.sum(at < amplitude, axis=0)
-        index = jnp.minimum(2 * (below // 2), size - 1)
+        number = jnp.sum(jnp.isfinite(at), axis=0)
+        index = jnp.where(number == before, place, jnp.minimum(2 * (below // 2), size - 1))
         reached = jnp.take_along_axis(at, index[None], axis=0)[0]
-        return jnp.where(jnp.isfinite(reached), reached, amplitude), index
+        return (jnp.where(jnp.isfinite(reached), reached, amplitude), index, number), index
 
-    rest = jnp.zeros_like(roots[0, 0])
+    nowhere = jnp.zeros_like(jnp.sum(jnp.isfinite(roots[0]), axis=0))
+    rest = (jnp.zeros_like(roots[0, 0]), nowhere, nowhere)
     up = jax.lax.scan(move, rest, roots)[1]
     down = jax.lax.scan(move, rest, roots, reverse=True)[1]
     return jnp.stack([up, down], axis=1)
