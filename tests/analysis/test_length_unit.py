@@ -20,7 +20,11 @@ def run(analysis, size, outputs, **scene):
 def agree(found, expected, size, lengths):
     for name in expected.data_vars:
         scale = size if name in lengths else 1.0
-        np.testing.assert_allclose(found[name].values / scale, expected[name].values, rtol=1e-12, err_msg=name)
+        wanted = expected[name].values
+        # Where a motion passes through 0 rounding is relative to the motion.
+        np.testing.assert_allclose(
+            found[name].values / scale, wanted, rtol=1e-12, atol=1e-14 * np.nanmax(np.abs(wanted)), err_msg=name
+        )
 
 
 SIZES = [2.0**-1000, 2.0**-600, 2.0**-500, 2.0**600, 2.0**900]

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from drivetrain_jax.systems import PiecewiseLinearOscillator
@@ -23,18 +24,21 @@ _LENGTHS = frozenset((
 _LARGEST = 1000
 
 
-def measured(model: PiecewiseLinearOscillator) -> tuple[PiecewiseLinearOscillator, Array]:
+def measured(model: PiecewiseLinearOscillator) -> tuple[PiecewiseLinearOscillator, Array | np.ndarray]:
     """``model`` with lengths in units of their own, and this unit [m], of the common shape of all fields but omega."""
-    drive = jnp.maximum(jnp.abs(jnp.asarray(model.B0, float)), jnp.abs(jnp.asarray(model.B1, float)))
-    b = jnp.asarray(model.b, float)
-    static = jnp.frexp(drive)[1] - jnp.frexp(jnp.asarray(model.stiffness, float))[1]
+    fields = (model.b, model.B0, model.B1, model.stiffness)
+    # What a scene fixes stays a constant of the kernel.
+    xp = jnp if any(isinstance(x, Array) for x in fields) else np
+    b, B0, B1, stiffness = (xp.asarray(x, float) for x in fields)
+    drive = xp.maximum(xp.abs(B0), xp.abs(B1))
+    static = xp.frexp(drive)[1] - xp.frexp(stiffness)[1]
     none = -10 * _LARGEST
-    exponent = jnp.maximum(jnp.where(b > 0, jnp.frexp(b)[1], none), jnp.where(drive > 0, static, none))
-    exponent = jnp.where(exponent == none, 0, jnp.clip(exponent, -_LARGEST, _LARGEST))
-    unit, inverse = (jnp.ldexp(jnp.ones(exponent.shape), power) for power in (exponent, -exponent))
-    return replace(model, b=model.b * inverse, B0=model.B0 * inverse, B1=model.B1 * inverse), unit
+    exponent = xp.maximum(xp.where(b > 0, xp.frexp(b)[1], none), xp.where(drive > 0, static, none))
+    exponent = xp.where(exponent == none, 0, xp.clip(exponent, -_LARGEST, _LARGEST))
+    unit, inverse = (xp.ldexp(xp.ones(exponent.shape), power) for power in (exponent, -exponent))
+    return replace(model, b=b * inverse, B0=B0 * inverse, B1=B1 * inverse), unit
 
 
-def restored(results: Mapping[str, Array], unit: Array) -> dict[str, Array]:
+def restored(results: Mapping[str, Array], unit: Array | np.ndarray) -> dict[str, Array]:
     """``results``, whose last axis is that of ``unit``, with lengths in metres."""
     return {name: x * unit if name in _LENGTHS else x for name, x in results.items()}
