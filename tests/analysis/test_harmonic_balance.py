@@ -225,3 +225,18 @@ def test_subharmonics_follow_a_doubled_period():
         [found["u_max"][1, 0, 0], found["u_min"][1, 0, 0]], [case["max"], case["min"]], atol=1e-3
     )
     assert (np.asarray(found["stability"]) == 0).all()
+
+
+def test_a_lane_does_not_depend_on_the_others():
+    """Where a sweep loses its motion the equation is integrated: as finely and as long as the lane itself needs."""
+    omegas = np.array([0.7, 0.8, 0.9])
+
+    def run(values):
+        return harmonic_response.response(
+            oscillator(values | {"omega": omegas}), hb.Basis(3), (2,), ("u_max", "u_min", "residual")
+        )
+
+    run = jax.jit(run)
+    ours, others = run(lanes(({}, {}))), run(lanes(({}, {"c": 0.001, "k": 30.0})))
+    for name, value in ours.items():
+        np.testing.assert_array_equal(value[..., 0], others[name][..., 0], err_msg=name)

@@ -40,34 +40,44 @@ class Swept(NamedTuple):
     balanced: Array
 
 
-def settle(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array) -> Array:
-    """Coefficients of the motion some time after it was in the state of ``x`` at tau = 0."""
-    shape = x.shape[1:]
+def _effort(model: PiecewiseLinearOscillator, basis: Basis, omega: Array) -> tuple[Array, Array]:
+    """Base periods that each lane takes to settle, and steps from one sample to the next: its own, whatever its batch."""
+    fastest = jnp.sqrt(model.stiffness * jnp.maximum(model.alpha, 1.0)) / omega
+    steps = jnp.clip(2 * np.pi * _PER_RADIAN * fastest, *_STEPS)
+    decay = -np.log(_SETTLED) * omega / (np.pi * jnp.maximum(model.damping, 1e-12 * omega))
+    periods = jnp.clip(jnp.ceil(decay / basis.order), *(p // basis.order for p in _PERIODS))
+    return periods.astype(jnp.int32), jnp.ceil(steps * basis.order / basis.count).astype(jnp.int32)
+
+
+def settle(
+    model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array, wanted: Array | bool = True
+) -> Array:
+    """Coefficients of the motion some time after it was in the state of ``x`` at tau = 0, where this is ``wanted``."""
+    lanes = x.shape[1:]
     start = jnp.asarray(basis.at(np.zeros(1))[0]), jnp.asarray((basis.at(np.zeros(1)) @ basis.derivative)[0])
     u, v = jnp.tensordot(start[0], x, 1), jnp.tensordot(start[1], x, 1) * omega / basis.order
     # A motion that repeats exactly stays so: a push lets disturbances grow that it is unstable to.
     u = u + _PUSH * jnp.sqrt(jnp.sum(x[1:] ** 2, axis=0))
-    fastest = jnp.sqrt(model.stiffness * jnp.maximum(model.alpha, 1.0)) / omega
-    steps = jnp.clip(jnp.ceil(2 * np.pi * _PER_RADIAN * jnp.max(fastest)), *_STEPS).astype(jnp.int32)
-    decay = jnp.max(-np.log(_SETTLED) * omega / (np.pi * jnp.maximum(model.damping, 1e-12)))
-    periods = jnp.clip(jnp.ceil(decay / basis.order), *(p // basis.order for p in _PERIODS)).astype(jnp.int32)
-    turn = basis.order * steps
-    h = 2 * np.pi / (steps * omega) + jnp.zeros(shape)
-    orders = jnp.asarray(basis.orders)
-    odd = jnp.asarray((np.arange(basis.size) % 2 == 0) & (basis.orders > 0))
+    sampled = Basis(basis.harmonics, basis.order, max(_STEPS[0], 1 << (2 * basis.harmonics).bit_length()))
+    effort = (jnp.where(wanted, number, 0) for number in _effort(model, sampled, omega))
+    periods, parts = (jnp.broadcast_to(number, lanes) for number in effort)
+    turn = parts * sampled.count
+    h = 2 * np.pi * basis.order / (jnp.maximum(turn, 1) * omega)
 
-    def advance(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        return _runge_kutta(model, omega, (i % steps) * h, h, state)
+    def advance(number: Array, until: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        moved = _runge_kutta(model, omega, (number % jnp.maximum(turn, 1)) * h, h, state)
+        return tuple(jnp.where(number < until, new, old) for new, old in zip(moved, state, strict=True))
 
-    def project(i: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def project(sample: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         u, v, total = carry
-        angle = orders * (2 * np.pi / turn) * i
-        function = jnp.where(odd, jnp.sin(angle), jnp.cos(angle)) * jnp.where(orders == 0, 1.0, 2.0) / turn
-        total = total + function.reshape(-1, *(1,) * len(shape)) * u
-        return *advance(i, (u, v)), total
+        total = total + jnp.asarray(sampled.projection)[:, sample].reshape(-1, *(1,) * len(lanes)) * u
+        first, last = sample * parts, (sample + 1) * parts
+        u, v = jax.lax.fori_loop(0, jnp.max(parts), lambda i, state: advance(first + i, last, state), (u, v))
+        return u, v, total
 
-    u, v = jax.lax.fori_loop(0, periods * turn, advance, (u, v))
-    return jax.lax.fori_loop(0, turn, project, (u, v, jnp.zeros_like(x)))[2]
+    whole = periods * turn
+    u, v = jax.lax.fori_loop(0, jnp.max(whole), lambda i, state: advance(i, whole, state), (u, v))
+    return jax.lax.fori_loop(0, sampled.count, project, (u, v, jnp.zeros_like(x)))[2]
 
 
 def _runge_kutta(
@@ -107,7 +117,7 @@ def step(model: PiecewiseLinearOscillator, basis: Basis, before: Swept, omega: A
 
     def waited(count: Array, lost: Array, seed: Array, now: Swept) -> Array:
         # The motion settles once; past a fold that only the balance has, it would come back to it every time.
-        start = jax.lax.cond(count == 1, lambda seed: settle(model, basis, seed, omega), lambda seed: seed, seed)
+        start = jax.lax.cond(count == 1, lambda seed: settle(model, basis, seed, omega, lost), lambda seed: seed, seed)
         found = drift(model, basis, jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, seed), omega)
         return jnp.where(lost, jnp.where(jnp.all(jnp.isfinite(found), axis=0), found, seed), now.x)
 
