@@ -128,19 +128,22 @@ def _solve(
 ) -> dict[str, Array]:
     """A line; ``effort`` only orders the batches."""
     del effort
-    model, options = build(values), request.options
+    model, unit = measured(build(values))
+    options, shape = request.options, _shape(model)
     if request.method == "exact":
-        return _exact(model, request)
-    if request.method == "harmonic_balance":
+        results = _exact(model, request)
+    elif request.method == "harmonic_balance":
         basis = Basis(options["harmonics"], options["subharmonic"], options["samples"])
-        return harmonic_response.response(model, basis, _shape(model), request.outputs)
-    fit_range = options.get("fit_range", 0.0)
-    return closed_form_response.response(model, request.method, fit_range, _shape(model), request.outputs)
+        results = harmonic_response.response(model, basis, shape, request.outputs)
+    else:
+        given = options.get("fit_range", 0.0)
+        fit_range = given / unit if given > 0 else None
+        results = closed_form_response.response(model, request.method, fit_range, shape, request.outputs)
+    return restored(results, unit)
 
 
 def _exact(model: PiecewiseLinearOscillator, request: Request) -> dict[str, Array]:
     """The frequencies in rising order, and back to that of the path."""
-    model, unit = measured(model)
     rising, place = np.unique(np.asarray(model.omega), return_inverse=True)
     found = exact_response.sweeps(
         replace(model, omega=rising),
@@ -154,7 +157,7 @@ def _exact(model: PiecewiseLinearOscillator, request: Request) -> dict[str, Arra
         results, complete = _exact_branch(model, rising, found, special)
         found |= results
         outcome = jnp.where(~complete & (outcome == Outcome.SUCCESS), Outcome.TOLERANCE_NOT_MET, outcome)
-    results = restored({name: found[name][place] for name in request.outputs}, unit)
+    results = {name: found[name][place] for name in request.outputs}
     return results | {"outcome": outcome[place].astype(jnp.int8)}
 
 

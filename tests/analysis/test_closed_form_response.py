@@ -41,7 +41,7 @@ def lanes(cases) -> dict[str, np.ndarray]:
     return {name: np.array([table[name] for table in tables]) for name in TABLE1}
 
 
-def solve(method: str, omegas=OMEGAS, cases=CASES, fit_range: float = 0.0) -> dict[str, np.ndarray]:
+def solve(method: str, omegas=OMEGAS, cases=CASES, fit_range: float | None = None) -> dict[str, np.ndarray]:
     def run(values):
         model = oscillator(values | {"omega": omegas})
         return closed_form_response.response(model, method, fit_range, (len(cases),), OUTPUTS)
@@ -326,7 +326,7 @@ def test_softening_bends_down(describing):
 
 def test_a_line_without_lanes_equals_the_batch(describing):
     model = oscillator(TABLE1 | {"omega": OMEGAS})
-    alone = closed_form_response.response(model, "describing_function", 0.0, (), ("u_max", "fold_frequency"))
+    alone = closed_form_response.response(model, "describing_function", None, (), ("u_max", "fold_frequency"))
     np.testing.assert_allclose(alone["u_max"], describing["u_max"][..., 0], rtol=1e-12)
     assert alone["fold_frequency"].shape == (len(OMEGAS), closed_form_response.FOLDS)
 

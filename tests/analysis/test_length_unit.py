@@ -46,6 +46,30 @@ def test_a_response_and_its_branch():
     agree(found, expected, SIZES[1], lengths)
 
 
+@pytest.mark.parametrize("size", [2.0**-600, 2.0**-200, 2.0**900])
+@pytest.mark.parametrize(
+    ("method", "options", "own"),
+    [
+        ("multiple_scales", {}, ["peak_frequency", "fold_frequency"]),
+        ("multiple_scales", {"fit_range": 1.0}, ["peak_frequency", "fold_frequency"]),
+        ("describing_function", {}, ["peak_frequency", "fold_frequency"]),
+        ("harmonic_balance", {"harmonics": 3}, []),
+    ],
+)
+def test_an_approximate_response(method, options, own, size):
+    lengths = ["u_max", "u_min", "u_rms", "residual", "branch_u_max", "branch_u_min"]
+    lengths += ["peak_amplitude", "backbone_amplitude"] if own else []
+    lengths += ["fit_range"] if method == "multiple_scales" else []
+    outputs = [*lengths, *own, "phase", "spectral_radius", "regime", "stability"]
+    axes = {"omega": {"start": 0.7, "stop": 0.9, "num": 9}}
+
+    def response(size):
+        given = {"fit_range": size * options["fit_range"]} if "fit_range" in options else {}
+        return run("frequency_response", size, outputs, axes=axes, options={"method": method} | options | given)
+
+    agree(response(size), response(1.0), size, lengths)
+
+
 def test_basins():
     lengths, outputs = ["attractor_u_max", "attractor_u_min"], ["basin_fraction", "attractor_multiple"]
     found, expected = (

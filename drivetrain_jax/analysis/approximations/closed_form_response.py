@@ -47,12 +47,10 @@ class Curves(NamedTuple):
     fit_range: Array
 
 
-def of_multiple_scales(model: PiecewiseLinearOscillator, shape: tuple[int, ...], fit_range: float) -> Curves:
-    """The corrected closed form of the paper; ``fit_range = 0`` stands for the self-consistent one."""
-    given = jnp.full(shape, fit_range)
-    fit = multiple_scales.cubic_fit(
-        model, given if fit_range > 0 else multiple_scales.self_consistent_range(model, shape)
-    )
+def of_multiple_scales(model: PiecewiseLinearOscillator, shape: tuple[int, ...], fit_range: Array | None) -> Curves:
+    """The corrected closed form of the paper; without ``fit_range`` [m] the self-consistent one is taken."""
+    own = multiple_scales.self_consistent_range(model, shape) if fit_range is None else fit_range
+    fit = multiple_scales.cubic_fit(model, jnp.broadcast_to(own, shape))
     flow = multiple_scales.slow_flow(model, fit)
 
     def motions(omega: Any) -> OneTerm:
@@ -89,7 +87,11 @@ def of_describing_function(model: PiecewiseLinearOscillator, shape: tuple[int, .
 
 
 def response(
-    model: PiecewiseLinearOscillator, method: str, fit_range: float, shape: tuple[int, ...], outputs: tuple[str, ...]
+    model: PiecewiseLinearOscillator,
+    method: str,
+    fit_range: Array | None,
+    shape: tuple[int, ...],
+    outputs: tuple[str, ...],
 ) -> dict[str, Array]:
     """The requested results of a line of frequencies ``model.omega`` (L,) of oscillators of the batch ``shape``.
 

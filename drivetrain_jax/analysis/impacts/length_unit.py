@@ -15,10 +15,11 @@ from jax import Array
 
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
-# Results that are lengths or velocities.
+# Results that are lengths, velocities or accelerations.
 _LENGTHS = frozenset((
     "u_max", "u_min", "u_mean", "u_rms", "impact_velocity", "orbit_state", "state_error", "u_history", "v_history",
-    "branch_u_max", "branch_u_min", "attractor_u_max", "attractor_u_min",
+    "branch_u_max", "branch_u_min", "attractor_u_max", "attractor_u_min", "residual", "peak_amplitude",
+    "backbone_amplitude", "fit_range",
 ))  # fmt: skip
 # Beyond these exponents a power of two or its inverse is not a normal number.
 _LARGEST = 1000
