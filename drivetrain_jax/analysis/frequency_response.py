@@ -164,7 +164,8 @@ def _exact(model: PiecewiseLinearOscillator, request: Request) -> dict[str, Arra
 def _exact_branch(
     model: PiecewiseLinearOscillator, rising: np.ndarray, found: dict[str, Array], special: bool
 ) -> tuple[dict[str, Array], Array]:
-    """The branch through the first motion of period one that the sweep up has met, and whether it is complete."""
+    """The branch through the first motion of period one that the sweep up has met, and whether it is complete at each
+    frequency."""
     shape = _shape(model)
     lanes = int(np.prod(shape, dtype=int))
     single = found["period_multiple"][:, 0].reshape(-1, lanes) == 1
@@ -174,7 +175,9 @@ def _exact_branch(
     x = jnp.concatenate([state, jnp.asarray(rising)[first][None]])
     x = jnp.where(jnp.any(single, axis=0), x, jnp.nan)
     results, complete = exact_branch.branch(model, rising, x, special=special, width=exact_response.WIDTH)
-    return {name: value.reshape(*value.shape[:2], *shape) for name, value in results.items()}, complete.reshape(shape)
+    return {name: value.reshape(*value.shape[:2], *shape) for name, value in results.items()}, complete.reshape(
+        -1, *shape
+    )
 
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:

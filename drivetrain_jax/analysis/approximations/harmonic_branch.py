@@ -128,13 +128,14 @@ def trace(model: PiecewiseLinearOscillator, basis: Basis, x: Array, start: float
 
 def at_frequency(
     model: PiecewiseLinearOscillator, basis: Basis, branch: Course, omega: Array, count: int
-) -> tuple[Array, Array]:
-    """Up to ``count`` motions of the branch at ``omega``, in its order, balanced: ``(count, n, ...)`` and which exist."""
-    guess, exists = sections(branch, omega, count)
+) -> tuple[Array, Array, Array]:
+    """Up to ``count`` motions of the branch at ``omega``, in its order, balanced: ``(count, n, ...)``, which exist, and
+    whether these are as many as it has there."""
+    guess, exists, every = sections(branch, omega, count)
 
     def improved(x: Array) -> tuple[Array, Array]:
         found = balance(model, basis, x, omega + jnp.zeros(x.shape[1:]), _POLISH)
         return found.x, found.converged
 
     found, converged = jax.lax.map(improved, guess[:, :-1])
-    return found, exists & converged
+    return found, exists & converged, every & jnp.all(converged | ~exists, axis=0)

@@ -17,7 +17,7 @@ from drivetrain_jax.analysis.approximations.harmonic_balance import Basis, balan
 from drivetrain_jax.analysis.approximations.harmonic_branch import Branch, at_frequency, trace
 from drivetrain_jax.analysis.approximations.harmonic_stability import half_trace, spectral_radius
 from drivetrain_jax.analysis.approximations.harmonic_sweep import sweep
-from drivetrain_jax.analysis.impacts.branch_sections import course
+from drivetrain_jax.analysis.impacts.branch_sections import course, distinct
 from drivetrain_jax.analysis.impacts.motion import ABSENT, STABLE, UNSTABLE, imbalance, phase_lag, regime
 from drivetrain_jax.analysis.numerics.amplitude_roots import refined
 from drivetrain_jax.systems import PiecewiseLinearOscillator
@@ -104,7 +104,7 @@ def response(
     """The requested results of a line of frequencies ``model.omega`` (L,) of oscillators of the batch ``shape``.
 
     Outcome ``NOT_CONVERGED`` where a sweep has no balanced motion, ``TOLERANCE_NOT_MET`` where the branch was asked for
-    and could not be followed to the lowest frequency.
+    and could not be followed to the lowest frequency, or has more motions than are given.
     """
     omega = np.asarray(model.omega)
     lanes = shape or (1,)
@@ -147,7 +147,8 @@ def _sweeps(
 def _branches(
     model: PiecewiseLinearOscillator, basis: Basis, omega: np.ndarray, first: Array
 ) -> tuple[dict[str, Array], Array]:
-    """Extremes and stability ``(L, branch, N)`` of the motions on the branch of ``first``, by rising extremes.
+    """Extremes and stability ``(L, branch, N)`` of the motions on the branch of ``first``, by rising extremes, and
+    whether these are all that it has at a frequency, ``(L, N)``.
 
     The branch is followed from the highest frequency to the lowest.
     """
@@ -163,12 +164,15 @@ def _branches(
     units = jnp.concatenate([jnp.broadcast_to(scale, (basis.size, *lanes)), width])
     along = course(jnp.concatenate([curve.x, curve.omega[:, None]], axis=1), units)
 
-    def at(frequency: Array) -> tuple[Array, Array, Array]:
-        x, exists = at_frequency(model, basis, along, frequency, BRANCHES)
+    def at(frequency: Array) -> tuple[Array, Array, Array, Array]:
+        x, exists, every = at_frequency(model, basis, along, frequency, BRANCHES)
         wide = jnp.broadcast_to(frequency, lanes)
         found = jax.lax.map(lambda pair: describe(model, basis, pair[0], wide, pair[1]), (x, exists))
         order = jnp.argsort(found.u_max, axis=0)
-        return tuple(jnp.take_along_axis(v, order, axis=0) for v in (found.u_max, found.u_min, found.stability))
+        high, low, stability = (
+            jnp.take_along_axis(v, order, axis=0) for v in (found.u_max, found.u_min, found.stability)
+        )
+        return high, low, stability, every & distinct(high, low)
 
-    high, low, stability = jax.lax.map(at, jnp.asarray(omega))
-    return {"branch_u_max": high, "branch_u_min": low, "branch_stability": stability}, curve.complete
+    high, low, stability, every = jax.lax.map(at, jnp.asarray(omega))
+    return {"branch_u_max": high, "branch_u_min": low, "branch_stability": stability}, every & curve.complete

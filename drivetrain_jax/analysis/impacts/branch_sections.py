@@ -15,6 +15,8 @@ from jax import Array
 from drivetrain_jax.analysis.numerics.amplitude_roots import sign_changes
 
 _HALVINGS = 50
+# Difference of extremes, over their size, below which two motions are one.
+_SAME = 1e-9
 
 
 class Course(NamedTuple):
@@ -61,9 +63,12 @@ def course(points: Array, scale: Array) -> Course:
     return Course(points, slopes, cut, jnp.concatenate([nodes, omega[-1:]]))
 
 
-def sections(branch: Course, omega: Array, count: int) -> tuple[Array, Array]:
-    """Up to ``count`` places of the branch at ``omega``, in its order: ``(count, n, N)``, and which exist."""
-    changes = sign_changes(branch.nodes > omega, count) & jnp.isfinite(branch.nodes[1:])
+def sections(branch: Course, omega: Array, count: int) -> tuple[Array, Array, Array]:
+    """Up to ``count`` places of the branch at ``omega``, in its order: ``(count, n, N)``, which exist, and whether these
+    are all."""
+    above = branch.nodes > omega
+    changes = sign_changes(above, count) & jnp.isfinite(branch.nodes[1:])
+    every = jnp.sum((above[1:] != above[:-1]) & jnp.isfinite(branch.nodes[1:]), axis=0) <= count
     exists = jnp.any(changes, axis=1)
     place = jnp.argmax(changes, axis=1)
     number, second = place // 2, place % 2
@@ -87,4 +92,14 @@ def sections(branch: Course, omega: Array, count: int) -> tuple[Array, Array]:
 
     low, high = jax.lax.fori_loop(0, _HALVINGS, halve, (low, high))
     found = _cubic(ends, slopes, ((low + high) / 2)[:, None])
-    return jnp.where(exists[:, None], found, 0.0), exists
+    return jnp.where(exists[:, None], found, 0.0), exists, every
+
+
+def distinct(high: Array, low: Array) -> Array:
+    """Whether all motions with these extremes, ``(count, ...)`` by rising ``high`` and NaN after the last, are different.
+
+    Two places of a branch that are corrected to one motion have left out another.
+    """
+    size = jnp.maximum(jnp.abs(high), jnp.abs(low))[1:]
+    same = (jnp.abs(jnp.diff(high, axis=0)) <= _SAME * size) & (jnp.abs(jnp.diff(low, axis=0)) <= _SAME * size)
+    return ~jnp.any(same, axis=0)

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis.impacts.attractor import take
-from drivetrain_jax.analysis.impacts.branch_sections import course, sections
+from drivetrain_jax.analysis.impacts.branch_sections import course, distinct, sections
 from drivetrain_jax.analysis.impacts.motion import ABSENT, STABLE, UNSTABLE
 from drivetrain_jax.analysis.impacts.orbit_branch import Branch, doubling_test, fold_test, follow, locate, scale_of
 from drivetrain_jax.analysis.impacts.orbit_measures import measure
@@ -35,8 +35,9 @@ def branch(
 
     ``branch_u_max, branch_u_min, branch_stability``, shape ``(L, 7, N)``, by rising largest displacement; if
     ``special``, ``fold_frequency`` and ``doubling_frequency``, shape ``(L, 16, N)``, the largest 16 within the line,
-    rising. Second: whether each branch has been followed out of the line both ways, to the highest frequency at least
-    one way, and has no more folds or doublings than that. NaN in ``first``: no branch.
+    rising. Second, shape ``(L, N)``: whether each branch has been followed out of the line both ways, to the highest
+    frequency at least one way, and has no more orbits at a frequency, folds or doublings than that, each of them found.
+    NaN in ``first``: no branch.
     """
     low, high = float(omega[0]), float(omega[-1])
     own = {name: jnp.tile(v, 2) for name, v in vars(model).items() if name != "omega" and jnp.ndim(v)}
@@ -46,15 +47,17 @@ def branch(
     limits = (low * (1 - 1e-9), high * (1 + 1e-9))
     found = follow(both, 1, twice, direction=way, attempts=_ATTEMPTS, longest=_LONGEST, limits=limits)
     along = course(found.x, scale_of(both, twice, limits[1]))
-    guess, exists = jax.lax.map(lambda w: sections(along, w, BRANCHES), jnp.asarray(omega))
+    guess, exists, every = jax.lax.map(lambda w: sections(along, w, BRANCHES), jnp.asarray(omega))
     lanes = first.shape[1]
     number = np.broadcast_to(np.arange(omega.size)[:, None, None] * lanes, exists.shape)
     index = jnp.asarray((number + np.tile(np.arange(lanes), 2)).reshape(-1))
     points = _points(model, omega, lanes)
     states = jnp.moveaxis(guess, 2, 0).reshape(3, -1)[:2]
     results = _described(take(points, index), states, exists.reshape(-1), width)
-    results = _ordered({name: x.reshape(omega.size, 2 * BRANCHES, lanes) for name, x in results.items()})
-    complete = _ended(found.x[:, 2], limits).reshape(2, lanes).all(axis=0)
+    exists = exists.reshape(omega.size, 2 * BRANCHES, lanes)
+    results, all_told = _ordered({name: x.reshape(exists.shape) for name, x in results.items()}, exists)
+    complete = all_told & every.reshape(-1, 2, lanes).all(axis=1)
+    complete &= _ended(found.x[:, 2], limits).reshape(2, lanes).all(axis=0)
     complete &= (found.x[:, 2] >= high).any(axis=0).reshape(2, lanes).any(axis=0)
     if special:
         frequencies, all_found = _special(both, found, (low, high))
@@ -78,10 +81,15 @@ def _along(values: Array, omega: np.ndarray) -> Array:
     return jnp.broadcast_to(values, (omega.size, *values.shape))
 
 
-def _ordered(results: dict[str, Array]) -> dict[str, Array]:
-    """By rising largest displacement along the second axis, those that exist first."""
-    order = jnp.argsort(results["branch_u_max"], axis=1)[:, :BRANCHES]
-    return {name: jnp.take_along_axis(x, order, axis=1) for name, x in results.items()}
+def _ordered(results: dict[str, Array], exists: Array) -> tuple[dict[str, Array], Array]:
+    """By rising largest displacement along the second axis, those that exist first; whether they are as many different
+    orbits as there are places on the branch."""
+    order = jnp.argsort(results["branch_u_max"], axis=1)
+    ordered = {name: jnp.take_along_axis(x, order, axis=1) for name, x in results.items()}
+    high, low = (jnp.moveaxis(ordered[name], 1, 0) for name in ("branch_u_max", "branch_u_min"))
+    number = jnp.sum(exists, axis=1)
+    all_told = distinct(high, low) & (jnp.sum(jnp.isfinite(high), axis=0) == number) & (number <= BRANCHES)
+    return {name: x[:, :BRANCHES] for name, x in ordered.items()}, all_told
 
 
 def _corrected(model: PiecewiseLinearOscillator, states: Array, exists: Array) -> Array:

@@ -1,0 +1,53 @@
+"""A frequency at which the branch has more motions than are given says so, and only that one."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivetrain_jax.analysis import Outcome, frequency_response
+from drivetrain_jax.analysis._base import Request
+from drivetrain_jax.analysis.approximations import harmonic_branch, harmonic_response
+from drivetrain_jax.analysis.impacts import exact_branch
+from drivetrain_jax.analysis.impacts.branch_sections import distinct
+from drivetrain_jax.systems import rattle
+
+# Of Table 1: at .8 there are three motions.
+OMEGAS = np.array([0.65, 0.8, 0.95])
+OPTIONS = {
+    "exact": {"rtol": 1e-10, "most_periods": 1000},
+    "harmonic_balance": {"harmonics": 3, "subharmonic": 1, "samples": 256},
+}
+
+
+def branch(method):
+    request = Request(("branch_u_max",), method, OPTIONS[method])
+    solve = frequency_response.ANALYSIS.solvers(rattle.SYSTEM, request)[0].solve
+    values = rattle.PRESETS["table1"] | {"omega": OMEGAS}
+    found = jax.jit(lambda: solve(values, jnp.asarray(1)))()
+    return np.isfinite(found["branch_u_max"]).sum(axis=1), np.asarray(found["outcome"])
+
+
+@pytest.mark.parametrize(("method", "module"), [("exact", exact_branch), ("harmonic_balance", harmonic_response)])
+def test_more_motions_than_there_is_room_for(method, module, monkeypatch):
+    monkeypatch.setattr(module, "BRANCHES", 2)
+    number, outcome = branch(method)
+    np.testing.assert_array_equal(number, [1, 2, 1])
+    np.testing.assert_array_equal(outcome, [Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS])
+
+
+@pytest.mark.parametrize(
+    ("method", "module", "name"),
+    [("exact", exact_branch, "_CORRECTIONS"), ("harmonic_balance", harmonic_branch, "_POLISH")],
+)
+def test_a_motion_that_cannot_be_corrected(method, module, name, monkeypatch):
+    monkeypatch.setattr(module, name, 1)
+    number, outcome = branch(method)
+    assert number[1] < 3
+    np.testing.assert_array_equal(outcome == Outcome.TOLERANCE_NOT_MET, number < [1, 3, 1])
+
+
+def test_two_places_that_are_corrected_to_one_motion():
+    high = np.array([[0.1, 0.1, 0.1], [0.2, 0.1, 0.1], [np.nan, 0.3, 0.3]])
+    low = np.array([[-0.1, -0.1, -0.3], [-0.2, -0.1, -0.1], [np.nan, -0.3, -0.3]])
+    np.testing.assert_array_equal(distinct(jnp.asarray(high), jnp.asarray(low)), [True, False, True])
