@@ -17,7 +17,8 @@ from sphinx.util.docutils import SphinxDirective
 import drivetrain_jax as dt
 from drivetrain_jax._quantities import Parameter, Variable
 from drivetrain_jax.analysis import Analysis, Outcome, get_analysis
-from drivetrain_jax.systems import get_system
+from drivetrain_jax.sweep.toml import entries
+from drivetrain_jax.systems import System, get_system
 from drivetrain_jax.view.style import symbol
 
 ROOT = Path(__file__).parents[1]
@@ -44,9 +45,7 @@ def parameters(system: str) -> str:
     rows = [_parameter_row(p) for p in get_system(system).parameters]
     text = table(("symbol", "name", "meaning", "unit", "allowed", "default"), rows)
     presets = get_system(system).presets
-    listed = [
-        (f"`{n}`", ", ".join(f"`{k} = {value_text(v)}`" for k, v in given.items())) for n, given in presets.items()
-    ]
+    listed = [(f"`{name}`", ", ".join(f"`{entry}`" for entry in entries(given))) for name, given in presets.items()]
     return text + ("\n" + table(("preset", "values"), listed) if listed else "")
 
 
@@ -81,14 +80,16 @@ def value_text(value: Any) -> str:
 
 def analyses(system: str) -> str:
     """The analyses of a system: results, methods and options of each."""
-    return "\n".join(_analysis(get_analysis(name)) for name in get_system(system).models)
+    served = get_system(system)
+    return "\n".join(_analysis(get_analysis(name), served) for name in served.models)
 
 
-def _analysis(analysis: Analysis) -> str:
-    results = table(
-        ("result", "meaning", "unit", "dimensions"), [_variable_row(v, analysis) for v in analysis.variables]
-    )
-    methods = ", ".join(f"`{name}` ({', '.join(used) or 'no options'})" for name, used in analysis.methods.items())
+def _analysis(analysis: Analysis, system: System) -> str:
+    lacking = analysis.lacks(system)
+    offered = [v for v in analysis.variables if v.name not in lacking]
+    results = table(("result", "meaning", "unit", "dimensions"), [_variable_row(v, analysis) for v in offered])
+    used = {name: options for name, options in analysis.methods.items() if name not in lacking}
+    methods = ", ".join(f"`{name}` ({', '.join(options) or 'no options'})" for name, options in used.items())
     heading = f"### `{analysis.name}`\n\n{analysis.title[0].upper()}{analysis.title[1:]}."
     text = f"{heading}\n\n{results}\nMethods and the options they use, the first by default: {methods}.\n"
     rows = [_parameter_row(option)[1:] for option in analysis.options]

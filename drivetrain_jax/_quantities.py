@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from drivetrain_jax._wording import shown
+
 # Codes of ``outcome`` from here on mean that there is no value.
 FIRST_FAILURE = 2
 
@@ -72,21 +74,21 @@ class Parameter:
             # A word that looks like a number may be written without quotes.
             value = str(value) if isinstance(value, int) and str(value) in self.choices else value
             if value not in self.choices:
-                raise ValueError(f"{self.name} = {value!r}: allowed is {self.allowed}")
+                raise ValueError(f"{self.name} = {shown(value)}: allowed is {self.allowed}")
             return value
         if self.text:
             if not isinstance(value, str):
-                raise ValueError(f"{self.name} = {value!r}: allowed is text")
+                raise ValueError(f"{self.name} = {shown(value)}: allowed is text")
             return value
         if self.listed and not (self.broadcast and not isinstance(value, (list, tuple))):
             if not isinstance(value, (list, tuple)) or not value:
-                raise ValueError(f"{self.name} = {value!r}: allowed is a list of numbers, {self.allowed}")
+                raise ValueError(f"{self.name} = {shown(value)}: allowed is a list of numbers, {self.allowed}")
             return tuple(self._check_number(entry, f"{self.name}[{i}]") for i, entry in enumerate(value))
         return self._check_number(value, self.name)
 
     def _check_number(self, value: object, label: str) -> float | int:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise ValueError(f"{label} = {value!r}: allowed is a number, {self.allowed}")
+            raise ValueError(f"{label} = {shown(value)}: allowed is a number, {self.allowed}")
         below = value <= self.lower if self.open_lower else value < self.lower
         above = value >= self.upper if self.open_upper else value > self.upper
         finite = math.isfinite(value) or (self.infinite and value == math.inf)

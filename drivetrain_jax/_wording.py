@@ -16,7 +16,7 @@ def clipped(text: str) -> str:
 
 def shown(value: Any) -> str:
     """What was given, as a message repeats it."""
-    return clipped(repr(value))
+    return clipped(" ".join(repr(value).split("\n")))
 
 
 def counted(count: int, one: str, many: str) -> str:

@@ -38,6 +38,9 @@ VARIABLES = (
     Variable("velocity_error", "rad/s", "estimated absolute error of velocity", ("time",)),
 )
 _COMPONENT = {"phi": 0, "velocity": 1}
+_NUM = Parameter(
+    "num", "1", "number of equally spaced times from 0 to stop", default=1001, lower=2, upper=1e7, integer=True
+)
 
 # Tolerances of the steps over that of the result: errors of steps add up over the memory of the damped motion.
 _SHARPNESS, _COARSER, _SHARPEST = 0.01, 10.0, 1e-15
@@ -81,6 +84,8 @@ def requested_times(request: Request) -> tuple[float, ...]:
     times, stop, num = (request.options[name] for name in ("times", "stop", "num"))
     if times and stop:
         raise InputError(f"options.stop = {stop:g}: given together with times; allowed is one of the two")
+    if times and num != _NUM.default:
+        raise InputError(f"options.num = {num}: given together with times; allowed is one of the two")
     if not times and not stop:
         raise InputError("options.times: missing; allowed is times, or stop and num")
     if times and (np.diff(times) <= 0).any():
@@ -274,9 +279,7 @@ ANALYSIS = Analysis(
             upper=MOST_SECONDS,
         ),
         Parameter("stop", "s", "end of the history (0: see times)", default=0.0, lower=0.0, upper=MOST_SECONDS),
-        Parameter(
-            "num", "1", "number of equally spaced times from 0 to stop", default=1001, lower=2, upper=1e7, integer=True
-        ),
+        _NUM,
         RTOL,
         Parameter("solver", "1", "diffrax solver", default="Dopri8", choices=SOLVERS),
     ),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
@@ -12,6 +11,7 @@ from drivetrain_jax._quantities import Parameter, Variable
 from drivetrain_jax._wording import aligned, written
 from drivetrain_jax.analysis import get_analysis
 from drivetrain_jax.sweep.scene import find_system
+from drivetrain_jax.sweep.toml import entries
 from drivetrain_jax.systems import System, system_names
 
 
@@ -39,7 +39,7 @@ def describe(name: str) -> str:
         lines += aligned([(p.name, f"[{p.units}]", p.long_name, p.allowed) for p in system.physical.quantities])
     if system.presets:
         lines += ["", "Sets of values, to be copied into a scene"]
-        lines += aligned([(preset, _assignments(values)) for preset, values in system.presets.items()])
+        lines += aligned([(preset, ", ".join(entries(values))) for preset, values in system.presets.items()])
     for analysis in system.models:
         lines += ["", *_analysis_lines(analysis, system)]
     return "\n".join([*lines, *_scene_lines(system)]) + "\n"
@@ -75,10 +75,6 @@ def _parameter_row(parameter: Parameter) -> tuple[str, ...]:
 def _variable_row(variable: Variable, default: bool) -> tuple[str, ...]:
     meaning = variable.long_name + (f": {', '.join(variable.flags)}" if variable.flags else "")
     return f"{variable.name}{'*' if default else ''}", f"[{variable.units}]", meaning, ", ".join(variable.dims)
-
-
-def _assignments(values: Any) -> str:
-    return ", ".join(f"{name} = {value}" for name, value in values.items())
 
 
 def _scene_lines(system: System | None) -> list[str]:

@@ -7,6 +7,7 @@ from dataclasses import fields
 from typing import Any
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax.sweep import toml
 from drivetrain_jax.systems import System
 
 
@@ -42,4 +43,4 @@ def nondimensional(system: System, given: Mapping[str, Any]) -> tuple[Any, dict[
 def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
         return tuple(map(_plain, value))
-    return value.tolist() if hasattr(value, "tolist") else value
+    return toml.plain(value)

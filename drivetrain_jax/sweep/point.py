@@ -12,7 +12,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Variable
-from drivetrain_jax._wording import aligned, nearest, written
+from drivetrain_jax._wording import aligned, nearest, shown, written
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request, get_analysis
 from drivetrain_jax.sweep.assemble import Table
 from drivetrain_jax.sweep.engine import Engine
@@ -174,7 +174,7 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
     names = (*parameters, "method", *(o.name for o in analysis.options))
     for name, value in given.items():
         if name not in names:
-            raise InputError(f"{name} = {value!r}: unknown{nearest(name, names)}")
+            raise InputError(f"{name} = {shown(value)}: unknown{nearest(name, names)}")
         if name not in parameters:
             tree["options"][name] = value
         elif parameters[name].is_number and not isinstance(value, (list, tuple)) and name != path:

@@ -69,7 +69,7 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
     tree, text = toml.read(source, overrides)
     table = _convert(tree, _SceneTable, "")
     system, analysis = system_and_analysis(table.system, table.analysis)
-    request = _request(table, analysis)
+    request = _request(table, system, analysis)
     _check_offered(analysis, system, request)
     axes, zipped = _axes(table, system, analysis)
     fixed = _fixed(table, system, analysis, axes)
@@ -137,25 +137,28 @@ def _toml_types(match: re.Match[str]) -> str:
     return " or ".join(words) or "nothing"
 
 
-def _request(table: _SceneTable, analysis: Analysis) -> Request:
-    """Outputs, method and options, checked against what the analysis offers."""
+def _request(table: _SceneTable, system: System, analysis: Analysis) -> Request:
+    """Outputs, method and options, checked against what the analysis knows; messages name what the system offers of it."""
+    lacking = analysis.lacks(system)
     names = [v.name for v in analysis.variables]
+    offered = [name for name in names if name not in lacking]
+    methods = [name for name in analysis.methods if name not in lacking]
     outputs = list(analysis.default_outputs) if table.outputs is None else table.outputs
     for name in outputs:
         if name not in names and name != OUTCOME.name:
-            raise InputError(f"outputs: {name!r} is not a result of {analysis.name}{nearest(name, names)}")
+            raise InputError(f"outputs: {name!r} is not a result of {analysis.name}{nearest(name, offered)}")
     # The outcome is stored with every result, named or not.
     outputs = [name for name in outputs if name != OUTCOME.name]
     if not outputs or len(set(outputs)) < len(outputs):
-        raise InputError(f"outputs = {shown(table.outputs)}: allowed is one or more of {', '.join(names)}, each once")
+        raise InputError(f"outputs = {shown(table.outputs)}: allowed is one or more of {', '.join(offered)}, each once")
     given = dict(table.options)
     method = given.pop("method", next(iter(analysis.methods)))
     if not isinstance(method, str) or method not in analysis.methods:
-        raise InputError(f"options.method = {method!r}: unknown{nearest(str(method), analysis.methods)}")
+        raise InputError(f"options.method = {shown(method)}: unknown{nearest(str(method), methods)}")
     used = analysis.methods[method]
     for key, value in given.items():
         if key not in used:
-            others = [name for name, options in analysis.methods.items() if key in options]
+            others = [name for name in methods if key in analysis.methods[name]]
             guess = f", but by {', '.join(others)}" if others else did_you_mean(key, ("method", *used))
             allowed = f"allowed is {', '.join(('method', *used))}"
             raise InputError(f"options.{key} = {shown(value)}: not used by method {method}{guess}; {allowed}")
@@ -312,7 +315,7 @@ def _fixed(table: _SceneTable, system: System, analysis: Analysis, axes: tuple[A
         others = f" (missing too: {', '.join(p.name for p in missing[1:])})" if missing[1:] else ""
         raise InputError(f"fixed.{missing[0].name}: missing; allowed is {missing[0].allowed_in_units}{others}")
     for axis in axes:
-        _check_entry(axis, fixed)
+        _check_entry(axis, fixed, "points" if table.points else "axes")
     _check_together(system.models[analysis.name], fixed)
     return fixed
 
@@ -340,16 +343,17 @@ def _path_axis(
     return name
 
 
-def _check_entry(axis: Axis, fixed: Mapping[str, Value]) -> None:
+def _check_entry(axis: Axis, fixed: Mapping[str, Value], where: str) -> None:
     """One swept entry needs the whole list beside it, for its length and the other entries."""
     name = axis.parameter.name
     if axis.entry is None:
         return
-    if name not in fixed:
+    # An empty list is the default "none".
+    if fixed.get(name, ()) == ():
         raise InputError(
             f"fixed.{name}: missing; {axis.name} varies one entry of this list; allowed is {axis.parameter.allowed}"
         )
     if not isinstance(fixed[name], tuple):
         raise InputError(f"fixed.{name} = {fixed[name]}: {axis.name} varies one entry; allowed is a list of numbers")
     if axis.entry >= len(fixed[name]):
-        raise InputError(f"axes.{axis.name}: allowed is {name}[0] to {name}[{len(fixed[name]) - 1}]")
+        raise InputError(f"{where}.{axis.name}: allowed is {name}[0] to {name}[{len(fixed[name]) - 1}]")

@@ -11,6 +11,8 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
+import numpy as np
+
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import shown
 
@@ -38,7 +40,7 @@ def read(
 
 def _read(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None) -> tuple[dict[str, Any], str]:
     if isinstance(source, Mapping):
-        tree, text = _plain(source), None
+        tree, text = plain(source), None
     elif not isinstance(source, (str, os.PathLike)):
         raise InputError(f"scene = {shown(source)}: allowed is the path of a scene file, or a table")
     else:
@@ -59,18 +61,21 @@ def _read(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] |
                 f"overrides = {shown(overrides)}: allowed is a table by dotted keys, {{'fixed.zeta': 0.002}}"
             )
         for key, value in overrides.items():
-            _replace(tree, key, _plain(value))
+            _replace(tree, key, plain(value))
     _check(tree, "scene")
     return tree, write(tree) if text is None else text
 
 
-def _plain(value: Any) -> Any:
-    """A copy in the types of TOML: NumPy numbers and arrays and tuples become numbers and lists."""
+def plain(value: Any) -> Any:
+    """A copy in the types of TOML: numbers and arrays of NumPy and its like, tuples and ranges become numbers and lists."""
     if isinstance(value, Mapping):
-        return {key: _plain(entry) for key, entry in value.items()}
+        return {key: plain(entry) for key, entry in value.items()}
     if hasattr(value, "tolist"):
         return value.tolist()
-    return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+    if hasattr(value, "__array__"):
+        # Labelled arrays of xarray know no tolist of their own.
+        return np.asarray(value).tolist()
+    return [plain(entry) for entry in value] if isinstance(value, (list, tuple, range)) else value
 
 
 def _check(value: Any, field: str) -> None:
@@ -139,14 +144,15 @@ def parse_value(text: str) -> Any:
 def write(tree: Mapping[str, Any]) -> str:
     """TOML text of ``tree``: plain entries first, then its tables, whose own tables are written inline. What is None, which
     stands for nothing, is left out: TOML has no word for it."""
-    plain = _entries({name: value for name, value in tree.items() if not isinstance(value, Mapping)})
+    lines = entries({name: value for name, value in tree.items() if not isinstance(value, Mapping)})
     for name, table in tree.items():
         if isinstance(table, Mapping):
-            plain += ["", f"[{_key(name)}]", *_entries(table)]
-    return "\n".join(plain) + "\n"
+            lines += ["", f"[{_key(name)}]", *entries(table)]
+    return "\n".join(lines) + "\n"
 
 
-def _entries(table: Mapping[str, Any]) -> list[str]:
+def entries(table: Mapping[str, Any]) -> list[str]:
+    """``name = value`` for every entry of ``table``."""
     return [f"{_key(name)} = {_value(value)}" for name, value in table.items() if value is not None]
 
 
@@ -165,7 +171,7 @@ def _value(value: Any) -> str:
     if isinstance(value, str):
         return _quoted(value)
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(_entries(value)) + " }"
+        return "{ " + ", ".join(entries(value)) + " }"
     if isinstance(value, Sequence):
         return "[" + ", ".join(_value(entry) for entry in value) + "]"
     return repr(value)

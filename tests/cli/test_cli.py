@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import h5py
@@ -17,6 +18,7 @@ from drivetrain_jax import ChunkError, InputError, __version__
 from drivetrain_jax.cli import main
 from drivetrain_jax.cli.progress import progress_line
 from drivetrain_jax.sweep.work import Progress
+from drivetrain_jax.systems import get_system
 
 SCENE = """
 system = "toy"
@@ -393,6 +395,17 @@ def test_list(cli):
     assert code == 0
     for part in ("beta", "rad", "joint angle", "required", "0 <= zeta", "spectral_radius", "rtol", "default 1e-10"):
         assert part in out
+
+
+def test_sets_of_values_can_be_copied_into_a_scene(cli):
+    lines = cli("list", "bicardan")[1].splitlines()
+    given = next(line for line in lines if line.startswith("  paper  ")).split(maxsplit=1)[1]
+    wanted = get_system("bicardan").presets["paper"]
+    assert tomllib.loads(f"set = {{ {given} }}")["set"] == {k: _listed(v) for k, v in wanted.items()}
+
+
+def _listed(value):
+    return list(value) if isinstance(value, tuple) else value
 
 
 def test_titles_that_an_output_cannot_write_are_escaped(folder):

@@ -6,12 +6,22 @@ import math
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from drivetrain_jax import InputError
 from drivetrain_jax.sweep import toml
 from drivetrain_jax.sweep.scene import load_scene
 
 GOOD = {"system": "toy", "analysis": "toy", "axes": {"a": {"start": 0, "stop": 1, "num": 3}}}
+
+HISTORY = {"system": "tripod", "analysis": "history", "fixed": {"element": "input", "beta": 0.1, "zeta": 0.01}}
+TWO_SEGMENTS = {"length": [1.0, 1.0], "EI": [1.0, 1.0], "rhoA": [1.0, 1.0], "k_A": 1.0, "k_D": 1.0}
+SHAFT = {"system": "bicardan", "analysis": "critical_speeds", "fixed": TWO_SEGMENTS}
+
+
+class Lines:
+    def __repr__(self):
+        return "one\ntwo"
 
 
 def changed(**changes):
@@ -53,6 +63,14 @@ def test_axis_values(axis, expected):
 def test_mapping_may_hold_numpy_values():
     scene = load_scene({**GOOD, "axes": {"a": {"values": np.linspace(0, 1, 3)}}, "fixed": {"b": np.float64(1.5)}})
     assert scene.axes[0].values.tolist() == [0, 0.5, 1] and scene.fixed["b"] == 1.5
+
+
+@pytest.mark.parametrize(
+    "values", [xr.DataArray([0.0, 0.5, 1.0]), xr.DataArray([0.0, 0.5, 1.0]).to_series(), range(3), (0.0, 0.5, 1.0)]
+)
+def test_mapping_may_hold_what_is_like_a_list(values):
+    scene = load_scene({**GOOD, "axes": {"a": {"values": values}}, "fixed": {"b": xr.DataArray(1.5)}})
+    assert scene.axes[0].values.tolist() == list(values) and scene.fixed["b"] == 1.5
 
 
 def test_text_of_a_changed_scene_gives_that_scene(tmp_path):
@@ -176,6 +194,33 @@ WRONG = {
         "fixed.weight = [1.0, 2.0]: 2 entries",
         "equally",
     ),
+    "result that this system lacks": (
+        {"system": "cardan", "analysis": "floquet", "outputs": ["floquet_exponents"]},
+        "'floquet_exponents'",
+        "allowed is floquet_multiplier, spectral_radius,",
+    ),
+    "method that this system lacks": (
+        {"system": "tripod", "analysis": "floquet", "options": {"method": "magic"}},
+        "options.method = 'magic'",
+        "allowed is auto, direct, diffrax",
+    ),
+    "num beside times": (
+        {**HISTORY, "options": {"times": [0.0, 1.0], "num": 5}},
+        "options.num = 5",
+        "given together with times",
+    ),
+    "entry of a list that is not given": (
+        {**SHAFT, "axes": {"k_joint[0]": {"values": [1e6]}}},
+        "fixed.k_joint: missing",
+        "k_joint[0] varies one entry",
+    ),
+    "entry beyond the list among points": (
+        {**SHAFT, "points": {"length[2]": [1.0]}},
+        "points.length[2]",
+        "length[0] to length[1]",
+    ),
+    "value of many lines": (changed(fixed={"b": Lines()}), "fixed.b = one two", "a number"),
+    "long list for a number": (changed(fixed={"b": [0.5] * 1000}), "fixed.b = [0.5, 0.5,", "...: allowed"),
     "list of one": (
         {"system": "planetary", "analysis": "modes", "fixed": {"planet_angle": [0.0, 2.0], "m_p": [1.0]}},
         "fixed.m_p = [1.0]: 1 entry where planet_angle has 2",
