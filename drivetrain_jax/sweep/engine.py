@@ -9,9 +9,10 @@ from concurrent.futures import Future
 from functools import cached_property
 from typing import Any
 
+import jax
 import numpy as np
 
-from drivetrain_jax._errors import ChunkError, Passing
+from drivetrain_jax._errors import ChunkError, InputError, Passing
 from drivetrain_jax._threads import threads
 from drivetrain_jax.store.provenance import digest
 from drivetrain_jax.sweep import compile_cache
@@ -33,6 +34,7 @@ class Engine:
 
     def __init__(self, scene: Scene, points: np.ndarray | None = None, *, full_size: bool = False) -> None:
         # Before the first kernel, which may be one that a plan asks for.
+        _use_double_precision()
         compile_cache.enable()
         self.scene = scene
         self.grid = Grid.of(scene)
@@ -110,6 +112,14 @@ class Engine:
             solver = self.solvers[chunk.solver].name
             kind = Passing if _may_pass(error) else ChunkError
             raise kind(f"chunk {chunk.number} ({solver}): {type(error).__name__}: {error}") from error
+
+
+def _use_double_precision() -> None:
+    """Set jax to double precision again where it has been set to another since: nothing else would tell."""
+    jax.config.update("jax_enable_x64", True)
+    if not jax.config.jax_enable_x64:
+        # A context holds for its own thread and does not reach those that compute.
+        raise InputError("jax_enable_x64 = False: set by the context of this call; allowed is a call outside of it")
 
 
 def _may_pass(error: Exception) -> bool:

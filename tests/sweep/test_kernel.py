@@ -24,6 +24,36 @@ def test_double_precision():
     assert jax.config.jax_enable_x64 and jnp.ones(1).dtype == jnp.float64
 
 
+@pytest.fixture
+def unset_precision():
+    yield lambda: jax.config.update("jax_enable_x64", False)
+    jax.config.update("jax_enable_x64", True)
+
+
+TWO = {
+    "system": "tripod",
+    "analysis": "parameters",
+    "outputs": ["mean_inertia"],
+    "axes": {"beta": {"values": [0.1, 0.2]}},
+    "fixed": {"element": "input", "zeta": 0.01},
+}
+
+
+def test_precision_that_was_unset_is_set_again(unset_precision):
+    expected = dt.run(TWO).mean_inertia
+    unset_precision()
+    assert dt.run(TWO).mean_inertia.equals(expected)
+    # A context reaches this thread alone, not those that compute.
+    unset_precision()
+    with jax.enable_x64(True):
+        assert dt.run(TWO).mean_inertia.equals(expected)
+
+
+def test_a_call_within_single_precision_is_refused():
+    with jax.enable_x64(False), pytest.raises(dt.InputError, match="jax_enable_x64 = False"):
+        dt.run(TWO)
+
+
 def test_full_vector_width_only_where_there_is_avx512(monkeypatch):
     # Of jaxlib 0.10; another one is asked, see below.
     monkeypatch.setattr(kernels, "compiler_knows", lambda option, value: True)
