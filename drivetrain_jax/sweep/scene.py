@@ -257,7 +257,8 @@ def _points(table: _SceneTable, system: System) -> tuple[Axis, ...]:
     columns = []
     for name, values in table.points.items():
         parameter, entry = _swept_parameter(system, "points", name)
-        checked = [_checked(_scalar(parameter, name), value, "points.") for value in values]
+        scalar = _scalar(parameter, name)
+        checked = [_checked(scalar, value, "points.") for value in values]
         columns.append(Axis(name, parameter, entry, np.array(checked)))
     return tuple(columns)
 

@@ -111,11 +111,8 @@ def _text(path: Path) -> str:
 
 def _replace(tree: dict[str, Any], key: str, value: Any) -> None:
     *tables, last = key.split(".")
-    if (
-        not tables
-        and last not in tree
-        and (inside := [n for n, t in tree.items() if isinstance(t, dict) and last in t])
-    ):
+    first = key.partition(".")[0]
+    if first not in tree and (inside := [n for n, t in tree.items() if isinstance(t, dict) and first in t]):
         raise InputError(f"set {key}: not a key of the scene itself; did you mean {inside[0]}.{key}?")
     for name in tables:
         tree = tree.setdefault(name, {})

@@ -240,6 +240,7 @@ def test_wrong_run_is_one_line_and_writes_nothing(cli, folder, case):
         ),
         (("status", "scene.toml", "--out", "r.nc", "more"), "more: not an argument"),
         (("run", "scene.toml", "--out", "r.nc", "--set", "b=3"), "did you mean fixed.b?"),
+        (("run", "scene.toml", "--out", "r.nc", "--set", "a.num=3"), "did you mean axes.a.num?"),
         (("run", "scene.toml", "--out", "r.nc", "--dask", "nowhere"), "tcp://HOST:PORT"),
         (("run", "scene.toml", "--out", "r.nc", "--set", "system=cardna"), "(did you mean cardan?)"),
         (
