@@ -15,7 +15,7 @@ from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, N
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
-from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STATE_HATCHES, STATE_NAMES, STATES
+from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STATE_HATCHES, STATE_NAMES, STATES, symbol
 
 STABLE, UNSTABLE, UNDECIDED, FAILED = range(4)
 _PENDING, _PENDING_COLOUR = "pending", "#c4c4c4"
@@ -23,11 +23,24 @@ _NO_PARAMETERS = ("point", _PENDING)
 
 
 def prepare(dataset: xr.Dataset) -> xr.Dataset:
-    """``dataset`` with rising axes; axes of one value become scalar coordinates."""
+    """``dataset`` with rising axes; axes of one value become scalar coordinates. Infinite values of others are left out:
+    they have no place on an axis. The attribute ``left_out`` says so."""
+    dataset = _finite(dataset)
     single = {name: 0 for name in dataset["outcome"].dims if dataset.sizes[name] == 1}
     dataset = dataset.isel(single)
     axes = [name for name in dataset["outcome"].dims if name in dataset.coords]
     return _with_pending(dataset.sortby(axes) if axes else dataset)
+
+
+def _finite(dataset: xr.Dataset) -> xr.Dataset:
+    left_out = []
+    for name in dataset.coords:
+        coordinate = dataset[name]
+        infinite = np.isinf(coordinate.values) if coordinate.dtype.kind == "f" else np.zeros(coordinate.shape, bool)
+        if infinite.any() and not infinite.all() and coordinate.dims[0] in dataset["outcome"].dims:
+            dataset = dataset.isel({coordinate.dims[0]: ~infinite})
+            left_out.append(f"{symbol(str(name))} = inf left out")
+    return dataset.assign_attrs(left_out=", ".join(left_out)) if left_out else dataset
 
 
 def _with_pending(dataset: xr.Dataset) -> xr.Dataset:

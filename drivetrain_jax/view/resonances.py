@@ -94,15 +94,16 @@ def label(axes: Axes, lines: list[Prediction]) -> None:
     scale = 72 / axes.figure.dpi
     for edge, spacing, side in ((_top_exit, _SPACING_ACROSS, 0), (_right_exit, _SPACING_UP, 1)):
         found = [(line, edge(axes, line)) for line in sorted(lines, key=lambda line: line.order)]
-        ends = [(line, axes.transData.transform(point)) for line, point in found if point is not None]
+        ends = [(line, point) for line, point in found if point is not None]
+        along = [axes.transData.transform(point)[side] * scale for _, point in ends]
         box = axes.bbox
         limits = (box.xmin, box.xmax) if side == 0 else (box.ymin, box.ymax)
         # Labels may stand out over the corners by one width.
         span = (limits[0] * scale - spacing, limits[1] * scale + spacing)
-        kept, positions = _place([end[side] * scale for _, end in ends], spacing, span)
+        kept, positions = _place(along, spacing, span)
         for index, position in zip(kept, positions, strict=True):
             line, end = ends[index]
-            _write(axes, line.label, end, side, position - end[side] * scale)
+            _write(axes, line.label, end, side, position - along[index])
 
 
 def _place(wanted: list[float], spacing: float, span: tuple[float, float]) -> tuple[list[int], np.ndarray]:
@@ -138,18 +139,18 @@ def _right_exit(axes: Axes, line: Prediction) -> tuple[float, float] | None:
     return right, float(np.interp(right, line.x[i : i + 2], line.y[i : i + 2]))
 
 
-def _write(axes: Axes, text: str, end: np.ndarray, side: int, shift: float) -> None:
-    """Text beyond the edge, ``shift`` points along it, joined to ``end`` (pixels) by a thin leader."""
+def _write(axes: Axes, text: str, end: tuple[float, float], side: int, shift: float) -> None:
+    """Text beyond the edge, ``shift`` points along it, joined to ``end`` (data) by a thin leader."""
     axes.annotate(
         label_text(text),
-        tuple(end),
-        xycoords="figure pixels",
+        end,
         xytext=(shift, _LEADER) if side == 0 else (_LEADER, shift),
         textcoords="offset points",
         ha="center" if side == 0 else "left",
         va="bottom" if side == 0 else "center",
         size=_FONT,
         color=PREDICTION,
+        annotation_clip=False,
         arrowprops={
             "arrowstyle": "-",
             "linewidth": 0.5,

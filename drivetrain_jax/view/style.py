@@ -114,7 +114,7 @@ def caption(dataset: xr.Dataset) -> str:
         for name, coordinate in dataset.coords.items()
         if coordinate.ndim == 0 and name != "point"  # a number in a list tells nothing
     ]
-    return ", ".join(parts)
+    return ", ".join([*parts, *([dataset.attrs["left_out"]] if "left_out" in dataset.attrs else [])])
 
 
 def _unless_swept(dataset: xr.Dataset, name: str, entry: object) -> object:

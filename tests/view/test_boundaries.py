@@ -26,7 +26,8 @@ def tipped(beta: list[float], opens: list[int] | None, omega: list[float]):
 
 def sides(dataset) -> dict[tuple[float, float], tuple[int, int]]:
     """Direction from each named tip to its name."""
-    names = [text for text in plot(dataset).axes[0].texts if text.xycoords == "data"]
+    # Names of predicted lines have leaders.
+    names = [text for text in plot(dataset).axes[0].texts if text.arrow_patch is None]
     return {tuple(map(float, name.xy)): tuple(int(np.sign(x)) for x in name.xyann) for name in names}
 
 

@@ -56,6 +56,17 @@ def test_the_map_is_logarithmic_and_crosses_what_is_not_certified(swept):
     assert "not certified by the count" in [text.get_text() for text in figure.legends[0].get_texts()]
 
 
+@pytest.mark.parametrize("points", [False, True])
+def test_a_rigid_support_has_no_place_on_the_axis_and_is_told(swept, points):
+    stiffness = swept.k_D.values.copy()
+    stiffness[-1] = np.inf
+    rigid = swept.assign_coords(k_D=("k_D", stiffness, swept.k_D.attrs))
+    figure = plot(rigid.swap_dims(k_D="point").reset_coords("k_D").set_coords("k_D") if points else rigid)
+    curves = [line for line in figure.axes[0].get_lines() if len(line.get_xdata()) == 24]
+    np.testing.assert_array_equal(curves[0].get_xdata(), stiffness[:-1])
+    assert any("$k_{D}$ = inf left out" in text.get_text() for text in figure.texts)
+
+
 @pytest.mark.parametrize(
     ("variable", "low", "drawn"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 import xarray as xr
 from matplotlib.collections import PolyCollection, QuadMesh
 from matplotlib.colors import to_hex
+from matplotlib.text import Annotation, Text
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells, plot
@@ -123,8 +125,35 @@ def test_predicted_lines_inside_the_chart_without_difference_combinations():
 
 def test_labels_of_close_lines_are_kept_apart():
     axes = panels(plot(results.chart()))[0]
-    across = sorted(text.xy[0] * 72 / axes.figure.dpi + text.xyann[0] for text in axes.texts)
+    across = sorted(_across(text) + text.xyann[0] for text in axes.texts)
     assert np.diff(across).min() > 14
+
+
+def _across(text) -> float:
+    """Where the point is that a text belongs to, in points."""
+    return text.axes.transData.transform(text.xy)[0] * 72 / text.axes.figure.dpi
+
+
+@pytest.mark.parametrize("given", [{}, {"dpi": 77}, {"bbox_inches": "tight", "pad_inches": 1.0}, {"format": "svg"}])
+def test_labels_stand_above_the_chart_however_it_is_written(given, monkeypatch):
+    figure, seen = plot(results.chart()), {}
+    axes = panels(figure)[0]
+    draw = Annotation.draw
+
+    def watched(text, renderer):
+        draw(text, renderer)
+        # Without its leader, in parts of the panel: across, and upwards.
+        if text in axes.texts:
+            box = Text.get_window_extent(text, renderer)
+            seen[text.get_text()] = axes.transAxes.inverted().transform([(box.x0 + box.x1) / 2, box.y0])
+
+    monkeypatch.setattr(Annotation, "draw", watched)
+    figure.savefig(io.BytesIO(), **given)
+    lines = dict(zip(("$H_{21}$", "$S_{21}$", "$C^{+}_{1}$"), (0.7, 1.0, 1.02), strict=True))
+    left, right = axes.get_xlim()
+    for name, x in lines.items():
+        across, up = seen[name]
+        assert abs(across - (x - left) / (right - left)) < 0.06 and 1 < up < 1.15
 
 
 def test_predictions_that_depend_on_the_other_axis_are_curves_labelled_where_they_leave():
