@@ -21,7 +21,7 @@ from jax import Array
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.numerics.lanes import in_blocks, lane_count, with_path
+from drivetrain_jax.analysis.numerics.lanes import in_blocks, lane_count, path_entry, with_path
 from drivetrain_jax.analysis.numerics.singular_values import EPS, Bidiagonal, bidiagonal_form, bidiagonal_values
 from drivetrain_jax.analysis.spectra.mode_types import (
     MODE_TYPES,
@@ -216,14 +216,27 @@ def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Ar
     if not track:
         results = _results(build, request, values, lanes)
         return {name: results[name] for name in wanted}
+    along = path_entry(values, track)
     values, length = with_path(values, track, lanes)
     results = {
         name: jnp.moveaxis(value.reshape(*value.shape[:-1], length, lanes), -2, 0)
         for name, value in _results(build, request, values, length * lanes).items()
     }
     if _FOLLOWED & set(request.outputs):
-        results["branch"], results["mac"] = follow(results["vectors"], results["equal"])
+        order, place = _along(np.asarray(along))
+        followed = follow(results["vectors"][order], results["equal"][order])
+        results["branch"], results["mac"] = (each[place] for each in followed)
     return {name: results[name] for name in wanted}
+
+
+def _along(values: np.ndarray) -> tuple[Any, Any]:
+    """Positions of the values of a track as it is followed, and of those in the order listed: neighbours follow each other
+    in whatever order they are listed."""
+    steps = np.diff(values)
+    if (steps > 0).all() or (steps < 0).all():
+        return slice(None), slice(None)
+    order = np.argsort(values)
+    return order, np.argsort(order)
 
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:

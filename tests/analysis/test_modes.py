@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.optimize import brentq
 
 import drivetrain_jax as dt
@@ -285,6 +286,15 @@ def tracked():
         "options": {"track": "k_cu"},
     }
     return dt.run(scene)
+
+
+@pytest.mark.parametrize("order", [[3, 0, 6, 1, 5, 2, 4], [0, 1, 2, 3, 4, 6, 5]])
+def test_a_track_is_followed_from_neighbour_to_neighbour_however_it_is_listed(order):
+    stiffness = np.geomspace(1e8, 1e11, 7)
+    scene = {"system": "planetary", "analysis": "modes", "outputs": ["branch", "mac"], "options": {"track": "k_cu"}}
+    rising = dt.run(scene | {"axes": {"k_cu": {"values": stiffness}}})
+    listed = dt.run(scene | {"axes": {"k_cu": {"values": stiffness[order]}}})
+    xr.testing.assert_allclose(rising[["branch", "mac"]], listed[["branch", "mac"]].sortby("k_cu"), rtol=1e-12)
 
 
 def test_branches_keep_their_type_where_frequencies_cross(tracked):
