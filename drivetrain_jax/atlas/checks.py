@@ -10,6 +10,8 @@ import numpy as np
 
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.panels import Atlas
+from drivetrain_jax.atlas.patches import Patches, patches_of
+from drivetrain_jax.atlas.ridges import feet
 from drivetrain_jax.atlas.windows import Crossing, Interval, Line, Range
 
 Direct = Callable[[Mapping[str, np.ndarray]], np.ndarray]
@@ -66,24 +68,52 @@ class End:
 
 def check_ends(ends: list[End], line: Line, criteria: Criteria, direct: Direct) -> Check | None:
     """Direct solves right inside all ``ends`` of stable intervals of ``line``, over the whole other coordinate, and right
-    beyond, where the crossing is; either also where the surrogate is worst. None without ends."""
+    beyond, on the ridge of the tongue whose tip the crossing is, else where the crossing is; either also where the surrogate
+    is worst. None without ends."""
     part = criteria.atlas
     k = part.parameters.index(line.parameter)
     other, span = part.parameters[1 - k], float(part.upper[k] - part.lower[k])
     within = np.linspace(part.lower[1 - k], part.upper[1 - k], _SAMPLES)
+    patches = patches_of(criteria) if any(end.crossing for end in ends) else ()
     points, outer = [], []
     for end in ends:
-        step, at = end.step(span), [end.crossing.point[other]] if end.crossing else []
+        step = end.step(span)
         inner, value = end.value + end.inward * min(step, end.room / 2), end.value - end.inward * step
-        points += [(x, inner) for x in (*within, *at, _worst(criteria, k, inner))]
+        near, far = (_along_ridge(criteria, patches, k, end.crossing, x, other) for x in (inner, value))
+        points += [(x, inner) for x in (*within, *near, _worst(criteria, k, inner))]
         if end.crossing and _unstable(line, value):
-            outer += [(x, value) for x in (*at, _worst(criteria, k, value))]
+            outer += [(x, value) for x in (*far, _worst(criteria, k, value))]
     if not points:
         return None
     columns = np.array(points + outer).T
     rho = _solve(direct, part, {other: columns[0], line.parameter: columns[1]})
     inside, beyond = np.split(rho, [len(points)])
     return _check(inside, beyond.reshape(-1, 2).max(axis=1), criteria, len(rho))
+
+
+def _along_ridge(
+    criteria: Criteria, patches: tuple[Patches, ...], k: int, crossing: Crossing | None, value: float, other: str
+) -> tuple[float, ...]:
+    """Where over ``other`` to look for the tongue of ``crossing`` at a ``value`` of the coordinate ``k`` beside it.
+
+    A slanted ridge leaves the narrow tongue below it sideways, so that the place of the tip says nothing there. None
+    without a crossing.
+    """
+    if crossing is None:
+        return ()
+    part, place = criteria.atlas, crossing.point[other]
+    low, high = part.lower[1 - k], part.upper[1 - k]
+    # At the ends of the range a tongue comes in from outside; without damping the functions have no ridges.
+    if not low < place < high or criteria.conservative:
+        return (place,)
+    tip, beside = (np.insert([place], k, v)[None] for v in (crossing.value, value))
+    function = patches[criteria.multipliers.index(crossing.multiplier)]
+    bottom = part.to_coordinates(beside)[0, k]
+    foot = feet(function, part.to_coordinates(tip), 1 - k, bottom)[0]
+    if not np.isfinite(foot):
+        return (place,)
+    found = part.to_parameters(np.insert([foot], k, bottom)[None])[0, 1 - k]
+    return (float(np.clip(found, low, high)),)
 
 
 def _worst(criteria: Criteria, k: int, value: float) -> float:

@@ -173,6 +173,18 @@ def test_a_check_looks_right_inside_the_error(atlas, monkeypatch, beyond, agrees
     assert widest_angle(atlas, CARDAN, (1.3, 1.5), {}, direct=direct).check.agrees == agrees
 
 
+def test_a_check_follows_the_ridge_of_a_narrow_tongue():
+    """With next to no damping the error covers an undecided range; at its end the tongue has left the speed of its tip."""
+    fixed = {"zeta": 1.0165e-5, "alpha": 0.13975, "mu": 1.0822, "gamma": 1.09888}
+    slender = cardan_atlas({"beta": (0.0, 0.8), "Omega": (0.39, 0.43)}, 1e-11, fixed).atlas
+    answer = widest_angle(slender, CARDAN, (0.4, 0.42), {}, direct=direct)
+    limit = answer.limit
+    assert answer.certain and limit.error > 1e-6 and limit.multiplier == "+1"
+    beyond = {"beta": limit.value + limit.error, "Omega": limit.point["Omega"]}
+    assert direct({k: np.array([v]) for k, v in {**fixed, **beyond}.items()}) < 1
+    assert answer.check.agrees and answer.check.beyond > 1 + 1e-9
+
+
 @pytest.mark.parametrize(
     ("ask", "ranges", "fixed", "speeds", "ends", "safe_end"),
     [
