@@ -111,11 +111,9 @@ def _lines(results: list[xr.Dataset]) -> Figure:
             # Where the motion is opposite to the drive the lag is half a turn, not less than none.
             _draw_sweeps(panels.axes[1][0], each, each["phase"] % (2 * np.pi), look, jumps)
         handles += _entries(each, look)
-    backbone = next((r for r in results if "backbone_amplitude" in r), None)
     upper.set_ylim(0, None)
     handles += _draw_missing(upper, results)
-    if backbone is not None:
-        handles.append(_draw_backbone(upper, backbone))
+    handles += _draw_backbones(upper, results)
     cells.fit_axis(upper, "x", np.unique(np.concatenate([r[PATH].values for r in results])))
     panels.label_row(upper, f"half the peak-to-peak displacement [{results[0]['u_max'].attrs.get('units', '1')}]")
     if with_phase:
@@ -213,11 +211,17 @@ def _joined(x: np.ndarray, y: np.ndarray, stable: np.ndarray) -> tuple[np.ndarra
     return np.array(xs), np.array(ys)
 
 
-def _draw_backbone(axes: Axes, result: xr.Dataset) -> Line2D:
-    """Amplitude of free motions against their frequency, within the limits of the axes."""
-    style = {"color": FRAME_GREY, "linewidth": 0.7, "linestyle": (0, (6, 2, 1, 2))}
-    axes.plot(result[PATH], result["backbone_amplitude"], **style, scaley=False)
-    return Line2D([], [], **style, label="backbone")
+def _draw_backbones(axes: Axes, results: list[xr.Dataset]) -> list[Line2D]:
+    """Amplitudes of free motions against their frequency in the colours of the methods, within the limits of the axes."""
+    style = {"linewidth": 0.7, "linestyle": (0, (6, 2, 1, 2))}
+    with_backbone = [each for each in results if "backbone_amplitude" in each]
+    height = axes.get_ylim()[1]
+    for each in with_backbone:
+        amplitude = each["backbone_amplitude"].values
+        # From a motion far outside the line does not come back to another one.
+        line = _broken(each[PATH].values, amplitude, np.abs(np.diff(amplitude)) > height)
+        axes.plot(*line, **style, color=_METHODS[each.attrs["method"]].colour, scaley=False)
+    return [Line2D([], [], **style, color=FRAME_GREY, label="backbone")] if with_backbone else []
 
 
 def _draw_missing(axes: Axes, results: list[xr.Dataset]) -> list[Line2D]:

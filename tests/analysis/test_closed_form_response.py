@@ -314,6 +314,24 @@ def test_the_peak_is_the_largest_amplitude_also_with_heavy_damping():
     np.testing.assert_array_equal(frequency > 0, [False] * 4 + [True] * 2)
 
 
+@pytest.mark.parametrize("case", [{}, {"alpha": 0.0}, {"alpha": 3.0, "B0": 0.0}, {"B0": 0.3}])
+def test_the_backbone_is_the_largest_free_motion(case):
+    """Against a scan of amplitudes; it goes on beyond the peak, as the drive has no part in it."""
+    omegas = np.array([0.3, 0.65, 0.85, 0.9, 0.99, 0.99999, 1.3])
+    small, large = (
+        solve("describing_function", omegas, ({**case, "B1": b},))["backbone_amplitude"] for b in (1e-3, 0.5)
+    )
+    np.testing.assert_array_equal(small, large)
+    model, at = oscillator(TABLE1 | case), describing_function.point_at
+    scanned = jnp.geomspace(1e-4, 1e6, 100_001)
+    kappa = np.asarray(jax.jit(lambda a: at(model, a, describing_function.bias_of(model, a)).stiffness)(scanned))
+    for omega, found in zip(omegas, small[:, 0], strict=True):
+        crossed = np.flatnonzero((kappa[1:] > omega**2) != (kappa[:-1] > omega**2))
+        assert np.isfinite(found) == (crossed.size > 0)
+        if crossed.size:
+            assert scanned[crossed[-1]] <= found * (1 + 1e-9) and found <= scanned[crossed[-1] + 1] * (1 + 1e-9)
+
+
 def test_a_linear_spring_has_no_backbone(scales):
     """Its free motions have one frequency and any amplitude; at 1.3, above it, there is none."""
     assert np.isnan(scales["backbone_amplitude"][..., 2]).all()

@@ -38,12 +38,13 @@ class OneTerm(NamedTuple):
 
 class Curves(NamedTuple):
     """A response as a whole: ``motions(omega)`` (K, ...), rising amplitudes filled up with infinity; ``peak`` amplitude
-    and frequency, ``folds`` (frequencies), ``backbone(omega)`` (the largest amplitude on it) and the range of the fit."""
+    and frequency, ``folds`` (frequencies), ``backbone(omega)`` (the largest amplitude on it at every frequency, (L, ...)),
+    and the range of the fit."""
 
     motions: Callable[[Any], OneTerm]
     peak: tuple[Array, Array]
     folds: Array
-    backbone: Callable[[Any], Array]
+    backbone: Callable[[Array], Array]
     fit_range: Array
 
 
@@ -59,10 +60,11 @@ def of_multiple_scales(model: PiecewiseLinearOscillator, shape: tuple[int, ...],
         phase = multiple_scales.phase_lag(flow, omega, finite)
         return OneTerm(0 * finite, amplitude, phase, multiple_scales.decay_rate(flow, omega, finite))
 
-    def backbone(omega: Any) -> Array:
+    def backbone(omega: Array) -> Array:
         # A linear spring has free motions of one frequency only, of any amplitude.
         bends = flow.bend != 0
-        return jnp.where(bends, jnp.sqrt((omega - flow.frequency) / jnp.where(bends, flow.bend, 1.0)), jnp.nan)
+        detuning = omega.reshape(-1, *(1,) * len(shape)) - flow.frequency
+        return jnp.where(bends, jnp.sqrt(detuning / jnp.where(bends, flow.bend, 1.0)), jnp.nan)
 
     return Curves(motions, multiple_scales.peak(flow), multiple_scales.folds(flow)[1], backbone, fit.fit_range)
 
@@ -81,7 +83,7 @@ def of_describing_function(model: PiecewiseLinearOscillator, shape: tuple[int, .
         motions,
         describing_function.peak_of(model, bones),
         describing_function.fold_frequencies(model, bones),
-        partial(describing_function.backbone, bones),
+        partial(describing_function.backbone, model, shape),
         jnp.full(shape, jnp.nan),
     )
 
@@ -165,6 +167,6 @@ def _of_curves(curves: Curves, omega: Array, shape: tuple[int, ...]) -> dict[str
         "peak_amplitude": along(curves.peak[0]),
         "peak_frequency": along(curves.peak[1]),
         "fold_frequency": along(jnp.concatenate([folds, missing])),
-        "backbone_amplitude": jax.lax.map(curves.backbone, omega),
+        "backbone_amplitude": curves.backbone(omega),
         "fit_range": along(curves.fit_range),
     }

@@ -18,6 +18,7 @@ batch; ``A`` may have more leading axes.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -168,10 +169,10 @@ class Skeleton(NamedTuple):
     limit: Array
 
 
-def _nodes(model: PiecewiseLinearOscillator, end: Array) -> Array:
-    """Rising amplitudes from where the play is first felt to ``end``."""
+def _nodes(model: PiecewiseLinearOscillator, end: Array, far: float = _FAR) -> Array:
+    """Rising amplitudes from where the play is first felt to ``end``, logarithmic up to ``far`` lengths of the motions."""
     unit = _length(model)
-    last = jnp.minimum(end, _FAR * unit)
+    last = jnp.minimum(end, far * unit)
     first = jnp.clip(_first_contact(model), _NEAR * unit, last / 2)
     part = jnp.linspace(0.0, 1.0, _NODES).reshape(_NODES, *(1,) * end.ndim)
     return jnp.concatenate([first * (last / first) ** part[:-1], last[None], end[None]])
@@ -233,13 +234,33 @@ def fold_frequencies(model: PiecewiseLinearOscillator, bones: Skeleton) -> Array
     return jnp.concatenate([sides[0][:half], sides[1][half:]])
 
 
-def backbone(bones: Skeleton, omega: Array) -> Array:
-    """Largest amplitude of the undamped, undriven motion of this frequency, ``kappa(A) = omega^2``; NaN if none."""
-    above = bones.points.stiffness > omega**2
-    mask = sign_changes(above[::-1], 1)[:, ::-1]
-    low, high, stiffness = _interpolated(bones, mask)
-    rising = jnp.where(take(mask, above[1:], 1.0) > 0, 1.0, -1.0)
-    return bisect(lambda a: rising * (stiffness(a) - omega**2), low, high, 45)[0]
+def backbone(model: PiecewiseLinearOscillator, shape: tuple[int, ...], omega: Array) -> Array:
+    """Largest amplitude of the undamped, undriven motion of each frequency ``(L,)``, ``kappa(A) = omega^2``, ``(L, ...)``.
+
+    NaN if none, as beyond the frequency to which that of large motions tends. The drive has no part in it, so that it goes
+    on beyond the peak.
+    """
+    free = replace(model, B1=0.0)
+    amplitudes = _nodes(free, jnp.broadcast_to(_HUGE * _length(free), shape), _HUGE)
+    points = point_at(free, amplitudes, bias_of(free, amplitudes))
+
+    def largest(omega: Array) -> Array:
+        above = points.stiffness > omega**2
+        mask = sign_changes(above[::-1], 1)[:, ::-1]
+        low, high, stiffness = _interpolated(amplitudes, points, mask)
+        rising = jnp.where(take(mask, above[1:], 1.0) > 0, 1.0, -1.0)
+        found = bisect(lambda a: rising * (stiffness(a) - omega**2), low, high, _HALVINGS)
+        bias = _bias_between(points, mask, (found - low) / (high - low))
+
+        def polish(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+            amplitude, bias = state
+            bias = _improved(free, amplitude, bias)
+            point = point_at(free, amplitude, bias)
+            return jnp.clip(amplitude - (point.stiffness - omega**2) / point.slope, low, high), bias
+
+        return jax.lax.fori_loop(0, _POLISH_STEPS, polish, (found, bias))[0][0]
+
+    return jax.lax.map(largest, omega)
 
 
 def response_residual(model: PiecewiseLinearOscillator, omega: Array, amplitude: Array, stiffness: Array) -> Array:
@@ -247,10 +268,10 @@ def response_residual(model: PiecewiseLinearOscillator, omega: Array, amplitude:
     return ((stiffness - omega**2) ** 2 + (model.damping * omega) ** 2) * amplitude**2 - model.B1**2
 
 
-def _interpolated(bones: Skeleton, mask: Array) -> tuple[Array, Array, Callable[[Array], Array]]:
+def _interpolated(amplitudes: Array, points: Point, mask: Array) -> tuple[Array, Array, Callable[[Array], Array]]:
     """Bracket that ``mask`` marks, and the equivalent stiffness within it as a cubic through values and slopes."""
-    low, high = take(mask, bones.amplitudes[:-1]), take(mask, bones.amplitudes[1:])
-    ends = [take(mask, part[s]) for part in (bones.points.stiffness, bones.points.slope) for s in _ENDS]
+    low, high = take(mask, amplitudes[:-1]), take(mask, amplitudes[1:])
+    ends = [take(mask, part[s]) for part in (points.stiffness, points.slope) for s in _ENDS]
     k0, k1, d0, d1 = ends
     width = high - low
 
@@ -260,6 +281,12 @@ def _interpolated(bones: Skeleton, mask: Array) -> tuple[Array, Array, Callable[
         return k0 + s * (k1 - k0) + s * (1 - s) * bend
 
     return low, high, stiffness
+
+
+def _bias_between(points: Point, mask: Array, part: Array) -> Array:
+    """Bias at a part of the bracket that ``mask`` marks."""
+    first, last = (take(mask, points.bias[s]) for s in _ENDS)
+    return first + (last - first) * part
 
 
 def _arm_gap(
@@ -290,14 +317,13 @@ def roots(model: PiecewiseLinearOscillator, bones: Skeleton, omega: Array) -> tu
     """All amplitudes at one frequency, rising, ``(MOST_ROOTS, ...)``, infinite where there are fewer; and the points."""
     square = omega**2
     mask, sign, turned = _brackets(bones, square)
-    low, high, stiffness = _interpolated(bones, mask)
+    low, high, stiffness = _interpolated(bones.amplitudes, bones.points, mask)
 
     def above(amplitude: Array) -> Array:
         return turned * _arm_gap(model, square, amplitude, stiffness(amplitude), sign)[0]
 
     found = jnp.maximum(bisect(above, low, high, _HALVINGS), _TINY)
-    first, last = (take(mask, bones.points.bias[s]) for s in _ENDS)
-    bias = first + (last - first) * (found - low) / jnp.where(high > low, high - low, 1.0)
+    bias = _bias_between(bones.points, mask, (found - low) / jnp.where(high > low, high - low, 1.0))
     bias = _improved(model, found, bias)
 
     def polish(_: int, state: tuple[Array, ...]) -> tuple[Array, ...]:
