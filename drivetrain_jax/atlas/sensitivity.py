@@ -19,7 +19,7 @@ import numpy as np
 from drivetrain_jax.analysis.numerics.kernels import options_for_few
 from drivetrain_jax.analysis.periodic.direct import assemble
 from drivetrain_jax.analysis.periodic.floquet_effort import PANEL_COST, explicit_effort, implicit_effort
-from drivetrain_jax.analysis.periodic.propagator import explicit_propagator, implicit_propagator
+from drivetrain_jax.analysis.periodic.propagator import EXPLICIT_ORDER, explicit_propagator, implicit_propagator
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.growth import growth
 from drivetrain_jax.atlas.panels import Atlas
@@ -30,6 +30,8 @@ from drivetrain_jax.systems import System
 _RTOL, _AGREEMENT, _MOST_DOUBLINGS = 1e-12, 1e-8, 4
 # Moduli that differ by no more than rounding, as those of all multipliers without damping.
 _TIED = 1e-11
+# What rounding leaves of a monodromy matrix, relative; and the least by which a doubling of the steps divides their error.
+_ROUNDING, _DIVIDED = 16 * np.finfo(float).eps, 2**EXPLICIT_ORDER - 1
 
 
 @dataclass(frozen=True)
@@ -37,18 +39,20 @@ class Sensitivity:
     """``spectral_radius`` at a point, its ``gradient`` by parameter and the dominant ``multiplier``.
 
     ``gap`` is by how much the modulus of the next multiplier, its conjugate apart, is smaller, relative to its own: at 0 the
-    gradient does not exist.
+    gradient does not exist. ``error`` bounds the relative error of ``multiplier`` to first order; it grows like 1/gap where
+    two multipliers coalesce.
     """
 
     spectral_radius: float
     gradient: Mapping[str, float]
     multiplier: complex
     gap: float
+    error: float
 
     @property
     def exists(self) -> bool:
-        """Whether there is a gradient: one multiplier, or a pair, is the largest."""
-        return self.gap > _TIED
+        """Whether there is a gradient: one multiplier, or a pair, is the largest beyond the errors."""
+        return self.gap > max(_TIED, self.error)
 
     def boundary(self, parameter: str) -> dict[str, float]:
         """Derivative of the boundary value of ``parameter`` with respect to every other one, at a point of the boundary.
@@ -79,14 +83,14 @@ def atlas_sensitivity(atlas: Atlas, system: System, point: Mapping[str, float]) 
     gradient = radius * rates.gradient[0] * slope
     sigma = complex(rates.multiplier[0])
     slopes = dict(zip(atlas.parameters, map(float, gradient), strict=True))
-    return Sensitivity(radius, slopes, sigma, _gap(sigma, criteria.eigenvalues(x)[0]))
+    return Sensitivity(radius, slopes, sigma, _gap(sigma, criteria.eigenvalues(x)[0]), float(rates.error[0]))
 
 
 def direct_sensitivity(system: System, values: Mapping[str, float]) -> Sensitivity:
     """The gradient with respect to all parameters of ``system``, which ``values`` holds, from direct solves.
 
-    It is NaN where no scheme can take so many steps, or derivatives overflow. Raises ``KeyError`` if ``values`` lacks a
-    parameter or the system has no model for ``floquet``.
+    It is NaN where no scheme can take so many steps, derivatives overflow or the radius underflows. Raises ``KeyError`` if
+    ``values`` lacks a parameter or the system has no model for ``floquet``.
     """
     names = system.models["floquet"].parameters
     point = np.array([float(values[name]) for name in names])
@@ -96,11 +100,12 @@ def direct_sensitivity(system: System, values: Mapping[str, float]) -> Sensitivi
     solve, count = _derivatives(system.models["floquet"].build, names, scheme), int(count)
     z, change = solve(point, count)
     for _ in range(_MOST_DOUBLINGS):
-        before, count = change, 2 * count
+        coarse, before, count = z, change, 2 * count
         z, change = solve(point, count)
         if np.all(_norms(change - before) <= _AGREEMENT * _norms(change)):
             break
-    return _sensitivity(names, z, change)
+    error = np.linalg.norm(z - coarse) / _DIVIDED + _ROUNDING * np.linalg.norm(z)
+    return _sensitivity(names, z, change, float(error))
 
 
 def _scheme(system: System, columns: Mapping[str, np.ndarray]) -> tuple[Callable, float]:
@@ -112,7 +117,7 @@ def _scheme(system: System, columns: Mapping[str, np.ndarray]) -> tuple[Callable
 
 
 def _unknown(names: Sequence[str]) -> Sensitivity:
-    return Sensitivity(math.nan, dict.fromkeys(names, math.nan), complex(math.nan), math.nan)
+    return Sensitivity(math.nan, dict.fromkeys(names, math.nan), complex(math.nan), math.nan, math.nan)
 
 
 def _norms(change: np.ndarray) -> np.ndarray:
@@ -120,16 +125,19 @@ def _norms(change: np.ndarray) -> np.ndarray:
     return np.sqrt(np.sum(change**2, axis=(0, 1)))
 
 
-def _sensitivity(names: Sequence[str], z: np.ndarray, change: np.ndarray) -> Sensitivity:
-    if not (np.isfinite(z).all() and np.isfinite(change).all()):
+def _sensitivity(names: Sequence[str], z: np.ndarray, change: np.ndarray, error: float) -> Sensitivity:
+    """From ``z``, the norm of whose error is at most ``error``, and its derivatives."""
+    if not (np.isfinite(z).all() and np.isfinite(change).all() and z.any()):
         return _unknown(names)
     sigma, right = np.linalg.eig(z)
     k = int(np.argmax(np.abs(sigma)))
     left = np.linalg.inv(right)[k]
+    condition = np.linalg.norm(left) * np.linalg.norm(right[:, k])
     rates = np.einsum("i,ijp,j->p", left, change, right[:, k]) / sigma[k]
     radius = float(np.abs(sigma[k]))
     gradient = dict(zip(names, map(float, radius * rates.real), strict=True))
-    return Sensitivity(radius, gradient, complex(sigma[k]), _gap(complex(sigma[k]), sigma))
+    gap = _gap(complex(sigma[k]), sigma)
+    return Sensitivity(radius, gradient, complex(sigma[k]), gap, float(condition * error / radius))
 
 
 def _gap(sigma: complex, multipliers: np.ndarray) -> float:

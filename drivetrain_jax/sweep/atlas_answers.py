@@ -224,7 +224,8 @@ def _elsewhere(safe: str, asked: Asked, answer: design.Answer) -> list[str]:
 def _gradient_lines(atlas: StoredAtlas, slopes: Sensitivity) -> list[str]:
     if not slopes.exists:
         tied = math.isfinite(slopes.gap)
-        reason = "two multipliers have the largest modulus" if tied else "direct solves would take too many steps"
+        no_solves = "direct solves would take too many steps, or leave the range of numbers"
+        reason = "two multipliers have the largest modulus, within the errors" if tied else no_solves
         return ["gradient of spectral_radius", f"  none: {reason}"]
     units = {name: atlas.scene.system.parameter(name).units for name in slopes.gradient}
     return [

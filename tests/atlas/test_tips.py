@@ -357,6 +357,24 @@ def test_gradients_of_the_radius():
         assert slope == pytest.approx((values[1] - values[0]) / (2 * h), rel=1e-5, abs=1e-9)
 
 
+@pytest.mark.parametrize(("inside", "exists"), [(1e-15, False), (1e-10, True)])
+def test_a_gradient_at_multipliers_that_rounding_does_not_tell_apart(inside, exists):
+    """The edge of S21 without damping, in 30 digits: beside it d rho/d Omega = 0.20180 (Omega - edge)^(-1/2)."""
+    edge = 1.4001277838891882126
+    point = {**BASE, "zeta": 0.0, "beta": 0.3, "Omega": edge + inside}
+    found = direct_sensitivity(CARDAN, point)
+    assert found.exists == exists and found.gap > 1e-9
+    if exists:
+        assert found.gradient["Omega"] == pytest.approx(20180.37290, rel=1e-5)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_no_gradient_of_a_radius_below_the_smallest_number():
+    point = {**BASE, "zeta": 1.0, "gamma": 1.0, "beta": 0.3, "Omega": 0.001}
+    found = direct_sensitivity(CARDAN, point)
+    assert not found.exists and np.isnan([found.spectral_radius, *found.gradient.values()]).all()
+
+
 def test_what_cannot_be_followed_is_said(chart):
     for parameter, values, error, message in (
         ("mu", [], ValueError, r"^values = \[\]: allowed is one value or more$"),
