@@ -155,3 +155,9 @@ def test_lanes_and_a_rigid_mode(forward):
     for lane, k in enumerate(K_P.tolist()):
         exact = difference(EQUAL | {"k_p": k}, "k_p", None)
         np.testing.assert_allclose(slope[1:, lane], exact[1:], rtol=2e-6, atol=2e-7 * np.abs(exact[1:]).max())
+
+
+def test_whole_numbers_are_numbers():
+    rate = jax.tree.map(lambda x: 0, EQUAL) | {"k_p": 1}
+    whole, broken = (directional_derivatives(planetary.build, EQUAL | {"m_s": m}, rate) for m in (1, 1.0))
+    np.testing.assert_array_equal(np.asarray(whole), np.asarray(broken))

@@ -44,7 +44,7 @@ def natural_frequencies(build: Build, values: Mapping[str, Any]) -> Array:
     """Natural frequencies in Hz, rising, ``(n,)``, or ``(n, N)`` if some of ``values`` have shape ``(N,)``.
 
     ``build`` makes the spring system from ``values`` (for the planetary gear ``planetary.build`` and all its
-    parameters, ``planet_angle`` a tuple). Differentiable forwards and backwards with respect to every value;
+    parameters, ``planet_angle`` a tuple). Differentiable once, forwards and backwards, with respect to every value;
     derivatives of clusters are those of their mean, that of a rigid mode is zero, also by the stiffness of a spring that
     holds it, where f grows as sqrt(k) and has none. NaN where a value is not finite.
     """
@@ -67,11 +67,10 @@ def directional_derivatives(build: Build, values: Mapping[str, Any], directions:
     ``directions`` has the structure of ``values``. In a cluster: the derivatives of the branches that leave it in this
     direction, rising.
     """
+    values, directions = (jax.tree.map(lambda x: jnp.asarray(x, float), dict(p)) for p in (values, directions))
     frequency, shapes, largest, still = _frequencies_and_shapes(build, values)
     near = one_frequency(frequency, largest).reshape(*frequency.shape[:1] * 2, -1)
-    _, matrix = jax.jvp(
-        lambda p: _excess(build(p), shapes, frequency, mixed=True), (dict(values),), (dict(directions),)
-    )
+    _, matrix = jax.jvp(lambda p: _excess(build(p), shapes, frequency, mixed=True), (values,), (directions,))
     matrix = jnp.where(near, matrix.reshape(*near.shape), 0.0)
     # Made positive, its singular vectors are its eigenvectors.
     lift = jnp.sqrt(jnp.sum(matrix**2, axis=(0, 1)))
