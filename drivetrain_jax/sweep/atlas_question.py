@@ -14,7 +14,8 @@ from drivetrain_jax.sweep.atlas_file import StoredAtlas, as_given
 from drivetrain_jax.sweep.physical import nondimensional
 
 Range = tuple[float, float]
-# How closely a given parameter has to be what the atlas was made with.
+# How closely a given parameter has to be what the atlas was made with, and how far from an end of its range a value is
+# taken to be that end: converted from other units, or copied from a message, it is rounded.
 _SAME = 1e-9
 
 
@@ -57,7 +58,11 @@ class Asked:
         for name, value in values.items():
             if name in atlas.fixed and name not in free:
                 _check_same(name, value, atlas.fixed[name])
-        own = {name: value for name, value in values.items() if name in atlas.parameters and name not in free}
+        own = {
+            name: _within(value, atlas.ranges[name])
+            for name, value in values.items()
+            if name in atlas.parameters and name not in free
+        }
         for name in values:
             if name not in atlas.parameters and name not in atlas.fixed:
                 physical = atlas.scene.system.physical
@@ -101,6 +106,15 @@ def _meant(name: str, value: Any, shaft: Any) -> str:
     if shaft is None or name not in shaft.operation:
         return name
     return shaft.parameter(name, value[0] if isinstance(value, tuple) else value)[0]
+
+
+def _within(value: Any, ends: Range) -> Any:
+    """``value``, or both of a range, where it is next to an end of the atlas this end."""
+    if isinstance(value, tuple):
+        return tuple(_within(each, ends) for each in value)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return value
+    return next((end for end in ends if math.isclose(value, end, rel_tol=_SAME)), value)
 
 
 def _check_same(name: str, value: Any, fixed: float) -> None:

@@ -57,10 +57,16 @@ class PhysicalShaft:
         return math.sqrt(self.k1 / self.J1)
 
     @property
+    def critical_damping(self) -> float:
+        """2 sqrt(k1 J1), N m s/rad: the unit of zeta."""
+        # Of each alone: in some units the product leaves the range of numbers.
+        return 2 * math.sqrt(self.k1) * math.sqrt(self.J1)
+
+    @property
     def parameters(self) -> dict[str, float]:
         """zeta, alpha, mu and gamma."""
         return {
-            "zeta": self.c1 / (2 * math.sqrt(self.k1 * self.J1)),
+            "zeta": self.c1 / self.critical_damping,
             "alpha": self.c2 / self.c1 if self.c1 else 0.0,
             "mu": self.k2 / self.k1,
             "gamma": self.J2 / self.J1,
@@ -88,7 +94,7 @@ class PhysicalShaft:
 
     def damping(self, zeta: float) -> float:
         """c1 in N m s/rad of a value of zeta."""
-        return zeta * 2 * math.sqrt(self.k1 * self.J1)
+        return zeta * self.critical_damping
 
     def parameter(self, name: str, value: float) -> tuple[str, float]:
         """What ``speed`` in rpm or ``angle`` in degrees is among the nondimensional parameters."""

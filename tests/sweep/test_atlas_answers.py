@@ -19,6 +19,7 @@ from drivetrain_jax.sweep.atlas_answers import _from_one
 from drivetrain_jax.sweep.atlas_chart import chart
 from drivetrain_jax.sweep.atlas_file import StoredAtlas
 from drivetrain_jax.systems import get_system
+from drivetrain_jax.systems.cardan_units import PhysicalShaft
 
 S21 = (0.1063331213, 1.4159881603)
 CARDAN = get_system("cardan")
@@ -59,6 +60,20 @@ def test_boundaries_lie_on_both_sides_of_the_angle_0():
     assert (rho > 1).tolist() == [True, False, False, True]
     ends = atlas_answers.query(atlas, {"beta": 0.25, "Omega": 1.42}).data["nearest"]["beta"]
     assert ends["below"]["value"] == pytest.approx(above, rel=1e-12) and ends["above"] is None
+
+
+@pytest.mark.parametrize(("J1", "k1"), [(2.0, 1000.0), (2e-9, 3.7), (1e-170, 1e-170)])
+def test_the_ends_of_an_atlas_may_be_asked_for_in_other_units(J1, k1):
+    """Converted, or copied from the message that names them, they miss the ends by a rounding."""
+    atlas, critical = atlas_of((0.0, 0.3), (1.3, 1.5)), 2 * np.sqrt(J1) * np.sqrt(k1)
+    shaft = PhysicalShaft(J1, 100 * J1, k1, k1, 0.001 * critical, 0.001 * critical)
+    data = {name: getattr(shaft, name) for name in ("J1", "J2", "k1", "k2", "c1", "c2")}
+    ends = shaft.speed(1.3), shaft.speed(1.5)
+    exact = atlas_answers.widest_angle(atlas, {"Omega": (1.3, 1.5)}).data["value"]
+    for speed in (ends, tuple(float(f"{end:.10g}") for end in ends)):
+        assert atlas_answers.widest_angle(atlas, {**data, "speed": speed}).data["value"] == exact
+    with pytest.raises(dt.InputError, match=r"^speed = .*: allowed is speed=LOW:HIGH within"):
+        atlas_answers.widest_angle(atlas, {**data, "speed": (ends[0] * (1 - 1e-8), ends[1])})
 
 
 @pytest.mark.parametrize("axes", [("Omega", "beta", "mu"), ("mu", "beta", "Omega"), ("beta", "mu", "Omega")])
