@@ -184,5 +184,5 @@ def test_equation_may_be_a_number():
 def test_coefficients_beyond_one_are_an_outcome():
     """c1 reaches 1 at chi_n = 0.4987: the stiffness then vanishes during a turn and the model ends."""
     point = dt.point("tripod", "floquet", element="input", beta=NINE_DEGREES, zeta=0.01, chi_n=0.6)
-    assert point.outcome.name in ("NOT_FINITE", "STEP_LIMIT")
+    assert point.outcome.name == "NOT_FINITE"
     assert math.isnan(point.spectral_radius)

@@ -18,6 +18,8 @@ from drivetrain_jax.systems import FloquetModel, System
 _STIFF = 600
 # Beyond these a scheme does not start: the point is left to the other one, or ends as STEP_LIMIT.
 _MAX_EXPLICIT, _MAX_PANELS = 300_000, 20_000
+# A model without a value somewhere in its span is solved all the same: that makes the outcome NOT_FINITE.
+_TO_FIND_NO_VALUE = 64
 # Seconds of one implicit panel over those of one explicit step, per point. Full batches would have 150; but few points share
 # a chunk whatever they need, and steps that a point does not need cost it exactness, too.
 PANEL_COST = 50.0
@@ -61,6 +63,7 @@ def _explicit_steps(system: System, columns: Mapping[str, np.ndarray], rtol: flo
         # Systems that predict none: from the size of A^2.
         phase = predicted(_phase, (build,), columns)
         steps = (4 + 2.5 * phase**1.1) * (1e-9 / rtol) ** (1 / 9)
+        steps = np.where(np.isnan(steps), _TO_FIND_NO_VALUE, steps)
     return np.broadcast_to(2 * np.ceil(steps / 2), count_of(columns))
 
 
