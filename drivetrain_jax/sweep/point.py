@@ -172,12 +172,14 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
     path = analysis.path_axis(Request((), given.get("method", next(iter(analysis.methods))), options))
     tree: dict[str, Any] = {"system": system_name, "analysis": analysis_name, "points": {}, "fixed": {}, "options": {}}
     names = (*parameters, "method", *(o.name for o in analysis.options))
+    # A scene has no result of the name of what varies.
+    numbers = {p.name for p in system.parameters if p.is_number} - {path, *(v.name for v in analysis.variables)}
     for name, value in given.items():
         if name not in names:
             raise InputError(f"{name} = {shown(value)}: unknown{nearest(name, names)}")
         if name not in parameters:
             tree["options"][name] = value
-        elif parameters[name].is_number and not isinstance(value, (list, tuple)) and name != path:
+        elif name in numbers and not isinstance(value, (list, tuple)):
             tree["points"][name] = [value]
         else:
             tree["fixed"][name] = value

@@ -143,8 +143,13 @@ def _request(table: _SceneTable, system: System, analysis: Analysis) -> Request:
     names = [v.name for v in analysis.variables]
     offered = [name for name in names if name not in lacking]
     methods = [name for name in analysis.methods if name not in lacking]
-    outputs = list(analysis.default_outputs) if table.outputs is None else table.outputs
+    # What varies is a coordinate already, and a file has room for one of a name.
+    varies = {*table.axes, *table.points}
+    unnamed = [name for name in analysis.default_outputs if name not in varies]
+    outputs = unnamed if table.outputs is None else table.outputs
     for name in outputs:
+        if name in names and name in varies:
+            raise InputError(f"outputs: {name!r} varies in this scene; allowed is to leave it out")
         if name not in names and name != OUTCOME.name:
             raise InputError(f"outputs: {name!r} is not a result of {analysis.name}{nearest(name, offered)}")
     # The outcome is stored with every result, named or not.

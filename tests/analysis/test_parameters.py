@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import get_analysis
@@ -45,3 +46,18 @@ def test_one_point():
     point = dt.point("tripod", "parameters", element="input", beta=math.radians(9), modes=2)
     assert np.isclose(point.natural_angular_frequency, 9633.726700903984, rtol=1e-12)
     assert len(point.midshaft_frequency) == 2
+
+
+@pytest.mark.parametrize("swept", ["axes", "points"])
+def test_a_parameter_that_varies_is_a_coordinate_and_no_result(swept):
+    values = [0.1, 0.2]
+    scene = {"system": "tripod", "analysis": "parameters", "fixed": {"element": "input", "beta": 0.1, "zeta": 0.01}}
+    scene[swept] = {"chi_n": {"values": values} if swept == "axes" else values}
+    ds = dt.run(scene)
+    assert ds.chi_n.values.tolist() == values and "c_inertia" in ds.data_vars and "chi_n" not in ds.data_vars
+    with pytest.raises(dt.InputError, match="outputs: 'chi_n' varies in this scene"):
+        dt.run(scene | {"outputs": ["chi_n", "c_inertia"]})
+
+
+def test_at_a_point_a_given_parameter_is_a_result_too():
+    assert dt.point("tripod", "parameters", element="input", beta=0.1, zeta=0.01, chi_n=0.3).chi_n == 0.3
