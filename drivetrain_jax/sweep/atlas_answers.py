@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.atlas import design
@@ -52,7 +54,10 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
     found = atlas(**point)
     results = {str(name): v.values[()] for name, v in found.data_vars.items()}
     variables = {v.name: v for v in (*atlas.scene.analysis.variables, OUTCOME)}
-    rows = [f"  {name:<24} {variables[name].written(value)}" for name, value in results.items()]
+    rows = [
+        f"  {name:<24} {', '.join(map(variables[name].written, np.atleast_1d(value)))}"
+        for name, value in results.items()
+    ]
     slopes = direct_sensitivity(atlas.scene.system, {**atlas.fixed, **point})
     panels, system = atlas.stability.atlas, atlas.scene.system
     nearest = design.nearest_boundaries(panels, system, point) if has_boundaries(panels, system) else ()
@@ -285,6 +290,8 @@ def _plain(value: Any) -> Any:
         return {name: _plain(v) for name, v in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(v) for v in value]
-    if hasattr(value, "item"):
-        return _plain(value.item())
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, complex):
+        return {"real": _plain(value.real), "imag": _plain(value.imag)}
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -158,6 +158,9 @@ def _engine(scene: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] 
     """The engine of a scene that this machine can run."""
     checked = load_scene(scene, overrides)
     engine = Engine(checked)
+    if checked.analysis.continuous:
+        # It has no points.
+        return engine
     needed, present = engine.total * bytes_per_point(checked, on_disk), physical_memory()
     if needed > present:
         limit = f"allowed here is up to {present / 1e9:.0f} GB"

@@ -39,6 +39,17 @@ def panels(beta: tuple, omega: tuple, rtol: float = 1e-9, zeta: float = 0.001, g
     )
 
 
+def test_an_atlas_answers_with_multipliers_as_well():
+    axes = {"beta": {"start": 0.2, "stop": 0.4}, "Omega": {"start": 1.3, "stop": 1.5}}
+    fixed = {"zeta": 0.01, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+    scene = {"system": "cardan", "analysis": "atlas", "axes": axes, "fixed": fixed, "outputs": ["floquet_multiplier"]}
+    reply = atlas_answers.query(dt.open_atlas(dt.run(scene)), {"beta": 0.3, "Omega": 1.416})
+    expected = dt.point("cardan", "floquet", beta=0.3, Omega=1.416, outputs="floquet_multiplier", **fixed)
+    found = json.loads(reply.to_json())["values"]["floquet_multiplier"]
+    np.testing.assert_allclose([z["real"] + 1j * z["imag"] for z in found], expected.floquet_multiplier, rtol=1e-8)
+    assert str(reply).splitlines()[1].split()[1] == f"{found[0]['real']:.12g}{found[0]['imag']:+.12g}j,"
+
+
 def atlas_of(*given, **more) -> StoredAtlas:
     return dt.open_atlas(panels(*given, **more))
 
