@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
@@ -133,12 +134,24 @@ def draw_cells(axes: Axes, field: xr.DataArray, horizontal: str, vertical: str, 
         cell_edges(x), cell_edges(y), field.transpose(vertical, horizontal).values, rasterized=True, **options
     )
     if _PENDING in field.coords:
-        waiting = field[_PENDING].transpose(vertical, horizontal).values
-        grey = ListedColormap([_PENDING_COLOUR])
-        axes.pcolormesh(cell_edges(x), cell_edges(y), np.where(waiting, 0.0, np.nan), cmap=grey, rasterized=True)
+        _cover_pending(axes, cell_edges(x), cell_edges(y), field[_PENDING].transpose(vertical, horizontal).values)
     fit_axis(axes, "x", x)
     fit_axis(axes, "y", y)
     return mesh
+
+
+def draw_strip(axes: Axes, codes: xr.DataArray, name: str, heights: tuple[float, float], **options: object) -> None:
+    """``codes`` along the axis ``name`` as a strip between two heights, in parts of the panel."""
+    x = cell_edges(codes[name].values.astype(float))
+    place = {"transform": axes.get_xaxis_transform(), "clip_on": False, "rasterized": True}
+    axes.pcolormesh(x, heights, codes.values[None, :], **options, **place)
+    if _PENDING in codes.coords:
+        _cover_pending(axes, x, heights, codes[_PENDING].values[None, :], **place)
+
+
+def _cover_pending(axes: Axes, x: np.ndarray, y: Sequence[float], waiting: np.ndarray, **place: object) -> None:
+    grey = ListedColormap([_PENDING_COLOUR])
+    axes.pcolormesh(x, y, np.where(waiting, 0.0, np.nan), cmap=grey, **{"rasterized": True, **place})
 
 
 def fit_axis(axes: Axes, which: str, values: np.ndarray) -> None:

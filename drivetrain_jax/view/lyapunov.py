@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import matplotlib
 import numpy as np
 import xarray as xr
@@ -12,9 +14,18 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.layout import Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, axis_label, value_text, variable_label
+from drivetrain_jax.view.style import (
+    FRAME_GREY,
+    LINE_COLOURS,
+    STATE_COLOURS,
+    STYLE,
+    axis_label,
+    value_text,
+    variable_label,
+)
 
 # In the order of the flags of the verdict; lightness falls from regular to irregular, undecided is grey.
 KIND_COLOURS = ("#ffffff", "#cfe3f3", "#7fb2d9", "#d1771e", "#5b1020", "#b0b0b0")
@@ -100,13 +111,7 @@ def _draw_curves(axes: Axes, dataset: xr.Dataset, key: str, name: str) -> None:
 
 def _verdict_strip(axes: Axes, dataset: xr.Dataset, name: str) -> list[Artist]:
     """The verdict along the upper edge of the panel."""
-    edges = cells.cell_edges(dataset[name].values.astype(float))
-    codes = dataset["verdict"].values[None, :]
-    strip = axes.get_xaxis_transform()
-    axes.pcolormesh(
-        edges, [1.0, 1.05], codes, cmap=_kinds(), vmin=-0.5, vmax=len(KIND_COLOURS) - 0.5, transform=strip,
-        clip_on=False, rasterized=True,
-    )  # fmt: skip
+    cells.draw_strip(axes, _kind(dataset), name, (1.0, 1.05), **_scale())
     return _kind_legend(dataset)
 
 
@@ -134,8 +139,7 @@ def _maps(dataset: xr.Dataset, names: list[str], split: str | None) -> Figure:
 def _map_row(panels: Panels, row: list[Axes], parts: list[xr.Dataset], key: str, names: tuple[str, str]) -> None:
     if key == "verdict":
         for axes, part in zip(row, parts, strict=True):
-            options = {"cmap": _kinds(), "vmin": -0.5, "vmax": len(KIND_COLOURS) - 0.5}
-            cells.draw_cells(axes, part["verdict"], *names, **options)
+            cells.draw_cells(axes, _kind(part), *names, **_scale())
         return
     largest = [part["lyapunov_spectrum"].isel(exponent=0) for part in parts]
     finite = np.concatenate([field.values[np.isfinite(field.values)] for field in largest])
@@ -146,15 +150,22 @@ def _map_row(panels: Panels, row: list[Axes], parts: list[xr.Dataset], key: str,
     panels.colorbar(row[-1], mesh, f"largest Lyapunov exponent [{units}]")
 
 
-def _kinds() -> ListedColormap:
-    return ListedColormap(KIND_COLOURS, name="kinds")
+def _kind(dataset: xr.Dataset) -> xr.DataArray:
+    """The verdict of each point; the code after the last one where the outcome says that there is no value."""
+    return dataset["verdict"].where(dataset["outcome"] < FIRST_FAILURE, len(KIND_COLOURS))
+
+
+def _scale() -> dict[str, Any]:
+    """Colours of :func:`_kind`."""
+    colours = ListedColormap((*KIND_COLOURS, STATE_COLOURS[cells.FAILED]), name="kinds")
+    return {"cmap": colours, "vmin": -0.5, "vmax": len(KIND_COLOURS) + 0.5}
 
 
 def _kind_legend(dataset: xr.Dataset) -> list[Artist]:
-    """Kinds of motion that occur, with their number of points."""
+    """Kinds of motion that occur and what has no value, with their number of points."""
     meanings = str(dataset["verdict"].attrs.get("flag_meanings", "")).split()
-    counts = np.bincount(dataset["verdict"].values.astype(int).ravel(), minlength=len(meanings))
-    return [
+    counts = np.bincount(_kind(dataset).values.astype(int).ravel(), minlength=len(meanings))
+    kinds = [
         Patch(
             facecolor=KIND_COLOURS[code], edgecolor=FRAME_GREY, linewidth=0.6,
             label=f"{meaning.replace('_', ' ')} ({counts[code]})",
@@ -162,3 +173,4 @@ def _kind_legend(dataset: xr.Dataset) -> list[Artist]:
         for code, meaning in enumerate(meanings)
         if counts[code]
     ]  # fmt: skip
+    return [*kinds, *cells.failure_legend(dataset)]

@@ -115,16 +115,7 @@ def _draw_strip(axes: Axes, dataset: xr.Dataset, name: str) -> None:
     """The verdict as a strip along the foot of the panel."""
     low, high = axes.get_ylim()
     axes.set_ylim(low - 0.06 * (high - low), high)
-    axes.pcolormesh(
-        cells.cell_edges(dataset[name].values),
-        [0, 0.035],
-        cells.states(dataset).values[None, :],
-        cmap=cells.STATES,
-        vmin=-0.5,
-        vmax=3.5,
-        transform=axes.get_xaxis_transform(),
-        rasterized=True,
-    )
+    cells.draw_strip(axes, cells.states(dataset), name, (0, 0.035), cmap=cells.STATES, vmin=-0.5, vmax=3.5)
     axes.axhline(axes.get_ylim()[0] + 0.035 * np.ptp(axes.get_ylim()), color=FRAME_GREY, linewidth=0.5)
 
 

@@ -84,6 +84,15 @@ def test_cells_still_to_be_computed_are_not_failed():
     np.testing.assert_array_equal(np.ma.filled(over.get_array(), np.nan), [[np.nan] * 3, [0, np.nan, np.nan]])
 
 
+def test_a_strip_shows_what_is_still_to_be_computed():
+    line = results.with_axes(results.grid(np.array([0, 1, 0]), "Omega"), Omega=np.arange(3.0))
+    line["outcome"] = line["outcome"].assign_attrs(flag_values=np.arange(7), flag_meanings="a b c d e f pending")
+    line["outcome"][1] = 6
+    strip, over = meshes(plot(line))
+    np.testing.assert_array_equal(np.ma.filled(over.get_array(), np.nan), [[np.nan, 0, np.nan]])
+    assert strip.get_array().shape == (1, 3)
+
+
 @pytest.mark.parametrize(("letters", "cut"), [(20, False), (50, False), (300, True)])
 def test_a_title_is_never_wider_than_the_figure(letters, cut):
     figure = Panels(height=2.0).figure

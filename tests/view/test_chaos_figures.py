@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import to_hex
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import plot
+from drivetrain_jax.view.style import STATE_COLOURS
 
 KINDS = "fixed_point periodic quasi_periodic parametrically_unstable chaotic undecided"
 
@@ -53,6 +56,18 @@ def test_maps_with_a_column_for_each_value_of_a_third_axis():
     figure = plot(lyapunov(excitation_frequency=6, zeta=5, chi_n=3))
     assert legend(figure) == ["quasi periodic (89)", "chaotic (1)"]
     assert len([axes for axes in figure.axes if axes.get_label() != "colour bar"]) == 6
+
+
+@pytest.mark.parametrize("sizes", [{"zeta": 8}, {"zeta": 8, "chi_n": 1}, {"zeta": 4, "chi_n": 2}])
+def test_a_point_without_a_value_has_no_kind(sizes):
+    dataset = lyapunov(**sizes)
+    dataset["outcome"].values.reshape(-1)[-1] = 4
+    dataset["verdict"].values.reshape(-1)[-1] = 5
+    figure = plot(dataset)
+    assert legend(figure) == ["quasi periodic (6)", "chaotic (1)", "failed (1)"]
+    drawn = [mesh for axes in figure.axes for mesh in axes.collections if isinstance(mesh, QuadMesh)]
+    colours = [to_hex(colour) for mesh in drawn for colour in mesh.to_rgba(mesh.get_array()).reshape(-1, 4)]
+    assert STATE_COLOURS[3] in colours and "#b0b0b0" not in colours
 
 
 def test_convergence_of_one_point():
