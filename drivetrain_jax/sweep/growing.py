@@ -146,10 +146,13 @@ def find(engine: Engine, path: Path) -> Source:
     scene = load_scene(tomllib.loads(str(attrs["scene"])))
     grid = Grid.of(scene)
     theirs, ours = _same_points(scene, grid, engine.scene, engine.grid)
+    none = NotReusable(f"reuse = {str(path)!r}: holds none of the points; allowed is a result that shares some")
+    if not theirs.size:
+        raise none
     outcome = sweep_first(map_variable(path, OUTCOME.name), grid)[grid.place(theirs)]
     kept = ~(outcome == Outcome.LOST).any(axis=tuple(range(1, outcome.ndim)))
     if not kept.any():
-        raise NotReusable(f"reuse = {str(path)!r}: holds none of the points; allowed is a result that shares some")
+        raise none
     theirs, ours = theirs[kept], ours[kept]
     wanted = set(scene.request.outputs) <= set(engine.scene.request.outputs)
     # Several of our points may be one of theirs, and the other way round.

@@ -169,6 +169,28 @@ def test_lists_of_points(tmp_path):
     agree(tmp_path / "some.nc", some)
 
 
+ALONE = {"system": "toy", "analysis": "line"}
+
+
+@pytest.mark.parametrize(
+    ("small", "large"),
+    [
+        (ALONE | {"axes": {"b": {"values": [1.0, 4.0]}}, "fixed": {"a": 1.0}},
+         ALONE | {"axes": {"b": {"values": [1.0, 4.0, 9.0]}}, "fixed": {"a": 1.0}}),
+        (scene({}, {"a": 1.0}), scene({}, {"a": 2.0})),
+    ],
+    ids=["longer path", "no axes"],
+)  # fmt: skip
+def test_a_result_of_one_point_or_line_is_refused(tmp_path, small, large):
+    path = tmp_path / "r.nc"
+    run_to_file(small, path)
+    with pytest.raises(InputError, match=r"another scene or version: (axes\.b|fixed\.a)"):
+        run_to_file(large, path)
+    assert status(large, path).state == "stale"
+    with pytest.raises(InputError, match="holds none of the points"):
+        run_to_file(large, tmp_path / "other.nc", reuse=[path])
+
+
 @pytest.mark.parametrize("order", [("a", "b"), ("b", "a")])
 def test_lines_are_taken_whole(tmp_path, order):
     path, b = tmp_path / "r.nc", [1.0, 4.0, 9.0]
