@@ -43,6 +43,7 @@ DIMENSIONS = (
 )
 HISTORIES = frozenset(("u_history", "v_history"))
 _WHOLE = "over the period of the orbit (non-periodic: over 32 drive periods)"
+_AVERAGED = "(non-periodic: of this motion, mean over the last three quarters of most_periods)"
 VARIABLES = (
     Variable("u_max", "m", "largest relative displacement"),
     Variable("u_min", "m", "smallest relative displacement"),
@@ -52,7 +53,7 @@ VARIABLES = (
     Variable("period_multiple", "1", "period multiple (0: not periodic within most_periods)", dtype="int32"),
     Variable("spectral_radius", "1", "spectral radius of the transition over the motion's period"),
     Variable("floquet_multiplier", "1", "multipliers of the motion over its period", ("multiplier",), "complex128"),
-    Variable("lyapunov_exponent", "1/s", "largest Lyapunov exponent"),
+    Variable("lyapunov_exponent", "1/s", f"largest Lyapunov exponent {_AVERAGED}"),
     Variable("regime", "1", REGIME, dtype="int8", flags=REGIMES),
     Variable("impacts", "1", f"number of times that a flank is reached {_WHOLE}", ("flank",)),
     Variable("impact_velocity", "m/s", "largest velocity at which a flank is reached", ("flank",)),

@@ -112,6 +112,26 @@ def test_chaos_is_non_periodic_with_its_exponent(steady):
     np.testing.assert_allclose(found["lyapunov_exponent"], [0.057, 0.097], atol=0.02)
 
 
+def test_the_exponent_of_chaos_is_the_mean_growth_of_a_tangent():
+    """Whether or not most_periods is a multiple of 4; few enough periods for rounding to matter little."""
+    case, most = TABLE1 | {"alpha": 0.0, "B1": 0.2, "omega": 1.2}, 67
+    scene = {"system": "rattle", "analysis": "steady_state", "outputs": ["lyapunov_exponent", "regime"]}
+    found = dt.run(scene | {"points": {k: [v] for k, v in case.items()}, "options": {"most_periods": most}})
+    lanes = prepare(oscillator({k: jnp.array([v]) for k, v in case.items()}))
+    one_period = jax.jit(lambda u, v: march(lanes, start(lanes, u, v, jnp.asarray(1, jnp.int32)), 100_000))
+    u = v = jnp.zeros(1)
+    tangent, growth = np.array([0.6, 0.8]), []
+    for _ in range(most):
+        end = one_period(u, v)
+        u, v, tangent = end.u, end.v, np.array(end.matrix).reshape(2, 2) @ tangent
+        size = abs(tangent[0]) + abs(tangent[1]) / case["omega"]
+        growth.append(np.log(size))
+        tangent = tangent / size
+    assert found["regime"].item() == 3
+    mean = np.mean(growth[most // 4 :]) * case["omega"] / (2 * np.pi)
+    assert found["lyapunov_exponent"].item() == pytest.approx(mean, rel=3e-3)
+
+
 def test_what_is_said_of_chaos_leaves_room_for_a_transient():
     """No finite time tells it from an attractor."""
     said = {variable.name: variable.long_name for variable in ANALYSIS.variables}

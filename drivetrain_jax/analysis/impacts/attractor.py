@@ -13,7 +13,7 @@ from where the search began, is seen to approach it (:mod:`~drivetrain_jax.analy
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -78,6 +78,11 @@ class Attractors(NamedTuple):
 
 
 _RESULT = Attractors(0, 0, 0, (0, 0, 0, 0), 0, 0, 0, 0)
+
+
+def averaged(periods: Any) -> Any:
+    """How many of these periods, the last ones, the growth of a tangent is averaged over."""
+    return periods - periods // 4
 
 
 def take(oscillator: PiecewiseLinearOscillator, index: Array) -> PiecewiseLinearOscillator:
@@ -200,7 +205,7 @@ def _tick(task: _Task, work: _Work) -> _Work:
     shot, probed = (ready & lane.searching & ~broken & (on == (lane.probing >= 0)) for on in (False, True))
     after, verdict = _shoot(lane, shot, local, lanes, omega)
     settles = ready & ~lane.searching & ~broken
-    after = settle(after, settles, task.most_periods // 4, omega)
+    after = settle(after, settles, task.most_periods - averaged(task.most_periods), omega)
     after, reached = confirm(after, settles, history, omega)
     history = record(history, settles, after)
     first, second = candidates(after, history, omega)
@@ -211,7 +216,7 @@ def _tick(task: _Task, work: _Work) -> _Work:
     after = resume(after, verdict.failed | left | (ready & lane.searching & broken))
     stalled = ready & ~lane.searching & broken
     done = reached | stalled | (settles & (after.count >= task.most_periods))
-    result = _result(after, reached, stalled, task.most_periods * 2 * np.pi / omega)
+    result = _result(after, reached, stalled, averaged(task.most_periods) * 2 * np.pi / omega)
     rows = jnp.stack(jax.tree.leaves(result)).astype(float)
     store = work.store.at[:, jnp.where(done, place, total)].set(rows, mode="drop")
     lane, queue = _proceed(after, done, result, work.queue, task)
@@ -225,7 +230,7 @@ def _most_steps(lane: Lane, lanes: Lanes) -> Array:
 
 
 def _result(lane: Lane, reached: Array, stalled: Array, span: Array) -> Attractors:
-    """What a lane that is done has found; ``span`` is the longest time it may settle."""
+    """What a lane that is done has found; ``span`` is the time over which its tangent has grown if it has not settled."""
     orbit = lane.orbit
     return Attractors(
         u=jnp.where(reached, orbit.u, lane.latest[0]),
@@ -234,7 +239,7 @@ def _result(lane: Lane, reached: Array, stalled: Array, span: Array) -> Attracto
         matrix=orbit.matrix,
         error=jnp.where(reached, orbit.error, jnp.nan),
         periods=lane.count,
-        exponent=lane.growth / (0.75 * span),
+        exponent=lane.growth / span,
         stalled=stalled,
     )
 

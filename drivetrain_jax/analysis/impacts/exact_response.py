@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis._base import Outcome
-from drivetrain_jax.analysis.impacts.attractor import Attractors, attractors, take
+from drivetrain_jax.analysis.impacts.attractor import Attractors, attractors, averaged, take
 from drivetrain_jax.analysis.impacts.attractor_lanes import MOST_PERIODS
 from drivetrain_jax.analysis.impacts.motion import ABSENT, REGIMES, STABLE, UNSTABLE, phase_lag, regime
 from drivetrain_jax.analysis.impacts.orbit_measures import Measures, measure
@@ -48,7 +48,7 @@ def describe(
     """
     seen = measure(oscillator, found.u, found.v, found.multiple, width=WIDTH, integrals=integrals)
     periodic = found.multiple > 0
-    growth = found.exponent * 0.75 * found.periods * oscillator.period
+    growth = found.exponent * averaged(found.periods) * oscillator.period
     wild = ~periodic & (growth > _WILD)
     size = jnp.maximum(jnp.abs(seen.high), jnp.abs(seen.low))
     outcome = jnp.where(periodic & ~(found.error <= rtol * size), Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
