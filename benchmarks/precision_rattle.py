@@ -129,7 +129,7 @@ def balancing(harmonics: int) -> Callable[..., Any]:
         model = oscillator(values)
         swept = sweep(model, basis, values["omega"][None])
         x, good = swept.x[0], swept.balanced[0]
-        described = describe(model, basis, x, values["omega"], good)
+        described = describe(model, basis, x, values["omega"], good, swept.saddle[0])
         v = values["omega"] * jnp.sum(basis.orders[2::2, None] * x[2::2], axis=0)
         return jnp.stack([x[0] + jnp.sum(x[1::2], axis=0), v]), described.residual, good
 

@@ -240,3 +240,21 @@ def test_a_lane_does_not_depend_on_the_others():
     ours, others = run(lanes(({}, {}))), run(lanes(({}, {"c": 0.001, "k": 30.0})))
     for name, value in ours.items():
         np.testing.assert_array_equal(value[..., 0], others[name][..., 0], err_msg=name)
+
+
+@pytest.mark.parametrize("harmonics", [1, 2])
+def test_what_lies_between_two_folds_is_a_saddle(harmonics):
+    """Also where the disturbances of few harmonics are damped: as the describing function has it."""
+    omegas = np.linspace(0.65, 0.95, 31)
+    cases = ({"c": 0.01, "B1": 0.006}, {"c": 0.01, "B1": 0.006, "B0": 0.0})
+
+    def run(values):
+        names = ("branch_u_max", "branch_stability")
+        model = oscillator(values | {"omega": omegas})
+        return harmonic_response.response(model, hb.Basis(harmonics, 1, 256), (2,), names)
+
+    found = jax.jit(run)(lanes(cases))
+    three = np.isfinite(found["branch_u_max"]).sum(axis=1) == 3
+    assert (np.asarray(found["outcome"]) == 0).all()
+    assert three.sum() > 15
+    assert (np.asarray(found["branch_stability"])[:, 1][three] == 1).all()

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.numerics.linear_algebra import solve
+from drivetrain_jax.analysis.numerics.linear_algebra import solve, solve_oriented
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 _CROSSING_STEPS = 4
@@ -205,11 +205,13 @@ def jacobian(model: PiecewiseLinearOscillator, basis: Basis, omega: Array, touch
 
 
 class Balanced(NamedTuple):
-    """Coefficients, the last Newton step over their size, and whether it is negligible."""
+    """Coefficients, the last Newton step over their size, whether it is negligible, and whether the Jacobian has a
+    negative determinant, as between two folds: the slow motion of the balance (:func:`drift`) then leaves it."""
 
     x: Array
     step: Array
     converged: Array
+    saddle: Array
 
 
 # Relative step that is negligible, and the least part of a Newton step that is tried.
@@ -217,7 +219,8 @@ _TOLERANCE, _LEAST_PART = 1e-11, 1 / 16
 
 
 class _Iteration(NamedTuple):
-    """Best coefficients so far, the Newton step from there, its part that is tried, and the residual there."""
+    """Best coefficients so far, the Newton step from there, its part that is tried, the residual there, the size of the
+    step, and whether the determinant is negative."""
 
     count: Array
     best: Array
@@ -225,6 +228,7 @@ class _Iteration(NamedTuple):
     part: Array
     unbalanced: Array
     step: Array
+    saddle: Array
 
 
 def balance(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array, iterations: int = 20) -> Balanced:
@@ -241,7 +245,8 @@ def balance(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Arr
         touch = contact(model, basis, trial)
         force, _ = residual(model, basis, trial, omega, touch)
         unbalanced = norm(force)
-        change = solve(jacobian(model, basis, omega, touch), force[:, None])[:, 0]
+        change, negative = solve_oriented(jacobian(model, basis, omega, touch), force[:, None])
+        change = change[:, 0]
         usable = jnp.all(jnp.isfinite(change), axis=0)
         # A step so small that the residual is rounding need not decrease it.
         better = (unbalanced < state.unbalanced) | (state.part <= _LEAST_PART) | (state.step <= 1e-7)
@@ -257,15 +262,17 @@ def balance(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Arr
             jnp.where(taken, 1.0, state.part / 2),
             jnp.where(moved, unbalanced, state.unbalanced),
             jnp.where(moved, step, state.step),
+            jnp.where(moved, negative, state.saddle),
         )
 
     def unfinished(state: _Iteration) -> Array:
         return (state.count < iterations) & jnp.any(~(state.step <= _TOLERANCE))
 
     infinite = jnp.full(x.shape[1:], jnp.inf)
-    start = _Iteration(jnp.int32(0), x, jnp.zeros_like(x), jnp.ones(x.shape[1:]), infinite, infinite)
+    never = jnp.zeros(x.shape[1:], bool)
+    start = _Iteration(jnp.int32(0), x, jnp.zeros_like(x), jnp.ones(x.shape[1:]), infinite, infinite, never)
     end = jax.lax.while_loop(unfinished, improve, start)
-    return Balanced(end.best, end.step, end.step <= _TOLERANCE)
+    return Balanced(end.best, end.step, end.step <= _TOLERANCE, end.saddle)
 
 
 _DRIFT_STEPS = 40

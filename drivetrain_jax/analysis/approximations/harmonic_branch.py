@@ -128,14 +128,14 @@ def trace(model: PiecewiseLinearOscillator, basis: Basis, x: Array, start: float
 
 def at_frequency(
     model: PiecewiseLinearOscillator, basis: Basis, branch: Course, omega: Array, count: int
-) -> tuple[Array, Array, Array]:
-    """Up to ``count`` motions of the branch at ``omega``, in its order, balanced: ``(count, n, ...)``, which exist, and
-    whether these are as many as it has there."""
+) -> tuple[Array, Array, Array, Array]:
+    """Up to ``count`` motions of the branch at ``omega``, in its order, balanced: ``(count, n, ...)``, which exist, which
+    are saddles of the balance, and whether these are as many as it has there."""
     guess, exists, every = sections(branch, omega, count)
 
-    def improved(x: Array) -> tuple[Array, Array]:
+    def improved(x: Array) -> tuple[Array, Array, Array]:
         found = balance(model, basis, x, omega + jnp.zeros(x.shape[1:]), _POLISH)
-        return found.x, found.converged
+        return found.x, found.converged, found.saddle
 
-    found, converged = jax.lax.map(improved, guess[:, :-1])
-    return found, exists & converged, every & jnp.all(converged | ~exists, axis=0)
+    found, converged, saddle = jax.lax.map(improved, guess[:, :-1])
+    return found, exists & converged, saddle, every & jnp.all(converged | ~exists, axis=0)

@@ -78,8 +78,13 @@ def repetitions(basis: Basis, x: Array) -> Array:
     return times
 
 
-def describe(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array, exists: Array) -> Described:
-    """The motion with coefficients ``x`` (n, ...); NaN where it does not exist."""
+def describe(
+    model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array, exists: Array, saddle: Array
+) -> Described:
+    """The motion with coefficients ``x`` (n, ...); NaN where it does not exist.
+
+    A ``saddle`` of the balance is unstable also where the disturbances of its few harmonics do not grow.
+    """
     touch = contact(model, basis, x)
     half = half_trace(model, basis, omega, touch)
     radius = spectral_radius(model, basis, omega, half) ** (1 / repetitions(basis, x))
@@ -91,7 +96,7 @@ def describe(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Ar
     unbalanced = imbalance(model, (touch.u, rate, acceleration), model.B0 + model.B1 * jnp.cos(angle))
     cosine, sine = x[2 * basis.order - 1], x[2 * basis.order]
     rms = jnp.sqrt(x[0] ** 2 + jnp.sum(x[1:] ** 2, axis=0) / 2)
-    stability = jnp.where(radius > 1 + _MARGIN, UNSTABLE, STABLE)
+    stability = jnp.where((radius > 1 + _MARGIN) | saddle, UNSTABLE, STABLE)
     phase = phase_lag(cosine, sine, jnp.maximum(jnp.abs(high), jnp.abs(low)))
     rms, phase, radius, unbalanced = (jnp.where(exists, v, jnp.nan) for v in (rms, phase, radius, unbalanced))
     stability = jnp.where(exists, stability, ABSENT).astype(jnp.int8)
@@ -110,12 +115,13 @@ def response(
     lanes = shape or (1,)
     fields = {name: jnp.broadcast_to(value, lanes) for name, value in vars(model).items() if name != "omega"}
     model = PiecewiseLinearOscillator(**fields, omega=None)
-    swept_x, balanced = _sweeps(model, basis, omega, lanes)
+    swept_x, balanced, saddle = _sweeps(model, basis, omega, lanes)
 
-    def directions(at: tuple[Array, Array, Array]) -> Described:
-        return jax.vmap(lambda x, good: describe(model, basis, x, jnp.broadcast_to(at[0], lanes), good))(*at[1:])
+    def directions(at: tuple[Array, Array, Array, Array]) -> Described:
+        wide = jnp.broadcast_to(at[0], lanes)
+        return jax.vmap(lambda x, *state: describe(model, basis, x, wide, *state))(*at[1:])
 
-    described = jax.lax.map(directions, (jnp.asarray(omega), swept_x, balanced))
+    described = jax.lax.map(directions, (jnp.asarray(omega), swept_x, balanced, saddle))
     outcome = jnp.where(jnp.all(balanced, axis=1), Outcome.SUCCESS, Outcome.NOT_CONVERGED)
     results = described._asdict()
     if any(name.startswith("branch_") for name in outputs):
@@ -130,18 +136,19 @@ def response(
 
 def _sweeps(
     model: PiecewiseLinearOscillator, basis: Basis, omega: np.ndarray, lanes: tuple[int, ...]
-) -> tuple[Array, Array]:
-    """Coefficients ``(L, 2, n, N)`` of the sweeps up and down and whether they are balanced; both run side by side."""
+) -> tuple[Array, Array, Array]:
+    """Coefficients ``(L, 2, n, N)`` of the sweeps up and down, whether they are balanced, and whether saddles; both run
+    side by side."""
     fine, places = refined(omega, _LARGEST_STEP, _MOST_PARTS)
     twice = jax.tree.map(lambda field: jnp.tile(field, 2), {k: v for k, v in vars(model).items() if k != "omega"})
     both = PiecewiseLinearOscillator(**twice, omega=None)
     paths = np.repeat(np.stack([fine, fine[::-1]], axis=1), lanes[0], axis=1)
     swept = sweep(both, basis, jnp.asarray(paths))
     x = swept.x.reshape(len(fine), basis.size, 2, *lanes)
-    balanced = swept.balanced.reshape(len(fine), 2, *lanes)
     back = len(fine) - 1 - places
     x = jnp.stack([x[places, :, 0], x[back, :, 1]], axis=1)
-    return x, jnp.stack([balanced[places, 0], balanced[back, 1]], axis=1)
+    flags = (flag.reshape(len(fine), 2, *lanes) for flag in (swept.balanced, swept.saddle))
+    return x, *(jnp.stack([flag[places, 0], flag[back, 1]], axis=1) for flag in flags)
 
 
 def _branches(
@@ -165,9 +172,9 @@ def _branches(
     along = course(jnp.concatenate([curve.x, curve.omega[:, None]], axis=1), units)
 
     def at(frequency: Array) -> tuple[Array, Array, Array, Array]:
-        x, exists, every = at_frequency(model, basis, along, frequency, BRANCHES)
+        x, exists, saddle, every = at_frequency(model, basis, along, frequency, BRANCHES)
         wide = jnp.broadcast_to(frequency, lanes)
-        found = jax.lax.map(lambda pair: describe(model, basis, pair[0], wide, pair[1]), (x, exists))
+        found = jax.lax.map(lambda one: describe(model, basis, one[0], wide, *one[1:]), (x, exists, saddle))
         order = jnp.argsort(found.u_max, axis=0)
         high, low, stability = (
             jnp.take_along_axis(v, order, axis=0) for v in (found.u_max, found.u_min, found.stability)

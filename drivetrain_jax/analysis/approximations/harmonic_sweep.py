@@ -33,11 +33,13 @@ _WAITS = 8
 
 
 class Swept(NamedTuple):
-    """A motion on the way: coefficients ``(n, ...)``, the half trace of its transition, and whether it is balanced."""
+    """A motion on the way: coefficients ``(n, ...)``, the half trace of its transition, whether it is balanced, and
+    whether it is a saddle of the balance."""
 
     x: Array
     half: Array
     balanced: Array
+    saddle: Array
 
 
 def _effort(model: PiecewiseLinearOscillator, basis: Basis, omega: Array) -> tuple[Array, Array]:
@@ -103,8 +105,8 @@ def _checked(model: PiecewiseLinearOscillator, basis: Basis, found: Balanced, om
     growth = spectral_radius(model, basis, omega, half)
     # Without subharmonics a doubled period cannot be followed.
     followed = (half > 1) | (basis.order > 1)
-    attracts = found.converged & ~((growth > 1 + _MARGIN) & followed)
-    return Swept(found.x, half, found.converged), attracts
+    attracts = found.converged & ~found.saddle & ~((growth > 1 + _MARGIN) & followed)
+    return Swept(found.x, half, found.converged, found.saddle), attracts
 
 
 def _kept(condition: Array, first: Swept, second: Swept) -> Swept:
@@ -147,5 +149,5 @@ def sweep(model: PiecewiseLinearOscillator, basis: Basis, omegas: Array) -> Swep
     lanes = omegas.shape[1:]
     first = settle(model, basis, jnp.zeros((basis.size, *lanes)), omegas[0])
     first = jnp.where(jnp.isfinite(first), first, 0.0)
-    start = Swept(first, jnp.zeros(lanes), jnp.zeros(lanes, bool))
+    start = Swept(first, jnp.zeros(lanes), jnp.zeros(lanes, bool), jnp.zeros(lanes, bool))
     return jax.lax.scan(lambda before, omega: step(model, basis, before, omega), start, omegas)[1]

@@ -42,20 +42,29 @@ def solve(a: Array, b: Array) -> Array:
 
     Gauss-Jordan elimination with row exchanges; a singular matrix gives values that are not finite.
     """
+    return solve_oriented(a, b)[0]
+
+
+def solve_oriented(a: Array, b: Array) -> tuple[Array, Array]:
+    """The same, and whether the determinant of ``a`` is negative, ``(...)``."""
     n = a.shape[0]
     number = jnp.arange(n).reshape(n, *(1,) * (a.ndim - 2))
 
-    def eliminate(k: Array, system: Array) -> Array:
+    def eliminate(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        system, negative = state
         column = system[:, k]
         pivot = jnp.argmax(jnp.where(number < k, -1.0, jnp.abs(column)), axis=0)
         row = jnp.take_along_axis(system, pivot[None, None], axis=0)[0]
+        turned = negative ^ (row[k] < 0) ^ (pivot != k)
         row, displaced = row / row[k], system[k]
         at_pivot = number == pivot
         rest = jnp.where(at_pivot[:, None], displaced, system)
         rest = rest - jnp.where(at_pivot, displaced[k], column)[:, None] * row
-        return jnp.where((number == k)[:, None], row, rest)
+        return jnp.where((number == k)[:, None], row, rest), turned
 
-    return jax.lax.fori_loop(0, n, eliminate, jnp.concatenate([a, b], axis=1))[:, n:]
+    start = (jnp.concatenate([a, b], axis=1), jnp.zeros(a.shape[2:], bool))
+    system, negative = jax.lax.fori_loop(0, n, eliminate, start)
+    return system[:, n:], negative
 
 
 def spectral_norm(a: Array) -> Array:
