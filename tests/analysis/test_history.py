@@ -182,7 +182,8 @@ def test_hopelessly_many_strobes_are_not_begun():
 
 def test_a_flow_of_three_components_is_refused():
     system = SimpleNamespace(name="lorenz", models={"history": SimpleNamespace(build=lambda columns: lorenz(1))})
-    request = Request(("phi",), "diffrax", {"times": (1.0,), "stop": 0.0, "num": 2, "solver": "Dopri8"})
+    defaults = {option.name: option.default for option in history.ANALYSIS.options}
+    request = Request(("phi",), "diffrax", defaults | {"times": (1.0,)})
     (solver,) = history.ANALYSIS.solvers(system, request)
     with pytest.raises(
         InputError, match=r"^system = 'lorenz': has 3 components; history allows two, an angle and its rate$"
