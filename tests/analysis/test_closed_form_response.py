@@ -137,6 +137,23 @@ def test_self_consistent_range_is_the_peak_it_gives(scales):
     assert scales["peak_amplitude"][0, 0] == pytest.approx(float(reach), rel=1e-12)
 
 
+@pytest.mark.parametrize("name", ["B1", "b", "c", "alpha", "k"])
+def test_one_parameter_may_vary_alone(name):
+    """One, two or three lanes of one parameter, the others numbers: as with arrays of all parameters."""
+    # With 1.3 times this drive the largest of three ranges that give their own peak is nearly twice the next one.
+    table, factors = TABLE1 | {"alpha": 0.15, "B1": 0.0023}, np.array([0.9, 1.0, 1.3])
+    cases = [table | {name: table[name] * factor} for factor in factors]
+
+    def reach(values, shape):
+        return multiple_scales.self_consistent_range(oscillator(values), shape)
+
+    expected = jax.jit(lambda values: reach(values, (3,)))(lanes(cases))
+    for chosen in (slice(1), slice(1, None), slice(None)):
+        given = table[name] * factors[chosen]
+        found = jax.jit(lambda x, shape=given.shape: reach(table | {name: x}, shape))(given)
+        np.testing.assert_allclose(found, expected[chosen], rtol=1e-12)
+
+
 def settled(epsilon: float, sigma: float, start: float) -> float:
     """Amplitude that the cubic system settles to, from ``start`` in the phase of the averaged motion."""
     mu, drive = 0.2, 0.5

@@ -63,12 +63,13 @@ def cubic_fit(model: PiecewiseLinearOscillator, fit_range: Array) -> Cubic:
     return Cubic(model.stiffness * (1 - soft * _share(r)), cubic, fit_range)
 
 
-def _turning_ratios(model: PiecewiseLinearOscillator) -> Array:
-    """Ratios ``r = b/R`` (2, ...) where ``l1/r^2`` turns: zeros of ``(1 - alpha)(45 r + 50 r^3 - 63 r^5)/16 - 2``.
+def _turning_ratios(alpha: Array) -> Array:
+    """Ratios ``r = b/R`` where ``l1/r^2`` turns, ``(2, ...)`` with the shape of ``alpha`` behind: zeros of
+    ``(1 - alpha)(45 r + 50 r^3 - 63 r^5)/16 - 2``.
 
     The left side is largest at r = 0.8275; where it is negative even there ``l1/r^2`` falls all the way.
     """
-    soft = 1 - jnp.asarray(model.alpha, float)
+    soft = 1 - alpha
 
     def surplus(r: Array) -> Array:
         return soft * r * (45 + r**2 * (50 - 63 * r**2)) / 16 - 2
@@ -94,7 +95,8 @@ def self_consistent_range(model: PiecewiseLinearOscillator, shape: tuple[int, ..
     # Half of what follows from contact alone is below every solution where r is small.
     linear = target / jnp.sqrt(model.stiffness * jnp.ones(shape))
     least = jnp.minimum(_SMALL_RATIO, play / jnp.where(linear > 0, linear, play) / 2)
-    ends = jnp.concatenate([least[None], _turning_ratios(model) + jnp.zeros((2, *shape)), jnp.ones((1, *shape))])
+    turning = _turning_ratios(model.alpha + jnp.zeros(shape))
+    ends = jnp.concatenate([least[None], turning, jnp.ones((1, *shape))])
     log_r = jnp.log(ends)
     # At rest, r = 0, the excess is that of contact.
     mask = sign_changes((excess(log_r) > 0).at[0].set(True), 1)
