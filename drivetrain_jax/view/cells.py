@@ -241,6 +241,7 @@ def draw_growth(axes: Axes, radius: xr.DataArray, horizontal: str, vertical: str
     stops = [(0.0, _DECAY), (zero, _NEUTRAL), *((zero + part * (1 - zero), colour) for part, colour in _GROWTH)]
     cmap = LinearSegmentedColormap.from_list("growth", stops, N=1024)
     cmap = cmap.with_extremes(bad=STATE_COLOURS[FAILED])
-    mesh = draw_cells(axes, growth, horizontal, vertical, cmap=cmap, norm=norm)
     extend = "min" if bool((growth < low).any()) else "neither"
+    # A radius of 0 is the fastest decay, not a missing value.
+    mesh = draw_cells(axes, growth.clip(min=low), horizontal, vertical, cmap=cmap, norm=norm)
     return mesh, f"$\\log_{{10}}$ of the {radius.attrs.get('long_name', 'spectral radius')} [1]", extend

@@ -185,6 +185,7 @@ def _merge(keys: list[tuple[int, int]]) -> np.ndarray:
 
 def _motion(dataset: xr.Dataset) -> Figure:
     cells.require(dataset, "u_history", "v_history")
+    cells.require_values(dataset["u_history"])
     u, v, part = dataset["u_history"], dataset["v_history"], dataset["sample"]
     height = 2.6
     panels = Panels(height=height, margins=Margins(left=0.85, right=_PORTRAIT + 0.3))

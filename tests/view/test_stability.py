@@ -77,6 +77,15 @@ def test_growth_map_shows_the_logarithm_and_masks_failed_cells():
     np.testing.assert_allclose(sorted(set(growth.compressed())), np.log10([0.99, 1.0, 1.25]), atol=1e-15)
 
 
+def test_a_radius_of_zero_is_the_fastest_decay_and_not_failed():
+    chart = results.chart()
+    chart["spectral_radius"][2, 3] = 0.0
+    mesh = meshes(plot(chart))[1]
+    growth = mesh.get_array()
+    assert np.ma.getmaskarray(growth).sum() == 1
+    assert growth[2, 3] == mesh.norm.vmin
+
+
 def test_colours_of_growth_darken_all_the_way():
     dataset = results.chart()
     mesh = meshes(plot(dataset))[1]

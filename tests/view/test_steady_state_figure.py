@@ -140,3 +140,11 @@ def test_a_motion_shows_history_and_phase_portrait():
 def test_missing_variables_are_named():
     with pytest.raises(InputError, match="u_history"):
         plot(result({"omega": [0.5]}, u_max=[1.0]))
+
+
+def test_a_motion_without_values_is_refused():
+    empty = np.full(4, np.nan)
+    dataset = result({}, u_history=0.0, v_history=0.0)
+    dataset = dataset.assign({name: ("sample", empty) for name in ("u_history", "v_history")})
+    with pytest.raises(InputError, match="u_history = nan: nothing to plot"):
+        plot(dataset)
