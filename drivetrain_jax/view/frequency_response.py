@@ -23,6 +23,8 @@ _HEIGHT = 2.9
 _UNSTABLE = 1
 # A step of a sweep that is a jump: over the range of the values, and over the steps beside it.
 _JUMP, _STEEPER = 0.04, 6.0
+# Room above and below the angles of the phase, and what rounding may leave of one.
+_ANGLE_MARGIN, _ROUNDING = 0.1, 1e-6
 # Motions that meet in a fold are closer than this beside it, over the largest of all.
 _NEAR = 0.15
 
@@ -108,8 +110,7 @@ def _lines(results: list[xr.Dataset]) -> Figure:
         jumps = {str(d): _jumps(amplitude.sel(sweep_direction=d).values) for d in amplitude["sweep_direction"].values}
         _draw_sweeps(upper, each, amplitude, look, jumps)
         if with_phase:
-            # Where the motion is opposite to the drive the lag is half a turn, not less than none.
-            _draw_sweeps(panels.axes[1][0], each, each["phase"] % (2 * np.pi), look, jumps)
+            _draw_sweeps(panels.axes[1][0], each, _lag(each), look, jumps)
         handles += _entries(each, look)
     upper.set_ylim(0, None)
     handles += _draw_missing(upper, results)
@@ -117,7 +118,7 @@ def _lines(results: list[xr.Dataset]) -> Figure:
     cells.fit_axis(upper, "x", np.unique(np.concatenate([r[PATH].values for r in results])))
     panels.label_row(upper, f"half the peak-to-peak displacement [{results[0]['u_max'].attrs.get('units', '1')}]")
     if with_phase:
-        _angle_axis(panels.axes[1][0])
+        _angle_axis(panels.axes[1][0], max(float(_lag(each).max()) for each in results))
         panels.label_row(panels.axes[1][0], "lag of the fundamental [rad]")
     panels.label_axes(axis_label(results[0][PATH]))
     panels.titles(results[0])
@@ -252,6 +253,15 @@ def _entries(result: xr.Dataset, look: _Look) -> list[Line2D]:
     return [Line2D([], [], **style, **_MARK_STYLE, marker=m, label=f"{look.label}, {d}") for d, m in marks]
 
 
-def _angle_axis(axes: Axes) -> None:
-    axes.set_ylim(-0.1, np.pi + 0.1)
-    axes.set_yticks([0, np.pi / 2, np.pi], ["0", r"$\pi/2$", r"$\pi$"])
+def _lag(result: xr.Dataset) -> xr.DataArray:
+    """The phase within a turn: where the motion is opposite to the drive half a turn, not less than none. What rounding
+    has left below none stays there."""
+    return (result["phase"] + _ROUNDING) % (2 * np.pi) - _ROUNDING
+
+
+def _angle_axis(axes: Axes, largest: float) -> None:
+    """Half a turn, or a whole one where lags are longer, as those behind a drive of negative amplitude are."""
+    quarters = 5 if largest > np.pi + _ANGLE_MARGIN else 3
+    axes.set_ylim(-_ANGLE_MARGIN, (quarters - 1) * np.pi / 2 + _ANGLE_MARGIN)
+    labels = ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"]
+    axes.set_yticks(np.arange(quarters) * np.pi / 2, labels[:quarters])

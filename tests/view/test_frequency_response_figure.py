@@ -136,3 +136,17 @@ def test_what_cannot_be_drawn_is_refused():
         plot(xr.Dataset(attrs={"analysis": "floquet"}), line())
     with pytest.raises(InputError, match="beside the first result"):
         plot(line(), xr.Dataset(attrs={"analysis": "floquet"}))
+
+
+@pytest.mark.parametrize(("phase", "ticks"), [(-1e-15, 3), (np.pi + 1e-15, 3), (-0.05, 5), (-3.0, 5)])
+def test_every_phase_lies_within_its_panel(phase, ticks):
+    """Without damping rounding leaves a lag a little below none; a negative amplitude of the drive adds half a turn."""
+    dataset = line()
+    dataset["phase"][...] = phase
+    axes = plot(dataset).axes[1]
+    low, high = axes.get_ylim()
+    drawn = np.concatenate([curve.get_ydata() for curve in axes.lines])
+    drawn = drawn[np.isfinite(drawn)]
+    assert drawn.size and ((low < drawn) & (drawn < high)).all()
+    np.testing.assert_allclose(np.exp(1j * drawn), np.exp(1j * phase), atol=1e-12)
+    assert len(axes.get_yticks()) == ticks and (phase < -0.01) == (drawn.min() > np.pi + 0.01)
