@@ -229,6 +229,7 @@ def _points(dataset: xr.Dataset) -> Figure:
 
 def _multipliers(dataset: xr.Dataset) -> Figure:
     cells.require_any(dataset, "floquet_multiplier")
+    cells.require_values(dataset["floquet_multiplier"])
     panels = Panels(height=4.0, margins=Margins(left=1.5, right=1.5))
     axes = panels.axes[0][0]
     angle = np.linspace(0, 2 * np.pi, 361)

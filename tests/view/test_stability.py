@@ -285,3 +285,10 @@ def test_figures_need_neither_jax_nor_pyplot():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_point_without_multipliers_is_refused():
+    point = results.chart().isel(beta=0, Omega=0)
+    point["floquet_multiplier"] = ("multiplier", np.full(4, np.nan + 0j))
+    with pytest.raises(InputError, match="floquet_multiplier = nan: nothing to plot"):
+        plot(point)
