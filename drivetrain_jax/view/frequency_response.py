@@ -118,7 +118,7 @@ def _lines(results: list[xr.Dataset]) -> Figure:
     cells.fit_axis(upper, "x", np.unique(np.concatenate([r[PATH].values for r in results])))
     panels.label_row(upper, f"half the peak-to-peak displacement [{results[0]['u_max'].attrs.get('units', '1')}]")
     if with_phase:
-        _angle_axis(panels.axes[1][0], max(float(_lag(each).max()) for each in results))
+        _angle_axis(panels.axes[1][0], any(bool((_lag(each) > np.pi + _ANGLE_MARGIN).any()) for each in results))
         panels.label_row(panels.axes[1][0], "lag of the fundamental [rad]")
     panels.label_axes(axis_label(results[0][PATH]))
     panels.titles(results[0])
@@ -259,9 +259,9 @@ def _lag(result: xr.Dataset) -> xr.DataArray:
     return (result["phase"] + _ROUNDING) % (2 * np.pi) - _ROUNDING
 
 
-def _angle_axis(axes: Axes, largest: float) -> None:
+def _angle_axis(axes: Axes, longer: bool) -> None:
     """Half a turn, or a whole one where lags are longer, as those behind a drive of negative amplitude are."""
-    quarters = 5 if largest > np.pi + _ANGLE_MARGIN else 3
+    quarters = 5 if longer else 3
     axes.set_ylim(-_ANGLE_MARGIN, (quarters - 1) * np.pi / 2 + _ANGLE_MARGIN)
     labels = ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"]
     axes.set_yticks(np.arange(quarters) * np.pi / 2, labels[:quarters])
