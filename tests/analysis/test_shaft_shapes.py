@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mpmath import mp
 from scipy.linalg import eigh
 
 import drivetrain_jax as dt
@@ -151,6 +152,88 @@ def test_shapes_against_finite_elements(segments):
     named = len(shafts)
     shafts |= {f"random {i}": random_shaft(rng, segments) for i in range(20)}
     assert compare(shafts, 1e-6) > 4 * 20 + 2 * named
+
+
+UNLIKE = {"length": (1.0, 0.7, 1.3), "EI": (1.0, 2.0, 0.6), "rhoA": (1.0, 0.8, 1.7)}
+WEAK = {
+    "hinges on stiff supports": UNLIKE | {"k_A": 20.0, "k_D": 30.0, "k_joint": (1e6, 3e5), "k_hinge": 0.0},
+    "nearly hinges on rigid supports": UNLIKE | SUPPORTED | {"k_joint": INF, "k_hinge": (1e-5, 1e-4)},
+    "hinges on rigid supports": UNLIKE
+    | {"k_A": 4e5, "k_D": 0.4, "m_joint": (6.0, 0.3), "k_joint": INF, "k_hinge": 0.0},
+    "all kinds, with shear": UNLIKE
+    | {"kGA": (20.0, 5.0, 90.0), "rhoI": (0.01, 0.3, 0.03), "k_A": 20.0, "k_D": 21.0, "m_D": 0.2}
+    | {"k_joint": (6e4, INF), "k_hinge": (0.0, 8e-4), "m_joint": (0.0, 2.0)},
+}
+
+
+def exact_segment(v: Mapping, i: int, p: mp.mpf, x: mp.mpf) -> mp.matrix:
+    """Transfer matrix of the state (f, theta, M, F) over the length x of segment i: cubic in the matrix of (1)."""
+    EI, mass, rotary = (mp.mpf(v[name][i]) * scale for name, scale in (("EI", 1), ("rhoA", p * p), ("rhoI", p * p)))
+    shear = 1 / mp.mpf(v["kGA"][i])
+    A = mp.matrix([[0, 1, 0, shear], [0, 0, -1 / EI, 0], [0, rotary, 0, 1], [-mass, 0, 0, 0]])
+    half, product = (mass * shear + rotary / EI) / 2, mass / EI - mass * shear * rotary / EI
+    root = mp.sqrt(half * half + product)
+    a, b = mp.sqrt(root - half), mp.sqrt(root + half)
+    even, odd = (mp.cosh(a * x), mp.cos(b * x)), (mp.sinh(a * x) / a, mp.sin(b * x) / b)
+    total = [((b * b * h + a * a * t) / (2 * root), (h - t) / (2 * root)) for h, t in (even, odd)]
+    (c0, c2), (c1, c3) = (tuple(mp.re(c) for c in pair) for pair in total)
+    return c0 * mp.eye(4) + c1 * A + c2 * A**2 + c3 * A**3
+
+
+def exact_node(v: Mapping, i: int, p: mp.mpf) -> mp.matrix:
+    """Joint and support in front of segment i, or the support at the end; "rigid" and "hinge" to 30 digits."""
+    k, m = (np.r_[v[f"{what}_A"], v[f"{what}_joint"], v[f"{what}_D"]][i] for what in ("k", "m"))
+    turns = mp.mpf(v["k_hinge"][i - 1]) if 0 < i < len(v["length"]) else mp.inf
+    hinge, support = mp.eye(4), mp.eye(4)
+    hinge[1, 2], support[3, 0] = -1 / max(turns, mp.mpf("1e-30")), min(mp.mpf(k), mp.mpf("1e30")) - p * p * mp.mpf(m)
+    return support * hinge
+
+
+def exact_shape(v: Mapping, p: float, x: np.ndarray) -> np.ndarray:
+    """The mode near the angular frequency ``p`` at ``x`` in [0, 1] by plain transfer matrices, in 260 digits."""
+    lengths = [mp.mpf(length) for length in v["length"]]
+    ends = [mp.fsum(lengths[:i]) for i in range(len(lengths) + 1)]
+
+    def from_a(p: mp.mpf) -> list[mp.matrix]:
+        states = [exact_node(v, 0, p)[:, :2]]
+        for i, length in enumerate(lengths):
+            states.append(exact_node(v, i + 1, p) * (exact_segment(v, i, p, length) * states[-1]))
+        return states
+
+    def determinant(p: mp.mpf) -> mp.mpf:
+        return mp.det(from_a(p)[-1][2:, :])
+
+    with mp.workdps(260):
+        guess = mp.mpf(p)
+        p = mp.findroot(determinant, (guess * (1 - mp.mpf("1e-15")), guess * (1 + mp.mpf("1e-15"))), verify=False)
+        states = from_a(p)
+        mode = mp.matrix([states[-1][2, 1], -states[-1][2, 0]])
+        part = np.searchsorted(np.array(ends[1:-1], float), x * float(ends[-1]))
+        shape = [
+            (exact_segment(v, i, p, mp.mpf(place) * ends[-1] - ends[i]) * (states[i] * mode))[0]
+            for i, place in zip(part, x, strict=True)
+        ]
+        return np.array([float(f / max(shape, key=abs)) for f in shape])
+
+
+@pytest.mark.parametrize("name", WEAK)
+def test_shapes_of_weakly_coupled_parts(name):
+    """Also what hardly moves, and what is at rest, is known to rounding of the largest deflection."""
+    values = complete(WEAK[name])
+    x = np.linspace(0.0, 1.0, 41)
+    p, found = (np.asarray(y) for y in solve(*(jax.tree.map(lambda y: y[None], (everything(values), jnp.asarray(x))))))
+    for j in range(MODES):
+        expected = exact_shape(values, p[0, j], x)
+        assert min(np.abs(found[0, j] - expected).max(), np.abs(found[0, j] + expected).max()) < 1e-12, j
+
+
+def test_a_mode_that_turns_without_deflection():
+    """Between hinges on rigid supports theta is constant and f = 0 at p^2 = kGA/rhoI; its shape is no rounding."""
+    span = EQUAL | SUPPORTED | {"kGA": (20.0, 50.0), "rhoI": (0.2, 0.01), "k_hinge": 0.0, "k_joint": INF}
+    answer = dt.point("bicardan", "critical_speeds", outputs=["angular_frequency", "mode_shape"], **span)
+    turning = np.abs(answer.angular_frequency - math.sqrt(20.0 / 0.2)) < 1e-9
+    assert np.count_nonzero(turning) == 1
+    np.testing.assert_allclose(np.abs(answer.mode_shape).max(axis=1), np.where(turning, 0.0, 1.0), rtol=1e-15)
 
 
 def test_deflection_is_continuous_at_an_elastic_joint():
