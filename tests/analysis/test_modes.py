@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
@@ -12,6 +13,7 @@ from scipy.optimize import brentq
 import drivetrain_jax as dt
 from benchmarks.planetary_reference import TABLE_2, exact_frequencies, matrices, natural_frequencies
 from drivetrain_jax.analysis.spectra.mode_types import SYMMETRIC
+from drivetrain_jax.analysis.spectra.tracking import follow
 
 RIGID, ROTATIONAL, TRANSLATIONAL, PLANET, COUPLED = range(5)
 MODES = ["natural_frequency", "mode_type", "participation"]
@@ -340,3 +342,12 @@ def test_refusals():
     assert "k_sp" in refusal(fixed={"k_sp": -1.0})
     assert "m_p[1]" in refusal(fixed={"m_p": [0.6, 0.0, 1.0, 1.0]})
     assert "not an axis" in refusal(options={"track": "planet_angle[1]"})
+
+
+def test_a_path_begins_where_there_are_shapes():
+    """Without vectors at the first point the second is the first: no share of what is not there."""
+    vectors = np.stack([np.full((2, 2), np.nan), np.eye(2), np.full((2, 2), np.nan), np.eye(2)[:, ::-1]])
+    same = np.broadcast_to(np.eye(2, dtype=bool), (4, 2, 2))
+    branch, mac = (np.asarray(x) for x in follow(jnp.asarray(vectors), jnp.asarray(same)))
+    np.testing.assert_array_equal(mac, [[np.nan] * 2, [1, 1], [np.nan] * 2, [1, 1]])
+    np.testing.assert_array_equal(branch, [[1, 2], [1, 2], [1, 2], [2, 1]])

@@ -25,7 +25,8 @@ def follow(vectors: Array, same: Array) -> tuple[Array, Array]:
     ``same`` (L, n, n, ...): which modes of a point share one frequency. ``branch`` (int32) is the number, from 1, of
     the mode at the first point that each mode continues; ``mac`` the share, 0 to 1, that the shape of the branch at the
     previous point has in the space of the mode (1 at the first point). Every branch goes on at every point; pairs are
-    made by falling MAC. Where ``vectors`` are not finite, ``mac`` is NaN and the order by frequency is kept.
+    made by falling MAC. Where ``vectors`` are not finite, ``mac`` is NaN and the order by frequency is kept: the points
+    beside them are each other's neighbours, and the first point is the first one whose vectors are finite.
     """
     n = vectors.shape[2]
     numbers = jnp.arange(1, n + 1, dtype=jnp.int32).reshape(n, *(1,) * (vectors.ndim - 3))
@@ -40,7 +41,8 @@ def follow(vectors: Array, same: Array) -> tuple[Array, Array]:
         shared = jnp.sum(squares[:, :, None] * equal[None], axis=1)
         chosen = _pair(jnp.where(known, shared + _OWN * squares, jnp.eye(n).reshape(n, n, *(1,) * (shapes.ndim - 2))))
         branch = jnp.sum(chosen * first[:, None], axis=0)
-        mac = jnp.sum(chosen * shared, axis=0)
+        begun = jnp.any(reference != 0, axis=(0, 1))
+        mac = jnp.where(begun, jnp.sum(chosen * shared, axis=0), 1.0)
         carried = _carry(overlap, shapes, equal, chosen)
         reference = jnp.where(known, carried, reference)
         return reference, (branch.astype(jnp.int32), jnp.where(known, jnp.minimum(mac, 1.0), jnp.nan))
