@@ -55,8 +55,10 @@ def speed_ratio(beta: Any, phi: Any) -> tuple[Array, Array, Array]:
     Eq. (1): eta = cos(beta) / (1 - sin(beta)^2 sin(phi)^2), period pi.
     """
     c, s2 = jnp.cos(beta), jnp.sin(beta) ** 2
-    d = 1 - s2 * jnp.sin(phi) ** 2
-    sine, cosine = jnp.sin(2 * phi), jnp.cos(2 * phi)
+    across, along = jnp.sin(phi), jnp.cos(phi)
+    # Eq. (1) as a sum of squares: its difference loses 1/c^2 units of rounding where eta is largest.
+    d = along**2 + (c * across) ** 2
+    sine, cosine = 2 * across * along, (along - across) * (along + across)
     return c / d, c * s2 * sine / d**2, c * s2 * (2 * cosine / d**2 + 2 * s2 * sine**2 / d**3)
 
 
