@@ -1,4 +1,9 @@
-"""Tips of tongues followed as a third parameter of the atlas (mu, alpha, zeta) changes."""
+"""Tips of tongues followed as a third parameter of the atlas (mu, alpha, gamma, zeta) changes.
+
+On every step a tip is predicted from its slope at the start, found by Newton's method, and accepted if the slopes at both
+ends agree with the way between them. A step on which they do not is halved: Newton's method alone, started too far
+away, leads to the tip of another tongue.
+"""
 
 from __future__ import annotations
 
@@ -8,40 +13,43 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivetrain_jax.atlas.criteria import Criteria, parameters_at
+from drivetrain_jax.atlas.growth import growth, limiting
 from drivetrain_jax.atlas.panels import Atlas
-from drivetrain_jax.atlas.tips import Tip, find_tips, polish
-from drivetrain_jax.systems import System
+from drivetrain_jax.atlas.patches import Patches, patches_of
+from drivetrain_jax.atlas.tips import Tip, find_tips, polish, rises
+from drivetrain_jax.systems import Coordinate, System
 
-# Newton's steps on the boundary function.
-_NEWTON = 8
-# Into how many pieces a step is divided, one after the other, for the tips that it loses.
-_PIECES = (1, 4, 16)
-# The stencil's steps along the speed and along the other parameter, and the largest shift of a polish, of the domain.
-_ACROSS, _ALONG = 2e-4, 1e-3
-_LARGEST_SHIFT = 1e-3
-# Weights of the first and the second derivative, of order 6.
-_FIRST = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60
-_SECOND = np.array([2.0, -27.0, 270.0, -490.0, 270.0, -27.0, 2.0]) / 180
+# Newton's steps on the boundary function and on the multiplier, and how often a step from one value to the next is halved.
+_NEWTON, _POLISH, _HALVINGS = 8, 4, 6
+# Slopes are differences over this part of a step.
+_PART = 1e-3
+# How far a step may differ from what the slopes at its ends say, of its own length and of the domain.
+_BEND, _SMALL = 0.2, 1e-3
+# The largest shift of a polish, of the domain, and the largest rate of growth after it.
+_LARGEST_SHIFT, _LARGEST_RATE = 1e-3, 1e-9
 
 
 @dataclass(frozen=True)
 class Path:
     """The way of one tip: ``points`` maps the two parameters to arrays, one entry for each of ``values`` of ``parameter``.
 
-    NaN from where the tip has left the atlas or could not be followed.
+    NaN from where the tip has left the atlas, has met another one, or could not be followed. ``limiting`` is false also
+    where it lies within another tongue, so that it bounds no stable region there.
     """
 
     tip: Tip
     parameter: str
     values: np.ndarray
     points: Mapping[str, np.ndarray]
+    limiting: np.ndarray
 
 
 def follow_tips(atlas: Atlas, system: System, parameter: str, values: Sequence[float]) -> tuple[Path, ...]:
     """All tips at the first of ``values`` of ``parameter``, followed through the others in the order given.
 
     ``atlas`` has ``parameter`` and two more, one of them the axis of the system's resonances. A step on which a tip is lost
-    is divided; one that leaves the atlas ends there.
+    is divided; one that leaves the atlas ends there. At zero damping tongues have no width at their tips: on a step from or
+    to there, a tip is the one of the same name.
 
     Raises ``KeyError`` if ``atlas`` lacks ``parameter``, ``ValueError`` for a value outside its domain, for no values and
     for other parameters beside it, :class:`~drivetrain_jax.InputError` for an atlas without panels and a system without
@@ -50,73 +58,140 @@ def follow_tips(atlas: Atlas, system: System, parameter: str, values: Sequence[f
     values = np.asarray(values, float)
     if not values.size:
         raise ValueError("values = []: allowed is one value or more")
-    first = atlas.slice({parameter: values[0]}).folded()
-    tips = find_tips(first, system).tips
+    way = _Way(atlas, system, parameter)
+    first = way.criteria(values[0]).atlas
     names = first.parameters
-    h = names.index(system.resonances.axis)
+    # Tongues widen with the angle. Along a damping they close, and what closes them is their tip.
+    tips = find_tips(first, system, opening=system.roles.get("angle") in names).tips
+    criteria = [way.criteria(value) for value in values]
     track = np.full((len(values), len(tips), 2), np.nan)
-    track[0] = [[tip.point[name] for name in names] for tip in tips]
-    track[0] = first.to_coordinates(track[0])
-    kinds = [tip.multiplier for tip in tips]
+    track[0] = _places(first, tips)
     for k in range(1, len(values)):
-        for pieces in _PIECES:
-            lost = np.isnan(track[k]).any(axis=1) & np.isfinite(track[k - 1]).all(axis=1)
-            if lost.any():
-                chosen = [kind for kind, mine in zip(kinds, lost, strict=True) if mine]
-                between = np.linspace(values[k - 1], values[k], pieces + 1)
-                track[k, lost] = _advance(atlas, system, (parameter, between), chosen, track[k - 1, lost], h)
+        if criteria[k - 1].conservative or criteria[k].conservative:
+            alive = np.isfinite(track[k - 1]).all(axis=1)
+            track[k] = np.where(alive[:, None], _by_name(criteria[k], tips), np.nan)
+        else:
+            track[k] = way.advance(tips, track[k - 1], (values[k - 1], values[k]))
+    bounding = np.stack([_bounding(c, tips, x) for c, x in zip(criteria, track, strict=True)])
     points = parameters_at(first, track)
     return tuple(
-        Path(tip, parameter, values, {name: points[:, i, j] for j, name in enumerate(names)})
+        Path(tip, parameter, values, {name: points[:, i, j] for j, name in enumerate(names)}, bounding[:, i])
         for i, tip in enumerate(tips)
     )
 
 
-def _advance(atlas: Atlas, system: System, way: tuple, kinds: list[str], start: np.ndarray, h: int) -> np.ndarray:
-    """Tips at the last of the values of a parameter, ``way`` = (name, values), from those at the first."""
-    parameter, values = way
-    before, x = start, start
-    for value in values[1:]:
-        criteria = Criteria.of(atlas.slice({parameter: value}).folded(), system)
-        before, x = x, _step(criteria, kinds, 2 * x - before, h)
+@dataclass(frozen=True)
+class _Way:
+    """Tips along ``parameter`` of ``atlas``, in coordinates ``(M, 2)`` of its two others."""
+
+    atlas: Atlas
+    system: System
+    parameter: str
+
+    def criteria(self, value: float) -> Criteria:
+        """Those of the two other parameters at a value."""
+        return Criteria.of(self.atlas.slice({self.parameter: float(value)}).folded(), self.system)
+
+    def advance(
+        self, tips: Sequence[Tip], start: np.ndarray, ends: tuple[float, float], halvings: int = 0
+    ) -> np.ndarray:
+        """Where ``tips`` are at the second of the values ``ends``, from ``start`` at the first; NaN for what is lost."""
+        result = np.full(start.shape, np.nan)
+        alive = np.flatnonzero(np.isfinite(start).all(axis=1))
+        if not alive.size:
+            return result
+        found, followed = self._step([tips[i] for i in alive], start[alive], ends)
+        result[alive[followed]] = found[followed]
+        lost = alive[~followed]
+        if lost.size and halvings < _HALVINGS:
+            chosen = [tips[i] for i in lost]
+            middle = self._between(ends, 0.5)
+            half = self.advance(chosen, start[lost], (ends[0], middle), halvings + 1)
+            result[lost] = self.advance(chosen, half, (middle, ends[1]), halvings + 1)
+        return result
+
+    def _step(self, tips: list[Tip], x: np.ndarray, ends: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+        """Where ``tips`` are at the end of one step from ``x``, and whether its slopes agree with that."""
+        size = np.ptp(self._corners(), axis=0)
+        slope = (self._near(self._between(ends, _PART), tips, x) - x) / _PART
+        found = self._near(ends[1], tips, x + slope)
+        before = self._near(self._between(ends, 1 - _PART), tips, found - _PART * slope)
+        way = (found - x) / size
+        bends = [np.abs(way - each / size).max(axis=1) for each in (slope, (found - before) / _PART)]
+        return found, np.maximum(*bends) <= _BEND * np.abs(way).max(axis=1) + _SMALL
+
+    def _near(self, value: float, tips: list[Tip], guess: np.ndarray) -> np.ndarray:
+        """Tips like ``tips`` near ``guess``: Newton's method on the boundary functions, then on the multipliers; NaN if that
+        fails, or leads to where a tongue closes instead of opening."""
+        result = np.full(guess.shape, np.nan)
+        if not np.isfinite(guess).all(axis=1).any():
+            return result
+        criteria = self.criteria(value)
+        h = criteria.atlas.parameters.index(self.system.resonances.axis)
+        lower, upper = corners = _corners(criteria.atlas)
+        patches = patches_of(criteria)
+        for alike in sorted({(tip.multiplier, tip.opens) for tip in tips}):
+            kind, opens = alike
+            mine = [(tip.multiplier, tip.opens) == alike for tip in tips] & np.isfinite(guess).all(axis=1)
+            x, mine = _newton(patches[criteria.multipliers.index(kind)], guess[mine], corners, h), np.flatnonzero(mine)
+            mine, x = (part[((x >= lower) & (x <= upper)).all(axis=1)] for part in (mine, x))
+            polished, rates = polish(criteria, x, kind, h, _POLISH)
+            good = (np.abs(polished - x) <= _LARGEST_SHIFT * (upper - lower)).all(axis=1)
+            good &= (np.abs(rates.rate) < _LARGEST_RATE) & (rates.hessian[:, h, h] < 0)
+            good &= (rates.gradient[:, 1 - h] * rises(criteria, 1 - h) > 0) == opens
+            result[mine[good]] = polished[good]
+        return result
+
+    def _between(self, ends: tuple[float, float], part: float) -> float:
+        """The value at a ``part`` of the way, in the coordinate."""
+        coordinate: Coordinate = self.atlas.coordinates[self.atlas.parameters.index(self.parameter)]
+        a, b = (float(coordinate.forward(end)) for end in ends)
+        value = float(coordinate.inverse(a + part * (b - a)))
+        low, high = sorted(map(abs, ends) if coordinate.even else ends)
+        return float(np.copysign(np.clip(value, low, high), sum(ends)))
+
+    def _corners(self) -> np.ndarray:
+        k = self.atlas.parameters.index(self.parameter)
+        return np.delete(_corners(self.atlas.folded()), k, axis=1)
+
+
+def _corners(atlas: Atlas) -> np.ndarray:
+    """Least and largest coordinates, ``(2, d)``."""
+    return np.sort(atlas.to_coordinates(np.stack([atlas.lower, atlas.upper])), axis=0)
+
+
+def _newton(f: Patches, x: np.ndarray, corners: np.ndarray, h: int) -> np.ndarray:
+    """Zeros of f and f_h from ``x`` ``(M, 2)``. Outside the domain the function is taken as on its rim."""
+    v, f_h = 1 - h, f.derivative(h)
+    derived = f, f_h, f_h.derivative(h), f.derivative(v), f_h.derivative(v)
+    for _ in range(_NEWTON if len(x) else 0):
+        x = np.clip(x, *corners)
+        place = f.locate(x)
+        value, slope, bend, rise, twist = (each.at(*place) for each in derived)
+        with np.errstate(all="ignore"):
+            # The value on the ridge and its slope: far from the ridge a plain step of Newton's method overshoots.
+            step = (value - slope**2 / (2 * bend)) / (rise - slope * twist / bend)
+            x = x - np.stack([step, (slope - twist * step) / bend], axis=1)[:, [v, h]]
     return x
 
 
-def _step(criteria: Criteria, kinds: list[str], guess: np.ndarray, h: int) -> np.ndarray:
-    """Tips near ``guess`` ``(M, 2)``: Newton's method on the boundary functions, then on the multipliers."""
-    ends = criteria.atlas.to_coordinates(np.stack([criteria.atlas.lower, criteria.atlas.upper]))
-    lower, upper = ends.min(axis=0), ends.max(axis=0)
-    size = upper - lower
-    numbers = np.array([criteria.multipliers.index(kind) for kind in kinds], int)
-    x = guess.copy()
-    # The stencil must not leave the atlas.
-    rim = np.where(np.arange(2) == h, 3 * _ACROSS, _ALONG) * size
-    for _ in range(_NEWTON):
-        x = x - _newton(criteria, numbers, np.clip(x, lower + rim, upper - rim), h, size)
-    x[((x < lower) | (x > upper)).any(axis=1)] = np.nan
-    result = np.full(x.shape, np.nan)
-    for kind in set(kinds):
-        mine = np.array([k == kind for k in kinds]) & np.isfinite(x).all(axis=1)
-        polished, rates = polish(criteria, x[mine], kind, h)
-        near = (np.abs(polished - x[mine]) <= _LARGEST_SHIFT * size).all(axis=1) & (np.abs(rates.rate) < 1e-9)
-        result[mine] = np.where(near[:, None], polished, np.nan)
-    return result
+def _places(atlas: Atlas, tips: Sequence[Tip]) -> np.ndarray:
+    """Tips in coordinates, ``(M, 2)``."""
+    points = np.array([[tip.point[name] for name in atlas.parameters] for tip in tips])
+    return atlas.to_coordinates(points.reshape(-1, 2))
 
 
-def _newton(criteria: Criteria, numbers: np.ndarray, x: np.ndarray, h: int, size: np.ndarray) -> np.ndarray:
-    """The step for f = f_h = 0 with derivatives by differences."""
-    v, dh, dv = 1 - h, _ACROSS * size[h], _ALONG * size[1 - h]
-    shifts = np.arange(-3, 4)
-    points = np.repeat(x[:, None, None], 3, axis=1).repeat(len(shifts), axis=2)
-    points[..., h] += dh * shifts
-    points[..., v] += dv * np.arange(-1, 2)[:, None]
-    values = criteria.values(points.reshape(-1, 2)).reshape(-1, *points.shape[:3])[numbers, np.arange(len(x))]
-    f, below, above = values[:, 1, 3], values[:, 0], values[:, 2]
-    f_h, f_hh = values[:, 1] @ _FIRST / dh, values[:, 1] @ _SECOND / dh**2
-    f_v, f_hv = (above[:, 3] - below[:, 3]) / (2 * dv), (above - below) @ _FIRST / (2 * dv * dh)
-    step = np.empty(x.shape)
-    with np.errstate(all="ignore"):
-        # The value on the ridge and its slope: far from the ridge a plain step of Newton's method overshoots.
-        step[:, v] = (f - f_h**2 / (2 * f_hh)) / (f_v - f_h * f_hv / f_hh)
-        step[:, h] = (f_h - f_hv * step[:, v]) / f_hh
-    return step
+def _by_name(criteria: Criteria, tips: Sequence[Tip]) -> np.ndarray:
+    """The tips of the same names, NaN for those without a name or of a name that several bear."""
+    others = find_tips(criteria.atlas, criteria.system).tips
+    same = [[other for other in others if other.name == tip.name != ""] for tip in tips]
+    places = [_places(criteria.atlas, those)[0] if len(those) == 1 else np.full(2, np.nan) for those in same]
+    return np.array(places).reshape(-1, 2)
+
+
+def _bounding(criteria: Criteria, tips: Sequence[Tip], x: np.ndarray) -> np.ndarray:
+    """Whether no other multiplier grows where ``tips`` are, at ``x``."""
+    alive = np.isfinite(x).all(axis=1)
+    if criteria.conservative:
+        return alive
+    return alive & limiting(criteria, x, growth(criteria, x, [tip.multiplier for tip in tips]))

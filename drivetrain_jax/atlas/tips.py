@@ -85,10 +85,10 @@ def find_tips(atlas: Atlas, system: System, *, opening: bool = True) -> Tips:
     tips: list[Tip] = []
     for kind, patch, search in zip(criteria.multipliers, patches, searches, strict=True):
         x, rates = polish(criteria, search.points, kind, horizontal)
-        opens = (search.curvature * search.slope < 0) == (_rises(criteria, 1 - horizontal) > 0)
+        opens = (search.curvature * search.slope < 0) == (rises(criteria, 1 - horizontal) > 0)
         found = _describe(criteria, kind, horizontal, (x, rates, _named_at(criteria, patch, x, horizontal)), opens)
         x, rates = suspected(criteria, kind, horizontal, search.undecided, x)
-        opens = rates.gradient[:, 1 - horizontal] * _rises(criteria, 1 - horizontal) > 0
+        opens = rates.gradient[:, 1 - horizontal] * rises(criteria, 1 - horizontal) > 0
         likely = _describe(criteria, kind, horizontal, (x, rates, _named_at(criteria, patch, x, horizontal)), opens)
         tips += [*found, *(replace(tip, proved=False) for tip in likely)]
     undecided = tuple(_box(atlas, box) for search in searches for box in search.undecided)
@@ -97,10 +97,12 @@ def find_tips(atlas: Atlas, system: System, *, opening: bool = True) -> Tips:
     return Tips(_sorted(chosen, atlas, horizontal), undecided, sum(s.boxes for s in searches), not undecided)
 
 
-def polish(criteria: Criteria, x: np.ndarray, kind: str, horizontal: int) -> tuple[np.ndarray, Growth]:
+def polish(
+    criteria: Criteria, x: np.ndarray, kind: str, horizontal: int, steps: int = _POLISH
+) -> tuple[np.ndarray, Growth]:
     """Newton's method for ln|sigma| = 0 and its derivative along ``horizontal``, from ``x`` ``(N, 2)``."""
     kinds = [kind] * len(x)
-    for _ in range(_POLISH if len(x) else 0):
+    for _ in range(steps if len(x) else 0):
         rates = growth(criteria, x, kinds, second=True)
         jacobian = np.stack([rates.gradient, rates.hessian[:, horizontal]], axis=1)
         residual = np.stack([rates.rate, rates.gradient[:, horizontal]], axis=-1)
@@ -171,7 +173,7 @@ def _errors(rates: Growth, h: int) -> np.ndarray:
     return errors
 
 
-def _rises(criteria: Criteria, v: int) -> float:
+def rises(criteria: Criteria, v: int) -> float:
     """1 if the coordinate v rises with its parameter, else -1."""
     ends = criteria.atlas.to_coordinates(np.stack([criteria.atlas.lower, criteria.atlas.upper]))[:, v]
     return 1.0 if ends[1] > ends[0] else -1.0
