@@ -46,6 +46,9 @@ _VARIABLES = {
     "gap_upper": (("gap", "parameter"), "upper corner of a box without a panel, in coordinates"),
 }
 
+# Those that every atlas has.
+_DOMAIN = ("lower", "upper")
+
 
 def make_atlas(scene: Scene, work: Work, progress: Progress) -> xr.Dataset:
     """The file of an atlas scene. ``progress`` counts the solves."""
@@ -89,6 +92,8 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
         raise InputError(
             f"{label}: damaged ({checksums.named(changed)}); allowed is to restore it or to run its scene again"
         )
+    if missing := _missing(dataset):
+        raise InputError(f"{label}: lacks {missing[0]}; allowed is the whole result of a scene of an atlas")
     scene = load_scene(tomllib.loads(dataset.attrs["scene"]))
     names = tuple(str(name) for name in dataset["parameter"].values)
     ranges = dict(zip(names, zip(dataset["lower"].values, dataset["upper"].values, strict=True), strict=True))
@@ -105,6 +110,24 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
     tolerance, solves = dataset.attrs["tolerance"], dataset.attrs["solves"]
     atlas = from_arrays(arrays, names, domain.coordinates, used, tolerance, solves)
     return StoredAtlas(scene, stability_atlas(atlas, scene.system, scene.request.options["rtol"]))
+
+
+def _missing(dataset: xr.Dataset) -> list[str]:
+    """What :func:`make_atlas` writes and ``dataset`` lacks: an atlas has panels, gaps or both."""
+    of_gaps = {name: "gap" in dims for name, (dims, _) in _VARIABLES.items() if name not in _DOMAIN}
+    kinds = {of for name, of in of_gaps.items() if name in dataset} or {False}
+    needed = [
+        *_DOMAIN,
+        *(name for name, of in of_gaps.items() if of in kinds),
+        *(["gap_reason"] if True in kinds else []),
+    ]
+    missing = [name for name in needed if name not in dataset]
+    missing += [name for name in ("scene", "coordinates_of_panels", "tolerance", "solves") if name not in dataset.attrs]
+    if not missing and False in kinds:
+        bits = np.unpackbits(np.asarray(dataset["kept"].values, np.uint8))
+        missing += ["some of kept"] if bits.size < dataset["panel_degrees"].prod("parameter").sum() else []
+        missing += ["some of coefficients"] if dataset.sizes["coefficient"] != bits.sum() else []
+    return missing
 
 
 @dataclass(frozen=True)

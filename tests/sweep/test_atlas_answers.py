@@ -299,3 +299,22 @@ def test_steps_of_a_gradient_are_found_where_the_system_predicts_none():
 )
 def test_distance_from_one_is_not_lost_among_digits(radius, text):
     assert _from_one(radius) == text
+
+
+@pytest.mark.parametrize(
+    "name", ["lower", "panel_lower", "panel_degrees", "value_error", "derived_error", "coefficients", "kept", "scene"]
+)
+def test_a_part_of_an_atlas_is_refused(name):
+    """Without the bits that say which coefficients were kept, all would be 0, and every shaft stable."""
+    whole = panels((0.2, 0.3), (1.3, 1.5))
+    attrs = {key: value for key, value in whole.attrs.items() if key != name}
+    part = whole.drop_vars(name, errors="ignore").drop_attrs().assign_attrs(attrs)
+    with pytest.raises(dt.InputError, match=f"^dataset: lacks {name}; allowed is the whole result of a scene"):
+        dt.open_atlas(part)
+
+
+@pytest.mark.parametrize("cut", ["coefficient", "byte"])
+def test_an_atlas_that_was_cut_is_refused(cut):
+    whole = panels((0.2, 0.3), (1.3, 1.5))
+    with pytest.raises(dt.InputError, match=r"^dataset: lacks some of "):
+        dt.open_atlas(whole.isel({cut: slice(0, -1)}))
