@@ -57,14 +57,13 @@ class Sensitivity:
     def boundary(self, parameter: str) -> dict[str, float]:
         """Derivative of the boundary value of ``parameter`` with respect to every other one, at a point of the boundary.
 
-        At a tip it is that of the tip, because there the radius does not vary along the speed. NaN where the radius does not
-        vary with ``parameter``. Raises ``KeyError`` for a parameter that ``gradient`` lacks.
+        At a tip it is that of the tip, because there the radius does not vary along the speed. NaN where the radius has no
+        gradient or does not vary with ``parameter``. Raises ``KeyError`` for a parameter that ``gradient`` lacks.
         """
         slope = self.gradient[parameter]
+        known = self.exists and slope != 0
         return {
-            name: -value / slope if slope else float("nan")
-            for name, value in self.gradient.items()
-            if name != parameter
+            name: -value / slope if known else math.nan for name, value in self.gradient.items() if name != parameter
         }
 
 

@@ -347,8 +347,9 @@ def test_gradients_of_the_radius():
     point = {**BASE, "beta": 0.9, "Omega": 0.71}
     found = direct_sensitivity(CARDAN, point)
     assert found.exists
-    # Without damping all four lie on the circle.
-    assert not direct_sensitivity(CARDAN, {**point, "beta": 0.3, "Omega": 1.2, "zeta": 0.0}).exists
+    # Without damping all four lie on the circle, and what is left of derivatives is rounding.
+    undamped = direct_sensitivity(CARDAN, {**point, "beta": 0.3, "Omega": 1.2, "zeta": 0.0})
+    assert not undamped.exists and np.isnan(list(undamped.boundary("beta").values())).all()
     assert found.spectral_radius == pytest.approx(np.exp(rate(0.9, 0.71))[0], rel=1e-12)
     for name, slope in found.gradient.items():
         h = 1e-5 * point[name]
