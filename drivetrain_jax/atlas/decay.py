@@ -50,10 +50,11 @@ def foreseen(sizes: np.ndarray, limit: float) -> int | None:
     if tail[-3] <= limit:
         return needed(sizes, limit)
     start, end = n // 2, n - 3
-    if not 0 < tail[end] < tail[start]:
+    # Where values leave the range of numbers downwards, so does the limit, which is relative to them.
+    if not 0 < tail[end] < tail[start] or limit <= 0:
         return None
     rate = math.log(tail[start] / tail[end]) / (end - start)
-    count = end + math.ceil(math.log(tail[end] / limit) / rate)
+    count = end + math.ceil((math.log(tail[end]) - math.log(limit)) / rate)
     return count if count < n + n // 3 else None
 
 

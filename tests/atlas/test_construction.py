@@ -198,3 +198,16 @@ def test_slice_names_what_it_lacks():
         atlas.slice({"z": 1.0})
     with pytest.raises(ValueError, match=r"x = 5\.0: allowed is -1 to 2"):
         atlas.slice({"x": 5.0})
+
+
+def test_a_function_that_leaves_the_range_of_numbers_ends_as_gaps_not_as_an_error():
+    """Relative to its least values no coefficient is small enough."""
+
+    def solve(points):
+        return np.exp(-1 / points)
+
+    coordinate = Coordinate("x", np.asarray, np.asarray, lambda x: np.ones_like(np.asarray(x, float)))
+    domain = Domain(("x",), (5e-4,), (0.1,), (coordinate,), {})
+    norm = Quantity(1, lambda values: np.sqrt(np.sum(values**2, axis=1)))
+    atlas = run(construct(domain, norm, 1e-11), solve)
+    assert len(atlas.gaps) and atlas.solves < 5_000
