@@ -481,3 +481,14 @@ def test_point_beyond_every_scheme_is_an_outcome_not_an_exception(extreme):
     assert point.outcome.name == "STEP_LIMIT"
     assert np.isnan(point.spectral_radius)
     assert point.verdict == 2
+
+
+def test_strong_damping_where_only_the_speed_varies():
+    """The matrices that close the period are then one for all lanes."""
+    fixed = {"beta": 0.5, "zeta": 1.0, "alpha": 1.0, "mu": 1.0, "gamma": 1.0}
+    scene = {"system": "cardan", "analysis": "floquet", "fixed": fixed, "outputs": ["spectral_radius"]}
+    options = {"options": {"method": "direct", "rtol": 1e-10}}
+    speeds = [0.05, 0.06, 0.09]
+    swept = dt.run(scene | options | {"points": {"Omega": speeds}}).spectral_radius.values
+    alone = [dt.point("cardan", "floquet", Omega=speed, **fixed).spectral_radius for speed in speeds]
+    np.testing.assert_allclose(swept, alone, rtol=1e-9)

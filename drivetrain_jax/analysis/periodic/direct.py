@@ -63,6 +63,8 @@ def assemble(system: LinearPeriodic, phi: Array) -> Array:
 
 
 def _reversed(start: Array, end: Array, phi: Array) -> Array:
+    # One for all lanes where none of the parameters in them varies.
+    start, end = (each.reshape(*each.shape, *(1,) * (phi.ndim - each.ndim)) for each in (start, end))
     return matmul(matmul(start, jnp.swapaxes(phi, 0, 1)), matmul(end, phi))
 
 
