@@ -170,8 +170,7 @@ class Criteria:
 
 def parameters_at(atlas: Atlas, x: np.ndarray) -> np.ndarray:
     """Parameters of points in coordinates, ``(..., d)``, kept inside the domain against rounding; NaN stays NaN."""
-    ends = atlas.to_coordinates(np.stack([atlas.lower, atlas.upper]))
-    return np.clip(atlas.to_parameters(np.clip(x, ends.min(axis=0), ends.max(axis=0))), atlas.lower, atlas.upper)
+    return np.clip(atlas.to_parameters(np.clip(x, *atlas.corners)), atlas.lower, atlas.upper)
 
 
 def monodromy(phi: np.ndarray, transposed: np.ndarray | None = None) -> np.ndarray:

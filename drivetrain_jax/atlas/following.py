@@ -112,7 +112,7 @@ class _Way:
 
     def _step(self, tips: list[Tip], x: np.ndarray, ends: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
         """Where ``tips`` are at the end of one step from ``x``, and whether its slopes agree with that."""
-        size = np.ptp(self._corners(), axis=0)
+        size = np.ptp(self._others(self.atlas.folded().corners), axis=0)
         slope = (self._near(self._between(ends, _PART), tips, x) - x) / _PART
         found = self._near(ends[1], tips, x + slope)
         before = self._near(self._between(ends, 1 - _PART), tips, found - _PART * slope)
@@ -128,7 +128,7 @@ class _Way:
             return result
         criteria = self.criteria(value)
         h = criteria.atlas.parameters.index(self.system.resonances.axis)
-        lower, upper = corners = _corners(criteria.atlas)
+        lower, upper = corners = criteria.atlas.corners
         patches = patches_of(criteria)
         for alike in sorted({(tip.multiplier, tip.opens) for tip in tips}):
             kind, opens = alike
@@ -150,14 +150,8 @@ class _Way:
         low, high = sorted(map(abs, ends) if coordinate.even else ends)
         return float(np.copysign(np.clip(value, low, high), sum(ends)))
 
-    def _corners(self) -> np.ndarray:
-        k = self.atlas.parameters.index(self.parameter)
-        return np.delete(_corners(self.atlas.folded()), k, axis=1)
-
-
-def _corners(atlas: Atlas) -> np.ndarray:
-    """Least and largest coordinates, ``(2, d)``."""
-    return np.sort(atlas.to_coordinates(np.stack([atlas.lower, atlas.upper])), axis=0)
+    def _others(self, columns: np.ndarray) -> np.ndarray:
+        return np.delete(columns, self.atlas.parameters.index(self.parameter), axis=1)
 
 
 def _newton(f: Patches, x: np.ndarray, corners: np.ndarray, h: int) -> np.ndarray:

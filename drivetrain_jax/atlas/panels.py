@@ -73,6 +73,16 @@ class Atlas:
         """Number of coefficients of one value over all panels."""
         return sum(int(np.prod(p.degrees)) for p in self.panels)
 
+    @property
+    def ends(self) -> np.ndarray:
+        """Coordinates of ``lower`` and of ``upper``, ``(2, d)``; a coordinate may fall where its parameter rises."""
+        return self.to_coordinates(np.stack([self.lower, self.upper]))
+
+    @property
+    def corners(self) -> np.ndarray:
+        """Least and largest coordinates, ``(2, d)``."""
+        return np.sort(self.ends, axis=0)
+
     def to_coordinates(self, points: np.ndarray) -> np.ndarray:
         """Coordinates of points given by their parameters, ``(..., d)``."""
         points = np.asarray(points, float)

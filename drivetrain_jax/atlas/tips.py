@@ -114,7 +114,7 @@ def polish(
 def suspected(criteria: Criteria, kind: str, h: int, boxes: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, Growth]:
     """Tips to which Newton's method leads from ``undecided`` boxes: none of the ``known`` ones, and with bounds that leave
     them within the rectangle."""
-    low, high = np.sort(criteria.atlas.to_coordinates([criteria.atlas.lower, criteria.atlas.upper]), axis=0)
+    low, high = criteria.atlas.corners
     starts = boxes[np.linspace(0, len(boxes) - 1, min(len(boxes), _MAX_STARTS)).astype(int)].mean(axis=1)
     x, rates = polish(criteria, starts.reshape(-1, 2), kind, h)
     with np.errstate(invalid="ignore"):
@@ -175,8 +175,8 @@ def _errors(rates: Growth, h: int) -> np.ndarray:
 
 def rises(criteria: Criteria, v: int) -> float:
     """1 if the coordinate v rises with its parameter, else -1."""
-    ends = criteria.atlas.to_coordinates(np.stack([criteria.atlas.lower, criteria.atlas.upper]))[:, v]
-    return 1.0 if ends[1] > ends[0] else -1.0
+    first, last = criteria.atlas.ends[:, v]
+    return 1.0 if last > first else -1.0
 
 
 def _axis_of_resonances(atlas: Atlas, system: System) -> int:

@@ -125,7 +125,7 @@ def stability_over_range(atlas: Atlas, system: System, along: str) -> Line:
             suspects += _crossings(atlas, likely, np.zeros(len(likely)), v, kind)
         changes += _crossings(atlas, x, error, v, kind)
         undecided += [tuple(sorted(map(float, parameters_at(atlas, box)[:, v]))) for box in search.undecided]
-        for end in atlas.to_coordinates(np.stack([atlas.lower, atlas.upper]))[:, h]:
+        for end in atlas.ends[:, h]:
             rim = roots(on_line(patches[number], h, float(end)))
             x = np.insert(rim.x[:, None], h, end, axis=1)
             changes += _crossings(atlas, x, rim.error, v, kind)
@@ -152,9 +152,9 @@ def narrow(atlas: Atlas, bounds: Mapping[str, tuple[float, float]]) -> Atlas:
             raise ValueError(f"{name} = {a!r} to {b!r}: allowed is a range within {lower[k]:g} to {upper[k]:g}")
         lower[k], upper[k] = a, b
     part = replace(atlas, lower=lower, upper=upper).folded()
-    ends = np.sort(atlas.to_coordinates(np.stack([part.lower, part.upper])), axis=0)
-    panels = tuple(p for panel in atlas.panels if (p := _part(panel, *ends)) is not None)
-    gaps = tuple(g for gap in atlas.gaps if (g := _part(gap, *ends)) is not None)
+    corners = part.corners
+    panels = tuple(p for panel in atlas.panels if (p := _part(panel, *corners)) is not None)
+    gaps = tuple(g for gap in atlas.gaps if (g := _part(gap, *corners)) is not None)
     return replace(atlas, lower=lower, upper=upper, panels=panels, gaps=gaps)
 
 

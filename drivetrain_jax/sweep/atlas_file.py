@@ -46,8 +46,10 @@ _VARIABLES = {
     "gap_upper": (("gap", "parameter"), "upper corner of a box without a panel, in coordinates"),
 }
 
-# Those that every atlas has.
-_DOMAIN = ("lower", "upper")
+# Every atlas has a domain, and panels, gaps or both.
+_DOMAIN, _GAPS = ("lower", "upper"), ("gap_lower", "gap_upper", "gap_reason")
+_PANELS = tuple(name for name in _VARIABLES if name not in (*_DOMAIN, *_GAPS))
+_ATTRIBUTES = ("scene", "coordinates_of_panels", "tolerance", "solves")
 
 
 def make_atlas(scene: Scene, work: Work, progress: Progress) -> xr.Dataset:
@@ -113,20 +115,17 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
 
 
 def _missing(dataset: xr.Dataset) -> list[str]:
-    """What :func:`make_atlas` writes and ``dataset`` lacks: an atlas has panels, gaps or both."""
-    of_gaps = {name: "gap" in dims for name, (dims, _) in _VARIABLES.items() if name not in _DOMAIN}
-    kinds = {of for name, of in of_gaps.items() if name in dataset} or {False}
-    needed = [
-        *_DOMAIN,
-        *(name for name, of in of_gaps.items() if of in kinds),
-        *(["gap_reason"] if True in kinds else []),
-    ]
+    """What :func:`make_atlas` writes and ``dataset`` lacks."""
+    gaps = any(name in dataset for name in _GAPS)
+    panels = not gaps or any(name in dataset for name in _PANELS)
+    needed = (*_DOMAIN, *(_PANELS if panels else ()), *(_GAPS if gaps else ()))
     missing = [name for name in needed if name not in dataset]
-    missing += [name for name in ("scene", "coordinates_of_panels", "tolerance", "solves") if name not in dataset.attrs]
-    if not missing and False in kinds:
-        bits = np.unpackbits(np.asarray(dataset["kept"].values, np.uint8))
-        missing += ["some of kept"] if bits.size < dataset["panel_degrees"].prod("parameter").sum() else []
-        missing += ["some of coefficients"] if dataset.sizes["coefficient"] != bits.sum() else []
+    missing += [name for name in _ATTRIBUTES if name not in dataset.attrs]
+    if missing or not panels:
+        return missing
+    bits = np.unpackbits(np.asarray(dataset["kept"].values, np.uint8))
+    missing += ["some of kept"] if bits.size < dataset["panel_degrees"].prod("parameter").sum() else []
+    missing += ["some of coefficients"] if dataset.sizes["coefficient"] != bits.sum() else []
     return missing
 
 

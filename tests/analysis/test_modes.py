@@ -138,7 +138,7 @@ def nearly_equal(name: str, spread: float) -> dict:
     return TABLE_2 | {"planet_angle": SIX, name: listed}
 
 
-def check_modes(p: dict, frequency: np.ndarray, bound: np.ndarray, shapes: np.ndarray) -> None:
+def assert_modes(p: dict, frequency: np.ndarray, bound: np.ndarray, shapes: np.ndarray) -> None:
     """Frequencies within their bound of 50 digits; shapes that solve the equations of motion, each one the mode of an
     independent eigensolution where the gap to its neighbours determines it."""
     assert (np.abs(frequency - np.array(exact_frequencies(p))) <= bound).all()
@@ -167,7 +167,7 @@ def test_planets_that_differ_slightly_have_modes_of_their_own(name):
         np.abs(ds.natural_frequency.values - alone.natural_frequency.values), alone.natural_frequency_error.values
     )
     for i, gear in enumerate(gears):
-        check_modes(gear, *(ds[key].values[i] for key in FULL[:3]))
+        assert_modes(gear, *(ds[key].values[i] for key in FULL[:3]))
     # A spread of 1e-5 puts less than its square outside the family.
     assert [(ds.mode_type.values[1:] == kind).sum(1).tolist() for kind in (PLANET, RIGID)] == [[9, 9], [1, 1]]
 
@@ -175,7 +175,7 @@ def test_planets_that_differ_slightly_have_modes_of_their_own(name):
 def test_unequal_planets_at_one_angle():
     given = {name: list(value) for name, value in ONE_ANGLE.items() if isinstance(value, tuple)}
     found = dt.point("planetary", "modes", outputs=FULL, **given).values
-    check_modes(ONE_ANGLE, *(found[key] for key in FULL[:3]))
+    assert_modes(ONE_ANGLE, *(found[key] for key in FULL[:3]))
 
 
 def test_followed_frequencies_are_those_of_each_point():
