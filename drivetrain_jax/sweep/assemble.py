@@ -50,6 +50,11 @@ class Table:
         self._unreleased = 0
         self.arrays: Mapping[str, np.ndarray] = {}
 
+    @property
+    def on_disk(self) -> bool:
+        """Whether the values are in a file, not in memory."""
+        return self._allocate is not None
+
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
         """Enter the results of ``points``."""
         self._lay_out_for(results)

@@ -41,8 +41,11 @@ def fill_through_atlas(engine: Engine, table: Table, work: Work, progress: Progr
 
 
 def _lay_out(engine: Engine, table: Table) -> None:
-    """Lay out a table whose size does not depend on results; a small one holds the solves up for longer than it takes."""
-    if engine.grid.size >= _LARGE and not any(variable.dims for variable in table.variables):
+    """Lay out a file whose size does not depend on results; a small one holds the solves up for longer than it takes.
+
+    Room in memory is made by the thread that fills it: another one would not get what earlier results have left behind.
+    """
+    if engine.grid.size >= _LARGE and table.on_disk and not any(variable.dims for variable in table.variables):
         table.lay_out(blank=False)
 
 
