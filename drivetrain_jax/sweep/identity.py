@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -89,7 +89,7 @@ def _imports(path: Path) -> tuple[str, ...]:
     """Dotted names that a source file imports, those of ``from x import y`` as ``x.y``."""
     package = path.relative_to(_home(path)).parts[:-1]
     names: list[str] = []
-    for node in ast.walk(ast.parse(path.read_bytes())):
+    for node in _statements(ast.parse(path.read_bytes())):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -97,6 +97,14 @@ def _imports(path: Path) -> tuple[str, ...]:
             module = ".".join((*above, *filter(None, [node.module])))
             names += [f"{module}.{alias.name}" for alias in node.names]
     return (*names, ".".join(package)) if package else tuple(names)
+
+
+def _statements(node: ast.AST) -> Iterator[ast.AST]:
+    """All statements within ``node``; to look at every expression as well would take twice as long as to parse them."""
+    for block in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for inner in getattr(node, block, ()):
+            yield inner
+            yield from _statements(inner)
 
 
 @cache

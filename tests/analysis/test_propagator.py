@@ -11,6 +11,7 @@ import pytest
 from scipy.integrate import DOP853
 from scipy.linalg import expm
 
+from drivetrain_jax.analysis.numerics import dop853
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
 from drivetrain_jax.analysis.periodic.direct import assemble, direct_monodromy, stable_steps, stiffness_of
 from drivetrain_jax.analysis.periodic.multipliers import spectral_radius_bound
@@ -85,6 +86,11 @@ def test_implicit_scheme_keeps_its_order_on_a_stiff_problem():
         coarse, fine = full(propagate(jnp.int32(n))), full(propagate(jnp.int32(2 * n)))
         bound = 4 * np.abs(fine - coarse).max() / (2**IMPLICIT_ORDER - 1)
         assert np.abs(fine - exact).max() <= bound
+
+
+def test_coefficients_are_those_of_scipy():
+    for name in "ABC":
+        assert (getattr(dop853, name) == getattr(DOP853, name)).all(), name
 
 
 def test_explicit_scheme_is_one_step_of_dop853():

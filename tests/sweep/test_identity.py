@@ -97,6 +97,32 @@ def test_what_a_system_of_another_package_imports_from_its_own_decides(tmp_path)
     assert "systems/_base.py" in found and not any("numpy" in name or "unrelated" in name for name in found)
 
 
+def test_imports_are_found_within_every_kind_of_statement(tmp_path):
+    text = """
+def law(x):
+    for _ in x:
+        with x:
+            import a
+    else:
+        import b
+    try:
+        import c
+    except ImportError:
+        from d import e
+    finally:
+        if x: import f
+    match x:
+        case 1:
+            import g
+    class Inner:
+        async def lazy(self):
+            while self:
+                from . import h
+"""
+    (tmp_path / "law.py").write_text(text)
+    assert {name.strip(".") for name in identity._imports(tmp_path / "law.py")} == {*"abcfgh", "d.e"}
+
+
 def test_the_choice_of_an_atlas_decides():
     axes = {"beta": {"start": 0.0, "stop": 1.0, "num": 3}, "Omega": {"start": 1.0, "stop": 2.0, "num": 3}}
     scene = {"system": "cardan", "analysis": "floquet", "axes": axes, "fixed": CARDAN}

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
-from scipy.integrate import DOP853
 
+from drivetrain_jax.analysis.numerics import dop853
 from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, stored, suits_one_kernel
 from drivetrain_jax.systems import Flow
 
@@ -89,11 +89,11 @@ def strobe_map(flow: Flow, steps: Any) -> Callable[[Array, Frame], Frame]:
 def _step(flow: Flow, angles: Callable[[float], tuple], h: Any, frame: Frame) -> Frame:
     """One step of DOP853 for everything that the frame carries."""
     slopes: list[Frame] = []
-    for stage, (c, b) in enumerate(zip(DOP853.C, DOP853.B, strict=True)):
-        at = _advanced(frame._replace(contraction=None), h, DOP853.A[stage, :stage], slopes)
+    for stage, (c, b) in enumerate(zip(dop853.C, dop853.B, strict=True)):
+        at = _advanced(frame._replace(contraction=None), h, dop853.A[stage, :stage], slopes)
         contracts = frame.contraction is not None and b != 0
         slopes.append(_slopes(flow, contracts, angles(float(c)), at))
-    return _advanced(frame, h, DOP853.B, slopes)
+    return _advanced(frame, h, dop853.B, slopes)
 
 
 def _advanced(frame: Frame, h: Any, weights: Any, slopes: list[Frame]) -> Frame:

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax.analysis.numerics import dop853
 from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, stored, suits_one_kernel
 from drivetrain_jax.analysis.numerics.linear_algebra import matmul, solve
 from drivetrain_jax.analysis.numerics.staged import staged
@@ -38,7 +39,7 @@ class Propagator(NamedTuple):
     growth: Array | None = None
 
 
-# Order of the explicit scheme, see `_tableau`.
+# Order of the explicit scheme.
 EXPLICIT_ORDER = 8
 # Lanes that should march together: what a step reads and writes stays in the innermost caches.
 LANES = 32
@@ -68,7 +69,7 @@ def explicit_propagator(
             if not z
         ]
 
-    times = jnp.zeros((len(_tableau().C), 1))
+    times = jnp.zeros((dop853.STAGES, 1))
     split = staged(entries, *jax.eval_shape(system.basis, times))
     suits = suits_one_kernel(lambda t: system.rows(*system.basis(t)), times)
     mark = in_one_kernel if suits else lambda function: function
@@ -128,13 +129,6 @@ def _moved(piece: Array, product: Array, covariance: Array) -> tuple[Array, Arra
     return matmul(piece, product), matmul(matmul(piece, covariance), jnp.swapaxes(piece, 0, 1))
 
 
-def _tableau() -> Any:
-    """Coefficients A, B, C of Hairer, Norsett & Wanner's DOP853 as kept by SciPy."""
-    from scipy.integrate import DOP853  # loads most of SciPy, which a process that computes nothing does without
-
-    return DOP853
-
-
 def _identity(n: int, lanes: int) -> Rows:
     return [jnp.concatenate([jnp.full((1, lanes), float(i == j)) for j in range(n)]) for i in range(n)]
 
@@ -148,13 +142,12 @@ def _explicit_step(
     y: Rows,
 ) -> Rows:
     """One step from ``number * h``: the entries at all stages first, then stage after stage."""
-    scheme = _tableau()
-    at_stages = entries(*basis((number + jnp.asarray(scheme.C)[:, None]) * h))
+    at_stages = entries(*basis((number + jnp.asarray(dop853.C)[:, None]) * h))
     slopes: list[Rows] = []
-    for stage, weights in enumerate(scheme.A[: len(scheme.C), : len(scheme.C)]):
+    for stage, weights in enumerate(dop853.A):
         state = _advanced(y, h, weights[:stage], slopes)
         slopes.append(stored(partial(_slopes, zeros, stage))(at_stages, state))
-    return _advanced(y, h, scheme.B, slopes)
+    return _advanced(y, h, dop853.B, slopes)
 
 
 def _slopes(zeros: tuple[tuple[bool, ...], ...], stage: int, at_stages: list[Array], state: Rows) -> Rows:
