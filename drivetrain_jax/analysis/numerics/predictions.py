@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis.numerics.kernels import options_for_few
 
 # Points that are evaluated together: of few, and of many.
 _FEW, _MANY = 32, 2048
@@ -75,4 +76,5 @@ def _compiled(
     def one(numbers: Columns) -> Array:
         return function(*given, {**dict(words), **numbers})
 
-    return jax.jit(jax.vmap(one, 0, -1, axis_size=count))
+    options = options_for_few() if count == _FEW else {}
+    return jax.jit(jax.vmap(one, 0, -1, axis_size=count), compiler_options=options)
