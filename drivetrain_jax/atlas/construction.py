@@ -83,30 +83,48 @@ class Ledger:
     """Values of solved points: none is asked for twice (neighbouring boxes share the lines on their common face)."""
 
     def __init__(self) -> None:
-        self._values: dict[bytes, np.ndarray] = {}
+        self._numbers: dict[bytes, int] = {}
+        self._points: list[np.ndarray] = []
+        self._values: list[np.ndarray] = []
 
     def __len__(self) -> int:
-        return len(self._values)
+        return len(self._numbers)
 
     def missing(self, points: np.ndarray) -> np.ndarray:
         """Those of ``points`` that are not known, each once, in the order of their first appearance."""
-        new = {row.tobytes(): k for k, row in reversed(list(enumerate(points))) if row.tobytes() not in self._values}
-        return points[sorted(new.values())]
+        new: dict[bytes, int] = {}
+        for k, key in enumerate(_keys(points)):
+            if key not in self._numbers:
+                new.setdefault(key, k)
+        return points[list(new.values())]
 
     def add(self, points: np.ndarray, values: np.ndarray) -> None:
-        """Remember the values of ``points``."""
-        self._values.update(zip((row.tobytes() for row in points), values, strict=True))
+        """Remember the values of ``points``, none of which is known."""
+        self._numbers.update(zip(_keys(points), range(len(self), len(self) + len(points)), strict=True))
+        self._points.append(points)
+        self._values.append(values)
 
     def values(self, points: np.ndarray) -> np.ndarray:
         """Values of known points."""
-        return np.stack([self._values[row.tobytes()] for row in points])
+        numbers = np.array([self._numbers[key] for key in _keys(points)])
+        found, first = np.empty((len(points), self._values[0].shape[1])), 0
+        for block in self._values:
+            mine = np.flatnonzero((numbers >= first) & (numbers < first + len(block)))
+            found[mine] = block[numbers[mine] - first]
+            first += len(block)
+        return found
 
     def all(self) -> tuple[np.ndarray, np.ndarray]:
         """All points whose values are finite, and these."""
-        points = np.frombuffer(b"".join(self._values)).reshape(len(self), -1)
-        values = np.stack(list(self._values.values()))
+        points, values = np.concatenate(self._points), np.concatenate(self._values)
         finite = np.isfinite(values).all(axis=1)
         return points[finite], values[finite]
+
+
+def _keys(points: np.ndarray) -> list[bytes]:
+    """What tells points apart: their bytes."""
+    width, content = points.shape[1] * points.itemsize, points.tobytes()
+    return [content[start : start + width] for start in range(0, len(content), width)]
 
 
 def construct(
