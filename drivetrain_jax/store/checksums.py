@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -43,15 +43,14 @@ def seal(file: h5py.File) -> None:
 
 def checksums(file: h5py.File) -> dict[str, str]:
     """blake2b (128 bits) of each variable, type, dimensions and attributes included, and of the attributes of ``file``."""
-    own = {name: value for name, value in file.attrs.items() if name != ATTRIBUTE}
-    variables = {name: file[name] for name in _variables(file)}
+    variables = _variables(file)
     if sum(variable.nbytes for variable in variables.values()) < _LARGE:
         digests = [_of_variable(variable) for variable in variables.values()]
     else:
         # Hashing leaves the interpreter's lock to others.
         with ThreadPoolExecutor(min(usable_cores(), len(variables)), thread_name_prefix="hash") as pool:
             digests = list(pool.map(_of_variable, variables.values()))
-    return {FILE: _of_attributes(own).hexdigest()} | dict(zip(variables, digests, strict=True))
+    return {FILE: _of_attributes(file, {ATTRIBUTE}).hexdigest()} | dict(zip(variables, digests, strict=True))
 
 
 def damaged(path: Path) -> list[str] | None:
@@ -75,9 +74,9 @@ def named(names: list[str]) -> str:
     return ", ".join("attributes of the file" if name == FILE else name for name in names)
 
 
-def _variables(file: h5py.File) -> list[str]:
+def _variables(file: h5py.File) -> dict[str, h5py.Dataset]:
     # Beside them a file may hold the named type of its complex numbers.
-    return sorted(name for name in file if file.get(name, getclass=True) is h5py.Dataset)
+    return {name: found for name in sorted(file) if isinstance(found := file[name], h5py.Dataset)}
 
 
 def _parsed(stored: object) -> dict[str, str]:
@@ -90,31 +89,42 @@ def _parsed(stored: object) -> dict[str, str]:
 
 
 def _of_variable(variable: h5py.Dataset) -> str:
-    own = {name: variable.attrs[name] for name in variable.attrs if name not in _LINKS}
-    state = _of_attributes(own)
-    dims = [scales[0].name if len(scales) else scales.label for scales in variable.dims]
+    state = _of_attributes(variable, _LINKS)
+    dims = [_dimension(variable, axis) for axis in range(variable.ndim)]
     state.update(json.dumps([dims, variable.dtype.str, variable.shape, repr(variable.fillvalue)]).encode())
     for block in _blocks(variable):
         state.update(_bytes(block))
     return state.hexdigest()
 
 
+def _dimension(variable: h5py.Dataset, axis: int) -> str | None:
+    """Name of a dimension in the file: of its first scale, which h5py would look for three times."""
+    if not h5py.h5ds.get_num_scales(variable.id, axis):
+        return variable.dims[axis].label
+    scales: list[h5py.h5d.DatasetID] = []
+    h5py.h5ds.iterate(variable.id, axis, scales.append, 0)
+    return h5py.Dataset(scales[0]).name
+
+
 def _blocks(variable: h5py.Dataset) -> Iterator[np.ndarray]:
     """The values, some megabytes at a time."""
-    if not variable.shape:
+    shape, size = variable.shape, variable.nbytes
+    if not shape or 0 < size <= _BLOCK:
         yield np.asarray(variable[()])
         return
-    rows = max(_BLOCK * variable.shape[0] // max(variable.nbytes, 1), 1)
-    for start in range(0, variable.shape[0], rows):
+    rows = max(_BLOCK * shape[0] // max(size, 1), 1)
+    for start in range(0, shape[0], rows):
         yield variable[start : start + rows]
 
 
-def _of_attributes(attributes: dict[str, object]) -> hashlib.blake2b:
-    state = hashlib.blake2b(digest_size=16)
+def _of_attributes(owner: h5py.HLObject, apart: Collection[str]) -> hashlib.blake2b:
+    """The state after all attributes of ``owner`` but those ``apart``."""
+    state, attributes = hashlib.blake2b(digest_size=16), owner.attrs
     for name in sorted(attributes):
-        value = np.asarray(attributes[name])
-        state.update(json.dumps([name, value.dtype.str, value.shape]).encode())
-        state.update(_bytes(value))
+        if name not in apart:
+            value = np.asarray(attributes[name])
+            state.update(json.dumps([name, value.dtype.str, value.shape]).encode())
+            state.update(_bytes(value))
     return state
 
 

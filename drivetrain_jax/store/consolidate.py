@@ -12,11 +12,15 @@ import h5py
 import numpy as np
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.store import checksums
+from drivetrain_jax.store import checksums, netcdf
 from drivetrain_jax.store.files import move_into_place
+from drivetrain_jax.store.schema import Labelled
 
 if TYPE_CHECKING:
     import xarray as xr
+
+# Bytes that the attributes of a variable take at most.
+_LABELS = 1 << 16
 
 
 class ResultFile:
@@ -37,18 +41,16 @@ class ResultFile:
         self._mapped = None
         self._temporary.unlink(missing_ok=True)
 
-    def lay_out(self, template: xr.Dataset) -> Mapping[str, np.ndarray]:
+    def lay_out(self, template: Labelled) -> Mapping[str, np.ndarray]:
         """Room for the data of ``template``, which may have any content (a broadcast zero takes no memory).
 
         A disk without enough room is an ``OSError`` here, before anything is computed.
         """
-        _reserve(self._temporary, _write_frame(template, self._temporary))
-        with h5py.File(self._temporary, "r") as file:
-            places = {str(name): file[str(name)].id.get_offset() for name in template.data_vars}
+        places = _write_frame(template, self._temporary)
         with open(self._temporary, "r+b") as file:
             self._mapped = mmap.mmap(file.fileno(), 0)
-        # What has no entries has no place.
-        return {n: np.ndarray(template[n].shape, template[n].dtype, self._mapped, at or 0) for n, at in places.items()}
+        data = {name: entry.values for name, entry in template.data.items()}
+        return {n: np.ndarray(data[n].shape, data[n].dtype, self._mapped, at) for n, at in places.items()}
 
     def finish(self, path: Path, **attrs: float) -> None:
         """Change these attributes, add checksums, flush all to the disk, and move the file to ``path`` in one step."""
@@ -61,50 +63,28 @@ class ResultFile:
         move_into_place(self._temporary, path)
 
 
-def write_result(dataset: xr.Dataset, path: Path, temporary: Path) -> None:
-    """Write ``dataset`` to ``path`` in one step; ``temporary`` is where it grows. A full disk leaves ``path`` alone."""
+def write_result(result: Labelled, path: Path, temporary: Path) -> None:
+    """Write ``result`` to ``path`` in one step; ``temporary`` is where it grows. A full disk leaves ``path`` alone."""
     with ResultFile(temporary) as file:
-        for name, array in file.lay_out(dataset).items():
-            array[...] = dataset[name].values
+        for name, array in file.lay_out(result).items():
+            array[...] = result.data[name].values
         file.finish(path)
 
 
-def _write_frame(template: xr.Dataset, path: Path) -> int:
-    """Write all but the data, whose contiguous room is left blank; returns the size of the file.
+def _write_frame(template: Labelled, path: Path) -> Mapping[str, int]:
+    """Write all but the data, whose contiguous room is left blank; returns where that is.
 
-    The head is made in memory, and room for what h5netcdf adds to it is reserved before: HDF5 may crash the process when
-    a disk fills up under it.
+    The head is made in memory, and room for what is added to it is reserved before: HDF5 may crash the process when a disk
+    fills up under it.
     """
-    import h5netcdf
-
-    head = template.drop_vars(template.data_vars).to_netcdf(None, engine="h5netcdf")
+    head = netcdf.head(template)
     path.write_bytes(head)
-    _reserve(path, len(head) + sum(v.nbytes for v in template.data_vars.values()) + (1 << 16) * len(template.data_vars))
-    with h5netcdf.File(path, "r+") as file:
-        for dimension in template.sizes.keys() - file.dimensions.keys():
-            file.dimensions[dimension] = template.sizes[dimension]
-        for name, variable in template.data_vars.items():
-            creation = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-            creation.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
-            fill = variable.encoding.get("_FillValue")
-            options = {"fillvalue": fill, "dcpl": creation, "fill_time": "never"}
-            created = file.create_variable(str(name), variable.dims, dtype=variable.dtype, **options)
-            if not variable.dims:
-                created[...] = variable.values  # HDF5 gives a scalar its place when it is written
-            for key, value in variable.attrs.items():
-                created.attrs[key] = value
-            if aside := _coordinates_of(template, variable):
-                created.attrs["coordinates"] = aside
+    _reserve(path, len(head) + sum(entry.values.nbytes + _LABELS for entry in template.data.values()))
     with h5py.File(path, "r+") as file:
+        places = netcdf.add_data(file, template)
         checksums.reserve(file)
-    return path.stat().st_size
-
-
-def _coordinates_of(template: xr.Dataset, variable: xr.DataArray) -> str:
-    """Names of the coordinates that a reader cannot find through the dimensions of ``variable`` (CF, 5)."""
-    return " ".join(
-        str(n) for n, c in template.coords.items() if n not in template.dims and set(c.dims) <= {*variable.dims}
-    )
+    _reserve(path, path.stat().st_size)
+    return places
 
 
 def _reserve(path: Path, size: int) -> None:

@@ -1,10 +1,10 @@
-"""The shape of a result: names, dimensions, units and CF attributes of one xarray Dataset."""
+"""The shape of a result: names, dimensions, units and CF attributes, before it is an xarray Dataset or a file."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,41 +27,89 @@ class Coordinate:
     long_name: str
 
 
-def build_dataset(
-    sweep_dims: Sequence[str],
-    coordinates: Iterable[Coordinate],
-    dimensions: Iterable[Dimension],
-    results: Iterable[tuple[Variable, np.ndarray]],
-    attrs: Mapping[str, str | float],
-) -> xr.Dataset:
-    """The labelled result.
+@dataclass(frozen=True)
+class Entry:
+    """What a name in a result stands for. ``fill`` is what readers take for a missing value."""
 
-    Every variable has the dimensions ``sweep_dims`` followed by its own. Coordinates are written for the sweep
-    (``coordinates``) and for those ``dimensions`` that a result uses; every one has ``units`` and ``long_name``. A
-    dimension without values of its own is numbered from 0.
-    """
-    import xarray as xr  # half a second with pandas, which a process that only looks at a result does without
-
-    results = list(results)
-    coords = {c.name: (c.dims, c.values, {"units": c.units, "long_name": c.long_name}) for c in coordinates}
-    sizes = {
-        dim: size for v, values in results for dim, size in zip(reversed(v.dims), reversed(values.shape), strict=False)
-    }
-    for d in dimensions:
-        if d.name in sizes:
-            values = np.asarray(d.values) if d.values else np.arange(sizes[d.name])
-            coords[d.name] = ((d.name,), values, {"units": d.units, "long_name": d.long_name})
-    data = {v.name: ((*sweep_dims, *v.dims), values, _variable_attrs(v)) for v, values in results}
-    dataset = xr.Dataset(data, coords, {"Conventions": CONVENTIONS, **attrs})
-    for name, variable in dataset.variables.items():
-        missing = np.nan if name in data and variable.dtype.kind == "f" else None
-        variable.encoding["_FillValue"] = missing
-    return dataset
+    dims: tuple[str, ...]
+    values: np.ndarray
+    attrs: Mapping[str, Any]
+    fill: float | None = None
 
 
-def _variable_attrs(variable: Variable) -> dict[str, object]:
+@dataclass(frozen=True)
+class Labelled:
+    """A result with its labels as plain data; making a Dataset of it takes xarray, making a file does not."""
+
+    coords: Mapping[str, Entry]
+    data: Mapping[str, Entry]
+    attrs: Mapping[str, Any]
+
+    @classmethod
+    def build(
+        cls,
+        sweep_dims: Sequence[str],
+        coordinates: Iterable[Coordinate],
+        dimensions: Iterable[Dimension],
+        results: Iterable[tuple[Variable, np.ndarray]],
+        attrs: Mapping[str, str | float],
+    ) -> Labelled:
+        """The labelled ``results``.
+
+        Every variable has the dimensions ``sweep_dims`` followed by its own. Coordinates are written for the sweep
+        (``coordinates``) and for those ``dimensions`` that a result uses; every one has ``units`` and ``long_name``. A
+        dimension without values of its own is numbered from 0.
+        """
+        results = list(results)
+        coords = {c.name: Entry(c.dims, c.values, _labels(c.units, c.long_name)) for c in coordinates}
+        sizes = {d: n for v, values in results for d, n in zip(reversed(v.dims), reversed(values.shape), strict=False)}
+        for d in dimensions:
+            if d.name in sizes:
+                values = np.asarray(d.values) if d.values else np.arange(sizes[d.name])
+                coords[d.name] = Entry((d.name,), values, _labels(d.units, d.long_name))
+        data = {
+            v.name: Entry((*sweep_dims, *v.dims), values, _variable_attrs(v), _fill(values)) for v, values in results
+        }
+        return cls(coords, data, {"Conventions": CONVENTIONS, **attrs})
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Lengths of the dimensions, those of the coordinates first. ``ValueError`` where two entries disagree."""
+        sizes: dict[str, int] = {}
+        for name, entry in {**self.coords, **self.data}.items():
+            for dim, size in zip(entry.dims, entry.values.shape, strict=True):
+                if sizes.setdefault(dim, size) != size:
+                    raise ValueError(f"{name}: length {size} along {dim!r}, which has length {sizes[dim]}")
+        return sizes
+
+    def with_attrs(self, **attrs: Any) -> Labelled:
+        """The same with these attributes added, or in place of those it has."""
+        return replace(self, attrs={**self.attrs, **attrs})
+
+    def to_dataset(self) -> xr.Dataset:
+        """The same as a Dataset."""
+        import xarray as xr  # half a second with pandas, which a process that only writes a result does without
+
+        data, coords = (
+            {n: (e.dims, e.values, e.attrs) for n, e in entries.items()} for entries in (self.data, self.coords)
+        )
+        dataset = xr.Dataset(data, coords, self.attrs)
+        for name, entry in {**self.coords, **self.data}.items():
+            dataset.variables[name].encoding["_FillValue"] = entry.fill
+        return dataset
+
+
+def _fill(values: np.ndarray) -> float | None:
+    return np.nan if values.dtype.kind == "f" else None
+
+
+def _labels(units: str, long_name: str) -> dict[str, Any]:
+    return {"units": units, "long_name": long_name}
+
+
+def _variable_attrs(variable: Variable) -> dict[str, Any]:
     """CF attributes; the codes of a flag variable have its own type, as the convention demands."""
-    attrs: dict[str, object] = {"units": variable.units, "long_name": variable.long_name}
+    attrs = _labels(variable.units, variable.long_name)
     if variable.flags:
         attrs["flag_values"] = np.arange(len(variable.flags), dtype=variable.dtype)
         attrs["flag_meanings"] = " ".join(flag.replace(" ", "_") for flag in variable.flags)

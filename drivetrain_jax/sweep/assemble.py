@@ -15,7 +15,7 @@ from drivetrain_jax._quantities import FIRST_FAILURE, Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.store import provenance
 from drivetrain_jax.store.consolidate import release
-from drivetrain_jax.store.schema import Coordinate, build_dataset
+from drivetrain_jax.store.schema import Coordinate, Labelled
 from drivetrain_jax.sweep.grid import Grid
 from drivetrain_jax.sweep.identity import PACKAGES
 from drivetrain_jax.sweep.scene import Scene
@@ -36,11 +36,11 @@ class Table:
     """Results of all points of a grid, filled chunk by chunk. What is never filled counts as step limit reached.
 
     ``arrays`` holds all values: the axes in the order of the scene (or the points), then a result's own dimensions.
-    ``allocate(template)`` gives such arrays for the data variables of a dataset; without it they are in memory.
+    ``allocate(template)`` gives such arrays for the data of a labelled result; without it they are in memory.
     """
 
     def __init__(
-        self, scene: Scene, grid: Grid, allocate: Callable[[xr.Dataset], Mapping[str, np.ndarray]] | None = None
+        self, scene: Scene, grid: Grid, allocate: Callable[[Labelled], Mapping[str, np.ndarray]] | None = None
     ) -> None:
         self.variables = result_variables(scene)
         self._scene, self._grid = scene, grid
@@ -117,7 +117,7 @@ class Table:
             else:
                 # Broadcast zeros take no memory.
                 zeros = {v.name: np.broadcast_to(np.zeros((), v.dtype), shape) for v, shape in shapes.items()}
-                self.arrays = self._allocate(to_dataset(self._scene, zeros, {}))
+                self.arrays = self._allocate(labelled(self._scene, zeros, {}))
             for variable in self.variables if blank else ():
                 rows = self.arrays[variable.name].reshape(-1)
                 for start in range(0, rows.size, _ROWS):
@@ -169,12 +169,17 @@ def bytes_per_point(scene: Scene, on_disk: bool) -> int:
     )
 
 
-def to_dataset(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str, str | float]) -> xr.Dataset:
+def labelled(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str, str | float]) -> Labelled:
     """The labelled result: dimensions are the axes in scene order (or ``point``), then those of the variable."""
     sweep_dims = ("point",) if scene.zipped else tuple(axis.name for axis in scene.axes)
     results = [(v, arrays[v.name]) for v in result_variables(scene)]
     coordinates = [*_axis_coordinates(scene), *_resonances(scene)]
-    return build_dataset(sweep_dims, coordinates, scene.dimensions, results, result_attrs(scene) | dict(attrs))
+    return Labelled.build(sweep_dims, coordinates, scene.dimensions, results, result_attrs(scene) | dict(attrs))
+
+
+def to_dataset(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str, str | float]) -> xr.Dataset:
+    """The labelled result as a Dataset."""
+    return labelled(scene, arrays, attrs).to_dataset()
 
 
 def _axis_coordinates(scene: Scene) -> list[Coordinate]:

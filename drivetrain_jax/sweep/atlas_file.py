@@ -1,4 +1,4 @@
-"""Atlas files: panels as a Dataset like any other result, and the object that answers from one."""
+"""Atlas files: panels as a labelled result like any other, and the object that answers from one."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
-import xarray as xr
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import did_you_mean, shown
@@ -20,6 +19,7 @@ from drivetrain_jax.atlas import StabilityAtlas, from_arrays, stability_atlas, t
 from drivetrain_jax.atlas.floquet import floquet_domain
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.consolidate import open_result
+from drivetrain_jax.store.schema import Entry, Labelled
 from drivetrain_jax.sweep import compile_cache
 from drivetrain_jax.sweep.assemble import Table, result_attrs, to_dataset
 from drivetrain_jax.sweep.atlas_choice import atlas_ranges
@@ -30,6 +30,9 @@ from drivetrain_jax.sweep.rounds import build_atlas
 from drivetrain_jax.sweep.scene import Scene, load_scene
 from drivetrain_jax.sweep.through_atlas import evaluate
 from drivetrain_jax.sweep.work import Progress, Work
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 # Name in the file, dimensions, meaning. Boxes are in the coordinates of the atlas, which have the attribute's names.
 _VARIABLES = {
@@ -52,30 +55,27 @@ _PANELS = tuple(name for name in _VARIABLES if name not in (*_DOMAIN, *_GAPS))
 _ATTRIBUTES = ("scene", "coordinates_of_panels", "tolerance", "solves")
 
 
-def make_atlas(scene: Scene, work: Work, progress: Progress) -> xr.Dataset:
-    """The file of an atlas scene. ``progress`` counts the solves."""
+def make_atlas(scene: Scene, work: Work, progress: Progress) -> Labelled:
+    """The content of the file of an atlas scene. ``progress`` counts the solves."""
     stability, _ = build_atlas(scene, atlas_ranges(scene), work, progress)
     atlas = stability.atlas
     arrays = to_arrays(atlas)
     data = {
-        name: (dims, arrays[name], {"units": "1", "long_name": meaning})
+        name: Entry(dims, arrays[name], {"units": "1", "long_name": meaning})
         for name, (dims, meaning) in _VARIABLES.items()
         if arrays[name].size
     }
     names = {"units": "1", "long_name": "name of the parameter"}
-    coords = {"parameter": (("parameter",), np.array(atlas.parameters), names)}
+    coords = {"parameter": Entry(("parameter",), np.array(atlas.parameters), names)}
     if atlas.gaps:
         reason = {"units": "1", "long_name": "why there is no panel"}
-        coords["gap_reason"] = (("gap",), arrays["gap_reason"].astype(str), reason)
+        coords["gap_reason"] = Entry(("gap",), arrays["gap_reason"].astype(str), reason)
     attrs = result_attrs(scene) | {
         "coordinates_of_panels": json.dumps([c.name for c in atlas.coordinates]),
         "tolerance": atlas.tolerance,
         "solves": atlas.solves,
     }
-    dataset = xr.Dataset(data, coords, attrs)
-    for variable in dataset.variables.values():
-        variable.encoding["_FillValue"] = None
-    return dataset
+    return Labelled(coords, data, attrs)
 
 
 def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
@@ -85,7 +85,7 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
     coordinates by now.
     """
     compile_cache.enable()
-    dataset = source if isinstance(source, xr.Dataset) else open_result(Path(source))
+    dataset = open_result(Path(source)) if isinstance(source, (str, Path)) else source
     label = "dataset" if dataset is source else f"file = {str(source)!r}"
     if dataset.attrs.get("analysis") != ANALYSIS.name:
         raise InputError(f"{label}: holds the analysis {dataset.attrs.get('analysis')!r}; allowed is an atlas")
@@ -181,6 +181,8 @@ class StoredAtlas:
         Raises :class:`InputError` for a name that is missing or unknown, for a value outside the atlas, and for arrays that
         do not fit together; :class:`ChunkError` if a direct solve in a gap fails.
         """
+        import xarray as xr
+
         checked = {name: self._checked(name, values) for name in self._names(values)}
         columns = dict(zip(checked, _broadcast(checked), strict=True))
         shape, dims = columns[self.parameters[0]].shape, columns[self.parameters[0]].dims
@@ -273,6 +275,8 @@ def as_given(value: Any) -> str:
 
 def _broadcast(given: Mapping[str, Any]) -> tuple[xr.DataArray, ...]:
     """Numbers and arrays of one shape: those without labels by their places, then all by the names of their dimensions."""
+    import xarray as xr
+
     plain = {name: np.asarray(v, float) for name, v in given.items() if not isinstance(v, xr.DataArray)}
     try:
         plain = dict(zip(plain, np.broadcast_arrays(*plain.values()), strict=True))

@@ -38,7 +38,7 @@ def export(store: Path, out: Path) -> int:
             raise InputError(f"out = {str(out)!r}: unfinished work is in {str(parts.path)!r}; allowed is a new file")
         ours = True
         with ResultFile(parts.result) as file:
-            table = Table(scene, grid, lambda blank: file.lay_out(blank.assign_attrs(kept)))
+            table = Table(scene, grid, lambda blank: file.lay_out(blank.with_attrs(**kept)))
             seen = _fill(store, shards.groups_of(attrs), table, np.zeros(grid.size, bool))
             if seen != attrs[shards.HELD]:
                 raise _damaged(store, f"it holds {seen} of {attrs[shards.HELD]} points")

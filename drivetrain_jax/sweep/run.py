@@ -13,6 +13,7 @@ from drivetrain_jax._wording import shown
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.consolidate import ResultFile, open_result, write_result
+from drivetrain_jax.store.schema import Labelled
 from drivetrain_jax.sweep import sharded
 from drivetrain_jax.sweep.assemble import Table, bytes_per_point, failures, to_dataset
 from drivetrain_jax.sweep.atlas_choice import uses_atlas
@@ -178,7 +179,7 @@ def _in_memory(engine: Engine, where: Where, report: Report | None) -> xr.Datase
     work = Work(where, report)
     try:
         if engine.scene.analysis.continuous:
-            dataset = _atlas(engine, work, progress)
+            dataset = _atlas(engine, work, progress).to_dataset()
         else:
             table = Table(engine.scene, engine.grid)
             extra = _fill(engine, table, work, progress)
@@ -206,10 +207,10 @@ def _resume(
     temporary = parts.result
     if engine.scene.analysis.continuous:
         with work:
-            write_result(_atlas(engine, work, progress).assign_attrs(wall_time_s=seconds()), out, temporary)
+            write_result(_atlas(engine, work, progress).with_attrs(wall_time_s=seconds()), out, temporary)
         return
     with work, ResultFile(temporary) as file:
-        table = Table(engine.scene, engine.grid, lambda blank: file.lay_out(blank.assign_attrs(_attrs(engine))))
+        table = Table(engine.scene, engine.grid, lambda blank: file.lay_out(blank.with_attrs(**_attrs(engine))))
         extra = _fill(engine, table, work, progress, taken)
         table.lay_out()
         file.finish(out, wall_time_s=seconds(), **extra)
@@ -229,10 +230,10 @@ def _fill(engine: Engine, table: Table, work: Work, progress: Progress, taken: T
     return taken.attrs
 
 
-def _atlas(engine: Engine, work: Work, progress: Progress) -> xr.Dataset:
+def _atlas(engine: Engine, work: Work, progress: Progress) -> Labelled:
     from drivetrain_jax.sweep.atlas_file import make_atlas
 
-    return make_atlas(engine.scene, work, progress).assign_attrs(_attrs(engine))
+    return make_atlas(engine.scene, work, progress).with_attrs(**_attrs(engine))
 
 
 def _attrs(engine: Engine) -> dict[str, str | float]:

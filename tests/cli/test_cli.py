@@ -509,6 +509,19 @@ def test_looking_at_a_result_loads_no_integrator_and_no_tables(folder):
     assert not {"xarray", "pandas", "scipy.integrate", "diffrax", "matplotlib", "rich"} & set(done.stdout.split())
 
 
+@pytest.mark.parametrize("scene", ["quickstart.toml", "cardan_atlas.toml"])
+def test_a_run_writes_its_file_without_tables(folder, scene):
+    """A third of the time of a short run would go into loading these packages."""
+    path = Path(__file__).parents[2] / "sweeps" / scene
+    small = ["axes.beta.stop=0.2", "axes.Omega.start=1.0", "axes.Omega.stop=1.2"]
+    small += ["axes.beta.num=2", "axes.Omega.num=3"] if scene == "quickstart.toml" else []
+    given = ["run", str(path), "--out", "r.nc", "--quiet", *(word for entry in small for word in ("--set", entry))]
+    code = f"import sys; from drivetrain_jax.cli import main\nassert main({given!r}) == 0\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert "h5py" in done.stdout.split() and Path("r.nc").is_file()
+    assert not {"xarray", "pandas", "dask", "distributed", "h5netcdf", "matplotlib"} & set(done.stdout.split())
+
+
 @pytest.mark.parametrize(
     ("where", "code", "said"),
     [

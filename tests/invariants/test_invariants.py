@@ -14,6 +14,7 @@ from drivetrain_jax.invariants import check, registry
 from drivetrain_jax.invariants.verify import verify
 from drivetrain_jax.store.chunks import Part, PartsFolder
 from drivetrain_jax.store.consolidate import write_result
+from tests.labels import labelled
 
 
 def flag(values, count):
@@ -159,7 +160,7 @@ def test_what_is_declared_exists():
 
 @pytest.fixture
 def path(chart, tmp_path):
-    write_result(chart, tmp_path / "r.nc", tmp_path / "tmp")
+    write_result(labelled(chart), tmp_path / "r.nc", tmp_path / "tmp")
     return tmp_path / "r.nc"
 
 
@@ -168,7 +169,7 @@ def test_verify_a_file(path, chart):
     assert report.problem == "" and report.complete and report.lines[0] == "checksums: all agree"
     wrong = chart.copy(deep=True)
     wrong["verdict"].values[1] = 0
-    write_result(wrong, path, path.with_name("tmp"))
+    write_result(labelled(wrong), path, path.with_name("tmp"))
     assert verify(path).problem.startswith("verdict follows from spectral_radius and its bound: broken at 1 of 3")
     data = path.read_bytes().replace(np.float64(2.0).tobytes(), np.float64(2.5).tobytes())
     path.write_bytes(data)
@@ -182,7 +183,7 @@ def test_verify_a_file_without_checksums(chart, tmp_path):
 
 def test_a_result_that_has_lost_its_checksums_is_not_sound(chart, tmp_path):
     path = tmp_path / "r.nc"
-    write_result(chart.assign_attrs(digest="abc"), path, tmp_path / "tmp")
+    write_result(labelled(chart.assign_attrs(digest="abc")), path, tmp_path / "tmp")
     with h5py.File(path, "r+") as file:
         del file.attrs["checksums"]
     report = verify(path)

@@ -11,7 +11,7 @@ from drivetrain_jax import InputError
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.consolidate import open_result, write_result
-from drivetrain_jax.store.schema import Coordinate, build_dataset
+from drivetrain_jax.store.schema import Coordinate, Labelled
 
 
 @pytest.fixture
@@ -24,8 +24,8 @@ def path(tmp_path):
     ]
     # HDF5 stores more than eight attributes in another way.
     attrs = {"title": "one", "analysis": "toy"} | {f"attribute_{i}": "some" for i in range(9)}
-    dataset = build_dataset(("x",), [axis], (Dimension("k", "number", ("up", "down")),), results, attrs)
-    write_result(dataset, tmp_path / "r.nc", tmp_path / "tmp")
+    result = Labelled.build(("x",), [axis], (Dimension("k", "number", ("up", "down")),), results, attrs)
+    write_result(result, tmp_path / "r.nc", tmp_path / "tmp")
     return tmp_path / "r.nc"
 
 

@@ -15,11 +15,11 @@ from drivetrain_jax._machine import machine, physical_memory, usable_cores
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.store import files, provenance
 from drivetrain_jax.store.consolidate import ResultFile, open_result, read_attribute, release, write_result
-from drivetrain_jax.store.schema import Coordinate, build_dataset
+from drivetrain_jax.store.schema import Coordinate, Labelled
 
 
 @pytest.fixture
-def dataset():
+def result():
     x = Coordinate("x", ("x",), np.array([1.0, 2.0]), "m", "place")
     time = Coordinate("t0", ("x",), np.array([0.0, 5.0]), "s", "instant")
     results = [
@@ -28,20 +28,21 @@ def dataset():
         (Variable("v", "1", "flag", dtype="int8", flags=("no", "not at all")), np.array([0, 1], np.int8)),
     ]
     dims = (Dimension("k", "number", ("up", "down")), Dimension("unused", "never", (1, 2)))
-    return build_dataset(
+    return Labelled.build(
         ("x",), [x, time], dims, results, {"digest": "abc", "scene": "é = 1\n" * 30_000, "wall_time_s": 1.5}
     )
 
 
-def test_labels(dataset):
+def test_labels(result):
+    dataset = result.to_dataset()
     assert dataset["z"].dims == ("x", "k") and "unused" not in dataset.coords
     assert dataset["v"].attrs["flag_meanings"] == "no not_at_all" and dataset["v"].attrs["flag_values"].dtype == np.int8
     assert all(v.attrs["units"] and v.attrs["long_name"] for v in dataset.variables.values())
 
 
-def test_round_trip_by_plain_xarray(dataset, tmp_path):
-    path = tmp_path / "r.nc"
-    write_result(dataset, path, tmp_path / "tmp")
+def test_round_trip_by_plain_xarray(result, tmp_path):
+    path, dataset = tmp_path / "r.nc", result.to_dataset()
+    write_result(result, path, tmp_path / "tmp")
     with xr.open_dataset(path, engine="h5netcdf") as again:
         assert sorted(json.loads(again.attrs.pop("checksums"))) == ["/", "f", "k", "t0", "v", "x", "z"]
         xr.testing.assert_identical(again, dataset)
@@ -51,17 +52,17 @@ def test_round_trip_by_plain_xarray(dataset, tmp_path):
     assert os.listdir(tmp_path) == ["r.nc"]
 
 
-def test_two_files_of_one_dataset_are_identical(dataset, tmp_path):
+def test_two_files_of_one_result_are_identical(result, tmp_path):
     for name in ("one", "two"):
-        write_result(dataset, tmp_path / name, tmp_path / "tmp")
+        write_result(result, tmp_path / name, tmp_path / "tmp")
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
 
 
 def test_a_variable_without_entries(tmp_path):
     axis = Coordinate("x", ("x",), np.array([1.0, 2.0]), "m", "place")
     results = [(Variable("z", "1", "nothing", ("k",)), np.empty((2, 0))), (Variable("f", "s", "time"), np.ones(2))]
-    dataset = build_dataset(("x",), [axis], (), results, {"digest": "abc"})
-    write_result(dataset, tmp_path / "r.nc", tmp_path / "tmp")
+    result = Labelled.build(("x",), [axis], (), results, {"digest": "abc"})
+    write_result(result, tmp_path / "r.nc", tmp_path / "tmp")
     with xr.open_dataset(tmp_path / "r.nc", engine="h5netcdf") as again:
         assert again["z"].shape == (2, 0) and again["f"].values.tolist() == [1.0, 1.0]
 
@@ -75,7 +76,7 @@ def resident():
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory is looked up in /proc")
 def test_what_is_released_takes_no_memory_and_is_not_lost(tmp_path):
     blank = np.broadcast_to(np.zeros(()), (1 << 22,))
-    template = build_dataset(("x",), [], [], [(Variable("f", "s", "duration"), blank)], {"digest": "abc"})
+    template = Labelled.build(("x",), [], [], [(Variable("f", "s", "duration"), blank)], {"digest": "abc"})
     with ResultFile(tmp_path / "tmp") as file:
         arrays = file.lay_out(template)
         arrays["f"][:] = 3.0
@@ -116,10 +117,10 @@ def test_a_folder_is_told_what_it_is(tmp_path, name, file, told):
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no HDF5 at all", "cut"])
-def test_unreadable_result_is_one_clear_line(tmp_path, dataset, content):
+def test_unreadable_result_is_one_clear_line(tmp_path, result, content):
     path = tmp_path / "r.nc"
     if content == "cut":
-        write_result(dataset, path, tmp_path / "tmp")
+        write_result(result, path, tmp_path / "tmp")
         content = path.read_bytes()[:2000]
     if content is not None:
         path.write_bytes(content)

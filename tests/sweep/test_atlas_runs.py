@@ -25,6 +25,7 @@ from drivetrain_jax.sweep.atlas_chart import chart
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.run import Incomplete, Interrupted, run_to_file
 from drivetrain_jax.sweep.scene import load_scene
+from tests.labels import labelled
 
 BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 ENDS = " allowed is start and stop"
@@ -453,7 +454,7 @@ def test_too_many_parameters_for_an_atlas():
 @pytest.fixture(scope="module")
 def file(stored, tmp_path_factory):
     folder = tmp_path_factory.mktemp("atlas")
-    write_result(stored, folder / "atlas.nc", folder / "tmp")
+    write_result(labelled(stored), folder / "atlas.nc", folder / "tmp")
     return folder / "atlas.nc"
 
 

@@ -1,0 +1,114 @@
+"""Files in the netCDF4 format: for every reader the same as what h5netcdf writes of the same result."""
+
+from __future__ import annotations
+
+import h5py
+import netCDF4
+import numpy as np
+import pytest
+import xarray as xr
+
+from drivetrain_jax._quantities import Dimension, Variable
+from drivetrain_jax.store.consolidate import write_result
+from drivetrain_jax.store.schema import Coordinate, Labelled
+
+OWN = {"_NCProperties", "checksums"}
+
+
+@pytest.fixture
+def result():
+    """Dimensions with and without coordinates, one of them empty; texts, codes, complex numbers, a coordinate aside."""
+    x = Coordinate("x", ("x",), np.array([1.0, 2.0]), "m", "place")
+    time = Coordinate("t0", ("x",), np.array([0.0, 5.0]), "s", "instant")
+    results = [
+        (Variable("z", "1", "complex", ("k",), "complex128"), np.array([[1 + 2j, np.nan], [0, -1j]])),
+        (Variable("e", "s", "empty", ("none",)), np.empty((2, 0))),
+        (Variable("n", "s", "many", ("a", "b", "number")), np.arange(48.0).reshape(2, 3, 2, 4)),
+        (Variable("v", "1", "flag", dtype="int8", flags=("no", "not at all")), np.array([0, 1], np.int8)),
+    ]
+    dims = (Dimension("k", "name", ("up", "é")), Dimension("number", "number", (), "s"))
+    attrs = {"digest": "abc", "scene": "é = 1\n" * 30_000, "wall_time_s": 1.5, "solves": 3, "none": ""}
+    return Labelled.build(("x",), [x, time], dims, results, attrs)
+
+
+@pytest.fixture
+def path(result, tmp_path):
+    write_result(result, tmp_path / "r.nc", tmp_path / "tmp")
+    return tmp_path / "r.nc"
+
+
+def kind(of):
+    """A type of HDF5, and whether it has a name in the file."""
+    text = of.get_cset() if isinstance(of, h5py.h5t.TypeStringID) else None
+    return str(of.dtype), of.get_class(), text, of.committed()
+
+
+def shown(file, key, value):
+    """The value of an attribute; whatever stands for a dimension or a variable by the name of that."""
+    if isinstance(value, h5py.Reference):
+        return file[value].name
+    if key.startswith("_Netcdf4"):
+        numbers = {int(v.attrs["_Netcdf4Dimid"]): name for name, v in file.items() if "CLASS" in v.attrs}
+        return [numbers[number] for number in np.atleast_1d(value)]
+    if isinstance(value, (np.ndarray, np.void)):
+        parts = [shown(file, key, part) for part in value]
+        # The order in which variables were linked to a dimension does not count.
+        return sorted(parts) if key == "REFERENCE_LIST" and isinstance(value, np.ndarray) else parts
+    return repr(value)
+
+
+def listing(path):
+    """All that there is in a file, by name: types, shapes, values, and attributes with the hidden ones."""
+    with h5py.File(path) as file:
+        found = {}
+        for name, item in {"/": file, **file}.items():
+            if isinstance(item, h5py.Dataset):
+                found[name] = kind(item.id.get_type()), item.shape, item.maxshape, repr(item.fillvalue), repr(item[()])
+            if isinstance(item, h5py.Datatype):
+                found[name] = kind(item.id)
+            for key in item.attrs:
+                of = item.attrs.get_id(key)
+                found[f"{name}@{key}"] = kind(of.get_type()), of.shape, shown(file, key, item.attrs[key])
+        return {key: value for key, value in found.items() if key.removeprefix("/@") not in OWN}
+
+
+def test_the_file_is_what_h5netcdf_writes(result, path, tmp_path):
+    result.to_dataset().to_netcdf(tmp_path / "x.nc", engine="h5netcdf")
+    ours, theirs = listing(path), listing(tmp_path / "x.nc")
+    # The coordinate that is aside is told to those who do not look at the variables as well.
+    assert ours.pop("/@coordinates")[2] == "'t0'"
+    assert ours == theirs
+
+
+def test_netcdf4_reads_what_was_written(result, path):
+    with netCDF4.Dataset(path, auto_complex=True) as file:
+        assert {name: dim.size for name, dim in file.dimensions.items()} == result.sizes
+        # Numbered alike in every process.
+        assert list(file.dimensions) == ["x", "k", "number", "none", "a", "b"]
+        assert file.data_model == "NETCDF4" and file.wall_time_s == 1.5 and file.solves == 3 and file.none == ""
+        for name, entry in {**result.coords, **result.data}.items():
+            assert file[name].dimensions == entry.dims
+            np.testing.assert_array_equal(np.ma.filled(file[name][...], np.nan), entry.values)
+            assert {"units", "long_name"} <= set(file[name].ncattrs())
+
+
+def test_a_scalar_without_any_dimension(tmp_path):
+    scalars = [(Variable("f", "s", "time"), np.array(np.pi)), (Variable("z", "1", "c", (), "complex128"), np.array(2j))]
+    write_result(Labelled.build((), [], (), scalars, {"digest": "abc"}), tmp_path / "r.nc", tmp_path / "tmp")
+    with xr.open_dataset(tmp_path / "r.nc", engine="h5netcdf") as again:
+        assert (again["f"].item(), again["z"].item(), dict(again.sizes)) == (np.pi, 2j, {})
+
+
+def test_data_are_in_one_piece_and_have_their_room(result, path):
+    with h5py.File(path) as file:
+        for name, entry in result.data.items():
+            variable = file[name]
+            assert variable.id.get_storage_size() == entry.values.nbytes
+            assert variable.chunks is None or not variable.size
+
+
+def test_lengths_that_disagree_are_refused():
+    results = [(Variable("f", "s", "time", ("k",)), np.ones(3))]
+    labelled = Labelled.build((), [], (Dimension("k", "name", ("up", "down")),), results, {})
+    with pytest.raises(ValueError, match="f: length 3 along 'k', which has length 2"):
+        _ = labelled.sizes
