@@ -5,6 +5,7 @@ from __future__ import annotations
 import mmap
 import os
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.store import checksums, netcdf
-from drivetrain_jax.store.files import move_into_place
+from drivetrain_jax.store.files import flush, move_into_place
 from drivetrain_jax.store.schema import Labelled
 
 if TYPE_CHECKING:
@@ -54,12 +55,14 @@ class ResultFile:
 
     def finish(self, path: Path, **attrs: float) -> None:
         """Change these attributes, add checksums, flush all to the disk, and move the file to ``path`` in one step."""
-        if self._mapped:
-            self._mapped.flush()
-        with h5py.File(self._temporary, "r+") as file:
-            for name, value in attrs.items():
-                file.attrs.modify(name, value)
-            checksums.seal(file)
+        with ThreadPoolExecutor(1) as aside:
+            # What is mapped is on its way to the disk while it is read once more.
+            written = aside.submit(flush, self._temporary)
+            with h5py.File(self._temporary, "r+") as file:
+                for name, value in attrs.items():
+                    file.attrs.modify(name, value)
+                checksums.seal(file)
+            written.result()
         move_into_place(self._temporary, path)
 
 

@@ -25,11 +25,16 @@ def write_atomic(path: Path, data: bytes | memoryview, temporary: Path) -> None:
     move_into_place(temporary, path)
 
 
+def flush(path: Path) -> None:
+    """Return when all of the file, what was written into maps of it included, is on the disk."""
+    with open(path, "rb+") as file:
+        os.fsync(file.fileno())
+
+
 def move_into_place(temporary: Path, path: Path) -> None:
     """Flush the finished file ``temporary`` to the disk and rename it to ``path``; on failure it is deleted."""
     try:
-        with open(temporary, "rb+") as file:
-            os.fsync(file.fileno())
+        flush(temporary)
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)

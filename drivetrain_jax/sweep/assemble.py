@@ -29,7 +29,7 @@ _USUAL_SIZE = 4
 _PLANNED = 4
 # Bytes of results on the disk that are kept in memory as well, and values that are blanked at a time.
 _RESIDENT, _ROWS = 1 << 26, 1 << 22
-_STORAGE = ("xarray", "h5netcdf", "h5py")
+_STORAGE = ("h5py",)
 
 
 class Table:
