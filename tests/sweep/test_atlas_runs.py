@@ -216,6 +216,18 @@ def test_numbers_for_all_parameters_no_points_and_shapes_that_do_not_fit(atlas):
     assert np.isfinite(row).all() and (row == row[:, :1]).all()
 
 
+def test_arrays_with_labels_keep_them_and_are_never_stretched_to_fit(atlas):
+    grid = atlas.grid(beta=[0.1, 0.31], Omega=[1.1, 1.2, 1.3])
+    outer = atlas(beta=grid["beta"], Omega=grid["Omega"])
+    assert outer.indexes.keys() == {"beta", "Omega"} and outer["beta"].attrs["units"] == "rad"
+    assert float(outer["verdict"].sel(beta=0.31, Omega=1.2)) == float(grid["verdict"].sel(beta=0.31, Omega=1.2))
+    beta = xr.DataArray([0.1, 0.2], dims="shaft", coords={"shaft": ["a", "b"]})
+    fleet = atlas(beta=beta, Omega=1.2)
+    assert fleet["shaft"].values.tolist() == ["a", "b"] and fleet["Omega"].dims == ("shaft",)
+    with pytest.raises(dt.InputError, match="of the same labels along a dimension that they share"):
+        atlas(beta=beta, Omega=xr.DataArray([1.1, 1.2], dims="shaft", coords={"shaft": ["b", "c"]}))
+
+
 @pytest.mark.parametrize("outputs", [["floquet_multiplier", "verdict"], ["spectral_radius"]])
 def test_an_atlas_without_a_panel_has_all_its_points_solved(monkeypatch, tmp_path, outputs):
     monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
