@@ -164,6 +164,9 @@ class StoredAtlas:
 
     def refuse(self, name: str, value: Any, *others: str) -> NoReturn:
         """Raise :class:`InputError` for a name that is neither a parameter nor one of ``others``."""
+        if name in self.fixed:
+            made = f"the atlas is made for {name} = {as_given(self.fixed[name])}"
+            raise InputError(f"{name} = {as_given(value)}: {made}; allowed is to leave it out")
         guess = did_you_mean(name, (*self.parameters, *others))
         allowed = "; ".join(map(self.allowed, self.parameters))
         raise InputError(f"{name} = {as_given(value)}: not a parameter of the atlas{guess}; allowed is {allowed}")
