@@ -119,7 +119,9 @@ def _on_all_sides(found: Tips, signs: list[dict[str, float]], ranges: Mapping[st
     for side in signs:
         for tip in found.tips:
             point = {name: sign * tip.point[name] for name, sign in side.items()}
-            if all(low <= point[name] <= high for name, (low, high) in ranges.items()):
+            # At 0 both sides are one.
+            known = any(point == other.point for other in tips)
+            if not known and all(low <= point[name] <= high for name, (low, high) in ranges.items()):
                 # What opens upwards on one side of 0 opens downwards on the other.
                 tips.append(replace(tip, point=point, opens=tip.opens == (min(side.values()) > 0)))
         for box in found.undecided:
