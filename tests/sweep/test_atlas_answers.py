@@ -12,6 +12,8 @@ import xarray as xr
 
 import drivetrain_jax as dt
 from drivetrain_jax.atlas import design, stability
+from drivetrain_jax.atlas.boundaries import boundaries
+from drivetrain_jax.atlas.exclusion import critical_points
 from drivetrain_jax.atlas.sensitivity import direct_sensitivity
 from drivetrain_jax.atlas.tiles import tiles
 from drivetrain_jax.sweep import atlas_answers
@@ -140,6 +142,22 @@ def test_a_chart_over_the_angle_0_has_curves_and_tips_on_both_sides():
     part = chart(source, {"beta": (-0.2, -0.05)}, 20)
     assert part["tip_beta"].values == pytest.approx([-S21[0]], abs=1e-8)
     assert np.nanmax(part["boundary_beta"].values) < -0.1
+
+
+def test_a_chart_looks_for_its_tips_once(monkeypatch):
+    source, searched = panels((0.0, 0.3), (1.3, 1.5)), []
+
+    def counted(patches, number, horizontal):
+        searched.append(number)
+        return critical_points(patches, number, horizontal)
+
+    for module in ("tips", "boundaries"):
+        monkeypatch.setattr(f"drivetrain_jax.atlas.{module}.critical_points", counted)
+    drawn = chart(source, {}, 4)
+    assert sorted(searched) == [0, 1, 2]
+    curves = boundaries(dt.open_atlas(source).stability.atlas, CARDAN)
+    length = sum(len(segment["beta"]) for curve in curves for segment in curve.segments())
+    assert np.isfinite(drawn["boundary_beta"]).sum() == length
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
