@@ -216,6 +216,12 @@ def test_numbers_for_all_parameters_no_points_and_shapes_that_do_not_fit(atlas):
     assert np.isfinite(row).all() and (row == row[:, :1]).all()
 
 
+def test_an_atlas_of_another_range_is_refused(tmp_path):
+    run_to_file(ATLAS, tmp_path / "a.nc")
+    with pytest.raises(dt.InputError, match=r"axes.beta has the range from 0 to 0\.5, had the range from 0 to 0\.6;"):
+        run_to_file(ATLAS, tmp_path / "a.nc", overrides={"axes.beta.stop": 0.5})
+
+
 def test_arrays_with_labels_keep_them_and_are_never_stretched_to_fit(atlas):
     grid = atlas.grid(beta=[0.1, 0.31], Omega=[1.1, 1.2, 1.3])
     outer = atlas(beta=grid["beta"], Omega=grid["Omega"])
