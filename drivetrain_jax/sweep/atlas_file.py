@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._wording import did_you_mean, shown
+from drivetrain_jax._wording import counted, did_you_mean, shown
 from drivetrain_jax.analysis import Request, get_analysis
 from drivetrain_jax.analysis.atlas import ANALYSIS
 from drivetrain_jax.atlas import StabilityAtlas, from_arrays, stability_atlas, to_arrays
@@ -175,7 +175,8 @@ class StoredAtlas:
         ranges = ", ".join(f"{name} {a:g} to {b:g}" for name, (a, b) in self.ranges.items())
         atlas = self.stability.atlas
         fixed = ", ".join(f"{name} = {value:g}" for name, value in self.fixed.items())
-        return f"{self.scene.system.name} atlas: {ranges}; {fixed}; {len(atlas.panels)} panels, {len(atlas.gaps)} gaps"
+        parts = f"{counted(len(atlas.panels), 'panel', 'panels')}, {counted(len(atlas.gaps), 'gap', 'gaps')}"
+        return f"{self.scene.system.name} atlas: {ranges}; {fixed}; {parts}"
 
     def __call__(self, **values: Any) -> xr.Dataset:
         """Results at points: every parameter a number or an array, broadcast against each other.

@@ -277,7 +277,7 @@ def test_a_system_without_an_atlas_is_refused_before_anything_is_written(tmp_pat
 def test_gaps_of_a_stored_atlas_are_solved(monkeypatch):
     monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
     atlas = dt.open_atlas(dt.run(ATLAS))
-    assert "0 panels, 1 gaps" in repr(atlas)
+    assert "0 panels, 1 gap" in repr(atlas)
     found, exact = atlas(beta=0.3, Omega=1.3), dt.point("cardan", "floquet", beta=0.3, Omega=1.3, **BASE)
     assert float(found["spectral_radius"]) == pytest.approx(exact.spectral_radius, rel=1e-12)
 
