@@ -7,13 +7,13 @@ where they bound the stable region.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from drivetrain_jax.atlas.criteria import LIMITING, Criteria, parameters_at
-from drivetrain_jax.atlas.exclusion import critical_points
+from drivetrain_jax.atlas.exclusion import Search, critical_points
 from drivetrain_jax.atlas.growth import growth, limiting, monodromy_error
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.patches import Patches, patches_of
@@ -53,10 +53,10 @@ class Boundary:
         )
 
 
-def boundaries(atlas: Atlas, system: System) -> tuple[Boundary, ...]:
+def boundaries(atlas: Atlas, system: System, searches: Sequence[Search] = ()) -> tuple[Boundary, ...]:
     """All boundary curves within ``atlas``, which has two parameters (``ValueError`` for another number).
 
-    Angles are given without their signs.
+    Angles are given without their signs. ``searches`` are those of the tips of the same atlas, if these are known.
     """
     atlas = atlas.folded()
     if len(atlas.parameters) != 2:
@@ -69,7 +69,8 @@ def boundaries(atlas: Atlas, system: System) -> tuple[Boundary, ...]:
         field = Field(patches[number])
         curves: list[Curve] = []
         if not criteria.conservative:
-            rough = critical_points(patches, number, horizontal).points
+            search = searches[number] if searches else critical_points(patches, number, horizontal)
+            rough = search.points
             fine = polish(criteria, rough, kind, horizontal)[0]
             near = np.abs(field.to_unit(fine) - field.to_unit(rough)).max(axis=1, initial=0.0) < _LARGEST_SHIFT
             curves = _distinct(field, np.where(near[:, None], fine, rough), [], horizontal)

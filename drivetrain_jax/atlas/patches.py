@@ -72,8 +72,10 @@ class Patches:
     def derivative(self, axis: int) -> Patches:
         """The patches of the derivative along a coordinate."""
         matrix = _differentiation(self.coefficients.shape[axis])
-        scale = 2 / (self.upper[:, axis] - self.lower[:, axis])
-        coefficients = _apply(matrix, self.coefficients, axis) * scale
+        # Of patches without extent they are not finite, and decide nothing.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = 2 / (self.upper[:, axis] - self.lower[:, axis])
+            coefficients = _apply(matrix, self.coefficients, axis) * scale
         nothing = np.zeros((*(1,) * self.dimension, len(self)))
         return replace(self, coefficients=coefficients, lever=nothing, floor=self.error * self.roughness[:, axis])
 
@@ -93,7 +95,8 @@ class Patches:
     def locate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Number of the patch of each point and the position in it, ``(N, d) -> (N,), (N, d)``; the nearest if outside."""
         point = x[:, None]
-        outside = np.maximum(self.lower - point, point - self.upper) / (self.upper - self.lower)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            outside = np.maximum(self.lower - point, point - self.upper) / (self.upper - self.lower)
         number = np.argmin(np.nan_to_num(np.maximum(outside, 0.0).max(axis=2), nan=np.inf), axis=1)
         lower, upper = self.lower[number], self.upper[number]
         return number, ((x - lower) - (upper - x)) / (upper - lower)
@@ -271,7 +274,9 @@ def _tail(coefficients: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _apply(matrix: np.ndarray, coefficients: np.ndarray, axis: int) -> np.ndarray:
-    return np.moveaxis(np.tensordot(matrix, coefficients, axes=((1,), (axis,))), 0, axis)
+    # Derivatives over patches without extent are not finite.
+    with np.errstate(invalid="ignore"):
+        return np.moveaxis(np.tensordot(matrix, coefficients, axes=((1,), (axis,))), 0, axis)
 
 
 @lru_cache

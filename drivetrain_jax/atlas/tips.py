@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drivetrain_jax.atlas.criteria import Criteria, parameters_at
-from drivetrain_jax.atlas.exclusion import critical_points
+from drivetrain_jax.atlas.exclusion import Search, critical_points
 from drivetrain_jax.atlas.growth import Growth, growth, limiting
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.patches import Patches, patches_of
@@ -59,13 +59,15 @@ class Tips:
     """All tips, in rising order of the other parameter; ``undecided`` boxes of parameters that may hide further ones.
 
     ``boxes`` is the number of boxes looked at. At zero damping tongues have no width at their tips: these are then those of
-    the theory, and ``complete`` is false.
+    the theory, and ``complete`` is false. ``searches`` is what :func:`~drivetrain_jax.atlas.boundaries.boundaries` of the
+    same atlas would look for again.
     """
 
     tips: tuple[Tip, ...]
     undecided: tuple[Box, ...]
     boxes: int
     complete: bool
+    searches: tuple[Search, ...] = ()
 
 
 def find_tips(atlas: Atlas, system: System, *, opening: bool = True) -> Tips:
@@ -81,7 +83,7 @@ def find_tips(atlas: Atlas, system: System, *, opening: bool = True) -> Tips:
         tips = tuple(_named(t, atlas) for t in undamped_tips(criteria, horizontal, _predictions(atlas, system)))
         return Tips(_sorted(tips, atlas, horizontal), (), 0, False)
     patches = patches_of(criteria)
-    searches = [critical_points(patches, k, horizontal) for k in range(len(patches))]
+    searches = tuple(critical_points(patches, k, horizontal) for k in range(len(patches)))
     tips: list[Tip] = []
     for kind, patch, search in zip(criteria.multipliers, patches, searches, strict=True):
         x, rates = polish(criteria, search.points, kind, horizontal)
@@ -94,7 +96,7 @@ def find_tips(atlas: Atlas, system: System, *, opening: bool = True) -> Tips:
     undecided = tuple(_box(atlas, box) for search in searches for box in search.undecided)
     undecided += tuple(_box(atlas, np.stack([gap.lower, gap.upper])) for gap in atlas.gaps)
     chosen = tuple(tip for tip in tips if tip.opens or not opening)
-    return Tips(_sorted(chosen, atlas, horizontal), undecided, sum(s.boxes for s in searches), not undecided)
+    return Tips(_sorted(chosen, atlas, horizontal), undecided, sum(s.boxes for s in searches), not undecided, searches)
 
 
 def polish(

@@ -62,7 +62,8 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
     panels, system = atlas.stability.atlas, atlas.scene.system
     nearest = design.nearest_boundaries(panels, system, point) if has_boundaries(panels, system) else ()
     lines = [f"{system.name} atlas, {asked.heading()}", *rows, *_gradient_lines(atlas, slopes)]
-    lines += ["nearest change of stability"] if nearest else []
+    lines += ["nearest change of stability"] if nearest or not panels.panels else []
+    lines += [] if panels.panels else [f"  unknown: the atlas has no panel ({panels.gaps[0].reason})"]
     for each in nearest:
         sides = [_side(asked, each.parameter, each.value, c) for c in (each.below, each.above) if c]
         lines.append(f"  {each.parameter:<24} {'; '.join(sides) or _reach(atlas, each)}")

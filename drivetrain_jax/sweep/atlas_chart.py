@@ -80,9 +80,13 @@ def _curves(
     system = atlas.scene.system
     panels = narrow(atlas.stability.atlas.slice(fixed), ranges)
     signs = _signs(panels)
+    tips = None
+    if system.resonances is not None and system.resonances.axis in ranges:
+        # Tongues widen with the angle. Along a damping they close, and what closes them is their tip.
+        tips = find_tips(panels, system, opening=system.roles.get("angle") in ranges)
     segments = [
         _within({name: sign * segment[name] for name, sign in side.items()}, ranges)
-        for curve in boundaries(panels, system)
+        for curve in boundaries(panels, system, tips.searches if tips else ())
         for segment in curve.segments()
         for side in signs
     ]
@@ -92,10 +96,8 @@ def _curves(
         parts = [np.append(segment[name], np.nan) for segment in segments]
         values = np.concatenate(parts) if parts else np.empty(0)
         coordinates[f"boundary_{name}"] = ("boundary", values, {**about, "long_name": f"boundary of stability, {name}"})
-    if system.resonances is None or system.resonances.axis not in ranges:
+    if tips is None:
         return coordinates
-    # Tongues widen with the angle. Along a damping they close, and what closes them is their tip.
-    tips = find_tips(panels, system, opening=system.roles.get("angle") in ranges)
     return coordinates | _tips(_on_all_sides(tips, signs, ranges), system, ranges)
 
 
@@ -119,7 +121,9 @@ def _on_all_sides(found: Tips, signs: list[dict[str, float]], ranges: Mapping[st
     for side in signs:
         for tip in found.tips:
             point = {name: sign * tip.point[name] for name, sign in side.items()}
-            if all(low <= point[name] <= high for name, (low, high) in ranges.items()):
+            # At 0 both sides are one.
+            known = any(point == other.point for other in tips)
+            if not known and all(low <= point[name] <= high for name, (low, high) in ranges.items()):
                 # What opens upwards on one side of 0 opens downwards on the other.
                 tips.append(replace(tip, point=point, opens=tip.opens == (min(side.values()) > 0)))
         for box in found.undecided:

@@ -43,7 +43,8 @@ def uses_atlas(scene: Scene) -> bool:
     count = len(atlas_ranges(scene))
     if scene.request.method == "atlas":
         if count > MAX_RANGES:
-            raise InputError(f"options.method = 'atlas': the scene varies {count} parameters; allowed are {MAX_RANGES}")
+            allowed = f"allowed are at most {MAX_RANGES}"
+            raise InputError(f"options.method = 'atlas': the scene varies {count} parameters; {allowed}")
         return count > 0
     model = scene.system.models.get(ANALYSIS.name)
     return (

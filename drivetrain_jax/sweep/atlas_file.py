@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._wording import did_you_mean, shown
+from drivetrain_jax._wording import counted, did_you_mean, shown
 from drivetrain_jax.analysis import Request, get_analysis
 from drivetrain_jax.analysis.atlas import ANALYSIS
 from drivetrain_jax.atlas import StabilityAtlas, from_arrays, stability_atlas, to_arrays
@@ -164,6 +164,9 @@ class StoredAtlas:
 
     def refuse(self, name: str, value: Any, *others: str) -> NoReturn:
         """Raise :class:`InputError` for a name that is neither a parameter nor one of ``others``."""
+        if name in self.fixed:
+            made = f"the atlas is made for {name} = {as_given(self.fixed[name])}"
+            raise InputError(f"{name} = {as_given(value)}: {made}; allowed is to leave it out")
         guess = did_you_mean(name, (*self.parameters, *others))
         allowed = "; ".join(map(self.allowed, self.parameters))
         raise InputError(f"{name} = {as_given(value)}: not a parameter of the atlas{guess}; allowed is {allowed}")
@@ -172,20 +175,22 @@ class StoredAtlas:
         ranges = ", ".join(f"{name} {a:g} to {b:g}" for name, (a, b) in self.ranges.items())
         atlas = self.stability.atlas
         fixed = ", ".join(f"{name} = {value:g}" for name, value in self.fixed.items())
-        return f"{self.scene.system.name} atlas: {ranges}; {fixed}; {len(atlas.panels)} panels, {len(atlas.gaps)} gaps"
+        parts = f"{counted(len(atlas.panels), 'panel', 'panels')}, {counted(len(atlas.gaps), 'gap', 'gaps')}"
+        return f"{self.scene.system.name} atlas: {ranges}; {fixed}; {parts}"
 
     def __call__(self, **values: Any) -> xr.Dataset:
         """Results at points: every parameter a number or an array, broadcast against each other.
 
-        Arrays of xarray keep their dimensions, others have the dimension ``point`` (or ``dim_0``, ``dim_1``, ...).
-        Raises :class:`InputError` for a name that is missing or unknown, for a value outside the atlas, and for arrays that
-        do not fit together; :class:`ChunkError` if a direct solve in a gap fails.
+        Arrays of xarray keep their dimensions and labels, others have the dimension ``point`` (or ``dim_0``, ``dim_1``,
+        ...). Raises :class:`InputError` for a name that is missing or unknown, for a value outside the atlas, and for
+        arrays whose shapes or labels do not fit together; :class:`ChunkError` if a direct solve in a gap fails.
         """
         import xarray as xr
 
         checked = {name: self._checked(name, values) for name in self._names(values)}
         columns = dict(zip(checked, _broadcast(checked), strict=True))
-        shape, dims = columns[self.parameters[0]].shape, columns[self.parameters[0]].dims
+        whole = columns[self.parameters[0]]
+        shape, dims = whole.shape, whole.dims
         flat = {name: np.asarray(column.values, float).reshape(-1) for name, column in columns.items()}
         found = self._evaluate(self.stability, flat, zipped=True)
         own = {name: v.dims[1:] for name, v in found.data_vars.items()}
@@ -193,8 +198,10 @@ class StoredAtlas:
             name: ((*dims, *own[name]), v.values.reshape((*shape, *v.shape[1:])), v.attrs)
             for name, v in found.data_vars.items()
         }
-        coords = {name: (dims, column.values, found[name].attrs) for name, column in columns.items()}
-        return xr.Dataset(data, coords, found.attrs)
+        labels = {dim: whole.coords[dim] for dim in dims if dim in whole.coords}
+        given = {name: v if isinstance(v, xr.DataArray) else columns[name] for name, v in checked.items()}
+        coords = {name: (v.dims, np.asarray(v.values, float), found[name].attrs) for name, v in given.items()}
+        return xr.Dataset(data, labels | coords, found.attrs)
 
     def grid(self, **values: Any) -> xr.Dataset:
         """Results on the outer product of arrays, as a scene with these axes would give; numbers fix a parameter.
@@ -281,7 +288,10 @@ def _broadcast(given: Mapping[str, Any]) -> tuple[xr.DataArray, ...]:
     try:
         plain = dict(zip(plain, np.broadcast_arrays(*plain.values()), strict=True))
         labelled = {n: xr.DataArray(v, dims=("point",) if v.ndim == 1 else None) for n, v in plain.items()}
-        return xr.broadcast(*(labelled.get(name, value) for name, value in given.items()))
+        arrays = [labelled.get(name, value) for name, value in given.items()]
+        # By itself `broadcast` gives the union of labels, with NaN where an array has none.
+        return xr.broadcast(*xr.align(*arrays, join="exact", copy=False))
     except ValueError:
         shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in given.items())
-        raise InputError(f"shapes {shapes}: allowed are arrays that broadcast against each other") from None
+        allowed = "arrays that broadcast against each other, of the same labels along a dimension that they share"
+        raise InputError(f"shapes {shapes}: allowed are {allowed}") from None

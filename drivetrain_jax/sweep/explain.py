@@ -12,6 +12,7 @@ import numpy as np
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import clipped, counted
+from drivetrain_jax.analysis.atlas import ANALYSIS
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.identity import EVALUATES_ATLAS, scene_content
 from drivetrain_jax.sweep.scene import Scene, load_scene
@@ -62,10 +63,13 @@ def _of_axes(theirs: Scene, ours: Scene) -> Iterator[str]:
         return
     for name, values in new.items():
         if not np.array_equal(values, old[name]):
-            yield f"{'points' if ours.zipped else 'axes'}.{name} has {_range(values)}, had {_range(old[name])}"
+            now, before = (_range(each, ours) for each in (values, old[name]))
+            yield f"{'points' if ours.zipped else 'axes'}.{name} has {now}, had {before}"
 
 
-def _range(values: np.ndarray) -> str:
+def _range(values: np.ndarray, scene: Scene) -> str:
+    if scene.analysis.name == ANALYSIS.name:
+        return f"the range from {values[0]:.10g} to {values[-1]:.10g}"
     ends = f"at {values[0]:.10g}" if len(values) == 1 else f"from {values[0]:.10g} to {values[-1]:.10g}"
     return f"{counted(len(values), 'value', 'values')} {ends}"
 

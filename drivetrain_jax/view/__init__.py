@@ -39,6 +39,9 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     that cannot share a figure.
     """
     analysis = dataset.attrs.get("analysis")
+    if analysis == "atlas":
+        drawn = "what its `grid` and `drivetrain plot` make of it"
+        raise InputError(f"analysis = 'atlas': is a function; allowed is {drawn}")
     if analysis not in _MODULES:
         raise InputError(f"analysis = {analysis!r}: allowed is one of {', '.join(_MODULES)}")
     if others and analysis not in _OVERLAYS:

@@ -77,6 +77,13 @@ def test_progress_then_the_last_line(cli):
     assert any("21/21 points" in line and "/s" in line for line in err[:-1])
 
 
+def test_points_that_cost_nothing_are_counted(capsys):
+    """Those of an atlas are evaluated."""
+    with progress_line() as report:
+        report(Progress(total=21, computed=21))
+    assert "21/21 points" in capsys.readouterr().err
+
+
 def test_no_bar_beside_the_line_of_wrong_input(capsys):
     """A scheduler that does not answer is found out after the first report."""
     with pytest.raises(InputError), progress_line() as report:

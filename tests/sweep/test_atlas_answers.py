@@ -12,6 +12,8 @@ import xarray as xr
 
 import drivetrain_jax as dt
 from drivetrain_jax.atlas import design, stability
+from drivetrain_jax.atlas.boundaries import boundaries
+from drivetrain_jax.atlas.exclusion import critical_points
 from drivetrain_jax.atlas.sensitivity import direct_sensitivity
 from drivetrain_jax.atlas.tiles import tiles
 from drivetrain_jax.sweep import atlas_answers
@@ -142,6 +144,37 @@ def test_a_chart_over_the_angle_0_has_curves_and_tips_on_both_sides():
     assert np.nanmax(part["boundary_beta"].values) < -0.1
 
 
+def test_a_chart_looks_for_its_tips_once(monkeypatch):
+    source, searched = panels((0.0, 0.3), (1.3, 1.5)), []
+
+    def counted(patches, number, horizontal):
+        searched.append(number)
+        return critical_points(patches, number, horizontal)
+
+    for module in ("tips", "boundaries"):
+        monkeypatch.setattr(f"drivetrain_jax.atlas.{module}.critical_points", counted)
+    drawn = chart(source, {}, 4)
+    assert sorted(searched) == [0, 1, 2]
+    curves = boundaries(dt.open_atlas(source).stability.atlas, CARDAN)
+    length = sum(len(segment["beta"]) for curve in curves for segment in curve.segments())
+    assert np.isfinite(drawn["boundary_beta"]).sum() == length
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_part_without_extent_is_drawn():
+    drawn = chart(panels((0.0, 0.3), (1.3, 1.5)), {"Omega": (1.4, 1.4000000000000001), "beta": (0.1, 0.3)}, 4)
+    assert (drawn["verdict"].values == 0).all() and drawn["tip"].size == 0
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_range_of_speeds_without_extent_has_a_widest_angle():
+    atlas = dt.open_atlas(panels((0.0, 1.5), (0.1, 2.0)))
+    found = atlas_answers.widest_angle(atlas, {"Omega": (1.4, 1.4000000000000004)}).data
+    beta, margin = found["value"], found["error"]
+    assert margin < 1e-5
+    assert atlas(beta=[beta - margin, beta + margin], Omega=1.4)["verdict"].values.tolist() == [0, 1]
+
+
 @pytest.mark.parametrize(("rtol", "beta"), [(1e-5, 0.894981), (1e-5, 0.788523), (1e-4, 0.549493), (1e-4, 0.871812)])
 def test_an_undecided_range_that_hides_a_change_ends_a_window(rtol, beta):
     atlas = atlas_of((0.0, 1.3), (0.15, 2.0), rtol=rtol)
@@ -243,6 +276,8 @@ def test_answers_without_damping_agree_with_direct_solves():
 def test_without_damping_tips_are_where_the_angle_is_0():
     source = panels((0.0, 1.2), (0.3, 2.0), zeta=0.0)
     assert {"S21", "H21", "C+1"} <= set(chart(source, {}, 20)["tip"].values)
+    both = chart(panels((-0.3, 0.2), (1.3, 1.5), zeta=0.0), {}, 20)
+    assert both["tip"].values.tolist() == ["S21"] and both["tip_opens"].values.tolist() == [1]
     assert chart(source, {"beta": (0.9, 1.2)}, 20)["tip"].size == 0
 
 
@@ -255,6 +290,7 @@ def test_an_atlas_without_a_panel_answers_what_it_can():
         "cardan", "floquet", beta=0.1, Omega=0.0015, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0, rtol=1e-8
     )
     assert reply.data["values"]["spectral_radius"] == pytest.approx(direct.spectral_radius, abs=1e-7)
+    assert reply.text.splitlines()[-1].startswith("  unknown: the atlas has no panel (")
     assert reply.data["nearest"] == {} and "boundary_beta" not in chart(source, {}, 4).coords
     with pytest.raises(
         dt.InputError, match=r"^file: the atlas has no panel \(.*\); allowed is one whose solves converged$"

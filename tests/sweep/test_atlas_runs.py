@@ -217,6 +217,24 @@ def test_numbers_for_all_parameters_no_points_and_shapes_that_do_not_fit(atlas):
     assert np.isfinite(row).all() and (row == row[:, :1]).all()
 
 
+def test_an_atlas_of_another_range_is_refused(tmp_path):
+    run_to_file(ATLAS, tmp_path / "a.nc")
+    with pytest.raises(dt.InputError, match=r"axes.beta has the range from 0 to 0\.5, had the range from 0 to 0\.6;"):
+        run_to_file(ATLAS, tmp_path / "a.nc", overrides={"axes.beta.stop": 0.5})
+
+
+def test_arrays_with_labels_keep_them_and_are_never_stretched_to_fit(atlas):
+    grid = atlas.grid(beta=[0.1, 0.31], Omega=[1.1, 1.2, 1.3])
+    outer = atlas(beta=grid["beta"], Omega=grid["Omega"])
+    assert outer.indexes.keys() == {"beta", "Omega"} and outer["beta"].attrs["units"] == "rad"
+    assert float(outer["verdict"].sel(beta=0.31, Omega=1.2)) == float(grid["verdict"].sel(beta=0.31, Omega=1.2))
+    beta = xr.DataArray([0.1, 0.2], dims="shaft", coords={"shaft": ["a", "b"]})
+    fleet = atlas(beta=beta, Omega=1.2)
+    assert fleet["shaft"].values.tolist() == ["a", "b"] and fleet["Omega"].dims == ("shaft",)
+    with pytest.raises(dt.InputError, match="of the same labels along a dimension that they share"):
+        atlas(beta=beta, Omega=xr.DataArray([1.1, 1.2], dims="shaft", coords={"shaft": ["b", "c"]}))
+
+
 @pytest.mark.parametrize("outputs", [["floquet_multiplier", "verdict"], ["spectral_radius"]])
 def test_an_atlas_without_a_panel_has_all_its_points_solved(monkeypatch, tmp_path, outputs):
     monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
@@ -260,7 +278,7 @@ def test_a_system_without_an_atlas_is_refused_before_anything_is_written(tmp_pat
 def test_gaps_of_a_stored_atlas_are_solved(monkeypatch):
     monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
     atlas = dt.open_atlas(dt.run(ATLAS))
-    assert "0 panels, 1 gaps" in repr(atlas)
+    assert "0 panels, 1 gap" in repr(atlas)
     found, exact = atlas(beta=0.3, Omega=1.3), dt.point("cardan", "floquet", beta=0.3, Omega=1.3, **BASE)
     assert float(found["spectral_radius"]) == pytest.approx(exact.spectral_radius, rel=1e-12)
 
@@ -286,7 +304,7 @@ def test_a_file_of_other_coordinates_is_refused(stored):
         ),
         (
             {"beta": 0.3, "Omega": 1.5, "mu": 1.0},
-            "mu = 1: not a parameter of the atlas; allowed is 0 <= beta <= 0.6, in rad; 1 <= Omega <= 2",
+            "mu = 1: the atlas is made for mu = 1; allowed is to leave it out",
         ),
     ],
 )
@@ -446,7 +464,7 @@ def test_wrong_ranges(change, message):
 def test_too_many_parameters_for_an_atlas():
     axes = {n: {"start": 0.5, "stop": 1.0, "num": 2} for n in ("beta", "Omega", "zeta", "alpha", "mu")}
     with pytest.raises(
-        dt.InputError, match=r"^options\.method = 'atlas': the scene varies 5 parameters; allowed are 4$"
+        dt.InputError, match=r"^options\.method = 'atlas': the scene varies 5 parameters; allowed are at most 4$"
     ):
         dt.run({**floquet("atlas", axes), "fixed": {"gamma": 100.0}})
 
