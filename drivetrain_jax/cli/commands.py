@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
             # There is nothing to count before all that computes is loaded.
             progress = getattr(stop, "progress", "points: total=0 computed=0 reused=0 failed=0")
             code, reason = INTERRUPTED, "interrupted; the same command resumes"
-        if code != OK:
+        if reason:
             sys.stderr.write(one_line(reason))
         sys.stderr.write(f"{progress}\n")
         if code == INTERRUPTED and options.workers is None:
@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[Any, int, str]:
-    """Counts, exit code and, if that is not 0, the reason."""
+    """Counts, exit code, and why that is not 0 or what else there is to be told."""
     from drivetrain_jax.sweep.executor import Where
     from drivetrain_jax.sweep.run import Incomplete, run_to_file
 
@@ -81,7 +81,7 @@ def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[An
             )
         except Incomplete as error:
             return error.progress, INCOMPLETE, str(error)
-    return progress, OK, ""
+    return progress, OK, "" if options.quiet else progress.note
 
 
 def _progress_line(quiet: bool) -> Any:

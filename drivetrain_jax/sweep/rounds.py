@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from drivetrain_jax._wording import counted
 from drivetrain_jax.analysis import Request
 from drivetrain_jax.analysis.periodic.floquet_propagator import ANALYSIS
 from drivetrain_jax.atlas import (
+    Atlas,
     StabilityAtlas,
     floquet_domain,
     floquet_rounds,
@@ -39,7 +41,8 @@ def build_atlas(
 ) -> tuple[StabilityAtlas, int]:
     """The atlas of ``scene`` over ``ranges``, and the number of the first chunk that it leaves free.
 
-    ``progress`` counts the solves. Rounds are small, so that threads of this process solve them wherever the run works.
+    ``progress`` counts the solves and notes gaps. Rounds are small, so that threads of this process solve them wherever the
+    run works.
     """
     fixed = fixed_of(scene, ranges)
     rtol = scene.request.options["rtol"]
@@ -53,6 +56,7 @@ def build_atlas(
         try:
             points = rounds.send(values)
         except StopIteration as end:
+            progress.note = _note(end.value)
             return stability_atlas(end.value, scene.system, rtol), first
         engine = Engine(_solves(scene, fixed, tuple(ranges), points, options), full_size=True)
         answers = _Answers(len(points), width)
@@ -60,6 +64,15 @@ def build_atlas(
         work.do(engine, answers, progress, first, threads)
         first += len(engine.plan.costs)
         values = answers.values
+
+
+def _note(atlas: Atlas) -> str:
+    """What the user of ``atlas`` has to know of its gaps."""
+    if not atlas.gaps:
+        return ""
+    have = f"{counted(len(atlas.panels), 'panel', 'panels')} and {counted(len(atlas.gaps), 'gap', 'gaps')}"
+    reasons = "; ".join(sorted({gap.reason for gap in atlas.gaps}))
+    return f"the atlas has {have} ({reasons}): what lies in a gap is solved directly"
 
 
 def node_engine(scene: Scene, ranges: Mapping[str, tuple[float, float]], count: int) -> Engine:

@@ -34,6 +34,7 @@ def fill_through_atlas(engine: Engine, table: Table, work: Work, progress: Progr
     with ThreadPoolExecutor(1) as aside:
         prepared = [aside.submit(_lay_out, engine, table), aside.submit(_prepare_judging, engine)]
         atlas, first = build_atlas(scene, atlas_ranges(scene), work, solves, solves_allowed(scene))
+        progress.note = solves.note
         prepared[0].result()
         uncovered = evaluate(engine, table, atlas, work, progress, first)
         prepared[1].result()

@@ -28,7 +28,10 @@ _MOST_WAITING = 1 << 25
 
 @dataclass
 class Progress:
-    """How far a run is: ``computed``, ``reused`` and ``failed`` count what ``kind`` says, costs are in the plan's units."""
+    """How far a run is: ``computed``, ``reused`` and ``failed`` count what ``kind`` says, costs are in the plan's units.
+
+    ``note`` says what the counts do not tell.
+    """
 
     total: int
     computed: int = 0
@@ -37,6 +40,7 @@ class Progress:
     cost: float = 0.0
     total_cost: float = 0.0
     kind: str = "points"
+    note: str = ""
 
     def __str__(self) -> str:
         return f"points: total={self.total} computed={self.computed} reused={self.reused} failed={self.failed}"

@@ -77,6 +77,14 @@ def test_progress_then_the_last_line(cli):
     assert any("21/21 points" in line and "/s" in line for line in err[:-1])
 
 
+def test_what_counts_do_not_tell_is_a_line_before_them(cli, monkeypatch):
+    noted = Progress(3, computed=3, note="the atlas has gaps")
+    monkeypatch.setattr("drivetrain_jax.sweep.run.run_to_file", lambda *_, **__: noted)
+    counts = "points: total=3 computed=3 reused=0 failed=0"
+    assert cli("run", "scene.toml", "--out", "r.nc")[2][-2:] == ["drivetrain: the atlas has gaps", counts]
+    assert cli("run", "scene.toml", "--out", "r.nc", "--quiet")[2] == [counts]
+
+
 def test_points_that_cost_nothing_are_counted(capsys):
     """Those of an atlas are evaluated."""
     with progress_line() as report:

@@ -145,6 +145,16 @@ def test_what_an_atlas_does_not_cover_is_solved(monkeypatch, direct):
     same_arrays(found, direct)
 
 
+def test_gaps_of_an_atlas_are_told(monkeypatch, tmp_path):
+    assert run_to_file(floquet("atlas"), tmp_path / "whole.nc").note == ""
+    monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
+    told = (
+        "the atlas has 0 panels and 1 gap (more than 50 solves would be needed): what lies in a gap is solved directly"
+    )
+    for name, scene in (("chart.nc", floquet("atlas")), ("atlas.nc", ATLAS)):
+        assert run_to_file(scene, tmp_path / name).note == told
+
+
 def interrupted_run(scene, out, reports):
     """A run that is stopped after this many reports."""
     with pytest.raises(Interrupted):
