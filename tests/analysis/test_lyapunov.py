@@ -356,6 +356,15 @@ def test_limit_cycle_is_periodic():
     assert np.abs(ours["lyapunov_spectrum"][0]).max() < 1e-3
 
 
+def test_a_slow_drift_in_a_plane_is_no_torus():
+    """x'' = 0 and x'' = 1e-8 x: both exponents are zero as far as the time tells."""
+    stiffness = jnp.array([0.0, 1e-8])
+    flow = Flow(lambda _, y: (y[1], stiffness * y[0]), (jnp.ones(2), jnp.zeros(2)), period=1.0)
+    ours = results(flow, OUTPUTS, 3000.0, 12)
+    assert (ours["outcome"] == Outcome.SUCCESS).all()
+    assert ours["verdict"].tolist() == [Verdict.UNDECIDED] * 2
+
+
 def test_phases_do_not_supply_exponents():
     """The two-well oscillator with its forcing as a third component has the same two exponents."""
 
