@@ -16,10 +16,10 @@ class Parameter:
     """An input of a system or an option of an analysis.
 
     ``default=None`` means that it must be given, unless ``derived`` says from what a model computes it when it is not;
-    the model then finds no such value. ``lower``/``upper`` are inclusive unless the matching ``open_*``
-    flag is set; ``infinite`` admits infinity. ``choices`` makes it one of these words, ``text`` any word, ``listed`` a
-    list of numbers of which each entry obeys the range (default ``()``: none), ``listed`` with ``broadcast`` such a list
-    or one number that stands for a list of equal entries.
+    the model then finds no such value, and an analysis an option of ``None``. ``lower``/``upper`` are inclusive unless
+    the matching ``open_*`` flag is set; ``infinite`` admits infinity. ``choices`` makes it one of these words, ``text``
+    any word, ``listed`` a list of numbers of which each entry obeys the range (default ``()``: none), ``listed`` with
+    ``broadcast`` such a list or one number that stands for a list of equal entries.
     """
 
     name: str

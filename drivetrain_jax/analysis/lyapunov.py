@@ -3,11 +3,14 @@
 Exponents in natural logarithms per second, in falling order; phases of the flow are left out (their exponents are zero
 whatever happens). The paper's own estimator is offered beside them under its own name.
 
-Outcome: ``SUCCESS``, or ``TOLERANCE_NOT_MET`` if the standard error is above the target at ``max_time`` or ``steps`` are
+Steps are as many as the flow lets predict for every point (see :mod:`~drivetrain_jax.analysis.chaos.march_steps`) unless
+``steps`` are given; a batch marches by the largest number of its members.
+
+Outcome: ``SUCCESS``, or ``TOLERANCE_NOT_MET`` if the standard error is above the target at ``max_time`` or the steps are
 too few for the motion: the exponents do not add up to the mean divergence, or a positive one is another with half the
 steps. The verdict is ``undecided`` then. A motion that leaves all bounds is data: its verdict says so, and its exponents are
 those of the time before, without an error (NaN). ``NOT_FINITE`` if it leaves so soon that there are none, ``STEP_LIMIT``
-where ``max_time`` is more than 1e12 steps.
+where ``max_time`` is more than 1e12 steps, or a strobe is predicted to need more than 1e5.
 """
 
 from __future__ import annotations
@@ -33,15 +36,13 @@ from drivetrain_jax.analysis.chaos.growth import (
     block_size,
     record_growth,
     running_mean,
-    sampled,
-    state_size,
 )
+from drivetrain_jax.analysis.chaos.march_steps import LEAST, MOST, contraction, needed_steps
 from drivetrain_jax.analysis.chaos.paper_estimator import paper_estimator
 from drivetrain_jax.analysis.chaos.resolution import STANDARD_ERRORS, resolved
-from drivetrain_jax.analysis.chaos.section_measures import period_multiple
-from drivetrain_jax.analysis.chaos.variational import batch_shape, divergence, initial_state
+from drivetrain_jax.analysis.chaos.sampling import SAMPLES, Sampling, sample
+from drivetrain_jax.analysis.chaos.variational import batch_shape
 from drivetrain_jax.analysis.chaos.verdict import Evidence, Verdict, grows, judge
-from drivetrain_jax.analysis.chaos.zero_one_test import largest_k01
 from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.systems import Flow, System
 
@@ -66,20 +67,17 @@ VARIABLES = (
 OPTIONS = (
     Parameter("standard_error", "1/s", "standard error at which a run may end", default=0.0, lower=0.0),
     Parameter("max_time", "s", "longest time of a run", default=1.0, lower=0.0, upper=MOST_SECONDS, open_lower=True),
-    Parameter("steps", "1", "integration steps per strobe", default=48, lower=4, upper=1e6, integer=True),
+    Parameter(
+        "steps",
+        "1",
+        "integration steps per strobe",
+        derived=f"as many as the field needs, at least {LEAST}",
+        lower=4,
+        upper=1e6,
+        integer=True,
+    ),
 )
-# Strobes that follow the run for the verdict and the 0-1 test, and the longest period looked for among them.
-SAMPLES, LONGEST = 1024, 512
 _SECTION = {"verdict", "chaos_k01", "period_multiple"}
-# Repetition is judged to this fraction of the motion; that a motion does not repeat, only if less than the second is left
-# of its transient.
-_REPEATED, _UNSETTLED = 1e-9, 1e-4
-# The bound on what is left of the transient is so many times as large as its exponent says: of a near-degenerate pair the
-# exponents are known to about the inverse of the time only, whatever the standard error is.
-_MARGIN = 1e3
-# Times that a motion is followed for as many strobes again, where what is left of the transient could hide or feign a
-# repetition.
-_MOST_LOOKS = 16
 # What one step needs of this many members is in the innermost caches.
 _CHUNK = 64
 
@@ -122,7 +120,7 @@ class Run(NamedTuple):
     coarse: Record
 
 
-def run_twice(flow: Flow, steps: int, max_time: float, target: float, check: bool) -> Run:
+def run_twice(flow: Flow, steps: Any, max_time: float, target: float, check: bool) -> Run:
     """The growth with ``steps`` and ``steps // 2`` per strobe; ``check``: the latter of all members, otherwise of those
     whose largest exponent is positive beyond its error. One compiled loop serves both."""
 
@@ -133,85 +131,8 @@ def run_twice(flow: Flow, steps: int, max_time: float, target: float, check: boo
         return candidate | check, record
 
     start = jnp.ones(batch_shape(flow), bool)
-    _, both = jax.lax.scan(one, start, jnp.array([steps, max(steps // 2, 1)]))
+    _, both = jax.lax.scan(one, start, jnp.stack([jnp.asarray(steps), jnp.maximum(steps // 2, 1)]))
     return Run(*(jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1)))
-
-
-class Sampling(NamedTuple):
-    """What the strobes after a run show: K of the 0-1 test, the period in strobes, and whether it could be told."""
-
-    k01: Array
-    multiple: Array
-    settled: Array
-
-
-class _Look(NamedTuple):
-    """``SAMPLES`` strobes looked at: how many times before, the state after them and its number, the first section of all,
-    and what has been found of every member."""
-
-    number: Array
-    state: tuple
-    strobe: Array
-    first: Array
-    multiple: Array
-    settled: Array
-
-
-def sample(flow: Flow, steps: int, record: Record, spectrum: Spectrum, k01_for: Array) -> Sampling:
-    """Follow the motion for ``SAMPLES`` strobes; K of the members of ``k01_for``, otherwise 0.
-
-    Motions that decay are followed further until their period can be told from what is left of the transient.
-    """
-    watched = [i for i in range(flow.size) if i not in (*flow.phases, *flow.cyclic)] or [0]
-    shape = batch_shape(flow)
-    decays = jnp.zeros(shape, bool)
-    if flow.turns:
-        decays = record.bounded & (spectrum.values[0] < -STANDARD_ERRORS * spectrum.errors[0])
-
-    def look(seen: _Look) -> _Look:
-        states, state = sampled(flow, steps, seen.state, seen.strobe, SAMPLES)
-        section = states[:, jnp.array(watched)]
-        left = transient_left(flow, record, spectrum, seen.strobe + SAMPLES // 2)
-        multiple, settled = repetition(section, left)
-        # What has been told stands: no member's result depends on how long its neighbours are followed.
-        multiple, settled = (
-            jnp.where(seen.settled, *pair) for pair in ((seen.multiple, multiple), (seen.settled, settled))
-        )
-        first = jnp.where(seen.number == 0, section, seen.first)
-        return _Look(seen.number + 1, state, seen.strobe + SAMPLES, first, multiple, settled)
-
-    def unsettled(seen: _Look) -> Array:
-        return (seen.number == 0) | ((seen.number < _MOST_LOOKS) & jnp.any(decays & ~seen.settled))
-
-    blank = jnp.zeros((SAMPLES, len(watched), *shape))
-    nothing = jnp.zeros(shape, jnp.int64)
-    start = _Look(jnp.int64(0), record.state, record.strobe, blank, nothing, jnp.zeros(shape, bool))
-    seen = jax.lax.while_loop(unsettled, look, start)
-    good = record.bounded & jnp.all(jnp.isfinite(seen.first), axis=(0, 1))
-    k01 = jax.lax.cond(jnp.any(k01_for), largest_k01, lambda x: jnp.zeros(x.shape[2:]), seen.first)
-    k01 = jnp.where(k01_for, k01, 0.0)
-    return Sampling(jnp.where(good, k01, jnp.nan), jnp.where(good, seen.multiple, 0), seen.settled)
-
-
-def transient_left(flow: Flow, record: Record, spectrum: Spectrum, strobe: Array) -> Array:
-    """Bound on the size that the transient still has at a strobe: a multiple of the largest state, decayed at the slowest
-    rate that the standard error allows."""
-    largest = jnp.maximum(jnp.max(record.size, axis=0), state_size(flow, initial_state(flow)))
-    rate = spectrum.values[0] + STANDARD_ERRORS * spectrum.errors[0]
-    return _MARGIN * largest * jnp.exp(jnp.minimum(rate, 0.0) * strobe * flow.period)
-
-
-def repetition(section: Array, left: Array) -> tuple[Array, Array]:
-    """Strobes after which ``section`` repeats to rounding (0: none), and whether this is more than a transient's doing.
-
-    ``left``: what may be left of the transient. A number of strobes after which the motion repeats to within that only,
-    but not to rounding, may be its period or not: a slow drift along a torus looks the same.
-    """
-    scale = jnp.max(jnp.abs(section), axis=(0, 1))
-    left = left / jnp.where(scale > 0, scale, 1.0)
-    tolerance = jnp.stack([jnp.full_like(left, _REPEATED), jnp.maximum(left, _REPEATED)])
-    strict, loose = period_multiple(section, tolerance, LONGEST)
-    return strict, (strict == loose) & ((strict > 0) | (left < _UNSETTLED))
 
 
 class Findings(NamedTuple):
@@ -248,10 +169,16 @@ def _solve(system: System, request: Request, values: Mapping[str, Any], effort: 
     return analyse(system.models["lyapunov"].build(values), request)
 
 
+def steps_of(flow: Flow, request: Request) -> Any:
+    """Steps per strobe: those asked for, or as many as the member that needs most of them does."""
+    given = request.options["steps"]
+    return jnp.max(needed_steps(flow)).astype(jnp.int64) if given is None else given
+
+
 def analyse(flow: Flow, request: Request) -> dict[str, Array]:
     """The requested results of ``flow`` and ``outcome``, the batch as last axis."""
     wanted, options = set(request.outputs), request.options
-    steps, max_time, target = options["steps"], options["max_time"], options["standard_error"]
+    steps, max_time, target = steps_of(flow, request), options["max_time"], options["standard_error"]
     results: dict[str, Array] = {}
     if "paper_estimator" in wanted:
         results["paper_estimator"] = paper_estimator(flow, steps, max_time)
@@ -266,7 +193,8 @@ def analyse(flow: Flow, request: Request) -> dict[str, Array]:
         # What nothing forces is judged by K wherever it does not decay.
         needed = spectrum.values[0] > STANDARD_ERRORS * spectrum.errors[0]
         needed = jnp.ones_like(needed) if "chaos_k01" in wanted or not flow.turns else needed
-        seen = sample(flow, steps, run.fine, spectrum, needed)
+        rate = spectrum.values[0] + STANDARD_ERRORS * spectrum.errors[0]
+        seen = sample(flow, steps, run.fine, rate, needed)
         results["verdict"] = judge(evidence_of(flow, run.fine, found, seen), autonomous=not flow.turns)
         # K tells nothing of a few points over and over again, nor is it asked to.
         repeating = seen.multiple > 0
@@ -304,23 +232,25 @@ def averaging_time(record: Record) -> Array:
 
 
 def _effort(system: System, request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Predicted steps, shape (N,): those of a whole run, or up to where the mean contraction has settled the motion.
+    """Predicted steps, shape (N,): those of a whole run, or up to where the mean contraction has settled the motion, and of
+    the strobes that follow it.
 
     Infinite where a whole run is not worth beginning.
     """
     options, longest = request.options, request.options["max_time"]
-    rate, period = predicted(_contraction, (system.models["lyapunov"].build,), columns)
-    settling = SETTLED / np.maximum(rate, SETTLED / longest) if options["standard_error"] > 0 else longest
-    steps = np.ceil(options["steps"] * np.clip(settling, longest / 4, longest) / period)
-    return np.where(options["steps"] * longest / period <= MOST_STEPS, steps, np.inf)
+    rate, period, needed = predicted(_march, (system.models["lyapunov"].build,), columns)
+    steps = np.where(needed <= MOST, needed, np.inf) if options["steps"] is None else options["steps"]
+    # Without a rate the field has no value: that is found out by marching.
+    settling = SETTLED / np.fmax(rate, SETTLED / longest) if options["standard_error"] > 0 else longest
+    strobes = np.maximum(np.clip(settling, longest / 4, longest) / period, SEGMENTS)
+    following = SAMPLES if _SECTION & set(request.outputs) else 0
+    return np.where(steps * longest / period <= MOST_STEPS, np.ceil(steps * (strobes + following)), np.inf)
 
 
-def _contraction(build: Callable[..., Flow], values: Mapping[str, Any]) -> Array:
-    """Mean rate of contraction of one point where it starts, and its period."""
+def _march(build: Callable[..., Flow], values: Mapping[str, Any]) -> Array:
+    """Mean rate of contraction of one point where it starts, its period, and the steps that it needs."""
     flow = build(values)
-    return jnp.stack(
-        [-divergence(flow, flow.angles(0, 0.0), initial_state(flow)) / flow.size, jnp.asarray(flow.period)]
-    )
+    return jnp.stack([contraction(flow) / flow.size, jnp.asarray(flow.period, float), needed_steps(flow)])
 
 
 def _dimensions(*_: Any) -> tuple[Dimension, ...]:

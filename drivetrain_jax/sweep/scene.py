@@ -186,7 +186,7 @@ def _check_offered(analysis: Analysis, system: System, request: Request) -> None
 def _option(option: Parameter, given: Mapping[str, Any]) -> Value:
     if option.name in given:
         return _checked(option, given[option.name], "options.")
-    if option.default is None:
+    if option.default is None and not option.derived:
         raise InputError(f"options.{option.name}: missing; allowed is {option.allowed}")
     return option.default
 

@@ -1,8 +1,9 @@
 """Growth of tangent vectors along a trajectory, recorded in segments of equal time (Benettin's method).
 
 Benettin, Galgani, Giorgilli & Strelcyn, Meccanica 15 (1980): tangent vectors are carried by the linearised flow and
-made orthonormal after every strobe; the mean logarithms of the lengths that Gram-Schmidt finds are the Lyapunov
-exponents. A record has a fixed number of segments whatever the time, so that memory does not grow with it.
+made orthonormal after every strobe, more often where rounding would not let them part so far; the mean logarithms of the
+lengths that Gram-Schmidt finds are the Lyapunov exponents. A record has a fixed number of segments whatever the time, so
+that memory does not grow with it.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from drivetrain_jax.analysis.chaos.march_steps import needed_parts
 from drivetrain_jax.analysis.chaos.variational import (
     Frame,
     Vector,
@@ -86,7 +88,8 @@ def record_growth(flow: Flow, steps: Any, max_time: float, target: float, active
     """March until every member's standard error is below ``target``, at most ``max_time``, with ``steps`` per strobe.
 
     A motion that decays is followed until its transient is below e^-12, too. Each member stops for itself: its record
-    does not depend on its neighbours. Members not ``active`` do not start.
+    does not depend on its neighbours, but for rounding where one of them has to be made orthonormal within strobes. Members
+    not ``active`` do not start.
     """
     frame = initial_frame(flow)
     shape = frame.state[0].shape
@@ -97,7 +100,7 @@ def record_growth(flow: Flow, steps: Any, max_time: float, target: float, active
         frame, jnp.zeros(shape, jnp.int64), active, jnp.ones(shape, bool), jnp.int64(0),
         jnp.zeros((SEGMENTS, len(frame.tangents[0]), *shape)), record, record, jnp.zeros(shape, jnp.int64),
     )  # fmt: skip
-    segment = one_kernel(flow)(_segment(flow, steps, length))
+    segment = one_kernel(flow)(_segment(flow, steps, needed_parts(flow, steps), length))
     span = length * flow.period
 
     def body(march: _March) -> _March:
@@ -112,19 +115,33 @@ def record_growth(flow: Flow, steps: Any, max_time: float, target: float, active
     )
 
 
-def _segment(flow: Flow, steps: Any, length: Array) -> Callable[[_March, Array], _March]:
-    """The march over one segment, at most ``longest`` strobes; no sums or maxima over an axis: it is one kernel."""
+def _grown(flow: Flow, steps: Any, parts: Array) -> Callable[[Array, Frame], tuple[Frame, Array]]:
+    """The map ``(strobe, frame) -> frame one strobe later``, its vectors orthonormal, and how much each has grown."""
     advance = strobe_map(flow, steps)
+
+    def strobe(number: Array, frame: Frame) -> tuple[Frame, Array]:
+        def part(k: Array, carry: tuple[Frame, Array]) -> tuple[Frame, Array]:
+            frame, growth = carry
+            frame = advance(number, frame, k * steps // parts, (k + 1) * steps // parts)
+            tangents, logs = stored(orthonormal)(frame.tangents)
+            return frame._replace(tangents=tangents), growth + logs
+
+        return jax.lax.fori_loop(0, parts, part, (frame, jnp.zeros_like(frame.tangents[0])))
+
+    return strobe
+
+
+def _segment(flow: Flow, steps: Any, parts: Array, length: Array) -> Callable[[_March, Array], _March]:
+    """The march over one segment, at most ``longest`` strobes; no sums or maxima over an axis: it is one kernel."""
+    advance = _grown(flow, steps, parts)
 
     def strobe(carry: tuple) -> tuple:
         k, frame, number, alive, bounded, growth, size = carry
         moving = alive & (k < length)
-        new = advance(number, frame)
-        tangents, logs = stored(orthonormal)(new.tangents)
+        new, logs = advance(number, frame)
         largest = state_size(flow, new.state)
         well = reduce(jnp.logical_and, map(jnp.isfinite, logs), largest < BOUND)
         moving &= well
-        new = Frame(new.state, tangents, new.contraction)
         frame = jax.tree.map(lambda a, b: jnp.where(moving, a, b), new, frame)
         growth = growth + jnp.where(moving, logs, 0.0)
         left = alive & (k < length) & ~well

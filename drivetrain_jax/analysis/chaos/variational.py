@@ -69,19 +69,21 @@ def one_kernel(flow: Flow) -> Callable[[Callable], Callable]:
     return in_one_kernel if suits_one_kernel(rates, initial_state(flow)) else lambda function: function
 
 
-def strobe_map(flow: Flow, steps: Any) -> Callable[[Array, Frame], Frame]:
+def strobe_map(flow: Flow, steps: Any) -> Callable[..., Frame]:
     """The map ``(strobe, frame) -> frame one strobe later`` by ``steps`` equal steps (an integer, may be traced).
+
+    ``(strobe, frame, first, last)``: by the steps from ``first`` to before ``last`` only.
 
     ``y' = f(t, y)``, ``v' = (df/dy) v`` for every tangent vector (products with the Jacobian by forward
     differentiation) and, if the frame carries it, the integral of ``div f``.
     """
     h = flow.period / steps
 
-    def advance(strobe: Array, frame: Frame) -> Frame:
+    def advance(strobe: Array, frame: Frame, first: Any = 0, last: Any = steps) -> Frame:
         def step(i: Array, frame: Frame) -> Frame:
             return _step(flow, lambda c: flow.angles(strobe, (i + c) / steps), h, frame)
 
-        return jax.lax.fori_loop(0, steps, step, frame)
+        return jax.lax.fori_loop(first, last, step, frame)
 
     return advance
 

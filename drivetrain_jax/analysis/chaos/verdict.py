@@ -107,9 +107,11 @@ def _forced(evidence: Evidence) -> Array:
 
 
 def _autonomous(evidence: Evidence) -> Array:
-    """Kind of a motion that nothing forces: one exponent is zero along any motion that does not rest."""
+    """Kind of a motion that nothing forces: one exponent is zero along any motion that does not rest, and no motion in a
+    plane is a torus: what has no other exponents there is degenerate, or drifts more slowly than the time can tell."""
     zeros = jnp.abs(evidence.spectrum) <= STANDARD_ERRORS * evidence.error + zero_floor(evidence.spectrum)
     count = jnp.sum(zeros, axis=0)
-    kind = jnp.where(count == 0, Verdict.FIXED_POINT, jnp.where(count == 1, Verdict.PERIODIC, Verdict.QUASI_PERIODIC))
+    torus = jnp.where(evidence.roomy, Verdict.QUASI_PERIODIC, Verdict.UNDECIDED)
+    kind = jnp.where(count == 0, Verdict.FIXED_POINT, jnp.where(count == 1, Verdict.PERIODIC, torus))
     sound = ~jnp.isnan(evidence.spectrum[0]) & (~zeros[0] | (evidence.k01 < 1 - CHAOTIC_K))
     return jnp.where(sound, kind, Verdict.UNDECIDED)
