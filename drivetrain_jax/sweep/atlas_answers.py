@@ -127,7 +127,7 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
             asked.named(speed, value) + _BEYOND[_kind(atlas, speed, *end)]
             for value, end in zip(w.safe, w.interval.ends, strict=True)
         )
-        lines.append(f"  {ends}; largest spectral radius {w.largest:.10g} at {speed} = {number(w.where)}")
+        lines.append(f"  {ends}; largest spectral radius {_from_one(w.largest)} at {speed} = {number(w.where)}")
         lines.append(f"    {_checked(w.check)}")
     data = {
         "question": "speed_windows",

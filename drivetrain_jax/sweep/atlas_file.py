@@ -243,9 +243,12 @@ class StoredAtlas:
     def _checked(self, name: str, values: Mapping[str, Any]) -> Any:
         low, high = self.ranges[name]
         try:
-            numbers = np.asarray(values[name], float)
-        except (TypeError, ValueError):
-            raise InputError(f"{name} = {values[name]!r}: allowed are numbers") from None
+            numbers = np.asarray(values[name])
+        except ValueError:
+            # Rows of different lengths.
+            numbers = np.empty(0, object)
+        if numbers.dtype.kind not in "iuf":
+            raise InputError(f"{name} = {shown(values[name])}: allowed are numbers")
         outside = numbers[~((numbers >= low) & (numbers <= high))]
         if outside.size:
             raise InputError(f"{name} = {outside.flat[0]:.10g}: allowed is {self.allowed(name)}")

@@ -264,6 +264,7 @@ def test_windows_say_what_ends_them():
             crossed = end["kind"] == "crossing"
             assert (end["error"] is not None) == (end["multiplier"] is not None) == crossed
             assert safe == pytest.approx(end["value"] + sign * (end["error"] if crossed else 0.0), abs=1e-12)
+    assert "largest spectral radius 1 - " in str(found) and "largest spectral radius 1 at" not in str(found)
 
 
 def test_answers_without_damping_agree_with_direct_solves():

@@ -306,7 +306,9 @@ def test_a_file_of_other_coordinates_is_refused(stored):
         ({"beta": 0.3}, "Omega: missing; allowed is 1 <= Omega <= 2"),
         ({"beta": 0.3, "Omega": 2.5}, "Omega = 2.5: allowed is 1 <= Omega <= 2"),
         ({"beta": [0.3, np.nan], "Omega": 1.5}, "beta = nan: allowed is 0 <= beta <= 0.6, in rad"),
-        ({"beta": "wide", "Omega": 1.5}, "beta = 'wide': allowed are numbers"),
+        ({"beta": "0.3", "Omega": 1.5}, "beta = '0.3': allowed are numbers"),
+        ({"beta": None, "Omega": 1.5}, "beta = None: allowed are numbers"),
+        ({"beta": [[0.1], [0.1, 0.2]], "Omega": 1.5}, "beta = [[0.1], [0.1, 0.2]]: allowed are numbers"),
         (
             {"beta": 0.3, "Omga": 1.5},
             "Omga = 1.5: not a parameter of the atlas (did you mean Omega?); "
