@@ -33,13 +33,11 @@ class ResultFile:
 
     def __init__(self, temporary: Path) -> None:
         self._temporary = temporary
-        self._mapped: mmap.mmap | None = None
 
     def __enter__(self) -> ResultFile:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._mapped = None
         self._temporary.unlink(missing_ok=True)
 
     def lay_out(self, template: Labelled) -> Mapping[str, np.ndarray]:
@@ -49,9 +47,9 @@ class ResultFile:
         """
         places = _write_frame(template, self._temporary)
         with open(self._temporary, "r+b") as file:
-            self._mapped = mmap.mmap(file.fileno(), 0)
+            mapped = mmap.mmap(file.fileno(), 0)
         data = {name: entry.values for name, entry in template.data.items()}
-        return {n: np.ndarray(data[n].shape, data[n].dtype, self._mapped, at) for n, at in places.items()}
+        return {n: np.ndarray(data[n].shape, data[n].dtype, mapped, at) for n, at in places.items()}
 
     def finish(self, path: Path, **attrs: float) -> None:
         """Change these attributes, add checksums, flush all to the disk, and move the file to ``path`` in one step."""
