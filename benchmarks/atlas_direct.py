@@ -13,7 +13,7 @@ import numpy as np
 
 from drivetrain_jax.analysis import Request
 from drivetrain_jax.analysis.periodic.floquet_propagator import ANALYSIS
-from drivetrain_jax.atlas import StabilityAtlas, floquet_rounds, run, solve_rtol, span_parts, stability_atlas
+from drivetrain_jax.atlas import StabilityAtlas, floquet_rounds, run, solve_rtol, stability_atlas
 from drivetrain_jax.systems import get_system
 
 CARDAN = get_system("cardan")
@@ -23,15 +23,15 @@ OUTPUTS = ANALYSIS.default_outputs
 _SIZES = (512, 16)
 
 
-def solvers(rtol: float, parts: int = 1) -> Sequence[Any]:
+def solvers(rtol: float) -> Sequence[Any]:
     """The solvers of ``direct`` for the propagator."""
-    return ANALYSIS.solvers(CARDAN, Request(OUTPUTS, "direct", {"rtol": rtol, "parts": parts}))
+    return ANALYSIS.solvers(CARDAN, Request(OUTPUTS, "direct", {"rtol": rtol}))
 
 
 @cache
-def _batch(index: int, parts: int) -> Callable[..., jax.Array]:
+def _batch(index: int) -> Callable[..., jax.Array]:
     def batch(values: Mapping[str, Any], effort: Any, rtol: Any) -> jax.Array:
-        solver = solvers(rtol, parts)[index]
+        solver = solvers(rtol)[index]
         solve = solver.solve if solver.broadcasts else jax.vmap(solver.solve, in_axes=(0, None), out_axes=-1)
         found = solve(values, effort)
         return jnp.concatenate([found[name] for name in OUTPUTS])
@@ -39,25 +39,25 @@ def _batch(index: int, parts: int) -> Callable[..., jax.Array]:
     return jax.jit(batch)
 
 
-def propagators(columns: Mapping[str, Any], rtol: float = 1e-13, parts: int = 1) -> np.ndarray:
-    """``(N, 16 parts)`` for arrays of parameters."""
-    return solves(columns, rtol, parts)[:, : 16 * parts]
+def propagators(columns: Mapping[str, Any], rtol: float = 1e-13) -> np.ndarray:
+    """``(N, 16)`` for arrays of parameters."""
+    return solves(columns, rtol)[:, :16]
 
 
-def solves(columns: Mapping[str, Any], rtol: float, parts: int) -> np.ndarray:
-    """The same with their errors behind them, ``(N, 16 parts + 16)``; points of similar effort are solved together."""
+def solves(columns: Mapping[str, Any], rtol: float) -> np.ndarray:
+    """The same with their errors behind them, ``(N, 32)``; points of similar effort are solved together."""
     given = np.broadcast_arrays(*(np.atleast_1d(np.asarray(columns[name], float)) for name in NAMES))
     points = dict(zip(NAMES, given, strict=True))
     efforts = np.stack([np.asarray(s.effort(points), float) * s.unit_cost for s in solvers(rtol)])
     choice = np.argmin(efforts, axis=0)
-    out = np.empty((choice.size, 16 * parts + 16))
+    out = np.empty((choice.size, 32))
     for index, size in enumerate(_SIZES):
         mine = np.flatnonzero(choice == index)
         mine = mine[np.argsort(efforts[index, mine], kind="stable")]
         for part in (mine[i : i + size] for i in range(0, mine.size, size)):
             padded = {name: np.pad(x[part], (0, size - part.size), mode="edge") for name, x in points.items()}
             effort = np.int64(efforts[index, part].max() / solvers(rtol)[index].unit_cost)
-            out[part] = np.asarray(_batch(index, parts)(padded, effort, rtol)).T[: part.size]
+            out[part] = np.asarray(_batch(index)(padded, effort, rtol)).T[: part.size]
     return out
 
 
@@ -69,12 +69,12 @@ def cardan_atlas(
 ) -> StabilityAtlas:
     """An atlas of the cardan shaft."""
     fixed = {name: value for name, value in fixed.items() if name not in ranges}
-    names, parts = tuple(ranges), span_parts(CARDAN, ranges, fixed, tolerance)
+    names = tuple(ranges)
 
     def solve(points: np.ndarray) -> np.ndarray:
-        return solves({**fixed, **dict(zip(names, points.T, strict=True))}, solve_rtol(tolerance), parts)
+        return solves({**fixed, **dict(zip(names, points.T, strict=True))}, solve_rtol(tolerance))
 
-    rounds = floquet_rounds(CARDAN, ranges, fixed, tolerance, parts=parts)
+    rounds = floquet_rounds(CARDAN, ranges, fixed, tolerance)
     return stability_atlas(run(rounds, solve), CARDAN, rtol)
 
 

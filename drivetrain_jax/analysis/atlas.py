@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from drivetrain_jax.analysis._base import RTOL, Request, Solver
+from drivetrain_jax.analysis._base import Request, Solver
 from drivetrain_jax.analysis.periodic import floquet_propagator
 from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES, lacks
 from drivetrain_jax.systems import System
@@ -16,8 +16,7 @@ from drivetrain_jax.systems import System
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     solves = floquet_propagator.ANALYSIS
-    options = {**request.options, "parts": 1}
-    return solves.solvers(system, replace(request, outputs=solves.default_outputs, options=options))
+    return solves.solvers(system, replace(request, outputs=solves.default_outputs))
 
 
 ANALYSIS = replace(
@@ -25,9 +24,6 @@ ANALYSIS = replace(
     title="stability atlas",
     variables=VARIABLES,
     default_outputs=("spectral_radius", "spectral_radius_error", "verdict"),
-    # How many parts a chart needs is found, not given.
-    methods={"direct": ("rtol",)},
-    options=(RTOL,),
     solvers=_solvers,
     lacks=lacks,
     continuous=True,

@@ -18,7 +18,6 @@ from drivetrain_jax.atlas.floquet import (
     numbers_per_solve,
     prepare_judging,
     solve_rtol,
-    span_parts,
     stability_atlas,
 )
 from drivetrain_jax.atlas.panels import Atlas, Gap, Panel
@@ -42,7 +41,6 @@ __all__ = [
     "prepare_judging",
     "run",
     "solve_rtol",
-    "span_parts",
     "stability_atlas",
     "to_arrays",
     "values_at",

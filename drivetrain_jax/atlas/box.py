@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from drivetrain_jax.atlas.interpolation import nodes, tensor_nodes
+from drivetrain_jax.atlas.interpolation import nodes
 from drivetrain_jax.atlas.panels import Gap, Panel, position_between
 from drivetrain_jax.atlas.quantity import Quantity
 
@@ -17,26 +17,30 @@ TROUBLED_DEPTH, _MAX_DEPTH = 2, 12
 
 
 class Source(Protocol):
-    """Where the values at nodes come from if they are not solved."""
+    """Where the values at nodes come from if they are not solved: in lines along the coordinate ``axis``, by multiples of
+    ``positions``."""
 
-    def at(self, x: np.ndarray) -> np.ndarray:
-        """Values at points ``(N, d)`` of one box, in coordinates."""
+    axis: int
+    positions: int
 
-    def on_grid(self, axes: Sequence[np.ndarray]) -> np.ndarray:
-        """Values at the points of a grid in C order."""
+    def radians(self, lower: np.ndarray, upper: np.ndarray) -> float:
+        """About half the angle through which values turn on a line between two corners."""
+
+    def start(self, axes: Sequence[np.ndarray]) -> Callable[[], np.ndarray]:
+        """Begin to compute the grid of ``axes`` (coordinates); what is returned waits for its values ``(N, m)``, points in C
+        order, NaN where there are none."""
 
 
 @dataclass(frozen=True)
 class Settings:
     """What all boxes share. ``value_of`` makes values of the quantity ``(N, m)`` from what is solved; with a ``source`` only
-    held-out points are. ``rough`` panels are but a step to others, which are checked again."""
+    held-out points are."""
 
     quantity: Quantity
     tolerance: float
     max_nodes: int
     value_of: Callable[[np.ndarray], np.ndarray] = lambda solved: solved
     source: Source | None = None
-    rough: bool = False
 
     def limit(self, values: np.ndarray) -> float:
         """Largest admissible error of the values, from a sample ``(N, m)`` of them."""
@@ -74,6 +78,11 @@ class Box:
         """Coordinates of points ``t`` in [-1, 1]^d."""
         return (self.lower * (1 - t) + self.upper * (1 + t)) / 2
 
+    def axes(self, degrees: Sequence[int]) -> list[np.ndarray]:
+        """Coordinates of the nodes of a tensor along each of them."""
+        ends = zip(self.lower, self.upper, map(nodes, degrees), strict=True)
+        return [(lower * (1 - t) + upper * (1 + t)) / 2 for lower, upper, t in ends]
+
     def position(self, x: np.ndarray) -> np.ndarray:
         """Points ``t`` in [-1, 1]^d of coordinates ``x``."""
         return position_between(self.lower, self.upper, x)
@@ -98,24 +107,6 @@ class Exploring:
     box: Box
     settings: Settings
     solved: list[Sample] = field(default_factory=list)
-
-    def line(self, t: np.ndarray) -> Generator[np.ndarray, np.ndarray, np.ndarray]:
-        """Values at points ``t`` in [-1, 1]^d, which are not held out."""
-        source = self.settings.source
-        return source.at(self.box.place(t)) if source else (yield from self.solve(t))
-
-    def tensor(
-        self, degrees: Sequence[int], held_out: np.ndarray
-    ) -> Generator[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Values at the nodes of a tensor and at ``held_out`` points in [-1, 1]^d."""
-        source = self.settings.source
-        if source is None:
-            values = yield from self.solve(np.concatenate([tensor_nodes(degrees), held_out]))
-            return np.split(values, [len(values) - len(held_out)])
-        t = [np.broadcast_to(nodes(n)[:, None], (n, len(degrees))) for n in degrees]
-        values = source.on_grid([self.box.place(x)[:, k] for k, x in enumerate(t)])
-        fresh = (yield from self.solve(held_out)) if len(held_out) else np.empty((0, values.shape[1]))
-        return values, fresh
 
     def solve(self, t: np.ndarray) -> Generator[np.ndarray, np.ndarray, np.ndarray]:
         """Solved values at points ``t`` in [-1, 1]^d; those that did not fail are remembered."""

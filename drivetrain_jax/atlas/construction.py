@@ -10,7 +10,8 @@ same questions, so that a run can be replayed from stored answers. Every box goe
 3. acceptance, if what the coefficients left out add up to (the last pairs of slabs continued) and the errors at all
    held-out points are small enough, else growth by the slope of the tail (twice at most), else a split in two halves.
 
-Nodes may come from something cheaper than solves (:func:`construct_from_parts`); held-out points never do.
+Nodes may come from something cheaper than solves (a ``Source``): then there are no probes, and tensors grow until their
+coefficients have fallen. Held-out points are always solved.
 
 A box in which solves fail, or whose coefficients fall like a power (a kink), is halved twice along each coordinate at
 most and then left as a :class:`~drivetrain_jax.atlas.Gap` that says why.
@@ -24,11 +25,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivetrain_jax.atlas.box import TROUBLED_DEPTH, Box, Exploration, Exploring, Settings
+from drivetrain_jax.atlas.box import TROUBLED_DEPTH, Box, Exploration, Exploring, Settings, Source
 from drivetrain_jax.atlas.fitting import fit
+from drivetrain_jax.atlas.given_nodes import fit_given
 from drivetrain_jax.atlas.lines import probe
 from drivetrain_jax.atlas.panels import Atlas, Gap, Panel, inside
-from drivetrain_jax.atlas.parts import Product, parts_quantity, product
 from drivetrain_jax.atlas.quantity import Quantity
 from drivetrain_jax.systems import Coordinate
 
@@ -37,8 +38,6 @@ Rounds = Generator[np.ndarray, np.ndarray, Atlas]
 _Open = tuple[Box, Exploration, np.ndarray]
 _Told = tuple[Box, Exploration, np.ndarray | None]
 MAX_SOLVES, MAX_NODES = 400_000, 128
-# Numbers that are kept of all solves with parts.
-_MOST_NUMBERS = 50_000_000
 # Width of a box in which a coordinate does not vary, relative to it.
 _THINNEST = 1e-15
 # Solves of a panel, those that are least exact, whose errors are followed into its bounds.
@@ -128,46 +127,29 @@ def _keys(points: np.ndarray) -> list[bytes]:
 
 
 def construct(
-    domain: Domain, quantity: Quantity, tolerance: float, *, max_nodes: int = MAX_NODES, max_solves: int = MAX_SOLVES
+    domain: Domain,
+    quantity: Quantity,
+    tolerance: float,
+    *,
+    source: Source | None = None,
+    max_nodes: int = MAX_NODES,
+    max_solves: int = MAX_SOLVES,
 ) -> Rounds:
     """An atlas of ``quantity`` over ``domain`` with errors of about ``tolerance`` times its scale.
 
-    ``max_nodes`` bounds the polynomials of one coordinate. When the next round would exceed ``max_solves``, the boxes that
-    are still open become gaps.
+    With a ``source`` nodes come from there and only held-out points are solved; where the two do not agree the nodes are
+    solved, too. ``max_nodes`` bounds the polynomials of one coordinate. When the next round would exceed ``max_solves``, the
+    boxes that are still open become gaps.
     """
     ledger = Ledger()
     settings = Settings(quantity, tolerance, max_nodes, lambda solved: solved[:, : quantity.size])
-    done = yield from _explored([domain.box()], domain, settings, ledger, max_solves)
+    boxes, done = [domain.box()], []
+    if source:
+        found = yield from _explored(boxes, domain, replace(settings, source=source), ledger, max_solves)
+        done = [part for part in found if isinstance(part, Panel)]
+        boxes = [Box.of(part, TROUBLED_DEPTH) for part in found if isinstance(part, Gap)]
+    done += yield from _explored(boxes, domain, settings, ledger, max_solves)
     return _vouched(_atlas(domain, done, tolerance, ledger), settings, ledger, quantity.size)
-
-
-def construct_from_parts(
-    domain: Domain,
-    quantity: Quantity,
-    count: int,
-    tolerance: float,
-    *,
-    max_solves: int = MAX_SOLVES,
-) -> Rounds:
-    """The same for propagators, from solves that give their ``count`` parts (see :mod:`~drivetrain_jax.atlas.parts`).
-
-    Panels of the parts come first. Those of ``quantity`` lie within them, take their nodes from the product, and are held
-    against solves, in which the errors of both show. Where that fails the nodes are solved.
-    """
-    ledger = Ledger()
-    size = count * quantity.size
-    asked = parts_quantity(quantity, count, tolerance)
-    settings = Settings(asked, tolerance, MAX_NODES, lambda solved: solved[:, :size], rough=True)
-    max_solves = min(max_solves, _MOST_NUMBERS // size)
-    first = yield from _explored([domain.box()], domain, settings, ledger, max_solves)
-    parts = _atlas(domain, first, tolerance, ledger)
-    solved = Settings(quantity, tolerance, MAX_NODES, lambda solved: product(solved[:, :size], count))
-    settings = replace(solved, source=Product(parts, count))
-    done = yield from _explored(map(Box.of, parts.panels), domain, settings, ledger, max_solves)
-    whole = _atlas(domain, [*done, *parts.gaps], tolerance, ledger)
-    boxes = [Box.of(gap, TROUBLED_DEPTH) for gap in whole.gaps]
-    done = yield from _explored(boxes, domain, solved, ledger, max_solves)
-    return _vouched(_atlas(domain, [*whole.panels, *done], tolerance, ledger), solved, ledger, size)
 
 
 def _explored(
@@ -250,6 +232,8 @@ def _vouched(atlas: Atlas, settings: Settings, ledger: Ledger, size: int) -> Atl
 def explore(box: Box, settings: Settings) -> Exploration:
     """Asks for values at points in coordinates; returns what became of the box."""
     exploring = Exploring(box, settings)
+    if settings.source:
+        return (yield from fit_given(exploring, settings.source))
     found = yield from probe(exploring)
     return (yield from fit(exploring, found)) if isinstance(found, list) else found
 

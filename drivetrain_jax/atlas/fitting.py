@@ -6,44 +6,45 @@ import numpy as np
 
 from drivetrain_jax.atlas import decay
 from drivetrain_jax.atlas.box import Exploration, Exploring, Parts, Sample
-from drivetrain_jax.atlas.interpolation import coefficients, evaluate, slabs
+from drivetrain_jax.atlas.interpolation import coefficients, evaluate, slabs, tensor_nodes
 from drivetrain_jax.atlas.panels import Panel
 from drivetrain_jax.atlas.quantity import distance
 
-_HELD_OUT, _MAX_CHECKS = 64, 512
-# Of these for panels that are but a step to others. Nodes whose scale is looked at.
-_ROUGH_CHECKS, _SCALES = 32, 128
+HELD_OUT, _MAX_CHECKS = 64, 512
+# Nodes whose scale is looked at.
+_SCALES = 128
 # Bounds are this many times the largest error at held-out points.
 _SAFETY = 8.0
 # Coefficients below this part of the tolerance are left out: they take up most of the space of a large tensor.
 _NEGLIGIBLE = 1e-3
 _MAX_GROWTHS = 2
 # Nodes of a tensor, and numbers at all of them.
-_MAX_TENSOR, _MAX_NUMBERS = 300_000, 30_000_000
+_MAX_TENSOR, MAX_NUMBERS = 300_000, 30_000_000
 
 
 def fit(exploring: Exploring, degrees: list[int]) -> Exploration:
     """A panel of about ``degrees`` nodes, or what becomes of the box instead."""
     d = len(degrees)
-    most = min(_MAX_TENSOR, _MAX_NUMBERS // exploring.settings.quantity.size)
+    most = min(_MAX_TENSOR, MAX_NUMBERS // exploring.settings.quantity.size)
     for growth in range(_MAX_GROWTHS + 1):
         if np.prod(degrees, dtype=float) > most:
             return exploring.split(int(np.argmax(degrees)), f"more than {most} nodes would be needed")
-        checks = _checks(exploring)
-        extra = scattered(_HELD_OUT, d) if growth == 0 else np.empty((0, d))
-        values, fresh = yield from exploring.tensor(degrees, extra)
-        if not np.isfinite(values).all() or not np.isfinite(fresh).all():
-            return exploring.failed(np.concatenate([values, fresh]))
+        checks = known_checks(exploring)
+        extra = scattered(HELD_OUT, d) if growth == 0 else np.empty((0, d))
+        values = yield from exploring.solve(np.concatenate([tensor_nodes(degrees), extra]))
+        if not np.isfinite(values).all():
+            return exploring.failed(values)
+        values, fresh = np.split(values, [len(values) - len(extra)])
         x = np.concatenate([checks.x, exploring.box.place(extra)])
         checks = Sample(x, np.concatenate([checks.values, fresh]))
         tensor = coefficients(values, degrees)
-        panel, tails, limit = _judge(exploring, tensor, values, checks)
+        panel, tails, limit = judge(exploring, tensor, values, checks)
         if panel is not None:
             return (panel,)
         if any(decay.is_noise(slabs(tensor, k)) for k in range(d) if tails[k] > 1 and degrees[k] > 24):
             return exploring.give_up("the direct solves scatter more than the tolerance allows")
-        degrees = _grown(tensor, tails, limit)
-    return _unresolved(exploring, tails)
+        degrees = grown(tensor, tails, limit)
+    return unresolved(exploring, tails)
 
 
 def scattered(count: int, d: int) -> np.ndarray:
@@ -55,40 +56,51 @@ def scattered(count: int, d: int) -> np.ndarray:
     return np.cos(np.pi * fractions)
 
 
-def _checks(exploring: Exploring) -> Sample:
+def known_checks(exploring: Exploring) -> Sample:
     """Solves that are no nodes of the next tensor, evenly thinned out."""
     d = len(exploring.box.lower)
     none = Sample(np.empty((0, d)), np.empty((0, exploring.settings.quantity.size)))
     samples = [none, *exploring.box.known, *exploring.solved]
     x = np.concatenate([s.x for s in samples])
     values = np.concatenate([s.values for s in samples])
-    most = _ROUGH_CHECKS if exploring.settings.rough else _MAX_CHECKS
-    chosen = np.linspace(0, len(x) - 1, min(len(x), most)).astype(int)
+    chosen = np.linspace(0, len(x) - 1, min(len(x), _MAX_CHECKS)).astype(int)
     return Sample(x[chosen], values[chosen])
 
 
-def _judge(
-    exploring: Exploring, tensor: np.ndarray, values: np.ndarray, checks: Sample
+def judge(
+    exploring: Exploring, tensor: np.ndarray, values: np.ndarray, checks: Sample, spare: float = 0.5
 ) -> tuple[Panel | None, np.ndarray, float]:
-    """The panel if it is good enough; what each coordinate leaves out over its limit; that limit."""
+    """The panel if it is good enough; what each coordinate leaves out over its limit, half the tolerance; that limit.
+
+    Errors at the held-out points may be the part ``spare`` of the tolerance.
+    """
     quantity, tolerance = exploring.settings.quantity, exploring.settings.tolerance
     t = exploring.box.position(checks.x)
     few = values[:: -(-len(values) // _SCALES)]
     scale = quantity.scale(np.concatenate([few, checks.values]))
-    limit, spare = tolerance * scale.min(), 1.0 if exploring.settings.rough else 0.5
-    tails = np.array([decay.remainder(slabs(tensor, k), limit) for k in range(tensor.ndim - 1)]) / (spare * limit)
-    tensor = np.where(np.max(np.abs(tensor), axis=-1, keepdims=True) > _NEGLIGIBLE * limit, tensor, 0.0)
+    limit = tolerance * scale.min()
+    tails = np.array([decay.remainder(slabs(tensor, k), limit) for k in range(tensor.ndim - 1)]) / (limit / 2)
+    tensor = _without(tensor, _NEGLIGIBLE * limit)
     fitted = evaluate(tensor, t)
-    relative = quantity.relative_error(fitted, checks.values, scale[len(few) :])
-    if relative.max() > spare * tolerance or tails.max() > 1:
-        return None, tails, spare * limit
     errors = distance(fitted, checks.values)
+    if (errors / scale[len(few) :]).max() > spare * tolerance or tails.max() > 1:
+        return None, tails, limit / 2
     derived = np.abs(quantity.derived(fitted) - quantity.derived(checks.values))
     bounds = float(_SAFETY * errors.max()), _SAFETY * derived.max(axis=0, initial=0.0)
-    return Panel(exploring.box.lower, exploring.box.upper, tensor, *bounds), tails, spare * limit
+    return Panel(exploring.box.lower, exploring.box.upper, tensor, *bounds), tails, limit / 2
 
 
-def _grown(tensor: np.ndarray, tails: np.ndarray, limit: float) -> list[int]:
+def _without(tensor: np.ndarray, negligible: float) -> np.ndarray:
+    """``tensor`` without the coefficients below ``negligible``, as small as it then can be."""
+    large = np.max(np.abs(tensor), axis=-1) > negligible
+    kept = tuple(
+        slice(int(np.max(np.flatnonzero(large.any(axis=tuple(set(range(large.ndim)) - {k}))), initial=0)) + 1)
+        for k in range(large.ndim)
+    )
+    return np.where(large[..., None], tensor, 0.0)[kept]
+
+
+def grown(tensor: np.ndarray, tails: np.ndarray, limit: float) -> list[int]:
     """More nodes where the tail is too large; a few everywhere if only the held-out points are missed."""
     degrees = list(tensor.shape[:-1])
     if tails.max() <= 1:
@@ -97,6 +109,7 @@ def _grown(tensor: np.ndarray, tails: np.ndarray, limit: float) -> list[int]:
     return [decay.extrapolated(s, limit) if tail > 1 else n for n, s, tail in zip(degrees, sizes, tails, strict=True)]
 
 
-def _unresolved(exploring: Exploring, tails: np.ndarray) -> Parts:
+def unresolved(exploring: Exploring, tails: np.ndarray) -> Parts:
+    """What becomes of a box whose tensor has grown often enough."""
     axis = int(np.argmax(tails)) if tails.max() > 1 else None
     return exploring.trouble("not resolved where its edges are: not smooth", axis)

@@ -16,9 +16,8 @@ from drivetrain_jax.atlas.interpolation import envelope
 # Points of a line at first; each refinement doubles the intervals.
 _LINE = 17
 # A line is resolved to this fraction of the tolerance, and the tensor has so many nodes more: lines along the edges do
-# not see everything. Less where what is made of the panels is checked, and nodes are solved, and with three coordinates and
-# more, where every node counts and there are more lines.
-_THOROUGH, _ROUGH, _MANY = (1 / 8, 2), (1 / 4, 1), (1 / 2, 0)
+# not see everything. Less with three coordinates and more, where every node counts and there are more lines.
+_THOROUGH, _MANY = (1 / 8, 2), (1 / 2, 0)
 # Most lines at which a coordinate is probed.
 _MAX_LINES = 8
 
@@ -60,10 +59,10 @@ def probe(exploring: Exploring) -> Probe:
     d = len(exploring.box.lower)
     places = [(axis, corner) for axis in range(d) for corner in _corners(d, axis)]
     t = np.concatenate([_along(corner, axis, decay.lobatto(_LINE)) for axis, corner in places])
-    values = yield from exploring.line(t)
+    values = yield from exploring.solve(t)
     if not np.isfinite(values).all():
         return exploring.failed(values)
-    fraction, margin = _MANY if d > 2 else _ROUGH if exploring.settings.rough else _THOROUGH
+    fraction, margin = _MANY if d > 2 else _THOROUGH
     limit = exploring.settings.limit(values) * fraction
     lines = [_Line(*place, v) for place, v in zip(places, np.split(values, len(places)), strict=True)]
 
@@ -83,7 +82,7 @@ def _refine(exploring: Exploring, lines: list[_Line], limit: float, margin: int)
             if hopeless:
                 return hopeless
         t = [_along(line.corner, line.axis, decay.lobatto(2 * len(line.values) - 1)[1::2]) for line in open_lines]
-        values = yield from exploring.line(np.concatenate(t))
+        values = yield from exploring.solve(np.concatenate(t))
         if not np.isfinite(values).all():
             return exploring.failed(values)
         for line, new in zip(open_lines, np.split(values, np.cumsum([len(x) for x in t])[:-1]), strict=True):

@@ -32,15 +32,8 @@ class Quantity:
     ``scale(values)`` ``(N,)``: an error of the values (Euclidean norm) divided by this is what the tolerance of an atlas
     limits; by default the largest norm among the points. ``derived(values)`` ``(N, k)``: numbers for whose errors
     panels vouch as well, because bounds that follow from that of the values would be too wide; by default none.
-    ``relative(fitted, exact)`` ``(N,)`` is the error that the tolerance limits if that is not the distance over the scale,
-    which then only tells how small coefficients may be left out.
     """
 
     size: int
     scale: Callable[[np.ndarray], np.ndarray] = _largest
     derived: Callable[[np.ndarray], np.ndarray] = _nothing
-    relative: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
-
-    def relative_error(self, fitted: np.ndarray, exact: np.ndarray, scale: np.ndarray) -> np.ndarray:
-        """What the tolerance limits at every point, ``(N,)``, of which ``scale`` is the scale."""
-        return self.relative(fitted, exact) if self.relative else distance(fitted, exact) / scale

@@ -18,7 +18,6 @@ from drivetrain_jax.atlas import (
     floquet_rounds,
     numbers_per_solve,
     solve_rtol,
-    span_parts,
     stability_atlas,
 )
 from drivetrain_jax.atlas.construction import MAX_SOLVES
@@ -47,10 +46,9 @@ def build_atlas(
     fixed = fixed_of(scene, ranges)
     rtol = scene.request.options["rtol"]
     tolerance = _tolerance(scene)
-    parts = span_parts(scene.system, ranges, fixed, tolerance)
-    rounds = floquet_rounds(scene.system, ranges, fixed, tolerance, max_solves or MAX_SOLVES, parts)
-    options = {"rtol": solve_rtol(tolerance), "parts": parts}
-    width = numbers_per_solve(scene.system, ranges, fixed, parts)
+    rounds = floquet_rounds(scene.system, ranges, fixed, tolerance, max_solves or MAX_SOLVES)
+    options = {"rtol": solve_rtol(tolerance)}
+    width = numbers_per_solve(scene.system, ranges, fixed)
     first, threads, values = 0, Where(work.where.threads), None
     while True:
         try:
@@ -81,7 +79,7 @@ def node_engine(scene: Scene, ranges: Mapping[str, tuple[float, float]], count: 
     domain = floquet_domain(scene.system, ranges, fixed)
     spread = np.cos(np.pi * np.random.default_rng(0).random((count, len(ranges))))
     points = domain.points(domain.box().place(spread))
-    options = {"rtol": solve_rtol(_tolerance(scene)), "parts": 1}
+    options = {"rtol": solve_rtol(_tolerance(scene))}
     return Engine(_solves(scene, fixed, tuple(ranges), points, options), full_size=True)
 
 

@@ -25,7 +25,7 @@ from drivetrain_jax.systems._flow import Flow  # noqa: E402
 from drivetrain_jax.systems._modal import FAMILIES, Block, SpringSystem  # noqa: E402
 from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator  # noqa: E402
 from drivetrain_jax.systems._shaft import Shaft  # noqa: E402
-from drivetrain_jax.systems._smooth import Coordinate, Smoothness  # noqa: E402
+from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness  # noqa: E402
 
 ENTRY_POINT_GROUP = "drivetrain_jax.systems"
 _BUILT_IN = ("cardan", "tripod", "rattle", "planetary", "bicardan")
@@ -43,6 +43,7 @@ __all__ = [
     "Parameter",
     "PiecewiseLinearOscillator",
     "Resonances",
+    "Series",
     "Shaft",
     "Smoothness",
     "SpringSystem",

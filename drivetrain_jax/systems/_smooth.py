@@ -32,10 +32,26 @@ def identity(name: str) -> Coordinate:
 
 
 @dataclass(frozen=True)
+class Series:
+    """``A(t) = A0(t) + x A1(t)`` with the coordinate x of ``parameter``, for the reduced form of a ``FloquetModel``.
+
+    ``A0`` only leads from the ``first`` states to the others: ``A0[i, j] = 0`` unless ``i >= first > j``. The propagator is
+    then a power series in x whose terms are integrals.
+    """
+
+    parameter: str
+    first: int
+
+
+@dataclass(frozen=True)
 class Smoothness:
-    """Coordinates by parameter in which the results of a model are smooth; one that is missing is its own coordinate."""
+    """Coordinates by parameter in which the results of a model are smooth; one that is missing is its own coordinate.
+
+    With ``series`` the nodes of an atlas over its parameter are not solved one by one.
+    """
 
     coordinates: Mapping[str, Coordinate]
+    series: Series | None = None
 
     def coordinate(self, parameter: str) -> Coordinate:
         """The coordinate of ``parameter``."""

@@ -29,7 +29,7 @@ from drivetrain_jax.systems._base import (
     System,
     Values,
 )
-from drivetrain_jax.systems._smooth import Coordinate, Smoothness
+from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness
 from drivetrain_jax.systems.cardan_units import PhysicalShaft
 
 PARAMETERS = (
@@ -361,7 +361,9 @@ SMOOTH = Smoothness(
         "gamma": Coordinate(
             "1/sqrt(gamma)", lambda x: 1 / np.sqrt(x), _inverse_square, lambda x: -0.5 / (np.sqrt(x) * np.asarray(x))
         ),
-    }
+    },
+    # Without 1/Omega only the gyroscopic terms are left, by which q acts on P.
+    series=Series("Omega", first=2),
 )
 
 SYSTEM = System(

@@ -129,7 +129,7 @@ def test_growth_of_what_is_made_on_the_way():
         t = np.arange(1, pieces) / pieces
         squares = (norm(whole - lost(t)) * norm(lost(t)) / norm(whole)) ** 2 / 2
         expected = math.sqrt((squares.sum() + 1) / pieces)
-        found = explicit_propagator(system, jnp.int32(160), (), 0, pieces)
+        found = explicit_propagator(system, jnp.int32(160), (), pieces)
         assert float(found.growth) == pytest.approx(expected, rel=1e-6)
         np.testing.assert_allclose(np.diag(full(found)), np.exp(-24), rtol=1e-9)
     assert float(implicit_propagator(system, jnp.int32(32)).growth) == pytest.approx(expected, rel=1e-6)
@@ -217,22 +217,21 @@ def test_bound_holds_for_stiff_systems_whose_determinant_is_not_known(rates):
     assert bound < 60 * np.finfo(float).eps * float(stiffness_of(system)) * exact
 
 
-@pytest.mark.parametrize(("steps", "parts"), [(24, 0), (24, 1), (30, 7), (48, 6)])
-def test_a_fourfold_coarser_solution_tells_the_same_error(steps, parts):
-    """Both estimates hold and agree; where parts leave no room for the ratio, it is smaller."""
+@pytest.mark.parametrize("steps", [24, 30, 48])
+def test_a_fourfold_coarser_solution_tells_the_same_error(steps):
+    """Both estimates hold and agree."""
     system, exact = rotating((-3.0, 0.5)), rotating_exactly((-3.0, 0.5))
 
     def solve(ratio):
         return direct_monodromy(
             system,
-            lambda n: explicit_propagator(system, n, (), parts),
+            lambda n: explicit_propagator(system, n, ()),
             jnp.int32(steps),
             (),
             0.0,
             1e-8,
             EXPLICIT_ORDER,
             ratio,
-            max(parts, 1),
         )
 
     two, four = (jax.jit(solve, static_argnums=0)(ratio) for ratio in (2, 4))
@@ -240,7 +239,7 @@ def test_a_fourfold_coarser_solution_tells_the_same_error(steps, parts):
     for found in (two, four):
         error = np.linalg.norm(np.asarray(found.matrix) - exact)
         assert error <= float(found.error) * np.linalg.norm(exact)
-        assert parts == 0 or error <= np.linalg.norm(np.asarray(found.change)) <= 20 * error
+        assert error <= np.linalg.norm(np.asarray(found.change)) <= 20 * error
 
 
 def test_the_coarser_solution_of_a_damped_system_is_stable():
@@ -252,7 +251,7 @@ def test_the_coarser_solution_of_a_damped_system_is_stable():
         return explicit_propagator(system, steps, ())
 
     def solve(least):
-        return direct_monodromy(system, propagate, jnp.int32(240), (), 0.0, 1e-5, EXPLICIT_ORDER, 4, 1, least)
+        return direct_monodromy(system, propagate, jnp.int32(240), (), 0.0, 1e-5, EXPLICIT_ORDER, 4, least)
 
     least = stable_steps(system)
     found = jax.jit(solve)(least)

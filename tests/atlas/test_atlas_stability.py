@@ -48,12 +48,13 @@ def test_first_chart_of_the_theory_page(chart):
 
 
 def equal_to_rounding(points, grid, rtol):
-    """The same closed form at points as on a grid without nodes; rounding grows where multipliers are nearly double."""
+    """The same closed form at points as on a grid without nodes; rounding, a tenth of the bounds of some 1e-13, grows where
+    multipliers are nearly double."""
     rho, error = points["spectral_radius"], points["spectral_radius_error"]
     difference = np.abs(rho - grid["spectral_radius"])
     assert (difference <= error).all() and (difference <= 0.1 * error + 2e-14 * rho).mean() > 0.99
     ratio = error / grid["spectral_radius_error"]
-    assert (np.abs(ratio - 1) < 0.02).mean() > 0.99
+    assert (np.abs(ratio - 1) < 0.04).mean() > 0.99
     at_the_limit = np.abs(error / (10 * rtol * rho) - 1) < 0.02
     assert (points["verdict"] == grid["verdict"]).all() and (
         (points["outcome"] == grid["outcome"]) | at_the_limit

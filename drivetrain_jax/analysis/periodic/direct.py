@@ -38,8 +38,8 @@ class Monodromy(NamedTuple):
     The coefficients a_k of ``matrix``'s characteristic polynomial are wrong by at most ``error`` times the k-th power of
     its spectral radius; ``met`` says that this is the target or the limit of rounding. ``residual`` is det Z minus its
     exact value (Liouville) in units of the n-th power of a lower bound of the spectral radius; 0 if that is not known.
-    ``parts`` are those of the :class:`Propagator` that it was computed from; where there are any, ``change`` is the
-    estimated error of ``matrix``, entry by entry: four times the finer result's distance to the limit of the two.
+    ``change`` is the estimated error of ``matrix``, entry by entry: four times the finer result's distance to the limit of
+    the two, where there were two.
     """
 
     matrix: Array
@@ -47,7 +47,6 @@ class Monodromy(NamedTuple):
     error: Array
     met: Array
     residual: Array
-    parts: Array | None = None
     change: Array | None = None
 
 
@@ -123,10 +122,10 @@ def compare(
     """Monodromy matrix of ``fine`` and its error; ``stiffness`` as of :func:`stiffness_of`.
 
     ``reduction`` is the error of ``coarse`` over that of ``fine``, less one. The propagators themselves are compared too,
-    lest the errors of a product that is nearly of rank one are small by accident, and so are parts, if there are any, all
-    relative to their own norms. Rounding of the matrix products accumulates like the square root of ``steps``. What is made
-    on the way grows until the end as ``fine`` says, but never by so much that it would not show in ``coarse``. That of the
-    entries of A is the same in both propagators: it shifts exponents by `_ENTRIES` units of the ``stiffness``.
+    lest the errors of a product that is nearly of rank one are small by accident, relative to their own norm. Rounding of
+    the matrix products accumulates like the square root of ``steps``. What is made on the way grows until the end as
+    ``fine`` says, but never by so much that it would not show in ``coarse``. That of the entries of A is the same in both
+    propagators: it shifts exponents by `_ENTRIES` units of the ``stiffness``.
     """
     other = jnp.exp(coarse.log_scale - fine.log_scale) * coarse.matrix
     z_fine, z_coarse, norm = _assembled(system, fine.matrix, other)
@@ -134,13 +133,12 @@ def compare(
     scale = root_scale(a_fine)
     n = a_fine.shape[0]
     log_scale = system.halves * fine.log_scale
-    differences = [jnp.sqrt(jnp.sum((z_fine - z_coarse) ** 2, axis=(0, 1))) / scale]
+    apart = z_fine - z_coarse
+    differences = [jnp.sqrt(jnp.sum(apart**2, axis=(0, 1))) / scale]
     differences += [jnp.abs(a_fine[k] - a_coarse[k]) / scale ** (k + 1) for k in range(n)]
-    differences.append(_relative_difference(fine.matrix[None], other[None])[0])
-    change = None
-    if fine.parts is not None:
-        change = (4 / reduction) * (z_fine - z_coarse)
-        differences.append(jnp.max(_relative_difference(fine.parts, coarse.parts), axis=0))
+    differences.append(
+        jnp.sqrt(jnp.sum((fine.matrix - other) ** 2, axis=(0, 1)) / jnp.sum(fine.matrix**2, axis=(0, 1)))
+    )
     difference = 4 * jnp.max(jnp.stack(differences), axis=0)
     truncation = difference / reduction
     residual = jnp.zeros_like(scale)
@@ -155,12 +153,7 @@ def compare(
     of_entries = _ENTRIES * system.halves * stiffness * np.finfo(float).eps
     rounding = at_the_end + jnp.minimum((growth - 1) * at_the_end, difference) + of_entries
     met = truncation <= jnp.maximum(rtol, rounding)
-    return Monodromy(z_fine, log_scale, truncation + rounding, met, residual, fine.parts, change)
-
-
-def _relative_difference(a: Array, b: Array) -> Array:
-    """Of matrices ``(K, n, n, ...)``, in Frobenius' norm."""
-    return jnp.sqrt(jnp.sum((a - b) ** 2, axis=(1, 2)) / jnp.sum(a**2, axis=(1, 2)))
+    return Monodromy(z_fine, log_scale, truncation + rounding, met, residual, (4 / reduction) * apart)
 
 
 def direct_monodromy(
@@ -172,7 +165,6 @@ def direct_monodromy(
     rtol: float,
     order: int,
     ratio: int = 2,
-    parts: int = 1,
     least: Array | float = 0.0,
 ) -> Monodromy:
     """Refine from ``steps`` predicted steps (traced integer) until the error of every lane is at most ``rtol``.
@@ -180,19 +172,18 @@ def direct_monodromy(
     ``propagate(steps)`` gives the propagator of ``system`` with batch shape ``shape``, by a scheme of order ``order``.
     ``stiffness`` is that of :func:`stiffness_of`. A lane that overflows gets two doublings to recover and then no longer
     holds up the others; after six the error tells what was reached.
-    The first comparison is with ``ratio`` times fewer steps, as far as there are as many in every one of ``parts`` parts. It
-    costs the less the more that is, but the order of the scheme has to show in both: a small ``rtol`` makes sure of that, as
-    does that they are not fewer than the ``least`` with which it is stable, or than four fifths of the steps.
+    The first comparison is with ``ratio`` times fewer steps. It costs the less the more that is, but the order of the scheme
+    has to show in both: a small ``rtol`` makes sure of that, as does that they are not fewer than the ``least`` with which
+    it is stable, or than four fifths of the steps.
     """
-    each = jnp.maximum(-(-steps // parts), 2)
-    stable = jnp.minimum(jnp.ceil(least / parts), each * 4 // 5).astype(each.dtype)
-    begin, predicted = parts * jnp.maximum(stable, -(-each // ratio)), parts * each
+    predicted = jnp.maximum(steps, 2)
+    stable = jnp.minimum(jnp.ceil(least), predicted * 4 // 5).astype(predicted.dtype)
+    begin = jnp.maximum(stable, -(-predicted // ratio))
     zero = jnp.zeros(shape)
     # Traced once, not for its shapes and again for its values.
     propagate = jax.jit(propagate)
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape), jax.eval_shape(propagate, steps))
-    change = None if blank.parts is None else blank.matrix
-    unknown = Monodromy(blank.matrix, zero, jnp.full(shape, jnp.inf), jnp.zeros(shape, bool), zero, blank.parts, change)
+    unknown = Monodromy(blank.matrix, zero, jnp.full(shape, jnp.inf), jnp.zeros(shape, bool), zero, blank.matrix)
 
     def unfinished(state: tuple) -> Array:
         count, current, _, result = state

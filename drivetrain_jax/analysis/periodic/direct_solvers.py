@@ -45,16 +45,14 @@ def direct_solvers(
     form: Form,
     results: Results,
     chunks: tuple[int, int] = (512, 64),
-    parts: int = 0,
     stiff: Form | None = None,
 ) -> tuple[Solver, ...]:
     """Solvers that give ``results(model, monodromy)`` from the monodromy matrix of ``form(model)``.
 
-    ``rtol`` predicts the effort, ``target`` is the error that every point is refined to. The propagators over ``parts``
-    equal parts of the span are kept, and how far their product may be wrong; neither if there are none. ``stiff(model)`` is
-    the form for the implicit scheme, and for the explicit one where damping is strong; None if it is no other one.
+    ``rtol`` predicts the effort, ``target`` is the error that every point is refined to. ``stiff(model)`` is the form for
+    the implicit scheme, and for the explicit one where damping is strong; None if it is no other one.
     """
-    solve = partial(_solve, system, target, results, parts)
+    solve = partial(_solve, system, target, results)
 
     def explicit(name: str, form: Form, effort: Callable[[Mapping[str, Any]], Any]) -> Solver:
         return Solver(
@@ -92,7 +90,6 @@ def _solve(
     system: System,
     target: float,
     results: Results,
-    parts: int,
     form: Form,
     values: Mapping[str, Any],
     effort: Array,
@@ -108,16 +105,16 @@ def _solve(
     def in_lanes(steps: Array) -> Propagator:
         def block(part: Mapping[str, Any], count: int) -> Propagator:
             own = form(system.models["floquet"].build(part))
-            return explicit_propagator(own, steps, (count,) if shape else (), parts, pieces)
+            return explicit_propagator(own, steps, (count,) if shape else (), pieces)
 
         return in_blocks(block, values, shape[0] if shape else 1, LANES)
 
     def one(steps: Array) -> Propagator:
-        return implicit_propagator(periodic, steps, parts)
+        return implicit_propagator(periodic, steps)
 
     propagate = in_lanes if explicit else one
     order = EXPLICIT_ORDER if explicit else IMPLICIT_ORDER
     stiffness = stiffness_of(periodic, shape)
     ratio = jnp.where(target <= _FINE, _RATIO, 2) if explicit and model.explicit_steps else 2
-    found = direct_monodromy(periodic, propagate, effort, shape, stiffness, target, order, ratio, max(parts, 1), least)
+    found = direct_monodromy(periodic, propagate, effort, shape, stiffness, target, order, ratio, least)
     return results(model, found)

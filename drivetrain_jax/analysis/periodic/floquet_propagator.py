@@ -1,8 +1,7 @@
 """The propagator of a linear periodic system over the span of its reduced form: what an atlas interpolates.
 
 ``Phi`` is a smooth function of the parameters, which multipliers and spectral radius are not. It is computed by the
-direct solvers of ``floquet`` with two step sizes, whose difference tells its error. The option ``parts`` asks for the
-propagators over so many equal parts of the span, one after the other, instead of their product.
+direct solvers of ``floquet`` with two step sizes, whose difference tells its error.
 
 Scenes know it only as ``atlas`` (``analysis/atlas.py``), which is why it has that name and the model of that name.
 """
@@ -16,7 +15,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.periodic.direct import Monodromy
 from drivetrain_jax.analysis.periodic.direct_solvers import direct_solvers
@@ -26,7 +25,7 @@ from drivetrain_jax.systems import LinearPeriodic, System
 PROPAGATOR, CHANGE = "propagator", "propagator_change"
 VARIABLES = (
     Variable(PROPAGATOR, "1", "entries of the propagator over the span of the reduced form, by rows", ("entry",)),
-    Variable(CHANGE, "1", "estimated error of the propagator over the whole span, by rows", ("whole_entry",)),
+    Variable(CHANGE, "1", "estimated error of the propagator, by rows", ("entry",)),
 )
 # An atlas asks for a hundred points at a time: large chunks would leave most lanes, and a core, without work.
 _CHUNKS = (32, 16)
@@ -49,13 +48,12 @@ def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
         lambda model: whole_span(model.reduced),
         lambda model, phi: _results(phi, request.outputs),
         _CHUNKS,
-        request.options["parts"],
     )
 
 
 def _results(phi: Monodromy, outputs: tuple[str, ...]) -> dict[str, Array]:
-    matrices = {PROPAGATOR: phi.parts, CHANGE: phi.change * jnp.exp(phi.log_scale)}
-    entries = {name: matrix.reshape(-1, *phi.met.shape) for name, matrix in matrices.items()}
+    matrices = {PROPAGATOR: phi.matrix, CHANGE: phi.change}
+    entries = {name: (jnp.exp(phi.log_scale) * x).reshape(-1, *phi.met.shape) for name, x in matrices.items()}
     finite = jnp.all(jnp.isfinite(jnp.concatenate(list(entries.values()))), axis=0)
     outcome = jnp.where(finite, jnp.where(phi.met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET), Outcome.NOT_FINITE)
     results = {name: jnp.where(finite, entry, jnp.nan) for name, entry in entries.items()}
@@ -63,7 +61,7 @@ def _results(phi: Monodromy, outputs: tuple[str, ...]) -> dict[str, Array]:
 
 
 def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
-    return tuple(Dimension(name, "row times size plus column", ()) for name in ("entry", "whole_entry"))
+    return tuple(Dimension(name, "row times size plus column", ()) for name in ("entry",))
 
 
 ANALYSIS = Analysis(
@@ -71,11 +69,11 @@ ANALYSIS = Analysis(
     title="Propagator of a linear periodic system, for its atlas",
     variables=VARIABLES,
     default_outputs=(PROPAGATOR, CHANGE),
-    methods={"direct": ("rtol", "parts")},
+    methods={"direct": ("rtol",)},
     method_titles={
         "direct": "direct solves of floquet at the nodes of Chebyshev panels",
     },
-    options=(RTOL, Parameter("parts", "1", "equal parts of the span", default=1, lower=1, integer=True)),
+    options=(RTOL,),
     solvers=_solvers,
     dimensions=_dimensions,
 )

@@ -27,15 +27,12 @@ from drivetrain_jax.systems import LinearPeriodic
 class Propagator(NamedTuple):
     """``Phi = exp(log_scale) matrix``, shape ``(n, n, ...)``.
 
-    ``parts`` are the propagators over ``K`` equal parts of the span, the first one first, ``(K, n, n, ...)``, of which
-    ``Phi`` is the product; None for ``K = 0``. ``growth`` is how much larger at the end an error is that was made on the way
-    than one made there, the root of the mean square of ``|Phi(T, t)| |Phi(t, 0)| / |Phi(T, 0)|`` (1 at t = T) over some
-    instants; None if none were looked at.
+    ``growth`` is how much larger at the end an error is that was made on the way than one made there, the root of the mean
+    square of ``|Phi(T, t)| |Phi(t, 0)| / |Phi(T, 0)|`` (1 at t = T) over some instants; None if none were looked at.
     """
 
     matrix: Array
     log_scale: Array
-    parts: Array | None = None
     growth: Array | None = None
 
 
@@ -50,12 +47,12 @@ Rows = list[Array]
 
 
 def explicit_propagator(
-    system: LinearPeriodic, steps: Array, shape: tuple[int, ...], parts: int = 0, pieces: Array | int = 1
+    system: LinearPeriodic, steps: Array, shape: tuple[int, ...], pieces: Array | int = 1
 ) -> Propagator:
     """``Phi`` by ``steps`` equal steps of the 12-stage Runge-Kutta scheme of order 8 (DOP853), batch shape ``shape``.
 
-    Fastest for batches of up to about ``LANES``. ``steps`` is a multiple of ``parts``. Where there are not several of these
-    to be returned, the growth is looked at between so many ``pieces`` of the span, up to ``PIECES``.
+    Fastest for batches of up to about ``LANES``. The growth is looked at between so many ``pieces`` of the span, up to
+    ``PIECES``.
     """
     zeros: list[list[bool]] = []
 
@@ -82,19 +79,7 @@ def explicit_propagator(
         rows = mark(march)(first, last, system.span / steps, split.fixed)
         return Propagator(jnp.stack(rows).reshape(len(zeros), len(zeros), *shape), jnp.zeros(shape))
 
-    return _in_parts(part, steps, parts, pieces)
-
-
-def _in_parts(part: Callable[[Array, Array], Propagator], steps: Array, parts: int, pieces: Array | int) -> Propagator:
-    """``part(first, last)`` over all steps, looked at in ``pieces``, or over ``parts`` equal numbers of them."""
-    if parts < 2:
-        whole = _in_pieces(part, steps, pieces)
-        return whole._replace(parts=(jnp.exp(whole.log_scale) * whole.matrix)[None] if parts else None)
-    each = steps // parts
-    found = jax.lax.map(lambda k: part(k * each, (k + 1) * each), jnp.arange(parts, dtype=steps.dtype))
-    product = jax.lax.fori_loop(1, parts, lambda k, p: stored(matmul)(found.matrix[k], p), found.matrix[0])
-    scale = jnp.exp(found.log_scale)[:, None, None]
-    return Propagator(product, jnp.sum(found.log_scale, axis=0), found.matrix * scale)
+    return _in_pieces(part, steps, pieces)
 
 
 def _in_pieces(part: Callable[[Array, Array], Propagator], steps: Array, pieces: Array | int) -> Propagator:
@@ -200,7 +185,7 @@ STAGES = 8
 IMPLICIT_ORDER = 8
 
 
-def implicit_propagator(system: LinearPeriodic, steps: Array, parts: int = 0) -> Propagator:
+def implicit_propagator(system: LinearPeriodic, steps: Array) -> Propagator:
     """``Phi`` of one point by ``steps`` equal panels of Radau IIA collocation with 8 stages (order 15, L-stable).
 
     The stage values solve ``Y_i - h sum_j a_ij A(t_j) Y_j = I``; the last one is the panel's propagator. The product
@@ -223,4 +208,4 @@ def implicit_propagator(system: LinearPeriodic, steps: Array, parts: int = 0) ->
     def part(first: Array, last: Array) -> Propagator:
         return Propagator(*jax.lax.fori_loop(first, last, body, (jnp.eye(n), jnp.zeros(()))))
 
-    return _in_parts(part, steps, parts, PIECES)
+    return _in_pieces(part, steps, PIECES)

@@ -1,0 +1,107 @@
+"""The panel of a box whose nodes a source gives in lines, for less than solves: only held-out points are solved.
+
+With one or two coordinates the tensor begins with enough nodes for most boxes, and grows until its coefficients have fallen.
+Of lines over more coordinates there are many: along each of these the edges are looked at first.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+
+from drivetrain_jax.atlas import decay
+from drivetrain_jax.atlas.box import Exploration, Exploring, Sample, Source
+from drivetrain_jax.atlas.fitting import HELD_OUT, MAX_NUMBERS, grown, judge, known_checks, scattered, unresolved
+from drivetrain_jax.atlas.interpolation import analysis_matrix, coefficients, envelope, slabs
+
+# Lines to begin with, and those that show how many a coordinate needs.
+_LINES, _PROBES = 32, 64
+# Nodes beyond those that coefficients ask for: edges do not see everything. Along lines, nodes beyond the radians in units
+# of their cube root.
+_SPARE, _BEYOND = 2, 10.0
+_MAX_GROWTHS = 8
+
+
+def fit_given(exploring: Exploring, source: Source) -> Exploration:
+    """A panel whose nodes are those of ``source``, held against solves, or what becomes of the box instead."""
+    d, most = len(exploring.box.lower), MAX_NUMBERS // exploring.settings.quantity.size
+    radians = source.radians(exploring.box.lower, exploring.box.upper)
+    if radians > exploring.settings.max_nodes:
+        return exploring.split(source.axis, "not resolved")
+    # Along it cos(r x) and sin(r x) have coefficients J_n(r), which fall from n = r on.
+    along = min(round(radians + _BEYOND * np.cbrt(radians)), exploring.settings.max_nodes)
+    degrees = [max(along, 1) if k == source.axis else _LINES for k in range(d)]
+    if d > 2:
+        degrees = _probed(exploring, source, _suited(degrees, source))
+    checks: Sample | None = None
+    for _ in range(_MAX_GROWTHS + 1):
+        largest = int(np.argmax(degrees))
+        if degrees[largest] > exploring.settings.max_nodes or np.prod(degrees, dtype=float) > most:
+            return exploring.split(largest, "not resolved")
+        degrees = _suited(degrees, source)
+        waiting = source.start(exploring.box.axes(degrees))
+        if checks is None:
+            # Beside the nodes.
+            solved = yield from exploring.solve(_held_out(d))
+            if not np.isfinite(solved).all():
+                return exploring.failed(solved)
+            checks = known_checks(exploring)
+        values = waiting()
+        if not np.isfinite(values).all():
+            return exploring.trouble("no values at the nodes")
+        tensor = coefficients(values, degrees)
+        panel, tails, limit = judge(exploring, tensor, values, checks, spare=1.0)
+        if panel is not None:
+            return (panel,)
+        if tails.max() <= 1:
+            return exploring.give_up("the nodes are not what is solved")
+        degrees = _resized(tensor, tails, limit)
+    return unresolved(exploring, tails)
+
+
+def _held_out(d: int) -> np.ndarray:
+    """The corners of [-1, 1]^d, where propagators are largest, and scattered points."""
+    corners = np.array(list(product((-1.0, 1.0), repeat=d)))
+    return np.concatenate([corners, scattered(HELD_OUT - len(corners), d)])
+
+
+def _suited(degrees: list[int], source: Source) -> list[int]:
+    """``degrees``, and as many more as cost nothing."""
+    return [-(-n // source.positions) * source.positions if k == source.axis else n for k, n in enumerate(degrees)]
+
+
+def _probed(exploring: Exploring, source: Source, degrees: list[int]) -> list[int]:
+    """Nodes that each coordinate needs along the edges of the box."""
+    box, d = exploring.box, len(exploring.box.lower)
+    ends = [np.array(pair) for pair in zip(box.lower, box.upper, strict=True)]
+    counts = [degrees[k] if k == source.axis else _PROBES for k in range(d)]
+    along = box.axes(counts)
+    degrees = [1] * d
+    started = []
+    for k in set(range(d)) - {source.axis}:
+        axes = [along[j] if j in (k, source.axis) else ends[j] for j in range(d)]
+        started.append((k, [len(axis) for axis in axes], source.start(axes)))
+    for k, shape, waiting in started:
+        values = waiting()
+        limit = exploring.settings.limit(values) / 2
+        tensor = values.reshape(*shape, -1)
+        for axis in (k, source.axis):
+            sizes = slabs(np.tensordot(analysis_matrix(shape[axis]), tensor, axes=(1, axis)), 0)
+            needed = _needed(sizes, limit) if sizes[-3:].max() <= limit else decay.extrapolated(sizes, limit)
+            degrees[axis] = max(degrees[axis], needed + _SPARE)
+    return degrees
+
+
+def _resized(tensor: np.ndarray, tails: np.ndarray, limit: float) -> list[int]:
+    """More nodes where the tail is too large, and no more than are needed elsewhere."""
+    more = zip(tensor.shape, grown(tensor, tails, limit), tails, strict=False)
+    return [
+        count if tail > 1 else min(n, _needed(slabs(tensor, k), limit) + _SPARE)
+        for k, (n, count, tail) in enumerate(more)
+    ]
+
+
+def _needed(sizes: np.ndarray, limit: float) -> int:
+    """How many polynomials leave out nothing above ``limit``."""
+    return int(np.count_nonzero(envelope(sizes) > limit))

@@ -1,0 +1,158 @@
+"""Nodes of an atlas from power series along one coordinate: a whole line of them for the price of a few solves."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from functools import lru_cache
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._machine import usable_cores
+from drivetrain_jax._threads import threads
+from drivetrain_jax.analysis.numerics.kernels import compiler_options
+from drivetrain_jax.analysis.numerics.predictions import Words, predicted, split
+from drivetrain_jax.analysis.periodic.direct import stable_steps
+from drivetrain_jax.analysis.periodic.floquet_effort import explicit_effort
+from drivetrain_jax.analysis.periodic.series import propagators_along
+from drivetrain_jax.atlas.construction import Domain
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic, Series, Smoothness, System
+
+# Lines that are computed together, and what the number of positions along them is a multiple of, so that few kernels serve
+# all panels.
+_LANES, _POSITIONS = 16, 48
+# Parts of the span for each step that the explicit scheme takes at 1e-10: series then leave out 3e-14 of the propagator. How
+# many fewer are enough for each digit less, four at most. Parts for each step that decay takes.
+_PARTS, _LEAST, _SPARED, _MOST_SPARED, _DECAY = 0.1, 3e-14, 0.0095, 4, 3.0
+# What series may leave out, as part of the tolerance. A line that leaves out more is computed again with twice the parts.
+_SHARPER, _MOST_PARTS = 1e-3, 4_000
+# Below this tolerance rounding of the parts shows in their product. So it does where decay takes so many steps: the product
+# is then small against the parts.
+_TOO_FINE, _STIFF = 5e-13, 50
+# Where steps are predicted, and the angle of one of them.
+_STEPS_AT, _RADIANS = 1e-10, 0.14
+
+Key = tuple[Callable[..., FloquetModel], Series, tuple[str, ...], Words, tuple[tuple[str, tuple[int, ...]], ...]]
+
+
+def series_nodes(system: System, domain: Domain, tolerance: float) -> SeriesNodes | None:
+    """The source of nodes for ``domain``; None where the system declares none or the parts would not be exact enough."""
+    smooth = system.models["atlas"].smooth or Smoothness({})
+    if smooth.series is None or smooth.series.parameter not in domain.parameters or tolerance < _TOO_FINE:
+        return None
+    corners = np.array(list(itertools.product(*zip(domain.lower, domain.upper, strict=True))))
+    columns = {**domain.fixed, **dict(zip(domain.parameters, corners.T, strict=True))}
+    decay = float(np.max(predicted(_stable_steps, (system.models["floquet"].build,), columns)))
+    return SeriesNodes(system, domain, smooth.series, decay, tolerance) if decay <= _STIFF else None
+
+
+def _stable_steps(build: Callable[..., FloquetModel], values: Any) -> Array:
+    return stable_steps(build(values).reduced)
+
+
+class SeriesNodes:
+    """Propagators on grids of coordinates, as a source of nodes for :func:`construct`."""
+
+    positions = _POSITIONS
+
+    def __init__(self, system: System, domain: Domain, series: Series, decay: float, tolerance: float) -> None:
+        self._system, self._domain, self._series = system, domain, series
+        self.axis = domain.parameters.index(series.parameter)
+        target = max(_SHARPER * tolerance, _LEAST)
+        self._left_out = 10 * target
+        self._parts = _PARTS - _SPARED * min(math.log10(target / _LEAST), _MOST_SPARED)
+        self._least = 1 + math.ceil(_DECAY * decay)
+        words, numbers = split(domain.fixed)
+        self._fixed = {name: np.asarray(value, float) for name, value in numbers.items()}
+        names = tuple(name for name in domain.parameters if name != series.parameter)
+        shapes = tuple((name, value.shape) for name, value in self._fixed.items())
+        self._key = (system.models["floquet"].build, series, names, words, shapes)
+
+    def radians(self, lower: np.ndarray, upper: np.ndarray) -> float:
+        """About half the angle through which propagators turn on a line between two corners, by the steps that it takes."""
+        pairs = [np.array(pair) for pair in zip(lower, upper, strict=True)]
+        end = max(abs(pairs[self.axis]))
+        _, steps = self._lines([pair if k != self.axis else np.array([end]) for k, pair in enumerate(pairs)])
+        return _RADIANS * float(np.max(steps)) * float(np.ptp(pairs[self.axis])) / (2 * end) if end else 0.0
+
+    def start(self, axes: Sequence[np.ndarray]) -> Callable[[], np.ndarray]:
+        """Begin to compute the grid of ``axes``; what is returned waits for its values ``(N, n n)``, points in C order.
+
+        Values are NaN on lines along which the series does not converge.
+        """
+        x = axes[self.axis]
+        end = x[np.argmax(np.abs(x))]
+        columns, steps = self._lines([axis if k != self.axis else np.array([end]) for k, axis in enumerate(axes)])
+        parts = np.maximum(np.ceil(self._parts * steps), self._least)
+        order = np.argsort(-parts, kind="stable")
+        chunks = [order[i : i + _LANES] for i in range(0, len(order), _LANES)]
+        pool = threads(usable_cores(), "tile")
+        pending = [
+            pool.submit(self._along, {n: c[chosen] for n, c in columns.items()}, end, parts[chosen[0]], x)
+            for chosen in chunks
+        ]
+
+        def values() -> np.ndarray:
+            try:
+                found = np.empty((len(parts), *pending[0].result().shape[1:]))
+                for chosen, future in zip(chunks, pending, strict=True):
+                    found[chosen] = future.result()[: len(chosen)]
+            finally:
+                for future in pending:
+                    future.cancel()
+            counts = [len(axis) for k, axis in enumerate(axes) if k != self.axis]
+            return np.moveaxis(found.reshape(*counts, *found.shape[1:]), -2, self.axis).reshape(-1, found.shape[-1])
+
+        return values
+
+    def _lines(self, axes: Sequence[np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """The parameters of all lines on a grid, that of the series apart, and steps for its value in ``axes``."""
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+        columns = dict(zip(self._domain.parameters, self._domain.points(grid).T, strict=True))
+        steps = explicit_effort(self._system, {**self._domain.fixed, **columns}, _STEPS_AT)
+        return {name: column for name, column in columns.items() if name != self._series.parameter}, steps
+
+    def _along(self, columns: Mapping[str, np.ndarray], end: float, parts: float, x: np.ndarray) -> np.ndarray:
+        """Values on up to ``_LANES`` lines, ``(_LANES, P, n n)``; ``end`` is the coordinate ``x`` that is largest."""
+        kernel = _kernel(self._key, len(x)).result()
+        full = {name: np.pad(column, (0, _LANES - len(column)), mode="edge") for name, column in columns.items()}
+        with np.errstate(divide="ignore"):
+            ends = self._domain.coordinates[self.axis].inverse(np.array([0.0, end]))
+        while True:
+            hopeless = not parts <= _MOST_PARTS
+            number = np.int64(1 if hopeless else parts)
+            phi, left_out = map(np.asarray, kernel(full, self._fixed, ends, number, x / end if end else x))
+            exact = (left_out <= self._left_out) & (not hopeless)
+            if hopeless or exact.all():
+                break
+            parts = 2 * parts if np.isfinite(left_out).all() else math.inf
+        return np.where(exact[:, None, None], np.transpose(phi.reshape(len(x), -1, _LANES), (2, 0, 1)), np.nan)
+
+
+@lru_cache(maxsize=16)
+def _kernel(key: Key, positions: int) -> Future[Any]:
+    """:func:`propagators_along` for ``_LANES`` lines, compiled in a thread of its own."""
+    build, series, names, words, fixed = key
+
+    def lines(columns: dict, numbers: dict, ends: Array, parts: Array, x: Array) -> tuple[Array, Array]:
+        given = {**dict(words), **numbers, **columns}
+
+        def form(value: Array) -> LinearPeriodic:
+            return build({**given, series.parameter: value}).reduced
+
+        return propagators_along(form, ends, series.first, _LANES, parts, x)
+
+    def array(*shape: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(shape, float)
+
+    def compiled() -> Any:
+        columns, numbers = {name: array(_LANES) for name in names}, {name: array(*shape) for name, shape in fixed}
+        arguments = columns, numbers, array(2), jax.ShapeDtypeStruct((), np.int64), array(positions)
+        return jax.jit(lines, compiler_options=compiler_options(_LANES, short_loops=True)).lower(*arguments).compile()
+
+    return threads(2, "series").submit(compiled)

@@ -1,0 +1,82 @@
+"""Propagators as power series along a coordinate, against closed forms and direct solves."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks.atlas_direct import BASE, CARDAN, propagators
+from drivetrain_jax.analysis.periodic.series import propagators_along
+from drivetrain_jax.systems import LinearPeriodic
+
+LANES = 3
+X = np.array([1.0, -0.35, 0.0, 0.6])
+
+
+def along(form, ends, first, parts, x=X):
+    phi, left_out = propagators_along(form, jnp.asarray(ends), first, LANES, jnp.int64(parts), jnp.asarray(x))
+    return np.moveaxis(np.asarray(phi), -1, 0), np.asarray(left_out)
+
+
+def chain(parameter):
+    """q' = x (1 + t) P, P' = (g - x (1 + t)) q: a rotation by x (t + t^2/2) for g = 0, and g leads from q to P for x = 0."""
+    return LinearPeriodic(
+        lambda t: ((0, parameter * (1 + t)), (jnp.array([2.0, 1.0, 0.0]) * t - parameter * (1 + t), 0)), 1.5
+    )
+
+
+def test_a_rotation_and_a_chain():
+    found, left_out = along(chain, (0.0, 2.0), 1, 4)
+    angle = 2.0 * X * (1.5 + 1.5**2 / 2)
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    assert found[2] == pytest.approx(np.moveaxis(turn, -1, 0), abs=1e-13)
+    # Where x = 0 only P' = g q is left.
+    assert found[0, 2] == pytest.approx(np.array([[1.0, 0.0], [2.25, 1.0]]), abs=1e-14)
+    assert (np.linalg.det(found) == pytest.approx(1.0, abs=1e-12)) and left_out.max() < 1e-12
+
+
+def test_fewer_parts_leave_out_more_and_say_so():
+    exact, _ = along(chain, (0.0, 20.0), 1, 200)
+    before = np.inf
+    for parts in (20, 30, 45):
+        found, left_out = along(chain, (0.0, 20.0), 1, parts)
+        error = np.abs(found - exact).max()
+        # The last term is there: what is left out is the next one, and what time nodes leave out.
+        assert error < 0.1 * before and error < 100 * left_out.max()
+        before = error
+    assert before < 1e-10
+
+
+def test_entries_elsewhere_where_the_coordinate_is_0_are_noticed():
+    def friction(parameter):
+        return LinearPeriodic(lambda t: ((0, parameter), (-parameter, jnp.array([0.0, -0.1, 0.0]))), 1.0)
+
+    assert np.isinf(along(friction, (0.0, 1.0), 1, 4)[1]).tolist() == [False, True, False]
+    # That one leads from the second state to the first.
+    assert np.isinf(along(lambda p: LinearPeriodic(lambda t: ((0, 1 + p), (-p, 0)), 1.0), (0.0, 1.0), 1, 4)[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "steepest"),
+    [({}, 1.569), ({"zeta": 0.0}, 1.57), ({"zeta": 0.1, "alpha": 3.0}, 1.3), ({"mu": 20.0, "gamma": 0.5}, 1.55)],
+)
+def test_lines_of_the_cardan_shaft_against_direct_solves(change, steepest):
+    """Steep angles, strong damping and speeds down to 0.05."""
+    fixed = {**BASE, **change}
+    beta, omega = np.array([0.0, 1.0, steepest]), 0.05
+    build = CARDAN.models["floquet"].build
+
+    def form(parameter):
+        return build({**fixed, "beta": jnp.asarray(beta), "Omega": parameter}).reduced
+
+    x = np.array([1.0, 0.5, 0.02])
+    found, left_out = jax.jit(lambda ends, x: propagators_along(form, ends, 2, LANES, jnp.int64(250), x))(
+        jnp.array([np.inf, omega]), jnp.asarray(x)
+    )
+    assert np.asarray(left_out).max() < 1e-14
+    for k, angle in enumerate(beta):
+        exact = propagators({**fixed, "beta": angle, "Omega": omega / x}).reshape(-1, 4, 4)
+        error = np.linalg.norm(np.asarray(found)[..., k] - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
+        assert error.max() < 3e-12
