@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 
 from drivetrain_jax.atlas import decay
-from drivetrain_jax.atlas.box import Exploration, Exploring, Sample, Source
+from drivetrain_jax.atlas.box import Exploration, Exploring, Source
 from drivetrain_jax.atlas.fitting import HELD_OUT, MAX_NUMBERS, grown, judge, known_checks, scattered, unresolved
 from drivetrain_jax.atlas.interpolation import analysis_matrix, coefficients, envelope, slabs
 
@@ -20,24 +20,28 @@ _LINES, _PROBES = 32, 64
 # Nodes beyond those that coefficients ask for: edges do not see everything. Along lines, nodes beyond the radians in units
 # of their cube root.
 _SPARE, _BEYOND = 2, 10.0
+# Boxes along lines up to which it is worth while to cut them.
+_MOST_BOXES = 100
 _MAX_GROWTHS = 8
 
 
 def fit_given(exploring: Exploring, source: Source) -> Exploration:
     """A panel whose nodes are those of ``source``, held against solves, or what becomes of the box instead."""
     d, most = len(exploring.box.lower), MAX_NUMBERS // exploring.settings.quantity.size
+    most_along, checks = exploring.settings.max_nodes, None
     radians = source.radians(exploring.box.lower, exploring.box.upper)
-    if radians > exploring.settings.max_nodes:
+    if not radians < _MOST_BOXES * most_along:
+        return exploring.give_up("too many nodes would be needed")
+    if radians > most_along:
         return exploring.split(source.axis, "not resolved")
-    # Along it cos(r x) and sin(r x) have coefficients J_n(r), which fall from n = r on.
-    along = min(round(radians + _BEYOND * np.cbrt(radians)), exploring.settings.max_nodes)
+    # Along lines cos(r x) and sin(r x) have coefficients J_n(r), which fall from n = r on.
+    along = min(round(radians + _BEYOND * np.cbrt(radians)), most_along)
     degrees = [max(along, 1) if k == source.axis else _LINES for k in range(d)]
     if d > 2:
         degrees = _probed(exploring, source, _suited(degrees, source))
-    checks: Sample | None = None
     for _ in range(_MAX_GROWTHS + 1):
         largest = int(np.argmax(degrees))
-        if degrees[largest] > exploring.settings.max_nodes or np.prod(degrees, dtype=float) > most:
+        if degrees[largest] > most_along or np.prod(degrees, dtype=float) > most:
             return exploring.split(largest, "not resolved")
         degrees = _suited(degrees, source)
         waiting = source.start(exploring.box.axes(degrees))
@@ -72,25 +76,27 @@ def _suited(degrees: list[int], source: Source) -> list[int]:
 
 
 def _probed(exploring: Exploring, source: Source, degrees: list[int]) -> list[int]:
-    """Nodes that each coordinate needs along the edges of the box."""
+    """Nodes that each coordinate needs along the edges of the box; ``degrees`` where there are no values."""
     box, d = exploring.box, len(exploring.box.lower)
     ends = [np.array(pair) for pair in zip(box.lower, box.upper, strict=True)]
     counts = [degrees[k] if k == source.axis else _PROBES for k in range(d)]
     along = box.axes(counts)
-    degrees = [1] * d
+    found = [1] * d
     started = []
     for k in set(range(d)) - {source.axis}:
         axes = [along[j] if j in (k, source.axis) else ends[j] for j in range(d)]
         started.append((k, [len(axis) for axis in axes], source.start(axes)))
     for k, shape, waiting in started:
         values = waiting()
+        if not np.isfinite(values).all():
+            return degrees
         limit = exploring.settings.limit(values) / 2
         tensor = values.reshape(*shape, -1)
         for axis in (k, source.axis):
             sizes = slabs(np.tensordot(analysis_matrix(shape[axis]), tensor, axes=(1, axis)), 0)
             needed = _needed(sizes, limit) if sizes[-3:].max() <= limit else decay.extrapolated(sizes, limit)
-            degrees[axis] = max(degrees[axis], needed + _SPARE)
-    return degrees
+            found[axis] = max(found[axis], needed + _SPARE)
+    return found
 
 
 def _resized(tensor: np.ndarray, tails: np.ndarray, limit: float) -> list[int]:

@@ -74,11 +74,15 @@ class SeriesNodes:
         self._key = (system.models["floquet"].build, series, names, words, shapes)
 
     def radians(self, lower: np.ndarray, upper: np.ndarray) -> float:
-        """About half the angle through which propagators turn on a line between two corners, by the steps that it takes."""
+        """About half the angle through which propagators turn on a line between two corners, by the steps that it takes;
+        infinite where these are too many."""
         pairs = [np.array(pair) for pair in zip(lower, upper, strict=True)]
         end = max(abs(pairs[self.axis]))
         _, steps = self._lines([pair if k != self.axis else np.array([end]) for k, pair in enumerate(pairs)])
-        return _RADIANS * float(np.max(steps)) * float(np.ptp(pairs[self.axis])) / (2 * end) if end else 0.0
+        most = float(np.max(steps))
+        if not self._parts * most <= _MOST_PARTS:
+            return math.inf
+        return _RADIANS * most * float(np.ptp(pairs[self.axis])) / (2 * end) if end else 0.0
 
     def start(self, axes: Sequence[np.ndarray]) -> Callable[[], np.ndarray]:
         """Begin to compute the grid of ``axes``; what is returned waits for its values ``(N, n n)``, points in C order.

@@ -15,7 +15,7 @@ from drivetrain_jax.sweep.scene import Scene
 _WORTHWHILE = 100_000
 # The share of the effort of solving every point that "auto" may spend on it. What is not covered by then is solved directly.
 _SHARE = 1 / 8
-# An atlas of one, two, ... parameters is not to be expected from fewer.
+# What an atlas of one, two, ... parameters takes at least, in direct solves.
 _FEWEST = (100, 500, 2_000, 8_000)
 # Points whose effort is predicted to tell that of all.
 _SAMPLE = 4096

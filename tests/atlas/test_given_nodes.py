@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from benchmarks.atlas_direct import BASE, CARDAN, cardan_atlas, direct_radius, random_points
+from drivetrain_jax.analysis.numerics.predictions import predicted
+from drivetrain_jax.analysis.periodic.floquet_effort import explicit_effort
+from drivetrain_jax.analysis.periodic.series import propagators_along
 from drivetrain_jax.atlas import Domain, Quantity, construct, run, values_at
 from drivetrain_jax.atlas import series as series_module
 from drivetrain_jax.atlas.floquet import floquet_domain
@@ -16,7 +21,6 @@ from drivetrain_jax.systems import Series, Smoothness
 from drivetrain_jax.systems._smooth import identity
 
 TOLERANCE = 1e-9
-NAMES = ("s", "x", "y", "z")
 SQUARE = Domain(("x", "s"), (-1.0, 1.0), (1.0, 30.0), (identity("x"), identity("s")), {})
 WAVES = Quantity(2, derived=lambda values: values[:, :1] * values[:, 1:])
 
@@ -91,6 +95,13 @@ def test_lines_that_turn_too_far_are_halved_before_anything_is_computed():
     assert atlas.solves == 126
     assert all(source.rate * np.ptp([panel.lower[1], panel.upper[1]]) / 2 < 128 for panel in atlas.panels)
     assert len(source.asked) <= 6
+
+
+@pytest.mark.parametrize("rate", [np.inf, np.nan, 1e5])
+def test_lines_that_would_have_to_be_cut_too_often_are_solved(rate):
+    source = Lines(rate=rate)
+    atlas = run(construct(SQUARE, WAVES, TOLERANCE, source=source), waves)
+    assert holds(atlas) and not source.asked
 
 
 def test_many_coordinates_are_looked_at_along_the_edges_first():
@@ -205,6 +216,29 @@ def test_the_grid_is_in_c_order_whatever_the_order_of_the_parameters():
         found[order] = np.transpose(values, (*(order.index(name) for name in axes), 3))
     first, *others = found.values()
     assert all(other == pytest.approx(first, abs=1e-12) for other in others)
+
+
+def test_parts_by_predicted_steps_are_short_enough():
+    """Random shafts, with the number of parts that an atlas takes for each, against three times as many."""
+    lanes, random = 16, np.random.default_rng(1)
+    columns = {
+        "beta": random.uniform(0.0, 1.55, lanes),
+        **{name: 10 ** random.uniform(-1, 1.3, lanes) for name in ("alpha", "mu", "gamma")},
+        "zeta": 10 ** random.uniform(-4, -1, lanes),
+    }
+    omega, build = 0.1, CARDAN.models["floquet"].build
+    decay = predicted(series_module._stable_steps, (build,), columns | {"Omega": np.full(lanes, omega)})
+    steps = explicit_effort(CARDAN, columns | {"Omega": np.full(lanes, omega)}, series_module._STEPS_AT)
+    parts = np.maximum(np.ceil(series_module._PARTS * steps), 1 + np.ceil(series_module._DECAY * decay))
+    ends, x = jnp.array([np.inf, omega]), jnp.array([1.0, 0.7, -0.2])
+    along = jax.jit(
+        lambda parts: propagators_along(
+            lambda value: build({**columns, "Omega": value}).reduced, ends, 2, lanes, parts, x
+        )
+    )
+    for lane, count in enumerate(parts):
+        found, exact = (np.asarray(along(jnp.int64(n))[0])[..., lane] for n in (count, 3 * count))
+        assert np.abs(found - exact).max() < 1e-13 * np.abs(exact).max()
 
 
 def test_lines_that_leave_out_too_much_are_computed_again(monkeypatch):

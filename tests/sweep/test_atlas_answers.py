@@ -16,7 +16,7 @@ from drivetrain_jax.atlas.boundaries import boundaries
 from drivetrain_jax.atlas.exclusion import critical_points
 from drivetrain_jax.atlas.sensitivity import direct_sensitivity
 from drivetrain_jax.atlas.tiles import tiles
-from drivetrain_jax.sweep import atlas_answers
+from drivetrain_jax.sweep import atlas_answers, rounds
 from drivetrain_jax.sweep.atlas_answers import _from_one
 from drivetrain_jax.sweep.atlas_chart import chart
 from drivetrain_jax.sweep.atlas_file import StoredAtlas
@@ -282,7 +282,8 @@ def test_without_damping_tips_are_where_the_angle_is_0():
     assert chart(source, {"beta": (0.9, 1.2)}, 20)["tip"].size == 0
 
 
-def test_an_atlas_without_a_panel_answers_what_it_can():
+def test_an_atlas_without_a_panel_answers_what_it_can(monkeypatch):
+    monkeypatch.setattr(rounds, "MAX_SOLVES", 10)
     source = panels((0.0, 0.5), (0.001, 0.002), rtol=1e-8)
     atlas = dt.open_atlas(source)
     assert not atlas.stability.atlas.panels
