@@ -20,7 +20,7 @@ CARDAN = get_system("cardan")
 BASE = dict(CARDAN.presets["base"])
 NAMES = CARDAN.models["floquet"].parameters
 OUTPUTS = ANALYSIS.default_outputs
-_SIZES = (512, 16)
+_SIZES = (512, 16, 64)
 
 
 def solvers(rtol: float) -> Sequence[Any]:

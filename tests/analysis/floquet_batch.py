@@ -26,7 +26,9 @@ def request(method: str, rtol: float, outputs=EVERYTHING, **options) -> Request:
 class FloquetBatch:
     """Results by name, the points as first axis, of arrays of parameters; points by falling cost of their solver."""
 
-    def __init__(self, method="direct", system: System = CARDAN, outputs=EVERYTHING, chunk=(256, 8, 256), **options):
+    def __init__(
+        self, method="direct", system: System = CARDAN, outputs=EVERYTHING, chunk=(256, 8, 256, 64), **options
+    ):
         self.method, self.system, self.outputs, self.options = method, system, outputs, options
         self.chunk = chunk
         self.names = system.models["floquet"].parameters

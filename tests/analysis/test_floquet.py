@@ -197,7 +197,7 @@ def test_errors_that_cancel_in_the_product_do_not_deceive():
     easy = (1.0563183658089397, 2.7349631755532484, 0.5761121672699921, 10.00834660652285, 0.0793118790, 49.2510470811)
     hard = (1.430161738887235, 2.831786623776442, 0.6559498501124649, 6.079785878549506, 0.07667072270795319)
     points = np.array([(*hard, 51.92629177049027), easy]).T
-    batch = FloquetBatch("direct", chunk=(2, 1, 2))
+    batch = FloquetBatch("direct", chunk=(2, 1, 2, 2))
     names = ("beta", "Omega", "zeta", "alpha", "mu", "gamma")
     loose, sharp = (batch(dict(zip(names, points, strict=True)), rtol=rtol) for rtol in (1e-5, 1e-12))
     error = np.abs(loose["spectral_radius"] - sharp["spectral_radius"])

@@ -7,8 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.atlas_direct import BASE, CARDAN, propagators
+import drivetrain_jax as dt
+from benchmarks.atlas_direct import BASE, CARDAN, monodromy, propagators
 from drivetrain_jax.analysis.periodic.series import propagators_along
+from drivetrain_jax.sweep.engine import Engine
+from drivetrain_jax.sweep.scene import load_scene
 from drivetrain_jax.systems import LinearPeriodic
 
 LANES = 3
@@ -80,3 +83,37 @@ def test_lines_of_the_cardan_shaft_against_direct_solves(change, steepest):
         exact = propagators({**fixed, "beta": angle, "Omega": omega / x}).reshape(-1, 4, 4)
         error = np.linalg.norm(np.asarray(found)[..., k] - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
         assert error.max() < 3e-12
+
+
+def test_very_slow_speeds_are_marched_explicitly_and_apart_from_others():
+    """Omega = 0.001: 21,000 steps, of which the implicit scheme would make 26 times the work. Against power series."""
+    omega = [1.0, 1e-3, 1.1e-3]
+    scene = {
+        "system": "cardan",
+        "analysis": "floquet",
+        "outputs": ["spectral_radius", "spectral_radius_error"],
+        "points": {"Omega": omega},
+        "fixed": {**BASE, "beta": 1.2},
+        "options": {"method": "direct"},
+    }
+    engine = Engine(load_scene(scene))
+    assert [(group.solver.name.split(", ")[-1], group.size) for group in engine.plan.groups] == [
+        ("direct: explicit Runge-Kutta of order 8", 1),
+        ("long marches", 2),
+    ]
+    found = dt.run(scene)
+
+    def form(parameter):
+        return CARDAN.models["floquet"].build({**BASE, "beta": 1.2, "Omega": parameter}).reduced
+
+    x = 1e-3 / np.array(omega)
+    phi, left_out = jax.jit(lambda ends, x: propagators_along(form, ends, 2, 1, jnp.int64(2500), x))(
+        jnp.array([np.inf, 1e-3]), jnp.asarray(x)
+    )
+    exact = np.abs(np.linalg.eigvals(monodromy(np.asarray(phi)[..., 0].reshape(3, 16)))).max(axis=1)
+    assert float(left_out[0]) < 1e-13
+    assert (np.abs(found.spectral_radius - exact) <= found.spectral_radius_error).all()
+    assert found.spectral_radius.values == pytest.approx(exact, abs=1e-11)
+    # The long marches of the others leave the first one as exact as it is alone.
+    alone = dt.run(scene | {"points": {"Omega": omega[:1]}})
+    assert float(found.spectral_radius_error[0]) == pytest.approx(float(alone.spectral_radius_error[0]), rel=1e-3)

@@ -14,6 +14,7 @@ from drivetrain_jax.analysis._base import Solver
 from drivetrain_jax.analysis.numerics.lanes import in_blocks
 from drivetrain_jax.analysis.periodic.direct import Monodromy, direct_monodromy, stable_steps, stiffness_of
 from drivetrain_jax.analysis.periodic.floquet_effort import (
+    LONG,
     PANEL_COST,
     explicit_effort,
     implicit_effort,
@@ -65,11 +66,7 @@ def direct_solvers(
             short_loops=True,
         )
 
-    def steps(damped: bool, columns: Mapping[str, Any]) -> Any:
-        if stiff is None:
-            return explicit_effort(system, columns, rtol)
-        mine = strongly_damped(system, columns) == damped
-        return np.where(mine, explicit_effort(system, columns, rtol) if mine.any() else np.inf, np.inf)
+    steps = partial(_explicit_steps, system, rtol, stiff is not None, _Last())
 
     implicit = Solver(
         "direct: Radau IIA of 8 stages",
@@ -80,10 +77,31 @@ def direct_solvers(
         march=True,
         short_loops=True,
     )
-    plain = explicit("", form, partial(steps, False))
+    plain = explicit("", form, lambda columns: steps(columns)["short"])
+    long = explicit(", long marches", form, lambda columns: steps(columns)["long"])
     if stiff is None:
-        return plain, implicit
-    return plain, implicit, explicit(", form for strong damping", stiff, partial(steps, True))
+        return plain, implicit, long
+    return plain, implicit, explicit(", form for strong damping", stiff, lambda columns: steps(columns)["damped"]), long
+
+
+class _Last:
+    """What was found for the columns asked for last: the solvers of a plan ask one after the other."""
+
+    known: tuple[Mapping[str, Any] | None, Mapping[str, np.ndarray]] = (None, {})
+
+
+def _explicit_steps(
+    system: System, rtol: float, has_stiff: bool, last: _Last, columns: Mapping[str, Any]
+) -> Mapping[str, np.ndarray]:
+    """Steps of the explicit scheme by march: ``short``, ``long`` or ``damped`` (the other form), inf for the other two."""
+    asked, found = last.known
+    if asked is not columns:
+        steps = explicit_effort(system, columns, rtol)
+        damped = strongly_damped(system, columns) if has_stiff else np.zeros(steps.shape, bool)
+        kinds = {"short": ~damped & (steps <= LONG), "long": ~damped & (steps > LONG), "damped": damped}
+        found = {kind: np.where(mine, steps, np.inf) for kind, mine in kinds.items()}
+        last.known = columns, found
+    return found
 
 
 def _solve(

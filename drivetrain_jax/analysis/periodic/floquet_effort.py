@@ -16,8 +16,11 @@ from drivetrain_jax.systems import FloquetModel, System
 
 # Below this many explicit steps the implicit scheme is never the cheaper one.
 _STIFF = 600
+# Marches of more explicit steps are long: they share no batch with others, whose rounding would grow with the steps. The
+# steps of a stiff point are at least so many times those of its oscillation.
+LONG, _OSCILLATES = 10_000, 10.0
 # Beyond these a scheme does not start: the point is left to the other one, or ends as STEP_LIMIT.
-_MAX_EXPLICIT, _MAX_PANELS = 300_000, 20_000
+_MAX_EXPLICIT, _MAX_PANELS = 1_000_000, 20_000
 # A model without a value somewhere in its span is solved all the same: that makes the outcome NOT_FINITE.
 _TO_FIND_NO_VALUE = 64
 # Seconds of one implicit panel over those of one explicit step, per point. Full batches would have 150; but few points share
@@ -43,7 +46,10 @@ def strongly_damped(system: System, columns: Mapping[str, np.ndarray]) -> np.nda
 
 
 def implicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
-    """Panels of the implicit scheme, ``(N,)``: it must resolve what oscillates, whereas decay costs it nothing."""
+    """Panels of the implicit scheme, ``(N,)``: it must resolve what oscillates, whereas decay costs it nothing.
+
+    Infinite where oscillation makes an explicit march long: that costs a twentieth, and is as exact.
+    """
     explicit = _explicit_steps(system, columns, rtol)
     effort = np.full(explicit.shape, np.inf)
     stiff = np.flatnonzero(explicit > _STIFF)
@@ -51,7 +57,10 @@ def implicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: flo
         phase = _frequency_phase(system, taken(columns, stiff))
         decaying = (12 + 2 * np.sqrt(phase)) * (1e-9 / rtol) ** (1 / 13)
         oscillating = (8 + phase / 5) * (1e-10 / rtol) ** (1 / 16)
-        effort[stiff] = 2 * np.ceil(np.maximum(decaying, oscillating) / 2)
+        panels = 2 * np.ceil(np.maximum(decaying, oscillating) / 2)
+        steps = explicit[stiff]
+        slow = (steps > LONG) & (steps <= _MAX_EXPLICIT) & (steps < _OSCILLATES * _steps_of(phase, rtol))
+        effort[stiff] = np.where(slow, np.inf, panels)
     return _up_to(_MAX_PANELS, effort)
 
 
@@ -62,9 +71,14 @@ def _explicit_steps(system: System, columns: Mapping[str, np.ndarray], rtol: flo
     else:
         # Systems that predict none: from the size of A^2.
         phase = predicted(_phase, (build,), columns)
-        steps = (4 + 2.5 * phase**1.1) * (1e-9 / rtol) ** (1 / 9)
+        steps = _steps_of(phase, rtol)
         steps = np.where(np.isnan(steps), _TO_FIND_NO_VALUE, steps)
     return np.broadcast_to(2 * np.ceil(steps / 2), count_of(columns))
+
+
+def _steps_of(phase: np.ndarray, rtol: float) -> np.ndarray:
+    """Steps of the explicit scheme for an oscillation through ``phase``."""
+    return (4 + 2.5 * phase**1.1) * (1e-9 / rtol) ** (1 / 9)
 
 
 def _knows(build: Build, fact: str, columns: Mapping[str, Any]) -> bool:
