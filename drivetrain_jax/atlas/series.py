@@ -95,9 +95,10 @@ class SeriesNodes:
         parts = np.maximum(np.ceil(self._parts * steps), self._least)
         order = np.argsort(-parts, kind="stable")
         chunks = [order[i : i + _LANES] for i in range(0, len(order), _LANES)]
-        pool = threads(usable_cores(), "tile")
+        # Not asked for in threads, which would have it compiled twice.
+        kernel, pool = _kernel(self._key, len(x)), threads(usable_cores(), "tile")
         pending = [
-            pool.submit(self._along, {n: c[chosen] for n, c in columns.items()}, end, parts[chosen[0]], x)
+            pool.submit(self._along, kernel, {n: c[chosen] for n, c in columns.items()}, end, parts[chosen[0]], x)
             for chosen in chunks
         ]
 
@@ -121,9 +122,11 @@ class SeriesNodes:
         steps = explicit_effort(self._system, {**self._domain.fixed, **columns}, _STEPS_AT)
         return {name: column for name, column in columns.items() if name != self._series.parameter}, steps
 
-    def _along(self, columns: Mapping[str, np.ndarray], end: float, parts: float, x: np.ndarray) -> np.ndarray:
+    def _along(
+        self, compiled: Future[Any], columns: Mapping[str, np.ndarray], end: float, parts: float, x: np.ndarray
+    ) -> np.ndarray:
         """Values on up to ``_LANES`` lines, ``(_LANES, P, n n)``; ``end`` is the coordinate ``x`` that is largest."""
-        kernel = _kernel(self._key, len(x)).result()
+        kernel = compiled.result()
         full = {name: np.pad(column, (0, _LANES - len(column)), mode="edge") for name, column in columns.items()}
         with np.errstate(divide="ignore"):
             ends = self._domain.coordinates[self.axis].inverse(np.array([0.0, end]))
