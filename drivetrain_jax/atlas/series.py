@@ -30,7 +30,7 @@ _LANES, _POSITIONS = 16, 48
 # many fewer are enough for each digit less, four at most. Parts for each step that decay takes.
 _PARTS, _LEAST, _SPARED, _MOST_SPARED, _DECAY = 0.1, 3e-14, 0.0095, 4, 3.0
 # What series may leave out, as part of the tolerance. A line that leaves out more is computed again with twice the parts.
-_SHARPER, _MOST_PARTS = 1e-3, 4_000
+_SHARPER, _MOST_PARTS = 1e-2, 4_000
 # Below this tolerance rounding of the parts shows in their product. So it does where decay takes so many steps: the product
 # is then small against the parts.
 _TOO_FINE, _STIFF = 5e-13, 50

@@ -79,19 +79,20 @@ def explicit_propagator(
         rows = mark(march)(first, last, system.span / steps, split.fixed)
         return Propagator(jnp.stack(rows).reshape(len(zeros), len(zeros), *shape), jnp.zeros(shape))
 
-    return _in_pieces(part, steps, pieces)
+    return _in_pieces(part, len(zeros), shape, steps, pieces)
 
 
-def _in_pieces(part: Callable[[Array, Array], Propagator], steps: Array, pieces: Array | int) -> Propagator:
-    """``part(first, last)`` over all steps, as the product of what it is over ``pieces`` of them, and the growth.
+def _in_pieces(
+    part: Callable[[Array, Array], Propagator], n: int, shape: tuple[int, ...], steps: Array, pieces: Array | int
+) -> Propagator:
+    """``part(first, last)`` over all steps, as the product of what it is over ``pieces`` of them, and the growth; of batch
+    shape ``shape`` for ``n`` states.
 
     ``C' = P C P^T + |Phi(t, 0)|^2 I`` sums that up over the ends t of the pieces P: the covariance of errors that are as
     large as ``Phi`` where they are made, and know nothing of each other.
     """
     pieces = jnp.asarray(pieces, steps.dtype)
-    blank = jax.eval_shape(part, steps, steps)
-    n = blank.matrix.shape[0]
-    unit = jnp.broadcast_to(jnp.eye(n).reshape(n, n, *(1,) * blank.log_scale.ndim), blank.matrix.shape)
+    unit = jnp.broadcast_to(jnp.eye(n).reshape(n, n, *(1,) * len(shape)), (n, n, *shape))
 
     def onward(k: Array, state: tuple) -> tuple:
         product, log_scale, covariance = state
@@ -103,7 +104,7 @@ def _in_pieces(part: Callable[[Array, Array], Propagator], steps: Array, pieces:
         covariance = moved / size**2 + jnp.sum(product**2, axis=(0, 1)) * unit
         return product, log_scale + own.log_scale + jnp.log(size), covariance
 
-    start = unit, jnp.zeros(blank.log_scale.shape), jnp.zeros(unit.shape)
+    start = unit, jnp.zeros(shape), jnp.zeros(unit.shape)
     product, log_scale, covariance = jax.lax.fori_loop(0, pieces, onward, start)
     trace = sum(covariance[i, i] for i in range(n))
     growth = jnp.sqrt(trace / (n * pieces * jnp.sum(product**2, axis=(0, 1))))
@@ -208,4 +209,4 @@ def implicit_propagator(system: LinearPeriodic, steps: Array) -> Propagator:
     def part(first: Array, last: Array) -> Propagator:
         return Propagator(*jax.lax.fori_loop(first, last, body, (jnp.eye(n), jnp.zeros(()))))
 
-    return _in_pieces(part, steps, PIECES)
+    return _in_pieces(part, n, (), steps, PIECES)
