@@ -7,14 +7,13 @@ verdict. Times of the package for each number of cells:
 
     evaluation    the grid from an atlas that is there (its kernels compiled)
     points        as many cells at random places, one million at most
-    construction  the atlas alone: direct solves and fits. It does not depend on the number of cells
-    warm          atlas, grid and result in memory: direct solves included, compilation not
+    construction  the atlas alone: nodes, direct solves and fits. It does not depend on the number of cells
+    warm          atlas, grid and result in memory: nodes and direct solves included, compilation not
     file          the same into a file, flushed to the disk (not read back)
     cold          the whole command `drivetrain run`: import, compilation, solves, evaluation, file
 
 What `warm` takes beyond `construction` and `evaluation` is the checking of the scene, the digest of the code and the
-labelled result. In the construction the rounds (lines along the edges, refined, then the tensor) follow each other, and a
-round of few points keeps one core waiting.
+labelled result.
 
 Last row: an atlas over four parameters (sweeps/cardan_atlas_4d.toml) opened and sliced to a chart of 1000 x 1000 cells.
 
