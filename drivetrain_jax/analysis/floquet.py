@@ -1,7 +1,7 @@
 """Floquet analysis of a linear periodic system: multipliers, certified spectral radius and verdict of one point.
 
 ``direct`` uses the system's reduced form: an explicit scheme of order 8 batched inside the state, or an L-stable
-implicit one where that needs fewer operations. ``atlas`` evaluates a whole scene from polynomials through direct solves
+implicit one where that needs fewer operations. ``atlas`` evaluates a whole scene from polynomials held against direct solves
 (see ``drivetrain_jax.atlas``), and what they do not cover directly; ``auto`` does so where it is cheaper. ``diffrax``
 integrates the system as published over its full period with any adaptive diffrax solver: slower, and independent of
 the others in coordinates, clock and factorisation.
@@ -93,7 +93,7 @@ ANALYSIS = Analysis(
     methods={"auto": ("rtol",), "atlas": ("rtol",), "direct": ("rtol",), "diffrax": ("rtol", "atol", "solver")},
     method_titles={
         "auto": "atlas where that is cheaper, else direct",
-        "atlas": "Chebyshev panels through direct solves, with their bound",
+        "atlas": "Chebyshev panels held against direct solves, with their bound",
         "direct": "equal steps of order 8, implicit where that is cheaper",
         "diffrax": "adaptive steps, for the equations as published",
     },
