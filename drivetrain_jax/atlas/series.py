@@ -21,7 +21,7 @@ from drivetrain_jax.analysis.periodic.direct import stable_steps
 from drivetrain_jax.analysis.periodic.floquet_effort import explicit_effort
 from drivetrain_jax.analysis.periodic.series import propagators_along
 from drivetrain_jax.atlas.construction import Domain
-from drivetrain_jax.systems import FloquetModel, LinearPeriodic, Series, Smoothness, System
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic, Series, System
 
 # Lines that are computed together, and what the number of positions along them is a multiple of, so that few kernels serve
 # all panels.
@@ -42,13 +42,14 @@ Key = tuple[Callable[..., FloquetModel], Series, tuple[str, ...], Words, tuple[t
 
 def series_nodes(system: System, domain: Domain, tolerance: float) -> SeriesNodes | None:
     """The source of nodes for ``domain``; None where the system declares none or the parts would not be exact enough."""
-    smooth = system.models["atlas"].smooth or Smoothness({})
-    if smooth.series is None or smooth.series.parameter not in domain.parameters or tolerance < _TOO_FINE:
+    smooth = system.models["atlas"].smooth
+    series = smooth.series if smooth else None
+    if series is None or series.parameter not in domain.parameters or tolerance < _TOO_FINE:
         return None
     corners = np.array(list(itertools.product(*zip(domain.lower, domain.upper, strict=True))))
     columns = {**domain.fixed, **dict(zip(domain.parameters, corners.T, strict=True))}
     decay = float(np.max(predicted(_stable_steps, (system.models["floquet"].build,), columns)))
-    return SeriesNodes(system, domain, smooth.series, decay, tolerance) if decay <= _STIFF else None
+    return SeriesNodes(system, domain, series, decay, tolerance) if decay <= _STIFF else None
 
 
 def _stable_steps(build: Callable[..., FloquetModel], values: Any) -> Array:
@@ -64,6 +65,7 @@ class SeriesNodes:
         self._system, self._domain, self._series = system, domain, series
         self.axis = domain.parameters.index(series.parameter)
         target = max(_SHARPER * tolerance, _LEAST)
+        # Of the last term, which is taken: those that are left out are far smaller.
         self._left_out = 10 * target
         self._parts = _PARTS - _SPARED * min(math.log10(target / _LEAST), _MOST_SPARED)
         self._least = 1 + math.ceil(_DECAY * decay)
@@ -77,12 +79,12 @@ class SeriesNodes:
         """About half the angle through which propagators turn on a line between two corners, by the steps that it takes;
         infinite where these are too many."""
         pairs = [np.array(pair) for pair in zip(lower, upper, strict=True)]
-        end = max(abs(pairs[self.axis]))
+        end = max(pairs[self.axis], key=abs)
         _, steps = self._lines([pair if k != self.axis else np.array([end]) for k, pair in enumerate(pairs)])
         most = float(np.max(steps))
         if not self._parts * most <= _MOST_PARTS:
             return math.inf
-        return _RADIANS * most * float(np.ptp(pairs[self.axis])) / (2 * end) if end else 0.0
+        return _RADIANS * most * float(np.ptp(pairs[self.axis])) / (2 * abs(end)) if end else 0.0
 
     def start(self, axes: Sequence[np.ndarray]) -> Callable[[], np.ndarray]:
         """Begin to compute the grid of ``axes``; what is returned waits for its values ``(N, n n)``, points in C order.
@@ -90,7 +92,7 @@ class SeriesNodes:
         Values are NaN on lines along which the series does not converge.
         """
         x = axes[self.axis]
-        end = x[np.argmax(np.abs(x))]
+        end = max(x, key=abs)
         columns, steps = self._lines([axis if k != self.axis else np.array([end]) for k, axis in enumerate(axes)])
         parts = np.maximum(np.ceil(self._parts * steps), self._least)
         order = np.argsort(-parts, kind="stable")

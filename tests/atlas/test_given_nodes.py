@@ -17,7 +17,7 @@ from drivetrain_jax.atlas import Domain, Quantity, construct, run, values_at
 from drivetrain_jax.atlas import series as series_module
 from drivetrain_jax.atlas.floquet import floquet_domain
 from drivetrain_jax.atlas.series import series_nodes
-from drivetrain_jax.systems import Series, Smoothness
+from drivetrain_jax.systems import Coordinate, Series, Smoothness
 from drivetrain_jax.systems._smooth import identity
 
 TOLERANCE = 1e-9
@@ -216,6 +216,21 @@ def test_the_grid_is_in_c_order_whatever_the_order_of_the_parameters():
         found[order] = np.transpose(values, (*(order.index(name) for name in axes), 3))
     first, *others = found.values()
     assert all(other == pytest.approx(first, abs=1e-12) for other in others)
+
+
+def test_a_coordinate_may_be_negative(monkeypatch):
+    """-1/Omega: the same lines, from their other ends."""
+    axes = [np.array([0.3, 1.2]), np.linspace(0.5, 5.0, 48)]
+    one = series_nodes(CARDAN, domain_of(RANGES), 1e-11)
+    forward, inverse = (lambda x: -1 / np.asarray(x),) * 2
+    turned = Coordinate("-1/Omega", forward, inverse, lambda x: 1 / np.asarray(x) ** 2)
+    model = CARDAN.models["atlas"]
+    smooth = replace(model.smooth, coordinates={**model.smooth.coordinates, "Omega": turned})
+    monkeypatch.setitem(CARDAN.models, "atlas", replace(model, smooth=smooth))
+    other = series_nodes(CARDAN, domain_of(RANGES), 1e-11)
+    ends = np.array([[0.3, 0.5], [1.2, 3.0]])
+    assert other.radians(*(ends[::-1] * [1.0, -1.0])) == pytest.approx(one.radians(*ends), rel=1e-12)
+    assert other.start([axes[0], -axes[1]])() == pytest.approx(one.start(axes)(), abs=1e-12)
 
 
 def test_parts_by_predicted_steps_are_short_enough():

@@ -76,10 +76,12 @@ COUNTS = {
 }
 
 
-def check(name: str, found: int) -> None:
-    """``found`` against the stored count."""
-    assert found <= 1.1 * COUNTS[name], f"{name}: {found}, stored is {COUNTS[name]}"
-    assert found >= 0.7 * COUNTS[name], f"{name}: {found} is so much less than {COUNTS[name]} that it should be stored"
+def complaint(name: str, found: int) -> str:
+    """What is wrong with ``found`` by the stored count; nothing if it is within bounds."""
+    stored = COUNTS[name]
+    if found > 1.1 * stored:
+        return f"{name}: {found}, stored is {stored}"
+    return f"{name}: {found} is so much less than {stored} that it should be stored" if found < 0.7 * stored else ""
 
 
 def operations(jaxpr: Any) -> int:
@@ -97,18 +99,18 @@ def test_operations(system):
     shape = (8,) if solver.broadcasts else ()
     columns = {name: jax.ShapeDtypeStruct(shape, float) for name in engine.grid.columns(np.arange(1))}
     traced = jax.make_jaxpr(lambda c, effort: solver.solve(engine.grid.bind(c), effort))(columns, np.int64(1))
-    check(f"operations {system}", operations(traced.jaxpr))
+    assert not complaint(f"operations {system}", operations(traced.jaxpr))
 
 
 def test_steps_of_the_chart():
     plan = Engine(load_scene(SCENES["cardan"])).plan
-    check("predicted steps cardan", int(sum(group.efforts.sum() * group.chunk for group in plan.groups)))
+    assert not complaint("predicted steps cardan", int(sum(group.efforts.sum() * group.chunk for group in plan.groups)))
 
 
 def test_solves_of_an_atlas():
     scene = SCENES["cardan"] | {"options": {"method": "atlas", "rtol": 1e-10}}
     scene["fixed"] = scene["fixed"] | {"mu": 20.0}
-    check("solves cardan, mu = 20", int(dt.run(scene).attrs["atlas_solves"]))
+    assert not complaint("solves cardan, mu = 20", int(dt.run(scene).attrs["atlas_solves"]))
 
 
 @pytest.fixture
@@ -147,9 +149,9 @@ def test_shafts(monkeypatch, tally, compilations, tmp_path):
     monkeypatch.setattr(shaft_roots, "characteristic", counted)
     first = dt.run(SCENES["bicardan"], out=tmp_path / "first.nc", threads=1)
     jax.effects_barrier()
-    check("evaluations bicardan", tally.total)
-    check("compilations bicardan", len(compilations))
-    check("bytes bicardan", (tmp_path / "first.nc").stat().st_size)
+    assert not complaint("evaluations bicardan", tally.total)
+    assert not complaint("compilations bicardan", len(compilations))
+    assert not complaint("bytes bicardan", (tmp_path / "first.nc").stat().st_size)
     compilations.clear()
     np.testing.assert_array_equal(dt.run(SCENES["bicardan"]).natural_frequency, first.natural_frequency)
     assert not compilations, "a second run compiles again"
@@ -165,7 +167,7 @@ def test_sweeps_of_gears(monkeypatch, tally):
     monkeypatch.setattr(singular_values, "_sweep", counted)
     dt.run(SCENES["planetary"] | {"title": "counted"}, threads=1)
     jax.effects_barrier()
-    check("sweeps planetary", tally.total)
+    assert not complaint("sweeps planetary", tally.total)
 
 
 def test_steps_of_rattle():
@@ -176,7 +178,7 @@ def test_steps_of_rattle():
         lanes = prepare(oscillator(PRESETS["table1"] | {"omega": omega}))
         return march(lanes, start(lanes, 0 * omega, 0 * omega, jnp.full(16, 10, jnp.int32)), 100_000).steps
 
-    check("steps rattle", int(steps(omega).sum()))
+    assert not complaint("steps rattle", int(steps(omega).sum()))
 
 
 def test_steps_of_a_history(monkeypatch, tally):
@@ -190,4 +192,4 @@ def test_steps_of_a_history(monkeypatch, tally):
     monkeypatch.setattr(history.diffrax, "diffeqsolve", counted)
     dt.run(SCENES["tripod"], threads=1)
     jax.effects_barrier()
-    check("steps tripod", tally.total)
+    assert not complaint("steps tripod", tally.total)

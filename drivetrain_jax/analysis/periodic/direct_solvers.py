@@ -66,7 +66,7 @@ def direct_solvers(
             short_loops=True,
         )
 
-    steps = partial(_explicit_steps, system, rtol, stiff is not None, _Last())
+    steps = _ExplicitSteps(system, rtol, stiff is not None)
 
     implicit = Solver(
         "direct: Radau IIA of 8 stages",
@@ -84,24 +84,25 @@ def direct_solvers(
     return plain, implicit, explicit(", form for strong damping", stiff, lambda columns: steps(columns)["damped"]), long
 
 
-class _Last:
-    """What was found for the columns asked for last: the solvers of a plan ask one after the other."""
+class _ExplicitSteps:
+    """Steps of the explicit scheme by march: ``short``, ``long`` or ``damped`` (the other form), inf for the other two.
 
-    known: tuple[Mapping[str, Any] | None, Mapping[str, np.ndarray]] = (None, {})
+    Those asked for last are kept: the solvers of a plan ask for the same columns one after the other.
+    """
 
+    def __init__(self, system: System, rtol: float, has_stiff: bool) -> None:
+        self._system, self._rtol, self._has_stiff = system, rtol, has_stiff
+        self._last: tuple[Mapping[str, Any], Mapping[str, np.ndarray]] = ({}, {})
 
-def _explicit_steps(
-    system: System, rtol: float, has_stiff: bool, last: _Last, columns: Mapping[str, Any]
-) -> Mapping[str, np.ndarray]:
-    """Steps of the explicit scheme by march: ``short``, ``long`` or ``damped`` (the other form), inf for the other two."""
-    asked, found = last.known
-    if asked is not columns:
-        steps = explicit_effort(system, columns, rtol)
-        damped = strongly_damped(system, columns) if has_stiff else np.zeros(steps.shape, bool)
-        kinds = {"short": ~damped & (steps <= LONG), "long": ~damped & (steps > LONG), "damped": damped}
-        found = {kind: np.where(mine, steps, np.inf) for kind, mine in kinds.items()}
-        last.known = columns, found
-    return found
+    def __call__(self, columns: Mapping[str, Any]) -> Mapping[str, np.ndarray]:
+        asked, found = self._last
+        if asked is not columns:
+            steps = explicit_effort(self._system, columns, self._rtol)
+            damped = strongly_damped(self._system, columns) if self._has_stiff else np.zeros(steps.shape, bool)
+            kinds = {"short": ~damped & (steps <= LONG), "long": ~damped & (steps > LONG), "damped": damped}
+            found = {kind: np.where(mine, steps, np.inf) for kind, mine in kinds.items()}
+            self._last = columns, found
+        return found
 
 
 def _solve(
