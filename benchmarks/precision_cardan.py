@@ -143,15 +143,16 @@ def _constant(solver: str, count: int) -> Callable[[Columns, float], Any]:
     import optimistix
 
     from drivetrain_jax.analysis.periodic.monodromy import state_transition
-    from drivetrain_jax.systems.cardan import linear_rows
+    from drivetrain_jax.systems.cardan import Cardan
 
     # Without a controller to take tolerances from, the root finder of an implicit scheme needs its own. diffrax's usual
     # one, a chord method, gives up at these: its slope is that of another time.
     settings = {"root_finder": optimistix.Newton(rtol=1e-10, atol=1e-12)} if solver == IMPLICIT else {}
 
     def one(values: Mapping[str, Any], step: Any) -> Any:
+        shaft = Cardan.of(values)
         return state_transition(
-            lambda t: jnp.array(linear_rows(t, values)), np.pi, 4, solver=getattr(diffrax, solver)(**settings), dt0=step,
+            lambda t: jnp.array(shaft.linear_rows(t)), np.pi, 4, solver=getattr(diffrax, solver)(**settings), dt0=step,
             stepsize_controller=diffrax.ConstantStepSize(), max_steps=2 * max(STEPS),
         )[0]  # fmt: skip
 

@@ -32,7 +32,7 @@ from drivetrain_jax.analysis.approximations.harmonic_balance import Basis
 from drivetrain_jax.analysis.approximations.harmonic_response import describe
 from drivetrain_jax.analysis.approximations.harmonic_sweep import sweep
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
-from drivetrain_jax.systems.rattle import PRESETS, oscillator
+from drivetrain_jax.systems.rattle import PRESETS, Rattle
 
 PERIODS = 10
 _TABLE1 = PRESETS["table1"] | {"omega": 0.76}
@@ -98,7 +98,7 @@ def marching(lanes: int) -> Callable[..., Any]:
     """The closed form, compiled for this many lanes: states, transition matrix (2, 2) and whether they arrived."""
 
     def run(values: dict[str, jax.Array], u: jax.Array, v: jax.Array, periods: jax.Array) -> tuple:
-        made = prepare(oscillator(values))
+        made = prepare(Rattle.models["basins"].build(values))
         motion = march(made, start(made, u, v, periods), _MOST_STEPS)
         return jnp.stack([motion.u, motion.v]), jnp.stack(motion.matrix), motion.left == 0
 
@@ -112,7 +112,7 @@ def integrating(events: bool) -> Callable[..., Any]:
 
     def one(values: dict[str, jax.Array], state: jax.Array, rtol: jax.Array) -> jax.Array:
         end = PERIODS * 2 * jnp.pi / values["omega"]
-        found, done = integrate(oscillator(values), state, end, rtol=rtol, events=events)
+        found, done = integrate(Rattle.models["basins"].build(values), state, end, rtol=rtol, events=events)
         return jnp.where(done, found, jnp.nan)
 
     example = arrays(_TABLE1, _DIFFRAX_LANES)
@@ -126,7 +126,7 @@ def balancing(harmonics: int) -> Callable[..., Any]:
     basis = Basis(harmonics)
 
     def run(values: dict[str, jax.Array]) -> tuple:
-        model = oscillator(values)
+        model = Rattle.models["basins"].build(values)
         swept = sweep(model, basis, values["omega"][None])
         x, good = swept.x[0], swept.balanced[0]
         described = describe(model, basis, x, values["omega"], good, swept.saddle[0])

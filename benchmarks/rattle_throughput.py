@@ -27,7 +27,7 @@ from benchmarks.rattle_diffrax import integrate
 from benchmarks.rattle_reference import extended, scipy_events, scipy_plain
 from benchmarks.timing import interleaved, median, parser, provenance, results_folder, table, write_csv
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
-from drivetrain_jax.systems.rattle import PRESETS, oscillator
+from drivetrain_jax.systems.rattle import PRESETS, Rattle
 
 PERIODS = 10
 TABLE1 = PRESETS["table1"]
@@ -61,7 +61,7 @@ def exact(omega: np.ndarray) -> Callable[[], np.ndarray]:
     """The closed form, compiled for these frequencies."""
 
     def run(w: jax.Array) -> tuple[jax.Array, jax.Array]:
-        lanes = prepare(oscillator(TABLE1 | {"omega": w}))
+        lanes = prepare(Rattle.models["basins"].build(TABLE1 | {"omega": w}))
         motion = march(lanes, start(lanes, 0.0 * w, 0.0 * w, jnp.full(w.shape, PERIODS, jnp.int32)), 100_000)
         return motion.u, motion.v
 
@@ -74,7 +74,9 @@ def by_diffrax(omega: np.ndarray, rtol: float, events: bool) -> Callable[[], np.
 
     def one(w: jax.Array) -> jax.Array:
         end = PERIODS * 2 * jnp.pi / w
-        state, done = integrate(oscillator(TABLE1 | {"omega": w}), jnp.zeros(2), end, rtol=rtol, events=events)
+        state, done = integrate(
+            Rattle.models["basins"].build(TABLE1 | {"omega": w}), jnp.zeros(2), end, rtol=rtol, events=events
+        )
         return jnp.where(done, state, jnp.nan)
 
     compiled = jax.jit(jax.vmap(one)).lower(omega).compile()

@@ -19,7 +19,7 @@ class Parameter:
     the model then finds no such value, and an analysis an option of ``None``. ``lower``/``upper`` are inclusive unless
     the matching ``open_*`` flag is set; ``infinite`` admits infinity. ``choices`` makes it one of these words, ``text``
     any word, ``listed`` a list of numbers of which each entry obeys the range (default ``()``: none), ``listed`` with
-    ``broadcast`` such a list or one number that stands for a list of equal entries.
+    ``broadcast`` such a list or one number that stands for a list of equal entries. ``symbol`` is how formulas write it.
     """
 
     name: str
@@ -37,6 +37,7 @@ class Parameter:
     integer: bool = False
     infinite: bool = False
     text: bool = False
+    symbol: str = ""
 
     @property
     def is_number(self) -> bool:

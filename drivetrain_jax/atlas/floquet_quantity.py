@@ -24,17 +24,18 @@ def floquet_quantity(form: LinearPeriodic) -> Quantity:
 
     Derived are the coefficients a_k of det(sigma I - Z), all but the last where Liouville's formula gives that one.
     """
-    n = form.size if form.reversor is None else len(form.reversor)
+    x = None if form.reversor is None else np.array(form.reversor)
+    n = form.size if x is None else len(x)
     count = n if form.log_determinant is None else n - 1
 
     def monodromy(values: np.ndarray) -> np.ndarray:
         phi = values.reshape(-1, n, n)
-        return phi if form.reversor is None else form.reversor @ np.swapaxes(phi, 1, 2) @ form.reversor @ phi
+        return phi if x is None else x @ np.swapaxes(phi, 1, 2) @ x @ phi
 
     def scale(values: np.ndarray) -> np.ndarray:
         # |dZ| <= 2 |Phi| |dPhi| where Z is a product of two.
         size = np.linalg.norm(monodromy(values), axis=(1, 2))
-        return size if form.reversor is None else size / (2 * np.linalg.norm(values, axis=1))
+        return size if x is None else size / (2 * np.linalg.norm(values, axis=1))
 
     def derived(values: np.ndarray) -> np.ndarray:
         return _characteristic_coefficients(monodromy(values))[:, :count]

@@ -35,8 +35,8 @@ def numerics_of(scene: Scene) -> dict[str, Any]:
     through_atlas = scene.analysis.continuous or uses_atlas(scene)
     starts = [_ROOT / name for name in (*_ENGINE, *(_THROUGH_ATLAS if through_atlas else ()))]
     for function in (scene.system.models[scene.analysis.name].build, scene.analysis.solvers):
-        # A partial has no source of its own.
-        starts.append(Path(inspect.getsourcefile(getattr(function, "func", function)) or ""))
+        # Neither a partial nor what is wrapped around a method has a source of its own.
+        starts.append(Path(inspect.getsourcefile(inspect.unwrap(getattr(function, "func", function))) or ""))
     return {
         "sources": {name: _source_digest(name, path) for name, path in _sources(tuple(starts))},
         "versions": versions(PACKAGES),

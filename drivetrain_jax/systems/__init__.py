@@ -1,5 +1,5 @@
 """The drivetrain systems, found by name; other packages add theirs through the entry point group
-``drivetrain_jax.systems`` (each entry point names a :class:`~drivetrain_jax.systems._base.System`)."""
+``drivetrain_jax.systems`` (each entry point names a class, a :class:`~drivetrain_jax.systems._base.System`)."""
 
 from __future__ import annotations
 
@@ -12,23 +12,22 @@ import jax
 jax.config.update("jax_enable_x64", True)
 
 from drivetrain_jax._quantities import Parameter  # noqa: E402
-from drivetrain_jax.systems._base import (  # noqa: E402
-    FloquetModel,
-    ForcedModel,
-    LinearPeriodic,
-    Model,
-    Resonances,
-    System,
-    dense,
-)
+from drivetrain_jax.systems._base import Model, Resonances, System, parameter, serves  # noqa: E402
 from drivetrain_jax.systems._flow import Flow  # noqa: E402
 from drivetrain_jax.systems._modal import FAMILIES, Block, SpringSystem  # noqa: E402
+from drivetrain_jax.systems._periodic import FloquetModel, ForcedModel, LinearPeriodic, dense  # noqa: E402
 from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator  # noqa: E402
 from drivetrain_jax.systems._shaft import Shaft  # noqa: E402
 from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness  # noqa: E402
 
 ENTRY_POINT_GROUP = "drivetrain_jax.systems"
-_BUILT_IN = ("cardan", "tripod", "rattle", "planetary", "bicardan")
+_BUILT_IN = {
+    "cardan": "Cardan",
+    "tripod": "Tripod",
+    "rattle": "Rattle",
+    "planetary": "Planetary",
+    "bicardan": "Bicardan",
+}
 
 __all__ = [
     "ENTRY_POINT_GROUP",
@@ -50,6 +49,8 @@ __all__ = [
     "System",
     "dense",
     "get_system",
+    "parameter",
+    "serves",
     "system_names",
 ]
 
@@ -60,23 +61,24 @@ def system_names() -> tuple[str, ...]:
     return (*_BUILT_IN, *external)
 
 
-def get_system(name: str) -> System:
+def get_system(name: str) -> type[System]:
     """The system ``name``; ``KeyError`` with the known names if there is none, ``ImportError`` if its package fails."""
     if name in _BUILT_IN:
-        return import_module(f"drivetrain_jax.systems.{name}").SYSTEM
+        return getattr(import_module(f"drivetrain_jax.systems.{name}"), _BUILT_IN[name])
     for entry in entry_points(group=ENTRY_POINT_GROUP):
         if entry.name == name:
             return _loaded(entry)
     raise KeyError(f"system = {name!r}: allowed is one of {', '.join(system_names())}")
 
 
-def _loaded(entry: EntryPoint) -> System:
+def _loaded(entry: EntryPoint) -> type[System]:
     try:
         system = entry.load()
     # Whatever another package raises.
     except Exception as error:
         raise ImportError(f"{entry.value} cannot be loaded: {type(error).__name__}: {error}") from error
-    if not isinstance(system, System) or system.name != entry.name:
-        called = f"the system {system.name}" if isinstance(system, System) else f"a {type(system).__name__}"
-        raise ImportError(f"{entry.value} is {called}, not the system {entry.name}")
+    if not (isinstance(system, type) and issubclass(system, System)):
+        raise ImportError(f"{entry.value} is a {type(system).__name__}, not a system")
+    if system.name != entry.name:
+        raise ImportError(f"{entry.value} is the system {system.name}, not the system {entry.name}")
     return system

@@ -1,110 +1,32 @@
-"""What a system is: parameters with units and ranges, and the mathematical models its analyses need.
+"""What a system is: an Equinox module whose fields are its parameters, and the models its analyses need.
 
-A system is data. It knows nothing of batches, files or analyses: under the name of each analysis it supports it
-hands over a function from parameter values to the model which that analysis documents, for example a
-:class:`LinearPeriodic` pair for ``floquet``. All model functions broadcast over a trailing axis: a parameter is a
-scalar or an array of shape ``(...)``, and a matrix then has shape ``(n, n, ...)``.
+A system knows nothing of batches, files or figures. Under the name of each analysis it serves, a method marked with
+:func:`serves` returns the model which that analysis documents, for example a :class:`LinearPeriodic` pair for ``floquet``.
+All models broadcast over a trailing axis: a parameter is a scalar or an array of shape ``(...)``, and a matrix then has
+shape ``(n, n, ...)``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any, ClassVar, TypeVar
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter
 from drivetrain_jax.systems._smooth import Smoothness
 
 Values = Mapping[str, Any]
-# The reversor that exchanges the first two of four states with the others.
-SWAP = np.kron(np.array([[0.0, 1.0], [1.0, 0.0]]), np.eye(2))
-Rows = tuple[tuple[Any, ...], ...]
-
-
-def dense(rows: Rows) -> Array:
-    """The matrix of these rows, ``(n, n, ...)``."""
-    shape = jnp.broadcast_shapes(*(jnp.shape(entry) for row in rows for entry in row))
-    return jnp.stack([jnp.stack([jnp.broadcast_to(entry, shape) for entry in row]) for row in rows])
-
-
-@dataclass(frozen=True)
-class LinearPeriodic:
-    """The linear system ``x' = A(t) x`` over one interval ``[0, span]`` of its clock ``t``.
-
-    ``basis(t)`` returns the functions of the clock alone (they are shared by all points of a batch) and
-    ``rows(*basis(t))`` the matrix as nested tuples; an entry that vanishes identically is the integer ``0``.
-    Without ``reversor`` the interval is the period and the monodromy matrix is the propagator ``Phi`` itself.
-    With the reversor ``X`` (``X X = I``) the interval is half the period and the monodromy matrix is similar to
-    ``X Phi^T X Phi``; with ``reversal()``, two matrices ``(R0, R1)`` as rows, to ``R0 Phi^T R1 Phi``.
-    ``log_determinant()`` is the exact logarithm of its determinant (Liouville's formula), if known.
-    """
-
-    rows: Callable[..., Rows]
-    span: float
-    basis: Callable[[Any], tuple[Any, ...]] = lambda t: (t,)
-    reversor: np.ndarray | None = None
-    log_determinant: Callable[[], Any] | None = None
-    reversal: Callable[[], tuple[Rows, Rows]] | None = None
-
-    @property
-    def halves(self) -> int:
-        """How many of the interval make the period: 1 or 2."""
-        return 1 if self.reversor is None and self.reversal is None else 2
-
-    @property
-    def size(self) -> int:
-        """Number of states."""
-        return len(self.rows(*self.basis(0.0)))
-
-    @property
-    def exchanges_halves(self) -> bool:
-        """Whether there are four states, of which the reversor exchanges the first two with the others."""
-        return self.reversor is not None and np.array_equal(self.reversor, SWAP)
-
-    def matrix(self, t: Any) -> Array:
-        """``A(t)``, shape ``(n, n, ...)``."""
-        return dense(self.rows(*self.basis(t)))
-
-
-@dataclass(frozen=True)
-class FloquetModel:
-    """The model of the analysis ``floquet``.
-
-    ``natural`` is the system as published, over its full period in its own time; ``reduced`` is an equivalent form
-    (same multipliers) that is cheaper or better conditioned. They may be the same object. ``explicit_steps(rtol)``
-    predicts, from parameters given as NumPy arrays of shape ``(N,)``, how many steps ``reduced`` needs with the
-    explicit scheme of order 8; None leaves the prediction to the analysis. ``hamiltonian()`` is true where ``reduced`` is a
-    Hamiltonian system, whose multipliers come in pairs sigma, 1/sigma; None if it never is.
-    ``stiff`` is one more form, in which the slow modes of strong damping are no differences of large entries; None if there
-    is no better one than ``reduced``. The implicit scheme always takes it, the explicit one where ``strongly_damped()``
-    says so, from NumPy arrays as well; None if nowhere.
-    """
-
-    natural: LinearPeriodic
-    reduced: LinearPeriodic
-    explicit_steps: Callable[[float], np.ndarray] | None = None
-    hamiltonian: Callable[[], Any] | None = None
-    stiff: LinearPeriodic | None = None
-    strongly_damped: Callable[[], np.ndarray] | None = None
-
-
-@dataclass(frozen=True)
-class ForcedModel:
-    """The model of the analysis ``forced``.
-
-    ``field(t, y)`` is the nonlinear system ``y' = field(t, y)`` of period ``period`` and ``linear(t, y)`` its
-    linearisation about ``y = 0``, forcing included. Both act on states of shape ``(n,)``. ``displacements`` are the
-    indices of the components whose amplitude is reported.
-    """
-
-    field: Callable[[Any, Array], Array]
-    linear: Callable[[Any, Array], Array]
-    period: float
-    displacements: tuple[int, ...]
+Method = TypeVar("Method", bound=Callable[..., Any])
+Number = float | Array | np.ndarray
+_PARAMETER, _SERVES = "parameter", "_serves"
 
 
 @dataclass(frozen=True)
@@ -141,33 +63,150 @@ class Resonances:
     up_to: Callable[[int], Resonances] | None = None
 
 
-@dataclass(frozen=True)
-class System:
-    """A drivetrain model: see the module's docstring. ``presets`` are named parameter sets of the source.
+def numeric(*values: Any) -> tuple[Any, ...]:
+    """The module to compute with, then ``values`` as its arrays of floats: NumPy, unless one of them is traced."""
+    module = jnp if any(isinstance(value, jax.core.Tracer) for value in values) else np
+    return module, *(module.asarray(value, float) for value in values)
 
-    An atlas is made of the results of ``floquet``: a model for ``atlas`` without one for it is refused (``ValueError``).
 
-    ``time_units`` is the unit of the time of its equations, ``1`` if that is nondimensional. ``physical`` converts data in
-    physical units to nondimensional parameters and back (pattern: ``cardan_units.PhysicalShaft``), None if the parameters
-    have physical units themselves. ``roles`` names its ``speed`` (or frequency of excitation), which figures draw
-    horizontally, and the ``angle`` and ``damping`` that design questions are about, as far as it has them.
+def parameter(units: str, long_name: str, **more: Any) -> Any:
+    """A field of a :class:`System`: a parameter in ``units``; ``more`` as in :class:`Parameter` (default, range, ...).
+
+    Words are static parts of the module; numbers and lists of numbers are leaves.
+    """
+    described = Parameter("", units, long_name, **more)
+    static = bool(described.choices) or described.text
+    return eqx.field(kw_only=True, static=static, default=described.default, metadata={_PARAMETER: described})
+
+
+def serves(
+    *analyses: str,
+    parameters: tuple[str, ...] | None = None,
+    check: Callable[[Values], None] | None = None,
+    smooth: Smoothness | None = None,
+) -> Callable[[Method], Method]:
+    """Mark a method of a :class:`System` as the one that returns the model of these ``analyses``.
+
+    ``parameters``: names of those that the model uses, by default all. ``check`` and ``smooth`` as in :class:`Model`.
     """
 
-    name: str
-    title: str
-    source: str
-    parameters: tuple[Parameter, ...]
-    models: Mapping[str, Model]
-    presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    resonances: Resonances | None = None
-    time_units: str = "1"
-    physical: type | None = None
-    roles: Mapping[str, str] = field(default_factory=dict)
+    def mark(method: Method) -> Method:
+        vars(method).setdefault(_SERVES, {}).update(dict.fromkeys(analyses, (parameters, check, smooth)))
+        return method
+
+    return mark
+
+
+class System(eqx.Module):
+    """A drivetrain model: see the module's docstring. A subclass declares its parameters as fields by :func:`parameter`.
+
+    Concrete values are checked against their ranges, :class:`~drivetrain_jax.InputError` names the first that is outside;
+    traced ones are taken as they are.
+
+    What the class itself holds: ``name``, ``title`` and ``source``; ``presets``, named parameter sets of the source;
+    ``resonances`` that are predicted; ``time_units``, the unit of the time of its equations, ``1`` if that is
+    nondimensional; ``physical``, which converts data in physical units to nondimensional parameters and back (pattern:
+    ``cardan_units.PhysicalShaft``), None if the parameters have physical units themselves; ``roles``, which names its
+    ``speed`` (or frequency of excitation), which figures draw horizontally, and the ``angle`` and ``damping`` that design
+    questions are about, as far as it has them. ``parameters`` and ``models`` follow from fields and methods. An atlas is
+    made of the results of ``floquet``: a model for ``atlas`` without one for it is refused (``ValueError``).
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    source: ClassVar[str] = ""
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({})
+    resonances: ClassVar[Resonances | None] = None
+    time_units: ClassVar[str] = "1"
+    physical: ClassVar[type | None] = None
+    roles: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
+    models: ClassVar[dict[str, Model]] = {}
+
+    def __init_subclass__(cls, **more: Any) -> None:
+        super().__init_subclass__(**more)
+        own = vars(cls)
+        fields = {
+            name: own[name].metadata for name in own.get("__annotations__", {}) if hasattr(own.get(name), "metadata")
+        }
+        cls.parameters += tuple(replace(m[_PARAMETER], name=name) for name, m in fields.items() if _PARAMETER in m)
+        if "models" not in own:
+            cls.models = dict(cls.models) | {a: m for method in own.values() for a, m in _models(cls, method).items()}
+        if "atlas" in cls.models and "floquet" not in cls.models:
+            raise ValueError(f"models of {cls.name}: atlas needs floquet as well")
 
     def __post_init__(self) -> None:
-        if "atlas" in self.models and "floquet" not in self.models:
-            raise ValueError(f"models of {self.name}: atlas needs floquet as well")
+        for each in self.parameters:
+            object.__setattr__(self, each.name, _admitted(each, getattr(self, each.name)))
 
-    def parameter(self, name: str) -> Parameter:
+    @classmethod
+    def of(cls, values: Values) -> Any:
+        """The system with these ``values``, which are not checked; a parameter that is missing has its default."""
+        new = object.__new__(cls)
+        for each in cls.parameters:
+            object.__setattr__(new, each.name, values.get(each.name, each.default))
+        return new
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The parameters by name, those left out that are to be derived from others."""
+        named = {each.name: getattr(self, each.name) for each in self.parameters}
+        return {name: value for name, value in named.items() if value is not None}
+
+    @classmethod
+    def parameter(cls, name: str) -> Parameter:
         """The parameter called ``name``; ``KeyError`` if there is none."""
-        return {p.name: p for p in self.parameters}[name]
+        return {p.name: p for p in cls.parameters}[name]
+
+
+def _models(system: type[System], method: Any) -> dict[str, Model]:
+    """The models that ``method`` of ``system`` returns, by analysis."""
+    marks = getattr(method, _SERVES, {})
+    if not marks:
+        return {}
+
+    def build(values: Values) -> Any:
+        return method(system.of(values))
+
+    # Where the code of a model stands decides what its results depend on.
+    build.__wrapped__ = method
+    everything = tuple(p.name for p in system.parameters)
+    return {
+        name: Model(build, everything if parameters is None else parameters, check, smooth)
+        for name, (parameters, check, smooth) in marks.items()
+    }
+
+
+def _admitted(described: Parameter, value: Any) -> Any:
+    """``value`` in its stored type, or :class:`InputError`; arrays and traced values stay what they are."""
+    if value is None:
+        if described.default is None and not described.derived:
+            raise InputError(f"{described.name}: missing; allowed is {described.allowed_in_units}")
+        return None
+    if described.choices or described.text:
+        return _checked(described, value)
+    if described.listed and isinstance(value, (list, tuple)):
+        each = replace(described, listed=False)
+        return tuple(_number(replace(each, name=f"{each.name}[{i}]"), entry) for i, entry in enumerate(value))
+    return _number(described, value)
+
+
+def _number(described: Parameter, value: Any) -> Any:
+    if isinstance(value, jax.core.Tracer) or not hasattr(value, "dtype"):
+        # A placeholder of a transformation, such as a shape, is no number either.
+        return _checked(described, value) if isinstance(value, (int, float, str, list, tuple)) else value
+    whole = np.asarray(value)
+    if whole.dtype.kind not in "iuf":
+        raise InputError(
+            f"{described.name}: an array of {whole.dtype}; allowed are numbers, {described.allowed_in_units}"
+        )
+    for extreme in (whole.min(), whole.max()) if whole.size else ():
+        _checked(described, float(extreme))
+    return value if whole.dtype.kind == "f" else whole.astype(float)
+
+
+def _checked(described: Parameter, value: Any) -> Any:
+    try:
+        return described.check(value)
+    except ValueError as error:
+        raise InputError(str(error)) from None

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
@@ -20,8 +20,7 @@ Components = tuple[Any, ...]
 _SPLIT = 2.0**26
 
 
-@dataclass(frozen=True)
-class Flow:
+class Flow(eqx.Module):
     """A vector field with its clocks, its initial state and what is known about it.
 
     ``field(angles, y)`` gives the components of ``y'`` (per unit of time) from the angles of the clocks [rad] and the
@@ -47,8 +46,8 @@ class Flow:
     turns: Components = ()
     scale: tuple[Any, ...] | None = None
     divergence: Callable[[Components, Sequence[Any]], Any] | None = None
-    phases: tuple[int, ...] = ()
-    cyclic: tuple[int, ...] = ()
+    phases: tuple[int, ...] = eqx.field(default=(), static=True)
+    cyclic: tuple[int, ...] = eqx.field(default=(), static=True)
     fastest: Any = None
 
     @property

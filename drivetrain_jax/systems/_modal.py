@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -12,8 +11,7 @@ from jax import Array
 FAMILIES = ("rotational", "translational", "planet")
 
 
-@dataclass(frozen=True)
-class Block:
+class Block(eqx.Module):
     """An invariant part of a spring system: its natural angular frequencies are the singular values of ``factor``.
 
     ``factor``: shape (rows, n, ...), rows >= n. ``basis`` (dofs, n, copies, ...) embeds the part into the mass-weighted
@@ -34,8 +32,7 @@ class Block:
         return self.basis.shape[2]
 
 
-@dataclass(frozen=True)
-class SpringSystem:
+class SpringSystem(eqx.Module):
     """``M q'' + B^T diag(k) B q = 0`` with the diagonal mass matrix ``M``.
 
     ``extensions`` (springs, dofs, ...) is ``B``: the extension of each spring per unit of each coordinate;
@@ -51,8 +48,8 @@ class SpringSystem:
     blocks: tuple[Block, ...]
     whole: Block
     asymmetry: Array
-    dofs: tuple[str, ...]
-    body_names: tuple[str, ...]
+    dofs: tuple[str, ...] = eqx.field(static=True)
+    body_names: tuple[str, ...] = eqx.field(static=True)
     bodies: np.ndarray
 
 

@@ -6,16 +6,15 @@ Equation: ``u'' + damping u' + stiffness f_s(u) = B0 + B1 cos(omega t)`` with
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 
-@dataclass(frozen=True)
-class PiecewiseLinearOscillator:
+class PiecewiseLinearOscillator(eqx.Module):
     """The equation in the module's docstring; every field is a number or an array, all of one common shape ``(...)``.
 
     ``damping`` is c/I [1/s], ``stiffness`` k/I [1/s^2], ``alpha`` the stiffness within the play over that outside [1],

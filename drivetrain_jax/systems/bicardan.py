@@ -14,28 +14,10 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from drivetrain_jax._quantities import Parameter
 from drivetrain_jax._wording import counted
-from drivetrain_jax.systems._base import Model, System, Values
+from drivetrain_jax.systems._base import Number, System, parameter, serves
 from drivetrain_jax.systems._shaft import Shaft, stack
 
-_LIST = {"listed": True, "lower": 0.0}
-_NONE = {"default": (), "broadcast": True, **_LIST}
-PARAMETERS = (
-    Parameter("length", "m", "lengths of the segments, from A to D", open_lower=True, **_LIST),
-    Parameter("EI", "N m2", "bending stiffness of the segments", open_lower=True, **_LIST),
-    Parameter("rhoA", "kg/m", "mass per length of the segments", open_lower=True, **_LIST),
-    Parameter("k_A", "N/m", "stiffness of the support at A", lower=0.0, infinite=True),
-    Parameter("k_D", "N/m", "stiffness of the support at D", lower=0.0, infinite=True),
-    Parameter("k_joint", "N/m", "stiffness of supports at the joints between segments", infinite=True, **_NONE),
-    Parameter("m_A", "kg", "lumped mass at A", default=0.0, lower=0.0),
-    Parameter("m_D", "kg", "lumped mass at D", default=0.0, lower=0.0),
-    Parameter("m_joint", "kg", "lumped masses (yokes) at the joints between segments", **_NONE),
-    Parameter("k_hinge", "N m/rad", "rotational stiffness of the joints, inf: rigid", infinite=True, **_NONE),
-    Parameter("kGA", "N", "shear stiffness of the segments, inf: no shear", open_lower=True, infinite=True, **_NONE),
-    Parameter("rhoI", "kg m", "rotary inertia per length of the segments", **_NONE),
-)
-NAMES = tuple(p.name for p in PARAMETERS)
 _PER_SEGMENT, _PER_JOINT = ("EI", "rhoA", "kGA", "rhoI"), ("k_joint", "m_joint", "k_hinge")
 
 _SUPPORTS = {"k_A": 85e6, "k_D": 20e6}
@@ -62,42 +44,70 @@ def check(fixed: Mapping[str, Any]) -> None:
                 )
 
 
-def shaft(values: Values) -> Shaft:
-    """The shaft with these parameters (numbers, or arrays of one shape of lanes; lists as tuples of them).
+_LIST = {"listed": True, "lower": 0.0}
+_NONE = {"default": (), "broadcast": True, **_LIST}
+Numbers = tuple[Number, ...]
 
-    What is known to have no effect, such as masses of 0, is left out of the computation.
+
+class Bicardan(System):
+    """The stepped shaft of the module's docstring: segments from A to D, joints between them.
+
+    >>> from drivetrain_jax.systems.bicardan import PRESETS
+    >>> Bicardan(**PRESETS["paper"]).shaft().segments
+    3
     """
-    length = values["length"] if isinstance(values["length"], tuple) else (values["length"],)
-    segments = len(length)
 
-    def entries(name: str, count: int, none: float) -> tuple[Any, ...]:
-        value = values.get(name, ())
-        if not isinstance(value, tuple):
-            return (value,) * count
-        return value or (none,) * count
+    name = "bicardan"
+    title = "Bicardanic shaft on elastic supports"
+    source = "Bulac, Fiabilitate si Durabilitate, Supplement 1/2012"
+    presets = PRESETS
 
-    def unless(items: tuple[Any, ...], none: float) -> Any:
-        return None if all(isinstance(x, (int, float)) and x == none for x in items) else stack(items)
+    length: Numbers = parameter("m", "lengths of the segments, from A to D", open_lower=True, **_LIST)
+    EI: Numbers = parameter("N m2", "bending stiffness of the segments", open_lower=True, **_LIST)
+    rhoA: Numbers = parameter("kg/m", "mass per length of the segments", symbol="ρA", open_lower=True, **_LIST)
+    k_A: Number = parameter("N/m", "stiffness of the support at A", lower=0.0, infinite=True)
+    k_D: Number = parameter("N/m", "stiffness of the support at D", lower=0.0, infinite=True)
+    k_joint: Numbers | Number = parameter(
+        "N/m", "stiffness of supports at the joints between segments", infinite=True, **_NONE
+    )
+    m_A: Number = parameter("kg", "lumped mass at A", default=0.0, lower=0.0)
+    m_D: Number = parameter("kg", "lumped mass at D", default=0.0, lower=0.0)
+    m_joint: Numbers | Number = parameter("kg", "lumped masses (yokes) at the joints between segments", **_NONE)
+    k_hinge: Numbers | Number = parameter(
+        "N m/rad", "rotational stiffness of the joints, inf: rigid", infinite=True, **_NONE
+    )
+    kGA: Numbers | Number = parameter(
+        "N", "shear stiffness of the segments, inf: no shear", open_lower=True, infinite=True, **_NONE
+    )
+    rhoI: Numbers | Number = parameter("kg m", "rotary inertia per length of the segments", symbol="ρI", **_NONE)
 
-    supports = (values["k_A"], *entries("k_joint", segments - 1, 0.0), values["k_D"])
-    masses = (values.get("m_A", 0.0), *entries("m_joint", segments - 1, 0.0), values.get("m_D", 0.0))
-    return Shaft(
-        stack(length),
-        stack(entries("EI", segments, 0.0)),
-        stack(entries("rhoA", segments, 0.0)),
-        stack(supports),
-        unless(masses, 0.0),
-        unless(entries("k_hinge", segments - 1, math.inf), math.inf),
-        unless(entries("kGA", segments, math.inf), math.inf),
-        unless(entries("rhoI", segments, 0.0), 0.0),
-    ).arrays()
+    @serves("critical_speeds", check=check)
+    def shaft(self) -> Shaft:
+        """The shaft with these parameters (numbers, or arrays of one shape of lanes; lists as tuples of them).
 
+        What is known to have no effect, such as masses of 0, is left out of the computation.
+        """
+        length = self.length if isinstance(self.length, tuple) else (self.length,)
+        segments = len(length)
 
-SYSTEM = System(
-    name="bicardan",
-    title="Bicardanic shaft on elastic supports",
-    source="Bulac, Fiabilitate si Durabilitate, Supplement 1/2012",
-    parameters=PARAMETERS,
-    models={"critical_speeds": Model(shaft, NAMES, check)},
-    presets=PRESETS,
-)
+        def entries(name: str, count: int, none: float) -> tuple[Any, ...]:
+            value = getattr(self, name)
+            if not isinstance(value, tuple):
+                return (value,) * count
+            return value or (none,) * count
+
+        def unless(items: tuple[Any, ...], none: float) -> Any:
+            return None if all(isinstance(x, (int, float)) and x == none for x in items) else stack(items)
+
+        supports = (self.k_A, *entries("k_joint", segments - 1, 0.0), self.k_D)
+        masses = (self.m_A, *entries("m_joint", segments - 1, 0.0), self.m_D)
+        return Shaft(
+            stack(length),
+            stack(entries("EI", segments, 0.0)),
+            stack(entries("rhoA", segments, 0.0)),
+            stack(supports),
+            unless(masses, 0.0),
+            unless(entries("k_hinge", segments - 1, math.inf), math.inf),
+            unless(entries("kGA", segments, math.inf), math.inf),
+            unless(entries("rhoI", segments, 0.0), 0.0),
+        ).arrays()

@@ -18,9 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._quantities import Parameter
 from drivetrain_jax._wording import counted
-from drivetrain_jax.systems._base import Model, System, Values
+from drivetrain_jax.systems._base import Number, System, Values, parameter, serves
 from drivetrain_jax.systems._modal import Block, SpringSystem, weighted_factor
 
 BODIES = ("carrier", "ring", "sun")
@@ -31,59 +30,7 @@ ROTATIONAL, TRANSLATIONAL, PLANET = range(3)
 _BALANCED = 4e-16
 
 
-def _mass(name: str, meaning: str, default: float, of_planets: bool = False) -> Parameter:
-    shape = {"listed": True, "broadcast": True} if of_planets else {}
-    return Parameter(name, "kg", meaning, default=default, lower=0.0, open_lower=True, **shape)
-
-
-def _stiffness(name: str, meaning: str, default: float, of_planets: bool = False) -> Parameter:
-    shape = {"listed": True, "broadcast": True} if of_planets else {}
-    return Parameter(name, "N/m", meaning, default=default, lower=0.0, **shape)
-
-
-# Two turns, more than anyone needs: angles in degrees are refused.
-_LARGEST_ANGLE = 4 * math.pi
-
-PARAMETERS = (
-    Parameter(
-        "planet_angle",
-        "rad",
-        "angle of the planet",
-        default=tuple(i * math.pi / 2 for i in range(4)),
-        lower=-_LARGEST_ANGLE,
-        upper=_LARGEST_ANGLE,
-        listed=True,
-    ),
-    _mass("m_s", "mass of the sun", 0.4),
-    _mass("m_r", "mass of the ring", 2.35),
-    _mass("m_c", "mass of the carrier", 5.43),
-    _mass("m_p", "mass of a planet", 0.66, of_planets=True),
-    _mass("I_s", "inertia of the sun over its base radius squared", 0.39),
-    _mass("I_r", "inertia of the ring over its base radius squared", 3.0),
-    _mass("I_c", "inertia of the carrier over its radius squared", 6.29),
-    _mass("I_p", "inertia of a planet over its base radius squared", 0.61, of_planets=True),
-    _stiffness("k_sp", "mesh stiffness between sun and planet", 5e8, of_planets=True),
-    _stiffness("k_rp", "mesh stiffness between ring and planet", 5e8, of_planets=True),
-    _stiffness("k_p", "bearing stiffness of a planet", 1e8, of_planets=True),
-    _stiffness("k_s", "bearing stiffness of the sun", 1e8),
-    _stiffness("k_r", "bearing stiffness of the ring", 1e8),
-    _stiffness("k_c", "bearing stiffness of the carrier", 1e8),
-    _stiffness("k_su", "rotational stiffness of the sun's bearing", 0.0),
-    _stiffness("k_ru", "rotational stiffness of the ring's bearing", 1e9),
-    _stiffness("k_cu", "rotational stiffness of the carrier's bearing", 0.0),
-    Parameter(
-        "pressure_angle",
-        "rad",
-        "pressure angle of both meshes",
-        default=math.radians(24.6),
-        lower=-math.pi / 2,
-        upper=math.pi / 2,
-        open_lower=True,
-        open_upper=True,
-    ),
-)
-NAMES = tuple(p.name for p in PARAMETERS)
-PER_PLANET = tuple(p.name for p in PARAMETERS if p.broadcast)
+PER_PLANET = ("m_p", "I_p", "k_sp", "k_rp", "k_p")
 
 # Extensions of the springs (rows: bearing radially, tangentially, mesh with ring, with sun) per unit of the central
 # coordinates, as coefficients of (1, cos psi, sin psi), times (1, cos a, sin a) of the pressure angle: (2)-(5).
@@ -125,8 +72,7 @@ def _spread(values: Values) -> dict[str, Any]:
         return jnp.broadcast_to(jnp.asarray(value, float), shape)
 
     spread_values: dict[str, Any] = {}
-    for name in NAMES:
-        value = values[name]
+    for name, value in values.items():
         if name in PER_PLANET or name == "planet_angle":
             whole = value if isinstance(value, tuple) else (value,) * count
             spread_values[name] = jnp.stack([spread(entry) for entry in whole])
@@ -242,32 +188,6 @@ def _reduced_blocks(p: Mapping[str, Array], frame: Array, directions: Array, bal
     return tuple(blocks)
 
 
-def build(values: Values) -> SpringSystem:
-    """The gear as masses and springs, eqs (1)-(7), with its decomposition (8)-(9) if all planets are alike."""
-    p, n = _spread(values), len(values["planet_angle"])
-    angles = p["planet_angle"]
-    directions = jnp.stack([jnp.ones_like(angles), jnp.cos(angles), jnp.sin(angles)], axis=1)
-    extensions, _ = _extensions(directions, p["pressure_angle"])
-    stiffness, mass = _stiffness_and_mass(p, n)
-    family, polar = _families(n)
-    alike = identical_planets(values)
-    frames = [orthonormal_frame(jnp.sqrt(p[name])[:, None] * directions)[0] for name in ("m_p", "I_p")]
-    size = _CENTRAL + _PER_PLANET * n
-    identity = jnp.broadcast_to(np.eye(size).reshape(size, size, *(1,) * (angles.ndim - 1)), (size, *mass.shape))
-    factor = weighted_factor(extensions, stiffness, mass)
-    whole = Block(factor, family, polar, identity[:, :, None], _embed(*frames))
-    blocks: tuple[Block, ...] = (whole,)
-    if alike and n >= 3:
-        frame, triangle = orthonormal_frame(directions)
-        known = all(isinstance(angle, (int, float)) for angle in values["planet_angle"])
-        balanced = known and float(spacing(values["planet_angle"])) <= _BALANCED
-        blocks = _reduced_blocks(p, frame, triangle[:3], balanced)
-    names, bodies = coordinate_names(n), np.repeat(np.arange(3 + n), 3)
-    body_names = (*BODIES, *(f"planet_{i + 1}" for i in range(n)))
-    asymmetry = jnp.maximum(spacing(tuple(angles)), _inequality(p))
-    return SpringSystem(extensions, stiffness, mass, blocks, whole, asymmetry, names, body_names, bodies)
-
-
 def coordinate_names(n: int) -> tuple[str, ...]:
     """``x_c, y_c, u_c, x_r, ...`` of carrier, ring and sun, then ``xi_1, eta_1, u_1, ...`` of the planets."""
     central = tuple(f"{kind}_{body}" for body in "crs" for kind in ("x", "y", "u"))
@@ -286,10 +206,90 @@ def check(fixed: Mapping[str, Any]) -> None:
             )
 
 
-SYSTEM = System(
-    name="planetary",
-    title="Planetary gear",
-    source="A. Shahabi, F. Sheykh Samani, Modares Mechanical Engineering 16(12), 2016",
-    parameters=PARAMETERS,
-    models={"modes": Model(build, NAMES, check)},
-)
+def _mass(long_name: str, default: float, **more: Any) -> Any:
+    return parameter("kg", long_name, default=default, lower=0.0, open_lower=True, **more)
+
+
+def _stiffness(long_name: str, default: float, **more: Any) -> Any:
+    return parameter("N/m", long_name, default=default, lower=0.0, **more)
+
+
+# Two turns, more than anyone needs: angles in degrees are refused.
+_LARGEST_ANGLE = 4 * math.pi
+_EACH = {"listed": True, "broadcast": True}
+Numbers = tuple[Number, ...]
+
+
+class Planetary(System):
+    """The gear of the module's docstring; what belongs to a planet is one number for all, or a list with one for each.
+
+    >>> Planetary().springs().mass.shape
+    (21,)
+    """
+
+    name = "planetary"
+    title = "Planetary gear"
+    source = "A. Shahabi, F. Sheykh Samani, Modares Mechanical Engineering 16(12), 2016"
+
+    planet_angle: Numbers = parameter(
+        "rad",
+        "angle of the planet",
+        symbol="ψ",
+        default=tuple(i * math.pi / 2 for i in range(4)),
+        lower=-_LARGEST_ANGLE,
+        upper=_LARGEST_ANGLE,
+        listed=True,
+    )
+    m_s: Number = _mass("mass of the sun", 0.4)
+    m_r: Number = _mass("mass of the ring", 2.35)
+    m_c: Number = _mass("mass of the carrier", 5.43)
+    m_p: Numbers | Number = _mass("mass of a planet", 0.66, **_EACH)
+    I_s: Number = _mass("inertia of the sun over its base radius squared", 0.39)
+    I_r: Number = _mass("inertia of the ring over its base radius squared", 3.0)
+    I_c: Number = _mass("inertia of the carrier over its radius squared", 6.29)
+    I_p: Numbers | Number = _mass("inertia of a planet over its base radius squared", 0.61, **_EACH)
+    k_sp: Numbers | Number = _stiffness("mesh stiffness between sun and planet", 5e8, **_EACH)
+    k_rp: Numbers | Number = _stiffness("mesh stiffness between ring and planet", 5e8, **_EACH)
+    k_p: Numbers | Number = _stiffness("bearing stiffness of a planet", 1e8, **_EACH)
+    k_s: Number = _stiffness("bearing stiffness of the sun", 1e8)
+    k_r: Number = _stiffness("bearing stiffness of the ring", 1e8)
+    k_c: Number = _stiffness("bearing stiffness of the carrier", 1e8)
+    k_su: Number = _stiffness("rotational stiffness of the sun's bearing", 0.0)
+    k_ru: Number = _stiffness("rotational stiffness of the ring's bearing", 1e9)
+    k_cu: Number = _stiffness("rotational stiffness of the carrier's bearing", 0.0)
+    pressure_angle: Number = parameter(
+        "rad",
+        "pressure angle of both meshes",
+        symbol="α",
+        default=math.radians(24.6),
+        lower=-math.pi / 2,
+        upper=math.pi / 2,
+        open_lower=True,
+        open_upper=True,
+    )
+
+    @serves("modes", check=check)
+    def springs(self) -> SpringSystem:
+        """The gear as masses and springs, eqs (1)-(7), with its decomposition (8)-(9) if all planets are alike."""
+        p, n = _spread(self.values), len(self.planet_angle)
+        angles = p["planet_angle"]
+        directions = jnp.stack([jnp.ones_like(angles), jnp.cos(angles), jnp.sin(angles)], axis=1)
+        extensions, _ = _extensions(directions, p["pressure_angle"])
+        stiffness, mass = _stiffness_and_mass(p, n)
+        family, polar = _families(n)
+        alike = identical_planets(self.values)
+        frames = [orthonormal_frame(jnp.sqrt(p[name])[:, None] * directions)[0] for name in ("m_p", "I_p")]
+        size = _CENTRAL + _PER_PLANET * n
+        identity = jnp.broadcast_to(np.eye(size).reshape(size, size, *(1,) * (angles.ndim - 1)), (size, *mass.shape))
+        factor = weighted_factor(extensions, stiffness, mass)
+        whole = Block(factor, family, polar, identity[:, :, None], _embed(*frames))
+        blocks: tuple[Block, ...] = (whole,)
+        if alike and n >= 3:
+            frame, triangle = orthonormal_frame(directions)
+            known = all(isinstance(angle, (int, float)) for angle in self.planet_angle)
+            balanced = known and float(spacing(self.planet_angle)) <= _BALANCED
+            blocks = _reduced_blocks(p, frame, triangle[:3], balanced)
+        names, bodies = coordinate_names(n), np.repeat(np.arange(3 + n), 3)
+        body_names = (*BODIES, *(f"planet_{i + 1}" for i in range(n)))
+        asymmetry = jnp.maximum(spacing(tuple(angles)), _inequality(p))
+        return SpringSystem(extensions, stiffness, mass, blocks, whole, asymmetry, names, body_names, bodies)

@@ -15,42 +15,17 @@ equation is homogeneous in u, b, B0 and B1, so that any unit of length will do.
 from __future__ import annotations
 
 import math
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
+from jax import Array
 
-from drivetrain_jax._quantities import Parameter
-from drivetrain_jax.systems._base import Model, Resonances, System, Values
+from drivetrain_jax.systems._base import Number, Resonances, System, Values, parameter, serves
 from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator
-
-PARAMETERS = (
-    Parameter("omega", "rad/s", "frequency of the drive", lower=0.0, open_lower=True),
-    Parameter("B0", "m/s2", "mean of the drive"),
-    Parameter("B1", "m/s2", "amplitude of the drive"),
-    Parameter("b", "m", "half the backlash", lower=0.0),
-    Parameter("c", "N s/m", "damping of the mesh", lower=0.0),
-    Parameter("alpha", "1", "stiffness within the backlash over that in contact", lower=0.0),
-    Parameter("k", "N/m", "stiffness in contact", lower=0.0, open_lower=True),
-    Parameter("I", "kg", "equivalent mass", lower=0.0, open_lower=True),
-    Parameter("u0", "m", "relative displacement at t = 0", default=0.0),
-    Parameter("v0", "m/s", "relative velocity at t = 0", default=0.0),
-)
-NAMES = tuple(p.name for p in PARAMETERS[:8])
 
 # Table 1 of the paper: b = 10 deg.
 PRESETS = {"table1": {"B0": 0.05, "B1": 0.03, "b": math.pi / 18, "c": 0.05, "alpha": 0.25, "k": 1.0, "I": 1.0}}
-
-
-def oscillator(values: Values) -> PiecewiseLinearOscillator:
-    """The oscillator of these parameters (scalars or arrays of one shape)."""
-    return PiecewiseLinearOscillator(
-        damping=values["c"] / values["I"],
-        stiffness=values["k"] / values["I"],
-        alpha=values["alpha"],
-        b=values["b"],
-        B0=values["B0"],
-        B1=values["B1"],
-        omega=values["omega"],
-    )
 
 
 def rattle_threshold(values: Values) -> np.ndarray:
@@ -68,23 +43,56 @@ def rattle_threshold(values: Values) -> np.ndarray:
     return np.where(margin > 0, threshold, np.nan)[..., None]
 
 
-SYSTEM = System(
-    name="rattle",
-    title="Gear rattle: a pair of gears with backlash",
-    source="Rezaee & Farshidianfar (in Persian); corrections in docs/theory/rattle.md",
-    parameters=PARAMETERS,
-    models={
-        "frequency_response": Model(oscillator, NAMES),
-        "steady_state": Model(oscillator, (*NAMES, "u0", "v0")),
-        "basins": Model(oscillator, NAMES),
-    },
-    presets=PRESETS,
-    resonances=Resonances(
+POSITIVE = {"lower": 0.0, "open_lower": True}
+_MOTION = ("omega", "B0", "B1", "b", "c", "alpha", "k", "I")
+
+
+class Rattle(System):
+    """The oscillator of the module's docstring.
+
+    >>> import jax.numpy as jnp
+    >>> gears = Rattle(omega=0.7, **PRESETS["table1"])
+    >>> print(gears.vector_field(0.0, jnp.array([0.2, 0.0])))
+    """
+
+    name = "rattle"
+    title = "Gear rattle: a pair of gears with backlash"
+    source = "Rezaee & Farshidianfar (in Persian); corrections in docs/theory/rattle.md"
+    presets = PRESETS
+    resonances = Resonances(
         "B1",
         ("omega", "B0", "b", "c", "alpha", "k", "I"),
         ("no separation ends",),
         rattle_threshold,
         "amplitude at which the orbit without separation ends",
-    ),
-    roles={"speed": "omega"},
-)
+    )
+    roles = MappingProxyType({"speed": "omega"})
+
+    omega: Number = parameter("rad/s", "frequency of the drive", symbol="ω", **POSITIVE)
+    B0: Number = parameter("m/s2", "mean of the drive")
+    B1: Number = parameter("m/s2", "amplitude of the drive")
+    b: Number = parameter("m", "half the backlash", lower=0.0)
+    c: Number = parameter("N s/m", "damping of the mesh", lower=0.0)
+    alpha: Number = parameter("1", "stiffness within the backlash over that in contact", symbol="α", lower=0.0)
+    k: Number = parameter("N/m", "stiffness in contact", **POSITIVE)
+    I: Number = parameter("kg", "equivalent mass", **POSITIVE)  # noqa: E741
+    u0: Number = parameter("m", "relative displacement at t = 0", default=0.0)
+    v0: Number = parameter("m/s", "relative velocity at t = 0", default=0.0)
+
+    @serves("frequency_response", "basins", parameters=_MOTION)
+    @serves("steady_state")
+    def oscillator(self) -> PiecewiseLinearOscillator:
+        """The oscillator in units of its mass."""
+        return PiecewiseLinearOscillator(
+            damping=self.c / self.I,
+            stiffness=self.k / self.I,
+            alpha=self.alpha,
+            b=self.b,
+            B0=self.B0,
+            B1=self.B1,
+            omega=self.omega,
+        )
+
+    def vector_field(self, t: Any, y: Array) -> Array:
+        """``(u', u'')`` of ``y = (u, u')``, shape ``(2, ...)``, at the time ``t`` [s]."""
+        return self.oscillator().field(t, y)

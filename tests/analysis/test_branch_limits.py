@@ -22,7 +22,7 @@ OPTIONS = {
 
 def branch(method):
     request = Request(("branch_u_max",), method, OPTIONS[method])
-    solve = frequency_response.ANALYSIS.solvers(rattle.SYSTEM, request)[0].solve
+    solve = frequency_response.ANALYSIS.solvers(rattle.Rattle, request)[0].solve
     values = rattle.PRESETS["table1"] | {"omega": OMEGAS}
     found = jax.jit(lambda: solve(values, jnp.asarray(1)))()
     return np.isfinite(found["branch_u_max"]).sum(axis=1), np.asarray(found["outcome"])

@@ -13,10 +13,10 @@ from scipy.integrate import quad, solve_ivp
 
 from drivetrain_jax.analysis.approximations import closed_form_response, describing_function, multiple_scales
 from drivetrain_jax.analysis.numerics.amplitude_roots import follow, refined
-from drivetrain_jax.systems.rattle import PRESETS, oscillator
+from drivetrain_jax.systems.rattle import PRESETS, Rattle
 
 TABLE1 = PRESETS["table1"] | {"omega": 1.0}
-MODEL = oscillator(TABLE1)
+MODEL = Rattle.models["basins"].build(TABLE1)
 OMEGAS = np.array([0.3, 0.5, 0.76, 0.8, 0.84, 0.9, 1.0, 1.3])
 # Cases by lane: Table 1 first, then limits.
 CASES = (
@@ -43,7 +43,7 @@ def lanes(cases) -> dict[str, np.ndarray]:
 
 def solve(method: str, omegas=OMEGAS, cases=CASES, fit_range: float | None = None) -> dict[str, np.ndarray]:
     def run(values):
-        model = oscillator(values | {"omega": omegas})
+        model = Rattle.models["basins"].build(values | {"omega": omegas})
         return closed_form_response.response(model, method, fit_range, (len(cases),), OUTPUTS)
 
     return {name: np.asarray(value) for name, value in jax.jit(run)(lanes(cases)).items()}
@@ -118,7 +118,9 @@ def test_the_largest_self_consistent_range_is_taken(alpha):
         stiffness = 1 - (1 - alpha) * float(multiple_scales._share(ratio))
         if stiffness <= 0:
             continue
-        model = oscillator(TABLE1 | {"alpha": alpha, "B1": TABLE1["c"] * TABLE1["b"] / ratio * math.sqrt(stiffness)})
+        model = Rattle.models["basins"].build(
+            TABLE1 | {"alpha": alpha, "B1": TABLE1["c"] * TABLE1["b"] / ratio * math.sqrt(stiffness)}
+        )
         reach = float(multiple_scales.self_consistent_range(model, ()))
         r = np.linspace(1e-3, 1, 400_000)
         excess = (1 - (1 - alpha) * multiple_scales._share(r)) / r**2 - stiffness / ratio**2
@@ -145,7 +147,7 @@ def test_one_parameter_may_vary_alone(name):
     cases = [table | {name: table[name] * factor} for factor in factors]
 
     def reach(values, shape):
-        return multiple_scales.self_consistent_range(oscillator(values), shape)
+        return multiple_scales.self_consistent_range(Rattle.models["basins"].build(values), shape)
 
     expected = jax.jit(lambda values: reach(values, (3,)))(lanes(cases))
     for chosen in (slice(1), slice(1, None), slice(None)):
@@ -339,7 +341,7 @@ def test_the_backbone_is_the_largest_free_motion(case):
         solve("describing_function", omegas, ({**case, "B1": b},))["backbone_amplitude"] for b in (1e-3, 0.5)
     )
     np.testing.assert_array_equal(small, large)
-    model, at = oscillator(TABLE1 | case), describing_function.point_at
+    model, at = Rattle.models["basins"].build(TABLE1 | case), describing_function.point_at
     scanned = jnp.geomspace(1e-4, 1e6, 100_001)
     kappa = np.asarray(jax.jit(lambda a: at(model, a, describing_function.bias_of(model, a)).stiffness)(scanned))
     for omega, found in zip(omegas, small[:, 0], strict=True):
@@ -360,7 +362,7 @@ def test_softening_bends_down(describing):
 
 
 def test_a_line_without_lanes_equals_the_batch(describing):
-    model = oscillator(TABLE1 | {"omega": OMEGAS})
+    model = Rattle.models["basins"].build(TABLE1 | {"omega": OMEGAS})
     alone = closed_form_response.response(model, "describing_function", None, (), ("u_max", "fold_frequency"))
     np.testing.assert_allclose(alone["u_max"], describing["u_max"][..., 0], rtol=1e-12)
     assert alone["fold_frequency"].shape == (len(OMEGAS), closed_form_response.FOLDS)

@@ -21,7 +21,7 @@ from drivetrain_jax.analysis.shafts.mechanisms import zero_modes
 from drivetrain_jax.analysis.shafts.roots import find_roots, relative_error
 from drivetrain_jax.analysis.shafts.shapes import mode_shapes
 from drivetrain_jax.systems import Shaft
-from drivetrain_jax.systems.bicardan import PRESETS, shaft
+from drivetrain_jax.systems.bicardan import PRESETS, Bicardan
 
 CASES = json.loads((Path(__file__).parents[1] / "reference" / "bicardan.json").read_text())
 PAPER = PRESETS["paper"]
@@ -90,7 +90,7 @@ def test_mode_60_of_closed_forms():
 
 def test_mode_60_of_a_stepped_shaft():
     """The determinant of the plain transfer matrices, with 150 digits, changes sign within 1e-13 of modes 30, 60."""
-    found = np.asarray(jax.jit(lambda s: find_roots(s, 60).q)(shaft(PAPER))) ** 2
+    found = np.asarray(jax.jit(lambda s: find_roots(s, 60).q)(Bicardan.of(PAPER).shaft())) ** 2
     for mode in (30, 60):
         signs = [_exact_determinant(found[mode - 1] * (1 + side * 1e-13)) > 0 for side in (-1, 1)]
         assert signs[0] != signs[1]
@@ -246,7 +246,7 @@ def test_compound_is_the_exponential(z):
 
 def test_count_grows_by_one_through_every_frequency():
     """Also next to the poles of the segments' stiffness, where the count has nothing to hold on to."""
-    uniform = shaft(PRESETS["paper_tube"])
+    uniform = Bicardan.of(PRESETS["paper_tube"]).shaft()
     q = eight(everything(PRESETS["paper_tube"]))[0].q
     clamped = jnp.array([4.730040744862704, 7.853204624095838]) / (0.3 * (2.808 / 22155.0) ** 0.25)
     near = jnp.sort(jnp.concatenate([clamped * (1 + side * 1e-15) for side in (-1, 0, 1)]))

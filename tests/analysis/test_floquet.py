@@ -397,26 +397,27 @@ import math
 import jax.numpy as jnp
 
 from drivetrain_jax._quantities import Parameter
-from drivetrain_jax.systems import FloquetModel, LinearPeriodic, Model, System
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System, parameter, serves
 
 
-def floquet(values):
+class Mathieu(System):
     """x'' + 2 d x' + (a - 2 q cos 2t) x = 0."""
 
-    def rows(t):
-        return (0, 1.0), (2 * values["q"] * jnp.cos(2 * t) - values["a"], -2 * values["d"])
+    name = "mathieu"
+    title = "Damped Mathieu equation"
+    source = "DLMF 28"
 
-    form = LinearPeriodic(rows, math.pi)
-    return FloquetModel(form, form)
+    a: float = parameter("1", "stiffness")
+    q: float = parameter("1", "modulation")
+    d: float = parameter("1", "damping")
 
+    @serves("floquet")
+    def floquet_model(self):
+        form = LinearPeriodic(self.rows, math.pi)
+        return FloquetModel(form, form)
 
-SYSTEM = System(
-    name="mathieu",
-    title="Damped Mathieu equation",
-    source="DLMF 28",
-    parameters=(Parameter("a", "1", "stiffness"), Parameter("q", "1", "modulation"), Parameter("d", "1", "damping")),
-    models={"floquet": Model(floquet, ("a", "q", "d"))},
-)
+    def rows(self, t):
+        return (0, 1.0), (2 * self.q * jnp.cos(2 * t) - self.a, -2 * self.d)
 '''
 
 
@@ -427,7 +428,7 @@ def other_package(tmp_path_factory):
     info = folder / "other_shafts-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other-shafts\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[drivetrain_jax.systems]\nmathieu = other_shafts:SYSTEM\n")
+    (info / "entry_points.txt").write_text("[drivetrain_jax.systems]\nmathieu = other_shafts:Mathieu\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DRIVETRAIN_JAX_CACHE", "0")
         patch.syspath_prepend(str(folder))

@@ -17,7 +17,7 @@ from drivetrain_jax.analysis.approximations.harmonic_branch import trace
 from drivetrain_jax.analysis.approximations.harmonic_stability import half_trace, spectral_radius
 from drivetrain_jax.analysis.approximations.harmonic_sweep import settle
 from drivetrain_jax.systems import PiecewiseLinearOscillator
-from drivetrain_jax.systems.rattle import PRESETS, oscillator
+from drivetrain_jax.systems.rattle import PRESETS, Rattle
 
 TABLE1 = PRESETS["table1"]
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "rattle.json").read_text())
@@ -35,13 +35,15 @@ def lanes(cases) -> dict[str, np.ndarray]:
 
 
 def model_of(cases, omega) -> PiecewiseLinearOscillator:
-    return oscillator(lanes(cases) | {"omega": omega})
+    return Rattle.models["basins"].build(lanes(cases) | {"omega": omega})
 
 
 @pytest.fixture(scope="module")
 def swept():
     def run(values):
-        return harmonic_response.response(oscillator(values | {"omega": OMEGAS}), hb.Basis(7), (len(CASES),), OUTPUTS)
+        return harmonic_response.response(
+            Rattle.models["basins"].build(values | {"omega": OMEGAS}), hb.Basis(7), (len(CASES),), OUTPUTS
+        )
 
     return {name: np.asarray(value) for name, value in jax.jit(run)(lanes(CASES)).items()}
 
@@ -171,7 +173,7 @@ def test_one_harmonic_is_the_describing_function():
     cases = ({}, {"alpha": 0.0}, {"alpha": 1.5})
 
     def run(values):
-        model = oscillator(values | {"omega": np.array([0.6, 0.7])})
+        model = Rattle.models["basins"].build(values | {"omega": np.array([0.6, 0.7])})
         ours = harmonic_response.response(model, hb.Basis(1, 1, 4096), (3,), ("u_max", "u_min"))
         return ours, closed_form(model, "describing_function", None, (3,), ("branch_u_max", "branch_u_min"))
 
@@ -186,7 +188,7 @@ def test_any_number_of_samples(samples):
     omegas = np.array([0.7, 0.9])
 
     def run(values):
-        model = oscillator(values | {"omega": omegas})
+        model = Rattle.models["basins"].build(values | {"omega": omegas})
         return [
             harmonic_response.response(model, hb.Basis(5, 1, count), (1,), ("u_max", "spectral_radius"))
             for count in (samples, 1024)
@@ -203,7 +205,10 @@ def test_spectral_radius_is_over_the_period_of_the_motion():
 
     def run(values, order):
         return harmonic_response.response(
-            oscillator(values | {"omega": omegas}), hb.Basis(5, order, 128), (1,), ("spectral_radius", "u_max")
+            Rattle.models["basins"].build(values | {"omega": omegas}),
+            hb.Basis(5, order, 128),
+            (1,),
+            ("spectral_radius", "u_max"),
         )
 
     one, two, four = (jax.jit(lambda values, m=m: run(values, m))(lanes(({},))) for m in (1, 2, 4))
@@ -217,7 +222,7 @@ def test_subharmonics_follow_a_doubled_period():
     case = STEADY["T1 P2 w.45"]
 
     def run(values):
-        model = oscillator(values | {"omega": np.array([0.44, 0.45])})
+        model = Rattle.models["basins"].build(values | {"omega": np.array([0.44, 0.45])})
         return harmonic_response.response(model, hb.Basis(7, 2), (1,), ("u_max", "u_min", "stability"))
 
     found = jax.jit(run)(lanes(({},)))
@@ -233,7 +238,7 @@ def test_a_lane_does_not_depend_on_the_others():
 
     def run(values):
         return harmonic_response.response(
-            oscillator(values | {"omega": omegas}), hb.Basis(3), (2,), ("u_max", "u_min", "residual")
+            Rattle.models["basins"].build(values | {"omega": omegas}), hb.Basis(3), (2,), ("u_max", "u_min", "residual")
         )
 
     run = jax.jit(run)
@@ -250,7 +255,7 @@ def test_what_lies_between_two_folds_is_a_saddle(harmonics):
 
     def run(values):
         names = ("branch_u_max", "branch_stability")
-        model = oscillator(values | {"omega": omegas})
+        model = Rattle.models["basins"].build(values | {"omega": omegas})
         return harmonic_response.response(model, hb.Basis(harmonics, 1, 256), (2,), names)
 
     found = jax.jit(run)(lanes(cases))

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.planetary_reference import TABLE_2, exact_frequencies
 from drivetrain_jax.analysis.spectra.mode_gradients import directional_derivatives, natural_frequencies
-from drivetrain_jax.systems import planetary
+from drivetrain_jax.systems.planetary import Planetary
 
 ANGLES = (0.1, 1.5, 3.0, 4.9)
 UNEQUAL = TABLE_2 | {"planet_angle": ANGLES, "m_p": (0.6, 0.66, 0.7, 0.75), "k_sp": (4e8, 5e8, 6e8, 5.5e8)}
@@ -20,7 +20,7 @@ NAMES = [*STIFFNESSES, "m_p", "m_s", "I_c", "pressure_angle", "planet_angle"]
 
 
 def twice(p):
-    f = natural_frequencies(planetary.build, p)
+    f = natural_frequencies(Planetary.models["modes"].build, p)
     return f, f
 
 
@@ -47,7 +47,7 @@ def forward():
     @jax.jit
     def along(k_p, angles):
         def moving(k, psi):
-            return natural_frequencies(planetary.build, EQUAL | {"k_p": k, "planet_angle": psi})
+            return natural_frequencies(Planetary.models["modes"].build, EQUAL | {"k_p": k, "planet_angle": psi})
 
         return jax.jvp(moving, (K_P, EQUAL["planet_angle"]), (k_p, angles))
 
@@ -85,7 +85,7 @@ def test_planets_that_differ_slightly():
     listed = tuple(1e8 * (1 + 1e-5 * x) for x in (0, 0.3, -0.5, 0.9, -0.2, 0.6))
     p = TABLE_2 | {"planet_angle": tuple(2 * np.pi * i / 6 for i in range(6)), "k_p": listed}
     rate = jax.tree.map(lambda x: 0.0, p) | {"k_p": (0.0, 1.0, 0.0, 0.0, 0.0, 0.0)}
-    slope = jax.jit(lambda q, d: jax.jvp(lambda x: natural_frequencies(planetary.build, x), (q,), (d,)))
+    slope = jax.jit(lambda q, d: jax.jvp(lambda x: natural_frequencies(Planetary.models["modes"].build, x), (q,), (d,)))
     value, ours = map(np.asarray, slope(p, rate))
     low, here, high = (np.array(exact_frequencies(moved(p, "k_p", 1, step))) for step in (-0.1, 0.0, 0.1))
     np.testing.assert_allclose(value[1:], here[1:], rtol=1e-13)
@@ -109,7 +109,7 @@ def test_scaling_of_all_stiffnesses(jacobian, frequencies):
 def test_masses_of_a_stiff_gear():
     """Derivatives by a mass where springs are nearly rigid, whose forces cancel."""
     stiff = UNEQUAL | {"k_rp": 1e20}
-    along = jax.jit(lambda p, d: jax.jvp(lambda q: natural_frequencies(planetary.build, q), (p,), (d,)))
+    along = jax.jit(lambda p, d: jax.jvp(lambda q: natural_frequencies(Planetary.models["modes"].build, q), (p,), (d,)))
     frequency, slope = map(np.asarray, along(stiff, jax.tree.map(lambda x: 0.0, stiff) | {"m_r": 1.0}))
     assert frequency[-1] / frequency[1] > 1e6
     soft = slice(1, 12)
@@ -125,7 +125,9 @@ def test_turning_the_gear_changes_nothing(jacobian, frequencies):
 @pytest.mark.full
 def test_forward_and_reverse_agree(jacobian):
     tangent = jax.tree.map(lambda x: 0.0, UNEQUAL) | {"k_p": 1.0}
-    forward = jax.jit(lambda p, d: jax.jvp(lambda q: natural_frequencies(planetary.build, q), (p,), (d,))[1])
+    forward = jax.jit(
+        lambda p, d: jax.jvp(lambda q: natural_frequencies(Planetary.models["modes"].build, q), (p,), (d,))[1]
+    )
     along = forward(UNEQUAL, tangent)
     np.testing.assert_allclose(np.asarray(along), np.asarray(jacobian["k_p"]), rtol=1e-10, atol=1e-20)
 
@@ -133,7 +135,9 @@ def test_forward_and_reverse_agree(jacobian):
 def test_doublets_get_the_derivative_of_their_mean_and_split_along_the_projected_matrix(forward):
     """Moving one planet splits the translational doublets of equal spacing."""
     tangent = jax.tree.map(lambda x: 0.0, EQUAL) | {"planet_angle": (0.0, 1.0, 0.0, 0.0)}
-    split = np.asarray(jax.jit(lambda p, d: directional_derivatives(planetary.build, p, d))(EQUAL, tangent))
+    split = np.asarray(
+        jax.jit(lambda p, d: directional_derivatives(Planetary.models["modes"].build, p, d))(EQUAL, tangent)
+    )
     mean = forward(0.0, tangent["planet_angle"])[1][:, 1]
     step = 1e-5
     here = np.array(exact_frequencies(EQUAL))
@@ -159,5 +163,7 @@ def test_lanes_and_a_rigid_mode(forward):
 
 def test_whole_numbers_are_numbers():
     rate = jax.tree.map(lambda x: 0, EQUAL) | {"k_p": 1}
-    whole, broken = (directional_derivatives(planetary.build, EQUAL | {"m_s": m}, rate) for m in (1, 1.0))
+    whole, broken = (
+        directional_derivatives(Planetary.models["modes"].build, EQUAL | {"m_s": m}, rate) for m in (1, 1.0)
+    )
     np.testing.assert_array_equal(np.asarray(whole), np.asarray(broken))

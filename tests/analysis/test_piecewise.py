@@ -12,7 +12,7 @@ from benchmarks.rattle_reference import extended, random_case
 from drivetrain_jax.analysis.impacts.orbit_history import history
 from drivetrain_jax.analysis.impacts.piecewise_flow import piece, responses
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start, usual_steps
-from drivetrain_jax.systems.rattle import PRESETS, oscillator
+from drivetrain_jax.systems.rattle import PRESETS, Rattle
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "rattle.json").read_text())
 TABLE1 = PRESETS["table1"]
@@ -20,7 +20,7 @@ TABLE1 = PRESETS["table1"]
 
 @jax.jit
 def run(values, u, v, periods):
-    lanes = prepare(oscillator(values))
+    lanes = prepare(Rattle.models["basins"].build(values))
     return march(lanes, start(lanes, u, v, periods), 400_000), usual_steps(lanes)
 
 
@@ -32,7 +32,7 @@ def columns(cases):
 def test_step_response_solves_its_equation(stiffness):
     """Against the doubling formulas, which hold for every linear equation, from a step on which the series holds."""
     mp = pytest.importorskip("mpmath")
-    model = oscillator(TABLE1 | {"c": 1.0, "omega": 1.0})
+    model = Rattle.models["basins"].build(TABLE1 | {"c": 1.0, "omega": 1.0})
     for d in (1e-6, 0.01, 0.3, 0.7, 3.0, 20.0):
         got = [float(x) for x in responses(piece(model, jnp.asarray(stiffness)), jnp.asarray(d))]
         with mp.workdps(60):
@@ -140,7 +140,7 @@ def test_a_lane_that_is_not_finite_does_not_hold_up_the_others():
 
 def test_a_history_is_right_however_far_apart_its_times_are():
     """More than 10,000 steps lie between them; an event solver written for this has -.3245944 after half a period."""
-    slow = oscillator(TABLE1 | {"omega": 1e-4, "c": 1e-3, "alpha": 0.0, "B1": 0.2})
+    slow = Rattle.models["basins"].build(TABLE1 | {"omega": 1e-4, "c": 1e-3, "alpha": 0.0, "B1": 0.2})
     u, v, one = jnp.array([0.5]), jnp.array([0.1]), jnp.array([1])
     far, near = (np.asarray(history(slow, u, v, one, samples)[0])[:, 0] for samples in (2, 64))
     assert far[1] == pytest.approx(-0.3245944, abs=1e-6)

@@ -14,7 +14,7 @@ from drivetrain_jax.analysis import Outcome, Request, get_analysis
 from drivetrain_jax.analysis.impacts.exact_response import sweeps
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
 from drivetrain_jax.systems import get_system
-from drivetrain_jax.systems.rattle import PRESETS, oscillator
+from drivetrain_jax.systems.rattle import PRESETS, Rattle
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "rattle.json").read_text())
 STEADY = REFERENCE["steady"]
@@ -91,7 +91,7 @@ def test_the_attractor_is_the_one_that_the_motion_reaches(steady):
 
     @jax.jit
     def settled(values):
-        lanes = prepare(oscillator(values))
+        lanes = prepare(Rattle.models["basins"].build(values))
         return march(lanes, start(lanes, values["u0"], values["v0"], jnp.full(48, 480, jnp.int32)), 100_000)
 
     motion = settled(table)
@@ -117,7 +117,7 @@ def test_the_exponent_of_chaos_is_the_mean_growth_of_a_tangent():
     case, most = TABLE1 | {"alpha": 0.0, "B1": 0.2, "omega": 1.2}, 67
     scene = {"system": "rattle", "analysis": "steady_state", "outputs": ["lyapunov_exponent", "regime"]}
     found = dt.run(scene | {"points": {k: [v] for k, v in case.items()}, "options": {"most_periods": most}})
-    lanes = prepare(oscillator({k: jnp.array([v]) for k, v in case.items()}))
+    lanes = prepare(Rattle.models["basins"].build({k: jnp.array([v]) for k, v in case.items()}))
     one_period = jax.jit(lambda u, v: march(lanes, start(lanes, u, v, jnp.asarray(1, jnp.int32)), 100_000))
     u = v = jnp.zeros(1)
     tangent, growth = np.array([0.6, 0.8]), []
@@ -154,7 +154,7 @@ def test_an_undamped_motion_does_not_settle_and_says_so(steady):
 
 def test_sweeps_jump_where_the_folds_are():
     omega = np.arange(0.74, 0.885, 0.002)
-    found = jax.jit(lambda w: sweeps(oscillator(TABLE1 | {"omega": w})))(omega)
+    found = jax.jit(lambda w: sweeps(Rattle.models["basins"].build(TABLE1 | {"omega": w})))(omega)
     assert np.all(found["outcome"] == Outcome.SUCCESS)
     swing = np.asarray(found["u_max"] - found["u_min"])
     up, down = (omega[:-1][np.abs(np.diff(swing[:, k])) > 0.2] for k in (0, 1))
@@ -193,7 +193,7 @@ def test_initial_states_lead_where_the_motion_goes(steady):
     table = {name: jnp.array([case[name] for case in cases]) for name in NAMES}
 
     def end(values):
-        lanes = prepare(oscillator(values))
+        lanes = prepare(Rattle.models["basins"].build(values))
         return march(lanes, start(lanes, values["u0"], values["v0"], jnp.full(len(cases), 600, jnp.int32)), 100_000).u
 
     assert np.all(found["outcome"] == Outcome.SUCCESS)

@@ -438,16 +438,16 @@ def test_titles_that_an_output_cannot_write_are_escaped(folder):
 def test_a_package_that_fails_spoils_no_other_system(cli, tmp_path, monkeypatch):
     info = tmp_path / "site" / "broken-1.dist-info"
     info.mkdir(parents=True)
-    (info.parent / "broken_shafts.py").write_text("from drivetrain_jax.systems.cardan import SYSTEM\n1 / 0\n")
-    (info.parent / "renamed_shafts.py").write_text("from drivetrain_jax.systems.cardan import SYSTEM\n")
+    (info.parent / "broken_shafts.py").write_text("from drivetrain_jax.systems.cardan import Cardan\n1 / 0\n")
+    (info.parent / "renamed_shafts.py").write_text("from drivetrain_jax.systems.cardan import Cardan\n")
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1\n")
-    entries = "[drivetrain_jax.systems]\nbroken = broken_shafts:SYSTEM\nrenamed = renamed_shafts:SYSTEM\n"
+    entries = "[drivetrain_jax.systems]\nbroken = broken_shafts:Cardan\nrenamed = renamed_shafts:Cardan\n"
     (info / "entry_points.txt").write_text(entries)
     monkeypatch.syspath_prepend(str(info.parent))
     code, out, _ = cli("list")
-    fails = "broken_shafts:SYSTEM cannot be loaded: ZeroDivisionError: division by zero"
+    fails = "broken_shafts:Cardan cannot be loaded: ZeroDivisionError: division by zero"
     assert code == 0 and "cardan     Cardan" in out and f"broken     {fails}" in out
-    assert "renamed    renamed_shafts:SYSTEM is the system cardan, not the system renamed" in out
+    assert "renamed    renamed_shafts:Cardan is the system cardan, not the system renamed" in out
     code, _, err = cli("list", "broken")
     assert (code, err) == (2, [f"drivetrain: system = 'broken': {fails}"])
 

@@ -39,7 +39,7 @@ def install(folder: Path) -> str:
     info = folder / "light-1.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: light\nVersion: 1\n")
-    (info / "entry_points.txt").write_text("[drivetrain_jax.systems]\nlight = light:SYSTEM\n")
+    (info / "entry_points.txt").write_text("[drivetrain_jax.systems]\nlight = light:Light\n")
     shutil.copy(Path(__file__).with_name("light.py"), folder)
     sys.path.insert(0, str(folder))
     return os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])

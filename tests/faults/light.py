@@ -5,26 +5,30 @@ from __future__ import annotations
 import math
 
 import jax.numpy as jnp
-import numpy as np
 
-from drivetrain_jax._quantities import Parameter
-from drivetrain_jax.systems import FloquetModel, LinearPeriodic, Model, System
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System, parameter, serves
 
 
-def _model(values) -> FloquetModel:
-    delta, epsilon = values["delta"], values["epsilon"]
-    system = LinearPeriodic(
-        lambda t: ((0, 1.0), (-(delta + epsilon * jnp.cos(t)), -0.02)),
-        2 * math.pi,
-        log_determinant=lambda: -0.04 * math.pi + 0 * delta,
-    )
-    return FloquetModel(system, system, lambda rtol: 40 + 60 * np.sqrt(np.asarray(delta)) + 0 * np.asarray(epsilon))
+class Light(System):
+    """x'' + 0.02 x' + (delta + epsilon cos t) x = 0."""
 
+    name = "light"
+    title = "Damped Mathieu oscillator"
+    source = "tests"
 
-SYSTEM = System(
-    name="light",
-    title="Damped Mathieu oscillator",
-    source="tests",
-    parameters=(Parameter("delta", "1", "mean stiffness"), Parameter("epsilon", "1", "depth of modulation")),
-    models={"floquet": Model(_model, ("delta", "epsilon"))},
-)
+    delta: float = parameter("1", "mean stiffness")
+    epsilon: float = parameter("1", "depth of modulation")
+
+    @serves("floquet")
+    def floquet_model(self) -> FloquetModel:
+        system = LinearPeriodic(self.rows, 2 * math.pi, log_determinant=self.log_determinant)
+        return FloquetModel(system, system, self.steps)
+
+    def rows(self, t):
+        return (0, 1.0), (-(self.delta + self.epsilon * jnp.cos(t)), -0.02)
+
+    def log_determinant(self):
+        return -0.04 * math.pi + 0 * self.delta
+
+    def steps(self, rtol):
+        return 40 + 60 * self.delta**0.5 + 0 * self.epsilon

@@ -12,8 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drivetrain_jax._quantities import Parameter
-from drivetrain_jax.systems import FloquetModel, LinearPeriodic, Model, System
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System, parameter, serves
 
 
 def _perhaps_die(deadly: np.ndarray, folder: str) -> np.ndarray:
@@ -38,32 +37,37 @@ def _perhaps_die_at_start() -> None:
 _perhaps_die_at_start()
 
 
-def _model(values) -> FloquetModel:
-    delta, deadly = values["delta"], values["deadly"]
-    zero = 0.0
-    # Compiled code alone is dangerous; plans are made with plain arrays.
-    if isinstance(delta, jax.core.Tracer):
-        folder = os.environ["FRAGILE_FOLDER"]
-        zero = jax.pure_callback(
-            lambda sort: _perhaps_die(sort, folder), jax.ShapeDtypeStruct((), float), jnp.asarray(deadly) + 0 * delta
+class Fragile(System):
+    """x'' + 0.02 x' + (delta + epsilon cos t) x = 0."""
+
+    name = "fragile"
+    title = "Damped Mathieu oscillator"
+    source = "tests"
+
+    delta: float = parameter("1", "mean stiffness")
+    epsilon: float = parameter("1", "depth of modulation", default=0.3)
+    deadly: int = parameter("1", "what happens", default=0, lower=0, upper=2, integer=True)
+
+    @serves("floquet")
+    def floquet_model(self) -> FloquetModel:
+        zero = 0.0
+        # Compiled code alone is dangerous; plans are made with plain arrays.
+        if isinstance(self.delta, jax.core.Tracer):
+            folder = os.environ["FRAGILE_FOLDER"]
+            sort = jnp.asarray(self.deadly) + 0 * self.delta
+            zero = jax.pure_callback(
+                lambda sort: _perhaps_die(sort, folder),
+                jax.ShapeDtypeStruct((), float),
+                sort,
+                vmap_method="expand_dims",
+            )
+        system = LinearPeriodic(
+            lambda t: ((0, 1.0), (-(self.delta + zero + self.epsilon * jnp.cos(t)), -0.02)),
+            2 * math.pi,
+            log_determinant=lambda: -0.04 * math.pi + 0 * self.delta,
         )
-    system = LinearPeriodic(
-        lambda t: ((0, 1.0), (-(delta + zero + values["epsilon"] * jnp.cos(t)), -0.02)),
-        2 * math.pi,
-        log_determinant=lambda: -0.04 * math.pi + 0 * delta,
-    )
-    # The effort keeps deadly points in chunks of their own.
-    return FloquetModel(system, system, lambda rtol: 30 + 10 * (np.asarray(deadly) + 0 * np.asarray(delta)))
+        return FloquetModel(system, system, self.steps)
 
-
-SYSTEM = System(
-    name="fragile",
-    title="Damped Mathieu oscillator",
-    source="tests",
-    parameters=(
-        Parameter("delta", "1", "mean stiffness"),
-        Parameter("epsilon", "1", "depth of modulation", default=0.3),
-        Parameter("deadly", "1", "what happens", default=0, lower=0, upper=2, integer=True),
-    ),
-    models={"floquet": Model(_model, ("delta", "epsilon", "deadly"))},
-)
+    def steps(self, rtol):
+        """The effort keeps deadly points in chunks of their own."""
+        return 30 + 10 * (self.deadly + 0 * self.delta)

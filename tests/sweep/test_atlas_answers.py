@@ -324,7 +324,7 @@ def test_gradients_at_extremes(point):
 def test_steps_of_a_gradient_are_found_where_the_system_predicts_none():
     model = CARDAN.models["floquet"]
     other = replace(model, build=lambda values: replace(model.build(values), explicit_steps=None))
-    system = replace(CARDAN, models={**CARDAN.models, "floquet": other})
+    system = type("Variant", (CARDAN,), {"models": CARDAN.models | {"floquet": other}})
     point = {"beta": 0.3, "Omega": 0.004, "zeta": 1e-4, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
     found, exact = direct_sensitivity(system, point), direct_sensitivity(CARDAN, point)
     assert found.spectral_radius == pytest.approx(exact.spectral_radius, rel=1e-11)

@@ -23,7 +23,7 @@ from drivetrain_jax.analysis.numerics import singular_values
 from drivetrain_jax.analysis.shafts import roots as shaft_roots
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.scene import load_scene
-from drivetrain_jax.systems.rattle import PRESETS, oscillator
+from drivetrain_jax.systems.rattle import PRESETS, Rattle
 
 SCENES: dict[str, dict[str, Any]] = {
     "cardan": {
@@ -175,7 +175,7 @@ def test_steps_of_rattle():
 
     @jax.jit
     def steps(omega):
-        lanes = prepare(oscillator(PRESETS["table1"] | {"omega": omega}))
+        lanes = prepare(Rattle.models["basins"].build(PRESETS["table1"] | {"omega": omega}))
         return march(lanes, start(lanes, 0 * omega, 0 * omega, jnp.full(16, 10, jnp.int32)), 100_000).steps
 
     assert not complaint("steps rattle", int(steps(omega).sum()))

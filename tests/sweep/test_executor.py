@@ -42,7 +42,7 @@ def package(tmp_path):
     info = tmp_path / "packages" / "fragile-1.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: fragile\nVersion: 1\n")
-    (info / "entry_points.txt").write_text("[drivetrain_jax.systems]\nfragile = fragile:SYSTEM\n")
+    (info / "entry_points.txt").write_text("[drivetrain_jax.systems]\nfragile = fragile:Fragile\n")
     path = os.pathsep.join([str(info.parent), str(HERE), *filter(None, [os.environ.get("PYTHONPATH")])])
     return os.environ | {"PYTHONPATH": path, "FRAGILE_FOLDER": str(tmp_path)}
 

@@ -147,7 +147,7 @@ def sources(system, analysis):
         {"system": system, "analysis": analysis, "points": {"beta": [0.1], "Omega": [1.0]}, "fixed": CARDAN}
     )
     build, solvers = scene.system.models[analysis].build, scene.analysis.solvers
-    starts = [Path(inspect.getsourcefile(function)) for function in (build, solvers)]
+    starts = [Path(inspect.getsourcefile(inspect.unwrap(function))) for function in (build, solvers)]
     return {path.relative_to(Path(dt.__file__).parent).as_posix() for path in identity._imported(starts)}
 
 

@@ -12,34 +12,33 @@ import numpy as np
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis import RTOL, Analysis, Outcome, Solver
 from drivetrain_jax.sweep import scene
-from drivetrain_jax.systems import Model, Resonances, System
+from drivetrain_jax.systems import Model, Resonances, System, parameter
 
-SYSTEM = System(
-    name="toy",
-    title="Toy",
-    source="nowhere",
-    parameters=(
-        Parameter("a", "m", "first", lower=0.0, upper=10.0),
-        Parameter("b", "s", "second", default=2.0, lower=0.0, open_lower=True),
-        Parameter("n", "1", "count", default=3, lower=1, integer=True),
-        Parameter("kind", "1", "sort", default="plain", choices=("plain", "fancy")),
-        Parameter("length", "m", "lengths", default=(1.0, 2.0, 3.0), lower=0.0, listed=True),
-        Parameter("derived", "1", "twice a", derived="2 a"),
-        Parameter("unused", "1", "not used by any analysis"),
-        Parameter("weight", "N/m", "weights", default=1.0, lower=0.0, listed=True, broadcast=True),
-        Parameter("stiffness", "N/m", "stiffness of the support", default=float("inf"), lower=0.0, infinite=True),
-    ),
-    models={
-        name: Model(lambda values: values, ("a", "b", "n", "kind", "length", "derived"))
-        for name in ("toy", "slow", "broken", "line")
-    }
-    | {
+_USED = ("a", "b", "n", "kind", "length", "derived")
+
+
+class Toy(System):
+    name = "toy"
+    title = "Toy"
+    source = "nowhere"
+    resonances = Resonances("a", ("b",), ("R1", "R2"), lambda v: np.stack([v["b"] * 1.0, v["b"] / 2], -1), "predicted")
+    models = {name: Model(lambda values: values, _USED) for name in ("toy", "slow", "broken", "line")} | {
         "follow": Model(
             lambda values: values, ("b", "length", "weight", "stiffness"), lambda f: _lengths_and_weights(f)
         )
-    },
-    resonances=Resonances("a", ("b",), ("R1", "R2"), lambda v: np.stack([v["b"] * 1.0, v["b"] / 2], -1), "predicted"),
-)
+    }
+
+    a: float = parameter("m", "first", lower=0.0, upper=10.0)
+    b: float = parameter("s", "second", default=2.0, lower=0.0, open_lower=True)
+    n: int = parameter("1", "count", default=3, lower=1, integer=True)
+    kind: str = parameter("1", "sort", default="plain", choices=("plain", "fancy"))
+    length: tuple = parameter("m", "lengths", default=(1.0, 2.0, 3.0), lower=0.0, listed=True)
+    derived: float = parameter("1", "twice a", derived="2 a")
+    unused: float = parameter("1", "not used by any analysis")
+    weight: float = parameter("N/m", "weights", default=1.0, lower=0.0, listed=True, broadcast=True)
+    stiffness: float = parameter("N/m", "stiffness of the support", default=float("inf"), lower=0.0, infinite=True)
+
+
 VARIABLES = (
     Variable("value", "m", "sum of everything"),
     Variable("wave", "1", "complex result", ("part",), "complex128"),
@@ -182,7 +181,7 @@ def _find(registry: dict, original):
 
 def names(replace=setattr) -> None:
     """Make the toys known to scenes; ``replace`` may be ``monkeypatch.setattr``."""
-    replace(scene, "get_system", _find({"toy": SYSTEM}, scene.get_system))
+    replace(scene, "get_system", _find({"toy": Toy}, scene.get_system))
     replace(scene, "get_analysis", _find(ANALYSES, scene.get_analysis))
 
 

@@ -11,7 +11,7 @@ import drivetrain_jax as dt
 from benchmarks.bicardan_reference import finite_elements
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.sweep.scene import load_scene
-from drivetrain_jax.systems.bicardan import PRESETS, shaft
+from drivetrain_jax.systems.bicardan import PRESETS, Bicardan
 
 FIXED = {name: list(value) if isinstance(value, tuple) else value for name, value in PRESETS["paper_fitted"].items()}
 SCENE = {"system": "bicardan", "analysis": "critical_speeds"}
@@ -62,9 +62,9 @@ def test_operating_speeds_in_the_wrong_order_are_refused_whatever_is_asked_for()
 
 
 def test_what_is_absent_is_left_out():
-    plain = shaft(PRESETS["paper"])
+    plain = Bicardan.of(PRESETS["paper"]).shaft()
     assert plain.m is None and plain.k_hinge is None and not plain.is_timoshenko
-    assert shaft(PRESETS["paper"] | {"m_D": 1.0}).m is not None
+    assert Bicardan.of(PRESETS["paper"] | {"m_D": 1.0}).shaft().m is not None
 
 
 @pytest.fixture(scope="module")

@@ -107,7 +107,7 @@ def exact_form(v, psi, transformation):
 
 @jax.jit
 def nonlinear_jacobian(values, tau):
-    return jax.jacfwd(lambda y: cardan.nonlinear_field(tau, y, values))(jnp.zeros(4))
+    return jax.jacfwd(lambda y: cardan.Cardan.of(values).vector_field(tau, y))(jnp.zeros(4))
 
 
 @pytest.mark.parametrize("point", range(len(POINTS)))
@@ -118,7 +118,7 @@ def test_linearisation_is_the_derivative_of_the_nonlinear_equations(point, model
     for tau in (0.0, 0.37, 1.5, 2.9):
         jacobian = np.asarray(nonlinear_jacobian(v, tau))
         assert relative(jacobian, model_matrices(v, tau=tau)[0]) <= tolerance
-        e, p = cardan.damping_and_stiffness(tau, v)
+        e, p = cardan.Cardan(**v).damping_and_stiffness(tau)
         assert relative(-jacobian[2:], np.hstack([np.array(p, float), np.array(e, float)])) <= tolerance
 
 
@@ -132,8 +132,9 @@ def test_forcing_is_what_the_nonlinear_equations_have_at_rest():
     for v in POINTS[:6]:
         for tau in (0.3, 1.4, 2.2):
             forcing = [0, 0, 0, -float(exact_ratio(v["beta"], mp.mpf(tau))[1])]
-            for field in (cardan.nonlinear_field, cardan.linear_field):
-                np.testing.assert_allclose(field(tau, jnp.zeros(4), v), forcing, rtol=1e-13, atol=1e-15)
+            shaft = cardan.Cardan(**v)
+            for field in (shaft.vector_field, shaft.linear_field):
+                np.testing.assert_allclose(field(tau, jnp.zeros(4)), forcing, rtol=1e-13, atol=1e-15)
 
 
 @pytest.mark.parametrize("point", range(len(POINTS)))
@@ -149,9 +150,9 @@ def test_both_forms_are_the_transformed_natural_system(point, model_matrices):
 def test_the_stiff_form_runs_back_as_the_reduced_one_does(point):
     """R0 = Y^-1 X Y^-T at the start, R1 = Y^T X Y at the end, with (q, P) = Y (x, v)."""
     v = POINTS[point]
-    start, end = cardan.floquet_model(v).stiff.reversal()
+    start, end = cardan.Cardan(**v).floquet_model().stiff.reversal()
     with mp.workdps(60):
-        swap = mp.matrix(cardan.floquet_model(v).reduced.reversor.tolist())
+        swap = mp.matrix(cardan.Cardan(**v).floquet_model().reduced.reversor)
         first, last = (exact_transformation(v, tau) * exact_twists(v, tau) ** -1 for tau in (mp.mpf(0), mp.pi / 2))
         exact = first**-1 * swap * (first**-1).T, last.T * swap * last
         for found, e in zip((start, end), exact, strict=True):
@@ -189,7 +190,7 @@ def test_speed_ratio_and_its_derivatives():
 @pytest.mark.parametrize("point", range(len(POINTS)))
 def test_determinant_is_the_exponential_of_the_trace(point, model_matrices):
     v = POINTS[point]
-    exact = float(cardan.log_determinant(v))
+    exact = float(cardan.Cardan(**v).log_determinant())
     model = SYSTEM.models["floquet"].build(v)
     half, _ = quad(lambda psi: float(np.trace(model_matrices(v, psi=psi)[1])), 0, math.pi / 2, epsabs=0, epsrel=1e-11)
     assert 2 * half == pytest.approx(exact, rel=1e-9)
@@ -270,11 +271,15 @@ def test_parameter_ranges(name, good, bad):
 
 def test_explicit_steps_grow_with_what_makes_a_point_harder():
     base = {"beta": 0.5, "Omega": 0.5, "zeta": 0.01, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
-    easy = cardan.explicit_steps(base, 1e-10)
+
+    def steps(rtol=1e-10, **changed):
+        return cardan.Cardan(**(base | changed)).explicit_steps(rtol)
+
+    easy = steps()
     for harder in ({"Omega": 0.1}, {"beta": 1.4}, {"mu": 20.0}, {"zeta": 5.0}, {"gamma": 1e-2}):
-        assert cardan.explicit_steps(base | harder, 1e-10) > 1.2 * easy, harder
-    assert cardan.explicit_steps(base, 1e-13) > 1.5 * easy
-    assert cardan.explicit_steps(base | {"beta": np.linspace(0, 1, 7)}, 1e-10).shape == (7,)
+        assert steps(**harder) > 1.2 * easy, harder
+    assert steps(1e-13) > 1.5 * easy
+    assert steps(beta=np.linspace(0, 1, 7)).shape == (7,)
 
 
 def test_systems_are_found_by_name():
@@ -297,8 +302,8 @@ def test_systems_are_found_by_name():
 )
 def test_predicted_steps_are_enough_and_not_many_more(point, rtol):
     """What decays asks for stability more than for accuracy: it takes no steps like an oscillation as fast as that."""
-    form = cardan.floquet_model({"alpha": 1.0, "mu": 1.0, "gamma": 100.0} | point).reduced
-    predicted = int(cardan.explicit_steps({"alpha": 1.0, "mu": 1.0, "gamma": 100.0} | point, rtol))
+    shaft = cardan.Cardan(alpha=1.0, mu=1.0, gamma=100.0, **point)
+    form, predicted = shaft.floquet_model().reduced, int(shaft.explicit_steps(rtol))
     exact = assemble(form, explicit_propagator(form, jnp.int32(8 * predicted), ()).matrix)
 
     def error(steps: int) -> float:
@@ -315,7 +320,8 @@ def test_slow_points_meet_their_tolerance_with_the_predicted_steps(rtol):
     """What is a little too few is found out by twice as many: a block of points then takes 2.6 times as long."""
     for omega, beta in ((0.006, 0.9), (0.01, 0.3), (0.03, 0.1)):
         point = {"beta": beta, "Omega": omega, "zeta": 1e-3, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
-        form, steps = cardan.floquet_model(point).reduced, int(cardan.explicit_steps(point, rtol))
+        shaft = cardan.Cardan(**point)
+        form, steps = shaft.floquet_model().reduced, int(shaft.explicit_steps(rtol))
         few = -(-steps // 4)
         coarse, fine = (explicit_propagator(form, jnp.int32(n), ()) for n in (few, steps))
         found = compare(form, coarse, fine, steps, 0.0, rtol, (steps / few) ** EXPLICIT_ORDER - 1)

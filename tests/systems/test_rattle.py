@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from drivetrain_jax.systems import get_system
-from drivetrain_jax.systems.rattle import PRESETS, oscillator, rattle_threshold
+from drivetrain_jax.systems.rattle import PRESETS, Rattle, rattle_threshold
 
 TABLE1 = PRESETS["table1"] | {"omega": 0.7}
 
 
 def test_the_spring_is_continuous_and_linear_outside_the_play():
-    model = oscillator(TABLE1)
+    model = Rattle.models["basins"].build(TABLE1)
     b, alpha = TABLE1["b"], TABLE1["alpha"]
     u = jnp.array([-b - 0.3, -b, -0.5 * b, 0.0, 0.5 * b, b, b + 0.3])
     expected = [-0.3 - alpha * b, -alpha * b, -alpha * b / 2, 0.0, alpha * b / 2, alpha * b, 0.3 + alpha * b]
@@ -19,7 +19,7 @@ def test_the_spring_is_continuous_and_linear_outside_the_play():
 
 
 def test_the_field_is_the_equation_of_motion():
-    model = oscillator(TABLE1 | {"I": 2.0, "k": 3.0})
+    model = Rattle.models["basins"].build(TABLE1 | {"I": 2.0, "k": 3.0})
     u, v, t = 0.4, -0.2, 1.3
     spring = u - 0.75 * math.pi / 18
     expected = 0.05 + 0.03 * math.cos(0.7 * t) - 0.05 / 2 * v - 1.5 * spring

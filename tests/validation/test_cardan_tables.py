@@ -14,7 +14,7 @@ MISPRINTS = {"H11", "H21"}
 
 
 def ours() -> dict[str, float]:
-    return dict(zip(cardan.SYSTEM.resonances.labels, cardan.resonance_speeds({"mu": 1.0, "gamma": 100.0}), strict=True))
+    return dict(zip(cardan.Cardan.resonances.labels, cardan.resonance_speeds({"mu": 1.0, "gamma": 100.0}), strict=True))
 
 
 def test_natural_frequencies():

@@ -57,7 +57,7 @@ def assemble(system: LinearPeriodic, phi: Array) -> Array:
         return _reversed(*map(dense, system.reversal()), phi)
     if system.reversor is None:
         return phi
-    x = jnp.asarray(system.reversor).reshape(*system.reversor.shape, *(1,) * (phi.ndim - 2))
+    x = jnp.asarray(system.reversor).reshape(*phi.shape[:2], *(1,) * (phi.ndim - 2))
     return matmul(matmul(x, matmul(jnp.swapaxes(phi, 0, 1), x)), phi)
 
 

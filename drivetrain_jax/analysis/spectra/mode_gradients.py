@@ -11,10 +11,11 @@ the matrix u_i^T (dK - (2 pi f)^2 dM) u_j, which :func:`directional_derivatives`
 in the direction, and therefore a gradient, is their mean: :func:`natural_frequencies` gives every member of a cluster
 the derivative of the cluster's mean.
 
->>> import jax, drivetrain_jax.systems.planetary as planetary
+>>> import jax
+>>> from drivetrain_jax.systems.planetary import Planetary
 >>> from drivetrain_jax.analysis.spectra.mode_gradients import natural_frequencies
->>> p = {q.name: q.default for q in planetary.PARAMETERS}
->>> jax.grad(lambda k: natural_frequencies(planetary.build, p | {"k_p": k})[1])(1e8)     # Hz per N/m   # doctest: +SKIP
+>>> p, build = Planetary().values, Planetary.models["modes"].build
+>>> jax.grad(lambda k: natural_frequencies(build, p | {"k_p": k})[1])(1e8)     # Hz per N/m   # doctest: +SKIP
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ Build = Callable[[Mapping[str, Any]], SpringSystem]
 def natural_frequencies(build: Build, values: Mapping[str, Any]) -> Array:
     """Natural frequencies in Hz, rising, ``(n,)``, or ``(n, N)`` if some of ``values`` have shape ``(N,)``.
 
-    ``build`` makes the spring system from ``values`` (for the planetary gear ``planetary.build`` and all its
+    ``build`` makes the spring system from ``values`` (for the planetary gear that of its model, and all its
     parameters, ``planet_angle`` a tuple). Differentiable once, forwards and backwards, with respect to every value;
     derivatives of clusters are those of their mean, that of a rigid mode is zero, also by the stiffness of a spring that
     holds it, where f grows as sqrt(k) and has none. NaN where a value is not finite.

@@ -1,0 +1,121 @@
+"""Linear periodic systems and what the analyses ``floquet`` and ``forced`` ask of a model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+Rows = tuple[tuple[Any, ...], ...]
+
+
+def dense(rows: Rows) -> Array:
+    """The matrix of these rows, ``(n, n, ...)``."""
+    shape = jnp.broadcast_shapes(*(jnp.shape(entry) for row in rows for entry in row))
+    return jnp.stack([jnp.stack([jnp.broadcast_to(entry, shape) for entry in row]) for row in rows])
+
+
+def _time(t: Any) -> tuple[Any, ...]:
+    return (t,)
+
+
+def _tuples(matrix: Any) -> Rows | None:
+    return None if matrix is None else tuple(tuple(map(float, row)) for row in matrix)
+
+
+# The reversor that exchanges the first two of four states with the others.
+SWAP = _tuples(np.kron(np.array([[0.0, 1.0], [1.0, 0.0]]), np.eye(2)))
+
+
+class LinearPeriodic(diffrax.AbstractTerm):
+    """The linear system ``x' = A(t) x`` over one interval ``[0, span]`` of its clock ``t``: a term for any diffrax solver.
+
+    ``basis(t)`` returns the functions of the clock alone (they are shared by all points of a batch) and
+    ``rows(*basis(t))`` the matrix as nested tuples; an entry that vanishes identically is the integer ``0``.
+    Without ``reversor`` the interval is the period and the monodromy matrix is the propagator ``Phi`` itself.
+    With the reversor ``X`` (``X X = I``) the interval is half the period and the monodromy matrix is similar to
+    ``X Phi^T X Phi``; with ``reversal()``, two matrices ``(R0, R1)`` as rows, to ``R0 Phi^T R1 Phi``.
+    ``log_determinant()`` is the exact logarithm of its determinant (Liouville's formula), if known.
+
+    It is a pytree if its functions are, such as the bound methods of an Equinox module.
+    """
+
+    rows: Callable[..., Rows]
+    span: Any
+    basis: Callable[[Any], tuple[Any, ...]] = eqx.field(default=_time, static=True)
+    reversor: Rows | None = eqx.field(default=None, static=True, converter=_tuples)
+    log_determinant: Callable[[], Any] | None = None
+    reversal: Callable[[], tuple[Rows, Rows]] | None = None
+
+    @property
+    def halves(self) -> int:
+        """How many of the interval make the period: 1 or 2."""
+        return 1 if self.reversor is None and self.reversal is None else 2
+
+    @property
+    def size(self) -> int:
+        """Number of states."""
+        return len(self.rows(*self.basis(0.0)))
+
+    @property
+    def exchanges_halves(self) -> bool:
+        """Whether there are four states, of which the reversor exchanges the first two with the others."""
+        return self.reversor == SWAP
+
+    def matrix(self, t: Any) -> Array:
+        """``A(t)``, shape ``(n, n, ...)``."""
+        return dense(self.rows(*self.basis(t)))
+
+    def vf(self, t: Any, y: Any, args: Any) -> Array:
+        """``A(t) y`` of a state or a matrix of states ``y``."""
+        del args
+        return self.matrix(t) @ y
+
+    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
+        """The time between ``t0`` and ``t1``."""
+        del kwargs
+        return t1 - t0
+
+    def prod(self, vf: Any, control: Any) -> Any:
+        """``vf`` times the time."""
+        return vf * control
+
+
+class FloquetModel(eqx.Module):
+    """The model of the analysis ``floquet``.
+
+    ``natural`` is the system as published, over its full period in its own time; ``reduced`` is an equivalent form
+    (same multipliers) that is cheaper or better conditioned. They may be the same object. ``explicit_steps(rtol)``
+    predicts how many steps ``reduced`` needs with the explicit scheme of order 8, from parameters given as NumPy arrays of
+    shape ``(N,)`` or traced; None leaves the prediction to the analysis. ``hamiltonian()`` is true where ``reduced`` is a
+    Hamiltonian system, whose multipliers come in pairs sigma, 1/sigma; None if it never is.
+    ``stiff`` is one more form, in which the slow modes of strong damping are no differences of large entries; None if there
+    is no better one than ``reduced``. The implicit scheme always takes it, the explicit one where ``strongly_damped()``
+    says so; None if nowhere.
+    """
+
+    natural: LinearPeriodic
+    reduced: LinearPeriodic
+    explicit_steps: Callable[[float], Any] | None = None
+    hamiltonian: Callable[[], Any] | None = None
+    stiff: LinearPeriodic | None = None
+    strongly_damped: Callable[[], Any] | None = None
+
+
+class ForcedModel(eqx.Module):
+    """The model of the analysis ``forced``.
+
+    ``field(t, y)`` is the nonlinear system ``y' = field(t, y)`` of period ``period`` and ``linear(t, y)`` its
+    linearisation about ``y = 0``, forcing included. Both act on states of shape ``(n,)``. ``displacements`` are the
+    indices of the components whose amplitude is reported.
+    """
+
+    field: Callable[[Any, Array], Array]
+    linear: Callable[[Any, Array], Array]
+    period: Any
+    displacements: tuple[int, ...] = eqx.field(static=True)
