@@ -32,8 +32,7 @@ def solvers(rtol: float) -> Sequence[Any]:
 def _batch(index: int) -> Callable[..., jax.Array]:
     def batch(values: Mapping[str, Any], effort: Any, rtol: Any) -> jax.Array:
         solver = solvers(rtol)[index]
-        solve = solver.solve if solver.broadcasts else jax.vmap(solver.solve, in_axes=(0, None), out_axes=-1)
-        found = solve(values, effort)
+        found = solver.solve(values, effort)
         return jnp.concatenate([found[name] for name in OUTPUTS])
 
     return jax.jit(batch)

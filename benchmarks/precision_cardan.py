@@ -142,7 +142,8 @@ def _constant(solver: str, count: int) -> Callable[[Columns, float], Any]:
     import jax.numpy as jnp
     import optimistix
 
-    from drivetrain_jax.analysis.periodic.monodromy import state_transition
+    from drivetrain_jax.analysis.periodic.diffrax_solvers import diffrax_propagator
+    from drivetrain_jax.analysis.periodic.propagator import EqualStepSize
     from drivetrain_jax.systems.cardan import Cardan
 
     # Without a controller to take tolerances from, the root finder of an implicit scheme needs its own. diffrax's usual
@@ -150,11 +151,9 @@ def _constant(solver: str, count: int) -> Callable[[Columns, float], Any]:
     settings = {"root_finder": optimistix.Newton(rtol=1e-10, atol=1e-12)} if solver == IMPLICIT else {}
 
     def one(values: Mapping[str, Any], step: Any) -> Any:
-        shaft = Cardan.of(values)
-        return state_transition(
-            lambda t: jnp.array(shaft.linear_rows(t)), np.pi, 4, solver=getattr(diffrax, solver)(**settings), dt0=step,
-            stepsize_controller=diffrax.ConstantStepSize(), max_steps=2 * max(STEPS),
-        )[0]  # fmt: skip
+        form = Cardan.of(values).floquet_model().natural
+        steps = EqualStepSize(jnp.round(np.pi / step).astype(int))
+        return diffrax_propagator(form, getattr(diffrax, solver)(**settings), stepsize_controller=steps)[0].matrix
 
     kinds = {name: jax.ShapeDtypeStruct((count,), float) for name in NAMES}
     return jax.jit(jax.vmap(one, in_axes=(0, None))).lower(kinds, jax.ShapeDtypeStruct((), float)).compile()

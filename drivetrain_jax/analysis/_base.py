@@ -33,6 +33,8 @@ OUTCOME = Variable(
     "outcome", "1", "outcome of the computation", dtype="int8", flags=tuple(o.name.lower() for o in Outcome)
 )
 RTOL = Parameter("rtol", "1", "target relative error of the results", default=1e-10, lower=1e-14, upper=1e-2)
+# Solvers of diffrax that an option may name: explicit ones of order 8 and 5, and a stiff one.
+DIFFRAX_SOLVERS = ("Dopri8", "Dopri5", "Tsit5", "Kvaerno5")
 # Seconds beyond which no motion is asked for, thirty years of it; and steps beyond which none is begun: at a microsecond
 # each they would take eleven days.
 MOST_SECONDS, MOST_STEPS = 1e9, 1e12
@@ -51,10 +53,10 @@ class Request:
 class Solver:
     """One way to compute the requested results of one point.
 
-    ``solve(values, effort)`` returns every requested variable and ``outcome``. ``values`` holds all parameters of
-    the model: fixed ones as Python numbers, swept ones as scalars, or as arrays of shape ``(N,)`` if ``broadcasts``;
-    results then carry the batch as their LAST axis. The values of a path axis arrive as a whole, shape ``(L,)``, and
-    results have the path as their FIRST axis; ``chunk`` counts lines then.
+    ``solve(values, effort)`` returns every requested variable and ``outcome``, the lanes as LAST axis. ``values`` holds all
+    parameters of the model: those that vary as JAX arrays of lanes ``(N,)``, the others as numbers
+    (:func:`~drivetrain_jax.analysis.numerics.lanes.over_lanes` makes that of a function of one point). The values of a path
+    axis arrive as a whole, a NumPy array ``(L,)``; results have the path as FIRST axis, and ``chunk`` counts lines.
     ``effort`` is a traced integer, the largest that ``effort(columns)`` predicts in the batch (columns: NumPy arrays
     of shape ``(N,)``; a count of steps or the like; by default the same for all points). The engine gives every point
     to the solver for which ``effort * unit_cost`` is smallest and runs batches of ``chunk`` points of similar effort.
@@ -66,7 +68,6 @@ class Solver:
     solve: Callable[[Mapping[str, Any], Array], dict[str, Array]]
     effort: Callable[[Mapping[str, np.ndarray]], np.ndarray] = lambda columns: np.ones(())
     unit_cost: float = 1.0
-    broadcasts: bool = False
     chunk: int = 256
     march: bool = False
     short_loops: bool = False

@@ -116,7 +116,7 @@ def shares(high: Array, low: Array, multiple: Array, outcome: Array) -> dict[str
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     build = system.models["basins"].build
-    return (Solver("exact", partial(_solve, build, request), broadcasts=True, chunk=_CHUNK),)
+    return (Solver("exact", partial(_solve, build, request), chunk=_CHUNK),)
 
 
 ANALYSIS = Analysis(

@@ -146,7 +146,7 @@ def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
         room = min(room, _STATIONS_PER_CHUNK // (modes * request.options["stations"]))
     chunk = 1 << max(min(room, 2048), 16).bit_length() - 1
     solve = partial(_solve, build, request)
-    return (Solver(request.method, solve, broadcasts=True, chunk=chunk),)
+    return (Solver(request.method, solve, chunk=chunk),)
 
 
 ANALYSIS = Analysis(

@@ -23,6 +23,7 @@ from jax import Array
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, solve, spectral_norm
 from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.analysis.periodic.amplitude import amplitudes
@@ -234,7 +235,8 @@ def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     build = system.models["forced"].build
     steps = partial(predicted_steps, build)
     chunk = CHUNK if set(request.outputs) <= set(LINEAR) else ORBITS_CHUNK
-    return (Solver("diffrax", partial(_solve, build, request), steps, chunk=chunk, march=True, short_loops=True),)
+    solve = over_lanes(partial(_solve, build, request))
+    return (Solver("diffrax", solve, steps, chunk=chunk, march=True, short_loops=True),)
 
 
 ANALYSIS = Analysis(

@@ -182,7 +182,7 @@ def _exact_branch(
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     build = system.models["frequency_response"].build
-    return (Solver(request.method, partial(_solve, build, request), broadcasts=True, chunk=_CHUNK),)
+    return (Solver(request.method, partial(_solve, build, request), chunk=_CHUNK),)
 
 
 ANALYSIS = Analysis(

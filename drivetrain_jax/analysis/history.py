@@ -25,10 +25,10 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis._base import MOST_SECONDS, RTOL, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis._base import DIFFRAX_SOLVERS, MOST_SECONDS, RTOL, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.analysis.numerics.watched_steps import WatchedSteps, largest_met
-from drivetrain_jax.analysis.periodic.monodromy import SOLVERS
 from drivetrain_jax.systems import Flow, System
 
 VARIABLES = (
@@ -252,7 +252,7 @@ def _period(build: Callable[..., Flow], name: str, values: Mapping[str, Any]) ->
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     name = f"diffrax: {request.options['solver']}"
     solve, effort = partial(_solve, system, request), partial(_effort, system, request)
-    return (Solver(name, solve, effort, chunk=16, march=True, lengthy=True),)
+    return (Solver(name, over_lanes(solve), effort, chunk=16, march=True, lengthy=True),)
 
 
 def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
@@ -281,7 +281,7 @@ ANALYSIS = Analysis(
         Parameter("stop", "s", "end of the history (0: see times)", default=0.0, lower=0.0, upper=MOST_SECONDS),
         _NUM,
         RTOL,
-        Parameter("solver", "1", "diffrax solver", default="Dopri8", choices=SOLVERS),
+        Parameter("solver", "1", "diffrax solver", default="Dopri8", choices=DIFFRAX_SOLVERS),
     ),
     solvers=_solvers,
     dimensions=_dimensions,

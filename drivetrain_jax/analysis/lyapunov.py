@@ -263,7 +263,7 @@ def _dimensions(*_: Any) -> tuple[Dimension, ...]:
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     solve, effort = partial(_solve, system, request), partial(_effort, system, request)
-    return (Solver("tangent", solve, effort, broadcasts=True, chunk=_CHUNK, march=True, lengthy=True),)
+    return (Solver("tangent", solve, effort, chunk=_CHUNK, march=True, lengthy=True),)
 
 
 ANALYSIS = Analysis(

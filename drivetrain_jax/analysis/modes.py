@@ -243,7 +243,7 @@ def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     chunk = _SPECTRUM_CHUNK if set(request.outputs) <= _SPECTRUM else _MODES_CHUNK
     chunk = _LINES_CHUNK if request.options["track"] else chunk
     solve = partial(_solve, system.models["modes"].build, request)
-    return (Solver("singular values", solve, broadcasts=True, chunk=chunk, short_loops=True),)
+    return (Solver("singular values", solve, chunk=chunk, short_loops=True),)
 
 
 def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:

@@ -55,7 +55,7 @@ def _lanes(result: Array, name: str) -> Array:
 
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
-    return (Solver("closed form", partial(_solve, system, request), broadcasts=True, chunk=4096),)
+    return (Solver("closed form", partial(_solve, system, request), chunk=4096),)
 
 
 def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:

@@ -36,6 +36,7 @@ from drivetrain_jax.analysis.chaos.section_error import EARLY, Steps, section_er
 from drivetrain_jax.analysis.chaos.section_measures import period_multiple, torus_residual
 from drivetrain_jax.analysis.chaos.variational import batch_shape, initial_state
 from drivetrain_jax.analysis.chaos.zero_one_test import largest_k01
+from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.systems import Flow, System
 
 VARIABLES = (
@@ -188,9 +189,9 @@ def _effort(request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     solve, effort = partial(_solve, system, request), partial(_effort, request)
     if request.method == "adaptive":
-        return (Solver("adaptive", solve, effort, chunk=16, march=True, lengthy=True),)
+        return (Solver("adaptive", over_lanes(solve), effort, chunk=16, march=True, lengthy=True),)
     chunk = max(1, min(_CHUNK, _NUMBERS // (2 * request.options["strobes"])))
-    return (Solver("fixed", solve, effort, broadcasts=True, chunk=chunk, march=True, lengthy=True),)
+    return (Solver("fixed", solve, effort, chunk=chunk, march=True, lengthy=True),)
 
 
 def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:

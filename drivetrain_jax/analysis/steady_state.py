@@ -110,7 +110,7 @@ def _solve(
 
 def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     build = system.models["steady_state"].build
-    return (Solver("exact", partial(_solve, build, request), broadcasts=True, chunk=_CHUNK),)
+    return (Solver("exact", partial(_solve, build, request), chunk=_CHUNK),)
 
 
 ANALYSIS = Analysis(

@@ -36,7 +36,6 @@ class Kernel:
 
     compiled: Callable[..., dict[str, Array]]
     chunk: int
-    batch_last: bool
     variables: tuple[Variable, ...]
     turn: AbstractContextManager[object]
 
@@ -50,7 +49,7 @@ class Kernel:
         arrays = {}
         for variable in self.variables:
             values = results[variable.name]
-            values = np.moveaxis(values, -1, 0) if self.batch_last else values
+            values = np.moveaxis(values, -1, 0)
             arrays[variable.name] = np.ascontiguousarray(values[:count], dtype=variable.dtype)
         return arrays
 
@@ -61,16 +60,13 @@ def _batch(
     """The function of a whole chunk, and the kinds of its varying parameters."""
     own = {v.name: len(v.dims) + (grid.path is not None) for v in variables}
 
-    def one(columns: Mapping[str, Any], effort: Array) -> dict[str, Array]:
-        return solver.solve(grid.bind(columns), effort)
-
-    def whole(columns: Mapping[str, Any], effort: Array) -> dict[str, Array]:
-        # A result that depends on nothing that varies comes without a batch axis.
-        results = {name: jnp.asarray(value) for name, value in one(columns, effort).items()}
+    def batch(columns: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+        # A result that depends on nothing that varies comes without lanes.
+        solved = solver.solve(grid.bind(columns), effort)
+        results = {name: jnp.asarray(value) for name, value in solved.items()}
         spread = {n: v if v.ndim > own[n] else v[..., None] for n, v in results.items()}
         return {n: jnp.broadcast_to(v, (*v.shape[:-1], chunk)) for n, v in spread.items()}
 
-    batch = whole if solver.broadcasts else jax.vmap(one, in_axes=(0, None), axis_size=chunk)
     columns = {axis.name: jax.ShapeDtypeStruct((chunk,), axis.values.dtype) for axis in grid.axes}
     return batch, columns
 
@@ -80,7 +76,7 @@ def result_shapes(scene: Scene, grid: Grid, solver: Solver) -> dict[str, tuple[i
     variables = result_variables(scene)
     batch, columns = _batch(solver, grid, 1, variables)
     shapes = jax.eval_shape(batch, columns, jax.ShapeDtypeStruct((), np.int64))
-    return {v.name: shapes[v.name].shape[:-1] if solver.broadcasts else shapes[v.name].shape[1:] for v in variables}
+    return {v.name: shapes[v.name].shape[:-1] for v in variables}
 
 
 def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[Variable], few: bool = False) -> Kernel:
@@ -92,7 +88,7 @@ def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[V
     lowered = jax.jit(batch).lower(columns, jax.ShapeDtypeStruct((), np.int64))
     options = compiler_options(chunk, march=solver.march, short_loops=solver.short_loops)
     compiled = lowered.compile(options_for_few() if few else options)
-    return Kernel(compiled, chunk, solver.broadcasts, tuple(variables), _turn(compiled))
+    return Kernel(compiled, chunk, tuple(variables), _turn(compiled))
 
 
 def for_device(solver: Solver) -> Solver:

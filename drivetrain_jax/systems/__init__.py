@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING, Any
 
 import jax
 
@@ -15,10 +16,13 @@ from drivetrain_jax._quantities import Parameter  # noqa: E402
 from drivetrain_jax.systems._base import Model, Resonances, System, parameter, serves  # noqa: E402
 from drivetrain_jax.systems._flow import Flow  # noqa: E402
 from drivetrain_jax.systems._modal import FAMILIES, Block, SpringSystem  # noqa: E402
-from drivetrain_jax.systems._periodic import FloquetModel, ForcedModel, LinearPeriodic, dense  # noqa: E402
 from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator  # noqa: E402
+from drivetrain_jax.systems._rows import dense  # noqa: E402
 from drivetrain_jax.systems._shaft import Shaft  # noqa: E402
 from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness  # noqa: E402
+
+if TYPE_CHECKING:
+    from drivetrain_jax.systems._periodic import FloquetModel, ForcedModel, LinearPeriodic
 
 ENTRY_POINT_GROUP = "drivetrain_jax.systems"
 _BUILT_IN = {
@@ -53,6 +57,13 @@ __all__ = [
     "serves",
     "system_names",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    # Their module imports diffrax, which takes as long as jax: nobody should wait for that to look at a result.
+    if name in ("FloquetModel", "ForcedModel", "LinearPeriodic"):
+        return getattr(import_module("drivetrain_jax.systems._periodic"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def system_names() -> tuple[str, ...]:

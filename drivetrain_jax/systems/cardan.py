@@ -12,16 +12,19 @@ from __future__ import annotations
 
 import math
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from drivetrain_jax.systems._base import Number, Resonances, System, Values, numeric, parameter, serves
-from drivetrain_jax.systems._periodic import SWAP, FloquetModel, ForcedModel, LinearPeriodic, Rows
+from drivetrain_jax.systems._rows import Rows
 from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness
 from drivetrain_jax.systems.cardan_units import PhysicalShaft
+
+if TYPE_CHECKING:
+    from drivetrain_jax.systems._periodic import FloquetModel, ForcedModel
 
 OPEN = {"open_lower": True, "open_upper": True}
 POSITIVE = {"lower": 0.0, "open_lower": True}
@@ -337,6 +340,8 @@ class Cardan(System):
     @serves("floquet")
     def floquet_model(self) -> FloquetModel:
         """The linearised shaft in its own coordinates and time, and two forms of it over half a period."""
+        from drivetrain_jax.systems._periodic import SWAP, FloquetModel, LinearPeriodic
+
         exact = self.log_determinant
         # The reversor exchanges q and P: time reversal about the middle of the half period.
         reduced = LinearPeriodic(self._reduced_rows, math.pi / 2, _clock_basis, SWAP, exact)
@@ -353,4 +358,6 @@ class Cardan(System):
     @serves("forced")
     def forced_model(self) -> ForcedModel:
         """The nonlinear shaft, and its linearisation with the forcing (0, -eta')."""
+        from drivetrain_jax.systems._periodic import ForcedModel
+
         return ForcedModel(self.vector_field, self.linear_field, math.pi, displacements=(0, 1))

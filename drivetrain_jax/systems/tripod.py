@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from jax import Array
 
 from drivetrain_jax.systems._base import Number, System, Values, parameter, serves
 from drivetrain_jax.systems._flow import Components, Flow
-from drivetrain_jax.systems._periodic import FloquetModel, LinearPeriodic, Rows
+from drivetrain_jax.systems._rows import Rows
 from drivetrain_jax.systems._tripod_parameters import (
     CHI_SOURCES,
     EQUATIONS,
@@ -37,6 +37,9 @@ from drivetrain_jax.systems._tripod_parameters import (
     positive,
 )
 from drivetrain_jax.systems.trigonometry import cos, sin
+
+if TYPE_CHECKING:
+    from drivetrain_jax.systems._periodic import FloquetModel, LinearPeriodic
 
 
 class Element(NamedTuple):
@@ -283,6 +286,8 @@ def floquet_model(values: Values) -> FloquetModel:
     """
     element = element_of(values)
     omega, frequency = element.frequency, excitation_frequency(values, element)
+
+    from drivetrain_jax.systems._periodic import FloquetModel, LinearPeriodic
 
     natural = _Parametric(element, values["zeta"], omega, frequency)
     reduced = _Parametric(element, values["zeta"], omega / (2 * math.pi * frequency), frequency)

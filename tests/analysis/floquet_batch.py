@@ -38,14 +38,9 @@ class FloquetBatch:
         return ANALYSIS.solvers(self.system, request(self.method, rtol, self.outputs, **self.options))
 
     def kernel(self, index: int):
-        def one(values, effort, rtol):
-            return self.solvers(rtol)[index].solve(values, effort)
-
         def batch(values, effort, rtol):
-            if self.solvers(rtol)[index].broadcasts:
-                results = one(values, effort, rtol)
-                return {name: jnp.moveaxis(x, -1, 0) for name, x in results.items()}
-            return jax.vmap(one, in_axes=(0, None, None))(values, effort, rtol)
+            results = self.solvers(rtol)[index].solve(values, effort)
+            return {name: jnp.moveaxis(x, -1, 0) for name, x in results.items()}
 
         return self.compiled.setdefault(index, jax.jit(batch))
 

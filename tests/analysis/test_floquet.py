@@ -18,7 +18,7 @@ import drivetrain_jax as dt
 from benchmarks.cardan_reference import monodromy, spectral_radius, stacked_monodromy
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.periodic.direct import assemble, compare
-from drivetrain_jax.analysis.periodic.propagator import EXPLICIT_ORDER, explicit_propagator, implicit_propagator
+from drivetrain_jax.analysis.periodic.propagator import EXPLICIT_ORDER, Radau, propagator
 from drivetrain_jax.systems import LinearPeriodic, get_system, system_names
 
 RANGES = {"Omega": (0.05, 5), "zeta": (1e-4, 1), "alpha": (0.1, 20), "mu": (0.1, 20), "gamma": (0.1, 1e3)}
@@ -185,7 +185,7 @@ def test_slow_modes_lose_their_digits_in_the_reduced_form():
     model = CARDAN.models["floquet"].build({name: values[0] for name, values in SLOW_BESIDE_FAST.items()})
 
     def error(form: LinearPeriodic) -> float:
-        phi = jax.jit(lambda steps: implicit_propagator(form, steps))(jnp.int64(256))
+        phi = jax.jit(lambda steps: propagator(form, steps, 16, Radau))(jnp.int64(256))
         radius = np.abs(np.linalg.eigvals(assemble(form, phi.matrix))).max() * np.exp(2 * phi.log_scale)
         return abs(radius / RADII[0] - 1)
 
@@ -347,7 +347,7 @@ def test_liouville_residual_shows_too_few_steps():
 
     @jax.jit
     def coarse_and_fine(steps):
-        pair = (explicit_propagator(form, n, ()) for n in (steps, 2 * steps))
+        pair = (propagator(form, n) for n in (steps, 2 * steps))
         return compare(form, *pair, 2 * steps, 0.0, 1e-10, 2.0**EXPLICIT_ORDER - 1)
 
     poor, good = coarse_and_fine(jnp.int32(2)), coarse_and_fine(jnp.int32(128))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,9 +19,10 @@ from drivetrain_jax.analysis.periodic.multipliers import spectral_radius_bound
 from drivetrain_jax.analysis.periodic.propagator import (
     EXPLICIT_ORDER,
     IMPLICIT_ORDER,
+    Order8,
     Propagator,
-    explicit_propagator,
-    implicit_propagator,
+    Radau,
+    propagator,
     radau_iia,
 )
 from drivetrain_jax.systems import LinearPeriodic
@@ -55,11 +57,11 @@ def full(propagator: Propagator) -> np.ndarray:
 
 
 def explicit(system: LinearPeriodic):
-    return jax.jit(lambda steps: explicit_propagator(system, steps, ()))
+    return jax.jit(lambda steps: propagator(system, steps))
 
 
 def implicit(system: LinearPeriodic):
-    return jax.jit(lambda steps: implicit_propagator(system, steps))
+    return jax.jit(lambda steps: propagator(system, steps, 1, Radau))
 
 
 def measured_orders(propagate, exact: np.ndarray, steps: list[int]) -> np.ndarray:
@@ -109,7 +111,7 @@ def test_explicit_scheme_is_one_step_of_dop853():
 def test_implicit_scheme_is_l_stable(decay):
     """What decays at once must be gone after one panel, not stay with modulus one as in a symmetric scheme."""
     system = LinearPeriodic(lambda t: ((-decay + 0 * t, 0), (0, -1.0 + 0 * t)), 1.0)
-    phi = full(implicit_propagator(system, jnp.int32(1)))
+    phi = full(propagator(system, jnp.int32(1), 1, Radau))
     assert abs(phi[0, 0]) <= 10 / decay
     assert phi[1, 1] == pytest.approx(math.exp(-1), rel=1e-14)
 
@@ -129,10 +131,10 @@ def test_growth_of_what_is_made_on_the_way():
         t = np.arange(1, pieces) / pieces
         squares = (norm(whole - lost(t)) * norm(lost(t)) / norm(whole)) ** 2 / 2
         expected = math.sqrt((squares.sum() + 1) / pieces)
-        found = explicit_propagator(system, jnp.int32(160), (), pieces)
+        found = propagator(system, jnp.int32(160), pieces)
         assert float(found.growth) == pytest.approx(expected, rel=1e-6)
         np.testing.assert_allclose(np.diag(full(found)), np.exp(-24), rtol=1e-9)
-    assert float(implicit_propagator(system, jnp.int32(32)).growth) == pytest.approx(expected, rel=1e-6)
+    assert float(propagator(system, jnp.int32(32), 16, Radau).growth) == pytest.approx(expected, rel=1e-6)
     assert expected > 100
 
 
@@ -140,36 +142,67 @@ def test_growth_of_what_is_made_on_the_way():
 def test_constant_coefficients(n):
     a = 2 * np.random.default_rng(n).standard_normal((n, n))
     expected = expm(a)
-    for propagator in (
-        explicit_propagator(constant(a), jnp.int32(40), ()),
-        implicit_propagator(constant(a), jnp.int32(4)),
-    ):
-        np.testing.assert_allclose(full(propagator), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    for found in (propagator(constant(a), jnp.int32(40)), propagator(constant(a), jnp.int32(4), 4, Radau)):
+        np.testing.assert_allclose(full(found), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
 def test_batch_and_structural_zeros():
     """An oscillator of many frequencies; lanes do not know of each other, zeros may be the integer 0."""
-    frequency = np.linspace(0.5, 3.0, 7)
-    system = LinearPeriodic(lambda t: ((0, 1.0), (-(frequency**2), 0)), 1.3)
-    phi = full(explicit_propagator(system, jnp.int32(30), (7,)))
-    c, s = np.cos(1.3 * frequency), np.sin(1.3 * frequency)
-    np.testing.assert_allclose(phi, [[c, s / frequency], [-frequency * s, c]], rtol=0, atol=1e-12)
+
+    def rows(frequency, t):
+        return (0, 1.0), (-(frequency**2), 0)
+
+    def one(frequency):
+        return propagator(LinearPeriodic(jax.tree_util.Partial(rows, frequency), 1.3), jnp.int32(30)).matrix
+
+    def closed(frequency):
+        return propagator(LinearPeriodic(lambda t: rows(frequency, t), 1.3), jnp.int32(30)).matrix
+
+    for count in (1, 7, 32, 71):
+        frequency = np.linspace(0.5, 3.0, count)
+        c, s = np.cos(1.3 * frequency), np.sin(1.3 * frequency)
+        exact = np.moveaxis(np.array([[c, s / frequency], [-frequency * s, c]]), -1, 0)
+        for function in (one, closed):
+            np.testing.assert_allclose(jax.vmap(function)(frequency), exact, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(one(frequency[-1]), exact[-1], rtol=0, atol=1e-12)
+    nested = jax.vmap(jax.vmap(one))(frequency[:70].reshape(10, 7)).reshape(70, 2, 2)
+    np.testing.assert_array_equal(nested, jax.vmap(one)(frequency[:70]))
+
+
+@pytest.mark.parametrize("solver", [Order8, Radau])
+def test_a_solver_takes_any_state_of_any_linear_term_forwards_and_backwards(solver):
+    system, y = rotating((-0.5, 1.5)), jnp.array([0.3, -1.2])
+    whole = rotating_exactly((-0.5, 1.5))
+
+    def solve(t0, t1, y):
+        return diffrax.diffeqsolve(
+            system, solver(60), t0, t1, (t1 - t0) / 3, y, stepsize_controller=diffrax.ConstantStepSize(), max_steps=8
+        ).ys[0]
+
+    assert isinstance(system, diffrax.AbstractTerm)
+    there = solve(0.0, SPAN, y)
+    np.testing.assert_allclose(there, whole @ y, rtol=1e-12)
+    np.testing.assert_allclose(solve(SPAN, 0.0, there), y, rtol=1e-12)
+    stock = diffrax.diffeqsolve(
+        system, diffrax.Dopri8(), 0.0, SPAN, None, y, stepsize_controller=diffrax.PIDController(rtol=1e-12, atol=1e-12)
+    )
+    np.testing.assert_allclose(stock.ys[0], there, rtol=1e-10)
 
 
 def test_clock_functions_reach_the_rows():
     """x' = cos(t) x through ``basis``; a wrong node would show at once."""
     system = LinearPeriodic(lambda cosine: ((cosine,),), SPAN, basis=lambda t: (jnp.cos(t),))
-    for propagator in (explicit_propagator(system, jnp.int32(20), ()), implicit_propagator(system, jnp.int32(3))):
-        assert full(propagator).item() == pytest.approx(math.exp(math.sin(SPAN)), rel=1e-13)
+    for found in (propagator(system, jnp.int32(20)), propagator(system, jnp.int32(3), 3, Radau)):
+        assert full(found).item() == pytest.approx(math.exp(math.sin(SPAN)), rel=1e-13)
 
 
 def test_log_scale_saves_what_underflows():
     """e^-2000 is below the smallest float64; the ratio of the two decays survives beside the scale."""
     system = LinearPeriodic(lambda t: ((-1000.0 + 0 * t, 0), (0, -1000.5 + 0 * t)), 2.0)
-    propagator = implicit_propagator(system, jnp.int32(2000))
-    assert float(jnp.exp(propagator.log_scale)) == 0
-    log_first = math.log(propagator.matrix[0, 0]) + float(propagator.log_scale)
-    log_second = math.log(propagator.matrix[1, 1]) + float(propagator.log_scale)
+    found = propagator(system, jnp.int32(2000), 16, Radau)
+    assert float(jnp.exp(found.log_scale)) == 0
+    log_first = math.log(found.matrix[0, 0]) + float(found.log_scale)
+    log_second = math.log(found.matrix[1, 1]) + float(found.log_scale)
     assert log_first == pytest.approx(-2000, rel=1e-12)
     assert log_second - log_first == pytest.approx(-1, rel=1e-9)
 
@@ -191,7 +224,7 @@ def test_half_period_is_completed_by_the_reversor():
     rows = lambda t: ((0, 1.0), (-(1.3 - 2 * 0.4 * jnp.cos(2 * t)), 0))  # noqa: E731
     exchange = np.array([[0.0, 1.0], [1.0, 0.0]])
     half, whole = LinearPeriodic(rows, math.pi / 2, reversor=exchange), LinearPeriodic(rows, math.pi)
-    z = [np.asarray(assemble(s, explicit_propagator(s, jnp.int32(60), ()).matrix)) for s in (half, whole)]
+    z = [np.asarray(assemble(s, propagator(s, jnp.int32(60)).matrix)) for s in (half, whole)]
     np.testing.assert_allclose(np.poly(z[0]), np.poly(z[1]), rtol=0, atol=1e-12)
 
 
@@ -202,7 +235,7 @@ def test_bound_holds_for_stiff_systems_whose_determinant_is_not_known(rates):
     z = jax.jit(
         lambda n: direct_monodromy(
             system,
-            lambda steps: implicit_propagator(system, steps),
+            lambda steps, pieces: propagator(system, steps, pieces, Radau),
             n,
             (),
             stiffness_of(system),
@@ -225,7 +258,7 @@ def test_a_fourfold_coarser_solution_tells_the_same_error(steps):
     def solve(ratio):
         return direct_monodromy(
             system,
-            lambda n: explicit_propagator(system, n, ()),
+            lambda n, pieces: propagator(system, n, pieces),
             jnp.int32(steps),
             (),
             0.0,
@@ -246,9 +279,9 @@ def test_the_coarser_solution_of_a_damped_system_is_stable():
     """Else it would tell nothing, and a third propagator would have to."""
     system, counts = rotating((-300.0, 0.5)), []
 
-    def propagate(steps):
+    def propagate(steps, pieces):
         jax.debug.callback(lambda n: counts.append(int(n)), steps)
-        return explicit_propagator(system, steps, ())
+        return propagator(system, steps, pieces)
 
     def solve(least):
         return direct_monodromy(system, propagate, jnp.int32(240), (), 0.0, 1e-5, EXPLICIT_ORDER, 4, least)

@@ -53,7 +53,8 @@ SCENES: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 COUNTS = {
     # Operations in the trace of one chunk, nested ones once: what computes more than is asked for has more of them.
-    "operations cardan": 5183,
+    # 600 of those of cardan are the loop of diffrax.
+    "operations cardan": 5793,
     "operations bicardan": 846,
     "operations rattle": 4424,
     # Steps that the plan predicts for the 1,550 cells of the chart, padding included.
@@ -96,8 +97,7 @@ def operations(jaxpr: Any) -> int:
 def test_operations(system):
     engine = Engine(load_scene(SCENES[system]))
     solver = engine.solvers[engine.plan.groups[0].index]
-    shape = (8,) if solver.broadcasts else ()
-    columns = {name: jax.ShapeDtypeStruct(shape, float) for name in engine.grid.columns(np.arange(1))}
+    columns = {name: jax.ShapeDtypeStruct((8,), float) for name in engine.grid.columns(np.arange(1))}
     traced = jax.make_jaxpr(lambda c, effort: solver.solve(engine.grid.bind(c), effort))(columns, np.int64(1))
     assert not complaint(f"operations {system}", operations(traced.jaxpr))
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis import RTOL, Analysis, Outcome, Solver
+from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.sweep import scene
 from drivetrain_jax.systems import Model, Resonances, System, parameter
 
@@ -70,11 +71,14 @@ def _solvers(system: System, request) -> tuple[Solver, ...]:
         "broadcasting",
         lambda values, effort: _solve(values, effort, request.outputs, 0.0),
         lambda c: np.where(c["a"] > LARGE, np.inf, 10 * c["a"]),
-        broadcasts=True,
         chunk=32,
     )
     large = Solver(
-        "mapped", lambda v, e: _solve(v, e, request.outputs, 0.0), lambda c: 100 * c["b"], unit_cost=2.0, chunk=16
+        "mapped",
+        over_lanes(lambda v, e: _solve(v, e, request.outputs, 0.0)),
+        lambda c: 100 * c["b"],
+        unit_cost=2.0,
+        chunk=16,
     )
     hopeless = "hopeless" == request.method
     return (small,) if hopeless else (small, large)
@@ -88,7 +92,7 @@ def _slow_solvers(system: System, request) -> tuple[Solver, ...]:
         )
         return results | {"value": results["value"] + wait}
 
-    return (Solver("slow", solve, lambda c: 1 + c["a"], broadcasts=True, chunk=8),)
+    return (Solver("slow", solve, lambda c: 1 + c["a"], chunk=8),)
 
 
 def _broken_solvers(system: System, request) -> tuple[Solver, ...]:
@@ -106,7 +110,7 @@ def _line_solvers(system: System, request) -> tuple[Solver, ...]:
         both = jnp.stack([running, jnp.cumsum(values["b"][::-1])[::-1]], axis=1)
         return {"response": both, "outcome": jnp.zeros(running.shape, jnp.int8)}
 
-    return (Solver("line", solve, lambda c: np.full(c["a"].shape, c["b"].size), chunk=4),)
+    return (Solver("line", over_lanes(solve), lambda c: np.full(c["a"].shape, c["b"].size), chunk=4),)
 
 
 def _follow_solvers(system: System, request) -> tuple[Solver, ...]:
@@ -121,7 +125,7 @@ def _follow_solvers(system: System, request) -> tuple[Solver, ...]:
         load = jnp.stack([jnp.cumsum(jnp.broadcast_to(x, path)) for x in step], axis=1)[..., None] + 0 * lanes
         return {"load": load, "outcome": jnp.zeros((path, lanes.size), jnp.int8)}
 
-    return (Solver("follow", solve, lambda c: c["b"], broadcasts=True, chunk=4),)
+    return (Solver("follow", solve, lambda c: c["b"], chunk=4),)
 
 
 def _lengths_and_weights(fixed) -> None:

@@ -12,7 +12,7 @@ from mpmath import mp
 from scipy.integrate import quad
 
 from drivetrain_jax.analysis.periodic.direct import assemble, compare, stable_steps
-from drivetrain_jax.analysis.periodic.propagator import EXPLICIT_ORDER, explicit_propagator
+from drivetrain_jax.analysis.periodic.propagator import EXPLICIT_ORDER, propagator
 from drivetrain_jax.systems import cardan, get_system, system_names
 
 SYSTEM = get_system("cardan")
@@ -304,10 +304,10 @@ def test_predicted_steps_are_enough_and_not_many_more(point, rtol):
     """What decays asks for stability more than for accuracy: it takes no steps like an oscillation as fast as that."""
     shaft = cardan.Cardan(alpha=1.0, mu=1.0, gamma=100.0, **point)
     form, predicted = shaft.floquet_model().reduced, int(shaft.explicit_steps(rtol))
-    exact = assemble(form, explicit_propagator(form, jnp.int32(8 * predicted), ()).matrix)
+    exact = assemble(form, propagator(form, jnp.int32(8 * predicted)).matrix)
 
     def error(steps: int) -> float:
-        z = assemble(form, explicit_propagator(form, jnp.int32(steps), ()).matrix)
+        z = assemble(form, propagator(form, jnp.int32(steps)).matrix)
         return float(jnp.linalg.norm(z - exact) / jnp.max(jnp.abs(jnp.linalg.eigvals(exact))))
 
     # Overflow is an error as well.
@@ -323,6 +323,6 @@ def test_slow_points_meet_their_tolerance_with_the_predicted_steps(rtol):
         shaft = cardan.Cardan(**point)
         form, steps = shaft.floquet_model().reduced, int(shaft.explicit_steps(rtol))
         few = -(-steps // 4)
-        coarse, fine = (explicit_propagator(form, jnp.int32(n), ()) for n in (few, steps))
+        coarse, fine = (propagator(form, jnp.int32(n)) for n in (few, steps))
         found = compare(form, coarse, fine, steps, 0.0, rtol, (steps / few) ** EXPLICIT_ORDER - 1)
         assert found.met and float(found.error) < rtol, omega

@@ -1,17 +1,21 @@
-"""Batches as the last axis: counting the lanes of a set of parameters, and working through them in parts."""
+"""Batches as the last axis: what ``jax.vmap`` makes of a function of one point, and working through lanes in parts."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.custom_batching import custom_vmap
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
-from drivetrain_jax.analysis.numerics.kernels import on_cpu
+from drivetrain_jax.analysis.numerics.kernels import FULL_WIDTH, on_cpu
 
 Values = Mapping[str, Any]
 
@@ -43,17 +47,17 @@ def with_path(values: Values, path: str, lanes: int) -> tuple[dict[str, Any], in
     return jax.tree.map(spread, dict(values)), length
 
 
-def in_blocks(function: Callable[[dict[str, Any], int], Any], values: Values, lanes: int, size: int) -> Any:
+def in_blocks(function: Callable[[Any, int], Any], values: Any, lanes: int, size: int) -> Any:
     """``function(values, count)`` of ``lanes`` lanes, ``size`` at a time; its results have the lanes as last axis.
 
-    The arrays among ``values`` are cut; numbers stay the constants that they are. The caches of a core are what ``size`` is
-    for: an accelerator does all lanes at once.
+    The arrays among ``values`` whose last axis are the lanes are cut; what else there is stays. The caches of a core are
+    what ``size`` is for: an accelerator does all lanes at once.
     """
     count = -(-lanes // size)
-    leaves, tree = jax.tree.flatten(dict(values))
-    varying = [i for i, leaf in enumerate(leaves) if np.ndim(leaf)]
+    leaves, tree = jax.tree.flatten(values)
+    varying = [i for i, leaf in enumerate(leaves) if np.ndim(leaf) and np.shape(leaf)[-1] == lanes]
     if count == 1 or not varying or not on_cpu():
-        return function(dict(values), lanes)
+        return function(values, lanes)
 
     def part(columns: list[Array]) -> Any:
         own = list(leaves)
@@ -61,13 +65,130 @@ def in_blocks(function: Callable[[dict[str, Any], int], Any], values: Values, la
             own[i] = column
         return function(jax.tree.unflatten(tree, own), size)
 
-    columns = [jnp.pad(leaves[i], (0, count * size - lanes), mode="edge").reshape(count, size) for i in varying]
+    def cut(leaf: Array) -> Array:
+        return jnp.moveaxis(_padded(leaf, count * size).reshape(*leaf.shape[:-1], count, size), -2, 0)
 
     def join(result: Array) -> Array:
         whole = jnp.moveaxis(result, 0, -2)
         return whole.reshape(*whole.shape[:-2], count * size)[..., :lanes]
 
-    return jax.tree.map(join, lax.map(part, columns))
+    return jax.tree.map(join, lax.map(part, [cut(jnp.asarray(leaves[i])) for i in varying]))
+
+
+def _padded(array: Array, lanes: int) -> Array:
+    """``array`` with its last lane repeated up to so many ``lanes``."""
+    widths = [(0, 0)] * (array.ndim - 1) + [(0, lanes - array.shape[-1])]
+    return jnp.pad(array, widths, mode="edge")
+
+
+class Constants:
+    """What a traced function depends on besides its arrays: the leaves and the structure of ``tree``, to be compared."""
+
+    def __init__(self, tree: Any) -> None:
+        self.tree = tree
+        leaves, structure = jax.tree.flatten(tree)
+        self._content = (*leaves, structure)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Constants) and self._content == other._content
+
+    def __hash__(self) -> int:
+        return hash(self._content)
+
+
+def lanes_last(
+    function: Callable[[Any, Any, Any], Any], constants: Constants, varying: Any, shared: Any, size: int | None = None
+) -> Any:
+    """``function(constants, varying, shared)`` of one point; under ``jax.vmap``, however often, one call for all lanes.
+
+    ``function`` is written for lanes as an additional last axis of every array in ``varying`` and in its results. What all
+    lanes have in common comes with a last axis of 1, numbers without one. ``shared`` is for all lanes: a whole number that
+    is not the same counts with its largest value, another one comes as an array of lanes. With ``size``, lanes go through
+    ``function`` that many at a time, and it is traced for this number alone, once for equal ``constants`` (a batch that fits
+    into one vector goes through it as a whole).
+    """
+
+    def at_once(varying: Any, shared: Any, size: int | None) -> Any:
+        lanes = max(x.shape[-1] for x in jax.tree.leaves(varying))
+        given = jax.tree.map(lambda x: x[0] if x.shape == (1,) and lanes > 1 else x, varying), shared
+        if size is None or not on_cpu():
+            return function(constants, *given)
+        full = max(lanes, size)
+        given = jax.tree.map(lambda x: _padded(x, full) if x.ndim and x.shape[-1] == lanes else x, given)
+        results = in_blocks(lambda own, _: _traced_once(function, constants, *own), given, full, size)
+        return jax.tree.map(lambda x: x[..., :lanes], results)
+
+    @custom_vmap
+    def call(varying: Any, shared: Any) -> Any:
+        # As many at a time as in most batches: a trace for a single point would be one more.
+        return at_once(varying, shared, size)
+
+    @call.def_vmap
+    def rule(batch: int, batched: Any, varying: Any, shared: Any) -> Any:
+        if not any(jax.tree.leaves(batched)):
+            results = call(varying, shared)
+            return results, jax.tree.map(lambda _: False, results)
+        lanes = max(x.shape[-1] for x in jax.tree.leaves(varying))
+
+        def merged(x: Array, own: bool) -> Array:
+            if own:
+                x = jnp.broadcast_to(x, (*x.shape[:-1], lanes))
+                return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], batch * lanes)
+            return x if x.shape[-1] == 1 else jnp.tile(x, batch)
+
+        def common(x: Array, own: bool) -> Array:
+            if own and jnp.issubdtype(x.dtype, jnp.integer):
+                return jnp.max(x)
+            if own:
+                return jnp.broadcast_to(x if x.ndim > 1 else x[:, None], (batch, lanes)).reshape(-1)
+            return x if x.ndim == 0 else jnp.tile(x, batch)
+
+        def parted(x: Array) -> Array:
+            return jnp.moveaxis(x.reshape(*x.shape[:-1], batch, lanes), -2, 0)
+
+        merged_varying = jax.tree.map(merged, varying, batched[0])
+        merged_shared = jax.tree.map(common, shared, batched[1])
+        if batch * lanes <= FULL_WIDTH:
+            results = at_once(merged_varying, merged_shared, size and FULL_WIDTH)
+        else:
+            results = call(merged_varying, merged_shared)
+        return jax.tree.map(parted, results), jax.tree.map(lambda _: True, results)
+
+    results = call(jax.tree.map(lambda x: jnp.asarray(x)[..., None], varying), shared)
+    return jax.tree.map(lambda x: x[..., 0], results)
+
+
+def _traced_once(function: Callable[[Any, Any, Any], Any], constants: Constants, varying: Any, shared: Any) -> Any:
+    """``function(constants, varying, shared)`` by a trace that is kept, which jax does not do across transformations."""
+    leaves, tree = jax.tree.flatten((varying, shared))
+    kinds = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves)
+    closed, results = _trace(function, constants, tree, kinds)
+    return jax.tree.unflatten(results, jaxpr_as_fun(closed)(*leaves))
+
+
+@lru_cache(maxsize=64)
+def _trace(
+    function: Callable[[Any, Any, Any], Any], constants: Constants, tree: Any, kinds: tuple[jax.ShapeDtypeStruct, ...]
+) -> tuple[ClosedJaxpr, Any]:
+    traced = jax.make_jaxpr(lambda *x: function(constants, *jax.tree.unflatten(tree, x)), return_shape=True)
+    closed, shapes = traced(*kinds)
+    return closed, jax.tree.structure(shapes)
+
+
+def over_lanes(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """``function(values, effort)`` of one point, for values of which JAX arrays hold one number for each lane.
+
+    Its results have the lanes as last axis, if there are any. What else is among ``values``, NumPy arrays included, is for
+    all lanes.
+    """
+
+    def all_lanes(values: Any, effort: Any) -> Any:
+        arrays, rest = eqx.partition(dict(values), lambda x: isinstance(x, jax.Array) and x.ndim > 0)
+        if not jax.tree.leaves(arrays):
+            return function(values, effort)
+        return jax.vmap(lambda own: function(eqx.combine(own, rest), effort), 0, -1)(arrays)
+
+    return all_lanes
 
 
 def by_rows(function: Callable[[Any], Any], rows: Any) -> Any:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import reduce
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +20,11 @@ from jax import Array
 
 from drivetrain_jax.analysis.numerics.linear_algebra import matmul
 from drivetrain_jax.analysis.periodic.multipliers import characteristic_coefficients, root_scale
-from drivetrain_jax.analysis.periodic.propagator import Propagator
-from drivetrain_jax.systems import LinearPeriodic, dense
+from drivetrain_jax.systems import dense
+
+if TYPE_CHECKING:
+    from drivetrain_jax.analysis.periodic.propagator import Propagator
+    from drivetrain_jax.systems import LinearPeriodic
 
 # Doublings of the predicted number of steps that a batch may take, and the steps at which there is no further one.
 _MAX_REFINEMENTS = 6
@@ -147,7 +150,7 @@ def compare(
         residual = ((-1) ** n * a_fine[-1] - exact) / scale**n
     truncation = jnp.maximum(truncation, jnp.abs(residual))
     # Eightfold growth is well within what rounding of the products is taken for, if their size is only estimated.
-    growth = 1.0 if fine.growth is None else jnp.maximum(fine.growth / (8 if system.reversal is None else 1), 1.0)
+    growth = jnp.maximum(fine.growth / (8 if system.reversal is None else 1), 1.0)
     unit = np.finfo(float).eps * norm / scale
     at_the_end = (4 + jnp.sqrt(steps)) * unit
     of_entries = _ENTRIES * system.halves * stiffness * np.finfo(float).eps
@@ -158,7 +161,7 @@ def compare(
 
 def direct_monodromy(
     system: LinearPeriodic,
-    propagate: Callable[[Array], Propagator],
+    propagate: Callable[[Array, Array], Propagator],
     steps: Array,
     shape: tuple[int, ...],
     stiffness: Array | float,
@@ -166,12 +169,13 @@ def direct_monodromy(
     order: int,
     ratio: int = 2,
     least: Array | float = 0.0,
+    most_pieces: Array | int = 1,
 ) -> Monodromy:
     """Refine from ``steps`` predicted steps (traced integer) until the error of every lane is at most ``rtol``.
 
-    ``propagate(steps)`` gives the propagator of ``system`` with batch shape ``shape``, by a scheme of order ``order``.
-    ``stiffness`` is that of :func:`stiffness_of`. A lane that overflows gets two doublings to recover and then no longer
-    holds up the others; after six the error tells what was reached.
+    ``propagate(steps, pieces)`` gives the propagator of ``system`` with batch shape ``shape``, by a scheme of order
+    ``order``, in up to ``most_pieces``. ``stiffness`` is that of :func:`stiffness_of`. A lane that overflows gets two
+    doublings to recover and then no longer holds up the others; after six the error tells what was reached.
     The first comparison is with ``ratio`` times fewer steps. It costs the less the more that is, but the order of the scheme
     has to show in both: a small ``rtol`` makes sure of that, as does that they are not fewer than the ``least`` with which
     it is stable, or than four fifths of the steps.
@@ -179,10 +183,13 @@ def direct_monodromy(
     predicted = jnp.maximum(steps, 2)
     stable = jnp.minimum(jnp.ceil(least), predicted * 4 // 5).astype(predicted.dtype)
     begin = jnp.maximum(stable, -(-predicted // ratio))
+    # Pieces of equally many steps.
+    pieces = -(-begin // -(-begin // most_pieces))
+    begin, predicted = (-(-count // pieces) * pieces for count in (begin, predicted))
     zero = jnp.zeros(shape)
     # Traced once, not for its shapes and again for its values.
     propagate = jax.jit(propagate)
-    blank = jax.tree.map(lambda x: jnp.zeros(x.shape), jax.eval_shape(propagate, steps))
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape), jax.eval_shape(propagate, steps, pieces))
     unknown = Monodromy(blank.matrix, zero, jnp.full(shape, jnp.inf), jnp.zeros(shape, bool), zero, blank.matrix)
 
     def unfinished(state: tuple) -> Array:
@@ -193,7 +200,7 @@ def direct_monodromy(
 
     def refine(state: tuple) -> tuple:
         count, current, coarse, _ = state
-        fine = propagate(current)
+        fine = propagate(current, pieces)
 
         def compared() -> Monodromy:
             gain = jnp.where(count == 1, predicted / begin, 2.0)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis._base import Solver
-from drivetrain_jax.analysis.numerics.lanes import in_blocks
+from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.analysis.periodic.direct import Monodromy, direct_monodromy, stable_steps, stiffness_of
 from drivetrain_jax.analysis.periodic.floquet_effort import (
     LONG,
@@ -20,27 +20,22 @@ from drivetrain_jax.analysis.periodic.floquet_effort import (
     implicit_effort,
     strongly_damped,
 )
-from drivetrain_jax.analysis.periodic.propagator import (
-    EXPLICIT_ORDER,
-    IMPLICIT_ORDER,
-    LANES,
-    PIECES,
-    Propagator,
-    explicit_propagator,
-    implicit_propagator,
-)
-from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System
+from drivetrain_jax.systems import System
+
+if TYPE_CHECKING:
+    from drivetrain_jax.analysis.periodic.propagator import Propagator
+    from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
 # Steps of the explicit scheme over those of the coarser solution that tells its error, up to this rtol, where the system
 # predicts them itself: of any other one it is not known that the order of the scheme shows with so few.
 _RATIO, _FINE = 4, 1e-8
 
-Form = Callable[[FloquetModel], LinearPeriodic]
-Results = Callable[[FloquetModel, Monodromy], dict[str, Array]]
+Form = Callable[["FloquetModel"], "LinearPeriodic"]
+Results = Callable[["FloquetModel", Monodromy], dict[str, Array]]
 
 
 def direct_solvers(
-    system: System,
+    system: type[System],
     rtol: float,
     target: float,
     form: Form,
@@ -60,7 +55,6 @@ def direct_solvers(
             f"direct: explicit Runge-Kutta of order 8{name}",
             lambda values, steps: solve(form, values, steps, True),
             effort,
-            broadcasts=True,
             chunk=chunks[0],
             march=True,
             short_loops=True,
@@ -70,7 +64,7 @@ def direct_solvers(
 
     implicit = Solver(
         "direct: Radau IIA of 8 stages",
-        lambda values, effort: solve(stiff or form, values, effort, False),
+        over_lanes(lambda values, effort: solve(stiff or form, values, effort, False)),
         lambda columns: implicit_effort(system, columns, rtol),
         unit_cost=PANEL_COST,
         chunk=chunks[1],
@@ -90,7 +84,7 @@ class _ExplicitSteps:
     Those asked for last are kept: the solvers of a plan ask for the same columns one after the other.
     """
 
-    def __init__(self, system: System, rtol: float, has_stiff: bool) -> None:
+    def __init__(self, system: type[System], rtol: float, has_stiff: bool) -> None:
         self._system, self._rtol, self._has_stiff = system, rtol, has_stiff
         self._last: tuple[Mapping[str, Any], Mapping[str, np.ndarray]] = ({}, {})
 
@@ -106,7 +100,7 @@ class _ExplicitSteps:
 
 
 def _solve(
-    system: System,
+    system: type[System],
     target: float,
     results: Results,
     form: Form,
@@ -114,26 +108,25 @@ def _solve(
     effort: Array,
     explicit: bool,
 ) -> dict[str, Array]:
-    model = system.models["floquet"].build(values)
+    # Diffrax takes as long to import as jax: nobody should wait for that to look at a result.
+    from drivetrain_jax.analysis.periodic.propagator import PIECES, Order8, Radau, propagator
+
+    scheme = Order8 if explicit else Radau
+    build = system.models["floquet"].build
+    model = build(values)
     periodic = form(model)
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in values.values() if not isinstance(x, str)))
     least = stable_steps(periodic) if explicit else 0.0
     # Errors grow on the way where modes decay at rates that differ by much, and by other ones later than at first.
-    pieces = jnp.clip(least, 1, PIECES).astype(effort.dtype)
+    pieces = jnp.clip(least, 1, PIECES).astype(effort.dtype) if explicit else PIECES
 
-    def in_lanes(steps: Array) -> Propagator:
-        def block(part: Mapping[str, Any], count: int) -> Propagator:
-            own = form(system.models["floquet"].build(part))
-            return explicit_propagator(own, steps, (count,) if shape else (), pieces)
+    def propagate(steps: Array, pieces: Array) -> Propagator:
+        def one(own: Mapping[str, Any], _: None) -> Propagator:
+            return propagator(form(build(own)), steps, pieces, scheme)
 
-        return in_blocks(block, values, shape[0] if shape else 1, LANES)
+        return over_lanes(one)(values, None) if shape else one(values, None)
 
-    def one(steps: Array) -> Propagator:
-        return implicit_propagator(periodic, steps)
-
-    propagate = in_lanes if explicit else one
-    order = EXPLICIT_ORDER if explicit else IMPLICIT_ORDER
     stiffness = stiffness_of(periodic, shape)
     ratio = jnp.where(target <= _FINE, _RATIO, 2) if explicit and model.explicit_steps else 2
-    found = direct_monodromy(periodic, propagate, effort, shape, stiffness, target, order, ratio, least)
+    found = direct_monodromy(periodic, propagate, effort, shape, stiffness, target, scheme.ORDER, ratio, least, pieces)
     return results(model, found)

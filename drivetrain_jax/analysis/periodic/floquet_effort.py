@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,10 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis.numerics.predictions import Words, count_of, predicted, split, taken
-from drivetrain_jax.systems import FloquetModel, System
+from drivetrain_jax.systems import System
+
+if TYPE_CHECKING:
+    from drivetrain_jax.systems import FloquetModel
 
 # Below this many explicit steps the implicit scheme is never the cheaper one.
 _STIFF = 600
@@ -30,7 +33,7 @@ PANEL_COST = 50.0
 _NODES, _WEIGHTS = ((x + a) / 2 for x, a in zip(np.polynomial.legendre.leggauss(8), (1, 0), strict=True))
 _PLACES = tuple(_NODES.tolist())
 
-Build = Callable[..., FloquetModel]
+Build = Callable[..., "FloquetModel"]
 
 
 def explicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 from jax import Array
@@ -19,7 +19,10 @@ from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.periodic.direct import Monodromy
 from drivetrain_jax.analysis.periodic.direct_solvers import direct_solvers
-from drivetrain_jax.systems import LinearPeriodic, System
+from drivetrain_jax.systems import System
+
+if TYPE_CHECKING:
+    from drivetrain_jax.systems import LinearPeriodic
 
 # The result that an atlas interpolates, and what it may be wrong by.
 PROPAGATOR, CHANGE = "propagator", "propagator_change"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +20,10 @@ from drivetrain_jax.analysis.periodic.radius import (
     radius_by_eigenvalues,
     radius_in_closed_form,
 )
-from drivetrain_jax.systems import LinearPeriodic, System
+from drivetrain_jax.systems import System
+
+if TYPE_CHECKING:
+    from drivetrain_jax.systems import LinearPeriodic
 
 VARIABLES = (
     Variable("floquet_multiplier", "1", "Floquet multiplier over one period", ("multiplier",), "complex128"),

@@ -1,17 +1,20 @@
-"""Propagators of linear periodic systems by fixed steps: an explicit scheme of order 8 and an L-stable implicit one.
+"""Propagators of linear periodic systems by diffrax, with two solvers of equal steps: explicit of order 8, or L-stable.
 
 Both give ``Phi`` over ``[0, span]`` of a :class:`~drivetrain_jax.systems.LinearPeriodic` with the number of steps as a
-traced integer, so that one compilation serves every accuracy. The explicit scheme marches over a trailing batch axis as
-one kernel, keeps every matrix as rows of shape ``(n, ...)`` and evaluates the entries of ``A`` at all stages of a step
-together, what they share once (:mod:`~drivetrain_jax.analysis.numerics.staged`). The implicit one is for a single point.
+traced integer, so that one compilation serves every accuracy. A step of diffrax is a piece of the span, and a piece is many
+steps of the scheme. Under ``jax.vmap`` the explicit scheme marches blocks of lanes as one kernel each, keeps every matrix as
+rows of shape ``(n, lanes)`` and evaluates the entries of ``A`` at all stages of a step together, what they share once
+(:mod:`~drivetrain_jax.analysis.numerics.staged`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
+import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +22,7 @@ from jax import Array
 
 from drivetrain_jax.analysis.numerics import dop853
 from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, stored, suits_one_kernel
+from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last
 from drivetrain_jax.analysis.numerics.linear_algebra import matmul, solve
 from drivetrain_jax.analysis.numerics.staged import staged
 from drivetrain_jax.systems import LinearPeriodic
@@ -28,32 +32,188 @@ class Propagator(NamedTuple):
     """``Phi = exp(log_scale) matrix``, shape ``(n, n, ...)``.
 
     ``growth`` is how much larger at the end an error is that was made on the way than one made there, the root of the mean
-    square of ``|Phi(T, t)| |Phi(t, 0)| / |Phi(T, 0)|`` (1 at t = T) over some instants; None if none were looked at.
+    square of ``|Phi(T, t)| |Phi(t, 0)| / |Phi(T, 0)|`` (1 at t = T) over the ends of the pieces.
     """
 
     matrix: Array
     log_scale: Array
-    growth: Array | None = None
+    growth: Array
 
 
-# Order of the explicit scheme.
-EXPLICIT_ORDER = 8
-# Lanes that should march together: what a step reads and writes stays in the innermost caches.
+# Order of the explicit scheme; stages of the implicit one, and what its errors fall with at least (the stage order, which is
+# what stiff problems leave of the classical order 15).
+EXPLICIT_ORDER, STAGES, IMPLICIT_ORDER = 8, 8, 8
+# Lanes that march together: what a step reads and writes stays in the innermost caches.
 LANES = 32
+# States whose largest entry is beyond exp(70), or below exp(-70), are scaled: far from overflow, even squared.
+_FAR = 70.0
 # Pieces of the span between which the growth of errors is looked at, at most.
 PIECES = 16
 
 Rows = list[Array]
+_NOTHING = Constants(())
 
 
-def explicit_propagator(
-    system: LinearPeriodic, steps: Array, shape: tuple[int, ...], pieces: Array | int = 1
-) -> Propagator:
-    """``Phi`` by ``steps`` equal steps of the 12-stage Runge-Kutta scheme of order 8 (DOP853), batch shape ``shape``.
+class _Record(NamedTuple):
+    """``y(t) = exp(log_scale) state``, and the covariance at t of errors made at the ends of all steps so far.
 
-    Fastest for batches of up to about ``LANES``. The growth is looked at between so many ``pieces`` of the span, up to
-    ``PIECES``.
+    ``C' = P C P^T + |y|^2 I`` with the propagator P of a step sums these up: errors that are as large as ``y`` where they
+    are made, and know nothing of each other.
     """
+
+    log_scale: Array
+    covariance: Array
+
+
+class EqualSteps(diffrax.AbstractSolver):
+    """A solver of linear periodic terms: each step of diffrax is ``count`` equal steps of a scheme of its own.
+
+    The state is a vector or a matrix of them. Where it is far from 1 it is scaled; the logarithm is in the solver's state.
+    """
+
+    count: Any
+    ORDER: ClassVar[int]
+    term_structure: ClassVar = LinearPeriodic
+    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
+
+    def order(self, terms: LinearPeriodic) -> int:
+        """What the errors fall with at least."""
+        return self.ORDER
+
+    def init(self, terms: LinearPeriodic, t0: Any, t1: Any, y0: Array, args: Any) -> _Record:
+        """Nothing scaled, and no errors."""
+        return _Record(jnp.zeros(()), jnp.zeros((len(y0), len(y0))))
+
+    def func(self, terms: LinearPeriodic, t0: Any, y0: Array, args: Any) -> Array:
+        """``A(t) y``."""
+        return terms.vf(t0, y0, args)
+
+    def step(
+        self, terms: LinearPeriodic, t0: Any, t1: Any, y0: Array, args: Any, solver_state: _Record, made_jump: Any
+    ) -> tuple[Array, None, dict[str, Array], _Record, diffrax.RESULTS]:
+        """The state at t1."""
+        del args, made_jump
+        term, forwards = _unwrapped(terms)
+        given = (*self.piece(term, forwards * t0, forwards * t1), y0.reshape(len(y0), -1), solver_state)
+        y1, record = lanes_last(_onward, _NOTHING, given, ())
+        y1 = y1.reshape(y0.shape)
+        return y1, None, {"y0": y0, "y1": y1}, record, diffrax.RESULTS.successful
+
+    def piece(self, terms: LinearPeriodic, t0: Any, t1: Any) -> tuple[Array, Array]:
+        """The propagator from t0 to t1 as a matrix ``(n, n)`` and the logarithm of its factor."""
+        raise NotImplementedError
+
+
+def _unwrapped(terms: Any) -> tuple[LinearPeriodic, Any]:
+    """The term that diffrax has wrapped, and 1, or -1 if it solves backwards."""
+    return (terms, 1) if isinstance(terms, LinearPeriodic) else (terms.term, terms.direction)
+
+
+class Order8(EqualSteps):
+    """The 12-stage Runge-Kutta scheme of order 8 (DOP853) in equal steps, for blocks of lanes under ``jax.vmap``."""
+
+    ORDER: ClassVar = EXPLICIT_ORDER
+
+    def piece(self, terms: LinearPeriodic, t0: Any, t1: Any) -> tuple[Array, Array]:
+        """See :class:`EqualSteps`."""
+        # What else there is of the term has no part in it.
+        arrays, rest = eqx.partition(LinearPeriodic(terms.rows, 0.0, terms.basis), eqx.is_array)
+        shared = jnp.asarray(t0, float), jnp.asarray(t1, float), self.count
+        if not jax.tree.leaves(arrays) or not isinstance(terms.rows, eqx.Module | jax.tree_util.Partial):
+            # Numbers alone, or a function that may depend on arrays of which nothing is known.
+            matrix, log_scale = _march(terms, *shared)
+            return matrix[..., 0], log_scale[0]
+        return lanes_last(_block, Constants(rest), arrays, shared, LANES)
+
+
+def _block(rest: Constants, arrays: LinearPeriodic, shared: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    return _march(eqx.combine(arrays, rest.tree), *shared)
+
+
+class Radau(EqualSteps):
+    """Radau IIA collocation with 8 stages (order 15, L-stable) in equal panels."""
+
+    ORDER: ClassVar = IMPLICIT_ORDER
+
+    def piece(self, terms: LinearPeriodic, t0: Any, t1: Any) -> tuple[Array, Array]:
+        """See :class:`EqualSteps`. The product is rescaled after each panel, so that strong damping does not underflow.
+
+        The stage values solve ``Y_i - h sum_j a_ij A(t_j) Y_j = I``; the last one is the panel's propagator.
+        """
+        a, c = radau_iia(STAGES)
+        h, n = (t1 - t0) / self.count, terms.size
+        right = jnp.tile(jnp.eye(n), (STAGES, 1))
+        at_nodes = jax.vmap(terms.matrix)
+
+        def body(step: Array, carry: tuple) -> tuple:
+            product, log_scale = carry
+            blocks = jnp.einsum("ij,jkl->ikjl", h * a, at_nodes(t0 + (step + c) * h)).reshape(STAGES * n, STAGES * n)
+            product = solve(jnp.eye(STAGES * n) - blocks, right)[-n:] @ product
+            size = jnp.max(jnp.abs(product))
+            size = jnp.where(size > 0, size, 1.0)
+            return product / size, log_scale + jnp.log(size)
+
+        return jax.lax.fori_loop(0, self.count, body, (jnp.eye(n), jnp.zeros(())))
+
+
+class EqualStepSize(diffrax.ConstantStepSize):
+    """``count`` equal steps, which may be traced."""
+
+    count: Any
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: None, args: Any, func: Any, error_order: Any) -> tuple:
+        """End of the first step, and the state."""
+        return super().init(terms, t0, t1, y0, (t1 - t0) / self.count, args, func, error_order)
+
+
+def propagator(
+    system: LinearPeriodic, steps: Array, pieces: Array | int = 1, solver: type[EqualSteps] = Order8
+) -> Propagator:
+    """``Phi`` of one point by ``steps`` equal steps (or panels) of ``solver``, a multiple of ``pieces``.
+
+    The growth is looked at between so many ``pieces`` of the span, up to ``PIECES``.
+    """
+    n = system.size
+    end = diffrax.diffeqsolve(
+        system,
+        solver(steps // pieces),
+        t0=0.0,
+        t1=system.span,
+        dt0=None,
+        y0=jnp.eye(n),
+        stepsize_controller=EqualStepSize(pieces),
+        saveat=diffrax.SaveAt(t1=True, solver_state=True),
+        adjoint=diffrax.ForwardMode(),
+        max_steps=PIECES,
+        throw=False,
+    )
+    matrix, record = end.ys[0], end.solver_state
+    growth = jnp.sqrt(jnp.trace(record.covariance) / (n * pieces * jnp.sum(matrix**2)))
+    return Propagator(matrix, record.log_scale, growth)
+
+
+def _onward(_: Constants, varying: tuple[Array, Array, Array, _Record], __: tuple) -> tuple[Array, _Record]:
+    """State and record after a step, all with the lanes as last axis."""
+    matrix, log_scale, state, record = varying
+    state, moved = stored(_moved)(matrix, state, record.covariance)
+    size = jnp.max(jnp.abs(state), axis=(0, 1))
+    total = log_scale + jnp.log(jnp.where(size > 0, size, 1.0))
+    near = jnp.abs(total) <= _FAR
+    factor = jnp.where(near, jnp.exp(log_scale), 1 / jnp.where(size > 0, size, 1.0))
+    state = state * factor
+    unit = jnp.eye(len(matrix)).reshape(*matrix.shape[:2], *(1,) * (matrix.ndim - 2))
+    covariance = moved * factor**2 + jnp.sum(state**2, axis=(0, 1)) * unit
+    return state, _Record(record.log_scale + jnp.where(near, 0.0, total), covariance)
+
+
+def _moved(piece: Array, state: Array, covariance: Array) -> tuple[Array, Array]:
+    return matmul(piece, state), matmul(matmul(piece, covariance), jnp.swapaxes(piece, 0, 1))
+
+
+def _march(system: LinearPeriodic, t0: Array, t1: Array, count: Array) -> tuple[Array, Array]:
+    """``Phi`` from t0 to t1 of all lanes, the last axis of what varies, by ``count`` steps."""
+    varying = jax.tree.leaves((eqx.filter(system, eqx.is_array), t0, t1))
+    lanes = max((np.shape(x)[-1] for x in varying if np.ndim(x)), default=1)
     zeros: list[list[bool]] = []
 
     def entries(*basis: Array) -> list[Array]:
@@ -71,48 +231,12 @@ def explicit_propagator(
     suits = suits_one_kernel(lambda t: system.rows(*system.basis(t)), times)
     mark = in_one_kernel if suits else lambda function: function
 
-    def march(first: Array, last: Array, h: Array, fixed: list[Array]) -> Rows:
-        step = partial(_explicit_step, system.basis, partial(split.moving, fixed), tuple(map(tuple, zeros)), h)
-        return jax.lax.fori_loop(first, last, step, _identity(len(zeros), shape[0] if shape else 1))
+    def march(count: Array, start: Array, h: Array, fixed: list[Array]) -> Rows:
+        step = partial(_explicit_step, system.basis, partial(split.moving, fixed), tuple(map(tuple, zeros)), start, h)
+        return jax.lax.fori_loop(0, count, step, _identity(len(zeros), lanes))
 
-    def part(first: Array, last: Array) -> Propagator:
-        rows = mark(march)(first, last, system.span / steps, split.fixed)
-        return Propagator(jnp.stack(rows).reshape(len(zeros), len(zeros), *shape), jnp.zeros(shape))
-
-    return _in_pieces(part, len(zeros), shape, steps, pieces)
-
-
-def _in_pieces(
-    part: Callable[[Array, Array], Propagator], n: int, shape: tuple[int, ...], steps: Array, pieces: Array | int
-) -> Propagator:
-    """``part(first, last)`` over all steps, as the product of what it is over ``pieces`` of them, and the growth; of batch
-    shape ``shape`` for ``n`` states.
-
-    ``C' = P C P^T + |Phi(t, 0)|^2 I`` sums that up over the ends t of the pieces P: the covariance of errors that are as
-    large as ``Phi`` where they are made, and know nothing of each other.
-    """
-    pieces = jnp.asarray(pieces, steps.dtype)
-    unit = jnp.broadcast_to(jnp.eye(n).reshape(n, n, *(1,) * len(shape)), (n, n, *shape))
-
-    def onward(k: Array, state: tuple) -> tuple:
-        product, log_scale, covariance = state
-        own = part(k * steps // pieces, (k + 1) * steps // pieces)
-        product, moved = stored(_moved)(own.matrix, product, covariance)
-        size = jnp.max(jnp.abs(product), axis=(0, 1))
-        size = jnp.where((pieces > 1) & (size > 0), size, 1.0)
-        product = product / size
-        covariance = moved / size**2 + jnp.sum(product**2, axis=(0, 1)) * unit
-        return product, log_scale + own.log_scale + jnp.log(size), covariance
-
-    start = unit, jnp.zeros(shape), jnp.zeros(unit.shape)
-    product, log_scale, covariance = jax.lax.fori_loop(0, pieces, onward, start)
-    trace = sum(covariance[i, i] for i in range(n))
-    growth = jnp.sqrt(trace / (n * pieces * jnp.sum(product**2, axis=(0, 1))))
-    return Propagator(product, log_scale, growth=growth)
-
-
-def _moved(piece: Array, product: Array, covariance: Array) -> tuple[Array, Array]:
-    return matmul(piece, product), matmul(matmul(piece, covariance), jnp.swapaxes(piece, 0, 1))
+    rows = mark(march)(count, t0, (t1 - t0) / count, split.fixed)
+    return jnp.stack(rows), jnp.zeros(lanes)
 
 
 def _identity(n: int, lanes: int) -> Rows:
@@ -123,12 +247,13 @@ def _explicit_step(
     basis: Callable[[Array], tuple[Array, ...]],
     entries: Callable[..., list[Array]],
     zeros: tuple[tuple[bool, ...], ...],
+    start: Array,
     h: Array,
     number: Array,
     y: Rows,
 ) -> Rows:
-    """One step from ``number * h``: the entries at all stages first, then stage after stage."""
-    at_stages = entries(*basis((number + jnp.asarray(dop853.C)[:, None]) * h))
+    """One step from ``start + number * h``: the entries at all stages first, then stage after stage."""
+    at_stages = entries(*basis(start + (number + jnp.asarray(dop853.C)[:, None]) * h))
     slopes: list[Rows] = []
     for stage, weights in enumerate(dop853.A):
         state = _advanced(y, h, weights[:stage], slopes)
@@ -179,34 +304,3 @@ def radau_iia(stages: int) -> tuple[np.ndarray, np.ndarray]:
         for k in set(range(stages)) - {j}:
             lagrange[j] *= (points - c[k]) / (c[j] - c[k])
     return np.einsum("jiq,q->ij", lagrange, weights / 2) * c[:, None], c
-
-
-STAGES = 8
-# What the errors fall with at least, for stiff problems too (the stage order; the classical order is 15).
-IMPLICIT_ORDER = 8
-
-
-def implicit_propagator(system: LinearPeriodic, steps: Array) -> Propagator:
-    """``Phi`` of one point by ``steps`` equal panels of Radau IIA collocation with 8 stages (order 15, L-stable).
-
-    The stage values solve ``Y_i - h sum_j a_ij A(t_j) Y_j = I``; the last one is the panel's propagator. The product
-    is rescaled after each panel, so that strong damping does not underflow.
-    """
-    a, c = radau_iia(STAGES)
-    h = system.span / steps
-    n = system.size
-    right = jnp.tile(jnp.eye(n), (STAGES, 1))
-    at_nodes = jax.vmap(system.matrix)
-
-    def body(step: Array, carry: tuple) -> tuple:
-        product, log_scale = carry
-        blocks = jnp.einsum("ij,jkl->ikjl", h * a, at_nodes((step + c) * h)).reshape(STAGES * n, STAGES * n)
-        product = solve(jnp.eye(STAGES * n) - blocks, right)[-n:] @ product
-        size = jnp.max(jnp.abs(product))
-        size = jnp.where(size > 0, size, 1.0)
-        return product / size, log_scale + jnp.log(size)
-
-    def part(first: Array, last: Array) -> Propagator:
-        return Propagator(*jax.lax.fori_loop(first, last, body, (jnp.eye(n), jnp.zeros(()))))
-
-    return _in_pieces(part, n, (), steps, PIECES)

@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis.periodic.multipliers import characteristic_coefficients
-from drivetrain_jax.analysis.periodic.propagator import explicit_propagator
+from drivetrain_jax.analysis.periodic.propagator import propagator
 from drivetrain_jax.systems import LinearPeriodic
 
 Form = Callable[[Any, Any], LinearPeriodic]
@@ -44,9 +44,9 @@ class TongueTip(NamedTuple):
     curvature: float
 
 
-def edge_function(form: LinearPeriodic, shape: tuple[int, ...]) -> Array:
-    """``det(Z + I)`` of the system ``form`` with batch shape ``shape``: 0 where a multiplier is -1."""
-    a = characteristic_coefficients(explicit_propagator(form, jnp.int32(_STEPS), shape).matrix)
+def edge_function(form: LinearPeriodic) -> Array:
+    """``det(Z + I)`` of the system ``form``: 0 where a multiplier is -1."""
+    a = characteristic_coefficients(propagator(form, jnp.int32(_STEPS)).matrix)
     # (-1)^n det(-I - Z), from the coefficients of det(s I - Z) at s = -1.
     return 1 + sum((-1) ** (k + 1) * a[k] for k in range(a.shape[0]))
 
@@ -59,7 +59,7 @@ def tongue_edge(form: Form, frequency: Array, guess: Array) -> Array:
     frequency = jnp.asarray(frequency, float)
 
     def edge(amplitude: Array) -> Array:
-        return edge_function(form(amplitude, frequency), frequency.shape)
+        return jax.vmap(lambda *point: edge_function(form(*point)))(amplitude, frequency)
 
     def moving(old: Array, q: Array) -> Array:
         return jnp.abs(q - old) > _CONVERGED * jnp.abs(q)
@@ -85,7 +85,7 @@ def tongue_tip(form: Form, amplitude: float, frequency: float, width: float) -> 
     """The tip of the subharmonic tongue of ``form(amplitude, frequency)`` near a first guess of both.
 
     The tip is looked for within ``frequency * (1 +- width)``; the damping ratio is a suitable width and perturbation
-    theory a suitable guess. Both arguments of ``form`` are arrays of shape ``(N,)``. NaN if the edge is not lowest
+    theory a suitable guess. Both arguments of ``form`` are traced numbers. NaN if the edge is not lowest
     inside that interval.
     """
     edge = jax.jit(lambda f, guess: tongue_edge(form, f, guess))
