@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -60,6 +63,7 @@ class Solver:
     ``effort`` is a traced integer, the largest that ``effort(columns)`` predicts in the batch (columns: NumPy arrays
     of shape ``(N,)``; a count of steps or the like; by default the same for all points). The engine gives every point
     to the solver for which ``effort * unit_cost`` is smallest and runs batches of ``chunk`` points of similar effort.
+    ``steps(values)`` predicts the effort of every lane from traced values, if ``solve`` makes use of it.
     ``march`` marks integrations in time, ``short_loops`` what works through its lanes by some tens: both are compiled
     otherwise (``numerics.kernels.compiler_options``). One point of a ``lengthy`` solver takes as long as a compilation.
     """
@@ -67,11 +71,37 @@ class Solver:
     name: str
     solve: Callable[[Mapping[str, Any], Array], dict[str, Array]]
     effort: Callable[[Mapping[str, np.ndarray]], np.ndarray] = lambda columns: np.ones(())
+    steps: Callable[[Mapping[str, Any]], Array] | None = None
     unit_cost: float = 1.0
     chunk: int = 256
     march: bool = False
     short_loops: bool = False
     lengthy: bool = False
+
+
+def stacked(jacobian: Any) -> Array:
+    """A pytree of derivatives by each parameter as one Jacobian ``(..., P)``."""
+    return jnp.stack(jax.tree.leaves(jacobian), axis=-1)
+
+
+def forward_derivatives(
+    solvers: Callable[[type[System], Request], tuple[Solver, ...]],
+    system: type[System],
+    request: Request,
+    parameters: Any,
+    constants: Any,
+    results: Mapping[str, Array],
+) -> dict[str, Array]:
+    """Jacobians by forward differentiation of the first of ``solvers`` itself, see :class:`Analysis`."""
+    solve = solvers(system, request)[0].solve
+    names = [n for n, x in results.items() if jnp.issubdtype(x.dtype, jnp.inexact) and not n.endswith("_error")]
+
+    def found(parameters: Any) -> dict[str, Array]:
+        solved = solve(eqx.combine(parameters, constants.tree), jnp.int64(1))
+        return {name: solved[name] for name in names}
+
+    jacobians = jax.jacfwd(found)(parameters)
+    return {name: stacked(jacobian) for name, jacobian in jacobians.items()}
 
 
 @dataclass(frozen=True)
@@ -85,6 +115,8 @@ class Analysis:
     holds the parameters that do not vary (a list is whole also if one entry varies). It raises
     :class:`~drivetrain_jax._errors.InputError` where a request and these parameters do not fit together.
     ``lacks(system)`` maps the results and methods that cannot be had of a system to what messages say of them.
+    ``derivatives(system, request, parameters, constants, results)`` gives Jacobians ``(..., P)`` of results at one point by
+    all P ``parameters`` (arrays; ``constants`` hold the rest), as far as there are any.
     ``path_axis(request)`` names the axis that is consumed whole, if there is one. A ``continuous`` analysis takes ranges
     for axes and gives a function of the parameters instead of values on a grid.
     """
@@ -99,6 +131,7 @@ class Analysis:
     dimensions: Callable[[System, Request, Mapping[str, Any]], tuple[Dimension, ...]] = lambda *_: ()
     lacks: Callable[[System], Mapping[str, str]] = lambda _: {}
     path_axis: Callable[[Request], str | None] = lambda _: None
+    derivatives: Callable[..., Mapping[str, Array]] | None = None
     continuous: bool = False
     method_titles: Mapping[str, str] = field(default_factory=dict)
 

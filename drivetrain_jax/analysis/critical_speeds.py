@@ -22,13 +22,16 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver, stacked
+from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.analysis.shafts import krylov as shaft_krylov
 from drivetrain_jax.analysis.shafts import roots as shaft_roots
 from drivetrain_jax.analysis.shafts.mechanisms import mechanism_shapes, zero_modes
@@ -149,6 +152,23 @@ def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     return (Solver(request.method, solve, chunk=chunk),)
 
 
+def _derivatives(
+    system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Jacobians of all frequencies, by one evaluation of the characteristic function for each parameter."""
+    build, options = system.models["critical_speeds"].build, request.options
+
+    def frequencies(parameters: Any) -> dict[str, Array]:
+        p = angular_frequencies(build(eqx.combine(parameters, constants.tree)), options["modes"])
+        found = {"angular_frequency": p, "natural_frequency": p / (2 * math.pi), "critical_speed": p * (30 / math.pi)}
+        if "separation_margin" in results:
+            low, high = options["operating_min"], options["operating_max"]
+            found["separation_margin"] = separation_margin(found["critical_speed"], low, high)
+        return found
+
+    return {name: stacked(x) for name, x in jax.jacfwd(frequencies)(parameters).items()}
+
+
 ANALYSIS = Analysis(
     name="critical_speeds",
     title="critical speeds",
@@ -162,4 +182,5 @@ ANALYSIS = Analysis(
     options=OPTIONS,
     solvers=_solvers,
     dimensions=_dimensions,
+    derivatives=_derivatives,
 )

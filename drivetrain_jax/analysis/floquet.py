@@ -11,9 +11,19 @@ factorisation.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
 from drivetrain_jax._quantities import Dimension, Parameter
 from drivetrain_jax.analysis._base import DIFFRAX_SOLVERS, RTOL, Analysis, Request, Solver
+from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.analysis.periodic.direct_solvers import direct_solvers
+from drivetrain_jax.analysis.periodic.floquet_effort import traced_steps
 from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES, lacks, results
 from drivetrain_jax.systems import System
 
@@ -41,6 +51,36 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     return diffrax_solvers(system, request)
 
 
+# Relative error that the steps of derivatives are predicted for: these are less exact than the multipliers by some digits.
+_DERIVATIVES = 1e-11
+
+
+def _derivatives(
+    system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Jacobians of multipliers, exponents and spectral radius; NaN where multipliers coalesce."""
+    from drivetrain_jax.analysis.periodic.derivatives import monodromy_change, multiplier_change, radius_change
+
+    build = system.models["floquet"].build
+
+    def model(parameters: Any) -> Any:
+        return build(eqx.combine(parameters, constants.tree))
+
+    steps = traced_steps(build, eqx.combine(parameters, constants.tree), _DERIVATIVES)
+    change = monodromy_change(build, parameters, constants, steps)
+    sigma, moved = multiplier_change(change)
+    error = results.get("spectral_radius_error", 10 * request.options["rtol"] * results.get("spectral_radius", 1.0))
+    scale = jnp.exp(change.log_scale)
+    slope = radius_change(sigma, moved, error / (scale * jnp.abs(sigma[0])))
+    found = {"spectral_radius": scale * slope, "floquet_multiplier": scale * moved}
+    if "floquet_exponent" in request.outputs:
+        period, longer = jax.value_and_grad(lambda p: jnp.asarray(model(p).natural.span, float))(parameters)
+        rates = (jnp.log(jnp.abs(sigma)) + change.log_scale) / period
+        slopes = (jnp.conj(sigma)[:, None] * moved).real / jnp.abs(sigma)[:, None] ** 2
+        found["floquet_exponent"] = (slopes - rates[:, None] * jnp.stack(jax.tree.leaves(longer))) / period
+    return found
+
+
 def _lacks(system: System) -> dict[str, str]:
     return lacks(system) | ({} if "atlas" in system.models else {"atlas": f"{system.name} has no model for it"})
 
@@ -66,4 +106,5 @@ ANALYSIS = Analysis(
     solvers=_solvers,
     dimensions=lambda *_: (Dimension("multiplier", "Floquet multipliers by falling modulus", ()),),
     lacks=_lacks,
+    derivatives=_derivatives,
 )

@@ -22,7 +22,7 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Variable
-from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver, forward_derivatives
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, solve, spectral_norm
 from drivetrain_jax.analysis.numerics.predictions import predicted
@@ -251,4 +251,5 @@ ANALYSIS = Analysis(
     options=(RTOL,),
     solvers=_solvers,
     dimensions=lambda *_: (STATE, SHAFT),
+    derivatives=partial(forward_derivatives, _solvers),
 )

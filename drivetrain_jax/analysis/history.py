@@ -25,7 +25,16 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis._base import DIFFRAX_SOLVERS, MOST_SECONDS, RTOL, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis._base import (
+    DIFFRAX_SOLVERS,
+    MOST_SECONDS,
+    RTOL,
+    Analysis,
+    Outcome,
+    Request,
+    Solver,
+    forward_derivatives,
+)
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.analysis.numerics.watched_steps import WatchedSteps, largest_met
@@ -130,6 +139,7 @@ def _segment(
         y0=place.y,
         stepsize_controller=WatchedSteps(controller, part, end - place.fraction),
         saveat=diffrax.SaveAt(t1=True, controller_state=True),
+        adjoint=diffrax.ForwardMode(),
         max_steps=_MAX_SEGMENT,
         throw=False,
     )
@@ -285,4 +295,5 @@ ANALYSIS = Analysis(
     ),
     solvers=_solvers,
     dimensions=_dimensions,
+    derivatives=partial(forward_derivatives, _solvers),
 )

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +22,7 @@ from jax import Array
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.numerics.lanes import in_blocks, lane_count, path_entry, with_path
+from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lane_count, path_entry, with_path
 from drivetrain_jax.analysis.numerics.singular_values import EPS, Bidiagonal, bidiagonal_form, bidiagonal_values
 from drivetrain_jax.analysis.spectra.mode_types import (
     MODE_TYPES,
@@ -264,6 +265,20 @@ def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> t
     )
 
 
+def _derivatives(
+    system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Jacobian of the frequencies; NaN where a parameter splits frequencies that are equal."""
+    from drivetrain_jax.analysis.spectra.mode_gradients import frequency_jacobian
+
+    del request, results
+
+    def model(parameters: Any) -> SpringSystem:
+        return system.models["modes"].build(eqx.combine(parameters, constants.tree))
+
+    return {"natural_frequency": frequency_jacobian(model, parameters)}
+
+
 ANALYSIS = Analysis(
     name="modes",
     title="natural frequencies and modes",
@@ -277,5 +292,6 @@ ANALYSIS = Analysis(
     options=(Parameter("track", "1", "axis along which modes are followed", default="", text=True),),
     solvers=_solvers,
     dimensions=_dimensions,
+    derivatives=_derivatives,
     path_axis=lambda request: request.options["track"] or None,
 )

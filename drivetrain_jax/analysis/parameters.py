@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver, forward_derivatives
 from drivetrain_jax.systems import System
 
 MODE = "mode"
@@ -82,4 +82,5 @@ ANALYSIS = Analysis(
     options=(Parameter("modes", "1", "modes of the midshaft", default=5, lower=1, upper=1000, integer=True),),
     solvers=_solvers,
     dimensions=_dimensions,
+    derivatives=partial(forward_derivatives, _solvers),
 )

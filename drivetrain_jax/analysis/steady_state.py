@@ -26,7 +26,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver, forward_derivatives
 from drivetrain_jax.analysis.impacts.attractor import attractors
 from drivetrain_jax.analysis.impacts.exact_response import INTEGRALS, WIDTH, describe
 from drivetrain_jax.analysis.impacts.length_unit import measured, restored
@@ -125,4 +125,5 @@ ANALYSIS = Analysis(
     options=(RTOL, WAIT),
     solvers=_solvers,
     dimensions=lambda *_: DIMENSIONS,
+    derivatives=partial(forward_derivatives, _solvers),
 )

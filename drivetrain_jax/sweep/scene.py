@@ -16,7 +16,8 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._machine import physical_memory
 from drivetrain_jax._quantities import Dimension, Parameter
 from drivetrain_jax._wording import clipped, did_you_mean, nearest, shown
-from drivetrain_jax.analysis import OUTCOME, Analysis, Request, get_analysis
+from drivetrain_jax.analysis import Analysis, Request, get_analysis
+from drivetrain_jax.analysis.request import checked, make_request
 from drivetrain_jax.sweep import toml
 from drivetrain_jax.sweep.axes import MAX_POINTS, MAX_RANGES, Axis, AxisTable, check_count, entry_of, spread
 from drivetrain_jax.systems import Model, System, get_system, system_names
@@ -69,8 +70,7 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
     tree, text = toml.read(source, overrides)
     table = _convert(tree, _SceneTable, "")
     system, analysis = system_and_analysis(table.system, table.analysis)
-    request = _request(table, system, analysis)
-    _check_offered(analysis, system, request)
+    request = make_request(system, analysis, table.outputs, table.options, {*table.axes, *table.points})
     axes, zipped = _axes(table, system, analysis)
     fixed = _fixed(table, system, analysis, axes)
     path_axis = _path_axis(analysis, request, axes, zipped, fixed)
@@ -137,69 +137,6 @@ def _toml_types(match: re.Match[str]) -> str:
     return " or ".join(words) or "nothing"
 
 
-def _request(table: _SceneTable, system: System, analysis: Analysis) -> Request:
-    """Outputs, method and options, checked against what the analysis knows; messages name what the system offers of it."""
-    lacking = analysis.lacks(system)
-    names = [v.name for v in analysis.variables]
-    offered = [name for name in names if name not in lacking]
-    methods = [name for name in analysis.methods if name not in lacking]
-    # What varies is a coordinate already, and a file has room for one of a name.
-    varies = {*table.axes, *table.points}
-    unnamed = [name for name in analysis.default_outputs if name not in varies]
-    outputs = unnamed if table.outputs is None else table.outputs
-    for name in outputs:
-        if name in names and name in varies:
-            raise InputError(f"outputs: {name!r} varies in this scene; allowed is to leave it out")
-        if name not in names and name != OUTCOME.name:
-            raise InputError(f"outputs: {name!r} is not a result of {analysis.name}{nearest(name, offered)}")
-    # The outcome is stored with every result, named or not.
-    outputs = [name for name in outputs if name != OUTCOME.name]
-    if not outputs or len(set(outputs)) < len(outputs):
-        raise InputError(f"outputs = {shown(table.outputs)}: allowed is one or more of {', '.join(offered)}, each once")
-    given = dict(table.options)
-    method = given.pop("method", next(iter(analysis.methods)))
-    if not isinstance(method, str) or method not in analysis.methods:
-        raise InputError(f"options.method = {shown(method)}: unknown{nearest(str(method), methods)}")
-    used = analysis.methods[method]
-    for key, value in given.items():
-        if key not in used:
-            others = [name for name in methods if key in analysis.methods[name]]
-            guess = f", but by {', '.join(others)}" if others else did_you_mean(key, ("method", *used))
-            allowed = f"allowed is {', '.join(('method', *used))}"
-            raise InputError(f"options.{key} = {shown(value)}: not used by method {method}{guess}; {allowed}")
-    options = {o.name: _option(o, given) for o in analysis.options if o.name in used}
-    return Request(tuple(outputs), method, options)
-
-
-def _check_offered(analysis: Analysis, system: System, request: Request) -> None:
-    """Whether the method and the results can be had of this system."""
-    lacking = analysis.lacks(system)
-    for field, name, offered in (
-        ("options.method", request.method, analysis.methods),
-        *(("outputs", name, (v.name for v in analysis.variables)) for name in request.outputs),
-    ):
-        if name in lacking:
-            allowed = ", ".join(other for other in offered if other not in lacking)
-            raise InputError(f"{field} = {name!r}: {lacking[name]}; allowed is {allowed}")
-
-
-def _option(option: Parameter, given: Mapping[str, Any]) -> Value:
-    if option.name in given:
-        return _checked(option, given[option.name], "options.")
-    if option.default is None and not option.derived:
-        raise InputError(f"options.{option.name}: missing; allowed is {option.allowed}")
-    return option.default
-
-
-def _checked(parameter: Parameter, value: Any, where: str) -> Value:
-    try:
-        return parameter.check(value)
-    except ValueError as error:
-        raise InputError(f"{where}{error}") from None
-    except OverflowError:
-        raise InputError(f"{where}{parameter.name} = {shown(value)}: allowed is {parameter.allowed}") from None
-
-
 def _axes(table: _SceneTable, system: System, analysis: Analysis) -> tuple[tuple[Axis, ...], bool]:
     """The varying parameters; counted before a single value is made."""
     if table.axes and table.points:
@@ -242,11 +179,11 @@ def _axis(system: System, name: str, spec: AxisTable) -> Axis:
     parameter, entry = _swept_parameter(system, "axes", name)
     scalar = _scalar(parameter, name)
     for value in spec.values if spec.values is not None else (spec.start, spec.stop):
-        _checked(scalar, value, "axes.")
+        checked(scalar, value, "axes.")
     values = spread(spec, f"axes.{name}")
     if parameter.integer:
         for value in values:
-            _checked(scalar, float(value), "axes.")
+            checked(scalar, float(value), "axes.")
     return Axis(name, parameter, entry, values.astype(np.int64) if parameter.integer else values)
 
 
@@ -263,8 +200,8 @@ def _points(table: _SceneTable, system: System) -> tuple[Axis, ...]:
     for name, values in table.points.items():
         parameter, entry = _swept_parameter(system, "points", name)
         scalar = _scalar(parameter, name)
-        checked = [_checked(scalar, value, "points.") for value in values]
-        columns.append(Axis(name, parameter, entry, np.array(checked)))
+        numbers = [checked(scalar, value, "points.") for value in values]
+        columns.append(Axis(name, parameter, entry, np.array(numbers)))
     return tuple(columns)
 
 
@@ -313,7 +250,7 @@ def _fixed(table: _SceneTable, system: System, analysis: Analysis, axes: tuple[A
     used, missing = system.models[analysis.name].parameters, []
     for parameter in system.parameters:
         if parameter.name in table.fixed:
-            fixed[parameter.name] = _checked(parameter, table.fixed[parameter.name], "fixed.")
+            fixed[parameter.name] = checked(parameter, table.fixed[parameter.name], "fixed.")
         elif parameter.name in used and parameter.name not in whole and not parameter.derived:
             fixed[parameter.name] = parameter.default
             missing += [parameter] if parameter.default is None else []

@@ -87,7 +87,8 @@ class Constants:
     def __init__(self, tree: Any) -> None:
         self.tree = tree
         leaves, structure = jax.tree.flatten(tree)
-        self._content = (*leaves, structure)
+        content = [(x.shape, x.tobytes()) if isinstance(x, np.ndarray) else x for x in leaves]
+        self._content = (*content, structure)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Constants) and self._content == other._content

@@ -113,9 +113,9 @@ def multiplier_change(change: Change) -> tuple[Array, Array]:
     return sigma, jnp.where(simple[:, None], moved / jnp.where(simple, slope, 1.0)[:, None], jnp.nan)
 
 
-def radius_change(sigma: Array, moved: Array, error: Array | float) -> tuple[Array, Array]:
-    """The spectral radius and its derivatives ``(P,)``, from multipliers and theirs; NaN where more than one multiplier and
-    its conjugate have the largest modulus within ``error``, which is relative."""
+def radius_change(sigma: Array, moved: Array, error: Array | float) -> Array:
+    """Derivatives of the spectral radius ``(P,)`` from multipliers and theirs; NaN where more than one multiplier and its
+    conjugate have the largest modulus within ``error``, which is relative."""
     modulus = jnp.abs(sigma)
     apart = jnp.abs(sigma - jnp.conj(sigma[0]))
     # Real multipliers are their own conjugate.
@@ -123,4 +123,4 @@ def radius_change(sigma: Array, moved: Array, error: Array | float) -> tuple[Arr
     others = jnp.where(partner | (jnp.arange(len(sigma)) == 0), 0.0, modulus)
     tied = jnp.max(others) > modulus[0] * (1 - jnp.maximum(TIED, error))
     slope = (jnp.conj(sigma[0]) * moved[0]).real / modulus[0]
-    return modulus[0], jnp.where(tied, jnp.nan, slope)
+    return jnp.where(tied, jnp.nan, slope)

@@ -13,7 +13,7 @@ from jax import Array
 from drivetrain_jax.analysis._base import Outcome, Request, Solver
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.analysis.periodic.direct import compare, direct_monodromy, stable_steps, stiffness_of
-from drivetrain_jax.analysis.periodic.floquet_effort import explicit_effort
+from drivetrain_jax.analysis.periodic.floquet_effort import explicit_effort, traced_steps
 from drivetrain_jax.analysis.periodic.floquet_results import NEED_ERROR, results
 from drivetrain_jax.analysis.periodic.propagator import EqualStepSize, Propagator
 from drivetrain_jax.systems import LinearPeriodic, System
@@ -57,7 +57,11 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
         more = rtol ** (1 / 8 - 1 / solver.order(diffrax.ODETerm(lambda t, y, args: y)))
         return more * explicit_effort(system, columns, rtol)
 
-    return (Solver(f"diffrax: {request.options['solver']}, equal steps", solve, effort, chunk=256),)
+    def steps(values: Mapping[str, Any]) -> Array:
+        order = solver.order(diffrax.ODETerm(lambda t, y, args: y))
+        return (rtol ** (1 / 8 - 1 / order) * traced_steps(build, values, rtol)).astype(jnp.int64)
+
+    return (Solver(f"diffrax: {request.options['solver']}, equal steps", solve, effort, steps, chunk=256),)
 
 
 def adaptive_steps(system: type[System], request: Request) -> tuple[Solver, ...]:

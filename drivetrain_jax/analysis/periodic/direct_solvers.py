@@ -19,6 +19,7 @@ from drivetrain_jax.analysis.periodic.floquet_effort import (
     explicit_effort,
     implicit_effort,
     strongly_damped,
+    traced_steps,
 )
 from drivetrain_jax.systems import System
 
@@ -55,6 +56,7 @@ def direct_solvers(
             f"direct: explicit Runge-Kutta of order 8{name}",
             lambda values, steps: solve(form, values, steps, True),
             effort,
+            lambda values: traced_steps(system.models["floquet"].build, values, rtol),
             chunk=chunks[0],
             march=True,
             short_loops=True,

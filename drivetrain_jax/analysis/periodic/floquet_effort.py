@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -39,6 +40,19 @@ Build = Callable[..., "FloquetModel"]
 def explicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
     """Steps of the explicit scheme, ``(N,)``; inf where there would be too many."""
     return _up_to(_MAX_EXPLICIT, _explicit_steps(system, columns, rtol))
+
+
+def traced_steps(build: Build, values: Mapping[str, Any], rtol: float) -> Array:
+    """Steps of the explicit scheme for traced ``values``, numbers or lanes: as :func:`explicit_effort`, at least 2."""
+    model = build(values)
+    if model.explicit_steps is not None:
+        steps = model.explicit_steps(rtol)
+    else:
+        arrays, rest = eqx.partition(dict(values), lambda x: isinstance(x, jax.Array) and x.ndim > 0)
+        phase = lambda own: _phase(build, eqx.combine(own, rest))  # noqa: E731
+        steps = _steps_of(jax.vmap(phase)(arrays) if jax.tree.leaves(arrays) else phase(arrays), rtol)
+    even = 2 * jnp.ceil(jnp.where(jnp.isnan(steps), _TO_FIND_NO_VALUE, steps) / 2)
+    return jnp.clip(even, 2, _MAX_EXPLICIT).astype(jnp.int64)
 
 
 def strongly_damped(system: System, columns: Mapping[str, np.ndarray]) -> np.ndarray:

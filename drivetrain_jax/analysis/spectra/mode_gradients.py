@@ -37,6 +37,9 @@ from drivetrain_jax.analysis.numerics.singular_vectors import jacobi_vectors
 from drivetrain_jax.analysis.spectra.mode_types import is_rigid, one_frequency
 from drivetrain_jax.systems import SpringSystem
 
+# Slopes of equal frequencies over the largest of all, up to which their differences are rounding.
+_SPLIT = 1e-8
+
 Build = Callable[[Mapping[str, Any]], SpringSystem]
 
 
@@ -81,6 +84,29 @@ def directional_derivatives(build: Build, values: Mapping[str, Any], directions:
     order = jnp.lexsort((slopes, number), axis=0)
     slopes = jnp.take_along_axis(slopes, order, axis=0).reshape(frequency.shape)
     return _per_frequency(slopes, frequency, still)
+
+
+def frequency_jacobian(build: Build, parameters: Any) -> Array:
+    """Derivatives in Hz of all natural frequencies ``(n, P)`` by the P numbers in the pytree ``parameters``; NaN where a
+    parameter splits frequencies that are equal: these have slopes along a direction, but no derivatives."""
+    leaves, tree = jax.tree.flatten(parameters)
+
+    def named(numbers: Any) -> dict[str, Any]:
+        return {"all": jax.tree.unflatten(tree, list(numbers))}
+
+    def model(values: Mapping[str, Any]) -> SpringSystem:
+        return build(values["all"])
+
+    frequency, _, largest, _ = _frequencies_and_shapes(model, named(leaves))
+    near = one_frequency(frequency, largest)
+
+    def along(direction: Array) -> Array:
+        slopes = directional_derivatives(model, named(leaves), named(direction))
+        own = jnp.where(near, slopes[None], jnp.nan)
+        split = jnp.nanmax(own, axis=1) - jnp.nanmin(own, axis=1)
+        return jnp.where(split > _SPLIT * jnp.max(jnp.abs(slopes)), jnp.nan, slopes)
+
+    return jax.vmap(along, out_axes=-1)(jnp.eye(len(leaves)))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -1,0 +1,230 @@
+"""The analyses as pure functions of a system: ``floquet(shaft)``, under ``jax.jit``, ``jax.vmap`` and ``jax.grad`` as well.
+
+A function takes one system, whose numbers may be traced, and returns a :class:`Result`, a pytree of the requested variables
+and ``outcome``. Called with concrete numbers it chooses the cheapest solver, as a scene does; traced numbers take the first
+one. Under ``jax.vmap`` all lanes go through the kernels of a sweep, those of similar effort together. Derivatives are
+forward Jacobians contracted with the tangents, so that both modes work; where there is no derivative, they are NaN.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._wording import did_you_mean
+from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, get_analysis
+from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
+from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lanes_last, path_entry
+from drivetrain_jax.analysis.request import make_request
+from drivetrain_jax.systems import System
+
+# Lanes of similar effort that are solved together.
+_TOGETHER = 128
+
+
+class Result(eqx.Module):
+    """The variables of one analysis by attribute or by name, ``outcome`` among them; a pytree of arrays.
+
+    Units and meanings: ``drivetrain list SYSTEM``.
+    """
+
+    variables: dict[str, Array]
+
+    def __getattr__(self, name: str) -> Array:
+        if name.startswith("_") or name == "variables" or name not in self.variables:
+            raise AttributeError(f"no result {name!r}; there is {', '.join(vars(self).get('variables', ()))}")
+        return self.variables[name]
+
+    def __getitem__(self, name: str) -> Array:
+        return self.variables[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.variables)
+
+    def keys(self) -> Any:
+        """Names of the variables, so that ``dict(result)`` holds them."""
+        return self.variables.keys()
+
+    def __dir__(self) -> list[str]:
+        return sorted({*super().__dir__(), *self.variables})
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Everything about a call but its numbers: two equal jobs are one compilation.
+
+    With ``single`` the path has one value, and is no dimension of the results.
+    """
+
+    analysis: Analysis
+    system: type[System]
+    request: Request
+    constants: Constants
+    path: bool
+    single: bool
+
+    def __hash__(self) -> int:
+        return hash((self.analysis.name, self.system, self.request.outputs, self.request.method, self.constants))
+
+    @property
+    def solvers(self) -> tuple[Solver, ...]:
+        """All candidates for the work."""
+        return self.analysis.solvers(self.system, self.request)
+
+    def own_dims(self, name: str) -> int:
+        """Number of dimensions that the result ``name`` has at one point."""
+        return self.path + (0 if name == OUTCOME.name else len(self.analysis.variable(name).dims))
+
+
+def analyse(name: str, system: System, outputs: Sequence[str] | None, options: Mapping[str, Any]) -> Result:
+    """The analysis ``name`` of one ``system``; see the module's docstring."""
+    job, parameters = _job(name, system, outputs, options)
+    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(parameters)):
+        found = _pure(job)(parameters)
+    else:
+        found = _concrete(job, parameters)
+    return Result({name: x[0] for name, x in found.items()} if job.single else found)
+
+
+def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapping[str, Any]) -> tuple[_Job, Any]:
+    """What is asked, checked, and the numbers."""
+    if not isinstance(system, System):
+        raise InputError(
+            f"system: got a {type(system).__name__}; allowed is a system such as drivetrain_jax.Cardan(...)"
+        )
+    if name not in system.models:
+        guess = did_you_mean(name, system.models)
+        raise InputError(f"{name}: unknown to {system.name}{guess}; allowed is one of {', '.join(system.models)}")
+    analysis, model = get_analysis(name), system.models[name]
+    values = {key: value for key, value in system.values.items() if key in model.parameters}
+    try:
+        request = make_request(type(system), analysis, [outputs] if isinstance(outputs, str) else outputs, options)
+        analysis.dimensions(type(system), request, values)
+        if model.check:
+            model.check(values)
+    except ValueError as error:
+        # The tables of a scene are no concern of someone who gave none.
+        raise InputError(re.sub(r"^(fixed|options)\.", "", str(error))) from None
+    along = analysis.path_axis(request)
+    leaf = None if along is None else path_entry(values, along)
+
+    def number(x: Any) -> Array | None:
+        return None if isinstance(x, str) or (along is not None and x is leaf) else jnp.asarray(x, float)
+
+    parameters = jax.tree.map(number, values)
+    for x in jax.tree.leaves(parameters):
+        if x.ndim:
+            raise InputError(
+                f"{name}: parameters of the shape {x.shape}; allowed is one system, or a batch under jax.vmap"
+            )
+    path = None if along is None else _path(along, leaf)
+    rest = jax.tree.map(
+        lambda x: x if isinstance(x, str) else path if x is leaf and along is not None else None, values
+    )
+    job = _Job(
+        analysis, type(system), request, Constants(rest), along is not None, along is not None and np.ndim(leaf) == 0
+    )
+    return job, parameters
+
+
+def _path(name: str, values: Any) -> np.ndarray:
+    if isinstance(values, jax.core.Tracer):
+        raise InputError(f"{name}: a traced array; allowed for the path that the analysis follows are concrete numbers")
+    return np.atleast_1d(np.asarray(values, float))
+
+
+def _concrete(job: _Job, parameters: Any) -> dict[str, Array]:
+    """By the solver that predicts the least cost, compiled once for all numbers."""
+    columns = eqx.combine(jax.tree.map(lambda x: np.asarray(x)[None], parameters), job.constants.tree)
+    efforts = [float(np.max(np.asarray(solver.effort(columns), float))) for solver in job.solvers]
+    costs = [effort * solver.unit_cost for effort, solver in zip(efforts, job.solvers, strict=True)]
+    index = int(np.argmin(costs))
+    if not np.isfinite(costs[index]):
+        shapes = jax.eval_shape(_pure(job), parameters)
+        lost = {name: jnp.full(x.shape, jnp.nan if x.dtype.kind in "fc" else 0, x.dtype) for name, x in shapes.items()}
+        return lost | {OUTCOME.name: jnp.full_like(lost[OUTCOME.name], Outcome.STEP_LIMIT)}
+    return _compiled(job, index)(parameters, np.int64(np.ceil(efforts[index])))
+
+
+@lru_cache(maxsize=64)
+def _compiled(job: _Job, index: int) -> Callable[..., dict[str, Array]]:
+    solver = job.solvers[index]
+    # Compiled without optimising where a call takes milliseconds: whoever makes many compiles them himself.
+    options = compiler_options(1, march=solver.march) if solver.lengthy else options_for_few()
+    return jax.jit(partial(_solve, job, index), compiler_options=options)
+
+
+@lru_cache(maxsize=64)
+def _pure(job: _Job) -> Callable[[Any], dict[str, Array]]:
+    """The function of the parameters, with its derivatives."""
+
+    @jax.custom_jvp
+    def solve(parameters: Any) -> dict[str, Array]:
+        return _solve(job, 0, parameters, None)
+
+    @solve.defjvp
+    def _(primals: tuple[Any], tangents: tuple[Any]) -> tuple[dict[str, Array], dict[str, Any]]:
+        (parameters,), (directions,) = primals, tangents
+        results, direction = solve(parameters), jnp.stack(jax.tree.leaves(directions))
+        known = job.analysis.derivatives
+        found = known(job.system, job.request, parameters, job.constants, results) if known else {}
+        return results, {name: _tangent(name, x, found, direction) for name, x in results.items()}
+
+    return jax.jit(solve)
+
+
+def _tangent(name: str, result: Array, jacobians: Mapping[str, Array], direction: Array) -> Any:
+    """The tangent of one result: what is estimated of errors counts as constant, what has no derivative is NaN."""
+    if not jnp.issubdtype(result.dtype, jnp.inexact):
+        return np.zeros(result.shape, jax.dtypes.float0)
+    if name in jacobians:
+        return jnp.asarray(jacobians[name], result.dtype) @ direction.astype(result.dtype)
+    unknown = 0.0 if name.endswith(("_error", "_residual")) else jnp.nan
+    return jnp.full(result.shape, unknown, result.dtype) * jnp.sum(direction)
+
+
+def _solve(job: _Job, index: int, parameters: Any, effort: Array | None) -> dict[str, Array]:
+    """One point by solver number ``index``; without ``effort`` it is predicted for every lane."""
+    solver = job.solvers[index]
+
+    def of_lanes(constants: Constants, parameters: Any, effort: Array) -> dict[str, Array]:
+        lanes = max((x.shape[-1] for x in jax.tree.leaves(parameters) if x.ndim), default=1)
+
+        def solve(values: Any, effort: Array, count: int) -> dict[str, Array]:
+            found = solver.solve(eqx.combine(values, constants.tree), effort)
+            return {name: _with_lanes(x, job.own_dims(name), count) for name, x in found.items()}
+
+        if predict is None:
+            return solve(parameters, effort, lanes)
+        needed = jnp.broadcast_to(predict(eqx.combine(parameters, constants.tree)), lanes)
+        order = jnp.argsort(needed)
+        in_order = jax.tree.map(lambda x: x[order] if x.ndim else x, (parameters, needed))
+
+        def block(part: Any, count: int) -> dict[str, Array]:
+            return solve(part[0], jnp.max(part[1]), count)
+
+        found = in_blocks(block, in_order, lanes, _TOGETHER)
+        place = jnp.argsort(order)
+        return {name: x[..., place] for name, x in found.items()}
+
+    predict = solver.steps if effort is None else None
+    if not jax.tree.leaves(parameters):
+        return {name: x[..., 0] for name, x in of_lanes(job.constants, parameters, jnp.int64(1)).items()}
+    return lanes_last(of_lanes, job.constants, parameters, jnp.int64(1) if effort is None else effort)
+
+
+def _with_lanes(result: Array, own: int, lanes: int) -> Array:
+    """``result`` with the lanes as last axis, also if it depends on nothing that varies."""
+    result = jnp.asarray(result)
+    result = result if result.ndim > own else result[..., None]
+    return jnp.broadcast_to(result, (*result.shape[:-1], lanes))
