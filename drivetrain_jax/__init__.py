@@ -1,7 +1,9 @@
-"""Stability and vibration of drivetrains: batched simulation in JAX, from a scene file to one labelled dataset.
+"""Stability and vibration of drivetrains in JAX: systems are pytrees, analyses pure functions of them.
 
-``run`` computes a scene, ``point`` a single parameter set; wrong input raises ``InputError``, a computation that fails
-``ChunkError`` or, with a file to resume, ``Incomplete``. Everything heavy is imported on first use.
+``floquet(Cardan(...))`` and the other analyses take one system and work under ``jax.jit``, ``jax.vmap`` and ``jax.grad``;
+``sweep`` runs them, or any function of yours, over a grid into one labelled, resumable dataset. ``run`` computes a scene
+file, ``point`` a single parameter set. Wrong input raises ``InputError``, a computation that fails ``ChunkError`` or, with a
+file to resume, ``Incomplete``. Everything heavy is imported on first use.
 """
 
 from __future__ import annotations
@@ -12,39 +14,96 @@ from typing import TYPE_CHECKING, Any
 from drivetrain_jax._errors import ChunkError, InputError
 
 if TYPE_CHECKING:
+    from drivetrain_jax.functions import (
+        Result,
+        basins,
+        critical_speeds,
+        floquet,
+        forced,
+        frequency_response,
+        history,
+        lyapunov,
+        modes,
+        poincare,
+        steady_state,
+    )
     from drivetrain_jax.sweep.atlas_file import open_atlas
+    from drivetrain_jax.sweep.over import sweep
     from drivetrain_jax.sweep.partial import open_result
     from drivetrain_jax.sweep.point import point
     from drivetrain_jax.sweep.run import Incomplete, Interrupted, run
+    from drivetrain_jax.systems.bicardan import Bicardan
+    from drivetrain_jax.systems.cardan import Cardan
+    from drivetrain_jax.systems.planetary import Planetary
+    from drivetrain_jax.systems.rattle import Rattle
+    from drivetrain_jax.systems.tripod import Tripod
+    from drivetrain_jax.view.figure import plot
 
 __version__ = "0.1.0"
 
+_HOME = {
+    "sweep.atlas_file": ("open_atlas",),
+    "sweep.over": ("sweep",),
+    "sweep.partial": ("open_result",),
+    "sweep.point": ("point",),
+    "sweep.run": ("Incomplete", "Interrupted", "run"),
+    "systems.bicardan": ("Bicardan",),
+    "systems.cardan": ("Cardan",),
+    "systems.planetary": ("Planetary",),
+    "systems.rattle": ("Rattle",),
+    "systems.tripod": ("Tripod",),
+    "view.figure": ("plot",),
+    "functions": (
+        "Result",
+        "basins",
+        "critical_speeds",
+        "floquet",
+        "forced",
+        "frequency_response",
+        "history",
+        "lyapunov",
+        "modes",
+        "poincare",
+        "steady_state",
+    ),
+}
+_MODULE = {name: module for module, names in _HOME.items() for name in names}
+
 __all__ = [
+    "Bicardan",
+    "Cardan",
     "ChunkError",
     "Incomplete",
     "InputError",
     "Interrupted",
+    "Planetary",
+    "Rattle",
+    "Result",
+    "Tripod",
     "__version__",
+    "basins",
+    "critical_speeds",
+    "floquet",
+    "forced",
+    "frequency_response",
+    "history",
+    "lyapunov",
+    "modes",
     "open_atlas",
     "open_result",
+    "plot",
+    "poincare",
     "point",
     "run",
+    "steady_state",
+    "sweep",
 ]
-
-_HOME = {
-    "Incomplete": "drivetrain_jax.sweep.run",
-    "Interrupted": "drivetrain_jax.sweep.run",
-    "open_atlas": "drivetrain_jax.sweep.atlas_file",
-    "open_result": "drivetrain_jax.sweep.partial",
-    "point": "drivetrain_jax.sweep.point",
-    "run": "drivetrain_jax.sweep.run",
-}
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    if name not in _MODULE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOME[name]), name)
+    return getattr(import_module(f"{__name__}.{_MODULE[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -20,7 +20,7 @@ from drivetrain_jax.sweep.atlas_choice import uses_atlas
 from drivetrain_jax.sweep.engine import Engine
 from drivetrain_jax.sweep.executor import Where
 from drivetrain_jax.sweep.growing import NOTHING, Taken, rest_of
-from drivetrain_jax.sweep.scene import load_scene
+from drivetrain_jax.sweep.scene import Scene, load_scene
 from drivetrain_jax.sweep.target import Target
 from drivetrain_jax.sweep.work import Progress, Report, Work
 
@@ -45,7 +45,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def run(
-    scene: str | Path | Mapping[str, Any],
+    scene: str | Path | Mapping[str, Any] | Scene,
     out: str | Path | None = None,
     *,
     overrides: Mapping[str, Any] | None = None,
@@ -62,7 +62,7 @@ def run(
     work is kept in ``FILE.nc.parts/`` and taken up by the next call, and a complete result is only read. A Zarr store is for
     results that are too large to be returned, and so the command line's: ``drivetrain run --store zarr``.
 
-    :param scene: path of a scene file, or a mapping with the same keys.
+    :param scene: path of a scene file, a mapping with the same keys, or a checked scene.
     :param overrides: entries to replace, by dotted key: ``{"fixed.zeta": 0.002}``.
     :param fresh: compute everything anew: replace a result, or drop unfinished work, at ``out``. One that was interrupted is
         resumed by the same call.
@@ -87,7 +87,7 @@ def run(
 
 
 def run_to_file(
-    scene: str | Path | Mapping[str, Any],
+    scene: str | Path | Mapping[str, Any] | Scene,
     out: Path,
     *,
     overrides: Mapping[str, Any] | None = None,
@@ -155,9 +155,11 @@ def _into(target: Target, taken: Taken, fresh: bool, where: Where, report: Repor
     return progress
 
 
-def _engine(scene: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None, on_disk: bool) -> Engine:
+def _engine(
+    scene: str | Path | Mapping[str, Any] | Scene, overrides: Mapping[str, Any] | None, on_disk: bool
+) -> Engine:
     """The engine of a scene that this machine can run."""
-    checked = load_scene(scene, overrides)
+    checked = scene if isinstance(scene, Scene) else load_scene(scene, overrides)
     engine = Engine(checked)
     if checked.analysis.continuous:
         # It has no points.

@@ -42,15 +42,18 @@ def amplitudes(
     """
     import diffrax
 
-    term, solver, control = diffrax.ODETerm(lambda t, y, _: field(t, y)), diffrax.Dopri8(), controller(period, rtol)
-    order = solver.error_order(term)
+    term, control = diffrax.ODETerm(lambda t, y, _: field(t, y)), controller(period, rtol)
+    # A loop over the stages that can be differentiated forwards.
+    solver = diffrax.Dopri8(scan_kind="lax")
+    order, fixed = solver.error_order(term), jax.lax.stop_gradient
 
     def unfinished(s: _Peaks) -> Array:
         return (s.t0 < period) & (s.count < MAX_STEPS) & (s.t1 > s.t0)
 
     def advance(s: _Peaks) -> _Peaks:
         y1, error, dense, state, _ = solver.step(term, s.t0, s.t1, s.y, None, s.solver, s.made_jump)
-        adapted = control.adapt_step_size(s.t0, s.t1, s.y, y1, None, error, order, s.control)
+        # Where steps end is no matter of derivatives: at a peak the solution does not change with time.
+        adapted = control.adapt_step_size(s.t0, s.t1, *fixed((s.y, y1)), None, fixed(error), order, s.control)
         keep, t0, t1, jump, controlled, result = adapted
         # An empty step ends the loop: the controller has given up.
         t1 = jnp.where(result == diffrax.RESULTS.successful, jnp.minimum(t1, period), t0)
@@ -58,7 +61,7 @@ def amplitudes(
         found = _peaks_on_step(field, between.evaluate, s.t0, s.t1, s.y, y1, indices)
         largest = jnp.maximum(s.largest, found.at_end)
         new = keep & ~jnp.any(s.aimed) & (found.value > largest) & (jnp.abs(found.place - 0.5) < 0.5 - EDGE)
-        nearest = jnp.min(jnp.where(new, found.place, 1.0))
+        nearest = fixed(jnp.min(jnp.where(new, found.place, 1.0)))
         again = jnp.any(new)
         t0, t1 = jnp.where(again, s.t0, t0), jnp.where(again, s.t0 + nearest * (s.t1 - s.t0), t1)
         largest = jnp.maximum(largest, jnp.where(s.aimed, found.near_end, found.value))
@@ -68,7 +71,7 @@ def amplitudes(
         return _Peaks(t0, t1, y, new & (found.place == nearest), largest, s.count + 1, jump, state, controlled)
 
     zero = jnp.zeros(())
-    t1, controlled = control.init(term, zero, period, start, None, None, solver.func, order)
+    t1, controlled = control.init(term, zero, period, fixed(start), None, None, solver.func, order)
     t1 = jnp.minimum(t1, period)
     state = solver.init(term, zero, t1, start, None)
     largest, jump = jnp.abs(start[jnp.array(indices)]), jnp.array(False)
