@@ -91,11 +91,11 @@ def scene(cells: int) -> dict[str, Any]:
 def package_jobs(cells: int, folder: Path) -> dict[str, Callable[[], Any]]:
     """The warm times of the package."""
     import drivetrain_jax as dt
-    from drivetrain_jax.sweep.executor import Where
-    from drivetrain_jax.sweep.rounds import build_atlas
-    from drivetrain_jax.sweep.run import run_to_file
-    from drivetrain_jax.sweep.scene import load_scene
-    from drivetrain_jax.sweep.work import Progress, Work
+    from drivetrain_jax.runs.executor import Where
+    from drivetrain_jax.runs.rounds import build_atlas
+    from drivetrain_jax.runs.run import run_to_file
+    from drivetrain_jax.runs.scene import load_scene
+    from drivetrain_jax.runs.work import Progress, Work
 
     grid, given = axes(cells), scene(cells)
     ranges = {name: (float(x[0]), float(x[-1])) for name, x in grid.items()}

@@ -39,11 +39,11 @@ scene, out, cores, runs = json.loads(sys.argv[1]), sys.argv[2], int(sys.argv[3])
 os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
 start = time.perf_counter()
 from pathlib import Path
-from drivetrain_jax.sweep import compile_cache
-from drivetrain_jax.sweep.engine import Engine
-from drivetrain_jax.sweep.kernel import kernel_of
-from drivetrain_jax.sweep.run import run, run_to_file
-from drivetrain_jax.sweep.scene import load_scene
+from drivetrain_jax.runs import compile_cache
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.kernel import kernel_of
+from drivetrain_jax.runs.run import run, run_to_file
+from drivetrain_jax.runs.scene import load_scene
 imported = time.perf_counter()
 compile_cache.enable()
 engine = Engine(load_scene(scene))
@@ -78,9 +78,9 @@ def child(scene: Mapping[str, Any], cores: int, cache: str, runs: int = 2) -> di
 
 def kernel_job(scene: Mapping[str, Any], width: int | None = None) -> tuple[Any, int]:
     """``job()`` runs one full chunk of ``scene``; and its number of points, ``width`` or that of the plan."""
-    from drivetrain_jax.sweep.engine import Engine
-    from drivetrain_jax.sweep.kernel import kernel_of
-    from drivetrain_jax.sweep.scene import load_scene
+    from drivetrain_jax.runs.engine import Engine
+    from drivetrain_jax.runs.kernel import kernel_of
+    from drivetrain_jax.runs.scene import load_scene
 
     engine = Engine(load_scene(dict(scene)))
     chunk = engine.plan.chunk(0)

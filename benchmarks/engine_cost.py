@@ -16,18 +16,18 @@ from typing import Any
 from benchmarks.cardan_reference import BASE_CASE
 from benchmarks.timing import PROCESSES, interleaved, median
 from drivetrain_jax._machine import usable_cores
-from drivetrain_jax.sweep import toml
-from drivetrain_jax.sweep.engine import Engine
-from drivetrain_jax.sweep.executor import Where, run_threads
-from drivetrain_jax.sweep.run import run_to_file
-from drivetrain_jax.sweep.scene import load_scene
+from drivetrain_jax.runs import toml
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.executor import Where, run_threads
+from drivetrain_jax.runs.run import run_to_file
+from drivetrain_jax.runs.scene import load_scene
 
 # A sweep of one output, run by a process of its own; prints its largest resident memory in MB, with the pages of mapped
 # files, and without them, and the seconds that it took.
 _ONE_OUTPUT = """
 import sys, time
 from pathlib import Path
-from drivetrain_jax.sweep.run import run_to_file
+from drivetrain_jax.runs.run import run_to_file
 
 def resident(field):
     lines = Path("/proc/self/status").read_text().splitlines()

@@ -27,10 +27,10 @@ def engine_job(scene: Mapping[str, Any], threads: int = 1) -> Callable[[], Resul
 
     The kernels are compiled by this call, unless another scene of the process has had the same.
     """
-    from drivetrain_jax.sweep.engine import Engine
-    from drivetrain_jax.sweep.executor import run_threads
-    from drivetrain_jax.sweep.kernel import kernel_of
-    from drivetrain_jax.sweep.scene import load_scene
+    from drivetrain_jax.runs.engine import Engine
+    from drivetrain_jax.runs.executor import run_threads
+    from drivetrain_jax.runs.kernel import kernel_of
+    from drivetrain_jax.runs.scene import load_scene
 
     engine = Engine(load_scene(dict(scene)))
     grid, plan = engine.grid, engine.plan

@@ -21,12 +21,12 @@ from benchmarks import engine_cost
 from benchmarks.engine_cost import Memory, cpu_seconds, scene
 from benchmarks.results_files import between_marks
 from benchmarks.timing import RESULTS, median, parser, provenance, results_folder, significant, write_csv
+from drivetrain_jax.runs.assemble import Table
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.executor import IN_FLIGHT
+from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.chunks import Part
-from drivetrain_jax.sweep.assemble import Table
-from drivetrain_jax.sweep.engine import Engine
-from drivetrain_jax.sweep.executor import IN_FLIGHT
-from drivetrain_jax.sweep.scene import load_scene
 
 PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
 BEGIN, END = "<!-- scaling: written by python -m benchmarks.scaling -->", "<!-- end of scaling -->"

@@ -20,10 +20,10 @@ import drivetrain_jax
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.cli.progress import progress_line
+from drivetrain_jax.runs.atlas_chart import chart
+from drivetrain_jax.runs.run import Incomplete, run_to_file
+from drivetrain_jax.runs.status import status
 from drivetrain_jax.store.consolidate import open_result
-from drivetrain_jax.sweep.atlas_chart import chart
-from drivetrain_jax.sweep.run import Incomplete, run_to_file
-from drivetrain_jax.sweep.status import status
 from drivetrain_jax.systems import get_system, system_names
 from drivetrain_jax.view import plot
 
@@ -88,7 +88,7 @@ def draw(item: Item, results: Sequence[Path], figure: Path) -> None:
     """Write the figure unless it is newer than all that it comes from."""
     code = [*PACKAGE.glob("view/*.py"), Path(__file__)]
     if any(tomllib.loads(scene.read_text())["analysis"] == "atlas" for scene in item.scenes):
-        code += [*PACKAGE.glob("atlas/*.py"), PACKAGE / "sweep" / "atlas_chart.py"]
+        code += [*PACKAGE.glob("atlas/*.py"), PACKAGE / "runs" / "atlas_chart.py"]
     newest = max(path.stat().st_mtime for path in (*results, *code))
     if figure.exists() and figure.stat().st_mtime > newest:
         return

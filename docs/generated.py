@@ -17,7 +17,7 @@ from sphinx.util.docutils import SphinxDirective
 import drivetrain_jax as dt
 from drivetrain_jax._quantities import Parameter, Variable
 from drivetrain_jax.analysis import Analysis, Outcome, get_analysis
-from drivetrain_jax.sweep.toml import entries
+from drivetrain_jax.runs.toml import entries
 from drivetrain_jax.systems import System, get_system
 from drivetrain_jax.view.style import symbol
 

@@ -27,11 +27,11 @@ if TYPE_CHECKING:
         poincare,
         steady_state,
     )
-    from drivetrain_jax.sweep.atlas_file import open_atlas
-    from drivetrain_jax.sweep.over import sweep
-    from drivetrain_jax.sweep.partial import open_result
-    from drivetrain_jax.sweep.point import point
-    from drivetrain_jax.sweep.run import Incomplete, Interrupted, run
+    from drivetrain_jax.runs.atlas_file import open_atlas
+    from drivetrain_jax.runs.over import sweep
+    from drivetrain_jax.runs.partial import open_result
+    from drivetrain_jax.runs.point import point
+    from drivetrain_jax.runs.run import Incomplete, Interrupted, run
     from drivetrain_jax.systems.bicardan import Bicardan
     from drivetrain_jax.systems.cardan import Cardan
     from drivetrain_jax.systems.planetary import Planetary
@@ -42,11 +42,11 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "sweep.atlas_file": ("open_atlas",),
-    "sweep.over": ("sweep",),
-    "sweep.partial": ("open_result",),
-    "sweep.point": ("point",),
-    "sweep.run": ("Incomplete", "Interrupted", "run"),
+    "runs.atlas_file": ("open_atlas",),
+    "runs.over": ("sweep",),
+    "runs.partial": ("open_result",),
+    "runs.point": ("point",),
+    "runs.run": ("Incomplete", "Interrupted", "run"),
     "systems.bicardan": ("Bicardan",),
     "systems.cardan": ("Cardan",),
     "systems.planetary": ("Planetary",),

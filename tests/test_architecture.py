@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from drivetrain_jax.analysis import analysis_names, get_analysis
-from drivetrain_jax.sweep.engine import Engine
-from drivetrain_jax.sweep.scene import load_scene
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import get_system, system_names
 
 ROOT = Path(__file__).parents[1]
@@ -51,7 +51,7 @@ COMPUTING = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
     for layer in ("systems", "analysis")
     for path in sorted((ROOT / "drivetrain_jax" / layer).glob("*.py"))
-] + ["drivetrain_jax.sweep.kernel"]
+] + ["drivetrain_jax.runs.kernel"]
 
 
 def test_every_computing_module_works_in_double_precision():

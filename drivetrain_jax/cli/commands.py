@@ -24,7 +24,7 @@ _FIGURES = (".png", ".pdf", ".svg")
 
 def list_systems(options: argparse.Namespace) -> int:
     """What there is, or one system in full."""
-    from drivetrain_jax.sweep.catalogue import describe, overview
+    from drivetrain_jax.runs.catalogue import describe, overview
 
     say(describe(options.system) if options.system else overview())
     return OK
@@ -57,8 +57,8 @@ def run(options: argparse.Namespace) -> int:
 
 def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[Any, int, str]:
     """Counts, exit code, and why that is not 0 or what else there is to be told."""
-    from drivetrain_jax.sweep.executor import Where
-    from drivetrain_jax.sweep.run import Incomplete, run_to_file
+    from drivetrain_jax.runs.executor import Where
+    from drivetrain_jax.runs.run import Incomplete, run_to_file
 
     overrides = assignments(options.set, "--set")
     with _progress_line(options.quiet) as show:
@@ -94,7 +94,7 @@ def _progress_line(quiet: bool) -> Any:
 
 def status(options: argparse.Namespace) -> int:
     """How much of a scene is done."""
-    from drivetrain_jax.sweep.status import status
+    from drivetrain_jax.runs.status import status
 
     return _answer(status(options.scene, options.out, assignments(options.set, "--set")), options)
 
@@ -112,7 +112,7 @@ def verify(options: argparse.Namespace) -> int:
 
 def export(options: argparse.Namespace) -> int:
     """One HDF5 file from a Zarr store."""
-    from drivetrain_jax.sweep.export import export
+    from drivetrain_jax.runs.export import export
 
     sys.stderr.write(f"points: {export(options.store, options.file)} exported\n")
     return OK
@@ -133,7 +133,7 @@ def plot(options: argparse.Namespace) -> int:
     if any(result.attrs.get("analysis") == "atlas" for result in results):
         if len(results) > 1:
             raise InputError("FILE.nc: an atlas among several results; allowed is an atlas alone")
-        from drivetrain_jax.sweep.atlas_chart import chart
+        from drivetrain_jax.runs.atlas_chart import chart
 
         cells = _CELLS if options.cells is None else options.cells
         results = [chart(file, ranges(options.part, "--part"), cells) for file in options.files]
@@ -173,14 +173,14 @@ def _open_unfinished(file: Path) -> Any:
 
     if not PartsFolder(file).holds_work():
         return open_result(file)
-    from drivetrain_jax.sweep import partial
+    from drivetrain_jax.runs import partial
 
     return partial.open_result(file)
 
 
 def point(options: argparse.Namespace) -> int:
     """One point."""
-    from drivetrain_jax.sweep.point import point
+    from drivetrain_jax.runs.point import point
 
     given = assignments(options.given, "point")
     for name in ("system", "analysis"):
@@ -194,8 +194,8 @@ def point(options: argparse.Namespace) -> int:
 
 def query(options: argparse.Namespace) -> int:
     """An atlas at one point."""
-    from drivetrain_jax.sweep.atlas_answers import query
-    from drivetrain_jax.sweep.atlas_file import open_atlas
+    from drivetrain_jax.runs.atlas_answers import query
+    from drivetrain_jax.runs.atlas_file import open_atlas
 
     given = ranges(options.given, "query")
     return _answer(query(open_atlas(options.file), given), options)
@@ -203,8 +203,8 @@ def query(options: argparse.Namespace) -> int:
 
 def design(options: argparse.Namespace) -> int:
     """What a design has to be, after an atlas."""
-    from drivetrain_jax.sweep import atlas_answers
-    from drivetrain_jax.sweep.atlas_file import open_atlas
+    from drivetrain_jax.runs import atlas_answers
+    from drivetrain_jax.runs.atlas_file import open_atlas
 
     extra = {} if options.margin is None else {"margin": options.margin}
     if extra and options.question != "speed-windows":

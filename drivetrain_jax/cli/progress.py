@@ -14,7 +14,7 @@ from rich.progress import Progress as Bar
 from drivetrain_jax._errors import InputError
 
 if TYPE_CHECKING:
-    from drivetrain_jax.sweep.run import Progress
+    from drivetrain_jax.runs.run import Progress
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from drivetrain_jax._wording import clipped
 
 def assignments(texts: Sequence[str], field: str) -> dict[str, Any]:
     """``name=value`` pairs, values in TOML or plain text."""
-    from drivetrain_jax.sweep.toml import parse_value
+    from drivetrain_jax.runs.toml import parse_value
 
     pairs: dict[str, Any] = {}
     for text in texts:

@@ -13,7 +13,7 @@ import drivetrain_jax as dt
 from benchmarks import tripod_reference as oracle
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import Outcome, Request, history
-from drivetrain_jax.sweep.scene import load_scene
+from drivetrain_jax.runs.scene import load_scene
 
 NINE_DEGREES = math.radians(9)
 FIXED = {"element": "input", "equation": "25", "beta": NINE_DEGREES}

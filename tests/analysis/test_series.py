@@ -10,8 +10,8 @@ import pytest
 import drivetrain_jax as dt
 from benchmarks.atlas_direct import BASE, CARDAN, monodromy, propagators
 from drivetrain_jax.analysis.periodic.series import propagators_along
-from drivetrain_jax.sweep.engine import Engine
-from drivetrain_jax.sweep.scene import load_scene
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import LinearPeriodic
 
 LANES = 3

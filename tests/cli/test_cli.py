@@ -17,7 +17,7 @@ import xarray as xr
 from drivetrain_jax import ChunkError, InputError, __version__
 from drivetrain_jax.cli import main
 from drivetrain_jax.cli.progress import progress_line
-from drivetrain_jax.sweep.work import Progress
+from drivetrain_jax.runs.work import Progress
 from drivetrain_jax.systems import get_system
 
 SCENE = """
@@ -79,7 +79,7 @@ def test_progress_then_the_last_line(cli):
 
 def test_what_counts_do_not_tell_is_a_line_before_them(cli, monkeypatch):
     noted = Progress(3, computed=3, note="the atlas has gaps")
-    monkeypatch.setattr("drivetrain_jax.sweep.run.run_to_file", lambda *_, **__: noted)
+    monkeypatch.setattr("drivetrain_jax.runs.run.run_to_file", lambda *_, **__: noted)
     counts = "points: total=3 computed=3 reused=0 failed=0"
     assert cli("run", "scene.toml", "--out", "r.nc")[2][-2:] == ["drivetrain: the atlas has gaps", counts]
     assert cli("run", "scene.toml", "--out", "r.nc", "--quiet")[2] == [counts]
@@ -340,7 +340,7 @@ def test_a_direct_solve_of_an_atlas_that_fails_is_one_line(cli, monkeypatch, wor
     def fails(_):
         raise ChunkError("chunk 3 (direct): MemoryError: ")
 
-    monkeypatch.setattr("drivetrain_jax.sweep.atlas_file.open_atlas", fails)
+    monkeypatch.setattr("drivetrain_jax.runs.atlas_file.open_atlas", fails)
     assert cli(*words) == (3, "", ["drivetrain: chunk 3 (direct): MemoryError:"])
 
 
@@ -349,7 +349,7 @@ def test_parts_that_cannot_be_used_are_wrong_input(cli, monkeypatch, needed):
     os.mkdir("r.nc.parts")
     lacking = os.W_OK if needed == "writable" else os.R_OK
     allows = lambda path, mode: Path(path).suffix != ".parts" or not mode & lacking  # noqa: E731
-    monkeypatch.setattr("drivetrain_jax.sweep.target.os.access", allows)
+    monkeypatch.setattr("drivetrain_jax.runs.target.os.access", allows)
     code, _, err = cli("run", "scene.toml", "--out", "r.nc")
     assert (code, len(err)) == (2, 1) and f"the folder 'r.nc.parts' is not {needed}; allowed is" in err[0]
 
@@ -371,7 +371,7 @@ def test_an_interrupt_while_all_is_loaded_counts_nothing(cli, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("drivetrain_jax.sweep.run.load_scene", interrupted)
+    monkeypatch.setattr("drivetrain_jax.runs.run.load_scene", interrupted)
     monkeypatch.setattr("drivetrain_jax.cli.commands.os._exit", sys.exit)
     counts = "points: total=0 computed=0 reused=0 failed=0"
     line = "drivetrain: interrupted; the same command resumes"
@@ -399,7 +399,7 @@ def test_a_run_that_is_refused_on_the_way_leaves_nothing(cli, monkeypatch):
     def nobody(*_):
         raise InputError("dask = 'tcp://nowhere:1': no scheduler answers there")
 
-    monkeypatch.setattr("drivetrain_jax.sweep.executor.Where.compute", nobody)
+    monkeypatch.setattr("drivetrain_jax.runs.executor.Where.compute", nobody)
     code, _, err = cli("run", "scene.toml", "--out", "r.nc", "--quiet")
     assert (code, len(err)) == (2, 1) and "no scheduler" in err[0] and os.listdir() == ["scene.toml"]
 
@@ -485,7 +485,7 @@ def test_plot_writes_the_figure(cli, monkeypatch):
 def test_several_atlases_are_refused_before_one_is_evaluated(cli, monkeypatch):
     cli("run", "scene.toml", "--out", "r.nc", "--quiet")
     xr.load_dataset("r.nc", engine="h5netcdf").assign_attrs(analysis="atlas").to_netcdf("a.nc", engine="h5netcdf")
-    monkeypatch.setattr("drivetrain_jax.sweep.atlas_chart.chart", lambda *_: 1 / 0)
+    monkeypatch.setattr("drivetrain_jax.runs.atlas_chart.chart", lambda *_: 1 / 0)
     line = "drivetrain: FILE.nc: an atlas among several results; allowed is an atlas alone"
     assert cli("plot", "r.nc", "a.nc", "--out", "f.png") == (2, "", [line])
 
@@ -516,7 +516,7 @@ def test_looking_at_a_result_loads_no_integrator_and_no_tables(folder):
     """What a finished result is recognised with; half of the time until then would go into these packages."""
     scene = Path(__file__).parents[2] / "sweeps" / "quickstart.toml"
     code = (
-        "import sys, drivetrain_jax.sweep.run as run; from drivetrain_jax.cli import main\n"
+        "import sys, drivetrain_jax.runs.run as run; from drivetrain_jax.cli import main\n"
         f"assert main(['status', {str(scene)!r}, '--out', 'r.nc']) == 0\nprint(*sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)

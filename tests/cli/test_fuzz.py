@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import drivetrain_jax
 from drivetrain_jax.cli import main
-from drivetrain_jax.sweep import toml
+from drivetrain_jax.runs import toml
 
 # Seconds within which a small scene has to be run, or a bad one refused, on a busy machine.
 PATIENCE = 30.0
@@ -186,7 +186,7 @@ def test_a_grid_of_many_points_is_refused_with_count_and_limit(folder, capsys):
 
 
 def test_an_axis_that_would_not_fit_into_memory_is_refused_before_it_is_made(folder, capsys, monkeypatch):
-    monkeypatch.setattr("drivetrain_jax.sweep.scene.physical_memory", lambda: 1e9)
+    monkeypatch.setattr("drivetrain_jax.runs.scene.physical_memory", lambda: 1e9)
     Path("scene.toml").write_text(toml.write(GOOD | {"axes": {"a": {"start": 0.0, "stop": 10.0, "num": 10**9}}}))
     begin = time.monotonic()
     code, err = judge(folder, capsys, "run", "scene.toml", "--out", "r.nc")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from drivetrain_jax.cli.arguments import parser
-from drivetrain_jax.sweep.scene import load_scene
+from drivetrain_jax.runs.scene import load_scene
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs" / "theory").glob("*.md"))]

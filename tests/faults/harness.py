@@ -17,8 +17,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from drivetrain_jax.sweep import toml
-from drivetrain_jax.sweep.status import Status, status
+from drivetrain_jax.runs import toml
+from drivetrain_jax.runs.status import Status, status
 
 ROOT = Path(__file__).parents[2]
 _MARK = "DRIVETRAIN_FAULT_RUN"

@@ -10,7 +10,7 @@ import pytest
 import drivetrain_jax as dt
 from benchmarks.bicardan_reference import finite_elements
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.sweep.scene import load_scene
+from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems.bicardan import PRESETS, Bicardan
 
 FIXED = {name: list(value) if isinstance(value, tuple) else value for name, value in PRESETS["paper_fitted"].items()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.sweep.scene import load_scene
+from drivetrain_jax.runs.scene import load_scene
 
 
 def test_lists_have_one_entry_per_planet():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivetrain_jax.atlas.tips import Tip, Tips
-from drivetrain_jax.sweep.atlas_chart import _tips
+from drivetrain_jax.runs.atlas_chart import _tips
 from drivetrain_jax.systems import get_system
 from drivetrain_jax.view import plot
 from tests.view import results

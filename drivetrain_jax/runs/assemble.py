@@ -1,0 +1,240 @@
+"""From chunks to the labelled result of a scene."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import drivetrain_jax
+from drivetrain_jax._machine import machine
+from drivetrain_jax._quantities import FIRST_FAILURE, Variable
+from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.runs.grid import Grid
+from drivetrain_jax.runs.identity import PACKAGES
+from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.store import provenance
+from drivetrain_jax.store.consolidate import release
+from drivetrain_jax.store.schema import Coordinate, Labelled
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# Entries assumed for a dimension whose size depends on the system, when memory is estimated.
+_USUAL_SIZE = 4
+# Bytes of the plan per point, even where chunks are small.
+_PLANNED = 4
+# Bytes of results on the disk that are kept in memory as well, and values that are blanked at a time.
+_RESIDENT, _ROWS = 1 << 26, 1 << 22
+_STORAGE = ("h5py",)
+
+
+class Table:
+    """Results of all points of a grid, filled chunk by chunk. What is never filled counts as step limit reached.
+
+    ``arrays`` holds all values: the axes in the order of the scene (or the points), then a result's own dimensions.
+    ``allocate(template)`` gives such arrays for the data of a labelled result; without it they are in memory.
+    """
+
+    def __init__(
+        self, scene: Scene, grid: Grid, allocate: Callable[[Labelled], Mapping[str, np.ndarray]] | None = None
+    ) -> None:
+        self.variables = result_variables(scene)
+        self._scene, self._grid = scene, grid
+        self._allocate = allocate
+        self._sizes = {d.name: len(d.values) for d in scene.dimensions}
+        self._lost: list[np.ndarray] = []
+        self._unreleased = 0
+        self.arrays: Mapping[str, np.ndarray] = {}
+
+    @property
+    def on_disk(self) -> bool:
+        """Whether the values are in a file, not in memory."""
+        return self._allocate is not None
+
+    def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
+        """Enter the results of ``points``."""
+        self._lay_out_for(results)
+        for name, values in results.items():
+            # A fixed path parameter is no dimension of the result.
+            enter(self.arrays[name], self._grid, points, values[:, 0] if self._grid.path_is_fixed else values)
+        self.release_after(results)
+
+    def block(self, place: tuple[slice, ...], like: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """The arrays of a block of the grid, or of a row of the points: all that is in them is to be overwritten. ``like``
+        are results of a point."""
+        self._lay_out_for(like, blank=False)
+        return {name: values[place] for name, values in self.arrays.items()}
+
+    def release_after(self, results: Mapping[str, np.ndarray]) -> None:
+        """Let the system have back, from time to time, the memory of what is in a file."""
+        self._unreleased += sum(values.nbytes for values in results.values())
+        if self._unreleased >= _RESIDENT:
+            self._unreleased = 0
+            release(self.arrays.values())
+
+    def _lay_out_for(self, results: Mapping[str, np.ndarray], *, blank: bool = True) -> None:
+        """Make the arrays; the first results tell the sizes of dimensions that depend on the system."""
+        if not self.arrays:
+            for variable in self.variables:
+                self._sizes |= zip(reversed(variable.dims), reversed(results[variable.name].shape), strict=False)
+            self.lay_out(blank=blank)
+
+    def _complete_sizes(self) -> None:
+        """Where no point has a result, the solver tells the sizes of dimensions that depend on the system."""
+        if all(self._sizes[dim] for variable in self.variables for dim in variable.dims):
+            return
+        # It needs this module, and jax.
+        from drivetrain_jax.runs.kernel import result_shapes
+
+        scene = self._scene
+        shapes = result_shapes(scene, self._grid, scene.analysis.solvers(scene.system, scene.request)[0])
+        for variable in self.variables:
+            self._sizes |= zip(reversed(variable.dims), reversed(shapes[variable.name]), strict=False)
+
+    def lose(self, points: np.ndarray) -> None:
+        """Record that nobody survived the computation of ``points``."""
+        self._lost.append(points)
+        if self.arrays:
+            self._mark_lost()
+
+    def _mark_lost(self) -> None:
+        for points in self._lost:
+            enter(self.arrays[OUTCOME.name], self._grid, points, Outcome.LOST)
+        self._lost.clear()
+
+    def lay_out(self, *, blank: bool = True) -> Mapping[str, np.ndarray]:
+        """The arrays, made if nothing has been filled in yet; without ``blank`` what is in them is anything."""
+        if not self.arrays:
+            self._complete_sizes()
+            sweep = self._grid.result_shape
+            shapes = {v: (*sweep, *(self._sizes[dim] for dim in v.dims)) for v in self.variables}
+            if self._allocate is None:
+                self.arrays = {v.name: np.empty(shape, v.dtype) for v, shape in shapes.items()}
+            else:
+                # Broadcast zeros take no memory.
+                zeros = {v.name: np.broadcast_to(np.zeros((), v.dtype), shape) for v, shape in shapes.items()}
+                self.arrays = self._allocate(labelled(self._scene, zeros, {}))
+            for variable in self.variables if blank else ():
+                rows = self.arrays[variable.name].reshape(-1)
+                for start in range(0, rows.size, _ROWS):
+                    rows[start : start + _ROWS] = missing_value(variable)
+                    release([self.arrays[variable.name]])
+            self._mark_lost()
+        return self.arrays
+
+
+def enter(array: np.ndarray, grid: Grid, points: np.ndarray, values: np.ndarray | int) -> None:
+    """Put ``values`` of ``points`` into the ``array`` of a result."""
+    if grid.path_position is None:
+        array.reshape(grid.size, *array.shape[len(grid.shape) :])[points] = values
+    else:
+        sweep_first(array, grid)[grid.place(points)] = values
+
+
+def sweep_first(array: np.ndarray, grid: Grid) -> np.ndarray:
+    """``array`` of a result with the path, if it is an axis, behind all other axes of the sweep."""
+    position = grid.path_position
+    return array if position is None else np.moveaxis(array, position, len(grid.shape))
+
+
+def failures(outcome: np.ndarray) -> int:
+    """How many outcomes mean that there is no value."""
+    return int(np.count_nonzero(outcome >= FIRST_FAILURE))
+
+
+def missing_value(variable: Variable) -> float | int:
+    """What stands for a result that is not there."""
+    if variable.name == OUTCOME.name:
+        return Outcome.STEP_LIMIT
+    # A flag has no NaN; its last code is the one that claims least (undecided, none).
+    return len(variable.flags) - 1 if variable.flags else 0 if np.dtype(variable.dtype).kind in "iu" else np.nan
+
+
+def result_variables(scene: Scene) -> tuple[Variable, ...]:
+    """The requested results, then the outcome."""
+    return (*(scene.analysis.variable(name) for name in scene.request.outputs), OUTCOME)
+
+
+def bytes_per_point(scene: Scene, on_disk: bool) -> int:
+    """Memory that one point takes while its scene runs: the plan, and the results unless they grow on the disk."""
+    if on_disk:
+        return _PLANNED
+    sizes = {d.name: len(d.values) or _USUAL_SIZE for d in scene.dimensions}
+    return _PLANNED + sum(
+        np.dtype(v.dtype).itemsize * math.prod(sizes[dim] for dim in v.dims) for v in result_variables(scene)
+    )
+
+
+def labelled(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str, str | float]) -> Labelled:
+    """The labelled result: dimensions are the axes in scene order (or ``point``), then those of the variable."""
+    sweep_dims = ("point",) if scene.zipped else tuple(axis.name for axis in scene.axes)
+    results = [(v, arrays[v.name]) for v in result_variables(scene)]
+    coordinates = [*_axis_coordinates(scene), *_resonances(scene)]
+    return Labelled.build(sweep_dims, coordinates, scene.dimensions, results, result_attrs(scene) | dict(attrs))
+
+
+def to_dataset(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str, str | float]) -> xr.Dataset:
+    """The labelled result as a Dataset."""
+    return labelled(scene, arrays, attrs).to_dataset()
+
+
+def _axis_coordinates(scene: Scene) -> list[Coordinate]:
+    coordinates = [
+        Coordinate(a.name, ("point",) if scene.zipped else (a.name,), a.values, a.parameter.units, a.long_name)
+        for a in scene.axes
+    ]
+    if scene.zipped:
+        numbers = np.arange(len(scene.axes[0].values))
+        coordinates.insert(0, Coordinate("point", ("point",), numbers, "1", "number of the point"))
+    return coordinates
+
+
+def _resonances(scene: Scene) -> list[Coordinate]:
+    """Predicted values of an axis, if the system predicts any: labels, and values over the axes they depend on."""
+    predicted = scene.system.resonances
+    axes = {axis.name: axis.values for axis in scene.axes}
+    if predicted is None or scene.zipped or predicted.axis not in axes:
+        return []
+    if any(name not in axes and name not in scene.fixed for name in predicted.parameters):
+        return []
+    depends = [axis.name for axis in scene.axes if axis.name in predicted.parameters]
+    mesh = dict(zip(depends, np.meshgrid(*(axes[name] for name in depends), indexing="ij"), strict=True))
+    values = np.asarray(
+        predicted.values({name: mesh.get(name, scene.fixed.get(name)) for name in predicted.parameters})
+    )
+    units = scene.system.parameter(predicted.axis).units
+    name = f"resonance_{predicted.axis}"
+    return [
+        Coordinate("resonance", ("resonance",), np.array(predicted.labels), "1", "name of the resonance"),
+        Coordinate(name, (*depends, "resonance"), values, units, predicted.long_name),
+    ]
+
+
+def result_attrs(scene: Scene) -> dict[str, str]:
+    """What the result is of and where it comes from, apart from what each run adds."""
+    fixed: dict[str, Any] = {}
+    for name, value in scene.fixed.items():
+        parameter = scene.system.parameter(name)
+        # JSON has no infinity; the word is what every reader of numbers understands.
+        plain = str(value) if value == math.inf else value
+        fixed[name] = {"value": plain, "units": parameter.units, "long_name": parameter.long_name}
+    installed = provenance.versions((*PACKAGES, *_STORAGE))
+    return {
+        "title": scene.title,
+        "system": scene.system.name,
+        "roles": json.dumps(dict(scene.system.roles)),
+        "analysis": scene.analysis.name,
+        "method": scene.request.method,
+        "options": json.dumps(dict(scene.request.options)),
+        "source": scene.system.source,
+        "scene": scene.text,
+        "fixed_parameters": json.dumps(fixed),
+        "drivetrain_jax_version": drivetrain_jax.__version__,
+        "versions": ", ".join(f"{name} {number}" for name, number in installed.items()),
+        "machine": machine(),
+        "created": provenance.now(),
+    }

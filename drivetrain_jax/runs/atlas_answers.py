@@ -1,0 +1,298 @@
+"""Answers of an atlas in words: what holds at a point, how far stability reaches, and what a design has to be.
+
+Every design answer is checked by direct solves. What may be asked: :mod:`~drivetrain_jax.runs.atlas_question`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis import OUTCOME
+from drivetrain_jax.atlas import design
+from drivetrain_jax.atlas.criteria import has_boundaries
+from drivetrain_jax.atlas.sensitivity import Sensitivity, direct_sensitivity
+from drivetrain_jax.atlas.windows import Crossing, Interval
+from drivetrain_jax.runs.atlas_file import StoredAtlas
+from drivetrain_jax.runs.atlas_question import Asked, Range, number, roles_of
+
+# Distance of a spectral radius from 1 that would be lost among its digits.
+_CLOSE = 1e-3
+# What is said of the end of a stable interval that is not a change of stability.
+_BEYOND = {"crossing": "", "atlas": " (the end of the atlas)", "undecided": " (undecided beyond)"}
+
+
+@dataclass(frozen=True)
+class Reply:
+    """An answer to be read (``str``) or processed (``data``, plain numbers, words and lists)."""
+
+    text: str
+    data: Mapping[str, Any]
+
+    def __str__(self) -> str:
+        return self.text
+
+    def to_json(self) -> str:
+        """``data`` as one JSON object; what is not finite is null."""
+        return json.dumps(_plain(self.data), allow_nan=False)
+
+
+def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
+    """Results at one point, the gradient of its spectral radius, and the nearest changes of stability along every parameter.
+
+    The gradient is by direct solves and with respect to every parameter of the system. Raises :class:`InputError` for
+    names and values that the atlas does not cover, :class:`ChunkError` if a direct solve fails.
+    """
+    asked = Asked.of(atlas, given, ranges=())
+    point = asked.values
+    found = atlas(**point)
+    results = {str(name): v.values[()] for name, v in found.data_vars.items()}
+    variables = {v.name: v for v in (*atlas.scene.analysis.variables, OUTCOME)}
+    rows = [
+        f"  {name:<24} {', '.join(map(variables[name].written, np.atleast_1d(value)))}"
+        for name, value in results.items()
+    ]
+    slopes = direct_sensitivity(atlas.scene.system, {**atlas.fixed, **point})
+    panels, system = atlas.stability.atlas, atlas.scene.system
+    nearest = design.nearest_boundaries(panels, system, point) if has_boundaries(panels, system) else ()
+    lines = [f"{system.name} atlas, {asked.heading()}", *rows, *_gradient_lines(atlas, slopes)]
+    lines += ["nearest change of stability"] if nearest or not panels.panels else []
+    lines += [] if panels.panels else [f"  unknown: the atlas has no panel ({panels.gaps[0].reason})"]
+    for each in nearest:
+        sides = [_side(asked, each.parameter, each.value, c) for c in (each.below, each.above) if c]
+        lines.append(f"  {each.parameter:<24} {'; '.join(sides) or _reach(atlas, each)}")
+        lines += [f"  {'':<24} undecided from {number(a)} to {number(b)}" for a, b in each.undecided]
+    data = {
+        "system": atlas.scene.system.name,
+        "parameters": {**atlas.fixed, **point},
+        "physical": asked.physical(point),
+        "values": results,
+        "meanings": {n: variables[n].flags[int(v)] for n, v in results.items() if variables[n].flags},
+        "gradient": slopes.gradient if slopes.exists else None,
+        "nearest": {
+            each.parameter: {
+                "below": _crossing(asked, each.parameter, each.below),
+                "above": _crossing(asked, each.parameter, each.above),
+                "undecided": [list(r) for r in each.undecided],
+            }
+            for each in nearest
+        },
+    }
+    return Reply("\n".join(lines), data)
+
+
+def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Reply:
+    """The least damping from which on a range of speeds is stable, or the ranges of damping for which it is where the
+    atlas's largest damping is unstable. Raises as :func:`query`.
+
+    Of a cardan shaft in physical units only the ratio ``c2/c1`` of the dampings given is used; the answer is ``c1`` with it.
+    """
+    speed, damping = roles_of(atlas, "speed", "damping")
+    asked = Asked.of(atlas, given, ranges=(speed,), free=(damping,))
+    answer = design.least_damping(
+        atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.radius
+    )
+    return _answered("least damping", "from {} on", "largest", asked, answer)
+
+
+def widest_angle(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Reply:
+    """The widest joint angle up to which a range of speeds is stable, or the ranges of angles for which it is where the
+    atlas's smallest angle is unstable. Raises as :func:`query`."""
+    speed, angle = roles_of(atlas, "speed", "angle")
+    asked = Asked.of(atlas, given, ranges=(speed,), free=(angle,))
+    answer = design.widest_angle(
+        atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.radius
+    )
+    return _answered("widest angle", "up to {}", "smallest", asked, answer)
+
+
+def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float = 0.0) -> Reply:
+    """The stable ranges of speed, shortened by ``margin`` of the speed at either end. Raises as :func:`query`."""
+    if not 0 <= margin < 1:
+        raise InputError(f"margin = {margin!r}: allowed is 0 <= margin < 1")
+    (speed,) = roles_of(atlas, "speed")
+    asked = Asked.of(atlas, given, ranges=(), free=(speed,))
+    found = design.speed_windows(
+        atlas.stability.atlas, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.radius
+    )
+    lines = [f"safe speeds, {asked.heading()}, margin {margin:g}"]
+    for w in found.windows:
+        ends = " to ".join(
+            asked.named(speed, value) + _BEYOND[_kind(atlas, speed, *end)]
+            for value, end in zip(w.safe, w.interval.ends, strict=True)
+        )
+        lines.append(f"  {ends}; largest spectral radius {_from_one(w.largest)} at {speed} = {number(w.where)}")
+        lines.append(f"    {_checked(w.check)}")
+    data = {
+        "question": "speed_windows",
+        "parameters": {**atlas.fixed, **asked.values},
+        "margin": margin,
+        "windows": [
+            {
+                "safe": list(w.safe),
+                "physical": asked.physical({speed: w.safe}),
+                "ends": _ends(asked, speed, w.interval),
+                "largest": w.largest,
+                "where": w.where,
+                "check": _check(w.check),
+            }
+            for w in found.windows
+        ],
+        "undecided": [list(r) for r in found.undecided],
+    }
+    lines += [] if found.windows else ["  none within the atlas"]
+    lines += [f"  undecided from {number(a)} to {number(b)}" for a, b in found.undecided]
+    return Reply("\n".join(lines), data)
+
+
+def _kind(atlas: StoredAtlas, name: str, end: float, crossing: Crossing | None) -> str:
+    """What ends a stable interval: a ``crossing``, the end of the ``atlas``, or what is ``undecided``."""
+    if crossing:
+        return "crossing"
+    low, high = atlas.ranges[name]
+    # Of an angle the modulus counts.
+    return "atlas" if abs(end) in {abs(low), abs(high), *([0.0] if low < 0 < high else [])} else "undecided"
+
+
+def _ends(asked: Asked, name: str, interval: Interval) -> list[dict[str, Any]]:
+    """Both ends of a stable interval as data; ``error`` and ``multiplier`` are those of a crossing."""
+    return [
+        {
+            "value": value,
+            "kind": _kind(asked.atlas, name, value, crossing),
+            "error": crossing.error if crossing else None,
+            "multiplier": crossing.multiplier if crossing else None,
+        }
+        for value, crossing in interval.ends
+    ]
+
+
+def _bounded(asked: Asked, name: str, value: float, crossing: Crossing | None) -> str:
+    """An end of a stable interval in words, with its error."""
+    bound = f" +- {crossing.error:.1e}" if crossing else _BEYOND[_kind(asked.atlas, name, value, crossing)]
+    return asked.named(name, value) + bound
+
+
+def _answered(title: str, phrase: str, safe: str, asked: Asked, answer: design.Answer) -> Reply:
+    """``phrase`` says where the value lies, ``safe`` which value of the atlas is the safe end."""
+    name = answer.parameter
+    lines = [f"{title}, {asked.heading()}"]
+    if answer.value is not None:
+        lines.append(f"  stable {phrase.format(_bounded(asked, name, answer.value, answer.limit))}")
+    elif answer.stable:
+        lines += _elsewhere(safe, asked, answer)
+    else:
+        none = "of the atlas will do" if answer.certain else "found; whether there is one is undecided"
+        lines.append(f"  no {name} {none}")
+    if answer.limit:
+        where = ", ".join(f"{n} = {number(v)}" for n, v in answer.limit.point.items())
+        lines.append(f"  limit: multiplier {answer.limit.multiplier} at {where}")
+    if answer.check:
+        lines += [] if answer.certain else ["  not certain: undecided ranges reach beyond the errors"]
+        lines.append(f"  {_checked(answer.check)}")
+    lines += [f"  undecided from {number(a)} to {number(b)}" for a, b in answer.undecided]
+    data = {
+        "question": title.replace(" ", "_"),
+        "parameters": {**asked.atlas.fixed, **asked.values},
+        "parameter": name,
+        "value": answer.value,
+        "physical": {} if answer.value is None else asked.physical({name: answer.value}),
+        "error": answer.error,
+        "certain": answer.certain,
+        "limit": _crossing(asked, name, answer.limit),
+        "intervals": [
+            {"physical": asked.physical({name: (i.lower, i.upper)}), "ends": _ends(asked, name, i)}
+            for i in answer.stable
+        ],
+        "undecided": [list(r) for r in answer.undecided],
+        "check": _check(answer.check),
+    }
+    return Reply("\n".join(lines), data)
+
+
+def _elsewhere(safe: str, asked: Asked, answer: design.Answer) -> list[str]:
+    """That the safe end is not stable, and which intervals are."""
+    name, end = answer.parameter, answer.safe_end
+    unstable = any(i.lower <= end <= i.upper for i in answer.intervals)
+    lines = [f"  {'unstable' if unstable else 'undecided'} at {asked.named(name, end)}, the {safe} of the atlas"]
+    for interval in answer.stable:
+        lower, upper = (_bounded(asked, name, *each) for each in interval.ends)
+        lines.append(f"  stable from {lower} to {upper}")
+    return lines
+
+
+def _gradient_lines(atlas: StoredAtlas, slopes: Sensitivity) -> list[str]:
+    if not slopes.exists:
+        tied = math.isfinite(slopes.gap)
+        no_solves = "direct solves would take too many steps, or leave the range of numbers"
+        reason = "two multipliers have the largest modulus, within the errors" if tied else no_solves
+        return ["gradient of spectral_radius", f"  none: {reason}"]
+    units = {name: atlas.scene.system.parameter(name).units for name in slopes.gradient}
+    return [
+        "gradient of spectral_radius",
+        *(
+            f"  {name:<24} {value:.6g}{'' if units[name] == '1' else f' per {units[name]}'}"
+            for name, value in slopes.gradient.items()
+        ),
+    ]
+
+
+def _side(asked: Asked, name: str, value: float, crossing: Crossing) -> str:
+    where = "below" if crossing.value <= value else "above"
+    return f"{abs(crossing.value - value):.6g} {where}: {asked.named(name, crossing.value)} +- {crossing.error:.1e}"
+
+
+def _reach(atlas: StoredAtlas, nearest: design.Nearest) -> str:
+    low, high = atlas.ranges[nearest.parameter]
+    # Stability may change within a range that is undecided.
+    elsewhere = ", unless where it is undecided:" if nearest.undecided else ""
+    return f"none from {number(low)} to {number(high)}{elsewhere}"
+
+
+def _crossing(asked: Asked, name: str, crossing: Crossing | None) -> dict[str, Any] | None:
+    if crossing is None:
+        return None
+    return {
+        "value": crossing.value,
+        "physical": asked.physical({name: crossing.value}),
+        "error": crossing.error,
+        "multiplier": crossing.multiplier,
+        "point": dict(crossing.point),
+    }
+
+
+def _check(check: design.Check | None) -> dict[str, Any] | None:
+    if check is None:
+        return None
+    return {"inside": check.inside, "beyond": check.beyond, "solves": check.solves, "agrees": check.agrees}
+
+
+def _checked(check: design.Check) -> str:
+    inside = f"spectral radius at most {_from_one(check.inside)} inside"
+    beyond = "" if math.isnan(check.beyond) else f", {_from_one(check.beyond)} beyond it"
+    verdict = "agree" if check.agrees else "DISAGREE"
+    return f"direct solves {verdict}: {inside}{beyond} ({check.solves} solves)"
+
+
+def _from_one(radius: float) -> str:
+    """Next to a boundary the digits of a spectral radius are those of its distance from 1."""
+    apart = radius - 1
+    return f"{radius:.6g}" if not 0 < abs(apart) < _CLOSE else f"1 {'+' if apart > 0 else '-'} {abs(apart):.1e}"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _plain(v) for name, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, complex):
+        return {"real": _plain(value.real), "imag": _plain(value.imag)}
+    return None if isinstance(value, float) and not math.isfinite(value) else value

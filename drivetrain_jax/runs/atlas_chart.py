@@ -1,0 +1,162 @@
+"""A chart of a stored atlas at any resolution and zoom, with its boundaries and tips as curves and points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.atlas.boundaries import boundaries
+from drivetrain_jax.atlas.criteria import has_boundaries
+from drivetrain_jax.atlas.panels import Atlas
+from drivetrain_jax.atlas.tips import Tips, find_tips
+from drivetrain_jax.atlas.windows import narrow
+from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, open_atlas
+from drivetrain_jax.systems import System
+
+# Values of a parameter beside the two of a chart.
+_SLICES = 3
+
+
+def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, float]], cells: int) -> xr.Dataset:
+    """The ``floquet`` result on ``cells`` values of each of two parameters of the atlas in ``source``.
+
+    ``part`` fixes parameters (numbers) or zooms in (ranges). Of further parameters there are three values. A chart of two
+    parameters also has, if the system has such, its stability boundaries (``boundary_NAME``, parts separated by NaN) and
+    the tips of its tongues (``tip_NAME``, with their names, ``tip_NAME_error``, ``tip_opens`` and ``tip_proved``) and the
+    boxes that may hide further ones (``undecided_NAME``). Raises :class:`InputError` for what the atlas does not cover,
+    :class:`ChunkError` if a direct solve in a gap fails.
+    """
+    if not 2 <= cells <= 20_000:
+        raise InputError(f"cells = {cells}: allowed is 2 <= cells <= 20000")
+    atlas = open_atlas(source)
+    ranges = _ranges(atlas, part)
+    fixed = {name: value for name, value in ranges.items() if not isinstance(value, tuple)}
+    shown = _shown(atlas.scene.system, [name for name in ranges if name not in fixed])
+    if not shown:
+        raise InputError(f"part: fixes {', '.join(fixed)}; a chart needs one that varies, and query tells of one point")
+    axes = {
+        name: np.linspace(*ranges[name], cells if name in shown[:2] else _SLICES)
+        for name in atlas.parameters
+        if name in shown
+    }
+    given = {
+        name: ((), value, {"units": p.units, "long_name": p.long_name})
+        for name, value in fixed.items()
+        for p in [atlas.scene.system.parameter(name)]
+    }
+    dataset = atlas.grid(**axes, **fixed).assign_coords(given)
+    if len(shown) != 2 or not has_boundaries(atlas.stability.atlas, atlas.scene.system):
+        return dataset
+    return dataset.assign_coords(_curves(atlas, fixed, {n: ranges[n] for n in shown}))
+
+
+def _ranges(atlas: StoredAtlas, part: Mapping[str, Any]) -> dict[str, Any]:
+    for name, value in part.items():
+        if name not in atlas.parameters:
+            atlas.refuse(name, value)
+        low, high = atlas.ranges[name]
+        rising = not isinstance(value, tuple) or value[0] < value[1]
+        if not rising or not all(low <= end <= high for end in np.atleast_1d(value)):
+            raise InputError(f"{name} = {as_given(value)}: allowed is a number or LOW:HIGH, {atlas.allowed(name)}")
+    return {name: part.get(name, atlas.ranges[name]) for name in atlas.parameters}
+
+
+def _shown(system: System, names: list[str]) -> list[str]:
+    """The two parameters of the chart first, the axis of the resonances among them, or the speed if there are none."""
+    axis = system.resonances.axis if system.resonances else system.roles.get("speed")
+    return sorted(names, key=lambda name: name != axis)
+
+
+def _curves(
+    atlas: StoredAtlas, fixed: Mapping[str, float], ranges: Mapping[str, tuple[float, float]]
+) -> dict[str, tuple[str, np.ndarray, dict[str, str]]]:
+    system = atlas.scene.system
+    panels = narrow(atlas.stability.atlas.slice(fixed), ranges)
+    signs = _signs(panels)
+    tips = None
+    if system.resonances is not None and system.resonances.axis in ranges:
+        # Tongues widen with the angle. Along a damping they close, and what closes them is their tip.
+        tips = find_tips(panels, system, opening=system.roles.get("angle") in ranges)
+    segments = [
+        _within({name: sign * segment[name] for name, sign in side.items()}, ranges)
+        for curve in boundaries(panels, system, tips.searches if tips else ())
+        for segment in curve.segments()
+        for side in signs
+    ]
+    coordinates = {}
+    for name in ranges:
+        about = {"units": system.parameter(name).units}
+        parts = [np.append(segment[name], np.nan) for segment in segments]
+        values = np.concatenate(parts) if parts else np.empty(0)
+        coordinates[f"boundary_{name}"] = ("boundary", values, {**about, "long_name": f"boundary of stability, {name}"})
+    if tips is None:
+        return coordinates
+    return coordinates | _tips(_on_all_sides(tips, signs, ranges), system, ranges)
+
+
+def _signs(atlas: Atlas) -> list[dict[str, float]]:
+    """The signs of the parameters with which moduli lie in ``atlas``: both where it reaches over 0."""
+    choices = []
+    for coordinate, low, high in zip(atlas.coordinates, atlas.lower, atlas.upper, strict=True):
+        both = [1.0] if not coordinate.even or high > 0 else []
+        choices.append([*both, -1.0] if coordinate.even and low < 0 else both)
+    return [dict(zip(atlas.parameters, signs, strict=True)) for signs in product(*choices)]
+
+
+def _within(places: Mapping[str, np.ndarray], ranges: Mapping[str, tuple[float, float]]) -> dict[str, np.ndarray]:
+    """``places`` with NaN for those outside ``ranges``."""
+    inside = np.logical_and.reduce([(low <= places[n]) & (places[n] <= high) for n, (low, high) in ranges.items()])
+    return {name: np.where(inside, values, np.nan) for name, values in places.items()}
+
+
+def _on_all_sides(found: Tips, signs: list[dict[str, float]], ranges: Mapping[str, tuple[float, float]]) -> Tips:
+    tips, boxes = [], []
+    for side in signs:
+        for tip in found.tips:
+            point = {name: sign * tip.point[name] for name, sign in side.items()}
+            # At 0 both sides are one.
+            known = any(point == other.point for other in tips)
+            if not known and all(low <= point[name] <= high for name, (low, high) in ranges.items()):
+                # What opens upwards on one side of 0 opens downwards on the other.
+                tips.append(replace(tip, point=point, opens=tip.opens == (min(side.values()) > 0)))
+        for box in found.undecided:
+            boxes.append({name: tuple(sorted(sign * end for end in box[name])) for name, sign in side.items()})
+    return replace(found, tips=tuple(tips), undecided=tuple(boxes))
+
+
+def _tips(
+    found: Tips, system: System, names: Iterable[str]
+) -> dict[str, tuple[str | tuple[str, str], np.ndarray, dict[str, str]]]:
+    """The tips as coordinates: names, whether they open and are proved, place and its error; and the undecided boxes."""
+    labels = np.array([tip.name for tip in found.tips], dtype=str)
+    proved = np.array([tip.proved for tip in found.tips], np.int8)
+    meaning = {
+        "units": "1",
+        "long_name": "whether there is exactly one tip here within the bounds of the atlas (1) or not (0)",
+    }
+    other = next(name for name in names if name != system.resonances.axis)
+    opens = np.array([tip.opens for tip in found.tips], np.int8)
+    direction = {"units": "1", "long_name": f"whether the tongue opens (1) or closes (0) at its tip as {other} rises"}
+    coordinates: dict[str, tuple] = {
+        "tip": ("tip", labels, {"units": "1", "long_name": "resonance that the tongue grows from"}),
+        "tip_opens": ("tip", opens, direction),
+        "tip_proved": ("tip", proved, meaning),
+    }
+    for name in names:
+        units = {"units": system.parameter(name).units}
+        values = np.array([tip.point[name] for tip in found.tips])
+        errors = np.array([tip.error[name] for tip in found.tips])
+        coordinates[f"tip_{name}"] = ("tip", values, {**units, "long_name": f"tip of a tongue, {name}"})
+        coordinates[f"tip_{name}_error"] = ("tip", errors, {**units, "long_name": f"bound of the error of tip_{name}"})
+        if found.undecided:
+            boxes = np.array([box[name] for box in found.undecided])
+            about = {**units, "long_name": f"lower and upper {name} of a box that may hide further tips"}
+            coordinates[f"undecided_{name}"] = (("undecided_box", "end"), boxes, about)
+    return coordinates

@@ -1,0 +1,76 @@
+"""Whether a scene is computed through an atlas, and over which ranges of its parameters."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis.atlas import ANALYSIS
+from drivetrain_jax.runs.axes import MAX_RANGES
+from drivetrain_jax.runs.grid import Grid
+from drivetrain_jax.runs.plan import mean_cost
+from drivetrain_jax.runs.scene import Scene
+
+# Points from which on "auto" tries an atlas: fewer are solved directly in the time that two more kernels take to compile.
+_WORTHWHILE = 100_000
+# The share of the effort of solving every point that "auto" may spend on it. What is not covered by then is solved directly.
+_SHARE = 1 / 8
+# What an atlas of one, two, ... parameters takes at least, in direct solves.
+_FEWEST = (100, 500, 2_000, 8_000)
+# Points whose effort is predicted to tell that of all.
+_SAMPLE = 4096
+# Below this target relative error rounding keeps the panels of an atlas from being accepted.
+_FINEST = 1e-12
+
+
+def atlas_ranges(scene: Scene) -> dict[str, tuple[float, float]]:
+    """Lowest and highest value of every parameter that varies, those with the fewest values first."""
+    lengths = {axis.name: len(axis.values) for axis in scene.axes}
+    varying = [axis for axis in scene.axes if axis.values.min() < axis.values.max()]
+    return {
+        axis.name: (float(axis.values.min()), float(axis.values.max()))
+        for axis in sorted(varying, key=lambda axis: lengths[axis.name])
+    }
+
+
+def uses_atlas(scene: Scene) -> bool:
+    """Whether the points of ``scene`` are evaluated from an atlas: on request, or if ``auto`` finds it worthwhile.
+
+    Raises :class:`InputError` for a scene that asks for one and varies too many parameters.
+    """
+    if scene.analysis.name != "floquet" or scene.request.method not in ("auto", "atlas"):
+        return False
+    count = len(atlas_ranges(scene))
+    if scene.request.method == "atlas":
+        if count > MAX_RANGES:
+            allowed = f"allowed are at most {MAX_RANGES}"
+            raise InputError(f"options.method = 'atlas': the scene varies {count} parameters; {allowed}")
+        return count > 0
+    model = scene.system.models.get(ANALYSIS.name)
+    return (
+        model is not None
+        and model.smooth is not None
+        and 0 < count <= MAX_RANGES
+        and Grid.of(scene).size >= _WORTHWHILE
+        and scene.request.options["rtol"] >= _FINEST
+        and solves_allowed(scene) >= _FEWEST[count - 1]
+    )
+
+
+def solves_allowed(scene: Scene) -> int | None:
+    """The largest number of direct solves that the atlas of ``scene`` may take, None for its own limit.
+
+    Nodes cost more than points: they are solved more sharply, and lie evenly in the coordinates of the atlas, such as
+    1/Omega, where points are few and dear.
+    """
+    if scene.request.method != "auto":
+        return None
+    from drivetrain_jax.runs.rounds import node_engine
+
+    grid, random = Grid.of(scene), np.random.default_rng(0)
+    chosen = random.integers(0, grid.size, _SAMPLE)
+    point = mean_cost(scene.analysis.solvers(scene.system, scene.request), grid, chosen)
+    nodes = node_engine(scene, atlas_ranges(scene), _SAMPLE)
+    node = mean_cost(nodes.solvers, nodes.grid, np.arange(_SAMPLE))
+    # Nodes that cost nothing are nodes that no solver can do.
+    return int(grid.size * _SHARE * point / node) if node else 0

@@ -1,0 +1,300 @@
+"""Atlas files: panels as a labelled result like any other, and the object that answers from one."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._wording import counted, did_you_mean, shown
+from drivetrain_jax.analysis import Request, get_analysis
+from drivetrain_jax.analysis.atlas import ANALYSIS
+from drivetrain_jax.atlas import StabilityAtlas, from_arrays, stability_atlas, to_arrays
+from drivetrain_jax.atlas.floquet import floquet_domain
+from drivetrain_jax.runs import compile_cache
+from drivetrain_jax.runs.assemble import Table, result_attrs, to_dataset
+from drivetrain_jax.runs.atlas_choice import atlas_ranges
+from drivetrain_jax.runs.axes import Axis
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.executor import Where
+from drivetrain_jax.runs.rounds import build_atlas
+from drivetrain_jax.runs.scene import Scene, load_scene
+from drivetrain_jax.runs.through_atlas import evaluate
+from drivetrain_jax.runs.work import Progress, Work
+from drivetrain_jax.store import checksums
+from drivetrain_jax.store.consolidate import open_result
+from drivetrain_jax.store.schema import Entry, Labelled
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# Name in the file, dimensions, meaning. Boxes are in the coordinates of the atlas, which have the attribute's names.
+_VARIABLES = {
+    "lower": (("parameter",), "lower end of the domain, in the parameter's unit"),
+    "upper": (("parameter",), "upper end of the domain, in the parameter's unit"),
+    "panel_lower": (("panel", "parameter"), "lower corner of a panel, in coordinates"),
+    "panel_upper": (("panel", "parameter"), "upper corner of a panel, in coordinates"),
+    "panel_degrees": (("panel", "parameter"), "number of Chebyshev polynomials of a panel"),
+    "value_error": (("panel",), "bound of the error of the propagator (Frobenius norm)"),
+    "derived_error": (("panel", "derived"), "bounds of the errors of the coefficients of det(sigma I - Z)"),
+    "coefficients": (("coefficient", "entry"), "Chebyshev coefficients that are not 0, panel after panel in C order"),
+    "kept": (("byte",), "bits that say which coefficients are not 0, of all panels together (most significant first)"),
+    "gap_lower": (("gap", "parameter"), "lower corner of a box without a panel, in coordinates"),
+    "gap_upper": (("gap", "parameter"), "upper corner of a box without a panel, in coordinates"),
+}
+
+# Every atlas has a domain, and panels, gaps or both.
+_DOMAIN, _GAPS = ("lower", "upper"), ("gap_lower", "gap_upper", "gap_reason")
+_PANELS = tuple(name for name in _VARIABLES if name not in (*_DOMAIN, *_GAPS))
+_ATTRIBUTES = ("scene", "coordinates_of_panels", "tolerance", "solves")
+
+
+def make_atlas(scene: Scene, work: Work, progress: Progress) -> Labelled:
+    """The content of the file of an atlas scene. ``progress`` counts the solves."""
+    stability, _ = build_atlas(scene, atlas_ranges(scene), work, progress)
+    atlas = stability.atlas
+    arrays = to_arrays(atlas)
+    data = {
+        name: Entry(dims, arrays[name], {"units": "1", "long_name": meaning})
+        for name, (dims, meaning) in _VARIABLES.items()
+        if arrays[name].size
+    }
+    names = {"units": "1", "long_name": "name of the parameter"}
+    coords = {"parameter": Entry(("parameter",), np.array(atlas.parameters), names)}
+    if atlas.gaps:
+        reason = {"units": "1", "long_name": "why there is no panel"}
+        coords["gap_reason"] = Entry(("gap",), arrays["gap_reason"].astype(str), reason)
+    attrs = result_attrs(scene) | {
+        "coordinates_of_panels": json.dumps([c.name for c in atlas.coordinates]),
+        "tolerance": atlas.tolerance,
+        "solves": atlas.solves,
+    }
+    return Labelled(coords, data, attrs)
+
+
+def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
+    """The atlas that the run of a scene with ``analysis = "atlas"`` gave: its file, or the dataset itself.
+
+    Raises :class:`InputError` if it is none or its file damaged, or if its system is not installed or has other
+    coordinates by now.
+    """
+    compile_cache.enable()
+    dataset = open_result(Path(source)) if isinstance(source, (str, Path)) else source
+    label = "dataset" if dataset is source else f"file = {str(source)!r}"
+    if dataset.attrs.get("analysis") != ANALYSIS.name:
+        raise InputError(f"{label}: holds the analysis {dataset.attrs.get('analysis')!r}; allowed is an atlas")
+    # Bounds that are carried with the panels hold for panels as they were written: nothing else would tell.
+    if dataset is not source and (changed := checksums.damaged(Path(source))):
+        raise InputError(
+            f"{label}: damaged ({checksums.named(changed)}); allowed is to restore it or to run its scene again"
+        )
+    if missing := _missing(dataset):
+        raise InputError(f"{label}: lacks {missing[0]}; allowed is the whole result of a scene of an atlas")
+    scene = load_scene(tomllib.loads(dataset.attrs["scene"]))
+    names = tuple(str(name) for name in dataset["parameter"].values)
+    ranges = dict(zip(names, zip(dataset["lower"].values, dataset["upper"].values, strict=True), strict=True))
+    domain = floquet_domain(scene.system, ranges, scene.fixed)
+    if [c.name for c in domain.coordinates] != json.loads(dataset.attrs["coordinates_of_panels"]):
+        raise InputError(f"{label}: made by another version of {scene.system.name}; allowed is to run its scene again")
+    d, arrays = len(names), {name: dataset[name].values for name in _VARIABLES if name in dataset}
+    if "gap_lower" in dataset:
+        arrays["gap_reason"] = dataset["gap_reason"].values
+    blank = {name: np.empty((0, d)) for name in ("panel_lower", "panel_upper", "gap_lower", "gap_upper")}
+    blank |= {"panel_degrees": np.empty((0, d), int), "gap_reason": np.empty(0), "kept": np.empty(0, np.uint8)}
+    arrays = blank | {"coefficients": np.empty((0, 0))} | arrays
+    used = {name: scene.fixed[name] for name in scene.system.models["atlas"].parameters if name in scene.fixed}
+    tolerance, solves = dataset.attrs["tolerance"], dataset.attrs["solves"]
+    atlas = from_arrays(arrays, names, domain.coordinates, used, tolerance, solves)
+    return StoredAtlas(scene, stability_atlas(atlas, scene.system, scene.request.options["rtol"]))
+
+
+def _missing(dataset: xr.Dataset) -> list[str]:
+    """What :func:`make_atlas` writes and ``dataset`` lacks."""
+    gaps = any(name in dataset for name in _GAPS)
+    panels = not gaps or any(name in dataset for name in _PANELS)
+    needed = (*_DOMAIN, *(_PANELS if panels else ()), *(_GAPS if gaps else ()))
+    missing = [name for name in needed if name not in dataset]
+    missing += [name for name in _ATTRIBUTES if name not in dataset.attrs]
+    if missing or not panels:
+        return missing
+    bits = np.unpackbits(np.asarray(dataset["kept"].values, np.uint8))
+    missing += ["some of kept"] if bits.size < dataset["panel_degrees"].prod("parameter").sum() else []
+    missing += ["some of coefficients"] if dataset.sizes["coefficient"] != bits.sum() else []
+    return missing
+
+
+@dataclass(frozen=True)
+class StoredAtlas:
+    """A stability atlas as a function: ``atlas(beta=0.31, Omega=1.2)``.
+
+    ``scene`` is the one that made it, ``stability`` what evaluates its panels. Points in gaps are solved directly.
+    """
+
+    scene: Scene
+    stability: StabilityAtlas
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that may vary."""
+        return self.stability.atlas.parameters
+
+    @property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Least and largest value of each parameter."""
+        atlas = self.stability.atlas
+        ends = zip(atlas.lower.tolist(), atlas.upper.tolist(), strict=True)
+        return dict(zip(atlas.parameters, ends, strict=True))
+
+    @property
+    def fixed(self) -> Mapping[str, Any]:
+        """The other parameters."""
+        return self.stability.atlas.fixed
+
+    def allowed(self, name: str) -> str:
+        """The range of a parameter as messages write it: ``0 <= beta <= 1.5, in rad``."""
+        low, high = self.ranges[name]
+        units = self.scene.system.parameter(name).units
+        return f"{low:.10g} <= {name} <= {high:.10g}" + ("" if units == "1" else f", in {units}")
+
+    def refuse(self, name: str, value: Any, *others: str) -> NoReturn:
+        """Raise :class:`InputError` for a name that is neither a parameter nor one of ``others``."""
+        if name in self.fixed:
+            made = f"the atlas is made for {name} = {as_given(self.fixed[name])}"
+            raise InputError(f"{name} = {as_given(value)}: {made}; allowed is to leave it out")
+        guess = did_you_mean(name, (*self.parameters, *others))
+        allowed = "; ".join(map(self.allowed, self.parameters))
+        raise InputError(f"{name} = {as_given(value)}: not a parameter of the atlas{guess}; allowed is {allowed}")
+
+    def __repr__(self) -> str:
+        ranges = ", ".join(f"{name} {a:g} to {b:g}" for name, (a, b) in self.ranges.items())
+        atlas = self.stability.atlas
+        fixed = ", ".join(f"{name} = {value:g}" for name, value in self.fixed.items())
+        parts = f"{counted(len(atlas.panels), 'panel', 'panels')}, {counted(len(atlas.gaps), 'gap', 'gaps')}"
+        return f"{self.scene.system.name} atlas: {ranges}; {fixed}; {parts}"
+
+    def __call__(self, **values: Any) -> xr.Dataset:
+        """Results at points: every parameter a number or an array, broadcast against each other.
+
+        Arrays of xarray keep their dimensions and labels, others have the dimension ``point`` (or ``dim_0``, ``dim_1``,
+        ...). Raises :class:`InputError` for a name that is missing or unknown, for a value outside the atlas, and for
+        arrays whose shapes or labels do not fit together; :class:`ChunkError` if a direct solve in a gap fails.
+        """
+        import xarray as xr
+
+        checked = {name: self._checked(name, values) for name in self._names(values)}
+        columns = dict(zip(checked, _broadcast(checked), strict=True))
+        whole = columns[self.parameters[0]]
+        shape, dims = whole.shape, whole.dims
+        flat = {name: np.asarray(column.values, float).reshape(-1) for name, column in columns.items()}
+        found = self._evaluate(self.stability, flat, zipped=True)
+        own = {name: v.dims[1:] for name, v in found.data_vars.items()}
+        data = {
+            name: ((*dims, *own[name]), v.values.reshape((*shape, *v.shape[1:])), v.attrs)
+            for name, v in found.data_vars.items()
+        }
+        labels = {dim: whole.coords[dim] for dim in dims if dim in whole.coords}
+        given = {name: v if isinstance(v, xr.DataArray) else columns[name] for name, v in checked.items()}
+        coords = {name: (v.dims, np.asarray(v.values, float), found[name].attrs) for name, v in given.items()}
+        return xr.Dataset(data, labels | coords, found.attrs)
+
+    def grid(self, **values: Any) -> xr.Dataset:
+        """Results on the outer product of arrays, as a scene with these axes would give; numbers fix a parameter.
+
+        The dimensions have the order in which the arrays are given. Raises as a call does.
+        """
+        self._names(values)
+        given = {name: np.asarray(self._checked(name, values), float) for name in values}
+        axes = {name: column for name, column in given.items() if column.ndim}
+        for name, column in axes.items():
+            if column.ndim > 1 or not column.size:
+                raise InputError(f"{name}: an array of shape {column.shape}; allowed is a number or a row of numbers")
+        if not axes:
+            return self(**values)
+        fixed = {name: float(column) for name, column in given.items() if not column.ndim}
+        return self._evaluate(self.stability.slice(fixed), axes, zipped=False)
+
+    def radius(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Spectral radii ``(N,)`` by direct solves, without the panels; ``columns`` of all parameters.
+
+        Raises :class:`ChunkError` if a solve fails.
+        """
+        axes = {name: column for name, column in columns.items() if name in self.parameters}
+        request = Request(("spectral_radius",), "direct", self.scene.request.options)
+        engine = Engine(self._scene(axes, dict(self.fixed), request, zipped=True))
+        table = Table(engine.scene, engine.grid)
+        Work(Where()).do(engine, table, Progress(engine.total))
+        return table.lay_out()["spectral_radius"]
+
+    def _names(self, values: Mapping[str, Any]) -> tuple[str, ...]:
+        for name in values:
+            if name not in self.parameters:
+                self.refuse(name, values[name])
+        for name in self.parameters:
+            if name not in values:
+                raise InputError(f"{name}: missing; allowed is {self.allowed(name)}")
+        return self.parameters
+
+    def _checked(self, name: str, values: Mapping[str, Any]) -> Any:
+        low, high = self.ranges[name]
+        try:
+            numbers = np.asarray(values[name])
+        except ValueError:
+            # Rows of different lengths.
+            numbers = np.empty(0, object)
+        if numbers.dtype.kind not in "iuf":
+            raise InputError(f"{name} = {shown(values[name])}: allowed are numbers")
+        outside = numbers[~((numbers >= low) & (numbers <= high))]
+        if outside.size:
+            raise InputError(f"{name} = {outside.flat[0]:.10g}: allowed is {self.allowed(name)}")
+        return values[name]
+
+    def _evaluate(self, stability: StabilityAtlas, axes: Mapping[str, np.ndarray], zipped: bool) -> xr.Dataset:
+        request = Request(self.scene.request.outputs, "atlas", self.scene.request.options)
+        scene = self._scene(axes, stability.atlas.fixed, request, zipped)
+        engine = Engine(scene)
+        table = Table(scene, engine.grid)
+        evaluate(engine, table, stability, Work(Where()), Progress(engine.total))
+        return to_dataset(scene, table.lay_out(), {})
+
+    def _scene(self, axes: Mapping[str, np.ndarray], fixed: Mapping[str, Any], request: Request, zipped: bool) -> Scene:
+        system, floquet = self.scene.system, get_analysis("floquet")
+        columns = tuple(Axis(name, system.parameter(name), None, np.asarray(v, float)) for name, v in axes.items())
+        fixed = dict(self.scene.fixed) | {name: value for name, value in fixed.items() if name not in axes}
+        return replace(
+            self.scene,
+            analysis=floquet,
+            request=request,
+            axes=columns,
+            zipped=zipped,
+            fixed=fixed,
+            dimensions=floquet.dimensions(system, request, fixed),
+        )
+
+
+def as_given(value: Any) -> str:
+    """A number or a range as it is given: ``1.3:1.5``."""
+    ends = value if isinstance(value, tuple) else (value,)
+    return ":".join(f"{end:.10g}" if isinstance(end, (int, float)) else shown(end) for end in ends)
+
+
+def _broadcast(given: Mapping[str, Any]) -> tuple[xr.DataArray, ...]:
+    """Numbers and arrays of one shape: those without labels by their places, then all by the names of their dimensions."""
+    import xarray as xr
+
+    plain = {name: np.asarray(v, float) for name, v in given.items() if not isinstance(v, xr.DataArray)}
+    try:
+        plain = dict(zip(plain, np.broadcast_arrays(*plain.values()), strict=True))
+        labelled = {n: xr.DataArray(v, dims=("point",) if v.ndim == 1 else None) for n, v in plain.items()}
+        arrays = [labelled.get(name, value) for name, value in given.items()]
+        # By itself `broadcast` gives the union of labels, with NaN where an array has none.
+        return xr.broadcast(*xr.align(*arrays, join="exact", copy=False))
+    except ValueError:
+        shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in given.items())
+        allowed = "arrays that broadcast against each other, of the same labels along a dimension that they share"
+        raise InputError(f"shapes {shapes}: allowed are {allowed}") from None

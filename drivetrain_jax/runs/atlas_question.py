@@ -1,0 +1,162 @@
+"""What is asked of an atlas: parameters as those of the atlas, or in the physical units of the system
+(``drivetrain_jax.systems``: ``physical``), checked before anything is computed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given
+from drivetrain_jax.runs.physical import nondimensional
+
+Range = tuple[float, float]
+# How closely a given parameter has to be what the atlas was made with, and how far from an end of its range a value is
+# taken to be that end: converted from other units, or copied from a message, it is rounded.
+_SAME = 1e-9
+
+
+def number(value: float) -> str:
+    """As numbers are written in answers and messages."""
+    return f"{value:.10g}"
+
+
+def roles_of(atlas: StoredAtlas, *roles: str) -> list[str]:
+    """The parameters with these ``roles`` in the system; :class:`InputError` if it names none."""
+    system = atlas.scene.system
+    for role in roles:
+        if role not in system.roles:
+            raise InputError(f"file: {system.name} names no {role}; allowed is a system that does")
+    return [system.roles[role] for role in roles]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What was given, as parameters of the atlas (numbers, or ranges), and the physical data behind it."""
+
+    atlas: StoredAtlas
+    values: Mapping[str, Any]
+    shaft: Any
+
+    @classmethod
+    def of(
+        cls, atlas: StoredAtlas, given: Mapping[str, Any], ranges: tuple[str, ...], free: tuple[str, ...] = ()
+    ) -> Asked:
+        """``ranges`` names the parameters of which a range is wanted, ``free`` those that are the answer."""
+        shaft, values = nondimensional(atlas.scene.system, given)
+        for name, value in given.items():
+            if _meant(name, value, shaft) in free:
+                raise InputError(f"{name} = {as_given(value)}: is what is asked for; allowed is to leave it out")
+        for name in (*ranges, *free):
+            if name not in atlas.parameters:
+                raise InputError(
+                    f"file: the atlas does not vary {name}; allowed is one over {', '.join((*ranges, *free))}"
+                )
+        for name, value in values.items():
+            if name in atlas.fixed and name not in free:
+                _check_same(name, value, atlas.fixed[name])
+        own = {
+            name: _within(value, atlas.ranges[name])
+            for name, value in values.items()
+            if name in atlas.parameters and name not in free
+        }
+        for name in values:
+            if name not in atlas.parameters and name not in atlas.fixed:
+                physical = atlas.scene.system.physical
+                atlas.refuse(name, values[name], *atlas.fixed, *(physical.names if physical else ()))
+        for name in atlas.parameters:
+            if name not in free:
+                _check_range(_Words.of(atlas, shaft, name), atlas.ranges[name], own.get(name), name in ranges)
+        return cls(atlas, own, shaft)
+
+    def numbers(self) -> dict[str, float]:
+        """The values that are numbers."""
+        return {name: value for name, value in self.values.items() if not isinstance(value, tuple)}
+
+    def heading(self) -> str:
+        """What holds for the answer, in words."""
+        everything = {**self.values, **self.atlas.fixed}
+        return ", ".join(
+            f"{name} = {number(v[0])} to {number(v[1])}" if isinstance(v, tuple) else f"{name} = {number(v)}"
+            for name, v in everything.items()
+        )
+
+    def named(self, name: str, value: float) -> str:
+        """``beta = 0.31 (17.76 deg)``"""
+        physical = self.shaft.quantity(name, value) if self.shaft else None
+        aside = f" ({physical[0]} = {number(physical[1])} {physical[2]})" if physical else ""
+        return f"{name} = {number(value)}{aside}"
+
+    def physical(self, values: Mapping[str, float | Range]) -> dict[str, Any]:
+        """``values`` in the units that were given, by their names there; empty where none were."""
+        found = {}
+        for name, value in values.items() if self.shaft else ():
+            ends = [self.shaft.quantity(name, end) for end in (value if isinstance(value, tuple) else (value,))]
+            if ends[0] is not None:
+                numbers = [number for _, number, _ in ends]
+                found[ends[0][0]] = {"value": numbers if isinstance(value, tuple) else numbers[0], "units": ends[0][2]}
+        return found
+
+
+def _meant(name: str, value: Any, shaft: Any) -> str:
+    """The parameter that ``name`` gives, itself or in another unit."""
+    if shaft is None or name not in shaft.operation:
+        return name
+    return shaft.parameter(name, value[0] if isinstance(value, tuple) else value)[0]
+
+
+def _within(value: Any, ends: Range) -> Any:
+    """``value``, or both of a range, where it is next to an end of the atlas this end."""
+    if isinstance(value, tuple):
+        return tuple(_within(each, ends) for each in value)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return value
+    return next((end for end in ends if math.isclose(value, end, rel_tol=_SAME)), value)
+
+
+def _check_same(name: str, value: Any, fixed: float) -> None:
+    if isinstance(value, tuple) or not math.isclose(value, fixed, rel_tol=_SAME):
+        raise InputError(
+            f"{name} = {as_given(value)}: the atlas is made for {name} = {number(fixed)}; allowed is that value"
+        )
+
+
+@dataclass(frozen=True)
+class _Words:
+    """How messages name a parameter of the atlas, its range and its values: in the units that were given."""
+
+    name: str
+    allowed: str
+    convert: Callable[[float], float] = lambda value: value
+
+    @classmethod
+    def of(cls, atlas: StoredAtlas, shaft: Any, name: str) -> _Words:
+        physical = [shaft.quantity(name, end) for end in atlas.ranges[name]] if shaft else [None, None]
+        if physical[0] is None or physical[0][0] not in shaft.operation:
+            return cls(name, atlas.allowed(name))
+        (label, low, units), (_, high, _) = physical
+        allowed = f"{low:.10g} <= {label} <= {high:.10g}, in {units}"
+        return cls(label, allowed, lambda value: shaft.quantity(name, value)[1])
+
+    def given(self, value: Any) -> str:
+        """A value or a range as it was given."""
+        ends = value if isinstance(value, tuple) else (value,)
+        shown = tuple(self.convert(end) if isinstance(end, float) else end for end in ends)
+        return as_given(shown if isinstance(value, tuple) else shown[0])
+
+
+def _check_range(words: _Words, ends: Range, value: Any, wanted: bool) -> None:
+    allowed = f"allowed is {f'{words.name}=LOW:HIGH within ' if wanted else ''}{words.allowed}"
+    if value is None:
+        raise InputError(f"{words.name}: missing; {allowed}")
+    if isinstance(value, tuple) != wanted:
+        needed = "a range is needed" if wanted else "is a range"
+        raise InputError(f"{words.name} = {words.given(value)}: {needed}; {allowed}")
+    for end in value if wanted else (value,):
+        if isinstance(end, bool) or not isinstance(end, (int, float)) or not ends[0] <= end <= ends[1]:
+            raise InputError(f"{words.name} = {words.given(end)}: {allowed}")
+    if wanted and not value[0] < value[1]:
+        raise InputError(f"{words.name} = {words.given(value)}: allowed is a rising range")

@@ -1,0 +1,92 @@
+"""What there is to compute: systems, their parameters and analyses, and scene files, as plain text."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import drivetrain_jax
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Parameter, Variable
+from drivetrain_jax._wording import aligned, written
+from drivetrain_jax.analysis import get_analysis
+from drivetrain_jax.runs.scene import find_system
+from drivetrain_jax.runs.toml import entries
+from drivetrain_jax.systems import System, system_names
+
+
+def overview() -> str:
+    """Systems with their analyses, and the scenes found here."""
+    lines = ["Systems (drivetrain list SYSTEM describes one)", *aligned([_system_row(name) for name in system_names()])]
+    return "\n".join([*lines, *_scene_lines(None)]) + "\n"
+
+
+def _system_row(name: str) -> tuple[str, str]:
+    try:
+        system = find_system(name)
+    except InputError as error:
+        return name, str(error).partition(": ")[2]
+    return name, f"{system.title}; analyses: {', '.join(system.models)}"
+
+
+def describe(name: str) -> str:
+    """Parameters, presets, analyses with results and options, and scenes of one system."""
+    system = find_system(name)
+    lines = [f"{system.name}: {system.title}", f"  {system.source}", "", "Parameters"]
+    lines += aligned([_parameter_row(p) for p in system.parameters])
+    if system.physical:
+        lines += ["", "Physical units, instead of these for point, query and design"]
+        lines += aligned([(p.name, f"[{p.units}]", p.long_name, p.allowed) for p in system.physical.quantities])
+    if system.presets:
+        lines += ["", "Sets of values, to be copied into a scene"]
+        lines += aligned([(preset, ", ".join(entries(values))) for preset, values in system.presets.items()])
+    for analysis in system.models:
+        lines += ["", *_analysis_lines(analysis, system)]
+    return "\n".join([*lines, *_scene_lines(system)]) + "\n"
+
+
+def _analysis_lines(name: str, system: System) -> list[str]:
+    analysis = get_analysis(name)
+    lacking = analysis.lacks(system)
+    lines = [f"Analysis {name}: {analysis.title}"]
+    lines += aligned(
+        [_variable_row(v, v.name in analysis.default_outputs) for v in analysis.variables if v.name not in lacking]
+    )
+    lines += [
+        "  (* computed unless outputs says otherwise)",
+        "  Methods and the options they use, the first by default",
+    ]
+    methods = [
+        (method, analysis.method_titles.get(method, ""), ", ".join(used))
+        for method, used in analysis.methods.items()
+        if method not in lacking
+    ]
+    lines += ["  " + line for line in aligned(methods)]
+    return [*lines, "  Options", *("  " + line for line in aligned([_parameter_row(o) for o in analysis.options]))]
+
+
+def _parameter_row(parameter: Parameter) -> tuple[str, ...]:
+    given = "none" if parameter.default in ((), "") else written(parameter.default)
+    default = "required" if parameter.default is None else f"default {given}"
+    default = f"default {parameter.derived}" if parameter.derived else default
+    return parameter.name, f"[{parameter.units}]", parameter.long_name, default, parameter.allowed
+
+
+def _variable_row(variable: Variable, default: bool) -> tuple[str, ...]:
+    meaning = variable.long_name + (f": {', '.join(variable.flags)}" if variable.flags else "")
+    return f"{variable.name}{'*' if default else ''}", f"[{variable.units}]", meaning, ", ".join(variable.dims)
+
+
+def _scene_lines(system: System | None) -> list[str]:
+    """Scene files in ``sweeps/`` of the working folder, or of the checkout that the package is installed from."""
+    folders = (Path("sweeps"), Path(drivetrain_jax.__file__).parents[1] / "sweeps")
+    folder = next((f for f in folders if f.is_dir()), None)
+    rows = []
+    for path in sorted(folder.glob("*.toml")) if folder else ():
+        try:
+            content = tomllib.loads(path.read_text("utf-8"))
+        except (OSError, ValueError, RecursionError):
+            continue
+        if system is None or content.get("system") == system.name:
+            rows.append((f"{folder.name}/{path.name}", str(content.get("title", ""))))
+    return ["", "Scenes", *aligned(rows)] if rows else []

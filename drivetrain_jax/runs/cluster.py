@@ -1,0 +1,91 @@
+"""Chunks computed on a Dask cluster: this process plans and writes, the workers compute and hand back arrays."""
+
+from __future__ import annotations
+
+import logging
+import re
+import uuid
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+from drivetrain_jax._errors import InputError, Passing
+from drivetrain_jax.runs import worker
+from drivetrain_jax.runs.executor import IN_FLIGHT, Results
+from drivetrain_jax.runs.plan import Chunk
+from drivetrain_jax.runs.worker import Job
+
+_PATIENCE = "10s"
+_LOCAL = re.compile(r"local:([1-9]\d*)")
+# What these libraries say of their own accord when a scheduler or a worker dies; here that is one line, or no news.
+_TALKATIVE = ("distributed", "tornado", "asyncio")
+
+
+def run_cluster(chunks: Iterable[Chunk], job: Job, address: str) -> Iterator[tuple[Chunk, Results | None]]:
+    """``(chunk, results)`` in the order of completion, from the scheduler at ``address`` or from ``local:N`` processes.
+
+    A chunk whose worker died is computed again elsewhere; results are None for one at which too many died (Dask's
+    setting ``distributed.scheduler.allowed-failures``). An exception of a chunk is raised here; a scheduler that
+    vanishes is a :class:`Passing`.
+    """
+    distributed = _distributed()
+    with ExitStack() as stack:
+        client = _connect(distributed, address, stack)
+        remaining, running = iter(chunks), {}
+        finished = distributed.as_completed(loop=client.loop)
+        room = IN_FLIGHT * max(sum(client.nthreads().values()), 1)
+        # A scheduler gives two tasks of one key one result, and other runs have other points under the same numbers.
+        run = uuid.uuid4().hex
+        while True:
+            while len(running) < room and (chunk := next(remaining, None)) is not None:
+                future = client.submit(worker.compute, job, chunk, key=f"chunk-{chunk.number}-{run}")
+                running[future.key] = chunk
+                finished.add(future)
+            if not running:
+                return
+            future = next(finished)
+            yield running.pop(future.key), _result(distributed, future)
+            future.release()
+
+
+def check_scheduler(address: str) -> None:
+    """Raises :class:`InputError` if none answers there. One of this process's own is only started when it has work."""
+    distributed = _distributed()
+    if not _LOCAL.fullmatch(address):
+        with ExitStack() as stack:
+            _connect(distributed, address, stack)
+
+
+def _result(distributed: Any, future: Any) -> Results | None:
+    try:
+        return future.result()
+    except distributed.KilledWorker:
+        return None
+    except (distributed.CancelledError, OSError) as error:
+        raise Passing(f"dask: the scheduler is gone ({type(error).__name__})") from error
+
+
+def _connect(distributed: Any, address: str, stack: ExitStack) -> Any:
+    local = _LOCAL.fullmatch(address)
+    if local:
+        cluster = distributed.LocalCluster(
+            n_workers=int(local.group(1)), threads_per_worker=1, processes=True, dashboard_address=None
+        )
+        address = stack.enter_context(cluster).scheduler_address
+    try:
+        return stack.enter_context(distributed.Client(address, timeout=_PATIENCE, set_as_default=False))
+    except (OSError, ValueError) as error:
+        raise InputError(f"dask = {address!r}: no scheduler answers there; {type(error).__name__}") from None
+
+
+def _distributed() -> Any:
+    try:
+        import distributed
+    except ImportError:
+        raise InputError(
+            "dask: the package distributed is not installed; install drivetrain_jax[distributed]"
+        ) from None
+    for name in (*_TALKATIVE, *logging.root.manager.loggerDict):
+        if name.split(".")[0] in _TALKATIVE:
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+    return distributed

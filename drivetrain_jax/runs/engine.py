@@ -1,0 +1,127 @@
+"""A scene made ready: solvers, plan and kernels, and the function that computes one chunk."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterable, Iterator, Mapping, Set
+from concurrent.futures import Future
+from functools import cached_property
+from typing import Any
+
+import jax
+import numpy as np
+
+from drivetrain_jax._errors import ChunkError, InputError, Passing
+from drivetrain_jax._threads import threads
+from drivetrain_jax.runs import compile_cache
+from drivetrain_jax.runs.grid import Grid
+from drivetrain_jax.runs.identity import numerics_of, scene_digest
+from drivetrain_jax.runs.kernel import Kernel, for_device, is_small, kernel_of
+from drivetrain_jax.runs.plan import Chunk, Plan, make_plan
+from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.store.provenance import digest
+
+# Kernels that are compiled at a time.
+_SIDE_BY_SIDE = 8
+
+
+class Engine:
+    """Computes the chunks of one scene. Everything costly is made on first use.
+
+    ``points`` restricts the plan to these points of the grid; ``full_size`` see :func:`make_plan`.
+    """
+
+    def __init__(self, scene: Scene, points: np.ndarray | None = None, *, full_size: bool = False) -> None:
+        # Before the first kernel, which may be one that a plan asks for.
+        _use_double_precision()
+        compile_cache.enable()
+        self.scene = scene
+        self.grid = Grid.of(scene)
+        self.solvers = tuple(map(for_device, scene.analysis.solvers(scene.system, scene.request)))
+        self._points, self._full_size = points, full_size
+        self._kernels: dict[tuple[int, int], Future[Kernel]] = {}
+        self._lock = threading.Lock()
+
+    def only(self, points: np.ndarray) -> Engine:
+        """The same for these points of the grid."""
+        return Engine(self.scene, points, full_size=self._full_size)
+
+    @cached_property
+    def numerics(self) -> str:
+        """Digest of the code and the machine that compute."""
+        return digest(self.numerics_detail)
+
+    @cached_property
+    def numerics_detail(self) -> dict[str, Any]:
+        """What that digest is of, piece by piece."""
+        return numerics_of(self.scene)
+
+    @property
+    def numerics_attrs(self) -> dict[str, str]:
+        """Both as a result and a plan keep them."""
+        return {"numerics": self.numerics, "numerics_detail": json.dumps(self.numerics_detail)}
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of everything that decides the result."""
+        return scene_digest(self.scene, self.solvers, self.numerics)
+
+    @cached_property
+    def plan(self) -> Plan:
+        """Solver and chunk of every point."""
+        return make_plan(self.solvers, self.grid, self._points, full_size=self._full_size)
+
+    @cached_property
+    def _small(self) -> bool:
+        return not self._full_size and is_small(self.grid, self.solvers)
+
+    @property
+    def total(self) -> int:
+        """Number of points, those along a path counted one by one."""
+        return (self.grid.size if self._points is None else len(self._points)) * self.grid.path_length
+
+    @property
+    def hopeless(self) -> int:
+        """Number of points that no solver can do; they are done before anything is computed, without a value."""
+        return self.total - self.plan.size * self.grid.path_length
+
+    def ordered(self, numbers: Iterable[int]) -> Iterator[Chunk]:
+        """The chunks with these numbers in the order in which they are to be computed, each made when it is asked for."""
+        return map(self.plan.chunk, self.plan.ordered(numbers))
+
+    def prepare(self, kernels: Set[tuple[int, int]]) -> None:
+        """Begin to compile kernels (position of the solver, size of chunks), side by side, without waiting for them."""
+        with self._lock:
+            missing = kernels - self._kernels.keys()
+            if not missing:
+                return
+            pool = threads(_SIDE_BY_SIDE, "compile")
+            for index, size in missing:
+                solver = self.solvers[index]
+                few = self._small and not solver.lengthy
+                self._kernels[index, size] = pool.submit(kernel_of, self.scene, self.grid, solver, size, few)
+
+    def compute_chunk(self, chunk: Chunk) -> Mapping[str, np.ndarray]:
+        """Results of one chunk; may be called from several threads. Raises :class:`ChunkError`."""
+        self.prepare({(chunk.solver, chunk.size)})
+        try:
+            kernel = self._kernels[chunk.solver, chunk.size].result()
+            return kernel(self.grid.columns(chunk.points), chunk.effort)
+        except Exception as error:
+            solver = self.solvers[chunk.solver].name
+            kind = Passing if _may_pass(error) else ChunkError
+            raise kind(f"chunk {chunk.number} ({solver}): {type(error).__name__}: {error}") from error
+
+
+def _use_double_precision() -> None:
+    """Set jax to double precision again where it has been set to another since: nothing else would tell."""
+    jax.config.update("jax_enable_x64", True)
+    if not jax.config.jax_enable_x64:
+        # A context holds for its own thread and does not reach those that compute.
+        raise InputError("jax_enable_x64 = False: set by the context of this call; allowed is a call outside of it")
+
+
+def _may_pass(error: Exception) -> bool:
+    # XLA says that memory is short with an error of its own.
+    return isinstance(error, (OSError, MemoryError)) or "RESOURCE_EXHAUSTED" in str(error)

@@ -1,0 +1,107 @@
+"""Why a result, or unfinished work, is not that of a scene: what differs, in words."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+import drivetrain_jax
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._wording import clipped, counted
+from drivetrain_jax.analysis.atlas import ANALYSIS
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.identity import EVALUATES_ATLAS, scene_content
+from drivetrain_jax.runs.scene import Scene, load_scene
+
+
+def differences(stored: Mapping[str, Any], engine: Engine, *, points: bool = True) -> list[str]:
+    """What keeps stored work from being that of ``engine``: its ``scene`` (TOML), ``drivetrain_jax_version``, ``numerics``
+    and, if known, ``numerics_detail``. Without ``points`` its axes, fixed values and results may be others, as long as all
+    results wanted are there."""
+    try:
+        scene = load_scene(tomllib.loads(str(stored.get("scene"))))
+    except (InputError, tomllib.TOMLDecodeError) as error:
+        return [f"its scene can no longer be read ({' '.join(str(error).split())})"]
+    found = list(_of_scenes(scene, engine.scene, points))
+    if stored.get("drivetrain_jax_version") != drivetrain_jax.__version__:
+        found.append(f"drivetrain_jax is {drivetrain_jax.__version__}, was {stored.get('drivetrain_jax_version')}")
+    if stored.get("numerics") != engine.numerics:
+        found += _of_numerics(stored.get("numerics_detail"), engine.numerics_detail)
+    return found
+
+
+def _of_scenes(theirs: Scene, ours: Scene, points: bool) -> Iterator[str]:
+    old, new = scene_content(theirs), scene_content(ours)
+    for key in ("system", "analysis", "method"):
+        if old[key] != new[key]:
+            yield f"{key} is {new[key]}, was {old[key]}"
+    yield from _of_tables("options", old["options"], new["options"])
+    if points:
+        if old["outputs"] != new["outputs"]:
+            yield f"outputs are {', '.join(new['outputs'])}, were {', '.join(old['outputs'])}"
+        yield from _of_tables("fixed", old["fixed"], new["fixed"])
+        yield from _of_axes(theirs, ours)
+    elif missing := [name for name in new["outputs"] if name not in old["outputs"]]:
+        yield f"lacks {', '.join(missing)}"
+
+
+def _of_tables(table: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+    for name in sorted({*old, *new}):
+        if old.get(name) != new.get(name):
+            yield f"{table}.{name} is {_text(new.get(name))}, was {_text(old.get(name))}"
+
+
+def _of_axes(theirs: Scene, ours: Scene) -> Iterator[str]:
+    old, new = ({axis.name: axis.values for axis in scene.axes} for scene in (theirs, ours))
+    if list(old) != list(new) or theirs.zipped != ours.zipped:
+        kinds = ["points" if scene.zipped else "axes" for scene in (ours, theirs)]
+        yield f"{kinds[0]} are {', '.join(new) or 'none'}, {kinds[1]} were {', '.join(old) or 'none'}"
+        return
+    for name, values in new.items():
+        if not np.array_equal(values, old[name]):
+            now, before = (_range(each, ours) for each in (values, old[name]))
+            yield f"{'points' if ours.zipped else 'axes'}.{name} has {now}, had {before}"
+
+
+def _range(values: np.ndarray, scene: Scene) -> str:
+    if scene.analysis.name == ANALYSIS.name:
+        return f"the range from {values[0]:.10g} to {values[-1]:.10g}"
+    ends = f"at {values[0]:.10g}" if len(values) == 1 else f"from {values[0]:.10g} to {values[-1]:.10g}"
+    return f"{counted(len(values), 'value', 'values')} {ends}"
+
+
+def _of_numerics(stored: str | None, present: Mapping[str, Any]) -> list[str]:
+    """Versions, sources and machine one by one, as far as they were recorded."""
+    try:
+        old = json.loads(stored or "")
+    except ValueError:
+        return ["the code, a version or the machine is another one"]
+    found = []
+    for key, value in present.items():
+        before = old.get(key)
+        if isinstance(value, Mapping) and isinstance(before, Mapping):
+            names = {*value, *before}
+            if key == "sources" and (EVALUATES_ATLAS in value) != (EVALUATES_ATLAS in before):
+                found.append(f"points are {_route(value)}, were {_route(before)}")
+                # The files that only one of the two ways runs have not changed.
+                names = {*value} & {*before}
+            changed = [name for name in sorted(names) if value.get(name) != before.get(name)]
+            if key == "versions":
+                found += [f"{name} is {value.get(name)}, was {before.get(name)}" for name in changed]
+            elif changed:
+                found.append(f"the code has changed in {', '.join(changed[:3])}{', ...' if len(changed) > 3 else ''}")
+        elif value != before:
+            found.append(f"{key} is {_text(value)}, was {_text(before)}")
+    return found or ["the code, a version or the machine is another one"]
+
+
+def _route(sources: Mapping[str, str]) -> str:
+    return "evaluated through an atlas" if EVALUATES_ATLAS in sources else "solved directly"
+
+
+def _text(value: Any) -> str:
+    return "not given" if value is None else clipped(str(list(value) if isinstance(value, tuple) else value))

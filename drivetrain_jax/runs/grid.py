@@ -1,0 +1,107 @@
+"""The points of a scene by number: parameter values on demand, so that a grid never exists as a whole."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drivetrain_jax.runs.axes import Axis
+from drivetrain_jax.runs.scene import Scene, Value
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Points numbered from 0 in C order of ``axes`` (``shape``), or one point per entry of ``axes`` if ``zipped``.
+
+    With a path axis a point is a whole line: ``axes`` lacks ``path``, which is number ``path_position`` among the axes
+    of the scene, or None if it is a line of one fixed value.
+    """
+
+    axes: tuple[Axis, ...]
+    zipped: bool
+    fixed: Mapping[str, Value]
+    parameters: tuple[str, ...]
+    path: Axis | None = None
+    path_position: int | None = None
+
+    @classmethod
+    def of(cls, scene: Scene) -> Grid:
+        """The grid of ``scene``; a fixed path parameter makes lines of one value."""
+        parameters = scene.system.models[scene.analysis.name].parameters
+        name = scene.path_axis
+        if name is None:
+            return cls(scene.axes, scene.zipped, scene.fixed, parameters)
+        position = next((i for i, axis in enumerate(scene.axes) if axis.name == name), None)
+        if position is None:
+            path = Axis(name, scene.system.parameter(name), None, np.array([scene.fixed[name]]))
+            return cls(scene.axes, scene.zipped, scene.fixed, parameters, path)
+        others = scene.axes[:position] + scene.axes[position + 1 :]
+        return cls(others, scene.zipped, scene.fixed, parameters, scene.axes[position], position)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Lengths of the axes; one length if they are zipped."""
+        lengths = tuple(len(axis.values) for axis in self.axes)
+        return lengths[:1] if self.zipped else lengths
+
+    @property
+    def size(self) -> int:
+        """Number of points (lines, if there is a path)."""
+        return math.prod(self.shape)
+
+    @property
+    def path_length(self) -> int:
+        """Number of results along a line, 1 without a path."""
+        return 1 if self.path is None else len(self.path.values)
+
+    @property
+    def path_is_fixed(self) -> bool:
+        """Whether the path is a line of one fixed value, and so no dimension of the result."""
+        return self.path is not None and self.path_position is None
+
+    @property
+    def result_shape(self) -> tuple[int, ...]:
+        """Lengths of the axes in the order of the scene, the path among them."""
+        if self.path_position is None:
+            return self.shape
+        return (*self.shape[: self.path_position], self.path_length, *self.shape[self.path_position :])
+
+    def place(self, points: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Indices of ``points`` in an array of shape ``shape``."""
+        # No axis at all is one point, of which unravel_index knows nothing.
+        return np.unravel_index(points, self.shape) if self.shape else (np.newaxis,)
+
+    def columns(self, points: np.ndarray) -> dict[str, np.ndarray]:
+        """Values of the varying parameters at ``points``, by name of the axis, each of the shape of ``points``."""
+        if self.zipped:
+            return {axis.name: axis.values[points] for axis in self.axes}
+        return {axis.name: axis.values[i] for axis, i in zip(self.axes, self.place(points), strict=False)}
+
+    def bind(self, columns: Mapping[str, Any]) -> dict[str, Any]:
+        """All parameters of the model: the fixed ones, ``columns`` of the varying ones, and the path as a whole."""
+        values: dict[str, Any] = dict(self.fixed)
+        varying = [(axis, columns[axis.name]) for axis in self.axes]
+        if self.path is not None:
+            varying.append((self.path, self.path.values))
+        for axis, value in varying:
+            name = axis.parameter.name
+            if axis.entry is None:
+                values[name] = value
+            else:
+                values[name] = (*values[name][: axis.entry], value, *values[name][axis.entry + 1 :])
+        # A derived parameter that is not given is the model's own affair.
+        return {name: values[name] for name in self.parameters if name in values}
+
+    def arrays(self, points: np.ndarray) -> dict[str, Any]:
+        """Like ``bind`` at ``points``, with every number (and entry of a list) an array of the shape of ``points``."""
+        return {name: self._spread(value, points.shape) for name, value in self.bind(self.columns(points)).items()}
+
+    def _spread(self, value: Any, shape: tuple[int, ...]) -> Any:
+        if isinstance(value, tuple):
+            return tuple(self._spread(entry, shape) for entry in value)
+        whole = isinstance(value, str) or (self.path is not None and value is self.path.values)
+        return value if whole else np.broadcast_to(value, shape)

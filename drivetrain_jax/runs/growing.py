@@ -1,0 +1,311 @@
+"""Points that another result holds already: a longer axis, a finer grid, one more axis, or a part of what was computed.
+
+Values are taken only from a result of the same numerics (code, versions, instruction set), method, options and fixed
+values. They meet the same tolerance as computed ones, but need not agree with those to the last bit: how many steps a point
+takes follows from the points that share its chunk.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.runs.assemble import sweep_first
+from drivetrain_jax.runs.axes import entry_of
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.explain import differences
+from drivetrain_jax.runs.grid import Grid
+from drivetrain_jax.runs.scene import Scene, load_scene
+from drivetrain_jax.store import checksums
+from drivetrain_jax.store.consolidate import map_variable, read_attribute
+from drivetrain_jax.store.provenance import digest
+from drivetrain_jax.store.shards import is_store
+
+# Points entered at a time.
+_BLOCK = 1 << 18
+# Values of an axis agree within so many roundings; the same value comes out of different counts of steps.
+_ROUNDINGS = 4 * np.finfo(float).eps
+
+
+class NotReusable(InputError):
+    """Why nothing of a result can stand for points of a scene."""
+
+
+class Damaged(NotReusable):
+    """A result is not what was written; ``what`` of it."""
+
+    def __init__(self, path: Path, what: str) -> None:
+        allowed = "allowed is to restore the file or to compute it again"
+        super().__init__(f"reuse = {str(path)!r}: not what was written ({what}); {allowed}")
+        self.what = what
+
+
+@dataclass(frozen=True)
+class Source:
+    """Results in the file ``path`` of another scene: ``theirs[i]`` is the same point as ``ours[i]`` of ours.
+
+    ``is_covered`` says whether all of its points and all of its results are wanted, so that replacing it loses nothing.
+    """
+
+    path: Path
+    digest: str
+    grid: Grid
+    theirs: np.ndarray
+    ours: np.ndarray
+    is_covered: bool
+
+    def blocks(self, names: Sequence[str]) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+        """Our points and their results, some at a time; nothing is loaded as a whole."""
+        arrays = {name: sweep_first(map_variable(self.path, name), self.grid) for name in names}
+        for start in range(0, self.ours.size, _BLOCK):
+            place = self.grid.place(self.theirs[start : start + _BLOCK])
+            results = {name: np.array(array[place]) for name, array in arrays.items()}
+            if self.grid.path_is_fixed:
+                results = {name: values[:, None] for name, values in results.items()}
+            yield self.ours[start : start + _BLOCK], results
+
+
+@dataclass(frozen=True)
+class Taken:
+    """The points that are taken from ``sources``, which share none."""
+
+    sources: tuple[Source, ...]
+
+    @property
+    def points(self) -> np.ndarray:
+        """Their numbers, rising."""
+        return np.sort(np.concatenate([np.empty(0, np.int64), *(source.ours for source in self.sources)]))
+
+    @property
+    def count(self) -> int:
+        """How many results they have, those along a path one by one."""
+        return sum(source.ours.size * source.grid.path_length for source in self.sources)
+
+    @property
+    def digest(self) -> str | None:
+        """Identifies them, None if there are none: the chunks of the others depend on it."""
+        if not self.sources:
+            return None
+        return digest([[source.digest, source.ours] for source in self.sources])
+
+    @property
+    def attrs(self) -> dict[str, str | int]:
+        """What a result says of them."""
+        if not self.sources:
+            return {}
+        return {"reused_points": self.count, "reused_from": " ".join(s.digest for s in self.sources)}
+
+    def blocks(self, names: Sequence[str]) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+        """Their numbers and the results ``names``, some points at a time."""
+        for source in self.sources:
+            yield from source.blocks(names)
+
+
+NOTHING = Taken(())
+
+
+def rest_of(engine: Engine, taken: Taken) -> Engine:
+    """``engine`` for the points that are not taken."""
+    if not taken.sources:
+        return engine
+    left = np.ones(engine.grid.size, bool)
+    left[taken.points] = False
+    return engine.only(np.flatnonzero(left))
+
+
+def take(engine: Engine, found: Iterable[Source]) -> Taken:
+    """The points of ``engine`` that these results hold, each from the first that has it."""
+    free = np.ones(engine.grid.size, bool)
+    sources = []
+    for source in found:
+        keep = free[source.ours]
+        free[source.ours] = False
+        sources.append(replace(source, theirs=source.theirs[keep], ours=source.ours[keep]))
+    return Taken(tuple(source for source in sources if source.ours.size))
+
+
+def find(engine: Engine, path: Path) -> Source:
+    """What the result at ``path`` holds of the points of ``engine``; lost points do not count. Raises
+    :class:`NotReusable`, or :class:`InputError` if there is no readable result."""
+    if not path.is_file():
+        raise NotReusable(f"reuse = {str(path)!r}: {_no_file(path)}")
+    names = ("scene", "digest", "drivetrain_jax_version", "numerics", "numerics_detail")
+    attrs = {name: read_attribute(path, name) for name in names}
+    if attrs["digest"] is None:
+        raise NotReusable(f"reuse = {str(path)!r}: not a result of drivetrain_jax; allowed is such a result")
+    if reasons := differences(attrs, engine, points=False):
+        raise NotReusable(f"reuse = {str(path)!r}: {reasons[0]}; allowed is a result that differs in its points only")
+    _check_intact(path)
+    scene = load_scene(tomllib.loads(str(attrs["scene"])))
+    grid = Grid.of(scene)
+    theirs, ours = _same_points(scene, grid, engine.scene, engine.grid)
+    none = NotReusable(f"reuse = {str(path)!r}: holds none of the points; allowed is a result that shares some")
+    if not theirs.size:
+        raise none
+    outcome = sweep_first(map_variable(path, OUTCOME.name), grid)[grid.place(theirs)]
+    kept = ~(outcome == Outcome.LOST).any(axis=tuple(range(1, outcome.ndim)))
+    if not kept.any():
+        raise none
+    theirs, ours = theirs[kept], ours[kept]
+    wanted = set(scene.request.outputs) <= set(engine.scene.request.outputs)
+    # Several of our points may be one of theirs, and the other way round.
+    is_covered = wanted and np.unique(theirs).size == grid.size
+    ours, first = np.unique(ours, return_index=True)
+    return Source(path, str(attrs["digest"]), grid, theirs[first], ours, is_covered)
+
+
+def _no_file(path: Path) -> str:
+    if is_store(path):
+        return "is a Zarr store; allowed is the file that `drivetrain export` makes of it"
+    what = "is a folder" if path.is_dir() else "does not exist"
+    return f"{what}; allowed is a result written by `drivetrain run`"
+
+
+def _check_intact(path: Path) -> None:
+    """Whatever is taken over gets checksums of its own: nobody would find the damage afterwards."""
+    try:
+        wrong = checksums.damaged(path)
+    except InputError:
+        raise Damaged(path, "its structure") from None
+    if wrong or wrong is None:
+        raise Damaged(path, checksums.named(wrong) if wrong else "it has no checksums")
+
+
+def _same_points(scene: Scene, grid: Grid, our_scene: Scene, our_grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of the points that both grids have, pairwise; none if lines or fixed values differ."""
+    nothing = np.empty(0, np.int64), np.empty(0, np.int64)
+    if not (_same_lines(grid, our_grid) and _same_fixed(scene, our_scene)):
+        return nothing
+    if grid.zipped and our_grid.zipped:
+        return _same_rows(grid, our_grid)
+    if grid.zipped:
+        ours, theirs = _inside(our_scene, our_grid, scene, grid)
+        return theirs, ours
+    return _inside(scene, grid, our_scene, our_grid)
+
+
+def _same_lines(grid: Grid, other: Grid) -> bool:
+    if grid.path is None or other.path is None:
+        return grid.path is other.path
+    same = grid.path.name == other.path.name and np.array_equal(grid.path.values, other.path.values)
+    return same and grid.path_is_fixed == other.path_is_fixed
+
+
+def _same_fixed(scene: Scene, other: Scene) -> bool:
+    """Whether the parameters that neither of them varies agree, as far as the analysis uses them."""
+    varied = {axis.name for axis in (*scene.axes, *other.axes)}
+    used = scene.system.models[scene.analysis.name].parameters
+
+    def constant(values: Mapping[str, Any]) -> dict[str, Any]:
+        kept = {}
+        for name in used:
+            if name in varied or name not in values:
+                continue
+            value = values[name]
+            if isinstance(value, tuple):
+                value = tuple(None if f"{name}[{i}]" in varied else entry for i, entry in enumerate(value))
+            kept[name] = value
+        return kept
+
+    return constant(scene.fixed) == constant(other.fixed)
+
+
+def _value(scene: Scene, name: str) -> float | None:
+    """The fixed number that stands for the axis ``name`` of another scene, None if there is none."""
+    base, entry = entry_of(name)
+    value = scene.fixed.get(base)
+    if entry is not None:
+        value = value[entry] if isinstance(value, tuple) and entry < len(value) else None
+    return value if isinstance(value, (int, float)) else None
+
+
+def _matters(scene: Scene, name: str) -> bool:
+    return entry_of(name)[0] in scene.system.models[scene.analysis.name].parameters
+
+
+def _at(scene: Scene, name: str, values: np.ndarray) -> np.ndarray:
+    """0 where one of ``values`` is what ``scene`` fixes under this ``name``, else -1."""
+    fixed = _value(scene, name)
+    if not _matters(scene, name):
+        return np.zeros(len(values), np.int64)
+    return np.full(len(values), -1) if fixed is None else _positions(np.array([fixed]), values)
+
+
+def _among(scene: Scene, name: str, values: np.ndarray) -> int:
+    """Position among ``values`` of what ``scene`` fixes under this ``name``, -1 if it is not there."""
+    fixed = _value(scene, name)
+    if not _matters(scene, name):
+        return 0
+    return -1 if fixed is None else int(_positions(values, np.array([fixed]))[0])
+
+
+def _inside(scene: Scene, grid: Grid, other_scene: Scene, other: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the outer product ``grid``, and those of ``other`` that are the same ones."""
+    axes, theirs = ({axis.name: axis.values for axis in one.axes} for one in (grid, other))
+    # Position along each axis of ``grid`` for each value along each axis of ``other``; -1 where there is none.
+    along = {
+        name: _positions(axes[name], values) if name in axes else _at(scene, name, values)
+        for name, values in theirs.items()
+    }
+    constant = {name: _among(other_scene, name, axes[name]) for name in axes.keys() - theirs.keys()}
+    if min(constant.values(), default=0) < 0:
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    columns = [along[axis.name] for axis in other.axes]
+    if other.zipped:
+        chosen = np.flatnonzero(np.all([column >= 0 for column in columns], axis=0)) if columns else np.zeros(1, int)
+        index = {axis.name: column[chosen] for axis, column in zip(other.axes, columns, strict=True)}
+    else:
+        kept = [np.flatnonzero(column >= 0) for column in columns]
+        mesh = np.meshgrid(*kept, indexing="ij")
+        chosen = np.ravel_multi_index([m.ravel() for m in mesh], other.shape) if kept else np.zeros(1, int)
+        index = {a.name: c[m.ravel()] for a, c, m in zip(other.axes, columns, mesh, strict=True)}
+    place = [np.broadcast_to(index.get(axis.name, constant.get(axis.name)), chosen.shape) for axis in grid.axes]
+    return (np.ravel_multi_index(place, grid.shape) if place else np.zeros(chosen.shape, int)), chosen
+
+
+def _positions(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Position of each of ``wanted`` among ``values``, -1 where there is none, up to the roundings of an axis."""
+    order = np.argsort(values)
+    rising = values[order].astype(float)
+    right = np.clip(np.searchsorted(rising, wanted), 0, len(rising) - 1)
+    left = np.maximum(right - 1, 0)
+    nearest = np.where(abs(rising[left] - wanted) < abs(rising[right] - wanted), left, right)
+    sought, place = np.unique(np.asarray(wanted, float), return_inverse=True)
+    own, other = _extents(rising)[nearest], _extents(sought)[place]
+    # Only what lies between the ends of an axis is rounded as they are; of two such axes neither may blur the other.
+    extent = np.where((own > 0) & (other > 0), np.minimum(own, other), np.maximum(own, other))
+    room = _ROUNDINGS * (abs(rising[nearest]) + extent)
+    return np.where(abs(rising[nearest] - wanted) <= room, order[nearest], -1)
+
+
+def _extents(rising: np.ndarray) -> np.ndarray:
+    """Length of the even axis on which each of these values would have its nearest neighbour; 0 for both ends, which are
+    exact."""
+    gaps = np.diff(rising)
+    between = np.minimum(gaps[1:], gaps[:-1]) * len(rising)
+    return np.pad(between, 1)[: len(rising)] if len(rising) > 1 else np.zeros(len(rising))
+
+
+def _same_rows(grid: Grid, other: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Two lists of points: equal rows, if both vary the same parameters. Every row that the other list has is in a pair."""
+    names = [axis.name for axis in grid.axes]
+    if sorted(names) != sorted(axis.name for axis in other.axes):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    theirs, ours = (_rows(one, names) for one in (grid, other))
+    their_place, our_place = ({row: i for i, row in enumerate(rows)} for rows in (theirs, ours))
+    pairs = [(their_place[row], i) for i, row in enumerate(ours) if row in their_place]
+    pairs += [(i, our_place[row]) for i, row in enumerate(theirs) if row in our_place]
+    found = np.array(pairs, np.int64).reshape(-1, 2)
+    return found[:, 0], found[:, 1]
+
+
+def _rows(grid: Grid, names: Sequence[str]) -> list[tuple[float, ...]]:
+    columns = {axis.name: axis.values.tolist() for axis in grid.axes}
+    return list(zip(*(columns[name] for name in names), strict=True))

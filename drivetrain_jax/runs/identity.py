@@ -1,0 +1,148 @@
+"""What decides every bit of a result: the scene and the numerics. Only work with the same digest may be resumed."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import os
+from collections.abc import Iterator, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import drivetrain_jax
+from drivetrain_jax._machine import instruction_set
+from drivetrain_jax.analysis import Solver
+from drivetrain_jax.runs.atlas_choice import uses_atlas
+from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.store.provenance import digest, source_digest, versions
+
+PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "numpy", "scipy")
+_ROOT = Path(drivetrain_jax.__file__).parent
+_ENGINE = ("runs/grid.py", "runs/plan.py", "runs/kernel.py")
+# The file that is among the sources of points that an atlas gives, and of no others.
+EVALUATES_ATLAS = "runs/through_atlas.py"
+_THROUGH_ATLAS = ("atlas/floquet.py", "runs/atlas_choice.py", "runs/rounds.py", EVALUATES_ATLAS)
+# What these packages hold decides numbers; what lies above them does not.
+_NUMERIC = ("drivetrain_jax._quantities", "drivetrain_jax.systems", "drivetrain_jax.analysis", "drivetrain_jax.atlas")
+
+
+def numerics_of(scene: Scene) -> dict[str, Any]:
+    """The code that this scene runs, the versions of all that computes, and the machine's instruction set: what decides
+    the bits of its numbers. Code of other systems and analyses may change without making a result stale."""
+    through_atlas = scene.analysis.continuous or uses_atlas(scene)
+    starts = [_ROOT / name for name in (*_ENGINE, *(_THROUGH_ATLAS if through_atlas else ()))]
+    for function in (scene.system.models[scene.analysis.name].build, scene.analysis.solvers):
+        # Neither a partial nor what is wrapped around a method has a source of its own.
+        starts.append(Path(inspect.getsourcefile(inspect.unwrap(getattr(function, "func", function))) or ""))
+    return {
+        "sources": {name: _source_digest(name, path) for name, path in _sources(tuple(starts))},
+        "versions": versions(PACKAGES),
+        "x64": bool(jax.config.jax_enable_x64),
+        "backend": jax.default_backend(),
+        "flags": os.environ.get("XLA_FLAGS", ""),
+        "instructions": " ".join(sorted(instruction_set())),
+    }
+
+
+# The code that runs is the one that was there when it was imported, not one that is edited since.
+@cache
+def _source_digest(name: str, path: Path) -> str:
+    return source_digest({name: path})
+
+
+@cache
+def _sources(starts: tuple[Path, ...]) -> tuple[tuple[str, Path], ...]:
+    """The files ``starts`` and all numeric code that they import, by name."""
+    return tuple(sorted((_label(path), path) for path in _imported(starts)))
+
+
+def _label(path: Path) -> str:
+    return path.relative_to(_ROOT if _ROOT in path.parents else _home(path)).as_posix()
+
+
+@cache
+def _home(path: Path) -> Path:
+    """The folder that the package of a source file lies in."""
+    folder = path.parent
+    while (folder / "__init__.py").is_file():
+        folder = folder.parent
+    return folder
+
+
+def _imported(starts: Sequence[Path]) -> set[Path]:
+    """The source files ``starts`` and what they import, directly or not, from their own packages and the numeric ones."""
+    found: set[Path] = set()
+    waiting = [path for path in starts if path.is_file()]
+    while waiting:
+        path = waiting.pop()
+        if path not in found:
+            found.add(path)
+            waiting += [file for name in _imports(path) for file in _files(name, path)]
+    return found
+
+
+@cache
+def _imports(path: Path) -> tuple[str, ...]:
+    """Dotted names that a source file imports, those of ``from x import y`` as ``x.y``."""
+    package = path.relative_to(_home(path)).parts[:-1]
+    names: list[str] = []
+    for node in _statements(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else ()
+            module = ".".join((*above, *filter(None, [node.module])))
+            names += [f"{module}.{alias.name}" for alias in node.names]
+    return (*names, ".".join(package)) if package else tuple(names)
+
+
+def _statements(node: ast.AST) -> Iterator[ast.AST]:
+    """All statements within ``node``; to look at every expression as well would take twice as long as to parse them."""
+    for block in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for inner in getattr(node, block, ()):
+            yield inner
+            yield from _statements(inner)
+
+
+@cache
+def _files(name: str, importer: Path) -> list[Path]:
+    """Modules that importing the dotted ``name`` runs: numeric code of this package, or code of that of ``importer``."""
+    home, parts, first = _home(importer), name.split("."), 0
+    if parts[0] == drivetrain_jax.__name__:
+        if not any(name == package or name.startswith(package + ".") for package in _NUMERIC):
+            return []
+        home, first = _ROOT.parent, 1
+    elif parts[0] != importer.relative_to(home).with_suffix("").parts[0]:
+        return []
+    stems = [home.joinpath(*parts[: k + 1]) for k in range(first, len(parts))]
+    return [file for stem in stems for file in (stem.with_suffix(".py"), stem / "__init__.py") if file.is_file()]
+
+
+def scene_content(scene: Scene) -> dict[str, Any]:
+    """What a scene asks for, its title apart."""
+    request = scene.request
+    return {
+        "system": scene.system.name,
+        "analysis": scene.analysis.name,
+        "outputs": request.outputs,
+        "method": request.method,
+        "options": dict(request.options),
+        "axes": [[axis.name, axis.values] for axis in scene.axes],
+        "zipped": scene.zipped,
+        "fixed": dict(scene.fixed),
+    }
+
+
+def scene_digest(scene: Scene, solvers: Sequence[Solver], numerics: str) -> str:
+    """Digest of what is computed: scene (not its title), sizes of chunks, package version, numerics."""
+    return digest(
+        scene_content(scene)
+        | {
+            "solvers": [[solver.name, solver.chunk, solver.unit_cost] for solver in solvers],
+            "version": drivetrain_jax.__version__,
+            "numerics": numerics,
+        }
+    )

@@ -1,0 +1,144 @@
+"""Compiled batches: the only place where points are batched and compiled, once for all scenes of a process."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._quantities import Variable
+from drivetrain_jax.analysis import Solver
+from drivetrain_jax.analysis.numerics.kernels import compiler_options, on_cpu, options_for_few
+from drivetrain_jax.runs.assemble import result_variables
+from drivetrain_jax.runs.grid import Grid
+from drivetrain_jax.runs.plan import make_plan
+from drivetrain_jax.runs.scene import Scene
+
+_LAPACK = threading.Lock()
+# A scene of so few points with so little predicted work, in the units of a plan, is computed in less time than it takes
+# to optimise its kernels.
+_FEW, _LIGHT = 128, 3e4
+# Points of a chunk on an accelerator: so many times those that suit a core, up to so many.
+_WIDER, _WIDEST = 64, 1 << 15
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A solver compiled ahead of time for chunks of ``chunk`` points; may be called from several threads."""
+
+    compiled: Callable[..., dict[str, Array]]
+    chunk: int
+    variables: tuple[Variable, ...]
+    turn: AbstractContextManager[object]
+
+    def __call__(self, columns: Mapping[str, np.ndarray], effort: int) -> dict[str, np.ndarray]:
+        """Results of up to ``chunk`` points, the points as first axis; a short chunk is padded with its last point."""
+        count = len(next(iter(columns.values()))) if columns else self.chunk
+        if count < self.chunk:
+            columns = {name: np.pad(values, (0, self.chunk - count), mode="edge") for name, values in columns.items()}
+        with self.turn:
+            results = {name: np.asarray(value) for name, value in self.compiled(columns, np.int64(effort)).items()}
+        arrays = {}
+        for variable in self.variables:
+            values = results[variable.name]
+            values = np.moveaxis(values, -1, 0)
+            arrays[variable.name] = np.ascontiguousarray(values[:count], dtype=variable.dtype)
+        return arrays
+
+
+def _batch(
+    solver: Solver, grid: Grid, chunk: int, variables: Sequence[Variable]
+) -> tuple[Callable[..., dict[str, Array]], dict[str, jax.ShapeDtypeStruct]]:
+    """The function of a whole chunk, and the kinds of its varying parameters."""
+    own = {v.name: len(v.dims) + (grid.path is not None) for v in variables}
+
+    def batch(columns: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+        # A result that depends on nothing that varies comes without lanes.
+        solved = solver.solve(grid.bind(columns), effort)
+        results = {name: jnp.asarray(value) for name, value in solved.items()}
+        spread = {n: v if v.ndim > own[n] else v[..., None] for n, v in results.items()}
+        return {n: jnp.broadcast_to(v, (*v.shape[:-1], chunk)) for n, v in spread.items()}
+
+    columns = {axis.name: jax.ShapeDtypeStruct((chunk,), axis.values.dtype) for axis in grid.axes}
+    return batch, columns
+
+
+def result_shapes(scene: Scene, grid: Grid, solver: Solver) -> dict[str, tuple[int, ...]]:
+    """The shape of every result at one point (or line); nothing is compiled or computed."""
+    variables = result_variables(scene)
+    batch, columns = _batch(solver, grid, 1, variables)
+    shapes = jax.eval_shape(batch, columns, jax.ShapeDtypeStruct((), np.int64))
+    return {v.name: shapes[v.name].shape[:-1] for v in variables}
+
+
+def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[Variable], few: bool = False) -> Kernel:
+    """Compile ``solver`` for chunks of ``chunk`` points of ``grid``, for ``few`` of them in all without optimising.
+
+    Fixed parameters are constants of the compiled code; the varying ones and the effort are its arguments.
+    """
+    batch, columns = _batch(solver, grid, chunk, variables)
+    lowered = jax.jit(batch).lower(columns, jax.ShapeDtypeStruct((), np.int64))
+    options = compiler_options(chunk, march=solver.march, short_loops=solver.short_loops)
+    compiled = lowered.compile(options_for_few() if few else options)
+    return Kernel(compiled, chunk, tuple(variables), _turn(compiled))
+
+
+def for_device(solver: Solver) -> Solver:
+    """``solver`` with chunks that keep the device of this process busy."""
+    return solver if on_cpu() else replace(solver, chunk=max(solver.chunk, min(_WIDER * solver.chunk, _WIDEST)))
+
+
+def is_small(grid: Grid, solvers: Sequence[Solver]) -> bool:
+    """Whether kernels are not worth optimising: by the whole grid, whatever part of it is computed where."""
+    return grid.size * grid.path_length <= _FEW and make_plan(solvers, grid).costs.sum() <= _LIGHT
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What a kernel is compiled for; two jobs are equal if one kernel of a size serves both."""
+
+    identity: tuple[Any, ...]
+    scene: Scene = field(compare=False)
+    grid: Grid = field(compare=False)
+    solver: Solver = field(compare=False)
+
+
+def kernel_of(scene: Scene, grid: Grid, solver: Solver, size: int, few: bool = False) -> Kernel:
+    """The kernel of ``solver`` for chunks of ``size`` points of ``scene``, made if no scene before needed the same; ``few``
+    see :func:`compile_kernel`."""
+    # What varies is an argument of the kernel, so one value of each axis is enough to keep.
+    axes = tuple(replace(axis, values=axis.values[:1]) for axis in grid.axes)
+    request = scene.request
+    path = None if grid.path is None else (grid.path.name, grid.path.values.tobytes())
+    identity = (
+        # The job keeps both alive, so that no other ones can take over their identities.
+        id(scene.system),
+        id(scene.analysis),
+        request.outputs,
+        request.method,
+        tuple(request.options.items()),
+        tuple(scene.fixed.items()),
+        tuple((axis.name, axis.values.dtype) for axis in axes),
+        path,
+        solver.name,
+    )
+    return _compiled(_Job(identity, replace(scene, axes=axes), replace(grid, axes=axes), solver), size, few)
+
+
+@lru_cache(maxsize=64)
+def _compiled(job: _Job, size: int, few: bool) -> Kernel:
+    return compile_kernel(job.solver, job.grid, size, result_variables(job.scene), few)
+
+
+def _turn(compiled: Any) -> AbstractContextManager[object]:
+    """What a call has to hold while it runs: LAPACK calls of XLA hand work to the thread pool that they run in and wait
+    for it, so that two kernels which make them can wait for each other for ever (seen with jax 0.10.2 on two cores)."""
+    return _LAPACK if 'custom_call_target="lapack_' in compiled.as_text() else nullcontext()

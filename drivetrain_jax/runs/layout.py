@@ -1,0 +1,49 @@
+"""Whether the file of a result is laid out as its scene says: a copy may have been cut, turned or transposed since."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from drivetrain_jax.runs.assemble import result_variables
+from drivetrain_jax.runs.grid import Grid
+from drivetrain_jax.runs.scene import Scene
+
+
+def rearranged(path: Path, scene: Scene, grid: Grid) -> list[str]:
+    """Names of the coordinates and results at ``path`` that have other values, dimensions or shapes than those of ``scene``.
+
+    Results are not read, so that this takes no time; whether they are what was written is for checksums to say.
+    """
+    try:
+        return _rearranged(path, scene, grid)
+    except (OSError, KeyError, ValueError, RuntimeError, TypeError):
+        return ["its structure"]
+
+
+def _rearranged(path: Path, scene: Scene, grid: Grid) -> list[str]:
+    dims = ("point",) if scene.zipped else tuple(axis.name for axis in scene.axes)
+    expected = {axis.name: axis.values for axis in scene.axes}
+    with h5py.File(path, "r") as file:
+        for own in scene.dimensions:
+            if own.name in file:
+                expected[own.name] = np.asarray(own.values or range(file[own.name].size))
+        wrong = [name for name, values in expected.items() if not _holds(file.get(name), values)]
+        for variable in result_variables(scene):
+            wrong += [] if _lies(file.get(variable.name), (*dims, *variable.dims), grid) else [variable.name]
+    return wrong
+
+
+def _holds(stored: h5py.Dataset | None, values: np.ndarray) -> bool:
+    if stored is None:
+        return False
+    words = h5py.check_string_dtype(stored.dtype) is not None
+    return np.array_equal((stored.asstr() if words else stored)[()], values)
+
+
+def _lies(stored: h5py.Dataset | None, dims: tuple[str, ...], grid: Grid) -> bool:
+    if stored is None or stored.shape[: len(grid.result_shape)] != grid.result_shape:
+        return False
+    return [scales[0].name if len(scales) else None for scales in stored.dims] == [f"/{dim}" for dim in dims]

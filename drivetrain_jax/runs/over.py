@@ -1,0 +1,231 @@
+"""Sweeps of functions: an analysis of the package, or any JAX function of a pytree, over a grid of its parameters."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax import functions
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analysis_names
+from drivetrain_jax.analysis.numerics.lanes import over_lanes
+from drivetrain_jax.runs.axes import Axis, entry_of
+from drivetrain_jax.runs.run import run
+from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.systems import Model, System
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# Points of a chunk of a function that nothing is known of.
+_CHUNK = 256
+# The fixed word that says what a function computes.
+_COMPUTES = "computes"
+
+
+def sweep(
+    function: Callable[..., Any],
+    system: Any,
+    over: Mapping[str, Any],
+    out: str | Path | None = None,
+    outputs: Sequence[str] | None = None,
+    **options: Any,
+) -> xr.Dataset:
+    """Results of ``function(system)`` over the outer product of ``over``, as one labelled dataset.
+
+    Args:
+        function: an analysis such as :func:`drivetrain_jax.floquet`, or any JAX function of a pytree that returns an array,
+            a dict of arrays, or what an analysis returns.
+        system: the pytree; what is not in ``over`` stays as it is.
+        over: values ``(N,)`` by name of a parameter, of an entry of a list (``"length[1]"``), of a key or an attribute.
+        out: a netCDF file. Unfinished work is kept beside it and taken up by the next call; a finished result is only read.
+        outputs: variables wanted; default: those of the analysis, or all.
+        options: those of the analysis, or keyword arguments of the function.
+
+    Returns: a dataset with a dimension for each entry of ``over``, in that order, and ``outcome``: a point whose result is
+    not finite is NaN there, and the rest is unaffected.
+
+    Raises: :class:`~drivetrain_jax.InputError` for what is unknown or out of range, before anything is computed.
+
+    >>> import drivetrain_jax as dt, numpy as np
+    >>> shaft = dt.Cardan(beta=0.3, Omega=1.4, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)
+    >>> chart = dt.sweep(dt.floquet, shaft, over={"beta": np.linspace(0, 1, 3), "Omega": [1.3, 1.4]}, outputs=["verdict"])
+    >>> chart.verdict.dims, chart.verdict.shape
+    (('beta', 'Omega'), (3, 2))
+    """
+    if not isinstance(over, Mapping) or not over:
+        raise InputError("over: empty; allowed are values by the name of what varies")
+    own = getattr(function, "__name__", "")
+    if own in analysis_names() and getattr(functions, own, None) is function:
+        return run(_scene_table(own, system, over, outputs, options), out=out)
+    return run(_function_scene(function, system, over, outputs, options), out=out)
+
+
+def _scene_table(
+    name: str, system: Any, over: Mapping[str, Any], outputs: Sequence[str] | None, options: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The scene of an analysis of the package."""
+    if not isinstance(system, System):
+        raise InputError(
+            f"system: got a {type(system).__name__}; allowed is a system such as drivetrain_jax.Cardan(...)"
+        )
+    # An empty list is the default "none".
+    fixed = {key: _plain(value) for key, value in system.values.items() if key not in over and value != ()}
+    axes = {
+        key: value if isinstance(value, Mapping) else {"values": _numbers(key, value)} for key, value in over.items()
+    }
+    table = {"system": system.name, "analysis": name, "axes": axes, "fixed": fixed, "options": dict(options)}
+    return table if outputs is None else table | {"outputs": [outputs] if isinstance(outputs, str) else list(outputs)}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(entry) for entry in value]
+    return value if isinstance(value, str) else float(value)
+
+
+def _numbers(name: str, values: Any) -> list[float]:
+    try:
+        array = np.asarray(values, float)
+    except (TypeError, ValueError):
+        raise InputError(f"over.{name}: got {values!r}; allowed are numbers") from None
+    if array.ndim != 1 or not array.size:
+        raise InputError(
+            f"over.{name}: got an array of the shape {array.shape}; allowed is one of the shape (N,), N >= 1"
+        )
+    return array.tolist()
+
+
+def _function_scene(
+    function: Callable[..., Any],
+    system: Any,
+    over: Mapping[str, Any],
+    outputs: Sequence[str] | None,
+    options: Mapping[str, Any],
+) -> Scene:
+    """A scene of any function: what varies are its parameters, and what it computes is a fixed word."""
+    values = {name: np.array(_numbers(name, given)) for name, given in over.items()}
+    name = re.sub(r"\W", "_", getattr(function, "__name__", "function")).strip("_") or "value"
+
+    def one(point: Mapping[str, Any]) -> dict[str, Array]:
+        return _named(function(_replaced(system, point), **options), name)
+
+    example = {key: jax.ShapeDtypeStruct((), float) for key in values}
+    traced, shapes = jax.make_jaxpr(one, return_shape=True)(example)
+    wanted = [key for key in shapes if key != OUTCOME.name] if outputs is None else list(outputs)
+    for key in wanted:
+        if key not in shapes:
+            raise InputError(f"outputs: {key!r} is not a result of {name}; allowed is one of {', '.join(shapes)}")
+    content = [re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr)), *(np.asarray(x).tobytes() for x in traced.consts)]
+    computes = hashlib.blake2b(repr(content).encode(), digest_size=16).hexdigest()
+    variables = tuple(_variable(key, shapes[key]) for key in wanted)
+    kind, analysis = _kind(_Once(one), name, tuple(values), type(system), variables, computes)
+    axes = tuple(Axis(key, kind.parameter(key), None, numbers) for key, numbers in values.items())
+    text = f'system = "{kind.name}"\nanalysis = "{name}"\n\n[fixed]\n{_COMPUTES} = "{computes}"\n'
+    request, fixed = Request(tuple(wanted), "function", {}), {_COMPUTES: computes}
+    dimensions = analysis.dimensions(kind, request, fixed)
+    return Scene(f"{name} of {kind.title}", kind, analysis, request, axes, False, fixed, dimensions, None, text)
+
+
+class _Once:
+    """A function that equals any other one: what it computes is compared by a digest."""
+
+    def __init__(self, call: Callable[..., Any]) -> None:
+        self.call = call
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Once)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+@lru_cache(maxsize=16)
+def _kind(
+    one: _Once, name: str, varies: tuple[str, ...], of: type, variables: tuple[Variable, ...], computes: str
+) -> tuple[type[System], Analysis]:
+    """A system whose parameters are what varies, and the analysis; the same ones for the same function, compiled once."""
+    known = {p.name: p for p in of.parameters} if issubclass(of, System) else {}
+    described = {}
+    for key in varies:
+        base = known.get(entry_of(key)[0], Parameter(key, "1", key))
+        described[key] = Parameter(key, base.units, base.long_name)
+    computing = Parameter(_COMPUTES, "1", "digest of what the function computes", text=True)
+
+    def build(values: Mapping[str, Any]) -> Mapping[str, Any]:
+        return values
+
+    def solve(values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+        del effort
+        found = one.call({key: values[key] for key in varies})
+        results = {v.name: found[v.name].astype(v.dtype) for v in variables}
+        finite = [jnp.all(jnp.isfinite(x)) for x in results.values() if jnp.issubdtype(x.dtype, jnp.inexact)]
+        state = jnp.where(jnp.all(jnp.array([True, *finite])), Outcome.SUCCESS, Outcome.NOT_FINITE).astype(jnp.int8)
+        return results | {OUTCOME.name: found.get(OUTCOME.name, state).astype(jnp.int8)}
+
+    def solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
+        return (Solver(name, over_lanes(solve), chunk=_CHUNK),)
+
+    dimensions = tuple(Dimension(dim, f"index of {v.name}", ()) for v in variables for dim in v.dims)
+    body = {
+        "name": "function",
+        "title": of.__name__,
+        "parameters": (*described.values(), computing),
+        "models": {name: Model(build, varies)},
+    }
+    analysis = Analysis(
+        name,
+        f"function {name}",
+        variables,
+        tuple(v.name for v in variables),
+        {"function": ()},
+        (),
+        solvers,
+        lambda *_: dimensions,
+    )
+    return type("Function", (System,), body), analysis
+
+
+def _variable(name: str, shape: jax.ShapeDtypeStruct) -> Variable:
+    dtype = "int8" if shape.dtype == bool else str(shape.dtype)
+    return Variable(name, "1", name, tuple(f"{name}_{i}" for i in range(len(shape.shape))), dtype)
+
+
+def _named(result: Any, name: str) -> dict[str, Array]:
+    """The arrays of a result by name."""
+    if isinstance(result, functions.Result):
+        result = result.variables
+    if isinstance(result, Mapping):
+        return {str(key): jnp.asarray(value) for key, value in result.items()}
+    try:
+        return {name: jnp.asarray(result)}
+    except TypeError:
+        kind = type(result).__name__
+        raise InputError(f"function: returns a {kind}; allowed is an array or a dict of arrays") from None
+
+
+def _replaced(system: Any, point: Mapping[str, Any]) -> Any:
+    """``system`` with these parameters, keys or attributes."""
+    for name, value in point.items():
+        base, entry = entry_of(name)
+        try:
+            old = system[base] if isinstance(system, Mapping) else getattr(system, base)
+        except (AttributeError, KeyError):
+            raise InputError(f"over.{name}: unknown to a {type(system).__name__}") from None
+        new = value if entry is None else (*old[:entry], value, *old[entry + 1 :])
+        if isinstance(system, Mapping):
+            system = {**system, base: new}
+        else:
+            system = eqx.tree_at(lambda s, base=base: getattr(s, base), system, new, is_leaf=lambda x: x is None)
+    return system

@@ -1,0 +1,86 @@
+"""Unfinished work as a labelled result, while a run goes on or after it was stopped."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.runs.assemble import Table, enter, to_dataset
+from drivetrain_jax.runs.atlas_choice import uses_atlas
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.growing import rest_of
+from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.runs.sharded import stored
+from drivetrain_jax.runs.target import Target
+from drivetrain_jax.store import consolidate, shards
+from drivetrain_jax.store.chunks import PartsFolder
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# The outcome of a point that is still to be computed. No finished file has it.
+PENDING = len(Outcome)
+
+
+def open_result(path: str | Path) -> xr.Dataset:
+    """The result at ``path``, loaded. Where there is none yet but unfinished work in ``FILE.nc.parts/``, what that holds:
+    points still to be computed have the outcome ``pending`` and no value, and the attribute ``points_done`` counts the
+    others. Nothing is disturbed, whether the run goes on or not.
+
+    Raises :class:`InputError` if there is neither, or if the work is of other code than the present.
+    """
+    path = Path(path)
+    if path.exists() or not PartsFolder(path).holds_work():
+        return consolidate.open_result(path)
+    return _open_partial(path)
+
+
+def _open_partial(path: Path) -> xr.Dataset:
+    plan = PartsFolder(path).plan()
+    engine = Engine(load_scene(tomllib.loads(str(plan.get("scene", "")))))
+    target = Target(path, engine)
+    if target.state != "partial":
+        raise InputError(f"file = {str(path)!r}: holds {target.obstacle}; allowed is to run its scene again")
+    if engine.scene.analysis.continuous or uses_atlas(engine.scene):
+        raise InputError(
+            f"file = {str(path)!r}: an atlas that is not finished; allowed is to wait for it or to resume it"
+        )
+    table, done = Table(engine.scene, engine.grid), np.zeros(engine.grid.size, bool)
+    for points, results in _finished(engine, target):
+        table.fill(points, results)
+        done[points] = True
+    return _labelled(engine, table, done)
+
+
+def _finished(engine: Engine, target: Target) -> Iterator[tuple[np.ndarray, Mapping[str, np.ndarray]]]:
+    """Points and results, those taken from other results among them."""
+    if target.store == "zarr":
+        store = target.parts.path / shards.UNFINISHED
+        for _, arrays in stored(engine, store) if shards.is_store(store) else ():
+            if arrays is not None:
+                yield shards.without_padding(arrays)
+        return
+    taken = target.taken_before()
+    yield from taken.blocks([variable.name for variable in Table(engine.scene, engine.grid).variables])
+    plan = rest_of(engine, taken).plan
+    for part in target.parts.read():
+        for number, results in part:
+            yield plan.chunk(number).points, results
+
+
+def _labelled(engine: Engine, table: Table, done: np.ndarray) -> xr.Dataset:
+    arrays = dict(table.lay_out())
+    enter(arrays[OUTCOME.name], engine.grid, np.flatnonzero(~done), PENDING)
+    count = int(done.sum()) * engine.grid.path_length
+    dataset = to_dataset(engine.scene, arrays, {"digest": engine.digest, "points_done": count})
+    outcome = dataset[OUTCOME.name].attrs
+    outcome["flag_values"] = np.arange(PENDING + 1, dtype=OUTCOME.dtype)
+    outcome["flag_meanings"] += " pending"
+    title = f"{engine.scene.title} (unfinished: {count} of {engine.total} points)"
+    return dataset.assign_attrs(title=title)

@@ -1,0 +1,220 @@
+"""Who computes what: a solver for every point, points of similar effort together, chunks of one shape per solver.
+
+Points are sorted block by block, so that neither memory nor the wait for the first result grows with the grid: a plan
+keeps the efforts of chunks, and sorts a block again when its chunks are wanted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from drivetrain_jax._machine import usable_cores
+from drivetrain_jax.analysis import Solver
+from drivetrain_jax.runs.grid import Grid
+
+# Points that are sorted together, and those among them whose effort is predicted at a time (few stay in fast memory).
+_BLOCK, _PIECE = 1 << 18, 1 << 15
+# Sorted blocks that are kept.
+_KEPT = 16
+_BITS, _POSITION = np.uint64(32), np.uint64(2**32 - 1)
+_MAX_EFFORT = 2**31 - 1
+# Small scenes are cut into at least this many chunks per solver. It is not the number of cores: bits must not depend
+# on that.
+_MIN_CHUNKS = 2
+_LANES = 16
+
+
+@dataclass(frozen=True)
+class Group:
+    """The points of one solver, by falling effort in each block, cut into chunks of ``chunk``; the last one of a block may
+    be shorter, and costs as much as a full one: it has the least effort.
+
+    ``index`` is the position of the solver, ``size`` the number of points, ``efforts`` the largest effort within each
+    chunk, and ``firsts[b]`` the first chunk of block b (one entry more than blocks).
+    """
+
+    index: int
+    solver: Solver
+    size: int
+    efforts: np.ndarray
+    firsts: np.ndarray
+    chunk: int
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Number, position of the solver, points, the ``size`` that they are filled up to, and the largest effort.
+
+    It says all that a worker has to know beside the scene.
+    """
+
+    number: int
+    solver: int
+    size: int
+    points: np.ndarray
+    effort: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All chunks, numbered through the groups. Points for which every solver predicts infinite cost are in none."""
+
+    groups: tuple[Group, ...]
+    blocks: Blocks
+
+    @cached_property
+    def costs(self) -> np.ndarray:
+        """Predicted cost of every chunk, in units of its own."""
+        return np.concatenate([np.empty(0), *(g.efforts * (g.solver.unit_cost * g.chunk) for g in self.groups)])
+
+    @property
+    def size(self) -> int:
+        """Number of points in all chunks."""
+        return sum(group.size for group in self.groups)
+
+    @cached_property
+    def _firsts(self) -> np.ndarray:
+        """Number of the first chunk of each group, and of all chunks."""
+        return np.cumsum([0, *(len(group.efforts) for group in self.groups)])
+
+    def kernels(self, numbers: Iterable[int]) -> set[tuple[int, int]]:
+        """Position of the solver and size of the chunks with these numbers."""
+        used = np.unique(np.searchsorted(self._firsts, np.fromiter(numbers, np.int64), side="right") - 1)
+        return {(self.groups[g].index, self.groups[g].chunk) for g in used}
+
+    def ordered(self, numbers: Iterable[int]) -> np.ndarray:
+        """These numbers block by block, in each the costliest first."""
+        chosen = np.fromiter(numbers, np.int64)
+        counts = [np.diff(group.firsts) for group in self.groups]
+        blocks = np.concatenate([np.empty(0, int), *(np.repeat(np.arange(len(n)), n) for n in counts)])
+        return chosen[np.lexsort((-self.costs[chosen], blocks[chosen]))]
+
+    def chunk(self, number: int) -> Chunk:
+        """Chunk number ``number``."""
+        if not 0 <= number < self._firsts[-1]:
+            raise IndexError(number)
+        g = int(np.searchsorted(self._firsts, number, side="right")) - 1
+        group, k = self.groups[g], number - self._firsts[g]
+        block = int(np.searchsorted(group.firsts, k, side="right")) - 1
+        start = (k - group.firsts[block]) * group.chunk
+        points = self.blocks.points(block, group.index, slice(start, start + group.chunk))
+        return Chunk(int(number), group.index, group.chunk, points, int(group.efforts[k]))
+
+
+class Blocks:
+    """The points of a plan in blocks, each sorted when it is needed."""
+
+    def __init__(self, solvers: Sequence[Solver], grid: Grid, points: np.ndarray | None) -> None:
+        self._solvers, self._grid, self._points = solvers, grid, points
+        self._size = grid.size if points is None else len(points)
+        self.count = -(-self._size // _BLOCK)
+        self._kept: dict[int, tuple[list[np.ndarray], list[np.ndarray]]] = {}
+
+    def efforts(self, block: int) -> Sequence[np.ndarray]:
+        """For each solver the efforts of its points in ``block``, falling."""
+        return self._sorted(block)[1]
+
+    def points(self, block: int, solver: int, part: slice) -> np.ndarray:
+        """A part of these points."""
+        return self._number(self._sorted(block)[0][solver][part].astype(np.int64) + block * _BLOCK)
+
+    def _number(self, positions: np.ndarray) -> np.ndarray:
+        return positions if self._points is None else self._points[positions]
+
+    def _sorted(self, block: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        if block not in self._kept:
+            while len(self._kept) >= _KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[block] = self._sort(block)
+        return self._kept[block]
+
+    def _sort(self, block: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """For each solver its points, numbered through the block, and their efforts."""
+        start, stop = block * _BLOCK, min((block + 1) * _BLOCK, self._size)
+        pieces = [self._number(np.arange(i, min(i + _PIECE, stop))) for i in range(start, stop, _PIECE)]
+        found = [_cheapest(self._solvers, self._grid, pieces[0])]
+        if len(pieces) > 1:
+            with ThreadPoolExecutor(min(usable_cores(), len(pieces) - 1), thread_name_prefix="plan") as pool:
+                found += pool.map(lambda points: _cheapest(self._solvers, self._grid, points), pieces[1:])
+        choice, effort = (np.concatenate(column) for column in zip(*found, strict=True))
+        orders, efforts = [], []
+        for index in range(len(self._solvers)):
+            mine = np.flatnonzero(choice == index).astype(np.uint64)
+            # Effort and position in one number: the fastest of all ways to sort by both.
+            keys = ((_MAX_EFFORT - effort[mine]).astype(np.uint64) << _BITS) | mine
+            keys.sort()
+            orders.append((keys & _POSITION).astype(np.uint32))
+            efforts.append(_MAX_EFFORT - (keys >> _BITS).astype(np.int32))
+        return orders, efforts
+
+
+class _Tally:
+    """Efforts of the points of one solver: of each point while chunks might be small, then the largest of each chunk."""
+
+    def __init__(self, solver: Solver) -> None:
+        self._solver = solver
+        self._efforts: list[np.ndarray] = []
+        self.count, self._few = 0, True
+
+    def add(self, efforts: np.ndarray) -> None:
+        """Those of one more block, falling."""
+        self.count += efforts.size
+        self._efforts.append(efforts if self._few else efforts[:: self._solver.chunk])
+        if self._few and self.count >= _MIN_CHUNKS * self._solver.chunk:
+            self._few = False
+            self._efforts = [block[:: self._solver.chunk] for block in self._efforts]
+
+    def group(self, index: int, full_size: bool) -> Group:
+        """The chunks of all blocks."""
+        size = chunk_size(self._solver.chunk, self.count) if self._few and not full_size else self._solver.chunk
+        efforts = [block[::size] for block in self._efforts] if self._few else self._efforts
+        firsts = np.cumsum([0, *map(len, efforts)])
+        return Group(index, self._solver, self.count, np.concatenate(efforts), firsts, size)
+
+
+def chunk_size(largest: int, count: int) -> int:
+    """Points per chunk for ``count`` points, at most ``largest``; fewer in small scenes, to give all cores work."""
+    if count <= _LANES:
+        return min(largest, 1 << (count - 1).bit_length())
+    share = -(-count // _MIN_CHUNKS)
+    return min(largest, -(-share // _LANES) * _LANES)
+
+
+def make_plan(
+    solvers: Sequence[Solver], grid: Grid, points: np.ndarray | None = None, *, full_size: bool = False
+) -> Plan:
+    """Give every one of ``points`` (all of ``grid``) to the solver with the smallest predicted cost, the first of equals.
+
+    ``full_size`` keeps the size of chunks where points are few, so that further plans need no other kernels.
+    """
+    blocks, tallies = Blocks(solvers, grid, points), [_Tally(solver) for solver in solvers]
+    for block in range(blocks.count):
+        for tally, efforts in zip(tallies, blocks.efforts(block), strict=True):
+            tally.add(efforts)
+    return Plan(tuple(tally.group(i, full_size) for i, tally in enumerate(tallies) if tally.count), blocks)
+
+
+def mean_cost(solvers: Sequence[Solver], grid: Grid, points: np.ndarray) -> float:
+    """Predicted cost of one of these points, in the units of a plan, on average; points that no solver can do are free."""
+    choice, effort = _cheapest(solvers, grid, points)
+    unit = np.array([*(solver.unit_cost for solver in solvers), 0.0])
+    return float(np.mean(effort * unit[choice]))
+
+
+def _cheapest(solvers: Sequence[Solver], grid: Grid, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Position of the cheapest solver (-1 if all costs are infinite) and its effort, for each of ``points``."""
+    columns = grid.arrays(points)
+    best, effort, cost = np.full(points.shape, -1), np.zeros(points.shape), np.full(points.shape, np.inf)
+    for index, solver in enumerate(solvers):
+        own = np.broadcast_to(np.asarray(solver.effort(columns), float), points.shape)
+        with np.errstate(over="ignore"):
+            own_cost = own * solver.unit_cost
+        # Neither NaN nor infinity is less.
+        less = own_cost < cost
+        best[less], cost, effort = index, np.where(less, own_cost, cost), np.where(less, own, effort)
+    return best, np.ceil(np.clip(effort, 0, _MAX_EFFORT)).astype(np.int64)

@@ -1,0 +1,222 @@
+"""One point: the same path as a sweep, and an answer that can be read."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Iterator, KeysView, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Variable
+from drivetrain_jax._wording import aligned, nearest, shown, written
+from drivetrain_jax.analysis import OUTCOME, Outcome, Request, get_analysis
+from drivetrain_jax.runs.assemble import Table
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.physical import nondimensional
+from drivetrain_jax.runs.scene import find_system, load_scene, system_and_analysis
+
+
+@dataclass(frozen=True)
+class PointResult:
+    """Results of one point, by attribute or by name: ``result.spectral_radius`` or ``result["spectral_radius"]``.
+
+    ``outcome`` tells what became of it (results are NaN unless ``outcome.has_value``), ``units`` the units by name,
+    ``labels`` the entries of each dimension that a result has.
+    """
+
+    system: str
+    analysis: str
+    method: str
+    parameters: Mapping[str, Any]
+    values: Mapping[str, Any]
+    outcome: Outcome
+    variables: Mapping[str, Variable] = field(repr=False)
+    parameter_units: Mapping[str, str] = field(repr=False)
+    labels: Mapping[str, Sequence[Any]] = field(repr=False)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the results."""
+        return {name: self.variables[name].units for name in self.values}
+
+    def __getitem__(self, name: str) -> Any:
+        return self.values[name]
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name not in self.values:
+            raise AttributeError(f"no result {name!r}; there is {', '.join(self.values)}")
+        return self.values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values)
+
+    def keys(self) -> KeysView[str]:
+        """Names of the results, so that ``dict(result)`` holds them."""
+        return self.values.keys()
+
+    def __dir__(self) -> list[str]:
+        return sorted({*super().__dir__(), *self.values})
+
+    def to_json(self) -> str:
+        """The answer as one JSON object; what is not finite is null, a complex value has ``real`` and ``imag``, a code its
+        ``meaning``."""
+        values = {n: {"value": _plain(v), "units": self.variables[n].units} for n, v in self.values.items()}
+        for name, value in self.values.items():
+            if flags := self.variables[name].flags:
+                values[name]["meaning"] = _meaning(flags, value)
+        parameters = {n: {"value": _plain(v), "units": self.parameter_units[n]} for n, v in self.parameters.items()}
+        head = {"system": self.system, "analysis": self.analysis, "method": self.method}
+        answer = {**head, "parameters": parameters, "outcome": self.outcome.name.lower(), "values": values}
+        return json.dumps(answer, allow_nan=False)
+
+    def __repr__(self) -> str:
+        # An empty list is the default "none".
+        given = ", ".join(
+            _with_units(f"{n} = {written(v)}", self.parameter_units[n]) for n, v in self.parameters.items() if v != ()
+        )
+        listed = [n for n, v in self.values.items() if np.ndim(v) == 1]
+        matrices = [n for n, v in self.values.items() if np.ndim(v) == 2]
+        plain = [name for name in self.values if name not in (*listed, *matrices)]
+        width = max(map(len, (*plain, "outcome")))
+        lines = [f"{self.system} {self.analysis} (method {self.method}), {given}"]
+        for name in plain:
+            text = _text(self.variables[name], self.values[name])
+            lines.append(f"  {name:{width}} = {_with_units(text, self.variables[name].units)}")
+        lines.append(f"  {'outcome':{width}} = {self.outcome.name.lower()}")
+        for (dim,) in dict.fromkeys(self.variables[name].dims for name in listed):
+            lines += self._table(dim, [name for name in listed if self.variables[name].dims == (dim,)])
+        for name in matrices:
+            lines += self._matrix(name)
+        return "\n".join(lines)
+
+    def _matrix(self, name: str) -> list[str]:
+        """A result over two dimensions, the longer one downwards."""
+        variable, values = self.variables[name], np.asarray(self.values[name])
+        rows, columns = variable.dims
+        if values.shape[0] < values.shape[1]:
+            rows, columns, values = columns, rows, values.T
+        head = [rows, *(f"{columns} {written(label)}" for label in self.labels[columns])]
+        named = zip(self.labels[rows], values, strict=True)
+        cells = [[written(label), *(_text(variable, value) for value in row)] for label, row in named]
+        return [f"  {_with_units(name, variable.units)}", *aligned([head, *cells])]
+
+    def _table(self, dim: str, names: Sequence[str]) -> list[str]:
+        """Results that are lists over one dimension, side by side."""
+        columns = [[dim, *map(str, self.labels[dim])]]
+        for name in names:
+            variable = self.variables[name]
+            head = name if variable.units == "1" else f"{name} [{variable.units}]"
+            columns.append([head, *(_text(variable, value) for value in self.values[name])])
+        return aligned(list(zip(*columns, strict=True)))
+
+
+def _plain(value: Any) -> Any:
+    """Words, numbers and lists that JSON knows."""
+    if isinstance(value, str):
+        return value
+    if np.iscomplexobj(value):
+        return {"real": _plain(np.real(value)), "imag": _plain(np.imag(value))}
+    if np.ndim(value):
+        return [_plain(entry) for entry in value]
+    return np.asarray(value).item() if np.isfinite(value) else None
+
+
+def _meaning(flags: Sequence[str], value: Any) -> Any:
+    """The words of codes, in the shape of ``value``."""
+    return [_meaning(flags, each) for each in value] if np.ndim(value) else flags[int(value)]
+
+
+def _with_units(text: str, units: str) -> str:
+    return text if units == "1" else f"{text} {units}"
+
+
+def _text(variable: Variable, value: Any) -> str:
+    if np.ndim(value):
+        return np.array2string(value, precision=10, separator=", ", max_line_width=10_000)
+    return variable.written(value)
+
+
+def point(system: str, analysis: str, *, outputs: Sequence[str] | None = None, **given: Any) -> PointResult:
+    """Compute one point.
+
+    ``given`` holds parameters of the system (or its data in physical units, as `drivetrain list SYSTEM` names them) and
+    options of the analysis (``method``, ``rtol``, ...) by name;
+    ``outputs`` the results wanted, by default those of the analysis.
+    Raises :class:`InputError` with one line naming the field, what was given and what is allowed, and
+    :class:`ChunkError` if the computation itself fails.
+    """
+    tree = _tree(system, analysis, nondimensional(find_system(system), given)[1])
+    if outputs is not None:
+        outputs = [outputs] if isinstance(outputs, str) else outputs
+        tree["outputs"] = list(outputs) if isinstance(outputs, Iterable) else outputs
+    try:
+        engine = Engine(load_scene(tree))
+    except InputError as error:
+        # The tables of a scene are no concern of someone who gave none.
+        raise InputError(re.sub(r"^(points|fixed|options)\.", "", str(error))) from None
+    return _result(engine, _compute(engine))
+
+
+def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The scene of one point. Numbers vary, so that the next one needs no compilation; words and lists are fixed."""
+    system, analysis = system_and_analysis(system_name, analysis_name)
+    if analysis.continuous:
+        others = ", ".join(name for name in system.models if not get_analysis(name).continuous)
+        raise InputError(f"analysis = {analysis_name!r}: is made over ranges; allowed at a point is one of {others}")
+    parameters = {p.name: p for p in system.parameters}
+    options = {o.name: given.get(o.name, o.default) for o in analysis.options}
+    path = analysis.path_axis(Request((), given.get("method", next(iter(analysis.methods))), options))
+    tree: dict[str, Any] = {"system": system_name, "analysis": analysis_name, "points": {}, "fixed": {}, "options": {}}
+    names = (*parameters, "method", *(o.name for o in analysis.options))
+    # A scene has no result of the name of what varies.
+    numbers = {p.name for p in system.parameters if p.is_number} - {path, *(v.name for v in analysis.variables)}
+    for name, value in given.items():
+        if name not in names:
+            raise InputError(f"{name} = {shown(value)}: unknown{nearest(name, names)}")
+        if name not in parameters:
+            tree["options"][name] = value
+        elif name in numbers and not isinstance(value, (list, tuple)):
+            tree["points"][name] = [value]
+        else:
+            tree["fixed"][name] = value
+    return tree
+
+
+def _compute(engine: Engine) -> Table:
+    table = Table(engine.scene, engine.grid)
+    for number in range(len(engine.plan.costs)):
+        chunk = engine.plan.chunk(number)
+        table.fill(chunk.points, engine.compute_chunk(chunk))
+    return table
+
+
+def _result(engine: Engine, table: Table) -> PointResult:
+    scene = engine.scene
+    first = (0,) * len(engine.grid.result_shape)
+    values = {v.name: table.lay_out()[v.name][first] for v in table.variables}
+    outcome = Outcome(int(values.pop(OUTCOME.name)))
+    parameters = {a.parameter.name: a.values[0].item() for a in scene.axes} | dict(scene.fixed)
+    ordered = {p.name: parameters[p.name] for p in scene.system.parameters if p.name in parameters}
+    return PointResult(
+        system=scene.system.name,
+        analysis=scene.analysis.name,
+        method=scene.request.method,
+        parameters=ordered,
+        values=values,
+        outcome=outcome,
+        variables={v.name: v for v in table.variables},
+        parameter_units={p.name: p.units for p in scene.system.parameters},
+        labels=_labels(engine, values, table),
+    )
+
+
+def _labels(engine: Engine, values: Mapping[str, Any], table: Table) -> dict[str, Sequence[Any]]:
+    """The entries of every dimension of ``values``: their coordinates, or their numbers."""
+    shown = [v for v in table.variables if v.name in values]
+    sizes = {dim: n for v in shown for dim, n in zip(v.dims, np.shape(values[v.name]), strict=True)}
+    known = {dimension.name: dimension.values for dimension in engine.scene.dimensions}
+    return {dim: known.get(dim) or range(size) for dim, size in sizes.items()}

@@ -1,0 +1,142 @@
+"""Chunks computed in spawned processes, one per core: a crash costs the chunk that caused it and nothing else."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+
+from drivetrain_jax._errors import Passing
+from drivetrain_jax.runs import worker
+from drivetrain_jax.runs.executor import IN_FLIGHT, Results
+from drivetrain_jax.runs.plan import Chunk
+from drivetrain_jax.runs.worker import Job
+
+# A chunk is given up when it was being computed at the death of this many processes.
+ATTEMPTS = 3
+
+
+def run_processes(chunks: Iterable[Chunk], job: Job, count: int) -> Iterator[tuple[Chunk, Results | None]]:
+    """``(chunk, results)`` in the order of completion; results are None for a chunk that kills every process.
+
+    An exception of a chunk is raised here, as is one that keeps a process from starting. When the iterator is left (also
+    by an interrupt) the processes are killed; they also end by themselves when this process does.
+    """
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
+    waiting, deaths = _Tasks(chunks), Counter[int]()
+    slots = [_Slot(job, cores[k % len(cores)]) for k in range(count)]
+    try:
+        while True:
+            for slot in slots:
+                slot.fill(waiting)
+            futures = [future for slot in slots for future in slot.running]
+            if not futures:
+                return
+            wait(futures, return_when=FIRST_COMPLETED)
+            for slot in slots:
+                yield from slot.collect(waiting, deaths)
+    finally:
+        for slot in slots:
+            slot.kill()
+
+
+class _Tasks:
+    """Chunks to do; those that a dying process left behind come first."""
+
+    def __init__(self, chunks: Iterable[Chunk]) -> None:
+        self._chunks = iter(chunks)
+        self._again: deque[Chunk] = deque()
+
+    def put_back(self, chunks: Iterable[Chunk]) -> None:
+        self._again.extend(chunks)
+
+    def take(self) -> Chunk | None:
+        return self._again.popleft() if self._again else next(self._chunks, None)
+
+
+class _Slot:
+    """One process, replaced when it dies, and the chunks that it has been given in their order."""
+
+    def __init__(self, job: Job, core: int | None) -> None:
+        self._job, self._core = job, core
+        self.running: dict[Future[Results], Chunk] = {}
+        self._stillborn = 0
+        self._start()
+
+    def _start(self) -> None:
+        others = set(multiprocessing.active_children())
+        context = multiprocessing.get_context("spawn")
+        self._pool = ProcessPoolExecutor(1, context, initializer=_initialise, initargs=(self._core,))
+        self._ready = self._pool.submit(worker.prepare, self._job)
+        self._processes = set(multiprocessing.active_children()) - others
+
+    def fill(self, waiting: _Tasks) -> None:
+        """Give the process what it has room for."""
+        while len(self.running) < IN_FLIGHT and (chunk := waiting.take()) is not None:
+            try:
+                self.running[self._pool.submit(worker.compute, self._job, chunk)] = chunk
+            except BrokenProcessPool:
+                waiting.put_back([chunk])
+                if self.running:
+                    # It has just died; what it was computing tells so when it is collected.
+                    return
+                self._was_ready()
+                self._restart()
+
+    def collect(self, waiting: _Tasks, deaths: Counter[int]) -> Iterator[tuple[Chunk, Results | None]]:
+        """Results that are there. The chunk that a dead process was computing is tried again, or given up."""
+        while self.running and next(iter(self.running)).done():
+            future = next(iter(self.running))
+            chunk = self.running.pop(future)
+            try:
+                yield chunk, future.result()
+            except BrokenProcessPool:
+                ready = self._was_ready()
+                waiting.put_back(self.running.values())
+                self.running.clear()
+                self._restart()
+                deaths[chunk.number] += ready
+                if deaths[chunk.number] < ATTEMPTS:
+                    waiting.put_back([chunk])
+                else:
+                    yield chunk, None
+
+    def _restart(self) -> None:
+        self._pool.shutdown(wait=False)
+        self._start()
+
+    def _was_ready(self) -> bool:
+        """Whether the process died at a chunk. One that dies every time while it gets ready would do so for any."""
+        try:
+            self._ready.result()
+        except BrokenProcessPool:
+            self._stillborn += 1
+            if self._stillborn >= ATTEMPTS:
+                raise Passing("worker processes die while they get ready") from None
+            return False
+        self._stillborn = 0
+        return True
+
+    def kill(self) -> None:
+        """End the process at once; what it was computing is not wanted any more."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        for process in self._processes:
+            process.kill()
+
+
+def _initialise(core: int | None) -> None:
+    """Runs first in a new process: one core, no answer to the terminal's Ctrl-C, no life without the parent."""
+    if core is not None:
+        os.sched_setaffinity(0, {core})
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    multiprocessing.parent_process().join()
+    os._exit(1)

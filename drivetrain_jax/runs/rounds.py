@@ -1,0 +1,118 @@
+"""An atlas from direct solves: every round of its construction is a plan of chunks, kept and resumed like any others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from drivetrain_jax._wording import counted
+from drivetrain_jax.analysis import Request
+from drivetrain_jax.analysis.periodic.floquet_propagator import ANALYSIS
+from drivetrain_jax.atlas import (
+    Atlas,
+    StabilityAtlas,
+    floquet_domain,
+    floquet_rounds,
+    numbers_per_solve,
+    solve_rtol,
+    stability_atlas,
+)
+from drivetrain_jax.atlas.construction import MAX_SOLVES
+from drivetrain_jax.runs.axes import Axis
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.executor import Where
+from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.runs.work import Progress, Work
+
+# Panels are to be this much better than the results that follow from them.
+_SHARPER = 0.1
+
+
+def build_atlas(
+    scene: Scene,
+    ranges: Mapping[str, tuple[float, float]],
+    work: Work,
+    progress: Progress,
+    max_solves: int | None = None,
+) -> tuple[StabilityAtlas, int]:
+    """The atlas of ``scene`` over ``ranges``, and the number of the first chunk that it leaves free.
+
+    ``progress`` counts the solves and notes gaps. Rounds are small, so that threads of this process solve them wherever the
+    run works.
+    """
+    fixed = fixed_of(scene, ranges)
+    rtol = scene.request.options["rtol"]
+    tolerance = _tolerance(scene)
+    rounds = floquet_rounds(scene.system, ranges, fixed, tolerance, max_solves or MAX_SOLVES)
+    options = {"rtol": solve_rtol(tolerance)}
+    width = numbers_per_solve(scene.system, ranges, fixed)
+    first, threads, values = 0, Where(work.where.threads), None
+    while True:
+        try:
+            points = rounds.send(values)
+        except StopIteration as end:
+            progress.note = _note(end.value)
+            return stability_atlas(end.value, scene.system, rtol), first
+        engine = Engine(_solves(scene, fixed, tuple(ranges), points, options), full_size=True)
+        answers = _Answers(len(points), width)
+        progress.total += len(points)
+        work.do(engine, answers, progress, first, threads)
+        first += len(engine.plan.costs)
+        values = answers.values
+
+
+def _note(atlas: Atlas) -> str:
+    """What the user of ``atlas`` has to know of its gaps."""
+    if not atlas.gaps:
+        return ""
+    have = f"{counted(len(atlas.panels), 'panel', 'panels')} and {counted(len(atlas.gaps), 'gap', 'gaps')}"
+    reasons = "; ".join(sorted({gap.reason for gap in atlas.gaps}))
+    return f"the atlas has {have} ({reasons}): what lies in a gap is solved directly"
+
+
+def node_engine(scene: Scene, ranges: Mapping[str, tuple[float, float]], count: int) -> Engine:
+    """The engine of ``count`` solves for an atlas of ``scene``, spread like those of its construction."""
+    fixed = fixed_of(scene, ranges)
+    domain = floquet_domain(scene.system, ranges, fixed)
+    spread = np.cos(np.pi * np.random.default_rng(0).random((count, len(ranges))))
+    points = domain.points(domain.box().place(spread))
+    options = {"rtol": solve_rtol(_tolerance(scene))}
+    return Engine(_solves(scene, fixed, tuple(ranges), points, options), full_size=True)
+
+
+def _tolerance(scene: Scene) -> float:
+    return _SHARPER * scene.request.options["rtol"]
+
+
+def fixed_of(scene: Scene, ranges: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+    """The parameters of the propagator that are not in ``ranges``, and their values."""
+    fixed = scene.fixed | {a.name: a.values[0].item() for a in scene.axes if a.name not in ranges}
+    return {name: fixed[name] for name in scene.system.models[ANALYSIS.name].parameters if name in fixed}
+
+
+def _solves(scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.ndarray, options: Mapping) -> Scene:
+    """The scene of one round."""
+    axes = tuple(
+        Axis(name, scene.system.parameter(name), None, column) for name, column in zip(names, points.T, strict=True)
+    )
+    request = Request(ANALYSIS.default_outputs, next(iter(ANALYSIS.methods)), dict(options))
+    dimensions = ANALYSIS.dimensions(scene.system, request, fixed)
+    return replace(
+        scene, analysis=ANALYSIS, request=request, axes=axes, zipped=True, fixed=fixed, dimensions=dimensions
+    )
+
+
+class _Answers:
+    """All results of the points of a round side by side, ``(N, m)``, NaN for those that could not be solved."""
+
+    def __init__(self, count: int, width: int) -> None:
+        self.values = np.full((count, width), np.nan)
+
+    def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
+        self.values[points] = np.concatenate([results[name] for name in ANALYSIS.default_outputs], axis=1)
+
+    def lose(self, points: np.ndarray) -> None:
+        """What is not filled in is lost."""

@@ -1,0 +1,243 @@
+"""Runs a scene: in memory, or into a file that is resumed after any interruption and never damaged."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from drivetrain_jax._errors import ChunkError, InputError, Passing
+from drivetrain_jax._machine import physical_memory
+from drivetrain_jax._wording import shown
+from drivetrain_jax.analysis import OUTCOME
+from drivetrain_jax.runs import sharded
+from drivetrain_jax.runs.assemble import Table, bytes_per_point, failures, to_dataset
+from drivetrain_jax.runs.atlas_choice import uses_atlas
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.executor import Where
+from drivetrain_jax.runs.growing import NOTHING, Taken, rest_of
+from drivetrain_jax.runs.scene import Scene, load_scene
+from drivetrain_jax.runs.target import Target
+from drivetrain_jax.runs.work import Progress, Report, Work
+from drivetrain_jax.store.chunks import PartsFolder
+from drivetrain_jax.store.consolidate import ResultFile, open_result, write_result
+from drivetrain_jax.store.schema import Labelled
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class Incomplete(RuntimeError):
+    """A run stopped before its end; finished chunks are kept. ``progress`` says how far it came."""
+
+    def __init__(self, reason: str, progress: Progress) -> None:
+        super().__init__(reason)
+        self.progress = progress
+
+
+class Interrupted(KeyboardInterrupt):
+    """The user stopped a run; finished chunks are kept. ``progress`` says how far it came."""
+
+    def __init__(self, progress: Progress) -> None:
+        super().__init__("interrupted")
+        self.progress = progress
+
+
+def run(
+    scene: str | Path | Mapping[str, Any] | Scene,
+    out: str | Path | None = None,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    fresh: bool = False,
+    threads: int | None = None,
+    workers: int | None = None,
+    dask: str | None = None,
+    reuse: str | Path | Sequence[str | Path] = (),
+    report: Report | None = None,
+) -> xr.Dataset:
+    """Compute a scene and return its labelled result.
+
+    Without ``out`` everything happens in memory. With it the result is written to that netCDF4/HDF5 file; unfinished
+    work is kept in ``FILE.nc.parts/`` and taken up by the next call, and a complete result is only read. A Zarr store is for
+    results that are too large to be returned, and so the command line's: ``drivetrain run --store zarr``.
+
+    :param scene: path of a scene file, a mapping with the same keys, or a checked scene.
+    :param overrides: entries to replace, by dotted key: ``{"fixed.zeta": 0.002}``.
+    :param fresh: compute everything anew: replace a result, or drop unfinished work, at ``out``. One that was interrupted is
+        resumed by the same call.
+    :param threads: chunks computed at a time in threads of this process (default: the cores it may use).
+    :param workers: this many spawned processes instead: one that crashes costs the chunk it was computing. A script that
+        asks for them has to be guarded by ``if __name__ == "__main__"``.
+    :param dask: the Dask cluster at ``tcp://host:port``, or ``local:N`` processes of Dask's own, instead.
+    :param reuse: a result, or several, of which the points that this scene shares are taken over; only with ``out``. The
+        result that ``out`` holds is one of them without being named, if all of its points and results are this scene's.
+    :param report: called with the :class:`Progress` after every chunk.
+    :raises InputError: one line naming the field, what was given, what is allowed. Nothing is computed or written.
+    :raises Incomplete: something failed on the way; what is finished is kept. The message says so where the same call may
+        get further (a full disk, too little memory, a worker that died).
+    """
+    where = Where(threads, workers, dask)
+    if out is None:
+        if reuse:
+            raise InputError("reuse: given without out; allowed is a run into a file")
+        return _in_memory(_engine(scene, overrides, on_disk=False), where, report)
+    run_to_file(scene, Path(out), overrides=overrides, fresh=fresh, where=where, reuse=reuse, report=report)
+    return open_result(Path(out))
+
+
+def run_to_file(
+    scene: str | Path | Mapping[str, Any] | Scene,
+    out: Path,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    fresh: bool = False,
+    where: Where = Where(),  # noqa: B008
+    reuse: str | Path | Sequence[str | Path] = (),
+    store: str = "hdf5",
+    report: Report | None = None,
+) -> Progress:
+    """Like :func:`run` with ``out``, but returns the counts instead of the result.
+
+    ``store`` is ``hdf5``, or ``zarr`` where workers are to write a Zarr store themselves (see :mod:`.sharded`).
+    """
+    engine = _engine(scene, overrides, on_disk=True)
+    if store == "zarr":
+        sharded.check(engine)
+    target = Target(out, engine, store)
+    target.restore()
+    if not fresh and target.state == "complete":
+        target.parts.discard(target.digest, target.written)
+        total = target.points(engine.total)
+        return Progress(total, reused=total, failed=target.failed)
+    if not fresh and target.state == "stale":
+        raise target.refusal
+    target.check_writable()
+    where.check()
+    return _into(target, target.take(_paths(reuse), fresh), fresh, where, report)
+
+
+def _paths(reuse: str | Path | Sequence[str | Path]) -> Sequence[str | Path]:
+    paths = [reuse] if isinstance(reuse, (str, Path)) else reuse
+    if not isinstance(paths, Sequence) or not all(isinstance(path, (str, Path)) for path in paths):
+        raise InputError(f"reuse = {shown(reuse)}: allowed is the path of a result, or a list of them")
+    return paths
+
+
+def _into(target: Target, taken: Taken, fresh: bool, where: Where, report: Report | None) -> Progress:
+    """Begin the result of ``target``, or go on with it; ``taken`` is computed already."""
+    engine, parts, progress = target.engine, target.parts, _progress(target.engine)
+    begins = False
+    try:
+        parts.open()
+        target.check_unchanged()
+        begins = not target.resumes(taken, fresh)
+        if begins:
+            parts.start(target.plan(taken, fresh))
+        if target.store == "zarr":
+            sharded.compute(engine, target.out, parts, progress, where, report)
+        else:
+            _resume(engine, target.out, parts, progress, where, report, taken)
+        parts.close(remove=True)
+    except KeyboardInterrupt:
+        raise Interrupted(progress) from None
+    except InputError:
+        # For example no scheduler at the address: what is refused at its start leaves nothing behind.
+        parts.close(remove=not parts.holds_work() or (begins and progress.computed == 0))
+        raise
+    except (Passing, OSError, MemoryError) as error:
+        raise Incomplete(f"{error or type(error).__name__}; the same command resumes", progress) from error
+    except ChunkError as error:
+        # The same command would come to it again.
+        raise Incomplete(str(error), progress) from error
+    finally:
+        parts.close()
+    return progress
+
+
+def _engine(
+    scene: str | Path | Mapping[str, Any] | Scene, overrides: Mapping[str, Any] | None, on_disk: bool
+) -> Engine:
+    """The engine of a scene that this machine can run."""
+    checked = scene if isinstance(scene, Scene) else load_scene(scene, overrides)
+    engine = Engine(checked)
+    if checked.analysis.continuous:
+        # It has no points.
+        return engine
+    needed, present = engine.total * bytes_per_point(checked, on_disk), physical_memory()
+    if needed > present:
+        limit = f"allowed here is up to {present / 1e9:.0f} GB"
+        raise InputError(f"axes: {engine.total} points need {needed / 1e9:.0f} GB of memory; {limit}")
+    return engine
+
+
+def _progress(engine: Engine) -> Progress:
+    """Counts before anything is computed. How many solves a function takes shows while it is made."""
+    return Progress(0, kind="direct solves") if engine.scene.analysis.continuous else Progress(engine.total)
+
+
+def _in_memory(engine: Engine, where: Where, report: Report | None) -> xr.Dataset:
+    progress, begin = _progress(engine), time.monotonic()
+    work = Work(where, report)
+    try:
+        if engine.scene.analysis.continuous:
+            dataset = _atlas(engine, work, progress).to_dataset()
+        else:
+            table = Table(engine.scene, engine.grid)
+            extra = _fill(engine, table, work, progress)
+            dataset = to_dataset(engine.scene, table.lay_out(), _attrs(engine) | extra)
+    except ChunkError as error:
+        raise Incomplete(str(error), progress) from error
+    return dataset.assign_attrs(wall_time_s=round(time.monotonic() - begin, 3))
+
+
+def _resume(
+    engine: Engine,
+    out: Path,
+    parts: PartsFolder,
+    progress: Progress,
+    where: Where,
+    report: Report | None,
+    taken: Taken,
+) -> None:
+    """Write the result ``out`` from the points ``taken``, the parts that exist and those that are computed and kept now."""
+    work, begin = Work(where, report, parts), time.monotonic()
+
+    def seconds() -> float:
+        return round(work.seconds + time.monotonic() - begin, 3)
+
+    temporary = parts.result
+    if engine.scene.analysis.continuous:
+        with work:
+            write_result(_atlas(engine, work, progress).with_attrs(wall_time_s=seconds()), out, temporary)
+        return
+    with work, ResultFile(temporary) as file:
+        table = Table(engine.scene, engine.grid, lambda blank: file.lay_out(blank.with_attrs(**_attrs(engine))))
+        extra = _fill(engine, table, work, progress, taken)
+        table.lay_out()
+        file.finish(out, wall_time_s=seconds(), **extra)
+
+
+def _fill(engine: Engine, table: Table, work: Work, progress: Progress, taken: Taken = NOTHING) -> dict[str, str | int]:
+    """All points into ``table``; what the attributes of the result are to say of it."""
+    if uses_atlas(engine.scene):
+        from drivetrain_jax.runs.through_atlas import fill_through_atlas
+
+        return fill_through_atlas(engine, table, work, progress)
+    for points, results in taken.blocks([variable.name for variable in table.variables]):
+        table.fill(points, results)
+        progress.reused += results[OUTCOME.name].size
+        progress.failed += failures(results[OUTCOME.name])
+    work.do(rest_of(engine, taken), table, progress)
+    return taken.attrs
+
+
+def _atlas(engine: Engine, work: Work, progress: Progress) -> Labelled:
+    from drivetrain_jax.runs.atlas_file import make_atlas
+
+    return make_atlas(engine.scene, work, progress).with_attrs(**_attrs(engine))
+
+
+def _attrs(engine: Engine) -> dict[str, str | float]:
+    """Whose result it is; what it took is told at its end."""
+    return {"digest": engine.digest, **engine.numerics_attrs, "wall_time_s": 0.0}

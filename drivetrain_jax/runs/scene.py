@@ -1,0 +1,302 @@
+"""A scene: which system, which analysis, which parameters vary and how. Checked before anything is compiled."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._machine import physical_memory
+from drivetrain_jax._quantities import Dimension, Parameter
+from drivetrain_jax._wording import clipped, did_you_mean, nearest, shown
+from drivetrain_jax.analysis import Analysis, Request, get_analysis
+from drivetrain_jax.analysis.request import checked, make_request
+from drivetrain_jax.runs import toml
+from drivetrain_jax.runs.axes import MAX_POINTS, MAX_RANGES, Axis, AxisTable, check_count, entry_of, spread
+from drivetrain_jax.systems import Model, System, get_system, system_names
+
+# What an axis takes for each value while it is made and checked.
+_BYTES = 32
+
+Value = float | int | str | tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A checked scene.
+
+    ``axes`` vary: as an outer product in this order, or together as one list of points if ``zipped``. ``fixed`` holds
+    the other parameters of the system that are known, defaults included. ``dimensions`` are those that the analysis adds
+    to the results, ``path_axis`` is the name of the axis that it consumes whole. ``text`` is the scene in TOML.
+    """
+
+    title: str
+    system: System
+    analysis: Analysis
+    request: Request
+    axes: tuple[Axis, ...]
+    zipped: bool
+    fixed: Mapping[str, Value]
+    dimensions: tuple[Dimension, ...]
+    path_axis: str | None
+    text: str
+
+
+class _SceneTable(msgspec.Struct, forbid_unknown_fields=True):
+    """The keys of a scene file."""
+
+    system: str
+    analysis: str
+    title: str = ""
+    outputs: list[str] | None = None
+    axes: dict[str, Any] = {}
+    points: dict[str, Any] = {}
+    fixed: dict[str, Any] = {}
+    options: dict[str, Any] = {}
+
+
+def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Scene:
+    """Read and check a scene: a path, or a mapping with the same keys. ``overrides``: see :func:`toml.read`.
+
+    Raises :class:`InputError` with one line that names the field, what was given and what is allowed.
+    """
+    tree, text = toml.read(source, overrides)
+    table = _convert(tree, _SceneTable, "")
+    system, analysis = system_and_analysis(table.system, table.analysis)
+    request = make_request(system, analysis, table.outputs, table.options, {*table.axes, *table.points})
+    axes, zipped = _axes(table, system, analysis)
+    fixed = _fixed(table, system, analysis, axes)
+    path_axis = _path_axis(analysis, request, axes, zipped, fixed)
+    dimensions = analysis.dimensions(system, request, fixed)
+    title = table.title or f"{system.title}: {analysis.title}"
+    return Scene(title, system, analysis, request, axes, zipped, fixed, dimensions, path_axis, text)
+
+
+def find_system(name: str) -> System:
+    """The system called so; ``InputError`` with the name that may have been meant if there is none, or why it fails."""
+    try:
+        return get_system(name)
+    except KeyError:
+        raise InputError(f"system = {name!r}: unknown{nearest(str(name), system_names())}") from None
+    except ImportError as error:
+        # One line, whatever the package had to say.
+        raise InputError(f"system = {name!r}: {' '.join(str(error).split())}") from error
+
+
+def system_and_analysis(system_name: str, analysis_name: str) -> tuple[System, Analysis]:
+    """The system and the analysis called so; ``InputError`` unless both exist and the one has a model for the other."""
+    system = find_system(system_name)
+    if analysis_name not in system.models:
+        guess = did_you_mean(str(analysis_name), system.models)
+        allowed = f"allowed for {system.name} is one of {', '.join(system.models)}"
+        raise InputError(f"analysis = {analysis_name!r}: unknown{guess}; {allowed}")
+    return system, get_analysis(analysis_name)
+
+
+def _convert(given: Any, kind: type, where: str) -> Any:
+    """``given`` as the table ``kind``; ``where`` is the dotted prefix of its fields in messages."""
+    names = [field.name for field in msgspec.structs.fields(kind)]
+    for key in given:
+        if key not in names:
+            raise InputError(f"{where}{key} = {shown(given[key])}: unknown key{nearest(key, names)}")
+    try:
+        return msgspec.convert(given, kind)
+    except msgspec.ValidationError as error:
+        reason, _, path = str(error).partition(" - at `$.")
+        if missing := re.search(r"missing required field `(\w+)`", reason):
+            name = missing.group(1)
+            raise InputError(f"{where}{name}: missing; {_MISSING.get(name, 'it must be given')}") from None
+        name = re.match(r"\w*", path).group()
+        reason = re.sub(r"`([^`]*)`", _toml_types, reason)
+        raise InputError(
+            f"{where}{name} = {shown(given.get(name))}: {reason.replace('Expected', 'allowed is')}"
+        ) from None
+
+
+_TOML_TYPES = {
+    "object": "table",
+    "array": "list",
+    "str": "text",
+    "int": "integer",
+    "float": "number",
+    "bool": "boolean",
+}
+_MISSING = {"system": "give the name of a system", "analysis": "give the name of an analysis"}
+
+
+def _toml_types(match: re.Match[str]) -> str:
+    """``int | null`` in the words of TOML, in which there is no null."""
+    words = [_TOML_TYPES.get(word, word) for word in match.group(1).split(" | ") if word != "null"]
+    return " or ".join(words) or "nothing"
+
+
+def _axes(table: _SceneTable, system: System, analysis: Analysis) -> tuple[tuple[Axis, ...], bool]:
+    """The varying parameters; counted before a single value is made."""
+    if table.axes and table.points:
+        raise InputError("points: given together with axes; allowed is one of the two")
+    if analysis.continuous:
+        _check_ranges(table, analysis)
+    for where, name in [("axes", n) for n in table.axes] + [("points", n) for n in table.points]:
+        _swept_parameter(system, where, name)
+    if table.points:
+        return _points(table, system), True
+    specs = {name: _axis_table(name, value) for name, value in table.axes.items()}
+    counts = {name: check_count(name, spec, analysis.continuous) for name, spec in specs.items()}
+    total = math.prod(counts.values())
+    if total > MAX_POINTS:
+        raise InputError(f"axes: {clipped(str(total))} points; allowed is up to {MAX_POINTS}")
+    most, present = max(counts.values(), default=0), physical_memory()
+    if most * _BYTES > present:
+        name = max(counts, key=lambda name: counts[name])
+        raise InputError(f"axes.{name}.num = {most}: allowed with this memory is up to {int(present / _BYTES)}")
+    return tuple(_axis(system, name, spec) for name, spec in specs.items()), False
+
+
+def _check_ranges(table: _SceneTable, analysis: Analysis) -> None:
+    if table.points:
+        raise InputError(f"points: {analysis.name} is made over ranges; allowed are axes with start and stop")
+    if not 1 <= len(table.axes) <= MAX_RANGES:
+        raise InputError(f"axes: {len(table.axes)} are given; {analysis.name} allows 1 to {MAX_RANGES}")
+
+
+def _axis_table(name: str, given: Any) -> AxisTable:
+    if not isinstance(given, Mapping):
+        raise InputError(f"axes.{name} = {shown(given)}: allowed is a table {{ start, stop, num }} or {{ values }}")
+    if isinstance(num := given.get("num"), float) and num.is_integer():
+        # As options and parameters take 1e3 for 1000.
+        given = {**given, "num": int(num)}
+    return _convert(given, AxisTable, f"axes.{name}.")
+
+
+def _axis(system: System, name: str, spec: AxisTable) -> Axis:
+    parameter, entry = _swept_parameter(system, "axes", name)
+    scalar = _scalar(parameter, name)
+    for value in spec.values if spec.values is not None else (spec.start, spec.stop):
+        checked(scalar, value, "axes.")
+    values = spread(spec, f"axes.{name}")
+    if parameter.integer:
+        for value in values:
+            checked(scalar, float(value), "axes.")
+    return Axis(name, parameter, entry, values.astype(np.int64) if parameter.integer else values)
+
+
+def _points(table: _SceneTable, system: System) -> tuple[Axis, ...]:
+    """Equally long columns of parameter values."""
+    for name, values in table.points.items():
+        if not isinstance(values, list):
+            raise InputError(f"points.{name} = {shown(values)}: allowed is a list of numbers")
+    lengths = {name: len(values) for name, values in table.points.items()}
+    if len(set(lengths.values())) > 1 or not all(lengths.values()):
+        listed = ", ".join(f"{name} has {length}" for name, length in lengths.items())
+        raise InputError(f"points: {listed}; allowed are lists of one length, at least 1")
+    columns = []
+    for name, values in table.points.items():
+        parameter, entry = _swept_parameter(system, "points", name)
+        scalar = _scalar(parameter, name)
+        numbers = [checked(scalar, value, "points.") for value in values]
+        columns.append(Axis(name, parameter, entry, np.array(numbers)))
+    return tuple(columns)
+
+
+def _scalar(parameter: Parameter, name: str) -> Parameter:
+    """The range of one number of ``parameter``, under the name it is swept by."""
+    return replace(parameter, name=name, listed=False, broadcast=False)
+
+
+def _swept_parameter(system: System, where: str, name: str) -> tuple[Parameter, int | None]:
+    """The parameter behind the axis ``name`` and, for one entry of a list, its position."""
+    base, entry = entry_of(name)
+    known = {p.name: p for p in system.parameters}
+    parameter = known.get(base)
+    if parameter is None:
+        raise InputError(f"{where}.{name}: {_unknown(system, base)}")
+    if parameter.choices or parameter.text:
+        raise InputError(f"{where}.{name}: a word cannot vary; allowed is to fix it: {parameter.allowed}")
+    if not parameter.is_number and entry is None:
+        raise InputError(
+            f'{where}.{name}: a list cannot vary as a whole; allowed is one entry, for example "{name}[0]"'
+        )
+    if entry is not None and not parameter.listed:
+        raise InputError(f"{where}.{name}: {base} is not a list; allowed is {base}")
+    return parameter, entry
+
+
+def _unknown(system: System, name: str) -> str:
+    """Why a scene has no parameter ``name``, and what it may have."""
+    known = [p.name for p in system.parameters]
+    if system.physical and name in system.physical.names:
+        return f"physical units are for point, query and design; allowed in a scene is {', '.join(known)}"
+    return f"unknown parameter{nearest(name, known)}"
+
+
+def _fixed(table: _SceneTable, system: System, analysis: Analysis, axes: tuple[Axis, ...]) -> dict[str, Value]:
+    """The parameters that do not vary: those given, then the defaults of those the analysis uses."""
+    known = {p.name: p for p in system.parameters}
+    whole = {axis.name for axis in axes if axis.entry is None}
+    for name, value in table.fixed.items():
+        if name not in known:
+            raise InputError(f"fixed.{name} = {shown(value)}: {_unknown(system, name)}")
+        if name in whole:
+            where = "points" if table.points else "axes"
+            raise InputError(f"fixed.{name} = {shown(value)}: also in [{where}]; allowed is one of the two")
+    fixed: dict[str, Value] = {}
+    used, missing = system.models[analysis.name].parameters, []
+    for parameter in system.parameters:
+        if parameter.name in table.fixed:
+            fixed[parameter.name] = checked(parameter, table.fixed[parameter.name], "fixed.")
+        elif parameter.name in used and parameter.name not in whole and not parameter.derived:
+            fixed[parameter.name] = parameter.default
+            missing += [parameter] if parameter.default is None else []
+    if missing:
+        others = f" (missing too: {', '.join(p.name for p in missing[1:])})" if missing[1:] else ""
+        raise InputError(f"fixed.{missing[0].name}: missing; allowed is {missing[0].allowed_in_units}{others}")
+    for axis in axes:
+        _check_entry(axis, fixed, "points" if table.points else "axes")
+    _check_together(system.models[analysis.name], fixed)
+    return fixed
+
+
+def _check_together(model: Model, fixed: Mapping[str, Value]) -> None:
+    if model.check is None:
+        return
+    try:
+        model.check(fixed)
+    except ValueError as error:
+        raise InputError(f"fixed.{error}") from None
+
+
+def _path_axis(
+    analysis: Analysis, request: Request, axes: tuple[Axis, ...], zipped: bool, fixed: Mapping[str, Value]
+) -> str | None:
+    """The name of the axis that is consumed whole: an axis of the scene, or a fixed number as a line of one."""
+    name = analysis.path_axis(request)
+    names = [axis.name for axis in axes]
+    if name in names and zipped:
+        raise InputError(f"points.{name}: {analysis.name} follows it as a path; allowed is an axis or a fixed value")
+    if name is not None and name not in names and not isinstance(fixed.get(name), (int, float)):
+        allowed = f"allowed is one of {', '.join(names)}" if names else "the scene has no axes"
+        raise InputError(f"options: {name!r} is not an axis of the scene; {allowed}")
+    return name
+
+
+def _check_entry(axis: Axis, fixed: Mapping[str, Value], where: str) -> None:
+    """One swept entry needs the whole list beside it, for its length and the other entries."""
+    name = axis.parameter.name
+    if axis.entry is None:
+        return
+    # An empty list is the default "none".
+    if fixed.get(name, ()) == ():
+        raise InputError(
+            f"fixed.{name}: missing; {axis.name} varies one entry of this list; allowed is {axis.parameter.allowed}"
+        )
+    if not isinstance(fixed[name], tuple):
+        raise InputError(f"fixed.{name} = {fixed[name]}: {axis.name} varies one entry; allowed is a list of numbers")
+    if axis.entry >= len(fixed[name]):
+        raise InputError(f"{where}.{axis.name}: allowed is {name}[0] to {name}[{len(fixed[name]) - 1}]")

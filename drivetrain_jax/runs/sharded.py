@@ -1,0 +1,213 @@
+"""Runs whose workers write their results themselves, as whole shards of a Zarr store: nothing passes through the driver."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from drivetrain_jax._errors import ChunkError, InputError
+from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.runs.assemble import failures, missing_value, result_attrs, result_variables
+from drivetrain_jax.runs.atlas_choice import uses_atlas
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.executor import Where
+from drivetrain_jax.runs.kernel import result_shapes
+from drivetrain_jax.runs.plan import Chunk
+from drivetrain_jax.runs.work import Progress, Report
+from drivetrain_jax.runs.worker import Job
+from drivetrain_jax.store import shards
+from drivetrain_jax.store.chunks import PartsFolder
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Shard ``index`` of ``group`` is made up of the chunks with these ``numbers``."""
+
+    number: int
+    group: shards.Group
+    index: int
+    numbers: range
+
+
+@dataclass(frozen=True)
+class Task:
+    """A shard and its chunks: all that a worker has to know beside the scene."""
+
+    number: int
+    shard: Shard
+    chunks: tuple[Chunk, ...]
+
+    @classmethod
+    def of(cls, engine: Engine, shard: Shard) -> Task:
+        """The task of computing ``shard``."""
+        return cls(shard.number, shard, tuple(map(engine.plan.chunk, shard.numbers)))
+
+
+@dataclass(frozen=True)
+class ShardJob(Job):
+    """Shards of the store at ``path``, which every worker has to see under this name."""
+
+    path: str
+
+    def do(self, engine: Engine, task: Task) -> Mapping[str, np.ndarray]:
+        """Compute and write a shard; only the outcomes come back."""
+        return _write(self.path, engine, task, [engine.compute_chunk(chunk) for chunk in task.chunks])
+
+
+def check(engine: Engine) -> None:
+    """:class:`InputError` for a scene that has no points to compute one by one."""
+    if engine.scene.analysis.continuous or uses_atlas(engine.scene):
+        raise InputError(
+            "store = 'zarr': an atlas is small; allowed is hdf5, or a scene that solves every point directly"
+        )
+
+
+def groups_of(engine: Engine) -> list[shards.Group]:
+    """One for each solver of the plan."""
+    return [shards.Group(f"solver_{g.index}", len(g.efforts), g.chunk) for g in engine.plan.groups]
+
+
+def compute(
+    engine: Engine, out: Path, parts: PartsFolder, progress: Progress, where: Where, report: Report | None
+) -> None:
+    """Fill the store that grows among ``parts``, and put it at ``out`` when it is complete."""
+    path, begin = parts.path / shards.UNFINISHED, time.monotonic()
+    progress.computed += engine.hopeless
+    progress.failed += engine.hopeless
+    if not shards.is_store(path):
+        _create(engine, path)
+    missing = list(_missing(engine, path, progress))
+    costs = engine.plan.costs
+    progress.total_cost = float(sum(costs[shard.numbers].sum() for shard in missing))
+    _tell(report, progress)
+    job = ShardJob(engine.scene.text, engine.digest, os.path.abspath(path))
+    # Made when they are handed out: the points of all shards together may be too many for the driver.
+    tasks = map(partial(Task.of, engine), missing)
+    with closing(where.each(tasks, partial(job.do, engine), lambda: job)) as finished:
+        for task, results in finished:
+            outcome = _one_by_one(engine, where, path, task) if results is None else results[OUTCOME.name]
+            progress.computed += outcome.size
+            progress.failed += failures(outcome)
+            progress.cost += float(costs[task.shard.numbers].sum())
+            _tell(report, progress)
+    _finish(engine, path, out, parts, round(time.monotonic() - begin, 3))
+
+
+def _tell(report: Report | None, progress: Progress) -> None:
+    if report:
+        report(progress)
+
+
+def _create(engine: Engine, path: Path) -> None:
+    shutil.rmtree(path, ignore_errors=True)
+    # Moved in one step: what is there is a whole store.
+    half = path.with_name("half")
+    shutil.rmtree(half, ignore_errors=True)
+    shards.create(half, groups_of(engine), _fields(engine), _attrs(engine))
+    half.rename(path)
+
+
+def _fields(engine: Engine) -> list[shards.Field]:
+    if not engine.plan.groups:
+        return []
+    shapes = result_shapes(engine.scene, engine.grid, engine.solvers[engine.plan.groups[0].index])
+    return [shards.Field(v.name, v.dtype, shapes[v.name]) for v in result_variables(engine.scene)]
+
+
+def _attrs(engine: Engine) -> dict[str, str | int]:
+    """Whose result it is, and which points its shards hold: those that no solver can do are in none."""
+    whose = {"digest": engine.digest, **engine.numerics_attrs}
+    held = {shards.GROUPS: shards.describe(groups_of(engine)), shards.HELD: engine.plan.size}
+    return result_attrs(engine.scene) | whose | held
+
+
+def all_shards(engine: Engine) -> Iterator[Shard]:
+    """The plan in shards."""
+    number = first = 0
+    for group in groups_of(engine):
+        for index in range(group.shards):
+            start = index * group.per_shard
+            yield Shard(number, group, index, range(first + start, first + min(start + group.per_shard, group.count)))
+            number += 1
+        first += group.count
+
+
+def _missing(engine: Engine, path: Path, progress: Progress) -> Iterator[Shard]:
+    """Shards that are not there or damaged; the others count as reused."""
+    for shard, present in stored(engine, path):
+        if present is None:
+            yield shard
+            continue
+        outcome = shards.without_padding(present)[1][OUTCOME.name]
+        progress.reused += outcome.size
+        progress.failed += failures(outcome)
+
+
+def stored(engine: Engine, path: Path) -> Iterator[tuple[Shard, Mapping[str, np.ndarray] | None]]:
+    """All shards and what the store at ``path`` holds of them: None if one is not there or damaged.
+
+    Raises :class:`InputError` if the store itself is damaged.
+    """
+    shards.check_layout(path, groups_of(engine), _fields(engine))
+    names = [shards.POINT, *(variable.name for variable in result_variables(engine.scene))]
+    marked = {group.name: shards.done(path, group) for group in groups_of(engine)}
+    for shard in all_shards(engine):
+        is_done = marked[shard.group.name][shard.index]
+        yield shard, shards.read(path, shard.group, shard.index, names) if is_done else None
+
+
+def _write(
+    path: str | Path, engine: Engine, task: Task, results: list[Mapping[str, np.ndarray]]
+) -> dict[str, np.ndarray]:
+    """Write the results of all chunks of a shard, padded to whole chunks; returns the outcomes."""
+    shard, width = task.shard, task.shard.group.width
+    arrays = {shards.POINT: np.concatenate([_padded(c.points, width, -1) for c in task.chunks])}
+    for variable in result_variables(engine.scene):
+        blank = missing_value(variable)
+        arrays[variable.name] = np.concatenate([_padded(r[variable.name], width, blank) for r in results])
+    shards.write(Path(path), shard.group, shard.index, arrays)
+    return {OUTCOME.name: arrays[OUTCOME.name][arrays[shards.POINT] >= 0]}
+
+
+def _padded(values: np.ndarray, count: int, blank: float) -> np.ndarray:
+    full = np.full((count, *values.shape[1:]), blank, values.dtype)
+    full[: len(values)] = values
+    return full
+
+
+def _one_by_one(engine: Engine, where: Where, path: Path, task: Task) -> np.ndarray:
+    """A shard at which processes die: its chunks alone, so that only the deadly one is lost; the driver writes it."""
+    found = {chunk.number: results for chunk, results in where.compute(engine, task.shard.numbers)}
+    shapes = result_shapes(engine.scene, engine.grid, engine.solvers[task.chunks[0].solver])
+    lost = {
+        v.name: np.full((task.shard.group.width, *shapes[v.name]), missing_value(v), v.dtype)
+        for v in result_variables(engine.scene)
+    }
+    lost[OUTCOME.name][...] = Outcome.LOST
+    results = [found[c.number] or {n: a[: c.points.size] for n, a in lost.items()} for c in task.chunks]
+    return _write(path, engine, task, results)[OUTCOME.name]
+
+
+def _finish(engine: Engine, path: Path, out: Path, parts: PartsFolder, seconds: float) -> None:
+    """Put the store into place. A former one is set aside first: a directory cannot be replaced in one step.
+
+    Raises :class:`ChunkError` if a shard is not there, though its worker said that it had been written.
+    """
+    absent = sum(int(np.sum(~shards.done(path, group))) for group in groups_of(engine))
+    if absent:
+        raise ChunkError(f"{absent} shards were written elsewhere; every worker has to see the store as {str(path)!r}")
+    # Made anew: what a store has got while it grew is not guarded.
+    shards.seal(path, _attrs(engine) | {"wall_time_s": seconds})
+    former = parts.path / shards.FORMER
+    if out.exists():
+        shutil.rmtree(former, ignore_errors=True)
+        out.rename(former)
+    path.rename(out)

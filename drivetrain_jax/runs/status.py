@@ -1,0 +1,105 @@
+"""What a run of a scene into a file would find there."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.analysis.periodic.floquet_propagator import PROPAGATOR
+from drivetrain_jax.runs.assemble import failures
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.runs.target import Target
+from drivetrain_jax.store import shards
+
+
+@dataclass(frozen=True)
+class Status:
+    """How much of a scene is at ``out``: counts of points, and absent, partial, complete or stale (another scene).
+
+    ``failed_by_outcome`` counts the points without a value by what became of them. ``reason`` says why a run would be
+    refused, empty if it would not.
+    """
+
+    total: int
+    done: int
+    failed: int
+    state: str
+    failed_by_outcome: Mapping[str, int] = field(default_factory=dict)
+    reason: str = ""
+
+    def __str__(self) -> str:
+        lines = [f"{self.state}: {self.done} of {self.total} points done, {self.failed} without a value"]
+        lines += [f"  {name}: {count}" for name, count in self.failed_by_outcome.items()]
+        return "\n".join([*lines, *([f"  a run would be refused: {self.reason}"] if self.reason else [])])
+
+    def to_json(self) -> str:
+        """The counts and the state, and what else there is to say, as one JSON object."""
+        content = {name: getattr(self, name) for name in ("total", "done", "failed", "state")}
+        more = {"failed_by_outcome": dict(self.failed_by_outcome), "reason": self.reason}
+        return json.dumps(content | {name: value for name, value in more.items() if value})
+
+
+def status(
+    scene: str | Path | Mapping[str, Any], out: str | Path, overrides: Mapping[str, Any] | None = None
+) -> Status:
+    """What a run of ``scene`` into ``out`` would find. Changes nothing and compiles nothing."""
+    engine = Engine(load_scene(scene, overrides))
+    target = Target(Path(out), engine)
+    total = 0 if engine.scene.analysis.continuous else engine.total
+    if target.state == "stale":
+        reason = f"it holds {target.obstacle}; {target.remedy}"
+        return Status(total, 0, 0, target.state, reason=reason)
+    try:
+        found = _counts(target)
+    except InputError as error:
+        return Status(total, 0, 0, "stale", reason=str(error))
+    if engine.scene.analysis.continuous:
+        total = done = target.points(0) if target.state == "complete" else found.done
+        return Status(total, done, found.failed, target.state, found.by_outcome)
+    return Status(total, found.done, found.failed, target.state, found.by_outcome)
+
+
+@dataclass(frozen=True)
+class _Counts:
+    done: int
+    failed: int
+    by_outcome: Mapping[str, int]
+
+
+def _counts(target: Target) -> _Counts:
+    done, failed, codes = 0, 0, Counter[int]()
+    for outcome in _outcomes(target):
+        done += outcome.size
+        failed += failures(outcome)
+        codes.update(dict(enumerate(np.bincount(outcome.ravel(), minlength=len(Outcome)).tolist())))
+    by_outcome = {o.name.lower(): codes[o] for o in Outcome if not o.has_value and codes[o]}
+    return _Counts(done, failed, by_outcome)
+
+
+def _outcomes(target: Target) -> Iterator[np.ndarray]:
+    """Outcomes of all points that are done."""
+    if target.state == "complete":
+        # A function of the parameters has no points.
+        yield from () if target.is_function else (target.outcomes,)
+    elif target.state == "partial" and target.store == "zarr":
+        store = target.parts.path / shards.UNFINISHED
+        yield from shards.finished(store, OUTCOME.name) if shards.is_store(store) else ()
+    elif target.state == "partial":
+        continuous, seen = target.engine.scene.analysis.continuous, set[int]()
+        for part in target.parts.read():
+            # Solves for an atlas are no points of a grid.
+            if continuous or PROPAGATOR not in part.results:
+                # An interrupt in the middle of writing may have left a chunk in two parts.
+                yield from (results[OUTCOME.name] for number, results in part if number not in seen)
+                seen.update(part.chunks.tolist())
+        for _, results in target.taken_before().blocks([OUTCOME.name]):
+            yield results[OUTCOME.name]

@@ -1,0 +1,310 @@
+"""What lies at the path of a result: nothing, unfinished work, the result itself, or something else."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import drivetrain_jax
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._wording import clipped
+from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.runs.assemble import failures
+from drivetrain_jax.runs.atlas_choice import uses_atlas
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.explain import differences
+from drivetrain_jax.runs.growing import NOTHING, Damaged, NotReusable, Source, Taken, find, take
+from drivetrain_jax.runs.layout import rearranged
+from drivetrain_jax.store import shards
+from drivetrain_jax.store.chunks import PartsFolder
+from drivetrain_jax.store.consolidate import read_attribute, read_variable
+from drivetrain_jax.store.files import behind_link
+
+
+class Target:
+    """The result file ``out`` and the folder of its parts, seen by the scene of ``engine``.
+
+    ``state`` is ``absent``, ``partial``, ``complete`` or ``stale`` (a result or parts of another scene or version).
+    Raises :class:`InputError` if nothing can be written there, or if a file there is not a result of this package.
+    """
+
+    def __init__(self, out: Path, engine: Engine, store: str | None = None) -> None:
+        self.out = out = behind_link(out)
+        self.parts = PartsFolder(out)
+        _check_name(out, self.parts)
+        _check_parts(out, self.parts.path)
+        self.store = store or self._kind()
+        _check_place(out, self._held, self.store)
+        self.engine, self.digest = engine, engine.digest
+        self.present = _digest_of(out, self._held)
+        self._plan_seen = self.parts.plan()
+
+    def _kind(self) -> str:
+        """``hdf5`` or ``zarr``, after what is there."""
+        return "zarr" if shards.is_store(self._held) else self.parts.plan().get("store", "hdf5")
+
+    @property
+    def _held(self) -> Path:
+        """Where the result that is there lies: a run puts a store aside just before it puts the new one in its place."""
+        former = self.parts.path / shards.FORMER
+        return former if not self.out.exists() and former.exists() else self.out
+
+    @property
+    def written(self) -> int | None:
+        """When the result that is there was written, in the clock of its file system."""
+        held = self._held / "zarr.json" if self.store == "zarr" else self._held
+        return held.stat().st_mtime_ns if held.exists() else None
+
+    def restore(self) -> None:
+        """Put a store back that a run was killed over while it replaced it.
+
+        Raises :class:`InputError` if that run is still at work.
+        """
+        if self._held == self.out:
+            return
+        self.check_writable()
+        self.parts.open()
+        try:
+            if self._held != self.out:
+                self._held.rename(self.out)
+        finally:
+            self.parts.close()
+
+    @cached_property
+    def state(self) -> str:
+        """See the class."""
+        if self.present == self.digest:
+            return "stale" if self._rearranged else "complete"
+        if self.parts.holds_work():
+            # Parts that are to replace another result belong to that one alone.
+            return "partial" if _same(self.parts.plan(), self.plan(), ("digest", "replaces", "store")) else "stale"
+        if self.present is None:
+            return "absent"
+        return "partial" if self._grows else "stale"
+
+    def plan(self, taken: Taken = NOTHING, fresh: bool = False) -> dict[str, Any]:
+        """What parts written now belong to, and what a reader needs to know of them."""
+        return {
+            "digest": self.digest,
+            "replaces": self.present,
+            "replaces_written": self.written,
+            "store": self.store,
+            "fresh": fresh,
+            "reuses": taken.digest,
+            "reused": taken.count,
+            "reused_files": [os.path.relpath(source.path, self.out.parent) for source in taken.sources],
+            **provenance_of(self.engine),
+        }
+
+    def resumes(self, taken: Taken, fresh: bool) -> bool:
+        """Whether a run goes on with the parts that are there. A ``fresh`` one does so with those of its own beginning."""
+        if not fresh:
+            return self.parts.holds_work()
+        # Parts that the result was made from already, by a run that was killed before it deleted them, are none of these.
+        names = ("digest", "replaces", "replaces_written", "store", "reuses", "fresh")
+        return _same(self.parts.plan(), self.plan(taken, fresh), names)
+
+    def check_unchanged(self) -> None:
+        """Raises :class:`InputError` if another run has come to its end, or begun, since this was made."""
+        if (_digest_of(self.out, self._held), self.parts.plan()) != (self.present, self._plan_seen):
+            raise InputError(f"out = {str(self.out)!r}: another run has changed it meanwhile; allowed is to try again")
+
+    def check_writable(self) -> None:
+        """Raises :class:`InputError` if nothing can be written beside what is there."""
+        for folder in (self.out.parent, self.parts.path):
+            if folder.exists() and not os.access(folder, os.W_OK | os.X_OK):
+                raise InputError(
+                    f"out = {str(self.out)!r}: the folder {str(folder)!r} is not writable; "
+                    "allowed is a file in a writable folder"
+                )
+
+    @cached_property
+    def _rearranged(self) -> list[str]:
+        """What of the result that is there is not laid out as this scene says."""
+        if self.engine.scene.analysis.continuous or self.store == "zarr":
+            return []
+        return rearranged(self.out, self.engine.scene, self.engine.grid)
+
+    @cached_property
+    def _found(self) -> Source | NotReusable | None:
+        """What the result that is there holds of the points of this scene, or why it is of no use."""
+        if self.engine.scene.analysis.continuous or self.present is None or self.store == "zarr":
+            return None
+        try:
+            return find(self.engine, self.out)
+        except NotReusable as error:
+            return error
+
+    @property
+    def _shared(self) -> Source | None:
+        return self._found if isinstance(self._found, Source) else None
+
+    @property
+    def _grows(self) -> bool:
+        """Whether the result that is there is a part of this scene's, so that replacing it loses nothing."""
+        return self._shared is not None and self._shared.is_covered
+
+    @property
+    def remedy(self) -> str:
+        """What there is to do about the :attr:`obstacle`."""
+        if self._shared is None or self.parts.holds_work():
+            return "--fresh replaces it"
+        kept = f"--reuse {self.out.name} with another --out takes {Taken((self._shared,)).count} points from it"
+        return f"--fresh replaces it, {kept}"
+
+    def take(self, reuse: Sequence[str | Path], fresh: bool) -> Taken:
+        """The points that a run takes from the results ``reuse`` and, unless it is ``fresh``, from the one in its place.
+
+        Raises :class:`InputError` if unfinished work was begun with others, or if one of ``reuse`` has nothing to give.
+        """
+        scene = self.engine.scene
+        if self.store == "zarr":
+            if reuse:
+                raise InputError("reuse: given together with store = 'zarr'; allowed is one of them")
+            return NOTHING
+        if scene.analysis.continuous or uses_atlas(scene):
+            if reuse:
+                raise InputError("reuse: an atlas is made anew; allowed for a scene that solves every point directly")
+            return NOTHING
+        paths = [Path(path) for path in reuse]
+        found = [find(self.engine, path) for path in paths]
+        # Work that was begun afresh is resumed as it was begun.
+        if not (fresh or self.parts.plan().get("fresh")):
+            if isinstance(self._found, Damaged):
+                raise self.refusal
+            found += [self._shared] if self._grows else []
+        taken = take(self.engine, found)
+        if not fresh and self.parts.holds_work() and self.parts.plan().get("reuses") != taken.digest:
+            files = ", ".join(self.parts.plan().get("reused_files") or ["no other result"])
+            raise InputError(
+                f"reuse = {[str(p) for p in paths]}: the unfinished work at {str(self.out)!r} takes points from {files}; "
+                "allowed is the same again, or --fresh"
+            )
+        return taken
+
+    def taken_before(self) -> Taken:
+        """The points that unfinished work takes from other results, or a run would."""
+        if not self.parts.holds_work():
+            return self.take((), fresh=False)
+        names = self.parts.plan().get("reused_files") or ()
+        return take(self.engine, [find(self.engine, self.out.parent / name) for name in names])
+
+    @property
+    def refusal(self) -> InputError:
+        """What a run says that is not to replace what is there."""
+        return InputError(f"out = {str(self.out)!r}: holds {self.obstacle}; {self.remedy}")
+
+    @property
+    def obstacle(self) -> str:
+        """Why a run is refused, or would be: what is there, and what makes it another one's."""
+        if self.present == self.digest:
+            return f"a result that was rearranged after it was written ({', '.join(self._rearranged)})"
+        if isinstance(self._found, Damaged):
+            return f"a result that is not what was written ({self._found.what})"
+        if self.parts.holds_work():
+            stored, what = self.parts.plan(), "unfinished work"
+            if self.present != stored.get("replaces"):
+                return f"{what} beside another result than the one it was begun with"
+            if self.store != stored.get("store"):
+                return f"{what} of --store {stored.get('store')}"
+        else:
+            stored, what = {name: _attribute(self._held, name) for name in provenance_of(self.engine)}, "a result"
+        reasons = differences(stored, self.engine) if stored else ["it cannot be told which"]
+        more = f" and {len(reasons) - 2} more" if len(reasons) > 2 else ""
+        return f"{what} of another scene or version: {'; '.join(reasons[:2]) or 'other sizes of chunks'}{more}"
+
+    @property
+    def outcomes(self) -> np.ndarray:
+        """Outcomes of all points of the complete result."""
+        if self.store == "zarr":
+            held = np.concatenate(
+                [np.empty(0, np.int8), *(a.ravel() for a in shards.finished(self._held, OUTCOME.name))]
+            )
+            # Points that no solver can do are in no shard.
+            return np.append(held, np.full(max(self.engine.total - held.size, 0), Outcome.STEP_LIMIT, np.int8))
+        return read_variable(self.out, OUTCOME.name)
+
+    @property
+    def failed(self) -> int:
+        """Number of points without a value in the complete result. A function of the parameters has no points."""
+        return 0 if self._solves is not None else failures(self.outcomes)
+
+    def points(self, total: int) -> int:
+        """What the complete result took: the ``total`` points of its grid, or the solves behind a function."""
+        return total if self._solves is None else self._solves
+
+    @property
+    def is_function(self) -> bool:
+        """Whether the complete result is a function of the parameters instead of points."""
+        return self._solves is not None
+
+    @property
+    def _solves(self) -> int | None:
+        value = _attribute(self._held, "solves")
+        return None if value is None else int(np.squeeze(value))
+
+
+def provenance_of(engine: Engine) -> dict[str, str]:
+    """What tells later why work is not that of a scene."""
+    return {
+        "scene": engine.scene.text,
+        "drivetrain_jax_version": drivetrain_jax.__version__,
+        **engine.numerics_attrs,
+    }
+
+
+def _same(one: Mapping[str, Any], other: Mapping[str, Any], names: Iterable[str]) -> bool:
+    return all(one.get(name) == other.get(name) for name in names)
+
+
+def _check_name(out: Path, parts: PartsFolder) -> None:
+    """The folder of the parts has the longer name."""
+    try:
+        parts.path.exists()
+    except OSError as error:
+        raise InputError(
+            f"out = {clipped(str(out))!r}: {error.strerror} (with '.parts'); allowed is a shorter name"
+        ) from None
+
+
+def _check_parts(out: Path, folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"out = {str(out)!r}: {str(folder)!r} is in the way; allowed is to move that file away")
+    if folder.exists() and not os.access(folder, os.R_OK | os.X_OK):
+        raise InputError(f"out = {str(out)!r}: the folder {str(folder)!r} is not readable; allowed is one that is")
+
+
+def _check_place(out: Path, held: Path, store: str) -> None:
+    folder = out.parent
+    if not folder.is_dir():
+        raise InputError(
+            f"out = {str(out)!r}: the folder {str(folder)!r} does not exist; allowed is a file in an existing folder"
+        )
+    if held.is_dir() and not (store == "zarr" and shards.is_store(held)):
+        raise InputError(f"out = {str(out)!r}: is a folder; allowed is the path of a file")
+    if out.is_file() and store == "zarr":
+        raise InputError(f"out = {str(out)!r}: is a file; allowed for store = 'zarr' is a new path, or such a store")
+
+
+def _attribute(held: Path, name: str) -> Any:
+    return shards.attributes(held).get(name) if held.is_dir() else read_attribute(held, name)
+
+
+def _digest_of(out: Path, held: Path) -> str | None:
+    """Digest of the result of ``out``, which lies at ``held``; None if there is none."""
+    if not held.exists():
+        return None
+    try:
+        digest, what = _attribute(held, "digest"), "not a result of drivetrain_jax"
+    except InputError:
+        if held.is_dir():
+            raise
+        digest, what = None, "not a readable netCDF4/HDF5 file"
+    if not isinstance(digest, str):
+        raise InputError(f"out = {str(out)!r}: {what}; allowed is a new file or a result of drivetrain_jax")
+    return digest

@@ -1,0 +1,358 @@
+"""Questions to an atlas where it is loose, undamped, without panels, or reaches over the angle 0."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import drivetrain_jax as dt
+from drivetrain_jax.atlas import design, stability
+from drivetrain_jax.atlas.boundaries import boundaries
+from drivetrain_jax.atlas.exclusion import critical_points
+from drivetrain_jax.atlas.sensitivity import direct_sensitivity
+from drivetrain_jax.atlas.tiles import tiles
+from drivetrain_jax.runs import atlas_answers, rounds
+from drivetrain_jax.runs.atlas_answers import _from_one
+from drivetrain_jax.runs.atlas_chart import chart
+from drivetrain_jax.runs.atlas_file import StoredAtlas
+from drivetrain_jax.systems import get_system
+from drivetrain_jax.systems.cardan_units import PhysicalShaft
+
+S21 = (0.1063331213, 1.4159881603)
+CARDAN = get_system("cardan")
+
+
+@cache
+def panels(beta: tuple, omega: tuple, rtol: float = 1e-9, zeta: float = 0.001, gamma: float = 100.0) -> xr.Dataset:
+    axes = {"beta": beta, "Omega": omega}
+    return dt.run(
+        {
+            "system": "cardan",
+            "analysis": "atlas",
+            "axes": {name: {"start": low, "stop": high} for name, (low, high) in axes.items()},
+            "fixed": {"zeta": zeta, "alpha": 1.0, "mu": 1.0, "gamma": gamma},
+            "options": {"rtol": rtol},
+        }
+    )
+
+
+def test_an_atlas_answers_with_multipliers_as_well():
+    axes = {"beta": {"start": 0.2, "stop": 0.4}, "Omega": {"start": 1.3, "stop": 1.5}}
+    fixed = {"zeta": 0.01, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+    scene = {"system": "cardan", "analysis": "atlas", "axes": axes, "fixed": fixed, "outputs": ["floquet_multiplier"]}
+    reply = atlas_answers.query(dt.open_atlas(dt.run(scene)), {"beta": 0.3, "Omega": 1.416})
+    expected = dt.point("cardan", "floquet", beta=0.3, Omega=1.416, outputs="floquet_multiplier", **fixed)
+    found = json.loads(reply.to_json())["values"]["floquet_multiplier"]
+    np.testing.assert_allclose([z["real"] + 1j * z["imag"] for z in found], expected.floquet_multiplier, rtol=1e-8)
+    assert str(reply).splitlines()[1].split()[1] == f"{found[0]['real']:.12g}{found[0]['imag']:+.12g}j,"
+
+
+def atlas_of(*given, **more) -> StoredAtlas:
+    return dt.open_atlas(panels(*given, **more))
+
+
+@pytest.mark.parametrize("beta", [(-0.3, 0.0), (-0.3, 0.1), (-0.1, 0.3)])
+def test_the_widest_angle_has_no_sign(beta):
+    answer = atlas_answers.widest_angle(atlas_of(beta, (1.3, 1.5)), {"Omega": (1.35, 1.45)}).data
+    assert answer["value"] == pytest.approx(S21[0], abs=1e-8) and answer["check"]["agrees"]
+
+
+def test_boundaries_lie_on_both_sides_of_the_angle_0():
+    """Stable between the edges of S21 at a speed beside its tip, unstable beyond them, on either side."""
+    atlas, at = atlas_of((-0.2, 0.3), (1.3, 1.5)), {"beta": -0.15, "Omega": 1.42}
+    nearest = atlas_answers.query(atlas, at).data["nearest"]["beta"]
+    below, above = nearest["below"]["value"], nearest["above"]["value"]
+    assert below == pytest.approx(-above, rel=1e-12) and -0.2 < below < -0.15
+    beside = [below - 1e-6, below + 1e-6, above - 1e-6, above + 1e-6]
+    rho = atlas.radius({"beta": np.array(beside), "Omega": np.full(4, 1.42), **columns(4)})
+    assert (rho > 1).tolist() == [True, False, False, True]
+    ends = atlas_answers.query(atlas, {"beta": 0.25, "Omega": 1.42}).data["nearest"]["beta"]
+    assert ends["below"]["value"] == pytest.approx(above, rel=1e-12) and ends["above"] is None
+
+
+@pytest.mark.parametrize(("J1", "k1"), [(2.0, 1000.0), (2e-9, 3.7), (1e-170, 1e-170)])
+def test_the_ends_of_an_atlas_may_be_asked_for_in_other_units(J1, k1):
+    """Converted, or copied from the message that names them, they miss the ends by a rounding."""
+    atlas, critical = atlas_of((0.0, 0.3), (1.3, 1.5)), 2 * np.sqrt(J1) * np.sqrt(k1)
+    shaft = PhysicalShaft(J1, 100 * J1, k1, k1, 0.001 * critical, 0.001 * critical)
+    data = {name: getattr(shaft, name) for name in ("J1", "J2", "k1", "k2", "c1", "c2")}
+    ends = shaft.speed(1.3), shaft.speed(1.5)
+    exact = atlas_answers.widest_angle(atlas, {"Omega": (1.3, 1.5)}).data["value"]
+    for speed in (ends, tuple(float(f"{end:.10g}") for end in ends)):
+        assert atlas_answers.widest_angle(atlas, {**data, "speed": speed}).data["value"] == exact
+    with pytest.raises(dt.InputError, match=r"^speed = .*: allowed is speed=LOW:HIGH within"):
+        atlas_answers.widest_angle(atlas, {**data, "speed": (ends[0] * (1 - 1e-8), ends[1])})
+
+
+@pytest.mark.parametrize("axes", [("Omega", "beta", "mu"), ("mu", "beta", "Omega"), ("beta", "mu", "Omega")])
+def test_tiles_lie_along_the_longest_axes_of_a_chart(monkeypatch, axes):
+    """A chart may have few values of the last two parameters of its atlas: tiles then held as few cells."""
+    ranges = {"beta": (0.2, 0.5), "Omega": (1.3, 1.5), "mu": (1.0, 1.1)}
+    table = {name: dict(zip(("start", "stop"), ranges[name], strict=True)) for name in axes}
+    fixed = {"zeta": 0.001, "alpha": 1.0, "gamma": 100.0}
+    scene = {"system": "cardan", "analysis": "atlas", "axes": table, "fixed": fixed, "options": {"rtol": 1e-8}}
+    atlas, cut = dt.open_atlas(dt.run(scene)), []
+
+    def counted(*given, **more):
+        for tile in tiles(*given, **more):
+            cut.append(tile)
+            yield tile
+
+    monkeypatch.setattr(stability, "tiles", counted)
+    lengths = {"beta": 60, "Omega": 70, "mu": 3}
+    values = {name: np.linspace(*ranges[name], n) for name, n in lengths.items()}
+    found = atlas.grid(**values)
+    assert len(cut) <= 2 * lengths["mu"] * len(atlas.stability.atlas.panels)
+    for mu in values["mu"]:
+        alone, ours = atlas.grid(**{**values, "mu": float(mu)}), found.sel(mu=mu)
+        bound = alone.spectral_radius_error + ours.spectral_radius_error
+        assert (abs(alone.spectral_radius - ours.spectral_radius) <= bound).all()
+        assert (alone.verdict == ours.verdict).all() and (ours.spectral_radius_error < 1e-7).all()
+
+
+@pytest.mark.parametrize("number", [np.float32, np.float64, np.array])
+def test_numbers_of_numpy_are_numbers(number):
+    atlas, speeds = atlas_of((-0.2, 0.3), (1.3, 1.5)), (1.3125, 1.5)
+    found = atlas_answers.query(atlas, {"beta": number(0.25), "Omega": number(1.375)}).data
+    assert found == atlas_answers.query(atlas, {"beta": 0.25, "Omega": 1.375}).data
+    asked = {"Omega": tuple(map(number, speeds))}
+    assert atlas_answers.widest_angle(atlas, asked).data == atlas_answers.widest_angle(atlas, {"Omega": speeds}).data
+
+
+def columns(count: int, zeta: float = 0.001) -> dict[str, np.ndarray]:
+    return {name: np.full(count, x) for name, x in {"zeta": zeta, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}.items()}
+
+
+def test_a_chart_over_the_angle_0_has_curves_and_tips_on_both_sides():
+    source = panels((-0.2, 0.3), (1.3, 1.5))
+    drawn = chart(source, {}, 20)
+    assert sorted(drawn["tip_beta"].values) == pytest.approx([-S21[0], S21[0]], abs=1e-8)
+    assert drawn["tip_Omega"].values == pytest.approx([S21[1]] * 2, abs=1e-8)
+    assert (drawn["tip_opens"].values == (drawn["tip_beta"].values > 0)).all()
+    beta, omega = (drawn[f"boundary_{name}"].values for name in ("beta", "Omega"))
+    beta, omega = beta[np.isfinite(beta)], omega[np.isfinite(beta)]
+    assert beta.min() == pytest.approx(-0.2, abs=2e-3) and beta.max() == pytest.approx(0.3, abs=1e-12)
+    rho = dt.open_atlas(source)(beta=beta, Omega=omega).spectral_radius.values
+    np.testing.assert_allclose(rho, 1.0, rtol=0, atol=1e-7)
+    part = chart(source, {"beta": (-0.2, -0.05)}, 20)
+    assert part["tip_beta"].values == pytest.approx([-S21[0]], abs=1e-8)
+    assert np.nanmax(part["boundary_beta"].values) < -0.1
+
+
+def test_a_chart_looks_for_its_tips_once(monkeypatch):
+    source, searched = panels((0.0, 0.3), (1.3, 1.5)), []
+
+    def counted(patches, number, horizontal):
+        searched.append(number)
+        return critical_points(patches, number, horizontal)
+
+    for module in ("tips", "boundaries"):
+        monkeypatch.setattr(f"drivetrain_jax.atlas.{module}.critical_points", counted)
+    drawn = chart(source, {}, 4)
+    assert sorted(searched) == [0, 1, 2]
+    curves = boundaries(dt.open_atlas(source).stability.atlas, CARDAN)
+    length = sum(len(segment["beta"]) for curve in curves for segment in curve.segments())
+    assert np.isfinite(drawn["boundary_beta"]).sum() == length
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_part_without_extent_is_drawn():
+    drawn = chart(panels((0.0, 0.3), (1.3, 1.5)), {"Omega": (1.4, 1.4000000000000001), "beta": (0.1, 0.3)}, 4)
+    assert (drawn["verdict"].values == 0).all() and drawn["tip"].size == 0
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_range_of_speeds_without_extent_has_a_widest_angle():
+    atlas = dt.open_atlas(panels((0.0, 1.5), (0.1, 2.0)))
+    found = atlas_answers.widest_angle(atlas, {"Omega": (1.4, 1.4000000000000004)}).data
+    beta, margin = found["value"], found["error"]
+    assert margin < 1e-5
+    assert atlas(beta=[beta - margin, beta + margin], Omega=1.4)["verdict"].values.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(("rtol", "beta"), [(1e-5, 0.894981), (1e-5, 0.788523), (1e-4, 0.549493), (1e-4, 0.871812)])
+def test_an_undecided_range_that_hides_a_change_ends_a_window(rtol, beta):
+    atlas = atlas_of((0.0, 1.3), (0.15, 2.0), rtol=rtol)
+    windows = atlas_answers.speed_windows(atlas, {"beta": beta}).data["windows"]
+    speeds = np.concatenate([np.linspace(*window["safe"], 41)[1:-1] for window in windows])
+    assert len(windows) >= 5 and all(window["check"]["agrees"] for window in windows)
+    assert atlas.radius({"beta": np.full(speeds.size, beta), "Omega": speeds, **columns(speeds.size)}).max() < 1
+
+
+def test_the_nearest_change_beside_an_undecided_range():
+    atlas = atlas_of((0.0, 1.3), (0.15, 2.0), rtol=1e-5)
+    below = atlas_answers.query(atlas, {"beta": 0.894981, "Omega": 0.752}).data["nearest"]["Omega"]["below"]
+    exact = atlas_answers.query(atlas_of((0.0, 1.3), (0.15, 2.0)), {"beta": 0.894981, "Omega": 0.752})
+    assert abs(below["value"] - exact.data["nearest"]["Omega"]["below"]["value"]) < below["error"] < 1e-3
+
+
+def test_a_change_that_may_hide_in_an_undecided_range_is_not_denied():
+    atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
+    nearest = design.Nearest("Omega", 1.0, None, None, ((0.9, 1.1),))
+    assert atlas_answers._reach(atlas, nearest) == "none from 0.3 to 2, unless where it is undecided:"
+    assert atlas_answers._reach(atlas, replace(nearest, undecided=())) == "none from 0.3 to 2"
+
+
+def test_next_to_no_damping_is_not_none():
+    """Without damping S21 reaches down to the angle 0, with this little of it down to .0001 only."""
+    atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
+    point = {"beta": 0.00005, "Omega": 1.4159846397}
+    assert atlas_answers.query(atlas, point).data["meanings"]["verdict"] == "unstable"
+    with pytest.raises(dt.InputError, match=r"^zeta = 1e-09: the atlas is made for zeta = 0; allowed is that value$"):
+        atlas_answers.query(atlas, {**point, "zeta": 1e-9})
+
+
+def test_only_what_is_certain_is_denied():
+    crowded = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=1e-7)
+    assert "\n  no beta found; whether there is one is undecided\n" in str(
+        atlas_answers.widest_angle(crowded, {"Omega": (1.3, 1.5)})
+    )
+    none = atlas_answers.widest_angle(atlas_of((0.3, 1.2), (0.3, 2.0)), {"Omega": (1.3, 1.5)})
+    assert "\n  no beta of the atlas will do" in str(none) and none.data["certain"]
+
+
+def test_stable_intervals_away_from_the_safe_end_are_listed():
+    """At beta = .9 a tongue covers all speeds; it closes at 1.144."""
+    atlas = atlas_of((0.9, 1.45), (0.5, 0.6), zeta=0.01, gamma=1.0)
+    reply = atlas_answers.widest_angle(atlas, {"Omega": (0.5504, 0.5506)})
+    assert "\n  unstable at beta = 0.9, the smallest of the atlas\n  stable from beta = 1.144318298 +- " in str(reply)
+    assert " to beta = 1.357177456 +- " in str(reply) and "will do" not in str(reply)
+    assert "\n  direct solves agree" in str(reply)
+    found = json.loads(reply.to_json())
+    assert found["value"] is None and found["error"] is None and found["certain"] and found["check"]["agrees"]
+    ((low, high),) = (interval["ends"] for interval in found["intervals"])
+    assert [low["value"], high["value"]] == pytest.approx([1.1443182976, 1.3571774558], abs=1e-8)
+    assert [low["multiplier"], high["multiplier"]] == ["pair", "-1"] and low["kind"] == high["kind"] == "crossing"
+    assert 0 < max(low["error"], high["error"]) < 1e-8
+    shaft = {"J1": 2.0, "J2": 2.0, "k1": 1000.0, "k2": 1000.0, "c1": 0.894427191, "c2": 0.894427191}
+    degrees = atlas_answers.widest_angle(atlas, {**shaft, "Omega": (0.5504, 0.5506)}).data["intervals"][0]["physical"]
+    assert degrees["angle"]["value"] == pytest.approx([65.564609, 77.760540], abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("speeds", "kind", "value"), [((1.3, 1.5), "crossing", S21[0]), ((1.415, 1.417), "undecided", 0.1062824374)]
+)
+def test_an_answer_says_what_ends_it(speeds, kind, value):
+    """On a loose atlas the tip of S21 is undecided from .10628 to .10640, in a narrow range of speeds to .11255."""
+    reply = atlas_answers.widest_angle(atlas_of((0.0, 1.3), (0.15, 2.0), rtol=1e-5), {"Omega": speeds})
+    found = json.loads(reply.to_json())
+    start, end = found["intervals"][0]["ends"]
+    assert start == {"value": 0.0, "kind": "atlas", "error": None, "multiplier": None} and end["kind"] == kind
+    assert found["value"] == end["value"] == pytest.approx(value, abs=1e-7) and found["error"] == end["error"]
+    decided = kind == "crossing"
+    assert found["certain"] == decided and found["check"]["agrees"]
+    assert (end["multiplier"], found["limit"] is None) == (("-1", False) if decided else (None, True))
+    if decided:
+        assert abs(value - S21[0]) < found["error"] < 1e-4
+    else:
+        assert found["error"] is None and value < S21[0] and " (undecided beyond)\n  not certain" in str(reply)
+
+
+def test_windows_say_what_ends_them():
+    found = atlas_answers.speed_windows(atlas_of((0.0, 1.3), (0.15, 2.0), rtol=1e-5), {"beta": 0.894981})
+    windows = json.loads(found.to_json())["windows"]
+    kinds = [[end["kind"] for end in window["ends"]] for window in windows]
+    assert kinds[0] == ["atlas", "crossing"] and kinds[-1] == ["crossing", "atlas"]
+    assert any("undecided" in both for both in kinds)
+    for window in windows:
+        for safe, end, sign in zip(window["safe"], window["ends"], (1, -1), strict=True):
+            crossed = end["kind"] == "crossing"
+            assert (end["error"] is not None) == (end["multiplier"] is not None) == crossed
+            assert safe == pytest.approx(end["value"] + sign * (end["error"] if crossed else 0.0), abs=1e-12)
+    assert "largest spectral radius 1 - " in str(found) and "largest spectral radius 1 at" not in str(found)
+
+
+def test_answers_without_damping_agree_with_direct_solves():
+    atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
+    assert atlas_answers.widest_angle(atlas, {"Omega": (1.6, 1.9)}).data["check"]["agrees"]
+    windows = atlas_answers.speed_windows(atlas, {"beta": 0.5}).data["windows"]
+    assert len(windows) >= 5 and all(window["check"]["agrees"] for window in windows)
+
+
+def test_without_damping_tips_are_where_the_angle_is_0():
+    source = panels((0.0, 1.2), (0.3, 2.0), zeta=0.0)
+    assert {"S21", "H21", "C+1"} <= set(chart(source, {}, 20)["tip"].values)
+    both = chart(panels((-0.3, 0.2), (1.3, 1.5), zeta=0.0), {}, 20)
+    assert both["tip"].values.tolist() == ["S21"] and both["tip_opens"].values.tolist() == [1]
+    assert chart(source, {"beta": (0.9, 1.2)}, 20)["tip"].size == 0
+
+
+def test_an_atlas_without_a_panel_answers_what_it_can(monkeypatch):
+    monkeypatch.setattr(rounds, "MAX_SOLVES", 10)
+    source = panels((0.0, 0.5), (0.001, 0.002), rtol=1e-8)
+    atlas = dt.open_atlas(source)
+    assert not atlas.stability.atlas.panels
+    reply = atlas_answers.query(atlas, {"beta": 0.1, "Omega": 0.0015})
+    direct = dt.point(
+        "cardan", "floquet", beta=0.1, Omega=0.0015, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0, rtol=1e-8
+    )
+    assert reply.data["values"]["spectral_radius"] == pytest.approx(direct.spectral_radius, abs=1e-7)
+    assert reply.text.splitlines()[-1].startswith("  unknown: the atlas has no panel (")
+    assert reply.data["nearest"] == {} and "boundary_beta" not in chart(source, {}, 4).coords
+    with pytest.raises(
+        dt.InputError, match=r"^file: the atlas has no panel \(.*\); allowed is one whose solves converged$"
+    ):
+        atlas_answers.widest_angle(atlas, {"Omega": (0.001, 0.002)})
+
+
+@pytest.mark.parametrize(
+    "point",
+    [
+        {"beta": 1.2, "Omega": 0.001, "zeta": 1e-4},
+        {"beta": 1.569, "Omega": 2.0, "zeta": 0.01},
+        {"beta": 1.0, "Omega": 0.1, "zeta": 10.0},
+        {"beta": 0.4, "Omega": 1.2, "zeta": 1e-7},
+    ],
+)
+def test_gradients_at_extremes(point):
+    """Against differences of direct solves, with steps that are small against the phase and the distance to pi/2."""
+    point = {"alpha": 1.0, "mu": 1.0, "gamma": 100.0} | point
+    gradient = direct_sensitivity(CARDAN, point).gradient
+    for name in ("beta", "Omega", "zeta"):
+        h = 3e-6 * (np.pi / 2 - point["beta"] if name == "beta" else point[name]) * (30 if name == "zeta" else 1)
+        radii = [dt.point("cardan", "floquet", **{**point, name: point[name] + d}, rtol=1e-13) for d in (-h, h)]
+        difference = (radii[1].spectral_radius - radii[0].spectral_radius) / (2 * h)
+        noise = 4e-13 * radii[0].spectral_radius / h
+        assert gradient[name] == pytest.approx(difference, rel=1e-5, abs=noise), name
+
+
+def test_steps_of_a_gradient_are_found_where_the_system_predicts_none():
+    model = CARDAN.models["floquet"]
+    other = replace(model, build=lambda values: replace(model.build(values), explicit_steps=None))
+    system = type("Variant", (CARDAN,), {"models": CARDAN.models | {"floquet": other}})
+    point = {"beta": 0.3, "Omega": 0.004, "zeta": 1e-4, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+    found, exact = direct_sensitivity(system, point), direct_sensitivity(CARDAN, point)
+    assert found.spectral_radius == pytest.approx(exact.spectral_radius, rel=1e-11)
+    for name, slope in exact.gradient.items():
+        assert found.gradient[name] == pytest.approx(slope, rel=1e-5, abs=1e-9), name
+
+
+@pytest.mark.parametrize(
+    ("radius", "text"), [(1 - 2.04e-10, "1 - 2.0e-10"), (1 + 5e-7, "1 + 5.0e-07"), (0.9, "0.9"), (1.0, "1")]
+)
+def test_distance_from_one_is_not_lost_among_digits(radius, text):
+    assert _from_one(radius) == text
+
+
+@pytest.mark.parametrize(
+    "name", ["lower", "panel_lower", "panel_degrees", "value_error", "derived_error", "coefficients", "kept", "scene"]
+)
+def test_a_part_of_an_atlas_is_refused(name):
+    """Without the bits that say which coefficients were kept, all would be 0, and every shaft stable."""
+    whole = panels((0.2, 0.3), (1.3, 1.5))
+    attrs = {key: value for key, value in whole.attrs.items() if key != name}
+    part = whole.drop_vars(name, errors="ignore").drop_attrs().assign_attrs(attrs)
+    with pytest.raises(dt.InputError, match=f"^dataset: lacks {name}; allowed is the whole result of a scene"):
+        dt.open_atlas(part)
+
+
+@pytest.mark.parametrize("cut", ["coefficient", "byte"])
+def test_an_atlas_that_was_cut_is_refused(cut):
+    whole = panels((0.2, 0.3), (1.3, 1.5))
+    with pytest.raises(dt.InputError, match=r"^dataset: lacks some of "):
+        dt.open_atlas(whole.isel({cut: slice(0, -1)}))

@@ -1,0 +1,568 @@
+"""Scenes computed through an atlas, atlas files, and the questions they answer."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import time
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+from interrupts import stop_after
+
+import drivetrain_jax as dt
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis import Outcome
+from drivetrain_jax.atlas.criteria import Criteria, has_boundaries
+from drivetrain_jax.cli import main
+from drivetrain_jax.runs import atlas_answers, atlas_chart, atlas_choice, rounds, through_atlas
+from drivetrain_jax.runs.atlas_chart import chart
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.run import Incomplete, Interrupted, run_to_file
+from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.store.consolidate import write_result
+from tests.labels import labelled
+
+BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+ENDS = " allowed is start and stop"
+BETA, OMEGA = (0.0, 0.6), (1.0, 2.0)
+ATLAS = {
+    "system": "cardan",
+    "analysis": "atlas",
+    "axes": {"beta": {"start": BETA[0], "stop": BETA[1]}, "Omega": {"start": OMEGA[0], "stop": OMEGA[1]}},
+    "fixed": BASE,
+}
+AT_ONE_SPEED = ATLAS | {
+    "axes": {"beta": {"start": 0.1, "stop": 0.5}, "mu": {"start": 0.5, "stop": 1.5}},
+    "fixed": {"zeta": 0.001, "alpha": 1.0, "Omega": 1.3, "gamma": 100.0},
+}
+
+
+def floquet(method, axes=None, **more):
+    axes = axes or {
+        "Omega": {"start": OMEGA[1], "stop": OMEGA[0], "num": 41},
+        "mu": {"values": [1.0]},
+        "beta": {"start": BETA[0], "stop": BETA[1], "num": 13},
+    }
+    fixed = {name: value for name, value in BASE.items() if name not in axes}
+    return {
+        "system": "cardan",
+        "analysis": "floquet",
+        "axes": axes,
+        "fixed": fixed,
+        "options": {"method": method},
+        **more,
+    }
+
+
+def same_arrays(a, b):
+    assert set(a.variables) == set(b.variables)
+    for name in a.variables:
+        np.testing.assert_array_equal(a[name].values, b[name].values, err_msg=name)
+
+
+def assert_agree(found, exact):
+    error = np.abs(found["spectral_radius"] - exact["spectral_radius"])
+    bound = found["spectral_radius_error"] + exact["spectral_radius_error"]
+    assert found["spectral_radius"].dims == exact["spectral_radius"].dims
+    assert bool((error <= bound).all()) and float(bound.median()) < 1e-9
+    decided = (found["verdict"] < 2) & (exact["verdict"] < 2)
+    assert bool((found["verdict"] == exact["verdict"]).where(decided, True).all()) and bool(decided.mean() > 0.99)
+
+
+@pytest.fixture(scope="module")
+def direct():
+    return dt.run(floquet("direct"))
+
+
+@pytest.fixture(scope="module")
+def stored():
+    return dt.run(ATLAS)
+
+
+@pytest.fixture(scope="module")
+def atlas(stored):
+    return dt.open_atlas(stored)
+
+
+def test_a_chart_through_an_atlas(direct):
+    found = dt.run(floquet("atlas"))
+    assert_agree(found, direct)
+    assert found.attrs["atlas_uncovered"] == 0 and found.attrs["atlas_solves"] == 64
+    assert found.sizes["mu"] == 1 and (found["outcome"] <= Outcome.TOLERANCE_NOT_MET).all()
+
+
+def test_points_and_multipliers_through_an_atlas():
+    random = np.random.default_rng(0)
+    points = {"Omega": random.uniform(*OMEGA, 50).tolist(), "beta": random.uniform(*BETA, 50).tolist()}
+    scene = {**floquet("atlas"), "outputs": ["floquet_multiplier", "spectral_radius"], "points": points, "axes": {}}
+    scene["fixed"] = BASE
+    found = dt.run(scene)
+    exact = dt.run({**scene, "options": {"method": "direct"}})
+    assert found["floquet_multiplier"].dims == ("point", "multiplier")
+    np.testing.assert_allclose(found["spectral_radius"], exact["spectral_radius"], rtol=1e-9)
+    modulus = np.abs(found["floquet_multiplier"])
+    np.testing.assert_allclose(modulus.max("multiplier"), found["spectral_radius"], rtol=1e-12)
+
+
+def test_auto_takes_an_atlas_where_points_are_many(monkeypatch, direct):
+    assert "atlas_solves" not in dt.run(floquet("auto")).attrs
+    monkeypatch.setattr(atlas_choice, "_WORTHWHILE", 500)
+    # An eighth of the effort of 533 points is that of some 30 solves: no atlas of two parameters is to be had for that.
+    assert "atlas_solves" not in dt.run(floquet("auto")).attrs
+    monkeypatch.setattr(atlas_choice, "_FEWEST", (1, 1))
+    found = dt.run(floquet("auto"))
+    # Tried all the same, it stops at the first round, and all points are solved directly.
+    assert found.attrs["atlas_uncovered"] == 533
+    same_arrays(found, direct)
+    monkeypatch.setattr(atlas_choice, "_SHARE", 10.0)
+    assert_agree(dt.run(floquet("auto")), direct)
+
+
+def test_the_way_that_auto_takes_is_named_where_it_keeps_a_result_from_growing(monkeypatch, tmp_path):
+    path = tmp_path / "r.nc"
+    run_to_file(floquet("auto"), path)
+    for name, value in (("_WORTHWHILE", 600), ("_FEWEST", (1, 1))):
+        monkeypatch.setattr(atlas_choice, name, value)
+    large = floquet("auto", floquet("auto")["axes"] | {"beta": {"start": BETA[0], "stop": BETA[1], "num": 25}})
+    with pytest.raises(InputError, match="points are evaluated through an atlas, were solved directly") as refused:
+        run_to_file(large, path)
+    assert "the code has changed" not in str(refused.value)
+
+
+@pytest.mark.parametrize(("slowest", "fastest", "tried"), [(0.1, 2.0, True), (0.005, 2.0, False), (1e-9, 1e-8, False)])
+def test_auto_counts_the_effort_of_solves_not_their_number(slowest, fastest, tried):
+    """Down to Omega = .005 a node costs some fifty cells: that many cells are cheaper one by one. Below 1e-8 no solver can
+    do any."""
+    axes = {"beta": {"start": 0.0, "stop": 1.5, "num": 400}, "Omega": {"start": slowest, "stop": fastest, "num": 400}}
+    assert atlas_choice.uses_atlas(load_scene(floquet("auto", axes))) is tried
+
+
+def test_what_an_atlas_does_not_cover_is_solved(monkeypatch, direct):
+    monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
+    found = dt.run(floquet("atlas"))
+    assert found.attrs["atlas_uncovered"] == 533 and found.attrs["atlas_panels"] == 0
+    same_arrays(found, direct)
+
+
+def test_gaps_of_an_atlas_are_told(monkeypatch, tmp_path):
+    assert run_to_file(floquet("atlas"), tmp_path / "whole.nc").note == ""
+    monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
+    told = (
+        "the atlas has 0 panels and 1 gap (more than 50 solves would be needed): what lies in a gap is solved directly"
+    )
+    for name, scene in (("chart.nc", floquet("atlas")), ("atlas.nc", ATLAS)):
+        assert run_to_file(scene, tmp_path / name).note == told
+
+
+def interrupted_run(scene, out, reports):
+    """A run that is stopped after this many reports."""
+    with pytest.raises(Interrupted):
+        run_to_file(scene, out, report=stop_after(reports))
+
+
+@pytest.mark.parametrize(("scene", "chunks"), [(ATLAS, 1), (AT_ONE_SPEED, 1), (AT_ONE_SPEED, 3), (AT_ONE_SPEED, 6)])
+def test_an_interrupted_atlas_is_resumed_with_the_same_bits(tmp_path, scene, chunks):
+    """Within the only round of solves, and within the first and later ones of an atlas whose nodes are solved."""
+    out, whole = tmp_path / "a.nc", dt.run(scene)
+    interrupted_run(scene, out, chunks)
+    assert not out.exists() and (tmp_path / "a.nc.parts").is_dir()
+    progress = run_to_file(scene, out)
+    assert progress.reused > 0 and progress.reused + progress.computed == progress.total == whole.attrs["solves"]
+    with xr.open_dataset(out, engine="h5netcdf") as found:
+        same_arrays(found, whole)
+    again = run_to_file(scene, out)
+    assert again.computed == 0 and again.reused == whole.attrs["solves"]
+
+
+def test_an_interrupted_chart_is_resumed_with_the_same_bits(tmp_path, monkeypatch):
+    out, scene = tmp_path / "a.nc", floquet("atlas")
+    interrupted_run(scene, out, 2)
+    # The file may be laid out after the last solve is there.
+    slowly = lambda _, table: (time.sleep(1.0), table.lay_out(blank=False))  # noqa: E731
+    monkeypatch.setattr(through_atlas, "_lay_out", slowly)
+    progress = run_to_file(scene, out)
+    assert progress.total == progress.computed == 533 and progress.failed == 0
+    with xr.open_dataset(out, engine="h5netcdf") as found:
+        same_arrays(found, dt.run(scene))
+
+
+def test_solves_are_kept_when_a_chart_fails_after_them(tmp_path, monkeypatch):
+    out, scene = tmp_path / "a.nc", floquet("atlas")
+
+    def failing(*_):
+        raise OSError("no luck")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(through_atlas, "evaluate", failing)
+        with pytest.raises(Incomplete, match="no luck"):
+            run_to_file(scene, out)
+    monkeypatch.setattr(Engine, "compute_chunk", failing)
+    assert run_to_file(scene, out).computed == 533
+
+
+def test_the_function_of_the_parameters(atlas, direct):
+    assert atlas.parameters == ("beta", "Omega") and atlas.ranges == {"beta": BETA, "Omega": OMEGA}
+    omega, beta = direct["Omega"].values, direct["beta"].values
+    grid = atlas.grid(Omega=omega, beta=beta)
+    assert grid["spectral_radius"].dims == ("Omega", "beta")
+    assert_agree(grid, direct.isel(mu=0, drop=True))
+    points = atlas(beta=xr.DataArray(beta, dims="b"), Omega=xr.DataArray(omega, dims="w"))
+    assert points["verdict"].dims == ("b", "w")
+    np.testing.assert_allclose(points["spectral_radius"].T, grid["spectral_radius"], atol=1e-9)
+    assert atlas(beta=0.31, Omega=1.2)["spectral_radius"].shape == ()
+    line = atlas.grid(beta=0.31, Omega=omega)
+    assert line["spectral_radius"].dims == ("Omega",) and float(line["beta"] if "beta" in line.coords else 0.31) == 0.31
+
+
+def test_numbers_for_all_parameters_no_points_and_shapes_that_do_not_fit(atlas):
+    point = atlas.grid(beta=0.31, Omega=1.2)
+    assert point["spectral_radius"].shape == ()
+    assert float(point["spectral_radius"]) == float(atlas(beta=0.31, Omega=1.2)["spectral_radius"])
+    assert dict(atlas(beta=np.empty(0), Omega=1.2).sizes) == {"point": 0}
+    crossed = atlas(beta=np.full((2, 1), 0.31), Omega=np.full((1, 3), 1.2))["spectral_radius"]
+    assert crossed.shape == (2, 3) and (crossed == point["spectral_radius"]).all()
+    with pytest.raises(dt.InputError, match=r"shapes beta \(2,\), Omega \(3,\): allowed are arrays that broadcast"):
+        atlas(beta=[0.1, 0.2], Omega=[1.1, 1.2, 1.3])
+    row = atlas.grid(beta=[0.1, 0.2], Omega=np.full(100, 1.3))["spectral_radius"].values
+    assert np.isfinite(row).all() and (row == row[:, :1]).all()
+
+
+def test_an_atlas_of_another_range_is_refused(tmp_path):
+    run_to_file(ATLAS, tmp_path / "a.nc")
+    with pytest.raises(dt.InputError, match=r"axes.beta has the range from 0 to 0\.5, had the range from 0 to 0\.6;"):
+        run_to_file(ATLAS, tmp_path / "a.nc", overrides={"axes.beta.stop": 0.5})
+
+
+def test_arrays_with_labels_keep_them_and_are_never_stretched_to_fit(atlas):
+    grid = atlas.grid(beta=[0.1, 0.31], Omega=[1.1, 1.2, 1.3])
+    outer = atlas(beta=grid["beta"], Omega=grid["Omega"])
+    assert outer.indexes.keys() == {"beta", "Omega"} and outer["beta"].attrs["units"] == "rad"
+    assert float(outer["verdict"].sel(beta=0.31, Omega=1.2)) == float(grid["verdict"].sel(beta=0.31, Omega=1.2))
+    beta = xr.DataArray([0.1, 0.2], dims="shaft", coords={"shaft": ["a", "b"]})
+    fleet = atlas(beta=beta, Omega=1.2)
+    assert fleet["shaft"].values.tolist() == ["a", "b"] and fleet["Omega"].dims == ("shaft",)
+    with pytest.raises(dt.InputError, match="of the same labels along a dimension that they share"):
+        atlas(beta=beta, Omega=xr.DataArray([1.1, 1.2], dims="shaft", coords={"shaft": ["b", "c"]}))
+
+
+@pytest.mark.parametrize("outputs", [["floquet_multiplier", "verdict"], ["spectral_radius"]])
+def test_an_atlas_without_a_panel_has_all_its_points_solved(monkeypatch, tmp_path, outputs):
+    monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
+    scene = floquet("atlas") | {"outputs": outputs}
+    exact = dt.run(scene | {"options": {"method": "direct"}})
+    for found in (dt.run(scene), dt.run(scene, out=tmp_path / "r.nc")):
+        assert found.attrs["atlas_panels"] == 0
+        same_arrays(found, exact)
+
+
+def test_values_that_are_one_in_the_coordinates_of_an_atlas():
+    """Speeds a rounding apart, and angles whose squares vanish."""
+    for axes in (
+        {"beta": {"values": [0.1, 0.3]}, "Omega": {"values": [1.9, 1.9000000000000001]}},
+        {"beta": {"start": 0.0, "stop": 1e-170, "num": 3}, "Omega": {"values": [1.3, 1.4]}},
+    ):
+        found, exact = (dt.run(floquet(method, axes)) for method in ("atlas", "direct"))
+        assert found.attrs["atlas_panels"] > 0 and (found["outcome"] == 0).all()
+        np.testing.assert_allclose(found["spectral_radius"], exact["spectral_radius"], rtol=1e-11)
+
+
+def test_what_is_not_finite_is_never_called_stable(atlas):
+    """Compiled, the largest of moduli that are all NaN is -inf: less than 1."""
+    panels = tuple(replace(panel, coefficients=np.nan * panel.coefficients) for panel in atlas.stability.atlas.panels)
+    lost = replace(atlas.stability, atlas=replace(atlas.stability.atlas, panels=panels))
+    for outputs in (["spectral_radius", "verdict"], ["spectral_radius", "verdict", "floquet_multiplier"]):
+        found = lost.at(np.array([[0.3, 1.2], [0.4, 1.3]]), outputs)
+        assert (found["outcome"] == Outcome.NOT_FINITE).all() and (found["verdict"] == 2).all()
+        assert all(np.isnan(found[name]).all() for name in outputs if name != "verdict")
+
+
+def test_a_system_without_an_atlas_is_refused_before_anything_is_written(tmp_path, capsys):
+    assert (
+        main(["run", "sweeps/tripod_tongue.toml", "--out", str(tmp_path / "t.nc"), "--set", "options.method=atlas"])
+        == 2
+    )
+    assert "tripod has no model for it; allowed is auto, direct, diffrax" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_gaps_of_a_stored_atlas_are_solved(monkeypatch):
+    monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
+    atlas = dt.open_atlas(dt.run(ATLAS))
+    assert "0 panels, 1 gap" in repr(atlas)
+    found, exact = atlas(beta=0.3, Omega=1.3), dt.point("cardan", "floquet", beta=0.3, Omega=1.3, **BASE)
+    assert float(found["spectral_radius"]) == pytest.approx(exact.spectral_radius, rel=1e-12)
+
+
+def test_a_file_of_other_coordinates_is_refused(stored):
+    with pytest.raises(dt.InputError, match="made by another version of cardan"):
+        dt.open_atlas(stored.assign_attrs(coordinates_of_panels='["beta", "Omega"]'))
+    with pytest.raises(dt.InputError, match="holds the analysis 'floquet'; allowed is an atlas"):
+        dt.open_atlas(stored.assign_attrs(analysis="floquet"))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"beta": 0.3}, "Omega: missing; allowed is 1 <= Omega <= 2"),
+        ({"beta": 0.3, "Omega": 2.5}, "Omega = 2.5: allowed is 1 <= Omega <= 2"),
+        ({"beta": [0.3, np.nan], "Omega": 1.5}, "beta = nan: allowed is 0 <= beta <= 0.6, in rad"),
+        ({"beta": "0.3", "Omega": 1.5}, "beta = '0.3': allowed are numbers"),
+        ({"beta": None, "Omega": 1.5}, "beta = None: allowed are numbers"),
+        ({"beta": [[0.1], [0.1, 0.2]], "Omega": 1.5}, "beta = [[0.1], [0.1, 0.2]]: allowed are numbers"),
+        (
+            {"beta": 0.3, "Omga": 1.5},
+            "Omga = 1.5: not a parameter of the atlas (did you mean Omega?); "
+            "allowed is 0 <= beta <= 0.6, in rad; 1 <= Omega <= 2",
+        ),
+        (
+            {"beta": 0.3, "Omega": 1.5, "mu": 1.0},
+            "mu = 1: the atlas is made for mu = 1; allowed is to leave it out",
+        ),
+    ],
+)
+def test_questions_outside_the_atlas(atlas, given, message):
+    with pytest.raises(dt.InputError) as error:
+        atlas(**given)
+    assert str(error.value) == message
+
+
+def test_nearest_boundaries_of_a_point(atlas):
+    reply = atlas_answers.query(atlas, {"beta": 0.31, "Omega": 1.2})
+    data = json.loads(reply.to_json())
+    assert data["values"]["verdict"] == 0 and data["nearest"]["Omega"]["below"] is None
+    omega = data["nearest"]["Omega"]["above"]["value"]
+    radius = [dt.point("cardan", "floquet", beta=0.31, Omega=omega + d, **BASE).spectral_radius for d in (-1e-7, 1e-7)]
+    assert radius[0] < 1 < radius[1]
+    steps = [dt.point("cardan", "floquet", beta=0.31, Omega=1.2 + d, **BASE).spectral_radius for d in (-1e-4, 1e-4)]
+    assert data["gradient"]["Omega"] == pytest.approx((steps[1] - steps[0]) / 2e-4, rel=1e-6)
+    assert set(data["gradient"]) == {"beta", "Omega", *BASE} and "per rad" in str(reply)
+    assert f"Omega = {omega:.10g}" in str(reply) and "verdict                  stable (0)" in str(reply)
+
+
+def test_the_same_point_in_physical_units(atlas):
+    stiffness, inertia = 1000.0, 2.0
+    damping = 2 * 0.001 * (stiffness * inertia) ** 0.5
+    rpm = 1.2 * (stiffness / inertia) ** 0.5 * 60 / (2 * np.pi)
+    shaft = {"J1": inertia, "J2": 100 * inertia, "k1": stiffness, "k2": stiffness, "c1": damping, "c2": damping}
+    reply = atlas_answers.query(atlas, {**shaft, "speed": rpm, "angle": np.degrees(0.31)})
+    plain = atlas_answers.query(atlas, {"beta": 0.31, "Omega": 1.2})
+    assert reply.data["values"]["spectral_radius"] == pytest.approx(plain.data["values"]["spectral_radius"], abs=1e-12)
+    assert "rpm" in str(reply) and "rpm" not in str(plain)
+    assert reply.data["physical"]["speed"] == {"value": pytest.approx(rpm), "units": "rpm"}
+    assert reply.data["physical"]["angle"]["value"] == pytest.approx(np.degrees(0.31)) and plain.data["physical"] == {}
+    above, per_unit = reply.data["nearest"]["Omega"]["above"], rpm / 1.2
+    assert above["physical"]["speed"]["value"] == pytest.approx(above["value"] * per_unit)
+    assert reply.data["meanings"] == {"verdict": "stable", "outcome": "success"}
+    windows = atlas_answers.speed_windows(atlas, {**shaft, "angle": np.degrees(0.31)}).data["windows"]
+    assert windows[0]["physical"]["speed"]["value"] == pytest.approx([x * per_unit for x in windows[0]["safe"]])
+    with pytest.raises(dt.InputError, match=r"^speed = 1000: allowed is [\d.]+ <= speed <= [\d.]+, in rpm$"):
+        atlas_answers.query(atlas, {**shaft, "speed": 1000.0, "angle": 10.0})
+    with pytest.raises(dt.InputError, match=r"^angle: missing; allowed is 0 <= angle <= 34\.37\d*, in deg$"):
+        atlas_answers.query(atlas, {**shaft, "speed": rpm})
+    with pytest.raises(dt.InputError, match=r"^J2: missing; physical units need all of J1, J2, k1, k2, c1, c2$"):
+        atlas_answers.query(atlas, {"J1": 1.0, "speed": 100.0})
+    with pytest.raises(dt.InputError, match=r"^mu = 2: the atlas is made for mu = 1; allowed is that value$"):
+        atlas_answers.query(atlas, {**shaft, "k2": 2000.0, "speed": rpm, "angle": 10.0})
+    with pytest.raises(
+        dt.InputError, match=r"^beta = 0\.1: is given in physical units, too; allowed is one of the two$"
+    ):
+        atlas_answers.query(atlas, {**shaft, "speed": rpm, "angle": 10.0, "beta": 0.1})
+
+
+def test_what_is_asked_for_is_not_given(atlas):
+    shaft = {"J1": 2.0, "J2": 200.0, "k1": 1000.0, "k2": 1000.0, "c1": 0.0894427191, "c2": 0.0894427191}
+    refused = "is what is asked for; allowed is to leave it out"
+    with pytest.raises(dt.InputError, match=f"^Omega = 1.1:1.2: {refused}$"):
+        atlas_answers.speed_windows(atlas, {"beta": 0.31, "Omega": (1.1, 1.2)})
+    with pytest.raises(dt.InputError, match=f"^speed = 250:260: {refused}$"):
+        atlas_answers.speed_windows(atlas, {**shaft, "angle": 10.0, "speed": (250.0, 260.0)})
+    with pytest.raises(dt.InputError, match=f"^angle = 20: {refused}$"):
+        atlas_answers.widest_angle(atlas, {**shaft, "speed": (250.0, 260.0), "angle": 20.0})
+
+
+def test_design_answers_are_checked_by_direct_solves(atlas):
+    angle = atlas_answers.widest_angle(atlas, {"Omega": (1.3, 1.5)})
+    assert angle.data["value"] == pytest.approx(0.1063331213, abs=1e-8)  # the tip of S21
+    assert angle.data["check"]["agrees"] and "direct solves agree" in str(angle)
+    reply = atlas_answers.speed_windows(atlas, {"beta": 0.31}, margin=0.02)
+    windows = reply.data["windows"]
+    assert len(windows) == 2 and all(w["check"]["agrees"] for w in windows)
+    assert "Omega = 1 (the end of the atlas) to " in str(reply) and reply.data["undecided"] == []
+    edge = json.loads(atlas_answers.query(atlas, {"beta": 0.31, "Omega": 1.2}).to_json())["nearest"]["Omega"]["above"]
+    assert windows[0]["safe"][1] == pytest.approx(edge["value"] * 0.98, rel=1e-8)
+    with pytest.raises(dt.InputError, match=r"^file: the atlas does not vary zeta"):
+        atlas_answers.least_damping(atlas, {"Omega": (1.0, 1.2)})
+    with pytest.raises(dt.InputError, match=r"^Omega = 1\.2: a range is needed"):
+        atlas_answers.widest_angle(atlas, {"Omega": 1.2})
+    with pytest.raises(dt.InputError, match=r"^margin = 2: allowed is 0 <= margin < 1$"):
+        atlas_answers.speed_windows(atlas, {"beta": 0.31}, margin=2)
+
+
+def test_a_system_without_boundary_functions_has_values_and_charts(atlas, stored, monkeypatch):
+    def of_the_unreduced_form(values):
+        model = build(values)
+        return replace(model, reduced=model.natural)
+
+    system = atlas.scene.system
+    build = system.models["floquet"].build
+    model = replace(system.models["floquet"], build=of_the_unreduced_form)
+    other = type("Variant", (system,), {"models": system.models | {"floquet": model}})
+    assert has_boundaries(atlas.stability.atlas, system) and not has_boundaries(atlas.stability.atlas, other)
+    with pytest.raises(dt.InputError, match="system = 'cardan': has no boundary functions; allowed for boundaries"):
+        Criteria.of(atlas.stability.atlas, other)
+    for module in (atlas_answers, atlas_chart):
+        monkeypatch.setattr(module, "has_boundaries", lambda *_: False)
+    reply = atlas_answers.query(atlas, {"beta": 0.31, "Omega": 1.2})
+    assert reply.data["nearest"] == {} and "nearest change" not in str(reply)
+    assert not [name for name in chart(stored, {}, 5).coords if name.startswith(("boundary", "tip"))]
+
+
+def test_least_damping_of_a_range_of_speeds():
+    axes = {"Omega": {"start": 1.3, "stop": 1.6}, "zeta": {"start": 0.0, "stop": 0.05}}
+    fixed = {name: value for name, value in BASE.items() if name != "zeta"}
+    atlas = dt.open_atlas(dt.run({**ATLAS, "axes": axes, "fixed": {**fixed, "beta": 0.2}}))
+    data = atlas_answers.least_damping(atlas, {"Omega": (1.35, 1.5)}).data
+    assert data["certain"] and data["check"]["agrees"]
+
+    def largest(zeta):
+        speeds = {"start": 1.35, "stop": 1.5, "num": 601}
+        scene = floquet("direct", {"Omega": speeds})
+        return float(dt.run({**scene, "fixed": {**fixed, "beta": 0.2, "zeta": zeta}})["spectral_radius"].max())
+
+    assert largest(0.999 * data["value"]) > 1 > largest(1.001 * data["value"])
+
+
+def test_a_chart_of_a_stored_atlas(stored):
+    found = chart(stored, {"Omega": (1.3, 1.5)}, 60)
+    assert found["verdict"].shape == (60, 60) and found["Omega"].values[[0, -1]].tolist() == [1.3, 1.5]
+    assert found["tip"].values.tolist() == ["S21"]
+    assert float(found["tip_beta"][0]) == pytest.approx(0.1063331213, abs=1e-8)
+    on_curve = found["boundary_beta"].dropna("boundary")
+    beta, omega = on_curve.values, found["boundary_Omega"].dropna("boundary").values
+    radius = dt.open_atlas(stored)(beta=beta, Omega=omega)["spectral_radius"]
+    assert len(beta) > 20 and float(np.abs(radius - 1).max()) < 1e-9
+    with pytest.raises(dt.InputError, match=r"^Omega = 1\.5:3: allowed is a number or LOW:HIGH, 1 <= Omega <= 2$"):
+        chart(stored, {"Omega": (1.5, 3.0)}, 60)
+    with pytest.raises(dt.InputError, match=r"^part: fixes beta, Omega; a chart needs one that varies"):
+        chart(stored, {"Omega": 1.5, "beta": 0.1}, 60)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"axes": {}}, "axes: 0 are given; atlas allows 1 to 4"),
+        (
+            {"axes": {"beta": {"start": 0.0, "stop": 1.0, "num": 5}}},
+            "axes.beta.num = 5: an atlas has ranges; allowed is start and stop",
+        ),
+        (
+            {"axes": {"beta": {"values": [0.1]}}},
+            "axes.beta.values = [0.1]: an atlas has ranges; allowed is start and stop",
+        ),
+        ({"axes": {"beta": {"start": 1.0, "stop": 1.0}}}, "axes.beta.stop = 1.0: allowed is stop > start = 1.0"),
+        ({"axes": {"beta": {"start": 0.0}}}, "axes.beta.stop: missing; allowed is start and stop"),
+        (
+            {"axes": {}, "points": {"beta": [0.1]}},
+            "points: atlas is made over ranges; allowed are axes with start and stop",
+        ),
+    ],
+)
+def test_wrong_ranges(change, message):
+    with pytest.raises(dt.InputError) as error:
+        dt.run({**ATLAS, **change})
+    assert str(error.value) == message
+
+
+def test_too_many_parameters_for_an_atlas():
+    axes = {n: {"start": 0.5, "stop": 1.0, "num": 2} for n in ("beta", "Omega", "zeta", "alpha", "mu")}
+    with pytest.raises(
+        dt.InputError, match=r"^options\.method = 'atlas': the scene varies 5 parameters; allowed are at most 4$"
+    ):
+        dt.run({**floquet("atlas", axes), "fixed": {"gamma": 100.0}})
+
+
+@pytest.fixture(scope="module")
+def file(stored, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("atlas")
+    write_result(labelled(stored), folder / "atlas.nc", folder / "tmp")
+    return folder / "atlas.nc"
+
+
+def answer(capsys, *arguments):
+    try:
+        code = main([str(a) for a in arguments])
+    except SystemExit as stop:
+        code = stop.code
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_questions_on_the_command_line(file, capsys):
+    code, out, _ = answer(capsys, "query", file, "beta=0.31", "Omega=1.2", "--json")
+    assert code == 0 and json.loads(out)["values"]["verdict"] == 0
+    code, out, _ = answer(capsys, "design", "widest-angle", file, "Omega=1.3:1.5")
+    assert code == 0 and "stable up to beta = 0.10633312" in out and "direct solves agree" in out
+    code, out, err = answer(capsys, "query", file, "beta=0.31", "Omega=wide")
+    assert (code, out, err) == (2, "", "drivetrain: Omega = 'wide': allowed is a number or LOW:HIGH\n")
+    code, _, err = answer(capsys, "query", file, "beta=0.31", "spede=1.2")
+    assert code == 2 and err.startswith("drivetrain: spede = 1.2: not a parameter of the atlas (did you mean speed?)")
+    code, _, err = answer(capsys, "design", "narrowest-angle", file)
+    assert code == 2 and "least-damping" in err and err.count("\n") == 1
+
+
+def test_a_zoom_on_the_command_line(file, capsys):
+    figure = file.with_name("zoom.png")
+    code, _, err = answer(
+        capsys, "plot", file, "--out", figure, "--part", "Omega=1.3:1.5", "beta=0:0.3", "--cells", "80"
+    )
+    assert (code, err) == (0, "") and figure.stat().st_size > 20_000
+    code, _, err = answer(capsys, "plot", file, "--out", figure, "--part", "Omega=3")
+    assert code == 2 and err == "drivetrain: Omega = 3: allowed is a number or LOW:HIGH, 1 <= Omega <= 2\n"
+
+
+def test_panels_that_are_not_those_written_answer_nothing(file, tmp_path, capsys):
+    damaged, figure = tmp_path / "damaged.nc", tmp_path / "f.png"
+    shutil.copy(file, damaged)
+    with h5py.File(damaged, "r+") as store:
+        store["coefficients"][0, 0] *= 2
+    for question in (
+        ("query", damaged, "beta=0.31", "Omega=1.2"),
+        ("design", "widest-angle", damaged, "Omega=1.3:1.5"),
+        ("plot", damaged, "--out", figure),
+    ):
+        code, out, err = answer(capsys, *question)
+        assert (code, out, err.count("\n")) == (2, "", 1) and "damaged (coefficients" in err
+    assert not figure.exists()
+    with pytest.raises(InputError, match=r"damaged \(coefficients"):
+        dt.open_atlas(damaged)
+
+
+@pytest.mark.parametrize(
+    ("lengths", "rows"), [((3873, 5164), 384), ((173, 174), 173), ((100_000, 100), 20_928), ((5, 3000, 1500), 1344)]
+)
+def test_blocks_of_a_grid_cover_it_once(lengths, rows):
+    """With as many rows each, whole tiles of them, but for the last."""
+    blocks = list(through_atlas._cut(lengths))
+    places = [tuple(part.start for part in block) for block in blocks]
+    sizes = [[part.stop - part.start for part in block] for block in blocks]
+    assert len(set(places)) == len(places)
+    assert sum(map(math.prod, sizes)) == math.prod(lengths)
+    assert {size[-2] for size in sizes} <= {rows, lengths[-2] % rows}
+
+
+def test_what_judges_cells_is_compiled_before_the_atlas_is_there(monkeypatch):
+    """In a large chart, while the solves are compiled; afterwards nothing is left to compile for it."""
+    from drivetrain_jax.atlas import stability
+
+    made = []
+    once = stability._point_kernel.__wrapped__
+    stability._point_kernel.cache_clear()
+    monkeypatch.setattr(stability, "_point_kernel", lambda *key: made.append(key) or once(*key))
+    monkeypatch.setattr(through_atlas, "_LARGE", 1)
+    dt.run(floquet("atlas"))
+    assert len(set(made)) == 1

@@ -1,0 +1,175 @@
+"""Precision, compiler options and the cache of compiled code."""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+import sys
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import drivetrain_jax as dt
+from drivetrain_jax.analysis.numerics import kernels
+from drivetrain_jax.atlas import charts
+from drivetrain_jax.runs import kernel
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.scene import load_scene
+
+
+def test_double_precision():
+    assert jax.config.jax_enable_x64 and jnp.ones(1).dtype == jnp.float64
+
+
+@pytest.fixture
+def unset_precision():
+    yield lambda: jax.config.update("jax_enable_x64", False)
+    jax.config.update("jax_enable_x64", True)
+
+
+TWO = {
+    "system": "tripod",
+    "analysis": "parameters",
+    "outputs": ["mean_inertia"],
+    "axes": {"beta": {"values": [0.1, 0.2]}},
+    "fixed": {"element": "input", "zeta": 0.01},
+}
+
+
+def test_precision_that_was_unset_is_set_again(unset_precision):
+    expected = dt.run(TWO).mean_inertia
+    unset_precision()
+    assert dt.run(TWO).mean_inertia.equals(expected)
+    # A context reaches this thread alone, not those that compute.
+    unset_precision()
+    with jax.enable_x64(True):
+        assert dt.run(TWO).mean_inertia.equals(expected)
+
+
+def test_a_call_within_single_precision_is_refused():
+    with jax.enable_x64(False), pytest.raises(dt.InputError, match="jax_enable_x64 = False"):
+        dt.run(TWO)
+
+
+def test_full_vector_width_only_where_there_is_avx512(monkeypatch):
+    # Of jaxlib 0.10; another one is asked, see below.
+    monkeypatch.setattr(kernels, "compiler_knows", lambda option, value: True)
+    monkeypatch.setattr(kernels, "instruction_set", lambda: {"x86_64", "avx2"})
+    assert kernels.compiler_options() == {}
+    monkeypatch.setattr(kernels, "instruction_set", lambda: {"x86_64", "avx512f"})
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert kernels.compiler_options(march=True) == {}
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    assert kernels.compiler_options() == {"xla_cpu_prefer_vector_width": 512}
+    # Four lanes at full width: tens of gigabytes (seen with jax 0.10.2).
+    assert kernels.compiler_options(4) == {}
+    assert kernels.compiler_options(4, march=True) == {"xla_cpu_use_fusion_emitters": False}
+    assert kernels.compiler_options(4, short_loops=True) == {"xla_backend_optimization_level": 1}
+
+
+def test_options_that_another_compiler_does_not_know_are_left_out(monkeypatch):
+    monkeypatch.setattr(kernels.jaxlib, "__version__", "0.99.0")
+    kernels.compiler_knows.cache_clear()
+    # The one that is installed is asked.
+    assert kernels.compiler_knows("xla_backend_optimization_level", 0)
+    assert not kernels.compiler_knows("xla_cpu_no_such_option", 1)
+    monkeypatch.setattr(kernels, "compiler_knows", lambda option, value: option != "xla_cpu_use_fusion_emitters")
+    assert kernels.compiler_options(4, march=True) == {}
+    assert set(kernels.options_for_few()) == {"xla_backend_optimization_level"}
+
+
+def chart(method):
+    axes = {"beta": {"start": 0.1, "stop": 1.2, "num": 30}, "Omega": {"start": 0.4, "stop": 2.0, "num": 40}}
+    fixed = {"mu": 3.0, "alpha": 2.0, "zeta": 0.001, "gamma": 1.0}
+    return {"system": "cardan", "analysis": "floquet", "axes": axes, "fixed": fixed, "options": {"method": method}}
+
+
+GEARS = {
+    "system": "planetary",
+    "analysis": "modes",
+    "axes": {"k_sp": {"start": 1e8, "stop": 1e9, "num": 300}},
+    "fixed": {"planet_angle": [0.0, 1.5, 3.1, 4.7]},
+}
+
+
+@pytest.mark.parametrize("scene", [chart("direct"), chart("atlas"), GEARS], ids=["march", "tiles", "matrices"])
+def test_an_accelerator_gets_wide_batches_and_gives_the_same_results(monkeypatch, scene):
+    """What is done otherwise there (chunks, lanes and rows at once, no marks), here by the processor."""
+    expected, solver = dt.run(scene), Engine(load_scene(scene)).solvers[0]
+    caches = kernel._compiled, charts.tile_kernel
+    with monkeypatch.context() as patch:
+        patch.setattr(jax, "default_backend", lambda: "gpu")
+        for cache in caches:
+            cache.cache_clear()
+        assert Engine(load_scene(scene)).solvers[0].chunk == min(64 * solver.chunk, 1 << 15) > solver.chunk
+        found = dt.run(scene)
+    for cache in caches:
+        cache.cache_clear()
+    name = next(iter(expected.data_vars))
+    assert float(abs(found[name] - expected[name]).max()) < 1e-10 * float(abs(expected[name]).max())
+
+
+SCRIPT = """
+from drivetrain_jax.runs import compile_cache
+import jax
+compile_cache.enable()
+print(jax.config.jax_compilation_cache_dir)
+jax.jit(lambda x: x + 1)(1.0)
+"""
+
+
+def folder_used(**environment):
+    keep = {k: v for k, v in os.environ.items() if k not in ("DRIVETRAIN_JAX_CACHE", "XDG_CACHE_HOME")}
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT], env=keep | environment, capture_output=True, text=True, check=True
+    )
+    assert not done.stderr
+    return done.stdout.strip()
+
+
+def test_compiled_code_is_kept_in_a_private_folder(tmp_path):
+    folder = folder_used(XDG_CACHE_HOME=str(tmp_path))
+    assert folder.startswith(str(tmp_path / "drivetrain_jax")) and len(os.listdir(folder)) > 0
+    assert stat.S_IMODE(os.stat(folder).st_mode) == 0o700
+
+
+@pytest.mark.parametrize("setting", ["0", "a file"])
+def test_cache_is_off_if_unwanted_or_impossible(tmp_path, setting):
+    if setting == "a file":
+        (tmp_path / "file").touch()
+        setting = str(tmp_path / "file")
+    assert folder_used(DRIVETRAIN_JAX_CACHE=setting, XDG_CACHE_HOME=str(tmp_path)) == "None"
+
+
+def test_kernels_with_lapack_calls_take_turns():
+    """Two of them at a time can wait for each other for ever."""
+    matrix = jax.ShapeDtypeStruct((8, 4, 4), float)
+    with_lapack = jax.jit(jnp.linalg.eigvals).lower(matrix).compile()
+    without = jax.jit(jnp.sin).lower(matrix).compile()
+    assert kernel._turn(with_lapack) is kernel._turn(with_lapack) is kernel._LAPACK
+    assert kernel._turn(without) is not kernel._LAPACK
+
+
+def test_scenes_of_few_points_are_compiled_without_optimising(monkeypatch):
+    """Not those whose points take long, nor rounds of an atlas: their kernels serve further ones."""
+    given = []
+    monkeypatch.setattr(kernel, "compile_kernel", lambda *of: given.append(of[-1]) or object())
+    kernel._compiled.cache_clear()
+    cases = (
+        (128, {}, False),
+        (129, {}, False),
+        (2, {"lengthy": True}, False),
+        (2, {}, True),
+        (2, {"unit_cost": 1e5}, False),
+    )
+    for count, change, full_size in cases:
+        scene = load_scene({"system": "toy", "analysis": "toy", "axes": {"a": {"start": 0, "stop": 1, "num": count}}})
+        engine = Engine(scene, full_size=full_size)
+        engine.solvers = tuple(replace(solver, **change) for solver in engine.solvers)
+        engine.prepare({(0, 16)})
+        assert all(future.result() for future in engine._kernels.values())
+        kernel._compiled.cache_clear()
+    assert given == [True, False, False, False, False]

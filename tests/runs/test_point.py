@@ -1,0 +1,183 @@
+"""One point: values, units, a readable answer."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+import drivetrain_jax as dt
+from drivetrain_jax.runs import kernel
+from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.systems.cardan_units import PhysicalShaft
+
+
+def test_results_by_attribute_and_name():
+    result = dt.point("toy", "toy", a=1.0, outputs=["value", "wave", "sign"])
+    assert result.value == result["value"] == 328.0 and result.sign == 0
+    assert result.wave.dtype == complex and result.wave.shape == (3,)
+    assert result.units == {"value": "m", "wave": "1", "sign": "1"}
+    assert result.outcome == 0 and result.outcome.has_value and list(result) == ["value", "wave", "sign"]
+    assert result.parameters["b"] == 2.0 and result.parameters["a"] == 1.0
+    with pytest.raises(AttributeError, match="there is value, wave, sign"):
+        result.nothing  # noqa: B018
+    with pytest.raises(AttributeError):
+        result.value = 3
+
+
+def test_same_value_as_in_a_sweep():
+    ds = dt.run(
+        {"system": "toy", "analysis": "toy", "axes": {"a": {"values": [0.3, 6.1]}, "b": {"values": [1.0, 1.7]}}}
+    )
+    for a, b in [(0.3, 1.7), (6.1, 1.0)]:
+        assert dt.point("toy", "toy", a=a, b=b).value == pytest.approx(float(ds["value"].sel(a=a, b=b)), rel=1e-14)
+
+
+def test_readable():
+    text = repr(dt.point("toy", "toy", a=6.0, b=1.5, outputs=["value", "sign"]))
+    assert text.splitlines() == [
+        "toy toy (method plain), a = 6 m, b = 1.5 s, n = 3, kind = plain, length = [1, 2, 3] m",
+        "  value   = 331.5 m",
+        "  sign    = large (1)",
+        "  outcome = success",
+    ]
+
+
+def test_errors_have_three_digits():
+    found = dt.point("planetary", "modes", outputs=["natural_frequency", "natural_frequency_error"])
+    first = repr(found).splitlines()[3].split()
+    assert first[1:] == [f"{found.natural_frequency[0]:.12g}", f"{found.natural_frequency_error[0]:.3g}"]
+
+
+def test_physical_units():
+    data = {"J1": 2.0, "J2": 200.0, "k1": 1000.0, "k2": 1500.0, "c1": 0.1, "c2": 0.05}
+    found = dt.point("cardan", "floquet", **data, speed=300.0, angle=18.0)
+    shaft = PhysicalShaft(**data)
+    exact = dt.point("cardan", "floquet", **shaft.at(300.0, 18.0))
+    assert found.parameters == exact.parameters and found.spectral_radius == exact.spectral_radius
+    for given, message in (
+        ({"J1": 2.0, "speed": 300.0}, "J2: missing; physical units need all of J1, J2, k1, k2, c1, c2"),
+        ({**data, "speed": "fast", "angle": 1.0}, "speed = 'fast': allowed is a number, 0 < speed < inf"),
+        (
+            {**data, "speed": 300.0, "angle": 18.0, "zeta": 0.4},
+            "zeta = 0.4: is given in physical units, too; allowed is one of the two",
+        ),
+        ({**data, "angle": 90.0, "speed": 1.0}, "angle = 90.0: allowed is -90 < angle < 90, in deg"),
+    ):
+        with pytest.raises(dt.InputError, match=f"^{re.escape(message)}$"):
+            dt.point("cardan", "floquet", **given)
+
+
+def test_angles_of_planets_in_degrees_are_refused():
+    with pytest.raises(dt.InputError, match=r"^planet_angle\[1\] = 120: allowed is .*, in rad$"):
+        dt.point("planetary", "modes", planet_angle=[0, 120, 240])
+
+
+def test_one_output_may_be_a_word():
+    assert list(dt.point("toy", "toy", a=6.0, outputs="sign")) == ["sign"]
+    with pytest.raises(dt.InputError, match="outputs: 'all' is not a result of toy"):
+        dt.point("toy", "toy", a=6.0, outputs="all")
+
+
+def test_lists_stand_side_by_side():
+    result = dt.point("planetary", "modes", outputs=["natural_frequency", "mode_type"])
+    lines = repr(result).splitlines()
+    assert lines[1] == "  outcome = success" and lines[2].split() == ["mode", "natural_frequency", "[Hz]", "mode_type"]
+    assert len(lines) == 3 + 21
+    number, frequency, *kind = lines[8].split()
+    assert (number, kind) == ("6", ["rotational", "(1)"])
+    assert float(frequency) == pytest.approx(float(result.natural_frequency[5]), rel=1e-11)
+    assert list(result.labels["mode"]) == list(range(1, 22))
+
+
+def test_failed_point_says_so():
+    result = dt.point("toy", "toy", a=9.5)
+    assert np.isnan(result.value) and not result.outcome.has_value and "not_finite" in repr(result)
+    assert json.loads(result.to_json())["values"]["value"] == {"value": None, "units": "m"}
+
+
+def test_json():
+    answer = json.loads(dt.point("toy", "toy", a=0.0, outputs=["wave"]).to_json())
+    assert answer["values"]["wave"]["value"] == {"real": [1.0, 1.0, 1.0], "imag": [0.0, 0.0, 0.0]}
+    assert answer["outcome"] == "success" and answer["parameters"]["a"] == {"value": 0.0, "units": "m"}
+    result = dt.point("toy", "toy", a=6.0, outputs=["value", "sign"])
+    assert json.loads(result.to_json())["values"]["sign"] == {"value": 1, "units": "1", "meaning": "large"}
+    assert dict(result) == {"value": result.value, "sign": 1}
+
+
+def test_words_lists_and_options():
+    assert dt.point("toy", "toy", a=1.0, kind="fancy", length=[1.0], method="other", knob=2.0).value == 8.5
+
+
+def test_a_line_of_one_value():
+    assert dt.point("toy", "line", a=2.0, b=3.0).response.tolist() == [6.0, 3.0]
+
+
+def test_another_point_needs_no_new_compilation():
+    dt.point("toy", "toy", a=1.0, b=1.0)
+    before = kernel._compiled.cache_info()
+    dt.point("toy", "toy", a=2.0, b=1.5)
+    after = kernel._compiled.cache_info()
+    assert after.hits == before.hits + 1 and after.misses == before.misses
+
+
+@pytest.mark.parametrize(
+    ("given", "part"),
+    [
+        ({"a": 11}, "^a = 11: allowed is 0 <= a <= 10, in m$"),
+        ({"a": "x"}, "^a = 'x': allowed is a number"),
+        ({"a": [1.0]}, "^a = "),
+        ({}, "^a: missing"),
+        ({"a": 1, "c": 2}, "^c = 2: unknown; allowed is a, b"),
+        ({"a": 1, "rtol": 2}, "^rtol = 2"),
+        ({"a": 1, "knob": 2}, "^knob = 2: not used by method plain"),
+        ({"a": 1, "kind": "odd"}, "^kind = 'odd'"),
+        ({"a": 1, "outputs": ["nothing"]}, "^outputs: 'nothing'"),
+        ({"a": 1, "outputs": 5}, "^outputs = 5: allowed is list"),
+        ({"a": 1, "outputs": True}, "^outputs = True: allowed is list"),
+        ({"a": 1j}, "^a = 1j: allowed is text, a number"),
+    ],
+)
+def test_wrong_input_is_one_clear_line(given, part):
+    with pytest.raises(dt.InputError, match=part):
+        dt.point("toy", "toy", **given)
+
+
+def test_unknown_system_and_analysis():
+    with pytest.raises(dt.InputError, match="system = 'tractor'"):
+        dt.point("tractor", "toy")
+    with pytest.raises(dt.InputError, match="analysis = 'dance'"):
+        dt.point("toy", "dance")
+    with pytest.raises(dt.InputError, match="system = 5"):
+        dt.point(5, "toy")
+    with pytest.raises(dt.InputError, match="analysis = 5"):
+        dt.point("toy", 5)
+
+
+def test_a_function_has_no_value_at_one_point():
+    message = "analysis = 'atlas': is made over ranges; allowed at a point is one of floquet, forced"
+    with pytest.raises(dt.InputError, match=f"^{message}$"):
+        dt.point("cardan", "atlas", beta=0.3)
+
+
+def test_a_matrix_is_printed_with_its_rows_and_columns():
+    shaft = {"length": [0.07, 0.59, 0.25], "EI": [64427.0, 22157.0, 8350.0], "rhoA": [15.3, 2.81, 5.51]}
+    shape = dt.point("bicardan", "critical_speeds", **shaft, k_A=85e6, k_D=2e7, modes=2, outputs=["mode_shape"])
+    lines = repr(shape).splitlines()
+    assert lines[-len(shape.labels["x"]) - 1].split() == ["x", "mode", "1", "mode", "2"]
+    assert [float(cell) for cell in lines[-1].split()] == pytest.approx(
+        [shape.labels["x"][-1], *shape.mode_shape[:, -1]]
+    )
+
+
+def test_physical_units_in_a_scene_are_refused_with_the_way_out():
+    scene = {"system": "cardan", "analysis": "floquet", "axes": {"angle": {"start": 0.0, "stop": 30.0, "num": 3}}}
+    message = (
+        r"^axes\.angle: physical units are for point, query and design; allowed in a scene is beta, Omega, .*gamma$"
+    )
+    with pytest.raises(dt.InputError, match=message):
+        load_scene(scene)
+    with pytest.raises(dt.InputError, match=r"^fixed\.k1 = 3: physical units are for point, query and design"):
+        load_scene({**scene, "axes": {"beta": {"start": 0.0, "stop": 0.3, "num": 3}}, "fixed": {"k1": 3}})

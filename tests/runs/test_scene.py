@@ -1,0 +1,330 @@
+"""Reading and checking scenes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from drivetrain_jax import InputError
+from drivetrain_jax.runs import toml
+from drivetrain_jax.runs.scene import load_scene
+
+GOOD = {"system": "toy", "analysis": "toy", "axes": {"a": {"start": 0, "stop": 1, "num": 3}}}
+
+HISTORY = {"system": "tripod", "analysis": "history", "fixed": {"element": "input", "beta": 0.1, "zeta": 0.01}}
+TWO_SEGMENTS = {"length": [1.0, 1.0], "EI": [1.0, 1.0], "rhoA": [1.0, 1.0], "k_A": 1.0, "k_D": 1.0}
+SHAFT = {"system": "bicardan", "analysis": "critical_speeds", "fixed": TWO_SEGMENTS}
+
+
+class Lines:
+    def __repr__(self):
+        return "one\ntwo"
+
+
+def changed(**changes):
+    return GOOD | changes
+
+
+def follow(**changes):
+    axes = {"length[0]": {"values": [1.0, 2.0]}}
+    return {"system": "toy", "analysis": "follow", "axes": axes, "options": {"track": "length[0]"}} | changes
+
+
+def test_defaults_are_filled_in():
+    scene = load_scene(GOOD)
+    assert scene.request.outputs == ("value",)
+    assert scene.request.method == "plain" and scene.request.options == {"rtol": 1e-10}
+    assert scene.fixed == {"b": 2.0, "n": 3, "kind": "plain", "length": (1.0, 2.0, 3.0)}
+    assert scene.title == "Toy: toy analysis"
+
+
+def test_unused_parameter_is_recorded():
+    assert load_scene(changed(fixed={"unused": 7})).fixed["unused"] == 7.0
+
+
+@pytest.mark.parametrize(
+    ("axis", "expected"),
+    [
+        ({"start": 1, "stop": 9, "num": 5}, [1, 3, 5, 7, 9]),
+        ({"start": 9, "stop": 1, "num": 3}, [9, 5, 1]),
+        ({"start": 1, "stop": 9, "num": 5.0}, [1, 3, 5, 7, 9]),
+        ({"start": 0.01, "stop": 1, "num": 3, "scale": "log"}, [0.01, 0.1, 1.0]),
+        ({"values": [3, 1, 2.5]}, [3, 1, 2.5]),
+        ({"start": 4, "stop": 4, "num": 1}, [4]),
+    ],
+)
+def test_axis_values(axis, expected):
+    np.testing.assert_allclose(load_scene(changed(axes={"a": axis})).axes[0].values, expected, rtol=1e-15)
+
+
+def test_mapping_may_hold_numpy_values():
+    scene = load_scene({**GOOD, "axes": {"a": {"values": np.linspace(0, 1, 3)}}, "fixed": {"b": np.float64(1.5)}})
+    assert scene.axes[0].values.tolist() == [0, 0.5, 1] and scene.fixed["b"] == 1.5
+
+
+@pytest.mark.parametrize(
+    "values", [xr.DataArray([0.0, 0.5, 1.0]), xr.DataArray([0.0, 0.5, 1.0]).to_series(), range(3), (0.0, 0.5, 1.0)]
+)
+def test_mapping_may_hold_what_is_like_a_list(values):
+    scene = load_scene({**GOOD, "axes": {"a": {"values": values}}, "fixed": {"b": xr.DataArray(1.5)}})
+    assert scene.axes[0].values.tolist() == list(values) and scene.fixed["b"] == 1.5
+
+
+def test_text_of_a_changed_scene_gives_that_scene(tmp_path):
+    path = tmp_path / "s.toml"
+    path.write_text('system="toy"\nanalysis="toy"\n[axes]\na={start=0,stop=1,num=3}\n"length[1]"={values=[1,2]}\n')
+    assert load_scene(path).text == path.read_text()
+    scene = load_scene(path, {"fixed.b": 4.5, "axes.a.num": 5, "title": 'quote " and \\ and é', "options.rtol": 1e-7})
+    path.write_text(scene.text)
+    again = load_scene(path)
+    assert again.fixed == scene.fixed and again.title == scene.title and again.request == scene.request
+    assert [a.name for a in again.axes] == ["a", "length[1]"] and len(again.axes[0].values) == 5
+
+
+@pytest.mark.parametrize(
+    ("given", "of"),
+    [
+        ({"outputs": None}, lambda s: s.request.outputs == ("value",)),
+        ({"axes": {"a": {"start": 0, "stop": 1, "num": 3, "scale": None, "values": None}}}, lambda s: len(s.axes) == 1),
+        ({"title": "\x7f, \x01 and \t"}, lambda s: s.title == "\x7f, \x01 and \t"),
+    ],
+)
+def test_text_of_a_mapping_gives_its_scene(tmp_path, given, of):
+    """Other processes, and results that grow, have only the text."""
+    path, scene = tmp_path / "s.toml", load_scene(changed(**given))
+    path.write_text(scene.text)
+    assert of(scene) and of(load_scene(path)) and load_scene(path, {"outputs": None}).request == scene.request
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("0.5", 0.5),
+        (".3", 0.3),
+        ("5", 5),
+        ("[1, 2]", [1, 2]),
+        ('"x"', "x"),
+        ("diffrax", "diffrax"),
+        ("true", True),
+        ("9" * 5000, math.inf),
+    ],
+)
+def test_values_on_the_command_line(text, value):
+    parsed = toml.parse_value(text)
+    assert parsed == value and type(parsed) is type(value)
+
+
+WRONG = {
+    "unknown key": (changed(axis={}), "axis", "axes"),
+    "missing system": ({"analysis": "toy"}, "system", "missing"),
+    "unknown system": (changed(system="tooy"), "tooy", "cardan"),
+    "unknown analysis": (changed(analysis="ty"), "ty", "allowed for toy is one of toy, slow"),
+    "analysis of another system": (changed(system="cardan", analysis="toy"), "toy", "floquet"),
+    "wrong type of a key": (changed(title=3), "title = 3", "text"),
+    "wrong type of outputs": (changed(outputs="value"), "outputs", "list"),
+    "unknown output": (changed(outputs=["valu"]), "valu", "did you mean value?"),
+    "no output": (changed(outputs=[]), "outputs = []", "value"),
+    "output twice": (changed(outputs=["value", "value"]), "outputs", "once"),
+    "unknown parameter": (changed(fixed={"bb": 1}), "fixed.bb = 1", "did you mean b?"),
+    "unknown axis": (changed(axes={"x": {"values": [1]}}), "axes.x", "allowed is a, b"),
+    "missing parameter": (changed(axes={}), "fixed.a: missing", "0 <= a <= 10"),
+    "parameter of the wrong type": (changed(fixed={"b": "two"}), "fixed.b = 'two'", "number"),
+    "boolean for a number": (changed(fixed={"b": True}), "b = True", "number"),
+    "parameter out of range": (changed(fixed={"b": 0}), "fixed.b = 0", "0 < b"),
+    "not a number": (changed(fixed={"b": float("nan")}), "b = nan", "0 < b"),
+    "infinite": (changed(fixed={"b": float("inf")}), "b = inf", "0 < b"),
+    "beyond float": (changed(fixed={"b": 10**400}), "b = 1000", "0 < b"),
+    "not an integer": (changed(fixed={"n": 1.5}), "n = 1.5", "integer"),
+    "unknown word": (changed(fixed={"kind": "odd"}), "kind = 'odd'", "plain, fancy"),
+    "list entry out of range": (changed(fixed={"length": [1, -1]}), "length[1] = -1", "0 <= length"),
+    "axis start out of range": (changed(axes={"a": {"start": -1, "stop": 1, "num": 3}}), "axes.a = -1", "0 <= a"),
+    "axis stop out of range": (changed(axes={"a": {"start": 1, "stop": 11, "num": 3}}), "axes.a = 11", "a <= 10"),
+    "axis value out of range": (changed(axes={"a": {"values": [1, 11]}}), "axes.a = 11", "a <= 10"),
+    "axis with nan": (changed(axes={"a": {"values": [1, float("nan")]}}), "axes.a = nan", "0 <= a"),
+    "empty axis": (changed(axes={"a": {"values": []}}), "axes.a.values = []", "one value or more"),
+    "one point of two ends": (
+        changed(axes={"a": {"start": 0, "stop": 1, "num": 1}}),
+        "axes.a.num = 1: start = 0 and stop = 1 are two values",
+        "allowed is num >= 2, or values = [0]",
+    ),
+    "no points on an axis": (changed(axes={"a": {"start": 0, "stop": 1, "num": 0}}), "axes.a.num = 0", "num >= 1"),
+    "num of many digits": (
+        changed(axes={"a": {"start": 0, "stop": 1, "num": 1e300}}),
+        "axes: 100000000000000005250476025520442024870446858110815915491... points",
+        "allowed is up to",
+    ),
+    "num not finite": (
+        changed(axes={"a": {"start": 0, "stop": 1, "num": float("inf")}}),
+        "axes.a.num = inf",
+        "integer",
+    ),
+    "num of the wrong type": (changed(axes={"a": {"start": 0, "stop": 1, "num": 2.5}}), "axes.a.num = 2.5", "integer"),
+    "axis without num": (changed(axes={"a": {"start": 0, "stop": 1}}), "axes.a.num", "atlas"),
+    "axis without stop": (changed(axes={"a": {"start": 0, "num": 3}}), "axes.a.stop: missing", "values"),
+    "axis with everything": (changed(axes={"a": {"start": 0, "values": [1]}}), "axes.a", "one of the two"),
+    "unknown key of an axis": (changed(axes={"a": {"begin": 0}}), "axes.a.begin", "start"),
+    "axis that is no table": (changed(axes={"a": 3}), "axes.a = 3", "table"),
+    "unknown scale": (changed(axes={"a": {"start": 1, "stop": 2, "num": 3, "scale": "ln"}}), "'ln'", "lin, log"),
+    "log axis from zero": (changed(axes={"a": {"start": 0, "stop": 2, "num": 3, "scale": "log"}}), "start = 0", "> 0"),
+    "value twice": (changed(axes={"a": {"values": [1, 2, 1]}}), "the value 1", "distinct"),
+    "axis too long to be divided": (
+        changed(axes={**GOOD["axes"], "unused": {"start": -1.7e308, "stop": 1.7e308, "num": 3}}),
+        "axes.unused: start = -1.7e+308, stop = 1.7e+308",
+        "closer together",
+    ),
+    "entry with a leading zero": (
+        changed(axes={**GOOD["axes"], "length[1]": {"values": [1]}, "length[01]": {"values": [2]}}),
+        "axes.length[01]",
+        "unknown parameter",
+    ),
+    "entry in other digits": (changed(axes={"length[\u0661]": {"values": [1]}}), "axes.length[", "unknown parameter"),
+    "entry of many digits": (changed(axes={f"length[{'9' * 5000}]": {"values": [1]}}), "axes.", "unknown parameter"),
+    "axis without extent": (changed(axes={"a": {"start": 1, "stop": 1, "num": 2}}), "the value 1", "distinct"),
+    "integer axis between integers": (
+        changed(axes={**GOOD["axes"], "n": {"start": 1, "stop": 2, "num": 3}}),
+        "n = 1.5",
+        "integer",
+    ),
+    "word as axis": (changed(axes={"kind": {"values": [1]}}), "axes.kind", "fix it"),
+    "list of another length": (
+        follow(fixed={"b": 1.0, "weight": [1, 2]}),
+        "fixed.weight = [1.0, 2.0]: 2 entries",
+        "equally",
+    ),
+    "result that this system lacks": (
+        {"system": "cardan", "analysis": "floquet", "outputs": ["floquet_exponents"]},
+        "'floquet_exponents'",
+        "allowed is floquet_multiplier, spectral_radius,",
+    ),
+    "method that this system lacks": (
+        {"system": "tripod", "analysis": "floquet", "options": {"method": "magic"}},
+        "options.method = 'magic'",
+        "allowed is auto, direct, diffrax",
+    ),
+    "num beside times": (
+        {**HISTORY, "options": {"times": [0.0, 1.0], "num": 5}},
+        "options.num = 5",
+        "given together with times",
+    ),
+    "entry of a list that is not given": (
+        {**SHAFT, "axes": {"k_joint[0]": {"values": [1e6]}}},
+        "fixed.k_joint: missing",
+        "k_joint[0] varies one entry",
+    ),
+    "entry beyond the list among points": (
+        {**SHAFT, "points": {"length[2]": [1.0]}},
+        "points.length[2]",
+        "length[0] to length[1]",
+    ),
+    "value of many lines": (changed(fixed={"b": Lines()}), "fixed.b = one two", "a number"),
+    "long list for a number": (changed(fixed={"b": [0.5] * 1000}), "fixed.b = [0.5, 0.5,", "...: allowed"),
+    "list of one": (
+        {"system": "planetary", "analysis": "modes", "fixed": {"planet_angle": [0.0, 2.0], "m_p": [1.0]}},
+        "fixed.m_p = [1.0]: 1 entry where planet_angle has 2",
+        "one entry per planet",
+    ),
+    "entry of a number for all": (
+        follow(axes={"weight[0]": {"values": [1]}}, fixed={"b": 1.0}),
+        "fixed.weight = 1.0",
+        "list",
+    ),
+    "path that is no axis": (follow(options={"track": "c"}), "options: 'c'", "allowed is one of length[0]"),
+    "path that is a number": (follow(options={"track": 3}), "options.track = 3", "text"),
+    "no infinity": (changed(fixed={"b": math.inf}), "fixed.b = inf", "0 < b"),
+    "whole list as axis": (changed(axes={"length": {"values": [1]}}), "axes.length", '"length[0]"'),
+    "entry of a number": (changed(axes={"a[0]": {"values": [1]}}), "axes.a[0]", "not a list"),
+    "entry beyond the list": (changed(axes={**GOOD["axes"], "length[3]": {"values": [1]}}), "length[3]", "length[2]"),
+    "axis and fixed": (changed(fixed={"a": 1}), "fixed.a = 1", "also in [axes]"),
+    "axes and points": (changed(points={"a": [1]}), "points", "one of the two"),
+    "points of different length": (
+        {**GOOD, "axes": {}, "points": {"a": [1, 2], "b": [1]}},
+        "a has 2, b has 1",
+        "one length",
+    ),
+    "no points": ({**GOOD, "axes": {}, "points": {"a": []}}, "a has 0", "at least 1"),
+    "points that are no list": ({**GOOD, "axes": {}, "points": {"a": 1}}, "points.a = 1", "list"),
+    "point out of range": ({**GOOD, "axes": {}, "points": {"a": [1, 11]}}, "points.a = 11", "a <= 10"),
+    "path among points": ({"system": "toy", "analysis": "line", "points": {"a": [1], "b": [1]}}, "points.b", "path"),
+    "unknown method": (changed(options={"method": "magic"}), "options.method = 'magic'", "plain, other"),
+    "unknown option": (changed(options={"rtl": 1}), "options.rtl = 1", "did you mean rtol?"),
+    "option of another method": (
+        changed(options={"knob": 1.0}),
+        "options.knob",
+        "not used by method plain, but by other;",
+    ),
+    "option out of range": (changed(options={"rtol": 1.0}), "options.rtol = 1.0", "0.01"),
+    "key that is no word": (changed(axes={5: {"values": [1]}}), "axes: the key 5", "words"),
+    "scene with a key that is no word": ({**GOOD, 5: 1}, "scene: the key 5", "words"),
+    "key that is half a character": ({**GOOD, "\ud800": 1}, r"the key '\ud800'", "words"),
+    "set of outputs": (changed(outputs={"value"}), "outputs = {'value'}", "a list"),
+    "bytes": (changed(title=b"x"), "title = b'x'", "text"),
+    "complex number": (changed(fixed={"b": 1j}), "fixed.b = 1j", "a number"),
+    "NUL in the title": (changed(title="a\0b"), r"title = 'a\x00b'", "text without NUL"),
+    "half a character in the title": (changed(title="\ud800"), r"title = '\ud800'", "halves of characters"),
+    "half a character in a list": (changed(outputs=["\udcce"]), r"outputs = '\udcce'", "halves of characters"),
+    "integer of too many digits": (changed(fixed={"b": 10**5000}), "fixed.b: an integer of 16610 bits", "1.8e308"),
+    "number for a scene": (5, "scene = 5", "path of a scene file"),
+    "no path": ("a\0b", r"scene = 'a\x00b'", "path of a scene file"),
+    "nothing": (None, "scene = None", "path of a scene file"),
+    "too many points": (
+        changed(axes={n: {"start": 1, "stop": 2, "num": 10**6} for n in ("a", "b")}),
+        "1000000000000 points",
+        "2000000000",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_scene_is_one_clear_line(case):
+    scene, field, allowed = WRONG[case]
+    with pytest.raises(InputError) as error:
+        load_scene(scene)
+    message = str(error.value)
+    assert field in message and allowed in message and "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("content", "part"),
+    [
+        (b"a = " + b"9" * 5000, "a number of too many digits; allowed are up to 4300"),
+        (b'system = "toy"\nanalysis = "toy"\ntitle = "a\\u0000b"', r"title = 'a\\x00b': allowed is text without NUL"),
+        (b"a = [1", "line 1"),
+        (b"\xff\xfe", "UTF-8"),
+        (None, "No such file"),
+        (b"a=1\na=2", "line 2"),
+        (b"a = " + b"[" * 5000 + b"]" * 5000, "nested too deeply"),
+    ],
+)
+def test_wrong_file_is_one_clear_line(tmp_path, content, part):
+    path = tmp_path / "s.toml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=part):
+        load_scene(path)
+
+
+def test_a_table_within_itself_is_one_clear_line():
+    tree = {}
+    tree["fixed"] = tree
+    with pytest.raises(InputError, match="scene = a table: not valid TOML: nested too deeply"):
+        load_scene(tree)
+
+
+@pytest.mark.parametrize("overrides", [{5: 1}, {"": 1}, [1], "fixed.a"])
+def test_overrides_that_are_none_are_one_clear_line(overrides):
+    with pytest.raises(InputError, match=r"overrides = .*allowed is a table by dotted keys"):
+        load_scene(GOOD, overrides)
+
+
+def test_a_byte_order_mark_and_line_ends_of_windows_are_read(tmp_path):
+    path, text = tmp_path / "s.toml", toml.write(GOOD)
+    path.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+    assert load_scene(path).axes[0].values.tolist() == load_scene(GOOD).axes[0].values.tolist()
+
+
+def test_huge_axis_is_refused_before_it_is_made():
+    with pytest.raises(InputError, match="allowed is up to 2000000000"):
+        load_scene(changed(axes={"a": {"start": 0, "stop": 1, "num": 10**15}}))

@@ -1,0 +1,338 @@
+"""Zarr stores that workers write: the same result as the HDF5 file, resumable, damage found."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from interrupts import stop_after
+
+import drivetrain_jax as dt
+from drivetrain_jax import InputError
+from drivetrain_jax._threads import threads
+from drivetrain_jax.cli import main
+from drivetrain_jax.invariants.verify import verify
+from drivetrain_jax.runs.executor import Where
+from drivetrain_jax.runs.export import export
+from drivetrain_jax.runs.partial import PENDING
+from drivetrain_jax.runs.run import Incomplete, Interrupted, run_to_file
+from drivetrain_jax.runs.status import status
+from drivetrain_jax.store import shards
+from drivetrain_jax.store.chunks import PartsFolder
+
+pytest.importorskip("zarr")
+
+
+def to_store(scene, path, **options):
+    return run_to_file(scene, path, store="zarr", **options)
+
+
+def opened(path):
+    with xr.open_dataset(path, engine="h5netcdf") as ds:
+        return ds.load()
+
+
+def identical(one, two):
+    for name in one.variables:
+        a, b = one[name], two[name]
+        assert (a.dims, a.dtype, str(a.attrs)) == (b.dims, b.dtype, str(b.attrs)), name
+        assert a.values.tobytes() == b.values.tobytes(), name
+    assert list(one.variables) == list(two.variables) and one.attrs["digest"] == two.attrs["digest"]
+
+
+def large(scene):
+    """Enough chunks for shards of several."""
+    return scene | {"axes": {"b": {"start": 1.0, "stop": 9.0, "num": 40}, "a": {"start": 0.0, "stop": 10.0, "num": 41}}}
+
+
+LINE = {
+    "system": "toy",
+    "analysis": "line",
+    "axes": {"b": {"values": [1.0, 4.0]}, "a": {"start": 0, "stop": 9, "num": 9}},
+}
+ONE = {"system": "toy", "analysis": "toy", "outputs": ["value", "wave"], "fixed": {"a": 1.0}}
+FIXED_PATH = LINE | {"axes": {"a": {"values": [1.0, 2.0]}}, "fixed": {"b": 5.0}}
+POINTS = {"system": "toy", "analysis": "toy", "points": {"a": [1.0, 8.0, 9.5], "b": [1.0, 2.0, 3.0]}}
+
+
+@pytest.mark.parametrize("which", ["grid", "line", "one", "fixed path", "points"])
+def test_export_is_bit_identical_to_the_file(grid_scene, tmp_path, which):
+    scenes = {"grid": large(grid_scene), "line": LINE, "one": ONE, "fixed path": FIXED_PATH, "points": POINTS}
+    scene = scenes[which]
+    direct = run_to_file(scene, tmp_path / "direct.nc")
+    assert str(to_store(scene, tmp_path / "r.zarr")) == str(direct)
+    export(tmp_path / "r.zarr", tmp_path / "exported.nc")
+    ours, exported = opened(tmp_path / "direct.nc"), opened(tmp_path / "exported.nc")
+    identical(ours, exported)
+    # A new version then says what differs, and can grow either.
+    assert ours.attrs["numerics_detail"] == exported.attrs["numerics_detail"]
+    assert verify(tmp_path / "exported.nc").problem == "" == verify(tmp_path / "r.zarr").problem
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["direct.nc", "exported.nc", "r.zarr"]
+    found = status(scene, tmp_path / "r.zarr")
+    assert (found.state, found.done, found.failed) == ("complete", direct.total, direct.failed)
+    assert to_store(scene, tmp_path / "r.zarr").reused == direct.total
+
+
+def test_interrupted_damaged_and_resumed(grid_scene, tmp_path):
+    scene, path, pool = large(grid_scene), tmp_path / "r.zarr", threads(1, "chunk")
+    with pytest.raises(Interrupted) as stopped:
+        to_store(scene, path, where=Where(threads=1), report=stop_after(3))
+    # In a process of its own the thread would be gone.
+    pool.shutdown()
+    done, found = stopped.value.progress.computed, status(scene, path)
+    assert 0 < done <= found.done < 1640 and found.state == "partial" and not path.exists()
+    with pytest.raises(InputError, match="unfinished work of --store zarr"):
+        run_to_file(scene, path)
+    store = tmp_path / "r.zarr.parts" / "store"
+    group = next(g for g in shards.groups_of(shards.attributes(store)) if shards.done(store, g).any())
+    file = store / group.name / "value" / "c" / str(np.flatnonzero(shards.done(store, group))[0])
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 4
+    file.write_bytes(data)
+    progress = to_store(scene, path)
+    assert 0 < progress.reused < found.done and progress.reused + progress.computed == 1640
+    export(path, tmp_path / "e.nc")
+    run_to_file(scene, tmp_path / "d.nc")
+    identical(opened(tmp_path / "d.nc"), opened(tmp_path / "e.nc"))
+
+
+@pytest.mark.parametrize("name", ["value", "wave", "outcome", "point", "done"])
+def test_damage_of_a_finished_store_is_found(grid_scene, tmp_path, name):
+    path = tmp_path / "r.zarr"
+    to_store(grid_scene, path)
+    file = sorted(path.rglob(f"{name}/c/*"))[0]
+    file = file if file.is_file() else next(p for p in file.rglob("*") if p.is_file())
+    data = bytearray(file.read_bytes())
+    data[len(data) // 3] ^= 1
+    file.write_bytes(data)
+    assert "shards are not what was written" in verify(path).problem
+    with pytest.raises(InputError, match="is damaged"):
+        export(path, tmp_path / "e.nc")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["r.zarr"]
+
+
+@pytest.mark.parametrize("name", ["scene", "groups", "digest", "held_points", "checksum"])
+@pytest.mark.parametrize("how", ["changed", "renamed", "gone"])
+def test_damage_of_the_attributes_is_found(tmp_path, capsys, name, how):
+    path = tmp_path / "r.zarr"
+    to_store(POINTS, path)
+    content = json.loads((path / "zarr.json").read_text())
+    value = content["attributes"].pop(name)
+    if how != "gone":
+        changed = str(value).replace("1", "3")
+        content["attributes"] |= {name + "x": value} if how == "renamed" else {name: changed + " "}
+    (path / "zarr.json").write_text(json.dumps(content))
+    for command in (["verify", str(path)], ["export", str(path), str(tmp_path / "e.nc")]):
+        assert main(command) == 2
+        err = capsys.readouterr().err
+        assert len(err.splitlines()) == 1 and ("attributes" in err or "not a result" in err), err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["r.zarr"]
+
+
+@pytest.mark.parametrize("change", ["fewer", "twice", "beyond"])
+def test_every_planned_point_is_exported_once(grid_scene, tmp_path, change):
+    """Whatever the checksums say: here the store is sealed anew."""
+    path = tmp_path / "r.zarr"
+    to_store(grid_scene, path)
+    attrs = shards.attributes(path)
+    attrs.pop("checksum")
+    groups = json.loads(attrs["groups"])
+    if change == "fewer":
+        attrs["groups"] = json.dumps(groups[:1])
+    elif change == "twice":
+        attrs["groups"] = json.dumps([*groups, groups[0]])
+    else:
+        attrs["scene"] = attrs["scene"].replace("num = 41", "num = 40")
+    shards.seal(path, attrs)
+    with pytest.raises(InputError, match=r"it holds \d+ of 123 points|holds points of another one, or of none"):
+        export(path, tmp_path / "e.nc")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["r.zarr"]
+
+
+def test_attributes_that_were_damaged_while_the_store_grew_are_made_anew(grid_scene, tmp_path):
+    scene, path, pool = large(grid_scene), tmp_path / "r.zarr", threads(1, "chunk")
+    with pytest.raises(Interrupted):
+        to_store(scene, path, where=Where(threads=1), report=stop_after(2))
+    pool.shutdown()
+    file = tmp_path / "r.zarr.parts" / "store" / "zarr.json"
+    file.write_text(file.read_text().replace("stop = 10.0", "stop = 10.5"))
+    to_store(scene, path)
+    export(path, tmp_path / "e.nc")
+    assert opened(tmp_path / "e.nc").equals(dt.run(scene))
+
+
+def test_export_leaves_unfinished_work_alone(grid_scene, tmp_path):
+    to_store(ONE, tmp_path / "r.zarr")
+    with pytest.raises(Interrupted):
+        run_to_file(grid_scene, tmp_path / "e.nc", where=Where(threads=1), report=stop_after(2))
+    done = status(grid_scene, tmp_path / "e.nc").done
+    with pytest.raises(InputError, match=r"out = .*e.nc': unfinished work is in .*e.nc.parts'; allowed is a new file"):
+        export(tmp_path / "r.zarr", tmp_path / "e.nc")
+    assert status(grid_scene, tmp_path / "e.nc").done == done > 0
+
+
+@pytest.mark.parametrize("kind", ["group", "array", "text", "attributes"])
+def test_what_is_no_store_is_one_line(tmp_path, capsys, kind):
+    import zarr
+
+    path = tmp_path / "r.zarr"
+    if kind == "array":
+        zarr.create_array(path, shape=(3,), dtype="f8")
+    else:
+        zarr.create_group(path, attributes={"title": "of another program"})
+    if kind in ("text", "attributes"):
+        (path / "zarr.json").write_text({"text": "{rubbish", "attributes": '{"attributes": 3}'}[kind])
+    for command in (["verify", str(path)], ["export", str(path), str(tmp_path / "e.nc")]):
+        assert main(command) == 2
+        err = capsys.readouterr().err.splitlines()
+        assert len(err) == 1 and ("not a readable Zarr store" in err[0] or "not a result of" in err[0])
+
+
+@pytest.mark.parametrize("place", ["", "outcome", "done"])
+def test_broken_metadata_of_a_finished_store_is_one_line(grid_scene, tmp_path, place):
+    path = tmp_path / "r.zarr"
+    to_store(grid_scene, path)
+    next(path.glob(f"solver_0/{place}/zarr.json" if place else "solver_0/zarr.json")).write_text("{rubbish")
+    assert "not what was written" in verify(path).problem
+    with pytest.raises(InputError, match="is damaged"):
+        export(path, tmp_path / "e.nc")
+    with pytest.raises(InputError, match="damaged; allowed is to restore it"):
+        to_store(grid_scene, path)
+
+
+def test_points_that_no_solver_can_do_are_counted(tmp_path):
+    scene = {"system": "toy", "analysis": "toy", "options": {"method": "hopeless"}}
+    scene["axes"] = {"a": {"start": 0.0, "stop": 10.0, "num": 11}}
+    first = to_store(scene, tmp_path / "r.zarr")
+    found, again = status(scene, tmp_path / "r.zarr"), to_store(scene, tmp_path / "r.zarr")
+    assert (first.failed, again.failed, again.reused) == (5, 5, 11)
+    assert (found.done, found.failed, found.failed_by_outcome) == (11, 5, {"step_limit": 5})
+    assert export(tmp_path / "r.zarr", tmp_path / "e.nc") == 11 and opened(tmp_path / "e.nc").equals(dt.run(scene))
+
+
+def test_unfinished_work_is_opened_and_counted(grid_scene, tmp_path):
+    scene, path, pool = large(grid_scene), tmp_path / "r.zarr", threads(1, "chunk")
+    with pytest.raises(Interrupted):
+        to_store(scene, path, where=Where(threads=1), report=stop_after(3))
+    pool.shutdown()
+    partial, whole, done = dt.open_result(path), dt.run(scene), status(scene, path).done
+    there = (partial["outcome"] != PENDING).values
+    assert 0 < partial.attrs["points_done"] == there.sum() == done < 1640
+    assert partial["wave"].values[there].tobytes() == whole["wave"].values[there].tobytes()
+    report = verify(path)
+    assert not report.complete and re.fullmatch(r"unfinished: ([1-9]\d*) of \1 shards are intact", str(report))
+    shutil.rmtree(next((tmp_path / "r.zarr.parts" / "store").glob("*/value/c")))
+    assert "the run that resumes computes the chunks of the others again" in str(verify(path))
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        (".", lambda file: file.write_text("rubbish")),
+        ("solver_0", lambda file: file.write_text("{}")),
+        ("solver_0/done", lambda file: file.unlink()),
+        ("solver_0/done", lambda file: file.write_text(json.dumps(json.loads(file.read_text()) | {"shape": [1]}))),
+        ("solver_0/point", lambda file: file.write_text(json.dumps(json.loads(file.read_text()) | {"shape": [1]}))),
+        ("solver_1/value", lambda file: file.write_text(file.read_text().replace("float64", "float32"))),
+    ],
+)
+def test_an_unfinished_store_with_damaged_metadata_is_one_line(grid_scene, tmp_path, name, damage):
+    path, scene = tmp_path / "r.zarr", large(grid_scene)
+    with pytest.raises(Interrupted):
+        to_store(scene, path, where=Where(threads=1), report=stop_after(3))
+    store = tmp_path / "r.zarr.parts" / "store"
+    damage(store / name / "zarr.json")
+    line = re.escape(f"store = {str(store)!r}: its metadata are damaged; allowed is to restore them, or --fresh")
+    for look in (lambda: to_store(scene, path), lambda: dt.open_result(path)):
+        with pytest.raises(InputError, match=f"^{line}$"):
+            look()
+    assert to_store(scene, path, fresh=True).computed == 1640 and verify(path).problem == ""
+
+
+@pytest.mark.parametrize("name", ["value", "done"])
+def test_a_shard_that_is_gone_is_found(grid_scene, tmp_path, name):
+    to_store(grid_scene, tmp_path / "r.zarr")
+    next(p for p in (tmp_path / "r.zarr").rglob(f"{name}/c/*") if p.is_file()).unlink()
+    assert "not what was written" in verify(tmp_path / "r.zarr").problem
+
+
+def test_a_store_that_workers_wrote_elsewhere_is_not_finished(grid_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(shards, "write", lambda *_: None)
+    with pytest.raises(Incomplete, match=r"1 shards were written elsewhere; every worker has to see the store"):
+        to_store(ONE, tmp_path / "r.zarr")
+    assert not (tmp_path / "r.zarr").exists()
+
+
+def test_fresh_replaces_and_a_kill_between_keeps_the_former(grid_scene, tmp_path, monkeypatch):
+    path, other = tmp_path / "r.zarr", grid_scene | {"fixed": {"n": 4}}
+    to_store(grid_scene, path)
+    with pytest.raises(InputError, match=r"fixed.n is 4, was 3; --fresh replaces it"):
+        to_store(other, path)
+    (tmp_path / "r.zarr.parts").mkdir()
+    path.rename(tmp_path / "r.zarr.parts" / "former")
+    assert status(grid_scene, path).state == "complete"
+    to_store(other, path, fresh=True)
+    assert status(other, path).state == "complete" and [p.name for p in tmp_path.iterdir()] == ["r.zarr"]
+
+
+def test_looking_while_a_store_is_replaced_moves_nothing(grid_scene, tmp_path, monkeypatch):
+    path, other, seen = tmp_path / "r.zarr", grid_scene | {"fixed": {"n": 4}}, []
+    to_store(grid_scene, path)
+    rename = Path.rename
+
+    def look(self, target):
+        moved = rename(self, target)
+        if Path(target).name == shards.FORMER:
+            seen.append((status(other, path), status(grid_scene, path), dt.open_result(path), verify(path)))
+        return moved
+
+    with monkeypatch.context() as replacing:
+        replacing.setattr(Path, "rename", look)
+        assert to_store(other, path, fresh=True).computed == 123
+    ((ours, former, partial, report),) = seen
+    assert (ours.state, ours.done, former.state) == ("partial", 123, "complete")
+    assert partial.attrs["points_done"] == 123 and str(report) == "unfinished: 6 of 6 shards are intact"
+    assert status(other, path).state == "complete" and [p.name for p in tmp_path.iterdir()] == ["r.zarr"]
+
+
+def test_a_run_puts_a_former_store_back_unless_another_is_at_work(grid_scene, tmp_path):
+    path = tmp_path / "r.zarr"
+    to_store(grid_scene, path)
+    parts = PartsFolder(path)
+    parts.open()
+    path.rename(parts.path / shards.FORMER)
+    with pytest.raises(InputError, match="another run is working on it"):
+        to_store(grid_scene, path)
+    parts.close()
+    assert to_store(grid_scene, path).reused == 123 and [p.name for p in tmp_path.iterdir()] == ["r.zarr"]
+
+
+def test_the_command_line(tmp_path, monkeypatch, capsys):
+    from drivetrain_jax.runs import toml
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(toml.write(POINTS))
+    assert main(["run", "scene.toml", "--out", "r.zarr", "--store", "zarr", "--quiet"]) == 0
+    assert main(["export", "r.zarr", "e.nc"]) == 0 and main(["verify", "r.zarr"]) == 0
+    assert opened("e.nc").equals(dt.run(POINTS))
+    capsys.readouterr()
+    for arguments, part in [
+        (["export", "nothing", "f.nc"], "not a Zarr store"),
+        (["export", "r.zarr", "e.nc"], "allowed is a new file"),
+        (["export", "r.zarr", "nowhere/e.nc"], "allowed is a new file"),
+        (["run", "scene.toml", "--out", "e.nc", "--store", "zarr"], "is a file"),
+        (["run", "scene.toml", "--out", "r.zarr"], "is a folder"),
+        (["run", "scene.toml", "--out", "f.zarr", "--store", "zarr", "--reuse", "e.nc"], "reuse: given together"),
+    ]:
+        assert main(arguments) == 2
+        assert part in capsys.readouterr().err, arguments
+
+
+def test_shards_are_as_many_as_they_may_be():
+    assert [shards.Group("g", n, 8).per_shard for n in (1, 7, 16, 10_000)] == [1, 1, 2, 64]
+    assert shards.Group("g", 10_000, 8).shards == 157 and np.isclose(157 * 64, 10_000, rtol=0.01)
