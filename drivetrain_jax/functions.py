@@ -98,6 +98,8 @@ def analyse(name: str, system: System, outputs: Sequence[str] | None, options: M
 
 def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapping[str, Any]) -> tuple[_Job, Any]:
     """What is asked, checked, and the numbers."""
+    if not jax.config.jax_enable_x64:
+        raise InputError("jax_enable_x64 = False: allowed is True, by jax.config.update or within jax.enable_x64(True)")
     if not isinstance(system, System):
         raise InputError(
             f"system: got a {type(system).__name__}; allowed is a system such as drivetrain_jax.Cardan(...)"
@@ -293,7 +295,7 @@ def lyapunov(system: System, *, outputs: Sequence[str] | None = None, **options:
 
 
 def poincare(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
-    """Poincare section: the state ``section`` (strobe, 2) at ``strobes`` periods of the excitation after the first ``discard``.
+    """Poincare section: the state ``section`` (strobe, 2) at ``strobes`` periods of the excitation after ``discard`` others.
 
     Args as of :func:`floquet`. No derivatives.
 

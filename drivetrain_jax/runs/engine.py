@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Set
 from concurrent.futures import Future
@@ -115,11 +116,11 @@ class Engine:
 
 
 def _use_double_precision() -> None:
-    """Set jax to double precision again where it has been set to another since: nothing else would tell."""
-    jax.config.update("jax_enable_x64", True)
+    """Set jax to double precision again where it has been set to another since, unless that is the caller's own affair."""
+    if not jax.config.jax_enable_x64 and os.environ.get("DRIVETRAIN_JAX_ENABLE_X64") != "0":
+        jax.config.update("jax_enable_x64", True)
     if not jax.config.jax_enable_x64:
-        # A context holds for its own thread and does not reach those that compute.
-        raise InputError("jax_enable_x64 = False: set by the context of this call; allowed is a call outside of it")
+        raise InputError("jax_enable_x64 = False: set by the context of this call; allowed is jax.enable_x64(True)")
 
 
 def _may_pass(error: Exception) -> bool:

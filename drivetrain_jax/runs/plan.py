@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from drivetrain_jax._machine import usable_cores
+from drivetrain_jax._threads import in_double_precision
 from drivetrain_jax.analysis import Solver
 from drivetrain_jax.runs.grid import Grid
 
@@ -139,7 +140,8 @@ class Blocks:
         pieces = [self._number(np.arange(i, min(i + _PIECE, stop))) for i in range(start, stop, _PIECE)]
         found = [_cheapest(self._solvers, self._grid, pieces[0])]
         if len(pieces) > 1:
-            with ThreadPoolExecutor(min(usable_cores(), len(pieces) - 1), thread_name_prefix="plan") as pool:
+            workers = min(usable_cores(), len(pieces) - 1)
+            with ThreadPoolExecutor(workers, "plan", initializer=in_double_precision) as pool:
                 found += pool.map(lambda points: _cheapest(self._solvers, self._grid, points), pieces[1:])
         choice, effort = (np.concatenate(column) for column in zip(*found, strict=True))
         orders, efforts = [], []

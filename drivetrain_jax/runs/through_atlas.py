@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from drivetrain_jax._threads import in_double_precision
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.atlas import StabilityAtlas, prepare_judging
 from drivetrain_jax.runs.assemble import Table, failures
@@ -31,7 +32,7 @@ def fill_through_atlas(engine: Engine, table: Table, work: Work, progress: Progr
     scene = engine.scene
     solves = Progress(0, kind="direct solves for the atlas")
     # Beside the solves.
-    with ThreadPoolExecutor(1) as aside:
+    with ThreadPoolExecutor(1, initializer=in_double_precision) as aside:
         prepared = [aside.submit(_lay_out, engine, table), aside.submit(_prepare_judging, engine)]
         atlas, first = build_atlas(scene, atlas_ranges(scene), work, solves, solves_allowed(scene))
         progress.note = solves.note

@@ -3,23 +3,26 @@
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
 
 import jax
 
-# Every module that computes imports this package first, so no array can be made in single precision before this line.
-jax.config.update("jax_enable_x64", True)
+# The one place that turns on double precision. Every module that computes imports this package first, so no array is made
+# in single precision before. Who embeds the package and turns it on himself, or only in a context, says no.
+if os.environ.get("DRIVETRAIN_JAX_ENABLE_X64") != "0":
+    jax.config.update("jax_enable_x64", True)
 
-from drivetrain_jax._quantities import Parameter  # noqa: E402
-from drivetrain_jax.systems._base import Model, Resonances, System, parameter, serves  # noqa: E402
-from drivetrain_jax.systems._flow import Flow  # noqa: E402
-from drivetrain_jax.systems._modal import FAMILIES, Block, SpringSystem  # noqa: E402
-from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator  # noqa: E402
-from drivetrain_jax.systems._rows import dense  # noqa: E402
-from drivetrain_jax.systems._shaft import Shaft  # noqa: E402
-from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness  # noqa: E402
+from drivetrain_jax._quantities import Parameter
+from drivetrain_jax.systems._base import Model, Resonances, System, parameter, serves
+from drivetrain_jax.systems._flow import Flow
+from drivetrain_jax.systems._modal import FAMILIES, Block, SpringSystem
+from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator
+from drivetrain_jax.systems._rows import dense
+from drivetrain_jax.systems._shaft import Shaft
+from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness
 
 if TYPE_CHECKING:
     from drivetrain_jax.systems._periodic import FloquetModel, ForcedModel, LinearPeriodic
