@@ -1,7 +1,7 @@
 """Gradients of the spectral radius and of stability boundaries with respect to parameters.
 
 Inside an atlas they come from the surrogate; with respect to every parameter of the system, fixed ones included, from direct
-solves whose steps are differentiated: derivatives of the monodromy matrix, which is smooth, never of the spectral radius.
+solves of the system and its derivative together: derivatives of the monodromy matrix, which is smooth, never of the radius.
 Both use left and right eigenvectors of Z, so that no branch is picked wrongly near a crossing.
 """
 
@@ -17,9 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from drivetrain_jax.analysis.numerics.kernels import options_for_few
-from drivetrain_jax.analysis.periodic.direct import assemble
+from drivetrain_jax.analysis.numerics.lanes import Constants
+from drivetrain_jax.analysis.periodic.derivatives import monodromy_change
 from drivetrain_jax.analysis.periodic.floquet_effort import PANEL_COST, explicit_effort, implicit_effort
-from drivetrain_jax.analysis.periodic.propagator import EXPLICIT_ORDER, explicit_propagator, implicit_propagator
+from drivetrain_jax.analysis.periodic.propagator import EXPLICIT_ORDER, EqualSteps, Order8, Radau
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.growth import growth
 from drivetrain_jax.atlas.panels import Atlas
@@ -93,10 +94,10 @@ def direct_sensitivity(system: System, values: Mapping[str, float]) -> Sensitivi
     """
     names = system.models["floquet"].parameters
     point = np.array([float(values[name]) for name in names])
-    scheme, count = _scheme(system, dict(zip(names, point[:, None], strict=True)))
+    solver, count = _scheme(system, dict(zip(names, point[:, None], strict=True)))
     if not math.isfinite(count):
         return _unknown(names)
-    solve, count = _derivatives(system.models["floquet"].build, names, scheme), int(count)
+    solve, count = _derivatives(system.models["floquet"].build, names, solver), int(count)
     z, change = solve(point, count)
     for _ in range(_MOST_DOUBLINGS):
         coarse, before, count = z, change, 2 * count
@@ -107,12 +108,12 @@ def direct_sensitivity(system: System, values: Mapping[str, float]) -> Sensitivi
     return _sensitivity(names, z, change, float(error))
 
 
-def _scheme(system: System, columns: Mapping[str, np.ndarray]) -> tuple[Callable, float]:
+def _scheme(system: System, columns: Mapping[str, np.ndarray]) -> tuple[type[EqualSteps], float]:
     """The cheaper scheme for one point, and its predicted steps or panels; infinite if there would be too many of both."""
     explicit, implicit = (float(of(system, columns, _RTOL)[0]) for of in (explicit_effort, implicit_effort))
     if PANEL_COST * implicit < explicit:
-        return implicit_propagator, implicit
-    return explicit_propagator, explicit
+        return Radau, implicit
+    return Order8, explicit
 
 
 def _unknown(names: Sequence[str]) -> Sensitivity:
@@ -150,17 +151,17 @@ def _gap(sigma: complex, multipliers: np.ndarray) -> float:
 
 @lru_cache
 def _derivatives(
-    build: Callable, names: tuple[str, ...], scheme: Callable
+    build: Callable, names: tuple[str, ...], solver: type[EqualSteps]
 ) -> Callable[[np.ndarray, int], tuple[np.ndarray, np.ndarray]]:
     """Z of a model at a point, ``(n, n)``, and its derivatives by all parameters, ``(n, n, p)``, compiled for any steps."""
 
-    def monodromy(point: jax.Array, steps: jax.Array) -> jax.Array:
-        form = build(dict(zip(names, point, strict=True))).reduced
-        phi = scheme(form, steps) if scheme is implicit_propagator else scheme(form, steps, ())
-        return assemble(form, jnp.exp(phi.log_scale) * phi.matrix)
-
     def both(point: jax.Array, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return monodromy(point, steps), jax.jacfwd(monodromy)(point, steps)
+        parameters, constants = dict(zip(names, point, strict=True)), Constants(dict.fromkeys(names))
+        found = monodromy_change(build, parameters, constants, steps, solver)
+        size = jnp.exp(found.log_scale)
+        # Leaves of a dictionary are in the order of the alphabet.
+        place = np.argsort(np.argsort(names))
+        return size * found.z, size * jnp.moveaxis(found.dz, 0, -1)[..., place]
 
     compiled = jax.jit(both, compiler_options=options_for_few())
     return lambda point, steps: tuple(map(np.asarray, compiled(point, np.int64(steps))))

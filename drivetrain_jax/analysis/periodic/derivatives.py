@@ -19,7 +19,7 @@ from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
 from drivetrain_jax.analysis.periodic.direct import assemble
 from drivetrain_jax.analysis.periodic.multipliers import sort_multipliers
-from drivetrain_jax.analysis.periodic.propagator import propagator
+from drivetrain_jax.analysis.periodic.propagator import EqualSteps, Order8, propagator
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
 # Moduli that differ by no more than rounding, as those of all multipliers without damping.
@@ -74,14 +74,16 @@ def reduced_form(build: Build, parameters: Any, constants: Constants) -> LinearP
     return build(eqx.combine(parameters, constants.tree)).reduced
 
 
-def monodromy_change(build: Build, parameters: Any, constants: Constants, steps: Array) -> Change:
+def monodromy_change(
+    build: Build, parameters: Any, constants: Constants, steps: Array, solver: type[EqualSteps] = Order8
+) -> Change:
     """The monodromy matrix of one point and its derivatives by all ``parameters``, a pytree of P numbers, by ``steps``."""
     leaves, tree = jax.tree.flatten(parameters)
 
     def along(direction: Array) -> Change:
         direction = jax.tree.unflatten(tree, list(direction))
         varied = LinearPeriodic(_Varied(parameters, direction, build, constants).rows, 1.0)
-        found = propagator(varied, steps)
+        found = propagator(varied, steps, 1, solver)
         n = len(found.matrix) // 2
         phi, change = found.matrix[:n, :n], found.matrix[n:, :n]
 
