@@ -1,0 +1,272 @@
+"""The analyses as pure functions: the same numbers as scenes, under transformations as well, and their derivatives."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+import drivetrain_jax as dt
+from drivetrain_jax.analysis.periodic import propagator
+from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.kernel import compile_kernel, result_variables
+from drivetrain_jax.runs.scene import load_scene
+
+BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+SHAFT = dt.Cardan(beta=0.3, Omega=1.416, **BASE)
+GEARS = dt.Rattle(omega=0.7, **dt.Rattle.presets["table1"])
+TRIPOD = dt.Tripod(element="input", beta=0.157, zeta=0.0016, chi_n=0.3)
+
+CASES = {
+    "cardan floquet": (dt.floquet, SHAFT, "beta", np.linspace(0.05, 1.4, 37), 1e-11),
+    "tripod floquet": (dt.floquet, TRIPOD, "excitation_frequency", np.linspace(2000.0, 4000.0, 5), 1e-11),
+    "cardan forced": (dt.forced, SHAFT, "Omega", np.linspace(0.9, 1.1, 3), 1e-9),
+    "tripod history": (lambda s, **o: dt.history(s, times=(1e-4, 1e-3), **o), TRIPOD, "zeta", [0.001, 0.01], 1e-9),
+    "bicardan critical_speeds": (
+        dt.critical_speeds, dt.Bicardan(**dt.Bicardan.presets["paper"]), "k_A", [1e7, 85e6, 1e9], 1e-12
+    ),
+    "planetary modes": (dt.modes, dt.Planetary(), "k_p", [5e7, 1e8, 2e8], 1e-9),
+    "rattle steady_state": (dt.steady_state, GEARS, "omega", [0.6, 0.7, 0.9], 1e-9),
+}  # fmt: skip
+
+
+def replaced(system, name, value):
+    return type(system).of(system.values | {name: value})
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_batch_equals_the_loop_and_the_sweep(case):
+    function, system, name, values, rtol = CASES[case]
+    batch = jax.vmap(lambda x: replaced(system, name, x))(jnp.asarray(values))
+    found = jax.jit(jax.vmap(function))(batch)
+    alone = [function(replaced(system, name, float(x))) for x in (values[0], values[-1])]
+    own = case.split()[1]
+    options = {"times": [1e-4, 1e-3]} if own == "history" else {}
+    swept = dt.sweep(getattr(dt, own), system, over={name: values}, **options)
+    for key in found:
+        together = np.asarray(found[key])
+        scale = np.abs(together).max() if together.dtype.kind in "fc" else 1
+        if not key.endswith("_error"):
+            np.testing.assert_allclose(together, swept[key].values, rtol=rtol, atol=rtol * scale)
+            for one, lane in zip(alone, (together[0], together[-1]), strict=True):
+                np.testing.assert_allclose(one[key], lane, rtol=rtol, atol=rtol * scale)
+
+
+def test_nested_batches_are_one():
+    betas, speeds = jnp.linspace(0.1, 1.2, 3), jnp.linspace(0.5, 1.5, 4)
+
+    def radius(beta, Omega):
+        return dt.floquet(dt.Cardan(beta=beta, Omega=Omega, **BASE)).spectral_radius
+
+    nested = jax.vmap(lambda b: jax.vmap(lambda s: radius(b, s))(speeds))(betas)
+    for i, beta in enumerate(betas):
+        np.testing.assert_allclose(nested[i], jax.vmap(lambda s, b=beta: radius(b, s))(speeds), rtol=1e-11)
+
+
+def differences(function, system, names, step):
+    """Central differences of order four."""
+    slopes = {}
+    for name in names:
+        h = step * abs(system.values[name])
+        f = [np.asarray(function(replaced(system, name, system.values[name] + k * h))) for k in (-2, -1, 1, 2)]
+        slopes[name] = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * h)
+    return slopes
+
+
+def test_gradients_of_the_spectral_radius_at_random_points():
+    """Where the largest multiplier is simple, real or one of a pair; against differences of the sharpest solves."""
+    rng = np.random.default_rng(0)
+    radius = lambda s: dt.floquet(s, outputs="spectral_radius").spectral_radius  # noqa: E731
+    sharp = jax.jit(lambda s: dt.floquet(s, outputs="spectral_radius", rtol=1e-13).spectral_radius)
+    gradient, checked = jax.jit(jax.grad(radius)), 0
+    while checked < 20:
+        values = {"beta": rng.uniform(0.2, 1.3), "Omega": rng.uniform(0.4, 2), "zeta": rng.uniform(1e-3, 0.2)}
+        values |= {"alpha": rng.uniform(0.2, 5), "mu": rng.uniform(0.3, 5), "gamma": rng.uniform(1, 100)}
+        shaft = dt.Cardan(**values)
+        size = np.sort(np.abs(dt.floquet(shaft, outputs="floquet_multiplier").floquet_multiplier))
+        if min(1 - size[-3] / size[-1], max(1 - size[-2] / size[-1], 1e-3 * (size[-2] > size[-1] * (1 - 1e-9)))) < 1e-3:
+            continue
+        found = gradient(shaft)
+        for name, slope in differences(sharp, shaft, values, 1e-4).items():
+            assert getattr(found, name) == pytest.approx(slope, rel=1e-6, abs=1e-7 / values[name]), (values, name)
+        checked += 1
+
+
+DERIVATIVES = {
+    "floquet_exponent": (
+        lambda s: dt.floquet(s, outputs="floquet_exponent").floquet_exponent, TRIPOD, ("beta", "zeta", "chi_n"), 1e-7
+    ),
+    "floquet_multiplier": (
+        lambda s: jnp.abs(dt.floquet(s, outputs="floquet_multiplier").floquet_multiplier)[:2],
+        SHAFT, ("beta", "zeta", "mu"), 1e-6,
+    ),
+    "critical_speed": (
+        lambda s: dt.critical_speeds(s).critical_speed, CASES["bicardan critical_speeds"][1], ("k_A", "k_D"), 1e-7
+    ),
+    "natural_frequency": (
+        lambda s: dt.modes(s).natural_frequency[1:], dt.Planetary(), ("m_s", "k_p", "pressure_angle"), 1e-6
+    ),
+    "amplitude": (
+        lambda s: dt.forced(s, outputs=["amplitude"]).amplitude, replaced(SHAFT, "Omega", 1.0), ("beta", "mu"), 1e-5
+    ),
+    "u_max": (lambda s: dt.steady_state(s, outputs=["u_max"]).u_max, GEARS, ("omega", "B1", "b", "k"), 1e-7),
+    "phi": (lambda s: dt.history(s, times=(1e-4, 1e-3)).phi, TRIPOD, ("beta", "zeta"), 1e-6),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", DERIVATIVES)
+def test_derivatives_equal_differences(case):
+    function, system, names, rtol = DERIVATIVES[case]
+    # A narrow resonance asks for small steps.
+    step = 2e-4 if system is SHAFT else 1e-3
+    jacobian = jax.jit(jax.jacrev(function))(system)
+    for name, slope in differences(jax.jit(function), system, names, step).items():
+        found = np.asarray(getattr(jacobian, name))
+        np.testing.assert_allclose(found, slope, rtol=rtol, atol=rtol * np.abs(slope).max(), err_msg=name)
+
+
+def test_both_modes_agree():
+    check_grads(lambda s: dt.floquet(s).spectral_radius, (SHAFT,), order=1, modes=("fwd", "rev"), eps=1e-5)
+
+
+def test_where_there_is_no_derivative_there_is_none():
+    """All multipliers on the unit circle; a parameter that splits a pair; a result that has no derivative at all."""
+    undamped = dt.Cardan(beta=0.3, Omega=1.2, zeta=0.0, alpha=1.0, mu=1.0, gamma=100.0)
+    slopes = jax.jit(jax.grad(lambda s: dt.floquet(s).spectral_radius))(undamped)
+    assert all(np.isnan(x) for x in jax.tree.leaves(slopes))
+    gear = dt.Planetary(planet_angle=(0.0, 2 * np.pi / 3, 4 * np.pi / 3))
+    slopes = jax.jit(jax.jacrev(lambda s: dt.modes(s).natural_frequency[1:3]))(gear)
+    assert np.isnan(slopes.planet_angle[1]).all() and np.isfinite(slopes.k_p).all()
+    slope = jax.grad(lambda s: dt.frequency_response(s, method="describing_function").u_max[0])
+    assert np.isnan(slope(GEARS).B1)
+
+
+def test_errors_and_codes_count_as_constants():
+    slopes = jax.grad(lambda s: dt.floquet(s).spectral_radius + dt.floquet(s).spectral_radius_error)(SHAFT)
+    alone = jax.grad(lambda s: dt.floquet(s).spectral_radius)(SHAFT)
+    assert jax.tree.leaves(slopes) == jax.tree.leaves(alone)
+
+
+def calls_of_diffeqsolve(monkeypatch, scene) -> list[bool]:
+    """For every solver of a scene: whether the term that diffrax is given is batched by vmap."""
+    calls, original = [], diffrax.diffeqsolve
+
+    def watched(terms, *given, **more):
+        calls.append(any("Batch" in type(x).__name__ for x in jax.tree.leaves(terms)))
+        return original(terms, *given, **more)
+
+    monkeypatch.setattr(propagator.diffrax, "diffeqsolve", watched)
+    engine = Engine(load_scene(scene))
+    for solver in engine.solvers:
+        before = len(calls)
+        compile_kernel(solver, engine.grid, 16, result_variables(engine.scene), few=True)
+        assert len(calls) > before
+    return calls
+
+
+@pytest.mark.parametrize("analysis", ["floquet", "atlas"])
+def test_diffrax_under_vmap_is_the_engine(monkeypatch, analysis):
+    """Of charts, and of the nodes that an atlas solves directly."""
+    axes = {"beta": {"start": 0.1, "stop": 1.0}, "Omega": {"start": 0.5, "stop": 1.0}}
+    if analysis == "floquet":
+        axes = {name: axis | {"num": 8} for name, axis in axes.items()}
+        scene = {"system": "cardan", "analysis": "floquet", "axes": axes, "fixed": BASE}
+        assert all(calls_of_diffeqsolve(monkeypatch, scene))
+    else:
+        calls, original = [], diffrax.diffeqsolve
+        monkeypatch.setattr(propagator.diffrax, "diffeqsolve", lambda *a, **k: calls.append(1) or original(*a, **k))
+        fixed = BASE | {"mu": 1.2345}
+        dt.run({"system": "cardan", "analysis": "atlas", "axes": axes, "fixed": fixed})
+        assert calls
+
+
+def test_diffrax_under_vmap_is_the_engine_of_the_tripod(monkeypatch):
+    axes = {"beta": {"start": 0.1, "stop": 0.2, "num": 8}}
+    scene = {"system": "tripod", "analysis": "floquet", "axes": axes, "fixed": {"element": "input", "zeta": 0.01}}
+    assert calls_of_diffeqsolve(monkeypatch, scene)[0]
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: dt.Cardan(beta=17, Omega=1.4, **BASE), "beta = 17: allowed is -1.57"),
+        (lambda: dt.Cardan(beta=0.1, Omega=1.4), "zeta: missing; allowed is 0 <= zeta"),
+        (lambda: dt.Cardan(beta=np.array([0.1, 2.0]), Omega=1.4, **BASE), "beta = 2.0: allowed is"),
+        (lambda: dt.floquet(SHAFT, rtol=1.0), "rtol = 1.0: allowed is"),
+        (lambda: dt.floquet(SHAFT, rtoll=1e-9), "rtoll = 1e-09: not used by method auto"),
+        (lambda: dt.floquet(SHAFT, outputs="radius"), "outputs: 'radius' is not a result of floquet"),
+        (lambda: dt.modes(SHAFT), "modes: unknown to cardan; allowed is one of floquet, atlas, forced"),
+        (lambda: dt.floquet(3.0), "system: got a float; allowed is a system"),
+        (lambda: dt.floquet(replaced(SHAFT, "beta", jnp.ones(3))), r"parameters of the shape \(3,\)"),
+        (lambda: dt.history(dt.Tripod(element="input", beta=0.1, zeta=0.1, equation="26"), stop=1.0), "equation = '26'"),
+        (lambda: dt.sweep(dt.floquet, SHAFT, over={}), "over: empty"),
+        (lambda: dt.sweep(dt.floquet, SHAFT, over={"bet": [0.1]}), "bet: unknown parameter"),
+        (lambda: dt.sweep(dt.floquet, SHAFT, over={"beta": [[0.1]]}), r"over.beta: got an array of the shape \(1, 1\)"),
+        (lambda: dt.sweep(lambda p: p["a"], {"a": 1.0}, over={"b": [1.0]}), "over.b: unknown to a dict"),
+    ],
+)  # fmt: skip
+def test_wrong_input_is_one_line(call, message):
+    with pytest.raises(dt.InputError, match=message) as raised:
+        call()
+    assert "\n" not in str(raised.value)
+
+
+def test_any_function_is_swept_resumed_and_refused(tmp_path):
+    """Points that are not finite are data; another function is not taken for this one."""
+    out, pytree, over = tmp_path / "r.nc", {"a": 1.0, "b": 2.0}, {"a": [-1.0, 4.0, 9.0], "b": [1.0, 3.0]}
+
+    def one(factor):
+        def root(p):
+            return {
+                "root": factor * jnp.sqrt(p["a"]) * p["b"],
+                "both": jnp.stack([p["a"], p["b"]]),
+                "large": p["a"] > 5,
+            }
+
+        return root
+
+    found = dt.sweep(one(1.0), pytree, over=over, out=out)
+    assert found.root.dims == ("a", "b") and found.both.shape == (3, 2, 2)
+    np.testing.assert_allclose(found.root, np.sqrt([[np.nan], [4], [9]]) * [1, 3])
+    assert found.outcome.values.tolist() == [[4, 4], [0, 0], [0, 0]] and found.large.values[2].tolist() == [1, 1]
+    before = out.stat().st_mtime_ns
+    dt.sweep(one(1.0), pytree, over=over, out=out)
+    assert out.stat().st_mtime_ns == before
+    with pytest.raises(dt.InputError, match="another scene"):
+        dt.sweep(one(2.0), pytree, over=over, out=out)
+
+
+def test_a_chart_of_gradients():
+    def slope(shaft):
+        return jax.grad(lambda s: dt.floquet(s).spectral_radius)(shaft).zeta
+
+    chart = dt.sweep(slope, SHAFT, over={"Omega": [1.41, 1.416]})
+    assert float(chart.slope[1]) == pytest.approx(-4.592945, abs=1e-6)
+
+
+def test_who_embeds_the_package_may_keep_single_precision():
+    code = """
+import os
+os.environ["DRIVETRAIN_JAX_ENABLE_X64"] = "0"
+import jax, drivetrain_jax as dt
+gears = dt.Bicardan(**dt.Bicardan.presets["paper"])
+with jax.enable_x64(True):
+    assert dt.critical_speeds(gears).critical_speed.dtype == "float64"
+    chart = dt.sweep(dt.critical_speeds, gears, over={"k_A": [1e7, 1e8]})
+    assert chart.critical_speed.dtype == "float64" and (chart.outcome == 0).all()
+assert not jax.config.jax_enable_x64 and jax.numpy.ones(1).dtype == "float32"
+for call in (lambda: dt.critical_speeds(gears), lambda: dt.sweep(dt.critical_speeds, gears, over={"k_A": [1e7]})):
+    try:
+        call()
+    except dt.InputError as error:
+        assert "jax_enable_x64 = False" in str(error)
+    else:
+        raise AssertionError
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
