@@ -97,7 +97,7 @@ def analyse(name: str, system: System, outputs: Sequence[str] | None, options: M
 
 
 def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapping[str, Any]) -> tuple[_Job, Any]:
-    """What is asked, checked, and the numbers."""
+    """The checked call, and its numbers as arrays."""
     if not jax.config.jax_enable_x64:
         raise InputError("jax_enable_x64 = False: allowed is True, by jax.config.update or within jax.enable_x64(True)")
     if not isinstance(system, System):

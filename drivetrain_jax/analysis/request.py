@@ -1,4 +1,4 @@
-"""What is asked of an analysis, checked against what it and the system offer."""
+"""Outputs, method and options of an analysis, checked against those that it and the system offer."""
 
 from __future__ import annotations
 

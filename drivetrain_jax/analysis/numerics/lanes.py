@@ -82,7 +82,7 @@ def _padded(array: Array, lanes: int) -> Array:
 
 
 class Constants:
-    """What a traced function depends on besides its arrays: the leaves and the structure of ``tree``, to be compared."""
+    """A hashable pytree: the part of a traced function's arguments that is no array."""
 
     def __init__(self, tree: Any) -> None:
         self.tree = tree

@@ -9,6 +9,7 @@ rows of shape ``(n, lanes)`` and evaluates the entries of ``A`` at all stages of
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any, ClassVar, NamedTuple
@@ -77,7 +78,7 @@ class EqualSteps(diffrax.AbstractSolver):
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
     def order(self, terms: LinearPeriodic) -> int:
-        """What the errors fall with at least."""
+        """Order of the errors, for stiff problems too."""
         return self.ORDER
 
     def init(self, terms: LinearPeriodic, t0: Any, t1: Any, y0: Array, args: Any) -> _Record:
@@ -99,9 +100,9 @@ class EqualSteps(diffrax.AbstractSolver):
         y1 = y1.reshape(y0.shape)
         return y1, None, {"y0": y0, "y1": y1}, record, diffrax.RESULTS.successful
 
+    @abc.abstractmethod
     def piece(self, terms: LinearPeriodic, t0: Any, t1: Any) -> tuple[Array, Array]:
         """The propagator from t0 to t1 as a matrix ``(n, n)`` and the logarithm of its factor."""
-        raise NotImplementedError
 
 
 def _unwrapped(terms: Any) -> tuple[LinearPeriodic, Any]:
