@@ -87,7 +87,7 @@ def kernel_job(scene: Mapping[str, Any], width: int | None = None) -> tuple[Any,
     size = width or chunk.size
     kernel = kernel_of(engine.scene, engine.grid, engine.solvers[chunk.solver], size)
     columns = engine.grid.columns(np.resize(chunk.points, size))
-    return lambda: kernel(columns, chunk.effort), size
+    return lambda: kernel(columns, engine.grid.numbers, chunk.effort), size
 
 
 def rate_row(what: str, system: str, number: int, per_s: float, how: str, peak: float = float("nan")) -> dict[str, Any]:

@@ -39,7 +39,7 @@ def engine_job(scene: Mapping[str, Any], threads: int = 1) -> Callable[[], Resul
         kernels = {group.index: kernel_of(engine.scene, grid, group.solver, group.chunk) for group in plan.groups}
 
     def work(chunk: Any) -> Mapping[str, np.ndarray]:
-        return kernels[chunk.solver](grid.columns(chunk.points), chunk.effort)
+        return kernels[chunk.solver](grid.columns(chunk.points), grid.numbers, chunk.effort)
 
     def job() -> Results:
         found: Results = {}

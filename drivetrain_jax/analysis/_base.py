@@ -104,7 +104,7 @@ def forward_derivatives(
     return {name: stacked(jacobian) for name, jacobian in jacobians.items()}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Analysis:
     """Named results and how to get them.
 

@@ -108,7 +108,7 @@ class Engine:
         self.prepare({(chunk.solver, chunk.size)})
         try:
             kernel = self._kernels[chunk.solver, chunk.size].result()
-            return kernel(self.grid.columns(chunk.points), chunk.effort)
+            return kernel(self.grid.columns(chunk.points), self.grid.numbers, chunk.effort)
         except Exception as error:
             solver = self.solvers[chunk.solver].name
             kind = Passing if _may_pass(error) else ChunkError

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -81,9 +82,18 @@ class Grid:
             return {axis.name: axis.values[points] for axis in self.axes}
         return {axis.name: axis.values[i] for axis, i in zip(self.axes, self.place(points), strict=False)}
 
-    def bind(self, columns: Mapping[str, Any]) -> dict[str, Any]:
-        """All parameters of the model: the fixed ones, ``columns`` of the varying ones, and the path as a whole."""
-        values: dict[str, Any] = dict(self.fixed)
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """The fixed parameters of the model that are real numbers, or lists of them."""
+        own = {name: self.fixed[name] for name in self.parameters if name in self.fixed}
+        return {name: value for name, value in own.items() if value != () and _is_real(value)}
+
+    def bind(self, columns: Mapping[str, Any], numbers: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
+        """All parameters of the model: the fixed ones, ``columns`` of the varying ones, and the path as a whole.
+
+        ``numbers`` replace fixed ones.
+        """
+        values: dict[str, Any] = {**self.fixed, **numbers}
         varying = [(axis, columns[axis.name]) for axis in self.axes]
         if self.path is not None:
             varying.append((self.path, self.path.values))
@@ -105,3 +115,7 @@ class Grid:
             return tuple(self._spread(entry, shape) for entry in value)
         whole = isinstance(value, str) or (self.path is not None and value is self.path.values)
         return value if whole else np.broadcast_to(value, shape)
+
+
+def _is_real(value: Value) -> bool:
+    return all(map(_is_real, value)) if isinstance(value, tuple) else isinstance(value, float)

@@ -15,12 +15,16 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._quantities import Variable
-from drivetrain_jax.analysis import Solver
+from drivetrain_jax.analysis import Analysis, Solver
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, on_cpu, options_for_few
+from drivetrain_jax.runs import compile_cache
 from drivetrain_jax.runs.assemble import result_variables
 from drivetrain_jax.runs.grid import Grid
+from drivetrain_jax.runs.identity import is_of_package, numerics_of
 from drivetrain_jax.runs.plan import make_plan
 from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.store.provenance import digest
+from drivetrain_jax.systems import System
 
 _LAPACK = threading.Lock()
 # A scene of so few points with so little predicted work, in the units of a plan, is computed in less time than it takes
@@ -39,13 +43,21 @@ class Kernel:
     variables: tuple[Variable, ...]
     turn: AbstractContextManager[object]
 
-    def __call__(self, columns: Mapping[str, np.ndarray], effort: int) -> dict[str, np.ndarray]:
-        """Results of up to ``chunk`` points, the points as first axis; a short chunk is padded with its last point."""
+    def __call__(
+        self, columns: Mapping[str, np.ndarray], numbers: Mapping[str, Any], effort: int
+    ) -> dict[str, np.ndarray]:
+        """Results of up to ``chunk`` points with the fixed ``numbers``, the points as first axis.
+
+        A short chunk is padded with its last point.
+        """
         count = len(next(iter(columns.values()))) if columns else self.chunk
         if count < self.chunk:
             columns = {name: np.pad(values, (0, self.chunk - count), mode="edge") for name, values in columns.items()}
         with self.turn:
-            results = {name: np.asarray(value) for name, value in self.compiled(columns, np.int64(effort)).items()}
+            results = {
+                name: np.asarray(value)
+                for name, value in self.compiled(columns, _arrays(numbers), np.int64(effort)).items()
+            }
         arrays = {}
         for variable in self.variables:
             values = results[variable.name]
@@ -56,36 +68,41 @@ class Kernel:
 
 def _batch(
     solver: Solver, grid: Grid, chunk: int, variables: Sequence[Variable]
-) -> tuple[Callable[..., dict[str, Array]], dict[str, jax.ShapeDtypeStruct]]:
-    """The function of a whole chunk, and the kinds of its varying parameters."""
+) -> tuple[Callable[..., dict[str, Array]], tuple[Any, ...]]:
+    """The function of a whole chunk, and the kinds of its arguments: varying parameters, fixed numbers, effort."""
     own = {v.name: len(v.dims) + (grid.path is not None) for v in variables}
 
-    def batch(columns: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+    def batch(columns: Mapping[str, Any], numbers: Mapping[str, Any], effort: Array) -> dict[str, Array]:
         # A result that depends on nothing that varies comes without lanes.
-        solved = solver.solve(grid.bind(columns), effort)
+        solved = solver.solve(grid.bind(columns, numbers), effort)
         results = {name: jnp.asarray(value) for name, value in solved.items()}
         spread = {n: v if v.ndim > own[n] else v[..., None] for n, v in results.items()}
         return {n: jnp.broadcast_to(v, (*v.shape[:-1], chunk)) for n, v in spread.items()}
 
     columns = {axis.name: jax.ShapeDtypeStruct((chunk,), axis.values.dtype) for axis in grid.axes}
-    return batch, columns
+    return batch, (columns, _arrays(grid.numbers), jax.ShapeDtypeStruct((), np.int64))
+
+
+def _arrays(numbers: Mapping[str, Any]) -> dict[str, Any]:
+    return jax.tree.map(np.float64, dict(numbers))
 
 
 def result_shapes(scene: Scene, grid: Grid, solver: Solver) -> dict[str, tuple[int, ...]]:
     """The shape of every result at one point (or line); nothing is compiled or computed."""
     variables = result_variables(scene)
-    batch, columns = _batch(solver, grid, 1, variables)
-    shapes = jax.eval_shape(batch, columns, jax.ShapeDtypeStruct((), np.int64))
+    batch, kinds = _batch(solver, grid, 1, variables)
+    shapes = jax.eval_shape(batch, *kinds)
     return {v.name: shapes[v.name].shape[:-1] for v in variables}
 
 
 def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[Variable], few: bool = False) -> Kernel:
     """Compile ``solver`` for chunks of ``chunk`` points of ``grid``, for ``few`` of them in all without optimising.
 
-    Fixed parameters are constants of the compiled code; the varying ones and the effort are its arguments.
+    All numbers are arguments of the compiled code, those along a path apart. Words, whole numbers, lengths of lists and
+    options are constants of it.
     """
-    batch, columns = _batch(solver, grid, chunk, variables)
-    lowered = jax.jit(batch).lower(columns, jax.ShapeDtypeStruct((), np.int64))
+    batch, kinds = _batch(solver, grid, chunk, variables)
+    lowered = jax.jit(batch).lower(*kinds)
     options = compiler_options(chunk, march=solver.march, short_loops=solver.short_loops)
     compiled = lowered.compile(options_for_few() if few else options)
     return Kernel(compiled, chunk, tuple(variables), _turn(compiled))
@@ -105,37 +122,52 @@ def is_small(grid: Grid, solvers: Sequence[Solver]) -> bool:
 class _Job:
     """What a kernel is compiled for; two jobs are equal if one kernel of a size serves both."""
 
-    identity: tuple[Any, ...]
+    system: System
+    analysis: Analysis
+    structure: tuple[Any, ...]
     scene: Scene = field(compare=False)
     grid: Grid = field(compare=False)
     solver: Solver = field(compare=False)
 
+    def key(self, size: int, few: bool) -> str | None:
+        """The name under which the kernel is kept on disk; None if the sources of its code are not known."""
+        if not is_of_package(self.scene):
+            return None
+        names = self.system.name, self.analysis.name
+        return digest([numerics_of(self.scene), names, repr(self.structure), size, few])
+
 
 def kernel_of(scene: Scene, grid: Grid, solver: Solver, size: int, few: bool = False) -> Kernel:
-    """The kernel of ``solver`` for chunks of ``size`` points of ``scene``, made if no scene before needed the same; ``few``
-    see :func:`compile_kernel`."""
+    """The kernel of ``solver`` for chunks of ``size`` points of ``scene``, made if no scene before needed the same.
+
+    For ``few`` see :func:`compile_kernel`.
+    """
     # What varies is an argument of the kernel, so one value of each axis is enough to keep.
     axes = tuple(replace(axis, values=axis.values[:1]) for axis in grid.axes)
-    request = scene.request
-    path = None if grid.path is None else (grid.path.name, grid.path.values.tobytes())
-    identity = (
-        # The job keeps both alive, so that no other ones can take over their identities.
-        id(scene.system),
-        id(scene.analysis),
+    request, numbers = scene.request, grid.numbers
+    structure = (
         request.outputs,
         request.method,
         tuple(request.options.items()),
-        tuple(scene.fixed.items()),
-        tuple((axis.name, axis.values.dtype) for axis in axes),
-        path,
+        str(jax.tree.structure(numbers)),
+        tuple((name, value) for name, value in scene.fixed.items() if name not in numbers),
+        tuple((axis.name, str(axis.values.dtype)) for axis in axes),
+        None if grid.path is None else (grid.path.name, grid.path.values.tobytes()),
         solver.name,
     )
-    return _compiled(_Job(identity, replace(scene, axes=axes), replace(grid, axes=axes), solver), size, few)
+    job = _Job(scene.system, scene.analysis, structure, replace(scene, axes=axes), replace(grid, axes=axes), solver)
+    return _compiled(job, size, few)
 
 
 @lru_cache(maxsize=64)
 def _compiled(job: _Job, size: int, few: bool) -> Kernel:
-    return compile_kernel(job.solver, job.grid, size, result_variables(job.scene), few)
+    variables, key = result_variables(job.scene), job.key(size, few)
+    if key and (compiled := compile_cache.load(key)):
+        return Kernel(compiled, size, tuple(variables), _turn(compiled))
+    kernel = compile_kernel(job.solver, job.grid, size, variables, few)
+    if key:
+        compile_cache.keep(key, kernel.compiled)
+    return kernel
 
 
 def _turn(compiled: Any) -> AbstractContextManager[object]:

@@ -27,6 +27,7 @@ _MAX_EFFORT = 2**31 - 1
 # Small scenes are cut into at least this many chunks per solver. It is not the number of cores: bits must not depend
 # on that.
 _MIN_CHUNKS = 2
+# Points of the smallest chunk of more than one point.
 _LANES = 16
 
 
@@ -173,18 +174,23 @@ class _Tally:
 
     def group(self, index: int, full_size: bool) -> Group:
         """The chunks of all blocks."""
-        size = chunk_size(self._solver.chunk, self.count) if self._few and not full_size else self._solver.chunk
+        size = self._solver.chunk
+        if self._few and not full_size:
+            size = chunk_size(size, self.count, self._solver.lengthy)
         efforts = [block[::size] for block in self._efforts] if self._few else self._efforts
         firsts = np.cumsum([0, *map(len, efforts)])
         return Group(index, self._solver, self.count, np.concatenate(efforts), firsts, size)
 
 
-def chunk_size(largest: int, count: int) -> int:
-    """Points per chunk for ``count`` points, at most ``largest``; fewer in small scenes, to give all cores work."""
-    if count <= _LANES:
-        return min(largest, 1 << (count - 1).bit_length())
-    share = -(-count // _MIN_CHUNKS)
-    return min(largest, -(-share // _LANES) * _LANES)
+def chunk_size(largest: int, count: int, lengthy: bool = False) -> int:
+    """Points per chunk for ``count`` points, at most ``largest``; fewer in small scenes, to give all cores work.
+
+    Sizes are few, so that another count seldom needs another kernel: 1, 16 and further powers of two. Points that are
+    ``lengthy`` are not padded to 16.
+    """
+    share = count if count <= _LANES else -(-count // _MIN_CHUNKS)
+    least = 1 if lengthy or count == 1 else _LANES
+    return min(largest, max(least, 1 << (share - 1).bit_length()))
 
 
 def make_plan(

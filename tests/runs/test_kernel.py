@@ -173,3 +173,32 @@ def test_scenes_of_few_points_are_compiled_without_optimising(monkeypatch):
         assert all(future.result() for future in engine._kernels.values())
         kernel._compiled.cache_clear()
     assert given == [True, False, False, False, False]
+
+
+def test_other_numbers_compile_nothing():
+    dt.run(chart("direct"))
+    before = kernel._compiled.cache_info().misses
+    other = chart("direct") | {"fixed": {"mu": 2.0, "alpha": 1.5, "zeta": 0.002, "gamma": 3.0}}
+    found = dt.run(other)
+    assert kernel._compiled.cache_info().misses == before
+    beta, omega = float(found.beta[7]), float(found.Omega[11])
+    point = dt.point("cardan", "floquet", beta=beta, Omega=omega, **other["fixed"])
+    assert float(found.spectral_radius[7, 11]) == pytest.approx(point["spectral_radius"].item(), rel=1e-9)
+
+
+def test_a_kernel_is_kept_whole_and_a_damaged_one_is_made_anew(tmp_path, monkeypatch):
+    folder = tmp_path / "kept"
+    monkeypatch.setattr(kernel.compile_cache, "_path", lambda key: folder / key)
+    made = []
+    real = kernel.compile_kernel
+    monkeypatch.setattr(kernel, "compile_kernel", lambda *of: made.append(of) or real(*of))
+    results = []
+    for damage in (None, None, b"x"):
+        if damage:
+            (file,) = folder.iterdir()
+            file.write_bytes(file.read_bytes()[:-1] + damage)
+        kernel._compiled.cache_clear()
+        results.append(dt.run(GEARS))
+    kernel._compiled.cache_clear()
+    assert len(made) == 2
+    assert results[0].equals(results[1]) and results[0].equals(results[2])

@@ -110,10 +110,15 @@ def test_absurd_efforts(effort, planned):
 
 @pytest.mark.parametrize(
     ("largest", "count", "expected"),
-    [(256, 1, 1), (256, 3, 4), (256, 16, 16), (256, 17, 16), (256, 100, 64), (256, 1000, 256), (8, 1000, 8), (1, 5, 1)],
+    [(256, 1, 1), (256, 3, 16), (256, 16, 16), (256, 17, 16), (256, 70, 64), (256, 1000, 256), (8, 1000, 8), (1, 5, 1)],
 )
 def test_chunk_size(largest, count, expected):
     assert chunk_size(largest, count) == expected
+
+
+@pytest.mark.parametrize(("count", "expected"), [(1, 1), (3, 4), (16, 16), (17, 16), (33, 32)])
+def test_lengthy_points_are_not_padded_to_a_whole_chunk(count, expected):
+    assert chunk_size(256, count, lengthy=True) == expected
 
 
 def test_grid_numbers_points_in_c_order():
