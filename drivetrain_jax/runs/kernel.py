@@ -115,7 +115,7 @@ def for_device(solver: Solver) -> Solver:
 
 def is_small(grid: Grid, solvers: Sequence[Solver]) -> bool:
     """Whether kernels are not worth optimising: by the whole grid, whatever part of it is computed where."""
-    return grid.size * grid.path_length <= _FEW and make_plan(solvers, grid).costs.sum() <= _LIGHT
+    return bool(grid.size * grid.path_length <= _FEW and make_plan(solvers, grid).costs.sum() <= _LIGHT)
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import diffrax
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis._base import Outcome, Request, Solver
-from drivetrain_jax.analysis.numerics.lanes import over_lanes
+from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last, over_lanes
 from drivetrain_jax.analysis.periodic.direct import compare, direct_monodromy, stable_steps, stiffness_of
 from drivetrain_jax.analysis.periodic.floquet_effort import explicit_effort, traced_steps
 from drivetrain_jax.analysis.periodic.floquet_results import NEED_ERROR, results
@@ -44,7 +46,7 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
 
         def propagate(steps: Array, _: Array) -> Propagator:
             def one(own: Mapping[str, Any], steps: Array) -> Propagator:
-                return diffrax_propagator(build(own).reduced, solver, stepsize_controller=EqualStepSize(steps))[0]
+                return equal_step_propagator(build(own).reduced, solver, steps)
 
             return over_lanes(one)(values, steps)
 
@@ -61,7 +63,7 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
         order = solver.order(diffrax.ODETerm(lambda t, y, args: y))
         return (rtol ** (1 / 8 - 1 / order) * traced_steps(build, values, rtol)).astype(jnp.int64)
 
-    return (Solver(f"diffrax: {request.options['solver']}, equal steps", solve, effort, steps, chunk=256),)
+    return (Solver(f"diffrax: {request.options['solver']}, equal steps", solve, effort, steps, chunk=256, march=True),)
 
 
 def adaptive_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
@@ -92,6 +94,56 @@ def adaptive_steps(system: type[System], request: Request) -> tuple[Solver, ...]
 
     name = f"diffrax: {request.options['solver']}, {request.options['form']}, adaptive steps"
     return (Solver(name, over_lanes(solve), effort, chunk=256),)
+
+
+class _UnitClock(diffrax.AbstractTerm):
+    """``form`` with its span as the unit of time, so that lanes of different spans share a clock."""
+
+    form: LinearPeriodic
+
+    def vf(self, t: Any, y: Any, args: Any) -> Array:
+        return self.form.span * self.form.vf(self.form.span * t, y, args)
+
+    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
+        return self.form.contr(t0, t1, **kwargs)
+
+    def prod(self, vf: Any, control: Any) -> Any:
+        return vf * control
+
+
+def equal_step_propagator(form: LinearPeriodic, solver: diffrax.AbstractSolver, steps: Array) -> Propagator:
+    """The propagator of one point by ``steps`` equal steps.
+
+    Under ``jax.vmap`` the lanes are the last axis of a single state, which halves the time of ``solver``.
+    """
+    arrays, rest = eqx.partition(LinearPeriodic(form.rows, form.span, form.basis), eqx.is_array)
+    if isinstance(form.rows, eqx.Module | jax.tree_util.Partial):
+        matrix = lanes_last(_integrated, Constants((rest, solver)), arrays, steps)
+    else:
+        # Nothing is known of the arrays that another function may depend on.
+        matrix = _integrated(Constants((rest, solver)), arrays, steps)[..., 0]
+    return Propagator(matrix, jnp.zeros(()), jnp.ones(()))
+
+
+def _integrated(constants: Constants, arrays: LinearPeriodic, steps: Array) -> Array:
+    rest, solver = constants.tree
+    form = eqx.combine(arrays, rest)
+    lanes = max((np.shape(x)[-1] for x in jax.tree.leaves(arrays) if np.ndim(x)), default=1)
+    start = jnp.broadcast_to(jnp.eye(form.size)[..., None], (form.size, form.size, lanes))
+    solution = diffrax.diffeqsolve(
+        _UnitClock(form),
+        solver,
+        t0=0.0,
+        t1=1.0,
+        dt0=None,
+        y0=start,
+        stepsize_controller=EqualStepSize(steps),
+        saveat=diffrax.SaveAt(t1=True),
+        adjoint=diffrax.ForwardMode(),
+        max_steps=None,
+        throw=False,
+    )
+    return solution.ys[-1]
 
 
 def diffrax_propagator(
