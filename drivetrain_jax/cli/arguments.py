@@ -206,7 +206,7 @@ def _add_given(command: argparse.ArgumentParser, text: str) -> None:
 
 
 def _add_scene(command: argparse.ArgumentParser) -> None:
-    command.add_argument("scene", metavar="SCENE.toml", type=_path, help="`drivetrain list` names some")
+    command.add_argument("scene", metavar="SCENE.toml", type=_path, help="scene file, or a name of `drivetrain list`")
     command.add_argument("--out", required=True, metavar="FILE.nc", type=_path, help="result file")
     command.add_argument(
         "--set",

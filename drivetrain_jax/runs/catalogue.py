@@ -5,11 +5,11 @@ from __future__ import annotations
 import tomllib
 from pathlib import Path
 
-import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter, Variable
 from drivetrain_jax._wording import aligned, written
 from drivetrain_jax.analysis import get_analysis
+from drivetrain_jax.runs import shipped
 from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.runs.toml import entries
 from drivetrain_jax.systems import System, system_names
@@ -78,15 +78,21 @@ def _variable_row(variable: Variable, default: bool) -> tuple[str, ...]:
 
 
 def _scene_lines(system: System | None) -> list[str]:
-    """Scene files in ``sweeps/`` of the working folder, or of the checkout that the package is installed from."""
-    folders = (Path("sweeps"), Path(drivetrain_jax.__file__).parents[1] / "sweeps")
-    folder = next((f for f in folders if f.is_dir()), None)
+    """Scenes that the package brings, by name, and files of another ``sweeps/`` in the working folder."""
+    here = Path("sweeps")
+    lines = _rows("Scenes (drivetrain run NAME computes one)", shipped.FOLDER, "{0.stem}", system)
+    if here.is_dir() and not here.samefile(shipped.FOLDER):
+        lines += _rows("Scenes of this folder", here, "{0}", system)
+    return lines
+
+
+def _rows(heading: str, folder: Path, named: str, system: System | None) -> list[str]:
     rows = []
-    for path in sorted(folder.glob("*.toml")) if folder else ():
+    for path in sorted(folder.glob("*.toml")):
         try:
             content = tomllib.loads(path.read_text("utf-8"))
         except (OSError, ValueError, RecursionError):
             continue
         if system is None or content.get("system") == system.name:
-            rows.append((f"{folder.name}/{path.name}", str(content.get("title", ""))))
-    return ["", "Scenes", *aligned(rows)] if rows else []
+            rows.append((named.format(path), str(content.get("title", ""))))
+    return ["", heading, *aligned(rows)] if rows else []

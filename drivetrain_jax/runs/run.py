@@ -62,7 +62,8 @@ def run(
     work is kept in ``FILE.nc.parts/`` and taken up by the next call, and a complete result is only read. A Zarr store is for
     results that are too large to be returned, and so the command line's: ``drivetrain run --store zarr``.
 
-    :param scene: path of a scene file, a mapping with the same keys, or a checked scene.
+    :param scene: path of a scene file, name of one that the package brings, a mapping with the same keys, or a checked
+        scene.
     :param overrides: entries to replace, by dotted key: ``{"fixed.zeta": 0.002}``.
     :param fresh: compute everything anew: replace a result, or drop unfinished work, at ``out``. One that was interrupted is
         resumed by the same call.

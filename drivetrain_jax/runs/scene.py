@@ -63,8 +63,9 @@ class _SceneTable(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Scene:
-    """Read and check a scene: a path, or a mapping with the same keys. ``overrides``: see :func:`toml.read`.
+    """Read and check a scene: a path, a name of `drivetrain list`, or a mapping with the same keys.
 
+    ``overrides``: see :func:`toml.read`.
     Raises :class:`InputError` with one line that names the field, what was given and what is allowed.
     """
     tree, text = toml.read(source, overrides)

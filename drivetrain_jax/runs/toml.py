@@ -15,6 +15,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import shown
+from drivetrain_jax.runs import shipped
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 # What no attribute of a result can hold.
@@ -28,8 +29,8 @@ def read(
 ) -> tuple[dict[str, Any], str]:
     """The tables of a scene and its TOML text.
 
-    ``source`` is a path or a mapping. ``overrides`` replaces single entries, for example ``{"fixed.zeta": 0.002}``;
-    the text then is that of the changed scene.
+    ``source`` is a path, the name of a scene that the package brings, or a mapping. ``overrides`` replaces single
+    entries, for example ``{"fixed.zeta": 0.002}``; the text then is that of the changed scene.
     """
     try:
         return _read(source, overrides)
@@ -100,13 +101,13 @@ def _check(value: Any, field: str) -> None:
 def _text(path: Path) -> str:
     try:
         # Editors on Windows put a byte order mark first.
-        return path.read_bytes().decode("utf-8-sig")
+        return shipped.scene_file(path).read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"scene = {str(path)!r}: not a text file in UTF-8") from None
     except ValueError:
         raise InputError(f"scene = {str(path)!r}: not a path; give the path of a scene file") from None
     except OSError as error:
-        raise InputError(f"scene = {str(path)!r}: {error.strerror}; give the path of a scene file") from None
+        raise InputError(f"scene = {str(path)!r}: {error.strerror}; {shipped.remedy(path)}") from None
 
 
 def _replace(tree: dict[str, Any], key: str, value: Any) -> None:

@@ -1,0 +1,26 @@
+"""Scenes that the package brings, by name: ``quickstart`` is ``sweeps/quickstart.toml``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import drivetrain_jax
+from drivetrain_jax._wording import did_you_mean
+
+# In a checkout a link to the folder at its top; the wheel holds the files.
+FOLDER = Path(drivetrain_jax.__file__).parent / "sweeps"
+
+
+def names() -> list[str]:
+    """Names of these scenes, sorted."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def scene_file(source: Path) -> Path:
+    """The packaged file if ``source`` is the name of a scene and no file here is called so, else ``source``."""
+    return FOLDER / f"{source}.toml" if str(source) in names() and not source.is_file() else source
+
+
+def remedy(source: Path) -> str:
+    """Advice to somebody who gave ``source``, which cannot be read."""
+    return f"give the path of a scene file, or a name of `drivetrain list`{did_you_mean(str(source), names())}"
