@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
+# `make test CONSTRAINTS=` in a new checkout takes the newest versions instead.
+CONSTRAINTS ?= constraints.txt
+PIP_INSTALL := $(BIN)/python -m pip install --quiet $(addprefix -c ,$(CONSTRAINTS))
 
 .PHONY: atlas test validate faults lint bench validation gallery docs help clean
 
@@ -20,9 +23,10 @@ validate: $(VENV)/installed-test  ## the comparisons at full size
 faults: $(VENV)/installed-test  ## real faults at random moments; writes the table of docs/reliability.md
 	$(BIN)/python tests/faults/suite.py
 
-lint: $(VENV)/installed-test  ## style, formatting, directions of imports
+lint: $(VENV)/installed-test  ## style, formatting, spelling, directions of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
 	$(BIN)/lint-imports
 
 bench: $(VENV)/installed-bench  ## error against run time, with the peers; writes benchmarks/results/, docs/benchmarks.md and the figures of README.md
@@ -41,20 +45,20 @@ docs: $(VENV)/installed-docs  ## the documentation site, in out/docs/html: no wa
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/installed: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e .
+$(VENV)/installed: pyproject.toml $(CONSTRAINTS) | $(VENV)/bin/python
+	$(PIP_INSTALL) -e .
 	@touch $@
 
 $(VENV)/installed-test: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test]'
+	$(PIP_INSTALL) -e '.[test]'
 	@touch $@
 
 $(VENV)/installed-bench: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[bench]'
+	$(PIP_INSTALL) -e '.[bench]'
 	@touch $@
 
 $(VENV)/installed-docs: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
+	$(PIP_INSTALL) -e '.[docs]'
 	@touch $@
 
 help:  ## this list
