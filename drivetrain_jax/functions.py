@@ -190,9 +190,29 @@ def _tangent(name: str, result: Array, jacobians: Mapping[str, Array], direction
     if not jnp.issubdtype(result.dtype, jnp.inexact):
         return np.zeros(result.shape, jax.dtypes.float0)
     if name in jacobians:
-        return jnp.asarray(jacobians[name], result.dtype) @ direction.astype(result.dtype)
+        jacobian = jnp.asarray(jacobians[name], result.dtype).reshape(result.size, direction.size)
+        return _product(jacobian, direction.astype(result.dtype)).reshape(result.shape)
     unknown = 0.0 if name.endswith(("_error", "_residual")) else jnp.nan
     return jnp.full(result.shape, unknown, result.dtype) * jnp.sum(direction)
+
+
+def _product(jacobian: Array, direction: Array) -> Array:
+    """``jacobian @ direction``, in which zeros win against NaN, also transposed: NaN stays with its result and parameter.
+
+    The product is the solution x of ``x = (jacobian @ direction, direction)``, for which jax takes a transpose as given.
+    """
+    count = len(jacobian)
+
+    def times(matrix: Array, vector: Array) -> Array:
+        return jnp.sum(jnp.where(vector == 0, 0.0, matrix * vector), axis=1)
+
+    solution = jax.lax.custom_linear_solve(
+        lambda x: x.at[:count].add(-jacobian @ x[count:]),
+        jnp.pad(direction, (count, 0)),
+        lambda _, b: b.at[:count].add(times(jacobian, b[count:])),
+        lambda _, b: b.at[count:].add(times(jacobian.T, b[:count])),
+    )
+    return solution[:count]
 
 
 def _solve(job: _Job, index: int, parameters: Any, effort: Array | None) -> dict[str, Array]:

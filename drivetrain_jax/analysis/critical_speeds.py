@@ -9,8 +9,6 @@ Modes are numbered by frequency and are not followed along an axis: the frequenc
 separated ends are simple (only where a hinge lies on a rigid support, or nearly, do they meet), so curves of equal
 number do not cross and following them would give the same curves.
 
-Derivatives of the frequencies: :func:`angular_frequencies`.
-
 Outcome: ``NOT_FINITE`` where parameters give no finite equations, ``NOT_CONVERGED`` where a frequency was not found
 (NaN), ``TOLERANCE_NOT_MET`` where a root of ``krylov_determinant`` is not certified.
 """
@@ -30,16 +28,14 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver, stacked
+from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.analysis.shafts import krylov as shaft_krylov
 from drivetrain_jax.analysis.shafts import roots as shaft_roots
 from drivetrain_jax.analysis.shafts.mechanisms import mechanism_shapes, zero_modes
-from drivetrain_jax.analysis.shafts.roots import Roots, angular_frequencies
+from drivetrain_jax.analysis.shafts.roots import Roots, frequency_derivatives
 from drivetrain_jax.analysis.shafts.shapes import mode_shapes, normalised
 from drivetrain_jax.systems import Shaft, System
-
-__all__ = ["ANALYSIS", "angular_frequencies", "separation_margin"]
 
 VARIABLES = (
     Variable("natural_frequency", "Hz", "natural frequency", ("mode",)),
@@ -61,6 +57,8 @@ OPTIONS = (
     Parameter("operating_max", "rpm", "highest operating speed (0: not given)", default=0.0, lower=0.0),
 )
 _OPTION_NAMES = tuple(option.name for option in OPTIONS)
+# Per rad/s.
+_UNITS = {"angular_frequency": 1.0, "natural_frequency": 1 / (2 * math.pi), "critical_speed": 30 / math.pi}
 # What the paper's method knows nothing of.
 _ADDITIONS = ("k_joint", "m_A", "m_D", "m_joint", "k_hinge", "kGA", "rhoI")
 # Roots of all modes of a chunk together: they stay in the cache.
@@ -125,9 +123,7 @@ def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Ar
     missing, doubtful = jnp.any(jnp.isnan(roots.q), axis=0), ~jnp.all(roots.certified, axis=0)
     outcome = jnp.where(missing, Outcome.NOT_CONVERGED, jnp.where(doubtful, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS))
     results = {
-        "angular_frequency": p,
-        "natural_frequency": p / (2 * math.pi),
-        "critical_speed": p * (30 / math.pi),
+        **{name: p * unit for name, unit in _UNITS.items()},
         "count_certified": roots.certified.astype(jnp.int8),
         "outcome": jnp.where(finite, outcome, Outcome.NOT_FINITE).astype(jnp.int8),
     }
@@ -155,18 +151,21 @@ def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
 def _derivatives(
     system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Jacobians of all frequencies, by one evaluation of the characteristic function for each parameter."""
-    build, options = system.models["critical_speeds"].build, request.options
+    """Jacobians of all frequencies and of the separation margin."""
+    options = request.options
 
-    def frequencies(parameters: Any) -> dict[str, Array]:
-        p = angular_frequencies(build(eqx.combine(parameters, constants.tree)), options["modes"])
-        found = {"angular_frequency": p, "natural_frequency": p / (2 * math.pi), "critical_speed": p * (30 / math.pi)}
-        if "separation_margin" in results:
-            low, high = options["operating_min"], options["operating_max"]
-            found["separation_margin"] = separation_margin(found["critical_speed"], low, high)
-        return found
+    def build(parameters: Any) -> Shaft:
+        return system.models["critical_speeds"].build(eqx.combine(parameters, constants.tree))
 
-    return {name: stacked(x) for name, x in jax.jacfwd(frequencies)(parameters).items()}
+    known = [results[name] / unit for name, unit in _UNITS.items() if name in results and request.method == "certified"]
+    q = jnp.sqrt(known[0]) if known else shaft_roots.find_roots(build(parameters), options["modes"]).q
+    slope = frequency_derivatives(build, parameters, q)
+    found = {name: slope * unit for name, unit in _UNITS.items()}
+    if "separation_margin" in results:
+        low, high = options["operating_min"], options["operating_max"]
+        margin = jax.vmap(jax.grad(lambda speed: separation_margin(speed, low, high)))
+        found["separation_margin"] = margin(q**2 * _UNITS["critical_speed"])[:, None] * found["critical_speed"]
+    return found
 
 
 ANALYSIS = Analysis(

@@ -21,13 +21,14 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver, stacked
 from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lane_count, path_entry, with_path
 from drivetrain_jax.analysis.numerics.singular_values import EPS, Bidiagonal, bidiagonal_form, bidiagonal_values
 from drivetrain_jax.analysis.spectra.mode_types import (
     MODE_TYPES,
     BlockModes,
     block_modes,
+    is_rigid,
     mode_types,
     one_frequency,
 )
@@ -265,18 +266,44 @@ def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> t
     )
 
 
+# Rounding of derivatives within a cluster: relative to these, and to the largest of all modes.
+_ROUNDING, _OF_LARGEST = 1e-8, 1e-13
+
+
 def _derivatives(
     system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Jacobian of the frequencies; NaN where a parameter splits frequencies that are equal."""
-    from drivetrain_jax.analysis.spectra.mode_gradients import frequency_jacobian
+    """Jacobian of the frequencies, ``df = u^T (dK - (2 pi f)^2 dM) u / (8 pi^2 f)`` with modes u of unit modal mass.
 
+    It is formed spring by spring, without a stiffness matrix. A parameter splits equal frequencies along the eigenvalues of
+    ``u_i^T (dK - (2 pi f)^2 dM) u_j``, and sets a rigid mode in motion as sqrt(k): NaN in both cases.
+    """
     del request, results
 
     def model(parameters: Any) -> SpringSystem:
         return system.models["modes"].build(eqx.combine(parameters, constants.tree))
 
-    return {"natural_frequency": frequency_jacobian(model, parameters)}
+    here = model(parameters)
+    modes, largest = system_modes(here, "auto", 1), largest_frequency(here, 1)
+    near, still = one_frequency(modes.frequency, largest)[..., 0], is_rigid(modes.frequency, largest)
+    omega = jnp.where(modes.found, modes.frequency, jnp.nan)[:, 0]
+    shapes = modes.vectors[..., 0] / jnp.sqrt(here.mass)[:, None]
+
+    def excess(parameters: Any) -> Array:
+        """Zero but for rounding; its derivatives at fixed shapes are those of ``(2 pi f)^2``."""
+        springs = model(parameters)
+        stretched = springs.extensions @ shapes
+        elastic = stretched.T @ (springs.stiffness[:, None] * stretched)
+        return elastic - omega[:, None] * omega * (shapes.T @ (springs.mass[:, None] * shapes))
+
+    squares = jnp.where(near[..., None], stacked(jax.jacfwd(excess)(parameters)), 0.0)
+    mean = near @ jnp.diagonal(squares).T / jnp.sum(near, axis=1)[:, None]
+    within, largest = jnp.max(jnp.abs(squares), axis=1), jnp.max(jnp.abs(squares), axis=(0, 1))
+    apart = jnp.max(jnp.abs(squares - jnp.eye(len(omega))[..., None] * mean), axis=1)
+    split = apart > _ROUNDING * within + _OF_LARGEST * largest
+    slope = jnp.where(split, jnp.nan, mean) / (4 * math.pi * jnp.where(still, 1.0, modes.frequency))
+    starts = jnp.abs(mean) > _ROUNDING * largest
+    return {"natural_frequency": jnp.where(still, jnp.where(starts, jnp.nan, 0.0), slope)}
 
 
 ANALYSIS = Analysis(

@@ -12,14 +12,15 @@ bracket that is closed stays as it is, so results do not depend on the lanes bes
 from __future__ import annotations
 
 import math
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax.analysis._base import stacked
 from drivetrain_jax.analysis.shafts.compound import Scales, characteristic, pairings
 from drivetrain_jax.analysis.shafts.mechanisms import zero_modes
 from drivetrain_jax.systems import Shaft
@@ -162,8 +163,8 @@ def _finish(shaft: Shaft, brackets: _Brackets, room: int) -> _Brackets:
 
 
 def find_roots(shaft: Shaft, modes: int) -> Roots:
-    """The first ``modes`` natural frequencies of every lane, zero modes included. Not differentiable: see
-    :func:`angular_frequencies`."""
+    """The first ``modes`` natural frequencies of every lane, zero modes included. Derivatives:
+    :func:`frequency_derivatives`."""
     brackets = _search(shaft, modes)
     index = jnp.arange(1, modes + 1).reshape(modes, *(1,) * (brackets.high.ndim - 1))
     zero = (index <= zero_modes(shaft)) & jnp.isfinite(brackets.high)
@@ -175,26 +176,33 @@ def find_roots(shaft: Shaft, modes: int) -> Roots:
     return Roots(jnp.where(certified, q, jnp.nan), width, certified)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(1,))
-def square_roots(shaft: Shaft, modes: int) -> Array:
-    """``q = sqrt(p)`` of the first ``modes`` natural frequencies, with the derivative that follows from Psi(q) = 0."""
-    return find_roots(shaft, modes).q
+def frequency_derivatives(build: Callable[[Any], Shaft], parameters: Any, q: Array) -> Array:
+    """Derivatives ``(modes, P)`` of the angular frequencies ``p = q^2`` of one shaft by all P ``parameters``.
 
-
-@square_roots.defjvp
-def _square_roots_jvp(modes: int, primals: tuple[Shaft], tangents: tuple[Shaft]) -> tuple[Array, Array]:
-    (shaft,) = primals
-    q = square_roots(shaft, modes)
-    moving = q > 0
+    With Psi, the closed form of the characteristic function, ``dp = -(dPsi/dparameter) / (dPsi/dp)``: one evaluation for
+    each parameter, whatever the number of steps that found p: the energy formulas of docs/theory/bicardan.md, (12).
+    A zero mode has the derivative 0, but none by the stiffness of a spring that could hold it, where p grows as sqrt(k). A
+    multiple frequency has none (NaN); beside another one at the relative distance d the error is of the order of eps/d.
+    """
+    shaft, moving = build(parameters), q > 0
     safe = jnp.where(moving, q, 1.0)
-    psi, along_shaft = jax.jvp(lambda s: pairings(s, safe), (shaft,), tangents)
-    _, along_q = jax.jvp(lambda x: pairings(shaft, x), (safe,), (jnp.ones_like(safe),))
+    psi, along_q = jax.jvp(lambda x: pairings(shaft, x), (safe,), (jnp.ones_like(safe),))
+    along = stacked(jax.jacfwd(lambda p: pairings(build(p), safe))(parameters))
     # A section that the mode does not reach does not show its frequency as a zero.
     section = jnp.argmin(jnp.abs(psi / along_q), axis=0)[None]
-    along_shaft, along_q = (jnp.take_along_axis(x, section, axis=0)[0] for x in (along_shaft, along_q))
-    # A factor, so that NaN passes backwards too.
-    slope = -along_shaft / along_q * jnp.where(_multiple(*jax.lax.stop_gradient((shaft, q))), jnp.nan, 1.0)
-    return q, jnp.where(moving, slope, 0.0)
+    along_q, along = (
+        jnp.take_along_axis(x, i, axis=0)[0] for x, i in ((along_q, section), (along, section[..., None]))
+    )
+    slope = jnp.where(_multiple(shaft, q)[:, None], jnp.nan, -2 * q[:, None] * along / along_q[:, None])
+
+    def missing(parameters: Any) -> Array:
+        """Stiffness of all springs and hinges that are not there."""
+        springs = build(parameters)
+        present = [x for x in (springs.k, springs.k_hinge) if x is not None]
+        return jnp.concatenate([jnp.where(x == 0, x, 0.0) for x in present])
+
+    held = jnp.any(stacked(jax.jacfwd(missing)(parameters)) != 0, axis=0)
+    return jnp.where(jnp.isnan(q) | moving, slope.T, jnp.where(held[:, None], jnp.nan, 0.0)).T
 
 
 def _multiple(shaft: Shaft, q: Array) -> Array:
@@ -204,28 +212,6 @@ def _multiple(shaft: Shaft, q: Array) -> Array:
     above = jnp.where(q[-1:] > 0, q[-1:] * (1 + _MULTIPLE), 1.0)
     beyond = (q[-1:] > 0) & (characteristic(shaft, above).count > len(q))
     return jnp.concatenate([none, near]) | jnp.concatenate([near, beyond])
-
-
-def angular_frequencies(shaft: Shaft, modes: int) -> Array:
-    """Natural angular frequencies ``p`` [rad/s] of the first ``modes`` modes, rising, shape ``(modes, *lanes)``.
-
-    Differentiable with respect to every field of ``shaft``, forwards and backwards and repeatedly. With Psi, the
-    closed form of the characteristic function, ``dp = -(dPsi/dshaft) / (dPsi/dp)``: one evaluation more, whatever the
-    number of steps that found p. It equals the energy formulas of docs/theory/bicardan.md, (12). A zero mode has the
-    derivative 0, also by the stiffness of a spring that would hold it, where p grows as sqrt(k) and has none. A multiple
-    frequency has none (NaN); beside another one at the relative distance d the error is of the order of eps/d. A frequency
-    that could not be certified is NaN.
-
-    >>> import jax
-    >>> from drivetrain_jax.analysis.critical_speeds import angular_frequencies
-    >>> from drivetrain_jax.systems import Shaft
-    >>> def first(EI):
-    ...     shaft = Shaft([0.07, 0.59, 0.25], EI, [15.288, 2.808, 5.5068], [85e6, 0.0, 0.0, 20e6])
-    ...     return angular_frequencies(shaft, modes=1)[0]
-    >>> print(jax.grad(first)(jax.numpy.array([64155.0, 22155.0, 8337.0])))
-    [5.11090386e-06 1.27159912e-02 1.66726753e-02]
-    """
-    return square_roots(shaft.arrays(), modes) ** 2
 
 
 def relative_error(shaft: Shaft, roots: Roots) -> Array:
