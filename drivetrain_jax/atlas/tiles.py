@@ -72,9 +72,8 @@ def tiles(
     shape = _shared(rows or len(axes[-2]), most[0], 8, 2), _width(atlas, axes[-1], most[1], dense)
     for panel, groups in _assigned(atlas, axes):
         bands = _kinds_first(list(_bands(panel, axes[-1], groups[-1], degrees[1], shape[1], dense)))
-        for leading in np.ndindex(*(len(g) for g in groups[:-2])):
-            fixed = [g[i] for g, i in zip(groups[:-2], leading, strict=True)]
-            tensor = padded_tensor(_reduced(panel, axes, fixed), degrees)
+        for fixed, reduced in _reductions(panel, axes, groups[:-2]):
+            tensor = padded_tensor(reduced, degrees)
             for start in range(0, len(groups[-2]), shape[0]):
                 chosen = groups[-2][start : start + shape[0]]
                 weights = filled_up(chebyshev(_positions(panel, -2, axes[-2][chosen]), degrees[0]), shape[0])
@@ -90,13 +89,24 @@ def _first_product(weights: Array, tensor: Array) -> Array:
     return (weights @ tensor.reshape(len(tensor), -1)).reshape(-1, *tensor.shape[1:])
 
 
-def _reduced(panel: Panel, axes: Sequence[np.ndarray], fixed: Sequence[int]) -> Panel:
-    """The panel of the last two coordinates where the leading ones are those of the cells ``fixed``."""
-    coefficients = panel.coefficients
-    for k, i in enumerate(fixed):
-        weights = chebyshev(_positions(panel, k, axes[k][i : i + 1]), panel.degrees[k])[0]
-        coefficients = np.tensordot(weights, coefficients, axes=(0, 0))
-    return Panel(panel.lower[-2:], panel.upper[-2:], coefficients, 0.0, np.empty(0))
+def _reductions(
+    panel: Panel, axes: Sequence[np.ndarray], groups: Sequence[np.ndarray]
+) -> Iterator[tuple[tuple[int, ...], Panel]]:
+    """Cells of the leading coordinates, and the panel of the last two there.
+
+    Cells that share their first coordinates share the products with the whole tensor, which cost most.
+    """
+
+    def reduced(coefficients: np.ndarray, fixed: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], Panel]]:
+        k = len(fixed)
+        if k == len(groups):
+            yield fixed, Panel(panel.lower[-2:], panel.upper[-2:], coefficients, 0.0, np.empty(0))
+            return
+        for i in groups[k]:
+            weights = chebyshev(_positions(panel, k, axes[k][i : i + 1]), panel.degrees[k])[0]
+            yield from reduced(np.tensordot(weights, coefficients, axes=(0, 0)), (*fixed, i))
+
+    return reduced(panel.coefficients, ())
 
 
 def _shared(count: int, most: int, step: int, multiple: int = 1) -> int:
