@@ -46,12 +46,7 @@ def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, flo
         for name in atlas.parameters
         if name in shown
     }
-    given = {
-        name: ((), value, {"units": p.units, "long_name": p.long_name})
-        for name, value in fixed.items()
-        for p in [atlas.scene.system.parameter(name)]
-    }
-    dataset = atlas.grid(**axes, **fixed).assign_coords(given)
+    dataset = atlas.grid(**axes, **fixed)
     if len(shown) != 2 or not has_boundaries(atlas.stability.atlas, atlas.scene.system):
         return dataset
     return dataset.assign_coords(_curves(atlas, fixed, {n: ranges[n] for n in shown}))

@@ -162,6 +162,18 @@ class StoredAtlas:
         units = self.scene.system.parameter(name).units
         return f"{low:.10g} <= {name} <= {high:.10g}" + ("" if units == "1" else f", in {units}")
 
+    def labels(self, name: str) -> dict[str, str]:
+        """Unit and meaning of a parameter, as attributes."""
+        parameter = self.scene.system.parameter(name)
+        return {"units": parameter.units, "long_name": parameter.long_name}
+
+    def check_within(self, name: str, numbers: np.ndarray) -> None:
+        """Raise :class:`InputError` for values of a parameter outside its range."""
+        low, high = self.ranges[name]
+        outside = numbers[~((numbers >= low) & (numbers <= high))]
+        if outside.size:
+            raise InputError(f"{name} = {outside.flat[0]:.10g}: allowed is {self.allowed(name)}")
+
     def refuse(self, name: str, value: Any, *others: str) -> NoReturn:
         """Raise :class:`InputError` for a name that is neither a parameter nor one of ``others``."""
         if name in self.fixed:
@@ -192,7 +204,7 @@ class StoredAtlas:
         whole = columns[self.parameters[0]]
         shape, dims = whole.shape, whole.dims
         flat = {name: np.asarray(column.values, float).reshape(-1) for name, column in columns.items()}
-        found = self._evaluate(self.stability, flat, zipped=True)
+        found = to_dataset(self.scene_on(flat, zipped=True), self.arrays(flat, zipped=True), {})
         own = {name: v.dims[1:] for name, v in found.data_vars.items()}
         data = {
             name: ((*dims, *own[name]), v.values.reshape((*shape, *v.shape[1:])), v.attrs)
@@ -206,7 +218,8 @@ class StoredAtlas:
     def grid(self, **values: Any) -> xr.Dataset:
         """Results on the outer product of arrays, as a scene with these axes would give; numbers fix a parameter.
 
-        The dimensions have the order in which the arrays are given. Raises as a call does.
+        The dimensions have the order in which the arrays are given; a number is a coordinate without a dimension. Raises as
+        a call does.
         """
         self._names(values)
         given = {name: np.asarray(self._checked(name, values), float) for name in values}
@@ -217,7 +230,35 @@ class StoredAtlas:
         if not axes:
             return self(**values)
         fixed = {name: float(column) for name, column in given.items() if not column.ndim}
-        return self._evaluate(self.stability.slice(fixed), axes, zipped=False)
+        part = self.slice(fixed)
+        scalars = {name: ((), value, self.labels(name)) for name, value in fixed.items()}
+        return to_dataset(part.scene_on(axes), part.arrays(axes), {}).assign_coords(scalars)
+
+    def slice(self, values: Mapping[str, float]) -> StoredAtlas:
+        """The atlas of the remaining parameters where those in ``values`` have these values, which lie within its ranges."""
+        return replace(self, stability=self.stability.slice(values)) if values else self
+
+    def arrays(
+        self, columns: Mapping[str, np.ndarray], *, zipped: bool = False, solve: bool = True
+    ) -> Mapping[str, np.ndarray]:
+        """Results by name on the outer product of ``columns``, or at one point for each entry of them if ``zipped``.
+
+        Without ``solve`` what lies in a gap has no value and the outcome ``LOST``.
+        """
+        scene = self.scene_on(columns, zipped=zipped)
+        engine = Engine(scene)
+        table = Table(scene, engine.grid)
+        evaluate(engine, table, self.stability, Work(Where()), Progress(engine.total), solve=solve)
+        return table.lay_out()
+
+    def scene_on(self, columns: Mapping[str, np.ndarray], *, zipped: bool = False) -> Scene:
+        """The ``floquet`` scene whose results :meth:`arrays` gives."""
+        return self._scene(columns, self.fixed, self.request, zipped)
+
+    @property
+    def request(self) -> Request:
+        """The results that a point has, and how they are found."""
+        return Request(self.scene.request.outputs, "atlas", self.scene.request.options)
 
     def radius(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """Spectral radii ``(N,)`` by direct solves, without the panels; ``columns`` of all parameters.
@@ -241,7 +282,6 @@ class StoredAtlas:
         return self.parameters
 
     def _checked(self, name: str, values: Mapping[str, Any]) -> Any:
-        low, high = self.ranges[name]
         try:
             numbers = np.asarray(values[name])
         except ValueError:
@@ -249,18 +289,8 @@ class StoredAtlas:
             numbers = np.empty(0, object)
         if numbers.dtype.kind not in "iuf":
             raise InputError(f"{name} = {shown(values[name])}: allowed are numbers")
-        outside = numbers[~((numbers >= low) & (numbers <= high))]
-        if outside.size:
-            raise InputError(f"{name} = {outside.flat[0]:.10g}: allowed is {self.allowed(name)}")
+        self.check_within(name, numbers)
         return values[name]
-
-    def _evaluate(self, stability: StabilityAtlas, axes: Mapping[str, np.ndarray], zipped: bool) -> xr.Dataset:
-        request = Request(self.scene.request.outputs, "atlas", self.scene.request.options)
-        scene = self._scene(axes, stability.atlas.fixed, request, zipped)
-        engine = Engine(scene)
-        table = Table(scene, engine.grid)
-        evaluate(engine, table, stability, Work(Where()), Progress(engine.total))
-        return to_dataset(scene, table.lay_out(), {})
 
     def _scene(self, axes: Mapping[str, np.ndarray], fixed: Mapping[str, Any], request: Request, zipped: bool) -> Scene:
         system, floquet = self.scene.system, get_analysis("floquet")

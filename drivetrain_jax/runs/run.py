@@ -22,6 +22,7 @@ from drivetrain_jax.runs.target import Target
 from drivetrain_jax.runs.work import Progress, Report, Work
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.consolidate import ResultFile, open_result, write_result
+from drivetrain_jax.store.files import ATLAS_PREFACE
 from drivetrain_jax.store.schema import Labelled
 
 if TYPE_CHECKING:
@@ -210,7 +211,8 @@ def _resume(
     temporary = parts.result
     if engine.scene.analysis.continuous:
         with work:
-            write_result(_atlas(engine, work, progress).with_attrs(wall_time_s=seconds()), out, temporary)
+            result = _atlas(engine, work, progress).with_attrs(wall_time_s=seconds())
+            write_result(result, out, temporary, ATLAS_PREFACE)
         return
     with work, ResultFile(temporary) as file:
         table = Table(engine.scene, engine.grid, lambda blank: file.lay_out(blank.with_attrs(**_attrs(engine))))

@@ -61,9 +61,17 @@ def _prepare_judging(engine: Engine) -> None:
 
 
 def evaluate(
-    engine: Engine, table: Table, atlas: StabilityAtlas, work: Work, progress: Progress, first: int = 0
+    engine: Engine,
+    table: Table,
+    atlas: StabilityAtlas,
+    work: Work,
+    progress: Progress,
+    first: int = 0,
+    *,
+    solve: bool = True,
 ) -> int:
-    """All points of ``engine`` into ``table`` from ``atlas``; those that it does not cover are solved and counted.
+    """All points of ``engine`` into ``table`` from ``atlas``; those that it does not cover are counted, and solved unless
+    ``solve`` is false.
 
     A run that is resumed evaluates again, which is faster than reading would be. ``first`` see :meth:`Work.do`.
     """
@@ -79,7 +87,7 @@ def evaluate(
         if work.report:
             work.report(progress)
     rest = np.concatenate([np.empty(0, int), *uncovered])
-    if rest.size:
+    if rest.size and solve:
         work.do(engine.only(rest), table, progress, first)
     return rest.size
 
@@ -104,7 +112,7 @@ def _blocks(engine: Engine, atlas: StabilityAtlas, table: Table) -> Iterator[tup
     lengths = {name: len(axes[name]) for name in atlas.atlas.parameters}
     longest = sorted(lengths, key=lambda name: lengths[name])[-2:]
     # Rows and columns of a tile are the last two. Of axes as long as each other their order decides, which stays.
-    atlas = atlas.ordered(sorted(lengths, key=lambda name: name in longest))
+    atlas = atlas.ordered(sorted(lengths, key=lambda name: (name in longest, name not in longest and lengths[name])))
     names, outputs = atlas.atlas.parameters, engine.scene.request.outputs
     lengths = [lengths[name] for name in names]
     for ranges in _cut(lengths):

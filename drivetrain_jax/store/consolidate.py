@@ -22,17 +22,19 @@ if TYPE_CHECKING:
 
 # Bytes that the attributes of a variable take at most.
 _LABELS = 1 << 16
+# Bytes of the block in front of HDF5 that a preface takes: the least that HDF5 looks behind.
+_USER_BLOCK = 512
 
 
 class ResultFile:
     """A result that grows on the disk beside its final place, so that memory does not grow with it.
 
     ``lay_out`` gives its data variables as arrays mapped from the file ``temporary``, to be filled in any order; ``finish``
-    puts it into place. Leaving the context without that deletes it.
+    puts it into place. Leaving the context without that deletes it. A ``preface`` stands in front of HDF5.
     """
 
-    def __init__(self, temporary: Path) -> None:
-        self._temporary = temporary
+    def __init__(self, temporary: Path, preface: bytes = b"") -> None:
+        self._temporary, self._preface = temporary, preface
 
     def __enter__(self) -> ResultFile:
         return self
@@ -45,7 +47,7 @@ class ResultFile:
 
         A disk without enough room is an ``OSError`` here, before anything is computed.
         """
-        places = _write_frame(template, self._temporary)
+        places = _write_frame(template, self._temporary, self._preface)
         with open(self._temporary, "r+b") as file:
             mapped = mmap.mmap(file.fileno(), 0)
         data = {name: entry.values for name, entry in template.data.items()}
@@ -64,21 +66,21 @@ class ResultFile:
         move_into_place(self._temporary, path)
 
 
-def write_result(result: Labelled, path: Path, temporary: Path) -> None:
+def write_result(result: Labelled, path: Path, temporary: Path, preface: bytes = b"") -> None:
     """Write ``result`` to ``path`` in one step; ``temporary`` is where it grows. A full disk leaves ``path`` alone."""
-    with ResultFile(temporary) as file:
+    with ResultFile(temporary, preface) as file:
         for name, array in file.lay_out(result).items():
             array[...] = result.data[name].values
         file.finish(path)
 
 
-def _write_frame(template: Labelled, path: Path) -> Mapping[str, int]:
+def _write_frame(template: Labelled, path: Path, preface: bytes) -> Mapping[str, int]:
     """Write all but the data, whose contiguous room is left blank; returns where that is.
 
     The head is made in memory, and room for what is added to it is reserved before: HDF5 may crash the process when a disk
     fills up under it.
     """
-    head = netcdf.head(template)
+    head = (preface.ljust(_USER_BLOCK, b"\0") if preface else b"") + netcdf.head(template)
     path.write_bytes(head)
     _reserve(path, len(head) + sum(entry.values.nbytes + _LABELS for entry in template.data.values()))
     with h5py.File(path, "r+") as file:

@@ -5,6 +5,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+# First bytes of the file of an atlas, in a user block of HDF5: xarray then finds the engine that evaluates it. Every reader
+# of HDF5 and netCDF looks for the file behind it.
+ATLAS_PREFACE = b"An atlas of drivetrain_jax, HDF5 from byte 512 on.\n"
+
 
 def behind_link(path: Path) -> Path:
     """``path``, or the file that it links to: renaming over the link would replace that instead."""

@@ -1,0 +1,74 @@
+"""The grid on which an atlas is opened: values of each of its parameters, as ``grid=`` gives them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._wording import shown
+from drivetrain_jax.runs.atlas_file import StoredAtlas
+
+# Values of a parameter for which nothing is given.
+_DEFAULT = 512
+_ALLOWED = "a number of values (1000), (START, STOP, NUM), a row of values, or one value (0.5)"
+
+
+def grid_values(atlas: StoredAtlas, grid: Any) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """Axes ``(N,)`` in the order of the atlas's parameters, and the values of the parameters that do not vary.
+
+    Args:
+        grid: by the name of a parameter a number of values between the ends of the atlas, ``(start, stop, num)``, a row of
+            values, or one value, a float; or one number of values for all parameters. Default: 512.
+
+    Raises: InputError for what is none of these and for values outside the atlas.
+    """
+    given = dict.fromkeys(atlas.parameters, grid) if _is_count(grid) else grid
+    given = {} if given is None else given
+    if not isinstance(given, Mapping):
+        raise InputError(f"grid = {shown(grid)}: allowed is a number of values, or a table by the names of parameters")
+    for name, value in given.items():
+        if name not in atlas.parameters:
+            atlas.refuse(str(name), value)
+    values = {name: _values(atlas, name, given.get(name, _DEFAULT)) for name in atlas.parameters}
+    axes = {name: value for name, value in values.items() if value.ndim}
+    if not axes:
+        raise InputError("grid: fixes all parameters; allowed is one that varies, and query answers for a point")
+    return axes, {name: float(value) for name, value in values.items() if not value.ndim}
+
+
+def _values(atlas: StoredAtlas, name: str, given: Any) -> np.ndarray:
+    if _is_count(given):
+        values = np.linspace(*atlas.ranges[name], _count(name, given))
+    elif isinstance(given, tuple) and len(given) == 3 and _is_count(given[2]):
+        values = np.linspace(*(float(_number(name, end)) for end in given[:2]), _count(name, given[2]))
+    else:
+        values = _number(name, given)
+    if values.ndim > 1 or not values.size:
+        raise InputError(f"grid.{name}: an array of the shape {values.shape}; allowed is {_ALLOWED}")
+    atlas.check_within(name, values)
+    return values
+
+
+def _number(name: str, given: Any) -> np.ndarray:
+    try:
+        values = np.asarray(given)
+    except ValueError:
+        # Rows of different lengths.
+        values = np.empty(0, object)
+    if values.dtype.kind not in "iuf":
+        raise InputError(f"grid.{name} = {shown(given)}: allowed is {_ALLOWED}")
+    return values.astype(float)
+
+
+def _count(name: str, given: Any) -> int:
+    if given < 2:
+        allowed = f"allowed is 2 or more; {float(given)} would fix {name}"
+        raise InputError(f"grid.{name} = {given}: is a number of values; {allowed}")
+    return int(given)
+
+
+def _is_count(given: Any) -> bool:
+    return isinstance(given, (int, np.integer)) and not isinstance(given, bool)

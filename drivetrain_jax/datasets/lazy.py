@@ -1,0 +1,176 @@
+"""Results of an atlas file as lazy arrays: a cell is evaluated when it is asked for, and no other."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from xarray.backends import BackendArray
+from xarray.core import indexing
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.runs.atlas_file import StoredAtlas, open_atlas
+
+# The outcome of a cell in a gap of the atlas that is not solved. No file has it.
+GAP = len(Outcome)
+# Bytes of results that are kept: the variables of a selection are mostly asked for one after another, each of them once.
+_KEPT = 24_000_000
+# Cells of an outer product that may be evaluated for each point asked for, before points are evaluated one by one.
+_SPARE = 4
+
+Key = tuple[int | slice | np.ndarray, ...]
+
+
+class AtlasGrid:
+    """Results of the atlas in a file on the outer product of ``axes``, ``fixed`` being the other parameters.
+
+    It holds no more than the path and the axes, so that it can be sent to another process, which opens the file itself.
+    """
+
+    def __init__(self, path: str, axes: Mapping[str, np.ndarray], fixed: Mapping[str, float], solve: bool) -> None:
+        self.path, self.axes, self.fixed, self.solve = path, dict(axes), dict(fixed), solve
+        self._stamp = _stamp(path)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._kept: OrderedDict[tuple, dict[str, np.ndarray]] = OrderedDict()
+        self._lock = Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name not in ("_kept", "_lock")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._forget()
+
+    @property
+    def atlas(self) -> StoredAtlas:
+        """The atlas of the parameters that vary on the grid."""
+        return self._part({})
+
+    def _part(self, values: Mapping[str, float]) -> StoredAtlas:
+        if _stamp(self.path) != self._stamp:
+            raise InputError(f"file = {self.path!r}: has changed since it was opened; allowed is to open it again")
+        return _sliced(self.path, self._stamp, tuple({**self.fixed, **values}.items()))
+
+    def block(self, key: Key, name: str) -> np.ndarray:
+        """The result ``name`` where ``key`` has a position, a slice or a row of positions for each axis."""
+        columns = [axis[part] for axis, part in zip(self.axes.values(), key, strict=True)]
+        return self._taken(("block", *columns), name, lambda: self._evaluated(columns))
+
+    def points(self, positions: Sequence[np.ndarray], name: str) -> np.ndarray:
+        """The result ``name`` at points, given by positions along each axis, of one shape."""
+        shape = positions[0].shape
+        columns = [axis[part].reshape(-1) for axis, part in zip(self.axes.values(), positions, strict=True)]
+
+        def evaluated() -> Mapping[str, np.ndarray]:
+            found = self.atlas.arrays(dict(zip(self.axes, columns, strict=True)), zipped=True, solve=self.solve)
+            return {name: values.reshape(shape + values.shape[1:]) for name, values in found.items()}
+
+        return self._taken(("points", shape, *columns), name, evaluated)
+
+    def _evaluated(self, columns: list[np.ndarray]) -> Mapping[str, np.ndarray]:
+        by_name = dict(zip(self.axes, columns, strict=True))
+        axes = {name: column for name, column in by_name.items() if column.ndim}
+        numbers = {name: float(column) for name, column in by_name.items() if not column.ndim}
+        if axes:
+            return self._part(numbers).arrays(axes, solve=self.solve)
+        single = {name: np.array([value]) for name, value in numbers.items()}
+        found = self.atlas.arrays(single, zipped=True, solve=self.solve)
+        return {name: values[0] for name, values in found.items()}
+
+    def _taken(self, parts: tuple, name: str, evaluated: Callable[[], Mapping[str, np.ndarray]]) -> np.ndarray:
+        """One of the results of a selection; the others are kept for a while."""
+        key = tuple(part.tobytes() if isinstance(part, np.ndarray) else part for part in parts)
+        with self._lock:
+            if name in self._kept.get(key, ()):
+                return self._kept[key].pop(name)
+        found = {name: np.asarray(values) for name, values in evaluated().items()}
+        if not self.solve:
+            outcome = found[OUTCOME.name]
+            found[OUTCOME.name] = np.where(outcome == Outcome.LOST, np.int8(GAP), outcome)
+        wanted = found.pop(name)
+        with self._lock:
+            self._kept[key] = found
+            while sum(values.nbytes for kept in self._kept.values() for values in kept.values()) > _KEPT:
+                self._kept.popitem(last=False)
+        return wanted
+
+
+class AtlasArray(BackendArray):
+    """One result on an :class:`AtlasGrid`."""
+
+    def __init__(self, grid: AtlasGrid, name: str, own: tuple[int, ...], dtype: np.dtype) -> None:
+        self.grid, self.name, self.dtype = grid, name, np.dtype(dtype)
+        self.shape = (*(axis.size for axis in grid.axes.values()), *own)
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> np.ndarray:
+        if isinstance(key, indexing.VectorizedIndexer) and self._are_scattered(key.tuple):
+            positions = _spread_out(key.tuple, self.shape)
+            swept, own = positions[: len(self.grid.axes)], positions[len(self.grid.axes) :]
+            found = self.grid.points(np.broadcast_arrays(*swept), self.name)
+            return np.take_along_axis(found, own[0], -1) if own else found
+        return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._block)
+
+    def _block(self, key: Key) -> np.ndarray:
+        count = len(self.grid.axes)
+        sizes = [1 if isinstance(k, (int, np.integer)) else _length(k, n) for k, n in zip(key, self.shape, strict=True)]
+        if not all(sizes):
+            kept = [size for size, k in zip(sizes, key, strict=True) if not isinstance(k, (int, np.integer))]
+            return np.empty(kept, self.dtype)
+        return self.grid.block(key[:count], self.name)[(..., *key[count:])]
+
+    def _are_scattered(self, key: Key) -> bool:
+        """Whether points are so few that the outer product of their positions would be wasted on them."""
+        arrays = [k for k in key if isinstance(k, np.ndarray)]
+        product = math.prod(len(np.unique(k)) for k in arrays)
+        return product > _SPARE * math.prod(np.broadcast_shapes(*(k.shape for k in arrays)))
+
+
+def _length(part: slice | np.ndarray, size: int) -> int:
+    return len(range(*part.indices(size))) if isinstance(part, slice) else len(part)
+
+
+def _spread_out(key: Key, shape: tuple[int, ...]) -> list[np.ndarray]:
+    """Positions along each axis that broadcast against each other: those of slices follow those of arrays."""
+    slices = [k for k in key if isinstance(k, slice)]
+    ahead = next(k.ndim for k in key if isinstance(k, np.ndarray))
+    positions, number = [], 0
+    for part, size in zip(key, shape, strict=True):
+        if isinstance(part, slice):
+            behind = len(slices) - number - 1
+            positions.append(np.arange(*part.indices(size)).reshape((1,) * (ahead + number) + (-1,) + (1,) * behind))
+            number += 1
+        else:
+            positions.append(part.reshape(part.shape + (1,) * len(slices)))
+    return positions
+
+
+def _stamp(path: str) -> tuple[int, int]:
+    try:
+        about = os.stat(path)
+    except OSError as error:
+        raise InputError(f"file = {path!r}: {error.strerror}; give the file of an atlas") from None
+    return about.st_mtime_ns, about.st_size
+
+
+def whole(path: str) -> StoredAtlas:
+    """The atlas in the file at ``path``; a file that has not changed is read once."""
+    return _opened(path, _stamp(path))
+
+
+@lru_cache(maxsize=4)
+def _opened(path: str, stamp: tuple[int, int]) -> StoredAtlas:
+    return open_atlas(path)
+
+
+@lru_cache(maxsize=8)
+def _sliced(path: str, stamp: tuple[int, int], values: tuple[tuple[str, float], ...]) -> StoredAtlas:
+    return _opened(path, stamp).slice(dict(values))

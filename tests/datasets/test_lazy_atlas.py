@@ -1,0 +1,240 @@
+"""An atlas opened by xarray: on any grid, evaluated where it is touched."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import shutil
+
+import dask
+import h5py
+import netCDF4
+import numpy as np
+import pytest
+import xarray as xr
+
+import drivetrain_jax as dt
+from drivetrain_jax.datasets import lazy
+from drivetrain_jax.runs import rounds
+from drivetrain_jax.runs.atlas_file import StoredAtlas
+
+ATLAS = {
+    "system": "cardan",
+    "analysis": "atlas",
+    "axes": {"beta": {"start": 0.0, "stop": 0.6}, "Omega": {"start": 1.0, "stop": 2.0}},
+    "fixed": {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0},
+}
+GRID = {"beta": 300, "Omega": (1.2, 1.8, 400)}
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("atlas") / "atlas.nc"
+    dt.run(ATLAS, out=path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def atlas(file):
+    return dt.open_atlas(file)
+
+
+@pytest.fixture(scope="module")
+def expected(atlas):
+    return atlas.grid(beta=np.linspace(0, 0.6, 300), Omega=np.linspace(1.2, 1.8, 400))
+
+
+@pytest.fixture
+def evaluated(monkeypatch):
+    """How many cells each evaluation had."""
+    sizes, arrays = [], StoredAtlas.arrays
+
+    def counting(self, columns, **options):
+        found = arrays(self, columns, **options)
+        sizes.append(found["outcome"].size)
+        return found
+
+    monkeypatch.setattr(StoredAtlas, "arrays", counting)
+    return sizes
+
+
+def opened(file, grid=GRID, **options):
+    return xr.open_dataset(file, engine="drivetrain", grid=grid, **options)
+
+
+def test_it_is_the_result_on_the_grid(file, expected):
+    found = opened(file)
+    xr.testing.assert_identical(found.drop_attrs(deep=False), expected.drop_attrs(deep=False))
+    assert found.attrs.keys() == expected.attrs.keys() and found.attrs["analysis"] == "floquet"
+    assert opened(file, None)["verdict"].shape == (512, 512)
+
+
+def test_what_is_never_touched_is_never_computed(file, evaluated):
+    found = opened(file, dict.fromkeys(("beta", "Omega"), 1_000_000))
+    assert found["verdict"].shape == (1_000_000, 1_000_000) and "verdict" in repr(found)
+    part = found.isel(beta=slice(0, 3000, 1000), Omega=500_000)
+    assert evaluated == []
+    part.load()
+    # All results of a selection come from one evaluation.
+    assert evaluated == [3]
+
+
+def test_selections_are_the_grid_of_their_values(file, atlas, evaluated):
+    found = opened(file, 2000)
+    part = found.sel(beta=slice(0.2, 0.4)).isel(Omega=[30, 10, 1000])
+    xr.testing.assert_equal(part.load(), atlas.grid(beta=part["beta"].values, Omega=part["Omega"].values))
+    line = found.sel(beta=0.3, method="nearest")
+    xr.testing.assert_equal(line.load(), atlas.grid(beta=float(line["beta"]), Omega=line["Omega"].values))
+    point = found.isel(beta=700, Omega=900)
+    assert float(point["spectral_radius"]) == float(
+        atlas(beta=float(point["beta"]), Omega=float(point["Omega"]))["spectral_radius"]
+    )
+    assert found.isel(beta=slice(0, 0))["verdict"].values.shape == (0, 2000)
+    turned = found["spectral_radius"].isel(beta=slice(40), Omega=slice(60)).T
+    evaluated.clear()
+    assert turned.values.shape == (60, 40) and evaluated == [2400]
+
+
+def test_scattered_points_are_evaluated_one_by_one(file, atlas, evaluated):
+    random = np.random.default_rng(0)
+    places = {name: xr.DataArray(random.integers(0, 10_000, (4, 25)), dims=("a", "b")) for name in ("beta", "Omega")}
+    found = opened(file, 10_000).isel(places)["spectral_radius"]
+    assert found.dims == ("a", "b") and evaluated == []
+    values = found.values
+    assert evaluated == [100]
+    exact = atlas(beta=found["beta"], Omega=found["Omega"])["spectral_radius"]
+    np.testing.assert_array_equal(values, exact.values)
+    along = opened(file, 1000).isel(beta=xr.DataArray(np.arange(0, 1000, 100), dims="a"))["verdict"]
+    assert along.dims == ("a", "Omega") and along.values.shape == (10, 1000)
+
+
+def test_usual_ways_of_xarray(file, expected, tmp_path):
+    found = opened(file)
+    assert float(found["spectral_radius"].mean()) == float(expected["spectral_radius"].mean())
+    unstable = found["spectral_radius"].where(found["verdict"] == 1)
+    assert int(unstable.count()) == int((expected["verdict"] == 1).sum()) > 100
+    found.to_zarr(tmp_path / "grid.zarr")
+    with xr.open_zarr(tmp_path / "grid.zarr") as again:
+        xr.testing.assert_identical(again["spectral_radius"].load(), expected["spectral_radius"])
+    found["spectral_radius"].sel(beta=slice(0.1, 0.2)).plot()
+
+
+@pytest.mark.filterwarnings("ignore:The specified chunks")
+@pytest.mark.parametrize("scheduler", ["threads", "processes"])
+def test_chunks_of_dask(file, expected, scheduler):
+    found = opened(file, chunks={"beta": 100, "Omega": 400})
+    assert found["spectral_radius"].chunks == ((100, 100, 100), (400,))
+    with dask.config.set(scheduler=scheduler, num_workers=2):
+        mean = float(found["spectral_radius"].mean())
+        counts = int((found["verdict"] == 1).sum())
+    assert mean == pytest.approx(float(expected["spectral_radius"].mean()), rel=1e-12)
+    assert counts == int((expected["verdict"] == 1).sum())
+
+
+def test_chunks_that_dask_chooses_are_of_one_size(file):
+    sizes = opened(file, 3000, chunks={})["verdict"].chunks
+    assert all(len(set(along[:-1])) == 1 and along[-1] >= 0.9 * along[0] for along in sizes)
+    assert opened(file, 300, chunks={})["verdict"].chunks == ((300,), (300,))
+
+
+def test_arrays_travel_without_what_they_hold(file, expected):
+    array = opened(file)["spectral_radius"].variable
+    array[:10, :10].values  # noqa: B018
+    packed = pickle.dumps(array)
+    assert len(packed) < 20_000
+    np.testing.assert_array_equal(pickle.loads(packed).values, expected["spectral_radius"].values)
+
+
+def test_values_of_all_kinds_make_a_grid(file):
+    row = np.array([0.1, 0.4, 0.2])
+    found = opened(file, {"beta": row, "Omega": 1.5})
+    assert found["verdict"].dims == ("beta",) and found["beta"].values.tolist() == row.tolist()
+    assert float(found["Omega"]) == 1.5 and found["Omega"].attrs["units"] == "1"
+    assert opened(file, {"beta": xr.DataArray(row), "Omega": [1.5]})["verdict"].shape == (3, 1)
+    dropped = opened(file, drop_variables=["verdict", "outcome"])
+    assert set(dropped.data_vars) == {"spectral_radius", "spectral_radius_error"}
+
+
+@pytest.mark.parametrize(
+    ("grid", "message"),
+    [
+        (
+            {"speed": 10},
+            "speed = 10: not a parameter of the atlas; allowed is 0 <= beta <= 0.6, in rad; 1 <= Omega <= 2",
+        ),
+        ({"mu": 10}, "mu = 10: the atlas is made for mu = 1; allowed is to leave it out"),
+        ({"beta": 1}, "grid.beta = 1: is a number of values; allowed is 2 or more; 1.0 would fix beta"),
+        ({"Omega": (1.0, 3.0, 5)}, "Omega = 2.5: allowed is 1 <= Omega <= 2"),
+        ({"beta": "wide"}, "grid.beta = 'wide': allowed is a number of values (1000), (START, STOP, NUM), "),
+        ({"beta": True}, "grid.beta = True: allowed is "),
+        ({"beta": np.zeros((2, 2))}, "grid.beta: an array of the shape (2, 2); allowed is "),
+        ({"beta": 0.1, "Omega": 1.5}, "grid: fixes all parameters; allowed is one that varies, "),
+        ("all", "grid = 'all': allowed is a number of values, or a table by the names of parameters"),
+    ],
+)
+def test_grids_that_are_none(file, grid, message):
+    with pytest.raises(dt.InputError) as refused:
+        opened(file, grid)
+    assert str(refused.value).startswith(message)
+
+
+def test_files_that_are_none(tmp_path, file):
+    with pytest.raises(dt.InputError, match=r"gaps = 'fill': allowed is one of solve, nan"):
+        opened(file, gaps="fill")
+    with pytest.raises(dt.InputError, match=r"none.nc': No such file"):
+        opened(tmp_path / "none.nc")
+    with pytest.raises(dt.InputError, match="allowed is the path of the file of an atlas"):
+        opened(memoryview(b""))
+    damaged = tmp_path / "damaged.nc"
+    shutil.copy(file, damaged)
+    with h5py.File(damaged, "r+") as store:
+        store["coefficients"][0, 0] *= 2
+    with pytest.raises(dt.InputError, match=r"damaged \(coefficients"):
+        opened(damaged)
+
+
+def test_a_file_that_changes_is_not_mixed_with_another(tmp_path, file):
+    copy = tmp_path / "atlas.nc"
+    shutil.copy(file, copy)
+    found = opened(copy)
+    os.utime(copy, ns=(0, 0))
+    with pytest.raises(dt.InputError, match="has changed since it was opened; allowed is to open it again"):
+        found["verdict"].values  # noqa: B018
+    assert opened(copy)["verdict"].isel(beta=0).values.shape == (400,)
+
+
+def test_xarray_knows_the_file_without_an_engine(file, tmp_path):
+    assert xr.open_dataset(file)["verdict"].shape == (512, 512)
+    knows = xr.backends.list_engines()["drivetrain"].guess_can_open
+    assert knows(file) and knows(str(file))
+    chart = tmp_path / "chart.nc"
+    axes = {"beta": {"values": [0.1, 0.2]}, "Omega": {"values": [1.2, 1.3]}}
+    dt.run(ATLAS | {"analysis": "floquet", "axes": axes}, out=chart)
+    for other in (chart, tmp_path, tmp_path / "absent.nc", "https://example.org/atlas.nc", b"bytes", None):
+        assert not knows(other)
+    assert "spectral_radius" in xr.open_dataset(chart)
+
+
+def test_other_readers_see_the_panels(file):
+    with netCDF4.Dataset(file) as found:
+        coefficients = found["coefficients"][:]
+    with h5py.File(file) as found:
+        np.testing.assert_array_equal(found["coefficients"][:], coefficients)
+    with xr.open_dataset(file, engine="h5netcdf") as found:
+        assert found.attrs["analysis"] == "atlas"
+        np.testing.assert_array_equal(found["coefficients"].values, coefficients)
+
+
+def test_gaps_are_solved_or_have_no_value(monkeypatch, tmp_path):
+    monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
+    path, grid = tmp_path / "gaps.nc", {"beta": [0.1, 0.3], "Omega": [1.2, 1.3, 1.9]}
+    dt.run(ATLAS, out=path)
+    solved = opened(path, grid)
+    axes = {name: {"values": values} for name, values in grid.items()}
+    exact = dt.run(ATLAS | {"analysis": "floquet", "axes": axes, "options": {"method": "direct"}})
+    np.testing.assert_array_equal(solved["spectral_radius"].values, exact["spectral_radius"].values)
+    blank = opened(path, grid, gaps="nan")
+    assert np.isnan(blank["spectral_radius"].values).all() and (blank["verdict"] == 2).all()
+    assert (blank["outcome"] == lazy.GAP).all()
+    assert blank["outcome"].attrs["flag_meanings"].split()[lazy.GAP] == "gap"
+    assert blank["outcome"].attrs["flag_values"].tolist() == list(range(lazy.GAP + 1))
