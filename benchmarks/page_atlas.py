@@ -1,4 +1,4 @@
-"""The measured part of docs/theory/atlas.md, from results/atlas_attack.csv; `python -m benchmarks.page` writes it."""
+"""Generate the measured part of docs/theory/atlas.md from atlas_attack.csv; `python -m benchmarks.page` writes it."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ _UNKNOWN = "not measured"
 
 
 def written(text: str, folder: Path = RESULTS) -> str:
-    """``text`` of the page with its measured part made from the files in ``folder``."""
+    """``text`` with its measured part replaced from the files in ``folder``."""
     return between_marks(text, section(folder))
 
 
 def write_page() -> None:
-    """Write the measured part of the page anew."""
+    """Rewrite the measured part of the page."""
     PAGE.write_text(written(PAGE.read_text()))
 
 
 def section(folder: Path = RESULTS) -> str:
-    """The text between the marks."""
+    """The text between the two marks."""
     file = load(folder, NAME)
     if file is None:
         return not_measured(NAME)
@@ -48,7 +48,7 @@ def section(folder: Path = RESULTS) -> str:
 
 
 def label(case: Case) -> str:
-    """Ranges of a case and what differs from the base case, in symbols."""
+    """Ranges of a case and its differences from the base case, in symbols."""
     ranges = [
         rf"{_SYMBOLS[name]} \in [{_number(low)}, {_number(high)}]" if low else rf"{_SYMBOLS[name]} \le {_number(high)}"
         for name, (low, high) in case.ranges.items()
@@ -82,9 +82,9 @@ def _error_cells(row: Row) -> list[str]:
 def _explanation(rows: Sequence[Row]) -> str:
     cells, few = (_several({int(row[name]) for row in rows}) for name in ("cells", "worst"))
     return (
-        f"{cells} cells of each kind against direct solves, {few} of each against 30 digits. Error of $\\rho$: what 99.9 % "
-        "of the random cells stay below. Random, nearest, widest: the largest part of its bound that an error was (against "
-        "direct solves beyond their rounding)."
+        f"{cells} cells of each kind are compared with direct solves, {few} with 30 digits. Error of $\\rho$: 99.9 % "
+        "quantile over the random cells. Random, nearest, widest: largest ratio of error to bound. The rounding of "
+        "direct solves is subtracted from the error."
     )
 
 

@@ -1,4 +1,4 @@
-"""The work-precision part of the page: who is fastest at an error of 1e-9, and what becomes of whom at the extremes."""
+"""The work-precision part of docs/benchmarks.md: the fastest method at an error of 1e-9, and failures at the extremes."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Precision:
         return min(good, key=lambda rung: rung.seconds_per_point, default=None)
 
     def fastest(self, region: str, own: bool) -> Rung | None:
-        """The fastest to reach 1e-9 among the package's methods, or among the rivals."""
+        """The fastest setting that reaches 1e-9, of the package's methods (``own``) or of the rivals."""
         names = [method for method in self.methods if is_own(method) == own]
         good = [rung for rung in (self.reaching(region, name) for name in names) if rung]
         return min(good, key=lambda rung: rung.seconds_per_point, default=None)
@@ -52,7 +52,7 @@ class Precision:
 
 
 def is_own(method: str) -> bool:
-    """Whether a method belongs to the package."""
+    """True if the method belongs to the package."""
     return method.split(",")[0] == OWN
 
 
@@ -63,19 +63,19 @@ def load_precision(folder: Path) -> dict[str, Precision]:
 
 
 def conclusions(found: dict[str, Precision]) -> list[str]:
-    """Who wins where, losses included, and whether anything fails silently."""
+    """Regions won and lost by each system, then silent failures."""
     return [*(_winners(precision) for precision in found.values()), *(_silence(list(found.values())) if found else [])]
 
 
 def losses(found: dict[str, Precision]) -> str:
-    """Where a rival is ahead, in one sentence; empty if nowhere."""
+    """A sentence that lists the regions where a rival is faster; empty without any."""
     behind = {system: _compared(precision).lost for system, precision in found.items()}
     told = "; ".join(f"`{system}`: {', '.join(regions)}" for system, regions in behind.items() if regions)
-    return f"Behind at an error of {GOAL:g} on one core, of all regions of the page below: {told}." if told else ""
+    return f"Regions where a rival is faster (error {GOAL:g}, one core): {told}." if told else ""
 
 
 class _Compared(NamedTuple):
-    """Regions by who is ahead in them, each with the rival where there is one."""
+    """Regions sorted by the fastest method, each with its rival."""
 
     won: list[str]
     level: list[str]
@@ -109,10 +109,10 @@ def _winners(precision: Precision) -> str:
     won, level, lost, alone, nobody = _compared(precision)
     parts = [
         f"fastest in {', '.join(won)}" if won else "",
-        f"alone in reaching it: {', '.join(alone)}" if alone else "",
-        f"level within {LEVEL - 1:.0%} in {', '.join(level)}" if level else "",
-        f"**behind** in {', '.join(lost)}" if lost else "",
-        f"nobody reaches it: {', '.join(nobody)}" if nobody else "",
+        f"the only one to reach it in {', '.join(alone)}" if alone else "",
+        f"equal within {LEVEL - 1:.0%} in {', '.join(level)}" if level else "",
+        f"**slower** in {', '.join(lost)}" if lost else "",
+        f"like all others short of it in {', '.join(nobody)}" if nobody else "",
     ]
     return f"`{precision.system}` at an error of {GOAL:g}, one core: the package is {'; '.join(filter(None, parts))}."
 
@@ -137,7 +137,7 @@ def _silence(systems: Sequence[Precision]) -> list[str]:
     if not rivals:
         return [first]
     listed = "; ".join(f"{method} ({', '.join(where)})" for method, where in rivals.items())
-    return [first, f"Rivals that are wrong without saying so: {listed}."]
+    return [first, f"Rivals that fail silently: {listed}."]
 
 
 def section(folder: Path, images: str, system: str, found: dict[str, Precision]) -> str:
@@ -151,9 +151,9 @@ def section(folder: Path, images: str, system: str, found: dict[str, Precision])
         [
             title,
             f"![Error against time per point, one panel for each region]({images}{name}.png)",
-            f"Time per point at the fastest setting with an error of at most {GOAL:g} at every point, in brackets the "
-            "error; else the smallest error reached. In bold the fastest of each region, and what is within "
-            f"{LEVEL - 1:.0%} of it.",
+            f"Time per point (error) at the fastest setting with an error of at most {GOAL:g} at every point. "
+            f"`only`: the smallest error, where no setting reaches {GOAL:g}. Bold: the fastest of each region, and all "
+            f"within {LEVEL - 1:.0%} of it.",
             _times_table(precision),
             "At the extremes:",
             _extremes_table(precision),

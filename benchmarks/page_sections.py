@@ -1,4 +1,4 @@
-"""The tables of the benchmarks' page beside the work-precision: atlas, scaling, outputs, peers; where files come from."""
+"""Tables of docs/benchmarks.md other than work-precision: atlas, scaling, outputs, peers, sources."""
 
 from __future__ import annotations
 
@@ -8,39 +8,39 @@ from benchmarks.results_files import ResultFile, against, count, markdown, not_m
 
 Files = Mapping[str, ResultFile | None]
 _DAMPING = (
-    "At (beta, Omega) = (1, 0.1), one core. From some damping on `direct` takes an implicit scheme (Radau IIA), whose cost "
-    "does not depend on the damping; an explicit one, as Taylor series are, needs steps as short as the fastest decay. "
-    "Differences are those of the two spectral radii."
+    "At (beta, Omega) = (1, 0.1), one core. At strong damping `direct` changes to an implicit scheme (Radau IIA); its cost "
+    "is independent of damping. An explicit scheme, such as a Taylor series, needs steps as short as the fastest decay. "
+    "The difference is that of the two spectral radii."
 )
 _SCALING = {
     "batches": (
         "### Batch width, number of points, cores, states",
-        "`width` and `planets`: one kernel on one core; `points` and `cores`: a run from its start to a file.",
+        "`width` and `planets`: one kernel on one core. `points` and `cores`: a run from its start to the file.",
     ),
     "outputs": (
         "### What each output costs",
-        "Kernels contain what is asked for and nothing else, and what does not vary is a constant of them. Times are those "
-        "of one core, over that of the first set of each system.",
+        "A kernel computes only the requested outputs. Times are relative to the first set of outputs of each system, on "
+        "one core.",
     ),
-    "cold_start": ("### Cold start of a small scene", "In seconds; `compiled code`: the folder that it is kept in."),
-    "overhead": ("### The engine beside its kernels", ""),
+    "cold_start": ("### Cold start of a small scene", "In seconds. `compiled code`: state of the compilation cache."),
+    "overhead": ("### Overhead of the engine over its kernels", ""),
 }
 
 
 def damping_sentence(file: ResultFile | None) -> str:
-    """Who is faster at which damping, and why."""
+    """The ratio of speeds of `direct` and heyoka for each damping."""
     told: list[str] = []
     rates: dict[str, dict[str, float]] = {}
     for row in file.rows if file else ():
         rates.setdefault(row["zeta"], {})[row["method"].partition(",")[0]] = float(row["us_per_point"])
     for zeta, spent in rates.items():
         told.append(f"{against(spent['heyoka batch'] / spent['package'], 'heyoka batch')} at zeta = {float(zeta):g}")
-    words = "its implicit scheme, taken where damping is strong, costs the same however strong it is"
-    return f"At Omega = 0.1, `direct` is {', '.join(told)}: {words}." if told else ""
+    words = "At strong damping it changes to an implicit scheme, whose cost is independent of damping"
+    return f"At Omega = 0.1, `direct` is {', '.join(told)}. {words}." if told else ""
 
 
 def atlas(file: ResultFile | None) -> str:
-    """What an atlas takes, next to heyoka and SciPy."""
+    """Cost and error of an atlas compared with heyoka and SciPy."""
     heads = {
         "chart": "cells", "method": "method", "cells_computed": "computed", "cells_per_s": "cells/s",
         "times_heyoka": "times heyoka", "max_error": "largest error", "median_bound": "median bound", "peak_MB": "peak MB",
@@ -49,7 +49,7 @@ def atlas(file: ResultFile | None) -> str:
 
 
 def scaling(files: Files) -> list[str]:
-    """Batches, outputs, cold start and the engine's own work."""
+    """Batches, outputs, cold start and the overhead of the engine."""
     found: list[str] = []
     for name, (title, words) in _SCALING.items():
         file = files[name]
@@ -59,7 +59,7 @@ def scaling(files: Files) -> list[str]:
 
 
 def peers(files: Files, images: str) -> list[str]:
-    """Every peer that is not part of the work-precision."""
+    """Tables of the peers that work-precision does not cover."""
     shafts = {"method": "method", "shafts_per_s": "shafts/s", "ratio": "times", "max_difference": "largest difference"}
     gears = {"planets": "planets", "method": "method", "gears_per_s": "gears/s", "over_numpy_svd": "times NumPy svd",
              "error": "error", "rigid_Hz": "rigid mode / Hz"}  # fmt: skip
@@ -95,7 +95,7 @@ def peers(files: Files, images: str) -> list[str]:
 
 
 def figure(files: Files, name: str, images: str, words: str) -> str:
-    """The link to a figure whose file of numbers is there."""
+    """The link to a figure, or "Not measured" without its CSV file."""
     return f"![{words}]({images}{name}.png)" if files[name] else not_measured(name)
 
 

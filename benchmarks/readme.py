@@ -1,4 +1,4 @@
-"""The measured part of the README, from the result files alone; `python -m benchmarks.page` writes it with the page."""
+"""Generate the measured part of README.md from the result files; `python -m benchmarks.page` writes it."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ NAMES = (
 OWN = "drivetrain_jax direct"
 LABELS = {
     OWN: "**`direct`**",
-    "heyoka batch": "heyoka, a compiled Taylor integrator",
-    "scipy DOP853 stacked": "SciPy DOP853, the whole grid as one state",
+    "heyoka batch": "heyoka (compiled Taylor integrator)",
+    "scipy DOP853 stacked": "SciPy DOP853, whole grid as one state",
     "scipy DOP853": "SciPy DOP853, point by point",
     "scipy RK45": "SciPy RK45, point by point (the paper's method)",
     "drivetrain_jax diffrax": "`diffrax` under vmap",
@@ -25,7 +25,7 @@ LABELS = {
 
 
 def section(folder: Path = RESULTS) -> str:
-    """The text between the marks."""
+    """The text between the two marks."""
     files = {name: load(folder, name) for name in NAMES}
     told = [
         page.critical_sentence(files["critical_speeds"]),
@@ -42,8 +42,8 @@ def section(folder: Path = RESULTS) -> str:
 
 
 def _machines(files: page.Files) -> str:
-    """That not all was measured on the machine of the chart, if so."""
-    told = f"{page.machine(files)} [The page](docs/benchmarks.md) names that of every file."
+    """A sentence that names the machines; empty if all files have the same one."""
+    told = f"{page.machine(files)} [The page](docs/benchmarks.md) names the machine of every file."
     return told if len(page.machines(files)) > 1 else ""
 
 
@@ -59,9 +59,9 @@ def _chart(file: ResultFile | None) -> list[str]:
         for row in sorted(shown, key=lambda row: -float(row["cells_per_s"]))
     ]
     head = (
-        f"Spectral radius on the {file.notes[0]}, compilation apart; of the rivals the fastest setting whose largest error "
-        f"is at most {GOAL:g}, else the most exact. Of these, `direct` alone gives an error bound for every cell. "
-        + page.machine({"throughput": file})
+        f"Spectral radius, {file.notes[0]}, without compilation. Each rival is shown at its fastest setting with an error "
+        f"of at most {GOAL:g}, or at its most accurate setting if it never gets there. Only `direct` gives an error bound "
+        "for every cell. " + page.machine({"throughput": file})
     )
     return [head, markdown(["method", "cells/s", "largest error"], rows)]
 
@@ -83,15 +83,15 @@ def _atlas(file: ResultFile | None) -> str:
         kind = row["method"].removeprefix("atlas, ")
         if kind in rates:
             rates[kind].append(float(row["cells_per_s"]))
-    told = [f"up to {count(max(rates[kind]))} {what} a second" for kind, what in _KINDS.items() if rates[kind]]
+    told = [f"up to {count(max(rates[kind]))} {what} per second" for kind, what in _KINDS.items() if rates[kind]]
     sliced = next((row for row in file.rows if "four parameters" in row["method"]), None)
     if sliced:
         time = seconds(float(sliced["cells_computed"]) / float(sliced["cells_per_s"]))
-        told.append(f"one over four parameters gives any chart of {count(sliced['cells_computed'])} cells in {time}")
-    return f"An atlas, with bounds and verdicts: {'; '.join(told)}."
+        told.append(f"a chart of {count(sliced['cells_computed'])} cells from a four-parameter atlas in {time}")
+    return f"Evaluation of an atlas, with bounds and verdicts: {'; '.join(told)}."
 
 
-_KINDS = {"evaluation": "cells of a chart", "points": "points"}
+_KINDS = {"evaluation": "grid cells", "points": "scattered points"}
 
 
 def _memory(file: ResultFile | None) -> str:
@@ -99,14 +99,14 @@ def _memory(file: ResultFile | None) -> str:
         return ""
     row = max(file.rows, key=lambda row: float(row["points"]))
     took = f"{seconds(row['seconds'])}, {row['resident_mb']} MB of memory"
-    return f"A sweep of {count(row['points'])} points of the cheapest analysis, one result each, to a file: {took}."
+    return f"A sweep of {count(row['points'])} points to a file, cheapest analysis, one result per point: {took}."
 
 
 def written(text: str, folder: Path = RESULTS) -> str:
-    """``text`` of a README with its measured part made from the files in ``folder``."""
+    """``text`` with its measured part replaced from the files in ``folder``."""
     return between_marks(text, section(folder))
 
 
 def write_readme() -> None:
-    """Write the measured part of the README anew."""
+    """Rewrite the measured part of README.md."""
     README.write_text(written(README.read_text()))

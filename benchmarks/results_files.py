@@ -1,4 +1,4 @@
-"""Result files as the page reads them: rows, the head with its provenance, numbers and tables in Markdown."""
+"""Read result files, and format their numbers and tables as Markdown."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 Row = Mapping[str, str]
-# Times that differ by less are not told apart from one run to the next.
+# Ratio of times below which two runs cannot be distinguished.
 LEVEL = 1.1
-# Around what is written in a page that is otherwise typed.
+# Marks around the generated part of a page.
 BEGIN = "<!-- Written by `python -m benchmarks.page`; do not edit. -->"
-END = "<!-- End of what is written. -->"
+END = "<!-- End of the generated part. -->"
 _PROVENANCE = ("date", "machine", "load", "versions", "accelerator")
 
 
 @dataclass(frozen=True)
 class ResultFile:
-    """A CSV of results: ``facts`` (date, machine, load, versions), ``notes`` of its head, ``rows``."""
+    """A CSV file of results: ``facts`` (date, machine, load, versions), ``notes`` from its head, ``rows``."""
 
     name: str
     facts: Mapping[str, str]
@@ -42,7 +42,7 @@ def load(folder: Path, name: str) -> ResultFile | None:
 
 
 def count(value: str | float) -> str:
-    """A rate or a number of things, with thousands separated: two or three significant digits."""
+    """A count or rate with three significant digits and separated thousands."""
     number = float(value)
     if number >= 100:
         return f"{float(f'{number:.3g}'):,.0f}"
@@ -50,7 +50,7 @@ def count(value: str | float) -> str:
 
 
 def plain(text: str) -> str:
-    """A cell as it stands, but ``8,192`` for 8192, ``1,110`` for 1.11e+03, and nothing for a number that there is not."""
+    """A cell of a table: ``8,192`` for 8192, ``1,110`` for 1.11e+03, empty for NaN, other text unchanged."""
     if text.isdecimal():
         return f"{int(text):,}"
     try:
@@ -63,7 +63,7 @@ def plain(text: str) -> str:
 
 
 def small(value: str | float) -> str:
-    """An error: one significant digit and a half, ``2.4e-10``."""
+    """An error with two significant digits, ``2.4e-10``."""
     number = float(value)
     if math.isnan(number):
         return "none"
@@ -71,7 +71,7 @@ def small(value: str | float) -> str:
 
 
 def seconds(value: str | float) -> str:
-    """A time in the unit that suits it."""
+    """A time in s, ms, us or ns."""
     number = float(value)
     for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)):
         if number >= scale or unit == "ns":
@@ -80,17 +80,17 @@ def seconds(value: str | float) -> str:
 
 
 def times(ratio: float) -> str:
-    """``1.7`` or ``860``: how many times, two significant digits (three above 100)."""
+    """A ratio with two significant digits (three above 100): ``1.7``, ``860``."""
     return f"{float(f'{ratio:.2g}'):g}" if ratio < 100 else f"{float(f'{ratio:.3g}'):,.0f}"
 
 
 def is_level(ratio: float) -> bool:
-    """Whether two speeds are not told apart: another run may turn such a ratio round."""
+    """True if two speeds cannot be distinguished: another run may reverse their order."""
     return 1 / LEVEL < ratio < LEVEL
 
 
 def against(ratio: float, rival: str) -> str:
-    """A comparison of speeds in words that follow from the figure."""
+    """A comparison of speeds in words."""
     if is_level(ratio):
         return f"level with {rival}"
     return f"{times(ratio)} times as fast as {rival}" if ratio > 1 else f"{times(1 / ratio)} times slower than {rival}"
