@@ -256,8 +256,8 @@ def overhead_sentence(file: ResultFile | None) -> str:
     row = file.rows[0]
     return (
         f"From scene to file, {count(row['points'])} points take {100 * float(row['engine_over_kernels']):.1f} % longer "
-        f"than the kernels alone. The file has {float(row['bytes_per_point']):.3g} bytes per point. Reopening a finished run "
-        f"takes {seconds(row['resume_s'])}."
+        f"than the kernels alone. The file has {float(row['bytes_per_point']):.3g} bytes per point. Reopening a finished "
+        f"run takes {seconds(row['resume_s'])}."
     )
 
 

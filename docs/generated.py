@@ -1,6 +1,8 @@
-"""Directives whose tables come from the code: parameters, analyses, scenes, outcomes, what a file holds, the gallery.
+"""Tables of the documentation that come from the code: parameters, analyses, scenes, outcomes, file contents, figures.
 
-Each writes Markdown and lets the page's parser read it, so that a table in a page cannot differ from the package.
+    python docs/generated.py      # rewrites the tables in docs/, between their marks
+
+A table stands in its page between two comments, ``<!-- generated: NAME [SYSTEM] -->`` and ``<!-- end of generated -->``.
 """
 
 from __future__ import annotations
@@ -9,33 +11,53 @@ import re
 import tomllib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
-from docutils import nodes
-from sphinx.util.docutils import SphinxDirective
+import gallery
 
 import drivetrain_jax as dt
 from drivetrain_jax._quantities import Parameter, Variable
 from drivetrain_jax.analysis import Analysis, Outcome, get_analysis
 from drivetrain_jax.runs.toml import entries
-from drivetrain_jax.systems import System, get_system
+from drivetrain_jax.systems import System, get_system, system_names
 from drivetrain_jax.view.style import symbol
 
-ROOT = Path(__file__).parents[1]
-GALLERY = ROOT / "out" / "gallery"
+DOCS = Path(__file__).parent
+FIGURES = DOCS.parent / "out" / "gallery" / "index.md"
+_MARKS = re.compile(r"(<!-- generated: (\S+)(?: (\S+))? -->\n).*?(<!-- end of generated -->)", re.S)
 
 MEANINGS = {
-    Outcome.SUCCESS: "the value is there, within the target",
-    Outcome.TOLERANCE_NOT_MET: "the value is there with its error, which exceeds the target",
-    Outcome.NOT_CONVERGED: "an iteration found nothing; NaN",
-    Outcome.STEP_LIMIT: "the point would take more steps than are allowed; NaN",
-    Outcome.NOT_FINITE: "overflow, or a model without a value there; NaN",
-    Outcome.LOST: "the process that computed it died every time; NaN. Another run tries again",
+    Outcome.SUCCESS: "the value meets its target",
+    Outcome.TOLERANCE_NOT_MET: "the value is stored; its error exceeds the target",
+    Outcome.NOT_CONVERGED: "NaN: an iteration did not converge",
+    Outcome.STEP_LIMIT: "NaN: the point needs more steps than the limit",
+    Outcome.NOT_FINITE: "NaN: overflow, or the model has no value",
+    Outcome.LOST: "NaN: the chunk crashed its worker three times; another run tries again",
+}
+ATTRIBUTES = {
+    "Conventions": "version of the CF conventions",
+    "title": "title of the scene, or of its system and analysis",
+    "system": "name of the system",
+    "roles": "parameters that are the speed, the angle, the damping, ... (JSON)",
+    "analysis": "name of the analysis",
+    "method": "method of the scene",
+    "options": "options of the scene with defaults (JSON)",
+    "source": "paper that the system is taken from",
+    "scene": "text of the scene (TOML)",
+    "fixed_parameters": "value, unit and meaning of every fixed parameter (JSON)",
+    "drivetrain_jax_version": "version of this package",
+    "versions": "versions of the numerical packages",
+    "machine": "processor, cores, operating system, Python",
+    "created": "time at which the file was completed (UTC)",
+    "digest": "digest of scene, chunk sizes and numerics; runs of one digest give identical bits",
+    "numerics": "digest of `numerics_detail`",
+    "numerics_detail": "digests of the source files, versions, instruction set (JSON)",
+    "wall_time_s": "time of the computation in s",
 }
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table; bars within cells are escaped."""
+    """A Markdown table; vertical bars in cells are escaped."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |" for line in lines) + "\n"
 
@@ -63,7 +85,7 @@ def _parameter_row(parameter: Parameter) -> tuple[str, ...]:
 
 
 def default_text(parameter: Parameter) -> str:
-    """The default as a reader would write it."""
+    """The default value as text."""
     if parameter.derived:
         return parameter.derived
     if parameter.default is None:
@@ -72,7 +94,7 @@ def default_text(parameter: Parameter) -> str:
 
 
 def value_text(value: Any) -> str:
-    """A word, a number or a list of numbers."""
+    """A word, a number or a list of numbers as text."""
     if isinstance(value, tuple):
         return ", ".join(map(value_text, value))
     return f"{value:.10g}" if isinstance(value, float) else str(value)
@@ -91,7 +113,7 @@ def _analysis(analysis: Analysis, system: System) -> str:
     used = {name: options for name, options in analysis.methods.items() if name not in lacking}
     methods = ", ".join(f"`{name}` ({', '.join(options) or 'no options'})" for name, options in used.items())
     heading = f"### `{analysis.name}`\n\n{analysis.title[0].upper()}{analysis.title[1:]}."
-    text = f"{heading}\n\n{results}\nMethods and the options they use, the first by default: {methods}.\n"
+    text = f"{heading}\n\n{results}\nMethods (options), the default first: {methods}.\n"
     rows = [_parameter_row(option)[1:] for option in analysis.options]
     return text + ("\n" + table(("option", "meaning", "unit", "allowed", "default"), rows) if rows else "")
 
@@ -103,9 +125,9 @@ def _variable_row(variable: Variable, analysis: Analysis) -> tuple[str, ...]:
 
 
 def scenes(system: str) -> str:
-    """The scenes of a system, each with what it is about."""
+    """The scenes of a system with their titles."""
     rows = []
-    for path in sorted((ROOT / "sweeps").glob("*.toml")):
+    for path in sorted(gallery.SCENES.glob("*.toml")):
         scene = tomllib.loads(path.read_text())
         if scene["system"] == system:
             rows.append((f"`sweeps/{path.name}`", scene["title"], f"`{scene['analysis']}`"))
@@ -118,7 +140,7 @@ def outcomes() -> str:
 
 
 def file_contents() -> str:
-    """Variables and attributes of a result, read from one."""
+    """Variables and attributes of a result of the analysis ``floquet``."""
     axes = {"beta": {"values": [0.1, 0.3]}, "Omega": {"values": [1.0, 1.4]}}
     fixed = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
     result = dt.run({"system": "cardan", "analysis": "floquet", "axes": axes, "fixed": fixed})
@@ -126,48 +148,50 @@ def file_contents() -> str:
         (f"`{name}`", ", ".join(v.dims), str(v.dtype), v.attrs["units"], v.attrs["long_name"])
         for name, v in result.variables.items()
     ]
-    attributes = [(f"`{name}`", f"`{_one_line(value)}`") for name, value in result.attrs.items()]
-    return (
-        table(("variable", "dimensions", "type", "units", "long_name"), rows)
-        + "\n"
-        + table(("attribute", "here"), attributes)
-    )
+    variables = table(("variable", "dimensions", "type", "units", "long_name"), rows)
+    return f"{variables}\n{table(('attribute', 'meaning'), [(f'`{name}`', ATTRIBUTES[name]) for name in result.attrs])}"
 
 
-def _one_line(value: Any) -> str:
-    text = " ".join(str(value).split()).replace("`", "'")
-    return text if len(text) <= 90 else text[:87] + "..."
+def figures() -> str:
+    """The figures of the gallery by system, with the scenes that they come from."""
+    rows = [
+        (get_system(item.system).title, item.title, ", ".join(f"`{scene.stem}`" for scene in item.scenes))
+        for item in gallery.items(gallery.SCENES)
+    ]
+    return table(("system", "figure", "scenes in `sweeps/`"), rows)
 
 
-def gallery() -> str:
-    """The figures that `make gallery` has rendered, or how to get them."""
-    page = GALLERY / "index.md"
-    if not page.exists():
-        return "This copy was built without figures: `make gallery` renders them, `make docs` then includes them.\n"
-    return page.read_text().replace("](", "](../out/gallery/")
+SOURCES = {f.__name__.replace("_", "-"): f for f in (parameters, analyses, scenes, outcomes, file_contents, figures)}
 
 
-class Generated(SphinxDirective):
-    """Parses what one of the functions above writes in place of the directive."""
+def written(text: str) -> str:
+    """``text`` of a page with its generated tables replaced."""
 
-    optional_arguments = 1
-    sources: ClassVar = {
-        f.__name__.replace("_", "-"): f for f in (parameters, analyses, scenes, outcomes, file_contents, gallery)
-    }
+    def replaced(found: re.Match[str]) -> str:
+        begin, name, argument, end = found.groups()
+        return f"{begin}\n{SOURCES[name](*filter(None, [argument]))}\n{end}"
 
-    def run(self) -> list[nodes.Node]:
-        """The nodes of the generated Markdown."""
-        return self.parse_text_to_nodes(self.sources[self.name](*self.arguments), allow_section_headings=True)
+    return _MARKS.sub(replaced, text)
 
 
-def unlink_folders(app: Any, page: str, source: list[str]) -> None:
-    """Links to folders of the repository are of use there only: on the site their text is left."""
+def pages() -> list[Path]:
+    """The pages that have generated tables."""
+    return [*(DOCS / "systems" / f"{name}.md" for name in system_names()), DOCS / "file_format.md", DOCS / "gallery.md"]
+
+
+def adapt_to_site(app: Any, page: str, source: list[str]) -> None:
+    """On the site, drop links to folders of the repository and append the figures of `make gallery`."""
     source[0] = re.sub(r"\[([^\]]*)\]\(\.\./[^)#]*/\)", r"\1", source[0])
+    if page == "gallery" and FIGURES.exists():
+        source[0] += "\n" + FIGURES.read_text().replace("](", "](../out/gallery/")
 
 
 def setup(app: Any) -> dict[str, bool]:
-    """Registers a directive for every table."""
-    app.connect("source-read", unlink_folders)
-    for name in Generated.sources:
-        app.add_directive(name, Generated)
+    """Sphinx extension: adapt every page to the site."""
+    app.connect("source-read", adapt_to_site)
     return {"parallel_read_safe": True}
+
+
+if __name__ == "__main__":
+    for path in pages():
+        path.write_text(written(path.read_text()))
