@@ -59,14 +59,14 @@ def inject(bench: Bench, kind: str, function) -> Record:
 
 
 def heading(bench: Bench, records: list[Record], seconds: float) -> str:
-    """Where and how the table came about."""
+    """The machine, the seed and the meaning of the columns."""
     hits = sum(r.hit for r in records)
     total = bench.status(bench.reference).total
     return (
-        f"{len(records)} injections, {hits} of them while the run was at work; chart of {total} points, "
+        f"{len(records)} injections, {hits} of them during the computation; chart of {total} points, "
         f"{bench.duration:.1f} s undisturbed; seed {bench.seed}; {seconds / 60:.0f} minutes on {machine()}, {now()[:10]}. "
-        "Lost: points that were there after the fault and had to be computed again. Wrong: variables that differ from "
-        "those of an undisturbed run in a bit, a label or their encoding. Orphans: processes left behind."
+        "Lost: finished points that were computed again. Wrong: variables that differ from an undisturbed run in a bit, a "
+        "label or their encoding. Orphans: processes that still run."
     )
 
 
@@ -76,7 +76,7 @@ def table(records: list[Record]) -> list[str]:
     for record in records:
         rows[record.kind].append(record)
     lines = [
-        "| fault | injections | at work | exit codes | points reused | lost | wrong | orphans | other problems |",
+        "| fault | injections | during computation | exit codes | points reused | lost | wrong | orphans | other problems |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     rows = {kind: rows[kind] for kind, *_ in KINDS if kind in rows}
