@@ -1,6 +1,6 @@
-"""docs/validation/<system>.md, regenerated: what a paper prints, what this package computes, and why they differ.
+"""Generate docs/validation/<system>.md: published and computed values, and the reasons of their differences.
 
     python -m benchmarks.validation [SYSTEM ...] [--full]      # --full: comparisons over whole charts, not samples
 
-Every number of the package is set beside an independent one by NumPy and SciPy where that is feasible.
+Numbers of the package are compared with independent ones by NumPy and SciPy where that is feasible.
 """

@@ -61,13 +61,13 @@ def section_four() -> str:
     second = markdown(("case [rpm]", "printed", "ours, 30 p/pi", "printed p x 30/3.14"), speeds)
     return f"""## Section 4: pulsations and critical speeds
 
-E and I are not printed. With E = 2.1e11 N/m2, rho = 7800 kg/m3 and the printed areas (A2 = 3.6e-4 m2 is not the area
-of the 50/45 tube, 3.7306e-4), rounded I of 3.055e-7, 1.055e-7, 3.97e-8 m4 and uniform bars of 3 x 0.30 = 0.90 m (not
-0.91) reproduce the printed values; only the solid bar (I = 3.05e-7) keeps a gap of 0.06 %. "Independent" are finite
-elements of high degree (benchmarks/bicardan_reference.py). "Exact I" has the moments of the diameters 50, 50/45, 30 mm.
+The paper does not print E and I. These values reproduce its results: E = 2.1e11 N/m2, rho = 7800 kg/m3, the printed areas,
+I = 3.055e-7, 1.055e-7, 3.97e-8 m4, and uniform bars of 3 x 0.30 = 0.90 m (not 0.91). A2 = 3.6e-4 m2 is not the area of the
+50/45 tube, 3.7306e-4. The solid bar (I = 3.05e-7) differs by 0.06 %. "Independent": finite elements of high degree
+(benchmarks/bicardan_reference.py). "Exact I": moments of the diameters 50, 50/45, 30 mm.
 
 {table}
-The printed critical speeds follow from the printed pulsations with 3.14 for pi, which makes them 0.05 % too high:
+The paper computes critical speeds with 3.14 for pi, so they are 0.05 % too high:
 
 {second}"""
 
@@ -79,8 +79,8 @@ def formula_31() -> str:
     ours = float(solve(PRESETS["paper_fitted"], ("critical_speed",), modes=1).critical_speed[0])
     rows = [
         ["n of (31), D = 5, d = 4.5, L = 91 cm", "", f"{rule:.2f}", ""],
-        ["its excess over the printed n1 = 8375.78", "17 %", f"{100 * (rule / 8375.78 - 1):.2f} %", ""],
-        ["its excess over the computed n1", "", f"{100 * (rule / ours - 1):.2f} %", "(31) is a uniform pinned tube"],
+        ["excess over the printed n1 = 8375.78", "17 %", f"{100 * (rule / 8375.78 - 1):.2f} %", ""],
+        ["excess over the computed n1", "", f"{100 * (rule / ours - 1):.2f} %", "(31) is a uniform pinned tube"],
     ]
     return f"## Conclusion 1: formula (31)\n\n{markdown(('quantity', 'printed', 'ours', 'why'), rows)}"
 
@@ -109,7 +109,7 @@ def conclusions() -> str:
         ["3", "k_D 20e6 to 85e6: amplitude at D drops four times (f_A = 1)", f"{ends[0] / ends[1]:.2f} times", "yes"],
         [
             "3",
-            "... and so in the characteristic points",
+            "... and at the characteristic points",
             f"largest deflection {middle[0] / middle[1]:.3f} times",
             "no: at D only",
         ],
@@ -129,7 +129,7 @@ def conclusions() -> str:
             "5",
             "a shorter shaft raises n2 (here 0.9 of all lengths)",
             f"n2 {short[1] / n[0][1] - 1:+.2%}",
-            "yes; less than 1/0.81 as the supports stay",
+            "yes; less than 1/0.81, because the supports stay",
         ],
     ]
     return f"## Conclusions 2 to 5\n\n{markdown(('no.', 'the paper', 'ours', 'holds'), rows)}"
@@ -158,7 +158,7 @@ def _printed_determinant(p: float, parameters: Parameters) -> float:
 
 
 def printed_errors() -> str:
-    """The errors of print and what they do."""
+    """The printing errors and their effects."""
     effects = []
     for name, shaft in (("fitted", PRESETS["paper_fitted"]), ("exact areas and moments", EXACT_SECTIONS)):
         wrong, right = printed_row_of_seven(shaft), float(frequencies(shaft, 1)[0])
@@ -170,7 +170,7 @@ def printed_errors() -> str:
         ["(26)", "theta_A = -R32/R31", "-k_A R32/R31", "dimension: F_A = k_A for f_A = 1"],
         ["(30)", "[alpha3] F [alpha3]", "[alpha3]^-1 F [alpha3]", "as in (28)"],
     ]
-    return f"## Errors of print\n\n{markdown(('place', 'printed', 'right', 'how we know'), rows)}"
+    return f"## Printing errors\n\n{markdown(('place', 'printed', 'right', 'evidence'), rows)}"
 
 
 def numerics() -> str:
@@ -199,16 +199,16 @@ def numerics() -> str:
         "NumPy, Brent",
         "certified by the count",
     )
-    return f"""## How far the determinant carries
+    return f"""## Range of the plain determinant
 
-Relative differences from the certified method, for the shaft of three segments with exact I. The determinant cancels
-like exp(tau), tau being the sum of all phases; near mode 12 nothing is left, and the count says so.
+Relative differences from the certified method, for the shaft of three segments with exact I. Cancellation in the
+determinant grows like exp(tau), where tau is the sum of all phases. Near mode 12 no digit is left, and the count fails.
 
 {markdown(head, rows)}"""
 
 
 def additions() -> str:
-    """What the paper does not have, against finite elements."""
+    """Extensions of the paper's model, compared with finite elements."""
     tube = PRESETS["paper_tube"]
     area, moment = 3.6e-4, 1.055e-7
     thick = {"kGA": (0.53 * 8.1e10 * area,) * 3, "rhoI": (7800 * moment,) * 3}
@@ -230,9 +230,9 @@ def additions() -> str:
     head = ("tube 50/45, 3 x 0.30 m, with", "p1", "p2", "finite elements differ by", "p1", "p2")
     return f"""## Beyond the paper
 
-The last two columns compare with the same supports and nothing added. Shear (0.53 G A, G = 8.1e10 N/m2) and rotary
-inertia lower p2 by 3.3 % on the paper's supports and by 3.9 % on stiff ones (1e12 N/m), where the shaft itself has to
-give more.
+The last two columns compare with the plain tube on the same supports. Shear (0.53 G A, G = 8.1e10 N/m2) and rotary
+inertia lower p2 by 3.3 % on the paper's supports. On stiff supports (1e12 N/m), where the shaft itself deforms more,
+they lower it by 3.9 %.
 
 {markdown(head, rows)}"""
 
@@ -242,7 +242,7 @@ def page(full: bool) -> Page:
     del full
     introduction = (
         "I. Bulac, *Vibrations of the bicardanic transmissions with elastic supports*, Fiabilitate si Durabilitate, "
-        "Supplement 1/2012, computed again."
+        "Supplement 1/2012, compared with this package."
     )
     sections = [section_four(), formula_31(), conclusions(), printed_errors(), numerics(), additions()]
     return Page("Validation: bicardanic shaft", introduction, sections)

@@ -142,7 +142,7 @@ def _speed_reason(printed: float, from_printed: float, exact: float) -> str:
         )
     if abs(exact - printed) < 0.00051:
         return "agrees with the exact frequency, not with the printed one"
-    return "follows from neither set of frequencies in its last digit"
+    return "its last digit follows from neither set of frequencies"
 
 
 def equations_section(stride: int) -> str:
@@ -154,8 +154,8 @@ def equations_section(stride: int) -> str:
     cells = base_chart(stride)["beta"].size
     fraction, dropped = unstable_fraction(damping_and_stiffness, stride)
     printed, sign_only = (unstable_fraction(printed_matrices(sign), stride)[0] for sign in (1.0, -1.0))
-    impossible = "unstable almost everywhere, impossible next to Figs 2-3: the authors cannot have computed with (15)"
-    blank = "without eta'' and with eta' in place of 2 eta' the chart is silently blank"
+    impossible = "unstable almost everywhere, against Figs 2-3, so the authors did not compute with (15)"
+    blank = "without eta'' and with eta' in place of 2 eta' the chart is empty"
     clause = "share of the unstable cells that 'or Re(sigma) <= 0' calls stable"
     share = f"{1 - kept.sum() / unstable.sum():.3f}"
     origin = "linearisation of the paper's (1), (5), (6)"
@@ -267,10 +267,9 @@ def forced_section() -> str:
             [f"{at} amplitudes of the orbit / rad", _pair(ours.orbit_amplitude[i].values), _pair(amplitude)],
         ]
     text = (
-        "The paper keeps the forcing (0, -eta')^T in (15) but judges stability by the homogeneous part, that is about "
-        "theta = 0. "
-        "The shaft moves along the forced periodic orbit instead; where the verdicts differ, the orbit's counts. "
-        "Nothing is published here.\n"
+        "The paper keeps the forcing (0, -eta')^T in (15), but judges stability by the homogeneous part, about "
+        "theta = 0. The shaft moves along the forced periodic orbit instead. Where the verdicts differ, that of the "
+        "orbit is right. The paper publishes no values here.\n"
     )
     return (
         "## Forced response and the true orbit\n\n"

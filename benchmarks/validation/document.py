@@ -1,4 +1,4 @@
-"""A validation page: Markdown made of sections, each with its tables."""
+"""A validation page in Markdown, made of sections with tables."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ Rows = Sequence[Sequence[str]]
 
 @dataclass(frozen=True)
 class Page:
-    """What is compared for one system: ``title`` and ``introduction``, then ``sections`` in Markdown."""
+    """The validation page of one system: ``title``, ``introduction`` and ``sections`` in Markdown."""
 
     title: str
     introduction: str
     sections: Sequence[str]
 
     def write(self, system: str, full: bool) -> Path:
-        """Write docs/validation/<system>.md with the machine and the versions that computed it."""
+        """Write docs/validation/<system>.md with the machine and the versions at its end."""
         command = f"python -m benchmarks.validation {system}{' --full' if full else ''}"
         head = f"# {self.title}\n\n{self.introduction} Written by `{command}`; do not edit.\n"
         facts = provenance()

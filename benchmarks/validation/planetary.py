@@ -96,8 +96,9 @@ def table_1() -> str:
     frequency, types = ds.natural_frequency.values, kinds(ds)
     rows = [_row(i, types[i - 1], frequency[i - 1], exact[i - 1], printed) for i, printed in TABLE_1.items()]
     text = (
-        'The paper reports errors of "0.04 %" against Lin & Parker. They are pi/3.14 = 1.000507: the frequencies were '
-        "divided by 2 x 3.14 and cut, not rounded, after one decimal. Times pi/3.14 all entries agree to that cut.\n"
+        'The paper reports errors of "0.04 %" against Lin & Parker. The factor is pi/3.14 = 1.000507: the '
+        "frequencies were divided by 2 x 3.14, and truncated after one decimal. Computed values times pi/3.14, "
+        "truncated, give every entry.\n"
     )
     return f"## Table 1: four equally spaced planets (Hz)\n\n{text}\n{markdown(HEAD, rows)}"
 
@@ -109,8 +110,8 @@ def table_3() -> str:
     planets = tuple(TABLE_1[i] for i in (7, 14, 15))
     printed = {"rotational": rotational, "planet": planets, "translational": TABLE_3}
     text = (
-        "sum exp(i psi) = 0 and sum exp(2 i psi) is not: the translational pairs split, everything else stays, as the "
-        "paper says.\n"
+        "Here sum exp(i psi) = 0, but sum exp(2 i psi) is not zero. The translational pairs split and all other "
+        "modes stay, as the paper says.\n"
     )
     unequal = markdown(HEAD, _by_kind(ds, exact, printed, PRINTED_PI))
     degrees = (0, 90, 180, 270)
@@ -138,12 +139,11 @@ def table_5() -> str:
     nearest = [f"{angle:.1f}" for angle in NEAREST_THREE]
     left = [_distance_of_unequal_three(NEAREST_THREE, 1.0), _distance_of_unequal_three((120, 240), PRINTED_PI)]
     text = (
-        "The column for unequal spacing gives no angles, and none reproduce it. Of all angles, in steps of 4 degrees and "
-        f"from the best of them refined, {nearest[0]} and {nearest[1]} degrees come nearest if frequencies have the true "
-        f"pi; they leave {left[0]:.1f} Hz. With pi/3.14 equal spacing itself is nearest and leaves {left[1]:.1f} Hz: the "
-        "second table. With three planets "
-        "sum exp(i psi) = 0 only if they are equally spaced: every unequal spacing couples rotation with translation, "
-        "and the modes that the paper reports as missing exist.\n"
+        "The column for unequal spacing states no angles, and no angles reproduce it. All angles were "
+        "searched in steps of 4 degrees, and the best ones refined. With the true pi the closest angles are "
+        f"{nearest[0]} and {nearest[1]} degrees, with a difference of {left[0]:.1f} Hz. With pi/3.14 equal spacing is "
+        f"closest, with {left[1]:.1f} Hz (second table). Three planets have sum exp(i psi) = 0 only at equal spacing. Any unequal spacing "
+        "couples rotation with translation, and the modes that the paper calls missing exist.\n"
     )
     return f"## Table 5: three planets (Hz)\n\n{equal}\n{text}\n{own}"
 
@@ -177,11 +177,11 @@ def _unequal_five() -> str:
         row = _row(i + 1, types[i], frequency[i], exact[i], value)
         rows.append([*row[:2], f"{shares[i, 0]:.4f}", *row[2:]])
     text = (
-        "At 0, 72, 144, 252, 324 degrees the paper states that the rotational modes stay and the translational ones do "
-        "not appear. The condition for uncoupled rotation is sum exp(i psi) = 0; the sum of the sines alone, (30b), which "
-        "these angles fulfil, does not suffice. Here |sum exp(i psi)|/5 = 0.2: all modes exist, and those that are "
-        "neither rigid nor planet modes are coupled. The printed values are those of equal spacing times pi/3.14, within "
-        "1.1 Hz; beside them stand the coupled modes nearest to them.\n"
+        "For 0, 72, 144, 252, 324 degrees the paper states that the rotational modes stay and the translational "
+        "ones vanish. Uncoupled rotation needs sum exp(i psi) = 0. The sum of the sines alone, (30b), which these "
+        "angles satisfy, is not sufficient. Here |sum exp(i psi)|/5 = 0.2: all modes exist, and all except rigid "
+        "and planet modes are coupled. The printed values agree within 1.1 Hz with equal spacing times pi/3.14. The "
+        "table also lists the closest coupled modes.\n"
     )
     return f"{text}\n{markdown(head, rows)}"
 
@@ -198,8 +198,8 @@ def _balanced_five(equal: Any) -> str:
     ]
     count = int((kinds(ds) == "translational").sum())
     text = (
-        "At 0, 30, 120, 210, 240 degrees five unequally spaced planets balance. The rotational modes are those of equal "
-        f"spacing, and {count} translational modes exist.\n"
+        "At 0, 30, 120, 210, 240 degrees five unequally spaced planets are balanced. The rotational modes are those "
+        f"of equal spacing, and {count} translational modes exist.\n"
     )
     return f"{text}\n{markdown(['rotational, balanced unequal spacing', 'rotational, equal spacing'], rows)}"
 
@@ -220,12 +220,11 @@ def table_7() -> str:
         ]
         parts.append(f"{title}:\n\n{markdown([*HEAD, 'with k_cu = 1e10, x pi/3.14'], rows)}")
     text = (
-        "The text says k_cu = 1e10 N/m; the values are those of 1e9. The table of the four planets lists 1085.5 twice; the "
-        "second stands where Table 3 has 1095.3, the other half of the split pair. It lists 1937.0 twice; there is one such "
-        "mode, and the next is the rotational one that k_cu has raised from 1971.6 to 2292.3 (x pi/3.14). For the 1859.2 of "
-        "Table 3 it has 1859.6. The "
-        'paper calls modes such as 713.3 and 1085.5 "distinct" and "degenerate"; here they are translational modes, '
-        "which k_cu does not affect.\n"
+        "The text states k_cu = 1e10 N/m; the values belong to 1e9. The table of four planets lists 1085.5 twice; "
+        "the second replaces 1095.3 of Table 3, the other half of the split pair. It lists 1937.0 twice, but only "
+        "one such mode exists. The next mode is the rotational one that k_cu raises from 1971.6 to 2292.3 (x "
+        "pi/3.14). Table 3 has 1859.2 where this table has 1859.6. The paper calls modes such as 713.3 and 1085.5 "
+        '"distinct" and "degenerate"; they are translational modes, which k_cu does not affect.\n'
     )
     return "## Table 7: carrier held (Hz)\n\n" + "\n".join([text, *parts])
 

@@ -76,11 +76,12 @@ def peak_section() -> str:
     ds = package("describing_function", CURVES, [0.8]).isel(omega=0)
     rows.append(["describing function", *_curve_cells(ds), "1.37595; .7511, .8745 (note)"])
     text = (
-        "Table 1 is read as dimensionless with b = 10 deg = pi/18. The paper shows its answers as curves only (Figs 2 and "
-        "3) and states the agreement of peak and its frequency in words; the range of the cubic fit behind Fig. 2 is not "
-        "stated, so that its curve cannot be reproduced, only the family to which it belongs. With R = 1 the frequency of "
-        "the peak agrees with the exact one to 0.2 %, and the amplitude is 8 % high; with the self-consistent range it "
-        "is 15 % high. The superharmonic peaks below .5 are in neither one-term method, as the paper says.\n"
+        "Table 1 is read as dimensionless with b = 10 deg = pi/18. The paper shows its results only as curves (Figs "
+        "2 and 3), and describes the agreement of the peak in words. It does not state the range of the cubic fit "
+        "behind Fig. 2, so only the family of that curve can be reproduced. With R = 1 the frequency of the peak "
+        "agrees with the exact one to 0.2 %, and the amplitude is 8 % too high. With the self-consistent range the "
+        "amplitude is 15 % too high. Neither one-term method has the superharmonic peaks below .5, as the paper "
+        "says.\n"
     )
     head = ["", "peak to peak at the peak", "its frequency", "lower fold", "upper fold", "independent"]
     return f"## Peak and folds of Table 1\n\n{text}\n{markdown(head, rows)}"
@@ -119,11 +120,11 @@ def epsilon_section() -> str:
         cells = [f"{a:.4f} at {w:.4f}" for a, w in (printed_peak(epsilon, 1.0, k) for k in READINGS)]
         rows.append([f"{epsilon:g}", *cells])
     text = (
-        "As far as the scanned text can be read, the last term of (50) and (63) is printed B1^2 T^2/(4 omega^2 eps^2), "
-        "where B1^2 T^4/(4 eps^2 U^2) follows from (18); (13), (51) and (52) are printed with lambda_1^2 where (9) and "
-        "(10) define lambda_1. With these corrected, epsilon cancels. "
-        "With U in the place of that omega, which the scan may also show, epsilon cancels too, but a factor T is wrong. "
-        "Fit range R = 1; amplitude a of the peak and its frequency.\n"
+        "The scan is partly illegible. The last term of (50) and (63) seems to be printed as B1^2 T^2/(4 omega^2 "
+        "eps^2), but (18) gives B1^2 T^4/(4 eps^2 U^2). Equations (13), (51) and (52) are printed with lambda_1^2, "
+        "but (9) and (10) define lambda_1. With these corrections epsilon cancels. If the scan shows U in place of "
+        "that omega, epsilon also cancels, but a factor T is wrong. The table lists the amplitude a and the "
+        "frequency of the peak for the fit range R = 1.\n"
     )
     return (
         "## The printed response equation\n\n" + text + "\n"
@@ -141,7 +142,8 @@ def harmonics_section() -> str:
         errors = [abs(float(at.u_max) - case["max"]), abs(float(at.u_min) - case["min"])]
         rows.append([str(count), *(f"{e:.1e}" for e in errors), f"{float(at.residual):.1e}"])
     text = (
-        "Error of the extremes at omega = .7 against the exact motion, and what the motion leaves unbalanced (rms).\n"
+        "Errors of u_max and u_min at omega = .7 compared with the exact motion, and rms residual of the equation "
+        "of motion.\n"
     )
     return f"## Harmonics\n\n{text}\n{markdown(['harmonics', 'u_max', 'u_min', 'residual'], rows)}"
 

@@ -129,8 +129,9 @@ def histories_section() -> str:
                 ]
             )
     text = (
-        "From rest, with the stated chi_n. Nothing is printed but graphs. Every history is a damped oscillation about a "
-        "static twist; the phase portraits that the paper calls strange attractors are its transient.\n"
+        "All histories start from rest and use the stated chi_n. The paper prints only graphs. Every history is a "
+        "damped oscillation about a static twist. The phase portraits that the paper calls strange attractors are "
+        "its transient.\n"
     )
     head = ["", "phi, ours", "phi, SciPy", "velocity, ours", "velocity, SciPy", "estimated error of phi"]
     return f"## Histories: the equations of Figs 11-16\n\n{text}\n" + markdown(head, rows)
@@ -170,8 +171,9 @@ def floquet_section() -> str:
             ]
         )
     text = (
-        "The paper reports chaos and parametric instability here; the linear parametric part is stable at each of its "
-        "settings. It becomes unstable at the nonuniformities of the second table, 15 and 54 times the stated 0.0026.\n"
+        "The paper reports chaos and parametric instability here. The linear parametric part is stable at every "
+        "setting of the paper. It becomes unstable at the values of chi_n in the second table, 15 and 54 times the "
+        "stated 0.0026.\n"
     )
     head = ["", "spectral radius, ours", "SciPy", "exponents / 1/s", "determinant minus its exact value"]
     critical = markdown(["zeta", "critical chi_n, ours", "SciPy (brentq, bounded search)", "theory note"], tips)

@@ -109,10 +109,11 @@ def controls_section(full: bool) -> str:
         kinds(chaos)[0],
     ])  # fmt: skip
     text = (
-        "The rule does find instability and chaos where they are (29). The last row is unphysical, a control only. The "
-        "theory note has -6.83, 6.43 and 28.39 for the first three: means over some 4000 strobes from the displacement "
-        "(1, 0) at t = 0, its first alignment included (4000 powers of SciPy's monodromy matrix give -6.826, 6.434 and "
-        "28.399; 20,000 give -6.604, 6.671 and 28.659). The limits are the Floquet exponents given here.\n"
+        "The verdict detects instability and chaos where (29) has them. The last row is an unphysical control. The "
+        "theory note gives -6.83, 6.43 and 28.39 for the first three. These are means over about 4000 strobes from "
+        "the displacement (1, 0) at t = 0, with the initial alignment included; 4000 powers of the monodromy matrix "
+        "by SciPy give -6.826, 6.434 and 28.399, and 20,000 give -6.604, 6.671 and 28.659. The limits are the "
+        "Floquet exponents in the table.\n"
     )
     return "\n".join(
         ["## Positive controls\n", text, markdown(["", "independent", "ours / s^-1", "our verdict"], rows)]
