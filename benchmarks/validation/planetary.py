@@ -142,8 +142,8 @@ def table_5() -> str:
         "The column for unequal spacing states no angles, and no angles reproduce it. All angles were "
         "searched in steps of 4 degrees, and the best ones refined. With the true pi the closest angles are "
         f"{nearest[0]} and {nearest[1]} degrees, with a difference of {left[0]:.1f} Hz. With pi/3.14 equal spacing is "
-        f"closest, with {left[1]:.1f} Hz (second table). Three planets have sum exp(i psi) = 0 only at equal spacing. Any unequal spacing "
-        "couples rotation with translation, and the modes that the paper calls missing exist.\n"
+        f"closest, with {left[1]:.1f} Hz (second table). Three planets have sum exp(i psi) = 0 only at equal spacing. Any "
+        "unequal spacing couples rotation with translation, and the modes that the paper calls missing exist.\n"
     )
     return f"## Table 5: three planets (Hz)\n\n{equal}\n{text}\n{own}"
 

@@ -1,4 +1,4 @@
-"""The command ``drivetrain``. Thin: every command imports what it needs, so that ``--help`` is instant."""
+"""The command ``drivetrain``. Each command imports its own modules, so ``--help`` is fast."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ __all__ = ["main"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code (0 done, 2 wrong input, 3 incomplete and resumable, 130 interrupted)."""
+    """Run one command and return its exit code: 0 done, 2 wrong input, 3 incomplete and resumable, 130 interrupted."""
     if arguments is None:
-        # Most objects are needed until the end: usual garbage collection takes a third of a second and frees little.
+        # Default garbage collection takes a third of a second and frees little: most objects live until the end.
         gc.set_threshold(50_000)
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
-            # Closed by whoever started the process, who wants no answer.
+            # The parent process closed this stream and reads no output.
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     options = parser().parse_args(arguments)
     try:
@@ -34,15 +34,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(one_line(str(error)))
         return INCOMPLETE
     except BrokenPipeError:
-        # The reader of our output has gone (``drivetrain list | head``): nobody is left to tell.
+        # The reader of standard output has closed it (``drivetrain list | head``): write no message.
         drop_output()
         return OK
     except KeyboardInterrupt:
         return INTERRUPTED
     finally:
         if arguments is None:
-            # The process ends now, and what it has done is done: a signal could only spoil its way out.
+            # The work is finished: a signal during the exit could only change the exit code.
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, signal.SIG_IGN)
-            # The garbage collection that Python ends with would take another third of a second.
+            # Skip Python's garbage collection at exit, which takes a third of a second.
             gc.freeze()

@@ -1,4 +1,4 @@
-"""What the command line accepts: the commands with their arguments, and the text of ``--help``."""
+"""The command-line parser: commands, arguments and the text of ``--help``."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from drivetrain_jax.cli.replies import WRONG_INPUT, one_line
 
 
 class _Parser(argparse.ArgumentParser):
-    """Usage errors are one line and end with the code for wrong input."""
+    """A parser whose usage errors are one line, with the exit code for wrong input."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(allow_abbrev=False, **options)
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As usual, but that values may stand behind options; an unknown one is answered by the command it was given to."""
+        """Parse; values may follow options, and the command itself reports an unknown argument."""
         options, unknown = self.parse_known_args(args, namespace)
         if "given" in options:
             values = [word for word in unknown if "=" in word and not word.startswith("-")]
@@ -39,7 +39,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _reworded(message: str) -> str:
-    """What argparse says in the words of all other messages."""
+    """A message of argparse, reworded like all other messages."""
     if choice := re.fullmatch(r"argument ([\w-]+): invalid choice: '(.*)' \(choose from (.*)\)", message):
         field, given, allowed = choice.group(1), choice.group(2), choice.group(3).replace("'", "").split(", ")
         return f"{field} = {given!r}: unknown{nearest(given, allowed)}"
@@ -54,7 +54,7 @@ def _reworded(message: str) -> str:
 
 
 def _path(text: str) -> Path:
-    """A path that the system can look for; whether anything is there is for the command to say."""
+    """A path of valid length; the command checks if the file exists."""
     try:
         os.stat(text)
     except OSError as error:
@@ -65,11 +65,11 @@ def _path(text: str) -> Path:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The parser of all commands; what it gives has the function of the command as ``command``."""
+    """The parser of all commands; the result has the function of the command as ``command``."""
     whole = _Parser(
         prog="drivetrain",
-        description="Stability and vibration of drivetrains, from a scene file to a chart.",
-        epilog="Begin with `drivetrain list`; `drivetrain COMMAND --help` describes a command.",
+        description="Compute stability and vibration of drivetrains, and draw the results.",
+        epilog="Start with `drivetrain list`. `drivetrain COMMAND --help` describes a command.",
     )
     whole.add_argument("--version", action="version", version=__version__)
     subparsers = whole.add_subparsers(metavar="COMMAND", required=True)
@@ -80,42 +80,44 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _add_list(subparsers: Any) -> None:
-    command = _command(subparsers, "list", commands.list_systems, "systems, analyses, parameters and scenes")
-    command.add_argument("system", nargs="?", metavar="SYSTEM", help="describe this one")
+    command = _command(subparsers, "list", commands.list_systems, "list systems, analyses, parameters and scenes")
+    command.add_argument("system", nargs="?", metavar="SYSTEM", help="describe this system")
 
 
 def _add_run(subparsers: Any) -> None:
-    command = _command(subparsers, "run", commands.run, "compute a scene, or resume it")
+    command = _command(subparsers, "run", commands.run, "compute a scene, or resume an interrupted run")
     _add_scene(command)
     command.add_argument(
-        "--fresh", action="store_true", help="compute all anew: replace a result, drop unfinished work"
+        "--fresh", action="store_true", help="compute all points again; replace result and unfinished work"
     )
-    command.add_argument("--threads", type=int, metavar="N", help="chunks computed at a time (default: usable cores)")
-    command.add_argument("--workers", type=int, metavar="N", help="N processes instead of threads: survive a crash")
-    command.add_argument("--dask", metavar="ADDRESS", help="a Dask cluster instead: tcp://HOST:PORT or local:N")
+    command.add_argument("--threads", type=int, metavar="N", help="number of threads (default: usable cores)")
+    command.add_argument(
+        "--workers", type=int, metavar="N", help="N worker processes instead of threads; a worker may crash"
+    )
+    command.add_argument(
+        "--dask", metavar="ADDRESS", help="Dask cluster instead of threads: tcp://HOST:PORT or local:N"
+    )
     command.add_argument(
         "--reuse",
         action="append",
         default=[],
         metavar="FILE.nc",
         type=_path,
-        help="take over the points that this result shares; a smaller result at --out is taken over without it",
+        help="reuse the common points of this result; a smaller result at --out is always reused",
     )
-    command.add_argument(
-        "--store", choices=("hdf5", "zarr"), default="hdf5", help="zarr: a store that the workers write themselves"
-    )
-    command.add_argument("--quiet", action="store_true", help="no progress, only the last line")
+    command.add_argument("--store", choices=("hdf5", "zarr"), default="hdf5", help="zarr: workers write a Zarr store")
+    command.add_argument("--quiet", action="store_true", help="print only the last line")
 
 
 def _add_status(subparsers: Any) -> None:
-    command = _command(subparsers, "status", commands.status, "how much of a scene is computed")
+    command = _command(subparsers, "status", commands.status, "show how much of a scene is computed")
     _add_scene(command)
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
 
 def _add_verify(subparsers: Any) -> None:
     command = _command(
-        subparsers, "verify", commands.verify, "check every checksum of a result, and what must hold of its numbers"
+        subparsers, "verify", commands.verify, "compare all checksums of a result, and apply the rules of its analysis"
     )
     command.add_argument("file", metavar="FILE.nc", type=_path, help="result, finished or not")
     command.add_argument("--json", action="store_true", help="as one JSON object")
@@ -128,56 +130,56 @@ def _add_export(subparsers: Any) -> None:
 
 
 def _add_plot(subparsers: Any) -> None:
-    command = _command(subparsers, "plot", commands.plot, "draw the figure that suits a result")
+    command = _command(subparsers, "plot", commands.plot, "draw the figure of a result")
     command.add_argument(
-        "files", metavar="FILE.nc", type=_path, nargs="+", help="several methods of one analysis overlay"
+        "files", metavar="FILE.nc", type=_path, nargs="+", help="results; several methods of one analysis are overlaid"
     )
     command.add_argument(
         "--out", required=True, metavar="FIGURE", type=_path, help="figure to write (.png, .pdf, .svg)"
     )
     command.add_argument(
-        "--part", nargs="+", default=[], metavar="name=LOW:HIGH", help="of an atlas: ranges to zoom into, or name=value"
+        "--part", nargs="+", default=[], metavar="name=LOW:HIGH", help="part of an atlas: ranges, or name=value"
     )
-    command.add_argument("--cells", type=int, metavar="N", help="of an atlas: cells each way (800)")
+    command.add_argument("--cells", type=int, metavar="N", help="cells per axis for an atlas (default: 800)")
 
 
 def _add_point(subparsers: Any) -> None:
     command = _command(subparsers, "point", commands.point, "compute one point")
-    command.add_argument("system", metavar="SYSTEM", help="`drivetrain list` names them")
-    command.add_argument("analysis", metavar="ANALYSIS", help="`drivetrain list SYSTEM` names them")
+    command.add_argument("system", metavar="SYSTEM", help="name from `drivetrain list`")
+    command.add_argument("analysis", metavar="ANALYSIS", help="name from `drivetrain list SYSTEM`")
     _add_given(command, "parameters in the units of `drivetrain list SYSTEM`, options, and outputs=NAME,NAME")
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
 
 def _add_query(subparsers: Any) -> None:
-    command = _command(subparsers, "query", commands.query, "ask a stored atlas about one point")
+    command = _command(subparsers, "query", commands.query, "evaluate a stored atlas at one point")
     command.add_argument("file", metavar="FILE.nc", type=_path, help='result of a scene with analysis = "atlas"')
-    _add_given(command, "parameters, or the data in physical units")
+    _add_given(command, "parameters, or physical data")
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
 
 def _add_design(subparsers: Any) -> None:
-    command = _command(subparsers, "design", commands.design, "ask a stored atlas what a design has to be")
+    command = _command(subparsers, "design", commands.design, "answer a design question from a stored atlas")
     questions = ("least-damping", "widest-angle", "speed-windows")
     command.add_argument("question", choices=questions, metavar="QUESTION", help=", ".join(questions))
     command.add_argument("file", metavar="FILE.nc", type=_path, help='result of a scene with analysis = "atlas"')
     _add_given(command, "parameters; a range is name=LOW:HIGH")
     command.add_argument(
-        "--margin", type=float, metavar="PART", help="speed-windows: part of the speed kept clear of every boundary"
+        "--margin", type=float, metavar="PART", help="speed-windows: relative distance in speed from every boundary"
     )
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
 
 def _add_bench(subparsers: Any) -> None:
     command = _command(
-        subparsers, "bench", commands.bench, "measure error and run time against the peers (source checkout only)"
+        subparsers, "bench", commands.bench, "measure error and run time, compared with peers (source checkout only)"
     )
-    command.add_argument("systems", nargs="*", default=[], metavar="SYSTEM", help="only the studies of these")
+    command.add_argument("systems", nargs="*", default=[], metavar="SYSTEM", help="only the studies of these systems")
     command.add_argument(
-        "--quick", action="store_true", help="small forms, minutes; the stored results stay as they are"
+        "--quick", action="store_true", help="small versions (minutes); do not change the stored results"
     )
-    command.add_argument("--out", metavar="FOLDER", type=_path, help="where files and page go")
-    command.add_argument("--peers", metavar="PYTHON", help="interpreter of an environment with ROSS and pynamicalsys")
+    command.add_argument("--out", metavar="FOLDER", type=_path, help="output folder")
+    command.add_argument("--peers", metavar="PYTHON", help="Python of an environment with ROSS and pynamicalsys")
 
 
 _COMMANDS = (
@@ -201,7 +203,7 @@ def _command(subparsers: Any, name: str, function: Any, text: str) -> argparse.A
 
 
 def _add_given(command: argparse.ArgumentParser, text: str) -> None:
-    # With a default of its own it is not said to be required.
+    # The default keeps argparse from reporting it as required.
     command.add_argument("given", nargs="*", default=[], metavar="name=value", help=text)
 
 

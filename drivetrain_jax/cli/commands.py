@@ -1,4 +1,4 @@
-"""What each command does. Heavy imports stand inside, so that a command loads no more than it needs."""
+"""The functions of the commands. Heavy imports are local, so a command loads only its own modules."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from drivetrain_jax.cli.replies import INCOMPLETE, INTERRUPTED, OK, one_line, sa
 from drivetrain_jax.cli.signals import stop_on_signals
 from drivetrain_jax.cli.values import assignments, ranges
 
-# Cells each way in the chart of an atlas.
+# Cells per axis in the chart of an atlas.
 _CELLS = 800
 _FIGURES = (".png", ".pdf", ".svg")
 
 
 def list_systems(options: argparse.Namespace) -> int:
-    """What there is, or one system in full."""
+    """Print all systems, or one system in detail."""
     from drivetrain_jax.runs.catalogue import describe, overview
 
     say(describe(options.system) if options.system else overview())
@@ -36,27 +36,27 @@ def _answer(reply: Any, options: argparse.Namespace) -> int:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Compute a scene, or resume it. Ctrl-C and SIGTERM end it in order."""
+    """Compute or resume a scene. Ctrl-C and SIGTERM stop it after finished chunks are written."""
     with stop_on_signals() as check:
         try:
             progress, code, reason = _compute(options, check)
         except KeyboardInterrupt as stop:
-            # There is nothing to count before all that computes is loaded.
+            # Before the modules are loaded no point is counted.
             progress = getattr(stop, "progress", "points: total=0 computed=0 reused=0 failed=0")
             code, reason = INTERRUPTED, "interrupted; the same command resumes"
         if reason:
             sys.stderr.write(one_line(reason))
         sys.stderr.write(f"{progress}\n")
         if code == INTERRUPTED and options.workers is None:
-            # Chunks that are still being computed would hold up a normal exit; their results are not wanted any more.
-            # Processes have been killed by now, and what they shared with this one is given back by a normal exit only.
+            # A normal exit would wait for running chunks, whose results are not needed.
+            # Worker processes are already killed; a normal exit releases the resources shared with them.
             sys.stderr.flush()
             os._exit(code)
     return code
 
 
 def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[Any, int, str]:
-    """Counts, exit code, and why that is not 0 or what else there is to be told."""
+    """Counts, exit code, and the message for the user."""
     from drivetrain_jax.runs.executor import Where
     from drivetrain_jax.runs.run import Incomplete, run_to_file
 
@@ -93,14 +93,14 @@ def _progress_line(quiet: bool) -> Any:
 
 
 def status(options: argparse.Namespace) -> int:
-    """How much of a scene is done."""
+    """Print how much of a scene is computed."""
     from drivetrain_jax.runs.status import status
 
     return _answer(status(options.scene, options.out, assignments(options.set, "--set")), options)
 
 
 def verify(options: argparse.Namespace) -> int:
-    """Checksums and invariants of a result; a damaged one is wrong input."""
+    """Verify the checksums and rules of a result; a damaged result is wrong input."""
     from drivetrain_jax.invariants.verify import verify
 
     report = verify(options.file)
@@ -111,7 +111,7 @@ def verify(options: argparse.Namespace) -> int:
 
 
 def export(options: argparse.Namespace) -> int:
-    """One HDF5 file from a Zarr store."""
+    """Write a Zarr store as one HDF5 file."""
     from drivetrain_jax.runs.export import export
 
     sys.stderr.write(f"points: {export(options.store, options.file)} exported\n")
@@ -119,7 +119,7 @@ def export(options: argparse.Namespace) -> int:
 
 
 def plot(options: argparse.Namespace) -> int:
-    """The figure of one result, or of several that share one."""
+    """Draw the figure of one result, or of several results together."""
     from drivetrain_jax.store.consolidate import open_result
     from drivetrain_jax.store.files import write_atomic
     from drivetrain_jax.view import plot
@@ -132,14 +132,14 @@ def plot(options: argparse.Namespace) -> int:
     results = [open_result(file) if file.exists() else _open_unfinished(file) for file in options.files]
     if any(result.attrs.get("analysis") == "atlas" for result in results):
         if len(results) > 1:
-            raise InputError("FILE.nc: an atlas among several results; allowed is an atlas alone")
+            raise InputError("FILE.nc: an atlas together with other results; allowed is one atlas alone")
         from drivetrain_jax.runs.atlas_chart import chart
 
         cells = _CELLS if options.cells is None else options.cells
         results = [chart(file, ranges(options.part, "--part"), cells) for file in options.files]
     elif options.part or options.cells is not None:
         field = f"--part = {options.part[0]!r}" if options.part else f"--cells = {options.cells}"
-        raise InputError(f"{field}: a result on a grid is drawn whole; allowed for an atlas")
+        raise InputError(f"{field}: not available for a result on a grid; allowed for an atlas")
     try:
         figure = plot(*results)
     except InputError:
@@ -157,17 +157,17 @@ def plot(options: argparse.Namespace) -> int:
 
 
 def _refuse_damaged(files: list[Path]) -> None:
-    """:class:`InputError` if one of these results is not what was written: what it lacks may be why there is no figure."""
+    """Raise :class:`InputError` if one of these results is damaged: damage may be why the figure failed."""
     from drivetrain_jax.store import checksums
 
     for file in files:
         if file.is_file() and (changed := checksums.damaged(file)):
-            what = f"not what was written ({checksums.named(changed)})"
+            what = f"damaged ({checksums.named(changed)})"
             raise InputError(f"file = {str(file)!r}: {what}; allowed is to restore it or to compute it again") from None
 
 
 def _open_unfinished(file: Path) -> Any:
-    """What a run has done so far, if one is at work there."""
+    """The finished part of a run that is not complete."""
     from drivetrain_jax.store.chunks import PartsFolder
     from drivetrain_jax.store.consolidate import open_result
 
@@ -179,7 +179,7 @@ def _open_unfinished(file: Path) -> Any:
 
 
 def point(options: argparse.Namespace) -> int:
-    """One point."""
+    """Print the results of one point."""
     from drivetrain_jax.runs.point import point
 
     given = assignments(options.given, "point")
@@ -193,7 +193,7 @@ def point(options: argparse.Namespace) -> int:
 
 
 def query(options: argparse.Namespace) -> int:
-    """An atlas at one point."""
+    """Print the values of an atlas at one point."""
     from drivetrain_jax.runs.atlas_answers import query
     from drivetrain_jax.runs.atlas_file import open_atlas
 
@@ -202,7 +202,7 @@ def query(options: argparse.Namespace) -> int:
 
 
 def design(options: argparse.Namespace) -> int:
-    """What a design has to be, after an atlas."""
+    """Print the answer of an atlas to a design question."""
     from drivetrain_jax.runs import atlas_answers
     from drivetrain_jax.runs.atlas_file import open_atlas
 
@@ -215,13 +215,13 @@ def design(options: argparse.Namespace) -> int:
 
 
 def bench(options: argparse.Namespace) -> int:
-    """The measurements of a checkout, in a process of their own."""
+    """Run the benchmarks of a checkout in a separate process."""
     import subprocess
 
     package = Path(drivetrain_jax.__file__).resolve().parent
     checkout = package.parent
     if not (checkout / "benchmarks" / "__main__.py").is_file():
-        raise InputError(f"bench: no folder benchmarks/ beside {str(package)!r}; allowed is a checkout")
+        raise InputError(f"bench: no folder benchmarks/ next to {str(package)!r}; allowed is a checkout")
     words = [*options.systems, *(["--quick"] if options.quick else [])]
     words += ["--out", str(options.out.absolute())] if options.out else []
     words += ["--peers", options.peers] if options.peers else []

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def progress_line() -> Iterator[Callable[[Progress], None]]:
-    """A bar that the yielded function moves. It grows with the predicted cost, so the time left is a fair guess."""
+    """A progress bar that the yielded function updates. Its length follows the predicted cost of the points."""
     columns = (
         BarColumn(),
         TextColumn("{task.fields[counts]}"),
@@ -32,7 +32,7 @@ def progress_line() -> Iterator[Callable[[Progress], None]]:
     begin = time.monotonic()
 
     def report(progress: Progress) -> None:
-        # Not before the first report: wrong input is answered with a single line.
+        # Created at the first report, because wrong input must print a single line.
         bar.start()
         done = progress.computed + progress.reused
         rate = progress.computed / max(time.monotonic() - begin, 1e-9)
@@ -43,7 +43,7 @@ def progress_line() -> Iterator[Callable[[Progress], None]]:
     try:
         yield report
     except InputError:
-        # Wrong input that only the work brings to light, such as a scheduler that does not answer: no bar beside its line.
+        # Wrong input found during the run, such as a scheduler that does not answer: remove the bar.
         bar.live.transient = True
         bar.live.stop()
         raise

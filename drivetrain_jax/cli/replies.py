@@ -1,4 +1,4 @@
-"""What every command answers with: an exit code, and for wrong input one line on standard error."""
+"""Exit codes, and the one-line messages on standard error."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ OK, WRONG_INPUT, INCOMPLETE, INTERRUPTED = 0, 2, 3, 130
 
 
 def say(text: str) -> None:
-    """``text`` on standard output; one that takes no more (a full disk) is wrong input."""
+    """Print ``text`` on standard output; if that fails (a full disk), raise :class:`InputError`."""
     encoding = sys.stdout.encoding or "utf-8"
     try:
-        # A terminal may lack letters that a title has.
+        # The encoding of a terminal may lack characters of a title.
         sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding))
         sys.stdout.flush()
     except BrokenPipeError:
@@ -25,10 +25,10 @@ def say(text: str) -> None:
 
 
 def drop_output() -> None:
-    """What is still on its way to standard output goes nowhere: at its end Python would try again."""
+    """Discard buffered output; otherwise Python would try to write it again at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def one_line(message: str) -> str:
-    """``message`` as this command says it, without line breaks of its own."""
+    """``message`` on one line, with the name of the command in front."""
     return f"drivetrain: {' '.join(message.split())}\n"

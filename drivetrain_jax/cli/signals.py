@@ -1,4 +1,4 @@
-"""Ctrl-C and a scheduler's SIGTERM while a scene is computed."""
+"""Handle Ctrl-C and SIGTERM during a run."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-# Seconds that are left to what was stopped, to write down what is finished: further signals do not cut it short.
+# Time in s after a signal in which further signals are ignored, so that finished chunks are written.
 _GRACE = 2.0
 
 
 @contextmanager
 def stop_on_signals() -> Iterator[Callable[[], None]]:
-    """Ctrl-C and a scheduler's SIGTERM raise ``KeyboardInterrupt`` until the context is left.
+    """Raise ``KeyboardInterrupt`` on Ctrl-C and SIGTERM inside the context.
 
-    It gives a function that raises it once more after a signal, for a destructor or a C callback may have swallowed the
-    first; the traceback that Python prints in that case is not shown. For two seconds further signals are ignored, so that
-    what is finished can be written down.
+    Yields a function that raises it again after a signal, because a destructor or a C callback may swallow the first
+    one. The traceback that Python prints in that case is hidden. Further signals are ignored for two seconds, so that
+    finished chunks are written.
     """
     caught: list[float] = []
     before = sys.unraisablehook
@@ -44,8 +44,8 @@ def stop_on_signals() -> Iterator[Callable[[], None]]:
         yield check
     finally:
         for number, handler in handlers.items():
-            # Not one of Python's own: nothing that could be set again.
+            # The handler was not set by Python, so it cannot be restored.
             signal.signal(number, handler or signal.SIG_DFL)
-        # After a signal the process is about to end, and what was left half made ends with it.
+        # After a signal the hook stays: errors of unfinished work are not shown.
         if not caught:
             sys.unraisablehook = before

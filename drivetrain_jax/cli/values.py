@@ -1,4 +1,4 @@
-"""Values on the command line: ``name=value``, ``name=LOW:HIGH``."""
+"""Parse values on the command line: ``name=value``, ``name=LOW:HIGH``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from drivetrain_jax._wording import clipped
 
 
 def assignments(texts: Sequence[str], field: str) -> dict[str, Any]:
-    """``name=value`` pairs, values in TOML or plain text."""
+    """A mapping from ``name=value`` words; values are TOML or plain text."""
     from drivetrain_jax.runs.toml import parse_value
 
     pairs: dict[str, Any] = {}
@@ -33,7 +33,7 @@ def assignments(texts: Sequence[str], field: str) -> dict[str, Any]:
 
 
 def ranges(texts: Sequence[str], field: str) -> dict[str, Any]:
-    """``name=value`` pairs, values numbers or pairs of them, ``LOW:HIGH``."""
+    """A mapping from ``name=value`` words; values are numbers or pairs ``LOW:HIGH``."""
     return {name: _number_or_range(name, value) for name, value in assignments(texts, field).items()}
 
 

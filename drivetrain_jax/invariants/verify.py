@@ -47,7 +47,7 @@ def verify(path: Path) -> Report:
     damaged = checksums.damaged(path)
     if damaged:
         names = checksums.named(damaged)
-        problem = f"{names}: not what was written; allowed is to restore the file or to compute it again"
+        problem = f"{names}: damaged; allowed is to restore the file or to compute it again"
         return Report((f"checksums: {len(damaged)} differ: {names}",), problem)
     if damaged is None and read_attribute(path, "digest") is not None:
         problem = "its checksums are gone; allowed is to restore the file or to compute it again"
@@ -65,11 +65,11 @@ def _first_broken(findings: list[Finding]) -> str:
 def _verify_store(path: Path) -> Report:
     if not shards.is_sealed(path):
         what = "attributes of the store"
-        problem = f"{what}: not what was written; allowed is to restore them or to compute the store again"
+        problem = f"{what}: damaged; allowed is to restore them or to compute the store again"
         return Report((f"checksums: {what} differ",), problem)
     intact, _, count = shards.tally(path)
     wrong = count - intact
-    problem = f"{wrong} of {count} shards are not what was written; allowed is to compute them again" if wrong else ""
+    problem = f"{wrong} of {count} shards are damaged; allowed is to compute them again" if wrong else ""
     rules = "rules: applied to the file that `drivetrain export` makes of the store"
     return Report((f"checksums: {wrong or 'none'} of {count} shards differ", rules), problem)
 

@@ -39,11 +39,11 @@ class NotReusable(InputError):
 
 
 class Damaged(NotReusable):
-    """A result is not what was written; ``what`` of it."""
+    """A damaged result; ``what`` names the damaged variables."""
 
     def __init__(self, path: Path, what: str) -> None:
         allowed = "allowed is to restore the file or to compute it again"
-        super().__init__(f"reuse = {str(path)!r}: not what was written ({what}); {allowed}")
+        super().__init__(f"reuse = {str(path)!r}: damaged ({what}); {allowed}")
         self.what = what
 
 

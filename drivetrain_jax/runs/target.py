@@ -205,7 +205,7 @@ class Target:
         if self.present == self.digest:
             return f"a result that was rearranged after it was written ({', '.join(self._rearranged)})"
         if isinstance(self._found, Damaged):
-            return f"a result that is not what was written ({self._found.what})"
+            return f"a damaged result ({self._found.what})"
         if self.parts.holds_work():
             stored, what = self.parts.plan(), "unfinished work"
             if self.present != stored.get("replaces"):

@@ -54,7 +54,7 @@ def checksums(file: h5py.File) -> dict[str, str]:
 
 
 def damaged(path: Path) -> list[str] | None:
-    """Names of the variables (``/``: attributes) of the result at ``path`` that are not what was written; None if it has
+    """Names of the variables (``/``: attributes) of the result at ``path`` that are damaged; None if it has
     no checksums. Raises :class:`InputError` if the file cannot be read."""
     try:
         with h5py.File(path, "r") as file:

@@ -157,7 +157,7 @@ def test_verify(cli):
     with h5py.File("r.nc", "r+") as file:
         file["value"][3] = 1.0
     code, _, err = cli("verify", "r.nc", "--json")
-    assert (code, len(err)) == (2, 1) and "value: not what was written" in err[0]
+    assert (code, len(err)) == (2, 1) and "value: damaged" in err[0]
     answer = json.loads(cli("verify", "r.nc", "--json")[1])
     assert answer["state"] == "damaged" and answer["checks"] == ["checksums: 1 differ: value"]
     open("r.nc", "r+").truncate(100)
@@ -299,12 +299,12 @@ def test_wrong_command_is_one_line(cli, folder, arguments, part):
 # What another program made of a chart, its new attributes, and what the answer says.
 CHANGED = {
     "of another program": (lambda _: xr.Dataset({"x": 1.0}), {}, "not a result of drivetrain_jax"),
-    "without variables": (lambda ds: ds.drop_vars(list(ds)), {"analysis": "parameters"}, "not what was written (a"),
-    "without cells": (lambda ds: ds.isel(a=slice(0, 0)), {"analysis": "parameters"}, "not what was written (a"),
+    "without variables": (lambda ds: ds.drop_vars(list(ds)), {"analysis": "parameters"}, "damaged (a"),
+    "without cells": (lambda ds: ds.isel(a=slice(0, 0)), {"analysis": "parameters"}, "damaged (a"),
     "attributes rubbish": (
         lambda ds: ds,
         {"analysis": "parameters", "fixed_parameters": "rubbish"},
-        "not what was written (attributes of the file",
+        "damaged (attributes of the file",
     ),
     "no atlas": (lambda ds: ds, {"analysis": "atlas"}, "damaged (attributes of the file"),
 }
@@ -486,7 +486,7 @@ def test_several_atlases_are_refused_before_one_is_evaluated(cli, monkeypatch):
     cli("run", "scene.toml", "--out", "r.nc", "--quiet")
     xr.load_dataset("r.nc", engine="h5netcdf").assign_attrs(analysis="atlas").to_netcdf("a.nc", engine="h5netcdf")
     monkeypatch.setattr("drivetrain_jax.runs.atlas_chart.chart", lambda *_: 1 / 0)
-    line = "drivetrain: FILE.nc: an atlas among several results; allowed is an atlas alone"
+    line = "drivetrain: FILE.nc: an atlas together with other results; allowed is one atlas alone"
     assert cli("plot", "r.nc", "a.nc", "--out", "f.png") == (2, "", [line])
 
 

@@ -173,7 +173,7 @@ def test_verify_a_file(path, chart):
     assert verify(path).problem.startswith("verdict follows from spectral_radius and its bound: broken at 1 of 3")
     data = path.read_bytes().replace(np.float64(2.0).tobytes(), np.float64(2.5).tobytes())
     path.write_bytes(data)
-    assert verify(path).problem.startswith("floquet_multiplier, spectral_radius: not what was written")
+    assert verify(path).problem.startswith("floquet_multiplier, spectral_radius: damaged")
 
 
 def test_verify_a_file_without_checksums(chart, tmp_path):

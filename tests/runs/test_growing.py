@@ -343,9 +343,9 @@ def test_a_rearranged_copy_is_neither_taken_nor_called_complete(tmp_path, change
     run_to_file(SMALL, tmp_path / "r.nc")
     copy = turned(tmp_path / "r.nc", **change)
     before = copy.read_bytes()
-    with pytest.raises(InputError, match=r"reuse = '.*turned.nc': not what was written \("):
+    with pytest.raises(InputError, match=r"reuse = '.*turned.nc': damaged \("):
         run_to_file(LARGE, tmp_path / "new.nc", reuse=[copy])
-    with pytest.raises(InputError, match=r"holds a result that is not what was written \(.*--fresh replaces it"):
+    with pytest.raises(InputError, match=r"holds a damaged result \(.*--fresh replaces it"):
         run_to_file(LARGE, copy)
     with pytest.raises(InputError, match=r"holds a result that was rearranged .*--fresh replaces it"):
         run_to_file(SMALL, copy)
@@ -366,13 +366,13 @@ def test_damaged_values_do_not_enter_another_result(tmp_path):
     run_to_file(SMALL, path)
     with h5py.File(path, "r+") as file:
         file["value"][1, 3] = -7.0
-    with pytest.raises(InputError, match=r"holds a result that is not what was written \(value\); --fresh replaces it"):
+    with pytest.raises(InputError, match=r"holds a damaged result \(value\); --fresh replaces it"):
         run_to_file(LARGE, path)
-    with pytest.raises(InputError, match=r"r.nc': not what was written \(value\); allowed is to restore"):
+    with pytest.raises(InputError, match=r"r.nc': damaged \(value\); allowed is to restore"):
         run_to_file(LARGE, tmp_path / "new.nc", reuse=[path])
     with h5py.File(path, "r+") as file:
         del file.attrs["checksums"]
-    with pytest.raises(InputError, match=r"not what was written \(it has no checksums\)"):
+    with pytest.raises(InputError, match=r"damaged \(it has no checksums\)"):
         run_to_file(LARGE, tmp_path / "new.nc", reuse=[path])
 
 
@@ -383,8 +383,8 @@ def test_damage_that_came_during_an_interrupted_growth_is_named(tmp_path):
         run_to_file(LARGE, path, where=Where(threads=1), report=stop_after(2))
     with h5py.File(path, "r+") as file:
         file["value"][1, 3] = -7.0
-    assert "not what was written (value)" in status(LARGE, path).reason
-    with pytest.raises(InputError, match=r"not what was written \(value\); --fresh replaces it"):
+    assert "damaged (value)" in status(LARGE, path).reason
+    with pytest.raises(InputError, match=r"damaged \(value\); --fresh replaces it"):
         run_to_file(LARGE, path)
 
 
