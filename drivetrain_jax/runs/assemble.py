@@ -1,4 +1,4 @@
-"""From chunks to the labelled result of a scene."""
+"""Assemble the results of chunks into the labelled result of a scene."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from drivetrain_jax.store.schema import Coordinate, Labelled
 if TYPE_CHECKING:
     import xarray as xr
 
-# Entries assumed for a dimension whose size depends on the system, when memory is estimated.
+# Assumed length of a dimension that depends on the system, for the memory estimate.
 _USUAL_SIZE = 4
-# Bytes of the plan per point, even where chunks are small.
+# Bytes of the plan per point; an upper limit for small chunks.
 _PLANNED = 4
-# Bytes of results on the disk that are kept in memory as well, and values that are blanked at a time.
+# Bytes of mapped results kept in memory; values blanked at a time.
 _RESIDENT, _ROWS = 1 << 26, 1 << 22
 _STORAGE = ("h5py",)
 
 
 class Table:
-    """Results of all points of a grid, filled chunk by chunk. What is never filled counts as step limit reached.
+    """Results of all points of a grid, filled chunk by chunk. A point that is never filled has the outcome step limit.
 
-    ``arrays`` holds all values: the axes in the order of the scene (or the points), then a result's own dimensions.
-    ``allocate(template)`` gives such arrays for the data of a labelled result; without it they are in memory.
+    ``arrays`` holds all values: the axes in scene order (or the points), then the dimensions of the result.
+    ``allocate(template)`` returns such arrays for a labelled result (default: in memory).
     """
 
     def __init__(
@@ -52,42 +52,42 @@ class Table:
 
     @property
     def on_disk(self) -> bool:
-        """Whether the values are in a file, not in memory."""
+        """True if the values are in a file, not in memory."""
         return self._allocate is not None
 
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
-        """Enter the results of ``points``."""
+        """Write the results of ``points``."""
         self._lay_out_for(results)
         for name, values in results.items():
-            # A fixed path parameter is no dimension of the result.
+            # A fixed path parameter is not a dimension of the result.
             enter(self.arrays[name], self._grid, points, values[:, 0] if self._grid.path_is_fixed else values)
         self.release_after(results)
 
     def block(self, place: tuple[slice, ...], like: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """The arrays of a block of the grid, or of a row of the points: all that is in them is to be overwritten. ``like``
-        are results of a point."""
+        """Views of the arrays at a block of the grid, or a row of the points, to be overwritten. ``like``: results of
+        one point."""
         self._lay_out_for(like, blank=False)
         return {name: values[place] for name, values in self.arrays.items()}
 
     def release_after(self, results: Mapping[str, np.ndarray]) -> None:
-        """Let the system have back, from time to time, the memory of what is in a file."""
+        """Periodically release pages of the memory map."""
         self._unreleased += sum(values.nbytes for values in results.values())
         if self._unreleased >= _RESIDENT:
             self._unreleased = 0
             release(self.arrays.values())
 
     def _lay_out_for(self, results: Mapping[str, np.ndarray], *, blank: bool = True) -> None:
-        """Make the arrays; the first results tell the sizes of dimensions that depend on the system."""
+        """Create the arrays; the first results give the lengths of dimensions that depend on the system."""
         if not self.arrays:
             for variable in self.variables:
                 self._sizes |= zip(reversed(variable.dims), reversed(results[variable.name].shape), strict=False)
             self.lay_out(blank=blank)
 
     def _complete_sizes(self) -> None:
-        """Where no point has a result, the solver tells the sizes of dimensions that depend on the system."""
+        """Get the lengths of system-dependent dimensions from the solver if no point has a result."""
         if all(self._sizes[dim] for variable in self.variables for dim in variable.dims):
             return
-        # It needs this module, and jax.
+        # Imported here: this module imports jax and the present one.
         from drivetrain_jax.runs.kernel import result_shapes
 
         scene = self._scene
@@ -96,7 +96,7 @@ class Table:
             self._sizes |= zip(reversed(variable.dims), reversed(shapes[variable.name]), strict=False)
 
     def lose(self, points: np.ndarray) -> None:
-        """Record that nobody survived the computation of ``points``."""
+        """Mark these points as lost: their worker crashed three times."""
         self._lost.append(points)
         if self.arrays:
             self._mark_lost()
@@ -107,7 +107,7 @@ class Table:
         self._lost.clear()
 
     def lay_out(self, *, blank: bool = True) -> Mapping[str, np.ndarray]:
-        """The arrays, made if nothing has been filled in yet; without ``blank`` what is in them is anything."""
+        """The arrays, created if nothing has been filled; their content is undefined without ``blank``."""
         if not self.arrays:
             self._complete_sizes()
             sweep = self._grid.result_shape
@@ -128,7 +128,7 @@ class Table:
 
 
 def enter(array: np.ndarray, grid: Grid, points: np.ndarray, values: np.ndarray | int) -> None:
-    """Put ``values`` of ``points`` into the ``array`` of a result."""
+    """Write ``values`` of ``points`` into the ``array`` of a result."""
     if grid.path_position is None:
         array.reshape(grid.size, *array.shape[len(grid.shape) :])[points] = values
     else:
@@ -136,21 +136,21 @@ def enter(array: np.ndarray, grid: Grid, points: np.ndarray, values: np.ndarray 
 
 
 def sweep_first(array: np.ndarray, grid: Grid) -> np.ndarray:
-    """``array`` of a result with the path, if it is an axis, behind all other axes of the sweep."""
+    """``array`` of a result, with a path axis moved behind the other axes of the sweep."""
     position = grid.path_position
     return array if position is None else np.moveaxis(array, position, len(grid.shape))
 
 
 def failures(outcome: np.ndarray) -> int:
-    """How many outcomes mean that there is no value."""
+    """Number of outcomes without a value."""
     return int(np.count_nonzero(outcome >= FIRST_FAILURE))
 
 
 def missing_value(variable: Variable) -> float | int:
-    """What stands for a result that is not there."""
+    """The value of a result that is missing."""
     if variable.name == OUTCOME.name:
         return Outcome.STEP_LIMIT
-    # A flag has no NaN; its last code is the one that claims least (undecided, none).
+    # Integers have no NaN: a flag uses its last code (undecided, none).
     return len(variable.flags) - 1 if variable.flags else 0 if np.dtype(variable.dtype).kind in "iu" else np.nan
 
 
@@ -160,7 +160,7 @@ def result_variables(scene: Scene) -> tuple[Variable, ...]:
 
 
 def bytes_per_point(scene: Scene, on_disk: bool) -> int:
-    """Memory that one point takes while its scene runs: the plan, and the results unless they grow on the disk."""
+    """Bytes of memory per point during a run: the plan, and the results unless they are in a file."""
     if on_disk:
         return _PLANNED
     sizes = {d.name: len(d.values) or _USUAL_SIZE for d in scene.dimensions}
@@ -194,7 +194,7 @@ def _axis_coordinates(scene: Scene) -> list[Coordinate]:
 
 
 def _resonances(scene: Scene) -> list[Coordinate]:
-    """Predicted values of an axis, if the system predicts any: labels, and values over the axes they depend on."""
+    """Predicted resonances of the system: labels, and values over the axes that they depend on."""
     predicted = scene.system.resonances
     axes = {axis.name: axis.values for axis in scene.axes}
     if predicted is None or scene.zipped or predicted.axis not in axes:
@@ -215,11 +215,11 @@ def _resonances(scene: Scene) -> list[Coordinate]:
 
 
 def result_attrs(scene: Scene) -> dict[str, str]:
-    """What the result is of and where it comes from, apart from what each run adds."""
+    """Attributes of the result that do not depend on the single run."""
     fixed: dict[str, Any] = {}
     for name, value in scene.fixed.items():
         parameter = scene.system.parameter(name)
-        # JSON has no infinity; the word is what every reader of numbers understands.
+        # JSON has no infinity; the word "inf" is read by every parser of numbers.
         plain = str(value) if value == math.inf else value
         fixed[name] = {"value": plain, "units": parameter.units, "long_name": parameter.long_name}
     installed = provenance.versions((*PACKAGES, *_STORAGE))

@@ -1,6 +1,6 @@
-"""Answers of an atlas in words: what holds at a point, how far stability reaches, and what a design has to be.
+"""Answers of an atlas as text: values at a point, distances to the stability boundary, design values.
 
-Every design answer is checked by direct solves. What may be asked: :mod:`~drivetrain_jax.runs.atlas_question`.
+Every design answer is checked by direct solves. For the input see :mod:`~drivetrain_jax.runs.atlas_question`.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from drivetrain_jax.atlas.windows import Crossing, Interval
 from drivetrain_jax.runs.atlas_file import StoredAtlas
 from drivetrain_jax.runs.atlas_question import Asked, Range, number, roles_of
 
-# Distance of a spectral radius from 1 that would be lost among its digits.
+# Distance of a spectral radius from 1 below which the distance itself is printed.
 _CLOSE = 1e-3
-# What is said of the end of a stable interval that is not a change of stability.
+# Text for the end of a stable interval that is not a change of stability.
 _BEYOND = {"crossing": "", "atlas": " (the end of the atlas)", "undecided": " (undecided beyond)"}
 
 
 @dataclass(frozen=True)
 class Reply:
-    """An answer to be read (``str``) or processed (``data``, plain numbers, words and lists)."""
+    """An answer as text (``str``) and as plain numbers, words and lists (``data``)."""
 
     text: str
     data: Mapping[str, Any]
@@ -39,15 +39,15 @@ class Reply:
         return self.text
 
     def to_json(self) -> str:
-        """``data`` as one JSON object; what is not finite is null."""
+        """``data`` as one JSON object; numbers that are not finite become null."""
         return json.dumps(_plain(self.data), allow_nan=False)
 
 
 def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
-    """Results at one point, the gradient of its spectral radius, and the nearest changes of stability along every parameter.
+    """Results at one point, the gradient of the spectral radius, and the nearest change of stability along every parameter.
 
-    The gradient is by direct solves and with respect to every parameter of the system. Raises :class:`InputError` for
-    names and values that the atlas does not cover, :class:`ChunkError` if a direct solve fails.
+    The gradient comes from direct solves, with respect to every parameter of the system. Raises :class:`InputError` for
+    names and values outside the atlas, :class:`ChunkError` if a direct solve fails.
     """
     asked = Asked.of(atlas, given, ranges=())
     point = asked.values
@@ -88,11 +88,9 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
 
 
 def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Reply:
-    """The least damping from which on a range of speeds is stable, or the ranges of damping for which it is where the
-    atlas's largest damping is unstable. Raises as :func:`query`.
-
-    Of a cardan shaft in physical units only the ratio ``c2/c1`` of the dampings given is used; the answer is ``c1`` with it.
-    """
+    """The least damping above which a range of speeds is stable. If the largest damping of the atlas is unstable, the
+    answer lists the stable ranges of damping. For a cardan shaft in physical units only the ratio ``c2/c1`` of the given
+    dampings is used, and the answer is ``c1``. Raises as :func:`query`."""
     speed, damping = roles_of(atlas, "speed", "damping")
     asked = Asked.of(atlas, given, ranges=(speed,), free=(damping,))
     answer = design.least_damping(
@@ -102,8 +100,8 @@ def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Rep
 
 
 def widest_angle(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Reply:
-    """The widest joint angle up to which a range of speeds is stable, or the ranges of angles for which it is where the
-    atlas's smallest angle is unstable. Raises as :func:`query`."""
+    """The widest joint angle below which a range of speeds is stable. If the smallest angle of the atlas is unstable,
+    the answer lists the stable ranges of angle. Raises as :func:`query`."""
     speed, angle = roles_of(atlas, "speed", "angle")
     asked = Asked.of(atlas, given, ranges=(speed,), free=(angle,))
     answer = design.widest_angle(
@@ -113,7 +111,7 @@ def widest_angle(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Repl
 
 
 def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float = 0.0) -> Reply:
-    """The stable ranges of speed, shortened by ``margin`` of the speed at either end. Raises as :func:`query`."""
+    """The stable ranges of speed, shortened by ``margin`` times the speed at either end. Raises as :func:`query`."""
     if not 0 <= margin < 1:
         raise InputError(f"margin = {margin!r}: allowed is 0 <= margin < 1")
     (speed,) = roles_of(atlas, "speed")
@@ -152,16 +150,16 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
 
 
 def _kind(atlas: StoredAtlas, name: str, end: float, crossing: Crossing | None) -> str:
-    """What ends a stable interval: a ``crossing``, the end of the ``atlas``, or what is ``undecided``."""
+    """The end of a stable interval: a ``crossing``, the end of the ``atlas``, or ``undecided``."""
     if crossing:
         return "crossing"
     low, high = atlas.ranges[name]
-    # Of an angle the modulus counts.
+    # The modulus of an angle is compared.
     return "atlas" if abs(end) in {abs(low), abs(high), *([0.0] if low < 0 < high else [])} else "undecided"
 
 
 def _ends(asked: Asked, name: str, interval: Interval) -> list[dict[str, Any]]:
-    """Both ends of a stable interval as data; ``error`` and ``multiplier`` are those of a crossing."""
+    """Both ends of a stable interval as data; a crossing has ``error`` and ``multiplier``."""
     return [
         {
             "value": value,
@@ -174,13 +172,13 @@ def _ends(asked: Asked, name: str, interval: Interval) -> list[dict[str, Any]]:
 
 
 def _bounded(asked: Asked, name: str, value: float, crossing: Crossing | None) -> str:
-    """An end of a stable interval in words, with its error."""
+    """One end of a stable interval as text, with its error."""
     bound = f" +- {crossing.error:.1e}" if crossing else _BEYOND[_kind(asked.atlas, name, value, crossing)]
     return asked.named(name, value) + bound
 
 
 def _answered(title: str, phrase: str, safe: str, asked: Asked, answer: design.Answer) -> Reply:
-    """``phrase`` says where the value lies, ``safe`` which value of the atlas is the safe end."""
+    """The answer as text; ``phrase`` names the value, ``safe`` the stable end of the atlas."""
     name = answer.parameter
     lines = [f"{title}, {asked.heading()}"]
     if answer.value is not None:
@@ -217,7 +215,7 @@ def _answered(title: str, phrase: str, safe: str, asked: Asked, answer: design.A
 
 
 def _elsewhere(safe: str, asked: Asked, answer: design.Answer) -> list[str]:
-    """That the safe end is not stable, and which intervals are."""
+    """The text if the safe end is unstable: the stable intervals."""
     name, end = answer.parameter, answer.safe_end
     unstable = any(i.lower <= end <= i.upper for i in answer.intervals)
     lines = [f"  {'unstable' if unstable else 'undecided'} at {asked.named(name, end)}, the {safe} of the atlas"]
@@ -250,7 +248,7 @@ def _side(asked: Asked, name: str, value: float, crossing: Crossing) -> str:
 
 def _reach(atlas: StoredAtlas, nearest: design.Nearest) -> str:
     low, high = atlas.ranges[nearest.parameter]
-    # Stability may change within a range that is undecided.
+    # Stability may change inside an undecided range.
     elsewhere = ", unless where it is undecided:" if nearest.undecided else ""
     return f"none from {number(low)} to {number(high)}{elsewhere}"
 
@@ -281,7 +279,7 @@ def _checked(check: design.Check) -> str:
 
 
 def _from_one(radius: float) -> str:
-    """Next to a boundary the digits of a spectral radius are those of its distance from 1."""
+    """A spectral radius near 1 as its distance from 1, to keep its digits."""
     apart = radius - 1
     return f"{radius:.6g}" if not 0 < abs(apart) < _CLOSE else f"1 {'+' if apart > 0 else '-'} {abs(apart):.1e}"
 

@@ -1,4 +1,4 @@
-"""A chart of a stored atlas at any resolution and zoom, with its boundaries and tips as curves and points."""
+"""Evaluate a stored atlas as a chart, with its boundaries as curves and its tips as points."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from drivetrain_jax.atlas.windows import narrow
 from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, open_atlas
 from drivetrain_jax.systems import System
 
-# Values of a parameter beside the two of a chart.
+# Values of each parameter that is not an axis of the chart.
 _SLICES = 3
 
 
 def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, float]], cells: int) -> xr.Dataset:
     """The ``floquet`` result on ``cells`` values of each of two parameters of the atlas in ``source``.
 
-    ``part`` fixes parameters (numbers) or zooms in (ranges). Of further parameters there are three values. A chart of two
-    parameters also has, if the system has such, its stability boundaries (``boundary_NAME``, parts separated by NaN) and
-    the tips of its tongues (``tip_NAME``, with their names, ``tip_NAME_error``, ``tip_opens`` and ``tip_proved``) and the
-    boxes that may hide further ones (``undecided_NAME``). Raises :class:`InputError` for what the atlas does not cover,
+    ``part`` fixes parameters (numbers) or restricts them (ranges). Any further parameter gets three values. A chart of two
+    parameters also has the stability boundaries (``boundary_NAME``, segments separated by NaN), the tips of the tongues
+    (``tip_NAME``, their names, ``tip_NAME_error``, ``tip_opens``, ``tip_proved``) and boxes that may contain more tips
+    (``undecided_NAME``), if the system has them. Raises :class:`InputError` for values outside the atlas,
     :class:`ChunkError` if a direct solve in a gap fails.
     """
     if not 2 <= cells <= 20_000:
@@ -64,7 +64,7 @@ def _ranges(atlas: StoredAtlas, part: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _shown(system: System, names: list[str]) -> list[str]:
-    """The two parameters of the chart first, the axis of the resonances among them, or the speed if there are none."""
+    """The parameters with the two of the chart first: the axis of the resonances, or the speed without resonances."""
     axis = system.resonances.axis if system.resonances else system.roles.get("speed")
     return sorted(names, key=lambda name: name != axis)
 
@@ -77,7 +77,7 @@ def _curves(
     signs = _signs(panels)
     tips = None
     if system.resonances is not None and system.resonances.axis in ranges:
-        # Tongues widen with the angle. Along a damping they close, and what closes them is their tip.
+        # Tongues widen with the angle. They close with increasing damping, at their tip.
         tips = find_tips(panels, system, opening=system.roles.get("angle") in ranges)
     segments = [
         _within({name: sign * segment[name] for name, sign in side.items()}, ranges)
@@ -97,7 +97,7 @@ def _curves(
 
 
 def _signs(atlas: Atlas) -> list[dict[str, float]]:
-    """The signs of the parameters with which moduli lie in ``atlas``: both where it reaches over 0."""
+    """The signs of the parameters whose moduli lie in ``atlas``: both signs if the range crosses 0."""
     choices = []
     for coordinate, low, high in zip(atlas.coordinates, atlas.lower, atlas.upper, strict=True):
         both = [1.0] if not coordinate.even or high > 0 else []
@@ -106,7 +106,7 @@ def _signs(atlas: Atlas) -> list[dict[str, float]]:
 
 
 def _within(places: Mapping[str, np.ndarray], ranges: Mapping[str, tuple[float, float]]) -> dict[str, np.ndarray]:
-    """``places`` with NaN for those outside ``ranges``."""
+    """``places`` with NaN outside ``ranges``."""
     inside = np.logical_and.reduce([(low <= places[n]) & (places[n] <= high) for n, (low, high) in ranges.items()])
     return {name: np.where(inside, values, np.nan) for name, values in places.items()}
 
@@ -116,10 +116,10 @@ def _on_all_sides(found: Tips, signs: list[dict[str, float]], ranges: Mapping[st
     for side in signs:
         for tip in found.tips:
             point = {name: sign * tip.point[name] for name, sign in side.items()}
-            # At 0 both sides are one.
+            # At 0 both signs are the same point.
             known = any(point == other.point for other in tips)
             if not known and all(low <= point[name] <= high for name, (low, high) in ranges.items()):
-                # What opens upwards on one side of 0 opens downwards on the other.
+                # A tongue that opens upwards at positive values opens downwards at negative ones.
                 tips.append(replace(tip, point=point, opens=tip.opens == (min(side.values()) > 0)))
         for box in found.undecided:
             boxes.append({name: tuple(sorted(sign * end for end in box[name])) for name, sign in side.items()})
@@ -129,7 +129,7 @@ def _on_all_sides(found: Tips, signs: list[dict[str, float]], ranges: Mapping[st
 def _tips(
     found: Tips, system: System, names: Iterable[str]
 ) -> dict[str, tuple[str | tuple[str, str], np.ndarray, dict[str, str]]]:
-    """The tips as coordinates: names, whether they open and are proved, place and its error; and the undecided boxes."""
+    """The tips as coordinates: names, opening, proof, position and error; and the undecided boxes."""
     labels = np.array([tip.name for tip in found.tips], dtype=str)
     proved = np.array([tip.proved for tip in found.tips], np.int8)
     meaning = {

@@ -1,4 +1,4 @@
-"""Whether a scene is computed through an atlas, and over which ranges of its parameters."""
+"""Decide if a scene is evaluated from an atlas, and over which ranges."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from drivetrain_jax.runs.grid import Grid
 from drivetrain_jax.runs.plan import mean_cost
 from drivetrain_jax.runs.scene import Scene
 
-# Points from which on "auto" tries an atlas: fewer are solved directly in the time that two more kernels take to compile.
+# Points below which "auto" solves directly: two more kernels would take longer to compile.
 _WORTHWHILE = 100_000
-# The share of the effort of solving every point that "auto" may spend on it. What is not covered by then is solved directly.
+# Share of the effort of direct solves that "auto" may spend on an atlas; the rest is then solved directly.
 _SHARE = 1 / 8
-# What an atlas of one, two, ... parameters takes at least, in direct solves.
+# Direct solves of the cheapest atlas with one, two, ... parameters.
 _FEWEST = (100, 500, 2_000, 8_000)
-# Points whose effort is predicted to tell that of all.
+# Sample of points whose effort estimates that of all.
 _SAMPLE = 4096
-# Below this target relative error rounding keeps the panels of an atlas from being accepted.
+# Target relative error below which rounding prevents panels from being accepted.
 _FINEST = 1e-12
 
 
@@ -34,9 +34,9 @@ def atlas_ranges(scene: Scene) -> dict[str, tuple[float, float]]:
 
 
 def uses_atlas(scene: Scene) -> bool:
-    """Whether the points of ``scene`` are evaluated from an atlas: on request, or if ``auto`` finds it worthwhile.
+    """True if ``scene`` is evaluated from an atlas: on request, or if ``auto`` predicts a lower cost.
 
-    Raises :class:`InputError` for a scene that asks for one and varies too many parameters.
+    Raises :class:`InputError` if the scene requests an atlas and varies too many parameters.
     """
     if scene.analysis.name != "floquet" or scene.request.method not in ("auto", "atlas"):
         return False
@@ -58,10 +58,10 @@ def uses_atlas(scene: Scene) -> bool:
 
 
 def solves_allowed(scene: Scene) -> int | None:
-    """The largest number of direct solves that the atlas of ``scene`` may take, None for its own limit.
+    """Largest number of direct solves for the atlas of ``scene``; None for its own limit.
 
-    Nodes cost more than points: they are solved more sharply, and lie evenly in the coordinates of the atlas, such as
-    1/Omega, where points are few and dear.
+    A node costs more than a point: its tolerance is tighter, and nodes are even in the coordinates of the atlas, such as
+    1/Omega, where expensive points are rare.
     """
     if scene.request.method != "auto":
         return None
@@ -72,5 +72,5 @@ def solves_allowed(scene: Scene) -> int | None:
     point = mean_cost(scene.analysis.solvers(scene.system, scene.request), grid, chosen)
     nodes = node_engine(scene, atlas_ranges(scene), _SAMPLE)
     node = mean_cost(nodes.solvers, nodes.grid, np.arange(_SAMPLE))
-    # Nodes that cost nothing are nodes that no solver can do.
+    # Nodes of cost 0 are nodes that no solver can compute.
     return int(grid.size * _SHARE * point / node) if node else 0

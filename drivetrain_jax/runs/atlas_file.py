@@ -1,4 +1,4 @@
-"""Atlas files: panels as a labelled result like any other, and the object that answers from one."""
+"""Atlas files: panels as a labelled result, and the object that evaluates them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from drivetrain_jax.store.schema import Entry, Labelled
 if TYPE_CHECKING:
     import xarray as xr
 
-# Name in the file, dimensions, meaning. Boxes are in the coordinates of the atlas, which have the attribute's names.
+# Variables of the file: name, dimensions, meaning. Boxes are in the coordinates named by the attribute.
 _VARIABLES = {
     "lower": (("parameter",), "lower end of the domain, in the parameter's unit"),
     "upper": (("parameter",), "upper end of the domain, in the parameter's unit"),
@@ -56,7 +56,7 @@ _ATTRIBUTES = ("scene", "coordinates_of_panels", "tolerance", "solves")
 
 
 def make_atlas(scene: Scene, work: Work, progress: Progress) -> Labelled:
-    """The content of the file of an atlas scene. ``progress`` counts the solves."""
+    """The dataset of an atlas scene. ``progress`` counts the solves."""
     stability, _ = build_atlas(scene, atlas_ranges(scene), work, progress)
     atlas = stability.atlas
     arrays = to_arrays(atlas)
@@ -79,17 +79,17 @@ def make_atlas(scene: Scene, work: Work, progress: Progress) -> Labelled:
 
 
 def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
-    """The atlas that the run of a scene with ``analysis = "atlas"`` gave: its file, or the dataset itself.
+    """The :class:`StoredAtlas` of a scene with ``analysis = "atlas"``, from its file or its dataset.
 
-    Raises :class:`InputError` if it is none or its file damaged, or if its system is not installed or has other
-    coordinates by now.
+    Raises :class:`InputError` if ``source`` is not an atlas or is damaged, or if its system is not installed or has other
+    coordinates now.
     """
     compile_cache.enable()
     dataset = open_result(Path(source)) if isinstance(source, (str, Path)) else source
     label = "dataset" if dataset is source else f"file = {str(source)!r}"
     if dataset.attrs.get("analysis") != ANALYSIS.name:
         raise InputError(f"{label}: holds the analysis {dataset.attrs.get('analysis')!r}; allowed is an atlas")
-    # Bounds that are carried with the panels hold for panels as they were written: nothing else would tell.
+    # The bounds hold only for the panels as written, and damage would not be visible otherwise.
     if dataset is not source and (changed := checksums.damaged(Path(source))):
         raise InputError(
             f"{label}: damaged ({checksums.named(changed)}); allowed is to restore it or to run its scene again"
@@ -115,7 +115,7 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
 
 
 def _missing(dataset: xr.Dataset) -> list[str]:
-    """What :func:`make_atlas` writes and ``dataset`` lacks."""
+    """Names of the variables of :func:`make_atlas` that ``dataset`` lacks."""
     gaps = any(name in dataset for name in _GAPS)
     panels = not gaps or any(name in dataset for name in _PANELS)
     needed = (*_DOMAIN, *(_PANELS if panels else ()), *(_GAPS if gaps else ()))
@@ -133,7 +133,7 @@ def _missing(dataset: xr.Dataset) -> list[str]:
 class StoredAtlas:
     """A stability atlas as a function: ``atlas(beta=0.31, Omega=1.2)``.
 
-    ``scene`` is the one that made it, ``stability`` what evaluates its panels. Points in gaps are solved directly.
+    ``scene`` is the scene that computed it; ``stability`` evaluates its panels. Points in gaps are solved directly.
     """
 
     scene: Scene
@@ -153,11 +153,11 @@ class StoredAtlas:
 
     @property
     def fixed(self) -> Mapping[str, Any]:
-        """The other parameters."""
+        """Values of the fixed parameters."""
         return self.stability.atlas.fixed
 
     def allowed(self, name: str) -> str:
-        """The range of a parameter as messages write it: ``0 <= beta <= 1.5, in rad``."""
+        """The range of a parameter as text: ``0 <= beta <= 1.5, in rad``."""
         low, high = self.ranges[name]
         units = self.scene.system.parameter(name).units
         return f"{low:.10g} <= {name} <= {high:.10g}" + ("" if units == "1" else f", in {units}")
@@ -191,11 +191,11 @@ class StoredAtlas:
         return f"{self.scene.system.name} atlas: {ranges}; {fixed}; {parts}"
 
     def __call__(self, **values: Any) -> xr.Dataset:
-        """Results at points: every parameter a number or an array, broadcast against each other.
+        """Results at points: every parameter is a number or an array; they are broadcast against each other.
 
-        Arrays of xarray keep their dimensions and labels, others have the dimension ``point`` (or ``dim_0``, ``dim_1``,
-        ...). Raises :class:`InputError` for a name that is missing or unknown, for a value outside the atlas, and for
-        arrays whose shapes or labels do not fit together; :class:`ChunkError` if a direct solve in a gap fails.
+        Arrays of xarray keep their dimensions and labels; others have the dimension ``point`` (or ``dim_0``, ``dim_1``,
+        ...). Raises :class:`InputError` for a missing or unknown name, a value outside the atlas, or shapes or labels that
+        do not match; :class:`ChunkError` if a direct solve in a gap fails.
         """
         import xarray as xr
 
@@ -216,7 +216,7 @@ class StoredAtlas:
         return xr.Dataset(data, labels | coords, found.attrs)
 
     def grid(self, **values: Any) -> xr.Dataset:
-        """Results on the outer product of arrays, as a scene with these axes would give; numbers fix a parameter.
+        """Results on the outer product of arrays, as a scene with these axes would compute; numbers fix a parameter.
 
         The dimensions have the order in which the arrays are given; a number is a coordinate without a dimension. Raises as
         a call does.
@@ -261,7 +261,7 @@ class StoredAtlas:
         return Request(self.scene.request.outputs, "atlas", self.scene.request.options)
 
     def radius(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Spectral radii ``(N,)`` by direct solves, without the panels; ``columns`` of all parameters.
+        """Spectral radii ``(N,)`` by direct solves, without the panels; ``columns`` holds all parameters.
 
         Raises :class:`ChunkError` if a solve fails.
         """
@@ -308,13 +308,13 @@ class StoredAtlas:
 
 
 def as_given(value: Any) -> str:
-    """A number or a range as it is given: ``1.3:1.5``."""
+    """A number or a range as text: ``1.3:1.5``."""
     ends = value if isinstance(value, tuple) else (value,)
     return ":".join(f"{end:.10g}" if isinstance(end, (int, float)) else shown(end) for end in ends)
 
 
 def _broadcast(given: Mapping[str, Any]) -> tuple[xr.DataArray, ...]:
-    """Numbers and arrays of one shape: those without labels by their places, then all by the names of their dimensions."""
+    """Arrays of one shape: unlabelled ones are broadcast by position, then all by dimension names."""
     import xarray as xr
 
     plain = {name: np.asarray(v, float) for name, v in given.items() if not isinstance(v, xr.DataArray)}
@@ -322,7 +322,7 @@ def _broadcast(given: Mapping[str, Any]) -> tuple[xr.DataArray, ...]:
         plain = dict(zip(plain, np.broadcast_arrays(*plain.values()), strict=True))
         labelled = {n: xr.DataArray(v, dims=("point",) if v.ndim == 1 else None) for n, v in plain.items()}
         arrays = [labelled.get(name, value) for name, value in given.items()]
-        # By itself `broadcast` gives the union of labels, with NaN where an array has none.
+        # The default of `broadcast` is the union of labels, with NaN for missing ones.
         return xr.broadcast(*xr.align(*arrays, join="exact", copy=False))
     except ValueError:
         shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in given.items())

@@ -1,6 +1,4 @@
-"""What is asked of an atlas: parameters as those of the atlas, or in the physical units of the system
-(``drivetrain_jax.systems``: ``physical``), checked before anything is computed.
-"""
+"""Input of questions to an atlas: its parameters, or physical data of the system, checked before any computation."""
 
 from __future__ import annotations
 
@@ -14,18 +12,18 @@ from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given
 from drivetrain_jax.runs.physical import nondimensional
 
 Range = tuple[float, float]
-# How closely a given parameter has to be what the atlas was made with, and how far from an end of its range a value is
-# taken to be that end: converted from other units, or copied from a message, it is rounded.
+# Relative tolerance within which a value equals a fixed parameter, or an end of a range: values converted from other units,
+# or copied from a message, are rounded.
 _SAME = 1e-9
 
 
 def number(value: float) -> str:
-    """As numbers are written in answers and messages."""
+    """A number as text, as in answers and messages."""
     return f"{value:.10g}"
 
 
 def roles_of(atlas: StoredAtlas, *roles: str) -> list[str]:
-    """The parameters with these ``roles`` in the system; :class:`InputError` if it names none."""
+    """The parameters with these ``roles`` in the system; :class:`InputError` if it has none."""
     system = atlas.scene.system
     for role in roles:
         if role not in system.roles:
@@ -35,7 +33,7 @@ def roles_of(atlas: StoredAtlas, *roles: str) -> list[str]:
 
 @dataclass(frozen=True)
 class Asked:
-    """What was given, as parameters of the atlas (numbers, or ranges), and the physical data behind it."""
+    """The given values as parameters of the atlas (numbers or ranges), with the physical data behind them."""
 
     atlas: StoredAtlas
     values: Mapping[str, Any]
@@ -45,7 +43,7 @@ class Asked:
     def of(
         cls, atlas: StoredAtlas, given: Mapping[str, Any], ranges: tuple[str, ...], free: tuple[str, ...] = ()
     ) -> Asked:
-        """``ranges`` names the parameters of which a range is wanted, ``free`` those that are the answer."""
+        """Check the given values; ``ranges`` names parameters that need a range, ``free`` those that are the answer."""
         shaft, values = nondimensional(atlas.scene.system, given)
         for name, value in given.items():
             if _meant(name, value, shaft) in free:
@@ -77,7 +75,7 @@ class Asked:
         return {name: value for name, value in self.values.items() if not isinstance(value, tuple)}
 
     def heading(self) -> str:
-        """What holds for the answer, in words."""
+        """The conditions of the answer as text."""
         everything = {**self.values, **self.atlas.fixed}
         return ", ".join(
             f"{name} = {number(v[0])} to {number(v[1])}" if isinstance(v, tuple) else f"{name} = {number(v)}"
@@ -85,13 +83,13 @@ class Asked:
         )
 
     def named(self, name: str, value: float) -> str:
-        """``beta = 0.31 (17.76 deg)``"""
+        """A value as text: ``beta = 0.31 (17.76 deg)``."""
         physical = self.shaft.quantity(name, value) if self.shaft else None
         aside = f" ({physical[0]} = {number(physical[1])} {physical[2]})" if physical else ""
         return f"{name} = {number(value)}{aside}"
 
     def physical(self, values: Mapping[str, float | Range]) -> dict[str, Any]:
-        """``values`` in the units that were given, by their names there; empty where none were."""
+        """``values`` in the physical units of the input; empty without physical input."""
         found = {}
         for name, value in values.items() if self.shaft else ():
             ends = [self.shaft.quantity(name, end) for end in (value if isinstance(value, tuple) else (value,))]
@@ -102,14 +100,14 @@ class Asked:
 
 
 def _meant(name: str, value: Any, shaft: Any) -> str:
-    """The parameter that ``name`` gives, itself or in another unit."""
+    """The parameter that ``name`` stands for, itself or as physical data."""
     if shaft is None or name not in shaft.operation:
         return name
     return shaft.parameter(name, value[0] if isinstance(value, tuple) else value)[0]
 
 
 def _within(value: Any, ends: Range) -> Any:
-    """``value``, or both of a range, where it is next to an end of the atlas this end."""
+    """``value`` (or both ends of a range), moved to an end of the atlas if it is that close."""
     if isinstance(value, tuple):
         return tuple(_within(each, ends) for each in value)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -126,7 +124,7 @@ def _check_same(name: str, value: Any, fixed: float) -> None:
 
 @dataclass(frozen=True)
 class _Words:
-    """How messages name a parameter of the atlas, its range and its values: in the units that were given."""
+    """Texts for a parameter of the atlas, its range and its values, in the units of the input."""
 
     name: str
     allowed: str
@@ -142,7 +140,7 @@ class _Words:
         return cls(label, allowed, lambda value: shaft.quantity(name, value)[1])
 
     def given(self, value: Any) -> str:
-        """A value or a range as it was given."""
+        """A value or a range in the units of the input."""
         ends = value if isinstance(value, tuple) else (value,)
         shown = tuple(self.convert(end) if isinstance(end, float) else end for end in ends)
         return as_given(shown if isinstance(value, tuple) else shown[0])

@@ -1,4 +1,4 @@
-"""Axes of a scene: how they are written, and their values."""
+"""Axes of a scene: their keys, and their values."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter
 
 MAX_POINTS = 2_000_000_000
-# Parameters of an atlas.
+# Largest number of parameters of an atlas.
 MAX_RANGES = 4
 _SCALES = ("lin", "log")
 
@@ -29,7 +29,7 @@ class AxisTable(msgspec.Struct, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Axis:
-    """A varying parameter, or entry number ``entry`` of a list-valued one. ``name`` is ``Omega`` or ``length[1]``."""
+    """A varying parameter, or entry number ``entry`` of a list. ``name`` is ``Omega`` or ``length[1]``."""
 
     name: str
     parameter: Parameter
@@ -44,16 +44,16 @@ class Axis:
 
 
 def entry_of(name: str) -> tuple[str, int | None]:
-    """Parameter and position behind the name of an axis: ``length[1]`` is ``("length", 1)``."""
-    # One spelling for each entry: two axes of different names never vary the same one.
+    """Parameter and position of the name of an axis: ``length[1]`` is ``("length", 1)``."""
+    # Each entry has one spelling, so two axes of different names never vary the same entry.
     match = re.fullmatch(r"(.+)\[(0|[1-9][0-9]{0,8})\]", name)
     return (match.group(1), int(match.group(2))) if match else (name, None)
 
 
 def check_count(name: str, spec: AxisTable, continuous: bool) -> int:
-    """Number of values of an axis, without making them; refuses incomplete and contradictory ones.
+    """Number of values of an axis, before they are computed; raises for incomplete or contradictory keys.
 
-    Those of a ``continuous`` axis are its two ends.
+    A ``continuous`` axis has two values, its ends.
     """
     field = f"axes.{name}"
     if continuous:
@@ -97,7 +97,7 @@ def _check_range(field: str, spec: AxisTable) -> int:
 
 
 def spread(spec: AxisTable, field: str) -> np.ndarray:
-    """The values of a checked axis; no value may occur twice."""
+    """The values of a checked axis; raises if a value occurs twice."""
     if spec.values is not None:
         values = np.array(spec.values, float)
     elif spec.num is None:

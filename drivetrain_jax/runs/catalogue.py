@@ -1,4 +1,4 @@
-"""What there is to compute: systems, their parameters and analyses, and scene files, as plain text."""
+"""List systems, their parameters and analyses, and scene files as plain text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Chunks computed on a Dask cluster: this process plans and writes, the workers compute and hand back arrays."""
+"""Compute chunks on a Dask cluster: this process plans and writes, the workers return arrays."""
 
 from __future__ import annotations
 
@@ -17,16 +17,15 @@ from drivetrain_jax.runs.worker import Job
 
 _PATIENCE = "10s"
 _LOCAL = re.compile(r"local:([1-9]\d*)")
-# What these libraries say of their own accord when a scheduler or a worker dies; here that is one line, or no news.
+# Loggers of Dask that report the death of a scheduler or worker; the run reports it in one line.
 _TALKATIVE = ("distributed", "tornado", "asyncio")
 
 
 def run_cluster(chunks: Iterable[Chunk], job: Job, address: str) -> Iterator[tuple[Chunk, Results | None]]:
-    """``(chunk, results)`` in the order of completion, from the scheduler at ``address`` or from ``local:N`` processes.
+    """Yield ``(chunk, results)`` in the order of completion, from the scheduler at ``address`` or ``local:N`` processes.
 
-    A chunk whose worker died is computed again elsewhere; results are None for one at which too many died (Dask's
-    setting ``distributed.scheduler.allowed-failures``). An exception of a chunk is raised here; a scheduler that
-    vanishes is a :class:`Passing`.
+    A chunk whose worker died is computed again. Results are None after too many deaths (Dask's setting
+    ``distributed.scheduler.allowed-failures``). Exceptions of chunks are raised; a lost scheduler raises :class:`Passing`.
     """
     distributed = _distributed()
     with ExitStack() as stack:
@@ -34,7 +33,7 @@ def run_cluster(chunks: Iterable[Chunk], job: Job, address: str) -> Iterator[tup
         remaining, running = iter(chunks), {}
         finished = distributed.as_completed(loop=client.loop)
         room = IN_FLIGHT * max(sum(client.nthreads().values()), 1)
-        # A scheduler gives two tasks of one key one result, and other runs have other points under the same numbers.
+        # A random part of the key: another run on the same scheduler uses the same chunk numbers.
         run = uuid.uuid4().hex
         while True:
             while len(running) < room and (chunk := next(remaining, None)) is not None:
@@ -49,7 +48,7 @@ def run_cluster(chunks: Iterable[Chunk], job: Job, address: str) -> Iterator[tup
 
 
 def check_scheduler(address: str) -> None:
-    """Raises :class:`InputError` if none answers there. One of this process's own is only started when it has work."""
+    """Raise :class:`InputError` if no scheduler answers at the address; a local one starts with the first work."""
     distributed = _distributed()
     if not _LOCAL.fullmatch(address):
         with ExitStack() as stack:

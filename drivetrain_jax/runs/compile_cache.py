@@ -26,9 +26,9 @@ _CHECKSUM_BYTES = 16
 
 
 def enable() -> None:
-    """Let jax keep compiled code. ``DRIVETRAIN_JAX_CACHE=0`` turns it off, any other value is the folder to use.
+    """Turn on jax's compilation cache. ``DRIVETRAIN_JAX_CACHE=0`` turns it off; any other value names its folder.
 
-    A cache that the user has set up in jax is left alone; a folder that cannot be written means no cache.
+    A cache that the user has configured stays unchanged. Without a writable folder there is no cache.
     """
     wanted = os.environ.get(_VARIABLE, "")
     if wanted == "0" or jax.config.jax_compilation_cache_dir:
@@ -94,7 +94,7 @@ def _shrink(folder: Path) -> None:
 
 
 def _folder(wanted: str) -> Path:
-    """One folder per instruction set and jax version: code of another machine may not run here."""
+    """One folder per instruction set and jax version, because compiled code is not portable."""
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     root = Path(wanted) if wanted else base / "drivetrain_jax"
     return root / digest([sorted(instruction_set()), jax.__version__])
@@ -103,7 +103,7 @@ def _folder(wanted: str) -> Path:
 def _writable(folder: Path) -> bool:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        # Compiled code is executed: a folder of another user is not trusted.
+        # Compiled code is executed, so a folder of another user is not trusted.
         if hasattr(os, "getuid") and folder.stat().st_uid != os.getuid():
             return False
         with tempfile.TemporaryFile(dir=folder):

@@ -1,4 +1,4 @@
-"""A scene made ready: solvers, plan and kernels, and the function that computes one chunk."""
+"""The engine of a scene: solvers, plan and kernels, and the function that computes one chunk."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from drivetrain_jax.runs.plan import Chunk, Plan, make_plan
 from drivetrain_jax.runs.scene import Scene
 from drivetrain_jax.store.provenance import digest
 
-# Kernels that are compiled at a time.
+# Kernels that are compiled at the same time.
 _SIDE_BY_SIDE = 8
 
 
 class Engine:
-    """Computes the chunks of one scene. Everything costly is made on first use.
+    """Computes the chunks of one scene. Plan and kernels are created on first use.
 
-    ``points`` restricts the plan to these points of the grid; ``full_size`` see :func:`make_plan`.
+    ``points`` restricts the plan to these points of the grid; for ``full_size`` see :func:`make_plan`.
     """
 
     def __init__(self, scene: Scene, points: np.ndarray | None = None, *, full_size: bool = False) -> None:
-        # Before the first kernel, which may be one that a plan asks for.
+        # Before the first kernel, which the plan may need.
         _use_double_precision()
         compile_cache.enable()
         self.scene = scene
@@ -45,27 +45,27 @@ class Engine:
         self._lock = threading.Lock()
 
     def only(self, points: np.ndarray) -> Engine:
-        """The same for these points of the grid."""
+        """The engine restricted to these points of the grid."""
         return Engine(self.scene, points, full_size=self._full_size)
 
     @cached_property
     def numerics(self) -> str:
-        """Digest of the code and the machine that compute."""
+        """Digest of code, versions and machine."""
         return digest(self.numerics_detail)
 
     @cached_property
     def numerics_detail(self) -> dict[str, Any]:
-        """What that digest is of, piece by piece."""
+        """The parts of that digest."""
         return numerics_of(self.scene)
 
     @property
     def numerics_attrs(self) -> dict[str, str]:
-        """Both as a result and a plan keep them."""
+        """Digest and parts as attributes of a result or plan."""
         return {"numerics": self.numerics, "numerics_detail": json.dumps(self.numerics_detail)}
 
     @cached_property
     def digest(self) -> str:
-        """Digest of everything that decides the result."""
+        """Digest of everything that affects the result."""
         return scene_digest(self.scene, self.solvers, self.numerics)
 
     @cached_property
@@ -79,20 +79,20 @@ class Engine:
 
     @property
     def total(self) -> int:
-        """Number of points, those along a path counted one by one."""
+        """Number of results; every point of a path counts."""
         return (self.grid.size if self._points is None else len(self._points)) * self.grid.path_length
 
     @property
     def hopeless(self) -> int:
-        """Number of points that no solver can do; they are done before anything is computed, without a value."""
+        """Number of points that no solver can compute; they have no value."""
         return self.total - self.plan.size * self.grid.path_length
 
     def ordered(self, numbers: Iterable[int]) -> Iterator[Chunk]:
-        """The chunks with these numbers in the order in which they are to be computed, each made when it is asked for."""
+        """Yield the chunks with these numbers in the order of computation, each created on demand."""
         return map(self.plan.chunk, self.plan.ordered(numbers))
 
     def prepare(self, kernels: Set[tuple[int, int]]) -> None:
-        """Begin to compile kernels (position of the solver, size of chunks), side by side, without waiting for them."""
+        """Start compiling kernels (position of the solver, chunk size) in parallel, without waiting."""
         with self._lock:
             missing = kernels - self._kernels.keys()
             if not missing:
@@ -104,7 +104,7 @@ class Engine:
                 self._kernels[index, size] = pool.submit(kernel_of, self.scene, self.grid, solver, size, few)
 
     def compute_chunk(self, chunk: Chunk) -> Mapping[str, np.ndarray]:
-        """Results of one chunk; may be called from several threads. Raises :class:`ChunkError`."""
+        """Results of one chunk; thread-safe. Raises :class:`ChunkError`."""
         self.prepare({(chunk.solver, chunk.size)})
         try:
             kernel = self._kernels[chunk.solver, chunk.size].result()
@@ -116,7 +116,7 @@ class Engine:
 
 
 def _use_double_precision() -> None:
-    """Set jax to double precision again where it has been set to another since, unless that is the caller's own affair."""
+    """Set jax to double precision again, unless the environment variable leaves that to the caller."""
     if not jax.config.jax_enable_x64 and os.environ.get("DRIVETRAIN_JAX_ENABLE_X64") != "0":
         jax.config.update("jax_enable_x64", True)
     if not jax.config.jax_enable_x64:
@@ -124,5 +124,5 @@ def _use_double_precision() -> None:
 
 
 def _may_pass(error: Exception) -> bool:
-    # XLA says that memory is short with an error of its own.
+    # XLA reports lack of memory by an exception of its own.
     return isinstance(error, (OSError, MemoryError)) or "RESOURCE_EXHAUSTED" in str(error)

@@ -1,4 +1,4 @@
-"""Where chunks are computed: in threads of this process, in processes of their own, or on a Dask cluster."""
+"""Executors of chunks: threads of this process, spawned processes, or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     from drivetrain_jax.runs.worker import Job
 
 Results = Mapping[str, np.ndarray]
-# Chunks handed out per worker: one that is computed and one that waits, so that none idles while results are stored.
+# Chunks per worker: one is computed while the other waits, so no worker idles during writing.
 IN_FLIGHT = 2
-# Small chunks are computed faster than results are stored: threads are handed up to this many, and bytes of results.
+# Upper limits of chunks, and of bytes of results, per thread: small chunks are computed faster than stored.
 _MOST_AHEAD, _BYTES_AHEAD = 32, 1 << 23
 
 
 @dataclass(frozen=True)
 class Where:
-    """``workers`` processes, the Dask cluster at ``dask`` (``tcp://host:port`` or ``local:N``), or else ``threads``.
+    """The executor: ``workers`` processes, Dask at ``dask`` (``tcp://host:port`` or ``local:N``), or ``threads``.
 
-    None of them decides any number. Raises :class:`InputError` where they are out of range or exclude each other.
+    The executor does not affect the numbers. Raises :class:`InputError` for invalid or conflicting settings.
     """
 
     threads: int | None = None
@@ -51,16 +51,16 @@ class Where:
             raise InputError(f"{given[0]}: given together with {given[1]}; allowed is one of them")
 
     def check(self) -> None:
-        """Raises :class:`InputError` if no scheduler answers at the address: before earlier work is given up for a run."""
+        """Raise :class:`InputError` if no scheduler answers at the address, before earlier work is deleted."""
         if self.dask is not None:
             from drivetrain_jax.runs.cluster import check_scheduler
 
             check_scheduler(self.dask)
 
     def compute(self, engine: Engine, numbers: Iterable[int]) -> Iterator[tuple[Chunk, Results | None]]:
-        """``(chunk, results)`` of the chunks with these numbers in the order of completion, the costliest begun first.
+        """Yield ``(chunk, results)`` of the chunks with these numbers in the order of completion, the most expensive first.
 
-        Results are None for a chunk that killed every process which computed it. What fails otherwise is raised.
+        Results are None for a chunk that killed every process that computed it. Other failures are raised.
         """
         numbers = np.fromiter(numbers, np.int64)
         if self.workers is None and self.dask is None:
@@ -70,8 +70,8 @@ class Where:
     def each(
         self, chunks: Iterable[Any], here: Callable[[Any], Results], job: Callable[[], Job]
     ) -> Iterator[tuple[Any, Results | None]]:
-        """``(chunk, results)`` like :meth:`compute` for any numbered pieces of work: done by ``here`` in threads of this
-        process, else by ``job().do`` elsewhere."""
+        """Like :meth:`compute` for any numbered tasks, done by ``here`` in threads of this process, or by ``job().do``
+        elsewhere."""
         if self.workers is None and self.dask is None:
             return run_threads(chunks, here, self.threads or usable_cores())
         if self.workers is not None:
@@ -96,10 +96,10 @@ def _job(engine: Engine) -> Job:
 def run_threads(
     chunks: Iterable[Chunk], work: Callable[[Chunk], Results], count: int
 ) -> Iterator[tuple[Chunk, Results]]:
-    """``count`` threads of this process; compiled code runs without the interpreter's lock.
+    """Yield results from ``count`` threads of this process; compiled code releases the interpreter's lock.
 
-    An exception of a chunk is raised here. When the iterator is left (also by an interrupt), no further chunk starts;
-    those that run finish in the background and their results are dropped.
+    An exception of a chunk is raised here. After the iterator is closed (also by an interrupt) no further chunk starts;
+    running ones finish in the background, and their results are dropped.
     """
     pool = threads(count, "chunk")
     remaining = iter(chunks)
@@ -122,11 +122,11 @@ def run_threads(
         if running:
             for future in running:
                 future.cancel()
-            # What still runs is not to be waited for by whoever comes next.
+            # The next user of the pool must not wait for running chunks.
             threads.cache_clear()
 
 
 def _ahead(results: Results) -> int:
-    """Chunks like that of ``results`` to be handed out per thread."""
+    """Number of chunks like that of ``results`` to queue per thread."""
     size = sum(values.nbytes for values in results.values())
     return min(max(_BYTES_AHEAD // max(size, 1), IN_FLIGHT), _MOST_AHEAD)

@@ -1,4 +1,4 @@
-"""Why a result, or unfinished work, is not that of a scene: what differs, in words."""
+"""Explain in words how stored work differs from a scene."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ from drivetrain_jax.runs.scene import Scene, load_scene
 
 
 def differences(stored: Mapping[str, Any], engine: Engine, *, points: bool = True) -> list[str]:
-    """What keeps stored work from being that of ``engine``: its ``scene`` (TOML), ``drivetrain_jax_version``, ``numerics``
-    and, if known, ``numerics_detail``. Without ``points`` its axes, fixed values and results may be others, as long as all
-    results wanted are there."""
+    """Differences of stored work from that of ``engine``: scene (TOML), package version, ``numerics``,
+    ``numerics_detail``. Without ``points``, axes and fixed values may differ, and results may be more than requested."""
     try:
         scene = load_scene(tomllib.loads(str(stored.get("scene"))))
     except (InputError, tomllib.TOMLDecodeError) as error:
@@ -75,7 +74,7 @@ def _range(values: np.ndarray, scene: Scene) -> str:
 
 
 def _of_numerics(stored: str | None, present: Mapping[str, Any]) -> list[str]:
-    """Versions, sources and machine one by one, as far as they were recorded."""
+    """Differences of versions, sources and machine, as far as they were recorded."""
     try:
         old = json.loads(stored or "")
     except ValueError:
@@ -87,7 +86,7 @@ def _of_numerics(stored: str | None, present: Mapping[str, Any]) -> list[str]:
             names = {*value, *before}
             if key == "sources" and (EVALUATES_ATLAS in value) != (EVALUATES_ATLAS in before):
                 found.append(f"points are {_route(value)}, were {_route(before)}")
-                # The files that only one of the two ways runs have not changed.
+                # The two methods run different files; those files have not changed.
                 names = {*value} & {*before}
             changed = [name for name in sorted(names) if value.get(name) != before.get(name)]
             if key == "versions":

@@ -1,4 +1,4 @@
-"""One HDF5 file from a Zarr store: the same arrays, coordinates and labels as those of a run that writes HDF5 itself."""
+"""Convert a Zarr store to one HDF5 file: arrays, coordinates and labels equal those of an HDF5 run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from drivetrain_jax.store.consolidate import ResultFile
 def export(store: Path, out: Path) -> int:
     """Write the result in the Zarr ``store`` to the new file ``out``, shard by shard; returns the number of points.
 
-    Raises :class:`InputError` if ``store`` is none or damaged, or if ``out`` exists or cannot be written.
+    Raises :class:`InputError` if ``store`` is not a sound Zarr store, or if ``out`` exists or cannot be written.
     """
     if not shards.is_store(store):
         raise InputError(f"store = {str(store)!r}: not a Zarr store; give one of `drivetrain run --store zarr`")
@@ -52,7 +52,7 @@ def export(store: Path, out: Path) -> int:
 
 
 def _fill(store: Path, groups: Sequence[shards.Group], table: Table, seen: np.ndarray) -> int:
-    """Enter all shards and mark their points in ``seen``; returns the number of points."""
+    """Write all shards and mark their points in ``seen``; returns the number of points."""
     names = [shards.POINT, *(variable.name for variable in table.variables)]
     for group in groups:
         for shard in range(group.shards):

@@ -1,4 +1,4 @@
-"""The points of a scene by number: parameter values on demand, so that a grid never exists as a whole."""
+"""The points of a scene by number. Parameter values are computed on demand, so a grid is never stored as a whole."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from drivetrain_jax.runs.scene import Scene, Value
 class Grid:
     """Points numbered from 0 in C order of ``axes`` (``shape``), or one point per entry of ``axes`` if ``zipped``.
 
-    With a path axis a point is a whole line: ``axes`` lacks ``path``, which is number ``path_position`` among the axes
-    of the scene, or None if it is a line of one fixed value.
+    With a path axis each point is a line: ``axes`` lacks ``path``. ``path_position`` is its position among the axes of the
+    scene, or None for a line of one fixed value.
     """
 
     axes: tuple[Axis, ...]
@@ -31,7 +31,7 @@ class Grid:
 
     @classmethod
     def of(cls, scene: Scene) -> Grid:
-        """The grid of ``scene``; a fixed path parameter makes lines of one value."""
+        """The grid of ``scene``; a fixed path parameter gives lines of one value."""
         parameters = scene.system.models[scene.analysis.name].parameters
         name = scene.path_axis
         if name is None:
@@ -51,7 +51,7 @@ class Grid:
 
     @property
     def size(self) -> int:
-        """Number of points (lines, if there is a path)."""
+        """Number of points, or of lines if there is a path."""
         return math.prod(self.shape)
 
     @property
@@ -61,23 +61,23 @@ class Grid:
 
     @property
     def path_is_fixed(self) -> bool:
-        """Whether the path is a line of one fixed value, and so no dimension of the result."""
+        """True if the path is a line of one fixed value, and so not a dimension of the result."""
         return self.path is not None and self.path_position is None
 
     @property
     def result_shape(self) -> tuple[int, ...]:
-        """Lengths of the axes in the order of the scene, the path among them."""
+        """Lengths of the axes in scene order, the path included."""
         if self.path_position is None:
             return self.shape
         return (*self.shape[: self.path_position], self.path_length, *self.shape[self.path_position :])
 
     def place(self, points: np.ndarray) -> tuple[np.ndarray, ...]:
         """Indices of ``points`` in an array of shape ``shape``."""
-        # No axis at all is one point, of which unravel_index knows nothing.
+        # Without axes there is one point, and unravel_index needs at least one axis.
         return np.unravel_index(points, self.shape) if self.shape else (np.newaxis,)
 
     def columns(self, points: np.ndarray) -> dict[str, np.ndarray]:
-        """Values of the varying parameters at ``points``, by name of the axis, each of the shape of ``points``."""
+        """Values of the varying parameters at ``points`` by axis name, each of the shape of ``points``."""
         if self.zipped:
             return {axis.name: axis.values[points] for axis in self.axes}
         return {axis.name: axis.values[i] for axis, i in zip(self.axes, self.place(points), strict=False)}
@@ -103,11 +103,11 @@ class Grid:
                 values[name] = value
             else:
                 values[name] = (*values[name][: axis.entry], value, *values[name][axis.entry + 1 :])
-        # A derived parameter that is not given is the model's own affair.
+        # The model computes a derived parameter that is not given.
         return {name: values[name] for name in self.parameters if name in values}
 
     def arrays(self, points: np.ndarray) -> dict[str, Any]:
-        """Like ``bind`` at ``points``, with every number (and entry of a list) an array of the shape of ``points``."""
+        """Like ``bind`` at ``points``, with every number (and entry of a list) as an array of the shape of ``points``."""
         return {name: self._spread(value, points.shape) for name, value in self.bind(self.columns(points)).items()}
 
     def _spread(self, value: Any, shape: tuple[int, ...]) -> Any:

@@ -1,8 +1,8 @@
-"""Points that another result holds already: a longer axis, a finer grid, one more axis, or a part of what was computed.
+"""Reuse points of another result: a longer axis, a finer grid, one more axis, or a part of a sweep.
 
-Values are taken only from a result of the same numerics (code, versions, instruction set), method, options and fixed
-values. They meet the same tolerance as computed ones, but need not agree with those to the last bit: how many steps a point
-takes follows from the points that share its chunk.
+Numerics (code, versions, instruction set), method, options and fixed values must be the same. Reused values meet the same
+tolerance as computed ones. Their last bits may differ, because the number of steps of a point depends on the points in its
+chunk.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from drivetrain_jax.store.consolidate import map_variable, read_attribute
 from drivetrain_jax.store.provenance import digest
 from drivetrain_jax.store.shards import is_store
 
-# Points entered at a time.
+# Points that are copied at a time.
 _BLOCK = 1 << 18
-# Values of an axis agree within so many roundings; the same value comes out of different counts of steps.
+# Tolerance for equal axis values, in relative units: another ``num`` gives other roundings.
 _ROUNDINGS = 4 * np.finfo(float).eps
 
 
 class NotReusable(InputError):
-    """Why nothing of a result can stand for points of a scene."""
+    """Raised if no point of a result can be reused."""
 
 
 class Damaged(NotReusable):
@@ -49,9 +49,9 @@ class Damaged(NotReusable):
 
 @dataclass(frozen=True)
 class Source:
-    """Results in the file ``path`` of another scene: ``theirs[i]`` is the same point as ``ours[i]`` of ours.
+    """Results in the file ``path`` of another scene: its points ``theirs[i]`` equal our points ``ours[i]``.
 
-    ``is_covered`` says whether all of its points and all of its results are wanted, so that replacing it loses nothing.
+    ``is_covered`` is true if our scene contains all of its points and results, so replacing it loses nothing.
     """
 
     path: Path
@@ -62,7 +62,7 @@ class Source:
     is_covered: bool
 
     def blocks(self, names: Sequence[str]) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-        """Our points and their results, some at a time; nothing is loaded as a whole."""
+        """Yield our points and their results in blocks, so nothing is loaded as a whole."""
         arrays = {name: sweep_first(map_variable(self.path, name), self.grid) for name in names}
         for start in range(0, self.ours.size, _BLOCK):
             place = self.grid.place(self.theirs[start : start + _BLOCK])
@@ -74,36 +74,36 @@ class Source:
 
 @dataclass(frozen=True)
 class Taken:
-    """The points that are taken from ``sources``, which share none."""
+    """The points reused from ``sources``, which are disjoint."""
 
     sources: tuple[Source, ...]
 
     @property
     def points(self) -> np.ndarray:
-        """Their numbers, rising."""
+        """Numbers of the reused points, rising."""
         return np.sort(np.concatenate([np.empty(0, np.int64), *(source.ours for source in self.sources)]))
 
     @property
     def count(self) -> int:
-        """How many results they have, those along a path one by one."""
+        """Number of reused results; every point of a path counts."""
         return sum(source.ours.size * source.grid.path_length for source in self.sources)
 
     @property
     def digest(self) -> str | None:
-        """Identifies them, None if there are none: the chunks of the others depend on it."""
+        """Digest of the sources, None without any: the chunks of the other points depend on it."""
         if not self.sources:
             return None
         return digest([[source.digest, source.ours] for source in self.sources])
 
     @property
     def attrs(self) -> dict[str, str | int]:
-        """What a result says of them."""
+        """Attributes of the result that record the reuse."""
         if not self.sources:
             return {}
         return {"reused_points": self.count, "reused_from": " ".join(s.digest for s in self.sources)}
 
     def blocks(self, names: Sequence[str]) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-        """Their numbers and the results ``names``, some points at a time."""
+        """Yield the reused points and their results ``names`` in blocks."""
         for source in self.sources:
             yield from source.blocks(names)
 
@@ -112,7 +112,7 @@ NOTHING = Taken(())
 
 
 def rest_of(engine: Engine, taken: Taken) -> Engine:
-    """``engine`` for the points that are not taken."""
+    """``engine`` restricted to the points that are not reused."""
     if not taken.sources:
         return engine
     left = np.ones(engine.grid.size, bool)
@@ -121,7 +121,7 @@ def rest_of(engine: Engine, taken: Taken) -> Engine:
 
 
 def take(engine: Engine, found: Iterable[Source]) -> Taken:
-    """The points of ``engine`` that these results hold, each from the first that has it."""
+    """The points of ``engine`` that these results contain, each from the first result that has it."""
     free = np.ones(engine.grid.size, bool)
     sources = []
     for source in found:
@@ -132,8 +132,8 @@ def take(engine: Engine, found: Iterable[Source]) -> Taken:
 
 
 def find(engine: Engine, path: Path) -> Source:
-    """What the result at ``path`` holds of the points of ``engine``; lost points do not count. Raises
-    :class:`NotReusable`, or :class:`InputError` if there is no readable result."""
+    """The points of ``engine`` that the result at ``path`` contains, without lost ones. Raises :class:`NotReusable`, or
+    :class:`InputError` if there is no readable result."""
     if not path.is_file():
         raise NotReusable(f"reuse = {str(path)!r}: {_no_file(path)}")
     names = ("scene", "digest", "drivetrain_jax_version", "numerics", "numerics_detail")
@@ -155,7 +155,7 @@ def find(engine: Engine, path: Path) -> Source:
         raise none
     theirs, ours = theirs[kept], ours[kept]
     wanted = set(scene.request.outputs) <= set(engine.scene.request.outputs)
-    # Several of our points may be one of theirs, and the other way round.
+    # Several of our points may equal one of theirs, and the reverse.
     is_covered = wanted and np.unique(theirs).size == grid.size
     ours, first = np.unique(ours, return_index=True)
     return Source(path, str(attrs["digest"]), grid, theirs[first], ours, is_covered)
@@ -169,7 +169,7 @@ def _no_file(path: Path) -> str:
 
 
 def _check_intact(path: Path) -> None:
-    """Whatever is taken over gets checksums of its own: nobody would find the damage afterwards."""
+    """Raise :class:`Damaged` for a damaged source: the new checksums would hide the damage."""
     try:
         wrong = checksums.damaged(path)
     except InputError:
@@ -179,7 +179,7 @@ def _check_intact(path: Path) -> None:
 
 
 def _same_points(scene: Scene, grid: Grid, our_scene: Scene, our_grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of the points that both grids have, pairwise; none if lines or fixed values differ."""
+    """Pairs of equal points of both grids; none if lines or fixed values differ."""
     nothing = np.empty(0, np.int64), np.empty(0, np.int64)
     if not (_same_lines(grid, our_grid) and _same_fixed(scene, our_scene)):
         return nothing
@@ -199,7 +199,7 @@ def _same_lines(grid: Grid, other: Grid) -> bool:
 
 
 def _same_fixed(scene: Scene, other: Scene) -> bool:
-    """Whether the parameters that neither of them varies agree, as far as the analysis uses them."""
+    """True if the parameters that neither scene varies agree, as far as the analysis uses them."""
     varied = {axis.name for axis in (*scene.axes, *other.axes)}
     used = scene.system.models[scene.analysis.name].parameters
 
@@ -218,7 +218,7 @@ def _same_fixed(scene: Scene, other: Scene) -> bool:
 
 
 def _value(scene: Scene, name: str) -> float | None:
-    """The fixed number that stands for the axis ``name`` of another scene, None if there is none."""
+    """The fixed number in place of the axis ``name`` of another scene, None without one."""
     base, entry = entry_of(name)
     value = scene.fixed.get(base)
     if entry is not None:
@@ -231,7 +231,7 @@ def _matters(scene: Scene, name: str) -> bool:
 
 
 def _at(scene: Scene, name: str, values: np.ndarray) -> np.ndarray:
-    """0 where one of ``values`` is what ``scene`` fixes under this ``name``, else -1."""
+    """0 for each of ``values`` that equals the fixed ``name`` of ``scene``, else -1."""
     fixed = _value(scene, name)
     if not _matters(scene, name):
         return np.zeros(len(values), np.int64)
@@ -239,7 +239,7 @@ def _at(scene: Scene, name: str, values: np.ndarray) -> np.ndarray:
 
 
 def _among(scene: Scene, name: str, values: np.ndarray) -> int:
-    """Position among ``values`` of what ``scene`` fixes under this ``name``, -1 if it is not there."""
+    """Position of the fixed ``name`` of ``scene`` among ``values``, -1 if it is missing."""
     fixed = _value(scene, name)
     if not _matters(scene, name):
         return 0
@@ -247,9 +247,9 @@ def _among(scene: Scene, name: str, values: np.ndarray) -> int:
 
 
 def _inside(scene: Scene, grid: Grid, other_scene: Scene, other: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the outer product ``grid``, and those of ``other`` that are the same ones."""
+    """Points of the outer product ``grid``, and the equal points of ``other``."""
     axes, theirs = ({axis.name: axis.values for axis in one.axes} for one in (grid, other))
-    # Position along each axis of ``grid`` for each value along each axis of ``other``; -1 where there is none.
+    # Position along each axis of ``grid`` for each value along the axes of ``other``; -1 for none.
     along = {
         name: _positions(axes[name], values) if name in axes else _at(scene, name, values)
         for name, values in theirs.items()
@@ -271,7 +271,7 @@ def _inside(scene: Scene, grid: Grid, other_scene: Scene, other: Grid) -> tuple[
 
 
 def _positions(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Position of each of ``wanted`` among ``values``, -1 where there is none, up to the roundings of an axis."""
+    """Position of each of ``wanted`` among ``values`` within the tolerance of an axis, -1 for none."""
     order = np.argsort(values)
     rising = values[order].astype(float)
     right = np.clip(np.searchsorted(rising, wanted), 0, len(rising) - 1)
@@ -279,22 +279,21 @@ def _positions(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     nearest = np.where(abs(rising[left] - wanted) < abs(rising[right] - wanted), left, right)
     sought, place = np.unique(np.asarray(wanted, float), return_inverse=True)
     own, other = _extents(rising)[nearest], _extents(sought)[place]
-    # Only what lies between the ends of an axis is rounded as they are; of two such axes neither may blur the other.
+    # Inner values of an axis have its rounding errors, its ends have none; use the smaller tolerance of both axes.
     extent = np.where((own > 0) & (other > 0), np.minimum(own, other), np.maximum(own, other))
     room = _ROUNDINGS * (abs(rising[nearest]) + extent)
     return np.where(abs(rising[nearest] - wanted) <= room, order[nearest], -1)
 
 
 def _extents(rising: np.ndarray) -> np.ndarray:
-    """Length of the even axis on which each of these values would have its nearest neighbour; 0 for both ends, which are
-    exact."""
+    """Length of the even axis on which each value would have its nearest neighbour; 0 for both ends, which are exact."""
     gaps = np.diff(rising)
     between = np.minimum(gaps[1:], gaps[:-1]) * len(rising)
     return np.pad(between, 1)[: len(rising)] if len(rising) > 1 else np.zeros(len(rising))
 
 
 def _same_rows(grid: Grid, other: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Two lists of points: equal rows, if both vary the same parameters. Every row that the other list has is in a pair."""
+    """Pairs of equal rows of two lists of points that vary the same parameters; every common row is in a pair."""
     names = [axis.name for axis in grid.axes]
     if sorted(names) != sorted(axis.name for axis in other.axes):
         return np.empty(0, np.int64), np.empty(0, np.int64)

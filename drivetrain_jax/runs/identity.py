@@ -1,4 +1,4 @@
-"""What decides every bit of a result: the scene and the numerics. Only work with the same digest may be resumed."""
+"""Digests of everything that affects the bits of a result. Only work with the same digest may be resumed."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from drivetrain_jax.store.provenance import digest, source_digest, versions
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "numpy", "scipy")
 _ROOT = Path(drivetrain_jax.__file__).parent
 _ENGINE = ("runs/grid.py", "runs/plan.py", "runs/kernel.py")
-# The file that is among the sources of points that an atlas gives, and of no others.
+# A source file of points that are evaluated from an atlas, and of no others.
 EVALUATES_ATLAS = "runs/through_atlas.py"
 _THROUGH_ATLAS = ("atlas/floquet.py", "runs/atlas_choice.py", "runs/rounds.py", EVALUATES_ATLAS)
-# What these packages hold decides numbers; what lies above them does not.
+# Packages whose sources affect the numbers.
 _NUMERIC = ("drivetrain_jax._quantities", "drivetrain_jax.systems", "drivetrain_jax.analysis", "drivetrain_jax.atlas")
 
 
 def numerics_of(scene: Scene) -> dict[str, Any]:
-    """The code that this scene runs, the versions of all that computes, and the machine's instruction set: what decides
-    the bits of its numbers. Code of other systems and analyses may change without making a result stale."""
+    """The sources that this scene runs, the versions of the numerical packages, and the instruction set of the machine.
+    Sources of other systems and analyses are not included, so a change there does not make the result stale."""
     through_atlas = scene.analysis.continuous or uses_atlas(scene)
     starts = [_ROOT / name for name in (*_ENGINE, *(_THROUGH_ATLAS if through_atlas else ()))]
     starts += _own_sources(scene)
@@ -76,7 +76,7 @@ def _label(path: Path) -> str:
 
 @cache
 def _home(path: Path) -> Path:
-    """The folder that the package of a source file lies in."""
+    """The folder that contains the package of a source file."""
     folder = path.parent
     while (folder / "__init__.py").is_file():
         folder = folder.parent
@@ -84,7 +84,7 @@ def _home(path: Path) -> Path:
 
 
 def _imported(starts: Sequence[Path]) -> set[Path]:
-    """The source files ``starts`` and what they import, directly or not, from their own packages and the numeric ones."""
+    """The source files ``starts`` and everything they import from their own packages and the numeric ones."""
     found: set[Path] = set()
     waiting = [path for path in starts if path.is_file()]
     while waiting:
@@ -97,7 +97,7 @@ def _imported(starts: Sequence[Path]) -> set[Path]:
 
 @cache
 def _imports(path: Path) -> tuple[str, ...]:
-    """Dotted names that a source file imports, those of ``from x import y`` as ``x.y``."""
+    """Dotted names that a source file imports; ``from x import y`` gives ``x.y``."""
     package = path.relative_to(_home(path)).parts[:-1]
     names: list[str] = []
     for node in _statements(ast.parse(path.read_bytes())):
@@ -111,7 +111,7 @@ def _imports(path: Path) -> tuple[str, ...]:
 
 
 def _statements(node: ast.AST) -> Iterator[ast.AST]:
-    """All statements within ``node``; to look at every expression as well would take twice as long as to parse them."""
+    """All statements within ``node``. Visiting expressions too would take twice as long as parsing."""
     for block in ("body", "orelse", "finalbody", "handlers", "cases"):
         for inner in getattr(node, block, ()):
             yield inner
@@ -120,7 +120,8 @@ def _statements(node: ast.AST) -> Iterator[ast.AST]:
 
 @cache
 def _files(name: str, importer: Path) -> list[Path]:
-    """Modules that importing the dotted ``name`` runs: numeric code of this package, or code of that of ``importer``."""
+    """Modules that importing the dotted ``name`` runs: numeric code of this package, or code of the package of
+    ``importer``."""
     home, parts, first = _home(importer), name.split("."), 0
     if parts[0] == drivetrain_jax.__name__:
         if not any(name == package or name.startswith(package + ".") for package in _NUMERIC):
@@ -133,7 +134,7 @@ def _files(name: str, importer: Path) -> list[Path]:
 
 
 def scene_content(scene: Scene) -> dict[str, Any]:
-    """What a scene asks for, its title apart."""
+    """The content of a scene without its title."""
     request = scene.request
     return {
         "system": scene.system.name,
@@ -148,7 +149,7 @@ def scene_content(scene: Scene) -> dict[str, Any]:
 
 
 def scene_digest(scene: Scene, solvers: Sequence[Solver], numerics: str) -> str:
-    """Digest of what is computed: scene (not its title), sizes of chunks, package version, numerics."""
+    """Digest of scene (without title), chunk sizes, package version and numerics."""
     return digest(
         scene_content(scene)
         | {

@@ -1,4 +1,4 @@
-"""Compiled batches: the only place where points are batched and compiled, once for all scenes of a process."""
+"""Compile batches of points. All scenes of a process share the compiled kernels."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from drivetrain_jax.store.provenance import digest
 from drivetrain_jax.systems import System
 
 _LAPACK = threading.Lock()
-# A scene of so few points with so little predicted work, in the units of a plan, is computed in less time than it takes
-# to optimise its kernels.
+# Below this number of points and this predicted work (in units of the plan), computing takes less time than optimising the
+# kernels.
 _FEW, _LIGHT = 128, 3e4
-# Points of a chunk on an accelerator: so many times those that suit a core, up to so many.
+# GPU chunk size: 64 times the CPU size, at most 32,768.
 _WIDER, _WIDEST = 64, 1 << 15
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """A solver compiled ahead of time for chunks of ``chunk`` points; may be called from several threads."""
+    """A solver compiled for chunks of ``chunk`` points; thread-safe."""
 
     compiled: Callable[..., dict[str, Array]]
     chunk: int
@@ -88,7 +88,7 @@ def _arrays(numbers: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def result_shapes(scene: Scene, grid: Grid, solver: Solver) -> dict[str, tuple[int, ...]]:
-    """The shape of every result at one point (or line); nothing is compiled or computed."""
+    """The shape of every result at one point (or line), without compiling."""
     variables = result_variables(scene)
     batch, kinds = _batch(solver, grid, 1, variables)
     shapes = jax.eval_shape(batch, *kinds)
@@ -96,7 +96,7 @@ def result_shapes(scene: Scene, grid: Grid, solver: Solver) -> dict[str, tuple[i
 
 
 def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[Variable], few: bool = False) -> Kernel:
-    """Compile ``solver`` for chunks of ``chunk`` points of ``grid``, for ``few`` of them in all without optimising.
+    """Compile ``solver`` for chunks of ``chunk`` points of ``grid``; without optimisation for ``few`` points.
 
     All numbers are arguments of the compiled code, those along a path apart. Words, whole numbers, lengths of lists and
     options are constants of it.
@@ -109,7 +109,7 @@ def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[V
 
 
 def for_device(solver: Solver) -> Solver:
-    """``solver`` with chunks that keep the device of this process busy."""
+    """``solver`` with the chunk size that suits the device of this process."""
     return solver if on_cpu() else replace(solver, chunk=max(solver.chunk, min(_WIDER * solver.chunk, _WIDEST)))
 
 
@@ -120,7 +120,7 @@ def is_small(grid: Grid, solvers: Sequence[Solver]) -> bool:
 
 @dataclass(frozen=True)
 class _Job:
-    """What a kernel is compiled for; two jobs are equal if one kernel of a size serves both."""
+    """The key of a kernel in the cache; equal jobs share one kernel."""
 
     system: System
     analysis: Analysis
@@ -171,6 +171,6 @@ def _compiled(job: _Job, size: int, few: bool) -> Kernel:
 
 
 def _turn(compiled: Any) -> AbstractContextManager[object]:
-    """What a call has to hold while it runs: LAPACK calls of XLA hand work to the thread pool that they run in and wait
-    for it, so that two kernels which make them can wait for each other for ever (seen with jax 0.10.2 on two cores)."""
+    """The lock that a call needs. LAPACK calls of XLA wait for the thread pool that they run in, so two such kernels can
+    block each other for ever (seen with jax 0.10.2 on two cores)."""
     return _LAPACK if 'custom_call_target="lapack_' in compiled.as_text() else nullcontext()

@@ -1,4 +1,4 @@
-"""Whether the file of a result is laid out as its scene says: a copy may have been cut, turned or transposed since."""
+"""Compare the layout of a result file with its scene: a copy may have been cut, reordered or transposed."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from drivetrain_jax.runs.scene import Scene
 
 
 def rearranged(path: Path, scene: Scene, grid: Grid) -> list[str]:
-    """Names of the coordinates and results at ``path`` that have other values, dimensions or shapes than those of ``scene``.
+    """Names of the coordinates and results at ``path`` whose values, dimensions or shapes differ from those of ``scene``.
 
-    Results are not read, so that this takes no time; whether they are what was written is for checksums to say.
+    Results are not read, so this is fast; checksums detect damaged values.
     """
     try:
         return _rearranged(path, scene, grid)

@@ -28,9 +28,9 @@ from drivetrain_jax.systems import Model, System
 if TYPE_CHECKING:
     import xarray as xr
 
-# Points of a chunk of a function that nothing is known of.
+# Points per chunk of a user's function, whose cost is unknown.
 _CHUNK = 256
-# The fixed word that says what a function computes.
+# The fixed word that identifies what a function computes.
 _COMPUTES = "computes"
 
 
@@ -42,21 +42,21 @@ def sweep(
     outputs: Sequence[str] | None = None,
     **options: Any,
 ) -> xr.Dataset:
-    """Results of ``function(system)`` over the outer product of ``over``, as one labelled dataset.
+    """One labelled dataset with the results of ``function(system)`` on the outer product of ``over``.
 
     Args:
         function: an analysis such as :func:`drivetrain_jax.floquet`, or any JAX function of a pytree that returns an array,
-            a dict of arrays, or what an analysis returns.
-        system: the pytree; what is not in ``over`` stays as it is.
-        over: values ``(N,)`` by name of a parameter, of an entry of a list (``"length[1]"``), of a key or an attribute.
-        out: a netCDF file. Unfinished work is kept beside it and taken up by the next call; a finished result is only read.
-        outputs: variables wanted; default: those of the analysis, or all.
-        options: those of the analysis, or keyword arguments of the function.
+            a dict of arrays, or the result of an analysis.
+        system: the pytree; values that are not in ``over`` stay fixed.
+        over: values ``(N,)`` by name of a parameter, an entry of a list (``"length[1]"``), a key or an attribute.
+        out: a netCDF file. The next call resumes unfinished work, and only reads a finished result.
+        outputs: variables to compute; default: the default of the analysis, or all.
+        options: options of the analysis, or keyword arguments of the function.
 
-    Returns: a dataset with a dimension for each entry of ``over``, in that order, and ``outcome``: a point whose result is
-    not finite is NaN there, and the rest is unaffected.
+    Returns: a dataset with one dimension for each entry of ``over``, in that order. A point with a result that is not
+    finite is NaN and has a failed ``outcome``; other points are not affected.
 
-    Raises: :class:`~drivetrain_jax.InputError` for what is unknown or out of range, before anything is computed.
+    Raises: :class:`~drivetrain_jax.InputError` for an unknown name or a value out of range, before anything is computed.
 
     >>> import drivetrain_jax as dt, numpy as np
     >>> shaft = dt.Cardan(beta=0.3, Omega=1.4, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)
@@ -114,7 +114,7 @@ def _function_scene(
     outputs: Sequence[str] | None,
     options: Mapping[str, Any],
 ) -> Scene:
-    """A scene of any function: what varies are its parameters, and what it computes is a fixed word."""
+    """The scene of a user's function: its parameters vary, and a fixed word identifies the computation."""
     values = {name: np.array(_numbers(name, given)) for name, given in over.items()}
     name = re.sub(r"\W", "_", getattr(function, "__name__", "function")).strip("_") or "value"
 
@@ -139,7 +139,7 @@ def _function_scene(
 
 
 class _Once:
-    """A function that equals any other one: what it computes is compared by a digest."""
+    """A function that equals any other one; a digest compares what they compute."""
 
     def __init__(self, call: Callable[..., Any]) -> None:
         self.call = call
@@ -155,7 +155,7 @@ class _Once:
 def _kind(
     one: _Once, name: str, varies: tuple[str, ...], of: type, variables: tuple[Variable, ...], computes: str
 ) -> tuple[type[System], Analysis]:
-    """A system whose parameters are what varies, and the analysis; the same ones for the same function, compiled once."""
+    """A system whose parameters vary, and its analysis; cached, so the same function is compiled once."""
     known = {p.name: p for p in of.parameters} if issubclass(of, System) else {}
     described = {}
     for key in varies:
@@ -216,7 +216,7 @@ def _named(result: Any, name: str) -> dict[str, Array]:
 
 
 def _replaced(system: Any, point: Mapping[str, Any]) -> Any:
-    """``system`` with these parameters, keys or attributes."""
+    """``system`` with these parameters, keys or attributes replaced."""
     for name, value in point.items():
         base, entry = entry_of(name)
         try:

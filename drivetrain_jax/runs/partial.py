@@ -1,4 +1,4 @@
-"""Unfinished work as a labelled result, while a run goes on or after it was stopped."""
+"""Unfinished work as a labelled result, during a run or after it was stopped."""
 
 from __future__ import annotations
 
@@ -24,16 +24,17 @@ from drivetrain_jax.store.chunks import PartsFolder
 if TYPE_CHECKING:
     import xarray as xr
 
-# The outcome of a point that is still to be computed. No finished file has it.
+# Outcome of a point that is not yet computed. A finished file never has it.
 PENDING = len(Outcome)
 
 
 def open_result(path: str | Path) -> xr.Dataset:
-    """The result at ``path``, loaded. Where there is none yet but unfinished work in ``FILE.nc.parts/``, what that holds:
-    points still to be computed have the outcome ``pending`` and no value, and the attribute ``points_done`` counts the
-    others. Nothing is disturbed, whether the run goes on or not.
+    """The result at ``path``, loaded into memory.
 
-    Raises :class:`InputError` if there is neither, or if the work is of other code than the present.
+    If only unfinished work in ``FILE.nc.parts/`` exists, missing points have the outcome ``pending`` and no value; the
+    attribute ``points_done`` counts the others. A running computation is not disturbed.
+
+    Raises :class:`InputError` if there is neither, or if the work belongs to other code.
     """
     path = Path(path)
     if path.exists() or not PartsFolder(path).holds_work():
@@ -59,7 +60,7 @@ def _open_partial(path: Path) -> xr.Dataset:
 
 
 def _finished(engine: Engine, target: Target) -> Iterator[tuple[np.ndarray, Mapping[str, np.ndarray]]]:
-    """Points and results, those taken from other results among them."""
+    """Points and results that are finished, reused ones included."""
     if target.store == "zarr":
         store = target.parts.path / shards.UNFINISHED
         for _, arrays in stored(engine, store) if shards.is_store(store) else ():

@@ -1,4 +1,4 @@
-"""Input in physical units, for systems whose parameters are nondimensional."""
+"""Convert physical data to the parameters of nondimensional systems."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from drivetrain_jax.systems import System
 
 
 def nondimensional(system: System, given: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
-    """The physical data of ``system`` among ``given`` (None if there are none), and all values as its parameters.
+    """The physical data of ``system`` in ``given`` (None without any), and all values as its parameters.
 
-    A value is a number (of Python or NumPy) or a range, a pair of numbers. Raises :class:`InputError` where some of the data
-    are missing or out of range, or say the same as a parameter that is given too.
+    A value is a number (of Python or NumPy) or a range, a pair of numbers. Raises :class:`InputError` if data are missing
+    or out of range, or repeat a given parameter.
     """
     given = {name: _plain(value) for name, value in given.items()}
     physical = system.physical

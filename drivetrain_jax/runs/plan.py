@@ -1,7 +1,7 @@
-"""Who computes what: a solver for every point, points of similar effort together, chunks of one shape per solver.
+"""Plan of a run: a solver for every point, and chunks of points of similar effort, with one chunk size per solver.
 
-Points are sorted block by block, so that neither memory nor the wait for the first result grows with the grid: a plan
-keeps the efforts of chunks, and sorts a block again when its chunks are wanted.
+Points are sorted block by block, so memory and the time to the first result do not grow with the grid. A plan keeps the
+efforts of chunks, and sorts a block again when its chunks are computed.
 """
 
 from __future__ import annotations
@@ -18,14 +18,13 @@ from drivetrain_jax._threads import in_double_precision
 from drivetrain_jax.analysis import Solver
 from drivetrain_jax.runs.grid import Grid
 
-# Points that are sorted together, and those among them whose effort is predicted at a time (few stay in fast memory).
+# Points sorted together, and points whose effort is predicted together (small enough for the cache).
 _BLOCK, _PIECE = 1 << 18, 1 << 15
-# Sorted blocks that are kept.
+# Number of sorted blocks that are kept.
 _KEPT = 16
 _BITS, _POSITION = np.uint64(32), np.uint64(2**32 - 1)
 _MAX_EFFORT = 2**31 - 1
-# Small scenes are cut into at least this many chunks per solver. It is not the number of cores: bits must not depend
-# on that.
+# Least number of chunks per solver in a small scene. A constant, because bits must not depend on the number of cores.
 _MIN_CHUNKS = 2
 # Points of the smallest chunk of more than one point.
 _LANES = 16
@@ -33,8 +32,8 @@ _LANES = 16
 
 @dataclass(frozen=True)
 class Group:
-    """The points of one solver, by falling effort in each block, cut into chunks of ``chunk``; the last one of a block may
-    be shorter, and costs as much as a full one: it has the least effort.
+    """The points of one solver, by falling effort in each block, in chunks of ``chunk`` points. The last chunk of a block
+    may be shorter; it costs as much as a full one and has the least effort.
 
     ``index`` is the position of the solver, ``size`` the number of points, ``efforts`` the largest effort within each
     chunk, and ``firsts[b]`` the first chunk of block b (one entry more than blocks).
@@ -50,9 +49,9 @@ class Group:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Number, position of the solver, points, the ``size`` that they are filled up to, and the largest effort.
+    """Number, position of the solver, points, padded ``size``, and largest effort of a chunk.
 
-    It says all that a worker has to know beside the scene.
+    A worker needs only this and the scene.
     """
 
     number: int
@@ -64,14 +63,14 @@ class Chunk:
 
 @dataclass(frozen=True)
 class Plan:
-    """All chunks, numbered through the groups. Points for which every solver predicts infinite cost are in none."""
+    """All chunks, numbered through the groups. Points of infinite predicted cost belong to no chunk."""
 
     groups: tuple[Group, ...]
     blocks: Blocks
 
     @cached_property
     def costs(self) -> np.ndarray:
-        """Predicted cost of every chunk, in units of its own."""
+        """Predicted cost of every chunk, in units of the plan."""
         return np.concatenate([np.empty(0), *(g.efforts * (g.solver.unit_cost * g.chunk) for g in self.groups)])
 
     @property
@@ -81,16 +80,16 @@ class Plan:
 
     @cached_property
     def _firsts(self) -> np.ndarray:
-        """Number of the first chunk of each group, and of all chunks."""
+        """Number of the first chunk of each group, and number of all chunks."""
         return np.cumsum([0, *(len(group.efforts) for group in self.groups)])
 
     def kernels(self, numbers: Iterable[int]) -> set[tuple[int, int]]:
-        """Position of the solver and size of the chunks with these numbers."""
+        """Pairs of solver position and chunk size of the chunks with these numbers."""
         used = np.unique(np.searchsorted(self._firsts, np.fromiter(numbers, np.int64), side="right") - 1)
         return {(self.groups[g].index, self.groups[g].chunk) for g in used}
 
     def ordered(self, numbers: Iterable[int]) -> np.ndarray:
-        """These numbers block by block, in each the costliest first."""
+        """These numbers block by block, the most expensive first in each block."""
         chosen = np.fromiter(numbers, np.int64)
         counts = [np.diff(group.firsts) for group in self.groups]
         blocks = np.concatenate([np.empty(0, int), *(np.repeat(np.arange(len(n)), n) for n in counts)])
@@ -109,7 +108,7 @@ class Plan:
 
 
 class Blocks:
-    """The points of a plan in blocks, each sorted when it is needed."""
+    """The points of a plan in blocks, each sorted on demand."""
 
     def __init__(self, solvers: Sequence[Solver], grid: Grid, points: np.ndarray | None) -> None:
         self._solvers, self._grid, self._points = solvers, grid, points
@@ -122,7 +121,7 @@ class Blocks:
         return self._sorted(block)[1]
 
     def points(self, block: int, solver: int, part: slice) -> np.ndarray:
-        """A part of these points."""
+        """A part of the points of a solver in ``block``."""
         return self._number(self._sorted(block)[0][solver][part].astype(np.int64) + block * _BLOCK)
 
     def _number(self, positions: np.ndarray) -> np.ndarray:
@@ -136,7 +135,7 @@ class Blocks:
         return self._kept[block]
 
     def _sort(self, block: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """For each solver its points, numbered through the block, and their efforts."""
+        """For each solver its points, numbered within the block, and their efforts."""
         start, stop = block * _BLOCK, min((block + 1) * _BLOCK, self._size)
         pieces = [self._number(np.arange(i, min(i + _PIECE, stop))) for i in range(start, stop, _PIECE)]
         found = [_cheapest(self._solvers, self._grid, pieces[0])]
@@ -148,7 +147,7 @@ class Blocks:
         orders, efforts = [], []
         for index in range(len(self._solvers)):
             mine = np.flatnonzero(choice == index).astype(np.uint64)
-            # Effort and position in one number: the fastest of all ways to sort by both.
+            # Effort and position in one integer: sorting it is the fastest way to sort by both.
             keys = ((_MAX_EFFORT - effort[mine]).astype(np.uint64) << _BITS) | mine
             keys.sort()
             orders.append((keys & _POSITION).astype(np.uint32))
@@ -157,7 +156,7 @@ class Blocks:
 
 
 class _Tally:
-    """Efforts of the points of one solver: of each point while chunks might be small, then the largest of each chunk."""
+    """Collects the efforts of one solver: of each point while chunks may be small, then the largest of each chunk."""
 
     def __init__(self, solver: Solver) -> None:
         self._solver = solver
@@ -165,7 +164,7 @@ class _Tally:
         self.count, self._few = 0, True
 
     def add(self, efforts: np.ndarray) -> None:
-        """Those of one more block, falling."""
+        """Add the efforts of one more block, falling."""
         self.count += efforts.size
         self._efforts.append(efforts if self._few else efforts[:: self._solver.chunk])
         if self._few and self.count >= _MIN_CHUNKS * self._solver.chunk:
@@ -196,9 +195,9 @@ def chunk_size(largest: int, count: int, lengthy: bool = False) -> int:
 def make_plan(
     solvers: Sequence[Solver], grid: Grid, points: np.ndarray | None = None, *, full_size: bool = False
 ) -> Plan:
-    """Give every one of ``points`` (all of ``grid``) to the solver with the smallest predicted cost, the first of equals.
+    """Assign every one of ``points`` (default: all of ``grid``) to the solver with the smallest predicted cost.
 
-    ``full_size`` keeps the size of chunks where points are few, so that further plans need no other kernels.
+    ``full_size`` keeps the chunk size for few points, so further plans need no other kernels.
     """
     blocks, tallies = Blocks(solvers, grid, points), [_Tally(solver) for solver in solvers]
     for block in range(blocks.count):
@@ -208,7 +207,7 @@ def make_plan(
 
 
 def mean_cost(solvers: Sequence[Solver], grid: Grid, points: np.ndarray) -> float:
-    """Predicted cost of one of these points, in the units of a plan, on average; points that no solver can do are free."""
+    """Mean predicted cost of these points, in units of the plan; points that no solver can compute cost nothing."""
     choice, effort = _cheapest(solvers, grid, points)
     unit = np.array([*(solver.unit_cost for solver in solvers), 0.0])
     return float(np.mean(effort * unit[choice]))
@@ -222,7 +221,7 @@ def _cheapest(solvers: Sequence[Solver], grid: Grid, points: np.ndarray) -> tupl
         own = np.broadcast_to(np.asarray(solver.effort(columns), float), points.shape)
         with np.errstate(over="ignore"):
             own_cost = own * solver.unit_cost
-        # Neither NaN nor infinity is less.
+        # NaN and infinity are never smaller.
         less = own_cost < cost
         best[less], cost, effort = index, np.where(less, own_cost, cost), np.where(less, own, effort)
     return best, np.ceil(np.clip(effort, 0, _MAX_EFFORT)).astype(np.int64)

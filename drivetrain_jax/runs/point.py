@@ -1,4 +1,4 @@
-"""One point: the same path as a sweep, and an answer that can be read."""
+"""Compute one point by the code of a sweep, and print the answer."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from drivetrain_jax.runs.scene import find_system, load_scene, system_and_analys
 class PointResult:
     """Results of one point, by attribute or by name: ``result.spectral_radius`` or ``result["spectral_radius"]``.
 
-    ``outcome`` tells what became of it (results are NaN unless ``outcome.has_value``), ``units`` the units by name,
-    ``labels`` the entries of each dimension that a result has.
+    ``outcome`` is the outcome of the point (results are NaN unless ``outcome.has_value``), ``units`` the units by name,
+    ``labels`` the entries of each dimension of the results.
     """
 
     system: str
@@ -55,15 +55,15 @@ class PointResult:
         return iter(self.values)
 
     def keys(self) -> KeysView[str]:
-        """Names of the results, so that ``dict(result)`` holds them."""
+        """Names of the results, so that ``dict(result)`` contains them."""
         return self.values.keys()
 
     def __dir__(self) -> list[str]:
         return sorted({*super().__dir__(), *self.values})
 
     def to_json(self) -> str:
-        """The answer as one JSON object; what is not finite is null, a complex value has ``real`` and ``imag``, a code its
-        ``meaning``."""
+        """The answer as one JSON object. Numbers that are not finite are null, complex values have ``real`` and
+        ``imag``, codes have ``meaning``."""
         values = {n: {"value": _plain(v), "units": self.variables[n].units} for n, v in self.values.items()}
         for name, value in self.values.items():
             if flags := self.variables[name].flags:
@@ -94,7 +94,7 @@ class PointResult:
         return "\n".join(lines)
 
     def _matrix(self, name: str) -> list[str]:
-        """A result over two dimensions, the longer one downwards."""
+        """A result with two dimensions as text, the longer one downwards."""
         variable, values = self.variables[name], np.asarray(self.values[name])
         rows, columns = variable.dims
         if values.shape[0] < values.shape[1]:
@@ -105,7 +105,7 @@ class PointResult:
         return [f"  {_with_units(name, variable.units)}", *aligned([head, *cells])]
 
     def _table(self, dim: str, names: Sequence[str]) -> list[str]:
-        """Results that are lists over one dimension, side by side."""
+        """Results with one dimension as columns of a table."""
         columns = [[dim, *map(str, self.labels[dim])]]
         for name in names:
             variable = self.variables[name]
@@ -115,7 +115,7 @@ class PointResult:
 
 
 def _plain(value: Any) -> Any:
-    """Words, numbers and lists that JSON knows."""
+    """Words, numbers and lists as JSON types."""
     if isinstance(value, str):
         return value
     if np.iscomplexobj(value):
@@ -141,13 +141,15 @@ def _text(variable: Variable, value: Any) -> str:
 
 
 def point(system: str, analysis: str, *, outputs: Sequence[str] | None = None, **given: Any) -> PointResult:
-    """Compute one point.
+    """The results of one point.
 
-    ``given`` holds parameters of the system (or its data in physical units, as `drivetrain list SYSTEM` names them) and
-    options of the analysis (``method``, ``rtol``, ...) by name;
-    ``outputs`` the results wanted, by default those of the analysis.
-    Raises :class:`InputError` with one line naming the field, what was given and what is allowed, and
-    :class:`ChunkError` if the computation itself fails.
+    Args:
+        system, analysis: names, see ``drivetrain list``.
+        outputs: results to compute; default: those of the analysis.
+        given: parameters of the system (or its physical data), and options of the analysis (``method``, ``rtol``, ...).
+
+    Raises: :class:`InputError` with one line that names the field, the value and what is allowed; :class:`ChunkError` if
+    the computation fails.
     """
     tree = _tree(system, analysis, nondimensional(find_system(system), given)[1])
     if outputs is not None:
@@ -156,13 +158,13 @@ def point(system: str, analysis: str, *, outputs: Sequence[str] | None = None, *
     try:
         engine = Engine(load_scene(tree))
     except InputError as error:
-        # The tables of a scene are no concern of someone who gave none.
+        # Messages name the fields without the tables of a scene.
         raise InputError(re.sub(r"^(points|fixed|options)\.", "", str(error))) from None
     return _result(engine, _compute(engine))
 
 
 def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """The scene of one point. Numbers vary, so that the next one needs no compilation; words and lists are fixed."""
+    """The scene of one point. Numbers are axes, so the next point needs no compilation; words and lists are fixed."""
     system, analysis = system_and_analysis(system_name, analysis_name)
     if analysis.continuous:
         others = ", ".join(name for name in system.models if not get_analysis(name).continuous)
@@ -172,7 +174,7 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
     path = analysis.path_axis(Request((), given.get("method", next(iter(analysis.methods))), options))
     tree: dict[str, Any] = {"system": system_name, "analysis": analysis_name, "points": {}, "fixed": {}, "options": {}}
     names = (*parameters, "method", *(o.name for o in analysis.options))
-    # A scene has no result of the name of what varies.
+    # A parameter that varies cannot be an output of the scene.
     numbers = {p.name for p in system.parameters if p.is_number} - {path, *(v.name for v in analysis.variables)}
     for name, value in given.items():
         if name not in names:
@@ -215,7 +217,7 @@ def _result(engine: Engine, table: Table) -> PointResult:
 
 
 def _labels(engine: Engine, values: Mapping[str, Any], table: Table) -> dict[str, Sequence[Any]]:
-    """The entries of every dimension of ``values``: their coordinates, or their numbers."""
+    """The entries of every dimension of ``values``: coordinates, or numbers."""
     shown = [v for v in table.variables if v.name in values]
     sizes = {dim: n for v in shown for dim, n in zip(v.dims, np.shape(values[v.name]), strict=True)}
     known = {dimension.name: dimension.values for dimension in engine.scene.dimensions}

@@ -1,4 +1,4 @@
-"""Chunks computed in spawned processes, one per core: a crash costs the chunk that caused it and nothing else."""
+"""Compute chunks in spawned processes, one per core. Only a chunk that crashes its worker repeatedly is lost."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from drivetrain_jax.runs.executor import IN_FLIGHT, Results
 from drivetrain_jax.runs.plan import Chunk
 from drivetrain_jax.runs.worker import Job
 
-# A chunk is given up when it was being computed at the death of this many processes.
+# Number of crashes after which a chunk is marked lost.
 ATTEMPTS = 3
 
 
 def run_processes(chunks: Iterable[Chunk], job: Job, count: int) -> Iterator[tuple[Chunk, Results | None]]:
-    """``(chunk, results)`` in the order of completion; results are None for a chunk that kills every process.
+    """Yield ``(chunk, results)`` in the order of completion; results are None for a chunk that crashes every process.
 
-    An exception of a chunk is raised here, as is one that keeps a process from starting. When the iterator is left (also
-    by an interrupt) the processes are killed; they also end by themselves when this process does.
+    Exceptions of chunks, and of the start of a process, are raised here. When the iterator is closed (also by an interrupt)
+    the processes are killed; they also end when this process ends.
     """
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
     waiting, deaths = _Tasks(chunks), Counter[int]()
@@ -46,7 +46,7 @@ def run_processes(chunks: Iterable[Chunk], job: Job, count: int) -> Iterator[tup
 
 
 class _Tasks:
-    """Chunks to do; those that a dying process left behind come first."""
+    """Chunks to compute; chunks of a dead process come first."""
 
     def __init__(self, chunks: Iterable[Chunk]) -> None:
         self._chunks = iter(chunks)
@@ -60,7 +60,7 @@ class _Tasks:
 
 
 class _Slot:
-    """One process, replaced when it dies, and the chunks that it has been given in their order."""
+    """One process, replaced when it dies, and its chunks in order."""
 
     def __init__(self, job: Job, core: int | None) -> None:
         self._job, self._core = job, core
@@ -76,20 +76,20 @@ class _Slot:
         self._processes = set(multiprocessing.active_children()) - others
 
     def fill(self, waiting: _Tasks) -> None:
-        """Give the process what it has room for."""
+        """Send chunks to the process up to its limit."""
         while len(self.running) < IN_FLIGHT and (chunk := waiting.take()) is not None:
             try:
                 self.running[self._pool.submit(worker.compute, self._job, chunk)] = chunk
             except BrokenProcessPool:
                 waiting.put_back([chunk])
                 if self.running:
-                    # It has just died; what it was computing tells so when it is collected.
+                    # The process has died; its current chunk is handled when results are collected.
                     return
                 self._was_ready()
                 self._restart()
 
     def collect(self, waiting: _Tasks, deaths: Counter[int]) -> Iterator[tuple[Chunk, Results | None]]:
-        """Results that are there. The chunk that a dead process was computing is tried again, or given up."""
+        """Yield finished results. The chunk that a dead process was computing is retried, or marked lost."""
         while self.running and next(iter(self.running)).done():
             future = next(iter(self.running))
             chunk = self.running.pop(future)
@@ -111,7 +111,7 @@ class _Slot:
         self._start()
 
     def _was_ready(self) -> bool:
-        """Whether the process died at a chunk. One that dies every time while it gets ready would do so for any."""
+        """True if the process died during a chunk. If it dies during its start, every process would."""
         try:
             self._ready.result()
         except BrokenProcessPool:
@@ -123,14 +123,14 @@ class _Slot:
         return True
 
     def kill(self) -> None:
-        """End the process at once; what it was computing is not wanted any more."""
+        """Kill the process; its current chunk is dropped."""
         self._pool.shutdown(wait=False, cancel_futures=True)
         for process in self._processes:
             process.kill()
 
 
 def _initialise(core: int | None) -> None:
-    """Runs first in a new process: one core, no answer to the terminal's Ctrl-C, no life without the parent."""
+    """Initialise a new process: use one core, ignore Ctrl-C, and end with the parent."""
     if core is not None:
         os.sched_setaffinity(0, {core})
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,4 +1,4 @@
-"""An atlas from direct solves: every round of its construction is a plan of chunks, kept and resumed like any others."""
+"""Build an atlas from direct solves. Every round is a plan of chunks, stored and resumed like any other."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from drivetrain_jax.runs.executor import Where
 from drivetrain_jax.runs.scene import Scene
 from drivetrain_jax.runs.work import Progress, Work
 
-# Panels are to be this much better than the results that follow from them.
+# Ratio of the tolerance of the panels to that of the results.
 _SHARPER = 0.1
 
 
@@ -38,10 +38,9 @@ def build_atlas(
     progress: Progress,
     max_solves: int | None = None,
 ) -> tuple[StabilityAtlas, int]:
-    """The atlas of ``scene`` over ``ranges``, and the number of the first chunk that it leaves free.
+    """The atlas of ``scene`` over ``ranges``, and the first free chunk number.
 
-    ``progress`` counts the solves and notes gaps. Rounds are small, so that threads of this process solve them wherever the
-    run works.
+    ``progress`` counts the solves and notes gaps. Rounds are small, so threads of this process always solve them.
     """
     fixed = fixed_of(scene, ranges)
     rtol = scene.request.options["rtol"]
@@ -65,7 +64,7 @@ def build_atlas(
 
 
 def _note(atlas: Atlas) -> str:
-    """What the user of ``atlas`` has to know of its gaps."""
+    """The note for the user on the gaps of ``atlas``."""
     if not atlas.gaps:
         return ""
     have = f"{counted(len(atlas.panels), 'panel', 'panels')} and {counted(len(atlas.gaps), 'gap', 'gaps')}"
@@ -74,7 +73,7 @@ def _note(atlas: Atlas) -> str:
 
 
 def node_engine(scene: Scene, ranges: Mapping[str, tuple[float, float]], count: int) -> Engine:
-    """The engine of ``count`` solves for an atlas of ``scene``, spread like those of its construction."""
+    """The engine of ``count`` solves for an atlas of ``scene``, distributed like those of its construction."""
     fixed = fixed_of(scene, ranges)
     domain = floquet_domain(scene.system, ranges, fixed)
     spread = np.cos(np.pi * np.random.default_rng(0).random((count, len(ranges))))
@@ -106,7 +105,7 @@ def _solves(scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.nda
 
 
 class _Answers:
-    """All results of the points of a round side by side, ``(N, m)``, NaN for those that could not be solved."""
+    """The results of the points of a round, ``(N, m)``, NaN for unsolved points."""
 
     def __init__(self, count: int, width: int) -> None:
         self.values = np.full((count, width), np.nan)
@@ -115,4 +114,4 @@ class _Answers:
         self.values[points] = np.concatenate([results[name] for name in ANALYSIS.default_outputs], axis=1)
 
     def lose(self, points: np.ndarray) -> None:
-        """What is not filled in is lost."""
+        """Do nothing: missing points are NaN."""
