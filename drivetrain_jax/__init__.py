@@ -1,9 +1,9 @@
-"""Stability and vibration of drivetrains in JAX: systems are pytrees, analyses pure functions of them.
+"""Stability and vibration of drivetrains in JAX: systems are pytrees, and analyses are pure functions of systems.
 
-``floquet(Cardan(...))`` and the other analyses take one system and work under ``jax.jit``, ``jax.vmap`` and ``jax.grad``;
-``sweep`` runs them, or any function of yours, over a grid into one labelled, resumable dataset. ``run`` computes a scene
-file, ``point`` a single parameter set. Wrong input raises ``InputError``, a computation that fails ``ChunkError`` or, with a
-file to resume, ``Incomplete``. Everything heavy is imported on first use.
+``floquet(Cardan(...))`` and the other analyses accept one system and work under ``jax.jit``, ``jax.vmap`` and ``jax.grad``.
+``sweep`` computes an analysis, or any function of yours, on a grid and returns one labelled dataset. ``run`` computes a
+scene file, ``point`` one parameter set. Wrong input raises ``InputError``. A failed computation raises ``ChunkError``, or
+``Incomplete`` if a file can be resumed. Heavy modules are imported on first use.
 """
 
 from __future__ import annotations

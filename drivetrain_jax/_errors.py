@@ -1,13 +1,13 @@
-"""Errors that a caller can act on."""
+"""Exceptions that a caller can handle."""
 
 
 class InputError(ValueError):
-    """The user's input is wrong; the message is one line: the field, what was given, what is allowed."""
+    """Raised for wrong input; the message is one line with the field, the value and what is allowed."""
 
 
 class ChunkError(RuntimeError):
-    """Something could not be computed; the message names the chunk and the reason."""
+    """Raised for a failed computation; the message names the chunk and the reason."""
 
 
 class Passing(ChunkError):
-    """The reason may be gone the next time: memory or a disk that is full, a worker or a scheduler that has died."""
+    """Raised for a cause that may vanish: too little memory, a full disk, a dead worker or scheduler."""

@@ -1,4 +1,4 @@
-"""The machine that this process runs on."""
+"""Properties of the machine of this process."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 @lru_cache
 def _processor() -> dict[str, str]:
-    """Name and instruction-set flags of the processor, as far as the system tells."""
+    """Name and instruction-set flags of the processor, if the system reports them."""
     wanted = {"model name": "name", "flags": "flags", "Features": "flags"}
     found: dict[str, str] = {}
     try:
@@ -24,19 +24,19 @@ def _processor() -> dict[str, str]:
 
 
 def instruction_set() -> frozenset[str]:
-    """Architecture and instruction-set extensions: two machines that agree in them compile to the same code."""
+    """Architecture and instruction-set extensions; equal ones give equal compiled code."""
     return frozenset({platform.machine(), *_processor().get("flags", "").split()})
 
 
 def usable_cores() -> int:
-    """Number of cores that this process may run on."""
+    """Number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def physical_memory() -> float:
-    """Bytes of memory of the machine, infinite if the system does not tell."""
+    """Bytes of memory of the machine, infinite if the system does not report them."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, ValueError, OSError):

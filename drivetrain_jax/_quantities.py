@@ -1,4 +1,4 @@
-"""Names with units and ranges: the vocabulary that every layer shares. Free of jax and of files."""
+"""Parameters, variables and dimensions with units and ranges, shared by all layers. Needs neither jax nor files."""
 
 from __future__ import annotations
 
@@ -7,19 +7,18 @@ from dataclasses import dataclass
 
 from drivetrain_jax._wording import shown
 
-# Codes of ``outcome`` from here on mean that there is no value.
+# First code of ``outcome`` without a value.
 FIRST_FAILURE = 2
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """An input of a system or an option of an analysis.
+    """A parameter of a system, or an option of an analysis.
 
-    ``default=None`` means that it must be given, unless ``derived`` says from what a model computes it when it is not;
-    the model then finds no such value, and an analysis an option of ``None``. ``lower``/``upper`` are inclusive unless
-    the matching ``open_*`` flag is set; ``infinite`` admits infinity. ``choices`` makes it one of these words, ``text``
-    any word, ``listed`` a list of numbers of which each entry obeys the range (default ``()``: none), ``listed`` with
-    ``broadcast`` such a list or one number that stands for a list of equal entries. ``symbol`` is how formulas write it.
+    Required if ``default`` is None, unless ``derived`` names the parameters it follows from; the model then computes it.
+    ``lower`` and ``upper`` are inclusive unless the matching ``open_*`` flag is set; ``infinite`` admits infinity. The
+    value is one of the words ``choices``, any word (``text``), a list of numbers in the range (``listed``, default ``()``:
+    none), or, with ``broadcast``, also one number for all entries. ``symbol`` is its form in formulas.
     """
 
     name: str
@@ -41,12 +40,12 @@ class Parameter:
 
     @property
     def is_number(self) -> bool:
-        """Whether one number is an admissible kind of value, so that it can vary as a whole."""
+        """True if one number is a valid value, so the parameter can vary as a whole."""
         return not (self.choices or self.text or (self.listed and not self.broadcast))
 
     @property
     def allowed(self) -> str:
-        """The admissible values as a reader would write them, e.g. ``0 <= zeta < inf``."""
+        """The allowed values as text, e.g. ``0 <= zeta < inf``."""
         if self.choices:
             return f"one of {', '.join(self.choices)}"
         if self.text:
@@ -66,13 +65,13 @@ class Parameter:
 
     @property
     def allowed_in_units(self) -> str:
-        """The same with the unit: a number that is out of range was often meant in another one."""
+        """The allowed values with the unit, because a value out of range is often in another unit."""
         return self.allowed if self.units == "1" else f"{self.allowed}, in {self.units}"
 
     def check(self, value: object) -> float | int | str | tuple[float, ...]:
         """Return ``value`` in its stored type, or raise ``ValueError`` with one line that names the range."""
         if self.choices:
-            # A word that looks like a number may be written without quotes.
+            # A word that looks like a number needs no quotes.
             value = str(value) if isinstance(value, int) and str(value) in self.choices else value
             if value not in self.choices:
                 raise ValueError(f"{self.name} = {shown(value)}: allowed is {self.allowed}")
@@ -100,9 +99,9 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Dimension:
-    """An axis that an analysis adds to its results: its coordinate values and their meaning.
+    """A dimension that an analysis adds to its results: coordinate values and meaning.
 
-    Empty ``values`` stand for 0, 1, ... as many as the results have.
+    Empty ``values`` stand for 0, 1, ... up to the length of the results.
     """
 
     name: str
@@ -113,9 +112,9 @@ class Dimension:
 
 @dataclass(frozen=True)
 class Variable:
-    """A result of an analysis. ``dims`` names the dimensions it has besides those of the sweep.
+    """A result of an analysis. ``dims`` names its dimensions besides those of the sweep.
 
-    ``flags`` gives the meaning of the codes 0, 1, ... of an integer variable.
+    ``flags`` gives the meanings of the codes 0, 1, ... of an integer variable.
     """
 
     name: str
@@ -126,7 +125,7 @@ class Variable:
     flags: tuple[str, ...] = ()
 
     def written(self, value: complex) -> str:
-        """One value as a reader would write it: the meaning of a code; of a number twelve digits, of an error three."""
+        """One value as text: the meaning of a code, twelve digits of a number, three digits of an error."""
         if self.flags:
             return f"{self.flags[int(value)]} ({int(value)})"
         return f"{value:.3g}" if self.name.endswith("_error") else f"{value:.12g}"

@@ -1,21 +1,21 @@
-"""How messages and tables show values, and which name may have been meant."""
+"""Formatting of values in messages and tables, and suggestions of similar names."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-# Characters of a given value that a message repeats.
+# Most characters of a value that a message repeats.
 _SHOWN = 60
 
 
 def clipped(text: str) -> str:
-    """``text``, its end left out where it is too long for a message."""
+    """``text``, shortened if it is too long for a message."""
     return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
 
 
 def shown(value: Any) -> str:
-    """What was given, as a message repeats it."""
+    """A given value as a message repeats it."""
     return clipped(" ".join(repr(value).split("\n")))
 
 
@@ -25,24 +25,24 @@ def counted(count: int, one: str, many: str) -> str:
 
 
 def written(value: Any) -> str:
-    """A parameter's value: up to ten digits, a list in brackets."""
+    """A parameter's value as text: up to ten digits, a list in brackets."""
     if isinstance(value, tuple):
         return "[" + ", ".join(map(written, value)) + "]"
     return f"{value:.10g}" if isinstance(value, float) else str(value)
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """The lines of a table, its columns side by side."""
+    """The lines of a table with aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  " + "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def did_you_mean(name: str, allowed: Iterable[str]) -> str:
-    """``(did you mean X?)`` where a name is close, else nothing."""
+    """``(did you mean X?)`` for a similar name, else empty."""
     import difflib
 
     allowed = list(allowed)
-    # "Beta" is nearer to beta than to zeta.
+    # Compare without case: "Beta" is nearer to beta than to zeta.
     same = [other for other in allowed if other.lower() == name.lower()]
     match = same or difflib.get_close_matches(name, allowed, n=1)
     return f" (did you mean {match[0]}?)" if match else ""

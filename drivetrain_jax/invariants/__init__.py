@@ -1,4 +1,4 @@
-"""What must hold in every result, judged from the file alone: no equation is solved again and no jax is needed."""
+"""Rules that every result must obey, checked from the file alone, without solving equations or importing jax."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Finding", "check"]
 
 @dataclass(frozen=True)
 class Finding:
-    """A rule, how many points it was applied to, how many break it, and where the first of these lies."""
+    """Result of a rule: number of points it was applied to, number of points that break it, and the first of these."""
 
     rule: str
     points: int
@@ -31,7 +31,7 @@ class Finding:
 
 
 def check(dataset: xr.Dataset) -> list[Finding]:
-    """All rules that the variables of ``dataset`` allow: those of every result, then those of its analysis."""
+    """Apply all rules that the variables of ``dataset`` allow: general ones, then those of its analysis."""
     known = declared(str(dataset.attrs.get("analysis")))
     rules = [*_codes(dataset), *_errors(dataset), *known.rules]
     if known.has_points:
@@ -60,13 +60,13 @@ def _place(broken: xr.DataArray) -> str:
 
 
 def _text(values: xr.DataArray, dim: Hashable, i: int) -> str:
-    """The coordinate of position ``i`` along ``dim``, the position itself where there is none."""
+    """The coordinate of position ``i`` along ``dim``; the position itself without a coordinate."""
     value = values[dim].values[i] if dim in values.coords else i
     return f"{value:.10g}" if isinstance(value, float) else str(value)
 
 
 def _codes(dataset: xr.Dataset) -> Iterator[Rule]:
-    """A flag has one of its values."""
+    """Rules: every code is one of the flags."""
     for name, variable in dataset.data_vars.items():
         if "flag_values" in variable.attrs:
             allowed = np.atleast_1d(variable.attrs["flag_values"])
@@ -75,7 +75,7 @@ def _codes(dataset: xr.Dataset) -> Iterator[Rule]:
 
 
 def _values(dataset: xr.Dataset, known: Declared) -> Iterator[Rule]:
-    """Numbers where the outcome says that there are, and something missing where it says so."""
+    """Rules: all values exist after a success, and some value is missing after a failure."""
     whole = [str(n) for n, v in dataset.data_vars.items() if v.dtype.kind in "fc" and n not in known.gaps]
     for name in whole:
         text = f"{name} has a value where outcome says so"
@@ -96,7 +96,7 @@ def _somewhere(condition: xr.DataArray, ds: xr.Dataset) -> xr.DataArray:
 
 
 def _errors(dataset: xr.Dataset) -> Iterator[Rule]:
-    """Bounds and estimates of errors are not negative."""
+    """Rules: bounds and error estimates are not negative."""
     for name in map(str, dataset.data_vars):
         if name.endswith("_error"):
             yield Rule(f"{name} >= 0", (name,), lambda ds, name=name: ds[name] < 0)

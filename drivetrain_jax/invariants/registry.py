@@ -1,4 +1,4 @@
-"""What each analysis declares about its results. An analysis without an entry has the rules of every result."""
+"""Rules of each analysis. An analysis without an entry has only the general rules."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from drivetrain_jax.invariants.rules import Rule, in_order, multiple, ordered, r
 
 @dataclass(frozen=True)
 class Declared:
-    """``rules`` of an analysis; ``gaps`` are the variables that may lack a value although a point has succeeded, ``kept``
-    those that may have one although it has failed.
+    """``rules`` of an analysis. ``gaps``: variables that may be NaN after a success; ``kept``: variables that may have a
+    value after a failure.
 
-    ``has_points`` is false for a function of the parameters: there is no outcome of a point then.
+    ``has_points`` is false for a function of the parameters, which has no outcomes.
     """
 
     rules: tuple[Rule, ...] = ()
@@ -35,15 +35,15 @@ def _all_multipliers(compare: Callable[[xr.DataArray, xr.Dataset], xr.DataArray]
 
 
 def _liouville(ds: xr.Dataset) -> xr.DataArray:
-    """A coefficient's error ``e`` moves the outermost of n roots by at least ``e / 2^n`` (in units of rho)."""
-    # Of how many roots is known where all multipliers are stored. Elsewhere as many as cardan has, the most of any system of
-    # this package (tripod has two): a number too large overlooks more, one too small faults what is right.
+    """True where the residual contradicts the bound: a coefficient's error ``e`` moves the largest of n roots by ``e /
+    2^n`` or more."""
+    # Unless all multipliers are stored, n is four, as for cardan. A larger n misses errors, a smaller one invents them.
     n = ds.sizes.get("multiplier", 4)
     return abs(ds["liouville_residual"]) > 2**n * ds["spectral_radius_error"] / ds["spectral_radius"]
 
 
 def _verdict(ds: xr.Dataset) -> xr.DataArray:
-    """0 stable, 1 unstable, 2 undecided, against the interval of the spectral radius."""
+    """0 stable, 1 unstable, 2 undecided, from the interval of the spectral radius."""
     rho, error, verdict = ds["spectral_radius"], ds["spectral_radius_error"], ds["verdict"]
     return ((rho + error < 1) != (verdict == 0)) | ((rho - error > 1) != (verdict == 1))
 
@@ -84,7 +84,7 @@ def _rms_too_large(ds: xr.Dataset) -> xr.DataArray:
 
 
 def _sum_rule(ds: xr.Dataset) -> xr.DataArray:
-    """What the steps do not resolve does not add up, and is no success."""
+    """After a success the exponents must sum to the mean divergence."""
     off = abs(ds["sum_rule_residual"]) > 1e-2 * abs(ds["lyapunov_spectrum"]).sum("exponent")
     return off & (ds["outcome"] == 0)
 
@@ -106,7 +106,7 @@ _DECLARED = {
             within("chaos_k01", -1.0, 1.0),
             within("period_multiple", 0.0),
         ),
-        # A motion that left has exponents only, a run that met its aim early no history beyond.
+        # An unbounded motion has only exponents; a run that converged early has no history after that.
         gaps=(
             "lyapunov_standard_error",
             "lyapunov_history",
@@ -119,7 +119,7 @@ _DECLARED = {
     ),
     "poincare": Declared(
         (within("distinct_points", 0.0), within("chaos_k01", -1.0, 1.0)),
-        # Few strobes that do not repeat tell nothing.
+        # K is undefined for a short section that does not repeat.
         gaps=("chaos_k01",),
     ),
     "parameters": Declared(
@@ -158,12 +158,13 @@ _DECLARED = {
             within("impacts", 0.0),
             within("contact_fraction", 0.0, 1.0),
         ),
-        # A motion that never repeats has no transition over its period, one at rest no phase.
+        # A motion that never repeats has no multipliers, a motion at rest no phase.
         gaps=("phase", "spectral_radius", "floquet_multiplier", "state_error"),
     ),
     "frequency_response": Declared(
         (*_MOTION, in_order("branch_u_min", "branch_u_max"), ordered("fold_frequency", "fold")),
-        # As many places as there may be branches and folds, no phase at rest, and no backbone at some frequencies.
+        # There are more places than branches and folds; a motion at rest has no phase, and some frequencies have no
+        # backbone.
         gaps=(
             "phase",
             "branch_u_max",
@@ -184,7 +185,7 @@ _DECLARED = {
             sums_to_one("basin_fraction", "attractor", ("unsettled_fraction",)),
             in_order("attractor_u_min", "attractor_u_max"),
         ),
-        # As many places as there may be attractors.
+        # There are more places than attractors.
         gaps=("basin_fraction", "basin_error", "attractor_u_max", "attractor_u_min"),
         kept=("unsettled_fraction",),
     ),

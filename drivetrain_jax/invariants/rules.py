@@ -1,4 +1,4 @@
-"""Rules that numbers of a result have to obey, each a function of the Dataset alone. NaN obeys every rule of values."""
+"""Rules for the numbers of a result, each a function of the Dataset alone. NaN obeys every rule."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-# Relative room for the roundings of a formula that the computation wrote in another order.
+# Relative tolerance for the rounding of a formula evaluated in another order.
 ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
 class Rule:
-    """``broken(dataset)`` is true where the rule ``text`` does not hold. It needs all of ``variables``."""
+    """``broken(dataset)`` is true where the rule ``text`` is broken. It needs all of ``variables``."""
 
     text: str
     variables: tuple[str, ...]
@@ -23,7 +23,7 @@ class Rule:
 
 
 def within(name: str, lower: float = -np.inf, upper: float = np.inf) -> Rule:
-    """``lower <= name <= upper``, up to rounding."""
+    """``lower <= name <= upper`` up to rounding."""
     bounds = [f"{lower:g} <= " if lower > -np.inf else "", f" <= {upper:g}" if upper < np.inf else ""]
     room = ROUNDING * max(abs(x) for x in (lower, upper, 0.0) if np.isfinite(x))
     return Rule(
@@ -32,7 +32,7 @@ def within(name: str, lower: float = -np.inf, upper: float = np.inf) -> Rule:
 
 
 def ordered(name: str, dim: str, falling: bool = False, key: Callable = lambda values: values) -> Rule:
-    """``name`` rises (falls) along ``dim``, up to rounding; ``key`` says what of it is compared."""
+    """``name`` rises (falls) along ``dim`` up to rounding; ``key`` is the compared quantity."""
 
     def broken(ds: xr.Dataset) -> xr.DataArray:
         step = key(ds[name]).diff(dim)
@@ -43,7 +43,7 @@ def ordered(name: str, dim: str, falling: bool = False, key: Callable = lambda v
 
 
 def sums_to_one(name: str, dim: str, others: tuple[str, ...] = ()) -> Rule:
-    """The sum of ``name`` over ``dim``, and of ``others``, is 1 wherever there is a value."""
+    """``name`` summed over ``dim``, plus ``others``, is 1 where there is a value."""
 
     def broken(ds: xr.Dataset) -> xr.DataArray:
         total = ds[name].sum(dim) + sum(ds[other] for other in others)
@@ -64,7 +64,7 @@ def in_order(*names: str) -> Rule:
 
 
 def relation(text: str, variables: tuple[str, ...], broken: Callable[[xr.Dataset], xr.DataArray]) -> Rule:
-    """Any other one."""
+    """A rule given by its text and function."""
     return Rule(text, variables, broken)
 
 

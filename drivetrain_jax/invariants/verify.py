@@ -1,4 +1,4 @@
-"""Whether a result, or unfinished work, is what was written, and whether its numbers can be true."""
+"""Verify a result or unfinished work: checksums, then rules."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from drivetrain_jax.store.consolidate import open_result, read_attribute
 
 @dataclass(frozen=True)
 class Report:
-    """``lines`` for the reader; ``problem`` is the first thing that is wrong, empty if nothing is. ``complete`` is false for
+    """``lines`` for the reader; ``problem`` is the first problem, empty without one. ``complete`` is false for
     unfinished work."""
 
     lines: tuple[str, ...]
@@ -26,13 +26,13 @@ class Report:
         return "\n".join(self.lines)
 
     def to_json(self) -> str:
-        """The same as one JSON object, with the state in a word."""
+        """The report and the state as one JSON object."""
         state = "damaged" if self.problem else "complete" if self.complete else "partial"
         return json.dumps({"state": state, "problem": self.problem, "checks": self.lines})
 
 
 def verify(path: Path) -> Report:
-    """Check the result at ``path``, or the parts of the unfinished one.
+    """The report on the result at ``path``, or on the parts of an unfinished one.
 
     Raises :class:`InputError` if there is neither, or if the file cannot be read.
     """
@@ -75,7 +75,7 @@ def _verify_store(path: Path) -> Report:
 
 
 def _verify_parts(parts: PartsFolder) -> Report:
-    """Damaged parts are no problem of the user's: a run that is resumed computes their chunks again."""
+    """Report damaged parts. They are not an error, because a resumed run computes their chunks again."""
     store = parts.path / shards.UNFINISHED
     if shards.is_store(store):
         (intact, present, _), unit = shards.tally(store), "shards"

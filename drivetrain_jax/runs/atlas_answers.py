@@ -186,13 +186,13 @@ def _answered(title: str, phrase: str, safe: str, asked: Asked, answer: design.A
     elif answer.stable:
         lines += _elsewhere(safe, asked, answer)
     else:
-        none = "of the atlas will do" if answer.certain else "found; whether there is one is undecided"
+        none = "of the atlas is sufficient" if answer.certain else "found; whether there is one is undecided"
         lines.append(f"  no {name} {none}")
     if answer.limit:
         where = ", ".join(f"{n} = {number(v)}" for n, v in answer.limit.point.items())
         lines.append(f"  limit: multiplier {answer.limit.multiplier} at {where}")
     if answer.check:
-        lines += [] if answer.certain else ["  not certain: undecided ranges reach beyond the errors"]
+        lines += [] if answer.certain else ["  not certain: undecided ranges are wider than the errors"]
         lines.append(f"  {_checked(answer.check)}")
     lines += [f"  undecided from {number(a)} to {number(b)}" for a, b in answer.undecided]
     data = {
@@ -249,7 +249,7 @@ def _side(asked: Asked, name: str, value: float, crossing: Crossing) -> str:
 def _reach(atlas: StoredAtlas, nearest: design.Nearest) -> str:
     low, high = atlas.ranges[nearest.parameter]
     # Stability may change inside an undecided range.
-    elsewhere = ", unless where it is undecided:" if nearest.undecided else ""
+    elsewhere = ", except undecided ranges:" if nearest.undecided else ""
     return f"none from {number(low)} to {number(high)}{elsewhere}"
 
 

@@ -40,7 +40,7 @@ def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, flo
     fixed = {name: value for name, value in ranges.items() if not isinstance(value, tuple)}
     shown = _shown(atlas.scene.system, [name for name in ranges if name not in fixed])
     if not shown:
-        raise InputError(f"part: fixes {', '.join(fixed)}; a chart needs one that varies, and query tells of one point")
+        raise InputError(f"part: fixes {', '.join(fixed)}; a chart needs a varying parameter; use query for one point")
     axes = {
         name: np.linspace(*ranges[name], cells if name in shown[:2] else _SLICES)
         for name in atlas.parameters

@@ -68,7 +68,7 @@ def make_atlas(scene: Scene, work: Work, progress: Progress) -> Labelled:
     names = {"units": "1", "long_name": "name of the parameter"}
     coords = {"parameter": Entry(("parameter",), np.array(atlas.parameters), names)}
     if atlas.gaps:
-        reason = {"units": "1", "long_name": "why there is no panel"}
+        reason = {"units": "1", "long_name": "reason for the missing panel"}
         coords["gap_reason"] = Entry(("gap",), arrays["gap_reason"].astype(str), reason)
     attrs = result_attrs(scene) | {
         "coordinates_of_panels": json.dumps([c.name for c in atlas.coordinates]),

@@ -35,10 +35,10 @@ def describe(name: str) -> str:
     lines = [f"{system.name}: {system.title}", f"  {system.source}", "", "Parameters"]
     lines += aligned([_parameter_row(p) for p in system.parameters])
     if system.physical:
-        lines += ["", "Physical units, instead of these for point, query and design"]
+        lines += ["", "Physical data, accepted by point, query and design"]
         lines += aligned([(p.name, f"[{p.units}]", p.long_name, p.allowed) for p in system.physical.quantities])
     if system.presets:
-        lines += ["", "Sets of values, to be copied into a scene"]
+        lines += ["", "Presets, to copy into a scene"]
         lines += aligned([(preset, ", ".join(entries(values))) for preset, values in system.presets.items()])
     for analysis in system.models:
         lines += ["", *_analysis_lines(analysis, system)]
@@ -53,8 +53,8 @@ def _analysis_lines(name: str, system: System) -> list[str]:
         [_variable_row(v, v.name in analysis.default_outputs) for v in analysis.variables if v.name not in lacking]
     )
     lines += [
-        "  (* computed unless outputs says otherwise)",
-        "  Methods and the options they use, the first by default",
+        "  (* default of outputs)",
+        "  Methods and their options, the default first",
     ]
     methods = [
         (method, analysis.method_titles.get(method, ""), ", ".join(used))

@@ -61,7 +61,7 @@ def _result(distributed: Any, future: Any) -> Results | None:
     except distributed.KilledWorker:
         return None
     except (distributed.CancelledError, OSError) as error:
-        raise Passing(f"dask: the scheduler is gone ({type(error).__name__})") from error
+        raise Passing(f"dask: connection to the scheduler lost ({type(error).__name__})") from error
 
 
 def _connect(distributed: Any, address: str, stack: ExitStack) -> Any:

@@ -24,7 +24,7 @@ def differences(stored: Mapping[str, Any], engine: Engine, *, points: bool = Tru
     try:
         scene = load_scene(tomllib.loads(str(stored.get("scene"))))
     except (InputError, tomllib.TOMLDecodeError) as error:
-        return [f"its scene can no longer be read ({' '.join(str(error).split())})"]
+        return [f"its scene is not valid now ({' '.join(str(error).split())})"]
     found = list(_of_scenes(scene, engine.scene, points))
     if stored.get("drivetrain_jax_version") != drivetrain_jax.__version__:
         found.append(f"drivetrain_jax is {drivetrain_jax.__version__}, was {stored.get('drivetrain_jax_version')}")
@@ -78,7 +78,7 @@ def _of_numerics(stored: str | None, present: Mapping[str, Any]) -> list[str]:
     try:
         old = json.loads(stored or "")
     except ValueError:
-        return ["the code, a version or the machine is another one"]
+        return ["the code, a version or the machine differs"]
     found = []
     for key, value in present.items():
         before = old.get(key)
@@ -95,7 +95,7 @@ def _of_numerics(stored: str | None, present: Mapping[str, Any]) -> list[str]:
                 found.append(f"the code has changed in {', '.join(changed[:3])}{', ...' if len(changed) > 3 else ''}")
         elif value != before:
             found.append(f"{key} is {_text(value)}, was {_text(before)}")
-    return found or ["the code, a version or the machine is another one"]
+    return found or ["the code, a version or the machine differs"]
 
 
 def _route(sources: Mapping[str, str]) -> str:

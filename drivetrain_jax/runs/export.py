@@ -45,7 +45,9 @@ def export(store: Path, out: Path) -> int:
             table.lay_out()
             file.finish(out)
     except OSError as error:
-        raise InputError(f"out = {str(out)!r}: {error.strerror or error}; allowed is a disk with room") from None
+        raise InputError(
+            f"out = {str(out)!r}: {error.strerror or error}; allowed is a disk with enough free space"
+        ) from None
     finally:
         parts.close(remove=ours)
     return grid.size * grid.path_length

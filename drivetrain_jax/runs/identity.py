@@ -30,8 +30,8 @@ _NUMERIC = ("drivetrain_jax._quantities", "drivetrain_jax.systems", "drivetrain_
 
 
 def numerics_of(scene: Scene) -> dict[str, Any]:
-    """The sources that this scene runs, the versions of the numerical packages, and the instruction set of the machine.
-    Sources of other systems and analyses are not included, so a change there does not make the result stale."""
+    """The sources that this scene runs, the package versions, and the instruction set: all that affects the bits.
+    Sources of other systems and analyses are not included."""
     through_atlas = scene.analysis.continuous or uses_atlas(scene)
     starts = [_ROOT / name for name in (*_ENGINE, *(_THROUGH_ATLAS if through_atlas else ()))]
     starts += _own_sources(scene)

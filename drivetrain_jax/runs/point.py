@@ -168,7 +168,7 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
     system, analysis = system_and_analysis(system_name, analysis_name)
     if analysis.continuous:
         others = ", ".join(name for name in system.models if not get_analysis(name).continuous)
-        raise InputError(f"analysis = {analysis_name!r}: is made over ranges; allowed at a point is one of {others}")
+        raise InputError(f"analysis = {analysis_name!r}: needs ranges; allowed at a point is one of {others}")
     parameters = {p.name: p for p in system.parameters}
     options = {o.name: given.get(o.name, o.default) for o in analysis.options}
     path = analysis.path_axis(Request((), given.get("method", next(iter(analysis.methods))), options))

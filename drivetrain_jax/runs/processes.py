@@ -117,7 +117,7 @@ class _Slot:
         except BrokenProcessPool:
             self._stillborn += 1
             if self._stillborn >= ATTEMPTS:
-                raise Passing("worker processes die while they get ready") from None
+                raise Passing("worker processes crash during their start") from None
             return False
         self._stillborn = 0
         return True

@@ -1,4 +1,4 @@
-"""Runs a scene: in memory, or into a file that is resumed after any interruption and never damaged."""
+"""Run a scene in memory, or into a file that survives interruptions and is resumed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Incomplete(RuntimeError):
-    """A run stopped before its end; finished chunks are kept. ``progress`` says how far it came."""
+    """Raised when a run stops before its end; finished chunks are kept. ``progress`` holds the counts."""
 
     def __init__(self, reason: str, progress: Progress) -> None:
         super().__init__(reason)
@@ -38,7 +38,7 @@ class Incomplete(RuntimeError):
 
 
 class Interrupted(KeyboardInterrupt):
-    """The user stopped a run; finished chunks are kept. ``progress`` says how far it came."""
+    """Raised when the user interrupts a run; finished chunks are kept. ``progress`` holds the counts."""
 
     def __init__(self, progress: Progress) -> None:
         super().__init__("interrupted")
@@ -57,27 +57,26 @@ def run(
     reuse: str | Path | Sequence[str | Path] = (),
     report: Report | None = None,
 ) -> xr.Dataset:
-    """Compute a scene and return its labelled result.
+    """The labelled result of a scene.
 
-    Without ``out`` everything happens in memory. With it the result is written to that netCDF4/HDF5 file; unfinished
-    work is kept in ``FILE.nc.parts/`` and taken up by the next call, and a complete result is only read. A Zarr store is for
-    results that are too large to be returned, and so the command line's: ``drivetrain run --store zarr``.
+    With ``out`` the result is written to that netCDF4/HDF5 file. Unfinished work is kept in ``FILE.nc.parts/`` and resumed
+    by the next call; a complete result is only read. For results larger than one disk use ``drivetrain run --store zarr``.
 
     :param scene: path of a scene file, name of one that the package brings, a mapping with the same keys, or a checked
         scene.
     :param overrides: entries to replace, by dotted key: ``{"fixed.zeta": 0.002}``.
-    :param fresh: compute everything anew: replace a result, or drop unfinished work, at ``out``. One that was interrupted is
-        resumed by the same call.
-    :param threads: chunks computed at a time in threads of this process (default: the cores it may use).
-    :param workers: this many spawned processes instead: one that crashes costs the chunk it was computing. A script that
-        asks for them has to be guarded by ``if __name__ == "__main__"``.
-    :param dask: the Dask cluster at ``tcp://host:port``, or ``local:N`` processes of Dask's own, instead.
-    :param reuse: a result, or several, of which the points that this scene shares are taken over; only with ``out``. The
-        result that ``out`` holds is one of them without being named, if all of its points and results are this scene's.
+    :param fresh: compute all points again, and replace the result or unfinished work at ``out``. The same call resumes an
+        interrupted run.
+    :param threads: number of threads of this process (default: the usable cores).
+    :param workers: number of spawned processes instead of threads. A script that uses them needs the guard
+        ``if __name__ == "__main__"``.
+    :param dask: Dask cluster instead of threads: ``tcp://host:port``, or ``local:N`` processes.
+    :param reuse: path(s) of results whose common points are reused; only with ``out``. The result at ``out`` is always
+        reused if all of its points and outputs belong to this scene.
     :param report: called with the :class:`Progress` after every chunk.
-    :raises InputError: one line naming the field, what was given, what is allowed. Nothing is computed or written.
-    :raises Incomplete: something failed on the way; what is finished is kept. The message says so where the same call may
-        get further (a full disk, too little memory, a worker that died).
+    :raises InputError: one line that names the field, the value and what is allowed. Nothing is computed or written.
+    :raises Incomplete: the run failed, and finished chunks are kept. The message says if the same call may get further (a
+        full disk, too little memory, a worker that died).
     """
     where = Where(threads, workers, dask)
     if out is None:
@@ -101,7 +100,7 @@ def run_to_file(
 ) -> Progress:
     """Like :func:`run` with ``out``, but returns the counts instead of the result.
 
-    ``store`` is ``hdf5``, or ``zarr`` where workers are to write a Zarr store themselves (see :mod:`.sharded`).
+    ``store`` is ``hdf5``, or ``zarr`` if workers write a Zarr store (see :mod:`.sharded`).
     """
     engine = _engine(scene, overrides, on_disk=True)
     if store == "zarr":
@@ -127,7 +126,7 @@ def _paths(reuse: str | Path | Sequence[str | Path]) -> Sequence[str | Path]:
 
 
 def _into(target: Target, taken: Taken, fresh: bool, where: Where, report: Report | None) -> Progress:
-    """Begin the result of ``target``, or go on with it; ``taken`` is computed already."""
+    """Start or resume the result of ``target``; the points ``taken`` are reused."""
     engine, parts, progress = target.engine, target.parts, _progress(target.engine)
     begins = False
     try:
@@ -144,13 +143,13 @@ def _into(target: Target, taken: Taken, fresh: bool, where: Where, report: Repor
     except KeyboardInterrupt:
         raise Interrupted(progress) from None
     except InputError:
-        # For example no scheduler at the address: what is refused at its start leaves nothing behind.
+        # Failures at the start, such as no scheduler at the address, must leave no files.
         parts.close(remove=not parts.holds_work() or (begins and progress.computed == 0))
         raise
     except (Passing, OSError, MemoryError) as error:
         raise Incomplete(f"{error or type(error).__name__}; the same command resumes", progress) from error
     except ChunkError as error:
-        # The same command would come to it again.
+        # The same command would fail again.
         raise Incomplete(str(error), progress) from error
     finally:
         parts.close()
@@ -160,11 +159,11 @@ def _into(target: Target, taken: Taken, fresh: bool, where: Where, report: Repor
 def _engine(
     scene: str | Path | Mapping[str, Any] | Scene, overrides: Mapping[str, Any] | None, on_disk: bool
 ) -> Engine:
-    """The engine of a scene that this machine can run."""
+    """The engine of a scene, checked against the memory of this machine."""
     checked = scene if isinstance(scene, Scene) else load_scene(scene, overrides)
     engine = Engine(checked)
     if checked.analysis.continuous:
-        # It has no points.
+        # An atlas has no points.
         return engine
     needed, present = engine.total * bytes_per_point(checked, on_disk), physical_memory()
     if needed > present:
@@ -174,7 +173,7 @@ def _engine(
 
 
 def _progress(engine: Engine) -> Progress:
-    """Counts before anything is computed. How many solves a function takes shows while it is made."""
+    """The counts before the computation; the number of solves of an atlas is known only during its construction."""
     return Progress(0, kind="direct solves") if engine.scene.analysis.continuous else Progress(engine.total)
 
 
@@ -202,7 +201,7 @@ def _resume(
     report: Report | None,
     taken: Taken,
 ) -> None:
-    """Write the result ``out`` from the points ``taken``, the parts that exist and those that are computed and kept now."""
+    """Write the result ``out`` from the points ``taken``, the existing parts, and newly computed chunks."""
     work, begin = Work(where, report, parts), time.monotonic()
 
     def seconds() -> float:
@@ -222,7 +221,7 @@ def _resume(
 
 
 def _fill(engine: Engine, table: Table, work: Work, progress: Progress, taken: Taken = NOTHING) -> dict[str, str | int]:
-    """All points into ``table``; what the attributes of the result are to say of it."""
+    """Fill all points into ``table``; returns attributes of the result."""
     if uses_atlas(engine.scene):
         from drivetrain_jax.runs.through_atlas import fill_through_atlas
 
@@ -242,5 +241,5 @@ def _atlas(engine: Engine, work: Work, progress: Progress) -> Labelled:
 
 
 def _attrs(engine: Engine) -> dict[str, str | float]:
-    """Whose result it is; what it took is told at its end."""
+    """Attributes that identify the result; effort and time are added at the end."""
     return {"digest": engine.digest, **engine.numerics_attrs, "wall_time_s": 0.0}

@@ -1,4 +1,4 @@
-"""A scene: which system, which analysis, which parameters vary and how. Checked before anything is compiled."""
+"""A scene: system, analysis, and varying and fixed parameters, checked before anything is compiled."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.axes import MAX_POINTS, MAX_RANGES, Axis, AxisTable, check_count, entry_of, spread
 from drivetrain_jax.systems import Model, System, get_system, system_names
 
-# What an axis takes for each value while it is made and checked.
+# Bytes per value of an axis while it is created and checked.
 _BYTES = 32
 
 Value = float | int | str | tuple[float, ...]
@@ -32,9 +32,9 @@ Value = float | int | str | tuple[float, ...]
 class Scene:
     """A checked scene.
 
-    ``axes`` vary: as an outer product in this order, or together as one list of points if ``zipped``. ``fixed`` holds
-    the other parameters of the system that are known, defaults included. ``dimensions`` are those that the analysis adds
-    to the results, ``path_axis`` is the name of the axis that it consumes whole. ``text`` is the scene in TOML.
+    ``axes`` vary: as an outer product in this order, or together as a list of points if ``zipped``. ``fixed`` holds the
+    other known parameters of the system, defaults included. ``dimensions`` are those of the analysis. ``path_axis`` is the
+    name of the axis that the analysis computes as a whole. ``text`` is the scene in TOML.
     """
 
     title: str
@@ -81,18 +81,19 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
 
 
 def find_system(name: str) -> System:
-    """The system called so; ``InputError`` with the name that may have been meant if there is none, or why it fails."""
+    """The system of this name; ``InputError`` with a similar name if it is unknown, or with the reason if its import
+    fails."""
     try:
         return get_system(name)
     except KeyError:
         raise InputError(f"system = {name!r}: unknown{nearest(str(name), system_names())}") from None
     except ImportError as error:
-        # One line, whatever the package had to say.
+        # The message of the package on one line.
         raise InputError(f"system = {name!r}: {' '.join(str(error).split())}") from error
 
 
 def system_and_analysis(system_name: str, analysis_name: str) -> tuple[System, Analysis]:
-    """The system and the analysis called so; ``InputError`` unless both exist and the one has a model for the other."""
+    """The system and the analysis of these names; ``InputError`` if one is unknown, or if they do not match."""
     system = find_system(system_name)
     if analysis_name not in system.models:
         guess = did_you_mean(str(analysis_name), system.models)
@@ -102,7 +103,7 @@ def system_and_analysis(system_name: str, analysis_name: str) -> tuple[System, A
 
 
 def _convert(given: Any, kind: type, where: str) -> Any:
-    """``given`` as the table ``kind``; ``where`` is the dotted prefix of its fields in messages."""
+    """``given`` converted to the table ``kind``; ``where`` is the dotted prefix of its fields in messages."""
     names = [field.name for field in msgspec.structs.fields(kind)]
     for key in given:
         if key not in names:
@@ -133,13 +134,13 @@ _MISSING = {"system": "give the name of a system", "analysis": "give the name of
 
 
 def _toml_types(match: re.Match[str]) -> str:
-    """``int | null`` in the words of TOML, in which there is no null."""
+    """A type such as ``int | null`` in the words of TOML, which has no null."""
     words = [_TOML_TYPES.get(word, word) for word in match.group(1).split(" | ") if word != "null"]
     return " or ".join(words) or "nothing"
 
 
 def _axes(table: _SceneTable, system: System, analysis: Analysis) -> tuple[tuple[Axis, ...], bool]:
-    """The varying parameters; counted before a single value is made."""
+    """The varying parameters; their values are counted before they are computed."""
     if table.axes and table.points:
         raise InputError("points: given together with axes; allowed is one of the two")
     if analysis.continuous:
@@ -162,7 +163,7 @@ def _axes(table: _SceneTable, system: System, analysis: Analysis) -> tuple[tuple
 
 def _check_ranges(table: _SceneTable, analysis: Analysis) -> None:
     if table.points:
-        raise InputError(f"points: {analysis.name} is made over ranges; allowed are axes with start and stop")
+        raise InputError(f"points: {analysis.name} needs ranges; allowed are axes with start and stop")
     if not 1 <= len(table.axes) <= MAX_RANGES:
         raise InputError(f"axes: {len(table.axes)} are given; {analysis.name} allows 1 to {MAX_RANGES}")
 
@@ -171,7 +172,7 @@ def _axis_table(name: str, given: Any) -> AxisTable:
     if not isinstance(given, Mapping):
         raise InputError(f"axes.{name} = {shown(given)}: allowed is a table {{ start, stop, num }} or {{ values }}")
     if isinstance(num := given.get("num"), float) and num.is_integer():
-        # As options and parameters take 1e3 for 1000.
+        # Options and parameters also accept 1e3 for 1000.
         given = {**given, "num": int(num)}
     return _convert(given, AxisTable, f"axes.{name}.")
 
@@ -189,7 +190,7 @@ def _axis(system: System, name: str, spec: AxisTable) -> Axis:
 
 
 def _points(table: _SceneTable, system: System) -> tuple[Axis, ...]:
-    """Equally long columns of parameter values."""
+    """Columns of parameter values of equal length."""
     for name, values in table.points.items():
         if not isinstance(values, list):
             raise InputError(f"points.{name} = {shown(values)}: allowed is a list of numbers")
@@ -207,12 +208,12 @@ def _points(table: _SceneTable, system: System) -> tuple[Axis, ...]:
 
 
 def _scalar(parameter: Parameter, name: str) -> Parameter:
-    """The range of one number of ``parameter``, under the name it is swept by."""
+    """The range of one number of ``parameter``, under the name of its axis."""
     return replace(parameter, name=name, listed=False, broadcast=False)
 
 
 def _swept_parameter(system: System, where: str, name: str) -> tuple[Parameter, int | None]:
-    """The parameter behind the axis ``name`` and, for one entry of a list, its position."""
+    """The parameter of the axis ``name``, and the position of a list entry."""
     base, entry = entry_of(name)
     known = {p.name: p for p in system.parameters}
     parameter = known.get(base)
@@ -230,7 +231,7 @@ def _swept_parameter(system: System, where: str, name: str) -> tuple[Parameter, 
 
 
 def _unknown(system: System, name: str) -> str:
-    """Why a scene has no parameter ``name``, and what it may have."""
+    """The message for an unknown parameter ``name``, with the allowed names."""
     known = [p.name for p in system.parameters]
     if system.physical and name in system.physical.names:
         return f"physical units are for point, query and design; allowed in a scene is {', '.join(known)}"
@@ -238,7 +239,7 @@ def _unknown(system: System, name: str) -> str:
 
 
 def _fixed(table: _SceneTable, system: System, analysis: Analysis, axes: tuple[Axis, ...]) -> dict[str, Value]:
-    """The parameters that do not vary: those given, then the defaults of those the analysis uses."""
+    """The parameters that do not vary: given ones, then defaults of those that the analysis uses."""
     known = {p.name: p for p in system.parameters}
     whole = {axis.name for axis in axes if axis.entry is None}
     for name, value in table.fixed.items():
@@ -276,11 +277,11 @@ def _check_together(model: Model, fixed: Mapping[str, Value]) -> None:
 def _path_axis(
     analysis: Analysis, request: Request, axes: tuple[Axis, ...], zipped: bool, fixed: Mapping[str, Value]
 ) -> str | None:
-    """The name of the axis that is consumed whole: an axis of the scene, or a fixed number as a line of one."""
+    """The name of the path axis: an axis of the scene, or a fixed number as a line of one value."""
     name = analysis.path_axis(request)
     names = [axis.name for axis in axes]
     if name in names and zipped:
-        raise InputError(f"points.{name}: {analysis.name} follows it as a path; allowed is an axis or a fixed value")
+        raise InputError(f"points.{name}: {analysis.name} uses it as a path; allowed is an axis or a fixed value")
     if name is not None and name not in names and not isinstance(fixed.get(name), (int, float)):
         allowed = f"allowed is one of {', '.join(names)}" if names else "the scene has no axes"
         raise InputError(f"options: {name!r} is not an axis of the scene; {allowed}")
@@ -288,7 +289,7 @@ def _path_axis(
 
 
 def _check_entry(axis: Axis, fixed: Mapping[str, Value], where: str) -> None:
-    """One swept entry needs the whole list beside it, for its length and the other entries."""
+    """Check that the whole list is given beside a swept entry; it supplies the length and the other entries."""
     name = axis.parameter.name
     if axis.entry is None:
         return

@@ -1,4 +1,4 @@
-"""Runs whose workers write their results themselves, as whole shards of a Zarr store: nothing passes through the driver."""
+"""Runs whose workers write whole shards of a Zarr store themselves, so no results pass through the driver."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from drivetrain_jax.store.chunks import PartsFolder
 
 @dataclass(frozen=True)
 class Shard:
-    """Shard ``index`` of ``group`` is made up of the chunks with these ``numbers``."""
+    """Shard ``index`` of ``group``, with the chunks of these ``numbers``."""
 
     number: int
     group: shards.Group
@@ -39,7 +39,7 @@ class Shard:
 
 @dataclass(frozen=True)
 class Task:
-    """A shard and its chunks: all that a worker has to know beside the scene."""
+    """A shard and its chunks: with the scene, everything that a worker needs."""
 
     number: int
     shard: Shard
@@ -53,32 +53,30 @@ class Task:
 
 @dataclass(frozen=True)
 class ShardJob(Job):
-    """Shards of the store at ``path``, which every worker has to see under this name."""
+    """Shards of the store at ``path``, which every worker must see under this name."""
 
     path: str
 
     def do(self, engine: Engine, task: Task) -> Mapping[str, np.ndarray]:
-        """Compute and write a shard; only the outcomes come back."""
+        """Compute and write a shard; returns only the outcomes."""
         return _write(self.path, engine, task, [engine.compute_chunk(chunk) for chunk in task.chunks])
 
 
 def check(engine: Engine) -> None:
-    """:class:`InputError` for a scene that has no points to compute one by one."""
+    """Raise :class:`InputError` for a scene without points to compute one by one."""
     if engine.scene.analysis.continuous or uses_atlas(engine.scene):
-        raise InputError(
-            "store = 'zarr': an atlas is small; allowed is hdf5, or a scene that solves every point directly"
-        )
+        raise InputError("store = 'zarr': not available for an atlas; allowed is hdf5, or a scene with direct solves")
 
 
 def groups_of(engine: Engine) -> list[shards.Group]:
-    """One for each solver of the plan."""
+    """One group for each solver of the plan."""
     return [shards.Group(f"solver_{g.index}", len(g.efforts), g.chunk) for g in engine.plan.groups]
 
 
 def compute(
     engine: Engine, out: Path, parts: PartsFolder, progress: Progress, where: Where, report: Report | None
 ) -> None:
-    """Fill the store that grows among ``parts``, and put it at ``out`` when it is complete."""
+    """Fill the store that grows among ``parts``, and move it to ``out`` when it is complete."""
     path, begin = parts.path / shards.UNFINISHED, time.monotonic()
     progress.computed += engine.hopeless
     progress.failed += engine.hopeless
@@ -89,7 +87,7 @@ def compute(
     progress.total_cost = float(sum(costs[shard.numbers].sum() for shard in missing))
     _tell(report, progress)
     job = ShardJob(engine.scene.text, engine.digest, os.path.abspath(path))
-    # Made when they are handed out: the points of all shards together may be too many for the driver.
+    # Created on demand: the points of all shards may need more memory than the driver has.
     tasks = map(partial(Task.of, engine), missing)
     with closing(where.each(tasks, partial(job.do, engine), lambda: job)) as finished:
         for task, results in finished:
@@ -108,7 +106,7 @@ def _tell(report: Report | None, progress: Progress) -> None:
 
 def _create(engine: Engine, path: Path) -> None:
     shutil.rmtree(path, ignore_errors=True)
-    # Moved in one step: what is there is a whole store.
+    # Moved in one step, so the store at this path is always whole.
     half = path.with_name("half")
     shutil.rmtree(half, ignore_errors=True)
     shards.create(half, groups_of(engine), _fields(engine), _attrs(engine))
@@ -123,7 +121,7 @@ def _fields(engine: Engine) -> list[shards.Field]:
 
 
 def _attrs(engine: Engine) -> dict[str, str | int]:
-    """Whose result it is, and which points its shards hold: those that no solver can do are in none."""
+    """Attributes that identify the result and its points; points that no solver can compute are in no shard."""
     whose = {"digest": engine.digest, **engine.numerics_attrs}
     held = {shards.GROUPS: shards.describe(groups_of(engine)), shards.HELD: engine.plan.size}
     return result_attrs(engine.scene) | whose | held
@@ -141,7 +139,7 @@ def all_shards(engine: Engine) -> Iterator[Shard]:
 
 
 def _missing(engine: Engine, path: Path, progress: Progress) -> Iterator[Shard]:
-    """Shards that are not there or damaged; the others count as reused."""
+    """Shards that are missing or damaged; the others count as reused."""
     for shard, present in stored(engine, path):
         if present is None:
             yield shard
@@ -152,7 +150,7 @@ def _missing(engine: Engine, path: Path, progress: Progress) -> Iterator[Shard]:
 
 
 def stored(engine: Engine, path: Path) -> Iterator[tuple[Shard, Mapping[str, np.ndarray] | None]]:
-    """All shards and what the store at ``path`` holds of them: None if one is not there or damaged.
+    """Yield all shards with their contents in the store at ``path``: None if one is missing or damaged.
 
     Raises :class:`InputError` if the store itself is damaged.
     """
@@ -184,7 +182,8 @@ def _padded(values: np.ndarray, count: int, blank: float) -> np.ndarray:
 
 
 def _one_by_one(engine: Engine, where: Where, path: Path, task: Task) -> np.ndarray:
-    """A shard at which processes die: its chunks alone, so that only the deadly one is lost; the driver writes it."""
+    """Compute the chunks of a shard that crashes its workers one by one, so only the crashing chunk is lost; the driver
+    writes."""
     found = {chunk.number: results for chunk, results in where.compute(engine, task.shard.numbers)}
     shapes = result_shapes(engine.scene, engine.grid, engine.solvers[task.chunks[0].solver])
     lost = {
@@ -197,14 +196,14 @@ def _one_by_one(engine: Engine, where: Where, path: Path, task: Task) -> np.ndar
 
 
 def _finish(engine: Engine, path: Path, out: Path, parts: PartsFolder, seconds: float) -> None:
-    """Put the store into place. A former one is set aside first: a directory cannot be replaced in one step.
+    """Move the store into place. A former one is set aside first, because a directory cannot be replaced in one step.
 
-    Raises :class:`ChunkError` if a shard is not there, though its worker said that it had been written.
+    Raises :class:`ChunkError` if a shard that a worker reported as written is missing.
     """
     absent = sum(int(np.sum(~shards.done(path, group))) for group in groups_of(engine))
     if absent:
-        raise ChunkError(f"{absent} shards were written elsewhere; every worker has to see the store as {str(path)!r}")
-    # Made anew: what a store has got while it grew is not guarded.
+        raise ChunkError(f"{absent} shards are missing; every worker must see the store at {str(path)!r}")
+    # Written again, because the attributes of a growing store have no checksum.
     shards.seal(path, _attrs(engine) | {"wall_time_s": seconds})
     former = parts.path / shards.FORMER
     if out.exists():

@@ -1,4 +1,4 @@
-"""What a run of a scene into a file would find there."""
+"""The state of a result file, seen by its scene."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from drivetrain_jax.store import shards
 
 @dataclass(frozen=True)
 class Status:
-    """How much of a scene is at ``out``: counts of points, and absent, partial, complete or stale (another scene).
+    """Counts of the points at ``out``, and the state: absent, partial, complete or stale (another scene).
 
-    ``failed_by_outcome`` counts the points without a value by what became of them. ``reason`` says why a run would be
-    refused, empty if it would not.
+    ``failed_by_outcome`` counts the points without a value by outcome. ``reason`` is the error message that a run would
+    give, empty without one.
     """
 
     total: int
@@ -39,10 +39,10 @@ class Status:
     def __str__(self) -> str:
         lines = [f"{self.state}: {self.done} of {self.total} points done, {self.failed} without a value"]
         lines += [f"  {name}: {count}" for name, count in self.failed_by_outcome.items()]
-        return "\n".join([*lines, *([f"  a run would be refused: {self.reason}"] if self.reason else [])])
+        return "\n".join([*lines, *([f"  a run would stop: {self.reason}"] if self.reason else [])])
 
     def to_json(self) -> str:
-        """The counts and the state, and what else there is to say, as one JSON object."""
+        """The counts, the state and the reason as one JSON object."""
         content = {name: getattr(self, name) for name in ("total", "done", "failed", "state")}
         more = {"failed_by_outcome": dict(self.failed_by_outcome), "reason": self.reason}
         return json.dumps(content | {name: value for name, value in more.items() if value})
@@ -51,7 +51,7 @@ class Status:
 def status(
     scene: str | Path | Mapping[str, Any], out: str | Path, overrides: Mapping[str, Any] | None = None
 ) -> Status:
-    """What a run of ``scene`` into ``out`` would find. Changes nothing and compiles nothing."""
+    """The :class:`Status` of ``scene`` at ``out``. Changes nothing and compiles nothing."""
     engine = Engine(load_scene(scene, overrides))
     target = Target(Path(out), engine)
     total = 0 if engine.scene.analysis.continuous else engine.total
@@ -86,9 +86,9 @@ def _counts(target: Target) -> _Counts:
 
 
 def _outcomes(target: Target) -> Iterator[np.ndarray]:
-    """Outcomes of all points that are done."""
+    """Outcomes of all finished points."""
     if target.state == "complete":
-        # A function of the parameters has no points.
+        # An atlas has no points.
         yield from () if target.is_function else (target.outcomes,)
     elif target.state == "partial" and target.store == "zarr":
         store = target.parts.path / shards.UNFINISHED
@@ -96,9 +96,9 @@ def _outcomes(target: Target) -> Iterator[np.ndarray]:
     elif target.state == "partial":
         continuous, seen = target.engine.scene.analysis.continuous, set[int]()
         for part in target.parts.read():
-            # Solves for an atlas are no points of a grid.
+            # Solves of an atlas are not points of a grid.
             if continuous or PROPAGATOR not in part.results:
-                # An interrupt in the middle of writing may have left a chunk in two parts.
+                # An interrupt during writing may leave a chunk in two parts.
                 yield from (results[OUTCOME.name] for number, results in part if number not in seen)
                 seen.update(part.chunks.tolist())
         for _, results in target.taken_before().blocks([OUTCOME.name]):

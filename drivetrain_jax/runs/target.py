@@ -1,4 +1,4 @@
-"""What lies at the path of a result: nothing, unfinished work, the result itself, or something else."""
+"""The state of the output path: nothing, unfinished work, the result, or something else."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from drivetrain_jax.store.files import behind_link
 class Target:
     """The result file ``out`` and the folder of its parts, seen by the scene of ``engine``.
 
-    ``state`` is ``absent``, ``partial``, ``complete`` or ``stale`` (a result or parts of another scene or version).
-    Raises :class:`InputError` if nothing can be written there, or if a file there is not a result of this package.
+    ``state`` is ``absent``, ``partial``, ``complete`` or ``stale`` (a result or parts of another scene or version). Raises
+    :class:`InputError` if nothing can be written there, or if a file there is not a result of this package.
     """
 
     def __init__(self, out: Path, engine: Engine, store: str | None = None) -> None:
@@ -45,25 +45,25 @@ class Target:
         self._plan_seen = self.parts.plan()
 
     def _kind(self) -> str:
-        """``hdf5`` or ``zarr``, after what is there."""
+        """Format of the result at the path: ``hdf5`` or ``zarr``."""
         return "zarr" if shards.is_store(self._held) else self.parts.plan().get("store", "hdf5")
 
     @property
     def _held(self) -> Path:
-        """Where the result that is there lies: a run puts a store aside just before it puts the new one in its place."""
+        """Path of the present result: a run sets a store aside just before it moves the new one into place."""
         former = self.parts.path / shards.FORMER
         return former if not self.out.exists() and former.exists() else self.out
 
     @property
     def written(self) -> int | None:
-        """When the result that is there was written, in the clock of its file system."""
+        """Time at which the present result was written, by the clock of its file system."""
         held = self._held / "zarr.json" if self.store == "zarr" else self._held
         return held.stat().st_mtime_ns if held.exists() else None
 
     def restore(self) -> None:
-        """Put a store back that a run was killed over while it replaced it.
+        """Restore a store whose replacement was killed.
 
-        Raises :class:`InputError` if that run is still at work.
+        Raises :class:`InputError` if that run is still working.
         """
         if self._held == self.out:
             return
@@ -77,18 +77,18 @@ class Target:
 
     @cached_property
     def state(self) -> str:
-        """See the class."""
+        """``absent``, ``partial``, ``complete`` or ``stale``."""
         if self.present == self.digest:
             return "stale" if self._rearranged else "complete"
         if self.parts.holds_work():
-            # Parts that are to replace another result belong to that one alone.
+            # Parts that replace another result belong to that result only.
             return "partial" if _same(self.parts.plan(), self.plan(), ("digest", "replaces", "store")) else "stale"
         if self.present is None:
             return "absent"
         return "partial" if self._grows else "stale"
 
     def plan(self, taken: Taken = NOTHING, fresh: bool = False) -> dict[str, Any]:
-        """What parts written now belong to, and what a reader needs to know of them."""
+        """The digest of new parts, and what a reader needs to interpret them."""
         return {
             "digest": self.digest,
             "replaces": self.present,
@@ -102,20 +102,20 @@ class Target:
         }
 
     def resumes(self, taken: Taken, fresh: bool) -> bool:
-        """Whether a run goes on with the parts that are there. A ``fresh`` one does so with those of its own beginning."""
+        """True if a run resumes the present parts. A ``fresh`` run resumes only parts of a fresh run."""
         if not fresh:
             return self.parts.holds_work()
-        # Parts that the result was made from already, by a run that was killed before it deleted them, are none of these.
+        # Parts already contained in the result, left by a run that was killed before it deleted them, do not count.
         names = ("digest", "replaces", "replaces_written", "store", "reuses", "fresh")
         return _same(self.parts.plan(), self.plan(taken, fresh), names)
 
     def check_unchanged(self) -> None:
-        """Raises :class:`InputError` if another run has come to its end, or begun, since this was made."""
+        """Raise :class:`InputError` if another run has finished or started since this object was created."""
         if (_digest_of(self.out, self._held), self.parts.plan()) != (self.present, self._plan_seen):
-            raise InputError(f"out = {str(self.out)!r}: another run has changed it meanwhile; allowed is to try again")
+            raise InputError(f"out = {str(self.out)!r}: another run has changed it; run the command again")
 
     def check_writable(self) -> None:
-        """Raises :class:`InputError` if nothing can be written beside what is there."""
+        """Raise :class:`InputError` if the folder of the result is not writable."""
         for folder in (self.out.parent, self.parts.path):
             if folder.exists() and not os.access(folder, os.W_OK | os.X_OK):
                 raise InputError(
@@ -125,14 +125,14 @@ class Target:
 
     @cached_property
     def _rearranged(self) -> list[str]:
-        """What of the result that is there is not laid out as this scene says."""
+        """Names of the variables of the present result whose layout differs from this scene."""
         if self.engine.scene.analysis.continuous or self.store == "zarr":
             return []
         return rearranged(self.out, self.engine.scene, self.engine.grid)
 
     @cached_property
     def _found(self) -> Source | NotReusable | None:
-        """What the result that is there holds of the points of this scene, or why it is of no use."""
+        """The points of this scene that the present result contains, or the reason why it has none."""
         if self.engine.scene.analysis.continuous or self.present is None or self.store == "zarr":
             return None
         try:
@@ -146,21 +146,21 @@ class Target:
 
     @property
     def _grows(self) -> bool:
-        """Whether the result that is there is a part of this scene's, so that replacing it loses nothing."""
+        """True if the present result is a part of this scene's, so replacing it loses nothing."""
         return self._shared is not None and self._shared.is_covered
 
     @property
     def remedy(self) -> str:
-        """What there is to do about the :attr:`obstacle`."""
+        """The remedy for the :attr:`obstacle`."""
         if self._shared is None or self.parts.holds_work():
             return "--fresh replaces it"
         kept = f"--reuse {self.out.name} with another --out takes {Taken((self._shared,)).count} points from it"
         return f"--fresh replaces it, {kept}"
 
     def take(self, reuse: Sequence[str | Path], fresh: bool) -> Taken:
-        """The points that a run takes from the results ``reuse`` and, unless it is ``fresh``, from the one in its place.
+        """The points that a run reuses from the results ``reuse`` and, unless it is ``fresh``, from the present result.
 
-        Raises :class:`InputError` if unfinished work was begun with others, or if one of ``reuse`` has nothing to give.
+        Raises :class:`InputError` if unfinished work uses other results, or if one of ``reuse`` has no common points.
         """
         scene = self.engine.scene
         if self.store == "zarr":
@@ -169,11 +169,11 @@ class Target:
             return NOTHING
         if scene.analysis.continuous or uses_atlas(scene):
             if reuse:
-                raise InputError("reuse: an atlas is made anew; allowed for a scene that solves every point directly")
+                raise InputError("reuse: not available for an atlas; allowed for a scene with direct solves")
             return NOTHING
         paths = [Path(path) for path in reuse]
         found = [find(self.engine, path) for path in paths]
-        # Work that was begun afresh is resumed as it was begun.
+        # Unfinished fresh work is resumed as fresh.
         if not (fresh or self.parts.plan().get("fresh")):
             if isinstance(self._found, Damaged):
                 raise self.refusal
@@ -188,7 +188,7 @@ class Target:
         return taken
 
     def taken_before(self) -> Taken:
-        """The points that unfinished work takes from other results, or a run would."""
+        """The points that unfinished work reuses from other results, or that a run would reuse."""
         if not self.parts.holds_work():
             return self.take((), fresh=False)
         names = self.parts.plan().get("reused_files") or ()
@@ -196,25 +196,25 @@ class Target:
 
     @property
     def refusal(self) -> InputError:
-        """What a run says that is not to replace what is there."""
+        """The message of a run that may not replace the present result."""
         return InputError(f"out = {str(self.out)!r}: holds {self.obstacle}; {self.remedy}")
 
     @property
     def obstacle(self) -> str:
-        """Why a run is refused, or would be: what is there, and what makes it another one's."""
+        """The reason why a run stops or would stop; empty without one."""
         if self.present == self.digest:
-            return f"a result that was rearranged after it was written ({', '.join(self._rearranged)})"
+            return f"a result that was changed in order or shape after it was written ({', '.join(self._rearranged)})"
         if isinstance(self._found, Damaged):
             return f"a damaged result ({self._found.what})"
         if self.parts.holds_work():
             stored, what = self.parts.plan(), "unfinished work"
             if self.present != stored.get("replaces"):
-                return f"{what} beside another result than the one it was begun with"
+                return f"{what} that was started for another result"
             if self.store != stored.get("store"):
                 return f"{what} of --store {stored.get('store')}"
         else:
             stored, what = {name: _attribute(self._held, name) for name in provenance_of(self.engine)}, "a result"
-        reasons = differences(stored, self.engine) if stored else ["it cannot be told which"]
+        reasons = differences(stored, self.engine) if stored else ["the difference is unknown"]
         more = f" and {len(reasons) - 2} more" if len(reasons) > 2 else ""
         return f"{what} of another scene or version: {'; '.join(reasons[:2]) or 'other sizes of chunks'}{more}"
 
@@ -225,22 +225,22 @@ class Target:
             held = np.concatenate(
                 [np.empty(0, np.int8), *(a.ravel() for a in shards.finished(self._held, OUTCOME.name))]
             )
-            # Points that no solver can do are in no shard.
+            # Points that no solver can compute are in no shard.
             return np.append(held, np.full(max(self.engine.total - held.size, 0), Outcome.STEP_LIMIT, np.int8))
         return read_variable(self.out, OUTCOME.name)
 
     @property
     def failed(self) -> int:
-        """Number of points without a value in the complete result. A function of the parameters has no points."""
+        """Number of points without a value in the complete result. An atlas has no points."""
         return 0 if self._solves is not None else failures(self.outcomes)
 
     def points(self, total: int) -> int:
-        """What the complete result took: the ``total`` points of its grid, or the solves behind a function."""
+        """Number of points of the complete result, or of solves of an atlas."""
         return total if self._solves is None else self._solves
 
     @property
     def is_function(self) -> bool:
-        """Whether the complete result is a function of the parameters instead of points."""
+        """True if the complete result is a function of the parameters (an atlas)."""
         return self._solves is not None
 
     @property
@@ -250,7 +250,7 @@ class Target:
 
 
 def provenance_of(engine: Engine) -> dict[str, str]:
-    """What tells later why work is not that of a scene."""
+    """Attributes that explain later how stored work differs from a scene."""
     return {
         "scene": engine.scene.text,
         "drivetrain_jax_version": drivetrain_jax.__version__,
@@ -263,7 +263,7 @@ def _same(one: Mapping[str, Any], other: Mapping[str, Any], names: Iterable[str]
 
 
 def _check_name(out: Path, parts: PartsFolder) -> None:
-    """The folder of the parts has the longer name."""
+    """Check the length of the name; the folder of the parts has the longest."""
     try:
         parts.path.exists()
     except OSError as error:
@@ -274,7 +274,7 @@ def _check_name(out: Path, parts: PartsFolder) -> None:
 
 def _check_parts(out: Path, folder: Path) -> None:
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"out = {str(out)!r}: {str(folder)!r} is in the way; allowed is to move that file away")
+        raise InputError(f"out = {str(out)!r}: {str(folder)!r} is a file; allowed is to move it away")
     if folder.exists() and not os.access(folder, os.R_OK | os.X_OK):
         raise InputError(f"out = {str(out)!r}: the folder {str(folder)!r} is not readable; allowed is one that is")
 
@@ -296,7 +296,7 @@ def _attribute(held: Path, name: str) -> Any:
 
 
 def _digest_of(out: Path, held: Path) -> str | None:
-    """Digest of the result of ``out``, which lies at ``held``; None if there is none."""
+    """Digest of the result of ``out``, stored at ``held``; None without one."""
     if not held.exists():
         return None
     try:

@@ -1,4 +1,4 @@
-"""A scene computed through an atlas: the same table, filled by evaluating it, and by direct solves where it has gaps."""
+"""Compute a scene from an atlas: evaluate the panels, and solve the points in gaps directly."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.rounds import build_atlas, fixed_of
 from drivetrain_jax.runs.work import Progress, Work
 
-# Cells evaluated at a time: what they need in memory, and how often progress is told.
+# Cells evaluated at a time; determines memory and the interval of progress reports.
 _BLOCK = 1 << 21
 _ROWS = 64
-# Cells from which on something is done beside the solves.
+# Cells above which preparations run in parallel with the solves.
 _LARGE = 1 << 19
 
 Results = Mapping[str, np.ndarray]
 
 
 def fill_through_atlas(engine: Engine, table: Table, work: Work, progress: Progress) -> dict[str, int]:
-    """All points of ``engine`` into ``table``; returns what the attributes of the result are to say of it."""
+    """Fill all points of ``engine`` into ``table``; returns attributes of the result."""
     scene = engine.scene
     solves = Progress(0, kind="direct solves for the atlas")
-    # Beside the solves.
+    # In parallel with the solves.
     with ThreadPoolExecutor(1, initializer=in_double_precision) as aside:
         prepared = [aside.submit(_lay_out, engine, table), aside.submit(_prepare_judging, engine)]
         atlas, first = build_atlas(scene, atlas_ranges(scene), work, solves, solves_allowed(scene))
@@ -43,16 +43,16 @@ def fill_through_atlas(engine: Engine, table: Table, work: Work, progress: Progr
 
 
 def _lay_out(engine: Engine, table: Table) -> None:
-    """Lay out a file whose size does not depend on results; a small one holds the solves up for longer than it takes.
+    """Create the output file while the solves run; for a small file this would delay the solves.
 
-    Room in memory is made by the thread that fills it: another one would not get what earlier results have left behind.
+    The thread that fills memory must also allocate it, to reuse memory that earlier results have freed.
     """
     if engine.grid.size >= _LARGE and table.on_disk and not any(variable.dims for variable in table.variables):
         table.lay_out(blank=False)
 
 
 def _prepare_judging(engine: Engine) -> None:
-    """Of so many cells some have to be judged one by one, by a kernel that takes seconds to compile."""
+    """Compile the kernel that decides single cells, which takes seconds: of this many cells some need it."""
     if engine.grid.size < _LARGE:
         return
     scene, ranges = engine.scene, atlas_ranges(engine.scene)
@@ -73,7 +73,7 @@ def evaluate(
     """All points of ``engine`` into ``table`` from ``atlas``; those that it does not cover are counted, and solved unless
     ``solve`` is false.
 
-    A run that is resumed evaluates again, which is faster than reading would be. ``first`` see :meth:`Work.do`.
+    A resumed run evaluates again, because that is faster than reading. For ``first`` see :meth:`Work.do`.
     """
     uncovered: list[np.ndarray] = []
     filled = _points if engine.scene.zipped else _blocks
@@ -93,7 +93,7 @@ def evaluate(
 
 
 def _points(engine: Engine, atlas: StabilityAtlas, table: Table) -> Iterator[tuple[tuple[slice], Results]]:
-    """Places among the points and the arrays of ``table`` there, filled in."""
+    """Yield positions among the points, and the filled arrays of ``table`` there."""
     names, outputs = atlas.atlas.parameters, engine.scene.request.outputs
     for start in range(0, engine.grid.size, _BLOCK):
         numbers = np.arange(start, min(start + _BLOCK, engine.grid.size))
@@ -107,7 +107,7 @@ def _points(engine: Engine, atlas: StabilityAtlas, table: Table) -> Iterator[tup
 
 
 def _blocks(engine: Engine, atlas: StabilityAtlas, table: Table) -> Iterator[tuple[tuple[slice, ...], Results]]:
-    """Places in the grid, block by block, and the arrays of ``table`` there, filled in."""
+    """Yield positions in the grid block by block, and the filled arrays of ``table`` there."""
     axes = {axis.name: axis.values for axis in engine.grid.axes}
     lengths = {name: len(axes[name]) for name in atlas.atlas.parameters}
     longest = sorted(lengths, key=lambda name: lengths[name])[-2:]
@@ -129,7 +129,7 @@ def _cut(lengths: Sequence[int]) -> Iterator[tuple[slice, ...]]:
     whole = len(lengths) - 1
     while whole > 0 and math.prod(lengths[whole:]) <= _BLOCK:
         whole -= 1
-    # Axis number `whole` is cut into pieces, those before it into single values.
+    # Axis number `whole` is cut into pieces, earlier axes into single values.
     step = max(1, _BLOCK // max(math.prod(lengths[whole + 1 :]), 1))
     step = step - step % _ROWS if step > _ROWS else step
     starts = list(range(0, lengths[whole], step))
@@ -140,8 +140,8 @@ def _cut(lengths: Sequence[int]) -> Iterator[tuple[slice, ...]]:
 
 
 def _in_atlas_order(values: np.ndarray, names: Sequence[str], axes: Sequence[str]) -> np.ndarray:
-    """Results over the ``axes`` of the scene (then dimensions of their own), as a view over the parameters ``names`` of an
-    atlas; the other axes have one value."""
+    """A view of results over the ``axes`` of the scene as results over the parameters ``names`` of an atlas; other axes
+    have one value."""
     present = [name for name in axes if name in names]
     order = [present.index(name) for name in names]
     values = np.squeeze(values, axis=tuple(k for k, name in enumerate(axes) if name not in names))

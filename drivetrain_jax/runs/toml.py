@@ -1,4 +1,4 @@
-"""Scenes as nested tables: read from TOML, changed by dotted keys, written as TOML."""
+"""Scenes as nested tables: read TOML, replace entries by dotted keys, write TOML."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from drivetrain_jax._wording import shown
 from drivetrain_jax.runs import shipped
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
-# What no attribute of a result can hold.
+# Characters that an attribute of a result cannot store.
 _NO_TEXT = re.compile("[\0\ud800-\udfff]")
-# Bits of integers that are longer than any number of a scene and shorter than those that Python refuses to write.
+# Largest number of bits of an integer: more than a scene needs, less than Python's limit for printing.
 _MOST_BITS = 10_000
 
 
@@ -68,19 +68,19 @@ def _read(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] |
 
 
 def plain(value: Any) -> Any:
-    """A copy in the types of TOML: numbers and arrays of NumPy and its like, tuples and ranges become numbers and lists."""
+    """A copy in the types of TOML: NumPy numbers and arrays, tuples and ranges become numbers and lists."""
     if isinstance(value, Mapping):
         return {key: plain(entry) for key, entry in value.items()}
     if hasattr(value, "tolist"):
         return value.tolist()
     if hasattr(value, "__array__"):
-        # Labelled arrays of xarray know no tolist of their own.
+        # Labelled arrays of xarray have no tolist.
         return np.asarray(value).tolist()
     return [plain(entry) for entry in value] if isinstance(value, (list, tuple, range)) else value
 
 
 def _check(value: Any, field: str) -> None:
-    """:class:`InputError` unless ``value`` can be written as TOML, and into the attributes of a result."""
+    """Raise :class:`InputError` unless ``value`` can be stored as TOML and in the attributes of a result."""
     if isinstance(value, Mapping):
         for name, entry in value.items():
             if not isinstance(name, str) or _NO_TEXT.search(name):
@@ -125,11 +125,11 @@ def _replace(tree: dict[str, Any], key: str, value: Any) -> None:
 
 
 def parse_value(text: str) -> Any:
-    """A TOML value; text that is none is a number in its short form (``.3``) or a plain string (``diffrax``)."""
+    """A TOML value; other text is a number in short form (``.3``) or a plain string (``diffrax``)."""
     try:
         content = tomllib.loads(f"value = {text}")
     except ValueError:
-        # No TOML, or a number of too many digits.
+        # Not TOML, or a number with too many digits.
         content = {}
     if list(content) == ["value"]:
         return content["value"]
@@ -140,8 +140,8 @@ def parse_value(text: str) -> Any:
 
 
 def write(tree: Mapping[str, Any]) -> str:
-    """TOML text of ``tree``: plain entries first, then its tables, whose own tables are written inline. What is None, which
-    stands for nothing, is left out: TOML has no word for it."""
+    """TOML text of ``tree``: plain entries first, then its tables with inline subtables. None entries are left out,
+    because TOML has no null."""
     lines = entries({name: value for name, value in tree.items() if not isinstance(value, Mapping)})
     for name, table in tree.items():
         if isinstance(table, Mapping):
@@ -159,7 +159,7 @@ def _key(name: str) -> str:
 
 
 def _quoted(text: str) -> str:
-    # TOML wants the one control character escaped that JSON does not.
+    # TOML requires an escape for one control character that JSON does not escape.
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 

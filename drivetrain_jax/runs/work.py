@@ -1,4 +1,4 @@
-"""The chunks of a run: found among the parts of an earlier one, or computed and kept."""
+"""Find the chunks of a run among the parts of an earlier one, or compute and keep them."""
 
 from __future__ import annotations
 
@@ -19,18 +19,17 @@ from drivetrain_jax.runs.executor import Where
 from drivetrain_jax.runs.plan import Chunk
 from drivetrain_jax.store.chunks import Part, PartsFolder
 
-# Finished chunks are written together: small ones would cost more to write than to compute. Fewest and most seconds
-# between two parts, and the share of the time that writing may take in between.
+# Shortest and longest time in s between two parts, and the largest share of time for writing.
 _SHORTEST, _LONGEST, _WRITE_SHARE = 0.25, 2.0, 0.01
-# Bytes of results that wait to be written at most.
+# Most bytes of results that wait to be written.
 _MOST_WAITING = 1 << 25
 
 
 @dataclass
 class Progress:
-    """How far a run is: ``computed``, ``reused`` and ``failed`` count what ``kind`` says, costs are in the plan's units.
+    """Progress of a run: ``computed``, ``reused`` and ``failed`` count things of ``kind``; costs are in units of the plan.
 
-    ``note`` says what the counts do not tell.
+    ``note`` is a further remark.
     """
 
     total: int
@@ -50,21 +49,21 @@ Report = Callable[[Progress], None]
 
 
 class Sink(Protocol):
-    """Where results go: the table of a scene, or what else asks for solves."""
+    """Receives results: the table of a scene, or a collector of solves."""
 
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
-        """Enter the results of ``points``."""
+        """Write the results of ``points``."""
 
     def lose(self, points: np.ndarray) -> None:
-        """Record that nobody survived the computation of ``points``."""
+        """Mark these points as lost: their worker crashed three times."""
 
 
 class Work:
-    """Computes chunks ``where`` and tells ``report``. With ``parts`` (open) it keeps them there, and computes none that
-    is there already. ``seconds`` is what those took.
+    """Runs chunks on the executor and reports progress.
 
-    Leaving it as a context by an exception writes the finished chunks that are still in memory; leaving it normally drops
-    them, since the result holds them.
+    With ``parts`` (open) it stores finished chunks there and reuses stored ones; ``seconds`` is their computing time.
+    Leaving the context by an exception writes the chunks in memory; leaving it normally drops them, because the result
+    contains them.
     """
 
     def __init__(self, where: Where, report: Report | None = None, parts: PartsFolder | None = None) -> None:
@@ -81,9 +80,9 @@ class Work:
             self._keeper.write()
 
     def do(self, engine: Engine, sink: Sink, progress: Progress, first: int = 0, where: Where | None = None) -> None:
-        """Enter all chunks of ``engine`` into ``sink``; ``first`` is added to their numbers where they are kept.
+        """Compute or reuse all chunks of ``engine`` into ``sink``; stored chunk numbers start at ``first``.
 
-        Lost ones are not kept: a run that is resumed tries them again.
+        Lost chunks are not stored, so a resumed run computes them again.
         """
         progress.computed += engine.hopeless
         progress.failed += engine.hopeless
@@ -97,16 +96,16 @@ class Work:
             batch.flush()
         finally:
             batch.keep()
-            # An interrupt may come between keeping a chunk and counting it: what counts is what was kept, or is lost.
+            # An interrupt may come between storing a chunk and counting it: count what is stored or lost.
             progress.computed = before + (batch.kept + batch.lost) * engine.grid.path_length
 
     def _reuse(self, engine: Engine, parts: PartsFolder, sink: Sink, progress: Progress, first: int) -> np.ndarray:
-        """Enter the chunks that are there; the numbers of those that are not."""
+        """Copy the stored chunks; returns the numbers of the missing ones."""
         missing = np.ones(len(engine.plan.costs), bool)
         for part in parts.read(repair=True):
             self.seconds += 0.0 if self._counted else part.seconds
             for number, results in part:
-                # An interrupt in the middle of writing may have left a chunk in two parts.
+                # An interrupt during writing may leave a chunk in two parts.
                 if not (0 <= number - first < missing.size and missing[number - first]):
                     continue
                 missing[number - first] = False
@@ -122,7 +121,7 @@ class Work:
         progress.cost, progress.total_cost = 0.0, float(costs[numbers].sum())
         self._tell(progress)
         missing = len(numbers)
-        # Closed on the way out: after an interrupt no further chunk starts.
+        # Closed on exit: after an interrupt no further chunk starts.
         with closing(where.compute(engine, numbers)) as finished:
             for chunk, results in finished:
                 missing -= 1
@@ -137,7 +136,7 @@ class Work:
                 progress.cost += float(costs[chunk.number])
                 self._tell(progress)
         if missing:
-            raise Passing(f"{counted(missing, 'chunk', 'chunks')} never came back")
+            raise Passing(f"{counted(missing, 'chunk', 'chunks')} returned no result")
 
     def _tell(self, progress: Progress) -> None:
         if self.report:
@@ -145,8 +144,8 @@ class Work:
 
 
 class _Keeper:
-    """Takes finished chunks and writes those of a quarter of a second, on a slow disk of a longer time, together; without
-    ``parts`` it only says when that would be."""
+    """Writes finished chunks in parts of a quarter of a second, or longer on a slow disk. Without ``parts`` it only
+    reports when a part is due."""
 
     def __init__(self, parts: PartsFolder | None) -> None:
         self._parts = parts
@@ -155,11 +154,11 @@ class _Keeper:
         self._interval = _SHORTEST
 
     def due(self) -> bool:
-        """Whether it is time to write."""
+        """True if a part is due."""
         return time.monotonic() - self._written >= self._interval
 
     def take(self, numbers: list[int], sizes: list[int], results: Mapping[str, np.ndarray]) -> None:
-        """Have these chunks, to be written if the time has come."""
+        """Queue these chunks, and write if a part is due."""
         now = time.monotonic()
         if self._parts:
             self._waiting.append(Part(numbers, sizes, results, now - self._taken))
@@ -168,7 +167,7 @@ class _Keeper:
             self.write()
 
     def write(self) -> None:
-        """Write what waits."""
+        """Write the queued chunks."""
         begin = time.monotonic()
         while self._waiting and self._parts:
             self._parts.write(self._waiting[0])
@@ -178,7 +177,7 @@ class _Keeper:
 
 
 class _Batch:
-    """Collects finished chunks, which are kept and entered into ``sink`` together: that costs a third of one by one."""
+    """Collects finished chunks and enters them into ``sink`` together, which costs a third of entering them one by one."""
 
     def __init__(self, sink: Sink, keeper: _Keeper, first: int) -> None:
         self.sink, self._keeper, self._first = sink, keeper, first
@@ -191,25 +190,25 @@ class _Batch:
         self._waiting.append((chunk, results))
         self._bytes += sum(values.nbytes for values in results.values())
         if not self._begun:
-            # The first results make the room for all: a disk without it is told before more is computed.
+            # The first results allocate the whole output, so a full disk is reported before more is computed.
             self._begun = True
             self.sink.fill(chunk.points, results)
         if self._bytes >= _MOST_WAITING or self._keeper.due():
             self.flush()
 
     def lose(self, chunk: Chunk) -> None:
-        """Enter that nobody survived the chunk."""
+        """Mark the points of a chunk as lost."""
         self.sink.lose(chunk.points)
         self.lost += chunk.points.size
 
     def flush(self) -> None:
-        """Keep and enter what waits."""
+        """Store and enter the queued chunks."""
         chunks, results = self.keep()
         if chunks:
             self.sink.fill(np.concatenate([chunk.points for chunk in chunks]), results)
 
     def keep(self) -> tuple[list[Chunk], dict[str, np.ndarray]]:
-        """Hand over what waits. Returns it: its chunks, and their results one after the other."""
+        """Store the queued chunks; returns the chunks and their concatenated results."""
         chunks = [chunk for chunk, _ in self._waiting]
         if not chunks:
             return [], {}

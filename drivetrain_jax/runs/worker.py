@@ -1,4 +1,4 @@
-"""What another process does for a run: it makes the scene's engine ready once and computes chunks."""
+"""Code of a worker process: it prepares the engine of the scene once and computes chunks."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from drivetrain_jax.runs.scene import load_scene
 
 
 class Mismatch(ChunkError):
-    """A worker would compute something else than the run asks for: other code, versions or instruction set."""
+    """Raised if code, versions or instruction set of a worker differ from those of the run."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """A scene as text, and the digest of what its driver wants computed."""
+    """A scene as text, and the digest that its driver expects."""
 
     scene: str
     digest: str
 
     def do(self, engine: Engine, chunk: Any) -> Mapping[str, np.ndarray]:
-        """What is computed for ``chunk`` in the process of a worker."""
+        """The results of ``chunk`` in a worker process."""
         return engine.compute_chunk(chunk)
 
 
@@ -42,11 +42,11 @@ def _engine(job: Job) -> Engine:
 
 
 def prepare(job: Job) -> int:
-    """Make the engine ready; returns the number of this process. Raises :class:`Mismatch`."""
+    """Prepare the engine; returns the number of this process. Raises :class:`Mismatch`."""
     _engine(job)
     return os.getpid()
 
 
 def compute(job: Job, chunk: Chunk) -> Mapping[str, np.ndarray]:
-    """Results of ``chunk``; nothing is planned here. Raises :class:`Mismatch`, or what the computation raises."""
+    """Results of ``chunk``, without planning. Raises :class:`Mismatch`, or any error of the computation."""
     return job.do(_engine(job), chunk)

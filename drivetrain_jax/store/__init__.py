@@ -1,1 +1,1 @@
-"""Results on disk: labelled datasets, unfinished work that survives any interruption, and where numbers come from."""
+"""Results on disk: labelled datasets, unfinished work that survives interruptions, and provenance."""

@@ -1,7 +1,7 @@
 """Checksums of a finished result: of each variable as a reader sees it, and of the attributes of the file.
 
-They are made once, over the values in place, when the file is complete. HDF5's own filter (fletcher32) would need chunked
-storage, which cannot be mapped into memory, and would leave attributes and labels unguarded.
+They are computed once, when the file is complete. HDF5's own filter (fletcher32) needs chunked storage, which cannot be
+memory-mapped, and does not cover attributes and labels.
 """
 
 from __future__ import annotations
@@ -22,40 +22,40 @@ ATTRIBUTE = "checksums"
 # The name of the root group stands for the attributes of the file.
 FILE = "/"
 _BLOCK = 1 << 24
-# Bytes from which on threads are worth their while: they wait for one another except while they hash.
+# Bytes above which threads are faster: they run in parallel only while hashing.
 _LARGE = 1 << 22
-# Damage in the structure of a file surfaces in h5py as any of these.
+# Exceptions of h5py for a damaged file structure.
 BROKEN = (OSError, KeyError, ValueError, RuntimeError, TypeError, OverflowError)
-# What the netCDF library adds to link dimensions and variables; the links themselves are looked at by name.
+# Attributes by which the netCDF library links dimensions and variables; the links are checked by name.
 _LINKS = frozenset({"DIMENSION_LIST", "REFERENCE_LIST", "CLASS", "NAME", "_Netcdf4Dimid", "_Netcdf4Coordinates"})
 
 
 def reserve(file: h5py.File) -> None:
-    """Make room for the checksums of all that ``file`` holds: filling it in later needs no space on the disk."""
+    """Reserve space for the checksums of everything in ``file``, so filling them in needs no disk space."""
     blank = json.dumps(dict.fromkeys([FILE, *_variables(file)], "0" * 32))
     file.attrs.create(ATTRIBUTE, np.bytes_(blank))
 
 
 def seal(file: h5py.File) -> None:
-    """Fill in the checksums of the complete ``file``."""
+    """Write the checksums of the complete ``file``."""
     file.attrs.modify(ATTRIBUTE, np.bytes_(json.dumps(checksums(file))))
 
 
 def checksums(file: h5py.File) -> dict[str, str]:
-    """blake2b (128 bits) of each variable, type, dimensions and attributes included, and of the attributes of ``file``."""
+    """blake2b (128 bits) of each variable, with type, dimensions and attributes, and of the attributes of ``file``."""
     variables = _variables(file)
     if sum(variable.nbytes for variable in variables.values()) < _LARGE:
         digests = [_of_variable(variable) for variable in variables.values()]
     else:
-        # Hashing leaves the interpreter's lock to others.
+        # Hashing releases the interpreter's lock.
         with ThreadPoolExecutor(min(usable_cores(), len(variables)), thread_name_prefix="hash") as pool:
             digests = list(pool.map(_of_variable, variables.values()))
     return {FILE: _of_attributes(file, {ATTRIBUTE}).hexdigest()} | dict(zip(variables, digests, strict=True))
 
 
 def damaged(path: Path) -> list[str] | None:
-    """Names of the variables (``/``: attributes) of the result at ``path`` that are damaged; None if it has
-    no checksums. Raises :class:`InputError` if the file cannot be read."""
+    """Names of the damaged variables (``/``: attributes) of the result at ``path``; None if it has no checksums. Raises
+    :class:`InputError` if the file cannot be read."""
     try:
         with h5py.File(path, "r") as file:
             stored = file.attrs.get(ATTRIBUTE)
@@ -70,17 +70,17 @@ def damaged(path: Path) -> list[str] | None:
 
 
 def named(names: list[str]) -> str:
-    """The names that :func:`damaged` gives, as messages write them."""
+    """The names from :func:`damaged` as text."""
     return ", ".join("attributes of the file" if name == FILE else name for name in names)
 
 
 def _variables(file: h5py.File) -> dict[str, h5py.Dataset]:
-    # Beside them a file may hold the named type of its complex numbers.
+    # A file may also contain the named type of its complex numbers.
     return {name: found for name in sorted(file) if isinstance(found := file[name], h5py.Dataset)}
 
 
 def _parsed(stored: object) -> dict[str, str]:
-    """The stored table; a damaged one agrees with nothing."""
+    """The stored table; a damaged table equals nothing."""
     try:
         table = json.loads(stored)
     except (ValueError, TypeError):
@@ -98,7 +98,7 @@ def _of_variable(variable: h5py.Dataset) -> str:
 
 
 def _dimension(variable: h5py.Dataset, axis: int) -> str | None:
-    """Name of a dimension in the file: of its first scale, which h5py would look for three times."""
+    """Name of a dimension in the file, read from its first scale; h5py would look it up three times."""
     if not h5py.h5ds.get_num_scales(variable.id, axis):
         return variable.dims[axis].label
     scales: list[h5py.h5d.DatasetID] = []
@@ -107,7 +107,7 @@ def _dimension(variable: h5py.Dataset, axis: int) -> str | None:
 
 
 def _blocks(variable: h5py.Dataset) -> Iterator[np.ndarray]:
-    """The values, some megabytes at a time."""
+    """Yield the values in blocks of some megabytes."""
     shape, size = variable.shape, variable.nbytes
     if not shape or 0 < size <= _BLOCK:
         yield np.asarray(variable[()])
@@ -118,7 +118,7 @@ def _blocks(variable: h5py.Dataset) -> Iterator[np.ndarray]:
 
 
 def _of_attributes(owner: h5py.HLObject, apart: Collection[str]) -> hashlib.blake2b:
-    """The state after all attributes of ``owner`` but those ``apart``."""
+    """The hash state after all attributes of ``owner`` except ``apart``."""
     state, attributes = hashlib.blake2b(digest_size=16), owner.attrs
     for name in sorted(attributes):
         if name not in apart:

@@ -1,7 +1,8 @@
-"""Unfinished work: the folder ``FILE.nc.parts/`` with finished chunks in files that are complete, verified, or ignored.
+"""Unfinished work: the folder ``FILE.nc.parts/`` with files of finished chunks, which are complete and verified, or
+ignored.
 
-A part is one HDF5 image, made in memory and written at once. Its name carries the digest of its content: damage is
-found when it is read, and the chunks in it are computed again.
+A part is one HDF5 image, made in memory and written at once. Its name contains the digest of its content. A damaged part is
+detected on reading, and its chunks are computed again.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ Arrays = Mapping[str, np.ndarray]
 
 
 class Part:
-    """Finished chunks: their numbers, how many points each has, results (points first), seconds spent."""
+    """Finished chunks: their numbers, point counts, results (points first) and computing time in s."""
 
     def __init__(self, chunks: Sequence[int], sizes: Sequence[int], results: Arrays, seconds: float) -> None:
         self.chunks = np.asarray(chunks, np.int64)
@@ -42,7 +43,7 @@ class Part:
         return sum(values.nbytes for values in self.results.values())
 
     def __iter__(self) -> Iterator[tuple[int, Arrays]]:
-        """Chunk by chunk: number and results."""
+        """Yield number and results of each chunk."""
         stops = np.cumsum(self.sizes)
         for chunk, start, stop in zip(self.chunks, stops - self.sizes, stops, strict=True):
             yield int(chunk), {name: values[start:stop] for name, values in self.results.items()}
@@ -67,23 +68,20 @@ class Part:
 
 
 class PartsFolder:
-    """The parts of the result ``out``. Writing needs the folder to be open (``open``, ``close``), reading does not."""
+    """The parts of the result ``out``. Writing needs an open folder (``open``, ``close``), reading does not."""
 
     def __init__(self, out: Path) -> None:
         # One folder, and so one lock, for all names of a file.
         out = behind_link(out)
         self.path = out.parent / f"{out.name}.parts"
-        # Where the result grows until it is complete.
+        # Path at which the result grows.
         self.result = self.path / "result.tmp"
         self._plan = self.path / "plan.json"
         self._lock: FileLock | None = None
 
     def plan(self) -> dict[str, Any]:
-        """What the parts belong to: ``digest``, ``replaces``, the digest of the result that they will supersede, and what
-        else the run wanted remembered.
-
-        Empty if there is no readable plan.
-        """
+        """The plan of the parts: ``digest``, ``replaces`` (digest of the result that they will replace), and further
+        entries of the run. Empty without a readable plan."""
         try:
             content = json.loads(self._plan.read_text())
         except (OSError, ValueError):
@@ -91,8 +89,8 @@ class PartsFolder:
         return content if isinstance(content, dict) else {}
 
     def open(self) -> None:
-        """Create and lock the folder; ``InputError`` if another run holds it or no folder can be made there. Nothing in it
-        changes yet."""
+        """Create and lock the folder. Raises ``InputError`` if another run has locked it or it cannot be created.
+        Changes no content."""
         while True:
             self._make()
             lock = FileLock(self.path / "lock", timeout=0)
@@ -102,7 +100,7 @@ class PartsFolder:
                 raise InputError(f"out = {str(self.path)!r}: another run is working on it; wait or stop it") from None
             except FileNotFoundError:
                 continue
-            # The run that held it may have finished and removed the folder between our mkdir and our lock.
+            # Another run may have removed the folder between mkdir and lock.
             if os.path.exists(self.path / "lock"):
                 self._lock = lock
                 return
@@ -112,14 +110,14 @@ class PartsFolder:
         try:
             self.path.mkdir(exist_ok=True)
         except OSError as error:
-            # A full disk may have room later.
+            # A full disk may have space later.
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise
-            text = f"out = {str(self.path)!r}: {error.strerror}; allowed is a place where a folder can be made"
+            text = f"out = {str(self.path)!r}: {error.strerror}; allowed is a path in a writable folder"
             raise InputError(text) from None
 
     def start(self, plan: Mapping[str, Any]) -> None:
-        """Forget all parts and begin those of ``plan``."""
+        """Delete all parts and start those of ``plan``."""
         for entry in self.path.iterdir():
             if entry.is_dir():
                 shutil.rmtree(entry)
@@ -128,7 +126,7 @@ class PartsFolder:
         write_atomic(self._plan, json.dumps(dict(plan)).encode(), self.path / "plan.tmp")
 
     def close(self, remove: bool = False) -> None:
-        """Release the folder, or delete it with everything in it."""
+        """Unlock the folder, or delete it with its content."""
         if self._lock is None:
             return
         if remove:
@@ -137,9 +135,9 @@ class PartsFolder:
         self._lock = None
 
     def holds_work(self) -> bool:
-        """Whether there is anything to resume or to refuse; a run killed at its very start leaves nothing.
+        """True if there is work to resume or to report; a run killed at its start leaves none.
 
-        Raises :class:`InputError` if the folder may not be looked into.
+        Raises :class:`InputError` if the folder is not readable.
         """
         try:
             return self._plan.exists() or any(self.path.glob("*.h5"))
@@ -148,20 +146,20 @@ class PartsFolder:
             raise InputError(text) from None
 
     def discard(self, digest: str, written: int | None = None) -> None:
-        """Delete what is left over from the run that made ``digest``, if it was killed before it could do so itself.
+        """Delete the remains of the run that made ``digest``, if it was killed before it could delete them.
 
-        The work of another scene is left alone, and so is what is to replace this very result, ``written`` at this time.
+        Work of another scene, and work that will replace the result ``written`` at this time, stay.
         """
         plan = self.plan()
         replaces = (plan.get("replaces"), plan.get("replaces_written")) == (digest, written)
         if self.path.exists() and plan.get("digest") in (None, digest) and not replaces:
-            # What cannot be deleted does not keep anybody from reading the result.
+            # Readers can use the result even if the remains cannot be deleted.
             with suppress(InputError, OSError):
                 self.open()
                 self.close(remove=True)
 
     def write(self, part: Part) -> None:
-        """Add finished chunks."""
+        """Write finished chunks."""
         data = part.to_bytes()
         path = self.path / f"{int(part.chunks[0]):08d}-{_content_digest(data)}.h5"
         write_atomic(path, data, path.with_suffix(".tmp"))
@@ -171,7 +169,7 @@ class PartsFolder:
         return sum(1 for _ in self.path.glob("*-*.h5"))
 
     def read(self, repair: bool = False) -> Iterator[Part]:
-        """All intact parts. ``repair`` deletes damaged and half-written ones (only while the folder is open)."""
+        """All intact parts. ``repair`` deletes damaged and incomplete ones (only while the folder is open)."""
         if repair:
             for path in set(self.path.glob("*.tmp")) - {self.result}:
                 path.unlink(missing_ok=True)

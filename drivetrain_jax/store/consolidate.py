@@ -1,4 +1,4 @@
-"""The finished result: one netCDF4/HDF5 file, read without anything of this package."""
+"""The finished result: one netCDF4/HDF5 file that can be read without this package."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from drivetrain_jax.store.schema import Labelled
 if TYPE_CHECKING:
     import xarray as xr
 
-# Bytes that the attributes of a variable take at most.
+# Upper limit of the bytes of a variable's attributes.
 _LABELS = 1 << 16
 # Bytes of the block in front of HDF5 that a preface takes: the least that HDF5 looks behind.
 _USER_BLOCK = 512
 
 
 class ResultFile:
-    """A result that grows on the disk beside its final place, so that memory does not grow with it.
+    """A result that grows on disk next to its final path, so memory does not grow with it.
 
     ``lay_out`` gives its data variables as arrays mapped from the file ``temporary``, to be filled in any order; ``finish``
     puts it into place. Leaving the context without that deletes it. A ``preface`` stands in front of HDF5.
@@ -43,9 +43,9 @@ class ResultFile:
         self._temporary.unlink(missing_ok=True)
 
     def lay_out(self, template: Labelled) -> Mapping[str, np.ndarray]:
-        """Room for the data of ``template``, which may have any content (a broadcast zero takes no memory).
+        """Reserve space for the data of ``template``, whose content is ignored (a broadcast zero takes no memory).
 
-        A disk without enough room is an ``OSError`` here, before anything is computed.
+        Raises ``OSError`` if the disk lacks space, before anything is computed.
         """
         places = _write_frame(template, self._temporary, self._preface)
         with open(self._temporary, "r+b") as file:
@@ -54,9 +54,9 @@ class ResultFile:
         return {n: np.ndarray(data[n].shape, data[n].dtype, mapped, at) for n, at in places.items()}
 
     def finish(self, path: Path, **attrs: float) -> None:
-        """Change these attributes, add checksums, flush all to the disk, and move the file to ``path`` in one step."""
+        """Change these attributes, add checksums, flush to disk, and move the file to ``path`` in one step."""
         with ThreadPoolExecutor(1) as aside:
-            # What is mapped is on its way to the disk while it is read once more.
+            # Start writing the mapped pages now; computing the checksums reads them meanwhile.
             written = aside.submit(flush, self._temporary)
             with h5py.File(self._temporary, "r+") as file:
                 for name, value in attrs.items():
@@ -77,8 +77,7 @@ def write_result(result: Labelled, path: Path, temporary: Path, preface: bytes =
 def _write_frame(template: Labelled, path: Path, preface: bytes) -> Mapping[str, int]:
     """Write all but the data, whose contiguous room is left blank; returns where that is.
 
-    The head is made in memory, and room for what is added to it is reserved before: HDF5 may crash the process when a disk
-    fills up under it.
+    The head is built in memory with reserved space for later additions, because HDF5 may crash the process on a full disk.
     """
     head = (preface.ljust(_USER_BLOCK, b"\0") if preface else b"") + netcdf.head(template)
     path.write_bytes(head)
@@ -91,7 +90,7 @@ def _write_frame(template: Labelled, path: Path, preface: bytes) -> Mapping[str,
 
 
 def _reserve(path: Path, size: int) -> None:
-    """Make the disk provide ``size`` bytes; systems that cannot do so find out while they write."""
+    """Reserve ``size`` bytes on disk; systems without this call report a full disk during writing."""
     if not hasattr(os, "posix_fallocate"):
         return
     handle = os.open(path, os.O_RDWR)
@@ -102,14 +101,14 @@ def _reserve(path: Path, size: int) -> None:
 
 
 def release(arrays: Iterable[np.ndarray]) -> None:
-    """Give back the memory of the file that ``arrays`` are mapped from, if any; what was written into them stays there."""
+    """Release the pages of the memory map of ``arrays``, if any; written values stay in the file."""
     for mapped in {array.base for array in arrays if isinstance(array.base, mmap.mmap)}:
         if hasattr(mmap, "MADV_DONTNEED"):
             mapped.madvise(mmap.MADV_DONTNEED)
 
 
 def read_attribute(path: Path, name: str) -> str | None:
-    """A global attribute of the result at ``path``, None if it lacks it; ``InputError`` if the file is not readable."""
+    """A global attribute of the result at ``path``, None if missing; ``InputError`` if the file is not readable."""
     try:
         with h5py.File(path, "r") as file:
             value = file.attrs.get(name)
@@ -128,7 +127,7 @@ def read_variable(path: Path, name: str) -> np.ndarray:
 
 
 def map_variable(path: Path, name: str) -> np.ndarray:
-    """Like :func:`read_variable`, but in place, not loaded, where the storage of the variable allows that."""
+    """Like :func:`read_variable`, but as a memory map where the storage of the variable allows that."""
     try:
         with h5py.File(path, "r") as file:
             variable = file[name]
@@ -140,7 +139,7 @@ def map_variable(path: Path, name: str) -> np.ndarray:
 
 
 def open_result(path: Path) -> xr.Dataset:
-    """The result at ``path``, loaded; ``InputError`` if there is none or it cannot be read."""
+    """The result at ``path``, loaded into memory; ``InputError`` if it is missing or not readable."""
     import xarray as xr
 
     if not path.exists():

@@ -11,14 +11,14 @@ ATLAS_PREFACE = b"An atlas of drivetrain_jax, HDF5 from byte 512 on.\n"
 
 
 def behind_link(path: Path) -> Path:
-    """``path``, or the file that it links to: renaming over the link would replace that instead."""
+    """``path``, or the target of a link: renaming would replace the link."""
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 def write_atomic(path: Path, data: bytes | memoryview, temporary: Path) -> None:
-    """Put ``data`` at ``path``: written to ``temporary`` (same file system), flushed to the disk, then renamed.
+    """Write ``data`` to ``path``: to ``temporary`` (same file system), flushed to disk, then renamed.
 
-    An existing file is replaced at once or not at all, whatever happens meanwhile.
+    An existing file is replaced in one step or not at all.
     """
     try:
         with open(temporary, "wb") as file:
@@ -30,13 +30,13 @@ def write_atomic(path: Path, data: bytes | memoryview, temporary: Path) -> None:
 
 
 def flush(path: Path) -> None:
-    """Return when all of the file, what was written into maps of it included, is on the disk."""
+    """Flush the whole file to disk, memory maps included."""
     with open(path, "rb+") as file:
         os.fsync(file.fileno())
 
 
 def move_into_place(temporary: Path, path: Path) -> None:
-    """Flush the finished file ``temporary`` to the disk and rename it to ``path``; on failure it is deleted."""
+    """Flush the finished file ``temporary`` to disk and rename it to ``path``; delete it on failure."""
     try:
         flush(temporary)
         os.replace(temporary, path)
@@ -47,7 +47,7 @@ def move_into_place(temporary: Path, path: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make the renaming durable; systems that cannot open a folder do without."""
+    """Make the renaming durable; systems that cannot open a folder skip this."""
     try:
         handle = os.open(folder, os.O_RDONLY)
     except OSError:

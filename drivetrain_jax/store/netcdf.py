@@ -1,6 +1,6 @@
-"""Labelled results in the netCDF4 format: HDF5 whose dimensions, types and hidden attributes are what netCDF readers expect.
+"""Write labelled results in the netCDF4 format: HDF5 with the dimensions, types and hidden attributes that readers expect.
 
-h5py writes it: h5netcdf looks every object up anew for each of its properties and takes three times as long.
+h5py writes it: h5netcdf looks up every object for each of its properties and takes three times as long.
 https://docs.unidata.ucar.edu/netcdf-c/current/file_format_specifications.html
 """
 
@@ -16,12 +16,12 @@ from drivetrain_jax.store.schema import Entry, Labelled
 
 _MADE_BY = f"version=2,h5py={h5py.__version__},hdf5={h5py.version.hdf5_version}"
 _NOT_A_VARIABLE = "This is a netCDF dimension but not a netCDF variable."
-# Names by which netCDF readers know the types of complex numbers.
+# Names of the complex types that netCDF readers know.
 _COMPLEX = {"complex64": "_PFNC_FLOAT_COMPLEX_TYPE", "complex128": "_PFNC_DOUBLE_COMPLEX_TYPE"}
 
 
 def head(result: Labelled) -> bytes:
-    """A file with all of ``result`` but its data: attributes, dimensions and coordinates."""
+    """A file with everything of ``result`` except its data: attributes, dimensions and coordinates."""
     aside = _aside(result)
     with h5py.File("head", "w", driver="core", backing_store=False, track_order=True) as file:
         file.attrs["_NCProperties"] = np.bytes_(_MADE_BY)
@@ -36,29 +36,29 @@ def head(result: Labelled) -> bytes:
 
 
 def add_data(file: h5py.File, result: Labelled) -> dict[str, int]:
-    """Room for the data of ``result``, left blank, in the ``file`` that has its head; returns where it is.
+    """Reserve blank space for the data of ``result`` in the ``file`` with its head; returns its position.
 
-    What has no entries has no place and gets 0. A scalar is written.
+    Empty variables get position 0. Scalars are written.
     """
     scales, aside = {dim: file[dim] for dim in result.sizes}, _aside(result)
     for kind in sorted({str(entry.values.dtype) for entry in result.data.values()} & _COMPLEX.keys()):
         file[_COMPLEX[kind]] = np.dtype(kind)
     places = {}
     for name, entry in result.data.items():
-        # In one piece, there from the beginning and never filled, so that it can be mapped.
+        # Contiguous, allocated early and never filled, so it can be memory-mapped.
         early = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         early.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
         variable = _create(file, name, entry, shape=entry.values.shape, dcpl=early, fill_time="never")
         _link(variable, entry, scales)
         _set(variable, _coordinates([n for n, c in aside.items() if {*c.dims} <= {*entry.dims}]))
         if not entry.dims:
-            variable[()] = entry.values  # HDF5 gives a scalar its place when it is written
+            variable[()] = entry.values  # HDF5 allocates a scalar when it is written.
         places[name] = variable.id.get_offset() or 0
     return places
 
 
 def _create(file: h5py.File, name: str, entry: Entry, **options: Any) -> h5py.Dataset:
-    """A variable with its attributes; ``options`` give its data or its shape."""
+    """Create a variable with its attributes; ``options`` give its data or its shape."""
     options |= {"dtype": _type(entry.values), "fillvalue": entry.fill, **_growth(entry.values.shape)}
     variable = file.create_dataset(name, track_order=True, **options)
     if entry.fill is not None:
@@ -68,12 +68,12 @@ def _create(file: h5py.File, name: str, entry: Entry, **options: Any) -> h5py.Da
 
 
 def _type(values: np.ndarray) -> np.dtype:
-    """The type in the file: texts have any length there."""
+    """The type in the file; strings have variable length."""
     return h5py.string_dtype() if values.dtype.kind in "UO" else values.dtype
 
 
 def _make_scale(file: h5py.File, dim: str, number: int, size: int) -> h5py.Dataset:
-    """Make the coordinate ``dim`` a dimension, or a dimension that has no coordinate."""
+    """Make the coordinate ``dim`` a dimension, or create a dimension without coordinate."""
     if dim in file:
         scale, title = file[dim], dim
         scale.attrs["_Netcdf4Coordinates"] = np.array([number], np.int32)
@@ -86,12 +86,12 @@ def _make_scale(file: h5py.File, dim: str, number: int, size: int) -> h5py.Datas
 
 
 def _growth(shape: tuple[int, ...]) -> dict[str, tuple[int | None, ...]]:
-    """For netCDF a dimension of length 0 is one that may grow."""
+    """In netCDF a dimension of length 0 is unlimited."""
     return {} if all(shape) else {"maxshape": tuple(size or None for size in shape)}
 
 
 def _link(variable: h5py.Dataset, entry: Entry, scales: Mapping[str, h5py.Dataset]) -> None:
-    """Tie ``variable`` to its dimensions; ``scales`` are in the order of their numbers."""
+    """Attach ``variable`` to its dimensions; ``scales`` are in the order of their numbers."""
     for axis, dim in enumerate(entry.dims):
         variable.dims[axis].attach_scale(scales[dim])
     if entry.dims:
@@ -101,13 +101,13 @@ def _link(variable: h5py.Dataset, entry: Entry, scales: Mapping[str, h5py.Datase
 
 
 def _set(owner: h5py.HLObject, attrs: Mapping[str, Any]) -> None:
-    """Attributes; netCDF has no scalar numbers but rows of one."""
+    """Write attributes; netCDF stores a scalar number as an array of one."""
     for name, value in attrs.items():
         owner.attrs[name] = value if isinstance(value, str) else np.atleast_1d(value)
 
 
 def _aside(result: Labelled) -> dict[str, Entry]:
-    """The coordinates that a reader cannot find through the dimensions of a variable (CF, 5)."""
+    """Auxiliary coordinates, which a reader cannot find through the dimensions of a variable (CF, 5)."""
     sizes = result.sizes
     return {name: result.coords[name] for name in result.coords if name not in sizes}
 

@@ -1,4 +1,4 @@
-"""Where numbers come from: versions, time, and digests of sources and of whatever else decides them."""
+"""Provenance of numbers: versions, time, and digests of sources and inputs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def versions(packages: Iterable[str]) -> dict[str, str]:
     return {package: _version(package) for package in packages}
 
 
-# Reading the metadata of a package takes a millisecond.
+# Cached: reading the metadata of a package takes a millisecond.
 _version = lru_cache(maxsize=None)(version)
 
 
@@ -28,7 +28,7 @@ def now() -> str:
 
 
 def source_digest(files: Mapping[str, Path]) -> str:
-    """Digest of source files under the names that they are given here, independent of where they lie."""
+    """Digest of source files under the given names, independent of their location."""
     state = hashlib.blake2b(digest_size=16)
     for name in sorted(files):
         content = files[name].read_bytes()
@@ -38,7 +38,7 @@ def source_digest(files: Mapping[str, Path]) -> str:
 
 
 def digest(content: object) -> str:
-    """Digest of nested mappings, lists, strings, numbers and NumPy arrays; the order of keys does not matter."""
+    """Digest of nested mappings, lists, strings, numbers and NumPy arrays; independent of the order of keys."""
     state = hashlib.blake2b(digest_size=16)
 
     def replace_array(value: object) -> object:

@@ -1,4 +1,4 @@
-"""The shape of a result: names, dimensions, units and CF attributes, before it is an xarray Dataset or a file."""
+"""The schema of a result: names, dimensions, units and CF attributes, before it becomes a Dataset or a file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CONVENTIONS = "CF-1.11"
 
 @dataclass(frozen=True)
 class Coordinate:
-    """Values of a parameter, or of a prediction, along dimensions of the result."""
+    """Values of a parameter or prediction along dimensions of the result."""
 
     name: str
     dims: tuple[str, ...]
@@ -29,7 +29,7 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class Entry:
-    """What a name in a result stands for. ``fill`` is what readers take for a missing value."""
+    """One variable of a result. ``fill`` is the value for missing data."""
 
     dims: tuple[str, ...]
     values: np.ndarray
@@ -39,7 +39,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Labelled:
-    """A result with its labels as plain data; making a Dataset of it takes xarray, making a file does not."""
+    """A result with its labels as plain data. Converting it to a Dataset needs xarray, writing a file does not."""
 
     coords: Mapping[str, Entry]
     data: Mapping[str, Entry]
@@ -57,8 +57,8 @@ class Labelled:
         """The labelled ``results``.
 
         Every variable has the dimensions ``sweep_dims`` followed by its own. Coordinates are written for the sweep
-        (``coordinates``) and for those ``dimensions`` that a result uses; every one has ``units`` and ``long_name``. A
-        dimension without values of its own is numbered from 0.
+        (``coordinates``) and for the ``dimensions`` that a result uses; each has ``units`` and ``long_name``. A dimension
+        without values is numbered from 0.
         """
         results = list(results)
         coords = {c.name: Entry(c.dims, c.values, _labels(c.units, c.long_name)) for c in coordinates}
@@ -74,7 +74,7 @@ class Labelled:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Lengths of the dimensions, those of the coordinates first. ``ValueError`` where two entries disagree."""
+        """Lengths of the dimensions, those of the coordinates first. ``ValueError`` if two entries disagree."""
         sizes: dict[str, int] = {}
         for name, entry in {**self.coords, **self.data}.items():
             for dim, size in zip(entry.dims, entry.values.shape, strict=True):
@@ -83,12 +83,12 @@ class Labelled:
         return sizes
 
     def with_attrs(self, **attrs: Any) -> Labelled:
-        """The same with these attributes added, or in place of those it has."""
+        """A copy with these attributes added or replaced."""
         return replace(self, attrs={**self.attrs, **attrs})
 
     def to_dataset(self) -> xr.Dataset:
-        """The same as a Dataset."""
-        import xarray as xr  # half a second with pandas, which a process that only writes a result does without
+        """The result as a Dataset."""
+        import xarray as xr  # Local import: xarray and pandas take half a second
 
         data, coords = (
             {n: (e.dims, e.values, e.attrs) for n, e in entries.items()} for entries in (self.data, self.coords)
@@ -108,7 +108,7 @@ def _labels(units: str, long_name: str) -> dict[str, Any]:
 
 
 def _variable_attrs(variable: Variable) -> dict[str, Any]:
-    """CF attributes; the codes of a flag variable have its own type, as the convention demands."""
+    """CF attributes; flag values have the type of the variable, as CF requires."""
     attrs = _labels(variable.units, variable.long_name)
     if variable.flags:
         attrs["flag_values"] = np.arange(len(variable.flags), dtype=variable.dtype)

@@ -1,9 +1,9 @@
-"""A Zarr v3 store that many processes write at once: every shard is one file per variable and belongs to one writer.
+"""A Zarr v3 store that many processes write at once: each shard is one file per variable and has one writer.
 
-Rows are points in the order in which they are computed, ``width`` of them a chunk; the chunks of one group of the plan
-are one Zarr group. The array ``point`` holds the number of each row's point in the grid (-1: padding), and ``done`` a
-checksum of each shard, written after its data, 0 before. Damage is found by that, by the CRC-32C of every chunk, or both;
-that of the attributes by a digest of them, which a finished store has.
+Rows are points in the order of computation, ``width`` rows per chunk; the chunks of one group of the plan form one Zarr
+group. The array ``point`` holds the number of each row's point in the grid (-1: padding). The array ``done`` holds a
+checksum of each shard, written after its data (0 before). Damage to data is detected by this checksum or the CRC-32C of
+every chunk, damage to attributes by the digest of a finished store.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.store.provenance import digest
 
 POINT, DONE = "point", "done"
-# The folder among the parts of a result that a store grows in.
+# Folder among the parts in which a store grows.
 UNFINISHED = "store"
-# The folder among the parts that a store is in for the moment in which another takes its place.
+# Folder among the parts for a store while another one replaces it.
 FORMER = "former"
-# Attributes that only a store has: what finds its shards and says how many points they hold, and the digest of all others.
+# Attributes of a store: number of points and layout of its shards, and the digest of all other attributes.
 GROUPS, HELD, SEAL = "groups", "held_points", "checksum"
-# What decoding raises depends on where the damage is.
+# Exceptions of decoding, which depend on the position of the damage.
 _BROKEN = (ValueError, OSError, KeyError, RuntimeError, TypeError, AttributeError, IndexError, ArithmeticError)
 _MOST_CHUNKS = 64
 _FEWEST_SHARDS = 8
@@ -43,7 +43,7 @@ class Group:
 
     @property
     def per_shard(self) -> int:
-        """Chunks of a shard: few files, but enough of them to keep many workers busy."""
+        """Chunks per shard: few files, but enough to keep many workers busy."""
         return max(1, min(_MOST_CHUNKS, self.count // _FEWEST_SHARDS))
 
     @property
@@ -54,7 +54,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Field:
-    """A variable: type, and the shape of its results at one row."""
+    """A variable: type, and shape of its results in one row."""
 
     name: str
     dtype: str
@@ -62,12 +62,12 @@ class Field:
 
 
 def is_store(path: Path) -> bool:
-    """Whether there is a Zarr v3 group at ``path``."""
+    """True if there is a Zarr v3 group at ``path``."""
     return (path / "zarr.json").is_file()
 
 
 def create(path: Path, groups: Sequence[Group], fields: Sequence[Field], attrs: Mapping[str, Any]) -> None:
-    """An empty store. Raises ``OSError`` where there is no room for it."""
+    """Create an empty store. Raises ``OSError`` without enough space."""
     zarr = _zarr()
     root = zarr.create_group(path, zarr_format=3, attributes=dict(attrs))
     for group in groups:
@@ -77,7 +77,7 @@ def create(path: Path, groups: Sequence[Group], fields: Sequence[Field], attrs: 
 
 
 def _layouts(group: Group, fields: Sequence[Field]) -> dict[str, dict[str, Any]]:
-    """Shape, type and pieces of every array of ``group``."""
+    """Shape, type and chunks of every array of ``group``."""
     layouts = {}
     for field in (*fields, Field(POINT, "int64", ())):
         own = tuple(max(n, 1) for n in field.shape)
@@ -91,9 +91,9 @@ def _layouts(group: Group, fields: Sequence[Field]) -> dict[str, dict[str, Any]]
 
 
 def check_layout(path: Path, groups: Sequence[Group], fields: Sequence[Field]) -> None:
-    """Raises :class:`InputError` unless the unfinished store is laid out as :func:`create` does it.
+    """Raise :class:`InputError` unless the layout of the unfinished store is that of :func:`create`.
 
-    What would be written into other arrays is lost without a word.
+    Data written into arrays of another layout would be lost silently.
     """
     try:
         root = _zarr().open_group(path, mode="r")
@@ -110,7 +110,7 @@ def check_layout(path: Path, groups: Sequence[Group], fields: Sequence[Field]) -
 
 
 def write(path: Path, group: Group, shard: int, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write shard number ``shard`` of ``group``, all its rows, and mark it done."""
+    """Write shard number ``shard`` of ``group`` with all its rows, and mark it done."""
     own = _zarr().open_group(path, mode="r+")[group.name]
     rows = _rows(group, shard)
     for name, values in arrays.items():
@@ -119,12 +119,12 @@ def write(path: Path, group: Group, shard: int, arrays: Mapping[str, np.ndarray]
 
 
 def done(path: Path, group: Group) -> np.ndarray:
-    """The shards of ``group`` that are marked done, a flag each."""
+    """Flags of the shards of ``group`` that are marked done."""
     return _zarr().open_group(path, mode="r")[group.name][DONE][:] != 0
 
 
 def read(path: Path, group: Group, shard: int, names: Sequence[str]) -> dict[str, np.ndarray] | None:
-    """The arrays ``names`` of a shard; None if it is damaged. Its checksum needs all of its arrays to be asked for."""
+    """The arrays ``names`` of a shard; None if it is damaged. Checking the checksum needs all arrays."""
     zarr, rows = _zarr(), _rows(group, shard)
     try:
         own = zarr.open_group(path, mode="r")[group.name]
@@ -135,13 +135,13 @@ def read(path: Path, group: Group, shard: int, names: Sequence[str]) -> dict[str
 
 
 def without_padding(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """The points of a shard and their results."""
+    """The points of a shard and their results, without padding."""
     rows = arrays[POINT] >= 0
     return arrays[POINT][rows], {name: values[rows] for name, values in arrays.items() if name != POINT}
 
 
 def attributes(path: Path) -> dict[str, Any]:
-    """The attributes of the store; :class:`InputError` if it is none."""
+    """The attributes of the store; :class:`InputError` if it has none."""
     zarr = _zarr()
     try:
         return dict(zarr.open_group(path, mode="r").attrs)
@@ -150,12 +150,12 @@ def attributes(path: Path) -> dict[str, Any]:
 
 
 def seal(path: Path, attrs: Mapping[str, Any]) -> None:
-    """Give the finished store its attributes, in place of those it has, and the digest of them."""
+    """Replace the attributes of the finished store, and add their digest."""
     _zarr().open_group(path, mode="r+").attrs.put({**attrs, SEAL: digest(dict(attrs))})
 
 
 def is_sealed(path: Path) -> bool:
-    """Whether the attributes of a finished store are what was written; :class:`InputError` if it is no result."""
+    """True if the attributes of a finished store are intact; :class:`InputError` if it is not a result."""
     attrs = attributes(path)
     if "digest" not in attrs:
         raise InputError(f"store = {str(path)!r}: not a result of drivetrain_jax; give one of --store zarr")
@@ -163,7 +163,7 @@ def is_sealed(path: Path) -> bool:
 
 
 def finished(path: Path, name: str) -> Iterator[np.ndarray]:
-    """The values of one variable at all points that are done, group by group, as they are stored."""
+    """Yield the values of one variable at all finished points, group by group, in stored order."""
     try:
         root = _zarr().open_group(path, mode="r")
         for group in groups_of(root.attrs):
@@ -177,7 +177,7 @@ def finished(path: Path, name: str) -> Iterator[np.ndarray]:
 
 
 def tally(path: Path) -> tuple[int, int, int]:
-    """How many shards are what was written, how many are marked done, and how many a finished store has."""
+    """Numbers of intact shards, of shards marked done, and of shards of a finished store."""
     intact = marked = count = 0
     for group in groups_of(attributes(path)):
         names = _names(path, group)
@@ -188,7 +188,7 @@ def tally(path: Path) -> tuple[int, int, int]:
 
 
 def _names(path: Path, group: Group) -> list[str]:
-    """The arrays of a group that its checksums are made over."""
+    """The arrays of a group that its checksums cover."""
     return [file.parent.name for file in (path / group.name).glob("*/zarr.json") if file.parent.name != DONE]
 
 
@@ -208,7 +208,7 @@ def groups_of(attrs: Mapping[str, Any]) -> list[Group]:
 
 
 def describe(groups: Sequence[Group]) -> str:
-    """The attribute from which :func:`groups_of` finds them again."""
+    """The attribute from which :func:`groups_of` restores them."""
     return json.dumps([[group.name, group.count, group.width] for group in groups])
 
 
@@ -221,7 +221,7 @@ def _checksum(arrays: Mapping[str, np.ndarray]) -> int:
     state = hashlib.blake2b(digest_size=8)
     for name in sorted(arrays):
         state.update(np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8).data)
-    # 0 stands for "not done".
+    # 0 means "not done".
     return int.from_bytes(state.digest(), "little") or 1
 
 

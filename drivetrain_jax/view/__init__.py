@@ -1,4 +1,4 @@
-"""Figures of results: a Dataset in, a matplotlib Figure out. Needs neither jax nor the package that computed it."""
+"""Figures of results: a matplotlib Figure from a Dataset, without jax and the package that computed it."""
 
 from __future__ import annotations
 
@@ -24,19 +24,18 @@ _MODULES = {
     "basins": "basins",
     "critical_speeds": "critical_speeds",
 }
-# Several results of these analyses may share a figure.
+# Analyses of which several results may share a figure.
 _OVERLAYS = ("frequency_response",)
 
 __all__ = ["plot"]
 
 
 def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
-    """The figure that suits the analysis of ``dataset`` (attribute ``analysis``), for example a stability chart.
+    """The figure of the analysis of ``dataset`` (attribute ``analysis``), for example a stability chart.
 
-    ``others`` are results of the same analysis by other methods, drawn into the same axes where that makes sense
-    (``frequency_response``). The figure belongs to no window: write it with ``figure.savefig(path)``. Raises
-    :class:`InputError` for an analysis without a figure, for a result in which there is nothing to plot and for results
-    that cannot share a figure.
+    ``others`` are results of the same analysis by other methods, drawn into the same axes (``frequency_response``). Save
+    the figure with ``figure.savefig(path)``. Raises :class:`InputError` for an analysis without a figure, for a result
+    without values to plot, and for results that cannot share a figure.
     """
     analysis = dataset.attrs.get("analysis")
     if analysis == "atlas":

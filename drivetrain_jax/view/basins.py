@@ -1,4 +1,4 @@
-"""Figure of the analysis ``basins``: attractors along one axis and the share of initial states that reach each."""
+"""Figure of the analysis ``basins``: attractors along one axis, and the share of initial states of each."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from drivetrain_jax.view.layout import Margins, Panels
 from drivetrain_jax.view.style import ATTRACTOR_COLOURS, STYLE, axis_label, variable_label
 
 _NEEDED = ("attractor_u_max", "basin_fraction")
-# Change of size from one value of the axis to the next, over the size, within which an attractor is the same.
+# Relative change of size between neighbours of the axis within which an attractor is the same.
 _NEAR = 0.2
-# An attractor that is missing at this many values in a row has ended.
+# Number of missing values in a row after which an attractor ends.
 _LOST = 2
-# Smaller sizes are those of rest.
+# Sizes below this are motions at rest.
 _REST = 1e-300
 _MARKERS = "os^D"
 _ENTRIES, _ENTRY_HEIGHT = 6, 0.15
@@ -28,9 +28,9 @@ _HEIGHT = 2.2
 
 
 def plot(dataset: xr.Dataset) -> Figure:
-    """Largest displacement of every attractor, and its basin's share with the standard error, over the only axis.
+    """Largest displacement of every attractor, and the share of its basin with standard error, over the only axis.
 
-    Raises :class:`InputError` for other numbers of axes and where ``basin_fraction`` or ``attractor_u_max`` is missing.
+    Raises :class:`InputError` for another number of axes, and if ``basin_fraction`` or ``attractor_u_max`` is missing.
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
@@ -44,13 +44,13 @@ def plot(dataset: xr.Dataset) -> Figure:
 
 
 def _followed(x: np.ndarray, size: np.ndarray, exists: np.ndarray, multiple: np.ndarray) -> np.ndarray:
-    """Numbers of the branches that attractors ``(values of the axis, attractors)`` belong to, -1 where there is none.
+    """Branch numbers of attractors ``(values of the axis, attractors)``, -1 for none.
 
-    Results are in order of size, so that the number of an attractor changes where a larger one appears. A branch goes on
-    along its last two sizes to the nearest attractor of its period multiple, and ends where it has none twice.
+    Results are ordered by size, so the number of an attractor changes where a larger one appears. A branch is extrapolated
+    from its last two sizes to the nearest attractor of its period multiple. It ends after two misses.
     """
     branch, followed = np.full(size.shape, -1), []
-    # Those without a size do not repeat: all of them are one.
+    # Attractors without a size do not repeat: they count as one.
     size = np.where(np.isfinite(size), size, np.inf)
     for i, row in enumerate(size):
         here = np.flatnonzero(exists[i])
@@ -71,7 +71,7 @@ def _followed(x: np.ndarray, size: np.ndarray, exists: np.ndarray, multiple: np.
 
 
 def _ahead(x: np.ndarray, size: np.ndarray, places: list[tuple[int, int]], i: int) -> float:
-    """The size at ``x[i]`` on the straight line through the last two of ``places`` in ``size``, NaN if there is none."""
+    """The size at ``x[i]`` on the straight line through the last two of ``places`` in ``size``, NaN without one."""
     if len(places) < 2:
         return np.nan
     (before, _), (last, _) = places[-2:]
@@ -80,9 +80,9 @@ def _ahead(x: np.ndarray, size: np.ndarray, places: list[tuple[int, int]], i: in
 
 
 def _gap(size: float, likely: tuple[float, float]) -> float:
-    """Difference from the nearer of the ``likely`` sizes, over the size; 0 between two without a size.
+    """Relative difference from the nearer of the ``likely`` sizes; 0 between two without a size.
 
-    Both count: beside a peak the straight line overshoots.
+    Both sizes count, because the straight line overshoots near a peak.
     """
     if not np.isfinite(size):
         return 0.0 if size == likely[0] else np.inf
@@ -97,7 +97,7 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
     size, share = (dataset[each].transpose(name, "attractor").values for each in _NEEDED)
     error = dataset["basin_error"].transpose(name, "attractor").values if "basin_error" in dataset else 0 * share
     exists = np.isfinite(share)
-    # Where it is not stored, attractors with a size are periodic.
+    # Without a stored period multiple, attractors with a size are periodic.
     multiple = np.isfinite(size)
     if "attractor_multiple" in dataset:
         multiple = dataset["attractor_multiple"].transpose(name, "attractor").values

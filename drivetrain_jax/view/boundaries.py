@@ -1,4 +1,4 @@
-"""Stability boundaries as curves and the tips of tongues as named points, where a chart comes from an atlas."""
+"""Draw stability boundaries as curves and tips of tongues as named points, in charts of an atlas."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from drivetrain_jax.view.style import FRAME_GREY, PREDICTION, STATE_COLOURS
 
 _MARK = {"marker": "o", "markersize": 3.0, "markerfacecolor": "white", "markeredgewidth": 0.7, "linestyle": "none"}
 _FONT = 7.5
-# Width and height that a name takes, in points.
+# Width and height of a name in points.
 _ROOM = np.array([15.0, 9.0])
-# Where it may stand, rightwards and up from the tip of a tongue that opens upwards, and how it is aligned there.
+# Positions of a name relative to the tip of a tongue that opens upwards, in points, and its alignment.
 _SIDES = {
     (0, -1): ("center", "top"),
     (1, 0): ("left", "center"),
@@ -27,7 +27,8 @@ _SIDES = {
 
 
 def draw(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Artist]:
-    """Draw what ``dataset`` has of both (``boundary_NAME``, ``tip_NAME``, ``undecided_NAME``); handles for the legend."""
+    """Draw boundaries, tips and undecided boxes of ``dataset`` (``boundary_NAME``, ``tip_NAME``, ``undecided_NAME``);
+    returns legend handles."""
     handles: list[Artist] = []
     keep = {"scalex": False, "scaley": False}
     if dataset.sizes.get("boundary"):
@@ -46,7 +47,7 @@ def draw(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> lis
 
 
 def _draw_undecided(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Artist]:
-    """The boxes that may hide further tips: most are smaller than a pixel, hence outlined."""
+    """Draw the boxes that may contain further tips, as outlines: most are smaller than a pixel."""
     if f"undecided_{horizontal}" not in dataset.coords:
         return []
     x, y = (dataset[f"undecided_{name}"].values for name in (horizontal, vertical))
@@ -58,10 +59,9 @@ def _draw_undecided(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: 
 
 
 def _name(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> None:
-    """Names on the side of the tips where no tongue is, or beside them where they would lie over an earlier one or the
-    frame; else none."""
+    """Draw names outside of the tongues, or beside the tip if they would cover another name or the frame; else no name."""
     x, y = (dataset[f"tip_{name}"].values for name in (horizontal, vertical))
-    # Tongues open upwards in charts that do not tell.
+    # Tongues open upwards in charts without this variable.
     opens = dataset["tip_opens"].values if "tip_opens" in dataset.coords else np.ones(len(x))
     tips, names = np.stack([x, y], axis=-1), dataset["tip"].values.astype(str)
     scale = 72 / axes.figure.dpi

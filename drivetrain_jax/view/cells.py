@@ -1,4 +1,4 @@
-"""The grid of a result as coloured cells: which axes it has, where cells end, what state each is in."""
+"""The grid of a result as coloured cells: axes, cell edges and states."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _NO_PARAMETERS = ("point", _PENDING)
 
 
 def prepare(dataset: xr.Dataset) -> xr.Dataset:
-    """``dataset`` with rising axes; axes of one value become scalar coordinates. Infinite values of others are left out:
-    they have no place on an axis. The attribute ``left_out`` says so."""
+    """``dataset`` with rising axes; axes of one value become scalar coordinates. Infinite axis values are dropped and
+    recorded in the attribute ``left_out``."""
     dataset = _finite(dataset)
     single = {name: 0 for name in dataset["outcome"].dims if dataset.sizes[name] == 1}
     dataset = dataset.isel(single)
@@ -45,7 +45,7 @@ def _finite(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _with_pending(dataset: xr.Dataset) -> xr.Dataset:
-    """``dataset`` with the cells that are still to be computed as a coordinate, which goes along with every variable."""
+    """``dataset`` with a coordinate that marks pending cells; it stays with every variable."""
     outcome = dataset["outcome"]
     if not outcome.ndim or not str(outcome.attrs.get("flag_meanings", "")).endswith(" pending"):
         return dataset
@@ -58,7 +58,7 @@ def sweep_axes(dataset: xr.Dataset) -> list[str]:
 
 
 def described_axes(dataset: xr.Dataset) -> str:
-    """The axes of a prepared ``dataset`` for a message, those that have but one value too."""
+    """The axes of a prepared ``dataset`` as text, axes of one value included."""
     single = [f"{name} (one value)" for name, c in dataset.coords.items() if c.ndim == 0 and name not in _NO_PARAMETERS]
     return ", ".join([*sweep_axes(dataset), *single]) or "none"
 
@@ -71,7 +71,7 @@ def require(dataset: xr.Dataset, *names: str) -> None:
 
 
 def require_any(dataset: xr.Dataset, *names: str) -> list[str]:
-    """Those of ``names`` that are stored; raises :class:`InputError` if none is."""
+    """The stored ones of ``names``; raises :class:`InputError` without any."""
     if not (found := [name for name in names if name in dataset]):
         stored = ", ".join(str(name) for name in dataset.data_vars)
         raise InputError(f"outputs = {stored}: nothing to plot; the figure needs {' or '.join(names)}")
@@ -79,7 +79,7 @@ def require_any(dataset: xr.Dataset, *names: str) -> list[str]:
 
 
 def require_values(variable: xr.DataArray, positive: bool = False) -> None:
-    """Raise :class:`InputError` unless some value of ``variable`` is finite and, if ``positive``, above zero."""
+    """Raise :class:`InputError` unless ``variable`` has a finite value (above zero if ``positive``)."""
     finite = variable.values[np.isfinite(variable.values)]
     largest = finite.max() if finite.size else np.nan
     if not (largest > 0 if positive else finite.size):
@@ -88,18 +88,18 @@ def require_values(variable: xr.DataArray, positive: bool = False) -> None:
 
 
 def horizontal_axis(dataset: xr.Dataset, names: list[str]) -> str:
-    """That of ``names`` for which resonances are predicted, else the speed, else the last one."""
+    """The axis of ``names`` with predicted resonances, else the speed, else the last one."""
     return next((name for name in names if f"resonance_{name}" in dataset.coords), speed_axis(dataset, names))
 
 
 def speed_axis(dataset: xr.Dataset, names: list[str]) -> str:
-    """That of ``names`` which the system calls its speed (attribute ``roles``), else the last one."""
+    """The axis of ``names`` that the system calls its speed (attribute ``roles``), else the last one."""
     speed = json.loads(dataset.attrs.get("roles", "{}")).get("speed")
     return speed if speed in names else names[-1]
 
 
 def is_logarithmic(values: np.ndarray) -> bool:
-    """Whether ``values`` are spaced by a constant factor rather than by a constant step."""
+    """True if ``values`` are spaced by a constant factor rather than a constant step."""
     if len(values) < 3 or values[0] <= 0:
         return False
     steps, factors = np.diff(values), np.diff(np.log(values))
@@ -107,8 +107,8 @@ def is_logarithmic(values: np.ndarray) -> bool:
 
 
 def cell_edges(values: np.ndarray) -> np.ndarray:
-    """The ``n + 1`` edges of cells around ``n`` rising values: halfway between neighbours (in the logarithm on a
-    logarithmic axis), the outer cells as wide on both sides of their value."""
+    """The ``n + 1`` edges of cells around ``n`` rising values: midpoints of neighbours (of logarithms on a logarithmic
+    axis); outer cells are symmetric about their value."""
     if is_logarithmic(values):
         return np.exp(_midway(np.log(values)))
     return _midway(values)
@@ -123,12 +123,12 @@ def _midway(values: np.ndarray) -> np.ndarray:
 
 
 def states(dataset: xr.Dataset) -> xr.DataArray:
-    """The verdict of each cell, or ``FAILED`` where the outcome says that there is no value."""
+    """The verdict of each cell, or ``FAILED`` without a value."""
     return dataset["verdict"].where(dataset["outcome"] < FIRST_FAILURE, FAILED)
 
 
 def draw_cells(axes: Axes, field: xr.DataArray, horizontal: str, vertical: str, **options: object) -> QuadMesh:
-    """``field`` as cells over the two axes; limits and scales of ``axes`` follow the cells."""
+    """Draw ``field`` as cells over the two axes; limits and scales of ``axes`` follow the cells."""
     x, y = (field[name].values.astype(float) for name in (horizontal, vertical))
     mesh = axes.pcolormesh(
         cell_edges(x), cell_edges(y), field.transpose(vertical, horizontal).values, rasterized=True, **options
@@ -141,7 +141,7 @@ def draw_cells(axes: Axes, field: xr.DataArray, horizontal: str, vertical: str, 
 
 
 def draw_strip(axes: Axes, codes: xr.DataArray, name: str, heights: tuple[float, float], **options: object) -> None:
-    """``codes`` along the axis ``name`` as a strip between two heights, in parts of the panel."""
+    """Draw ``codes`` along the axis ``name`` as a strip between two heights, in fractions of the panel."""
     x = cell_edges(codes[name].values.astype(float))
     place = {"transform": axes.get_xaxis_transform(), "clip_on": False, "rasterized": True}
     axes.pcolormesh(x, heights, codes.values[None, :], **options, **place)
@@ -155,7 +155,7 @@ def _cover_pending(axes: Axes, x: np.ndarray, y: Sequence[float], waiting: np.nd
 
 
 def fit_axis(axes: Axes, which: str, values: np.ndarray) -> None:
-    """Scale and limits of one axis from the cells around ``values``; a logarithmic axis shows plain numbers."""
+    """Set scale and limits of one axis from the cells around ``values``; a logarithmic axis shows plain numbers."""
     edges = cell_edges(values)
     logarithmic = is_logarithmic(values)
     axes.set(**{f"{which}scale": "log" if logarithmic else "linear", f"{which}lim": (edges[0], edges[-1])})
@@ -164,8 +164,8 @@ def fit_axis(axes: Axes, which: str, values: np.ndarray) -> None:
 
 
 def plain_decades(axes: Axes, which: str) -> None:
-    """Plain numbers at 1, 2, 5 (at 1 alone if there are many decades) along a logarithmic axis; powers of ten where plain
-    numbers would be long."""
+    """Plain numbers at 1, 2, 5 (only 1 over many decades) along a logarithmic axis; powers of ten if plain numbers are
+    long."""
     low, high = getattr(axes, f"get_{which}lim")()
     side = getattr(axes, f"{which}axis")
     side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
@@ -175,12 +175,12 @@ def plain_decades(axes: Axes, which: str) -> None:
 
 
 def draw_states(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> QuadMesh:
-    """The regions of the verdict."""
+    """Draw the regions of the verdict."""
     return draw_cells(axes, states(dataset), horizontal, vertical, cmap=STATES, vmin=-0.5, vmax=3.5)
 
 
 def state_legend(dataset: xr.Dataset) -> list[Patch]:
-    """Legend entries of the states that occur; stable and unstable always, the others with their number of cells."""
+    """Legend entries of the states that occur; stable and unstable always, others with their number of cells."""
     counts = np.bincount(states(dataset).values.astype(int).ravel(), minlength=len(STATE_NAMES))
     shown = [code for code in range(FAILED) if code <= UNSTABLE or counts[code]]
     patches = [_state_patch(code, f" ({counts[code]})" if code > UNSTABLE else "") for code in shown]
@@ -188,7 +188,7 @@ def state_legend(dataset: xr.Dataset) -> list[Patch]:
 
 
 def failure_legend(dataset: xr.Dataset) -> list[Patch]:
-    """The legend entries of cells without a value, if there are any: failed, or still to be computed."""
+    """Legend entries of cells without a value: failed or pending."""
     waiting = int(dataset[_PENDING].sum()) if _PENDING in dataset.coords else 0
     failed = int(_failures(dataset).sum())
     patches = [_state_patch(FAILED, f" ({failed})")] if failed else []
@@ -198,13 +198,13 @@ def failure_legend(dataset: xr.Dataset) -> list[Patch]:
 
 
 def _failures(dataset: xr.Dataset) -> xr.DataArray:
-    """Where there is no value although nothing is still to be computed."""
+    """True where a finished point has no value."""
     failed = dataset["outcome"] >= FIRST_FAILURE
     return failed & ~dataset[_PENDING] if _PENDING in dataset.coords else failed
 
 
 def draw_failures(axes: Axes, dataset: xr.Dataset, name: str) -> list[Line2D]:
-    """Crosses at the foot of ``axes`` where points along the axis ``name`` have failed, as a handle for the legend."""
+    """Draw crosses at the foot of ``axes`` for failed points along the axis ``name``; returns a legend handle."""
     x = dataset[name].values[_failures(dataset).values]
     if not x.size:
         return []
@@ -218,18 +218,18 @@ def _state_patch(code: int, note: str) -> Patch:
     return Patch(**colours, linewidth=0.6, hatch=STATE_HATCHES[code], label=STATE_NAMES[code] + note)
 
 
-# Growth log10(rho) below this is drawn on a linear scale: narrow tongues differ from 1 by 1e-5 and less.
+# Below this growth log10(rho) the scale is linear: narrow tongues differ from 1 by 1e-5 and less.
 LINEAR_GROWTH = 1e-4
-# Position between no growth (0) and the largest (1), colour; the lightness falls all the way, as it does from decay.
-# White is left to what has no value.
+# Position between no growth (0) and largest growth (1), and colour; lightness falls monotonically. White is reserved for
+# cells without a value.
 _DECAY, _NEUTRAL = "#eef4f9", "#d0e0ef"
 _GROWTH = ((0.25, "#f3b562"), (0.55, "#c8553d"), (1.0, "#2d0a2b"))
 
 
 def draw_growth(axes: Axes, radius: xr.DataArray, horizontal: str, vertical: str) -> tuple[QuadMesh, str, str]:
-    """``log10`` of a spectral radius as cells, and label and ``extend`` of its colour bar.
+    """Draw ``log10`` of a spectral radius as cells; returns label and ``extend`` of its colour bar.
 
-    Pale decays, the paler the faster; orange to black grows. Missing values have the colour of failed cells.
+    Pale colours decay, paler ones faster; orange to black grows. Missing values have the colour of failed cells.
     """
     with np.errstate(divide="ignore"):
         growth = np.log10(radius)

@@ -1,4 +1,4 @@
-"""Figures of critical speeds: curves along one axis (the critical-speed map), maps over two, mode shapes."""
+"""Figures of critical speeds: curves along one axis (the critical-speed map), maps over two axes, mode shapes."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from drivetrain_jax.view import cells
 from drivetrain_jax.view.layout import Margins, Panels
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STATE_COLOURS, STYLE, axis_label, variable_label
 
-# Each at a speed of 1 rpm.
+# Value of each frequency unit at a speed of 1 rpm.
 _FREQUENCIES = {"critical_speed": 1.0, "natural_frequency": 1 / 60, "angular_frequency": math.pi / 30}
 _HEIGHT, _SHAPE_HEIGHT, _MAP_HEIGHT = 3.4, 1.15, 2.3
 _MOST_SHAPES, _MOST_MAPS = 6, 4
-# Letters of a label along one map.
+# Largest number of letters of a label along one map.
 _LETTERS = 32
-# Points between the names of two curves.
+# Least distance between the names of two curves, in points.
 _LABEL_HEIGHT = 8.0
-# Modes of zero frequency are drawn nowhere on a logarithmic axis; what is this far below the rest counts as zero.
+# Ratio to the other frequencies below which a frequency counts as zero; a logarithmic axis cannot show zero.
 _NEGLIGIBLE = 1e-9
 
 
 def plot(dataset: xr.Dataset) -> Figure:
-    """Curves of the frequencies of all modes along one axis, maps of the first modes over two, or the mode shapes.
+    """Curves of the frequencies of all modes along one axis, maps of the first modes over two axes, or the mode shapes.
 
     Along a logarithmic axis (support stiffness) both axes are logarithmic: the critical-speed map. A list of points is
-    drawn along its first parameter. Frequencies that the count does not certify are crossed. Raises
-    :class:`InputError` for more than two axes and where nothing that could be drawn is stored, or no value of it.
+    drawn along its first parameter. Uncertified frequencies are crossed. Raises :class:`InputError` for more than two axes,
+    and if no variable that can be drawn is stored or has a value.
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
@@ -59,12 +59,12 @@ def plot(dataset: xr.Dataset) -> Figure:
 
 
 def _colours(count: int) -> np.ndarray:
-    # The yellow end would be too light for lines on white.
+    # The yellow end of the colour map is too light for lines on white.
     return matplotlib.colormaps["viridis"](np.linspace(0.0, 0.75, count))
 
 
 def _abscissa(dataset: xr.Dataset, name: str) -> xr.DataArray:
-    """The coordinate along which points are drawn: the axis, or the first parameter of a list of points."""
+    """The coordinate of the horizontal axis: the axis, or the first parameter of a list of points."""
     if name in dataset.coords and name != "point":
         return dataset[name]
     own = [c for c in dataset.coords.values() if c.dims == (name,) and c.name != name]
@@ -103,14 +103,14 @@ def _curves(dataset: xr.Dataset, name: str, shown: str) -> Figure:
 
 
 def _operating(dataset: xr.Dataset, shown: str) -> tuple[float, float] | None:
-    """Lowest and highest operating speed in the units of ``shown``, if the file has them."""
+    """Lowest and highest operating speed in the units of ``shown``, if stored."""
     options = json.loads(dataset.attrs.get("options", "{}"))
     low, high = (options.get(f"operating_{end}", 0.0) * _FREQUENCIES[shown] for end in ("min", "max"))
     return (low, high) if high > 0 else None
 
 
 def _draw_range(axes: Axes, operating: tuple[float, float] | None) -> list[Artist]:
-    """The operating speeds as a band, down to the lower edge of ``axes`` if they begin at standstill."""
+    """Draw the operating speeds as a band, down to the lower edge of ``axes`` if they begin at standstill."""
     if operating is None:
         return []
     low, high = operating
@@ -120,7 +120,7 @@ def _draw_range(axes: Axes, operating: tuple[float, float] | None) -> list[Artis
 
 
 def _label_curves(axes: Axes) -> None:
-    """The names of the curves beside their right ends, those left out that would lie over another."""
+    """Write the names of the curves at their right ends, without overlaps."""
     taken = -np.inf
     for line in axes.get_lines():
         x, y = line.get_data()
@@ -136,7 +136,7 @@ def _label_curves(axes: Axes) -> None:
 
 
 def _every(dataset: xr.Dataset, abscissa: xr.DataArray, name: str) -> str:
-    """Label of the abscissa; parameters of a list of points that equal it are named with it."""
+    """Label of the horizontal axis, including parameters of a list of points that equal it."""
     equal = [
         str(c.name)
         for c in dataset.coords.values()
@@ -148,7 +148,7 @@ def _every(dataset: xr.Dataset, abscissa: xr.DataArray, name: str) -> str:
 def _doubtful(
     axes: Axes, dataset: xr.Dataset, name: str, x: np.ndarray, y: np.ndarray, order: np.ndarray
 ) -> list[Artist]:
-    """Crosses over the frequencies that are not certified."""
+    """Draw crosses over uncertified frequencies."""
     if "count_certified" not in dataset:
         return []
     doubtful = dataset["count_certified"].transpose("mode", name).values[:, order] == 0
@@ -195,9 +195,9 @@ def _maps(dataset: xr.Dataset, names: list[str], shown: str) -> Figure:
 def _draw_limits(
     axes: Axes, field: xr.DataArray, names: tuple[str, str], operating: tuple[float, float] | None
 ) -> dict[str, Artist]:
-    """Lines where ``field`` is the lowest or the highest operating speed; a legend entry by name for each that exists."""
+    """Draw lines where ``field`` equals the lowest or highest operating speed; returns legend entries."""
     handles: dict[str, Artist] = {}
-    # White beside the black, which is lost on the dark end of the map.
+    # A white outline keeps the black line visible on the dark end of the map.
     style = {"linewidth": 1.0, "path_effects": [withStroke(linewidth=2.4, foreground="white")]}
     for name, speed, dashes in zip(("lowest", "highest"), operating or (), ("dashed", "solid"), strict=False):
         if not float(field.min()) < speed < float(field.max()):
@@ -211,7 +211,7 @@ def _draw_limits(
 
 
 def _ticks(low: float, high: float) -> np.ndarray:
-    """1, 2, 5 and their decades between the two, or round numbers where there are too few."""
+    """Ticks at 1, 2, 5 and their decades, or round numbers if these are too few."""
     decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
     marks = np.outer(decades, [1, 2, 5]).ravel()
     inside = marks[(marks >= low) & (marks <= high)]
@@ -235,7 +235,7 @@ def _shapes(dataset: xr.Dataset) -> Figure:
 
 
 def _name(dataset: xr.Dataset, index: int) -> str:
-    """``mode 1: critical speed 8371.54 rpm``, as far as it is stored."""
+    """``mode 1: critical speed 8371.54 rpm``, with stored quantities only."""
     text = f"mode {dataset['mode'].values[index]}"
     shown = next((name for name in _FREQUENCIES if name in dataset), None)
     if shown is None:

@@ -1,4 +1,4 @@
-"""A figure of results in memory or in files."""
+"""Draw the figure of results in memory or in files."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
 
 
 def plot(result: xr.Dataset | str | Path, *others: xr.Dataset | str | Path) -> Figure:
-    """The figure that suits the analysis of ``result``, a dataset or the path of a result file.
+    """A matplotlib figure of ``result``, a dataset or the path of a result file.
 
     Args:
         others: results of the same analysis by other methods, drawn into the same axes (``frequency_response``).
 
-    Returns: a matplotlib figure that belongs to no window: ``figure.savefig("chart.png")``.
+    Returns: a figure without a window; save it with ``figure.savefig("chart.png")``.
 
     Raises: :class:`~drivetrain_jax.InputError` for a result that has no figure.
 

@@ -21,17 +21,17 @@ PATH = "omega"
 DASHES = (0, (3, 1.6))
 _HEIGHT = 2.9
 _UNSTABLE = 1
-# A step of a sweep that is a jump: over the range of the values, and over the steps beside it.
+# A step of a sweep is a jump if it exceeds these ratios to the range of the values and to the neighbouring steps.
 _JUMP, _STEEPER = 0.04, 6.0
-# Room above and below the angles of the phase, and what rounding may leave of one.
+# Margin above and below the angles of the phase; rounding tolerance of an angle.
 _ANGLE_MARGIN, _ROUNDING = 0.1, 1e-6
-# Motions that meet in a fold are closer than this beside it, over the largest of all.
+# Relative distance below which motions next to a fold belong together.
 _NEAR = 0.15
 
 
 @dataclass(frozen=True)
 class _Look:
-    """How the lines of one method are drawn; the exact solution lies on top, as thin lines with marks."""
+    """Line style of one method; the exact solution lies on top, as thin lines with markers."""
 
     label: str
     colour: str
@@ -50,12 +50,12 @@ _METHODS = {
 
 
 def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
-    """Half the peak-to-peak displacement over the frequency, and the phase where it is stored; or maps.
+    """Half the peak-to-peak displacement over the frequency, and the phase if stored; or maps.
 
-    Each of ``dataset`` and ``others`` (results for the same parameters by other methods) may have the single axis ``omega``:
-    stable motions are full lines, unstable ones dashed, jumps of a sweep dotted. One dataset with a second axis gives
-    maps of both sweeps. Raises :class:`InputError` for other axes or parameters, for a method that is given twice, and
-    where nothing that is shown is stored.
+    Each of ``dataset`` and ``others`` (results for the same parameters by other methods) may have the single axis
+    ``omega``. Stable motions are solid lines, unstable ones dashed, jumps of a sweep dotted. One dataset with a second axis
+    gives maps of both sweeps. Raises :class:`InputError` for other axes or parameters, for a method given twice, and if no
+    variable of the figure is stored.
     """
     with matplotlib.rc_context(STYLE):
         results = [cells.prepare(each) for each in (dataset, *others)]
@@ -75,8 +75,8 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
 
 
 def _check_comparable(results: list[xr.Dataset]) -> None:
-    """:class:`InputError` unless all results are for the same parameters, which the heading tells once, and differ in what
-    the legend tells."""
+    """Raise :class:`InputError` unless all results have the same parameters, shown in the heading, and differ in the
+    legend."""
     first, *others = (_fixed_values(each) for each in results)
     for other in others:
         for name in first | other:
@@ -91,7 +91,7 @@ def _check_comparable(results: list[xr.Dataset]) -> None:
 
 
 def _fixed_values(result: xr.Dataset) -> dict[str, object]:
-    """Parameters of ``result`` that do not vary, its axes of a single value among them."""
+    """Parameters of ``result`` that do not vary, axes of one value included."""
     fixed = json.loads(result.attrs.get("fixed_parameters", "{}"))
     values = {name: entry.get("value") if isinstance(entry, dict) else entry for name, entry in fixed.items()}
     return values | {str(name): c.item() for name, c in result.coords.items() if c.ndim == 0}
@@ -140,7 +140,7 @@ def _label(result: xr.Dataset, look: _Look) -> str:
 def _draw_sweeps(
     axes: Axes, result: xr.Dataset, values: xr.DataArray, look: _Look, jumps: dict[str, np.ndarray]
 ) -> None:
-    """Both sweeps: stable pieces full, unstable ones dashed, jumps dotted, the exact ones with marks."""
+    """Draw both sweeps: stable pieces solid, unstable ones dashed, jumps dotted, the exact ones with markers."""
     omega = result[PATH].values
     every = max(len(omega) // _MARKS, 1)
     for direction, mark in _DIRECTIONS.items():
@@ -159,14 +159,14 @@ def _draw_sweeps(
 
 
 def _grown(kind: np.ndarray) -> np.ndarray:
-    """``kind`` with one more point on either side, so that pieces of different kind meet."""
+    """``kind`` extended by one point on either side, so that pieces of different kind meet."""
     grown = kind.copy()
     grown[:-1] |= kind[1:] & ~kind[:-1]
     return grown
 
 
 def _jumps(y: np.ndarray) -> np.ndarray:
-    """Which steps along a sweep are jumps, shape (L - 1,)."""
+    """Flags of the steps along a sweep that are jumps, shape (L - 1,)."""
     if y.size < 4 or not np.isfinite(y).any():
         return np.zeros(max(y.size - 1, 0), bool)
     step = np.abs(np.diff(y))
@@ -182,7 +182,7 @@ def _broken(x: np.ndarray, y: np.ndarray, jumps: np.ndarray) -> tuple[np.ndarray
 
 
 def _draw_branches(axes: Axes, result: xr.Dataset, look: _Look) -> None:
-    """Unstable motions off the sweeps, as dashed lines through the motions of one number."""
+    """Draw unstable motions off the sweeps as dashed lines, one for each branch number."""
     if not {"branch_u_max", "branch_u_min", "branch_stability"} <= set(result):
         return
     amplitude = ((result["branch_u_max"] - result["branch_u_min"]) / 2).transpose(PATH, "branch").values
@@ -194,7 +194,7 @@ def _draw_branches(axes: Axes, result: xr.Dataset, look: _Look) -> None:
 
 
 def _joined(x: np.ndarray, y: np.ndarray, stable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The pieces of ``y``, each with the nearest of ``stable`` (L, n) added at both ends, where the two meet in a fold."""
+    """The pieces of ``y``, extended at both ends to the nearest of ``stable`` (L, n), where they meet in a fold."""
     xs: list[float] = []
     ys: list[float] = []
     near = _NEAR * np.nanmax(stable, initial=0.0)
@@ -213,20 +213,20 @@ def _joined(x: np.ndarray, y: np.ndarray, stable: np.ndarray) -> tuple[np.ndarra
 
 
 def _draw_backbones(axes: Axes, results: list[xr.Dataset]) -> list[Line2D]:
-    """Amplitudes of free motions against their frequency in the colours of the methods, within the limits of the axes."""
+    """Draw amplitudes of free motions over their frequency in the colours of the methods, within the limits of the axes."""
     style = {"linewidth": 0.7, "linestyle": (0, (6, 2, 1, 2))}
     with_backbone = [each for each in results if "backbone_amplitude" in each]
     height = axes.get_ylim()[1]
     for each in with_backbone:
         amplitude = each["backbone_amplitude"].values
-        # From a motion far outside the line does not come back to another one.
+        # Beyond a motion far outside, the line does not return.
         line = _broken(each[PATH].values, amplitude, np.abs(np.diff(amplitude)) > height)
         axes.plot(*line, **style, color=_METHODS[each.attrs["method"]].colour, scaley=False)
     return [Line2D([], [], **style, color=FRAME_GREY, label="backbone")] if with_backbone else []
 
 
 def _draw_missing(axes: Axes, results: list[xr.Dataset]) -> list[Line2D]:
-    """Crosses on the axis at the frequencies where a sweep has found no motion."""
+    """Draw crosses on the axis at frequencies where a sweep found no motion."""
     omega = [r[PATH].values[r["u_max"].isnull().any("sweep_direction").values] for r in results]
     count = sum(map(len, omega))
     if not count:
@@ -238,7 +238,7 @@ def _draw_missing(axes: Axes, results: list[xr.Dataset]) -> list[Line2D]:
 
 
 def _meanings(results: list[xr.Dataset]) -> list[Line2D]:
-    """The legend entry of the dashes, if there can be any."""
+    """The legend entry of the dashed lines, if there may be any."""
     if not any("stability" in r for r in results):
         return []
     return [Line2D([], [], color=FRAME_GREY, linewidth=1.2, linestyle=DASHES, label="unstable")]
@@ -254,13 +254,12 @@ def _entries(result: xr.Dataset, look: _Look) -> list[Line2D]:
 
 
 def _lag(result: xr.Dataset) -> xr.DataArray:
-    """The phase within a turn: where the motion is opposite to the drive half a turn, not less than none. What rounding
-    has left below none stays there."""
+    """The phase modulo a turn, in [0, 1) turns; small negative values from rounding stay."""
     return (result["phase"] + _ROUNDING) % (2 * np.pi) - _ROUNDING
 
 
 def _angle_axis(axes: Axes, longer: bool) -> None:
-    """Half a turn, or a whole one where lags are longer, as those behind a drive of negative amplitude are."""
+    """Set an angle axis of half a turn, or of a full turn for larger lags, as behind a drive of negative amplitude."""
     quarters = 5 if longer else 3
     axes.set_ylim(-_ANGLE_MARGIN, (quarters - 1) * np.pi / 2 + _ANGLE_MARGIN)
     labels = ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"]

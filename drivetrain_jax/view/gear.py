@@ -1,4 +1,4 @@
-"""A planetary gear drawn at rest (dashed) and displaced in a mode (full lines)."""
+"""Draw a planetary gear at rest (dashed) and displaced in a mode (solid)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from drivetrain_jax.view.style import FRAME_GREY
 
-# Radii over that of the carrier, after the paper's base radii 77.4, 100.3, 275 and 176.8 mm.
+# Radii relative to that of the carrier, from the paper's base radii 77.4, 100.3, 275 and 176.8 mm.
 SUN, PLANET, RING, CARRIER = 77.4 / 176.8, 100.3 / 176.8, 275 / 176.8, 1.0
 _LARGEST = 0.28
 BODY_COLOURS = {"ring": "#7a7a7a", "carrier": "#2f7d4f", "sun": "#c8553d", "planet": "#1f4e79"}
@@ -17,15 +17,15 @@ _CIRCLE = np.linspace(0, 2 * np.pi, 73)
 
 
 def displacements(shape: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """``[x, y, u]`` of carrier, ring and sun (3, 3) and ``[xi, eta, u]`` of the planets (N, 3) from one mode shape,
-    scaled so that the largest translation or rim movement is 0.28 of the carrier's radius."""
+    """``[x, y, u]`` of carrier, ring and sun (3, 3) and ``[xi, eta, u]`` of the planets (N, 3) of one mode shape, scaled
+    so that the largest translation or rim movement is 0.28 of the carrier's radius."""
     values = np.asarray(shape, float).reshape(-1, 3)
     scaled = values * (_LARGEST / max(np.abs(values).max(), 1e-300))
     return scaled[:3], scaled[3:]
 
 
 def draw_gear(axes: Axes, shape: Sequence[float], angles: Sequence[float]) -> None:
-    """The bodies at rest and displaced; a radius on each shows its rotation. Axes are scaled equally and hidden."""
+    """Draw the bodies at rest and displaced; a radius on each shows its rotation. Axes are scaled equally and hidden."""
     (carrier, ring, sun), planets = displacements(shape)
     _body(axes, np.zeros(2), ring, RING, BODY_COLOURS["ring"], mark=False)
     for angle in np.arange(3) * 2 * np.pi / 3 + np.pi / 6:
@@ -49,7 +49,7 @@ def _body(
     angle: float = 0.0,
     mark: bool = True,
 ) -> None:
-    """A disk at ``centre`` displaced by ``move`` (x, y, u), with a radius that pointed along ``angle``."""
+    """Draw a disk at ``centre`` displaced by ``move`` (x, y, u), with a radius at ``angle``."""
     rim = radius * np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE)])
     axes.plot(*(centre[:, None] + rim), color=FRAME_GREY, linewidth=0.4, linestyle=(0, (3, 2)))
     moved = centre + np.asarray(move[:2])
@@ -64,7 +64,7 @@ def _body(
 
 
 def _tick(axes: Axes, move: Sequence[float], radius: float, angle: float) -> None:
-    """A mark across the rim, which shows the rotation of a body whose middle is hidden."""
+    """Draw a mark across the rim that shows the rotation of a body with a hidden centre."""
     turned = angle + move[2] / radius
     along = np.array([np.cos(turned), np.sin(turned)])
     ends = np.stack([np.asarray(move[:2]) + r * along for r in (radius, 1.08 * radius)], axis=1)
@@ -72,7 +72,7 @@ def _tick(axes: Axes, move: Sequence[float], radius: float, angle: float) -> Non
 
 
 def _carrier(axes: Axes, move: Sequence[float], angles: Sequence[float]) -> None:
-    """The carrier as a star of arms to the places of its planets."""
+    """Draw the carrier as a star of arms to its planets."""
     centre = np.asarray(move[:2])
     for angle in angles:
         for start, turned, style in (

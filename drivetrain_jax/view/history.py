@@ -20,11 +20,11 @@ _CAPTION_LINES = 2
 
 
 def plot(dataset: xr.Dataset) -> Figure:
-    """Twist and rate over time, phase portrait, and for a single history the curve of both in time (3-D).
+    """Twist and rate over time, phase portrait, and for a single history the 3-D curve of both over time.
 
-    One history: four panels. One axis or ``[points]``: a row of three panels for each of up to eight values. Histories
-    without values keep empty panels that say so. Raises :class:`InputError` for more axes or values, and unless ``phi``
-    and ``velocity`` are stored.
+    One history: four panels. One axis or ``[points]``: a row of three panels for each of up to eight values. A history
+    without values has empty panels with a note. Raises :class:`InputError` for more axes or values, and unless ``phi`` and
+    ``velocity`` are stored.
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
@@ -73,7 +73,7 @@ def _rows(dataset: xr.Dataset, name: str) -> Figure:
 
 
 def _line(history: xr.Dataset) -> dict[str, object]:
-    """How a history is drawn: a single time has no line."""
+    """Line style of a history; a single time has no line."""
     return _LINE | {"marker": "o" if history.sizes["time"] == 1 else ""}
 
 
@@ -137,7 +137,7 @@ def _label(dataset: xr.Dataset, name: str) -> str:
 
 
 def _entry(history: xr.Dataset, name: str) -> str:
-    """The parameters that tell this row from the others."""
+    """The parameters that differ between the rows."""
     if name != "point":
         return value_text(name, history[name].item(), history[name].attrs.get("units", "1"))
     own = [c for c in history.coords if history[c].ndim == 0 and c != "point"]

@@ -1,4 +1,4 @@
-"""Figures whose panels are placed in inches, so that type is as legible in one panel as in nine."""
+"""Figures with panels placed in inches, so that text has the same size for one panel as for nine."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from drivetrain_jax.view.style import FRAME_GREY, STYLE, caption
 WIDTH = 7.0
 DPI = 200
 _LABEL_SIZE = 8.5
-# Inches of the page that a line of a label takes, with a margin.
+# Height of a line of a label in inches, with a margin.
 _LABEL_LINE = 0.16
 _INCHES_PER_LETTER = 0.068
 _CLEAR = 0.07
@@ -31,7 +31,7 @@ _CAPTION_SIZE, _CAPTION_TOP, _CAPTION_LINE = 8, 0.32, 0.14
 
 @dataclass(frozen=True)
 class Margins:
-    """Free space around and between the panels, and from the panels to the label of their vertical axis, in inches."""
+    """Margins around and between the panels, and from the panels to the vertical label, in inches."""
 
     left: float = 0.75
     right: float = 0.95
@@ -72,26 +72,26 @@ class Panels:
         return left / WIDTH, bottom / total, width / WIDTH, height / total
 
     def colorbar(self, axes: Axes, mapped: ScalarMappable, label: str, **options: object) -> None:
-        """A colour bar in the right margin beside ``axes``."""
+        """Add a colour bar in the right margin next to ``axes``."""
         box = axes.get_position()
         bar = self.figure.add_axes((box.x1 + 0.10 / WIDTH, box.y0, 0.14 / WIDTH, box.height), label="colour bar")
         self.figure.colorbar(mapped, cax=bar, label=_wrap(label, box.height * self.figure.get_figheight()), **options)
         bar.tick_params(labelsize=7.5)
 
     def label_axes(self, horizontal: str, vertical: str = "") -> None:
-        """One label for all horizontal axes and one for all vertical ones, wrapped to the panels' extent."""
+        """Add one label for all horizontal axes and one for all vertical ones, wrapped to the extent of the panels."""
         self._label_side([row[0] for row in self.axes], vertical)
         first, last = self.axes[0][0].get_position(), self.axes[-1][-1].get_position()
         x, y = (first.x0 + last.x1) / 2, last.y0 - 0.36 / self.figure.get_figheight()
         text = _wrap(horizontal, (last.x1 - first.x0) * WIDTH)
         self.figure.text(x, y, text, ha="center", va="center", size=_LABEL_SIZE)
-        # All columns have one power of ten: written at the right end, clear of the label in the middle.
+        # All columns share a power of ten, written at the right end, clear of the label.
         for row in self.axes:
             for axes in row[:-1]:
                 axes.xaxis.get_offset_text().set_visible(False)
 
     def label_row(self, axes: Axes, vertical: str) -> None:
-        """A label for the vertical axis of one row."""
+        """Add a label for the vertical axis of one row."""
         self._label_side([axes], vertical)
 
     def _label_side(self, beside: Sequence[Axes], text: str) -> None:
@@ -108,7 +108,7 @@ class Panels:
         )
 
     def _move_left_edge(self, shift: float) -> None:
-        """Make the panels narrower: numbers that are wide would leave no room for their label."""
+        """Make the panels narrower, so that wide numbers leave space for the label."""
         left, right = self.axes[0][0].get_position().x0, self.axes[0][-1].get_position().x1
         narrower = (right - left - shift) / (right - left)
         for axes in (axes for row in self.axes for axes in row):
@@ -117,7 +117,7 @@ class Panels:
             axes.set_position((x0, box.y0, x1 - x0, box.height))
 
     def titles(self, dataset: xr.Dataset, note: str = "") -> None:
-        """The scene's title and, below it, the fixed parameters (and ``note``)."""
+        """Add the scene's title and, below it, the fixed parameters (and ``note``)."""
         total = self.figure.get_figheight()
         left = self.margins.left / WIDTH
         write_title(self.figure, dataset, self.margins.left)
@@ -127,7 +127,7 @@ class Panels:
         self.figure.text(left, 1 - _CAPTION_TOP / total, text, va="top", size=_CAPTION_SIZE, color=FRAME_GREY)
 
     def legend(self, handles: Sequence[Artist]) -> None:
-        """One legend for the whole figure, in the bottom margin, in as many rows as its length needs."""
+        """Add one legend for the whole figure in the bottom margin, in as many rows as it needs."""
         length = sum(_INCHES_PER_ENTRY + _INCHES_PER_LETTER * len(_plain(handle.get_label())) for handle in handles)
         rows = max(math.ceil(length / (WIDTH - self.margins.left)), 1)
         self.figure.legend(
@@ -143,13 +143,13 @@ class Panels:
 
 
 def _left_of_numbers(axes: Axes) -> float:
-    """Right end, over the figure's width, of a label that clears the numbers of the vertical axis."""
+    """Right end of a label that clears the numbers of the vertical axis, relative to the figure's width."""
     box = axes.yaxis.get_tightbbox()
     return box.x0 / axes.figure.bbox.width - _CLEAR / WIDTH if box else 1.0
 
 
 def write_title(figure: Figure, dataset: xr.Dataset, left: float) -> None:
-    """The scene's title from ``left`` (inches) on: in smaller type where it would not fit, then cut."""
+    """Write the scene's title from ``left`` (inches) on; too long a title is set smaller, then cut."""
     title, room = str(dataset.attrs.get("title", "")), WIDTH - left - 0.1
     size = max(min(_TITLE_SIZE, _TITLE_SIZE * room / max(_title_length(title), 1e-9)), _SMALLEST_TITLE)
     while _title_length(title) * size / _TITLE_SIZE > room * 1.001:
@@ -160,8 +160,8 @@ def write_title(figure: Figure, dataset: xr.Dataset, left: float) -> None:
 
 
 def _title_length(title: str) -> float:
-    """Length of a title of full size in inches, with room for the letters that a screen rounds up."""
-    # A title is anybody's text, in which a dollar need not begin a formula.
+    """Length in inches of a title of full size, with a margin for pixel rounding of letters."""
+    # A title is free text, in which a dollar sign need not begin a formula.
     title = title.replace("$", r"\$")
     bold = FontProperties(family=STYLE["font.sans-serif"], weight="bold")
     length = TextPath((0, 0), title, size=_TITLE_SIZE, prop=bold).get_extents().width if title.strip() else 0.0
@@ -177,7 +177,7 @@ def _wrap(text: str, inches: float) -> str:
 
 
 def _fill(parts: Sequence[str], inches: float, length: Callable[[str], float]) -> list[str]:
-    """``parts`` in lines of ``inches``, none of them broken."""
+    """``parts`` in lines of ``inches``, without breaking any."""
     lines = [parts[0]]
     for part in parts[1:]:
         longer = f"{lines[-1]} {part}"
@@ -189,8 +189,8 @@ def _fill(parts: Sequence[str], inches: float, length: Callable[[str], float]) -
 
 
 def wrap_caption(text: str, inches: float, lines: int) -> str:
-    """``text`` in at most ``lines`` lines, broken between its parts (never within a formula); what is left over gives
-    way to an ellipsis."""
+    """``text`` in at most ``lines`` lines, broken between its parts (never within a formula); an ellipsis replaces the
+    rest."""
     wrapped = _fill(re.split(r"(?<=[,;]) (?![^\[]*\])", text), inches, _caption_length)
     if len(wrapped) > lines:
         wrapped = [*wrapped[: lines - 1], f"{wrapped[lines - 1].rstrip(',;')}, {_ELLIPSIS}"]
@@ -203,5 +203,5 @@ def _caption_length(line: str) -> float:
 
 
 def _plain(label: object) -> str:
-    """The letters of a label without the marks of a formula."""
+    """The letters of a label without formula marks."""
     return re.sub(r"[$^_{}]|\\(?:mathrm)?", "", str(label))

@@ -1,4 +1,4 @@
-"""Figures of the analysis ``lyapunov``: spectra with their errors, how they converge, and what kind of motion it is."""
+"""Figures of the analysis ``lyapunov``: spectra with their errors, convergence, and verdict."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ _MOST_COLUMNS = 4
 def plot(dataset: xr.Dataset) -> Figure:
     """The exponents over one axis, over two axes as maps (a third one of up to four values as columns), or over time.
 
-    Over one axis: spectrum with bands of three standard errors, the paper's estimator, the sum rule's residual and K,
-    as far as they are stored, with the verdict as a coloured strip. For a single point the convergence history. Raises
-    :class:`InputError` if there is nothing of that.
+    Over one axis: spectrum with bands of three standard errors, the paper's estimator, the sum rule's residual and K, if
+    stored, with the verdict as a coloured strip. A single point shows the convergence history. Raises :class:`InputError`
+    if none of these is stored.
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
@@ -110,7 +110,7 @@ def _draw_curves(axes: Axes, dataset: xr.Dataset, key: str, name: str) -> None:
 
 
 def _verdict_strip(axes: Axes, dataset: xr.Dataset, name: str) -> list[Artist]:
-    """The verdict along the upper edge of the panel."""
+    """Draw the verdict along the upper edge of the panel."""
     cells.draw_strip(axes, _kind(dataset), name, (1.0, 1.05), **_scale())
     return _kind_legend(dataset)
 
@@ -151,7 +151,7 @@ def _map_row(panels: Panels, row: list[Axes], parts: list[xr.Dataset], key: str,
 
 
 def _kind(dataset: xr.Dataset) -> xr.DataArray:
-    """The verdict of each point; the code after the last one where the outcome says that there is no value."""
+    """The verdict of each point; one code above the last for points without a value."""
     return dataset["verdict"].where(dataset["outcome"] < FIRST_FAILURE, len(KIND_COLOURS))
 
 
@@ -162,7 +162,7 @@ def _scale() -> dict[str, Any]:
 
 
 def _kind_legend(dataset: xr.Dataset) -> list[Artist]:
-    """Kinds of motion that occur and what has no value, with their number of points."""
+    """Legend entries of the verdicts that occur and of missing values, with their number of points."""
     meanings = str(dataset["verdict"].attrs.get("flag_meanings", "")).split()
     counts = np.bincount(_kind(dataset).values.astype(int).ravel(), minlength=len(meanings))
     kinds = [

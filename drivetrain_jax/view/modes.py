@@ -26,17 +26,16 @@ TYPE_COLOURS = {
 }
 _CURVES_HEIGHT, _GEAR_HEIGHT = 4.4, 1.62
 _COLUMNS, _MOST_SHAPES = 4, 16
-# Frequencies this near to each other are one multiple frequency, of which one shape is drawn.
+# Relative difference below which frequencies are one multiple frequency, with one shape drawn.
 _SAME = 1e-8
 
 
 def plot(dataset: xr.Dataset) -> Figure:
     """Frequencies over one axis, coloured by the type of the mode, or the mode shapes of a single point.
 
-    Curves follow the stored ``branch`` where there is one, so that they do not change colour where frequencies cross or
-    veer; without it every point is a dot. Zero frequencies do not show on the logarithmic scale. Axes of a single value
-    count as fixed. Raises :class:`InputError` for more than one axis, and if the variables needed are not stored or have no
-    value.
+    Curves follow the stored ``branch``, so colours do not change where frequencies cross or veer; without it every point is
+    a dot. Zero frequencies are not visible on the logarithmic scale. Axes of one value count as fixed. Raises
+    :class:`InputError` for more than one axis, and if needed variables are not stored or have no value.
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
@@ -55,7 +54,7 @@ def _meanings(dataset: xr.Dataset) -> list[str]:
 
 
 def _types(dataset: xr.Dataset) -> np.ndarray:
-    """Type of every mode by name; without the variable all count as coupled."""
+    """Type of every mode by name; all modes are coupled if the variable is missing."""
     if "mode_type" not in dataset:
         return np.full(dataset["natural_frequency"].shape, "coupled")
     return np.array(_meanings(dataset))[dataset["mode_type"].values]
@@ -91,14 +90,14 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
 
 
 def _segments(x: np.ndarray, curve: np.ndarray, kinds: np.ndarray) -> LineCollection:
-    """One branch; a piece between points of different types has the colour of its end."""
+    """Draw one branch; a piece between points of different types has the colour of its end."""
     points = np.stack([x, curve], axis=-1)
     return LineCollection(
         list(np.stack([points[:-1], points[1:]], axis=1)),
         colors=[TYPE_COLOURS[str(kind)] for kind in kinds[1:]],
         linewidths=1.1,
         capstyle="round",
-        # Pieces that are moved to whole pixels one by one make steps.
+        # Rounding of single pieces to whole pixels would make steps.
         snap=False,
     )
 

@@ -16,16 +16,16 @@ from drivetrain_jax.view.layout import DPI, WIDTH, Margins, Panels, write_title
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, axis_label, caption, variable_label
 
 _HEIGHT, _MOST_CURVES = 1.8, 8
-# Of the table: inches between lines, and between lines of the caption, and letters of such a line.
+# Line spacing of the table, line spacing of the caption (inches), and letters per line of the caption.
 _ROW, _CAPTION, _LETTERS = 0.24, 0.15, 105
 
 
 def plot(dataset: xr.Dataset) -> Figure:
-    """Every stored constant over the one axis of ``dataset``, a panel each; without axes a table of their values.
+    """One panel for every stored constant over the one axis of ``dataset``; without axes a table of the values.
 
-    Constants with a dimension of their own (natural frequencies by mode) become one curve or one line of the table for
-    each entry. Axes of a single value count as fixed. Raises :class:`InputError` for more axes, for ``[points]``, for
-    more than eight panels and for none.
+    A constant with a dimension of its own (natural frequencies by mode) has one curve or one line for each entry. Axes of
+    one value count as fixed. Raises :class:`InputError` for more axes, for ``[points]``, for more than eight panels, and
+    without constants.
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
@@ -48,7 +48,7 @@ def _curves(dataset: xr.Dataset, name: str, shown: list[str]) -> Figure:
         variable = dataset[key].where(dataset["outcome"] < FIRST_FAILURE).transpose(name, ...)
         axes.plot(dataset[name], variable.values.reshape(dataset.sizes[name], -1), color=LINE_COLOURS[0])
         axes.margins(x=0)
-        # Few digits: the label stands at a fixed distance.
+        # Few digits, because the label has a fixed position.
         axes.locator_params(axis="y", nbins=4)
         panels.label_row(axes, variable_label(variable))
     panels.label_axes(axis_label(dataset[name]))
@@ -58,7 +58,7 @@ def _curves(dataset: xr.Dataset, name: str, shown: list[str]) -> Figure:
 
 def _table(dataset: xr.Dataset, shown: list[str]) -> Figure:
     lines = [line for name in shown for line in _lines(dataset[name])]
-    # Breaks between the parameters only, not within one.
+    # Break only between parameters.
     entries = ", ".join(entry.replace(" ", "\u00a0") for entry in caption(dataset).split(", "))
     head = textwrap.wrap(entries, _LETTERS, break_long_words=False)
     top = 0.55 + _CAPTION * len(head)

@@ -1,4 +1,4 @@
-"""Figures of the analysis ``poincare``: the points of the section, all of them and the first ones alone."""
+"""Figures of the analysis ``poincare``: all points of the section, and the first ones alone."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, value_tex
 
 _FIRST = 1000
 _MOST_ROWS = 6
-# A section narrower than this, over its distance from zero, is drawn as a point; so are rates of twist that are a
-# thousandth of those of a vibration with this angular frequency [rad/s].
+# Relative width below which a section is drawn as a point. Rates of twist count from a thousandth of those of a vibration
+# with this angular frequency in rad/s.
 _NARROW, _RATE = 1e-9, 1e3
 _HEIGHT = 2.6
 
 
 def plot(dataset: xr.Dataset) -> Figure:
-    """The section with all its strobes and, of more than 1000, with the first 1000 alone; a row for each of up to six
-    values of one axis.
+    """The section with all strobes, and the first 1000 alone if there are more; one row for each of up to six values of one
+    axis.
 
     Raises :class:`InputError` for more axes or values, and unless ``section`` is stored.
     """
@@ -65,7 +65,7 @@ def _draw_row(row: list[Axes], part: xr.Dataset, name: str | None) -> None:
 
 
 def _is_point(points: np.ndarray) -> bool:
-    """Whether all finite points are the same but for rounding."""
+    """True if all finite points are equal up to rounding."""
     finite = points[np.isfinite(points).all(axis=1)]
     twist, rate = np.ptp(finite, axis=0) if len(finite) else (np.inf, np.inf)
     size = np.abs(finite[:, 0]).max(initial=0.0)
@@ -73,7 +73,7 @@ def _is_point(points: np.ndarray) -> bool:
 
 
 def _widen(axes: Axes, which: str, values: np.ndarray, least: float) -> None:
-    """Limits that do not blow rounding errors up to the height of the panel."""
+    """Limits that do not magnify rounding errors to the height of the panel."""
     if not values.size:
         return
     size = max(_NARROW * np.abs(values).max(), least)

@@ -1,4 +1,4 @@
-"""Maps of a frequency response over the frequency and one more parameter: displacement and regime of both sweeps."""
+"""Maps of a frequency response over frequency and one more parameter: displacement and regime of both sweeps."""
 
 from __future__ import annotations
 
@@ -18,10 +18,9 @@ _HEIGHT = 2.3
 
 
 def plot(dataset: xr.Dataset, names: list[str]) -> Figure:
-    """``u_max`` and ``regime``, as far as they are stored, over the axes ``names``; one column for each sweep.
+    """``u_max`` and ``regime``, if stored, over the axes ``names``; one column for each sweep.
 
-    Where results carry a prediction for the other axis (the end of the motion without separation) it is drawn over
-    them. Raises :class:`InputError` if neither is stored.
+    A predicted end of the motion without separation is drawn over them. Raises :class:`InputError` if neither is stored.
     """
     shown = cells.require_any(dataset, "u_max", "regime")
     horizontal = cells.speed_axis(dataset, names)

@@ -1,4 +1,4 @@
-"""Regimes of motion with play as coloured cells: by how many flanks contact is made and lost."""
+"""Regimes of motion with backlash as coloured cells: the number of flanks with contact made and lost."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.style import FRAME_GREY, PREDICTION, STATE_COLOURS
 
-# Lightness falls with the number of flanks; what is not periodic and what failed stand apart in hue.
+# Lightness falls with the number of flanks; non-periodic and failed cells differ in hue.
 _NAMES = ("no separation", "single-sided", "double-sided", "non-periodic", "failed")
 COLOURS = ("#ffffff", "#9cc3e0", "#33517c", "#f2b632", STATE_COLOURS[cells.FAILED])
 NON_PERIODIC, FAILED = 3, 4
 
 
 def draw(axes: Axes, dataset: xr.Dataset, field: xr.DataArray, horizontal: str, vertical: str) -> QuadMesh:
-    """The regimes ``field`` of ``dataset``."""
+    """Draw the regimes ``field`` of ``dataset``."""
     codes = field.where(dataset["outcome"] < FIRST_FAILURE, FAILED)
     cmap = ListedColormap(COLOURS, name="regimes")
     return cells.draw_cells(axes, codes, horizontal, vertical, cmap=cmap, vmin=-0.5, vmax=FAILED + 0.5)
 
 
 def legend(dataset: xr.Dataset) -> list[Patch]:
-    """Entries of the regimes with contact made and lost at no, one or two flanks, and of all others that occur."""
+    """Legend entries of the regimes with no, one or two flanks, and of all others that occur."""
     known = (dataset["outcome"] < FIRST_FAILURE).values
     present = {*range(NON_PERIODIC), *np.unique(dataset["regime"].values[known]).tolist()}
     patches = [
@@ -38,7 +38,7 @@ def legend(dataset: xr.Dataset) -> list[Patch]:
 
 
 def draw_threshold(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Line2D]:
-    """The predicted end of the motion without separation, if it is stored as a curve over the horizontal axis."""
+    """Draw the predicted end of the motion without separation, if stored as a curve over the horizontal axis."""
     name = f"resonance_{vertical}"
     if name not in dataset.coords or horizontal not in dataset[name].dims:
         return []

@@ -1,4 +1,4 @@
-"""Predicted resonances over a chart: thin lines or curves, labelled at the edge where they leave it."""
+"""Predicted resonances over a chart: thin lines or curves, labelled at the edge."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from matplotlib.lines import Line2D
 
 from drivetrain_jax.view.style import PREDICTION
 
-# Difference combinations do not appear as tongues of parametric resonance (equal Krein signature).
+# Difference combinations make no tongues of parametric resonance (equal Krein signature).
 _HIDDEN = ("C-",)
 _DASHES = {"H": "-", "S": (0, (5, 2)), "C": (0, (5, 1.5, 1, 1.5))}
 _MEANING = {"H": "harmonic $H$", "S": "subharmonic $S$", "C": "sum combination $C^+$"}
-# Type size of the labels, room for each along the edges, leader and largest shift from the line, in points.
+# Type size of the labels, space for each along the edges, leader and largest shift from the line, in points.
 _FONT = 7.5
 _SPACING_ACROSS = 14.5
 _SPACING_UP = 9.5
@@ -39,7 +39,7 @@ class Prediction:
 
     @property
     def order(self) -> int:
-        """Last digit of the label, 0 if it has none."""
+        """Last digit of the label, 0 without one."""
         digits = re.findall(r"\d", self.label)
         return int(digits[-1]) if digits else 0
 
@@ -47,7 +47,7 @@ class Prediction:
 def predictions(
     dataset: xr.Dataset, horizontal: str, vertical: str | None = None, families: tuple[str, ...] = ()
 ) -> list[Prediction]:
-    """Predicted lines over ``horizontal`` (all families, or those named); none if the dataset has no predictions."""
+    """Predicted lines over ``horizontal`` (all families, or those named); none without predictions."""
     name = f"resonance_{horizontal}"
     if name not in dataset.coords:
         return []
@@ -62,7 +62,7 @@ def predictions(
 
 
 def label_text(label: str) -> str:
-    """``C+1`` as a formula; anything that is not letters, sign, digits stays as it is."""
+    """``C+1`` as a formula; text other than letters, sign and digits stays unchanged."""
     match = re.fullmatch(r"([A-Za-z]+)([+-]?)(\d+)", label)
     if not match:
         return label
@@ -71,7 +71,7 @@ def label_text(label: str) -> str:
 
 
 def draw(axes: Axes, lines: list[Prediction]) -> list[Line2D]:
-    """Draw the lines that cross ``axes``, whose limits are kept; returns one handle a family for the legend."""
+    """Draw the lines that cross ``axes``, keeping its limits; returns one legend handle per family."""
     low, high = axes.get_xlim()
     handles: dict[str, Line2D] = {}
     for line in lines:
@@ -87,9 +87,9 @@ def draw(axes: Axes, lines: list[Prediction]) -> list[Line2D]:
 
 
 def label(axes: Axes, lines: list[Prediction]) -> None:
-    """Label lines at the edge where they leave ``axes``: above it or right of it, spread so that none overlap.
+    """Label lines at the upper or right edge of ``axes``, without overlaps.
 
-    Lines of low order come first; a label that would have to move far from its line is left out.
+    Lines of low order come first; a label that would move far from its line is left out.
     """
     scale = 72 / axes.figure.dpi
     for edge, spacing, side in ((_top_exit, _SPACING_ACROSS, 0), (_right_exit, _SPACING_UP, 1)):
@@ -98,7 +98,7 @@ def label(axes: Axes, lines: list[Prediction]) -> None:
         along = [axes.transData.transform(point)[side] * scale for _, point in ends]
         box = axes.bbox
         limits = (box.xmin, box.xmax) if side == 0 else (box.ymin, box.ymax)
-        # Labels may stand out over the corners by one width.
+        # Labels may extend over the corners by one width.
         span = (limits[0] * scale - spacing, limits[1] * scale + spacing)
         kept, positions = _place(along, spacing, span)
         for index, position in zip(kept, positions, strict=True):
@@ -107,8 +107,8 @@ def label(axes: Axes, lines: list[Prediction]) -> None:
 
 
 def _place(wanted: list[float], spacing: float, span: tuple[float, float]) -> tuple[list[int], np.ndarray]:
-    """Which labels fit (indices in rising position), and the nearest positions for them at least ``spacing`` apart."""
-    from scipy.optimize import isotonic_regression  # takes longer to load than most figures to draw
+    """Rising indices of the labels that fit, and the nearest positions for them at least ``spacing`` apart."""
+    from scipy.optimize import isotonic_regression  # loading takes longer than drawing most figures
 
     kept: list[int] = []
     positions = np.empty(0)
@@ -116,7 +116,7 @@ def _place(wanted: list[float], spacing: float, span: tuple[float, float]) -> tu
         trial = sorted([*kept, index], key=lambda i: wanted[i])
         target = np.array([wanted[i] for i in trial])
         offsets = spacing * np.arange(len(trial))
-        # Positions p with p[i+1] - p[i] >= spacing: isotonic regression after the offsets are taken off.
+        # Positions p with p[i+1] - p[i] >= spacing: isotonic regression of p[i] - i * spacing.
         spread = np.clip(isotonic_regression(target - offsets).x, span[0], span[1] - offsets[-1]) + offsets
         if np.abs(spread - target).max() <= _MAX_SHIFT:
             kept, positions = trial, spread
@@ -124,13 +124,13 @@ def _place(wanted: list[float], spacing: float, span: tuple[float, float]) -> tu
 
 
 def _top_exit(axes: Axes, line: Prediction) -> tuple[float, float] | None:
-    """Where the line meets the upper edge, in data coordinates."""
+    """Intersection of the line with the upper edge, in data coordinates."""
     left, right = axes.get_xlim()
     return (float(line.x[-1]), axes.get_ylim()[1]) if left <= line.x[-1] <= right else None
 
 
 def _right_exit(axes: Axes, line: Prediction) -> tuple[float, float] | None:
-    """Where a curve meets the right edge, in data coordinates."""
+    """Intersection of a curve with the right edge, in data coordinates."""
     right = axes.get_xlim()[1]
     crossing = np.flatnonzero((line.x[:-1] <= right) & (line.x[1:] > right))
     if not crossing.size or line.y is None:
@@ -140,7 +140,7 @@ def _right_exit(axes: Axes, line: Prediction) -> tuple[float, float] | None:
 
 
 def _write(axes: Axes, text: str, end: tuple[float, float], side: int, shift: float) -> None:
-    """Text beyond the edge, ``shift`` points along it, joined to ``end`` (data) by a thin leader."""
+    """Write text beyond the edge, ``shift`` points along it, joined to ``end`` (data) by a thin leader."""
     axes.annotate(
         label_text(text),
         end,

@@ -1,4 +1,4 @@
-"""Figures of the analysis ``forced``: how far the shafts twist, and whether the true periodic motion is stable."""
+"""Figures of the analysis ``forced``: amplitudes of the shafts, and stability of the nonlinear periodic orbit."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _HEIGHT = 2.1
 
 
 def plot(dataset: xr.Dataset) -> Figure:
-    """Amplitudes of the shafts, and the orbit's spectral radius and the condition where they are stored.
+    """Amplitudes of the shafts, and the orbit's spectral radius and the condition if stored.
 
-    Over one axis as curves (full line: linear response, dashed: nonlinear orbit), over two axes as maps. Failed points
-    are marked: by crosses at the foot of the curves, by a colour of their own in maps. Axes of a single value count as
-    fixed. Raises :class:`InputError` for any other number of axes and if none of these variables is stored.
+    Over one axis as curves (solid: linear response, dashed: nonlinear orbit), over two axes as maps. Failed points are
+    crosses at the foot of the curves, or coloured cells of the maps. Axes of one value count as fixed. Raises
+    :class:`InputError` for another number of axes, and if none of these variables is stored.
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
@@ -66,7 +66,7 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
         both = f"amplitude of the shafts [{units}]"
         panels.label_row(stack[0], both if len(amplitudes) > 1 else variable_label(dataset[amplitudes[0]]))
     cells.fit_axis(stack[0], "x", dataset[name].values)
-    # Forcing has even harmonics of the speed only: it meets natural frequencies at the harmonic speeds.
+    # The forcing has only even harmonics of the speed: it meets natural frequencies at the harmonic speeds.
     lines = resonances.predictions(dataset, name, families=("H",))
     handles += cells.draw_failures(stack[0], dataset, name)
     for axes in stack:
@@ -92,7 +92,7 @@ def _draw_amplitudes(axes: Axes, dataset: xr.Dataset, name: str, keys: list[str]
 
 
 def _set_decades(axes: Axes, *shown: xr.DataArray) -> None:
-    """A logarithmic scale, which has no place for the zeros of straight joints and for what has failed, if there is more."""
+    """Set a logarithmic scale if there are positive values; it cannot show zeros (straight joints) and failed points."""
     if any((np.isfinite(each.values) & (each.values > 0)).any() for each in shown):
         axes.set_yscale("log")
         cells.plain_decades(axes, "y")
@@ -120,7 +120,7 @@ def _maps(dataset: xr.Dataset, names: list[str], shown: list[str]) -> Figure:
 
 
 def _draw_decades(axes: Axes, field: xr.DataArray, horizontal: str, vertical: str) -> QuadMesh:
-    """Positive values on a logarithmic colour scale, darker for larger; beta = 0 has amplitude 0 and stays lightest."""
+    """Draw positive values on a logarithmic colour scale, darker for larger; beta = 0 has amplitude 0 and is lightest."""
     values = field.values[np.isfinite(field.values) & (field.values > 0)]
     low, high = (values.min(), values.max()) if values.size else (0.1, 1.0)
     cmap = matplotlib.colormaps["cividis_r"].with_extremes(bad=STATE_COLOURS[cells.FAILED])
@@ -129,7 +129,7 @@ def _draw_decades(axes: Axes, field: xr.DataArray, horizontal: str, vertical: st
 
 
 def _split(variable: xr.DataArray, names: list[str]) -> list[xr.DataArray]:
-    """The variable over the axes alone, one for each entry of its own dimension; the entry joins the long name."""
+    """The variable over the axes alone, one for each entry of its own dimension, named in the long name."""
     own = [dim for dim in variable.dims if dim not in names]
     if not own:
         return [variable]

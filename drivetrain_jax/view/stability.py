@@ -31,20 +31,18 @@ from drivetrain_jax.view.style import (
 
 _PANEL = 2.45
 _SMALL_PANEL = 1.35
-# Axes of up to this many values run across a figure of small panels.
+# Largest number of values of an axis across a figure of small panels.
 _FEW = 4
 
 
 def plot(dataset: xr.Dataset) -> Figure:
-    """The chart of a ``floquet`` result; what it shows depends on the number of swept axes.
+    """The chart of a ``floquet`` result, by number of swept axes.
 
-    - none: the multipliers in the complex plane;
-    - one: the spectral radius with its error band and the limit 1;
-    - two: regions of the verdict and a map of ``log10(spectral radius)``, whichever are stored;
-    - more: regions of the verdict for the first, middle and last value of two further axes;
-    - ``[points]``: the points coloured by their verdict.
+    - none: the multipliers in the complex plane; - one: the spectral radius with its error band and the limit 1; - two:
+    regions of the verdict and a map of ``log10(spectral radius)``, if stored; - more: regions of the verdict for the first,
+    middle and last value of two further axes; - ``[points]``: the points coloured by their verdict.
 
-    Axes of a single value count as fixed. Raises :class:`InputError` if the variables needed are not stored.
+    Axes of one value count as fixed. Raises :class:`InputError` if needed variables are not stored.
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
@@ -73,7 +71,7 @@ def _chart(dataset: xr.Dataset, names: list[str]) -> Figure:
             radius = dataset[name].where(dataset["outcome"] < FIRST_FAILURE)
             mesh, label, extend = cells.draw_growth(axes, radius, horizontal, vertical)
             panels.colorbar(axes, mesh, label, extend=extend)
-    # Over the upper panel only: the map below shows the narrow tongues uncovered.
+    # Only over the upper panel, so that narrow tongues stay visible in the map below.
     lines = resonances.predictions(dataset, horizontal, vertical)
     handles += resonances.draw(panels.axes[0][0], lines)
     panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
@@ -112,7 +110,7 @@ def _curve(dataset: xr.Dataset, name: str, marker: str = "") -> Figure:
 
 
 def _draw_strip(axes: Axes, dataset: xr.Dataset, name: str) -> None:
-    """The verdict as a strip along the foot of the panel."""
+    """Draw the verdict as a strip along the foot of the panel."""
     low, high = axes.get_ylim()
     axes.set_ylim(low - 0.06 * (high - low), high)
     cells.draw_strip(axes, cells.states(dataset), name, (0, 0.035), cmap=cells.STATES, vmin=-0.5, vmax=3.5)
@@ -126,7 +124,7 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
     horizontal = cells.horizontal_axis(dataset, long if len(long) > 1 else names)
     vertical = max((name for name in names if name != horizontal), key=lambda name: dataset.sizes[name])
     sliced = [name for name in names if name not in (horizontal, vertical)]
-    # Labels stand over the first row only, so an axis on which the predictions depend runs across.
+    # Labels are drawn only over the first row, so an axis on which the predictions depend runs across.
     dependent = dataset.coords.get(f"resonance_{horizontal}", xr.DataArray(0)).dims
     sliced.sort(key=lambda name: name not in dependent)
     count = math.prod(dataset.sizes[name] for name in sliced)
@@ -136,7 +134,7 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
         [dataset.isel({across: column} | ({down: row} if down else {})) for column in _spread(dataset, across)]
         for row in (_spread(dataset, down) if down else [0])
     ]
-    # Regions without a boundary are blank: then how far from it they are.
+    # Regions without a boundary are blank: show the distance from it instead.
     plain = "spectral_radius" in dataset and bool((cells.states(dataset) == cells.STABLE).all())
     margins = Margins(right=1.05 if plain else 0.25, top=1.12, between_rows=0.32, between_columns=0.16)
     height = _SMALL_PANEL if len(slices) > 1 else _PANEL
@@ -170,13 +168,13 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
 
 
 def _clear_ticks(axes: Axes) -> list[float]:
-    """Few ticks, none at the right end: its number would run into the first one of the next panel."""
+    """Set few ticks, none at the right end, to keep it clear of the next panel."""
     low, high = axes.get_xlim()
     return [tick for tick in MaxNLocator(4).tick_values(low, high) if low <= tick <= high - 0.08 * (high - low)]
 
 
 def _draw_radius(panels: Panels, axes: Axes, panel: xr.Dataset, whole: xr.Dataset, names: tuple[str, str]) -> None:
-    """Spectral radii below 1 on the scale of the whole result; a colour bar at the end of the row."""
+    """Draw spectral radii below 1 on the scale of the whole result, with a colour bar at the end of the row."""
     radius = whole["spectral_radius"]
     limits = {"vmin": float(radius.min()), "vmax": float(radius.max())}
     mesh = cells.draw_cells(axes, panel["spectral_radius"], *names, cmap="cividis", **limits)

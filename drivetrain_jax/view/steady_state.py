@@ -31,19 +31,18 @@ from drivetrain_jax.view.style import (
 )
 
 _HEIGHT, _PORTRAIT = 2.45, 3.1
-# Amplitudes of attractors closer than this, relatively, are one.
+# Relative difference of amplitudes below which attractors are the same.
 _SAME = 1e-5
 
 
 def plot(dataset: xr.Dataset) -> Figure:
-    """The figure of a ``steady_state`` result; what it shows depends on the axes.
+    """The figure of a ``steady_state`` result, by its axes.
 
-    - none: time history and phase portrait of the motion (needs ``u_history`` and ``v_history``);
-    - one: extremes, period multiple and growth along it;
-    - ``u0`` and ``v0``: basins of the attractors with the share of each;
-    - any other two: the regime and the largest displacement, with the threshold of rattle where it is predicted.
+    - none: time history and phase portrait of the motion (needs ``u_history`` and ``v_history``); - one: extremes, period
+    multiple and growth along it; - ``u0`` and ``v0``: basins of the attractors with the share of each; - any other two: the
+    regime and the largest displacement, with the predicted threshold of rattle.
 
-    Axes of a single value count as fixed. Raises :class:`InputError` for other axes and where variables are missing.
+    Axes of one value count as fixed. Raises :class:`InputError` for other axes, and if variables are missing.
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
@@ -148,11 +147,11 @@ def _basins(dataset: xr.Dataset) -> Figure:
 
 
 def _attractors(dataset: xr.Dataset) -> tuple[xr.DataArray, list[str]]:
-    """The attractors by falling share: number of each point's, and what distinguishes them."""
+    """The attractors by falling share: the number of each point's attractor, and its properties."""
     known = (dataset["outcome"] < FIRST_FAILURE).values
     multiple, high = dataset["period_multiple"].values, dataset["u_max"].values
     units = dataset["u_max"].attrs.get("units", "")
-    # All non-periodic motions are taken for one attractor.
+    # All non-periodic motions count as one attractor.
     level = np.where(multiple > 0, np.log(np.abs(np.where(known, high, 1.0)) + 1e-300) / _SAME, 0.0)
     keys = [(int(m), round(float(x))) for m, x in zip(multiple[known], level[known], strict=True)]
     merged = _merge(keys)
@@ -209,7 +208,7 @@ def _motion(dataset: xr.Dataset) -> Figure:
         handles.append(flank)
     history.set_xlim(0, 1)
     panels.label_axes("part of the motion's period [1]", variable_label(u))
-    # To the left, clear of a power of ten at the right end.
+    # On the left, clear of a power of ten at the right end.
     portrait.set_xlabel(variable_label(u), loc="left")
     portrait.set_ylabel(variable_label(v))
     panels.titles(dataset)

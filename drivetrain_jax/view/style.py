@@ -1,4 +1,4 @@
-"""The look of all figures: type sizes, colours that differ in lightness as well as hue, and how names are written."""
+"""Style of all figures: type sizes, colours that differ in lightness and hue, and the formatting of names."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import tomllib
 import xarray as xr
 from matplotlib.colors import ListedColormap
 
-# Handed to rc_context around every figure, never to the global rcParams.
+# Passed to rc_context around every figure; global rcParams stay unchanged.
 STYLE = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
@@ -19,7 +19,7 @@ STYLE = {
     "axes.titlesize": 8.5,
     "axes.linewidth": 0.7,
     "axes.formatter.useoffset": False,
-    # Numbers of five digits would run into the label of their axis: powers of ten beside it, as a product, not as 1e-4.
+    # Numbers of five digits would overlap the axis label: show powers of ten as a factor.
     "axes.formatter.limits": (-3, 4),
     "axes.formatter.use_mathtext": True,
     "xtick.labelsize": 8.0,
@@ -32,14 +32,14 @@ STYLE = {
     "hatch.linewidth": 0.5,
 }
 
-# Lightness 100, 27, 76, 50: the four states stay apart in grey.
+# Lightness 100, 27, 76, 50: the four states differ in grey.
 STATE_NAMES = ("stable", "unstable", "undecided", "failed")
 STATE_COLOURS = ("#ffffff", "#33415c", "#f2b632", "#d1495b")
 STATE_HATCHES = ("", "", "////", "xxxx")
 STATES = ListedColormap(STATE_COLOURS, name="states")
 
 LINE_COLOURS = ("#1f4e79", "#d1771e")
-# Attractors: lightness differs as well as hue.
+# Attractors differ in lightness and hue.
 ATTRACTOR_COLOURS = ("#33517c", "#f2b632", "#9cc3e0", "#c8553d", "#6a994e", "#d9c5e0", "#2d0a2b", "#8d99ae")
 FRAME_GREY = "#555555"
 PREDICTION = "#0b84d8"
@@ -49,16 +49,15 @@ _GREEK = {
     *("rho", "sigma", "tau", "phi", "chi", "psi", "omega", "Gamma", "Delta", "Theta", "Lambda", "Phi", "Psi", "Omega"),
 }
 
-# Longer lists are not written out in a caption.
+# Largest length of a list in a caption.
 _MOST_ENTRIES = 6
 _PRODUCTS = {"EI": "$EI$", "rhoA": r"$\rho A$", "rhoI": r"$\rho I$", "kGA": r"$\kappa GA$"}
 
 
 def symbol(name: str) -> str:
-    """``name`` as it is set in a formula: Greek letters by name, an index as subscript (``k_A``, ``k_joint``), else
-    unchanged.
+    """``name`` as a formula: Greek letters by name, an index as subscript (``k_A``, ``k_joint``), else unchanged.
 
-    Entries of a list, which scenes count from 0, are counted from 1 as bodies and modes are: ``m_p[1]`` is m_p,2.
+    Scenes count entries of a list from 0, figures from 1 as bodies and modes: ``m_p[1]`` is m_p,2.
     """
     if match := re.fullmatch(r"(.+)\[(\d+)\]", name):
         head, number = symbol(match[1]), int(match[2]) + 1
@@ -79,7 +78,7 @@ def symbol(name: str) -> str:
 
 
 def axis_label(coordinate: xr.DataArray) -> str:
-    """``long name (symbol) [units]`` of a swept parameter; no symbol where the name only repeats the long name."""
+    """``long name (symbol) [units]`` of a swept parameter, without a symbol that repeats the long name."""
     name, long_name = str(coordinate.name), _long_name(coordinate)
     mark = "" if name.replace("_", " ") == long_name else f" ({symbol(name)})"
     return f"{long_name}{mark} [{coordinate.attrs.get('units', '1')}]"
@@ -102,23 +101,20 @@ def value_text(name: str, value: object, units: str = "1") -> str:
 
 
 def caption(dataset: xr.Dataset) -> str:
-    """One line with the parameters that do not vary: those the scene fixes, then scalar coordinates.
-
-    Defaults, of which a system may have twenty, are left to the attributes of the file.
-    """
+    """One line with the fixed parameters of the scene, then scalar coordinates; defaults are left out."""
     fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}"))
     named = tomllib.loads(dataset.attrs["scene"]).get("fixed", {}) if "scene" in dataset.attrs else fixed
     parts = [_fixed_text(name, _unless_swept(dataset, name, value)) for name, value in fixed.items() if name in named]
     parts += [
         value_text(str(name), coordinate.item(), coordinate.attrs.get("units", "1"))
         for name, coordinate in dataset.coords.items()
-        if coordinate.ndim == 0 and name != "point"  # a number in a list tells nothing
+        if coordinate.ndim == 0 and name != "point"  # a number of a list needs no caption
     ]
     return ", ".join([*parts, *([dataset.attrs["left_out"]] if "left_out" in dataset.attrs else [])])
 
 
 def _unless_swept(dataset: xr.Dataset, name: str, entry: object) -> object:
-    """A fixed list with the entries that are axes of their own, such as ``planet_angle[1]``, said to vary."""
+    """A fixed list in which swept entries, such as ``planet_angle[1]``, are marked as varying."""
     value = entry.get("value") if isinstance(entry, dict) else entry
     if not isinstance(value, (list, tuple)):
         return entry

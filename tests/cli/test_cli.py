@@ -130,7 +130,7 @@ def test_other_scene_needs_fresh(cli):
 def test_status_tells_why_a_run_would_be_refused(cli):
     cli("run", "scene.toml", "--out", "r.nc", "--quiet")
     code, out, _ = cli("status", "scene.toml", "--out", "r.nc", "--set", "fixed.b=3", "--set", "axes.a.num=5")
-    assert code == 0 and out.startswith("stale: 0 of 5 points done, 0 without a value\n  a run would be refused: ")
+    assert code == 0 and out.startswith("stale: 0 of 5 points done, 0 without a value\n  a run would stop: ")
     assert "fixed.b is 3.0, was 2.0; axes.a has 5 values from 0 to 10, had 21 values" in out
     answer = json.loads(cli("status", "scene.toml", "--out", "r.nc", "--set", "fixed.b=3", "--json")[1])
     assert (
@@ -207,7 +207,7 @@ WRONG_RUNS = {
     "result is the scene": (None, ["--out", "scene.toml", "--fresh"], "out = 'scene.toml': not a readable"),
     "name too long": (None, ["--out", "r" * 300], "--out = 'rrrr"),
     "name of the parts too long": (None, ["--out", "r" * 252], "(with '.parts')"),
-    "no folder can be made": (None, ["--out", "/proc/r.nc"], "a place where a folder can be made"),
+    "no folder can be made": (None, ["--out", "/proc/r.nc"], "a path in a writable folder"),
     "reuse of a foreign file": (
         lambda: xr.Dataset({"x": 1.0}).to_netcdf("x.nc", engine="h5netcdf"),
         ["--reuse", "x.nc"],

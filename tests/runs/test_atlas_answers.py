@@ -194,7 +194,7 @@ def test_the_nearest_change_beside_an_undecided_range():
 def test_a_change_that_may_hide_in_an_undecided_range_is_not_denied():
     atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
     nearest = design.Nearest("Omega", 1.0, None, None, ((0.9, 1.1),))
-    assert atlas_answers._reach(atlas, nearest) == "none from 0.3 to 2, unless where it is undecided:"
+    assert atlas_answers._reach(atlas, nearest) == "none from 0.3 to 2, except undecided ranges:"
     assert atlas_answers._reach(atlas, replace(nearest, undecided=())) == "none from 0.3 to 2"
 
 
@@ -213,7 +213,7 @@ def test_only_what_is_certain_is_denied():
         atlas_answers.widest_angle(crowded, {"Omega": (1.3, 1.5)})
     )
     none = atlas_answers.widest_angle(atlas_of((0.3, 1.2), (0.3, 2.0)), {"Omega": (1.3, 1.5)})
-    assert "\n  no beta of the atlas will do" in str(none) and none.data["certain"]
+    assert "\n  no beta of the atlas is sufficient" in str(none) and none.data["certain"]
 
 
 def test_stable_intervals_away_from_the_safe_end_are_listed():
@@ -221,7 +221,7 @@ def test_stable_intervals_away_from_the_safe_end_are_listed():
     atlas = atlas_of((0.9, 1.45), (0.5, 0.6), zeta=0.01, gamma=1.0)
     reply = atlas_answers.widest_angle(atlas, {"Omega": (0.5504, 0.5506)})
     assert "\n  unstable at beta = 0.9, the smallest of the atlas\n  stable from beta = 1.144318298 +- " in str(reply)
-    assert " to beta = 1.357177456 +- " in str(reply) and "will do" not in str(reply)
+    assert " to beta = 1.357177456 +- " in str(reply) and "is sufficient" not in str(reply)
     assert "\n  direct solves agree" in str(reply)
     found = json.loads(reply.to_json())
     assert found["value"] is None and found["error"] is None and found["certain"] and found["check"]["agrees"]

@@ -468,7 +468,7 @@ def test_a_chart_of_a_stored_atlas(stored):
         ({"axes": {"beta": {"start": 0.0}}}, "axes.beta.stop: missing; allowed is start and stop"),
         (
             {"axes": {}, "points": {"beta": [0.1]}},
-            "points: atlas is made over ranges; allowed are axes with start and stop",
+            "points: atlas needs ranges; allowed are axes with start and stop",
         ),
     ],
 )

@@ -131,7 +131,7 @@ def test_a_process_that_dies_while_it_gets_ready_is_started_again(drivetrain, pa
     package["FRAGILE_AT_START"] = deaths
     scene = SCENE | {"axes": {"delta": {"start": 0.1, "stop": 2.0, "num": 40}}}
     error = finished(drivetrain(scene, "starts", "--workers", "1"), code)
-    assert ("computed=40 reused=0 failed=0" if code == 0 else "die while they get ready") in error
+    assert ("computed=40 reused=0 failed=0" if code == 0 else "crash during their start") in error
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL])
@@ -286,7 +286,7 @@ def test_a_process_that_dies_between_two_chunks_is_replaced():
 
 def test_chunks_that_never_come_back_are_missed(monkeypatch):
     monkeypatch.setattr(Where, "compute", lambda *_: (chunk for chunk in ()))
-    with pytest.raises(dt.Incomplete, match=r"^1 chunk never came back"):
+    with pytest.raises(dt.Incomplete, match=r"^1 chunk returned no result"):
         dt.run(cardan_scene({"beta": {"values": [0.1, 0.2]}, "Omega": {"values": [1.0]}}))
 
 

@@ -347,9 +347,9 @@ def test_a_rearranged_copy_is_neither_taken_nor_called_complete(tmp_path, change
         run_to_file(LARGE, tmp_path / "new.nc", reuse=[copy])
     with pytest.raises(InputError, match=r"holds a damaged result \(.*--fresh replaces it"):
         run_to_file(LARGE, copy)
-    with pytest.raises(InputError, match=r"holds a result that was rearranged .*--fresh replaces it"):
+    with pytest.raises(InputError, match=r"holds a result that was changed in order or shape .*--fresh replaces it"):
         run_to_file(SMALL, copy)
-    assert status(SMALL, copy).state == "stale" and "rearranged" in status(SMALL, copy).reason
+    assert status(SMALL, copy).state == "stale" and "order or shape" in status(SMALL, copy).reason
     assert copy.read_bytes() == before and not (tmp_path / "new.nc").exists()
     assert counts(run_to_file(SMALL, copy, fresh=True)) == (22, 22, 0)
 
@@ -357,7 +357,9 @@ def test_a_rearranged_copy_is_neither_taken_nor_called_complete(tmp_path, change
 def test_a_transposed_copy_is_not_complete(tmp_path):
     run_to_file(SMALL, tmp_path / "r.nc")
     opened(tmp_path / "r.nc").transpose("a", "b", ...).to_netcdf(tmp_path / "turned.nc", engine="h5netcdf")
-    with pytest.raises(InputError, match=r"rearranged after it was written \(value, wave, sign, outcome\)"):
+    with pytest.raises(
+        InputError, match=r"changed in order or shape after it was written \(value, wave, sign, outcome\)"
+    ):
         run_to_file(SMALL, tmp_path / "turned.nc")
 
 
@@ -384,7 +386,7 @@ def test_damage_that_came_during_an_interrupted_growth_is_named(tmp_path):
     with h5py.File(path, "r+") as file:
         file["value"][1, 3] = -7.0
     assert "damaged (value)" in status(LARGE, path).reason
-    with pytest.raises(InputError, match=r"damaged \(value\); --fresh replaces it"):
+    with pytest.raises(InputError, match=r"damaged result \(value\); --fresh replaces it"):
         run_to_file(LARGE, path)
 
 

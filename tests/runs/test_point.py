@@ -157,7 +157,7 @@ def test_unknown_system_and_analysis():
 
 
 def test_a_function_has_no_value_at_one_point():
-    message = "analysis = 'atlas': is made over ranges; allowed at a point is one of floquet, forced"
+    message = "analysis = 'atlas': needs ranges; allowed at a point is one of floquet, forced"
     with pytest.raises(dt.InputError, match=f"^{message}$"):
         dt.point("cardan", "atlas", beta=0.3)
 

@@ -274,7 +274,7 @@ def test_work_is_not_resumed_over_a_result_that_came_meanwhile(grid_scene, tmp_p
     os.replace(meanwhile, path)
     before = path.read_bytes()
     assert status(grid_scene, path).state == "stale"
-    with pytest.raises(dt.InputError, match="beside another result than the one it was begun with"):
+    with pytest.raises(dt.InputError, match="that was started for another result"):
         run_to_file(grid_scene, path)
     assert path.read_bytes() == before
 
@@ -321,7 +321,7 @@ def test_a_run_that_ends_between_the_look_and_the_lock_is_noticed(grid_scene, tm
         open_folder(folder)
 
     monkeypatch.setattr(PartsFolder, "open", late)
-    with pytest.raises(dt.InputError, match="another run has changed it meanwhile"):
+    with pytest.raises(dt.InputError, match="another run has changed it"):
         run_to_file(grid_scene, path)
     assert status(other, path).state == "complete" and os.listdir(tmp_path) == ["r.nc"]
 

@@ -263,7 +263,7 @@ def test_a_shard_that_is_gone_is_found(grid_scene, tmp_path, name):
 
 def test_a_store_that_workers_wrote_elsewhere_is_not_finished(grid_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(shards, "write", lambda *_: None)
-    with pytest.raises(Incomplete, match=r"1 shards were written elsewhere; every worker has to see the store"):
+    with pytest.raises(Incomplete, match=r"1 shards are missing; every worker must see the store at"):
         to_store(ONE, tmp_path / "r.zarr")
     assert not (tmp_path / "r.zarr").exists()
 
