@@ -137,6 +137,14 @@ def test_chunks_that_dask_chooses_are_of_one_size(file):
     assert opened(file, 300, chunks={})["verdict"].chunks == ((300,), (300,))
 
 
+def test_chunks_agree_along_an_axis_that_predictions_depend_on(tmp_path):
+    axes = ATLAS["axes"] | {"mu": {"start": 0.9, "stop": 1.1}}
+    dt.run(ATLAS | {"axes": axes, "fixed": {"zeta": 0.001, "alpha": 1.0, "gamma": 100.0}}, out=tmp_path / "a.nc")
+    found = opened(tmp_path / "a.nc", 200, chunks={})
+    assert found["resonance_Omega"].dims == ("mu", "resonance")
+    assert found.chunks["mu"] == found["verdict"].chunksizes["mu"] and len(found.chunks["mu"]) > 10
+
+
 def test_arrays_travel_without_what_they_hold(file, expected):
     array = opened(file)["spectral_radius"].variable
     array[:10, :10].values  # noqa: B018
