@@ -127,9 +127,9 @@ class Analysis:
     default_outputs: tuple[str, ...]
     methods: Mapping[str, tuple[str, ...]]
     options: tuple[Parameter, ...]
-    solvers: Callable[[System, Request], tuple[Solver, ...]]
-    dimensions: Callable[[System, Request, Mapping[str, Any]], tuple[Dimension, ...]] = lambda *_: ()
-    lacks: Callable[[System], Mapping[str, str]] = lambda _: {}
+    solvers: Callable[[type[System], Request], tuple[Solver, ...]]
+    dimensions: Callable[[type[System], Request, Mapping[str, Any]], tuple[Dimension, ...]] = lambda *_: ()
+    lacks: Callable[[type[System]], Mapping[str, str]] = lambda _: {}
     path_axis: Callable[[Request], str | None] = lambda _: None
     derivatives: Callable[..., Mapping[str, Array]] | None = None
     continuous: bool = False

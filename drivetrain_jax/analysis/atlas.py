@@ -14,7 +14,7 @@ from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES, lacks
 from drivetrain_jax.systems import System
 
 
-def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     solves = floquet_propagator.ANALYSIS
     return solves.solvers(system, replace(request, outputs=solves.default_outputs))
 

@@ -114,7 +114,7 @@ def shares(high: Array, low: Array, multiple: Array, outcome: Array) -> dict[str
     }
 
 
-def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     build = system.models["basins"].build
     return (Solver("exact", partial(_solve, build, request), chunk=_CHUNK),)
 

@@ -77,7 +77,7 @@ def separation_margin(speed: Array, lowest: float, highest: float) -> Array:
     return jnp.maximum(jnp.maximum(below, (speed - highest) / highest), 0.0)
 
 
-def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     options = request.options
     if request.method == "krylov_determinant":
         for name in (name for name in _ADDITIONS if name in {p.name for p in system.parameters}):
@@ -137,7 +137,7 @@ def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Ar
     return {name: results[name] for name in (*request.outputs, "outcome")}
 
 
-def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     build = system.models["critical_speeds"].build
     modes = request.options["modes"]
     room = _ROOTS_PER_CHUNK // modes

@@ -81,7 +81,7 @@ def _derivatives(
     return found
 
 
-def _lacks(system: System) -> dict[str, str]:
+def _lacks(system: type[System]) -> dict[str, str]:
     return lacks(system) | ({} if "atlas" in system.models else {"atlas": f"{system.name} has no model for it"})
 
 

@@ -201,7 +201,7 @@ def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Ar
     del effort
     model, rtol = build(values), request.options["rtol"]
     response = linear_response(model, len(STATE.values), rtol, "amplitude" in request.outputs)
-    results = {"periodic_state": response.state, "periodic_state_error": response.error}
+    results: dict[str, Any] = {"periodic_state": response.state, "periodic_state_error": response.error}
     results["amplitude"] = response.amplitude
     outcome = response.outcome
     if "condition" in request.outputs:
@@ -231,7 +231,7 @@ def _matrices(build: Build, values: Mapping[str, Any]) -> Array:
     return model.period * jax.vmap(lambda t: jax.jacfwd(lambda y: model.linear(t, y))(jnp.zeros(n)))(phases)
 
 
-def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     build = system.models["forced"].build
     steps = partial(predicted_steps, build)
     chunk = CHUNK if set(request.outputs) <= set(LINEAR) else ORBITS_CHUNK

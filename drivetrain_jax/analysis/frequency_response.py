@@ -96,7 +96,7 @@ _SPECIAL = frozenset(("fold_frequency", "doubling_frequency"))
 _CHUNK = 50
 
 
-def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     """Directions, branches and folds; ``InputError`` for a result that the method does not give, or too few samples."""
     del system, fixed
     for name in request.outputs:
@@ -180,7 +180,7 @@ def _exact_branch(
     )
 
 
-def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     build = system.models["frequency_response"].build
     return (Solver(request.method, partial(_solve, build, request), chunk=_CHUNK),)
 

@@ -137,14 +137,14 @@ def _segment(
         t1=end,
         dt0=None,
         y0=place.y,
-        stepsize_controller=WatchedSteps(controller, part, end - place.fraction),
+        stepsize_controller=WatchedSteps(controller, part, end - place.fraction),  # pyright: ignore[reportCallIssue]
         saveat=diffrax.SaveAt(t1=True, controller_state=True),
         adjoint=diffrax.ForwardMode(),
         max_steps=_MAX_SEGMENT,
         throw=False,
     )
     well = solution.result == diffrax.RESULTS.successful
-    return solution.ys[0], largest_met(solution), solution.stats["num_steps"], well
+    return solution.ys[0], largest_met(solution), solution.stats["num_steps"], well  # pyright: ignore[reportOptionalSubscript]
 
 
 def _ahead(place: _Place, target: tuple[Array, Array]) -> Array:
@@ -198,7 +198,7 @@ def _twice(flow: Flow, times: Array, tolerance: Array, attempts: Array, request:
     solver = getattr(diffrax, request.options["solver"])()
     settings = tolerance * jnp.array([1.0, _COARSER]), _PART**attempts * jnp.array([_PART, 1.0])
     # One after the other in one loop: compiled once.
-    runs, reached, healthy = jax.lax.map(lambda setting: trajectory(flow, times, *setting, solver), settings)
+    runs, reached, healthy = jax.lax.map(lambda setting: trajectory(flow, times, *setting, solver), settings)  # pyright: ignore[reportCallIssue]
     error = jnp.abs(runs[0] - runs[1])
     largest = jnp.max(error)
     excess = jnp.where(largest == 0, 0.0, largest / (request.options["rtol"] * reached[0]))
@@ -230,7 +230,7 @@ def _integrated(flow: Flow, request: Request) -> _Found:
     return jax.lax.while_loop(missed, attempt, start)
 
 
-def _solve(system: System, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """All requested results of one point; ``effort`` only orders the batches, as the integration is adaptive."""
     del effort
     flow: Flow = system.models["history"].build(values)
@@ -245,7 +245,7 @@ def _solve(system: System, request: Request, values: Mapping[str, Any], effort: 
     return {name: results[name] for name in request.outputs} | {"outcome": outcome.astype(jnp.int8)}
 
 
-def _effort(system: System, request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+def _effort(system: type[System], request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Predicted segments, shape (N,): strobes and requested times; infinite beyond what is worth beginning."""
     times = requested_times(request)
     strobes = times[-1] / predicted(_period, (system.models["history"].build, system.name), columns)
@@ -259,13 +259,13 @@ def _period(build: Callable[..., Flow], name: str, values: Mapping[str, Any]) ->
     return jnp.asarray(flow.period)
 
 
-def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     name = f"diffrax: {request.options['solver']}"
     solve, effort = partial(_solve, system, request), partial(_effort, system, request)
     return (Solver(name, over_lanes(solve), effort, chunk=16, march=True, lengthy=True),)
 
 
-def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     return (Dimension("time", "time", requested_times(request), "s"),)
 
 

@@ -94,7 +94,7 @@ def spectrum_of(record: Record) -> Spectrum:
     """Exponents after the transient. Of a motion that left: means over what there is, errors NaN."""
     values, errors = mean_rate(record, record.growth)
     order = jnp.argsort(-values, axis=0)
-    return Spectrum(*(jnp.take_along_axis(x, order, axis=0) for x in (values, errors)), order)
+    return Spectrum(*(jnp.take_along_axis(x, order, axis=0) for x in (values, errors)), order)  # pyright: ignore[reportCallIssue]
 
 
 def mean_rate(record: Record, series: Array) -> tuple[Array, Array]:
@@ -163,7 +163,7 @@ def evidence_of(flow: Flow, fine: Record, found: Findings, seen: Sampling) -> Ev
     )  # fmt: skip
 
 
-def _solve(system: System, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """All requested results of a batch, its axis last; ``effort`` only orders the batches."""
     del effort
     return analyse(system.models["lyapunov"].build(values), request)
@@ -231,7 +231,7 @@ def averaging_time(record: Record) -> Array:
     return jnp.where(record.bounded, BLOCKS * block_size(record.used) * record.span, jnp.nan)
 
 
-def _effort(system: System, request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+def _effort(system: type[System], request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Predicted steps, shape (N,): those of a whole run, or up to where the mean contraction has settled the motion, and of
     the strobes that follow it.
 
@@ -261,7 +261,7 @@ def _dimensions(*_: Any) -> tuple[Dimension, ...]:
     )
 
 
-def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     solve, effort = partial(_solve, system, request), partial(_effort, system, request)
     return (Solver("tangent", solve, effort, chunk=_CHUNK, march=True, lengthy=True),)
 

@@ -145,7 +145,7 @@ def _lift(block: Block, part: BlockModes, lanes: int) -> Array:
     """Vectors of a block in the coordinates of the system, (dofs, n * copies, N)."""
     basis = block.basis if block.basis.ndim == 4 else block.basis[..., None]
     lifted = sum(basis[:, c, None] * part.vectors[c, :, None] for c in range(basis.shape[1]))
-    lifted = lifted.reshape(basis.shape[0], -1, lifted.shape[-1])
+    lifted = lifted.reshape(basis.shape[0], -1, lifted.shape[-1])  # pyright: ignore[reportAttributeAccessIssue]
     return jnp.broadcast_to(lifted, (*lifted.shape[:2], lanes))
 
 
@@ -178,7 +178,7 @@ def _results(build: Build, request: Request, values: Mapping[str, Any], lanes: i
             modes.found, mode_types(modes.frequency, modes.label, largest), len(MODE_TYPES) - 1
         )
         if shapes:
-            vectors = jnp.where(modes.found, _canonical(modes.vectors), jnp.nan)
+            vectors = jnp.where(modes.found, _canonical(modes.vectors), jnp.nan)  # pyright: ignore[reportArgumentType]
             mass = model.mass[:, None] if model.mass.ndim == 2 else model.mass[:, None, None]
             results["mode_shape"] = jnp.swapaxes(vectors / jnp.sqrt(mass), 0, 1)
             results["kinetic_energy"] = _by_body(vectors, model.bodies)
@@ -241,14 +241,14 @@ def _along(values: np.ndarray) -> tuple[Any, Any]:
     return order, np.argsort(order)
 
 
-def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     chunk = _SPECTRUM_CHUNK if set(request.outputs) <= _SPECTRUM else _MODES_CHUNK
     chunk = _LINES_CHUNK if request.options["track"] else chunk
     solve = partial(_solve, system.models["modes"].build, request)
     return (Solver("singular values", solve, chunk=chunk, short_loops=True),)
 
 
-def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     """Modes counted from 1, families, bodies and coordinates."""
     followed = sorted(_FOLLOWED & set(request.outputs))
     if followed and not request.options["track"]:

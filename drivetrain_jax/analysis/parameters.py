@@ -35,7 +35,7 @@ VARIABLES = (
 )
 
 
-def _solve(system: System, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     del effort
     constants = system.models["parameters"].build(values)
     results = {name: jnp.asarray(constants[name], float) for name in request.outputs if name != "midshaft_frequency"}
@@ -54,11 +54,11 @@ def _lanes(result: Array, name: str) -> Array:
     return result if name == "midshaft_frequency" else result[None]
 
 
-def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     return (Solver("closed form", partial(_solve, system, request), chunk=4096),)
 
 
-def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     return (Dimension(MODE, "number of the mode", tuple(range(1, request.options["modes"] + 1))),)
 
 

@@ -98,7 +98,7 @@ def adaptive_section(flow: Flow, request: Request) -> Section:
             diffrax.Dopri5(), 0.0, 1.0, None, y,
             stepsize_controller=controller, saveat=diffrax.SaveAt(t1=True), max_steps=_MAX_STEPS, throw=False,
         )  # fmt: skip
-        y = solution.ys[0]
+        y = solution.ys[0]  # pyright: ignore[reportOptionalSubscript]
         return y, well & (solution.result == diffrax.RESULTS.successful)
 
     def keep(carry: tuple, strobe: Array) -> tuple:
@@ -157,7 +157,7 @@ def _angle(flow: Flow, strobes: Array) -> Array | None:
     return jnp.broadcast_to(angle, (len(strobes), *batch_shape(flow)))
 
 
-def _solve(system: System, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """All requested results, the batch (if any) as last axis; ``effort`` only orders the batches."""
     del effort
     flow: Flow = system.models["poincare"].build(values)
@@ -186,7 +186,7 @@ def _effort(request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.full(count, strobes if strobes * request.options.get("steps", 1) <= MOST_STEPS else np.inf)
 
 
-def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     solve, effort = partial(_solve, system, request), partial(_effort, request)
     if request.method == "adaptive":
         return (Solver("adaptive", over_lanes(solve), effort, chunk=16, march=True, lengthy=True),)
@@ -194,7 +194,7 @@ def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
     return (Solver("fixed", solve, effort, chunk=chunk, march=True, lengthy=True),)
 
 
-def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     first, count = (request.options[name] for name in ("discard", "strobes"))
     strobes = Dimension("strobe", "number of the strobe", tuple(range(first + 1, first + count + 1)))
     return (strobes, Dimension("state", "twist, then rate of twist", ()))

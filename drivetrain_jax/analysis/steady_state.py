@@ -110,7 +110,7 @@ def _solve(
     return {name: x.reshape(*x.shape[:-1], *shape) for name, x in wanted.items()}
 
 
-def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     build = system.models["steady_state"].build
     return (Solver("exact", partial(_solve, build, request), chunk=_CHUNK),)
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -222,7 +222,7 @@ class _Iteration(NamedTuple):
     """Best coefficients so far, the Newton step from there, its part that is tried, the residual there, the size of the
     step, and whether the determinant is negative."""
 
-    count: Array
+    count: Array  # pyright: ignore[reportIncompatibleMethodOverride]
     best: Array
     change: Array
     part: Array
@@ -290,7 +290,7 @@ def drift(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array
     eye = jnp.eye(basis.size).reshape(turn.shape)
     inertia = (2 * omega / basis.order * turn + model.damping * eye) * omega / np.pi
 
-    def advance(_: int, x: Array) -> Array:
+    def advance(_: Any, x: Array) -> Array:
         touch = contact(model, basis, x)
         force, _ = residual(model, basis, x, omega, touch)
         return x - solve(jacobian(model, basis, omega, touch) + inertia, force[:, None])[:, 0]

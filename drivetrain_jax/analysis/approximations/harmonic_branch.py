@@ -7,7 +7,7 @@ across it lead back. Every lane has its own step length, shortened where they fa
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -66,7 +66,7 @@ def _advance(
     """A trial step: point, tangent there, whether it closed, whether it was quick."""
     guess = front.point + front.length * front.tangent
 
-    def correct(_: int, state: tuple[Array, ...]) -> tuple[Array, ...]:
+    def correct(_: Any, state: tuple[Array, ...]) -> tuple[Array, ...]:
         point, _, first, _ = state
         force, matrix = _bordered(model, basis, units, point, front.tangent)
         along = jnp.sum(front.tangent * (point - guess), axis=0)

@@ -148,7 +148,7 @@ def _sweeps(
     back = len(fine) - 1 - places
     x = jnp.stack([x[places, :, 0], x[back, :, 1]], axis=1)
     flags = (flag.reshape(len(fine), 2, *lanes) for flag in (swept.balanced, swept.saddle))
-    return x, *(jnp.stack([flag[places, 0], flag[back, 1]], axis=1) for flag in flags)
+    return x, *(jnp.stack([flag[places, 0], flag[back, 1]], axis=1) for flag in flags)  # pyright: ignore[reportReturnType]
 
 
 def _branches(

@@ -55,7 +55,7 @@ def _ordered_product(matrices: Rows) -> Rows:
         for m, u in zip(matrices, unit, strict=True)
     )
     by_block = tuple(jnp.moveaxis(m.reshape(_BLOCKS, -1, *tail), 0, 1) for m in filled)
-    blocks = jax.lax.scan(multiply, tuple(jnp.broadcast_to(u, (_BLOCKS, *tail)) for u in unit), by_block)[0]
+    blocks = jax.lax.scan(multiply, tuple(jnp.broadcast_to(u, (_BLOCKS, *tail)) for u in unit), by_block)[0]  # pyright: ignore[reportArgumentType]
     return jax.lax.scan(multiply, unit, blocks)[0]
 
 

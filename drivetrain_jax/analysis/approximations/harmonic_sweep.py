@@ -68,7 +68,7 @@ def settle(
 
     def advance(number: Array, until: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         moved = _runge_kutta(model, omega, (number % jnp.maximum(turn, 1)) * h, h, state)
-        return tuple(jnp.where(number < until, new, old) for new, old in zip(moved, state, strict=True))
+        return tuple(jnp.where(number < until, new, old) for new, old in zip(moved, state, strict=True))  # pyright: ignore[reportReturnType]
 
     def project(sample: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         u, v, total = carry

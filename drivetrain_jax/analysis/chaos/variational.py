@@ -7,7 +7,7 @@ caches. Time enters through :meth:`Flow.angles` of a counted strobe, so that not
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -36,7 +36,7 @@ def batch_shape(flow: Flow) -> tuple[int, ...]:
     """Shape of the batch that the parameters of ``flow`` span."""
     rates = jax.eval_shape(lambda: [jnp.asarray(r) for r in flow.field(flow.angles(0, 0.0), flow.start)])
     shapes = [jnp.shape(x) for x in (*flow.start, flow.period, *flow.turns)]
-    return jnp.broadcast_shapes(*(r.shape for r in rates), *shapes)
+    return jnp.broadcast_shapes(*(r.shape for r in rates), *shapes)  # pyright: ignore[reportReturnType]
 
 
 def initial_state(flow: Flow) -> Vector:
@@ -98,7 +98,7 @@ def _step(flow: Flow, angles: Callable[[float], tuple], h: Any, frame: Frame) ->
     return _advanced(frame, h, dop853.B, slopes)
 
 
-def _advanced(frame: Frame, h: Any, weights: Any, slopes: list[Frame]) -> Frame:
+def _advanced(frame: Frame, h: Any, weights: Any, slopes: Sequence[Frame]) -> Frame:
     """``frame + h sum(weights * slopes)``, component by component."""
     terms = [(float(w), slope) for w, slope in zip(weights, slopes, strict=True) if w != 0]
     if not terms:
@@ -144,7 +144,7 @@ def divergence(flow: Flow, angles: tuple, y: Vector) -> Array:
         return jnp.asarray(flow.divergence(angles, y), float)
     _, push = jax.linearize(_field(flow, angles, y[0].shape), *y)
     zero = jnp.zeros_like(y[0])
-    return sum(push(*(zero + float(i == j) for i in range(flow.size)))[j] for j in range(flow.size))
+    return sum(push(*(zero + float(i == j) for i in range(flow.size)))[j] for j in range(flow.size))  # pyright: ignore[reportReturnType]
 
 
 def orthonormal(tangents: Vector) -> tuple[Vector, Array]:

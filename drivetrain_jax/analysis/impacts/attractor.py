@@ -77,7 +77,7 @@ class Attractors(NamedTuple):
     stalled: Array
 
 
-_RESULT = Attractors(0, 0, 0, (0, 0, 0, 0), 0, 0, 0, 0)
+_RESULT = Attractors(0, 0, 0, (0, 0, 0, 0), 0, 0, 0, 0)  # pyright: ignore[reportArgumentType]
 
 
 def averaged(periods: Any) -> Any:

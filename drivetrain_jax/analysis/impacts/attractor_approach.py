@@ -89,7 +89,7 @@ def along(orbit: Orbit, away: tuple[Array, Array]) -> tuple[Array, Array]:
     root = jnp.sqrt(jnp.maximum(half**2 - jnp.exp(orbit.log_determinant), 0.0))
     slow, fast = jnp.where(half < 0, half - root, half + root), jnp.where(half < 0, half + root, half - root)
     moved = apply(orbit.matrix, *away)
-    return tuple((m - fast * x) / (slow - fast) for m, x in zip(moved, away, strict=True))
+    return tuple((m - fast * x) / (slow - fast) for m, x in zip(moved, away, strict=True))  # pyright: ignore[reportReturnType]
 
 
 def creeps(orbit: Orbit, state: tuple[Array, Array], omega: Array) -> Array:

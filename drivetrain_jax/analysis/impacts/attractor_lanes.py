@@ -31,7 +31,7 @@ class Lane(NamedTuple):
     job: Array
     place: Array
     motion: Motion
-    count: Array  # periods settled
+    count: Array  # periods settled  # pyright: ignore[reportIncompatibleMethodOverride]
     due: Array  # periods after which the next search starts
     latest: tuple[Array, Array]  # state after these
     tangent: tuple[Array, Array]
@@ -83,7 +83,7 @@ def record(history: Array, now: Array, lane: Lane) -> Array:
     return jnp.where(jnp.concatenate([row, row]) == _ROWS, jnp.concatenate(lane.latest), history)
 
 
-def restart(lane: Lane, going: Array, u: Array, v: Array, periods: Array) -> Lane:
+def restart(lane: Lane, going: Array, u: Array, v: Array, periods: Array | int) -> Lane:
     """Lanes ``going`` start anew at the beginning of a period from ``(u, v)``."""
     one, zero = jnp.ones_like(u), jnp.zeros_like(u)
     count = jnp.zeros(u.shape, jnp.int32)

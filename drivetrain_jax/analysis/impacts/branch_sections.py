@@ -91,7 +91,7 @@ def sections(branch: Course, omega: Array, count: int) -> tuple[Array, Array, Ar
         return jnp.where(here == start, middle, low), jnp.where(here == start, high, middle)
 
     low, high = jax.lax.fori_loop(0, _HALVINGS, halve, (low, high))
-    found = _cubic(ends, slopes, ((low + high) / 2)[:, None])
+    found = _cubic(ends, slopes, ((low + high) / 2)[:, None])  # pyright: ignore[reportArgumentType]
     return jnp.where(exists[:, None], found, 0.0), exists, every
 
 

@@ -100,7 +100,7 @@ def _on_plane(model: PiecewiseLinearOscillator, multiple: int, guess: Array, nor
             tuple(normal[k] / scale[k] for k in range(3)),
         )
         along = jnp.sum(normal * (guess - old.x) / scale, axis=0)
-        step = _solve_3(rows, (old.x[0] - end[0], old.x[1] - end[1], along))
+        step = _solve_3(rows, (old.x[0] - end[0], old.x[1] - end[1], along))  # pyright: ignore[reportArgumentType]
         change = jnp.max(jnp.abs(step / scale), axis=0)
         open_ = old.change > _CONVERGED
         new = _Solved(old.x + step, m, derivative, old.corrections + 1, change)

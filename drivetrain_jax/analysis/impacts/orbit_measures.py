@@ -62,16 +62,16 @@ class Measures(NamedTuple):
     complete: Array
 
 
-_RESULT = Measures(0, 0, 0, (0,) * 4, (0,) * 2, (0,) * 2, (0,) * 2, 0, (0,) * 4, 0)
+_RESULT = Measures(0, 0, 0, (0,) * 4, (0,) * 2, (0,) * 2, (0,) * 2, 0, (0,) * 4, 0)  # pyright: ignore[reportArgumentType]
 
 
 def _fresh(u: Array, side: Array) -> Measures:
     zero = jnp.zeros_like(u)
     pair = (zero, zero)
-    return Measures(zero, u, u, (zero,) * 4, pair, pair, pair, side, (zero + 1, zero, zero, zero + 1), zero)
+    return Measures(zero, u, u, (zero,) * 4, pair, pair, pair, side, (zero + 1, zero, zero, zero + 1), zero)  # pyright: ignore[reportArgumentType]
 
 
-def _reversal(motion: Motion, rate: Derivatives, size: Array) -> Bound:
+def _reversal(motion: Motion, rate: Derivatives, size: tuple[Array, Array]) -> Bound:
     """How far the velocity is from changing sign; infinitely far where nothing moves."""
     v, a = motion.v, rate.acceleration
     sign = jnp.where(v != 0, jnp.sign(v), jnp.sign(a))
@@ -152,7 +152,7 @@ class _Work(NamedTuple):
     ``renewed``: where a lane has just turned to another motion.
     """
 
-    index: Array
+    index: Array  # pyright: ignore[reportIncompatibleMethodOverride]
     queue: Array
     renewed: Array
     motion: Motion
@@ -174,7 +174,7 @@ def measure(
     most = jnp.where(recurs, multiple, MOST_PERIODS)
     task = _Task(oscillator, jnp.stack([u, v, most.astype(float), recurs.astype(float)]), integrals)
     index, blank = jnp.arange(width, dtype=jnp.int32), jnp.zeros(width)
-    motion = Motion(blank, blank, blank, blank, blank, (blank,) * 4, 0 * index, 0 * index)
+    motion = Motion(blank, blank, blank, blank, blank, (blank,) * 4, 0 * index, 0 * index)  # pyright: ignore[reportArgumentType]
     store = jnp.zeros((len(jax.tree.leaves(_RESULT)), count))
     work = _Work(index, jnp.asarray(width, jnp.int32), index >= 0, motion, _fresh(blank, blank), store)
     work = jax.lax.while_loop(lambda work: jnp.any(work.index < count), lambda work: _tick(task, work), work)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-Matrix = tuple[Array, Array, Array, Array]
+# Four entries, row by row.
+Matrix = tuple[Array, ...]
 
 
 def spectral_radius(matrix: Matrix, log_determinant: Array) -> Array:

@@ -13,6 +13,7 @@ from functools import cache, partial
 from typing import Any, ParamSpec, TypeVar
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import jaxlib
 from jax import Array
@@ -20,7 +21,8 @@ from jax.experimental.xla_metadata import set_xla_metadata
 
 from drivetrain_jax._machine import instruction_set
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 # Numbers in a vector of AVX-512.
 FULL_WIDTH = 8
@@ -85,7 +87,7 @@ def compiler_knows(option: str, value: Any) -> bool:
 
     Those of jaxlib 0.10 are known without asking, which takes the time of a small compilation.
     """
-    if jaxlib.__version__.startswith("0.10."):
+    if jaxlib.__version__.startswith("0.10."):  # pyright: ignore[reportPrivateImportUsage]
         return True
     try:
         jax.jit(lambda: jnp.zeros(())).lower().compile({option: value})
@@ -99,7 +101,7 @@ def stored(function: Callable[P, R]) -> Callable[P, R]:
     return _marked(function, _APART)
 
 
-def in_one_kernel(function: Callable[P, R]) -> Callable[P, R]:
+def in_one_kernel(function: Callable[..., R]) -> Callable[..., R]:
     """``function``, loops and all, as a single kernel: for batches that fit into the innermost cache.
 
     Everything in it has to pass :func:`suits_one_kernel`.

@@ -15,7 +15,8 @@ from jax import Array
 
 from drivetrain_jax.analysis.numerics.kernels import stored
 
-Complex = tuple[Array, Array]
+# Real and imaginary part.
+Complex = tuple[Array, ...]
 
 _EPS = np.finfo(float).eps
 _MAX_SWEEPS = 40
@@ -23,10 +24,10 @@ _MAX_SWEEPS = 40
 
 def matmul(a: Array, b: Array) -> Array:
     """Product of matrices whose batch axes trail: ``(n, m, ...)`` times ``(m, k, ...)``."""
-    return sum(a[:, j, None] * b[None, j] for j in range(a.shape[1]))
+    return sum(a[:, j, None] * b[None, j] for j in range(a.shape[1]))  # pyright: ignore[reportReturnType]
 
 
-def looped_matmul(a: Array, b: Array) -> Array:
+def looped_matmul(a: Array, b: Array | np.ndarray) -> Array:
     """The same for matrices of ten rows and more, for which that would be long to compile."""
 
     def add(j: Array, total: Array) -> Array:
@@ -152,10 +153,10 @@ def _sweep(h: Complex, shift: Complex, size: Array) -> Complex:
     # Stored: each rotation would be computed anew for all that follows from it, and compiled as often.
     for k in range(n - 1):
         x, y = rows[k], rows[k + 1]
-        rows[k], rows[k + 1], *rotation = stored(_turn_rows)(x, y, *((r[0][k], r[1][k]) for r in (x, y)), active[k + 1])
+        rows[k], rows[k + 1], *rotation = stored(_turn_rows)(x, y, *((r[0][k], r[1][k]) for r in (x, y)), active[k + 1])  # pyright: ignore[reportCallIssue]
         rotations.append(rotation)
     re, im = (jnp.stack([row[part] for row in rows]) for part in (0, 1))
-    columns = [(re[:, j], im[:, j]) for j in range(n)]
+    columns: list[Complex] = [(re[:, j], im[:, j]) for j in range(n)]
     for k, rotation in enumerate(rotations):
         columns[k], columns[k + 1] = stored(_turn_columns)(columns[k], columns[k + 1], *rotation)
     return _add_to_diagonal(tuple(jnp.stack([x[part] for x in columns], axis=1) for part in (0, 1)), shift, active)

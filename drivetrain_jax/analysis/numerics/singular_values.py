@@ -57,7 +57,7 @@ def bidiagonal_form(*blocks: Array) -> Bidiagonal:
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(block), axis=(0, 1)) for block in blocks]), axis=0)
     scale = jnp.where(finite & (size > 0), size, 1.0)
     pairs = [_bidiagonalise(jnp.where(finite, block / scale, 0.0)) for block in blocks]
-    return Bidiagonal(*(jnp.concatenate([pair[i] for pair in pairs]) for i in (0, 1)), scale, finite)
+    return Bidiagonal(*(jnp.concatenate([pair[i] for pair in pairs]) for i in (0, 1)), scale, finite)  # pyright: ignore[reportCallIssue]
 
 
 def _reflector(x: Array, place: Array) -> tuple[Array, Array, Array, Array]:

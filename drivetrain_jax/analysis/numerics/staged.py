@@ -85,7 +85,7 @@ def _shared_once(equations: Sequence[JaxprEqn], results: Iterable[Any]) -> list[
         (out,) = equation.outvars
         heads = users.get(out, set())
         # What does not depend on the lane is not computed for every lane.
-        alone = len(heads) == 1 and out not in wanted and all(v.aval.size == out.aval.size for v in heads)
+        alone = len(heads) == 1 and out not in wanted and all(v.aval.size == out.aval.size for v in heads)  # pyright: ignore[reportAttributeAccessIssue]
         head_of[out] = next(iter(heads)) if alone else out
         for v in _variables(equation.invars):
             users.setdefault(v, set()).add(head_of[out])

@@ -25,17 +25,17 @@ class WatchedSteps(diffrax.AbstractAdaptiveStepSizeController[_State, None]):
     length: Any
 
     @property
-    def rtol(self) -> Any:
+    def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         """That of the controller."""
         return self.controller.rtol
 
     @property
-    def atol(self) -> Any:
+    def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         """That of the controller."""
         return self.controller.atol
 
     @property
-    def norm(self) -> Any:
+    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """That of the controller."""
         return self.controller.norm
 
@@ -54,7 +54,7 @@ class WatchedSteps(diffrax.AbstractAdaptiveStepSizeController[_State, None]):
         step = jnp.where(step < longest / 2, step, jnp.minimum(self.part * step, longest))
         return t0 + step, (state, jnp.max(jnp.abs(y0)), longest)
 
-    def adapt_step_size(
+    def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any, error_order: Any, state: _State
     ) -> tuple:
         """Whether the step is kept, the next one, whether it begins at a jump, the state, and the result."""
@@ -68,4 +68,4 @@ class WatchedSteps(diffrax.AbstractAdaptiveStepSizeController[_State, None]):
 
 def largest_met(solution: diffrax.Solution) -> Array:
     """Largest component in absolute value of the states at the ends of the steps; saved with ``controller_state=True``."""
-    return solution.controller_state[1]
+    return solution.controller_state[1]  # pyright: ignore[reportOptionalSubscript]

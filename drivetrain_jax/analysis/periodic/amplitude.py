@@ -25,7 +25,7 @@ class _Peaks(NamedTuple):
     y: Array
     aimed: Array
     largest: Array
-    count: Array
+    count: Array  # pyright: ignore[reportIncompatibleMethodOverride]
     made_jump: Any
     solver: Any
     control: Any
@@ -53,7 +53,7 @@ def amplitudes(
     def advance(s: _Peaks) -> _Peaks:
         y1, error, dense, state, _ = solver.step(term, s.t0, s.t1, s.y, None, s.solver, s.made_jump)
         # Where steps end is no matter of derivatives: at a peak the solution does not change with time.
-        adapted = control.adapt_step_size(s.t0, s.t1, *fixed((s.y, y1)), None, fixed(error), order, s.control)
+        adapted = control.adapt_step_size(s.t0, s.t1, *fixed((s.y, y1)), None, fixed(error), order, s.control)  # pyright: ignore[reportArgumentType]
         keep, t0, t1, jump, controlled, result = adapted
         # An empty step ends the loop: the controller has given up.
         t1 = jnp.where(result == diffrax.RESULTS.successful, jnp.minimum(t1, period), t0)
@@ -68,7 +68,7 @@ def amplitudes(
         y, state, largest = jax.tree.map(
             lambda new, old: jnp.where(keep & ~again, new, old), (y1, state, largest), (s.y, s.solver, s.largest)
         )
-        return _Peaks(t0, t1, y, new & (found.place == nearest), largest, s.count + 1, jump, state, controlled)
+        return _Peaks(t0, t1, y, new & (found.place == nearest), largest, s.count + 1, jump, state, controlled)  # pyright: ignore[reportArgumentType]
 
     zero = jnp.zeros(())
     t1, controlled = control.init(term, zero, period, fixed(start), None, None, solver.func, order)

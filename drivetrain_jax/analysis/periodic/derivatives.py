@@ -91,7 +91,7 @@ def monodromy_change(
             return assemble(reduced_form(build, parameters, constants), phi)
 
         halves = reduced_form(build, parameters, constants).halves
-        return Change(*jax.jvp(z, (parameters, phi), (direction, change)), halves * found.log_scale)
+        return Change(*jax.jvp(z, (parameters, phi), (direction, change)), halves * found.log_scale)  # pyright: ignore[reportCallIssue]
 
     found = jax.vmap(along)(jnp.eye(len(leaves)))
     return Change(found.z[0], found.dz, found.log_scale[0])

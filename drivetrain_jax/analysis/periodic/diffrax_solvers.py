@@ -164,5 +164,5 @@ def diffrax_propagator(
         **options,
     )
     success = solution.result == diffrax.RESULTS.successful
-    matrix = jnp.where(success, solution.ys[-1], jnp.nan)
+    matrix = jnp.where(success, solution.ys[-1], jnp.nan)  # pyright: ignore[reportOptionalSubscript]
     return Propagator(matrix, jnp.zeros(()), jnp.ones(())), success

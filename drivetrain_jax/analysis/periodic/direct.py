@@ -57,7 +57,7 @@ def assemble(system: LinearPeriodic, phi: Array) -> Array:
     """The monodromy matrix, up to similarity, from the propagator over the span: ``Phi``, ``X Phi^T X Phi`` or
     ``R0 Phi^T R1 Phi``."""
     if system.reversal is not None:
-        return _reversed(*map(dense, system.reversal()), phi)
+        return _reversed(*map(dense, system.reversal()), phi)  # pyright: ignore[reportCallIssue]
     if system.reversor is None:
         return phi
     x = jnp.asarray(system.reversor).reshape(*phi.shape[:2], *(1,) * (phi.ndim - 2))
@@ -74,11 +74,11 @@ def _assembled(system: LinearPeriodic, fine: Array, coarse: Array) -> tuple[Arra
     """The monodromy matrices of two propagators, up to one similarity, and the size of what was added up in the first."""
     z = [assemble(system, fine), assemble(system, coarse)]
     if system.reversal is None:
-        return *z, jnp.sum(fine**2, axis=(0, 1)) ** (system.halves / 2)
-    size = _reversed(*(jnp.abs(dense(rows)) for rows in system.reversal()), jnp.abs(fine))
+        return *z, jnp.sum(fine**2, axis=(0, 1)) ** (system.halves / 2)  # pyright: ignore[reportReturnType]
+    size = _reversed(*(jnp.abs(dense(rows)) for rows in system.reversal()), jnp.abs(fine))  # pyright: ignore[reportCallIssue]
     scales = _balance(size)
     *z, size = (matrix * scales / scales[:, None] for matrix in (*z, size))
-    return *z, jnp.sqrt(jnp.sum(size**2, axis=(0, 1)))
+    return *z, jnp.sqrt(jnp.sum(size**2, axis=(0, 1)))  # pyright: ignore[reportReturnType]
 
 
 def _balance(size: Array) -> Array:
@@ -120,7 +120,7 @@ def compare(
     steps: Array,
     stiffness: Array | float,
     rtol: float,
-    reduction: float,
+    reduction: Array | float,
 ) -> Monodromy:
     """Monodromy matrix of ``fine`` and its error; ``stiffness`` as of :func:`stiffness_of`.
 
@@ -167,7 +167,7 @@ def direct_monodromy(
     stiffness: Array | float,
     rtol: float,
     order: int,
-    ratio: int = 2,
+    ratio: Array | int = 2,
     least: Array | float = 0.0,
     most_pieces: Array | int = 1,
 ) -> Monodromy:

@@ -37,7 +37,7 @@ _PLACES = tuple(_NODES.tolist())
 Build = Callable[..., "FloquetModel"]
 
 
-def explicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
+def explicit_effort(system: type[System], columns: Mapping[str, Any], rtol: float) -> np.ndarray:
     """Steps of the explicit scheme, ``(N,)``; inf where there would be too many."""
     return _up_to(_MAX_EXPLICIT, _explicit_steps(system, columns, rtol))
 
@@ -55,14 +55,14 @@ def traced_steps(build: Build, values: Mapping[str, Any], rtol: float) -> Array:
     return jnp.clip(even, 2, _MAX_EXPLICIT).astype(jnp.int64)
 
 
-def strongly_damped(system: System, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+def strongly_damped(system: type[System], columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Where the explicit scheme uses the ``stiff`` form of the model as well, ``(N,)``."""
     build = system.models["floquet"].build
     strong = build(columns).strongly_damped() if _knows(build, "strongly_damped", columns) else False
     return np.broadcast_to(strong, count_of(columns))
 
 
-def implicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
+def implicit_effort(system: type[System], columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
     """Panels of the implicit scheme, ``(N,)``: it must resolve what oscillates, whereas decay costs it nothing.
 
     Infinite where oscillation makes an explicit march long: that costs a twentieth, and is as exact.
@@ -81,7 +81,7 @@ def implicit_effort(system: System, columns: Mapping[str, np.ndarray], rtol: flo
     return _up_to(_MAX_PANELS, effort)
 
 
-def _explicit_steps(system: System, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
+def _explicit_steps(system: type[System], columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
     build = system.models["floquet"].build
     if _knows(build, "explicit_steps", columns):
         steps = build(columns).explicit_steps(rtol)
@@ -93,7 +93,7 @@ def _explicit_steps(system: System, columns: Mapping[str, np.ndarray], rtol: flo
     return np.broadcast_to(2 * np.ceil(steps / 2), count_of(columns))
 
 
-def _steps_of(phase: np.ndarray, rtol: float) -> np.ndarray:
+def _steps_of(phase: np.ndarray | Array, rtol: float) -> np.ndarray:
     """Steps of the explicit scheme for an oscillation through ``phase``."""
     with np.errstate(over="ignore"):
         return (4 + 2.5 * phase**1.1) * (1e-9 / rtol) ** (1 / 9)
@@ -123,11 +123,11 @@ def _phase(build: Build, values: Mapping[str, Any]) -> Array:
     return jnp.maximum(jnp.mean(rates), jnp.max(rates) / 2)
 
 
-def _frequency_phase(system: System, columns: Mapping[str, Any]) -> np.ndarray:
+def _frequency_phase(system: type[System], columns: Mapping[str, Any]) -> np.ndarray:
     """int max |Im lambda(A(t))| dt over the span, ``(N,)``, by Gauss quadrature with 8 nodes."""
     a = np.moveaxis(predicted(_matrices, (system.models["floquet"].build, _PLACES), columns), -1, 1)
     finite = np.isfinite(a).all(axis=(2, 3))
-    frequency = np.abs(np.linalg.eigvals(np.where(finite[..., None, None], a, 0.0)).imag).max(-1)
+    frequency = np.abs(np.linalg.eigvals(np.where(finite[..., None, None], a, 0.0)).imag).max(-1)  # pyright: ignore[reportIndexIssue]
     return np.tensordot(_WEIGHTS, np.where(finite, frequency, np.inf), 1)
 
 

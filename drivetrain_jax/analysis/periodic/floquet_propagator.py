@@ -42,7 +42,7 @@ def whole_span(form: LinearPeriodic) -> LinearPeriodic:
     return replace(form, reversor=None, log_determinant=lambda: exact() / 2)
 
 
-def _solvers(system: System, request: Request) -> tuple[Solver, ...]:
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     rtol = request.options["rtol"]
     return direct_solvers(
         system,
@@ -63,7 +63,7 @@ def _results(phi: Monodromy, outputs: tuple[str, ...]) -> dict[str, Array]:
     return {name: results[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}
 
 
-def _dimensions(system: System, request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     return tuple(Dimension(name, "row times size plus column", ()) for name in ("entry",))
 
 

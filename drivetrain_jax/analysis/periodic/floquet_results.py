@@ -40,7 +40,7 @@ _TINY = np.finfo(float).tiny
 MULTIPLIERS = {"floquet_multiplier", "floquet_exponent"}
 
 
-def lacks(system: System) -> dict[str, str]:
+def lacks(system: type[System]) -> dict[str, str]:
     """The result that systems whose time has no unit lack, see :class:`~drivetrain_jax.analysis.Analysis`."""
     if system.time_units == "s":
         return {}

@@ -88,7 +88,7 @@ def controller(period: float, rtol: Array | float) -> diffrax.PIDController:
     return diffrax.PIDController(rtol=rtol, atol=ATOL_RATIO * rtol, dtmin=STEP_RATIO * period, force_dtmin=False)
 
 
-def integrate(field: Field, start: Array, period: float, rtol: Array | float) -> tuple[Array, Array]:
+def integrate(field: Field, start: Array, period: Array | float, rtol: Array | float) -> tuple[Array, Array]:
     """State after one period from ``start`` at t = 0, by Dopri8 with error control, and an ``Outcome``."""
     import diffrax
 
@@ -99,18 +99,18 @@ def integrate(field: Field, start: Array, period: float, rtol: Array | float) ->
         period,
         None,
         start,
-        stepsize_controller=controller(period, rtol),
+        stepsize_controller=controller(period, rtol),  # pyright: ignore[reportArgumentType]
         adjoint=diffrax.ForwardMode(),
         max_steps=MAX_STEPS,
         throw=False,
     )
-    end = solution.ys[-1]
+    end = solution.ys[-1]  # pyright: ignore[reportOptionalSubscript]
     limited = solution.result == diffrax.RESULTS.max_steps_reached
     failed = (solution.result != diffrax.RESULTS.successful) | ~jnp.all(jnp.isfinite(end))
     return end, jnp.where(limited, Outcome.STEP_LIMIT, jnp.where(failed, Outcome.NOT_FINITE, Outcome.SUCCESS))
 
 
-def transition(field: Field, start: Array, period: float, rtol: Array | float) -> Transition:
+def transition(field: Field, start: Array, period: Array | float, rtol: Array | float) -> Transition:
     """Map over one period about ``start`` (entries of order one) and its derivative, by the variational equations."""
     columns = jnp.concatenate([start[:, None], jnp.eye(start.size)], axis=1)
     end, outcome = integrate(variational(field), columns, period, rtol)
@@ -136,7 +136,7 @@ class _Path(NamedTuple):
     last: Array
     point: Array
     correction: Array
-    count: Array
+    count: Array  # pyright: ignore[reportIncompatibleMethodOverride]
     total: Array
     matrix: Array
     found: Array

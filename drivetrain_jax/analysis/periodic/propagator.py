@@ -162,7 +162,7 @@ class EqualStepSize(diffrax.ConstantStepSize):
 
     count: Any
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: None, args: Any, func: Any, error_order: Any) -> tuple:
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: None, args: Any, func: Any, error_order: Any) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
         """End of the first step, and the state."""
         return super().init(terms, t0, t1, y0, (t1 - t0) / self.count, args, func, error_order)
 
@@ -188,9 +188,9 @@ def propagator(
         max_steps=PIECES,
         throw=False,
     )
-    matrix, record = end.ys[0], end.solver_state
-    growth = jnp.sqrt(jnp.trace(record.covariance) / (n * pieces * jnp.sum(matrix**2)))
-    return Propagator(matrix, record.log_scale, growth)
+    matrix, record = end.ys[0], end.solver_state  # pyright: ignore[reportOptionalSubscript]
+    growth = jnp.sqrt(jnp.trace(record.covariance) / (n * pieces * jnp.sum(matrix**2)))  # pyright: ignore[reportOptionalMemberAccess]
+    return Propagator(matrix, record.log_scale, growth)  # pyright: ignore[reportOptionalMemberAccess]
 
 
 def _onward(_: Constants, varying: tuple[Array, Array, Array, _Record], __: tuple) -> tuple[Array, _Record]:
@@ -265,7 +265,7 @@ def _explicit_step(
 def _slopes(zeros: tuple[tuple[bool, ...], ...], stage: int, at_stages: list[Array], state: Rows) -> Rows:
     """``A y`` at one stage; entries that vanish identically are left out."""
     entries = iter(at_stages)
-    return [sum(_at(next(entries), stage) * x for x, zero in zip(state, row, strict=True) if not zero) for row in zeros]
+    return [sum(_at(next(entries), stage) * x for x, zero in zip(state, row, strict=True) if not zero) for row in zeros]  # pyright: ignore[reportReturnType]
 
 
 def _at(entry: Array, stage: int) -> Array:

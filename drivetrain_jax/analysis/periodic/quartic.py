@@ -94,11 +94,11 @@ def invariants(phi: Blocks, left_out: Array | float = 0.0) -> tuple[tuple[Array,
     return (e1, e2, 2 * (first + second)), (rounding, rounding * z, rounding * z**2)
 
 
-def with_determinant(e: Sequence[Array], errors: Sequence[Array], log_d: Array) -> Coefficients:
+def with_determinant(e: Sequence[Array] | Array, errors: Sequence[Array] | Array, log_d: Array) -> Coefficients:
     """The coefficients from ``e1, e2, e3``, bounds of their errors, and log d."""
     # Not made anew, by an exponential each, wherever a power of it is needed.
     kappa = stored(jnp.exp)(log_d / 4)
-    return Coefficients(*e, kappa, (*errors, 8 * EPS * (1 + jnp.abs(log_d)) * kappa**4))
+    return Coefficients(*e, kappa, (*errors, 8 * EPS * (1 + jnp.abs(log_d)) * kappa**4))  # pyright: ignore[reportCallIssue]
 
 
 def coefficients(phi: Blocks, log_d: Array, derived_error: Array, left_out: Array | float = 0.0) -> Coefficients:

@@ -40,7 +40,7 @@ def radius_in_closed_form(z: Array, error: Array, scale: Array, tolerance: float
     a = characteristic_coefficients(z)
     # The determinant of the matrix itself, although the exact one may be known: multipliers that nearly meet are moved
     # far less by a change of the matrix than by one of a single coefficient.
-    c = quartic.Coefficients(-a[0], a[1], -a[2], jnp.sqrt(jnp.sqrt(a[3])), (0.0,) * 4)
+    c = quartic.Coefficients(-a[0], a[1], -a[2], jnp.sqrt(jnp.sqrt(a[3])), (0.0,) * 4)  # pyright: ignore[reportArgumentType]
     split = quartic.factors(c)
     size, norm = jnp.maximum(split[0].large, split[1].large), jnp.sqrt(jnp.sum(z**2, axis=(0, 1)))
     # The recursion that gives a_k multiplies k matrices.
@@ -50,6 +50,6 @@ def radius_in_closed_form(z: Array, error: Array, scale: Array, tolerance: float
 
     def repaired() -> Radius:
         found = radius_by_eigenvalues(eigenvalues(z), error)
-        return tuple(jnp.where(certain, *pair) for pair in zip((rho, bound), found, strict=True))
+        return tuple(jnp.where(certain, *pair) for pair in zip((rho, bound), found, strict=True))  # pyright: ignore[reportReturnType]
 
     return jax.lax.cond(jnp.all(certain), lambda: (rho, bound), repaired)

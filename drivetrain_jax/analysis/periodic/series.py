@@ -93,4 +93,4 @@ def _split(form: Form, ends: Array, t: Array, lanes: int) -> tuple[Array, Array]
 
 def _product(a: Array, b: Array) -> Array:
     """Products of matrices, ``(P, k, l, lanes)`` times ``(P, l, m, lanes)``."""
-    return sum(a[:, :, j, None] * b[:, None, j] for j in range(b.shape[1]))
+    return sum(a[:, :, j, None] * b[:, None, j] for j in range(b.shape[1]))  # pyright: ignore[reportReturnType]

@@ -48,7 +48,7 @@ def edge_function(form: LinearPeriodic) -> Array:
     """``det(Z + I)`` of the system ``form``: 0 where a multiplier is -1."""
     a = characteristic_coefficients(propagator(form, jnp.int32(_STEPS)).matrix)
     # (-1)^n det(-I - Z), from the coefficients of det(s I - Z) at s = -1.
-    return 1 + sum((-1) ** (k + 1) * a[k] for k in range(a.shape[0]))
+    return 1 + sum((-1) ** (k + 1) * a[k] for k in range(a.shape[0]))  # pyright: ignore[reportReturnType]
 
 
 def tongue_edge(form: Form, frequency: Array, guess: Array) -> Array:
@@ -77,7 +77,7 @@ def tongue_edge(form: Form, frequency: Array, guess: Array) -> Array:
 
     first = jnp.broadcast_to(jnp.asarray(guess, float), frequency.shape)
     start = (0.95 * first, edge(0.95 * first), first, 0)
-    old, _, q, _ = jax.lax.while_loop(unfinished, secant, start)
+    old, _, q, _ = jax.lax.while_loop(unfinished, secant, start)  # pyright: ignore[reportArgumentType]
     return jnp.where(moving(old, q), jnp.nan, q)
 
 

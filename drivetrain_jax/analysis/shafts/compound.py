@@ -62,13 +62,13 @@ class Value(NamedTuple):
     ``count`` of natural frequencies below, zero modes included (None unless asked for)."""
 
     psi: Array
-    count: Array | None
+    count: Array | None  # pyright: ignore[reportIncompatibleMethodOverride]
 
 
 class _State(NamedTuple):
     u: Plane
     sign: Array
-    count: Array
+    count: Array  # pyright: ignore[reportIncompatibleMethodOverride]
 
 
 class _Segment(NamedTuple):
@@ -155,7 +155,7 @@ def functions_of(segment: _Segment, q: Array) -> Compound | General:
     z = q * segment.beta
     if segment.shear is None:
         return compound(z)
-    return general(z, q * q * segment.shear, q * q * segment.rotary)
+    return general(z, q * q * segment.shear, q * q * segment.rotary)  # pyright: ignore[reportOperatorIssue]
 
 
 def _segments(shaft: Shaft) -> tuple[_Segment, tuple[Array, Array | None, Array, Array, Array]]:
@@ -187,7 +187,7 @@ def _enter(state: _State, segment: _Segment, q: Array) -> _State:
     """Across the joint and the support in front of ``segment``, and into its coordinates."""
     u, sign, count = state
     if segment.k_hinge is not None:
-        u = _across_hinge(u, segment.k_hinge, segment.turn, q)
+        u = _across_hinge(u, segment.k_hinge, segment.turn, q)  # pyright: ignore[reportArgumentType]
         after = sign_of(u[0])
         count, sign = count + 0.5 * (1 - after * sign), after
     u = _across_support(u, segment.k, segment.m, segment.unit, q)
@@ -300,4 +300,4 @@ def _negative(determinant: Array, trace: Array) -> Array:
 
 
 def _size(u: Plane) -> Array:
-    return sum(jnp.abs(x) for x in u)
+    return sum(jnp.abs(x) for x in u)  # pyright: ignore[reportReturnType]

@@ -20,7 +20,8 @@ from jax import Array
 
 from drivetrain_jax.systems.trigonometry import horner, sincos
 
-Plane = tuple[Array, Array, Array, Array, Array]
+# Five entries.
+Plane = tuple[Array, ...]
 
 # Below this phase the functions are summed as series: their closed forms cancel for z -> 0.
 _SERIES = 2.0
@@ -168,7 +169,7 @@ def general(z: Array, s: Array, t: Array) -> General:
     small = z * z * 2 * (jnp.maximum(s, t) + 1) < _SERIES**2
     summed = _general_series(jnp.where(small, z, 0.0), s, t)
     g = tuple(jnp.where(small, unit * a, b) for a, b in zip(summed, direct, strict=True))
-    return General(s, t, unit, growth, g)
+    return General(s, t, unit, growth, g)  # pyright: ignore[reportArgumentType]
 
 
 def _general_series(z: Array, s: Array, t: Array) -> tuple[Array, Array, Array, Array]:

@@ -91,5 +91,5 @@ def find_roots(shaft: Shaft, modes: int) -> Roots:
     q = jnp.where(wanted <= 0, 0.0, jnp.where(found, 0.5 * (low + high), jnp.nan))
     safe = jnp.where(q > 0, q, 1.0)
     below, above = (characteristic(shaft, safe * (1 + shift)).count for shift in (-_APART, _APART))
-    certified = (wanted <= 0) | (found & (below < index) & (above >= index))
+    certified = (wanted <= 0) | (found & (below < index) & (above >= index))  # pyright: ignore[reportOptionalOperand]
     return Roots(q, jnp.where(q > 0, 2 * (high - low) / safe, 0.0), certified)

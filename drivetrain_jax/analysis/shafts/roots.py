@@ -102,10 +102,10 @@ def _closed(b: _Brackets) -> Array:
 def _step(shaft: Shaft, index: Array, b: _Brackets) -> _Brackets:
     q = _trial(b)
     value = characteristic(shaft, q)
-    above = value.count >= index
+    above = value.count >= index  # pyright: ignore[reportOptionalOperand]
     shrink = jnp.where((b.low == 0) & above, b.shrink * b.shrink, b.shrink)
     low, high = jnp.where(above, b.low, q), jnp.where(above, q, b.high)
-    count_low, count_high = jnp.where(above, b.count_low, value.count), jnp.where(above, value.count, b.count_high)
+    count_low, count_high = jnp.where(above, b.count_low, value.count), jnp.where(above, value.count, b.count_high)  # pyright: ignore[reportArgumentType]
     psi_low, psi_high = jnp.where(above, b.psi_low, value.psi), jnp.where(above, value.psi, b.psi_high)
     isolated = (count_high - count_low == 1) & (high <= _NEAR * low) & (psi_low * psi_high < 0)
     first_width = jnp.where(isolated & ~b.isolated, high - low, b.first_width)
@@ -210,7 +210,7 @@ def _multiple(shaft: Shaft, q: Array) -> Array:
     near = q[1:] - q[:-1] <= _MULTIPLE * q[1:]
     none = jnp.zeros_like(q[:1], bool)
     above = jnp.where(q[-1:] > 0, q[-1:] * (1 + _MULTIPLE), 1.0)
-    beyond = (q[-1:] > 0) & (characteristic(shaft, above).count > len(q))
+    beyond = (q[-1:] > 0) & (characteristic(shaft, above).count > len(q))  # pyright: ignore[reportOptionalOperand]
     return jnp.concatenate([none, near]) | jnp.concatenate([near, beyond])
 
 

@@ -183,7 +183,7 @@ def _across_joints(shaft: Shaft, q: Array) -> _Links:
         return jnp.stack(entries[:-1], axis=1).reshape(len(keep), 4, 4, *keep.shape[1:])
 
     units = scales.b, scales.e2, scales.e3
-    return _Links(forms(*(last(x) for x in units), turn, reaction), forms(*units, 0.0, 0.0))
+    return _Links(forms(*(last(x) for x in units), turn, reaction), forms(*units, 0.0, 0.0))  # pyright: ignore[reportCallIssue]
 
 
 def _next_state(plane: Array, link: _Links, state: Array) -> Array:
@@ -200,7 +200,9 @@ def _next_state(plane: Array, link: _Links, state: Array) -> Array:
     return jnp.where(minor == 0, 0.0, result / jnp.where(minor == 0, 1.0, minor))
 
 
-def _carried(across: _Links, along: _Links, ahead: tuple[Plane, Plane], start: Array, place: Array) -> Array:
+def _carried(
+    across: _Links, along: _Links, ahead: tuple[Plane, Plane], start: Array | np.ndarray, place: Array
+) -> Array:
     """States at the 2n ends of segments from the one at ``place`` (``start``) to the last; 0 before. ``ahead`` are the
     planes of the other side there, in front of and behind the segments. Shape ``(2n, 4, modes, ...)``."""
 
