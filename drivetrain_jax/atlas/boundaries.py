@@ -53,7 +53,7 @@ class Boundary:
         )
 
 
-def boundaries(atlas: Atlas, system: System, searches: Sequence[Search] = ()) -> tuple[Boundary, ...]:
+def boundaries(atlas: Atlas, system: type[System], searches: Sequence[Search] = ()) -> tuple[Boundary, ...]:
     """All boundary curves within ``atlas``, which has two parameters (``ValueError`` for another number).
 
     Angles are given without their signs. ``searches`` are those of the tips of the same atlas, if these are known.
@@ -80,7 +80,7 @@ def boundaries(atlas: Atlas, system: System, searches: Sequence[Search] = ()) ->
     return tuple(found)
 
 
-def _narrow_axis(atlas: Atlas, system: System) -> int:
+def _narrow_axis(atlas: Atlas, system: type[System]) -> int:
     """The coordinate along which tongues are narrow: the axis of the resonances, else the second one."""
     axis = system.resonances.axis if system.resonances else ""
     return atlas.parameters.index(axis) if axis in atlas.parameters else 1

@@ -25,10 +25,12 @@ class Source(Protocol):
 
     def radians(self, lower: np.ndarray, upper: np.ndarray) -> float:
         """About half the angle through which values turn on a line between two corners."""
+        ...
 
     def start(self, axes: Sequence[np.ndarray]) -> Callable[[], np.ndarray]:
         """Begin to compute the grid of ``axes`` (coordinates); what is returned waits for its values ``(N, m)``, points in C
         order, NaN where there are none."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ class Box:
         left, right = self.upper.copy(), self.lower.copy()
         left[axis] = right[axis] = (self.lower[axis] + self.upper[axis]) / 2
         ends = ((self.lower, left), (right, self.upper))
-        return tuple(Box(a, b, splits, tuple(s.within(a, b) for s in (*self.known, *solved))) for a, b in ends)
+        return tuple(Box(a, b, splits, tuple(s.within(a, b) for s in (*self.known, *solved))) for a, b in ends)  # pyright: ignore[reportReturnType]
 
 
 Parts = tuple[Box | Panel | Gap, ...]

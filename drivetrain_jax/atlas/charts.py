@@ -36,7 +36,8 @@ _SPREAD = 4.0
 
 # Results of cells by name, and which of them are to be judged again (`judged`).
 Cells = dict[str, np.ndarray]
-T, R = TypeVar("T"), TypeVar("R")
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 def errors_of(panel: Panel) -> np.ndarray:
@@ -108,7 +109,7 @@ def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
         def row(inputs: tuple[Array, Array]) -> dict[str, Array]:
             weights, value = inputs
             model, phi = bind(values, fixed, value), weights @ columns
-            log_d = jnp.broadcast_to(model.reduced.log_determinant(), phi.shape[1:])
+            log_d = jnp.broadcast_to(model.reduced.log_determinant(), phi.shape[1:])  # pyright: ignore[reportOptionalCall]
             parts = quartic.blocks(phi)
             exact = exact_verdict(model, parts, errors[0]) if kind == "undamped" else None
             return judged(quartic.coefficients(parts, log_d, errors[1:]), rtol, exact)
@@ -123,7 +124,7 @@ def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
         def row(inputs: tuple[Array, Array, Array]) -> dict[str, Array]:
             e, bounds, value = inputs
             lanes = e @ spread
-            log_d = jnp.broadcast_to(bind(values, fixed, value).reduced.log_determinant(), lanes.shape[1:])
+            log_d = jnp.broadcast_to(bind(values, fixed, value).reduced.log_determinant(), lanes.shape[1:])  # pyright: ignore[reportOptionalCall]
             return judged(quartic.with_determinant(lanes, bounds, log_d), rtol)
 
         return by_rows(row, (at_nodes, bounds, values[names[-2]]))
@@ -140,7 +141,7 @@ def _left_out(e: Array) -> Array:
 def exact_verdict(model: FloquetModel, phi: quartic.Blocks, value_error: Array) -> Array:
     """The verdict of Hamiltonian lanes, -1 of others."""
     shape = phi.a[0][0].shape
-    applies = jnp.broadcast_to(jnp.asarray(model.hamiltonian()), shape)
+    applies = jnp.broadcast_to(jnp.asarray(model.hamiltonian()), shape)  # pyright: ignore[reportOptionalCall]
     nothing = jnp.full(shape, -1, jnp.int8)
     return jax.lax.cond(
         jnp.any(applies), lambda: jnp.where(applies, conservative.verdict(phi, value_error), nothing), lambda: nothing

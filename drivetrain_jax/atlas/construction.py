@@ -182,7 +182,7 @@ def _advanced(tasks: Iterable[_Told], settings: Settings) -> tuple[list[_Open], 
     while waiting:
         box, task, answer = waiting.popleft()
         try:
-            going.append((box, task, task.send(answer)))
+            going.append((box, task, task.send(answer)))  # pyright: ignore[reportArgumentType]
         except StopIteration as end:
             waiting += [(part, explore(part, settings), None) for part in end.value if isinstance(part, Box)]
             done += [part for part in end.value if not isinstance(part, Box)]

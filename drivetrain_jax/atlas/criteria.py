@@ -39,7 +39,7 @@ _STATES = 4
 _BLOCKS = (64, 512, 4096)
 
 
-def has_boundaries(atlas: Atlas, system: System) -> bool:
+def has_boundaries(atlas: Atlas, system: type[System]) -> bool:
     """Whether the system has four states and a reversor that exchanges two halves of them, and ``atlas`` panels."""
     if not atlas.panels:
         return False
@@ -56,7 +56,7 @@ class Criteria:
     """
 
     atlas: Atlas
-    system: System
+    system: type[System]
     conservative: bool = False
 
     def __post_init__(self) -> None:
@@ -70,7 +70,7 @@ class Criteria:
             )
 
     @classmethod
-    def of(cls, atlas: Atlas, system: System) -> Criteria:
+    def of(cls, atlas: Atlas, system: type[System]) -> Criteria:
         """The criteria that suit ``atlas``: those without dissipation if det Z = 1 everywhere in it."""
         criteria = cls(atlas, system)
         corners = atlas.to_coordinates(np.stack([atlas.lower, (atlas.lower + atlas.upper) / 2, atlas.upper]))
@@ -143,9 +143,9 @@ class Criteria:
         """Floquet multipliers at points by falling modulus, ``(N, d) -> (N, 4)``."""
         z = np.moveaxis(monodromy(self.propagator(x)), -1, 0)
         finite = np.isfinite(z).all(axis=(1, 2))
-        sigma = np.linalg.eigvals(np.where(finite[:, None, None], z, 0.0)).astype(complex)
+        sigma = np.linalg.eigvals(np.where(finite[:, None, None], z, 0.0)).astype(complex)  # pyright: ignore[reportIndexIssue]
         sigma = np.take_along_axis(sigma, np.argsort(-np.abs(sigma), axis=1), axis=1)
-        return np.where(finite[:, None], sigma, np.nan)
+        return np.where(finite[:, None], sigma, np.nan)  # pyright: ignore[reportIndexIssue]
 
     def spectral_radius(self, x: np.ndarray) -> np.ndarray:
         """Largest modulus of the multipliers at points, ``(N, d) -> (N,)``."""
@@ -181,7 +181,7 @@ def monodromy(phi: np.ndarray, transposed: np.ndarray | None = None) -> np.ndarr
     phi, other = (f.reshape(_STATES, _STATES, *f.shape[1:]) for f in (phi, phi if transposed is None else transposed))
     half = _STATES // 2
     swapped = np.roll(np.roll(np.swapaxes(other, 0, 1), half, axis=0), half, axis=1)
-    return sum(swapped[:, j, None] * phi[j] for j in range(_STATES))
+    return sum(swapped[:, j, None] * phi[j] for j in range(_STATES))  # pyright: ignore[reportReturnType]
 
 
 def invariants(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -190,7 +190,7 @@ def invariants(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     a = sum(z[i, i] for i in size)
     b = sum(z[i, i] * z[j, j] - z[i, j] * z[j, i] for i, j in combinations(size, 2))
     c = sum(_minor(z, rows) for rows in combinations(size, 3))
-    return a, b, c
+    return a, b, c  # pyright: ignore[reportReturnType]
 
 
 def _minor(z: np.ndarray, rows: tuple[int, ...]) -> np.ndarray:

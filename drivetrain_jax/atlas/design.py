@@ -99,7 +99,7 @@ class Nearest:
 
 def least_damping(
     atlas: Atlas,
-    system: System,
+    system: type[System],
     speeds: Range,
     at: Mapping[str, float],
     *,
@@ -111,7 +111,7 @@ def least_damping(
 
 def widest_angle(
     atlas: Atlas,
-    system: System,
+    system: type[System],
     speeds: Range,
     at: Mapping[str, float],
     *,
@@ -123,7 +123,7 @@ def widest_angle(
 
 def speed_windows(
     atlas: Atlas,
-    system: System,
+    system: type[System],
     at: Mapping[str, float],
     *,
     margin: float = 0.0,
@@ -147,7 +147,7 @@ def speed_windows(
     return Windows(tuple(windows), line.undecided)
 
 
-def _over(atlas: Atlas, system: System, at: Mapping[str, float], *roles: str) -> Atlas:
+def _over(atlas: Atlas, system: type[System], at: Mapping[str, float], *roles: str) -> Atlas:
     """``atlas`` where it is ``at``, over the parameters with these ``roles`` and no other."""
     wanted, part = [system.roles[role] for role in roles], atlas.slice(at)
     if set(part.parameters) != set(wanted):
@@ -192,7 +192,7 @@ def _shortened(interval: Interval, part: Atlas, margin: float) -> Range:
     return low, high
 
 
-def nearest_boundaries(atlas: Atlas, system: System, point: Mapping[str, float]) -> tuple[Nearest, ...]:
+def nearest_boundaries(atlas: Atlas, system: type[System], point: Mapping[str, float]) -> tuple[Nearest, ...]:
     """For every parameter of ``atlas`` the nearest changes of stability when it alone is varied from ``point``."""
     found = []
     for name in atlas.parameters:
@@ -213,7 +213,7 @@ def nearest_boundaries(atlas: Atlas, system: System, point: Mapping[str, float])
     return tuple(found)
 
 
-def _extreme(atlas: Atlas, system: System, speeds: Range, side: float, direct: Direct | None) -> Answer:
+def _extreme(atlas: Atlas, system: type[System], speeds: Range, side: float, direct: Direct | None) -> Answer:
     """Up to where, from the end of the other parameter on that ``side`` on, all ``speeds`` are stable."""
     speed = system.roles["speed"]
     part = narrow(atlas, {speed: speeds}).folded()

@@ -36,7 +36,7 @@ def values_at(
     if not atlas.panels and direct is None:
         reasons = "; ".join(sorted({gap.reason for gap in atlas.gaps}))
         raise ValueError(f"atlas without a panel ({reasons}): allowed is one that covers some of its domain")
-    size = atlas.panels[0].coefficients.shape[-1] if atlas.panels else direct.shape[1]
+    size = atlas.panels[0].coefficients.shape[-1] if atlas.panels else direct.shape[1]  # pyright: ignore[reportOptionalMemberAccess]
     values, bounds = np.full((len(points), size), np.nan), np.full(len(points), np.nan)
     for k, panel in enumerate(atlas.panels):
         mine = number == k

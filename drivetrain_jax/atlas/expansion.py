@@ -59,7 +59,7 @@ class Expansion:
             box = [np.searchsorted(edges[1:-1], column) for edges, column in zip(self._edges, t.T, strict=True)]
             flat = np.ravel_multi_index(box, [len(edges) - 1 for edges in self._edges]).astype(np.int32)
             order = np.argsort(flat, kind="stable")
-            starts = np.flatnonzero(np.diff(flat[order], prepend=-1))
+            starts = np.flatnonzero(np.diff(flat[order], prepend=-1))  # pyright: ignore[reportIndexIssue]
             for chosen in np.split(order, starts[1:]):
                 corner = tuple(int(b[chosen[0]]) for b in box)
                 ends = [(edges[i], edges[i + 1]) for edges, i in zip(self._edges, corner, strict=True)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ def solve_rtol(tolerance: float) -> float:
     return max(_SHARPER * tolerance, _FINEST)
 
 
-def floquet_domain(system: System, ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, float]) -> Domain:
+def floquet_domain(system: type[System], ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, Any]) -> Domain:
     """The box ``ranges`` (name to lower and upper value) of ``system`` with the coordinates that the system declares."""
     smooth = system.models["atlas"].smooth or Smoothness({})
     names = tuple(ranges)
@@ -36,7 +37,7 @@ def floquet_domain(system: System, ranges: Mapping[str, tuple[float, float]], fi
 
 
 def floquet_rounds(
-    system: System,
+    system: type[System],
     ranges: Mapping[str, tuple[float, float]],
     fixed: Mapping[str, float],
     tolerance: float,
@@ -51,13 +52,15 @@ def floquet_rounds(
     return construct(domain, quantity, tolerance, source=series_nodes(system, domain, tolerance), max_solves=max_solves)
 
 
-def numbers_per_solve(system: System, ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, float]) -> int:
+def numbers_per_solve(
+    system: type[System], ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, float]
+) -> int:
     """How many numbers a solve for :func:`floquet_rounds` gives: entries of the propagator, and their errors."""
     return 2 * floquet_quantity(_form(system, floquet_domain(system, ranges, fixed))).size
 
 
 def prepare_judging(
-    system: System,
+    system: type[System],
     ranges: Mapping[str, tuple[float, float]],
     fixed: Mapping[str, float],
     rtol: float,
@@ -89,11 +92,11 @@ def prepare_judging(
     stability_atlas(zero, system, rtol).by_eigenvalues(np.array([middle]), tuple(outputs))
 
 
-def _form(system: System, domain: Domain) -> LinearPeriodic:
+def _form(system: type[System], domain: Domain) -> LinearPeriodic:
     middle = {name: (a + b) / 2 for name, a, b in zip(domain.parameters, domain.lower, domain.upper, strict=True)}
     return system.models["floquet"].build({**domain.fixed, **middle}).reduced
 
 
-def stability_atlas(atlas: Atlas, system: System, rtol: float) -> StabilityAtlas:
+def stability_atlas(atlas: Atlas, system: type[System], rtol: float) -> StabilityAtlas:
     """Spectral radius, bound and verdict from an atlas that :func:`floquet_rounds` made; ``rtol`` judges outcomes."""
     return StabilityAtlas(atlas, system.models["floquet"].build, rtol)

@@ -44,7 +44,7 @@ class Path:
     limiting: np.ndarray
 
 
-def follow_tips(atlas: Atlas, system: System, parameter: str, values: Sequence[float]) -> tuple[Path, ...]:
+def follow_tips(atlas: Atlas, system: type[System], parameter: str, values: Sequence[float]) -> tuple[Path, ...]:
     """All tips at the first of ``values`` of ``parameter``, followed through the others in the order given.
 
     ``atlas`` has ``parameter`` and two more, one of them the axis of the system's resonances. A step on which a tip is lost
@@ -55,27 +55,27 @@ def follow_tips(atlas: Atlas, system: System, parameter: str, values: Sequence[f
     for other parameters beside it, :class:`~drivetrain_jax.InputError` for an atlas without panels and a system without
     boundary functions.
     """
-    values = np.asarray(values, float)
-    if not values.size:
+    places = np.asarray(values, float)
+    if not places.size:
         raise ValueError("values = []: allowed is one value or more")
     way = _Way(atlas, system, parameter)
-    first = way.criteria(values[0]).atlas
+    first = way.criteria(places[0]).atlas
     names = first.parameters
     # Tongues widen with the angle. Along a damping they close, and what closes them is their tip.
     tips = find_tips(first, system, opening=system.roles.get("angle") in names).tips
-    criteria = [way.criteria(value) for value in values]
-    track = np.full((len(values), len(tips), 2), np.nan)
+    criteria = [way.criteria(value) for value in places]
+    track = np.full((len(places), len(tips), 2), np.nan)
     track[0] = _places(first, tips)
-    for k in range(1, len(values)):
+    for k in range(1, len(places)):
         if criteria[k - 1].conservative or criteria[k].conservative:
             alive = np.isfinite(track[k - 1]).all(axis=1)
             track[k] = np.where(alive[:, None], _by_name(criteria[k], tips), np.nan)
         else:
-            track[k] = way.advance(tips, track[k - 1], (values[k - 1], values[k]))
+            track[k] = way.advance(tips, track[k - 1], (places[k - 1], places[k]))
     bounding = np.stack([_bounding(c, tips, x) for c, x in zip(criteria, track, strict=True)])
     points = parameters_at(first, track)
     return tuple(
-        Path(tip, parameter, values, {name: points[:, i, j] for j, name in enumerate(names)}, bounding[:, i])
+        Path(tip, parameter, places, {name: points[:, i, j] for j, name in enumerate(names)}, bounding[:, i])
         for i, tip in enumerate(tips)
     )
 
@@ -85,7 +85,7 @@ class _Way:
     """Tips along ``parameter`` of ``atlas``, in coordinates ``(M, 2)`` of its two others."""
 
     atlas: Atlas
-    system: System
+    system: type[System]
     parameter: str
 
     def criteria(self, value: float) -> Criteria:
@@ -100,7 +100,7 @@ class _Way:
         alive = np.flatnonzero(np.isfinite(start).all(axis=1))
         if not alive.size:
             return result
-        found, followed = self._step([tips[i] for i in alive], start[alive], ends)
+        found, followed = self._step([tips[i] for i in alive], start[alive], ends)  # pyright: ignore[reportArgumentType, reportCallIssue]
         result[alive[followed]] = found[followed]
         lost = alive[~followed]
         if lost.size and halvings < _HALVINGS:
@@ -127,12 +127,12 @@ class _Way:
         if not np.isfinite(guess).all(axis=1).any():
             return result
         criteria = self.criteria(value)
-        h = criteria.atlas.parameters.index(self.system.resonances.axis)
+        h = criteria.atlas.parameters.index(self.system.resonances.axis)  # pyright: ignore[reportOptionalMemberAccess]
         lower, upper = corners = criteria.atlas.corners
         patches = patches_of(criteria)
         for alike in sorted({(tip.multiplier, tip.opens) for tip in tips}):
             kind, opens = alike
-            mine = [(tip.multiplier, tip.opens) == alike for tip in tips] & np.isfinite(guess).all(axis=1)
+            mine = [(tip.multiplier, tip.opens) == alike for tip in tips] & np.isfinite(guess).all(axis=1)  # pyright: ignore[reportOperatorIssue]
             x, mine = _newton(patches[criteria.multipliers.index(kind)], guess[mine], corners, h), np.flatnonzero(mine)
             mine, x = (part[((x >= lower) & (x <= upper)).all(axis=1)] for part in (mine, x))
             polished, rates = polish(criteria, x, kind, h, _POLISH)
@@ -187,5 +187,5 @@ def _bounding(criteria: Criteria, tips: Sequence[Tip], x: np.ndarray) -> np.ndar
     """Whether no other multiplier grows where ``tips`` are, at ``x``."""
     alive = np.isfinite(x).all(axis=1)
     if criteria.conservative:
-        return alive
+        return alive  # pyright: ignore[reportReturnType]
     return alive & limiting(criteria, x, growth(criteria, x, [tip.multiplier for tip in tips]))

@@ -12,6 +12,7 @@ combination for a pair has a slope of only 1e-6 there; so points are found with 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -68,7 +69,7 @@ def limiting(criteria: Criteria, x: np.ndarray, own: Growth) -> np.ndarray:
         return np.log(criteria.spectral_radius(x)) <= bound
 
 
-def _second(criteria: Criteria, x: np.ndarray, phi: np.ndarray, first: list, dz: list, eigen: tuple) -> np.ndarray:
+def _second(criteria: Criteria, x: np.ndarray, phi: np.ndarray, first: Any, dz: list, eigen: tuple) -> np.ndarray:
     sigma, right, left, chosen, ds = eigen
     n, d = x.shape
     rows = np.arange(n)
@@ -89,7 +90,7 @@ def _second(criteria: Criteria, x: np.ndarray, phi: np.ndarray, first: list, dz:
 def _eigen(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Eigenvalues ``(N, 4)``, right ones as columns and left ones as rows with unit products; NaN where not finite."""
     finite = np.isfinite(z).all(axis=(1, 2))
-    sigma, right = np.linalg.eig(np.where(finite[:, None, None], z, np.diag([1.0, 2.0, 3.0, 4.0])).astype(complex))
+    sigma, right = np.linalg.eig(np.where(finite[:, None, None], z, np.diag([1.0, 2.0, 3.0, 4.0])).astype(complex))  # pyright: ignore[reportIndexIssue]
     singular = np.linalg.svd(right, compute_uv=False)[:, -1] < np.finfo(float).eps
     left = np.linalg.inv(np.where(singular[:, None, None], np.eye(4), right))
     bad = ~finite | singular
@@ -106,7 +107,7 @@ def _choose(sigma: np.ndarray, kinds: list[str]) -> np.ndarray:
         MINUS: np.abs(sigma + 1),
         "largest": -np.abs(sigma),
         # One of the two of a pair, by the sign of its imaginary part.
-        "pair": np.abs(np.abs(sigma) - 1) + np.where(sigma.imag > 0, 0.0, 1e3),
+        "pair": np.abs(np.abs(sigma) - 1) + np.where(sigma.imag > 0, 0.0, 1e3),  # pyright: ignore[reportAttributeAccessIssue]
     }
     distance = np.stack([targets[kind][i] for i, kind in enumerate(kinds)]) if kinds else np.empty((0, 4))
     return np.argmin(np.nan_to_num(distance, nan=0.0), axis=1)
@@ -117,7 +118,7 @@ def _matrices(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     return np.moveaxis(monodromy(right, left), -1, 0)
 
 
-def _derivatives(criteria: Criteria, x: np.ndarray, order: int) -> list | dict:
+def _derivatives(criteria: Criteria, x: np.ndarray, order: int) -> Any:
     """First derivatives of Phi as a list, or the second ones by pairs of coordinates."""
     d = x.shape[1]
     if order == 1:

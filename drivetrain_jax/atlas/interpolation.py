@@ -42,7 +42,7 @@ def coefficients(values: np.ndarray, degrees: Sequence[int]) -> np.ndarray:
     """Coefficients ``(n_1, ..., n_d, m)`` from the values at ``tensor_nodes(degrees)``, ``(prod(degrees), m)``."""
     axes = tuple(range(len(degrees)))
     # Products of matrices take less time, but their roundings keep tails from falling: up to five times the solves at 1e-11.
-    tensor = dctn(values.reshape(*degrees, -1), axes=axes) / np.prod(degrees)
+    tensor = dctn(values.reshape(*degrees, -1), axes=axes) / np.prod(degrees)  # pyright: ignore[reportOperatorIssue]
     for axis in axes:
         first = [slice(None)] * tensor.ndim
         first[axis] = slice(0, 1)

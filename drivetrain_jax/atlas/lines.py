@@ -89,7 +89,7 @@ def _refine(exploring: Exploring, lines: list[_Line], limit: float, margin: int)
             merged = np.empty((2 * len(line.values) - 1, values.shape[1]))
             merged[::2], merged[1::2] = line.values, new
             lines[line.axis] = replace(line, values=merged)
-    degrees = [decay.foreseen(line.sizes, limit) + margin for line in lines]
+    degrees = [decay.foreseen(line.sizes, limit) + margin for line in lines]  # pyright: ignore[reportOptionalOperand]
     largest = int(np.argmax(degrees))
     if degrees[largest] > exploring.settings.max_nodes:
         return exploring.split(largest, f"more than {exploring.settings.max_nodes} nodes would be needed")

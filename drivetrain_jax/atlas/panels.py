@@ -177,7 +177,7 @@ def grid_positions(panel: Panel | Gap, axes: Sequence[np.ndarray]) -> list[np.nd
     return [position_between(*ends) for ends in zip(panel.lower, panel.upper, axes, strict=True)]
 
 
-def position_between(lower: np.ndarray, upper: np.ndarray, x: np.ndarray) -> np.ndarray:
+def position_between(lower: np.ndarray, upper: np.ndarray, x: np.ndarray | float) -> np.ndarray:
     """-1 where ``x`` is ``lower``, 1 where it is ``upper``."""
     return np.clip(((x - lower) - (upper - x)) / (upper - lower), -1.0, 1.0)
 
@@ -199,10 +199,10 @@ def chebyshev(x: np.ndarray, n: int) -> np.ndarray:
 
 def inside(panel: Panel | Gap, x: np.ndarray) -> np.ndarray:
     """Whether points given by their coordinates, ``(..., d)``, lie in the box, up to rounding."""
-    return between(panel.lower, panel.upper, x).all(axis=-1)
+    return between(panel.lower, panel.upper, x).all(axis=-1)  # pyright: ignore[reportReturnType]
 
 
-def between(lower: np.ndarray, upper: np.ndarray, x: np.ndarray) -> np.ndarray:
+def between(lower: np.ndarray, upper: np.ndarray, x: np.ndarray | float) -> np.ndarray:
     """Whether ``x`` lies between ``lower`` and ``upper``, up to rounding."""
     slack = _SLACK * np.maximum(np.abs(lower), np.abs(upper))
     return (x >= lower - slack) & (x <= upper + slack)

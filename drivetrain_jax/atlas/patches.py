@@ -104,7 +104,7 @@ class Patches:
     def at(self, number: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Values at positions ``t`` in the patches ``number``, as :meth:`locate` gives them; NaN if far outside."""
         inside = (np.abs(t) <= 1 + MARGIN).all(axis=1)
-        values = self.take(number)(np.where(inside[:, None], np.clip(t, -1.0, 1.0), 0.0))
+        values = self.take(number)(np.where(inside[:, None], np.clip(t, -1.0, 1.0), 0.0))  # pyright: ignore[reportIndexIssue]
         return np.where(inside, values, np.nan)
 
     def trim(self) -> Patches:
@@ -298,4 +298,4 @@ def _restrictions(n: int) -> tuple[np.ndarray, np.ndarray]:
     """Matrices from the coefficients over [-1, 1] to those over the two parts left and right of the cut."""
     t = nodes(n)
     left, right = (_CUT - 1 + (1 + _CUT) * t) / 2, (1 + _CUT + (1 - _CUT) * t) / 2
-    return tuple(analysis_matrix(n) @ chebyshev(part, n) for part in (left, right))
+    return tuple(analysis_matrix(n) @ chebyshev(part, n) for part in (left, right))  # pyright: ignore[reportReturnType]

@@ -67,7 +67,7 @@ def point_kernel(build: Build, undamped: bool, few: bool) -> Any:
 
             phi = _values(tensor, polynomials(cut(place)))
             model = build({**fixed, **{name: cut(column) for name, column in values.items()}})
-            log_d = jnp.broadcast_to(model.reduced.log_determinant(), (LANES,))
+            log_d = jnp.broadcast_to(model.reduced.log_determinant(), (LANES,))  # pyright: ignore[reportOptionalCall]
             parts = quartic.blocks(phi)
             exact = exact_verdict(model, parts, errors[0] + left_out) if undamped else None
             return judged(quartic.coefficients(parts, log_d, errors[1:, None], left_out), rtol, exact)
@@ -100,5 +100,5 @@ def _values(tensor: Array, polynomials: Array) -> Array:
     values = (tensor.reshape(-1, first) @ polynomials[:first, 0]).reshape(*others, m, -1)
     for k, n in enumerate(others, start=1):
         # Term by term: the compiler does not vectorise a sum over an axis in the middle.
-        values = sum(values[j] * polynomials[j, k] for j in range(n))
-    return values
+        values = sum(values[j] * polynomials[j, k] for j in range(n))  # pyright: ignore[reportIndexIssue]
+    return values  # pyright: ignore[reportReturnType]

@@ -68,7 +68,7 @@ class Sensitivity:
         }
 
 
-def atlas_sensitivity(atlas: Atlas, system: System, point: Mapping[str, float]) -> Sensitivity:
+def atlas_sensitivity(atlas: Atlas, system: type[System], point: Mapping[str, float]) -> Sensitivity:
     """The gradient with respect to the parameters of ``atlas`` at ``point`` (a value for each), from the surrogate.
 
     It is NaN in a gap and outside the domain. Raises ``KeyError`` if ``point`` lacks a parameter,
@@ -86,7 +86,7 @@ def atlas_sensitivity(atlas: Atlas, system: System, point: Mapping[str, float]) 
     return Sensitivity(radius, slopes, sigma, _gap(sigma, criteria.eigenvalues(x)[0]), float(rates.error[0]))
 
 
-def direct_sensitivity(system: System, values: Mapping[str, float]) -> Sensitivity:
+def direct_sensitivity(system: type[System], values: Mapping[str, float]) -> Sensitivity:
     """The gradient with respect to all parameters of ``system``, which ``values`` holds, from direct solves.
 
     It is NaN where no scheme can take so many steps, derivatives overflow or the radius underflows. Raises ``KeyError`` if
@@ -108,7 +108,7 @@ def direct_sensitivity(system: System, values: Mapping[str, float]) -> Sensitivi
     return _sensitivity(names, z, change, float(error))
 
 
-def _scheme(system: System, columns: Mapping[str, np.ndarray]) -> tuple[type[EqualSteps], float]:
+def _scheme(system: type[System], columns: Mapping[str, np.ndarray]) -> tuple[type[EqualSteps], float]:
     """The cheaper scheme for one point, and its predicted steps or panels; infinite if there would be too many of both."""
     explicit, implicit = (float(of(system, columns, _RTOL)[0]) for of in (explicit_effort, implicit_effort))
     if PANEL_COST * implicit < explicit:
@@ -164,4 +164,4 @@ def _derivatives(
         return size * found.z, size * jnp.moveaxis(found.dz, 0, -1)[..., place]
 
     compiled = jax.jit(both, compiler_options=options_for_few())
-    return lambda point, steps: tuple(map(np.asarray, compiled(point, np.int64(steps))))
+    return lambda point, steps: tuple(map(np.asarray, compiled(point, np.int64(steps))))  # pyright: ignore[reportReturnType]

@@ -40,7 +40,7 @@ _STEPS_AT, _RADIANS = 1e-10, 0.14
 Key = tuple[Callable[..., FloquetModel], Series, tuple[str, ...], Words, tuple[tuple[str, tuple[int, ...]], ...]]
 
 
-def series_nodes(system: System, domain: Domain, tolerance: float) -> SeriesNodes | None:
+def series_nodes(system: type[System], domain: Domain, tolerance: float) -> SeriesNodes | None:
     """The source of nodes for ``domain``; None where the system declares none or the parts would not be exact enough."""
     smooth = system.models["atlas"].smooth
     series = smooth.series if smooth else None
@@ -61,7 +61,7 @@ class SeriesNodes:
 
     positions = _POSITIONS
 
-    def __init__(self, system: System, domain: Domain, series: Series, decay: float, tolerance: float) -> None:
+    def __init__(self, system: type[System], domain: Domain, series: Series, decay: float, tolerance: float) -> None:
         self._system, self._domain, self._series = system, domain, series
         self.axis = domain.parameters.index(series.parameter)
         target = max(_SHARPER * tolerance, _LEAST)
@@ -100,7 +100,7 @@ class SeriesNodes:
         # Not asked for in threads, which would have it compiled twice.
         kernel, pool = _kernel(self._key, len(x)), threads(usable_cores(), "tile")
         pending = [
-            pool.submit(self._along, kernel, {n: c[chosen] for n, c in columns.items()}, end, parts[chosen[0]], x)
+            pool.submit(self._along, kernel, {n: c[chosen] for n, c in columns.items()}, end, parts[chosen[0]], x)  # pyright: ignore[reportArgumentType]
             for chosen in chunks
         ]
 

@@ -8,7 +8,7 @@ the eigenvalues, as do all results of systems without it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from threading import Lock
@@ -186,7 +186,7 @@ class StabilityAtlas:
             for name, values in found.items():
                 values[lost] = _nothing(name, values)
 
-    def _may_be_undamped(self, columns: Sequence[np.ndarray]) -> bool:
+    def _may_be_undamped(self, columns: Iterable[np.ndarray]) -> bool:
         """Whether the system is Hamiltonian in any cell; ``columns`` are broadcast against each other."""
         model = self.build({**self.atlas.fixed, **dict(zip(self.atlas.parameters, columns, strict=True))})
         return model.hamiltonian is not None and bool(np.any(model.hamiltonian()))
@@ -251,7 +251,7 @@ def _point_kernel(build: Build, outputs: tuple[str, ...], rtol: float, closed_fo
 def _sharper(phi: Array, model: FloquetModel, errors: Array, found: dict[str, Array]) -> dict[str, Array]:
     """Verdicts also where the interval of rho holds 1, but no multiplier can cross the unit circle (Schur-Cohn), and the
     exact results of Hamiltonian lanes."""
-    parts, log_d = quartic.blocks(phi), jnp.broadcast_to(model.reduced.log_determinant(), phi.shape[1:])
+    parts, log_d = quartic.blocks(phi), jnp.broadcast_to(model.reduced.log_determinant(), phi.shape[1:])  # pyright: ignore[reportOptionalCall]
     rho, error, verdict = (found[name] for name in DEFAULT_OUTPUTS)
     settled = quartic.nothing_crosses(quartic.coefficients(parts, log_d, errors[1:, None]), log_d)
     verdict = jnp.where((verdict == charts.UNDECIDED) & settled, jnp.where(rho < 1, 0, 1), verdict).astype(jnp.int8)

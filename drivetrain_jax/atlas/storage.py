@@ -49,7 +49,7 @@ def from_arrays(
     arrays: Mapping[str, Any],
     parameters: tuple[str, ...],
     coordinates: tuple[Coordinate, ...],
-    fixed: Mapping[str, float],
+    fixed: Mapping[str, Any],
     tolerance: float,
     solves: int,
 ) -> Atlas:

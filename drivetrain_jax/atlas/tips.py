@@ -70,7 +70,7 @@ class Tips:
     searches: tuple[Search, ...] = ()
 
 
-def find_tips(atlas: Atlas, system: System, *, opening: bool = True) -> Tips:
+def find_tips(atlas: Atlas, system: type[System], *, opening: bool = True) -> Tips:
     """The tips of all tongues within ``atlas`` (two parameters, one of them the axis of the system's resonances).
 
     With ``opening=False`` also the places where tongues close or meet. Angles are given without their signs. Raises
@@ -80,8 +80,8 @@ def find_tips(atlas: Atlas, system: System, *, opening: bool = True) -> Tips:
     horizontal = _axis_of_resonances(atlas, system)
     criteria = Criteria.of(atlas, system)
     if criteria.conservative:
-        tips = tuple(_named(t, atlas) for t in undamped_tips(criteria, horizontal, _predictions(atlas, system)))
-        return Tips(_sorted(tips, atlas, horizontal), (), 0, False)
+        undamped = tuple(_named(t, atlas) for t in undamped_tips(criteria, horizontal, _predictions(atlas, system)))
+        return Tips(_sorted(undamped, atlas, horizontal), (), 0, False)
     patches = patches_of(criteria)
     searches = tuple(critical_points(patches, k, horizontal) for k in range(len(patches)))
     tips: list[Tip] = []
@@ -181,7 +181,7 @@ def rises(criteria: Criteria, v: int) -> float:
     return 1.0 if last > first else -1.0
 
 
-def _axis_of_resonances(atlas: Atlas, system: System) -> int:
+def _axis_of_resonances(atlas: Atlas, system: type[System]) -> int:
     """The coordinate of the axis of the system's resonances; ``ValueError`` for an atlas without it."""
     axis = system.resonances.axis if system.resonances else ""
     if len(atlas.parameters) != 2 or axis not in atlas.parameters:
@@ -190,9 +190,10 @@ def _axis_of_resonances(atlas: Atlas, system: System) -> int:
     return atlas.parameters.index(axis)
 
 
-def _predictions(atlas: Atlas, system: System) -> Resonances:
+def _predictions(atlas: Atlas, system: type[System]) -> Resonances:
     """The system's resonances up to the order that the lower end of the axis needs."""
     basic = system.resonances
+    assert basic is not None
     if basic.up_to is None:
         return basic
     # Of the two ends of a parameter that moves the resonances one needs the higher order.
@@ -213,7 +214,7 @@ def _named_at(criteria: Criteria, patch: Patches, x: np.ndarray, h: int) -> np.n
     angle of the atlas, and its ridge may leave the rectangle or bend faster than it can be followed. There it is the tip.
     """
     atlas, v = criteria.atlas, 1 - h
-    if atlas.parameters[v] in criteria.system.resonances.parameters:
+    if atlas.parameters[v] in criteria.system.resonances.parameters:  # pyright: ignore[reportOptionalMemberAccess]
         return x
     bottom = float(atlas.to_coordinates(atlas.lower)[v])
     points = np.full(x.shape, bottom)
@@ -221,7 +222,7 @@ def _named_at(criteria: Criteria, patch: Patches, x: np.ndarray, h: int) -> np.n
     return points
 
 
-def _name(atlas: Atlas, system: System, kind: str, x: np.ndarray) -> str:
+def _name(atlas: Atlas, system: type[System], kind: str, x: np.ndarray) -> str:
     """The resonance of this multiplier that is clearly the nearest to ``x`` in coordinates, or nothing."""
     resonances = _predictions(atlas, system)
     if not np.isfinite(x).all() or not resonances.multipliers:

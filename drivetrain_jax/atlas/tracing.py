@@ -152,7 +152,7 @@ def _follow(field: Field, start: np.ndarray, sense: np.ndarray) -> tuple[list[np
         easy = good & (cosine > np.cos(_TURN / 3))
         step[mine[easy]] = np.minimum(step[mine[easy]] * _GROWTH, _LONGEST)
         step[mine[~good]] /= 4
-        alive[mine] = ~gone & ~home & (step[mine] > _SHORTEST)
+        alive[mine] = ~gone & ~home & (step[mine] > _SHORTEST)  # pyright: ignore[reportIndexIssue]
     return [np.stack(path) for path in paths], returned
 
 
@@ -177,7 +177,7 @@ def _tangent(gradient: np.ndarray, sense: np.ndarray) -> np.ndarray:
 
 
 def _outside(y: np.ndarray) -> np.ndarray:
-    return ((y < 0) | (y > 1)).any(axis=1)
+    return ((y < 0) | (y > 1)).any(axis=1)  # pyright: ignore[reportReturnType]
 
 
 def _meet_rim(

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -80,14 +81,14 @@ class Line:
         return tuple(i.upper_end for i in self.intervals if i.upper_end)
 
 
-def stability_along(atlas: Atlas, system: System) -> Line:
+def stability_along(atlas: Atlas, system: type[System]) -> Line:
     """The intervals of stability along the one parameter of ``atlas`` (slice the others away)."""
     folded = atlas.folded()
     line = _along(folded, system)
     return line if folded.lower[0] == atlas.lower[0] else _unfolded(line, float(atlas.lower[0]), float(atlas.upper[0]))
 
 
-def _along(atlas: Atlas, system: System) -> Line:
+def _along(atlas: Atlas, system: type[System]) -> Line:
     criteria = Criteria.of(atlas, system)
     changes, undecided = [], []
     for kind, patches in zip(criteria.multipliers, patches_of(criteria), strict=True):
@@ -100,7 +101,7 @@ def _along(atlas: Atlas, system: System) -> Line:
     return _line(atlas.parameters[0], (atlas.lower[0], atlas.upper[0]), changes, undecided, _stable_at(criteria))
 
 
-def stability_over_range(atlas: Atlas, system: System, along: str) -> Line:
+def stability_over_range(atlas: Atlas, system: type[System], along: str) -> Line:
     """The intervals of the other parameter of ``atlas`` (two) in which all values of ``along`` are stable.
 
     Angles are given without their signs.
@@ -112,7 +113,7 @@ def stability_over_range(atlas: Atlas, system: System, along: str) -> Line:
     patches = patches_of(criteria)
     changes: list[Crossing] = []
     suspects: list[Crossing] = []
-    undecided: list[tuple[float, float]] = []
+    undecided: list[Any] = []
     for number, kind in enumerate(criteria.multipliers):
         search = critical_points(patches, number, h)
         if criteria.conservative:
@@ -269,7 +270,7 @@ def _one_change(candidates: list[Crossing], between: Range, rising: bool, widest
     return replace(best, error=math.nan if any(math.isnan(c.error) for c in candidates) else reach)
 
 
-def _tested(lower: tuple[float, float], upper: tuple[float, float], undecided: Iterable[Range]) -> tuple[list, list]:
+def _tested(lower: Any, upper: Any, undecided: Iterable[Range]) -> tuple[list, list]:
     """The decided parts between two candidates (values, bounds of errors) in which stability is tested, and the others.
 
     These are no wider than the errors, which belong to them.
