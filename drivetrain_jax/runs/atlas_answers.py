@@ -126,7 +126,7 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
             for value, end in zip(w.safe, w.interval.ends, strict=True)
         )
         lines.append(f"  {ends}; largest spectral radius {_from_one(w.largest)} at {speed} = {number(w.where)}")
-        lines.append(f"    {_checked(w.check)}")
+        lines.append(f"    {_checked(w.check)}")  # pyright: ignore[reportArgumentType]
     data = {
         "question": "speed_windows",
         "parameters": {**atlas.fixed, **asked.values},

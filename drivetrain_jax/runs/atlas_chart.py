@@ -42,7 +42,7 @@ def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, flo
     if not shown:
         raise InputError(f"part: fixes {', '.join(fixed)}; a chart needs a varying parameter; use query for one point")
     axes = {
-        name: np.linspace(*ranges[name], cells if name in shown[:2] else _SLICES)
+        name: np.linspace(*ranges[name], num=cells if name in shown[:2] else _SLICES)
         for name in atlas.parameters
         if name in shown
     }
@@ -63,7 +63,7 @@ def _ranges(atlas: StoredAtlas, part: Mapping[str, Any]) -> dict[str, Any]:
     return {name: part.get(name, atlas.ranges[name]) for name in atlas.parameters}
 
 
-def _shown(system: System, names: list[str]) -> list[str]:
+def _shown(system: type[System], names: list[str]) -> list[str]:
     """The parameters with the two of the chart first: the axis of the resonances, or the speed without resonances."""
     axis = system.resonances.axis if system.resonances else system.roles.get("speed")
     return sorted(names, key=lambda name: name != axis)
@@ -71,7 +71,7 @@ def _shown(system: System, names: list[str]) -> list[str]:
 
 def _curves(
     atlas: StoredAtlas, fixed: Mapping[str, float], ranges: Mapping[str, tuple[float, float]]
-) -> dict[str, tuple[str, np.ndarray, dict[str, str]]]:
+) -> dict[str, tuple[str | tuple[str, str], np.ndarray, dict[str, str]]]:
     system = atlas.scene.system
     panels = narrow(atlas.stability.atlas.slice(fixed), ranges)
     signs = _signs(panels)
@@ -85,7 +85,7 @@ def _curves(
         for segment in curve.segments()
         for side in signs
     ]
-    coordinates = {}
+    coordinates: dict[str, Any] = {}
     for name in ranges:
         about = {"units": system.parameter(name).units}
         parts = [np.append(segment[name], np.nan) for segment in segments]
@@ -127,7 +127,7 @@ def _on_all_sides(found: Tips, signs: list[dict[str, float]], ranges: Mapping[st
 
 
 def _tips(
-    found: Tips, system: System, names: Iterable[str]
+    found: Tips, system: type[System], names: Iterable[str]
 ) -> dict[str, tuple[str | tuple[str, str], np.ndarray, dict[str, str]]]:
     """The tips as coordinates: names, opening, proof, position and error; and the undecided boxes."""
     labels = np.array([tip.name for tip in found.tips], dtype=str)
@@ -136,7 +136,7 @@ def _tips(
         "units": "1",
         "long_name": "whether there is exactly one tip here within the bounds of the atlas (1) or not (0)",
     }
-    other = next(name for name in names if name != system.resonances.axis)
+    other = next(name for name in names if name != system.resonances.axis)  # pyright: ignore[reportOptionalMemberAccess]
     opens = np.array([tip.opens for tip in found.tips], np.int8)
     direction = {"units": "1", "long_name": f"whether the tongue opens (1) or closes (0) at its tip as {other} rises"}
     coordinates: dict[str, tuple] = {

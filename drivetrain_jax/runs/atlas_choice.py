@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 
 from drivetrain_jax._errors import InputError
@@ -53,7 +55,7 @@ def uses_atlas(scene: Scene) -> bool:
         and 0 < count <= MAX_RANGES
         and Grid.of(scene).size >= _WORTHWHILE
         and scene.request.options["rtol"] >= _FINEST
-        and solves_allowed(scene) >= _FEWEST[count - 1]
+        and cast(int, solves_allowed(scene)) >= _FEWEST[count - 1]
     )
 
 

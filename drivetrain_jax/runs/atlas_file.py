@@ -90,7 +90,7 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
     if dataset.attrs.get("analysis") != ANALYSIS.name:
         raise InputError(f"{label}: holds the analysis {dataset.attrs.get('analysis')!r}; allowed is an atlas")
     # The bounds hold only for the panels as written, and damage would not be visible otherwise.
-    if dataset is not source and (changed := checksums.damaged(Path(source))):
+    if isinstance(source, (str, Path)) and (changed := checksums.damaged(Path(source))):
         raise InputError(
             f"{label}: damaged ({checksums.named(changed)}); allowed is to restore it or to run its scene again"
         )
@@ -320,7 +320,9 @@ def _broadcast(given: Mapping[str, Any]) -> tuple[xr.DataArray, ...]:
     plain = {name: np.asarray(v, float) for name, v in given.items() if not isinstance(v, xr.DataArray)}
     try:
         plain = dict(zip(plain, np.broadcast_arrays(*plain.values()), strict=True))
-        labelled = {n: xr.DataArray(v, dims=("point",) if v.ndim == 1 else None) for n, v in plain.items()}
+        labelled: dict[str, Any] = {
+            n: xr.DataArray(v, dims=("point",) if v.ndim == 1 else None) for n, v in plain.items()
+        }
         arrays = [labelled.get(name, value) for name, value in given.items()]
         # The default of `broadcast` is the union of labels, with NaN for missing ones.
         return xr.broadcast(*xr.align(*arrays, join="exact", copy=False))

@@ -132,7 +132,7 @@ class _Words:
 
     @classmethod
     def of(cls, atlas: StoredAtlas, shaft: Any, name: str) -> _Words:
-        physical = [shaft.quantity(name, end) for end in atlas.ranges[name]] if shaft else [None, None]
+        physical: list[Any] = [shaft.quantity(name, end) for end in atlas.ranges[name]] if shaft else [None, None]
         if physical[0] is None or physical[0][0] not in shaft.operation:
             return cls(name, atlas.allowed(name))
         (label, low, units), (_, high, _) = physical

@@ -69,6 +69,7 @@ def check_count(name: str, spec: AxisTable, continuous: bool) -> int:
     for key in ("start", "stop"):
         if getattr(spec, key) is None:
             raise InputError(f"{field}.{key}: missing; allowed is start, stop and num, or values")
+    assert spec.start is not None and spec.stop is not None
     if spec.num is None:
         raise InputError(f"{field}.num: missing; allowed is num >= 1 (a range without num: analysis = 'atlas')")
     if spec.num < 1:
@@ -91,6 +92,7 @@ def _check_range(field: str, spec: AxisTable) -> int:
     for key in ("start", "stop"):
         if getattr(spec, key) is None:
             raise InputError(f"{field}.{key}: missing; allowed is start and stop")
+    assert spec.start is not None and spec.stop is not None
     if not spec.start < spec.stop:
         raise InputError(f"{field}.stop = {spec.stop!r}: allowed is stop > start = {spec.start!r}")
     return 2
@@ -112,6 +114,7 @@ def spread(spec: AxisTable, field: str) -> np.ndarray:
 
 
 def _between(spec: AxisTable, field: str) -> np.ndarray:
+    assert spec.start is not None and spec.stop is not None and spec.num is not None
     with np.errstate(over="ignore", invalid="ignore"):
         values = (np.geomspace if spec.scale == "log" else np.linspace)(float(spec.start), float(spec.stop), spec.num)
     if not np.isfinite(values).all():

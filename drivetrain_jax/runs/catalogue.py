@@ -45,7 +45,7 @@ def describe(name: str) -> str:
     return "\n".join([*lines, *_scene_lines(system)]) + "\n"
 
 
-def _analysis_lines(name: str, system: System) -> list[str]:
+def _analysis_lines(name: str, system: type[System]) -> list[str]:
     analysis = get_analysis(name)
     lacking = analysis.lacks(system)
     lines = [f"Analysis {name}: {analysis.title}"]
@@ -77,7 +77,7 @@ def _variable_row(variable: Variable, default: bool) -> tuple[str, ...]:
     return f"{variable.name}{'*' if default else ''}", f"[{variable.units}]", meaning, ", ".join(variable.dims)
 
 
-def _scene_lines(system: System | None) -> list[str]:
+def _scene_lines(system: type[System] | None) -> list[str]:
     """Scenes that the package brings, by name, and files of another ``sweeps/`` in the working folder."""
     here = Path("sweeps")
     lines = _rows("Scenes (drivetrain run NAME computes one)", shipped.FOLDER, "{0.stem}", system)
@@ -86,7 +86,7 @@ def _scene_lines(system: System | None) -> list[str]:
     return lines
 
 
-def _rows(heading: str, folder: Path, named: str, system: System | None) -> list[str]:
+def _rows(heading: str, folder: Path, named: str, system: type[System] | None) -> list[str]:
     rows = []
     for path in sorted(folder.glob("*.toml")):
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from contextlib import ExitStack
 from typing import Any
 
@@ -21,7 +21,7 @@ _LOCAL = re.compile(r"local:([1-9]\d*)")
 _TALKATIVE = ("distributed", "tornado", "asyncio")
 
 
-def run_cluster(chunks: Iterable[Chunk], job: Job, address: str) -> Iterator[tuple[Chunk, Results | None]]:
+def run_cluster(chunks: Iterable[Chunk], job: Job, address: str) -> Generator[tuple[Chunk, Results | None], None, None]:
     """Yield ``(chunk, results)`` in the order of completion, from the scheduler at ``address`` or ``local:N`` processes.
 
     A chunk whose worker died is computed again. Results are None after too many deaths (Dask's setting

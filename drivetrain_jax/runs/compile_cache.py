@@ -31,7 +31,7 @@ def enable() -> None:
     A cache that the user has configured stays unchanged. Without a writable folder there is no cache.
     """
     wanted = os.environ.get(_VARIABLE, "")
-    if wanted == "0" or jax.config.jax_compilation_cache_dir:
+    if wanted == "0" or jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
         return
     folder = _folder(wanted)
     if not _writable(folder):

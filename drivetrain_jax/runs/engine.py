@@ -117,9 +117,9 @@ class Engine:
 
 def _use_double_precision() -> None:
     """Set jax to double precision again, unless the environment variable leaves that to the caller."""
-    if not jax.config.jax_enable_x64 and os.environ.get("DRIVETRAIN_JAX_ENABLE_X64") != "0":
+    if not jax.config.jax_enable_x64 and os.environ.get("DRIVETRAIN_JAX_ENABLE_X64") != "0":  # pyright: ignore[reportAttributeAccessIssue]
         jax.config.update("jax_enable_x64", True)
-    if not jax.config.jax_enable_x64:
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise InputError("jax_enable_x64 = False: set by the context of this call; allowed is jax.enable_x64(True)")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
 from queue import SimpleQueue
@@ -57,7 +57,7 @@ class Where:
 
             check_scheduler(self.dask)
 
-    def compute(self, engine: Engine, numbers: Iterable[int]) -> Iterator[tuple[Chunk, Results | None]]:
+    def compute(self, engine: Engine, numbers: Iterable[int]) -> Generator[tuple[Chunk, Results | None], None, None]:
         """Yield ``(chunk, results)`` of the chunks with these numbers in the order of completion, the most expensive first.
 
         Results are None for a chunk that killed every process that computed it. Other failures are raised.
@@ -69,7 +69,7 @@ class Where:
 
     def each(
         self, chunks: Iterable[Any], here: Callable[[Any], Results], job: Callable[[], Job]
-    ) -> Iterator[tuple[Any, Results | None]]:
+    ) -> Generator[tuple[Any, Results | None], None, None]:
         """Like :meth:`compute` for any numbered tasks, done by ``here`` in threads of this process, or by ``job().do``
         elsewhere."""
         if self.workers is None and self.dask is None:
@@ -80,6 +80,7 @@ class Where:
             return run_processes(chunks, job(), self.workers)
         from drivetrain_jax.runs.cluster import run_cluster
 
+        assert self.dask is not None
         return run_cluster(chunks, job(), self.dask)
 
 
@@ -95,7 +96,7 @@ def _job(engine: Engine) -> Job:
 
 def run_threads(
     chunks: Iterable[Chunk], work: Callable[[Chunk], Results], count: int
-) -> Iterator[tuple[Chunk, Results]]:
+) -> Generator[tuple[Chunk, Results], None, None]:
     """Yield results from ``count`` threads of this process; compiled code releases the interpreter's lock.
 
     An exception of a chunk is raised here. After the iterator is closed (also by an interrupt) no further chunk starts;

@@ -71,8 +71,8 @@ class Grid:
             return self.shape
         return (*self.shape[: self.path_position], self.path_length, *self.shape[self.path_position :])
 
-    def place(self, points: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Indices of ``points`` in an array of shape ``shape``."""
+    def place(self, points: np.ndarray) -> tuple[Any, ...]:
+        """Index of ``points`` in an array of shape ``shape``."""
         # Without axes there is one point, and unravel_index needs at least one axis.
         return np.unravel_index(points, self.shape) if self.shape else (np.newaxis,)
 

@@ -266,8 +266,11 @@ def _inside(scene: Scene, grid: Grid, other_scene: Scene, other: Grid) -> tuple[
         mesh = np.meshgrid(*kept, indexing="ij")
         chosen = np.ravel_multi_index([m.ravel() for m in mesh], other.shape) if kept else np.zeros(1, int)
         index = {a.name: c[m.ravel()] for a, c, m in zip(other.axes, columns, mesh, strict=True)}
-    place = [np.broadcast_to(index.get(axis.name, constant.get(axis.name)), chosen.shape) for axis in grid.axes]
-    return (np.ravel_multi_index(place, grid.shape) if place else np.zeros(chosen.shape, int)), chosen
+    place = [
+        np.broadcast_to(index[axis.name] if axis.name in index else constant[axis.name], chosen.shape)
+        for axis in grid.axes
+    ]
+    return (np.ravel_multi_index(tuple(place), grid.shape) if place else np.zeros(chosen.shape, int)), chosen
 
 
 def _positions(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:

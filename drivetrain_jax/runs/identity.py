@@ -38,7 +38,7 @@ def numerics_of(scene: Scene) -> dict[str, Any]:
     return {
         "sources": {name: _source_digest(name, path) for name, path in _sources(tuple(starts))},
         "versions": versions(PACKAGES),
-        "x64": bool(jax.config.jax_enable_x64),
+        "x64": bool(jax.config.jax_enable_x64),  # pyright: ignore[reportAttributeAccessIssue]
         "backend": jax.default_backend(),
         "flags": os.environ.get("XLA_FLAGS", ""),
         "instructions": " ".join(sorted(instruction_set())),

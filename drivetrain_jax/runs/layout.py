@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, cast
 
 import h5py
 import numpy as np
@@ -26,7 +27,7 @@ def rearranged(path: Path, scene: Scene, grid: Grid) -> list[str]:
 def _rearranged(path: Path, scene: Scene, grid: Grid) -> list[str]:
     dims = ("point",) if scene.zipped else tuple(axis.name for axis in scene.axes)
     expected = {axis.name: axis.values for axis in scene.axes}
-    with h5py.File(path, "r") as file:
+    with cast(Any, h5py.File(path, "r")) as file:
         for own in scene.dimensions:
             if own.name in file:
                 expected[own.name] = np.asarray(own.values or range(file[own.name].size))

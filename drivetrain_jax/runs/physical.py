@@ -11,7 +11,7 @@ from drivetrain_jax.runs import toml
 from drivetrain_jax.systems import System
 
 
-def nondimensional(system: System, given: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
+def nondimensional(system: type[System], given: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
     """The physical data of ``system`` in ``given`` (None without any), and all values as its parameters.
 
     A value is a number (of Python or NumPy) or a range, a pair of numbers. Raises :class:`InputError` if data are missing

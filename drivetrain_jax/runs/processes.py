@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 
@@ -21,7 +21,7 @@ from drivetrain_jax.runs.worker import Job
 ATTEMPTS = 3
 
 
-def run_processes(chunks: Iterable[Chunk], job: Job, count: int) -> Iterator[tuple[Chunk, Results | None]]:
+def run_processes(chunks: Iterable[Chunk], job: Job, count: int) -> Generator[tuple[Chunk, Results | None], None, None]:
     """Yield ``(chunk, results)`` in the order of completion; results are None for a chunk that crashes every process.
 
     Exceptions of chunks, and of the start of a process, are raised here. When the iterator is closed (also by an interrupt)
@@ -88,7 +88,7 @@ class _Slot:
                 self._was_ready()
                 self._restart()
 
-    def collect(self, waiting: _Tasks, deaths: Counter[int]) -> Iterator[tuple[Chunk, Results | None]]:
+    def collect(self, waiting: _Tasks, deaths: Counter[int]) -> Generator[tuple[Chunk, Results | None], None, None]:
         """Yield finished results. The chunk that a dead process was computing is retried, or marked lost."""
         while self.running and next(iter(self.running)).done():
             future = next(iter(self.running))
@@ -138,5 +138,5 @@ def _initialise(core: int | None) -> None:
 
 
 def _end_with_parent() -> None:
-    multiprocessing.parent_process().join()
+    multiprocessing.parent_process().join()  # pyright: ignore[reportOptionalMemberAccess]
     os._exit(1)

@@ -51,7 +51,7 @@ def build_atlas(
     first, threads, values = 0, Where(work.where.threads), None
     while True:
         try:
-            points = rounds.send(values)
+            points = rounds.send(values)  # pyright: ignore[reportArgumentType]
         except StopIteration as end:
             progress.note = _note(end.value)
             return stability_atlas(end.value, scene.system, rtol), first
@@ -88,7 +88,7 @@ def _tolerance(scene: Scene) -> float:
 
 def fixed_of(scene: Scene, ranges: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
     """The parameters of the propagator that are not in ``ranges``, and their values."""
-    fixed = scene.fixed | {a.name: a.values[0].item() for a in scene.axes if a.name not in ranges}
+    fixed = {**scene.fixed} | {a.name: a.values[0].item() for a in scene.axes if a.name not in ranges}
     return {name: fixed[name] for name in scene.system.models[ANALYSIS.name].parameters if name in fixed}
 
 

@@ -38,7 +38,7 @@ class Scene:
     """
 
     title: str
-    system: System
+    system: type[System]
     analysis: Analysis
     request: Request
     axes: tuple[Axis, ...]
@@ -80,7 +80,7 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
     return Scene(title, system, analysis, request, axes, zipped, fixed, dimensions, path_axis, text)
 
 
-def find_system(name: str) -> System:
+def find_system(name: str) -> type[System]:
     """The system of this name; ``InputError`` with a similar name if it is unknown, or with the reason if its import
     fails."""
     try:
@@ -92,7 +92,7 @@ def find_system(name: str) -> System:
         raise InputError(f"system = {name!r}: {' '.join(str(error).split())}") from error
 
 
-def system_and_analysis(system_name: str, analysis_name: str) -> tuple[System, Analysis]:
+def system_and_analysis(system_name: str, analysis_name: str) -> tuple[type[System], Analysis]:
     """The system and the analysis of these names; ``InputError`` if one is unknown, or if they do not match."""
     system = find_system(system_name)
     if analysis_name not in system.models:
@@ -115,7 +115,7 @@ def _convert(given: Any, kind: type, where: str) -> Any:
         if missing := re.search(r"missing required field `(\w+)`", reason):
             name = missing.group(1)
             raise InputError(f"{where}{name}: missing; {_MISSING.get(name, 'it must be given')}") from None
-        name = re.match(r"\w*", path).group()
+        name = re.split(r"\W", path, maxsplit=1)[0]
         reason = re.sub(r"`([^`]*)`", _toml_types, reason)
         raise InputError(
             f"{where}{name} = {shown(given.get(name))}: {reason.replace('Expected', 'allowed is')}"
@@ -139,7 +139,7 @@ def _toml_types(match: re.Match[str]) -> str:
     return " or ".join(words) or "nothing"
 
 
-def _axes(table: _SceneTable, system: System, analysis: Analysis) -> tuple[tuple[Axis, ...], bool]:
+def _axes(table: _SceneTable, system: type[System], analysis: Analysis) -> tuple[tuple[Axis, ...], bool]:
     """The varying parameters; their values are counted before they are computed."""
     if table.axes and table.points:
         raise InputError("points: given together with axes; allowed is one of the two")
@@ -177,7 +177,7 @@ def _axis_table(name: str, given: Any) -> AxisTable:
     return _convert(given, AxisTable, f"axes.{name}.")
 
 
-def _axis(system: System, name: str, spec: AxisTable) -> Axis:
+def _axis(system: type[System], name: str, spec: AxisTable) -> Axis:
     parameter, entry = _swept_parameter(system, "axes", name)
     scalar = _scalar(parameter, name)
     for value in spec.values if spec.values is not None else (spec.start, spec.stop):
@@ -189,7 +189,7 @@ def _axis(system: System, name: str, spec: AxisTable) -> Axis:
     return Axis(name, parameter, entry, values.astype(np.int64) if parameter.integer else values)
 
 
-def _points(table: _SceneTable, system: System) -> tuple[Axis, ...]:
+def _points(table: _SceneTable, system: type[System]) -> tuple[Axis, ...]:
     """Columns of parameter values of equal length."""
     for name, values in table.points.items():
         if not isinstance(values, list):
@@ -212,7 +212,7 @@ def _scalar(parameter: Parameter, name: str) -> Parameter:
     return replace(parameter, name=name, listed=False, broadcast=False)
 
 
-def _swept_parameter(system: System, where: str, name: str) -> tuple[Parameter, int | None]:
+def _swept_parameter(system: type[System], where: str, name: str) -> tuple[Parameter, int | None]:
     """The parameter of the axis ``name``, and the position of a list entry."""
     base, entry = entry_of(name)
     known = {p.name: p for p in system.parameters}
@@ -230,7 +230,7 @@ def _swept_parameter(system: System, where: str, name: str) -> tuple[Parameter, 
     return parameter, entry
 
 
-def _unknown(system: System, name: str) -> str:
+def _unknown(system: type[System], name: str) -> str:
     """The message for an unknown parameter ``name``, with the allowed names."""
     known = [p.name for p in system.parameters]
     if system.physical and name in system.physical.names:
@@ -238,7 +238,7 @@ def _unknown(system: System, name: str) -> str:
     return f"unknown parameter{nearest(name, known)}"
 
 
-def _fixed(table: _SceneTable, system: System, analysis: Analysis, axes: tuple[Axis, ...]) -> dict[str, Value]:
+def _fixed(table: _SceneTable, system: type[System], analysis: Analysis, axes: tuple[Axis, ...]) -> dict[str, Value]:
     """The parameters that do not vary: given ones, then defaults of those that the analysis uses."""
     known = {p.name: p for p in system.parameters}
     whole = {axis.name for axis in axes if axis.entry is None}
@@ -248,7 +248,7 @@ def _fixed(table: _SceneTable, system: System, analysis: Analysis, axes: tuple[A
         if name in whole:
             where = "points" if table.points else "axes"
             raise InputError(f"fixed.{name} = {shown(value)}: also in [{where}]; allowed is one of the two")
-    fixed: dict[str, Value] = {}
+    fixed: dict[str, Any] = {}
     used, missing = system.models[analysis.name].parameters, []
     for parameter in system.parameters:
         if parameter.name in table.fixed:
@@ -298,7 +298,8 @@ def _check_entry(axis: Axis, fixed: Mapping[str, Value], where: str) -> None:
         raise InputError(
             f"fixed.{name}: missing; {axis.name} varies one entry of this list; allowed is {axis.parameter.allowed}"
         )
-    if not isinstance(fixed[name], tuple):
-        raise InputError(f"fixed.{name} = {fixed[name]}: {axis.name} varies one entry; allowed is a list of numbers")
-    if axis.entry >= len(fixed[name]):
-        raise InputError(f"{where}.{axis.name}: allowed is {name}[0] to {name}[{len(fixed[name]) - 1}]")
+    whole = fixed[name]
+    if not isinstance(whole, tuple):
+        raise InputError(f"fixed.{name} = {whole}: {axis.name} varies one entry; allowed is a list of numbers")
+    if axis.entry >= len(whole):
+        raise InputError(f"{where}.{axis.name}: allowed is {name}[0] to {name}[{len(whole) - 1}]")

@@ -57,7 +57,7 @@ class ShardJob(Job):
 
     path: str
 
-    def do(self, engine: Engine, task: Task) -> Mapping[str, np.ndarray]:
+    def do(self, engine: Engine, task: Task) -> Mapping[str, np.ndarray]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Compute and write a shard; returns only the outcomes."""
         return _write(self.path, engine, task, [engine.compute_chunk(chunk) for chunk in task.chunks])
 

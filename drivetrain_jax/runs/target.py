@@ -177,7 +177,7 @@ class Target:
         if not (fresh or self.parts.plan().get("fresh")):
             if isinstance(self._found, Damaged):
                 raise self.refusal
-            found += [self._shared] if self._grows else []
+            found += [self._shared] if self._shared is not None and self._grows else []
         taken = take(self.engine, found)
         if not fresh and self.parts.holds_work() and self.parts.plan().get("reuses") != taken.digest:
             files = ", ".join(self.parts.plan().get("reused_files") or ["no other result"])

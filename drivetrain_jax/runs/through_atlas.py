@@ -27,7 +27,7 @@ _LARGE = 1 << 19
 Results = Mapping[str, np.ndarray]
 
 
-def fill_through_atlas(engine: Engine, table: Table, work: Work, progress: Progress) -> dict[str, int]:
+def fill_through_atlas(engine: Engine, table: Table, work: Work, progress: Progress) -> dict[str, str | int]:
     """Fill all points of ``engine`` into ``table``; returns attributes of the result."""
     scene = engine.scene
     solves = Progress(0, kind="direct solves for the atlas")
@@ -81,7 +81,7 @@ def evaluate(
         table.release_after(results)
         outcome = results[OUTCOME.name]
         lost = np.argwhere(outcome == Outcome.LOST) + [part.start for part in block]
-        uncovered.append(np.ravel_multi_index(tuple(lost.T), engine.grid.shape))
+        uncovered.append(np.ravel_multi_index(tuple(lost.T), engine.grid.shape))  # pyright: ignore[reportArgumentType]
         progress.computed += outcome.size - len(lost)
         progress.failed += failures(outcome) - len(lost)
         if work.report:
@@ -114,13 +114,13 @@ def _blocks(engine: Engine, atlas: StabilityAtlas, table: Table) -> Iterator[tup
     # Rows and columns of a tile are the last two. Of axes as long as each other their order decides, which stays.
     atlas = atlas.ordered(sorted(lengths, key=lambda name: (name in longest, name not in longest and lengths[name])))
     names, outputs = atlas.atlas.parameters, engine.scene.request.outputs
-    lengths = [lengths[name] for name in names]
-    for ranges in _cut(lengths):
+    sizes = [lengths[name] for name in names]
+    for ranges in _cut(sizes):
         values = [axes[name][part] for name, part in zip(names, ranges, strict=True)]
         place = tuple(dict(zip(names, ranges, strict=True)).get(name, slice(0, 1)) for name in axes)
         arrays = table.block(place, atlas.blank((), outputs))
         places = {n: _in_atlas_order(a, names, tuple(axes)) for n, a in arrays.items()}
-        atlas.on_grid(values, outputs, places, rows=lengths[-2] if len(lengths) > 1 else None)
+        atlas.on_grid(values, outputs, places, rows=sizes[-2] if len(sizes) > 1 else None)
         yield place, arrays
 
 

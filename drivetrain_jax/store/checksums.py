@@ -11,6 +11,7 @@ import json
 from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -79,7 +80,7 @@ def _variables(file: h5py.File) -> dict[str, h5py.Dataset]:
     return {name: found for name in sorted(file) if isinstance(found := file[name], h5py.Dataset)}
 
 
-def _parsed(stored: object) -> dict[str, str]:
+def _parsed(stored: Any) -> dict[str, str]:
     """The stored table; a damaged table equals nothing."""
     try:
         table = json.loads(stored)

@@ -16,7 +16,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import h5py
 import numpy as np
@@ -62,7 +62,7 @@ class Part:
     @classmethod
     def from_bytes(cls, data: bytes) -> Part:
         """The part in an HDF5 image."""
-        with h5py.File(io.BytesIO(data), "r") as file:
+        with cast(Any, h5py.File(io.BytesIO(data), "r")) as file:
             results = {name: values[()] for name, values in file["results"].items()}
             return cls(file["chunks"][()], file["sizes"][()], results, float(file.attrs["seconds"]))
 

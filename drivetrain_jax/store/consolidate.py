@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import h5py
 import numpy as np
@@ -53,7 +53,7 @@ class ResultFile:
         data = {name: entry.values for name, entry in template.data.items()}
         return {n: np.ndarray(data[n].shape, data[n].dtype, mapped, at) for n, at in places.items()}
 
-    def finish(self, path: Path, **attrs: float) -> None:
+    def finish(self, path: Path, **attrs: str | float) -> None:
         """Change these attributes, add checksums, flush to disk, and move the file to ``path`` in one step."""
         with ThreadPoolExecutor(1) as aside:
             # Start writing the mapped pages now; computing the checksums reads them meanwhile.
@@ -102,7 +102,7 @@ def _reserve(path: Path, size: int) -> None:
 
 def release(arrays: Iterable[np.ndarray]) -> None:
     """Release the pages of the memory map of ``arrays``, if any; written values stay in the file."""
-    for mapped in {array.base for array in arrays if isinstance(array.base, mmap.mmap)}:
+    for mapped in {array.base for array in arrays if isinstance(array.base, mmap.mmap)}:  # pyright: ignore[reportUnhashable]
         if hasattr(mmap, "MADV_DONTNEED"):
             mapped.madvise(mmap.MADV_DONTNEED)
 
@@ -121,7 +121,7 @@ def read_variable(path: Path, name: str) -> np.ndarray:
     """One variable of the result at ``path``, without loading the others; ``InputError`` if it cannot be read."""
     try:
         with h5py.File(path, "r") as file:
-            return file[name][()]
+            return cast(h5py.Dataset, file[name])[()]
     except checksums.BROKEN:
         raise _unreadable(path) from None
 
@@ -130,7 +130,7 @@ def map_variable(path: Path, name: str) -> np.ndarray:
     """Like :func:`read_variable`, but as a memory map where the storage of the variable allows that."""
     try:
         with h5py.File(path, "r") as file:
-            variable = file[name]
+            variable = cast(h5py.Dataset, file[name])
             if variable.chunks is None and (offset := variable.id.get_offset()) is not None and variable.size:
                 return np.memmap(path, variable.dtype, "r", offset, variable.shape)
     except checksums.BROKEN:

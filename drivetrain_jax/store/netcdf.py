@@ -7,7 +7,7 @@ https://docs.unidata.ucar.edu/netcdf-c/current/file_format_specifications.html
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import h5py
 import numpy as np
@@ -30,7 +30,7 @@ def head(result: Labelled) -> bytes:
             _create(file, name, entry, data=entry.values.astype(_type(entry.values), copy=False))
         scales = {d: _make_scale(file, d, number, size) for number, (d, size) in enumerate(result.sizes.items())}
         for name, entry in aside.items():
-            _link(file[name], entry, scales)
+            _link(cast(h5py.Dataset, file[name]), entry, scales)
         file.flush()
         return file.id.get_file_image()
 
@@ -40,7 +40,7 @@ def add_data(file: h5py.File, result: Labelled) -> dict[str, int]:
 
     Empty variables get position 0. Scalars are written.
     """
-    scales, aside = {dim: file[dim] for dim in result.sizes}, _aside(result)
+    scales, aside = {dim: cast(h5py.Dataset, file[dim]) for dim in result.sizes}, _aside(result)
     for kind in sorted({str(entry.values.dtype) for entry in result.data.values()} & _COMPLEX.keys()):
         file[_COMPLEX[kind]] = np.dtype(kind)
     places = {}
@@ -75,7 +75,7 @@ def _type(values: np.ndarray) -> np.dtype:
 def _make_scale(file: h5py.File, dim: str, number: int, size: int) -> h5py.Dataset:
     """Make the coordinate ``dim`` a dimension, or create a dimension without coordinate."""
     if dim in file:
-        scale, title = file[dim], dim
+        scale, title = cast(h5py.Dataset, file[dim]), dim
         scale.attrs["_Netcdf4Coordinates"] = np.array([number], np.int32)
     else:
         scale = file.create_dataset(dim, (size,), ">f4", track_order=True, **_growth((size,)))
