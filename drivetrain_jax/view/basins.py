@@ -59,7 +59,7 @@ def _followed(x: np.ndarray, size: np.ndarray, exists: np.ndarray, multiple: np.
             last, k = places[-1]
             if i - last <= _LOST:
                 likely = (size[last, k], _ahead(x, size, places, i))
-                gaps |= {(j, b): _gap(row[j], likely) for j in here if multiple[i, j] == multiple[last, k]}
+                gaps |= {(j, b): _gap(row[j], likely) for j in here if multiple[i, j] == multiple[last, k]}  # pyright: ignore[reportArgumentType]
         for (k, b), gap in sorted(gaps.items(), key=lambda item: item[1]):
             if branch[i, k] < 0 and b not in branch[i] and gap <= _NEAR:
                 branch[i, k] = b

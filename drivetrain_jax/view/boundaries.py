@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 from matplotlib.artist import Artist
@@ -30,7 +32,7 @@ def draw(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> lis
     """Draw boundaries, tips and undecided boxes of ``dataset`` (``boundary_NAME``, ``tip_NAME``, ``undecided_NAME``);
     returns legend handles."""
     handles: list[Artist] = []
-    keep = {"scalex": False, "scaley": False}
+    keep: dict[str, Any] = {"scalex": False, "scaley": False}
     if dataset.sizes.get("boundary"):
         x, y = (dataset[f"boundary_{name}"] for name in (horizontal, vertical))
         handles += axes.plot(x, y, color=FRAME_GREY, linewidth=0.6, label="boundary", **keep)
@@ -53,7 +55,7 @@ def _draw_undecided(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: 
     x, y = (dataset[f"undecided_{name}"].values for name in (horizontal, vertical))
     corners = np.stack([x[:, [0, 1, 1, 0]], y[:, [0, 0, 1, 1]]], axis=-1)
     colour = STATE_COLOURS[2]
-    boxes = PolyCollection(corners, facecolor=colour, edgecolor=colour, linewidth=1.5, zorder=3)
+    boxes = PolyCollection(corners, facecolor=colour, edgecolor=colour, linewidth=1.5, zorder=3)  # pyright: ignore[reportArgumentType]
     axes.add_collection(boxes, autolim=False)
     return [Patch(facecolor=colour, label="may hide tips")]
 
@@ -65,7 +67,7 @@ def _name(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> No
     opens = dataset["tip_opens"].values if "tip_opens" in dataset.coords else np.ones(len(x))
     tips, names = np.stack([x, y], axis=-1), dataset["tip"].values.astype(str)
     scale = 72 / axes.figure.dpi
-    low, high = axes.bbox.min * scale + _ROOM / 2, axes.bbox.max * scale - _ROOM / 2
+    low, high = axes.bbox.min * scale + _ROOM / 2, axes.bbox.max * scale - _ROOM / 2  # pyright: ignore[reportOperatorIssue]
     taken: list[np.ndarray] = []
     for name, tip, up in zip(names, tips, opens, strict=True):
         mark = axes.transData.transform(tip) * scale
@@ -81,7 +83,7 @@ def _name(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> No
         axes.annotate(
             label_text(name),
             tip,
-            xytext=3.5 * np.array(side),
+            xytext=3.5 * np.array(side),  # pyright: ignore[reportArgumentType]
             textcoords="offset points",
             ha=aligned,
             va=level,

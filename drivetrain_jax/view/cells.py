@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -127,7 +128,7 @@ def states(dataset: xr.Dataset) -> xr.DataArray:
     return dataset["verdict"].where(dataset["outcome"] < FIRST_FAILURE, FAILED)
 
 
-def draw_cells(axes: Axes, field: xr.DataArray, horizontal: str, vertical: str, **options: object) -> QuadMesh:
+def draw_cells(axes: Axes, field: xr.DataArray, horizontal: str, vertical: str, **options: Any) -> QuadMesh:
     """Draw ``field`` as cells over the two axes; limits and scales of ``axes`` follow the cells."""
     x, y = (field[name].values.astype(float) for name in (horizontal, vertical))
     mesh = axes.pcolormesh(
@@ -140,7 +141,7 @@ def draw_cells(axes: Axes, field: xr.DataArray, horizontal: str, vertical: str, 
     return mesh
 
 
-def draw_strip(axes: Axes, codes: xr.DataArray, name: str, heights: tuple[float, float], **options: object) -> None:
+def draw_strip(axes: Axes, codes: xr.DataArray, name: str, heights: tuple[float, float], **options: Any) -> None:
     """Draw ``codes`` along the axis ``name`` as a strip between two heights, in fractions of the panel."""
     x = cell_edges(codes[name].values.astype(float))
     place = {"transform": axes.get_xaxis_transform(), "clip_on": False, "rasterized": True}
@@ -149,7 +150,9 @@ def draw_strip(axes: Axes, codes: xr.DataArray, name: str, heights: tuple[float,
         _cover_pending(axes, x, heights, codes[_PENDING].values[None, :], **place)
 
 
-def _cover_pending(axes: Axes, x: np.ndarray, y: Sequence[float], waiting: np.ndarray, **place: object) -> None:
+def _cover_pending(
+    axes: Axes, x: np.ndarray, y: Sequence[float] | np.ndarray, waiting: np.ndarray, **place: Any
+) -> None:
     grey = ListedColormap([_PENDING_COLOUR])
     axes.pcolormesh(x, y, np.where(waiting, 0.0, np.nan), cmap=grey, **{"rasterized": True, **place})
 
@@ -214,7 +217,7 @@ def draw_failures(axes: Axes, dataset: xr.Dataset, name: str) -> list[Line2D]:
 
 
 def _state_patch(code: int, note: str) -> Patch:
-    colours = {"facecolor": STATE_COLOURS[code], "edgecolor": FRAME_GREY}
+    colours: dict[str, Any] = {"facecolor": STATE_COLOURS[code], "edgecolor": FRAME_GREY}
     return Patch(**colours, linewidth=0.6, hatch=STATE_HATCHES[code], label=STATE_NAMES[code] + note)
 
 
@@ -232,7 +235,7 @@ def draw_growth(axes: Axes, radius: xr.DataArray, horizontal: str, vertical: str
     Pale colours decay, paler ones faster; orange to black grows. Missing values have the colour of failed cells.
     """
     with np.errstate(divide="ignore"):
-        growth = np.log10(radius)
+        growth: Any = np.log10(radius)
     finite = growth.values[np.isfinite(growth.values)]
     high = max(float(finite.max(initial=0.0)), 10 * LINEAR_GROWTH)
     low = min(max(float(finite.min(initial=0.0)), -1.0), -LINEAR_GROWTH)

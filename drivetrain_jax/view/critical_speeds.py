@@ -123,7 +123,7 @@ def _label_curves(axes: Axes) -> None:
     """Write the names of the curves at their right ends, without overlaps."""
     taken = -np.inf
     for line in axes.get_lines():
-        x, y = line.get_data()
+        x, y = map(np.asarray, line.get_data())
         present = np.flatnonzero(np.isfinite(y))
         if not present.size:
             continue
@@ -131,7 +131,7 @@ def _label_curves(axes: Axes) -> None:
         height = axes.transData.transform(end)[1] * 72 / axes.figure.dpi
         if height > taken + _LABEL_HEIGHT:
             label, colour = line.get_label(), line.get_color()
-            axes.annotate(label, end, (4, 0), textcoords="offset points", va="center", color=colour)
+            axes.annotate(label, end, (4, 0), textcoords="offset points", va="center", color=colour)  # pyright: ignore[reportArgumentType]
             taken = height
 
 
@@ -215,7 +215,7 @@ def _ticks(low: float, high: float) -> np.ndarray:
     decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
     marks = np.outer(decades, [1, 2, 5]).ravel()
     inside = marks[(marks >= low) & (marks <= high)]
-    return inside if len(inside) > 1 else ticker.MaxNLocator(5).tick_values(low, high)
+    return inside if len(inside) > 1 else ticker.MaxNLocator(5).tick_values(low, high)  # pyright: ignore[reportReturnType]
 
 
 def _shapes(dataset: xr.Dataset) -> Figure:

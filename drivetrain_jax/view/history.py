@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import matplotlib
 import numpy as np
 import xarray as xr
@@ -14,7 +16,7 @@ from drivetrain_jax.view import cells
 from drivetrain_jax.view.layout import DPI, WIDTH, wrap_caption, write_title
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, caption, symbol, value_text
 
-_LINE = {"color": LINE_COLOURS[0], "linewidth": 0.6, "markersize": 3.5}
+_LINE: dict[str, Any] = {"color": LINE_COLOURS[0], "linewidth": 0.6, "markersize": 3.5}
 _MOST_ROWS = 8
 _CAPTION_LINES = 2
 
@@ -72,7 +74,7 @@ def _rows(dataset: xr.Dataset, name: str) -> Figure:
     return figure
 
 
-def _line(history: xr.Dataset) -> dict[str, object]:
+def _line(history: xr.Dataset) -> dict[str, Any]:
     """Line style of a history; a single time has no line."""
     return _LINE | {"marker": "o" if history.sizes["time"] == 1 else ""}
 
@@ -97,13 +99,14 @@ def _draw_space(history: xr.Dataset, space: Axes3D) -> None:
     space.plot(history["phi"].values, history["velocity"].values, history["time"].values, **_line(history))
     space.set(xlabel=_label(history, "phi"), ylabel=_label(history, "velocity"), zlabel=_label(history, "time"))
     space.tick_params(labelsize=6.5, pad=-2)
+    axis: Any
     for axis in (space.xaxis, space.yaxis, space.zaxis):
         axis.labelpad = -3
         axis.label.set_size(7.5)
         axis.pane.set_facecolor("white")
     space.locator_params(nbins=4)
     space.view_init(elev=22, azim=-58)
-    space.set_box_aspect((1, 1, 0.8), zoom=0.92)
+    space.set_box_aspect((1, 1, 0.8), zoom=0.92)  # pyright: ignore[reportArgumentType]
 
 
 def _figure(dataset: xr.Dataset, height: float) -> Figure:
@@ -115,7 +118,7 @@ def _figure(dataset: xr.Dataset, height: float) -> Figure:
     return figure
 
 
-def _add(figure: Figure, box: tuple[float, float, float, float], height: float, **options: str) -> Axes:
+def _add(figure: Figure, box: tuple[float, float, float, float], height: float, **options: Any) -> Axes:
     """Axes in the box (left, bottom, width, height) in inches."""
     x, y, w, h = box
     return figure.add_axes((x / WIDTH, y / height, w / WIDTH, h / height), **options)

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import xarray as xr
 from matplotlib.artist import Artist
@@ -71,7 +72,7 @@ class Panels:
         total = self.figure.get_figheight()
         return left / WIDTH, bottom / total, width / WIDTH, height / total
 
-    def colorbar(self, axes: Axes, mapped: ScalarMappable, label: str, **options: object) -> None:
+    def colorbar(self, axes: Axes, mapped: ScalarMappable, label: str, **options: Any) -> None:
         """Add a colour bar in the right margin next to ``axes``."""
         box = axes.get_position()
         bar = self.figure.add_axes((box.x1 + 0.10 / WIDTH, box.y0, 0.14 / WIDTH, box.height), label="colour bar")

@@ -33,7 +33,7 @@ def plot(dataset: xr.Dataset, names: list[str]) -> Figure:
             draw = _draw_displacement if name == "u_max" else regimes.draw
             mesh = draw(axes, dataset, field, horizontal, vertical)
         if name == "u_max":
-            panels.colorbar(row[-1], mesh, variable_label(dataset[name]))
+            panels.colorbar(row[-1], mesh, variable_label(dataset[name]))  # pyright: ignore[reportArgumentType]
         else:
             handles += regimes.legend(dataset)
     for axes, direction in zip(panels.axes[0], ("up", "down"), strict=True):

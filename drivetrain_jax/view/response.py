@@ -85,7 +85,7 @@ def _draw_amplitudes(axes: Axes, dataset: xr.Dataset, name: str, keys: list[str]
         (own,) = (dim for dim in dataset[key].dims if dim != name)
         for index, colour in zip(range(dataset.sizes[own]), LINE_COLOURS, strict=False):
             curve = dataset[key].isel({own: index})
-            label = f"{_entry(curve, own, index)}, {meaning}"
+            label = f"{_entry(curve, own, index)}, {meaning}"  # pyright: ignore[reportArgumentType]
             handles += axes.plot(dataset[name], curve, color=colour, linestyle=style, label=label)
     _set_decades(axes, *(dataset[key] for key in keys))
     return handles
@@ -135,7 +135,7 @@ def _split(variable: xr.DataArray, names: list[str]) -> list[xr.DataArray]:
         return [variable]
     parts = [variable.isel({own[0]: index}) for index in range(variable.sizes[own[0]])]
     return [
-        part.assign_attrs(long_name=f"{part.attrs.get('long_name', part.name)}, {_entry(part, own[0], index)}")
+        part.assign_attrs(long_name=f"{part.attrs.get('long_name', part.name)}, {_entry(part, own[0], index)}")  # pyright: ignore[reportArgumentType]
         for index, part in enumerate(parts)
     ]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import chain
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -94,7 +95,7 @@ def _curve(dataset: xr.Dataset, name: str, marker: str = "") -> Figure:
         band = axes.fill_between(
             x, radius - error, radius + error, color=LINE_COLOURS[0], alpha=0.3, linewidth=0, label="error band"
         )
-        handles.append(band)
+        handles.append(band)  # pyright: ignore[reportArgumentType]
     handles.append(axes.axhline(1, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)), label="limit of stability"))
     cells.fit_axis(axes, "x", x)
     if "verdict" in dataset:
@@ -216,7 +217,9 @@ def _points(dataset: xr.Dataset) -> Figure:
     for state, marker in enumerate(_MARKERS):
         chosen = dataset.isel(point=code == state)
         if chosen.sizes["point"]:
-            colour = {"edgecolors": FRAME_GREY} if state == cells.STABLE else {"color": STATE_COLOURS[state]}
+            colour: dict[str, Any] = (
+                {"edgecolors": FRAME_GREY} if state == cells.STABLE else {"color": STATE_COLOURS[state]}
+            )
             label = f"{STATE_NAMES[state]} ({chosen.sizes['point']})"
             handles.append(axes.scatter(chosen[horizontal], chosen[vertical], s=22, label=label, **marker, **colour))
     panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
@@ -233,7 +236,7 @@ def _multipliers(dataset: xr.Dataset) -> Figure:
     angle = np.linspace(0, 2 * np.pi, 361)
     circle = axes.plot(np.cos(angle), np.sin(angle), color=FRAME_GREY, linewidth=0.8, label="unit circle")
     values = dataset["floquet_multiplier"].values
-    dots = axes.plot(values.real, values.imag, "o", color=LINE_COLOURS[0], markersize=5, label="Floquet multipliers")
+    dots = axes.plot(values.real, values.imag, "o", color=LINE_COLOURS[0], markersize=5, label="Floquet multipliers")  # pyright: ignore[reportAttributeAccessIssue]
     axes.set_aspect("equal", adjustable="datalim")
     panels.label_axes("real part of the multiplier [1]", "imaginary part [1]")
     panels.titles(dataset)

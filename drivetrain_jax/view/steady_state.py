@@ -137,7 +137,7 @@ def _basins(dataset: xr.Dataset) -> Figure:
     share = [float((codes == k).mean()) for k in range(len(names) + 1)]
     handles = [
         Patch(facecolor=colour, edgecolor=FRAME_GREY, linewidth=0.6, label=f"{label}: {part:.1%}")
-        for colour, label, part in zip(colours.colors, [*names, "other or failed"], share, strict=True)
+        for colour, label, part in zip(colours.colors, [*names, "other or failed"], share, strict=True)  # pyright: ignore[reportArgumentType]
         if part > 0
     ]
     panels.label_axes(axis_label(dataset["u0"]), axis_label(dataset["v0"]))

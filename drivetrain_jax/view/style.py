@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+from typing import Any
 
 import xarray as xr
 from matplotlib.colors import ListedColormap
 
 # Passed to rc_context around every figure; global rcParams stay unchanged.
-STYLE = {
+STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
     "mathtext.fontset": "dejavusans",
