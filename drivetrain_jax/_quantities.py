@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from drivetrain_jax._wording import shown
 
@@ -73,7 +74,7 @@ class Parameter:
         if self.choices:
             # A word that looks like a number needs no quotes.
             value = str(value) if isinstance(value, int) and str(value) in self.choices else value
-            if value not in self.choices:
+            if not isinstance(value, str) or value not in self.choices:
                 raise ValueError(f"{self.name} = {shown(value)}: allowed is {self.allowed}")
             return value
         if self.text:
@@ -124,7 +125,7 @@ class Variable:
     dtype: str = "float64"
     flags: tuple[str, ...] = ()
 
-    def written(self, value: complex) -> str:
+    def written(self, value: Any) -> str:
         """One value as text: the meaning of a code, twelve digits of a number, three digits of an error."""
         if self.flags:
             return f"{self.flags[int(value)]} ({int(value)})"

@@ -16,6 +16,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -98,7 +99,7 @@ def analyse(name: str, system: System, outputs: Sequence[str] | None, options: M
 
 def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapping[str, Any]) -> tuple[_Job, Any]:
     """The checked call, and its numbers as arrays."""
-    if not jax.config.jax_enable_x64:
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise InputError("jax_enable_x64 = False: allowed is True, by jax.config.update or within jax.enable_x64(True)")
     if not isinstance(system, System):
         raise InputError(
@@ -134,7 +135,12 @@ def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapp
         lambda x: x if isinstance(x, str) else path if x is leaf and along is not None else None, values
     )
     job = _Job(
-        analysis, type(system), request, Constants(rest), along is not None, along is not None and np.ndim(leaf) == 0
+        analysis,
+        type(system),
+        request,
+        Constants(rest),
+        along is not None,
+        along is not None and np.ndim(leaf) == 0,  # pyright: ignore[reportArgumentType]
     )
     return job, parameters
 

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -118,7 +119,7 @@ class System(eqx.Module):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({})
     resonances: ClassVar[Resonances | None] = None
     time_units: ClassVar[str] = "1"
-    physical: ClassVar[type | None] = None
+    physical: ClassVar[Any] = None
     roles: ClassVar[Mapping[str, str]] = MappingProxyType({})
     parameters: ClassVar[tuple[Parameter, ...]] = ()
     models: ClassVar[dict[str, Model]] = {}
@@ -169,7 +170,7 @@ def _models(system: type[System], method: Any) -> dict[str, Model]:
         return method(system.of(values))
 
     # Where the code of a model stands decides what its results depend on.
-    build.__wrapped__ = method
+    build.__wrapped__ = method  # pyright: ignore[reportFunctionMemberAccess]
     everything = tuple(p.name for p in system.parameters)
     return {
         name: Model(build, everything if parameters is None else parameters, check, smooth)

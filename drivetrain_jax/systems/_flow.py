@@ -8,7 +8,7 @@ the start; an autonomous system has no clock and any interval serves as its stro
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -40,12 +40,12 @@ class Flow(eqx.Module):
       takes 48 steps per strobe unless told otherwise.
     """
 
-    field: Callable[[Components, Sequence[Any]], Components]
+    field: Callable[[Components, Any], Components]
     start: Components
     period: Any
     turns: Components = ()
     scale: tuple[Any, ...] | None = None
-    divergence: Callable[[Components, Sequence[Any]], Any] | None = None
+    divergence: Callable[[Components, Any], Any] | None = None
     phases: tuple[int, ...] = eqx.field(default=(), static=True)
     cyclic: tuple[int, ...] = eqx.field(default=(), static=True)
     fastest: Any = None

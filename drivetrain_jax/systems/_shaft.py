@@ -43,7 +43,7 @@ class Shaft(NamedTuple):
     @property
     def lanes(self) -> tuple[int, ...]:
         """Shape of the lanes of all fields together."""
-        return jnp.broadcast_shapes(*(field.shape[1:] for field in self if field is not None))
+        return jnp.broadcast_shapes(*(field.shape[1:] for field in self if field is not None))  # pyright: ignore[reportReturnType]
 
     def mirrored(self) -> Shaft:
         """The same shaft seen from its other end."""

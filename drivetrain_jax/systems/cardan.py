@@ -286,7 +286,7 @@ class Cardan(System):
         Eq. (13): -(2 pi zeta/Omega) [1 + alpha/gamma + alpha (1 + c^2)/(2 c)], c = cos(beta).
         """
         c = jnp.cos(self.beta)
-        mean = 1 + self.alpha / self.gamma + self.alpha * (1 + c**2) / (2 * c)
+        mean: Any = 1 + self.alpha / self.gamma + self.alpha * (1 + c**2) / (2 * c)
         return -2 * math.pi * self.zeta / self.Omega * mean
 
     def explicit_steps(self, rtol: float) -> np.ndarray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter
@@ -110,7 +110,7 @@ class PhysicalShaft:
 
 
 def _check(name: str, value: float) -> float:
-    parameter = next(p for p in PHYSICAL if p.name == name)
+    parameter: Any = next(p for p in PHYSICAL if p.name == name)
     try:
         return float(parameter.check(value))
     except ValueError as error:

@@ -88,12 +88,12 @@ def _extensions(directions: Array, pressure_angle: Array) -> tuple[Array, Array]
     weights = jnp.stack([jnp.ones_like(pressure_angle), jnp.cos(pressure_angle), jnp.sin(pressure_angle)])
     central = sum(w * part[(...,) + (None,) * len(lanes)] for w, part in zip(weights, _CENTRAL_PARTS, strict=True))
     own = sum(w * part[(...,) + (None,) * len(lanes)] for w, part in zip(weights, _PLANET_PARTS, strict=True))
-    coupling = sum(directions[None, :, None, i] * central[:, None, :, i] for i in range(3))
+    coupling = sum(directions[None, :, None, i] * central[:, None, :, i] for i in range(3))  # pyright: ignore[reportIndexIssue]
     eye = np.eye(n).reshape(1, n, n, 1, *(1,) * len(lanes))
-    planets = (eye * own[:, None, None]).reshape(4 * n, _PER_PLANET * n, *lanes)
-    springs = jnp.concatenate([coupling.reshape(4 * n, _CENTRAL, *lanes), planets], axis=1)
+    planets = (eye * own[:, None, None]).reshape(4 * n, _PER_PLANET * n, *lanes)  # pyright: ignore[reportIndexIssue]
+    springs = jnp.concatenate([coupling.reshape(4 * n, _CENTRAL, *lanes), planets], axis=1)  # pyright: ignore[reportAttributeAccessIssue]
     bearings = np.eye(_CENTRAL, _CENTRAL + _PER_PLANET * n).reshape(_CENTRAL, -1, *(1,) * len(lanes))
-    return jnp.concatenate([springs, jnp.broadcast_to(bearings, (_CENTRAL, *springs.shape[1:]))]), own
+    return jnp.concatenate([springs, jnp.broadcast_to(bearings, (_CENTRAL, *springs.shape[1:]))]), own  # pyright: ignore[reportReturnType]
 
 
 def _stiffness_and_mass(p: Mapping[str, Array], n: int) -> tuple[Array, Array]:

@@ -397,5 +397,5 @@ class Tripod(System):
         """``(phi', phi'')`` of ``y = (phi, phi')`` [rad, rad/s] at the time ``t`` [s]; (25) or (26) by default."""
         flow = self.history_model()
         turned = t / flow.period
-        scale = jnp.stack([jnp.asarray(s, float) for s in flow.scale])
+        scale = jnp.stack([jnp.asarray(s, float) for s in flow.scale or ()])
         return scale * flow.vector(0, turned, y / scale)
