@@ -23,10 +23,11 @@ validate: $(VENV)/installed-test  ## the comparisons at full size
 faults: $(VENV)/installed-test  ## real faults at random moments; writes the table of docs/reliability.md
 	$(BIN)/python tests/faults/suite.py
 
-lint: $(VENV)/installed-test  ## style, formatting, spelling, directions of imports
+lint: $(VENV)/installed-test  ## style, formatting, spelling, types, directions of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/codespell
+	$(BIN)/python -m pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
 
 bench: $(VENV)/installed-bench  ## error against run time, with the peers; writes benchmarks/results/, docs/benchmarks.md and the figures of README.md
