@@ -287,7 +287,7 @@ def _derivatives(
     modes, largest = system_modes(here, "auto", 1), largest_frequency(here, 1)
     near, still = one_frequency(modes.frequency, largest)[..., 0], is_rigid(modes.frequency, largest)
     omega = jnp.where(modes.found, modes.frequency, jnp.nan)[:, 0]
-    shapes = modes.vectors[..., 0] / jnp.sqrt(here.mass)[:, None]
+    shapes = modes.vectors[..., 0] / jnp.sqrt(here.mass)[:, None]  # pyright: ignore[reportOptionalSubscript]
 
     def excess(parameters: Any) -> Array:
         """Zero but for rounding; its derivatives at fixed shapes are those of ``(2 pi f)^2``."""

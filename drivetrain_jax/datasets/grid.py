@@ -43,7 +43,8 @@ def _values(atlas: StoredAtlas, name: str, given: Any) -> np.ndarray:
     if _is_count(given):
         values = np.linspace(*atlas.ranges[name], _count(name, given))
     elif isinstance(given, tuple) and len(given) == 3 and _is_count(given[2]):
-        values = np.linspace(*(float(_number(name, end)) for end in given[:2]), _count(name, given[2]))
+        start, stop = (float(_number(name, end)) for end in given[:2])
+        values = np.linspace(start, stop, _count(name, given[2]))
     else:
         values = _number(name, given)
     if values.ndim > 1 or not values.size:

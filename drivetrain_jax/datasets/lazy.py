@@ -149,7 +149,8 @@ def _spread_out(key: Key, shape: tuple[int, ...]) -> list[np.ndarray]:
             positions.append(np.arange(*part.indices(size)).reshape((1,) * (ahead + number) + (-1,) + (1,) * behind))
             number += 1
         else:
-            positions.append(part.reshape(part.shape + (1,) * len(slices)))
+            array = np.asarray(part)
+            positions.append(array.reshape(array.shape + (1,) * len(slices)))
     return positions
 
 

@@ -75,7 +75,7 @@ def keep(key: str, compiled: Any) -> None:
 
 def _path(key: str) -> Path | None:
     """The file of a kernel, in a folder next to jax's own files; None if nothing is kept."""
-    folder = jax.config.jax_compilation_cache_dir
+    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     own = folder is not None and Path(folder) == _folder(os.environ.get(_VARIABLE, ""))
     return Path(f"{folder}-kernels", key) if own else None
 

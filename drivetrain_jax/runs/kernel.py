@@ -122,7 +122,7 @@ def is_small(grid: Grid, solvers: Sequence[Solver]) -> bool:
 class _Job:
     """The key of a kernel in the cache; equal jobs share one kernel."""
 
-    system: System
+    system: type[System]
     analysis: Analysis
     structure: tuple[Any, ...]
     scene: Scene = field(compare=False)

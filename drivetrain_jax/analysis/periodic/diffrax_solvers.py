@@ -143,7 +143,7 @@ def _integrated(constants: Constants, arrays: LinearPeriodic, steps: Array) -> A
         max_steps=None,
         throw=False,
     )
-    return solution.ys[-1]
+    return solution.ys[-1]  # pyright: ignore[reportOptionalSubscript]
 
 
 def diffrax_propagator(
