@@ -17,6 +17,7 @@ from drivetrain_jax.runs.atlas_choice import uses_atlas
 from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.executor import Where
 from drivetrain_jax.runs.growing import NOTHING, Taken, rest_of
+from drivetrain_jax.runs.notebook import shown_progress
 from drivetrain_jax.runs.scene import Scene, load_scene
 from drivetrain_jax.runs.target import Target
 from drivetrain_jax.runs.work import Progress, Report, Work
@@ -73,7 +74,7 @@ def run(
     :param dask: Dask cluster instead of threads: ``tcp://host:port``, or ``local:N`` processes.
     :param reuse: path(s) of results whose common points are reused; only with ``out``. The result at ``out`` is always
         reused if all of its points and outputs belong to this scene.
-    :param report: called with the :class:`Progress` after every chunk.
+    :param report: called with the :class:`Progress` after every chunk; by default a notebook shows a bar.
     :raises InputError: one line that names the field, the value and what is allowed. Nothing is computed or written.
     :raises Incomplete: the run failed, and finished chunks are kept. The message says if the same call may get further (a
         full disk, too little memory, a worker that died).
@@ -82,8 +83,10 @@ def run(
     if out is None:
         if reuse:
             raise InputError("reuse: given without out; allowed is a run into a file")
-        return _in_memory(_engine(scene, overrides, on_disk=False), where, report)
-    run_to_file(scene, Path(out), overrides=overrides, fresh=fresh, where=where, reuse=reuse, report=report)
+        with shown_progress(report) as shown:
+            return _in_memory(_engine(scene, overrides, on_disk=False), where, shown)
+    with shown_progress(report) as shown:
+        run_to_file(scene, Path(out), overrides=overrides, fresh=fresh, where=where, reuse=reuse, report=shown)
     return open_result(Path(out))
 
 

@@ -1,0 +1,94 @@
+"""Figures of results in memory or in files, atlases among them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from drivetrain_jax import view
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._wording import shown
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
+
+    Result = xr.Dataset | str | Path
+
+# Cells each way in the chart of an atlas.
+CELLS = 800
+# Cells that a figure may have: matplotlib takes some hundred bytes for each.
+_MOST_CELLS = 100_000_000
+
+
+def plot(
+    result: Result | list[Result] | tuple[Result, ...],
+    *others: Result,
+    part: Mapping[str, float | tuple[float, float]] | None = None,
+    cells: int | None = None,
+) -> Figure:
+    """The figure that suits the analysis of a result.
+
+    Args:
+        result: a dataset, the path of a result file, or a list of them; an atlas is drawn with its boundaries and tips.
+        others: results of the same analysis by other methods, drawn into the same axes (``frequency_response``).
+        part: of an atlas, what its chart shows: a number or ``(low, high)`` by the name of a parameter.
+        cells: of an atlas, the number of cells each way (800).
+
+    Returns: a matplotlib figure that shows itself in a notebook and belongs to no window: ``figure.savefig("chart.png")``.
+
+    Raises: :class:`~drivetrain_jax.InputError` for a result that has no figure.
+
+    >>> import drivetrain_jax as dt, numpy as np
+    >>> shaft = dt.Cardan(beta=0.3, Omega=1.4, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)
+    >>> chart = dt.sweep(dt.floquet, shaft, over={"beta": np.linspace(0, 1, 3), "Omega": np.linspace(1.3, 1.5, 3)})
+    >>> type(dt.plot(chart)).__name__
+    'Figure'
+    """
+    sources = [*result, *others] if isinstance(result, (list, tuple)) else [result, *others]
+    if not sources:
+        raise InputError("result = []: allowed is a result, or a list of one or more")
+    datasets = [_dataset(source) for source in sources]
+    if any(dataset.attrs.get("analysis") == "atlas" for dataset in datasets):
+        if len(datasets) > 1:
+            raise InputError("results: an atlas among several; allowed is an atlas alone")
+        return view.plot(_chart(sources[0], datasets[0], part, cells))
+    if part is not None or cells is not None:
+        field = f"part = {shown(part)}" if part is not None else f"cells = {cells}"
+        raise InputError(f"{field}: a result on a grid is drawn whole; allowed for an atlas")
+    return view.plot(*map(_loaded, datasets))
+
+
+def _dataset(source: Any) -> xr.Dataset:
+    import xarray as xr
+
+    if isinstance(source, xr.Dataset):
+        return source
+    if isinstance(source, (str, Path)):
+        from drivetrain_jax.runs.partial import open_result
+
+        return open_result(source)
+    raise InputError(f"result: got a {type(source).__name__}; allowed is a Dataset, the path of a result, or a list of them")
+
+
+def _chart(
+    source: Result,
+    dataset: xr.Dataset,
+    part: Mapping[str, float | tuple[float, float]] | None,
+    cells: int | None,
+) -> xr.Dataset:
+    from drivetrain_jax.runs.atlas_chart import chart
+
+    # From its file an atlas is checked for damage.
+    place = Path(source) if isinstance(source, (str, Path)) else dataset
+    return chart(place, part or {}, CELLS if cells is None else cells)
+
+
+def _loaded(dataset: xr.Dataset) -> xr.Dataset:
+    """``dataset`` in memory: cells of an atlas are then evaluated once."""
+    size = dataset["outcome"].size if "outcome" in dataset else 0
+    if size > _MOST_CELLS:
+        some = "select some with .sel or .isel"
+        raise InputError(f"result: has {size:.3g} cells; allowed in a figure are up to {_MOST_CELLS:.0e}: {some}")
+    return dataset.compute()

@@ -1,0 +1,56 @@
+"""The progress of a run where a notebook would show it."""
+
+from __future__ import annotations
+
+import re
+import sys
+from types import ModuleType, SimpleNamespace
+
+import pytest
+
+import drivetrain_jax as dt
+from drivetrain_jax.runs import notebook
+
+
+@pytest.fixture
+def shown(monkeypatch):
+    """What the cell of a notebook shows, state after state: IPython as far as the bar uses it."""
+    states = []
+    ipython, display = ModuleType("IPython"), ModuleType("IPython.display")
+    ipython.get_ipython = lambda: SimpleNamespace(kernel=object())
+    display.HTML = str
+    display.display = lambda content, display_id: states.append(content) or SimpleNamespace(update=states.append)
+    for name, module in (("IPython", ipython), ("IPython.display", display)):
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.setattr(notebook, "_PATIENCE", 0.0)
+    monkeypatch.setattr(notebook, "_STEP", 0.0)
+    return states
+
+
+def test_a_notebook_shows_a_bar(shown, grid_scene, tmp_path):
+    found = dt.run(grid_scene)
+    failed = int((found["outcome"] > 1).sum())
+    last = re.fullmatch(r'<progress value="1.0000" max="1"></progress> (.*)', shown[-1])[1]
+    assert last.startswith("123/123 points, ") and last.endswith(f" s, {failed} failed") and failed
+    assert "123/123 points" not in shown[0]
+    before = len(shown)
+    dt.run(grid_scene, out=tmp_path / "r.nc")
+    assert len(shown) > before
+
+
+def test_a_report_of_the_caller_is_the_only_one(shown, grid_scene):
+    reports = []
+    dt.run(grid_scene, report=reports.append)
+    assert reports and not shown
+
+
+def test_a_terminal_shows_none(shown, grid_scene, monkeypatch):
+    monkeypatch.setattr(sys.modules["IPython"], "get_ipython", lambda: SimpleNamespace())
+    dt.run(grid_scene)
+    assert not shown
+
+
+def test_a_short_run_shows_none(shown, grid_scene, monkeypatch):
+    monkeypatch.setattr(notebook, "_PATIENCE", 100.0)
+    dt.run(grid_scene)
+    assert not shown
