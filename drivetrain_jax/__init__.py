@@ -12,8 +12,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._errors import ChunkError, InputError
+from drivetrain_jax._registration import register_accessor
 
 if TYPE_CHECKING:
+    from drivetrain_jax.datasets.figure import plot
     from drivetrain_jax.functions import (
         Result,
         basins,
@@ -37,11 +39,11 @@ if TYPE_CHECKING:
     from drivetrain_jax.systems.planetary import Planetary
     from drivetrain_jax.systems.rattle import Rattle
     from drivetrain_jax.systems.tripod import Tripod
-    from drivetrain_jax.view.figure import plot
 
 __version__ = "0.1.0"
 
 _HOME = {
+    "datasets.figure": ("plot",),
     "runs.atlas_file": ("open_atlas",),
     "runs.over": ("sweep",),
     "runs.partial": ("open_result",),
@@ -52,7 +54,6 @@ _HOME = {
     "systems.planetary": ("Planetary",),
     "systems.rattle": ("Rattle",),
     "systems.tripod": ("Tripod",),
-    "view.figure": ("plot",),
     "functions": (
         "Result",
         "basins",
@@ -108,3 +109,6 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted(__all__)
+
+
+register_accessor()

@@ -43,8 +43,8 @@ def plot(
     >>> import drivetrain_jax as dt, numpy as np
     >>> shaft = dt.Cardan(beta=0.3, Omega=1.4, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)
     >>> chart = dt.sweep(dt.floquet, shaft, over={"beta": np.linspace(0, 1, 3), "Omega": np.linspace(1.3, 1.5, 3)})
-    >>> type(dt.plot(chart)).__name__
-    'Figure'
+    >>> dt.plot(chart).get_size_inches().tolist()
+    [7.0, 6.87]
     """
     sources = [*result, *others] if isinstance(result, (list, tuple)) else [result, *others]
     if not sources:
@@ -69,7 +69,9 @@ def _dataset(source: Any) -> xr.Dataset:
         from drivetrain_jax.runs.partial import open_result
 
         return open_result(source)
-    raise InputError(f"result: got a {type(source).__name__}; allowed is a Dataset, the path of a result, or a list of them")
+    raise InputError(
+        f"result: got a {type(source).__name__}; allowed is a Dataset, the path of a result, or a list of them"
+    )
 
 
 def _chart(
@@ -86,9 +88,16 @@ def _chart(
 
 
 def _loaded(dataset: xr.Dataset) -> xr.Dataset:
-    """``dataset`` in memory: cells of an atlas are then evaluated once."""
-    size = dataset["outcome"].size if "outcome" in dataset else 0
-    if size > _MOST_CELLS:
+    """``dataset`` in memory, so that cells of an atlas are evaluated once; dimensions along which results were joined are
+    numbered."""
+    if "outcome" not in dataset:
+        return dataset
+    outcome = dataset["outcome"]
+    if outcome.dtype.kind == "U":
+        raise InputError("result: has words for codes; allowed is the result itself, before .drivetrain.named()")
+    if outcome.size > _MOST_CELLS:
         some = "select some with .sel or .isel"
-        raise InputError(f"result: has {size:.3g} cells; allowed in a figure are up to {_MOST_CELLS:.0e}: {some}")
-    return dataset.compute()
+        raise InputError(
+            f"result: has {outcome.size:.3g} cells; allowed in a figure are up to {_MOST_CELLS:.0e}: {some}"
+        )
+    return dataset.compute().assign_coords({d: range(n) for d, n in outcome.sizes.items() if d not in dataset.coords})

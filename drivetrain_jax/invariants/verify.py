@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.invariants import Finding, check
@@ -12,8 +13,11 @@ from drivetrain_jax.store import checksums, shards
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.consolidate import open_result, read_attribute
 
+if TYPE_CHECKING:
+    import xarray as xr
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Report:
     """``lines`` for the reader; ``problem`` is the first problem, empty without one. ``complete`` is false for
     unfinished work."""
@@ -24,6 +28,9 @@ class Report:
 
     def __str__(self) -> str:
         return "\n".join(self.lines)
+
+    # A notebook shows what `print` does.
+    __repr__ = __str__
 
     def to_json(self) -> str:
         """The report and the state as one JSON object."""
@@ -56,6 +63,17 @@ def verify(path: Path) -> Report:
     findings = check(open_result(path))
     lines = (f"checksums: {sealed}", *map(str, findings))
     return Report(lines, _first_broken(findings))
+
+
+def verify_dataset(dataset: xr.Dataset, file: Path | None) -> Report:
+    """Check the numbers of ``dataset``, and that ``file``, which it comes from, is what was written."""
+    findings = check(dataset)
+    changed = checksums.damaged(file) if file else None
+    if changed:
+        problem = f"file = {str(file)!r}: {checksums.named(changed)} is not what was written; allowed is to restore it"
+        return Report((f"checksums: {len(changed)} differ: {checksums.named(changed)}", *map(str, findings)), problem)
+    sealed = "not of a file" if changed is None else f"all agree in {file}"
+    return Report((f"checksums: {sealed}", *map(str, findings)), _first_broken(findings))
 
 
 def _first_broken(findings: list[Finding]) -> str:

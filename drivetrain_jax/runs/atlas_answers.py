@@ -28,7 +28,7 @@ _CLOSE = 1e-3
 _BEYOND = {"crossing": "", "atlas": " (the end of the atlas)", "undecided": " (undecided beyond)"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Reply:
     """An answer as text (``str``) and as plain numbers, words and lists (``data``)."""
 
@@ -37,6 +37,9 @@ class Reply:
 
     def __str__(self) -> str:
         return self.text
+
+    # A notebook shows what `print` does.
+    __repr__ = __str__
 
     def to_json(self) -> str:
         """``data`` as one JSON object; numbers that are not finite become null."""

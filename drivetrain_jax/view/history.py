@@ -13,7 +13,7 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
-from drivetrain_jax.view.layout import DPI, WIDTH, wrap_caption, write_title
+from drivetrain_jax.view.layout import DPI, WIDTH, NotebookFigure, wrap_caption, write_title
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, caption, symbol, value_text
 
 _LINE: dict[str, Any] = {"color": LINE_COLOURS[0], "linewidth": 0.6, "markersize": 3.5}
@@ -110,7 +110,7 @@ def _draw_space(history: xr.Dataset, space: Axes3D) -> None:
 
 
 def _figure(dataset: xr.Dataset, height: float) -> Figure:
-    figure = Figure(figsize=(WIDTH, height), dpi=DPI)
+    figure = NotebookFigure(figsize=(WIDTH, height), dpi=DPI)
     left = 0.35 / WIDTH
     write_title(figure, dataset, 0.35)
     text = wrap_caption(caption(dataset), WIDTH - 0.35 - 0.1, _CAPTION_LINES)

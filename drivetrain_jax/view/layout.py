@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
 from collections.abc import Callable, Sequence
@@ -20,6 +21,7 @@ from drivetrain_jax.view.style import FRAME_GREY, STYLE, caption
 
 WIDTH = 7.0
 DPI = 200
+_NOTEBOOK_DPI = 100
 _LABEL_SIZE = 8.5
 # Height of a line of a label in inches, with a margin.
 _LABEL_LINE = 0.16
@@ -43,6 +45,17 @@ class Margins:
     label: float = 0.44
 
 
+class NotebookFigure(Figure):
+    """A figure that a notebook shows where it ends a cell, without pyplot."""
+
+    def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
+        image = io.BytesIO()
+        self.savefig(image, format="png")
+        width, height = self.get_size_inches()
+        # As large as a figure of pyplot, with all dots for screens that have them.
+        return image.getvalue(), {"width": round(width * _NOTEBOOK_DPI), "height": round(height * _NOTEBOOK_DPI)}
+
+
 class Panels:
     """A figure of ``rows x columns`` equal panels with title, caption and legend.
 
@@ -55,7 +68,7 @@ class Panels:
         self.margins = m = margins or Margins()
         width = (WIDTH - m.left - m.right - (columns - 1) * m.between_columns) / columns
         total = m.top + m.bottom + rows * height + (rows - 1) * m.between_rows
-        self.figure = Figure(figsize=(WIDTH, total), dpi=DPI)
+        self.figure = NotebookFigure(figsize=(WIDTH, total), dpi=DPI)
         self.axes: list[list[Axes]] = []
         first: Axes | None = None
         for row in range(rows):

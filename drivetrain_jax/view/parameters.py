@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import cells
-from drivetrain_jax.view.layout import DPI, WIDTH, Margins, Panels, write_title
+from drivetrain_jax.view.layout import DPI, WIDTH, Margins, NotebookFigure, Panels, write_title
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, axis_label, caption, variable_label
 
 _HEIGHT, _MOST_CURVES = 1.8, 8
@@ -63,7 +63,7 @@ def _table(dataset: xr.Dataset, shown: list[str]) -> Figure:
     head = textwrap.wrap(entries, _LETTERS, break_long_words=False)
     top = 0.55 + _CAPTION * len(head)
     height = top + 0.1 + _ROW * len(lines)
-    figure = Figure(figsize=(WIDTH, height), dpi=DPI)
+    figure = NotebookFigure(figsize=(WIDTH, height), dpi=DPI)
     left, value, units = 0.35 / WIDTH, 0.72, 0.74
     write_title(figure, dataset, 0.35)
     figure.text(left, 1 - 0.32 / height, "\n".join(head), va="top", size=8, color=FRAME_GREY)

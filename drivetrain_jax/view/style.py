@@ -104,14 +104,32 @@ def value_text(name: str, value: object, units: str = "1") -> str:
 def caption(dataset: xr.Dataset) -> str:
     """One line with the fixed parameters of the scene, then scalar coordinates; defaults are left out."""
     fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}"))
-    named = tomllib.loads(dataset.attrs["scene"]).get("fixed", {}) if "scene" in dataset.attrs else fixed
-    parts = [_fixed_text(name, _unless_swept(dataset, name, value)) for name, value in fixed.items() if name in named]
+    scene = tomllib.loads(dataset.attrs["scene"]) if "scene" in dataset.attrs else {"fixed": fixed}
+    named = {name for table in ("fixed", "axes", "points") for name in scene.get(table, {})}
+    scalars = {
+        str(name): c for name, c in dataset.coords.items() if c.ndim == 0 and _says_something(str(name), c, fixed)
+    }
+    shown = [] if _is_joined(dataset, named) else [name for name in fixed if name in scene.get("fixed", {})]
+    varies = {str(name) for name in (*dataset.coords, *dataset.dims)}
+    parts = [_fixed_text(name, _unless_swept(dataset, name, fixed[name])) for name in shown if name not in varies]
     parts += [
         value_text(str(name), coordinate.item(), coordinate.attrs.get("units", "1"))
         for name, coordinate in dataset.coords.items()
         if coordinate.ndim == 0 and name != "point"  # a number of a list needs no caption
     ]
     return ", ".join([*parts, *([dataset.attrs["left_out"]] if "left_out" in dataset.attrs else [])])
+
+
+def _says_something(name: str, coordinate: xr.DataArray, fixed: dict[str, object]) -> bool:
+    """False for a number in a list of points, and for an entry of a list that is written out as a whole."""
+    whole = str(coordinate.attrs.get("parameter", name)).partition("[")[0]
+    return name != "point" and (whole == name or whole not in fixed)
+
+
+def _is_joined(dataset: xr.Dataset, known: set[str]) -> bool:
+    """Whether results of several scenes lie side by side along a dimension of their own."""
+    dims = {str(dim) for dim in dataset["outcome"].dims} if "outcome" in dataset else set()
+    return "scene" in dataset.attrs and bool(dims - known - {"point"})
 
 
 def _unless_swept(dataset: xr.Dataset, name: str, entry: object) -> object:

@@ -1,0 +1,141 @@
+"""The accessor ``.drivetrain`` of Datasets."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from xarray.backends import BackendArray
+from xarray.core import indexing
+
+from drivetrain_jax._errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from drivetrain_jax.invariants.verify import Report
+    from drivetrain_jax.runs.atlas_answers import Reply
+
+
+class DrivetrainAccessor:
+    """What a result of this package can do: ``dataset.drivetrain``."""
+
+    def __init__(self, dataset: xr.Dataset) -> None:
+        self._dataset = dataset
+
+    def plot(self, *others: xr.Dataset | str | Path, **options: Any) -> Figure:
+        """The figure that suits the result; arguments as of :func:`drivetrain_jax.plot`."""
+        from drivetrain_jax.datasets.figure import plot
+
+        return plot(self._dataset, *others, **options)
+
+    def verify(self) -> Report:
+        """Check that the numbers obey the rules of their analysis, and that the file they come from is what was written.
+
+        Returns: a report to be printed; ``problem`` is the first thing that is wrong, empty if nothing is.
+        """
+        from drivetrain_jax.invariants.verify import verify_dataset
+
+        self._analysis()
+        return verify_dataset(self._dataset, self._file())
+
+    def query(self, **values: Any) -> Reply:
+        """The answer of an atlas at one point: results, gradient, and the nearest changes of stability.
+
+        Args:
+            values: every parameter of the atlas, in its units or in physical ones.
+
+        Returns: an answer to be printed; ``data`` holds it in plain numbers.
+
+        Raises: InputError for a result on a grid, and for values outside the atlas.
+        """
+        from drivetrain_jax.runs.atlas_answers import query
+        from drivetrain_jax.runs.atlas_file import open_atlas
+
+        if self._analysis() == "atlas":
+            return query(open_atlas(self._dataset), values)
+        file = self._file()
+        if file is None or self._dataset.attrs.get("method") != "atlas":
+            raise InputError("query: the result holds values on a grid; allowed for an atlas, opened from its file")
+        return query(open_atlas(file), values)
+
+    def named(self) -> xr.Dataset:
+        """The result with words for codes, and with the values that do not vary, defaults included, as coordinates.
+
+        Entries of a list become coordinates of their own: ``length_0``, ``length_1``. Nothing is loaded.
+
+        >>> import drivetrain_jax as dt
+        >>> shaft = dt.Cardan(beta=0.3, Omega=1.4, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)
+        >>> chart = dt.sweep(dt.floquet, shaft, over={"Omega": [1.2, 1.415]}).drivetrain.named()
+        >>> chart.verdict.values.tolist(), float(chart.zeta)
+        (['stable', 'unstable'], 0.001)
+        """
+        self._analysis()
+        dataset = self._dataset
+        coded = {name: v for name, v in dataset.variables.items() if "flag_meanings" in v.attrs}
+        named = dataset.assign({name: _in_words(variable) for name, variable in coded.items()})
+        fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}"))
+        return named.assign_coords(
+            {
+                name: ((), value, attrs)
+                for parameter, entry in fixed.items()
+                for name, value, attrs in _scalars(parameter, entry)
+                if not {name, attrs["parameter"]} & {str(known) for known in dataset.variables}
+            }
+        )
+
+    def _analysis(self) -> str:
+        analysis = self._dataset.attrs.get("analysis")
+        if analysis is None:
+            raise InputError("dataset: has no attribute 'analysis'; allowed is a result of drivetrain_jax")
+        return analysis
+
+    def _file(self) -> Path | None:
+        """The file that the dataset was opened from, if it is still there."""
+        source = self._dataset.encoding.get("source")
+        return Path(source) if isinstance(source, str) and Path(source).is_file() else None
+
+
+def _scalars(name: str, entry: dict[str, Any]) -> list[tuple[str, Any, dict[str, str]]]:
+    """A fixed value, or the entries of a list, with attributes."""
+    value, labels = entry["value"], {key: entry[key] for key in ("units", "long_name") if key in entry}
+    if not isinstance(value, list):
+        # JSON has no infinity.
+        return [(name, np.inf if value == "inf" else value, labels | {"parameter": name})]
+    return [(f"{name}_{i}", number, labels | {"parameter": f"{name}[{i}]"}) for i, number in enumerate(value)]
+
+
+def _in_words(variable: xr.Variable) -> xr.Variable:
+    """A variable of codes with their meanings in place of them, found as they are asked for; an empty word for others."""
+    words = _Words(variable)
+    attrs = {name: value for name, value in variable.attrs.items() if not name.startswith("flag_")}
+    encoding = {name: sizes for name, sizes in variable.encoding.items() if name == "preferred_chunks"}
+    if variable.chunks is None:
+        return xr.Variable(variable.dims, indexing.LazilyIndexedArray(words), attrs, encoding)
+    return xr.Variable(variable.dims, variable.data.map_blocks(words.of, dtype=words.dtype), attrs, encoding)
+
+
+class _Words(BackendArray):
+    """Meanings of the codes of a variable."""
+
+    def __init__(self, codes: xr.Variable) -> None:
+        self._codes, self.shape = codes, codes.shape
+        meanings = codes.attrs["flag_meanings"].split()
+        self._meanings = dict(zip(np.atleast_1d(codes.attrs["flag_values"]).tolist(), meanings, strict=True))
+        self.dtype = np.array(meanings).dtype
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> np.ndarray:
+        support = indexing.IndexingSupport.OUTER
+        return indexing.explicit_indexing_adapter(
+            key, self.shape, support, lambda part: self.of(self._codes[part].values)
+        )
+
+    def of(self, codes: np.ndarray) -> np.ndarray:
+        """The words for these codes."""
+        words = np.full(np.shape(codes), "", self.dtype)
+        for code, meaning in self._meanings.items():
+            words[codes == code] = meaning
+        return words
