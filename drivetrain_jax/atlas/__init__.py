@@ -1,11 +1,11 @@
-"""Functions of parameters instead of pixels: smooth results as Chebyshev panels, evaluated anywhere with a bound.
+"""Atlases: smooth results as Chebyshev panels over parameters, evaluated anywhere with an error bound.
 
-The layer knows nothing of files or scenes: it asks for solves, is given values, and hands over arrays.
+This layer uses no files and no scenes: it requests solves, receives values, and returns arrays.
 
-- :func:`construct`: any :class:`Quantity` over a :class:`Domain`, as a coroutine of rounds of solves; :func:`run` drives it.
-- :func:`values_at`: the functions anywhere, with bounds, and by direct solves where the atlas has gaps.
-- :func:`floquet_rounds`: the same for the propagator of a periodic system; :func:`stability_atlas` evaluates the result.
-- :func:`to_arrays`, :func:`from_arrays`: what a file keeps.
+- :func:`construct`: any :class:`Quantity` over a :class:`Domain`, as a coroutine of rounds of solves; :func:`run` drives
+it. - :func:`values_at`: the functions anywhere, with bounds, by direct solves in gaps. - :func:`floquet_rounds`: the
+construction for the propagator of a periodic system; :func:`stability_atlas` evaluates it. - :func:`to_arrays`,
+:func:`from_arrays`: the arrays of a file.
 """
 
 from __future__ import annotations

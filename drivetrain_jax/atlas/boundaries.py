@@ -1,8 +1,8 @@
 """Stability boundaries as curves: zeros of the analytic boundary functions, traced and polished on the surrogate.
 
 Seeds are the tips of all tongues (found by exclusion, so that none is missed), and the crossings with the rim of the
-rectangle and with a few lines across it. Curves are followed through regions that are unstable anyway; ``limiting`` says
-where they bound the stable region.
+rectangle and with a few lines across it. Curves also continue inside unstable regions; ``limiting`` is true where they
+bound the stable region.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from drivetrain_jax.atlas.tips import polish
 from drivetrain_jax.atlas.tracing import Curve, Field, trace, trace_tips
 from drivetrain_jax.systems import System
 
-# Lines across the rectangle, each way, for seeds.
+# Number of lines across the rectangle in each direction, for seeds.
 _LINES = 8
-# Newton's steps of the last polish and the largest relative shift it may make.
+# Newton steps of the last polish, and their largest relative shift.
 _POLISH, _LARGEST_SHIFT = 2, 1e-4
 
 
@@ -32,8 +32,8 @@ _POLISH, _LARGEST_SHIFT = 2, 1e-4
 class Boundary:
     """One curve: ``points`` maps the two parameters to arrays ``(n,)``.
 
-    ``error`` maps them to bounds of the error of either parameter if the other is exact (inf where the curve runs along
-    it). ``multiplier`` (``+1``, ``-1`` or ``pair``) crosses the unit circle; ``limiting`` ``(n,)`` is true where no other
+    ``error`` maps each parameter to a bound of its error with the other one exact (inf where the curve runs along it). The
+    ``multiplier`` (``+1``, ``-1`` or ``pair``) crosses the unit circle. ``limiting`` ``(n,)`` is true where no other
     multiplier lies outside.
     """
 
@@ -56,7 +56,7 @@ class Boundary:
 def boundaries(atlas: Atlas, system: type[System], searches: Sequence[Search] = ()) -> tuple[Boundary, ...]:
     """All boundary curves within ``atlas``, which has two parameters (``ValueError`` for another number).
 
-    Angles are given without their signs. ``searches`` are those of the tips of the same atlas, if these are known.
+    Angles are returned without signs. ``searches``: known searches for the tips of the same atlas.
     """
     atlas = atlas.folded()
     if len(atlas.parameters) != 2:
@@ -87,7 +87,8 @@ def _narrow_axis(atlas: Atlas, system: type[System]) -> int:
 
 
 def _distinct(field: Field, seeds: np.ndarray, known: list[Curve], horizontal: int | None = None) -> list[Curve]:
-    """``known`` and the curves through those ``seeds`` that are not on them; tips if ``horizontal`` is given."""
+    """``known`` curves, and the curves through those ``seeds`` that are not on them; seeds are tips if ``horizontal`` is
+    given."""
     kept = list(known)
     on_curve = np.zeros(len(seeds), bool)
     for curve in kept:
@@ -101,7 +102,7 @@ def _distinct(field: Field, seeds: np.ndarray, known: list[Curve], horizontal: i
 
 
 def _contains(field: Field, curve: Curve, seeds: np.ndarray) -> np.ndarray:
-    """Whether ``curve`` passes through each of ``seeds`` ``(M, 2)``."""
+    """Flags of ``seeds`` ``(M, 2)`` that lie on ``curve``."""
     if not len(seeds):
         return np.zeros(0, bool)
     y, target = field.to_unit(curve.points), field.to_unit(seeds)
@@ -112,7 +113,7 @@ def _contains(field: Field, curve: Curve, seeds: np.ndarray) -> np.ndarray:
     distance = np.linalg.norm(y[:-1] + t[..., None] * step - target[:, None], axis=2)
     best = np.argmin(distance, axis=1)
     distance, t = (a[np.arange(len(seeds)), best] for a in (distance, t))
-    # Chords of steps that turn by less than a quarter stay within a thirtieth of their length from the curve; the other
+    # The chord of a step that turns by less than a quarter stays within a thirtieth of its length from the curve. The other
     # edge of a narrow tongue may be as near, but has the opposite gradient.
     _, at_seed = field(target)
     _, at_curve = field(y[best + (t > 0.5)])
@@ -121,7 +122,7 @@ def _contains(field: Field, curve: Curve, seeds: np.ndarray) -> np.ndarray:
 
 
 def _line_seeds(field: Field) -> Iterator[np.ndarray]:
-    """Crossings with the four sides of the rim, one after the other, and then with lines across the rectangle."""
+    """Crossings with the four sides of the rim, then with lines across the rectangle."""
     across = np.arange(1, _LINES) / _LINES
     for fractions in ([1.0], [0.0], across):
         for axis in range(2):
@@ -135,7 +136,7 @@ def _line_seeds(field: Field) -> Iterator[np.ndarray]:
 def _finish(criteria: Criteria, patches: Patches, field: Field, kind: str, curve: Curve) -> Boundary:
     """Polish the points of a curve with the multiplier itself and attach bounds."""
     atlas = criteria.atlas
-    # Newton's method takes points of the rim outside by rounding.
+    # Rounding of Newton's method may move points of the rim outside.
     x, error = _polish(criteria, field, kind, np.clip(curve.points, field.lower, field.upper))
     value, gradient = field(field.to_unit(x))
     place = patches.locate(x)[0]
@@ -156,10 +157,10 @@ def _finish(criteria: Criteria, patches: Patches, field: Field, kind: str, curve
 
 
 def _limiting(criteria: Criteria, x: np.ndarray, kind: str) -> np.ndarray:
-    """Whether points of a curve bound the stable region."""
+    """Flags of the points of a curve that bound the stable region."""
     if not criteria.conservative:
         return limiting(criteria, x, growth(criteria, x, [kind] * len(x)))
-    # Where two multipliers are one, without damping, the error of the growth rate is the square root of that of Z.
+    # Where two multipliers coincide without damping, the error of the growth rate is the square root of that of Z.
     error = np.sqrt(monodromy_error(criteria, x, criteria.propagator(x)))
     return np.log(criteria.spectral_radius(x)) <= LIMITING + error
 

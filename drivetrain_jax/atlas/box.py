@@ -1,4 +1,4 @@
-"""One box of an atlas under construction, and what the steps of its exploration share."""
+"""A box of an atlas under construction, and the operations shared by the steps of its construction."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from drivetrain_jax.atlas.interpolation import nodes
 from drivetrain_jax.atlas.panels import Gap, Panel, position_between
 from drivetrain_jax.atlas.quantity import Quantity
 
-# Splits along one coordinate of a box in which something is wrong (failed solves, a kink), and in all of any box.
+# Splits along one coordinate of a box with failed solves or a kink, and splits of any box in total.
 TROUBLED_DEPTH, _MAX_DEPTH = 2, 12
 
 
 class Source(Protocol):
-    """Where the values at nodes come from if they are not solved: in lines along the coordinate ``axis``, by multiples of
+    """Supplies the values at nodes without solves: in lines along the coordinate ``axis``, at multiples of
     ``positions``."""
 
     axis: int
@@ -28,15 +28,15 @@ class Source(Protocol):
         ...
 
     def start(self, axes: Sequence[np.ndarray]) -> Callable[[], np.ndarray]:
-        """Begin to compute the grid of ``axes`` (coordinates); what is returned waits for its values ``(N, m)``, points in C
-        order, NaN where there are none."""
+        """Start computing the grid of ``axes`` (coordinates); returns a function that waits for its values ``(N, m)``,
+        points in C order, NaN for missing ones."""
         ...
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What all boxes share. ``value_of`` makes values of the quantity ``(N, m)`` from what is solved; with a ``source`` only
-    held-out points are."""
+    """Settings of all boxes. ``value_of`` converts solved numbers to values of the quantity ``(N, m)``; with a
+    ``source`` only held-out points are solved."""
 
     quantity: Quantity
     tolerance: float
@@ -45,7 +45,7 @@ class Settings:
     source: Source | None = None
 
     def limit(self, values: np.ndarray) -> float:
-        """Largest admissible error of the values, from a sample ``(N, m)`` of them."""
+        """Largest allowed error of the values, from a sample ``(N, m)`` of them."""
         return self.tolerance * float(np.min(self.quantity.scale(values)))
 
 
@@ -57,7 +57,7 @@ class Sample:
     values: np.ndarray
 
     def within(self, lower: np.ndarray, upper: np.ndarray) -> Sample:
-        """Those that lie in a box."""
+        """The sample points inside a box."""
         inside = ((self.x >= lower) & (self.x <= upper)).all(axis=1)
         return Sample(self.x[inside], self.values[inside])
 
@@ -81,7 +81,7 @@ class Box:
         return (self.lower * (1 - t) + self.upper * (1 + t)) / 2
 
     def axes(self, degrees: Sequence[int]) -> list[np.ndarray]:
-        """Coordinates of the nodes of a tensor along each of them."""
+        """Coordinates of the nodes of a tensor, one array per coordinate."""
         ends = zip(self.lower, self.upper, map(nodes, degrees), strict=True)
         return [(lower * (1 - t) + upper * (1 + t)) / 2 for lower, upper, t in ends]
 
@@ -104,14 +104,14 @@ Exploration = Generator[np.ndarray, np.ndarray, Parts]
 
 @dataclass
 class Exploring:
-    """A box that is being explored."""
+    """A box under construction."""
 
     box: Box
     settings: Settings
     solved: list[Sample] = field(default_factory=list)
 
     def solve(self, t: np.ndarray) -> Generator[np.ndarray, np.ndarray, np.ndarray]:
-        """Solved values at points ``t`` in [-1, 1]^d; those that did not fail are remembered."""
+        """Solved values at points ``t`` in [-1, 1]^d; successful ones are stored."""
         x = self.box.place(t)
         values = yield x
         finite = np.isfinite(values).all(axis=1)
@@ -123,20 +123,20 @@ class Exploring:
         return (Gap(self.box.lower, self.box.upper, reason),)
 
     def failed(self, values: np.ndarray) -> Parts:
-        """What becomes of a box in which solves failed."""
+        """Handle a box with failed solves."""
         lost = int(np.sum(~np.isfinite(values).all(axis=1)))
         reason = f"{lost} of {len(values)} direct solves failed"
         return self.give_up(reason) if lost == len(values) else self.trouble(reason)
 
     def trouble(self, reason: str, axis: int | None = None) -> Parts:
-        """Split a troubled box, along ``axis`` or the coordinate that was split least, or give it up."""
+        """Split an unresolved box along ``axis`` or the coordinate with the fewest splits, or leave a gap."""
         chosen = int(np.argmin(self.box.splits)) if axis is None else axis
         if self.box.splits[chosen] >= TROUBLED_DEPTH:
             return self.give_up(reason)
         return self.split(chosen, reason)
 
     def split(self, axis: int, reason: str) -> Parts:
-        """The halves along ``axis``; a gap where there have been too many splits."""
+        """The halves along ``axis``; a gap after too many splits."""
         if sum(self.box.splits) >= _MAX_DEPTH:
             return self.give_up(f"{reason} after {_MAX_DEPTH} splits")
         return self.box.halves(axis, self.solved)

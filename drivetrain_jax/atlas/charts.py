@@ -1,4 +1,4 @@
-"""Closed-form results on grids, tile by tile, on all cores: what makes a chart cheap."""
+"""Closed-form results on grids, tile by tile, on all cores."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from drivetrain_jax.atlas.panels import Panel, chebyshev
 from drivetrain_jax.atlas.tiles import NODES, Tile, filled_up
 from drivetrain_jax.systems import FloquetModel
 
-# Most rows and columns of a tile. The columns of a row are the lanes of all loops: so few are not cut into parallel tasks.
+# Most rows and columns of a tile. The columns of a row are the lanes of all loops; a row this short stays in one task.
 ROWS, COLUMNS = 64, 512
-# Pieces of work per core that are under way.
+# Tasks per core that are queued.
 _AHEAD = 2
 UNDECIDED = 2
-# Interpolation between nodes multiplies their roundings by less than this.
+# Factor by which interpolation between nodes may amplify rounding.
 _SPREAD = 4.0
 
-# Results of cells by name, and which of them are to be judged again (`judged`).
+# Results of cells by name, and flags of the cells to compute again by eigenvalues (`judged`).
 Cells = dict[str, np.ndarray]
 T = TypeVar("T")
 R = TypeVar("R")
@@ -53,7 +53,7 @@ def judged_tiles(
     kernel: Callable[[bool], Any],
     rtol: float,
 ) -> Iterator[tuple[Tile, Cells]]:
-    """Every tile with the results of its cells, in order; ``axes`` are those of the grid, in parameters.
+    """Yield every tile with the results of its cells, in order; ``axes`` are those of the grid, in parameters.
 
     ``kernel(dense)`` is that of :func:`tile_kernel`.
     """
@@ -74,7 +74,7 @@ def judged_tiles(
 
 
 def in_threads(pieces: Iterable[T], work: Callable[[T], R]) -> Iterator[tuple[T, R]]:
-    """Every piece with ``work(piece)``, in order, done on all cores; pieces are taken only as they are needed."""
+    """Yield every piece with ``work(piece)``, in order, computed on all cores; pieces are created on demand."""
     count = usable_cores()
     pool = threads(count, "tile")
     pending: deque[tuple[T, Future[R]]] = deque()
@@ -94,17 +94,17 @@ def in_threads(pieces: Iterable[T], work: Callable[[T], R]) -> Iterator[tuple[T,
 
 @lru_cache(maxsize=32)
 def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
-    """Results ``(R, C)`` of a tile, those of :func:`judged`.
+    """The kernel of results ``(R, C)`` of a tile, see :func:`judged`.
 
-    ``kind``: ``dense`` or ``sparse`` as the tile is, ``undamped`` for sparse tiles with cells that may be Hamiltonian.
+    ``kind``: ``dense`` or ``sparse`` like the tile, ``undamped`` for sparse tiles with cells that may be Hamiltonian.
     """
 
     def bind(values: Mapping, fixed: Mapping, row: Array) -> FloquetModel:
         leading = {name: values[name][0] for name in names[:-2]}
         return build({**fixed, **leading, names[-2]: row, names[-1]: values[names[-1]]})
 
-    # Row by row: all intermediate results of a row stay in the cache. The last product is made in the loop, not before it:
-    # a row of a larger result would be cut out anew wherever it is used.
+    # Row by row, because the intermediate results of a row fit into the cache. The last product is inside the loop: a row
+    # of a larger result would be copied at every use.
     def sparse(first, columns, errors, values, fixed, rtol):
         def row(inputs: tuple[Array, Array]) -> dict[str, Array]:
             weights, value = inputs
@@ -133,7 +133,7 @@ def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
 
 
 def _left_out(e: Array) -> Array:
-    """What the interpolation of ``e`` ``(R, 3, NODES)`` leaves out at most, ``(R, 3)``: twice its last coefficients."""
+    """Bound of the truncation error of interpolating ``e`` ``(R, 3, NODES)``, ``(R, 3)``: twice the last coefficients."""
     last = 2 / NODES * chebyshev(nodes(NODES), NODES)[:, -3:]
     return 2 * jnp.sum(jnp.abs(e @ last), axis=-1)
 
@@ -149,10 +149,11 @@ def exact_verdict(model: FloquetModel, phi: quartic.Blocks, value_error: Array) 
 
 
 def judged(c: quartic.Coefficients, rtol: Array, exact: Array | None = None) -> dict[str, Array]:
-    """Results of lanes by name, and which are to be judged again (``unsure``); ``exact`` are verdicts of Hamiltonian ones.
+    """Results of lanes by name, and flags ``unsure`` of lanes to compute again by eigenvalues; ``exact``: verdicts of
+    Hamiltonian lanes.
 
-    All others are decided: their intervals do not hold 1. As one kernel: thirty small ones, which repeat what makes the
-    coefficients, take up to a quarter more time, and the compiler half as much again.
+    The intervals of all other lanes do not contain 1. One kernel: thirty small ones repeat the computation of the
+    coefficients, and take up to a quarter longer to run and half as long again to compile.
     """
     return in_one_kernel(_judged)(c, rtol, exact)
 
@@ -164,7 +165,7 @@ def _judged(c: quartic.Coefficients, rtol: Array, exact: Array | None) -> dict[s
     verdict = jnp.where(unsure, UNDECIDED, rho > 1).astype(jnp.int8)
     if exact is not None:
         rho, error, verdict = exactly(exact, rho, error, verdict)
-        # Cells on the unit circle are settled; for the others eigenvalues may give a better bound.
+        # Hamiltonian cells are decided; for the others eigenvalues may give a better bound.
         unsure &= exact != 0
     outcome = jnp.where(error <= 10 * rtol * rho, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET).astype(jnp.int8)
     return {
@@ -177,7 +178,7 @@ def _judged(c: quartic.Coefficients, rtol: Array, exact: Array | None) -> dict[s
 
 
 def exactly(exact: Array, rho: Array, error: Array, verdict: Array) -> tuple[Array, Array, Array]:
-    """Results with the verdict ``exact`` where that is not negative: a stable Hamiltonian system has rho = 1."""
+    """Results with the verdict ``exact`` where it is not negative: a stable Hamiltonian system has rho = 1."""
     return (
         jnp.where(exact == 0, 1.0, rho),
         jnp.where(exact == 0, 4 * quartic.EPS, error),

@@ -1,4 +1,4 @@
-"""Checks of design answers by direct solves, which know nothing of the atlas."""
+"""Checks of design answers by direct solves, independent of the atlas."""
 
 from __future__ import annotations
 
@@ -16,22 +16,21 @@ from drivetrain_jax.atlas.windows import Crossing, Interval, Line, Range
 
 Direct = Callable[[Mapping[str, np.ndarray]], np.ndarray]
 
-# The check of a window steps aside from its ends by this many error bounds, and at least by this part of the parameter's
-# range; that of the end of an interval by its bound and at least by a part that leaves direct solves the sign of rho - 1.
+# Distance of a check from the end of a window in error bounds, and its minimum relative to the range of the parameter; then
+# both for the end of an interval, where direct solves must resolve the sign of rho - 1.
 _BOUNDS, _PART, _BESIDE = 10.0, 1e-6, 1e-9
-# Points over a range at which a check solves, and those at which it looks for the worst on the surrogate.
+# Points of a range at which a check solves, and points at which it searches the maximum on the surrogate.
 _SAMPLES, DENSE = 101, 801
-# By how much direct solves may miss the unit circle.
+# Largest distance of direct solves from the unit circle that counts as on it.
 _ON_THE_CIRCLE = 1e-6
 
 
 @dataclass(frozen=True)
 class Check:
-    """Direct solves beside an answer: the largest spectral radius ``inside`` the range said to be stable, and ``beyond`` it.
+    """Direct solves for an answer: the largest spectral radius ``inside`` the stable range, and ``beyond`` it.
 
-    ``beyond`` is NaN where the range ends with the atlas, or a tongue is too narrow to step into. ``agrees`` if
-    inside < 1 < beyond; without damping, where all multipliers of a stable point lie on the circle and two that meet there
-    are known to half the digits, inside is 1.
+    ``beyond`` is NaN at an end of the atlas, or if a tongue is too narrow to sample. ``agrees`` if inside < 1 < beyond.
+    Without damping all multipliers of a stable point lie on the circle, double ones with half the digits; inside is then 1.
     """
 
     inside: float
@@ -41,14 +40,14 @@ class Check:
 
     @property
     def agrees(self) -> bool:
-        """Whether the direct solves confirm the answer."""
+        """True if the direct solves confirm the answer."""
         within = self.inside <= 1 + _ON_THE_CIRCLE if self.conservative else self.inside < 1
         return within and not self.beyond <= 1
 
 
 @dataclass(frozen=True)
 class End:
-    """An end ``value`` of a stable interval, which is ``room`` long and lies on the ``inward`` side (a sign)."""
+    """An end ``value`` of a stable interval of length ``room`` on the ``inward`` side (a sign)."""
 
     value: float
     crossing: Crossing | None
@@ -61,15 +60,15 @@ class End:
         return cls(*interval.ends[0 if inward > 0 else 1], inward, interval.upper - interval.lower)
 
     def step(self, span: float) -> float:
-        """How far aside to check: right outside the error, over a range of length ``span``."""
+        """Distance of the check from the end: outside the error, over a range of length ``span``."""
         error = self.crossing.error if self.crossing else 0.0
         return max(error, _BESIDE * span) if math.isfinite(error) else _PART * span
 
 
 def check_ends(ends: list[End], line: Line, criteria: Criteria, direct: Direct) -> Check | None:
-    """Direct solves right inside all ``ends`` of stable intervals of ``line``, over the whole other coordinate, and right
-    beyond, on the ridge of the tongue whose tip the crossing is, else where the crossing is; either also where the surrogate
-    is worst. None without ends."""
+    """Direct solves just inside all ``ends`` of stable intervals of ``line``, over the whole other coordinate, and just
+    beyond. Beyond, they lie on the ridge of the tongue at the crossing, else at the crossing; both also at the maximum
+    of the surrogate. None without ends."""
     part = criteria.atlas
     k = part.parameters.index(line.parameter)
     other, span = part.parameters[1 - k], float(part.upper[k] - part.lower[k])
@@ -94,16 +93,15 @@ def check_ends(ends: list[End], line: Line, criteria: Criteria, direct: Direct) 
 def _along_ridge(
     criteria: Criteria, patches: tuple[Patches, ...], k: int, crossing: Crossing | None, value: float, other: str
 ) -> tuple[float, ...]:
-    """Where over ``other`` to look for the tongue of ``crossing`` at a ``value`` of the coordinate ``k`` beside it.
+    """Positions over ``other`` at which the tongue of ``crossing`` is expected, at a ``value`` of the coordinate ``k``.
 
-    A slanted ridge leaves the narrow tongue below it sideways, so that the place of the tip says nothing there. None
-    without a crossing.
+    A slanted ridge leaves the narrow tongue sideways, so the position of the tip does not apply. None without a crossing.
     """
     if crossing is None:
         return ()
     part, place = criteria.atlas, crossing.point[other]
     low, high = part.lower[1 - k], part.upper[1 - k]
-    # At the ends of the range a tongue comes in from outside; without damping the functions have no ridges.
+    # At the ends of the range a tongue enters from outside; without damping the functions have no ridges.
     if not low < place < high or criteria.conservative:
         return (place,)
     tip, beside = (np.insert([place], k, v)[None] for v in (crossing.value, value))
@@ -117,7 +115,7 @@ def _along_ridge(
 
 
 def _worst(criteria: Criteria, k: int, value: float) -> float:
-    """Where the surrogate's spectral radius is largest over the other coordinate than ``k``, which has ``value``."""
+    """Position of the surrogate's largest spectral radius over the coordinate other than ``k``, which has ``value``."""
     part = criteria.atlas
     others = np.linspace(part.lower[1 - k], part.upper[1 - k], DENSE)
     rho = criteria.spectral_radius(part.to_coordinates(np.insert(others[:, None], k, value, axis=1)))
@@ -125,7 +123,8 @@ def _worst(criteria: Criteria, k: int, value: float) -> float:
 
 
 def check_window(safe: Range, interval: Interval, line: Line, criteria: Criteria, direct: Direct) -> Check:
-    """Direct solves within ``safe``, a part of the stable ``interval``, and in the unstable ones of ``line`` beside it."""
+    """Direct solves within ``safe``, a part of the stable ``interval``, and in the unstable intervals of ``line`` next
+    to it."""
     part = criteria.atlas
     span = float(part.upper[0] - part.lower[0])
     outer = []
@@ -133,7 +132,7 @@ def check_window(safe: Range, interval: Interval, line: Line, criteria: Criteria
         if crossing:
             value = crossing.value + side * max(_BOUNDS * crossing.error, _PART * span)
             outer += [value] if _unstable(line, value) else []
-    # The crossings are part of the window if there is no margin: step inside by as much.
+    # Without a margin the crossings belong to the window: step inside by as much.
     step = _PART * span
     inner = np.linspace(safe[0] + step, safe[1] - step, _SAMPLES)
     rho = _solve(direct, part, {line.parameter: np.append(inner, outer)})
@@ -141,7 +140,7 @@ def check_window(safe: Range, interval: Interval, line: Line, criteria: Criteria
 
 
 def _unstable(line: Line, value: float) -> bool:
-    """Whether ``line`` is said to be unstable at ``value``, which a step may have led across a narrow tongue."""
+    """True if ``line`` is unstable at ``value``; a step may cross a narrow tongue."""
     return any(i.lower < value < i.upper and not i.stable for i in line.intervals)
 
 

@@ -15,7 +15,7 @@ from drivetrain_jax.analysis.periodic.quartic import EPS, Blocks, determinant, s
 
 
 def _sign(value: Array, error: Array) -> Array:
-    """-1 or 1 where certain, else 0."""
+    """The sign -1 or 1 where it is certain, else 0."""
     return jnp.where(value > error, 1, jnp.where(value < -error, -1, 0))
 
 
@@ -35,7 +35,7 @@ def verdict(phi: Blocks, value_error: Array) -> Array:
     m_error = delta * (jnp.sqrt(square_norm(phi.b)) + jnp.sqrt(square_norm(phi.c)) + delta)
     m_norm = jnp.sqrt(square_norm(m))
     pair = _sign(spread**2 + 4 * m[0][1] * m[1][0], 8 * m_error * (m_norm + m_error) + 16 * EPS * m_norm**2)
-    # Of two real m with the same sign and with the same sign of 1 + m, the mean tells where they lie.
+    # For two real m with equal signs, and equal signs of 1 + m, the mean shows where they lie.
     inside = _sign(-trace, 2 * m_error) * _sign(2 + trace, 2 * m_error)
     stable = (at_one > 0) & (at_minus_one > 0) & (pair > 0) & (inside > 0)
     unstable = (at_one < 0) | (at_minus_one < 0) | (pair < 0)

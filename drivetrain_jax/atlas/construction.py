@@ -1,20 +1,20 @@
-"""Adaptive construction of an atlas, as a coroutine that asks for solves in rounds.
+"""Adaptive construction of an atlas, as a coroutine that requests solves in rounds.
 
-``construct(...)`` yields arrays of points (parameters, ``(N, d)``) and is sent their values ``(N, m)``, NaN where a solve
-failed; it returns the :class:`~drivetrain_jax.atlas.Atlas`. Solves that know how far they may be wrong, entry by entry, send
-that in further columns, and the bounds of the panels include it. The construction is deterministic: the same values give the
-same questions, so that a run can be replayed from stored answers. Every box goes through
+``construct(...)`` yields arrays of points (parameters, ``(N, d)``) and receives their values ``(N, m)``, NaN where a solve
+failed. It returns the :class:`~drivetrain_jax.atlas.Atlas`. Solves may report an error for each entry in further columns;
+the bounds of the panels then include it. The construction is deterministic: equal values give equal requests, so a run can
+be replayed from stored answers. Every box passes these steps:
 
-1. probes along lines on its edges, refined until the Chebyshev coefficients of each coordinate are resolved;
-2. a tensor grid with some more nodes per coordinate than the worst line needs, and held-out points;
-3. acceptance, if what the coefficients left out add up to (the last pairs of slabs continued) and the errors at all
-   held-out points are small enough, else growth by the slope of the tail (twice at most), else a split in two halves.
+1. probes along lines on its edges, refined until the Chebyshev coefficients of each coordinate are resolved; 2. a tensor
+grid with some more nodes per coordinate than the worst line needs, and held-out points; 3. acceptance, if the truncated
+tail (extrapolated from the last pairs of slabs) and the errors at all held-out points are    small enough; else growth by
+the slope of the tail (at most twice), else a split in two halves.
 
-Nodes may come from something cheaper than solves (a ``Source``): then there are no probes, and tensors grow until their
-coefficients have fallen. Held-out points are always solved.
+A cheap ``Source`` of nodes replaces the probes: tensors then grow until their coefficients have fallen. Held-out points are
+always solved.
 
-A box in which solves fail, or whose coefficients fall like a power (a kink), is halved twice along each coordinate at
-most and then left as a :class:`~drivetrain_jax.atlas.Gap` that says why.
+A box with failed solves, or with coefficients that fall like a power (a kink), is halved at most twice along each
+coordinate. What remains is a :class:`~drivetrain_jax.atlas.Gap` with its reason.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from drivetrain_jax.atlas.quantity import Quantity
 from drivetrain_jax.systems import Coordinate
 
 Rounds = Generator[np.ndarray, np.ndarray, Atlas]
-# A box with its exploration and the points that this asks for, or the answer to them (None to begin with).
+# A box with its construction, and the points that it requests, or their values (None at the start).
 _Open = tuple[Box, Exploration, np.ndarray]
 _Told = tuple[Box, Exploration, np.ndarray | None]
 MAX_SOLVES, MAX_NODES = 400_000, 128
-# Width of a box in which a coordinate does not vary, relative to it.
+# Relative width of a box in a coordinate that does not vary.
 _THINNEST = 1e-15
-# Solves of a panel, those that are least exact, whose errors are followed into its bounds.
+# Number of the least accurate solves of a panel whose errors enter its bounds.
 _MOST_CHANGES = 64
 
 
@@ -58,12 +58,12 @@ class Domain:
         """The domain in its coordinates."""
         ends = [self._ends(k) for k in range(len(self.parameters))]
         lower, upper = (np.array([of(e) for e in ends], float) for of in (min, max))
-        # Values that differ may have one coordinate.
+        # Different values may have the same coordinate.
         wider = upper + np.maximum(_THINNEST * np.abs(upper), np.finfo(float).tiny)
         return Box(lower, np.where(upper > lower, upper, wider), (0,) * len(ends))
 
     def points(self, x: np.ndarray) -> np.ndarray:
-        """Parameters of points in coordinates, ``(N, d)``, kept inside the domain against rounding."""
+        """Parameters of points in coordinates, ``(N, d)``, clipped to the domain against rounding."""
         columns = []
         for k, coordinate in enumerate(self.coordinates):
             ends = coordinate.inverse(np.array(self._ends(k)))
@@ -71,7 +71,7 @@ class Domain:
         return np.stack(columns, axis=-1)
 
     def _ends(self, k: int) -> list[float]:
-        """Coordinates between which those of the domain lie; an even one also takes that of 0."""
+        """Coordinates between which the domain lies; an even coordinate also includes that of 0."""
         even = self.coordinates[k].even and self.lower[k] < 0 < self.upper[k]
         return [
             float(self.coordinates[k].forward(p)) for p in (self.lower[k], self.upper[k], *((0.0,) if even else ()))
@@ -79,7 +79,7 @@ class Domain:
 
 
 class Ledger:
-    """Values of solved points: none is asked for twice (neighbouring boxes share the lines on their common face)."""
+    """Cache of solved points: none is requested twice (neighbouring boxes share the lines on their common face)."""
 
     def __init__(self) -> None:
         self._numbers: dict[bytes, int] = {}
@@ -90,7 +90,7 @@ class Ledger:
         return len(self._numbers)
 
     def missing(self, points: np.ndarray) -> np.ndarray:
-        """Those of ``points`` that are not known, each once, in the order of their first appearance."""
+        """The unknown ones of ``points``, each once, in the order of first appearance."""
         new: dict[bytes, int] = {}
         for k, key in enumerate(_keys(points)):
             if key not in self._numbers:
@@ -98,7 +98,7 @@ class Ledger:
         return points[list(new.values())]
 
     def add(self, points: np.ndarray, values: np.ndarray) -> None:
-        """Remember the values of ``points``, none of which is known."""
+        """Store the values of unknown ``points``."""
         self._numbers.update(zip(_keys(points), range(len(self), len(self) + len(points)), strict=True))
         self._points.append(points)
         self._values.append(values)
@@ -114,14 +114,14 @@ class Ledger:
         return found
 
     def all(self) -> tuple[np.ndarray, np.ndarray]:
-        """All points whose values are finite, and these."""
+        """All points with finite values, and these values."""
         points, values = np.concatenate(self._points), np.concatenate(self._values)
         finite = np.isfinite(values).all(axis=1)
         return points[finite], values[finite]
 
 
 def _keys(points: np.ndarray) -> list[bytes]:
-    """What tells points apart: their bytes."""
+    """Keys of points: their bytes."""
     width, content = points.shape[1] * points.itemsize, points.tobytes()
     return [content[start : start + width] for start in range(0, len(content), width)]
 
@@ -137,9 +137,9 @@ def construct(
 ) -> Rounds:
     """An atlas of ``quantity`` over ``domain`` with errors of about ``tolerance`` times its scale.
 
-    With a ``source`` nodes come from there and only held-out points are solved; where the two do not agree the nodes are
-    solved, too. ``max_nodes`` bounds the polynomials of one coordinate. When the next round would exceed ``max_solves``, the
-    boxes that are still open become gaps.
+    A ``source`` supplies the nodes, and only held-out points are solved; if the two disagree, the nodes are solved too.
+    ``max_nodes`` limits the polynomials of one coordinate. If the next round would exceed ``max_solves``, the boxes that
+    are still open become gaps.
     """
     ledger = Ledger()
     settings = Settings(quantity, tolerance, max_nodes, lambda solved: solved[:, : quantity.size])
@@ -155,7 +155,7 @@ def construct(
 def _explored(
     boxes: Iterable[Box], domain: Domain, settings: Settings, ledger: Ledger, max_solves: int
 ) -> Generator[np.ndarray, np.ndarray, list[Panel | Gap]]:
-    """What became of ``boxes``."""
+    """The panels and gaps of ``boxes``."""
     active, done = _advanced([(box, explore(box, settings), None) for box in boxes], settings)
     while active:
         requests = [request for _, _, request in active]
@@ -175,7 +175,7 @@ def _explored(
 
 
 def _advanced(tasks: Iterable[_Told], settings: Settings) -> tuple[list[_Open], list[Panel | Gap]]:
-    """The boxes that are open after their answers, the parts of those that were split among them, and what is done."""
+    """The open boxes after their answers, including parts of split ones, and the finished ones."""
     waiting = deque(tasks)
     going: list[_Open] = []
     done: list[Panel | Gap] = []
@@ -204,9 +204,9 @@ def _atlas(domain: Domain, done: Iterable[Panel | Gap], tolerance: float, ledger
 
 
 def _vouched(atlas: Atlas, settings: Settings, ledger: Ledger, size: int) -> Atlas:
-    """``atlas`` with bounds that include the errors of the solves, which these tell after the first ``size`` columns.
+    """``atlas`` with bounds that include the errors of the solves, stored after the first ``size`` columns.
 
-    Held-out points do not show what all solves have in common.
+    Held-out points do not show errors that all solves have in common.
     """
     if not atlas.panels:
         return atlas
@@ -230,7 +230,7 @@ def _vouched(atlas: Atlas, settings: Settings, ledger: Ledger, size: int) -> Atl
 
 
 def explore(box: Box, settings: Settings) -> Exploration:
-    """Asks for values at points in coordinates; returns what became of the box."""
+    """Yield requests for values at points in coordinates; returns the panel, gap or halves of the box."""
     exploring = Exploring(box, settings)
     if settings.source:
         return (yield from fit_given(exploring, settings.source))

@@ -1,11 +1,11 @@
-"""Design questions answered from an atlas, each answer with a bound of its error and a check by direct solves.
+"""Design questions answered from an atlas, each answer with an error bound and a check by direct solves.
 
-The atlas may have more parameters than a question names: ``at`` gives their values. Which parameter is the speed, the angle
-or the damping is a matter of the system (``roles``). ``direct`` is the check: a function from
-columns of all parameters, a mapping of names to arrays ``(N,)``, to spectral radii ``(N,)`` computed without the atlas.
+The atlas may have more parameters than a question names: ``at`` gives their values. The system declares which parameter is
+the speed, the angle or the damping (``roles``). The check ``direct`` is a function from columns of all parameters, a
+mapping of names to arrays ``(N,)``, to spectral radii ``(N,)`` computed without the atlas.
 
-All raise ``KeyError`` for parameters that the atlas lacks, ``ValueError`` for values outside its domain, and
-:class:`InputError` for an atlas without panels or boundaries, or one that with ``at`` is not over what is asked.
+All raise ``KeyError`` for parameters that the atlas lacks, and ``ValueError`` for values outside its domain. They raise
+:class:`InputError` for an atlas without panels or boundaries, or with the wrong free parameters.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from drivetrain_jax.atlas.windows import (
 )
 from drivetrain_jax.systems import System
 
-# By how much rounding may part the end of an undecided range from that of the error that covers it.
+# Largest gap by rounding between an undecided range and the end of the error that covers it.
 _ROUNDING = 4 * np.finfo(float).eps
 
 
 @dataclass(frozen=True)
 class Answer:
-    """``value`` of ``parameter`` with a bound of its ``error``; None if the ``safe_end`` of the atlas, from which stability
-    has to reach to the value, is not stable itself: ``stable`` may then hold other intervals.
+    """``value`` of ``parameter`` with a bound of its ``error``. The value is None if the ``safe_end`` of the atlas, from
+    which stability must reach to it, is unstable; ``stable`` may then contain other intervals.
 
-    ``limit`` is the crossing that sets the value. It is None where the atlas ends first, with an error of 0, and where an
-    undecided range begins, with one of NaN. ``intervals`` lists all stable and unstable ranges, ``undecided`` those that
-    errors leave open. A value is ``certain`` only if none of these is on its safe side beyond its error; without a value
-    it is certain which intervals are stable only if the errors of their ends cover all of these.
+    ``limit`` is the crossing that determines the value. It is None at the end of the atlas (error 0) and at the start of an
+    undecided range (error NaN). ``intervals`` lists all stable and unstable ranges, ``undecided`` those that errors leave
+    open. A value is ``certain`` if no undecided range lies on its safe side beyond its error. Without a value it is certain
+    if the errors of the ends of the stable intervals cover all undecided ranges.
     """
 
     parameter: str
@@ -59,15 +59,15 @@ class Answer:
 
     @property
     def stable(self) -> tuple[Interval, ...]:
-        """The stable intervals without what is undecided."""
+        """The stable intervals without undecided ranges."""
         return tuple(_stable_and_decided(self.intervals, self.undecided))
 
 
 @dataclass(frozen=True)
 class Window:
-    """A stable range of a parameter; ``safe`` is what the margin leaves of it.
+    """A stable range of a parameter; ``safe`` is the range within the margin.
 
-    ``largest`` is the largest spectral radius within ``safe`` (sampled) and ``where`` its place.
+    ``largest`` is the largest spectral radius within ``safe`` (sampled) and ``where`` its position.
     """
 
     interval: Interval
@@ -79,7 +79,7 @@ class Window:
 
 @dataclass(frozen=True)
 class Windows:
-    """All ``windows``, and the ``undecided`` ranges, which are in none of them."""
+    """All ``windows``, and the ``undecided`` ranges, which belong to no window."""
 
     windows: tuple[Window, ...]
     undecided: tuple[Range, ...]
@@ -87,8 +87,8 @@ class Windows:
 
 @dataclass(frozen=True)
 class Nearest:
-    """The nearest changes of stability ``below`` and ``above`` a value of ``parameter`` whose places are known; None where
-    the atlas ends first. Further ones may lie in the ``undecided`` ranges."""
+    """The nearest known changes of stability ``below`` and ``above`` a value of ``parameter``, None at the end of the
+    atlas. Further ones may lie in the ``undecided`` ranges."""
 
     parameter: str
     value: float
@@ -105,7 +105,7 @@ def least_damping(
     *,
     direct: Direct | None = None,
 ) -> Answer:
-    """The least damping from which on, up to the atlas's largest, all ``speeds`` are stable."""
+    """The least damping above which, up to the largest of the atlas, all ``speeds`` are stable."""
     return _extreme(_over(atlas, system, at, "speed", "damping"), system, speeds, 1.0, direct)
 
 
@@ -117,7 +117,7 @@ def widest_angle(
     *,
     direct: Direct | None = None,
 ) -> Answer:
-    """The widest angle up to which, from the atlas's smallest on, all ``speeds`` are stable."""
+    """The widest angle below which, down to the smallest of the atlas, all ``speeds`` are stable."""
     return _extreme(_over(atlas, system, at, "speed", "angle"), system, speeds, -1.0, direct)
 
 
@@ -129,8 +129,10 @@ def speed_windows(
     margin: float = 0.0,
     direct: Direct | None = None,
 ) -> Windows:
-    """The stable ranges of the speed where the other parameters are ``at``, each shortened by ``margin`` of the speed at
-    both ends, unless the atlas ends there. What a margin leaves nothing of is left out."""
+    """The stable ranges of the speed with the other parameters ``at``.
+
+    Each is shortened by ``margin`` times the speed at both ends, except at the end of the atlas; empty ranges are left out.
+    """
     part = _over(atlas, system, at, "speed")
     line = stability_along(part, system)
     criteria = Criteria.of(part, system)
@@ -148,7 +150,7 @@ def speed_windows(
 
 
 def _over(atlas: Atlas, system: type[System], at: Mapping[str, float], *roles: str) -> Atlas:
-    """``atlas`` where it is ``at``, over the parameters with these ``roles`` and no other."""
+    """``atlas`` restricted to ``at``, over exactly the parameters with these ``roles``."""
     wanted, part = [system.roles[role] for role in roles], atlas.slice(at)
     if set(part.parameters) != set(wanted):
         left = " and ".join(part.parameters) or "nothing"
@@ -157,7 +159,7 @@ def _over(atlas: Atlas, system: type[System], at: Mapping[str, float], *roles: s
 
 
 def _stable_and_decided(intervals: Iterable[Interval], undecided: Iterable[Range]) -> list[Interval]:
-    """The stable ones of ``intervals``, cut where it is ``undecided`` unless the errors of their ends cover it."""
+    """The stable ones of ``intervals``, cut at ``undecided`` ranges unless the errors of their ends cover these."""
     return [
         replace(
             interval,
@@ -179,7 +181,7 @@ def _uncovered(undecided: Iterable[Range], crossings: Iterable[Crossing]) -> lis
 
 
 def _reach(crossing: Crossing) -> float:
-    """How far its error reaches, where it is known, and what rounding takes from that."""
+    """The reach of a known error, with a tolerance for rounding."""
     return float(np.nan_to_num(crossing.error)) + _ROUNDING * abs(crossing.value)
 
 
@@ -193,7 +195,7 @@ def _shortened(interval: Interval, part: Atlas, margin: float) -> Range:
 
 
 def nearest_boundaries(atlas: Atlas, system: type[System], point: Mapping[str, float]) -> tuple[Nearest, ...]:
-    """For every parameter of ``atlas`` the nearest changes of stability when it alone is varied from ``point``."""
+    """The nearest changes of stability along every parameter of ``atlas`` from ``point``, one parameter at a time."""
     found = []
     for name in atlas.parameters:
         others = {other: point[other] for other in atlas.parameters if other != name}
@@ -214,14 +216,14 @@ def nearest_boundaries(atlas: Atlas, system: type[System], point: Mapping[str, f
 
 
 def _extreme(atlas: Atlas, system: type[System], speeds: Range, side: float, direct: Direct | None) -> Answer:
-    """Up to where, from the end of the other parameter on that ``side`` on, all ``speeds`` are stable."""
+    """The limit up to which all ``speeds`` are stable, from the end of the other parameter on that ``side``."""
     speed = system.roles["speed"]
     part = narrow(atlas, {speed: speeds}).folded()
     line = stability_over_range(part, system, speed)
     answer = _from_safe_end(line, part, side)
     if direct is None:
         return answer
-    # What is stated: where there is a value its limit, otherwise both ends of every stable interval.
+    # The values to check: the limit of a value, otherwise both ends of every stable interval.
     stated = answer.stable if answer.value is None else (line.intervals[-1 if side > 0 else 0],)
     sides = (1.0, -1.0) if answer.value is None else (side,)
     ends = [End.of(interval, inward) for interval in stated for inward in sides]
@@ -229,7 +231,7 @@ def _extreme(atlas: Atlas, system: type[System], speeds: Range, side: float, dir
 
 
 def _from_safe_end(line: Line, part: Atlas, side: float) -> Answer:
-    """Up to where, and to which crossing, it is stable from the end on that ``side`` on."""
+    """The value and the crossing up to which it is stable from the end on that ``side``."""
     k = part.parameters.index(line.parameter)
     safe, other = (float(x[k]) for x in ((part.upper, part.lower) if side > 0 else (part.lower, part.upper)))
     answer = Answer(line.parameter, None, math.nan, None, line.intervals, line.undecided, False, safe)
@@ -244,6 +246,6 @@ def _from_safe_end(line: Line, part: Atlas, side: float) -> Answer:
 
 
 def _doubted(line: Line, value: float, limit: Crossing | None, side: float) -> bool:
-    """Whether an undecided range reaches the safe side of ``value``, further than its error if a crossing limits it."""
+    """True if an undecided range reaches the safe side of ``value``, beyond its error if a crossing limits it."""
     reached = max((max(side * a, side * b) for a, b in line.undecided), default=-math.inf)
     return reached > side * value + _reach(limit) if limit else reached >= side * value

@@ -15,18 +15,18 @@ from jax import Array
 from drivetrain_jax.atlas import interpolation
 from drivetrain_jax.atlas.panels import Atlas, Panel, chebyshev, position
 
-# Numbers that the first product of a block of scattered points may make.
+# Upper limit of the size of the first product of a block of scattered points.
 _WORKING_SET = 1 << 22
 
 
 def values_at(
     atlas: Atlas, points: np.ndarray, solve: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The functions that ``atlas`` holds at points ``(N, d)`` (parameters): values ``(N, m)`` and bounds ``(N,)``.
+    """The functions of ``atlas`` at points ``(N, d)`` (parameters): values ``(N, m)`` and bounds ``(N,)``.
 
-    The bound is that of the panel for the norm of the values' error, without rounding at evaluation. Points that no panel
-    covers (gaps, or outside) are given to ``solve(points) -> values``, as in the construction, and have the bound 0; without
-    ``solve`` both are NaN there. Raises ``ValueError`` if there is neither a panel nor ``solve``.
+    The bound is that of the panel for the norm of the error, without rounding at evaluation. Points in gaps or outside go
+    to ``solve(points) -> values``, as in the construction, and have the bound 0; without ``solve`` they are NaN. Raises
+    ``ValueError`` if there is neither a panel nor ``solve``.
     """
     points = np.asarray(points, float)
     x = atlas.to_coordinates(points)
@@ -57,7 +57,7 @@ def scattered(tensor: Array, weights: Sequence[Array]) -> Array:
 
 
 def block_size(atlas: Atlas) -> int:
-    """Scattered points to be evaluated at a time."""
+    """Number of scattered points to evaluate at a time."""
     rest = max((int(np.prod(p.coefficients.shape[1:])) for p in atlas.panels), default=1)
     return int(2 ** np.clip(np.floor(np.log2(_WORKING_SET / rest)), 6, 10))
 
@@ -68,12 +68,12 @@ def common_degrees(panels: Sequence[Panel]) -> tuple[int, ...]:
 
 
 def padded_tensor(panel: Panel, degrees: Sequence[int]) -> np.ndarray:
-    """Coefficients as ``(n_1, m, n_2, ..., n_d)``, filled up with zeros to ``degrees``."""
+    """Coefficients as ``(n_1, m, n_2, ..., n_d)``, padded with zeros to ``degrees``."""
     fill = [(0, n - k) for n, k in zip(degrees, panel.degrees, strict=True)]
     return np.ascontiguousarray(np.moveaxis(np.pad(panel.coefficients, [*fill, (0, 0)]), -1, 1))
 
 
 def point_weights(panel: Panel, x: np.ndarray, degrees: Sequence[int], size: int) -> list[np.ndarray]:
-    """``weights`` of :func:`scattered` for points in coordinates ``(N, d)``, filled up to ``size`` with the last one."""
+    """``weights`` of :func:`scattered` for points in coordinates ``(N, d)``, padded to ``size`` with the last one."""
     t = np.pad(position(panel, x), ((0, size - len(x)), (0, 0)), mode="edge")
     return [np.ascontiguousarray(chebyshev(t[:, k], n).T) for k, n in enumerate(degrees)]

@@ -22,17 +22,18 @@ import numpy as np
 
 from drivetrain_jax.atlas.patches import Patches
 
-# Smallest extent of a box relative to the whole domain, largest number of boxes in hand, of Newton's steps at the end.
+# Smallest box relative to the domain, largest number of boxes in a queue, largest number of final Newton steps.
 _SMALLEST = 2.0**-22
 _MAX_BOXES = 20_000
 _POLISH = 4
-# How far from the domain, relative to it, a point on its rim may be found.
+# Relative distance from the domain within which a point of its rim may be found.
 _RIM = 1e-9
 
 
 @dataclass(frozen=True)
 class Search:
-    """``points`` ``(M, 2)`` in coordinates; ``undecided`` boxes ``(K, 2, 2)`` as (lower, upper); ``boxes`` looked at.
+    """``points`` ``(M, 2)`` in coordinates; ``undecided`` boxes ``(K, 2, 2)`` as (lower, upper); number of ``boxes``
+    examined.
 
     ``curvature`` ``(M,)`` is f_hh and ``slope`` ``(M,)`` f_v at the points, v the other coordinate.
     """
@@ -67,7 +68,7 @@ def critical_points(patches: tuple[Patches, ...], number: int, horizontal: int) 
         rest = np.concatenate([chosen[~single], np.flatnonzero(unclear)])
         active, others = active.take(rest), tuple(p.take(rest) for p in others)
         small = ((active.upper - active.lower) <= smallest).all(axis=1) | ~np.isfinite(active.error)
-        # A function that does not rise above its error proves nothing on smaller boxes either.
+        # Where a function stays below its error, smaller boxes prove nothing either.
         small |= np.maximum(*(np.abs(end) for end in active.range())) <= 3 * active.error
         small |= len(active) > _MAX_BOXES
         undecided.append(np.stack([active.lower[small], active.upper[small]], axis=1))
@@ -107,7 +108,7 @@ class _Bundle:
         return _Bundle(self.f.enlarged(), self.h, tuple(p.enlarged() for p in self.derived))
 
     def excluded(self) -> np.ndarray:
-        """Boxes of which the range of f_h or the ridge test proves that they hold no zero."""
+        """Flags of boxes in which the range of f_h or the ridge test excludes a zero."""
         low, high = self.f_h.range()
         sign, bend = self._bend()
         value, slope = self._along_valley(sign)
@@ -124,7 +125,7 @@ class _Bundle:
         inside = (_highest(left) + self.f_h.error < 0) & (_highest(-right) + self.f_h.error < 0)
         low, high = self.f_v.range()
         one_way = (low > 0) | (high < 0)
-        # The end of v where the valley is higher, and the values of f and f_h on the line through its floor.
+        # The end of v where the valley is higher, and the values of f and f_h on the line along its floor.
         top = np.where((low > 0) == (sign > 0), 1.0, -1.0)
         value, slope = self._along_valley(sign)
         alternating = (-1.0) ** np.arange(len(value))[:, None]
@@ -176,7 +177,7 @@ def _highest(series: np.ndarray) -> np.ndarray:
 
 
 def _distinct(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Indices that leave out the points in a box, each with only one zero, of an earlier one."""
+    """Indices without the points in a box (with a single zero) of an earlier point."""
     kept: list[int] = []
     for i, point in enumerate(points):
         if not any(((point >= boxes[j, 0]) & (point <= boxes[j, 1])).all() for j in kept):

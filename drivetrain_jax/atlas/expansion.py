@@ -1,7 +1,7 @@
-"""Panels expanded anew on small boxes, where few polynomials are enough: what makes scattered points cheap.
+"""Panels expanded on small boxes with few polynomials, for fast evaluation of scattered points.
 
 A panel of n polynomials is cut in each coordinate into boxes of equal angle arccos(t). On a box [a, b] its polynomials are
-again polynomials, T_j(x(y)) = sum_(k <= j) R_kj T_k(y), and those of the highest degrees in y can be left out.
+T_j(x(y)) = sum_(k <= j) R_kj T_k(y), and the highest degrees in y can be dropped.
 """
 
 from __future__ import annotations
@@ -18,18 +18,17 @@ from jax import Array
 from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
 from drivetrain_jax.atlas.panels import Atlas, Panel, chebyshev, position
 
-# Polynomials of a panel for each of its boxes along a coordinate. With many coordinates the boxes would take up more memory
-# than they save work.
+# Polynomials of a panel per box and coordinate. With many coordinates the boxes would take more memory than they save work.
 _PER_BOX, _PER_LARGE_BOX = 6, 12
 _FEW_COORDINATES = 2
-# What is left out, as part of a panel's error, or where that is more as part of its values.
+# Largest truncation error relative to the panel's error, or to its values if that is more.
 _PART, _ROUNDING = 1e-4, np.finfo(float).eps / 8
 
 
 @dataclass(frozen=True)
 class Cell:
     """Points of one box: ``tensor`` ``(n_2, ..., n_d, m, n_1)``, numbers ``index`` of the points, and their ``place`` in
-    [-1, 1]^d, ``(d, N)``. ``left_out`` bounds the norm of what ``tensor`` lacks of ``panel``."""
+    [-1, 1]^d, ``(d, N)``. ``left_out`` bounds the norm of the truncation error."""
 
     panel: Panel
     tensor: Array
@@ -39,7 +38,7 @@ class Cell:
 
 
 class Expansion:
-    """The boxes of all panels of an atlas, with as many polynomials in each, so that one kernel serves all of them."""
+    """The boxes of all panels of an atlas, with equal numbers of polynomials, so that one kernel serves all of them."""
 
     def __init__(self, atlas: Atlas) -> None:
         self._atlas = atlas
@@ -90,7 +89,7 @@ class Expansion:
 
     @cached_property
     def _tails(self) -> list[list[np.ndarray]]:
-        """What is left out at most with k polynomials, for k = 0, 1, ... and every panel and coordinate."""
+        """Bounds of the truncation error with k polynomials, k = 0, 1, ..., for every panel and coordinate."""
         found = []
         for panel, restrictions in zip(self._atlas.panels, self._restrictions, strict=True):
             sizes = np.linalg.norm(panel.coefficients, axis=-1)
@@ -99,7 +98,7 @@ class Expansion:
                 slabs = sizes.sum(axis=tuple(k for k in range(sizes.ndim) if k != axis))
                 each = np.max([np.abs(r) @ slabs for r in boxes], axis=0)
                 tails.append(np.append(spread * np.cumsum(each[::-1])[::-1], 0.0))
-                # How much larger expanding along this coordinate may make what the others leave out.
+                # Factor by which expanding along this coordinate may amplify the truncation error of the others.
                 spread *= max(float(np.abs(r).sum(axis=0).max()) for r in boxes)
             found.append(tails)
         return found
@@ -123,7 +122,7 @@ class Expansion:
 
 
 def _restriction(n: int, lower: float, upper: float) -> np.ndarray:
-    """R for [lower, upper] and ``n`` polynomials. It is triangular: what rounding puts elsewhere is left out."""
+    """R for [lower, upper] and ``n`` polynomials. R is triangular; rounding errors elsewhere are set to 0."""
     y = nodes(n)
     x = np.clip((lower * (1 - y) + upper * (1 + y)) / 2, -1.0, 1.0)
     return np.triu(analysis_matrix(n) @ chebyshev(x, n))

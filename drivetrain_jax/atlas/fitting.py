@@ -11,19 +11,19 @@ from drivetrain_jax.atlas.panels import Panel
 from drivetrain_jax.atlas.quantity import distance
 
 HELD_OUT, _MAX_CHECKS = 64, 512
-# Nodes whose scale is looked at.
+# Number of nodes from which the scale is estimated.
 _SCALES = 128
-# Bounds are this many times the largest error at held-out points.
+# Ratio of a bound to the largest error at held-out points.
 _SAFETY = 8.0
-# Coefficients below this part of the tolerance are left out: they take up most of the space of a large tensor.
+# Coefficients below this fraction of the tolerance are dropped, because they take most of the space of a large tensor.
 _NEGLIGIBLE = 1e-3
 _MAX_GROWTHS = 2
-# Nodes of a tensor, and numbers at all of them.
+# Most nodes of a tensor, and most numbers at all nodes.
 _MAX_TENSOR, MAX_NUMBERS = 300_000, 30_000_000
 
 
 def fit(exploring: Exploring, degrees: list[int]) -> Exploration:
-    """A panel of about ``degrees`` nodes, or what becomes of the box instead."""
+    """A panel of about ``degrees`` nodes, or the halves or gap of the box instead."""
     d = len(degrees)
     most = min(_MAX_TENSOR, MAX_NUMBERS // exploring.settings.quantity.size)
     for growth in range(_MAX_GROWTHS + 1):
@@ -48,7 +48,7 @@ def fit(exploring: Exploring, degrees: list[int]) -> Exploration:
 
 
 def scattered(count: int, d: int) -> np.ndarray:
-    """Held-out points in [-1, 1]^d: an additive recurrence, denser towards the faces, where errors are largest."""
+    """Held-out points in [-1, 1]^d: an additive recurrence, denser near the faces, where errors are largest."""
     root = 2.0
     for _ in range(64):
         root = (1 + root) ** (1 / (d + 1))
@@ -57,7 +57,7 @@ def scattered(count: int, d: int) -> np.ndarray:
 
 
 def known_checks(exploring: Exploring) -> Sample:
-    """Solves that are no nodes of the next tensor, evenly thinned out."""
+    """Solves that are not nodes of the next tensor, thinned evenly."""
     d = len(exploring.box.lower)
     none = Sample(np.empty((0, d)), np.empty((0, exploring.settings.quantity.size)))
     samples = [none, *exploring.box.known, *exploring.solved]
@@ -70,9 +70,10 @@ def known_checks(exploring: Exploring) -> Sample:
 def judge(
     exploring: Exploring, tensor: np.ndarray, values: np.ndarray, checks: Sample, spare: float = 0.5
 ) -> tuple[Panel | None, np.ndarray, float]:
-    """The panel if it is good enough; what each coordinate leaves out over its limit, half the tolerance; that limit.
+    """The panel if it is accurate enough; the truncation error of each coordinate over its limit, half the tolerance; that
+    limit.
 
-    Errors at the held-out points may be the part ``spare`` of the tolerance.
+    Errors at the held-out points may use the fraction ``spare`` of the tolerance.
     """
     quantity, tolerance = exploring.settings.quantity, exploring.settings.tolerance
     t = exploring.box.position(checks.x)
@@ -91,7 +92,7 @@ def judge(
 
 
 def _without(tensor: np.ndarray, negligible: float) -> np.ndarray:
-    """``tensor`` without the coefficients below ``negligible``, as small as it then can be."""
+    """``tensor`` without the coefficients below ``negligible``, as small as possible."""
     large = np.max(np.abs(tensor), axis=-1) > negligible
     kept = tuple(
         slice(int(np.max(np.flatnonzero(large.any(axis=tuple(set(range(large.ndim)) - {k}))), initial=0)) + 1)
@@ -101,7 +102,7 @@ def _without(tensor: np.ndarray, negligible: float) -> np.ndarray:
 
 
 def grown(tensor: np.ndarray, tails: np.ndarray, limit: float) -> list[int]:
-    """More nodes where the tail is too large; a few everywhere if only the held-out points are missed."""
+    """More nodes where the tail is too large; a few everywhere if only the held-out points exceed the limit."""
     degrees = list(tensor.shape[:-1])
     if tails.max() <= 1:
         return [n + max(2, n // 10) for n in degrees]
@@ -110,6 +111,6 @@ def grown(tensor: np.ndarray, tails: np.ndarray, limit: float) -> list[int]:
 
 
 def unresolved(exploring: Exploring, tails: np.ndarray) -> Parts:
-    """What becomes of a box whose tensor has grown often enough."""
+    """The halves or gap of a box whose tensor has grown often enough."""
     axis = int(np.argmax(tails)) if tails.max() > 1 else None
     return exploring.trouble("not resolved where its edges are: not smooth", axis)

@@ -1,4 +1,4 @@
-"""The atlas of the floquet analysis of a system: what to construct, how sharply to solve, how to evaluate it."""
+"""The atlas of the floquet analysis of a system: quantity, tolerance of the solves, and evaluation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from drivetrain_jax.atlas.series import series_nodes
 from drivetrain_jax.atlas.stability import StabilityAtlas
 from drivetrain_jax.systems import LinearPeriodic, Smoothness, System
 
-# Direct solves are to be this much better than the atlas, as far as rounding allows.
+# Ratio of the tolerance of direct solves to that of the atlas, as far as rounding allows.
 _SHARPER, _FINEST = 3e-2, 1e-13
 
 
@@ -45,7 +45,7 @@ def floquet_rounds(
 ) -> Rounds:
     """The construction of an atlas of the propagator, as :func:`~drivetrain_jax.atlas.construct`.
 
-    It asks for the variables of the analysis ``floquet_propagator``, side by side, with ``rtol = solve_rtol(tolerance)``.
+    It requests the variables of the analysis ``floquet_propagator``, in one array, with ``rtol = solve_rtol(tolerance)``.
     """
     domain = floquet_domain(system, ranges, fixed)
     quantity = floquet_quantity(_form(system, domain))
@@ -55,7 +55,7 @@ def floquet_rounds(
 def numbers_per_solve(
     system: type[System], ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, float]
 ) -> int:
-    """How many numbers a solve for :func:`floquet_rounds` gives: entries of the propagator, and their errors."""
+    """Number of values per solve for :func:`floquet_rounds`: entries of the propagator, and their errors."""
     return 2 * floquet_quantity(_form(system, floquet_domain(system, ranges, fixed))).size
 
 
@@ -66,9 +66,9 @@ def prepare_judging(
     rtol: float,
     outputs: Sequence[str],
 ) -> None:
-    """Compile what judges single cells of :func:`stability_atlas`, by evaluating an atlas that is zero.
+    """Compile the kernel that decides single cells of :func:`stability_atlas`, by evaluating a zero atlas.
 
-    It takes seconds, in which the solves for the real one can be compiled and made on the other cores.
+    This takes seconds, in which other cores can compile and run the solves for the real atlas.
     """
     domain = floquet_domain(system, ranges, fixed)
     middle = [(a + b) / 2 for a, b in zip(domain.lower, domain.upper, strict=True)]
@@ -98,5 +98,5 @@ def _form(system: type[System], domain: Domain) -> LinearPeriodic:
 
 
 def stability_atlas(atlas: Atlas, system: type[System], rtol: float) -> StabilityAtlas:
-    """Spectral radius, bound and verdict from an atlas that :func:`floquet_rounds` made; ``rtol`` judges outcomes."""
+    """Spectral radius, bound and verdict from an atlas of :func:`floquet_rounds`; ``rtol`` determines outcomes."""
     return StabilityAtlas(atlas, system.models["floquet"].build, rtol)

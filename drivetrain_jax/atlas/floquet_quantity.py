@@ -1,4 +1,4 @@
-"""The propagator of a periodic system as the quantity of an atlas, and how cells are judged one by one."""
+"""The propagator of a periodic system as the quantity of an atlas, and the decision of single cells."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Build = Callable[[Mapping[str, Any]], FloquetModel]
 def floquet_quantity(form: LinearPeriodic) -> Quantity:
     """Entries of ``Phi`` of ``form`` by rows; errors are measured on the monodromy matrix, relative to its size.
 
-    Derived are the coefficients a_k of det(sigma I - Z), all but the last where Liouville's formula gives that one.
+    Derived numbers are the coefficients a_k of det(sigma I - Z), without the last one if Liouville's formula gives it.
     """
     x = None if form.reversor is None else np.array(form.reversor)
     n = form.size if x is None else len(x)
@@ -44,7 +44,7 @@ def floquet_quantity(form: LinearPeriodic) -> Quantity:
 
 
 def _characteristic_coefficients(z: np.ndarray) -> np.ndarray:
-    """As :func:`characteristic_coefficients`, ``(N, n, n) -> (N, n)``: without JAX, which would trace every step for few
+    """As :func:`characteristic_coefficients`, ``(N, n, n) -> (N, n)``, without JAX, which would trace every step for few
     points."""
     power, found = z, []
     for k in range(1, z.shape[1] + 1):
