@@ -31,16 +31,16 @@ from drivetrain_jax.atlas.panels import Atlas, Panel, derivative, position
 from drivetrain_jax.systems import System
 
 PLUS, MINUS, PAIR = "+1", "-1", "pair"
-# A zero bounds the stable region if no multiplier grows; others lie in a region that is unstable anyway. However large the
-# errors of the growth, one that is faster than this is no error.
+# A zero bounds the stable region only if no multiplier grows. A growth rate above this value counts as real, whatever its
+# error bound.
 LIMITING = 1e-6
 _STATES = 4
-# Points for which the determinant is computed at once: few shapes, hence few compilations.
+# Points per call of the determinant: few shapes need few compilations.
 _BLOCKS = (64, 512, 4096)
 
 
 def has_boundaries(atlas: Atlas, system: type[System]) -> bool:
-    """Whether the system has four states and a reversor that exchanges two halves of them, and ``atlas`` panels."""
+    """True if ``atlas`` has panels, and the system four states with a reversor that exchanges their halves."""
     if not atlas.panels:
         return False
     corner = {**atlas.fixed, **dict(zip(atlas.parameters, atlas.lower, strict=True))}
@@ -51,8 +51,8 @@ def has_boundaries(atlas: Atlas, system: type[System]) -> bool:
 class Criteria:
     """The boundary functions of ``atlas``, whose values are the propagator ``Phi`` of the reduced form of ``system``.
 
-    Points are given in the atlas's coordinates, ``(N, d)``. ``conservative`` chooses the functions without dissipation.
-    Raises :class:`InputError` for a system that does not have them (:func:`has_boundaries`).
+    Points are in the coordinates of the atlas, ``(N, d)``. ``conservative`` selects the functions without dissipation.
+    Raises :class:`InputError` for a system without boundary functions (:func:`has_boundaries`).
     """
 
     atlas: Atlas
@@ -71,7 +71,7 @@ class Criteria:
 
     @classmethod
     def of(cls, atlas: Atlas, system: type[System]) -> Criteria:
-        """The criteria that suit ``atlas``: those without dissipation if det Z = 1 everywhere in it."""
+        """The criteria for ``atlas``: those without dissipation if det Z = 1 everywhere in it."""
         criteria = cls(atlas, system)
         corners = atlas.to_coordinates(np.stack([atlas.lower, (atlas.lower + atlas.upper) / 2, atlas.upper]))
         return cls(atlas, system, conservative=bool((criteria.log_determinant(corners) == 0).all()))
@@ -82,7 +82,7 @@ class Criteria:
         return (MINUS, MINUS, PLUS, PLUS, PAIR) if self.conservative else (PLUS, MINUS, PAIR)
 
     def propagator(self, x: np.ndarray, order: tuple[int, ...] = ()) -> np.ndarray:
-        """``Phi`` or its derivative of ``order`` per coordinate, ``(N, d) -> (16, N)``, NaN where the atlas has none."""
+        """``Phi`` or its derivative of ``order`` per coordinate, ``(N, d) -> (16, N)``, NaN outside the panels."""
         found = self.atlas.find(x)
         values = np.full((_STATES**2, len(x)), np.nan)
         for number in np.unique(found[found >= 0]):
@@ -92,7 +92,7 @@ class Criteria:
         return values
 
     def log_determinant(self, x: np.ndarray) -> np.ndarray:
-        """log det Z, ``(N, d) -> (N,)``: exact where the system knows it."""
+        """log det Z, ``(N, d) -> (N,)``, exact if the system gives it."""
         values = self._values(x)
         size = next((n for n in _BLOCKS if n >= len(x)), _BLOCKS[-1])
         parts = []
@@ -119,10 +119,11 @@ class Criteria:
         return np.stack([1 - a + b - c + d, 1 + a + b + c + d, 1 + d - b + product])
 
     def errors(self, panel: Panel, phi: np.ndarray, log_determinant: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What the errors of ``panel`` (statistical bounds) and rounding make of the functions: |error| <= first + |second|.
+        """Error bounds of the functions from the (statistical) errors of ``panel`` and rounding: |error| <= first +
+        |second|.
 
-        Both have shape ``(k, ...)``; the second is smooth. For the pair g = 1 + d - b + a^2/4 - W^2/4, W = P - Q, and the
-        error of W is large, but W vanishes where two pairs meet: the second part is W times half its error.
+        Both have shape ``(k, ...)``; the second is smooth. For the pair g = 1 + d - b + a^2/4 - W^2/4, W = P - Q. The error
+        of W is large, but W vanishes where two pairs meet: the second part is W times half its error.
         """
         z = monodromy(phi)
         a, _, c = invariants(z)
@@ -152,8 +153,8 @@ class Criteria:
         return np.abs(self.eigenvalues(x)).max(axis=1, initial=0.0) if len(x) else np.empty(0)
 
     def stable(self, x: np.ndarray) -> np.ndarray:
-        """Whether the surrogate is stable at points, ``(N, d) -> (N,)``: all multipliers inside, or without dissipation on
-        the unit circle and apart. Errors are not considered here."""
+        """Flags of stable points of the surrogate, ``(N, d) -> (N,)``: all multipliers inside the unit circle, or
+        without dissipation on it and distinct. Errors are not considered here."""
         if not self.conservative:
             return self.spectral_radius(x) < 1
         phi = self.propagator(x)
@@ -169,7 +170,7 @@ class Criteria:
 
 
 def parameters_at(atlas: Atlas, x: np.ndarray) -> np.ndarray:
-    """Parameters of points in coordinates, ``(..., d)``, kept inside the domain against rounding; NaN stays NaN."""
+    """Parameters of points in coordinates, ``(..., d)``, clipped to the domain against rounding; NaN stays NaN."""
     return np.clip(atlas.to_parameters(np.clip(x, *atlas.corners)), atlas.lower, atlas.upper)
 
 
@@ -211,7 +212,7 @@ def _block_determinants(phi: np.ndarray) -> list[np.ndarray]:
 
 @lru_cache
 def _determinant(build: Callable) -> Callable:
-    """Compiled log det Z of a model, kept for all atlases of it."""
+    """Compiled log det Z of a model, cached for all its atlases."""
 
     def exact(values: Mapping[str, jax.Array]) -> jax.Array:
         return build(values).reduced.log_determinant()

@@ -1,4 +1,4 @@
-"""How the Chebyshev coefficients of one line fall, and what that says about the function."""
+"""Decay of the Chebyshev coefficients of one line: needed degree, noise, kinks."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 
 from drivetrain_jax.atlas.interpolation import envelope
 
-# A plateau that lies this far below the largest coefficient is rounding or noise of the solves, not an oscillation.
+# A plateau this far below the largest coefficient is rounding or noise of the solves, not an oscillation.
 _NOISE = 1e-6
-# The same for the last coefficients of a tensor, in terms of what may be left out.
+# The same for the last coefficients of a tensor, relative to the allowed truncation error.
 _ROUNDING = 1e-2
 
 
@@ -36,7 +36,8 @@ def _transform(n: int) -> np.ndarray:
 
 
 def needed(sizes: np.ndarray, limit: float) -> int | None:
-    """How many polynomials leave out nothing above ``limit``; None if the last three are not below it."""
+    """Number of polynomials whose truncated coefficients are all below ``limit``; None if the last three are not below
+    it."""
     tail = envelope(sizes)
     if tail[-3] > limit:
         return None
@@ -44,13 +45,13 @@ def needed(sizes: np.ndarray, limit: float) -> int | None:
 
 
 def foreseen(sizes: np.ndarray, limit: float) -> int | None:
-    """As :func:`needed`; by the slope of the last half where that takes less than a third as many again. What falls faster
-    and faster is overestimated."""
+    """As :func:`needed`, or by the slope of the last half if that adds less than a third. Overestimates superexponential
+    decay."""
     tail, n = envelope(sizes), len(sizes)
     if tail[-3] <= limit:
         return needed(sizes, limit)
     start, end = n // 2, n - 3
-    # Where values leave the range of numbers downwards, so does the limit, which is relative to them.
+    # The limit is relative to the values, and underflows with them.
     if not 0 < tail[end] < tail[start] or limit <= 0:
         return None
     rate = math.log(tail[start] / tail[end]) / (end - start)
@@ -59,13 +60,13 @@ def foreseen(sizes: np.ndarray, limit: float) -> int | None:
 
 
 def is_noise(sizes: np.ndarray) -> bool:
-    """The coefficients have stopped falling far below the first ones: more of them resolve nothing."""
+    """True if the coefficients stopped falling far below the first ones: more of them resolve nothing."""
     tail, n = envelope(sizes), len(sizes)
     return bool(tail[n // 2] < 4 * tail[-n // 8] and tail[n // 2] < _NOISE * tail[0])
 
 
 def is_algebraic(sizes: np.ndarray) -> bool:
-    """The coefficients fall like a power of their number, as those of a function with a kink or a jump.
+    """True if the coefficients fall like a power of their number, as for a function with a kink or a jump.
 
     The exponent is measured over n/4..n/2 and n/2..7n/8: for a smooth function it nearly doubles.
     """
@@ -80,9 +81,9 @@ def is_algebraic(sizes: np.ndarray) -> bool:
 
 
 def remainder(sizes: np.ndarray, limit: float) -> float:
-    """What the coefficients left out add up to, if they go on falling as the last pairs do; inf if these do not fall.
+    """Sum of the truncated coefficients, extrapolated from the last pairs; inf if these do not fall.
 
-    Where they stopped falling far below ``limit`` they are rounding, and nothing is left out.
+    Coefficients that stopped falling far below ``limit`` are rounding: the sum is then 0.
     """
     before, last = max(sizes[-4:-2], default=np.inf), max(sizes[-2:])
     if last < _ROUNDING * limit:

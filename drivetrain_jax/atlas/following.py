@@ -1,8 +1,8 @@
-"""Tips of tongues followed as a third parameter of the atlas (mu, alpha, gamma, zeta) changes.
+"""Follow tips of tongues as a third parameter of the atlas (mu, alpha, gamma, zeta) changes.
 
-On every step a tip is predicted from its slope at the start, found by Newton's method, and accepted if the slopes at both
-ends agree with the way between them. A step on which they do not is halved: Newton's method alone, started too far
-away, leads to the tip of another tongue.
+On every step a tip is predicted from its slope at the start and found by Newton's method. It is accepted if the slopes at
+both ends agree with the displacement; otherwise the step is halved. Newton's method alone, started too far away, would
+converge to the tip of another tongue.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from drivetrain_jax.atlas.patches import Patches, patches_of
 from drivetrain_jax.atlas.tips import Tip, find_tips, polish, rises
 from drivetrain_jax.systems import Coordinate, System
 
-# Newton's steps on the boundary function and on the multiplier, and how often a step from one value to the next is halved.
+# Newton steps on the boundary function and on the multiplier, and the largest number of halvings of a step.
 _NEWTON, _POLISH, _HALVINGS = 8, 4, 6
-# Slopes are differences over this part of a step.
+# Step of difference quotients relative to a step.
 _PART = 1e-3
-# How far a step may differ from what the slopes at its ends say, of its own length and of the domain.
+# Largest deviation of a step from its slopes, relative to its length and to the domain.
 _BEND, _SMALL = 0.2, 1e-3
-# The largest shift of a polish, of the domain, and the largest rate of growth after it.
+# Largest shift of a polish relative to the domain, and largest growth rate after it.
 _LARGEST_SHIFT, _LARGEST_RATE = 1e-3, 1e-9
 
 
 @dataclass(frozen=True)
 class Path:
-    """The way of one tip: ``points`` maps the two parameters to arrays, one entry for each of ``values`` of ``parameter``.
+    """The path of one tip: ``points`` maps the two parameters to arrays, one entry for each of ``values`` of ``parameter``.
 
-    NaN from where the tip has left the atlas, has met another one, or could not be followed. ``limiting`` is false also
-    where it lies within another tongue, so that it bounds no stable region there.
+    NaN after the tip has left the atlas, met another one, or been lost. ``limiting`` is false also inside another tongue,
+    where the tip bounds no stable region.
     """
 
     tip: Tip
@@ -45,15 +45,15 @@ class Path:
 
 
 def follow_tips(atlas: Atlas, system: type[System], parameter: str, values: Sequence[float]) -> tuple[Path, ...]:
-    """All tips at the first of ``values`` of ``parameter``, followed through the others in the order given.
+    """All tips at the first of ``values`` of ``parameter``, followed through the others in the given order.
 
-    ``atlas`` has ``parameter`` and two more, one of them the axis of the system's resonances. A step on which a tip is lost
-    is divided; one that leaves the atlas ends there. At zero damping tongues have no width at their tips: on a step from or
-    to there, a tip is the one of the same name.
+    ``atlas`` has ``parameter`` and two more, one of them the axis of the system's resonances. A step that loses a tip is
+    divided; one that leaves the atlas ends there. At zero damping tongues have no width at their tips, so on a step from or
+    to zero damping tips are matched by name.
 
-    Raises ``KeyError`` if ``atlas`` lacks ``parameter``, ``ValueError`` for a value outside its domain, for no values and
-    for other parameters beside it, :class:`~drivetrain_jax.InputError` for an atlas without panels and a system without
-    boundary functions.
+    Raises ``KeyError`` if ``atlas`` lacks ``parameter``; ``ValueError`` for a value outside its domain, for no values and
+    for further parameters; :class:`~drivetrain_jax.InputError` for an atlas without panels and a system without boundary
+    functions.
     """
     places = np.asarray(values, float)
     if not places.size:
@@ -61,7 +61,7 @@ def follow_tips(atlas: Atlas, system: type[System], parameter: str, values: Sequ
     way = _Way(atlas, system, parameter)
     first = way.criteria(places[0]).atlas
     names = first.parameters
-    # Tongues widen with the angle. Along a damping they close, and what closes them is their tip.
+    # Tongues widen with the angle. They close with increasing damping, at their tip.
     tips = find_tips(first, system, opening=system.roles.get("angle") in names).tips
     criteria = [way.criteria(value) for value in places]
     track = np.full((len(places), len(tips), 2), np.nan)
@@ -89,13 +89,13 @@ class _Way:
     parameter: str
 
     def criteria(self, value: float) -> Criteria:
-        """Those of the two other parameters at a value."""
+        """The criteria of the two other parameters at a value."""
         return Criteria.of(self.atlas.slice({self.parameter: float(value)}).folded(), self.system)
 
     def advance(
         self, tips: Sequence[Tip], start: np.ndarray, ends: tuple[float, float], halvings: int = 0
     ) -> np.ndarray:
-        """Where ``tips`` are at the second of the values ``ends``, from ``start`` at the first; NaN for what is lost."""
+        """Positions of ``tips`` at the second of the values ``ends``, from ``start`` at the first; NaN for lost ones."""
         result = np.full(start.shape, np.nan)
         alive = np.flatnonzero(np.isfinite(start).all(axis=1))
         if not alive.size:
@@ -111,7 +111,7 @@ class _Way:
         return result
 
     def _step(self, tips: list[Tip], x: np.ndarray, ends: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-        """Where ``tips`` are at the end of one step from ``x``, and whether its slopes agree with that."""
+        """Positions of ``tips`` at the end of one step from ``x``, and flags where the slopes agree."""
         size = np.ptp(self._others(self.atlas.folded().corners), axis=0)
         slope = (self._near(self._between(ends, _PART), tips, x) - x) / _PART
         found = self._near(ends[1], tips, x + slope)
@@ -121,8 +121,8 @@ class _Way:
         return found, np.maximum(*bends) <= _BEND * np.abs(way).max(axis=1) + _SMALL
 
     def _near(self, value: float, tips: list[Tip], guess: np.ndarray) -> np.ndarray:
-        """Tips like ``tips`` near ``guess``: Newton's method on the boundary functions, then on the multipliers; NaN if that
-        fails, or leads to where a tongue closes instead of opening."""
+        """Tips like ``tips`` near ``guess``: Newton's method on the boundary functions, then on the multipliers. NaN if
+        it fails, or converges to a point where a tongue closes instead of opening."""
         result = np.full(guess.shape, np.nan)
         if not np.isfinite(guess).all(axis=1).any():
             return result
@@ -143,7 +143,7 @@ class _Way:
         return result
 
     def _between(self, ends: tuple[float, float], part: float) -> float:
-        """The value at a ``part`` of the way, in the coordinate."""
+        """The value at a fraction ``part`` of the step, in the coordinate."""
         coordinate: Coordinate = self.atlas.coordinates[self.atlas.parameters.index(self.parameter)]
         a, b = (float(coordinate.forward(end)) for end in ends)
         value = float(coordinate.inverse(a + part * (b - a)))
@@ -155,7 +155,7 @@ class _Way:
 
 
 def _newton(f: Patches, x: np.ndarray, corners: np.ndarray, h: int) -> np.ndarray:
-    """Zeros of f and f_h from ``x`` ``(M, 2)``. Outside the domain the function is taken as on its rim."""
+    """Zeros of f and f_h from ``x`` ``(M, 2)``. Outside the domain the function has its values on the rim."""
     v, f_h = 1 - h, f.derivative(h)
     derived = f, f_h, f_h.derivative(h), f.derivative(v), f_h.derivative(v)
     for _ in range(_NEWTON if len(x) else 0):
@@ -163,7 +163,7 @@ def _newton(f: Patches, x: np.ndarray, corners: np.ndarray, h: int) -> np.ndarra
         place = f.locate(x)
         value, slope, bend, rise, twist = (each.at(*place) for each in derived)
         with np.errstate(all="ignore"):
-            # The value on the ridge and its slope: far from the ridge a plain step of Newton's method overshoots.
+            # Uses the value on the ridge and its slope; far from the ridge a plain Newton step overshoots.
             step = (value - slope**2 / (2 * bend)) / (rise - slope * twist / bend)
             x = x - np.stack([step, (slope - twist * step) / bend], axis=1)[:, [v, h]]
     return x
@@ -176,7 +176,7 @@ def _places(atlas: Atlas, tips: Sequence[Tip]) -> np.ndarray:
 
 
 def _by_name(criteria: Criteria, tips: Sequence[Tip]) -> np.ndarray:
-    """The tips of the same names, NaN for those without a name or of a name that several bear."""
+    """The tips of the same names; NaN for unnamed tips and for names that are not unique."""
     others = find_tips(criteria.atlas, criteria.system).tips
     same = [[other for other in others if other.name == tip.name != ""] for tip in tips]
     places = [_places(criteria.atlas, those)[0] if len(those) == 1 else np.full(2, np.nan) for those in same]
@@ -184,7 +184,7 @@ def _by_name(criteria: Criteria, tips: Sequence[Tip]) -> np.ndarray:
 
 
 def _bounding(criteria: Criteria, tips: Sequence[Tip], x: np.ndarray) -> np.ndarray:
-    """Whether no other multiplier grows where ``tips`` are, at ``x``."""
+    """Flags of ``tips`` at ``x`` where no other multiplier grows."""
     alive = np.isfinite(x).all(axis=1)
     if criteria.conservative:
         return alive  # pyright: ignore[reportReturnType]

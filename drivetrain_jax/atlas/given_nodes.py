@@ -1,7 +1,7 @@
-"""The panel of a box whose nodes a source gives in lines, for less than solves: only held-out points are solved.
+"""The panel of a box whose nodes come from a cheap source in lines; only held-out points are solved.
 
-With one or two coordinates the tensor begins with enough nodes for most boxes, and grows until its coefficients have fallen.
-Of lines over more coordinates there are many: along each of these the edges are looked at first.
+With one or two coordinates the tensor starts with enough nodes for most boxes, and grows until its coefficients have
+fallen. With more coordinates there are many lines, so the edges are probed first.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from drivetrain_jax.atlas.box import Exploration, Exploring, Source
 from drivetrain_jax.atlas.fitting import HELD_OUT, MAX_NUMBERS, grown, judge, known_checks, scattered, unresolved
 from drivetrain_jax.atlas.interpolation import analysis_matrix, coefficients, envelope, slabs
 
-# Lines to begin with, and those that show how many a coordinate needs.
+# Number of lines at the start, and of lines that probe the need of a coordinate.
 _LINES, _PROBES = 32, 64
-# Nodes beyond those that coefficients ask for: edges do not see everything. Along lines, nodes beyond the radians in units
-# of their cube root.
+# Nodes beyond those that the coefficients need, because edges do not show everything. Along lines: nodes beyond the radians
+# in units of their cube root.
 _SPARE, _BEYOND = 2, 10.0
-# Boxes along lines up to which it is worth while to cut them.
+# Number of boxes along lines up to which cutting is cheaper.
 _MOST_BOXES = 100
 _MAX_GROWTHS = 8
 
 
 def fit_given(exploring: Exploring, source: Source) -> Exploration:
-    """A panel whose nodes are those of ``source``, held against solves, or what becomes of the box instead."""
+    """A panel with nodes from ``source``, compared with solves, or the halves or gap of the box instead."""
     d, most = len(exploring.box.lower), MAX_NUMBERS // exploring.settings.quantity.size
     most_along, checks = exploring.settings.max_nodes, None
     radians = source.radians(exploring.box.lower, exploring.box.upper)
@@ -34,7 +34,7 @@ def fit_given(exploring: Exploring, source: Source) -> Exploration:
         return exploring.give_up("too many nodes would be needed")
     if radians > most_along:
         return exploring.split(source.axis, "not resolved")
-    # Along lines cos(r x) and sin(r x) have coefficients J_n(r), which fall from n = r on.
+    # Along lines cos(r x) and sin(r x) have coefficients J_n(r), which fall beyond n = r.
     along = min(round(radians + _BEYOND * np.cbrt(radians)), most_along)
     degrees = [max(along, 1) if k == source.axis else _LINES for k in range(d)]
     if d > 2:
@@ -46,7 +46,7 @@ def fit_given(exploring: Exploring, source: Source) -> Exploration:
         degrees = _suited(degrees, source)
         waiting = source.start(exploring.box.axes(degrees))
         if checks is None:
-            # Beside the nodes.
+            # In parallel with the nodes.
             solved = yield from exploring.solve(_held_out(d))
             if not np.isfinite(solved).all():
                 return exploring.failed(solved)
@@ -71,12 +71,12 @@ def _held_out(d: int) -> np.ndarray:
 
 
 def _suited(degrees: list[int], source: Source) -> list[int]:
-    """``degrees``, and as many more as cost nothing."""
+    """``degrees``, rounded up where more nodes cost nothing."""
     return [-(-n // source.positions) * source.positions if k == source.axis else n for k, n in enumerate(degrees)]
 
 
 def _probed(exploring: Exploring, source: Source, degrees: list[int]) -> list[int]:
-    """Nodes that each coordinate needs along the edges of the box; ``degrees`` where there are no values."""
+    """Nodes that each coordinate needs along the edges of the box; ``degrees`` where values are missing."""
     box, d = exploring.box, len(exploring.box.lower)
     ends = [np.array(pair) for pair in zip(box.lower, box.upper, strict=True)]
     counts = [degrees[k] if k == source.axis else _PROBES for k in range(d)]
@@ -100,7 +100,7 @@ def _probed(exploring: Exploring, source: Source, degrees: list[int]) -> list[in
 
 
 def _resized(tensor: np.ndarray, tails: np.ndarray, limit: float) -> list[int]:
-    """More nodes where the tail is too large, and no more than are needed elsewhere."""
+    """More nodes where the tail is too large, and only the needed ones elsewhere."""
     more = zip(tensor.shape, grown(tensor, tails, limit), tails, strict=False)
     return [
         count if tail > 1 else min(n, _needed(slabs(tensor, k), limit) + _SPARE)
@@ -109,5 +109,5 @@ def _resized(tensor: np.ndarray, tails: np.ndarray, limit: float) -> list[int]:
 
 
 def _needed(sizes: np.ndarray, limit: float) -> int:
-    """How many polynomials leave out nothing above ``limit``."""
+    """Number of polynomials whose truncated coefficients are all below ``limit``."""
     return int(np.count_nonzero(envelope(sizes) > limit))

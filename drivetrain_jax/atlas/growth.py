@@ -50,7 +50,7 @@ def growth(criteria: Criteria, x: np.ndarray, kinds: list[str], *, second: bool 
     dz = [_matrices(a, phi) + _matrices(phi, a) for a in first]
     ds = np.stack([np.einsum("ni,nij,nj->n", yl, a, xr) for a in dz], axis=-1)
     hessian = np.full((n, d, d), np.nan)
-    # What lies outside the panels is NaN here and below.
+    # Points outside the panels are NaN here and below.
     if second:
         with np.errstate(invalid="ignore"):
             hessian = _second(criteria, x, phi, first, dz, (sigma, right, left, chosen, ds))
@@ -61,8 +61,8 @@ def growth(criteria: Criteria, x: np.ndarray, kinds: list[str], *, second: bool 
 
 
 def limiting(criteria: Criteria, x: np.ndarray, own: Growth) -> np.ndarray:
-    """Whether at ``x``, where the multipliers of ``own`` are on the unit circle but for their rates, none grows beyond that
-    and the errors, ``(N,)``. With little damping the rates within a tongue are small."""
+    """Flags ``(N,)`` where no multiplier grows at ``x`` except ``own``, which are on the unit circle up to their rates.
+    With little damping the rates within a tongue are small."""
     largest = growth(criteria, x, ["largest"] * len(x))
     with np.errstate(invalid="ignore"):
         bound = np.fmin(np.abs(own.rate) + own.error + largest.error, LIMITING)

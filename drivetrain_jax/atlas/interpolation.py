@@ -10,8 +10,8 @@ from scipy.fft import dctn
 
 from drivetrain_jax.atlas.panels import chebyshev
 
-# Numbers that the first product of a block of points may make, and multiplications up to which OpenBLAS starts no threads:
-# these spin on for a tenth of a second, on cores that solves and charts need.
+# Largest first product of a block of points; size below which OpenBLAS starts no threads. Its threads spin for a tenth of a
+# second on cores that solves and charts need.
 _WORKING_SET, _ONE_THREAD = 1 << 22, 1 << 18
 
 
@@ -22,9 +22,9 @@ def nodes(n: int) -> np.ndarray:
 
 @lru_cache(maxsize=256)
 def analysis_matrix(n: int) -> np.ndarray:
-    """Matrix ``(n, n)`` from values at ``nodes(n)`` to Chebyshev coefficients; not to be written to.
+    """Matrix ``(n, n)`` from values at ``nodes(n)`` to Chebyshev coefficients; read-only.
 
-    Multiples of the angles are taken as integers, modulo a turn: their cosines are then exact to the last bit but one.
+    Multiples of the angles are integers modulo a turn, so their cosines are exact to the last bit but one.
     """
     quarters = np.outer(np.arange(n), 2 * np.arange(n) + 1) % (4 * n)
     matrix = 2 / n * np.cos(np.pi / (2 * n) * quarters)
@@ -41,7 +41,7 @@ def tensor_nodes(degrees: Sequence[int]) -> np.ndarray:
 def coefficients(values: np.ndarray, degrees: Sequence[int]) -> np.ndarray:
     """Coefficients ``(n_1, ..., n_d, m)`` from the values at ``tensor_nodes(degrees)``, ``(prod(degrees), m)``."""
     axes = tuple(range(len(degrees)))
-    # Products of matrices take less time, but their roundings keep tails from falling: up to five times the solves at 1e-11.
+    # Matrix products are faster, but their rounding keeps tails from falling: up to five times the solves at 1e-11.
     tensor = dctn(values.reshape(*degrees, -1), axes=axes) / np.prod(degrees)  # pyright: ignore[reportOperatorIssue]
     for axis in axes:
         first = [slice(None)] * tensor.ndim
@@ -57,7 +57,7 @@ def evaluate(tensor: np.ndarray, x: np.ndarray) -> np.ndarray:
     block = max(_WORKING_SET // first.shape[1], 1)
     for start in range(0, len(x), block):
         part = x[start : start + block]
-        # The first contraction is one product of matrices; the others are over what is left of each point.
+        # The first contraction is one matrix product; the others act on each point's remainder.
         rest = _product(chebyshev(part[:, 0], tensor.shape[0]), first)
         for k in range(1, x.shape[1]):
             rest = np.einsum(
@@ -91,5 +91,5 @@ def slabs(tensor: np.ndarray, axis: int) -> np.ndarray:
 
 
 def envelope(sizes: np.ndarray) -> np.ndarray:
-    """Largest of ``sizes`` from each one on."""
+    """Largest of ``sizes`` from each index on."""
     return np.maximum.accumulate(sizes[::-1])[::-1]

@@ -1,4 +1,4 @@
-"""How many nodes each coordinate of a box needs, from probes along lines on its edges."""
+"""Number of nodes that each coordinate of a box needs, from probes along lines on its edges."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from drivetrain_jax.atlas.interpolation import envelope
 
 # Points of a line at first; each refinement doubles the intervals.
 _LINE = 17
-# A line is resolved to this fraction of the tolerance, and the tensor has so many nodes more: lines along the edges do
-# not see everything. Less with three coordinates and more, where every node counts and there are more lines.
+# Resolution of a line relative to the tolerance, and further nodes of the tensor, because lines along the edges do not show
+# everything. Fewer with three coordinates and more, where every node counts and there are more lines.
 _THOROUGH, _MANY = (1 / 8, 2), (1 / 2, 0)
 # Most lines at which a coordinate is probed.
 _MAX_LINES = 8
@@ -55,7 +55,7 @@ def _along(corner: np.ndarray, axis: int, t: np.ndarray) -> np.ndarray:
 
 
 def probe(exploring: Exploring) -> Probe:
-    """Nodes that each coordinate needs according to lines along the edges, or what becomes of the box instead."""
+    """Nodes that each coordinate needs according to lines along the edges, or the halves or gap of the box instead."""
     d = len(exploring.box.lower)
     places = [(axis, corner) for axis in range(d) for corner in _corners(d, axis)]
     t = np.concatenate([_along(corner, axis, decay.lobatto(_LINE)) for axis, corner in places])
@@ -75,7 +75,7 @@ def probe(exploring: Exploring) -> Probe:
 
 
 def _refine(exploring: Exploring, lines: list[_Line], limit: float, margin: int) -> Probe:
-    """Refine the worst line of each coordinate until all are resolved, or one is hopeless."""
+    """Refine the worst line of each coordinate until all are resolved, or one cannot be resolved."""
     while open_lines := [line for line in lines if decay.foreseen(line.sizes, limit) is None]:
         for line in open_lines:
             hopeless = _verdict(line, exploring)
@@ -97,7 +97,7 @@ def _refine(exploring: Exploring, lines: list[_Line], limit: float, margin: int)
 
 
 def _verdict(line: _Line, exploring: Exploring) -> Parts | None:
-    """What becomes of the box if ``line`` is no use refining; None if it is."""
+    """The halves or gap of the box if refining ``line`` is useless; None if it helps."""
     if len(line.values) <= 2 * _LINE:
         return None
     sizes = line.sizes

@@ -1,7 +1,7 @@
 """An atlas: smooth functions of parameters as Chebyshev tensors over boxes (panels) that tile a domain.
 
-Nothing here knows what the functions mean. Boxes and coefficients are in the atlas's own coordinates (1/Omega, ...),
-one per parameter; parameters are converted at the door. With x in [-1, 1]^d the position within a panel,
+Boxes and coefficients are in the coordinates of the atlas (1/Omega, ...), one per parameter; the interface converts
+parameters. With x in [-1, 1]^d the position within a panel,
 
     f_e(x) = sum_k coefficients[k_1, ..., k_d, e] T_(k_1)(x_1) ... T_(k_d)(x_d).
 """
@@ -15,7 +15,7 @@ import numpy as np
 
 from drivetrain_jax.systems import Coordinate
 
-# Points that lie outside the domain by rounding of their coordinate alone belong to it.
+# Relative tolerance for points outside the domain by rounding of their coordinate.
 _SLACK = 8 * np.finfo(float).eps
 
 
@@ -23,10 +23,10 @@ _SLACK = 8 * np.finfo(float).eps
 class Panel:
     """One box ``lower``..``upper``, both ``(d,)`` in the coordinates, with ``coefficients`` ``(n_1, ..., n_d, m)``.
 
-    ``value_error`` bounds the Euclidean norm of the error of the m values, ``derived_error`` ``(k,)`` the absolute
-    errors of the k numbers that the atlas's quantity derives from them (see :class:`~drivetrain_jax.atlas.Quantity`);
-    for the cardan shaft a_1, a_2, a_3 of det(sigma I - Z) = sigma^4 + a_1 sigma^3 + a_2 sigma^2 + a_3 sigma + a_4.
-    The bounds are statistical (from held-out solves), not proved. Rounding at evaluation is not in them.
+    ``value_error`` bounds the Euclidean norm of the error of the m values. ``derived_error`` ``(k,)`` bounds the absolute
+    errors of the k derived numbers (see :class:`~drivetrain_jax.atlas.Quantity`); for the cardan shaft these are a_1, a_2,
+    a_3 of det(sigma I - Z) = sigma^4 + a_1 sigma^3 + a_2 sigma^2 + a_3 sigma + a_4. The bounds are statistical (from
+    held-out solves), not proved, and exclude rounding at evaluation.
     """
 
     lower: np.ndarray
@@ -43,7 +43,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Gap:
-    """A box, in the coordinates, without a panel: why the function did not converge there."""
+    """A box, in the coordinates, without a panel, and the reason."""
 
     lower: np.ndarray
     upper: np.ndarray
@@ -54,8 +54,8 @@ class Gap:
 class Atlas:
     """Panels over the box ``lower``..``upper`` (in parameters, ``(d,)``) of ``parameters``; the others are ``fixed``.
 
-    ``coordinates`` has one entry per parameter. ``tolerance`` is the aim of the construction, relative to the size of
-    the values; ``solves`` the number of direct solves spent. Panels and gaps together tile the domain.
+    ``coordinates`` has one entry per parameter. ``tolerance`` is the target of the construction, relative to the size of
+    the values; ``solves`` the number of direct solves. Panels and gaps together tile the domain.
     """
 
     parameters: tuple[str, ...]
@@ -102,7 +102,7 @@ class Atlas:
         return found
 
     def folded(self) -> Atlas:
-        """The same over the moduli of the parameters that its coordinates know without their signs."""
+        """The atlas over the moduli of the parameters whose coordinates are even."""
         lower, upper = self.lower.copy(), self.upper.copy()
         for k, coordinate in enumerate(self.coordinates):
             if coordinate.even and lower[k] < 0:
@@ -111,7 +111,7 @@ class Atlas:
         return replace(self, lower=lower, upper=upper)
 
     def slice(self, values: Mapping[str, float]) -> Atlas:
-        """The atlas of the remaining parameters where those in ``values`` have these values.
+        """The atlas of the remaining parameters, with those in ``values`` fixed.
 
         Raises ``KeyError`` for a parameter that the atlas lacks and ``ValueError`` for a value outside the domain.
         """
@@ -121,7 +121,7 @@ class Atlas:
         return atlas
 
     def ordered(self, parameters: Sequence[str]) -> Atlas:
-        """The same with the parameters in this order."""
+        """The atlas with the parameters in this order."""
         if tuple(parameters) == self.parameters:
             return self
         order = [self.parameters.index(name) for name in parameters]
@@ -150,7 +150,7 @@ class Atlas:
             raise ValueError(f"{name} = {value!r}: allowed is {self.lower[k]:g} to {self.upper[k]:g}")
         x = float(self.coordinates[k].forward(value))
         boxes = [box for box in (*self.panels, *self.gaps) if between(box.lower[k], box.upper[k], x)]
-        # On a common face the first of two neighbours is enough.
+        # On a common face the first of two neighbours is used.
         kept: dict[tuple, Panel | Gap] = {}
         for box in boxes:
             reduced = _fix(box, k, x)
@@ -173,7 +173,7 @@ def position(panel: Panel | Gap, x: np.ndarray) -> np.ndarray:
 
 
 def grid_positions(panel: Panel | Gap, axes: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """The same for the points of a grid, from its ``axes`` ``(N_k,)``."""
+    """Positions in [-1, 1] of the points of a grid, from its ``axes`` ``(N_k,)``."""
     return [position_between(*ends) for ends in zip(panel.lower, panel.upper, axes, strict=True)]
 
 
@@ -183,7 +183,7 @@ def position_between(lower: np.ndarray, upper: np.ndarray, x: np.ndarray | float
 
 
 def derivative(panel: Panel, order: Sequence[int]) -> np.ndarray:
-    """Coefficients of the derivative of ``order`` per coordinate; no ``order`` leaves the function itself."""
+    """Coefficients of the derivative of ``order`` per coordinate; order 0 is the function itself."""
     coefficients = panel.coefficients
     for axis, times in enumerate(order):
         if times:
@@ -198,12 +198,12 @@ def chebyshev(x: np.ndarray, n: int) -> np.ndarray:
 
 
 def inside(panel: Panel | Gap, x: np.ndarray) -> np.ndarray:
-    """Whether points given by their coordinates, ``(..., d)``, lie in the box, up to rounding."""
+    """Flags of points in coordinates, ``(..., d)``, that lie in the box up to rounding."""
     return between(panel.lower, panel.upper, x).all(axis=-1)  # pyright: ignore[reportReturnType]
 
 
 def between(lower: np.ndarray, upper: np.ndarray, x: np.ndarray | float) -> np.ndarray:
-    """Whether ``x`` lies between ``lower`` and ``upper``, up to rounding."""
+    """Flags of ``x`` between ``lower`` and ``upper``, up to rounding."""
     slack = _SLACK * np.maximum(np.abs(lower), np.abs(upper))
     return (x >= lower - slack) & (x <= upper + slack)
 

@@ -1,8 +1,8 @@
-"""Boundary functions as Chebyshev polynomials of low degree over many small boxes, and what can be proved of them there.
+"""Boundary functions as Chebyshev polynomials of low degree over many small boxes, and proofs based on their ranges.
 
-A patch holds f(x) = sum_k c_k T_(k_1)(t_1) ... T_(k_d)(t_d), t in [-1, 1]^d, for d = 1 or 2, with a bound ``error`` of
-|f - true function| over the patch. All operations act on an array of patches at once. The range of a polynomial lies
-within c_0 -+ sum |other c_k|; that is what every exclusion rests on.
+A patch holds f(x) = sum_k c_k T_(k_1)(t_1) ... T_(k_d)(t_d), t in [-1, 1]^d, for d = 1 or 2, with a bound ``error`` of |f -
+true function| over the patch. All operations act on an array of patches at once. The range of a polynomial lies within c_0
+-+ sum |other c_k|; every exclusion uses this.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from drivetrain_jax.atlas.panels import Panel, chebyshev, grid_positions
 NODES = 16
 _TAIL = 3e-14
 _MAX_PATCHES = 8_000
-# By how much boxes are enlarged so that a root on a face is inside.
+# Relative enlargement of boxes, so that a root on a face is inside.
 MARGIN = 0.25
-# Off the middle, so that a root rarely sits on the face between two boxes.
+# Off the middle, so that a root is rarely on the face between two boxes.
 _CUT = 0.0271
 
 
@@ -72,7 +72,7 @@ class Patches:
     def derivative(self, axis: int) -> Patches:
         """The patches of the derivative along a coordinate."""
         matrix = _differentiation(self.coefficients.shape[axis])
-        # Of patches without extent they are not finite, and decide nothing.
+        # Patches without extent have derivatives that are not finite and decide nothing.
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = 2 / (self.upper[:, axis] - self.lower[:, axis])
             coefficients = _apply(matrix, self.coefficients, axis) * scale
@@ -108,7 +108,8 @@ class Patches:
         return np.where(inside, values, np.nan)
 
     def trim(self) -> Patches:
-        """The same with fewer coefficients, if those left out add less than a hundredth to the error of every patch."""
+        """The patches with fewer coefficients, if the dropped ones add less than a hundredth to the error of every
+        patch."""
         patches = self
         for axis in range(self.dimension):
             c = np.moveaxis(np.abs(patches.coefficients), axis, 0)
@@ -121,7 +122,7 @@ class Patches:
         return patches
 
     def restrict(self, axis: int, t: np.ndarray) -> Patches:
-        """Patches of the other coordinates where the coordinate ``axis`` is at positions ``t`` ``(N,)``."""
+        """Patches of the other coordinates at the positions ``t`` ``(N,)`` of the coordinate ``axis``."""
 
         def contract(c: np.ndarray) -> np.ndarray:
             weights = np.cos(np.arange(c.shape[axis])[:, None] * np.arccos(np.clip(t, -1.0, 1.0)))
@@ -189,7 +190,7 @@ def patches_of(criteria: Criteria) -> tuple[Patches, ...]:
 
 
 def _cover(criteria: Criteria, panel: Panel) -> tuple[Patches, ...]:
-    """Patches over one panel, finer along each coordinate until all series have ended."""
+    """Patches over one panel, refined along each coordinate until all series have converged."""
     counts = [max(1, round(degree / NODES)) for degree in panel.degrees]
     before = [np.inf] * len(counts)
     while True:
@@ -204,7 +205,7 @@ def _cover(criteria: Criteria, panel: Panel) -> tuple[Patches, ...]:
             break
         before = [e if split else b for e, b, split in zip(excess, before, rough, strict=True)]
         counts = [int(np.ceil(1.5 * count)) if split else count for count, split in zip(counts, rough, strict=True)]
-    # The tail that was cut off is about as large as the last coefficients that were kept.
+    # The truncated tail is about as large as the last kept coefficients.
     floors = sample.floor + 4 * sum(tails)
     floors = np.where(np.isfinite(floors), floors, np.inf)
     roughness = _roughness(panel, sample.lower, sample.upper)

@@ -18,20 +18,20 @@ from drivetrain_jax.atlas.expansion import Cell, Expansion
 from drivetrain_jax.atlas.floquet_quantity import Build
 from drivetrain_jax.atlas.panels import Atlas
 
-# Points of a row, whose intermediate results stay in the cache, and rows of a block.
+# Points of a row, whose intermediate results fit into the cache, and rows of a block.
 LANES, ROWS = 128, 16
 
 
 def judged_cells(
     expansion: Expansion, points: np.ndarray, x: np.ndarray, atlas: Atlas, kernel: Any, rtol: float
 ) -> Iterator[tuple[np.ndarray, Cells]]:
-    """Numbers of points and their results, block after block. ``points`` ``(N, d)`` are parameters, ``x`` coordinates;
-    ``kernel`` is that of :func:`point_kernel`."""
+    """Yield numbers of points and their results, block by block. ``points`` ``(N, d)`` are parameters, ``x``
+    coordinates; ``kernel`` is that of :func:`point_kernel`."""
     block = LANES * ROWS
 
     def work(part: tuple[Cell, int]) -> Cells:
         cell, start = part
-        # The last block is filled up with its last point.
+        # The last block is padded with its last point.
         numbers = np.minimum(np.arange(start, start + block), cell.index.size - 1)
         columns = points[cell.index[numbers]].T
         values, rows = dict(zip(atlas.parameters, columns, strict=True)), -(-(cell.index.size - start) // LANES)
@@ -86,7 +86,7 @@ def point_kernel(build: Build, undamped: bool, few: bool) -> Any:
 
 
 def _chebyshev(x: Array, count: int) -> Array:
-    """``T_0 .. T_(count - 1)`` at ``x``, ``(count, *x.shape)``. Few of them: the recurrence loses no digits that matter."""
+    """``T_0 .. T_(count - 1)`` at ``x``, ``(count, *x.shape)``. The recurrence is accurate enough for few of them."""
 
     def step(pair: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
         return (pair[1], 2 * x * pair[1] - pair[0]), pair[0]
@@ -99,6 +99,6 @@ def _values(tensor: Array, polynomials: Array) -> Array:
     *others, m, first = tensor.shape
     values = (tensor.reshape(-1, first) @ polynomials[:first, 0]).reshape(*others, m, -1)
     for k, n in enumerate(others, start=1):
-        # Term by term: the compiler does not vectorise a sum over an axis in the middle.
+        # Term by term, because the compiler does not vectorise a sum over a middle axis.
         values = sum(values[j] * polynomials[j, k] for j in range(n))  # pyright: ignore[reportIndexIssue]
     return values  # pyright: ignore[reportReturnType]

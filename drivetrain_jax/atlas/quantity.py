@@ -1,4 +1,4 @@
-"""What an atlas interpolates, and how its accuracy is measured."""
+"""The functions that an atlas interpolates, and the norm of their errors."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def _nothing(values: np.ndarray) -> np.ndarray:
 class Quantity:
     """``size`` smooth functions of the parameters. All functions below take values ``(N, size)`` of N points.
 
-    ``scale(values)`` ``(N,)``: an error of the values (Euclidean norm) divided by this is what the tolerance of an atlas
-    limits; by default the largest norm among the points. ``derived(values)`` ``(N, k)``: numbers for whose errors
-    panels vouch as well, because bounds that follow from that of the values would be too wide; by default none.
+    ``scale(values)`` ``(N,)``: the tolerance of an atlas limits the error of the values (Euclidean norm) divided by this;
+    default: the largest norm among the points. ``derived(values)`` ``(N, k)``: numbers with error bounds of their own,
+    because bounds derived from that of the values would be too wide; default: none.
     """
 
     size: int

@@ -1,4 +1,4 @@
-"""The line f_h = 0 along which a tongue grows, followed from its tip down to the foot: which resonance it comes from."""
+"""Follow the line f_h = 0 of a tongue from its tip down to the foot, to identify its resonance."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 
 from drivetrain_jax.atlas.patches import Patches
 
-# Steps down the ridge, of Newton's method on each, and the most that one step may shift the ridge, of the domain.
+# Steps down the ridge, Newton steps on each, and the largest shift of the ridge in one step relative to the domain.
 _STEPS = 40
 _NEWTON = 3
 _LARGEST_SHIFT = 0.02
 
 
 def feet(patches: Patches, tips: np.ndarray, horizontal: int, bottom: float) -> np.ndarray:
-    """Coordinate h of the foot of each ridge where the other coordinate is ``bottom``, ``(N,)``; NaN if it is lost.
+    """Coordinate h of the foot of each ridge where the other coordinate is ``bottom``, ``(N,)``; NaN if the ridge is lost.
 
     ``patches`` hold the function whose tips are ``tips`` ``(N, 2)`` in coordinates.
     """

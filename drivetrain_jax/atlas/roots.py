@@ -1,4 +1,4 @@
-"""All zeros of a boundary function on a line, by the same exclusion of boxes in one dimension."""
+"""All zeros of a boundary function on a line, by exclusion of intervals."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from drivetrain_jax.atlas.panels import position_between
 from drivetrain_jax.atlas.patches import MARGIN, Patches
 
-# Smallest interval relative to the whole line; halvings that find a zero to rounding.
+# Smallest interval relative to the whole line; number of halvings down to rounding.
 _SMALLEST = 2.0**-40
 _HALVINGS = 60
 
@@ -18,7 +18,7 @@ _HALVINGS = 60
 class Roots:
     """``x`` ``(M,)`` in the coordinate, rising, with bounds ``error`` and the function's ``slope`` there.
 
-    ``undecided`` ``(K, 2)`` are intervals in which a zero, or two, may be hidden by the error of the function.
+    ``undecided`` ``(K, 2)`` are intervals in which the error of the function may hide one or two zeros.
     """
 
     x: np.ndarray
@@ -56,7 +56,7 @@ def roots(patches: Patches) -> Roots:
         found.append(_bisect(wide.take(crossing), slope.take(crossing)))
         active = active.take(~(monotone & certain))
         small = (active.upper - active.lower)[:, 0] <= smallest
-        # A function that does not rise above its error decides nothing on smaller intervals either.
+        # Where a function stays below its error, smaller intervals decide nothing either.
         small |= ~(np.maximum(*(np.abs(end) for end in active.range())) > 3 * active.error)
         undecided.append(np.stack([active.lower[small, 0], active.upper[small, 0]], axis=-1))
         active = active.take(~small)
@@ -86,7 +86,7 @@ def _bisect(patches: Patches, slope: Patches) -> tuple[np.ndarray, np.ndarray, n
 
 
 def merge(intervals: np.ndarray) -> np.ndarray:
-    """Intervals ``(K, 2)``, those that touch or overlap joined, rising."""
+    """Intervals ``(K, 2)``, rising; those that touch or overlap are joined."""
     merged: list[list[float]] = []
     for a, b in intervals[np.argsort(intervals[:, 0])]:
         if merged and a <= merged[-1][1]:

@@ -1,4 +1,4 @@
-"""Nodes of an atlas from power series along one coordinate: a whole line of them for the price of a few solves."""
+"""Nodes of an atlas from power series along one coordinate: a whole line costs as much as a few solves."""
 
 from __future__ import annotations
 
@@ -23,25 +23,24 @@ from drivetrain_jax.analysis.periodic.series import propagators_along
 from drivetrain_jax.atlas.construction import Domain
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, Series, System
 
-# Lines that are computed together, and what the number of positions along them is a multiple of, so that few kernels serve
-# all panels.
+# Lines computed together, and divisor of the number of positions along them, so that few kernels serve all panels.
 _LANES, _POSITIONS = 16, 48
-# Parts of the span for each step that the explicit scheme takes at 1e-10: series then leave out 3e-14 of the propagator. How
-# many fewer are enough for each digit less, four at most. Parts for each step that decay takes.
+# Parts of the span per step of the explicit scheme at 1e-10, with a truncation error of 3e-14 of the propagator. Reduction
+# in parts per decade of looser tolerance (four at most). Parts per step of decay.
 _PARTS, _LEAST, _SPARED, _MOST_SPARED, _DECAY = 0.1, 3e-14, 0.0095, 4, 3.0
-# What series may leave out, as part of the tolerance. A line that leaves out more is computed again with twice the parts.
+# Largest truncation error relative to the tolerance; a line above it is computed again with twice the parts.
 _SHARPER, _MOST_PARTS = 1e-2, 4_000
-# Below this tolerance rounding of the parts shows in their product. So it does where decay takes so many steps: the product
-# is then small against the parts.
+# Tolerance below which rounding of the parts shows in their product. Many steps of decay have the same effect, because the
+# product is then small.
 _TOO_FINE, _STIFF = 5e-13, 50
-# Where steps are predicted, and the angle of one of them.
+# Settings at which steps are predicted, and the angle of one step.
 _STEPS_AT, _RADIANS = 1e-10, 0.14
 
 Key = tuple[Callable[..., FloquetModel], Series, tuple[str, ...], Words, tuple[tuple[str, tuple[int, ...]], ...]]
 
 
 def series_nodes(system: type[System], domain: Domain, tolerance: float) -> SeriesNodes | None:
-    """The source of nodes for ``domain``; None where the system declares none or the parts would not be exact enough."""
+    """The source of nodes for ``domain``; None without a series of the system, or if the parts would be too inaccurate."""
     smooth = system.models["atlas"].smooth
     series = smooth.series if smooth else None
     if series is None or series.parameter not in domain.parameters or tolerance < _TOO_FINE:
@@ -65,7 +64,7 @@ class SeriesNodes:
         self._system, self._domain, self._series = system, domain, series
         self.axis = domain.parameters.index(series.parameter)
         target = max(_SHARPER * tolerance, _LEAST)
-        # Of the last term, which is taken: those that are left out are far smaller.
+        # Of the last term, which is kept; the truncated ones are far smaller.
         self._left_out = 10 * target
         self._parts = _PARTS - _SPARED * min(math.log10(target / _LEAST), _MOST_SPARED)
         self._least = 1 + math.ceil(_DECAY * decay)
@@ -76,8 +75,8 @@ class SeriesNodes:
         self._key = (system.models["floquet"].build, series, names, words, shapes)
 
     def radians(self, lower: np.ndarray, upper: np.ndarray) -> float:
-        """About half the angle through which propagators turn on a line between two corners, by the steps that it takes;
-        infinite where these are too many."""
+        """About half the angle through which propagators turn on a line between two corners, from its steps; infinite
+        for too many."""
         pairs = [np.array(pair) for pair in zip(lower, upper, strict=True)]
         end = max(pairs[self.axis], key=abs)
         _, steps = self._lines([pair if k != self.axis else np.array([end]) for k, pair in enumerate(pairs)])
@@ -87,7 +86,8 @@ class SeriesNodes:
         return _RADIANS * most * float(np.ptp(pairs[self.axis])) / (2 * abs(end)) if end else 0.0
 
     def start(self, axes: Sequence[np.ndarray]) -> Callable[[], np.ndarray]:
-        """Begin to compute the grid of ``axes``; what is returned waits for its values ``(N, n n)``, points in C order.
+        """Start computing the grid of ``axes``; returns a function that waits for its values ``(N, n n)``, points in C
+        order.
 
         Values are NaN on lines along which the series does not converge.
         """
@@ -97,7 +97,7 @@ class SeriesNodes:
         parts = np.maximum(np.ceil(self._parts * steps), self._least)
         order = np.argsort(-parts, kind="stable")
         chunks = [order[i : i + _LANES] for i in range(0, len(order), _LANES)]
-        # Not asked for in threads, which would have it compiled twice.
+        # Requested outside of threads, which would compile it twice.
         kernel, pool = _kernel(self._key, len(x)), threads(usable_cores(), "tile")
         pending = [
             pool.submit(self._along, kernel, {n: c[chosen] for n, c in columns.items()}, end, parts[chosen[0]], x)  # pyright: ignore[reportArgumentType]
@@ -118,7 +118,7 @@ class SeriesNodes:
         return values
 
     def _lines(self, axes: Sequence[np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """The parameters of all lines on a grid, that of the series apart, and steps for its value in ``axes``."""
+        """The parameters of all lines on a grid, without that of the series, and the steps for its value in ``axes``."""
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
         columns = dict(zip(self._domain.parameters, self._domain.points(grid).T, strict=True))
         steps = explicit_effort(self._system, {**self._domain.fixed, **columns}, _STEPS_AT)
@@ -127,7 +127,7 @@ class SeriesNodes:
     def _along(
         self, compiled: Future[Any], columns: Mapping[str, np.ndarray], end: float, parts: float, x: np.ndarray
     ) -> np.ndarray:
-        """Values on up to ``_LANES`` lines, ``(_LANES, P, n n)``; ``end`` is the coordinate ``x`` that is largest."""
+        """Values on up to ``_LANES`` lines, ``(_LANES, P, n n)``; ``end`` is the largest coordinate ``x``."""
         kernel = compiled.result()
         full = {name: np.pad(column, (0, _LANES - len(column)), mode="edge") for name, column in columns.items()}
         with np.errstate(divide="ignore"):
@@ -145,7 +145,7 @@ class SeriesNodes:
 
 @lru_cache(maxsize=16)
 def _kernel(key: Key, positions: int) -> Future[Any]:
-    """:func:`propagators_along` for ``_LANES`` lines, compiled in a thread of its own."""
+    """:func:`propagators_along` for ``_LANES`` lines, compiled in a separate thread."""
     build, series, names, words, fixed = key
 
     def lines(columns: dict, numbers: dict, ends: Array, parts: Array, x: Array) -> tuple[Array, Array]:

@@ -1,9 +1,9 @@
 """Stability from an atlas of the propagator: spectral radius with its bound and verdict, on grids and at points.
 
-Most cells of a grid and most points are judged in closed form (``charts``, ``points``). Those for which that gives too wide
-a bound or no verdict are judged again by the eigenvalues of Z, and by the test of Schur and Cohn where the interval of
-rho holds 1; without damping the verdict is that of ``conservative``. Results that the closed form does not give come from
-the eigenvalues, as do all results of systems without it.
+Most cells of a grid and most points are decided in closed form (``charts``, ``points``). If its bound is too wide or gives
+no verdict, the eigenvalues of Z decide, and the test of Schur and Cohn where the interval of rho contains 1. Without
+damping the verdict is that of ``conservative``. All other results, and all results of systems without a closed form, come
+from the eigenvalues.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
 DEFAULT_OUTPUTS = ("spectral_radius", "spectral_radius_error", "verdict")
 _FAST = frozenset(DEFAULT_OUTPUTS)
-# A kernel that is asked for while another thread has it compiled would be compiled twice.
+# A kernel requested while another thread compiles it would be compiled twice.
 _JUDGING = Lock()
 
 
 @dataclass(frozen=True)
 class StabilityAtlas:
-    """An atlas whose values are the propagator of the reduced form of ``build(values)``, and what follows from it.
+    """An atlas of the propagator of the reduced form of ``build(values)``, and the results that follow from it.
 
-    ``rtol`` is the target by which outcomes are judged.
+    ``rtol`` is the target that determines outcomes.
     """
 
     atlas: Atlas
@@ -49,17 +49,17 @@ class StabilityAtlas:
     rtol: float
 
     def slice(self, values: Mapping[str, float]) -> StabilityAtlas:
-        """The same for the remaining parameters; errors as in :meth:`Atlas.slice`."""
+        """The atlas of the remaining parameters; raises as :meth:`Atlas.slice`."""
         return StabilityAtlas(self.atlas.slice(values), self.build, self.rtol)
 
     def ordered(self, parameters: Sequence[str]) -> StabilityAtlas:
-        """The same with the parameters in this order."""
+        """The atlas with the parameters in this order."""
         return StabilityAtlas(self.atlas.ordered(parameters), self.build, self.rtol)
 
     def at(self, points: np.ndarray, outputs: Sequence[str] = DEFAULT_OUTPUTS) -> dict[str, np.ndarray]:
         """Results by name at points ``(N, d)`` in the order of ``atlas.parameters``, points first, and ``outcome``.
 
-        Points that no panel covers are NaN, their verdict undecided and their outcome ``LOST``: these are to be solved.
+        Points that no panel covers are NaN, undecided, and have the outcome ``LOST``: solve them directly.
         """
         points = np.atleast_2d(np.asarray(points, float))
         if not (self._closed_form and _FAST.issuperset(outputs) and self.atlas.panels):
@@ -77,7 +77,7 @@ class StabilityAtlas:
         return found
 
     def by_eigenvalues(self, points: np.ndarray, outputs: Sequence[str]) -> dict[str, np.ndarray]:
-        """The same as :meth:`at`, all points by the eigenvalues of Z."""
+        """As :meth:`at`, all points by the eigenvalues of Z."""
         x, found = self.atlas.to_coordinates(points), self.blank((len(points),), outputs)
         number, size = self.atlas.find(x), evaluation.block_size(self.atlas)
         for k in range(len(self.atlas.panels)):
@@ -88,7 +88,7 @@ class StabilityAtlas:
         return found
 
     def blank(self, shape: tuple[int, ...], outputs: Sequence[str] = DEFAULT_OUTPUTS) -> dict[str, np.ndarray]:
-        """Results by name, and ``outcome``, of points that nothing is known of."""
+        """Results by name, and ``outcome``, of unknown points."""
         found = self._empty(shape, outputs)
         for name, values in found.items():
             values[...] = _nothing(name, values)
@@ -108,12 +108,12 @@ class StabilityAtlas:
         *,
         rows: int | None = None,
     ) -> dict[str, np.ndarray]:
-        """Results by name on the grid of ``axes``, one per parameter of the atlas, in its order, and ``outcome``; in the
-        arrays ``out``, if they are given.
+        """Results by name on the grid of ``axes``, one per parameter of the atlas, in its order, and ``outcome``; written
+        to ``out`` if given.
 
-        The last two axes should be the longest: their cells are judged together. Cells that no panel covers are marked as
-        in :meth:`at`. If this is a part of a chart, ``rows`` is the length of the chart's last axis but one: all parts then
-        have the same kernels.
+        The last two axes should be the longest, because their cells are computed together. Cells that no panel covers are
+        marked as in :meth:`at`. For a part of a chart, ``rows`` is the length of the chart's last axis but one, so that all
+        parts share their kernels.
         """
         axes = [np.asarray(axis, float) for axis in axes]
         shape = tuple(len(axis) for axis in axes)
@@ -127,8 +127,8 @@ class StabilityAtlas:
         return found
 
     def _tile(self, found: dict[str, np.ndarray], axes: list[np.ndarray], rows: int | None) -> None:
-        """Fill ``found`` in closed form, the axes being in any order."""
-        # Tiles are blocks of neighbours, so panels have to cover ranges: axes rise in the atlas's coordinates.
+        """Fill ``found`` in closed form; the axes may be in any order."""
+        # Tiles are blocks of neighbours, so axes must rise in the coordinates of the atlas.
         orders = [np.argsort(c.forward(a), kind="stable") for c, a in zip(self.atlas.coordinates, axes, strict=True)]
         rising = [axis[order] for axis, order in zip(axes, orders, strict=True)]
         steps = [set(np.diff(order)) for order in orders]
@@ -143,7 +143,7 @@ class StabilityAtlas:
 
     @property
     def _multipliers(self) -> int:
-        # Panels tell in no time.
+        # Reading the panels takes no time.
         return round(self.atlas.panels[0].coefficients.shape[-1] ** 0.5) if self.atlas.panels else self._form.size
 
     @cached_property
@@ -152,7 +152,7 @@ class StabilityAtlas:
 
     @cached_property
     def _tensors(self) -> list[Array]:
-        """Coefficients of the panels where the kernels want them, converted once."""
+        """Coefficients of the panels in the layout of the kernels, converted once."""
         degrees = evaluation.common_degrees(self.atlas.panels)
         return [jnp.asarray(evaluation.padded_tensor(panel, degrees)) for panel in self.atlas.panels]
 
@@ -166,7 +166,7 @@ class StabilityAtlas:
         return self._form.exchanges_halves and self._form.log_determinant is not None
 
     def _fill(self, found: dict[str, np.ndarray], axes: list[np.ndarray], rows: int | None) -> None:
-        """Fill ``found`` tile by tile, then judge again the cells for which the closed form is not good enough."""
+        """Fill ``found`` tile by tile, then compute cells again for which the closed form is not accurate enough."""
         names, undamped = self.atlas.parameters, self._may_be_undamped(np.ix_(*axes))
         # What no tile covers. To write nothing into all other arrays as well would take a tenth of the time of a chart.
         found[OUTCOME.name][...] = Outcome.LOST

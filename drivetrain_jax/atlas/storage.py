@@ -1,4 +1,4 @@
-"""An atlas as plain arrays and words, and back: all that a file has to keep."""
+"""Convert an atlas to plain arrays and words, and back."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def to_arrays(atlas: Atlas) -> Arrays:
 
     ``lower``, ``upper`` (d,): the domain in parameters; ``panel_lower``, ``panel_upper``, ``panel_degrees`` (p, d),
     ``value_error`` (p,), ``derived_error`` (p, k); ``gap_lower``, ``gap_upper`` (g, d), ``gap_reason`` (g,);
-    ``coefficients`` (c, m): those that are not left out, in C order, panel after panel, and ``kept`` the bits that say
-    which (``numpy.packbits`` of all panels together).
+    ``coefficients`` (c, m): the kept ones, in C order, panel after panel; ``kept``: the bits that mark them
+    (``numpy.packbits`` of all panels together).
     """
     d = len(atlas.parameters)
     flat = [p.coefficients.reshape(-1, p.coefficients.shape[-1]) for p in atlas.panels]
@@ -53,7 +53,7 @@ def from_arrays(
     tolerance: float,
     solves: int,
 ) -> Atlas:
-    """The atlas that :func:`to_arrays` took apart; the words and numbers that are no arrays are given beside them."""
+    """The atlas from the arrays of :func:`to_arrays`, with its words and numbers given separately."""
     degrees = np.asarray(arrays["panel_degrees"])
     sizes = np.prod(degrees, axis=1, dtype=int)
     kept = np.unpackbits(np.asarray(arrays["kept"]), count=int(sizes.sum())).astype(bool)

@@ -1,7 +1,7 @@
 """A grid cut into tiles, each within one panel: the factors whose products are the values of the atlas there.
 
-Where cells are dense along the last axis, what is needed of Phi in a row is smooth over many cells: a tile then asks for it
-at ``NODES`` Chebyshev nodes only, and ``spread`` carries it to the cells. Shapes are fixed, so that one compiled kernel
+Where cells are dense along the last axis, the needed functions of Phi are smooth over many cells. A tile is then evaluated
+only at ``NODES`` Chebyshev nodes, and ``spread`` interpolates to the cells. Shapes are fixed, so that one compiled kernel
 serves all tiles of a chart: tiles are padded, and so are the degrees of smaller panels (with coefficients 0).
 """
 
@@ -18,15 +18,15 @@ from drivetrain_jax.atlas.evaluation import common_degrees, padded_tensor
 from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
 from drivetrain_jax.atlas.panels import Atlas, Panel, between, chebyshev, position_between
 
-# Nodes of a dense tile, and the angle arccos(t) that it may span, times the degree of its panel: the highest polynomial
-# runs through 5.5 rad to either side of the middle, where the 24th coefficient of an oscillation is 1e-13, and those that
-# matter through half of it. What is left out is measured in every tile.
+# Nodes of a dense tile, and its largest angle arccos(t) times the degree of its panel. The highest polynomial runs through
+# 5.5 rad to either side of the middle, where the 24th coefficient of an oscillation is 1e-13; the relevant ones run through
+# half of it. The truncation error is measured in every tile.
 NODES = 24
 _SPAN = 11.0
-# Part of the width of a tile from which on nodes are worth while: other tiles cost half as much again, but are always full.
+# Fraction of the width of a tile above which nodes are used: other tiles cost half as much again, but are always full.
 _DENSE = 2 / 3
-# Widths are multiples of a step. Cost of a cell with and without nodes and of a row of a tile, in cells; how much less a
-# width has to cost than the one that shares the cells out evenly, so that most charts of a size have one kernel.
+# Widths are multiples of a step. Cost of a cell with and without nodes, and of a row of a tile, in cells; least saving of a
+# width over the one that divides the cells evenly, so that most charts of a size share one kernel.
 _STEP, _COSTS, _ROW, _WORTH = 16, {True: 1.0, False: 1.6}, 100, 0.95
 
 
@@ -35,9 +35,9 @@ class Tile:
     """A rectangle of a grid within one panel.
 
     ``index`` are the positions along each axis of the grid: one number for each leading axis, arrays for the last two.
-    ``first`` ``(R, m, n)`` is what is left of the panel's tensor in each row, ``columns`` ``(n, C)`` are T_j at the cells.
-    In a dense tile ``columns`` ``(n, NODES)`` are T_j at the nodes, and ``spread`` ``(NODES, C)`` leads from there to the
-    cells.
+    ``first`` ``(R, m, n)`` is the contracted tensor of the panel in each row, ``columns`` ``(n, C)`` are T_j at the cells.
+    In a dense tile ``columns`` ``(n, NODES)`` are T_j at the nodes, and ``spread`` ``(NODES, C)`` interpolates from the
+    nodes to the cells.
     """
 
     panel: Panel
@@ -49,7 +49,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class _Band:
-    """Cells along the last axis that a tile takes, with its ``columns`` and ``spread``."""
+    """The cells of a tile along the last axis, with its ``columns`` and ``spread``."""
 
     chosen: np.ndarray
     columns: np.ndarray
@@ -59,16 +59,15 @@ class _Band:
 def tiles(
     atlas: Atlas, axes: Sequence[np.ndarray], most: tuple[int, int], *, rows: int | None = None, dense: bool = True
 ) -> Iterator[Tile]:
-    """Tiles of at most ``most`` cells that cover what panels cover of the grid of ``axes``, two or more, in coordinates.
+    """Tiles of at most ``most`` cells that cover the panels' part of the grid of ``axes``, two or more, in coordinates.
 
-    ``axes`` rise. Tiles overlap on faces that panels share: the last one there is of the panel that
-    :meth:`Atlas.find` gives. Without ``dense`` no tile has nodes. A part of a chart of ``rows`` rows has tiles of the same
-    shape as all others.
+    ``axes`` rise. Tiles overlap on faces that panels share: the last one belongs to the panel of :meth:`Atlas.find`.
+    Without ``dense`` no tile has nodes. A part of a chart of ``rows`` rows has tiles of the same shape as all other parts.
     """
     if not atlas.panels:
         return
     degrees = common_degrees(atlas.panels)[-2:]
-    # An even number of rows of tiles: two cores are then done at the same time.
+    # An even number of rows of tiles, so two cores finish at the same time.
     shape = _shared(rows or len(axes[-2]), most[0], 8, 2), _width(atlas, axes[-1], most[1], dense)
     for panel, groups in _assigned(atlas, axes):
         bands = _kinds_first(list(_bands(panel, axes[-1], groups[-1], degrees[1], shape[1], dense)))
@@ -85,7 +84,7 @@ def tiles(
 
 @jax.jit
 def _first_product(weights: Array, tensor: Array) -> Array:
-    """``(R, n_1)`` times ``(n_1, m, n)``. Not by NumPy: the threads of its BLAS stand in the way of those that judge."""
+    """``(R, n_1)`` times ``(n_1, m, n)``, without NumPy, whose BLAS threads would compete with the worker threads."""
     return (weights @ tensor.reshape(len(tensor), -1)).reshape(-1, *tensor.shape[1:])
 
 
@@ -110,15 +109,15 @@ def _reductions(
 
 
 def _shared(count: int, most: int, step: int, multiple: int = 1) -> int:
-    """The size, a multiple of ``step`` and ``most`` at most, of so many pieces: what fills up the last one costs as much as
-    cells. Their number is a multiple of another."""
+    """The size of pieces, a multiple of ``step`` and at most ``most``, so that their number is a multiple of another;
+    padding costs as much as cells."""
     pieces = -(-count // (most * multiple)) * multiple
     return -(-count // (pieces * step)) * step
 
 
 def _width(atlas: Atlas, axis: np.ndarray, most: int, dense: bool) -> int:
-    """The width of tiles with which a row of the grid costs least. It depends on the last axis alone: parts of a chart
-    have the same kernels."""
+    """The cheapest width of tiles for a row of the grid. It depends only on the last axis, so parts of a chart share
+    kernels."""
     even = _shared(len(axis), most, _STEP)
     panels = {(panel.lower[-1], panel.upper[-1], panel.degrees[-1]): panel for panel in atlas.panels}.values()
     rooms = [_room(panel, _positions(panel, -1, axis[_covered(panel, -1, axis)])) for panel in panels]
@@ -133,13 +132,13 @@ def _width(atlas: Atlas, axis: np.ndarray, most: int, dense: bool) -> int:
 
 
 def _room(panel: Panel, t: np.ndarray) -> np.ndarray:
-    """How many cells from each on are no further apart than nodes allow, by the panel's degree."""
+    """Number of cells from each one that a tile with nodes may span, by the panel's degree."""
     angle = -np.arccos(t)
     return np.searchsorted(angle, angle + _SPAN / panel.degrees[-1], side="right") - np.arange(len(t))
 
 
 def _cuts(room: np.ndarray, width: int, dense: bool) -> Iterator[tuple[int, int, bool]]:
-    """Neighbouring cells ``start, end`` by ``width`` at most, and whether they have nodes."""
+    """Ranges ``start, end`` of at most ``width`` neighbouring cells, and flags of those with nodes."""
     count = np.minimum(room, width)
     with_nodes = dense & (count >= max(_DENSE * width, 2 * NODES))
     start = 0
@@ -153,13 +152,13 @@ def _bands(panel: Panel, axis: np.ndarray, cells: np.ndarray, degree: int, width
     """The cells of a panel along the last axis, cut."""
     t = _positions(panel, -1, axis[cells])
     for start, end, with_nodes in _cuts(_room(panel, t), width, dense):
-        # Cells that are all the same leave no room for nodes.
+        # Equal cells leave no space for nodes.
         band = _dense if with_nodes and t[end - 1] > t[start] else _sparse
         yield band(cells[start:end], t[start:end], degree, width)
 
 
 def _kinds_first(bands: list[_Band]) -> list[_Band]:
-    """One band of each kind first: their kernels are then compiled side by side."""
+    """One band of each kind first, so that their kernels are compiled in parallel."""
     first = list({band.spread is None: band for band in reversed(bands)}.values())
     return first + [band for band in bands if all(band is not other for other in first)]
 
@@ -178,7 +177,7 @@ def _dense(cells: np.ndarray, t: np.ndarray, degree: int, width: int) -> _Band:
 
 
 def filled_up(rows: np.ndarray, size: int) -> np.ndarray:
-    """``rows`` with the last one repeated up to ``size`` (``np.pad`` takes the time of a small tile)."""
+    """``rows`` with the last one repeated up to ``size`` (``np.pad`` takes as long as a small tile)."""
     return rows if len(rows) == size else np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), axis=0)])
 
 

@@ -1,9 +1,9 @@
-"""Tips of the tongues of instability: all of them in a rectangle, with names, error bounds and what is left undecided.
+"""Tips of the tongues of instability in a rectangle: all tips with names and error bounds, and the undecided boxes.
 
 A tip is a point of the stability boundary where the boundary function and its derivative along the speed (the axis of the
-system's predicted resonances) vanish. It is found by exclusion (:mod:`~drivetrain_jax.atlas.exclusion`), polished on the
-whole surrogate with the multiplier itself (ln|sigma| = 0, d ln|sigma|/d speed = 0) and named by the resonance at the foot
-of its ridge, or at the tip itself along a parameter that moves the resonances, along which no tongue grows.
+system's predicted resonances) vanish. Tips are found by exclusion (:mod:`~drivetrain_jax.atlas.exclusion`) and polished on
+the whole surrogate with the multiplier itself (ln|sigma| = 0, d ln|sigma|/d speed = 0). The name is the resonance at the
+foot of the ridge. Along a parameter that moves the resonances no tongue grows, and the resonance at the tip is used.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from drivetrain_jax.atlas.undamped import undamped_tips
 from drivetrain_jax.systems import Resonances, System
 
 _POLISH = 8
-# How far the foot of a ridge may lie from a prediction, relative; and how much nearer than to the next one.
+# Largest relative distance of the foot of a ridge from its prediction, and its ratio to that of the next one.
 _NEAR, _CLEAR = 0.02, 3.0
 _HIGHEST_ORDER = 60
-# Undecided boxes from which tips are looked for, the largest error of what they lead to as part of the rectangle, and the
-# distance below which two of them are one.
+# Number of undecided boxes from which tips are searched, largest error of their tips relative to the rectangle, and
+# distance below which two tips are the same.
 _MAX_STARTS, _LARGEST_ERROR, _SAME = 200, 0.1, 1e-6
 
 Box = Mapping[str, tuple[float, float]]
@@ -38,11 +38,10 @@ Box = Mapping[str, tuple[float, float]]
 class Tip:
     """``point`` maps the two parameters to their values at the tip, ``error`` to bounds of their errors.
 
-    ``name`` is the resonance the tongue grows from, empty if its ridge was lost or no resonance is clearly the nearest;
-    ``multiplier`` is ``+1``, ``-1`` or ``pair`` and ``angle`` its argument in rad. ``opens`` tells a tongue's tip from a
-    place where one closes or two meet, as the other parameter rises.
-    ``proved`` is false for a tip in a box that was left undecided: the surrogate has one there, but within its error
-    bound there may also be none, or several.
+    ``name`` is the resonance of the tongue, empty if its ridge was lost or no resonance is clearly the nearest.
+    ``multiplier`` is ``+1``, ``-1`` or ``pair`` and ``angle`` its argument in rad. ``opens`` is true where a tongue opens
+    with the other parameter, false where one closes or two meet. ``proved`` is false for a tip in an undecided box: the
+    surrogate has one there, but within its error bound there may be none, or several.
     """
 
     name: str
@@ -56,11 +55,11 @@ class Tip:
 
 @dataclass(frozen=True)
 class Tips:
-    """All tips, in rising order of the other parameter; ``undecided`` boxes of parameters that may hide further ones.
+    """All tips, in rising order of the other parameter; ``undecided`` boxes of parameters that may contain more.
 
-    ``boxes`` is the number of boxes looked at. At zero damping tongues have no width at their tips: these are then those of
-    the theory, and ``complete`` is false. ``searches`` is what :func:`~drivetrain_jax.atlas.boundaries.boundaries` of the
-    same atlas would look for again.
+    ``boxes`` is the number of boxes examined. At zero damping tongues have no width at their tips: these are then predicted
+    by theory, and ``complete`` is false. ``searches`` can be reused by :func:`~drivetrain_jax.atlas.boundaries.boundaries`
+    of the same atlas.
     """
 
     tips: tuple[Tip, ...]
@@ -73,7 +72,7 @@ class Tips:
 def find_tips(atlas: Atlas, system: type[System], *, opening: bool = True) -> Tips:
     """The tips of all tongues within ``atlas`` (two parameters, one of them the axis of the system's resonances).
 
-    With ``opening=False`` also the places where tongues close or meet. Angles are given without their signs. Raises
+    With ``opening=False`` also the points where tongues close or meet. Angles are returned without signs. Raises
     ``ValueError`` for other atlases.
     """
     atlas = atlas.folded()
@@ -114,8 +113,8 @@ def polish(
 
 
 def suspected(criteria: Criteria, kind: str, h: int, boxes: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, Growth]:
-    """Tips to which Newton's method leads from ``undecided`` boxes: none of the ``known`` ones, and with bounds that leave
-    them within the rectangle."""
+    """Tips that Newton's method finds from ``undecided`` boxes: none of the ``known`` ones, and inside the rectangle
+    within their bounds."""
     low, high = criteria.atlas.corners
     starts = boxes[np.linspace(0, len(boxes) - 1, min(len(boxes), _MAX_STARTS)).astype(int)].mean(axis=1)
     x, rates = polish(criteria, starts.reshape(-1, 2), kind, h)
@@ -164,7 +163,8 @@ def _describe(criteria: Criteria, kind: str, h: int, points: tuple, opens: np.nd
 
 
 def _errors(rates: Growth, h: int) -> np.ndarray:
-    """Bounds of the coordinates' errors: along v that of the rate over its slope, along h what lowers the maximum by it."""
+    """Bounds of the coordinates' errors: along v the error of the rate over its slope, along h the shift that lowers the
+    maximum by it."""
     v = 1 - h
     errors = np.empty(rates.gradient.shape)
     with np.errstate(all="ignore"):
@@ -196,7 +196,7 @@ def _predictions(atlas: Atlas, system: type[System]) -> Resonances:
     assert basic is not None
     if basic.up_to is None:
         return basic
-    # Of the two ends of a parameter that moves the resonances one needs the higher order.
+    # One of the two ends of a parameter that moves the resonances needs the higher order.
     values = [_predicted(basic, atlas, end) for end in (atlas.lower, atlas.upper)]
     lowest = atlas.lower[atlas.parameters.index(basic.axis)]
     order = math.ceil(np.nanmax(values) / max(float(lowest), 1e-300) / 2) + 1
@@ -210,8 +210,8 @@ def _predicted(resonances: Resonances, atlas: Atlas, point: np.ndarray) -> np.nd
 def _named_at(criteria: Criteria, patch: Patches, x: np.ndarray, h: int) -> np.ndarray:
     """Points ``(N, 2)`` whose speeds are compared with the predictions, for tips ``x``: the feet of their ridges.
 
-    Along a parameter that moves the resonances a tongue has no foot: a tip is where it has shrunk to nothing at the
-    angle of the atlas, and its ridge may leave the rectangle or bend faster than it can be followed. There it is the tip.
+    Along a parameter that moves the resonances a tongue has no foot: the tip is where it shrinks to nothing, and its ridge
+    may leave the rectangle or bend too fast to be followed. The point is then the tip.
     """
     atlas, v = criteria.atlas, 1 - h
     if atlas.parameters[v] in criteria.system.resonances.parameters:  # pyright: ignore[reportOptionalMemberAccess]
@@ -223,7 +223,7 @@ def _named_at(criteria: Criteria, patch: Patches, x: np.ndarray, h: int) -> np.n
 
 
 def _name(atlas: Atlas, system: type[System], kind: str, x: np.ndarray) -> str:
-    """The resonance of this multiplier that is clearly the nearest to ``x`` in coordinates, or nothing."""
+    """The resonance of this multiplier that is clearly the nearest to ``x`` in coordinates, or an empty name."""
     resonances = _predictions(atlas, system)
     if not np.isfinite(x).all() or not resonances.multipliers:
         return ""

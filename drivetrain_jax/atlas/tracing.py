@@ -1,8 +1,8 @@
 """Zero curves of a function of two coordinates by pseudo-arclength continuation, many curves at a time.
 
 Predictor: a step along the tangent; corrector: Newton's method along the gradient. All lengths are relative to the domain.
-The tangent is the gradient turned by a right angle, so that it keeps its sense along a curve and reverses on the other
-edge of a narrow tongue: a step that lands there turns by 180 degrees and is refused, however narrow the tongue is.
+The tangent is the gradient turned by a right angle, so it keeps its sense along a curve and reverses on the other edge of a
+narrow tongue. A step that lands there turns by 180 degrees and is rejected.
 """
 
 from __future__ import annotations
@@ -13,16 +13,15 @@ import numpy as np
 
 from drivetrain_jax.atlas.patches import Patches
 
-# Longest and shortest step, first step, largest turn and correction of a step, growth of the steps. The shortest, the first
-# and the growth only decide how many steps are taken: each is accepted or refused by its turn and its correction.
+# Longest, shortest and first step, largest turn and correction of a step, growth of the steps. The shortest, first and
+# growth affect only the number of steps: turn and correction decide if a step is accepted.
 _LONGEST, _SHORTEST, _FIRST = 0.015, 1e-7, 1e-5
 _TURN, _CORRECTION, _GROWTH = 0.25, 0.15, 1.6
 _NEWTON, _MAX_STEPS = 3, 800
-# The largest last step of Newton's method with which a point counts as one of the curve: between the edges of a narrow
-# tongue it converges slowly.
+# Largest last Newton step of a point on the curve; between the edges of a narrow tongue Newton's method converges slowly.
 _SETTLED = 1e-9
-# Distances from a tip in the other coordinate at which its flanks are entered: far enough to step on from, and near enough
-# that they can be joined to the tip by chords; a factor of ten either way changes nothing.
+# Distances from a tip in the other coordinate at which its flanks are entered: far enough to continue, and near enough for
+# a chord to the tip. A factor of ten either way changes nothing.
 _APPROACH = 1e-4 * np.array([1 / 64, 1 / 16, 1 / 4, 1.0])
 
 
@@ -77,14 +76,14 @@ def trace(field: Field, seeds: np.ndarray) -> list[Curve]:
 def trace_tips(field: Field, tips: np.ndarray, horizontal: int) -> list[Curve]:
     """The zero curves through ``tips`` ``(M, 2)``, where the derivative along ``horizontal`` vanishes.
 
-    A tip may be so sharp (radius 1e-7 of the domain) that no step leads around it: the flanks are entered a little away
-    from it, where f f_hh < 0, by Newton's method along ``horizontal``, and followed from there.
+    A tip may be so sharp (radius 1e-7 of the domain) that no step leads around it. The flanks are therefore entered a
+    little away from it, where f f_hh < 0, by Newton's method along ``horizontal``, and followed from there.
     """
     top = field.to_unit(np.asarray(tips, float).reshape(-1, 2))
     flanks = np.stack([_flank(field, top, horizontal, side) for side in (-1.0, 1.0)])
     start = flanks[:, :, -1].reshape(-1, 2)
     _, gradient = field(start)
-    # Away from the tip: the tangent that leads on in the direction from the tip to the flank.
+    # Away from the tip: the tangent in the direction from the tip to the flank.
     away = start - np.concatenate([top, top])
     sense = np.sign(-gradient[:, 1] * away[:, 0] + gradient[:, 0] * away[:, 1])
     paths, returned = _follow(field, start, sense)
@@ -110,7 +109,7 @@ def _flank(field: Field, top: np.ndarray, h: int, side: float) -> np.ndarray:
     for k, distance in enumerate(_APPROACH):
         y[:, v] = top[:, v] + inwards * distance
         with np.errstate(all="ignore"):
-            # A slanted ridge shifts by more than the width of its tongue: from the ridge there, not from the tip.
+            # A slanted ridge shifts by more than the width of its tongue: start from the ridge there, not from the tip.
             for _ in range(_NEWTON):
                 y[:, h] -= field(y)[1][:, h] / curvature(y)
             edge = y.copy()
@@ -123,7 +122,7 @@ def _flank(field: Field, top: np.ndarray, h: int, side: float) -> np.ndarray:
 
 
 def _follow(field: Field, start: np.ndarray, sense: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
-    """Paths from ``start`` along the tangent of ``sense``, and which of them returned."""
+    """Paths from ``start`` along the tangent of ``sense``, and flags of those that returned."""
     y, _, tangent = _correct(field, start, sense)
     step = np.full(len(y), _FIRST)
     first, length = y.copy(), np.zeros(len(y))
@@ -157,7 +156,7 @@ def _follow(field: Field, start: np.ndarray, sense: np.ndarray) -> tuple[list[np
 
 
 def _correct(field: Field, y: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points on the curve near ``y``, how far they moved, and the unit tangents there."""
+    """Points on the curve near ``y``, their shifts, and the unit tangents there."""
     new = y.copy()
     for _ in range(_NEWTON):
         value, gradient = field(new)
@@ -183,7 +182,7 @@ def _outside(y: np.ndarray) -> np.ndarray:
 def _meet_rim(
     field: Field, a: np.ndarray, b: np.ndarray, sense: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the curve meets the rim between ``a`` inside and ``b`` outside, as :func:`_correct` gives points."""
+    """The point where the curve meets the rim between ``a`` inside and ``b`` outside, as from :func:`_correct`."""
     new = np.array([_to_rim(field, *ends) for ends in zip(a, b, strict=True)]).reshape(-1, 2)
     value, gradient = field(new)
     way, step = new - a, b - a
@@ -194,10 +193,10 @@ def _meet_rim(
 
 
 def _passes(first: np.ndarray, a: np.ndarray, b: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Whether the step from ``a`` to ``b`` passes the first point again."""
+    """True if the step from ``a`` to ``b`` passes the first point again."""
     step = b - a
     size = np.linalg.norm(step, axis=1)
-    # A path that starts on the rim and leads outwards ends where it is.
+    # A path that starts on the rim and leads outwards ends at its start.
     with np.errstate(invalid="ignore"):
         along = ((first - a) * step).sum(axis=1) / size
         across = np.linalg.norm(first - a - (along / size)[:, None] * step, axis=1)
@@ -209,7 +208,7 @@ def _to_rim(field: Field, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     with np.errstate(all="ignore"):
         fractions = np.where(b < 0, a / (a - b), np.where(b > 1, (1 - a) / (b - a), np.inf))
     axis = int(np.argmin(fractions))
-    # Along the rim both may lie outside by rounding, and the line through them meets it far away.
+    # Along the rim both points may lie outside by rounding, and the line through them meets it far away.
     y = a + np.clip(fractions[axis], 0.0, 1.0) * (b - a)
     y[axis] = float(b[axis] > 1)
     other = 1 - axis

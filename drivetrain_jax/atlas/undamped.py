@@ -17,7 +17,7 @@ from drivetrain_jax.systems import Resonances
 
 _STEPS = 60
 _NEWTON = 4
-# Which two functions bound the tongue of a multiplier, by their numbers in the criteria.
+# Numbers of the two criteria that bound the tongue of a multiplier.
 _EDGES = {MINUS: (0, 1), PLUS: (2, 3)}
 _PAIR = 4
 
@@ -25,7 +25,7 @@ _PAIR = 4
 def undamped_tips(criteria: Criteria, horizontal: int, resonances: Resonances) -> list[tuple]:
     """(name, multiplier, its angle, parameters) of every resonance from which a tongue of resolved width grows.
 
-    The resonances are at the angle 0: there are none where the atlas does not begin with it.
+    The resonances are at the angle 0; an atlas that does not start there has none.
     """
     atlas, h, v = criteria.atlas, horizontal, 1 - horizontal
     if atlas.parameters[v] != criteria.system.roles.get("angle", atlas.parameters[v]) or atlas.lower[v] > 0:
@@ -59,7 +59,7 @@ def _ascend(start: np.ndarray, end: float, v: int) -> np.ndarray:
 
 
 def _separates(edges: list[Patches], start: np.ndarray, end: float, h: int) -> bool:
-    """Whether the zeros of the two functions along h, followed from ``start``, come apart by more than their errors."""
+    """True if the zeros of the two functions along h, followed from ``start``, separate by more than their errors."""
     positions = np.full(2, start[h])
     slopes = [edge.derivative(h) for edge in edges]
     for x in _ascend(start, end, 1 - h):
@@ -79,7 +79,7 @@ def _separates(edges: list[Patches], start: np.ndarray, end: float, h: int) -> b
 
 
 def _collides(discriminant: Patches, start: np.ndarray, end: float, h: int) -> bool:
-    """Whether the discriminant on the ridge above ``start`` becomes negative by more than its error."""
+    """True if the discriminant on the ridge above ``start`` becomes negative by more than its error."""
     slope = discriminant.derivative(h)
     curvature = slope.derivative(h)
     position = start[h]

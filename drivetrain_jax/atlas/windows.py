@@ -1,4 +1,4 @@
-"""Where a system is stable along one parameter, and for which values of one it is stable over a range of another."""
+"""Intervals of one parameter in which a system is stable, at a point or over a whole range of another parameter."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from drivetrain_jax.atlas.tips import polish, suspected
 from drivetrain_jax.systems import System
 
 Range = tuple[float, float]
-# A part between two candidates is tested if it is so many times wider than the errors of these: its middle is beyond them.
+# Ratio of the width between two candidates to their errors above which stability is tested between them.
 _WIDER = 2.0
-# The widest undecided range, relative to the whole one, that the error of a change within it may cover.
+# Widest undecided range, relative to the whole range, that the error of a change inside it may cover.
 _COVERED = 1e-3
 
 
@@ -31,7 +31,7 @@ class Crossing:
     """``value`` of a parameter at which the stability changes, with a bound of its error.
 
     ``multiplier`` (``+1``, ``-1`` or ``pair``) crosses the unit circle; ``point`` holds all parameters of the atlas there.
-    In a narrow undecided range another one, at another point, may change it: the error covers the range.
+    In a narrow undecided range another multiplier may cross first, at another point: the error covers the range.
     """
 
     value: float
@@ -42,8 +42,8 @@ class Crossing:
 
 @dataclass(frozen=True)
 class Interval:
-    """An interval of a parameter; ``lower_end`` and ``upper_end`` are None where the atlas ends, or what follows is
-    undecided."""
+    """An interval of a parameter; ``lower_end`` and ``upper_end`` are None at an end of the atlas or of an undecided
+    range."""
 
     lower: float
     upper: float
@@ -58,16 +58,16 @@ class Interval:
 
     @property
     def crossings(self) -> tuple[Crossing, ...]:
-        """Those of its ends that are known."""
+        """The known crossings at its ends."""
         return tuple(end for end in (self.lower_end, self.upper_end) if end)
 
 
 @dataclass(frozen=True)
 class Line:
-    """``intervals`` that alternate between stable and unstable, and the ``undecided`` ranges within, between or beside them.
+    """``intervals`` that alternate between stable and unstable, and the ``undecided`` ranges.
 
-    Where a change hides in an undecided range that no error covers, one interval ends, and the next one begins, with that
-    range. So do the first and the last one where the range reaches an end of the atlas. No intervals: everything is
+    If a change lies in an undecided range that no error covers, one interval ends, and the next one begins, with that
+    range. The first and last interval also end there if the range reaches an end of the atlas. Without intervals all is
     undecided.
     """
 
@@ -104,7 +104,7 @@ def _along(atlas: Atlas, system: type[System]) -> Line:
 def stability_over_range(atlas: Atlas, system: type[System], along: str) -> Line:
     """The intervals of the other parameter of ``atlas`` (two) in which all values of ``along`` are stable.
 
-    Angles are given without their signs.
+    Angles are returned without signs.
     """
     atlas = atlas.folded()
     h = atlas.parameters.index(along)
@@ -122,7 +122,7 @@ def stability_over_range(atlas: Atlas, system: type[System], along: str) -> Line
             x, rates = polish(criteria, search.points, kind, h)
             error = rates.error / np.abs(rates.gradient[:, v])
             likely, _ = suspected(criteria, kind, h, search.undecided, x)
-            # The range in which they are looked for is their error.
+            # The range in which they are searched is their error.
             suspects += _crossings(atlas, likely, np.zeros(len(likely)), v, kind)
         changes += _crossings(atlas, x, error, v, kind)
         undecided += [tuple(sorted(map(float, parameters_at(atlas, box)[:, v]))) for box in search.undecided]
@@ -143,7 +143,8 @@ def stability_over_range(atlas: Atlas, system: type[System], along: str) -> Line
 
 
 def narrow(atlas: Atlas, bounds: Mapping[str, tuple[float, float]]) -> Atlas:
-    """The part of ``atlas`` within ``bounds``; ``ValueError`` for bounds that leave its domain, ``KeyError`` for names."""
+    """The part of ``atlas`` within ``bounds``; ``ValueError`` for bounds that leave its domain, ``KeyError`` for unknown
+    names."""
     lower, upper = atlas.lower.copy(), atlas.upper.copy()
     for name, (a, b) in bounds.items():
         if name not in atlas.parameters:
@@ -176,7 +177,7 @@ def _part(box: Panel | Gap, lower: np.ndarray, upper: np.ndarray) -> Panel | Gap
 
 def _crossings(atlas: Atlas, x: np.ndarray, error: np.ndarray, v: int, kind: str) -> list[Crossing]:
     points = parameters_at(atlas, x)
-    # At an angle of 0 its square says nothing about the error.
+    # At an angle of 0 its square gives no error.
     with np.errstate(divide="ignore", invalid="ignore"):
         errors = error / np.abs(atlas.coordinates[v].slope(points[:, v]))
     return [
@@ -194,7 +195,7 @@ def _stable_at(criteria: Criteria):
 
 
 def _all_stable(criteria: Criteria, patches: tuple[Patches, ...], h: int, value: float) -> bool:
-    """Whether all of ``h`` is stable where the other parameter has ``value``: no zero, and one point that is stable."""
+    """True if all of ``h`` is stable at this ``value`` of the other parameter: no zero, and one stable point."""
     atlas = criteria.atlas
     point = (atlas.lower + atlas.upper) / 2
     point[1 - h] = value
@@ -205,7 +206,7 @@ def _all_stable(criteria: Criteria, patches: tuple[Patches, ...], h: int, value:
 
 
 def decided(lower: float, upper: float, undecided: Iterable[Range]) -> list[Range]:
-    """What ``undecided`` ranges leave of the one from ``lower`` to ``upper``."""
+    """The range from ``lower`` to ``upper`` without the ``undecided`` ranges."""
     left = []
     for a, b in sorted(undecided):
         left += [(lower, min(a, upper))] if lower < min(a, upper) else []
@@ -221,11 +222,10 @@ def _line(
     stable: Callable[[np.ndarray], np.ndarray],
     suspects: Iterable[Crossing] = (),
 ) -> Line:
-    """Sort candidates, test between them and keep those at which the stability changes; ``suspects`` are further ones in
-    undecided ranges.
+    """The line from sorted candidates, with tests between them; ``suspects`` are further candidates in undecided ranges.
 
-    Between two candidates every decided part is tested: an undecided range may hide a change. Parts that are too narrow
-    for a test are undecided as well, and so is what lies before the first part that is tested, and after the last one.
+    Between two candidates every decided part is tested, because an undecided range may hide a change. Parts too narrow for
+    a test are undecided, and so are the ranges before the first and after the last tested part.
     """
     changes = sorted((c for c in changes if ends[0] < c.value < ends[1]), key=lambda c: c.value)
     edges = [(float(ends[0]), 0.0), *((c.value, c.error) for c in changes), (float(ends[1]), 0.0)]
@@ -250,10 +250,10 @@ def _line(
 
 
 def _one_change(candidates: list[Crossing], between: Range, rising: bool, widest: float) -> Crossing | None:
-    """The change of stability ``between`` two tested parts, the upper one stable if ``rising``: the candidate nearest to the
-    stable part, with an error that covers everything between.
+    """The change of stability ``between`` two tested parts, the upper one stable if ``rising``: the candidate nearest to
+    the stable part, with an error that covers everything between.
 
-    None if there is no candidate, or what is undecided reaches further than the errors of the nearest ones and ``widest``.
+    None without a candidate, or if the undecided range is wider than the errors of the nearest ones and ``widest``.
     """
     if not candidates:
         return None
@@ -273,7 +273,7 @@ def _one_change(candidates: list[Crossing], between: Range, rising: bool, widest
 def _tested(lower: Any, upper: Any, undecided: Iterable[Range]) -> tuple[list, list]:
     """The decided parts between two candidates (values, bounds of errors) in which stability is tested, and the others.
 
-    These are no wider than the errors, which belong to them.
+    The others are no wider than the errors and count to them.
     """
     (a, error), (b, other) = lower, upper = [tuple(map(float, np.nan_to_num(end))) for end in (lower, upper)]
     least = _least(lower, upper)
@@ -288,18 +288,18 @@ def _end(change: Crossing) -> tuple[float, float]:
 
 
 def _least(lower: tuple[float, float], upper: tuple[float, float]) -> float:
-    """The width of a part between two candidates (values, bounds of errors) that is not tested."""
+    """Largest width of a part between two candidates (values, bounds of errors) that is not tested."""
     return _WIDER * max(lower[1], upper[1], np.finfo(float).eps * max(abs(lower[0]), abs(upper[0])))
 
 
 def _unfolded(line: Line, lower: float, upper: float) -> Line:
-    """A line over moduli as that over the parameter from ``lower``, which is negative, to ``upper``."""
+    """A line over moduli as a line over the parameter from ``lower``, which is negative, to ``upper``."""
     negative = [_mirrored(interval) for interval in reversed(line.intervals)]
     both = [*negative, *line.intervals] if upper > 0 else negative
     parts = [part for interval in both if (part := _clipped(interval, lower, upper)) is not None]
     joined: list[Interval] = []
     for part in parts:
-        # At 0 nothing changes, nor across an undecided range around it.
+        # Nothing changes at 0, or across an undecided range around it.
         if joined and joined[-1].upper == -part.lower:
             last = joined.pop()
             part = replace(part, lower=last.lower, lower_end=last.lower_end)
@@ -321,7 +321,7 @@ def _opposite(crossing: Crossing | None) -> Crossing | None:
 
 
 def _clipped(interval: Interval, lower: float, upper: float) -> Interval | None:
-    """What lies between the ends of the atlas."""
+    """The parts between the ends of the atlas."""
     if interval.upper <= lower or interval.lower >= upper:
         return None
     if interval.lower < lower:
