@@ -1,4 +1,4 @@
-"""The analyses, found by name. Each is written for one point and knows nothing of grids, files or figures."""
+"""The analyses by name. Each one solves a single point, independent of grids, files and figures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an analysis is: named results of one point (or of one line of a path axis), and the solvers that give them."""
+"""An analysis: named results of one point (or of one line along a path axis), and its solvers."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from drivetrain_jax.systems import System
 
 
 class Outcome(IntEnum):
-    """What became of a point. From ``NOT_CONVERGED`` (``FIRST_FAILURE``) on, what could not be computed is NaN."""
+    """Outcome of a point. From ``NOT_CONVERGED`` (``FIRST_FAILURE``) on, results that could not be computed are NaN."""
 
     SUCCESS = 0
     TOLERANCE_NOT_MET = 1  # the value is stored with its error, which exceeds the target
     NOT_CONVERGED = 2
     STEP_LIMIT = 3
     NOT_FINITE = 4
-    LOST = 5  # the process that computed it died every time
+    LOST = 5  # its worker crashed three times
 
     @property
     def has_value(self) -> bool:
@@ -36,16 +36,15 @@ OUTCOME = Variable(
     "outcome", "1", "outcome of the computation", dtype="int8", flags=tuple(o.name.lower() for o in Outcome)
 )
 RTOL = Parameter("rtol", "1", "target relative error of the results", default=1e-10, lower=1e-14, upper=1e-2)
-# Solvers of diffrax that an option may name: explicit ones of order 8 and 5, and a stiff one.
+# Solvers of diffrax for the option: explicit ones of order 8 and 5, and a stiff one.
 DIFFRAX_SOLVERS = ("Dopri8", "Dopri5", "Tsit5", "Kvaerno5")
-# Seconds beyond which no motion is asked for, thirty years of it; and steps beyond which none is begun: at a microsecond
-# each they would take eleven days.
+# Upper limit of simulated time (30 years, in s), and of steps (11 days at a microsecond each).
 MOST_SECONDS, MOST_STEPS = 1e9, 1e12
 
 
 @dataclass(frozen=True)
 class Request:
-    """What a scene asks of an analysis: the results wanted, its method and options (defaults filled in)."""
+    """The requested results of an analysis, its method, and its options with defaults."""
 
     outputs: tuple[str, ...]
     method: str
@@ -56,16 +55,17 @@ class Request:
 class Solver:
     """One way to compute the requested results of one point.
 
-    ``solve(values, effort)`` returns every requested variable and ``outcome``, the lanes as LAST axis. ``values`` holds all
-    parameters of the model: those that vary as JAX arrays of lanes ``(N,)``, the others as numbers
-    (:func:`~drivetrain_jax.analysis.numerics.lanes.over_lanes` makes that of a function of one point). The values of a path
-    axis arrive as a whole, a NumPy array ``(L,)``; results have the path as FIRST axis, and ``chunk`` counts lines.
-    ``effort`` is a traced integer, the largest that ``effort(columns)`` predicts in the batch (columns: NumPy arrays
-    of shape ``(N,)``; a count of steps or the like; by default the same for all points). The engine gives every point
-    to the solver for which ``effort * unit_cost`` is smallest and runs batches of ``chunk`` points of similar effort.
-    ``steps(values)`` predicts the effort of every lane from traced values, if ``solve`` makes use of it.
-    ``march`` marks integrations in time, ``short_loops`` what works through its lanes by some tens: both are compiled
-    otherwise (``numerics.kernels.compiler_options``). One point of a ``lengthy`` solver takes as long as a compilation.
+    ``solve(values, effort)`` returns every requested variable and ``outcome``, with the lanes as LAST axis. ``values``
+    holds all parameters of the model: varying ones as JAX arrays of lanes ``(N,)``, the others as numbers. From a function
+    of one point :func:`~drivetrain_jax.analysis.numerics.lanes.over_lanes` makes a ``solve``. A path axis is a NumPy array
+    ``(L,)``; results then have the path as FIRST axis, and ``chunk`` counts lines.
+
+    ``effort`` is a traced integer, the largest ``effort(columns)`` in the batch (columns: NumPy arrays ``(N,)``; result: a
+    number of steps, default equal for all points). The engine assigns every point to the solver with the smallest ``effort
+    * unit_cost``, and runs batches of ``chunk`` points of similar effort. ``steps(values)`` predicts the effort of every
+    lane from traced values, if ``solve`` uses it. ``march`` marks integrations in time, ``short_loops`` loops over some
+    tens of lanes; both have other compiler options (``numerics.kernels.compiler_options``). One point of a ``lengthy``
+    solver takes as long as a compilation.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Solver:
 
 
 def stacked(jacobian: Any) -> Array:
-    """A pytree of derivatives by each parameter as one Jacobian ``(..., P)``."""
+    """A pytree of derivatives with respect to each parameter as one Jacobian ``(..., P)``."""
     return jnp.stack(jax.tree.leaves(jacobian), axis=-1)
 
 
@@ -106,19 +106,17 @@ def forward_derivatives(
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """Named results and how to get them.
+    """Named results, methods and solvers.
 
-    ``methods`` maps each method to the names of the options it uses, the first method being the default; ``options``
-    describes all of them, ``method_titles`` the methods.
-    ``solvers(system, request)`` gives the candidates of the requested method.
+    ``methods`` maps each method to the names of its options, the default method first; ``options`` describes the options
+    and ``method_titles`` the methods. ``solvers(system, request)`` returns the candidates of the requested method.
     ``dimensions(system, request, fixed)`` describes the dimensions of the results besides those of the sweep; ``fixed``
     holds the parameters that do not vary (a list is whole also if one entry varies). It raises
-    :class:`~drivetrain_jax._errors.InputError` where a request and these parameters do not fit together.
-    ``lacks(system)`` maps the results and methods that cannot be had of a system to what messages say of them.
-    ``derivatives(system, request, parameters, constants, results)`` gives Jacobians ``(..., P)`` of results at one point by
-    all P ``parameters`` (arrays; ``constants`` hold the rest), as far as there are any.
-    ``path_axis(request)`` names the axis that is consumed whole, if there is one. A ``continuous`` analysis takes ranges
-    for axes and gives a function of the parameters instead of values on a grid.
+    :class:`~drivetrain_jax._errors.InputError` if request and parameters do not match. ``lacks(system)`` maps the results
+    and methods that a system does not support to the reason. ``derivatives(system, request, parameters, constants,
+    results)`` returns Jacobians ``(..., P)`` of differentiable results at one point with respect to all P ``parameters``
+    (arrays; ``constants`` hold the rest). ``path_axis(request)`` names the axis that is computed as a whole, if any. A
+    ``continuous`` analysis accepts ranges for axes and returns a function of the parameters instead of values on a grid.
     """
 
     name: str

@@ -1,6 +1,6 @@
-"""Stability as a function of the parameters: what the file of a scene whose axes are ranges answers.
+"""Stability as a function of the parameters, for scenes whose axes are ranges.
 
-What is computed are propagators (``periodic/floquet_propagator.py``); the panels that go through them give the results of
+The solves compute propagators (``periodic/floquet_propagator.py``); panels interpolate them, and give the results of
 ``floquet`` anywhere in the ranges.
 """
 

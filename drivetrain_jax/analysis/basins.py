@@ -1,12 +1,12 @@
 """Shares of the initial conditions from which an oscillator with play reaches each of its attractors.
 
-Initial states are drawn uniformly from the box ``|u0| <= reach_u, |v0| <= reach_v`` by a seeded generator, the same ones
-for every point of a sweep; each is followed to its attractor exactly (analysis ``steady_state``). Motions of one period
-multiple whose extremes agree are one attractor. Non-periodic motions are taken for one attractor if there is nothing else.
-Beside a periodic one they count as not settled: they may be transients that end on it after ``most_periods``.
+Initial states are drawn uniformly from the box ``|u0| <= reach_u, |v0| <= reach_v`` by a seeded generator, equal for all
+points of a sweep; each is followed to its attractor exactly (analysis ``steady_state``). Motions of one period multiple and
+equal extremes are one attractor. If all motions are non-periodic, they count as one attractor. If some are periodic, the
+others count as unsettled: they may be transients that end on a periodic one after ``most_periods``.
 
-Outcome: ``TOLERANCE_NOT_MET`` if some motions have not settled or belong to a ninth attractor, which
-``unsettled_fraction`` counts, ``NOT_CONVERGED`` if none has settled.
+Outcome: ``TOLERANCE_NOT_MET`` if some motions have not settled or belong to a ninth attractor (counted by
+``unsettled_fraction``), ``NOT_CONVERGED`` if none has settled.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ OPTIONS = (
     Parameter("reach_v", "m/s", "half the range of the initial velocity", default=1.0, lower=0.0),
     WAIT,
 )
-# Difference of extremes, over their size, below which two motions are the same.
+# Relative difference of extremes below which two motions are the same.
 _SAME = 1e-6
 _TOLERANCE = 1e-10
 _CHUNK = 8
@@ -54,7 +54,7 @@ _CHUNK = 8
 def _solve(
     build: Callable[..., PiecewiseLinearOscillator], request: Request, values: Mapping[str, Any], effort: Array
 ) -> dict[str, Array]:
-    """The requested results of a batch of points, the batch as last axis; ``effort`` decides nothing."""
+    """The requested results of a batch of points, the batch as last axis; ``effort`` is not used."""
     del effort
     model, options = build(values), request.options
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in vars(model).values()))
@@ -77,14 +77,14 @@ def _solve(
 def shares(high: Array, low: Array, multiple: Array, outcome: Array) -> dict[str, Array]:
     """Attractors and their shares, shape ``(8, N)``, by falling ``attractor_u_max``, from motions ``(samples, N)``.
 
-    A motion that stands for its attractor is the first one not yet counted.
+    Each attractor is represented by the first motion not yet counted.
     """
     count = high.shape[0]
     periodic = multiple > 0
     settled = outcome < Outcome.NOT_CONVERGED
-    # No finite time tells a chaotic attractor from a chaotic transient to a periodic one.
+    # A finite time cannot distinguish a chaotic attractor from a chaotic transient to a periodic one.
     settled &= periodic | ~jnp.any(settled & periodic, axis=0)
-    # Extremes of non-periodic motions depend on the time that they are observed for.
+    # Extremes of non-periodic motions depend on the observed time.
     high, low = (jnp.where(periodic, x, jnp.nan) for x in (high, low))
 
     def next_kind(left: Array, _: None) -> tuple[Array, tuple[Array, Array, Array, Array]]:

@@ -1,16 +1,15 @@
 """Critical speeds: natural frequencies of the lateral vibration of a shaft, certified by a count.
 
-The synchronous critical speed of a shaft whose gyroscopic effect is neglected is its natural frequency,
-``n = 30 p/pi`` rpm. Method ``certified`` (default): :mod:`~drivetrain_jax.analysis.shafts.roots`, at full accuracy for
-any mode. Method ``krylov_determinant``: the paper's, which loses all digits near mode 12;
-``count_certified`` tells which of its roots have the number they claim.
+The synchronous critical speed of a shaft whose gyroscopic effect is neglected is its natural frequency, ``n = 30 p/pi``
+rpm. The method ``certified`` (default, :mod:`~drivetrain_jax.analysis.shafts.roots`) has full accuracy for any mode. The
+method ``krylov_determinant`` is the paper's and loses all digits near mode 12; ``count_certified`` marks its roots with the
+right number.
 
-Modes are numbered by frequency and are not followed along an axis: the frequencies of a shaft in one plane between
-separated ends are simple (only where a hinge lies on a rigid support, or nearly, do they meet), so curves of equal
-number do not cross and following them would give the same curves.
+Modes are numbered by frequency and not followed along an axis. The frequencies of a shaft in one plane between separated
+ends are simple (except with a hinge on, or almost on, a rigid support), so curves of equal number do not cross.
 
-Outcome: ``NOT_FINITE`` where parameters give no finite equations, ``NOT_CONVERGED`` where a frequency was not found
-(NaN), ``TOLERANCE_NOT_MET`` where a root of ``krylov_determinant`` is not certified.
+Outcome: ``NOT_FINITE`` if parameters give no finite equations, ``NOT_CONVERGED`` if a frequency was not found (NaN),
+``TOLERANCE_NOT_MET`` if a root of ``krylov_determinant`` is not certified.
 """
 
 from __future__ import annotations
@@ -59,9 +58,9 @@ OPTIONS = (
 _OPTION_NAMES = tuple(option.name for option in OPTIONS)
 # Per rad/s.
 _UNITS = {"angular_frequency": 1.0, "natural_frequency": 1 / (2 * math.pi), "critical_speed": 30 / math.pi}
-# What the paper's method knows nothing of.
+# Parameters that the paper's method does not include.
 _ADDITIONS = ("k_joint", "m_A", "m_D", "m_joint", "k_hinge", "kGA", "rhoI")
-# Roots of all modes of a chunk together: they stay in the cache.
+# Roots of all modes of a chunk together, small enough for the cache.
 _ROOTS_PER_CHUNK = 12288
 _STATIONS_PER_CHUNK = 1 << 18
 
@@ -100,7 +99,7 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
 
 
 def _shapes(shaft: Shaft, roots: Roots, stations: int) -> Array:
-    """Shapes of zero modes and of the others; NaN where there is no frequency."""
+    """Shapes of zero modes and of the others; NaN for missing frequencies."""
     modes, lanes = roots.q.shape[0], roots.q.shape[1:]
     x = jnp.linspace(0.0, 1.0, stations)
     elastic = mode_shapes(shaft, jnp.where(roots.q > 0, roots.q, 1.0), x)
@@ -113,7 +112,7 @@ def _shapes(shaft: Shaft, roots: Roots, stations: int) -> Array:
 
 
 def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
-    """All requested results; ``values`` may be arrays of lanes, which are the last axis of the results then."""
+    """All requested results; for arrays of lanes the lanes are the last axis."""
     del effort
     shaft, options = build(values), request.options
     certified = request.method == "certified"

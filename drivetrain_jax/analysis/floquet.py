@@ -1,12 +1,10 @@
-"""Floquet analysis of a linear periodic system: multipliers, certified spectral radius and verdict of one point.
+"""Floquet analysis of a linear periodic system: multipliers, spectral radius with error bound, and verdict of one point.
 
 ``direct`` integrates the system's reduced form by diffrax with solvers for linear periodic terms: an explicit scheme of
 order 8, or an L-stable implicit one where that needs fewer operations. ``atlas`` evaluates a whole scene from polynomials
-held against direct solves (see ``drivetrain_jax.atlas``), and solves what they do not cover; ``auto`` does so where that is
-cheaper.
-``diffrax`` takes any of diffrax's own solvers: in equal steps for the reduced form, or in adaptive steps for the system as
-published over its full period (``form = "published"``), which is independent of the others in coordinates, clock and
-factorisation.
+compared with direct solves (see ``drivetrain_jax.atlas``), and solves points in gaps. ``auto`` chooses the cheaper one.
+``diffrax`` uses one of diffrax's own solvers: in equal steps for the reduced form, or in adaptive steps for the system as
+published over its full period (``form = "published"``), with other coordinates, clock and factorisation.
 """
 
 from __future__ import annotations
@@ -45,13 +43,13 @@ def _direct_solvers(system: type[System], request: Request) -> tuple[Solver, ...
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     if request.method != "diffrax":
         return _direct_solvers(system, request)
-    # Diffrax takes as long to import as jax: nobody should wait for that to look at a result.
+    # diffrax takes as long to import as jax, and is not needed to read a result.
     from drivetrain_jax.analysis.periodic.diffrax_solvers import diffrax_solvers
 
     return diffrax_solvers(system, request)
 
 
-# Relative error that the steps of derivatives are predicted for: these are less exact than the multipliers by some digits.
+# Relative error for which the steps of derivatives are predicted: they lose some digits against the multipliers.
 _DERIVATIVES = 1e-11
 
 

@@ -1,12 +1,12 @@
 """Forced response: periodic solution of the linearised system, and the nonlinear periodic orbit with its multipliers.
 
 Linear, over one period T from rest, by variational equations: ``y(T; y0) = r + Z y0``, hence ``y0 = (I - Z)^-1 r``.
-Nonlinear: Newton shooting along growing forcing (:func:`~drivetrain_jax.analysis.periodic.orbit.shoot`). Where several
-orbits exist it gives the one that this path meets first.
+Nonlinear: Newton shooting along growing forcing (:func:`~drivetrain_jax.analysis.periodic.orbit.shoot`). Of several orbits
+it returns the first one on this path.
 
-Outcome: ``TOLERANCE_NOT_MET`` if the estimated error of a state exceeds ``rtol`` times its largest entry;
-``NOT_CONVERGED`` if I - Z is singular to working accuracy or no nonlinear orbit was found. Only what could not be
-computed is NaN then: a finite linear response is kept beside an orbit that was not found, and so is ``condition``.
+Outcome: ``TOLERANCE_NOT_MET`` if the estimated error of a state exceeds ``rtol`` times its largest entry; ``NOT_CONVERGED``
+if I - Z is singular to working accuracy or no nonlinear orbit was found. Only missing results are NaN then: a finite linear
+response and ``condition`` are kept if the orbit was not found.
 """
 
 from __future__ import annotations
@@ -56,27 +56,27 @@ LINEAR = ("periodic_state", "periodic_state_error", "amplitude", "condition")
 
 Build = Callable[[Mapping[str, Any]], ForcedModel]
 
-# Integrations are sharper than what is asked of the results, the one that closes the period more than the first one: errors
-# of two are alike, and a tenth as large is not enough to tell that of the first.
+# Tolerances of the integrations relative to ``rtol``. The integration that closes the period is the more accurate one, to
+# estimate the error of the first.
 TRANSITION_SHARPNESS, CLOSING_SHARPNESS, SHARPEST = 0.1, 0.001, 1e-14
-# What an integration may be wrong by, over its tolerance. With it errors covered the true ones at 256 random points and four
+# Ratio of the error of an integration to its tolerance. With it errors covered the true ones at 256 random points and four
 # rtol; without it they were up to 27 times too small.
 CLOSING_ERROR = 0.1
-# Loosest ``rtol`` they are derived from: (I - Z)^-1 multiplies their errors by up to its condition.
+# Loosest ``rtol`` for these tolerances: (I - Z)^-1 multiplies their errors by up to its condition.
 LOOSEST = 1e-6
-# I - Z counts as singular where its condition times the error of Z reaches ``NOT_FOUND``. That error is taken as this at
-# most: a looser request must not lose an answer, whose error the closing of the period tells in any case.
+# I - Z counts as singular if its condition times the error of Z reaches ``NOT_FOUND``. This is the largest error assumed
+# for Z: a looser request must not lose an answer, whose error the closing of the period shows.
 SINGULAR_SHARPNESS = 1e-11
-# Relative error from which a periodic solution counts as not found.
+# Relative error above which a periodic solution counts as not found.
 NOT_FOUND = 1e-2
 FORCING_SAMPLES = 64
-# Points of a chunk: of the linear response; of orbits, where one that takes hundreds of corrections keeps others waiting.
+# Points of a chunk: of the linear response; of orbits, where one orbit with hundreds of corrections delays the others.
 CHUNK, ORBITS_CHUNK = 128, 16
 
 
 class Response(NamedTuple):
-    """Periodic solution of the linear system: ``state`` (n,), absolute ``error``, ``amplitude`` (None unless asked for)
-    and the map over one period that it comes from."""
+    """Periodic solution of the linear system: ``state`` (n,), absolute ``error``, ``amplitude`` (None unless requested),
+    and the map over one period behind it."""
 
     state: Array
     error: Array
@@ -106,11 +106,11 @@ def _mapped(model: ForcedModel, n: int, rtol: float) -> tuple[Transition, Array,
 def linear_response(model: ForcedModel, n: int, rtol: float, with_amplitude: bool) -> Response:
     """Periodic solution of ``y' = linear(t, y)``; ``n`` is the size of the state.
 
-    ``y0 = (I - Z)^-1 r`` is followed over the period once more; how far it fails to close, times (I - Z)^-1, corrects it.
-    The error is that correction and, times the same, what the second integration may be wrong by.
+    ``y0 = (I - Z)^-1 r`` is integrated over another period; its closing error times (I - Z)^-1 corrects it. The stored
+    error is that correction plus (I - Z)^-1 times the possible error of the second integration.
     """
     step, unit, forcing = _mapped(model, n, rtol)
-    # Without a solution there is nothing to follow.
+    # Without a solution there is nothing to integrate.
     found = (step.outcome == Outcome.SUCCESS) & jnp.all(jnp.isfinite(unit))
     unit = jnp.where(found, unit, 0.0)
     size = size_of(unit)
@@ -130,8 +130,8 @@ def linear_response(model: ForcedModel, n: int, rtol: float, with_amplitude: boo
 def _closed(
     model: ForcedModel, field: Field, start: Array, matrix: Array, sharp: float, with_amplitude: bool
 ) -> tuple[Array | None, Array, Array]:
-    """Largest displacements (None unless asked for) on the way from ``start``, of order one, over a period, the correction
-    of ``start`` from how far that fails to close, and the outcome; ``matrix`` is the transition."""
+    """Largest displacements (None unless requested) over a period from ``start``, of order one; the correction of
+    ``start`` by the closing error; and the outcome. ``matrix`` is the transition."""
     if with_amplitude:
         largest, end, closed = amplitudes(field, start, model.period, model.displacements, sharp)
     else:
@@ -140,7 +140,7 @@ def _closed(
 
 
 def _regular(matrix: Array, rtol: float) -> Array:
-    """Whether ``I - Z`` is further from singular than the accuracy of Z."""
+    """True if ``I - Z`` is further from singular than the accuracy of Z."""
     return _condition(matrix) * min(_sharpness(rtol, TRANSITION_SHARPNESS), SINGULAR_SHARPNESS) < NOT_FOUND
 
 
@@ -160,11 +160,11 @@ def _condition(matrix: Array) -> Array:
 def nonlinear_orbit(
     model: ForcedModel, response: Response, rtol: float, with_amplitude: bool
 ) -> tuple[Orbit, Array | None]:
-    """Nonlinear periodic orbit on the path that starts along ``response``, NaN with its outcome where there is none, and
-    its amplitude (None unless asked for)."""
+    """Nonlinear periodic orbit on the path that starts along ``response`` (NaN with its outcome if there is none), and
+    its amplitude (None unless requested)."""
     usable = response.outcome < Outcome.NOT_CONVERGED
     start = jnp.where(usable, response.state, 0.0)
-    # Nonlinearity sets in at states of order one; smaller responses are their own unit.
+    # Nonlinearity matters for states of order one; smaller responses are their own unit.
     unit = jnp.minimum(size_of(start), 1.0)
     orbit = shoot(in_units_of(unit, model.field), start / unit, model.period, _sharpness(rtol, TRANSITION_SHARPNESS))
     outcome = jnp.where(usable, orbit.outcome, response.outcome)

@@ -1,12 +1,12 @@
-"""Frequency response of an oscillator with play: what slow sweeps of the drive's frequency, up and down, find.
+"""Frequency response of an oscillator with play: motions found by slow sweeps of the drive's frequency, up and down.
 
-The frequency ``omega`` is the path: a line of frequencies is followed as a whole. A sweep starts from rest at the lowest
-(up) or highest (down) frequency and stays on its branch until this ceases to exist or to be stable; then it goes where
-the motion goes. Methods: the exact solution, harmonic balance (approximates the motion by a chosen number of
-harmonics), multiple scales (the paper's closed form for a cubic spring) and the describing function (bias and
-fundamental). Every result says what it leaves unbalanced in the equation of motion (``residual``).
+The frequency ``omega`` is the path: a line of frequencies is computed as a whole. A sweep starts from rest at the lowest
+(up) or highest (down) frequency and stays on its branch until this ends or becomes unstable; then it jumps to the motion
+that follows in time. Methods: the exact solution, harmonic balance (a chosen number of harmonics), multiple scales (the
+paper's closed form for a cubic spring) and the describing function (bias and fundamental). ``residual`` is the rms residual
+of the equation of motion.
 
-Outcome: the worse one of both directions. What the other direction found is kept beside it.
+Outcome: the worse one of both directions. Results of the other direction are kept.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ METHODS = {
     "multiple_scales": ("fit_range",),
     "describing_function": (),
 }
-# Which results are not given by every method.
+# Results that not every method provides.
 _CLOSED = ("multiple_scales", "describing_function")
 _APPROXIMATE = ("harmonic_balance", *_CLOSED)
 _ONLY = {
@@ -92,12 +92,12 @@ _ONLY = {
     "fit_range": ("multiple_scales",),
 }
 _SPECIAL = frozenset(("fold_frequency", "doubling_frequency"))
-# Lines of a chunk: of a map of 200 lines, as many for either of two cores.
+# Lines of a chunk: for a map of 200 lines, equally many for two cores.
 _CHUNK = 50
 
 
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
-    """Directions, branches and folds; ``InputError`` for a result that the method does not give, or too few samples."""
+    """Directions, branches and folds; ``InputError`` for a result that the method does not provide, or too few samples."""
     del system, fixed
     for name in request.outputs:
         if request.method not in _ONLY.get(name, (request.method,)):
@@ -143,7 +143,7 @@ def _solve(
 
 
 def _exact(model: PiecewiseLinearOscillator, request: Request) -> dict[str, Array]:
-    """The frequencies in rising order, and back to that of the path."""
+    """The frequencies in rising order, and indices back to the path."""
     rising, place = np.unique(np.asarray(model.omega), return_inverse=True)
     found = exact_response.sweeps(
         replace(model, omega=rising),
@@ -164,8 +164,8 @@ def _exact(model: PiecewiseLinearOscillator, request: Request) -> dict[str, Arra
 def _exact_branch(
     model: PiecewiseLinearOscillator, rising: np.ndarray, found: dict[str, Array], special: bool
 ) -> tuple[dict[str, Array], Array]:
-    """The branch through the first motion of period one that the sweep up has met, and whether it is complete at each
-    frequency."""
+    """The branch through the first motion of period one of the sweep up, and flags of the frequencies where it is
+    complete."""
     shape = _shape(model)
     lanes = int(np.prod(shape, dtype=int))
     single = found["period_multiple"][:, 0].reshape(-1, lanes) == 1

@@ -1,14 +1,12 @@
 """Time histories: the motion of a flow at requested times, from any initial state.
 
-diffrax integrates adaptively from strobe to strobe and from requested time to requested time, so that every value is
-the end of a step (no interpolation) and the angles of the clocks are taken afresh from whole strobes: they are as exact
-after 50,000 strobes as at the start. Errors are the differences from a run at a tolerance ten times as large whose steps
-may be twice as long, which is made whether they are asked for or not; where they exceed ``rtol`` times the size of the
-motion, the largest component that it reaches, sharper runs follow.
+diffrax integrates adaptively between strobes and requested times, so every value is the end of a step (no interpolation).
+Angles of the clocks are computed from whole strobes: they are as accurate after 50,000 strobes as at the start. Errors are
+differences from a run with ten times the tolerance and up to twice the step; this run is always made. If errors exceed
+``rtol`` times the size of the motion (its largest component), runs with tighter tolerances follow.
 
-Outcome: ``TOLERANCE_NOT_MET`` if an error exceeds ``rtol`` times the size of the motion all the same;
-``STEP_LIMIT`` if the integrator needed too many steps (values up to that time are kept), ``NOT_FINITE`` if the field
-is not finite at the start.
+Outcome: ``TOLERANCE_NOT_MET`` if an error still exceeds ``rtol`` times the size of the motion; ``STEP_LIMIT`` if the
+integrator needed too many steps (earlier values are kept), ``NOT_FINITE`` if the field is not finite at the start.
 """
 
 from __future__ import annotations
@@ -51,20 +49,20 @@ _NUM = Parameter(
     "num", "1", "number of equally spaced times from 0 to stop", default=1001, lower=2, upper=1e7, integer=True
 )
 
-# Tolerances of the steps over that of the result: errors of steps add up over the memory of the damped motion.
+# Tolerances of the steps relative to that of the result: errors of steps accumulate over the memory of the damped motion.
 _SHARPNESS, _COARSER, _SHARPEST = 0.01, 10.0, 1e-15
-# Longest steps of the sharper run over those of the other, which are a segment at first: where one step of a segment is good
-# for both tolerances, both runs would be the same and tell no error. Every further try begins with steps of the last one.
+# Longest steps of the accurate run relative to those of the other, at first a segment: with one step per segment both runs
+# would be equal and show no error. Every further try starts with the steps of the last one.
 _PART = 0.5
-# Where that misses rtol, as they add up over a long memory: part of rtol aimed at next, and the sharpest and most tries.
+# Settings of further tries: fraction of rtol as next target, tightest tolerance, number of tries.
 _RESERVE, _SHARPEST_AGAIN, _MOST_ATTEMPTS = 0.3, 1e-14, 3
-# Steps of one segment (at most a strobe) and of a whole history; strobes beyond which none is begun.
+# Steps of one segment (at most a strobe) and of a whole history; largest number of strobes.
 _MAX_SEGMENT, _MAX_STEPS, _MAX_STROBES = 4096, 20_000_000, 2_000_000
 
 
 class _Place(NamedTuple):
-    """Where the integration stands: ``(strobe + fraction) * period``, the state, the largest component and the number of
-    the steps so far, and if all is well."""
+    """State of the integration: time ``(strobe + fraction) * period``, state, largest component so far, number of steps,
+    and a flag of success."""
 
     strobe: Array
     fraction: Array
@@ -75,7 +73,7 @@ class _Place(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """States (T, n) by steps of ``tolerance``, their estimated ``error`` and its ``excess`` over what is allowed."""
+    """States (T, n) by steps of ``tolerance``, their estimated ``error``, and its ``excess`` over the allowed one."""
 
     tolerance: Array
     states: Array
@@ -103,7 +101,7 @@ def requested_times(request: Request) -> tuple[float, ...]:
 
 
 def size_of(flow: Flow) -> Array:
-    """What the motion may reach, in its own components: the initial state, and the way made by it within a radian."""
+    """Estimated size of the motion, per component: the initial state, and its change within a radian."""
     start = _start(flow)
     rate = flow.vector(0, 0.0, start)
     fastest = 2 * np.pi / flow.period if flow.fastest is None else flow.fastest
@@ -115,7 +113,7 @@ def _start(flow: Flow) -> Array:
 
 
 def _has_finite_start(flow: Flow) -> Array:
-    """Whether there is anything to integrate."""
+    """True if the field is finite at the start."""
     start = _start(flow)
     return jnp.all(jnp.isfinite(start)) & jnp.all(jnp.isfinite(flow.vector(0, 0.0, start)))
 
@@ -128,8 +126,7 @@ def _segment(
     place: _Place,
     end: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """State at the fraction ``end`` of the strobe, the largest component and the number of the steps, and whether the
-    integration went well."""
+    """State at the fraction ``end`` of the strobe, largest component, number of steps, and a flag of success."""
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda s, y, _: flow.period * flow.vector(place.strobe, s, y)),
         solver,
@@ -148,7 +145,7 @@ def _segment(
 
 
 def _ahead(place: _Place, target: tuple[Array, Array]) -> Array:
-    """Whether the place is before the target."""
+    """True if the place is before the target."""
     strobe, fraction = target
     return place.healthy & ((place.strobe < strobe) | (place.fraction < fraction))
 
@@ -156,10 +153,10 @@ def _ahead(place: _Place, target: tuple[Array, Array]) -> Array:
 def trajectory(
     flow: Flow, times: Array, tolerance: Any, part: Any, solver: diffrax.AbstractSolver
 ) -> tuple[Array, Array, Array]:
-    """States at the rising ``times``, shape ``(len(times), n)``, the largest component met on the way, and whether the step
-    limit was kept; NaN beyond it.
+    """States at the rising ``times``, shape ``(len(times), n)``, the largest component, and a flag if the step limit was
+    kept; NaN beyond it.
 
-    ``tolerance`` bounds the error of a step relative to the state and to :func:`size_of`, ``part`` its length over that of
+    ``tolerance`` bounds the error of a step relative to the state and to :func:`size_of`, ``part`` its length relative to
     the segment, which is at most a strobe.
     """
     controller = diffrax.PIDController(rtol=tolerance, atol=jnp.maximum(tolerance * size_of(flow), 1e-300))
@@ -169,7 +166,7 @@ def trajectory(
     def advance(place: _Place, target: tuple[Array, Array]) -> _Place:
         strobe, fraction = target
         last = place.strobe == strobe
-        # In a batch a lane that has arrived or failed takes part until the others are there: it must not take steps.
+        # In a batch, lanes that have finished or failed wait for the others: they must not take steps.
         end = jnp.where(_ahead(place, target), jnp.where(last, fraction, 1.0), place.fraction)
         y, reached, steps, well = _segment(flow, solver, controller, part, place, end)
         total = place.steps + steps
@@ -206,7 +203,7 @@ def _twice(flow: Flow, times: Array, tolerance: Array, attempts: Array, request:
 
 
 def _integrated(flow: Flow, request: Request) -> _Found:
-    """States and errors at the requested times, from sharper runs where the first ones miss ``rtol``."""
+    """States and errors at the requested times, from tighter runs if the first ones miss ``rtol``."""
     times = jnp.asarray(requested_times(request))
 
     def sharper(found: _Found) -> Array:
@@ -246,7 +243,7 @@ def _solve(system: type[System], request: Request, values: Mapping[str, Any], ef
 
 
 def _effort(system: type[System], request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Predicted segments, shape (N,): strobes and requested times; infinite beyond what is worth beginning."""
+    """Predicted segments, shape (N,): strobes and requested times; infinite beyond the limit."""
     times = requested_times(request)
     strobes = times[-1] / predicted(_period, (system.models["history"].build, system.name), columns)
     return np.where(strobes <= _MAX_STROBES, np.ceil(strobes) + len(times), np.inf)

@@ -1,16 +1,16 @@
-"""Lyapunov spectra by the variational equations, with everything that tells how far to trust them, and a verdict.
+"""Lyapunov spectra by the variational equations, with error estimates and a verdict.
 
-Exponents in natural logarithms per second, in falling order; phases of the flow are left out (their exponents are zero
-whatever happens). The paper's own estimator is offered beside them under its own name.
+Exponents are natural logarithms per second, in falling order. Phases of the flow are left out (their exponents are always
+zero). The paper's estimator is available under its own name.
 
-Steps are as many as the flow lets predict for every point (see :mod:`~drivetrain_jax.analysis.chaos.march_steps`) unless
-``steps`` are given; a batch marches by the largest number of its members.
+The number of steps is predicted for every point (see :mod:`~drivetrain_jax.analysis.chaos.march_steps`) unless ``steps`` is
+given; a batch uses the largest number of its members.
 
-Outcome: ``SUCCESS``, or ``TOLERANCE_NOT_MET`` if the standard error is above the target at ``max_time`` or the steps are
-too few for the motion: the exponents do not add up to the mean divergence, or a positive one is another with half the
-steps. The verdict is ``undecided`` then. A motion that leaves all bounds is data: its verdict says so, and its exponents are
-those of the time before, without an error (NaN). ``NOT_FINITE`` if it leaves so soon that there are none, ``STEP_LIMIT``
-where ``max_time`` is more than 1e12 steps, or a strobe is predicted to need more than 1e5.
+Outcome: ``SUCCESS``, or ``TOLERANCE_NOT_MET`` if the standard error exceeds the target at ``max_time`` or the steps are too
+few: the exponents do not sum to the mean divergence, or a positive one changes with half the steps. The verdict is then
+``undecided``. For a motion that leaves all bounds the verdict says so, and its exponents are those of the time before,
+without an error (NaN). ``NOT_FINITE`` if it leaves too soon for exponents, ``STEP_LIMIT`` if ``max_time`` is more than 1e12
+steps, or a strobe is predicted to need more than 1e5.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ OPTIONS = (
     ),
 )
 _SECTION = {"verdict", "chaos_k01", "period_multiple"}
-# What one step needs of this many members is in the innermost caches.
+# Number of members whose data of one step fit into the innermost caches.
 _CHUNK = 64
 
 
@@ -91,14 +91,15 @@ class Spectrum(NamedTuple):
 
 
 def spectrum_of(record: Record) -> Spectrum:
-    """Exponents after the transient. Of a motion that left: means over what there is, errors NaN."""
+    """Exponents after the transient. For an unbounded motion: means over the recorded time, errors NaN."""
     values, errors = mean_rate(record, record.growth)
     order = jnp.argsort(-values, axis=0)
     return Spectrum(*(jnp.take_along_axis(x, order, axis=0) for x in (values, errors)), order)  # pyright: ignore[reportCallIssue]
 
 
 def mean_rate(record: Record, series: Array) -> tuple[Array, Array]:
-    """Mean rate of ``series`` (SEGMENTS, m, ...) after the transient and its error. Of a motion that left: before, NaN."""
+    """Mean rate of ``series`` (SEGMENTS, m, ...) after the transient, and its error. For an unbounded motion: before it
+    left, NaN."""
     values, errors = block_mean(series, record.used, record.span)
     partial_mean = running_mean(series, record.used, record.span)
     last = jnp.arange(SEGMENTS).reshape(-1, *(1,) * values.ndim) == record.used - 1
@@ -114,15 +115,15 @@ def sum_rule_residual(record: Record, spectrum: Spectrum) -> Array:
 
 
 class Run(NamedTuple):
-    """Records with the step and with twice the step (empty where that was not needed)."""
+    """Records with the step and with twice the step (empty if not needed)."""
 
     fine: Record
     coarse: Record
 
 
 def run_twice(flow: Flow, steps: Any, max_time: float, target: float, check: bool) -> Run:
-    """The growth with ``steps`` and ``steps // 2`` per strobe; ``check``: the latter of all members, otherwise of those
-    whose largest exponent is positive beyond its error. One compiled loop serves both."""
+    """The growth with ``steps`` and ``steps // 2`` per strobe. With ``check`` the latter for all members, otherwise only
+    for those with a positive largest exponent beyond its error. One compiled loop serves both."""
 
     def one(active: Array, steps: Array) -> tuple[Array, Record]:
         record = record_growth(flow, steps, max_time, target, active)
@@ -136,8 +137,8 @@ def run_twice(flow: Flow, steps: Any, max_time: float, target: float, check: boo
 
 
 class Findings(NamedTuple):
-    """What a run gives: the spectrum, that with twice the step where it was run, the residual of the sum rule, and whether
-    the steps resolve the motion."""
+    """Results of a run: the spectrum, the spectrum with twice the step if it was run, the residual of the sum rule, and
+    a flag if the steps resolve the motion."""
 
     spectrum: Spectrum
     coarse: Spectrum
@@ -146,7 +147,7 @@ class Findings(NamedTuple):
 
 
 def findings_of(run: Run, period: Any) -> Findings:
-    """The results of both marches, judged by each other."""
+    """The results of both marches, compared with each other."""
     spectrum, coarse = spectrum_of(run.fine), spectrum_of(run.coarse)
     residual = sum_rule_residual(run.fine, spectrum)
     sound = resolved(spectrum.values, spectrum.errors, residual, period, coarse.values[0], coarse.errors[0])
@@ -154,7 +155,7 @@ def findings_of(run: Run, period: Any) -> Findings:
 
 
 def evidence_of(flow: Flow, fine: Record, found: Findings, seen: Sampling) -> Evidence:
-    """What :func:`judge` asks for."""
+    """The input of :func:`judge`."""
     spectrum, coarse = found.spectrum, found.coarse
     growing = grows(fine.size, fine.used, fine.span, spectrum.values[0])
     return Evidence(
@@ -170,7 +171,7 @@ def _solve(system: type[System], request: Request, values: Mapping[str, Any], ef
 
 
 def steps_of(flow: Flow, request: Request) -> Any:
-    """Steps per strobe: those asked for, or as many as the member that needs most of them does."""
+    """Steps per strobe: the given number, or the largest need of all members."""
     given = request.options["steps"]
     return jnp.max(needed_steps(flow)).astype(jnp.int64) if given is None else given
 
@@ -190,13 +191,13 @@ def analyse(flow: Flow, request: Request) -> dict[str, Array]:
     spectrum = found.spectrum
     results |= _of_spectrum(run.fine, found)
     if wanted & _SECTION:
-        # What nothing forces is judged by K wherever it does not decay.
+        # Unforced motion that does not decay is decided by K.
         needed = spectrum.values[0] > STANDARD_ERRORS * spectrum.errors[0]
         needed = jnp.ones_like(needed) if "chaos_k01" in wanted or not flow.turns else needed
         rate = spectrum.values[0] + STANDARD_ERRORS * spectrum.errors[0]
         seen = sample(flow, steps, run.fine, rate, needed)
         results["verdict"] = judge(evidence_of(flow, run.fine, found, seen), autonomous=not flow.turns)
-        # K tells nothing of a few points over and over again, nor is it asked to.
+        # K is meaningless for a few repeating points, and is not used there.
         repeating = seen.multiple > 0
         results["chaos_k01"] = jnp.where(repeating, 0.0, seen.k01)
         results["period_multiple"] = seen.multiple.astype(jnp.int32)
@@ -232,15 +233,15 @@ def averaging_time(record: Record) -> Array:
 
 
 def _effort(system: type[System], request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Predicted steps, shape (N,): those of a whole run, or up to where the mean contraction has settled the motion, and of
-    the strobes that follow it.
+    """Predicted steps, shape (N,): those of a whole run, or of the strobes until the mean contraction has settled the
+    motion, and of the strobes after that.
 
-    Infinite where a whole run is not worth beginning.
+    Infinite above the limit of a whole run.
     """
     options, longest = request.options, request.options["max_time"]
     rate, period, needed = predicted(_march, (system.models["lyapunov"].build,), columns)
     steps = np.where(needed <= MOST, needed, np.inf) if options["steps"] is None else options["steps"]
-    # Without a rate the field has no value: that is found out by marching.
+    # Without a rate the field has no value; the march will find that.
     settling = SETTLED / np.fmax(rate, SETTLED / longest) if options["standard_error"] > 0 else longest
     strobes = np.maximum(np.clip(settling, longest / 4, longest) / period, SEGMENTS)
     following = SAMPLES if _SECTION & set(request.outputs) else 0
@@ -248,7 +249,7 @@ def _effort(system: type[System], request: Request, columns: Mapping[str, np.nda
 
 
 def _march(build: Callable[..., Flow], values: Mapping[str, Any]) -> Array:
-    """Mean rate of contraction of one point where it starts, its period, and the steps that it needs."""
+    """Mean rate of contraction of one point at its start, its period, and the number of steps."""
     flow = build(values)
     return jnp.stack([contraction(flow) / flow.size, jnp.asarray(flow.period, float), needed_steps(flow)])
 

@@ -1,9 +1,7 @@
-"""Natural frequencies and modes of masses joined by springs: values, families, shapes, and modes followed along an
-axis.
+"""Natural frequencies and modes of masses joined by springs: values, families, shapes, and modes tracked along an axis.
 
-Frequencies come from singular values (:mod:`singular_values`), whatever else is asked for; vectors from
-:mod:`singular_vectors`. Both work on the factor ``diag(sqrt k) B M^(-1/2)``: the stiffness matrix, which would square
-the condition, is never formed.
+Frequencies come from singular values (:mod:`singular_values`), vectors from :mod:`singular_vectors`. Both use the factor
+``diag(sqrt k) B M^(-1/2)``: the stiffness matrix, which would square the condition, is never formed.
 """
 
 from __future__ import annotations
@@ -49,7 +47,7 @@ VARIABLES = (
 )
 _SPECTRUM = {"natural_frequency", "natural_frequency_error"}
 _FOLLOWED = {"branch", "mac"}
-# Chunks of the engine, and lanes that are worked on at a time: these fit into the cache of a core.
+# Chunks of the engine, and lanes computed at a time, which fit into the cache of a core.
 _SPECTRUM_CHUNK, _MODES_CHUNK, _LINES_CHUNK = 512, 256, 8
 _CACHE = 1 << 16
 
@@ -76,7 +74,7 @@ def _blocks(model: SpringSystem, method: str) -> tuple[Block, ...]:
 
 
 def _spectrum(build: Build, method: str, values: Mapping[str, Any], lanes: int) -> tuple[Array, Array]:
-    """Angular frequencies (n, N), rising, and whether all were found."""
+    """Angular frequencies (n, N), rising, and flags if all were found."""
     sample = _blocks(build(_first_lane(values)), method)
     copies = np.concatenate([np.full(block.factor.shape[1], block.copies) for block in sample])
 
@@ -89,7 +87,7 @@ def _spectrum(build: Build, method: str, values: Mapping[str, Any], lanes: int) 
 
 
 def _first_lane(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters with the arrays among them reduced to their first entry: enough to see all shapes."""
+    """The parameters with arrays reduced to their first entry: enough to get all shapes."""
 
     def first(value: Any) -> Any:
         if isinstance(value, tuple):
@@ -111,7 +109,7 @@ def largest_frequency(model: SpringSystem, lanes: int) -> Array:
 
 
 def system_modes(model: SpringSystem, method: str, lanes: int, shapes: bool = True) -> Modes:
-    """Modes of ``model`` for ``lanes`` lanes; method ``full`` does without its decomposition."""
+    """Modes of ``model`` for ``lanes`` lanes; the method ``full`` does not use its decomposition."""
     largest = largest_frequency(model, lanes)
     asymmetry = jnp.broadcast_to(model.asymmetry, (lanes,))
     blocks = [_as_lanes(block, lanes) for block in _blocks(model, method)]
@@ -156,12 +154,12 @@ def _canonical(vectors: Array) -> Array:
 
 
 def _places(vectors: Array) -> np.ndarray:
-    """Row numbers: of entries that are equal up to rounding, the first counts as the largest."""
+    """Row numbers: of entries equal up to rounding, the first counts as the largest."""
     return np.arange(vectors.shape[0]).reshape(-1, 1, 1)
 
 
 def _results(build: Build, request: Request, values: Mapping[str, Any], lanes: int) -> dict[str, Array]:
-    """The requested results of every lane, except those along a track; for these, mass-weighted vectors."""
+    """The requested results of every lane, without those along a track; for these, mass-weighted vectors."""
     wanted = set(request.outputs)
     followed = bool(request.options["track"])
     if wanted <= _SPECTRUM:
@@ -198,7 +196,7 @@ def _by_body(vectors: Array, bodies: np.ndarray) -> Array:
 
 
 def _frequencies(frequency: Array, found: Array, participation: Array | None) -> dict[str, Array]:
-    """Frequency, its error and outcome; NaN where nothing was found."""
+    """Frequency, its error and outcome; NaN for missing ones."""
     value = jnp.where(found, frequency / (2 * math.pi), jnp.nan)
     # Backward error of orthogonal transformations, in practice a tenth of it; the same for every mode of a point.
     error = 4 * EPS * math.sqrt(frequency.shape[0]) * value[-1]
@@ -232,8 +230,8 @@ def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Ar
 
 
 def _along(values: np.ndarray) -> tuple[Any, Any]:
-    """Positions of the values of a track as it is followed, and of those in the order listed: neighbours follow each other
-    in whatever order they are listed."""
+    """Positions of the values of a track in rising order, and back to the listed order: neighbours are compared in any
+    listed order."""
     steps = np.diff(values)
     if (steps > 0).all() or (steps < 0).all():
         return slice(None), slice(None)
@@ -254,7 +252,7 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
     if followed and not request.options["track"]:
         raise InputError(f"outputs: {followed[0]!r} needs the option track; allowed is the name of an axis")
     model = system.models["modes"]
-    # Names and sizes do not depend on what varies.
+    # Names and sizes do not depend on varying parameters.
     values = {name: fixed.get(name, 1.0) for name in model.parameters}
     described: list[SpringSystem] = []
     jax.eval_shape(lambda: described.append(model.build(values)))

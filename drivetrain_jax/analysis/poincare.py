@@ -1,20 +1,19 @@
-"""Poincare sections: the state at every strobe, 50,000 strobes and more, and what tells a curve from a cloud.
+"""Poincare sections: the state at every strobe, 50,000 strobes and more, and measures that distinguish a curve from a
+cloud.
 
-Time is a counted strobe plus a fraction of it, so that the angles of the clocks do not drift. The method ``fixed`` takes
-equal steps of order 8. The method ``adaptive`` is there to show what a loose tolerance does: the pair of Dormand &
-Prince of orders 5 and 4 with the control of ``rtol`` and ``atol`` that is usual for it.
+Time is a counted strobe plus a fraction, so that the angles of the clocks do not drift. The method ``fixed`` takes equal
+steps of order 8. The method ``adaptive`` shows the effect of loose tolerances: the pair of Dormand & Prince of orders 5 and
+4 with the usual control of ``rtol`` and ``atol``.
 
-Both methods check themselves. Some strobes, the first ones from the start included, are taken again by finer equal steps
-(twice as many as ``fixed`` takes, 96 after ``adaptive``): ``strobe_error``, the error made within one strobe of the section.
-The whole motion is marched once more by equal steps (a quarter as many, 48 after ``adaptive``; after ``fixed`` twice as many
-where these leave doubts): ``section_error``, what these errors have added up to since the start.
-See :mod:`~drivetrain_jax.analysis.chaos.section_error`.
+Both methods estimate their errors. Some strobes, including the first ones, are repeated with finer equal steps (twice as
+many as ``fixed``, 96 after ``adaptive``): ``strobe_error`` is the error within one strobe of the section. The whole motion
+is repeated with equal steps (a quarter as many, 48 after ``adaptive``; after ``fixed`` twice as many in doubtful cases):
+``section_error`` is the accumulated error since the start. See :mod:`~drivetrain_jax.analysis.chaos.section_error`.
 
-Outcome: ``TOLERANCE_NOT_MET`` if ``section_error`` exceeds 1e-6 or ten times ``rtol``, or is not known. That is so of
-every long section of a chaotic motion: errors grow until they are as large as the motion, and no section is the motion
-from its start. ``strobe_error`` says whether its strobes are right. ``NOT_FINITE`` if the state overflowed: what came
-before is kept. ``STEP_LIMIT``: the adaptive method needed too many steps within a strobe, or all
-strobes are more than 1e12 equal steps.
+Outcome: ``TOLERANCE_NOT_MET`` if ``section_error`` exceeds 1e-6 or ten times ``rtol``, or is unknown. This holds for every
+long section of a chaotic motion: errors grow to the size of the motion. ``strobe_error`` then shows if its strobes are
+right. ``NOT_FINITE`` if the state overflowed; earlier strobes are kept. ``STEP_LIMIT``: the adaptive method needed too many
+steps within a strobe, or all strobes are more than 1e12 equal steps.
 """
 
 from __future__ import annotations
@@ -54,16 +53,16 @@ OPTIONS = (
     Parameter("rtol", "1", "relative tolerance of a step", default=1e-3, lower=1e-14, upper=1e-1),
     Parameter("atol", "1", "absolute tolerance of a step", default=1e-6, lower=0.0, open_lower=True),
 )
-# Points closer than this, over the largest value, are one; periods up to this are looked for.
+# Relative distance below which points are equal; longest period that is searched.
 _DISTINCT, _LONGEST = 1e-9, 8192
-# Strobes of the 0-1 test at most; of a motion that does not repeat fewer than the second tell nothing: K of smooth curves
-# of three harmonics is up to 0.99 with 128, 0.93 with 256 and 0.13 with 512.
+# Most strobes of the 0-1 test, and fewest for a motion that does not repeat: K of smooth curves of three harmonics is up to
+# 0.99 with 128, 0.93 with 256 and 0.13 with 512.
 _SAMPLES, _FEWEST_SAMPLES = 2000, 512
 _MAX_STEPS = 4096
-# Error above which it is said, and the steps that check the adaptive method.
+# Error above which the outcome reports it, and the steps that check the adaptive method.
 _TOLERATED = 1e-6
 _ADAPTIVE_CHECKS = Steps(96, 48)
-# The fewest steps that tell how errors add up.
+# The fewest steps that show the accumulation of errors.
 _FEWEST = 6
 # Numbers of a chunk's sections, and points of a chunk at most.
 _NUMBERS, _CHUNK = 1 << 23, 64
@@ -113,7 +112,7 @@ def adaptive_section(flow: Flow, request: Request) -> Section:
 
 
 def checking_steps(request: Request) -> Steps:
-    """Steps that check a section."""
+    """Steps of the march that checks a section."""
     if request.method == "adaptive":
         return _ADAPTIVE_CHECKS
     steps = request.options["steps"]
@@ -126,7 +125,7 @@ def tolerated(request: Request) -> float:
 
 
 def measures(flow: Flow, states: Array, request: Request) -> dict[str, Array]:
-    """Torus residual, distinct points and K of the section ``states``, as far as they are requested."""
+    """Torus residual, distinct points and K of the section ``states``, if requested."""
     results: dict[str, Array] = {}
     kept = watched(flow)
     if "torus_residual" in request.outputs:
@@ -141,14 +140,14 @@ def measures(flow: Flow, states: Array, request: Request) -> dict[str, Array]:
 
 
 def _k01(section: Array, distinct: Array) -> Array:
-    """K of the section; its limit where it repeats, as a short record of few points may look like diffusion."""
+    """K of the section; its limit if it repeats, because a short record of few points may look like diffusion."""
     enough = len(section) >= _FEWEST_SAMPLES
     k01 = largest_k01(section) if enough else jnp.full(section.shape[2:], jnp.nan)
     return jnp.where(distinct > 0, 0.0, k01)
 
 
 def _angle(flow: Flow, strobes: Array) -> Array | None:
-    """Angle of the first clock that does not define the strobe, shape ``(T, ...)``; None if there is none."""
+    """Angle of the first clock that does not define the strobe, shape ``(T, ...)``; None without one."""
     others = [i for i, turns in enumerate(flow.turns) if not isinstance(turns, int)]
     if not others:
         return None
@@ -179,10 +178,10 @@ def _solve(system: type[System], request: Request, values: Mapping[str, Any], ef
 
 
 def _effort(request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Strobes, shape (N,); infinite where they are not worth beginning."""
+    """Strobes, shape (N,); infinite above the limit."""
     count = np.broadcast(*jax.tree.leaves({k: v for k, v in columns.items() if not isinstance(v, str)})).size
     strobes = request.options["strobes"] + request.options["discard"]
-    # The adaptive method has a limit of its own.
+    # The adaptive method has its own limit.
     return np.full(count, strobes if strobes * request.options.get("steps", 1) <= MOST_STEPS else np.inf)
 
 

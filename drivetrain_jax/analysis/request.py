@@ -1,4 +1,4 @@
-"""Outputs, method and options of an analysis, checked against those that it and the system offer."""
+"""Check outputs, method and options against those that the analysis and the system offer."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def make_request(
     options: Mapping[str, Any],
     varies: Set[str] = frozenset(),
 ) -> Request:
-    """Outputs, method and options, defaults filled in; what ``varies`` is a coordinate already and no result.
+    """Outputs, method and options with defaults; a parameter that ``varies`` is a coordinate and not a result.
 
     Raises :class:`InputError` with one line that names what the system offers.
     """
@@ -32,7 +32,7 @@ def make_request(
             raise InputError(f"outputs: {name!r} varies in this scene; allowed is to leave it out")
         if name not in names and name != OUTCOME.name:
             raise InputError(f"outputs: {name!r} is not a result of {analysis.name}{nearest(name, offered)}")
-    # The outcome comes with every result, named or not.
+    # The outcome is always a result.
     wanted = [name for name in wanted if name != OUTCOME.name]
     if not wanted or len(set(wanted)) < len(wanted):
         raise InputError(f"outputs = {shown(outputs)}: allowed is one or more of {', '.join(offered)}, each once")
@@ -73,7 +73,7 @@ def _option(option: Parameter, given: Mapping[str, Any]) -> Any:
 
 
 def checked(parameter: Parameter, value: Any, where: str) -> Any:
-    """``value`` in its stored type, or :class:`InputError`; ``where`` is the table of a scene that it stands in."""
+    """``value`` in its stored type, or :class:`InputError`; ``where`` is its table of the scene."""
     try:
         return parameter.check(value)
     except ValueError as error:

@@ -1,17 +1,16 @@
-"""Steady state of an oscillator with play: the attractor that the motion from given initial conditions ends on, or what
-it does after ``most_periods`` if that is chaotic.
+"""Steady state of an oscillator with play: the attractor reached from given initial conditions, or a chaotic motion.
 
-The motion is exact within rounding (closed form in each linear region), and so are its extremes, multipliers and
-contacts. An orbit found by Newton shooting counts only if the motion has come so near to it that its linearisation
-governs the rest (:mod:`~drivetrain_jax.analysis.impacts.attractor`).
+The motion is exact within rounding (closed form in each linear region), and so are its extremes, multipliers and contacts.
+An orbit found by Newton shooting is accepted only if the motion has come so close that its linearisation governs the rest
+(:mod:`~drivetrain_jax.analysis.impacts.attractor`).
 
-A motion that has not settled within ``most_periods`` drive periods, but has separated from its neighbours by a factor of
-exp(20) over their last three quarters, as only chaos does, is a success, too: ``non_periodic``. It may be a chaotic
-attractor or a long transient, which no finite time can tell; more ``most_periods`` may show its end.
+A motion that has not settled within ``most_periods`` drive periods is ``non_periodic``, a success, if neighbours separated
+by a factor of exp(20) over the last three quarters of that time, as only chaos does. It may be a chaotic attractor or a
+long transient, which a finite time cannot distinguish; more ``most_periods`` may show its end.
 
-Outcome: ``NOT_CONVERGED`` if the motion has done neither; ``TOLERANCE_NOT_MET`` if the estimated error of the orbit exceeds
-``rtol`` times its largest displacement; ``STEP_LIMIT`` if the motion needs more events per period than any but a grazing
-one does.
+Outcome: ``NOT_CONVERGED`` if the motion has neither settled nor separated; ``TOLERANCE_NOT_MET`` if the estimated error of
+the orbit exceeds ``rtol`` times its largest displacement; ``STEP_LIMIT`` if the motion has more events per period than any
+motion that does not graze.
 """
 
 from __future__ import annotations
@@ -77,7 +76,7 @@ WAIT = Parameter(
     upper=1e8,
     integer=True,
 )
-# Points of a chunk: enough that the last lanes at work, with nothing left in the queue, are few.
+# Points of a chunk: enough that few lanes are left working when the queue is empty.
 _CHUNK = 4096
 
 
@@ -89,7 +88,7 @@ def _shape(model: PiecewiseLinearOscillator, values: Mapping[str, Any]) -> tuple
 def _solve(
     build: Callable[..., PiecewiseLinearOscillator], request: Request, values: Mapping[str, Any], effort: Array
 ) -> dict[str, Array]:
-    """The requested results of a batch of points, the batch as last axis; ``effort`` decides nothing."""
+    """The requested results of a batch of points, the batch as last axis; ``effort`` is not used."""
     del effort
     model = build(values)
     shape = _shape(model, values)
@@ -115,16 +114,16 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     return (Solver("exact", partial(_solve, build, request), chunk=_CHUNK),)
 
 
-# Relative steps of the differences, and how far those of order two may be from those of order four.
+# Relative steps of the differences, and largest deviation of those of order two from those of order four.
 _STEP, _SMOOTH = 1e-3, 1e-2
 
 
 def _derivatives(
     system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Jacobians of extremes and means by central differences of order four, which are exact to ten digits as the motion is.
+    """Jacobians of extremes and means by central differences of order four, accurate to ten digits.
 
-    NaN where the neighbours are another motion, or where it changes too abruptly to tell.
+    NaN if the neighbours are another motion, or if it changes too abruptly.
     """
     leaves, tree = jax.tree.flatten(parameters)
     point = jnp.stack(leaves)
@@ -137,7 +136,7 @@ def _derivatives(
     found = _solve(system.models["steady_state"].build, asked, values, jnp.int64(1))
     multiple = found["period_multiple"].reshape(len(leaves), 4)
     same = jnp.all((multiple == multiple[0, 0]) & (multiple > 0), axis=1)
-    # What a motion begins with decides which one it ends on, and nothing else.
+    # The initial state only selects the motion.
     begins = jnp.array([name in ("u0", "v0") for name in parameters])
     jacobians = {}
     for name in names:
