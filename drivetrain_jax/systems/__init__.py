@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 
-# The one place that turns on double precision. Every module that computes imports this package first, so no array is made
-# in single precision before. Who embeds the package and turns it on himself, or only in a context, says no.
+# Double precision is turned on only here: every module that computes imports this package first. The environment variable
+# leaves the choice to the caller.
 if os.environ.get("DRIVETRAIN_JAX_ENABLE_X64") != "0":
     jax.config.update("jax_enable_x64", True)
 
@@ -63,7 +63,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # Their module imports diffrax, which takes as long as jax: nobody should wait for that to look at a result.
+    # Imported here: that module imports diffrax, which takes as long as jax and is not needed to read a result.
     if name in ("FloquetModel", "ForcedModel", "LinearPeriodic"):
         return getattr(import_module("drivetrain_jax.systems._periodic"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -88,7 +88,7 @@ def get_system(name: str) -> type[System]:
 def _loaded(entry: EntryPoint) -> type[System]:
     try:
         system = entry.load()
-    # Whatever another package raises.
+    # Any exception of another package.
     except Exception as error:
         raise ImportError(f"{entry.value} cannot be loaded: {type(error).__name__}: {error}") from error
     if not (isinstance(system, type) and issubclass(system, System)):

@@ -1,9 +1,8 @@
-"""What a system is: an Equinox module whose fields are its parameters, and the models its analyses need.
+"""Base class of systems: an Equinox module whose fields are parameters, and whose methods return models for analyses.
 
-A system knows nothing of batches, files or figures. Under the name of each analysis it serves, a method marked with
-:func:`serves` returns the model which that analysis documents, for example a :class:`LinearPeriodic` pair for ``floquet``.
-All models broadcast over a trailing axis: a parameter is a scalar or an array of shape ``(...)``, and a matrix then has
-shape ``(n, n, ...)``.
+A system does not deal with batches, files or figures. For each analysis that it serves, a method marked with :func:`serves`
+returns the documented model, for example a :class:`LinearPeriodic` pair for ``floquet``. All models broadcast over a
+trailing axis: a parameter is a scalar or an array of shape ``(...)``, and a matrix then has shape ``(n, n, ...)``.
 """
 
 from __future__ import annotations
@@ -32,12 +31,12 @@ _PARAMETER, _SERVES = "parameter", "_serves"
 
 @dataclass(frozen=True)
 class Model:
-    """How a system serves one analysis: ``build(values)`` gives the model from the values of ``parameters``.
+    """The service of a system for one analysis: ``build(values)`` returns the model from the values of ``parameters``.
 
-    ``check(fixed)`` raises ``ValueError`` with one line, ``name = value: allowed is ...``, where parameters that are each
-    in range do not fit together. ``fixed`` holds those that do not vary; a list is whole also if one entry varies.
-    ``smooth`` tells in which coordinates an atlas of the results is best made. None: in the parameters themselves, and only
-    where it is asked for (``method = "auto"`` then makes none).
+    ``check(fixed)`` raises ``ValueError`` with one line, ``name = value: allowed is ...``, if parameters in range do not
+    match each other. ``fixed`` holds those that do not vary; a list is whole also if one entry varies. ``smooth`` declares
+    the coordinates of an atlas. None: the parameters themselves, and an atlas only on request (``method = "auto"`` makes
+    none).
     """
 
     build: Callable[[Values], Any]
@@ -48,11 +47,11 @@ class Model:
 
 @dataclass(frozen=True)
 class Resonances:
-    """Predicted values of the parameter ``axis`` at which something is expected, to be drawn over charts.
+    """Predicted values of the parameter ``axis``, drawn over charts.
 
-    ``values(parameters)`` maps the values of ``parameters`` (scalars or arrays of shape ``(...)``) to an array of
-    shape ``(..., len(labels))``. ``multipliers`` says for each label which multiplier meets the unit circle there, ``+1``,
-    ``-1`` or ``pair``, if that is known, and ``up_to(k)`` gives the same predictions for the orders 1 to k.
+    ``values(parameters)`` maps the values of ``parameters`` (scalars or arrays of shape ``(...)``) to an array of shape
+    ``(..., len(labels))``. ``multipliers`` gives for each label the multiplier that meets the unit circle there, ``+1``,
+    ``-1`` or ``pair``, if known. ``up_to(k)`` returns the same predictions for the orders 1 to k.
     """
 
     axis: str
@@ -99,18 +98,17 @@ def serves(
 
 
 class System(eqx.Module):
-    """A drivetrain model: see the module's docstring. A subclass declares its parameters as fields by :func:`parameter`.
+    """A drivetrain model, see the module's docstring. A subclass declares its parameters as fields by :func:`parameter`.
 
-    Concrete values are checked against their ranges, :class:`~drivetrain_jax.InputError` names the first that is outside;
-    traced ones are taken as they are.
+    Concrete values are checked against their ranges: :class:`~drivetrain_jax.InputError` names the first one out of range.
+    Traced values are not checked.
 
-    What the class itself holds: ``name``, ``title`` and ``source``; ``presets``, named parameter sets of the source;
-    ``resonances`` that are predicted; ``time_units``, the unit of the time of its equations, ``1`` if that is
-    nondimensional; ``physical``, which converts data in physical units to nondimensional parameters and back (pattern:
-    ``cardan_units.PhysicalShaft``), None if the parameters have physical units themselves; ``roles``, which names its
-    ``speed`` (or frequency of excitation), which figures draw horizontally, and the ``angle`` and ``damping`` that design
-    questions are about, as far as it has them. ``parameters`` and ``models`` follow from fields and methods. An atlas is
-    made of the results of ``floquet``: a model for ``atlas`` without one for it is refused (``ValueError``).
+    Class attributes: ``name``, ``title`` and ``source``; ``presets``, named parameter sets of the source; ``resonances``,
+    the predicted ones; ``time_units``, the unit of time in its equations (``1``: nondimensional); ``physical``, which
+    converts physical data to parameters and back (pattern: ``cardan_units.PhysicalShaft``), None if the parameters are
+    physical; ``roles``, the names of its ``speed`` (or excitation frequency), which figures draw horizontally, and of the
+    ``angle`` and ``damping`` of design questions, if it has them. ``parameters`` and ``models`` follow from fields and
+    methods. A model for ``atlas`` without one for ``floquet`` raises ``ValueError``.
     """
 
     name: ClassVar[str]
@@ -169,7 +167,7 @@ def _models(system: type[System], method: Any) -> dict[str, Model]:
     def build(values: Values) -> Any:
         return method(system.of(values))
 
-    # Where the code of a model stands decides what its results depend on.
+    # The source file of a model determines its digest.
     build.__wrapped__ = method  # pyright: ignore[reportFunctionMemberAccess]
     everything = tuple(p.name for p in system.parameters)
     return {
@@ -179,7 +177,7 @@ def _models(system: type[System], method: Any) -> dict[str, Model]:
 
 
 def _admitted(described: Parameter, value: Any) -> Any:
-    """``value`` in its stored type, or :class:`InputError`; arrays and traced values stay what they are."""
+    """``value`` in its stored type, or :class:`InputError`; arrays and traced values are unchanged."""
     if value is None:
         if described.default is None and not described.derived:
             raise InputError(f"{described.name}: missing; allowed is {described.allowed_in_units}")

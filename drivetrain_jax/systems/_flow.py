@@ -1,8 +1,8 @@
-"""An initial value problem whose explicit time enters through clocks: what is integrated, strobed and judged.
+"""An initial value problem whose explicit time enters through clocks.
 
 ``y' = f(theta_1, theta_2, ..., y)``, where the angle of clock i turns ``turns[i]`` times per strobe. Time is counted as
-``(strobe + fraction) * period`` with an integer strobe, so that the angles are as exact after millions of strobes as at
-the start; an autonomous system has no clock and any interval serves as its strobe.
+``(strobe + fraction) * period`` with an integer strobe, so the angles are as accurate after millions of strobes as at the
+start. An autonomous system has no clock, and any interval can be its strobe.
 """
 
 from __future__ import annotations
@@ -21,23 +21,19 @@ _SPLIT = 2.0**26
 
 
 class Flow(eqx.Module):
-    """A vector field with its clocks, its initial state and what is known about it.
+    """A vector field with its clocks, its initial state and known properties.
 
-    ``field(angles, y)`` gives the components of ``y'`` (per unit of time) from the angles of the clocks [rad] and the
-    components of ``y``; each is a number or an array of shape ``(...)``, so that a batch may be carried as trailing axis.
+    ``field(angles, y)`` returns the components of ``y'`` (per unit of time) from the angles of the clocks [rad] and the
+    components of ``y``; each is a number or an array of shape ``(...)``, so a batch may be a trailing axis.
 
-    - ``start``: components of ``y`` at t = 0.
-    - ``period``: time between two strobes.
-    - ``turns``: turns of each clock per strobe. A clock that defines the strobe has the number 1, its angle is then the
-      same for every member of a batch.
-    - ``scale``: what one unit of each component is in the units that are reported.
-    - ``divergence(angles, y)``: trace of the field's Jacobian in closed form, if known: its mean is the sum of all
-      Lyapunov exponents.
-    - ``phases``: components with a constant rate. Each has the exponent 0 whatever the motion does, so that they are
-      dropped before it is judged. (The clocks are not components.)
-    - ``cyclic``: components that are angles, known up to whole turns: they may grow although the motion is bounded.
-    - ``fastest``: largest angular frequency of the motion, from which step sizes follow, if known. Without it ``lyapunov``
-      takes 48 steps per strobe unless told otherwise.
+    - ``start``: components of ``y`` at t = 0. - ``period``: time between two strobes. - ``turns``: turns of each clock per
+    strobe. A clock that defines the strobe has the number 1; its angle is then the   same for every member of a batch. -
+    ``scale``: factor from one unit of each component to the reported units. - ``divergence(angles, y)``: trace of the
+    field's Jacobian in closed form, if known: its mean is the sum of all   Lyapunov exponents. - ``phases``: components
+    with a constant rate. Their exponents are always 0, so the verdict ignores them. (The clocks   are not components.) -
+    ``cyclic``: components that are angles, known up to whole turns: they may grow although the motion is bounded. -
+    ``fastest``: largest angular frequency of the motion, from which step sizes follow, if known. Without it ``lyapunov``
+    takes 48 steps per strobe by default.
     """
 
     field: Callable[[Components, Any], Components]

@@ -1,4 +1,4 @@
-"""Masses joined by springs: what a system hands to the analysis ``modes``."""
+"""Masses joined by springs: the model of the analysis ``modes``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Block(eqx.Module):
 
     @property
     def copies(self) -> int:
-        """How often each of its frequencies occurs."""
+        """Multiplicity of each of its frequencies."""
         return self.basis.shape[2]
 
 

@@ -1,4 +1,4 @@
-"""Linear periodic systems and what the analyses ``floquet`` and ``forced`` ask of a model."""
+"""Linear periodic systems: the models of the analyses ``floquet`` and ``forced``."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class LinearPeriodic(diffrax.AbstractTerm):
 
     @property
     def halves(self) -> int:
-        """How many of the interval make the period: 1 or 2."""
+        """Number of spans in a period: 1 or 2."""
         return 1 if self.reversor is None and self.reversal is None else 2
 
     @property
@@ -62,7 +62,7 @@ class LinearPeriodic(diffrax.AbstractTerm):
 
     @property
     def exchanges_halves(self) -> bool:
-        """Whether there are four states, of which the reversor exchanges the first two with the others."""
+        """True if there are four states, and the reversor exchanges the first two with the others."""
         return self.reversor == SWAP
 
     def matrix(self, t: Any) -> Array:
@@ -72,7 +72,7 @@ class LinearPeriodic(diffrax.AbstractTerm):
     def vf(self, t: Any, y: Any, args: Any) -> Array:
         """``A(t) y`` of a state or a matrix of states ``y``."""
         del args
-        # Entry by entry: under vmap, small products of matrices are slower than what they consist of.
+        # Entry by entry: under vmap, small matrix products are slower than their sums.
         rows = self.rows(*self.basis(t))
         return jnp.stack([sum(a * y[j] for j, a in enumerate(row) if not _vanishes(a)) + 0 * y[0] for row in rows])
 
@@ -89,14 +89,13 @@ class LinearPeriodic(diffrax.AbstractTerm):
 class FloquetModel(eqx.Module):
     """The model of the analysis ``floquet``.
 
-    ``natural`` is the system as published, over its full period in its own time; ``reduced`` is an equivalent form
-    (same multipliers) that is cheaper or better conditioned. They may be the same object. ``explicit_steps(rtol)``
-    predicts how many steps ``reduced`` needs with the explicit scheme of order 8, from parameters given as NumPy arrays of
-    shape ``(N,)`` or traced; None leaves the prediction to the analysis. ``hamiltonian()`` is true where ``reduced`` is a
-    Hamiltonian system, whose multipliers come in pairs sigma, 1/sigma; None if it never is.
-    ``stiff`` is one more form, in which the slow modes of strong damping are no differences of large entries; None if there
-    is no better one than ``reduced``. The implicit scheme always takes it, the explicit one where ``strongly_damped()``
-    says so; None if nowhere.
+    ``natural`` is the system as published, over its full period in its own time. ``reduced`` is an equivalent form (same
+    multipliers) that is cheaper or better conditioned; both may be the same object. ``explicit_steps(rtol)`` predicts the
+    number of steps of ``reduced`` by the explicit scheme of order 8, from parameters as NumPy arrays of shape ``(N,)`` or
+    traced; None leaves the prediction to the analysis. ``hamiltonian()`` is true where ``reduced`` is a Hamiltonian system,
+    whose multipliers come in pairs sigma, 1/sigma; None if it never is. ``stiff`` is a form for strong damping, whose slow
+    modes are not differences of large entries; None if ``reduced`` is as good. The implicit scheme always uses it, the
+    explicit one where ``strongly_damped()`` is true; None means never.
     """
 
     natural: LinearPeriodic

@@ -36,7 +36,7 @@ class PiecewiseLinearOscillator(eqx.Module):
 
     def restoring(self, u: Any) -> Array:
         """``f_s(u)``, same units as ``u``, shape of ``u`` and the parameters broadcast."""
-        # u minus what the play takes: exact for b = 0 and continuous in floating point.
+        # u minus the force lost in the play: exact for b = 0 and continuous in floating point.
         return u - (1 - self.alpha) * jnp.clip(u, -self.b, self.b)
 
     def field(self, t: Any, state: Array) -> Array:

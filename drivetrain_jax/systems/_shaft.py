@@ -1,4 +1,4 @@
-"""The lateral vibration of a stepped shaft: what the system hands to the analysis ``critical_speeds``."""
+"""The lateral vibration of a stepped shaft: the model of the analysis ``critical_speeds``."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Shaft(NamedTuple):
 
     @property
     def is_timoshenko(self) -> bool:
-        """Whether shear or rotary inertia is part of the model."""
+        """True if shear or rotary inertia is part of the model."""
         return self.kGA is not None or self.rhoI is not None
 
     @property
@@ -55,7 +55,7 @@ class Shaft(NamedTuple):
         return Shaft(*(None if f is None else jnp.broadcast_to(f, (len(f), *lanes)) for f in self.arrays()))
 
     def arrays(self) -> Shaft:
-        """The same shaft with every field an array in double precision, with as many axes as the lanes need."""
+        """The shaft with all fields as arrays in double precision, with the axes of the lanes."""
         fields = Shaft(*(None if field is None else stack(field) for field in self))
         axes = len(fields.lanes) + 1
 

@@ -1,4 +1,4 @@
-"""In which variables the results of a model are smooth: what a system declares for its atlas."""
+"""Variables in which the results of a model are smooth: the declaration of a system for its atlas."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the parameters of the double-tripod driveshaft default to in the paper, and which of them go together.
+"""Default parameters of the double-tripod driveshaft from the paper, and conflicts between them.
 
 Tables 1, 2 and 4 of the source that :mod:`~drivetrain_jax.systems.tripod` names.
 """

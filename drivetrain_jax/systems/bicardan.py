@@ -85,7 +85,7 @@ class Bicardan(System):
     def shaft(self) -> Shaft:
         """The shaft with these parameters (numbers, or arrays of one shape of lanes; lists as tuples of them).
 
-        What is known to have no effect, such as masses of 0, is left out of the computation.
+        Parameters without effect, such as masses of 0, are left out of the computation.
         """
         length = self.length if isinstance(self.length, tuple) else (self.length,)
         segments = len(length)

@@ -81,7 +81,7 @@ def _clock(cos2psi: Any, sin2psi: Any, beta: Any) -> tuple[Any, Any, Any]:
 def _oscillation_steps(xp: Any, phase: Any, sharpness: Any, digits: float) -> Any:
     x, bend = xp.log(phase), 2.57
     capped = xp.minimum(x, bend)
-    # Beyond 1e-10 rounding decides, and so many more steps would have points left to the implicit scheme.
+    # Beyond 1e-10 rounding dominates, and so many steps would move points to the implicit scheme.
     power = 1.13 + 0.01 * digits if digits <= 1 else 1.1
     log_steps = 0.59 * capped + 0.1 * capped**2 + power * (x - capped)
     return xp.exp(log_steps + (0.59 - 0.13 * capped - 0.034 * sharpness) * sharpness + 1.7 + 0.26 * digits)
@@ -292,13 +292,13 @@ class Cardan(System):
     def explicit_steps(self, rtol: float) -> np.ndarray:
         """Predicted steps of the order-8 scheme for the reduced form, as floats of the batch's shape.
 
-        For what oscillates log n is a fitted quadratic in the logarithms of the phase over the half period (by
-        Simpson's rule) and of 1/cos(beta), the sharpness of the variation; beyond a phase of 13 n grows like its
-        power 1.09 to 1.14, so that even blocks of slow points rarely need more. For what decays log n is linear in
-        the logarithm of the largest decay over the half period, with a slope that falls with rtol, as long as the
-        scheme is stable. The two add up like the sides of a right angle. Fitted to 6,000 random points with zeta from
-        1e-4 to 300 and rtol from 1e-5 to 1e-11: 1.6 times what is needed in the median, four times where both matter.
-        It decides the cost and never the accuracy, which is checked.
+        For oscillation log n is a fitted quadratic in the logarithms of the phase over the half period (by Simpson's rule)
+        and of 1/cos(beta), the steepness of the variation; beyond a phase of 13 n grows like its power 1.09 to 1.14, so
+        that even blocks of slow points rarely need more. For decay log n is linear in the logarithm of the largest decay
+        over the half period, with a slope that falls with rtol, as long as the scheme is stable. The two add like the sides
+        of a right angle. Fitted to 6,000 random points with zeta from 1e-4 to 300 and rtol from 1e-5 to 1e-11: 1.6 times
+        the need in the median, four times where both matter. The prediction affects the cost and never the accuracy, which
+        is checked.
         """
         xp, beta, speed, mu, gamma = numeric(self.beta, self.Omega, self.mu, self.gamma)
         with np.errstate(over="ignore"):
@@ -329,11 +329,11 @@ class Cardan(System):
             )
 
     def is_strongly_damped(self) -> np.ndarray:
-        """Whether the stiff form is the better one for the explicit scheme."""
+        """True where the stiff form is better for the explicit scheme."""
         return self._decay() > _STRONG
 
     def is_hamiltonian(self) -> Any:
-        """Whether there is no damping."""
+        """True without damping."""
         return self.zeta == 0
 
     @serves("atlas", smooth=SMOOTH)

@@ -40,7 +40,7 @@ class PhysicalShaft:
     k2: float
     c1: float
     c2: float
-    # How the shaft is run, given beside what it is; and the names of all data.
+    # Operating conditions, given with the physical data; and the names of all data.
     operation: ClassVar[tuple[str, ...]] = ("speed", "angle")
     quantities: ClassVar[tuple[Parameter, ...]] = PHYSICAL
     names: ClassVar[tuple[str, ...]] = tuple(p.name for p in PHYSICAL)
@@ -59,7 +59,7 @@ class PhysicalShaft:
     @property
     def critical_damping(self) -> float:
         """2 sqrt(k1 J1), N m s/rad: the unit of zeta."""
-        # Of each alone: in some units the product leaves the range of numbers.
+        # Square roots one by one, because in some units the product overflows.
         return 2 * math.sqrt(self.k1) * math.sqrt(self.J1)
 
     @property
@@ -97,11 +97,11 @@ class PhysicalShaft:
         return zeta * self.critical_damping
 
     def parameter(self, name: str, value: float) -> tuple[str, float]:
-        """What ``speed`` in rpm or ``angle`` in degrees is among the nondimensional parameters."""
+        """The nondimensional parameter of ``speed`` in rpm or ``angle`` in degrees."""
         return ("Omega", self.omega(value)) if name == "speed" else ("beta", self.beta(value))
 
     def quantity(self, parameter: str, value: float) -> tuple[str, float, str] | None:
-        """Name, value and unit of what Omega, beta or zeta stands for, None for another parameter."""
+        """Name, value and unit of the physical quantity behind Omega, beta or zeta, None for another parameter."""
         if parameter == "Omega":
             return "speed", self.speed(value), "rpm"
         if parameter == "beta":

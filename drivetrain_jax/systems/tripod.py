@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 
 class Element(NamedTuple):
-    """Constants of one element: what its equation of motion is made of."""
+    """Constants in the equation of motion of one element."""
 
     J_A: Any
     """Moment of area of the axle, reduced to the midshaft axis [m4]."""
@@ -222,7 +222,7 @@ def history_model(values: Values) -> Flow:
 
 
 def constants(values: Values) -> dict[str, Any]:
-    """What the analysis ``parameters`` reports, by the name of the result."""
+    """Results of the analysis ``parameters`` by name."""
     element = element_of(values)
     mean = values["M_AEM"] if values["element"] == "input" else -values["M_MS"]
     return {

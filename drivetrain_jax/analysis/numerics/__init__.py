@@ -1,1 +1,1 @@
-"""What several families compute with: small linear algebra, roots, lanes of a batch, how kernels are compiled."""
+"""Shared numerics: small linear algebra, roots, lanes of a batch, compilation of kernels."""

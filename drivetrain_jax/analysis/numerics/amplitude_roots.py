@@ -45,12 +45,12 @@ def bisect(function: Callable[[Array], Array], low: Array, high: Array, halvings
 
 
 def sign_changes(positive: Array, count: int) -> Array:
-    """Which interval holds the n-th change of a sign along the first axis, as a mask ``(count, K - 1, ...)``."""
+    """Mask ``(count, K - 1, ...)`` of the interval with the n-th change of sign along the first axis."""
     return first_marks(positive[1:] != positive[:-1], count)
 
 
 def first_marks(marks: Array, count: int) -> Array:
-    """The first ``count`` of the ``marks`` (K, ...) along the first axis, each in a row of its own: ``(count, K, ...)``."""
+    """The first ``count`` of the ``marks`` (K, ...) along the first axis, one per row: ``(count, K, ...)``."""
     rank = jnp.cumsum(marks, axis=0)
     number = jnp.arange(1, count + 1).reshape(count, *(1,) * marks.ndim)
     return marks & (rank == number)
@@ -63,12 +63,12 @@ def take(mask: Array, values: Array, missing: float = np.nan) -> Array:
 
 
 def follow(roots: Array) -> Array:
-    """The root at which a sweep up and a sweep down stand, ``(L, K, ...) -> (L, 2, ...)`` indices.
+    """Indices of the roots of a sweep up and a sweep down, ``(L, K, ...) -> (L, 2, ...)``.
 
-    ``roots`` are rising along K and filled up with infinity, the frequencies rising along L. A sweep starts from rest.
-    Between folds there are as many roots as before, and it keeps its place among them, however steep they are. At the first
-    frequency past a fold the amplitude moves the way the averaged motion moves it: to the next root above if the
-    residual at the old amplitude is negative, to the next one below if it is positive.
+    ``roots`` rise along K and are padded with infinity; frequencies rise along L. A sweep starts from rest. Between folds
+    the number of roots is constant, and the sweep keeps its position among them, even on steep branches. At the first
+    frequency past a fold the amplitude moves as the averaged motion: to the next root above if the residual at the old
+    amplitude is negative, to the next one below if it is positive.
     """
     size = roots.shape[1]
 

@@ -1,9 +1,9 @@
-"""How kernels are compiled for the CPU, marches of many small operations above all.
+"""Compile kernels for the CPU, in particular marches of many small operations.
 
-XLA computes an intermediate value again for every result that needs it, and calls a kernel for each result: a step of a
-Runge-Kutta method is computed several times over, or costs more in calls than in arithmetic. :func:`stored` and
-:func:`in_one_kernel` mark functions for the compiler. The marks change no number beyond rounding; a compiler that does
-not know them ignores them.
+XLA recomputes an intermediate value for every result that needs it, and calls a kernel for each result: a step of a
+Runge-Kutta method is computed several times, or costs more in calls than in arithmetic. :func:`stored` and
+:func:`in_one_kernel` mark functions for the compiler. The marks change numbers only by rounding; a compiler that does not
+know them ignores them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ R = TypeVar("R")
 FULL_WIDTH = 8
 # A call that is not inlined is not fused with what surrounds it either: its results are computed once and stored.
 _APART = {"inlineable": "false"}
-# What XLA does of its own accord with loops over less than half a kilobyte.
+# XLA does this by default for loops over less than half a kilobyte.
 _ONE_KERNEL = {**_APART, "xla_cpu_small_call": "true"}
 # Operations that may be part of such a kernel. Sorting, scattering, calls of libraries and (by their new emitters) sums
 # and maxima over an axis may not.
@@ -45,20 +45,20 @@ _KNOWN = {*_ELEMENTWISE.split(), *_STRUCTURE.split()}
 
 
 def on_cpu() -> bool:
-    """Whether this process computes on a processor's cores. An accelerator needs other batches and takes no such marks."""
+    """True if this process computes on a CPU. An accelerator needs other batches and no marks."""
     return jax.default_backend() == "cpu"
 
 
 def compiler_options(lanes: int = FULL_WIDTH, *, march: bool = False, short_loops: bool = False) -> dict[str, Any]:
-    """Full vector width: XLA uses half of AVX-512 unless told otherwise, which costs a factor of 1.6.
+    """Compiler options for full vector width; XLA's default is half of AVX-512, which is 1.6 times slower.
 
-    Not for fewer ``lanes`` than a vector has: a march of four lanes then takes the compiler tens of gigabytes (jax 0.10.2).
-    A ``march`` is left to the older of two code generators, which takes half the time and makes most marches no slower
-    (charts, determinants, impacts and adaptive steps in lockstep become slower, by up to a factor of two).
+    Not for fewer ``lanes`` than a vector: compiling a march of four lanes then takes tens of gigabytes (jax 0.10.2). A
+    ``march`` uses the older of two code generators, which compiles twice as fast and makes most marches no slower (charts,
+    determinants, impacts and adaptive steps in lockstep would be slower, by up to a factor of two).
 
-    Loops over some tens of lanes (``short_loops``) are compiled at a lower level of optimisation: the highest one unrolls
-    them into operations on single numbers instead of vectors, and so much code does not fit into the cache. Marches of
-    tangent vectors stay at the highest: with few lanes they take the compiler tens of gigabytes at any other.
+    Loops over some tens of lanes (``short_loops``) use a lower level of optimisation: the highest one unrolls them into
+    scalar operations that do not fit into the cache. Marches of tangent vectors stay at the highest: with few lanes any
+    other level needs tens of gigabytes to compile.
     """
     options: dict[str, Any] = {}
     if "avx512f" in instruction_set() and lanes >= FULL_WIDTH:
@@ -83,9 +83,9 @@ def _applicable(options: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def compiler_knows(option: str, value: Any) -> bool:
-    """Whether XLA takes an option, which may go with any release of jaxlib: then kernels are slower, not missing.
+    """True if XLA accepts an option, which any release of jaxlib may remove: kernels are then slower, not missing.
 
-    Those of jaxlib 0.10 are known without asking, which takes the time of a small compilation.
+    Options of jaxlib 0.10 are listed, because asking takes as long as a small compilation.
     """
     if jaxlib.__version__.startswith("0.10."):  # pyright: ignore[reportPrivateImportUsage]
         return True
@@ -97,7 +97,7 @@ def compiler_knows(option: str, value: Any) -> bool:
 
 
 def stored(function: Callable[P, R]) -> Callable[P, R]:
-    """``function`` with its results computed once, whatever uses them."""
+    """``function`` with its results computed once for all uses."""
     return _marked(function, _APART)
 
 
@@ -121,11 +121,11 @@ def in_one_kernel(function: Callable[..., R]) -> Callable[..., R]:
 
 
 def _using_all(closed: Any, certain: Array, values: list[Array]) -> list[Array]:
-    """Results of ``closed`` for what it captured and its arguments, all of which are read.
+    """Results of ``closed`` for its captured values and its arguments, all of which are read.
 
-    XLA aborts the process over a kernel that is given what it does not use (jax 0.10.2): the time of a march whose field
-    does not depend on it, or everything if the march is seen to take no steps. What the values are is hidden from it, and
-    that ``certain`` is true.
+    XLA aborts the process for a kernel with unused inputs (jax 0.10.2), for example the time of a march whose field does
+    not depend on it, or everything if the march takes no steps. The values, and that ``certain`` is true, are therefore
+    hidden from the compiler.
     """
     captured = len(closed.consts)
     first, *others = jax.core.eval_jaxpr(closed.jaxpr, values[:captured], *values[captured:])
@@ -134,7 +134,7 @@ def _using_all(closed: Any, certain: Array, values: list[Array]) -> list[Array]:
 
 
 def suits_one_kernel(function: Callable[..., Any], *arguments: Any) -> bool:
-    """Whether all that ``function`` does with ``arguments`` may be part of a single kernel."""
+    """True if all operations of ``function`` on ``arguments`` may be part of a single kernel."""
     return all(name in _KNOWN for name in _operations(jax.make_jaxpr(function)(*arguments).jaxpr))
 
 

@@ -76,7 +76,7 @@ def in_blocks(function: Callable[[Any, int], Any], values: Any, lanes: int, size
 
 
 def _padded(array: Array, lanes: int) -> Array:
-    """``array`` with its last lane repeated up to so many ``lanes``."""
+    """``array`` with its last lane repeated up to ``lanes``."""
     widths = [(0, 0)] * (array.ndim - 1) + [(0, lanes - array.shape[-1])]
     return jnp.pad(array, widths, mode="edge")
 
@@ -100,13 +100,12 @@ class Constants:
 def lanes_last(
     function: Callable[[Any, Any, Any], Any], constants: Constants, varying: Any, shared: Any, size: int | None = None
 ) -> Any:
-    """``function(constants, varying, shared)`` of one point; under ``jax.vmap``, however often, one call for all lanes.
+    """``function(constants, varying, shared)`` of one point; under ``jax.vmap``, even nested, one call for all lanes.
 
-    ``function`` is written for lanes as an additional last axis of every array in ``varying`` and in its results. What all
-    lanes have in common comes with a last axis of 1, numbers without one. ``shared`` is for all lanes: a whole number that
-    is not the same counts with its largest value, another one comes as an array of lanes. With ``size``, lanes go through
-    ``function`` that many at a time, and it is traced for this number alone, once for equal ``constants`` (a batch that fits
-    into one vector goes through it as a whole).
+    ``function`` has the lanes as an additional last axis of every array in ``varying`` and of its results. Values common to
+    all lanes have a last axis of 1, numbers none. ``shared`` applies to all lanes: of different integers the largest
+    counts, other values become an array of lanes. With ``size``, that many lanes are computed at a time, and ``function``
+    is traced only for this number, once for equal ``constants`` (a batch that fits into one vector is computed as a whole).
     """
 
     def at_once(varying: Any, shared: Any, size: int | None) -> Any:
@@ -121,7 +120,7 @@ def lanes_last(
 
     @custom_vmap
     def call(varying: Any, shared: Any) -> Any:
-        # As many at a time as in most batches: a trace for a single point would be one more.
+        # The usual size of a batch: a single point would need another trace.
         return at_once(varying, shared, size)
 
     @call.def_vmap
@@ -193,8 +192,8 @@ def over_lanes(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]
 
 
 def by_rows(function: Callable[[Any], Any], rows: Any) -> Any:
-    """``function`` of every entry along the first axis of ``rows``, one after the other, so that what it makes on the way
-    stays in the caches; on an accelerator all at once."""
+    """``function`` of every entry along the first axis of ``rows``, one by one, so that intermediate values stay in the
+    caches; on an accelerator all at once."""
     return lax.map(function, rows) if on_cpu() else jax.vmap(function)(rows)
 
 

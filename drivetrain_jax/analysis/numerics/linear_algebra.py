@@ -128,7 +128,7 @@ def _add_to_diagonal(h: Complex, shift: Complex, active: Array) -> Complex:
 
 
 def _turn_rows(x: Complex, y: Complex, a: Complex, b: Complex, wanted: Array) -> tuple[Complex, ...]:
-    """The rotation ``c, s`` that makes ``b`` vanish against ``a``, after what it makes of the rows ``x`` and ``y``; none
+    """The rotation ``c, s`` that eliminates ``b`` against ``a``, and the rotated rows ``x`` and ``y``; the identity
     unless ``wanted``."""
     norm = jnp.sqrt(a[0] ** 2 + a[1] ** 2 + b[0] ** 2 + b[1] ** 2)
     turns = wanted & (norm > 0)
@@ -150,7 +150,7 @@ def _sweep(h: Complex, shift: Complex, size: Array) -> Complex:
     active = jnp.arange(n) < size
     h = _add_to_diagonal(h, (-shift[0], -shift[1]), active)
     rows, rotations = [(h[0][i], h[1][i]) for i in range(n)], []
-    # Stored: each rotation would be computed anew for all that follows from it, and compiled as often.
+    # Stored: otherwise each rotation would be recomputed for everything that depends on it, and compiled as often.
     for k in range(n - 1):
         x, y = rows[k], rows[k + 1]
         rows[k], rows[k + 1], *rotation = stored(_turn_rows)(x, y, *((r[0][k], r[1][k]) for r in (x, y)), active[k + 1])  # pyright: ignore[reportCallIssue]
@@ -169,7 +169,7 @@ def _size(a: Complex) -> Array:
 def eigenvalues(a: Array) -> tuple[Array, Array]:
     """Real and imaginary parts of the eigenvalues of ``a``, ``(n, n, ...) -> (n, ...)`` each, in no particular order.
 
-    Lanes that are not finite give NaN and do not hold up the others.
+    Lanes that are not finite give NaN and do not delay the others.
     """
     reduced = hessenberg(a)
     h = (reduced, jnp.zeros_like(reduced))
@@ -184,7 +184,7 @@ def eigenvalues(a: Array) -> tuple[Array, Array]:
 def _deflated(h: Complex) -> Complex:
     """``h`` after QR steps that decouple, in every lane, one row after the other from below, down to two.
 
-    One loop for all sizes: each of its own would be compiled, which takes seconds.
+    One loop for all sizes, because compiling a loop takes seconds.
     """
 
     def step(state: tuple) -> tuple:

@@ -1,4 +1,4 @@
-"""What is predicted from parameters, before anything is computed, by functions in JAX."""
+"""Predictions from parameters before a computation, by functions in JAX."""
 
 from __future__ import annotations
 

@@ -17,9 +17,9 @@ from jax import Array, lax
 from drivetrain_jax.analysis.numerics.lanes import evaluated_once
 
 EPS = float(np.finfo(float).eps)
-# Matrices are scaled to entries of order one; what is smaller than these has no influence on any digit.
+# Matrices are scaled to entries of order one; smaller values than these affect no digit.
 _TINY, _TINY_SQUARE = 1e-150, 1e-300
-# Of off-diagonal entries, this is taken for nothing; squares of what is larger do not vanish.
+# Off-diagonal entries below this count as zero; squares of larger ones do not underflow.
 _NEGLIGIBLE = 1e-140
 # QR sweeps per singular value: less than two are needed on average, LAPACK allows six per value and column.
 _SWEEPS_PER_VALUE = 12
@@ -40,11 +40,11 @@ class Bidiagonal(NamedTuple):
 
 
 def singular_values(*blocks: Array) -> tuple[Array, Array]:
-    """Singular values of block-diagonal matrices: ``(n, N)`` rising, and whether every one was found, ``(N,)``.
+    """Singular values of block-diagonal matrices: ``(n, N)`` rising, and flags if all were found, ``(N,)``.
 
-    ``blocks`` have shapes ``(m_i, n_i, N)`` with ``m_i >= n_i``; ``n`` is the sum of ``n_i``. Backward stable: errors
-    of the order of the rounding unit times the largest singular value. A lane with an entry that is not finite gives
-    NaN and does not hold up the others.
+    ``blocks`` have shapes ``(m_i, n_i, N)`` with ``m_i >= n_i``; ``n`` is the sum of ``n_i``. Backward stable: errors are
+    of the order of the rounding unit times the largest singular value. A lane with an entry that is not finite gives NaN
+    and does not delay the others.
     """
     values, found = bidiagonal_values(bidiagonal_form(*blocks))
     return jnp.sort(values, axis=0), found

@@ -31,7 +31,7 @@ def jacobi_vectors(a: Array) -> tuple[Array, Array]:
         return identity, finite
     half = (n + 1) // 2
     padded = jnp.concatenate([columns, jnp.zeros((2 * half - n, m + n, lanes))])
-    # What is smaller than this is rounding of the largest column and need not become orthogonal.
+    # Smaller values are rounding of the largest column and need not become orthogonal.
     noise = EPS * n * jnp.sqrt(jnp.max(jnp.sum(padded[:, :m] ** 2, axis=1), axis=0))
 
     def round_of_pairs(_: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -57,7 +57,7 @@ def jacobi_vectors(a: Array) -> tuple[Array, Array]:
 
 
 def _rotate(top: Array, bottom: Array, m: int, noise: Array) -> tuple[Array, Array, Array]:
-    """Make facing columns orthogonal in their first ``m`` entries; tells which lanes still needed it."""
+    """Make facing columns orthogonal in their first ``m`` entries; returns flags of the lanes that needed it."""
     x, y = top[:, :m], bottom[:, :m]
     a, b, product = jnp.sum(x * x, axis=1), jnp.sum(y * y, axis=1), jnp.sum(x * y, axis=1)
     sizes = jnp.sqrt(a) * jnp.sqrt(b)

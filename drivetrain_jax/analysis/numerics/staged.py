@@ -18,15 +18,15 @@ from jax.extend.core import ClosedJaxpr, DebugInfo, Jaxpr, JaxprEqn, Literal, Va
 
 from drivetrain_jax.analysis.numerics.kernels import stored
 
-# They give a value another shape. Done before the march they would only make what it reads larger.
+# Operations that only change the shape. Done before the march they would only enlarge its input.
 _SHAPING = {"broadcast_in_dim", "reshape", "expand_dims", "squeeze"}
 
 
 class Staged(NamedTuple):
     """``function(*arguments) = moving(fixed, *arguments)``, as a list of arrays.
 
-    ``fixed`` holds one array for each shape: what is handed to a kernel must not come twice, which the compiler of jax
-    0.10.2 does not survive, and equal values that it finds equal would.
+    ``fixed`` holds one array for each shape: duplicate inputs of a kernel, and inputs that it finds equal, crash the
+    compiler of jax 0.10.2.
     """
 
     fixed: list[Array]
@@ -84,7 +84,7 @@ def _shared_once(equations: Sequence[JaxprEqn], results: Iterable[Any]) -> list[
     for equation in reversed(equations):
         (out,) = equation.outvars
         heads = users.get(out, set())
-        # What does not depend on the lane is not computed for every lane.
+        # Values that do not depend on the lane are computed once.
         alone = len(heads) == 1 and out not in wanted and all(v.aval.size == out.aval.size for v in heads)  # pyright: ignore[reportAttributeAccessIssue]
         head_of[out] = next(iter(heads)) if alone else out
         for v in _variables(equation.invars):

@@ -13,11 +13,11 @@ _State = tuple[Any, Array, Array]
 
 
 class WatchedSteps(diffrax.AbstractAdaptiveStepSizeController[_State, None]):
-    """The steps of ``controller``, which are at most ``part`` of the interval ``length``; a first one of more than half of
-    that is ``part`` of what it would be.
+    """The steps of ``controller``, at most ``part`` of the interval ``length``; a first step of more than half of
+    ``length`` is multiplied by ``part``.
 
-    With ``part`` 1 they are those of ``controller``. With less, they differ from those even where these do not depend on the
-    tolerance: where one or two steps take the whole interval.
+    With ``part`` 1 they are the steps of ``controller``. With less they differ even if one or two steps take the whole
+    interval, where the tolerance does not matter.
     """
 
     controller: diffrax.PIDController
@@ -26,17 +26,17 @@ class WatchedSteps(diffrax.AbstractAdaptiveStepSizeController[_State, None]):
 
     @property
     def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """That of the controller."""
+        """rtol of the controller."""
         return self.controller.rtol
 
     @property
     def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """That of the controller."""
+        """atol of the controller."""
         return self.controller.atol
 
     @property
     def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """That of the controller."""
+        """Norm of the controller."""
         return self.controller.norm
 
     def wrap(self, direction: Any) -> WatchedSteps:
@@ -57,7 +57,7 @@ class WatchedSteps(diffrax.AbstractAdaptiveStepSizeController[_State, None]):
     def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any, error_order: Any, state: _State
     ) -> tuple:
-        """Whether the step is kept, the next one, whether it begins at a jump, the state, and the result."""
+        """Flag if the step is accepted, the next step, flag if it begins at a jump, the state, and the result."""
         inner, largest, longest = state
         kept, start, end, jumped, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner

@@ -52,10 +52,10 @@ def amplitudes(
 
     def advance(s: _Peaks) -> _Peaks:
         y1, error, dense, state, _ = solver.step(term, s.t0, s.t1, s.y, None, s.solver, s.made_jump)
-        # Where steps end is no matter of derivatives: at a peak the solution does not change with time.
+        # Derivatives ignore the ends of steps: at a peak the solution is stationary in time.
         adapted = control.adapt_step_size(s.t0, s.t1, *fixed((s.y, y1)), None, fixed(error), order, s.control)  # pyright: ignore[reportArgumentType]
         keep, t0, t1, jump, controlled, result = adapted
-        # An empty step ends the loop: the controller has given up.
+        # An empty step ends the loop: the controller has stopped.
         t1 = jnp.where(result == diffrax.RESULTS.successful, jnp.minimum(t1, period), t0)
         between = solver.interpolation_cls(t0=s.t0, t1=s.t1, **dense)
         found = _peaks_on_step(field, between.evaluate, s.t0, s.t1, s.y, y1, indices)

@@ -22,7 +22,7 @@ from drivetrain_jax.analysis.periodic.multipliers import sort_multipliers
 from drivetrain_jax.analysis.periodic.propagator import EqualSteps, Order8, propagator
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
-# Moduli that differ by no more than rounding, as those of all multipliers without damping.
+# Moduli that differ only by rounding, as all multipliers without damping.
 TIED = 1e-11
 # Derivatives p'(s) of multipliers in units of the spectral radius, below which these are not simple.
 _SIMPLE = 1e-7

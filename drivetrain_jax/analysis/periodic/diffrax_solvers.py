@@ -55,7 +55,7 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
         return results(z, request.outputs, rtol, model.natural)
 
     def effort(columns: Mapping[str, Any]) -> np.ndarray:
-        # Fitted for order 8; a lower one needs the more steps the sharper the result is to be.
+        # Fitted for order 8; a lower order needs more steps for a smaller tolerance.
         more = rtol ** (1 / 8 - 1 / solver.order(diffrax.ODETerm(lambda t, y, args: y)))
         return more * explicit_effort(system, columns, rtol)
 

@@ -1,10 +1,10 @@
 """Monodromy matrix of a linear periodic system with a bound of its error, by two step sizes.
 
 The propagator is computed with m/r, m, 2 m, 4 m, ... steps until two successive ones agree. With a scheme of order p the
-error of the finer one is their difference over r^p - 1, then 2^p - 1; four times that is taken as its bound, measured on
-the matrix and on the coefficients of its characteristic polynomial (the larger counts, so that no accidental zero deceives).
-The determinant is compared with Liouville's exact value, which notices an oscillation that both step sizes miss. All
-functions broadcast over a trailing batch.
+error of the finer one is their difference over r^p - 1, then 2^p - 1. The bound is four times that error, measured on the
+matrix and on the coefficients of its characteristic polynomial; the larger one counts, because either may vanish by
+accident. The determinant is compared with Liouville's exact value, which detects an oscillation that both step sizes miss.
+All functions broadcast over a trailing batch.
 """
 
 from __future__ import annotations
@@ -124,10 +124,10 @@ def compare(
 ) -> Monodromy:
     """Monodromy matrix of ``fine`` and its error; ``stiffness`` as of :func:`stiffness_of`.
 
-    ``reduction`` is the error of ``coarse`` over that of ``fine``, less one. The propagators themselves are compared too,
-    lest the errors of a product that is nearly of rank one are small by accident, relative to their own norm. Rounding of
-    the matrix products accumulates like the square root of ``steps``. What is made on the way grows until the end as
-    ``fine`` says, but never by so much that it would not show in ``coarse``. That of the entries of A is the same in both
+    ``reduction`` is the error of ``coarse`` over that of ``fine``, minus one. The propagators are compared too, because the
+    errors of a product of nearly rank one may be small by accident, relative to its norm. Rounding of the matrix products
+    accumulates like the square root of ``steps``. Rounding during the march grows until its end by the factor from
+    ``fine``, but never so much that it would not show in ``coarse``. Rounding of the entries of A is equal in both
     propagators: it shifts exponents by `_ENTRIES` units of the ``stiffness``.
     """
     other = jnp.exp(coarse.log_scale - fine.log_scale) * coarse.matrix
@@ -149,7 +149,7 @@ def compare(
         exact = jnp.exp(system.log_determinant() - n * log_scale)
         residual = ((-1) ** n * a_fine[-1] - exact) / scale**n
     truncation = jnp.maximum(truncation, jnp.abs(residual))
-    # Eightfold growth is well within what rounding of the products is taken for, if their size is only estimated.
+    # Eightfold growth is well within the assumed rounding of the products, if their size is only estimated.
     growth = jnp.maximum(fine.growth / (8 if system.reversal is None else 1), 1.0)
     unit = np.finfo(float).eps * norm / scale
     at_the_end = (4 + jnp.sqrt(steps)) * unit
@@ -173,12 +173,11 @@ def direct_monodromy(
 ) -> Monodromy:
     """Refine from ``steps`` predicted steps (traced integer) until the error of every lane is at most ``rtol``.
 
-    ``propagate(steps, pieces)`` gives the propagator of ``system`` with batch shape ``shape``, by a scheme of order
+    ``propagate(steps, pieces)`` returns the propagator of ``system`` with batch shape ``shape``, by a scheme of order
     ``order``, in up to ``most_pieces``. ``stiffness`` is that of :func:`stiffness_of`. A lane that overflows gets two
-    doublings to recover and then no longer holds up the others; after six the error tells what was reached.
-    The first comparison is with ``ratio`` times fewer steps. It costs the less the more that is, but the order of the scheme
-    has to show in both: a small ``rtol`` makes sure of that, as does that they are not fewer than the ``least`` with which
-    it is stable, or than four fifths of the steps.
+    doublings to recover and then no longer delays the others. After six doublings the error is reported as it is. The first
+    comparison uses ``ratio`` times fewer steps. A larger ratio costs less, but both step numbers must show the order of the
+    scheme: hence a small ``rtol``, and at least the ``least`` number for stability or four fifths of the steps.
     """
     predicted = jnp.maximum(steps, 2)
     stable = jnp.minimum(jnp.ceil(least), predicted * 4 // 5).astype(predicted.dtype)

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from drivetrain_jax.analysis.periodic.propagator import Propagator
     from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
-# Steps of the explicit scheme over those of the coarser solution that tells its error, up to this rtol, where the system
-# predicts them itself: of any other one it is not known that the order of the scheme shows with so few.
+# Ratio of the explicit steps to those of the coarser solution for the error estimate, up to this rtol, if the system
+# predicts its steps. For other systems so few steps may not show the order of the scheme.
 _RATIO, _FINE = 4, 1e-8
 
 Form = Callable[["FloquetModel"], "LinearPeriodic"]
@@ -83,7 +83,7 @@ def direct_solvers(
 class _ExplicitSteps:
     """Steps of the explicit scheme by march: ``short``, ``long`` or ``damped`` (the other form), inf for the other two.
 
-    Those asked for last are kept: the solvers of a plan ask for the same columns one after the other.
+    The last request is cached, because the solvers of a plan request the same columns in turn.
     """
 
     def __init__(self, system: type[System], rtol: float, has_stiff: bool) -> None:
@@ -110,7 +110,7 @@ def _solve(
     effort: Array,
     explicit: bool,
 ) -> dict[str, Array]:
-    # Diffrax takes as long to import as jax: nobody should wait for that to look at a result.
+    # diffrax takes as long to import as jax, and is not needed to read a result.
     from drivetrain_jax.analysis.periodic.propagator import PIECES, Order8, Radau, propagator
 
     scheme = Order8 if explicit else Radau

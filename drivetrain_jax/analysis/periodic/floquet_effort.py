@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 # Below this many explicit steps the implicit scheme is never the cheaper one.
 _STIFF = 600
-# Marches of more explicit steps are long: they share no batch with others, whose rounding would grow with the steps. The
-# steps of a stiff point are at least so many times those of its oscillation.
+# Marches of more explicit steps are long: they have separate batches, because rounding grows with the steps. A stiff point
+# needs at least this ratio of steps to those of its oscillation.
 LONG, _OSCILLATES = 10_000, 10.0
 # Beyond these a scheme does not start: the point is left to the other one, or ends as STEP_LIMIT.
 _MAX_EXPLICIT, _MAX_PANELS = 1_000_000, 20_000
 # A model without a value somewhere in its span is solved all the same: that makes the outcome NOT_FINITE.
 _TO_FIND_NO_VALUE = 64
-# Seconds of one implicit panel over those of one explicit step, per point. Full batches would have 150; but few points share
-# a chunk whatever they need, and steps that a point does not need cost it exactness, too.
+# Ratio of the time of one implicit panel to one explicit step, per point. Full batches would have 150; but few points share
+# a chunk, and unneeded steps cost a point accuracy too.
 PANEL_COST = 50.0
 # Nodes and weights of a quadrature over [0, 1].
 _NODES, _WEIGHTS = ((x + a) / 2 for x, a in zip(np.polynomial.legendre.leggauss(8), (1, 0), strict=True))
@@ -56,7 +56,7 @@ def traced_steps(build: Build, values: Mapping[str, Any], rtol: float) -> Array:
 
 
 def strongly_damped(system: type[System], columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Where the explicit scheme uses the ``stiff`` form of the model as well, ``(N,)``."""
+    """Flags of points where the explicit scheme also uses the ``stiff`` form of the model, ``(N,)``."""
     build = system.models["floquet"].build
     strong = build(columns).strongly_damped() if _knows(build, "strongly_damped", columns) else False
     return np.broadcast_to(strong, count_of(columns))
@@ -100,7 +100,7 @@ def _steps_of(phase: np.ndarray | Array, rtol: float) -> np.ndarray:
 
 
 def _knows(build: Build, fact: str, columns: Mapping[str, Any]) -> bool:
-    """Whether the model tells this ``fact`` itself, found out without computing anything of it."""
+    """True if the model provides this ``fact``, found without computing it."""
     words, numbers = split(columns)
     leaves, tree = jax.tree.flatten(numbers)
     return _known(build, fact, words, tree, len(leaves))

@@ -1,9 +1,9 @@
-"""The propagator of a linear periodic system over the span of its reduced form: what an atlas interpolates.
+"""The propagator of a linear periodic system over the span of its reduced form, interpolated by an atlas.
 
-``Phi`` is a smooth function of the parameters, which multipliers and spectral radius are not. It is computed by the
-direct solvers of ``floquet`` with two step sizes, whose difference tells its error.
+``Phi`` is a smooth function of the parameters; multipliers and spectral radius are not. The direct solvers of ``floquet``
+compute it with two step sizes, whose difference estimates its error.
 
-Scenes know it only as ``atlas`` (``analysis/atlas.py``), which is why it has that name and the model of that name.
+Scenes know it only as ``atlas`` (``analysis/atlas.py``), so this analysis and its model have that name.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from drivetrain_jax.systems import System
 if TYPE_CHECKING:
     from drivetrain_jax.systems import LinearPeriodic
 
-# The result that an atlas interpolates, and what it may be wrong by.
+# The interpolated result, and its error.
 PROPAGATOR, CHANGE = "propagator", "propagator_change"
 VARIABLES = (
     Variable(PROPAGATOR, "1", "entries of the propagator over the span of the reduced form, by rows", ("entry",)),
@@ -35,7 +35,7 @@ _CHUNKS = (32, 16)
 
 
 def whole_span(form: LinearPeriodic) -> LinearPeriodic:
-    """``form`` with its span taken for the period: the monodromy matrix is then the propagator itself."""
+    """``form`` with its span as period: the monodromy matrix is then the propagator itself."""
     if form.reversor is None or form.log_determinant is None:
         return replace(form, reversor=None)
     exact = form.log_determinant

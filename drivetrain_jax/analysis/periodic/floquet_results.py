@@ -1,4 +1,4 @@
-"""The results of the floquet analysis from a monodromy matrix, however that was obtained."""
+"""The results of the floquet analysis from a monodromy matrix."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ def results(
 ) -> dict[str, Array]:
     """The requested variables and the outcome from a monodromy matrix of ``system`` with trailing batch axes.
 
-    ``spectrum``: real and imaginary parts of the eigenvalues of ``z.matrix`` where they are known already. Otherwise the
-    spectral radius of four states is found in closed form, and by eigenvalues only where that says too little.
+    ``spectrum``: real and imaginary parts of the eigenvalues of ``z.matrix``, if known. Otherwise the spectral radius of
+    four states comes from the closed form, and from eigenvalues only where the closed form is not accurate enough.
     """
     wanted = set(outputs)
     finite = jnp.all(jnp.isfinite(z.matrix), axis=(0, 1))
@@ -95,7 +95,7 @@ def results(
     found |= {"spectral_radius": rho * size, "liouville_residual": jnp.where(finite, z.residual, jnp.nan)}
     met = z.met
     if wanted & NEED_ERROR:
-        # What underflows is not 0: then the smallest number is its bound.
+        # A value that underflows is not 0: its bound is the smallest number.
         met = (error <= 10 * rtol * rho) & (rho * size >= _TINY)
         bound = jnp.maximum(error * size, _TINY)
         found |= {"spectral_radius_error": bound, "verdict": verdict(rho * size, bound)}

@@ -34,7 +34,7 @@ TURNED_AWAY = -1.0
 # A stride is kept if its first correction is below this part of it and the tangent turns by less than this cosine.
 FIRST_CORRECTION = 0.3
 TURN = 0.8
-# Last correction of an orbit on the way; looser ones leave no room for the strides that sharp bends need.
+# Largest last correction of an orbit on the way; looser ones prevent the long strides between bends.
 WAYPOINT_GOAL = 1e-4
 WAYPOINT_RTOL = 1e-9
 # Corrections this small that no longer shrink have reached the limit of the arithmetic.
@@ -164,7 +164,7 @@ def shoot(field: Field, response: Array, period: float, rtol: float) -> Orbit:
         return ~s.found & onwards & (s.total < MAX_CORRECTIONS)
 
     def correct(s: _Path) -> _Path:
-        # In a batch the loop goes on until the last lane is done: the others wait, and no step is taken for them.
+        # In a batch the loop runs until the last lane is done: finished lanes wait without steps.
         span = jnp.where(running(s), period, 0.0)
         step = transition(extended, s.point, span, jnp.where(s.last, rtol, WAYPOINT_RTOL))
         # Either lambda is fixed at 1, or the correction is normal to the path.
@@ -190,7 +190,7 @@ def _predict(waypoint: Array, tangent: Array, stride: Array, total: Array, matri
     last = stride * tangent[-1] >= (1 - 1e-6) * left
     stride = jnp.where(last, left / jnp.where(last, tangent[-1], 1.0), stride)
     point = waypoint + stride * tangent
-    # On the last stride lambda is 1 exactly, whatever the rounding.
+    # On the last stride lambda is exactly 1, despite rounding.
     point = point.at[-1].set(jnp.where(last, 1.0, point[-1]))
     return _Path(
         waypoint,
@@ -207,7 +207,7 @@ def _predict(waypoint: Array, tangent: Array, stride: Array, total: Array, matri
 
 
 def _judge(s: _Path, delta: Array, direction: Array, step: Transition, rtol: float) -> _Path:
-    """What follows a correction: another one, the next stride, or a shorter one."""
+    """The next action after a correction: another one, the next stride, or a shorter one."""
     point = s.point + delta
     change = jnp.max(jnp.abs(delta))
     shrinking = (change <= 0.5 * s.correction) & (direction @ s.tangent >= TURN)

@@ -41,10 +41,10 @@ class Propagator(NamedTuple):
     growth: Array
 
 
-# Order of the explicit scheme; stages of the implicit one, and what its errors fall with at least (the stage order, which is
-# what stiff problems leave of the classical order 15).
+# Order of the explicit scheme; stages of the implicit one, and the least order of its errors (the stage order, which stiff
+# problems have instead of the classical order 15).
 EXPLICIT_ORDER, STAGES, IMPLICIT_ORDER = 8, 8, 8
-# Lanes that march together: what a step reads and writes stays in the innermost caches.
+# Lanes per block: the data of a step fit into the innermost caches.
 LANES = 32
 # States whose largest entry is beyond exp(70), or below exp(-70), are scaled: far from overflow, even squared.
 _FAR = 70.0
@@ -67,9 +67,9 @@ class _Record(NamedTuple):
 
 
 class EqualSteps(diffrax.AbstractSolver):
-    """A solver of linear periodic terms: each step of diffrax is ``count`` equal steps of a scheme of its own.
+    """A solver of linear periodic terms: each step of diffrax is ``count`` equal steps of its scheme.
 
-    The state is a vector or a matrix of them. Where it is far from 1 it is scaled; the logarithm is in the solver's state.
+    The state is a vector or a matrix of vectors. Far from 1 it is scaled; the logarithm is in the solver's state.
     """
 
     count: Any
@@ -117,7 +117,7 @@ class Order8(EqualSteps):
 
     def piece(self, terms: LinearPeriodic, t0: Any, t1: Any) -> tuple[Array, Array]:
         """See :class:`EqualSteps`."""
-        # What else there is of the term has no part in it.
+        # Other parts of the term are not used.
         arrays, rest = eqx.partition(LinearPeriodic(terms.rows, 0.0, terms.basis), eqx.is_array)
         shared = jnp.asarray(t0, float), jnp.asarray(t1, float), self.count
         if not jax.tree.leaves(arrays) or not isinstance(terms.rows, eqx.Module | jax.tree_util.Partial):

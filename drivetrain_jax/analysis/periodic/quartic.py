@@ -96,7 +96,7 @@ def invariants(phi: Blocks, left_out: Array | float = 0.0) -> tuple[tuple[Array,
 
 def with_determinant(e: Sequence[Array] | Array, errors: Sequence[Array] | Array, log_d: Array) -> Coefficients:
     """The coefficients from ``e1, e2, e3``, bounds of their errors, and log d."""
-    # Not made anew, by an exponential each, wherever a power of it is needed.
+    # Computed once, because every power of it would need an exponential.
     kappa = stored(jnp.exp)(log_d / 4)
     return Coefficients(*e, kappa, (*errors, 8 * EPS * (1 + jnp.abs(log_d)) * kappa**4))  # pyright: ignore[reportCallIssue]
 
@@ -117,7 +117,7 @@ def _cubic_root(p2: Array, p1: Array, p0: Array) -> Array:
     bend = -p2 / 3
     concave = (bend > 0) & (((bend + p2) * bend + p1) * bend + p0 > 0)
     # Where w >= 1/4, w^2 <= m2 w + m1 - 4 p0 with the magnitudes m of negative coefficients. A step costs less than a
-    # square root or a quotient that would make the bound sharper.
+    # square root or a quotient for a tighter bound.
     m2, m1 = jnp.maximum(-p2, 0.0), jnp.maximum(-p1, 0.0)
     bound = jnp.maximum((m2 + jnp.sqrt(m2**2 + 4 * (m1 - 4 * p0))) / 2, 0.25)
     # If p2 > 0, w^3 may be left out.
@@ -183,7 +183,7 @@ def factors(c: Coefficients) -> tuple[_Factor, _Factor]:
 
 
 def _unexplained(c: Coefficients, one: _Factor, two: _Factor) -> tuple[Array, ...]:
-    """``errors`` plus what the product of the factors misses."""
+    """``errors`` plus the residual of the product of the factors."""
     t1, t2, m1, m2 = 2 * one.half, 2 * two.half, one.m**2, two.m**2
     misses = (c.e1 - (t1 + t2), c.e2 - (m1 + m2 + t1 * t2), c.e3 - (t1 * m2 + t2 * m1), 0.0)
     return tuple(jnp.abs(miss) + error for miss, error in zip(misses, c.errors, strict=True))
@@ -234,10 +234,11 @@ def spectral_radius(c: Coefficients, split: tuple[_Factor, _Factor] | None = Non
 
 
 def nothing_crosses(c: Coefficients, log_d: Array) -> Array:
-    """Whether no polynomial within the errors has a root on the unit circle: as many lie inside for all of them.
+    """True if no polynomial within the errors has a root on the unit circle: the number of roots inside is then the same
+    for all.
 
-    None of p(1), p(-1) and g = 1 + d - e2 + e1^2/4 - w^2/4, w = (e1 + e1 d - 2 e3)/(1 - d), may vanish:
-    p = (sigma^2 - P sigma + 1)(sigma^2 - Q sigma + d) is the same as g = 0, and w = P - Q.
+    None of p(1), p(-1) and g = 1 + d - e2 + e1^2/4 - w^2/4, w = (e1 + e1 d - 2 e3)/(1 - d), may vanish: p = (sigma^2 - P
+    sigma + 1)(sigma^2 - Q sigma + d) is the same as g = 0, and w = P - Q.
     """
     e1, e2, e3, d = c.e1, c.e2, c.e3, jnp.exp(log_d)
     d1, d2, d3, dd = c.errors

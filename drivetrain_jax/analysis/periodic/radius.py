@@ -1,8 +1,7 @@
 """Spectral radius of a monodromy matrix with a bound of its error: from its eigenvalues, or in closed form.
 
-The coefficients of the characteristic polynomial are known with an error; the bound says how far that moves the largest
-multiplier. For four states the closed form of :mod:`~drivetrain_jax.analysis.periodic.quartic` costs a tenth of the
-eigenvalues.
+The bound follows from the error of the coefficients of the characteristic polynomial. For four states the closed form of
+:mod:`~drivetrain_jax.analysis.periodic.quartic` costs a tenth of the eigenvalues.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ _ROUNDINGS = 16.0
 
 
 def has_closed_form(z: Array) -> bool:
-    """Whether ``z`` ``(n, n, ...)`` has four states, and lanes as its only batch axis (one by one they gain nothing)."""
+    """True if ``z`` ``(n, n, ...)`` has four states, and lanes as its only batch axis (single points gain nothing)."""
     return len(z) == 4 and z.ndim == 3
 
 
@@ -33,9 +32,10 @@ def radius_by_eigenvalues(spectrum: Spectrum, error: Array) -> Radius:
 
 
 def radius_in_closed_form(z: Array, error: Array, scale: Array, tolerance: float) -> Radius:
-    """The same of ``z`` ``(4, 4, N)``, by eigenvalues only for lanes where the closed form does not say enough.
+    """The same of ``z`` ``(4, 4, N)``, with eigenvalues only for lanes where the closed form is insufficient.
 
-    That is where its bound is not tight, is over ``tolerance`` rho, or leaves open on which side of 1 ``scale`` rho lies.
+    It is insufficient if its bound is not tight, exceeds ``tolerance`` rho, or does not show the side of 1 of ``scale``
+    rho.
     """
     a = characteristic_coefficients(z)
     # The determinant of the matrix itself, although the exact one may be known: multipliers that nearly meet are moved

@@ -1,8 +1,8 @@
-"""Where a tongue of parametric resonance begins: the least excitation that makes a periodic system unstable.
+"""The tip of a tongue of parametric resonance: the least excitation that makes a periodic system unstable.
 
 At the edge of a subharmonic tongue one Floquet multiplier is -1, that is p = det(Z + I) = 0. :func:`tongue_edge` solves
-this for the amplitude of the excitation at given frequencies; :func:`tongue_tip` finds the least of these amplitudes
-over the frequency from the Chebyshev interpolant of the edge, which is an analytic function near its minimum.
+this for the amplitude of the excitation at given frequencies; :func:`tongue_tip` finds the least of these amplitudes over
+the frequency from the Chebyshev interpolant of the edge, which is an analytic function near its minimum.
 """
 
 from __future__ import annotations

@@ -17,11 +17,11 @@ _NOTHING = 1e-9
 
 
 def zero_modes(shaft: Shaft) -> Array:
-    """Number of mechanisms (modes of frequency 0), shape of the lanes, from where springs and hinges are missing.
+    """Number of mechanisms (modes of frequency 0), shape of the lanes, from the missing springs and hinges.
 
-    From left to right the motions (f, theta) that cost no energy form the plane, a line or nothing. A support takes
-    the motions with f != 0 away; a line with f = 0 is one that turns about this section; a hinge without stiffness
-    frees theta, and a rotation that ends there is a mode of its own.
+    From left to right the motions (f, theta) without energy form the plane, a line or nothing. A support removes the
+    motions with f != 0. A line with f = 0 is a rotation about this section. A hinge without stiffness frees theta, and a
+    rotation that ends there is a separate mode.
     """
     lanes = shaft.lanes
     dimension, turning, found = jnp.full(lanes, 2), jnp.zeros(lanes, bool), jnp.zeros(lanes, int)

@@ -26,7 +26,7 @@ from drivetrain_jax.analysis.shafts.mechanisms import zero_modes
 from drivetrain_jax.systems import Shaft
 
 MAX_STEPS = 90
-# After as many steps some 5 % of the brackets are open.
+# After this many steps some 5 % of the brackets are open.
 COMMON_STEPS = 16
 # A clamped segment has more frequencies below the phase z than z/pi minus this.
 _CLAMPED_DEFICIT = 1.6
@@ -35,7 +35,7 @@ _CLOSED = 4 * np.finfo(float).eps
 # Ratio of the ends up to which a bracket is narrow enough for arithmetic means and for interpolation.
 _NEAR = 4.0
 _TRUNCATION = 0.2
-# Share of the brackets that go on at a time, and the smallest number worth it.
+# Share of the brackets that continue together, and the smallest useful number.
 _FEW, _WORTH = 1 / 16, 32
 # Relative distance up to which frequencies count as one; and up to which a zero of Psi is that of the frequency.
 _MULTIPLE = 1e-13
@@ -206,7 +206,7 @@ def frequency_derivatives(build: Callable[[Any], Shaft], parameters: Any, q: Arr
 
 
 def _multiple(shaft: Shaft, q: Array) -> Array:
-    """Which frequencies agree with a neighbour to rounding, the one after the last of them among these."""
+    """Flags of the frequencies that agree with a neighbour to rounding, including the one after the last."""
     near = q[1:] - q[:-1] <= _MULTIPLE * q[1:]
     none = jnp.zeros_like(q[:1], bool)
     above = jnp.where(q[-1:] > 0, q[-1:] * (1 + _MULTIPLE), 1.0)
@@ -225,8 +225,8 @@ def relative_error(shaft: Shaft, roots: Roots) -> Array:
     value, slope = jax.jvp(lambda q: pairings(mirrored, q), (safe,), (jnp.ones_like(safe),))
     shifts = jnp.abs(value / (slope * safe))
     shifts = jnp.where(jnp.isfinite(shifts), shifts, jnp.inf)
-    # What is no zero at all belongs to a section that the mode does not reach.
+    # A value that is no zero belongs to a section that the mode does not reach.
     shift = jnp.where(shifts[-1] < _ZERO, shifts[-1], jnp.min(shifts, axis=0))
-    # Where frequencies cluster Psi is flat and its zero says little: the bracket alone speaks.
+    # In a cluster Psi is flat, and its zero is inaccurate: use only the bracket.
     shift = jnp.where(jnp.isfinite(shift), jnp.minimum(shift, 1.0), 0.0)
     return jnp.where(roots.q > 0, 2 * shift + roots.width + 2 * np.finfo(float).eps, 0.0)

@@ -108,7 +108,7 @@ class _Segments(NamedTuple):
 
     @property
     def long(self) -> Array:
-        """Whether the hyperbolic pair is followed as a falling and a rising wave."""
+        """True if the hyperbolic pair is treated as a falling and a rising wave."""
         return self.number * self.z > 1
 
 
@@ -125,7 +125,7 @@ class _Links(NamedTuple):
 
 
 def _along_segments(w: _Segments) -> _Links:
-    """From the beginning of every segment to its end, for either direction."""
+    """From the start of every segment to its end, for either direction."""
     o, c, s = jnp.zeros_like(w.cosine), w.cosine, w.sine
     alpha, beta, alpha_h, beta_h = (
         jnp.stack(form, axis=1) for form in ((o, -c, o, s), (s, o, -c, o), (o, s, o, c), (c, o, s, o))
@@ -229,7 +229,7 @@ def _end_states(shaft: Shaft, q: Array, waves: _Segments) -> tuple[Array, Array]
 
     at_front, at_behind = _shared_states(front, right_front), _shared_states(behind, right_behind)
     shared, square, moving = (ends(a, b) for a, b in zip(at_front, at_behind, strict=True))
-    # Where parts that do not see each other share a frequency all is rounding, and any amplitudes will do.
+    # If independent parts share a frequency, all is rounding and any amplitudes are valid.
     moving = moving | ~jnp.any(moving, axis=0)
     logs = ends(log_front + log_d_behind[::-1], log_behind + log_d[::-1])
     unit = jnp.log(jnp.repeat(Scales.of(shaft).e1, 2, axis=0))[:, None]

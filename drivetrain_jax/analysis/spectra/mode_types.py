@@ -1,9 +1,9 @@
 """Modes of one block of a spring system with their families: rotational, translational, planet, or a mixture.
 
-Eigenvectors of a multiple frequency are arbitrary within its space. There the vectors are turned until they diagonalise
-the operator that has the number of the family as its eigenvalue: a pure mode that is in the space at all then appears
-as a vector of its own. Frequencies that differ have vectors of their own, however close they are, which stay what they
-are; only the name of a mode may be that of a vector turned within a wider cluster.
+Eigenvectors of a multiple frequency are arbitrary within its space. They are rotated until they diagonalise the operator
+whose eigenvalue is the number of the family, so a pure mode in the space becomes a vector. Eigenvectors of different
+frequencies stay unchanged, however close the frequencies are. Only the name of a mode may come from a vector rotated within
+a wider cluster.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MODE_TYPES = ("rigid", *FAMILIES, "coupled")
 RIGID, COUPLED = 0, len(FAMILIES) + 1
 # A mode belongs to a family if less than this share of it lies outside.
 PURITY = 1e-6
-# Angular frequencies that agree to so many units of rounding of the largest one count as one frequency.
+# Rounding units of the largest angular frequency within which frequencies count as equal.
 _ROUNDING = 64
 # Distance within which angular frequencies form a cluster, relative: their modes are named, followed and differentiated
 # together.
@@ -31,7 +31,7 @@ CLUSTER = 5e-8
 # Up to this asymmetry the families are uncoupled but for nearly equal frequencies: wider clusters are named together.
 SYMMETRIC = 2e-9
 _CLUSTER_IF_SYMMETRIC = 5e-5
-# Weight of motions along x beside the numbers of the families: these come first.
+# Weight of motions along x relative to the numbers of the families: these come first.
 _POLARISATION = 0.5
 
 
@@ -77,14 +77,14 @@ def _in_frame(block: Block, vectors: Array) -> Array:
 
 
 def clusters(frequency: Array, tolerance: Array) -> Array:
-    """Whether modes i and j are in one cluster, (n, n, ...): neighbours ``tolerance`` (n - 1, ...) apart at most."""
+    """Flags of modes i and j in one cluster, (n, n, ...): neighbours at most ``tolerance`` (n - 1, ...) apart."""
     apart = (frequency[1:] - frequency[:-1] > tolerance).astype(jnp.int32)
     number = jnp.concatenate([jnp.zeros_like(apart[:1]), jnp.cumsum(apart, axis=0)])
     return number[:, None] == number[None]
 
 
 def one_frequency(frequency: Array, largest: Array) -> Array:
-    """Which modes (n, n, ...) count as one cluster of the system whose largest frequency is ``largest`` (...)."""
+    """Flags of modes (n, n, ...) in one cluster of the system whose largest frequency is ``largest`` (...)."""
     return clusters(frequency, jnp.maximum(CLUSTER * frequency[1:], _ROUNDING * EPS * largest))
 
 
@@ -127,5 +127,5 @@ def mode_types(frequency: Array, label: Array, largest: Array) -> Array:
 
 
 def is_rigid(frequency: Array, largest: Array) -> Array:
-    """Which modes have no frequency beyond rounding of the largest one."""
+    """Flags of modes whose frequency is rounding of the largest one."""
     return frequency <= _ROUNDING * EPS * largest

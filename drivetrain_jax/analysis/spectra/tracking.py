@@ -12,7 +12,7 @@ from jax import Array, lax
 
 from drivetrain_jax.analysis.numerics.linear_algebra import looped_matmul
 
-# Below this share in the space of its new frequency a shape is not carried on but taken anew.
+# Share in the space of its new frequency below which the shape of a branch is replaced.
 _CARRIED = 0.25
 # Among the modes of one space, whose MAC are equal, the nearest vector is taken.
 _OWN = 1e-3
@@ -22,11 +22,11 @@ def follow(vectors: Array, same: Array) -> tuple[Array, Array]:
     """``branch`` and ``mac``, both ``(L, n, ...)``, of modes along a path of ``L`` points.
 
     ``vectors`` (L, m, n, ...): orthonormal shapes as columns (mass-weighted, or sampled so that they are orthonormal);
-    ``same`` (L, n, n, ...): which modes of a point share one frequency. ``branch`` (int32) is the number, from 1, of
-    the mode at the first point that each mode continues; ``mac`` the share, 0 to 1, that the shape of the branch at the
-    previous point has in the space of the mode (1 at the first point). Every branch goes on at every point; pairs are
-    made by falling MAC. Where ``vectors`` are not finite, ``mac`` is NaN and the order by frequency is kept: the points
-    beside them are each other's neighbours, and the first point is the first one whose vectors are finite.
+    ``same`` (L, n, n, ...): flags of modes of a point with equal frequencies. ``branch`` (int32) is the number, from 1, of
+    the mode at the first point that each mode continues. ``mac``, from 0 to 1, is the share of the branch's previous shape
+    in the space of the mode (1 at the first point). Every branch continues at every point; pairs are formed by falling MAC.
+    Where ``vectors`` are not finite, ``mac`` is NaN and the order by frequency is kept. Such points are skipped: the points
+    on both sides are neighbours, and the first point is the first finite one.
     """
     n = vectors.shape[2]
     numbers = jnp.arange(1, n + 1, dtype=jnp.int32).reshape(n, *(1,) * (vectors.ndim - 3))
