@@ -102,7 +102,10 @@ def value_text(name: str, value: object, units: str = "1") -> str:
 
 
 def caption(dataset: xr.Dataset) -> str:
-    """One line with the fixed parameters of the scene, then scalar coordinates; defaults are left out."""
+    """One line with the fixed parameters of the scene, then scalar coordinates; defaults are left out.
+
+    Joined results may differ in what their scenes fix: only their coordinates are shown.
+    """
     fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}"))
     scene = tomllib.loads(dataset.attrs["scene"]) if "scene" in dataset.attrs else {"fixed": fixed}
     named = {name for table in ("fixed", "axes", "points") for name in scene.get(table, {})}
@@ -113,9 +116,9 @@ def caption(dataset: xr.Dataset) -> str:
     varies = {str(name) for name in (*dataset.coords, *dataset.dims)}
     parts = [_fixed_text(name, _unless_swept(dataset, name, fixed[name])) for name in shown if name not in varies]
     parts += [
-        value_text(str(name), coordinate.item(), coordinate.attrs.get("units", "1"))
-        for name, coordinate in dataset.coords.items()
-        if coordinate.ndim == 0 and name != "point"  # a number of a list needs no caption
+        value_text(name, coordinate.item(), coordinate.attrs.get("units", "1"))
+        for name, coordinate in scalars.items()
+        if name in named or name not in fixed
     ]
     return ", ".join([*parts, *([dataset.attrs["left_out"]] if "left_out" in dataset.attrs else [])])
 
