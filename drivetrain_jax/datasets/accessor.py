@@ -115,7 +115,8 @@ def _in_words(variable: xr.Variable) -> xr.Variable:
     encoding = {name: sizes for name, sizes in variable.encoding.items() if name == "preferred_chunks"}
     if variable.chunks is None:
         return xr.Variable(variable.dims, indexing.LazilyIndexedArray(words), attrs, encoding)
-    return xr.Variable(variable.dims, variable.data.map_blocks(words.of, dtype=words.dtype), attrs, encoding)
+    blocks = variable.data.map_blocks(words.of, dtype=words.dtype)  # pyright: ignore[reportAttributeAccessIssue]
+    return xr.Variable(variable.dims, blocks, attrs, encoding)
 
 
 class _Words(BackendArray):

@@ -52,10 +52,10 @@ class _Bar:
             self._show()
 
     def _show(self) -> None:
-        from IPython.display import HTML, display
+        from IPython.display import HTML, display  # pyright: ignore[reportMissingImports]
 
         self._shown = time.monotonic()
-        content = HTML(_html(self._last, self._shown - self._begin))
+        content = HTML(_html(self._last, self._shown - self._begin))  # pyright: ignore[reportArgumentType]
         if self._display:
             self._display.update(content)
         else:
