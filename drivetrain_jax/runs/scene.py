@@ -169,8 +169,11 @@ def _check_ranges(table: _SceneTable, analysis: Analysis) -> None:
 
 
 def _axis_table(name: str, given: Any) -> AxisTable:
+    if isinstance(given, list):
+        given = {"values": given}
     if not isinstance(given, Mapping):
-        raise InputError(f"axes.{name} = {shown(given)}: allowed is a table {{ start, stop, num }} or {{ values }}")
+        allowed = "allowed is a table { start, stop, num } or { values }, or a row of values"
+        raise InputError(f"axes.{name} = {shown(given)}: {allowed}")
     if isinstance(num := given.get("num"), float) and num.is_integer():
         # Options and parameters also accept 1e3 for 1000.
         given = {**given, "num": int(num)}

@@ -64,7 +64,15 @@ def _read(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] |
         for key, value in overrides.items():
             _replace(tree, key, plain(value))
     _check(tree, "scene")
-    return tree, write(tree) if text is None else text
+    return tree, write(_with_axes_as_tables(tree)) if text is None else text
+
+
+def _with_axes_as_tables(tree: dict[str, Any]) -> dict[str, Any]:
+    """``tree`` with ``{ values = [...] }`` for an axis that is given as a row of values."""
+    axes = tree.get("axes")
+    if not isinstance(axes, dict):
+        return tree
+    return {**tree, "axes": {n: {"values": axis} if isinstance(axis, list) else axis for n, axis in axes.items()}}
 
 
 def plain(value: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
@@ -71,6 +72,28 @@ def test_mapping_may_hold_numpy_values():
 def test_mapping_may_hold_what_is_like_a_list(values):
     scene = load_scene({**GOOD, "axes": {"a": {"values": values}}, "fixed": {"b": xr.DataArray(1.5)}})
     assert scene.axes[0].values.tolist() == list(values) and scene.fixed["b"] == 1.5
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.linspace(0, 1, 3),
+        jnp.linspace(0, 1, 3),
+        xr.Dataset(coords={"a": [0.0, 0.5, 1.0]})["a"],
+        xr.Dataset(coords={"a": [0.0, 0.5, 1.0]}).indexes["a"],
+        [0, np.float32(0.5), 1.0],
+        (0.0, 0.5, 1.0),
+    ],
+    ids=lambda values: type(values).__name__,
+)
+def test_an_axis_may_be_a_row_of_values(tmp_path, values):
+    scene = load_scene({**GOOD, "axes": {"a": values}})
+    assert scene.axes[0].values.tolist() == [0, 0.5, 1]
+    # The text is that of a scene file, whoever reads it.
+    assert "a = { values = [0.0, 0.5, 1.0] }" in scene.text.replace("[0,", "[0.0,")
+    changed = load_scene(GOOD, {"axes.a": values})
+    assert changed.axes[0].values.tolist() == [0, 0.5, 1] and changed.text == scene.text
+    assert load_scene({**GOOD, "axes": {"a": range(3)}}).axes[0].values.tolist() == [0, 1, 2]
 
 
 def test_text_of_a_changed_scene_gives_that_scene(tmp_path):
@@ -166,6 +189,8 @@ WRONG = {
     "axis without stop": (changed(axes={"a": {"start": 0, "num": 3}}), "axes.a.stop: missing", "values"),
     "axis with everything": (changed(axes={"a": {"start": 0, "values": [1]}}), "axes.a", "one of the two"),
     "unknown key of an axis": (changed(axes={"a": {"begin": 0}}), "axes.a.begin", "start"),
+    "axis of two dimensions": (changed(axes={"a": np.zeros((2, 2))}), "axes.a.values = [[0.0", "number"),
+    "axis that is one number": (changed(axes={"a": np.float64(0.5)}), "axes.a = 0.5", "row of values"),
     "axis that is no table": (changed(axes={"a": 3}), "axes.a = 3", "table"),
     "unknown scale": (changed(axes={"a": {"start": 1, "stop": 2, "num": 3, "scale": "ln"}}), "'ln'", "lin, log"),
     "log axis from zero": (changed(axes={"a": {"start": 0, "stop": 2, "num": 3, "scale": "log"}}), "start = 0", "> 0"),
