@@ -41,8 +41,8 @@ VARIABLES = (
     Variable("regime", "1", REGIME, SWEEP, dtype="int8", flags=REGIMES),
     Variable("stability", "1", "stability of the motion", SWEEP, dtype="int8", flags=STABILITY),
     Variable("spectral_radius", "1", "spectral radius of the transition over the motion's period", SWEEP),
-    Variable("residual", "m/s2", "rms of what the motion leaves unbalanced in the equation of motion", SWEEP),
-    Variable("period_multiple", "1", "periods of the drive in one of the motion, 0: none found", SWEEP, dtype="int32"),
+    Variable("residual", "m/s2", "rms residual of the equation of motion", SWEEP),
+    Variable("period_multiple", "1", "period of the motion in drive periods (0: not found)", SWEEP, dtype="int32"),
     Variable("state_error", "m", "estimated error of the motion", SWEEP),
     Variable("branch_u_max", "m", "largest relative displacement of every motion found", BRANCH),
     Variable("branch_u_min", "m", "smallest relative displacement of every motion found", BRANCH),
@@ -57,7 +57,7 @@ VARIABLES = (
 OPTIONS = (
     RTOL,
     Parameter(
-        "most_periods", "1", "periods waited for a motion to settle", default=1000, lower=32, upper=1e6, integer=True
+        "most_periods", "1", "largest number of drive periods until a motion settles", default=1000, lower=32, upper=1e6, integer=True
     ),
     Parameter("harmonics", "1", "harmonics of the drive's frequency", default=15, lower=1, upper=200, integer=True),
     Parameter("subharmonic", "1", "order of the subharmonics kept", default=1, lower=1, upper=8, integer=True),
@@ -71,7 +71,7 @@ OPTIONS = (
         integer=True,
     ),
     Parameter(
-        "fit_range", "m", "range R of the cubic fit, 0: the peak amplitude that it gives", default=0.0, lower=0.0
+        "fit_range", "m", "range R of the cubic fit (0: its own peak amplitude)", default=0.0, lower=0.0
     ),
 )
 METHODS = {

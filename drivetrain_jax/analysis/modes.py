@@ -42,7 +42,7 @@ VARIABLES = (
     Variable("participation", "1", "share of the mode in each family", ("mode", "family")),
     Variable("kinetic_energy", "1", "share of the mode's kinetic energy in each body", ("mode", "body")),
     Variable("mode_shape", "kg-1/2", "mode shape of unit modal mass", ("mode", "dof")),
-    Variable("branch", "1", "number of the branch that the mode continues along the track", ("mode",), "int32"),
+    Variable("branch", "1", "number of the branch of the mode along the track", ("mode",), "int32"),
     Variable("mac", "1", "assurance criterion of the mode with its branch at the previous point", ("mode",)),
 )
 _SPECTRUM = {"natural_frequency", "natural_frequency_error"}
@@ -314,7 +314,7 @@ ANALYSIS = Analysis(
         "auto": "by the invariant blocks of a symmetry, if there is one",
         "full": "always the whole matrix",
     },
-    options=(Parameter("track", "1", "axis along which modes are followed", default="", text=True),),
+    options=(Parameter("track", "1", "axis along which modes are tracked", default="", text=True),),
     solvers=_solvers,
     dimensions=_dimensions,
     derivatives=_derivatives,

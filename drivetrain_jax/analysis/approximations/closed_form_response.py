@@ -1,7 +1,7 @@
 """Frequency response in closed form: multiple scales and describing function, with peak, folds, backbone, stability.
 
-Either gives all amplitudes at a frequency and the motion ``u = m + A cos(omega t - phi)`` of each; what is asked of a
-sweep is then a matter of choosing. Results are arrays ``(L, own dimensions, ...)``, the path first, the batch last.
+Both return all amplitudes at a frequency, and the motion ``u = m + A cos(omega t - phi)`` of each; a sweep selects among
+them. Results are arrays ``(L, own dimensions, ...)``, the path first, the batch last.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def _of_branches(motions: OneTerm) -> dict[str, Array]:
 
 
 def _of_curves(curves: Curves, omega: Array, shape: tuple[int, ...]) -> dict[str, Array]:
-    """What belongs to the response as a whole, the same at every frequency."""
+    """Quantities of the response as a whole, equal at every frequency."""
 
     def along(value: Array) -> Array:
         return jnp.broadcast_to(value, (omega.size, *value.shape))

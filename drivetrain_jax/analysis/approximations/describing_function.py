@@ -194,7 +194,7 @@ def skeleton(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Skelet
     folds = []
     for sign in (-1.0, 1.0):
         slope = arm_slope(model, nodes, points, sign)
-        # Where the arms meet the root vanishes: the sign of the other term, also in rounding.
+        # Where the arms meet the root vanishes: use the sign of the other term, to avoid rounding.
         slope = jnp.where(meet, -sign, slope)
         mask = sign_changes(slope > 0, _FOLDS_PER_ARM)
         low, high, start = take(mask, nodes[:-1]), take(mask, nodes[1:]), take(mask, slope[:-1])
@@ -298,9 +298,10 @@ def _arm_gap(
 
 
 def _brackets(bones: Skeleton, square: Array) -> tuple[Array, Array, Array]:
-    """Intervals of the skeleton where an arm crosses ``omega^2`` as a mask, which arm (-1, 1), whether the gap rises there.
+    """Intervals of the skeleton where an arm crosses ``omega^2``, as a mask; the arm (-1, 1); and flags where the gap
+    rises.
 
-    Each arm by itself: at light damping both may pass a frequency between the same two amplitudes.
+    Each arm separately: at light damping both may pass a frequency between the same two amplitudes.
     """
     lower, upper = bones.arms
     # At the peak, where the arms meet, one of the two holds.

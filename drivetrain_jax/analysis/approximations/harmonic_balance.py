@@ -48,7 +48,7 @@ class Basis:
 
     @cached_property
     def count(self) -> int:
-        """Samples of the base period; those asked for are per period of the drive."""
+        """Samples of the base period; the option counts them per period of the drive."""
         if self.samples:
             return self.samples * self.order
         # Fewer, and a contact between two samples that comes and goes interrupts the branch.
@@ -79,12 +79,12 @@ class Basis:
 
     @cached_property
     def projection(self) -> np.ndarray:
-        """From samples to coefficients, (n, M)."""
+        """Matrix from samples to coefficients, (n, M)."""
         return self.values.T * np.where(self.orders == 0, 1.0, 2.0)[:, None] / self.count
 
     @cached_property
     def products(self) -> tuple[np.ndarray, ...]:
-        """How moments of the contact make up the Jacobian: entry = a p[i] + b p[k], each of shape (n, n)."""
+        """Coefficients of the Jacobian in moments of the contact: entry = a p[i] + b p[k], each of shape (n, n)."""
         j, k = np.meshgrid(self.orders, self.orders, indexing="ij")
         sine = (np.arange(self.size) % 2 == 0) & (self.orders > 0)
         row, column = np.meshgrid(sine, sine, indexing="ij")
@@ -130,7 +130,7 @@ def _part(theta: Array) -> tuple[Array, ...]:
 
 
 def _crossing(d0: Array, d1: Array, rate0: Array, rate1: Array) -> Array:
-    """Where the cubic with these end values and rates vanishes in [0, 1], by Newton steps from the chord."""
+    """Zero in [0, 1] of the cubic with these end values and rates, by Newton steps from the chord."""
     change = d1 - d0
     theta = jnp.clip(d0 / jnp.where(change != 0, -change, 1.0), 0.0, 1.0)
     a, b = rate0 - change, change - rate1
@@ -252,7 +252,7 @@ def balance(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Arr
         better = (unbalanced < state.unbalanced) | (state.part <= _LEAST_PART) | (state.step <= 1e-7)
         size = norm(trial) + norm(change)
         step = norm(change) / jnp.where(size > 0, size, 1.0)
-        # A lane that has converged, or that is lost, stands still.
+        # A lane that has converged or failed does not move.
         going, taken = ~(state.step <= _TOLERANCE), better & usable
         moved = going & taken
         return _Iteration(
@@ -279,11 +279,11 @@ _DRIFT_STEPS = 40
 
 
 def drift(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array) -> Array:
-    """Coefficients after the slow motion of the balance itself from ``x``: it goes to a balance that is stable.
+    """Coefficients after the slow motion of the balance itself from ``x``, which ends at a stable balance.
 
-    Coefficients that vary slowly obey ``(2 omega/m D + c') x' = -residual``, D the derivative with respect to tau;
-    implicit Euler steps of half a drive period. Few harmonics may have their balance elsewhere than where the motion
-    itself settles, too far for Newton iterations.
+    Slowly varying coefficients satisfy ``(2 omega/m D + c') x' = -residual``, D the derivative with respect to tau; the
+    steps are implicit Euler steps of half a drive period. With few harmonics the balance may differ from the motion that
+    settles, too far for Newton iterations.
     """
     tail = (1,) * (x.ndim - 1)
     turn = jnp.asarray(basis.derivative).reshape(basis.size, basis.size, *tail)

@@ -129,8 +129,8 @@ def trace(model: PiecewiseLinearOscillator, basis: Basis, x: Array, start: float
 def at_frequency(
     model: PiecewiseLinearOscillator, basis: Basis, branch: Course, omega: Array, count: int
 ) -> tuple[Array, Array, Array, Array]:
-    """Up to ``count`` motions of the branch at ``omega``, in its order, balanced: ``(count, n, ...)``, which exist, which
-    are saddles of the balance, and whether these are as many as it has there."""
+    """Up to ``count`` motions of the branch at ``omega``, in its order, balanced: ``(count, n, ...)``; flags of existing
+    ones, of saddles of the balance, and if these are all."""
     guess, exists, every = sections(branch, omega, count)
 
     def improved(x: Array) -> tuple[Array, Array, Array]:

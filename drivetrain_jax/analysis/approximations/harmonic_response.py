@@ -29,12 +29,12 @@ _EXTREME_STEPS = 3
 _BEFORE = 0.999
 # Growth below this counts as stable: at a multiplier 1 within rounding.
 _MARGIN = 1e-9
-# Subharmonics below this part of the largest coefficient are what is left of the iterations.
+# Ratio to the largest coefficient below which subharmonics are remains of the iterations.
 _VANISHING = 1e-8
 
 
 class Described(NamedTuple):
-    """What is said about one motion, each of its lanes' shape."""
+    """Results of one motion, each of the shape of its lanes."""
 
     u_max: Array
     u_min: Array
@@ -69,7 +69,7 @@ def extreme(basis: Basis, x: Array, samples: Array, sign: float) -> Array:
 
 
 def repetitions(basis: Basis, x: Array) -> Array:
-    """How often the motion repeats within the base period: with subharmonics kept it may do without them."""
+    """Number of repetitions of the motion within the base period: with subharmonics kept, it may not use them."""
     size = jnp.max(jnp.abs(x[1:]), axis=0)
     times = jnp.ones(x.shape[1:])
     for count in (n for n in range(2, basis.order + 1) if basis.order % n == 0):
@@ -108,8 +108,8 @@ def response(
 ) -> dict[str, Array]:
     """The requested results of a line of frequencies ``model.omega`` (L,) of oscillators of the batch ``shape``.
 
-    Outcome ``NOT_CONVERGED`` where a sweep has no balanced motion, ``TOLERANCE_NOT_MET`` where the branch was asked for
-    and could not be followed to the lowest frequency, or has more motions than are given.
+    Outcome ``NOT_CONVERGED`` where a sweep has no balanced motion, ``TOLERANCE_NOT_MET`` where the requested branch could
+    not be followed to the lowest frequency, or has more motions than are stored.
     """
     omega = np.asarray(model.omega)
     lanes = shape or (1,)
@@ -137,8 +137,8 @@ def response(
 def _sweeps(
     model: PiecewiseLinearOscillator, basis: Basis, omega: np.ndarray, lanes: tuple[int, ...]
 ) -> tuple[Array, Array, Array]:
-    """Coefficients ``(L, 2, n, N)`` of the sweeps up and down, whether they are balanced, and whether saddles; both run
-    side by side."""
+    """Coefficients ``(L, 2, n, N)`` of the sweeps up and down, in parallel, and flags of balanced motions and of
+    saddles."""
     fine, places = refined(omega, _LARGEST_STEP, _MOST_PARTS)
     twice = jax.tree.map(lambda field: jnp.tile(field, 2), {k: v for k, v in vars(model).items() if k != "omega"})
     both = PiecewiseLinearOscillator(**twice, omega=None)

@@ -39,8 +39,8 @@ def _product(later: Rows, earlier: Rows) -> Rows:
 def _ordered_product(matrices: Rows) -> Rows:
     """Product of the matrices along the first axis, the last one leftmost.
 
-    In blocks side by side, then the blocks: loops whose results are stored, as XLA would compute the terms of one long
-    expression again for every use.
+    In parallel blocks, then the blocks: loops with stored results, because XLA would recompute the terms of one long
+    expression for every use.
     """
     tail = matrices[0].shape[1:]
     one, zero = jnp.ones(tail), jnp.zeros(tail)

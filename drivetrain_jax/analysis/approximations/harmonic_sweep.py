@@ -1,10 +1,9 @@
 """Slow sweeps of the drive's frequency by harmonic balance.
 
-At each frequency Newton iterations start from the motion at the last one. A motion that they lose, that jumps, or that
-has become unstable in a way the basis can follow (a fold; a doubled period, if subharmonics are kept) is left as in an
-experiment: the equation of motion is integrated from where the motion was until it has settled, and what it has
-settled to is balanced anew, from where the balance itself drifts to. If this fails, the motion of the Newton iterations
-is kept and its instability reported.
+At each frequency Newton iterations start from the motion at the last one. The motion is abandoned, as in an experiment, if
+the iterations lose it, if it jumps, or if it becomes unstable within the basis (a fold; a doubled period, if subharmonics
+are kept). The equation of motion is then integrated until it has settled, and the settled motion is balanced, starting from
+the drift of the balance. If this fails, the motion of the Newton iterations is kept and its instability reported.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ class Swept(NamedTuple):
 
 
 def _effort(model: PiecewiseLinearOscillator, basis: Basis, omega: Array) -> tuple[Array, Array]:
-    """Base periods that each lane takes to settle, and steps from one sample to the next: its own, whatever its batch."""
+    """Base periods for settling, and steps between two samples, of each lane, independent of its batch."""
     fastest = jnp.sqrt(model.stiffness * jnp.maximum(model.alpha, 1.0)) / omega
     steps = jnp.clip(2 * np.pi * _PER_RADIAN * fastest, *_STEPS)
     decay = -np.log(_SETTLED) * omega / (np.pi * jnp.maximum(model.damping, 1e-12 * omega))
@@ -100,7 +99,7 @@ def _runge_kutta(
 
 
 def _checked(model: PiecewiseLinearOscillator, basis: Basis, found: Balanced, omega: Array) -> tuple[Swept, Array]:
-    """A balanced motion with its half trace, and whether it is an attractor as far as the basis can tell."""
+    """A balanced motion with its half trace, and a flag if it is an attractor within the basis."""
     half = half_trace(model, basis, omega, contact(model, basis, found.x))
     growth = spectral_radius(model, basis, omega, half)
     # Without subharmonics a doubled period cannot be followed.
@@ -130,7 +129,7 @@ def step(model: PiecewiseLinearOscillator, basis: Basis, before: Swept, omega: A
         there, attracts = _checked(model, basis, balance(model, basis, seed, omega), omega)
         change = jnp.sqrt(jnp.sum((there.x - before.x)[1:] ** 2, axis=0))
         jumped = ~again & before.balanced & (change > _JUMP * size)
-        # What was settled to replaces what was lost unless it is no better.
+        # The settled motion replaces the lost one unless it is no better.
         taken = jnp.where(again, lost & (attracts | ~now.balanced), True)
         return count + 1, lost & (~attracts | jumped), seed, _kept(taken, there, now)
 

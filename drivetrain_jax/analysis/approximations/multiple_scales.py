@@ -44,7 +44,7 @@ class SlowFlow(NamedTuple):
 
 
 def _share(r: Array) -> Array:
-    """What the play takes from l1: ``(45 r - 50 r^3 + 21 r^5)/16``, 1 at r = 1."""
+    """Share by which the play reduces l1: ``(45 r - 50 r^3 + 21 r^5)/16``, 1 at r = 1."""
     return r * (45 - r**2 * (50 - 21 * r**2)) / 16
 
 
@@ -92,7 +92,7 @@ def self_consistent_range(model: PiecewiseLinearOscillator, shape: tuple[int, ..
         r = jnp.exp(log_r)
         return model.stiffness * (1 - (1 - model.alpha) * _share(r)) - (target / play * r) ** 2
 
-    # Half of what follows from contact alone is below every solution where r is small.
+    # Half the solution for contact alone is below every solution with small r.
     linear = target / jnp.sqrt(model.stiffness * jnp.ones(shape))
     least = jnp.minimum(_SMALL_RATIO, play / jnp.where(linear > 0, linear, play) / 2)
     turning = _turning_ratios(model.alpha + jnp.zeros(shape))

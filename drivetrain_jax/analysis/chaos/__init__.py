@@ -1,1 +1,1 @@
-"""Growth of perturbations, exponents, sections and the kind of motion they tell."""
+"""Growth of perturbations, Lyapunov exponents, sections and verdicts."""

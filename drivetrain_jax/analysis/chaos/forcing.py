@@ -1,6 +1,6 @@
-"""Whether a field has room for chaos: two components that nothing forces have none (Poincare and Bendixson).
+"""Decide if a field can be chaotic: two components without forcing cannot (Poincare and Bendixson).
 
-A clock may turn without being felt: its equation does not contain it, or the amplitude of what it drives is zero.
+A clock may turn without effect: its equation does not contain it, or the amplitude of its forcing is zero.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from jax import Array
 
 from drivetrain_jax.systems import Flow
 
-# Fractions of a strobe at which the clocks are turned; none where the derivative of a harmonic is zero by symmetry.
+# Fractions of a strobe at which the clocks are tested; none is a symmetry zero of a harmonic's derivative.
 _FRACTIONS = tuple((k + 0.37) / 8 for k in range(8))
 # A phase is a clock that is carried as a component.
 _PLANAR = 2
 
 
 def driven(flow: Flow, y: tuple[Array, ...]) -> Array:
-    """Whether the field at ``y`` depends on any of its clocks, shape (...). An amplitude that is small is still one."""
+    """Flags where the field at ``y`` depends on any of its clocks, shape (...). Small amplitudes count."""
     felt = [_felt(flow, y, number) for number in range(len(flow.turns))]
     return jnp.any(jnp.stack([jnp.zeros(jnp.shape(y[0]), bool), *felt]), axis=0)
 
 
 def _felt(flow: Flow, y: tuple[Array, ...], number: int) -> Array:
-    """Whether a turn of one clock changes any rate."""
+    """True where a turn of one clock changes any rate."""
     shape = (len(_FRACTIONS), *jnp.shape(y[0]))
     angles = flow.angles(0, jnp.asarray(_FRACTIONS).reshape(-1, *(1,) * jnp.ndim(y[0])))
 
@@ -38,7 +38,7 @@ def _felt(flow: Flow, y: tuple[Array, ...], number: int) -> Array:
 
 
 def may_be_chaotic(flow: Flow, y: tuple[Array, ...]) -> Array:
-    """Whether chaos is possible at all, shape (...); ``y`` is a state of the motion."""
+    """Flags where chaos is possible, shape (...); ``y`` is a state of the motion."""
     if flow.size > _PLANAR or flow.phases:
         return jnp.ones(jnp.shape(y[0]), bool)
     return driven(flow, y)

@@ -1,9 +1,8 @@
 """Growth of tangent vectors along a trajectory, recorded in segments of equal time (Benettin's method).
 
 Benettin, Galgani, Giorgilli & Strelcyn, Meccanica 15 (1980): tangent vectors are carried by the linearised flow and
-made orthonormal after every strobe, more often where rounding would not let them part so far; the mean logarithms of the
-lengths that Gram-Schmidt finds are the Lyapunov exponents. A record has a fixed number of segments whatever the time, so
-that memory does not grow with it.
+orthonormalised after every strobe, or more often if rounding requires it. The mean logarithms of the Gram-Schmidt lengths
+are the Lyapunov exponents. A record has a fixed number of segments for any time, so its memory does not grow.
 """
 
 from __future__ import annotations
@@ -30,25 +29,25 @@ from drivetrain_jax.analysis.numerics.kernels import stored
 from drivetrain_jax.systems import Flow
 
 SEGMENTS = 64
-# When the standard error is looked at: after a quarter, a half and all of the time.
+# Fractions of the time at which the standard error is tested.
 _CHECKS = (SEGMENTS // 4, SEGMENTS // 2, SEGMENTS)
-# The first quarter of what has been recorded is transient; the rest is judged in blocks.
+# The first quarter of the record is transient; the rest is averaged in blocks.
 _DISCARD, BLOCKS = 4, 12
-# A change between the halves of so many standard errors of its own is no scatter of the blocks.
+# Number of standard errors above which a change between the halves is drift, not scatter of the blocks.
 _DRIFTS = 5.0
 # A decaying motion is followed until its transient has fallen by e to this power.
 SETTLED = 12.0
-# A component that exceeds this has left.
+# Size of a component above which the motion is unbounded.
 BOUND = 1e6
 
 
 class Record(NamedTuple):
-    """What happened in each segment; the first axis of every record counts segments.
+    """Records of each segment; the first axis of every record counts segments.
 
     ``growth``: logarithmic growth of the orthonormal vectors, ``(SEGMENTS, m, ...)``; ``contraction``: integral of the
-    divergence, ``(SEGMENTS, ...)``; ``size``: largest component (phases and angles apart) at a strobe; ``used``: how
-    many segments count, ``(...)``; ``bounded``: whether the state stayed finite and within ``BOUND``; ``state`` and
-    ``strobe``: where the march ended; ``span``: duration of a segment.
+    divergence, ``(SEGMENTS, ...)``; ``size``: largest component (without phases and angles) at a strobe; ``used``: number
+    of valid segments, ``(...)``; ``bounded``: true if the state stayed finite and within ``BOUND``; ``state`` and
+    ``strobe``: end of the march; ``span``: duration of a segment.
     """
 
     growth: Array
@@ -87,9 +86,9 @@ def state_size(flow: Flow, y: Vector) -> Array:
 def record_growth(flow: Flow, steps: Any, max_time: float, target: float, active: Array) -> Record:
     """March until every member's standard error is below ``target``, at most ``max_time``, with ``steps`` per strobe.
 
-    A motion that decays is followed until its transient is below e^-12, too. Each member stops for itself: its record
-    does not depend on its neighbours, but for rounding where one of them has to be made orthonormal within strobes. Members
-    not ``active`` do not start.
+    A decaying motion is also followed until its transient is below e^-12. Each member stops on its own: its record does not
+    depend on the other members, except for rounding if one of them is orthonormalised within strobes. Members that are not
+    ``active`` do not start.
     """
     frame = initial_frame(flow)
     shape = frame.state[0].shape
@@ -116,7 +115,7 @@ def record_growth(flow: Flow, steps: Any, max_time: float, target: float, active
 
 
 def _grown(flow: Flow, steps: Any, parts: Array) -> Callable[[Array, Frame], tuple[Frame, Array]]:
-    """The map ``(strobe, frame) -> frame one strobe later``, its vectors orthonormal, and how much each has grown."""
+    """The map ``(strobe, frame) -> frame one strobe later`` with orthonormal vectors, and the growth of each."""
     advance = strobe_map(flow, steps)
 
     def strobe(number: Array, frame: Frame) -> tuple[Frame, Array]:
@@ -132,7 +131,7 @@ def _grown(flow: Flow, steps: Any, parts: Array) -> Callable[[Array, Frame], tup
 
 
 def _segment(flow: Flow, steps: Any, parts: Array, length: Array) -> Callable[[_March, Array], _March]:
-    """The march over one segment, at most ``longest`` strobes; no sums or maxima over an axis: it is one kernel."""
+    """The march over one segment, at most ``longest`` strobes, as one kernel: it has no sums or maxima over an axis."""
     advance = _grown(flow, steps, parts)
 
     def strobe(carry: tuple) -> tuple:
@@ -171,7 +170,7 @@ def _segment(flow: Flow, steps: Any, parts: Array, length: Array) -> Callable[[_
 
 
 def _stopped(march: _March, span: Array, target: float) -> _March:
-    """The march without those whose standard error is small enough and whose transient has decayed."""
+    """The march without members whose standard error is small enough and whose transient has decayed."""
     mean, error = block_mean(march.growth, march.used, span)
     largest = jnp.max(mean, axis=0)
     settled = (largest > 0) | (largest * march.used * span < -SETTLED)
@@ -201,9 +200,10 @@ def block_mean(series: Array, used: Array, span: Array) -> tuple[Array, Array]:
 
 
 def drift(means: Array) -> Array:
-    """Change from the first half of the block means to the second, without what their scatter from block to block explains.
+    """Change from the first half of the block means to the second, minus the part explained by their scatter.
 
-    Of a vector that grows in proportion to time the rates fall like 1/t, far from their limit by more than they scatter.
+    For a vector that grows in proportion to time the rates fall like 1/t, and differ from their limit by more than they
+    scatter.
     """
     half = BLOCKS // 2
     change = jnp.mean(means[:half], axis=0) - jnp.mean(means[half:], axis=0)
@@ -213,7 +213,7 @@ def drift(means: Array) -> Array:
 
 
 def running_mean(series: Array, used: Array, span: Array) -> Array:
-    """What the mean would be had the march ended after each segment, ``(SEGMENTS, m, ...)``; NaN beyond the end."""
+    """The mean if the march had ended after each segment, ``(SEGMENTS, m, ...)``; NaN beyond the end."""
     sums = jnp.concatenate([jnp.zeros_like(series[:1]), jnp.cumsum(series, axis=0)])
     ends = jnp.arange(1, SEGMENTS + 1)
     firsts = ends // _DISCARD

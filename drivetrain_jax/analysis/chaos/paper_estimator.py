@@ -19,7 +19,7 @@ from jax import Array
 from drivetrain_jax.analysis.chaos.variational import Frame, initial_state, one_kernel, strobe_map
 from drivetrain_jax.systems import Flow
 
-# Initial difference of every component, in the units that are reported.
+# Initial difference of every component, in the reported units.
 PERTURBATION = 1e-6
 _SMALLEST = 1e-300
 
@@ -62,7 +62,7 @@ def paper_estimator(flow: Flow, steps: Any, max_time: float) -> Array:
 
 
 def _shifted(flow: Flow) -> Any:
-    """The field whose strobe clock is ahead by the perturbation."""
+    """The field with its strobe clock advanced by the perturbation."""
 
     def field(angles: tuple, y: Any) -> Any:
         return flow.field((angles[0] + PERTURBATION, *angles[1:]) if angles else angles, y)

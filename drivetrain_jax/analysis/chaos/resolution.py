@@ -1,8 +1,8 @@
-"""Whether the steps resolve what they march: only then are exponents those of the field, whatever their standard errors.
+"""Decide if the steps resolve the motion; without that exponents are wrong even with small standard errors.
 
-Two tests. The exponents add up to the mean divergence, which is known without them; steps that damp or feed an
-oscillation, or that miss a fast decay, break this. And the largest exponent is the same with twice the step: a motion
-that the steps stir keeps the sum, for volume changes little where errors are those of phases.
+Two tests. The exponents must sum to the mean divergence, which is known without them; steps that damp or excite an
+oscillation, or that miss a fast decay, violate this. And the largest exponent must be the same with twice the step: steps
+that perturb phases keep the sum, because they hardly change volume.
 """
 
 from __future__ import annotations
@@ -13,20 +13,21 @@ import jax.numpy as jnp
 from jax import Array
 
 STANDARD_ERRORS = 3.0
-# Residual of the sum rule over the largest exponent.
+# Residual of the sum rule relative to the largest exponent.
 SUM_RULE = 1e-3
-# An exponent that is zero over the largest one.
+# Ratio to the largest exponent below which an exponent is zero.
 _ZERO = 1e-6
-# What rounding and the steps may change the volume by within a strobe where all exponents are nearly zero.
+# Largest change of volume within a strobe by rounding and steps, if all exponents are nearly zero.
 _VOLUME = 1e-9
-# Two step sizes agree to this part of the exponent, however small the standard errors are.
+# Relative agreement of two step sizes that suffices for any standard error.
 _AGREEMENT = 0.1
 
 
 def adds_up(spectrum: Array, error: Array, residual: Array, period: Any) -> Array:
-    """Whether the residual of the sum rule, shape (...), is small against the exponents ``(m, ...)`` or their errors.
+    """Flags where the residual of the sum rule, shape (...), is small relative to the exponents ``(m, ...)`` or their
+    errors.
 
-    Errors of motions that left are NaN and excuse nothing; nothing adds up where the residual is NaN.
+    Errors of unbounded motions are NaN and are ignored; the flag is false where the residual is NaN.
     """
     largest = jnp.max(jnp.abs(spectrum), axis=0)
     size = jnp.abs(residual)
@@ -34,29 +35,30 @@ def adds_up(spectrum: Array, error: Array, residual: Array, period: Any) -> Arra
 
 
 def same_exponent(value: Array, error: Array, other: Array, other_error: Array) -> Array:
-    """Whether two step sizes give the same exponent: to three combined standard errors or to a tenth.
+    """Flags where two step sizes give the same exponent: within three combined standard errors or a tenth.
 
-    To a tenth if an error is NaN, as of a motion that left; never if a value is.
+    Within a tenth if an error is NaN, as for an unbounded motion; never if a value is NaN.
     """
     allowed = jnp.fmax(STANDARD_ERRORS * jnp.hypot(error, other_error), _AGREEMENT * jnp.abs(value))
     return jnp.abs(value - other) <= allowed
 
 
 def zero_floor(spectrum: Array) -> Array:
-    """Size that an exponent that is zero may have, whatever its standard error says, shape (...)."""
+    """Largest size of a zero exponent for any standard error, shape (...)."""
     return _ZERO * jnp.max(jnp.abs(spectrum), axis=0)
 
 
 def significant(spectrum: Array, error: Array) -> Array:
-    """Whether the largest exponent, the first of ``(m, ...)``, is positive beyond three standard errors."""
+    """Flags where the largest exponent, the first of ``(m, ...)``, exceeds three standard errors."""
     return spectrum[0] > STANDARD_ERRORS * error[0] + zero_floor(spectrum)
 
 
 def resolved(spectrum: Array, error: Array, residual: Array, period: Any, coarse: Array, coarse_error: Array) -> Array:
-    """Whether the exponents add up and, if the largest one is positive, twice the step has it, too; shape (...).
+    """Flags where the exponents sum to the divergence and a positive largest one is confirmed by twice the step; shape
+    (...).
 
-    ``coarse``, ``coarse_error``: the largest one with twice the step. Motions that left have no significant exponent: they
-    are judged by the sum.
+    ``coarse``, ``coarse_error``: the largest one with twice the step. Unbounded motions have no significant exponent: only
+    the sum counts for them.
     """
     same = same_exponent(spectrum[0], error[0], coarse, coarse_error)
     return adds_up(spectrum, error, residual, period) & (same | ~significant(spectrum, error))

@@ -1,4 +1,4 @@
-"""The strobes that follow a run: after how many of them the motion repeats, and the 0-1 test."""
+"""The strobes after a run: the period of the motion, and the 0-1 test."""
 
 from __future__ import annotations
 
@@ -14,21 +14,19 @@ from drivetrain_jax.analysis.chaos.variational import batch_shape, initial_state
 from drivetrain_jax.analysis.chaos.zero_one_test import largest_k01
 from drivetrain_jax.systems import Flow
 
-# Strobes that follow the run for the verdict and the 0-1 test, and the longest period looked for among them.
+# Strobes after the run for the verdict and the 0-1 test, and the longest period searched among them.
 SAMPLES, LONGEST = 1024, 512
-# Repetition is judged to this fraction of the motion; that a motion does not repeat, only if less than the second is left
-# of its transient.
+# Relative tolerance for repetition; transient below which a motion that does not repeat is called so.
 _REPEATED, _UNSETTLED = 1e-9, 1e-4
-# The bound on what is left of the transient is so many times as large as its exponent says: of a near-degenerate pair the
-# exponents are known to about the inverse of the time only, whatever the standard error is.
+# Factor on the bound of the transient from its exponent: for a near-degenerate pair the exponents are known only to about
+# the inverse of the time, for any standard error.
 _MARGIN = 1e3
-# Times that a motion is followed for as many strobes again, where what is left of the transient could hide or feign a
-# repetition.
+# Largest number of further samples, if the transient could hide or imitate a repetition.
 _MOST_LOOKS = 16
 
 
 class Sampling(NamedTuple):
-    """What the strobes after a run show: K of the 0-1 test, the period in strobes, and whether it could be told."""
+    """Results of the strobes after a run: K of the 0-1 test, the period in strobes, and a flag if the period is certain."""
 
     k01: Array
     multiple: Array
@@ -36,8 +34,8 @@ class Sampling(NamedTuple):
 
 
 class _Look(NamedTuple):
-    """``SAMPLES`` strobes looked at: how many times before, the state after them and its number, the first section of all,
-    and what has been found of every member."""
+    """One sample of ``SAMPLES`` strobes: its number, the state after it and its strobe, the first section of all, and
+    the results of every member."""
 
     number: Array
     state: tuple
@@ -50,8 +48,8 @@ class _Look(NamedTuple):
 def sample(flow: Flow, steps: Any, record: Record, rate: Array, k01_for: Array) -> Sampling:
     """Follow the motion for ``SAMPLES`` strobes; K of the members of ``k01_for``, otherwise 0.
 
-    ``rate``: the largest exponent that its error allows, shape (...). Motions that decay are followed further until their
-    period can be told from what is left of the transient.
+    ``rate``: the largest exponent within its error, shape (...). Decaying motions are followed until the transient is small
+    enough to determine their period.
     """
     watched = [i for i in range(flow.size) if i not in (*flow.phases, *flow.cyclic)] or [0]
     shape = batch_shape(flow)
@@ -64,7 +62,7 @@ def sample(flow: Flow, steps: Any, record: Record, rate: Array, k01_for: Array) 
         section = states[:, jnp.array(watched)]
         left = transient_left(flow, record, rate, seen.strobe + SAMPLES // 2)
         multiple, settled = repetition(section, left)
-        # What has been told stands: no member's result depends on how long its neighbours are followed.
+        # Earlier results stay, so a member does not depend on the time of the others.
         multiple, settled = (
             jnp.where(seen.settled, *pair) for pair in ((seen.multiple, multiple), (seen.settled, settled))
         )
@@ -85,16 +83,16 @@ def sample(flow: Flow, steps: Any, record: Record, rate: Array, k01_for: Array) 
 
 
 def transient_left(flow: Flow, record: Record, rate: Array, strobe: Array) -> Array:
-    """Bound on the size that the transient still has at a strobe: a multiple of the largest state, decayed at ``rate``."""
+    """Bound on the size of the transient at a strobe: a multiple of the largest state, decayed at ``rate``."""
     largest = jnp.maximum(jnp.max(record.size, axis=0), state_size(flow, initial_state(flow)))
     return _MARGIN * largest * jnp.exp(jnp.minimum(rate, 0.0) * strobe * flow.period)
 
 
 def repetition(section: Array, left: Array) -> tuple[Array, Array]:
-    """Strobes after which ``section`` repeats to rounding (0: none), and whether this is more than a transient's doing.
+    """Strobes after which ``section`` repeats to rounding (0: none), and a flag if a transient cannot explain this.
 
-    ``left``: what may be left of the transient. A number of strobes after which the motion repeats to within that only,
-    but not to rounding, may be its period or not: a slow drift along a torus looks the same.
+    ``left``: bound of the transient. A repetition within that bound, but not to rounding, is uncertain: a slow drift along
+    a torus looks the same.
     """
     scale = jnp.max(jnp.abs(section), axis=(0, 1))
     left = left / jnp.where(scale > 0, scale, 1.0)

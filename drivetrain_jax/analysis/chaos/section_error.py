@@ -1,15 +1,15 @@
-"""Errors of a section: what one strobe is wrong by, and what that adds up to over the memory of the motion.
+"""Errors of a section: the error within one strobe, and the accumulated error over the memory of the motion.
 
-Errors of strobes are carried on: a damped motion forgets them, an undamped one adds them up, close to a tongue they grow
-for hundreds of strobes. Some strobes are taken again by finer equal steps: the error of one strobe. The whole motion, what
-was discarded included, is marched once more by other equal steps. As long as that stays within a tenth of the section, the
-error of the section is at most in that proportion to its distance in which the error of a strobe is to what the other steps
-make of the same strobe, so that few steps will do. The proportion is not the same everywhere: a violent start is resolved
-worse than what it settles to, and its errors may be all that there is. Hence the first strobes from the start are among
-those taken again, and the largest proportion counts. Where even so the error may matter, or the other steps lead away
-although every strobe is right, more steps are tried; the distance from these is the error.
+Errors of strobes are carried on: a damped motion forgets them, an undamped one accumulates them, and close to a tongue they
+grow for hundreds of strobes. Some strobes are repeated with finer equal steps, which gives the error of one strobe. The
+whole motion, discarded strobes included, is repeated once with other equal steps. As long as the two differ by at most a
+tenth of the section, the error of the section relates to this distance at most as the error of a strobe relates to the
+change of the same strobe by the other steps; few steps are enough for that. The ratio varies: a violent start is resolved
+worse than the motion it settles to, and may dominate the error. So the first strobes from the start are also repeated, and
+the largest ratio counts. If the error may still matter, or the other steps diverge although every strobe is right, more
+steps are tried; the distance from these is the error.
 
-Of a chaotic motion every number of steps gives another section: the error of one strobe is all that can be said of it.
+A chaotic motion has another section for every number of steps: only the error of one strobe is meaningful.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from drivetrain_jax.analysis.chaos.growth import discarded, sampled
 from drivetrain_jax.analysis.chaos.variational import Frame, initial_state, one_kernel, strobe_map
 from drivetrain_jax.systems import Flow
 
-# Strobes of the section and first strobes from the start that are taken again.
+# Strobes of the section, and first strobes from the start, that are repeated.
 _TAKEN_AGAIN, EARLY = 8, 16
-# Distances from the section up to which errors are in proportion, over its largest value.
+# Relative distances from the section up to which errors are proportional.
 _PROPORTIONAL = 0.1
-# Changes of strobes that are a smaller part of the largest one make no difference to the section: their proportion may be
-# that of roundings. Estimates above this part of what is tolerated are found again by more steps.
+# Changes of strobes below this fraction of the largest one do not affect the section: their ratio may be that of rounding.
+# Estimates above this fraction of the tolerance are repeated with more steps.
 _CONSIDERABLE, _DOUBTFUL = 0.01, 0.1
 
 
 class _Strobes(NamedTuple):
-    """Strobes to be taken again: their numbers, shape ``(K,)``, and the states at their ends, ``(K, n, ...)``."""
+    """Strobes to repeat: their numbers, shape ``(K,)``, and the states at their ends, ``(K, n, ...)``."""
 
     number: np.ndarray
     begin: Array
@@ -43,8 +43,8 @@ class _Strobes(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Equal steps a strobe: those of single strobes, those of the whole motion, and those (0: none), no fewer than of
-    single strobes, of the whole motion where the latter leave doubts."""
+    """Equal steps per strobe: of single strobes, of the whole motion, and (0: none) of the whole motion in doubtful
+    cases, where they are no fewer than those of single strobes."""
 
     strobe: int
     motion: int
@@ -59,16 +59,16 @@ def watched(flow: Flow) -> np.ndarray:
 def section_errors(
     flow: Flow, states: Array, early: Array, first: int, steps: Steps, tolerated: float
 ) -> tuple[Array, Array]:
-    """Errors of single strobes and of the whole of ``states``, shape ``(T, n, ...)``, those after the first ``first``
-    strobes from the start, over the largest value (a tenth or more: another section; NaN: not known). ``early``: states
-    after the first ``min(first, EARLY)`` of those strobes, as the section has them.
+    """Errors of single strobes and of the whole of ``states``, shape ``(T, n, ...)``, relative to the largest value (a
+    tenth or more: another section; NaN: unknown). The states follow the first ``first`` strobes from the start. ``early``:
+    states after the first ``min(first, EARLY)`` of those strobes, as in the section.
 
-    A second march is made only of motions whose errors of strobes are within ``tolerated`` or that the first one follows.
+    A second march is made only of motions whose strobe errors are within ``tolerated`` or that the first march follows.
     """
     size = jnp.max(jnp.abs(states[:, watched(flow)]), axis=(0, 1))
     size = jnp.where(size == 0, 1.0, size)
     strobes = _strobes(flow, states, early, first)
-    # One loop over the numbers of steps: marches are dear to compile.
+    # One loop over the numbers of steps, because marches are expensive to compile.
     errors, changes = jax.lax.map(lambda n: _changes(flow, strobes, n) / size, jnp.array(steps[:2]))
     strobe = jnp.max(errors[strobes.number >= first], axis=0)
     share = _share(errors, changes)
@@ -104,7 +104,7 @@ def _strobes(flow: Flow, states: Array, early: Array, first: int) -> _Strobes:
 
 
 def _changes(flow: Flow, strobes: _Strobes, steps: Array) -> Array:
-    """Largest change of each of the ``strobes`` when taken again by ``steps`` equal steps, shape ``(K, ...)``."""
+    """Largest change of each of the ``strobes`` when repeated with ``steps`` equal steps, shape ``(K, ...)``."""
     number = jnp.asarray(strobes.number).reshape(-1, *(1,) * (strobes.begin.ndim - 2))
     begin = Frame(tuple(jnp.moveaxis(strobes.begin, 1, 0)))
     ends = one_kernel(flow)(lambda steps, frame: strobe_map(flow, steps)(number, frame))(steps, begin).state
@@ -112,7 +112,7 @@ def _changes(flow: Flow, strobes: _Strobes, steps: Array) -> Array:
 
 
 def _share(errors: Array, changes: Array) -> Array:
-    """Largest proportion of ``errors`` to considerable ``changes``, both ``(K, ...)``; 1 if nothing changes."""
+    """Largest ratio of ``errors`` to relevant ``changes``, both ``(K, ...)``; 1 if nothing changes."""
     largest = jnp.max(jnp.where(jnp.isfinite(changes), changes, 0.0), axis=0)
     considerable = (changes > 0) & (changes >= _CONSIDERABLE * largest)
     ratio = jnp.where(considerable, errors / jnp.where(considerable, changes, 1.0), 0.0)
@@ -120,7 +120,7 @@ def _share(errors: Array, changes: Array) -> Array:
 
 
 def _distance(flow: Flow, states: Array, first: int, steps: Array) -> Array:
-    """Largest distance of ``states`` from the motion by ``steps`` equal steps a strobe, shape ``(...)``."""
+    """Largest distance of ``states`` from the motion with ``steps`` equal steps per strobe, shape ``(...)``."""
     start = discarded(flow, steps, jnp.int64(first))
     others, _ = sampled(flow, steps, start, jnp.int64(first), len(states))
     return jnp.max(jnp.abs(others - states)[:, watched(flow)], axis=(0, 1))

@@ -1,4 +1,4 @@
-"""Measures of a Poincare section: after how many strobes it repeats, and how far it is from a smooth torus."""
+"""Measures of a Poincare section: its period in strobes, and its distance from a smooth torus."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-# Strobes at the end of a section that are compared with those some strobes before them.
+# Number of last strobes of a section that are compared with earlier ones.
 _WINDOW = 64
-# Harmonics of a clock on which a torus is fitted, and iterations of the fit.
+# Harmonics of a clock in the fit of a torus, and iterations of the fit.
 HARMONICS = 64
 _ITERATIONS = 30
 

@@ -1,8 +1,8 @@
-"""Trajectories of a flow and of vectors tangent to them, by equal steps of the explicit scheme of order 8 (DOP853).
+"""Trajectories of a flow and of tangent vectors, by equal steps of the explicit scheme of order 8 (DOP853).
 
-A state is a tuple of components, each of the shape of the batch. What a stage computes is stored before the next one
-begins (see :mod:`~drivetrain_jax.analysis.numerics.kernels`); batches of 32 to 64 members keep that in the innermost
-caches. Time enters through :meth:`Flow.angles` of a counted strobe, so that nothing drifts however long the march is.
+A state is a tuple of components, each of the shape of the batch. The results of a stage are stored before the next one
+begins (see :mod:`~drivetrain_jax.analysis.numerics.kernels`); for batches of 32 to 64 members they fit into the innermost
+caches. Time enters through :meth:`Flow.angles` of a counted strobe, so nothing drifts in a long march.
 """
 
 from __future__ import annotations
@@ -48,8 +48,7 @@ def initial_state(flow: Flow) -> Vector:
 def initial_frame(flow: Flow) -> Frame:
     """The initial state and unit vectors along every component that is not a phase.
 
-    Displacements that leave the phases alone stay so: their exponents are those of the flow without the zeros that the
-    phases supply.
+    Displacements without phases stay so: their exponents are those of the flow without the zeros of the phases.
     """
     state = initial_state(flow)
     moving = jnp.array([i for i in range(flow.size) if i not in flow.phases])
@@ -60,7 +59,7 @@ def initial_frame(flow: Flow) -> Frame:
 
 
 def one_kernel(flow: Flow) -> Callable[[Callable], Callable]:
-    """The mark for a march of ``flow``: :func:`in_one_kernel`, or none if the field does what is not possible there."""
+    """The mark :func:`in_one_kernel` for a march of ``flow``, or none if the field has unsuitable operations."""
 
     def rates(y: Vector) -> Any:
         angles = flow.angles(0, 0.0)
@@ -89,7 +88,7 @@ def strobe_map(flow: Flow, steps: Any) -> Callable[..., Frame]:
 
 
 def _step(flow: Flow, angles: Callable[[float], tuple], h: Any, frame: Frame) -> Frame:
-    """One step of DOP853 for everything that the frame carries."""
+    """One step of DOP853 for all parts of the frame."""
     slopes: list[Frame] = []
     for stage, (c, b) in enumerate(zip(dop853.C, dop853.B, strict=True)):
         at = _advanced(frame._replace(contraction=None), h, dop853.A[stage, :stage], slopes)
@@ -129,7 +128,7 @@ def _slopes(flow: Flow, contracts: bool, angles: tuple, at: Frame) -> Frame:
     if not at.tangents:
         return Frame(field(*at.state), (), contraction)
     rates, push = jax.linearize(field, *at.state)
-    # The factors of the linear map are what it shares with the rates and the divergence.
+    # The factors of the linear map are shared with the rates and the divergence.
     linear, factors = jax.closure_convert(push, *at.state)
 
     def pushed(tangents: Vector, factors: list[Array]) -> Vector:

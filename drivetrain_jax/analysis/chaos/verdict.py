@@ -1,8 +1,8 @@
-"""What kind of motion it is, by a rule that a diffuse picture or one number cannot satisfy.
+"""The kind of a motion, by a rule that a diffuse picture or a single number cannot satisfy.
 
-Nothing is said where the steps do not resolve the motion. Chaotic only if the motion is bounded, its field has room for
-chaos, the largest exponent exceeds three standard errors and is the same at two step sizes, the exponents add up to the
-mean divergence, and the 0-1 test gives K > 0.9. Exponents of phases are not among those judged.
+There is no verdict if the steps do not resolve the motion. Chaotic requires all of: the motion is bounded, its field can be
+chaotic, the largest exponent exceeds three standard errors and agrees for two step sizes, the exponents sum to the mean
+divergence, and the 0-1 test gives K > 0.9. Exponents of phases are ignored.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from drivetrain_jax.analysis.chaos.growth import SEGMENTS
 from drivetrain_jax.analysis.chaos.resolution import STANDARD_ERRORS, SUM_RULE, significant, zero_floor
 
 CHAOTIC_K = 0.9
-# What grows in proportion to time, as at a double multiplier, grows by four over the three quarters that are averaged.
-# Growth that is exponential is told from it by twice its logarithm.
+# Growth in proportion to time, as at a double multiplier, is a factor of four over the averaged three quarters. Exponential
+# growth is distinguished by twice its logarithm.
 _TELLING = 2 * math.log(4)
 
 
 class Verdict(IntEnum):
-    """Kinds of motion. A fixed point, periodic and quasi-periodic motion are those of the strobes of a forced system
-    (a fixed point of the section is a motion of one strobe period) and of the motion itself if nothing forces it."""
+    """Kinds of motion. Fixed point, periodic and quasi-periodic refer to the strobes of a forced system (a fixed point
+    of the section has the period of the strobe), and to the motion itself without forcing."""
 
     FIXED_POINT = 0
     PERIODIC = 1
@@ -36,13 +36,13 @@ class Verdict(IntEnum):
 
 
 class Evidence(NamedTuple):
-    """What the verdict rests on; ``m`` exponents, phases apart, in falling order.
+    """Input of the verdict; ``m`` exponents without phases, in falling order.
 
     ``spectrum``, ``error`` (m, ...): exponents and standard errors; ``coarse``, ``coarse_error`` (...): the largest one
     with twice the step; ``sum_residual``: of the sum rule; ``k01``: of the 0-1 test; ``bounded``; ``growing``: see
-    :func:`grows`; ``multiple``: strobes until the motion repeats, 0 if it does not within those looked at; ``settled``:
-    whether the transient is small enough to tell; ``resolved``: see :func:`~.resolution.resolved`;
-    ``roomy``: whether the field has room for chaos.
+    :func:`grows`; ``multiple``: strobes until the motion repeats, 0 if it does not within the sample; ``settled``: true if
+    the transient is small enough to decide; ``resolved``: see :func:`~.resolution.resolved`; ``roomy``: true if the field
+    can be chaotic.
     """
 
     spectrum: Array
@@ -60,10 +60,10 @@ class Evidence(NamedTuple):
 
 
 def grows(size: Array, used: Array, span: Array, largest: Array) -> Array:
-    """Whether the motion grew about as fast as its largest exponent, or stayed at a rest that a disturbance leaves.
+    """Flags where the motion grew about as fast as its largest exponent, or stayed at an unstable rest.
 
-    ``size`` (SEGMENTS, ...): largest component in each segment. A bounded attractor has a positive exponent, too, but
-    its size does not follow it. What growth in proportion to time may reach as well tells nothing.
+    ``size`` (SEGMENTS, ...): largest component in each segment. A bounded attractor also has a positive exponent, but its
+    size does not follow it. Growth that is also possible in proportion to time does not count.
     """
     index = jnp.arange(SEGMENTS).reshape(-1, *(1,) * used.ndim)
     last = jnp.maximum(used - 1, 0)
@@ -86,20 +86,20 @@ def judge(evidence: Evidence, autonomous: bool) -> Array:
 
 
 def _unstable(evidence: Evidence) -> Array:
-    """Of what has left, whether it did so by its exponent: a torque may drive what is stable beyond the bounds."""
+    """Flags of unbounded motions that left by their exponent: a torque may drive a stable system beyond the bounds."""
     left = ~evidence.bounded & (evidence.spectrum[0] > 0)
     return left | (significant(evidence.spectrum, evidence.error) & evidence.growing)
 
 
 def _chaotic(evidence: Evidence) -> Array:
-    """All of it, for motions whose largest exponent is positive."""
+    """All conditions of chaos, for motions whose largest exponent is positive."""
     chaotic = evidence.bounded & evidence.roomy & (evidence.k01 > CHAOTIC_K)
     chaotic &= evidence.coarse > STANDARD_ERRORS * evidence.coarse_error
     return chaotic & (evidence.sum_residual <= SUM_RULE * jnp.max(jnp.abs(evidence.spectrum), axis=0))
 
 
 def _forced(evidence: Evidence) -> Array:
-    """Kind of a motion that attracts: by the strobes after which it repeats."""
+    """Kind of an attracting motion, by the strobes after which it repeats."""
     decays = evidence.spectrum[0] < -STANDARD_ERRORS * evidence.error[0] - zero_floor(evidence.spectrum)
     kind = jnp.where(evidence.multiple > 1, Verdict.PERIODIC, Verdict.QUASI_PERIODIC)
     kind = jnp.where(evidence.multiple == 1, Verdict.FIXED_POINT, kind)
@@ -107,8 +107,8 @@ def _forced(evidence: Evidence) -> Array:
 
 
 def _autonomous(evidence: Evidence) -> Array:
-    """Kind of a motion that nothing forces: one exponent is zero along any motion that does not rest, and no motion in a
-    plane is a torus: what has no other exponents there is degenerate, or drifts more slowly than the time can tell."""
+    """Kind of an unforced motion. One exponent is zero along any motion that is not at rest, and no motion in a plane is
+    a torus; a motion without other exponents there is degenerate, or drifts too slowly to decide."""
     zeros = jnp.abs(evidence.spectrum) <= STANDARD_ERRORS * evidence.error + zero_floor(evidence.spectrum)
     count = jnp.sum(zeros, axis=0)
     torus = jnp.where(evidence.roomy, Verdict.QUASI_PERIODIC, Verdict.UNDECIDED)

@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-# As many angles as the authors use, equally spread over the range that they advise.
+# As many angles as the authors use, equally spaced over their recommended range.
 _ANGLES = 100
 _RANGE = (math.pi / 5, 4 * math.pi / 5)
 _CUT = 10
-# Series that are worked on together: their walks stay in the inner caches.
+# Series computed together: their walks fit into the inner caches.
 _BLOCK = 32
 
 
@@ -32,7 +32,7 @@ def chaos_k01(series: Array) -> Array:
     mean = jnp.mean(series, axis=0)
     size = jnp.max(jnp.abs(series - mean), axis=0)
     constant = ~(size > 1e-12 * jnp.abs(mean))
-    # The test does not depend on the scale of the observable; an offset only adds the part that is taken out anyway.
+    # The test does not depend on the scale of the observable; an offset only adds to the part that is removed.
     scaled = (series - mean) / jnp.where(constant, 1.0, size)
     values = jax.lax.map(partial(_correlations, angles), _blocks(scaled))
     values = jnp.moveaxis(values, 1, 0).reshape(_ANGLES, -1)[:, : math.prod(size.shape)]
@@ -40,7 +40,7 @@ def chaos_k01(series: Array) -> Array:
 
 
 def _blocks(series: Array) -> Array:
-    """``(T, ...)`` in blocks of ``_BLOCK`` series, ``(blocks, T, _BLOCK)``, the last one filled up with zeros."""
+    """``(T, ...)`` in blocks of ``_BLOCK`` series, ``(blocks, T, _BLOCK)``, the last one padded with zeros."""
     flat = series.reshape(len(series), -1)
     flat = jnp.pad(flat, ((0, 0), (0, -flat.shape[1] % _BLOCK)))
     return jnp.moveaxis(flat.reshape(len(series), -1, _BLOCK), 1, 0)
@@ -54,8 +54,8 @@ def _correlations(angles: Array, series: Array) -> Array:
 def largest_k01(section: Array) -> Array:
     """The largest K of the components of ``section``, shape ``(T, n, ...)`` -> ``(...)``.
 
-    Of a regular motion every component is regular; a slow component of a chaotic one needs a longer record than a fast
-    one to show it.
+    All components of a regular motion are regular. A slow component of a chaotic motion needs a longer record than a fast
+    one.
     """
     return jnp.max(chaos_k01(section), axis=0)
 

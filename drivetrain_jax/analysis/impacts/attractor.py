@@ -1,13 +1,13 @@
 """From initial conditions to attractors of a piecewise linear oscillator, many points at a time.
 
-A *job* is a sequence of points, each started where the last one ended: a single point for a steady state, a line of
-drive frequencies for an up or down sweep. ``width`` lanes work through the queue of jobs, each at its own pace: a lane
-that settles slowly, or never, holds up no other one.
+A *job* is a sequence of points, each started where the last one ended: a single point for a steady state, a line of drive
+frequencies for an up or down sweep. ``width`` lanes process the queue of jobs, each at its own pace, so a lane that settles
+slowly, or never, does not delay the others.
 
-A lane settles period by period and now and then tries Newton shooting from where it is: ``z <- z + (1 - M)^-1 (F^m(z) -
-z)`` with the exact transition matrix M over m periods, m being a number after which the recent motion nearly recurs. An
-orbit counts as the attractor only if all its multipliers lie inside the unit circle and the motion itself, followed on
-from where the search began, is seen to approach it (:mod:`~drivetrain_jax.analysis.impacts.attractor_approach`).
+A lane settles period by period and from time to time tries Newton shooting from its state: ``z <- z + (1 - M)^-1 (F^m(z) -
+z)`` with the exact transition matrix M over m periods, m being a number of periods after which the motion nearly recurs. An
+orbit is accepted as the attractor only if all its multipliers lie inside the unit circle, and the motion itself, continued
+from the start of the search, approaches it (:mod:`~drivetrain_jax.analysis.impacts.attractor_approach`).
 """
 
 from __future__ import annotations
@@ -49,22 +49,22 @@ from drivetrain_jax.analysis.impacts.piecewise_march import (
 from drivetrain_jax.analysis.impacts.plane_map import Matrix, newton_correction
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
-# Newton: largest number of corrections, relative size at which one is the last, and below which rounding may end it.
+# Newton: largest number of corrections, relative size of a last one, and size below which rounding may end it.
 _CORRECTIONS, _CONVERGED, _ROUNDING = 12, 1e-11, 1e-7
-# Largest part of a correction that the next one may be: 2/3 at worst on the way to an orbit whose period is to double.
+# Largest ratio of a correction to the one before: 2/3 at worst near an orbit whose period is about to double.
 _SHRINKING = 0.75
-# A search is a failure beyond so many times the usual velocity, or so many times the steps that settling takes.
+# A search fails at this multiple of the usual velocity, or of the steps for settling.
 _ASTRAY, _COSTLY = 3.0, 4
 _EPS = np.finfo(float).eps
 
 
 class Attractors(NamedTuple):
-    """What each point ended on, every field of shape ``(points,)``.
+    """The attractor of each point, every field of shape ``(points,)``.
 
-    ``u, v``: state at the start of a drive period; ``multiple``: number of periods m after which it recurs (0 if not
-    within 32); ``matrix``: transition matrix over these; ``error``: estimated absolute error of u; ``periods``: drive
-    periods run; ``exponent``: Lyapunov exponent per unit of time, meaningful if ``multiple`` is 0; ``stalled``: given
-    up because of its number of steps or because it is not finite (1, else 0).
+    ``u, v``: state at the start of a drive period; ``multiple``: number of periods m after which it recurs (0 if not within
+    32); ``matrix``: transition matrix over these; ``error``: estimated absolute error of u; ``periods``: drive periods run;
+    ``exponent``: Lyapunov exponent per unit of time, meaningful if ``multiple`` is 0; ``stalled``: 1 if stopped because of
+    its number of steps or because it is not finite, else 0.
     """
 
     u: Array
@@ -81,19 +81,19 @@ _RESULT = Attractors(0, 0, 0, (0, 0, 0, 0), 0, 0, 0, 0)  # pyright: ignore[repor
 
 
 def averaged(periods: Any) -> Any:
-    """How many of these periods, the last ones, the growth of a tangent is averaged over."""
+    """Number of last periods over which the growth of a tangent is averaged."""
     return periods - periods // 4
 
 
 def take(oscillator: PiecewiseLinearOscillator, index: Array) -> PiecewiseLinearOscillator:
-    """The oscillators number ``index``; fields that are the same for all stay scalars."""
+    """The oscillators number ``index``; fields common to all stay scalars."""
     chosen = {f.name: getattr(oscillator, f.name) for f in fields(oscillator)}
     return replace(oscillator, **{name: x[index] if jnp.ndim(x) else x for name, x in chosen.items()})
 
 
 class _Verdict(NamedTuple):
-    """Outcome of a correction: lanes whose search has found an orbit that attracts, those whose motion would approach it
-    slowly, the orbit, and lanes whose search has failed."""
+    """Outcome of a correction: lanes that found an attracting orbit, lanes that approach it slowly, the orbit, and
+    failed lanes."""
 
     found: Array
     slow: Array
@@ -102,7 +102,7 @@ class _Verdict(NamedTuple):
 
 
 def _speed(local: PiecewiseLinearOscillator, u: Array, v: Array) -> Array:
-    """The velocity that the energy of a state in contact is worth, to within a factor of two."""
+    """The velocity that corresponds to the energy of a state in contact, within a factor of two."""
     return jnp.abs(v) + jnp.sqrt(local.stiffness) * jnp.maximum(jnp.abs(u) - local.b, 0.0)
 
 
@@ -114,7 +114,7 @@ def _usual_speed(local: PiecewiseLinearOscillator) -> Array:
 def _shoot(
     lane: Lane, now: Array, local: PiecewiseLinearOscillator, lanes: Lanes, omega: Array
 ) -> tuple[Lane, _Verdict]:
-    """One Newton correction in the lanes ``now``, and what it shows."""
+    """One Newton correction in the lanes ``now``, and its outcome."""
     motion, (u, v) = lane.motion, lane.guess
     first = select(lane.corrections == 0, (motion.u, motion.v), lane.first)
     du, dv = newton_correction(motion.matrix, motion.u - u, motion.v - v)
@@ -125,7 +125,7 @@ def _shoot(
     converged = (change <= _CONVERGED * size) | stuck
     astray = ~(_speed(local, *guess) <= _ASTRAY * (_speed(local, *lane.latest) + _usual_speed(local)))
     going = now & ~converged & (lane.corrections < _CORRECTIONS) & ~astray & (change <= _SHRINKING * lane.change)
-    # Rounding of the state after m periods, in u and v, as it acts on the u of the orbit.
+    # Rounding of the state after m periods, in u and v, and its effect on the u of the orbit.
     by_u, by_v = (newton_correction(motion.matrix, 1.0 - k + 0 * u, k * omega)[0] for k in (0.0, 1.0))
     inverse = jnp.abs(by_u) + jnp.abs(by_v)
     rounding = 32 * size * jnp.sqrt(motion.steps.astype(float)) + 2 * _taken_off(lanes, motion)
@@ -141,14 +141,14 @@ def _shoot(
 
 
 def _taken_off(lanes: Lanes, motion: Motion) -> Array:
-    """The largest harmonic response that is taken off the displacement on the way: a step is as exact as that."""
+    """The largest harmonic response subtracted from the displacement; it limits the accuracy of a step."""
     here = locate(lanes, motion.u)
     own, contact, gap = (jnp.hypot(piece.cosine, piece.sine) for piece in (here.region, lanes.contact, lanes.gap))
     return jnp.where(stays(lanes, here, motion), own, jnp.maximum(contact, gap))
 
 
 class _Work(NamedTuple):
-    """The lanes, their latest states, the number of the next job, and the results so far, one row for each field."""
+    """The lanes, their latest states, the number of the next job, and the results so far, one row per field."""
 
     lane: Lane
     history: Array
@@ -157,7 +157,7 @@ class _Work(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """What there is to do: the points ``visits`` of all jobs in turn, ``length`` of each, from the states ``origin``."""
+    """The work: the points ``visits`` of all jobs in turn, ``length`` of each, from the states ``origin``."""
 
     oscillator: PiecewiseLinearOscillator
     visits: Array
@@ -179,7 +179,7 @@ def attractors(
     width = min(width, jobs)
     total = jobs * length
     task = _Task(oscillator, route.reshape(total), length, (u0, v0), most_periods)
-    # One array for all results: several scatters side by side make XLA's CPU compiler abort (jax 0.10.2).
+    # One array for all results: several parallel scatters make XLA's CPU compiler abort (jax 0.10.2).
     store = jnp.zeros((len(jax.tree.leaves(_RESULT)), total))
     numbers = jnp.arange(width, dtype=jnp.int32)
     lane = enter(blank(width), numbers >= 0, numbers, 0 * numbers, u0[:width], v0[:width], 0 * numbers + 1)
@@ -191,7 +191,7 @@ def attractors(
 
 
 def _tick(task: _Task, work: _Work) -> _Work:
-    """All lanes a few steps on; those that have ended a period or a search go on to what comes next."""
+    """Advance all lanes by a few steps; those that have ended a period or a search continue with the next task."""
     lane, history = work.lane, work.history
     total = task.visits.size
     working = lane.job < total // task.length
@@ -224,13 +224,13 @@ def _tick(task: _Task, work: _Work) -> _Work:
 
 
 def _most_steps(lane: Lane, lanes: Lanes) -> Array:
-    """Steps after which a lane is given up: it goes from event to event without getting on."""
+    """Steps after which a lane is stopped: it moves from event to event without progress."""
     searching = lane.searching & (lane.count > 0)
     return lane.multiple * jnp.where(searching, _COSTLY * lane.cost + 500, usual_steps(lanes))
 
 
 def _result(lane: Lane, reached: Array, stalled: Array, span: Array) -> Attractors:
-    """What a lane that is done has found; ``span`` is the time over which its tangent has grown if it has not settled."""
+    """The result of a finished lane; ``span`` is the time of growth of its tangent if it has not settled."""
     orbit = lane.orbit
     return Attractors(
         u=jnp.where(reached, orbit.u, lane.latest[0]),
@@ -245,7 +245,7 @@ def _result(lane: Lane, reached: Array, stalled: Array, span: Array) -> Attracto
 
 
 def _proceed(lane: Lane, done: Array, result: Attractors, queue: Array, task: _Task) -> tuple[Lane, Array]:
-    """Lanes that are done go on to the next point of their job or, at its end, to the next job of the queue."""
+    """Finished lanes continue with the next point of their job or, at its end, the next job of the queue."""
     origin = task.origin
     jobs = origin[0].size
     last = done & (lane.place == task.length - 1)

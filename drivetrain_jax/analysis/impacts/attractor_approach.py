@@ -1,22 +1,21 @@
-"""Whether a motion is on its way to a periodic orbit that Newton's method has found from one of its states.
+"""Decide if a motion approaches a periodic orbit that Newton's method found from one of its states.
 
-Newton's method may jump to an orbit in whose basin the state does not lie, and that the linearisation about the orbit
-happens to predict one recurrence of the motion proves nothing: the remainder is a vector that passes through zero here
-and there. So the motion itself is followed on. With M the transition matrix about the orbit ``z*``, rho its spectral
-radius and m the period multiple, every recurrence has to obey
+Newton's method may converge to an orbit whose basin does not contain the state. One recurrence predicted by the
+linearisation about the orbit proves nothing, because the remainder is a vector that vanishes at some points. So the motion
+itself is continued. With M the transition matrix about the orbit ``z*``, rho its spectral radius and m the period multiple,
+every recurrence must satisfy
 
     |F^m(z) - z* - M (z - z*)| <= 0.02 (1 - rho) |z - z*|
 
-for so long that the places met enclose the rest of the way. Where the multipliers are complex, with the argument theta,
-the motion comes by all directions within ``max(2 pi/theta, pi/(pi - theta))`` recurrences; the gaps between these
-directions, at most 120 degrees, are as good as closed once the distance has shrunk by ``cos(gap/2)``. Where they are real,
-the faster one has to have reduced its part against the other by a factor of 30. In any case it is enough that the
-distance itself has shrunk by that factor.
+until the visited points enclose the rest of the way. With complex multipliers of argument theta the motion passes through
+all directions within ``max(2 pi/theta, pi/(pi - theta))`` recurrences. The gaps between these directions, at most 120
+degrees, count as closed after the distance has shrunk by ``cos(gap/2)``. With real multipliers the faster component must
+have shrunk by a factor of 30 relative to the other. In any case it is enough that the distance has shrunk by that factor.
 
-Beside a fold or a period doubling rho is nearly 1, and this would take thousands of periods. The motion then creeps
-along one line, the direction of the slow multiplier. That nothing else lies on it is judged by the map itself: started
-at eight points of the line between the orbit and the motion, one recurrence (two if the multiplier is negative) must lead
-nearer to the orbit from each of them.
+Near a fold or a period doubling rho is nearly 1, and this would take thousands of periods. The motion then moves slowly
+along one line, the direction of the slow multiplier. The map itself shows that this line contains nothing else: from each
+of eight points between the orbit and the motion, one recurrence (two if the multiplier is negative) must lead nearer to the
+orbit.
 """
 
 from __future__ import annotations
@@ -29,14 +28,14 @@ from jax import Array
 
 from drivetrain_jax.analysis.impacts.plane_map import Matrix, apply, spectral_radius
 
-# Remainder of the linearisation that is tolerated, as part of the contraction 1 - rho.
+# Tolerated remainder of the linearisation relative to the contraction 1 - rho.
 REMAINDER = 0.02
-# Distance over size at which the motion has arrived.
+# Relative distance at which the motion has arrived.
 _ARRIVED = 1e-9
 _DECAY = np.log(30.0)
-# Slow: modulus of the slow multiplier, of the fast one against it, and part of the distance off the slow line.
+# Slow: modulus of the slow multiplier, ratio of the fast one to it, and relative distance from the slow line.
 _SLOW, _APART, _OFF = 0.9, 0.9, 0.1
-# Points of the line, and the contraction they must show, as a part of 1 - rho.
+# Points of the line, and their least contraction as a fraction of 1 - rho.
 PROBES, _PULL = 8, 0.2
 
 
@@ -52,12 +51,12 @@ class Orbit(NamedTuple):
 
 
 def attracts(orbit: Orbit) -> Array:
-    """Whether all multipliers lie inside the unit circle."""
+    """True if all multipliers lie inside the unit circle."""
     return spectral_radius(orbit.matrix, orbit.log_determinant) < 1
 
 
 def recurrences(orbit: Orbit) -> Array:
-    """For how many recurrences a motion has to obey the linearisation (module docstring), at least 2."""
+    """Number of recurrences that must satisfy the linearisation (module docstring), at least 2."""
     rho = spectral_radius(orbit.matrix, orbit.log_determinant)
     half = (orbit.matrix[0] + orbit.matrix[3]) / 2
     gap = half**2 - jnp.exp(orbit.log_determinant)
@@ -72,7 +71,7 @@ def recurrences(orbit: Orbit) -> Array:
 
 
 def obeys(orbit: Orbit, before: tuple[Array, Array], after: tuple[Array, Array], omega: Array) -> tuple[Array, Array]:
-    """Whether ``after``, one recurrence after ``before``, is where the linearisation has it; whether it has arrived."""
+    """Flags where ``after``, one recurrence after ``before``, agrees with the linearisation; flags where it has arrived."""
     rho = spectral_radius(orbit.matrix, orbit.log_determinant)
     away = (before[0] - orbit.u, before[1] - orbit.v)
     ahead = apply(orbit.matrix, *away)
@@ -93,7 +92,7 @@ def along(orbit: Orbit, away: tuple[Array, Array]) -> tuple[Array, Array]:
 
 
 def creeps(orbit: Orbit, state: tuple[Array, Array], omega: Array) -> Array:
-    """Whether the motion in ``state`` creeps towards the orbit along the slow line."""
+    """Flags where the motion in ``state`` moves slowly towards the orbit along the slow line."""
     half = (orbit.matrix[0] + orbit.matrix[3]) / 2
     rho, real = spectral_radius(orbit.matrix, orbit.log_determinant), half**2 > jnp.exp(orbit.log_determinant)
     away = (state[0] - orbit.u, state[1] - orbit.v)
@@ -105,9 +104,9 @@ def creeps(orbit: Orbit, state: tuple[Array, Array], omega: Array) -> Array:
 
 
 def doubled(orbit: Orbit) -> tuple[Orbit, Array]:
-    """The orbit, over two of its periods where its slow multiplier is negative; whether that is so.
+    """The orbit, over two of its periods where its slow multiplier is negative; flags of these.
 
-    Over one period a motion beside such an orbit changes sides, and may come nearer from one side only.
+    Over one period a motion near such an orbit changes sides, and may approach from one side only.
     """
     a, b, c, d = orbit.matrix
     negative = a + d < 0
@@ -117,13 +116,14 @@ def doubled(orbit: Orbit) -> tuple[Orbit, Array]:
 
 
 def probe(orbit: Orbit, state: tuple[Array, Array], number: Array) -> tuple[Array, tuple[Array, Array]]:
-    """Point ``number`` of the line, from 0: its place (0 the orbit, 1 ``state``) and its state."""
+    """Point ``number`` of the line, from 0: its position (0 the orbit, 1 ``state``) and its state."""
     place = (number + 1) / PROBES
     return place, (orbit.u + place * (state[0] - orbit.u), orbit.v + place * (state[1] - orbit.v))
 
 
 def pulled(orbit: Orbit, state: tuple[Array, Array], place: Array, after: tuple[Array, Array], omega: Array) -> Array:
-    """Whether ``after``, a recurrence after the point ``place`` of the line to ``state``, is nearer on the same side."""
+    """Flags where ``after``, a recurrence after the point ``place`` of the line to ``state``, is nearer on the same
+    side."""
     rho = spectral_radius(orbit.matrix, orbit.log_determinant)
     unit = along(orbit, (state[0] - orbit.u, state[1] - orbit.v))
     there = along(orbit, (after[0] - orbit.u, after[1] - orbit.v))

@@ -1,7 +1,7 @@
-"""Lanes on their way to attractors: they settle period by period, start searches, and confirm what these find.
+"""Lanes on their way to attractors: they settle period by period, start searches, and confirm the results.
 
-A *lane* works on one point at a time. It keeps the states of the last 33 periods, from which the number of periods after
-which the motion recurs is guessed, and counts the growth of a tangent for the Lyapunov exponent.
+A *lane* processes one point at a time. It stores the states of the last 33 periods, to guess the number of periods after
+which the motion recurs, and accumulates the growth of a tangent for the Lyapunov exponent.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from drivetrain_jax.analysis.impacts.piecewise_march import Motion
 from drivetrain_jax.analysis.impacts.plane_map import apply
 
 MOST_PERIODS = 32
-# Recurrences that count as equally good.
+# Ratio of recurrences that count as equally good.
 _NEAR, _NARROW = 30.0, 1.5
-# Recurrences for which an orbit that was found is kept although the motion does not yet obey its linearisation.
+# Recurrences for which a found orbit is kept while the motion does not yet satisfy its linearisation.
 _PATIENCE = 8
 _ROWS = np.arange(MOST_PERIODS + 1, dtype=np.int32)[:, None]
 
@@ -72,8 +72,8 @@ def candidates(lane: Lane, history: Array, omega: Array) -> tuple[Array, Array]:
         return jnp.where(recurs, age, MOST_PERIODS).min(axis=0).astype(jnp.int32)
 
     first, second = smallest(_NEAR), smallest(_NARROW)
-    # About an orbit whose period is soon to double the motion alternates: twice the period recurs best, and Newton's
-    # method, which is slow for twice the period, is quick for the period itself.
+    # Near an orbit whose period is about to double the motion alternates: twice the period recurs best, but Newton's method
+    # converges slowly for twice the period and fast for the period itself.
     return first, jnp.where((second == first) & (first % 2 == 0), first // 2, second)
 
 
@@ -84,7 +84,7 @@ def record(history: Array, now: Array, lane: Lane) -> Array:
 
 
 def restart(lane: Lane, going: Array, u: Array, v: Array, periods: Array | int) -> Lane:
-    """Lanes ``going`` start anew at the beginning of a period from ``(u, v)``."""
+    """Lanes ``going`` restart at the beginning of a period from ``(u, v)``."""
     one, zero = jnp.ones_like(u), jnp.zeros_like(u)
     count = jnp.zeros(u.shape, jnp.int32)
     fresh = Motion(zero, one, zero, u, v, (one, zero, zero, one), jnp.broadcast_to(periods, u.shape) + count, count)
@@ -92,7 +92,7 @@ def restart(lane: Lane, going: Array, u: Array, v: Array, periods: Array | int) 
 
 
 def settle(lane: Lane, now: Array, forget: int, omega: Array) -> Lane:
-    """One more period settled in the lanes ``now``; at the period number ``forget`` the growth is counted anew."""
+    """One more period settled in the lanes ``now``; at the period number ``forget`` the growth restarts."""
     motion = lane.motion
     count = lane.count + 1
     tangent = apply(motion.matrix, *lane.tangent)
@@ -123,7 +123,7 @@ def search(lane: Lane, now: Array, multiple: Array, second: Array) -> Lane:
 
 
 def resume(lane: Lane, failed: Array) -> Lane:
-    """After a failed search: the second candidate if there is one, else on with settling."""
+    """After a failed search: the second candidate if there is one, else continue settling."""
     lane = lane._replace(probing=jnp.where(failed, -1, lane.probing))
     again = failed & (lane.second != lane.multiple)
     back = failed & ~again
@@ -133,7 +133,7 @@ def resume(lane: Lane, failed: Array) -> Lane:
 
 
 def approach(lane: Lane, now: Array, orbit: Orbit) -> Lane:
-    """Lanes ``now`` have found an orbit from their latest state: from there the motion itself goes on towards it."""
+    """Lanes ``now`` have found an orbit from their latest state: the motion continues from there towards it."""
     begun = lane._replace(
         searching=jnp.zeros_like(now),
         approaching=jnp.ones_like(now),
@@ -145,9 +145,9 @@ def approach(lane: Lane, now: Array, orbit: Orbit) -> Lane:
 
 
 def confirm(lane: Lane, now: Array, history: Array, omega: Array) -> tuple[Lane, Array]:
-    """Lanes ``now``, a period further: those that have approached their orbit for long enough are returned second.
+    """Lanes ``now``, a period further; second: those that have approached their orbit for long enough.
 
-    Where the motion does not obey the linearisation about the orbit, counting starts again; a new search may follow.
+    If the motion does not satisfy the linearisation about the orbit, counting restarts; a new search may follow.
     """
     due = now & lane.approaching & (lane.count > lane.begun) & ((lane.count - lane.begun) % lane.multiple == 0)
     row = (lane.count - lane.multiple) % (MOST_PERIODS + 1)
@@ -158,9 +158,10 @@ def confirm(lane: Lane, now: Array, history: Array, omega: Array) -> tuple[Lane,
 
 
 def try_line(lane: Lane, now: Array, orbit: Orbit, omega: Array) -> tuple[Lane, Array, Array]:
-    """Lanes ``now`` have found an orbit that their motion creeps towards, or have run from a point of the line to it.
+    """Lanes ``now`` have found an orbit that they approach slowly, or have run from a point of the line to it.
 
-    They go to the next point. Second: those that all points have led nearer to the orbit; third, those that one has not.
+    They continue with the next point. Second: lanes whose points all approached the orbit; third: lanes with one that did
+    not.
     """
     begins = now & (lane.probing < 0)
     twice, negative = doubled(orbit)
@@ -197,7 +198,7 @@ def enter(lane: Lane, now: Array, job: Array, place: Array, u: Array, v: Array, 
 
 
 def blank(width: int) -> Lane:
-    """Lanes that have entered no point yet."""
+    """Lanes without a point."""
     real, whole = jnp.zeros(width), jnp.zeros(width, jnp.int32)
     pair, flag = (real, real), jnp.zeros(width, bool)
     motion = Motion(real, real + 1, real, real, real, (real + 1, real, real, real + 1), whole, whole)

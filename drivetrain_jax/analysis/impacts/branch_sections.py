@@ -1,7 +1,7 @@
-"""Where a branch of motions, known by points along it, has a given frequency.
+"""Motions of a branch at a given frequency, from points along the branch.
 
-Between its points the branch is taken for a cubic (Hermite's, with the slopes of parabolas through three points), cut in
-two where the cubic turns back in frequency. Next to a fold both of its sides are thus met, each near its own motion.
+Between its points the branch is a cubic (Hermite's, with the slopes of parabolas through three points), cut in two where it
+turns back in frequency. Next to a fold both of its sides are thus found, each near its own motion.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from jax import Array
 from drivetrain_jax.analysis.numerics.amplitude_roots import sign_changes
 
 _HALVINGS = 50
-# Difference of extremes, over their size, below which two motions are one.
+# Relative difference of extremes below which two motions are the same.
 _SAME = 1e-9
 
 
@@ -64,8 +64,8 @@ def course(points: Array, scale: Array) -> Course:
 
 
 def sections(branch: Course, omega: Array, count: int) -> tuple[Array, Array, Array]:
-    """Up to ``count`` places of the branch at ``omega``, in its order: ``(count, n, N)``, which exist, and whether these
-    are all."""
+    """Up to ``count`` positions of the branch at ``omega``, in its order: ``(count, n, N)``, flags of existing ones, and
+    flags if these are all."""
     above = branch.nodes > omega
     changes = sign_changes(above, count) & jnp.isfinite(branch.nodes[1:])
     every = jnp.sum((above[1:] != above[:-1]) & jnp.isfinite(branch.nodes[1:]), axis=0) <= count
@@ -96,9 +96,9 @@ def sections(branch: Course, omega: Array, count: int) -> tuple[Array, Array, Ar
 
 
 def distinct(high: Array, low: Array) -> Array:
-    """Whether all motions with these extremes, ``(count, ...)`` by rising ``high`` and NaN after the last, are different.
+    """True if all motions with these extremes, ``(count, ...)`` by rising ``high`` and NaN after the last, are different.
 
-    Two places of a branch that are corrected to one motion have left out another.
+    Two positions of a branch corrected to one motion mean that another one is missing.
     """
     size = jnp.maximum(jnp.abs(high), jnp.abs(low))[1:]
     same = (jnp.abs(jnp.diff(high, axis=0)) <= _SAME * size) & (jnp.abs(jnp.diff(low, axis=0)) <= _SAME * size)

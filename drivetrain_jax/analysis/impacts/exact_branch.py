@@ -33,11 +33,10 @@ def branch(
 ) -> tuple[dict[str, Array], Array]:
     """Results of the branches through ``first = (u, v, omega)``, shape ``(3, N)``, over the rising ``omega`` (L,).
 
-    ``branch_u_max, branch_u_min, branch_stability``, shape ``(L, 7, N)``, by rising largest displacement; if
-    ``special``, ``fold_frequency`` and ``doubling_frequency``, shape ``(L, 16, N)``, the largest 16 within the line,
-    rising. Second, shape ``(L, N)``: whether each branch has been followed out of the line both ways, to the highest
-    frequency at least one way, and has no more orbits at a frequency, folds or doublings than that, each of them found.
-    NaN in ``first``: no branch.
+    ``branch_u_max, branch_u_min, branch_stability``, shape ``(L, 7, N)``, by rising largest displacement; if ``special``,
+    ``fold_frequency`` and ``doubling_frequency``, shape ``(L, 16, N)``, the largest 16 within the line, rising. Second,
+    shape ``(L, N)``: true if the branch was followed out of the line both ways (to the highest frequency at least one way),
+    all its orbits were found, and it has no more orbits, folds or doublings than these. NaN in ``first``: no branch.
     """
     low, high = float(omega[0]), float(omega[-1])
     own = {name: jnp.tile(v, 2) for name, v in vars(model).items() if name != "omega" and jnp.ndim(v)}
@@ -67,7 +66,7 @@ def branch(
 
 
 def _ended(omega: Array, limits: tuple[float, float]) -> Array:
-    """Whether a branch has been followed until it left the limits."""
+    """True if a branch has been followed until it left the limits."""
     return jnp.any((omega > limits[1]) | (omega < limits[0]), axis=0)
 
 
@@ -82,8 +81,8 @@ def _along(values: Array, omega: np.ndarray) -> Array:
 
 
 def _ordered(results: dict[str, Array], exists: Array) -> tuple[dict[str, Array], Array]:
-    """By rising largest displacement along the second axis, those that exist first; whether they are as many different
-    orbits as there are places on the branch."""
+    """By rising largest displacement along the second axis, existing ones first; flags if each position of the branch
+    has its own orbit."""
     order = jnp.argsort(results["branch_u_max"], axis=1)
     ordered = {name: jnp.take_along_axis(x, order, axis=1) for name, x in results.items()}
     high, low = (jnp.moveaxis(ordered[name], 1, 0) for name in ("branch_u_max", "branch_u_min"))
@@ -145,13 +144,13 @@ def _described(model: PiecewiseLinearOscillator, states: Array, exists: Array, w
 def _special(
     model: PiecewiseLinearOscillator, found: Branch, limits: tuple[float, float]
 ) -> tuple[dict[str, Array], Array]:
-    """Frequencies of folds and period doublings within the limits, ``(16, N)``, rising, NaN after the last; and whether
-    these are all that the branches have there."""
+    """Frequencies of folds and period doublings within the limits, ``(16, N)``, rising, NaN after the last; and flags if
+    these are all of the branches."""
     tests = jnp.stack([fold_test(found.matrix), doubling_test(found.matrix)])
     changes = (tests[:, 1:] * tests[:, :-1] < 0).transpose(1, 0, 2)
     lanes = changes.shape[2]
 
-    # The highest ones, and one more to tell whether there are more.
+    # The highest ones, and one more to detect further ones.
     above = jnp.maximum(found.x[1:, 2], found.x[:-1, 2])[:, None]
     above = jnp.where(changes, above, -jnp.inf)
     place = jnp.argsort(-above, axis=0)[: SPECIAL + 1]

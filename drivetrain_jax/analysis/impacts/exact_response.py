@@ -1,8 +1,8 @@
-"""Exact motions of an oscillator with play, described: single points, and sweeps of the drive's frequency up and down.
+"""Results of exact motions of an oscillator with play: single points, and sweeps of the drive's frequency up and down.
 
-:func:`sweeps` is what the analysis ``frequency_response`` calls for its method ``exact``: ``model.omega`` has shape
-``(L,)``, the other fields are scalars or have one shape ``(N,)``; the results carry the frequencies first, then the
-direction (up, down), then the lanes.
+:func:`sweeps` serves the method ``exact`` of the analysis ``frequency_response``: ``model.omega`` has shape ``(L,)``, the
+other fields are scalars or have one shape ``(N,)``; results have the frequencies first, then the direction (up, down), then
+the lanes.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from drivetrain_jax.systems import PiecewiseLinearOscillator
 NON_PERIODIC = REGIMES.index("non_periodic")
 # Results that need integrals over the motion.
 INTEGRALS = frozenset(("u_mean", "u_rms", "phase"))
-# Growth of a tangent (its logarithm) that only chaos explains, lasting or transient: shear alone gives the logarithm of
-# the time.
+# Growth of a tangent (its logarithm) that only chaos explains, lasting or transient: shear alone gives the logarithm of the
+# time.
 _WILD = 20.0
-# Lanes that are worked on at a time: enough to fill the vector units, few enough to wait little for the slowest. Sweeps
-# are long jobs of very different length.
+# Lanes computed at a time: enough to fill the vector units, few enough to wait little for the slowest. Sweeps are long jobs
+# of very different length.
 WIDTH, _SWEEP_WIDTH = 64, 32
 
 
 def describe(
     oscillator: PiecewiseLinearOscillator, found: Attractors, *, rtol: float, integrals: bool = True
 ) -> dict[str, Array]:
-    """Everything said about the motions ``found``, every field of shape ``(N,)`` as those of ``oscillator``.
+    """All results of the motions ``found``, every field of shape ``(N,)`` as those of ``oscillator``.
 
-    Scalars per motion under the names of the analyses' variables, shape ``(N,)``; ``impacts``, ``impact_velocity`` and
+    Scalars per motion under the names of the variables, shape ``(N,)``; ``impacts``, ``impact_velocity`` and
     ``contact_fraction`` of the driving and the back flank, ``orbit_state`` and (complex) ``floquet_multiplier``, shape
-    ``(2, N)``. What is not known is NaN (``stability``: absent). A motion that recurs within 32 periods is described over
-    its period. One that does not, but whose tangent has grown by exp(20) over the last three quarters of the run, is
-    non-periodic: ``period_multiple`` 0, described over 32 drive periods. It may still be a transient to a periodic motion,
-    and then has the exponent of the chaos that it is leaving. Any other has not settled. ``outcome`` is
+    ``(2, N)``. Unknown values are NaN (``stability``: absent). A motion that recurs within 32 periods is described over its
+    period. If it does not recur, but its tangent has grown by exp(20) over the last three quarters of the run, it is
+    non-periodic (``period_multiple`` 0) and described over 32 drive periods. It may still be a transient to a periodic
+    motion, with the exponent of the chaos that it is leaving. Any other motion has not settled. ``outcome`` is
     TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its size.
     """
     seen = measure(oscillator, found.u, found.v, found.multiple, width=WIDTH, integrals=integrals)

@@ -1,7 +1,7 @@
-"""The unit of length in which a motion is computed: a power of two near the lengths of the oscillator itself.
+"""The unit of length of a computation: a power of two near the lengths of the oscillator.
 
-The equation is homogeneous in u, b, B0 and B1, and a power of two rounds nothing. Squares of lengths of 1e-160, which are 0
-in double precision, are thus met no more than those of 1e160.
+The equation is homogeneous in u, b, B0 and B1, and a power of two causes no rounding. Squares of lengths then neither
+underflow (1e-160) nor overflow (1e160).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _LARGEST = 1000
 
 
 def measured(model: PiecewiseLinearOscillator) -> tuple[PiecewiseLinearOscillator, Array | np.ndarray]:
-    """``model`` with lengths in units of their own, and this unit [m], of the common shape of all fields but omega."""
+    """``model`` with lengths in a unit of its own, and this unit [m], of the common shape of all fields but omega."""
     fields = (model.b, model.B0, model.B1, model.stiffness)
-    # What a scene fixes stays a constant of the kernel.
+    # Fixed values of a scene stay constants of the kernel.
     xp = jnp if any(isinstance(x, Array) for x in fields) else np
     b, B0, B1, stiffness = (xp.asarray(x, float) for x in fields)
     drive = xp.maximum(xp.abs(B0), xp.abs(B1))

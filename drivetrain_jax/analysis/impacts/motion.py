@@ -1,4 +1,4 @@
-"""What is said about a periodic motion of the oscillator with play, however it was found."""
+"""Quantities of a periodic motion of the oscillator with play, for all methods."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from jax import Array
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 REGIMES = ("no_separation", "single_sided", "double_sided", "non_periodic")
-REGIME = "flanks at which contact is made and lost (non_periodic in the time given: maybe a transient)"
+REGIME = "flanks at which contact is made and lost (non_periodic within the time limit: possibly a transient)"
 STABILITY = ("stable", "unstable", "absent")
 STABLE, UNSTABLE, ABSENT = range(3)
-PHASE = "lag of the fundamental behind the drive (NaN where the motion has none)"
-# A fundamental below this part of the displacement is rounding: 1e-14 of it is left of a motion at rest.
+PHASE = "lag of the fundamental behind the drive (NaN without a fundamental)"
+# Relative size below which a fundamental is rounding: a motion at rest has 1e-14.
 _ROUNDING = 1e-13
 
 
@@ -33,7 +33,8 @@ def phase_lag(cosine: Array, sine: Array, size: Array) -> Array:
 
 
 def imbalance(model: PiecewiseLinearOscillator, motion: tuple[Array, Array, Array], drive: Array) -> Array:
-    """Root mean square over the first axis (samples of a period) of what ``(u, u', u'')`` leaves of the drive."""
+    """Root mean square over the first axis (samples of a period) of the residual of the equation of motion for ``(u, u',
+    u'')``."""
     u, rate, acceleration = motion
     rest = acceleration + model.damping * rate + model.stiffness * model.restoring(u) - drive
     return jnp.sqrt(jnp.mean(rest**2, axis=0))

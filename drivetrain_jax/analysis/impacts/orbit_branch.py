@@ -25,13 +25,14 @@ _CORRECTIONS, _CONVERGED, _DIFFERENCE = 8, 1e-12, 1e-6
 # A step is shortened if it fails and lengthened if it takes few corrections.
 _SHORTER, _LONGER, _FEW = 0.4, 1.4, 4
 _SHORTEST, _CLOSED, _LEAST_COSINE = 1e-7, 1e-9, 0.8
-# How far from its guess, over the step, a point may lie: on an arc that turns by so much it is tan(acos(0.8)/2).
+# Largest distance of a point from its guess relative to the step; on an arc that turns by acos(0.8) it is tan(acos(0.8)/2).
 _ASIDE = 1 / 3
-# Between two points no special point may hide: how far the trace may lie off the line through the last two, over the
-# distance of a multiplier from 1 or -1, that distance at least, and the part of the longest step that need not be tried.
+# Limits so that no special point hides between two points: largest deviation of the trace from the line through the last
+# two, relative to the distance of a multiplier from 1 or -1; least such distance; part of the longest step that is always
+# accepted.
 _BENT, _LEAST_DISTANCE, _FINE = 0.25, 0.02, 0.01
 _MOST_STEPS = 100_000
-# Locating a special point: most steps, and the last one as a part of the chord.
+# Locating a special point: most steps, and the last one relative to the chord.
 _ROOT_STEPS, _LOCATED = 40, 1e-13
 
 
@@ -133,8 +134,8 @@ def scale_of(model: PiecewiseLinearOscillator, x: Array, highest: float = np.inf
 
 
 class _Front(NamedTuple):
-    """The last orbit, the tangent there, the length of the next step, the number of the orbit on the branch, and how
-    fast the trace of the transition matrix has changed on the last step."""
+    """The last orbit, the tangent there, the length of the next step, the number of the orbit on the branch, and the
+    last change of the trace of the transition matrix."""
 
     solved: _Solved
     tangent: Array
@@ -190,18 +191,18 @@ def follow(
 
 
 def _row(solved: _Solved) -> Array:
-    """What a branch stores of a point, ``(7, N)``."""
+    """The stored values of a point of a branch, ``(7, N)``."""
     return jnp.concatenate([solved.x, jnp.stack(solved.matrix)])
 
 
 def _going(front: _Front, limits: tuple[float, float]) -> Array:
-    """Where the branch has not ended."""
+    """Flags of branches that have not ended."""
     omega = front.solved.x[2]
     return (omega >= limits[0]) & (omega <= limits[1]) & (front.length > _SHORTEST)
 
 
 def _straight(front: _Front, there: _Solved) -> Array:
-    """Whether the trace changes steadily enough for no two special points to hide between the last point and the next."""
+    """True if the trace changes steadily enough, so that no two special points hide between the last point and the next."""
     old, new = front.solved.matrix, there.matrix
     bent = jnp.abs(new[0] + new[3] - old[0] - old[3] - front.slope * front.length)
     tests = jnp.stack([test(matrix) for test in (fold_test, doubling_test) for matrix in (old, new)])
@@ -211,9 +212,9 @@ def _straight(front: _Front, there: _Solved) -> Array:
 def _moved(
     front: _Front, there: _Solved, near: Array, tangent: Array, longest: float, limits: tuple[float, float]
 ) -> _Front:
-    """The front at ``there``, or where that is no good, the old one with a shorter step.
+    """The front at ``there``, or the old one with a shorter step if ``there`` is not acceptable.
 
-    What is not ``near`` where the tangent leads may lie on another part of the branch, or on another branch.
+    A point that is not ``near`` the tangent may lie on another part of the branch, or on another branch.
     """
     good = (
         near & (there.change <= _CLOSED) & (jnp.sum(tangent * front.tangent, axis=0) > _LEAST_COSINE) & (there.x[2] > 0)

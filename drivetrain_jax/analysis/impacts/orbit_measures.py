@@ -1,7 +1,7 @@
-"""What a motion of a piecewise linear oscillator does over its period: extremes, means, contacts and impacts.
+"""Measures of a motion of a piecewise linear oscillator over its period: extremes, means, contacts and impacts.
 
-The motion is followed by exact steps that also stop at every reversal of the velocity, so that every extreme is the end
-of a step. Means are Gauss-Legendre sums over the steps, with 8 nodes on at most two radians of the fastest motion.
+The motion is followed by exact steps that also stop at every reversal of the velocity, so every extreme is the end of a
+step. Means are Gauss-Legendre sums over the steps, with 8 nodes on at most two radians of the fastest motion.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from drivetrain_jax.systems.trigonometry import sincos
 
 _NODES, _WEIGHTS = (x.tolist() for x in np.polynomial.legendre.leggauss(8))
 _LONGEST_ARC = 2.0
-# Relative size of what is no motion but rounding, and of a difference that still counts as recurrence.
+# Relative size below which a motion is rounding, and of a difference that still counts as recurrence.
 _ROUNDING, _RECURRENCE = 1e-13, 1e-7
 _FEW = 8
 
@@ -72,11 +72,11 @@ def _fresh(u: Array, side: Array) -> Measures:
 
 
 def _reversal(motion: Motion, rate: Derivatives, size: tuple[Array, Array]) -> Bound:
-    """How far the velocity is from changing sign; infinitely far where nothing moves."""
+    """Distance of the velocity from a change of sign; infinite without motion."""
     v, a = motion.v, rate.acceleration
     sign = jnp.where(v != 0, jnp.sign(v), jnp.sign(a))
     still = jnp.abs(v) * size[1] + jnp.abs(a) <= _ROUNDING * size[0]
-    # Infinitely far with a slope would be a quotient of infinities.
+    # An infinite value with a slope would be a quotient of infinities.
     slope = jnp.where(still, 0.0, sign * a)
     return Bound(jnp.where(still, jnp.inf, jnp.abs(v)), slope, sign * rate.jerk, rate.snap_bound)
 
@@ -119,11 +119,11 @@ def _watched(lanes: Lanes, motion: Motion, so_far: Measures, integrals: bool) ->
         d = jnp.where(moves, jnp.minimum(d, _LONGEST_ARC / jnp.maximum(region.rate, 1e-300)), d)
     d = jnp.minimum(jnp.maximum(d, least_step(lanes, here, motion, rate)), rest)
     moved = advance(lanes, here, motion, d)
-    # A flank is reached where a step begins beyond it. Compiled code may round the end of a step in one way to tell its
-    # side and in another to go on from it: counted at the end, an impact was missed or counted twice.
+    # A flank is reached if a step begins beyond it. Compiled code may round the end of a step differently in two uses:
+    # counted at the end, an impact was missed or counted twice.
     before, last = here.side, so_far.side
     hits = tuple((before == side) & (last != side) for side in (1.0, -1.0))
-    # Without backlash the whole line is in contact, with the flank that the mean drive holds.
+    # Without backlash the whole line is in contact, with the flank loaded by the mean drive.
     held = (before == 1) | ((before == 2) & (lanes.mean >= 0)), (before == -1) | ((before == 2) & (lanes.mean < 0))
     speed = jnp.abs(motion.v)
     added = _integrals(lanes, here, motion, d) if integrals else (jnp.zeros_like(d),) * 4
@@ -139,7 +139,7 @@ def _watched(lanes: Lanes, motion: Motion, so_far: Measures, integrals: bool) ->
 
 
 class _Task(NamedTuple):
-    """The motions to be followed; ``first``: u, v, most periods, and whether a recurrence ends them, ``(4, N)``."""
+    """The motions to follow; ``first``: u, v, most periods, and a flag if a recurrence ends them, ``(4, N)``."""
 
     oscillator: PiecewiseLinearOscillator
     first: Array
@@ -147,9 +147,9 @@ class _Task(NamedTuple):
 
 
 class _Work(NamedTuple):
-    """Lanes that each follow the motion ``index``, the next one in the ``queue``, and what is stored of those done.
+    """Lanes that each follow the motion ``index``, the next one in the ``queue``, and the stored results.
 
-    ``renewed``: where a lane has just turned to another motion.
+    ``renewed``: flags of lanes that have just started another motion.
     """
 
     index: Array  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -182,7 +182,7 @@ def measure(
 
 
 def _tick(task: _Task, work: _Work) -> _Work:
-    """All lanes a few steps on; those whose motion is done store it and take the next one of the queue."""
+    """Advance all lanes by a few steps; those whose motion is finished store it and take the next one of the queue."""
     count = task.first.shape[1]
     here = jnp.minimum(work.index, count - 1)
     u, v, periods, recurs = task.first[:, here]
@@ -206,7 +206,7 @@ def _tick(task: _Task, work: _Work) -> _Work:
 
 
 def _few_steps(lanes: Lanes, periods: Array, pair: tuple[Motion, Measures], integrals: bool) -> tuple[Motion, Measures]:
-    """Some steps; a lane waits at the end of each period until its recurrence has been looked at."""
+    """Some steps; a lane waits at the end of each period for the test of recurrence."""
 
     def one(_: Array, pair: tuple[Motion, Measures]) -> tuple[Motion, Measures]:
         motion, so_far = pair

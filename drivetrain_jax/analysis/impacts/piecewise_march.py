@@ -1,10 +1,10 @@
-"""Motion of a piecewise linear oscillator over drive periods: every lane goes from event to event at its own pace.
+"""Motion of a piecewise linear oscillator over drive periods: every lane moves from event to event at its own pace.
 
-Each pass of the loop advances every lane by one exact step (:mod:`~drivetrain_jax.analysis.impacts.piecewise_flow`) that is
-certain to stay within its linear region. Steps therefore shrink towards a flank like Newton iterates and can neither
-miss a crossing nor hang on a grazing contact: a least step carries the lane over the flank once it is nearer than that.
-The excess, 1e-12 of the shortest time scale, changes the velocity by 1e-24 of itself, as the force is continuous. The
-transition matrix, which it changes by 1e-12, is corrected for it.
+Each pass of the loop advances every lane by one exact step (:mod:`~drivetrain_jax.analysis.impacts.piecewise_flow`) that
+certainly stays within its linear region. Steps therefore shrink towards a flank like Newton iterates. They cannot miss a
+crossing; near a grazing contact a least step carries the lane over the flank. The excess, 1e-12 of the shortest time scale,
+changes the velocity by a relative 1e-24, because the force is continuous. The transition matrix, which it changes by 1e-12,
+is corrected.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ _LEAST_STEP, _LEAST_PART = 1e-12, 1e-15
 # Longest step, as a phase of the drive.
 _LONGEST_PHASE = 1.5
 _LIKELY_ARC = 2.5
-# So near to a flank, in half backlashes, a lane is taken over it; one that rests there moves on by such a part of its own
-# motion.
+# Distance from a flank, in half backlashes, at which a lane is carried over it; a lane at rest there moves by this fraction
+# of its motion.
 _ON_FLANK, _RESTING_ARC = 4e-16, 0.1
 _FEW = 8
 
 
 class Lanes(NamedTuple):
-    """An oscillator made ready: regions, flanks and time scales, each of shape ``(N,)``."""
+    """An oscillator with its derived constants: regions, flanks and time scales, each of shape ``(N,)``."""
 
     contact: Piece
     gap: Piece
@@ -74,8 +74,8 @@ def prepare(oscillator: PiecewiseLinearOscillator) -> Lanes:
 
 
 class Motion(NamedTuple):
-    """Where the lanes are: time since the start of the period, cosine and sine of the drive's phase, displacement,
-    velocity, transition matrix so far ``(m11, m12, m21, m22)``, periods still to go, and steps taken."""
+    """State of the lanes: time since the start of the period, cosine and sine of the drive's phase, displacement,
+    velocity, transition matrix ``(m11, m12, m21, m22)``, remaining periods, and number of steps."""
 
     time: Array
     cosine: Array
@@ -135,7 +135,7 @@ def derivatives(lanes: Lanes, here: Here, motion: Motion, limit: Array) -> Deriv
 
 
 def flank_bounds(lanes: Lanes, side: Array, motion: Motion, rate: Derivatives) -> tuple[Bound, Bound]:
-    """How far the lane is from leaving its region on either side (infinitely far where there is no flank)."""
+    """Distances of the lane from leaving its region on either side (infinite without a flank)."""
     b, u, v, a, jerk = lanes.flank, motion.u, motion.v, rate.acceleration, rate.jerk_bound
     inside, sign = side == 0, jnp.where(side == 0, -1.0, side)
     near = jnp.where(inside, b - u, sign * u - b)
@@ -147,10 +147,10 @@ def flank_bounds(lanes: Lanes, side: Array, motion: Motion, rate: Derivatives) -
 
 
 def _overdue(lanes: Lanes, here: Here, u: Array, v: Array, d: Array) -> Array:
-    """How long a step of length ``d`` that has ended in ``(u, v)`` has stayed in contact in truth where the region ``here``
-    is the gap; less than 0 the other way round."""
+    """Time that a step of length ``d`` ending in ``(u, v)`` was really in contact if the region ``here`` is the gap;
+    negative in the other direction."""
     over = jnp.abs(u) - lanes.flank
-    # A lane that is turned back at the flank may be over it for all of the step; one that rests there is not.
+    # A lane that is turned back at the flank may be over it during the whole step; one at rest there is not.
     late = jnp.minimum(jnp.abs(over) / jnp.maximum(jnp.abs(v), 1e-300), d)
     late = jnp.where(jnp.abs(over) > _ON_FLANK * lanes.flank, late, 0.0)
     left = (jnp.abs(here.side) == 1) & (over < 0)
@@ -183,12 +183,12 @@ def advance(lanes: Lanes, here: Here, motion: Motion, d: Array) -> Motion:
 
 
 def likely_span(here: Here) -> Array:
-    """A first guess at the length of a step that stays in the region: a good part of its own oscillation."""
+    """A first guess of the length of a step within the region: a large part of its oscillation."""
     return _LIKELY_ARC / jnp.maximum(here.region.rate, 1e-300)
 
 
 def stays(lanes: Lanes, here: Here, motion: Motion) -> Array:
-    """Whether the energy of the free motion about the harmonic response is too small for ever leaving the region."""
+    """True if the energy of the free motion about the harmonic response is too small ever to leave the region."""
     region = here.region
     x = motion.u - (region.cosine * motion.cosine + region.sine * motion.sine)
     y = motion.v - lanes.omega * (region.sine * motion.cosine - region.cosine * motion.sine)
@@ -202,8 +202,8 @@ def stays(lanes: Lanes, here: Here, motion: Motion) -> Array:
 
 
 def least_step(lanes: Lanes, here: Here, motion: Motion, rate: Derivatives) -> Array:
-    """The step that is taken whatever lies ahead. On a flank, as far as rounding can tell, it is long enough to leave it,
-    however slow the lane: it would stand still there for ever."""
+    """The least step. On a flank, up to rounding, it is long enough to leave it even for a slow lane, which would
+    otherwise never move."""
     way = jnp.maximum(_ON_FLANK * jnp.abs(lanes.flank), 1e-300)
     longest = _RESTING_ARC / jnp.maximum(here.region.rate, 1e-300)
     pull = jnp.abs(rate.acceleration) + longest * rate.jerk_bound
@@ -213,7 +213,7 @@ def least_step(lanes: Lanes, here: Here, motion: Motion, rate: Derivatives) -> A
 
 
 def next_step(lanes: Lanes, here: Here, motion: Motion) -> Array:
-    """The longest step that is certain to stay in the region ``here`` (or the least step) within the period."""
+    """The longest certain step within the region ``here`` (or the least step) within the period."""
     rest = lanes.period - motion.time
     limit = jnp.minimum(rest, _LONGEST_PHASE / lanes.omega)
     rate = derivatives(lanes, here, motion, limit)
@@ -236,13 +236,13 @@ def few_steps(lanes: Lanes, motion: Motion) -> Motion:
 
 
 def usual_steps(lanes: Lanes) -> Array:
-    """A number of steps that no drive period needs (measured: 5 for an oscillation, up to 15 for a crossing)."""
+    """A number of steps above the need of any drive period (measured: 5 for an oscillation, up to 15 for a crossing)."""
     return 2000 + 100 * lanes.period * jnp.maximum(lanes.contact.rate, lanes.gap.rate) / (2 * np.pi)
 
 
 def march(lanes: Lanes, motion: Motion, most_steps: int) -> Motion:
-    """``motion`` after the periods it has to go. A lane that needs more than ``most_steps`` steps keeps periods
-    ``left``; lanes that are done or not finite wait."""
+    """``motion`` after its remaining periods. A lane that needs more than ``most_steps`` steps keeps periods ``left``;
+    lanes that are finished or not finite wait."""
 
     def going(motion: Motion) -> Array:
         return jnp.any((motion.left > 0) & (motion.steps < most_steps) & jnp.isfinite(motion.u))
