@@ -35,8 +35,12 @@ VARIABLES = (
     Variable("basin_error", "1", "standard error of the share", OWN),
     Variable("attractor_u_max", "m", "largest relative displacement on the attractor", OWN),
     Variable("attractor_u_min", "m", "smallest relative displacement on the attractor", OWN),
-    Variable("attractor_multiple", "1", "period multiple of the attractor (0: non-periodic or none)", OWN, dtype="int32"),
-    Variable("unsettled_fraction", "1", "share of initial states that did not settle (chaotic ones if others are periodic)"),
+    Variable(
+        "attractor_multiple", "1", "period multiple of the attractor (0: non-periodic or none)", OWN, dtype="int32"
+    ),
+    Variable(
+        "unsettled_fraction", "1", "share of initial states that did not settle (chaotic ones if others are periodic)"
+    ),
 )
 OPTIONS = (
     Parameter("samples", "1", "number of initial states", default=1024, lower=1, upper=1e6, integer=True),

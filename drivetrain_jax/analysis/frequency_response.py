@@ -57,7 +57,13 @@ VARIABLES = (
 OPTIONS = (
     RTOL,
     Parameter(
-        "most_periods", "1", "largest number of drive periods until a motion settles", default=1000, lower=32, upper=1e6, integer=True
+        "most_periods",
+        "1",
+        "largest number of drive periods until a motion settles",
+        default=1000,
+        lower=32,
+        upper=1e6,
+        integer=True,
     ),
     Parameter("harmonics", "1", "harmonics of the drive's frequency", default=15, lower=1, upper=200, integer=True),
     Parameter("subharmonic", "1", "order of the subharmonics kept", default=1, lower=1, upper=8, integer=True),
@@ -70,9 +76,7 @@ OPTIONS = (
         upper=1e5,
         integer=True,
     ),
-    Parameter(
-        "fit_range", "m", "range R of the cubic fit (0: its own peak amplitude)", default=0.0, lower=0.0
-    ),
+    Parameter("fit_range", "m", "range R of the cubic fit (0: its own peak amplitude)", default=0.0, lower=0.0),
 )
 METHODS = {
     "exact": ("rtol", "most_periods"),

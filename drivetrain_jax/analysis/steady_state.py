@@ -59,7 +59,10 @@ VARIABLES = (
     Variable("impacts", "1", f"number of times that a flank is reached {_WHOLE}", ("flank",)),
     Variable("impact_velocity", "m/s", "largest velocity at which a flank is reached", ("flank",)),
     Variable(
-        "contact_fraction", "1", "fraction of the time in contact (b = 0: always, with the flank loaded by B0)", ("flank",)
+        "contact_fraction",
+        "1",
+        "fraction of the time in contact (b = 0: always, with the flank loaded by B0)",
+        ("flank",),
     ),
     Variable("orbit_state", "m, m/s", "state at the start of a drive period", ("state",)),
     Variable("state_error", "m", "estimated absolute error of the orbit's displacement"),

@@ -31,9 +31,7 @@ VARIABLES = (
     Variable("spectral_radius", "1", "largest modulus of the Floquet multipliers"),
     Variable("spectral_radius_error", "1", "bound of the absolute error of spectral_radius"),
     Variable("verdict", "1", "stability of the equilibrium", dtype="int8", flags=VERDICTS),
-    Variable(
-        "liouville_residual", "1", "(determinant of the monodromy matrix - exact value) / spectral_radius^n"
-    ),
+    Variable("liouville_residual", "1", "(determinant of the monodromy matrix - exact value) / spectral_radius^n"),
 )
 NEED_ERROR = {"spectral_radius_error", "verdict"}
 _TINY = np.finfo(float).tiny
