@@ -34,9 +34,14 @@ _TOGETHER = 128
 
 
 class Result(eqx.Module):
-    """The variables of one analysis by attribute or by name, ``outcome`` among them; a pytree of arrays.
+    """The variables of one analysis and ``outcome``, by attribute or by name; a pytree of arrays.
 
     Units and meanings: ``drivetrain list SYSTEM``.
+
+    >>> import drivetrain_jax as dt
+    >>> found = dt.modes(dt.Planetary(), outputs=["natural_frequency"])
+    >>> list(found), found["natural_frequency"].shape
+    (['natural_frequency', 'outcome'], (21,))
     """
 
     variables: dict[str, Array]
@@ -289,7 +294,7 @@ def forced(system: System, *, outputs: Sequence[str] | None = None, **options: A
     >>> import drivetrain_jax as dt
     >>> shaft = dt.Cardan(beta=0.3, Omega=1.0, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)
     >>> print(dt.forced(shaft).amplitude.round(4))
-    [0.0115 0.0339]
+    [0.0115 0.0344]
     """
     return analyse("forced", system, outputs, options)
 
@@ -327,8 +332,8 @@ def poincare(system: System, *, outputs: Sequence[str] | None = None, **options:
 
     >>> import drivetrain_jax as dt
     >>> shaft = dt.Tripod(element="input", beta=0.157, zeta=0.0016)
-    >>> dt.poincare(shaft, strobes=8, discard=10).section.shape
-    (8, 2)
+    >>> dt.poincare(shaft, strobes=128, discard=10).section.shape
+    (128, 2)
     """
     return analyse("poincare", system, outputs, options)
 
@@ -341,7 +346,7 @@ def steady_state(system: System, *, outputs: Sequence[str] | None = None, **opti
     >>> import drivetrain_jax as dt
     >>> gears = dt.Rattle(omega=0.7, **dt.Rattle.presets["table1"])
     >>> print(f"{dt.steady_state(gears).u_max:.6f}")
-    0.356265
+    0.449100
     """
     return analyse("steady_state", system, outputs, options)
 
@@ -381,7 +386,7 @@ def critical_speeds(system: System, *, outputs: Sequence[str] | None = None, **o
 
     >>> import drivetrain_jax as dt
     >>> print(dt.critical_speeds(dt.Bicardan(**dt.Bicardan.presets["paper"]), modes=2).critical_speed.round(1))
-    [ 7303.2 23189.8]
+    [ 8373.8 27007.5]
     """
     return analyse("critical_speeds", system, outputs, options)
 

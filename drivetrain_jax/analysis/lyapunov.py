@@ -98,8 +98,7 @@ def spectrum_of(record: Record) -> Spectrum:
 
 
 def mean_rate(record: Record, series: Array) -> tuple[Array, Array]:
-    """Mean rate of ``series`` (SEGMENTS, m, ...) after the transient, and its error. For an unbounded motion: before it
-    left, NaN."""
+    """Mean rate of ``series`` (SEGMENTS, m, ...) after the transient, and its error (NaN for an unbounded motion)."""
     values, errors = block_mean(series, record.used, record.span)
     partial_mean = running_mean(series, record.used, record.span)
     last = jnp.arange(SEGMENTS).reshape(-1, *(1,) * values.ndim) == record.used - 1

@@ -87,8 +87,7 @@ def _narrow_axis(atlas: Atlas, system: type[System]) -> int:
 
 
 def _distinct(field: Field, seeds: np.ndarray, known: list[Curve], horizontal: int | None = None) -> list[Curve]:
-    """``known`` curves, and the curves through those ``seeds`` that are not on them; seeds are tips if ``horizontal`` is
-    given."""
+    """``known`` curves, and those through other ``seeds``, which are tips if ``horizontal`` is given."""
     kept = list(known)
     on_curve = np.zeros(len(seeds), bool)
     for curve in kept:

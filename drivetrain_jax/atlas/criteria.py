@@ -31,8 +31,7 @@ from drivetrain_jax.atlas.panels import Atlas, Panel, derivative, position
 from drivetrain_jax.systems import System
 
 PLUS, MINUS, PAIR = "+1", "-1", "pair"
-# A zero bounds the stable region only if no multiplier grows. A growth rate above this value counts as real, whatever its
-# error bound.
+# A zero bounds the stable region only if no multiplier grows. A growth rate above this value counts as real.
 LIMITING = 1e-6
 _STATES = 4
 # Points per call of the determinant: few shapes need few compilations.

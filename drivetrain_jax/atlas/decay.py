@@ -36,8 +36,7 @@ def _transform(n: int) -> np.ndarray:
 
 
 def needed(sizes: np.ndarray, limit: float) -> int | None:
-    """Number of polynomials whose truncated coefficients are all below ``limit``; None if the last three are not below
-    it."""
+    """Number of polynomials with all truncated coefficients below ``limit``; None if the last three are not."""
     tail = envelope(sizes)
     if tail[-3] > limit:
         return None

@@ -108,8 +108,7 @@ class Patches:
         return np.where(inside, values, np.nan)
 
     def trim(self) -> Patches:
-        """The patches with fewer coefficients, if the dropped ones add less than a hundredth to the error of every
-        patch."""
+        """The patches with fewer coefficients, if the dropped ones add less than a hundredth to every error."""
         patches = self
         for axis in range(self.dimension):
             c = np.moveaxis(np.abs(patches.coefficients), axis, 0)

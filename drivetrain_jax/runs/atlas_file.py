@@ -83,6 +83,13 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
 
     Raises :class:`InputError` if ``source`` is not an atlas or is damaged, or if its system is not installed or has other
     coordinates now.
+
+    >>> import drivetrain_jax as dt
+    >>> base = {"beta": 0.3, "zeta": 0.01, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+    >>> axes = {"Omega": {"start": 1.0, "stop": 1.2}}
+    >>> atlas = dt.open_atlas(dt.run({"system": "cardan", "analysis": "atlas", "axes": axes, "fixed": base}))
+    >>> print(atlas(Omega=1.1).verdict.item())
+    0
     """
     compile_cache.enable()
     dataset = open_result(Path(source)) if isinstance(source, (str, Path)) else source

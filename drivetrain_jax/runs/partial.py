@@ -35,6 +35,11 @@ def open_result(path: str | Path) -> xr.Dataset:
     attribute ``points_done`` counts the others. A running computation is not disturbed.
 
     Raises :class:`InputError` if there is neither, or if the work belongs to other code.
+
+    >>> import drivetrain_jax as dt
+    >>> dt.open_result("missing.nc")
+    Traceback (most recent call last):
+    drivetrain_jax._errors.InputError: file = 'missing.nc': does not exist; give a result written by `drivetrain run`
     """
     path = Path(path)
     if path.exists() or not PartsFolder(path).holds_work():

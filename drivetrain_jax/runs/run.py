@@ -78,6 +78,11 @@ def run(
     :raises InputError: one line that names the field, the value and what is allowed. Nothing is computed or written.
     :raises Incomplete: the run failed, and finished chunks are kept. The message says if the same call may get further (a
         full disk, too little memory, a worker that died).
+
+    >>> import drivetrain_jax as dt
+    >>> axes = {"k_sp": {"values": [4e8, 5e8]}}
+    >>> dict(dt.run({"system": "planetary", "analysis": "modes", "axes": axes}).sizes)["k_sp"]
+    2
     """
     where = Where(threads, workers, dask)
     if out is None:

@@ -81,8 +81,7 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
 
 
 def find_system(name: str) -> type[System]:
-    """The system of this name; ``InputError`` with a similar name if it is unknown, or with the reason if its import
-    fails."""
+    """The system of this name; ``InputError`` if it is unknown (with a similar name) or cannot be imported."""
     try:
         return get_system(name)
     except KeyError:

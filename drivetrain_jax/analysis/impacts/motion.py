@@ -33,8 +33,7 @@ def phase_lag(cosine: Array, sine: Array, size: Array) -> Array:
 
 
 def imbalance(model: PiecewiseLinearOscillator, motion: tuple[Array, Array, Array], drive: Array) -> Array:
-    """Root mean square over the first axis (samples of a period) of the residual of the equation of motion for ``(u, u',
-    u'')``."""
+    """Rms over the first axis (samples of a period) of the residual of the equation of motion for ``(u, u', u'')``."""
     u, rate, acceleration = motion
     rest = acceleration + model.damping * rate + model.stiffness * model.restoring(u) - drive
     return jnp.sqrt(jnp.mean(rest**2, axis=0))

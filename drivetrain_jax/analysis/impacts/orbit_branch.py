@@ -28,8 +28,7 @@ _SHORTEST, _CLOSED, _LEAST_COSINE = 1e-7, 1e-9, 0.8
 # Largest distance of a point from its guess relative to the step; on an arc that turns by acos(0.8) it is tan(acos(0.8)/2).
 _ASIDE = 1 / 3
 # Limits so that no special point hides between two points: largest deviation of the trace from the line through the last
-# two, relative to the distance of a multiplier from 1 or -1; least such distance; part of the longest step that is always
-# accepted.
+# two, relative to the distance of a multiplier from 1 or -1; least such distance; part of the longest step always accepted.
 _BENT, _LEAST_DISTANCE, _FINE = 0.25, 0.02, 0.01
 _MOST_STEPS = 100_000
 # Locating a special point: most steps, and the last one relative to the chord.
