@@ -34,7 +34,9 @@ def numerics_of(scene: Scene) -> dict[str, Any]:
     Sources of other systems and analyses are not included."""
     through_atlas = scene.analysis.continuous or uses_atlas(scene)
     starts = [_ROOT / name for name in (*_ENGINE, *(_THROUGH_ATLAS if through_atlas else ()))]
-    starts += _own_sources(scene)
+    for function in (scene.system.models[scene.analysis.name].build, scene.analysis.solvers):
+        # Neither a partial nor what is wrapped around a method has a source of its own.
+        starts.append(Path(inspect.getsourcefile(inspect.unwrap(getattr(function, "func", function))) or ""))
     return {
         "sources": {name: _source_digest(name, path) for name, path in _sources(tuple(starts))},
         "versions": versions(PACKAGES),
@@ -43,19 +45,6 @@ def numerics_of(scene: Scene) -> dict[str, Any]:
         "flags": os.environ.get("XLA_FLAGS", ""),
         "instructions": " ".join(sorted(instruction_set())),
     }
-
-
-def is_of_package(scene: Scene) -> bool:
-    """Whether system and analysis are this package's own, so that their sources say all about their code."""
-    return all(_ROOT in path.parents for path in _own_sources(scene))
-
-
-def _own_sources(scene: Scene) -> list[Path]:
-    """The source files of the model and of the analysis."""
-    functions = scene.system.models[scene.analysis.name].build, scene.analysis.solvers
-    # Neither a partial nor what is wrapped around a method has a source of its own.
-    inner = [inspect.unwrap(getattr(function, "func", function)) for function in functions]
-    return [Path(inspect.getsourcefile(function) or "") for function in inner]
 
 
 # The code that runs is the one that was there when it was imported, not one that is edited since.

@@ -17,13 +17,10 @@ from jax import Array
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import Analysis, Solver
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, on_cpu, options_for_few
-from drivetrain_jax.runs import compile_cache
 from drivetrain_jax.runs.assemble import result_variables
 from drivetrain_jax.runs.grid import Grid
-from drivetrain_jax.runs.identity import is_of_package, numerics_of
 from drivetrain_jax.runs.plan import make_plan
 from drivetrain_jax.runs.scene import Scene
-from drivetrain_jax.store.provenance import digest
 from drivetrain_jax.systems import System
 
 _LAPACK = threading.Lock()
@@ -129,13 +126,6 @@ class _Job:
     grid: Grid = field(compare=False)
     solver: Solver = field(compare=False)
 
-    def key(self, size: int, few: bool) -> str | None:
-        """The name under which the kernel is kept on disk; None if the sources of its code are not known."""
-        if not is_of_package(self.scene):
-            return None
-        names = self.system.name, self.analysis.name
-        return digest([numerics_of(self.scene), names, repr(self.structure), size, few])
-
 
 def kernel_of(scene: Scene, grid: Grid, solver: Solver, size: int, few: bool = False) -> Kernel:
     """The kernel of ``solver`` for chunks of ``size`` points of ``scene``, made if no scene before needed the same.
@@ -161,13 +151,7 @@ def kernel_of(scene: Scene, grid: Grid, solver: Solver, size: int, few: bool = F
 
 @lru_cache(maxsize=64)
 def _compiled(job: _Job, size: int, few: bool) -> Kernel:
-    variables, key = result_variables(job.scene), job.key(size, few)
-    if key and (compiled := compile_cache.load(key)):
-        return Kernel(compiled, size, tuple(variables), _turn(compiled))
-    kernel = compile_kernel(job.solver, job.grid, size, variables, few)
-    if key:
-        compile_cache.keep(key, kernel.compiled)
-    return kernel
+    return compile_kernel(job.solver, job.grid, size, result_variables(job.scene), few)
 
 
 def _turn(compiled: Any) -> AbstractContextManager[object]:

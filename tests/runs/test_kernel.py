@@ -184,21 +184,3 @@ def test_other_numbers_compile_nothing():
     beta, omega = float(found.beta[7]), float(found.Omega[11])
     point = dt.point("cardan", "floquet", beta=beta, Omega=omega, **other["fixed"])
     assert float(found.spectral_radius[7, 11]) == pytest.approx(point["spectral_radius"].item(), rel=1e-9)
-
-
-def test_a_kernel_is_kept_whole_and_a_damaged_one_is_made_anew(tmp_path, monkeypatch):
-    folder = tmp_path / "kept"
-    monkeypatch.setattr(kernel.compile_cache, "_path", lambda key: folder / key)
-    made = []
-    real = kernel.compile_kernel
-    monkeypatch.setattr(kernel, "compile_kernel", lambda *of: made.append(of) or real(*of))
-    results = []
-    for damage in (None, None, b"x"):
-        if damage:
-            (file,) = folder.iterdir()
-            file.write_bytes(file.read_bytes()[:-1] + damage)
-        kernel._compiled.cache_clear()
-        results.append(dt.run(GEARS))
-    kernel._compiled.cache_clear()
-    assert len(made) == 2
-    assert results[0].equals(results[1]) and results[0].equals(results[2])
