@@ -448,7 +448,7 @@ def test_a_chart_of_a_stored_atlas(stored):
     assert len(beta) > 20 and float(np.abs(radius - 1).max()) < 1e-9
     with pytest.raises(dt.InputError, match=r"^Omega = 1\.5:3: allowed is a number or LOW:HIGH, 1 <= Omega <= 2$"):
         chart(stored, {"Omega": (1.5, 3.0)}, 60)
-    with pytest.raises(dt.InputError, match=r"^part: fixes beta, Omega; a chart needs one that varies"):
+    with pytest.raises(dt.InputError, match=r"^part: fixes beta, Omega; a chart needs a varying parameter"):
         chart(stored, {"Omega": 1.5, "beta": 0.1}, 60)
 
 
