@@ -1,4 +1,4 @@
-"""What a point costs: by batch width, number of points, cores, size of the system, outputs asked for; and a cold start.
+"""Cost of a point by batch width, number of points, cores, size of the system and outputs; and a cold start.
 
     python -m benchmarks.batches [--quick] [--out FOLDER]     # batches.csv, outputs.csv, cold_start.csv and batches.png
 

@@ -80,7 +80,7 @@ def differences(function, system, names, step):
 
 
 def test_gradients_of_the_spectral_radius_at_random_points():
-    """Where the largest multiplier is simple, real or one of a pair; against differences of the sharpest solves."""
+    """Points with a simple largest multiplier, real or one of a pair, against differences of the sharpest solves."""
     rng = np.random.default_rng(0)
     radius = lambda s: dt.floquet(s, outputs="spectral_radius").spectral_radius  # noqa: E731
     sharp = jax.jit(lambda s: dt.floquet(s, outputs="spectral_radius", rtol=1e-13).spectral_radius)

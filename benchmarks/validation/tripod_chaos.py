@@ -132,7 +132,7 @@ def chaotic_control(steps: int) -> Any:
 
 
 def sections_section(full: bool) -> str:
-    """What the Poincare sections are made of (Figs 25-30)."""
+    """The paragraph about the Poincare sections of Figs 25-30."""
     strobes = 50000 if full else 2000
     rows = []
     for element, (chi, zetas, frequency) in CLAIMS.items():

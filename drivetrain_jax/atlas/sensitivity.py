@@ -52,7 +52,7 @@ class Sensitivity:
 
     @property
     def exists(self) -> bool:
-        """Whether there is a gradient: one multiplier, or a pair, is the largest beyond the errors."""
+        """True if one multiplier, or one pair, is the largest by more than the errors: else there is no gradient."""
         return self.gap > max(_TIED, self.error)
 
     def boundary(self, parameter: str) -> dict[str, float]:

@@ -187,7 +187,7 @@ class StabilityAtlas:
                 values[lost] = _nothing(name, values)
 
     def _may_be_undamped(self, columns: Iterable[np.ndarray]) -> bool:
-        """Whether the system is Hamiltonian in any cell; ``columns`` are broadcast against each other."""
+        """True if the system is Hamiltonian in any cell; ``columns`` are broadcast against each other."""
         model = self.build({**self.atlas.fixed, **dict(zip(self.atlas.parameters, columns, strict=True))})
         return model.hamiltonian is not None and bool(np.any(model.hamiltonian()))
 
@@ -213,7 +213,7 @@ class StabilityAtlas:
 
 
 def _nothing(name: str, values: np.ndarray) -> float | int:
-    """What stands for no result."""
+    """The value of a missing result."""
     return Outcome.LOST if name == OUTCOME.name else charts.UNDECIDED if values.dtype == np.int8 else np.nan
 
 

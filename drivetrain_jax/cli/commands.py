@@ -17,8 +17,6 @@ from drivetrain_jax.cli.replies import INCOMPLETE, INTERRUPTED, OK, one_line, sa
 from drivetrain_jax.cli.signals import stop_on_signals
 from drivetrain_jax.cli.values import assignments, ranges
 
-# Cells per axis in the chart of an atlas.
-_CELLS = 800
 _FIGURES = (".png", ".pdf", ".svg")
 
 
@@ -120,28 +118,17 @@ def export(options: argparse.Namespace) -> int:
 
 def plot(options: argparse.Namespace) -> int:
     """Draw the figure of one result, or of several results together."""
-    from drivetrain_jax.store.consolidate import open_result
+    from drivetrain_jax.datasets.figure import plot
     from drivetrain_jax.store.files import write_atomic
-    from drivetrain_jax.view import plot
 
     out = options.out
     if not out.parent.is_dir():
         raise InputError(f"out = {str(out)!r}: the folder does not exist; allowed is a file in an existing folder")
     if out.suffix.lower() not in _FIGURES:
         raise InputError(f"out = {str(out)!r}: allowed is a name that ends in {', '.join(_FIGURES)}")
-    results = [open_result(file) if file.exists() else _open_unfinished(file) for file in options.files]
-    if any(result.attrs.get("analysis") == "atlas" for result in results):
-        if len(results) > 1:
-            raise InputError("FILE.nc: an atlas together with other results; allowed is one atlas alone")
-        from drivetrain_jax.runs.atlas_chart import chart
-
-        cells = _CELLS if options.cells is None else options.cells
-        results = [chart(file, ranges(options.part, "--part"), cells) for file in options.files]
-    elif options.part or options.cells is not None:
-        field = f"--part = {options.part[0]!r}" if options.part else f"--cells = {options.cells}"
-        raise InputError(f"{field}: not available for a result on a grid; allowed for an atlas")
+    part = ranges(options.part, "--part") or None
     try:
-        figure = plot(*results)
+        figure = plot(options.files, part=part, cells=options.cells)
     except InputError:
         raise
     except (LookupError, ValueError):
@@ -164,18 +151,6 @@ def _refuse_damaged(files: list[Path]) -> None:
         if file.is_file() and (changed := checksums.damaged(file)):
             what = f"damaged ({checksums.named(changed)})"
             raise InputError(f"file = {str(file)!r}: {what}; allowed is to restore it or to compute it again") from None
-
-
-def _open_unfinished(file: Path) -> Any:
-    """The finished part of a run that is not complete."""
-    from drivetrain_jax.store.chunks import PartsFolder
-    from drivetrain_jax.store.consolidate import open_result
-
-    if not PartsFolder(file).holds_work():
-        return open_result(file)
-    from drivetrain_jax.runs import partial
-
-    return partial.open_result(file)
 
 
 def point(options: argparse.Namespace) -> int:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class DrivetrainAccessor:
-    """What a result of this package can do: ``dataset.drivetrain``."""
+    """Methods of a result of this package: ``dataset.drivetrain``."""
 
     def __init__(self, dataset: xr.Dataset) -> None:
         self._dataset = dataset

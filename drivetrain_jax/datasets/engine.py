@@ -31,7 +31,7 @@ class AtlasEntrypoint(BackendEntrypoint):
     url: ClassVar[str] = ""
 
     def guess_can_open(self, filename_or_obj: Any) -> bool:
-        """Whether the file begins as atlases do. Those that other tools have written anew need ``engine="drivetrain"``."""
+        """True if the file begins with the preface of an atlas. Copies by other tools need ``engine="drivetrain"``."""
         if not isinstance(filename_or_obj, (str, os.PathLike)) or not os.path.isfile(filename_or_obj):
             return False
         try:

@@ -66,12 +66,22 @@ def _dataset(source: Any) -> xr.Dataset:
     if isinstance(source, xr.Dataset):
         return source
     if isinstance(source, (str, Path)):
-        from drivetrain_jax.runs.partial import open_result
-
-        return open_result(source)
+        return _opened(Path(source))
     raise InputError(
         f"result: got a {type(source).__name__}; allowed is a Dataset, the path of a result, or a list of them"
     )
+
+
+def _opened(path: Path) -> xr.Dataset:
+    from drivetrain_jax.store.chunks import PartsFolder
+    from drivetrain_jax.store.consolidate import open_result
+
+    if path.exists() or not PartsFolder(path).holds_work():
+        return open_result(path)
+    # Local import: it loads jax, which a complete result does not need.
+    from drivetrain_jax.runs import partial
+
+    return partial.open_result(path)
 
 
 def _chart(

@@ -128,7 +128,7 @@ class AtlasArray(BackendArray):
         return self.grid.block(key[:count], self.name)[(..., *key[count:])]
 
     def _are_scattered(self, key: Key) -> bool:
-        """Whether points are so few that the outer product of their positions would be wasted on them."""
+        """True if the outer product of the positions has far more cells than the selection has points."""
         arrays = [k for k in key if isinstance(k, np.ndarray)]
         product = math.prod(len(np.unique(k)) for k in arrays)
         return product > _SPARE * math.prod(np.broadcast_shapes(*(k.shape for k in arrays)))

@@ -26,7 +26,7 @@ class Declared:
 
 
 def declared(analysis: str) -> Declared:
-    """What the analysis of this name declares."""
+    """The declaration of the analysis with this name."""
     return _DECLARED.get(analysis, Declared())
 
 

@@ -111,7 +111,7 @@ def for_device(solver: Solver) -> Solver:
 
 
 def is_small(grid: Grid, solvers: Sequence[Solver]) -> bool:
-    """Whether kernels are not worth optimising: by the whole grid, whatever part of it is computed where."""
+    """True if the whole grid is so cheap that its kernels are not worth optimising."""
     return bool(grid.size * grid.path_length <= _FEW and make_plan(solvers, grid).costs.sum() <= _LIGHT)
 
 
@@ -139,9 +139,9 @@ def kernel_of(scene: Scene, grid: Grid, solver: Solver, size: int, few: bool = F
         request.outputs,
         request.method,
         tuple(request.options.items()),
-        str(jax.tree.structure(numbers)),
-        tuple((name, value) for name, value in scene.fixed.items() if name not in numbers),
-        tuple((axis.name, str(axis.values.dtype)) for axis in axes),
+        jax.tree.structure(numbers),
+        tuple((name, grid.fixed.get(name)) for name in grid.parameters if name not in numbers),
+        tuple((axis.name, axis.values.dtype) for axis in axes),
         None if grid.path is None else (grid.path.name, grid.path.values.tobytes()),
         solver.name,
     )

@@ -28,7 +28,7 @@ def shown_progress(report: Report | None) -> Iterator[Report | None]:
 
 
 def _in_notebook() -> bool:
-    """Whether a kernel of Jupyter runs this code, rather than a script or a terminal."""
+    """True in a kernel of Jupyter, false in a script or a terminal."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return getattr(shell, "kernel", None) is not None
 

@@ -145,7 +145,7 @@ def _embed(frame: Array, inertia_frame: Array | None = None) -> Array:
 
 
 def identical_planets(values: Values) -> bool:
-    """Whether all planets are known to be alike: their parameters are numbers, or lists of equal numbers."""
+    """True if the parameters of all planets are single numbers or lists of equal numbers."""
 
     def alike(value: Any) -> bool:
         constant = isinstance(value, tuple) and all(isinstance(entry, (int, float)) for entry in value)

@@ -130,7 +130,7 @@ def _says_something(name: str, coordinate: xr.DataArray, fixed: dict[str, object
 
 
 def _is_joined(dataset: xr.Dataset, known: set[str]) -> bool:
-    """Whether results of several scenes lie side by side along a dimension of their own."""
+    """True if results of several scenes were joined along a dimension that no scene has."""
     dims = {str(dim) for dim in dataset["outcome"].dims} if "outcome" in dataset else set()
     return "scene" in dataset.attrs and bool(dims - known - {"point"})
 

@@ -86,7 +86,7 @@ def test_what_counts_do_not_tell_is_a_line_before_them(cli, monkeypatch):
 
 
 def test_points_that_cost_nothing_are_counted(capsys):
-    """Those of an atlas are evaluated."""
+    """The points of an atlas have no cost in the plan."""
     with progress_line() as report:
         report(Progress(total=21, computed=21))
     assert "21/21 points" in capsys.readouterr().err
@@ -477,7 +477,7 @@ def test_plot_writes_the_figure(cli, monkeypatch):
         code, _, err = cli("plot", "r.nc", "--out", "g.png")
     assert (code, len(err)) == (2, 1) and "No space left" in err[0] and not [n for n in os.listdir() if n[0] == "g"]
     code, _, err = cli("plot", "r.nc", "--out", "f.png", "--cells", "9")
-    assert code == 2 and len(err) == 1 and "--cells = 9" in err[0]
+    assert code == 2 and len(err) == 1 and "cells = 9" in err[0]
     code, _, err = cli("plot", "r.nc", "--out", "f.txt")
     assert code == 2 and len(err) == 1 and ".png" in err[0]
 
@@ -486,7 +486,7 @@ def test_several_atlases_are_refused_before_one_is_evaluated(cli, monkeypatch):
     cli("run", "scene.toml", "--out", "r.nc", "--quiet")
     xr.load_dataset("r.nc", engine="h5netcdf").assign_attrs(analysis="atlas").to_netcdf("a.nc", engine="h5netcdf")
     monkeypatch.setattr("drivetrain_jax.runs.atlas_chart.chart", lambda *_: 1 / 0)
-    line = "drivetrain: FILE.nc: an atlas together with other results; allowed is one atlas alone"
+    line = "drivetrain: results: an atlas among several; allowed is an atlas alone"
     assert cli("plot", "r.nc", "a.nc", "--out", "f.png") == (2, "", [line])
 
 
@@ -513,7 +513,7 @@ def test_a_call_from_python_leaves_its_garbage_collector_alone(cli):
 
 
 def test_looking_at_a_result_loads_no_integrator_and_no_tables(folder):
-    """What a finished result is recognised with; half of the time until then would go into these packages."""
+    """These packages would take half of the time until a finished result is recognised."""
     scene = Path(__file__).parents[2] / "sweeps" / "quickstart.toml"
     code = (
         "import sys, drivetrain_jax.runs.run as run; from drivetrain_jax.cli import main\n"

@@ -46,7 +46,7 @@ def expected(atlas):
 
 @pytest.fixture
 def evaluated(monkeypatch):
-    """How many cells each evaluation had."""
+    """Numbers of cells of all evaluations."""
     sizes, arrays = [], StoredAtlas.arrays
 
     def counting(self, columns, **options):

@@ -97,7 +97,7 @@ GEARS = {
 
 @pytest.mark.parametrize("scene", [chart("direct"), chart("atlas"), GEARS], ids=["march", "tiles", "matrices"])
 def test_an_accelerator_gets_wide_batches_and_gives_the_same_results(monkeypatch, scene):
-    """What is done otherwise there (chunks, lanes and rows at once, no marks), here by the processor."""
+    """The code path of an accelerator (wide chunks, all lanes at once, no marks), run on the CPU."""
     expected, solver = dt.run(scene), Engine(load_scene(scene)).solvers[0]
     caches = kernel._compiled, charts.tile_kernel
     with monkeypatch.context() as patch:

@@ -14,7 +14,7 @@ from drivetrain_jax.runs import notebook
 
 @pytest.fixture
 def shown(monkeypatch):
-    """What the cell of a notebook shows, state after state: IPython as far as the bar uses it."""
+    """The states that a notebook cell shows one after another, by a stand-in for IPython."""
     states = []
     ipython, display = ModuleType("IPython"), ModuleType("IPython.display")
     ipython.get_ipython = lambda: SimpleNamespace(kernel=object())

@@ -564,7 +564,7 @@ def test_signal_stops_promptly_and_loses_nothing(slow_process, sent):
 
 
 def test_impatient_interrupts_lose_nothing_either(slow_process):
-    """What is finished is written down after the first one, which those that follow at once do not cut short."""
+    """Finished chunks are written after the first interrupt; further ones do not cut that short."""
     start, out = slow_process
     process = start()
     wait_for_parts(out, 1, process)

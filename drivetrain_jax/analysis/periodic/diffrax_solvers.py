@@ -96,21 +96,6 @@ def adaptive_steps(system: type[System], request: Request) -> tuple[Solver, ...]
     return (Solver(name, over_lanes(solve), effort, chunk=256),)
 
 
-class _UnitClock(diffrax.AbstractTerm):
-    """``form`` with its span as the unit of time, so that lanes of different spans share a clock."""
-
-    form: LinearPeriodic
-
-    def vf(self, t: Any, y: Any, args: Any) -> Array:
-        return self.form.span * self.form.vf(self.form.span * t, y, args)
-
-    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
-        return self.form.contr(t0, t1, **kwargs)
-
-    def prod(self, vf: Any, control: Any) -> Any:
-        return vf * control
-
-
 def equal_step_propagator(form: LinearPeriodic, solver: diffrax.AbstractSolver, steps: Array) -> Propagator:
     """The propagator of one point by ``steps`` equal steps.
 
@@ -130,8 +115,10 @@ def _integrated(constants: Constants, arrays: LinearPeriodic, steps: Array) -> A
     form = eqx.combine(arrays, rest)
     lanes = max((np.shape(x)[-1] for x in jax.tree.leaves(arrays) if np.ndim(x)), default=1)
     start = jnp.broadcast_to(jnp.eye(form.size)[..., None], (form.size, form.size, lanes))
+    # Lanes of different spans share a clock whose unit is the span.
+    scaled = diffrax.ODETerm(lambda t, y, args: form.span * form.vf(form.span * t, y, args))
     solution = diffrax.diffeqsolve(
-        _UnitClock(form),
+        scaled,
         solver,
         t0=0.0,
         t1=1.0,

@@ -40,7 +40,7 @@ _MAX_LEVELS = 22
 
 
 class Scales(NamedTuple):
-    """What depends on the segments alone: ``beta = l (rhoA/EI)^(1/4)``, so that z = q beta, and the units of S22, S12
+    """Quantities of the segments alone: ``beta = l (rhoA/EI)^(1/4)``, so that z = q beta, and the units of S22, S12
     and S11: ``e1 = b EI``, ``e2 = b^2 EI``, ``e3 = b^3 EI`` with ``b = (rhoA/EI)^(1/4)``; shape ``(n, ...)`` each."""
 
     beta: Array
