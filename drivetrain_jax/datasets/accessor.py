@@ -33,7 +33,7 @@ class DrivetrainAccessor:
         return plot(self._dataset, *others, **options)
 
     def verify(self) -> Report:
-        """Check that the numbers obey the rules of their analysis, and that the file they come from is what was written.
+        """The report on the rules of the analysis, and on the checksums of the file that the dataset was opened from.
 
         Returns: a report to be printed; ``problem`` is the first thing that is wrong, empty if nothing is.
         """

@@ -66,11 +66,11 @@ def verify(path: Path) -> Report:
 
 
 def verify_dataset(dataset: xr.Dataset, file: Path | None) -> Report:
-    """Check the numbers of ``dataset``, and that ``file``, which it comes from, is what was written."""
+    """The report on the numbers of ``dataset`` and on the checksums of ``file``, from which it was opened."""
     findings = check(dataset)
     changed = checksums.damaged(file) if file else None
     if changed:
-        problem = f"file = {str(file)!r}: {checksums.named(changed)} is not what was written; allowed is to restore it"
+        problem = f"file = {str(file)!r}: {checksums.named(changed)}: damaged; allowed is to restore the file or to compute it again"
         return Report((f"checksums: {len(changed)} differ: {checksums.named(changed)}", *map(str, findings)), problem)
     sealed = "not of a file" if changed is None else f"all agree in {file}"
     return Report((f"checksums: {sealed}", *map(str, findings)), _first_broken(findings))

@@ -186,7 +186,7 @@ def test_verify(chart, folder, tmp_path):
     with h5py.File(tmp_path / "damaged.nc", "r+") as store:
         store["spectral_radius"][0, 0] += 1e-12
     with xr.open_dataset(tmp_path / "damaged.nc", engine="h5netcdf") as damaged:
-        assert "spectral_radius is not what was written" in damaged.drivetrain.verify().problem
+        assert "spectral_radius: damaged" in damaged.drivetrain.verify().problem
 
 
 def test_query(folder, chart):
