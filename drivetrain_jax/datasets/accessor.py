@@ -33,9 +33,9 @@ class DrivetrainAccessor:
         return plot(self._dataset, *others, **options)
 
     def verify(self) -> Report:
-        """The report on the rules of the analysis, and on the checksums of the file that the dataset was opened from.
+        """The report on the rules of the analysis and on the checksums of the file.
 
-        Returns: a report to be printed; ``problem`` is the first thing that is wrong, empty if nothing is.
+        Returns: a report to be printed; ``problem`` is the first problem, empty without one.
         """
         from drivetrain_jax.invariants.verify import verify_dataset
 
