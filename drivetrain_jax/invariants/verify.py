@@ -70,7 +70,8 @@ def verify_dataset(dataset: xr.Dataset, file: Path | None) -> Report:
     findings = check(dataset)
     changed = checksums.damaged(file) if file else None
     if changed:
-        problem = f"file = {str(file)!r}: {checksums.named(changed)}: damaged; allowed is to restore the file or to compute it again"
+        remedy = "allowed is to restore the file or to compute it again"
+        problem = f"file = {str(file)!r}: {checksums.named(changed)}: damaged; {remedy}"
         return Report((f"checksums: {len(changed)} differ: {checksums.named(changed)}", *map(str, findings)), problem)
     sealed = "not of a file" if changed is None else f"all agree in {file}"
     return Report((f"checksums: {sealed}", *map(str, findings)), _first_broken(findings))
