@@ -26,6 +26,7 @@ class Grid:
     zipped: bool
     fixed: Mapping[str, Value]
     parameters: tuple[str, ...]
+    numbers: Mapping[str, float]
     path: Axis | None = None
     path_position: int | None = None
 
@@ -34,14 +35,15 @@ class Grid:
         """The grid of ``scene``; a fixed path parameter gives lines of one value."""
         parameters = scene.system.models[scene.analysis.name].parameters
         name = scene.path_axis
+        numbers = {n: value for n, value in _numbers(scene).items() if n != name}
         if name is None:
-            return cls(scene.axes, scene.zipped, scene.fixed, parameters)
+            return cls(scene.axes, scene.zipped, scene.fixed, parameters, numbers)
         position = next((i for i, axis in enumerate(scene.axes) if axis.name == name), None)
         if position is None:
             path = Axis(name, scene.system.parameter(name), None, np.array([scene.fixed[name]]))
-            return cls(scene.axes, scene.zipped, scene.fixed, parameters, path)
+            return cls(scene.axes, scene.zipped, scene.fixed, parameters, numbers, path)
         others = scene.axes[:position] + scene.axes[position + 1 :]
-        return cls(others, scene.zipped, scene.fixed, parameters, scene.axes[position], position)
+        return cls(others, scene.zipped, scene.fixed, parameters, numbers, scene.axes[position], position)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -82,12 +84,6 @@ class Grid:
             return {axis.name: axis.values[points] for axis in self.axes}
         return {axis.name: axis.values[i] for axis, i in zip(self.axes, self.place(points), strict=False)}
 
-    @property
-    def numbers(self) -> dict[str, Any]:
-        """The fixed parameters of the model that are real numbers, or lists of them."""
-        own = {name: self.fixed[name] for name in self.parameters if name in self.fixed}
-        return {name: value for name, value in own.items() if value != () and _is_real(value)}
-
     def bind(self, columns: Mapping[str, Any], numbers: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
         """All parameters of the model: the fixed ones, ``columns`` of the varying ones, and the path as a whole.
 
@@ -117,5 +113,16 @@ class Grid:
         return value if whole else np.broadcast_to(value, shape)
 
 
-def _is_real(value: Value) -> bool:
-    return all(map(_is_real, value)) if isinstance(value, tuple) else isinstance(value, float)
+def _numbers(scene: Scene) -> dict[str, float]:
+    """The fixed numbers of the model, without those from which it may conclude that a part is absent.
+
+    Such numbers are 0, infinity and defaults. They are constants of compiled code, and so are lists, whose entries may be
+    equal or equally spaced.
+    """
+    names = scene.system.models[scene.analysis.name].parameters
+    given = {name: scene.fixed[name] for name in names if name in scene.fixed}
+    return {
+        name: value
+        for name, value in given.items()
+        if isinstance(value, float) and value not in (0.0, math.inf, scene.system.parameter(name).default)
+    }

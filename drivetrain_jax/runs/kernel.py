@@ -80,8 +80,8 @@ def _batch(
     return batch, (columns, _arrays(grid.numbers), jax.ShapeDtypeStruct((), np.int64))
 
 
-def _arrays(numbers: Mapping[str, Any]) -> dict[str, Any]:
-    return jax.tree.map(np.float64, dict(numbers))
+def _arrays(numbers: Mapping[str, float]) -> dict[str, np.float64]:
+    return {name: np.float64(value) for name, value in numbers.items()}
 
 
 def result_shapes(scene: Scene, grid: Grid, solver: Solver) -> dict[str, tuple[int, ...]]:
@@ -95,8 +95,8 @@ def result_shapes(scene: Scene, grid: Grid, solver: Solver) -> dict[str, tuple[i
 def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[Variable], few: bool = False) -> Kernel:
     """Compile ``solver`` for chunks of ``chunk`` points of ``grid``; without optimisation for ``few`` points.
 
-    All numbers are arguments of the compiled code, those along a path apart. Words, whole numbers, lengths of lists and
-    options are constants of it.
+    Varying parameters, the ``numbers`` of the grid and the effort are arguments of the compiled code. Other fixed
+    parameters, the values along a path and options are constants of it.
     """
     batch, kinds = _batch(solver, grid, chunk, variables)
     lowered = jax.jit(batch).lower(*kinds)
@@ -139,7 +139,7 @@ def kernel_of(scene: Scene, grid: Grid, solver: Solver, size: int, few: bool = F
         request.outputs,
         request.method,
         tuple(request.options.items()),
-        jax.tree.structure(numbers),
+        tuple(numbers),
         tuple((name, grid.fixed.get(name)) for name in grid.parameters if name not in numbers),
         tuple((axis.name, axis.values.dtype) for axis in axes),
         None if grid.path is None else (grid.path.name, grid.path.values.tobytes()),

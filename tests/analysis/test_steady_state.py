@@ -136,7 +136,7 @@ def test_what_is_said_of_chaos_leaves_room_for_a_transient():
     """No finite time tells it from an attractor."""
     said = {variable.name: variable.long_name for variable in ANALYSIS.variables}
     assert "not periodic within most_periods" in said["period_multiple"]
-    assert "maybe a transient" in said["regime"]
+    assert "possibly a transient" in said["regime"]
 
 
 def test_a_lane_alone_is_the_lane_in_its_batch(steady):
