@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -188,10 +188,14 @@ def _pure(job: _Job) -> Callable[[Any], dict[str, Array]]:
     @solve.defjvp
     def _(primals: tuple[Any], tangents: tuple[Any]) -> tuple[dict[str, Array], dict[str, Any]]:
         (parameters,), (directions,) = primals, tangents
-        results, direction = solve(parameters), jnp.stack(jax.tree.leaves(directions))
-        known = job.analysis.derivatives
-        found = known(job.system, job.request, parameters, job.constants, results) if known else {}
-        return results, {name: _tangent(name, x, found, direction) for name, x in results.items()}
+        analysis, direction = job.analysis, jnp.stack(jax.tree.leaves(directions))
+        outputs = tuple(dict.fromkeys((*job.request.outputs, *analysis.derivative_outputs(job.request.outputs))))
+        wider = job if outputs == job.request.outputs else replace(job, request=replace(job.request, outputs=outputs))
+        results = _pure(wider)(parameters)
+        known = analysis.derivatives
+        found = known(job.system, wider.request, parameters, job.constants, results) if known else {}
+        kept = {name: results[name] for name in (*job.request.outputs, OUTCOME.name)}
+        return kept, {name: _tangent(name, x, found, direction) for name, x in kept.items()}
 
     return jax.jit(solve)
 

@@ -99,6 +99,7 @@ def test_gradients_of_the_spectral_radius_at_random_points():
         checked += 1
 
 
+MEASURES = ["u_mean", "phase", "spectral_radius", "lyapunov_exponent", "contact_fraction", "impact_velocity"]
 DERIVATIVES = {
     "floquet_exponent": (
         lambda s: dt.floquet(s, outputs="floquet_exponent").floquet_exponent, TRIPOD, ("beta", "zeta", "chi_n"), 1e-7
@@ -117,6 +118,12 @@ DERIVATIVES = {
         lambda s: dt.forced(s, outputs=["amplitude"]).amplitude, replaced(SHAFT, "Omega", 1.0), ("beta", "mu"), 1e-5
     ),
     "u_max": (lambda s: dt.steady_state(s, outputs=["u_max"]).u_max, GEARS, ("omega", "B1", "b", "k"), 1e-7),
+    "measures of rattle": (
+        lambda s: jnp.hstack([
+            x for name, x in sorted(dt.steady_state(s, outputs=MEASURES).variables.items()) if name in MEASURES
+        ]),
+        GEARS, ("omega", "B0", "c", "alpha"), 1e-7,
+    ),
     "phi": (lambda s: dt.history(s, times=(1e-4, 1e-3)).phi, TRIPOD, ("beta", "zeta"), 1e-6),
 }  # fmt: skip
 

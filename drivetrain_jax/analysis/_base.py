@@ -115,8 +115,9 @@ class Analysis:
     :class:`~drivetrain_jax._errors.InputError` if request and parameters do not match. ``lacks(system)`` maps the results
     and methods that a system does not support to the reason. ``derivatives(system, request, parameters, constants,
     results)`` returns Jacobians ``(..., P)`` of differentiable results at one point with respect to all P ``parameters``
-    (arrays; ``constants`` hold the rest). ``path_axis(request)`` names the axis that is computed as a whole, if any. A
-    ``continuous`` analysis accepts ranges for axes and returns a function of the parameters instead of values on a grid.
+    (arrays; ``constants`` hold the rest); ``results`` include ``derivative_outputs(outputs)``. ``path_axis(request)`` names
+    the axis that is computed as a whole, if any. A ``continuous`` analysis accepts ranges for axes and returns a function of
+    the parameters instead of values on a grid.
     """
 
     name: str
@@ -130,6 +131,7 @@ class Analysis:
     lacks: Callable[[type[System]], Mapping[str, str]] = lambda _: {}
     path_axis: Callable[[Request], str | None] = lambda _: None
     derivatives: Callable[..., Mapping[str, Array]] | None = None
+    derivative_outputs: Callable[[tuple[str, ...]], tuple[str, ...]] = lambda _: ()
     continuous: bool = False
     method_titles: Mapping[str, str] = field(default_factory=dict)
 

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,10 +24,11 @@ from jax import Array
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver, forward_derivatives
-from drivetrain_jax.analysis.numerics.lanes import over_lanes
+from drivetrain_jax.analysis.numerics.lanes import Constants, over_lanes
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, solve, spectral_norm
 from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.analysis.periodic.amplitude import amplitudes
+from drivetrain_jax.analysis.periodic.forced_derivatives import periodic_slopes
 from drivetrain_jax.analysis.periodic.orbit import (
     Field,
     Orbit,
@@ -46,13 +48,18 @@ VARIABLES = (
     Variable("periodic_state", "rad", "periodic solution of the linear system at tau = 0 (rates: d/dtau)", ("state",)),
     Variable("periodic_state_error", "rad", "estimated absolute error of periodic_state"),
     Variable("amplitude", "rad", "largest |theta| over the period, linear system", ("shaft",)),
+    Variable("amplitude_phase", "rad", "tau at which |theta| is largest, linear system", ("shaft",)),
     Variable("condition", "1", "2-norm condition number of I - Z, linear system"),
     Variable("orbit_state", "rad", "nonlinear periodic orbit at tau = 0 (rates: d/dtau)", ("state",)),
     Variable("orbit_state_error", "rad", "estimated absolute error of orbit_state"),
     Variable("orbit_amplitude", "rad", "largest |theta| over the period, nonlinear orbit", ("shaft",)),
+    Variable("orbit_amplitude_phase", "rad", "tau at which |theta| is largest, nonlinear orbit", ("shaft",)),
     Variable("orbit_spectral_radius", "1", "spectral radius of the monodromy matrix about the nonlinear orbit"),
 )
-LINEAR = ("periodic_state", "periodic_state_error", "amplitude", "condition")
+LINEAR = ("periodic_state", "periodic_state_error", "amplitude", "amplitude_phase", "condition")
+PEAKS = frozenset(("amplitude", "amplitude_phase"))
+ORBIT_PEAKS = frozenset(("orbit_amplitude", "orbit_amplitude_phase"))
+PERIODIC, ORBITS = PEAKS | {"periodic_state"}, ORBIT_PEAKS | {"orbit_state"}
 
 Build = Callable[[Mapping[str, Any]], ForcedModel]
 
@@ -75,12 +82,13 @@ CHUNK, ORBITS_CHUNK = 128, 16
 
 
 class Response(NamedTuple):
-    """Periodic solution of the linear system: ``state`` (n,), absolute ``error``, ``amplitude`` (None unless requested),
-    and the map over one period behind it."""
+    """Periodic solution of the linear system: ``state`` (n,), absolute ``error``, ``amplitude`` and its ``phase`` (None
+    unless requested), and the map over one period behind it."""
 
     state: Array
     error: Array
     amplitude: Array | None
+    phase: Array | None
     step: Transition
     outcome: Array
 
@@ -115,7 +123,7 @@ def linear_response(model: ForcedModel, n: int, rtol: float, with_amplitude: boo
     unit = jnp.where(found, unit, 0.0)
     size = size_of(unit)
     start, field, sharp = unit / size, in_units_of(size * forcing, model.linear), _sharpness(rtol, CLOSING_SHARPNESS)
-    largest, correction, closed = _closed(model, field, start, step.matrix, sharp, with_amplitude)
+    (largest, phase), correction, closed = _closed(model, field, start, step.matrix, sharp, with_amplitude)
     error = jnp.max(jnp.abs(correction)) + CLOSING_ERROR * sharp * _gain(step.matrix)
     lost = ~found | ~(error <= NOT_FOUND) | ~_regular(step.matrix, rtol)
     missed = jnp.where(error > rtol, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
@@ -124,19 +132,20 @@ def linear_response(model: ForcedModel, n: int, rtol: float, with_amplitude: boo
         lambda x: jnp.where(outcome < Outcome.NOT_CONVERGED, size * forcing * x, jnp.nan),
         (start + correction, error, largest),
     )
-    return Response(state, error, largest, step, outcome)
+    phase = None if phase is None else jnp.where(outcome < Outcome.NOT_CONVERGED, phase, jnp.nan)
+    return Response(state, error, largest, phase, step, outcome)
 
 
 def _closed(
     model: ForcedModel, field: Field, start: Array, matrix: Array, sharp: float, with_amplitude: bool
-) -> tuple[Array | None, Array, Array]:
-    """Largest displacements (None unless requested) over a period from ``start``, of order one; the correction of
-    ``start`` by the closing error; and the outcome. ``matrix`` is the transition."""
+) -> tuple[tuple[Array | None, Array | None], Array, Array]:
+    """Largest displacements over a period from ``start``, of order one, and their phases (None unless requested); the
+    correction of ``start`` by the closing error; and the outcome. ``matrix`` is the transition."""
     if with_amplitude:
-        largest, end, closed = amplitudes(field, start, model.period, model.displacements, sharp)
+        *largest, end, closed = amplitudes(field, start, model.period, model.displacements, sharp)
     else:
-        largest, (end, closed) = None, integrate(field, start, model.period, sharp)
-    return largest, newton_step(Transition(end, matrix, closed), start), closed
+        largest, (end, closed) = (None, None), integrate(field, start, model.period, sharp)
+    return tuple(largest), newton_step(Transition(end, matrix, closed), start), closed
 
 
 def _regular(matrix: Array, rtol: float) -> Array:
@@ -159,9 +168,9 @@ def _condition(matrix: Array) -> Array:
 
 def nonlinear_orbit(
     model: ForcedModel, response: Response, rtol: float, with_amplitude: bool
-) -> tuple[Orbit, Array | None]:
+) -> tuple[Orbit, Array | None, Array | None]:
     """Nonlinear periodic orbit on the path that starts along ``response`` (NaN with its outcome if there is none), and
-    its amplitude (None unless requested)."""
+    its amplitude and the phase of that (None unless requested)."""
     usable = response.outcome < Outcome.NOT_CONVERGED
     start = jnp.where(usable, response.state, 0.0)
     # Nonlinearity matters for states of order one; smaller responses are their own unit.
@@ -171,24 +180,25 @@ def nonlinear_orbit(
     state = jnp.where(outcome < Outcome.NOT_CONVERGED, unit * orbit.state, 0.0)
     size = size_of(state)
     field, sharp = in_units_of(size, model.field), _sharpness(rtol, CLOSING_SHARPNESS)
-    largest, correction, closed = _closed(model, field, state / size, orbit.matrix, sharp, with_amplitude)
+    (largest, phase), correction, closed = _closed(model, field, state / size, orbit.matrix, sharp, with_amplitude)
     error = size * jnp.max(jnp.abs(correction)) + unit * orbit.error
     missed = jnp.where(error <= rtol * size, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
     outcome = _worst(outcome, jnp.where(outcome < Outcome.NOT_CONVERGED, _worst(closed, missed), outcome))
-    state, matrix, error, largest = jax.tree.map(
+    state, matrix, error, largest, phase = jax.tree.map(
         lambda x: jnp.where(outcome < Outcome.NOT_CONVERGED, x, jnp.nan),
-        (state, orbit.matrix, error, None if largest is None else size * largest),
+        (state, orbit.matrix, error, None if largest is None else size * largest, phase),
     )
-    return Orbit(state, matrix, error, outcome, orbit.corrections), largest
+    return Orbit(state, matrix, error, outcome, orbit.corrections), largest, phase
 
 
 def _orbit_results(
     model: ForcedModel, response: Response, outputs: tuple[str, ...], rtol: float
 ) -> tuple[dict[str, Any], Array]:
     """The requested results of the nonlinear orbit and their outcome."""
-    orbit, largest = nonlinear_orbit(model, response, rtol, "orbit_amplitude" in outputs)
+    orbit, largest, phase = nonlinear_orbit(model, response, rtol, not ORBIT_PEAKS.isdisjoint(outputs))
     found = orbit.outcome < Outcome.NOT_CONVERGED
-    results = {"orbit_state": orbit.state, "orbit_state_error": orbit.error, "orbit_amplitude": largest}
+    results = {"orbit_state": orbit.state, "orbit_state_error": orbit.error}
+    results |= {"orbit_amplitude": largest, "orbit_amplitude_phase": phase}
     if "orbit_spectral_radius" in outputs:
         matrix = jnp.where(found, orbit.matrix, jnp.eye(orbit.state.size))
         radius = jnp.max(jnp.hypot(*eigenvalues(matrix)))
@@ -200,9 +210,9 @@ def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Ar
     """All requested results of one point; ``effort`` only orders the batches, as every integration is adaptive."""
     del effort
     model, rtol = build(values), request.options["rtol"]
-    response = linear_response(model, len(STATE.values), rtol, "amplitude" in request.outputs)
+    response = linear_response(model, len(STATE.values), rtol, not PEAKS.isdisjoint(request.outputs))
     results: dict[str, Any] = {"periodic_state": response.state, "periodic_state_error": response.error}
-    results["amplitude"] = response.amplitude
+    results |= {"amplitude": response.amplitude, "amplitude_phase": response.phase}
     outcome = response.outcome
     if "condition" in request.outputs:
         results["condition"] = jnp.where(
@@ -239,6 +249,54 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     return (Solver("diffrax", solve, steps, chunk=chunk, march=True, short_loops=True),)
 
 
+# Results that need second derivatives along the motion: the first solver itself is differentiated.
+_SECOND = frozenset(("condition", "orbit_spectral_radius"))
+
+
+def _derivative_outputs(outputs: tuple[str, ...]) -> tuple[str, ...]:
+    linear = ("periodic_state",) + (("amplitude_phase",) if "amplitude" in outputs else ())
+    orbit = ("orbit_state",) + (("orbit_amplitude_phase",) if "orbit_amplitude" in outputs else ())
+    return (() if PERIODIC.isdisjoint(outputs) else linear) + (() if ORBITS.isdisjoint(outputs) else orbit)
+
+
+def _derivatives(
+    system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Jacobians of states and amplitudes by the variational equations, of all else by differentiating the solver."""
+    build, found = system.models["forced"].build, {}
+    second = tuple(name for name in request.outputs if name in _SECOND)
+    if second:
+        kept = {name: results[name] for name in second}
+        asked = Request(second, request.method, request.options)
+        found |= forward_derivatives(_solvers, system, asked, parameters, constants, kept)
+    for prefix, state, top in (("linear", "periodic_state", "amplitude"), ("field", "orbit_state", "orbit_amplitude")):
+        if state in request.outputs:
+            model = lambda p: build(eqx.combine(p, constants.tree))  # noqa: E731
+            found |= _slopes(model, prefix, parameters, results, (state, top), request.options["rtol"])
+    return found
+
+
+def _slopes(
+    model: Callable[[Any], ForcedModel],
+    which: str,
+    parameters: Any,
+    results: Mapping[str, Array],
+    names: tuple[str, str],
+    rtol: float,
+) -> dict[str, Array]:
+    """Jacobians of the periodic solution ``names[0]`` of the field ``which``, and of its amplitude if that is requested."""
+
+    def field(parameters: Any, s: Any, y: Array) -> Array:
+        there = model(parameters)
+        return there.period * getattr(there, which)(there.period * s, y)
+
+    state, top = names
+    here, phase = model(parameters), f"{top}_phase"
+    peaks = (results[phase] / here.period, here.displacements) if phase in results else (jnp.zeros(0), ())
+    slopes = periodic_slopes(field, parameters, results[state], peaks, _sharpness(rtol, 1.0))
+    return {state: slopes.state} | ({top: slopes.tops} if phase in results else {})
+
+
 ANALYSIS = Analysis(
     name="forced",
     title="forced response",
@@ -251,5 +309,6 @@ ANALYSIS = Analysis(
     options=(RTOL,),
     solvers=_solvers,
     dimensions=lambda *_: (STATE, SHAFT),
-    derivatives=partial(forward_derivatives, _solvers),
+    derivatives=_derivatives,
+    derivative_outputs=_derivative_outputs,
 )

@@ -19,7 +19,6 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,6 +30,7 @@ from drivetrain_jax.analysis.impacts.attractor import attractors
 from drivetrain_jax.analysis.impacts.exact_response import INTEGRALS, WIDTH, describe
 from drivetrain_jax.analysis.impacts.length_unit import measured, restored
 from drivetrain_jax.analysis.impacts.motion import PHASE, REGIME, REGIMES
+from drivetrain_jax.analysis.impacts.orbit_derivatives import orbit_jacobians
 from drivetrain_jax.analysis.impacts.orbit_history import history
 from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System
@@ -117,38 +117,14 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     return (Solver("exact", partial(_solve, build, request), chunk=_CHUNK),)
 
 
-# Relative steps of the differences, and largest deviation of those of order two from those of order four.
-_STEP, _SMOOTH = 1e-3, 1e-2
-
-
 def _derivatives(
     system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Jacobians of extremes and means by central differences of order four, accurate to ten digits.
-
-    NaN if the neighbours are another motion, or if it changes too abruptly.
-    """
-    leaves, tree = jax.tree.flatten(parameters)
-    point = jnp.stack(leaves)
-    steps = _STEP * jnp.abs(point)
-    offsets = jnp.array([-2.0, -1.0, 1.0, 2.0])
-    lanes = point[:, None, None] + jnp.eye(len(leaves))[:, :, None] * (steps[:, None, None] * offsets)
-    values = eqx.combine(jax.tree.unflatten(tree, list(lanes.reshape(len(leaves), -1))), constants.tree)
-    names = [n for n, x in results.items() if jnp.issubdtype(x.dtype, jnp.inexact) and not n.endswith("_error")]
-    asked = Request((*names, "period_multiple"), request.method, request.options)
-    found = _solve(system.models["steady_state"].build, asked, values, jnp.int64(1))
-    multiple = found["period_multiple"].reshape(len(leaves), 4)
-    same = jnp.all((multiple == multiple[0, 0]) & (multiple > 0), axis=1)
-    # The initial state only selects the motion.
-    begins = jnp.array([name in ("u0", "v0") for name in parameters])
-    jacobians = {}
-    for name in names:
-        x = found[name].reshape(*results[name].shape, len(leaves), 4)
-        wide, narrow = (x[..., 3] - x[..., 0]) / (4 * steps), (x[..., 2] - x[..., 1]) / (2 * steps)
-        slope = (4 * narrow - wide) / 3
-        smooth = same & (jnp.abs(slope - narrow) <= _SMOOTH * jnp.abs(slope) + 1e-9 * jnp.abs(results[name])[..., None])
-        jacobians[name] = jnp.where(begins, 0.0, jnp.where(smooth, slope, jnp.nan))
-    return jacobians
+    """Jacobians of all results of a periodic motion that are not counts or errors."""
+    real = (n for n, x in results.items() if jnp.issubdtype(x.dtype, jnp.inexact) and not n.endswith("_error"))
+    names = tuple(n for n in real if n != "impacts")
+    build = system.models["steady_state"].build
+    return orbit_jacobians(build, parameters, constants, results, names, SAMPLES)
 
 
 ANALYSIS = Analysis(
@@ -164,4 +140,5 @@ ANALYSIS = Analysis(
     solvers=_solvers,
     dimensions=lambda *_: DIMENSIONS,
     derivatives=_derivatives,
+    derivative_outputs=lambda _: ("orbit_state", "period_multiple"),
 )

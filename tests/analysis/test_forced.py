@@ -281,16 +281,18 @@ def test_peaks_between_steps(frequency):
         return jnp.stack([y[1], -(frequency**2) * y[0]])
 
     start = jnp.array([math.cos(0.4), -frequency * math.sin(0.4)]) / frequency
-    peak, end, outcome = jax.jit(lambda y: amplitudes(field, y, 6.1, (0, 1), 1e-12))(start)
+    peak, when, end, outcome = jax.jit(lambda y: amplitudes(field, y, 6.1, (0, 1), 1e-12))(start)
     assert outcome == Outcome.SUCCESS
     np.testing.assert_allclose(peak, (1 / frequency, 1.0), rtol=2e-9)
+    angle = frequency * when + 0.4
+    np.testing.assert_allclose((math.sin(angle[0]), math.cos(angle[1])), 0, atol=1e-6)
     assert end[1] == pytest.approx(-math.sin(6.1 * frequency + 0.4), abs=1e-8)
 
 
 def test_field_that_is_not_finite():
     for broken in (lambda t, y: y * jnp.nan, lambda t, y: y**2):
         assert integrate(broken, jnp.ones(2), 3.0, 1e-8)[1] == Outcome.NOT_FINITE
-        assert amplitudes(broken, jnp.ones(2), 3.0, (0,), 1e-8)[2] == Outcome.NOT_FINITE
+        assert amplitudes(broken, jnp.ones(2), 3.0, (0,), 1e-8)[3] == Outcome.NOT_FINITE
 
 
 def test_no_orbit_without_restoring_force():

@@ -57,7 +57,10 @@ def describe(
     finite = jnp.isfinite(found.u) & jnp.isfinite(seen.high + seen.low)
     outcome = jnp.where(finite, outcome, Outcome.NOT_FINITE)
     known = outcome < Outcome.NOT_CONVERGED
-    results = _of_period(oscillator, seen) | _of_stability(oscillator, found, seen, periodic & known)
+    results = periodic_results(oscillator, seen)
+    for name in ("floquet_multiplier", "spectral_radius"):
+        results[name] = jnp.where(periodic, results[name], jnp.nan)
+    results["lyapunov_exponent"] = jnp.where(periodic, results["lyapunov_exponent"], found.exponent)
     state = jnp.stack([found.u, found.v])
     results |= {"orbit_state": state, "state_error": jnp.where(periodic, found.error, jnp.nan)}
     results = {name: jnp.where(known, value, jnp.nan) for name, value in results.items()}
@@ -71,11 +74,18 @@ def describe(
     }
 
 
-def _of_period(oscillator: PiecewiseLinearOscillator, seen: Measures) -> dict[str, Array]:
-    """Extremes, means, contacts and impacts over the periods followed."""
+def periodic_results(oscillator: PiecewiseLinearOscillator, seen: Measures) -> dict[str, Array]:
+    """Extremes, means, contacts and impacts over the periods followed, and the multipliers and Lyapunov exponent of a motion
+    with this period."""
     span = seen.periods * oscillator.period
     mean, square, cosine, sine = (integral / span for integral in seen.integrals)
     size = jnp.maximum(jnp.abs(seen.high), jnp.abs(seen.low))
+    log_determinant = -oscillator.damping * span
+    half, determinant = (seen.matrix[0] + seen.matrix[3]) / 2, jnp.exp(log_determinant)
+    root = jnp.sqrt((half**2 - determinant).astype(complex))
+    # The larger of both first, the other one from the product.
+    first = half + jnp.where(half < 0, -root, root)
+    rho = spectral_radius(seen.matrix, log_determinant)
     return {
         "u_max": seen.high,
         "u_min": seen.low,
@@ -85,25 +95,9 @@ def _of_period(oscillator: PiecewiseLinearOscillator, seen: Measures) -> dict[st
         "impacts": jnp.stack(seen.impacts),
         "impact_velocity": jnp.stack(seen.speed),
         "contact_fraction": jnp.stack(seen.contact) / span,
-    }
-
-
-def _of_stability(
-    oscillator: PiecewiseLinearOscillator, found: Attractors, seen: Measures, periodic: Array
-) -> dict[str, Array]:
-    """Multipliers over the smallest period, their largest modulus, and the Lyapunov exponent."""
-    span = seen.periods * oscillator.period
-    log_determinant = -oscillator.damping * span
-    half, determinant = (seen.matrix[0] + seen.matrix[3]) / 2, jnp.exp(log_determinant)
-    root = jnp.sqrt((half**2 - determinant).astype(complex))
-    # The larger of both first, the other one from the product.
-    first = half + jnp.where(half < 0, -root, root)
-    multiplier = jnp.stack([first, determinant / first])
-    rho = spectral_radius(seen.matrix, log_determinant)
-    return {
-        "floquet_multiplier": jnp.where(periodic, multiplier, jnp.nan),
-        "spectral_radius": jnp.where(periodic, rho, jnp.nan),
-        "lyapunov_exponent": jnp.where(periodic, jnp.log(rho) / span, found.exponent),
+        "floquet_multiplier": jnp.stack([first, determinant / first]),
+        "spectral_radius": rho,
+        "lyapunov_exponent": jnp.log(rho) / span,
     }
 
 

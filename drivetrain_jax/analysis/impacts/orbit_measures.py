@@ -46,8 +46,8 @@ class Measures(NamedTuple):
 
     ``periods``: drive periods followed; ``high, low``: extremes of u; ``integrals``: of u, u^2, u cos(omega t) and
     u sin(omega t); ``contact``: time in contact; ``impacts``: number of times that a flank is reached; ``speed``:
-    largest velocity at which it is; ``side``: region of the last step; ``matrix``: transition matrix; ``complete``: 1, or
-    0 if given up.
+    largest velocity at which it is; ``side``: region of the last step; ``matrix``: transition matrix; ``end``: the last u
+    and v; ``complete``: 1, or 0 if given up.
     """
 
     periods: Array
@@ -59,16 +59,17 @@ class Measures(NamedTuple):
     speed: tuple[Array, Array]
     side: Array
     matrix: tuple[Array, Array, Array, Array]
+    end: tuple[Array, Array]
     complete: Array
 
 
-_RESULT = Measures(0, 0, 0, (0,) * 4, (0,) * 2, (0,) * 2, (0,) * 2, 0, (0,) * 4, 0)  # pyright: ignore[reportArgumentType]
+_RESULT = Measures(0, 0, 0, (0,) * 4, (0,) * 2, (0,) * 2, (0,) * 2, 0, (0,) * 4, (0,) * 2, 0)  # pyright: ignore[reportArgumentType]
 
 
 def _fresh(u: Array, side: Array) -> Measures:
     zero = jnp.zeros_like(u)
     pair = (zero, zero)
-    return Measures(zero, u, u, (zero,) * 4, pair, pair, pair, side, (zero + 1, zero, zero, zero + 1), zero)  # pyright: ignore[reportArgumentType]
+    return Measures(zero, u, u, (zero,) * 4, pair, pair, pair, side, (zero + 1, zero, zero, zero + 1), pair, zero)  # pyright: ignore[reportArgumentType]
 
 
 def _reversal(motion: Motion, rate: Derivatives, size: tuple[Array, Array]) -> Bound:
@@ -79,6 +80,14 @@ def _reversal(motion: Motion, rate: Derivatives, size: tuple[Array, Array]) -> B
     # An infinite value with a slope would be a quotient of infinities.
     slope = jnp.where(still, 0.0, sign * a)
     return Bound(jnp.where(still, jnp.inf, jnp.abs(v)), slope, sign * rate.jerk, rate.snap_bound)
+
+
+def _crossing(lanes: Lanes, side: Array, last: Array, motion: Motion) -> Array:
+    """Zero, with the derivative of the time at which the lane passed from the region ``last`` to ``side``: steps end at the
+    same times for neighbouring motions, and flanks are reached at others."""
+    passed = (side != last) & (motion.v != 0)
+    late = ((side + last) * lanes.flank - motion.u) / jnp.where(passed, motion.v, 1.0)
+    return jnp.where(passed, late - jax.lax.stop_gradient(late), 0.0)
 
 
 def _integrals(lanes: Lanes, here: Here, motion: Motion, d: Array) -> tuple[Array, Array, Array, Array]:
@@ -117,7 +126,9 @@ def _watched(lanes: Lanes, motion: Motion, so_far: Measures, integrals: bool) ->
         free = jnp.abs(here.force - region.stiffness * x) + region.rate * jnp.abs(y)
         moves = free > _ROUNDING * region.rate**2 * extent
         d = jnp.where(moves, jnp.minimum(d, _LONGEST_ARC / jnp.maximum(region.rate, 1e-300)), d)
-    d = jnp.minimum(jnp.maximum(d, least_step(lanes, here, motion, rate)), rest)
+    d = jnp.maximum(d, least_step(lanes, here, motion, rate))
+    # Derivatives ignore the ends of steps, which change no measure, except for the end of the period.
+    d = jnp.where(d >= rest, rest, jax.lax.stop_gradient(d))
     moved = advance(lanes, here, motion, d)
     # A flank is reached if a step begins beyond it. Compiled code may round the end of a step differently in two uses:
     # counted at the end, an impact was missed or counted twice.
@@ -125,13 +136,16 @@ def _watched(lanes: Lanes, motion: Motion, so_far: Measures, integrals: bool) ->
     hits = tuple((before == side) & (last != side) for side in (1.0, -1.0))
     # Without backlash the whole line is in contact, with the flank loaded by the mean drive.
     held = (before == 1) | ((before == 2) & (lanes.mean >= 0)), (before == -1) | ((before == 2) & (lanes.mean < 0))
-    speed = jnp.abs(motion.v)
+    later = _crossing(lanes, before, last, motion)
+    speed = jnp.abs(motion.v + rate.acceleration * later)
+    moved_over = tuple(((last == side) * 1.0 - (before == side)) * later for side in (1, -1))
+    spans = tuple(jnp.where(on, d, 0.0) + x for on, x in zip(held, moved_over, strict=True))
     added = _integrals(lanes, here, motion, d) if integrals else (jnp.zeros_like(d),) * 4
     return moved, so_far._replace(
         high=jnp.maximum(so_far.high, moved.u),
         low=jnp.minimum(so_far.low, moved.u),
         integrals=tuple(a + b for a, b in zip(so_far.integrals, added, strict=True)),
-        contact=tuple(t + jnp.where(on, d, 0.0) for t, on in zip(so_far.contact, held, strict=True)),
+        contact=tuple(map(jnp.add, so_far.contact, spans)),
         impacts=tuple(n + hit for n, hit in zip(so_far.impacts, hits, strict=True)),
         speed=tuple(jnp.maximum(s, jnp.where(hit, speed, 0.0)) for s, hit in zip(so_far.speed, hits, strict=True)),
         side=before,
@@ -197,7 +211,7 @@ def _tick(task: _Task, work: _Work) -> _Work:
     back = (recurs > 0) & (distance <= _RECURRENCE * size)
     broken = ~jnp.isfinite(motion.u) | (motion.steps > 2 * periods * usual_steps(lanes))
     done = (work.index < count) & (broken | (ended & (back | (motion.left <= 0))))
-    result = so_far._replace(matrix=motion.matrix, complete=jnp.where(broken, 0.0, 1.0))
+    result = so_far._replace(matrix=motion.matrix, end=(motion.u, motion.v), complete=jnp.where(broken, 0.0, 1.0))
     rows = jnp.stack(jax.tree.leaves(result)).astype(float)
     store = work.store.at[:, jnp.where(done, here, count)].set(rows, mode="drop")
     following = work.queue + jnp.cumsum(done.astype(jnp.int32)) - 1

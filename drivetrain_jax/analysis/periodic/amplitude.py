@@ -18,13 +18,14 @@ EDGE = 0.01
 
 class _Peaks(NamedTuple):
     """State of the loop of :func:`amplitudes`: the step ``[t0, t1]`` to try from ``y``, the components ``aimed`` (k,)
-    whose peak it is to end at, and the largest so far."""
+    whose peak it is to end at, and the largest so far with their times ``when``."""
 
     t0: Array
     t1: Array
     y: Array
     aimed: Array
     largest: Array
+    when: Array
     count: Array  # pyright: ignore[reportIncompatibleMethodOverride]
     made_jump: Any
     solver: Any
@@ -33,8 +34,8 @@ class _Peaks(NamedTuple):
 
 def amplitudes(
     field: Field, start: Array, period: float, indices: tuple[int, ...], rtol: float
-) -> tuple[Array, Array, Array]:
-    """Largest ``|y_i|`` over a period for the components ``indices``, the state at its end, and an ``Outcome``.
+) -> tuple[Array, Array, Array, Array]:
+    """Largest ``|y_i|`` over a period for the components ``indices``, their times, the state at its end, and an ``Outcome``.
 
     Every accepted step of the integration is searched for a peak, so that none is missed however fast the solution
     oscillates. A step with a new largest value is taken again, to end at that peak: the solver's continuous extension
@@ -59,34 +60,43 @@ def amplitudes(
         t1 = jnp.where(result == diffrax.RESULTS.successful, jnp.minimum(t1, period), t0)
         between = solver.interpolation_cls(t0=s.t0, t1=s.t1, **dense)
         found = _peaks_on_step(field, between.evaluate, s.t0, s.t1, s.y, y1, indices)
-        largest = jnp.maximum(s.largest, found.at_end)
+        largest, when = _larger((s.largest, s.when), (found.at_end, s.t1))
         new = keep & ~jnp.any(s.aimed) & (found.value > largest) & (jnp.abs(found.place - 0.5) < 0.5 - EDGE)
         nearest = fixed(jnp.min(jnp.where(new, found.place, 1.0)))
         again = jnp.any(new)
+        place = jnp.where(s.aimed, s.t1 + found.late, s.t0 + found.place * (s.t1 - s.t0))
+        largest, when = _larger((largest, when), (jnp.where(s.aimed, found.near_end, found.value), place))
         t0, t1 = jnp.where(again, s.t0, t0), jnp.where(again, s.t0 + nearest * (s.t1 - s.t0), t1)
-        largest = jnp.maximum(largest, jnp.where(s.aimed, found.near_end, found.value))
-        y, state, largest = jax.tree.map(
-            lambda new, old: jnp.where(keep & ~again, new, old), (y1, state, largest), (s.y, s.solver, s.largest)
+        y, state, largest, when = jax.tree.map(
+            lambda new, old: jnp.where(keep & ~again, new, old),
+            (y1, state, largest, when),
+            (s.y, s.solver, s.largest, s.when),
         )
-        return _Peaks(t0, t1, y, new & (found.place == nearest), largest, s.count + 1, jump, state, controlled)  # pyright: ignore[reportArgumentType]
+        return _Peaks(t0, t1, y, new & (found.place == nearest), largest, when, s.count + 1, jump, state, controlled)  # pyright: ignore[reportArgumentType]
 
     zero = jnp.zeros(())
     t1, controlled = control.init(term, zero, period, fixed(start), None, None, solver.func, order)
     t1 = jnp.minimum(t1, period)
     state = solver.init(term, zero, t1, start, None)
     largest, jump = jnp.abs(start[jnp.array(indices)]), jnp.array(False)
-    first = _Peaks(zero, t1, start, largest < 0, largest, jnp.zeros((), int), jump, state, controlled)
+    first = _Peaks(zero, t1, start, largest < 0, largest, 0 * largest, jnp.zeros((), int), jump, state, controlled)
     last = jax.lax.while_loop(unfinished, advance, first)
     stopped = jnp.where(last.count < MAX_STEPS, Outcome.NOT_FINITE, Outcome.STEP_LIMIT)
-    return last.largest, last.y, jnp.where(last.t0 < period, stopped, Outcome.SUCCESS)
+    return last.largest, last.when, last.y, jnp.where(last.t0 < period, stopped, Outcome.SUCCESS)
+
+
+def _larger(best: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
+    """The larger values of both pairs of values and times."""
+    return jnp.maximum(best[0], other[0]), jnp.where(other[0] > best[0], other[1], best[1])
 
 
 class _Found(NamedTuple):
-    """``|y_i|`` on a step: ``at_end``, extrapolated to the peak ``near_end``, and the largest ``value`` in between, at
-    the fraction ``place``, or 0 if there is none."""
+    """``|y_i|`` on a step: ``at_end``, extrapolated to the peak ``near_end`` by the time ``late``, and the largest ``value``
+    in between, at the fraction ``place``, or 0 if there is none."""
 
     at_end: Array
     near_end: Array
+    late: Array
     value: Array
     place: Array
 
@@ -112,10 +122,9 @@ def _peaks_on_step(
         y = evaluate(t0 + x * h)
         slope, curve = (d[i] for d in derivatives(t0 + x * h, y))
         value, shift = _vertex(y[i], slope, curve)
-        near_end, _ = _vertex(y1[i], slope1[i], curve1[i])
-        return _Found(
-            jnp.abs(y1[i]), jnp.abs(near_end), jnp.where(inside, jnp.abs(value), 0.0), jnp.clip(x + shift / h, 0.0, 1.0)
-        )
+        near_end, late = _vertex(y1[i], slope1[i], curve1[i])
+        between = jnp.where(inside, jnp.abs(value), 0.0), jnp.clip(x + shift / h, 0.0, 1.0)
+        return _Found(jnp.abs(y1[i]), jnp.abs(near_end), late, *between)
 
     return jax.vmap(of)(jnp.array(indices))
 
