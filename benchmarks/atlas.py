@@ -38,7 +38,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.cardan_reference import BASE_CASE
 from benchmarks.throughput import Columns, heyoka_contender, reference_radius, scipy_contender
 from benchmarks.timing import (
     chart,
@@ -51,6 +50,7 @@ from benchmarks.timing import (
     take,
     write_csv,
 )
+from tests.oracles.cardan_reference import BASE_CASE
 
 CELLS = (30_000, 1_000_000, 4_000_000, 20_000_000)
 RTOL = 3e-8

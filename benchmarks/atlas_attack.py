@@ -7,7 +7,7 @@
 Of each case: the relative error of Z at random points of its ranges; the error of rho at random cells of a grid, at the
 cells nearest to rho = 1 and at those with the widest bound, against direct solves with rtol = 1e-14; of each the cells
 whose error is the largest part of their bound once more against values to 30 digits, which share no code with the package
-(benchmarks.cardan_precise_reference). An error may exceed its bound by 2e-14 of the value where both sides are rounded,
+(tests.oracles.cardan_precise_reference). An error may exceed its bound by 2e-14 of the value where both sides are rounded,
 and by nothing against 30 digits. With more than two parameters random points stand in for the grid.
 
 Where rho = 1 by decree (no damping) direct solves are wrong by the root of rounding: there they must only come near 1.
@@ -25,10 +25,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks import cardan_precise_reference as precise
-from benchmarks.cardan_reference import BASE_CASE
 from benchmarks.results_files import load
 from benchmarks.timing import parser, results_folder, spawned_workers, table, write_csv
+from tests.oracles import cardan_precise_reference as precise
+from tests.oracles.cardan_reference import BASE_CASE
 
 if TYPE_CHECKING:
     from drivetrain_jax.atlas import StabilityAtlas
@@ -65,7 +65,7 @@ class Case:
 
     def build(self) -> StabilityAtlas:
         """The atlas, by direct solves."""
-        from benchmarks.atlas_direct import cardan_atlas
+        from tests.oracles.atlas_direct import cardan_atlas
 
         return cardan_atlas(self.ranges, self.tolerance, self.fixed, self.rtol)
 
@@ -125,9 +125,9 @@ def _smallest(values: np.ndarray, count: int) -> np.ndarray:
 
 def relative_error_of_z(atlas: StabilityAtlas, points: np.ndarray) -> np.ndarray:
     """Error of Z at ``points`` against direct solves, over its norm."""
-    from benchmarks.atlas_direct import monodromy, propagators
     from drivetrain_jax.atlas.interpolation import evaluate
     from drivetrain_jax.atlas.panels import position
+    from tests.oracles.atlas_direct import monodromy, propagators
 
     columns = {**atlas.atlas.fixed, **dict(zip(atlas.atlas.parameters, points.T, strict=True))}
     exact = monodromy(propagators(columns, 1e-14))
@@ -152,7 +152,7 @@ class Candidates:
 
 def candidates(atlas: StabilityAtlas, side: int) -> Candidates:
     """``side`` x ``side`` cells over the ranges of the atlas, or random points, fewer, as each takes longer."""
-    from benchmarks.atlas_direct import random_points
+    from tests.oracles.atlas_direct import random_points
 
     if len(atlas.atlas.parameters) > 2:
         points = random_points(atlas, side**2 // _PART, seed=3)
@@ -220,7 +220,7 @@ def against_precise(
 
 def attack(case: Case, size: Size, atlas: StabilityAtlas, pool: Executor | None = None) -> dict[str, Any]:
     """The row of the file for one case."""
-    from benchmarks.atlas_direct import direct_radius, random_points
+    from tests.oracles.atlas_direct import direct_radius, random_points
 
     row = description(case, atlas) | {
         "z_error": float(relative_error_of_z(atlas, random_points(atlas, size.cells)).max())

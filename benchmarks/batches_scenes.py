@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.cardan_reference import BASE_CASE
+from tests.oracles.cardan_reference import BASE_CASE
 
 Scene = dict[str, Any]
 _SHAFT = {"length": [0.07, 0.59, 0.25], "EI": [64427.0, 22157.0, 8350.0], "rhoA": [15.3, 2.81, 5.51]}

@@ -30,7 +30,8 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from benchmarks.chaos_reference import (
+from benchmarks.timing import PROCESSES, median, parser, results_folder, spawned_workers, table, write_csv
+from tests.oracles.chaos_reference import (
     INTERVAL,
     HeyokaFlow,
     attractor,
@@ -41,7 +42,6 @@ from benchmarks.chaos_reference import (
     scipy_spectrum,
     tripod_field,
 )
-from benchmarks.timing import PROCESSES, median, parser, results_folder, spawned_workers, table, write_csv
 
 matplotlib.use("Agg")
 

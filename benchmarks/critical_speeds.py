@@ -5,7 +5,7 @@
 Six critical speeds of random shafts of three segments (those of the paper, every parameter within a factor of 1.5,
 supports from 1e5 to 1e9 N/m). The package runs as its engine does, compiled beforehand, on the chunks of its plan by
 two threads. SciPy scans the determinant of the transfer matrices and applies Brent's method
-(benchmarks/bicardan_reference.py), point by point in two processes. The critical-speed map over 20 support
+(tests/oracles/bicardan_reference.py), point by point in two processes. The critical-speed map over 20 support
 stiffnesses is computed by the package and by ``Rotor.run_ucs`` of ROSS (``ross-rotordynamics``, extra ``peers``; it
 needs plotly before 6) in the Python of ``--ross``, 4 elements per segment; ROSS computes both planes of bending with
 the gyroscopic effect.
@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.bicardan_reference import determinant_roots
 from benchmarks.engine_job import columns_scene, engine_job
 from benchmarks.timing import (
     PROCESSES,
@@ -38,6 +37,7 @@ from benchmarks.timing import (
     write_csv,
 )
 from drivetrain_jax.systems.bicardan import PRESETS
+from tests.oracles.bicardan_reference import determinant_roots
 
 MODES = 6
 SUPPORTS = np.geomspace(1e5, 1e9, 20)

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.cardan_reference import BASE_CASE
 from benchmarks.timing import PROCESSES, interleaved, median
 from drivetrain_jax._machine import usable_cores
 from drivetrain_jax.runs import toml
@@ -21,6 +20,7 @@ from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.executor import Where, run_threads
 from drivetrain_jax.runs.run import run_to_file
 from drivetrain_jax.runs.scene import load_scene
+from tests.oracles.cardan_reference import BASE_CASE
 
 # A sweep of one output, run by a process of its own; prints its largest resident memory in MB, with the pages of mapped
 # files, and without them, and the seconds that it took.

@@ -23,9 +23,9 @@ from typing import Any
 import heyoka as hy
 import numpy as np
 
-from benchmarks.cardan_reference import BASE_CASE, spectral_radius
 from benchmarks.engine_job import columns_scene, engine_job
 from benchmarks.timing import chart, interleaved, median, parser, results_folder, table, take, write_csv
+from tests.oracles.cardan_reference import BASE_CASE, spectral_radius
 
 FORMS = ("full", "half", "chi")
 # Number of heyoka's runtime parameters: cos and sin^2 of beta, 1/Omega^2, 2 zeta/Omega, alpha, mu, 1/gamma; in chi also

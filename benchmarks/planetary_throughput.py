@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.engine_job import columns_scene, engine_job
-from benchmarks.planetary_reference import TABLE_2, exact_frequencies, extension_matrix, natural_frequencies
 from benchmarks.timing import PROCESSES, at_once, interleaved, median, parser, results_folder, table, write_csv
+from tests.oracles.planetary_reference import TABLE_2, exact_frequencies, extension_matrix, natural_frequencies
 
 COUNTS = (3, 4, 5, 7, 12)
 _CHECKED = 5

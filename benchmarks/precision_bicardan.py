@@ -4,7 +4,7 @@
 
 Six frequencies of a shaft of three segments (the 55th to the 60th of "high mode", all 60 being solved for). Every
 region is one shaft and its neighbours, each parameter within 1 %; all points are timed, the error is that of the first
-one, against the paper's determinant in as many digits as it loses (benchmarks/bicardan_precise_reference.py), whose
+one, against the paper's determinant in as many digits as it loses (tests/oracles/bicardan_precise_reference.py), whose
 number and place of roots come from finite elements of high degree. A mode of frequency 0 counts by its size over the
 first elastic frequency. The package takes its points in batches, as its engine does, one chunk at a time; "dynamic
 stiffness" bisects those of a batch together with NumPy; the others go shaft by shaft.
@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.bicardan_precise_reference import precise_frequencies
-from benchmarks.bicardan_reference import determinant_roots, finite_elements
-from benchmarks.bicardan_rivals import dynamic_stiffness_frequencies, hermite_frequencies
 from benchmarks.engine_job import columns_scene, engine_job, told
 from benchmarks.precision import Contender, Judged, study
+from tests.oracles.bicardan_precise_reference import precise_frequencies
+from tests.oracles.bicardan_reference import determinant_roots, finite_elements
+from tests.oracles.bicardan_rivals import dynamic_stiffness_frequencies, hermite_frequencies
 
 _PAPER = {"length": (0.07, 0.59, 0.25), "EI": (64427.2, 22156.5, 8349.76), "rhoA": (15.288, 2.808, 5.5068)}
 _UNIFORM = {"length": (0.3,) * 3, "EI": (64050.0,) * 3, "rhoA": (15.288,) * 3}

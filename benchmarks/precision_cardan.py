@@ -3,7 +3,7 @@
     python -m benchmarks.precision_cardan [--quick] [--out FOLDER]     # precision_cardan.csv and .png
 
 A region is a point (beta, Omega) and a grid of 16 x 32 neighbours within 0.5 %; the error is the largest of its centre
-and a corner against 200-bit Taylor series (benchmarks/cardan_precise_reference.py), which SciPy's DOP853 at 1e-13
+and a corner against 200-bit Taylor series (tests/oracles/cardan_precise_reference.py), which SciPy's DOP853 at 1e-13
 confirms (head of the CSV). Every method runs on one core. The package and heyoka take the whole grid, diffrax and the
 stacked SciPy 64 of its points (Kvaerno5 8), SciPy point by point the two that are compared.
 """
@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.cardan_precise_reference import spectral_radius as precise_radius
-from benchmarks.cardan_reference import BASE_CASE, NAMES, monodromy, spectral_radius, stacked_monodromy
 from benchmarks.engine_job import columns_scene, engine_job, told
 from benchmarks.precision import Contender, Judged, study
 from benchmarks.timing import once, take
+from tests.oracles.cardan_precise_reference import spectral_radius as precise_radius
+from tests.oracles.cardan_reference import BASE_CASE, NAMES, monodromy, spectral_radius, stacked_monodromy
 
 Columns = dict[str, np.ndarray]
 REGIONS: dict[str, dict[str, float]] = {

@@ -4,7 +4,7 @@
 
 All frequencies of a gear. Every region is one gear and its neighbours, masses and stiffnesses within 1 %; all points are
 timed, the error is that of the first one, the largest over its modes, against eigenvalues in 50 digits (mpmath) of matrices
-that were assembled another way (benchmarks/planetary_reference.py). A mode of frequency 0 counts by its size over the
+that were assembled another way (tests/oracles/planetary_reference.py). A mode of frequency 0 counts by its size over the
 lowest other one. No method has a setting, so that each is one point.
 
 "reduced" is the package's default, which splits the equations of identical planets; "whole" its singular values of the
@@ -28,8 +28,14 @@ import numpy as np
 from scipy.linalg import eigh
 
 from benchmarks.engine_job import columns_scene, engine_job, told
-from benchmarks.planetary_reference import TABLE_2, exact_frequencies, extension_matrix, matrices, natural_frequencies
 from benchmarks.precision import GOAL, Contender, Judged, study
+from tests.oracles.planetary_reference import (
+    TABLE_2,
+    exact_frequencies,
+    extension_matrix,
+    matrices,
+    natural_frequencies,
+)
 
 _LANES, _FEW = 1024, 8
 # Everything but the angles varies, so that gears of one number of planets share a kernel.

@@ -4,7 +4,7 @@
 
 Every region is one gear pair with an initial state; integrators follow it over ten drive periods. The error is that of
 (u, v) at the end over the size of the motion (amplitude, and amplitude times omega), against the solution in extended
-precision, event by event (benchmarks/rattle_reference.py). The closed form takes 256 lanes at once, diffrax 8, SciPy one
+precision, event by event (tests/oracles/rattle_reference.py). The closed form takes 256 lanes at once, diffrax 8, SciPy one
 after another; lanes are equal. Harmonic balance gives an orbit and no transient: its error is the distance of its state at
 the start of a period from the orbit next to it (Newton iterations on the map of one period, checked in extended precision);
 it says by its ``residual`` what it leaves unbalanced, which counts as a notice from 1e-6 of the drive on.
@@ -26,13 +26,13 @@ import numpy as np
 
 from benchmarks.precision import Contender, Judged, study
 from benchmarks.rattle_diffrax import integrate
-from benchmarks.rattle_reference import extended, scipy_events, scipy_plain
 from benchmarks.timing import once
 from drivetrain_jax.analysis.approximations.harmonic_balance import Basis
 from drivetrain_jax.analysis.approximations.harmonic_response import describe
 from drivetrain_jax.analysis.approximations.harmonic_sweep import sweep
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
+from tests.oracles.rattle_reference import extended, scipy_events, scipy_plain
 
 PERIODS = 10
 _TABLE1 = PRESETS["table1"] | {"omega": 0.76}

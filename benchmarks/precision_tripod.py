@@ -31,7 +31,7 @@ from scipy.integrate import solve_ivp
 from benchmarks.engine_job import columns_scene, engine_job, told
 from benchmarks.precision import Contender, Judged, study
 from benchmarks.timing import once
-from benchmarks.tripod_reference import NINE_DEGREES, Shaft, shaft
+from tests.oracles.tripod_reference import NINE_DEGREES, Shaft, shaft
 
 _OMEGA = shaft("input").omega
 # Everything that differs between regions, so that they share kernels.

@@ -24,10 +24,10 @@ from matplotlib.figure import Figure
 
 from benchmarks.precision_figure import style_of
 from benchmarks.rattle_diffrax import integrate
-from benchmarks.rattle_reference import extended, scipy_events, scipy_plain
 from benchmarks.timing import interleaved, median, parser, provenance, results_folder, table, write_csv
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
+from tests.oracles.rattle_reference import extended, scipy_events, scipy_plain
 
 PERIODS = 10
 TABLE1 = PRESETS["table1"]

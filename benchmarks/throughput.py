@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 
 from benchmarks import peers
-from benchmarks.cardan_reference import BASE_CASE, monodromy, spectral_radius, stacked_monodromy
 from benchmarks.engine_job import engine_job
 from benchmarks.timing import (
     PROCESSES,
@@ -39,6 +38,7 @@ from benchmarks.timing import (
     take,
     write_csv,
 )
+from tests.oracles.cardan_reference import BASE_CASE, monodromy, spectral_radius, stacked_monodromy
 
 Columns = Mapping[str, np.ndarray]
 _exact = cache(peers.HeyokaBatch)

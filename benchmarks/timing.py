@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.cardan_reference import BASE_CASE
+from tests.oracles.cardan_reference import BASE_CASE
 
 RESULTS = Path(__file__).resolve().parent / "results"
 PROCESSES = 2

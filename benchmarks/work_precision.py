@@ -32,8 +32,8 @@ import matplotlib
 import numpy as np
 from scipy.integrate import DOP853
 
-from benchmarks.cardan_reference import NAMES
 from benchmarks.timing import parser, provenance, results_folder, write_csv
+from tests.oracles.cardan_reference import NAMES
 
 jax.config.update("jax_enable_x64", True)
 matplotlib.use("Agg")

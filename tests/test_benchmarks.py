@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 import drivetrain_jax
-from benchmarks.bicardan_precise_reference import determinant
-from benchmarks.bicardan_reference import transfer_determinant
-from benchmarks.chaos_reference import _orthonormalise
 from benchmarks.page import PAGE, text_of
 from benchmarks.precision import Contender, Judged, Rung, judge, measure, read, write
 from benchmarks.results_files import against, plain
 from benchmarks.timing import RESULTS, at_once, once, write_csv
 from drivetrain_jax import cli
+from tests.oracles.bicardan_precise_reference import determinant
+from tests.oracles.bicardan_reference import transfer_determinant
+from tests.oracles.chaos_reference import _orthonormalise
 
 
 def rung(setting="rtol=1e-9", error=1e-10, failed=0, noticed=""):

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 import drivetrain_jax as dt
-from benchmarks.bicardan_reference import determinant_roots, finite_elements
 from benchmarks.validation.document import Page, markdown
 from drivetrain_jax.systems.bicardan import PRESETS
+from tests.oracles.bicardan_reference import determinant_roots, finite_elements
 
 Parameters = Mapping[str, Any]
 
@@ -64,7 +64,7 @@ def section_four() -> str:
 The paper does not print E and I. These values reproduce its results: E = 2.1e11 N/m2, rho = 7800 kg/m3, the printed areas,
 I = 3.055e-7, 1.055e-7, 3.97e-8 m4, and uniform bars of 3 x 0.30 = 0.90 m (not 0.91). A2 = 3.6e-4 m2 is not the area of the
 50/45 tube, 3.7306e-4. The solid bar (I = 3.05e-7) differs by 0.06 %. "Independent": finite elements of high degree
-(benchmarks/bicardan_reference.py). "Exact I": moments of the diameters 50, 50/45, 30 mm.
+(tests/oracles/bicardan_reference.py). "Exact I": moments of the diameters 50, 50/45, 30 mm.
 
 {table}
 The paper computes critical speeds with 3.14 for pi, so they are 0.05 % too high:

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 import drivetrain_jax as dt
-from benchmarks.cardan_orbit_reference import linear_response, nonlinear_orbit
-from benchmarks.cardan_reference import (
+from benchmarks.validation.document import Page, markdown
+from tests.oracles.cardan_orbit_reference import linear_response, nonlinear_orbit
+from tests.oracles.cardan_reference import (
     BASE_CASE,
     Matrices,
     Pair,
@@ -20,7 +21,6 @@ from benchmarks.cardan_reference import (
     speed_ratio,
     stacked_monodromy,
 )
-from benchmarks.validation.document import Page, markdown
 
 PRINTED_FREQUENCIES = (0.072, 1.422)
 # Tables 1 and 2 as printed. The column of Table 2 headed Omega^C holds the difference combinations C-.

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 import drivetrain_jax as dt
-from benchmarks.planetary_reference import TABLE_2, exact_frequencies
 from benchmarks.validation.document import Page, markdown
+from tests.oracles.planetary_reference import TABLE_2, exact_frequencies
 
 # The paper divides by 2 x 3.14 instead of 2 pi, and cuts after the first decimal.
 PRINTED_PI = math.pi / 3.14

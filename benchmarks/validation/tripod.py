@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 import drivetrain_jax as dt
-from benchmarks import tripod_reference as oracle
 from benchmarks.validation import tripod_chaos
 from benchmarks.validation.document import Page, markdown
+from tests.oracles import tripod_reference as oracle
 
 NINE_DEGREES = math.radians(9)
 REFERENCE = Path(__file__).parents[2] / "tests" / "reference" / "tripod.json"

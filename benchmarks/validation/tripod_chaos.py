@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 import drivetrain_jax as dt
-from benchmarks.chaos_reference import scipy_spectrum, tripod_field
 from benchmarks.validation.document import markdown
+from tests.oracles.chaos_reference import scipy_spectrum, tripod_field
 
 BETA = math.radians(9)
 # Printed values of chi_n and the range of damping ratios for which the paper claims chaos, and the excitation frequency.

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
-from benchmarks.bicardan_reference import complete, finite_elements
 from drivetrain_jax.analysis.critical_speeds import separation_margin
 from drivetrain_jax.analysis.shafts.compound import characteristic
 from drivetrain_jax.analysis.shafts.functions import compound, general
@@ -23,6 +22,7 @@ from drivetrain_jax.analysis.shafts.roots import find_roots, relative_error
 from drivetrain_jax.analysis.shafts.shapes import mode_shapes
 from drivetrain_jax.systems import Shaft
 from drivetrain_jax.systems.bicardan import PRESETS, Bicardan
+from tests.oracles.bicardan_reference import complete, finite_elements
 
 CASES = json.loads((Path(__file__).parents[1] / "reference" / "bicardan.json").read_text())
 PAPER = PRESETS["paper"]

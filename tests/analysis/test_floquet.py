@@ -15,11 +15,11 @@ from scipy.integrate import solve_ivp
 from scipy.special import mathieu_a, mathieu_b
 
 import drivetrain_jax as dt
-from benchmarks.cardan_reference import monodromy, spectral_radius, stacked_monodromy
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.periodic.direct import assemble, compare
 from drivetrain_jax.analysis.periodic.propagator import EXPLICIT_ORDER, Radau, propagator
 from drivetrain_jax.systems import LinearPeriodic, get_system, system_names
+from tests.oracles.cardan_reference import monodromy, spectral_radius, stacked_monodromy
 
 RANGES = {"Omega": (0.05, 5), "zeta": (1e-4, 1), "alpha": (0.1, 20), "mu": (0.1, 20), "gamma": (0.1, 1e3)}
 
@@ -102,7 +102,7 @@ CROSSING = {
     "mu": np.array([10.976429953601453, 3.5240622328300297, 10.758480824751404]),
     "gamma": np.array([0.36790064817400686, 0.5100380577939942, 0.7959599064678967]),
 }
-# By benchmarks/cardan_precise_reference.py with BITS = 300 and 400.
+# By tests/oracles/cardan_precise_reference.py with BITS = 300 and 400.
 CROSSING_RADIUS = np.array([2.19580758985809508e-18, 1.0515487833445584448e-44, 6.8701943106188223541e-16])
 
 
@@ -116,7 +116,7 @@ def test_bound_counts_rounding_that_grows_on_the_way(direct, rtol):
     assert (found["spectral_radius_error"] <= 1e-8 * CROSSING_RADIUS + 10 * rtol * CROSSING_RADIUS).all()
 
 
-# beta, Omega; spectral radius by benchmarks/cardan_precise_reference.py with BITS = 300.
+# beta, Omega; spectral radius by tests/oracles/cardan_precise_reference.py with BITS = 300.
 STIFF_AND_SOFT = (
     (1.2406405954877202, 0.3171689579416352, 0.52542871630596923),
     (1.2458283486844648, 0.33150135645386614, 0.99999999999974989),

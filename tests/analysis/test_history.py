@@ -10,10 +10,10 @@ import pytest
 from flows import lorenz
 
 import drivetrain_jax as dt
-from benchmarks import tripod_reference as oracle
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import Outcome, Request, history
 from drivetrain_jax.runs.scene import load_scene
+from tests.oracles import tripod_reference as oracle
 
 NINE_DEGREES = math.radians(9)
 FIXED = {"element": "input", "equation": "25", "beta": NINE_DEGREES}

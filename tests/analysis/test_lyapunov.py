@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
-from benchmarks import tripod_reference as oracle
 from drivetrain_jax.analysis import Outcome, Request
 from drivetrain_jax.analysis.chaos.forcing import may_be_chaotic
 from drivetrain_jax.analysis.chaos.march_steps import needed_steps
@@ -23,6 +22,7 @@ from drivetrain_jax.analysis.chaos.verdict import Verdict
 from drivetrain_jax.analysis.lyapunov import analyse
 from drivetrain_jax.invariants import check
 from drivetrain_jax.systems import Flow, get_system
+from tests.oracles import tripod_reference as oracle
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "tripod.json").read_text())
 OUTPUTS = ("lyapunov_spectrum", "lyapunov_standard_error", "sum_rule_residual", "verdict", "chaos_k01")
@@ -405,7 +405,7 @@ class TestPaperEstimator:
         assert expected[1] > 100
 
     def test_it_is_what_is_printed_for_the_output_element(self):
-        """(30) by SciPy at 3e-14: benchmarks.tripod_reference.paper_estimator, values in the reference file."""
+        """(30) by SciPy at 3e-14: tests.oracles.tripod_reference.paper_estimator, values in the reference file."""
         case = REFERENCE["paper_estimator"]
         fixed = {"element": "output", "beta": math.radians(9), "zeta": case["zeta"], "chi_n": case["chi_n"]}
         fixed |= {"excitation_frequency": case["frequency_Hz"]}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
-from benchmarks.planetary_reference import TABLE_2, exact_frequencies
+from tests.oracles.planetary_reference import TABLE_2, exact_frequencies
 
 ANGLES = (0.1, 1.5, 3.0, 4.9)
 UNEQUAL = TABLE_2 | {"planet_angle": ANGLES, "m_p": (0.6, 0.66, 0.7, 0.75), "k_sp": (4e8, 5e8, 6e8, 5.5e8)}

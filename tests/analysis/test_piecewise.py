@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.rattle_reference import extended, random_case
 from drivetrain_jax.analysis.impacts.orbit_history import history
 from drivetrain_jax.analysis.impacts.piecewise_flow import piece, responses
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start, usual_steps
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
+from tests.oracles.rattle_reference import extended, random_case
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "rattle.json").read_text())
 TABLE1 = PRESETS["table1"]

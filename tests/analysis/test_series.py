@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
-from benchmarks.atlas_direct import BASE, CARDAN, monodromy, propagators
 from drivetrain_jax.analysis.periodic.series import propagators_along
 from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import LinearPeriodic
+from tests.oracles.atlas_direct import BASE, CARDAN, monodromy, propagators
 
 LANES = 3
 X = np.array([1.0, -0.35, 0.0, 0.6])

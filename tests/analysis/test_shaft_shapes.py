@@ -14,10 +14,10 @@ from mpmath import mp
 from scipy.linalg import eigh
 
 import drivetrain_jax as dt
-from benchmarks.bicardan_reference import complete, matrices
 from drivetrain_jax.analysis.shafts.roots import find_roots
 from drivetrain_jax.analysis.shafts.shapes import mode_shapes
 from drivetrain_jax.systems import Shaft
+from tests.oracles.bicardan_reference import complete, matrices
 
 INF = math.inf
 # Pieces more than modes: no mode of a single span is at rest at all nodes.

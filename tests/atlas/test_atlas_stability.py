@@ -20,12 +20,12 @@ from benchmarks.atlas_attack import (
     worst,
     wrong,
 )
-from benchmarks.atlas_direct import BASE, cardan_atlas, direct_radius, random_points
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.periodic import quartic
 from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES
 from drivetrain_jax.atlas import charts, tiles
 from drivetrain_jax.atlas.panels import Atlas, Panel
+from tests.oracles.atlas_direct import BASE, cardan_atlas, direct_radius, random_points
 
 COUNTS = [f"{what}_{by}" for what in ("violations", "wrong") for by in ("direct", "precise")]
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.atlas_direct import direct_radius, random_points
 from drivetrain_jax.analysis.periodic import quartic
 from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES
 from drivetrain_jax.atlas import StabilityAtlas, expansion
 from drivetrain_jax.atlas.criteria import invariants, monodromy
+from tests.oracles.atlas_direct import direct_radius, random_points
 
 ERROR = 1e-7
 EVERYTHING = tuple(v.name for v in VARIABLES if v.name != "floquet_exponent")

@@ -9,13 +9,13 @@ from functools import partial
 import numpy as np
 import pytest
 
-from benchmarks.atlas_direct import BASE, CARDAN, cardan_atlas, monodromy, propagators
 from drivetrain_jax import InputError
 from drivetrain_jax.atlas import design
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.design import least_damping, nearest_boundaries, speed_windows, widest_angle
 from drivetrain_jax.atlas.panels import Gap
 from drivetrain_jax.atlas.windows import Crossing, Interval, Line, _line, narrow, stability_along
+from tests.oracles.atlas_direct import BASE, CARDAN, cardan_atlas, monodromy, propagators
 
 
 def direct(columns):

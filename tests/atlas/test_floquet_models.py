@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.atlas_direct import BASE, CARDAN, direct_radius, propagators
 from drivetrain_jax.atlas import floquet_rounds, run, solve_rtol, stability_atlas
+from tests.oracles.atlas_direct import BASE, CARDAN, direct_radius, propagators
 
 
 def variant(models):

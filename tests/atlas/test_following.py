@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.atlas_direct import BASE, CARDAN, cardan_atlas, monodromy, propagators
 from drivetrain_jax.atlas.following import follow_tips
 from drivetrain_jax.atlas.tips import find_tips
 from drivetrain_jax.atlas.windows import narrow
+from tests.oracles.atlas_direct import BASE, CARDAN, cardan_atlas, monodromy, propagators
 
 
 def tips_at(atlas, **values):

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.atlas_direct import BASE, CARDAN, cardan_atlas, direct_radius, random_points
 from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.analysis.periodic.floquet_effort import explicit_effort
 from drivetrain_jax.analysis.periodic.series import propagators_along
@@ -19,6 +18,7 @@ from drivetrain_jax.atlas.floquet import floquet_domain
 from drivetrain_jax.atlas.series import series_nodes
 from drivetrain_jax.systems import Coordinate, Series, Smoothness
 from drivetrain_jax.systems._smooth import identity
+from tests.oracles.atlas_direct import BASE, CARDAN, cardan_atlas, direct_radius, random_points
 
 TOLERANCE = 1e-9
 SQUARE = Domain(("x", "s"), (-1.0, 1.0), (1.0, 30.0), (identity("x"), identity("s")), {})

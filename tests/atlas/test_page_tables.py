@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_tips import TIPS
 
-from benchmarks.atlas_direct import BASE, propagators
+from tests.oracles.atlas_direct import BASE, propagators
 
 THEORY = Path(__file__).parents[2] / "docs" / "theory"
 # Coordinate of the angle and its inverse, in the order of the table.

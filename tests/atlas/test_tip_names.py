@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.atlas_direct import BASE, CARDAN, cardan_atlas, monodromy, propagators
 from drivetrain_jax.atlas import tips as naming
 from drivetrain_jax.atlas.boundaries import boundaries
 from drivetrain_jax.systems.cardan import natural_frequencies
+from tests.oracles.atlas_direct import BASE, CARDAN, cardan_atlas, monodromy, propagators
 
 BETA = np.pi / 6
 

@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.atlas_direct import BASE, CARDAN, cardan_atlas, monodromy, propagators
-from benchmarks.cardan_reference import monodromy as reference_monodromy
 from drivetrain_jax.atlas import tips as naming
 from drivetrain_jax.atlas.boundaries import boundaries
 from drivetrain_jax.atlas.criteria import Criteria, invariants
@@ -20,9 +18,11 @@ from drivetrain_jax.atlas.roots import on_line, roots
 from drivetrain_jax.atlas.sensitivity import atlas_sensitivity, direct_sensitivity
 from drivetrain_jax.atlas.tips import find_tips
 from drivetrain_jax.systems.cardan import natural_frequencies
+from tests.oracles.atlas_direct import BASE, CARDAN, cardan_atlas, monodromy, propagators
+from tests.oracles.cardan_reference import monodromy as reference_monodromy
 
 # By root finding on direct solves (`direct_tip` below, at rtol 1e-14): beta, Omega. That of C-1, where two multipliers
-# nearly coincide, by the same on values to 30 digits (benchmarks.cardan_precise_reference).
+# nearly coincide, by the same on values to 30 digits (tests.oracles.cardan_precise_reference).
 TIPS = {
     "S11": (0.0237682936, 0.0706222355),
     "S21": (0.1063331213, 1.4159881603),

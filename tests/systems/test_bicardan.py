@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
-from benchmarks.bicardan_reference import finite_elements
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems.bicardan import PRESETS, Bicardan
+from tests.oracles.bicardan_reference import finite_elements
 
 FIXED = {name: list(value) if isinstance(value, tuple) else value for name, value in PRESETS["paper_fitted"].items()}
 SCENE = {"system": "bicardan", "analysis": "critical_speeds"}

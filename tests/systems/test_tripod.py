@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
-from benchmarks import tripod_reference as oracle
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import get_system, tripod
+from tests.oracles import tripod_reference as oracle
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "tripod.json").read_text())
 SYSTEM = get_system("tripod")

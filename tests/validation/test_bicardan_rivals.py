@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.bicardan_precise_reference import precise_frequencies
-from benchmarks.bicardan_rivals import count_below, dynamic_stiffness_frequencies, hermite_frequencies
+from tests.oracles.bicardan_precise_reference import precise_frequencies
+from tests.oracles.bicardan_rivals import count_below, dynamic_stiffness_frequencies, hermite_frequencies
 
 CASES = json.loads((Path(__file__).parents[1] / "reference" / "bicardan.json").read_text())
 NAMES = {"length": "l", "EI": "EI", "rhoA": "rhoA", "k_A": "kA", "k_D": "kD"}

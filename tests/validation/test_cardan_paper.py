@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
-from benchmarks.cardan_orbit_reference import linear_response, nonlinear_orbit
-from benchmarks.cardan_reference import BASE_CASE, damping_and_stiffness
 from benchmarks.validation.cardan import printed_matrices, unstable_fraction
+from tests.oracles.cardan_orbit_reference import linear_response, nonlinear_orbit
+from tests.oracles.cardan_reference import BASE_CASE, damping_and_stiffness
 
 # Every tenth angle and speed of the base chart: 16 x 20 cells.
 STRIDE = 10

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
-from benchmarks.cardan_reference import BASE_CASE, NAMES, monodromy, spectral_radius, stacked_monodromy
+from tests.oracles.cardan_reference import BASE_CASE, NAMES, monodromy, spectral_radius, stacked_monodromy
 
 POINTS = json.loads((Path(__file__).parents[1] / "reference" / "cardan.json").read_text())["points"]
 RHO = np.array([float(point["rho"]) for point in POINTS])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
-from benchmarks.planetary_reference import case_parameters, exact_frequencies, natural_frequencies
+from tests.oracles.planetary_reference import case_parameters, exact_frequencies, natural_frequencies
 
 CASES = json.loads((Path(__file__).parents[1] / "reference" / "planetary.json").read_text())
 TYPES = {"R": "rotational", "T": "translational", "P": "planet", "X": "coupled"}

@@ -4,7 +4,7 @@
     T = alpha d theta2' + mu s theta2,   s = 1/Omega^2,   d = 2 zeta/Omega,   eta, eta_phi at phi = tau + theta1;
 
 the linear response is that of the same equations to first order in theta1, theta2 and their rates.
-Independent of drivetrain_jax like :mod:`benchmarks.cardan_reference`; states are (theta1, theta2, theta1', theta2').
+Independent of drivetrain_jax like :mod:`tests.oracles.cardan_reference`; states are (theta1, theta2, theta1', theta2').
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from benchmarks.cardan_reference import PERIOD, damping_and_stiffness, speed_ratio
+from tests.oracles.cardan_reference import PERIOD, damping_and_stiffness, speed_ratio
 
 _TOLERANCES = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14}
 

@@ -2,7 +2,7 @@
 
     y' = f(t, y),  v' = (df/dy) v for every tangent vector v, made orthonormal after every interval (Benettin);
 
-Lorenz: x' = 10 (y - x), y' = x (28 - z) - y, z' = x y - 8/3 z; double tripod: (29), see :mod:`benchmarks.tripod_reference`.
+Lorenz: x' = 10 (y - x), y' = x (28 - z) - y, z' = x y - 8/3 z; double tripod: (29) of :mod:`tests.oracles.tripod_reference`.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 ``Psi(p)``, (25) of the paper, loses ``exp(tau)`` in accuracy, tau being the sum of all phases: mpmath carries that many
 digits more. Number and place of the frequencies come from finite elements of high degree
-(:func:`benchmarks.bicardan_reference.finite_elements`), so that none is missed where two lie next to each other; the two
+(:func:`tests.oracles.bicardan_reference.finite_elements`), so that none is missed where two lie next to each other; the two
 methods share nothing, and the result says how far they differ.
 """
 
@@ -14,7 +14,7 @@ from typing import Any
 import mpmath
 import numpy as np
 
-from benchmarks.bicardan_reference import finite_elements
+from tests.oracles.bicardan_reference import finite_elements
 
 DIGITS = 40
 # Part of the highest frequency below which double precision leaves the finite elements no digits to compare.

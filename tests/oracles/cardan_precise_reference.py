@@ -1,6 +1,6 @@
 """The spectral radius of the cardan shaft to 30 digits and more, by Taylor series in fixed-point arithmetic.
 
-    python -m benchmarks.cardan_precise_reference 1.5 0.1        # beta Omega [zeta alpha mu gamma]
+    python -m tests.oracles.cardan_precise_reference 1.5 0.1        # beta Omega [zeta alpha mu gamma]
 
 Nothing here comes from drivetrain_jax or from SciPy. In theta1, v1 = theta1', phi = theta2 + eta theta1 and w = phi'
 the linearised equations need no derivative of eta,

@@ -1,0 +1,1 @@
+"""Tests; a package, so that test files and benchmarks share their oracles."""

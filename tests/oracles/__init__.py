@@ -1,0 +1,1 @@
+"""Independent computations that tests and benchmarks compare with."""
