@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
-from benchmarks.validation.cardan import printed_matrices, unstable_fraction
 from tests.oracles.cardan_orbit_reference import linear_response, nonlinear_orbit
+from tests.oracles.cardan_paper import printed_matrices, unstable_fraction
 from tests.oracles.cardan_reference import BASE_CASE, damping_and_stiffness
 
 # Every tenth angle and speed of the base chart: 16 x 20 cells.

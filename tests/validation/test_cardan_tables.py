@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.validation.cardan import PRINTED_FREQUENCIES, PRINTED_SPEEDS, natural_frequencies, predicted_speeds
 from drivetrain_jax.systems import cardan
+from tests.oracles.cardan_paper import PRINTED_FREQUENCIES, PRINTED_SPEEDS, natural_frequencies, predicted_speeds
 
 EXACT = (0.070622235012, 1.415984639720)
 # The two printed speeds that the printed frequencies do not give: .072/2 = .036 and 1.422/2 = .711.
