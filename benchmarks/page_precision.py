@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -117,27 +117,29 @@ def _winners(precision: Precision) -> str:
     return f"`{precision.system}` at an error of {GOAL:g}, one core: the package is {'; '.join(filter(None, parts))}."
 
 
-def _silence(systems: Sequence[Precision]) -> list[str]:
-    own: list[str] = []
-    rivals: dict[str, list[str]] = {}
+def silent(systems: Iterable[Precision]) -> dict[str, list[str]]:
+    """Systems and regions in which a method fails silently, by method."""
+    found: dict[str, list[str]] = {}
     for precision in systems:
         for region in precision.regions:
             for method in precision.methods:
                 judged = precision.judgement(region, method)
                 if judged and judged.word == "SILENT":
-                    if is_own(method):
-                        own.append(f"{precision.system}, {region}, {method}")
-                    else:
-                        rivals.setdefault(method, []).append(f"{precision.system} {region}")
-    if not own:
-        names = ", ".join(f"`{precision.system}`" for precision in systems)
-        first = f"No method of the package fails silently in any region measured ({names})."
-    else:
-        first = f"**The package fails silently** in: {'; '.join(own)}."
-    if not rivals:
-        return [first]
-    listed = "; ".join(f"{method} ({', '.join(where)})" for method, where in rivals.items())
-    return [first, f"Rivals that fail silently: {listed}."]
+                    found.setdefault(method, []).append(f"{precision.system} {region}")
+    return found
+
+
+def _silence(systems: Sequence[Precision]) -> list[str]:
+    own, rivals = [], []
+    for method, regions in silent(systems).items():
+        (own if is_own(method) else rivals).append(f"{method} ({', '.join(regions)})")
+    names = ", ".join(f"`{precision.system}`" for precision in systems)
+    first = (
+        f"**The package fails silently** in: {'; '.join(own)}."
+        if own
+        else f"No method of the package fails silently in any region measured ({names})."
+    )
+    return [first, f"Rivals that fail silently: {'; '.join(rivals)}."] if rivals else [first]
 
 
 def section(folder: Path, images: str, system: str, found: dict[str, Precision]) -> str:

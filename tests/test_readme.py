@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.readme import written
+from benchmarks.results_files import not_measured
 
 ROOT = Path(__file__).parents[1]
 
@@ -31,7 +32,7 @@ def test_python_blocks_print_what_the_readme_shows(tmp_path):
 def test_the_measured_part_is_what_the_stored_files_give(tmp_path):
     text = (ROOT / "README.md").read_text()
     assert written(text) == text, "run `python -m benchmarks.page`"
-    assert "Not measured: `throughput.csv` is missing." in written(text, tmp_path)
+    assert not_measured("throughput") in written(text, tmp_path)
 
 
 def test_no_figure_of_a_measurement_is_typed():
