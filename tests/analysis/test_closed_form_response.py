@@ -173,7 +173,7 @@ def settled(epsilon: float, sigma: float, start: float) -> float:
     return (u.max() - u.min()) / 2
 
 
-def test_averaged_amplitudes_are_met_by_the_cubic_system_to_first_order():
+def test_cubic_system_meets_averaged_amplitudes_to_first_order():
     """Independent of the averaging: errors halve with epsilon, and the middle amplitude divides the others."""
     sigma, errors = 0.55, []
     flow = multiple_scales.SlowFlow(jnp.array(0.0), jnp.array(0.2), jnp.array(0.25), jnp.array(0.375))
@@ -224,7 +224,7 @@ def assert_balanced(values, omega, bias, amplitude, rtol=1e-9):
     assert size == pytest.approx(values["B1"], rel=rtol * max(1.0, amplitude / values["B1"]))
 
 
-def test_amplitudes_on_either_side_of_a_narrow_resonance_are_found():
+def test_amplitudes_on_both_sides_of_a_narrow_resonance():
     """At light damping both arms pass a frequency within a thousandth of an amplitude."""
     values = {"B0": 0.14, "B1": 1.4e-4, "b": 0.63, "c": 1.2e-4, "alpha": 0.0}
     omegas = np.array([0.53, 0.59, 0.66, 0.74])
@@ -320,7 +320,7 @@ def test_limits_without_drive_damping_or_stiffness(scales, describing):
     assert np.isnan(describing["fold_frequency"][0, 1:, 5]).all()
 
 
-def test_the_peak_is_the_largest_amplitude_also_with_heavy_damping():
+def test_peak_is_the_largest_amplitude_with_heavy_damping():
     """Without a resonance the amplitude falls from its static value: of a linear spring B1/k', at the frequency 0."""
     cases = ({"alpha": 1.0, "c": 1.9}, {"alpha": 1.0, "c": 2.5}, {"c": 1.5}, {"alpha": 0.0, "B0": 0.0, "c": 3.0})
     cases += ({"c": 0.8}, {"alpha": 3.0, "b": 0.05, "B1": 0.2, "c": 1.0})

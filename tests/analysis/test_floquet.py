@@ -125,7 +125,7 @@ STIFF_AND_SOFT = (
 
 
 @pytest.mark.parametrize("rtol", [1e-5, 1e-10, 1e-13])
-def test_bound_counts_the_rounding_of_entries_that_both_step_sizes_share(direct, rtol):
+def test_bound_counts_rounding_that_both_step_sizes_share(direct, rtol):
     """The stiffness of a soft mode is the difference of entries five hundred times as large."""
     beta, omega, exact = map(np.array, zip(*STIFF_AND_SOFT, strict=True))
     shaft = {"zeta": 0.11912450176186314, "alpha": 45.51311106679596, "mu": 520.8626364709467}
@@ -145,7 +145,7 @@ TOO_LONG_TO_MARCH = (
 )
 
 
-def test_bound_counts_the_rounding_of_entries_in_the_implicit_scheme_too(direct):
+def test_bound_counts_rounding_of_the_implicit_scheme(direct):
     beta, omega, exact = map(np.array, zip(*TOO_LONG_TO_MARCH, strict=True))
     shaft = {
         "zeta": 1.2355069626811421,
@@ -172,7 +172,7 @@ RADII = np.array([1.4146604913796845e-19, 1.2510611059620708e-06, 2.760897344063
 
 
 @pytest.mark.parametrize("rtol", [1e-9, 1e-10, 1e-13])
-def test_slow_modes_beside_fast_ones_are_no_difference_of_large_numbers(direct, rtol):
+def test_slow_modes_beside_fast_ones_keep_their_digits(direct, rtol):
     """The first was the largest multiple of its bound, 13, among points sought for it in the reduced form."""
     found = direct({name: np.array(values) for name, values in SLOW_BESIDE_FAST.items()}, rtol=rtol)
     error, bound = np.abs(found["spectral_radius"] - RADII), found["spectral_radius_error"]
@@ -278,7 +278,7 @@ def test_unit_of_time_does_not_matter(direct):
         np.testing.assert_allclose(np.poly(multipliers), np.poly(expected), rtol=0, atol=1e-9)
 
 
-def test_without_damping_nothing_is_called_stable_and_only_tongues_unstable(direct):
+def test_without_damping_only_tongues_are_decided(direct):
     rng = np.random.default_rng(18)
     points = BASE | {"zeta": 0.0, "beta": rng.uniform(0.0, 1.4, 384), "Omega": rng.uniform(0.2, 2.0, 384)}
     rho = spectral_radius(stacked_monodromy(points, 1e-11, 1e-12))
@@ -476,7 +476,7 @@ def test_any_linear_periodic_system_is_analysed(other_package, method):
 
 
 @pytest.mark.parametrize("extreme", [{"zeta": 1e300}, {"Omega": 1e-300}])
-def test_point_beyond_every_scheme_is_an_outcome_not_an_exception(extreme):
+def test_point_beyond_every_scheme_has_an_outcome(extreme):
     base = {"beta": 0.5, "Omega": 1.0, "zeta": 0.1, "alpha": 1.0, "mu": 1.0, "gamma": 1.0}
     point = dt.point("cardan", "floquet", **(base | extreme))
     assert point.outcome.name == "STEP_LIMIT"

@@ -387,7 +387,7 @@ def test_loosest_request_has_an_answer():
     assert np.all(np.isfinite(found["orbit_state"]))
 
 
-def test_the_error_covers_what_the_second_integration_is_wrong_by():
+def test_error_covers_that_of_the_second_integration():
     """A condition of 300 and a loose tolerance (extrapolation in extended precision with two numbers of steps)."""
     shaft = {"beta": 1.406319971883954, "Omega": 5.025357952450546, "zeta": 0.028807120682004222, "alpha": 0.0}
     shaft |= {"mu": 1.000570502262628, "gamma": 9.05935896640445}

@@ -97,7 +97,7 @@ def test_the_exact_branch_has_the_saddles_between_folds(exact):
     assert (exact.branch_stability.values[doubled, 0] == 1).all()
 
 
-def test_a_direction_without_a_motion_is_called_absent_and_the_other_one_kept():
+def test_direction_without_a_motion_is_absent_and_the_other_kept():
     """Without a mean torque nothing holds the mass within the play: what the sweep down meets there attracts nothing."""
     fixed = {"B0": 0.0, "B1": 0.03, "b": 0.05, "alpha": 0.0, "c": 0.05, "k": 1.0, "I": 1.0}
     axes = {"omega": {"start": 0.7, "stop": 0.9, "num": 5}}

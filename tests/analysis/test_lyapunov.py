@@ -108,7 +108,7 @@ def linear_motions(linear):
     return linear([1.0, 0.2, 0.01, -0.5], [0.09, 1.01, 1.0, 1.0])
 
 
-def test_linear_oscillator_under_constant_torque_is_a_fixed_point(linear_motions):
+def test_linear_oscillator_under_constant_torque_stands_still(linear_motions):
     np.testing.assert_allclose(linear_motions["lyapunov_spectrum"][:, 0], [-0.1, -0.9], rtol=1e-6)
     assert linear_motions["verdict"][0] == Verdict.FIXED_POINT
 
@@ -229,14 +229,14 @@ def test_steps_that_are_given_are_taken():
         tripod(points, steps=0)
 
 
-def test_a_decay_by_more_than_rounding_bears_within_a_strobe_is_found():
+def test_decay_beyond_rounding_within_a_strobe_is_found():
     """By e to the 63 here: of vectors made orthonormal once a strobe nothing is left."""
     ours = tripod({"excitation_frequency": [3066.5], "zeta": [10.0]}, OUTPUTS[:4], max_time=0.5, steps=192)
     assert ours.lyapunov_spectrum.values.sum() == pytest.approx(-192674.6, rel=1e-6)
     assert ours.outcome.values.tolist() == [Outcome.SUCCESS]
 
 
-def test_more_steps_than_are_worth_beginning_are_taken_only_if_asked_for():
+def test_more_steps_than_usual_are_taken_only_on_request():
     points = {"excitation_frequency": [0.05, 3066.5], "zeta": [0.01, 0.01]}
     ours = tripod(points, OUTPUTS[:1], max_time=0.01)
     assert ours.outcome.values.tolist() == [Outcome.STEP_LIMIT, Outcome.SUCCESS]

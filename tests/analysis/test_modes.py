@@ -291,7 +291,7 @@ def tracked():
 
 
 @pytest.mark.parametrize("order", [[3, 0, 6, 1, 5, 2, 4], [0, 1, 2, 3, 4, 6, 5]])
-def test_a_track_is_followed_from_neighbour_to_neighbour_however_it_is_listed(order):
+def test_tracks_follow_neighbours_in_any_order_of_points(order):
     stiffness = np.geomspace(1e8, 1e11, 7)
     scene = {"system": "planetary", "analysis": "modes", "outputs": ["branch", "mac"], "options": {"track": "k_cu"}}
     rising = dt.run(scene | {"axes": {"k_cu": {"values": stiffness}}})

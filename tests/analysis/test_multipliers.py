@@ -235,7 +235,7 @@ def test_multipliers_are_sorted_by_falling_modulus():
         np.testing.assert_array_equal(found, [-0.9, 0.5 - 0.5j, 0.5 + 0.5j, 0.3])
 
 
-def test_order_of_a_conjugate_pair_does_not_hang_on_the_last_bits():
+def test_order_of_a_conjugate_pair_is_stable_under_rounding():
     up, down = 0.6 + 0.8j, (0.6 - 0.8j) * (1 - 1e-15)
     for x in ([up, down], [up * (1 - 2e-15), down]):
         found = np.asarray(sort_multipliers(jnp.asarray(np.real(x)), jnp.asarray(np.imag(x))))

@@ -45,7 +45,7 @@ def test_compiled_once_for_all_numbers_and_again_for_other_words():
     assert traced == ["one", "other"]
 
 
-def test_a_result_that_depends_on_no_parameter_is_that_of_every_point():
+def test_result_without_parameters_is_that_of_every_point():
     np.testing.assert_array_equal(
         predicted(lambda values: jnp.eye(2), (), {"x": np.ones(3)}), np.eye(2)[..., None] * np.ones(3)
     )

@@ -170,7 +170,7 @@ def test_batch_and_structural_zeros():
 
 
 @pytest.mark.parametrize("solver", [Order8, Radau])
-def test_a_solver_takes_any_state_of_any_linear_term_forwards_and_backwards(solver):
+def test_solver_takes_any_state_of_any_linear_term_both_ways(solver):
     system, y = rotating((-0.5, 1.5)), jnp.array([0.3, -1.2])
     whole = rotating_exactly((-0.5, 1.5))
 
@@ -229,7 +229,7 @@ def test_half_period_is_completed_by_the_reversor():
 
 
 @pytest.mark.parametrize("rates", [(-1e3, 0.5), (-1e6, 0.5), (-1e8, -0.1), (-1e9, 0.5)])
-def test_bound_holds_for_stiff_systems_whose_determinant_is_not_known(rates):
+def test_bound_holds_for_stiff_systems_without_a_determinant(rates):
     """And is no larger than the rounding of the entries makes it, which no scheme escapes."""
     system, exact = rotating(rates), np.abs(np.linalg.eigvals(rotating_exactly(rates))).max()
     z = jax.jit(

@@ -44,7 +44,7 @@ def radii(z: jnp.ndarray, error: float = ERROR, tolerance: float = TOLERANCE) ->
     return np.asarray(rho), np.asarray(bound)
 
 
-def test_its_bound_holds_and_is_a_few_times_that_of_the_eigenvalues():
+def test_bound_holds_and_is_a_few_times_that_of_eigenvalues():
     multipliers = samples()
     z = matrices(multipliers)
     exact = np.abs(multipliers).max(axis=1)
@@ -74,7 +74,7 @@ def test_lanes_do_not_depend_on_each_other():
     assert np.isnan(beside[0][-1])
 
 
-def test_multipliers_that_meet_have_the_root_of_the_error_as_bound():
+def test_meeting_multipliers_have_the_root_of_the_error_as_bound():
     """A pair on its way to a double multiplier: honest, and not infinite."""
     for gap in (1e-3, 1e-6, 0.0):
         rho, bound = radii(matrices(np.array([[1.2 + gap, 1.2 - gap, 0.2 + 0.1j, 0.2 - 0.1j]])))

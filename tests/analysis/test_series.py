@@ -85,7 +85,7 @@ def test_lines_of_the_cardan_shaft_against_direct_solves(change, steepest):
         assert error.max() < 3e-12
 
 
-def test_very_slow_speeds_are_marched_explicitly_and_apart_from_others():
+def test_very_slow_speeds_are_marched_explicitly_and_apart():
     """Omega = 0.001: 21,000 steps, of which the implicit scheme would make 26 times the work. Against power series."""
     omega = [1.0, 1e-3, 1.1e-3]
     scene = {

@@ -164,7 +164,7 @@ def test_branches_go_with_the_shape_through_a_crossing():
     np.testing.assert_allclose(mac[0], 1)
 
 
-def test_branches_pass_a_point_where_two_frequencies_meet_in_arbitrary_vectors():
+def test_branches_pass_a_point_where_two_frequencies_meet():
     shapes = rotating(np.full(5, 0.2))
     turn = rotating(np.array([0.9]))[0]
     shapes[2] = shapes[2] @ turn

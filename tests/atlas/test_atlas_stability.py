@@ -294,7 +294,7 @@ def test_closed_form_on_known_multipliers(kind):
     assert np.median(error / exact) < 1e-11
 
 
-def test_bound_knows_of_smaller_multipliers_that_errors_may_make_larger():
+def test_bound_covers_multipliers_that_errors_may_make_larger():
     """A simple one at 1 and two that nearly coincide a little further in: errors move these by their root, beyond 1."""
     rng, n = np.random.default_rng(5), 300
     inner = 1 - 10.0 ** rng.uniform(-6, -3, n)

@@ -68,7 +68,7 @@ def test_on_a_boundary_a_coarse_atlas_does_not_decide(chart, coarse):
     assert chart.at(np.array([[0.5, below - 1e-3], [0.5, above + 1e-3]]))["verdict"].tolist() == [0, 1]
 
 
-def test_without_damping_a_tongue_narrower_than_the_error_is_not_decided(undamped):
+def test_undamped_tongue_narrower_than_the_error_is_undecided(undamped):
     """S21 at beta = 0.001, where an exact atlas finds it."""
     point = np.array([[1e-3, 1.4159846397197]])
     assert undamped.at(point)["verdict"].tolist() == [1]

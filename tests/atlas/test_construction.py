@@ -114,7 +114,7 @@ def stepped(p):
 
 
 @pytest.mark.parametrize("function", [kinked, stepped])
-def test_what_is_not_smooth_leaves_a_gap_that_says_so_and_is_solved_directly(function):
+def test_gap_of_a_function_that_is_not_smooth_is_solved_directly(function):
     atlas = run(construct(SQUARE, Quantity(1), 1e-8), function)
     assert atlas.gaps and atlas.panels and atlas.solves < 20_000
     # The boxes that were given up hold the kink, and are small against the domain.
@@ -200,7 +200,7 @@ def test_slice_names_what_it_lacks():
         atlas.slice({"x": 5.0})
 
 
-def test_a_function_that_leaves_the_range_of_numbers_ends_as_gaps_not_as_an_error():
+def test_function_beyond_the_range_of_numbers_ends_as_gaps():
     """Relative to its least values no coefficient is small enough."""
 
     def solve(points):

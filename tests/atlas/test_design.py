@@ -136,7 +136,7 @@ def test_a_line_of_candidates(changes, undecided, expected):
         ((0.39, 0.4), [0.395], None, None),
     ],
 )
-def test_the_error_of_a_change_covers_what_is_undecided_around_it(undecided, suspects, value, error):
+def test_error_of_a_change_covers_undecided_ranges(undecided, suspects, value, error):
     given = candidates(0.4), [undecided], lambda values: values < 0.4
     line = _line("beta", (0.0, 1.0), *given, candidates(*suspects, error=0.0))
     below, above = line.intervals

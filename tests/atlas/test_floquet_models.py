@@ -23,7 +23,7 @@ def test_a_system_with_an_atlas_alone_is_refused():
     assert set(variant(models | {"floquet": CARDAN.models["floquet"]}).models) == {"atlas", "floquet"}
 
 
-def test_without_coordinates_of_its_own_an_atlas_is_made_in_the_parameters():
+def test_atlas_without_own_coordinates_uses_the_parameters():
     model = replace(CARDAN.models["atlas"], smooth=None)
     plain = variant(CARDAN.models | {"atlas": model})
     ranges, tolerance = {"beta": (0.3, 0.4), "Omega": (1.0, 1.2)}, 1e-8

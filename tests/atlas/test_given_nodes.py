@@ -86,7 +86,7 @@ def test_a_tensor_grows_where_it_is_not_resolved():
     assert last[1] > first[1] and last[0] > first[0] == 32
 
 
-def test_lines_that_turn_too_far_are_halved_before_anything_is_computed():
+def test_lines_that_turn_too_far_are_halved_first():
     domain = replace(SQUARE, lower=(-0.1, 1.0), upper=(0.1, 250.0))
     source = Lines(domain)
     atlas = run(construct(domain, WAVES, TOLERANCE, source=source), waves)
@@ -137,7 +137,7 @@ def test_lines_without_values_are_solved():
     assert holds(atlas) and not atlas.gaps
 
 
-def test_boxes_are_halved_down_to_a_kink_and_what_remains_is_a_gap():
+def test_boxes_are_halved_down_to_a_kink_which_is_a_gap():
     def kinked(points):
         return waves(points) + np.abs(points[:, :1] - 0.37)
 
@@ -201,11 +201,11 @@ def domain_of(ranges, **change):
         (RANGES, {"zeta": 30.0}, 1e-11, False),
     ],
 )
-def test_nodes_come_from_series_unless_rounding_would_show_or_the_speed_is_fixed(ranges, change, tolerance, given):
+def test_nodes_come_from_series_where_rounding_and_speed_allow(ranges, change, tolerance, given):
     assert (series_nodes(CARDAN, domain_of(ranges, **change), tolerance) is not None) == given
 
 
-def test_the_grid_is_in_c_order_whatever_the_order_of_the_parameters():
+def test_grid_is_in_c_order_for_any_order_of_parameters():
     axes = {"beta": np.array([0.2, 1.0, 1.3]), "Omega": 1 / np.linspace(1.0, 3.0, 48), "mu": np.array([0.5, 2.0])}
     ranges = {name: (float(axis.min()), float(axis.max())) for name, axis in axes.items()}
     found = {}

@@ -44,7 +44,7 @@ def meeting(beta, omega, mu, steps=13):
     return omega, value - slope**2 / (4 * bend)
 
 
-def test_tips_over_the_stiffness_ratio_bear_the_name_of_the_resonance_there(stiffnesses):
+def test_tips_over_the_stiffness_ratio_have_the_resonance_name(stiffnesses):
     """C+2 closes and opens again. Its ridge leaves the rectangle long before the least stiffness."""
     tips = naming.find_tips(stiffnesses, CARDAN, opening=False).tips
     assert [(tip.name, tip.opens) for tip in tips] == [("C+2", False), ("C+2", True)]

@@ -227,7 +227,7 @@ def test_a_name_belongs_to_a_resonance_of_the_same_multiplier(atlas):
 @pytest.mark.parametrize(
     ("mu", "beta", "omega"), [(3.0, 0.3654, 0.52311), (5.5, 0.7509, 0.66445), (12.0, 0.2913, 0.92914)]
 )
-def test_the_tip_over_the_angle_rises_above_that_of_fig_7_between(mu, beta, omega):
+def test_tip_over_the_angle_rises_above_that_of_fig_7(mu, beta, omega):
     assert direct_tip(beta, omega, mu=mu) == (pytest.approx(beta, abs=1e-4), pytest.approx(omega, abs=1e-5))
 
 
@@ -300,7 +300,7 @@ def test_undamped_tongues_start_at_the_resonances(undamped):
     assert not tips.complete
 
 
-def test_undamped_boundaries_separate_bounded_from_growing_motion(undamped):
+def test_undamped_boundaries_separate_bounded_and_growing_motion(undamped):
     curves = boundaries(undamped.atlas, CARDAN)
     curve = max((c for c in curves if c.multiplier == "-1"), key=lambda c: np.ptp(c.points["beta"]))
     middle = np.argmin(np.abs(curve.points["beta"] - 0.6))
@@ -311,7 +311,7 @@ def test_undamped_boundaries_separate_bounded_from_growing_motion(undamped):
     assert np.abs(np.linalg.eigvals(z) + 1).min() < 1e-2
 
 
-def test_what_is_limiting_without_damping_allows_for_a_loose_atlas():
+def test_limits_without_damping_allow_for_a_loose_atlas():
     """Multipliers that meet on the unit circle leave it by the root of the atlas's error; other tongues lead farther."""
     fixed = {**BASE, "zeta": 0.0, "gamma": 1.0}
     atlas = cardan_atlas({"beta": (0.6, 1.5), "Omega": (0.5, 2.0)}, 1e-3, fixed).atlas
@@ -359,7 +359,7 @@ def test_gradients_of_the_radius():
 
 
 @pytest.mark.parametrize(("inside", "exists"), [(1e-15, False), (1e-10, True)])
-def test_a_gradient_at_multipliers_that_rounding_does_not_tell_apart(inside, exists):
+def test_gradient_at_multipliers_equal_to_rounding(inside, exists):
     """The edge of S21 without damping, in 30 digits: beside it d rho/d Omega = 0.20180 (Omega - edge)^(-1/2)."""
     edge = 1.4001277838891882126
     point = {**BASE, "zeta": 0.0, "beta": 0.3, "Omega": edge + inside}
@@ -390,7 +390,7 @@ def test_what_cannot_be_followed_is_said(chart):
         atlas_sensitivity(chart.atlas, CARDAN, {"beta": 1.0})
 
 
-def test_with_little_damping_what_lies_in_a_tongue_bounds_nothing():
+def test_with_little_damping_points_in_a_tongue_bound_nothing():
     """The edge of the tongue of -1 runs through that of a pair, in which multipliers grow by no more than 7e-8."""
     fixed = {**BASE, "zeta": 1e-5, "mu": 3.0}
     atlas = cardan_atlas({"beta": (1.0, 1.2), "Omega": (1.45, 1.6)}, 1e-11, fixed).atlas

@@ -29,7 +29,7 @@ def test_a_box_without_a_tip_is_not_one_with_a_single_tip(shift, error, expected
 
 
 @pytest.mark.parametrize(("floor", "error", "expected"), [(0.5, 0.0, True), (0.5, 0.7, False), (-0.5, 0.7, False)])
-def test_a_valley_above_or_below_zero_by_more_than_its_error_is_excluded(floor, error, expected):
+def test_valley_farther_from_zero_than_its_error_is_excluded(floor, error, expected):
     bundle = exclusion._Bundle(one_patch([[0.5 + floor], [0.0], [0.5]], error), 0)
     assert bundle.excluded().tolist() == [expected]
 

@@ -185,7 +185,7 @@ def test_a_grid_of_many_points_is_refused_with_count_and_limit(folder, capsys):
     assert code == 2 and "1000000000000 points; allowed is up to 2000000000" in err[0]
 
 
-def test_an_axis_that_would_not_fit_into_memory_is_refused_before_it_is_made(folder, capsys, monkeypatch):
+def test_axis_larger_than_memory_is_refused_before_it_is_made(folder, capsys, monkeypatch):
     monkeypatch.setattr("drivetrain_jax.runs.scene.physical_memory", lambda: 1e9)
     Path("scene.toml").write_text(toml.write(GOOD | {"axes": {"a": {"start": 0.0, "stop": 10.0, "num": 10**9}}}))
     begin = time.monotonic()

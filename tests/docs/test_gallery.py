@@ -36,7 +36,7 @@ def state(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in folder.iterdir() if path.suffix != ".md"}
 
 
-def test_what_has_not_changed_is_left_alone_and_what_has_is_made_again(folders, monkeypatch):
+def test_only_changed_figures_are_made_again(folders, monkeypatch):
     scenes, out = folders
     monkeypatch.setenv("DRIVETRAIN_JAX_CACHE", "0")
     arguments = ["--scenes", str(scenes), str(out)]

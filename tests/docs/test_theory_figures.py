@@ -88,7 +88,7 @@ def test_steps_in_the_three_clocks(row):
         assert enough and (not fewer or printed == "8"), name
 
 
-def test_tips_are_those_of_the_page_of_the_boundaries_and_the_predictions_those_of_eq_15():
+def test_tips_are_those_of_the_page_and_predictions_of_eq_15():
     one, two = natural_frequencies(BASE["mu"], BASE["gamma"])
     tips = {name: (beta, omega) for name, _, beta, omega in rows("boundaries.md", "name | multiplier")}
     table = rows("cardan.md", "tongue | predicted")
@@ -129,7 +129,7 @@ def test_first_order_of_the_subharmonic_tongues(mode, beta, start, error):
     assert abs(width / half - 1) < error
 
 
-def test_folds_and_doublings_of_gear_rattle_are_those_of_the_reference():
+def test_folds_and_doublings_of_rattle_are_the_reference_ones():
     specials = json.loads((ROOT / "tests" / "reference" / "rattle.json").read_text())["specials"]["table1"]
     table = dict(rows("rattle.md", "quantity | value"))
     folds = f"{table['folds of the main resonance']}, {table['further folds']}".split(", ")

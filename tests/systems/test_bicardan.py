@@ -56,7 +56,7 @@ def test_a_margin_needs_operating_speeds():
     )
 
 
-def test_operating_speeds_in_the_wrong_order_are_refused_whatever_is_asked_for():
+def test_operating_speeds_in_the_wrong_order_are_refused():
     assert "operating_max = 5" in refusal(options={"operating_min": 9.0, "operating_max": 5.0})
     assert "operating_max = 0" in refusal(options={"operating_min": 9.0})
 
@@ -112,7 +112,7 @@ def test_mode_shapes(swept):
     assert np.abs(shapes[3, :, -1]).max() < 1e-13
 
 
-def test_mode_shapes_are_orthogonal_and_have_their_rayleigh_quotient(swept):
+def test_mode_shapes_are_orthogonal_with_their_rayleigh_quotient(swept):
     """In the mass of the shaft, by numerical integration over the stored stations."""
     x = swept.x.values
     ends = np.cumsum(FIXED["length"]) / sum(FIXED["length"])

@@ -111,7 +111,7 @@ def nonlinear_jacobian(values, tau):
 
 
 @pytest.mark.parametrize("point", range(len(POINTS)))
-def test_linearisation_is_the_derivative_of_the_nonlinear_equations(point, model_matrices):
+def test_linearisation_is_the_derivative_of_the_equations(point, model_matrices):
     v = POINTS[point]
     # Next to pi/2 both sides lose digits in 1 - sin(beta)^2 sin(phi)^2.
     tolerance = 1e-14 if abs(v["beta"]) < NEAR_PERPENDICULAR else 1e-13
@@ -316,7 +316,7 @@ def test_predicted_steps_are_enough_and_not_many_more(point, rtol):
 
 
 @pytest.mark.parametrize("rtol", [1e-7, 1e-9, 1e-10])
-def test_slow_points_meet_their_tolerance_with_the_predicted_steps(rtol):
+def test_slow_points_meet_their_tolerance_in_predicted_steps(rtol):
     """What is a little too few is found out by twice as many: a block of points then takes 2.6 times as long."""
     for omega, beta in ((0.006, 0.9), (0.01, 0.3), (0.03, 0.1)):
         point = {"beta": beta, "Omega": omega, "zeta": 1e-3, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}

@@ -27,7 +27,7 @@ def test_the_field_is_the_equation_of_motion():
     np.testing.assert_allclose(model.switching(jnp.array([u, v])), [u - TABLE1["b"], u + TABLE1["b"]])
 
 
-def test_the_threshold_is_where_the_orbit_without_separation_touches_the_flank():
+def test_at_the_threshold_the_orbit_touches_the_flank():
     values = TABLE1 | {"omega": 2.0}
     b1 = float(rattle_threshold(values)[0])
     response = b1 / complex(1.0 - 4.0, 0.05 * 2.0)

@@ -110,6 +110,6 @@ def test_a_title_is_text_and_no_formula(text):
     assert figure.texts[0].get_text()[:20] == text[:20] and not figure.texts[0].get_parse_math()
 
 
-def test_the_caption_gives_parameters_and_not_the_number_of_the_point():
+def test_caption_gives_parameters_instead_of_the_point_number():
     dataset = xr.Dataset(coords={"point": 0, "omega": ((), 0.86, {"units": "rad/s"})})
     assert caption(dataset) == "$\\omega$ = 0.86 rad/s"

@@ -44,7 +44,7 @@ def swept() -> xr.Dataset:
     return result(data, {"k_D": ("k_D", k)})
 
 
-def test_the_map_is_logarithmic_and_crosses_what_is_not_certified(swept):
+def test_map_is_logarithmic_and_crosses_uncertified_points(swept):
     figure = plot(swept)
     axes = figure.axes[0]
     assert axes.get_xscale() == axes.get_yscale() == "log"

@@ -60,7 +60,7 @@ def with_fixed(dataset: xr.Dataset, **values: float) -> xr.Dataset:
     return dataset.assign_attrs(fixed_parameters=json.dumps(fixed))
 
 
-def test_what_shares_a_figure_has_the_same_parameters_and_another_method():
+def test_results_in_one_figure_differ_only_by_method():
     """The heading tells the parameters once, and the legend a method."""
     first = with_fixed(line(), B1=0.03)
     plot(first, with_fixed(line("exact"), B1=0.03))

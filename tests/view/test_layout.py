@@ -49,7 +49,7 @@ def test_wide_numbers_leave_room_for_a_label_of_two_lines(columns):
     assert widths == pytest.approx([widths[0]] * columns)
 
 
-def test_small_and_large_numbers_have_a_power_of_ten_beside_the_axis():
+def test_small_and_large_numbers_have_a_power_of_ten_at_the_axis():
     with matplotlib.rc_context(STYLE):
         panels = Panels(2, height=1.5, share_y=False)
         for (axes,), top in zip(panels.axes, (8e-4, 0.03), strict=True):

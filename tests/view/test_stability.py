@@ -126,7 +126,7 @@ def test_title_and_fixed_parameters():
     assert {"A tongue", r"$\zeta$ = 0.001, $\gamma$ = 100"} <= set(texts(plot(results.chart())))
 
 
-def test_predicted_lines_inside_the_chart_without_difference_combinations():
+def test_predicted_lines_exclude_difference_combinations():
     axes = panels(plot(results.chart()))[0]
     assert sorted(line.get_xdata()[0] for line in axes.lines) == [0.7, 1.0, 1.02]
     assert [text.get_text() for text in axes.texts] == ["$H_{21}$", "$S_{21}$", "$C^{+}_{1}$"]
@@ -165,7 +165,7 @@ def test_labels_stand_above_the_chart_however_it_is_written(given, monkeypatch):
         assert abs(across - (x - left) / (right - left)) < 0.06 and 1 < up < 1.15
 
 
-def test_predictions_that_depend_on_the_other_axis_are_curves_labelled_where_they_leave():
+def test_predictions_over_both_axes_are_curves_with_end_labels():
     mu, omega = np.linspace(1, 4, 7), np.linspace(0.5, 2.0, 16)
     dataset = results.with_axes(results.grid(np.zeros((7, 16), int), "mu", "Omega"), mu=mu, Omega=omega)
     dataset = results.with_resonances(dataset, S21=1.2 * np.sqrt(mu), H21=0.6 * np.sqrt(mu))

@@ -64,7 +64,7 @@ def test_an_attractor_keeps_its_colour_where_a_larger_one_ends():
         ([1.0, 1.2, 1.5, 1.8, 1.6], [1, 1, 1, 1, 1], [0, 0, 0, 0, 0]),
     ],
 )
-def test_a_branch_goes_on_with_its_period_multiple_and_slope_and_ends_where_it_is_missing_twice(size, multiple, branch):
+def test_branch_keeps_its_period_and_slope_and_ends_at_two_gaps(size, multiple, branch):
     size = np.array(size)[:, None]
     found = basins._followed(np.arange(len(size)), size, np.isfinite(size), np.array(multiple)[:, None])
     assert found[:, 0].tolist() == branch
@@ -87,7 +87,7 @@ def basin(multiple):
     return dataset
 
 
-def test_motions_have_letters_since_their_numbers_are_not_those_of_the_file():
+def test_motions_have_letters_instead_of_numbers():
     assert labels(plot(basin([1, 1, 4, 4]))) == ["motion A", "motion B"]
     assert labels(plot(basin([1, 1, 1, 1]))) == ["motion A"]
 
