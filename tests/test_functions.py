@@ -8,16 +8,20 @@ import sys
 import diffrax
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 from jax.test_util import check_grads
 
 import drivetrain_jax as dt
+from drivetrain_jax.analysis import OUTCOME, get_analysis
 from drivetrain_jax.analysis.periodic import propagator
+from drivetrain_jax.analysis.request import make_request
 from drivetrain_jax.runs import kernel
 from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.kernel import compile_kernel, result_variables
 from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.systems import get_system
 
 BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 SHAFT = dt.Cardan(beta=0.3, Omega=1.416, **BASE)
@@ -68,6 +72,42 @@ def test_nested_batches_are_one():
     nested = jax.vmap(lambda b: jax.vmap(lambda s: radius(b, s))(speeds))(betas)
     for i, beta in enumerate(betas):
         np.testing.assert_allclose(nested[i], jax.vmap(lambda s, b=beta: radius(b, s))(speeds), rtol=1e-11)
+
+
+SYSTEMS = {
+    "cardan": SHAFT, "tripod": TRIPOD, "rattle": GEARS, "planetary": dt.Planetary(),
+    "bicardan": dt.Bicardan(**dt.Bicardan.presets["paper"]),
+}  # fmt: skip
+# Results that the system, or the method that is used here, does not have.
+ABSENT = {
+    "cardan floquet": ["floquet_exponent"],
+    "rattle frequency_response": ["residual", "peak_amplitude", "peak_frequency", "backbone_amplitude", "fit_range"],
+}
+OPTIONS = {
+    "history": {"stop": 1e-3, "num": 5}, "critical_speeds": {"operating_max": 3000.0}, "modes": {"track": "k_p"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", [f"{s} {a}" for s in SYSTEMS for a in get_system(s).models if hasattr(dt, a)])
+def test_results_have_the_declared_shapes_and_types(case):
+    """Of a batch of three; dimensions of one name have one length, that of their coordinate if there is one."""
+    kind, name = case.split()
+    system, analysis, options = SYSTEMS[kind], get_analysis(name), OPTIONS.get(name, {})
+    if path := analysis.path_axis(make_request(type(system), analysis, None, options)):
+        system = replaced(system, path, np.linspace(0.5, 0.9, 4) * system.values[path])
+    outputs = [v.name for v in analysis.variables if v.name not in ABSENT.get(case, [])]
+    request = make_request(type(system), analysis, outputs, options)
+    own = {d.name: len(d.values) or d.name for d in analysis.dimensions(type(system), request, system.values)}
+    swept = next(n for n, x in system.values.items() if isinstance(x, float) and n != path)
+    found = jax.eval_shape(
+        jax.vmap(lambda x: getattr(dt, name)(replaced(system, swept, x), outputs=outputs, **options)), jnp.ones(3)
+    )
+    assert set(found) == {*outputs, "outcome"}
+    with jaxtyping.jaxtyped("context"):
+        for variable in (*map(analysis.variable, outputs), OUTCOME):
+            dims = " ".join(["3", *(["4"] if path else []), *(str(own[d]) for d in variable.dims)])
+            declared = getattr(jaxtyping, variable.dtype.capitalize())[jax.ShapeDtypeStruct, dims]
+            assert isinstance(found[variable.name], declared), (variable, found[variable.name])
 
 
 def differences(function, system, names, step):
