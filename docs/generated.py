@@ -103,7 +103,7 @@ def value_text(value: Any) -> str:
 def analyses(system: str) -> str:
     """The analyses of a system: results, methods and options of each."""
     served = get_system(system)
-    return "\n".join(_analysis(get_analysis(name), served) for name in served.models)
+    return "\n".join(_analysis(get_analysis(name).for_system(served), served) for name in served.models)
 
 
 def _analysis(analysis: Analysis, system: System) -> str:

@@ -115,7 +115,8 @@ class Dimension:
 class Variable:
     """A result of an analysis. ``dims`` names its dimensions besides those of the sweep.
 
-    ``flags`` gives the meanings of the codes 0, 1, ... of an integer variable.
+    ``flags`` gives the meanings of the codes 0, 1, ... of an integer variable. ``lower`` is the smallest valid value: files
+    store it (``valid_min``), and ``verify`` checks it.
     """
 
     name: str
@@ -124,6 +125,7 @@ class Variable:
     dims: tuple[str, ...] = ()
     dtype: str = "float64"
     flags: tuple[str, ...] = ()
+    lower: float | None = None
 
     def written(self, value: Any) -> str:
         """One value as text: the meaning of a code, twelve digits of a number, three digits of an error."""

@@ -113,7 +113,7 @@ def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapp
     if name not in system.models:
         guess = did_you_mean(name, system.models)
         raise InputError(f"{name}: unknown to {system.name}{guess}; allowed is one of {', '.join(system.models)}")
-    analysis, model = get_analysis(name), system.models[name]
+    analysis, model = get_analysis(name).for_system(type(system)), system.models[name]
     values = {key: value for key, value in system.values.items() if key in model.parameters}
     try:
         request = make_request(type(system), analysis, [outputs] if isinstance(outputs, str) else outputs, options)
@@ -123,7 +123,7 @@ def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapp
     except ValueError as error:
         # The tables of a scene are no concern of someone who gave none.
         raise InputError(re.sub(r"^(fixed|options)\.", "", str(error))) from None
-    along = analysis.path_axis(request)
+    along = analysis.path_axis(type(system), request)
     leaf = None if along is None else path_entry(values, along)
 
     def number(x: Any) -> Array | None:

@@ -107,12 +107,13 @@ def methods() -> list:
     """Every method of these scenes' analyses, and the implicit diffrax solver besides the default one."""
     found = []
     for (system, analysis), scene in scenes().items():
-        for method, used in get_analysis(analysis).methods.items():
+        offered = get_analysis(analysis).for_system(get_system(system))
+        for method, used in offered.methods.items():
             given = {name: value for name, value in scene.get("options", {}).items() if name in used}
             variants = (
                 [given, given | {"solver": "Kvaerno5"}] if analysis == "floquet" and "solver" in used else [given]
             )
-            lacking = {"auto", *get_analysis(analysis).lacks(get_system(system))}
+            lacking = {"auto", *offered.lacks(get_system(system))}
             for options in variants if method not in lacking else []:
                 label = f"{system} {analysis} {method} {options.get('solver', '')}".strip()
                 found.append(pytest.param(scene | {"options": options | {"method": method}}, id=label))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from functools import lru_cache
 from typing import Any
 
 import equinox as eqx
@@ -115,9 +116,10 @@ class Analysis:
     :class:`~drivetrain_jax._errors.InputError` if request and parameters do not match. ``lacks(system)`` maps the results
     and methods that a system does not support to the reason. ``derivatives(system, request, parameters, constants,
     results)`` returns Jacobians ``(..., P)`` of differentiable results at one point with respect to all P ``parameters``
-    (arrays; ``constants`` hold the rest); ``results`` include ``derivative_outputs(outputs)``. ``path_axis(request)`` names
-    the axis that is computed as a whole, if any. A ``continuous`` analysis accepts ranges for axes and returns a function of
-    the parameters instead of values on a grid.
+    (arrays; ``constants`` hold the rest); ``results`` include ``derivative_outputs(outputs)``. ``path_axis(system,
+    request)`` names the axis that is computed as a whole, if any. A ``continuous`` analysis accepts ranges for axes and
+    returns a function of the parameters instead of values on a grid. ``of_system(system)`` returns the fields that depend
+    on the system, by name, for example its ``variables``.
     """
 
     name: str
@@ -129,12 +131,24 @@ class Analysis:
     solvers: Callable[[type[System], Request], tuple[Solver, ...]]
     dimensions: Callable[[type[System], Request, Mapping[str, Any]], tuple[Dimension, ...]] = lambda *_: ()
     lacks: Callable[[type[System]], Mapping[str, str]] = lambda _: {}
-    path_axis: Callable[[Request], str | None] = lambda _: None
+    path_axis: Callable[[type[System], Request], str | None] = lambda *_: None
     derivatives: Callable[..., Mapping[str, Array]] | None = None
     derivative_outputs: Callable[[tuple[str, ...]], tuple[str, ...]] = lambda _: ()
     continuous: bool = False
     method_titles: Mapping[str, str] = field(default_factory=dict)
+    of_system: Callable[[type[System]], Mapping[str, Any]] = lambda _: {}
+
+    def for_system(self, system: type[System]) -> Analysis:
+        """The analysis of ``system``, with the fields that it declares."""
+        return _for_system(self, system)
 
     def variable(self, name: str) -> Variable:
         """The result called ``name``; ``KeyError`` if there is none."""
         return {v.name: v for v in self.variables}[name]
+
+
+# One object for each system: kernels are cached by it.
+@lru_cache(maxsize=256)
+def _for_system(analysis: Analysis, system: type[System]) -> Analysis:
+    own = analysis.of_system(system)
+    return replace(analysis, **own) if own else analysis

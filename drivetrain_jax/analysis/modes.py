@@ -318,5 +318,5 @@ ANALYSIS = Analysis(
     solvers=_solvers,
     dimensions=_dimensions,
     derivatives=_derivatives,
-    path_axis=lambda request: request.options["track"] or None,
+    path_axis=lambda _, request: request.options["track"] or None,
 )

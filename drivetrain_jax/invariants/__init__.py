@@ -10,7 +10,7 @@ import xarray as xr
 
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.invariants.registry import Declared, declared
-from drivetrain_jax.invariants.rules import Rule
+from drivetrain_jax.invariants.rules import Rule, within
 
 __all__ = ["Finding", "check"]
 
@@ -33,7 +33,7 @@ class Finding:
 def check(dataset: xr.Dataset) -> list[Finding]:
     """Apply all rules that the variables of ``dataset`` allow: general ones, then those of its analysis."""
     known = declared(str(dataset.attrs.get("analysis")))
-    rules = [*_codes(dataset), *_errors(dataset), *known.rules]
+    rules = [*_codes(dataset), *_ranges(dataset), *_errors(dataset), *known.rules]
     if known.has_points:
         if "outcome" not in dataset:
             return [Finding("outcome is stored", 1, 1, "the file")]
@@ -72,6 +72,13 @@ def _codes(dataset: xr.Dataset) -> Iterator[Rule]:
             allowed = np.atleast_1d(variable.attrs["flag_values"])
             text = f"{name} is one of its {allowed.size} codes"
             yield Rule(text, (str(name),), lambda ds, name=name, allowed=allowed: ~ds[name].isin(allowed))
+
+
+def _ranges(dataset: xr.Dataset) -> Iterator[Rule]:
+    """Rules: no value is below the smallest valid one (CF attribute ``valid_min``)."""
+    for name, variable in dataset.data_vars.items():
+        if "valid_min" in variable.attrs:
+            yield within(str(name), float(variable.attrs["valid_min"]))
 
 
 def _values(dataset: xr.Dataset, known: Declared) -> Iterator[Rule]:

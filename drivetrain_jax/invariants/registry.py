@@ -121,14 +121,6 @@ _DECLARED = {
         # K is undefined for a short section that does not repeat.
         gaps=("chaos_k01",),
     ),
-    "parameters": Declared(
-        (
-            within("natural_angular_frequency", 0.0),
-            within("mean_inertia", 0.0),
-            within("torsional_stiffness", 0.0),
-            ordered("midshaft_frequency", "mode"),
-        )
-    ),
     "modes": Declared(
         (
             ordered("natural_frequency", "mode"),

@@ -300,7 +300,7 @@ class StoredAtlas:
         return values[name]
 
     def _scene(self, axes: Mapping[str, np.ndarray], fixed: Mapping[str, Any], request: Request, zipped: bool) -> Scene:
-        system, floquet = self.scene.system, get_analysis("floquet")
+        system, floquet = self.scene.system, get_analysis("floquet").for_system(self.scene.system)
         columns = tuple(Axis(name, system.parameter(name), None, np.asarray(v, float)) for name, v in axes.items())
         fixed = dict(self.scene.fixed) | {name: value for name, value in fixed.items() if name not in axes}
         return replace(

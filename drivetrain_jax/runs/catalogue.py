@@ -46,7 +46,7 @@ def describe(name: str) -> str:
 
 
 def _analysis_lines(name: str, system: type[System]) -> list[str]:
-    analysis = get_analysis(name)
+    analysis = get_analysis(name).for_system(system)
     lacking = analysis.lacks(system)
     lines = [f"Analysis {name}: {analysis.title}"]
     lines += aligned(

@@ -175,7 +175,7 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
         raise InputError(f"analysis = {analysis_name!r}: needs ranges; allowed at a point is one of {others}")
     parameters = {p.name: p for p in system.parameters}
     options = {o.name: given.get(o.name, o.default) for o in analysis.options}
-    path = analysis.path_axis(Request((), given.get("method", next(iter(analysis.methods))), options))
+    path = analysis.path_axis(system, Request((), given.get("method", next(iter(analysis.methods))), options))
     tree: dict[str, Any] = {"system": system_name, "analysis": analysis_name, "points": {}, "fixed": {}, "options": {}}
     names = (*parameters, "method", *(o.name for o in analysis.options))
     # A parameter that varies cannot be an output of the scene.

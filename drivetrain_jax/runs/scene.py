@@ -74,7 +74,7 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
     request = make_request(system, analysis, table.outputs, table.options, {*table.axes, *table.points})
     axes, zipped = _axes(table, system, analysis)
     fixed = _fixed(table, system, analysis, axes)
-    path_axis = _path_axis(analysis, request, axes, zipped, fixed)
+    path_axis = _path_axis(analysis, analysis.path_axis(system, request), axes, zipped, fixed)
     dimensions = analysis.dimensions(system, request, fixed)
     title = table.title or f"{system.title}: {analysis.title}"
     return Scene(title, system, analysis, request, axes, zipped, fixed, dimensions, path_axis, text)
@@ -98,7 +98,7 @@ def system_and_analysis(system_name: str, analysis_name: str) -> tuple[type[Syst
         guess = did_you_mean(str(analysis_name), system.models)
         allowed = f"allowed for {system.name} is one of {', '.join(system.models)}"
         raise InputError(f"analysis = {analysis_name!r}: unknown{guess}; {allowed}")
-    return system, get_analysis(analysis_name)
+    return system, get_analysis(analysis_name).for_system(system)
 
 
 def _convert(given: Any, kind: type, where: str) -> Any:
@@ -277,10 +277,9 @@ def _check_together(model: Model, fixed: Mapping[str, Value]) -> None:
 
 
 def _path_axis(
-    analysis: Analysis, request: Request, axes: tuple[Axis, ...], zipped: bool, fixed: Mapping[str, Value]
+    analysis: Analysis, name: str | None, axes: tuple[Axis, ...], zipped: bool, fixed: Mapping[str, Value]
 ) -> str | None:
-    """The name of the path axis: an axis of the scene, or a fixed number as a line of one value."""
-    name = analysis.path_axis(request)
+    """The checked ``name`` of the path axis: an axis of the scene, or a fixed number as a line of one value."""
     names = [axis.name for axis in axes]
     if name in names and zipped:
         raise InputError(f"points.{name}: {analysis.name} uses it as a path; allowed is an axis or a fixed value")

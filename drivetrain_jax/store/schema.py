@@ -113,4 +113,6 @@ def _variable_attrs(variable: Variable) -> dict[str, Any]:
     if variable.flags:
         attrs["flag_values"] = np.arange(len(variable.flags), dtype=variable.dtype)
         attrs["flag_meanings"] = " ".join(flag.replace(" ", "_") for flag in variable.flags)
+    if variable.lower is not None:
+        attrs["valid_min"] = variable.lower
     return attrs

@@ -20,7 +20,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._quantities import Parameter
+from drivetrain_jax._quantities import Parameter, Variable
 from drivetrain_jax.systems._smooth import Smoothness
 
 Values = Mapping[str, Any]
@@ -36,13 +36,16 @@ class Model:
     ``check(fixed)`` raises ``ValueError`` with one line, ``name = value: allowed is ...``, if parameters in range do not
     match each other. ``fixed`` holds those that do not vary; a list is whole also if one entry varies. ``smooth`` declares
     the coordinates of an atlas. None: the parameters themselves, and an atlas only on request (``method = "auto"`` makes
-    none).
+    none). ``results`` declares the variables of an analysis whose results are the system's own (``parameters``), and
+    ``default_outputs`` names those computed by default (empty: all).
     """
 
     build: Callable[[Values], Any]
     parameters: tuple[str, ...]
     check: Callable[[Values], None] | None = None
     smooth: Smoothness | None = None
+    results: tuple[Variable, ...] = ()
+    default_outputs: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -83,15 +86,17 @@ def serves(
     *analyses: str,
     parameters: tuple[str, ...] | None = None,
     check: Callable[[Values], None] | None = None,
-    smooth: Smoothness | None = None,
+    **declared: Any,
 ) -> Callable[[Method], Method]:
     """Mark a method of a :class:`System` as the one that returns the model of these ``analyses``.
 
-    ``parameters``: names of those that the model uses, by default all. ``check`` and ``smooth`` as in :class:`Model`.
+    ``parameters``: names of those that the model uses, by default all. ``check`` and what else is ``declared`` (``smooth``,
+    ``results``, ...) as in :class:`Model`.
     """
 
     def mark(method: Method) -> Method:
-        vars(method).setdefault(_SERVES, {}).update(dict.fromkeys(analyses, (parameters, check, smooth)))
+        known = {"parameters": parameters, "check": check, **declared}
+        vars(method).setdefault(_SERVES, {}).update(dict.fromkeys(analyses, known))
         return method
 
     return mark
@@ -171,8 +176,8 @@ def _models(system: type[System], method: Any) -> dict[str, Model]:
     build.__wrapped__ = method  # pyright: ignore[reportFunctionMemberAccess]
     everything = tuple(p.name for p in system.parameters)
     return {
-        name: Model(build, everything if parameters is None else parameters, check, smooth)
-        for name, (parameters, check, smooth) in marks.items()
+        name: Model(build, **(known if known["parameters"] is not None else known | {"parameters": everything}))
+        for name, known in marks.items()
     }
 
 

@@ -6,18 +6,23 @@ import json
 import math
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 import drivetrain_jax as dt
+from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import get_analysis
+from drivetrain_jax.functions import analyse
+from drivetrain_jax.invariants import check
+from drivetrain_jax.systems import System, get_system, parameter, serves
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "tripod.json").read_text())
 
 
 def test_every_constant_over_the_joint_angle():
     rows = REFERENCE["omega_vs_beta"]
-    outputs = [variable.name for variable in get_analysis("parameters").variables]
+    outputs = [variable.name for variable in get_system("tripod").models["parameters"].results]
     axes = {"beta": {"values": [math.radians(row["beta"]) for row in rows]}}
     ds = dt.run(
         {
@@ -40,6 +45,37 @@ def test_every_constant_over_the_joint_angle():
     assert ds["mode"].values.tolist() == [1, 2, 3, 4, 5]
     np.testing.assert_allclose(ds.torque_acceleration[9], -4300.254483961879, rtol=1e-12)
     assert (ds.outcome == 0).all()
+
+
+class Spring(System):
+    """Its results, one of them by mode, are its own; a traced parameter must do."""
+
+    name = "spring"
+    title = "Spring"
+    k: float = parameter("N/m", "stiffness", lower=0.0)
+
+    @serves(
+        "parameters", results=(Variable("period", "s", "period", lower=0.0), Variable("tone", "Hz", "tone", ("mode",)))
+    )
+    def constants(self):
+        return {"period": 2 * math.pi / self.k**0.5, "tone": lambda mode: mode * self.k}
+
+
+def test_a_system_declares_its_results():
+    analysis = get_analysis("parameters").for_system(Spring)
+    assert analysis.default_outputs == ("period", "tone") and analysis.methods == {"exact": ("modes",)}
+    found = analyse("parameters", Spring(k=4.0), None, {"modes": 2})
+    assert found.period == pytest.approx(math.pi) and found.tone.tolist() == [4.0, 8.0]
+    slope = jax.grad(lambda spring: analyse("parameters", spring, ["period"], {}).period)(Spring(k=4.0))
+    assert slope.k == pytest.approx(-math.pi / 8)
+
+
+def test_a_value_below_its_valid_range_breaks_a_rule():
+    ds = dt.point("tripod", "parameters", element="input", beta=0.1)
+    chart = dt.run({"system": "tripod", "analysis": "parameters", "fixed": {"element": "input", "beta": 0.1}})
+    assert chart.mean_inertia.attrs["valid_min"] == 0 and float(chart.mean_inertia) == ds.mean_inertia
+    assert not any(finding.broken for finding in check(chart))
+    assert [f.rule for f in check(chart.assign(mean_inertia=-chart.mean_inertia)) if f.broken] == ["0 <= mean_inertia"]
 
 
 def test_one_point():

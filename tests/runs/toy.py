@@ -161,7 +161,7 @@ ANALYSES = {
         options=(),
         solvers=_line_solvers,
         dimensions=lambda *_: (Dimension("direction", "direction of the sum", ("up", "down")),),
-        path_axis=lambda _: "b",
+        path_axis=lambda *_: "b",
     ),
     "follow": Analysis(
         name="follow",
@@ -174,7 +174,7 @@ ANALYSES = {
         dimensions=lambda system, request, fixed: (
             Dimension("piece", "number of the piece", tuple(range(1, 1 + len(fixed["length"])))),
         ),
-        path_axis=lambda request: request.options["track"],
+        path_axis=lambda _, request: request.options["track"],
     ),
 }
 
