@@ -23,7 +23,7 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import did_you_mean
-from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, get_analysis
+from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analyses_of, get_analysis
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
 from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lanes_last, path_entry
 from drivetrain_jax.analysis.request import make_request
@@ -110,10 +110,13 @@ def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapp
         raise InputError(
             f"system: got a {type(system).__name__}; allowed is a system such as drivetrain_jax.Cardan(...)"
         )
-    if name not in system.models:
-        guess = did_you_mean(name, system.models)
-        raise InputError(f"{name}: unknown to {system.name}{guess}; allowed is one of {', '.join(system.models)}")
-    analysis, model = get_analysis(name).for_system(type(system)), system.models[name]
+    try:
+        analysis = get_analysis(name).for_system(type(system))
+        model = analysis.model(type(system))
+    except KeyError:
+        known = analyses_of(type(system))
+        guess = did_you_mean(name, known)
+        raise InputError(f"{name}: unknown to {system.name}{guess}; allowed is one of {', '.join(known)}") from None
     values = {key: value for key, value in system.values.items() if key in model.parameters}
     try:
         request = make_request(type(system), analysis, [outputs] if isinstance(outputs, str) else outputs, options)
@@ -265,6 +268,17 @@ def _with_lanes(result: Array, own: int, lanes: int) -> Array:
     result = jnp.asarray(result)
     result = result if result.ndim > own else result[..., None]
     return jnp.broadcast_to(result, (*result.shape[:-1], lanes))
+
+
+@dataclass(frozen=True)
+class AnalysisFunction:
+    """The analysis ``name`` as a function, like :func:`floquet`: for the analyses of other packages."""
+
+    name: str
+
+    def __call__(self, system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
+        """The :class:`Result` for one ``system``."""
+        return analyse(self.name, system, outputs, options)
 
 
 def floquet(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:

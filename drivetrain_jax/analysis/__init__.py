@@ -1,36 +1,74 @@
-"""The analyses by name. Each one solves a single point, independent of grids, files and figures."""
+"""The analyses by name. Each one solves a single point, independent of grids, files and figures.
+
+Other packages add theirs through the entry point group ``drivetrain_jax.analyses``; each entry point names an
+:class:`Analysis`.
+"""
 
 from __future__ import annotations
 
 from importlib import import_module
 
+from drivetrain_jax._plugins import ANALYSES, load_plugin, plugin_names
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import OUTCOME, RTOL, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.numerics.lanes import over_lanes
+from drivetrain_jax.systems import System
 
-_ANALYSES = {
-    "floquet": "floquet",
-    "atlas": "atlas",
-    "forced": "forced",
-    "frequency_response": "frequency_response",
-    "history": "history",
-    "lyapunov": "lyapunov",
-    "poincare": "poincare",
-    "parameters": "parameters",
-    "modes": "modes",
-    "steady_state": "steady_state",
-    "basins": "basins",
-    "critical_speeds": "critical_speeds",
-}
+_BUILT_IN = (
+    "floquet",
+    "atlas",
+    "forced",
+    "frequency_response",
+    "history",
+    "lyapunov",
+    "poincare",
+    "parameters",
+    "modes",
+    "steady_state",
+    "basins",
+    "critical_speeds",
+)
 
-__all__ = ["OUTCOME", "RTOL", "Analysis", "Outcome", "Request", "Solver", "analysis_names", "get_analysis"]
+__all__ = [
+    "OUTCOME",
+    "RTOL",
+    "Analysis",
+    "Dimension",
+    "Outcome",
+    "Parameter",
+    "Request",
+    "Solver",
+    "Variable",
+    "analyses_of",
+    "analysis_names",
+    "get_analysis",
+    "over_lanes",
+]
 
 
 def analysis_names() -> tuple[str, ...]:
-    """Names of all analyses."""
-    return tuple(_ANALYSES)
+    """Names of all analyses: the built-in ones, then those of installed packages."""
+    return (*_BUILT_IN, *(name for name in plugin_names(ANALYSES) if name not in _BUILT_IN))
 
 
 def get_analysis(name: str) -> Analysis:
-    """The analysis called ``name``; ``KeyError`` with the known names if there is none."""
-    if name not in _ANALYSES:
-        raise KeyError(f"analysis = {name!r}: allowed is one of {', '.join(_ANALYSES)}")
-    return import_module(f"drivetrain_jax.analysis.{_ANALYSES[name]}").ANALYSIS
+    """The analysis ``name``; ``KeyError`` with the known names if there is none, ``ImportError`` if its package fails."""
+    if name in _BUILT_IN:
+        return import_module(f"drivetrain_jax.analysis.{name}").ANALYSIS
+    found = load_plugin(ANALYSES, name, "an analysis", lambda x: isinstance(x, Analysis))
+    if found is None:
+        raise KeyError(f"analysis = {name!r}: allowed is one of {', '.join(analysis_names())}")
+    return found
+
+
+def analyses_of(system: type[System]) -> tuple[str, ...]:
+    """Names of the analyses that ``system`` serves, also through the model of another one (``Analysis.uses``)."""
+    served = dict.fromkeys(system.models)
+    for name in plugin_names(ANALYSES):
+        try:
+            uses = get_analysis(name).uses
+        except ImportError:
+            # A package that fails spoils no other analysis; get_analysis says why it fails.
+            continue
+        served |= dict.fromkeys([name] if uses in system.models else [])
+    return tuple(served)

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._quantities import FIRST_FAILURE, Dimension, Parameter, Variable
-from drivetrain_jax.systems import System
+from drivetrain_jax.systems import Model, System
 
 
 class Outcome(IntEnum):
@@ -119,7 +119,8 @@ class Analysis:
     (arrays; ``constants`` hold the rest); ``results`` include ``derivative_outputs(outputs)``. ``path_axis(system,
     request)`` names the axis that is computed as a whole, if any. A ``continuous`` analysis accepts ranges for axes and
     returns a function of the parameters instead of values on a grid. ``of_system(system)`` returns the fields that depend
-    on the system, by name, for example its ``variables``.
+    on the system, by name, for example its ``variables``. An analysis with ``uses`` takes the model for the analysis of
+    this name, so that the systems need not know it.
     """
 
     name: str
@@ -137,10 +138,15 @@ class Analysis:
     continuous: bool = False
     method_titles: Mapping[str, str] = field(default_factory=dict)
     of_system: Callable[[type[System]], Mapping[str, Any]] = lambda _: {}
+    uses: str = ""
 
     def for_system(self, system: type[System]) -> Analysis:
         """The analysis of ``system``, with the fields that it declares."""
         return _for_system(self, system)
+
+    def model(self, system: type[System]) -> Model:
+        """The model of ``system`` for the analysis; ``KeyError`` if there is none."""
+        return system.models[self.uses or self.name]
 
     def variable(self, name: str) -> Variable:
         """The result called ``name``; ``KeyError`` if there is none."""

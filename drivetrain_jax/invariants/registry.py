@@ -1,4 +1,8 @@
-"""Rules of each analysis. An analysis without an entry has only the general rules."""
+"""Rules of each analysis. An analysis without an entry has only the general rules.
+
+Other packages add rules of their analyses through the entry point group ``drivetrain_jax.rules``; each entry point names a
+:class:`Declared`.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,8 @@ from dataclasses import dataclass
 
 import xarray as xr
 
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._plugins import RULES, load_plugin
 from drivetrain_jax.invariants.rules import Rule, in_order, multiple, ordered, relation, sums_to_one, within
 
 
@@ -27,7 +33,13 @@ class Declared:
 
 def declared(analysis: str) -> Declared:
     """The declaration of the analysis with this name."""
-    return _DECLARED.get(analysis, Declared())
+    if analysis in _DECLARED:
+        return _DECLARED[analysis]
+    try:
+        found = load_plugin(RULES, analysis, "the rules of an analysis", lambda x: isinstance(x, Declared))
+    except ImportError as error:
+        raise InputError(f"analysis = {analysis!r}: {' '.join(str(error).split())}") from error
+    return Declared() if found is None else found
 
 
 def _all_multipliers(compare: Callable[[xr.DataArray, xr.Dataset], xr.DataArray]) -> Callable:

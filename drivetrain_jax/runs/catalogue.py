@@ -8,7 +8,7 @@ from pathlib import Path
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter, Variable
 from drivetrain_jax._wording import aligned, written
-from drivetrain_jax.analysis import get_analysis
+from drivetrain_jax.analysis import analyses_of, get_analysis
 from drivetrain_jax.runs import shipped
 from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.runs.toml import entries
@@ -26,7 +26,7 @@ def _system_row(name: str) -> tuple[str, str]:
         system = find_system(name)
     except InputError as error:
         return name, str(error).partition(": ")[2]
-    return name, f"{system.title}; analyses: {', '.join(system.models)}"
+    return name, f"{system.title}; analyses: {', '.join(analyses_of(system))}"
 
 
 def describe(name: str) -> str:
@@ -40,7 +40,7 @@ def describe(name: str) -> str:
     if system.presets:
         lines += ["", "Presets, to copy into a scene"]
         lines += aligned([(preset, ", ".join(entries(values))) for preset, values in system.presets.items()])
-    for analysis in system.models:
+    for analysis in analyses_of(system):
         lines += ["", *_analysis_lines(analysis, system)]
     return "\n".join([*lines, *_scene_lines(system)]) + "\n"
 

@@ -33,7 +33,7 @@ class Grid:
     @classmethod
     def of(cls, scene: Scene) -> Grid:
         """The grid of ``scene``; a fixed path parameter gives lines of one value."""
-        parameters = scene.system.models[scene.analysis.name].parameters
+        parameters = scene.analysis.model(scene.system).parameters
         name = scene.path_axis
         numbers = {n: value for n, value in _numbers(scene).items() if n != name}
         if name is None:
@@ -119,7 +119,7 @@ def _numbers(scene: Scene) -> dict[str, float]:
     Such numbers are 0, infinity and defaults. They are constants of compiled code, and so are lists, whose entries may be
     equal or equally spaced.
     """
-    names = scene.system.models[scene.analysis.name].parameters
+    names = scene.analysis.model(scene.system).parameters
     given = {name: scene.fixed[name] for name in names if name in scene.fixed}
     return {
         name: value

@@ -201,7 +201,7 @@ def _same_lines(grid: Grid, other: Grid) -> bool:
 def _same_fixed(scene: Scene, other: Scene) -> bool:
     """True if the parameters that neither scene varies agree, as far as the analysis uses them."""
     varied = {axis.name for axis in (*scene.axes, *other.axes)}
-    used = scene.system.models[scene.analysis.name].parameters
+    used = scene.analysis.model(scene.system).parameters
 
     def constant(values: Mapping[str, Any]) -> dict[str, Any]:
         kept = {}
@@ -227,7 +227,7 @@ def _value(scene: Scene, name: str) -> float | None:
 
 
 def _matters(scene: Scene, name: str) -> bool:
-    return entry_of(name)[0] in scene.system.models[scene.analysis.name].parameters
+    return entry_of(name)[0] in scene.analysis.model(scene.system).parameters
 
 
 def _at(scene: Scene, name: str, values: np.ndarray) -> np.ndarray:

@@ -34,7 +34,7 @@ def numerics_of(scene: Scene) -> dict[str, Any]:
     Sources of other systems and analyses are not included."""
     through_atlas = scene.analysis.continuous or uses_atlas(scene)
     starts = [_ROOT / name for name in (*_ENGINE, *(_THROUGH_ATLAS if through_atlas else ()))]
-    for function in (scene.system.models[scene.analysis.name].build, scene.analysis.solvers):
+    for function in (scene.analysis.model(scene.system).build, scene.analysis.solvers):
         # Neither a partial nor what is wrapped around a method has a source of its own.
         starts.append(Path(inspect.getsourcefile(inspect.unwrap(getattr(function, "func", function))) or ""))
     return {

@@ -66,8 +66,9 @@ def sweep(
     """
     if not isinstance(over, Mapping) or not over:
         raise InputError("over: empty; allowed are values by the name of what varies")
-    own = getattr(function, "__name__", "")
-    if own in analysis_names() and getattr(functions, own, None) is function:
+    of_another_package = isinstance(function, functions.AnalysisFunction)
+    own = function.name if of_another_package else getattr(function, "__name__", "")
+    if of_another_package or (own in analysis_names() and getattr(functions, own, None) is function):
         return run(_scene_table(own, system, over, outputs, options), out=out)
     return run(_function_scene(function, system, over, outputs, options), out=out)
 

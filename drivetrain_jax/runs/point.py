@@ -13,7 +13,7 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax._wording import aligned, nearest, shown, written
-from drivetrain_jax.analysis import OUTCOME, Outcome, Request, get_analysis
+from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, get_analysis
 from drivetrain_jax.runs.assemble import Table
 from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.physical import nondimensional
@@ -171,7 +171,7 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
     """The scene of one point. Numbers are axes, so the next point needs no compilation; words and lists are fixed."""
     system, analysis = system_and_analysis(system_name, analysis_name)
     if analysis.continuous:
-        others = ", ".join(name for name in system.models if not get_analysis(name).continuous)
+        others = ", ".join(name for name in analyses_of(system) if not get_analysis(name).continuous)
         raise InputError(f"analysis = {analysis_name!r}: needs ranges; allowed at a point is one of {others}")
     parameters = {p.name: p for p in system.parameters}
     options = {o.name: given.get(o.name, o.default) for o in analysis.options}

@@ -16,7 +16,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._machine import physical_memory
 from drivetrain_jax._quantities import Dimension, Parameter
 from drivetrain_jax._wording import clipped, did_you_mean, nearest, shown
-from drivetrain_jax.analysis import Analysis, Request, get_analysis
+from drivetrain_jax.analysis import Analysis, Request, analyses_of, get_analysis
 from drivetrain_jax.analysis.request import checked, make_request
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.axes import MAX_POINTS, MAX_RANGES, Axis, AxisTable, check_count, entry_of, spread
@@ -94,11 +94,17 @@ def find_system(name: str) -> type[System]:
 def system_and_analysis(system_name: str, analysis_name: str) -> tuple[type[System], Analysis]:
     """The system and the analysis of these names; ``InputError`` if one is unknown, or if they do not match."""
     system = find_system(system_name)
-    if analysis_name not in system.models:
-        guess = did_you_mean(str(analysis_name), system.models)
-        allowed = f"allowed for {system.name} is one of {', '.join(system.models)}"
-        raise InputError(f"analysis = {analysis_name!r}: unknown{guess}; {allowed}")
-    return system, get_analysis(analysis_name).for_system(system)
+    try:
+        analysis = get_analysis(analysis_name)
+        analysis.model(system)
+    except KeyError:
+        known = analyses_of(system)
+        guess = did_you_mean(str(analysis_name), known)
+        allowed = f"allowed for {system.name} is one of {', '.join(known)}"
+        raise InputError(f"analysis = {analysis_name!r}: unknown{guess}; {allowed}") from None
+    except ImportError as error:
+        raise InputError(f"analysis = {analysis_name!r}: {' '.join(str(error).split())}") from error
+    return system, analysis.for_system(system)
 
 
 def _convert(given: Any, kind: type, where: str) -> Any:
@@ -251,7 +257,7 @@ def _fixed(table: _SceneTable, system: type[System], analysis: Analysis, axes: t
             where = "points" if table.points else "axes"
             raise InputError(f"fixed.{name} = {shown(value)}: also in [{where}]; allowed is one of the two")
     fixed: dict[str, Any] = {}
-    used, missing = system.models[analysis.name].parameters, []
+    used, missing = analysis.model(system).parameters, []
     for parameter in system.parameters:
         if parameter.name in table.fixed:
             fixed[parameter.name] = checked(parameter, table.fixed[parameter.name], "fixed.")
@@ -263,7 +269,7 @@ def _fixed(table: _SceneTable, system: type[System], analysis: Analysis, axes: t
         raise InputError(f"fixed.{missing[0].name}: missing; allowed is {missing[0].allowed_in_units}{others}")
     for axis in axes:
         _check_entry(axis, fixed, "points" if table.points else "axes")
-    _check_together(system.models[analysis.name], fixed)
+    _check_together(analysis.model(system), fixed)
     return fixed
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -15,6 +14,7 @@ import jax
 if os.environ.get("DRIVETRAIN_JAX_ENABLE_X64") != "0":
     jax.config.update("jax_enable_x64", True)
 
+from drivetrain_jax._plugins import SYSTEMS, load_plugin, plugin_names
 from drivetrain_jax._quantities import Parameter
 from drivetrain_jax.systems._base import Model, Resonances, System, parameter, serves
 from drivetrain_jax.systems._flow import Flow
@@ -27,7 +27,6 @@ from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness
 if TYPE_CHECKING:
     from drivetrain_jax.systems._periodic import FloquetModel, ForcedModel, LinearPeriodic
 
-ENTRY_POINT_GROUP = "drivetrain_jax.systems"
 _BUILT_IN = {
     "cardan": "Cardan",
     "tripod": "Tripod",
@@ -37,7 +36,6 @@ _BUILT_IN = {
 }
 
 __all__ = [
-    "ENTRY_POINT_GROUP",
     "FAMILIES",
     "Block",
     "Coordinate",
@@ -71,28 +69,14 @@ def __getattr__(name: str) -> Any:
 
 def system_names() -> tuple[str, ...]:
     """Names of all systems: the built-in ones, then those of installed packages."""
-    external = sorted(e.name for e in entry_points(group=ENTRY_POINT_GROUP) if e.name not in _BUILT_IN)
-    return (*_BUILT_IN, *external)
+    return (*_BUILT_IN, *(name for name in plugin_names(SYSTEMS) if name not in _BUILT_IN))
 
 
 def get_system(name: str) -> type[System]:
     """The system ``name``; ``KeyError`` with the known names if there is none, ``ImportError`` if its package fails."""
     if name in _BUILT_IN:
         return getattr(import_module(f"drivetrain_jax.systems.{name}"), _BUILT_IN[name])
-    for entry in entry_points(group=ENTRY_POINT_GROUP):
-        if entry.name == name:
-            return _loaded(entry)
-    raise KeyError(f"system = {name!r}: allowed is one of {', '.join(system_names())}")
-
-
-def _loaded(entry: EntryPoint) -> type[System]:
-    try:
-        system = entry.load()
-    # Any exception of another package.
-    except Exception as error:
-        raise ImportError(f"{entry.value} cannot be loaded: {type(error).__name__}: {error}") from error
-    if not (isinstance(system, type) and issubclass(system, System)):
-        raise ImportError(f"{entry.value} is a {type(system).__name__}, not a system")
-    if system.name != entry.name:
-        raise ImportError(f"{entry.value} is the system {system.name}, not the system {entry.name}")
-    return system
+    found = load_plugin(SYSTEMS, name, "a system", lambda x: isinstance(x, type) and issubclass(x, System))
+    if found is None:
+        raise KeyError(f"system = {name!r}: allowed is one of {', '.join(system_names())}")
+    return found

@@ -1,4 +1,8 @@
-"""Figures of results: a matplotlib Figure from a Dataset, without jax and the package that computed it."""
+"""Figures of results: a matplotlib Figure from a Dataset, without jax and the package that computed it.
+
+Other packages add figures of their analyses through the entry point group ``drivetrain_jax.figures``; each entry point names
+a function from a Dataset to a Figure.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._plugins import FIGURES, load_plugin, plugin_names
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -42,7 +47,7 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
         drawn = "what its `grid` and `drivetrain plot` make of it"
         raise InputError(f"analysis = 'atlas': is a function; allowed is {drawn}")
     if analysis not in _MODULES:
-        raise InputError(f"analysis = {analysis!r}: allowed is one of {', '.join(_MODULES)}")
+        return _plot_of_plugin(str(analysis), dataset, *others)
     if others and analysis not in _OVERLAYS:
         raise InputError(f"analysis = {analysis!r}: several results in one figure; allowed for {', '.join(_OVERLAYS)}")
     for other in others:
@@ -51,3 +56,15 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
                 f"analysis = {other.attrs.get('analysis')!r}: allowed beside the first result is {analysis}"
             )
     return import_module(f"drivetrain_jax.view.{_MODULES[analysis]}").plot(dataset, *others)
+
+
+def _plot_of_plugin(analysis: str, dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
+    """The figure that another package registered for ``analysis``."""
+    try:
+        found = load_plugin(FIGURES, analysis, "a function")
+    except ImportError as error:
+        raise InputError(f"analysis = {analysis!r}: {' '.join(str(error).split())}") from error
+    if found is None:
+        known = ", ".join((*_MODULES, *plugin_names(FIGURES)))
+        raise InputError(f"analysis = {analysis!r}: has no figure; allowed is one of {known}")
+    return found(dataset, *others)

@@ -447,9 +447,22 @@ def test_a_package_that_fails_spoils_no_other_system(cli, tmp_path, monkeypatch)
     code, out, _ = cli("list")
     fails = "broken_shafts:Cardan cannot be loaded: ZeroDivisionError: division by zero"
     assert code == 0 and "cardan     Cardan" in out and f"broken     {fails}" in out
-    assert "renamed    renamed_shafts:Cardan is the system cardan, not the system renamed" in out
+    assert "renamed    renamed_shafts:Cardan is named cardan, not renamed" in out
     code, _, err = cli("list", "broken")
     assert (code, err) == (2, [f"drivetrain: system = 'broken': {fails}"])
+
+
+def test_an_analysis_that_fails_spoils_no_other_one(cli, tmp_path, monkeypatch):
+    info = tmp_path / "site" / "unsound-1.dist-info"
+    info.mkdir(parents=True)
+    (info.parent / "unsound_analysis.py").write_text("1 / 0\n")
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: unsound\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[drivetrain_jax.analyses]\nunsound = unsound_analysis:ANALYSIS\n")
+    monkeypatch.syspath_prepend(str(info.parent))
+    assert "Analysis floquet" in cli("list", "cardan")[1]
+    code, _, err = cli("point", "cardan", "unsound", "beta=0.1")
+    fails = "unsound_analysis:ANALYSIS cannot be loaded: ZeroDivisionError: division by zero"
+    assert (code, err) == (2, [f"drivetrain: analysis = 'unsound': {fails}"])
 
 
 def test_list_shows_the_scenes_of_this_folder(cli, folder):

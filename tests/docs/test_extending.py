@@ -21,19 +21,23 @@ OFFLINE = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--targ
 SEVERAL = "import sys; from drivetrain_jax.cli import main; sys.exit(any(main(eval(line)) for line in sys.argv[1:]))"
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.M | re.S)
+SYSTEM, ANALYSIS = PAGE.split("## A new analysis")
 
 
-def test_the_page_is_true(tmp_path):
-    project, installed = tmp_path / "project", tmp_path / "installed"
+def blocks(text: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.M | re.S)
+
+
+def executed(text: str, folder: Path) -> tuple[Path, str]:
+    """The folder with the files of ``text``, installed, and the output of its commands."""
+    project, installed = folder / "project", folder / "installed"
     project.mkdir()
-    for content in [*blocks("python"), *blocks("toml")]:
+    for content in [*blocks(text, "python"), *blocks(text, "toml")]:
         (project / re.match(r"# (\S+)\n", content)[1]).write_text(content)
 
     def python(*arguments: str, **variables: str) -> str:
         paths = os.pathsep.join([str(installed), str(ROOT)])
-        environment = {**os.environ, "PYTHONPATH": paths, "DRIVETRAIN_JAX_CACHE": str(tmp_path / "cache"), **variables}
+        environment = {**os.environ, "PYTHONPATH": paths, "DRIVETRAIN_JAX_CACHE": str(folder / "cache"), **variables}
         done = subprocess.run(
             [sys.executable, *arguments], cwd=project, env=environment, capture_output=True, text=True, check=False
         )
@@ -41,14 +45,19 @@ def test_the_page_is_true(tmp_path):
         return done.stdout + done.stderr
 
     install, *commands, test = [
-        shlex.split(line) for line in re.findall(r"^\$ (.*)$", "".join(blocks("console")), re.M)
+        shlex.split(line) for line in re.findall(r"^\$ (.*)$", "".join(blocks(text, "console")), re.M)
     ]
     assert (install, test[0]) == (["pip", "install", "."], "python") and {c[0] for c in commands} == {"drivetrain"}
     python("-m", *install, *OFFLINE, str(installed))
     answers = python("-c", SEVERAL, *(repr(command[1:]) for command in commands), PYTHONSAFEPATH="1")
+    return project, answers + python(*test[1:])
+
+
+def test_the_page_is_true(tmp_path):
+    project, answers = executed(SYSTEM, tmp_path)
     assert "angle of both joints" in answers
     assert "points: total=4331 computed=4331 reused=0 failed=0" in answers
-    assert "2 passed" in python(*test[1:])
+    assert "2 passed" in answers
 
     chart = open_result(project / "chart.nc")
     unstable = chart["verdict"] == 1
@@ -59,3 +68,12 @@ def test_the_page_is_true(tmp_path):
     assert json.loads(chart.attrs["roles"])["speed"] == "Omega"
     assert chart["resonance_Omega"].values.tolist() == pytest.approx([1.0, 1 / 2, 1 / 3])
     assert (project / "chart.png").stat().st_size > 20_000
+
+
+def test_a_new_analysis_serves_the_systems_of_the_package(tmp_path):
+    project, answers = executed(ANALYSIS, tmp_path)
+    assert "Analysis settling: settling time" in answers and "remaining share" in answers
+    assert "points: total=8 computed=8 reused=0 failed=0" in answers
+    assert "0 <= settling_periods: holds at 8 points" in answers and "1 passed" in answers
+    assert open_result(project / "decay.nc")["settling_periods"].attrs["units"] == "1"
+    assert (project / "decay.png").stat().st_size > 5_000

@@ -1,0 +1,34 @@
+"""Systems, analyses, figures and rules of other packages, found through entry points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from typing import Any
+
+SYSTEMS, ANALYSES = "drivetrain_jax.systems", "drivetrain_jax.analyses"
+FIGURES, RULES = "drivetrain_jax.figures", "drivetrain_jax.rules"
+
+
+def plugin_names(group: str) -> tuple[str, ...]:
+    """Sorted names of the entry points in ``group``."""
+    return tuple(sorted({entry.name for entry in entry_points(group=group)}))
+
+
+def load_plugin(group: str, name: str, wanted: str, is_wanted: Callable[[Any], bool] = callable) -> Any:
+    """The object of the entry point ``name``; None without one.
+
+    ``ImportError`` with one line if its package fails, or if it is not a ``wanted`` one of this name.
+    """
+    for entry in entry_points(group=group, name=name):
+        try:
+            found = entry.load()
+        # Any exception of another package.
+        except Exception as error:
+            raise ImportError(f"{entry.value} cannot be loaded: {type(error).__name__}: {error}") from error
+        if not is_wanted(found):
+            raise ImportError(f"{entry.value} is of type {type(found).__name__}, not {wanted}")
+        if getattr(found, "name", name) != name:
+            raise ImportError(f"{entry.value} is named {found.name}, not {name}")
+        return found
+    return None
