@@ -99,6 +99,16 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class Component:
+    """A component of the state of a system; ``symbol`` is its form in figures, by default made of the name."""
+
+    name: str
+    units: str
+    long_name: str
+    symbol: str = ""
+
+
+@dataclass(frozen=True)
 class Dimension:
     """A dimension that an analysis adds to its results: coordinate values and meaning.
 

@@ -42,20 +42,6 @@ from drivetrain_jax.analysis.periodic.orbit import (
 )
 from drivetrain_jax.systems import ForcedModel, System
 
-STATE = Dimension("state", "component of the state", ("theta1", "theta2", "theta1_rate", "theta2_rate"))
-SHAFT = Dimension("shaft", "shaft", ("driving", "driven"))
-VARIABLES = (
-    Variable("periodic_state", "rad", "periodic solution of the linear system at tau = 0 (rates: d/dtau)", ("state",)),
-    Variable("periodic_state_error", "rad", "estimated absolute error of periodic_state"),
-    Variable("amplitude", "rad", "largest |theta| over the period, linear system", ("shaft",)),
-    Variable("amplitude_phase", "rad", "tau at which |theta| is largest, linear system", ("shaft",)),
-    Variable("condition", "1", "2-norm condition number of I - Z, linear system"),
-    Variable("orbit_state", "rad", "nonlinear periodic orbit at tau = 0 (rates: d/dtau)", ("state",)),
-    Variable("orbit_state_error", "rad", "estimated absolute error of orbit_state"),
-    Variable("orbit_amplitude", "rad", "largest |theta| over the period, nonlinear orbit", ("shaft",)),
-    Variable("orbit_amplitude_phase", "rad", "tau at which |theta| is largest, nonlinear orbit", ("shaft",)),
-    Variable("orbit_spectral_radius", "1", "spectral radius of the monodromy matrix about the nonlinear orbit"),
-)
 LINEAR = ("periodic_state", "periodic_state_error", "amplitude", "amplitude_phase", "condition")
 PEAKS = frozenset(("amplitude", "amplitude_phase"))
 ORBIT_PEAKS = frozenset(("orbit_amplitude", "orbit_amplitude_phase"))
@@ -206,11 +192,11 @@ def _orbit_results(
     return results, orbit.outcome
 
 
-def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+def _solve(build: Build, n: int, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """All requested results of one point; ``effort`` only orders the batches, as every integration is adaptive."""
     del effort
     model, rtol = build(values), request.options["rtol"]
-    response = linear_response(model, len(STATE.values), rtol, not PEAKS.isdisjoint(request.outputs))
+    response = linear_response(model, n, rtol, not PEAKS.isdisjoint(request.outputs))
     results: dict[str, Any] = {"periodic_state": response.state, "periodic_state_error": response.error}
     results |= {"amplitude": response.amplitude, "amplitude_phase": response.phase}
     outcome = response.outcome
@@ -225,27 +211,29 @@ def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Ar
     return {name: results[name] for name in request.outputs} | {"outcome": outcome.astype(jnp.int8)}
 
 
-def predicted_steps(build: Build, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+def predicted_steps(build: Build, n: int, moving: int, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Steps of one integration, shape (N,), from the mean spectral radius of the linear field over three phases."""
-    matrices = np.moveaxis(predicted(_matrices, (build,), columns), -1, 0)
+    matrices = np.moveaxis(predicted(_matrices, (build, n, moving), columns), -1, 0)
     rates = np.abs(np.linalg.eigvals(matrices)).max(axis=-1)
     return np.ceil(20 + 2 * np.mean(rates, axis=-1)).astype(np.int64)
 
 
-def _matrices(build: Build, values: Mapping[str, Any]) -> Array:
+def _matrices(build: Build, n: int, moving: int, values: Mapping[str, Any]) -> Array:
     """The period times the Jacobian of the linear field of one point at three phases, ``(3, n, n)``."""
-    model, n = build(values), len(STATE.values)
-    if len(model.displacements) != len(SHAFT.values):
-        raise InputError(f"system: has {len(model.displacements)} displacements; forced allows two, and {n} states")
+    model = build(values)
+    if len(model.displacements) != moving:
+        raise InputError(
+            f"system: its model has {len(model.displacements)} displacements; allowed is {moving}, as it says"
+        )
     phases = model.period * jnp.array([0.0, 0.25, 0.5])
     return model.period * jax.vmap(lambda t: jax.jacfwd(lambda y: model.linear(t, y))(jnp.zeros(n)))(phases)
 
 
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
-    build = system.models["forced"].build
-    steps = partial(predicted_steps, build)
+    build, n = system.models["forced"].build, len(system.state)
+    steps = partial(predicted_steps, build, n, len(_displacements(system).values))
     chunk = CHUNK if set(request.outputs) <= set(LINEAR) else ORBITS_CHUNK
-    solve = over_lanes(partial(_solve, build, request))
+    solve = over_lanes(partial(_solve, build, n, request))
     return (Solver("diffrax", solve, steps, chunk=chunk, march=True, short_loops=True),)
 
 
@@ -297,10 +285,41 @@ def _slopes(
     return {state: slopes.state} | ({top: slopes.tops} if phase in results else {})
 
 
+def _displacements(system: type[System]) -> Dimension:
+    assert system.displacements is not None  # System refuses a model of forced without them
+    return system.displacements
+
+
+def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    names = tuple(c.name for c in system.state)
+    return Dimension("state", "component of the state", names), _displacements(system)
+
+
+def _of_system(system: type[System]) -> dict[str, Any]:
+    """The variables, in the units of the system's state."""
+    units, length = ", ".join(dict.fromkeys(c.units for c in system.state)), system.state[0].units
+    each, state = (_displacements(system).name,), ("state",)
+    # A time without unit is the angle of a shaft.
+    time = "rad" if system.time_units == "1" else system.time_units
+    variables = (
+        Variable("periodic_state", units, "periodic solution of the linear system at the start of a period", state),
+        Variable("periodic_state_error", units, "estimated absolute error of periodic_state"),
+        Variable("amplitude", length, "largest displacement over the period, linear system", each),
+        Variable("amplitude_phase", time, "time at which the displacement is largest, linear system", each),
+        Variable("condition", "1", "2-norm condition number of I - Z, linear system"),
+        Variable("orbit_state", units, "nonlinear periodic orbit at the start of a period", state),
+        Variable("orbit_state_error", units, "estimated absolute error of orbit_state"),
+        Variable("orbit_amplitude", length, "largest displacement over the period, nonlinear orbit", each),
+        Variable("orbit_amplitude_phase", time, "time at which the displacement is largest, nonlinear orbit", each),
+        Variable("orbit_spectral_radius", "1", "spectral radius of the monodromy matrix about the nonlinear orbit"),
+    )
+    return {"variables": variables}
+
+
 ANALYSIS = Analysis(
     name="forced",
     title="forced response",
-    variables=VARIABLES,
+    variables=(),
     default_outputs=("periodic_state", "amplitude", "condition"),
     methods={"shooting": ("rtol",)},
     method_titles={
@@ -308,7 +327,8 @@ ANALYSIS = Analysis(
     },
     options=(RTOL,),
     solvers=_solvers,
-    dimensions=lambda *_: (STATE, SHAFT),
+    dimensions=_dimensions,
     derivatives=_derivatives,
     derivative_outputs=_derivative_outputs,
+    of_system=_of_system,
 )

@@ -1,6 +1,6 @@
 """Frequency response of an oscillator with play: motions found by slow sweeps of the drive's frequency, up and down.
 
-The frequency ``omega`` is the path: a line of frequencies is computed as a whole. A sweep starts from rest at the lowest
+The speed of the system is the path: a line of frequencies is computed as a whole. A sweep starts from rest at the lowest
 (up) or highest (down) frequency and stays on its branch until this ends or becomes unstable; then it jumps to the motion
 that follows in time. Methods: the exact solution, harmonic balance (a chosen number of harmonics), multiple scales (the
 paper's closed form for a cubic spring) and the describing function (bias and fundamental). ``residual`` is the rms residual
@@ -30,7 +30,6 @@ from drivetrain_jax.analysis.impacts.length_unit import measured, restored
 from drivetrain_jax.analysis.impacts.motion import PHASE, REGIME, REGIMES, STABILITY
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System
 
-PATH = "omega"
 SWEEP = ("sweep_direction",)
 BRANCH = ("branch",)
 VARIABLES = (
@@ -196,7 +195,7 @@ ANALYSIS = Analysis(
     default_outputs=("u_max", "u_min", "u_rms", "phase", "regime", "stability"),
     methods=METHODS,
     method_titles={
-        "exact": "exact motion from impact to impact, followed along omega",
+        "exact": "exact motion from impact to impact, followed along the path",
         "harmonic_balance": "a chosen number of harmonics",
         "multiple_scales": "closed form for a cubic spring, as published",
         "describing_function": "bias and fundamental alone",
@@ -204,5 +203,5 @@ ANALYSIS = Analysis(
     options=OPTIONS,
     solvers=_solvers,
     dimensions=_dimensions,
-    path_axis=lambda request: PATH,
+    path_axis=lambda system, _: system.role("speed"),
 )

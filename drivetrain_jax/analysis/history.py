@@ -1,4 +1,4 @@
-"""Time histories: the motion of a flow at requested times, from any initial state.
+"""Time histories: the state of a flow at requested times, from any initial state. The system names its components.
 
 diffrax integrates adaptively between strobes and requested times, so every value is the end of a step (no interpolation).
 Angles of the clocks are computed from whole strobes: they are as accurate after 50,000 strobes as at the start. Errors are
@@ -38,13 +38,6 @@ from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.analysis.numerics.watched_steps import WatchedSteps, largest_met
 from drivetrain_jax.systems import Flow, System
 
-VARIABLES = (
-    Variable("phi", "rad", "twist", ("time",)),
-    Variable("velocity", "rad/s", "rate of twist", ("time",)),
-    Variable("phi_error", "rad", "estimated absolute error of phi", ("time",)),
-    Variable("velocity_error", "rad/s", "estimated absolute error of velocity", ("time",)),
-)
-_COMPONENT = {"phi": 0, "velocity": 1}
 _NUM = Parameter(
     "num", "1", "number of equally spaced times from 0 to stop", default=1001, lower=2, upper=1e7, integer=True
 )
@@ -237,22 +230,22 @@ def _solve(system: type[System], request: Request, values: Mapping[str, Any], ef
     failed = jnp.where(_has_finite_start(flow), Outcome.STEP_LIMIT, Outcome.NOT_FINITE)
     outcome = jnp.where(found.healthy, outcome, failed)
     scale = jnp.stack([jnp.asarray(s, float) for s in flow.scale or (1.0,) * flow.size])
-    results = {name: (scale * states)[:, i] for name, i in _COMPONENT.items()}
-    results |= {f"{name}_error": (scale * error)[:, i] for name, i in _COMPONENT.items()}
+    results = {c.name: (scale * states)[:, i] for i, c in enumerate(system.state)}
+    results |= {f"{c.name}_error": (scale * error)[:, i] for i, c in enumerate(system.state)}
     return {name: results[name] for name in request.outputs} | {"outcome": outcome.astype(jnp.int8)}
 
 
 def _effort(system: type[System], request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Predicted segments, shape (N,): strobes and requested times; infinite beyond the limit."""
     times = requested_times(request)
-    strobes = times[-1] / predicted(_period, (system.models["history"].build, system.name), columns)
+    strobes = times[-1] / predicted(_period, (system.models["history"].build, len(system.state)), columns)
     return np.where(strobes <= _MAX_STROBES, np.ceil(strobes) + len(times), np.inf)
 
 
-def _period(build: Callable[..., Flow], name: str, values: Mapping[str, Any]) -> Array:
+def _period(build: Callable[..., Flow], size: int, values: Mapping[str, Any]) -> Array:
     flow = build(values)
-    if flow.size != len(_COMPONENT):
-        raise InputError(f"system = {name!r}: has {flow.size} components; history allows two, an angle and its rate")
+    if flow.size != size:
+        raise InputError(f"system: its flow has {flow.size} components; allowed is one for each of its state, {size}")
     return jnp.asarray(flow.period)
 
 
@@ -266,11 +259,20 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
     return (Dimension("time", "time", requested_times(request), "s"),)
 
 
+def _of_system(system: type[System]) -> dict[str, Any]:
+    """The components of the state, and their errors."""
+    values = tuple(Variable(c.name, c.units, c.long_name, ("time",)) for c in system.state)
+    errors = tuple(
+        Variable(f"{c.name}_error", c.units, f"estimated absolute error of {c.name}", ("time",)) for c in system.state
+    )
+    return {"variables": values + errors, "default_outputs": tuple(c.name for c in system.state)}
+
+
 ANALYSIS = Analysis(
     name="history",
     title="time history",
-    variables=VARIABLES,
-    default_outputs=("phi", "velocity"),
+    variables=(),
+    default_outputs=(),
     methods={"diffrax": ("times", "stop", "num", "rtol", "solver")},
     method_titles={
         "diffrax": "adaptive steps from strobe to strobe",
@@ -293,4 +295,5 @@ ANALYSIS = Analysis(
     solvers=_solvers,
     dimensions=_dimensions,
     derivatives=partial(forward_derivatives, _solvers),
+    of_system=_of_system,
 )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,22 +24,22 @@ from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver, st
 from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lane_count, path_entry, with_path
 from drivetrain_jax.analysis.numerics.singular_values import EPS, Bidiagonal, bidiagonal_form, bidiagonal_values
 from drivetrain_jax.analysis.spectra.mode_types import (
-    MODE_TYPES,
     BlockModes,
     block_modes,
     is_rigid,
+    mode_type_names,
     mode_types,
     one_frequency,
 )
 from drivetrain_jax.analysis.spectra.tracking import follow
-from drivetrain_jax.systems import FAMILIES, Block, SpringSystem, System
+from drivetrain_jax.systems import Block, SpringSystem, System
 
 Build = Callable[[Mapping[str, Any]], SpringSystem]
 
 VARIABLES = (
     Variable("natural_frequency", "Hz", "natural frequency", ("mode",)),
     Variable("natural_frequency_error", "Hz", "estimated bound of the error of natural_frequency", ("mode",)),
-    Variable("mode_type", "1", "type of the mode", ("mode",), "int8", MODE_TYPES),
+    Variable("mode_type", "1", "type of the mode", ("mode",), "int8"),
     Variable("participation", "1", "share of the mode in each family", ("mode", "family")),
     Variable("kinetic_energy", "1", "share of the mode's kinetic energy in each body", ("mode", "body")),
     Variable("mode_shape", "kg-1/2", "mode shape of unit modal mass", ("mode", "dof")),
@@ -113,7 +114,7 @@ def system_modes(model: SpringSystem, method: str, lanes: int, shapes: bool = Tr
     largest = largest_frequency(model, lanes)
     asymmetry = jnp.broadcast_to(model.asymmetry, (lanes,))
     blocks = [_as_lanes(block, lanes) for block in _blocks(model, method)]
-    parts = [block_modes(block, largest, asymmetry) for block in blocks]
+    parts = [block_modes(block, largest, asymmetry, model.families) for block in blocks]
 
     def of_all(name: str) -> Array:
         pairs = zip(blocks, parts, strict=True)
@@ -173,7 +174,7 @@ def _results(build: Build, request: Request, values: Mapping[str, Any], lanes: i
         largest = largest_frequency(model, count)
         results = _frequencies(modes.frequency, modes.found, modes.participation)
         results["mode_type"] = jnp.where(
-            modes.found, mode_types(modes.frequency, modes.label, largest), len(MODE_TYPES) - 1
+            modes.found, mode_types(modes.frequency, modes.label, largest), model.families + 1
         )
         if shapes:
             vectors = jnp.where(modes.found, _canonical(modes.vectors), jnp.nan)  # pyright: ignore[reportArgumentType]
@@ -258,7 +259,7 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
     jax.eval_shape(lambda: described.append(model.build(values)))
     return (
         Dimension("mode", "number of the mode", tuple(range(1, len(described[0].dofs) + 1))),
-        Dimension("family", "family of modes", FAMILIES),
+        Dimension("family", "family of modes", system.mode_families),
         Dimension("body", "body", described[0].body_names),
         Dimension("dof", "coordinate", described[0].dofs),
     )
@@ -304,6 +305,12 @@ def _derivatives(
     return {"natural_frequency": jnp.where(still, jnp.where(starts, jnp.nan, 0.0), slope)}
 
 
+def _of_system(system: type[System]) -> dict[str, Any]:
+    """The types of modes are those of the system's families."""
+    types = mode_type_names(system.mode_families)
+    return {"variables": tuple(replace(v, flags=types) if v.name == "mode_type" else v for v in VARIABLES)}
+
+
 ANALYSIS = Analysis(
     name="modes",
     title="natural frequencies and modes",
@@ -319,4 +326,5 @@ ANALYSIS = Analysis(
     dimensions=_dimensions,
     derivatives=_derivatives,
     path_axis=lambda _, request: request.options["track"] or None,
+    of_system=_of_system,
 )

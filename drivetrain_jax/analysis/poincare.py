@@ -19,6 +19,7 @@ steps within a strobe, or all strobes are more than 1e12 equal steps.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -39,7 +40,7 @@ from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.systems import Flow, System
 
 VARIABLES = (
-    Variable("section", "rad, rad/s", "state at the strobes", ("strobe", "state")),
+    Variable("section", "1", "state at the strobes", ("strobe", "state")),
     Variable("torus_residual", "1", "largest distance from a smooth curve, over the largest value", ("state",)),
     Variable("distinct_points", "1", "distinct points of the section, 0 if it does not repeat", dtype="int32"),
     Variable("chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic; 0 if the section repeats"),
@@ -196,7 +197,14 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     first, count = (request.options[name] for name in ("discard", "strobes"))
     strobes = Dimension("strobe", "number of the strobe", tuple(range(first + 1, first + count + 1)))
-    return (strobes, Dimension("state", "twist, then rate of twist", ()))
+    state = ", then ".join(c.long_name for c in system.state) or "component of the state"
+    return (strobes, Dimension("state", state, ()))
+
+
+def _of_system(system: type[System]) -> dict[str, Any]:
+    """The section in the units of the system's state."""
+    section = replace(VARIABLES[0], units=", ".join(c.units for c in system.state) or "1")
+    return {"variables": (section, *VARIABLES[1:])}
 
 
 _COMMON = ("strobes", "discard")
@@ -213,4 +221,5 @@ ANALYSIS = Analysis(
     options=OPTIONS,
     solvers=_solvers,
     dimensions=_dimensions,
+    of_system=_of_system,
 )

@@ -15,7 +15,7 @@ motion that does not graze.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -83,21 +83,19 @@ WAIT = Parameter(
 _CHUNK = 4096
 
 
-def _shape(model: PiecewiseLinearOscillator, values: Mapping[str, Any]) -> tuple[int, ...]:
-    shapes = (jnp.shape(x) for x in (*vars(model).values(), values["u0"], values["v0"]))
-    return jnp.broadcast_shapes(*shapes)
+# Roles of the parameters of the initial state.
+_STARTS = ("initial_displacement", "initial_rate")
 
 
-def _solve(
-    build: Callable[..., PiecewiseLinearOscillator], request: Request, values: Mapping[str, Any], effort: Array
-) -> dict[str, Array]:
+def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """The requested results of a batch of points, the batch as last axis; ``effort`` is not used."""
     del effort
-    model = build(values)
-    shape = _shape(model, values)
+    model: PiecewiseLinearOscillator = system.models["steady_state"].build(values)
+    start = [values[system.role(role)] for role in _STARTS]
+    shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in (*vars(model).values(), *start)))
     count = int(np.prod(shape, dtype=int))
     model, unit = measured(model)
-    u0, v0 = (jnp.broadcast_to(jnp.asarray(values[name], float) / unit, (count,)) for name in ("u0", "v0"))
+    u0, v0 = (jnp.broadcast_to(jnp.asarray(x, float) / unit, (count,)) for x in start)
     route = jnp.arange(count, dtype=jnp.int32)[:, None]
     found = attractors(model, route, u0, v0, most_periods=request.options["most_periods"], width=WIDTH)
     flat = jax.tree.map(lambda x: x[:, 0], found)
@@ -113,8 +111,7 @@ def _solve(
 
 
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
-    build = system.models["steady_state"].build
-    return (Solver("exact", partial(_solve, build, request), chunk=_CHUNK),)
+    return (Solver("exact", partial(_solve, system, request), chunk=_CHUNK),)
 
 
 def _derivatives(

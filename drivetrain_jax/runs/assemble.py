@@ -19,6 +19,7 @@ from drivetrain_jax.runs.scene import Scene
 from drivetrain_jax.store import provenance
 from drivetrain_jax.store.consolidate import release
 from drivetrain_jax.store.schema import Coordinate, Labelled
+from drivetrain_jax.systems import System
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -214,6 +215,16 @@ def _resonances(scene: Scene) -> list[Coordinate]:
     ]
 
 
+def _drawn(system: type[System]) -> dict[str, str]:
+    """Attributes that tell figures how to draw what the system declares."""
+    families = system.resonances.families if system.resonances else ()
+    attrs = {
+        "state": [vars(component) for component in system.state],
+        "resonance_families": {f.prefix: {k: v for k, v in vars(f).items() if k != "prefix"} for f in families},
+    }
+    return {name: json.dumps(value) for name, value in attrs.items() if value}
+
+
 def result_attrs(scene: Scene) -> dict[str, str]:
     """Attributes of the result that do not depend on the single run."""
     fixed: dict[str, Any] = {}
@@ -227,6 +238,7 @@ def result_attrs(scene: Scene) -> dict[str, str]:
         "title": scene.title,
         "system": scene.system.name,
         "roles": json.dumps(dict(scene.system.roles)),
+        **_drawn(scene.system),
         "analysis": scene.analysis.name,
         "method": scene.request.method,
         "options": json.dumps(dict(scene.request.options)),

@@ -15,10 +15,10 @@ if os.environ.get("DRIVETRAIN_JAX_ENABLE_X64") != "0":
     jax.config.update("jax_enable_x64", True)
 
 from drivetrain_jax._plugins import SYSTEMS, load_plugin, plugin_names
-from drivetrain_jax._quantities import Parameter
-from drivetrain_jax.systems._base import Model, Resonances, System, parameter, serves
+from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
+from drivetrain_jax.systems._base import Family, Model, Resonances, System, parameter, serves
 from drivetrain_jax.systems._flow import Flow
-from drivetrain_jax.systems._modal import FAMILIES, Block, SpringSystem
+from drivetrain_jax.systems._modal import Block, SpringSystem
 from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator
 from drivetrain_jax.systems._rows import dense
 from drivetrain_jax.systems._shaft import Shaft
@@ -36,9 +36,11 @@ _BUILT_IN = {
 }
 
 __all__ = [
-    "FAMILIES",
     "Block",
+    "Component",
     "Coordinate",
+    "Dimension",
+    "Family",
     "FloquetModel",
     "Flow",
     "ForcedModel",
@@ -52,6 +54,7 @@ __all__ = [
     "Smoothness",
     "SpringSystem",
     "System",
+    "Variable",
     "dense",
     "get_system",
     "parameter",

@@ -20,7 +20,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._quantities import Parameter, Variable
+from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
 from drivetrain_jax.systems._smooth import Smoothness
 
 Values = Mapping[str, Any]
@@ -49,12 +49,28 @@ class Model:
 
 
 @dataclass(frozen=True)
+class Family:
+    """Resonances whose labels begin with ``prefix``, as figures draw them.
+
+    ``name`` stands in the legend, ``line`` is ``solid``, ``dashed`` or ``dashdot``. Resonances that make no tongue are not
+    ``drawn``. The periodic forcing excites a ``forced`` family: figures of forced responses show it.
+    """
+
+    prefix: str
+    name: str
+    line: str = "solid"
+    drawn: bool = True
+    forced: bool = False
+
+
+@dataclass(frozen=True)
 class Resonances:
     """Predicted values of the parameter ``axis``, drawn over charts.
 
     ``values(parameters)`` maps the values of ``parameters`` (scalars or arrays of shape ``(...)``) to an array of shape
     ``(..., len(labels))``. ``multipliers`` gives for each label the multiplier that meets the unit circle there, ``+1``,
-    ``-1`` or ``pair``, if known. ``up_to(k)`` returns the same predictions for the orders 1 to k.
+    ``-1`` or ``pair``, if known. ``up_to(k)`` returns the same predictions for the orders 1 to k. ``families`` tell how
+    figures draw them; the family of a label is the one with the longest prefix.
     """
 
     axis: str
@@ -64,6 +80,7 @@ class Resonances:
     long_name: str
     multipliers: tuple[str, ...] = ()
     up_to: Callable[[int], Resonances] | None = None
+    families: tuple[Family, ...] = ()
 
 
 def numeric(*values: Any) -> tuple[Any, ...]:
@@ -111,9 +128,14 @@ class System(eqx.Module):
     Class attributes: ``name``, ``title`` and ``source``; ``presets``, named parameter sets of the source; ``resonances``,
     the predicted ones; ``time_units``, the unit of time in its equations (``1``: nondimensional); ``physical``, which
     converts physical data to parameters and back (pattern: ``cardan_units.PhysicalShaft``), None if the parameters are
-    physical; ``roles``, the names of its ``speed`` (or excitation frequency), which figures draw horizontally, and of the
-    ``angle`` and ``damping`` of design questions, if it has them. ``parameters`` and ``models`` follow from fields and
-    methods. A model for ``atlas`` without one for ``floquet`` raises ``ValueError``.
+    physical; ``roles``, the names of the parameters that analyses and figures ask for, see below; ``state``, the components
+    of its state, and ``displacements``, the dimension of those whose amplitudes ``forced`` reports; ``mode_families``, names
+    of the families of ``modes`` by their codes. ``parameters`` and ``models`` follow from fields and methods. A model for
+    ``atlas`` without one for ``floquet``, or for ``history`` or ``forced`` without ``state``, raises ``ValueError``.
+
+    Roles: ``speed`` (or excitation frequency), which figures draw horizontally and which is the path of
+    ``frequency_response``; ``angle`` and ``damping`` of design questions; ``initial_displacement`` and ``initial_rate`` of
+    ``steady_state``; ``half_play`` and ``planets``, the angles of the planets, of figures.
     """
 
     name: ClassVar[str]
@@ -124,6 +146,9 @@ class System(eqx.Module):
     time_units: ClassVar[str] = "1"
     physical: ClassVar[Any] = None
     roles: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    state: ClassVar[tuple[Component, ...]] = ()
+    displacements: ClassVar[Dimension | None] = None
+    mode_families: ClassVar[tuple[str, ...]] = ()
     parameters: ClassVar[tuple[Parameter, ...]] = ()
     models: ClassVar[dict[str, Model]] = {}
 
@@ -138,6 +163,9 @@ class System(eqx.Module):
             cls.models = dict(cls.models) | {a: m for method in own.values() for a, m in _models(cls, method).items()}
         if "atlas" in cls.models and "floquet" not in cls.models:
             raise ValueError(f"models of {cls.name}: atlas needs floquet as well")
+        for analysis in {"history", "forced"} & cls.models.keys():
+            if not cls.state or (analysis == "forced" and cls.displacements is None):
+                raise ValueError(f"models of {cls.name}: {analysis} needs state, and forced displacements")
 
     def __post_init__(self) -> None:
         for each in self.parameters:
@@ -156,6 +184,13 @@ class System(eqx.Module):
         """The parameters by name, those left out that are to be derived from others."""
         named = {each.name: getattr(self, each.name) for each in self.parameters}
         return {name: value for name, value in named.items() if value is not None}
+
+    @classmethod
+    def role(cls, name: str) -> str:
+        """The parameter with the role ``name``; :class:`~drivetrain_jax.InputError` if there is none."""
+        if name not in cls.roles:
+            raise InputError(f"system = {cls.name!r}: has no {name}; allowed is a system whose roles name it")
+        return cls.roles[name]
 
     @classmethod
     def parameter(cls, name: str) -> Parameter:

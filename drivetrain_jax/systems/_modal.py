@@ -7,9 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-# Families of modes, in the order of the codes in ``Block.family``.
-FAMILIES = ("rotational", "translational", "planet")
-
 
 class Block(eqx.Module):
     """An invariant part of a spring system: its natural angular frequencies are the singular values of ``factor``.
@@ -39,7 +36,7 @@ class SpringSystem(eqx.Module):
     ``stiffness`` (springs, ...), ``mass`` (dofs, ...). ``blocks`` are an exact decomposition into invariant parts;
     ``whole`` is the system as one block. ``asymmetry`` (...), from 0 to 1, measures all that couples the families;
     ``dofs`` and ``body_names`` name coordinates and bodies; ``bodies`` (dofs,) gives the number of the body of each
-    coordinate.
+    coordinate. ``families`` is the number of families of modes.
     """
 
     extensions: Array
@@ -51,6 +48,7 @@ class SpringSystem(eqx.Module):
     dofs: tuple[str, ...] = eqx.field(static=True)
     body_names: tuple[str, ...] = eqx.field(static=True)
     bodies: np.ndarray
+    families: int = eqx.field(static=True)
 
 
 def weighted_factor(extensions: Array, stiffness: Array, mass: Array) -> Array:

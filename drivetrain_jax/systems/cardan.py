@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.systems._base import Number, Resonances, System, Values, numeric, parameter, serves
+from drivetrain_jax._quantities import Component, Dimension
+from drivetrain_jax.systems._base import Family, Number, Resonances, System, Values, numeric, parameter, serves
 from drivetrain_jax.systems._rows import Rows
 from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness
 from drivetrain_jax.systems.cardan_units import PhysicalShaft
@@ -118,17 +119,28 @@ def resonance_speeds(values: Values, orders: int = 3) -> np.ndarray:
     return np.stack([*harmonic, *subharmonic, *combination], axis=-1)
 
 
+# The forcing has only even harmonics of the speed: it meets natural frequencies at the harmonic speeds. Difference
+# combinations make no tongues of parametric resonance (equal Krein signature).
+FAMILIES = (
+    Family("H", "harmonic $H$", forced=True),
+    Family("S", "subharmonic $S$", "dashed"),
+    Family("C", "sum combination $C^+$", "dashdot"),
+    Family("C-", "difference combination $C^-$", drawn=False),
+)
+
+
 def resonances(orders: int = 3) -> Resonances:
     """The predictions of :func:`resonance_speeds` with their labels (H12: first mode, order 2)."""
-    families = {"H1": "+1", "H2": "+1", "S1": "-1", "S2": "-1", "C+": "pair", "C-": "pair"}
+    kinds = {"H1": "+1", "H2": "+1", "S1": "-1", "S2": "-1", "C+": "pair", "C-": "pair"}
     return Resonances(
         axis="Omega",
         parameters=("mu", "gamma"),
-        labels=tuple(f"{family}{k}" for family in families for k in range(1, orders + 1)),
+        labels=tuple(f"{kind}{k}" for kind in kinds for k in range(1, orders + 1)),
         values=lambda values: resonance_speeds(values, orders),
         long_name="predicted parametric resonance",
-        multipliers=tuple(kind for kind in families.values() for _ in range(orders)),
+        multipliers=tuple(multiplier for multiplier in kinds.values() for _ in range(orders)),
         up_to=resonances,
+        families=FAMILIES,
     )
 
 
@@ -175,6 +187,13 @@ class Cardan(System):
     resonances = resonances()
     physical = PhysicalShaft
     roles = MappingProxyType({"speed": "Omega", "angle": "beta", "damping": "zeta"})
+    state = (
+        Component("theta1", "rad", "twist of the driving shaft"),
+        Component("theta2", "rad", "twist of the driven shaft"),
+        Component("theta1_rate", "rad", "d theta1/d tau"),
+        Component("theta2_rate", "rad", "d theta2/d tau"),
+    )
+    displacements = Dimension("shaft", "shaft", ("driving", "driven"))
 
     beta: Number = parameter("rad", "joint angle", symbol="β", lower=-math.pi / 2, upper=math.pi / 2, **OPEN)
     Omega: Number = parameter("1", "speed of the driving shaft over sqrt(k1/J1)", symbol="Ω", **POSITIVE)

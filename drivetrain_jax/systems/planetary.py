@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
@@ -25,6 +26,7 @@ from drivetrain_jax.systems._modal import Block, SpringSystem, weighted_factor
 BODIES = ("carrier", "ring", "sun")
 _CENTRAL = 9
 _PER_PLANET = 3
+FAMILIES = ("rotational", "translational", "planet")
 ROTATIONAL, TRANSLATIONAL, PLANET = range(3)
 # Below this the sum of the planets' unit vectors is zero up to the rounding of the angles.
 _BALANCED = 4e-16
@@ -230,6 +232,8 @@ class Planetary(System):
     name = "planetary"
     title = "Planetary gear"
     source = "A. Shahabi, F. Sheykh Samani, Modares Mechanical Engineering 16(12), 2016"
+    roles = MappingProxyType({"planets": "planet_angle"})
+    mode_families = FAMILIES
 
     planet_angle: Numbers = parameter(
         "rad",
@@ -292,4 +296,6 @@ class Planetary(System):
         names, bodies = coordinate_names(n), np.repeat(np.arange(3 + n), 3)
         body_names = (*BODIES, *(f"planet_{i + 1}" for i in range(n)))
         asymmetry = jnp.maximum(spacing(tuple(angles)), _inequality(p))
-        return SpringSystem(extensions, stiffness, mass, blocks, whole, asymmetry, names, body_names, bodies)
+        return SpringSystem(
+            extensions, stiffness, mass, blocks, whole, asymmetry, names, body_names, bodies, len(FAMILIES)
+        )

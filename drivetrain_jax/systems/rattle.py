@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from jax import Array
 
+from drivetrain_jax._quantities import Component
 from drivetrain_jax.systems._base import Number, Resonances, System, Values, parameter, serves
 from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator
 
@@ -67,7 +68,11 @@ class Rattle(System):
         rattle_threshold,
         "amplitude at which the orbit without separation ends",
     )
-    roles = MappingProxyType({"speed": "omega"})
+    roles = MappingProxyType({"speed": "omega", "initial_displacement": "u0", "initial_rate": "v0", "half_play": "b"})
+    state = (
+        Component("u", "m", "relative displacement"),
+        Component("v", "m/s", "relative velocity"),
+    )
 
     omega: Number = parameter("rad/s", "frequency of the drive", symbol="ω", **POSITIVE)
     B0: Number = parameter("m/s2", "mean of the drive")

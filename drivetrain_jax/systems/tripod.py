@@ -18,6 +18,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
+from drivetrain_jax._quantities import Component
 from drivetrain_jax.systems._base import Number, System, Values, parameter, serves
 from drivetrain_jax.systems._flow import Components, Flow
 from drivetrain_jax.systems._rows import Rows
@@ -231,6 +232,10 @@ class Tripod(System):
     source = "Bugaru & Vasile, Applied Sciences 12(12), 6182, 2022; corrections in docs/theory/tripod.md"
     time_units = "s"
     roles = MappingProxyType({"speed": "excitation_frequency", "angle": "beta", "damping": "zeta"})
+    state = (
+        Component("phi", "rad", "twist"),
+        Component("velocity", "rad/s", "rate of twist", r"d$\phi$/d$t$"),
+    )
 
     element: str = parameter("1", "element of the driveshaft", choices=tuple(GEOMETRY))
     beta: Number = parameter("rad", "joint angle", symbol="β", lower=0.0, upper=math.pi / 2, open_upper=True)

@@ -95,8 +95,13 @@ def horizontal_axis(dataset: xr.Dataset, names: list[str]) -> str:
 
 def speed_axis(dataset: xr.Dataset, names: list[str]) -> str:
     """The axis of ``names`` that the system calls its speed (attribute ``roles``), else the last one."""
-    speed = json.loads(dataset.attrs.get("roles", "{}")).get("speed")
+    speed = role(dataset, "speed")
     return speed if speed in names else names[-1]
+
+
+def role(dataset: xr.Dataset, name: str) -> str:
+    """The parameter with the role ``name`` in the system (attribute ``roles``); empty without one."""
+    return json.loads(dataset.attrs.get("roles", "{}")).get(name, "")
 
 
 def is_logarithmic(values: np.ndarray) -> bool:

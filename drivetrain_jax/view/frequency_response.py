@@ -17,7 +17,6 @@ from drivetrain_jax.view import cells, rattle_maps
 from drivetrain_jax.view.layout import Margins, Panels
 from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STYLE, axis_label
 
-PATH = "omega"
 DASHES = (0, (3, 1.6))
 _HEIGHT = 2.9
 _UNSTABLE = 1
@@ -52,8 +51,8 @@ _METHODS = {
 def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     """Half the peak-to-peak displacement over the frequency, and the phase if stored; or maps.
 
-    Each of ``dataset`` and ``others`` (results for the same parameters by other methods) may have the single axis
-    ``omega``. Stable motions are solid lines, unstable ones dashed, jumps of a sweep dotted. One dataset with a second axis
+    Each of ``dataset`` and ``others`` (results for the same parameters by other methods) may have the speed as its single
+    axis. Stable motions are solid lines, unstable ones dashed, jumps of a sweep dotted. One dataset with a second axis
     gives maps of both sweeps. Raises :class:`InputError` for other axes or parameters, for a method given twice, and if no
     variable of the figure is stored.
     """
@@ -62,16 +61,26 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
         axes = [cells.sweep_axes(each) for each in results]
         if len(results) == 1 and len(axes[0]) == 2:
             return rattle_maps.plot(results[0], axes[0])
+        path = _path(dataset)
         for each, names in zip(results, axes, strict=True):
-            if names != [PATH]:
+            if names != [path]:
                 raise InputError(
-                    f"axes = {cells.described_axes(each)}: allowed is {PATH} of several values, with one more axis if it is "
+                    f"axes = {cells.described_axes(each)}: allowed is {path} of several values, with one more axis if it is "
                     "a single result"
                 )
         for each in results:
             cells.require(each, "u_max", "u_min")
         _check_comparable(results)
         return _lines(results)
+
+
+def _path(result: xr.Dataset) -> str:
+    """The axis of the frequencies: the speed of the system."""
+    return cells.role(result, "speed")
+
+
+def _along(result: xr.Dataset) -> xr.DataArray:
+    return result[_path(result)]
 
 
 def _check_comparable(results: list[xr.Dataset]) -> None:
@@ -115,12 +124,12 @@ def _lines(results: list[xr.Dataset]) -> Figure:
     upper.set_ylim(0, None)
     handles += _draw_missing(upper, results)
     handles += _draw_backbones(upper, results)
-    cells.fit_axis(upper, "x", np.unique(np.concatenate([r[PATH].values for r in results])))
+    cells.fit_axis(upper, "x", np.unique(np.concatenate([_along(r).values for r in results])))
     panels.label_row(upper, f"half the peak-to-peak displacement [{results[0]['u_max'].attrs.get('units', '1')}]")
     if with_phase:
         _angle_axis(panels.axes[1][0], any(bool((_lag(each) > np.pi + _ANGLE_MARGIN).any()) for each in results))
         panels.label_row(panels.axes[1][0], "lag of the fundamental [rad]")
-    panels.label_axes(axis_label(results[0][PATH]))
+    panels.label_axes(axis_label(_along(results[0])))
     panels.titles(results[0])
     panels.legend([*handles, *_meanings(results)])
     return panels.figure
@@ -141,7 +150,7 @@ def _draw_sweeps(
     axes: Axes, result: xr.Dataset, values: xr.DataArray, look: _Look, jumps: dict[str, np.ndarray]
 ) -> None:
     """Draw both sweeps: stable pieces solid, unstable ones dashed, jumps dotted, the exact ones with markers."""
-    omega = result[PATH].values
+    omega = _along(result).values
     every = max(len(omega) // _MARKS, 1)
     for direction, mark in _DIRECTIONS.items():
         y = values.sel(sweep_direction=direction).values
@@ -185,11 +194,11 @@ def _draw_branches(axes: Axes, result: xr.Dataset, look: _Look) -> None:
     """Draw unstable motions off the sweeps as dashed lines, one for each branch number."""
     if not {"branch_u_max", "branch_u_min", "branch_stability"} <= set(result):
         return
-    amplitude = ((result["branch_u_max"] - result["branch_u_min"]) / 2).transpose(PATH, "branch").values
-    unstable = result["branch_stability"].transpose(PATH, "branch").values == _UNSTABLE
+    amplitude = ((result["branch_u_max"] - result["branch_u_min"]) / 2).transpose(_path(result), "branch").values
+    unstable = result["branch_stability"].transpose(_path(result), "branch").values == _UNSTABLE
     for number in range(amplitude.shape[1]):
         y = np.where(unstable[:, number], amplitude[:, number], np.nan)
-        x, y = _joined(result[PATH].values, y, np.where(unstable, np.nan, amplitude))
+        x, y = _joined(_along(result).values, y, np.where(unstable, np.nan, amplitude))
         axes.plot(x, y, color=look.colour, linewidth=min(look.width, 1.3), linestyle=DASHES)
 
 
@@ -220,14 +229,14 @@ def _draw_backbones(axes: Axes, results: list[xr.Dataset]) -> list[Line2D]:
     for each in with_backbone:
         amplitude = each["backbone_amplitude"].values
         # Beyond a motion far outside, the line does not return.
-        line = _broken(each[PATH].values, amplitude, np.abs(np.diff(amplitude)) > height)
+        line = _broken(_along(each).values, amplitude, np.abs(np.diff(amplitude)) > height)
         axes.plot(*line, **style, color=_METHODS[each.attrs["method"]].colour, scaley=False)
     return [Line2D([], [], **style, color=FRAME_GREY, label="backbone")] if with_backbone else []
 
 
 def _draw_missing(axes: Axes, results: list[xr.Dataset]) -> list[Line2D]:
     """Draw crosses on the axis at frequencies where a sweep found no motion."""
-    omega = [r[PATH].values[r["u_max"].isnull().any("sweep_direction").values] for r in results]
+    omega = [_along(r).values[r["u_max"].isnull().any("sweep_direction").values] for r in results]
     count = sum(map(len, omega))
     if not count:
         return []

@@ -1,4 +1,4 @@
-"""Figures of the analysis ``history``: twist and rate of twist over time, and the phase portrait."""
+"""Figures of the analysis ``history``: two components of the state over time, and the phase portrait."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.layout import DPI, WIDTH, NotebookFigure, wrap_caption, write_title
-from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, caption, symbol, value_text
+from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, caption, state, symbol, value_text
 
 _LINE: dict[str, Any] = {"color": LINE_COLOURS[0], "linewidth": 0.6, "markersize": 3.5}
 _MOST_ROWS = 8
@@ -22,15 +22,15 @@ _CAPTION_LINES = 2
 
 
 def plot(dataset: xr.Dataset) -> Figure:
-    """Twist and rate over time, phase portrait, and for a single history the 3-D curve of both over time.
+    """Displacement and rate over time, phase portrait, and for a single history the 3-D curve of both over time.
 
-    One history: four panels. One axis or ``[points]``: a row of three panels for each of up to eight values. A history
-    without values has empty panels with a note. Raises :class:`InputError` for more axes or values, and unless ``phi`` and
-    ``velocity`` are stored.
+    These are the first two components of the state. One history: four panels. One axis or ``[points]``: a row of three
+    panels for each of up to eight values. A history without values has empty panels with a note. Raises
+    :class:`InputError` for more axes or values, and unless both components are stored.
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
-        cells.require(dataset, "phi", "velocity")
+        cells.require(dataset, *_components(dataset))
         names = cells.sweep_axes(dataset)
         if not names:
             return _single(dataset)
@@ -41,36 +41,43 @@ def plot(dataset: xr.Dataset) -> Figure:
         )
 
 
+def _components(dataset: xr.Dataset) -> list[str]:
+    """Names of the first two components of the state, which the figure shows."""
+    return [str(c["name"]) for c in state(dataset)[:2]] or ["displacement", "rate"]
+
+
 def _single(dataset: xr.Dataset) -> Figure:
     height = 6.4
     figure = _figure(dataset, height)
     boxes = [(x, y, 2.55, 2.0) for y in (3.4, 0.55) for x in (0.75, 4.15)]
-    twist, rate, portrait = (_add(figure, boxes[k], height) for k in (0, 1, 3))
-    _draw(dataset, twist, rate, portrait)
-    for axes in (twist, rate):
+    along, rate, portrait = (_add(figure, boxes[k], height) for k in (0, 1, 3))
+    _draw(dataset, along, rate, portrait)
+    for axes in (along, rate):
         axes.set_xlabel(_label(dataset, "time"))
     space = _add(figure, (0.35, 0.3, 3.1, 2.25), height, projection="3d")
     assert isinstance(space, Axes3D)
     _draw_space(dataset, space)
-    for axes, letter in zip((twist, rate, space, portrait), "abcd", strict=True):
+    for axes, letter in zip((along, rate, space, portrait), "abcd", strict=True):
         _letter(axes, letter)
     return figure
 
 
-def _rows(dataset: xr.Dataset, name: str) -> Figure:
-    count = dataset.sizes[name]
+def _rows(dataset: xr.Dataset, varies: str) -> Figure:
+    count = dataset.sizes[varies]
     row, top, bottom = 1.85, 0.65, 0.35
     height = top + bottom + count * row
     figure = _figure(dataset, height)
     for k in range(count):
-        history = dataset.isel({name: k})
+        history = dataset.isel({varies: k})
         y = height - top - (k + 1) * row + 0.3
         boxes = [(x, y, 1.5, row - 0.6) for x in (0.75, 3.0, 5.3)]
-        twist, rate, portrait = (_add(figure, box, height) for box in boxes)
-        _draw(history, twist, rate, portrait)
-        rate.text(0.5, 1.06, _entry(history, name), transform=rate.transAxes, ha="center", color=FRAME_GREY)
-        for axes in (twist, rate, portrait):
-            axes.set_xlabel(_label(dataset, "phi" if axes is portrait else "time") if k == count - 1 else "")
+        along, rate, portrait = (_add(figure, box, height) for box in boxes)
+        _draw(history, along, rate, portrait)
+        rate.text(0.5, 1.06, _entry(history, varies), transform=rate.transAxes, ha="center", color=FRAME_GREY)
+        for axes in (along, rate, portrait):
+            axes.set_xlabel(
+                _label(dataset, _components(dataset)[0] if axes is portrait else "time") if k == count - 1 else ""
+            )
     return figure
 
 
@@ -79,25 +86,27 @@ def _line(history: xr.Dataset) -> dict[str, Any]:
     return _LINE | {"marker": "o" if history.sizes["time"] == 1 else ""}
 
 
-def _draw(history: xr.Dataset, twist: Axes, rate: Axes, portrait: Axes) -> None:
-    phi, velocity = history["phi"].values, history["velocity"].values
-    twist.plot(history["time"], phi, **_line(history))
-    rate.plot(history["time"], velocity, **_line(history))
-    portrait.plot(phi, velocity, **_line(history))
-    twist.set_ylabel(_label(history, "phi"))
+def _draw(history: xr.Dataset, along: Axes, rate: Axes, portrait: Axes) -> None:
+    first, second = _components(history)
+    x, v = history[first].values, history[second].values
+    along.plot(history["time"], x, **_line(history))
+    rate.plot(history["time"], v, **_line(history))
+    portrait.plot(x, v, **_line(history))
+    along.set_ylabel(_label(history, first))
     for axes in (rate, portrait):
-        axes.set_ylabel(_label(history, "velocity"))
-    portrait.set_xlabel(_label(history, "phi"))
-    for axes in (twist, rate) if history.sizes["time"] > 1 else ():
+        axes.set_ylabel(_label(history, second))
+    portrait.set_xlabel(_label(history, first))
+    for axes in (along, rate) if history.sizes["time"] > 1 else ():
         axes.set_xlim(history["time"].values[0], history["time"].values[-1])
-    if not np.isfinite(phi).any():
-        for axes in (twist, rate, portrait):
+    if not np.isfinite(x).any():
+        for axes in (along, rate, portrait):
             axes.text(0.5, 0.5, "no values", transform=axes.transAxes, ha="center", va="center", color=FRAME_GREY)
 
 
 def _draw_space(history: xr.Dataset, space: Axes3D) -> None:
-    space.plot(history["phi"].values, history["velocity"].values, history["time"].values, **_line(history))
-    space.set(xlabel=_label(history, "phi"), ylabel=_label(history, "velocity"), zlabel=_label(history, "time"))
+    shown = [*_components(history), "time"]
+    space.plot(*(history[name].values for name in shown), **_line(history))
+    space.set(**{f"{axis}label": _label(history, name) for axis, name in zip("xyz", shown, strict=True)})
     space.tick_params(labelsize=6.5, pad=-2)
     axis: Any
     for axis in (space.xaxis, space.yaxis, space.zaxis):
@@ -125,18 +134,20 @@ def _add(figure: Figure, box: tuple[float, float, float, float], height: float, 
 
 
 def _letter(axes: Axes, letter: str) -> None:
-    place = axes.get_position()
+    corner = axes.get_position()
     figure = axes.get_figure()
     assert figure is not None
-    figure.text(_LETTER_COLUMN[letter], place.y1 + 0.012, f"({letter})", ha="right", va="bottom", weight="bold")
+    figure.text(_LETTER_COLUMN[letter], corner.y1 + 0.012, f"({letter})", ha="right", va="bottom", weight="bold")
 
 
 _LETTER_COLUMN = {"a": 0.06, "c": 0.06, "b": 0.55, "d": 0.55}
-_SYMBOLS = {"phi": symbol("phi"), "velocity": r"d$\phi$/d$t$", "time": "$t$"}
 
 
 def _label(dataset: xr.Dataset, name: str) -> str:
-    return f"{_SYMBOLS[name]} [{dataset[name].attrs.get('units', '1')}]"
+    """``symbol [units]`` of a component or the time."""
+    symbols = {c["name"]: c["symbol"] for c in state(dataset)}
+    mark = "$t$" if name == "time" else symbols.get(name) or symbol(name)
+    return f"{mark} [{dataset[name].attrs.get('units', '1')}]"
 
 
 def _entry(history: xr.Dataset, name: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import cycle
 
 import matplotlib
 import numpy as np
@@ -17,13 +18,8 @@ from drivetrain_jax.view.gear import BODY_COLOURS, draw_gear
 from drivetrain_jax.view.layout import Margins, Panels
 from drivetrain_jax.view.style import FRAME_GREY, STYLE, axis_label, variable_label
 
-TYPE_COLOURS = {
-    "rigid": "#9a9a9a",
-    "rotational": "#16324f",
-    "translational": "#d1771e",
-    "planet": "#3f8f5f",
-    "coupled": "#a0308c",
-}
+# Rigid modes, families in their order, coupled modes.
+_RIGID, _FAMILIES, _COUPLED = "#9a9a9a", ("#16324f", "#d1771e", "#3f8f5f", "#7a4fa0", "#999933"), "#a0308c"
 _CURVES_HEIGHT, _GEAR_HEIGHT = 4.4, 1.62
 _COLUMNS, _MOST_SHAPES = 4, 16
 # Relative difference below which frequencies are one multiple frequency, with one shape drawn.
@@ -53,6 +49,14 @@ def _meanings(dataset: xr.Dataset) -> list[str]:
     return dataset["mode_type"].attrs["flag_meanings"].split()
 
 
+def type_colours(dataset: xr.Dataset) -> dict[str, str]:
+    """Colour of every type of modes by name."""
+    if "mode_type" not in dataset:
+        return {"coupled": _COUPLED}
+    rigid, *families, coupled = _meanings(dataset)
+    return {rigid: _RIGID, **dict(zip(families, cycle(_FAMILIES), strict=False)), coupled: _COUPLED}
+
+
 def _types(dataset: xr.Dataset) -> np.ndarray:
     """Type of every mode by name; all modes are coupled if the variable is missing."""
     if "mode_type" not in dataset:
@@ -65,6 +69,7 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
     cells.require_values(dataset["natural_frequency"], positive=True)
     dataset = dataset.transpose(name, ...)
     x, frequency, types = dataset[name].values, dataset["natural_frequency"].values, _types(dataset)
+    colours = type_colours(dataset)
     panels = Panels(1, height=_CURVES_HEIGHT, margins=Margins(right=0.3, left=0.9, top=0.6))
     axes = panels.axes[0][0]
     moving = np.where(frequency > 1e-6 * np.nanmax(frequency), frequency, np.nan)
@@ -73,9 +78,9 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
         branches, kinds = (np.take_along_axis(array, order, axis=1) for array in (moving, types))
         for curve, kind in zip(branches.T, kinds.T, strict=True):
             if np.isfinite(curve).any():
-                axes.add_collection(_segments(x, curve, kind))
+                axes.add_collection(_segments(x, curve, [colours[str(k)] for k in kind]))
     else:
-        for kind, colour in TYPE_COLOURS.items():
+        for kind, colour in colours.items():
             rows, modes = np.nonzero(types == kind)
             axes.plot(x[rows], moving[rows, modes], ".", markersize=2.5, color=colour)
     axes.set(yscale="log", ylim=(0.93 * np.nanmin(moving), 1.07 * np.nanmax(moving)))
@@ -83,18 +88,18 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
     cells.fit_axis(axes, "x", x)
     panels.label_axes(axis_label(dataset[name]), variable_label(dataset["natural_frequency"]))
     panels.titles(dataset)
-    shown = [kind for kind in TYPE_COLOURS if (types[np.isfinite(moving)] == kind).any()]
+    shown = [kind for kind in colours if (types[np.isfinite(moving)] == kind).any()]
     if "mode_type" in dataset:
-        panels.legend([Line2D([], [], color=TYPE_COLOURS[kind], label=kind) for kind in shown])
+        panels.legend([Line2D([], [], color=colours[kind], label=kind) for kind in shown])
     return panels.figure
 
 
-def _segments(x: np.ndarray, curve: np.ndarray, kinds: np.ndarray) -> LineCollection:
-    """Draw one branch; a piece between points of different types has the colour of its end."""
+def _segments(x: np.ndarray, curve: np.ndarray, colours: list[str]) -> LineCollection:
+    """Draw one branch through points with these ``colours``; a piece between two of them has that of its end."""
     points = np.stack([x, curve], axis=-1)
     return LineCollection(
         list(np.stack([points[:-1], points[1:]], axis=1)),
-        colors=[TYPE_COLOURS[str(kind)] for kind in kinds[1:]],
+        colors=colours[1:],
         linewidths=1.1,
         capstyle="round",
         # Rounding of single pieces to whole pixels would make steps.
@@ -104,13 +109,14 @@ def _segments(x: np.ndarray, curve: np.ndarray, kinds: np.ndarray) -> LineCollec
 
 def _angles(dataset: xr.Dataset) -> list[float]:
     """Angles of the planets, from the fixed parameters or from scalar coordinates of single entries."""
-    fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get("planet_angle")
+    name = cells.role(dataset, "planets")
+    fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get(name)
     if fixed is None:
-        raise InputError("planet_angle: missing; the figure of mode shapes needs it")
+        raise InputError(f"{name or 'planets'}: missing; the figure of mode shapes needs the angles of planets")
     angles = list(fixed["value"] if isinstance(fixed, dict) else fixed)
     for i in range(len(angles)):
-        if f"planet_angle[{i}]" in dataset.coords:
-            angles[i] = float(dataset[f"planet_angle[{i}]"])
+        if f"{name}[{i}]" in dataset.coords:
+            angles[i] = float(dataset[f"{name}[{i}]"])
     return angles
 
 
@@ -122,7 +128,7 @@ def _distinct(frequency: np.ndarray) -> list[tuple[int, int]]:
 
 def _shapes(dataset: xr.Dataset) -> Figure:
     cells.require(dataset, "natural_frequency", "mode_shape")
-    angles, types = _angles(dataset), _types(dataset)
+    angles, types, colours = _angles(dataset), _types(dataset), type_colours(dataset)
     frequency = dataset["natural_frequency"].values
     if not np.isfinite(frequency).all():
         raise InputError("natural_frequency = nan: nothing to plot; the point has no result")
@@ -135,7 +141,7 @@ def _shapes(dataset: xr.Dataset) -> Figure:
         draw_gear(axes, dataset["mode_shape"].transpose("mode", "dof").values[mode], angles)
         multiple = f" ×{count}" if count > 1 else ""
         kind = str(types[mode])
-        axes.set_title(f"{frequency[mode]:.1f} Hz{multiple}, {kind}", size=8, color=TYPE_COLOURS[kind], pad=1.5)
+        axes.set_title(f"{frequency[mode]:.1f} Hz{multiple}, {kind}", size=8, color=colours[kind], pad=1.5)
     for axes in flat[len(drawn) :]:
         axes.axis("off")
     left_out = len(_distinct(frequency)) - len(drawn)

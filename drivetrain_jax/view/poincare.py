@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.layout import Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, value_text
+from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, state, value_text
 
 _FIRST = 1000
 _MOST_ROWS = 6
@@ -39,9 +39,15 @@ def plot(dataset: xr.Dataset) -> Figure:
         panels = Panels(len(parts), columns, height=_HEIGHT, margins=margins, share_y=False)
         for row, part in zip(panels.axes, parts, strict=True):
             _draw_row(row, part, names[0] if names else None)
-        panels.label_axes("twist at the strobes [rad]", "rate of twist at the strobes [rad/s]")
+        panels.label_axes(*_labels(dataset))
         panels.titles(dataset)
         return panels.figure
+
+
+def _labels(dataset: xr.Dataset) -> list[str]:
+    """Names and units of the two components."""
+    described = state(dataset)[:2] or [{"long_name": f"component {i}", "units": "1"} for i in (1, 2)]
+    return [f"{c['long_name']} at the strobes [{c['units']}]" for c in described]
 
 
 def _draw_row(row: list[Axes], part: xr.Dataset, name: str | None) -> None:

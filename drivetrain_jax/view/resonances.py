@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -12,10 +15,7 @@ from matplotlib.lines import Line2D
 
 from drivetrain_jax.view.style import PREDICTION
 
-# Difference combinations make no tongues of parametric resonance (equal Krein signature).
-_HIDDEN = ("C-",)
-_DASHES = {"H": "-", "S": (0, (5, 2)), "C": (0, (5, 1.5, 1, 1.5))}
-_MEANING = {"H": "harmonic $H$", "S": "subharmonic $S$", "C": "sum combination $C^+$"}
+_DASHES = {"solid": "-", "dashed": (0, (5, 2)), "dashdot": (0, (5, 1.5, 1, 1.5))}
 # Type size of the labels, space for each along the edges, leader and largest shift from the line, in points.
 _FONT = 7.5
 _SPACING_ACROSS = 14.5
@@ -26,16 +26,14 @@ _MAX_SHIFT = 24.0
 
 @dataclass(frozen=True)
 class Prediction:
-    """One predicted line: values of the horizontal axis, and of the vertical axis unless it is straight."""
+    """One predicted line: values of the horizontal axis, and of the vertical axis unless it is straight; name and line
+    style of its family."""
 
     label: str
     x: np.ndarray
     y: np.ndarray | None
-
-    @property
-    def family(self) -> str:
-        """First letter of the label."""
-        return self.label[:1]
+    family: str
+    dashes: Any
 
     @property
     def order(self) -> int:
@@ -45,20 +43,29 @@ class Prediction:
 
 
 def predictions(
-    dataset: xr.Dataset, horizontal: str, vertical: str | None = None, families: tuple[str, ...] = ()
+    dataset: xr.Dataset, horizontal: str, vertical: str | None = None, forced: bool = False
 ) -> list[Prediction]:
-    """Predicted lines over ``horizontal`` (all families, or those named); none without predictions."""
+    """Predicted lines over ``horizontal`` (``forced``: of families that the forcing excites); none without predictions."""
     name = f"resonance_{horizontal}"
     if name not in dataset.coords:
         return []
     lines = []
-    for label in dataset["resonance"].values.astype(str):
-        if label.startswith(_HIDDEN) or (families and label[:1] not in families):
+    families = json.loads(dataset.attrs.get("resonance_families", "{}"))
+    for index, label in enumerate(dataset["resonance"].values.astype(str)):
+        family = _family(label, families)
+        if not family.get("drawn", True) or (forced and not family.get("forced")):
             continue
-        values = dataset[name].isel(resonance=int(np.flatnonzero(dataset["resonance"].values.astype(str) == label)[0]))
-        curve = vertical is not None and vertical in values.dims
-        lines.append(Prediction(label, np.atleast_1d(values.values), dataset[vertical].values if curve else None))
+        values = dataset[name].isel(resonance=index)
+        y = dataset[vertical].values if vertical is not None and vertical in values.dims else None
+        dashes = _DASHES.get(family.get("line", ""), "-")
+        lines.append(Prediction(label, np.atleast_1d(values.values), y, family["name"], dashes))
     return lines
+
+
+def _family(label: str, families: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What the system declares of the family of ``label``: the one with the longest prefix, else one by its first letter."""
+    prefixes = [prefix for prefix in families if label.startswith(prefix)]
+    return families[max(prefixes, key=len)] if prefixes else {"name": label[:1]}
 
 
 def label_text(label: str) -> str:
@@ -77,12 +84,12 @@ def draw(axes: Axes, lines: list[Prediction]) -> list[Line2D]:
     for line in lines:
         if line.x.max() < low or line.x.min() > high:
             continue
-        style = {"color": PREDICTION, "linewidth": 0.7, "linestyle": _DASHES.get(line.family, "-"), "alpha": 0.9}
+        style = {"color": PREDICTION, "linewidth": 0.7, "linestyle": line.dashes, "alpha": 0.9}
         if line.y is None:
             axes.axvline(line.x[0], **style)
         else:
             axes.plot(line.x, line.y, scalex=False, scaley=False, **style)
-        handles.setdefault(line.family, Line2D([], [], **style, label=_MEANING.get(line.family, line.family)))
+        handles.setdefault(line.family, Line2D([], [], **style, label=line.family))
     return list(handles.values())
 
 

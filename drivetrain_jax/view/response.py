@@ -1,4 +1,4 @@
-"""Figures of the analysis ``forced``: amplitudes of the shafts, and stability of the nonlinear periodic orbit."""
+"""Figures of the analysis ``forced``: amplitudes of the displacements, and stability of the nonlinear periodic orbit."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _HEIGHT = 2.1
 
 
 def plot(dataset: xr.Dataset) -> Figure:
-    """Amplitudes of the shafts, and the orbit's spectral radius and the condition if stored.
+    """Amplitudes of the displacements, and the orbit's spectral radius and the condition if stored.
 
     Over one axis as curves (solid: linear response, dashed: nonlinear orbit), over two axes as maps. Failed points are
     crosses at the foot of the curves, or coloured cells of the maps. Axes of one value count as fixed. Raises
@@ -63,11 +63,11 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
             )
     if amplitudes:
         units = dataset[amplitudes[0]].attrs.get("units", "1")
-        both = f"amplitude of the shafts [{units}]"
+        own = next(dim for dim in dataset[amplitudes[0]].dims if dim != name)
+        both = f"amplitude of the {own}s [{units}]"
         panels.label_row(stack[0], both if len(amplitudes) > 1 else variable_label(dataset[amplitudes[0]]))
     cells.fit_axis(stack[0], "x", dataset[name].values)
-    # The forcing has only even harmonics of the speed: it meets natural frequencies at the harmonic speeds.
-    lines = resonances.predictions(dataset, name, families=("H",))
+    lines = resonances.predictions(dataset, name, forced=True)
     handles += cells.draw_failures(stack[0], dataset, name)
     for axes in stack:
         predicted = resonances.draw(axes, lines)
@@ -110,7 +110,7 @@ def _maps(dataset: xr.Dataset, names: list[str], shown: list[str]) -> Figure:
         else:
             mesh = _draw_decades(axes, field, horizontal, vertical)
             panels.colorbar(axes, mesh, variable_label(field))
-    lines = resonances.predictions(dataset, horizontal, vertical, families=("H",))
+    lines = resonances.predictions(dataset, horizontal, vertical, forced=True)
     handles = resonances.draw(panels.axes[0][0], lines)
     panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
     resonances.label(panels.axes[0][0], lines)
@@ -120,7 +120,7 @@ def _maps(dataset: xr.Dataset, names: list[str], shown: list[str]) -> Figure:
 
 
 def _draw_decades(axes: Axes, field: xr.DataArray, horizontal: str, vertical: str) -> QuadMesh:
-    """Draw positive values on a logarithmic colour scale, darker for larger; beta = 0 has amplitude 0 and is lightest."""
+    """Draw positive values on a logarithmic colour scale, darker for larger; an amplitude of 0 is lightest."""
     values = field.values[np.isfinite(field.values) & (field.values > 0)]
     low, high = (values.min(), values.max()) if values.size else (0.1, 1.0)
     cmap = matplotlib.colormaps["cividis_r"].with_extremes(bad=STATE_COLOURS[cells.FAILED])

@@ -39,8 +39,8 @@ def plot(dataset: xr.Dataset) -> Figure:
     """The figure of a ``steady_state`` result, by its axes.
 
     - none: time history and phase portrait of the motion (needs ``u_history`` and ``v_history``); - one: extremes, period
-    multiple and growth along it; - ``u0`` and ``v0``: basins of the attractors with the share of each; - any other two: the
-    regime and the largest displacement, with the predicted threshold of rattle.
+    multiple and growth along it; - the initial state: basins of the attractors with the share of each; - any other two: the
+    regime and the largest displacement, with a predicted threshold.
 
     Axes of one value count as fixed. Raises :class:`InputError` for other axes, and if variables are missing.
     """
@@ -51,8 +51,9 @@ def plot(dataset: xr.Dataset) -> Figure:
             return _motion(dataset)
         if len(names) == 1 and names != ["point"]:
             return _curves(dataset, names[0])
-        if set(names) == {"u0", "v0"}:
-            return _basins(dataset)
+        initial = [cells.role(dataset, role) for role in ("initial_displacement", "initial_rate")]
+        if set(names) == set(initial):
+            return _basins(dataset, *initial)
         if len(names) == 2:
             return _maps(dataset, names)
         raise InputError(f"axes = {', '.join(names)}: allowed are at most two axes for a figure of steady states")
@@ -127,20 +128,20 @@ def _dots(axes: Axes, x: xr.DataArray, y: xr.DataArray, colour: str, label: str)
     return axes.plot(x, y, linestyle="", marker="o", markersize=1.8, color=colour, label=label)
 
 
-def _basins(dataset: xr.Dataset) -> Figure:
+def _basins(dataset: xr.Dataset, horizontal: str, vertical: str) -> Figure:
     cells.require(dataset, "u_max", "period_multiple")
     codes, names = _attractors(dataset)
     panels = Panels(height=4.2, margins=Margins(right=2.3))
     axes = panels.axes[0][0]
     colours = ListedColormap([*ATTRACTOR_COLOURS[: len(names)], STATE_COLOURS[cells.FAILED]])
-    cells.draw_cells(axes, codes, "u0", "v0", cmap=colours, vmin=-0.5, vmax=len(names) + 0.5)
+    cells.draw_cells(axes, codes, horizontal, vertical, cmap=colours, vmin=-0.5, vmax=len(names) + 0.5)
     share = [float((codes == k).mean()) for k in range(len(names) + 1)]
     handles = [
         Patch(facecolor=colour, edgecolor=FRAME_GREY, linewidth=0.6, label=f"{label}: {part:.1%}")
         for colour, label, part in zip(colours.colors, [*names, "other or failed"], share, strict=True)  # pyright: ignore[reportArgumentType]
         if part > 0
     ]
-    panels.label_axes(axis_label(dataset["u0"]), axis_label(dataset["v0"]))
+    panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
     panels.titles(dataset)
     panels.legend(handles)
     return panels.figure
@@ -198,8 +199,9 @@ def _motion(dataset: xr.Dataset) -> Figure:
         Line2D([], [], linestyle="", marker="o", markersize=4, color=LINE_COLOURS[1], label="start of a drive period")
     )
     history.plot(part[0], u[0], "o", markersize=4, color=LINE_COLOURS[1])
-    half = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get("b", {}).get("value")
-    half = dataset["b"].item() if "b" in dataset.coords else half
+    play = cells.role(dataset, "half_play")
+    half = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get(play, {}).get("value")
+    half = dataset[play].item() if play in dataset.coords else half
     if half is not None:
         style = {"color": FRAME_GREY, "linewidth": 0.8, "linestyle": (0, (2, 2))}
         for side in (half, -half):

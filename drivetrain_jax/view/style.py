@@ -78,6 +78,11 @@ def symbol(name: str) -> str:
     return name
 
 
+def state(dataset: xr.Dataset) -> list[dict[str, str]]:
+    """The components of the system's state: name, units, long_name, symbol. Empty if it declares none."""
+    return json.loads(dataset.attrs.get("state", "[]"))
+
+
 def axis_label(coordinate: xr.DataArray) -> str:
     """``long name (symbol) [units]`` of a swept parameter, without a symbol that repeats the long name."""
     name, long_name = str(coordinate.name), _long_name(coordinate)

@@ -271,8 +271,8 @@ def test_effort_grows_with_oscillations():
 
 def test_a_model_of_one_displacement_is_refused():
     model = ForcedModel(lambda t, y: y, lambda t, y: y, 1.0, (0,))
-    with pytest.raises(InputError, match=r"^system: has 1 displacements; forced allows two, and 4 states$"):
-        predicted_steps(lambda columns: model, {"a": np.ones(1)})
+    with pytest.raises(InputError, match=r"^system: its model has 1 displacements; allowed is 2, as it says$"):
+        predicted_steps(lambda columns: model, 4, 2, {"a": np.ones(1)})
 
 
 @pytest.mark.parametrize("frequency", [1.0, 7.3, 1000.0])

@@ -8,11 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from flows import lorenz
+from scipy.integrate import solve_ivp
 
 import drivetrain_jax as dt
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import Outcome, Request, history
+from drivetrain_jax.functions import analyse
 from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.systems import Component, Flow, System, serves
 from tests.oracles import tripod_reference as oracle
 
 NINE_DEGREES = math.radians(9)
@@ -180,12 +183,41 @@ def test_hopelessly_many_strobes_are_not_begun():
     assert np.isnan(ds.phi).all()
 
 
-def test_a_flow_of_three_components_is_refused():
-    system = SimpleNamespace(name="lorenz", models={"history": SimpleNamespace(build=lambda columns: lorenz(1))})
+class Lorenz(System):
+    """Three components, which the system names itself."""
+
+    name = "lorenz"
+    title = "Lorenz"
+    state = (Component("x", "m", "width"), Component("y", "m", "depth"), Component("z", "K", "heat"))
+
+    @serves("history")
+    def flow(self):
+        start = (1.0, 1.0, 20.0)
+        return Flow(lorenz(1).field, start, period=0.5)
+
+
+def test_a_system_names_the_components_of_its_state():
+    variables = history.ANALYSIS.for_system(Lorenz).variables
+    assert [v.name for v in variables] == ["x", "y", "z", "x_error", "y_error", "z_error"]
+    assert [v.units for v in variables[:3]] == ["m", "m", "K"]
+    found = analyse("history", Lorenz(), ["x", "z"], {"times": [0.0, 0.2]})
+    states = solve_ivp(lambda t, y: lorenz(1).field((), y), (0, 0.2), (1, 1, 20), rtol=1e-11, atol=1e-11).y[:, -1]
+    np.testing.assert_allclose([found.x[1], found.z[1]], states[[0, 2]], rtol=1e-8)
+
+
+def test_a_flow_has_the_components_that_the_system_says():
+    system = SimpleNamespace(
+        name="lorenz", models={"history": SimpleNamespace(build=lambda columns: lorenz(1))}, state=Lorenz.state[:2]
+    )
     defaults = {option.name: option.default for option in history.ANALYSIS.options}
     request = Request(("phi",), "diffrax", defaults | {"times": (1.0,)})
     (solver,) = history.ANALYSIS.solvers(system, request)
     with pytest.raises(
-        InputError, match=r"^system = 'lorenz': has 3 components; history allows two, an angle and its rate$"
+        InputError, match=r"^system: its flow has 3 components; allowed is one for each of its state, 2$"
     ):
         solver.effort({})
+
+
+def test_a_system_without_a_state_has_no_history():
+    with pytest.raises(ValueError, match="models of nameless: history needs state"):
+        type("Nameless", (System,), {"name": "nameless", "flow": Lorenz.flow})

@@ -11,6 +11,12 @@ LONG_NAMES = {"beta": "joint angle", "Omega": "speed", "mu": "stiffness ratio", 
 UNITS = {"beta": "rad"}
 FIXED = {"zeta": 0.001, "gamma": 100.0}
 ROLES = json.dumps({"speed": "Omega"})
+FAMILIES = {
+    "H": {"name": "harmonic $H$", "line": "solid", "forced": True},
+    "S": {"name": "subharmonic $S$", "line": "dashed"},
+    "C": {"name": "sum combination $C^+$", "line": "dashdot"},
+    "C-": {"name": "difference combination", "drawn": False},
+}
 
 
 def unstable(beta: float | np.ndarray, omega: float | np.ndarray) -> np.ndarray:
@@ -46,7 +52,8 @@ def with_resonances(dataset: xr.Dataset, **speeds: float | np.ndarray) -> xr.Dat
     labels = [name.replace("plus", "+").replace("minus", "-") for name in speeds]
     values = np.stack([np.asarray(speed, float) for speed in speeds.values()], axis=-1)
     dims = ("mu", "resonance") if values.ndim == 2 else ("resonance",)
-    return dataset.assign_coords(resonance=("resonance", labels), resonance_Omega=(dims, values))
+    dataset = dataset.assign_coords(resonance=("resonance", labels), resonance_Omega=(dims, values))
+    return dataset.assign_attrs(resonance_families=json.dumps(FAMILIES))
 
 
 def chart() -> xr.Dataset:

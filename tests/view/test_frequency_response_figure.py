@@ -43,7 +43,7 @@ def line(method: str = "multiple_scales", branches: bool = True) -> xr.Dataset:
             "branch_stability": variable(own, stability, "1"),
         }
     attrs = {"analysis": "frequency_response", "title": "A line", "method": method}
-    attrs |= {"fixed_parameters": "{}", "options": json.dumps({"harmonics": 7})}
+    attrs |= {"fixed_parameters": "{}", "options": json.dumps({"harmonics": 7}), "roles": '{"speed": "omega"}'}
     dataset = xr.Dataset(data, attrs=attrs).assign_coords(sweep_direction=["up", "down"])
     return dataset.assign_coords(omega=("omega", OMEGA, {"units": "rad/s", "long_name": "frequency of the drive"}))
 

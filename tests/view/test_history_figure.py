@@ -28,7 +28,12 @@ def history(**axes: list[float]) -> xr.Dataset:
     }
     coords = {name: (name, values, {"units": "1", "long_name": name}) for name, values in axes.items()}
     coords["time"] = ("time", TIMES, {"units": "s", "long_name": "time"})
-    attrs = {"analysis": "history", "title": "A twist", "fixed_parameters": json.dumps({"beta": 0.1})}
+    state = [
+        {"name": "phi", "units": "rad", "long_name": "twist", "symbol": ""},
+        {"name": "velocity", "units": "rad/s", "long_name": "rate of twist", "symbol": "$v$"},
+    ]
+    fixed = json.dumps({"beta": 0.1})
+    attrs = {"analysis": "history", "title": "A twist", "fixed_parameters": fixed, "state": json.dumps(state)}
     return xr.Dataset(data, coords, attrs)
 
 
@@ -46,7 +51,7 @@ def test_one_history_in_four_panels():
         np.testing.assert_array_equal(found, expected)
     texts = [text.get_text() for text in figure.texts]
     assert {"A twist", r"$\beta$ = 0.1", "(a)", "(b)", "(c)", "(d)"} <= set(texts)
-    assert twist.get_ylabel() == r"$\phi$ [rad]"
+    assert (twist.get_ylabel(), rate.get_ylabel()) == (r"$\phi$ [rad]", "$v$ [rad/s]")
 
 
 @pytest.mark.filterwarnings("error::UserWarning")

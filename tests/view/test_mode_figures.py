@@ -12,14 +12,17 @@ from matplotlib.colors import to_hex
 from drivetrain_jax import InputError
 from drivetrain_jax.view import plot
 from drivetrain_jax.view.gear import displacements
-from drivetrain_jax.view.modes import TYPE_COLOURS
+from drivetrain_jax.view.modes import type_colours
 
 TYPES = ("rigid", "rotational", "translational", "planet", "coupled")
 FIXED = {"planet_angle": {"value": [0.0, 2.0, 4.0], "units": "rad", "long_name": "angle"}}
 
 
+ROLES = json.dumps({"planets": "planet_angle"})
+
+
 def result(points: int, **variables) -> xr.Dataset:
-    attrs = {"analysis": "modes", "title": "Modes", "fixed_parameters": json.dumps(FIXED)}
+    attrs = {"analysis": "modes", "title": "Modes", "fixed_parameters": json.dumps(FIXED), "roles": ROLES}
     flags = {"flag_values": np.arange(5, dtype="int8"), "flag_meanings": " ".join(TYPES), "units": "1"}
     data = {"outcome": (("k_p",), np.zeros(points, "int8"), {"units": "1"})}
     for name, values in variables.items():
@@ -41,19 +44,19 @@ def crossing() -> xr.Dataset:
 
 
 def test_branches_keep_colour_and_direction_through_a_crossing():
-    axes = plot(crossing()).axes[0]
+    axes, of = plot(crossing()).axes[0], type_colours(crossing())
     curves = axes.collections
     colours = [{to_hex(colour) for colour in curve.get_colors()} for curve in curves]
-    assert colours == [{TYPE_COLOURS["rotational"]}, {TYPE_COLOURS["translational"]}]
+    assert colours == [{of["rotational"]}, {of["translational"]}]
     slopes = [np.diff(np.array(curve.get_segments())[:, :, 1], axis=1) for curve in curves]
     np.testing.assert_allclose(slopes[0], 10)
     np.testing.assert_allclose(slopes[1], -10)
 
 
 def test_without_branches_points_are_dots():
-    axes = plot(crossing().drop_vars("branch")).axes[0]
+    axes, of = plot(crossing().drop_vars("branch")).axes[0], type_colours(crossing())
     shown = {to_hex(line.get_color()): line.get_xdata().size for line in axes.lines}
-    assert shown[TYPE_COLOURS["rotational"]] == shown[TYPE_COLOURS["translational"]] == 6
+    assert shown[of["rotational"]] == shown[of["translational"]] == 6
 
 
 def shapes(planets: int = 3) -> xr.Dataset:

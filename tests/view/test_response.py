@@ -83,5 +83,5 @@ def test_nothing_to_plot_is_an_input_error():
 def test_unknown_analysis_is_an_input_error():
     with pytest.raises(InputError, match=r"analysis = 'atlas': is a function; .* its `grid` and `drivetrain plot`"):
         plot(results.forced(Omega=OMEGA).assign_attrs(analysis="atlas"))
-    with pytest.raises(InputError, match="analysis = 'anything': allowed is one of floquet, forced"):
+    with pytest.raises(InputError, match="analysis = 'anything': has no figure; allowed is one of floquet, forced"):
         plot(results.forced(Omega=OMEGA).assign_attrs(analysis="anything"))

@@ -8,7 +8,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import basins, plot
 
 FIXED = json.dumps({"b": {"value": 0.17, "units": "m", "long_name": "half the backlash"}})
-ROLES = json.dumps({"speed": "omega"})
+ROLES = json.dumps({"speed": "omega", "initial_displacement": "u0", "initial_rate": "v0", "half_play": "b"})
 
 
 def result(axes, **variables):

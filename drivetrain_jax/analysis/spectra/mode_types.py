@@ -1,4 +1,4 @@
-"""Modes of one block of a spring system with their families: rotational, translational, planet, or a mixture.
+"""Modes of one block of a spring system with the families that the system declares, or a mixture of them.
 
 Eigenvectors of a multiple frequency are arbitrary within its space. They are rotated until they diagonalise the operator
 whose eigenvalue is the number of the family, so a pure mode in the space becomes a vector. Eigenvectors of different
@@ -17,10 +17,10 @@ from jax import Array, lax
 from drivetrain_jax.analysis.numerics.linear_algebra import looped_matmul
 from drivetrain_jax.analysis.numerics.singular_values import EPS, singular_values
 from drivetrain_jax.analysis.numerics.singular_vectors import jacobi_vectors
-from drivetrain_jax.systems import FAMILIES, Block
+from drivetrain_jax.systems import Block
 
-MODE_TYPES = ("rigid", *FAMILIES, "coupled")
-RIGID, COUPLED = 0, len(FAMILIES) + 1
+# Code of a rigid mode; those of the families follow, then that of a coupled mode.
+RIGID = 0
 # A mode belongs to a family if less than this share of it lies outside.
 PURITY = 1e-6
 # Rounding units of the largest angular frequency within which frequencies count as equal.
@@ -37,8 +37,8 @@ _POLARISATION = 0.5
 
 class BlockModes(NamedTuple):
     """Modes of one block: angular ``frequency`` (n, ...), mass-weighted ``vectors`` (n, n, ...) as columns in the
-    coordinates of the block, share of each family ``participation`` (n, families, ...), code of the family in
-    ``MODE_TYPES`` as ``label`` (n, ...), ``found`` (...)."""
+    coordinates of the block, share of each family ``participation`` (n, families, ...), code of the
+    type as ``label`` (n, ...), ``found`` (...)."""
 
     frequency: Array
     vectors: Array
@@ -47,7 +47,12 @@ class BlockModes(NamedTuple):
     found: Array
 
 
-def block_modes(block: Block, largest: Array, asymmetry: Array) -> BlockModes:
+def mode_type_names(families: tuple[str, ...]) -> tuple[str, ...]:
+    """The types of modes by their codes."""
+    return ("rigid", *families, "coupled")
+
+
+def block_modes(block: Block, largest: Array, asymmetry: Array, families: int) -> BlockModes:
     """Modes of ``block`` (lanes (N,)) by rising frequency; ``largest`` is the system's largest angular frequency.
 
     The frequencies do not depend on the vectors: ``|G v|`` would err with a vector that was turned, and for a rigid
@@ -62,9 +67,8 @@ def block_modes(block: Block, largest: Array, asymmetry: Array) -> BlockModes:
     named = vectors
     if len(set(block.family)) > 1:
         named = _turned(block, vectors, clusters(frequency, jnp.maximum(relative * frequency[1:], rounding)), 0.0)
-    return BlockModes(
-        frequency, own, _participation(block, own), _label(_participation(block, named)), values_found & vectors_found
-    )
+    share, label = _participation(block, own, families), _label(_participation(block, named, families))
+    return BlockModes(frequency, own, share, label, values_found & vectors_found)
 
 
 def _rising(factor: Array, vectors: Array) -> Array:
@@ -108,18 +112,18 @@ def _turned(block: Block, vectors: Array, near: Array, further: np.ndarray | flo
     return lax.cond(jnp.any(neighbours), turn, lambda: vectors)
 
 
-def _participation(block: Block, vectors: Array) -> Array:
+def _participation(block: Block, vectors: Array, families: int) -> Array:
     shares = _in_frame(block, vectors) ** 2
-    return jnp.stack([jnp.sum(shares[block.family == kind], axis=0) for kind in range(len(FAMILIES))], axis=1)
+    return jnp.stack([jnp.sum(shares[block.family == kind], axis=0) for kind in range(families)], axis=1)
 
 
 def _label(participation: Array) -> Array:
     pure = participation > 1 - PURITY
-    return jnp.where(jnp.any(pure, axis=1), 1 + jnp.argmax(pure, axis=1), COUPLED)
+    return jnp.where(jnp.any(pure, axis=1), 1 + jnp.argmax(pure, axis=1), 1 + participation.shape[1])
 
 
 def mode_types(frequency: Array, label: Array, largest: Array) -> Array:
-    """Codes of ``MODE_TYPES``, int8 (n, ...), from those of the families.
+    """Codes of the types, int8 (n, ...), from those of the families.
 
     Rigid is what moves at no frequency that differs from zero by more than rounding.
     """
