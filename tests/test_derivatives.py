@@ -10,9 +10,9 @@ import pytest
 from scipy.linalg import eigh
 
 import drivetrain_jax as dt
-from benchmarks.bicardan_precise_reference import determinant
-from benchmarks.planetary_reference import matrices
 from tests.oracles import complex_step
+from tests.oracles.bicardan_precise_reference import determinant
+from tests.oracles.planetary_reference import matrices
 
 POINTS = 20
 CARDAN = ("beta", "Omega", "zeta", "alpha", "mu", "gamma")
