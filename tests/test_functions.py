@@ -257,6 +257,7 @@ def test_diffrax_under_vmap_is_the_engine_of_the_tripod(monkeypatch):
         (lambda: dt.sweep(dt.floquet, SHAFT, over={"bet": [0.1]}), "bet: unknown parameter"),
         (lambda: dt.sweep(dt.floquet, SHAFT, over={"beta": [[0.1]]}), r"over.beta: got an array of the shape \(1, 1\)"),
         (lambda: dt.sweep(lambda p: p["a"], {"a": 1.0}, over={"b": [1.0]}), "over.b: unknown to a dict"),
+        (lambda: dt.sweep(lambda p: {"a": p["a"]}, {"a": 1.0}, over={"a": [1.0]}), "over: 'a' names two dimensions"),
     ],
 )  # fmt: skip
 def test_wrong_input_is_one_line(call, message):

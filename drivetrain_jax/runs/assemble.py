@@ -172,7 +172,7 @@ def bytes_per_point(scene: Scene, on_disk: bool) -> int:
 
 def labelled(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str, str | float]) -> Labelled:
     """The labelled result: dimensions are the axes in scene order (or ``point``), then those of the variable."""
-    sweep_dims = ("point",) if scene.zipped else tuple(axis.name for axis in scene.axes)
+    sweep_dims = ("point",) if scene.zipped else tuple(axis.dim for axis in scene.axes)
     results = [(v, arrays[v.name]) for v in result_variables(scene)]
     coordinates = [*_axis_coordinates(scene), *_resonances(scene)]
     return Labelled.build(sweep_dims, coordinates, scene.dimensions, results, result_attrs(scene) | dict(attrs))
@@ -185,8 +185,15 @@ def to_dataset(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[st
 
 def _axis_coordinates(scene: Scene) -> list[Coordinate]:
     coordinates = [
-        Coordinate(a.name, ("point",) if scene.zipped else (a.name,), a.values, a.parameter.units, a.long_name)
-        for a in scene.axes
+        Coordinate(
+            axis.dim,
+            ("point",) if scene.zipped else (axis.dim,),
+            axis.values,
+            axis.parameter.units,
+            axis.long_name,
+            "" if axis.name == axis.dim else axis.name,
+        )
+        for axis in scene.axes
     ]
     if scene.zipped:
         numbers = np.arange(len(scene.axes[0].values))

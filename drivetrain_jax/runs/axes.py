@@ -29,7 +29,7 @@ class AxisTable(msgspec.Struct, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Axis:
-    """A varying parameter, or entry number ``entry`` of a list. ``name`` is ``Omega`` or ``length[1]``."""
+    """A varying parameter, or entry ``entry`` of a list. ``name`` is its key in the scene: ``Omega``, ``length[1]``."""
 
     name: str
     parameter: Parameter
@@ -37,10 +37,15 @@ class Axis:
     values: np.ndarray
 
     @property
+    def dim(self) -> str:
+        """Name of the dimension and of the coordinate: ``length_1``, letters, digits and underscores as CF asks."""
+        return re.sub(r"\W+", "_", self.name).strip("_")
+
+    @property
     def long_name(self) -> str:
-        """Long name of the parameter, with the position of a swept entry."""
+        """Long name of the parameter, with the position of a swept entry, counted from 0."""
         label = self.parameter.long_name
-        return label if self.entry is None else f"{label}, entry {self.entry + 1} of the list"
+        return label if self.entry is None else f"{label}, entry {self.entry}"
 
 
 def entry_of(name: str) -> tuple[str, int | None]:

@@ -25,8 +25,8 @@ def rearranged(path: Path, scene: Scene, grid: Grid) -> list[str]:
 
 
 def _rearranged(path: Path, scene: Scene, grid: Grid) -> list[str]:
-    dims = ("point",) if scene.zipped else tuple(axis.name for axis in scene.axes)
-    expected = {axis.name: axis.values for axis in scene.axes}
+    dims = ("point",) if scene.zipped else tuple(axis.dim for axis in scene.axes)
+    expected = {axis.dim: axis.values for axis in scene.axes}
     with cast(Any, h5py.File(path, "r")) as file:
         for own in scene.dimensions:
             if own.name in file:

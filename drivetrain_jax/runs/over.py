@@ -133,6 +133,9 @@ def _function_scene(
     variables = tuple(_variable(key, shapes[key]) for key in wanted)
     kind, analysis = _kind(_Once(one), name, tuple(values), type(system), variables, computes)
     axes = tuple(Axis(key, kind.parameter(key), None, numbers) for key, numbers in values.items())
+    names = [*(axis.dim for axis in axes), *wanted, *(dim for variable in variables for dim in variable.dims)]
+    if double := [label for label in names if names.count(label) > 1]:
+        raise InputError(f"over: {double[0]!r} names two dimensions or results; allowed are distinct names")
     text = f'system = "{kind.name}"\nanalysis = "{name}"\n\n[fixed]\n{_COMPUTES} = "{computes}"\n'
     request, fixed = Request(tuple(wanted), "function", {}), {_COMPUTES: computes}
     dimensions = analysis.dimensions(kind, request, fixed)

@@ -18,13 +18,15 @@ CONVENTIONS = "CF-1.11"
 
 @dataclass(frozen=True)
 class Coordinate:
-    """Values of a parameter or prediction along dimensions of the result."""
+    """Values of a parameter or prediction along dimensions of the result. ``parameter``: its key in the scene, if that is
+    another name."""
 
     name: str
     dims: tuple[str, ...]
     values: np.ndarray
     units: str
     long_name: str
+    parameter: str = ""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class Labelled:
         without values is numbered from 0.
         """
         results = list(results)
-        coords = {c.name: Entry(c.dims, c.values, _labels(c.units, c.long_name)) for c in coordinates}
+        coords = {c.name: Entry(c.dims, c.values, _coordinate_attrs(c)) for c in coordinates}
         sizes = {d: n for v, values in results for d, n in zip(reversed(v.dims), reversed(values.shape), strict=False)}
         for d in dimensions:
             if d.name in sizes:
@@ -105,6 +107,11 @@ def _fill(values: np.ndarray) -> float | None:
 
 def _labels(units: str, long_name: str) -> dict[str, Any]:
     return {"units": units, "long_name": long_name}
+
+
+def _coordinate_attrs(coordinate: Coordinate) -> dict[str, Any]:
+    attrs = _labels(coordinate.units, coordinate.long_name)
+    return attrs | {"parameter": coordinate.parameter} if coordinate.parameter else attrs
 
 
 def _variable_attrs(variable: Variable) -> dict[str, Any]:

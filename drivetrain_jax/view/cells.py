@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, N
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
-from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STATE_HATCHES, STATE_NAMES, STATES, symbol
+from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STATE_HATCHES, STATE_NAMES, STATES, scene_key, symbol
 
 STABLE, UNSTABLE, UNDECIDED, FAILED = range(4)
 _PENDING, _PENDING_COLOUR = "pending", "#c4c4c4"
@@ -41,7 +41,7 @@ def _finite(dataset: xr.Dataset) -> xr.Dataset:
         infinite = np.isinf(coordinate.values) if coordinate.dtype.kind == "f" else np.zeros(coordinate.shape, bool)
         if infinite.any() and not infinite.all() and coordinate.dims[0] in dataset["outcome"].dims:
             dataset = dataset.isel({coordinate.dims[0]: ~infinite})
-            left_out.append(f"{symbol(str(name))} = inf left out")
+            left_out.append(f"{symbol(scene_key(coordinate))} = inf left out")
     return dataset.assign_attrs(left_out=", ".join(left_out)) if left_out else dataset
 
 

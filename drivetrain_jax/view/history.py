@@ -14,7 +14,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.layout import DPI, WIDTH, NotebookFigure, wrap_caption, write_title
-from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, caption, state, symbol, value_text
+from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, caption, coordinate_text, state, symbol
 
 _LINE: dict[str, Any] = {"color": LINE_COLOURS[0], "linewidth": 0.6, "markersize": 3.5}
 _MOST_ROWS = 8
@@ -153,6 +153,6 @@ def _label(dataset: xr.Dataset, name: str) -> str:
 def _entry(history: xr.Dataset, name: str) -> str:
     """The parameters that differ between the rows."""
     if name != "point":
-        return value_text(name, history[name].item(), history[name].attrs.get("units", "1"))
-    own = [c for c in history.coords if history[c].ndim == 0 and c != "point"]
-    return ", ".join(value_text(str(c), history[c].item(), history[c].attrs.get("units", "1")) for c in own)
+        return coordinate_text(history[name])
+    own = [c for name, c in history.coords.items() if c.ndim == 0 and name != "point"]
+    return ", ".join(map(coordinate_text, own))

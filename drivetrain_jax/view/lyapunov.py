@@ -23,7 +23,7 @@ from drivetrain_jax.view.style import (
     STATE_COLOURS,
     STYLE,
     axis_label,
-    value_text,
+    coordinate_text,
     variable_label,
 )
 
@@ -126,8 +126,7 @@ def _maps(dataset: xr.Dataset, names: list[str], split: str | None) -> Figure:
         _map_row(panels, axes_row, parts, key, (horizontal, vertical))
     if split is not None:
         for axes, part in zip(panels.axes[0], parts, strict=True):
-            text = value_text(split, part[split].item(), part[split].attrs.get("units", "1"))
-            axes.text(0.5, 1.03, text, transform=axes.transAxes, ha="center", size=8)
+            axes.text(0.5, 1.03, coordinate_text(part[split]), transform=axes.transAxes, ha="center", size=8)
     for axes in panels.axes[-1]:
         axes.locator_params(axis="x", nbins=4)
     panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))

@@ -16,7 +16,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.gear import BODY_COLOURS, draw_gear
 from drivetrain_jax.view.layout import Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, STYLE, axis_label, variable_label
+from drivetrain_jax.view.style import FRAME_GREY, STYLE, axis_label, scene_key, variable_label
 
 # Rigid modes, families in their order, coupled modes.
 _RIGID, _FAMILIES, _COUPLED = "#9a9a9a", ("#16324f", "#d1771e", "#3f8f5f", "#7a4fa0", "#999933"), "#a0308c"
@@ -113,11 +113,9 @@ def _angles(dataset: xr.Dataset) -> list[float]:
     fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get(name)
     if fixed is None:
         raise InputError(f"{name or 'planets'}: missing; the figure of mode shapes needs the angles of planets")
-    angles = list(fixed["value"] if isinstance(fixed, dict) else fixed)
-    for i in range(len(angles)):
-        if f"{name}[{i}]" in dataset.coords:
-            angles[i] = float(dataset[f"{name}[{i}]"])
-    return angles
+    varied = {scene_key(c): c for c in dataset.coords.values()}
+    angles = enumerate(fixed["value"] if isinstance(fixed, dict) else fixed)
+    return [float(varied.get(f"{name}[{i}]", angle)) for i, angle in angles]
 
 
 def _distinct(frequency: np.ndarray) -> list[tuple[int, int]]:

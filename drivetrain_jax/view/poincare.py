@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.layout import Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, state, value_text
+from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, coordinate_text, state
 
 _FIRST = 1000
 _MOST_ROWS = 6
@@ -59,7 +59,7 @@ def _draw_row(row: list[Axes], part: xr.Dataset, name: str | None) -> None:
         axes.scatter(shown[:, 0], shown[:, 1], s=size, color=LINE_COLOURS[0], linewidths=0, rasterized=True)
         axes.text(1.0, 1.02, f"{len(shown)} strobes", transform=axes.transAxes, ha="right", va="bottom", size=7.5)
         axes.tick_params(labelbottom=True)
-    notes = [value_text(name, part[name].item(), part[name].attrs.get("units", "1"))] if name else []
+    notes = [coordinate_text(part[name])] if name else []
     if "torus_residual" in part:
         notes.append(f"distance from a smooth curve {np.max(part['torus_residual'].values):.1e} of the largest value")
     if "distinct_points" in part and part["distinct_points"].item():

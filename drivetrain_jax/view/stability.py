@@ -26,7 +26,7 @@ from drivetrain_jax.view.style import (
     STATE_NAMES,
     STYLE,
     axis_label,
-    value_text,
+    coordinate_text,
     variable_label,
 )
 
@@ -184,9 +184,7 @@ def _draw_radius(panels: Panels, axes: Axes, panel: xr.Dataset, whole: xr.Datase
 
 
 def _slice_text(panel: xr.Dataset, *names: str | None) -> str:
-    return ", ".join(
-        value_text(name, panel[name].item(), panel[name].attrs.get("units", "1")) for name in names if name
-    )
+    return ", ".join(coordinate_text(panel[name]) for name in names if name)
 
 
 def _spread(dataset: xr.Dataset, name: str) -> list[int]:

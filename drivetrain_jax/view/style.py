@@ -58,10 +58,10 @@ _PRODUCTS = {"EI": "$EI$", "rhoA": r"$\rho A$", "rhoI": r"$\rho I$", "kGA": r"$\
 def symbol(name: str) -> str:
     """``name`` as a formula: Greek letters by name, an index as subscript (``k_A``, ``k_joint``), else unchanged.
 
-    Scenes count entries of a list from 0, figures from 1 as bodies and modes: ``m_p[1]`` is m_p,2.
+    Entries of a list are counted from 0, as in scenes: ``m_p[1]`` is m_p,1.
     """
     if match := re.fullmatch(r"(.+)\[(\d+)\]", name):
-        head, number = symbol(match[1]), int(match[2]) + 1
+        head, number = symbol(match[1]), match[2]
         if head == match[1]:
             return name
         return f"{head[:-2]},{number}}}$" if head.endswith("}$") else f"{head[:-1]}_{{{number}}}$"
@@ -83,9 +83,14 @@ def state(dataset: xr.Dataset) -> list[dict[str, str]]:
     return json.loads(dataset.attrs.get("state", "[]"))
 
 
+def scene_key(coordinate: xr.DataArray) -> str:
+    """The name of a parameter in its scene: ``length[1]`` of the coordinate ``length_1``."""
+    return str(coordinate.attrs.get("parameter", coordinate.name))
+
+
 def axis_label(coordinate: xr.DataArray) -> str:
     """``long name (symbol) [units]`` of a swept parameter, without a symbol that repeats the long name."""
-    name, long_name = str(coordinate.name), _long_name(coordinate)
+    name, long_name = scene_key(coordinate), _long_name(coordinate)
     mark = "" if name.replace("_", " ") == long_name else f" ({symbol(name)})"
     return f"{long_name}{mark} [{coordinate.attrs.get('units', '1')}]"
 
@@ -106,6 +111,11 @@ def value_text(name: str, value: object, units: str = "1") -> str:
     return f"{symbol(name)} = {number}" + (f" {units}" if units not in ("1", "") else "")
 
 
+def coordinate_text(coordinate: xr.DataArray) -> str:
+    """``symbol = value units`` of a scalar coordinate."""
+    return value_text(scene_key(coordinate), coordinate.item(), coordinate.attrs.get("units", "1"))
+
+
 def caption(dataset: xr.Dataset) -> str:
     """One line with the fixed parameters of the scene, then scalar coordinates; defaults are left out.
 
@@ -120,23 +130,19 @@ def caption(dataset: xr.Dataset) -> str:
     shown = [] if _is_joined(dataset, named) else [name for name in fixed if name in scene.get("fixed", {})]
     varies = {str(name) for name in (*dataset.coords, *dataset.dims)}
     parts = [_fixed_text(name, _unless_swept(dataset, name, fixed[name])) for name in shown if name not in varies]
-    parts += [
-        value_text(name, coordinate.item(), coordinate.attrs.get("units", "1"))
-        for name, coordinate in scalars.items()
-        if name in named or name not in fixed
-    ]
+    parts += [coordinate_text(coordinate) for name, coordinate in scalars.items() if name in named or name not in fixed]
     return ", ".join([*parts, *([dataset.attrs["left_out"]] if "left_out" in dataset.attrs else [])])
 
 
 def _says_something(name: str, coordinate: xr.DataArray, fixed: dict[str, object]) -> bool:
     """False for a number in a list of points, and for an entry of a list that is written out as a whole."""
-    whole = str(coordinate.attrs.get("parameter", name)).partition("[")[0]
+    whole = scene_key(coordinate).partition("[")[0]
     return name != "point" and (whole == name or whole not in fixed)
 
 
 def _is_joined(dataset: xr.Dataset, known: set[str]) -> bool:
     """True if results of several scenes were joined along a dimension that no scene has."""
-    dims = {str(dim) for dim in dataset["outcome"].dims} if "outcome" in dataset else set()
+    dims = {scene_key(dataset[dim]) for dim in dataset["outcome"].dims} if "outcome" in dataset else set()
     return "scene" in dataset.attrs and bool(dims - known - {"point"})
 
 
@@ -145,7 +151,7 @@ def _unless_swept(dataset: xr.Dataset, name: str, entry: object) -> object:
     value = entry.get("value") if isinstance(entry, dict) else entry
     if not isinstance(value, (list, tuple)):
         return entry
-    axes = {str(c.name): "varies" if c.ndim else c.item() for c in dataset.coords.values()}
+    axes = {scene_key(c): "varies" if c.ndim else c.item() for c in dataset.coords.values()}
     shown = [axes.get(f"{name}[{i}]", number) for i, number in enumerate(value)]
     return {**entry, "value": shown} if isinstance(entry, dict) else shown
 

@@ -93,10 +93,12 @@ def test_points_are_one_dimension():
 def test_one_entry_of_a_list_is_swept():
     axes = {"length[1]": {"values": [0.0, 5.0]}, "a": {"values": [1.0, 6.0]}}
     ds = dt.run({"system": "toy", "analysis": "toy", "axes": axes, "fixed": {"length": [4.0, 1.0, 2.0]}})
-    assert ds["value"].dims == ("length[1]", "a")
+    assert ds["value"].dims == ("length_1", "a")
     for i, entry in enumerate((0.0, 5.0)):
         np.testing.assert_allclose(ds["value"][i], expected_value(ds["a"].values, 2.0, length=(4.0, entry, 2.0)))
-    assert ds["length[1]"].attrs["long_name"] == "lengths, entry 2 of the list"
+    named = {"units": "1", "long_name": "lengths, entry 1", "parameter": "length[1]"}
+    assert ds["length_1"].attrs == named | {"units": ds["length_1"].attrs["units"]}
+    assert "parameter" not in ds["a"].attrs
 
 
 def test_axis_that_the_analysis_does_not_use_and_integer_axis():
@@ -132,7 +134,7 @@ def test_an_option_names_the_path_and_it_may_be_one_entry_of_a_list():
     axes = {"b": {"values": [1.0, 2.0, 3.0]}, "length[1]": {"values": [5.0, 7.0]}}
     scene = {"system": "toy", "analysis": "follow", "axes": axes, "fixed": {"weight": [1.0, 2.0, 3.0]}}
     ds = dt.run(scene | {"options": {"track": "length[1]"}})
-    assert ds["load"].dims == ("b", "length[1]", "piece") and ds["piece"].values.tolist() == [1, 2, 3]
+    assert ds["load"].dims == ("b", "length_1", "piece") and ds["piece"].values.tolist() == [1, 2, 3]
     assert ds["load"].values[2].tolist() == [[1.0, 10.0, 9.0], [2.0, 24.0, 18.0]]
 
 

@@ -106,9 +106,9 @@ def test_a_long_caption_stays_in_the_figure():
         ("chi_n", r"$\chi_{n}$"),
         ("k_A", "$k_{A}$"),
         ("B0", "$B_{0}$"),
-        ("m_p[1]", "$m_{p,2}$"),
-        ("EI[0]", "$EI_{1}$"),
-        ("m_joint[1]", r"$m_{\mathrm{joint},2}$"),
+        ("m_p[1]", "$m_{p,1}$"),
+        ("EI[0]", "$EI_{0}$"),
+        ("m_joint[1]", r"$m_{\mathrm{joint},1}$"),
         ("planet_angle[1]", "planet_angle[1]"),
     ],
 )
