@@ -25,7 +25,6 @@ from drivetrain_jax.runs.run import Incomplete, run_to_file
 from drivetrain_jax.runs.status import status
 from drivetrain_jax.store.consolidate import open_result
 from drivetrain_jax.systems import get_system, system_names
-from drivetrain_jax.view import plot
 
 SCENES = Path(__file__).parents[1] / "sweeps"
 PACKAGE = Path(drivetrain_jax.__file__).parent
@@ -95,7 +94,7 @@ def draw(item: Item, results: Sequence[Path], figure: Path) -> None:
     datasets = [open_result(path) for path in results]
     if datasets[0].attrs["analysis"] == "atlas":
         datasets = [chart(ds, item.part, CELLS).assign_attrs(title=item.title) for ds in datasets]
-    plot(*datasets).savefig(figure)
+    drivetrain_jax.plot(*datasets).savefig(figure)
 
 
 def answered(title: str) -> str:

@@ -62,6 +62,19 @@ class DrivetrainAccessor:
             raise InputError("query: the result holds values on a grid; allowed for an atlas, opened from its file")
         return query(open_atlas(file), values)
 
+    def resonances(self) -> xr.DataArray:
+        """The resonances that the system predicts along an axis of the result, such as ``resonance_Omega``, by their labels.
+
+        Raises: InputError if the system predicts none along the axes of this result.
+        """
+        from drivetrain_jax.datasets.resonances import resonances
+
+        self._analysis()
+        found = resonances(self._dataset)
+        if found is None:
+            raise InputError("resonances: none are predicted along these axes; allowed is a chart that has some")
+        return found
+
     def named(self) -> xr.Dataset:
         """The result with words for codes, and with the values that do not vary, defaults included, as coordinates.
 

@@ -95,12 +95,8 @@ def _opened(path: str, grid: Any, solve: bool) -> xr.Dataset:
     for name, value in point.items():
         variable = dataset[name].variable
         data = indexing.LazilyIndexedArray(AtlasArray(cells, name, value.shape, value.dtype))
-        dataset[name] = xr.Variable(variable.dims, data, variable.attrs)
-    for name, variable in dataset.variables.items():
-        # Coordinates along these axes too, or Dask finds chunks that differ.
-        if name not in dataset.indexes:
-            sizes = dict(zip(variable.dims, variable.shape, strict=True))
-            dataset[name].encoding["preferred_chunks"] = sizes | {d: n for d, n in chunks.items() if d in sizes}
+        sizes = dict(zip(variable.dims, variable.shape, strict=True))
+        dataset[name] = xr.Variable(variable.dims, data, variable.attrs, {"preferred_chunks": sizes | chunks})
     if not solve:
         about = dataset[OUTCOME.name].attrs
         about["flag_values"] = np.arange(GAP + 1, dtype=OUTCOME.dtype)

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
     Result = xr.Dataset | str | Path
 
+# Analyses whose figures show predicted resonances.
+_PREDICTED = ("floquet", "forced", "frequency_response", "steady_state")
 # Cells each way in the chart of an atlas.
 CELLS = 800
 # Cells that a figure may have: matplotlib takes some hundred bytes for each.
@@ -53,11 +55,11 @@ def plot(
     if any(dataset.attrs.get("analysis") == "atlas" for dataset in datasets):
         if len(datasets) > 1:
             raise InputError("results: an atlas among several; allowed is an atlas alone")
-        return view.plot(_chart(sources[0], datasets[0], part, cells))
+        return view.plot(_with_resonances(_chart(sources[0], datasets[0], part, cells)))
     if part is not None or cells is not None:
         field = f"part = {shown(part)}" if part is not None else f"cells = {cells}"
         raise InputError(f"{field}: a result on a grid is drawn whole; allowed for an atlas")
-    return view.plot(*map(_loaded, datasets))
+    return view.plot(*(_with_resonances(_loaded(dataset)) for dataset in datasets))
 
 
 def _dataset(source: Any) -> xr.Dataset:
@@ -95,6 +97,16 @@ def _chart(
     # From its file an atlas is checked for damage.
     place = Path(source) if isinstance(source, (str, Path)) else dataset
     return chart(place, part or {}, CELLS if cells is None else cells)
+
+
+def _with_resonances(dataset: xr.Dataset) -> xr.Dataset:
+    """``dataset`` with the predicted resonances of its system; older files hold them."""
+    from drivetrain_jax.datasets.resonances import LABELS, resonances
+
+    if dataset.attrs.get("analysis") not in _PREDICTED or LABELS in dataset.coords:
+        return dataset
+    found = resonances(dataset)
+    return dataset if found is None else dataset.assign_coords({found.name: found})
 
 
 def _loaded(dataset: xr.Dataset) -> xr.Dataset:

@@ -174,8 +174,9 @@ def labelled(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str,
     """The labelled result: dimensions are the axes in scene order (or ``point``), then those of the variable."""
     sweep_dims = ("point",) if scene.zipped else tuple(axis.dim for axis in scene.axes)
     results = [(v, arrays[v.name]) for v in result_variables(scene)]
-    coordinates = [*_axis_coordinates(scene), *_resonances(scene)]
-    return Labelled.build(sweep_dims, coordinates, scene.dimensions, results, result_attrs(scene) | dict(attrs))
+    return Labelled.build(
+        sweep_dims, _axis_coordinates(scene), scene.dimensions, results, result_attrs(scene) | dict(attrs)
+    )
 
 
 def to_dataset(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str, str | float]) -> xr.Dataset:
@@ -199,27 +200,6 @@ def _axis_coordinates(scene: Scene) -> list[Coordinate]:
         numbers = np.arange(len(scene.axes[0].values))
         coordinates.insert(0, Coordinate("point", ("point",), numbers, "1", "number of the point"))
     return coordinates
-
-
-def _resonances(scene: Scene) -> list[Coordinate]:
-    """Predicted resonances of the system: labels, and values over the axes that they depend on."""
-    predicted = scene.system.resonances
-    axes = {axis.name: axis.values for axis in scene.axes}
-    if predicted is None or scene.zipped or predicted.axis not in axes:
-        return []
-    if any(name not in axes and name not in scene.fixed for name in predicted.parameters):
-        return []
-    depends = [axis.name for axis in scene.axes if axis.name in predicted.parameters]
-    mesh = dict(zip(depends, np.meshgrid(*(axes[name] for name in depends), indexing="ij"), strict=True))
-    values = np.asarray(
-        predicted.values({name: mesh.get(name, scene.fixed.get(name)) for name in predicted.parameters})
-    )
-    units = scene.system.parameter(predicted.axis).units
-    name = f"resonance_{predicted.axis}"
-    return [
-        Coordinate("resonance", ("resonance",), np.array(predicted.labels), "1", "name of the resonance"),
-        Coordinate(name, (*depends, "resonance"), values, units, predicted.long_name),
-    ]
 
 
 def _drawn(system: type[System]) -> dict[str, str]:

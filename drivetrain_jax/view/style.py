@@ -121,13 +121,12 @@ def caption(dataset: xr.Dataset) -> str:
 
     Joined results may differ in what their scenes fix: only their coordinates are shown.
     """
-    fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}"))
-    scene = tomllib.loads(dataset.attrs["scene"]) if "scene" in dataset.attrs else {"fixed": fixed}
-    named = {name for table in ("fixed", "axes", "points") for name in scene.get(table, {})}
+    fixed, given = json.loads(dataset.attrs.get("fixed_parameters", "{}")), _given(dataset)
+    named = set().union(*given.values())
     scalars = {
         str(name): c for name, c in dataset.coords.items() if c.ndim == 0 and _says_something(str(name), c, fixed)
     }
-    shown = [] if _is_joined(dataset, named) else [name for name in fixed if name in scene.get("fixed", {})]
+    shown = [] if is_joined(dataset) else [name for name in fixed if name in given["fixed"]]
     varies = {str(name) for name in (*dataset.coords, *dataset.dims)}
     parts = [_fixed_text(name, _unless_swept(dataset, name, fixed[name])) for name in shown if name not in varies]
     parts += [coordinate_text(coordinate) for name, coordinate in scalars.items() if name in named or name not in fixed]
@@ -140,10 +139,18 @@ def _says_something(name: str, coordinate: xr.DataArray, fixed: dict[str, object
     return name != "point" and (whole == name or whole not in fixed)
 
 
-def _is_joined(dataset: xr.Dataset, known: set[str]) -> bool:
+def is_joined(dataset: xr.Dataset) -> bool:
     """True if results of several scenes were joined along a dimension that no scene has."""
     dims = {scene_key(dataset[dim]) for dim in dataset["outcome"].dims} if "outcome" in dataset else set()
-    return "scene" in dataset.attrs and bool(dims - known - {"point"})
+    return "scene" in dataset.attrs and bool(dims - set().union(*_given(dataset).values()) - {"point"})
+
+
+def _given(dataset: xr.Dataset) -> dict[str, set[str]]:
+    """Names of the parameters in each table of the scene; without a scene all are fixed."""
+    if "scene" not in dataset.attrs:
+        return {"fixed": set(json.loads(dataset.attrs.get("fixed_parameters", "{}")))}
+    scene = tomllib.loads(dataset.attrs["scene"])
+    return {table: set(scene.get(table, ())) for table in ("fixed", "axes", "points")}
 
 
 def _unless_swept(dataset: xr.Dataset, name: str, entry: object) -> object:

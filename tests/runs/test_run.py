@@ -177,11 +177,23 @@ def test_a_result_without_a_single_value_has_its_dimensions_and_grows(tmp_path):
 
 def test_resonances_depend_on_the_axes_among_their_parameters():
     ds = dt.run({"system": "toy", "analysis": "toy", "axes": {"a": {"values": [1, 2]}, "b": {"values": [1.0, 3.0]}}})
-    assert ds["resonance_a"].dims == ("b", "resonance") and ds["resonance"].values.tolist() == ["R1", "R2"]
-    assert ds["resonance_a"].values.tolist() == [[1, 0.5], [3, 1.5]] and ds["resonance_a"].attrs["units"] == "m"
+    assert "resonance" not in ds.dims
+    predicted = ds.drivetrain.resonances()
+    assert predicted.name == "resonance_a" and predicted.attrs["units"] == "m"
+    assert predicted.dims == ("b", "resonance") and predicted["resonance"].values.tolist() == ["R1", "R2"]
+    assert predicted.values.tolist() == [[1, 0.5], [3, 1.5]]
+    assert ds.isel(b=1).drivetrain.resonances().values.tolist() == [3, 1.5]
     fixed = dt.run({"system": "toy", "analysis": "toy", "axes": {"a": {"values": [1, 2]}}})
-    assert fixed["resonance_a"].values.tolist() == [2.0, 1.0]
-    assert "resonance_a" not in dt.run({"system": "toy", "analysis": "toy", "points": {"a": [1, 2]}}).coords
+    assert fixed.drivetrain.resonances().values.tolist() == [2.0, 1.0]
+    # Nobody knows in what results along a dimension of the user's differ.
+    for other in (
+        dt.run({"system": "toy", "analysis": "toy", "points": {"a": [1, 2]}}),
+        xr.concat([fixed, fixed], "run"),
+        fixed.isel(a=0),
+        fixed.assign_attrs(system="of another package"),
+    ):
+        with pytest.raises(dt.InputError, match="resonances: none are predicted along these axes"):
+            other.drivetrain.resonances()
 
 
 def test_file_opens_with_xarray_h5py_and_netcdf4(grid_scene, tmp_path):

@@ -1,0 +1,57 @@
+"""Predicted resonances of the system of a result, computed from its scene whenever a figure or a user asks."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.view.style import is_joined, scene_key
+
+LABELS = "resonance"
+
+
+def resonances(dataset: xr.Dataset) -> xr.DataArray | None:
+    """The predicted resonances of the system of ``dataset`` along the axis that they are values of; None without any.
+
+    Returns: ``resonance_AXIS`` with the dimension ``resonance`` (labels), after the axes that the predictions depend on.
+    """
+    # Local import: it loads jax.
+    from drivetrain_jax.runs.scene import find_system
+
+    try:
+        system = find_system(str(dataset.attrs.get("system")))
+    except InputError:
+        # The package of the system is not installed, or the dataset is a sweep of a function.
+        return None
+    predicted = system.resonances
+    if predicted is None or predicted.axis not in dataset.dims or is_joined(dataset):
+        return None
+    values = {name: _value(dataset, name) for name in predicted.parameters}
+    if any(value is None for value in values.values()):
+        return None
+    dims = [str(dim) for dim in dataset.dims if dim in values]
+    mesh = dict(zip(dims, np.meshgrid(*(values[dim] for dim in dims), indexing="ij"), strict=True))
+    about = {"units": system.parameter(predicted.axis).units, "long_name": predicted.long_name}
+    return xr.DataArray(
+        predicted.values(values | mesh),
+        {dim: dataset[dim] for dim in dims} | {LABELS: (LABELS, list(predicted.labels), {"long_name": "resonance"})},
+        [*dims, LABELS],
+        f"{LABELS}_{predicted.axis}",
+        about,
+    )
+
+
+def _value(dataset: xr.Dataset, name: str) -> Any:
+    """The values of a parameter along its axis, or its value everywhere; None without either."""
+    if name in dataset.coords and dataset[name].dims in ((), (name,)):
+        return dataset[name].values
+    swept = {scene_key(coordinate).partition("[")[0] for coordinate in dataset.coords.values() if coordinate.ndim}
+    fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get(name)
+    if fixed is None or name in swept:
+        return None
+    # JSON has no infinity.
+    return np.inf if fixed["value"] == "inf" else fixed["value"]
