@@ -15,7 +15,7 @@ from drivetrain_jax._quantities import FIRST_FAILURE, Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.grid import Grid
 from drivetrain_jax.runs.identity import PACKAGES
-from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.runs.scene import Scene, result_variables
 from drivetrain_jax.store import provenance
 from drivetrain_jax.store.consolidate import release
 from drivetrain_jax.store.schema import Coordinate, Labelled
@@ -153,11 +153,6 @@ def missing_value(variable: Variable) -> float | int:
         return Outcome.STEP_LIMIT
     # Integers have no NaN: a flag uses its last code (undecided, none).
     return len(variable.flags) - 1 if variable.flags else 0 if np.dtype(variable.dtype).kind in "iu" else np.nan
-
-
-def result_variables(scene: Scene) -> tuple[Variable, ...]:
-    """The requested results, then the outcome."""
-    return (*(scene.analysis.variable(name) for name in scene.request.outputs), OUTCOME)
 
 
 def bytes_per_point(scene: Scene, on_disk: bool) -> int:

@@ -300,18 +300,11 @@ class StoredAtlas:
         return values[name]
 
     def _scene(self, axes: Mapping[str, np.ndarray], fixed: Mapping[str, Any], request: Request, zipped: bool) -> Scene:
-        system, floquet = self.scene.system, get_analysis("floquet").for_system(self.scene.system)
+        scene, system = self.scene, self.scene.system
         columns = tuple(Axis(name, system.parameter(name), None, np.asarray(v, float)) for name, v in axes.items())
-        fixed = dict(self.scene.fixed) | {name: value for name, value in fixed.items() if name not in axes}
-        return replace(
-            self.scene,
-            analysis=floquet,
-            request=request,
-            axes=columns,
-            zipped=zipped,
-            fixed=fixed,
-            dimensions=floquet.dimensions(system, request, fixed),
-        )
+        fixed = dict(scene.fixed) | {name: value for name, value in fixed.items() if name not in axes}
+        floquet = get_analysis("floquet").for_system(system)
+        return Scene(system, floquet, request, columns, zipped, fixed, scene.title, scene.text)
 
 
 def as_given(value: Any) -> str:

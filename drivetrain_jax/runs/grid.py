@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from drivetrain_jax.runs.axes import Axis
-from drivetrain_jax.runs.scene import Scene, Value
+from drivetrain_jax.runs.scene import Problem, Value
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Grid:
     path_position: int | None = None
 
     @classmethod
-    def of(cls, scene: Scene) -> Grid:
+    def of(cls, scene: Problem) -> Grid:
         """The grid of ``scene``; a fixed path parameter gives lines of one value."""
         parameters = scene.analysis.model(scene.system).parameters
         name = scene.path_axis
@@ -113,7 +113,7 @@ class Grid:
         return value if whole else np.broadcast_to(value, shape)
 
 
-def _numbers(scene: Scene) -> dict[str, float]:
+def _numbers(scene: Problem) -> dict[str, float]:
     """The fixed numbers of the model, without those from which it may conclude that a part is absent.
 
     Such numbers are 0, infinity and defaults. They are constants of compiled code, and so are lists, whose entries may be

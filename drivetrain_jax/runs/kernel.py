@@ -17,10 +17,9 @@ from jax import Array
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import Analysis, Solver
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, on_cpu, options_for_few
-from drivetrain_jax.runs.assemble import result_variables
 from drivetrain_jax.runs.grid import Grid
 from drivetrain_jax.runs.plan import make_plan
-from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.runs.scene import Problem, result_variables
 from drivetrain_jax.systems import System
 
 _LAPACK = threading.Lock()
@@ -84,9 +83,9 @@ def _arrays(numbers: Mapping[str, float]) -> dict[str, np.float64]:
     return {name: np.float64(value) for name, value in numbers.items()}
 
 
-def result_shapes(scene: Scene, grid: Grid, solver: Solver) -> dict[str, tuple[int, ...]]:
+def result_shapes(problem: Problem, grid: Grid, solver: Solver) -> dict[str, tuple[int, ...]]:
     """The shape of every result at one point (or line), without compiling."""
-    variables = result_variables(scene)
+    variables = result_variables(problem)
     batch, kinds = _batch(solver, grid, 1, variables)
     shapes = jax.eval_shape(batch, *kinds)
     return {v.name: shapes[v.name].shape[:-1] for v in variables}
@@ -116,25 +115,25 @@ def is_small(grid: Grid, solvers: Sequence[Solver]) -> bool:
 
 
 @dataclass(frozen=True)
-class _Job:
-    """The key of a kernel in the cache; equal jobs share one kernel."""
+class _Key:
+    """The key of a kernel in the cache; what does not compare follows from what does."""
 
     system: type[System]
     analysis: Analysis
     structure: tuple[Any, ...]
-    scene: Scene = field(compare=False)
+    variables: tuple[Variable, ...] = field(compare=False)
     grid: Grid = field(compare=False)
     solver: Solver = field(compare=False)
 
 
-def kernel_of(scene: Scene, grid: Grid, solver: Solver, size: int, few: bool = False) -> Kernel:
-    """The kernel of ``solver`` for chunks of ``size`` points of ``scene``, made if no scene before needed the same.
+def kernel_of(problem: Problem, grid: Grid, solver: Solver, size: int, few: bool = False) -> Kernel:
+    """The kernel of ``solver`` for chunks of ``size`` points of ``problem``, made if no problem before needed the same.
 
     For ``few`` see :func:`compile_kernel`.
     """
     # What varies is an argument of the kernel, so one value of each axis is enough to keep.
     axes = tuple(replace(axis, values=axis.values[:1]) for axis in grid.axes)
-    request, numbers = scene.request, grid.numbers
+    request, numbers = problem.request, grid.numbers
     structure = (
         request.outputs,
         request.method,
@@ -145,13 +144,14 @@ def kernel_of(scene: Scene, grid: Grid, solver: Solver, size: int, few: bool = F
         None if grid.path is None else (grid.path.name, grid.path.values.tobytes()),
         solver.name,
     )
-    job = _Job(scene.system, scene.analysis, structure, replace(scene, axes=axes), replace(grid, axes=axes), solver)
-    return _compiled(job, size, few)
+    variables = result_variables(problem)
+    key = _Key(problem.system, problem.analysis, structure, variables, replace(grid, axes=axes), solver)
+    return _compiled(key, size, few)
 
 
 @lru_cache(maxsize=64)
-def _compiled(job: _Job, size: int, few: bool) -> Kernel:
-    return compile_kernel(job.solver, job.grid, size, result_variables(job.scene), few)
+def _compiled(key: _Key, size: int, few: bool) -> Kernel:
+    return compile_kernel(key.solver, key.grid, size, key.variables, few)
 
 
 def _turn(compiled: Any) -> AbstractContextManager[object]:

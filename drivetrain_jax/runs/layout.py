@@ -8,9 +8,8 @@ from typing import Any, cast
 import h5py
 import numpy as np
 
-from drivetrain_jax.runs.assemble import result_variables
 from drivetrain_jax.runs.grid import Grid
-from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.runs.scene import Scene, result_variables
 
 
 def rearranged(path: Path, scene: Scene, grid: Grid) -> list[str]:

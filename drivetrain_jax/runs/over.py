@@ -138,8 +138,7 @@ def _function_scene(
         raise InputError(f"over: {double[0]!r} names two dimensions or results; allowed are distinct names")
     text = f'system = "{kind.name}"\nanalysis = "{name}"\n\n[fixed]\n{_COMPUTES} = "{computes}"\n'
     request, fixed = Request(tuple(wanted), "function", {}), {_COMPUTES: computes}
-    dimensions = analysis.dimensions(kind, request, fixed)
-    return Scene(f"{name} of {kind.title}", kind, analysis, request, axes, False, fixed, dimensions, None, text)
+    return Scene(kind, analysis, request, axes, False, fixed, f"{name} of {kind.title}", text)
 
 
 class _Once:

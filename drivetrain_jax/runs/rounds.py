@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from drivetrain_jax._wording import counted
-from drivetrain_jax.analysis import Request
+from drivetrain_jax.analysis import Analysis, Request
 from drivetrain_jax.analysis.periodic.floquet_propagator import ANALYSIS
 from drivetrain_jax.atlas import (
     Atlas,
@@ -24,7 +23,7 @@ from drivetrain_jax.atlas.construction import MAX_SOLVES
 from drivetrain_jax.runs.axes import Axis
 from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.executor import Where
-from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.runs.scene import Problem, Scene
 from drivetrain_jax.runs.work import Progress, Work
 
 # Ratio of the tolerance of the panels to that of the results.
@@ -92,16 +91,22 @@ def fixed_of(scene: Scene, ranges: Mapping[str, tuple[float, float]]) -> dict[st
     return {name: fixed[name] for name in scene.system.models[ANALYSIS.name].parameters if name in fixed}
 
 
-def _solves(scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.ndarray, options: Mapping) -> Scene:
-    """The scene of one round."""
+def _solves(scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.ndarray, options: Mapping) -> Nodes:
+    """The solves of one round."""
     axes = tuple(
         Axis(name, scene.system.parameter(name), None, column) for name, column in zip(names, points.T, strict=True)
     )
     request = Request(ANALYSIS.default_outputs, next(iter(ANALYSIS.methods)), dict(options))
-    dimensions = ANALYSIS.dimensions(scene.system, request, fixed)
-    return replace(
-        scene, analysis=ANALYSIS, request=request, axes=axes, zipped=True, fixed=fixed, dimensions=dimensions
-    )
+    return Nodes(scene.system, ANALYSIS, request, axes, True, fixed)
+
+
+class Nodes(Problem):
+    """Points at which the propagator is solved. Its analysis has the name that scenes give to a whole atlas."""
+
+    @staticmethod
+    def find_analysis(name: str) -> Analysis:
+        """The analysis of the propagator."""
+        return ANALYSIS
 
 
 class _Answers:

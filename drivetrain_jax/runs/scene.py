@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,9 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._machine import physical_memory
-from drivetrain_jax._quantities import Dimension, Parameter
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax._wording import clipped, did_you_mean, nearest, shown
-from drivetrain_jax.analysis import Analysis, Request, analyses_of, get_analysis
+from drivetrain_jax.analysis import OUTCOME, Analysis, Request, analyses_of, get_analysis
 from drivetrain_jax.analysis.request import checked, make_request
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.axes import MAX_POINTS, MAX_RANGES, Axis, AxisTable, check_count, entry_of, spread
@@ -28,25 +29,59 @@ _BYTES = 32
 Value = float | int | str | tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class Scene:
-    """A checked scene.
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The results that are computed, and their points.
 
     ``axes`` vary: as an outer product in this order, or together as a list of points if ``zipped``. ``fixed`` holds the
-    other known parameters of the system, defaults included. ``dimensions`` are those of the analysis. ``path_axis`` is the
-    name of the axis that the analysis computes as a whole. ``text`` is the scene in TOML.
+    other known parameters of the system, defaults included. A worker receives a problem by the names of its system and
+    analysis.
     """
 
-    title: str
     system: type[System]
     analysis: Analysis
     request: Request
     axes: tuple[Axis, ...]
     zipped: bool
     fixed: Mapping[str, Value]
-    dimensions: tuple[Dimension, ...]
-    path_axis: str | None
+
+    @cached_property
+    def dimensions(self) -> tuple[Dimension, ...]:
+        """Dimensions of the results besides those of the sweep."""
+        return self.analysis.dimensions(self.system, self.request, self.fixed)
+
+    @cached_property
+    def path_axis(self) -> str | None:
+        """Name of the axis that the analysis computes as a whole, if any."""
+        return self.analysis.path_axis(self.system, self.request)
+
+    @staticmethod
+    def find_analysis(name: str) -> Analysis:
+        """The analysis of this name."""
+        return get_analysis(name)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        names = {"system": self.system.name, "analysis": self.analysis.name}
+        return _restored, (type(self), {f.name: getattr(self, f.name) for f in fields(self)} | names)
+
+
+def _restored(kind: type[Problem], values: dict[str, Any]) -> Problem:
+    system = find_system(values["system"])
+    analysis = kind.find_analysis(values["analysis"]).for_system(system)
+    return kind(**values | {"system": system, "analysis": analysis})
+
+
+@dataclass(frozen=True, eq=False)
+class Scene(Problem):
+    """A checked scene; ``text`` is the scene in TOML."""
+
+    title: str
     text: str
+
+
+def result_variables(problem: Problem) -> tuple[Variable, ...]:
+    """The requested results, then the outcome."""
+    return (*(problem.analysis.variable(name) for name in problem.request.outputs), OUTCOME)
 
 
 class _SceneTable(msgspec.Struct, forbid_unknown_fields=True):
@@ -74,10 +109,12 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
     request = make_request(system, analysis, table.outputs, table.options, {*table.axes, *table.points})
     axes, zipped = _axes(table, system, analysis)
     fixed = _fixed(table, system, analysis, axes)
-    path_axis = _path_axis(analysis, analysis.path_axis(system, request), axes, zipped, fixed)
-    dimensions = analysis.dimensions(system, request, fixed)
     title = table.title or f"{system.title}: {analysis.title}"
-    return Scene(title, system, analysis, request, axes, zipped, fixed, dimensions, path_axis, text)
+    scene = Scene(system, analysis, request, axes, zipped, fixed, title, text)
+    _check_path(scene)
+    # The analysis checks that request and parameters match.
+    _ = scene.dimensions
+    return scene
 
 
 def find_system(name: str) -> type[System]:
@@ -282,17 +319,14 @@ def _check_together(model: Model, fixed: Mapping[str, Value]) -> None:
         raise InputError(f"fixed.{error}") from None
 
 
-def _path_axis(
-    analysis: Analysis, name: str | None, axes: tuple[Axis, ...], zipped: bool, fixed: Mapping[str, Value]
-) -> str | None:
-    """The checked ``name`` of the path axis: an axis of the scene, or a fixed number as a line of one value."""
-    names = [axis.name for axis in axes]
-    if name in names and zipped:
-        raise InputError(f"points.{name}: {analysis.name} uses it as a path; allowed is an axis or a fixed value")
-    if name is not None and name not in names and not isinstance(fixed.get(name), (int, float)):
+def _check_path(scene: Scene) -> None:
+    """Check that the path is an axis of the scene, or a fixed number: a line of one value."""
+    name, names = scene.path_axis, [axis.name for axis in scene.axes]
+    if name in names and scene.zipped:
+        raise InputError(f"points.{name}: {scene.analysis.name} uses it as a path; allowed is an axis or a fixed value")
+    if name is not None and name not in names and not isinstance(scene.fixed.get(name), (int, float)):
         allowed = f"allowed is one of {', '.join(names)}" if names else "the scene has no axes"
         raise InputError(f"options: {name!r} is not an axis of the scene; {allowed}")
-    return name
 
 
 def _check_entry(axis: Axis, fixed: Mapping[str, Value], where: str) -> None:

@@ -15,12 +15,13 @@ import numpy as np
 
 from drivetrain_jax._errors import ChunkError, InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.runs.assemble import failures, missing_value, result_attrs, result_variables
+from drivetrain_jax.runs.assemble import failures, missing_value, result_attrs
 from drivetrain_jax.runs.atlas_choice import uses_atlas
 from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.executor import Where
 from drivetrain_jax.runs.kernel import result_shapes
 from drivetrain_jax.runs.plan import Chunk
+from drivetrain_jax.runs.scene import result_variables
 from drivetrain_jax.runs.work import Progress, Report
 from drivetrain_jax.runs.worker import Job
 from drivetrain_jax.store import shards
