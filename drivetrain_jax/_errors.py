@@ -9,5 +9,5 @@ class ChunkError(RuntimeError):
     """Raised for a failed computation; the message names the chunk and the reason."""
 
 
-class Passing(ChunkError):
+class RetryableError(ChunkError):
     """Raised for a cause that may vanish: too little memory, a full disk, a dead worker or scheduler."""

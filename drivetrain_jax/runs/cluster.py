@@ -9,7 +9,7 @@ from collections.abc import Generator, Iterable
 from contextlib import ExitStack
 from typing import Any
 
-from drivetrain_jax._errors import InputError, Passing
+from drivetrain_jax._errors import InputError, RetryableError
 from drivetrain_jax.runs import worker
 from drivetrain_jax.runs.executor import IN_FLIGHT, Results
 from drivetrain_jax.runs.plan import Chunk
@@ -25,7 +25,8 @@ def run_cluster(chunks: Iterable[Chunk], job: Job, address: str) -> Generator[tu
     """Yield ``(chunk, results)`` in the order of completion, from the scheduler at ``address`` or ``local:N`` processes.
 
     A chunk whose worker died is computed again. Results are None after too many deaths (Dask's setting
-    ``distributed.scheduler.allowed-failures``). Exceptions of chunks are raised; a lost scheduler raises :class:`Passing`.
+    ``distributed.scheduler.allowed-failures``). Exceptions of chunks are raised; a lost scheduler
+    raises :class:`RetryableError`.
     """
     distributed = _distributed()
     with ExitStack() as stack:
@@ -61,7 +62,7 @@ def _result(distributed: Any, future: Any) -> Results | None:
     except distributed.KilledWorker:
         return None
     except (distributed.CancelledError, OSError) as error:
-        raise Passing(f"dask: connection to the scheduler lost ({type(error).__name__})") from error
+        raise RetryableError(f"dask: connection to the scheduler lost ({type(error).__name__})") from error
 
 
 def _connect(distributed: Any, address: str, stack: ExitStack) -> Any:

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from drivetrain_jax._errors import ChunkError, InputError, Passing
+from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax._threads import threads
 from drivetrain_jax.runs import compile_cache
 from drivetrain_jax.runs.grid import Grid
@@ -111,7 +111,7 @@ class Engine:
             return kernel(self.grid.columns(chunk.points), self.grid.numbers, chunk.effort)
         except Exception as error:
             solver = self.solvers[chunk.solver].name
-            kind = Passing if _may_pass(error) else ChunkError
+            kind = RetryableError if _is_retryable(error) else ChunkError
             raise kind(f"chunk {chunk.number} ({solver}): {type(error).__name__}: {error}") from error
 
 
@@ -123,6 +123,6 @@ def _use_double_precision() -> None:
         raise InputError("jax_enable_x64 = False: set by the context of this call; allowed is jax.enable_x64(True)")
 
 
-def _may_pass(error: Exception) -> bool:
+def _is_retryable(error: Exception) -> bool:
     # XLA reports lack of memory by an exception of its own.
     return isinstance(error, (OSError, MemoryError)) or "RESOURCE_EXHAUSTED" in str(error)

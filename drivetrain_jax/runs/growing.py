@@ -73,7 +73,7 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Taken:
+class ReusedPoints:
     """The points reused from ``sources``, which are disjoint."""
 
     sources: tuple[Source, ...]
@@ -108,19 +108,19 @@ class Taken:
             yield from source.blocks(names)
 
 
-NOTHING = Taken(())
+NO_REUSE = ReusedPoints(())
 
 
-def rest_of(engine: Engine, taken: Taken) -> Engine:
+def remaining(engine: Engine, reused: ReusedPoints) -> Engine:
     """``engine`` restricted to the points that are not reused."""
-    if not taken.sources:
+    if not reused.sources:
         return engine
     left = np.ones(engine.grid.size, bool)
-    left[taken.points] = False
+    left[reused.points] = False
     return engine.only(np.flatnonzero(left))
 
 
-def take(engine: Engine, found: Iterable[Source]) -> Taken:
+def combined(engine: Engine, found: Iterable[Source]) -> ReusedPoints:
     """The points of ``engine`` that these results contain, each from the first result that has it."""
     free = np.ones(engine.grid.size, bool)
     sources = []
@@ -128,7 +128,7 @@ def take(engine: Engine, found: Iterable[Source]) -> Taken:
         keep = free[source.ours]
         free[source.ours] = False
         sources.append(replace(source, theirs=source.theirs[keep], ours=source.ours[keep]))
-    return Taken(tuple(source for source in sources if source.ours.size))
+    return ReusedPoints(tuple(source for source in sources if source.ours.size))
 
 
 def find(engine: Engine, path: Path) -> Source:

@@ -14,7 +14,7 @@ from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import Table, enter, to_dataset
 from drivetrain_jax.runs.atlas_choice import uses_atlas
 from drivetrain_jax.runs.engine import Engine
-from drivetrain_jax.runs.growing import rest_of
+from drivetrain_jax.runs.growing import remaining
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.runs.sharded import stored
 from drivetrain_jax.runs.target import Target
@@ -72,9 +72,9 @@ def _finished(engine: Engine, target: Target) -> Iterator[tuple[np.ndarray, Mapp
             if arrays is not None:
                 yield shards.without_padding(arrays)
         return
-    taken = target.taken_before()
-    yield from taken.blocks([variable.name for variable in Table(engine.scene, engine.grid).variables])
-    plan = rest_of(engine, taken).plan
+    reused = target.reused_before()
+    yield from reused.blocks([variable.name for variable in Table(engine.scene, engine.grid).variables])
+    plan = remaining(engine, reused).plan
     for part in target.parts.read():
         for number, results in part:
             yield plan.chunk(number).points, results

@@ -155,7 +155,7 @@ class Blocks:
         return orders, efforts
 
 
-class _Tally:
+class _EffortCounter:
     """Collects the efforts of one solver: of each point while chunks may be small, then the largest of each chunk."""
 
     def __init__(self, solver: Solver) -> None:
@@ -199,11 +199,11 @@ def make_plan(
 
     ``full_size`` keeps the chunk size for few points, so further plans need no other kernels.
     """
-    blocks, tallies = Blocks(solvers, grid, points), [_Tally(solver) for solver in solvers]
+    blocks, counters = Blocks(solvers, grid, points), [_EffortCounter(solver) for solver in solvers]
     for block in range(blocks.count):
-        for tally, efforts in zip(tallies, blocks.efforts(block), strict=True):
-            tally.add(efforts)
-    return Plan(tuple(tally.group(i, full_size) for i, tally in enumerate(tallies) if tally.count), blocks)
+        for counter, efforts in zip(counters, blocks.efforts(block), strict=True):
+            counter.add(efforts)
+    return Plan(tuple(counter.group(i, full_size) for i, counter in enumerate(counters) if counter.count), blocks)
 
 
 def mean_cost(solvers: Sequence[Solver], grid: Grid, points: np.ndarray) -> float:

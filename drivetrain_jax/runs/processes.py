@@ -11,7 +11,7 @@ from collections.abc import Generator, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 
-from drivetrain_jax._errors import Passing
+from drivetrain_jax._errors import RetryableError
 from drivetrain_jax.runs import worker
 from drivetrain_jax.runs.executor import IN_FLIGHT, Results
 from drivetrain_jax.runs.plan import Chunk
@@ -117,7 +117,7 @@ class _Slot:
         except BrokenProcessPool:
             self._stillborn += 1
             if self._stillborn >= ATTEMPTS:
-                raise Passing("worker processes crash during their start") from None
+                raise RetryableError("worker processes crash during their start") from None
             return False
         self._stillborn = 0
         return True

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drivetrain_jax._errors import ChunkError, InputError, Passing
+from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax._machine import physical_memory
 from drivetrain_jax._wording import shown
 from drivetrain_jax.analysis import OUTCOME
@@ -16,7 +16,7 @@ from drivetrain_jax.runs.assemble import Table, bytes_per_point, failures, to_da
 from drivetrain_jax.runs.atlas_choice import uses_atlas
 from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.executor import Where
-from drivetrain_jax.runs.growing import NOTHING, Taken, rest_of
+from drivetrain_jax.runs.growing import NO_REUSE, ReusedPoints, remaining
 from drivetrain_jax.runs.notebook import shown_progress
 from drivetrain_jax.runs.scene import Scene, load_scene
 from drivetrain_jax.runs.target import Target
@@ -123,7 +123,7 @@ def run_to_file(
         raise target.refusal
     target.check_writable()
     where.check()
-    return _into(target, target.take(_paths(reuse), fresh), fresh, where, report)
+    return _into(target, target.reused_points(_paths(reuse), fresh), fresh, where, report)
 
 
 def _paths(reuse: str | Path | Sequence[str | Path]) -> Sequence[str | Path]:
@@ -133,20 +133,20 @@ def _paths(reuse: str | Path | Sequence[str | Path]) -> Sequence[str | Path]:
     return paths
 
 
-def _into(target: Target, taken: Taken, fresh: bool, where: Where, report: Report | None) -> Progress:
-    """Start or resume the result of ``target``; the points ``taken`` are reused."""
+def _into(target: Target, reused: ReusedPoints, fresh: bool, where: Where, report: Report | None) -> Progress:
+    """Start or resume the result of ``target``; the points ``reused`` are reused."""
     engine, parts, progress = target.engine, target.parts, _progress(target.engine)
     begins = False
     try:
         parts.open()
         target.check_unchanged()
-        begins = not target.resumes(taken, fresh)
+        begins = not target.resumes(reused, fresh)
         if begins:
-            parts.start(target.plan(taken, fresh))
+            parts.start(target.plan(reused, fresh))
         if target.store == "zarr":
             sharded.compute(engine, target.out, parts, progress, where, report)
         else:
-            _resume(engine, target.out, parts, progress, where, report, taken)
+            _resume(engine, target.out, parts, progress, where, report, reused)
         parts.close(remove=True)
     except KeyboardInterrupt:
         raise Interrupted(progress) from None
@@ -154,7 +154,7 @@ def _into(target: Target, taken: Taken, fresh: bool, where: Where, report: Repor
         # Failures at the start, such as no scheduler at the address, must leave no files.
         parts.close(remove=not parts.holds_work() or (begins and progress.computed == 0))
         raise
-    except (Passing, OSError, MemoryError) as error:
+    except (RetryableError, OSError, MemoryError) as error:
         raise Incomplete(f"{error or type(error).__name__}; the same command resumes", progress) from error
     except ChunkError as error:
         # The same command would fail again.
@@ -207,9 +207,9 @@ def _resume(
     progress: Progress,
     where: Where,
     report: Report | None,
-    taken: Taken,
+    reused: ReusedPoints,
 ) -> None:
-    """Write the result ``out`` from the points ``taken``, the existing parts, and newly computed chunks."""
+    """Write the result ``out`` from the points ``reused``, the existing parts, and newly computed chunks."""
     work, begin = Work(where, report, parts), time.monotonic()
 
     def seconds() -> float:
@@ -223,23 +223,25 @@ def _resume(
         return
     with work, ResultFile(temporary) as file:
         table = Table(engine.scene, engine.grid, lambda blank: file.lay_out(blank.with_attrs(**_attrs(engine))))
-        extra = _fill(engine, table, work, progress, taken)
+        extra = _fill(engine, table, work, progress, reused)
         table.lay_out()
         file.finish(out, wall_time_s=seconds(), **extra)
 
 
-def _fill(engine: Engine, table: Table, work: Work, progress: Progress, taken: Taken = NOTHING) -> dict[str, str | int]:
+def _fill(
+    engine: Engine, table: Table, work: Work, progress: Progress, reused: ReusedPoints = NO_REUSE
+) -> dict[str, str | int]:
     """Fill all points into ``table``; returns attributes of the result."""
     if uses_atlas(engine.scene):
         from drivetrain_jax.runs.through_atlas import fill_through_atlas
 
         return fill_through_atlas(engine, table, work, progress)
-    for points, results in taken.blocks([variable.name for variable in table.variables]):
+    for points, results in reused.blocks([variable.name for variable in table.variables]):
         table.fill(points, results)
         progress.reused += results[OUTCOME.name].size
         progress.failed += failures(results[OUTCOME.name])
-    work.do(rest_of(engine, taken), table, progress)
-    return taken.attrs
+    work.do(remaining(engine, reused), table, progress)
+    return reused.attrs
 
 
 def _atlas(engine: Engine, work: Work, progress: Progress) -> Labelled:

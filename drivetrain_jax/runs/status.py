@@ -101,5 +101,5 @@ def _outcomes(target: Target) -> Iterator[np.ndarray]:
                 # An interrupt during writing may leave a chunk in two parts.
                 yield from (results[OUTCOME.name] for number, results in part if number not in seen)
                 seen.update(part.chunks.tolist())
-        for _, results in target.taken_before().blocks([OUTCOME.name]):
+        for _, results in target.reused_before().blocks([OUTCOME.name]):
             yield results[OUTCOME.name]

@@ -18,7 +18,7 @@ from drivetrain_jax.runs.assemble import failures
 from drivetrain_jax.runs.atlas_choice import uses_atlas
 from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.explain import differences
-from drivetrain_jax.runs.growing import NOTHING, Damaged, NotReusable, Source, Taken, find, take
+from drivetrain_jax.runs.growing import NO_REUSE, Damaged, NotReusable, ReusedPoints, Source, combined, find
 from drivetrain_jax.runs.layout import rearranged
 from drivetrain_jax.store import shards
 from drivetrain_jax.store.chunks import PartsFolder
@@ -87,7 +87,7 @@ class Target:
             return "absent"
         return "partial" if self._grows else "stale"
 
-    def plan(self, taken: Taken = NOTHING, fresh: bool = False) -> dict[str, Any]:
+    def plan(self, reused: ReusedPoints = NO_REUSE, fresh: bool = False) -> dict[str, Any]:
         """The digest of new parts, and what a reader needs to interpret them."""
         return {
             "digest": self.digest,
@@ -95,19 +95,19 @@ class Target:
             "replaces_written": self.written,
             "store": self.store,
             "fresh": fresh,
-            "reuses": taken.digest,
-            "reused": taken.count,
-            "reused_files": [os.path.relpath(source.path, self.out.parent) for source in taken.sources],
+            "reuses": reused.digest,
+            "reused": reused.count,
+            "reused_files": [os.path.relpath(source.path, self.out.parent) for source in reused.sources],
             **provenance_of(self.engine),
         }
 
-    def resumes(self, taken: Taken, fresh: bool) -> bool:
+    def resumes(self, reused: ReusedPoints, fresh: bool) -> bool:
         """True if a run resumes the present parts. A ``fresh`` run resumes only parts of a fresh run."""
         if not fresh:
             return self.parts.holds_work()
         # Parts already contained in the result, left by a run that was killed before it deleted them, do not count.
         names = ("digest", "replaces", "replaces_written", "store", "reuses", "fresh")
-        return _same(self.parts.plan(), self.plan(taken, fresh), names)
+        return _same(self.parts.plan(), self.plan(reused, fresh), names)
 
     def check_unchanged(self) -> None:
         """Raise :class:`InputError` if another run has finished or started since this object was created."""
@@ -154,10 +154,10 @@ class Target:
         """The remedy for the :attr:`obstacle`."""
         if self._shared is None or self.parts.holds_work():
             return "--fresh replaces it"
-        kept = f"--reuse {self.out.name} with another --out takes {Taken((self._shared,)).count} points from it"
+        kept = f"--reuse {self.out.name} with another --out takes {ReusedPoints((self._shared,)).count} points from it"
         return f"--fresh replaces it, {kept}"
 
-    def take(self, reuse: Sequence[str | Path], fresh: bool) -> Taken:
+    def reused_points(self, reuse: Sequence[str | Path], fresh: bool) -> ReusedPoints:
         """The points that a run reuses from the results ``reuse`` and, unless it is ``fresh``, from the present result.
 
         Raises :class:`InputError` if unfinished work uses other results, or if one of ``reuse`` has no common points.
@@ -166,11 +166,11 @@ class Target:
         if self.store == "zarr":
             if reuse:
                 raise InputError("reuse: given together with store = 'zarr'; allowed is one of them")
-            return NOTHING
+            return NO_REUSE
         if scene.analysis.continuous or uses_atlas(scene):
             if reuse:
                 raise InputError("reuse: not available for an atlas; allowed for a scene with direct solves")
-            return NOTHING
+            return NO_REUSE
         paths = [Path(path) for path in reuse]
         found = [find(self.engine, path) for path in paths]
         # Unfinished fresh work is resumed as fresh.
@@ -178,21 +178,21 @@ class Target:
             if isinstance(self._found, Damaged):
                 raise self.refusal
             found += [self._shared] if self._shared is not None and self._grows else []
-        taken = take(self.engine, found)
-        if not fresh and self.parts.holds_work() and self.parts.plan().get("reuses") != taken.digest:
+        reused = combined(self.engine, found)
+        if not fresh and self.parts.holds_work() and self.parts.plan().get("reuses") != reused.digest:
             files = ", ".join(self.parts.plan().get("reused_files") or ["no other result"])
             raise InputError(
                 f"reuse = {[str(p) for p in paths]}: the unfinished work at {str(self.out)!r} takes points from {files}; "
                 "allowed is the same again, or --fresh"
             )
-        return taken
+        return reused
 
-    def taken_before(self) -> Taken:
+    def reused_before(self) -> ReusedPoints:
         """The points that unfinished work reuses from other results, or that a run would reuse."""
         if not self.parts.holds_work():
-            return self.take((), fresh=False)
+            return self.reused_points((), fresh=False)
         names = self.parts.plan().get("reused_files") or ()
-        return take(self.engine, [find(self.engine, self.out.parent / name) for name in names])
+        return combined(self.engine, [find(self.engine, self.out.parent / name) for name in names])
 
     @property
     def refusal(self) -> InputError:

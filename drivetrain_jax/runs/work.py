@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from drivetrain_jax._errors import Passing
+from drivetrain_jax._errors import RetryableError
 from drivetrain_jax._wording import counted
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.runs.assemble import failures
@@ -70,14 +70,14 @@ class Work:
         self.where, self.report, self.parts = where, report, parts
         self.seconds = 0.0
         self._counted = False
-        self._keeper = _Keeper(parts)
+        self._writer = _PartWriter(parts)
 
     def __enter__(self) -> Work:
         return self
 
     def __exit__(self, failure: type[BaseException] | None, *_: object) -> None:
         if failure:
-            self._keeper.write()
+            self._writer.write()
 
     def do(self, engine: Engine, sink: Sink, progress: Progress, first: int = 0, where: Where | None = None) -> None:
         """Compute or reuse all chunks of ``engine`` into ``sink``; stored chunk numbers start at ``first``.
@@ -90,7 +90,7 @@ class Work:
             missing = np.arange(len(engine.plan.costs))
         else:
             missing = self._reuse(engine, self.parts, sink, progress, first)
-        batch, before = _Batch(sink, self._keeper, first), progress.computed
+        batch, before = _Batch(sink, self._writer, first), progress.computed
         try:
             self._compute(engine, missing, batch, progress, where or self.where)
             batch.flush()
@@ -136,33 +136,33 @@ class Work:
                 progress.cost += float(costs[chunk.number])
                 self._tell(progress)
         if missing:
-            raise Passing(f"{counted(missing, 'chunk', 'chunks')} returned no result")
+            raise RetryableError(f"{counted(missing, 'chunk', 'chunks')} returned no result")
 
     def _tell(self, progress: Progress) -> None:
         if self.report:
             self.report(progress)
 
 
-class _Keeper:
+class _PartWriter:
     """Writes finished chunks in parts of a quarter of a second, or longer on a slow disk. Without ``parts`` it only
     reports when a part is due."""
 
     def __init__(self, parts: PartsFolder | None) -> None:
         self._parts = parts
         self._waiting: list[Part] = []
-        self._taken = self._written = time.monotonic()
+        self._added = self._written = time.monotonic()
         self._interval = _SHORTEST
 
     def due(self) -> bool:
         """True if a part is due."""
         return time.monotonic() - self._written >= self._interval
 
-    def take(self, numbers: list[int], sizes: list[int], results: Mapping[str, np.ndarray]) -> None:
+    def add(self, numbers: list[int], sizes: list[int], results: Mapping[str, np.ndarray]) -> None:
         """Queue these chunks, and write if a part is due."""
         now = time.monotonic()
         if self._parts:
-            self._waiting.append(Part(numbers, sizes, results, now - self._taken))
-        self._taken = now
+            self._waiting.append(Part(numbers, sizes, results, now - self._added))
+        self._added = now
         if self.due() or sum(part.nbytes for part in self._waiting) >= _MOST_WAITING:
             self.write()
 
@@ -179,8 +179,8 @@ class _Keeper:
 class _Batch:
     """Collects finished chunks and enters them into ``sink`` together, which costs a third of entering them one by one."""
 
-    def __init__(self, sink: Sink, keeper: _Keeper, first: int) -> None:
-        self.sink, self._keeper, self._first = sink, keeper, first
+    def __init__(self, sink: Sink, writer: _PartWriter, first: int) -> None:
+        self.sink, self._writer, self._first = sink, writer, first
         self._waiting: list[tuple[Chunk, Mapping[str, np.ndarray]]] = []
         self._bytes = 0
         self._begun = False
@@ -193,7 +193,7 @@ class _Batch:
             # The first results allocate the whole output, so a full disk is reported before more is computed.
             self._begun = True
             self.sink.fill(chunk.points, results)
-        if self._bytes >= _MOST_WAITING or self._keeper.due():
+        if self._bytes >= _MOST_WAITING or self._writer.due():
             self.flush()
 
     def lose(self, chunk: Chunk) -> None:
@@ -215,7 +215,7 @@ class _Batch:
         all_results = [results for _, results in self._waiting]
         joined = {name: np.concatenate([results[name] for results in all_results]) for name in all_results[0]}
         sizes = [chunk.points.size for chunk in chunks]
-        self._keeper.take([self._first + chunk.number for chunk in chunks], sizes, joined)
+        self._writer.add([self._first + chunk.number for chunk in chunks], sizes, joined)
         self._waiting.clear()
         self._bytes = 0
         self.kept += sum(sizes)
