@@ -91,7 +91,7 @@ def scene(cells: int) -> dict[str, Any]:
 def package_jobs(cells: int, folder: Path) -> dict[str, Callable[[], Any]]:
     """The warm times of the package."""
     import drivetrain_jax as dt
-    from drivetrain_jax.runs.executor import Where
+    from drivetrain_jax.runs.executor import Threads
     from drivetrain_jax.runs.rounds import build_atlas
     from drivetrain_jax.runs.run import run_to_file
     from drivetrain_jax.runs.scene import load_scene
@@ -102,7 +102,7 @@ def package_jobs(cells: int, folder: Path) -> dict[str, Callable[[], Any]]:
     checked = load_scene(given)
 
     def construct() -> Any:
-        return build_atlas(checked, ranges, Work(Where()), Progress(0))[0]
+        return build_atlas(checked, ranges, Work(Threads()), Progress(0))[0]
 
     atlas = construct()
     low, high = np.array(list(ranges.values())).T

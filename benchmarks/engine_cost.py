@@ -17,7 +17,8 @@ from benchmarks.timing import PROCESSES, interleaved, median
 from drivetrain_jax._machine import usable_cores
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.engine import Engine
-from drivetrain_jax.runs.executor import Where, run_threads
+from drivetrain_jax.runs.executor import Executor, Threads, run_threads
+from drivetrain_jax.runs.executors import make_executor
 from drivetrain_jax.runs.run import run_to_file
 from drivetrain_jax.runs.scene import load_scene
 from tests.oracles.cardan_reference import BASE_CASE
@@ -87,7 +88,7 @@ def cpu_seconds(job: Callable[[], Any]) -> float:
 def bare(engine: Engine) -> None:
     """The kernels alone: all chunks in threads, results dropped."""
     chunks = engine.ordered(range(len(engine.plan.costs)))
-    for _ in run_threads(chunks, engine.compute_chunk, usable_cores()):
+    for _ in run_threads(chunks, engine.compute, usable_cores()):
         pass
 
 
@@ -158,13 +159,13 @@ def places(points: int, repeats: int, folder: Path) -> list[Place]:
         n_workers=PROCESSES, threads_per_worker=1, processes=True, dashboard_address=None
     ) as cluster:
 
-        def job(where: Where) -> Callable[[], Any]:
-            return lambda: run_to_file(content, out, fresh=True, where=where)
+        def job(executor: Executor) -> Callable[[], Any]:
+            return lambda: run_to_file(content, out, fresh=True, executor=executor)
 
         jobs = {
-            f"{PROCESSES} threads": job(Where(threads=PROCESSES)),
-            f"{PROCESSES} processes, their start included": job(Where(workers=PROCESSES)),
-            f"{PROCESSES} workers of a Dask cluster": job(Where(dask=cluster.scheduler_address)),
+            f"{PROCESSES} threads": job(Threads(PROCESSES)),
+            f"{PROCESSES} processes, their start included": job(make_executor(workers=PROCESSES)),
+            f"{PROCESSES} workers of a Dask cluster": job(make_executor(dask=cluster.scheduler_address)),
         }
         for run in jobs.values():
             run()

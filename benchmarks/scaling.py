@@ -54,8 +54,8 @@ def costs(points: int) -> Costs:
     planning = cpu_seconds(lambda: engine.plan)
     chunks = [engine.plan.chunk(n) for n in range(len(engine.plan.costs))]
     sample = [chunks[i] for i in np.linspace(0, len(chunks) - 1, min(len(chunks), 24)).astype(int)]
-    results = [engine.compute_chunk(chunk) for chunk in sample]
-    computing = [cpu_seconds(lambda c=chunk: engine.compute_chunk(c)) for chunk in sample]
+    results = [engine.compute(chunk) for chunk in sample]
+    computing = [cpu_seconds(lambda c=chunk: engine.compute(c)) for chunk in sample]
     sizes = [len(pickle.dumps(dict(result))) for result in results]
     table = Table(engine.scene, engine.grid)
     table.lay_out()

@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[Any, int, str]:
     """Counts, exit code, and the message for the user."""
-    from drivetrain_jax.runs.executor import Where
+    from drivetrain_jax.runs.executors import make_executor
     from drivetrain_jax.runs.run import Incomplete, run_to_file
 
     overrides = assignments(options.set, "--set")
@@ -72,7 +72,7 @@ def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[An
                 options.out,
                 overrides=overrides,
                 fresh=options.fresh,
-                where=Where(options.threads, options.workers, options.dask),
+                executor=make_executor(options.threads, options.workers, options.dask),
                 reuse=options.reuse,
                 store=options.store,
                 report=report,

@@ -22,7 +22,7 @@ from drivetrain_jax.runs.assemble import Table, result_attrs, to_dataset
 from drivetrain_jax.runs.atlas_choice import atlas_ranges
 from drivetrain_jax.runs.axes import Axis
 from drivetrain_jax.runs.engine import Engine
-from drivetrain_jax.runs.executor import Where
+from drivetrain_jax.runs.executor import Threads
 from drivetrain_jax.runs.rounds import build_atlas
 from drivetrain_jax.runs.scene import Scene, load_scene
 from drivetrain_jax.runs.through_atlas import evaluate
@@ -255,7 +255,7 @@ class StoredAtlas:
         scene = self.scene_on(columns, zipped=zipped)
         engine = Engine(scene)
         table = Table(scene, engine.grid)
-        evaluate(engine, table, self.stability, Work(Where()), Progress(engine.total), solve=solve)
+        evaluate(engine, table, self.stability, Work(Threads()), Progress(engine.total), solve=solve)
         return table.lay_out()
 
     def scene_on(self, columns: Mapping[str, np.ndarray], *, zipped: bool = False) -> Scene:
@@ -276,7 +276,7 @@ class StoredAtlas:
         request = Request(("spectral_radius",), "direct", self.scene.request.options)
         engine = Engine(self._scene(axes, dict(self.fixed), request, zipped=True))
         table = Table(engine.scene, engine.grid)
-        Work(Where()).do(engine, table, Progress(engine.total))
+        Work(Threads()).do(engine, table, Progress(engine.total))
         return table.lay_out()["spectral_radius"]
 
     def _names(self, values: Mapping[str, Any]) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Compute chunks on a Dask cluster: this process plans and writes, the workers return arrays."""
+"""Workers of a Dask cluster: this process plans and writes, they return arrays."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from typing import Any
 
 from drivetrain_jax._errors import InputError, RetryableError
 from drivetrain_jax.runs import worker
-from drivetrain_jax.runs.executor import IN_FLIGHT, Results
-from drivetrain_jax.runs.plan import Chunk
-from drivetrain_jax.runs.worker import Job
+from drivetrain_jax.runs.executor import IN_FLIGHT, Computation, Results
+from drivetrain_jax.runs.worker import Parcel
 
 _PATIENCE = "10s"
 _LOCAL = re.compile(r"local:([1-9]\d*)")
@@ -21,25 +20,42 @@ _LOCAL = re.compile(r"local:([1-9]\d*)")
 _TALKATIVE = ("distributed", "tornado", "asyncio")
 
 
-def run_cluster(chunks: Iterable[Chunk], job: Job, address: str) -> Generator[tuple[Chunk, Results | None], None, None]:
-    """Yield ``(chunk, results)`` in the order of completion, from the scheduler at ``address`` or ``local:N`` processes.
+class Cluster:
+    """A Dask cluster: the scheduler at ``tcp://host:port``, or ``local:N`` processes, connected until ``close``."""
 
-    A chunk whose worker died is computed again. Results are None after too many deaths (Dask's setting
-    ``distributed.scheduler.allowed-failures``). Exceptions of chunks are raised; a lost scheduler
-    raises :class:`RetryableError`.
-    """
-    distributed = _distributed()
-    with ExitStack() as stack:
-        client = _connect(distributed, address, stack)
-        remaining, running = iter(chunks), {}
-        finished = distributed.as_completed(loop=client.loop)
-        room = IN_FLIGHT * max(sum(client.nthreads().values()), 1)
-        # A random part of the key: another run on the same scheduler uses the same chunk numbers.
+    in_process = False
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self._connection = ExitStack()
+        self._client: Any = None
+
+    def check(self) -> None:
+        """Raise :class:`InputError` if no scheduler answers at the address; a local one starts with the first work."""
+        distributed = _distributed()
+        if not _LOCAL.fullmatch(self._address):
+            with ExitStack() as stack:
+                _connect(distributed, self._address, stack)
+
+    def run(self, computation: Computation, tasks: Iterable[Any]) -> Generator[tuple[Any, Results | None], None, None]:
+        """Yield ``(task, results)`` in the order of completion.
+
+        A task whose worker died is computed again. Results are None after too many deaths (Dask's setting
+        ``distributed.scheduler.allowed-failures``). Exceptions of tasks are raised; a lost scheduler raises
+        :class:`RetryableError`.
+        """
+        distributed = _distributed()
+        if self._client is None:
+            self._client = _connect(distributed, self._address, self._connection)
+        parcel, remaining, running = Parcel.of(computation), iter(tasks), {}
+        finished = distributed.as_completed(loop=self._client.loop)
+        room = IN_FLIGHT * max(sum(self._client.nthreads().values()), 1)
+        # A random part of the key: another run on the same scheduler uses the same numbers.
         run = uuid.uuid4().hex
         while True:
-            while len(running) < room and (chunk := next(remaining, None)) is not None:
-                future = client.submit(worker.compute, job, chunk, key=f"chunk-{chunk.number}-{run}")
-                running[future.key] = chunk
+            while len(running) < room and (task := next(remaining, None)) is not None:
+                future = self._client.submit(worker.compute, parcel, task, key=f"chunk-{task.number}-{run}")
+                running[future.key] = task
                 finished.add(future)
             if not running:
                 return
@@ -47,13 +63,10 @@ def run_cluster(chunks: Iterable[Chunk], job: Job, address: str) -> Generator[tu
             yield running.pop(future.key), _result(distributed, future)
             future.release()
 
-
-def check_scheduler(address: str) -> None:
-    """Raise :class:`InputError` if no scheduler answers at the address; a local one starts with the first work."""
-    distributed = _distributed()
-    if not _LOCAL.fullmatch(address):
-        with ExitStack() as stack:
-            _connect(distributed, address, stack)
+    def close(self) -> None:
+        """Disconnect, and end a local cluster."""
+        self._client = None
+        self._connection.close()
 
 
 def _result(distributed: Any, future: Any) -> Results | None:

@@ -20,7 +20,7 @@ from drivetrain_jax.runs.grid import Grid
 from drivetrain_jax.runs.identity import numerics_of, scene_digest
 from drivetrain_jax.runs.kernel import Kernel, for_device, is_small, kernel_of
 from drivetrain_jax.runs.plan import Chunk, Plan, make_plan
-from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.runs.scene import Problem
 from drivetrain_jax.store.provenance import digest
 
 # Kernels that are compiled at the same time.
@@ -33,7 +33,7 @@ class Engine:
     ``points`` restricts the plan to these points of the grid; for ``full_size`` see :func:`make_plan`.
     """
 
-    def __init__(self, scene: Scene, points: np.ndarray | None = None, *, full_size: bool = False) -> None:
+    def __init__(self, scene: Problem, points: np.ndarray | None = None, *, full_size: bool = False) -> None:
         # Before the first kernel, which the plan may need.
         _use_double_precision()
         compile_cache.enable()
@@ -43,6 +43,10 @@ class Engine:
         self._points, self._full_size = points, full_size
         self._kernels: dict[tuple[int, int], Future[Kernel]] = {}
         self._lock = threading.Lock()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A worker computes given chunks, so it needs no points of its own.
+        return Engine, (self.scene, None)
 
     def only(self, points: np.ndarray) -> Engine:
         """The engine restricted to these points of the grid."""
@@ -103,7 +107,7 @@ class Engine:
                 few = self._small and not solver.lengthy
                 self._kernels[index, size] = pool.submit(kernel_of, self.scene, self.grid, solver, size, few)
 
-    def compute_chunk(self, chunk: Chunk) -> Mapping[str, np.ndarray]:
+    def compute(self, chunk: Chunk) -> Mapping[str, np.ndarray]:
         """Results of one chunk; thread-safe. Raises :class:`ChunkError`."""
         self.prepare({(chunk.solver, chunk.size)})
         try:

@@ -1,117 +1,95 @@
-"""Executors of chunks: threads of this process, spawned processes, or a Dask cluster."""
+"""Executors of chunks and other tasks: the interface, and threads of this process."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Generator, Iterable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from drivetrain_jax._errors import InputError
 from drivetrain_jax._machine import usable_cores
 from drivetrain_jax._threads import threads
-from drivetrain_jax._wording import shown
-from drivetrain_jax.runs.engine import Engine
-from drivetrain_jax.runs.plan import Chunk
-
-if TYPE_CHECKING:
-    from drivetrain_jax.runs.worker import Job
 
 Results = Mapping[str, np.ndarray]
-# Chunks per worker: one is computed while the other waits, so no worker idles during writing.
+# Tasks per worker: one is computed while the other waits, so no worker idles during writing.
 IN_FLIGHT = 2
-# Upper limits of chunks, and of bytes of results, per thread: small chunks are computed faster than stored.
+# Upper limits of tasks, and of bytes of results, per thread: small chunks are computed faster than stored.
 _MOST_AHEAD, _BYTES_AHEAD = 32, 1 << 23
 
 
-@dataclass(frozen=True)
-class Where:
-    """The executor: ``workers`` processes, Dask at ``dask`` (``tcp://host:port`` or ``local:N``), or ``threads``.
+class Computation(Protocol):
+    """Computes numbered tasks. Workers receive a pickled copy and compare its ``digest`` with that of the run."""
 
-    The executor does not affect the numbers. Raises :class:`InputError` for invalid or conflicting settings.
-    """
+    @property
+    def digest(self) -> str:
+        """Digest of everything that affects the results."""
+        ...
 
-    threads: int | None = None
-    workers: int | None = None
-    dask: str | None = None
+    def compute(self, task: Any) -> Results:
+        """The results of one task."""
+        ...
 
-    def __post_init__(self) -> None:
-        for name in ("threads", "workers"):
-            value = getattr(self, name)
-            if value is not None and not (_is_integer(value) and value >= 1):
-                raise InputError(f"{name} = {shown(value)}: allowed is {name} >= 1, an integer")
-        if self.dask is not None and not re.match(r"local:[1-9]\d*$|\w+://", str(self.dask)):
-            raise InputError(f"dask = {self.dask!r}: allowed is tcp://HOST:PORT or local:N with N >= 1")
-        given = [name for name in ("threads", "workers", "dask") if getattr(self, name) is not None]
-        if len(given) > 1:
-            raise InputError(f"{given[0]}: given together with {given[1]}; allowed is one of them")
+
+class Executor(Protocol):
+    """Computes tasks. It does not affect the numbers, and starts its workers on first use."""
+
+    # True if the computation itself runs, not a copy of it.
+    in_process: bool
 
     def check(self) -> None:
-        """Raise :class:`InputError` if no scheduler answers at the address, before earlier work is deleted."""
-        if self.dask is not None:
-            from drivetrain_jax.runs.cluster import check_scheduler
+        """Raise :class:`InputError` if no scheduler answers at the address."""
 
-            check_scheduler(self.dask)
+    def run(self, computation: Computation, tasks: Iterable[Any]) -> Generator[tuple[Any, Results | None], None, None]:
+        """Yield ``(task, results)`` in the order of completion. Tasks are drawn one by one, as workers get free.
 
-    def compute(self, engine: Engine, numbers: Iterable[int]) -> Generator[tuple[Chunk, Results | None], None, None]:
-        """Yield ``(chunk, results)`` of the chunks with these numbers in the order of completion, the most expensive first.
-
-        Results are None for a chunk that killed every process that computed it. Other failures are raised.
+        Results are None for a task that killed every process that computed it. Other failures are raised. After the
+        generator is closed (also by an interrupt) no further task starts.
         """
-        numbers = np.fromiter(numbers, np.int64)
-        if self.workers is None and self.dask is None:
-            engine.prepare(engine.plan.kernels(numbers))
-        return self.each(engine.ordered(numbers), engine.compute_chunk, lambda: _job(engine))
+        ...
 
-    def each(
-        self, chunks: Iterable[Any], here: Callable[[Any], Results], job: Callable[[], Job]
-    ) -> Generator[tuple[Any, Results | None], None, None]:
-        """Like :meth:`compute` for any numbered tasks, done by ``here`` in threads of this process, or by ``job().do``
-        elsewhere."""
-        if self.workers is None and self.dask is None:
-            return run_threads(chunks, here, self.threads or usable_cores())
-        if self.workers is not None:
-            from drivetrain_jax.runs.processes import run_processes
-
-            return run_processes(chunks, job(), self.workers)
-        from drivetrain_jax.runs.cluster import run_cluster
-
-        assert self.dask is not None
-        return run_cluster(chunks, job(), self.dask)
+    def close(self) -> None:
+        """End the workers."""
 
 
-def _is_integer(value: object) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+class Threads:
+    """Threads of this process (default: one for each usable core)."""
 
+    in_process = True
 
-def _job(engine: Engine) -> Job:
-    from drivetrain_jax.runs.worker import Job
+    def __init__(self, count: int | None = None) -> None:
+        self._count = count
 
-    return Job(engine.scene.text, engine.digest)
+    def check(self) -> None:
+        """Do nothing."""
+
+    def run(self, computation: Computation, tasks: Iterable[Any]) -> Generator[tuple[Any, Results], None, None]:
+        """Yield ``(task, results)`` in the order of completion."""
+        return run_threads(tasks, computation.compute, self._count or usable_cores())
+
+    def close(self) -> None:
+        """Do nothing: the next run uses the same threads."""
 
 
 def run_threads(
-    chunks: Iterable[Chunk], work: Callable[[Chunk], Results], count: int
-) -> Generator[tuple[Chunk, Results], None, None]:
+    tasks: Iterable[Any], work: Callable[[Any], Results], count: int
+) -> Generator[tuple[Any, Results], None, None]:
     """Yield results from ``count`` threads of this process; compiled code releases the interpreter's lock.
 
-    An exception of a chunk is raised here. After the iterator is closed (also by an interrupt) no further chunk starts;
+    An exception of a task is raised here. After the iterator is closed (also by an interrupt) no further task starts;
     running ones finish in the background, and their results are dropped.
     """
     pool = threads(count, "chunk")
-    remaining = iter(chunks)
-    running: dict[Future[Results], Chunk] = {}
+    remaining = iter(tasks)
+    running: dict[Future[Results], Any] = {}
     finished: SimpleQueue[Future[Results]] = SimpleQueue()
     ahead = IN_FLIGHT
     try:
         while True:
-            while len(running) < ahead * count and (chunk := next(remaining, None)) is not None:
-                future = pool.submit(work, chunk)
-                running[future] = chunk
+            while len(running) < ahead * count and (task := next(remaining, None)) is not None:
+                future = pool.submit(work, task)
+                running[future] = task
                 future.add_done_callback(finished.put)
             if not running:
                 return
@@ -123,11 +101,11 @@ def run_threads(
         if running:
             for future in running:
                 future.cancel()
-            # The next user of the pool must not wait for running chunks.
+            # The next user of the pool must not wait for running tasks.
             threads.cache_clear()
 
 
 def _ahead(results: Results) -> int:
-    """Number of chunks like that of ``results`` to queue per thread."""
+    """Number of tasks like that of ``results`` to queue per thread."""
     size = sum(values.nbytes for values in results.values())
     return min(max(_BYTES_AHEAD // max(size, 1), IN_FLIGHT), _MOST_AHEAD)

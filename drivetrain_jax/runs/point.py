@@ -196,7 +196,7 @@ def _compute(engine: Engine) -> Table:
     table = Table(engine.scene, engine.grid)
     for number in range(len(engine.plan.costs)):
         chunk = engine.plan.chunk(number)
-        table.fill(chunk.points, engine.compute_chunk(chunk))
+        table.fill(chunk.points, engine.compute(chunk))
     return table
 
 

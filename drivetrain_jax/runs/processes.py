@@ -1,4 +1,4 @@
-"""Compute chunks in spawned processes, one per core. Only a chunk that crashes its worker repeatedly is lost."""
+"""Spawned processes, one per core. Only a task that crashes its worker repeatedly is lost."""
 
 from __future__ import annotations
 
@@ -10,61 +10,85 @@ from collections import Counter, deque
 from collections.abc import Generator, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from typing import Any
 
 from drivetrain_jax._errors import RetryableError
 from drivetrain_jax.runs import worker
-from drivetrain_jax.runs.executor import IN_FLIGHT, Results
-from drivetrain_jax.runs.plan import Chunk
-from drivetrain_jax.runs.worker import Job
+from drivetrain_jax.runs.executor import IN_FLIGHT, Computation, Results
+from drivetrain_jax.runs.worker import Parcel
 
-# Number of crashes after which a chunk is marked lost.
+# Number of crashes after which a task is given up.
 ATTEMPTS = 3
 
 
-def run_processes(chunks: Iterable[Chunk], job: Job, count: int) -> Generator[tuple[Chunk, Results | None], None, None]:
-    """Yield ``(chunk, results)`` in the order of completion; results are None for a chunk that crashes every process.
+class Processes:
+    """Spawned processes, each on one core. They stay for the next run until ``close``, or until this process ends."""
 
-    Exceptions of chunks, and of the start of a process, are raised here. When the iterator is closed (also by an interrupt)
-    the processes are killed; they also end when this process ends.
-    """
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
-    waiting, deaths = _Tasks(chunks), Counter[int]()
-    slots = [_Slot(job, cores[k % len(cores)]) for k in range(count)]
-    try:
-        while True:
-            for slot in slots:
-                slot.fill(waiting)
-            futures = [future for slot in slots for future in slot.running]
-            if not futures:
-                return
-            wait(futures, return_when=FIRST_COMPLETED)
-            for slot in slots:
-                yield from slot.collect(waiting, deaths)
-    finally:
-        for slot in slots:
+    in_process = False
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._slots: list[_Slot] = []
+
+    def check(self) -> None:
+        """Do nothing."""
+
+    def run(self, computation: Computation, tasks: Iterable[Any]) -> Generator[tuple[Any, Results | None], None, None]:
+        """Yield ``(task, results)`` in the order of completion; results are None for a task that crashes every process.
+
+        Exceptions of tasks, and of the start of a process, are raised here. When the iterator is closed (also by an
+        interrupt) the processes are killed.
+        """
+        waiting, deaths = _Tasks(tasks), Counter[int]()
+        try:
+            self._start(Parcel.of(computation))
+            while True:
+                for slot in self._slots:
+                    slot.fill(waiting)
+                futures = [future for slot in self._slots for future in slot.running]
+                if not futures:
+                    return
+                wait(futures, return_when=FIRST_COMPLETED)
+                for slot in self._slots:
+                    yield from slot.collect(waiting, deaths)
+        except BaseException:
+            self.close()
+            raise
+
+    def _start(self, parcel: Parcel) -> None:
+        cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
+        for slot in self._slots:
+            slot.parcel = parcel
+        for k in range(len(self._slots), self._count):
+            self._slots.append(_Slot(parcel, cores[k % len(cores)]))
+
+    def close(self) -> None:
+        """Kill the processes; what they compute is dropped."""
+        for slot in self._slots:
             slot.kill()
+        self._slots.clear()
 
 
 class _Tasks:
-    """Chunks to compute; chunks of a dead process come first."""
+    """Tasks to compute; those of a dead process come first."""
 
-    def __init__(self, chunks: Iterable[Chunk]) -> None:
-        self._chunks = iter(chunks)
-        self._again: deque[Chunk] = deque()
+    def __init__(self, tasks: Iterable[Any]) -> None:
+        self._tasks = iter(tasks)
+        self._again: deque[Any] = deque()
 
-    def put_back(self, chunks: Iterable[Chunk]) -> None:
-        self._again.extend(chunks)
+    def put_back(self, tasks: Iterable[Any]) -> None:
+        self._again.extend(tasks)
 
-    def take(self) -> Chunk | None:
-        return self._again.popleft() if self._again else next(self._chunks, None)
+    def take(self) -> Any:
+        return self._again.popleft() if self._again else next(self._tasks, None)
 
 
 class _Slot:
-    """One process, replaced when it dies, and its chunks in order."""
+    """One process, replaced when it dies, and its tasks in order."""
 
-    def __init__(self, job: Job, core: int | None) -> None:
-        self._job, self._core = job, core
-        self.running: dict[Future[Results], Chunk] = {}
+    def __init__(self, parcel: Parcel, core: int | None) -> None:
+        self.parcel, self._core = parcel, core
+        self.running: dict[Future[Results], Any] = {}
         self._stillborn = 0
         self._start()
 
@@ -72,46 +96,46 @@ class _Slot:
         others = set(multiprocessing.active_children())
         context = multiprocessing.get_context("spawn")
         self._pool = ProcessPoolExecutor(1, context, initializer=_initialise, initargs=(self._core,))
-        self._ready = self._pool.submit(worker.prepare, self._job)
+        self._ready = self._pool.submit(worker.prepare, self.parcel)
         self._processes = set(multiprocessing.active_children()) - others
 
     def fill(self, waiting: _Tasks) -> None:
-        """Send chunks to the process up to its limit."""
-        while len(self.running) < IN_FLIGHT and (chunk := waiting.take()) is not None:
+        """Send tasks to the process up to its limit."""
+        while len(self.running) < IN_FLIGHT and (task := waiting.take()) is not None:
             try:
-                self.running[self._pool.submit(worker.compute, self._job, chunk)] = chunk
+                self.running[self._pool.submit(worker.compute, self.parcel, task)] = task
             except BrokenProcessPool:
-                waiting.put_back([chunk])
+                waiting.put_back([task])
                 if self.running:
-                    # The process has died; its current chunk is handled when results are collected.
+                    # The process has died; its current task is handled when results are collected.
                     return
                 self._was_ready()
                 self._restart()
 
-    def collect(self, waiting: _Tasks, deaths: Counter[int]) -> Generator[tuple[Chunk, Results | None], None, None]:
-        """Yield finished results. The chunk that a dead process was computing is retried, or marked lost."""
+    def collect(self, waiting: _Tasks, deaths: Counter[int]) -> Generator[tuple[Any, Results | None], None, None]:
+        """Yield finished results. The task that a dead process was computing is retried, or has no results."""
         while self.running and next(iter(self.running)).done():
             future = next(iter(self.running))
-            chunk = self.running.pop(future)
+            task = self.running.pop(future)
             try:
-                yield chunk, future.result()
+                yield task, future.result()
             except BrokenProcessPool:
                 ready = self._was_ready()
                 waiting.put_back(self.running.values())
                 self.running.clear()
                 self._restart()
-                deaths[chunk.number] += ready
-                if deaths[chunk.number] < ATTEMPTS:
-                    waiting.put_back([chunk])
+                deaths[task.number] += ready
+                if deaths[task.number] < ATTEMPTS:
+                    waiting.put_back([task])
                 else:
-                    yield chunk, None
+                    yield task, None
 
     def _restart(self) -> None:
         self._pool.shutdown(wait=False)
         self._start()
 
     def _was_ready(self) -> bool:
-        """True if the process died during a chunk. If it dies during its start, every process would."""
+        """True if the process died during a task. If it dies during its start, every process would."""
         try:
             self._ready.result()
         except BrokenProcessPool:
@@ -123,7 +147,7 @@ class _Slot:
         return True
 
     def kill(self) -> None:
-        """Kill the process; its current chunk is dropped."""
+        """Kill the process; its current task is dropped."""
         self._pool.shutdown(wait=False, cancel_futures=True)
         for process in self._processes:
             process.kill()

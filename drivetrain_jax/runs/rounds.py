@@ -22,7 +22,6 @@ from drivetrain_jax.atlas import (
 from drivetrain_jax.atlas.construction import MAX_SOLVES
 from drivetrain_jax.runs.axes import Axis
 from drivetrain_jax.runs.engine import Engine
-from drivetrain_jax.runs.executor import Where
 from drivetrain_jax.runs.scene import Problem, Scene
 from drivetrain_jax.runs.work import Progress, Work
 
@@ -39,7 +38,7 @@ def build_atlas(
 ) -> tuple[StabilityAtlas, int]:
     """The atlas of ``scene`` over ``ranges``, and the first free chunk number.
 
-    ``progress`` counts the solves and notes gaps. Rounds are small, so threads of this process always solve them.
+    ``progress`` counts the solves and notes gaps.
     """
     fixed = fixed_of(scene, ranges)
     rtol = scene.request.options["rtol"]
@@ -47,7 +46,7 @@ def build_atlas(
     rounds = floquet_rounds(scene.system, ranges, fixed, tolerance, max_solves or MAX_SOLVES)
     options = {"rtol": solve_rtol(tolerance)}
     width = numbers_per_solve(scene.system, ranges, fixed)
-    first, threads, values = 0, Where(work.where.threads), None
+    first, values = 0, None
     while True:
         try:
             points = rounds.send(values)  # pyright: ignore[reportArgumentType]
@@ -57,7 +56,7 @@ def build_atlas(
         engine = Engine(_solves(scene, fixed, tuple(ranges), points, options), full_size=True)
         answers = _Answers(len(points), width)
         progress.total += len(points)
-        work.do(engine, answers, progress, first, threads)
+        work.do(engine, answers, progress, first)
         first += len(engine.plan.costs)
         values = answers.values
 

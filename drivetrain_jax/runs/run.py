@@ -15,7 +15,8 @@ from drivetrain_jax.runs import sharded
 from drivetrain_jax.runs.assemble import Table, bytes_per_point, failures, to_dataset
 from drivetrain_jax.runs.atlas_choice import uses_atlas
 from drivetrain_jax.runs.engine import Engine
-from drivetrain_jax.runs.executor import Where
+from drivetrain_jax.runs.executor import Executor, Threads
+from drivetrain_jax.runs.executors import make_executor
 from drivetrain_jax.runs.growing import NO_REUSE, ReusedPoints, remaining
 from drivetrain_jax.runs.notebook import shown_progress
 from drivetrain_jax.runs.scene import Scene, load_scene
@@ -84,14 +85,14 @@ def run(
     >>> dict(dt.run({"system": "planetary", "analysis": "modes", "axes": axes}).sizes)["k_sp"]
     2
     """
-    where = Where(threads, workers, dask)
+    executor = make_executor(threads, workers, dask)
     if out is None:
         if reuse:
             raise InputError("reuse: given without out; allowed is a run into a file")
         with shown_progress(report) as shown:
-            return _in_memory(_engine(scene, overrides, on_disk=False), where, shown)
+            return _in_memory(_engine(scene, overrides, on_disk=False), executor, shown)
     with shown_progress(report) as shown:
-        run_to_file(scene, Path(out), overrides=overrides, fresh=fresh, where=where, reuse=reuse, report=shown)
+        run_to_file(scene, Path(out), overrides=overrides, fresh=fresh, executor=executor, reuse=reuse, report=shown)
     return open_result(Path(out))
 
 
@@ -101,7 +102,7 @@ def run_to_file(
     *,
     overrides: Mapping[str, Any] | None = None,
     fresh: bool = False,
-    where: Where = Where(),  # noqa: B008
+    executor: Executor | None = None,
     reuse: str | Path | Sequence[str | Path] = (),
     store: str = "hdf5",
     report: Report | None = None,
@@ -122,8 +123,9 @@ def run_to_file(
     if not fresh and target.state == "stale":
         raise target.refusal
     target.check_writable()
-    where.check()
-    return _into(target, target.reused_points(_paths(reuse), fresh), fresh, where, report)
+    executor = executor or Threads()
+    executor.check()
+    return _into(target, target.reused_points(_paths(reuse), fresh), fresh, executor, report)
 
 
 def _paths(reuse: str | Path | Sequence[str | Path]) -> Sequence[str | Path]:
@@ -133,7 +135,7 @@ def _paths(reuse: str | Path | Sequence[str | Path]) -> Sequence[str | Path]:
     return paths
 
 
-def _into(target: Target, reused: ReusedPoints, fresh: bool, where: Where, report: Report | None) -> Progress:
+def _into(target: Target, reused: ReusedPoints, fresh: bool, executor: Executor, report: Report | None) -> Progress:
     """Start or resume the result of ``target``; the points ``reused`` are reused."""
     engine, parts, progress = target.engine, target.parts, _progress(target.engine)
     begins = False
@@ -144,9 +146,9 @@ def _into(target: Target, reused: ReusedPoints, fresh: bool, where: Where, repor
         if begins:
             parts.start(target.plan(reused, fresh))
         if target.store == "zarr":
-            sharded.compute(engine, target.out, parts, progress, where, report)
+            sharded.compute(engine, target.out, parts, progress, executor, report)
         else:
-            _resume(engine, target.out, parts, progress, where, report, reused)
+            _resume(engine, target.out, parts, progress, executor, report, reused)
         parts.close(remove=True)
     except KeyboardInterrupt:
         raise Interrupted(progress) from None
@@ -185,16 +187,16 @@ def _progress(engine: Engine) -> Progress:
     return Progress(0, kind="direct solves") if engine.scene.analysis.continuous else Progress(engine.total)
 
 
-def _in_memory(engine: Engine, where: Where, report: Report | None) -> xr.Dataset:
+def _in_memory(engine: Engine, executor: Executor, report: Report | None) -> xr.Dataset:
     progress, begin = _progress(engine), time.monotonic()
-    work = Work(where, report)
     try:
-        if engine.scene.analysis.continuous:
-            dataset = _atlas(engine, work, progress).to_dataset()
-        else:
-            table = Table(engine.scene, engine.grid)
-            extra = _fill(engine, table, work, progress)
-            dataset = to_dataset(engine.scene, table.lay_out(), _attrs(engine) | extra)
+        with Work(executor, report) as work:
+            if engine.scene.analysis.continuous:
+                dataset = _atlas(engine, work, progress).to_dataset()
+            else:
+                table = Table(engine.scene, engine.grid)
+                extra = _fill(engine, table, work, progress)
+                dataset = to_dataset(engine.scene, table.lay_out(), _attrs(engine) | extra)
     except ChunkError as error:
         raise Incomplete(str(error), progress) from error
     return dataset.assign_attrs(wall_time_s=round(time.monotonic() - begin, 3))
@@ -205,12 +207,12 @@ def _resume(
     out: Path,
     parts: PartsFolder,
     progress: Progress,
-    where: Where,
+    executor: Executor,
     report: Report | None,
     reused: ReusedPoints,
 ) -> None:
     """Write the result ``out`` from the points ``reused``, the existing parts, and newly computed chunks."""
-    work, begin = Work(where, report, parts), time.monotonic()
+    work, begin = Work(executor, report, parts), time.monotonic()
 
     def seconds() -> float:
         return round(work.seconds + time.monotonic() - begin, 3)

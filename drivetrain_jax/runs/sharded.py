@@ -18,12 +18,11 @@ from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import failures, missing_value, result_attrs
 from drivetrain_jax.runs.atlas_choice import uses_atlas
 from drivetrain_jax.runs.engine import Engine
-from drivetrain_jax.runs.executor import Where
+from drivetrain_jax.runs.executor import Executor
 from drivetrain_jax.runs.kernel import result_shapes
 from drivetrain_jax.runs.plan import Chunk
 from drivetrain_jax.runs.scene import result_variables
 from drivetrain_jax.runs.work import Progress, Report
-from drivetrain_jax.runs.worker import Job
 from drivetrain_jax.store import shards
 from drivetrain_jax.store.chunks import PartsFolder
 
@@ -53,14 +52,20 @@ class Task:
 
 
 @dataclass(frozen=True)
-class ShardJob(Job):
-    """Shards of the store at ``path``, which every worker must see under this name."""
+class ShardWriter:
+    """Computes shards of the store at ``path``, which every worker must see under this name."""
 
+    engine: Engine
     path: str
 
-    def do(self, engine: Engine, task: Task) -> Mapping[str, np.ndarray]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    @property
+    def digest(self) -> str:
+        """Digest of the engine."""
+        return self.engine.digest
+
+    def compute(self, task: Task) -> Mapping[str, np.ndarray]:
         """Compute and write a shard; returns only the outcomes."""
-        return _write(self.path, engine, task, [engine.compute_chunk(chunk) for chunk in task.chunks])
+        return _write(self.path, self.engine, task, [self.engine.compute(chunk) for chunk in task.chunks])
 
 
 def check(engine: Engine) -> None:
@@ -75,7 +80,7 @@ def groups_of(engine: Engine) -> list[shards.Group]:
 
 
 def compute(
-    engine: Engine, out: Path, parts: PartsFolder, progress: Progress, where: Where, report: Report | None
+    engine: Engine, out: Path, parts: PartsFolder, progress: Progress, executor: Executor, report: Report | None
 ) -> None:
     """Fill the store that grows among ``parts``, and move it to ``out`` when it is complete."""
     path, begin = parts.path / shards.UNFINISHED, time.monotonic()
@@ -87,16 +92,26 @@ def compute(
     costs = engine.plan.costs
     progress.total_cost = float(sum(costs[shard.numbers].sum() for shard in missing))
     _tell(report, progress)
-    job = ShardJob(engine.scene.text, engine.digest, os.path.abspath(path))
+    writer = ShardWriter(engine, os.path.abspath(path))
     # Created on demand: the points of all shards may need more memory than the driver has.
     tasks = map(partial(Task.of, engine), missing)
-    with closing(where.each(tasks, partial(job.do, engine), lambda: job)) as finished:
-        for task, results in finished:
-            outcome = _one_by_one(engine, where, path, task) if results is None else results[OUTCOME.name]
-            progress.computed += outcome.size
-            progress.failed += failures(outcome)
-            progress.cost += float(costs[task.shard.numbers].sum())
-            _tell(report, progress)
+
+    def count(task: Task, outcome: np.ndarray) -> None:
+        progress.computed += outcome.size
+        progress.failed += failures(outcome)
+        progress.cost += float(costs[task.shard.numbers].sum())
+        _tell(report, progress)
+
+    with closing(executor):
+        crashed = []
+        with closing(executor.run(writer, tasks)) as finished:
+            for task, results in finished:
+                if results is None:
+                    crashed.append(task)
+                else:
+                    count(task, results[OUTCOME.name])
+        for task in crashed:
+            count(task, _one_by_one(engine, executor, path, task))
     _finish(engine, path, out, parts, round(time.monotonic() - begin, 3))
 
 
@@ -182,10 +197,10 @@ def _padded(values: np.ndarray, count: int, blank: float) -> np.ndarray:
     return full
 
 
-def _one_by_one(engine: Engine, where: Where, path: Path, task: Task) -> np.ndarray:
+def _one_by_one(engine: Engine, executor: Executor, path: Path, task: Task) -> np.ndarray:
     """Compute the chunks of a shard that crashes its workers one by one, so only the crashing chunk is lost; the driver
     writes."""
-    found = {chunk.number: results for chunk, results in where.compute(engine, task.shard.numbers)}
+    found = {chunk.number: results for chunk, results in executor.run(engine, task.chunks)}
     shapes = result_shapes(engine.scene, engine.grid, engine.solvers[task.chunks[0].solver])
     lost = {
         v.name: np.full((task.shard.group.width, *shapes[v.name]), missing_value(v), v.dtype)

@@ -15,7 +15,7 @@ from drivetrain_jax._wording import counted
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.runs.assemble import failures
 from drivetrain_jax.runs.engine import Engine
-from drivetrain_jax.runs.executor import Where
+from drivetrain_jax.runs.executor import Executor
 from drivetrain_jax.runs.plan import Chunk
 from drivetrain_jax.store.chunks import Part, PartsFolder
 
@@ -62,12 +62,12 @@ class Work:
     """Runs chunks on the executor and reports progress.
 
     With ``parts`` (open) it stores finished chunks there and reuses stored ones; ``seconds`` is their computing time.
-    Leaving the context by an exception writes the chunks in memory; leaving it normally drops them, because the result
+    Leaving the context ends the workers. By an exception it also writes the chunks in memory; otherwise the result
     contains them.
     """
 
-    def __init__(self, where: Where, report: Report | None = None, parts: PartsFolder | None = None) -> None:
-        self.where, self.report, self.parts = where, report, parts
+    def __init__(self, executor: Executor, report: Report | None = None, parts: PartsFolder | None = None) -> None:
+        self.executor, self.report, self.parts = executor, report, parts
         self.seconds = 0.0
         self._counted = False
         self._writer = _PartWriter(parts)
@@ -76,10 +76,13 @@ class Work:
         return self
 
     def __exit__(self, failure: type[BaseException] | None, *_: object) -> None:
-        if failure:
-            self._writer.write()
+        try:
+            if failure:
+                self._writer.write()
+        finally:
+            self.executor.close()
 
-    def do(self, engine: Engine, sink: Sink, progress: Progress, first: int = 0, where: Where | None = None) -> None:
+    def do(self, engine: Engine, sink: Sink, progress: Progress, first: int = 0) -> None:
         """Compute or reuse all chunks of ``engine`` into ``sink``; stored chunk numbers start at ``first``.
 
         Lost chunks are not stored, so a resumed run computes them again.
@@ -92,7 +95,7 @@ class Work:
             missing = self._reuse(engine, self.parts, sink, progress, first)
         batch, before = _Batch(sink, self._writer, first), progress.computed
         try:
-            self._compute(engine, missing, batch, progress, where or self.where)
+            self._compute(engine, missing, batch, progress)
             batch.flush()
         finally:
             batch.keep()
@@ -116,13 +119,15 @@ class Work:
         self._counted = True
         return np.flatnonzero(missing)
 
-    def _compute(self, engine: Engine, numbers: np.ndarray, batch: _Batch, progress: Progress, where: Where) -> None:
+    def _compute(self, engine: Engine, numbers: np.ndarray, batch: _Batch, progress: Progress) -> None:
         costs = engine.plan.costs
         progress.cost, progress.total_cost = 0.0, float(costs[numbers].sum())
         self._tell(progress)
         missing = len(numbers)
+        if self.executor.in_process:
+            engine.prepare(engine.plan.kernels(numbers))
         # Closed on exit: after an interrupt no further chunk starts.
-        with closing(where.compute(engine, numbers)) as finished:
+        with closing(self.executor.run(engine, engine.ordered(numbers))) as finished:
             for chunk, results in finished:
                 missing -= 1
                 count = chunk.points.size * engine.grid.path_length

@@ -1,20 +1,15 @@
-"""Code of a worker process: it prepares the engine of the scene once and computes chunks."""
+"""Code of a worker process: it unpacks a computation once and computes its tasks."""
 
 from __future__ import annotations
 
 import os
-import tomllib
-from collections.abc import Mapping
-from dataclasses import dataclass
+import pickle
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
-
 from drivetrain_jax._errors import ChunkError
-from drivetrain_jax.runs.engine import Engine
-from drivetrain_jax.runs.plan import Chunk
-from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.runs.executor import Computation, Results
 
 
 class Mismatch(ChunkError):
@@ -22,31 +17,32 @@ class Mismatch(ChunkError):
 
 
 @dataclass(frozen=True)
-class Job:
-    """A scene as text, and the digest that its driver expects."""
+class Parcel:
+    """A pickled computation, and the digest that its driver expects."""
 
-    scene: str
     digest: str
+    content: bytes = field(compare=False, repr=False)
 
-    def do(self, engine: Engine, chunk: Any) -> Mapping[str, np.ndarray]:
-        """The results of ``chunk`` in a worker process."""
-        return engine.compute_chunk(chunk)
+    @classmethod
+    def of(cls, computation: Computation) -> Parcel:
+        """The parcel that sends ``computation`` to workers."""
+        return cls(computation.digest, pickle.dumps(computation))
 
 
 @lru_cache(maxsize=1)
-def _engine(job: Job) -> Engine:
-    engine = Engine(load_scene(tomllib.loads(job.scene)))
-    if engine.digest != job.digest:
+def _unpacked(parcel: Parcel) -> Computation:
+    computation: Computation = pickle.loads(parcel.content)
+    if computation.digest != parcel.digest:
         raise Mismatch("code, versions or instruction set differ from those of the run")
-    return engine
+    return computation
 
 
-def prepare(job: Job) -> int:
-    """Prepare the engine; returns the number of this process. Raises :class:`Mismatch`."""
-    _engine(job)
+def prepare(parcel: Parcel) -> int:
+    """Unpack the computation; returns the number of this process. Raises :class:`Mismatch`."""
+    _unpacked(parcel)
     return os.getpid()
 
 
-def compute(job: Job, chunk: Chunk) -> Mapping[str, np.ndarray]:
-    """Results of ``chunk``, without planning. Raises :class:`Mismatch`, or any error of the computation."""
-    return job.do(_engine(job), chunk)
+def compute(parcel: Parcel, task: Any) -> Results:
+    """Results of ``task``, without planning. Raises :class:`Mismatch`, or any error of the computation."""
+    return _unpacked(parcel).compute(task)

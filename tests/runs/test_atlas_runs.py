@@ -201,7 +201,7 @@ def test_solves_are_kept_when_a_chart_fails_after_them(tmp_path, monkeypatch):
         broken.setattr(through_atlas, "evaluate", failing)
         with pytest.raises(Incomplete, match="no luck"):
             run_to_file(scene, out)
-    monkeypatch.setattr(Engine, "compute_chunk", failing)
+    monkeypatch.setattr(Engine, "compute", failing)
     assert run_to_file(scene, out).computed == 533
 
 

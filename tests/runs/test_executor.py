@@ -11,6 +11,8 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,10 +23,10 @@ import drivetrain_jax as dt
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.runs import toml
-from drivetrain_jax.runs.cluster import run_cluster
-from drivetrain_jax.runs.executor import Where, run_threads
+from drivetrain_jax.runs.cluster import Cluster
+from drivetrain_jax.runs.executor import Threads, run_threads
+from drivetrain_jax.runs.executors import make_executor
 from drivetrain_jax.runs.plan import Chunk
-from drivetrain_jax.runs.worker import Job
 
 HERE = Path(__file__).parent
 SCENE = {
@@ -175,6 +177,13 @@ def test_scheduler_and_workers_of_their_own(drivetrain, package, tmp_path):
     assert one.spectral_radius.values.tobytes() == other.spectral_radius.values.tobytes()
 
 
+@dataclass
+class Digest:
+    """A computation that nobody asks for results."""
+
+    digest: str
+
+
 def test_runs_on_one_scheduler_do_not_share_chunks(monkeypatch):
     """A grown result and the whole scene have one digest, and other points under the same numbers."""
     distributed = pytest.importorskip("distributed")
@@ -184,13 +193,14 @@ def test_runs_on_one_scheduler_do_not_share_chunks(monkeypatch):
         return {"points": chunk.points}
 
     monkeypatch.setattr("drivetrain_jax.runs.cluster.worker.compute", slow)
-    job = Job("", "digest")
+    same = Digest("digest")
     options = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": None}
     with distributed.LocalCluster(**options) as cluster, ThreadPoolExecutor(2) as pool:
 
         def run(first):
             chunks = [Chunk(number, 0, 1, np.array([first + number]), 1) for number in range(3)]
-            return [(c.points, results["points"]) for c, results in run_cluster(chunks, job, cluster.scheduler_address)]
+            with closing(Cluster(cluster.scheduler_address)) as executor:
+                return [(c.points, results["points"]) for c, results in executor.run(same, chunks)]
 
         for found in pool.map(run, (0, 100)):
             assert len(found) == 3
@@ -253,8 +263,7 @@ def test_wrong_place_is_one_clear_line(options, message, monkeypatch):
     if "dask" in options:
         pytest.importorskip("distributed")
     with pytest.raises(InputError, match=message.replace("(", r"\(")):
-        where = Where(**options)
-        list(where.compute(_engine(), [0]))
+        list(make_executor(**options).run(_engine(), [0]))
 
 
 def _engine():
@@ -285,7 +294,7 @@ def test_a_process_that_dies_between_two_chunks_is_replaced():
 
 
 def test_chunks_that_never_come_back_are_missed(monkeypatch):
-    monkeypatch.setattr(Where, "compute", lambda *_: (chunk for chunk in ()))
+    monkeypatch.setattr(Threads, "run", lambda *_: (chunk for chunk in ()))
     with pytest.raises(dt.Incomplete, match=r"^1 chunk returned no result"):
         dt.run(cardan_scene({"beta": {"values": [0.1, 0.2]}, "Omega": {"values": [1.0]}}))
 

@@ -11,7 +11,7 @@ from interrupts import stop_after
 import drivetrain_jax as dt
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.runs.executor import Where
+from drivetrain_jax.runs.executor import Threads
 from drivetrain_jax.runs.growing import _positions
 from drivetrain_jax.runs.run import Interrupted, run_to_file
 from drivetrain_jax.runs.status import status
@@ -229,7 +229,7 @@ def test_an_interrupted_growth_resumes_and_keeps_the_former_result(tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(Interrupted) as stopped:
-        run_to_file(LARGE, path, where=Where(threads=1), report=stop)
+        run_to_file(LARGE, path, executor=Threads(1), report=stop)
     assert path.read_bytes() == before
     done = stopped.value.progress.computed
     assert done > 0 and (status(LARGE, path).state, status(LARGE, path).done) == ("partial", 22 + done)
@@ -251,7 +251,7 @@ def test_unfinished_work_is_resumed_only_with_the_same_points_taken(tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(Interrupted):
-        run_to_file(LARGE, path, where=Where(threads=1), report=stop, reuse=[small])
+        run_to_file(LARGE, path, executor=Threads(1), report=stop, reuse=[small])
     with pytest.raises(InputError, match=r"takes points from small.nc; allowed is the same again, or --fresh"):
         run_to_file(LARGE, path)
     assert status(LARGE, path).done > 22
@@ -382,7 +382,7 @@ def test_damage_that_came_during_an_interrupted_growth_is_named(tmp_path):
     path = tmp_path / "r.nc"
     run_to_file(SMALL, path)
     with pytest.raises(Interrupted):
-        run_to_file(LARGE, path, where=Where(threads=1), report=stop_after(2))
+        run_to_file(LARGE, path, executor=Threads(1), report=stop_after(2))
     with h5py.File(path, "r+") as file:
         file["value"][1, 3] = -7.0
     assert "damaged (value)" in status(LARGE, path).reason
@@ -432,7 +432,7 @@ def small_and_interrupted(path, **more):
     """A small result, and unfinished work that is to replace it."""
     run_to_file(SMALL, path)
     with pytest.raises(Interrupted) as stopped:
-        run_to_file(LARGE, path, where=Where(threads=1), report=stop_after(2), **more)
+        run_to_file(LARGE, path, executor=Threads(1), report=stop_after(2), **more)
     assert stopped.value.progress.computed > 0
     return stopped.value.progress.computed
 
@@ -461,6 +461,6 @@ def test_an_interrupted_fresh_run_of_a_finished_scene_outlives_a_look_at_it(tmp_
     path = tmp_path / "r.nc"
     run_to_file(LARGE, path)
     with pytest.raises(Interrupted) as stopped:
-        run_to_file(LARGE, path, fresh=True, where=Where(threads=1), report=stop_after(2))
+        run_to_file(LARGE, path, fresh=True, executor=Threads(1), report=stop_after(2))
     assert counts(run_to_file(LARGE, path)) == (322, 0, 322)
     assert run_to_file(LARGE, path, fresh=True).reused == stopped.value.progress.computed > 0

@@ -9,7 +9,7 @@ from interrupts import stop_after
 import drivetrain_jax as dt
 from drivetrain_jax.cli import main
 from drivetrain_jax.runs import work
-from drivetrain_jax.runs.executor import Where
+from drivetrain_jax.runs.executor import Threads
 from drivetrain_jax.runs.partial import PENDING
 from drivetrain_jax.runs.run import Interrupted, run_to_file
 from drivetrain_jax.store.chunks import PartsFolder
@@ -35,7 +35,7 @@ def test_what_is_done_is_there_and_the_rest_is_pending(grid_scene, tmp_path, mon
         if progress.computed and not seen and PartsFolder(path).count():
             seen.append(dt.open_result(path))
 
-    run_to_file(grid_scene, path, where=Where(threads=1), report=look)
+    run_to_file(grid_scene, path, executor=Threads(1), report=look)
     assert seen
     compare(seen[0], whole)
     assert dt.open_result(path).equals(whole)
@@ -44,7 +44,7 @@ def test_what_is_done_is_there_and_the_rest_is_pending(grid_scene, tmp_path, mon
 def test_after_an_interrupt(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     with pytest.raises(Interrupted):
-        run_to_file(grid_scene, path, where=Where(threads=1), report=stop_after(2))
+        run_to_file(grid_scene, path, executor=Threads(1), report=stop_after(2))
     before = sorted(p.name for p in tmp_path.rglob("*"))
     compare(dt.open_result(path), dt.run(grid_scene))
     assert sorted(p.name for p in tmp_path.rglob("*")) == before
@@ -54,7 +54,7 @@ def test_points_taken_from_another_result_are_there(grid_scene, tmp_path):
     small, path = tmp_path / "small.nc", tmp_path / "r.nc"
     run_to_file(grid_scene | {"axes": grid_scene["axes"] | {"b": {"values": [3.0]}}}, small)
     with pytest.raises(Interrupted) as stopped:
-        run_to_file(grid_scene, path, where=Where(threads=1), report=stop_after(2), reuse=[small])
+        run_to_file(grid_scene, path, executor=Threads(1), report=stop_after(2), reuse=[small])
     partial = dt.open_result(path)
     assert partial.attrs["points_done"] == 41 + stopped.value.progress.computed
     assert (partial["outcome"].sel(b=3.0) != PENDING).all()
@@ -65,7 +65,7 @@ def test_lines_are_pending_as_a_whole(tmp_path, order):
     values = {"a": [float(x) for x in range(1, 10)], "b": [1.0, 4.0, 9.0]}
     scene = {"system": "toy", "analysis": "line", "axes": {name: {"values": values[name]} for name in order}}
     with pytest.raises(Interrupted):
-        run_to_file(scene, tmp_path / "r.nc", where=Where(threads=1), report=stop_after(1))
+        run_to_file(scene, tmp_path / "r.nc", executor=Threads(1), report=stop_after(1))
     partial = dt.open_result(tmp_path / "r.nc")
     pending = (partial["outcome"] == PENDING).transpose("a", "b").values
     assert pending.any() and not pending.all() and (pending.all(axis=1) == pending.any(axis=1)).all()
@@ -77,7 +77,7 @@ def test_an_unfinished_chart_is_drawn(tmp_path, capsys):
     scene = {"system": "cardan", "analysis": "floquet", "axes": axes, "fixed": base, "options": {"rtol": 1e-6}}
     path = tmp_path / "r.nc"
     with pytest.raises(Interrupted):
-        run_to_file(scene, path, where=Where(threads=1), report=stop_after(1))
+        run_to_file(scene, path, executor=Threads(1), report=stop_after(1))
     figure = tmp_path / "f.png"
     assert main(["plot", str(path), "--out", str(figure)]) == 0 and figure.stat().st_size > 5000
     assert main(["plot", str(tmp_path / "other.nc"), "--out", str(figure)]) == 2
@@ -87,7 +87,7 @@ def test_an_unfinished_chart_is_drawn(tmp_path, capsys):
 def test_work_of_another_version_is_not_opened(grid_scene, tmp_path, monkeypatch):
     path = tmp_path / "r.nc"
     with pytest.raises(Interrupted):
-        run_to_file(grid_scene, path, where=Where(threads=1), report=stop_after(2))
+        run_to_file(grid_scene, path, executor=Threads(1), report=stop_after(2))
     from drivetrain_jax.runs import identity
 
     monkeypatch.setattr(identity, "versions", lambda names: dict.fromkeys(names, "0"))

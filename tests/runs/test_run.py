@@ -20,7 +20,8 @@ from interrupts import stop_after
 
 import drivetrain_jax as dt
 from drivetrain_jax.runs import toml, work
-from drivetrain_jax.runs.executor import Where
+from drivetrain_jax.runs.cluster import Cluster
+from drivetrain_jax.runs.executor import Threads
 from drivetrain_jax.runs.run import Incomplete, run_to_file
 from drivetrain_jax.runs.status import status
 from drivetrain_jax.store.chunks import PartsFolder
@@ -241,7 +242,7 @@ def test_complete_result_is_only_read(grid_scene, tmp_path):
 def test_interrupted_and_resumed_equals_uninterrupted(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt) as stopped:
-        run_to_file(grid_scene, path, where=Where(threads=1), report=stop_after(2))
+        run_to_file(grid_scene, path, executor=Threads(1), report=stop_after(2))
     done = stopped.value.progress
     assert 0 < done.computed < 123 and not path.exists()
     found = status(grid_scene, path)
@@ -255,7 +256,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(grid_scene, tmp_path):
 def test_parts_are_not_resumed_by_another_scene(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt):
-        run_to_file(grid_scene, path, where=Where(threads=1), report=stop_after(2))
+        run_to_file(grid_scene, path, executor=Threads(1), report=stop_after(2))
     other = grid_scene | {"fixed": {"n": 4}}
     assert status(other, path).state == "stale"
     with pytest.raises(dt.InputError, match="unfinished work of another scene"):
@@ -273,7 +274,7 @@ def test_interrupted_replacement_keeps_the_old_result_and_resumes(grid_scene, tm
     with pytest.raises(dt.InputError, match="--fresh"):
         run_to_file(other, path)
     with pytest.raises(KeyboardInterrupt):
-        run_to_file(other, path, fresh=True, where=Where(threads=1), report=stop_after(2))
+        run_to_file(other, path, fresh=True, executor=Threads(1), report=stop_after(2))
     assert path.read_bytes() == before and status(other, path).state == "partial"
     assert run_to_file(other, path).reused > 0
     assert status(other, path).state == "complete" and os.listdir(tmp_path) == ["r.nc"]
@@ -283,7 +284,7 @@ def test_work_is_not_resumed_over_a_result_that_came_meanwhile(grid_scene, tmp_p
     path, meanwhile = tmp_path / "r.nc", tmp_path / "s.nc"
     run_to_file(grid_scene | {"fixed": {"n": 4}}, path)
     with pytest.raises(KeyboardInterrupt):
-        run_to_file(grid_scene, path, fresh=True, where=Where(threads=1), report=stop_after(2))
+        run_to_file(grid_scene, path, fresh=True, executor=Threads(1), report=stop_after(2))
     run_to_file(grid_scene | {"fixed": {"n": 5}}, meanwhile)
     os.replace(meanwhile, path)
     before = path.read_bytes()
@@ -297,7 +298,7 @@ def test_a_finished_result_is_read_beside_unfinished_work_of_another_scene(grid_
     path, other = tmp_path / "r.nc", grid_scene | {"fixed": {"n": 4}}
     run_to_file(grid_scene, path)
     with pytest.raises(KeyboardInterrupt) as stopped:
-        run_to_file(other, path, fresh=True, where=Where(threads=1), report=stop_after(2))
+        run_to_file(other, path, fresh=True, executor=Threads(1), report=stop_after(2))
     assert run_to_file(grid_scene, path).reused == 123
     assert run_to_file(other, path).reused == stopped.value.progress.computed > 0
 
@@ -320,9 +321,9 @@ def test_an_address_without_a_scheduler_costs_no_work(grid_scene, tmp_path, monk
     monkeypatch.setattr("drivetrain_jax.runs.cluster._PATIENCE", "1s")
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt) as stopped:
-        run_to_file(grid_scene, path, where=Where(threads=1), report=stop_after(2))
+        run_to_file(grid_scene, path, executor=Threads(1), report=stop_after(2))
     with pytest.raises(dt.InputError, match="no scheduler answers"):
-        run_to_file(grid_scene, path, fresh=True, where=Where(dask="tcp://127.0.0.1:1"))
+        run_to_file(grid_scene, path, fresh=True, executor=Cluster("tcp://127.0.0.1:1"))
     assert run_to_file(grid_scene, path).reused == stopped.value.progress.computed > 0
 
 
@@ -359,7 +360,7 @@ def test_a_link_stays_one_and_has_the_lock_of_its_file(grid_scene, tmp_path):
     run_to_file(grid_scene, link)
     assert link.is_symlink() and path.is_file()
     with pytest.raises(KeyboardInterrupt) as stopped:
-        run_to_file(grid_scene, link, fresh=True, where=Where(threads=1), report=stop_after(2))
+        run_to_file(grid_scene, link, fresh=True, executor=Threads(1), report=stop_after(2))
     assert PartsFolder(link).path == PartsFolder(path).path and len(os.listdir(tmp_path)) == 2
     assert run_to_file(grid_scene, path, fresh=True).reused == stopped.value.progress.computed > 0
     assert link.is_symlink() and os.listdir(tmp_path / "data") == ["r.nc"]
@@ -368,7 +369,7 @@ def test_a_link_stays_one_and_has_the_lock_of_its_file(grid_scene, tmp_path):
 def test_corrupted_chunk_is_computed_again(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt) as stopped:
-        run_to_file(grid_scene, path, where=Where(threads=1), report=stop_after(2))
+        run_to_file(grid_scene, path, executor=Threads(1), report=stop_after(2))
     for part in Path(f"{path}.parts").glob("*.h5"):
         data = bytearray(part.read_bytes())
         data[len(data) // 2] ^= 1
@@ -402,7 +403,7 @@ def test_only_what_may_pass_is_said_to_be_resumed_by_the_same_command(grid_scene
 
     monkeypatch.setattr("drivetrain_jax.runs.engine.kernel_of", lambda *_: kernel)
     with pytest.raises(Incomplete, match=rf"^chunk \d+ \(\w+\): {type(error).__name__}: ") as stopped:
-        run_to_file(grid_scene, tmp_path / "r.nc", where=Where(threads=1))
+        run_to_file(grid_scene, tmp_path / "r.nc", executor=Threads(1))
     assert str(stopped.value).endswith("; the same command resumes") is passes
 
 
@@ -470,7 +471,7 @@ def test_a_disk_without_room_is_told_before_anything_is_computed(grid_scene, tmp
 
     monkeypatch.setattr("drivetrain_jax.store.consolidate.os.posix_fallocate", full)
     with pytest.raises(Incomplete, match="No space left on device") as stopped:
-        run_to_file(grid_scene, tmp_path / "r.nc", where=Where(threads=1))
+        run_to_file(grid_scene, tmp_path / "r.nc", executor=Threads(1))
     assert stopped.value.progress.computed < 123 and not (tmp_path / "r.nc").exists()
     assert not list((tmp_path / "r.nc.parts").glob("*.tmp"))
 

@@ -17,7 +17,7 @@ from drivetrain_jax import InputError
 from drivetrain_jax._threads import threads
 from drivetrain_jax.cli import main
 from drivetrain_jax.invariants.verify import verify
-from drivetrain_jax.runs.executor import Where
+from drivetrain_jax.runs.executor import Threads
 from drivetrain_jax.runs.export import export
 from drivetrain_jax.runs.partial import PENDING
 from drivetrain_jax.runs.run import Incomplete, Interrupted, run_to_file
@@ -81,7 +81,7 @@ def test_export_is_bit_identical_to_the_file(grid_scene, tmp_path, which):
 def test_interrupted_damaged_and_resumed(grid_scene, tmp_path):
     scene, path, pool = large(grid_scene), tmp_path / "r.zarr", threads(1, "chunk")
     with pytest.raises(Interrupted) as stopped:
-        to_store(scene, path, where=Where(threads=1), report=stop_after(3))
+        to_store(scene, path, executor=Threads(1), report=stop_after(3))
     # In a process of its own the thread would be gone.
     pool.shutdown()
     done, found = stopped.value.progress.computed, status(scene, path)
@@ -157,7 +157,7 @@ def test_every_planned_point_is_exported_once(grid_scene, tmp_path, change):
 def test_attributes_that_were_damaged_while_the_store_grew_are_made_anew(grid_scene, tmp_path):
     scene, path, pool = large(grid_scene), tmp_path / "r.zarr", threads(1, "chunk")
     with pytest.raises(Interrupted):
-        to_store(scene, path, where=Where(threads=1), report=stop_after(2))
+        to_store(scene, path, executor=Threads(1), report=stop_after(2))
     pool.shutdown()
     file = tmp_path / "r.zarr.parts" / "store" / "zarr.json"
     file.write_text(file.read_text().replace("stop = 10.0", "stop = 10.5"))
@@ -169,7 +169,7 @@ def test_attributes_that_were_damaged_while_the_store_grew_are_made_anew(grid_sc
 def test_export_leaves_unfinished_work_alone(grid_scene, tmp_path):
     to_store(ONE, tmp_path / "r.zarr")
     with pytest.raises(Interrupted):
-        run_to_file(grid_scene, tmp_path / "e.nc", where=Where(threads=1), report=stop_after(2))
+        run_to_file(grid_scene, tmp_path / "e.nc", executor=Threads(1), report=stop_after(2))
     done = status(grid_scene, tmp_path / "e.nc").done
     with pytest.raises(InputError, match=r"out = .*e.nc': unfinished work is in .*e.nc.parts'; allowed is a new file"):
         export(tmp_path / "r.zarr", tmp_path / "e.nc")
@@ -218,7 +218,7 @@ def test_points_that_no_solver_can_do_are_counted(tmp_path):
 def test_unfinished_work_is_opened_and_counted(grid_scene, tmp_path):
     scene, path, pool = large(grid_scene), tmp_path / "r.zarr", threads(1, "chunk")
     with pytest.raises(Interrupted):
-        to_store(scene, path, where=Where(threads=1), report=stop_after(3))
+        to_store(scene, path, executor=Threads(1), report=stop_after(3))
     pool.shutdown()
     partial, whole, done = dt.open_result(path), dt.run(scene), status(scene, path).done
     there = (partial["outcome"] != PENDING).values
@@ -244,7 +244,7 @@ def test_unfinished_work_is_opened_and_counted(grid_scene, tmp_path):
 def test_an_unfinished_store_with_damaged_metadata_is_one_line(grid_scene, tmp_path, name, damage):
     path, scene = tmp_path / "r.zarr", large(grid_scene)
     with pytest.raises(Interrupted):
-        to_store(scene, path, where=Where(threads=1), report=stop_after(3))
+        to_store(scene, path, executor=Threads(1), report=stop_after(3))
     store = tmp_path / "r.zarr.parts" / "store"
     damage(store / name / "zarr.json")
     line = re.escape(f"store = {str(store)!r}: its metadata are damaged; allowed is to restore them, or --fresh")
