@@ -40,13 +40,13 @@ os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
 start = time.perf_counter()
 from pathlib import Path
 from drivetrain_jax.runs import compile_cache
-from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.kernel import kernel_of
 from drivetrain_jax.runs.run import run, run_to_file
 from drivetrain_jax.runs.scene import load_scene
 imported = time.perf_counter()
 compile_cache.enable()
-engine = Engine(load_scene(scene))
+engine = resolve(load_scene(scene))
 for group in engine.plan.groups:
     kernel_of(engine.scene, engine.grid, group.solver, group.chunk)
 compiled = time.perf_counter()
@@ -78,11 +78,11 @@ def child(scene: Mapping[str, Any], cores: int, cache: str, runs: int = 2) -> di
 
 def kernel_job(scene: Mapping[str, Any], width: int | None = None) -> tuple[Any, int]:
     """``job()`` runs one full chunk of ``scene``; and its number of points, ``width`` or that of the plan."""
-    from drivetrain_jax.runs.engine import Engine
     from drivetrain_jax.runs.kernel import kernel_of
+    from drivetrain_jax.runs.resolve import resolve
     from drivetrain_jax.runs.scene import load_scene
 
-    engine = Engine(load_scene(dict(scene)))
+    engine = resolve(load_scene(dict(scene)))
     chunk = engine.plan.chunk(0)
     size = width or chunk.size
     kernel = kernel_of(engine.scene, engine.grid, engine.solvers[chunk.solver], size)

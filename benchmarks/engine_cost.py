@@ -16,9 +16,10 @@ from typing import Any
 from benchmarks.timing import PROCESSES, interleaved, median
 from drivetrain_jax._machine import usable_cores
 from drivetrain_jax.runs import toml
-from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.executor import Executor, Threads, run_threads
 from drivetrain_jax.runs.executors import make_executor
+from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.run import run_to_file
 from drivetrain_jax.runs.scene import load_scene
 from tests.oracles.cardan_reference import BASE_CASE
@@ -85,10 +86,10 @@ def cpu_seconds(job: Callable[[], Any]) -> float:
     return time.process_time() - begin
 
 
-def bare(engine: Engine) -> None:
+def bare(job: Job) -> None:
     """The kernels alone: all chunks in threads, results dropped."""
-    chunks = engine.ordered(range(len(engine.plan.costs)))
-    for _ in run_threads(chunks, engine.compute, usable_cores()):
+    chunks = job.ordered(range(len(job.plan.costs)))
+    for _ in run_threads(chunks, job.compute, usable_cores()):
         pass
 
 
@@ -119,9 +120,9 @@ class Overhead:
 def overhead(points: int, repeats: int, folder: Path) -> Overhead:
     """Kernels are compiled before the clock starts in both; a finished run is resumed in a process of its own."""
     out, content = folder / "overhead.nc", scene(points)
-    engine = Engine(load_scene(content))
+    engine = resolve(load_scene(content))
     warm = scene(min(points, 50_000))
-    bare(Engine(load_scene(warm)))
+    bare(resolve(load_scene(warm)))
     run_to_file(warm, folder / "warm.nc")
     wall: dict[str, list[float]] = {"engine": [], "kernels": []}
     cpu: dict[str, list[float]] = {"engine": [], "kernels": []}

@@ -27,12 +27,12 @@ def engine_job(scene: Mapping[str, Any], threads: int = 1) -> Callable[[], Resul
 
     The kernels are compiled by this call, unless another scene of the process has had the same.
     """
-    from drivetrain_jax.runs.engine import Engine
     from drivetrain_jax.runs.executor import run_threads
     from drivetrain_jax.runs.kernel import kernel_of
+    from drivetrain_jax.runs.resolve import resolve
     from drivetrain_jax.runs.scene import load_scene
 
-    engine = Engine(load_scene(dict(scene)))
+    engine = resolve(load_scene(dict(scene)))
     grid, plan = engine.grid, engine.plan
     shape = {key: sorted(value) if key == "points" else value for key, value in scene.items()}
     with _COMPILING[repr((shape, [(group.solver.name, group.chunk) for group in plan.groups]))]:

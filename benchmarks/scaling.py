@@ -22,8 +22,8 @@ from benchmarks.engine_cost import Memory, cpu_seconds, scene
 from benchmarks.results_files import between_marks
 from benchmarks.timing import RESULTS, median, parser, provenance, results_folder, significant, write_csv
 from drivetrain_jax.runs.assemble import Table
-from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.executor import IN_FLIGHT
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.chunks import Part
@@ -50,7 +50,7 @@ class Costs:
 
 def costs(points: int) -> Costs:
     """CPU seconds: one core per chunk, as processes have it."""
-    engine = Engine(load_scene(scene(points)))
+    engine = resolve(load_scene(scene(points)))
     planning = cpu_seconds(lambda: engine.plan)
     chunks = [engine.plan.chunk(n) for n in range(len(engine.plan.costs))]
     sample = [chunks[i] for i in np.linspace(0, len(chunks) - 1, min(len(chunks), 24)).astype(int)]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from drivetrain_jax.analysis import analysis_names, get_analysis
-from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import get_system, system_names
 
@@ -127,7 +127,7 @@ def test_every_analysis_of_every_system_has_a_scene():
 @pytest.mark.parametrize("scene", methods())
 def test_kernels_do_not_call_lapack(scene):
     """Kernels that call it may not run side by side. Only diffrax's implicit solver needs to: the proof that it shows."""
-    engine = Engine(load_scene(scene))
+    engine = resolve(load_scene(scene))
     for solver in engine.solvers:
         columns = {axis.name: jax.ShapeDtypeStruct((2,), axis.values.dtype) for axis in engine.grid.axes}
         traced = jax.jit(lambda columns, effort, solve=solver.solve: solve(engine.grid.bind(columns), effort))

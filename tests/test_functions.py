@@ -18,8 +18,8 @@ from drivetrain_jax.analysis import OUTCOME, get_analysis
 from drivetrain_jax.analysis.periodic import propagator
 from drivetrain_jax.analysis.request import make_request
 from drivetrain_jax.runs import kernel
-from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.kernel import compile_kernel, result_variables
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import get_system
 
@@ -210,7 +210,7 @@ def calls_of_diffeqsolve(monkeypatch, scene) -> list[bool]:
         return original(terms, *given, **more)
 
     monkeypatch.setattr(propagator.diffrax, "diffeqsolve", watched)
-    engine = Engine(load_scene(scene))
+    engine = resolve(load_scene(scene))
     for solver in engine.solvers:
         before = len(calls)
         compile_kernel(solver, engine.grid, 16, result_variables(engine.scene), few=True)

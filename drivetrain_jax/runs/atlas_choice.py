@@ -1,8 +1,6 @@
-"""Decide if a scene is evaluated from an atlas, and over which ranges."""
+"""Decide if a scene is evaluated from an atlas, over which ranges, and from how many solves."""
 
 from __future__ import annotations
-
-from typing import cast
 
 import numpy as np
 
@@ -13,6 +11,7 @@ from drivetrain_jax.runs.grid import Grid
 from drivetrain_jax.runs.plan import mean_cost
 from drivetrain_jax.runs.scene import Scene
 
+Ranges = dict[str, tuple[float, float]]
 # Points below which "auto" solves directly: two more kernels would take longer to compile.
 _WORTHWHILE = 100_000
 # Share of the effort of direct solves that "auto" may spend on an atlas; the rest is then solved directly.
@@ -25,7 +24,7 @@ _SAMPLE = 4096
 _FINEST = 1e-12
 
 
-def atlas_ranges(scene: Scene) -> dict[str, tuple[float, float]]:
+def atlas_ranges(scene: Scene) -> Ranges:
     """Lowest and highest value of every parameter that varies, those with the fewest values first."""
     lengths = {axis.name: len(axis.values) for axis in scene.axes}
     varying = [axis for axis in scene.axes if axis.values.min() < axis.values.max()]
@@ -35,44 +34,44 @@ def atlas_ranges(scene: Scene) -> dict[str, tuple[float, float]]:
     }
 
 
-def uses_atlas(scene: Scene) -> bool:
-    """True if ``scene`` is evaluated from an atlas: on request, or if ``auto`` predicts a lower cost.
+def choose_atlas(scene: Scene) -> tuple[Ranges, int | None] | None:
+    """Ranges of the atlas that ``scene`` is evaluated from, and the largest number of its solves (None: its own limit).
 
-    Raises :class:`InputError` if the scene requests an atlas and varies too many parameters.
+    None if the scene neither asks for an atlas nor ``auto`` predicts a lower cost. Raises :class:`InputError` if it asks
+    for one and varies too many parameters.
     """
     if scene.analysis.name != "floquet" or scene.request.method not in ("auto", "atlas"):
-        return False
-    count = len(atlas_ranges(scene))
+        return None
+    ranges = atlas_ranges(scene)
     if scene.request.method == "atlas":
-        if count > MAX_RANGES:
+        if len(ranges) > MAX_RANGES:
             allowed = f"allowed are at most {MAX_RANGES}"
-            raise InputError(f"options.method = 'atlas': the scene varies {count} parameters; {allowed}")
-        return count > 0
-    model = scene.system.models.get(ANALYSIS.name)
-    return (
-        model is not None
-        and model.smooth is not None
-        and 0 < count <= MAX_RANGES
-        and Grid.of(scene).size >= _WORTHWHILE
-        and scene.request.options["rtol"] >= _FINEST
-        and cast(int, solves_allowed(scene)) >= _FEWEST[count - 1]
-    )
+            raise InputError(f"options.method = 'atlas': the scene varies {len(ranges)} parameters; {allowed}")
+        return (ranges, None) if ranges else None
+    model, grid = scene.system.models.get(ANALYSIS.name), Grid.of(scene)
+    if (
+        model is None
+        or model.smooth is None
+        or not 0 < len(ranges) <= MAX_RANGES
+        or grid.size < _WORTHWHILE
+        or scene.request.options["rtol"] < _FINEST
+    ):
+        return None
+    solves = _affordable_solves(scene, grid, ranges)
+    return (ranges, solves) if solves >= _FEWEST[len(ranges) - 1] else None
 
 
-def solves_allowed(scene: Scene) -> int | None:
-    """Largest number of direct solves for the atlas of ``scene``; None for its own limit.
+def _affordable_solves(scene: Scene, grid: Grid, ranges: Ranges) -> int:
+    """Number of direct solves of an atlas that cost a share of those of all points.
 
     A node costs more than a point: its tolerance is tighter, and nodes are even in the coordinates of the atlas, such as
     1/Omega, where expensive points are rare.
     """
-    if scene.request.method != "auto":
-        return None
-    from drivetrain_jax.runs.rounds import node_engine
+    from drivetrain_jax.runs.rounds import node_job
 
-    grid, random = Grid.of(scene), np.random.default_rng(0)
-    chosen = random.integers(0, grid.size, _SAMPLE)
+    chosen = np.random.default_rng(0).integers(0, grid.size, _SAMPLE)
     point = mean_cost(scene.analysis.solvers(scene.system, scene.request), grid, chosen)
-    nodes = node_engine(scene, atlas_ranges(scene), _SAMPLE)
+    nodes = node_job(scene, ranges, _SAMPLE)
     node = mean_cost(nodes.solvers, nodes.grid, np.arange(_SAMPLE))
     # Nodes of cost 0 are nodes that no solver can compute.
     return int(grid.size * _SHARE * point / node) if node else 0

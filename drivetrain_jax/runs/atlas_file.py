@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,16 +14,15 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import counted, did_you_mean, shown
 from drivetrain_jax.analysis import Request, get_analysis
 from drivetrain_jax.analysis.atlas import ANALYSIS
-from drivetrain_jax.atlas import StabilityAtlas, from_arrays, stability_atlas, to_arrays
+from drivetrain_jax.atlas import Atlas, StabilityAtlas, from_arrays, stability_atlas, to_arrays
 from drivetrain_jax.atlas.floquet import floquet_domain
 from drivetrain_jax.runs import compile_cache
 from drivetrain_jax.runs.assemble import Table, result_attrs, to_dataset
-from drivetrain_jax.runs.atlas_choice import atlas_ranges
 from drivetrain_jax.runs.axes import Axis
-from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.executor import Threads
-from drivetrain_jax.runs.rounds import build_atlas
-from drivetrain_jax.runs.scene import Scene, load_scene
+from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.routes import DIRECT
+from drivetrain_jax.runs.scene import Scene, restore_scene
 from drivetrain_jax.runs.through_atlas import evaluate
 from drivetrain_jax.runs.work import Progress, Work
 from drivetrain_jax.store import checksums
@@ -55,10 +53,8 @@ _PANELS = tuple(name for name in _VARIABLES if name not in (*_DOMAIN, *_GAPS))
 _ATTRIBUTES = ("scene", "coordinates_of_panels", "tolerance", "solves")
 
 
-def make_atlas(scene: Scene, work: Work, progress: Progress) -> Labelled:
-    """The dataset of an atlas scene. ``progress`` counts the solves."""
-    stability, _ = build_atlas(scene, atlas_ranges(scene), work, progress)
-    atlas = stability.atlas
+def to_labelled(atlas: Atlas, scene: Scene) -> Labelled:
+    """The result of a scene of an atlas."""
     arrays = to_arrays(atlas)
     data = {
         name: Entry(dims, arrays[name], {"units": "1", "long_name": meaning})
@@ -103,7 +99,7 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
         )
     if missing := _missing(dataset):
         raise InputError(f"{label}: lacks {missing[0]}; allowed is the whole result of a scene of an atlas")
-    scene = load_scene(tomllib.loads(dataset.attrs["scene"]))
+    scene = restore_scene(dataset.attrs["scene"])
     names = tuple(str(name) for name in dataset["parameter"].values)
     ranges = dict(zip(names, zip(dataset["lower"].values, dataset["upper"].values, strict=True), strict=True))
     domain = floquet_domain(scene.system, ranges, scene.fixed)
@@ -122,7 +118,7 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
 
 
 def _missing(dataset: xr.Dataset) -> list[str]:
-    """Names of the variables of :func:`make_atlas` that ``dataset`` lacks."""
+    """Names of the variables of :func:`to_labelled` that ``dataset`` lacks."""
     gaps = any(name in dataset for name in _GAPS)
     panels = not gaps or any(name in dataset for name in _PANELS)
     needed = (*_DOMAIN, *(_PANELS if panels else ()), *(_GAPS if gaps else ()))
@@ -253,9 +249,9 @@ class StoredAtlas:
         Without ``solve`` what lies in a gap has no value and the outcome ``LOST``.
         """
         scene = self.scene_on(columns, zipped=zipped)
-        engine = Engine(scene)
-        table = Table(scene, engine.grid)
-        evaluate(engine, table, self.stability, Work(Threads()), Progress(engine.total), solve=solve)
+        job = Job(scene, DIRECT)
+        table = Table(scene, job.grid)
+        evaluate(job, table, self.stability, Work(Threads()), Progress(job.total), solve=solve)
         return table.lay_out()
 
     def scene_on(self, columns: Mapping[str, np.ndarray], *, zipped: bool = False) -> Scene:
@@ -274,9 +270,9 @@ class StoredAtlas:
         """
         axes = {name: column for name, column in columns.items() if name in self.parameters}
         request = Request(("spectral_radius",), "direct", self.scene.request.options)
-        engine = Engine(self._scene(axes, dict(self.fixed), request, zipped=True))
-        table = Table(engine.scene, engine.grid)
-        Work(Threads()).do(engine, table, Progress(engine.total))
+        job = Job(self._scene(axes, dict(self.fixed), request, zipped=True), DIRECT)
+        table = Table(job.scene, job.grid)
+        Work(Threads()).do(job, table, Progress(job.total))
         return table.lay_out()["spectral_radius"]
 
     def _names(self, values: Mapping[str, Any]) -> tuple[str, ...]:

@@ -27,7 +27,7 @@ class Computation(Protocol):
         """Digest of everything that affects the results."""
         ...
 
-    def compute(self, task: Any) -> Results:
+    def compute(self, task: Any, /) -> Results:
         """The results of one task."""
         ...
 

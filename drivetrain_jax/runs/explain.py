@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -13,23 +12,34 @@ import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import clipped, counted
 from drivetrain_jax.analysis.atlas import ANALYSIS
-from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.identity import EVALUATES_ATLAS, scene_content
-from drivetrain_jax.runs.scene import Scene, load_scene
+from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.scene import Scene, restore_scene
 
 
-def differences(stored: Mapping[str, Any], engine: Engine, *, points: bool = True) -> list[str]:
-    """Differences of stored work from that of ``engine``: scene (TOML), package version, ``numerics``,
-    ``numerics_detail``. Without ``points``, axes and fixed values may differ, and results may be more than requested."""
+def differences(stored: Mapping[str, Any], job: Job) -> list[str]:
+    """Differences of stored work from that of ``job``: scene (TOML), package version, ``numerics``,
+    ``numerics_detail``."""
     try:
-        scene = load_scene(tomllib.loads(str(stored.get("scene"))))
-    except (InputError, tomllib.TOMLDecodeError) as error:
-        return [f"its scene is not valid now ({' '.join(str(error).split())})"]
-    found = list(_of_scenes(scene, engine.scene, points))
+        scene = restore_scene(stored.get("scene"))
+    except InputError as error:
+        return [not_valid(error)]
+    return differences_of(scene, stored, job)
+
+
+def not_valid(error: InputError) -> str:
+    """The reason why stored work has no scene."""
+    return f"its scene is not valid now ({' '.join(str(error).split())})"
+
+
+def differences_of(scene: Scene, stored: Mapping[str, Any], job: Job, *, points: bool = True) -> list[str]:
+    """Like :func:`differences`, for work of ``scene``. Without ``points``, axes and fixed values may differ, and results
+    may be more than requested."""
+    found = list(_of_scenes(scene, job.scene, points))
     if stored.get("drivetrain_jax_version") != drivetrain_jax.__version__:
         found.append(f"drivetrain_jax is {drivetrain_jax.__version__}, was {stored.get('drivetrain_jax_version')}")
-    if stored.get("numerics") != engine.numerics:
-        found += _of_numerics(stored.get("numerics_detail"), engine.numerics_detail)
+    if stored.get("numerics") != job.numerics:
+        found += _of_numerics(stored.get("numerics_detail"), job.numerics_detail)
     return found
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.runs.assemble import Table
 from drivetrain_jax.runs.grid import Grid
-from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.runs.scene import restore_scene
 from drivetrain_jax.store import shards
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.consolidate import ResultFile
@@ -29,7 +28,7 @@ def export(store: Path, out: Path) -> int:
     if not shards.is_sealed(store):
         raise _damaged(store, "its attributes are damaged, or it is not finished")
     attrs = shards.attributes(store)
-    scene = load_scene(tomllib.loads(attrs["scene"]))
+    scene = restore_scene(attrs["scene"])
     kept = {name: value for name, value in attrs.items() if name not in (shards.GROUPS, shards.HELD, shards.SEAL)}
     parts, grid, ours = PartsFolder(out), Grid.of(scene), False
     try:

@@ -7,7 +7,6 @@ chunk.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,10 +18,10 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import sweep_first
 from drivetrain_jax.runs.axes import entry_of
-from drivetrain_jax.runs.engine import Engine
-from drivetrain_jax.runs.explain import differences
+from drivetrain_jax.runs.explain import differences_of, not_valid
 from drivetrain_jax.runs.grid import Grid
-from drivetrain_jax.runs.scene import Scene, load_scene
+from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.scene import Scene, restore_scene
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.consolidate import map_variable, read_attribute
 from drivetrain_jax.store.provenance import digest
@@ -111,18 +110,18 @@ class ReusedPoints:
 NO_REUSE = ReusedPoints(())
 
 
-def remaining(engine: Engine, reused: ReusedPoints) -> Engine:
-    """``engine`` restricted to the points that are not reused."""
+def remaining(job: Job, reused: ReusedPoints) -> Job:
+    """``job`` restricted to the points that are not reused."""
     if not reused.sources:
-        return engine
-    left = np.ones(engine.grid.size, bool)
+        return job
+    left = np.ones(job.grid.size, bool)
     left[reused.points] = False
-    return engine.only(np.flatnonzero(left))
+    return job.only(np.flatnonzero(left))
 
 
-def combined(engine: Engine, found: Iterable[Source]) -> ReusedPoints:
-    """The points of ``engine`` that these results contain, each from the first result that has it."""
-    free = np.ones(engine.grid.size, bool)
+def combined(job: Job, found: Iterable[Source]) -> ReusedPoints:
+    """The points of ``job`` that these results contain, each from the first result that has it."""
+    free = np.ones(job.grid.size, bool)
     sources = []
     for source in found:
         keep = free[source.ours]
@@ -131,8 +130,8 @@ def combined(engine: Engine, found: Iterable[Source]) -> ReusedPoints:
     return ReusedPoints(tuple(source for source in sources if source.ours.size))
 
 
-def find(engine: Engine, path: Path) -> Source:
-    """The points of ``engine`` that the result at ``path`` contains, without lost ones. Raises :class:`NotReusable`, or
+def find(job: Job, path: Path) -> Source:
+    """The points of ``job`` that the result at ``path`` contains, without lost ones. Raises :class:`NotReusable`, or
     :class:`InputError` if there is no readable result."""
     if not path.is_file():
         raise NotReusable(f"reuse = {str(path)!r}: {_no_file(path)}")
@@ -140,12 +139,10 @@ def find(engine: Engine, path: Path) -> Source:
     attrs = {name: read_attribute(path, name) for name in names}
     if attrs["digest"] is None:
         raise NotReusable(f"reuse = {str(path)!r}: not a result of drivetrain_jax; allowed is such a result")
-    if reasons := differences(attrs, engine, points=False):
-        raise NotReusable(f"reuse = {str(path)!r}: {reasons[0]}; allowed is a result that differs in its points only")
+    scene = _same_computation(path, attrs, job)
     _check_intact(path)
-    scene = load_scene(tomllib.loads(str(attrs["scene"])))
     grid = Grid.of(scene)
-    theirs, ours = _same_points(scene, grid, engine.scene, engine.grid)
+    theirs, ours = _same_points(scene, grid, job.scene, job.grid)
     none = NotReusable(f"reuse = {str(path)!r}: holds none of the points; allowed is a result that shares some")
     if not theirs.size:
         raise none
@@ -154,11 +151,23 @@ def find(engine: Engine, path: Path) -> Source:
     if not kept.any():
         raise none
     theirs, ours = theirs[kept], ours[kept]
-    wanted = set(scene.request.outputs) <= set(engine.scene.request.outputs)
+    wanted = set(scene.request.outputs) <= set(job.scene.request.outputs)
     # Several of our points may equal one of theirs, and the reverse.
     is_covered = wanted and np.unique(theirs).size == grid.size
     ours, first = np.unique(ours, return_index=True)
     return Source(path, str(attrs["digest"]), grid, theirs[first], ours, is_covered)
+
+
+def _same_computation(path: Path, attrs: Mapping[str, Any], job: Job) -> Scene:
+    """The scene of a result that differs from ``job`` in its points only."""
+    try:
+        scene = restore_scene(attrs["scene"])
+        reasons = differences_of(scene, attrs, job, points=False)
+    except InputError as error:
+        reasons = [not_valid(error)]
+    if reasons:
+        raise NotReusable(f"reuse = {str(path)!r}: {reasons[0]}; allowed is a result that differs in its points only")
+    return scene
 
 
 def _no_file(path: Path) -> str:

@@ -15,8 +15,7 @@ import jax
 import drivetrain_jax
 from drivetrain_jax._machine import instruction_set
 from drivetrain_jax.analysis import Solver
-from drivetrain_jax.runs.atlas_choice import uses_atlas
-from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.runs.scene import Problem
 from drivetrain_jax.store.provenance import digest, source_digest, versions
 
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "numpy", "scipy")
@@ -24,16 +23,15 @@ _ROOT = Path(drivetrain_jax.__file__).parent
 _ENGINE = ("runs/grid.py", "runs/plan.py", "runs/kernel.py")
 # A source file of points that are evaluated from an atlas, and of no others.
 EVALUATES_ATLAS = "runs/through_atlas.py"
-_THROUGH_ATLAS = ("atlas/floquet.py", "runs/atlas_choice.py", "runs/rounds.py", EVALUATES_ATLAS)
+ATLAS_SOURCES = ("atlas/floquet.py", "runs/atlas_choice.py", "runs/rounds.py", EVALUATES_ATLAS)
 # Packages whose sources affect the numbers.
 _NUMERIC = ("drivetrain_jax._quantities", "drivetrain_jax.systems", "drivetrain_jax.analysis", "drivetrain_jax.atlas")
 
 
-def numerics_of(scene: Scene) -> dict[str, Any]:
-    """The sources that this scene runs, the package versions, and the instruction set: all that affects the bits.
-    Sources of other systems and analyses are not included."""
-    through_atlas = scene.analysis.continuous or uses_atlas(scene)
-    starts = [_ROOT / name for name in (*_ENGINE, *(_THROUGH_ATLAS if through_atlas else ()))]
+def numerics_of(scene: Problem, sources: Sequence[str]) -> dict[str, Any]:
+    """The sources that this scene runs (``sources`` are those of its route), the package versions, and the instruction
+    set: all that affects the bits. Sources of other systems and analyses are not included."""
+    starts = [_ROOT / name for name in (*_ENGINE, *sources)]
     for function in (scene.analysis.model(scene.system).build, scene.analysis.solvers):
         # Neither a partial nor what is wrapped around a method has a source of its own.
         starts.append(Path(inspect.getsourcefile(inspect.unwrap(getattr(function, "func", function))) or ""))
@@ -122,7 +120,7 @@ def _files(name: str, importer: Path) -> list[Path]:
     return [file for stem in stems for file in (stem.with_suffix(".py"), stem / "__init__.py") if file.is_file()]
 
 
-def scene_content(scene: Scene) -> dict[str, Any]:
+def scene_content(scene: Problem) -> dict[str, Any]:
     """The content of a scene without its title."""
     request = scene.request
     return {
@@ -137,7 +135,7 @@ def scene_content(scene: Scene) -> dict[str, Any]:
     }
 
 
-def scene_digest(scene: Scene, solvers: Sequence[Solver], numerics: str) -> str:
+def scene_digest(scene: Problem, solvers: Sequence[Solver], numerics: str) -> str:
     """Digest of scene (without title), chunk sizes, package version and numerics."""
     return digest(
         scene_content(scene)

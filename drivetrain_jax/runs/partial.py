@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,10 +11,10 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import Table, enter, to_dataset
-from drivetrain_jax.runs.atlas_choice import uses_atlas
-from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.growing import remaining
-from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.resolve import resolve
+from drivetrain_jax.runs.scene import restore_scene
 from drivetrain_jax.runs.sharded import stored
 from drivetrain_jax.runs.target import Target
 from drivetrain_jax.store import consolidate, shards
@@ -49,44 +48,44 @@ def open_result(path: str | Path) -> xr.Dataset:
 
 def _open_partial(path: Path) -> xr.Dataset:
     plan = PartsFolder(path).plan()
-    engine = Engine(load_scene(tomllib.loads(str(plan.get("scene", "")))))
-    target = Target(path, engine)
+    job = resolve(restore_scene(str(plan.get("scene", ""))))
+    target = Target(path, job)
     if target.state != "partial":
         raise InputError(f"file = {str(path)!r}: holds {target.obstacle}; allowed is to run its scene again")
-    if engine.scene.analysis.continuous or uses_atlas(engine.scene):
+    if not job.route.is_pointwise:
         raise InputError(
             f"file = {str(path)!r}: an atlas that is not finished; allowed is to wait for it or to resume it"
         )
-    table, done = Table(engine.scene, engine.grid), np.zeros(engine.grid.size, bool)
-    for points, results in _finished(engine, target):
+    table, done = Table(job.scene, job.grid), np.zeros(job.grid.size, bool)
+    for points, results in _finished(job, target):
         table.fill(points, results)
         done[points] = True
-    return _labelled(engine, table, done)
+    return _labelled(job, table, done)
 
 
-def _finished(engine: Engine, target: Target) -> Iterator[tuple[np.ndarray, Mapping[str, np.ndarray]]]:
+def _finished(job: Job, target: Target) -> Iterator[tuple[np.ndarray, Mapping[str, np.ndarray]]]:
     """Points and results that are finished, reused ones included."""
     if target.store == "zarr":
         store = target.parts.path / shards.UNFINISHED
-        for _, arrays in stored(engine, store) if shards.is_store(store) else ():
+        for _, arrays in stored(job, store) if shards.is_store(store) else ():
             if arrays is not None:
                 yield shards.without_padding(arrays)
         return
     reused = target.reused_before()
-    yield from reused.blocks([variable.name for variable in Table(engine.scene, engine.grid).variables])
-    plan = remaining(engine, reused).plan
+    yield from reused.blocks([variable.name for variable in Table(job.scene, job.grid).variables])
+    plan = remaining(job, reused).plan
     for part in target.parts.read():
         for number, results in part:
             yield plan.chunk(number).points, results
 
 
-def _labelled(engine: Engine, table: Table, done: np.ndarray) -> xr.Dataset:
+def _labelled(job: Job, table: Table, done: np.ndarray) -> xr.Dataset:
     arrays = dict(table.lay_out())
-    enter(arrays[OUTCOME.name], engine.grid, np.flatnonzero(~done), PENDING)
-    count = int(done.sum()) * engine.grid.path_length
-    dataset = to_dataset(engine.scene, arrays, {"digest": engine.digest, "points_done": count})
+    enter(arrays[OUTCOME.name], job.grid, np.flatnonzero(~done), PENDING)
+    count = int(done.sum()) * job.grid.path_length
+    dataset = to_dataset(job.scene, arrays, {"digest": job.digest, "points_done": count})
     outcome = dataset[OUTCOME.name].attrs
     outcome["flag_values"] = np.arange(PENDING + 1, dtype=OUTCOME.dtype)
     outcome["flag_meanings"] += " pending"
-    title = f"{engine.scene.title} (unfinished: {count} of {engine.total} points)"
+    title = f"{job.scene.title} (unfinished: {count} of {job.total} points)"
     return dataset.assign_attrs(title=title)

@@ -15,8 +15,9 @@ from drivetrain_jax._quantities import Variable
 from drivetrain_jax._wording import aligned, nearest, shown, written
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, get_analysis
 from drivetrain_jax.runs.assemble import Table
-from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.physical import nondimensional
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import find_system, load_scene, system_and_analysis
 
 
@@ -160,11 +161,11 @@ def point(system: str, analysis: str, *, outputs: Sequence[str] | None = None, *
         outputs = [outputs] if isinstance(outputs, str) else outputs
         tree["outputs"] = list(outputs) if isinstance(outputs, Iterable) else outputs
     try:
-        engine = Engine(load_scene(tree))
+        job = resolve(load_scene(tree))
     except InputError as error:
         # Messages name the fields without the tables of a scene.
         raise InputError(re.sub(r"^(points|fixed|options)\.", "", str(error))) from None
-    return _result(engine, _compute(engine))
+    return _result(job, _compute(job))
 
 
 def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -192,17 +193,17 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
     return tree
 
 
-def _compute(engine: Engine) -> Table:
-    table = Table(engine.scene, engine.grid)
-    for number in range(len(engine.plan.costs)):
-        chunk = engine.plan.chunk(number)
-        table.fill(chunk.points, engine.compute(chunk))
+def _compute(job: Job) -> Table:
+    table = Table(job.scene, job.grid)
+    for number in range(len(job.plan.costs)):
+        chunk = job.plan.chunk(number)
+        table.fill(chunk.points, job.compute(chunk))
     return table
 
 
-def _result(engine: Engine, table: Table) -> PointResult:
-    scene = engine.scene
-    first = (0,) * len(engine.grid.result_shape)
+def _result(job: Job, table: Table) -> PointResult:
+    scene = job.scene
+    first = (0,) * len(job.grid.result_shape)
     values = {v.name: table.lay_out()[v.name][first] for v in table.variables}
     outcome = Outcome(int(values.pop(OUTCOME.name)))
     parameters = {a.parameter.name: a.values[0].item() for a in scene.axes} | dict(scene.fixed)
@@ -216,13 +217,13 @@ def _result(engine: Engine, table: Table) -> PointResult:
         outcome=outcome,
         variables={v.name: v for v in table.variables},
         parameter_units={p.name: p.units for p in scene.system.parameters},
-        labels=_labels(engine, values, table),
+        labels=_labels(job, values, table),
     )
 
 
-def _labels(engine: Engine, values: Mapping[str, Any], table: Table) -> dict[str, Sequence[Any]]:
+def _labels(job: Job, values: Mapping[str, Any], table: Table) -> dict[str, Sequence[Any]]:
     """The entries of every dimension of ``values``: coordinates, or numbers."""
     shown = [v for v in table.variables if v.name in values]
     sizes = {dim: n for v in shown for dim, n in zip(v.dims, np.shape(values[v.name]), strict=True)}
-    known = {dimension.name: dimension.values for dimension in engine.scene.dimensions}
+    known = {dimension.name: dimension.values for dimension in job.scene.dimensions}
     return {dim: known.get(dim) or range(size) for dim, size in sizes.items()}

@@ -21,7 +21,8 @@ from drivetrain_jax.atlas import (
 )
 from drivetrain_jax.atlas.construction import MAX_SOLVES
 from drivetrain_jax.runs.axes import Axis
-from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.routes import DIRECT
 from drivetrain_jax.runs.scene import Problem, Scene
 from drivetrain_jax.runs.work import Progress, Work
 
@@ -53,11 +54,11 @@ def build_atlas(
         except StopIteration as end:
             progress.note = _note(end.value)
             return stability_atlas(end.value, scene.system, rtol), first
-        engine = Engine(_solves(scene, fixed, tuple(ranges), points, options), full_size=True)
+        job = Job(_solves(scene, fixed, tuple(ranges), points, options), DIRECT, full_size=True)
         answers = _Answers(len(points), width)
         progress.total += len(points)
-        work.do(engine, answers, progress, first)
-        first += len(engine.plan.costs)
+        work.do(job, answers, progress, first)
+        first += len(job.plan.costs)
         values = answers.values
 
 
@@ -70,14 +71,14 @@ def _note(atlas: Atlas) -> str:
     return f"the atlas has {have} ({reasons}): what lies in a gap is solved directly"
 
 
-def node_engine(scene: Scene, ranges: Mapping[str, tuple[float, float]], count: int) -> Engine:
-    """The engine of ``count`` solves for an atlas of ``scene``, distributed like those of its construction."""
+def node_job(scene: Scene, ranges: Mapping[str, tuple[float, float]], count: int) -> Job:
+    """The job of ``count`` solves for an atlas of ``scene``, distributed like those of its construction."""
     fixed = fixed_of(scene, ranges)
     domain = floquet_domain(scene.system, ranges, fixed)
     spread = np.cos(np.pi * np.random.default_rng(0).random((count, len(ranges))))
     points = domain.points(domain.box().place(spread))
     options = {"rtol": solve_rtol(_tolerance(scene))}
-    return Engine(_solves(scene, fixed, tuple(ranges), points, options), full_size=True)
+    return Job(_solves(scene, fixed, tuple(ranges), points, options), DIRECT, full_size=True)
 
 
 def _tolerance(scene: Scene) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,22 +9,17 @@ from typing import TYPE_CHECKING, Any
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax._machine import physical_memory
 from drivetrain_jax._wording import shown
-from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.runs import sharded
-from drivetrain_jax.runs.assemble import Table, bytes_per_point, failures, to_dataset
-from drivetrain_jax.runs.atlas_choice import uses_atlas
-from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.executor import Executor, Threads
 from drivetrain_jax.runs.executors import make_executor
-from drivetrain_jax.runs.growing import NO_REUSE, ReusedPoints, remaining
+from drivetrain_jax.runs.growing import ReusedPoints
+from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.notebook import shown_progress
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import Scene, load_scene
 from drivetrain_jax.runs.target import Target
 from drivetrain_jax.runs.work import Progress, Report, Work
-from drivetrain_jax.store.chunks import PartsFolder
-from drivetrain_jax.store.consolidate import ResultFile, open_result, write_result
-from drivetrain_jax.store.files import ATLAS_PREFACE
-from drivetrain_jax.store.schema import Labelled
+from drivetrain_jax.store.consolidate import open_result
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -90,7 +84,7 @@ def run(
         if reuse:
             raise InputError("reuse: given without out; allowed is a run into a file")
         with shown_progress(report) as shown:
-            return _in_memory(_engine(scene, overrides, on_disk=False), executor, shown)
+            return _in_memory(_job(scene, overrides, on_disk=False), executor, shown)
     with shown_progress(report) as shown:
         run_to_file(scene, Path(out), overrides=overrides, fresh=fresh, executor=executor, reuse=reuse, report=shown)
     return open_result(Path(out))
@@ -111,14 +105,14 @@ def run_to_file(
 
     ``store`` is ``hdf5``, or ``zarr`` if workers write a Zarr store (see :mod:`.sharded`).
     """
-    engine = _engine(scene, overrides, on_disk=True)
+    job = _job(scene, overrides, on_disk=True)
     if store == "zarr":
-        sharded.check(engine)
-    target = Target(out, engine, store)
+        sharded.check(job)
+    target = Target(out, job, store)
     target.restore()
     if not fresh and target.state == "complete":
         target.parts.discard(target.digest, target.written)
-        total = target.points(engine.total)
+        total = target.points(job.total)
         return Progress(total, reused=total, failed=target.failed)
     if not fresh and target.state == "stale":
         raise target.refusal
@@ -137,7 +131,7 @@ def _paths(reuse: str | Path | Sequence[str | Path]) -> Sequence[str | Path]:
 
 def _into(target: Target, reused: ReusedPoints, fresh: bool, executor: Executor, report: Report | None) -> Progress:
     """Start or resume the result of ``target``; the points ``reused`` are reused."""
-    engine, parts, progress = target.engine, target.parts, _progress(target.engine)
+    job, parts, progress = target.job, target.parts, target.job.route.progress(target.job)
     begins = False
     try:
         parts.open()
@@ -146,9 +140,10 @@ def _into(target: Target, reused: ReusedPoints, fresh: bool, executor: Executor,
         if begins:
             parts.start(target.plan(reused, fresh))
         if target.store == "zarr":
-            sharded.compute(engine, target.out, parts, progress, executor, report)
+            sharded.compute(job, target.out, parts, progress, executor, report)
         else:
-            _resume(engine, target.out, parts, progress, executor, report, reused)
+            with Work(executor, report, parts) as work:
+                job.route.into_file(job, target.out, parts.result, work, progress, reused)
         parts.close(remove=True)
     except KeyboardInterrupt:
         raise Interrupted(progress) from None
@@ -166,92 +161,21 @@ def _into(target: Target, reused: ReusedPoints, fresh: bool, executor: Executor,
     return progress
 
 
-def _engine(
-    scene: str | Path | Mapping[str, Any] | Scene, overrides: Mapping[str, Any] | None, on_disk: bool
-) -> Engine:
-    """The engine of a scene, checked against the memory of this machine."""
-    checked = scene if isinstance(scene, Scene) else load_scene(scene, overrides)
-    engine = Engine(checked)
-    if checked.analysis.continuous:
-        # An atlas has no points.
-        return engine
-    needed, present = engine.total * bytes_per_point(checked, on_disk), physical_memory()
+def _job(scene: str | Path | Mapping[str, Any] | Scene, overrides: Mapping[str, Any] | None, on_disk: bool) -> Job:
+    """The job of a scene, checked against the memory of this machine."""
+    job = resolve(scene if isinstance(scene, Scene) else load_scene(scene, overrides))
+    needed, present = job.route.bytes_needed(job, on_disk), physical_memory()
     if needed > present:
         limit = f"allowed here is up to {present / 1e9:.0f} GB"
-        raise InputError(f"axes: {engine.total} points need {needed / 1e9:.0f} GB of memory; {limit}")
-    return engine
+        raise InputError(f"axes: {job.total} points need {needed / 1e9:.0f} GB of memory; {limit}")
+    return job
 
 
-def _progress(engine: Engine) -> Progress:
-    """The counts before the computation; the number of solves of an atlas is known only during its construction."""
-    return Progress(0, kind="direct solves") if engine.scene.analysis.continuous else Progress(engine.total)
-
-
-def _in_memory(engine: Engine, executor: Executor, report: Report | None) -> xr.Dataset:
-    progress, begin = _progress(engine), time.monotonic()
+def _in_memory(job: Job, executor: Executor, report: Report | None) -> xr.Dataset:
+    progress = job.route.progress(job)
     try:
         with Work(executor, report) as work:
-            if engine.scene.analysis.continuous:
-                dataset = _atlas(engine, work, progress).to_dataset()
-            else:
-                table = Table(engine.scene, engine.grid)
-                extra = _fill(engine, table, work, progress)
-                dataset = to_dataset(engine.scene, table.lay_out(), _attrs(engine) | extra)
+            result = job.route.in_memory(job, work, progress)
+            return result.with_attrs(wall_time_s=work.elapsed).to_dataset()
     except ChunkError as error:
         raise Incomplete(str(error), progress) from error
-    return dataset.assign_attrs(wall_time_s=round(time.monotonic() - begin, 3))
-
-
-def _resume(
-    engine: Engine,
-    out: Path,
-    parts: PartsFolder,
-    progress: Progress,
-    executor: Executor,
-    report: Report | None,
-    reused: ReusedPoints,
-) -> None:
-    """Write the result ``out`` from the points ``reused``, the existing parts, and newly computed chunks."""
-    work, begin = Work(executor, report, parts), time.monotonic()
-
-    def seconds() -> float:
-        return round(work.seconds + time.monotonic() - begin, 3)
-
-    temporary = parts.result
-    if engine.scene.analysis.continuous:
-        with work:
-            result = _atlas(engine, work, progress).with_attrs(wall_time_s=seconds())
-            write_result(result, out, temporary, ATLAS_PREFACE)
-        return
-    with work, ResultFile(temporary) as file:
-        table = Table(engine.scene, engine.grid, lambda blank: file.lay_out(blank.with_attrs(**_attrs(engine))))
-        extra = _fill(engine, table, work, progress, reused)
-        table.lay_out()
-        file.finish(out, wall_time_s=seconds(), **extra)
-
-
-def _fill(
-    engine: Engine, table: Table, work: Work, progress: Progress, reused: ReusedPoints = NO_REUSE
-) -> dict[str, str | int]:
-    """Fill all points into ``table``; returns attributes of the result."""
-    if uses_atlas(engine.scene):
-        from drivetrain_jax.runs.through_atlas import fill_through_atlas
-
-        return fill_through_atlas(engine, table, work, progress)
-    for points, results in reused.blocks([variable.name for variable in table.variables]):
-        table.fill(points, results)
-        progress.reused += results[OUTCOME.name].size
-        progress.failed += failures(results[OUTCOME.name])
-    work.do(remaining(engine, reused), table, progress)
-    return reused.attrs
-
-
-def _atlas(engine: Engine, work: Work, progress: Progress) -> Labelled:
-    from drivetrain_jax.runs.atlas_file import make_atlas
-
-    return make_atlas(engine.scene, work, progress).with_attrs(**_attrs(engine))
-
-
-def _attrs(engine: Engine) -> dict[str, str | float]:
-    """Attributes that identify the result; effort and time are added at the end."""
-    return {"digest": engine.digest, **engine.numerics_attrs, "wall_time_s": 0.0}

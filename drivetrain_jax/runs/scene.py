@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -115,6 +116,14 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
     # The analysis checks that request and parameters match.
     _ = scene.dimensions
     return scene
+
+
+def restore_scene(text: object) -> Scene:
+    """The scene whose TOML text a result stores. Raises :class:`InputError` if it is not valid now."""
+    try:
+        return load_scene(tomllib.loads(str(text)))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(str(error)) from None
 
 
 def find_system(name: str) -> type[System]:

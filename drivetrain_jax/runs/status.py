@@ -13,9 +13,8 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.analysis.periodic.floquet_propagator import PROPAGATOR
 from drivetrain_jax.runs.assemble import failures
-from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.runs.target import Target
 from drivetrain_jax.store import shards
@@ -52,9 +51,8 @@ def status(
     scene: str | Path | Mapping[str, Any], out: str | Path, overrides: Mapping[str, Any] | None = None
 ) -> Status:
     """The :class:`Status` of ``scene`` at ``out``. Changes nothing and compiles nothing."""
-    engine = Engine(load_scene(scene, overrides))
-    target = Target(Path(out), engine)
-    total = 0 if engine.scene.analysis.continuous else engine.total
+    job = resolve(load_scene(scene, overrides))
+    target, total = Target(Path(out), job), job.route.total(job, 0)
     if target.state == "stale":
         reason = f"it holds {target.obstacle}; {target.remedy}"
         return Status(total, 0, 0, target.state, reason=reason)
@@ -62,10 +60,8 @@ def status(
         found = _counts(target)
     except InputError as error:
         return Status(total, 0, 0, "stale", reason=str(error))
-    if engine.scene.analysis.continuous:
-        total = done = target.points(0) if target.state == "complete" else found.done
-        return Status(total, done, found.failed, target.state, found.by_outcome)
-    return Status(total, found.done, found.failed, target.state, found.by_outcome)
+    done = target.points(found.done) if target.state == "complete" else found.done
+    return Status(job.route.total(job, done), done, found.failed, target.state, found.by_outcome)
 
 
 @dataclass(frozen=True)
@@ -94,10 +90,9 @@ def _outcomes(target: Target) -> Iterator[np.ndarray]:
         store = target.parts.path / shards.UNFINISHED
         yield from shards.finished(store, OUTCOME.name) if shards.is_store(store) else ()
     elif target.state == "partial":
-        continuous, seen = target.engine.scene.analysis.continuous, set[int]()
+        seen = set[int]()
         for part in target.parts.read():
-            # Solves of an atlas are not points of a grid.
-            if continuous or PROPAGATOR not in part.results:
+            if target.job.route.counts(part):
                 # An interrupt during writing may leave a chunk in two parts.
                 yield from (results[OUTCOME.name] for number, results in part if number not in seen)
                 seen.update(part.chunks.tolist())

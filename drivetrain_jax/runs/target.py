@@ -15,11 +15,9 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import clipped
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import failures
-from drivetrain_jax.runs.atlas_choice import uses_atlas
-from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.explain import differences
 from drivetrain_jax.runs.growing import NO_REUSE, Damaged, NotReusable, ReusedPoints, Source, combined, find
-from drivetrain_jax.runs.layout import rearranged
+from drivetrain_jax.runs.job import Job
 from drivetrain_jax.store import shards
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.consolidate import read_attribute, read_variable
@@ -27,20 +25,20 @@ from drivetrain_jax.store.files import behind_link
 
 
 class Target:
-    """The result file ``out`` and the folder of its parts, seen by the scene of ``engine``.
+    """The result file ``out`` and the folder of its parts, seen by the scene of ``job``.
 
     ``state`` is ``absent``, ``partial``, ``complete`` or ``stale`` (a result or parts of another scene or version). Raises
     :class:`InputError` if nothing can be written there, or if a file there is not a result of this package.
     """
 
-    def __init__(self, out: Path, engine: Engine, store: str | None = None) -> None:
+    def __init__(self, out: Path, job: Job, store: str | None = None) -> None:
         self.out = out = behind_link(out)
         self.parts = PartsFolder(out)
         _check_name(out, self.parts)
         _check_parts(out, self.parts.path)
         self.store = store or self._kind()
         _check_place(out, self._held, self.store)
-        self.engine, self.digest = engine, engine.digest
+        self.job, self.digest = job, job.digest
         self.present = _digest_of(out, self._held)
         self._plan_seen = self.parts.plan()
 
@@ -98,7 +96,7 @@ class Target:
             "reuses": reused.digest,
             "reused": reused.count,
             "reused_files": [os.path.relpath(source.path, self.out.parent) for source in reused.sources],
-            **provenance_of(self.engine),
+            **provenance_of(self.job),
         }
 
     def resumes(self, reused: ReusedPoints, fresh: bool) -> bool:
@@ -126,19 +124,14 @@ class Target:
     @cached_property
     def _rearranged(self) -> list[str]:
         """Names of the variables of the present result whose layout differs from this scene."""
-        if self.engine.scene.analysis.continuous or self.store == "zarr":
-            return []
-        return rearranged(self.out, self.engine.scene, self.engine.grid)
+        return [] if self.store == "zarr" else self.job.route.rearranged(self.job, self.out)
 
     @cached_property
     def _found(self) -> Source | NotReusable | None:
         """The points of this scene that the present result contains, or the reason why it has none."""
-        if self.engine.scene.analysis.continuous or self.present is None or self.store == "zarr":
+        if self.present is None or self.store == "zarr":
             return None
-        try:
-            return find(self.engine, self.out)
-        except NotReusable as error:
-            return error
+        return self.job.route.common_points(self.job, self.out)
 
     @property
     def _shared(self) -> Source | None:
@@ -162,23 +155,22 @@ class Target:
 
         Raises :class:`InputError` if unfinished work uses other results, or if one of ``reuse`` has no common points.
         """
-        scene = self.engine.scene
         if self.store == "zarr":
             if reuse:
                 raise InputError("reuse: given together with store = 'zarr'; allowed is one of them")
             return NO_REUSE
-        if scene.analysis.continuous or uses_atlas(scene):
+        if not self.job.route.is_pointwise:
             if reuse:
                 raise InputError("reuse: not available for an atlas; allowed for a scene with direct solves")
             return NO_REUSE
         paths = [Path(path) for path in reuse]
-        found = [find(self.engine, path) for path in paths]
+        found = [find(self.job, path) for path in paths]
         # Unfinished fresh work is resumed as fresh.
         if not (fresh or self.parts.plan().get("fresh")):
             if isinstance(self._found, Damaged):
                 raise self.refusal
             found += [self._shared] if self._shared is not None and self._grows else []
-        reused = combined(self.engine, found)
+        reused = combined(self.job, found)
         if not fresh and self.parts.holds_work() and self.parts.plan().get("reuses") != reused.digest:
             files = ", ".join(self.parts.plan().get("reused_files") or ["no other result"])
             raise InputError(
@@ -192,7 +184,7 @@ class Target:
         if not self.parts.holds_work():
             return self.reused_points((), fresh=False)
         names = self.parts.plan().get("reused_files") or ()
-        return combined(self.engine, [find(self.engine, self.out.parent / name) for name in names])
+        return combined(self.job, [find(self.job, self.out.parent / name) for name in names])
 
     @property
     def refusal(self) -> InputError:
@@ -213,8 +205,8 @@ class Target:
             if self.store != stored.get("store"):
                 return f"{what} of --store {stored.get('store')}"
         else:
-            stored, what = {name: _attribute(self._held, name) for name in provenance_of(self.engine)}, "a result"
-        reasons = differences(stored, self.engine) if stored else ["the difference is unknown"]
+            stored, what = {name: _attribute(self._held, name) for name in provenance_of(self.job)}, "a result"
+        reasons = differences(stored, self.job) if stored else ["the difference is unknown"]
         more = f" and {len(reasons) - 2} more" if len(reasons) > 2 else ""
         return f"{what} of another scene or version: {'; '.join(reasons[:2]) or 'other sizes of chunks'}{more}"
 
@@ -226,7 +218,7 @@ class Target:
                 [np.empty(0, np.int8), *(a.ravel() for a in shards.finished(self._held, OUTCOME.name))]
             )
             # Points that no solver can compute are in no shard.
-            return np.append(held, np.full(max(self.engine.total - held.size, 0), Outcome.STEP_LIMIT, np.int8))
+            return np.append(held, np.full(max(self.job.total - held.size, 0), Outcome.STEP_LIMIT, np.int8))
         return read_variable(self.out, OUTCOME.name)
 
     @property
@@ -249,12 +241,12 @@ class Target:
         return None if value is None else int(np.squeeze(value))
 
 
-def provenance_of(engine: Engine) -> dict[str, str]:
+def provenance_of(job: Job) -> dict[str, str]:
     """Attributes that explain later how stored work differs from a scene."""
     return {
-        "scene": engine.scene.text,
+        "scene": job.scene.text,
         "drivetrain_jax_version": drivetrain_jax.__version__,
-        **engine.numerics_attrs,
+        **job.numerics_attrs,
     }
 
 

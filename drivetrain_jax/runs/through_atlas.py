@@ -13,9 +13,12 @@ from drivetrain_jax._threads import in_double_precision
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.atlas import StabilityAtlas, prepare_judging
 from drivetrain_jax.runs.assemble import Table, failures
-from drivetrain_jax.runs.atlas_choice import atlas_ranges, solves_allowed
-from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.atlas_choice import Ranges
+from drivetrain_jax.runs.growing import ReusedPoints
+from drivetrain_jax.runs.identity import ATLAS_SOURCES
+from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.rounds import build_atlas, fixed_of
+from drivetrain_jax.runs.routes import PointsRoute
 from drivetrain_jax.runs.work import Progress, Work
 
 # Cells evaluated at a time; determines memory and the interval of progress reports.
@@ -27,41 +30,50 @@ _LARGE = 1 << 19
 Results = Mapping[str, np.ndarray]
 
 
-def fill_through_atlas(engine: Engine, table: Table, work: Work, progress: Progress) -> dict[str, str | int]:
-    """Fill all points of ``engine`` into ``table``; returns attributes of the result."""
-    scene = engine.scene
-    solves = Progress(0, kind="direct solves for the atlas")
-    # In parallel with the solves.
-    with ThreadPoolExecutor(1, initializer=in_double_precision) as aside:
-        prepared = [aside.submit(_lay_out, engine, table), aside.submit(_prepare_judging, engine)]
-        atlas, first = build_atlas(scene, atlas_ranges(scene), work, solves, solves_allowed(scene))
-        progress.note = solves.note
-        prepared[0].result()
-        uncovered = evaluate(engine, table, atlas, work, progress, first)
-        prepared[1].result()
-    return {"atlas_solves": atlas.atlas.solves, "atlas_panels": len(atlas.atlas.panels), "atlas_uncovered": uncovered}
+class ThroughAtlas(PointsRoute):
+    """Builds an atlas over ``ranges`` and evaluates it; points that it does not cover are solved."""
+
+    sources: tuple[str, ...] = ATLAS_SOURCES
+
+    def __init__(self, ranges: Ranges, max_solves: int | None) -> None:
+        self._ranges, self._max_solves = ranges, max_solves
+
+    def fill(
+        self, job: Job, table: Table, work: Work, progress: Progress, reused: ReusedPoints
+    ) -> dict[str, str | int]:
+        """Fill all points; nothing is reused, because evaluating is faster than reading."""
+        solves = Progress(0, kind="direct solves for the atlas")
+        # In parallel with the solves.
+        with ThreadPoolExecutor(1, initializer=in_double_precision) as aside:
+            prepared = [aside.submit(_lay_out, job, table), aside.submit(self._prepare_judging, job)]
+            atlas, first = build_atlas(job.scene, self._ranges, work, solves, self._max_solves)
+            progress.note = solves.note
+            prepared[0].result()
+            uncovered = evaluate(job, table, atlas, work, progress, first)
+            prepared[1].result()
+        panels = len(atlas.atlas.panels)
+        return {"atlas_solves": atlas.atlas.solves, "atlas_panels": panels, "atlas_uncovered": uncovered}
+
+    def _prepare_judging(self, job: Job) -> None:
+        """Compile the kernel that decides single cells, which takes seconds: of this many cells some need it."""
+        if job.grid.size < _LARGE:
+            return
+        scene = job.scene
+        fixed, rtol = fixed_of(scene, self._ranges), scene.request.options["rtol"]
+        prepare_judging(scene.system, self._ranges, fixed, rtol, scene.request.outputs)
 
 
-def _lay_out(engine: Engine, table: Table) -> None:
+def _lay_out(job: Job, table: Table) -> None:
     """Create the output file while the solves run; for a small file this would delay the solves.
 
     The thread that fills memory must also allocate it, to reuse memory that earlier results have freed.
     """
-    if engine.grid.size >= _LARGE and table.on_disk and not any(variable.dims for variable in table.variables):
+    if job.grid.size >= _LARGE and table.on_disk and not any(variable.dims for variable in table.variables):
         table.lay_out(blank=False)
 
 
-def _prepare_judging(engine: Engine) -> None:
-    """Compile the kernel that decides single cells, which takes seconds: of this many cells some need it."""
-    if engine.grid.size < _LARGE:
-        return
-    scene, ranges = engine.scene, atlas_ranges(engine.scene)
-    fixed, rtol = fixed_of(scene, ranges), scene.request.options["rtol"]
-    prepare_judging(scene.system, ranges, fixed, rtol, scene.request.outputs)
-
-
 def evaluate(
-    engine: Engine,
+    job: Job,
     table: Table,
     atlas: StabilityAtlas,
     work: Work,
@@ -70,34 +82,34 @@ def evaluate(
     *,
     solve: bool = True,
 ) -> int:
-    """All points of ``engine`` into ``table`` from ``atlas``; those that it does not cover are counted, and solved unless
+    """All points of ``job`` into ``table`` from ``atlas``; those that it does not cover are counted, and solved unless
     ``solve`` is false.
 
     A resumed run evaluates again, because that is faster than reading. For ``first`` see :meth:`Work.do`.
     """
     uncovered: list[np.ndarray] = []
-    filled = _points if engine.scene.zipped else _blocks
-    for block, results in filled(engine, atlas, table):
+    filled = _points if job.scene.zipped else _blocks
+    for block, results in filled(job, atlas, table):
         table.release_after(results)
         outcome = results[OUTCOME.name]
         lost = np.argwhere(outcome == Outcome.LOST) + [part.start for part in block]
-        uncovered.append(np.ravel_multi_index(tuple(lost.T), engine.grid.shape))  # pyright: ignore[reportArgumentType]
+        uncovered.append(np.ravel_multi_index(tuple(lost.T), job.grid.shape))  # pyright: ignore[reportArgumentType]
         progress.computed += outcome.size - len(lost)
         progress.failed += failures(outcome) - len(lost)
         if work.report:
             work.report(progress)
     rest = np.concatenate([np.empty(0, int), *uncovered])
     if rest.size and solve:
-        work.do(engine.only(rest), table, progress, first)
+        work.do(job.only(rest), table, progress, first)
     return rest.size
 
 
-def _points(engine: Engine, atlas: StabilityAtlas, table: Table) -> Iterator[tuple[tuple[slice], Results]]:
+def _points(job: Job, atlas: StabilityAtlas, table: Table) -> Iterator[tuple[tuple[slice], Results]]:
     """Yield positions among the points, and the filled arrays of ``table`` there."""
-    names, outputs = atlas.atlas.parameters, engine.scene.request.outputs
-    for start in range(0, engine.grid.size, _BLOCK):
-        numbers = np.arange(start, min(start + _BLOCK, engine.grid.size))
-        columns = engine.grid.columns(numbers)
+    names, outputs = atlas.atlas.parameters, job.scene.request.outputs
+    for start in range(0, job.grid.size, _BLOCK):
+        numbers = np.arange(start, min(start + _BLOCK, job.grid.size))
+        columns = job.grid.columns(numbers)
         points = np.stack([columns[name] for name in names], axis=-1)
         place = (slice(start, start + len(numbers)),)
         arrays = table.block(place, atlas.blank((), outputs))
@@ -106,14 +118,14 @@ def _points(engine: Engine, atlas: StabilityAtlas, table: Table) -> Iterator[tup
         yield place, arrays
 
 
-def _blocks(engine: Engine, atlas: StabilityAtlas, table: Table) -> Iterator[tuple[tuple[slice, ...], Results]]:
+def _blocks(job: Job, atlas: StabilityAtlas, table: Table) -> Iterator[tuple[tuple[slice, ...], Results]]:
     """Yield positions in the grid block by block, and the filled arrays of ``table`` there."""
-    axes = {axis.name: axis.values for axis in engine.grid.axes}
+    axes = {axis.name: axis.values for axis in job.grid.axes}
     lengths = {name: len(axes[name]) for name in atlas.atlas.parameters}
     longest = sorted(lengths, key=lambda name: lengths[name])[-2:]
     # Rows and columns of a tile are the last two. Of axes as long as each other their order decides, which stays.
     atlas = atlas.ordered(sorted(lengths, key=lambda name: (name in longest, name not in longest and lengths[name])))
-    names, outputs = atlas.atlas.parameters, engine.scene.request.outputs
+    names, outputs = atlas.atlas.parameters, job.scene.request.outputs
     sizes = [lengths[name] for name in names]
     for ranges in _cut(sizes):
         values = [axes[name][part] for name, part in zip(names, ranges, strict=True)]

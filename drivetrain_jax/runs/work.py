@@ -14,8 +14,8 @@ from drivetrain_jax._errors import RetryableError
 from drivetrain_jax._wording import counted
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.runs.assemble import failures
-from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.executor import Executor
+from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.plan import Chunk
 from drivetrain_jax.store.chunks import Part, PartsFolder
 
@@ -61,16 +61,21 @@ class Sink(Protocol):
 class Work:
     """Runs chunks on the executor and reports progress.
 
-    With ``parts`` (open) it stores finished chunks there and reuses stored ones; ``seconds`` is their computing time.
+    With ``parts`` (open) it stores finished chunks there and reuses stored ones.
     Leaving the context ends the workers. By an exception it also writes the chunks in memory; otherwise the result
     contains them.
     """
 
     def __init__(self, executor: Executor, report: Report | None = None, parts: PartsFolder | None = None) -> None:
         self.executor, self.report, self.parts = executor, report, parts
-        self.seconds = 0.0
+        self._seconds, self._begin = 0.0, time.monotonic()
         self._counted = False
         self._writer = _PartWriter(parts)
+
+    @property
+    def elapsed(self) -> float:
+        """Computing time in s, with that of reused parts."""
+        return round(self._seconds + time.monotonic() - self._begin, 3)
 
     def __enter__(self) -> Work:
         return self
@@ -82,55 +87,55 @@ class Work:
         finally:
             self.executor.close()
 
-    def do(self, engine: Engine, sink: Sink, progress: Progress, first: int = 0) -> None:
-        """Compute or reuse all chunks of ``engine`` into ``sink``; stored chunk numbers start at ``first``.
+    def do(self, job: Job, sink: Sink, progress: Progress, first: int = 0) -> None:
+        """Compute or reuse all chunks of ``job`` into ``sink``; stored chunk numbers start at ``first``.
 
         Lost chunks are not stored, so a resumed run computes them again.
         """
-        progress.computed += engine.hopeless
-        progress.failed += engine.hopeless
+        progress.computed += job.hopeless
+        progress.failed += job.hopeless
         if self.parts is None:
-            missing = np.arange(len(engine.plan.costs))
+            missing = np.arange(len(job.plan.costs))
         else:
-            missing = self._reuse(engine, self.parts, sink, progress, first)
+            missing = self._reuse(job, self.parts, sink, progress, first)
         batch, before = _Batch(sink, self._writer, first), progress.computed
         try:
-            self._compute(engine, missing, batch, progress)
+            self._compute(job, missing, batch, progress)
             batch.flush()
         finally:
             batch.keep()
             # An interrupt may come between storing a chunk and counting it: count what is stored or lost.
-            progress.computed = before + (batch.kept + batch.lost) * engine.grid.path_length
+            progress.computed = before + (batch.kept + batch.lost) * job.grid.path_length
 
-    def _reuse(self, engine: Engine, parts: PartsFolder, sink: Sink, progress: Progress, first: int) -> np.ndarray:
+    def _reuse(self, job: Job, parts: PartsFolder, sink: Sink, progress: Progress, first: int) -> np.ndarray:
         """Copy the stored chunks; returns the numbers of the missing ones."""
-        missing = np.ones(len(engine.plan.costs), bool)
+        missing = np.ones(len(job.plan.costs), bool)
         for part in parts.read(repair=True):
-            self.seconds += 0.0 if self._counted else part.seconds
+            self._seconds += 0.0 if self._counted else part.seconds
             for number, results in part:
                 # An interrupt during writing may leave a chunk in two parts.
                 if not (0 <= number - first < missing.size and missing[number - first]):
                     continue
                 missing[number - first] = False
-                points = engine.plan.chunk(number - first).points
+                points = job.plan.chunk(number - first).points
                 sink.fill(points, results)
-                progress.reused += points.size * engine.grid.path_length
+                progress.reused += points.size * job.grid.path_length
                 progress.failed += failures(results[OUTCOME.name])
         self._counted = True
         return np.flatnonzero(missing)
 
-    def _compute(self, engine: Engine, numbers: np.ndarray, batch: _Batch, progress: Progress) -> None:
-        costs = engine.plan.costs
+    def _compute(self, job: Job, numbers: np.ndarray, batch: _Batch, progress: Progress) -> None:
+        costs = job.plan.costs
         progress.cost, progress.total_cost = 0.0, float(costs[numbers].sum())
         self._tell(progress)
         missing = len(numbers)
         if self.executor.in_process:
-            engine.prepare(engine.plan.kernels(numbers))
+            job.prepare(job.plan.kernels(numbers))
         # Closed on exit: after an interrupt no further chunk starts.
-        with closing(self.executor.run(engine, engine.ordered(numbers))) as finished:
+        with closing(self.executor.run(job, job.ordered(numbers))) as finished:
             for chunk, results in finished:
                 missing -= 1
-                count = chunk.points.size * engine.grid.path_length
+                count = chunk.points.size * job.grid.path_length
                 if results is None:
                     batch.lose(chunk)
                     progress.failed += count

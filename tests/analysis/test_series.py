@@ -9,7 +9,7 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis.periodic.series import propagators_along
-from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import LinearPeriodic
 from tests.oracles.atlas_direct import BASE, CARDAN, monodromy, propagators
@@ -96,7 +96,7 @@ def test_very_slow_speeds_are_marched_explicitly_and_apart():
         "fixed": {**BASE, "beta": 1.2},
         "options": {"method": "direct"},
     }
-    engine = Engine(load_scene(scene))
+    engine = resolve(load_scene(scene))
     assert [(group.solver.name.split(", ")[-1], group.size) for group in engine.plan.groups] == [
         ("direct: explicit Runge-Kutta of order 8", 1),
         ("long marches", 2),

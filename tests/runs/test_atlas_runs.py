@@ -21,7 +21,7 @@ from drivetrain_jax.atlas.criteria import Criteria, has_boundaries
 from drivetrain_jax.cli import main
 from drivetrain_jax.runs import atlas_answers, atlas_chart, atlas_choice, rounds, through_atlas
 from drivetrain_jax.runs.atlas_chart import chart
-from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.run import Incomplete, Interrupted, run_to_file
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.store.consolidate import write_result
@@ -139,7 +139,7 @@ def test_auto_counts_the_effort_of_solves_not_their_number(slowest, fastest, tri
     """Down to Omega = .005 a node costs some fifty cells: that many cells are cheaper one by one. Below 1e-8 no solver can
     do any."""
     axes = {"beta": {"start": 0.0, "stop": 1.5, "num": 400}, "Omega": {"start": slowest, "stop": fastest, "num": 400}}
-    assert atlas_choice.uses_atlas(load_scene(floquet("auto", axes))) is tried
+    assert (atlas_choice.choose_atlas(load_scene(floquet("auto", axes))) is not None) is tried
 
 
 def test_what_an_atlas_does_not_cover_is_solved(monkeypatch, direct):
@@ -201,8 +201,14 @@ def test_solves_are_kept_when_a_chart_fails_after_them(tmp_path, monkeypatch):
         broken.setattr(through_atlas, "evaluate", failing)
         with pytest.raises(Incomplete, match="no luck"):
             run_to_file(scene, out)
-    monkeypatch.setattr(Engine, "compute", failing)
+    monkeypatch.setattr(Job, "compute", failing)
     assert run_to_file(scene, out).computed == 533
+
+
+def test_the_solves_of_an_atlas_run_on_workers(stored, monkeypatch):
+    """With the bits of threads, and none in this process."""
+    monkeypatch.setattr(Job, "compute", None)
+    same_arrays(dt.run(ATLAS, workers=2), stored)
 
 
 def test_the_function_of_the_parameters(atlas, direct):

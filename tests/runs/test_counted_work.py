@@ -21,7 +21,7 @@ from drivetrain_jax.analysis import history
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
 from drivetrain_jax.analysis.numerics import singular_values
 from drivetrain_jax.analysis.shafts import roots as shaft_roots
-from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
 
@@ -95,7 +95,7 @@ def operations(jaxpr: Any) -> int:
 
 @pytest.mark.parametrize("system", ["cardan", "bicardan", "rattle"])
 def test_operations(system):
-    engine = Engine(load_scene(SCENES[system]))
+    engine = resolve(load_scene(SCENES[system]))
     solver = engine.solvers[engine.plan.groups[0].index]
     columns = {name: jax.ShapeDtypeStruct((8,), float) for name in engine.grid.columns(np.arange(1))}
     traced = jax.make_jaxpr(lambda c, effort: solver.solve(engine.grid.bind(c), effort))(columns, np.int64(1))
@@ -103,7 +103,7 @@ def test_operations(system):
 
 
 def test_steps_of_the_chart():
-    plan = Engine(load_scene(SCENES["cardan"])).plan
+    plan = resolve(load_scene(SCENES["cardan"])).plan
     assert not complaint("predicted steps cardan", int(sum(group.efforts.sum() * group.chunk for group in plan.groups)))
 
 

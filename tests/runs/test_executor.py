@@ -267,11 +267,11 @@ def test_wrong_place_is_one_clear_line(options, message, monkeypatch):
 
 
 def _engine():
-    from drivetrain_jax.runs.engine import Engine
+    from drivetrain_jax.runs.resolve import resolve
     from drivetrain_jax.runs.scene import load_scene
 
     point = dict(beta=0.1, Omega=1.0, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)
-    return Engine(load_scene({"system": "cardan", "analysis": "floquet", "fixed": point}))
+    return resolve(load_scene({"system": "cardan", "analysis": "floquet", "fixed": point}))
 
 
 def test_a_process_that_dies_between_two_chunks_is_replaced():

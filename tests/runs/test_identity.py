@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import pickle
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ import toy
 
 import drivetrain_jax as dt
 from drivetrain_jax.runs import identity
-from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 
 CARDAN = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
@@ -18,7 +19,7 @@ BASE = {"system": "toy", "analysis": "toy", "axes": {"a": {"start": 0, "stop": 1
 
 
 def digest(scene):
-    return Engine(load_scene(scene)).digest
+    return resolve(load_scene(scene)).digest
 
 
 @pytest.mark.parametrize(
@@ -50,6 +51,16 @@ def test_the_same_computation_has_the_same_digest(same):
 )
 def test_another_computation_has_another_digest(other):
     assert digest(BASE | other) != digest(BASE)
+
+
+@pytest.mark.parametrize("method", ["direct", "atlas"])
+def test_a_job_is_equal_to_its_pickled_copy(method):
+    axes = {"beta": {"start": 0.0, "stop": 1.0, "num": 3}, "Omega": {"start": 1.0, "stop": 2.0, "num": 3}}
+    scene = {"system": "cardan", "analysis": "floquet", "axes": axes, "fixed": CARDAN}
+    job, other = (resolve(load_scene(scene | {"options": {"method": m}})) for m in (method, "diffrax"))
+    copy = pickle.loads(pickle.dumps(job))
+    assert copy == job and hash(copy) == hash(job) and len({job, copy, other}) == 2
+    assert copy.scene.text == job.scene.text and copy.route.sources == job.route.sources
 
 
 def test_order_of_axes_matters():
@@ -127,7 +138,7 @@ def test_the_choice_of_an_atlas_decides():
     axes = {"beta": {"start": 0.0, "stop": 1.0, "num": 3}, "Omega": {"start": 1.0, "stop": 2.0, "num": 3}}
     scene = {"system": "cardan", "analysis": "floquet", "axes": axes, "fixed": CARDAN}
     found, direct = (
-        set(identity.numerics_of(load_scene(scene | {"options": {"method": method}}))["sources"])
+        set(resolve(load_scene(scene | {"options": {"method": method}})).numerics_detail["sources"])
         for method in ("atlas", "direct")
     )
     assert found - direct >= {"runs/atlas_choice.py", "runs/rounds.py", "atlas/construction.py"}
@@ -137,7 +148,7 @@ def test_chunk_size_decides(monkeypatch):
     from dataclasses import replace
 
     scene = load_scene(BASE)
-    engine = Engine(scene)
+    engine = resolve(scene)
     solvers = [replace(solver, chunk=solver.chunk * 2) for solver in engine.solvers]
     assert identity.scene_digest(scene, solvers, engine.numerics) != engine.digest
 

@@ -16,7 +16,9 @@ import drivetrain_jax as dt
 from drivetrain_jax.analysis.numerics import kernels
 from drivetrain_jax.atlas import charts
 from drivetrain_jax.runs import kernel
-from drivetrain_jax.runs.engine import Engine
+from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.resolve import resolve
+from drivetrain_jax.runs.routes import DIRECT
 from drivetrain_jax.runs.scene import load_scene
 
 
@@ -98,13 +100,13 @@ GEARS = {
 @pytest.mark.parametrize("scene", [chart("direct"), chart("atlas"), GEARS], ids=["march", "tiles", "matrices"])
 def test_an_accelerator_gets_wide_batches_and_gives_the_same_results(monkeypatch, scene):
     """The code path of an accelerator (wide chunks, all lanes at once, no marks), run on the CPU."""
-    expected, solver = dt.run(scene), Engine(load_scene(scene)).solvers[0]
+    expected, solver = dt.run(scene), resolve(load_scene(scene)).solvers[0]
     caches = kernel._compiled, charts.tile_kernel
     with monkeypatch.context() as patch:
         patch.setattr(jax, "default_backend", lambda: "gpu")
         for cache in caches:
             cache.cache_clear()
-        assert Engine(load_scene(scene)).solvers[0].chunk == min(64 * solver.chunk, 1 << 15) > solver.chunk
+        assert resolve(load_scene(scene)).solvers[0].chunk == min(64 * solver.chunk, 1 << 15) > solver.chunk
         found = dt.run(scene)
     for cache in caches:
         cache.cache_clear()
@@ -167,7 +169,7 @@ def test_scenes_of_few_points_are_compiled_without_optimising(monkeypatch):
     )
     for count, change, full_size in cases:
         scene = load_scene({"system": "toy", "analysis": "toy", "axes": {"a": {"start": 0, "stop": 1, "num": count}}})
-        engine = Engine(scene, full_size=full_size)
+        engine = Job(scene, DIRECT, full_size=full_size)
         engine.solvers = tuple(replace(solver, **change) for solver in engine.solvers)
         engine.prepare({(0, 16)})
         assert all(future.result() for future in engine._kernels.values())

@@ -9,14 +9,14 @@ import pytest
 import toy
 
 from drivetrain_jax.analysis import Solver
-from drivetrain_jax.runs.engine import Engine
 from drivetrain_jax.runs.grid import Grid
 from drivetrain_jax.runs.plan import chunk_size, make_plan
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 
 
 def engine(scene):
-    return Engine(load_scene(scene))
+    return resolve(load_scene(scene))
 
 
 def test_every_point_is_in_exactly_one_chunk_of_the_cheapest_solver(grid_scene):

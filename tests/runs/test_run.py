@@ -401,7 +401,7 @@ def test_only_what_may_pass_is_said_to_be_resumed_by_the_same_command(grid_scene
     def kernel(*_):
         raise error
 
-    monkeypatch.setattr("drivetrain_jax.runs.engine.kernel_of", lambda *_: kernel)
+    monkeypatch.setattr("drivetrain_jax.runs.job.kernel_of", lambda *_: kernel)
     with pytest.raises(Incomplete, match=rf"^chunk \d+ \(\w+\): {type(error).__name__}: ") as stopped:
         run_to_file(grid_scene, tmp_path / "r.nc", executor=Threads(1))
     assert str(stopped.value).endswith("; the same command resumes") is passes

@@ -1,4 +1,4 @@
-"""The engine of a scene: solvers, plan and kernels, and the function that computes one chunk."""
+"""A job: a scene resolved once into its route, solvers, plan and kernels. It computes single chunks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import threading
 from collections.abc import Iterable, Iterator, Mapping, Set
 from concurrent.futures import Future
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 import jax
 import numpy as np
@@ -20,37 +21,101 @@ from drivetrain_jax.runs.grid import Grid
 from drivetrain_jax.runs.identity import numerics_of, scene_digest
 from drivetrain_jax.runs.kernel import Kernel, for_device, is_small, kernel_of
 from drivetrain_jax.runs.plan import Chunk, Plan, make_plan
-from drivetrain_jax.runs.scene import Problem
+from drivetrain_jax.runs.scene import Problem, Scene
 from drivetrain_jax.store.provenance import digest
+
+if TYPE_CHECKING:
+    from drivetrain_jax.runs.growing import NotReusable, ReusedPoints, Source
+    from drivetrain_jax.runs.work import Progress, Work
+    from drivetrain_jax.store.chunks import Part
+    from drivetrain_jax.store.schema import Labelled
 
 # Kernels that are compiled at the same time.
 _SIDE_BY_SIDE = 8
 
 
-class Engine:
-    """Computes the chunks of one scene. Plan and kernels are created on first use.
+class Route(Protocol):
+    """The way from a job to its result, chosen once by :func:`~drivetrain_jax.runs.resolve.resolve`."""
 
-    ``points`` restricts the plan to these points of the grid; for ``full_size`` see :func:`make_plan`.
+    # Source files that the route runs beside those of every job.
+    sources: tuple[str, ...]
+    # True if each point is solved by itself: results can be shown, reused and written point by point.
+    is_pointwise: bool
+
+    def total(self, job: Job, done: int) -> int:
+        """Number of results; ``done`` of them are there."""
+        ...
+
+    def bytes_needed(self, job: Job, on_disk: bool) -> int:
+        """Least memory of a run."""
+        ...
+
+    def progress(self, job: Job) -> Progress:
+        """The counts before a run."""
+        ...
+
+    def counts(self, part: Part) -> bool:
+        """True if the chunks of a part count as done."""
+        ...
+
+    def rearranged(self, job: Job, path: Path) -> list[str]:
+        """Names of the variables of the result at ``path`` whose layout differs from that of the job."""
+        ...
+
+    def common_points(self, job: Job, path: Path) -> Source | NotReusable | None:
+        """Points of the job in the result at ``path``, the reason why it has none, or None for a result without points."""
+        ...
+
+    def in_memory(self, job: Job, work: Work, progress: Progress) -> Labelled:
+        """The result."""
+        ...
+
+    def into_file(
+        self, job: Job, out: Path, temporary: Path, work: Work, progress: Progress, reused: ReusedPoints
+    ) -> None:
+        """Write the result to ``out``, growing at ``temporary``."""
+        ...
+
+
+class Job:
+    """A problem and the route to its result. Plan and kernels are created on first use.
+
+    ``points`` restricts the plan to these points of the grid; for ``full_size`` see :func:`make_plan`. Jobs are equal if
+    they have the same digest. A pickled job has no points of its own: it computes given chunks.
     """
 
-    def __init__(self, scene: Problem, points: np.ndarray | None = None, *, full_size: bool = False) -> None:
+    def __init__(
+        self, problem: Problem, route: Route, points: np.ndarray | None = None, *, full_size: bool = False
+    ) -> None:
         # Before the first kernel, which the plan may need.
         _use_double_precision()
         compile_cache.enable()
-        self.scene = scene
-        self.grid = Grid.of(scene)
-        self.solvers = tuple(map(for_device, scene.analysis.solvers(scene.system, scene.request)))
+        self.problem = problem
+        self.route = route
+        self.grid = Grid.of(problem)
+        self.solvers = tuple(map(for_device, problem.analysis.solvers(problem.system, problem.request)))
         self._points, self._full_size = points, full_size
         self._kernels: dict[tuple[int, int], Future[Kernel]] = {}
         self._lock = threading.Lock()
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        # A worker computes given chunks, so it needs no points of its own.
-        return Engine, (self.scene, None)
+    @property
+    def scene(self) -> Scene:
+        """The scene that the job is resolved from; the solves of an atlas have none."""
+        assert isinstance(self.problem, Scene)
+        return self.problem
 
-    def only(self, points: np.ndarray) -> Engine:
-        """The engine restricted to these points of the grid."""
-        return Engine(self.scene, points, full_size=self._full_size)
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Job, (self.problem, self.route)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Job) and other.digest == self.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    def only(self, points: np.ndarray) -> Job:
+        """The job restricted to these points of the grid."""
+        return Job(self.problem, self.route, points, full_size=self._full_size)
 
     @cached_property
     def numerics(self) -> str:
@@ -60,17 +125,26 @@ class Engine:
     @cached_property
     def numerics_detail(self) -> dict[str, Any]:
         """The parts of that digest."""
-        return numerics_of(self.scene)
+        return numerics_of(self.problem, self.route.sources)
 
     @property
     def numerics_attrs(self) -> dict[str, str]:
         """Digest and parts as attributes of a result or plan."""
         return {"numerics": self.numerics, "numerics_detail": json.dumps(self.numerics_detail)}
 
-    @cached_property
+    @property
+    def attrs(self) -> dict[str, str | float]:
+        """Attributes that identify the result; effort and time are added at the end."""
+        return {"digest": self.digest, **self.numerics_attrs, "wall_time_s": 0.0}
+
+    @property
     def digest(self) -> str:
         """Digest of everything that affects the result."""
-        return scene_digest(self.scene, self.solvers, self.numerics)
+        return self._digest
+
+    @cached_property
+    def _digest(self) -> str:
+        return scene_digest(self.problem, self.solvers, self.numerics)
 
     @cached_property
     def plan(self) -> Plan:
@@ -105,7 +179,7 @@ class Engine:
             for index, size in missing:
                 solver = self.solvers[index]
                 few = self._small and not solver.lengthy
-                self._kernels[index, size] = pool.submit(kernel_of, self.scene, self.grid, solver, size, few)
+                self._kernels[index, size] = pool.submit(kernel_of, self.problem, self.grid, solver, size, few)
 
     def compute(self, chunk: Chunk) -> Mapping[str, np.ndarray]:
         """Results of one chunk; thread-safe. Raises :class:`ChunkError`."""

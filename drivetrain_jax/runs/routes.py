@@ -1,0 +1,93 @@
+"""Routes to values at points; the direct one solves every point by itself."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+from drivetrain_jax.analysis import OUTCOME
+from drivetrain_jax.analysis.periodic.floquet_propagator import PROPAGATOR
+from drivetrain_jax.runs.assemble import Table, bytes_per_point, failures, labelled
+from drivetrain_jax.runs.growing import NO_REUSE, NotReusable, ReusedPoints, Source, find, remaining
+from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.layout import rearranged
+from drivetrain_jax.runs.work import Progress, Work
+from drivetrain_jax.store.chunks import Part
+from drivetrain_jax.store.consolidate import ResultFile
+from drivetrain_jax.store.schema import Labelled
+
+
+class PointsRoute(ABC):
+    """A route to values at points; see :class:`~drivetrain_jax.runs.job.Route`."""
+
+    sources: tuple[str, ...] = ()
+    is_pointwise = False
+
+    @abstractmethod
+    def fill(
+        self, job: Job, table: Table, work: Work, progress: Progress, reused: ReusedPoints
+    ) -> dict[str, str | int]:
+        """Fill all points of ``job`` into ``table``; returns attributes of the result."""
+
+    def total(self, job: Job, done: int) -> int:
+        """Number of points."""
+        return job.total
+
+    def bytes_needed(self, job: Job, on_disk: bool) -> int:
+        """Bytes of the plan, and of the results unless they are in a file."""
+        return job.total * bytes_per_point(job.scene, on_disk)
+
+    def progress(self, job: Job) -> Progress:
+        """The counts before a run."""
+        return Progress(job.total)
+
+    def counts(self, part: Part) -> bool:
+        """True for values at points; solves of an atlas are not points of the grid."""
+        return PROPAGATOR not in part.results
+
+    def rearranged(self, job: Job, path: Path) -> list[str]:
+        """Names of the variables of the result at ``path`` whose layout differs from that of the job."""
+        return rearranged(path, job.scene, job.grid)
+
+    def common_points(self, job: Job, path: Path) -> Source | NotReusable | None:
+        """Points of the job in the result at ``path``, or the reason why it has none."""
+        try:
+            return find(job, path)
+        except NotReusable as error:
+            return error
+
+    def in_memory(self, job: Job, work: Work, progress: Progress) -> Labelled:
+        """The result."""
+        table = Table(job.scene, job.grid)
+        extra = self.fill(job, table, work, progress, NO_REUSE)
+        return labelled(job.scene, table.lay_out(), job.attrs | extra)
+
+    def into_file(
+        self, job: Job, out: Path, temporary: Path, work: Work, progress: Progress, reused: ReusedPoints
+    ) -> None:
+        """Write the result from the points ``reused``, the existing parts, and newly computed chunks."""
+        with ResultFile(temporary) as file:
+            table = Table(job.scene, job.grid, lambda blank: file.lay_out(blank.with_attrs(**job.attrs)))
+            extra = self.fill(job, table, work, progress, reused)
+            table.lay_out()
+            file.finish(out, wall_time_s=work.elapsed, **extra)
+
+
+class DirectRoute(PointsRoute):
+    """Solves every point."""
+
+    is_pointwise = True
+
+    def fill(
+        self, job: Job, table: Table, work: Work, progress: Progress, reused: ReusedPoints
+    ) -> dict[str, str | int]:
+        """Copy the points ``reused`` and solve the others."""
+        for points, results in reused.blocks([variable.name for variable in table.variables]):
+            table.fill(points, results)
+            progress.reused += results[OUTCOME.name].size
+            progress.failed += failures(results[OUTCOME.name])
+        work.do(remaining(job, reused), table, progress)
+        return reused.attrs
+
+
+DIRECT = DirectRoute()
