@@ -128,10 +128,10 @@ def _closed(
     """Largest displacements over a period from ``start``, of order one, and their phases (None unless requested); the
     correction of ``start`` by the closing error; and the outcome. ``matrix`` is the transition."""
     if with_amplitude:
-        *largest, end, closed = amplitudes(field, start, model.period, model.displacements, sharp)
+        largest, phase, end, closed = amplitudes(field, start, model.period, model.displacements, sharp)
     else:
-        largest, (end, closed) = (None, None), integrate(field, start, model.period, sharp)
-    return tuple(largest), newton_step(Transition(end, matrix, closed), start), closed
+        (largest, phase), (end, closed) = (None, None), integrate(field, start, model.period, sharp)
+    return (largest, phase), newton_step(Transition(end, matrix, closed), start), closed
 
 
 def _regular(matrix: Array, rtol: float) -> Array:

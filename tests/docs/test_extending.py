@@ -8,6 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -28,8 +29,8 @@ def blocks(text: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", text, re.M | re.S)
 
 
-def executed(text: str, folder: Path) -> tuple[Path, str]:
-    """The folder with the files of ``text``, installed, and the output of its commands."""
+def executed(text: str, folder: Path) -> tuple[Path, str, Callable[..., str]]:
+    """The folder with the files of ``text``, installed, the output of its commands, and Python where these are installed."""
     project, installed = folder / "project", folder / "installed"
     project.mkdir()
     for content in [*blocks(text, "python"), *blocks(text, "toml")]:
@@ -50,11 +51,11 @@ def executed(text: str, folder: Path) -> tuple[Path, str]:
     assert (install, test[0]) == (["pip", "install", "."], "python") and {c[0] for c in commands} == {"drivetrain"}
     python("-m", *install, *OFFLINE, str(installed))
     answers = python("-c", SEVERAL, *(repr(command[1:]) for command in commands), PYTHONSAFEPATH="1")
-    return project, answers + python(*test[1:])
+    return project, answers + python(*test[1:]), python
 
 
 def test_the_page_is_true(tmp_path):
-    project, answers = executed(SYSTEM, tmp_path)
+    project, answers, python = executed(SYSTEM, tmp_path)
     assert "angle of both joints" in answers
     assert "points: total=4331 computed=4331 reused=0 failed=0" in answers
     assert "2 passed" in answers
@@ -72,7 +73,7 @@ def test_the_page_is_true(tmp_path):
 
 
 def test_a_new_analysis_serves_the_systems_of_the_package(tmp_path):
-    project, answers = executed(ANALYSIS, tmp_path)
+    project, answers, _ = executed(ANALYSIS, tmp_path)
     assert "Analysis settling: settling time" in answers and "remaining share" in answers
     assert "points: total=8 computed=8 reused=0 failed=0" in answers
     assert "0 <= settling_periods: holds at 8 points" in answers and "1 passed" in answers

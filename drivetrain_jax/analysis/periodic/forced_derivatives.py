@@ -72,7 +72,7 @@ def periodic_slopes(
         max_steps=MAX_STEPS,
         throw=False,
     )
-    found = jnp.where(solution.result == diffrax.RESULTS.successful, solution.ys, jnp.nan)
+    found = jnp.where(solution.result == diffrax.RESULTS.successful, solution.ys, jnp.nan)  # pyright: ignore[reportArgumentType]
     on_peaks, end = found[:-1][jnp.argsort(order)], found[-1]
     moved = solve(jnp.eye(n) - end[1 : n + 1].T, end[n + 1 :].T)
     tops = [
