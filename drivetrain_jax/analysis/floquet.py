@@ -66,10 +66,12 @@ def _derivatives(
 
     steps = traced_steps(build, eqx.combine(parameters, constants.tree), _DERIVATIVES)
     change = monodromy_change(build, parameters, constants, steps)
-    sigma, moved = multiplier_change(change)
-    error = results.get("spectral_radius_error", 10 * request.options["rtol"] * results.get("spectral_radius", 1.0))
+    sigma, moved, error = multiplier_change(change)
     scale = jnp.exp(change.log_scale)
-    slope = radius_change(sigma, moved, error / (scale * jnp.abs(sigma[0])))
+    radius = scale * jnp.abs(sigma[0])
+    slope = radius_change(sigma, moved, jnp.maximum(error, results.get("spectral_radius_error", 0.0) / radius))
+    # A radius that underflows has no derivative either.
+    slope = jnp.where(radius > 0, slope, jnp.nan)
     found = {"spectral_radius": scale * slope, "floquet_multiplier": scale * moved}
     if "floquet_exponent" in request.outputs:
         period, longer = jax.value_and_grad(lambda p: jnp.asarray(model(p).natural.span, float))(parameters)
