@@ -129,7 +129,7 @@ def package_ends(flow: Callable[[Any], Any], strobes: int) -> Callable[[np.ndarr
     import jax
     import jax.numpy as jnp
 
-    from drivetrain_jax.analysis.chaos.variational import initial_frame, one_kernel, strobe_map
+    from drivetrain_jax.analysis.lyapunov.variational import initial_frame, one_kernel, strobe_map
 
     @jax.jit
     def ends(starts: Any, steps: Any) -> Any:
@@ -147,7 +147,7 @@ def package_rate(flow: Callable[[Any], Any], starts: np.ndarray, period: float) 
     import jax
     import jax.numpy as jnp
 
-    from drivetrain_jax.analysis.chaos.growth import record_growth
+    from drivetrain_jax.analysis.lyapunov.growth_record import record_growth
 
     def march(starts: Any, steps: Any, time: Any) -> Any:
         record = record_growth(flow(starts), steps, time, 0.0, jnp.ones(LANES, bool))

@@ -142,8 +142,8 @@ def _constant(solver: str, count: int) -> Callable[[Columns, float], Any]:
     import jax.numpy as jnp
     import optimistix
 
-    from drivetrain_jax.analysis.periodic.diffrax_solvers import diffrax_propagator
-    from drivetrain_jax.analysis.periodic.propagator import EqualStepSize
+    from drivetrain_jax.analysis.floquet.diffrax_solvers import diffrax_propagator
+    from drivetrain_jax.analysis.floquet.propagator import EqualStepSize
     from drivetrain_jax.systems.cardan import Cardan
 
     # Without a controller to take tolerances from, the root finder of an implicit scheme needs its own. diffrax's usual

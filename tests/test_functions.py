@@ -15,7 +15,7 @@ from jax.test_util import check_grads
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import OUTCOME, get_analysis
-from drivetrain_jax.analysis.periodic import propagator
+from drivetrain_jax.analysis.floquet import propagator
 from drivetrain_jax.analysis.request import make_request
 from drivetrain_jax.runs import kernel
 from drivetrain_jax.runs.kernel import compile_kernel, result_variables

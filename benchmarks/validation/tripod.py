@@ -139,7 +139,7 @@ def histories_section() -> str:
 
 def floquet_section() -> str:
     """Multipliers and exponents of the linear parametric part, and the critical nonuniformity."""
-    from drivetrain_jax.analysis.periodic.tongue_tip import tongue_tip
+    from drivetrain_jax.analysis.floquet.tongue_tip import tongue_tip
     from drivetrain_jax.systems import get_system, tripod
 
     outputs = ["spectral_radius", "floquet_exponent", "liouville_residual"]

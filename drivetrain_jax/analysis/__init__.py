@@ -54,7 +54,7 @@ def analysis_names() -> tuple[str, ...]:
 def get_analysis(name: str) -> Analysis:
     """The analysis ``name``; ``KeyError`` with the known names if there is none, ``ImportError`` if its package fails."""
     if name in _BUILT_IN:
-        return import_module(f"drivetrain_jax.analysis.{name}").ANALYSIS
+        return import_module(f"drivetrain_jax.analysis.{name}.analysis").ANALYSIS
     found = load_plugin(ANALYSES, name, "an analysis", lambda x: isinstance(x, Analysis))
     if found is None:
         raise KeyError(f"analysis = {name!r}: allowed is one of {', '.join(analysis_names())}")

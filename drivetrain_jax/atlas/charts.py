@@ -16,9 +16,9 @@ from jax import Array
 from drivetrain_jax._machine import usable_cores
 from drivetrain_jax._threads import threads
 from drivetrain_jax.analysis import Outcome
+from drivetrain_jax.analysis.floquet import quartic
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, in_one_kernel
 from drivetrain_jax.analysis.numerics.lanes import by_rows
-from drivetrain_jax.analysis.periodic import quartic
 from drivetrain_jax.atlas import conservative
 from drivetrain_jax.atlas.floquet_quantity import Build
 from drivetrain_jax.atlas.interpolation import nodes

@@ -11,7 +11,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax.analysis.periodic.quartic import EPS, Blocks, determinant, square_norm, transposed_product
+from drivetrain_jax.analysis.floquet.quartic import EPS, Blocks, determinant, square_norm, transposed_product
 
 
 def _sign(value: Array, error: Array) -> Array:

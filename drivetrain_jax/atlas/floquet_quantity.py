@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax.analysis.floquet.direct import Monodromy, assemble
+from drivetrain_jax.analysis.floquet.multipliers import characteristic_coefficients
+from drivetrain_jax.analysis.floquet.results import results
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
-from drivetrain_jax.analysis.periodic.direct import Monodromy, assemble
-from drivetrain_jax.analysis.periodic.floquet_results import results
-from drivetrain_jax.analysis.periodic.multipliers import characteristic_coefficients
 from drivetrain_jax.atlas.quantity import Quantity
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 

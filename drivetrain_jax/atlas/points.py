@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax.analysis.floquet import quartic
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, in_one_kernel, options_for_few
-from drivetrain_jax.analysis.periodic import quartic
 from drivetrain_jax.atlas.charts import Cells, errors_of, exact_verdict, in_threads, judged
 from drivetrain_jax.atlas.expansion import Cell, Expansion
 from drivetrain_jax.atlas.floquet_quantity import Build

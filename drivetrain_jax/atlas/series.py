@@ -15,11 +15,11 @@ from jax import Array
 
 from drivetrain_jax._machine import usable_cores
 from drivetrain_jax._threads import threads
+from drivetrain_jax.analysis.floquet.direct import stable_steps
+from drivetrain_jax.analysis.floquet.effort import explicit_effort
+from drivetrain_jax.analysis.floquet.power_series import propagators_along
 from drivetrain_jax.analysis.numerics.kernels import compiler_options
 from drivetrain_jax.analysis.numerics.predictions import Words, predicted, split
-from drivetrain_jax.analysis.periodic.direct import stable_steps
-from drivetrain_jax.analysis.periodic.floquet_effort import explicit_effort
-from drivetrain_jax.analysis.periodic.series import propagators_along
 from drivetrain_jax.atlas.construction import Domain
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, Series, System
 

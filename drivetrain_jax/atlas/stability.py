@@ -20,9 +20,9 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.analysis.floquet import quartic
+from drivetrain_jax.analysis.floquet.results import VARIABLES
 from drivetrain_jax.analysis.numerics.kernels import compiler_options
-from drivetrain_jax.analysis.periodic import quartic
-from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES
 from drivetrain_jax.atlas import charts, evaluation
 from drivetrain_jax.atlas.expansion import Expansion
 from drivetrain_jax.atlas.floquet_quantity import Build, judge

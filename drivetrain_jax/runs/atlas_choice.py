@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.analysis.atlas import ANALYSIS
+from drivetrain_jax.analysis.atlas.analysis import ANALYSIS
 from drivetrain_jax.runs.axes import MAX_RANGES
 from drivetrain_jax.runs.grid import Grid
 from drivetrain_jax.runs.plan import mean_cost

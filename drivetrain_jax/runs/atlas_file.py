@@ -13,7 +13,7 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import counted, did_you_mean, shown
 from drivetrain_jax.analysis import Request, get_analysis
-from drivetrain_jax.analysis.atlas import ANALYSIS
+from drivetrain_jax.analysis.atlas.analysis import ANALYSIS
 from drivetrain_jax.atlas import Atlas, StabilityAtlas, from_arrays, stability_atlas, to_arrays
 from drivetrain_jax.atlas.floquet import floquet_domain
 from drivetrain_jax.runs import compile_cache

@@ -11,7 +11,7 @@ import numpy as np
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import clipped, counted
-from drivetrain_jax.analysis.atlas import ANALYSIS
+from drivetrain_jax.analysis.atlas.analysis import ANALYSIS
 from drivetrain_jax.runs.identity import EVALUATES_ATLAS, scene_content
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.scene import Scene, restore_scene

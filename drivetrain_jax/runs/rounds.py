@@ -9,7 +9,7 @@ import numpy as np
 
 from drivetrain_jax._wording import counted
 from drivetrain_jax.analysis import Analysis, Request
-from drivetrain_jax.analysis.periodic.floquet_propagator import ANALYSIS
+from drivetrain_jax.analysis.atlas.solves import ANALYSIS
 from drivetrain_jax.atlas import (
     Atlas,
     StabilityAtlas,

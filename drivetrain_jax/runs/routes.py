@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 
 from drivetrain_jax.analysis import OUTCOME
-from drivetrain_jax.analysis.periodic.floquet_propagator import PROPAGATOR
+from drivetrain_jax.analysis.atlas.solves import PROPAGATOR
 from drivetrain_jax.runs.assemble import Table, bytes_per_point, failures, labelled
 from drivetrain_jax.runs.growing import NO_REUSE, NotReusable, ReusedPoints, Source, find, remaining
 from drivetrain_jax.runs.job import Job

@@ -203,7 +203,7 @@ def floquet_model(values: Values) -> FloquetModel:
 
 
 def parametric_tongue(values: Values) -> tuple[Callable[[Any, Any], LinearPeriodic], float, float, float]:
-    """The arguments of :func:`~drivetrain_jax.analysis.periodic.tongue_tip.tongue_tip` for the principal resonance.
+    """The arguments of :func:`~drivetrain_jax.analysis.floquet.tongue_tip.tongue_tip` for the principal resonance.
 
     The parametric part as a function of chi_n and the excitation frequency [Hz], and where to look for its tip: the
     estimate 4 zeta chi_n/(c1 - c2 - chi_n) of perturbation theory (the coefficients are multiples of chi_n), Omega/pi

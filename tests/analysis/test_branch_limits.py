@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivetrain_jax.analysis import Outcome, frequency_response
+from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis._base import Request
-from drivetrain_jax.analysis.approximations import harmonic_branch, harmonic_response
+from drivetrain_jax.analysis.frequency_response import analysis as frequency_response
+from drivetrain_jax.analysis.frequency_response import harmonic_branch, harmonic_response
 from drivetrain_jax.analysis.impacts import exact_branch
 from drivetrain_jax.analysis.impacts.branch_sections import distinct
 from drivetrain_jax.systems import rattle

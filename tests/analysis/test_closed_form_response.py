@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 
-from drivetrain_jax.analysis.approximations import closed_form_response, describing_function, multiple_scales
+from drivetrain_jax.analysis.frequency_response import closed_form_response, describing_function, multiple_scales
 from drivetrain_jax.analysis.numerics.amplitude_roots import follow, refined
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
 

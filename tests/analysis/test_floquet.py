@@ -16,8 +16,8 @@ from scipy.special import mathieu_a, mathieu_b
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.analysis.periodic.direct import assemble, compare
-from drivetrain_jax.analysis.periodic.propagator import EXPLICIT_ORDER, Radau, propagator
+from drivetrain_jax.analysis.floquet.direct import assemble, compare
+from drivetrain_jax.analysis.floquet.propagator import EXPLICIT_ORDER, Radau, propagator
 from drivetrain_jax.systems import LinearPeriodic, get_system, system_names
 from tests.oracles.cardan_reference import monodromy, spectral_radius, stacked_monodromy
 

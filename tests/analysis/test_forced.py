@@ -14,10 +14,10 @@ from scipy.optimize import minimize_scalar, root
 import drivetrain_jax as dt
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import Outcome, Request, get_analysis
-from drivetrain_jax.analysis.forced import predicted_steps
-from drivetrain_jax.analysis.periodic import orbit
-from drivetrain_jax.analysis.periodic.amplitude import _cubic_root, amplitudes
-from drivetrain_jax.analysis.periodic.orbit import integrate, shoot
+from drivetrain_jax.analysis.forced import orbit
+from drivetrain_jax.analysis.forced.amplitude import _cubic_root, amplitudes
+from drivetrain_jax.analysis.forced.analysis import predicted_steps
+from drivetrain_jax.analysis.forced.orbit import integrate, shoot
 from drivetrain_jax.systems import ForcedModel, get_system
 
 ANALYSIS, SYSTEM = get_analysis("forced"), get_system("cardan")

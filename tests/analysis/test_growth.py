@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivetrain_jax.analysis.chaos.growth import SEGMENTS, block_mean, drift, record_growth
-from drivetrain_jax.analysis.chaos.variational import one_kernel
-from drivetrain_jax.analysis.lyapunov import spectrum_of, sum_rule_residual
+from drivetrain_jax.analysis.lyapunov.analysis import spectrum_of, sum_rule_residual
+from drivetrain_jax.analysis.lyapunov.growth_record import SEGMENTS, block_mean, drift, record_growth
+from drivetrain_jax.analysis.lyapunov.variational import one_kernel
 from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, stored, suits_one_kernel
 
 SPAN = 2.0
@@ -104,8 +104,10 @@ def test_marks_of_the_compiler_change_rounding_only(monkeypatch):
         return np.asarray(jax.jit(lambda: record_growth(flow, 32, 1.0, 0.0, active).growth)())[:2]
 
     marked = growth()
-    monkeypatch.setattr("drivetrain_jax.analysis.chaos.variational.stored", lambda function: function)
-    monkeypatch.setattr("drivetrain_jax.analysis.chaos.growth.one_kernel", lambda _: lambda function: function)
+    monkeypatch.setattr("drivetrain_jax.analysis.lyapunov.variational.stored", lambda function: function)
+    monkeypatch.setattr(
+        "drivetrain_jax.analysis.lyapunov.growth_record.one_kernel", lambda _: lambda function: function
+    )
     plain = growth()
     np.testing.assert_allclose(marked[:, :2], plain[:, :2], rtol=0, atol=1e-12)
     np.testing.assert_allclose(marked[:, 2], plain[:, 2], rtol=0, atol=1e-9)

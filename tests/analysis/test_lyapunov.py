@@ -15,11 +15,11 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import Outcome, Request
-from drivetrain_jax.analysis.chaos.forcing import may_be_chaotic
-from drivetrain_jax.analysis.chaos.march_steps import needed_steps
-from drivetrain_jax.analysis.chaos.sampling import repetition
-from drivetrain_jax.analysis.chaos.verdict import Verdict
-from drivetrain_jax.analysis.lyapunov import analyse
+from drivetrain_jax.analysis.lyapunov.analysis import analyse
+from drivetrain_jax.analysis.lyapunov.forcing import may_be_chaotic
+from drivetrain_jax.analysis.lyapunov.march_steps import needed_steps
+from drivetrain_jax.analysis.lyapunov.sampling import repetition
+from drivetrain_jax.analysis.lyapunov.verdict import Verdict
 from drivetrain_jax.invariants import check
 from drivetrain_jax.systems import Flow, get_system
 from tests.oracles import tripod_reference as oracle

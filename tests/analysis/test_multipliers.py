@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivetrain_jax.analysis.periodic.multipliers import (
+from drivetrain_jax.analysis.floquet.multipliers import (
     characteristic_coefficients,
     root_scale,
     sort_multipliers,

@@ -12,11 +12,9 @@ import pytest
 from scipy.integrate import DOP853
 from scipy.linalg import expm
 
-from drivetrain_jax.analysis.numerics import dop853
-from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
-from drivetrain_jax.analysis.periodic.direct import assemble, direct_monodromy, stable_steps, stiffness_of
-from drivetrain_jax.analysis.periodic.multipliers import spectral_radius_bound
-from drivetrain_jax.analysis.periodic.propagator import (
+from drivetrain_jax.analysis.floquet.direct import assemble, direct_monodromy, stable_steps, stiffness_of
+from drivetrain_jax.analysis.floquet.multipliers import spectral_radius_bound
+from drivetrain_jax.analysis.floquet.propagator import (
     EXPLICIT_ORDER,
     IMPLICIT_ORDER,
     Order8,
@@ -25,6 +23,8 @@ from drivetrain_jax.analysis.periodic.propagator import (
     propagator,
     radau_iia,
 )
+from drivetrain_jax.analysis.numerics import dop853
+from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
 from drivetrain_jax.systems import LinearPeriodic
 
 SPAN = 2.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
+from drivetrain_jax.analysis.floquet.radius import has_closed_form, radius_by_eigenvalues, radius_in_closed_form
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
-from drivetrain_jax.analysis.periodic.radius import has_closed_form, radius_by_eigenvalues, radius_in_closed_form
 
 ERROR, TOLERANCE = 1e-10, 1e-6
 

@@ -8,9 +8,9 @@ import pytest
 from flows import linear, lorenz
 from scipy.linalg import expm
 
-from drivetrain_jax.analysis.chaos.growth import discarded, sampled
-from drivetrain_jax.analysis.chaos.section_error import EARLY, Steps, section_errors
-from drivetrain_jax.analysis.chaos.variational import initial_state
+from drivetrain_jax.analysis.lyapunov.growth_record import discarded, sampled
+from drivetrain_jax.analysis.lyapunov.variational import initial_state
+from drivetrain_jax.analysis.poincare.section_error import EARLY, Steps, section_errors
 
 DAMPING, STIFFNESS, TORQUE = [0.0, 0.01, 2.0], 20.0, 1.0
 FIRST, COUNT = 200, 300

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
-from drivetrain_jax.analysis.periodic.series import propagators_along
+from drivetrain_jax.analysis.floquet.power_series import propagators_along
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import LinearPeriodic

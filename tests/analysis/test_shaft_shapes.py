@@ -14,8 +14,8 @@ from mpmath import mp
 from scipy.linalg import eigh
 
 import drivetrain_jax as dt
-from drivetrain_jax.analysis.shafts.roots import find_roots
-from drivetrain_jax.analysis.shafts.shapes import mode_shapes
+from drivetrain_jax.analysis.critical_speeds.frequency_roots import find_roots
+from drivetrain_jax.analysis.critical_speeds.shapes import mode_shapes
 from drivetrain_jax.systems import Shaft
 from tests.oracles.bicardan_reference import complete, matrices
 

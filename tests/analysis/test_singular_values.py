@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from drivetrain_jax.analysis.modes.tracking import follow
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
 from drivetrain_jax.analysis.numerics.lanes import in_blocks
 from drivetrain_jax.analysis.numerics.linear_algebra import looped_matmul
@@ -21,7 +22,6 @@ from drivetrain_jax.analysis.numerics.singular_values import (
     singular_values,
 )
 from drivetrain_jax.analysis.numerics.singular_vectors import jacobi_vectors
-from drivetrain_jax.analysis.spectra.tracking import follow
 from drivetrain_jax.systems import get_system
 from tests.oracles.planetary_reference import case_parameters
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivetrain_jax.analysis.periodic.tongue_tip import tongue_edge, tongue_tip
+from drivetrain_jax.analysis.floquet.tongue_tip import tongue_edge, tongue_tip
 from drivetrain_jax.systems import LinearPeriodic, get_system, tripod
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "tripod.json").read_text())

@@ -21,8 +21,8 @@ from benchmarks.atlas_attack import (
     wrong,
 )
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.analysis.periodic import quartic
-from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES
+from drivetrain_jax.analysis.floquet import quartic
+from drivetrain_jax.analysis.floquet.results import VARIABLES
 from drivetrain_jax.atlas import charts, tiles
 from drivetrain_jax.atlas.panels import Atlas, Panel
 from tests.oracles.atlas_direct import BASE, cardan_atlas, direct_radius, random_points

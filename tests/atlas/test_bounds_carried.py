@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivetrain_jax.analysis.periodic import quartic
-from drivetrain_jax.analysis.periodic.floquet_results import VARIABLES
+from drivetrain_jax.analysis.floquet import quartic
+from drivetrain_jax.analysis.floquet.results import VARIABLES
 from drivetrain_jax.atlas import StabilityAtlas, expansion
 from drivetrain_jax.atlas.criteria import invariants, monodromy
 from tests.oracles.atlas_direct import direct_radius, random_points

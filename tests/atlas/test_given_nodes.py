@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from drivetrain_jax.analysis.floquet.effort import explicit_effort
+from drivetrain_jax.analysis.floquet.power_series import propagators_along
 from drivetrain_jax.analysis.numerics.predictions import predicted
-from drivetrain_jax.analysis.periodic.floquet_effort import explicit_effort
-from drivetrain_jax.analysis.periodic.series import propagators_along
 from drivetrain_jax.atlas import Domain, Quantity, construct, run, values_at
 from drivetrain_jax.atlas import series as series_module
 from drivetrain_jax.atlas.floquet import floquet_domain

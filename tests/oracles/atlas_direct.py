@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drivetrain_jax.analysis import Request
-from drivetrain_jax.analysis.periodic.floquet_propagator import ANALYSIS
+from drivetrain_jax.analysis.atlas.solves import ANALYSIS
 from drivetrain_jax.atlas import StabilityAtlas, floquet_rounds, run, solve_rtol, stability_atlas
 from drivetrain_jax.systems import get_system
 

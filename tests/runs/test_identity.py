@@ -172,6 +172,6 @@ def test_only_code_that_the_scene_runs_decides():
         "analysis/numerics/linear_algebra.py",
     }
     assert common <= of_floquet & of_forced
-    assert {"analysis/periodic/propagator.py", "analysis/periodic/diffrax_solvers.py"} <= of_floquet - of_forced
-    assert {"analysis/periodic/orbit.py", "analysis/periodic/amplitude.py"} <= of_forced - of_floquet
+    assert {"analysis/floquet/propagator.py", "analysis/floquet/diffrax_solvers.py"} <= of_floquet - of_forced
+    assert {"analysis/forced/orbit.py", "analysis/forced/amplitude.py"} <= of_forced - of_floquet
     assert "systems/rattle.py" not in of_floquet | of_forced

@@ -11,8 +11,8 @@ import pytest
 from mpmath import mp
 from scipy.integrate import quad
 
-from drivetrain_jax.analysis.periodic.direct import assemble, compare, stable_steps
-from drivetrain_jax.analysis.periodic.propagator import EXPLICIT_ORDER, propagator
+from drivetrain_jax.analysis.floquet.direct import assemble, compare, stable_steps
+from drivetrain_jax.analysis.floquet.propagator import EXPLICIT_ORDER, propagator
 from drivetrain_jax.systems import cardan, get_system, system_names
 
 SYSTEM = get_system("cardan")

@@ -1,1 +1,0 @@
-"""Approximate responses of oscillators: harmonic balance, describing function, multiple scales."""

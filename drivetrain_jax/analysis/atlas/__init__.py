@@ -1,0 +1,1 @@
+"""The stability atlas as an analysis: its solves."""

@@ -1,0 +1,82 @@
+"""The propagator of a linear periodic system over the span of its reduced form, interpolated by an atlas.
+
+``Phi`` is a smooth function of the parameters; multipliers and spectral radius are not. The direct solvers of ``floquet``
+compute it with two step sizes, whose difference estimates its error.
+
+Scenes know it only as ``atlas`` (``analysis/atlas/analysis.py``), so this analysis and its model have that name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax._quantities import Dimension, Variable
+from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.floquet.direct import Monodromy
+from drivetrain_jax.analysis.floquet.direct_solvers import direct_solvers
+from drivetrain_jax.systems import System
+
+if TYPE_CHECKING:
+    from drivetrain_jax.systems import LinearPeriodic
+
+# The interpolated result, and its error.
+PROPAGATOR, CHANGE = "propagator", "propagator_change"
+VARIABLES = (
+    Variable(PROPAGATOR, "1", "entries of the propagator over the span of the reduced form, by rows", ("entry",)),
+    Variable(CHANGE, "1", "estimated error of the propagator, by rows", ("entry",)),
+)
+# An atlas asks for a hundred points at a time: large chunks would leave most lanes, and a core, without work.
+_CHUNKS = (32, 16)
+
+
+def whole_span(form: LinearPeriodic) -> LinearPeriodic:
+    """``form`` with its span as period: the monodromy matrix is then the propagator itself."""
+    if form.reversor is None or form.log_determinant is None:
+        return replace(form, reversor=None)
+    exact = form.log_determinant
+    return replace(form, reversor=None, log_determinant=lambda: exact() / 2)
+
+
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
+    rtol = request.options["rtol"]
+    return direct_solvers(
+        system,
+        rtol,
+        rtol,
+        lambda model: whole_span(model.reduced),
+        lambda model, phi: _results(phi, request.outputs),
+        _CHUNKS,
+    )
+
+
+def _results(phi: Monodromy, outputs: tuple[str, ...]) -> dict[str, Array]:
+    matrices = {PROPAGATOR: phi.matrix, CHANGE: phi.change}
+    entries = {name: (jnp.exp(phi.log_scale) * x).reshape(-1, *phi.met.shape) for name, x in matrices.items()}
+    finite = jnp.all(jnp.isfinite(jnp.concatenate(list(entries.values()))), axis=0)
+    outcome = jnp.where(finite, jnp.where(phi.met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET), Outcome.NOT_FINITE)
+    results = {name: jnp.where(finite, entry, jnp.nan) for name, entry in entries.items()}
+    return {name: results[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}
+
+
+def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    return tuple(Dimension(name, "row times size plus column", ()) for name in ("entry",))
+
+
+ANALYSIS = Analysis(
+    name="atlas",
+    title="Propagator of a linear periodic system, for its atlas",
+    variables=VARIABLES,
+    default_outputs=(PROPAGATOR, CHANGE),
+    methods={"direct": ("rtol",)},
+    method_titles={
+        "direct": "direct solves of floquet at the nodes of Chebyshev panels",
+    },
+    options=(RTOL,),
+    solvers=_solvers,
+    dimensions=_dimensions,
+)

@@ -1,1 +1,0 @@
-"""Growth of perturbations, Lyapunov exponents, sections and verdicts."""

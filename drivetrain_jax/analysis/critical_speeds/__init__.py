@@ -1,0 +1,1 @@
+"""Critical speeds of stepped shafts: transfer matrices, certified roots, mode shapes."""

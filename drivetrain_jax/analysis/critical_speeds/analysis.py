@@ -1,0 +1,184 @@
+"""Critical speeds: natural frequencies of the lateral vibration of a shaft, certified by a count.
+
+The synchronous critical speed of a shaft whose gyroscopic effect is neglected is its natural frequency, ``n = 30 p/pi``
+rpm. The method ``certified`` (default, :mod:`~drivetrain_jax.analysis.critical_speeds.frequency_roots`) has full accuracy
+for any mode. The method ``krylov_determinant`` is the paper's and loses all digits near mode 12; ``count_certified`` marks
+its roots with the right number.
+
+Modes are numbered by frequency and not followed along an axis. The frequencies of a shaft in one plane between separated
+ends are simple (except with a hinge on, or almost on, a rigid support), so curves of equal number do not cross.
+
+Outcome: ``NOT_FINITE`` if parameters give no finite equations, ``NOT_CONVERGED`` if a frequency was not found (NaN),
+``TOLERANCE_NOT_MET`` if a root of ``krylov_determinant`` is not certified.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.critical_speeds import frequency_roots as shaft_roots
+from drivetrain_jax.analysis.critical_speeds import krylov as shaft_krylov
+from drivetrain_jax.analysis.critical_speeds.frequency_roots import Roots, frequency_derivatives
+from drivetrain_jax.analysis.critical_speeds.mechanisms import mechanism_shapes, zero_modes
+from drivetrain_jax.analysis.critical_speeds.shapes import mode_shapes, normalised
+from drivetrain_jax.analysis.numerics.lanes import Constants
+from drivetrain_jax.systems import Shaft, System
+
+VARIABLES = (
+    Variable("natural_frequency", "Hz", "natural frequency", ("mode",)),
+    Variable("angular_frequency", "rad/s", "natural angular frequency", ("mode",)),
+    Variable("critical_speed", "rpm", "critical speed", ("mode",)),
+    Variable("relative_error", "1", "estimated relative error of the frequencies", ("mode",)),
+    Variable(
+        "count_certified", "1", "whether the count of frequencies below and above certifies the mode", ("mode",), "int8"
+    ),
+    Variable(
+        "separation_margin", "1", "distance of the critical speed from the operating speeds, over them", ("mode",)
+    ),
+    Variable("mode_shape", "1", "deflection of the mode, largest +1", ("mode", "x")),
+)
+OPTIONS = (
+    Parameter("modes", "1", "number of modes, zero modes included", default=6, lower=1, upper=1000, integer=True),
+    Parameter("stations", "1", "number of points of a mode shape", default=101, lower=2, upper=10001, integer=True),
+    Parameter("operating_min", "rpm", "lowest operating speed", default=0.0, lower=0.0),
+    Parameter("operating_max", "rpm", "highest operating speed (0: not given)", default=0.0, lower=0.0),
+)
+_OPTION_NAMES = tuple(option.name for option in OPTIONS)
+# Per rad/s.
+_UNITS = {"angular_frequency": 1.0, "natural_frequency": 1 / (2 * math.pi), "critical_speed": 30 / math.pi}
+# Parameters that the paper's method does not include.
+_ADDITIONS = ("k_joint", "m_A", "m_D", "m_joint", "k_hinge", "kGA", "rhoI")
+# Roots of all modes of a chunk together, small enough for the cache.
+_ROOTS_PER_CHUNK = 12288
+_STATIONS_PER_CHUNK = 1 << 18
+
+Build = Callable[[Mapping[str, Any]], Shaft]
+
+
+def separation_margin(speed: Array, lowest: float, highest: float) -> Array:
+    """Distance of ``speed`` from the operating range [lowest, highest] over its nearer end; 0 within.
+
+    A critical speed below gives ``(lowest - n)/lowest``, one above ``(n - highest)/highest`` (as in API 617).
+    """
+    below = (lowest - speed) / (lowest if lowest > 0 else 1.0)
+    return jnp.maximum(jnp.maximum(below, (speed - highest) / highest), 0.0)
+
+
+def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    options = request.options
+    if request.method == "krylov_determinant":
+        for name in (name for name in _ADDITIONS if name in {p.name for p in system.parameters}):
+            if fixed.get(name) != system.parameter(name).default:
+                given = f"fixed.{name} = {fixed[name]}" if name in fixed else name
+                raise InputError(
+                    f"{given}: not in the equations of krylov_determinant; allowed is the method certified"
+                )
+    low, high = options["operating_min"], options["operating_max"]
+    if high < low or (high == 0 and "separation_margin" in request.outputs):
+        raise InputError(
+            f"options.operating_max = {high:g}: allowed for separation_margin is a speed > 0, at least "
+            f"operating_min = {low:g}"
+        )
+    dimensions = [Dimension("mode", "number of the mode", tuple(range(1, options["modes"] + 1)))]
+    if "mode_shape" in request.outputs:
+        x = tuple(float(value) for value in np.linspace(0.0, 1.0, options["stations"]))
+        dimensions.append(Dimension("x", "distance from A over the length of the shaft", x))
+    return tuple(dimensions)
+
+
+def _shapes(shaft: Shaft, roots: Roots, stations: int) -> Array:
+    """Shapes of zero modes and of the others; NaN for missing frequencies."""
+    modes, lanes = roots.q.shape[0], roots.q.shape[1:]
+    x = jnp.linspace(0.0, 1.0, stations)
+    elastic = mode_shapes(shaft, jnp.where(roots.q > 0, roots.q, 1.0), x)
+    index = jnp.arange(modes).reshape(modes, *(1,) * len(lanes))
+    mechanisms = mechanism_shapes(shaft, x)
+    row = jnp.broadcast_to(jnp.minimum(index, len(mechanisms) - 1), (modes, *lanes))
+    rigid = normalised(jnp.take_along_axis(mechanisms, row[:, None], axis=0))
+    shape = jnp.where((index < zero_modes(shaft))[:, None], rigid, elastic)
+    return jnp.where(jnp.isfinite(roots.q)[:, None], shape, jnp.nan)
+
+
+def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+    """All requested results; for arrays of lanes the lanes are the last axis."""
+    del effort
+    shaft, options = build(values), request.options
+    certified = request.method == "certified"
+    roots = (shaft_roots if certified else shaft_krylov).find_roots(shaft, options["modes"])
+    p = roots.q**2
+    finite = jnp.all(jnp.isfinite(shaft.length) & jnp.isfinite(shaft.EI) & jnp.isfinite(shaft.rhoA), axis=0)
+    missing, doubtful = jnp.any(jnp.isnan(roots.q), axis=0), ~jnp.all(roots.certified, axis=0)
+    outcome = jnp.where(missing, Outcome.NOT_CONVERGED, jnp.where(doubtful, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS))
+    results = {
+        **{name: p * unit for name, unit in _UNITS.items()},
+        "count_certified": roots.certified.astype(jnp.int8),
+        "outcome": jnp.where(finite, outcome, Outcome.NOT_FINITE).astype(jnp.int8),
+    }
+    if "relative_error" in request.outputs:
+        results["relative_error"] = shaft_roots.relative_error(shaft, roots)
+    if "separation_margin" in request.outputs:
+        low, high = options["operating_min"], options["operating_max"]
+        results["separation_margin"] = separation_margin(results["critical_speed"], low, high)
+    if "mode_shape" in request.outputs:
+        results["mode_shape"] = _shapes(shaft, roots, options["stations"])
+    return {name: results[name] for name in (*request.outputs, "outcome")}
+
+
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
+    build = system.models["critical_speeds"].build
+    modes = request.options["modes"]
+    room = _ROOTS_PER_CHUNK // modes
+    if "mode_shape" in request.outputs:
+        room = min(room, _STATIONS_PER_CHUNK // (modes * request.options["stations"]))
+    chunk = 1 << max(min(room, 2048), 16).bit_length() - 1
+    solve = partial(_solve, build, request)
+    return (Solver(request.method, solve, chunk=chunk),)
+
+
+def _derivatives(
+    system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Jacobians of all frequencies and of the separation margin."""
+    options = request.options
+
+    def build(parameters: Any) -> Shaft:
+        return system.models["critical_speeds"].build(eqx.combine(parameters, constants.tree))
+
+    known = [results[name] / unit for name, unit in _UNITS.items() if name in results and request.method == "certified"]
+    q = jnp.sqrt(known[0]) if known else shaft_roots.find_roots(build(parameters), options["modes"]).q
+    slope = frequency_derivatives(build, parameters, q)
+    found = {name: slope * unit for name, unit in _UNITS.items()}
+    if "separation_margin" in results:
+        low, high = options["operating_min"], options["operating_max"]
+        margin = jax.vmap(jax.grad(lambda speed: separation_margin(speed, low, high)))
+        found["separation_margin"] = margin(q**2 * _UNITS["critical_speed"])[:, None] * found["critical_speed"]
+    return found
+
+
+ANALYSIS = Analysis(
+    name="critical_speeds",
+    title="critical speeds",
+    variables=VARIABLES,
+    default_outputs=("natural_frequency", "critical_speed", "count_certified"),
+    methods={"certified": _OPTION_NAMES, "krylov_determinant": _OPTION_NAMES},
+    method_titles={
+        "certified": "roots counted, at full accuracy for any mode",
+        "krylov_determinant": "the plain determinant, as published: it loses roots near mode 12",
+    },
+    options=OPTIONS,
+    solvers=_solvers,
+    dimensions=_dimensions,
+    derivatives=_derivatives,
+)

@@ -1,0 +1,232 @@
+"""Natural frequencies of a stepped shaft: certified brackets, and their derivatives.
+
+The j-th frequency is where the count N passes from below j to j or more. Every step keeps a bracket with N(low) < j <=
+N(high), so that no frequency can be missed and none invented. The upper end comes from the clamped-clamped frequencies
+of the segments, each of which has at least ``z/pi - 1.6`` of them below z, the lower one from falling powers of 4. Once
+a bracket holds one frequency alone, steps follow Psi (interpolation, truncation and projection: Oliveira & Takahashi,
+ACM TOMS 47 (2020) 5, never more than one step worse than bisection); in clusters they bisect. All modes of all lanes go
+through the same ``COMMON_STEPS``; the few brackets that are open then go on by themselves, to ``MAX_STEPS`` at most. A
+bracket that is closed stays as it is, so results do not depend on the lanes beside it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis._base import stacked
+from drivetrain_jax.analysis.critical_speeds.compound import Scales, characteristic, pairings
+from drivetrain_jax.analysis.critical_speeds.mechanisms import zero_modes
+from drivetrain_jax.systems import Shaft
+
+MAX_STEPS = 90
+# After this many steps some 5 % of the brackets are open.
+COMMON_STEPS = 16
+# A clamped segment has more frequencies below the phase z than z/pi minus this.
+_CLAMPED_DEFICIT = 1.6
+# Relative width at which a bracket in q is closed, and what rounding may add to it.
+_CLOSED = 4 * np.finfo(float).eps
+# Ratio of the ends up to which a bracket is narrow enough for arithmetic means and for interpolation.
+_NEAR = 4.0
+_TRUNCATION = 0.2
+# Share of the brackets that continue together, and the smallest useful number.
+_FEW, _WORTH = 1 / 16, 32
+# Relative distance up to which frequencies count as one; and up to which a zero of Psi is that of the frequency.
+_MULTIPLE = 1e-13
+_ZERO = 1e-9
+
+
+class Roots(NamedTuple):
+    """``q = sqrt(p)`` of the natural frequencies p [rad/s], rising; the relative ``width`` of the brackets of p;
+    whether the count certifies each: ``(modes, *lanes)``. A zero mode has the exact q = 0; what was not found is
+    NaN."""
+
+    q: Array
+    width: Array
+    certified: Array
+
+
+class _Brackets(NamedTuple):
+    """Ends of the brackets in q, the count and Psi there, the factor of the next lower trial while ``low`` is 0,
+    whether one simple root is left, the width when that was first so, and the reach of interpolation that is left."""
+
+    low: Array
+    high: Array
+    count_low: Array
+    count_high: Array
+    psi_low: Array
+    psi_high: Array
+    shrink: Array
+    isolated: Array
+    first_width: Array
+    span: Array
+
+
+def _start(shaft: Shaft, modes: int) -> _Brackets:
+    beta = Scales.of(shaft).beta
+    lanes = shaft.lanes
+    index = jnp.arange(1, modes + 1).reshape(modes, *(1,) * len(lanes))
+    high = math.pi * (index + _CLAMPED_DEFICIT * shaft.segments) / jnp.sum(beta, axis=0)
+    high = jnp.broadcast_to(high, (modes, *lanes))
+    zero = jnp.zeros_like(high)
+    return _Brackets(zero, high, zero - 1, zero + jnp.inf, zero, zero, zero + 1 / _NEAR, zero > 0, zero, zero)
+
+
+def _trial(b: _Brackets) -> Array:
+    """The next point of every bracket."""
+    middle = 0.5 * (b.low + b.high)
+    width = b.high - b.low
+    slope = b.psi_high - b.psi_low
+    secant = b.low - b.psi_low * width / jnp.where(slope == 0, 1.0, slope)
+    secant = jnp.where(b.isolated, jnp.clip(secant, b.low, b.high), middle)
+    towards = jnp.where(middle > secant, 1.0, -1.0)
+    first = jnp.where(b.isolated, b.first_width, width)
+    push = jnp.maximum(_TRUNCATION * width * width / first, 0.5 * _CLOSED * b.high)
+    truncated = jnp.where(push < jnp.abs(middle - secant), secant + towards * push, middle)
+    reach = jnp.where(b.isolated, jnp.maximum(b.span - 0.5 * width, 0.0), 0.0)
+    truncated = jnp.clip(truncated, middle - reach, middle + reach)
+    near = b.high <= _NEAR * b.low
+    return jnp.where(b.low == 0, b.high * b.shrink, jnp.where(near, truncated, jnp.sqrt(b.low * b.high)))
+
+
+def _closed(b: _Brackets) -> Array:
+    return ~(b.high - b.low > _CLOSED * b.high)
+
+
+def _step(shaft: Shaft, index: Array, b: _Brackets) -> _Brackets:
+    q = _trial(b)
+    value = characteristic(shaft, q)
+    above = value.count >= index  # pyright: ignore[reportOptionalOperand]
+    shrink = jnp.where((b.low == 0) & above, b.shrink * b.shrink, b.shrink)
+    low, high = jnp.where(above, b.low, q), jnp.where(above, q, b.high)
+    count_low, count_high = jnp.where(above, b.count_low, value.count), jnp.where(above, value.count, b.count_high)  # pyright: ignore[reportArgumentType]
+    psi_low, psi_high = jnp.where(above, b.psi_low, value.psi), jnp.where(above, value.psi, b.psi_high)
+    isolated = (count_high - count_low == 1) & (high <= _NEAR * low) & (psi_low * psi_high < 0)
+    first_width = jnp.where(isolated & ~b.isolated, high - low, b.first_width)
+    span = jnp.where(b.isolated, 0.5 * b.span, high - low)
+    new = _Brackets(low, high, count_low, count_high, psi_low, psi_high, shrink, isolated, first_width, span)
+    done = _closed(b)
+    return jax.tree.map(lambda old, fresh: jnp.where(done, old, fresh), b, new)
+
+
+def _search(shaft: Shaft, modes: int) -> _Brackets:
+    brackets = _start(shaft, modes)
+    index = jnp.arange(1, modes + 1).reshape(modes, *(1,) * (brackets.high.ndim - 1))
+    # Zero modes are known; their brackets are closed from the start. So are those of lanes that are not finite.
+    known = (index <= zero_modes(shaft)) | ~jnp.isfinite(brackets.high)
+    brackets = brackets._replace(low=jnp.where(known, brackets.high, brackets.low))
+
+    room = int(_FEW * brackets.high.size)
+    if room < _WORTH:
+        return _advance(shaft, index, 0, brackets, MAX_STEPS)
+    return _finish(shaft, _advance(shaft, index, 0, brackets, COMMON_STEPS), room)
+
+
+def _advance(shaft: Shaft, index: Array, count: int, brackets: _Brackets, most: int) -> _Brackets:
+    """Steps ``count`` to ``most`` of all brackets, or until they are closed."""
+
+    def open_ones(state: tuple[Array, _Brackets]) -> Array:
+        return (state[0] < most) & ~jnp.all(_closed(state[1]))
+
+    def advance(state: tuple[Array, _Brackets]) -> tuple[Array, _Brackets]:
+        return state[0] + 1, _step(shaft, index, state[1])
+
+    return jax.lax.while_loop(open_ones, advance, (jnp.int32(count), brackets))[1]
+
+
+def _finish(shaft: Shaft, brackets: _Brackets, room: int) -> _Brackets:
+    """The further steps of the open brackets, ``room`` of them at a time, each with its own shaft."""
+    shape = brackets.high.shape
+    lanes = math.prod(shape[1:])
+    fields = jax.tree.map(lambda field: field.reshape(len(field), lanes), shaft.spread())
+
+    def some_left(state: tuple[_Brackets, Array]) -> Array:
+        return jnp.any(state[1])
+
+    def some(state: tuple[_Brackets, Array]) -> tuple[_Brackets, Array]:
+        flat, left = state
+        # Free places are taken by the first of them once more: the same values, written twice.
+        place = jnp.nonzero(left, size=room, fill_value=jnp.argmax(left))[0]
+        own = jax.tree.map(lambda field: field[:, place % lanes], fields)
+        done = _advance(own, place // lanes + 1, COMMON_STEPS, jax.tree.map(lambda x: x[place], flat), MAX_STEPS)
+        return jax.tree.map(lambda x, new: x.at[place].set(new), flat, done), left.at[place].set(False)
+
+    flat = jax.tree.map(lambda x: x.reshape(-1), brackets)
+    flat, _ = jax.lax.while_loop(some_left, some, (flat, ~_closed(flat)))
+    return jax.tree.map(lambda x: x.reshape(shape), flat)
+
+
+def find_roots(shaft: Shaft, modes: int) -> Roots:
+    """The first ``modes`` natural frequencies of every lane, zero modes included. Derivatives:
+    :func:`frequency_derivatives`."""
+    brackets = _search(shaft, modes)
+    index = jnp.arange(1, modes + 1).reshape(modes, *(1,) * (brackets.high.ndim - 1))
+    zero = (index <= zero_modes(shaft)) & jnp.isfinite(brackets.high)
+    certified = (
+        _closed(brackets) & (brackets.low > 0) & (brackets.count_low >= 0) & jnp.isfinite(brackets.high)
+    ) | zero
+    q = jnp.where(zero, 0.0, 0.5 * (brackets.low + brackets.high))
+    width = jnp.where(zero, 0.0, 2 * (brackets.high - brackets.low) / brackets.high)
+    return Roots(jnp.where(certified, q, jnp.nan), width, certified)
+
+
+def frequency_derivatives(build: Callable[[Any], Shaft], parameters: Any, q: Array) -> Array:
+    """Derivatives ``(modes, P)`` of the angular frequencies ``p = q^2`` of one shaft by all P ``parameters``.
+
+    With Psi, the closed form of the characteristic function, ``dp = -(dPsi/dparameter) / (dPsi/dp)``: one evaluation for
+    each parameter, whatever the number of steps that found p: the energy formulas of docs/theory/bicardan.md, (12).
+    A zero mode has the derivative 0, but none by the stiffness of a spring that could hold it, where p grows as sqrt(k). A
+    multiple frequency has none (NaN); beside another one at the relative distance d the error is of the order of eps/d.
+    """
+    shaft, moving = build(parameters), q > 0
+    safe = jnp.where(moving, q, 1.0)
+    psi, along_q = jax.jvp(lambda x: pairings(shaft, x), (safe,), (jnp.ones_like(safe),))
+    along = stacked(jax.jacfwd(lambda p: pairings(build(p), safe))(parameters))
+    # A section that the mode does not reach does not show its frequency as a zero.
+    section = jnp.argmin(jnp.abs(psi / along_q), axis=0)[None]
+    along_q, along = (
+        jnp.take_along_axis(x, i, axis=0)[0] for x, i in ((along_q, section), (along, section[..., None]))
+    )
+    slope = jnp.where(_multiple(shaft, q)[:, None], jnp.nan, -2 * q[:, None] * along / along_q[:, None])
+
+    def missing(parameters: Any) -> Array:
+        """Stiffness of all springs and hinges that are not there."""
+        springs = build(parameters)
+        present = [x for x in (springs.k, springs.k_hinge) if x is not None]
+        return jnp.concatenate([jnp.where(x == 0, x, 0.0) for x in present])
+
+    held = jnp.any(stacked(jax.jacfwd(missing)(parameters)) != 0, axis=0)
+    return jnp.where(jnp.isnan(q) | moving, slope.T, jnp.where(held[:, None], jnp.nan, 0.0)).T
+
+
+def _multiple(shaft: Shaft, q: Array) -> Array:
+    """Flags of the frequencies that agree with a neighbour to rounding, including the one after the last."""
+    near = q[1:] - q[:-1] <= _MULTIPLE * q[1:]
+    none = jnp.zeros_like(q[:1], bool)
+    above = jnp.where(q[-1:] > 0, q[-1:] * (1 + _MULTIPLE), 1.0)
+    beyond = (q[-1:] > 0) & (characteristic(shaft, above).count > len(q))  # pyright: ignore[reportOptionalOperand]
+    return jnp.concatenate([none, near]) | jnp.concatenate([near, beyond])
+
+
+def relative_error(shaft: Shaft, roots: Roots) -> Array:
+    """Estimated relative error of ``p = q^2``, shape ``(modes, *lanes)``.
+
+    The same equations run from D to A round differently: how far their zero lies away shows the rounding of both. Added
+    to it are the width of the bracket and the rounding of p itself.
+    """
+    safe = jnp.where(roots.q > 0, roots.q, 1.0)
+    mirrored = shaft.mirrored()
+    value, slope = jax.jvp(lambda q: pairings(mirrored, q), (safe,), (jnp.ones_like(safe),))
+    shifts = jnp.abs(value / (slope * safe))
+    shifts = jnp.where(jnp.isfinite(shifts), shifts, jnp.inf)
+    # A value that is no zero belongs to a section that the mode does not reach.
+    shift = jnp.where(shifts[-1] < _ZERO, shifts[-1], jnp.min(shifts, axis=0))
+    # In a cluster Psi is flat, and its zero is inaccurate: use only the bracket.
+    shift = jnp.where(jnp.isfinite(shift), jnp.minimum(shift, 1.0), 0.0)
+    return jnp.where(roots.q > 0, 2 * shift + roots.width + 2 * np.finfo(float).eps, 0.0)

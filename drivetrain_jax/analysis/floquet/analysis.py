@@ -1,0 +1,110 @@
+"""Floquet analysis of a linear periodic system: multipliers, spectral radius with error bound, and verdict of one point.
+
+``direct`` integrates the system's reduced form by diffrax with solvers for linear periodic terms: an explicit scheme of
+order 8, or an L-stable implicit one where that needs fewer operations. ``atlas`` evaluates a whole scene from polynomials
+compared with direct solves (see ``drivetrain_jax.atlas``), and solves points in gaps. ``auto`` chooses the cheaper one.
+``diffrax`` uses one of diffrax's own solvers: in equal steps for the reduced form, or in adaptive steps for the system as
+published over its full period (``form = "published"``), with other coordinates, clock and factorisation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax._quantities import Dimension, Parameter
+from drivetrain_jax.analysis._base import DIFFRAX_SOLVERS, RTOL, Analysis, Request, Solver
+from drivetrain_jax.analysis.floquet.direct_solvers import direct_solvers
+from drivetrain_jax.analysis.floquet.effort import traced_steps
+from drivetrain_jax.analysis.floquet.results import VARIABLES, lacks, results
+from drivetrain_jax.analysis.numerics.lanes import Constants
+from drivetrain_jax.systems import System
+
+FORMS = ("reduced", "published")
+
+
+def _direct_solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
+    rtol = request.options["rtol"]
+    return direct_solvers(
+        system,
+        rtol,
+        rtol / 4,
+        lambda model: model.reduced,
+        lambda model, z: results(z, request.outputs, rtol, model.natural),
+        stiff=lambda model: model.stiff or model.reduced,
+    )
+
+
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
+    if request.method != "diffrax":
+        return _direct_solvers(system, request)
+    # diffrax takes as long to import as jax, and is not needed to read a result.
+    from drivetrain_jax.analysis.floquet.diffrax_solvers import diffrax_solvers
+
+    return diffrax_solvers(system, request)
+
+
+# Relative error for which the steps of derivatives are predicted: they lose some digits against the multipliers.
+_DERIVATIVES = 1e-11
+
+
+def _derivatives(
+    system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Jacobians of multipliers, exponents and spectral radius; NaN where multipliers coalesce."""
+    from drivetrain_jax.analysis.floquet.derivatives import monodromy_change, multiplier_change, radius_change
+
+    build = system.models["floquet"].build
+
+    def model(parameters: Any) -> Any:
+        return build(eqx.combine(parameters, constants.tree))
+
+    steps = traced_steps(build, eqx.combine(parameters, constants.tree), _DERIVATIVES)
+    change = monodromy_change(build, parameters, constants, steps)
+    sigma, moved, error = multiplier_change(change)
+    scale = jnp.exp(change.log_scale)
+    radius = scale * jnp.abs(sigma[0])
+    slope = radius_change(sigma, moved, jnp.maximum(error, results.get("spectral_radius_error", 0.0) / radius))
+    # A radius that underflows has no derivative either.
+    slope = jnp.where(radius > 0, slope, jnp.nan)
+    found = {"spectral_radius": scale * slope, "floquet_multiplier": scale * moved}
+    if "floquet_exponent" in request.outputs:
+        period, longer = jax.value_and_grad(lambda p: jnp.asarray(model(p).natural.span, float))(parameters)
+        rates = (jnp.log(jnp.abs(sigma)) + change.log_scale) / period
+        slopes = (jnp.conj(sigma)[:, None] * moved).real / jnp.abs(sigma)[:, None] ** 2
+        found["floquet_exponent"] = (slopes - rates[:, None] * jnp.stack(jax.tree.leaves(longer))) / period
+    return found
+
+
+def _lacks(system: type[System]) -> dict[str, str]:
+    return lacks(system) | ({} if "atlas" in system.models else {"atlas": f"{system.name} has no model for it"})
+
+
+ANALYSIS = Analysis(
+    name="floquet",
+    title="Floquet stability of the equilibrium",
+    variables=VARIABLES,
+    default_outputs=("spectral_radius", "spectral_radius_error", "verdict"),
+    methods={"auto": ("rtol",), "atlas": ("rtol",), "direct": ("rtol",), "diffrax": ("rtol", "atol", "solver", "form")},
+    method_titles={
+        "auto": "atlas where that is cheaper, else direct",
+        "atlas": "Chebyshev panels held against direct solves, with their bound",
+        "direct": "equal steps of order 8, implicit where that is cheaper",
+        "diffrax": "equal steps of a solver of diffrax, or adaptive ones for the equations as published",
+    },
+    options=(
+        RTOL,
+        Parameter("atol", "1", "absolute tolerance of adaptive steps", default=1e-12, lower=0.0, upper=1e-2),
+        Parameter("solver", "1", "diffrax solver", default="Dopri8", choices=DIFFRAX_SOLVERS),
+        Parameter("form", "1", "form of the equations", default="reduced", choices=FORMS),
+    ),
+    solvers=_solvers,
+    dimensions=lambda *_: (Dimension("multiplier", "Floquet multipliers by falling modulus", ()),),
+    lacks=_lacks,
+    derivatives=_derivatives,
+)

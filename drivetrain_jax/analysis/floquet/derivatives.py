@@ -1,0 +1,132 @@
+"""Derivatives of Floquet multipliers by the parameters of a system.
+
+With ``Phi' = A Phi`` the derivative by a parameter p obeys ``(d Phi/dp)' = A d Phi/dp + (dA/dp) Phi``: both are the
+propagator of a linear periodic system of twice the size, which is integrated like any other one, with the parameters as
+lanes. Of a simple multiplier, with ``p(s) = det(s I - Z)`` and the adjugate B of ``s I - Z``, ``d s = tr(B dZ) / p'(s)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax.analysis.floquet.direct import assemble
+from drivetrain_jax.analysis.floquet.multipliers import sort_multipliers
+from drivetrain_jax.analysis.floquet.propagator import EqualSteps, Order8, propagator
+from drivetrain_jax.analysis.numerics.lanes import Constants
+from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic
+
+# Moduli that differ only by rounding, as all multipliers without damping.
+TIED = 1e-11
+# Relative error of the matrix Z: its steps are predicted for 1e-11, and usually reach a tenth of it.
+_MATRIX_ERROR = 1e-12
+# Derivatives p'(s) of multipliers in units of the spectral radius, below which these are not simple.
+_SIMPLE = 1e-7
+
+Build = Callable[[Any], FloquetModel]
+
+
+class Change(NamedTuple):
+    """The monodromy matrix ``exp(log_scale) z``, ``(n, n)``, and its derivatives ``exp(log_scale) dz``, ``(P, n, n)``."""
+
+    z: Array
+    dz: Array
+    log_scale: Array
+
+
+class _Varied(eqx.Module):
+    """A system and its derivative along a direction of its parameters as one system, with the span as unit of time."""
+
+    parameters: Any
+    direction: Any
+    build: Build = eqx.field(static=True)
+    constants: Constants = eqx.field(static=True)
+
+    def rows(self, s: Any) -> tuple[tuple[Any, ...], ...]:
+        """``((A, 0), (dA, A))`` at the part s of the span."""
+        zeros: list[list[bool]] = []
+
+        def entries(parameters: Any) -> list[Array]:
+            form = reduced_form(self.build, parameters, self.constants)
+            rows = form.rows(*form.basis(s * form.span))
+            zeros[:] = [[isinstance(entry, int) and entry == 0 for entry in row] for row in rows]
+            pairs = [pair for row, no in zip(rows, zeros, strict=True) for pair in zip(row, no, strict=True)]
+            return [jnp.asarray(form.span * x, float) for x, zero in pairs if not zero]
+
+        both = jax.tree.map(lambda x, dx: tuple(jnp.broadcast_arrays(x, dx)), self.parameters, self.direction)
+        given, along = (
+            jax.tree.map(lambda pair, i=i: pair[i], both, is_leaf=lambda x: isinstance(x, tuple) and len(x) == 2)
+            for i in (0, 1)
+        )
+        a, da = map(iter, jax.jvp(entries, (given,), (along,)))
+        upper, lower = ([[0 if zero else next(x) for zero in row] for row in zeros] for x in (a, da))
+        nothing = [0] * len(zeros)
+        changed = [(*change, *row) for change, row in zip(lower, upper, strict=True)]
+        return (*((*row, *nothing) for row in upper), *changed)
+
+
+def reduced_form(build: Build, parameters: Any, constants: Constants) -> LinearPeriodic:
+    """The reduced form of the system with these ``parameters`` (arrays) and ``constants`` (all else)."""
+    return build(eqx.combine(parameters, constants.tree)).reduced
+
+
+def monodromy_change(
+    build: Build, parameters: Any, constants: Constants, steps: Array, solver: type[EqualSteps] = Order8
+) -> Change:
+    """The monodromy matrix of one point and its derivatives by all ``parameters``, a pytree of P numbers, by ``steps``."""
+    leaves, tree = jax.tree.flatten(parameters)
+
+    def along(direction: Array) -> Change:
+        direction = jax.tree.unflatten(tree, list(direction))
+        varied = LinearPeriodic(_Varied(parameters, direction, build, constants).rows, 1.0)
+        found = propagator(varied, steps, 1, solver)
+        n = len(found.matrix) // 2
+        phi, change = found.matrix[:n, :n], found.matrix[n:, :n]
+
+        def z(parameters: Any, phi: Array) -> Array:
+            return assemble(reduced_form(build, parameters, constants), phi)
+
+        halves = reduced_form(build, parameters, constants).halves
+        return Change(*jax.jvp(z, (parameters, phi), (direction, change)), halves * found.log_scale)  # pyright: ignore[reportCallIssue]
+
+    found = jax.vmap(along)(jnp.eye(len(leaves)))
+    return Change(found.z[0], found.dz, found.log_scale[0])
+
+
+def multiplier_change(change: Change) -> tuple[Array, Array, Array]:
+    """Multipliers by falling modulus ``(n,)`` and their derivatives ``(n, P)``, both over ``exp(log_scale)``, NaN where a
+    multiplier is not simple; and the relative error of the first multiplier, which grows where multipliers coalesce."""
+    z, n = change.z, len(change.z)
+    sigma = sort_multipliers(*(x[..., None] for x in eigenvalues(z)))[:, 0]
+    rho = jnp.abs(sigma[0])
+    # Faddeev and Le Verrier: the adjugate of s I - Z is sum_j s^(n-1-j) N_j.
+    terms = [jnp.eye(n)]
+    for k in range(1, n):
+        product = z @ terms[-1]
+        terms.append(product - jnp.trace(product) / k * jnp.eye(n))
+    adjugate = jnp.stack([sigma[:, None, None] ** (n - 1 - j) * term for j, term in enumerate(terms)]).sum(axis=0)
+    slope = jnp.trace(adjugate, axis1=1, axis2=2)
+    simple = jnp.abs(slope) > _SIMPLE * rho ** (n - 1)
+    moved = jnp.einsum("sij,pji->sp", adjugate, change.dz)
+    condition = jnp.linalg.norm(adjugate[0]) * jnp.linalg.norm(z) / jnp.abs(slope[0])
+    slopes = jnp.where(simple[:, None], moved / jnp.where(simple, slope, 1.0)[:, None], jnp.nan)
+    return sigma, slopes, _MATRIX_ERROR * condition / rho
+
+
+def radius_change(sigma: Array, moved: Array, error: Array | float) -> Array:
+    """Derivatives of the spectral radius ``(P,)`` from multipliers and theirs; NaN where more than one multiplier and its
+    conjugate have the largest modulus within ``error``, which is relative."""
+    modulus = jnp.abs(sigma)
+    apart = jnp.abs(sigma - jnp.conj(sigma[0]))
+    # Real multipliers are their own conjugate.
+    partner = (apart == jnp.min(apart)) & (jnp.abs(sigma[0].imag) > 1e-12 * modulus[0])
+    others = jnp.where(partner | (jnp.arange(len(sigma)) == 0), 0.0, modulus)
+    tied = jnp.max(others) > modulus[0] * (1 - jnp.maximum(TIED, error))
+    slope = (jnp.conj(sigma[0]) * moved[0]).real / modulus[0]
+    return jnp.where(tied, jnp.nan, slope)

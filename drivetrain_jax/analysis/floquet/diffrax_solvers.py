@@ -1,0 +1,155 @@
+"""Floquet analysis by diffrax's own solvers: equal steps for the reduced form, adaptive ones for the published equations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis._base import Outcome, Request, Solver
+from drivetrain_jax.analysis.floquet.direct import compare, direct_monodromy, stable_steps, stiffness_of
+from drivetrain_jax.analysis.floquet.effort import explicit_effort, traced_steps
+from drivetrain_jax.analysis.floquet.propagator import EqualStepSize, Propagator
+from drivetrain_jax.analysis.floquet.results import NEED_ERROR, results
+from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last, over_lanes
+from drivetrain_jax.systems import LinearPeriodic, System
+
+MAX_STEPS = 200_000
+# Passed to `compare` as the reduction of the error, it cancels that function's safety factor: the error is the difference
+# between two tolerances a decade apart, as it is.
+_REDUCTION = 4.0
+
+
+def diffrax_solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
+    """Equal steps for the reduced form; adaptive ones for the published form, and for solvers that iterate in each step:
+    these take the tolerance of their iteration from that of the steps."""
+    solver = getattr(diffrax, request.options["solver"])
+    adaptive = request.options["form"] == "published" or issubclass(solver, diffrax.AbstractImplicitSolver)
+    return (adaptive_steps if adaptive else equal_steps)(system, request)
+
+
+def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
+    """The reduced form in equal steps, predicted from the order of the solver and refined until two counts agree."""
+    rtol, build = request.options["rtol"], system.models["floquet"].build
+    solver = getattr(diffrax, request.options["solver"])()
+
+    def solve(values: Mapping[str, Any], steps: Array) -> dict[str, Array]:
+        model = build(values)
+        shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in values.values() if not isinstance(x, str)))
+        order = solver.order(model.reduced)
+
+        def propagate(steps: Array, _: Array) -> Propagator:
+            def one(own: Mapping[str, Any], steps: Array) -> Propagator:
+                return equal_step_propagator(build(own).reduced, solver, steps)
+
+            return over_lanes(one)(values, steps)
+
+        stiffness, least = stiffness_of(model.reduced, shape), stable_steps(model.reduced)
+        z = direct_monodromy(model.reduced, propagate, steps, shape, stiffness, rtol / 4, order, 2, least)
+        return results(z, request.outputs, rtol, model.natural)
+
+    def effort(columns: Mapping[str, Any]) -> np.ndarray:
+        # Fitted for order 8; a lower order needs more steps for a smaller tolerance.
+        more = rtol ** (1 / 8 - 1 / solver.order(diffrax.ODETerm(lambda t, y, args: y)))
+        return more * explicit_effort(system, columns, rtol)
+
+    def steps(values: Mapping[str, Any]) -> Array:
+        order = solver.order(diffrax.ODETerm(lambda t, y, args: y))
+        return (rtol ** (1 / 8 - 1 / order) * traced_steps(build, values, rtol)).astype(jnp.int64)
+
+    return (Solver(f"diffrax: {request.options['solver']}, equal steps", solve, effort, steps, chunk=256, march=True),)
+
+
+def adaptive_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
+    """The reduced form, or the system as published over its full period in its own time, at two tolerances."""
+    rtol, atol = request.options["rtol"], request.options["atol"]
+    solver = getattr(diffrax, request.options["solver"])()
+    needs_error, as_published = bool(NEED_ERROR & set(request.outputs)), request.options["form"] == "published"
+
+    def solve(values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+        del effort
+        model = system.models["floquet"].build(values)
+        form = model.natural if as_published else model.reduced
+
+        def propagate(tolerance: float) -> tuple[Propagator, Array]:
+            controller = diffrax.PIDController(rtol=tolerance, atol=tolerance / rtol * atol)
+            return diffrax_propagator(form, solver, stepsize_controller=controller, max_steps=MAX_STEPS)
+
+        fine, success = propagate(rtol / 10)
+        coarse, success_coarse = propagate(rtol) if needs_error else (fine, success)
+        z = compare(form, coarse, fine, jnp.zeros(()), 0.0, rtol, _REDUCTION)
+        found = results(z, request.outputs, rtol, model.natural)
+        failed = ~(success & success_coarse)
+        return found | {"outcome": jnp.where(failed, jnp.int8(Outcome.STEP_LIMIT), found["outcome"])}
+
+    def effort(columns: Mapping[str, Any]) -> np.ndarray:
+        # Large, not infinite, where the explicit scheme would need too many steps: diffrax tries these points as well.
+        return np.nan_to_num(explicit_effort(system, columns, rtol))
+
+    name = f"diffrax: {request.options['solver']}, {request.options['form']}, adaptive steps"
+    return (Solver(name, over_lanes(solve), effort, chunk=256),)
+
+
+def equal_step_propagator(form: LinearPeriodic, solver: diffrax.AbstractSolver, steps: Array) -> Propagator:
+    """The propagator of one point by ``steps`` equal steps.
+
+    Under ``jax.vmap`` the lanes are the last axis of a single state, which halves the time of ``solver``.
+    """
+    arrays, rest = eqx.partition(LinearPeriodic(form.rows, form.span, form.basis), eqx.is_array)
+    if isinstance(form.rows, eqx.Module | jax.tree_util.Partial):
+        matrix = lanes_last(_integrated, Constants((rest, solver)), arrays, steps)
+    else:
+        # Nothing is known of the arrays that another function may depend on.
+        matrix = _integrated(Constants((rest, solver)), arrays, steps)[..., 0]
+    return Propagator(matrix, jnp.zeros(()), jnp.ones(()))
+
+
+def _integrated(constants: Constants, arrays: LinearPeriodic, steps: Array) -> Array:
+    rest, solver = constants.tree
+    form = eqx.combine(arrays, rest)
+    lanes = max((np.shape(x)[-1] for x in jax.tree.leaves(arrays) if np.ndim(x)), default=1)
+    start = jnp.broadcast_to(jnp.eye(form.size)[..., None], (form.size, form.size, lanes))
+    # Lanes of different spans share a clock whose unit is the span.
+    scaled = diffrax.ODETerm(lambda t, y, args: form.span * form.vf(form.span * t, y, args))
+    solution = diffrax.diffeqsolve(
+        scaled,
+        solver,
+        t0=0.0,
+        t1=1.0,
+        dt0=None,
+        y0=start,
+        stepsize_controller=EqualStepSize(steps),
+        saveat=diffrax.SaveAt(t1=True),
+        adjoint=diffrax.ForwardMode(),
+        max_steps=None,
+        throw=False,
+    )
+    return solution.ys[-1]  # pyright: ignore[reportOptionalSubscript]
+
+
+def diffrax_propagator(
+    form: LinearPeriodic, solver: diffrax.AbstractSolver, max_steps: int | None = None, **options: Any
+) -> tuple[Propagator, Array]:
+    """The propagator of one point over the span, NaN where the integration failed, and whether it succeeded."""
+    solution = diffrax.diffeqsolve(
+        form,
+        solver,
+        t0=0.0,
+        t1=form.span,
+        dt0=None,
+        y0=jnp.eye(form.size),
+        saveat=diffrax.SaveAt(t1=True),
+        adjoint=diffrax.ForwardMode(),
+        max_steps=max_steps,
+        throw=False,
+        **options,
+    )
+    success = solution.result == diffrax.RESULTS.successful
+    matrix = jnp.where(success, solution.ys[-1], jnp.nan)  # pyright: ignore[reportOptionalSubscript]
+    return Propagator(matrix, jnp.zeros(()), jnp.ones(())), success

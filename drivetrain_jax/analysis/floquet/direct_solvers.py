@@ -1,0 +1,134 @@
+"""The direct solvers of a periodic system: explicit, batched inside the state, and L-stable where that is cheaper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis._base import Solver
+from drivetrain_jax.analysis.floquet.direct import Monodromy, direct_monodromy, stable_steps, stiffness_of
+from drivetrain_jax.analysis.floquet.effort import (
+    LONG,
+    PANEL_COST,
+    explicit_effort,
+    implicit_effort,
+    strongly_damped,
+    traced_steps,
+)
+from drivetrain_jax.analysis.numerics.lanes import over_lanes
+from drivetrain_jax.systems import System
+
+if TYPE_CHECKING:
+    from drivetrain_jax.analysis.floquet.propagator import Propagator
+    from drivetrain_jax.systems import FloquetModel, LinearPeriodic
+
+# Ratio of the explicit steps to those of the coarser solution for the error estimate, up to this rtol, if the system
+# predicts its steps. For other systems so few steps may not show the order of the scheme.
+_RATIO, _FINE = 4, 1e-8
+
+Form = Callable[["FloquetModel"], "LinearPeriodic"]
+Results = Callable[["FloquetModel", Monodromy], dict[str, Array]]
+
+
+def direct_solvers(
+    system: type[System],
+    rtol: float,
+    target: float,
+    form: Form,
+    results: Results,
+    chunks: tuple[int, int] = (512, 64),
+    stiff: Form | None = None,
+) -> tuple[Solver, ...]:
+    """Solvers that give ``results(model, monodromy)`` from the monodromy matrix of ``form(model)``.
+
+    ``rtol`` predicts the effort, ``target`` is the error that every point is refined to. ``stiff(model)`` is the form for
+    the implicit scheme, and for the explicit one where damping is strong; None if it is no other one.
+    """
+    solve = partial(_solve, system, target, results)
+
+    def explicit(name: str, form: Form, effort: Callable[[Mapping[str, Any]], Any]) -> Solver:
+        return Solver(
+            f"direct: explicit Runge-Kutta of order 8{name}",
+            lambda values, steps: solve(form, values, steps, True),
+            effort,
+            lambda values: traced_steps(system.models["floquet"].build, values, rtol),
+            chunk=chunks[0],
+            march=True,
+            short_loops=True,
+        )
+
+    steps = _ExplicitSteps(system, rtol, stiff is not None)
+
+    implicit = Solver(
+        "direct: Radau IIA of 8 stages",
+        over_lanes(lambda values, effort: solve(stiff or form, values, effort, False)),
+        lambda columns: implicit_effort(system, columns, rtol),
+        unit_cost=PANEL_COST,
+        chunk=chunks[1],
+        march=True,
+        short_loops=True,
+    )
+    plain = explicit("", form, lambda columns: steps(columns)["short"])
+    long = explicit(", long marches", form, lambda columns: steps(columns)["long"])
+    if stiff is None:
+        return plain, implicit, long
+    return plain, implicit, explicit(", form for strong damping", stiff, lambda columns: steps(columns)["damped"]), long
+
+
+class _ExplicitSteps:
+    """Steps of the explicit scheme by march: ``short``, ``long`` or ``damped`` (the other form), inf for the other two.
+
+    The last request is cached, because the solvers of a plan request the same columns in turn.
+    """
+
+    def __init__(self, system: type[System], rtol: float, has_stiff: bool) -> None:
+        self._system, self._rtol, self._has_stiff = system, rtol, has_stiff
+        self._last: tuple[Mapping[str, Any], Mapping[str, np.ndarray]] = ({}, {})
+
+    def __call__(self, columns: Mapping[str, Any]) -> Mapping[str, np.ndarray]:
+        asked, found = self._last
+        if asked is not columns:
+            steps = explicit_effort(self._system, columns, self._rtol)
+            damped = strongly_damped(self._system, columns) if self._has_stiff else np.zeros(steps.shape, bool)
+            kinds = {"short": ~damped & (steps <= LONG), "long": ~damped & (steps > LONG), "damped": damped}
+            found = {kind: np.where(mine, steps, np.inf) for kind, mine in kinds.items()}
+            self._last = columns, found
+        return found
+
+
+def _solve(
+    system: type[System],
+    target: float,
+    results: Results,
+    form: Form,
+    values: Mapping[str, Any],
+    effort: Array,
+    explicit: bool,
+) -> dict[str, Array]:
+    # diffrax takes as long to import as jax, and is not needed to read a result.
+    from drivetrain_jax.analysis.floquet.propagator import PIECES, Order8, Radau, propagator
+
+    scheme = Order8 if explicit else Radau
+    build = system.models["floquet"].build
+    model = build(values)
+    periodic = form(model)
+    shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in values.values() if not isinstance(x, str)))
+    least = stable_steps(periodic) if explicit else 0.0
+    # Errors grow on the way where modes decay at rates that differ by much, and by other ones later than at first.
+    pieces = jnp.clip(least, 1, PIECES).astype(effort.dtype) if explicit else PIECES
+
+    def propagate(steps: Array, pieces: Array) -> Propagator:
+        def one(own: Mapping[str, Any], _: None) -> Propagator:
+            return propagator(form(build(own)), steps, pieces, scheme)
+
+        return over_lanes(one)(values, None) if shape else one(values, None)
+
+    stiffness = stiffness_of(periodic, shape)
+    ratio = jnp.where(target <= _FINE, _RATIO, 2) if explicit and model.explicit_steps else 2
+    found = direct_monodromy(periodic, propagate, effort, shape, stiffness, target, scheme.ORDER, ratio, least, pieces)
+    return results(model, found)

@@ -1,0 +1,96 @@
+"""Propagators of a linear periodic system along a coordinate x, as power series in x: a line for the price of a few solves.
+
+Where ``A(t, x) = A0(t) + x A1(t)`` and ``A0`` only leads from the ``first`` states to the others, the states
+``y~ = (I - G) y`` with ``G' = A0`` obey ``y~' = x B y~``, ``B = (I - G) A1 (I + G)``. Over a part of the span, at whose
+start ``G = 0``, the propagator is
+
+    (I + G) sum_k x^k D_k,  D_k' = B D_(k-1),  D_0 = I and D_k = 0 for k > 0 at the start:
+
+nothing has to be solved. The span is cut into equal parts, so short that few terms are enough; integrals are those of
+Radau's collocation, whose last node is the end of the part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax.analysis.floquet.propagator import radau_iia
+from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, suits_one_kernel
+from drivetrain_jax.systems import LinearPeriodic
+
+# Nodes of a part and powers of x: what both leave out is about the same.
+NODES, TERMS = 12, 20
+
+Form = Callable[[Any], LinearPeriodic]
+
+
+def propagators_along(form: Form, ends: Array, first: int, lanes: int, parts: Array, x: Array) -> tuple[Array, Array]:
+    """``Phi`` of ``lanes`` lines at the P positions ``x``, ``(P, n, n, lanes)``, and what was left out, ``(lanes,)``.
+
+    ``form(p)`` is the system where the coordinate's parameter is p; ``ends`` ``(2,)`` are its values where the coordinate is
+    0 and where it is 1 in the units of ``x``; ``|x| <= 1``. The span is cut into ``parts`` (a traced integer). What was left
+    out is the size of the last term relative to the largest one, in the worst part: infinite where ``A0`` has entries that
+    do not lead from the ``first`` states to the others.
+    """
+    weights, places = radau_iia(NODES)
+    system = form(ends[0])
+    size, length = system.size, system.span / parts
+    powers = x[:, None] ** jnp.arange(TERMS + 1)
+    leads = ((jnp.arange(size) >= first)[:, None] & (jnp.arange(size) < first))[..., None]
+
+    def integral(slopes: Array) -> Array:
+        return (length * weights @ slopes.reshape(NODES, -1)).reshape(slopes.shape)
+
+    def onward(number: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        phi, left_out = state
+        constant, varying = _split(form, ends, ((number + places) * length)[:, None], lanes)
+        wrong = jnp.any(jnp.where(leads, 0.0, constant) != 0, axis=(0, 1, 2))
+        terms = _terms(constant[:, first:, :first], varying, first, integral)
+        sizes = jnp.max(jnp.abs(terms), axis=(1, 2))
+        missing = jnp.where(wrong, jnp.inf, sizes[-1] / jnp.max(sizes, axis=0))
+        part = (powers @ terms.reshape(TERMS + 1, -1)).reshape(phi.shape)
+        return _product(part, phi), jnp.maximum(left_out, missing)
+
+    unit = jnp.broadcast_to(jnp.eye(size)[..., None], (len(x), size, size, lanes))
+    return jax.lax.fori_loop(0, parts, onward, (unit, jnp.zeros(lanes)))
+
+
+def _terms(constant: Array, varying: Array, first: int, integral: Callable[[Array], Array]) -> Array:
+    """The terms at the end of a part, ``(TERMS + 1, n, n, lanes)``, from ``A0`` ``(NODES, n - first, first, lanes)`` and
+    ``A1`` ``(NODES, n, n, lanes)``."""
+    g = integral(constant)
+    b = varying.at[:, :, :first].add(_product(varying[:, :, first:], g))
+    b = b.at[:, first:].add(-_product(g, b[:, :first]))
+
+    def following(before: Array, _: None) -> tuple[Array, Array]:
+        found = integral(_product(b, before))
+        return found, found[-1]
+
+    unit = jnp.broadcast_to(jnp.eye(varying.shape[1])[..., None], varying.shape)
+    terms = jnp.concatenate([unit[-1:], jax.lax.scan(following, unit, length=TERMS)[1]])
+    return terms.at[:, first:].add(_product(g[-1:], terms[:, :first]))
+
+
+def _split(form: Form, ends: Array, t: Array, lanes: int) -> tuple[Array, Array]:
+    """``A0`` and ``A1`` at the times ``t`` ``(NODES, 1)``, both ``(NODES, n, n, lanes)``."""
+
+    def matrix(parameter: Array) -> Array:
+        system = form(parameter)
+        rows = system.rows(*system.basis(t))
+        entries = [[jnp.broadcast_to(jnp.asarray(x, float), (NODES, lanes)) for x in row] for row in rows]
+        return jnp.stack([jnp.stack(row, axis=1) for row in entries], axis=1)
+
+    # Both ends at once: what does not depend on the coordinate is computed once.
+    both = jax.vmap(matrix)
+    start, end = (in_one_kernel(both) if suits_one_kernel(both, ends) else both)(ends)
+    return start, end - start
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Products of matrices, ``(P, k, l, lanes)`` times ``(P, l, m, lanes)``."""
+    return sum(a[:, :, j, None] * b[:, None, j] for j in range(b.shape[1]))  # pyright: ignore[reportReturnType]

@@ -1,0 +1,102 @@
+"""The results of the floquet analysis from a monodromy matrix."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._quantities import Variable
+from drivetrain_jax.analysis._base import Outcome
+from drivetrain_jax.analysis.floquet.direct import Monodromy
+from drivetrain_jax.analysis.floquet.multipliers import VERDICTS, sort_multipliers, verdict
+from drivetrain_jax.analysis.floquet.radius import (
+    Spectrum,
+    has_closed_form,
+    radius_by_eigenvalues,
+    radius_in_closed_form,
+)
+from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
+from drivetrain_jax.systems import System
+
+if TYPE_CHECKING:
+    from drivetrain_jax.systems import LinearPeriodic
+
+VARIABLES = (
+    Variable("floquet_multiplier", "1", "Floquet multiplier over one period", ("multiplier",), "complex128"),
+    Variable("floquet_exponent", "1/s", "real part of the Floquet exponent", ("multiplier",)),
+    Variable("spectral_radius", "1", "largest modulus of the Floquet multipliers"),
+    Variable("spectral_radius_error", "1", "bound of the absolute error of spectral_radius"),
+    Variable("verdict", "1", "stability of the equilibrium", dtype="int8", flags=VERDICTS),
+    Variable("liouville_residual", "1", "(determinant of the monodromy matrix - exact value) / spectral_radius^n"),
+)
+NEED_ERROR = {"spectral_radius_error", "verdict"}
+_TINY = np.finfo(float).tiny
+MULTIPLIERS = {"floquet_multiplier", "floquet_exponent"}
+
+
+def lacks(system: type[System]) -> dict[str, str]:
+    """The result that systems whose time has no unit lack, see :class:`~drivetrain_jax.analysis.Analysis`."""
+    if system.time_units == "s":
+        return {}
+    return {"floquet_exponent": f"a rate in 1/s, and the time of {system.name} has no unit"}
+
+
+def _with_product(multipliers: Array, logarithms: Array, log_product: Array) -> tuple[Array, Array]:
+    """Two multipliers and the logarithms of their moduli, the second ones from those of the product.
+
+    As an eigenvalue the smaller one has the absolute error of the larger one: with strong damping it is nothing but that.
+    """
+    apart = logarithms[0] - logarithms[1] > math.log(2)
+    second = jnp.where(apart, jnp.exp(log_product) / multipliers[0], multipliers[1])
+    other = jnp.where(apart, log_product - logarithms[0], logarithms[1])
+    return jnp.stack([multipliers[0], second]), jnp.stack([logarithms[0], other])
+
+
+def results(
+    z: Monodromy,
+    outputs: tuple[str, ...],
+    rtol: float,
+    system: LinearPeriodic,
+    spectrum: Spectrum | None = None,
+) -> dict[str, Array]:
+    """The requested variables and the outcome from a monodromy matrix of ``system`` with trailing batch axes.
+
+    ``spectrum``: real and imaginary parts of the eigenvalues of ``z.matrix``, if known. Otherwise the spectral radius of
+    four states comes from the closed form, and from eigenvalues only where the closed form is not accurate enough.
+    """
+    wanted = set(outputs)
+    finite = jnp.all(jnp.isfinite(z.matrix), axis=(0, 1))
+    size = jnp.exp(z.log_scale)
+
+    def eigen() -> Spectrum:
+        return spectrum or eigenvalues(jnp.where(finite, z.matrix, jnp.nan))
+
+    found: dict[str, Array] = {}
+    if wanted & MULTIPLIERS:
+        real, imaginary = spectrum = eigen()
+        multipliers = jnp.where(finite, sort_multipliers(real, imaginary), jnp.nan)
+        logarithms = jnp.log(jnp.abs(multipliers))
+        if len(multipliers) == 2 and system.log_determinant is not None:
+            multipliers, logarithms = _with_product(multipliers, logarithms, system.log_determinant() - 2 * z.log_scale)
+        found["floquet_multiplier"] = multipliers * size
+        found["floquet_exponent"] = (logarithms + z.log_scale) / system.span
+    if spectrum is None and has_closed_form(z.matrix):
+        rho, error = radius_in_closed_form(z.matrix, z.error, size, 10 * rtol)
+    else:
+        rho, error = radius_by_eigenvalues(eigen(), z.error)
+    # Compiled, the largest of moduli that are all NaN may be -inf.
+    rho, error = (jnp.where(finite, x, jnp.nan) for x in (rho, error))
+    found |= {"spectral_radius": rho * size, "liouville_residual": jnp.where(finite, z.residual, jnp.nan)}
+    met = z.met
+    if wanted & NEED_ERROR:
+        # A value that underflows is not 0: its bound is the smallest number.
+        met = (error <= 10 * rtol * rho) & (rho * size >= _TINY)
+        bound = jnp.maximum(error * size, _TINY)
+        found |= {"spectral_radius_error": bound, "verdict": verdict(rho * size, bound)}
+    outcome = jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
+    outcome = jnp.where(finite, outcome, Outcome.NOT_FINITE)
+    return {name: found[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}

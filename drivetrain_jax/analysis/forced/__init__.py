@@ -1,0 +1,1 @@
+"""Forced response: periodic solutions of linear and nonlinear systems."""

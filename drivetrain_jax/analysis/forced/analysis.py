@@ -1,0 +1,334 @@
+"""Forced response: periodic solution of the linearised system, and the nonlinear periodic orbit with its multipliers.
+
+Linear, over one period T from rest, by variational equations: ``y(T; y0) = r + Z y0``, hence ``y0 = (I - Z)^-1 r``.
+Nonlinear: Newton shooting along growing forcing (:func:`~drivetrain_jax.analysis.forced.orbit.shoot`). Of several orbits
+it returns the first one on this path.
+
+Outcome: ``TOLERANCE_NOT_MET`` if the estimated error of a state exceeds ``rtol`` times its largest entry; ``NOT_CONVERGED``
+if I - Z is singular to working accuracy or no nonlinear orbit was found. Only missing results are NaN then: a finite linear
+response and ``condition`` are kept if the orbit was not found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Dimension, Variable
+from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver, forward_derivatives
+from drivetrain_jax.analysis.forced.amplitude import amplitudes
+from drivetrain_jax.analysis.forced.orbit import (
+    Field,
+    Orbit,
+    Transition,
+    in_units_of,
+    integrate,
+    newton_step,
+    shoot,
+    size_of,
+    transition,
+)
+from drivetrain_jax.analysis.forced.orbit_derivatives import periodic_slopes
+from drivetrain_jax.analysis.numerics.lanes import Constants, over_lanes
+from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, solve, spectral_norm
+from drivetrain_jax.analysis.numerics.predictions import predicted
+from drivetrain_jax.systems import ForcedModel, System
+
+LINEAR = ("periodic_state", "periodic_state_error", "amplitude", "amplitude_phase", "condition")
+PEAKS = frozenset(("amplitude", "amplitude_phase"))
+ORBIT_PEAKS = frozenset(("orbit_amplitude", "orbit_amplitude_phase"))
+PERIODIC, ORBITS = PEAKS | {"periodic_state"}, ORBIT_PEAKS | {"orbit_state"}
+
+Build = Callable[[Mapping[str, Any]], ForcedModel]
+
+# Tolerances of the integrations relative to ``rtol``. The integration that closes the period is the more accurate one, to
+# estimate the error of the first.
+TRANSITION_SHARPNESS, CLOSING_SHARPNESS, SHARPEST = 0.1, 0.001, 1e-14
+# Ratio of the error of an integration to its tolerance. With it errors covered the true ones at 256 random points and four
+# rtol; without it they were up to 27 times too small.
+CLOSING_ERROR = 0.1
+# Loosest ``rtol`` for these tolerances: (I - Z)^-1 multiplies their errors by up to its condition.
+LOOSEST = 1e-6
+# I - Z counts as singular if its condition times the error of Z reaches ``NOT_FOUND``. This is the largest error assumed
+# for Z: a looser request must not lose an answer, whose error the closing of the period shows.
+SINGULAR_SHARPNESS = 1e-11
+# Relative error above which a periodic solution counts as not found.
+NOT_FOUND = 1e-2
+FORCING_SAMPLES = 64
+# Points of a chunk: of the linear response; of orbits, where one orbit with hundreds of corrections delays the others.
+CHUNK, ORBITS_CHUNK = 128, 16
+
+
+class Response(NamedTuple):
+    """Periodic solution of the linear system: ``state`` (n,), absolute ``error``, ``amplitude`` and its ``phase`` (None
+    unless requested), and the map over one period behind it."""
+
+    state: Array
+    error: Array
+    amplitude: Array | None
+    phase: Array | None
+    step: Transition
+    outcome: Array
+
+
+def _worst(*outcomes: Array) -> Array:
+    return jnp.max(jnp.stack([jnp.asarray(o) for o in outcomes]))
+
+
+def _sharpness(rtol: float, factor: float) -> float:
+    return max(factor * min(rtol, LOOSEST), SHARPEST)
+
+
+def _mapped(model: ForcedModel, n: int, rtol: float) -> tuple[Transition, Array, Array]:
+    """The map over one period in units of the forcing, its fixed point in those units, and the unit."""
+    rest = jnp.zeros(n)
+    phases = model.period * np.arange(FORCING_SAMPLES) / FORCING_SAMPLES
+    forcing = size_of(jax.vmap(lambda t: model.linear(t, rest))(phases))
+    field = in_units_of(forcing, model.linear)
+    step = transition(field, rest, model.period, _sharpness(rtol, TRANSITION_SHARPNESS))
+    return step, newton_step(step, rest), forcing
+
+
+def linear_response(model: ForcedModel, n: int, rtol: float, with_amplitude: bool) -> Response:
+    """Periodic solution of ``y' = linear(t, y)``; ``n`` is the size of the state.
+
+    ``y0 = (I - Z)^-1 r`` is integrated over another period; its closing error times (I - Z)^-1 corrects it. The stored
+    error is that correction plus (I - Z)^-1 times the possible error of the second integration.
+    """
+    step, unit, forcing = _mapped(model, n, rtol)
+    # Without a solution there is nothing to integrate.
+    found = (step.outcome == Outcome.SUCCESS) & jnp.all(jnp.isfinite(unit))
+    unit = jnp.where(found, unit, 0.0)
+    size = size_of(unit)
+    start, field, sharp = unit / size, in_units_of(size * forcing, model.linear), _sharpness(rtol, CLOSING_SHARPNESS)
+    (largest, phase), correction, closed = _closed(model, field, start, step.matrix, sharp, with_amplitude)
+    error = jnp.max(jnp.abs(correction)) + CLOSING_ERROR * sharp * _gain(step.matrix)
+    lost = ~found | ~(error <= NOT_FOUND) | ~_regular(step.matrix, rtol)
+    missed = jnp.where(error > rtol, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
+    outcome = _worst(step.outcome, closed, jnp.where(lost, Outcome.NOT_CONVERGED, missed))
+    state, error, largest = jax.tree.map(
+        lambda x: jnp.where(outcome < Outcome.NOT_CONVERGED, size * forcing * x, jnp.nan),
+        (start + correction, error, largest),
+    )
+    phase = None if phase is None else jnp.where(outcome < Outcome.NOT_CONVERGED, phase, jnp.nan)
+    return Response(state, error, largest, phase, step, outcome)
+
+
+def _closed(
+    model: ForcedModel, field: Field, start: Array, matrix: Array, sharp: float, with_amplitude: bool
+) -> tuple[tuple[Array | None, Array | None], Array, Array]:
+    """Largest displacements over a period from ``start``, of order one, and their phases (None unless requested); the
+    correction of ``start`` by the closing error; and the outcome. ``matrix`` is the transition."""
+    if with_amplitude:
+        largest, phase, end, closed = amplitudes(field, start, model.period, model.displacements, sharp)
+    else:
+        (largest, phase), (end, closed) = (None, None), integrate(field, start, model.period, sharp)
+    return (largest, phase), newton_step(Transition(end, matrix, closed), start), closed
+
+
+def _regular(matrix: Array, rtol: float) -> Array:
+    """True if ``I - Z`` is further from singular than the accuracy of Z."""
+    return _condition(matrix) * min(_sharpness(rtol, TRANSITION_SHARPNESS), SINGULAR_SHARPNESS) < NOT_FOUND
+
+
+def _gain(matrix: Array) -> Array:
+    """Largest entry of ``(I - Z)^-1 e`` for an error ``e`` with entries up to 1."""
+    return jnp.max(jnp.sum(jnp.abs(solve(jnp.eye(matrix.shape[0]) - matrix, jnp.eye(matrix.shape[0]))), axis=1))
+
+
+def _condition(matrix: Array) -> Array:
+    """2-norm condition number of ``I - Z``; infinite if it is singular."""
+    difference = jnp.eye(matrix.shape[0]) - matrix
+    inverse = solve(difference, jnp.eye(matrix.shape[0]))
+    condition = spectral_norm(difference) * spectral_norm(jnp.where(jnp.isfinite(inverse), inverse, 0.0))
+    return jnp.where(jnp.all(jnp.isfinite(inverse)), condition, jnp.inf)
+
+
+def nonlinear_orbit(
+    model: ForcedModel, response: Response, rtol: float, with_amplitude: bool
+) -> tuple[Orbit, Array | None, Array | None]:
+    """Nonlinear periodic orbit on the path that starts along ``response`` (NaN with its outcome if there is none), and
+    its amplitude and the phase of that (None unless requested)."""
+    usable = response.outcome < Outcome.NOT_CONVERGED
+    start = jnp.where(usable, response.state, 0.0)
+    # Nonlinearity matters for states of order one; smaller responses are their own unit.
+    unit = jnp.minimum(size_of(start), 1.0)
+    orbit = shoot(in_units_of(unit, model.field), start / unit, model.period, _sharpness(rtol, TRANSITION_SHARPNESS))
+    outcome = jnp.where(usable, orbit.outcome, response.outcome)
+    state = jnp.where(outcome < Outcome.NOT_CONVERGED, unit * orbit.state, 0.0)
+    size = size_of(state)
+    field, sharp = in_units_of(size, model.field), _sharpness(rtol, CLOSING_SHARPNESS)
+    (largest, phase), correction, closed = _closed(model, field, state / size, orbit.matrix, sharp, with_amplitude)
+    error = size * jnp.max(jnp.abs(correction)) + unit * orbit.error
+    missed = jnp.where(error <= rtol * size, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
+    outcome = _worst(outcome, jnp.where(outcome < Outcome.NOT_CONVERGED, _worst(closed, missed), outcome))
+    state, matrix, error, largest, phase = jax.tree.map(
+        lambda x: jnp.where(outcome < Outcome.NOT_CONVERGED, x, jnp.nan),
+        (state, orbit.matrix, error, None if largest is None else size * largest, phase),
+    )
+    return Orbit(state, matrix, error, outcome, orbit.corrections), largest, phase
+
+
+def _orbit_results(
+    model: ForcedModel, response: Response, outputs: tuple[str, ...], rtol: float
+) -> tuple[dict[str, Any], Array]:
+    """The requested results of the nonlinear orbit and their outcome."""
+    orbit, largest, phase = nonlinear_orbit(model, response, rtol, not ORBIT_PEAKS.isdisjoint(outputs))
+    found = orbit.outcome < Outcome.NOT_CONVERGED
+    results = {"orbit_state": orbit.state, "orbit_state_error": orbit.error}
+    results |= {"orbit_amplitude": largest, "orbit_amplitude_phase": phase}
+    if "orbit_spectral_radius" in outputs:
+        matrix = jnp.where(found, orbit.matrix, jnp.eye(orbit.state.size))
+        radius = jnp.max(jnp.hypot(*eigenvalues(matrix)))
+        results["orbit_spectral_radius"] = jnp.where(found, radius, jnp.nan)
+    return results, orbit.outcome
+
+
+def _solve(build: Build, n: int, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+    """All requested results of one point; ``effort`` only orders the batches, as every integration is adaptive."""
+    del effort
+    model, rtol = build(values), request.options["rtol"]
+    response = linear_response(model, n, rtol, not PEAKS.isdisjoint(request.outputs))
+    results: dict[str, Any] = {"periodic_state": response.state, "periodic_state_error": response.error}
+    results |= {"amplitude": response.amplitude, "amplitude_phase": response.phase}
+    outcome = response.outcome
+    if "condition" in request.outputs:
+        results["condition"] = jnp.where(
+            response.step.outcome == Outcome.SUCCESS, _condition(response.step.matrix), jnp.nan
+        )
+    if not set(request.outputs) <= set(LINEAR):
+        of_orbit, orbit_outcome = _orbit_results(model, response, request.outputs, rtol)
+        results |= of_orbit
+        outcome = _worst(outcome, orbit_outcome)
+    return {name: results[name] for name in request.outputs} | {"outcome": outcome.astype(jnp.int8)}
+
+
+def predicted_steps(build: Build, n: int, moving: int, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Steps of one integration, shape (N,), from the mean spectral radius of the linear field over three phases."""
+    matrices = np.moveaxis(predicted(_matrices, (build, n, moving), columns), -1, 0)
+    rates = np.abs(np.linalg.eigvals(matrices)).max(axis=-1)
+    return np.ceil(20 + 2 * np.mean(rates, axis=-1)).astype(np.int64)
+
+
+def _matrices(build: Build, n: int, moving: int, values: Mapping[str, Any]) -> Array:
+    """The period times the Jacobian of the linear field of one point at three phases, ``(3, n, n)``."""
+    model = build(values)
+    if len(model.displacements) != moving:
+        raise InputError(
+            f"system: its model has {len(model.displacements)} displacements; allowed is {moving}, as it says"
+        )
+    phases = model.period * jnp.array([0.0, 0.25, 0.5])
+    return model.period * jax.vmap(lambda t: jax.jacfwd(lambda y: model.linear(t, y))(jnp.zeros(n)))(phases)
+
+
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
+    build, n = system.models["forced"].build, len(system.state)
+    steps = partial(predicted_steps, build, n, len(_displacements(system).values))
+    chunk = CHUNK if set(request.outputs) <= set(LINEAR) else ORBITS_CHUNK
+    solve = over_lanes(partial(_solve, build, n, request))
+    return (Solver("diffrax", solve, steps, chunk=chunk, march=True, short_loops=True),)
+
+
+# Results that need second derivatives along the motion: the first solver itself is differentiated.
+_SECOND = frozenset(("condition", "orbit_spectral_radius"))
+
+
+def _derivative_outputs(outputs: tuple[str, ...]) -> tuple[str, ...]:
+    linear = ("periodic_state",) + (("amplitude_phase",) if "amplitude" in outputs else ())
+    orbit = ("orbit_state",) + (("orbit_amplitude_phase",) if "orbit_amplitude" in outputs else ())
+    return (() if PERIODIC.isdisjoint(outputs) else linear) + (() if ORBITS.isdisjoint(outputs) else orbit)
+
+
+def _derivatives(
+    system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Jacobians of states and amplitudes by the variational equations, of all else by differentiating the solver."""
+    build, found = system.models["forced"].build, {}
+    second = tuple(name for name in request.outputs if name in _SECOND)
+    if second:
+        kept = {name: results[name] for name in second}
+        asked = Request(second, request.method, request.options)
+        found |= forward_derivatives(_solvers, system, asked, parameters, constants, kept)
+    for prefix, state, top in (("linear", "periodic_state", "amplitude"), ("field", "orbit_state", "orbit_amplitude")):
+        if state in request.outputs:
+            model = lambda p: build(eqx.combine(p, constants.tree))  # noqa: E731
+            found |= _slopes(model, prefix, parameters, results, (state, top), request.options["rtol"])
+    return found
+
+
+def _slopes(
+    model: Callable[[Any], ForcedModel],
+    which: str,
+    parameters: Any,
+    results: Mapping[str, Array],
+    names: tuple[str, str],
+    rtol: float,
+) -> dict[str, Array]:
+    """Jacobians of the periodic solution ``names[0]`` of the field ``which``, and of its amplitude if that is requested."""
+
+    def field(parameters: Any, s: Any, y: Array) -> Array:
+        there = model(parameters)
+        return there.period * getattr(there, which)(there.period * s, y)
+
+    state, top = names
+    here, phase = model(parameters), f"{top}_phase"
+    peaks = (results[phase] / here.period, here.displacements) if phase in results else (jnp.zeros(0), ())
+    slopes = periodic_slopes(field, parameters, results[state], peaks, _sharpness(rtol, 1.0))
+    return {state: slopes.state} | ({top: slopes.tops} if phase in results else {})
+
+
+def _displacements(system: type[System]) -> Dimension:
+    assert system.displacements is not None  # System refuses a model of forced without them
+    return system.displacements
+
+
+def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    names = tuple(c.name for c in system.state)
+    return Dimension("state", "component of the state", names), _displacements(system)
+
+
+def _of_system(system: type[System]) -> dict[str, Any]:
+    """The variables, in the units of the system's state."""
+    units, length = ", ".join(dict.fromkeys(c.units for c in system.state)), system.state[0].units
+    each, state = (_displacements(system).name,), ("state",)
+    # A time without unit is the angle of a shaft.
+    time = "rad" if system.time_units == "1" else system.time_units
+    variables = (
+        Variable("periodic_state", units, "periodic solution of the linear system at the start of a period", state),
+        Variable("periodic_state_error", units, "estimated absolute error of periodic_state"),
+        Variable("amplitude", length, "largest displacement over the period, linear system", each),
+        Variable("amplitude_phase", time, "time at which the displacement is largest, linear system", each),
+        Variable("condition", "1", "2-norm condition number of I - Z, linear system"),
+        Variable("orbit_state", units, "nonlinear periodic orbit at the start of a period", state),
+        Variable("orbit_state_error", units, "estimated absolute error of orbit_state"),
+        Variable("orbit_amplitude", length, "largest displacement over the period, nonlinear orbit", each),
+        Variable("orbit_amplitude_phase", time, "time at which the displacement is largest, nonlinear orbit", each),
+        Variable("orbit_spectral_radius", "1", "spectral radius of the monodromy matrix about the nonlinear orbit"),
+    )
+    return {"variables": variables}
+
+
+ANALYSIS = Analysis(
+    name="forced",
+    title="forced response",
+    variables=(),
+    default_outputs=("periodic_state", "amplitude", "condition"),
+    methods={"shooting": ("rtol",)},
+    method_titles={
+        "shooting": "periodic orbit by Newton's method over one period",
+    },
+    options=(RTOL,),
+    solvers=_solvers,
+    dimensions=_dimensions,
+    derivatives=_derivatives,
+    derivative_outputs=_derivative_outputs,
+    of_system=_of_system,
+)

@@ -1,0 +1,82 @@
+"""Derivatives of a periodic solution of ``y' = f(t, y; p)``, and of its largest displacements, by the variational equations.
+
+Over the part s of the period T, the columns ``V = dy/dy0`` and ``S = dy/dp`` at fixed ``y0`` obey ``V' = T f_y V`` and
+``S' = T f_y S + d(T f)/dp``. The start moves by ``dy0 = (I - V(1))^-1 S(1) dp``. At a peak the solution is stationary in
+time, so that its height moves by ``V dy0 + S dp`` there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax.analysis.forced.orbit import MAX_STEPS, controller, size_of
+from drivetrain_jax.analysis.numerics.linear_algebra import solve
+
+
+class PeriodicSlopes(NamedTuple):
+    """Derivatives by the P parameters: of the ``state`` at the start, ``(n, P)``, and of the largest displacements
+    ``tops``, ``(k, P)``."""
+
+    state: Array
+    tops: Array
+
+
+def periodic_slopes(
+    field: Callable[[Any, Any, Array], Array],
+    parameters: Any,
+    state: Array,
+    peaks: tuple[Array, tuple[int, ...]],
+    rtol: float,
+) -> PeriodicSlopes:
+    """Derivatives of the periodic solution through ``state`` by all ``parameters``, a pytree of P numbers.
+
+    ``field(parameters, s, y)`` returns ``T f`` at the part s of the period. ``peaks`` holds the parts of the period at which
+    the displacements with these indices have their largest modulus. NaN where the integration fails.
+    """
+    import diffrax
+
+    n, size = state.size, size_of(state)
+    leaves, tree = jax.tree.flatten(parameters)
+    point = jnp.stack(leaves)
+    # Relative changes of the parameters keep all columns of similar size.
+    scale = jnp.where(point == 0, 1.0, jnp.abs(point))
+    count = point.size
+    directions = jnp.concatenate([jnp.zeros((n, count)), jnp.eye(count)])
+
+    def lifted(s: Any, columns: Array, _: None) -> Array:
+        def right(y: Array, change: Array) -> Array:
+            moved = jax.tree.unflatten(tree, list(point + scale * change))
+            return field(moved, s, size * y) / size
+
+        slope, push = jax.linearize(right, columns[0], jnp.zeros(count))
+        return jnp.concatenate([slope[None], jax.vmap(push)(columns[1:], directions)])
+
+    first = jnp.concatenate([(state / size)[None], jnp.eye(n), jnp.zeros((count, n))])
+    places, indices = peaks
+    order = jnp.argsort(places)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lifted),
+        diffrax.Dopri8(),
+        0.0,
+        1.0,
+        None,
+        first,
+        saveat=diffrax.SaveAt(t1=True, ts=jnp.clip(places[order], 0.0, 1.0)),
+        stepsize_controller=controller(1.0, rtol),
+        adjoint=diffrax.ForwardMode(),
+        max_steps=MAX_STEPS,
+        throw=False,
+    )
+    found = jnp.where(solution.result == diffrax.RESULTS.successful, solution.ys, jnp.nan)  # pyright: ignore[reportArgumentType]
+    on_peaks, end = found[:-1][jnp.argsort(order)], found[-1]
+    moved = solve(jnp.eye(n) - end[1 : n + 1].T, end[n + 1 :].T)
+    tops = [
+        jnp.sign(columns[0, i]) * (columns[1 : n + 1, i] @ moved + columns[n + 1 :, i])
+        for columns, i in zip(on_peaks, indices, strict=True)
+    ]
+    return PeriodicSlopes(size * moved / scale, size * jnp.stack(tops) / scale)

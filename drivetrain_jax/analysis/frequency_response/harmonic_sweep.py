@@ -1,0 +1,152 @@
+"""Slow sweeps of the drive's frequency by harmonic balance.
+
+At each frequency Newton iterations start from the motion at the last one. The motion is abandoned, as in an experiment, if
+the iterations lose it, if it jumps, or if it becomes unstable within the basis (a fold; a doubled period, if subharmonics
+are kept). The equation of motion is then integrated until it has settled, and the settled motion is balanced, starting from
+the drift of the balance. If this fails, the motion of the Newton iterations is kept and its instability reported.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis.frequency_response.harmonic_balance import Balanced, Basis, balance, contact, drift
+from drivetrain_jax.analysis.frequency_response.harmonic_stability import half_trace, spectral_radius
+from drivetrain_jax.systems import PiecewiseLinearOscillator
+
+# Transients: until disturbances have decayed by this factor, within these limits; steps per radian of the stiffest
+# motion and per drive period. They only have to land in a basin, not to be accurate.
+_SETTLED, _PERIODS = 1e-4, (24, 400)
+_PER_RADIAN, _STEPS = 4.0, (64, 4000)
+# A change of the motion between two frequencies that counts as a jump, over its size.
+_JUMP = 0.35
+_MARGIN = 1e-7
+_PUSH = 0.05
+# Attempts at one frequency: the passage past a fold is slow close to it.
+_WAITS = 8
+
+
+class Swept(NamedTuple):
+    """A motion on the way: coefficients ``(n, ...)``, the half trace of its transition, whether it is balanced, and
+    whether it is a saddle of the balance."""
+
+    x: Array
+    half: Array
+    balanced: Array
+    saddle: Array
+
+
+def _effort(model: PiecewiseLinearOscillator, basis: Basis, omega: Array) -> tuple[Array, Array]:
+    """Base periods for settling, and steps between two samples, of each lane, independent of its batch."""
+    fastest = jnp.sqrt(model.stiffness * jnp.maximum(model.alpha, 1.0)) / omega
+    steps = jnp.clip(2 * np.pi * _PER_RADIAN * fastest, *_STEPS)
+    decay = -np.log(_SETTLED) * omega / (np.pi * jnp.maximum(model.damping, 1e-12 * omega))
+    periods = jnp.clip(jnp.ceil(decay / basis.order), *(p // basis.order for p in _PERIODS))
+    return periods.astype(jnp.int32), jnp.ceil(steps * basis.order / basis.count).astype(jnp.int32)
+
+
+def settle(
+    model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array, wanted: Array | bool = True
+) -> Array:
+    """Coefficients of the motion some time after it was in the state of ``x`` at tau = 0, where this is ``wanted``."""
+    lanes = x.shape[1:]
+    start = jnp.asarray(basis.at(np.zeros(1))[0]), jnp.asarray((basis.at(np.zeros(1)) @ basis.derivative)[0])
+    u, v = jnp.tensordot(start[0], x, 1), jnp.tensordot(start[1], x, 1) * omega / basis.order
+    # A motion that repeats exactly stays so: a push lets disturbances grow that it is unstable to.
+    u = u + _PUSH * jnp.sqrt(jnp.sum(x[1:] ** 2, axis=0))
+    sampled = Basis(basis.harmonics, basis.order, max(_STEPS[0], 1 << (2 * basis.harmonics).bit_length()))
+    effort = (jnp.where(wanted, number, 0) for number in _effort(model, sampled, omega))
+    periods, parts = (jnp.broadcast_to(number, lanes) for number in effort)
+    turn = parts * sampled.count
+    h = 2 * np.pi * basis.order / (jnp.maximum(turn, 1) * omega)
+
+    def advance(number: Array, until: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        moved = _runge_kutta(model, omega, (number % jnp.maximum(turn, 1)) * h, h, state)
+        return tuple(jnp.where(number < until, new, old) for new, old in zip(moved, state, strict=True))  # pyright: ignore[reportReturnType]
+
+    def project(sample: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        u, v, total = carry
+        total = total + jnp.asarray(sampled.projection)[:, sample].reshape(-1, *(1,) * len(lanes)) * u
+        first, last = sample * parts, (sample + 1) * parts
+        u, v = jax.lax.fori_loop(0, jnp.max(parts), lambda i, state: advance(first + i, last, state), (u, v))
+        return u, v, total
+
+    whole = periods * turn
+    u, v = jax.lax.fori_loop(0, jnp.max(whole), lambda i, state: advance(i, whole, state), (u, v))
+    return jax.lax.fori_loop(0, sampled.count, project, (u, v, jnp.zeros_like(x)))[2]
+
+
+def _runge_kutta(
+    model: PiecewiseLinearOscillator, omega: Array, t: Array, h: Array, state: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """One step of the classical Runge-Kutta scheme."""
+
+    def rate(t: Array, u: Array, v: Array) -> tuple[Array, Array]:
+        drive = model.B0 + model.B1 * jnp.cos(omega * t)
+        return v, drive - model.damping * v - model.stiffness * model.restoring(u)
+
+    u, v = state
+    total_u, total_v, du, dv = 0.0, 0.0, 0.0, 0.0
+    for lead, weight in ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6)):
+        du, dv = rate(t + lead * h, u + lead * h * du, v + lead * h * dv)
+        total_u, total_v = total_u + weight * du, total_v + weight * dv
+    return u + h * total_u, v + h * total_v
+
+
+def _checked(model: PiecewiseLinearOscillator, basis: Basis, found: Balanced, omega: Array) -> tuple[Swept, Array]:
+    """A balanced motion with its half trace, and a flag if it is an attractor within the basis."""
+    half = half_trace(model, basis, omega, contact(model, basis, found.x))
+    growth = spectral_radius(model, basis, omega, half)
+    # Without subharmonics a doubled period cannot be followed.
+    followed = (half > 1) | (basis.order > 1)
+    attracts = found.converged & ~found.saddle & ~((growth > 1 + _MARGIN) & followed)
+    return Swept(found.x, half, found.converged, found.saddle), attracts
+
+
+def _kept(condition: Array, first: Swept, second: Swept) -> Swept:
+    return Swept(*(jnp.where(condition, a, b) for a, b in zip(first, second, strict=True)))
+
+
+def step(model: PiecewiseLinearOscillator, basis: Basis, before: Swept, omega: Array) -> tuple[Swept, Swept]:
+    """The motion at ``omega``, from the one at a frequency near by: for the next step, and as a result."""
+    size = jnp.sqrt(jnp.sum(before.x[1:] ** 2, axis=0))
+
+    def waited(count: Array, lost: Array, seed: Array, now: Swept) -> Array:
+        # The motion settles once; past a fold that only the balance has, it would come back to it every time.
+        start = jax.lax.cond(count == 1, lambda seed: settle(model, basis, seed, omega, lost), lambda seed: seed, seed)
+        found = drift(model, basis, jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, seed), omega)
+        return jnp.where(lost, jnp.where(jnp.all(jnp.isfinite(found), axis=0), found, seed), now.x)
+
+    def attempt(state: tuple[Array, Array, Array, Swept]) -> tuple[Array, Array, Array, Swept]:
+        count, lost, seed, now = state
+        again = count > 0
+        seed = jax.lax.cond(again, waited, lambda count, lost, seed, now: seed, count, lost, seed, now)
+        there, attracts = _checked(model, basis, balance(model, basis, seed, omega), omega)
+        change = jnp.sqrt(jnp.sum((there.x - before.x)[1:] ** 2, axis=0))
+        jumped = ~again & before.balanced & (change > _JUMP * size)
+        # The settled motion replaces the lost one unless it is no better.
+        taken = jnp.where(again, lost & (attracts | ~now.balanced), True)
+        return count + 1, lost & (~attracts | jumped), seed, _kept(taken, there, now)
+
+    def unfinished(state: tuple[Array, Array, Array, Swept]) -> Array:
+        return (state[0] < _WAITS) & jnp.any(state[1])
+
+    start = (jnp.int32(0), jnp.ones_like(before.balanced), before.x, before)
+    after = jax.lax.while_loop(unfinished, attempt, start)[3]
+    # A motion that could not be balanced is no start for the next one.
+    carried = after._replace(x=jnp.where(after.balanced, after.x, before.x))
+    return carried, after
+
+
+def sweep(model: PiecewiseLinearOscillator, basis: Basis, omegas: Array) -> Swept:
+    """Motions along ``omegas`` (L, N), a path for each lane, starting from rest; fields ``(L, ...)``."""
+    lanes = omegas.shape[1:]
+    first = settle(model, basis, jnp.zeros((basis.size, *lanes)), omegas[0])
+    first = jnp.where(jnp.isfinite(first), first, 0.0)
+    start = Swept(first, jnp.zeros(lanes), jnp.zeros(lanes, bool), jnp.zeros(lanes, bool))
+    return jax.lax.scan(lambda before, omega: step(model, basis, before, omega), start, omegas)[1]

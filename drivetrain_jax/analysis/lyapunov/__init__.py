@@ -1,0 +1,1 @@
+"""Lyapunov spectra: growth of perturbations, standard errors, measures of sections, verdicts."""

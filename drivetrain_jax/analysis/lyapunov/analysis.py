@@ -1,0 +1,281 @@
+"""Lyapunov spectra by the variational equations, with error estimates and a verdict.
+
+Exponents are natural logarithms per second, in falling order. Phases of the flow are left out (their exponents are always
+zero). The paper's estimator is available under its own name.
+
+The number of steps is predicted for every point (see :mod:`~drivetrain_jax.analysis.lyapunov.march_steps`) unless
+``steps`` is given; a batch uses the largest number of its members.
+
+Outcome: ``SUCCESS``, or ``TOLERANCE_NOT_MET`` if the standard error exceeds the target at ``max_time`` or the steps are too
+few: the exponents do not sum to the mean divergence, or a positive one changes with half the steps. The verdict is then
+``undecided``. For a motion that leaves all bounds the verdict says so, and its exponents are those of the time before,
+without an error (NaN). ``NOT_FINITE`` if it leaves too soon for exponents, ``STEP_LIMIT`` if ``max_time`` is more than 1e12
+steps, or a strobe is predicted to need more than 1e5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax.analysis._base import MOST_SECONDS, MOST_STEPS, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.lyapunov.forcing import may_be_chaotic
+from drivetrain_jax.analysis.lyapunov.growth_record import (
+    BLOCKS,
+    SEGMENTS,
+    SETTLED,
+    Record,
+    block_mean,
+    block_size,
+    record_growth,
+    running_mean,
+)
+from drivetrain_jax.analysis.lyapunov.march_steps import LEAST, MOST, contraction, needed_steps
+from drivetrain_jax.analysis.lyapunov.paper_estimator import paper_estimator
+from drivetrain_jax.analysis.lyapunov.resolution import STANDARD_ERRORS, resolved
+from drivetrain_jax.analysis.lyapunov.sampling import SAMPLES, Sampling, sample
+from drivetrain_jax.analysis.lyapunov.variational import batch_shape
+from drivetrain_jax.analysis.lyapunov.verdict import Evidence, Verdict, grows, judge
+from drivetrain_jax.analysis.numerics.predictions import predicted
+from drivetrain_jax.systems import Flow, System
+
+VARIABLES = (
+    Variable("lyapunov_spectrum", "1/s", "Lyapunov exponent", ("exponent",)),
+    Variable("lyapunov_standard_error", "1/s", "standard error of the exponent, from block means", ("exponent",)),
+    Variable("lyapunov_history", "1/s", "exponent averaged up to this time", ("segment", "exponent")),
+    Variable("step_change", "1/s", "change of the exponent when the step is halved", ("exponent",)),
+    Variable("sum_rule_residual", "1/s", "sum of the exponents minus the mean divergence"),
+    Variable("averaging_time", "s", "time over which the exponents are averaged, transient excluded"),
+    Variable("paper_estimator", "1/s", "the paper's (31)-(36) as printed, not a Lyapunov exponent", ("component",)),
+    Variable("chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic; 0 if the section repeats"),
+    Variable("period_multiple", "1", "strobes after which the motion repeats (0: not found)", dtype="int32"),
+    Variable(
+        "verdict",
+        "1",
+        "kind of motion by its strobes (fixed_point repeats at every one)",
+        dtype="int8",
+        flags=tuple(v.name.lower() for v in Verdict),
+    ),
+)
+OPTIONS = (
+    Parameter("standard_error", "1/s", "standard error at which a run may end", default=0.0, lower=0.0),
+    Parameter("max_time", "s", "longest time of a run", default=1.0, lower=0.0, upper=MOST_SECONDS, open_lower=True),
+    Parameter(
+        "steps",
+        "1",
+        "integration steps per strobe",
+        derived=f"as many as the field needs, at least {LEAST}",
+        lower=4,
+        upper=1e6,
+        integer=True,
+    ),
+)
+_SECTION = {"verdict", "chaos_k01", "period_multiple"}
+# Number of members whose data of one step fit into the innermost caches.
+_CHUNK = 64
+
+
+class Spectrum(NamedTuple):
+    """Exponents in falling order and their errors, ``(m, ...)``; ``order``: place of each in the record."""
+
+    values: Array
+    errors: Array
+    order: Array
+
+
+def spectrum_of(record: Record) -> Spectrum:
+    """Exponents after the transient. For an unbounded motion: means over the recorded time, errors NaN."""
+    values, errors = mean_rate(record, record.growth)
+    order = jnp.argsort(-values, axis=0)
+    return Spectrum(*(jnp.take_along_axis(x, order, axis=0) for x in (values, errors)), order)  # pyright: ignore[reportCallIssue]
+
+
+def mean_rate(record: Record, series: Array) -> tuple[Array, Array]:
+    """Mean rate of ``series`` (SEGMENTS, m, ...) after the transient, and its error (NaN for an unbounded motion)."""
+    values, errors = block_mean(series, record.used, record.span)
+    partial_mean = running_mean(series, record.used, record.span)
+    last = jnp.arange(SEGMENTS).reshape(-1, *(1,) * values.ndim) == record.used - 1
+    until = jnp.sum(jnp.where(last, partial_mean, 0.0), axis=0)
+    until = jnp.where(record.used > 0, until, jnp.nan)
+    return jnp.where(record.bounded, values, until), jnp.where(record.bounded, errors, jnp.nan)
+
+
+def sum_rule_residual(record: Record, spectrum: Spectrum) -> Array:
+    """Sum of the exponents minus the divergence averaged over the same time; the phases add nothing to either."""
+    mean, _ = mean_rate(record, record.contraction[:, None])
+    return jnp.sum(spectrum.values, axis=0) - mean[0]
+
+
+class Run(NamedTuple):
+    """Records with the step and with twice the step (empty if not needed)."""
+
+    fine: Record
+    coarse: Record
+
+
+def run_twice(flow: Flow, steps: Any, max_time: float, target: float, check: bool) -> Run:
+    """The growth with ``steps`` and ``steps // 2`` per strobe. With ``check`` the latter for all members, otherwise only
+    for those with a positive largest exponent beyond its error. One compiled loop serves both."""
+
+    def one(active: Array, steps: Array) -> tuple[Array, Record]:
+        record = record_growth(flow, steps, max_time, target, active)
+        found = spectrum_of(record)
+        candidate = record.bounded & (found.values[0] > STANDARD_ERRORS * found.errors[0])
+        return candidate | check, record
+
+    start = jnp.ones(batch_shape(flow), bool)
+    _, both = jax.lax.scan(one, start, jnp.stack([jnp.asarray(steps), jnp.maximum(steps // 2, 1)]))
+    return Run(*(jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1)))
+
+
+class Findings(NamedTuple):
+    """Results of a run: the spectrum, the spectrum with twice the step if it was run, the residual of the sum rule, and
+    a flag if the steps resolve the motion."""
+
+    spectrum: Spectrum
+    coarse: Spectrum
+    residual: Array
+    resolved: Array
+
+
+def findings_of(run: Run, period: Any) -> Findings:
+    """The results of both marches, compared with each other."""
+    spectrum, coarse = spectrum_of(run.fine), spectrum_of(run.coarse)
+    residual = sum_rule_residual(run.fine, spectrum)
+    sound = resolved(spectrum.values, spectrum.errors, residual, period, coarse.values[0], coarse.errors[0])
+    return Findings(spectrum, coarse, residual, sound)
+
+
+def evidence_of(flow: Flow, fine: Record, found: Findings, seen: Sampling) -> Evidence:
+    """The input of :func:`judge`."""
+    spectrum, coarse = found.spectrum, found.coarse
+    growing = grows(fine.size, fine.used, fine.span, spectrum.values[0])
+    return Evidence(
+        spectrum.values, spectrum.errors, coarse.values[0], coarse.errors[0], jnp.abs(found.residual), seen.k01,
+        fine.bounded, growing, seen.multiple, seen.settled, found.resolved, may_be_chaotic(flow, fine.state),
+    )  # fmt: skip
+
+
+def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+    """All requested results of a batch, its axis last; ``effort`` only orders the batches."""
+    del effort
+    return analyse(system.models["lyapunov"].build(values), request)
+
+
+def steps_of(flow: Flow, request: Request) -> Any:
+    """Steps per strobe: the given number, or the largest need of all members."""
+    given = request.options["steps"]
+    return jnp.max(needed_steps(flow)).astype(jnp.int64) if given is None else given
+
+
+def analyse(flow: Flow, request: Request) -> dict[str, Array]:
+    """The requested results of ``flow`` and ``outcome``, the batch as last axis."""
+    wanted, options = set(request.outputs), request.options
+    steps, max_time, target = steps_of(flow, request), options["max_time"], options["standard_error"]
+    results: dict[str, Array] = {}
+    if "paper_estimator" in wanted:
+        results["paper_estimator"] = paper_estimator(flow, steps, max_time)
+    if wanted == {"paper_estimator"}:
+        finite = jnp.all(jnp.isfinite(results["paper_estimator"]), axis=0)
+        return results | {"outcome": jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE).astype(jnp.int8)}
+    run = run_twice(flow, steps, max_time, target, "step_change" in wanted)
+    found = findings_of(run, flow.period)
+    spectrum = found.spectrum
+    results |= _of_spectrum(run.fine, found)
+    if wanted & _SECTION:
+        # Unforced motion that does not decay is decided by K.
+        needed = spectrum.values[0] > STANDARD_ERRORS * spectrum.errors[0]
+        needed = jnp.ones_like(needed) if "chaos_k01" in wanted or not flow.turns else needed
+        rate = spectrum.values[0] + STANDARD_ERRORS * spectrum.errors[0]
+        seen = sample(flow, steps, run.fine, rate, needed)
+        results["verdict"] = judge(evidence_of(flow, run.fine, found, seen), autonomous=not flow.turns)
+        # K is meaningless for a few repeating points, and is not used there.
+        repeating = seen.multiple > 0
+        results["chaos_k01"] = jnp.where(repeating, 0.0, seen.k01)
+        results["period_multiple"] = seen.multiple.astype(jnp.int32)
+    results["outcome"] = _outcome(run.fine, found, target)
+    return {name: results[name] for name in (*request.outputs, "outcome")}
+
+
+def _outcome(fine: Record, found: Findings, target: float) -> Array:
+    """The outcome of every member, int8."""
+    values, errors, _ = found.spectrum
+    met = found.resolved & ((target == 0) | ~fine.bounded | (jnp.max(errors, axis=0) <= target))
+    outcome = jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
+    return jnp.where(jnp.all(jnp.isfinite(values), axis=0), outcome, Outcome.NOT_FINITE).astype(jnp.int8)
+
+
+def _of_spectrum(fine: Record, found: Findings) -> dict[str, Array]:
+    """Results that follow from the records of growth."""
+    spectrum = found.spectrum
+    history = running_mean(fine.growth, fine.used, fine.span)
+    return {
+        "lyapunov_spectrum": spectrum.values,
+        "lyapunov_standard_error": spectrum.errors,
+        "lyapunov_history": jnp.take_along_axis(history, spectrum.order[None], axis=1),
+        "step_change": spectrum.values - found.coarse.values,
+        "sum_rule_residual": found.residual,
+        "averaging_time": averaging_time(fine),
+    }
+
+
+def averaging_time(record: Record) -> Array:
+    """Duration of the blocks that are averaged, shape (...)."""
+    return jnp.where(record.bounded, BLOCKS * block_size(record.used) * record.span, jnp.nan)
+
+
+def _effort(system: type[System], request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Predicted steps, shape (N,): those of a whole run, or of the strobes until the mean contraction has settled the
+    motion, and of the strobes after that.
+
+    Infinite above the limit of a whole run.
+    """
+    options, longest = request.options, request.options["max_time"]
+    rate, period, needed = predicted(_march, (system.models["lyapunov"].build,), columns)
+    steps = np.where(needed <= MOST, needed, np.inf) if options["steps"] is None else options["steps"]
+    # Without a rate the field has no value; the march will find that.
+    settling = SETTLED / np.fmax(rate, SETTLED / longest) if options["standard_error"] > 0 else longest
+    strobes = np.maximum(np.clip(settling, longest / 4, longest) / period, SEGMENTS)
+    following = SAMPLES if _SECTION & set(request.outputs) else 0
+    return np.where(steps * longest / period <= MOST_STEPS, np.ceil(steps * (strobes + following)), np.inf)
+
+
+def _march(build: Callable[..., Flow], values: Mapping[str, Any]) -> Array:
+    """Mean rate of contraction of one point at its start, its period, and the number of steps."""
+    flow = build(values)
+    return jnp.stack([contraction(flow) / flow.size, jnp.asarray(flow.period, float), needed_steps(flow)])
+
+
+def _dimensions(*_: Any) -> tuple[Dimension, ...]:
+    return (
+        Dimension("exponent", "number of the exponent, from the largest", ()),
+        Dimension("segment", "part of max_time", tuple(range(1, SEGMENTS + 1))),
+        Dimension("component", "component of the difference: state, then strobe clock", ()),
+    )
+
+
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
+    solve, effort = partial(_solve, system, request), partial(_effort, system, request)
+    return (Solver("tangent", solve, effort, chunk=_CHUNK, march=True, lengthy=True),)
+
+
+ANALYSIS = Analysis(
+    name="lyapunov",
+    title="Lyapunov spectrum",
+    variables=VARIABLES,
+    default_outputs=("lyapunov_spectrum", "lyapunov_standard_error", "sum_rule_residual", "verdict"),
+    methods={"benettin": tuple(option.name for option in OPTIONS)},
+    method_titles={
+        "benettin": "the variational equations, orthonormalised again and again (Benettin)",
+    },
+    options=OPTIONS,
+    solvers=_solvers,
+    dimensions=_dimensions,
+)

@@ -1,0 +1,101 @@
+"""The strobes after a run: the period of the motion, and the 0-1 test."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax.analysis.lyapunov.growth_record import Record, sampled, state_size
+from drivetrain_jax.analysis.lyapunov.section_measures import period_multiple
+from drivetrain_jax.analysis.lyapunov.variational import batch_shape, initial_state
+from drivetrain_jax.analysis.lyapunov.zero_one_test import largest_k01
+from drivetrain_jax.systems import Flow
+
+# Strobes after the run for the verdict and the 0-1 test, and the longest period searched among them.
+SAMPLES, LONGEST = 1024, 512
+# Relative tolerance for repetition; transient below which a motion that does not repeat is called so.
+_REPEATED, _UNSETTLED = 1e-9, 1e-4
+# Factor on the bound of the transient from its exponent: for a near-degenerate pair the exponents are known only to about
+# the inverse of the time, for any standard error.
+_MARGIN = 1e3
+# Largest number of further samples, if the transient could hide or imitate a repetition.
+_MOST_LOOKS = 16
+
+
+class Sampling(NamedTuple):
+    """Results of the strobes after a run: K of the 0-1 test, the period in strobes, and a flag if the period is certain."""
+
+    k01: Array
+    multiple: Array
+    settled: Array
+
+
+class _Look(NamedTuple):
+    """One sample of ``SAMPLES`` strobes: its number, the state after it and its strobe, the first section of all, and
+    the results of every member."""
+
+    number: Array
+    state: tuple
+    strobe: Array
+    first: Array
+    multiple: Array
+    settled: Array
+
+
+def sample(flow: Flow, steps: Any, record: Record, rate: Array, k01_for: Array) -> Sampling:
+    """Follow the motion for ``SAMPLES`` strobes; K of the members of ``k01_for``, otherwise 0.
+
+    ``rate``: the largest exponent within its error, shape (...). Decaying motions are followed until the transient is small
+    enough to determine their period.
+    """
+    watched = [i for i in range(flow.size) if i not in (*flow.phases, *flow.cyclic)] or [0]
+    shape = batch_shape(flow)
+    decays = jnp.zeros(shape, bool)
+    if flow.turns:
+        decays = record.bounded & (rate < 0)
+
+    def look(seen: _Look) -> _Look:
+        states, state = sampled(flow, steps, seen.state, seen.strobe, SAMPLES)
+        section = states[:, jnp.array(watched)]
+        left = transient_left(flow, record, rate, seen.strobe + SAMPLES // 2)
+        multiple, settled = repetition(section, left)
+        # Earlier results stay, so a member does not depend on the time of the others.
+        multiple, settled = (
+            jnp.where(seen.settled, *pair) for pair in ((seen.multiple, multiple), (seen.settled, settled))
+        )
+        first = jnp.where(seen.number == 0, section, seen.first)
+        return _Look(seen.number + 1, state, seen.strobe + SAMPLES, first, multiple, settled)
+
+    def unsettled(seen: _Look) -> Array:
+        return (seen.number == 0) | ((seen.number < _MOST_LOOKS) & jnp.any(decays & ~seen.settled))
+
+    blank = jnp.zeros((SAMPLES, len(watched), *shape))
+    nothing = jnp.zeros(shape, jnp.int64)
+    start = _Look(jnp.int64(0), record.state, record.strobe, blank, nothing, jnp.zeros(shape, bool))
+    seen = jax.lax.while_loop(unsettled, look, start)
+    good = record.bounded & jnp.all(jnp.isfinite(seen.first), axis=(0, 1))
+    k01 = jax.lax.cond(jnp.any(k01_for), largest_k01, lambda x: jnp.zeros(x.shape[2:]), seen.first)
+    k01 = jnp.where(k01_for, k01, 0.0)
+    return Sampling(jnp.where(good, k01, jnp.nan), jnp.where(good, seen.multiple, 0), seen.settled)
+
+
+def transient_left(flow: Flow, record: Record, rate: Array, strobe: Array) -> Array:
+    """Bound on the size of the transient at a strobe: a multiple of the largest state, decayed at ``rate``."""
+    largest = jnp.maximum(jnp.max(record.size, axis=0), state_size(flow, initial_state(flow)))
+    return _MARGIN * largest * jnp.exp(jnp.minimum(rate, 0.0) * strobe * flow.period)
+
+
+def repetition(section: Array, left: Array) -> tuple[Array, Array]:
+    """Strobes after which ``section`` repeats to rounding (0: none), and a flag if a transient cannot explain this.
+
+    ``left``: bound of the transient. A repetition within that bound, but not to rounding, is uncertain: a slow drift along
+    a torus looks the same.
+    """
+    scale = jnp.max(jnp.abs(section), axis=(0, 1))
+    left = left / jnp.where(scale > 0, scale, 1.0)
+    tolerance = jnp.stack([jnp.full_like(left, _REPEATED), jnp.maximum(left, _REPEATED)])
+    strict, loose = period_multiple(section, tolerance, LONGEST)
+    return strict, (strict == loose) & ((strict > 0) | (left < _UNSETTLED))

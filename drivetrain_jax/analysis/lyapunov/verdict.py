@@ -1,0 +1,117 @@
+"""The kind of a motion, by a rule that a diffuse picture or a single number cannot satisfy.
+
+There is no verdict if the steps do not resolve the motion. Chaotic requires all of: the motion is bounded, its field can be
+chaotic, the largest exponent exceeds three standard errors and agrees for two step sizes, the exponents sum to the mean
+divergence, and the 0-1 test gives K > 0.9. Exponents of phases are ignored.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from drivetrain_jax.analysis.lyapunov.growth_record import SEGMENTS
+from drivetrain_jax.analysis.lyapunov.resolution import STANDARD_ERRORS, SUM_RULE, significant, zero_floor
+
+CHAOTIC_K = 0.9
+# Growth in proportion to time, as at a double multiplier, is a factor of four over the averaged three quarters. Exponential
+# growth is distinguished by twice its logarithm.
+_TELLING = 2 * math.log(4)
+
+
+class Verdict(IntEnum):
+    """Kinds of motion. Fixed point, periodic and quasi-periodic refer to the strobes of a forced system (a fixed point
+    of the section has the period of the strobe), and to the motion itself without forcing."""
+
+    FIXED_POINT = 0
+    PERIODIC = 1
+    QUASI_PERIODIC = 2
+    PARAMETRICALLY_UNSTABLE = 3
+    CHAOTIC = 4
+    UNDECIDED = 5
+
+
+class Evidence(NamedTuple):
+    """Input of the verdict; ``m`` exponents without phases, in falling order.
+
+    ``spectrum``, ``error`` (m, ...): exponents and standard errors; ``coarse``, ``coarse_error`` (...): the largest one
+    with twice the step; ``sum_residual``: of the sum rule; ``k01``: of the 0-1 test; ``bounded``; ``growing``: see
+    :func:`grows`; ``multiple``: strobes until the motion repeats, 0 if it does not within the sample; ``settled``: true if
+    the transient is small enough to decide; ``resolved``: see :func:`~.resolution.resolved`; ``roomy``: true if the field
+    can be chaotic.
+    """
+
+    spectrum: Array
+    error: Array
+    coarse: Array
+    coarse_error: Array
+    sum_residual: Array
+    k01: Array
+    bounded: Array
+    growing: Array
+    multiple: Array
+    settled: Array
+    resolved: Array
+    roomy: Array
+
+
+def grows(size: Array, used: Array, span: Array, largest: Array) -> Array:
+    """Flags where the motion grew about as fast as its largest exponent, or stayed at an unstable rest.
+
+    ``size`` (SEGMENTS, ...): largest component in each segment. A bounded attractor also has a positive exponent, but its
+    size does not follow it. Growth that is also possible in proportion to time does not count.
+    """
+    index = jnp.arange(SEGMENTS).reshape(-1, *(1,) * used.ndim)
+    last = jnp.maximum(used - 1, 0)
+    begin, end = (jnp.sum(jnp.where(index == i, size, 0.0), axis=0) for i in (used // 4, last))
+    time = (last - used // 4) * span
+    ratio = jnp.log(jnp.where((begin > 0) & (end > 0), end / jnp.where(begin > 0, begin, 1.0), 1.0))
+    at_rest = jnp.max(size, axis=0) == 0
+    return (at_rest | (ratio > 0.5 * largest * time)) & (largest * time > _TELLING)
+
+
+def judge(evidence: Evidence, autonomous: bool) -> Array:
+    """The verdict, int8 of shape (...)."""
+    regular = _autonomous(evidence) if autonomous else _forced(evidence)
+    regular = jnp.where(evidence.bounded, regular, Verdict.UNDECIDED)
+    positive = significant(evidence.spectrum, evidence.error)
+    verdict = jnp.where(positive, jnp.where(_chaotic(evidence), Verdict.CHAOTIC, Verdict.UNDECIDED), regular)
+    verdict = jnp.where(_unstable(evidence), Verdict.PARAMETRICALLY_UNSTABLE, verdict)
+    sound = evidence.resolved & jnp.all(jnp.isfinite(evidence.spectrum), axis=0)
+    return jnp.where(sound, verdict, Verdict.UNDECIDED).astype(jnp.int8)
+
+
+def _unstable(evidence: Evidence) -> Array:
+    """Flags of unbounded motions that left by their exponent: a torque may drive a stable system beyond the bounds."""
+    left = ~evidence.bounded & (evidence.spectrum[0] > 0)
+    return left | (significant(evidence.spectrum, evidence.error) & evidence.growing)
+
+
+def _chaotic(evidence: Evidence) -> Array:
+    """All conditions of chaos, for motions whose largest exponent is positive."""
+    chaotic = evidence.bounded & evidence.roomy & (evidence.k01 > CHAOTIC_K)
+    chaotic &= evidence.coarse > STANDARD_ERRORS * evidence.coarse_error
+    return chaotic & (evidence.sum_residual <= SUM_RULE * jnp.max(jnp.abs(evidence.spectrum), axis=0))
+
+
+def _forced(evidence: Evidence) -> Array:
+    """Kind of an attracting motion, by the strobes after which it repeats."""
+    decays = evidence.spectrum[0] < -STANDARD_ERRORS * evidence.error[0] - zero_floor(evidence.spectrum)
+    kind = jnp.where(evidence.multiple > 1, Verdict.PERIODIC, Verdict.QUASI_PERIODIC)
+    kind = jnp.where(evidence.multiple == 1, Verdict.FIXED_POINT, kind)
+    return jnp.where(decays & evidence.settled, kind, Verdict.UNDECIDED)
+
+
+def _autonomous(evidence: Evidence) -> Array:
+    """Kind of an unforced motion. One exponent is zero along any motion that is not at rest, and no motion in a plane is
+    a torus; a motion without other exponents there is degenerate, or drifts too slowly to decide."""
+    zeros = jnp.abs(evidence.spectrum) <= STANDARD_ERRORS * evidence.error + zero_floor(evidence.spectrum)
+    count = jnp.sum(zeros, axis=0)
+    torus = jnp.where(evidence.roomy, Verdict.QUASI_PERIODIC, Verdict.UNDECIDED)
+    kind = jnp.where(count == 0, Verdict.FIXED_POINT, jnp.where(count == 1, Verdict.PERIODIC, torus))
+    sound = ~jnp.isnan(evidence.spectrum[0]) & (~zeros[0] | (evidence.k01 < 1 - CHAOTIC_K))
+    return jnp.where(sound, kind, Verdict.UNDECIDED)

@@ -1,0 +1,1 @@
+"""Modes of discrete systems: frequencies, types, tracking, gradients."""

@@ -1,0 +1,330 @@
+"""Natural frequencies and modes of masses joined by springs: values, families, shapes, and modes tracked along an axis.
+
+Frequencies come from singular values (:mod:`singular_values`), vectors from :mod:`singular_vectors`. Both use the factor
+``diag(sqrt k) B M^(-1/2)``: the stiffness matrix, which would square the condition, is never formed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver, stacked
+from drivetrain_jax.analysis.modes.mode_types import (
+    BlockModes,
+    block_modes,
+    is_rigid,
+    mode_type_names,
+    mode_types,
+    one_frequency,
+)
+from drivetrain_jax.analysis.modes.tracking import follow
+from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lane_count, path_entry, with_path
+from drivetrain_jax.analysis.numerics.singular_values import EPS, Bidiagonal, bidiagonal_form, bidiagonal_values
+from drivetrain_jax.systems import Block, SpringSystem, System
+
+Build = Callable[[Mapping[str, Any]], SpringSystem]
+
+VARIABLES = (
+    Variable("natural_frequency", "Hz", "natural frequency", ("mode",)),
+    Variable("natural_frequency_error", "Hz", "estimated bound of the error of natural_frequency", ("mode",)),
+    Variable("mode_type", "1", "type of the mode", ("mode",), "int8"),
+    Variable("participation", "1", "share of the mode in each family", ("mode", "family")),
+    Variable("kinetic_energy", "1", "share of the mode's kinetic energy in each body", ("mode", "body")),
+    Variable("mode_shape", "kg-1/2", "mode shape of unit modal mass", ("mode", "dof")),
+    Variable("branch", "1", "number of the branch of the mode along the track", ("mode",), "int32"),
+    Variable("mac", "1", "assurance criterion of the mode with its branch at the previous point", ("mode",)),
+)
+_SPECTRUM = {"natural_frequency", "natural_frequency_error"}
+_FOLLOWED = {"branch", "mac"}
+# Chunks of the engine, and lanes computed at a time, which fit into the cache of a core.
+_SPECTRUM_CHUNK, _MODES_CHUNK, _LINES_CHUNK = 512, 256, 8
+_CACHE = 1 << 16
+
+
+class Modes(NamedTuple):
+    """Modes of the whole system, rising: angular ``frequency`` (n, N), mass-weighted ``vectors`` (dofs, n, N) or None,
+    ``participation`` (n, families, N), ``label`` of the family (n, N), ``found`` (N,)."""
+
+    frequency: Array
+    vectors: Array | None
+    participation: Array
+    label: Array
+    found: Array
+
+
+def _lanes_at_a_time(blocks: tuple[Block, ...]) -> int:
+    """Lanes whose matrices fill the cache, a multiple of the vector length."""
+    entries = max(block.factor.shape[0] * block.factor.shape[1] for block in blocks)
+    return int(np.clip(_CACHE // entries // 8 * 8, 16, 128))
+
+
+def _blocks(model: SpringSystem, method: str) -> tuple[Block, ...]:
+    return (model.whole,) if method == "full" else model.blocks
+
+
+def _spectrum(build: Build, method: str, values: Mapping[str, Any], lanes: int) -> tuple[Array, Array]:
+    """Angular frequencies (n, N), rising, and flags if all were found."""
+    sample = _blocks(build(_first_lane(values)), method)
+    copies = np.concatenate([np.full(block.factor.shape[1], block.copies) for block in sample])
+
+    def reduce(part: Mapping[str, Any], count: int) -> Bidiagonal:
+        factors = (_in_lanes(block.factor, count) for block in _blocks(build(part), method))
+        return bidiagonal_form(*factors)
+
+    found_values, found = bidiagonal_values(in_blocks(reduce, values, lanes, _lanes_at_a_time(sample)))
+    return jnp.sort(jnp.repeat(found_values, copies, axis=0, total_repeat_length=copies.sum()), axis=0), found
+
+
+def _first_lane(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters with arrays reduced to their first entry: enough to get all shapes."""
+
+    def first(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(first(entry) for entry in value)
+        return value if np.ndim(value) == 0 else jnp.ravel(value)[0]
+
+    return {name: first(value) for name, value in values.items()}
+
+
+def _in_lanes(array: Array, lanes: int) -> Array:
+    """``array`` (r, c) or (r, c, N) as (r, c, N)."""
+    array = array if array.ndim == 3 else array[:, :, None]
+    return jnp.broadcast_to(array, (*array.shape[:2], lanes))
+
+
+def largest_frequency(model: SpringSystem, lanes: int) -> Array:
+    """An upper bound of the angular frequencies, (N,), above the largest by a factor of 5 at most: Frobenius norm."""
+    return jnp.sqrt(jnp.sum(_in_lanes(model.whole.factor, lanes) ** 2, axis=(0, 1)))
+
+
+def system_modes(model: SpringSystem, method: str, lanes: int, shapes: bool = True) -> Modes:
+    """Modes of ``model`` for ``lanes`` lanes; the method ``full`` does not use its decomposition."""
+    largest = largest_frequency(model, lanes)
+    asymmetry = jnp.broadcast_to(model.asymmetry, (lanes,))
+    blocks = [_as_lanes(block, lanes) for block in _blocks(model, method)]
+    parts = [block_modes(block, largest, asymmetry, model.families) for block in blocks]
+
+    def of_all(name: str) -> Array:
+        pairs = zip(blocks, parts, strict=True)
+        return jnp.concatenate([jnp.repeat(getattr(part, name), block.copies, axis=0) for block, part in pairs])
+
+    frequency = of_all("frequency")
+    order = jnp.argsort(frequency, axis=0)
+    vectors = None
+    if shapes:
+        lifted = jnp.concatenate([_lift(b, p, lanes) for b, p in zip(blocks, parts, strict=True)], axis=1)
+        vectors = jnp.take_along_axis(lifted, order[None], axis=1)
+    return Modes(
+        jnp.take_along_axis(frequency, order, axis=0),
+        vectors,
+        jnp.take_along_axis(of_all("participation"), order[:, None], axis=0),
+        jnp.take_along_axis(of_all("label"), order, axis=0),
+        jnp.all(jnp.stack([part.found for part in parts]), axis=0),
+    )
+
+
+def _as_lanes(block: Block, lanes: int) -> Block:
+    frame = None if block.frame is None else _in_lanes(block.frame, lanes)
+    return Block(_in_lanes(block.factor, lanes), block.family, block.polar, block.basis, frame)
+
+
+def _lift(block: Block, part: BlockModes, lanes: int) -> Array:
+    """Vectors of a block in the coordinates of the system, (dofs, n * copies, N)."""
+    basis = block.basis if block.basis.ndim == 4 else block.basis[..., None]
+    lifted = sum(basis[:, c, None] * part.vectors[c, :, None] for c in range(basis.shape[1]))
+    lifted = lifted.reshape(basis.shape[0], -1, lifted.shape[-1])  # pyright: ignore[reportAttributeAccessIssue]
+    return jnp.broadcast_to(lifted, (*lifted.shape[:2], lanes))
+
+
+def _canonical(vectors: Array) -> Array:
+    """The sign by which the largest entry of every column is positive."""
+    largest = jnp.take_along_axis(vectors, jnp.argmax(jnp.abs(vectors) - 1e-9 * _places(vectors), 0)[None], axis=0)
+    return vectors * jnp.where(largest < 0, -1.0, 1.0)
+
+
+def _places(vectors: Array) -> np.ndarray:
+    """Row numbers: of entries equal up to rounding, the first counts as the largest."""
+    return np.arange(vectors.shape[0]).reshape(-1, 1, 1)
+
+
+def _results(build: Build, request: Request, values: Mapping[str, Any], lanes: int) -> dict[str, Array]:
+    """The requested results of every lane, without those along a track; for these, mass-weighted vectors."""
+    wanted = set(request.outputs)
+    followed = bool(request.options["track"])
+    if wanted <= _SPECTRUM:
+        frequency, found = _spectrum(build, request.method, values, lanes)
+        return _frequencies(frequency, found, None)
+    shapes = bool(wanted & {"mode_shape", "kinetic_energy"}) or followed
+
+    def compute(part: Mapping[str, Any], count: int) -> dict[str, Array]:
+        model = build(part)
+        modes = system_modes(model, request.method, count, shapes)
+        largest = largest_frequency(model, count)
+        results = _frequencies(modes.frequency, modes.found, modes.participation)
+        results["mode_type"] = jnp.where(
+            modes.found, mode_types(modes.frequency, modes.label, largest), model.families + 1
+        )
+        if shapes:
+            vectors = jnp.where(modes.found, _canonical(modes.vectors), jnp.nan)  # pyright: ignore[reportArgumentType]
+            mass = model.mass[:, None] if model.mass.ndim == 2 else model.mass[:, None, None]
+            results["mode_shape"] = jnp.swapaxes(vectors / jnp.sqrt(mass), 0, 1)
+            results["kinetic_energy"] = _by_body(vectors, model.bodies)
+            results["vectors"] = vectors
+        if followed:
+            results["equal"] = one_frequency(modes.frequency, largest)
+        kept = {*request.outputs, "outcome"} | ({"vectors", "equal"} if followed else set())
+        return {name: value for name, value in results.items() if name in kept}
+
+    sample = _blocks(build(_first_lane(values)), request.method)
+    return in_blocks(compute, values, lanes, max(_lanes_at_a_time(sample) // 2, 16))
+
+
+def _by_body(vectors: Array, bodies: np.ndarray) -> Array:
+    """Shares of kinetic energy (n, bodies, N) of mass-weighted ``vectors`` (dofs, n, N)."""
+    return jnp.stack([jnp.sum(vectors[bodies == body] ** 2, axis=0) for body in range(bodies.max() + 1)], axis=1)
+
+
+def _frequencies(frequency: Array, found: Array, participation: Array | None) -> dict[str, Array]:
+    """Frequency, its error and outcome; NaN for missing ones."""
+    value = jnp.where(found, frequency / (2 * math.pi), jnp.nan)
+    # Backward error of orthogonal transformations, in practice a tenth of it; the same for every mode of a point.
+    error = 4 * EPS * math.sqrt(frequency.shape[0]) * value[-1]
+    results = {"natural_frequency": value, "natural_frequency_error": jnp.broadcast_to(error, value.shape)}
+    if participation is not None:
+        results["participation"] = jnp.where(found, participation, jnp.nan)
+    finite = jnp.all(jnp.isfinite(frequency), axis=0)
+    missing = jnp.where(finite, Outcome.NOT_CONVERGED, Outcome.NOT_FINITE)
+    return results | {"outcome": jnp.where(found, Outcome.SUCCESS, missing).astype(jnp.int8)}
+
+
+def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+    """All requested results, lanes last; along a track its points first."""
+    del effort
+    track, lanes = request.options["track"], lane_count(values, request.options["track"])
+    wanted = (*request.outputs, "outcome")
+    if not track:
+        results = _results(build, request, values, lanes)
+        return {name: results[name] for name in wanted}
+    along = path_entry(values, track)
+    values, length = with_path(values, track, lanes)
+    results = {
+        name: jnp.moveaxis(value.reshape(*value.shape[:-1], length, lanes), -2, 0)
+        for name, value in _results(build, request, values, length * lanes).items()
+    }
+    if _FOLLOWED & set(request.outputs):
+        order, place = _along(np.asarray(along))
+        followed = follow(results["vectors"][order], results["equal"][order])
+        results["branch"], results["mac"] = (each[place] for each in followed)
+    return {name: results[name] for name in wanted}
+
+
+def _along(values: np.ndarray) -> tuple[Any, Any]:
+    """Positions of the values of a track in rising order, and back to the listed order: neighbours are compared in any
+    listed order."""
+    steps = np.diff(values)
+    if (steps > 0).all() or (steps < 0).all():
+        return slice(None), slice(None)
+    order = np.argsort(values)
+    return order, np.argsort(order)
+
+
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
+    chunk = _SPECTRUM_CHUNK if set(request.outputs) <= _SPECTRUM else _MODES_CHUNK
+    chunk = _LINES_CHUNK if request.options["track"] else chunk
+    solve = partial(_solve, system.models["modes"].build, request)
+    return (Solver("singular values", solve, chunk=chunk, short_loops=True),)
+
+
+def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    """Modes counted from 1, families, bodies and coordinates."""
+    followed = sorted(_FOLLOWED & set(request.outputs))
+    if followed and not request.options["track"]:
+        raise InputError(f"outputs: {followed[0]!r} needs the option track; allowed is the name of an axis")
+    model = system.models["modes"]
+    # Names and sizes do not depend on varying parameters.
+    values = {name: fixed.get(name, 1.0) for name in model.parameters}
+    described: list[SpringSystem] = []
+    jax.eval_shape(lambda: described.append(model.build(values)))
+    return (
+        Dimension("mode", "number of the mode", tuple(range(1, len(described[0].dofs) + 1))),
+        Dimension("family", "family of modes", system.mode_families),
+        Dimension("body", "body", described[0].body_names),
+        Dimension("dof", "coordinate", described[0].dofs),
+    )
+
+
+# Rounding of derivatives within a cluster: relative to these, and to the largest of all modes.
+_ROUNDING, _OF_LARGEST = 1e-8, 1e-13
+
+
+def _derivatives(
+    system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Jacobian of the frequencies, ``df = u^T (dK - (2 pi f)^2 dM) u / (8 pi^2 f)`` with modes u of unit modal mass.
+
+    It is formed spring by spring, without a stiffness matrix. A parameter splits equal frequencies along the eigenvalues of
+    ``u_i^T (dK - (2 pi f)^2 dM) u_j``, and sets a rigid mode in motion as sqrt(k): NaN in both cases.
+    """
+    del request, results
+
+    def model(parameters: Any) -> SpringSystem:
+        return system.models["modes"].build(eqx.combine(parameters, constants.tree))
+
+    here = model(parameters)
+    modes, largest = system_modes(here, "auto", 1), largest_frequency(here, 1)
+    near, still = one_frequency(modes.frequency, largest)[..., 0], is_rigid(modes.frequency, largest)
+    omega = jnp.where(modes.found, modes.frequency, jnp.nan)[:, 0]
+    shapes = modes.vectors[..., 0] / jnp.sqrt(here.mass)[:, None]  # pyright: ignore[reportOptionalSubscript]
+
+    def excess(parameters: Any) -> Array:
+        """Zero but for rounding; its derivatives at fixed shapes are those of ``(2 pi f)^2``."""
+        springs = model(parameters)
+        stretched = springs.extensions @ shapes
+        elastic = stretched.T @ (springs.stiffness[:, None] * stretched)
+        return elastic - omega[:, None] * omega * (shapes.T @ (springs.mass[:, None] * shapes))
+
+    squares = jnp.where(near[..., None], stacked(jax.jacfwd(excess)(parameters)), 0.0)
+    mean = near @ jnp.diagonal(squares).T / jnp.sum(near, axis=1)[:, None]
+    within, largest = jnp.max(jnp.abs(squares), axis=1), jnp.max(jnp.abs(squares), axis=(0, 1))
+    apart = jnp.max(jnp.abs(squares - jnp.eye(len(omega))[..., None] * mean), axis=1)
+    split = apart > _ROUNDING * within + _OF_LARGEST * largest
+    slope = jnp.where(split, jnp.nan, mean) / (4 * math.pi * jnp.where(still, 1.0, modes.frequency))
+    starts = jnp.abs(mean) > _ROUNDING * largest
+    return {"natural_frequency": jnp.where(still, jnp.where(starts, jnp.nan, 0.0), slope)}
+
+
+def _of_system(system: type[System]) -> dict[str, Any]:
+    """The types of modes are those of the system's families."""
+    types = mode_type_names(system.mode_families)
+    return {"variables": tuple(replace(v, flags=types) if v.name == "mode_type" else v for v in VARIABLES)}
+
+
+ANALYSIS = Analysis(
+    name="modes",
+    title="natural frequencies and modes",
+    variables=VARIABLES,
+    default_outputs=("natural_frequency", "mode_type"),
+    methods={"auto": ("track",), "full": ("track",)},
+    method_titles={
+        "auto": "by the invariant blocks of a symmetry, if there is one",
+        "full": "always the whole matrix",
+    },
+    options=(Parameter("track", "1", "axis along which modes are tracked", default="", text=True),),
+    solvers=_solvers,
+    dimensions=_dimensions,
+    derivatives=_derivatives,
+    path_axis=lambda _, request: request.options["track"] or None,
+    of_system=_of_system,
+)

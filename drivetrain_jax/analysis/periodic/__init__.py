@@ -1,1 +1,0 @@
-"""Linear periodic systems: propagators, multipliers with their bound, forced orbits."""

@@ -1,0 +1,1 @@
+"""Poincare sections and their errors."""

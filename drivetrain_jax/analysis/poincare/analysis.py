@@ -1,0 +1,225 @@
+"""Poincare sections: the state at every strobe, 50,000 strobes and more, and measures that distinguish a curve from a
+cloud.
+
+Time is a counted strobe plus a fraction, so that the angles of the clocks do not drift. The method ``fixed`` takes equal
+steps of order 8. The method ``adaptive`` shows the effect of loose tolerances: the pair of Dormand & Prince of orders 5 and
+4 with the usual control of ``rtol`` and ``atol``.
+
+Both methods estimate their errors. Some strobes, including the first ones, are repeated with finer equal steps (twice as
+many as ``fixed``, 96 after ``adaptive``): ``strobe_error`` is the error within one strobe of the section. The whole motion
+is repeated with equal steps (a quarter as many, 48 after ``adaptive``; after ``fixed`` twice as many in doubtful cases):
+``section_error`` is the accumulated error since the start. See :mod:`~drivetrain_jax.analysis.poincare.section_error`.
+
+Outcome: ``TOLERANCE_NOT_MET`` if ``section_error`` exceeds 1e-6 or ten times ``rtol``, or is unknown. This holds for every
+long section of a chaotic motion: errors grow to the size of the motion. ``strobe_error`` then shows if its strobes are
+right. ``NOT_FINITE`` if the state overflowed; earlier strobes are kept. ``STEP_LIMIT``: the adaptive method needed too many
+steps within a strobe, or all strobes are more than 1e12 equal steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax.analysis._base import MOST_STEPS, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.lyapunov.growth_record import discarded, sampled
+from drivetrain_jax.analysis.lyapunov.section_measures import period_multiple, torus_residual
+from drivetrain_jax.analysis.lyapunov.variational import batch_shape, initial_state
+from drivetrain_jax.analysis.lyapunov.zero_one_test import largest_k01
+from drivetrain_jax.analysis.numerics.lanes import over_lanes
+from drivetrain_jax.analysis.poincare.section_error import EARLY, Steps, section_errors, watched
+from drivetrain_jax.systems import Flow, System
+
+VARIABLES = (
+    Variable("section", "1", "state at the strobes", ("strobe", "state")),
+    Variable("torus_residual", "1", "largest distance from a smooth curve, over the largest value", ("state",)),
+    Variable("distinct_points", "1", "distinct points of the section, 0 if it does not repeat", dtype="int32"),
+    Variable("chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic; 0 if the section repeats"),
+    Variable("strobe_error", "1", "estimated error made within one strobe, over the largest value"),
+    Variable("section_error", "1", "estimated error of the section since the start, over the largest value"),
+)
+OPTIONS = (
+    Parameter("strobes", "1", "points of the section", default=5000, lower=128, upper=1e7, integer=True),
+    Parameter("discard", "1", "strobes before the first point", default=5000, lower=0, upper=1e9, integer=True),
+    Parameter("steps", "1", "integration steps per strobe", default=48, lower=4, upper=1e6, integer=True),
+    Parameter("rtol", "1", "relative tolerance of a step", default=1e-3, lower=1e-14, upper=1e-1),
+    Parameter("atol", "1", "absolute tolerance of a step", default=1e-6, lower=0.0, open_lower=True),
+)
+# Relative distance below which points are equal; longest period that is searched.
+_DISTINCT, _LONGEST = 1e-9, 8192
+# Most strobes of the 0-1 test, and fewest for a motion that does not repeat: K of smooth curves of three harmonics is up to
+# 0.99 with 128, 0.93 with 256 and 0.13 with 512.
+_SAMPLES, _FEWEST_SAMPLES = 2000, 512
+_MAX_STEPS = 4096
+# Error above which the outcome reports it, and the steps that check the adaptive method.
+_TOLERATED = 1e-6
+_ADAPTIVE_CHECKS = Steps(96, 48)
+# The fewest steps that show the accumulation of errors.
+_FEWEST = 6
+# Numbers of a chunk's sections, and points of a chunk at most.
+_NUMBERS, _CHUNK = 1 << 23, 64
+
+
+class Section(NamedTuple):
+    """States at the strobes, shape ``(strobes, n, ...)``, those at the first discarded ones, and the outcome."""
+
+    states: Array
+    early: Array
+    outcome: Array
+
+
+def fixed_section(flow: Flow, request: Request) -> Section:
+    """The section by equal steps."""
+    steps, first = request.options["steps"], request.options["discard"]
+    early, _ = sampled(flow, steps, initial_state(flow), jnp.int64(0), min(EARLY, first))
+    state = discarded(flow, steps, jnp.int64(first))
+    states, _ = sampled(flow, steps, state, jnp.int64(first), request.options["strobes"])
+    return Section(states, early, jnp.full(states.shape[2:], Outcome.SUCCESS, jnp.int8))
+
+
+def adaptive_section(flow: Flow, request: Request) -> Section:
+    """The section of one point by the adaptive pair; every strobe is the end of a step."""
+    rtol, atol, first = (request.options[name] for name in ("rtol", "atol", "discard"))
+    controller = diffrax.PIDController(rtol=rtol, atol=atol)
+
+    def advance(carry: tuple, strobe: Array) -> tuple:
+        y, well = carry
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda s, y, _: flow.period * flow.vector(strobe, s, y)),
+            diffrax.Dopri5(), 0.0, 1.0, None, y,
+            stepsize_controller=controller, saveat=diffrax.SaveAt(t1=True), max_steps=_MAX_STEPS, throw=False,
+        )  # fmt: skip
+        y = solution.ys[0]  # pyright: ignore[reportOptionalSubscript]
+        return y, well & (solution.result == diffrax.RESULTS.successful)
+
+    def keep(carry: tuple, strobe: Array) -> tuple:
+        carry = advance(carry, strobe)
+        return carry, carry[0]
+
+    start = (jnp.stack([jnp.asarray(x, float) for x in flow.start]), jnp.bool_(True))
+    carry, early = jax.lax.scan(keep, start, jnp.arange(min(EARLY, first)))
+    carry = jax.lax.fori_loop(len(early), first, lambda k, c: advance(c, k), carry)
+    (_, well), states = jax.lax.scan(keep, carry, first + jnp.arange(request.options["strobes"]))
+    return Section(states, early, jnp.where(well, Outcome.SUCCESS, Outcome.STEP_LIMIT).astype(jnp.int8))
+
+
+def checking_steps(request: Request) -> Steps:
+    """Steps of the march that checks a section."""
+    if request.method == "adaptive":
+        return _ADAPTIVE_CHECKS
+    steps = request.options["steps"]
+    return Steps(2 * steps, min(steps - 1, max(_FEWEST, steps // 4)), 2 * steps)
+
+
+def tolerated(request: Request) -> float:
+    """Largest error that is not a failure."""
+    return min(_TOLERATED, 10 * request.options["rtol"]) if request.method == "adaptive" else _TOLERATED
+
+
+def measures(flow: Flow, states: Array, request: Request) -> dict[str, Array]:
+    """Torus residual, distinct points and K of the section ``states``, if requested."""
+    results: dict[str, Array] = {}
+    kept = watched(flow)
+    if "torus_residual" in request.outputs:
+        strobes = request.options["discard"] + 1 + jnp.arange(len(states))
+        results["torus_residual"] = torus_residual(states, _angle(flow, strobes))
+    if {"distinct_points", "chaos_k01"} & set(request.outputs):
+        distinct = period_multiple(states[:, kept], jnp.float64(_DISTINCT), min(_LONGEST, len(states) // 2))
+        results["distinct_points"] = distinct.astype(jnp.int32)
+    if "chaos_k01" in request.outputs:
+        results["chaos_k01"] = _k01(states[-_SAMPLES:, kept], distinct)
+    return results
+
+
+def _k01(section: Array, distinct: Array) -> Array:
+    """K of the section; its limit if it repeats, because a short record of few points may look like diffusion."""
+    enough = len(section) >= _FEWEST_SAMPLES
+    k01 = largest_k01(section) if enough else jnp.full(section.shape[2:], jnp.nan)
+    return jnp.where(distinct > 0, 0.0, k01)
+
+
+def _angle(flow: Flow, strobes: Array) -> Array | None:
+    """Angle of the first clock that does not define the strobe, shape ``(T, ...)``; None without one."""
+    others = [i for i, turns in enumerate(flow.turns) if not isinstance(turns, int)]
+    if not others:
+        return None
+    column = strobes.reshape(-1, *(1,) * len(batch_shape(flow)))
+    angle = jnp.asarray(flow.angles(column, 0.0)[others[0]])
+    return jnp.broadcast_to(angle, (len(strobes), *batch_shape(flow)))
+
+
+def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+    """All requested results, the batch (if any) as last axis; ``effort`` only orders the batches."""
+    del effort
+    flow: Flow = system.models["poincare"].build(values)
+    section = adaptive_section if request.method == "adaptive" else fixed_section
+    states, early, outcome = section(flow, request)
+    results = measures(flow, states, request)
+    allowed = tolerated(request)
+    strobe, whole = section_errors(flow, states, early, request.options["discard"], checking_steps(request), allowed)
+    results |= {"strobe_error": strobe, "section_error": whole}
+    missed = jnp.where(whole <= allowed, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
+    outcome = jnp.maximum(outcome, missed.astype(jnp.int8))
+    scale = jnp.stack(
+        [jnp.broadcast_to(jnp.asarray(s, float), states.shape[2:]) for s in flow.scale or (1.0,) * flow.size]
+    )
+    finite = jnp.all(jnp.isfinite(states), axis=(0, 1))
+    results["section"] = jnp.where(jnp.isfinite(states), states, jnp.nan) * scale
+    outcome = jnp.where(finite, outcome, jnp.maximum(outcome, Outcome.NOT_FINITE)).astype(jnp.int8)
+    return {name: results[name] for name in request.outputs} | {"outcome": outcome}
+
+
+def _effort(request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Strobes, shape (N,); infinite above the limit."""
+    count = np.broadcast(*jax.tree.leaves({k: v for k, v in columns.items() if not isinstance(v, str)})).size
+    strobes = request.options["strobes"] + request.options["discard"]
+    # The adaptive method has its own limit.
+    return np.full(count, strobes if strobes * request.options.get("steps", 1) <= MOST_STEPS else np.inf)
+
+
+def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
+    solve, effort = partial(_solve, system, request), partial(_effort, request)
+    if request.method == "adaptive":
+        return (Solver("adaptive", over_lanes(solve), effort, chunk=16, march=True, lengthy=True),)
+    chunk = max(1, min(_CHUNK, _NUMBERS // (2 * request.options["strobes"])))
+    return (Solver("fixed", solve, effort, chunk=chunk, march=True, lengthy=True),)
+
+
+def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    first, count = (request.options[name] for name in ("discard", "strobes"))
+    strobes = Dimension("strobe", "number of the strobe", tuple(range(first + 1, first + count + 1)))
+    state = ", then ".join(c.long_name for c in system.state) or "component of the state"
+    return (strobes, Dimension("state", state, ()))
+
+
+def _of_system(system: type[System]) -> dict[str, Any]:
+    """The section in the units of the system's state."""
+    section = replace(VARIABLES[0], units=", ".join(c.units for c in system.state) or "1")
+    return {"variables": (section, *VARIABLES[1:])}
+
+
+_COMMON = ("strobes", "discard")
+ANALYSIS = Analysis(
+    name="poincare",
+    title="Poincare section",
+    variables=VARIABLES,
+    default_outputs=("section",),
+    methods={"fixed": (*_COMMON, "steps"), "adaptive": (*_COMMON, "rtol", "atol")},
+    method_titles={
+        "fixed": "equal steps of order 8",
+        "adaptive": "adaptive steps of order 5, to show what a loose tolerance does",
+    },
+    options=OPTIONS,
+    solvers=_solvers,
+    dimensions=_dimensions,
+    of_system=_of_system,
+)

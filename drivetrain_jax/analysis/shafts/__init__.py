@@ -1,1 +1,0 @@
-"""Stepped shafts: transfer matrices, certified roots, mode shapes."""
