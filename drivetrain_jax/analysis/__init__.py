@@ -7,12 +7,15 @@ Other packages add theirs through the entry point group ``drivetrain_jax.analyse
 from __future__ import annotations
 
 from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._plugins import ANALYSES, load_plugin, plugin_names
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis._base import OUTCOME, RTOL, Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.numerics.lanes import over_lanes
-from drivetrain_jax.systems import System
+
+if TYPE_CHECKING:
+    from drivetrain_jax.analysis._base import OUTCOME, RTOL, Analysis, Outcome, Request, Solver
+    from drivetrain_jax.analysis.numerics.lanes import over_lanes
+    from drivetrain_jax.systems import System
 
 _BUILT_IN = (
     "floquet",
@@ -46,6 +49,13 @@ __all__ = [
 ]
 
 
+def __getattr__(name: str) -> Any:
+    # The figure and the rules of an analysis are within this package, and need no jax.
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{'numerics.lanes' if name == 'over_lanes' else '_base'}"), name)
+
+
 def analysis_names() -> tuple[str, ...]:
     """Names of all analyses: the built-in ones, then those of installed packages."""
     return (*_BUILT_IN, *(name for name in plugin_names(ANALYSES) if name not in _BUILT_IN))
@@ -55,6 +65,8 @@ def get_analysis(name: str) -> Analysis:
     """The analysis ``name``; ``KeyError`` with the known names if there is none, ``ImportError`` if its package fails."""
     if name in _BUILT_IN:
         return import_module(f"drivetrain_jax.analysis.{name}.analysis").ANALYSIS
+    from drivetrain_jax.analysis._base import Analysis
+
     found = load_plugin(ANALYSES, name, "an analysis", lambda x: isinstance(x, Analysis))
     if found is None:
         raise KeyError(f"analysis = {name!r}: allowed is one of {', '.join(analysis_names())}")
