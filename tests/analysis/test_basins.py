@@ -35,10 +35,10 @@ def test_shares_of_the_high_branch(found):
     assert (found.attractor_multiple.values[:, :2] == 1).all()
 
 
-def test_the_seed_decides(found):
-    again, other = run(samples=1000, seed=3), run(samples=1000, seed=4)
-    np.testing.assert_array_equal(again.basin_fraction.values, found.basin_fraction.values)
-    assert (other.basin_fraction.values[:, 0] != found.basin_fraction.values[:, 0]).any()
+def test_the_seed_decides():
+    one, again, other = (run(samples=128, seed=seed).basin_fraction.values for seed in (3, 3, 4))
+    np.testing.assert_array_equal(again, one)
+    assert (other[:, 0] != one[:, 0]).any()
 
 
 # More than a quarter of the motions are chaotic for 4,000 periods, yet all end on motions of three or four periods.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from scipy.integrate import quad, solve_ivp
 
 from drivetrain_jax.analysis.frequency_response import closed_form_response, describing_function, multiple_scales
 from drivetrain_jax.analysis.numerics.amplitude_roots import follow, refined
+from drivetrain_jax.analysis.numerics.kernels import options_for_few
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
 
 TABLE1 = PRESETS["table1"] | {"omega": 1.0}
@@ -41,12 +43,20 @@ def lanes(cases) -> dict[str, np.ndarray]:
     return {name: np.array([table[name] for table in tables]) for name in TABLE1}
 
 
-def solve(method: str, omegas=OMEGAS, cases=CASES, fit_range: float | None = None) -> dict[str, np.ndarray]:
-    def run(values):
-        model = Rattle.models["basins"].build(values | {"omega": omegas})
-        return closed_form_response.response(model, method, fit_range, (len(cases),), OUTPUTS)
+@cache
+def compiled(method: str, omegas: tuple[float, ...], shape: tuple[int, ...], fit_range: float | None, outputs=OUTPUTS):
+    """The response at these frequencies; other parameters are arguments."""
 
-    return {name: np.asarray(value) for name, value in jax.jit(run)(lanes(cases)).items()}
+    def run(values):
+        model = Rattle.models["basins"].build(values | {"omega": np.array(omegas)})
+        return closed_form_response.response(model, method, fit_range, shape, outputs)
+
+    return jax.jit(run, compiler_options=options_for_few())
+
+
+def solve(method: str, omegas=OMEGAS, cases=CASES, fit_range: float | None = None) -> dict[str, np.ndarray]:
+    run = compiled(method, tuple(omegas), (len(cases),), fit_range)
+    return {name: np.asarray(value) for name, value in run(lanes(cases)).items()}
 
 
 @pytest.fixture(scope="module")
@@ -362,8 +372,7 @@ def test_softening_bends_down(describing):
 
 
 def test_a_line_without_lanes_equals_the_batch(describing):
-    model = Rattle.models["basins"].build(TABLE1 | {"omega": OMEGAS})
-    alone = closed_form_response.response(model, "describing_function", None, (), ("u_max", "fold_frequency"))
+    alone = compiled("describing_function", tuple(OMEGAS), (), None, ("u_max", "fold_frequency"))(TABLE1)
     np.testing.assert_allclose(alone["u_max"], describing["u_max"][..., 0], rtol=1e-12)
     assert alone["fold_frequency"].shape == (len(OMEGAS), closed_form_response.FOLDS)
 
