@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import re
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -166,8 +167,10 @@ def write_title(figure: Figure, dataset: xr.Dataset, left: float) -> None:
     """Write the scene's title from ``left`` (inches) on; too long a title is set smaller, then cut."""
     title, room = str(dataset.attrs.get("title", "")), WIDTH - left - 0.1
     size = max(min(_TITLE_SIZE, _TITLE_SIZE * room / max(_title_length(title), 1e-9)), _SMALLEST_TITLE)
-    while _title_length(title) * size / _TITLE_SIZE > room * 1.001:
-        title = title.rstrip(_ELLIPSIS)[:-1] + _ELLIPSIS
+    limit = 1.001 * room * _TITLE_SIZE / size
+    if _title_length(title) > limit:
+        letters = bisect_right(range(1, len(title)), limit, key=lambda n: _title_length(title[:n] + _ELLIPSIS))
+        title = title[:letters] + _ELLIPSIS
     figure.text(
         left / WIDTH, 1 - 0.10 / figure.get_figheight(), title, va="top", size=size, weight="bold", parse_math=False
     )
