@@ -52,8 +52,7 @@ ATTRIBUTES = {
     "machine": "processor, cores, operating system, Python",
     "created": "time at which the file was completed (UTC)",
     "digest": "digest of scene, chunk sizes and numerics; runs of one digest give identical bits",
-    "numerics": "digest of `numerics_detail`",
-    "numerics_detail": "digests of the source files, versions, instruction set (JSON)",
+    "numerics": "digest of `numerics_detail` of the group `provenance`",
     "wall_time_s": "time of the computation in s",
 }
 

@@ -33,7 +33,7 @@ _LINKS = frozenset({"DIMENSION_LIST", "REFERENCE_LIST", "CLASS", "NAME", "_Netcd
 
 def reserve(file: h5py.File) -> None:
     """Reserve space for the checksums of everything in ``file``, so filling them in needs no disk space."""
-    blank = json.dumps(dict.fromkeys([FILE, *_variables(file)], "0" * 32))
+    blank = json.dumps(dict.fromkeys([FILE, *_groups(file), *_variables(file)], "0" * 32))
     file.attrs.create(ATTRIBUTE, np.bytes_(blank))
 
 
@@ -43,7 +43,8 @@ def seal(file: h5py.File) -> None:
 
 
 def checksums(file: h5py.File) -> dict[str, str]:
-    """blake2b (128 bits) of each variable, with type, dimensions and attributes, and of the attributes of ``file``."""
+    """blake2b (128 bits) of each variable, with type, dimensions and attributes, and of the attributes of ``file`` and of
+    its groups."""
     variables = _variables(file)
     if sum(variable.nbytes for variable in variables.values()) < _LARGE:
         digests = [_of_variable(variable) for variable in variables.values()]
@@ -51,7 +52,9 @@ def checksums(file: h5py.File) -> dict[str, str]:
         # Hashing releases the interpreter's lock.
         with ThreadPoolExecutor(min(usable_cores(), len(variables)), thread_name_prefix="hash") as pool:
             digests = list(pool.map(_of_variable, variables.values()))
-    return {FILE: _of_attributes(file, {ATTRIBUTE}).hexdigest()} | dict(zip(variables, digests, strict=True))
+    owners = {FILE: file, **_groups(file)}
+    attributes = {name: _of_attributes(owner, {ATTRIBUTE}).hexdigest() for name, owner in owners.items()}
+    return attributes | dict(zip(variables, digests, strict=True))
 
 
 def damaged(path: Path) -> list[str] | None:
@@ -78,6 +81,10 @@ def named(names: list[str]) -> str:
 def _variables(file: h5py.File) -> dict[str, h5py.Dataset]:
     # A file may also contain the named type of its complex numbers.
     return {name: found for name in sorted(file) if isinstance(found := file[name], h5py.Dataset)}
+
+
+def _groups(file: h5py.File) -> dict[str, h5py.Group]:
+    return {name: found for name in sorted(file) if isinstance(found := file[name], h5py.Group)}
 
 
 def _parsed(stored: Any) -> dict[str, str]:

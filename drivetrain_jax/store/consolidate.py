@@ -15,7 +15,7 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.store import checksums, netcdf
 from drivetrain_jax.store.files import flush, move_into_place
-from drivetrain_jax.store.schema import Labelled
+from drivetrain_jax.store.schema import GROUP, Labelled
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -108,10 +108,13 @@ def release(arrays: Iterable[np.ndarray]) -> None:
 
 
 def read_attribute(path: Path, name: str) -> str | None:
-    """A global attribute of the result at ``path``, None if missing; ``InputError`` if the file is not readable."""
+    """A global attribute of the result at ``path``, or one of its details; None if missing. ``InputError`` if the file is
+    not readable."""
     try:
         with h5py.File(path, "r") as file:
-            value = file.attrs.get(name)
+            # Older files have no group of details.
+            holds = file[GROUP] if name not in file.attrs and GROUP in file else file
+            value = holds.attrs.get(name)
             return value.decode() if isinstance(value, bytes) else value
     except checksums.BROKEN:
         raise _unreadable(path) from None

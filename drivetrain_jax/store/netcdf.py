@@ -12,7 +12,7 @@ from typing import Any, cast
 import h5py
 import numpy as np
 
-from drivetrain_jax.store.schema import Entry, Labelled
+from drivetrain_jax.store.schema import DETAILS, GROUP, Entry, Labelled
 
 _MADE_BY = f"version=2,h5py={h5py.__version__},hdf5={h5py.version.hdf5_version}"
 _NOT_A_VARIABLE = "This is a netCDF dimension but not a netCDF variable."
@@ -25,7 +25,11 @@ def head(result: Labelled) -> bytes:
     aside = _aside(result)
     with h5py.File("head", "w", driver="core", backing_store=False, track_order=True) as file:
         file.attrs["_NCProperties"] = np.bytes_(_MADE_BY)
-        _set(file, {**result.attrs, **_coordinates(sorted(aside))})
+        details = {name: value for name, value in result.attrs.items() if name in DETAILS}
+        shown = {name: value for name, value in result.attrs.items() if name not in DETAILS}
+        _set(file, {**shown, **_coordinates(sorted(aside))})
+        if details:
+            _set(file.create_group(GROUP, track_order=True), details)
         for name, entry in result.coords.items():
             _create(file, name, entry, data=entry.values.astype(_type(entry.values), copy=False))
         scales = {d: _make_scale(file, d, number, size) for number, (d, size) in enumerate(result.sizes.items())}

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 CONVENTIONS = "CF-1.11"
+# Long attributes, which would fill the display of a dataset: a file holds them in a group of this name.
+DETAILS, GROUP = frozenset({"numerics_detail"}), "provenance"
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,10 @@ class Entry:
 
 @dataclass(frozen=True)
 class Labelled:
-    """A result with its labels as plain data. Converting it to a Dataset needs xarray, writing a file does not."""
+    """A result with its labels as plain data. Converting it to a Dataset needs xarray, writing a file does not.
+
+    A Dataset lacks the attributes ``DETAILS``.
+    """
 
     coords: Mapping[str, Entry]
     data: Mapping[str, Entry]
@@ -95,7 +100,7 @@ class Labelled:
         data, coords = (
             {n: (e.dims, e.values, e.attrs) for n, e in entries.items()} for entries in (self.data, self.coords)
         )
-        dataset = xr.Dataset(data, coords, self.attrs)
+        dataset = xr.Dataset(data, coords, {name: value for name, value in self.attrs.items() if name not in DETAILS})
         for name, entry in {**self.coords, **self.data}.items():
             dataset.variables[name].encoding["_FillValue"] = entry.fill
         return dataset

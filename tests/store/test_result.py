@@ -6,6 +6,8 @@ import json
 import os
 from pathlib import Path
 
+import h5py
+import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
@@ -50,6 +52,24 @@ def test_round_trip_by_plain_xarray(result, tmp_path):
         assert "_FillValue" not in again["x"].encoding and again["k"].values.tolist() == ["up", "down"]
     assert read_attribute(path, "digest") == "abc" and read_attribute(path, "nothing") is None
     assert os.listdir(tmp_path) == ["r.nc"]
+
+
+def test_long_details_are_in_a_group(result, tmp_path):
+    """Datasets do not show them; they are read from older files, too, which hold them among the attributes."""
+    path, long = tmp_path / "r.nc", "x" * 5000
+    detailed = result.with_attrs(numerics_detail=long)
+    write_result(detailed, path, tmp_path / "tmp")
+    with xr.open_dataset(path, engine="h5netcdf") as again:
+        assert "numerics_detail" not in again.attrs and len(repr(again)) < 1500
+        xr.testing.assert_identical(again.drop_attrs(deep=False), detailed.to_dataset().drop_attrs(deep=False))
+    assert "numerics_detail" not in detailed.to_dataset().attrs
+    assert read_attribute(path, "numerics_detail") == long and read_attribute(path, "digest") == "abc"
+    with netCDF4.Dataset(path) as file:
+        assert file["provenance"].numerics_detail == long
+    with h5py.File(path, "r+") as file:
+        del file["provenance"]
+        file.attrs["numerics_detail"] = "old"
+    assert read_attribute(path, "numerics_detail") == "old"
 
 
 def test_two_files_of_one_result_are_identical(result, tmp_path):
