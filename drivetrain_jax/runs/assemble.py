@@ -18,7 +18,7 @@ from drivetrain_jax.runs.identity import PACKAGES
 from drivetrain_jax.runs.scene import Scene, result_variables
 from drivetrain_jax.store import provenance
 from drivetrain_jax.store.consolidate import release
-from drivetrain_jax.store.schema import Coordinate, Labelled
+from drivetrain_jax.store.schema import CONVENTIONS, Coordinate, Labelled
 from drivetrain_jax.systems import System
 
 if TYPE_CHECKING:
@@ -215,20 +215,28 @@ def result_attrs(scene: Scene) -> dict[str, str]:
         # JSON has no infinity; the word "inf" is read by every parser of numbers.
         plain = str(value) if value == math.inf else value
         fixed[name] = {"value": plain, "units": parameter.units, "long_name": parameter.long_name}
-    installed = provenance.versions((*PACKAGES, *_STORAGE))
+    installed, created, version = (
+        provenance.versions((*PACKAGES, *_STORAGE)),
+        provenance.now(),
+        drivetrain_jax.__version__,
+    )
+    cited = {"references": scene.system.source} if scene.system.source else {}
     return {
+        "Conventions": CONVENTIONS,
         "title": scene.title,
+        "source": f"drivetrain_jax {version}",
+        "history": f"{created}: {provenance.command()}",
+        **cited,
         "system": scene.system.name,
         "roles": json.dumps(dict(scene.system.roles)),
         **_drawn(scene.system),
         "analysis": scene.analysis.name,
         "method": scene.request.method,
         "options": json.dumps(dict(scene.request.options)),
-        "source": scene.system.source,
         "scene": scene.text,
         "fixed_parameters": json.dumps(fixed),
-        "drivetrain_jax_version": drivetrain_jax.__version__,
+        "drivetrain_jax_version": version,
         "versions": ", ".join(f"{name} {number}" for name, number in installed.items()),
         "machine": machine(),
-        "created": provenance.now(),
+        "created": created,
     }

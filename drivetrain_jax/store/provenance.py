@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
+import sys
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -25,6 +27,15 @@ _version = lru_cache(maxsize=None)(version)
 def now() -> str:
     """Present time, UTC, ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def command() -> str:
+    """The program that runs, with its arguments."""
+    program = Path(sys.argv[0]).name
+    # A string of code and a prompt have no name; a notebook's server is not what the user called.
+    if program in ("", "-", "-c") or program.startswith("ipykernel"):
+        return "notebook" if program.startswith("ipykernel") else "python"
+    return shlex.join([program, *sys.argv[1:]])
 
 
 def source_digest(files: Mapping[str, Path]) -> str:

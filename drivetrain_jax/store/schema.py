@@ -77,7 +77,7 @@ class Labelled:
         data = {
             v.name: Entry((*sweep_dims, *v.dims), values, _variable_attrs(v), _fill(values)) for v, values in results
         }
-        return cls(coords, data, {"Conventions": CONVENTIONS, **attrs})
+        return cls(coords, data, attrs)
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -122,6 +122,9 @@ def _coordinate_attrs(coordinate: Coordinate) -> dict[str, Any]:
 def _variable_attrs(variable: Variable) -> dict[str, Any]:
     """CF attributes; flag values have the type of the variable, as CF requires."""
     attrs = _labels(variable.units, variable.long_name)
+    if ", " in variable.units:
+        # CF knows one unit a variable.
+        attrs = _labels("1", f"{variable.long_name} [{variable.units}]") | {"units_of_components": variable.units}
     if variable.flags:
         attrs["flag_values"] = np.arange(len(variable.flags), dtype=variable.dtype)
         attrs["flag_meanings"] = " ".join(flag.replace(" ", "_") for flag in variable.flags)

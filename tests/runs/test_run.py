@@ -206,6 +206,7 @@ def test_file_opens_with_xarray_h5py_and_netcdf4(grid_scene, tmp_path):
         assert ds.attrs["Conventions"] == "CF-1.11" and ds.attrs["system"] == "toy"
         assert json.loads(ds.attrs["fixed_parameters"])["n"]["value"] == 3
         assert {"title", "digest", "machine", "versions", "wall_time_s", "created", "method", "source"} <= set(ds.attrs)
+        assert ds.attrs["references"] == "nowhere"
     with h5py.File(path) as file:
         assert np.array_equal(file["wave"][()], memory["wave"]) and file["wave"].dtype == complex
     with netCDF4.Dataset(path, auto_complex=True) as file:

@@ -172,6 +172,21 @@ def test_digest_of_sources(tmp_path):
     assert one != provenance.source_digest({"x": tmp_path / "b.py"})
 
 
+@pytest.mark.parametrize(
+    ("argv", "told"),
+    [
+        (["/usr/bin/drivetrain", "run", "a b.toml", "--out", "r.nc"], "drivetrain run 'a b.toml' --out r.nc"),
+        (["study.py"], "study.py"),
+        (["-c", "x"], "python"),
+        ([""], "python"),
+        (["/lib/ipykernel_launcher.py", "-f", "/run/kernel.json"], "notebook"),
+    ],
+)
+def test_the_command_that_runs(monkeypatch, argv, told):
+    monkeypatch.setattr("sys.argv", argv)
+    assert provenance.command() == told
+
+
 def test_provenance_tells_machine_and_versions():
     assert "cores" in machine() and "/" not in machine().split("Python")[1]
     assert provenance.versions(["numpy"]) == {"numpy": np.__version__}

@@ -42,7 +42,8 @@ VARIABLES = (
     Variable("mode_type", "1", "type of the mode", ("mode",), "int8"),
     Variable("participation", "1", "share of the mode in each family", ("mode", "family")),
     Variable("kinetic_energy", "1", "share of the mode's kinetic energy in each body", ("mode", "body")),
-    Variable("mode_shape", "kg-1/2", "mode shape of unit modal mass", ("mode", "dof")),
+    # Without a unit where the modal mass has one: UDUNITS knows no root of a kilogram.
+    Variable("mode_shape", "1", "mode shape of modal mass 1 kg", ("mode", "dof")),
     Variable("branch", "1", "number of the branch of the mode along the track", ("mode",), "int32"),
     Variable("mac", "1", "assurance criterion of the mode with its branch at the previous point", ("mode",)),
 )

@@ -1,0 +1,133 @@
+"""Every scene of the package, made small: its file obeys the CF conventions and survives every way out and back."""
+
+from __future__ import annotations
+
+import shutil
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import drivetrain_jax as dt
+from drivetrain_jax.runs import engine
+from drivetrain_jax.runs.assemble import result_variables
+from drivetrain_jax.runs.grid import Grid
+from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.store.consolidate import read_attribute
+
+SCENES = sorted((Path(__file__).parents[2] / "sweeps").glob("*.toml"))
+# The least that these options allow.
+OPTIONS = {"strobes": 128, "discard": 0, "num": 12, "samples": 5}
+# Lengths that depend on the system: both the tripod's and those of a chart without its multipliers.
+SIZES = {"multiplier": 2, "exponent": 2, "component": 3, "state": 2}
+PROVENANCE = {"created", "history", "wall_time_s", "checksums"}
+
+
+def small(path: Path) -> dict[str, Any]:
+    """The scene with two values an axis, short motions, and a hundredth of the ranges of an atlas."""
+    scene = tomllib.loads(path.read_text())
+    for axis in scene.get("axes", {}).values():
+        if "values" in axis:
+            axis["values"] = axis["values"][:2]
+        elif "num" in axis:
+            axis["num"] = 2
+        else:
+            axis["stop"] = axis["start"] + 0.01 * (axis["stop"] - axis["start"])
+    scene["options"] = {name: OPTIONS.get(name, value) for name, value in scene.get("options", {}).items()}
+    return scene
+
+
+def invented(scene: Scene, grid: Grid, *_: Any) -> Any:
+    """A kernel that solves nothing, and gives numbers of the types and shapes of the results: compiling takes minutes."""
+    sizes = SIZES | {d.name: len(d.values) for d in scene.dimensions if d.values}
+    line = () if grid.path is None else (grid.path_length,)
+
+    def kernel(columns: dict[str, np.ndarray], *_: Any) -> dict[str, np.ndarray]:
+        count = len(next(iter(columns.values()))) if columns else 1
+        rng, found = np.random.default_rng(1), {}
+        for variable in result_variables(scene):
+            shape = (count, *line, *(sizes[dim] for dim in variable.dims))
+            if np.dtype(variable.dtype).kind in "iu":
+                found[variable.name] = rng.integers(0, len(variable.flags) or 100, shape).astype(variable.dtype)
+            else:
+                values = np.where(rng.random(shape) < 0.2, np.nan, rng.normal(size=shape)).astype(variable.dtype)
+                found[variable.name] = values * (1 + 2j) if variable.dtype == "complex128" else values
+        return found
+
+    return kernel
+
+
+@pytest.fixture(scope="module", params=SCENES, ids=lambda path: path.stem)
+def result(request, tmp_path_factory) -> Iterator[Path]:
+    """The file of a scene."""
+    scene, folder = small(request.param), tmp_path_factory.mktemp("scene")
+    with pytest.MonkeyPatch.context() as patch:
+        if scene["analysis"] != "atlas":
+            patch.setattr(engine, "kernel_of", invented)
+        dt.run(scene, out=folder / "r.nc")
+    yield folder / "r.nc"
+    shutil.rmtree(folder)
+
+
+def opened(path: Path, **options: Any) -> xr.Dataset:
+    with xr.open_dataset(path, engine="h5netcdf", **options) as dataset:
+        return dataset.load()
+
+
+@pytest.fixture(scope="module")
+def checker():
+    """The CF checker, which brings its tables along."""
+    from compliance_checker.runner import CheckSuite
+
+    CheckSuite.load_all_available_checkers()
+    suite = CheckSuite()
+
+    def messages(path: Path) -> list[str]:
+        """What the checker requires and the file lacks."""
+        dataset = suite.load_dataset(str(path))
+        try:
+            (groups, failed), *_ = suite.run_all(dataset, ["cf:1.11"]).values()
+        finally:
+            dataset.close()
+        wrong = [f"{group.name}: {text}" for group in groups if group.weight == 3 for text in unmet(group)]
+        return [*wrong, *(f"{name}: {error[0]}" for name, error in failed.items())]
+
+    return messages
+
+
+def unmet(group: Any) -> list[str]:
+    passed, asked = group.value if isinstance(group.value, tuple) else (group.value, True)
+    return [] if passed == asked else list(group.msgs)
+
+
+# What CF lacks, and the contract of the file demands.
+EXCEPTIONS = (
+    # Complex numbers.
+    ("§2.2 Data Types: The variable ", "_PFNC_DOUBLE_COMPLEX_TYPE"),
+    # The checker subtracts labels from each other; numbers are compared below.
+    ("check_coordinate_variables_strict_monotonicity: ", "'str' and 'str'"),
+    # The standard name stands for dates, not for seconds since a start.
+    ("§5.1 Independent", "Coordinate variable 'time' should have standard_name='time'"),
+)
+
+
+def test_cf(result, checker):
+    wrong = [m for m in checker(result) if not any(m.startswith(a) and b in m for a, b in EXCEPTIONS)]
+    assert not wrong
+    dataset = opened(result)
+    for name in dataset.indexes:
+        if dataset[name].dtype.kind != "U" and dataset[name].dtype.kind != "O":
+            steps = np.diff(dataset[name].values)
+            assert (steps > 0).all() or (steps < 0).all(), name
+    for variable in dataset.variables.values():
+        assert variable.attrs["units"] and variable.attrs["long_name"]
+    assert all(str(name).isidentifier() and str(name).isascii() for name in (*dataset.variables, *dataset.dims))
+    assert dataset.attrs["source"] == f"drivetrain_jax {dt.__version__}"
+    assert dataset.attrs["history"].startswith(f"{dataset.attrs['created']}: ")
+    assert dataset.attrs["title"] and dataset.attrs["references"] and dataset.attrs["Conventions"] == "CF-1.11"
+    assert "numerics_detail" not in dataset.attrs and read_attribute(result, "numerics_detail")
+    assert len(repr(dataset)) < 8000
