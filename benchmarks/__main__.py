@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from benchmarks.page import write_page
+from benchmarks.page_text import write_page
 from benchmarks.readme import write_readme
 from benchmarks.timing import RESULTS, parser, results_folder
 from drivetrain_jax._wording import nearest

@@ -27,7 +27,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.timing import RESULTS, at_once, interleaved, median, parser, results_folder, write_csv
+from benchmarks.timing import RESULTS, at_once, interleaved, median, write_csv
 
 REPEATS, SPENT = 9, 0.3
 # Global errors of a tolerance per step are commonly ten to some hundred tolerances.
@@ -208,25 +208,6 @@ def read(path: Path) -> list[Rung]:
         rows = csv.DictReader(line for line in file if not line.startswith("#"))
         kinds = {field.name: {"float": float, "int": int}.get(str(field.type), str) for field in fields(Rung)}
         return [Rung(**{name: kinds[name](text) for name, text in row.items()}) for row in rows]
-
-
-Contenders = Callable[[bool], tuple[Sequence[Contender], Sequence[str]]]
-
-
-def study(name: str, doc: str, contenders: Contenders, argv: Sequence[str] | None) -> None:
-    """The ``main`` of a study: ``contenders(quick)`` gives what competes and the notes for the head of the CSV."""
-    from benchmarks.precision_figure import draw
-
-    options = parser(doc).parse_args(argv)
-    folder = results_folder(options)
-    given, notes = contenders(options.quick)
-    repeats, spent = (3, SPENT / 4) if options.quick else (REPEATS, SPENT)
-    rungs = measure(given, repeats, spent)
-    about = f"medians of up to {repeats} runs in turns, as many as {spent:g} s allow ('timed'), without compilation"
-    write(name, rungs, [about, *notes], folder)
-    draw(name, rungs, folder)
-    for region, method, word, how in judgements(rungs):
-        print(f"{region:18} {method:32} {word:9} {how}")
 
 
 def judgements(rungs: Sequence[Rung]) -> list[tuple[str, str, str, str]]:

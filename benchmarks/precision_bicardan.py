@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.engine_job import columns_scene, engine_job, told
-from benchmarks.precision import Contender, Judged, study
+from benchmarks.precision import Contender, Judged
+from benchmarks.precision_study import study
 from tests.oracles.bicardan_precise_reference import precise_frequencies
 from tests.oracles.bicardan_reference import determinant_roots, finite_elements
 from tests.oracles.bicardan_rivals import dynamic_stiffness_frequencies, hermite_frequencies

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.engine_job import columns_scene, engine_job, told
-from benchmarks.precision import Contender, Judged, study
+from benchmarks.precision import Contender, Judged
+from benchmarks.precision_study import study
 from benchmarks.timing import once, take
 from tests.oracles.cardan_precise_reference import spectral_radius as precise_radius
 from tests.oracles.cardan_reference import BASE_CASE, NAMES, monodromy, spectral_radius, stacked_monodromy

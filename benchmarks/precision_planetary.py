@@ -28,7 +28,8 @@ import numpy as np
 from scipy.linalg import eigh
 
 from benchmarks.engine_job import columns_scene, engine_job, told
-from benchmarks.precision import GOAL, Contender, Judged, study
+from benchmarks.precision import GOAL, Contender, Judged
+from benchmarks.precision_study import study
 from tests.oracles.planetary_reference import (
     TABLE_2,
     exact_frequencies,

@@ -24,7 +24,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.precision import Contender, Judged, study
+from benchmarks.precision import Contender, Judged
+from benchmarks.precision_study import study
 from benchmarks.rattle_diffrax import integrate
 from benchmarks.timing import once
 from drivetrain_jax.analysis.frequency_response.harmonic_balance import Basis

@@ -29,7 +29,8 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from benchmarks.engine_job import columns_scene, engine_job, told
-from benchmarks.precision import Contender, Judged, study
+from benchmarks.precision import Contender, Judged
+from benchmarks.precision_study import study
 from benchmarks.timing import once
 from tests.oracles.tripod_reference import NINE_DEGREES, Shaft, shaft
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks import page, page_precision
+from benchmarks import page_precision, page_text
 from benchmarks.precision import GOAL
 from benchmarks.results_files import ResultFile, Row, between_marks, count, load, markdown, not_measured, seconds, small
 from benchmarks.timing import RESULTS
@@ -28,31 +28,31 @@ def section(folder: Path = RESULTS) -> str:
     """The text between the two marks."""
     files = {name: load(folder, name) for name in NAMES}
     told = [
-        page.critical_sentence(files["critical_speeds"]),
-        page.planetary_sentence(files["planetary_throughput"]),
-        page.chaos_sentence(files["chaos"]),
-        page.rattle_sentence(files["rattle_throughput"]),
+        page_text.critical_sentence(files["critical_speeds"]),
+        page_text.planetary_sentence(files["planetary_throughput"]),
+        page_text.chaos_sentence(files["chaos"]),
+        page_text.rattle_sentence(files["rattle_throughput"]),
         _atlas(files["atlas"]),
         _memory(files["memory"]),
-        page.overhead_sentence(files["overhead"]),
+        page_text.overhead_sentence(files["overhead"]),
         page_precision.losses(page_precision.load_precision(folder)),
         _machines(files),
     ]
     return "\n\n".join([*_chart(files["throughput"]), "\n".join(f"- {sentence}" for sentence in told if sentence)])
 
 
-def _machines(files: page.Files) -> str:
+def _machines(files: page_text.Files) -> str:
     """A sentence that names the machines; empty if all files have the same one."""
-    told = f"{page.machine(files)} [The page](docs/benchmarks.md) names the machine of every file."
-    return told if len(page.machines(files)) > 1 else ""
+    told = f"{page_text.machine(files)} [The page](docs/benchmarks.md) names the machine of every file."
+    return told if len(page_text.machines(files)) > 1 else ""
 
 
 def _chart(file: ResultFile | None) -> list[str]:
     if file is None:
         return [not_measured("throughput")]
-    good = page.at_equal_error(file)
+    good = page_text.at_equal_error(file)
     exact = {name: _most_exact(file, name) for name in LABELS}
-    shown = [row for row in file.rows if page.family(row) == OWN or row is good.get(page.family(row))]
+    shown = [row for row in file.rows if page_text.family(row) == OWN or row is good.get(page_text.family(row))]
     shown += [row for name, row in exact.items() if row and name not in good and row not in shown]
     rows = [
         [_label(row), count(row["cells_per_s"]), small(row["max_error"])]
@@ -61,17 +61,17 @@ def _chart(file: ResultFile | None) -> list[str]:
     head = (
         f"Spectral radius, {file.notes[0]}, without compilation. Each rival is shown at its fastest setting with an error "
         f"of at most {GOAL:g}, or at its most accurate setting if it never gets there. Only `direct` gives an error bound "
-        "for every cell. " + page.machine({"throughput": file})
+        "for every cell. " + page_text.machine({"throughput": file})
     )
     return [head, markdown(["method", "cells/s", "largest error"], rows)]
 
 
 def _label(row: Row) -> str:
-    return f"{LABELS[page.family(row)]}, {row['method'].rpartition(', ')[2]}"
+    return f"{LABELS[page_text.family(row)]}, {row['method'].rpartition(', ')[2]}"
 
 
 def _most_exact(file: ResultFile, name: str) -> Row | None:
-    rows = [row for row in file.rows if page.family(row) == name]
+    rows = [row for row in file.rows if page_text.family(row) == name]
     return min(rows, key=lambda row: float(row["max_error"]), default=None)
 
 

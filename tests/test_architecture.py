@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
 from drivetrain_jax.analysis import analysis_names, get_analysis
 from drivetrain_jax.runs.resolve import resolve
@@ -23,6 +27,49 @@ def python(code: str) -> str:
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
+
+
+def _sources() -> dict[str, Path]:
+    """Every module of the package and of the benchmarks by its dotted name."""
+    files = [path for top in ("drivetrain_jax", "benchmarks") for path in sorted((ROOT / top).rglob("*.py"))]
+    return {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
+
+
+def _runtime(node: ast.AST) -> Iterator[ast.AST]:
+    """Everything within ``node``, also inside functions, without what only type checkers see."""
+    for inner in ast.iter_child_nodes(node):
+        if not (isinstance(inner, ast.If) and "TYPE_CHECKING" in ast.unparse(inner.test)):
+            yield inner
+            yield from _runtime(inner)
+
+
+def _imported_names(name: str, path: Path) -> Iterator[str]:
+    package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
+    for node in _runtime(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else []
+            module = ".".join([*above, *filter(None, [node.module])])
+            yield from (f"{module}.{alias.name}" for alias in node.names)
+
+
+def test_no_files_import_each_other():
+    """Strongly connected components of the graph of all imports have size one."""
+    sources, graph = _sources(), {}
+    for name, path in sources.items():
+        graph[name] = set()
+        for target in _imported_names(name, path):
+            while target and target not in sources:
+                target = target.rpartition(".")[0]
+            graph[name] |= {target} - {"", name}
+    names = list(graph)
+    rows = [(names.index(name), names.index(target)) for name, targets in graph.items() for target in targets]
+    edges = csr_matrix((np.ones(len(rows)), np.array(rows).T), (len(names), len(names)))
+    _, labels = connected_components(edges, connection="strong")
+    assert len(names) > 200 and len(rows) > 800
+    cycles = [[name for name, label in zip(names, labels, strict=True) if label == k] for k in np.unique(labels)]
+    assert [cycle for cycle in cycles if len(cycle) > 1] == []
 
 
 def test_imports_run_only_downwards():

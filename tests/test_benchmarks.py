@@ -14,7 +14,7 @@ import pytest
 
 import drivetrain_jax
 from benchmarks import page_precision
-from benchmarks.page import NAMES, PAGE, conclusions, text_of
+from benchmarks.page_text import NAMES, PAGE, conclusions, text_of
 from benchmarks.precision import Contender, Judged, Rung, judge, measure, read, write
 from benchmarks.results_files import against, not_measured, plain
 from benchmarks.timing import RESULTS, at_once, once, write_csv
