@@ -16,6 +16,7 @@ import numpy as np
 
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax._threads import threads
+from drivetrain_jax.analysis import Solver
 from drivetrain_jax.runs import compile_cache
 from drivetrain_jax.runs.grid import Grid
 from drivetrain_jax.runs.identity import numerics_of, scene_digest
@@ -87,16 +88,24 @@ class Job:
     def __init__(
         self, problem: Problem, route: Route, points: np.ndarray | None = None, *, full_size: bool = False
     ) -> None:
-        # Before the first kernel, which the plan may need.
-        _use_double_precision()
-        compile_cache.enable()
-        self.problem = problem
-        self.route = route
-        self.grid = Grid.of(problem)
-        self.solvers = tuple(map(for_device, problem.analysis.solvers(problem.system, problem.request)))
+        self.problem, self.route = problem, route
         self._points, self._full_size = points, full_size
         self._kernels: dict[tuple[int, int], Future[Kernel]] = {}
         self._lock = threading.Lock()
+
+    @cached_property
+    def grid(self) -> Grid:
+        """The points."""
+        return Grid.of(self.problem)
+
+    @cached_property
+    def solvers(self) -> tuple[Solver, ...]:
+        """The solvers that a plan chooses from."""
+        # Before the first kernel, which the plan may need.
+        _use_double_precision()
+        compile_cache.enable()
+        solvers = self.problem.analysis.solvers(self.problem.system, self.problem.request)
+        return tuple(map(for_device, solvers))
 
     @property
     def scene(self) -> Scene:
@@ -105,7 +114,7 @@ class Job:
         return self.problem
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Job, (self.problem, self.route)
+        return _restored, (self.problem, self.route, self._full_size)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Job) and other.digest == self.digest
@@ -191,6 +200,10 @@ class Job:
             solver = self.solvers[chunk.solver].name
             kind = RetryableError if _is_retryable(error) else ChunkError
             raise kind(f"chunk {chunk.number} ({solver}): {type(error).__name__}: {error}") from error
+
+
+def _restored(problem: Problem, route: Route, full_size: bool) -> Job:
+    return Job(problem, route, full_size=full_size)
 
 
 def _use_double_precision() -> None:

@@ -1,9 +1,8 @@
-"""Code of a worker process: it unpacks a computation once and computes its tasks."""
+"""Code of a worker process: it checks a computation once and computes its tasks."""
 
 from __future__ import annotations
 
 import os
-import pickle
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -18,23 +17,23 @@ class Mismatch(ChunkError):
 
 @dataclass(frozen=True)
 class Parcel:
-    """A pickled computation, and the digest that its driver expects."""
+    """A computation on its way to workers, and the digest that its driver expects."""
 
     digest: str
-    content: bytes = field(compare=False, repr=False)
+    computation: Computation = field(compare=False, repr=False)
 
     @classmethod
     def of(cls, computation: Computation) -> Parcel:
         """The parcel that sends ``computation`` to workers."""
-        return cls(computation.digest, pickle.dumps(computation))
+        return cls(computation.digest, computation)
 
 
 @lru_cache(maxsize=1)
 def _unpacked(parcel: Parcel) -> Computation:
-    computation: Computation = pickle.loads(parcel.content)
-    if computation.digest != parcel.digest:
+    # The first copy with this digest serves all tasks; it holds the compiled kernels.
+    if parcel.computation.digest != parcel.digest:
         raise Mismatch("code, versions or instruction set differ from those of the run")
-    return computation
+    return parcel.computation
 
 
 def prepare(parcel: Parcel) -> int:

@@ -454,7 +454,7 @@ def test_a_short_run_that_ends_well_keeps_nothing_on_the_way(grid_scene, tmp_pat
     monkeypatch.setattr(work, "_SHORTEST", 60.0)
     run_to_file(grid_scene, tmp_path / "r.nc")
     assert not written
-    monkeypatch.setattr("drivetrain_jax.runs.run.ResultFile.finish", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr("drivetrain_jax.runs.routes.ResultFile.finish", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         run_to_file(grid_scene, tmp_path / "s.nc")
     assert sum(part.sizes.sum() for part in written) == dt.run(grid_scene)["outcome"].size
