@@ -1,4 +1,5 @@
-"""Derivatives at random points of every system, against complex steps and mpmath through other programs."""
+"""Derivatives of the analyses: at random points of every system against complex steps and mpmath through other programs;
+of further results against differences; and where there is none."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
+from jax.test_util import check_grads
 from scipy.linalg import eigh
 
 import drivetrain_jax as dt
@@ -15,9 +17,9 @@ from tests.oracles.bicardan_precise_reference import determinant
 from tests.oracles.planetary_reference import matrices
 
 POINTS = 20
-CARDAN = ("beta", "Omega", "zeta", "alpha", "mu", "gamma")
-TRIPOD = ("beta", "zeta", "chi_n", "J_m", "d_A", "L_B", "G", "rho")
-RATTLE = ("omega", "B0", "B1", "b", "c", "alpha", "k", "I")
+CARDAN_NAMES = ("beta", "Omega", "zeta", "alpha", "mu", "gamma")
+TRIPOD_NAMES = ("beta", "zeta", "chi_n", "J_m", "d_A", "L_B", "G", "rho")
+RATTLE_NAMES = ("omega", "B0", "B1", "b", "c", "alpha", "k", "I")
 # The tables of the input element, which the system fills in.
 ELEMENT = {
     **{"L_B": 0.190, "L_A": 0.130, "R": 0.070, "d_A": 0.054, "d_C": 0.098, "S_B": 0.0076, "J_m": 1.4645e-5},
@@ -63,14 +65,14 @@ def floquet_radius(system):
 
 def cardan_radius_slopes(shaft):
     slopes, apart = complex_step.radius_slopes(
-        complex_step.cardan_monodromy(shaft.values, CARDAN), shaft.values, CARDAN
+        complex_step.cardan_monodromy(shaft.values, CARDAN_NAMES), shaft.values, CARDAN_NAMES
     )
     return slopes if apart > 1e-3 else None
 
 
 def tripod_radius_slopes(shaft):
     slopes, apart = complex_step.radius_slopes(
-        complex_step.tripod_monodromy(shaft.values, TRIPOD), shaft.values, TRIPOD
+        complex_step.tripod_monodromy(shaft.values, TRIPOD_NAMES), shaft.values, TRIPOD_NAMES
     )
     return slopes if apart > 1e-3 else None
 
@@ -88,7 +90,7 @@ def orbit(shaft):
 def linear_slopes(shaft):
     state = np.asarray(dt.forced(shaft, outputs="periodic_state").periodic_state)
     field = complex_step.cardan_linear
-    return np.concatenate(complex_step.periodic_slopes(field, state, np.pi, (0, 1), shaft.values, CARDAN))
+    return np.concatenate(complex_step.periodic_slopes(field, state, np.pi, (0, 1), shaft.values, CARDAN_NAMES))
 
 
 def orbit_slopes(shaft):
@@ -96,7 +98,7 @@ def orbit_slopes(shaft):
     if found.outcome > 0 or found.orbit_spectral_radius > 1.5:
         return None
     field, state = complex_step.cardan_nonlinear, np.asarray(found.orbit_state)
-    return np.concatenate(complex_step.periodic_slopes(field, state, np.pi, (0, 1), shaft.values, CARDAN))
+    return np.concatenate(complex_step.periodic_slopes(field, state, np.pi, (0, 1), shaft.values, CARDAN_NAMES))
 
 
 TIMES = (2e-4, 1e-3)
@@ -108,7 +110,7 @@ def motion(shaft):
 
 
 def motion_slopes(shaft):
-    found = complex_step.tripod_history(shaft.values, TRIPOD, TIMES)
+    found = complex_step.tripod_history(shaft.values, TRIPOD_NAMES, TIMES)
     return np.concatenate([found[:, 0], 1e-3 * found[:, 1]])
 
 
@@ -190,19 +192,19 @@ def rattle_slopes(gears):
     if found.outcome > 0 or not 0 < found.period_multiple < 5 or found.spectral_radius > 0.9 or found.impacts.sum() < 1:
         return None
     orbit = complex_step.RattleOrbit(gears.values, np.asarray(found.orbit_state), int(found.period_multiple))
-    slopes = orbit.slopes(RATTLE)
+    slopes = orbit.slopes(RATTLE_NAMES)
     return np.concatenate([np.stack([slopes[key] for key in ("u_max", "u_min", "u_rms")]), slopes["orbit_state"]])
 
 
 CASES = {
-    "cardan floquet": (cardan, floquet_radius, cardan_radius_slopes, CARDAN),
-    "cardan forced": (cardan, linear_response, linear_slopes, CARDAN),
-    "cardan orbit": (cardan, orbit, orbit_slopes, CARDAN),
-    "tripod floquet": (tripod, floquet_radius, tripod_radius_slopes, TRIPOD),
-    "tripod history": (tripod, motion, motion_slopes, TRIPOD),
+    "cardan floquet": (cardan, floquet_radius, cardan_radius_slopes, CARDAN_NAMES),
+    "cardan forced": (cardan, linear_response, linear_slopes, CARDAN_NAMES),
+    "cardan orbit": (cardan, orbit, orbit_slopes, CARDAN_NAMES),
+    "tripod floquet": (tripod, floquet_radius, tripod_radius_slopes, TRIPOD_NAMES),
+    "tripod history": (tripod, motion, motion_slopes, TRIPOD_NAMES),
     "bicardan critical_speeds": (bicardan, speeds, speed_slopes, SPEEDS),
     "planetary modes": (planetary, frequencies, frequency_slopes, MODES),
-    "rattle steady_state": (rattle, gears_at_work, rattle_slopes, RATTLE),
+    "rattle steady_state": (rattle, gears_at_work, rattle_slopes, RATTLE_NAMES),
 }
 
 
@@ -232,3 +234,101 @@ def test_derivatives_at_random_points(case):
         error = np.where(known, np.abs((rows - expected) * size), 0) / np.where(scale > 0, scale, 1)
         assert np.nanmax(error) < 1e-6 and not np.isnan(rows[known]).any(), (system, error, rows, expected)
         checked += 1
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("case", CASES)
+def test_both_modes_at_random_points(case):
+    """By logarithms of the parameters, which differ by ten orders of magnitude."""
+    draw, function, oracle, _ = CASES[case]
+    rng, checked = np.random.default_rng(2), 0
+    scaled = jax.jit(lambda system, x: function(jax.tree.map(lambda p, f: p * jnp.exp(f), system, x)))
+    while checked < POINTS:
+        system = draw(rng)
+        if oracle(system) is None:
+            continue
+        size = jnp.abs(scaled(system, jax.tree.map(jnp.zeros_like, system)))
+        size = jnp.where(size > 1e-6 * jnp.max(size), size, jnp.inf)
+        check_grads(
+            lambda x, system=system, size=size: scaled(system, x) / size,
+            (jax.tree.map(jnp.zeros_like, system),),
+            order=1, modes=("fwd", "rev"), eps=1e-6, atol=1e-3, rtol=1e-4,
+        )  # fmt: skip
+        checked += 1
+
+
+SHAFT = dt.Cardan(beta=0.3, Omega=1.416, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)
+GEARS = dt.Rattle(omega=0.7, **dt.Rattle.presets["table1"])
+TRIPOD = dt.Tripod(element="input", beta=0.157, zeta=0.0016, chi_n=0.3)
+MEASURES = ["u_mean", "phase", "spectral_radius", "lyapunov_exponent", "contact_fraction", "impact_velocity"]
+
+
+def measures(gears):
+    found = dt.steady_state(gears, outputs=MEASURES)
+    return jnp.hstack([found[name] for name in MEASURES])
+
+
+def second_order(shaft):
+    found = dt.forced(shaft, outputs=["condition", "orbit_spectral_radius"])
+    return jnp.stack([found.condition, found.orbit_spectral_radius])
+
+
+# Function, point, parameters, relative step and error. A narrow resonance asks for small steps.
+FURTHER = {
+    "floquet_exponent": (
+        lambda s: dt.floquet(s, outputs="floquet_exponent").floquet_exponent, TRIPOD, ("beta", "zeta"), 1e-3, 1e-7
+    ),
+    "floquet_multiplier": (
+        lambda s: jnp.abs(dt.floquet(s, outputs="floquet_multiplier").floquet_multiplier)[:2],
+        SHAFT, ("beta", "zeta", "mu"), 2e-4, 1e-6,
+    ),
+    "condition and orbit_spectral_radius": (second_order, SHAFT, ("zeta", "gamma"), 1e-3, 1e-6),
+    "measures of rattle": (measures, GEARS, ("omega", "B0", "c", "alpha"), 1e-3, 1e-7),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", FURTHER)
+def test_derivatives_equal_differences(case):
+    """Central differences of order four."""
+    function, system, names, step, rtol = FURTHER[case]
+    jacobian, compiled = jax.jit(jax.jacrev(function))(system), jax.jit(function)
+    for name in names:
+        value = system.values[name]
+        f = [
+            np.asarray(compiled(type(system).of(system.values | {name: value * (1 + k * step)})))
+            for k in (-2, -1, 1, 2)
+        ]
+        slope = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * step * value)
+        found = np.asarray(getattr(jacobian, name))
+        np.testing.assert_allclose(found, slope, rtol=rtol, atol=rtol * np.abs(slope).max(), err_msg=name)
+
+
+def test_both_modes_agree():
+    check_grads(floquet_radius, (SHAFT,), order=1, modes=("fwd", "rev"), eps=1e-5)
+
+
+def test_where_there_is_no_derivative_there_is_none():
+    """All multipliers on the unit circle; a parameter that splits a pair; a result that has no derivative at all."""
+    undamped = dt.Cardan(beta=0.3, Omega=1.2, zeta=0.0, alpha=1.0, mu=1.0, gamma=100.0)
+    slopes = jax.jit(jax.grad(floquet_radius))(undamped)
+    assert all(np.isnan(x) for x in jax.tree.leaves(slopes))
+    gear = dt.Planetary(planet_angle=(0.0, 2 * np.pi / 3, 4 * np.pi / 3))
+    slopes = jax.jit(jax.jacrev(lambda s: dt.modes(s).natural_frequency[1:3]))(gear)
+    assert np.isnan(slopes.planet_angle[1]).all() and np.isfinite(slopes.k_p).all()
+    slopes = jax.grad(lambda s: dt.modes(s, outputs=["participation"]).participation[0, 0])(gear)
+    assert np.isnan(slopes.k_p)
+
+
+def test_an_oscillator_at_its_ends_has_no_derivative_by_them():
+    """Without backlash, and without a spring in the gap."""
+    slopes = jax.jit(jax.jacrev(gears_at_work))
+    found = slopes(dt.Rattle(**GEARS.values | {"b": 0.0}))
+    assert np.isnan(found.b).all() and np.isfinite(found.B1).all()
+    found = slopes(dt.Rattle(**GEARS.values | {"alpha": 0.0}))
+    assert np.isnan(found.alpha).all() and np.isfinite(found.B1).all() and not np.any(found.u0)
+
+
+def test_errors_and_codes_count_as_constants():
+    slopes = jax.grad(lambda s: dt.floquet(s).spectral_radius + dt.floquet(s).spectral_radius_error)(SHAFT)
+    alone = jax.grad(lambda s: dt.floquet(s).spectral_radius)(SHAFT)
+    assert jax.tree.leaves(slopes) == jax.tree.leaves(alone)

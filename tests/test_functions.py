@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import OUTCOME, get_analysis
@@ -108,97 +107,6 @@ def test_results_have_the_declared_shapes_and_types(case):
             dims = " ".join(["3", *(["4"] if path else []), *(str(own[d]) for d in variable.dims)])
             declared = getattr(jaxtyping, variable.dtype.capitalize())[jax.ShapeDtypeStruct, dims]
             assert isinstance(found[variable.name], declared), (variable, found[variable.name])
-
-
-def differences(function, system, names, step):
-    """Central differences of order four."""
-    slopes = {}
-    for name in names:
-        h = step * abs(system.values[name])
-        f = [np.asarray(function(replaced(system, name, system.values[name] + k * h))) for k in (-2, -1, 1, 2)]
-        slopes[name] = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * h)
-    return slopes
-
-
-def test_gradients_of_the_spectral_radius_at_random_points():
-    """Points with a simple largest multiplier, real or one of a pair, against differences of the sharpest solves."""
-    rng = np.random.default_rng(0)
-    radius = lambda s: dt.floquet(s, outputs="spectral_radius").spectral_radius  # noqa: E731
-    sharp = jax.jit(lambda s: dt.floquet(s, outputs="spectral_radius", rtol=1e-13).spectral_radius)
-    gradient, checked = jax.jit(jax.grad(radius)), 0
-    while checked < 20:
-        values = {"beta": rng.uniform(0.2, 1.3), "Omega": rng.uniform(0.4, 2), "zeta": rng.uniform(1e-3, 0.2)}
-        values |= {"alpha": rng.uniform(0.2, 5), "mu": rng.uniform(0.3, 5), "gamma": rng.uniform(1, 100)}
-        shaft = dt.Cardan(**values)
-        size = np.sort(np.abs(dt.floquet(shaft, outputs="floquet_multiplier").floquet_multiplier))
-        if min(1 - size[-3] / size[-1], max(1 - size[-2] / size[-1], 1e-3 * (size[-2] > size[-1] * (1 - 1e-9)))) < 1e-3:
-            continue
-        found = gradient(shaft)
-        for name, slope in differences(sharp, shaft, values, 1e-4).items():
-            assert getattr(found, name) == pytest.approx(slope, rel=1e-6, abs=1e-7 / values[name]), (values, name)
-        checked += 1
-
-
-MEASURES = ["u_mean", "phase", "spectral_radius", "lyapunov_exponent", "contact_fraction", "impact_velocity"]
-DERIVATIVES = {
-    "floquet_exponent": (
-        lambda s: dt.floquet(s, outputs="floquet_exponent").floquet_exponent, TRIPOD, ("beta", "zeta", "chi_n"), 1e-7
-    ),
-    "floquet_multiplier": (
-        lambda s: jnp.abs(dt.floquet(s, outputs="floquet_multiplier").floquet_multiplier)[:2],
-        SHAFT, ("beta", "zeta", "mu"), 1e-6,
-    ),
-    "critical_speed": (
-        lambda s: dt.critical_speeds(s).critical_speed, CASES["bicardan critical_speeds"][1], ("k_A", "k_D"), 1e-7
-    ),
-    "natural_frequency": (
-        lambda s: dt.modes(s).natural_frequency[1:], dt.Planetary(), ("m_s", "k_p", "pressure_angle"), 1e-6
-    ),
-    "amplitude": (
-        lambda s: dt.forced(s, outputs=["amplitude"]).amplitude, replaced(SHAFT, "Omega", 1.0), ("beta", "mu"), 1e-5
-    ),
-    "u_max": (lambda s: dt.steady_state(s, outputs=["u_max"]).u_max, GEARS, ("omega", "B1", "b", "k"), 1e-7),
-    "measures of rattle": (
-        lambda s: jnp.hstack([
-            x for name, x in sorted(dt.steady_state(s, outputs=MEASURES).variables.items()) if name in MEASURES
-        ]),
-        GEARS, ("omega", "B0", "c", "alpha"), 1e-7,
-    ),
-    "phi": (lambda s: dt.history(s, times=(1e-4, 1e-3)).phi, TRIPOD, ("beta", "zeta"), 1e-6),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", DERIVATIVES)
-def test_derivatives_equal_differences(case):
-    function, system, names, rtol = DERIVATIVES[case]
-    # A narrow resonance asks for small steps.
-    step = 2e-4 if system is SHAFT else 1e-3
-    jacobian = jax.jit(jax.jacrev(function))(system)
-    for name, slope in differences(jax.jit(function), system, names, step).items():
-        found = np.asarray(getattr(jacobian, name))
-        np.testing.assert_allclose(found, slope, rtol=rtol, atol=rtol * np.abs(slope).max(), err_msg=name)
-
-
-def test_both_modes_agree():
-    check_grads(lambda s: dt.floquet(s).spectral_radius, (SHAFT,), order=1, modes=("fwd", "rev"), eps=1e-5)
-
-
-def test_where_there_is_no_derivative_there_is_none():
-    """All multipliers on the unit circle; a parameter that splits a pair; a result that has no derivative at all."""
-    undamped = dt.Cardan(beta=0.3, Omega=1.2, zeta=0.0, alpha=1.0, mu=1.0, gamma=100.0)
-    slopes = jax.jit(jax.grad(lambda s: dt.floquet(s).spectral_radius))(undamped)
-    assert all(np.isnan(x) for x in jax.tree.leaves(slopes))
-    gear = dt.Planetary(planet_angle=(0.0, 2 * np.pi / 3, 4 * np.pi / 3))
-    slopes = jax.jit(jax.jacrev(lambda s: dt.modes(s).natural_frequency[1:3]))(gear)
-    assert np.isnan(slopes.planet_angle[1]).all() and np.isfinite(slopes.k_p).all()
-    slopes = jax.grad(lambda s: dt.modes(s, outputs=["participation"]).participation[0, 0])(gear)
-    assert np.isnan(slopes.k_p)
-
-
-def test_errors_and_codes_count_as_constants():
-    slopes = jax.grad(lambda s: dt.floquet(s).spectral_radius + dt.floquet(s).spectral_radius_error)(SHAFT)
-    alone = jax.grad(lambda s: dt.floquet(s).spectral_radius)(SHAFT)
-    assert jax.tree.leaves(slopes) == jax.tree.leaves(alone)
 
 
 def calls_of_diffeqsolve(monkeypatch, scene) -> list[bool]:
