@@ -16,19 +16,20 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-_MODULES = {
-    "floquet": "stability",
-    "forced": "response",
-    "history": "history",
-    "lyapunov": "lyapunov",
-    "poincare": "poincare",
-    "parameters": "parameters",
-    "modes": "modes",
-    "frequency_response": "frequency_response",
-    "steady_state": "steady_state",
-    "basins": "basins",
-    "critical_speeds": "critical_speeds",
-}
+# Analyses with a figure of their own, analysis/NAME/figure.py.
+_DRAWN = (
+    "floquet",
+    "forced",
+    "history",
+    "lyapunov",
+    "poincare",
+    "parameters",
+    "modes",
+    "frequency_response",
+    "steady_state",
+    "basins",
+    "critical_speeds",
+)
 # Analyses of which several results may share a figure.
 _OVERLAYS = ("frequency_response",)
 
@@ -46,7 +47,7 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     if analysis == "atlas":
         drawn = "what its `grid` and `drivetrain plot` make of it"
         raise InputError(f"analysis = 'atlas': is a function; allowed is {drawn}")
-    if analysis not in _MODULES:
+    if analysis not in _DRAWN:
         return _plot_of_plugin(str(analysis), dataset, *others)
     if others and analysis not in _OVERLAYS:
         raise InputError(f"analysis = {analysis!r}: several results in one figure; allowed for {', '.join(_OVERLAYS)}")
@@ -55,7 +56,7 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
             raise InputError(
                 f"analysis = {other.attrs.get('analysis')!r}: allowed beside the first result is {analysis}"
             )
-    return import_module(f"drivetrain_jax.view.{_MODULES[analysis]}").plot(dataset, *others)
+    return import_module(f"drivetrain_jax.analysis.{analysis}.figure").plot(dataset, *others)
 
 
 def _plot_of_plugin(analysis: str, dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
@@ -65,6 +66,6 @@ def _plot_of_plugin(analysis: str, dataset: xr.Dataset, *others: xr.Dataset) -> 
     except ImportError as error:
         raise InputError(f"analysis = {analysis!r}: {' '.join(str(error).split())}") from error
     if found is None:
-        known = ", ".join((*_MODULES, *plugin_names(FIGURES)))
+        known = ", ".join((*_DRAWN, *plugin_names(FIGURES)))
         raise InputError(f"analysis = {analysis!r}: has no figure; allowed is one of {known}")
     return found(dataset, *others)

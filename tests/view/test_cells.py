@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from drivetrain_jax.view import cells, plot
-from drivetrain_jax.view.layout import Panels, write_title
+from drivetrain_jax.view.figure_layout import Panels, write_title
 from drivetrain_jax.view.style import caption
 from tests.view import results
 from tests.view.test_stability import meshes, panels

@@ -12,7 +12,7 @@ from matplotlib.contour import QuadContourSet
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import plot
-from drivetrain_jax.view.layout import wrap_caption
+from drivetrain_jax.view.figure_layout import wrap_caption
 
 MODE = ("mode", [1, 2, 3])
 

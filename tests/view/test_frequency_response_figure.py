@@ -9,7 +9,8 @@ import pytest
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.view import frequency_response, plot
+from drivetrain_jax.analysis.frequency_response import figure as frequency_response
+from drivetrain_jax.view import plot
 
 OMEGA = np.linspace(0.5, 1.5, 41)
 

@@ -10,9 +10,9 @@ import xarray as xr
 from matplotlib.colors import to_hex
 
 from drivetrain_jax import InputError
+from drivetrain_jax.analysis.modes.figure import type_colours
+from drivetrain_jax.analysis.modes.planetary_gear import displacements
 from drivetrain_jax.view import plot
-from drivetrain_jax.view.gear import displacements
-from drivetrain_jax.view.modes import type_colours
 
 TYPES = ("rigid", "rotational", "translational", "planet", "coupled")
 FIXED = {"planet_angle": {"value": [0.0, 2.0, 4.0], "units": "rad", "long_name": "angle"}}

@@ -5,7 +5,8 @@ import pytest
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.view import basins, plot
+from drivetrain_jax.analysis.basins import figure as basins
+from drivetrain_jax.view import plot
 
 FIXED = json.dumps({"b": {"value": 0.17, "units": "m", "long_name": "half the backlash"}})
 ROLES = json.dumps({"speed": "omega", "initial_displacement": "u0", "initial_rate": "v0", "half_play": "b"})

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
-from drivetrain_jax.view.layout import Margins, Panels
+from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, coordinate_text, state
 
 _FIRST = 1000

@@ -13,8 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.view import cells, rattle_maps
-from drivetrain_jax.view.layout import Margins, Panels
+from drivetrain_jax.analysis.frequency_response import maps as rattle_maps
+from drivetrain_jax.view import cells
+from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STYLE, axis_label
 
 DASHES = (0, (3, 1.6))

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
-from drivetrain_jax.view.layout import Margins, Panels
+from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import ATTRACTOR_COLOURS, STYLE, axis_label, variable_label
 
 _NEEDED = ("attractor_u_max", "basin_fraction")

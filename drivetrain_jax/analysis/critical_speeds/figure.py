@@ -19,7 +19,7 @@ from matplotlib.patheffects import withStroke
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
-from drivetrain_jax.view.layout import Margins, Panels
+from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STATE_COLOURS, STYLE, axis_label, variable_label
 
 # Value of each frequency unit at a speed of 1 rpm.

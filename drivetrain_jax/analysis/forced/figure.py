@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells, resonances
-from drivetrain_jax.view.layout import Margins, Panels
+from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STATE_COLOURS, STYLE, axis_label, variable_label
 
 _AMPLITUDES = {"amplitude": ("-", "linear"), "orbit_amplitude": ((0, (4, 1.5)), "nonlinear orbit")}

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis.modes.planetary_gear import BODY_COLOURS, draw_gear
 from drivetrain_jax.view import cells
-from drivetrain_jax.view.gear import BODY_COLOURS, draw_gear
-from drivetrain_jax.view.layout import Margins, Panels
+from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import FRAME_GREY, STYLE, axis_label, scene_key, variable_label
 
 # Rigid modes, families in their order, coupled modes.

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import cells
-from drivetrain_jax.view.layout import DPI, WIDTH, Margins, NotebookFigure, Panels, write_title
+from drivetrain_jax.view.figure_layout import DPI, WIDTH, Margins, NotebookFigure, Panels, write_title
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, axis_label, caption, variable_label
 
 _HEIGHT, _MOST_CURVES = 1.8, 8

@@ -19,7 +19,7 @@ from matplotlib.ticker import MaxNLocator
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import cells, regimes
-from drivetrain_jax.view.layout import WIDTH, Margins, Panels
+from drivetrain_jax.view.figure_layout import WIDTH, Margins, Panels
 from drivetrain_jax.view.style import (
     ATTRACTOR_COLOURS,
     FRAME_GREY,

@@ -16,7 +16,7 @@ from matplotlib.patches import Patch
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import cells
-from drivetrain_jax.view.layout import Margins, Panels
+from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import (
     FRAME_GREY,
     LINE_COLOURS,

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from drivetrain_jax.view import cells, regimes
-from drivetrain_jax.view.layout import Margins, Panels
+from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import STATE_COLOURS, axis_label, variable_label
 
 _HEIGHT = 2.3

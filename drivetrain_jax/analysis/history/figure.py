@@ -13,7 +13,7 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
-from drivetrain_jax.view.layout import DPI, WIDTH, NotebookFigure, wrap_caption, write_title
+from drivetrain_jax.view.figure_layout import DPI, WIDTH, NotebookFigure, wrap_caption, write_title
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, caption, coordinate_text, state, symbol
 
 _LINE: dict[str, Any] = {"color": LINE_COLOURS[0], "linewidth": 0.6, "markersize": 3.5}
