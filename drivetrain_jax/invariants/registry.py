@@ -14,7 +14,7 @@ import xarray as xr
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._plugins import RULES, load_plugin
-from drivetrain_jax.invariants.rules import Rule, in_order, multiple, ordered, relation, sums_to_one, within
+from drivetrain_jax._rules import Rule, in_order, multiple, ordered, relation, sums_to_one, within
 
 
 @dataclass(frozen=True)

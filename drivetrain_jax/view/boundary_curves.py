@@ -12,7 +12,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
-from drivetrain_jax.view.resonances import label_text
+from drivetrain_jax.view.resonance_lines import label_text
 from drivetrain_jax.view.style import FRAME_GREY, PREDICTION, STATE_COLOURS
 
 _MARK = {"marker": "o", "markersize": 3.0, "markerfacecolor": "white", "markeredgewidth": 0.7, "linestyle": "none"}

@@ -18,7 +18,8 @@ from matplotlib.ticker import MaxNLocator
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import boundary_curves as boundaries
-from drivetrain_jax.view import cells, resonances
+from drivetrain_jax.view import cells
+from drivetrain_jax.view import resonance_lines as resonances
 from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import (
     FRAME_GREY,

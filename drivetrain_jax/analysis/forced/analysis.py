@@ -36,7 +36,7 @@ from drivetrain_jax.analysis.forced.orbit import (
     size_of,
     transition,
 )
-from drivetrain_jax.analysis.forced.orbit_derivatives import periodic_slopes
+from drivetrain_jax.analysis.forced.response_derivatives import periodic_slopes
 from drivetrain_jax.analysis.numerics.lanes import Constants, over_lanes
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, solve, spectral_norm
 from drivetrain_jax.analysis.numerics.predictions import predicted
