@@ -75,3 +75,17 @@ def multiple(name: str, factor: float, of: str) -> Rule:
 
 def _differ(one: xr.DataArray, other: xr.DataArray) -> xr.DataArray:
     return abs(one - other) > ROUNDING * (abs(one) + abs(other))
+
+
+@dataclass(frozen=True)
+class Declared:
+    """``rules`` of an analysis. ``gaps``: variables that may be NaN after a success; ``kept``: variables that may have a
+    value after a failure.
+
+    ``has_points`` is false for a function of the parameters, which has no outcomes.
+    """
+
+    rules: tuple[Rule, ...] = ()
+    gaps: tuple[str, ...] = ()
+    kept: tuple[str, ...] = ()
+    has_points: bool = True

@@ -98,9 +98,9 @@ def test_folder_does_without_jax(folder):
     assert python(f"import sys, {', '.join(modules(folder))}; print('jax' in sys.modules)") == "False"
 
 
-def test_figures_of_analyses_do_without_jax():
-    names = [name for name in modules("analysis") if name.endswith(".figure")]
-    assert len(names) > 10
+def test_figures_and_rules_do_without_jax():
+    names = [name for name in modules("analysis") if name.endswith((".figure", ".rules"))]
+    assert len(names) > 20
     assert python(f"import sys, {', '.join(names)}; print('jax' in sys.modules)") == "False"
 
 

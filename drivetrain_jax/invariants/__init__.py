@@ -9,8 +9,8 @@ import numpy as np
 import xarray as xr
 
 from drivetrain_jax._quantities import FIRST_FAILURE
-from drivetrain_jax._rules import Rule, within
-from drivetrain_jax.invariants.registry import Declared, declared
+from drivetrain_jax._rules import Declared, Rule, within
+from drivetrain_jax.invariants.registry import declared
 
 __all__ = ["Finding", "check"]
 

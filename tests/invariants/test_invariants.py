@@ -14,6 +14,7 @@ from drivetrain_jax.invariants import check, registry
 from drivetrain_jax.invariants.verify import verify
 from drivetrain_jax.store.chunks import Part, PartsFolder
 from drivetrain_jax.store.consolidate import write_result
+from drivetrain_jax.systems import get_system, system_names
 from tests.labels import labelled
 
 
@@ -151,7 +152,8 @@ def test_what_is_declared_exists():
     for analysis in analysis_names():
         if not registry.declared(analysis).has_points:
             continue
-        names = {variable.name for variable in get_analysis(analysis).variables} | {"outcome"}
+        served = [system for system in map(get_system, system_names()) if analysis in system.models]
+        names = {v.name for system in served for v in get_analysis(analysis).for_system(system).variables} | {"outcome"}
         known = registry.declared(analysis)
         used = {name for rule in known.rules for name in rule.variables} | {*known.gaps, *known.kept}
         assert used <= names, (analysis, used - names)

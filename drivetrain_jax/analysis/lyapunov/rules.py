@@ -1,0 +1,34 @@
+"""Rules for results of the analysis ``lyapunov``."""
+
+from __future__ import annotations
+
+import xarray as xr
+
+from drivetrain_jax._rules import Declared, ordered, relation, within
+
+
+def _sum_rule(ds: xr.Dataset) -> xr.DataArray:
+    """After a success the exponents must sum to the mean divergence."""
+    off = abs(ds["sum_rule_residual"]) > 1e-2 * abs(ds["lyapunov_spectrum"]).sum("exponent")
+    return off & (ds["outcome"] == 0)
+
+
+RULES = Declared(
+    (
+        ordered("lyapunov_spectrum", "exponent", falling=True),
+        relation("the exponents sum to the mean divergence", ("sum_rule_residual", "lyapunov_spectrum"), _sum_rule),
+        within("averaging_time", 0.0),
+        within("chaos_k01", -1.0, 1.0),
+        within("period_multiple", 0.0),
+    ),
+    # An unbounded motion has only exponents; a run that converged early has no history after that.
+    gaps=(
+        "lyapunov_standard_error",
+        "lyapunov_history",
+        "step_change",
+        "sum_rule_residual",
+        "averaging_time",
+        "paper_estimator",
+        "chaos_k01",
+    ),
+)
