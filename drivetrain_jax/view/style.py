@@ -50,6 +50,8 @@ _GREEK = {
     *("rho", "sigma", "tau", "phi", "chi", "psi", "omega", "Gamma", "Delta", "Theta", "Lambda", "Phi", "Psi", "Omega"),
 }
 
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
 # Largest length of a list in a caption.
 _MOST_ENTRIES = 6
 _PRODUCTS = {"EI": "$EI$", "rhoA": r"$\rho A$", "rhoI": r"$\rho I$", "kGA": r"$\kappa GA$"}
@@ -92,23 +94,34 @@ def axis_label(coordinate: xr.DataArray) -> str:
     """``long name (symbol) [units]`` of a swept parameter, without a symbol that repeats the long name."""
     name, long_name = scene_key(coordinate), _long_name(coordinate)
     mark = "" if name.replace("_", " ") == long_name else f" ({symbol(name)})"
-    return f"{long_name}{mark} [{coordinate.attrs.get('units', '1')}]"
+    return f"{long_name}{mark} [{units_of(coordinate)}]"
 
 
 def variable_label(variable: xr.DataArray) -> str:
     """``long name [units]`` of a result."""
-    return f"{_long_name(variable)} [{variable.attrs.get('units', '1')}]"
+    return f"{_long_name(variable)} [{units_of(variable)}]"
+
+
+def units_of(variable: xr.DataArray) -> str:
+    """The unit of a result as figures write it."""
+    return written_units(str(variable.attrs.get("units", "1")))
+
+
+def written_units(units: str) -> str:
+    """A unit of UDUNITS as people write it: ``kg m²`` for ``kg m2``."""
+    return re.sub(r"(?<=[A-Za-z])-?\d+", lambda power: power[0].translate(_SUPERSCRIPTS), units)
 
 
 def value_text(name: str, value: object, units: str = "1") -> str:
     """``symbol = value units``; a list of more than six entries is given by its length."""
+    end = f" {written_units(units)}" if units not in ("1", "") else ""
     if isinstance(value, (list, tuple)):
         if len(value) > _MOST_ENTRIES:
             return f"{symbol(name)}: {len(value)} values"
         entries = ", ".join(f"{entry:.5g}" if isinstance(entry, (int, float)) else str(entry) for entry in value)
-        return f"{symbol(name)} = [{entries}]" + (f" {units}" if units not in ("1", "") else "")
+        return f"{symbol(name)} = [{entries}]{end}"
     number = f"{value:.6g}" if isinstance(value, (int, float)) else str(value)
-    return f"{symbol(name)} = {number}" + (f" {units}" if units not in ("1", "") else "")
+    return f"{symbol(name)} = {number}{end}"
 
 
 def coordinate_text(coordinate: xr.DataArray) -> str:

@@ -10,7 +10,7 @@ import xarray as xr
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import plot
-from drivetrain_jax.view.style import symbol
+from drivetrain_jax.view.style import axis_label, symbol, value_text, written_units
 
 TIMES = np.linspace(0, 0.01, 101)
 
@@ -114,3 +114,24 @@ def test_a_long_caption_stays_in_the_figure():
 )
 def test_greek_letters_with_an_index(name, text):
     assert symbol(name) == text
+
+
+@pytest.mark.parametrize(
+    ("units", "text"),
+    [
+        ("1", "1"),
+        ("m2", "m²"),
+        ("kg m2", "kg m²"),
+        ("kg/m3", "kg/m³"),
+        ("N m/rad", "N m/rad"),
+        ("1/s", "1/s"),
+        ("s-1", "s⁻¹"),
+        ("kN", "kN"),
+        ("rad/s2", "rad/s²"),
+        ("m10", "m¹⁰"),
+    ],
+)
+def test_units_as_people_write_them(units, text):
+    assert written_units(units) == text
+    assert value_text("a", 1.5, units) == ("$a$ = 1.5" if units == "1" else f"$a$ = 1.5 {text}")
+    assert axis_label(xr.DataArray(0.0, name="a", attrs={"units": units, "long_name": "b"})) == f"b ($a$) [{text}]"

@@ -61,7 +61,7 @@ def test_caption_leaves_defaults_out():
     fixed = '{"beta": {"value": 0.1, "units": "rad"}, "rho": {"value": 7850.0, "units": "kg/m3"}}'
     dataset = xr.Dataset(attrs={"fixed_parameters": fixed, "scene": "[fixed]\nbeta = 0.1\n"})
     assert caption(dataset) == r"$\beta$ = 0.1 rad"
-    assert caption(dataset.assign_attrs(scene="[fixed]\nbeta = 0.1\nrho = 7850.0\n")).endswith("7850 kg/m3")
+    assert caption(dataset.assign_attrs(scene="[fixed]\nbeta = 0.1\nrho = 7850.0\n")).endswith("7850 kg/m³")
 
 
 def test_no_constant_at_all_is_an_input_error():

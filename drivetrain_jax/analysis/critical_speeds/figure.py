@@ -20,7 +20,15 @@ from matplotlib.patheffects import withStroke
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.figure_layout import Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STATE_COLOURS, STYLE, axis_label, variable_label
+from drivetrain_jax.view.style import (
+    FRAME_GREY,
+    LINE_COLOURS,
+    STATE_COLOURS,
+    STYLE,
+    axis_label,
+    units_of,
+    variable_label,
+)
 
 # Value of each frequency unit at a speed of 1 rpm.
 _FREQUENCIES = {"critical_speed": 1.0, "natural_frequency": 1 / 60, "angular_frequency": math.pi / 30}
@@ -241,4 +249,4 @@ def _name(dataset: xr.Dataset, index: int) -> str:
     if shown is None:
         return text
     field = dataset[shown]
-    return f"{text}: {field.attrs.get('long_name', shown)} {field.values[index]:.6g} {field.attrs.get('units', '')}"
+    return f"{text}: {field.attrs.get('long_name', shown)} {field.values[index]:.6g} {units_of(field)}"

@@ -16,7 +16,15 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
 from drivetrain_jax.view import resonance_lines as resonances
 from drivetrain_jax.view.figure_layout import Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STATE_COLOURS, STYLE, axis_label, variable_label
+from drivetrain_jax.view.style import (
+    FRAME_GREY,
+    LINE_COLOURS,
+    STATE_COLOURS,
+    STYLE,
+    axis_label,
+    units_of,
+    variable_label,
+)
 
 _AMPLITUDES = {"amplitude": ("-", "linear"), "orbit_amplitude": ((0, (4, 1.5)), "nonlinear orbit")}
 _SCALARS = ("orbit_spectral_radius", "condition")
@@ -63,9 +71,8 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
                 axes.axhline(1, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)), label="limit of stability")
             )
     if amplitudes:
-        units = dataset[amplitudes[0]].attrs.get("units", "1")
         own = next(dim for dim in dataset[amplitudes[0]].dims if dim != name)
-        both = f"amplitude of the {own}s [{units}]"
+        both = f"amplitude of the {own}s [{units_of(dataset[amplitudes[0]])}]"
         panels.label_row(stack[0], both if len(amplitudes) > 1 else variable_label(dataset[amplitudes[0]]))
     cells.fit_axis(stack[0], "x", dataset[name].values)
     lines = resonances.predictions(dataset, name, forced=True)

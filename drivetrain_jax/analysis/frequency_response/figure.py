@@ -16,7 +16,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.frequency_response import maps as rattle_maps
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.figure_layout import Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STYLE, axis_label
+from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STYLE, axis_label, units_of
 
 DASHES = (0, (3, 1.6))
 _HEIGHT = 2.9
@@ -126,7 +126,7 @@ def _lines(results: list[xr.Dataset]) -> Figure:
     handles += _draw_missing(upper, results)
     handles += _draw_backbones(upper, results)
     cells.fit_axis(upper, "x", np.unique(np.concatenate([_along(r).values for r in results])))
-    panels.label_row(upper, f"half the peak-to-peak displacement [{results[0]['u_max'].attrs.get('units', '1')}]")
+    panels.label_row(upper, f"half the peak-to-peak displacement [{units_of(results[0]['u_max'])}]")
     if with_phase:
         _angle_axis(panels.axes[1][0], any(bool((_lag(each) > np.pi + _ANGLE_MARGIN).any()) for each in results))
         panels.label_row(panels.axes[1][0], "lag of the fundamental [rad]")

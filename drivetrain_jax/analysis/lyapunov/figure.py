@@ -24,6 +24,7 @@ from drivetrain_jax.view.style import (
     STYLE,
     axis_label,
     coordinate_text,
+    units_of,
     variable_label,
 )
 
@@ -145,7 +146,7 @@ def _map_row(panels: Panels, row: list[Axes], parts: list[xr.Dataset], key: str,
     low, high = (finite.min(), finite.max()) if finite.size else (-1.0, 1.0)
     for axes, field in zip(row, largest, strict=True):
         mesh = cells.draw_cells(axes, field, *names, cmap="cividis", vmin=low, vmax=high)
-    units = parts[0]["lyapunov_spectrum"].attrs.get("units", "1")
+    units = units_of(parts[0]["lyapunov_spectrum"])
     panels.colorbar(row[-1], mesh, f"largest Lyapunov exponent [{units}]")
 
 

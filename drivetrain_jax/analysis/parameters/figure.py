@@ -13,7 +13,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.figure_layout import DPI, WIDTH, Margins, NotebookFigure, Panels, write_title
-from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, axis_label, caption, variable_label
+from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, axis_label, caption, units_of, variable_label
 
 _HEIGHT, _MOST_CURVES = 1.8, 8
 # Line spacing of the table, line spacing of the caption (inches), and letters per line of the caption.
@@ -78,7 +78,7 @@ def _table(dataset: xr.Dataset, shown: list[str]) -> Figure:
 def _lines(variable: xr.DataArray) -> list[tuple[str, str, str]]:
     """Name, value and unit of a constant, one line for each entry of its own dimension."""
     label = str(variable.attrs.get("long_name", variable.name))
-    units = str(variable.attrs.get("units", "1"))
+    units = units_of(variable)
     units = "" if units == "1" else units
     if not variable.dims:
         return [(label, f"{variable.item():.10g}", units)]

@@ -27,6 +27,7 @@ from drivetrain_jax.view.style import (
     STATE_COLOURS,
     STYLE,
     axis_label,
+    units_of,
     variable_label,
 )
 
@@ -106,8 +107,7 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
                 label="non-periodic",
             )
         )
-    units = dataset[extremes[0]].attrs.get("units", "1")
-    panels.label_row(stack[0], f"extremes of the displacement [{units}]")
+    panels.label_row(stack[0], f"extremes of the displacement [{units_of(dataset[extremes[0]])}]")
     for axes, key in zip(stack[1:], scalars, strict=True):
         _dots(axes, dataset[name], dataset[key].where(known), LINE_COLOURS[0], "")
         panels.label_row(axes, variable_label(dataset[key]))
@@ -151,7 +151,7 @@ def _attractors(dataset: xr.Dataset) -> tuple[xr.DataArray, list[str]]:
     """The attractors by falling share: the number of each point's attractor, and its properties."""
     known = (dataset["outcome"] < FIRST_FAILURE).values
     multiple, high = dataset["period_multiple"].values, dataset["u_max"].values
-    units = dataset["u_max"].attrs.get("units", "")
+    units = units_of(dataset["u_max"])
     # All non-periodic motions count as one attractor.
     level = np.where(multiple > 0, np.log(np.abs(np.where(known, high, 1.0)) + 1e-300) / _SAME, 0.0)
     keys = [(int(m), round(float(x))) for m, x in zip(multiple[known], level[known], strict=True)]
