@@ -112,13 +112,17 @@ class Component:
 class Dimension:
     """A dimension that an analysis adds to its results: coordinate values and meaning.
 
-    Empty ``values`` stand for 0, 1, ... up to the length of the results.
+    Empty ``values`` stand for 1, 2, ... up to the length of the results.
     """
 
     name: str
     long_name: str
     values: tuple[int | float | str, ...]
     units: str = "1"
+
+    def labels(self, length: int) -> tuple[int | float | str, ...]:
+        """The coordinate values of results of this ``length``."""
+        return self.values or tuple(range(1, length + 1))
 
 
 @dataclass(frozen=True)

@@ -193,7 +193,7 @@ def _axis_coordinates(scene: Scene) -> list[Coordinate]:
     ]
     if scene.zipped:
         numbers = np.arange(len(scene.axes[0].values))
-        coordinates.insert(0, Coordinate("point", ("point",), numbers, "1", "number of the point"))
+        coordinates.insert(0, Coordinate("point", ("point",), numbers, "1", "position of the point in the lists"))
     return coordinates
 
 

@@ -29,7 +29,7 @@ def _rearranged(path: Path, scene: Scene, grid: Grid) -> list[str]:
     with cast(Any, h5py.File(path, "r")) as file:
         for own in scene.dimensions:
             if own.name in file:
-                expected[own.name] = np.asarray(own.values or range(file[own.name].size))
+                expected[own.name] = np.asarray(own.labels(file[own.name].size))
         wrong = [name for name, values in expected.items() if not _holds(file.get(name), values)]
         for variable in result_variables(scene):
             wrong += [] if _lies(file.get(variable.name), (*dims, *variable.dims), grid) else [variable.name]

@@ -180,7 +180,7 @@ def _kind(
     def solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
         return (Solver(name, over_lanes(solve), chunk=_CHUNK),)
 
-    dimensions = tuple(Dimension(dim, f"index of {v.name}", ()) for v in variables for dim in v.dims)
+    dimensions = tuple(Dimension(dim, f"number of the entry of {v.name}", ()) for v in variables for dim in v.dims)
     body = {
         "name": "function",
         "title": of.__name__,

@@ -225,5 +225,4 @@ def _labels(job: Job, values: Mapping[str, Any], table: Table) -> dict[str, Sequ
     """The entries of every dimension of ``values``: coordinates, or numbers."""
     shown = [v for v in table.variables if v.name in values]
     sizes = {dim: n for v in shown for dim, n in zip(v.dims, np.shape(values[v.name]), strict=True)}
-    known = {dimension.name: dimension.values for dimension in job.scene.dimensions}
-    return {dim: known.get(dim) or range(size) for dim, size in sizes.items()}
+    return {d.name: d.labels(sizes[d.name]) for d in job.scene.dimensions if d.name in sizes}

@@ -65,15 +65,14 @@ class Labelled:
 
         Every variable has the dimensions ``sweep_dims`` followed by its own. Coordinates are written for the sweep
         (``coordinates``) and for the ``dimensions`` that a result uses; each has ``units`` and ``long_name``. A dimension
-        without values is numbered from 0.
+        without values is numbered from 1.
         """
         results = list(results)
         coords = {c.name: Entry(c.dims, c.values, _coordinate_attrs(c)) for c in coordinates}
         sizes = {d: n for v, values in results for d, n in zip(reversed(v.dims), reversed(values.shape), strict=False)}
         for d in dimensions:
             if d.name in sizes:
-                values = np.asarray(d.values) if d.values else np.arange(sizes[d.name])
-                coords[d.name] = Entry((d.name,), values, _labels(d.units, d.long_name))
+                coords[d.name] = Entry((d.name,), np.asarray(d.labels(sizes[d.name])), _labels(d.units, d.long_name))
         data = {
             v.name: Entry((*sweep_dims, *v.dims), values, _variable_attrs(v), _fill(values)) for v, values in results
         }

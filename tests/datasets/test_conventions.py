@@ -131,6 +131,9 @@ def test_cf(result, checker):
         if dataset[name].dtype.kind in "if":
             steps = np.diff(dataset[name].values)
             assert (steps > 0).all() or (steps < 0).all(), name
+            # Positions in lists of the scene count from 0, all other labels that count from 1.
+            counts = dataset[name].dtype.kind == "i" and name != "point" and "parameter" not in dataset[name].attrs
+            assert not counts or dataset[name].values[0] == 1, name
     for variable in dataset.variables.values():
         assert variable.attrs["units"] and variable.attrs["long_name"]
     assert all(str(name).isidentifier() and str(name).isascii() for name in (*dataset.variables, *dataset.dims))

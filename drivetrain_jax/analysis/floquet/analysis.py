@@ -104,7 +104,7 @@ ANALYSIS = Analysis(
         Parameter("form", "1", "form of the equations", default="reduced", choices=FORMS),
     ),
     solvers=_solvers,
-    dimensions=lambda *_: (Dimension("multiplier", "Floquet multipliers by falling modulus", ()),),
+    dimensions=lambda *_: (Dimension("multiplier", "number of the multiplier, by falling modulus", ()),),
     lacks=_lacks,
     derivatives=_derivatives,
 )
