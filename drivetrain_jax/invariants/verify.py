@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.invariants import Finding, check
-from drivetrain_jax.store import checksums, shards
+from drivetrain_jax.store import checksums, zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.consolidate import open_result, read_attribute
 
@@ -46,7 +46,7 @@ def verify(path: Path) -> Report:
     parts = PartsFolder(path)
     if not path.exists() and parts.holds_work():
         return _verify_parts(parts)
-    if shards.is_store(path):
+    if zarr_store.is_store(path):
         return _verify_store(path)
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "does not exist"
@@ -82,12 +82,12 @@ def _first_broken(findings: list[Finding]) -> str:
 
 
 def _verify_store(path: Path) -> Report:
-    if not shards.is_sealed(path):
+    if not zarr_store.is_sealed(path):
         what = "attributes of the store"
         problem = f"{what}: damaged; allowed is to restore them or to compute the store again"
         return Report((f"checksums: {what} differ",), problem)
-    intact, _, count = shards.tally(path)
-    wrong = count - intact
+    intact = list(zarr_store.intact(path))
+    wrong, count = intact.count(False), len(intact)
     problem = f"{wrong} of {count} shards are damaged; allowed is to compute them again" if wrong else ""
     rules = "rules: applied to the file that `drivetrain export` makes of the store"
     return Report((f"checksums: {wrong or 'none'} of {count} shards differ", rules), problem)
@@ -95,12 +95,8 @@ def _verify_store(path: Path) -> Report:
 
 def _verify_parts(parts: PartsFolder) -> Report:
     """Report damaged parts. They are not an error, because a resumed run computes their chunks again."""
-    store = parts.path / shards.UNFINISHED
-    if shards.is_store(store):
-        (intact, present, _), unit = shards.tally(store), "shards"
-    else:
-        present, intact, unit = parts.count(), sum(1 for _ in parts.read()), "parts"
-    lines = [f"unfinished: {intact} of {present} {unit} are intact"]
+    present, intact = parts.count(), sum(1 for _ in parts.read())
+    lines = [f"unfinished: {intact} of {present} parts are intact"]
     if intact < present:
         lines.append("the run that resumes computes the chunks of the others again")
     return Report(tuple(lines), complete=False)

@@ -25,7 +25,7 @@ from drivetrain_jax.runs.scene import Scene, restore_scene
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.consolidate import map_variable, read_attribute
 from drivetrain_jax.store.provenance import digest
-from drivetrain_jax.store.shards import is_store
+from drivetrain_jax.store.zarr_store import is_store
 
 # Points that are copied at a time.
 _BLOCK = 1 << 18

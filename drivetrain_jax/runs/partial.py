@@ -9,22 +9,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.runs.assemble import Table, enter, to_dataset
+from drivetrain_jax.analysis import OUTCOME
+from drivetrain_jax.runs.assemble import Table, enter, labelled
 from drivetrain_jax.runs.growing import remaining
 from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.output_state import OutputState
+from drivetrain_jax.runs.pending import PENDING, with_pending
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import restore_scene
-from drivetrain_jax.runs.sharded import stored
-from drivetrain_jax.runs.target import Target
-from drivetrain_jax.store import consolidate, shards
+from drivetrain_jax.store import consolidate
 from drivetrain_jax.store.chunks import PartsFolder
 
 if TYPE_CHECKING:
     import xarray as xr
-
-# Outcome of a point that is not yet computed. A finished file never has it.
-PENDING = len(Outcome)
 
 
 def open_result(path: str | Path) -> xr.Dataset:
@@ -49,32 +46,26 @@ def open_result(path: str | Path) -> xr.Dataset:
 def _open_partial(path: Path) -> xr.Dataset:
     plan = PartsFolder(path).plan()
     job = resolve(restore_scene(str(plan.get("scene", ""))))
-    target = Target(path, job)
-    if target.state != "partial":
-        raise InputError(f"file = {str(path)!r}: holds {target.obstacle}; allowed is to run its scene again")
+    output = OutputState(path, job)
+    if output.state != "partial":
+        raise InputError(f"file = {str(path)!r}: holds {output.obstacle}; allowed is to run its scene again")
     if not job.route.is_pointwise:
         raise InputError(
             f"file = {str(path)!r}: an atlas that is not finished; allowed is to wait for it or to resume it"
         )
     table, done = Table(job.scene, job.grid), np.zeros(job.grid.size, bool)
-    for points, results in _finished(job, target):
+    for points, results in _finished(job, output):
         table.fill(points, results)
         done[points] = True
     return _labelled(job, table, done)
 
 
-def _finished(job: Job, target: Target) -> Iterator[tuple[np.ndarray, Mapping[str, np.ndarray]]]:
+def _finished(job: Job, output: OutputState) -> Iterator[tuple[np.ndarray, Mapping[str, np.ndarray]]]:
     """Points and results that are finished, reused ones included."""
-    if target.store == "zarr":
-        store = target.parts.path / shards.UNFINISHED
-        for _, arrays in stored(job, store) if shards.is_store(store) else ():
-            if arrays is not None:
-                yield shards.without_padding(arrays)
-        return
-    reused = target.reused_before()
+    reused = output.reused_before()
     yield from reused.blocks([variable.name for variable in Table(job.scene, job.grid).variables])
     plan = remaining(job, reused).plan
-    for part in target.parts.read():
+    for part in output.parts.read():
         for number, results in part:
             yield plan.chunk(number).points, results
 
@@ -83,9 +74,6 @@ def _labelled(job: Job, table: Table, done: np.ndarray) -> xr.Dataset:
     arrays = dict(table.lay_out())
     enter(arrays[OUTCOME.name], job.grid, np.flatnonzero(~done), PENDING)
     count = int(done.sum()) * job.grid.path_length
-    dataset = to_dataset(job.scene, arrays, {"digest": job.digest, "points_done": count})
-    outcome = dataset[OUTCOME.name].attrs
-    outcome["flag_values"] = np.arange(PENDING + 1, dtype=OUTCOME.dtype)
-    outcome["flag_meanings"] += " pending"
+    result = labelled(job.scene, arrays, {"digest": job.digest, "points_done": count})
     title = f"{job.scene.title} (unfinished: {count} of {job.total} points)"
-    return dataset.assign_attrs(title=title)
+    return with_pending(result).with_attrs(title=title).to_dataset()

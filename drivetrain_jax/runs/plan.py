@@ -91,9 +91,22 @@ class Plan:
     def ordered(self, numbers: Iterable[int]) -> np.ndarray:
         """These numbers block by block, the most expensive first in each block."""
         chosen = np.fromiter(numbers, np.int64)
+        return chosen[np.lexsort((-self.costs[chosen], self.block_of[chosen]))]
+
+    @cached_property
+    def block_of(self) -> np.ndarray:
+        """Number of the block of every chunk."""
         counts = [np.diff(group.firsts) for group in self.groups]
-        blocks = np.concatenate([np.empty(0, int), *(np.repeat(np.arange(len(n)), n) for n in counts)])
-        return chosen[np.lexsort((-self.costs[chosen], blocks[chosen]))]
+        return np.concatenate([np.empty(0, int), *(np.repeat(np.arange(len(n)), n) for n in counts)])
+
+    @property
+    def block_size(self) -> int:
+        """Number of consecutive points in a block."""
+        return _BLOCK
+
+    def chunks_of(self, blocks: slice) -> np.ndarray:
+        """Numbers of the chunks in these blocks."""
+        return np.flatnonzero((self.block_of >= blocks.start) & (self.block_of < blocks.stop))
 
     def chunk(self, number: int) -> Chunk:
         """Chunk number ``number``."""

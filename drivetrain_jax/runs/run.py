@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Any
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax._machine import physical_memory
 from drivetrain_jax._wording import shown
-from drivetrain_jax.runs import sharded
 from drivetrain_jax.runs.executor import Executor, Threads
 from drivetrain_jax.runs.executors import make_executor
 from drivetrain_jax.runs.growing import ReusedPoints
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.notebook import shown_progress
+from drivetrain_jax.runs.output_state import OutputState
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import Scene, load_scene
-from drivetrain_jax.runs.target import Target
 from drivetrain_jax.runs.work import Progress, Report, Work
 from drivetrain_jax.store.consolidate import open_result
 
@@ -103,23 +102,22 @@ def run_to_file(
 ) -> Progress:
     """Like :func:`run` with ``out``, but returns the counts instead of the result.
 
-    ``store`` is ``hdf5``, or ``zarr`` if workers write a Zarr store (see :mod:`.sharded`).
+    ``store`` is ``hdf5``, or ``zarr`` if workers write a Zarr store (see :mod:`.zarr_sink`).
     """
     job = _job(scene, overrides, on_disk=True)
-    if store == "zarr":
-        sharded.check(job)
-    target = Target(out, job, store)
-    target.restore()
-    if not fresh and target.state == "complete":
-        target.parts.discard(target.digest, target.written)
-        total = target.points(job.total)
-        return Progress(total, reused=total, failed=target.failed)
-    if not fresh and target.state == "stale":
-        raise target.refusal
-    target.check_writable()
+    output = OutputState(out, job, store)
+    output.sink.check_job(job)
+    output.restore()
+    if not fresh and output.state == "complete":
+        output.parts.discard(output.digest, output.sink.written)
+        total = output.points(job.total)
+        return Progress(total, reused=total, failed=output.failed)
+    if not fresh and output.state == "stale":
+        raise output.refusal
+    output.check_writable()
     executor = executor or Threads()
     executor.check()
-    return _into(target, target.reused_points(_paths(reuse), fresh), fresh, executor, report)
+    return _into(output, output.reused_points(_paths(reuse), fresh), fresh, executor, report)
 
 
 def _paths(reuse: str | Path | Sequence[str | Path]) -> Sequence[str | Path]:
@@ -129,21 +127,19 @@ def _paths(reuse: str | Path | Sequence[str | Path]) -> Sequence[str | Path]:
     return paths
 
 
-def _into(target: Target, reused: ReusedPoints, fresh: bool, executor: Executor, report: Report | None) -> Progress:
-    """Start or resume the result of ``target``; the points ``reused`` are reused."""
-    job, parts, progress = target.job, target.parts, target.job.route.progress(target.job)
+def _into(
+    output: OutputState, reused: ReusedPoints, fresh: bool, executor: Executor, report: Report | None
+) -> Progress:
+    """Start or resume the result of ``output``; the points ``reused`` are reused."""
+    job, parts, progress = output.job, output.parts, output.job.route.progress(output.job)
     begins = False
     try:
         parts.open()
-        target.check_unchanged()
-        begins = not target.resumes(reused, fresh)
+        output.check_unchanged()
+        begins = not output.resumes(reused, fresh)
         if begins:
-            parts.start(target.plan(reused, fresh))
-        if target.store == "zarr":
-            sharded.compute(job, target.out, parts, progress, executor, report)
-        else:
-            with Work(executor, report, parts) as work:
-                job.route.into_file(job, target.out, parts.result, work, progress, reused)
+            parts.start(output.plan(reused, fresh))
+        output.sink.write(job, executor, report, progress, reused)
         parts.close(remove=True)
     except KeyboardInterrupt:
         raise Interrupted(progress) from None

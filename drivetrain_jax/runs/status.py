@@ -14,10 +14,9 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import failures
+from drivetrain_jax.runs.output_state import OutputState
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
-from drivetrain_jax.runs.target import Target
-from drivetrain_jax.store import shards
 
 
 @dataclass(frozen=True)
@@ -52,16 +51,16 @@ def status(
 ) -> Status:
     """The :class:`Status` of ``scene`` at ``out``. Changes nothing and compiles nothing."""
     job = resolve(load_scene(scene, overrides))
-    target, total = Target(Path(out), job), job.route.total(job, 0)
-    if target.state == "stale":
-        reason = f"it holds {target.obstacle}; {target.remedy}"
-        return Status(total, 0, 0, target.state, reason=reason)
+    output, total = OutputState(Path(out), job), job.route.total(job, 0)
+    if output.state == "stale":
+        reason = f"it holds {output.obstacle}; {output.remedy}"
+        return Status(total, 0, 0, output.state, reason=reason)
     try:
-        found = _counts(target)
+        found = _counts(output)
     except InputError as error:
         return Status(total, 0, 0, "stale", reason=str(error))
-    done = target.points(found.done) if target.state == "complete" else found.done
-    return Status(job.route.total(job, done), done, found.failed, target.state, found.by_outcome)
+    done = output.points(found.done) if output.state == "complete" else found.done
+    return Status(job.route.total(job, done), done, found.failed, output.state, found.by_outcome)
 
 
 @dataclass(frozen=True)
@@ -71,9 +70,9 @@ class _Counts:
     by_outcome: Mapping[str, int]
 
 
-def _counts(target: Target) -> _Counts:
+def _counts(output: OutputState) -> _Counts:
     done, failed, codes = 0, 0, Counter[int]()
-    for outcome in _outcomes(target):
+    for outcome in _outcomes(output):
         done += outcome.size
         failed += failures(outcome)
         codes.update(dict(enumerate(np.bincount(outcome.ravel(), minlength=len(Outcome)).tolist())))
@@ -81,20 +80,17 @@ def _counts(target: Target) -> _Counts:
     return _Counts(done, failed, by_outcome)
 
 
-def _outcomes(target: Target) -> Iterator[np.ndarray]:
+def _outcomes(output: OutputState) -> Iterator[np.ndarray]:
     """Outcomes of all finished points."""
-    if target.state == "complete":
+    if output.state == "complete":
         # An atlas has no points.
-        yield from () if target.is_function else (target.outcomes,)
-    elif target.state == "partial" and target.store == "zarr":
-        store = target.parts.path / shards.UNFINISHED
-        yield from shards.finished(store, OUTCOME.name) if shards.is_store(store) else ()
-    elif target.state == "partial":
+        yield from () if output.is_function else (output.sink.outcomes(),)
+    elif output.state == "partial":
         seen = set[int]()
-        for part in target.parts.read():
-            if target.job.route.counts(part):
+        for part in output.parts.read():
+            if output.job.route.counts(part):
                 # An interrupt during writing may leave a chunk in two parts.
                 yield from (results[OUTCOME.name] for number, results in part if number not in seen)
                 seen.update(part.chunks.tolist())
-        for _, results in target.reused_before().blocks([OUTCOME.name]):
+        for _, results in output.reused_before().blocks([OUTCOME.name]):
             yield results[OUTCOME.name]

@@ -48,7 +48,7 @@ class Progress:
 Report = Callable[[Progress], None]
 
 
-class Sink(Protocol):
+class Receiver(Protocol):
     """Receives results: the table of a scene, or a collector of solves."""
 
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
@@ -87,8 +87,8 @@ class Work:
         finally:
             self.executor.close()
 
-    def do(self, job: Job, sink: Sink, progress: Progress, first: int = 0) -> None:
-        """Compute or reuse all chunks of ``job`` into ``sink``; stored chunk numbers start at ``first``.
+    def do(self, job: Job, receiver: Receiver, progress: Progress, first: int = 0) -> None:
+        """Compute or reuse all chunks of ``job`` into ``receiver``; stored chunk numbers start at ``first``.
 
         Lost chunks are not stored, so a resumed run computes them again.
         """
@@ -97,8 +97,8 @@ class Work:
         if self.parts is None:
             missing = np.arange(len(job.plan.costs))
         else:
-            missing = self._reuse(job, self.parts, sink, progress, first)
-        batch, before = _Batch(sink, self._writer, first), progress.computed
+            missing = self._reuse(job, self.parts, receiver, progress, first)
+        batch, before = _Batch(receiver, self._writer, first), progress.computed
         try:
             self._compute(job, missing, batch, progress)
             batch.flush()
@@ -107,7 +107,7 @@ class Work:
             # An interrupt may come between storing a chunk and counting it: count what is stored or lost.
             progress.computed = before + (batch.kept + batch.lost) * job.grid.path_length
 
-    def _reuse(self, job: Job, parts: PartsFolder, sink: Sink, progress: Progress, first: int) -> np.ndarray:
+    def _reuse(self, job: Job, parts: PartsFolder, receiver: Receiver, progress: Progress, first: int) -> np.ndarray:
         """Copy the stored chunks; returns the numbers of the missing ones."""
         missing = np.ones(len(job.plan.costs), bool)
         for part in parts.read(repair=True):
@@ -118,7 +118,7 @@ class Work:
                     continue
                 missing[number - first] = False
                 points = job.plan.chunk(number - first).points
-                sink.fill(points, results)
+                receiver.fill(points, results)
                 progress.reused += points.size * job.grid.path_length
                 progress.failed += failures(results[OUTCOME.name])
         self._counted = True
@@ -187,10 +187,10 @@ class _PartWriter:
 
 
 class _Batch:
-    """Collects finished chunks and enters them into ``sink`` together, which costs a third of entering them one by one."""
+    """Collects finished chunks and enters them together, which costs a third of entering them one by one."""
 
-    def __init__(self, sink: Sink, writer: _PartWriter, first: int) -> None:
-        self.sink, self._writer, self._first = sink, writer, first
+    def __init__(self, receiver: Receiver, writer: _PartWriter, first: int) -> None:
+        self.receiver, self._writer, self._first = receiver, writer, first
         self._waiting: list[tuple[Chunk, Mapping[str, np.ndarray]]] = []
         self._bytes = 0
         self._begun = False
@@ -202,20 +202,20 @@ class _Batch:
         if not self._begun:
             # The first results allocate the whole output, so a full disk is reported before more is computed.
             self._begun = True
-            self.sink.fill(chunk.points, results)
+            self.receiver.fill(chunk.points, results)
         if self._bytes >= _MOST_WAITING or self._writer.due():
             self.flush()
 
     def lose(self, chunk: Chunk) -> None:
         """Mark the points of a chunk as lost."""
-        self.sink.lose(chunk.points)
+        self.receiver.lose(chunk.points)
         self.lost += chunk.points.size
 
     def flush(self) -> None:
         """Store and enter the queued chunks."""
         chunks, results = self.keep()
         if chunks:
-            self.sink.fill(np.concatenate([chunk.points for chunk in chunks]), results)
+            self.receiver.fill(np.concatenate([chunk.points for chunk in chunks]), results)
 
     def keep(self) -> tuple[list[Chunk], dict[str, np.ndarray]]:
         """Store the queued chunks; returns the chunks and their concatenated results."""

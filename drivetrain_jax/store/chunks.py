@@ -16,6 +16,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from threading import get_ident
 from typing import Any, cast
 
 import h5py
@@ -29,13 +30,23 @@ Arrays = Mapping[str, np.ndarray]
 
 
 class Part:
-    """Finished chunks: their numbers, point counts, results (points first) and computing time in s."""
+    """Finished chunks: their numbers, point counts, results (points first), computing time in s, and perhaps the
+    ``points``. A part that has been read has the ``name`` of its file."""
 
-    def __init__(self, chunks: Sequence[int], sizes: Sequence[int], results: Arrays, seconds: float) -> None:
+    def __init__(
+        self,
+        chunks: Sequence[int],
+        sizes: Sequence[int],
+        results: Arrays,
+        seconds: float,
+        points: np.ndarray | None = None,
+    ) -> None:
         self.chunks = np.asarray(chunks, np.int64)
         self.sizes = np.asarray(sizes, np.int64)
         self.results = results
         self.seconds = seconds
+        self.points = points
+        self.name = ""
 
     @property
     def nbytes(self) -> int:
@@ -50,9 +61,12 @@ class Part:
 
     def to_bytes(self) -> bytes:
         """The HDF5 image."""
-        with h5py.File("part", "w", driver="core", backing_store=False) as file:
+        # HDF5 keeps one open file of a name, and threads write at once.
+        with h5py.File(f"part {get_ident()}", "w", driver="core", backing_store=False) as file:
             file["chunks"], file["sizes"] = self.chunks, self.sizes
             file.attrs["seconds"] = self.seconds
+            if self.points is not None:
+                file["points"] = self.points
             group = file.create_group("results")
             for name, values in self.results.items():
                 group[name] = values
@@ -64,7 +78,8 @@ class Part:
         """The part in an HDF5 image."""
         with cast(Any, h5py.File(io.BytesIO(data), "r")) as file:
             results = {name: values[()] for name, values in file["results"].items()}
-            return cls(file["chunks"][()], file["sizes"][()], results, float(file.attrs["seconds"]))
+            points = file["points"][()] if "points" in file else None
+            return cls(file["chunks"][()], file["sizes"][()], results, float(file.attrs["seconds"]), points)
 
 
 class PartsFolder:
@@ -73,7 +88,7 @@ class PartsFolder:
     def __init__(self, out: Path) -> None:
         # One folder, and so one lock, for all names of a file.
         out = behind_link(out)
-        self.path = out.parent / f"{out.name}.parts"
+        self.out, self.path = out, out.parent / f"{out.name}.parts"
         # Path at which the result grows.
         self.result = self.path / "result.tmp"
         self._plan = self.path / "plan.json"
@@ -158,11 +173,16 @@ class PartsFolder:
                 self.open()
                 self.close(remove=True)
 
-    def write(self, part: Part) -> None:
-        """Write finished chunks."""
+    def write(self, part: Part) -> str:
+        """Write finished chunks; returns the name of the file."""
         data = part.to_bytes()
         path = self.path / f"{int(part.chunks[0]):08d}-{_content_digest(data)}.h5"
         write_atomic(path, data, path.with_suffix(".tmp"))
+        return path.name
+
+    def read_one(self, name: str) -> Part | None:
+        """The part of this name; None if it is damaged or gone."""
+        return _read_intact(self.path / name)
 
     def count(self) -> int:
         """Number of parts, damaged ones included."""
@@ -188,7 +208,9 @@ def _read_intact(path: Path) -> Part | None:
         return None
     if _content_digest(data) != path.stem.partition("-")[2]:
         return None
-    return Part.from_bytes(data)
+    part = Part.from_bytes(data)
+    part.name = path.name
+    return part
 
 
 def _content_digest(data: bytes) -> str:

@@ -349,7 +349,7 @@ def test_parts_that_cannot_be_used_are_wrong_input(cli, monkeypatch, needed):
     os.mkdir("r.nc.parts")
     lacking = os.W_OK if needed == "writable" else os.R_OK
     allows = lambda path, mode: Path(path).suffix != ".parts" or not mode & lacking  # noqa: E731
-    monkeypatch.setattr("drivetrain_jax.runs.target.os.access", allows)
+    monkeypatch.setattr("drivetrain_jax.runs.output_state.os.access", allows)
     code, _, err = cli("run", "scene.toml", "--out", "r.nc")
     assert (code, len(err)) == (2, 1) and f"the folder 'r.nc.parts' is not {needed}; allowed is" in err[0]
 

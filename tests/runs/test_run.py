@@ -345,7 +345,7 @@ def test_a_run_that_ends_between_the_look_and_the_lock_is_noticed(grid_scene, tm
 def test_a_finished_result_in_a_folder_without_write_permission_is_read(grid_scene, tmp_path, monkeypatch):
     path = tmp_path / "r.nc"
     run_to_file(grid_scene, path)
-    monkeypatch.setattr("drivetrain_jax.runs.target.os.access", lambda *_: False)
+    monkeypatch.setattr("drivetrain_jax.runs.output_state.os.access", lambda *_: False)
     assert run_to_file(grid_scene, path).reused == 123 and status(grid_scene, path).state == "complete"
     assert_same(dt.run(grid_scene, path), dt.run(grid_scene))
     for fresh, name in ((True, "r.nc"), (False, "new.nc")):

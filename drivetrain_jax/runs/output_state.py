@@ -13,18 +13,16 @@ import numpy as np
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import clipped
-from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import failures
 from drivetrain_jax.runs.explain import differences
 from drivetrain_jax.runs.growing import NO_REUSE, Damaged, NotReusable, ReusedPoints, Source, combined, find
 from drivetrain_jax.runs.job import Job
-from drivetrain_jax.store import shards
+from drivetrain_jax.runs.sinks import Sink, make_sink
 from drivetrain_jax.store.chunks import PartsFolder
-from drivetrain_jax.store.consolidate import read_attribute, read_variable
 from drivetrain_jax.store.files import behind_link
 
 
-class Target:
+class OutputState:
     """The result file ``out`` and the folder of its parts, seen by the scene of ``job``.
 
     ``state`` is ``absent``, ``partial``, ``complete`` or ``stale`` (a result or parts of another scene or version). Raises
@@ -36,40 +34,25 @@ class Target:
         self.parts = PartsFolder(out)
         _check_name(out, self.parts)
         _check_parts(out, self.parts.path)
-        self.store = store or self._kind()
-        _check_place(out, self._held, self.store)
+        _check_folder(out)
+        self.sink = make_sink(out, self.parts, store)
+        self.sink.check_place()
         self.job, self.digest = job, job.digest
-        self.present = _digest_of(out, self._held)
+        self.present = _digest_of(out, self.sink)
         self._plan_seen = self.parts.plan()
-
-    def _kind(self) -> str:
-        """Format of the result at the path: ``hdf5`` or ``zarr``."""
-        return "zarr" if shards.is_store(self._held) else self.parts.plan().get("store", "hdf5")
-
-    @property
-    def _held(self) -> Path:
-        """Path of the present result: a run sets a store aside just before it moves the new one into place."""
-        former = self.parts.path / shards.FORMER
-        return former if not self.out.exists() and former.exists() else self.out
-
-    @property
-    def written(self) -> int | None:
-        """Time at which the present result was written, by the clock of its file system."""
-        held = self._held / "zarr.json" if self.store == "zarr" else self._held
-        return held.stat().st_mtime_ns if held.exists() else None
 
     def restore(self) -> None:
         """Restore a store whose replacement was killed.
 
         Raises :class:`InputError` if that run is still working.
         """
-        if self._held == self.out:
+        if self.sink.held == self.out:
             return
         self.check_writable()
         self.parts.open()
         try:
-            if self._held != self.out:
-                self._held.rename(self.out)
+            if self.sink.held != self.out:
+                self.sink.held.rename(self.out)
         finally:
             self.parts.close()
 
@@ -90,8 +73,8 @@ class Target:
         return {
             "digest": self.digest,
             "replaces": self.present,
-            "replaces_written": self.written,
-            "store": self.store,
+            "replaces_written": self.sink.written,
+            "store": self.sink.store,
             "fresh": fresh,
             "reuses": reused.digest,
             "reused": reused.count,
@@ -109,7 +92,7 @@ class Target:
 
     def check_unchanged(self) -> None:
         """Raise :class:`InputError` if another run has finished or started since this object was created."""
-        if (_digest_of(self.out, self._held), self.parts.plan()) != (self.present, self._plan_seen):
+        if (_digest_of(self.out, self.sink), self.parts.plan()) != (self.present, self._plan_seen):
             raise InputError(f"out = {str(self.out)!r}: another run has changed it; run the command again")
 
     def check_writable(self) -> None:
@@ -124,14 +107,12 @@ class Target:
     @cached_property
     def _rearranged(self) -> list[str]:
         """Names of the variables of the present result whose layout differs from this scene."""
-        return [] if self.store == "zarr" else self.job.route.rearranged(self.job, self.out)
+        return self.sink.rearranged(self.job)
 
     @cached_property
     def _found(self) -> Source | NotReusable | None:
         """The points of this scene that the present result contains, or the reason why it has none."""
-        if self.present is None or self.store == "zarr":
-            return None
-        return self.job.route.common_points(self.job, self.out)
+        return None if self.present is None else self.sink.common_points(self.job)
 
     @property
     def _shared(self) -> Source | None:
@@ -155,10 +136,8 @@ class Target:
 
         Raises :class:`InputError` if unfinished work uses other results, or if one of ``reuse`` has no common points.
         """
-        if self.store == "zarr":
-            if reuse:
-                raise InputError("reuse: given together with store = 'zarr'; allowed is one of them")
-            return NO_REUSE
+        if reuse:
+            self.sink.check_reuse()
         if not self.job.route.is_pointwise:
             if reuse:
                 raise InputError("reuse: not available for an atlas; allowed for a scene with direct solves")
@@ -202,29 +181,18 @@ class Target:
             stored, what = self.parts.plan(), "unfinished work"
             if self.present != stored.get("replaces"):
                 return f"{what} that was started for another result"
-            if self.store != stored.get("store"):
+            if self.sink.store != stored.get("store"):
                 return f"{what} of --store {stored.get('store')}"
         else:
-            stored, what = {name: _attribute(self._held, name) for name in provenance_of(self.job)}, "a result"
+            stored, what = {name: self.sink.attribute(name) for name in provenance_of(self.job)}, "a result"
         reasons = differences(stored, self.job) if stored else ["the difference is unknown"]
         more = f" and {len(reasons) - 2} more" if len(reasons) > 2 else ""
         return f"{what} of another scene or version: {'; '.join(reasons[:2]) or 'other sizes of chunks'}{more}"
 
     @property
-    def outcomes(self) -> np.ndarray:
-        """Outcomes of all points of the complete result."""
-        if self.store == "zarr":
-            held = np.concatenate(
-                [np.empty(0, np.int8), *(a.ravel() for a in shards.finished(self._held, OUTCOME.name))]
-            )
-            # Points that no solver can compute are in no shard.
-            return np.append(held, np.full(max(self.job.total - held.size, 0), Outcome.STEP_LIMIT, np.int8))
-        return read_variable(self.out, OUTCOME.name)
-
-    @property
     def failed(self) -> int:
         """Number of points without a value in the complete result. An atlas has no points."""
-        return 0 if self._solves is not None else failures(self.outcomes)
+        return 0 if self._solves is not None else failures(self.sink.outcomes())
 
     def points(self, total: int) -> int:
         """Number of points of the complete result, or of solves of an atlas."""
@@ -237,7 +205,7 @@ class Target:
 
     @property
     def _solves(self) -> int | None:
-        value = _attribute(self._held, "solves")
+        value = self.sink.attribute("solves")
         return None if value is None else int(np.squeeze(value))
 
 
@@ -271,32 +239,21 @@ def _check_parts(out: Path, folder: Path) -> None:
         raise InputError(f"out = {str(out)!r}: the folder {str(folder)!r} is not readable; allowed is one that is")
 
 
-def _check_place(out: Path, held: Path, store: str) -> None:
+def _check_folder(out: Path) -> None:
     folder = out.parent
     if not folder.is_dir():
         raise InputError(
             f"out = {str(out)!r}: the folder {str(folder)!r} does not exist; allowed is a file in an existing folder"
         )
-    if held.is_dir() and not (store == "zarr" and shards.is_store(held)):
-        raise InputError(f"out = {str(out)!r}: is a folder; allowed is the path of a file")
-    if out.is_file() and store == "zarr":
-        raise InputError(f"out = {str(out)!r}: is a file; allowed for store = 'zarr' is a new path, or such a store")
 
 
-def _attribute(held: Path, name: str) -> Any:
-    return shards.attributes(held).get(name) if held.is_dir() else read_attribute(held, name)
-
-
-def _digest_of(out: Path, held: Path) -> str | None:
-    """Digest of the result of ``out``, stored at ``held``; None without one."""
-    if not held.exists():
+def _digest_of(out: Path, sink: Sink) -> str | None:
+    """Digest of the result of ``out``; None without one."""
+    if not sink.held.exists():
         return None
-    try:
-        digest, what = _attribute(held, "digest"), "not a result of drivetrain_jax"
-    except InputError:
-        if held.is_dir():
-            raise
-        digest, what = None, "not a readable netCDF4/HDF5 file"
+    digest = sink.digest()
     if not isinstance(digest, str):
-        raise InputError(f"out = {str(out)!r}: {what}; allowed is a new file or a result of drivetrain_jax")
+        raise InputError(
+            f"out = {str(out)!r}: not a result of drivetrain_jax; allowed is a new file or a result of drivetrain_jax"
+        )
     return digest

@@ -1,0 +1,262 @@
+"""A Zarr v3 store that xarray opens as the Dataset of the HDF5 file, and that many processes write at once.
+
+The sweep is cut into shards: each is one file per variable and has one writer. The group ``checksums``, which xarray leaves
+alone, holds a checksum of each shard, written after its data (0 before). Missing shards have the fill value. Damage to data
+is detected by the checksum or the CRC-32C of every file, damage to the rest by the digest of a finished store.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.store.provenance import digest
+from drivetrain_jax.store.schema import Labelled
+
+# Folder among the parts in which a store grows, and the one for a store while another one replaces it.
+UNFINISHED, FORMER = "store", "former"
+# Digest of everything in a store except its shards: an attribute.
+SEAL = "checksum"
+_CHECKSUMS, _OF_SHARDS, _RESULTS = "checksums", "checksums/shards", "results"
+# Upper limits of the points of a shard, and of its bytes.
+_MOST_POINTS, _MOST_BYTES = 1 << 18, 1 << 28
+# Exceptions of decoding, which depend on the position of the damage.
+_BROKEN = (ValueError, OSError, KeyError, RuntimeError, TypeError, AttributeError, IndexError, ArithmeticError)
+
+Place = tuple[slice, ...]
+
+
+@dataclass(frozen=True)
+class Shards:
+    """The shards of a sweep of this ``shape``, numbered in C order, of ``lengths`` along its axes (the last may be less).
+
+    Points of a shard are consecutive in C order; a path axis is whole.
+    """
+
+    shape: tuple[int, ...]
+    lengths: tuple[int, ...]
+
+    @classmethod
+    def of(cls, shape: tuple[int, ...], path: int | None, row_bytes: int) -> Shards:
+        """Shards of a sweep with its path along axis number ``path``, and ``row_bytes`` of results at a point."""
+        whole = 1 if path is None else shape[path]
+        room, lengths = max(1, min(_MOST_POINTS, _MOST_BYTES // max(row_bytes, 1)) // whole), []
+        for axis in reversed(range(len(shape))):
+            lengths.insert(0, shape[axis] if axis == path else min(shape[axis], room))
+            room = room if axis == path else max(1, room // shape[axis])
+        return cls(shape, tuple(lengths))
+
+    @property
+    def _counts(self) -> tuple[int, ...]:
+        return tuple(-(-size // length) for size, length in zip(self.shape, self.lengths, strict=True))
+
+    @property
+    def count(self) -> int:
+        """Number of shards."""
+        return math.prod(self._counts)
+
+    def place(self, shard: int) -> Place:
+        """The block of the sweep that a shard covers."""
+        at = np.unravel_index(shard, self._counts) if self.shape else ()
+        starts = [int(i) * length for i, length in zip(at, self.lengths, strict=True)]
+        return tuple(slice(a, min(a + n, size)) for a, n, size in zip(starts, self.lengths, self.shape, strict=True))
+
+
+def is_store(path: Path) -> bool:
+    """True if there is a Zarr v3 group at ``path``."""
+    return (path / "zarr.json").is_file()
+
+
+def create(path: Path, template: Labelled, shards: Shards, fills: Mapping[str, float]) -> None:
+    """Create an empty store for ``template``, whose data are ignored. Raises ``OSError`` without enough space."""
+    zarr = _zarr()
+    # Words of any length: those of a fixed one have no specification yet.
+    coords = {
+        n: replace(c, values=c.values.astype(object)) if c.values.dtype.kind == "U" else c
+        for n, c in template.coords.items()
+    }
+    replace(template, coords=coords, data={}).to_dataset().to_zarr(path, mode="w", zarr_format=3, consolidated=False)
+    root = _root(path, "r+")
+    for name, entry in template.data.items():
+        own = entry.values.shape[len(shards.shape) :]
+        root.create_array(
+            name,
+            shape=entry.values.shape,
+            dtype=entry.values.dtype,
+            chunks=(*shards.lengths, *(max(n, 1) for n in own)),
+            fill_value=fills[name],
+            compressors=zarr.codecs.Crc32cCodec(),
+            dimension_names=entry.dims,
+            attributes={
+                key: value.tolist() if hasattr(value, "tolist") else value for key, value in entry.attrs.items()
+            },
+        )
+    apart = root.create_group(_CHECKSUMS, attributes={_RESULTS: list(template.data)})
+    apart.create_array("shards", shape=(shards.count,), dtype="uint64", chunks=(1,), compressors=None)
+    _consolidate(path)
+
+
+def shards_of(path: Path) -> Shards:
+    """The shards of the store. Raises :class:`InputError` if it has none."""
+    try:
+        outcome = _root(path)["outcome"]
+        return Shards(tuple(outcome.shape), tuple(outcome.chunks))
+    except _BROKEN:
+        raise _damaged(path) from None
+
+
+def matches(path: Path, template: Labelled, shards: Shards) -> bool:
+    """True if the store at ``path`` has the layout of :func:`create`."""
+    try:
+        root = _root(path)
+        own = root[_OF_SHARDS].shape == (shards.count,) and set(template.coords) <= set(root.array_keys())
+        return own and all(
+            (root[name].shape, root[name].dtype, root[name].chunks[: len(shards.shape)])
+            == (entry.values.shape, entry.values.dtype, shards.lengths)
+            for name, entry in template.data.items()
+        )
+    except _BROKEN:
+        return False
+
+
+def result_shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """Shapes of the results by name."""
+    root = _root(path)
+    return {name: tuple(root[name].shape) for name in root[_CHECKSUMS].attrs[_RESULTS]}
+
+
+def write(path: Path, place: Place, arrays: Mapping[str, np.ndarray], shard: int | None) -> None:
+    """Write the results of a shard, and mark number ``shard`` done if given."""
+    root = _root(path, "r+")
+    for name, values in arrays.items():
+        root[name][(*place, ...)] = values
+    if shard is not None:
+        root[_OF_SHARDS][shard] = _checksum(arrays)
+
+
+def done(path: Path) -> np.ndarray:
+    """Flags of the shards that are marked done."""
+    try:
+        return _root(path)[_OF_SHARDS][:] != 0
+    except _BROKEN:
+        raise _damaged(path) from None
+
+
+def read(path: Path, shards: Shards, shard: int) -> dict[str, np.ndarray] | None:
+    """The results of a shard; None if it is missing or damaged."""
+    try:
+        root = _root(path)
+        place = (*shards.place(shard), ...)
+        arrays = {name: np.asarray(root[name][place]) for name in root[_CHECKSUMS].attrs[_RESULTS]}
+        return arrays if root[_OF_SHARDS][shard] == _checksum(arrays) else None
+    except _BROKEN:
+        return None
+
+
+def intact(path: Path) -> Iterator[bool]:
+    """Yield for each shard whether it is complete and not damaged."""
+    shards = shards_of(path)
+    for shard in range(shards.count):
+        yield read(path, shards, shard) is not None
+
+
+def read_variable(path: Path, name: str) -> np.ndarray:
+    """One variable of the store; :class:`InputError` if it cannot be read."""
+    try:
+        return np.asarray(_root(path)[name][...])
+    except _BROKEN:
+        raise _damaged(path) from None
+
+
+def attributes(path: Path) -> dict[str, Any]:
+    """The attributes of the store; :class:`InputError` if it has none."""
+    _zarr()
+    try:
+        return dict(_root(path).attrs)
+    except _BROKEN:
+        raise InputError(f"store = {str(path)!r}: not a readable Zarr store; give one of --store zarr") from None
+
+
+def seal(path: Path, attrs: Mapping[str, Any], labels: Mapping[str, Mapping[str, Any]]) -> None:
+    """Write the attributes of the finished store and the ``labels`` of variables, and add the digest of everything else."""
+    root = _root(path, "r+")
+    for name, own in labels.items():
+        root[name].attrs.update({key: v.tolist() if hasattr(v, "tolist") else v for key, v in own.items()})
+    # Written anew, because the attributes of a growing store have no checksum; xarray lists the coordinates in one.
+    kept = {name: value for name, value in root.attrs.items() if name == "coordinates"}
+    root.attrs.put({**kept, **attrs})
+    _consolidate(path)
+    root.attrs[SEAL] = _digest(path)
+    _consolidate(path)
+
+
+def _consolidate(path: Path) -> None:
+    """Copy the metadata of all arrays into those of the store, where xarray looks first."""
+    with warnings.catch_warnings():
+        # Not yet a part of the specification of Zarr 3; other readers leave the copy alone.
+        warnings.simplefilter("ignore")
+        _zarr().consolidate_metadata(path)
+
+
+def is_sealed(path: Path) -> bool:
+    """True if all but the shards of a finished store is intact; :class:`InputError` if it is not a result."""
+    attrs = attributes(path)
+    if "digest" not in attrs:
+        raise InputError(f"store = {str(path)!r}: not a result of drivetrain_jax; give one of --store zarr")
+    if "groups" in attrs:
+        raise _damaged(path)
+    try:
+        return attrs.get(SEAL) == _digest(path)
+    except _BROKEN:
+        return False
+
+
+def _digest(path: Path) -> str:
+    """Digest of attributes, metadata and coordinates."""
+    root = _root(path)
+    attrs = {name: value for name, value in root.attrs.items() if name != SEAL}
+    results = set(root[_CHECKSUMS].attrs[_RESULTS])
+    files = sorted({path / _CHECKSUMS, path / _OF_SHARDS, *(path / name for name in root.array_keys())})
+    metadata = {file.relative_to(path).as_posix(): json.loads((file / "zarr.json").read_text()) for file in files}
+    coords = {name: np.asarray(root[name][...]) for name in sorted(root.array_keys()) if name not in results}
+    copy = _zarr().open_group(path, mode="r")
+    copied = {name: dict(copy[name].attrs) for name in sorted(root.array_keys())}
+    labels = {name: values.tolist() if values.dtype.kind in ("O", "T") else values for name, values in coords.items()}
+    return digest([attrs, metadata, copied, labels])
+
+
+def _checksum(arrays: Mapping[str, np.ndarray]) -> int:
+    state = hashlib.blake2b(digest_size=8)
+    for name in sorted(arrays):
+        state.update(np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8).data)
+    # 0 means "not done".
+    return int.from_bytes(state.digest(), "little") or 1
+
+
+def _damaged(path: Path) -> InputError:
+    if "groups" in attributes(path):
+        made = "a store of an earlier version, which `drivetrain export` of that version reads"
+        return InputError(f"store = {str(path)!r}: {made}; allowed is a store of this one")
+    return InputError(f"store = {str(path)!r}: damaged; allowed is to restore it or to compute it again")
+
+
+def _root(path: Path, mode: str = "r") -> Any:
+    """The store by the metadata of every array, not by the copy of them."""
+    return _zarr().open_group(path, mode=mode, use_consolidated=False)
+
+
+def _zarr() -> Any:
+    try:
+        import zarr
+    except ImportError:
+        raise InputError("store = 'zarr': the package zarr is not installed; install drivetrain_jax[zarr]") from None
+    return zarr
