@@ -8,43 +8,22 @@ from drivetrain_jax.runs.atlas_choice import atlas_ranges
 from drivetrain_jax.runs.atlas_file import to_labelled
 from drivetrain_jax.runs.growing import ReusedPoints
 from drivetrain_jax.runs.identity import ATLAS_SOURCES
-from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.job import Job, Route
 from drivetrain_jax.runs.rounds import build_atlas
 from drivetrain_jax.runs.work import Progress, Work
-from drivetrain_jax.store.chunks import Part
 from drivetrain_jax.store.consolidate import write_result
 from drivetrain_jax.store.files import ATLAS_PREFACE
 from drivetrain_jax.store.schema import Labelled
 
 
-class AtlasRoute:
-    """Builds an atlas, whose solves are counted but are no points; see :class:`~drivetrain_jax.runs.job.Route`."""
+class AtlasRoute(Route):
+    """Builds an atlas. Its solves are counted, but are not points of a grid."""
 
-    sources: tuple[str, ...] = ATLAS_SOURCES
-    is_pointwise = False
-
-    def total(self, job: Job, done: int) -> int:
-        """Number of solves, known only at the end."""
-        return done
-
-    def bytes_needed(self, job: Job, on_disk: bool) -> int:
-        """Not predicted."""
-        return 0
+    sources = ATLAS_SOURCES
 
     def progress(self, job: Job) -> Progress:
         """The counts before a run."""
         return Progress(0, kind="direct solves")
-
-    def counts(self, part: Part) -> bool:
-        """True for every part."""
-        return True
-
-    def rearranged(self, job: Job, path: Path) -> list[str]:
-        """Nothing: an atlas has no grid."""
-        return []
-
-    def common_points(self, job: Job, path: Path) -> None:
-        """Nothing: an atlas has no points."""
 
     def in_memory(self, job: Job, work: Work, progress: Progress) -> Labelled:
         """The atlas; ``progress`` counts the solves."""

@@ -11,7 +11,7 @@ from typing import Any
 
 from drivetrain_jax._errors import InputError, RetryableError
 from drivetrain_jax.runs import worker
-from drivetrain_jax.runs.executor import IN_FLIGHT, Computation, Results
+from drivetrain_jax.runs.executor import IN_FLIGHT, Computation, Executor, Results
 from drivetrain_jax.runs.worker import Parcel
 
 _PATIENCE = "10s"
@@ -20,10 +20,8 @@ _LOCAL = re.compile(r"local:([1-9]\d*)")
 _TALKATIVE = ("distributed", "tornado", "asyncio")
 
 
-class Cluster:
+class Cluster(Executor):
     """A Dask cluster: the scheduler at ``tcp://host:port``, or ``local:N`` processes, connected until ``close``."""
-
-    in_process = False
 
     def __init__(self, address: str) -> None:
         self._address = address

@@ -36,7 +36,7 @@ class Executor(Protocol):
     """Computes tasks. It does not affect the numbers, and starts its workers on first use."""
 
     # True if the computation itself runs, not a copy of it.
-    in_process: bool
+    in_process: bool = False
 
     def check(self) -> None:
         """Raise :class:`InputError` if no scheduler answers at the address."""
@@ -53,7 +53,7 @@ class Executor(Protocol):
         """End the workers."""
 
 
-class Threads:
+class Threads(Executor):
     """Threads of this process (default: one for each usable core)."""
 
     in_process = True
@@ -61,15 +61,9 @@ class Threads:
     def __init__(self, count: int | None = None) -> None:
         self._count = count
 
-    def check(self) -> None:
-        """Do nothing."""
-
     def run(self, computation: Computation, tasks: Iterable[Any]) -> Generator[tuple[Any, Results], None, None]:
         """Yield ``(task, results)`` in the order of completion."""
         return run_threads(tasks, computation.compute, self._count or usable_cores())
-
-    def close(self) -> None:
-        """Do nothing: the next run uses the same threads."""
 
 
 def run_threads(

@@ -23,7 +23,7 @@ _ROOT = Path(drivetrain_jax.__file__).parent
 _ENGINE = ("runs/grid.py", "runs/plan.py", "runs/kernel.py")
 # A source file of points that are evaluated from an atlas, and of no others.
 EVALUATES_ATLAS = "runs/through_atlas.py"
-ATLAS_SOURCES = ("atlas/floquet.py", "runs/atlas_choice.py", "runs/rounds.py", EVALUATES_ATLAS)
+ATLAS_SOURCES: tuple[str, ...] = ("atlas/floquet.py", "runs/atlas_choice.py", "runs/rounds.py", EVALUATES_ATLAS)
 # Packages whose sources affect the numbers.
 _NUMERIC = ("drivetrain_jax._quantities", "drivetrain_jax.systems", "drivetrain_jax.analysis", "drivetrain_jax.atlas")
 

@@ -39,17 +39,17 @@ class Route(Protocol):
     """The way from a job to its result, chosen once by :func:`~drivetrain_jax.runs.resolve.resolve`."""
 
     # Source files that the route runs beside those of every job.
-    sources: tuple[str, ...]
+    sources: tuple[str, ...] = ()
     # True if each point is solved by itself: results can be shown, reused and written point by point.
-    is_pointwise: bool
+    is_pointwise: bool = False
 
     def total(self, job: Job, done: int) -> int:
-        """Number of results; ``done`` of them are there."""
-        ...
+        """Number of results, of which ``done`` are there."""
+        return done
 
     def bytes_needed(self, job: Job, on_disk: bool) -> int:
-        """Least memory of a run."""
-        ...
+        """Least memory of a run; 0 if it cannot be predicted."""
+        return 0
 
     def progress(self, job: Job) -> Progress:
         """The counts before a run."""
@@ -57,15 +57,15 @@ class Route(Protocol):
 
     def counts(self, part: Part) -> bool:
         """True if the chunks of a part count as done."""
-        ...
+        return True
 
     def rearranged(self, job: Job, path: Path) -> list[str]:
         """Names of the variables of the result at ``path`` whose layout differs from that of the job."""
-        ...
+        return []
 
     def common_points(self, job: Job, path: Path) -> Source | NotReusable | None:
         """Points of the job in the result at ``path``, the reason why it has none, or None for a result without points."""
-        ...
+        return None
 
     def in_memory(self, job: Job, work: Work, progress: Progress) -> Labelled:
         """The result."""

@@ -17,7 +17,8 @@ from drivetrain_jax.runs.assemble import failures
 from drivetrain_jax.runs.explain import differences
 from drivetrain_jax.runs.growing import NO_REUSE, Damaged, NotReusable, ReusedPoints, Source, combined, find
 from drivetrain_jax.runs.job import Job
-from drivetrain_jax.runs.sinks import Sink, make_sink
+from drivetrain_jax.runs.sink import Sink
+from drivetrain_jax.runs.sinks import make_sink
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.files import behind_link
 

@@ -14,24 +14,19 @@ from typing import Any
 
 from drivetrain_jax._errors import RetryableError
 from drivetrain_jax.runs import worker
-from drivetrain_jax.runs.executor import IN_FLIGHT, Computation, Results
+from drivetrain_jax.runs.executor import IN_FLIGHT, Computation, Executor, Results
 from drivetrain_jax.runs.worker import Parcel
 
 # Number of crashes after which a task is given up.
 ATTEMPTS = 3
 
 
-class Processes:
+class Processes(Executor):
     """Spawned processes, each on one core. They stay for the next run until ``close``, or until this process ends."""
-
-    in_process = False
 
     def __init__(self, count: int) -> None:
         self._count = count
         self._slots: list[_Slot] = []
-
-    def check(self) -> None:
-        """Do nothing."""
 
     def run(self, computation: Computation, tasks: Iterable[Any]) -> Generator[tuple[Any, Results | None], None, None]:
         """Yield ``(task, results)`` in the order of completion; results are None for a task that crashes every process.

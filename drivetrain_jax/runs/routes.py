@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from pathlib import Path
 
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.analysis.atlas.solves import PROPAGATOR
 from drivetrain_jax.runs.assemble import Table, bytes_per_point, failures, labelled
 from drivetrain_jax.runs.growing import NO_REUSE, NotReusable, ReusedPoints, Source, find, remaining
-from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.job import Job, Route
 from drivetrain_jax.runs.layout import rearranged
 from drivetrain_jax.runs.work import Progress, Work
 from drivetrain_jax.store.chunks import Part
@@ -17,17 +16,14 @@ from drivetrain_jax.store.consolidate import ResultFile
 from drivetrain_jax.store.schema import Labelled
 
 
-class PointsRoute(ABC):
-    """A route to values at points; see :class:`~drivetrain_jax.runs.job.Route`."""
+class PointsRoute(Route):
+    """A route to values at points."""
 
-    sources: tuple[str, ...] = ()
-    is_pointwise = False
-
-    @abstractmethod
     def fill(
         self, job: Job, table: Table, work: Work, progress: Progress, reused: ReusedPoints
     ) -> dict[str, str | int]:
         """Fill all points of ``job`` into ``table``; returns attributes of the result."""
+        raise NotImplementedError
 
     def total(self, job: Job, done: int) -> int:
         """Number of points."""

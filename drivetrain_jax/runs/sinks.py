@@ -1,9 +1,9 @@
-"""Sinks: forms in which a result is written. One HDF5 file, or a Zarr store."""
+"""The HDF5 sink, and the choice between that and a Zarr store."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.runs.executor import Executor
 from drivetrain_jax.runs.growing import NotReusable, ReusedPoints, Source
 from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.sink import Sink
 from drivetrain_jax.runs.work import Progress, Report, Work
 from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
@@ -20,79 +21,23 @@ from drivetrain_jax.store.consolidate import read_attribute, read_variable
 ZARR = "zarr"
 
 
-class Sink(Protocol):
-    """Writes the result of a job to a path, and knows the result that is there."""
-
-    store: str
-
-    @property
-    def held(self) -> Path:
-        """Path of the present result."""
-        ...
-
-    @property
-    def written(self) -> int | None:
-        """Time at which the present result was written, by the clock of its file system."""
-        ...
-
-    def check_place(self) -> None:
-        """Raise :class:`InputError` if something else is at the path."""
-
-    def check_job(self, job: Job) -> None:
-        """Raise :class:`InputError` if the result of ``job`` cannot be written."""
-
-    def check_reuse(self) -> None:
-        """Raise :class:`InputError` if points of other results cannot be reused."""
-
-    def attribute(self, name: str) -> Any:
-        """A global attribute of the present result."""
-        ...
-
-    def digest(self) -> Any:
-        """Digest of the present result; None if that is not a result."""
-        ...
-
-    def rearranged(self, job: Job) -> list[str]:
-        """Names of the variables of the present result whose layout differs from that of ``job``."""
-        ...
-
-    def common_points(self, job: Job) -> Source | NotReusable | None:
-        """Points of ``job`` in the present result, or the reason why it has none."""
-        ...
-
-    def outcomes(self) -> np.ndarray:
-        """Outcomes of all points of the present result."""
-        ...
-
-    def write(
-        self, job: Job, executor: Executor, report: Report | None, progress: Progress, reused: ReusedPoints
-    ) -> None:
-        """Write the result from the points ``reused``, stored work, and newly computed chunks."""
-
-
-class Hdf5Sink:
+class Hdf5Sink(Sink):
     """The result as one netCDF4/HDF5 file, which the driver writes."""
 
     store = "hdf5"
 
     def __init__(self, out: Path, parts: PartsFolder) -> None:
-        self.held, self._parts = out, parts
+        self._out, self._parts = out, parts
 
     @property
-    def written(self) -> int | None:
-        """Time at which the present result was written, by the clock of its file system."""
-        return self.held.stat().st_mtime_ns if self.held.exists() else None
+    def held(self) -> Path:
+        """Path of the result."""
+        return self._out
 
     def check_place(self) -> None:
         """Raise :class:`InputError` if the path is a folder."""
         if self.held.is_dir():
             raise InputError(f"out = {str(self.held)!r}: is a folder; allowed is the path of a file")
-
-    def check_job(self, job: Job) -> None:
-        """Do nothing: a file holds every result."""
-
-    def check_reuse(self) -> None:
-        """Do nothing."""
 
     def attribute(self, name: str) -> Any:
         """A global attribute of the present result."""
@@ -101,7 +46,7 @@ class Hdf5Sink:
     def digest(self) -> Any:
         """Digest of the present result."""
         try:
-            return self.attribute("digest")
+            return super().digest()
         except InputError:
             what = "not a readable netCDF4/HDF5 file; allowed is a new file or a result of drivetrain_jax"
             raise InputError(f"out = {str(self.held)!r}: {what}") from None

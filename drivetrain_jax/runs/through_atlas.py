@@ -33,7 +33,7 @@ Results = Mapping[str, np.ndarray]
 class ThroughAtlas(PointsRoute):
     """Builds an atlas over ``ranges`` and evaluates it; points that it does not cover are solved."""
 
-    sources: tuple[str, ...] = ATLAS_SOURCES
+    sources = ATLAS_SOURCES
 
     def __init__(self, ranges: Ranges, max_solves: int | None) -> None:
         self._ranges, self._max_solves = ranges, max_solves

@@ -31,6 +31,7 @@ from drivetrain_jax.runs.pending import PENDING, with_pending
 from drivetrain_jax.runs.plan import Chunk
 from drivetrain_jax.runs.scene import result_variables
 from drivetrain_jax.runs.shard_writer import PART, SECONDS, Assembly, Batch, ShardWriter, joined_part, points_of
+from drivetrain_jax.runs.sink import Sink
 from drivetrain_jax.runs.work import Progress, Report
 from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
@@ -43,8 +44,8 @@ _MOST_CHUNKS, _FEWEST_BATCHES = 64, 8
 _INTERVAL, _RATIO = 2.0, 20.0
 
 
-class ZarrSink:
-    """The result as a Zarr store; see :class:`~drivetrain_jax.runs.sinks.Sink`."""
+class ZarrSink(Sink):
+    """The result as a Zarr store. Its points are not reused, and checksums cover its layout."""
 
     store = "zarr"
 
@@ -83,17 +84,6 @@ class ZarrSink:
     def attribute(self, name: str) -> Any:
         """A global attribute of the present result."""
         return zarr_store.attributes(self.held).get(name)
-
-    def digest(self) -> Any:
-        """Digest of the present result."""
-        return self.attribute("digest")
-
-    def rearranged(self, job: Job) -> list[str]:
-        """Nothing: checksums cover the layout of a store."""
-        return []
-
-    def common_points(self, job: Job) -> None:
-        """Nothing: points of a store are not reused."""
 
     def outcomes(self) -> np.ndarray:
         """Outcomes of all points of the present result."""
