@@ -11,7 +11,6 @@ from drivetrain_jax.atlas import tips as naming
 from drivetrain_jax.atlas.boundaries import boundaries
 from drivetrain_jax.atlas.criteria import Criteria, invariants
 from drivetrain_jax.atlas.exclusion import critical_points
-from drivetrain_jax.atlas.following import follow_tips
 from drivetrain_jax.atlas.growth import growth
 from drivetrain_jax.atlas.patches import patches_of
 from drivetrain_jax.atlas.roots import on_line, roots
@@ -324,22 +323,15 @@ def test_limits_without_damping_allow_for_a_loose_atlas():
     assert limiting.sum() > 500 and (~limiting).sum() > 100
 
 
-def test_tips_followed_through_another_parameter():
+def test_the_gradient_of_a_tip():
+    """At a tip the radius does not vary along the speed, so that ``d beta/d mu = -rho_mu/rho_beta``."""
     atlas = cardan_atlas({"beta": (0.0, 0.7), "Omega": (0.65, 1.5), "mu": (1.0, 1.1)}, 1e-12).atlas
     values = np.linspace(1.0, 1.1, 3)
-    paths = {path.tip.name: path for path in follow_tips(atlas, CARDAN, "mu", values)}
-    assert list(paths) == ["S21", "H21", "C+1"]
-    last = {tip.name: tip for tip in find_tips(atlas.slice({"mu": 1.1}), CARDAN).tips}
-    for name, path in paths.items():
-        for axis in ("beta", "Omega"):
-            assert path.points[axis][-1] == pytest.approx(last[name].point[axis], abs=1e-8)
-    # The gradient of a tip: at the tip the radius does not vary along the speed.
-    start = {axis: paths["S21"].points[axis][0] for axis in ("beta", "Omega")}
-    slopes = radius_gradient(CARDAN, {**BASE, **start, "mu": 1.0})
-    slope = -slopes["mu"] / slopes["beta"]
-    mu = values - 1
-    difference = np.polyfit(mu, paths["S21"].points["beta"], 2)[1]
-    assert slope == pytest.approx(difference, rel=2e-2)
+    found = [{t.name: t.point for t in find_tips(atlas.slice({"mu": mu}), CARDAN).tips} for mu in values]
+    assert list(found[0]) == ["S21", "H21", "C+1"]
+    slopes = radius_gradient(CARDAN, {**BASE, **found[0]["S21"], "mu": 1.0})
+    difference = np.polyfit(values - 1, [tips["S21"]["beta"] for tips in found], 2)[1]
+    assert -slopes["mu"] / slopes["beta"] == pytest.approx(difference, rel=2e-2)
 
 
 def test_gradients_of_the_radius():
@@ -368,16 +360,6 @@ def test_gradient_at_multipliers_equal_to_rounding(inside, exists):
 def test_no_gradient_of_a_radius_below_the_smallest_number():
     point = {**BASE, "zeta": 1.0, "gamma": 1.0, "beta": 0.3, "Omega": 0.001}
     assert radius_gradient(CARDAN, point) is None
-
-
-def test_what_cannot_be_followed_is_said(chart):
-    for parameter, values, error, message in (
-        ("mu", [], ValueError, r"^values = \[\]: allowed is one value or more$"),
-        ("mu", [1.0], KeyError, "mu: the atlas has beta, Omega"),
-        ("beta", [0.1, 1.6], ValueError, "^parameters = Omega: allowed are two, one of them Omega$"),
-    ):
-        with pytest.raises(error, match=message):
-            follow_tips(chart.atlas, CARDAN, parameter, values)
 
 
 def test_with_little_damping_points_in_a_tongue_bound_nothing():
