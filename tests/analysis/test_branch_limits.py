@@ -1,6 +1,5 @@
 """A frequency at which the branch has more motions than are given says so, and only that one."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,8 +10,8 @@ from drivetrain_jax.analysis.frequency_response import analysis as frequency_res
 from drivetrain_jax.analysis.frequency_response import harmonic_branch, harmonic_response
 from drivetrain_jax.analysis.impacts import exact_branch
 from drivetrain_jax.analysis.impacts.branch_sections import distinct
-from drivetrain_jax.analysis.numerics.kernels import options_for_few
 from drivetrain_jax.systems import rattle
+from tests.quick_jit import quick_jit
 
 # Of Table 1: at .8 there are three motions.
 OMEGAS = np.array([0.65, 0.8, 0.95])
@@ -26,7 +25,7 @@ def branch(method):
     request = Request(("branch_u_max",), method, OPTIONS[method])
     solve = frequency_response.ANALYSIS.solvers(rattle.Rattle, request)[0].solve
     values = rattle.PRESETS["table1"] | {"omega": OMEGAS}
-    found = jax.jit(lambda: solve(values, jnp.asarray(1)), compiler_options=options_for_few())()
+    found = quick_jit(lambda: solve(values, jnp.asarray(1)))()
     return np.isfinite(found["branch_u_max"]).sum(axis=1), np.asarray(found["outcome"])
 
 

@@ -14,8 +14,8 @@ from scipy.integrate import quad, solve_ivp
 
 from drivetrain_jax.analysis.frequency_response import closed_form_response, describing_function, multiple_scales
 from drivetrain_jax.analysis.numerics.amplitude_roots import follow, refined
-from drivetrain_jax.analysis.numerics.kernels import options_for_few
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
+from tests.quick_jit import quick_jit
 
 TABLE1 = PRESETS["table1"] | {"omega": 1.0}
 MODEL = Rattle.models["basins"].build(TABLE1)
@@ -51,7 +51,7 @@ def compiled(method: str, omegas: tuple[float, ...], shape: tuple[int, ...], fit
         model = Rattle.models["basins"].build(values | {"omega": np.array(omegas)})
         return closed_form_response.response(model, method, fit_range, shape, outputs)
 
-    return jax.jit(run, compiler_options=options_for_few())
+    return quick_jit(run)
 
 
 def solve(method: str, omegas=OMEGAS, cases=CASES, fit_range: float | None = None) -> dict[str, np.ndarray]:

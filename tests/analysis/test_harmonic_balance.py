@@ -18,6 +18,7 @@ from drivetrain_jax.analysis.frequency_response.harmonic_stability import half_t
 from drivetrain_jax.analysis.frequency_response.harmonic_sweep import settle
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
+from tests.quick_jit import quick_jit
 
 TABLE1 = PRESETS["table1"]
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "rattle.json").read_text())
@@ -45,7 +46,7 @@ def swept():
             Rattle.models["basins"].build(values | {"omega": OMEGAS}), hb.Basis(7), (len(CASES),), OUTPUTS
         )
 
-    return {name: np.asarray(value) for name, value in jax.jit(run)(lanes(CASES)).items()}
+    return {name: np.asarray(value) for name, value in quick_jit(run)(lanes(CASES)).items()}
 
 
 def linear(values, omega):
@@ -75,7 +76,7 @@ def test_error_falls_with_the_harmonics():
     for harmonics in (1, 3, 7, 15, 31):
         basis = hb.Basis(harmonics)
         start = jnp.zeros((basis.size, 1)).at[0].set(0.06).at[1].set(0.3)
-        found = jax.jit(lambda x, basis=basis: hb.balance(model, basis, x, jnp.array([0.7])))(start)
+        found = quick_jit(lambda x, basis=basis: hb.balance(model, basis, x, jnp.array([0.7])))(start)
         assert bool(found.converged[0])
         fine = hb.Basis(harmonics, 1, 20_000).values @ np.asarray(found.x[:, 0])
         errors.append(abs(fine.max() - case["max"]))
@@ -127,7 +128,7 @@ def test_folds_of_the_branch():
     model, basis = model_of(({},), 0.7), hb.Basis(15)
     start = jnp.zeros((basis.size, 1)).at[0].set(0.06).at[1].set(0.3)
 
-    @jax.jit
+    @quick_jit
     def follow(x):
         begun = hb.balance(model, basis, x, jnp.array([0.7])).x
         return trace(model, basis, begun, 0.7, 1.0, jnp.array([0.2]))
@@ -148,7 +149,7 @@ def test_branch_passes_contacts_that_come_and_go(begin, end):
     """Seven harmonics have several folds near .12, where short contacts appear."""
     model, basis = model_of(({},), begin), hb.Basis(7)
 
-    @jax.jit
+    @quick_jit
     def follow():
         x = settle(model, basis, jnp.zeros((basis.size, 1)), jnp.array([begin]))
         return trace(model, basis, hb.balance(model, basis, x, jnp.array([begin])).x, begin, end, jnp.array([0.2]))
@@ -177,7 +178,7 @@ def test_one_harmonic_is_the_describing_function():
         ours = harmonic_response.response(model, hb.Basis(1, 1, 4096), (3,), ("u_max", "u_min"))
         return ours, closed_form(model, "describing_function", None, (3,), ("branch_u_max", "branch_u_min"))
 
-    ours, closed = jax.jit(run)(lanes(cases))
+    ours, closed = quick_jit(run)(lanes(cases))
     for name in ("u_max", "u_min"):
         distance = np.abs(np.asarray(closed[f"branch_{name}"]) - np.asarray(ours[name])[:, :1])
         assert np.nanmin(distance, axis=1).max() < 2e-9
@@ -194,7 +195,7 @@ def test_any_number_of_samples(samples):
             for count in (samples, 1024)
         ]
 
-    ours, fine = jax.jit(run)(lanes(({},)))
+    ours, fine = quick_jit(run)(lanes(({},)))
     np.testing.assert_allclose(ours["u_max"], fine["u_max"], rtol=1e-5)
     np.testing.assert_allclose(ours["spectral_radius"], fine["spectral_radius"], rtol=1e-3)
 
@@ -211,7 +212,7 @@ def test_spectral_radius_is_over_the_period_of_the_motion():
             ("spectral_radius", "u_max"),
         )
 
-    one, two, four = (jax.jit(lambda values, m=m: run(values, m))(lanes(({},))) for m in (1, 2, 4))
+    one, two, four = (quick_jit(lambda values, m=m: run(values, m))(lanes(({},))) for m in (1, 2, 4))
     np.testing.assert_allclose(two["u_max"][2:], one["u_max"][2:], rtol=1e-6)
     for kept in (two, four):
         np.testing.assert_allclose(kept["spectral_radius"][2:], one["spectral_radius"][2:], rtol=1e-5)
@@ -225,7 +226,7 @@ def test_subharmonics_follow_a_doubled_period():
         model = Rattle.models["basins"].build(values | {"omega": np.array([0.44, 0.45])})
         return harmonic_response.response(model, hb.Basis(7, 2), (1,), ("u_max", "u_min", "stability"))
 
-    found = jax.jit(run)(lanes(({},)))
+    found = quick_jit(run)(lanes(({},)))
     np.testing.assert_allclose(
         [found["u_max"][1, 0, 0], found["u_min"][1, 0, 0]], [case["max"], case["min"]], atol=1e-3
     )
@@ -241,7 +242,7 @@ def test_a_lane_does_not_depend_on_the_others():
             Rattle.models["basins"].build(values | {"omega": omegas}), hb.Basis(3), (2,), ("u_max", "u_min", "residual")
         )
 
-    run = jax.jit(run)
+    run = quick_jit(run)
     ours, others = run(lanes(({}, {}))), run(lanes(({}, {"c": 0.001, "k": 30.0})))
     for name, value in ours.items():
         np.testing.assert_array_equal(value[..., 0], others[name][..., 0], err_msg=name)
@@ -258,7 +259,7 @@ def test_what_lies_between_two_folds_is_a_saddle(harmonics):
         model = Rattle.models["basins"].build(values | {"omega": omegas})
         return harmonic_response.response(model, hb.Basis(harmonics, 1, 256), (2,), names)
 
-    found = jax.jit(run)(lanes(cases))
+    found = quick_jit(run)(lanes(cases))
     three = np.isfinite(found["branch_u_max"]).sum(axis=1) == 3
     assert (np.asarray(found["outcome"]) == 0).all()
     assert three.sum() > 15
