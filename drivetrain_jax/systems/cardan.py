@@ -22,6 +22,7 @@ from drivetrain_jax._quantities import Component, Dimension
 from drivetrain_jax.systems._base import Family, Number, Resonances, System, Values, numeric, parameter, serves
 from drivetrain_jax.systems._rows import Rows
 from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness
+from drivetrain_jax.systems.cardan_clock import clock, clock_basis, decay_steps, oscillation_steps
 from drivetrain_jax.systems.cardan_units import PhysicalShaft
 
 if TYPE_CHECKING:
@@ -48,49 +49,6 @@ def speed_ratio(beta: Any, phi: Any) -> tuple[Array, Array, Array]:
     d = along**2 + (c * across) ** 2
     sine, cosine = 2 * across * along, (along - across) * (along + across)
     return c / d, c * s2 * sine / d**2, c * s2 * (2 * cosine / d**2 + 2 * s2 * sine**2 / d**3)
-
-
-def _clock_basis(psi: Any) -> tuple[Array, Array]:
-    return jnp.cos(2 * psi), jnp.sin(2 * psi)
-
-
-def _clock(cos2psi: Any, sin2psi: Any, beta: Any) -> tuple[Any, Any, Any]:
-    """``eta``, ``dtau/dpsi`` and ``deta/dpsi`` in the clock psi, eqs (11)-(12).
-
-    Two Landen steps lead from tau to psi: tan(chi) = sqrt(cos beta) tan(tau) spreads the poles of eta near pi/2 over
-    0 and pi/2, tan(2 chi) = kappa tan(2 psi), kappa^2 = 1 - r^2, r = tan(beta/2)^2, moves these away from the axis.
-    """
-    c, r = jnp.cos(beta), jnp.tan(beta / 2) ** 2
-    # 1 - r = 2 c/(1 + c), and 1 -+ r cos(2 chi) below are sums of positive terms: no cancellation next to pi/2.
-    one_minus_r = 2 * c / (1 + c)
-    kappa2 = one_minus_r * (1 + r)
-    root = jnp.sqrt(cos2psi**2 + kappa2 * sin2psi**2)
-    # root (1 + |cos 2chi|) and root (1 - |cos 2chi|), then root (1 - r cos 2chi) and root (1 + r cos 2chi).
-    large = root + jnp.abs(cos2psi)
-    small = kappa2 * sin2psi**2 / large
-    first_half = cos2psi > 0
-    minus = one_minus_r * root + r * jnp.where(first_half, small, large)
-    plus = one_minus_r * root + r * jnp.where(first_half, large, small)
-    # One division for eta = minus/plus, w = dtau/dpsi and deta/dpsi.
-    inverse = 1 / (minus * plus * root)
-    inverse_plus = minus * root * inverse
-    eta = minus * inverse_plus
-    w = 2 * jnp.sqrt(c * kappa2) / (1 + c) * plus * inverse
-    return eta, w, 4 * r * kappa2 * sin2psi * inverse_plus * minus * inverse
-
-
-def _oscillation_steps(xp: Any, phase: Any, sharpness: Any, digits: float) -> Any:
-    x, bend = xp.log(phase), 2.57
-    capped = xp.minimum(x, bend)
-    # Beyond 1e-10 rounding dominates, and so many steps would move points to the implicit scheme.
-    power = 1.13 + 0.01 * digits if digits <= 1 else 1.1
-    log_steps = 0.59 * capped + 0.1 * capped**2 + power * (x - capped)
-    return xp.exp(log_steps + (0.59 - 0.13 * capped - 0.034 * sharpness) * sharpness + 1.7 + 0.26 * digits)
-
-
-def _decay_steps(xp: Any, decay: Any, digits: float) -> Any:
-    accurate = math.exp(1.35 + 0.36 * digits) * decay ** (0.79 - 0.027 * digits)
-    return xp.maximum(accurate, decay / 3.2)
 
 
 def natural_frequencies(mu: Any, gamma: Any) -> np.ndarray:
@@ -250,7 +208,7 @@ class Cardan(System):
         """``d(q, P)/dpsi = H (q, P)`` in absolute coordinates, P = Omega (q' + C0 q/2), in the clock psi, eqs (9)-(10)."""
         zeta, alpha, mu = self.zeta, self.alpha, self.mu
         s, g = 1 / self.Omega, 1 / jnp.sqrt(self.gamma)
-        eta, w, deta = _clock(cos2psi, sin2psi, self.beta)
+        eta, w, deta = clock(cos2psi, sin2psi, self.beta)
         w11, w12, w22 = 1 + alpha * eta**2, -alpha * g * eta, alpha * g**2
         v11, v12, v22 = 1 + mu * eta**2, -mu * g * eta, mu * g**2
         sw = s * w
@@ -271,7 +229,7 @@ class Cardan(System):
     def _stiff_rows(self, cos2psi: Any, sin2psi: Any) -> Rows:
         """``d(x, v)/dpsi`` of the twists x = (theta_1, sqrt(mu) theta_2) and v = Omega q', in the clock psi, eq. (13a)."""
         alpha, root_mu, g = self.alpha, jnp.sqrt(self.mu), 1 / jnp.sqrt(self.gamma)
-        eta, w, deta = _clock(cos2psi, sin2psi, self.beta)
+        eta, w, deta = clock(cos2psi, sin2psi, self.beta)
         sw, damping = w / self.Omega, 2 * self.zeta
         n21, n22, d = -root_mu * eta, root_mu * g, sw * damping
         # The joint moves the second twist when it turns the first one, and the damper feels it.
@@ -332,8 +290,8 @@ class Cardan(System):
         phase = math.pi / 2 / speed * (rates[0] + 2 * rates[1] + rates[2]) / 4
         digits = -math.log10(rtol) - 9
         with np.errstate(over="ignore"):
-            oscillation = _oscillation_steps(xp, phase, -xp.log(c), digits)
-            return xp.hypot(oscillation, _decay_steps(xp, self._decay(), digits)) + 2
+            oscillation = oscillation_steps(xp, phase, -xp.log(c), digits)
+            return xp.hypot(oscillation, decay_steps(xp, self._decay(), digits)) + 2
 
     def _decay(self) -> np.ndarray:
         """The largest rate of decay times half the period."""
@@ -363,8 +321,8 @@ class Cardan(System):
 
         exact = self.log_determinant
         # The reversor exchanges q and P: time reversal about the middle of the half period.
-        reduced = LinearPeriodic(self._reduced_rows, math.pi / 2, _clock_basis, SWAP, exact)
-        stiff = LinearPeriodic(self._stiff_rows, math.pi / 2, _clock_basis, None, exact, self._stiff_reversal)
+        reduced = LinearPeriodic(self._reduced_rows, math.pi / 2, clock_basis, SWAP, exact)
+        stiff = LinearPeriodic(self._stiff_rows, math.pi / 2, clock_basis, None, exact, self._stiff_reversal)
         return FloquetModel(
             natural=LinearPeriodic(self.linear_rows, math.pi, log_determinant=exact),
             reduced=reduced,

@@ -12,7 +12,12 @@ import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 
-from drivetrain_jax.analysis.frequency_response import closed_form_response, describing_function, multiple_scales
+from drivetrain_jax.analysis.frequency_response import (
+    closed_form_response,
+    describing_function,
+    equivalent_stiffness,
+    multiple_scales,
+)
 from drivetrain_jax.analysis.numerics.amplitude_roots import follow, refined
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
 from tests.quick_jit import quick_jit
@@ -202,7 +207,7 @@ def test_describing_function_against_quadrature():
     angle = 2 * np.pi * (np.arange(200_000) + 0.5) / 200_000
     force = np.asarray(MODEL.restoring(bias + amplitude * np.cos(angle)))
     assert float(point.stiffness) == pytest.approx(2 * np.mean(force * np.cos(angle)) / amplitude, rel=1e-8)
-    mean = describing_function._imbalance(MODEL, jnp.array(amplitude), jnp.array(bias))[0] + MODEL.B0 / MODEL.stiffness
+    mean = equivalent_stiffness.imbalance(MODEL, jnp.array(amplitude), jnp.array(bias))[0] + MODEL.B0 / MODEL.stiffness
     assert float(mean) == pytest.approx(force.mean(), rel=1e-8)
     a = 0.4
     step = 1e-5

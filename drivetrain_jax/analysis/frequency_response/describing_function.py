@@ -1,7 +1,7 @@
 """Bias and fundamental of the oscillator with play, ``u = m + A cos(omega t - phi)``, by its describing function.
 
-With ``p = (b - m)/A``, ``q = (b + m)/A`` and the moments h0, h1 of a clipped cosine (:func:`moments`), balance of mean
-and fundamental gives, in units of ``k' = k/I`` and ``c' = c/I``,
+With ``p = (b - m)/A``, ``q = (b + m)/A`` and the moments h0, h1 of a clipped cosine (``moments`` in
+``equivalent_stiffness.py``), balance of mean and fundamental gives, in units of ``k' = k/I`` and ``c' = c/I``,
 
     alpha m + (1 - alpha) A [h0(p) - h0(q)] = B0/k'                         the bias m(A), monotone in m
     kappa(A) = k' [alpha + (1 - alpha) (h1(p) + h1(q))]                     the equivalent stiffness
@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from drivetrain_jax.analysis.frequency_response.equivalent_stiffness import Point, bias_of, improved, point_at
 from drivetrain_jax.analysis.numerics.amplitude_roots import bisect, first_marks, sign_changes, take
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
@@ -33,73 +34,9 @@ from drivetrain_jax.systems import PiecewiseLinearOscillator
 _NODES, _NEAR, _FAR, _HUGE = 320, 1e-9, 1e4, 1e9
 _FOLDS_PER_ARM = 4
 MOST_ROOTS = 5
-_BIAS_STEPS, _HALVINGS, _POLISH_STEPS = 24, 20, 8
+_HALVINGS, _POLISH_STEPS = 20, 8
 _TINY = 1e-300
 _ENDS = (slice(None, -1), slice(1, None))
-
-
-class Point(NamedTuple):
-    """Bias ``m``, equivalent stiffness ``kappa`` and its derivative with respect to the amplitude."""
-
-    bias: Array
-    stiffness: Array
-    slope: Array
-
-
-def moments(x: Array) -> tuple[Array, Array]:
-    """Mean h0 and half the fundamental h1 of the part of a cosine above ``x``.
-
-    ``h0 = (sqrt(1 - x^2) - x acos x)/pi`` (``-x`` for x <= -1, 0 for x >= 1), ``h1 = (acos x - x sqrt(1 - x^2))/pi``.
-    """
-    inside = jnp.clip(x, -1.0, 1.0)
-    root, angle = jnp.sqrt(1 - inside**2), jnp.arccos(inside)
-    return (root - inside * angle) / jnp.pi + jnp.maximum(-1 - x, 0.0), (angle - inside * root) / jnp.pi
-
-
-def _imbalance(model: PiecewiseLinearOscillator, amplitude: Array, bias: Array) -> tuple[Array, Array]:
-    """Mean force less mean drive over k', and its derivative with respect to the bias (not negative)."""
-    p, q = (model.b - bias) / amplitude, (model.b + bias) / amplitude
-    beyond, before = moments(p)[0], moments(q)[0]
-    force = model.alpha * bias + (1 - model.alpha) * amplitude * (beyond - before)
-    share = (jnp.arccos(jnp.clip(p, -1.0, 1.0)) + jnp.arccos(jnp.clip(q, -1.0, 1.0))) / jnp.pi
-    return force - model.B0 / model.stiffness, model.alpha + (1 - model.alpha) * share
-
-
-def _improved(model: PiecewiseLinearOscillator, amplitude: Array, bias: Array) -> Array:
-    """One Newton step of the bias; where the mean force does not depend on it (free within the play) it stays."""
-    value, slope = _imbalance(model, amplitude, bias)
-    return bias - jnp.where(slope > 0, value / jnp.where(slope > 0, slope, 1.0), 0.0)
-
-
-def bias_of(model: PiecewiseLinearOscillator, amplitude: Array) -> Array:
-    """The bias at which the mean force balances the mean drive: bisection and Newton steps in turn."""
-    static, reach = model.B0 / model.stiffness, jnp.abs(1 - model.alpha) * model.b
-    reach = reach + jnp.zeros_like(amplitude)
-
-    def step(_: int, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        low, high, guess = state
-        for trial in (guess, (low + high) / 2):
-            value = _imbalance(model, amplitude, trial)[0]
-            low = jnp.where((value <= 0) & (trial > low), trial, low)
-            high = jnp.where((value >= 0) & (trial < high), trial, high)
-        return low, high, jnp.clip(_improved(model, amplitude, (low + high) / 2), low, high)
-
-    low, high, guess = jax.lax.fori_loop(0, _BIAS_STEPS, step, (static - reach, static + reach, static + 0 * reach))
-    return jnp.clip(_improved(model, amplitude, guess), low, high)
-
-
-def point_at(model: PiecewiseLinearOscillator, amplitude: Array, bias: Array) -> Point:
-    """Equivalent stiffness at a balanced ``bias``, and its total derivative along the bias curve m(A)."""
-    p, q = (model.b - bias) / amplitude, (model.b + bias) / amplitude
-    inside = tuple(jnp.clip(x, -1.0, 1.0) for x in (p, q))
-    root_p, root_q = (jnp.sqrt(1 - x**2) for x in inside)
-    soft = 1 - model.alpha
-    stiffness = model.stiffness * (model.alpha + soft * (moments(p)[1] + moments(q)[1]))
-    support = _imbalance(model, amplitude, bias)[1]
-    drift = soft * (root_q - root_p) / jnp.pi / jnp.where(support > 0, support, 1.0)
-    turn = root_p * (drift + p) + root_q * (q - drift)
-    slope = model.stiffness * soft * 2 / jnp.pi * turn / amplitude
-    return Point(bias, stiffness, slope)
 
 
 def _discriminant(model: PiecewiseLinearOscillator, amplitude: Array, stiffness: Array) -> Array:
@@ -254,7 +191,7 @@ def backbone(model: PiecewiseLinearOscillator, shape: tuple[int, ...], omega: Ar
 
         def polish(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
             amplitude, bias = state
-            bias = _improved(free, amplitude, bias)
+            bias = improved(free, amplitude, bias)
             point = point_at(free, amplitude, bias)
             return jnp.clip(amplitude - (point.stiffness - omega**2) / point.slope, low, high), bias
 
@@ -325,11 +262,11 @@ def roots(model: PiecewiseLinearOscillator, bones: Skeleton, omega: Array) -> tu
 
     found = jnp.maximum(bisect(above, low, high, _HALVINGS), _TINY)
     bias = _bias_between(bones.points, mask, (found - low) / jnp.where(high > low, high - low, 1.0))
-    bias = _improved(model, found, bias)
+    bias = improved(model, found, bias)
 
     def polish(_: int, state: tuple[Array, ...]) -> tuple[Array, ...]:
         low, high, amplitude, bias = state
-        bias = _improved(model, amplitude, bias)
+        bias = improved(model, amplitude, bias)
         point = point_at(model, amplitude, bias)
         gap, half = _arm_gap(model, square, amplitude, point.stiffness, sign)
         beyond = turned * gap > 0
@@ -346,7 +283,7 @@ def roots(model: PiecewiseLinearOscillator, bones: Skeleton, omega: Array) -> tu
     exists = jnp.any(mask, axis=1) & (found < bones.limit)
     order = jnp.argsort(jnp.where(exists, found, jnp.inf), axis=0)
     found, bias, exists = (jnp.take_along_axis(part, order, axis=0) for part in (found, bias, exists))
-    point = point_at(model, found, _improved(model, found, bias))
+    point = point_at(model, found, improved(model, found, bias))
     # Without drive there is rest alone.
     driven = model.B1 != 0
     number = jnp.arange(MOST_ROOTS).reshape(-1, *(1,) * (found.ndim - 1))
