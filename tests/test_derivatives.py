@@ -3,8 +3,6 @@ of further results against differences; and where there is none."""
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import mpmath
@@ -14,14 +12,12 @@ from jax.test_util import check_grads
 from scipy.linalg import eigh
 
 import drivetrain_jax as dt
-from drivetrain_jax.analysis.numerics.kernels import options_for_few
 from tests.oracles import complex_step
 from tests.oracles.bicardan_precise_reference import determinant
 from tests.oracles.planetary_reference import matrices
+from tests.quick_jit import quick_jit
 
 POINTS = 20
-# Compilation takes longer than twenty points: without optimising.
-compiled = partial(jax.jit, compiler_options=options_for_few())
 CARDAN_NAMES = ("beta", "Omega", "zeta", "alpha", "mu", "gamma")
 TRIPOD_NAMES = ("beta", "zeta", "chi_n", "J_m", "d_A", "L_B", "G", "rho")
 RATTLE_NAMES = ("omega", "B0", "B1", "b", "c", "alpha", "k", "I")
@@ -225,7 +221,7 @@ def test_derivatives_at_random_points(case):
     """Each entry within 1e-6 of the largest logarithmic derivative of its result."""
     draw, function, oracle, names = CASES[case]
     rng, checked = np.random.default_rng(1), 0
-    jacobian = compiled(jax.jacrev(function))
+    jacobian = quick_jit(jax.jacrev(function))
     while checked < POINTS:
         system = draw(rng)
         expected = oracle(system)
@@ -296,7 +292,7 @@ FURTHER = {
 def test_derivatives_equal_differences(case):
     """Central differences of order four."""
     function, system, names, step, rtol = FURTHER[case]
-    jacobian, value_of = compiled(jax.jacrev(function))(system), compiled(function)
+    jacobian, value_of = quick_jit(jax.jacrev(function))(system), quick_jit(function)
     for name in names:
         value = system.values[name]
         f = [
@@ -309,16 +305,16 @@ def test_derivatives_equal_differences(case):
 
 
 def test_both_modes_agree():
-    check_grads(compiled(floquet_radius), (SHAFT,), order=1, modes=("fwd", "rev"), eps=1e-5)
+    check_grads(quick_jit(floquet_radius), (SHAFT,), order=1, modes=("fwd", "rev"), eps=1e-5)
 
 
 def test_where_there_is_no_derivative_there_is_none():
     """All multipliers on the unit circle; a parameter that splits a pair; a result that has no derivative at all."""
     undamped = dt.Cardan(beta=0.3, Omega=1.2, zeta=0.0, alpha=1.0, mu=1.0, gamma=100.0)
-    slopes = compiled(jax.grad(floquet_radius))(undamped)
+    slopes = quick_jit(jax.grad(floquet_radius))(undamped)
     assert all(np.isnan(x) for x in jax.tree.leaves(slopes))
     gear = dt.Planetary(planet_angle=(0.0, 2 * np.pi / 3, 4 * np.pi / 3))
-    slopes = compiled(jax.jacrev(lambda s: dt.modes(s).natural_frequency[1:3]))(gear)
+    slopes = quick_jit(jax.jacrev(lambda s: dt.modes(s).natural_frequency[1:3]))(gear)
     assert np.isnan(slopes.planet_angle[1]).all() and np.isfinite(slopes.k_p).all()
     slopes = jax.grad(lambda s: dt.modes(s, outputs=["participation"]).participation[0, 0])(gear)
     assert np.isnan(slopes.k_p)
@@ -326,7 +322,7 @@ def test_where_there_is_no_derivative_there_is_none():
 
 def test_an_oscillator_at_its_ends_has_no_derivative_by_them():
     """Without backlash, and without a spring in the gap."""
-    slopes = compiled(jax.jacrev(gears_at_work))
+    slopes = quick_jit(jax.jacrev(gears_at_work))
     found = slopes(dt.Rattle(**GEARS.values | {"b": 0.0}))
     assert np.isnan(found.b).all() and np.isfinite(found.B1).all()
     found = slopes(dt.Rattle(**GEARS.values | {"alpha": 0.0}))
