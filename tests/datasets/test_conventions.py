@@ -15,10 +15,9 @@ import pytest
 import xarray as xr
 
 import drivetrain_jax as dt
-from drivetrain_jax.runs import engine
-from drivetrain_jax.runs.assemble import result_variables
+from drivetrain_jax.runs import job
 from drivetrain_jax.runs.grid import Grid
-from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.runs.scene import Problem, result_variables
 from drivetrain_jax.store.consolidate import read_attribute
 
 SCENES = sorted((Path(__file__).parents[2] / "sweeps").glob("*.toml"))
@@ -43,20 +42,22 @@ def small(path: Path) -> dict[str, Any]:
     return scene
 
 
-def invented(scene: Scene, grid: Grid, *_: Any) -> Any:
+def invented(problem: Problem, grid: Grid, *_: Any) -> Any:
     """A kernel that solves nothing, and gives numbers of the types and shapes of the results: compiling takes minutes."""
-    sizes = SIZES | {d.name: len(d.values) for d in scene.dimensions if d.values}
+    sizes = SIZES | {d.name: len(d.values) for d in problem.dimensions if d.values}
     line = () if grid.path is None else (grid.path_length,)
 
     def kernel(columns: dict[str, np.ndarray], *_: Any) -> dict[str, np.ndarray]:
         count = len(next(iter(columns.values()))) if columns else 1
         rng, found = np.random.default_rng(1), {}
-        for variable in result_variables(scene):
+        for variable in result_variables(problem):
             shape = (count, *line, *(sizes[dim] for dim in variable.dims))
+            # Below the smallest valid value netCDF4 masks.
+            least = max(variable.lower or 0, 0)
             if np.dtype(variable.dtype).kind in "iu":
-                found[variable.name] = rng.integers(0, len(variable.flags) or 100, shape).astype(variable.dtype)
+                found[variable.name] = rng.integers(least, len(variable.flags) or 100, shape).astype(variable.dtype)
             else:
-                values = np.where(rng.random(shape) < 0.2, np.nan, rng.normal(size=shape)).astype(variable.dtype)
+                values = np.where(rng.random(shape) < 0.2, np.nan, least + rng.random(shape)).astype(variable.dtype)
                 found[variable.name] = values * (1 + 2j) if variable.dtype == "complex128" else values
         return found
 
@@ -77,7 +78,7 @@ def computed(path: Path, out: Path | None = None) -> xr.Dataset:
     scene = small(path)
     with pytest.MonkeyPatch.context() as patch:
         if scene["analysis"] != "atlas":
-            patch.setattr(engine, "kernel_of", invented)
+            patch.setattr(job, "kernel_of", invented)
         return dt.run(scene, out=out)
 
 
