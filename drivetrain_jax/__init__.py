@@ -15,9 +15,7 @@ from drivetrain_jax._errors import ChunkError, InputError
 from drivetrain_jax._registration import register_accessor
 
 if TYPE_CHECKING:
-    from drivetrain_jax.datasets.figure import plot
-    from drivetrain_jax.functions import (
-        Result,
+    from drivetrain_jax.analyses import (
         basins,
         critical_speeds,
         floquet,
@@ -29,6 +27,8 @@ if TYPE_CHECKING:
         poincare,
         steady_state,
     )
+    from drivetrain_jax.datasets.figure import plot
+    from drivetrain_jax.functions import Result
     from drivetrain_jax.runs.atlas_file import open_atlas
     from drivetrain_jax.runs.over import sweep
     from drivetrain_jax.runs.partial import open_result
@@ -54,8 +54,8 @@ _HOME = {
     "systems.planetary": ("Planetary",),
     "systems.rattle": ("Rattle",),
     "systems.tripod": ("Tripod",),
-    "functions": (
-        "Result",
+    "functions": ("Result",),
+    "analyses": (
         "basins",
         "critical_speeds",
         "floquet",

@@ -1,4 +1,4 @@
-"""The analyses as pure functions of a system: ``floquet(shaft)``, under ``jax.jit``, ``jax.vmap`` and ``jax.grad`` as well.
+"""An analysis as a pure function of a system, under ``jax.jit``, ``jax.vmap`` and ``jax.grad`` as well.
 
 A function takes one system, whose numbers may be traced, and returns a :class:`Result`, a pytree of the requested variables
 and ``outcome``. Called with concrete numbers it chooses the cheapest solver, as a scene does; traced numbers take the first
@@ -128,29 +128,20 @@ def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapp
         raise InputError(re.sub(r"^(fixed|options)\.", "", str(error))) from None
     along = analysis.path_axis(type(system), request)
     leaf = None if along is None else path_entry(values, along)
+    path = None if along is None else _path(along, leaf)
+    parameters = jax.tree.map(lambda x: None if isinstance(x, str) or x is leaf else jnp.asarray(x, float), values)
+    _check_scalars(name, parameters)
+    rest = jax.tree.map(lambda x: x if isinstance(x, str) else path if x is leaf else None, values)
+    single = along is not None and np.ndim(leaf) == 0  # pyright: ignore[reportArgumentType]
+    return _Job(analysis, type(system), request, Constants(rest), along is not None, single), parameters
 
-    def number(x: Any) -> Array | None:
-        return None if isinstance(x, str) or (along is not None and x is leaf) else jnp.asarray(x, float)
 
-    parameters = jax.tree.map(number, values)
+def _check_scalars(name: str, parameters: Any) -> None:
     for x in jax.tree.leaves(parameters):
         if x.ndim:
             raise InputError(
                 f"{name}: parameters of the shape {x.shape}; allowed is one system, or a batch under jax.vmap"
             )
-    path = None if along is None else _path(along, leaf)
-    rest = jax.tree.map(
-        lambda x: x if isinstance(x, str) else path if x is leaf and along is not None else None, values
-    )
-    job = _Job(
-        analysis,
-        type(system),
-        request,
-        Constants(rest),
-        along is not None,
-        along is not None and np.ndim(leaf) == 0,  # pyright: ignore[reportArgumentType]
-    )
-    return job, parameters
 
 
 def _path(name: str, values: Any) -> np.ndarray:
@@ -268,155 +259,3 @@ def _with_lanes(result: Array, own: int, lanes: int) -> Array:
     result = jnp.asarray(result)
     result = result if result.ndim > own else result[..., None]
     return jnp.broadcast_to(result, (*result.shape[:-1], lanes))
-
-
-@dataclass(frozen=True)
-class AnalysisFunction:
-    """The analysis ``name`` as a function, like :func:`floquet`: for the analyses of other packages."""
-
-    name: str
-
-    def __call__(self, system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
-        """The :class:`Result` for one ``system``."""
-        return analyse(self.name, system, outputs, options)
-
-
-def floquet(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
-    """Floquet stability of the equilibrium: multipliers of ``x' = A(t) x`` over one period, spectral radius and verdict.
-
-    Args:
-        system: a system with a model for it, such as ``Cardan`` or ``Tripod``; one point, or a batch under ``jax.vmap``.
-        outputs: variables wanted; default ``spectral_radius``, ``spectral_radius_error`` (absolute bound), ``verdict`` (0
-            stable, 1 unstable, 2 undecided). Also ``floquet_multiplier`` (n,), ``floquet_exponent`` (n,) [1/s],
-            ``liouville_residual``.
-        options: ``method`` ("auto", "direct", "diffrax"), ``rtol``; see ``drivetrain list cardan``.
-
-    Returns: a :class:`Result`. Differentiable: radius, multipliers and exponents; NaN where multipliers coalesce or tie.
-
-    Raises: :class:`~drivetrain_jax.InputError` for options that are unknown or out of range.
-
-    >>> import drivetrain_jax as dt
-    >>> shaft = dt.Cardan(beta=0.3, Omega=1.416, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)
-    >>> print(f"{dt.floquet(shaft).spectral_radius:.8f}")
-    1.03193549
-    """
-    return analyse("floquet", system, outputs, options)
-
-
-def forced(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
-    """Periodic response to the forcing: of the linear system, ``y0 = (I - Z)^-1 r``, and the nonlinear orbit.
-
-    Args as of :func:`floquet`. Outputs: ``periodic_state`` (4,), ``amplitude`` (2,) [rad], ``condition`` (default);
-    ``orbit_state``, ``orbit_amplitude``, ``orbit_spectral_radius``. All are differentiable.
-
-    >>> import drivetrain_jax as dt
-    >>> shaft = dt.Cardan(beta=0.3, Omega=1.0, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)
-    >>> print(dt.forced(shaft).amplitude.round(4))
-    [0.0115 0.0344]
-    """
-    return analyse("forced", system, outputs, options)
-
-
-def history(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
-    """Twist ``phi`` [rad] and ``velocity`` [rad/s] at ``times`` [s], or at ``num`` times from 0 to ``stop``.
-
-    Args as of :func:`floquet`; each output has the shape of the times and is differentiable.
-
-    >>> import drivetrain_jax as dt
-    >>> shaft = dt.Tripod(element="input", beta=0.157, zeta=0.0016)
-    >>> dt.history(shaft, stop=1e-3, num=5).phi.shape
-    (5,)
-    """
-    return analyse("history", system, outputs, options)
-
-
-def lyapunov(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
-    """Lyapunov spectrum [1/s], falling, with its standard error, the residual of the sum rule and a verdict.
-
-    Args as of :func:`floquet`; options ``standard_error``, ``max_time`` [s], ``steps``. No derivatives.
-
-    >>> import drivetrain_jax as dt
-    >>> shaft = dt.Tripod(element="input", beta=0.157, zeta=0.0016)
-    >>> dt.lyapunov(shaft, max_time=0.05).lyapunov_spectrum.shape
-    (2,)
-    """
-    return analyse("lyapunov", system, outputs, options)
-
-
-def poincare(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
-    """Poincare section: the state ``section`` (strobe, 2) at ``strobes`` periods of the excitation after ``discard`` others.
-
-    Args as of :func:`floquet`. No derivatives.
-
-    >>> import drivetrain_jax as dt
-    >>> shaft = dt.Tripod(element="input", beta=0.157, zeta=0.0016)
-    >>> dt.poincare(shaft, strobes=128, discard=10).section.shape
-    (128, 2)
-    """
-    return analyse("poincare", system, outputs, options)
-
-
-def steady_state(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
-    """Attractor of an oscillator with play: ``u_max``, ``u_min``, ``u_rms`` [m], ``period_multiple``, ``regime``, impacts.
-
-    Args as of :func:`floquet`. Extremes and means of a periodic motion are differentiable; NaN where it changes.
-
-    >>> import drivetrain_jax as dt
-    >>> gears = dt.Rattle(omega=0.7, **dt.Rattle.presets["table1"])
-    >>> print(f"{dt.steady_state(gears).u_max:.6f}")
-    0.449100
-    """
-    return analyse("steady_state", system, outputs, options)
-
-
-def frequency_response(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
-    """Response along the frequencies ``system.omega`` (L,), swept up and down: ``u_max`` (L, 2) and so on.
-
-    Args as of :func:`floquet`; the frequencies are concrete numbers. Options ``method`` ("exact", "harmonic_balance",
-    "multiple_scales", "describing_function"). No derivatives.
-
-    >>> import drivetrain_jax as dt, numpy as np
-    >>> gears = dt.Rattle(omega=np.linspace(0.5, 0.9, 3), **dt.Rattle.presets["table1"])
-    >>> dt.frequency_response(gears, method="describing_function").u_max.shape
-    (3, 2)
-    """
-    return analyse("frequency_response", system, outputs, options)
-
-
-def basins(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
-    """Shares of random initial states that lead to each attractor of an oscillator with play: ``basin_fraction`` (8,).
-
-    Args as of :func:`floquet`; options ``samples``, ``seed``, ``reach_u`` [m], ``reach_v`` [m/s]. No derivatives.
-
-    >>> import drivetrain_jax as dt
-    >>> gears = dt.Rattle(omega=0.7, **dt.Rattle.presets["table1"])
-    >>> dt.basins(gears, samples=16).basin_fraction.shape
-    (8,)
-    """
-    return analyse("basins", system, outputs, options)
-
-
-def critical_speeds(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
-    """Critical speeds ``n = 30 p/pi`` [rpm] of a stepped shaft, rising, each certified by a count.
-
-    Args as of :func:`floquet`; options ``modes`` (default 6), ``method``. Outputs ``critical_speed`` (modes,),
-    ``natural_frequency`` [Hz], ``angular_frequency`` [rad/s] and ``separation_margin`` are differentiable.
-
-    >>> import drivetrain_jax as dt
-    >>> print(dt.critical_speeds(dt.Bicardan(**dt.Bicardan.presets["paper"]), modes=2).critical_speed.round(1))
-    [ 8373.8 27007.5]
-    """
-    return analyse("critical_speeds", system, outputs, options)
-
-
-def modes(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
-    """Natural frequencies [Hz] of a planetary gear, rising, with the type of each mode.
-
-    Args as of :func:`floquet`; outputs also ``participation``, ``mode_shape``, ``kinetic_energy``. ``natural_frequency`` is
-    differentiable; NaN where a parameter splits frequencies that are equal.
-
-    >>> import drivetrain_jax as dt
-    >>> print(dt.modes(dt.Planetary()).natural_frequency[1].round(2))
-    727.27
-    """
-    return analyse("modes", system, outputs, options)

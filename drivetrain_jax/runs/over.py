@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax import functions
+from drivetrain_jax import analyses, functions
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analysis_names
@@ -66,9 +66,9 @@ def sweep(
     """
     if not isinstance(over, Mapping) or not over:
         raise InputError("over: empty; allowed are values by the name of what varies")
-    of_another_package = isinstance(function, functions.AnalysisFunction)
+    of_another_package = isinstance(function, analyses.AnalysisFunction)
     own = function.name if of_another_package else getattr(function, "__name__", "")
-    if of_another_package or (own in analysis_names() and getattr(functions, own, None) is function):
+    if of_another_package or (own in analysis_names() and getattr(analyses, own, None) is function):
         return run(_scene_table(own, system, over, outputs, options), out=out)
     return run(_function_scene(function, system, over, outputs, options), out=out)
 

@@ -22,7 +22,8 @@ from drivetrain_jax.analysis.forced.orbit import integrate, shoot
 from drivetrain_jax.systems import ForcedModel, get_system
 from tests.quick_jit import quick_jit
 
-ANALYSIS, SYSTEM = get_analysis("forced"), get_system("cardan")
+SYSTEM = get_system("cardan")
+ANALYSIS = get_analysis("forced").for_system(SYSTEM)
 EVERYTHING = tuple(v.name for v in ANALYSIS.variables)
 BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 UPPER = 1.4159846397203325  # natural frequency omega2 at beta = 0

@@ -120,6 +120,11 @@ def _draw_strip(axes: Axes, dataset: xr.Dataset, name: str) -> None:
     axes.axhline(axes.get_ylim()[0] + 0.035 * np.ptp(axes.get_ylim()), color=FRAME_GREY, linewidth=0.5)
 
 
+def _notes(stable: bool, shown: int, count: int) -> str:
+    left_out = [f"{shown} of {count} charts shown"] if shown < count else []
+    return "; ".join([*(["stable everywhere"] if stable else []), *left_out])
+
+
 def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
     cells.require_any(dataset, "verdict")
     # Axes of few values run across, if that leaves two.
@@ -160,12 +165,7 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
     panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
     for axes, lines in labels:
         resonances.label(axes, lines)
-    shown = len(slices) * len(slices[0])
-    notes = [
-        *(["stable everywhere"] if plain else []),
-        *([f"{shown} of {count} charts shown"] if shown < count else []),
-    ]
-    panels.titles(dataset, "; ".join(notes))
+    panels.titles(dataset, _notes(plain, len(slices) * len(slices[0]), count))
     panels.legend(predicted if plain else [*cells.state_legend(dataset), *predicted])
     return panels.figure
 
