@@ -91,8 +91,9 @@ OPTIONS = {
 def test_results_have_the_declared_shapes_and_types(case):
     """Of a batch of three; dimensions of one name have one length, that of their coordinate if there is one."""
     kind, name = case.split()
-    system, analysis, options = SYSTEMS[kind], get_analysis(name), OPTIONS.get(name, {})
-    if path := analysis.path_axis(make_request(type(system), analysis, None, options)):
+    system, options = SYSTEMS[kind], OPTIONS.get(name, {})
+    analysis = get_analysis(name).for_system(type(system))
+    if path := analysis.path_axis(type(system), make_request(type(system), analysis, None, options)):
         system = replaced(system, path, np.linspace(0.5, 0.9, 4) * system.values[path])
     outputs = [v.name for v in analysis.variables if v.name not in ABSENT.get(case, [])]
     request = make_request(type(system), analysis, outputs, options)
