@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
+import time
 import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
+import toy
 import xarray as xr
 from interrupts import stop_after
 
@@ -17,6 +21,7 @@ from drivetrain_jax import InputError
 from drivetrain_jax._threads import threads
 from drivetrain_jax.cli import main
 from drivetrain_jax.invariants.verify import verify
+from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.executor import Threads
 from drivetrain_jax.runs.export import export
 from drivetrain_jax.runs.pending import PENDING
@@ -126,6 +131,36 @@ def test_a_growing_store_opens_and_has_what_is_computed(grid_scene, tmp_path, mo
         assert np.isnan(found.value.values[~there]).all() and found.outcome.attrs["flag_meanings"].endswith("pending")
     assert counts[0] == 0 and any(0 < count < 1640 for count in counts)
     assert "pending" not in as_file(path).outcome.attrs["flag_meanings"]
+
+
+SLOW = {
+    "system": "toy",
+    "analysis": "slow",
+    "outputs": ["value", "wave"],
+    "axes": {"a": {"start": 0.0, "stop": 8.0, "num": 400}},
+}
+
+
+def test_a_store_whose_run_is_killed_opens_and_is_resumed(tmp_path):
+    """Twice, by SIGKILL; no batch that was stored is lost, and the result has the bits of the file."""
+    (tmp_path / "scene.toml").write_text(toml.write(SLOW))
+    path, parts = tmp_path / "r.zarr", tmp_path / "r.zarr.parts"
+    command = [sys.executable, toy.__file__, "run", str(tmp_path / "scene.toml"), "--out", str(path), "--store", "zarr"]
+    for count in (2, 4):
+        process = subprocess.Popen([*command, "--threads", "1", "--quiet"], cwd=Path(toy.__file__).parents[2])
+        while len(list(parts.glob("*.h5"))) < count:
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.kill()
+        process.wait()
+    growing, whole, found = as_file(parts / "store"), dt.run(SLOW), status(SLOW, path)
+    there = (growing.outcome != PENDING).values
+    assert there.sum() <= found.done < 400 and not path.exists()
+    assert growing.value.values[there].tobytes() == whole.value.values[there].tobytes()
+    progress = to_store(SLOW, path)
+    assert (progress.reused, progress.computed) == (found.done, 400 - found.done) and found.done > 0
+    run_to_file(SLOW, tmp_path / "r.nc")
+    xr.testing.assert_identical(as_file(tmp_path / "r.nc"), as_file(path))
 
 
 def test_points_of_several_blocks_and_shards(grid_scene, tmp_path, monkeypatch):
@@ -370,8 +405,6 @@ def test_a_run_puts_a_former_store_back_unless_another_is_at_work(grid_scene, tm
 
 
 def test_the_command_line(tmp_path, monkeypatch, capsys):
-    from drivetrain_jax.runs import toml
-
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.toml").write_text(toml.write(POINTS))
     assert main(["run", "scene.toml", "--out", "r.zarr", "--store", "zarr", "--quiet"]) == 0
