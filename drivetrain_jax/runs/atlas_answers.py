@@ -24,7 +24,7 @@ from drivetrain_jax.atlas import design
 from drivetrain_jax.atlas.criteria import has_boundaries
 from drivetrain_jax.atlas.windows import Crossing, Interval
 from drivetrain_jax.runs.atlas_file import StoredAtlas
-from drivetrain_jax.runs.atlas_question import Asked, Range, number, roles_of
+from drivetrain_jax.runs.atlas_question import AtlasQuery, Range, number, roles_of
 from drivetrain_jax.systems import System
 
 # Distance of a spectral radius from 1 below which the distance itself is printed.
@@ -57,7 +57,7 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
     The gradient comes from direct solves, with respect to every parameter of the system. Raises :class:`InputError` for
     names and values outside the atlas, :class:`ChunkError` if a direct solve fails.
     """
-    asked = Asked.of(atlas, given, ranges=())
+    asked = AtlasQuery.of(atlas, given, ranges=())
     point = asked.values
     found = atlas(**point)
     results = {str(name): v.values[()] for name, v in found.data_vars.items()}
@@ -100,7 +100,7 @@ def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Rep
     answer lists the stable ranges of damping. For a cardan shaft in physical units only the ratio ``c2/c1`` of the given
     dampings is used, and the answer is ``c1``. Raises as :func:`query`."""
     speed, damping = roles_of(atlas, "speed", "damping")
-    asked = Asked.of(atlas, given, ranges=(speed,), free=(damping,))
+    asked = AtlasQuery.of(atlas, given, ranges=(speed,), free=(damping,))
     answer = design.least_damping(
         atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.radius
     )
@@ -111,7 +111,7 @@ def widest_angle(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Repl
     """The widest joint angle below which a range of speeds is stable. If the smallest angle of the atlas is unstable,
     the answer lists the stable ranges of angle. Raises as :func:`query`."""
     speed, angle = roles_of(atlas, "speed", "angle")
-    asked = Asked.of(atlas, given, ranges=(speed,), free=(angle,))
+    asked = AtlasQuery.of(atlas, given, ranges=(speed,), free=(angle,))
     answer = design.widest_angle(
         atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.radius
     )
@@ -123,7 +123,7 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
     if not 0 <= margin < 1:
         raise InputError(f"margin = {margin!r}: allowed is 0 <= margin < 1")
     (speed,) = roles_of(atlas, "speed")
-    asked = Asked.of(atlas, given, ranges=(), free=(speed,))
+    asked = AtlasQuery.of(atlas, given, ranges=(), free=(speed,))
     found = design.speed_windows(
         atlas.stability.atlas, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.radius
     )
@@ -166,7 +166,7 @@ def _kind(atlas: StoredAtlas, name: str, end: float, crossing: Crossing | None) 
     return "atlas" if abs(end) in {abs(low), abs(high), *([0.0] if low < 0 < high else [])} else "undecided"
 
 
-def _ends(asked: Asked, name: str, interval: Interval) -> list[dict[str, Any]]:
+def _ends(asked: AtlasQuery, name: str, interval: Interval) -> list[dict[str, Any]]:
     """Both ends of a stable interval as data; a crossing has ``error`` and ``multiplier``."""
     return [
         {
@@ -179,13 +179,13 @@ def _ends(asked: Asked, name: str, interval: Interval) -> list[dict[str, Any]]:
     ]
 
 
-def _bounded(asked: Asked, name: str, value: float, crossing: Crossing | None) -> str:
+def _bounded(asked: AtlasQuery, name: str, value: float, crossing: Crossing | None) -> str:
     """One end of a stable interval as text, with its error."""
     bound = f" +- {crossing.error:.1e}" if crossing else _BEYOND[_kind(asked.atlas, name, value, crossing)]
     return asked.named(name, value) + bound
 
 
-def _answered(title: str, phrase: str, safe: str, asked: Asked, answer: design.Answer) -> Reply:
+def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: design.Answer) -> Reply:
     """The answer as text; ``phrase`` names the value, ``safe`` the stable end of the atlas."""
     name = answer.parameter
     lines = [f"{title}, {asked.heading()}"]
@@ -222,7 +222,7 @@ def _answered(title: str, phrase: str, safe: str, asked: Asked, answer: design.A
     return Reply("\n".join(lines), data)
 
 
-def _elsewhere(safe: str, asked: Asked, answer: design.Answer) -> list[str]:
+def _elsewhere(safe: str, asked: AtlasQuery, answer: design.Answer) -> list[str]:
     """The text if the safe end is unstable: the stable intervals."""
     name, end = answer.parameter, answer.safe_end
     unstable = any(i.lower <= end <= i.upper for i in answer.intervals)
@@ -272,7 +272,7 @@ def _gradient_lines(atlas: StoredAtlas, slopes: Mapping[str, float] | None) -> l
     ]
 
 
-def _side(asked: Asked, name: str, value: float, crossing: Crossing) -> str:
+def _side(asked: AtlasQuery, name: str, value: float, crossing: Crossing) -> str:
     where = "below" if crossing.value <= value else "above"
     return f"{abs(crossing.value - value):.6g} {where}: {asked.named(name, crossing.value)} +- {crossing.error:.1e}"
 
@@ -284,7 +284,7 @@ def _reach(atlas: StoredAtlas, nearest: design.Nearest) -> str:
     return f"none from {number(low)} to {number(high)}{elsewhere}"
 
 
-def _crossing(asked: Asked, name: str, crossing: Crossing | None) -> dict[str, Any] | None:
+def _crossing(asked: AtlasQuery, name: str, crossing: Crossing | None) -> dict[str, Any] | None:
     if crossing is None:
         return None
     return {

@@ -32,7 +32,7 @@ def roles_of(atlas: StoredAtlas, *roles: str) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Asked:
+class AtlasQuery:
     """The given values as parameters of the atlas (numbers or ranges), with the physical data behind them."""
 
     atlas: StoredAtlas
@@ -42,7 +42,7 @@ class Asked:
     @classmethod
     def of(
         cls, atlas: StoredAtlas, given: Mapping[str, Any], ranges: tuple[str, ...], free: tuple[str, ...] = ()
-    ) -> Asked:
+    ) -> AtlasQuery:
         """Check the given values; ``ranges`` names parameters that need a range, ``free`` those that are the answer."""
         shaft, values = nondimensional(atlas.scene.system, given)
         for name, value in given.items():

@@ -170,7 +170,7 @@ class Job:
         return (self.grid.size if self._points is None else len(self._points)) * self.grid.path_length
 
     @property
-    def hopeless(self) -> int:
+    def unsolvable(self) -> int:
         """Number of points that no solver can compute; they have no value."""
         return self.total - self.plan.size * self.grid.path_length
 

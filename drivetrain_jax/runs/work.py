@@ -92,8 +92,8 @@ class Work:
 
         Lost chunks are not stored, so a resumed run computes them again.
         """
-        progress.computed += job.hopeless
-        progress.failed += job.hopeless
+        progress.computed += job.unsolvable
+        progress.failed += job.unsolvable
         if self.parts is None:
             missing = np.arange(len(job.plan.costs))
         else:

@@ -148,8 +148,8 @@ class _ShardedRun:
         self._create()
         self._reuse()
         job, progress = self._job, self._progress
-        progress.computed += job.hopeless
-        progress.failed += job.hopeless
+        progress.computed += job.unsolvable
+        progress.failed += job.unsolvable
         missing = np.flatnonzero(self._part_of < 0)
         # Blocks whose chunks are all there, and shards with results that are not written yet.
         self._left = np.bincount(job.plan.block_of[missing], minlength=job.plan.blocks.count)
