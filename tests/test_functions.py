@@ -102,7 +102,7 @@ def test_results_have_the_declared_shapes_and_types(case):
     found = jax.eval_shape(
         jax.vmap(lambda x: getattr(dt, name)(replaced(system, swept, x), outputs=outputs, **options)), jnp.ones(3)
     )
-    assert set(found) == {*outputs, "outcome"}
+    assert outputs and set(found) == {*outputs, "outcome"}
     with jaxtyping.jaxtyped("context"):
         for variable in (*map(analysis.variable, outputs), OUTCOME):
             dims = " ".join(["3", *(["4"] if path else []), *(str(own[d]) for d in variable.dims)])
