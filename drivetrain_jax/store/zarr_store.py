@@ -20,7 +20,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.store.provenance import digest
-from drivetrain_jax.store.schema import Labelled
+from drivetrain_jax.store.schema import DETAILS, GROUP, Labelled
 
 # Folder among the parts in which a store grows, and the one for a store while another one replaces it.
 UNFINISHED, FORMER = "store", "former"
@@ -100,6 +100,8 @@ def create(path: Path, template: Labelled, shards: Shards, fills: Mapping[str, f
                 key: value.tolist() if hasattr(value, "tolist") else value for key, value in entry.attrs.items()
             },
         )
+    details = {name: value for name, value in template.attrs.items() if name in DETAILS}
+    root.create_group(GROUP, attributes=details)
     apart = root.create_group(_CHECKSUMS, attributes={_RESULTS: list(template.data)})
     apart.create_array("shards", shape=(shards.count,), dtype="uint64", chunks=(1,), compressors=None)
     _consolidate(path)
@@ -181,7 +183,8 @@ def attributes(path: Path) -> dict[str, Any]:
     """The attributes of the store; :class:`InputError` if it has none."""
     _zarr()
     try:
-        return dict(_root(path).attrs)
+        root = _root(path)
+        return {**root.attrs, **(root[GROUP].attrs if GROUP in root else {})}
     except _BROKEN:
         raise InputError(f"store = {str(path)!r}: not a readable Zarr store; give one of --store zarr") from None
 
@@ -193,7 +196,8 @@ def seal(path: Path, attrs: Mapping[str, Any], labels: Mapping[str, Mapping[str,
         root[name].attrs.update({key: v.tolist() if hasattr(v, "tolist") else v for key, v in own.items()})
     # Written anew, because the attributes of a growing store have no checksum; xarray lists the coordinates in one.
     kept = {name: value for name, value in root.attrs.items() if name == "coordinates"}
-    root.attrs.put({**kept, **attrs})
+    root.attrs.put({**kept, **{name: value for name, value in attrs.items() if name not in DETAILS}})
+    root[GROUP].attrs.put({name: value for name, value in attrs.items() if name in DETAILS})
     _consolidate(path)
     root.attrs[SEAL] = _digest(path)
     _consolidate(path)
@@ -225,7 +229,7 @@ def _digest(path: Path) -> str:
     root = _root(path)
     attrs = {name: value for name, value in root.attrs.items() if name != SEAL}
     results = set(root[_CHECKSUMS].attrs[_RESULTS])
-    files = sorted({path / _CHECKSUMS, path / _OF_SHARDS, *(path / name for name in root.array_keys())})
+    files = sorted({path / GROUP, path / _CHECKSUMS, path / _OF_SHARDS, *(path / name for name in root.array_keys())})
     metadata = {file.relative_to(path).as_posix(): json.loads((file / "zarr.json").read_text()) for file in files}
     coords = {name: np.asarray(root[name][...]) for name in sorted(root.array_keys()) if name not in results}
     copy = _zarr().open_group(path, mode="r")

@@ -55,7 +55,7 @@ def test_grid_values_dims_and_labels(grid_scene):
         assert variable.attrs["units"] and variable.attrs["long_name"]
     assert ds["outcome"].attrs["flag_meanings"].split()[:2] == ["success", "tolerance_not_met"]
     assert ds["sign"].attrs["flag_values"].tolist() == [0, 1]
-    assert ds["part"].values.tolist() == [0, 1, 2]
+    assert ds["part"].values.tolist() == [1, 2, 3]
 
 
 def test_only_the_requested_results_are_there():

@@ -94,7 +94,7 @@ def as_file(path):
     else:
         ds = opened(path)
     return ds.drop_attrs(deep=False).assign_attrs(
-        {n: v for n, v in ds.attrs.items() if n not in ("created", "wall_time_s", "checksums", "checksum")}
+        {n: v for n, v in ds.attrs.items() if n not in ("created", "history", "wall_time_s", "checksums", "checksum")}
     )
 
 

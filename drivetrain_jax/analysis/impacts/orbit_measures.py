@@ -143,8 +143,9 @@ def _watched(lanes: Lanes, motion: Motion, so_far: Measures, integrals: bool) ->
     added = _integrals(lanes, here, motion, d) if integrals else (jnp.zeros_like(d),) * 4
     return moved, so_far._replace(
         # Not by maximum: compiled code may round u differently in its two uses, and the derivative of a tie counts twice.
-        high=jnp.where(moved.u > so_far.high, moved.u, so_far.high),
-        low=jnp.where(moved.u < so_far.low, moved.u, so_far.low),
+        # A motion that is not finite has no extreme.
+        high=jnp.where(moved.u <= so_far.high, so_far.high, moved.u),
+        low=jnp.where(moved.u >= so_far.low, so_far.low, moved.u),
         integrals=tuple(a + b for a, b in zip(so_far.integrals, added, strict=True)),
         contact=tuple(map(jnp.add, so_far.contact, spans)),
         impacts=tuple(n + hit for n, hit in zip(so_far.impacts, hits, strict=True)),

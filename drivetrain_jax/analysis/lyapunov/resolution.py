@@ -12,6 +12,8 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
+import drivetrain_jax.systems  # noqa: F401  double precision
+
 STANDARD_ERRORS = 3.0
 # Residual of the sum rule relative to the largest exponent.
 SUM_RULE = 1e-3

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+import drivetrain_jax.systems  # noqa: F401  double precision
+
 # Number of last strobes of a section that are compared with earlier ones.
 _WINDOW = 64
 # Harmonics of a clock in the fit of a torus, and iterations of the fit.

@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+import drivetrain_jax.systems  # noqa: F401  double precision
+
 # As many angles as the authors use, equally spaced over their recommended range.
 _ANGLES = 100
 _RANGE = (math.pi / 5, 4 * math.pi / 5)
