@@ -99,7 +99,8 @@ def poincare(system: System, *, outputs: Sequence[str] | None = None, **options:
 def steady_state(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
     """Attractor of an oscillator with play: ``u_max``, ``u_min``, ``u_rms`` [m], ``period_multiple``, ``regime``, impacts.
 
-    Args as of :func:`floquet`. Extremes and means of a periodic motion are differentiable; NaN where it changes.
+    Args as of :func:`floquet`. Extremes, means and multipliers of a periodic motion are differentiable; any other
+    motion gives NaN.
 
     >>> import drivetrain_jax as dt
     >>> gears = dt.Rattle(omega=0.7, **dt.Rattle.presets["table1"])
