@@ -244,7 +244,7 @@ def radius_gradient(system: type[System], values: Mapping[str, float]) -> dict[s
 
 @lru_cache(maxsize=8)
 def _compiled_gradient(system: type[System], names: tuple[str, ...]) -> Callable[[dict[str, float]], jax.Array]:
-    """The rule of ``jax.grad(floquet)`` without the value, which takes three quarters of its compilation."""
+    """The rule of ``jax.grad(floquet)`` alone: tracing the value too would take twice the time."""
     analysis = get_analysis("floquet").for_system(system)
     request = make_request(system, analysis, ["spectral_radius"], {})
 

@@ -56,7 +56,11 @@ _DERIVATIVES = 1e-11
 def _derivatives(
     system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Jacobians of multipliers, exponents and spectral radius; NaN where multipliers coalesce."""
+    """Jacobians of multipliers, exponents and spectral radius; NaN where multipliers coalesce.
+
+    They need no ``results``, so that a gradient alone computes no value.
+    """
+    del results
     from drivetrain_jax.analysis.floquet.derivatives import monodromy_change, multiplier_change, radius_change
 
     build = system.models["floquet"].build
@@ -68,10 +72,8 @@ def _derivatives(
     change = monodromy_change(build, parameters, constants, steps)
     sigma, moved, error = multiplier_change(change)
     scale = jnp.exp(change.log_scale)
-    radius = scale * jnp.abs(sigma[0])
-    slope = radius_change(sigma, moved, jnp.maximum(error, results.get("spectral_radius_error", 0.0) / radius))
     # A radius that underflows has no derivative either.
-    slope = jnp.where(radius > 0, slope, jnp.nan)
+    slope = jnp.where(scale * jnp.abs(sigma[0]) > 0, radius_change(sigma, moved, error), jnp.nan)
     found = {"spectral_radius": scale * slope, "floquet_multiplier": scale * moved}
     if "floquet_exponent" in request.outputs:
         period, longer = jax.value_and_grad(lambda p: jnp.asarray(model(p).natural.span, float))(parameters)
