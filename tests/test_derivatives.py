@@ -304,6 +304,14 @@ def test_derivatives_equal_differences(case):
         np.testing.assert_allclose(found, slope, rtol=rtol, atol=rtol * np.abs(slope).max(), err_msg=name)
 
 
+def test_a_state_alone_has_the_derivatives_that_it_has_with_its_amplitude():
+    shaft = dt.Cardan(**SHAFT.values | {"Omega": 1.0})
+    alone = quick_jit(jax.jacrev(lambda s: dt.forced(s, outputs=["periodic_state"]).periodic_state))(shaft)
+    found = quick_jit(jax.jacrev(linear_response))(shaft)
+    for name in CARDAN_NAMES:
+        np.testing.assert_allclose(getattr(alone, name), getattr(found, name)[:4], rtol=1e-7, atol=1e-9)
+
+
 def test_both_modes_agree():
     check_grads(floquet_radius, (SHAFT,), order=1, modes=("fwd", "rev"), eps=1e-5)
 

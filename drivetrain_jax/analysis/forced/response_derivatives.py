@@ -17,6 +17,8 @@ from jax import Array
 from drivetrain_jax.analysis.forced.orbit import MAX_STEPS, controller, size_of
 from drivetrain_jax.analysis.numerics.linear_algebra import solve
 
+Parametric = Callable[[Any, Any, Array], Array]
+
 
 class PeriodicSlopes(NamedTuple):
     """Derivatives by the P parameters: of the ``state`` at the start, ``(n, P)``, and of the largest displacements
@@ -27,11 +29,7 @@ class PeriodicSlopes(NamedTuple):
 
 
 def periodic_slopes(
-    field: Callable[[Any, Any, Array], Array],
-    parameters: Any,
-    state: Array,
-    peaks: tuple[Array, tuple[int, ...]],
-    rtol: float,
+    field: Parametric, parameters: Any, state: Array, peaks: tuple[Array, tuple[int, ...]], rtol: float
 ) -> PeriodicSlopes:
     """Derivatives of the periodic solution through ``state`` by all ``parameters``, a pytree of P numbers.
 
@@ -41,22 +39,7 @@ def periodic_slopes(
     import diffrax
 
     n, size = state.size, size_of(state)
-    leaves, tree = jax.tree.flatten(parameters)
-    point = jnp.stack(leaves)
-    # Relative changes of the parameters keep all columns of similar size.
-    scale = jnp.where(point == 0, 1.0, jnp.abs(point))
-    count = point.size
-    directions = jnp.concatenate([jnp.zeros((n, count)), jnp.eye(count)])
-
-    def lifted(s: Any, columns: Array, _: None) -> Array:
-        def right(y: Array, change: Array) -> Array:
-            moved = jax.tree.unflatten(tree, list(point + scale * change))
-            return field(moved, s, size * y) / size
-
-        slope, push = jax.linearize(right, columns[0], jnp.zeros(count))
-        return jnp.concatenate([slope[None], jax.vmap(push)(columns[1:], directions)])
-
-    first = jnp.concatenate([(state / size)[None], jnp.eye(n), jnp.zeros((count, n))])
+    lifted, scale = _lifted(field, parameters, n, size)
     places, indices = peaks
     order = jnp.argsort(places)
     solution = diffrax.diffeqsolve(
@@ -65,7 +48,7 @@ def periodic_slopes(
         0.0,
         1.0,
         None,
-        first,
+        jnp.concatenate([(state / size)[None], jnp.eye(n), jnp.zeros((scale.size, n))]),
         saveat=diffrax.SaveAt(t1=True, ts=jnp.clip(places[order], 0.0, 1.0)),
         stepsize_controller=controller(1.0, rtol),
         adjoint=diffrax.ForwardMode(),
@@ -76,7 +59,26 @@ def periodic_slopes(
     on_peaks, end = found[:-1][jnp.argsort(order)], found[-1]
     moved = solve(jnp.eye(n) - end[1 : n + 1].T, end[n + 1 :].T)
     tops = [
-        jnp.sign(columns[0, i]) * (columns[1 : n + 1, i] @ moved + columns[n + 1 :, i])
-        for columns, i in zip(on_peaks, indices, strict=True)
+        jnp.sign(rows[0, i]) * (rows[1 : n + 1, i] @ moved + rows[n + 1 :, i])
+        for rows, i in zip(on_peaks, indices, strict=True)
     ]
-    return PeriodicSlopes(size * moved / scale, size * jnp.stack(tops) / scale)
+    return PeriodicSlopes(size * moved / scale, size * jnp.array(tops).reshape(-1, scale.size) / scale)
+
+
+def _lifted(field: Parametric, parameters: Any, n: int, size: Array) -> tuple[Callable[..., Array], Array]:
+    """The field of the rows ``y/size``, V and S, ``(1 + n + P, n)``, and the unit of every parameter, ``(P,)``."""
+    leaves, tree = jax.tree.flatten(parameters)
+    point = jnp.stack(leaves)
+    # Relative changes of the parameters keep all rows of similar size.
+    scale = jnp.where(point == 0, 1.0, jnp.abs(point))
+    directions = jnp.concatenate([jnp.zeros((n, point.size)), jnp.eye(point.size)])
+
+    def lifted(s: Any, rows: Array, _: None) -> Array:
+        def right(y: Array, change: Array) -> Array:
+            moved = jax.tree.unflatten(tree, list(point + scale * change))
+            return field(moved, s, size * y) / size
+
+        slope, push = jax.linearize(right, rows[0], jnp.zeros(point.size))
+        return jnp.concatenate([slope[None], jax.vmap(push)(rows[1:], directions)])
+
+    return lifted, scale
