@@ -35,6 +35,7 @@ NAMES = (
 CHART = {
     "drivetrain_jax direct": "`direct`",
     "heyoka batch": "heyoka batch",
+    "scipy DOP853 stacked, half period": "SciPy DOP853 on the stacked grid over half a period",
     "scipy DOP853 stacked": "SciPy DOP853 on the stacked grid",
     "scipy DOP853": "SciPy DOP853 point by point",
     "scipy RK45": "SciPy RK45 point by point, the paper's method",

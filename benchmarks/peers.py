@@ -25,7 +25,7 @@ import numpy as np
 
 from benchmarks.engine_job import columns_scene, engine_job
 from benchmarks.timing import chart, interleaved, median, parser, results_folder, table, take, write_csv
-from tests.oracles.cardan_reference import BASE_CASE, spectral_radius
+from tests.oracles.cardan_reference import BASE_CASE, from_half_period, spectral_radius
 
 FORMS = ("full", "half", "chi")
 # Number of heyoka's runtime parameters: cos and sin^2 of beta, 1/Omega^2, 2 zeta/Omega, alpha, mu, 1/gamma; in chi also
@@ -73,17 +73,7 @@ class HeyokaBatch:
 
     def _monodromy(self, phi: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         # phi[j, i] is component i of column j.
-        if self.form == "full":
-            z = np.swapaxes(phi, 0, 1)
-        else:
-            c, size = np.cos(columns["beta"]), columns["Omega"].size
-            image = [_times_reversor_form(column, 1 / c, columns) for column in phi]
-            gram = np.empty((4, 4, size))
-            for i in range(4):
-                for j in range(i, 4):
-                    gram[i, j] = gram[j, i] = sum(phi[i, k] * image[j][k] for k in range(4))
-            z = np.stack([_solve_reversor_form(gram[:, j], c, columns) for j in range(4)], axis=1)
-        return np.moveaxis(z, -1, 0)
+        return np.moveaxis(phi, (0, 1), (2, 1)) if self.form == "full" else from_half_period(phi, columns)
 
 
 def prepare_worker(form: str, tolerance: float, batch: int) -> None:
@@ -148,23 +138,6 @@ def _runtime_parameters(p: Mapping[str, np.ndarray], form: str) -> np.ndarray:
         scale,
     )
     return np.stack(rows[: _PARAMETERS[form]])
-
-
-# N = T^T X T, where (q, q' + C0 q/2) = T (theta1, theta1', theta2, omega2) at an instant of symmetry (eta' = 0):
-#     N = [[d, 1, 0, gamma eta], [1, 0, 0, 0], [0, 0, alpha d, gamma], [gamma eta, 0, gamma, 0]],   d = 2 zeta/Omega
-def _times_reversor_form(x: np.ndarray, eta: np.ndarray, p: Mapping[str, np.ndarray]) -> np.ndarray:
-    d, gamma = 2 * p["zeta"] / p["Omega"], p["gamma"]
-    coupling = gamma * eta
-    return np.stack(
-        [d * x[0] + x[1] + coupling * x[3], x[0], p["alpha"] * d * x[2] + gamma * x[3], coupling * x[0] + gamma * x[2]]
-    )
-
-
-def _solve_reversor_form(y: np.ndarray, eta: np.ndarray, p: Mapping[str, np.ndarray]) -> np.ndarray:
-    d, gamma = 2 * p["zeta"] / p["Omega"], p["gamma"]
-    x2 = y[3] / gamma - eta * y[1]
-    x3 = (y[2] - p["alpha"] * d * x2) / gamma
-    return np.stack([y[1], y[0] - d * y[1] - gamma * eta * x3, x2, x3])
 
 
 def _similar_effort(p: Mapping[str, np.ndarray]) -> np.ndarray:

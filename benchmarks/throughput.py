@@ -38,15 +38,23 @@ from benchmarks.timing import (
     take,
     write_csv,
 )
-from tests.oracles.cardan_reference import BASE_CASE, monodromy, spectral_radius, stacked_monodromy
+from tests.oracles.cardan_reference import (
+    BASE_CASE,
+    monodromy,
+    spectral_radius,
+    stacked_half_period_monodromy,
+    stacked_monodromy,
+)
 
 Columns = Mapping[str, np.ndarray]
 _exact = cache(peers.HeyokaBatch)
 
 # Every family has a setting below and one above an error of 1e-9 on this chart.
 DIRECT_TOLERANCES = (1e-6, 1e-7, 1e-10)
+DIFFRAX_TOLERANCES = (1e-5, 1e-6)
 HEYOKA_TOLERANCES = (1e-8, 2e-9, 1e-10)
 RK45_TOLERANCES, DOP853_TOLERANCES, STACKED_TOLERANCES = (1e-9, 3e-11), (1e-9, 1e-10), (1e-9, 2e-12)
+HALF_PERIOD_TOLERANCES = (1e-9, 1e-10)
 # Memory and time from nothing to a result, measured in a process of its own.
 _FRESH = """
 import json, resource, sys, time
@@ -113,10 +121,11 @@ def scipy_contender(pool: Any, columns: Columns, method: str, rtol: float) -> Co
     return Contender(f"scipy {method}, rtol {rtol:g}", job, columns)
 
 
-def stacked_contender(pool: Any, columns: Columns, rtol: float) -> Contender:
+def stacked_contender(pool: Any, columns: Columns, rtol: float, half_period: bool = False) -> Contender:
     """``solve_ivp`` with hundreds of points in one state, on two processes."""
-    job = shared_out(pool.map, SciPyStacked(rtol), columns, PROCESSES)
-    return Contender(f"scipy DOP853 stacked, rtol {rtol:g}", job, columns)
+    job = shared_out(pool.map, SciPyStacked(rtol, half_period), columns, PROCESSES)
+    form = "stacked, half period" if half_period else "stacked"
+    return Contender(f"scipy DOP853 {form}, rtol {rtol:g}", job, columns)
 
 
 @dataclass(frozen=True)
@@ -137,10 +146,12 @@ class SciPyStacked:
     """Spectral radii of all points, 512 to a state."""
 
     rtol: float
+    half_period: bool = False
 
     def __call__(self, columns: Columns) -> np.ndarray:
         """Spectral radii of ``columns``."""
-        return spectral_radius(stacked_monodromy(columns, self.rtol, self.rtol))
+        solve = stacked_half_period_monodromy if self.half_period else stacked_monodromy
+        return spectral_radius(solve(columns, self.rtol, self.rtol))
 
 
 def shared_out(
@@ -176,7 +187,7 @@ def contenders(stack: ExitStack, columns: Columns, sample: int, quick: bool) -> 
     chosen = slice(-1, None) if quick else slice(None)
     direct = DIRECT_TOLERANCES[1:2] if quick else DIRECT_TOLERANCES
     own = [(columns, "direct", {"rtol": rtol}) for rtol in direct]
-    own += [] if quick else [(coarse, "diffrax", {"rtol": 1e-9})]
+    own += [] if quick else [(coarse, "diffrax", {"rtol": rtol}) for rtol in DIFFRAX_TOLERANCES]
     bare = () if quick else (heyoka_contender(stack, columns, HEYOKA_TOLERANCES[0], eigenvalues=False),)
     return [
         *at_once([partial(package_contender, *given) for given in own]),
@@ -185,6 +196,7 @@ def contenders(stack: ExitStack, columns: Columns, sample: int, quick: bool) -> 
         *(scipy_contender(pool, few, "RK45", rtol) for rtol in RK45_TOLERANCES[chosen]),
         *(scipy_contender(pool, few, "DOP853", rtol) for rtol in DOP853_TOLERANCES[chosen]),
         *(stacked_contender(pool, some, rtol) for rtol in STACKED_TOLERANCES[chosen]),
+        *(stacked_contender(pool, some, rtol, half_period=True) for rtol in HALF_PERIOD_TOLERANCES[chosen]),
     ]
 
 

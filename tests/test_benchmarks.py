@@ -21,6 +21,7 @@ from benchmarks.timing import RESULTS, at_once, once, write_csv
 from drivetrain_jax import cli
 from tests.oracles.bicardan_precise_reference import determinant
 from tests.oracles.bicardan_reference import transfer_determinant
+from tests.oracles.cardan_reference import BASE_CASE, monodromy, spectral_radius, stacked_half_period_monodromy
 from tests.oracles.chaos_reference import _orthonormalise
 
 
@@ -49,6 +50,16 @@ def test_an_accelerator_is_measured_or_there_was_none(tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_PLATFORMS", "")
     with pytest.raises(SystemExit, match="jax finds none"):
         accelerator.measure(tmp_path, quick=True)
+
+
+def test_half_a_period_gives_the_radius_of_a_whole_one():
+    """SciPy gets the same form of the problem as the package and heyoka."""
+    columns = {name: np.full(3, value) for name, value in (BASE_CASE | {"zeta": 0.05, "alpha": 2.0}).items()}
+    columns |= {"beta": np.array([0.3, 1.0, 1.4]), "Omega": np.array([1.4, 0.4, 0.9])}
+    points = [{name: column[i] for name, column in columns.items()} for i in range(3)]
+    expected = [spectral_radius(monodromy(point)) for point in points]
+    found = spectral_radius(stacked_half_period_monodromy(columns, 1e-12, 1e-12))
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize(("error", "fails"), [(1e-10, False), (1.0, True)])

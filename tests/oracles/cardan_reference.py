@@ -103,6 +103,42 @@ def stacked_monodromy(
     return out
 
 
+def stacked_half_period_monodromy(
+    p: Parameters, rtol: float = 1e-10, atol: float = 1e-10, method: str = "DOP853", batch: int = 512
+) -> np.ndarray:
+    """Matrices similar to the monodromy matrices, from half the period as heyoka and the package get it.
+
+    The state is (theta1, theta1', theta2, omega2) with omega2 = theta2' + (eta theta1)', which needs no eta''.
+    """
+    columns = np.broadcast_arrays(*(np.atleast_1d(np.asarray(p[name], float)) for name in NAMES))
+    out = np.empty((columns[0].size, 4, 4))
+    order = np.lexsort((columns[0], columns[1]))
+    for start in range(0, order.size, batch):
+        chosen = order[start : start + batch]
+        point = {name: column[chosen] for name, column in zip(NAMES, columns, strict=True)}
+        identity = np.repeat(np.eye(4)[:, :, None], chosen.size, axis=2)
+        phi = _solve(_half_period_field(point), identity, method, rtol, atol, period=PERIOD / 2)
+        out[chosen] = from_half_period(np.swapaxes(phi, 0, 1), point)
+    return out
+
+
+def from_half_period(phi: np.ndarray, p: Parameters) -> np.ndarray:
+    """``N0^-1 Phi^T N1 Phi``, shape ``(N, 4, 4)``, similar to the monodromy matrix; ``phi[j, i]``: entry i of column j.
+
+    N = T^T X T, where X is the reversor of docs/theory/cardan.md and (q, q' + C0 q/2) = T (theta1, theta1', theta2,
+    omega2) at an instant of symmetry (eta' = 0), is with d = 2 zeta/Omega
+
+        [[d, 1, 0, gamma eta], [1, 0, 0, 0], [0, 0, alpha d, gamma], [gamma eta, 0, gamma, 0]].
+    """
+    c, size = np.cos(p["beta"]), p["Omega"].size
+    image = [_times_reversor_form(column, 1 / c, p) for column in phi]
+    gram = np.empty((4, 4, size))
+    for i in range(4):
+        for j in range(i, 4):
+            gram[i, j] = gram[j, i] = sum(phi[i, k] * image[j][k] for k in range(4))
+    return np.moveaxis(np.stack([_solve_reversor_form(gram[:, j], c, p) for j in range(4)], axis=1), -1, 0)
+
+
 def spectral_radius(z: np.ndarray) -> np.ndarray:
     """Largest modulus of the eigenvalues of ``z``, shape ``(..., 4, 4)`` to ``(...)``; NaN where not finite."""
     finite = np.isfinite(z).all((-2, -1))
@@ -125,15 +161,48 @@ def _stacked_field(p: Parameters, matrices: Matrices) -> Callable[[float, np.nda
     return field
 
 
+def _half_period_field(p: Parameters) -> Callable[[float, np.ndarray], np.ndarray]:
+    c, s2 = np.cos(p["beta"]), np.sin(p["beta"]) ** 2
+    stiffness, damping = 1 / p["Omega"] ** 2, 2 * p["zeta"] / p["Omega"]
+    spring, damper, inverse = stiffness * p["mu"], damping * p["alpha"], 1 / p["gamma"]
+
+    def field(tau: float, y: np.ndarray) -> np.ndarray:
+        theta1, rate1, theta2, speed2 = y.reshape(4, 4, -1)
+        eta, d1, _ = speed_ratio(tau, c, s2)
+        out = np.empty((4, *theta1.shape))
+        out[0], out[2] = rate1, speed2 - d1 * theta1 - eta * rate1
+        torque = spring * theta2 + damper * out[2]
+        out[1], out[3] = eta * torque - damping * rate1 - stiffness * theta1, -inverse * torque
+        return out.reshape(-1)
+
+    return field
+
+
+def _times_reversor_form(x: np.ndarray, eta: np.ndarray, p: Parameters) -> np.ndarray:
+    d, gamma = 2 * p["zeta"] / p["Omega"], p["gamma"]
+    coupling = gamma * eta
+    return np.stack(
+        [d * x[0] + x[1] + coupling * x[3], x[0], p["alpha"] * d * x[2] + gamma * x[3], coupling * x[0] + gamma * x[2]]
+    )
+
+
+def _solve_reversor_form(y: np.ndarray, eta: np.ndarray, p: Parameters) -> np.ndarray:
+    d, gamma = 2 * p["zeta"] / p["Omega"], p["gamma"]
+    x2 = y[3] / gamma - eta * y[1]
+    x3 = (y[2] - p["alpha"] * d * x2) / gamma
+    return np.stack([y[1], y[0] - d * y[1] - gamma * eta * x3, x2, x3])
+
+
 def _solve(
     field: Callable[[float, np.ndarray], np.ndarray],
     start: np.ndarray,
     method: str,
     rtol: float,
     atol: float,
+    period: float = PERIOD,
     **extra: Any,
 ) -> np.ndarray:
     solution = solve_ivp(
-        field, (0.0, PERIOD), start.reshape(-1), method=method, rtol=rtol, atol=atol, t_eval=(PERIOD,), **extra
+        field, (0.0, period), start.reshape(-1), method=method, rtol=rtol, atol=atol, t_eval=(period,), **extra
     )
     return solution.y[:, -1].reshape(start.shape) if solution.success else np.full(start.shape, np.nan)
