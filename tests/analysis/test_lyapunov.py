@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -377,56 +378,51 @@ def test_phases_do_not_supply_exponents():
     assert ours["lyapunov_spectrum"].sum() == pytest.approx(-0.25, abs=1e-9)
 
 
-def damped(time: np.ndarray, omega: float, zeta: float) -> np.ndarray:
-    """Difference 1e-6 (1, 1) of displacement and rate carried along phi'' + 2 zeta omega phi' + omega^2 phi = 0, (2, T)."""
-    rate, decay = omega * math.sqrt(1 - zeta**2), zeta * omega
-    cosine, sine, fall = np.cos(rate * time), np.sin(rate * time), 1e-6 * np.exp(-decay * time)
-    slope = (1 + decay) / rate
-    return fall * np.stack([cosine + slope * sine, cosine - (decay * slope + rate) * sine])
+def by_the_paper(element: str, zeta: float, strobes: int) -> np.ndarray:
+    frequency, chi_n = (3066.5, 0.0026) if element == "input" else (2792.0, 0.0027)
+    shaft = dt.Tripod(element=element, beta=math.radians(9), zeta=zeta, chi_n=chi_n, excitation_frequency=frequency)
+    options = {"max_time": (strobes - 0.5) / frequency, "steps": 24}
+    return np.asarray(dt.lyapunov(shaft, outputs=["paper_estimator"], **options).paper_estimator)
 
 
 class TestPaperEstimator:
-    """The estimator as printed: equal to what independent computations of (31)-(33) give, and wrong on known answers."""
+    """The paper's rule: equal to independent computations of (31)-(36), and wrong on known answers."""
 
-    def test_it_is_what_is_printed_for_a_damped_linear_oscillator(self):
-        """Closed form of two trajectories of the shaft with constant coefficients: thousands, while the true exponents
-        are -zeta Omega = -15.4 1/s."""
-        omega, zeta, frequency, strobes = oracle.shaft("input", 0.0).omega, 0.0016, 3066.5, 1024
-        fixed = {"element": "input", "beta": 0.0, "zeta": zeta, "chi_n": 0.0, "excitation_frequency": frequency}
-        scene = {"system": "tripod", "analysis": "lyapunov", "outputs": ["paper_estimator"], "fixed": fixed}
-        ours = dt.run(
-            scene | {"options": {"max_time": (strobes - 0.5) / frequency, "steps": 24}}
-        ).paper_estimator.values
-        delta = damped(np.arange(1, strobes + 1) / frequency, omega, zeta)
-        delta = np.concatenate([delta, np.full((1, strobes), 1e-6)])
-        expected = np.sum(np.log10(np.abs(delta) / np.linalg.norm(delta[:, -1])), axis=1) * frequency / strobes
-        np.testing.assert_allclose(ours, expected, rtol=0, atol=2e-4 * abs(expected).max())
-        assert abs(expected).max() > 1000
-        assert expected[1] > 100
+    @pytest.mark.parametrize(
+        ("strobes", "expected"), [(307, (-22587.20, -10361.95, -1311.025)), (154, (-21779.65, -10317.94, -1293.414))]
+    )
+    def test_its_own_criterion_fails_at_fig_17(self, strobes, expected):
+        """RK4 by an independent author; the largest of all three is negative, so that (37) fails."""
+        np.testing.assert_allclose(by_the_paper("input", 0.0016, strobes), expected, rtol=0, atol=5.1e-3)
 
-    def test_it_is_what_is_printed_for_the_output_element(self):
-        """(30) by SciPy at 3e-14: tests.oracles.tripod_reference.paper_estimator, values in the reference file."""
-        case = REFERENCE["paper_estimator"]
-        fixed = {"element": "output", "beta": math.radians(9), "zeta": case["zeta"], "chi_n": case["chi_n"]}
-        fixed |= {"excitation_frequency": case["frequency_Hz"]}
-        scene = {"system": "tripod", "analysis": "lyapunov", "outputs": ["paper_estimator"], "fixed": fixed}
-        options = {"max_time": (case["strobes"] - 0.5) / case["frequency_Hz"], "steps": 24}
-        ours = dt.run(scene | {"options": options}).paper_estimator.values
-        np.testing.assert_allclose(ours, case["L"], rtol=1e-6)
+    @pytest.mark.parametrize("element", ["input", "output"])
+    def test_it_is_the_rule_by_scipy(self, element):
+        equation, frequency, chi_n = ("29", 3066.5, 0.0026) if element == "input" else ("30", 2792.0, 0.0027)
+        expected = oracle.paper_estimator(equation, 0.0064, chi_n, frequency, 12)
+        np.testing.assert_allclose(by_the_paper(element, 0.0064, 12), expected, rtol=1e-7)
 
-    def test_it_is_positive_for_a_damped_linear_oscillator(self):
-        ours = results(flows.linear([0.2], [1.0]), ("paper_estimator",), 100.0, 12)["paper_estimator"]
-        assert (ours > 1).all()  # the true exponents are -0.1
+    @pytest.mark.parametrize("interval", [1.0, 0.1])
+    def test_it_is_positive_for_a_damped_linear_oscillator(self, interval):
+        """The distance is proportional to the motion itself; the true exponents are -0.1, at any interval."""
+        flow = replace(flows.linear([0.2], [1.0], torque=0.0), period=interval)
+        ours = results(flow, ("paper_estimator",), 100.0, 12)["paper_estimator"]
+        rate, times = math.sqrt(1 - 0.1**2), np.arange(1, round(100 / interval) + 1) * interval
+        (x0, v0), cosine, sine = flow.start, np.cos(rate * times), np.sin(rate * times)
+        turned = [x0 * cosine + (v0 + 0.1 * x0) / rate * sine, v0 * cosine - (x0 + 0.1 * v0) / rate * sine]
+        motion = np.exp(-0.1 * times) * np.stack(turned)
+        expected = np.sum(np.log10(abs(motion) / np.linalg.norm(motion[:, -1])), axis=1) / times[-1]
+        np.testing.assert_allclose(ours[:, 0], expected, rtol=1e-6)
+        assert (expected * interval > 1).all()
 
-    def test_it_is_inversely_proportional_to_the_interval(self):
-        from dataclasses import replace
-
-        values = []
-        for interval in (0.05, 0.5):
-            flow = replace(flows.lorenz(1), period=interval)
-            values.append(results(flow, ("paper_estimator",), 200.0, 12)["paper_estimator"][:, 0])
-        assert (values[0] < 0).all()  # Lorenz' system is chaotic
-        assert abs(values[0] / values[1] - 10).max() < 6
+    def test_it_is_negative_for_a_chaotic_system(self):
+        """At every strobe of 0.05; with ten times the interval it is something else again."""
+        flow = flows.lorenz(1)
+        short, long = (
+            results(replace(flow, period=interval), ("paper_estimator",), 200.0, 12)["paper_estimator"][:, 0]
+            for interval in (0.05, 0.5)
+        )
+        assert (short < -1).all()
+        assert (abs(short - long) > 1).all()
 
 
 @pytest.fixture(scope="module")

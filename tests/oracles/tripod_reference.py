@@ -84,10 +84,12 @@ def ratio(s: Shaft, x: Any) -> Any:
     return (1 + s.c1 * np.cos(x)) / ((1 + s.c2 * np.cos(x)) * (1 + s.chi_n * np.cos(x)))
 
 
-def acceleration(s: Shaft, equation: str, zeta: float, frequency: float, motor: float, t: float, y: Sequence) -> float:
-    """phi'' of the equation; ``frequency`` [Hz] is that of Theta, ``motor`` [rad/s] the motor's."""
+def acceleration(
+    s: Shaft, equation: str, zeta: float, frequency: float, motor: float, t: float, y: Sequence, ahead: float = 0.0
+) -> float:
+    """phi'' of the equation; ``frequency`` [Hz] and ``ahead`` [rad] belong to Theta, ``motor`` [rad/s] to the motor."""
     phi, rate = y
-    g = ratio(s, 2 * math.pi * frequency * t if equation in ("29", "30") else 2 * phi)
+    g = ratio(s, 2 * math.pi * frequency * t + ahead if equation in ("29", "30") else 2 * phi)
     if equation in ("25", "29"):
         ripple = sum(math.cos(2**i * motor * t) / 2 ** (i + 1) for i in range(6))
     else:
@@ -166,23 +168,26 @@ def critical_nonuniformity(element: str, zeta: float) -> tuple[float, float]:
     return float(found.fun), float(found.x)
 
 
-def paper_estimator(zeta: float, chi_n: float, frequency: float, strobes: int) -> np.ndarray:
-    """(31)-(33) read literally for (30) from rest, of twist, rate of twist and Theta [1/s].
+def paper_estimator(equation: str, zeta: float, chi_n: float, frequency: float, strobes: int) -> np.ndarray:
+    """(31)-(36) for (29) or (30) from rest, of twist, rate of twist and Theta [1/s].
 
-    Two solutions by DOP853, 1e-6 apart in each of the three at t = 0 (rad, rad/s, rad). Nothing but Theta depends on the
-    time explicitly, so that the second one runs on a clock that is ahead.
+    On every interval between strobes the second solution starts from the first one times 1 + 1e-5, Theta included.
     """
-    s, size = shaft("output", chi_n=chi_n), 1e-6
-    end, ahead = strobes / frequency, size / (2 * math.pi * frequency)
+    s, share, motor = shaft(EQUATIONS[equation], chi_n=chi_n), 1e-5, 600 * math.pi
 
-    def field(t: float, y: np.ndarray) -> tuple[float, ...]:
-        first = acceleration(s, "30", zeta, frequency, 0.0, t, y[:2])
-        return y[1], first, y[3], acceleration(s, "30", zeta, frequency, 0.0, t + ahead, y[2:])
+    def after(start: np.ndarray, strobe: int, ahead: float) -> np.ndarray:
+        def field(t: float, y: np.ndarray) -> tuple[float, float]:
+            return y[1], acceleration(s, equation, zeta, frequency, motor, t, y, ahead)
 
-    times = np.arange(1, strobes + 1) / frequency
-    tolerance = 1e-17 * np.array([1.0, s.omega, 1.0, s.omega])
-    y = solve_ivp(
-        field, (0, end), (0.0, 0.0, size, size), "DOP853", t_eval=np.minimum(times, end), rtol=3e-14, atol=tolerance
-    ).y
-    delta = np.stack([y[2] - y[0], y[3] - y[1], np.full(strobes, size)])
-    return np.sum(np.log10(np.abs(delta) / np.linalg.norm(delta[:, -1])), axis=1) / end
+        span = (strobe / frequency, (strobe + 1) / frequency)
+        return solve_ivp(field, span, start, "DOP853", rtol=3e-14, atol=1e-17 * np.array([1.0, s.omega])).y[:, -1]
+
+    state, apart = np.zeros(2), []
+    for strobe in range(strobes):
+        ahead = share * 2 * math.pi * strobe
+        end = after(state, strobe, 0.0)
+        apart.append([*(after(state * (1 + share), strobe, ahead) - end), ahead])
+        state = end
+    # The perturbation of the first interval is zero.
+    delta = np.abs(apart[1:])
+    return np.sum(np.log10(delta / np.linalg.norm(delta[-1])), axis=0) * frequency / strobes

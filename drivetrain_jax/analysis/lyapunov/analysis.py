@@ -53,7 +53,7 @@ VARIABLES = (
     Variable("step_change", "1/s", "change of the exponent when the step is halved", ("exponent",)),
     Variable("sum_rule_residual", "1/s", "sum of the exponents minus the mean divergence"),
     Variable("averaging_time", "s", "time over which the exponents are averaged, transient excluded"),
-    Variable("paper_estimator", "1/s", "the paper's (31)-(36) as printed, not a Lyapunov exponent", ("component",)),
+    Variable("paper_estimator", "1/s", "the paper's (31)-(36), not a Lyapunov exponent", ("component",)),
     Variable("chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic; 0 if the section repeats"),
     Variable("period_multiple", "1", "strobes after which the motion repeats (0: not found)", dtype="int32"),
     Variable(

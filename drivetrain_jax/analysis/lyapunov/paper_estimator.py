@@ -1,10 +1,14 @@
-"""The estimator (31)-(36) of Bugaru & Vasile 2022, as printed. It is not a Lyapunov exponent.
+"""The estimator (31)-(36) of Bugaru & Vasile 2022. It is not a Lyapunov exponent.
 
-    L_j = (1/T_f) sum_i log10(|Delta_j(T_i)| / |Delta(T_f)|),  Delta = difference of two trajectories
+    L_j = (1/T_f) sum_i log10(|Delta_j(T_i+1)| / |Delta(T_f)|)
 
-for every component j, the clock that defines the strobe included; T_i are the strobes up to T_f. Nothing is made
-normal again, the base is 10, the ratio compares each time with the END, one component with a norm of mixed units, and
-the sum grows with the number of T_i: the result is inversely proportional to their distance.
+for every component j, the clock that defines the strobe included; T_i are the strobes up to T_f. On every interval
+(T_i, T_i+1) the second trajectory starts anew, at the first one plus a perturbation proportional to it. The base is 10,
+the ratio compares each time with the END, one component with a norm of mixed units, and the sum grows with the number of
+T_i: the result is inversely proportional to their distance.
+
+The paper does not print the length of an interval; here it is one strobe. An interval at whose end a component has no
+distance is left out: the first one of a flow with a clock, which starts at 0.
 """
 
 from __future__ import annotations
@@ -14,14 +18,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis.lyapunov.variational import Frame, initial_state, one_kernel, strobe_map
 from drivetrain_jax.systems import Flow
 
-# Initial difference of every component, in the reported units.
-PERTURBATION = 1e-6
-_SMALLEST = 1e-300
+# Share of every component by which it is perturbed.
+PERTURBATION = 1e-5
 
 
 def component_count(flow: Flow) -> int:
@@ -30,41 +34,42 @@ def component_count(flow: Flow) -> int:
 
 
 def paper_estimator(flow: Flow, steps: Any, max_time: float) -> Array:
-    """L_j in 1/s, shape ``(component_count(flow), ...)``, over ``max_time`` and differences of 1e-6 at t = 0."""
+    """L_j in 1/s, shape ``(component_count(flow), ...)``, over ``max_time``."""
     scale = flow.scale or (1.0,) * flow.size
     base = initial_state(flow)
     zero = jnp.zeros_like(base[0])
-    moved = tuple(x + PERTURBATION / s for x, s in zip(base, scale, strict=True))
-    shifted = replace(flow, field=_shifted(flow))
-    maps = strobe_map(flow, steps), strobe_map(shifted, steps)
+    advance = strobe_map(flow, steps)
     strobes = jnp.broadcast_to(jnp.ceil(jnp.asarray(max_time / flow.period)).astype(jnp.int64), zero.shape)
 
-    def logs(one: Frame, other: Frame) -> tuple[Array, Array]:
-        parts = [(b - a) * s for a, b, s in zip(one.state, other.state, scale, strict=True)]
-        parts += [zero + PERTURBATION] * bool(flow.turns)
-        delta = jnp.stack(parts)
-        norm = jnp.sqrt(sum(part**2 for part in parts))
-        return jnp.log10(jnp.maximum(jnp.abs(delta), _SMALLEST)), jnp.log10(jnp.maximum(norm, _SMALLEST))
+    def distances(k: Array, state: tuple, after: tuple) -> Array:
+        """Of all components at the end of interval ``k`` from ``state`` to ``after``."""
+        ahead = 2 * np.pi * PERTURBATION * k
+        moved = strobe_map(replace(flow, field=_shifted(flow, ahead)), steps)
+        other = moved(k, Frame(tuple(x * (1 + PERTURBATION) for x in state))).state
+        parts = [(b - a) * s for a, b, s in zip(after, other, scale, strict=True)]
+        return jnp.abs(jnp.stack([*parts, *[zero + ahead] * bool(flow.turns)]))
 
     def body(k: Array, carry: tuple) -> tuple:
-        frames, total, last = carry
-        new = tuple(advance(k, frame) for advance, frame in zip(maps, frames, strict=True))
-        components, norm = logs(*new)
-        counts = k < strobes
-        return new, total + jnp.where(counts, components, 0.0), jnp.where(counts, norm, last)
+        frame, total, counted, last = carry
+        new = advance(k, frame)
+        apart = distances(k, frame.state, new.state)
+        counts = (k < strobes) & jnp.all(apart > 0, axis=0)
+        logs = jnp.log10(jnp.where(counts, apart, 1.0))
+        norm = jnp.log10(jnp.sqrt(jnp.sum(jnp.where(counts, apart, 1.0) ** 2, axis=0)))
+        return new, total + logs, counted + counts, jnp.where(counts, norm, last)
 
     def march(start: tuple, count: Array) -> tuple:
         return jax.lax.fori_loop(0, count, body, start)
 
-    start = ((Frame(base), Frame(moved)), jnp.zeros((component_count(flow), *zero.shape)), zero)
-    _, total, last = one_kernel(flow)(march)(start, jnp.max(strobes))
-    return (total - strobes * last) / (strobes * flow.period)
+    start = (Frame(base), jnp.zeros((component_count(flow), *zero.shape)), zero, zero)
+    _, total, counted, last = one_kernel(flow)(march)(start, jnp.max(strobes))
+    return (total - counted * last) / (strobes * flow.period)
 
 
-def _shifted(flow: Flow) -> Any:
-    """The field with its strobe clock advanced by the perturbation."""
+def _shifted(flow: Flow, ahead: Array) -> Any:
+    """The field with its strobe clock ahead."""
 
     def field(angles: tuple, y: Any) -> Any:
-        return flow.field((angles[0] + PERTURBATION, *angles[1:]) if angles else angles, y)
+        return flow.field((angles[0] + ahead, *angles[1:]) if angles else angles, y)
 
     return field
