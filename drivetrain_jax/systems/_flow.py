@@ -26,14 +26,18 @@ class Flow(eqx.Module):
     ``field(angles, y)`` returns the components of ``y'`` (per unit of time) from the angles of the clocks [rad] and the
     components of ``y``; each is a number or an array of shape ``(...)``, so a batch may be a trailing axis.
 
-    - ``start``: components of ``y`` at t = 0. - ``period``: time between two strobes. - ``turns``: turns of each clock per
-    strobe. A clock that defines the strobe has the number 1; its angle is then the   same for every member of a batch. -
-    ``scale``: factor from one unit of each component to the reported units. - ``divergence(angles, y)``: trace of the
-    field's Jacobian in closed form, if known: its mean is the sum of all   Lyapunov exponents. - ``phases``: components
-    with a constant rate. Their exponents are always 0, so the verdict ignores them. (The clocks   are not components.) -
-    ``cyclic``: components that are angles, known up to whole turns: they may grow although the motion is bounded. -
-    ``fastest``: largest angular frequency of the motion, from which step sizes follow, if known. Without it ``lyapunov``
-    takes 48 steps per strobe by default.
+    - ``start``: components of ``y`` at t = 0.
+    - ``period``: time between two strobes.
+    - ``turns``: turns of each clock per strobe. A clock that defines the strobe has the number 1; its angle is then the
+      same for every member of a batch.
+    - ``scale``: factor from one unit of each component to the reported units.
+    - ``divergence(angles, y)``: trace of the field's Jacobian in closed form, if known: its mean is the sum of all
+      Lyapunov exponents.
+    - ``phases``: components with a constant rate. Their exponents are always 0, so the verdict ignores them. (The clocks
+      are not components.)
+    - ``cyclic``: components that are angles, known up to whole turns: they may grow although the motion is bounded.
+    - ``fastest``: largest angular frequency of the motion, from which step sizes follow, if known. Without it ``lyapunov``
+      takes 48 steps per strobe by default.
     """
 
     field: Callable[[Components, Any], Components]

@@ -41,9 +41,11 @@ _FEW = 4
 def plot(dataset: xr.Dataset) -> Figure:
     """The chart of a ``floquet`` result, by number of swept axes.
 
-    - none: the multipliers in the complex plane; - one: the spectral radius with its error band and the limit 1; - two:
-    regions of the verdict and a map of ``log10(spectral radius)``, if stored; - more: regions of the verdict for the first,
-    middle and last value of two further axes; - ``[points]``: the points coloured by their verdict.
+    - none: the multipliers in the complex plane;
+    - one: the spectral radius with its error band and the limit 1;
+    - two: regions of the verdict and a map of ``log10(spectral radius)``, if stored;
+    - more: regions of the verdict for the first, middle and last value of two further axes;
+    - ``[points]``: the points coloured by their verdict.
 
     Axes of one value count as fixed. Raises :class:`InputError` if needed variables are not stored.
     """
