@@ -7,7 +7,6 @@ from pathlib import Path
 from drivetrain_jax.runs.atlas_choice import atlas_ranges
 from drivetrain_jax.runs.atlas_file import to_labelled
 from drivetrain_jax.runs.growing import ReusedPoints
-from drivetrain_jax.runs.identity import ATLAS_SOURCES
 from drivetrain_jax.runs.job import Job, Route
 from drivetrain_jax.runs.rounds import build_atlas
 from drivetrain_jax.runs.work import Progress, Work
@@ -19,7 +18,7 @@ from drivetrain_jax.store.schema import Labelled
 class AtlasRoute(Route):
     """Builds an atlas. Its solves are counted, but are not points of a grid."""
 
-    sources = ATLAS_SOURCES
+    name = "an atlas"
 
     def progress(self, job: Job) -> Progress:
         """The counts before a run."""

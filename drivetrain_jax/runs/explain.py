@@ -12,7 +12,7 @@ import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import clipped, counted
 from drivetrain_jax.analysis.atlas.analysis import ANALYSIS
-from drivetrain_jax.runs.identity import EVALUATES_ATLAS, scene_content
+from drivetrain_jax.runs.identity import scene_content
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.scene import Scene, restore_scene
 
@@ -93,12 +93,7 @@ def _of_numerics(stored: str | None, present: Mapping[str, Any]) -> list[str]:
     for key, value in present.items():
         before = old.get(key)
         if isinstance(value, Mapping) and isinstance(before, Mapping):
-            names = {*value, *before}
-            if key == "sources" and (EVALUATES_ATLAS in value) != (EVALUATES_ATLAS in before):
-                found.append(f"points are {_route(value)}, were {_route(before)}")
-                # The two methods run different files; those files have not changed.
-                names = {*value} & {*before}
-            changed = [name for name in sorted(names) if value.get(name) != before.get(name)]
+            changed = [name for name in sorted({*value, *before}) if value.get(name) != before.get(name)]
             if key == "versions":
                 found += [f"{name} is {value.get(name)}, was {before.get(name)}" for name in changed]
             elif changed:
@@ -106,10 +101,6 @@ def _of_numerics(stored: str | None, present: Mapping[str, Any]) -> list[str]:
         elif value != before:
             found.append(f"{key} is {_text(value)}, was {_text(before)}")
     return found or ["the code, a version or the machine differs"]
-
-
-def _route(sources: Mapping[str, str]) -> str:
-    return "evaluated through an atlas" if EVALUATES_ATLAS in sources else "solved directly"
 
 
 def _text(value: Any) -> str:

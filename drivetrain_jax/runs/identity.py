@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import ast
 import inspect
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,23 +19,26 @@ from drivetrain_jax.store.provenance import digest, source_digest, versions
 
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "numpy", "scipy")
 _ROOT = Path(drivetrain_jax.__file__).parent
-_ENGINE = ("runs/grid.py", "runs/plan.py", "runs/kernel.py")
-# A source file of points that are evaluated from an atlas, and of no others.
-EVALUATES_ATLAS = "runs/through_atlas.py"
-ATLAS_SOURCES: tuple[str, ...] = ("atlas/floquet.py", "runs/atlas_choice.py", "runs/rounds.py", EVALUATES_ATLAS)
-# Packages whose sources affect the numbers.
-_NUMERIC = ("drivetrain_jax._quantities", "drivetrain_jax.systems", "drivetrain_jax.analysis", "drivetrain_jax.atlas")
+# Folders and files of this package that compute numbers, and the files in them that only read results.
+_FOLDERS = ("systems", "analysis", "atlas")
+_ENGINE = ("atlas_choice", "grid", "kernel", "over", "plan", "rounds", "through_atlas")
+_FILES = ("_quantities", *(f"runs/{name}" for name in _ENGINE))
+_READERS = ("figure.py", "rules.py")
 
 
-def numerics_of(scene: Problem, sources: Sequence[str]) -> dict[str, Any]:
-    """The sources that this scene runs (``sources`` are those of its route), the package versions, and the instruction
-    set: all that affects the bits. Sources of other systems and analyses are not included."""
-    starts = [_ROOT / name for name in (*_ENGINE, *sources)]
+def numerics_of(scene: Problem, route: str) -> dict[str, Any]:
+    """The route to the result, the numeric code, the package versions, and the instruction set: all that affects the bits.
+
+    The code is that of this package, and of the packages that the system and the analysis come from.
+    """
+    sources = dict(_own_sources())
     for function in (scene.analysis.model(scene.system).build, scene.analysis.solvers):
         # Neither a partial nor what is wrapped around a method has a source of its own.
-        starts.append(Path(inspect.getsourcefile(inspect.unwrap(getattr(function, "func", function))) or ""))
+        file = inspect.getsourcefile(inspect.unwrap(getattr(function, "func", function)))
+        sources |= _sources_of(_package_of(Path(file))) if file else {}
     return {
-        "sources": {name: _source_digest(name, path) for name, path in _sources(tuple(starts))},
+        "route": route,
+        "sources": sources,
         "versions": versions(PACKAGES),
         "x64": bool(jax.config.jax_enable_x64),  # pyright: ignore[reportAttributeAccessIssue]
         "backend": jax.default_backend(),
@@ -45,79 +47,31 @@ def numerics_of(scene: Problem, sources: Sequence[str]) -> dict[str, Any]:
     }
 
 
-# The code that runs is the one that was there when it was imported, not one that is edited since.
+# Cached: the code that runs is the one that was imported, not one that is edited since.
 @cache
-def _source_digest(name: str, path: Path) -> str:
-    return source_digest({name: path})
-
-
-@cache
-def _sources(starts: tuple[Path, ...]) -> tuple[tuple[str, Path], ...]:
-    """The files ``starts`` and all numeric code that they import, by name."""
-    return tuple(sorted((_label(path), path) for path in _imported(starts)))
-
-
-def _label(path: Path) -> str:
-    return path.relative_to(_ROOT if _ROOT in path.parents else _home(path)).as_posix()
+def _own_sources() -> dict[str, str]:
+    """Digests of the numeric code of this package, by folder or file."""
+    parts = {f"{name}.py": [_ROOT / f"{name}.py"] for name in _FILES}
+    for path in sorted(path for name in _FOLDERS for path in (_ROOT / name).rglob("*.py")):
+        if path.name not in _READERS:
+            parts.setdefault(path.parent.relative_to(_ROOT).as_posix(), []).append(path)
+    return {part: source_digest({path.name: path for path in paths}) for part, paths in parts.items()}
 
 
 @cache
-def _home(path: Path) -> Path:
-    """The folder that contains the package of a source file."""
-    folder = path.parent
-    while (folder / "__init__.py").is_file():
-        folder = folder.parent
-    return folder
+def _sources_of(package: Path) -> dict[str, str]:
+    """Digest of a package (a folder or one file) by its name; none of this package."""
+    if package == _ROOT or not package.exists():
+        return {}
+    files = package.rglob("*.py") if package.is_dir() else [package]
+    return {package.name: source_digest({path.relative_to(package.parent).as_posix(): path for path in files})}
 
 
-def _imported(starts: Sequence[Path]) -> set[Path]:
-    """The source files ``starts`` and everything they import from their own packages and the numeric ones."""
-    found: set[Path] = set()
-    waiting = [path for path in starts if path.is_file()]
-    while waiting:
-        path = waiting.pop()
-        if path not in found:
-            found.add(path)
-            waiting += [file for name in _imports(path) for file in _files(name, path)]
-    return found
-
-
-@cache
-def _imports(path: Path) -> tuple[str, ...]:
-    """Dotted names that a source file imports; ``from x import y`` gives ``x.y``."""
-    package = path.relative_to(_home(path)).parts[:-1]
-    names: list[str] = []
-    for node in _statements(ast.parse(path.read_bytes())):
-        if isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            above = package[: len(package) - node.level + 1] if node.level else ()
-            module = ".".join((*above, *filter(None, [node.module])))
-            names += [f"{module}.{alias.name}" for alias in node.names]
-    return (*names, ".".join(package)) if package else tuple(names)
-
-
-def _statements(node: ast.AST) -> Iterator[ast.AST]:
-    """All statements within ``node``. Visiting expressions too would take twice as long as parsing."""
-    for block in ("body", "orelse", "finalbody", "handlers", "cases"):
-        for inner in getattr(node, block, ()):
-            yield inner
-            yield from _statements(inner)
-
-
-@cache
-def _files(name: str, importer: Path) -> list[Path]:
-    """Modules that importing the dotted ``name`` runs: numeric code of this package, or code of the package of
-    ``importer``."""
-    home, parts, first = _home(importer), name.split("."), 0
-    if parts[0] == drivetrain_jax.__name__:
-        if not any(name == package or name.startswith(package + ".") for package in _NUMERIC):
-            return []
-        home, first = _ROOT.parent, 1
-    elif parts[0] != importer.relative_to(home).with_suffix("").parts[0]:
-        return []
-    stems = [home.joinpath(*parts[: k + 1]) for k in range(first, len(parts))]
-    return [file for stem in stems for file in (stem.with_suffix(".py"), stem / "__init__.py") if file.is_file()]
+def _package_of(path: Path) -> Path:
+    """The outermost package that contains a source file, or the file itself without one."""
+    while (path.parent / "__init__.py").is_file():
+        path = path.parent
+    return path
 
 
 def scene_content(scene: Problem) -> dict[str, Any]:

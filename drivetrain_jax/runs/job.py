@@ -38,8 +38,8 @@ _SIDE_BY_SIDE = 8
 class Route(Protocol):
     """The way from a job to its result, chosen once by :func:`~drivetrain_jax.runs.resolve.resolve`."""
 
-    # Source files that the route runs beside those of every job.
-    sources: tuple[str, ...] = ()
+    # Name of the way, which affects the bits.
+    name: str
     # True if each point is solved by itself: results can be shown, reused and written point by point.
     is_pointwise: bool = False
 
@@ -134,7 +134,7 @@ class Job:
     @cached_property
     def numerics_detail(self) -> dict[str, Any]:
         """The parts of that digest."""
-        return numerics_of(self.problem, self.route.sources)
+        return numerics_of(self.problem, self.route.name)
 
     @property
     def numerics_attrs(self) -> dict[str, str]:

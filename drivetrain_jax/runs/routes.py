@@ -72,6 +72,7 @@ class PointsRoute(Route):
 class DirectRoute(PointsRoute):
     """Solves every point."""
 
+    name = "direct solves"
     is_pointwise = True
 
     def fill(

@@ -15,7 +15,6 @@ from drivetrain_jax.atlas import StabilityAtlas, prepare_judging
 from drivetrain_jax.runs.assemble import Table, failures
 from drivetrain_jax.runs.atlas_choice import Ranges
 from drivetrain_jax.runs.growing import ReusedPoints
-from drivetrain_jax.runs.identity import ATLAS_SOURCES
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.rounds import build_atlas, fixed_of
 from drivetrain_jax.runs.routes import PointsRoute
@@ -33,7 +32,7 @@ Results = Mapping[str, np.ndarray]
 class ThroughAtlas(PointsRoute):
     """Builds an atlas over ``ranges`` and evaluates it; points that it does not cover are solved."""
 
-    sources = ATLAS_SOURCES
+    name = "an atlas"
 
     def __init__(self, ranges: Ranges, max_solves: int | None) -> None:
         self._ranges, self._max_solves = ranges, max_solves

@@ -129,7 +129,7 @@ def test_the_way_that_auto_takes_is_named_where_it_keeps_a_result_from_growing(m
     for name, value in (("_WORTHWHILE", 600), ("_FEWEST", (1, 1))):
         monkeypatch.setattr(atlas_choice, name, value)
     large = floquet("auto", floquet("auto")["axes"] | {"beta": {"start": BETA[0], "stop": BETA[1], "num": 25}})
-    with pytest.raises(InputError, match="points are evaluated through an atlas, were solved directly") as refused:
+    with pytest.raises(InputError, match="route is an atlas, was direct solves") as refused:
         run_to_file(large, path)
     assert "the code has changed" not in str(refused.value)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 import pickle
+import shutil
 from pathlib import Path
 
 import pytest
@@ -13,6 +13,7 @@ import drivetrain_jax as dt
 from drivetrain_jax.runs import identity
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.store.provenance import source_digest
 
 CARDAN = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 BASE = {"system": "toy", "analysis": "toy", "axes": {"a": {"start": 0, "stop": 1, "num": 3}}}
@@ -60,7 +61,7 @@ def test_a_job_is_equal_to_its_pickled_copy(method):
     job, other = (resolve(load_scene(scene | {"options": {"method": m}})) for m in (method, "diffrax"))
     copy = pickle.loads(pickle.dumps(job))
     assert copy == job and hash(copy) == hash(job) and len({job, copy, other}) == 2
-    assert copy.scene.text == job.scene.text and copy.route.sources == job.route.sources
+    assert copy.scene.text == job.scene.text and copy.route.name == job.route.name
 
 
 def test_order_of_axes_matters():
@@ -78,70 +79,58 @@ def test_numerics_decide(monkeypatch):
     assert digest(BASE) != before
 
 
-def test_source_of_systems_analyses_and_engine_decides(monkeypatch):
-    files = {}
-    monkeypatch.setattr(identity, "_source_digest", lambda name, path: str(files.setdefault(name, path)))
-    digest(BASE)
-    assert {"analysis/_base.py", "systems/_base.py", "runs/kernel.py", "runs/plan.py", "toy.py"} <= set(files)
-    assert files["toy.py"].samefile(toy.__file__)
+def code(scene):
+    return resolve(load_scene(scene)).numerics_detail["sources"]
 
 
-def test_what_a_system_of_another_package_imports_from_its_own_decides(tmp_path):
-    """Absolute and relative imports, however deep; its neighbours and libraries do not."""
+def test_the_code_of_systems_analyses_and_engine_decides():
+    parts = code(BASE)
+    own = {"_quantities.py", "systems", "analysis", "analysis/numerics", "analysis/floquet", "atlas", "runs/kernel.py"}
+    assert own < set(parts) and len(set(parts.values())) == len(parts)
+    # The code of a test's system is this one file.
+    assert parts["toy.py"] == source_digest({"toy.py": Path(toy.__file__)})
+
+
+def test_a_changed_file_changes_the_digest_and_a_figure_does_not(monkeypatch, tmp_path):
+    def digests():
+        identity._own_sources.cache_clear()
+        return identity._own_sources()
+
+    copy = tmp_path / "drivetrain_jax"
+    shutil.copytree(Path(dt.__file__).parent, copy, ignore=shutil.ignore_patterns("__pycache__", "sweeps"))
+    monkeypatch.setattr(identity, "_ROOT", copy)
+    before = digests()
+    try:
+        for name in ("figure.py", "rules.py"):
+            (copy / "analysis" / "floquet" / name).write_text("")
+        assert digests() == before
+        (copy / "analysis" / "floquet" / "direct.py").write_text("")
+        changed = digests()
+    finally:
+        identity._own_sources.cache_clear()
+    assert {name for name in before if changed[name] != before[name]} == {"analysis/floquet"}
+
+
+def test_the_whole_package_of_a_system_from_elsewhere_decides(tmp_path):
     package = tmp_path / "gears"
     (package / "laws").mkdir(parents=True)
-    texts = {
-        "gears/__init__.py": "",
-        "gears/shaft.py": "import numpy\nimport unrelated\nfrom . import mesh\nfrom gears.laws.stiffness import law\n",
-        "gears/mesh.py": "from drivetrain_jax.systems import System\n",
-        "gears/laws/__init__.py": "",
-        "gears/laws/stiffness.py": "from ..constants import PITCH\nfrom .contact import force\n",
-        "gears/laws/contact.py": "",
-        "gears/constants.py": "",
-        "gears/unused.py": "",
-        "unrelated.py": "",
-    }
-    for name, text in texts.items():
-        (tmp_path / name).write_text(text)
-    found = {identity._label(path) for path in identity._imported([package / "shaft.py"])}
-    assert {name for name in found if name.startswith("gears")} == set(texts) - {"gears/unused.py", "unrelated.py"}
-    assert "systems/_base.py" in found and not any("numpy" in name or "unrelated" in name for name in found)
+    for name in ("__init__.py", "shaft.py", "laws/__init__.py", "laws/stiffness.py"):
+        (package / name).write_text("")
+    assert identity._package_of(package / "laws" / "stiffness.py") == package
+    before = identity._sources_of(package)
+    assert list(before) == ["gears"]
+    (package / "laws" / "stiffness.py").write_text("K = 1")
+    identity._sources_of.cache_clear()
+    assert identity._sources_of(package) != before
 
 
-def test_imports_are_found_within_every_kind_of_statement(tmp_path):
-    text = """
-def law(x):
-    for _ in x:
-        with x:
-            import a
-    else:
-        import b
-    try:
-        import c
-    except ImportError:
-        from d import e
-    finally:
-        if x: import f
-    match x:
-        case 1:
-            import g
-    class Inner:
-        async def lazy(self):
-            while self:
-                from . import h
-"""
-    (tmp_path / "law.py").write_text(text)
-    assert {name.strip(".") for name in identity._imports(tmp_path / "law.py")} == {*"abcfgh", "d.e"}
-
-
-def test_the_choice_of_an_atlas_decides():
+def test_the_route_decides():
     axes = {"beta": {"start": 0.0, "stop": 1.0, "num": 3}, "Omega": {"start": 1.0, "stop": 2.0, "num": 3}}
     scene = {"system": "cardan", "analysis": "floquet", "axes": axes, "fixed": CARDAN}
-    found, direct = (
-        set(resolve(load_scene(scene | {"options": {"method": method}})).numerics_detail["sources"])
-        for method in ("atlas", "direct")
+    atlas, direct = (
+        resolve(load_scene(scene | {"options": {"method": method}})).numerics_detail for method in ("atlas", "direct")
     )
-    assert found - direct >= {"runs/atlas_choice.py", "runs/rounds.py", "atlas/construction.py"}
+    assert {name for name in atlas if atlas[name] != direct[name]} == {"route"}
 
 
 def test_chunk_size_decides(monkeypatch):
@@ -151,27 +140,3 @@ def test_chunk_size_decides(monkeypatch):
     engine = resolve(scene)
     solvers = [replace(solver, chunk=solver.chunk * 2) for solver in engine.solvers]
     assert identity.scene_digest(scene, solvers, engine.numerics) != engine.digest
-
-
-def sources(system, analysis):
-    scene = load_scene(
-        {"system": system, "analysis": analysis, "points": {"beta": [0.1], "Omega": [1.0]}, "fixed": CARDAN}
-    )
-    build, solvers = scene.system.models[analysis].build, scene.analysis.solvers
-    starts = [Path(inspect.getsourcefile(inspect.unwrap(function))) for function in (build, solvers)]
-    return {path.relative_to(Path(dt.__file__).parent).as_posix() for path in identity._imported(starts)}
-
-
-def test_only_code_that_the_scene_runs_decides():
-    of_floquet, of_forced = sources("cardan", "floquet"), sources("cardan", "forced")
-    common = {
-        "systems/cardan.py",
-        "systems/_base.py",
-        "_quantities.py",
-        "analysis/_base.py",
-        "analysis/numerics/linear_algebra.py",
-    }
-    assert common <= of_floquet & of_forced
-    assert {"analysis/floquet/propagator.py", "analysis/floquet/diffrax_solvers.py"} <= of_floquet - of_forced
-    assert {"analysis/forced/orbit.py", "analysis/forced/amplitude.py"} <= of_forced - of_floquet
-    assert "systems/rattle.py" not in of_floquet | of_forced
