@@ -8,11 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
+from scipy.optimize import root
 
 import drivetrain_jax as dt
 from benchmarks.validation import tripod_chaos
 from benchmarks.validation.document import Page, markdown
+from drivetrain_jax import Tripod, floquet
 from tests.oracles import tripod_reference as oracle
 
 NINE_DEGREES = math.radians(9)
@@ -143,9 +146,6 @@ def histories_section() -> str:
 
 def floquet_section() -> str:
     """Multipliers and exponents of the linear parametric part, and the critical nonuniformity."""
-    from drivetrain_jax.analysis.floquet.tongue_tip import tongue_tip
-    from drivetrain_jax.systems import get_system, tripod
-
     outputs = ["spectral_radius", "floquet_exponent", "liouville_residual"]
     rows = []
     for name, frequency, zeta, chi in FLOQUET:
@@ -161,16 +161,15 @@ def floquet_section() -> str:
                 f"{float(ours.liouville_residual):.1e}",
             ]
         )
-    defaults = {p.name: p.default for p in get_system("tripod").parameters if p.default is not None}
     tips, lowest = [], math.inf
     for zeta, expected in ((LOWEST_DAMPING, None), *_printed_tips()):
-        values = defaults | {"element": "input", "beta": NINE_DEGREES, "zeta": zeta}
-        tip, independent = tongue_tip(*tripod.parametric_tongue(values)), oracle.critical_nonuniformity("input", zeta)
-        lowest = min(lowest, tip.amplitude)
+        independent = oracle.critical_nonuniformity("input", zeta)
+        chi_n, frequency = _tip_of_tongue(zeta, independent)
+        lowest = min(lowest, chi_n)
         tips.append(
             [
                 f"{zeta:g}",
-                f"{tip.amplitude:.12f} at {tip.frequency:.4f} Hz",
+                f"{chi_n:.12f} at {frequency:.4f} Hz",
                 f"{independent[0]:.10f} at {independent[1]:.2f} Hz",
                 f"{expected:.12f}" if expected else "0.0173632641",
             ]
@@ -183,6 +182,24 @@ def floquet_section() -> str:
     head = ["", "spectral radius, ours", "SciPy", "exponents / 1/s", "determinant minus its exact value"]
     critical = markdown(["zeta", "critical chi_n, ours", "SciPy (brentq, bounded search)", "theory note"], tips)
     return f"## Floquet multipliers of (29) and (30)\n\n{text}\n" + markdown(head, rows) + "\n" + critical
+
+
+def _tip_of_tongue(zeta: float, start: tuple[float, float]) -> np.ndarray:
+    """chi_n and frequency [Hz] at which the spectral radius is 1 and largest over the frequency, near ``start``."""
+    unit = np.array(start)
+
+    def radius(relative: Any) -> Any:
+        chi_n, frequency = relative * unit
+        shaft = Tripod(element="input", beta=NINE_DEGREES, zeta=zeta, chi_n=chi_n, excitation_frequency=frequency)
+        return floquet(shaft, rtol=1e-13).spectral_radius
+
+    slopes = jax.jit(jax.value_and_grad(radius))
+
+    def misses(relative: np.ndarray) -> list[float]:
+        value, (_, along) = slopes(relative)
+        return [float(value) - 1, float(along)]
+
+    return root(misses, np.ones(2), tol=1e-13).x * unit
 
 
 def _printed_tips() -> list[tuple[float, float]]:

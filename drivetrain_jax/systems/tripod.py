@@ -10,7 +10,6 @@ All functions broadcast over parameters of any common shape. SI units, angles in
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -48,7 +47,7 @@ from drivetrain_jax.systems._tripod_parameters import (
 from drivetrain_jax.systems.trigonometry import cos, sin
 
 if TYPE_CHECKING:
-    from drivetrain_jax.systems._periodic import FloquetModel, LinearPeriodic
+    from drivetrain_jax.systems._periodic import FloquetModel
 
 
 def _octaves(cosine: Any, count: int) -> list[Any]:
@@ -200,22 +199,6 @@ def floquet_model(values: Values) -> FloquetModel:
         LinearPeriodic(natural.rows_in_time, 1 / frequency, log_determinant=natural.log_determinant),
         LinearPeriodic(reduced.rows, 2 * math.pi, _cosine, log_determinant=reduced.log_determinant),
     )
-
-
-def parametric_tongue(values: Values) -> tuple[Callable[[Any, Any], LinearPeriodic], float, float, float]:
-    """The arguments of :func:`~drivetrain_jax.analysis.floquet.tongue_tip.tongue_tip` for the principal resonance.
-
-    The parametric part as a function of chi_n and the excitation frequency [Hz], and where to look for its tip: the
-    estimate 4 zeta chi_n/(c1 - c2 - chi_n) of perturbation theory (the coefficients are multiples of chi_n), Omega/pi
-    and the damping ratio. A chi_n or excitation frequency in ``values`` is not used.
-    """
-    unit = element_of({**values, "chi_n": 1.0})
-    estimate = 4 * values["zeta"] / (unit.c_stiffness - unit.c_inertia - 1)
-
-    def form(chi_n: Any, frequency: Any) -> LinearPeriodic:
-        return floquet_model({**values, "chi_n": chi_n, "excitation_frequency": frequency}).reduced
-
-    return form, float(estimate), float(unit.frequency) / math.pi, float(values["zeta"])
 
 
 class Tripod(System):

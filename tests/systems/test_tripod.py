@@ -189,3 +189,32 @@ def test_coefficients_beyond_one_are_an_outcome():
     point = dt.point("tripod", "floquet", element="input", beta=NINE_DEGREES, zeta=0.01, chi_n=0.6)
     assert point.outcome.name == "NOT_FINITE"
     assert math.isnan(point.spectral_radius)
+
+
+@jax.jit
+def radius_and_slopes(chi_n, frequency, zeta):
+    """Spectral radius of the input element and its derivatives by chi_n and the excitation frequency."""
+
+    def radius(chi_n, frequency):
+        shaft = dt.Tripod(element="input", beta=NINE_DEGREES, zeta=zeta, chi_n=chi_n, excitation_frequency=frequency)
+        return dt.floquet(shaft, rtol=1e-13).spectral_radius
+
+    return jax.value_and_grad(radius, argnums=(0, 1))(chi_n, frequency)
+
+
+@pytest.mark.parametrize("case", REFERENCE["critical_chi_n"], ids=lambda case: str(case["zeta"]))
+def test_least_chi_n_that_makes_the_element_unstable(case):
+    """The tip of the principal tongue: the radius is 1, and largest over the frequency. Newton's steps are the errors."""
+    chi_n, frequency, zeta = (case[name] for name in ("chi_n", "excitation_frequency_Hz", "zeta"))
+    radius, (slope, along) = radius_and_slopes(chi_n, frequency, zeta)
+    assert abs(radius - 1) / slope < 1e-12
+    before, after = (radius_and_slopes(chi_n, frequency + step, zeta)[1][1] for step in (-0.01, 0.01))
+    bend = (after - before) / 0.02
+    assert bend < 0 and abs(along / bend) < 1e-4
+
+
+@pytest.mark.parametrize("case", REFERENCE["critical_chi_n_at_2_Omega"], ids=lambda case: str(case["zeta"]))
+def test_edge_of_the_tongue_at_twice_the_natural_frequency(case):
+    constants = dt.point("tripod", "parameters", element="input", beta=NINE_DEGREES, outputs="resonance_frequency")
+    radius, (slope, _) = radius_and_slopes(case["chi_n"], float(constants.resonance_frequency), case["zeta"])
+    assert abs(radius - 1) / slope < 1e-11

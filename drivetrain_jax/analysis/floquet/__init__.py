@@ -1,1 +1,1 @@
-"""Floquet stability: propagators, multipliers with their bound, verdicts, derivatives, the tip of a tongue."""
+"""Floquet stability: propagators, multipliers with their bound, verdicts, derivatives."""
