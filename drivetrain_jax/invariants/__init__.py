@@ -1,18 +1,38 @@
-"""Rules that every result must obey, checked from the file alone, without solving equations or importing jax."""
+"""Rules that every result must obey, checked from the file alone, without solving equations or importing jax.
+
+Other packages add rules of their analyses through the entry point group ``drivetrain_jax.rules``; each entry point names a
+:class:`~drivetrain_jax._rules.Declared`. An analysis without rules has only the general ones.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
+from importlib import import_module
 
 import numpy as np
 import xarray as xr
 
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._plugins import RULES, load_plugin
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax._rules import Declared, Rule, within
-from drivetrain_jax.invariants.registry import declared
 
-__all__ = ["Finding", "check"]
+__all__ = ["Finding", "check", "declared"]
+
+# Analyses with rules, analysis/NAME/rules.py.
+_BUILT_IN = (
+    "atlas",
+    "floquet",
+    "forced",
+    "lyapunov",
+    "poincare",
+    "modes",
+    "critical_speeds",
+    "steady_state",
+    "frequency_response",
+    "basins",
+)
 
 
 @dataclass(frozen=True)
@@ -107,3 +127,14 @@ def _errors(dataset: xr.Dataset) -> Iterator[Rule]:
     for name in map(str, dataset.data_vars):
         if name.endswith("_error"):
             yield Rule(f"{name} >= 0", (name,), lambda ds, name=name: ds[name] < 0)
+
+
+def declared(analysis: str) -> Declared:
+    """The declaration of the analysis with this name."""
+    if analysis in _BUILT_IN:
+        return import_module(f"drivetrain_jax.analysis.{analysis}.rules").RULES
+    try:
+        found = load_plugin(RULES, analysis, "the rules of an analysis", lambda x: isinstance(x, Declared))
+    except ImportError as error:
+        raise InputError(f"analysis = {analysis!r}: {' '.join(str(error).split())}") from error
+    return Declared() if found is None else found

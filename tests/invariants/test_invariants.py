@@ -10,7 +10,7 @@ import xarray as xr
 from drivetrain_jax import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.analysis import Outcome, analysis_names, get_analysis
-from drivetrain_jax.invariants import check, registry
+from drivetrain_jax.invariants import check, declared
 from drivetrain_jax.invariants.verify import verify
 from drivetrain_jax.store.chunks import Part, PartsFolder
 from drivetrain_jax.store.consolidate import write_result
@@ -150,11 +150,11 @@ def test_an_unknown_analysis_has_the_rules_of_every_result(chart):
 def test_what_is_declared_exists():
     """Names in the register are results of the analyses that they are registered for."""
     for analysis in analysis_names():
-        if not registry.declared(analysis).has_points:
+        if not declared(analysis).has_points:
             continue
         served = [system for system in map(get_system, system_names()) if analysis in system.models]
         names = {v.name for system in served for v in get_analysis(analysis).for_system(system).variables} | {"outcome"}
-        known = registry.declared(analysis)
+        known = declared(analysis)
         used = {name for rule in known.rules for name in rule.variables} | {*known.gaps, *known.kept}
         assert used <= names, (analysis, used - names)
     assert FIRST_FAILURE == Outcome.NOT_CONVERGED
