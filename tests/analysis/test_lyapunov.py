@@ -192,7 +192,7 @@ _HARD = ((20.0, 1e-4), (36.0, 0.0016), (120.0, 0.0016), (100.0, 0.3), (30.0, 1.5
 def hard():
     names = ("excitation_frequency", "zeta")
     points = dict(zip(names, map(list, zip(*_HARD, strict=True)), strict=True))
-    return points, tripod(points, (*OUTPUTS[:4], "step_change"), {"chi_n": 0.01}, max_time=0.5)
+    return points, tripod(points, OUTPUTS[:4], {"chi_n": 0.01}, max_time=0.5)
 
 
 def test_steps_follow_the_field(hard):

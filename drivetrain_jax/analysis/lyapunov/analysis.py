@@ -28,12 +28,10 @@ from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import MOST_SECONDS, MOST_STEPS, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.lyapunov.forcing import may_be_chaotic
 from drivetrain_jax.analysis.lyapunov.growth_record import (
-    BLOCKS,
     SEGMENTS,
     SETTLED,
     Record,
     block_mean,
-    block_size,
     record_growth,
     running_mean,
 )
@@ -50,9 +48,7 @@ VARIABLES = (
     Variable("lyapunov_spectrum", "1/s", "Lyapunov exponent", ("exponent",)),
     Variable("lyapunov_standard_error", "1/s", "standard error of the exponent, from block means", ("exponent",)),
     Variable("lyapunov_history", "1/s", "exponent averaged up to this time", ("segment", "exponent")),
-    Variable("step_change", "1/s", "change of the exponent when the step is halved", ("exponent",)),
     Variable("sum_rule_residual", "1/s", "sum of the exponents minus the mean divergence"),
-    Variable("averaging_time", "s", "time over which the exponents are averaged, transient excluded"),
     Variable("paper_estimator", "1/s", "the paper's (31)-(36), not a Lyapunov exponent", ("component",)),
     Variable("chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic; 0 if the section repeats"),
     Variable("period_multiple", "1", "strobes after which the motion repeats (0: not found)", dtype="int32"),
@@ -120,15 +116,14 @@ class Run(NamedTuple):
     coarse: Record
 
 
-def run_twice(flow: Flow, steps: Any, max_time: float, target: float, check: bool) -> Run:
-    """The growth with ``steps`` and ``steps // 2`` per strobe. With ``check`` the latter for all members, otherwise only
-    for those with a positive largest exponent beyond its error. One compiled loop serves both."""
+def run_twice(flow: Flow, steps: Any, max_time: float, target: float) -> Run:
+    """The growth with ``steps`` and ``steps // 2`` per strobe, the latter for members with a positive largest exponent
+    beyond its error. One compiled loop serves both."""
 
     def one(active: Array, steps: Array) -> tuple[Array, Record]:
         record = record_growth(flow, steps, max_time, target, active)
         found = spectrum_of(record)
-        candidate = record.bounded & (found.values[0] > STANDARD_ERRORS * found.errors[0])
-        return candidate | check, record
+        return record.bounded & (found.values[0] > STANDARD_ERRORS * found.errors[0]), record
 
     start = jnp.ones(batch_shape(flow), bool)
     _, both = jax.lax.scan(one, start, jnp.stack([jnp.asarray(steps), jnp.maximum(steps // 2, 1)]))
@@ -185,7 +180,7 @@ def analyse(flow: Flow, request: Request) -> dict[str, Array]:
     if wanted == {"paper_estimator"}:
         finite = jnp.all(jnp.isfinite(results["paper_estimator"]), axis=0)
         return results | {"outcome": jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE).astype(jnp.int8)}
-    run = run_twice(flow, steps, max_time, target, "step_change" in wanted)
+    run = run_twice(flow, steps, max_time, target)
     found = findings_of(run, flow.period)
     spectrum = found.spectrum
     results |= _of_spectrum(run.fine, found)
@@ -220,15 +215,8 @@ def _of_spectrum(fine: Record, found: Findings) -> dict[str, Array]:
         "lyapunov_spectrum": spectrum.values,
         "lyapunov_standard_error": spectrum.errors,
         "lyapunov_history": jnp.take_along_axis(history, spectrum.order[None], axis=1),
-        "step_change": spectrum.values - found.coarse.values,
         "sum_rule_residual": found.residual,
-        "averaging_time": averaging_time(fine),
     }
-
-
-def averaging_time(record: Record) -> Array:
-    """Duration of the blocks that are averaged, shape (...)."""
-    return jnp.where(record.bounded, BLOCKS * block_size(record.used) * record.span, jnp.nan)
 
 
 def _effort(system: type[System], request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -17,7 +17,6 @@ RULES = Declared(
     (
         ordered("lyapunov_spectrum", "exponent", falling=True),
         relation("the exponents sum to the mean divergence", ("sum_rule_residual", "lyapunov_spectrum"), _sum_rule),
-        within("averaging_time", 0.0),
         within("chaos_k01", -1.0, 1.0),
         within("period_multiple", 0.0),
     ),
@@ -25,9 +24,7 @@ RULES = Declared(
     gaps=(
         "lyapunov_standard_error",
         "lyapunov_history",
-        "step_change",
         "sum_rule_residual",
-        "averaging_time",
         "paper_estimator",
         "chaos_k01",
     ),
