@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -105,7 +104,7 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
     Raises :class:`InputError` with one line that names the field, what was given and what is allowed.
     """
     tree, text = toml.read(source, overrides)
-    table = _convert(tree, _SceneTable, "")
+    table = toml.converted(tree, _SceneTable, "")
     system, analysis = system_and_analysis(table.system, table.analysis)
     request = make_request(system, analysis, table.outputs, table.options, {*table.axes, *table.points})
     axes, zipped = _axes(table, system, analysis)
@@ -153,43 +152,6 @@ def system_and_analysis(system_name: str, analysis_name: str) -> tuple[type[Syst
     return system, analysis.for_system(system)
 
 
-def _convert(given: Any, kind: type, where: str) -> Any:
-    """``given`` converted to the table ``kind``; ``where`` is the dotted prefix of its fields in messages."""
-    names = [field.name for field in msgspec.structs.fields(kind)]
-    for key in given:
-        if key not in names:
-            raise InputError(f"{where}{key} = {shown(given[key])}: unknown key{nearest(key, names)}")
-    try:
-        return msgspec.convert(given, kind)
-    except msgspec.ValidationError as error:
-        reason, _, path = str(error).partition(" - at `$.")
-        if missing := re.search(r"missing required field `(\w+)`", reason):
-            name = missing.group(1)
-            raise InputError(f"{where}{name}: missing; {_MISSING.get(name, 'it must be given')}") from None
-        name = re.split(r"\W", path, maxsplit=1)[0]
-        reason = re.sub(r"`([^`]*)`", _toml_types, reason)
-        raise InputError(
-            f"{where}{name} = {shown(given.get(name))}: {reason.replace('Expected', 'allowed is')}"
-        ) from None
-
-
-_TOML_TYPES = {
-    "object": "table",
-    "array": "list",
-    "str": "text",
-    "int": "integer",
-    "float": "number",
-    "bool": "boolean",
-}
-_MISSING = {"system": "give the name of a system", "analysis": "give the name of an analysis"}
-
-
-def _toml_types(match: re.Match[str]) -> str:
-    """A type such as ``int | null`` in the words of TOML, which has no null."""
-    words = [_TOML_TYPES.get(word, word) for word in match.group(1).split(" | ") if word != "null"]
-    return " or ".join(words) or "nothing"
-
-
 def _axes(table: _SceneTable, system: type[System], analysis: Analysis) -> tuple[tuple[Axis, ...], bool]:
     """The varying parameters; their values are counted before they are computed."""
     if table.axes and table.points:
@@ -228,7 +190,7 @@ def _axis_table(name: str, given: Any) -> AxisTable:
     if isinstance(num := given.get("num"), float) and num.is_integer():
         # Options and parameters also accept 1e3 for 1000.
         given = {**given, "num": int(num)}
-    return _convert(given, AxisTable, f"axes.{name}.")
+    return toml.converted(given, AxisTable, f"axes.{name}.")
 
 
 def _axis(system: type[System], name: str, spec: AxisTable) -> Axis:

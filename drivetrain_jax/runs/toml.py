@@ -1,4 +1,4 @@
-"""Scenes as nested tables: read TOML, replace entries by dotted keys, write TOML."""
+"""Scenes as nested tables: read TOML, replace entries by dotted keys, convert to typed tables, write TOML."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
+import msgspec
 import numpy as np
 import tomli_w
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._wording import shown
+from drivetrain_jax._wording import nearest, shown
 from drivetrain_jax.runs import shipped
 
 # Characters that an attribute of a result cannot store.
@@ -129,6 +130,43 @@ def _replace(tree: dict[str, Any], key: str, value: Any) -> None:
                 f"set {key}: {name!r} is not a table of the scene; give table.name, for example fixed.zeta"
             )
     tree[last] = value
+
+
+def converted(given: Any, kind: type, where: str) -> Any:
+    """``given`` converted to the table ``kind``; ``where`` is the dotted prefix of its fields in messages."""
+    names = [field.name for field in msgspec.structs.fields(kind)]
+    for key in given:
+        if key not in names:
+            raise InputError(f"{where}{key} = {shown(given[key])}: unknown key{nearest(key, names)}")
+    try:
+        return msgspec.convert(given, kind)
+    except msgspec.ValidationError as error:
+        reason, _, path = str(error).partition(" - at `$.")
+        if missing := re.search(r"missing required field `(\w+)`", reason):
+            name = missing.group(1)
+            raise InputError(f"{where}{name}: missing; {_MISSING.get(name, 'it must be given')}") from None
+        name = re.split(r"\W", path, maxsplit=1)[0]
+        reason = re.sub(r"`([^`]*)`", _toml_types, reason)
+        raise InputError(
+            f"{where}{name} = {shown(given.get(name))}: {reason.replace('Expected', 'allowed is')}"
+        ) from None
+
+
+_TOML_TYPES = {
+    "object": "table",
+    "array": "list",
+    "str": "text",
+    "int": "integer",
+    "float": "number",
+    "bool": "boolean",
+}
+_MISSING = {"system": "give the name of a system", "analysis": "give the name of an analysis"}
+
+
+def _toml_types(match: re.Match[str]) -> str:
+    """A type such as ``int | null`` in the words of TOML, which has no null."""
+    words = [_TOML_TYPES.get(word, word) for word in match.group(1).split(" | ") if word != "null"]
+    return " or ".join(words) or "nothing"
 
 
 def parse_value(text: str) -> Any:
