@@ -72,6 +72,19 @@ def test_no_files_import_each_other():
     assert [cycle for cycle in cycles if len(cycle) > 1] == []
 
 
+def test_no_file_and_no_function_is_long():
+    """At most 350 lines a file and 45 a function, its signature and docstring included."""
+    files, functions = {}, {}
+    for name, path in _sources().items():
+        text = path.read_text()
+        files[name] = len(text.splitlines())
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                functions[f"{name}.{node.name}"] = node.end_lineno - node.lineno + 1
+    assert not {name: count for name, count in files.items() if count > 350}
+    assert not {name: count for name, count in functions.items() if count > 45}
+
+
 def test_imports_run_only_downwards():
     code = "import sys; from importlinter.cli import lint_imports; sys.exit(lint_imports(no_cache=True))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)

@@ -90,12 +90,7 @@ def conclusions() -> str:
     soft, base = PRESETS["paper_fitted"], ("critical_speed", "mode_shape")
     stiff, rigid_A = {**soft, "k_D": 85e6}, {**soft, "k_A": math.inf}
     results = [solve(p, base, modes=2) for p in (soft, stiff, rigid_A)]
-    ends, middle = [], []
-    for result in results[:2]:
-        shape = result.mode_shape.values[0]
-        at_A = shape / shape[0]
-        ends.append(at_A[-1])
-        middle.append(np.abs(at_A).max())
+    ends, middle = zip(*map(_at_d_and_largest, results[:2]), strict=True)
     softer = solve({**soft, "k_D": 2e6}, base, modes=2).critical_speed.values
     n = [result.critical_speed.values for result in results]
     short = solve({**soft, "length": tuple(0.9 * x for x in soft["length"])}, base, modes=2).critical_speed.values
@@ -133,6 +128,12 @@ def conclusions() -> str:
         ],
     ]
     return f"## Conclusions 2 to 5\n\n{markdown(('no.', 'the paper', 'ours', 'holds'), rows)}"
+
+
+def _at_d_and_largest(result: Any) -> tuple[float, float]:
+    """Amplitude at D, and the largest one, of the first mode with amplitude 1 at A."""
+    shape = result.mode_shape.values[0] / result.mode_shape.values[0, 0]
+    return shape[-1], np.abs(shape).max()
 
 
 def printed_row_of_seven(parameters: Parameters) -> float:

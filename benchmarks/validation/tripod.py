@@ -48,45 +48,10 @@ def run(analysis: str, outputs: Sequence[str], fixed: dict[str, Any], **rest: An
 
 def constants_section() -> str:
     """Figs 9-10 and Tables 1-3."""
-    outputs = ["natural_angular_frequency", "torsional_stiffness", "chi_n", "midshaft_frequency", "mean_inertia"]
-    rows = []
-    for name, k, printed, chi, product in (
-        ("input", 1, "9632", "0.0026", "3066 Hz x pi = 9632.1"),
-        ("output", 3, "8767", "0.0027", "2792 Hz x 3.14 = 8766.9"),
-    ):
-        ours, plain = run("parameters", outputs, {"element": name}), oracle.shaft(name)
-        formula = float(run("parameters", ["chi_n"], {"element": name, "chi_source": "printed_formula"}).chi_n)
-        stiffness = plain.omega**2 * plain.inertia
-        rows += [
-            [
-                f"Omega{k} at 9 deg / rad/s",
-                printed,
-                f"{float(ours.natural_angular_frequency):.9f}",
-                f"{plain.omega:.9f}",
-                f"the printed {product} is the frequency read off the graph, not (22)-(23)",
-            ],
-            [
-                f"2 Omega{k}/2 pi / Hz",
-                "3066.5" if k == 1 else "2792",
-                f"{float(ours.natural_angular_frequency) / math.pi:.6f}",
-                f"{plain.omega / math.pi:.6f}",
-                "agree in the printed digits",
-            ],
-            [
-                f"torsional stiffness of the {name} element / N m/rad",
-                "1.11e4",
-                f"{float(ours.torsional_stiffness):.6e}",
-                f"{stiffness:.6e}",
-                "(1) with the data of the same table",
-            ],
-            [
-                f"chi_n of the {name} element",
-                chi,
-                f"{float(ours.chi_n):.6e}; appendix B as printed: {formula:.6e}",
-                f"{plain.chi_n:.6e}",
-                "appendix B omits chi_B; the stated value follows from neither",
-            ],
-        ]
+    rows = [
+        *_constants_of("input", 1, "9632", "0.0026", "3066 Hz x pi = 9632.1"),
+        *_constants_of("output", 3, "8767", "0.0027", "2792 Hz x 3.14 = 8766.9"),
+    ]
     frequencies = run("parameters", ["midshaft_frequency"], {"element": "input"}).midshaft_frequency.values
     speed = math.sqrt(oracle.G / oracle.RHO)
     for k, (found, printed) in enumerate(zip(frequencies, (1669.2, 3338.4, 5007.6, 6676.8, 8346.0), strict=True), 1):
@@ -97,6 +62,44 @@ def constants_section() -> str:
     return "## Constants: Figs 9-10, Tables 1-3\n\n" + markdown(
         ["", "published", "ours", "independent: moments of area", "why they differ"], rows
     )
+
+
+def _constants_of(name: str, k: int, printed: str, chi: str, product: str) -> list[list[str]]:
+    """Rows of one element, from the printed values of Omega and chi_n."""
+    outputs = ["natural_angular_frequency", "torsional_stiffness", "chi_n"]
+    ours, plain = run("parameters", outputs, {"element": name}), oracle.shaft(name)
+    formula = float(run("parameters", ["chi_n"], {"element": name, "chi_source": "printed_formula"}).chi_n)
+    stiffness = plain.omega**2 * plain.inertia
+    return [
+        [
+            f"Omega{k} at 9 deg / rad/s",
+            printed,
+            f"{float(ours.natural_angular_frequency):.9f}",
+            f"{plain.omega:.9f}",
+            f"the printed {product} is the frequency read off the graph, not (22)-(23)",
+        ],
+        [
+            f"2 Omega{k}/2 pi / Hz",
+            "3066.5" if k == 1 else "2792",
+            f"{float(ours.natural_angular_frequency) / math.pi:.6f}",
+            f"{plain.omega / math.pi:.6f}",
+            "agree in the printed digits",
+        ],
+        [
+            f"torsional stiffness of the {name} element / N m/rad",
+            "1.11e4",
+            f"{float(ours.torsional_stiffness):.6e}",
+            f"{stiffness:.6e}",
+            "(1) with the data of the same table",
+        ],
+        [
+            f"chi_n of the {name} element",
+            chi,
+            f"{float(ours.chi_n):.6e}; appendix B as printed: {formula:.6e}",
+            f"{plain.chi_n:.6e}",
+            "appendix B omits chi_B; the stated value follows from neither",
+        ],
+    ]
 
 
 def angles_section() -> str:

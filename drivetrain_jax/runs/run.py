@@ -57,21 +57,20 @@ def run(
     With ``out`` the result is written to that netCDF4/HDF5 file. Unfinished work is kept in ``FILE.nc.parts/`` and resumed
     by the next call; a complete result is only read. For results larger than one disk use ``drivetrain run --store zarr``.
 
-    :param scene: path of a scene file, name of one that the package brings, a mapping with the same keys, or a checked
-        scene.
-    :param overrides: entries to replace, by dotted key: ``{"fixed.zeta": 0.002}``.
-    :param fresh: compute all points again, and replace the result or unfinished work at ``out``. The same call resumes an
-        interrupted run.
-    :param threads: number of threads of this process (default: the usable cores).
-    :param workers: number of spawned processes instead of threads. A script that uses them needs the guard
-        ``if __name__ == "__main__"``.
-    :param dask: Dask cluster instead of threads: ``tcp://host:port``, or ``local:N`` processes.
-    :param reuse: path(s) of results whose common points are reused; only with ``out``. The result at ``out`` is always
-        reused if all of its points and outputs belong to this scene.
-    :param report: called with the :class:`Progress` after every chunk; by default a notebook shows a bar.
-    :raises InputError: one line that names the field, the value and what is allowed. Nothing is computed or written.
-    :raises Incomplete: the run failed, and finished chunks are kept. The message says if the same call may get further (a
-        full disk, too little memory, a worker that died).
+    Args:
+        scene: path of a scene file, name of one that the package brings, a mapping with the same keys, or a checked scene.
+        out: netCDF4/HDF5 file to write; default: only in memory.
+        overrides: entries to replace, by dotted key: ``{"fixed.zeta": 0.002}``.
+        fresh: compute all points again and replace what is at ``out``. The same call resumes an interrupted run.
+        threads: number of threads of this process (default: the usable cores).
+        workers: number of processes instead of threads. A script needs the guard ``if __name__ == "__main__"``.
+        dask: Dask cluster instead of threads: ``tcp://host:port``, or ``local:N`` processes.
+        reuse: path(s) of results whose common points are reused, only with ``out``; a part of this result there always is.
+        report: called with the :class:`Progress` after every chunk; by default a notebook shows a bar.
+
+    Raises: :class:`InputError` with one line that names the field, the value and what is allowed, before anything is
+    computed or written; :class:`Incomplete` if the run failed. Finished chunks are kept, and the message says if the same
+    call may get further (a full disk, too little memory, a worker that died).
 
     >>> import drivetrain_jax as dt
     >>> axes = {"k_sp": {"values": [4e8, 5e8]}}
@@ -79,12 +78,11 @@ def run(
     2
     """
     executor = make_executor(threads, workers, dask)
-    if out is None:
-        if reuse:
-            raise InputError("reuse: given without out; allowed is a run into a file")
-        with shown_progress(report) as shown:
-            return _in_memory(_job(scene, overrides, on_disk=False), executor, shown)
+    if out is None and reuse:
+        raise InputError("reuse: given without out; allowed is a run into a file")
     with shown_progress(report) as shown:
+        if out is None:
+            return _in_memory(_job(scene, overrides, on_disk=False), executor, shown)
         run_to_file(scene, Path(out), overrides=overrides, fresh=fresh, executor=executor, reuse=reuse, report=shown)
     return open_result(Path(out))
 

@@ -159,6 +159,22 @@ def compare(
     return Monodromy(z_fine, log_scale, truncation + rounding, met, residual, (4 / reduction) * apart)
 
 
+def _first_steps(
+    steps: Array, ratio: Array | int, least: Array | float, most_pieces: Array | int
+) -> tuple[Array, Array, Array]:
+    """Steps of the first two propagators of :func:`direct_monodromy`, and pieces of equally many steps for both.
+
+    The first one has ``ratio`` times fewer steps. A larger ratio costs less, but both step numbers must show the order of
+    the scheme: hence a small tolerance, and at least the ``least`` number for stability or four fifths of the steps.
+    """
+    predicted = jnp.maximum(steps, 2)
+    stable = jnp.minimum(jnp.ceil(least), predicted * 4 // 5).astype(predicted.dtype)
+    begin = jnp.maximum(stable, -(-predicted // ratio))
+    pieces = -(-begin // -(-begin // most_pieces))
+    begin, predicted = (-(-count // pieces) * pieces for count in (begin, predicted))
+    return begin, predicted, pieces
+
+
 def direct_monodromy(
     system: LinearPeriodic,
     propagate: Callable[[Array, Array], Propagator],
@@ -167,24 +183,18 @@ def direct_monodromy(
     stiffness: Array | float,
     rtol: float,
     order: int,
-    ratio: Array | int = 2,
-    least: Array | float = 0.0,
+    ratio: Array | int,
+    least: Array | float,
     most_pieces: Array | int = 1,
 ) -> Monodromy:
     """Refine from ``steps`` predicted steps (traced integer) until the error of every lane is at most ``rtol``.
 
     ``propagate(steps, pieces)`` returns the propagator of ``system`` with batch shape ``shape``, by a scheme of order
     ``order``, in up to ``most_pieces``. ``stiffness`` is that of :func:`stiffness_of`. A lane that overflows gets two
-    doublings to recover and then no longer delays the others. After six doublings the error is reported as it is. The first
-    comparison uses ``ratio`` times fewer steps. A larger ratio costs less, but both step numbers must show the order of the
-    scheme: hence a small ``rtol``, and at least the ``least`` number for stability or four fifths of the steps.
+    doublings to recover and then no longer delays the others. After six doublings the error is reported as it is. For
+    ``ratio`` and ``least`` see :func:`_first_steps`.
     """
-    predicted = jnp.maximum(steps, 2)
-    stable = jnp.minimum(jnp.ceil(least), predicted * 4 // 5).astype(predicted.dtype)
-    begin = jnp.maximum(stable, -(-predicted // ratio))
-    # Pieces of equally many steps.
-    pieces = -(-begin // -(-begin // most_pieces))
-    begin, predicted = (-(-count // pieces) * pieces for count in (begin, predicted))
+    begin, predicted, pieces = _first_steps(steps, ratio, least, most_pieces)
     zero = jnp.zeros(shape)
     # Traced once, not for its shapes and again for its values.
     propagate = jax.jit(propagate)

@@ -60,26 +60,20 @@ def amplitudes(
         t1 = jnp.where(result == diffrax.RESULTS.successful, jnp.minimum(t1, period), t0)
         between = solver.interpolation_cls(t0=s.t0, t1=s.t1, **dense)
         found = _peaks_on_step(field, between.evaluate, s.t0, s.t1, s.y, y1, indices)
-        largest, when = _larger((s.largest, s.when), (found.at_end, s.t1))
-        new = keep & ~jnp.any(s.aimed) & (found.value > largest) & (jnp.abs(found.place - 0.5) < 0.5 - EDGE)
-        nearest = fixed(jnp.min(jnp.where(new, found.place, 1.0)))
-        again = jnp.any(new)
-        place = jnp.where(s.aimed, s.t1 + found.late, s.t0 + found.place * (s.t1 - s.t0))
-        largest, when = _larger((largest, when), (jnp.where(s.aimed, found.near_end, found.value), place))
-        t0, t1 = jnp.where(again, s.t0, t0), jnp.where(again, s.t0 + nearest * (s.t1 - s.t0), t1)
+        (largest, when), aimed, nearest = _larger_peaks(s, found, keep)
+        again = jnp.any(aimed)
+        t0, t1 = jnp.where(again, s.t0, t0), jnp.where(again, nearest, t1)
         y, state, largest, when = jax.tree.map(
             lambda new, old: jnp.where(keep & ~again, new, old),
             (y1, state, largest, when),
             (s.y, s.solver, s.largest, s.when),
         )
-        return _Peaks(t0, t1, y, new & (found.place == nearest), largest, when, s.count + 1, jump, state, controlled)  # pyright: ignore[reportArgumentType]
+        return _Peaks(t0, t1, y, aimed, largest, when, s.count + 1, jump, state, controlled)
 
     zero = jnp.zeros(())
     t1, controlled = control.init(term, zero, period, fixed(start), None, None, solver.func, order)
     t1 = jnp.minimum(t1, period)
-    state = solver.init(term, zero, t1, start, None)
-    largest, jump = jnp.abs(start[jnp.array(indices)]), jnp.array(False)
-    first = _Peaks(zero, t1, start, largest < 0, largest, 0 * largest, jnp.zeros((), int), jump, state, controlled)
+    first = _at_start(t1, start, indices, solver.init(term, zero, t1, start, None), controlled)
     last = jax.lax.while_loop(unfinished, advance, first)
     stopped = jnp.where(last.count < MAX_STEPS, Outcome.NOT_FINITE, Outcome.STEP_LIMIT)
     return last.largest, last.when, last.y, jnp.where(last.t0 < period, stopped, Outcome.SUCCESS)
@@ -88,6 +82,24 @@ def amplitudes(
 def _larger(best: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
     """The larger values of both pairs of values and times."""
     return jnp.maximum(best[0], other[0]), jnp.where(other[0] > best[0], other[1], best[1])
+
+
+def _at_start(t1: Array, start: Array, indices: tuple[int, ...], solver: Any, control: Any) -> _Peaks:
+    """The loop before its first step, to ``t1``."""
+    largest, zero = jnp.abs(start[jnp.array(indices)]), jnp.zeros(())
+    jump, count = jnp.array(False), jnp.zeros((), int)
+    return _Peaks(zero, t1, start, largest < 0, largest, 0 * largest, count, jump, solver, control)
+
+
+def _larger_peaks(s: _Peaks, found: _Found, keep: Any) -> tuple[tuple[Array, Array], Array, Array]:
+    """Largest values and their times after a step that is kept; flags of the components whose new largest value comes first
+    within it, and that time: the step is then taken again, to end there."""
+    largest = _larger((s.largest, s.when), (found.at_end, s.t1))
+    new = keep & ~jnp.any(s.aimed) & (found.value > largest[0]) & (jnp.abs(found.place - 0.5) < 0.5 - EDGE)
+    nearest = jax.lax.stop_gradient(jnp.min(jnp.where(new, found.place, 1.0)))
+    place = jnp.where(s.aimed, s.t1 + found.late, s.t0 + found.place * (s.t1 - s.t0))
+    largest = _larger(largest, (jnp.where(s.aimed, found.near_end, found.value), place))
+    return largest, new & (found.place == nearest), s.t0 + nearest * (s.t1 - s.t0)
 
 
 class _Found(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import equinox as eqx
@@ -107,16 +107,7 @@ def lanes_last(
     counts, other values become an array of lanes. With ``size``, that many lanes are computed at a time, and ``function``
     is traced only for this number, once for equal ``constants`` (a batch that fits into one vector is computed as a whole).
     """
-
-    def at_once(varying: Any, shared: Any, size: int | None) -> Any:
-        lanes = max(x.shape[-1] for x in jax.tree.leaves(varying))
-        given = jax.tree.map(lambda x: x[0] if x.shape == (1,) and lanes > 1 else x, varying), shared
-        if size is None or not on_cpu():
-            return function(constants, *given)
-        full = max(lanes, size)
-        given = jax.tree.map(lambda x: _padded(x, full) if x.ndim and x.shape[-1] == lanes else x, given)
-        results = in_blocks(lambda own, _: _traced_once(function, constants, *own), given, full, size)
-        return jax.tree.map(lambda x: x[..., :lanes], results)
+    at_once = partial(_at_once, function, constants)
 
     @custom_vmap
     def call(varying: Any, shared: Any) -> Any:
@@ -129,33 +120,46 @@ def lanes_last(
             results = call(varying, shared)
             return results, jax.tree.map(lambda _: False, results)
         lanes = max(x.shape[-1] for x in jax.tree.leaves(varying))
-
-        def merged(x: Array, own: bool) -> Array:
-            if own:
-                x = jnp.broadcast_to(x, (*x.shape[:-1], lanes))
-                return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], batch * lanes)
-            return x if x.shape[-1] == 1 else jnp.tile(x, batch)
-
-        def common(x: Array, own: bool) -> Array:
-            if own and jnp.issubdtype(x.dtype, jnp.integer):
-                return jnp.max(x)
-            if own:
-                return jnp.broadcast_to(x if x.ndim > 1 else x[:, None], (batch, lanes)).reshape(-1)
-            return x if x.ndim == 0 else jnp.tile(x, batch)
-
-        def parted(x: Array) -> Array:
-            return jnp.moveaxis(x.reshape(*x.shape[:-1], batch, lanes), -2, 0)
-
-        merged_varying = jax.tree.map(merged, varying, batched[0])
-        merged_shared = jax.tree.map(common, shared, batched[1])
-        if batch * lanes <= FULL_WIDTH:
-            results = at_once(merged_varying, merged_shared, size and FULL_WIDTH)
-        else:
-            results = call(merged_varying, merged_shared)
-        return jax.tree.map(parted, results), jax.tree.map(lambda _: True, results)
+        merged = jax.tree.map(partial(_merged, batch, lanes), varying, batched[0])
+        common = jax.tree.map(partial(_common, batch, lanes), shared, batched[1])
+        few = batch * lanes <= FULL_WIDTH
+        results = at_once(merged, common, size and FULL_WIDTH) if few else call(merged, common)
+        parted = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], batch, lanes), -2, 0), results)
+        return parted, jax.tree.map(lambda _: True, results)
 
     results = call(jax.tree.map(lambda x: jnp.asarray(x)[..., None], varying), shared)
     return jax.tree.map(lambda x: x[..., 0], results)
+
+
+def _at_once(
+    function: Callable[[Any, Any, Any], Any], constants: Constants, varying: Any, shared: Any, size: int | None
+) -> Any:
+    """The results of all lanes, ``size`` of them at a time if given."""
+    lanes = max(x.shape[-1] for x in jax.tree.leaves(varying))
+    given = jax.tree.map(lambda x: x[0] if x.shape == (1,) and lanes > 1 else x, varying), shared
+    if size is None or not on_cpu():
+        return function(constants, *given)
+    full = max(lanes, size)
+    given = jax.tree.map(lambda x: _padded(x, full) if x.ndim and x.shape[-1] == lanes else x, given)
+    results = in_blocks(lambda own, _: _traced_once(function, constants, *own), given, full, size)
+    return jax.tree.map(lambda x: x[..., :lanes], results)
+
+
+def _merged(batch: int, lanes: int, x: Array, own: bool) -> Array:
+    """A varying array with the batch, its first axis if it has its ``own`` values for each entry, among the lanes."""
+    if own:
+        x = jnp.broadcast_to(x, (*x.shape[:-1], lanes))
+        return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], batch * lanes)
+    return x if x.shape[-1] == 1 else jnp.tile(x, batch)
+
+
+def _common(batch: int, lanes: int, x: Array, own: bool) -> Array:
+    """A shared value for the whole batch: the largest of different integers, an array of lanes of other values."""
+    if own and jnp.issubdtype(x.dtype, jnp.integer):
+        return jnp.max(x)
+    if own:
+        return jnp.broadcast_to(x if x.ndim > 1 else x[:, None], (batch, lanes)).reshape(-1)
+    return x if x.ndim == 0 else jnp.tile(x, batch)
 
 
 def _traced_once(function: Callable[[Any, Any, Any], Any], constants: Constants, varying: Any, shared: Any) -> Any:
