@@ -13,8 +13,8 @@ import drivetrain_jax
 from drivetrain_jax._machine import machine
 from drivetrain_jax._quantities import FIRST_FAILURE, Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.runs.grid import Grid
 from drivetrain_jax.runs.identity import PACKAGES
+from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import Scene, result_variables
 from drivetrain_jax.store import provenance
 from drivetrain_jax.store.consolidate import release

@@ -7,8 +7,8 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.atlas.analysis import ANALYSIS
 from drivetrain_jax.runs.axes import MAX_RANGES
-from drivetrain_jax.runs.grid import Grid
 from drivetrain_jax.runs.plan import mean_cost
+from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import Scene
 
 Ranges = dict[str, tuple[float, float]]

@@ -10,7 +10,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.runs.assemble import labelled
-from drivetrain_jax.runs.grid import Grid
+from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import restore_scene, result_variables
 from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.chunks import PartsFolder

@@ -19,8 +19,8 @@ from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import sweep_first
 from drivetrain_jax.runs.axes import entry_of
 from drivetrain_jax.runs.explain import differences_of, not_valid
-from drivetrain_jax.runs.grid import Grid
 from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import Scene, restore_scene
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.consolidate import map_variable, read_attribute

@@ -18,10 +18,10 @@ from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax._threads import threads
 from drivetrain_jax.analysis import Solver
 from drivetrain_jax.runs import compile_cache
-from drivetrain_jax.runs.grid import Grid
 from drivetrain_jax.runs.identity import numerics_of, scene_digest
 from drivetrain_jax.runs.kernel import Kernel, for_device, is_small, kernel_of
 from drivetrain_jax.runs.plan import Chunk, Plan, make_plan
+from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import Problem, Scene
 from drivetrain_jax.store.provenance import digest
 

@@ -17,8 +17,8 @@ from jax import Array
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import Analysis, Solver
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, on_cpu, options_for_few
-from drivetrain_jax.runs.grid import Grid
 from drivetrain_jax.runs.plan import make_plan
+from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import Problem, result_variables
 from drivetrain_jax.systems import System
 

@@ -8,7 +8,7 @@ from typing import Any, cast
 import h5py
 import numpy as np
 
-from drivetrain_jax.runs.grid import Grid
+from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import Scene, result_variables
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from drivetrain_jax._machine import usable_cores
 from drivetrain_jax._threads import in_double_precision
 from drivetrain_jax.analysis import Solver
-from drivetrain_jax.runs.grid import Grid
+from drivetrain_jax.runs.point_grid import Grid
 
 # Points sorted together, and points whose effort is predicted together (small enough for the cache).
 _BLOCK, _PIECE = 1 << 18, 1 << 15

@@ -16,7 +16,7 @@ import xarray as xr
 
 import drivetrain_jax as dt
 from drivetrain_jax.runs import job
-from drivetrain_jax.runs.grid import Grid
+from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import Problem, result_variables
 from drivetrain_jax.store.consolidate import read_attribute
 

@@ -9,8 +9,8 @@ import pytest
 import toy
 
 from drivetrain_jax.analysis import Solver
-from drivetrain_jax.runs.grid import Grid
 from drivetrain_jax.runs.plan import chunk_size, make_plan
+from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 
