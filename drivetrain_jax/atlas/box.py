@@ -99,11 +99,11 @@ class Box:
 
 
 Parts = tuple[Box | Panel | Gap, ...]
-Exploration = Generator[np.ndarray, np.ndarray, Parts]
+Refinement = Generator[np.ndarray, np.ndarray, Parts]
 
 
 @dataclass
-class Exploring:
+class BoxRefinement:
     """A box under construction."""
 
     box: Box

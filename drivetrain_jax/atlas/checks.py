@@ -11,7 +11,7 @@ import numpy as np
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.patches import Patches, patches_of
-from drivetrain_jax.atlas.ridges import feet
+from drivetrain_jax.atlas.ridges import ridge_roots
 from drivetrain_jax.atlas.windows import Crossing, Interval, Line, Range
 
 Direct = Callable[[Mapping[str, np.ndarray]], np.ndarray]
@@ -107,7 +107,7 @@ def _along_ridge(
     tip, beside = (np.insert([place], k, v)[None] for v in (crossing.value, value))
     function = patches[criteria.multipliers.index(crossing.multiplier)]
     bottom = part.to_coordinates(beside)[0, k]
-    foot = feet(function, part.to_coordinates(tip), 1 - k, bottom)[0]
+    foot = ridge_roots(function, part.to_coordinates(tip), 1 - k, bottom)[0]
     if not np.isfinite(foot):
         return (place,)
     found = part.to_parameters(np.insert([foot], k, bottom)[None])[0, 1 - k]

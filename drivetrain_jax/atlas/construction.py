@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivetrain_jax.atlas.box import TROUBLED_DEPTH, Box, Exploration, Exploring, Settings, Source
+from drivetrain_jax.atlas.box import TROUBLED_DEPTH, Box, BoxRefinement, Refinement, Settings, Source
 from drivetrain_jax.atlas.fitting import fit
 from drivetrain_jax.atlas.given_nodes import fit_given
 from drivetrain_jax.atlas.lines import probe
@@ -35,8 +35,8 @@ from drivetrain_jax.systems import Coordinate
 
 Rounds = Generator[np.ndarray, np.ndarray, Atlas]
 # A box with its construction, and the points that it requests, or their values (None at the start).
-_Open = tuple[Box, Exploration, np.ndarray]
-_Told = tuple[Box, Exploration, np.ndarray | None]
+_Open = tuple[Box, Refinement, np.ndarray]
+_Answered = tuple[Box, Refinement, np.ndarray | None]
 MAX_SOLVES, MAX_NODES = 400_000, 128
 # Relative width of a box in a coordinate that does not vary.
 _THINNEST = 1e-15
@@ -78,7 +78,7 @@ class Domain:
         ]
 
 
-class Ledger:
+class SolveCache:
     """Cache of solved points: none is requested twice (neighbouring boxes share the lines on their common face)."""
 
     def __init__(self) -> None:
@@ -141,40 +141,40 @@ def construct(
     ``max_nodes`` limits the polynomials of one coordinate. If the next round would exceed ``max_solves``, the boxes that
     are still open become gaps.
     """
-    ledger = Ledger()
+    cache = SolveCache()
     settings = Settings(quantity, tolerance, max_nodes, lambda solved: solved[:, : quantity.size])
     boxes, done = [domain.box()], []
     if source:
-        found = yield from _explored(boxes, domain, replace(settings, source=source), ledger, max_solves)
+        found = yield from _refined(boxes, domain, replace(settings, source=source), cache, max_solves)
         done = [part for part in found if isinstance(part, Panel)]
         boxes = [Box.of(part, TROUBLED_DEPTH) for part in found if isinstance(part, Gap)]
-    done += yield from _explored(boxes, domain, settings, ledger, max_solves)
-    return _vouched(_atlas(domain, done, tolerance, ledger), settings, ledger, quantity.size)
+    done += yield from _refined(boxes, domain, settings, cache, max_solves)
+    return _with_solver_errors(_atlas(domain, done, tolerance, cache), settings, cache, quantity.size)
 
 
-def _explored(
-    boxes: Iterable[Box], domain: Domain, settings: Settings, ledger: Ledger, max_solves: int
+def _refined(
+    boxes: Iterable[Box], domain: Domain, settings: Settings, cache: SolveCache, max_solves: int
 ) -> Generator[np.ndarray, np.ndarray, list[Panel | Gap]]:
     """The panels and gaps of ``boxes``."""
-    active, done = _advanced([(box, explore(box, settings), None) for box in boxes], settings)
+    active, done = _advanced([(box, refine(box, settings), None) for box in boxes], settings)
     while active:
         requests = [request for _, _, request in active]
         points = domain.points(np.concatenate(requests))
-        new = ledger.missing(points)
-        if len(ledger) + len(new) > max_solves:
+        new = cache.missing(points)
+        if len(cache) + len(new) > max_solves:
             done += [Gap(box.lower, box.upper, f"more than {max_solves} solves would be needed") for box, *_ in active]
             break
         if len(new):
-            ledger.add(new, np.asarray((yield new), float))
-        values = settings.value_of(ledger.values(points))
+            cache.add(new, np.asarray((yield new), float))
+        values = settings.value_of(cache.values(points))
         answers = np.split(values, np.cumsum([len(x) for x in requests])[:-1])
-        told = [(box, task, answer) for (box, task, _), answer in zip(active, answers, strict=True)]
-        active, finished = _advanced(told, settings)
+        answered = [(box, task, answer) for (box, task, _), answer in zip(active, answers, strict=True)]
+        active, finished = _advanced(answered, settings)
         done += finished
     return done
 
 
-def _advanced(tasks: Iterable[_Told], settings: Settings) -> tuple[list[_Open], list[Panel | Gap]]:
+def _advanced(tasks: Iterable[_Answered], settings: Settings) -> tuple[list[_Open], list[Panel | Gap]]:
     """The open boxes after their answers, including parts of split ones, and the finished ones."""
     waiting = deque(tasks)
     going: list[_Open] = []
@@ -184,12 +184,12 @@ def _advanced(tasks: Iterable[_Told], settings: Settings) -> tuple[list[_Open], 
         try:
             going.append((box, task, task.send(answer)))  # pyright: ignore[reportArgumentType]
         except StopIteration as end:
-            waiting += [(part, explore(part, settings), None) for part in end.value if isinstance(part, Box)]
+            waiting += [(part, refine(part, settings), None) for part in end.value if isinstance(part, Box)]
             done += [part for part in end.value if not isinstance(part, Box)]
     return going, done
 
 
-def _atlas(domain: Domain, done: Iterable[Panel | Gap], tolerance: float, ledger: Ledger) -> Atlas:
+def _atlas(domain: Domain, done: Iterable[Panel | Gap], tolerance: float, cache: SolveCache) -> Atlas:
     return Atlas(
         parameters=domain.parameters,
         coordinates=domain.coordinates,
@@ -199,24 +199,24 @@ def _atlas(domain: Domain, done: Iterable[Panel | Gap], tolerance: float, ledger
         panels=tuple(part for part in done if isinstance(part, Panel)),
         gaps=tuple(part for part in done if isinstance(part, Gap)),
         tolerance=tolerance,
-        solves=len(ledger),
+        solves=len(cache),
     )
 
 
-def _vouched(atlas: Atlas, settings: Settings, ledger: Ledger, size: int) -> Atlas:
+def _with_solver_errors(atlas: Atlas, settings: Settings, cache: SolveCache, size: int) -> Atlas:
     """``atlas`` with bounds that include the errors of the solves, stored after the first ``size`` columns.
 
     Held-out points do not show errors that all solves have in common.
     """
     if not atlas.panels:
         return atlas
-    points, solved = ledger.all()
+    points, solved = cache.all()
     if solved.shape[1] == size:
         return atlas
     x, changes = atlas.to_coordinates(points), solved[:, size:]
     order = np.argsort(-np.sum(changes**2, axis=1), kind="stable")
 
-    def vouched(panel: Panel) -> Panel:
+    def with_errors(panel: Panel) -> Panel:
         chosen = order[inside(panel, x[order])][:_MOST_CHANGES]
         value, change = settings.value_of(solved[chosen]), changes[chosen]
         derived = np.abs(settings.quantity.derived(value + change) - settings.quantity.derived(value))
@@ -226,16 +226,16 @@ def _vouched(atlas: Atlas, settings: Settings, ledger: Ledger, size: int) -> Atl
             derived_error=panel.derived_error + derived.max(axis=0, initial=0.0),
         )
 
-    return replace(atlas, panels=tuple(map(vouched, atlas.panels)))
+    return replace(atlas, panels=tuple(map(with_errors, atlas.panels)))
 
 
-def explore(box: Box, settings: Settings) -> Exploration:
+def refine(box: Box, settings: Settings) -> Refinement:
     """Yield requests for values at points in coordinates; returns the panel, gap or halves of the box."""
-    exploring = Exploring(box, settings)
+    refinement = BoxRefinement(box, settings)
     if settings.source:
-        return (yield from fit_given(exploring, settings.source))
-    found = yield from probe(exploring)
-    return (yield from fit(exploring, found)) if isinstance(found, list) else found
+        return (yield from fit_given(refinement, settings.source))
+    found = yield from probe(refinement)
+    return (yield from fit(refinement, found)) if isinstance(found, list) else found
 
 
 def run(rounds: Rounds, solve: Callable[[np.ndarray], np.ndarray]) -> Atlas:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drivetrain_jax.atlas import decay
-from drivetrain_jax.atlas.box import Exploration, Exploring, Parts, Sample
+from drivetrain_jax.atlas.box import BoxRefinement, Parts, Refinement, Sample
 from drivetrain_jax.atlas.interpolation import coefficients, evaluate, slabs, tensor_nodes
 from drivetrain_jax.atlas.panels import Panel
 from drivetrain_jax.atlas.quantity import distance
@@ -22,29 +22,29 @@ _MAX_GROWTHS = 2
 _MAX_TENSOR, MAX_NUMBERS = 300_000, 30_000_000
 
 
-def fit(exploring: Exploring, degrees: list[int]) -> Exploration:
+def fit(refinement: BoxRefinement, degrees: list[int]) -> Refinement:
     """A panel of about ``degrees`` nodes, or the halves or gap of the box instead."""
     d = len(degrees)
-    most = min(_MAX_TENSOR, MAX_NUMBERS // exploring.settings.quantity.size)
+    most = min(_MAX_TENSOR, MAX_NUMBERS // refinement.settings.quantity.size)
     for growth in range(_MAX_GROWTHS + 1):
         if np.prod(degrees, dtype=float) > most:
-            return exploring.split(int(np.argmax(degrees)), f"more than {most} nodes would be needed")
-        checks = known_checks(exploring)
+            return refinement.split(int(np.argmax(degrees)), f"more than {most} nodes would be needed")
+        checks = known_checks(refinement)
         extra = scattered(HELD_OUT, d) if growth == 0 else np.empty((0, d))
-        values = yield from exploring.solve(np.concatenate([tensor_nodes(degrees), extra]))
+        values = yield from refinement.solve(np.concatenate([tensor_nodes(degrees), extra]))
         if not np.isfinite(values).all():
-            return exploring.failed(values)
+            return refinement.failed(values)
         values, fresh = np.split(values, [len(values) - len(extra)])
-        x = np.concatenate([checks.x, exploring.box.place(extra)])
+        x = np.concatenate([checks.x, refinement.box.place(extra)])
         checks = Sample(x, np.concatenate([checks.values, fresh]))
         tensor = coefficients(values, degrees)
-        panel, tails, limit = judge(exploring, tensor, values, checks)
+        panel, tails, limit = judge(refinement, tensor, values, checks)
         if panel is not None:
             return (panel,)
         if any(decay.is_noise(slabs(tensor, k)) for k in range(d) if tails[k] > 1 and degrees[k] > 24):
-            return exploring.give_up("the direct solves scatter more than the tolerance allows")
+            return refinement.give_up("the direct solves scatter more than the tolerance allows")
         degrees = grown(tensor, tails, limit)
-    return unresolved(exploring, tails)
+    return unresolved(refinement, tails)
 
 
 def scattered(count: int, d: int) -> np.ndarray:
@@ -56,11 +56,11 @@ def scattered(count: int, d: int) -> np.ndarray:
     return np.cos(np.pi * fractions)
 
 
-def known_checks(exploring: Exploring) -> Sample:
+def known_checks(refinement: BoxRefinement) -> Sample:
     """Solves that are not nodes of the next tensor, thinned evenly."""
-    d = len(exploring.box.lower)
-    none = Sample(np.empty((0, d)), np.empty((0, exploring.settings.quantity.size)))
-    samples = [none, *exploring.box.known, *exploring.solved]
+    d = len(refinement.box.lower)
+    none = Sample(np.empty((0, d)), np.empty((0, refinement.settings.quantity.size)))
+    samples = [none, *refinement.box.known, *refinement.solved]
     x = np.concatenate([s.x for s in samples])
     values = np.concatenate([s.values for s in samples])
     chosen = np.linspace(0, len(x) - 1, min(len(x), _MAX_CHECKS)).astype(int)
@@ -68,15 +68,15 @@ def known_checks(exploring: Exploring) -> Sample:
 
 
 def judge(
-    exploring: Exploring, tensor: np.ndarray, values: np.ndarray, checks: Sample, spare: float = 0.5
+    refinement: BoxRefinement, tensor: np.ndarray, values: np.ndarray, checks: Sample, spare: float = 0.5
 ) -> tuple[Panel | None, np.ndarray, float]:
     """The panel if it is accurate enough; the truncation error of each coordinate over its limit, half the tolerance; that
     limit.
 
     Errors at the held-out points may use the fraction ``spare`` of the tolerance.
     """
-    quantity, tolerance = exploring.settings.quantity, exploring.settings.tolerance
-    t = exploring.box.position(checks.x)
+    quantity, tolerance = refinement.settings.quantity, refinement.settings.tolerance
+    t = refinement.box.position(checks.x)
     few = values[:: -(-len(values) // _SCALES)]
     scale = quantity.scale(np.concatenate([few, checks.values]))
     limit = tolerance * scale.min()
@@ -88,7 +88,7 @@ def judge(
         return None, tails, limit / 2
     derived = np.abs(quantity.derived(fitted) - quantity.derived(checks.values))
     bounds = float(_SAFETY * errors.max()), _SAFETY * derived.max(axis=0, initial=0.0)
-    return Panel(exploring.box.lower, exploring.box.upper, tensor, *bounds), tails, limit / 2
+    return Panel(refinement.box.lower, refinement.box.upper, tensor, *bounds), tails, limit / 2
 
 
 def _without(tensor: np.ndarray, negligible: float) -> np.ndarray:
@@ -110,7 +110,7 @@ def grown(tensor: np.ndarray, tails: np.ndarray, limit: float) -> list[int]:
     return [decay.extrapolated(s, limit) if tail > 1 else n for n, s, tail in zip(degrees, sizes, tails, strict=True)]
 
 
-def unresolved(exploring: Exploring, tails: np.ndarray) -> Parts:
+def unresolved(refinement: BoxRefinement, tails: np.ndarray) -> Parts:
     """The halves or gap of a box whose tensor has grown often enough."""
     axis = int(np.argmax(tails)) if tails.max() > 1 else None
-    return exploring.trouble("not resolved where its edges are: not smooth", axis)
+    return refinement.trouble("not resolved where its edges are: not smooth", axis)

@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 
 from drivetrain_jax.atlas import decay
-from drivetrain_jax.atlas.box import Exploration, Exploring, Source
+from drivetrain_jax.atlas.box import BoxRefinement, Refinement, Source
 from drivetrain_jax.atlas.fitting import HELD_OUT, MAX_NUMBERS, grown, judge, known_checks, scattered, unresolved
 from drivetrain_jax.atlas.interpolation import analysis_matrix, coefficients, envelope, slabs
 
@@ -25,43 +25,43 @@ _MOST_BOXES = 100
 _MAX_GROWTHS = 8
 
 
-def fit_given(exploring: Exploring, source: Source) -> Exploration:
+def fit_given(refinement: BoxRefinement, source: Source) -> Refinement:
     """A panel with nodes from ``source``, compared with solves, or the halves or gap of the box instead."""
-    d, most = len(exploring.box.lower), MAX_NUMBERS // exploring.settings.quantity.size
-    most_along, checks = exploring.settings.max_nodes, None
-    radians = source.radians(exploring.box.lower, exploring.box.upper)
+    d, most = len(refinement.box.lower), MAX_NUMBERS // refinement.settings.quantity.size
+    most_along, checks = refinement.settings.max_nodes, None
+    radians = source.radians(refinement.box.lower, refinement.box.upper)
     if not radians < _MOST_BOXES * most_along:
-        return exploring.give_up("too many nodes would be needed")
+        return refinement.give_up("too many nodes would be needed")
     if radians > most_along:
-        return exploring.split(source.axis, "not resolved")
+        return refinement.split(source.axis, "not resolved")
     # Along lines cos(r x) and sin(r x) have coefficients J_n(r), which fall beyond n = r.
     along = min(round(radians + _BEYOND * np.cbrt(radians)), most_along)
     degrees = [max(along, 1) if k == source.axis else _LINES for k in range(d)]
     if d > 2:
-        degrees = _probed(exploring, source, _suited(degrees, source))
+        degrees = _probed(refinement, source, _suited(degrees, source))
     for _ in range(_MAX_GROWTHS + 1):
         largest = int(np.argmax(degrees))
         if degrees[largest] > most_along or np.prod(degrees, dtype=float) > most:
-            return exploring.split(largest, "not resolved")
+            return refinement.split(largest, "not resolved")
         degrees = _suited(degrees, source)
-        waiting = source.start(exploring.box.axes(degrees))
+        waiting = source.start(refinement.box.axes(degrees))
         if checks is None:
             # In parallel with the nodes.
-            solved = yield from exploring.solve(_held_out(d))
+            solved = yield from refinement.solve(_held_out(d))
             if not np.isfinite(solved).all():
-                return exploring.failed(solved)
-            checks = known_checks(exploring)
+                return refinement.failed(solved)
+            checks = known_checks(refinement)
         values = waiting()
         if not np.isfinite(values).all():
-            return exploring.trouble("no values at the nodes")
+            return refinement.trouble("no values at the nodes")
         tensor = coefficients(values, degrees)
-        panel, tails, limit = judge(exploring, tensor, values, checks, spare=1.0)
+        panel, tails, limit = judge(refinement, tensor, values, checks, spare=1.0)
         if panel is not None:
             return (panel,)
         if tails.max() <= 1:
-            return exploring.give_up("the nodes are not what is solved")
+            return refinement.give_up("the nodes are not what is solved")
         degrees = _resized(tensor, tails, limit)
-    return unresolved(exploring, tails)
+    return unresolved(refinement, tails)
 
 
 def _held_out(d: int) -> np.ndarray:
@@ -75,9 +75,9 @@ def _suited(degrees: list[int], source: Source) -> list[int]:
     return [-(-n // source.positions) * source.positions if k == source.axis else n for k, n in enumerate(degrees)]
 
 
-def _probed(exploring: Exploring, source: Source, degrees: list[int]) -> list[int]:
+def _probed(refinement: BoxRefinement, source: Source, degrees: list[int]) -> list[int]:
     """Nodes that each coordinate needs along the edges of the box; ``degrees`` where values are missing."""
-    box, d = exploring.box, len(exploring.box.lower)
+    box, d = refinement.box, len(refinement.box.lower)
     ends = [np.array(pair) for pair in zip(box.lower, box.upper, strict=True)]
     counts = [degrees[k] if k == source.axis else _PROBES for k in range(d)]
     along = box.axes(counts)
@@ -90,7 +90,7 @@ def _probed(exploring: Exploring, source: Source, degrees: list[int]) -> list[in
         values = waiting()
         if not np.isfinite(values).all():
             return degrees
-        limit = exploring.settings.limit(values) / 2
+        limit = refinement.settings.limit(values) / 2
         tensor = values.reshape(*shape, -1)
         for axis in (k, source.axis):
             sizes = slabs(np.tensordot(analysis_matrix(shape[axis]), tensor, axes=(1, axis)), 0)

@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 
 from drivetrain_jax.atlas import decay
-from drivetrain_jax.atlas.box import Exploring, Parts
+from drivetrain_jax.atlas.box import BoxRefinement, Parts
 from drivetrain_jax.atlas.interpolation import envelope
 
 # Points of a line at first; each refinement doubles the intervals.
@@ -54,16 +54,16 @@ def _along(corner: np.ndarray, axis: int, t: np.ndarray) -> np.ndarray:
     return points
 
 
-def probe(exploring: Exploring) -> Probe:
+def probe(refinement: BoxRefinement) -> Probe:
     """Nodes that each coordinate needs according to lines along the edges, or the halves or gap of the box instead."""
-    d = len(exploring.box.lower)
+    d = len(refinement.box.lower)
     places = [(axis, corner) for axis in range(d) for corner in _corners(d, axis)]
     t = np.concatenate([_along(corner, axis, decay.lobatto(_LINE)) for axis, corner in places])
-    values = yield from exploring.solve(t)
+    values = yield from refinement.solve(t)
     if not np.isfinite(values).all():
-        return exploring.failed(values)
+        return refinement.failed(values)
     fraction, margin = _MANY if d > 2 else _THOROUGH
-    limit = exploring.settings.limit(values) * fraction
+    limit = refinement.settings.limit(values) * fraction
     lines = [_Line(*place, v) for place, v in zip(places, np.split(values, len(places)), strict=True)]
 
     def cost(line: _Line) -> tuple[float, float]:
@@ -71,41 +71,41 @@ def probe(exploring: Exploring) -> Probe:
         return decay.needed(sizes, limit) or np.inf, envelope(sizes)[-3]
 
     worst = [max((line for line in lines if line.axis == axis), key=cost) for axis in range(d)]
-    return (yield from _refine(exploring, worst, limit, margin))
+    return (yield from _refine(refinement, worst, limit, margin))
 
 
-def _refine(exploring: Exploring, lines: list[_Line], limit: float, margin: int) -> Probe:
+def _refine(refinement: BoxRefinement, lines: list[_Line], limit: float, margin: int) -> Probe:
     """Refine the worst line of each coordinate until all are resolved, or one cannot be resolved."""
     while open_lines := [line for line in lines if decay.foreseen(line.sizes, limit) is None]:
         for line in open_lines:
-            hopeless = _verdict(line, exploring)
-            if hopeless:
-                return hopeless
+            useless = _verdict(line, refinement)
+            if useless:
+                return useless
         t = [_along(line.corner, line.axis, decay.lobatto(2 * len(line.values) - 1)[1::2]) for line in open_lines]
-        values = yield from exploring.solve(np.concatenate(t))
+        values = yield from refinement.solve(np.concatenate(t))
         if not np.isfinite(values).all():
-            return exploring.failed(values)
+            return refinement.failed(values)
         for line, new in zip(open_lines, np.split(values, np.cumsum([len(x) for x in t])[:-1]), strict=True):
             merged = np.empty((2 * len(line.values) - 1, values.shape[1]))
             merged[::2], merged[1::2] = line.values, new
             lines[line.axis] = replace(line, values=merged)
     degrees = [decay.foreseen(line.sizes, limit) + margin for line in lines]  # pyright: ignore[reportOptionalOperand]
     largest = int(np.argmax(degrees))
-    if degrees[largest] > exploring.settings.max_nodes:
-        return exploring.split(largest, f"more than {exploring.settings.max_nodes} nodes would be needed")
+    if degrees[largest] > refinement.settings.max_nodes:
+        return refinement.split(largest, f"more than {refinement.settings.max_nodes} nodes would be needed")
     return degrees
 
 
-def _verdict(line: _Line, exploring: Exploring) -> Parts | None:
+def _verdict(line: _Line, refinement: BoxRefinement) -> Parts | None:
     """The halves or gap of the box if refining ``line`` is useless; None if it helps."""
     if len(line.values) <= 2 * _LINE:
         return None
     sizes = line.sizes
     if decay.is_noise(sizes):
         level = envelope(sizes)[len(sizes) // 2] / sizes[0]
-        return exploring.give_up(f"the direct solves scatter by {level:.0e}, more than the tolerance allows")
+        return refinement.give_up(f"the direct solves scatter by {level:.0e}, more than the tolerance allows")
     if decay.is_algebraic(sizes):
-        return exploring.trouble("not smooth: the coefficients fall like a power", line.axis)
-    if len(line.values) > exploring.settings.max_nodes:
-        return exploring.split(line.axis, "not resolved")
+        return refinement.trouble("not smooth: the coefficients fall like a power", line.axis)
+    if len(line.values) > refinement.settings.max_nodes:
+        return refinement.split(line.axis, "not resolved")
     return None

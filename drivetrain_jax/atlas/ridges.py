@@ -12,7 +12,7 @@ _NEWTON = 3
 _LARGEST_SHIFT = 0.02
 
 
-def feet(patches: Patches, tips: np.ndarray, horizontal: int, bottom: float) -> np.ndarray:
+def ridge_roots(patches: Patches, tips: np.ndarray, horizontal: int, bottom: float) -> np.ndarray:
     """Coordinate h of the foot of each ridge where the other coordinate is ``bottom``, ``(N,)``; NaN if the ridge is lost.
 
     ``patches`` hold the function whose tips are ``tips`` ``(N, 2)`` in coordinates.

@@ -133,11 +133,11 @@ class SeriesNodes:
         with np.errstate(divide="ignore"):
             ends = self._domain.coordinates[self.axis].inverse(np.array([0.0, end]))
         while True:
-            hopeless = not parts <= _MOST_PARTS
-            number = np.int64(1 if hopeless else parts)
+            too_many = not parts <= _MOST_PARTS
+            number = np.int64(1 if too_many else parts)
             phi, left_out = map(np.asarray, kernel(full, self._fixed, ends, number, x / end if end else x))
-            exact = (left_out <= self._left_out) & (not hopeless)
-            if hopeless or exact.all():
+            exact = (left_out <= self._left_out) & (not too_many)
+            if too_many or exact.all():
                 break
             parts = 2 * parts if np.isfinite(left_out).all() else math.inf
         return np.where(exact[:, None, None], np.transpose(phi.reshape(len(x), -1, _LANES), (2, 0, 1)), np.nan)

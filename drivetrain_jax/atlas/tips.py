@@ -19,7 +19,7 @@ from drivetrain_jax.atlas.exclusion import Search, critical_points
 from drivetrain_jax.atlas.growth import Growth, growth, limiting
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.patches import Patches, patches_of
-from drivetrain_jax.atlas.ridges import feet
+from drivetrain_jax.atlas.ridges import ridge_roots
 from drivetrain_jax.atlas.undamped import undamped_tips
 from drivetrain_jax.systems import Resonances, System
 
@@ -218,7 +218,7 @@ def _named_at(criteria: Criteria, patch: Patches, x: np.ndarray, h: int) -> np.n
         return x
     bottom = float(atlas.to_coordinates(atlas.lower)[v])
     points = np.full(x.shape, bottom)
-    points[:, h] = feet(patch, x, h, bottom)
+    points[:, h] = ridge_roots(patch, x, h, bottom)
     return points
 
 
