@@ -21,7 +21,7 @@ from benchmarks import engine_cost
 from benchmarks.engine_cost import Memory, cpu_seconds, scene
 from benchmarks.results_files import between_marks
 from benchmarks.timing import RESULTS, median, parser, provenance, results_folder, significant, write_csv
-from drivetrain_jax.runs.assemble import Table
+from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.executor import IN_FLIGHT
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
@@ -57,7 +57,7 @@ def costs(points: int) -> Costs:
     results = [engine.compute(chunk) for chunk in sample]
     computing = [cpu_seconds(lambda c=chunk: engine.compute(c)) for chunk in sample]
     sizes = [len(pickle.dumps(dict(result))) for result in results]
-    table = Table(engine.scene, engine.grid)
+    table = ResultBuffer(engine.scene, engine.grid)
     table.lay_out()
 
     def handle() -> None:

@@ -33,7 +33,7 @@ _RESIDENT, _ROWS = 1 << 26, 1 << 22
 _STORAGE = ("h5py",)
 
 
-class Table:
+class ResultBuffer:
     """Results of all points of a grid, filled chunk by chunk. A point that is never filled has the outcome step limit.
 
     ``arrays`` holds all values: the axes in scene order (or the points), then the dimensions of the result.

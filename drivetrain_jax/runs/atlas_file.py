@@ -17,7 +17,7 @@ from drivetrain_jax.analysis.atlas.analysis import ANALYSIS
 from drivetrain_jax.atlas import Atlas, StabilityAtlas, from_arrays, stability_atlas, to_arrays
 from drivetrain_jax.atlas.floquet import floquet_domain
 from drivetrain_jax.runs import compile_cache
-from drivetrain_jax.runs.assemble import Table, result_attrs, to_dataset
+from drivetrain_jax.runs.assemble import ResultBuffer, result_attrs, to_dataset
 from drivetrain_jax.runs.axes import Axis
 from drivetrain_jax.runs.executor import Threads
 from drivetrain_jax.runs.job import Job
@@ -250,9 +250,9 @@ class StoredAtlas:
         """
         scene = self.scene_on(columns, zipped=zipped)
         job = Job(scene, DIRECT)
-        table = Table(scene, job.grid)
-        evaluate(job, table, self.stability, Work(Threads()), Progress(job.total), solve=solve)
-        return table.lay_out()
+        buffer = ResultBuffer(scene, job.grid)
+        evaluate(job, buffer, self.stability, Work(Threads()), Progress(job.total), solve=solve)
+        return buffer.lay_out()
 
     def scene_on(self, columns: Mapping[str, np.ndarray], *, zipped: bool = False) -> Scene:
         """The ``floquet`` scene whose results :meth:`arrays` gives."""
@@ -271,9 +271,9 @@ class StoredAtlas:
         axes = {name: column for name, column in columns.items() if name in self.parameters}
         request = Request(("spectral_radius",), "direct", self.scene.request.options)
         job = Job(self._scene(axes, dict(self.fixed), request, zipped=True), DIRECT)
-        table = Table(job.scene, job.grid)
-        Work(Threads()).do(job, table, Progress(job.total))
-        return table.lay_out()["spectral_radius"]
+        buffer = ResultBuffer(job.scene, job.grid)
+        Work(Threads()).do(job, buffer, Progress(job.total))
+        return buffer.lay_out()["spectral_radius"]
 
     def _names(self, values: Mapping[str, Any]) -> tuple[str, ...]:
         for name in values:

@@ -10,7 +10,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME
-from drivetrain_jax.runs.assemble import Table, enter, labelled
+from drivetrain_jax.runs.assemble import ResultBuffer, enter, labelled
 from drivetrain_jax.runs.growing import remaining
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.output_state import OutputState
@@ -53,25 +53,25 @@ def _open_partial(path: Path) -> xr.Dataset:
         raise InputError(
             f"file = {str(path)!r}: an atlas that is not finished; allowed is to wait for it or to resume it"
         )
-    table, done = Table(job.scene, job.grid), np.zeros(job.grid.size, bool)
+    buffer, done = ResultBuffer(job.scene, job.grid), np.zeros(job.grid.size, bool)
     for points, results in _finished(job, output):
-        table.fill(points, results)
+        buffer.fill(points, results)
         done[points] = True
-    return _labelled(job, table, done)
+    return _labelled(job, buffer, done)
 
 
 def _finished(job: Job, output: OutputState) -> Iterator[tuple[np.ndarray, Mapping[str, np.ndarray]]]:
     """Points and results that are finished, reused ones included."""
     reused = output.reused_before()
-    yield from reused.blocks([variable.name for variable in Table(job.scene, job.grid).variables])
+    yield from reused.blocks([variable.name for variable in ResultBuffer(job.scene, job.grid).variables])
     plan = remaining(job, reused).plan
     for part in output.parts.read():
         for number, results in part:
             yield plan.chunk(number).points, results
 
 
-def _labelled(job: Job, table: Table, done: np.ndarray) -> xr.Dataset:
-    arrays = dict(table.lay_out())
+def _labelled(job: Job, buffer: ResultBuffer, done: np.ndarray) -> xr.Dataset:
+    arrays = dict(buffer.lay_out())
     enter(arrays[OUTCOME.name], job.grid, np.flatnonzero(~done), PENDING)
     count = int(done.sum()) * job.grid.path_length
     result = labelled(job.scene, arrays, {"digest": job.digest, "points_done": count})

@@ -14,7 +14,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax._wording import aligned, json_value, nearest, shown, written
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, get_analysis
-from drivetrain_jax.runs.assemble import Table
+from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.physical import nondimensional
 from drivetrain_jax.runs.resolve import resolve
@@ -182,18 +182,18 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
     return tree
 
 
-def _compute(job: Job) -> Table:
-    table = Table(job.scene, job.grid)
+def _compute(job: Job) -> ResultBuffer:
+    buffer = ResultBuffer(job.scene, job.grid)
     for number in range(len(job.plan.costs)):
         chunk = job.plan.chunk(number)
-        table.fill(chunk.points, job.compute(chunk))
-    return table
+        buffer.fill(chunk.points, job.compute(chunk))
+    return buffer
 
 
-def _result(job: Job, table: Table) -> PointResult:
+def _result(job: Job, buffer: ResultBuffer) -> PointResult:
     scene = job.scene
     first = (0,) * len(job.grid.result_shape)
-    values = {v.name: table.lay_out()[v.name][first] for v in table.variables}
+    values = {v.name: buffer.lay_out()[v.name][first] for v in buffer.variables}
     outcome = Outcome(int(values.pop(OUTCOME.name)))
     parameters = {a.parameter.name: a.values[0].item() for a in scene.axes} | dict(scene.fixed)
     ordered = {p.name: parameters[p.name] for p in scene.system.parameters if p.name in parameters}
@@ -204,14 +204,14 @@ def _result(job: Job, table: Table) -> PointResult:
         parameters=ordered,
         values=values,
         outcome=outcome,
-        variables={v.name: v for v in table.variables},
+        variables={v.name: v for v in buffer.variables},
         parameter_units={p.name: p.units for p in scene.system.parameters},
-        labels=_labels(job, values, table),
+        labels=_labels(job, values, buffer),
     )
 
 
-def _labels(job: Job, values: Mapping[str, Any], table: Table) -> dict[str, Sequence[Any]]:
+def _labels(job: Job, values: Mapping[str, Any], buffer: ResultBuffer) -> dict[str, Sequence[Any]]:
     """The entries of every dimension of ``values``: coordinates, or numbers."""
-    shown = [v for v in table.variables if v.name in values]
+    shown = [v for v in buffer.variables if v.name in values]
     sizes = {dim: n for v in shown for dim, n in zip(v.dims, np.shape(values[v.name]), strict=True)}
     return {d.name: d.labels(sizes[d.name]) for d in job.scene.dimensions if d.name in sizes}

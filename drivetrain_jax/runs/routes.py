@@ -6,7 +6,7 @@ from pathlib import Path
 
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.analysis.atlas.solves import PROPAGATOR
-from drivetrain_jax.runs.assemble import Table, bytes_per_point, failures, labelled
+from drivetrain_jax.runs.assemble import ResultBuffer, bytes_per_point, failures, labelled
 from drivetrain_jax.runs.growing import NO_REUSE, NotReusable, ReusedPoints, Source, find, remaining
 from drivetrain_jax.runs.job import Job, Route
 from drivetrain_jax.runs.layout import rearranged
@@ -20,9 +20,9 @@ class PointsRoute(Route):
     """A route to values at points."""
 
     def fill(
-        self, job: Job, table: Table, work: Work, progress: Progress, reused: ReusedPoints
+        self, job: Job, buffer: ResultBuffer, work: Work, progress: Progress, reused: ReusedPoints
     ) -> dict[str, str | int]:
-        """Fill all points of ``job`` into ``table``; returns attributes of the result."""
+        """Fill all points of ``job`` into ``buffer``; returns attributes of the result."""
         raise NotImplementedError
 
     def total(self, job: Job, done: int) -> int:
@@ -54,18 +54,18 @@ class PointsRoute(Route):
 
     def in_memory(self, job: Job, work: Work, progress: Progress) -> Labelled:
         """The result."""
-        table = Table(job.scene, job.grid)
-        extra = self.fill(job, table, work, progress, NO_REUSE)
-        return labelled(job.scene, table.lay_out(), job.attrs | extra)
+        buffer = ResultBuffer(job.scene, job.grid)
+        extra = self.fill(job, buffer, work, progress, NO_REUSE)
+        return labelled(job.scene, buffer.lay_out(), job.attrs | extra)
 
     def into_file(
         self, job: Job, out: Path, temporary: Path, work: Work, progress: Progress, reused: ReusedPoints
     ) -> None:
         """Write the result from the points ``reused``, the existing parts, and newly computed chunks."""
         with ResultFile(temporary) as file:
-            table = Table(job.scene, job.grid, lambda blank: file.lay_out(blank.with_attrs(**job.attrs)))
-            extra = self.fill(job, table, work, progress, reused)
-            table.lay_out()
+            buffer = ResultBuffer(job.scene, job.grid, lambda blank: file.lay_out(blank.with_attrs(**job.attrs)))
+            extra = self.fill(job, buffer, work, progress, reused)
+            buffer.lay_out()
             file.finish(out, wall_time_s=work.elapsed, **extra)
 
 
@@ -76,14 +76,14 @@ class DirectRoute(PointsRoute):
     is_pointwise = True
 
     def fill(
-        self, job: Job, table: Table, work: Work, progress: Progress, reused: ReusedPoints
+        self, job: Job, buffer: ResultBuffer, work: Work, progress: Progress, reused: ReusedPoints
     ) -> dict[str, str | int]:
         """Copy the points ``reused`` and solve the others."""
-        for points, results in reused.blocks([variable.name for variable in table.variables]):
-            table.fill(points, results)
+        for points, results in reused.blocks([variable.name for variable in buffer.variables]):
+            buffer.fill(points, results)
             progress.reused += results[OUTCOME.name].size
             progress.failed += failures(results[OUTCOME.name])
-        work.do(remaining(job, reused), table, progress)
+        work.do(remaining(job, reused), buffer, progress)
         return reused.attrs
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from drivetrain_jax._threads import in_double_precision
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.atlas import StabilityAtlas, prepare_judging
-from drivetrain_jax.runs.assemble import Table, failures
+from drivetrain_jax.runs.assemble import ResultBuffer, failures
 from drivetrain_jax.runs.atlas_choice import Ranges
 from drivetrain_jax.runs.growing import ReusedPoints
 from drivetrain_jax.runs.job import Job
@@ -38,17 +38,17 @@ class ThroughAtlas(PointsRoute):
         self._ranges, self._max_solves = ranges, max_solves
 
     def fill(
-        self, job: Job, table: Table, work: Work, progress: Progress, reused: ReusedPoints
+        self, job: Job, buffer: ResultBuffer, work: Work, progress: Progress, reused: ReusedPoints
     ) -> dict[str, str | int]:
         """Fill all points; nothing is reused, because evaluating is faster than reading."""
         solves = Progress(0, kind="direct solves for the atlas")
         # In parallel with the solves.
         with ThreadPoolExecutor(1, initializer=in_double_precision) as aside:
-            prepared = [aside.submit(_lay_out, job, table), aside.submit(self._prepare_judging, job)]
+            prepared = [aside.submit(_lay_out, job, buffer), aside.submit(self._prepare_judging, job)]
             atlas, first = build_atlas(job.scene, self._ranges, work, solves, self._max_solves)
             progress.note = solves.note
             prepared[0].result()
-            uncovered = evaluate(job, table, atlas, work, progress, first)
+            uncovered = evaluate(job, buffer, atlas, work, progress, first)
             prepared[1].result()
         panels = len(atlas.atlas.panels)
         return {"atlas_solves": atlas.atlas.solves, "atlas_panels": panels, "atlas_uncovered": uncovered}
@@ -62,18 +62,18 @@ class ThroughAtlas(PointsRoute):
         prepare_judging(scene.system, self._ranges, fixed, rtol, scene.request.outputs)
 
 
-def _lay_out(job: Job, table: Table) -> None:
+def _lay_out(job: Job, buffer: ResultBuffer) -> None:
     """Create the output file while the solves run; for a small file this would delay the solves.
 
     The thread that fills memory must also allocate it, to reuse memory that earlier results have freed.
     """
-    if job.grid.size >= _LARGE and table.on_disk and not any(variable.dims for variable in table.variables):
-        table.lay_out(blank=False)
+    if job.grid.size >= _LARGE and buffer.on_disk and not any(variable.dims for variable in buffer.variables):
+        buffer.lay_out(blank=False)
 
 
 def evaluate(
     job: Job,
-    table: Table,
+    buffer: ResultBuffer,
     atlas: StabilityAtlas,
     work: Work,
     progress: Progress,
@@ -81,15 +81,15 @@ def evaluate(
     *,
     solve: bool = True,
 ) -> int:
-    """All points of ``job`` into ``table`` from ``atlas``; those that it does not cover are counted, and solved unless
+    """All points of ``job`` into ``buffer`` from ``atlas``; those that it does not cover are counted, and solved unless
     ``solve`` is false.
 
     A resumed run evaluates again, because that is faster than reading. For ``first`` see :meth:`Work.do`.
     """
     uncovered: list[np.ndarray] = []
     filled = _points if job.scene.zipped else _blocks
-    for block, results in filled(job, atlas, table):
-        table.release_after(results)
+    for block, results in filled(job, atlas, buffer):
+        buffer.release_after(results)
         outcome = results[OUTCOME.name]
         lost = np.argwhere(outcome == Outcome.LOST) + [part.start for part in block]
         uncovered.append(np.ravel_multi_index(tuple(lost.T), job.grid.shape))  # pyright: ignore[reportArgumentType]
@@ -99,26 +99,26 @@ def evaluate(
             work.report(progress)
     rest = np.concatenate([np.empty(0, int), *uncovered])
     if rest.size and solve:
-        work.do(job.only(rest), table, progress, first)
+        work.do(job.only(rest), buffer, progress, first)
     return rest.size
 
 
-def _points(job: Job, atlas: StabilityAtlas, table: Table) -> Iterator[tuple[tuple[slice], Results]]:
-    """Yield positions among the points, and the filled arrays of ``table`` there."""
+def _points(job: Job, atlas: StabilityAtlas, buffer: ResultBuffer) -> Iterator[tuple[tuple[slice], Results]]:
+    """Yield positions among the points, and the filled arrays of ``buffer`` there."""
     names, outputs = atlas.atlas.parameters, job.scene.request.outputs
     for start in range(0, job.grid.size, _BLOCK):
         numbers = np.arange(start, min(start + _BLOCK, job.grid.size))
         columns = job.grid.columns(numbers)
         points = np.stack([columns[name] for name in names], axis=-1)
         place = (slice(start, start + len(numbers)),)
-        arrays = table.block(place, atlas.blank((), outputs))
+        arrays = buffer.block(place, atlas.blank((), outputs))
         for name, values in atlas.at(points, outputs).items():
             arrays[name][...] = values
         yield place, arrays
 
 
-def _blocks(job: Job, atlas: StabilityAtlas, table: Table) -> Iterator[tuple[tuple[slice, ...], Results]]:
-    """Yield positions in the grid block by block, and the filled arrays of ``table`` there."""
+def _blocks(job: Job, atlas: StabilityAtlas, buffer: ResultBuffer) -> Iterator[tuple[tuple[slice, ...], Results]]:
+    """Yield positions in the grid block by block, and the filled arrays of ``buffer`` there."""
     axes = {axis.name: axis.values for axis in job.grid.axes}
     lengths = {name: len(axes[name]) for name in atlas.atlas.parameters}
     longest = sorted(lengths, key=lambda name: lengths[name])[-2:]
@@ -129,7 +129,7 @@ def _blocks(job: Job, atlas: StabilityAtlas, table: Table) -> Iterator[tuple[tup
     for ranges in _cut(sizes):
         values = [axes[name][part] for name, part in zip(names, ranges, strict=True)]
         place = tuple(dict(zip(names, ranges, strict=True)).get(name, slice(0, 1)) for name in axes)
-        arrays = table.block(place, atlas.blank((), outputs))
+        arrays = buffer.block(place, atlas.blank((), outputs))
         places = {n: _in_atlas_order(a, names, tuple(axes)) for n, a in arrays.items()}
         atlas.on_grid(values, outputs, places, rows=sizes[-2] if len(sizes) > 1 else None)
         yield place, arrays

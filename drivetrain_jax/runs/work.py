@@ -49,7 +49,7 @@ Report = Callable[[Progress], None]
 
 
 class Receiver(Protocol):
-    """Receives results: the table of a scene, or a collector of solves."""
+    """Receives results: the buffer of a scene, or a collector of solves."""
 
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
         """Write the results of ``points``."""
