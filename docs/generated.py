@@ -39,7 +39,7 @@ ATTRIBUTES = {
     "title": "title of the scene, or of its system and analysis",
     "system": "name of the system",
     "roles": "parameters that are the speed, the angle, the damping, ... (JSON)",
-    "state": "name, unit, meaning and symbol of every component of the system's state (JSON)",
+    "state": "name, unit, meaning, symbol and scale of every component of the system's state (JSON)",
     "resonance_families": "prefix of the labels, name and line style of the families of predicted resonances (JSON)",
     "analysis": "name of the analysis",
     "method": "method of the scene",

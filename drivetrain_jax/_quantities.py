@@ -100,12 +100,16 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Component:
-    """A component of the state of a system; ``symbol`` is its form in figures, by default made of the name."""
+    """A component of the state of a system; ``symbol`` is its form in figures, by default made of the name.
+
+    ``scale`` is its usual size over that of the first component, from which figures tell values from rounding.
+    """
 
     name: str
     units: str
     long_name: str
     symbol: str = ""
+    scale: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -217,7 +217,7 @@ class Tripod(System):
     roles = MappingProxyType({"speed": "excitation_frequency", "angle": "beta", "damping": "zeta"})
     state = (
         Component("phi", "rad", "twist"),
-        Component("velocity", "rad/s", "rate of twist", r"d$\phi$/d$t$"),
+        Component("velocity", "rad/s", "rate of twist", r"d$\phi$/d$t$", scale=1e3),
     )
 
     element: str = parameter("1", "element of the driveshaft", choices=tuple(GEOMETRY))

@@ -80,8 +80,8 @@ def symbol(name: str) -> str:
     return name
 
 
-def state(dataset: xr.Dataset) -> list[dict[str, str]]:
-    """The components of the system's state: name, units, long_name, symbol. Empty if it declares none."""
+def state(dataset: xr.Dataset) -> list[dict[str, Any]]:
+    """The components of the system's state: name, units, long_name, symbol, scale. Empty if it declares none."""
     return json.loads(dataset.attrs.get("state", "[]"))
 
 

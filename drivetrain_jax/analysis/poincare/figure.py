@@ -15,9 +15,8 @@ from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, coordinat
 
 _FIRST = 1000
 _MOST_ROWS = 6
-# Relative width below which a section is drawn as a point. Rates of twist count from a thousandth of those of a vibration
-# with this angular frequency in rad/s.
-_NARROW, _RATE = 1e-9, 1e3
+# Width below which a section is drawn as a point, and least height of a panel, relative to the usual size of a component.
+_NARROW, _LOW = 1e-9, 1e-3
 _HEIGHT = 2.6
 
 
@@ -51,11 +50,11 @@ def _labels(dataset: xr.Dataset) -> list[str]:
 
 
 def _draw_row(row: list[Axes], part: xr.Dataset, name: str | None) -> None:
-    points = part["section"].values
+    points, scale = part["section"].values, _scale(part)
     for axes in row[1:]:
         axes.sharey(row[0])
     for axes, shown in zip(row, (points, points[:_FIRST])[: len(row)], strict=True):
-        size = 14.0 if _is_point(points) else 0.6 if len(shown) > 2 * _FIRST else 1.5
+        size = 14.0 if _is_point(points, scale) else 0.6 if len(shown) > 2 * _FIRST else 1.5
         axes.scatter(shown[:, 0], shown[:, 1], s=size, color=LINE_COLOURS[0], linewidths=0, rasterized=True)
         axes.text(1.0, 1.02, f"{len(shown)} strobes", transform=axes.transAxes, ha="right", va="bottom", size=7.5)
         axes.tick_params(labelbottom=True)
@@ -65,17 +64,22 @@ def _draw_row(row: list[Axes], part: xr.Dataset, name: str | None) -> None:
     if "distinct_points" in part and part["distinct_points"].item():
         notes.append(f"distinct points: {part['distinct_points'].item()}")
     row[0].text(0.0, 1.08, "; ".join(notes), transform=row[0].transAxes, color=FRAME_GREY, size=7.5)
-    twist = np.nanmax(np.abs(points[:, 0]), initial=0.0)
-    for which, values, least in zip("xy", points.T, (0.0, 1e-3 * _RATE * twist), strict=True):
+    first = np.nanmax(np.abs(points[:, 0]), initial=0.0)
+    for which, values, least in zip("xy", points.T, (0.0, _LOW * scale * first), strict=True):
         _widen(row[0], which, values[np.isfinite(values)], least)
 
 
-def _is_point(points: np.ndarray) -> bool:
+def _scale(dataset: xr.Dataset) -> float:
+    """Usual size of the second component over that of the first."""
+    return state(dataset)[1].get("scale", 1.0) if len(state(dataset)) > 1 else 1.0
+
+
+def _is_point(points: np.ndarray, scale: float) -> bool:
     """True if all finite points are equal up to rounding."""
     finite = points[np.isfinite(points).all(axis=1)]
-    twist, rate = np.ptp(finite, axis=0) if len(finite) else (np.inf, np.inf)
-    size = np.abs(finite[:, 0]).max(initial=0.0)
-    return bool(twist <= _NARROW * size and rate <= _NARROW * _RATE * size)
+    first, second = np.ptp(finite, axis=0) if len(finite) else (np.inf, np.inf)
+    size = _NARROW * np.abs(finite[:, 0]).max(initial=0.0)
+    return bool(first <= size and second <= scale * size)
 
 
 def _widen(axes: Axes, which: str, values: np.ndarray, least: float) -> None:
