@@ -10,7 +10,7 @@ _NAME = "drivetrain"
 
 
 def register_accessor() -> None:
-    """Give every Dataset the accessor ``drivetrain``: now, or as soon as somebody imports xarray."""
+    """Give every Dataset the accessor ``drivetrain``: now, or as soon as xarray is imported."""
     if "xarray" in sys.modules:
         _register()
     else:
@@ -27,7 +27,7 @@ def _register() -> None:
 class _AfterXarray:
     """Finds xarray by the other finders, and registers the accessor after it has been imported.
 
-    It has what :class:`importlib.abc.MetaPathFinder` asks for, which itself takes longer to import than this package.
+    It does not inherit from :class:`importlib.abc.MetaPathFinder`, whose import takes longer than that of this package.
     """
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:

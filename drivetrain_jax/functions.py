@@ -195,7 +195,7 @@ def _pure(job: _Job) -> Callable[[Any], dict[str, Array]]:
 
 
 def _tangent(name: str, result: Array, jacobians: Mapping[str, Array], direction: Array) -> Any:
-    """The tangent of one result: what is estimated of errors counts as constant, what has no derivative is NaN."""
+    """The tangent of one result: error estimates count as constants, a result without derivative gives NaN."""
     if not jnp.issubdtype(result.dtype, jnp.inexact):
         return np.zeros(result.shape, jax.dtypes.float0)
     if name in jacobians:

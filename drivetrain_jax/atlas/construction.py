@@ -14,7 +14,7 @@ A cheap ``Source`` of nodes replaces the probes: tensors then grow until their c
 always solved.
 
 A box with failed solves, or with coefficients that fall like a power (a kink), is halved at most twice along each
-coordinate. What remains is a :class:`~drivetrain_jax.atlas.Gap` with its reason.
+coordinate. The unresolved rest is a :class:`~drivetrain_jax.atlas.Gap` with its reason.
 """
 
 from __future__ import annotations

@@ -64,8 +64,8 @@ class Criteria:
             raise InputError(f"file: the atlas has no panel ({reason}); allowed is one whose solves converged")
         if not has_boundaries(self.atlas, self.system):
             raise InputError(
-                f"system = {self.system.name!r}: has no boundary functions; allowed for boundaries and what is asked of "
-                "them is one of four states with a half-period propagator"
+                f"system = {self.system.name!r}: has no boundary functions; allowed for boundaries "
+                "and design answers is one of four states with a half-period propagator"
             )
 
     @classmethod

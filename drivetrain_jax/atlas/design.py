@@ -154,7 +154,9 @@ def _over(atlas: Atlas, system: type[System], at: Mapping[str, float], *roles: s
     wanted, part = [system.roles[role] for role in roles], atlas.slice(at)
     if set(part.parameters) != set(wanted):
         left = " and ".join(part.parameters) or "nothing"
-        raise InputError(f"at = {dict(at)}: leaves an atlas over {left}; allowed is what leaves {' and '.join(wanted)}")
+        raise InputError(
+            f"at = {dict(at)}: leaves an atlas over {left}; allowed are values that leave {' and '.join(wanted)}"
+        )
     return part
 
 

@@ -10,7 +10,7 @@ split until each is disposed of by one of
   f_h < 0 and > 0 at the two ends of h keeps it inside, and it is positive at one end of v and negative at the other.
   Tested on boxes enlarged a little, so that a zero on a common face belongs to both.
 
-What remains undecided below a smallest size is reported. The statements hold for every function within the patch's error
+Boxes that are undecided at the smallest size are reported. The statements hold for every function within the patch's error
 of the surrogate (and its derivatives within ``roughness`` times that); they are as good as this bound, which is statistical.
 """
 
@@ -48,8 +48,8 @@ class Search:
 def critical_points(patches: tuple[Patches, ...], number: int, horizontal: int) -> Search:
     """Every zero of function ``number`` and of its derivative along ``horizontal`` where no other function is negative.
 
-    ``patches`` holds all functions over the same boxes. Where another one is negative throughout a box the system is
-    unstable there anyway, and the box is left out.
+    ``patches`` holds all functions over the same boxes. If another function is negative throughout a box, the system is
+    unstable there, and the box is left out.
     """
     lower, upper = patches[0].lower.min(axis=0), patches[0].upper.max(axis=0)
     smallest = _SMALLEST * (upper - lower)

@@ -1,6 +1,6 @@
 """A grid cut into tiles, each within one panel: the factors whose products are the values of the atlas there.
 
-Where cells are dense along the last axis, the needed functions of Phi are smooth over many cells. A tile is then evaluated
+If cells are dense along the last axis, the needed functions of Phi are smooth over many cells. A tile is then evaluated
 only at ``NODES`` Chebyshev nodes, and ``spread`` interpolates to the cells. Shapes are fixed, so that one compiled kernel
 serves all tiles of a chart: tiles are padded, and so are the degrees of smaller panels (with coefficients 0).
 """

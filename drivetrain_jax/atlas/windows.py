@@ -22,7 +22,7 @@ from drivetrain_jax.systems import System
 Range = tuple[float, float]
 # Ratio of the width between two candidates to their errors above which stability is tested between them.
 _WIDER = 2.0
-# Widest undecided range, relative to the whole range, that the error of a change inside it may cover.
+# Widest undecided range, relative to the whole range, that counts as the error of a change inside it.
 _COVERED = 1e-3
 
 

@@ -198,7 +198,7 @@ def _axis_coordinates(scene: Scene) -> list[Coordinate]:
 
 
 def _drawn(system: type[System]) -> dict[str, str]:
-    """Attributes that tell figures how to draw what the system declares."""
+    """Declarations of the system for figures: its state and its families of resonances."""
     families = system.resonances.families if system.resonances else ()
     attrs = {
         "state": [vars(component) for component in system.state],

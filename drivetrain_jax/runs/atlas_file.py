@@ -246,7 +246,7 @@ class StoredAtlas:
     ) -> Mapping[str, np.ndarray]:
         """Results by name on the outer product of ``columns``, or at one point for each entry of them if ``zipped``.
 
-        Without ``solve`` what lies in a gap has no value and the outcome ``LOST``.
+        Without ``solve`` a point in a gap has no value and the outcome ``LOST``.
         """
         scene = self.scene_on(columns, zipped=zipped)
         job = Job(scene, DIRECT)

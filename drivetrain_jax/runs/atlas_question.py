@@ -47,7 +47,7 @@ class AtlasQuery:
         shaft, values = nondimensional(atlas.scene.system, given)
         for name, value in given.items():
             if _meant(name, value, shaft) in free:
-                raise InputError(f"{name} = {as_given(value)}: is what is asked for; allowed is to leave it out")
+                raise InputError(f"{name} = {as_given(value)}: is the answer; allowed is to leave it out")
         for name in (*ranges, *free):
             if name not in atlas.parameters:
                 raise InputError(

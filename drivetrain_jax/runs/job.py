@@ -40,7 +40,7 @@ class Route(Protocol):
 
     # Name of the way, which affects the bits.
     name: str
-    # True if each point is solved by itself: results can be shown, reused and written point by point.
+    # True if points are solved one by one, and can be shown, reused and written so.
     is_pointwise: bool = False
 
     def total(self, job: Job, done: int) -> int:

@@ -116,7 +116,7 @@ def is_small(grid: Grid, solvers: Sequence[Solver]) -> bool:
 
 @dataclass(frozen=True)
 class _Key:
-    """The key of a kernel in the cache; what does not compare follows from what does."""
+    """The key of a kernel in the cache; the fields that do not compare follow from the others."""
 
     system: type[System]
     analysis: Analysis
@@ -156,5 +156,5 @@ def _compiled(key: _Key, size: int, few: bool) -> Kernel:
 
 def _turn(compiled: Any) -> AbstractContextManager[object]:
     """The lock that a call needs. LAPACK calls of XLA wait for the thread pool that they run in, so two such kernels can
-    block each other for ever (seen with jax 0.10.2 on two cores)."""
+    block each other forever (seen with jax 0.10.2 on two cores)."""
     return _LAPACK if 'custom_call_target="lapack_' in compiled.as_text() else nullcontext()

@@ -70,7 +70,7 @@ class OutputState:
         return "partial" if self._grows else "stale"
 
     def plan(self, reused: ReusedPoints = NO_REUSE, fresh: bool = False) -> dict[str, Any]:
-        """The digest of new parts, and what a reader needs to interpret them."""
+        """The digest of new parts, and the entries that a reader needs to interpret them."""
         return {
             "digest": self.digest,
             "replaces": self.present,

@@ -65,7 +65,7 @@ def sweep(
     (('beta', 'Omega'), (3, 2))
     """
     if not isinstance(over, Mapping) or not over:
-        raise InputError("over: empty; allowed are values by the name of what varies")
+        raise InputError("over: empty; allowed are values by the name of a parameter")
     of_another_package = isinstance(function, analyses.AnalysisFunction)
     own = function.name if of_another_package else getattr(function, "__name__", "")
     if of_another_package or (own in analysis_names() and getattr(analyses, own, None) is function):

@@ -58,7 +58,7 @@ class Processes(Executor):
             self._slots.append(_Slot(parcel, cores[k % len(cores)]))
 
     def close(self) -> None:
-        """Kill the processes; what they compute is dropped."""
+        """Kill the processes; their running tasks are lost."""
         for slot in self._slots:
             slot.kill()
         self._slots.clear()

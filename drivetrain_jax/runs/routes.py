@@ -1,4 +1,4 @@
-"""Routes to values at points; the direct one solves every point by itself."""
+"""Routes to values at points; the direct one solves every point."""
 
 from __future__ import annotations
 

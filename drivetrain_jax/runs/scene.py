@@ -301,7 +301,7 @@ def _check_path(scene: Scene) -> None:
 
 
 def _check_entry(axis: Axis, fixed: Mapping[str, Value], where: str) -> None:
-    """Check that the whole list is given beside a swept entry; it supplies the length and the other entries."""
+    """Check that the whole list is fixed if one entry is swept; the list supplies its length and the other entries."""
     name = axis.parameter.name
     if axis.entry is None:
         return

@@ -22,5 +22,5 @@ def scene_file(source: Path) -> Path:
 
 
 def remedy(source: Path) -> str:
-    """Advice to somebody who gave ``source``, which cannot be read."""
+    """The remedy for a ``source`` that cannot be read."""
     return f"give the path of a scene file, or a name of `drivetrain list`{did_you_mean(str(source), names())}"

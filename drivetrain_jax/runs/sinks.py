@@ -72,7 +72,7 @@ class Hdf5Sink(Sink):
 
 
 def make_sink(out: Path, parts: PartsFolder, store: str | None) -> Sink:
-    """The sink for ``hdf5`` or ``zarr``; by default of the form of what is there."""
+    """The sink for ``hdf5`` or ``zarr``; by default the form of the present result."""
     if store is None:
         held = out if out.exists() else parts.path / zarr_store.FORMER
         store = ZARR if zarr_store.is_store(held) else parts.plan().get("store")

@@ -75,7 +75,7 @@ def write_result(result: Labelled, path: Path, temporary: Path, preface: bytes =
 
 
 def _write_frame(template: Labelled, path: Path, preface: bytes) -> Mapping[str, int]:
-    """Write all but the data, whose contiguous room is left blank; returns where that is.
+    """Write everything except the data, whose contiguous space stays blank; returns the positions of the data.
 
     The head is built in memory with reserved space for later additions, because HDF5 may crash the process on a full disk.
     """

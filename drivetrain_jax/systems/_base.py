@@ -69,7 +69,7 @@ class Resonances:
 
     ``values(parameters)`` maps the values of ``parameters`` (scalars or arrays of shape ``(...)``) to an array of shape
     ``(..., len(labels))``. ``multipliers`` gives for each label the multiplier that meets the unit circle there, ``+1``,
-    ``-1`` or ``pair``, if known. ``up_to(k)`` returns the same predictions for the orders 1 to k. ``families`` tell how
+    ``-1`` or ``pair``, if known. ``up_to(k)`` returns the same predictions for the orders 1 to k. ``families`` say how
     figures draw them; the family of a label is the one with the longest prefix.
     """
 
@@ -107,7 +107,7 @@ def serves(
 ) -> Callable[[Method], Method]:
     """Mark a method of a :class:`System` as the one that returns the model of these ``analyses``.
 
-    ``parameters``: names of those that the model uses, by default all. ``check`` and what else is ``declared`` (``smooth``,
+    ``parameters``: names of those that the model uses, by default all. ``check`` and other ``declared`` entries (``smooth``,
     ``results``, ...) as in :class:`Model`.
     """
 

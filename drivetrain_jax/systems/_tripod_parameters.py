@@ -10,7 +10,7 @@ from typing import Any
 
 from drivetrain_jax.systems._base import Values, parameter
 
-# Tables 1 and 2: what differs between the elements.
+# Tables 1 and 2: the values that differ between the elements.
 GEOMETRY: Mapping[str, Mapping[str, float]] = {
     "input": {
         "L_B": 0.190,

@@ -54,7 +54,7 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     for other in others:
         if other.attrs.get("analysis") != analysis:
             raise InputError(
-                f"analysis = {other.attrs.get('analysis')!r}: allowed beside the first result is {analysis}"
+                f"analysis = {other.attrs.get('analysis')!r}: allowed is the analysis of the first result, {analysis}"
             )
     return import_module(f"drivetrain_jax.analysis.{analysis}.figure").plot(dataset, *others)
 

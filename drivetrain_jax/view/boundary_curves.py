@@ -61,7 +61,7 @@ def _draw_undecided(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: 
 
 
 def _name(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> None:
-    """Draw names outside of the tongues, or beside the tip if they would cover another name or the frame; else no name."""
+    """Draw names outside of the tongues, or next to the tip if a name would cover another one or the frame; else none."""
     x, y = (dataset[f"tip_{name}"].values for name in (horizontal, vertical))
     # Tongues open upwards in charts without this variable.
     opens = dataset["tip_opens"].values if "tip_opens" in dataset.coords else np.ones(len(x))

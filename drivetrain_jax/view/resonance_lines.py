@@ -63,7 +63,7 @@ def predictions(
 
 
 def _family(label: str, families: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What the system declares of the family of ``label``: the one with the longest prefix, else one by its first letter."""
+    """The declared family of ``label``: the one with the longest prefix, else one named by its first letter."""
     prefixes = [prefix for prefix in families if label.startswith(prefix)]
     return families[max(prefixes, key=len)] if prefixes else {"name": label[:1]}
 

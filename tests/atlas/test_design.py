@@ -236,7 +236,7 @@ def test_what_is_stable_away_from_an_unstable_safe_end(ask, ranges, fixed, speed
 def test_an_atlas_over_other_parameters_is_refused(atlas, ask, at, left, wanted):
     with pytest.raises(InputError) as error:
         ask(atlas, CARDAN, at=at)
-    assert str(error.value) == f"at = {at}: leaves an atlas over {left}; allowed is what leaves {wanted}"
+    assert str(error.value) == f"at = {at}: leaves an atlas over {left}; allowed are values that leave {wanted}"
 
 
 def test_speed_windows_with_a_margin(atlas):

@@ -382,7 +382,7 @@ def test_the_same_point_in_physical_units(atlas):
 
 def test_what_is_asked_for_is_not_given(atlas):
     shaft = {"J1": 2.0, "J2": 200.0, "k1": 1000.0, "k2": 1000.0, "c1": 0.0894427191, "c2": 0.0894427191}
-    refused = "is what is asked for; allowed is to leave it out"
+    refused = "is the answer; allowed is to leave it out"
     with pytest.raises(dt.InputError, match=f"^Omega = 1.1:1.2: {refused}$"):
         atlas_answers.speed_windows(atlas, {"beta": 0.31, "Omega": (1.1, 1.2)})
     with pytest.raises(dt.InputError, match=f"^speed = 250:260: {refused}$"):

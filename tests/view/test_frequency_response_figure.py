@@ -65,7 +65,7 @@ def test_results_in_one_figure_differ_only_by_method():
     """The heading tells the parameters once, and the legend a method."""
     first = with_fixed(line(), B1=0.03)
     plot(first, with_fixed(line("exact"), B1=0.03))
-    with pytest.raises(InputError, match=r"B1 = 0\.02: allowed beside the first result is its value, 0\.03"):
+    with pytest.raises(InputError, match=r"B1 = 0\.02: allowed is the value of the first result, 0\.03"):
         plot(first, with_fixed(line("exact"), B1=0.02))
     with pytest.raises(InputError, match=r"B1 = 0\.02: allowed .* 0\.03"):
         plot(first, line("exact").assign_coords(B1=0.02))
@@ -135,7 +135,7 @@ def test_what_cannot_be_drawn_is_refused():
         plot(line().isel(omega=[3]))
     with pytest.raises(InputError, match="several results"):
         plot(xr.Dataset(attrs={"analysis": "floquet"}), line())
-    with pytest.raises(InputError, match="beside the first result"):
+    with pytest.raises(InputError, match="allowed is the analysis of the first result"):
         plot(line(), xr.Dataset(attrs={"analysis": "floquet"}))
 
 

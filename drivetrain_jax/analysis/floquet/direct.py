@@ -65,13 +65,13 @@ def assemble(system: LinearPeriodic, phi: Array) -> Array:
 
 
 def _reversed(start: Array, end: Array, phi: Array) -> Array:
-    # One for all lanes where none of the parameters in them varies.
+    # Without a varying parameter there is one matrix for all lanes.
     start, end = (each.reshape(*each.shape, *(1,) * (phi.ndim - each.ndim)) for each in (start, end))
     return matmul(matmul(start, jnp.swapaxes(phi, 0, 1)), matmul(end, phi))
 
 
 def _assembled(system: LinearPeriodic, fine: Array, coarse: Array) -> tuple[Array, Array, Array]:
-    """The monodromy matrices of two propagators, up to one similarity, and the size of what was added up in the first."""
+    """The monodromy matrices of two propagators, up to one similarity, and the size of the terms of the first."""
     z = [assemble(system, fine), assemble(system, coarse)]
     if system.reversal is None:
         return *z, jnp.sum(fine**2, axis=(0, 1)) ** (system.halves / 2)  # pyright: ignore[reportReturnType]
@@ -82,7 +82,7 @@ def _assembled(system: LinearPeriodic, fine: Array, coarse: Array) -> tuple[Arra
 
 
 def _balance(size: Array) -> Array:
-    """Scales ``(n, ...)`` of states in which rows and columns of ``size`` ``(n, n, ...)``, not negative, are alike.
+    """Scales ``(n, ...)`` of states in which rows and columns of ``size`` ``(n, n, ...)``, not negative, have similar sizes.
 
     Two sweeps of Osborne's iteration (Parlett & Reinsch, Numer. Math. 13, 1969), in powers of 2.
     """
@@ -191,7 +191,7 @@ def direct_monodromy(
 
     ``propagate(steps, pieces)`` returns the propagator of ``system`` with batch shape ``shape``, by a scheme of order
     ``order``, in up to ``most_pieces``. ``stiffness`` is that of :func:`stiffness_of`. A lane that overflows gets two
-    doublings to recover and then no longer delays the others. After six doublings the error is reported as it is. For
+    doublings to recover and then no longer delays the others. After six doublings the error is reported, whatever it is. For
     ``ratio`` and ``least`` see :func:`_first_steps`.
     """
     begin, predicted, pieces = _first_steps(steps, ratio, least, most_pieces)

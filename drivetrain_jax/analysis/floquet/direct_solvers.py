@@ -81,7 +81,7 @@ def direct_solvers(
 
 
 class _ExplicitSteps:
-    """Steps of the explicit scheme by march: ``short``, ``long`` or ``damped`` (the other form), inf for the other two.
+    """Steps of the explicit scheme by march: ``short``, ``long`` or ``damped`` (the other form); inf in the other two.
 
     The last request is cached, because the solvers of a plan request the same columns in turn.
     """

@@ -63,7 +63,7 @@ def strongly_damped(system: type[System], columns: Mapping[str, np.ndarray]) -> 
 
 
 def implicit_effort(system: type[System], columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
-    """Panels of the implicit scheme, ``(N,)``: it must resolve what oscillates, whereas decay costs it nothing.
+    """Panels of the implicit scheme, ``(N,)``: it must resolve oscillations; decay costs it nothing.
 
     Infinite where oscillation makes an explicit march long: that costs a twentieth, and is as exact.
     """

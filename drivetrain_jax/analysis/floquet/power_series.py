@@ -1,6 +1,6 @@
 """Propagators of a linear periodic system along a coordinate x, as power series in x: a line for the price of a few solves.
 
-Where ``A(t, x) = A0(t) + x A1(t)`` and ``A0`` only leads from the ``first`` states to the others, the states
+Let ``A(t, x) = A0(t) + x A1(t)``, where ``A0`` only leads from the ``first`` states to the others, the states
 ``y~ = (I - G) y`` with ``G' = A0`` obey ``y~' = x B y~``, ``B = (I - G) A1 (I + G)``. Over a part of the span, at whose
 start ``G = 0``, the propagator is
 
@@ -23,19 +23,19 @@ from drivetrain_jax.analysis.floquet.propagator import radau_iia
 from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, suits_one_kernel
 from drivetrain_jax.systems import LinearPeriodic
 
-# Nodes of a part and powers of x: what both leave out is about the same.
+# Nodes of a part and powers of x: both have about the same truncation error.
 NODES, TERMS = 12, 20
 
 Form = Callable[[Any], LinearPeriodic]
 
 
 def propagators_along(form: Form, ends: Array, first: int, lanes: int, parts: Array, x: Array) -> tuple[Array, Array]:
-    """``Phi`` of ``lanes`` lines at the P positions ``x``, ``(P, n, n, lanes)``, and what was left out, ``(lanes,)``.
+    """``Phi`` of ``lanes`` lines at the P positions ``x``, ``(P, n, n, lanes)``, and the truncation error, ``(lanes,)``.
 
     ``form(p)`` is the system where the coordinate's parameter is p; ``ends`` ``(2,)`` are its values where the coordinate is
-    0 and where it is 1 in the units of ``x``; ``|x| <= 1``. The span is cut into ``parts`` (a traced integer). What was left
-    out is the size of the last term relative to the largest one, in the worst part: infinite where ``A0`` has entries that
-    do not lead from the ``first`` states to the others.
+    0 and where it is 1 in the units of ``x``; ``|x| <= 1``. The span is cut into ``parts`` (a traced integer). The
+    truncation error is the size of the last term relative to the largest one, in the worst part; it is infinite if ``A0``
+    has entries that do not lead from the ``first`` states to the others.
     """
     weights, places = radau_iia(NODES)
     system = form(ends[0])
@@ -85,7 +85,7 @@ def _split(form: Form, ends: Array, t: Array, lanes: int) -> tuple[Array, Array]
         entries = [[jnp.broadcast_to(jnp.asarray(x, float), (NODES, lanes)) for x in row] for row in rows]
         return jnp.stack([jnp.stack(row, axis=1) for row in entries], axis=1)
 
-    # Both ends at once: what does not depend on the coordinate is computed once.
+    # Both ends at once: terms that do not depend on the coordinate are computed once.
     both = jax.vmap(matrix)
     start, end = (in_one_kernel(both) if suits_one_kernel(both, ends) else both)(ends)
     return start, end - start

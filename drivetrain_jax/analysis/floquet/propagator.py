@@ -212,7 +212,7 @@ def _moved(piece: Array, state: Array, covariance: Array) -> tuple[Array, Array]
 
 
 def _march(system: LinearPeriodic, t0: Array, t1: Array, count: Array) -> tuple[Array, Array]:
-    """``Phi`` from t0 to t1 of all lanes, the last axis of what varies, by ``count`` steps."""
+    """``Phi`` from t0 to t1 of all lanes, the last axis of arrays that vary, by ``count`` steps."""
     varying = jax.tree.leaves((eqx.filter(system, eqx.is_array), t0, t1))
     lanes = max((np.shape(x)[-1] for x in varying if np.ndim(x)), default=1)
     zeros: list[list[bool]] = []

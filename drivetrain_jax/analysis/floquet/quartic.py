@@ -76,7 +76,7 @@ def _sum(a: Matrix, b: Matrix) -> Matrix:
 
 
 def invariants(phi: Blocks, left_out: Array | float = 0.0) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """``e1, e2, e3`` by principal minors and what rounding, and an error of Phi of norm ``left_out``, make of them."""
+    """``e1, e2, e3`` by principal minors, and bounds of their errors by rounding and by that of Phi, ``left_out``."""
     a, b, c, d = phi
     s = _sum(transposed_product(d, a), transposed_product(b, c))
     upper, lower = transposed_product(d, b), transposed_product(c, a)
@@ -129,7 +129,7 @@ def _cubic_root(p2: Array, p1: Array, p0: Array) -> Array:
         value, slope = ((w + p2) * w + p1) * w + p0, (3 * w + 2 * p2) * w + p1
         return jnp.where(slope > 0, jnp.maximum(w - value / slope, 0.0), w)
 
-    # A loop, not its unrolled steps: the compiler would repeat all earlier ones in each of them.
+    # Unrolled, each step would repeat all earlier ones in the compiled code.
     return jax.lax.fori_loop(0, _NEWTON_STEPS, step, jnp.where(concave, 0.0, bound))
 
 

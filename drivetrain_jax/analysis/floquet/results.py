@@ -93,7 +93,7 @@ def results(
     found |= {"spectral_radius": rho * size, "liouville_residual": jnp.where(finite, z.residual, jnp.nan)}
     met = z.met
     if wanted & NEED_ERROR:
-        # A value that underflows is not 0: its bound is the smallest number.
+        # A value that underflows is not 0, so its error bound is the smallest number.
         met = (error <= 10 * rtol * rho) & (rho * size >= _TINY)
         bound = jnp.maximum(error * size, _TINY)
         found |= {"spectral_radius_error": bound, "verdict": verdict(rho * size, bound)}

@@ -118,7 +118,7 @@ def _peaks_on_step(
 ) -> _Found:
     """Largest ``|y_i|`` on a step, at its end and where the derivative changes sign in between.
 
-    The derivative is taken as a cubic from y' and y'' at both ends; what this leaves at the point found, y' = d, is
+    The derivative is taken as a cubic from y' and y'' at both ends; the remaining derivative d at the point found is
     removed by the parabola y - d^2/(2 y'').
     """
     h = t1 - t0

@@ -8,9 +8,9 @@ With ``p = (b - m)/A``, ``q = (b + m)/A`` and the moments h0, h1 of a clipped co
     [(kappa - omega^2)^2 + (c' omega)^2] A^2 = B1^2                         the response
 
 For a given A the response is quadratic in omega^2: two arms ``omega^2 = kappa - c'^2/2 -+ sqrt(B1^2/A^2 - c'^2 kappa +
-c'^4/4)`` that meet at the peak, on either side of the backbone ``omega^2 = kappa``. Folds are their turning points. Where
-damping is so heavy (``kappa < c'^2/2``) that they would meet at no real frequency, the upper one ends at omega = 0, at
-the static amplitude ``kappa A = B1``, the largest of all.
+c'^4/4)`` that meet at the peak, on either side of the backbone ``omega^2 = kappa``. Folds are their turning points. With
+heavy damping (``kappa < c'^2/2``) they would meet at no real frequency: the upper arm then ends at omega = 0, at the
+static amplitude ``kappa A = B1``, the largest of all.
 The approximation is the harmonic balance with one harmonic, integrals exact. All functions broadcast over a trailing
 batch; ``A`` may have more leading axes.
 """
@@ -66,8 +66,8 @@ def peak(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Array:
     """Largest amplitude over all frequencies; a huge one if there is none.
 
     It is where the smallest value that the response equation takes at any frequency vanishes: where the arms meet, or with
-    heavier damping the static amplitude, which the response approaches as the frequency falls to 0. That value rises with
-    the amplitude, because ``kappa A`` does.
+    heavier damping the static amplitude, which the response approaches as the frequency falls to 0. This smallest
+    value rises with the amplitude, because ``kappa A`` does.
     """
     unit = _length(model)
 
@@ -174,8 +174,8 @@ def fold_frequencies(model: PiecewiseLinearOscillator, bones: Skeleton) -> Array
 def backbone(model: PiecewiseLinearOscillator, shape: tuple[int, ...], omega: Array) -> Array:
     """Largest amplitude of the undamped, undriven motion of each frequency ``(L,)``, ``kappa(A) = omega^2``, ``(L, ...)``.
 
-    NaN if none, as beyond the frequency to which that of large motions tends. The drive has no part in it, so that it goes
-    on beyond the peak.
+    NaN if none, as beyond the frequency to which that of large motions tends. The backbone does not depend on the drive,
+    and continues beyond the peak.
     """
     free = replace(model, B1=0.0)
     amplitudes = _nodes(free, jnp.broadcast_to(_HUGE * _length(free), shape), _HUGE)

@@ -92,7 +92,7 @@ def _check_comparable(results: list[xr.Dataset]) -> None:
         for name in first | other:
             if first.get(name) != other.get(name):
                 raise InputError(
-                    f"{name} = {other.get(name)}: allowed beside the first result is its value, {first.get(name)}"
+                    f"{name} = {other.get(name)}: allowed is the value of the first result, {first.get(name)}"
                 )
     labels = [_label(each, _METHODS[each.attrs.get("method", "exact")]) for each in results]
     for label in labels:

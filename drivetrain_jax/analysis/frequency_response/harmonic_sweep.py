@@ -57,7 +57,7 @@ def settle(
     lanes = x.shape[1:]
     start = jnp.asarray(basis.at(np.zeros(1))[0]), jnp.asarray((basis.at(np.zeros(1)) @ basis.derivative)[0])
     u, v = jnp.tensordot(start[0], x, 1), jnp.tensordot(start[1], x, 1) * omega / basis.order
-    # A motion that repeats exactly stays so: a push lets disturbances grow that it is unstable to.
+    # A motion that repeats exactly never leaves an unstable orbit: a push lets disturbances grow.
     u = u + _PUSH * jnp.sqrt(jnp.sum(x[1:] ** 2, axis=0))
     sampled = Basis(basis.harmonics, basis.order, max(_STEPS[0], 1 << (2 * basis.harmonics).bit_length()))
     effort = (jnp.where(wanted, number, 0) for number in _effort(model, sampled, omega))

@@ -26,7 +26,7 @@ R = TypeVar("R")
 
 # Numbers in a vector of AVX-512.
 FULL_WIDTH = 8
-# A call that is not inlined is not fused with what surrounds it either: its results are computed once and stored.
+# A call that is not inlined is not fused with its neighbours either: its results are computed once and stored.
 _APART = {"inlineable": "false"}
 # XLA does this by default for loops over less than half a kilobyte.
 _ONE_KERNEL = {**_APART, "xla_cpu_small_call": "true"}

@@ -1,4 +1,4 @@
-"""Batches as the last axis: what ``jax.vmap`` makes of a function of one point, and working through lanes in parts."""
+"""Batches as the last axis: functions of one point under ``jax.vmap``, and lanes that are computed in parts."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def with_path(values: Values, path: str, lanes: int) -> tuple[dict[str, Any], in
 def in_blocks(function: Callable[[Any, int], Any], values: Any, lanes: int, size: int) -> Any:
     """``function(values, count)`` of ``lanes`` lanes, ``size`` at a time; its results have the lanes as last axis.
 
-    The arrays among ``values`` whose last axis are the lanes are cut; what else there is stays. The caches of a core are
-    what ``size`` is for: an accelerator does all lanes at once.
+    The arrays among ``values`` whose last axis are the lanes are cut; other values stay whole. ``size`` lanes fit into the
+    caches of a core; an accelerator computes all lanes at once.
     """
     count = -(-lanes // size)
     leaves, tree = jax.tree.flatten(values)
@@ -182,7 +182,7 @@ def _trace(
 def over_lanes(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
     """``function(values, effort)`` of one point, for values of which JAX arrays hold one number for each lane.
 
-    Its results have the lanes as last axis, if there are any. What else is among ``values``, NumPy arrays included, is for
+    Its results have the lanes as last axis, if there are any. All other ``values``, NumPy arrays included, apply to
     all lanes.
     """
 

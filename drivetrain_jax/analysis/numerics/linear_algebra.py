@@ -1,5 +1,5 @@
 """Small dense linear algebra without LAPACK calls: these, made from concurrent kernels, can wait for each other in
-XLA's thread pool for ever (seen with jax 0.10.2 on two cores).
+XLA's thread pool forever (seen with jax 0.10.2 on two cores).
 
 ``eigenvalues`` reduces to Hessenberg form by Householder reflections and applies the QR iteration with Wilkinson's
 complex shift, deflating from the bottom (Golub & Van Loan, Matrix Computations, 7.4-7.5): backward stable. All lanes of

@@ -65,7 +65,7 @@ def _called(call: Callable[[Columns], Array], block: Columns) -> np.ndarray:
     try:
         return np.asarray(call(block))
     except InputError as error:
-        # Without the notes that jax adds to what passes through it.
+        # Without the notes that jax adds to an exception.
         raise InputError(*error.args) from None
 
 

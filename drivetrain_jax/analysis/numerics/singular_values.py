@@ -2,7 +2,7 @@
 
 Householder bidiagonalisation, then the implicit QR iteration on the bidiagonal matrix (Golub & Van Loan, Matrix
 Computations, 8.6; Demmel & Kahan, SIAM J. Sci. Stat. Comput. 11, 873, 1990). The singular values never pass through
-squares, so that small ones keep their digits beside large ones. Every lane works on its own unreduced block; the
+squares, so small ones keep their digits. Every lane works on its own unreduced block; the
 sweeps of all lanes run through the same instructions, which vectorise over the lanes.
 """
 
