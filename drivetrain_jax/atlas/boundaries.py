@@ -16,7 +16,7 @@ from drivetrain_jax.atlas.criteria import LIMITING, Criteria, parameters_at
 from drivetrain_jax.atlas.exclusion import Search, critical_points
 from drivetrain_jax.atlas.growth import growth, limiting, monodromy_error
 from drivetrain_jax.atlas.panels import Atlas
-from drivetrain_jax.atlas.patches import Patches, patches_of
+from drivetrain_jax.atlas.patches import patches_of
 from drivetrain_jax.atlas.roots import on_line, roots
 from drivetrain_jax.atlas.tips import polish
 from drivetrain_jax.atlas.tracing import Curve, Field, trace, trace_tips
@@ -32,16 +32,13 @@ _POLISH, _LARGEST_SHIFT = 2, 1e-4
 class Boundary:
     """One curve: ``points`` maps the two parameters to arrays ``(n,)``.
 
-    ``error`` maps each parameter to a bound of its error with the other one exact (inf where the curve runs along it). The
-    ``multiplier`` (``+1``, ``-1`` or ``pair``) crosses the unit circle. ``limiting`` ``(n,)`` is true where no other
+    The ``multiplier`` (``+1``, ``-1`` or ``pair``) crosses the unit circle. ``limiting`` ``(n,)`` is true where no other
     multiplier lies outside.
     """
 
     multiplier: str
     points: Mapping[str, np.ndarray]
-    error: Mapping[str, np.ndarray]
     limiting: np.ndarray
-    closed: bool
 
     def segments(self) -> tuple[dict[str, np.ndarray], ...]:
         """The parts that bound the stable region, each as ``points``."""
@@ -76,7 +73,7 @@ def boundaries(atlas: Atlas, system: type[System], searches: Sequence[Search] = 
             curves = _distinct(field, np.where(near[:, None], fine, rough), [], horizontal)
         for seeds in _line_seeds(field):
             curves = _distinct(field, seeds, curves)
-        found += [_finish(criteria, patches[number], field, kind, curve) for curve in curves]
+        found += [_finish(criteria, field, kind, curve) for curve in curves]
     return tuple(found)
 
 
@@ -132,27 +129,12 @@ def _line_seeds(field: Field) -> Iterator[np.ndarray]:
             yield np.clip(np.concatenate(seeds), field.lower, field.upper)
 
 
-def _finish(criteria: Criteria, patches: Patches, field: Field, kind: str, curve: Curve) -> Boundary:
-    """Polish the points of a curve with the multiplier itself and attach bounds."""
-    atlas = criteria.atlas
+def _finish(criteria: Criteria, field: Field, kind: str, curve: Curve) -> Boundary:
+    """Polish the points of a curve with the multiplier itself."""
     # Rounding of Newton's method may move points of the rim outside.
-    x, error = _polish(criteria, field, kind, np.clip(curve.points, field.lower, field.upper))
-    value, gradient = field(field.to_unit(x))
-    place = patches.locate(x)[0]
-    with np.errstate(all="ignore"):
-        fallback = ((patches.error[place] + np.abs(value)) / np.abs(gradient.T)).T * (field.upper - field.lower)
-    error = np.where(np.isfinite(error), error, fallback)
-    point = parameters_at(atlas, x)
-    slope = np.stack([np.abs(c.slope(point[:, k])) for k, c in enumerate(atlas.coordinates)], axis=-1)
-    with np.errstate(all="ignore"):
-        error = np.nan_to_num(error / slope, nan=np.inf)
-    return Boundary(
-        kind,
-        dict(zip(atlas.parameters, point.T, strict=True)),
-        dict(zip(atlas.parameters, error.T, strict=True)),
-        _limiting(criteria, x, kind),
-        curve.closed,
-    )
+    x = _polish(criteria, field, kind, np.clip(curve.points, field.lower, field.upper))
+    points = dict(zip(criteria.atlas.parameters, parameters_at(criteria.atlas, x).T, strict=True))
+    return Boundary(kind, points, _limiting(criteria, x, kind))
 
 
 def _limiting(criteria: Criteria, x: np.ndarray, kind: str) -> np.ndarray:
@@ -164,10 +146,10 @@ def _limiting(criteria: Criteria, x: np.ndarray, kind: str) -> np.ndarray:
     return np.log(criteria.spectral_radius(x)) <= LIMITING + error
 
 
-def _polish(criteria: Criteria, field: Field, kind: str, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points with ln|sigma| = 0 and the bounds of either coordinate's error; NaN where the multiplier is not simple."""
+def _polish(criteria: Criteria, field: Field, kind: str, x: np.ndarray) -> np.ndarray:
+    """Points with ln|sigma| = 0 near ``x``, or ``x`` itself if the multiplier is not simple there."""
     if criteria.conservative:
-        return x, np.full(x.shape, np.nan)
+        return x
     scale = field.upper - field.lower
     kinds = [kind] * len(x)
     best = x.copy()
@@ -178,8 +160,5 @@ def _polish(criteria: Criteria, field: Field, kind: str, x: np.ndarray) -> tuple
             step = (rates.rate / (gradient**2).sum(axis=1))[:, None] * gradient
         good = np.linalg.norm(step, axis=1) < _LARGEST_SHIFT
         best = np.clip(np.where(good[:, None], best - step * scale, best), field.lower, field.upper)
-    rates = growth(criteria, best, kinds)
-    good &= np.abs(rates.rate) < 1e-8
-    with np.errstate(all="ignore"):
-        error = (rates.error + np.abs(rates.rate))[:, None] / np.abs(rates.gradient)
-    return np.where(good[:, None], best, x), np.where(good[:, None], error, np.nan)
+    good &= np.abs(growth(criteria, best, kinds).rate) < 1e-8
+    return np.where(good[:, None], best, x)

@@ -32,8 +32,7 @@ _RIM = 1e-9
 
 @dataclass(frozen=True)
 class Search:
-    """``points`` ``(M, 2)`` in coordinates; ``undecided`` boxes ``(K, 2, 2)`` as (lower, upper); number of ``boxes``
-    examined.
+    """``points`` ``(M, 2)`` in coordinates; ``undecided`` boxes ``(K, 2, 2)`` as (lower, upper).
 
     ``curvature`` ``(M,)`` is f_hh and ``slope`` ``(M,)`` f_v at the points, v the other coordinate.
     """
@@ -42,7 +41,6 @@ class Search:
     curvature: np.ndarray
     slope: np.ndarray
     undecided: np.ndarray
-    boxes: int
 
 
 def critical_points(patches: tuple[Patches, ...], number: int, horizontal: int) -> Search:
@@ -53,10 +51,9 @@ def critical_points(patches: tuple[Patches, ...], number: int, horizontal: int) 
     """
     lower, upper = patches[0].lower.min(axis=0), patches[0].upper.max(axis=0)
     smallest = _SMALLEST * (upper - lower)
-    found, undecided, count = [], [], 0
+    found, undecided = [], []
     active, others = patches[number], patches[:number] + patches[number + 1 :]
     while len(active):
-        count += len(active)
         keep = ~_excluded_by_value(active, others)
         active, others = active.take(keep).trim(), tuple(p.take(keep).trim() for p in others)
         bundle = _Bundle(active, horizontal)
@@ -80,7 +77,7 @@ def critical_points(patches: tuple[Patches, ...], number: int, horizontal: int) 
     beyond = (np.maximum(lower - points, points - upper) > _RIM * (upper - lower)).any(axis=1)
     points, curvature, slope, boxes = (part[~beyond] for part in (points, curvature, slope, boxes))
     keep = _distinct(points, boxes)
-    return Search(points[keep], curvature[keep], slope[keep], np.concatenate(undecided), count)
+    return Search(points[keep], curvature[keep], slope[keep], np.concatenate(undecided))
 
 
 def _excluded_by_value(active: Patches, others: tuple[Patches, ...]) -> np.ndarray:

@@ -23,14 +23,13 @@ from drivetrain_jax.atlas.criteria import LIMITING, MINUS, PLUS, Criteria, monod
 class Growth:
     """At N points: ``rate`` ln|sigma| ``(N,)``, its ``gradient`` ``(N, d)`` and ``hessian`` ``(N, d, d)`` in coordinates.
 
-    ``multiplier`` ``(N,)`` is sigma and ``error`` ``(N,)`` a bound of the rate's error to first order: the panel's
+    ``error`` ``(N,)`` is a bound of the rate's error to first order: the panel's
     (statistical) bound of Phi times the condition number of the eigenvalue.
     """
 
     rate: np.ndarray
     gradient: np.ndarray
     hessian: np.ndarray
-    multiplier: np.ndarray
     error: np.ndarray
 
 
@@ -57,7 +56,7 @@ def growth(criteria: Criteria, x: np.ndarray, kinds: list[str], *, second: bool 
     size = np.linalg.norm(xr, axis=1) * np.linalg.norm(yl, axis=1)
     error = monodromy_error(criteria, x, phi) * size / np.abs(s)
     with np.errstate(invalid="ignore"):
-        return Growth(np.log(np.abs(s)), (ds / s[:, None]).real, hessian, s, error)
+        return Growth(np.log(np.abs(s)), (ds / s[:, None]).real, hessian, error)
 
 
 def limiting(criteria: Criteria, x: np.ndarray, own: Growth) -> np.ndarray:

@@ -69,11 +69,6 @@ class Atlas:
     solves: int
 
     @property
-    def size(self) -> int:
-        """Number of coefficients of one value over all panels."""
-        return sum(int(np.prod(p.degrees)) for p in self.panels)
-
-    @property
     def ends(self) -> np.ndarray:
         """Coordinates of ``lower`` and of ``upper``, ``(2, d)``; a coordinate may fall where its parameter rises."""
         return self.to_coordinates(np.stack([self.lower, self.upper]))

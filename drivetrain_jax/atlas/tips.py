@@ -39,14 +39,13 @@ class Tip:
     """``point`` maps the two parameters to their values at the tip, ``error`` to bounds of their errors.
 
     ``name`` is the resonance of the tongue, empty if its ridge was lost or no resonance is clearly the nearest.
-    ``multiplier`` is ``+1``, ``-1`` or ``pair`` and ``angle`` its argument in rad. ``opens`` is true where a tongue opens
+    ``multiplier`` is ``+1``, ``-1`` or ``pair``. ``opens`` is true where a tongue opens
     with the other parameter, false where one closes or two meet. ``proved`` is false for a tip in an undecided box: the
     surrogate has one there, but within its error bound there may be none, or several.
     """
 
     name: str
     multiplier: str
-    angle: float
     point: Mapping[str, float]
     error: Mapping[str, float]
     opens: bool
@@ -57,15 +56,12 @@ class Tip:
 class Tips:
     """All tips, in rising order of the other parameter; ``undecided`` boxes of parameters that may contain more.
 
-    ``boxes`` is the number of boxes examined. At zero damping tongues have no width at their tips: these are then predicted
-    by theory, and ``complete`` is false. ``searches`` can be reused by :func:`~drivetrain_jax.atlas.boundaries.boundaries`
-    of the same atlas.
+    At zero damping tongues have no width at their tips: these are then predicted by theory. ``searches`` can be
+    reused by :func:`~drivetrain_jax.atlas.boundaries.boundaries` of the same atlas.
     """
 
     tips: tuple[Tip, ...]
     undecided: tuple[Box, ...]
-    boxes: int
-    complete: bool
     searches: tuple[Search, ...] = ()
 
 
@@ -80,7 +76,7 @@ def find_tips(atlas: Atlas, system: type[System], *, opening: bool = True) -> Ti
     criteria = Criteria.of(atlas, system)
     if criteria.conservative:
         undamped = tuple(_named(t, atlas) for t in undamped_tips(criteria, horizontal, _predictions(atlas, system)))
-        return Tips(_sorted(undamped, atlas, horizontal), (), 0, False)
+        return Tips(_sorted(undamped, atlas, horizontal), ())
     patches = patches_of(criteria)
     searches = tuple(critical_points(patches, k, horizontal) for k in range(len(patches)))
     tips: list[Tip] = []
@@ -95,7 +91,7 @@ def find_tips(atlas: Atlas, system: type[System], *, opening: bool = True) -> Ti
     undecided = tuple(_box(atlas, box) for search in searches for box in search.undecided)
     undecided += tuple(_box(atlas, np.stack([gap.lower, gap.upper])) for gap in atlas.gaps)
     chosen = tuple(tip for tip in tips if tip.opens or not opening)
-    return Tips(_sorted(chosen, atlas, horizontal), undecided, sum(s.boxes for s in searches), not undecided, searches)
+    return Tips(_sorted(chosen, atlas, horizontal), undecided, searches)
 
 
 def polish(
@@ -153,7 +149,6 @@ def _describe(criteria: Criteria, kind: str, h: int, points: tuple, opens: np.nd
             Tip(
                 _name(atlas, system, kind, compared[i]),
                 kind,
-                abs(float(np.angle(rates.multiplier[i]))),
                 dict(zip(atlas.parameters, map(float, point), strict=True)),
                 dict(zip(atlas.parameters, map(float, errors[i] / scale), strict=True)),
                 bool(opens[i]),
@@ -236,9 +231,9 @@ def _name(atlas: Atlas, system: type[System], kind: str, x: np.ndarray) -> str:
 
 
 def _named(tip: tuple, atlas: Atlas) -> Tip:
-    name, kind, angle, point = tip
+    name, kind, point = tip
     nothing = dict.fromkeys(atlas.parameters, 0.0)
-    return Tip(name, kind, angle, dict(zip(atlas.parameters, map(float, point), strict=True)), nothing, True)
+    return Tip(name, kind, dict(zip(atlas.parameters, map(float, point), strict=True)), nothing, True)
 
 
 def _box(atlas: Atlas, box: np.ndarray) -> Box:

@@ -7,8 +7,6 @@ more than their errors. A pair collides where the discriminant is negative beyon
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from drivetrain_jax.atlas.criteria import MINUS, PAIR, PLUS, Criteria
@@ -23,7 +21,7 @@ _PAIR = 4
 
 
 def undamped_tips(criteria: Criteria, horizontal: int, resonances: Resonances) -> list[tuple]:
-    """(name, multiplier, its angle, parameters) of every resonance from which a tongue of resolved width grows.
+    """(name, multiplier, parameters) of every resonance from which a tongue of resolved width grows.
 
     The resonances are at the angle 0; an atlas that does not start there has none.
     """
@@ -46,7 +44,7 @@ def undamped_tips(criteria: Criteria, horizontal: int, resonances: Resonances) -
         else:
             grows = _separates([patches[k] for k in _EDGES[kind]], start, end, h)
         if grows:
-            found.append((label, kind, _angle(criteria, start, kind), point))
+            found.append((label, kind, point))
     return found
 
 
@@ -94,10 +92,3 @@ def _collides(discriminant: Patches, start: np.ndarray, end: float, h: int) -> b
         if value < -discriminant.error[place[0][0]]:
             return True
     return False
-
-
-def _angle(criteria: Criteria, x: np.ndarray, kind: str) -> float:
-    if kind == PAIR:
-        sigma = criteria.eigenvalues(x[None])[0]
-        return float(np.abs(np.angle(sigma)).min())
-    return math.pi if kind == MINUS else 0.0

@@ -87,15 +87,13 @@ def direct_tip(beta, omega, shift=1e-5, narrowed=4, **others):
 
 
 def test_all_twelve_tips_and_no_other(tips):
-    assert tips.complete and tips.undecided == ()
+    assert tips.undecided == ()
     assert [tip.name for tip in tips.tips] == list(TIPS)
     for tip in tips.tips:
         beta, omega = TIPS[tip.name]
         assert tip.point["beta"] == pytest.approx(beta, abs=1e-8)
         assert tip.point["Omega"] == pytest.approx(omega, abs=1e-8)
         assert tip.multiplier == KINDS[tip.name[0]] and tip.opens
-        turn = {"+1": 0.0, "-1": np.pi}.get(tip.multiplier)
-        assert 0.01 < tip.angle < np.pi - 0.01 if turn is None else tip.angle == pytest.approx(turn, abs=1e-4)
 
 
 def test_errors_of_tips_lie_within_their_bounds(tips):
@@ -181,7 +179,7 @@ def test_a_large_error_leaves_boxes_undecided(atlas):
     assert [tip.name for tip in find_tips(part, CARDAN).tips] == ["S21"]
     panels = tuple(replace(p, value_error=1e-2, derived_error=np.full(3, 1e-2)) for p in part.panels)
     tips = find_tips(replace(part, panels=panels), CARDAN)
-    assert not tips.complete and tips.undecided
+    assert tips.undecided
     beta, omega = TIPS["S21"]
     inside = [
         b for b in tips.undecided if b["beta"][0] <= beta <= b["beta"][1] and b["Omega"][0] <= omega <= b["Omega"][1]
@@ -197,7 +195,7 @@ def test_a_tip_that_cannot_be_proved_is_listed_as_such(atlas):
     panels = tuple(replace(p, value_error=1e-6, derived_error=np.full(3, 1e-6)) for p in part.panels)
     tips = find_tips(replace(part, panels=panels), CARDAN)
     (tip,) = tips.tips
-    assert tip.name == "S21" and tip.opens and not tip.proved and not tips.complete
+    assert tip.name == "S21" and tip.opens and not tip.proved and tips.undecided
     assert tip.point == pytest.approx(dict(zip(("beta", "Omega"), TIPS["S21"], strict=True)), abs=1e-9)
     assert 1e-5 < tip.error["beta"] < 1e-3 and 1e-8 < tip.error["Omega"] < 1e-5
     (tip,) = find_tips(part, CARDAN).tips
@@ -296,7 +294,6 @@ def test_undamped_tongues_start_at_the_resonances(undamped):
     assert not any(name.startswith("C-") for name in found)
     assert found["S21"].point == {"beta": 0.0, "Omega": pytest.approx(omega2)}
     assert found["C+2"].point == {"beta": 0.0, "Omega": pytest.approx((omega1 + omega2) / 4)}
-    assert not tips.complete
 
 
 def test_undamped_boundaries_separate_bounded_and_growing_motion(undamped):
