@@ -17,6 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, N
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
+from drivetrain_jax.view.prefixes import with_prefixes
 from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STATE_HATCHES, STATE_NAMES, STATES, scene_key, symbol
 
 STABLE, UNSTABLE, UNDECIDED, FAILED = range(4)
@@ -25,11 +26,11 @@ _NO_PARAMETERS = ("point", _PENDING)
 
 
 def prepare(dataset: xr.Dataset) -> xr.Dataset:
-    """``dataset`` with rising axes; axes of one value become scalar coordinates. Infinite axis values are dropped and
-    recorded in the attribute ``left_out``."""
+    """``dataset`` with rising axes in units of a handy size; axes of one value become scalar coordinates. Infinite axis
+    values are dropped and recorded in the attribute ``left_out``."""
     dataset = _finite(dataset)
     single = {name: 0 for name in dataset["outcome"].dims if dataset.sizes[name] == 1}
-    dataset = dataset.isel(single)
+    dataset = with_prefixes(dataset.isel(single))
     axes = [name for name in dataset["outcome"].dims if name in dataset.coords]
     return _with_pending(dataset.sortby(axes) if axes else dataset)
 

@@ -10,6 +10,8 @@ from typing import Any
 import xarray as xr
 from matplotlib.colors import ListedColormap
 
+from drivetrain_jax.view.prefixes import prefixed
+
 # Passed to rc_context around every figure; global rcParams stay unchanged.
 STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
@@ -113,15 +115,15 @@ def written_units(units: str) -> str:
 
 
 def value_text(name: str, value: object, units: str = "1") -> str:
-    """``symbol = value units``; a list of more than six entries is given by its length."""
+    """``symbol = value units``, with a prefix of the unit; a list of more than six entries is given by its length."""
+    entries = value if isinstance(value, (list, tuple)) else [value]
+    if len(entries) > _MOST_ENTRIES:
+        return f"{symbol(name)}: {len(entries)} values"
+    factor, units = prefixed([entry for entry in entries if isinstance(entry, (int, float))], units)
     end = f" {written_units(units)}" if units not in ("1", "") else ""
-    if isinstance(value, (list, tuple)):
-        if len(value) > _MOST_ENTRIES:
-            return f"{symbol(name)}: {len(value)} values"
-        entries = ", ".join(f"{entry:.5g}" if isinstance(entry, (int, float)) else str(entry) for entry in value)
-        return f"{symbol(name)} = [{entries}]{end}"
-    number = f"{value:.6g}" if isinstance(value, (int, float)) else str(value)
-    return f"{symbol(name)} = {number}{end}"
+    digits = "{:.5g}" if entries is value else "{:.6g}"
+    text = ", ".join(digits.format(x / factor) if isinstance(x, (int, float)) else str(x) for x in entries)
+    return f"{symbol(name)} = [{text}]{end}" if entries is value else f"{symbol(name)} = {text}{end}"
 
 
 def coordinate_text(coordinate: xr.DataArray) -> str:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from drivetrain_jax.view import cells, plot
 from drivetrain_jax.view.figure_layout import Panels, write_title
-from drivetrain_jax.view.style import caption
+from drivetrain_jax.view.style import axis_label, caption, value_text, variable_label
 from tests.view import results
 from tests.view.test_stability import meshes, panels
 
@@ -113,3 +113,38 @@ def test_a_title_is_text_and_no_formula(text):
 def test_caption_gives_parameters_instead_of_the_point_number():
     dataset = xr.Dataset(coords={"point": 0, "omega": ((), 0.86, {"units": "rad/s"})})
     assert caption(dataset) == "$\\omega$ = 0.86 rad/s"
+
+
+@pytest.mark.parametrize(
+    ("value", "units", "text"),
+    [
+        (8.5e7, "N/m", "$k_{A}$ = 85 MN/m"),
+        (999.0, "N/m", "$k_{A}$ = 999 N/m"),
+        (-2550.0, "N m", "$k_{A}$ = -2.55 kN m"),
+        (2.1e11, "Pa", "$k_{A}$ = 210 GPa"),
+        ([64155.0, 22155.0, 8337.0], "N m2", "$k_{A}$ = [64.155, 22.155, 8.337] kN m²"),
+        ([0.0, 2e6, "varies"], "N/m", "$k_{A}$ = [0, 2, varies] MN/m"),
+        ("inf", "N/m", "$k_{A}$ = inf N/m"),
+        (0.0, "N/m", "$k_{A}$ = 0 N/m"),
+        (12.0, "MN/m", "$k_{A}$ = 12 MN/m"),
+        (4800.0, "Np", "$k_{A}$ = 4800 Np"),
+        (4800.0, "rpm", "$k_{A}$ = 4800 rpm"),
+    ],
+)
+def test_forces_have_the_prefix_that_people_write(value, units, text):
+    assert value_text("k_A", value, units) == text
+
+
+def test_axes_and_results_have_prefixes_together_with_their_numbers():
+    about = {"units": "N/m", "long_name": "stiffness"}
+    coords = {"k_A": ("k_A", [3e9, 1e7, 1e8], about), "k_B": ("k_B", [85e6], about)}
+    coords |= {f"boundary_{name}": ("boundary", [2e3, np.nan], about) for name in ("k_A", "k_C")}
+    torque = ("k_A", "k_B"), np.array([[0.0], [2e3], [np.nan]]), {"units": "N m", "long_name": "torque"}
+    data = {"torque": torque, "outcome": (("k_A", "k_B"), np.zeros((3, 1), "int8"))}
+    shown = cells.prepare(xr.Dataset(data, coords))
+    assert shown["k_A"].values.tolist() == [10.0, 100.0, 3000.0] and shown.indexes["k_A"].tolist() == [10, 100, 3000]
+    assert shown["boundary_k_A"].values[0] == 2e-3 and shown["boundary_k_C"].values[0] == 2.0
+    assert axis_label(shown["k_A"]) == "stiffness ($k_{A}$) [MN/m]"
+    np.testing.assert_array_equal(shown["torque"], [2.0, np.nan, 0.0])
+    assert variable_label(shown["torque"]) == "torque [kN m]"
+    assert caption(shown) == "$k_{B}$ = 85 MN/m"
