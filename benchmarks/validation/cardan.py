@@ -46,7 +46,7 @@ def _scene(analysis: str, outputs: Sequence[str], rest: Mapping[str, Any]) -> di
 
 def frequencies_section() -> str:
     """Natural frequencies and Tables 1-2."""
-    from drivetrain_jax.systems import cardan
+    from drivetrain_jax.resonances import cardan
 
     exact, independent = cardan.natural_frequencies(1.0, 100.0), natural_frequencies()
     rows = [
@@ -156,7 +156,7 @@ def trends_section() -> str:
 
 
 def _speeds_mu20() -> str:
-    from drivetrain_jax.systems import cardan
+    from drivetrain_jax.resonances import cardan
 
     speeds = predicted_speeds(cardan.natural_frequencies(20.0, 100.0))
     return ", ".join(f"{speeds[name]:.3f}" for name in ("S21", "C+1", "H21"))

@@ -9,9 +9,18 @@ import numpy as np
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax.resonances import Resonances, cardan, rattle
 from drivetrain_jax.view.style import is_joined, scene_key
 
 LABELS = "resonance"
+# Predictions of the systems of this package, so that their figures need no jax.
+BUILT_IN = {
+    "cardan": cardan.RESONANCES,
+    "rattle": rattle.THRESHOLD,
+    "tripod": None,
+    "planetary": None,
+    "bicardan": None,
+}
 
 
 def resonances(dataset: xr.Dataset) -> xr.DataArray | None:
@@ -19,15 +28,7 @@ def resonances(dataset: xr.Dataset) -> xr.DataArray | None:
 
     Returns: ``resonance_AXIS`` with the dimension ``resonance`` (labels), after the axes that the predictions depend on.
     """
-    # Local import: it loads jax.
-    from drivetrain_jax.runs.scene import find_system
-
-    try:
-        system = find_system(str(dataset.attrs.get("system")))
-    except InputError:
-        # The package of the system is not installed, or the dataset is a sweep of a function.
-        return None
-    predicted = system.resonances
+    predicted = _predicted(str(dataset.attrs.get("system")))
     if predicted is None or predicted.axis not in dataset.dims or is_joined(dataset):
         return None
     values = {name: _value(dataset, name) for name in predicted.parameters}
@@ -35,7 +36,7 @@ def resonances(dataset: xr.Dataset) -> xr.DataArray | None:
         return None
     dims = [str(dim) for dim in dataset.dims if dim in values]
     mesh = dict(zip(dims, np.meshgrid(*(values[dim] for dim in dims), indexing="ij"), strict=True))
-    about = {"units": system.parameter(predicted.axis).units, "long_name": predicted.long_name}
+    about = {"units": dataset[predicted.axis].attrs["units"], "long_name": predicted.long_name}
     return xr.DataArray(
         predicted.values(values | mesh),
         {dim: dataset[dim] for dim in dims} | {LABELS: (LABELS, list(predicted.labels), {"long_name": "resonance"})},
@@ -43,6 +44,19 @@ def resonances(dataset: xr.Dataset) -> xr.DataArray | None:
         f"{LABELS}_{predicted.axis}",
         about,
     )
+
+
+def _predicted(system: str) -> Resonances | None:
+    if system in BUILT_IN:
+        return BUILT_IN[system]
+    # Local import: it loads jax.
+    from drivetrain_jax.runs.scene import find_system
+
+    try:
+        return find_system(system).resonances
+    except InputError:
+        # The package of the system is not installed, or the dataset is a sweep of a function.
+        return None
 
 
 def _value(dataset: xr.Dataset, name: str) -> Any:

@@ -20,7 +20,7 @@ from drivetrain_jax.store.provenance import digest, source_digest, versions
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "numpy", "scipy")
 _ROOT = Path(drivetrain_jax.__file__).parent
 # Folders and files of this package that compute numbers, and the files in them that only read results.
-_FOLDERS = ("systems", "analysis", "atlas")
+_FOLDERS = ("resonances", "systems", "analysis", "atlas")
 _ENGINE = ("atlas_choice", "kernel", "over", "plan", "point_grid", "rounds", "through_atlas")
 _FILES = ("_quantities", *(f"runs/{name}" for name in _ENGINE))
 _READERS = ("figure.py", "rules.py")

@@ -16,7 +16,8 @@ if os.environ.get("DRIVETRAIN_JAX_ENABLE_X64") != "0":
 
 from drivetrain_jax._plugins import SYSTEMS, load_plugin, plugin_names
 from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
-from drivetrain_jax.systems._base import Family, Model, Resonances, System, parameter, serves
+from drivetrain_jax.resonances import Family, Resonances
+from drivetrain_jax.systems._base import Model, System, parameter, serves
 from drivetrain_jax.systems._flow import Flow
 from drivetrain_jax.systems._modal import Block, SpringSystem
 from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator

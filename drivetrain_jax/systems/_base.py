@@ -21,9 +21,9 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
+from drivetrain_jax.resonances import Resonances, Values
 from drivetrain_jax.systems._smooth import Smoothness
 
-Values = Mapping[str, Any]
 Method = TypeVar("Method", bound=Callable[..., Any])
 Number = float | Array | np.ndarray
 _PARAMETER, _SERVES = "parameter", "_serves"
@@ -46,41 +46,6 @@ class Model:
     smooth: Smoothness | None = None
     results: tuple[Variable, ...] = ()
     default_outputs: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Family:
-    """Resonances whose labels begin with ``prefix``, as figures draw them.
-
-    ``name`` stands in the legend, ``line`` is ``solid``, ``dashed`` or ``dashdot``. Resonances that make no tongue are not
-    ``drawn``. The periodic forcing excites a ``forced`` family: figures of forced responses show it.
-    """
-
-    prefix: str
-    name: str
-    line: str = "solid"
-    drawn: bool = True
-    forced: bool = False
-
-
-@dataclass(frozen=True)
-class Resonances:
-    """Predicted values of the parameter ``axis``, drawn over charts.
-
-    ``values(parameters)`` maps the values of ``parameters`` (scalars or arrays of shape ``(...)``) to an array of shape
-    ``(..., len(labels))``. ``multipliers`` gives for each label the multiplier that meets the unit circle there, ``+1``,
-    ``-1`` or ``pair``, if known. ``up_to(k)`` returns the same predictions for the orders 1 to k. ``families`` say how
-    figures draw them; the family of a label is the one with the longest prefix.
-    """
-
-    axis: str
-    parameters: tuple[str, ...]
-    labels: tuple[str, ...]
-    values: Callable[[Values], np.ndarray]
-    long_name: str
-    multipliers: tuple[str, ...] = ()
-    up_to: Callable[[int], Resonances] | None = None
-    families: tuple[Family, ...] = ()
 
 
 def numeric(*values: Any) -> tuple[Any, ...]:

@@ -18,30 +18,15 @@ import math
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 from jax import Array
 
 from drivetrain_jax._quantities import Component
-from drivetrain_jax.systems._base import Number, Resonances, System, Values, parameter, serves
+from drivetrain_jax.resonances.rattle import THRESHOLD
+from drivetrain_jax.systems._base import Number, System, parameter, serves
 from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator
 
 # Table 1 of the paper: b = 10 deg.
 PRESETS = {"table1": {"B0": 0.05, "B1": 0.03, "b": math.pi / 18, "c": 0.05, "alpha": 0.25, "k": 1.0, "I": 1.0}}
-
-
-def rattle_threshold(values: Values) -> np.ndarray:
-    """Amplitude ``B1`` at which the orbit without separation ceases to exist, shape ``(..., 1)``; NaN if there is none.
-
-    ``B1 = (|B0| - alpha b k/I) sqrt((1 - r^2)^2 + (2 zeta r)^2)``, ``r = omega/sqrt(k/I)``, ``zeta = c/(2 sqrt(k I))``,
-    for a mean drive that holds the teeth in contact (either flank). Rattle can coexist with that orbit below it.
-    """
-    mean, b, c, alpha, k, mass, omega = (
-        np.asarray(values[name], float) for name in ("B0", "b", "c", "alpha", "k", "I", "omega")
-    )
-    margin = np.abs(mean) - alpha * b * k / mass
-    r, zeta = omega / np.sqrt(k / mass), c / (2 * np.sqrt(k * mass))
-    threshold = margin * np.hypot(1 - r**2, 2 * zeta * r)
-    return np.where(margin > 0, threshold, np.nan)[..., None]
 
 
 POSITIVE = {"lower": 0.0, "open_lower": True}
@@ -61,13 +46,7 @@ class Rattle(System):
     title = "Gear rattle: a pair of gears with backlash"
     source = "Rezaee & Farshidianfar (in Persian); corrections in docs/theory/rattle.md"
     presets = PRESETS
-    resonances = Resonances(
-        "B1",
-        ("omega", "B0", "b", "c", "alpha", "k", "I"),
-        ("no separation ends",),
-        rattle_threshold,
-        "amplitude at which the orbit without separation ends",
-    )
+    resonances = THRESHOLD
     roles = MappingProxyType({"speed": "omega", "initial_displacement": "u0", "initial_rate": "v0", "half_play": "b"})
     state = (
         Component("u", "m", "relative displacement"),

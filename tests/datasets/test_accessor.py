@@ -16,6 +16,8 @@ import xarray as xr
 
 import drivetrain_jax as dt
 from drivetrain_jax.datasets import figure as figures
+from drivetrain_jax.datasets.resonances import BUILT_IN
+from drivetrain_jax.systems import get_system, system_names
 from drivetrain_jax.view.style import caption
 
 SHAFT = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
@@ -168,6 +170,23 @@ def test_a_lazy_grid_is_evaluated_once_for_its_figure(folder, monkeypatch):
 def test_a_figure_shows_itself(chart):
     png, size = dt.plot(chart)._repr_png_()
     assert png.startswith(b"\x89PNG") and size["width"] == 700
+
+
+def test_a_figure_of_a_stored_result_needs_no_jax(folder):
+    """Its predicted resonances neither; jax takes longer to import than the figure to draw."""
+    check = [
+        "import sys, drivetrain_jax as dt, xarray as xr",
+        "chart = xr.open_dataset(sys.argv[1], engine='h5netcdf')",
+        "for figure in (dt.plot(sys.argv[1]), chart.isel(beta=slice(3)).drivetrain.plot()):",
+        "    assert [text.get_text() for text in figure.axes[0].texts] == ['$S_{21}$']",
+        "assert 'jax' not in sys.modules",
+    ]
+    subprocess.run([sys.executable, "-c", "\n".join(check), folder / "chart.nc"], check=True)
+
+
+def test_built_in_systems_have_the_predictions_that_figures_know():
+    assert {name: get_system(name).resonances for name in BUILT_IN} == BUILT_IN
+    assert set(BUILT_IN) == set(system_names())
 
 
 def test_every_figure_is_one_that_shows_itself():

@@ -12,8 +12,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import newton
 
+from drivetrain_jax.resonances.cardan import natural_frequencies
 from drivetrain_jax.systems import get_system, tripod
-from drivetrain_jax.systems.cardan import natural_frequencies
 
 ROOT = Path(__file__).parents[2]
 THEORY = ROOT / "docs" / "theory"

@@ -4,8 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from drivetrain_jax.resonances.rattle import rattle_threshold
 from drivetrain_jax.systems import get_system
-from drivetrain_jax.systems.rattle import PRESETS, Rattle, rattle_threshold
+from drivetrain_jax.systems.rattle import PRESETS, Rattle
 
 TABLE1 = PRESETS["table1"] | {"omega": 0.7}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivetrain_jax.systems import cardan
+from drivetrain_jax.resonances import cardan
 from tests.oracles.cardan_paper import PRINTED_FREQUENCIES, PRINTED_SPEEDS, natural_frequencies, predicted_speeds
 
 EXACT = (0.070622235012, 1.415984639720)
@@ -21,7 +21,7 @@ def parameters(one: float, two: float) -> dict[str, float]:
 
 
 def speeds(values: dict[str, float]) -> dict[str, float]:
-    return dict(zip(cardan.Cardan.resonances.labels, cardan.resonance_speeds(values), strict=True))
+    return dict(zip(cardan.RESONANCES.labels, cardan.resonance_speeds(values), strict=True))
 
 
 def test_natural_frequencies():
