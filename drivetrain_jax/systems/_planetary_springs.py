@@ -1,0 +1,211 @@
+"""Springs, masses and invariant blocks of planetary gears; equation numbers are those of docs/theory/planetary.md."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.systems._base import Values
+from drivetrain_jax.systems._modal import Block, SpringSystem, weighted_factor
+
+BODIES = ("carrier", "ring", "sun")
+_CENTRAL = 9
+_PER_PLANET = 3
+FAMILIES = ("rotational", "translational", "planet")
+ROTATIONAL, TRANSLATIONAL, PLANET = range(3)
+# Below this the sum of the planets' unit vectors is zero up to the rounding of the angles.
+_BALANCED = 4e-16
+
+
+PER_PLANET = ("m_p", "I_p", "k_sp", "k_rp", "k_p")
+
+# Extensions of the springs (rows: bearing radially, tangentially, mesh with ring, with sun) per unit of the central
+# coordinates, as coefficients of (1, cos psi, sin psi), times (1, cos a, sin a) of the pressure angle: (2)-(5).
+_CENTRAL_PARTS = np.zeros((3, 4, _CENTRAL, 3))
+_CENTRAL_PARTS[0, 0, 0, 1] = _CENTRAL_PARTS[0, 0, 1, 2] = 1.0
+_CENTRAL_PARTS[0, 1, 0, 2] = -1.0
+_CENTRAL_PARTS[0, 1, 1, 1] = _CENTRAL_PARTS[0, 1, 2, 0] = 1.0
+for _row, _x, _sign in ((2, 3, 1.0), (3, 6, -1.0)):
+    _CENTRAL_PARTS[0, _row, _x + 2, 0] = _CENTRAL_PARTS[1, _row, _x + 1, 1] = 1.0
+    _CENTRAL_PARTS[1, _row, _x, 2] = -1.0
+    _CENTRAL_PARTS[2, _row, _x, 1] = _CENTRAL_PARTS[2, _row, _x + 1, 2] = -_sign
+# The same for the coordinates of the planet itself.
+_PLANET_PARTS = np.zeros((3, 4, _PER_PLANET))
+_PLANET_PARTS[0, 0, 0] = _PLANET_PARTS[0, 1, 1] = _PLANET_PARTS[0, 2, 2] = -1.0
+_PLANET_PARTS[0, 3, 2] = 1.0
+_PLANET_PARTS[1, 2:, 1] = -1.0
+_PLANET_PARTS[2, 2, 0], _PLANET_PARTS[2, 3, 0] = 1.0, -1.0
+
+
+def spacing(planet_angle: Any, order: int = 1) -> Any:
+    """``c1 = |sum e^(i psi)| / N`` (``c2`` with ``order`` 2): zero if rotation and translation are uncoupled."""
+    angles = [order * angle for angle in planet_angle]
+    module = np if all(isinstance(angle, (int, float)) for angle in angles) else jnp
+    count = len(angles)
+    return module.hypot(sum(module.cos(a) for a in angles) / count, sum(module.sin(a) for a in angles) / count)
+
+
+def _lanes(*arrays: Any) -> tuple[int, ...]:
+    return jnp.broadcast_shapes(*(jnp.shape(array) for array in arrays))
+
+
+def _spread(values: Values) -> dict[str, Any]:
+    """All parameters as arrays of one common shape ``(...)``; those of the planets and their angles ``(N, ...)``."""
+    count = len(values["planet_angle"])
+    entries = [entry for value in values.values() for entry in (value if isinstance(value, tuple) else (value,))]
+    shape = _lanes(*entries)
+
+    def spread(value: Any) -> Array:
+        return jnp.broadcast_to(jnp.asarray(value, float), shape)
+
+    spread_values: dict[str, Any] = {}
+    for name, value in values.items():
+        if name in PER_PLANET or name == "planet_angle":
+            whole = value if isinstance(value, tuple) else (value,) * count
+            spread_values[name] = jnp.stack([spread(entry) for entry in whole])
+        else:
+            spread_values[name] = spread(value)
+    return spread_values
+
+
+def _extensions(directions: Array, pressure_angle: Array) -> tuple[Array, Array]:
+    """``B`` of planets whose (1, cos psi, sin psi) are the rows of ``directions`` (n, 3, ...), and its part for one
+    planet's own coordinates (4, 3, ...). Rows: springs by kind, then planet; then the bearings of the bodies."""
+    n, lanes = directions.shape[0], directions.shape[2:]
+    weights = jnp.stack([jnp.ones_like(pressure_angle), jnp.cos(pressure_angle), jnp.sin(pressure_angle)])
+    central = sum(w * part[(...,) + (None,) * len(lanes)] for w, part in zip(weights, _CENTRAL_PARTS, strict=True))
+    own = sum(w * part[(...,) + (None,) * len(lanes)] for w, part in zip(weights, _PLANET_PARTS, strict=True))
+    coupling = sum(directions[None, :, None, i] * central[:, None, :, i] for i in range(3))  # pyright: ignore[reportIndexIssue]
+    eye = np.eye(n).reshape(1, n, n, 1, *(1,) * len(lanes))
+    planets = (eye * own[:, None, None]).reshape(4 * n, _PER_PLANET * n, *lanes)  # pyright: ignore[reportIndexIssue]
+    springs = jnp.concatenate([coupling.reshape(4 * n, _CENTRAL, *lanes), planets], axis=1)  # pyright: ignore[reportAttributeAccessIssue]
+    bearings = np.eye(_CENTRAL, _CENTRAL + _PER_PLANET * n).reshape(_CENTRAL, -1, *(1,) * len(lanes))
+    return jnp.concatenate([springs, jnp.broadcast_to(bearings, (_CENTRAL, *springs.shape[1:]))]), own  # pyright: ignore[reportReturnType]
+
+
+def _stiffness_and_mass(p: Mapping[str, Array], n: int) -> tuple[Array, Array]:
+    """Stiffness (4n + 9, ...) and mass (9 + 3n, ...) of ``n`` planets."""
+    springs = [p["k_p"][:n], p["k_p"][:n], p["k_rp"][:n], p["k_sp"][:n]]
+    bearings = jnp.stack([p[f"k_{body}{kind}"] for body in "crs" for kind in ("", "", "u")])
+    bodies = jnp.stack([p[f"{kind}_{body}"] for body in "crs" for kind in ("m", "m", "I")])
+    planets = jnp.stack([p["m_p"][:n], p["m_p"][:n], p["I_p"][:n]], axis=1)
+    planets = planets.reshape(_PER_PLANET * n, *planets.shape[2:])
+    return jnp.concatenate([*springs, bearings]), jnp.concatenate([bodies, planets])
+
+
+def orthonormal_frame(columns: Array) -> tuple[Array, Array]:
+    """``Q`` (n, n, ...) and ``R`` (n, k, ...) with ``columns`` (n, k, ...) = Q R, by Householder reflections.
+
+    Dependent columns are no exception: ``Q`` stays orthonormal.
+    """
+    n, k = columns.shape[:2]
+    frame = jnp.broadcast_to(np.eye(n).reshape(n, n, *(1,) * (columns.ndim - 2)), (n, n, *columns.shape[2:]))
+    for j in range(min(n - 1, k)):
+        x = columns[j:, j]
+        norm = jnp.sqrt(jnp.sum(x**2, axis=0))
+        v = x.at[0].add(jnp.where(x[0] < 0, -norm, norm))
+        size = jnp.sum(v**2, axis=0)
+        factor = jnp.where(size > 0, 2 / jnp.where(size > 0, size, 1.0), 0.0)
+        columns = columns.at[j:].add(-factor * v[:, None] * jnp.sum(v[:, None] * columns[j:], axis=0))
+        frame = frame.at[:, j:].add(-factor * jnp.sum(frame[:, j:] * v, axis=1)[:, None] * v)
+    return frame, columns
+
+
+def _families(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Family and polarisation of the central coordinates and of ``n`` frame vectors times [xi, eta, u]."""
+    central = np.tile([TRANSLATIONAL, TRANSLATIONAL, ROTATIONAL], 3)
+    planets = np.repeat(np.array([ROTATIONAL, TRANSLATIONAL, TRANSLATIONAL] + [PLANET] * max(n - 3, 0))[:n], 3)
+    return np.concatenate([central, planets]), np.arange(_CENTRAL + _PER_PLANET * n) % 3 == 0
+
+
+def _embed(frame: Array, inertia_frame: Array | None = None) -> Array:
+    """The matrix (9 + 3N, 9 + 3k, ...): identity on the central coordinates, ``frame`` (N, k, ...) on the planets'."""
+    n, k, lanes = frame.shape[0], frame.shape[1], frame.shape[2:]
+    other = frame if inertia_frame is None else inertia_frame
+    planets = jnp.zeros((n, _PER_PLANET, k, _PER_PLANET, *lanes))
+    for own, part in ((0, frame), (1, frame), (2, other)):
+        planets = planets.at[:, own, :, own].set(part)
+    whole = jnp.zeros((_CENTRAL + _PER_PLANET * n, _CENTRAL + _PER_PLANET * k, *lanes))
+    eye = np.eye(_CENTRAL).reshape(_CENTRAL, _CENTRAL, *(1,) * len(lanes))
+    whole = whole.at[:_CENTRAL, :_CENTRAL].set(jnp.broadcast_to(eye, (_CENTRAL, _CENTRAL, *lanes)))
+    return whole.at[_CENTRAL:, _CENTRAL:].set(planets.reshape(_PER_PLANET * n, _PER_PLANET * k, *lanes))
+
+
+def identical_planets(values: Values) -> bool:
+    """True if the parameters of all planets are single numbers or lists of equal numbers."""
+
+    def alike(value: Any) -> bool:
+        constant = isinstance(value, tuple) and all(isinstance(entry, (int, float)) for entry in value)
+        return not isinstance(value, tuple) or (constant and len(set(value)) == 1)
+
+    return all(alike(values[name]) for name in PER_PLANET)
+
+
+def _inequality(p: Mapping[str, Array]) -> Array:
+    """The largest relative difference between two planets in one parameter, 0 to 1."""
+    lists = jnp.stack([p[name] for name in PER_PLANET])
+    largest = jnp.max(lists, axis=1)
+    return jnp.max(
+        jnp.where(largest > 0, 1 - jnp.min(lists, axis=1) / jnp.where(largest > 0, largest, 1.0), 0.0), axis=0
+    )
+
+
+def _reduced_blocks(p: Mapping[str, Array], frame: Array, directions: Array, balanced: bool) -> tuple[Block, ...]:
+    """The blocks of identical planets: rotation with translation (apart if ``balanced``), and the planets alone
+    (8)-(9).
+
+    ``frame`` (N, N, ...) starts with span{1, cos psi, sin psi}, in which ``directions`` (3, 3, ...) is that basis.
+    """
+    n = frame.shape[0]
+    extensions, own = _extensions(directions, p["pressure_angle"])
+    stiffness, mass = _stiffness_and_mass(p, 3)
+    factor, basis = weighted_factor(extensions, stiffness, mass), _embed(frame[:, :3])
+    family, polar = _families(3)
+    # A row acts on rotations if it is the first of its kind (spring on the mean motion), or a rotational bearing.
+    rows = np.concatenate([np.arange(12) % 3 > 0, np.arange(_CENTRAL) % 3 < 2]).astype(int)
+    parts = [(rows == kind, family == kind) for kind in (0, 1)] if balanced else [(rows >= 0, family >= 0)]
+    blocks = [
+        Block(factor[row][:, column], family[column], polar[column], basis[:, column, None]) for row, column in parts
+    ]
+    if n > 3:
+        springs, masses = stiffness[:12:3], mass[_CENTRAL : _CENTRAL + _PER_PLANET]
+        alone = jnp.stack([_embed(frame[:, i : i + 1])[:, _CENTRAL:] for i in range(3, n)], axis=2)
+        kind = np.full(_PER_PLANET, PLANET)
+        blocks.append(Block(weighted_factor(own, springs, masses), kind, kind < 0, alone))
+    return tuple(blocks)
+
+
+def coordinate_names(n: int) -> tuple[str, ...]:
+    """``x_c, y_c, u_c, x_r, ...`` of carrier, ring and sun, then ``xi_1, eta_1, u_1, ...`` of the planets."""
+    central = tuple(f"{kind}_{body}" for body in "crs" for kind in ("x", "y", "u"))
+    return central + tuple(f"{kind}_{i}" for i in range(1, n + 1) for kind in ("xi", "eta", "u"))
+
+
+def plane_springs(values: Values) -> SpringSystem:
+    """The gear as masses and springs, eqs (1)-(7), with its decomposition (8)-(9) if all planets are alike."""
+    p, n = _spread(values), len(values["planet_angle"])
+    angles = p["planet_angle"]
+    directions = jnp.stack([jnp.ones_like(angles), jnp.cos(angles), jnp.sin(angles)], axis=1)
+    extensions, _ = _extensions(directions, p["pressure_angle"])
+    stiffness, mass = _stiffness_and_mass(p, n)
+    family, polar = _families(n)
+    alike = identical_planets(values)
+    frames = [orthonormal_frame(jnp.sqrt(p[name])[:, None] * directions)[0] for name in ("m_p", "I_p")]
+    size = _CENTRAL + _PER_PLANET * n
+    identity = jnp.broadcast_to(np.eye(size).reshape(size, size, *(1,) * (angles.ndim - 1)), (size, *mass.shape))
+    factor = weighted_factor(extensions, stiffness, mass)
+    whole = Block(factor, family, polar, identity[:, :, None], _embed(*frames))
+    blocks: tuple[Block, ...] = (whole,)
+    if alike and n >= 3:
+        frame, triangle = orthonormal_frame(directions)
+        known = all(isinstance(angle, (int, float)) for angle in values["planet_angle"])
+        balanced = known and float(spacing(values["planet_angle"])) <= _BALANCED
+        blocks = _reduced_blocks(p, frame, triangle[:3], balanced)
+    names, bodies = coordinate_names(n), np.repeat(np.arange(3 + n), 3)
+    body_names = (*BODIES, *(f"planet_{i + 1}" for i in range(n)))
+    asymmetry = jnp.maximum(spacing(tuple(angles)), _inequality(p))
+    return SpringSystem(extensions, stiffness, mass, blocks, whole, asymmetry, names, body_names, bodies, len(FAMILIES))
