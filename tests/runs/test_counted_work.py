@@ -18,7 +18,7 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis.critical_speeds import frequency_roots as shaft_roots
-from drivetrain_jax.analysis.history import analysis as history
+from drivetrain_jax.analysis.history import integration as history
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
 from drivetrain_jax.analysis.numerics import singular_values
 from drivetrain_jax.runs.resolve import resolve

@@ -1,0 +1,198 @@
+"""States of a flow at requested times by diffrax, with errors from a second run."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Parameter
+from drivetrain_jax.analysis._base import Request
+from drivetrain_jax.analysis.numerics.watched_steps import WatchedSteps, largest_met
+from drivetrain_jax.systems import Flow
+
+NUM = Parameter(
+    "num", "1", "number of equally spaced times from 0 to stop", default=1001, lower=2, upper=1e7, integer=True
+)
+
+# Tolerances of the steps relative to that of the result: errors of steps accumulate over the memory of the damped motion.
+_SHARPNESS, _COARSER, _SHARPEST = 0.01, 10.0, 1e-15
+# Longest steps of the accurate run relative to those of the other, at first a segment: with one step per segment both runs
+# would be equal and show no error. Every further try starts with the steps of the last one.
+_PART = 0.5
+# Settings of further tries: fraction of rtol as next target, tightest tolerance, number of tries.
+_RESERVE, _SHARPEST_AGAIN, _MOST_ATTEMPTS = 0.3, 1e-14, 3
+# Steps of one segment (at most a strobe) and of a whole history.
+_MAX_SEGMENT, _MAX_STEPS = 4096, 20_000_000
+
+
+class _Place(NamedTuple):
+    """State of the integration: time ``(strobe + fraction) * period``, state, largest component so far, number of steps,
+    and a flag of success."""
+
+    strobe: Array
+    fraction: Array
+    y: Array
+    reached: Array
+    steps: Array
+    healthy: Array
+
+
+class _Found(NamedTuple):
+    """States (T, n) by steps of ``tolerance``, their estimated ``error``, and its ``excess`` over the allowed one."""
+
+    tolerance: Array
+    states: Array
+    error: Array
+    excess: Array
+    healthy: Array
+    attempts: Array
+
+
+def requested_times(request: Request) -> tuple[float, ...]:
+    """The times of the options: ``times``, or ``num`` equal steps from 0 to ``stop``, ends included.
+
+    :class:`InputError` if both or neither are given, or ``times`` does not rise.
+    """
+    times, stop, num = (request.options[name] for name in ("times", "stop", "num"))
+    if times and stop:
+        raise InputError(f"options.stop = {stop:g}: given together with times; allowed is one of the two")
+    if times and num != NUM.default:
+        raise InputError(f"options.num = {num}: given together with times; allowed is one of the two")
+    if not times and not stop:
+        raise InputError("options.times: missing; allowed is times, or stop and num")
+    if times and (np.diff(times) <= 0).any():
+        raise InputError("options.times: allowed are rising times")
+    return tuple(times) if times else tuple(np.linspace(0.0, stop, num).tolist())
+
+
+def size_of(flow: Flow) -> Array:
+    """Estimated size of the motion, per component: the initial state, and its change within a radian."""
+    start = _start(flow)
+    rate = flow.vector(0, 0.0, start)
+    fastest = 2 * np.pi / flow.period if flow.fastest is None else flow.fastest
+    return jnp.max(jnp.abs(start)) + jnp.max(jnp.abs(rate)) / fastest
+
+
+def _start(flow: Flow) -> Array:
+    return jnp.stack([jnp.asarray(x, float) for x in flow.start])
+
+
+def has_finite_start(flow: Flow) -> Array:
+    """True if the field is finite at the start."""
+    start = _start(flow)
+    return jnp.all(jnp.isfinite(start)) & jnp.all(jnp.isfinite(flow.vector(0, 0.0, start)))
+
+
+def _segment(
+    flow: Flow,
+    solver: diffrax.AbstractSolver,
+    controller: diffrax.PIDController,
+    part: Array,
+    place: _Place,
+    end: Array,
+) -> tuple[Array, Array, Array, Array]:
+    """State at the fraction ``end`` of the strobe, largest component, number of steps, and a flag of success."""
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda s, y, _: flow.period * flow.vector(place.strobe, s, y)),
+        solver,
+        t0=place.fraction,
+        t1=end,
+        dt0=None,
+        y0=place.y,
+        stepsize_controller=WatchedSteps(controller, part, end - place.fraction),  # pyright: ignore[reportCallIssue]
+        saveat=diffrax.SaveAt(t1=True, controller_state=True),
+        adjoint=diffrax.ForwardMode(),
+        max_steps=_MAX_SEGMENT,
+        throw=False,
+    )
+    well = solution.result == diffrax.RESULTS.successful
+    return solution.ys[0], largest_met(solution), solution.stats["num_steps"], well  # pyright: ignore[reportOptionalSubscript]
+
+
+def _ahead(place: _Place, target: tuple[Array, Array]) -> Array:
+    """True if the place is before the target."""
+    strobe, fraction = target
+    return place.healthy & ((place.strobe < strobe) | (place.fraction < fraction))
+
+
+def trajectory(
+    flow: Flow, times: Array, tolerance: Any, part: Any, solver: diffrax.AbstractSolver
+) -> tuple[Array, Array, Array]:
+    """States at the rising ``times``, shape ``(len(times), n)``, the largest component, and a flag if the step limit was
+    kept; NaN beyond it.
+
+    ``tolerance`` bounds the error of a step relative to the state and to :func:`size_of`, ``part`` its length relative to
+    the segment, which is at most a strobe.
+    """
+    controller = diffrax.PIDController(rtol=tolerance, atol=jnp.maximum(tolerance * size_of(flow), 1e-300))
+    turns = times / flow.period
+    strobes = jnp.floor(turns).astype(jnp.int64)
+
+    def advance(place: _Place, target: tuple[Array, Array]) -> _Place:
+        strobe, fraction = target
+        last = place.strobe == strobe
+        # In a batch, lanes that have finished or failed wait for the others: they must not take steps.
+        end = jnp.where(_ahead(place, target), jnp.where(last, fraction, 1.0), place.fraction)
+        y, reached, steps, well = _segment(flow, solver, controller, part, place, end)
+        total = place.steps + steps
+        healthy = place.healthy & well & (total <= _MAX_STEPS) & jnp.all(jnp.isfinite(y))
+        return _Place(
+            jnp.where(last, strobe, place.strobe + 1),
+            jnp.where(last, fraction, 0.0),
+            jnp.where(healthy, y, place.y),
+            jnp.maximum(place.reached, reached),
+            total,
+            healthy,
+        )
+
+    def to(place: _Place, target: tuple[Array, Array]) -> tuple[_Place, Array]:
+        place = jax.lax.while_loop(lambda p: _ahead(p, target), lambda p: advance(p, target), place)
+        return place, jnp.where(place.healthy, place.y, jnp.nan)
+
+    start = _start(flow)
+    rest = _Place(jnp.int64(0), jnp.zeros(()), start, jnp.max(jnp.abs(start)), jnp.int64(0), has_finite_start(flow))
+    place, states = jax.lax.scan(to, rest, (strobes, turns - strobes))
+    return states, place.reached, place.healthy
+
+
+def _twice(flow: Flow, times: Array, tolerance: Array, attempts: Array, request: Request) -> _Found:
+    """The states at ``times``, with their difference from a run at a tolerance ``_COARSER`` times as large."""
+    solver = getattr(diffrax, request.options["solver"])()
+    settings = tolerance * jnp.array([1.0, _COARSER]), _PART**attempts * jnp.array([_PART, 1.0])
+    # One after the other in one loop: compiled once.
+    runs, reached, healthy = jax.lax.map(lambda setting: trajectory(flow, times, *setting, solver), settings)  # pyright: ignore[reportCallIssue]
+    error = jnp.abs(runs[0] - runs[1])
+    largest = jnp.max(error)
+    excess = jnp.where(largest == 0, 0.0, largest / (request.options["rtol"] * reached[0]))
+    return _Found(tolerance, runs[0], error, excess, healthy[0], attempts + jnp.int8(1))
+
+
+def integrated(flow: Flow, request: Request) -> _Found:
+    """States and errors at the requested times, from tighter runs if the first ones miss ``rtol``."""
+    times = jnp.asarray(requested_times(request))
+
+    def sharper(found: _Found) -> Array:
+        return found.tolerance * _RESERVE / found.excess
+
+    def missed(found: _Found) -> Array:
+        hopeful = (found.excess > 1) & (sharper(found) >= _SHARPEST_AGAIN) & (found.attempts < _MOST_ATTEMPTS)
+        return (found.attempts == 0) | (found.healthy & hopeful)
+
+    def attempt(found: _Found) -> _Found:
+        first = found.attempts == 0
+        tolerance = jnp.where(missed(found) & ~first, sharper(found), found.tolerance)
+        new = _twice(flow, times, tolerance, found.attempts, request)
+        better = first | (new.excess < found.excess)
+        kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, found)
+        return kept._replace(attempts=new.attempts)
+
+    nothing = jnp.full((len(times), flow.size), jnp.nan)
+    tolerance = jnp.asarray(max(_SHARPNESS * request.options["rtol"], _SHARPEST))
+    start = _Found(tolerance, nothing, nothing, jnp.asarray(jnp.nan), jnp.bool_(False), jnp.int8(0))
+    return jax.lax.while_loop(missed, attempt, start)
