@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 import drivetrain_jax as dt
+from benchmarks.validation.cardan_conclusions import conclusions_section, index_section, orbit_section
 from benchmarks.validation.document import Page, markdown
 from tests.oracles.cardan_orbit_reference import linear_response, nonlinear_orbit
 from tests.oracles.cardan_paper import (
@@ -238,5 +239,13 @@ def page(full: bool) -> Page:
         "Validation of the cardan shaft",
         "Soltan Rezaee & Ghazavi 2014 against this package; the corrected equations are derived in "
         "[theory/cardan.md](../theory/cardan.md).",
-        (frequencies_section(), equations_section(1 if full else 2), trends_section(), forced_section()),
+        (
+            frequencies_section(),
+            equations_section(1 if full else 2),
+            trends_section(),
+            conclusions_section(),
+            forced_section(),
+            orbit_section(),
+            index_section(),
+        ),
     )
