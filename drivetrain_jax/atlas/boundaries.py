@@ -19,7 +19,7 @@ from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.patches import patches_of
 from drivetrain_jax.atlas.roots import on_line, roots
 from drivetrain_jax.atlas.tips import polish
-from drivetrain_jax.atlas.tracing import Curve, Field, trace, trace_tips
+from drivetrain_jax.atlas.tracing import Field, trace, trace_tips
 from drivetrain_jax.systems import System
 
 # Number of lines across the rectangle in each direction, for seeds.
@@ -64,7 +64,7 @@ def boundaries(atlas: Atlas, system: type[System], searches: Sequence[Search] = 
     horizontal = _narrow_axis(atlas, system)
     for number, kind in enumerate(criteria.multipliers):
         field = Field(patches[number])
-        curves: list[Curve] = []
+        curves: list[np.ndarray] = []
         if not criteria.conservative:
             search = searches[number] if searches else critical_points(patches, number, horizontal)
             rough = search.points
@@ -83,7 +83,9 @@ def _narrow_axis(atlas: Atlas, system: type[System]) -> int:
     return atlas.parameters.index(axis) if axis in atlas.parameters else 1
 
 
-def _distinct(field: Field, seeds: np.ndarray, known: list[Curve], horizontal: int | None = None) -> list[Curve]:
+def _distinct(
+    field: Field, seeds: np.ndarray, known: list[np.ndarray], horizontal: int | None = None
+) -> list[np.ndarray]:
     """``known`` curves, and those through other ``seeds``, which are tips if ``horizontal`` is given."""
     kept = list(known)
     on_curve = np.zeros(len(seeds), bool)
@@ -92,16 +94,16 @@ def _distinct(field: Field, seeds: np.ndarray, known: list[Curve], horizontal: i
     new = seeds[~on_curve].reshape(-1, 2)
     curves = trace(field, new) if horizontal is None else trace_tips(field, new, horizontal)
     for seed, curve in zip(new, curves, strict=True):
-        if len(curve.points) > 2 and not any(_contains(field, other, seed[None])[0] for other in kept[len(known) :]):
+        if len(curve) > 2 and not any(_contains(field, other, seed[None])[0] for other in kept[len(known) :]):
             kept.append(curve)
     return kept
 
 
-def _contains(field: Field, curve: Curve, seeds: np.ndarray) -> np.ndarray:
+def _contains(field: Field, curve: np.ndarray, seeds: np.ndarray) -> np.ndarray:
     """Flags of ``seeds`` ``(M, 2)`` that lie on ``curve``."""
     if not len(seeds):
         return np.zeros(0, bool)
-    y, target = field.to_unit(curve.points), field.to_unit(seeds)
+    y, target = field.to_unit(curve), field.to_unit(seeds)
     step = np.diff(y, axis=0)
     size = (step**2).sum(axis=1)
     with np.errstate(all="ignore"):
@@ -129,10 +131,10 @@ def _line_seeds(field: Field) -> Iterator[np.ndarray]:
             yield np.clip(np.concatenate(seeds), field.lower, field.upper)
 
 
-def _finish(criteria: Criteria, field: Field, kind: str, curve: Curve) -> Boundary:
+def _finish(criteria: Criteria, field: Field, kind: str, curve: np.ndarray) -> Boundary:
     """Polish the points of a curve with the multiplier itself."""
     # Rounding of Newton's method may move points of the rim outside.
-    x = _polish(criteria, field, kind, np.clip(curve.points, field.lower, field.upper))
+    x = _polish(criteria, field, kind, np.clip(curve, field.lower, field.upper))
     points = dict(zip(criteria.atlas.parameters, parameters_at(criteria.atlas, x).T, strict=True))
     return Boundary(kind, points, _limiting(criteria, x, kind))
 

@@ -7,8 +7,6 @@ narrow tongue. A step that lands there turns by 180 degrees and is rejected.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from drivetrain_jax.atlas.patches import Patches
@@ -23,14 +21,6 @@ _SETTLED = 1e-9
 # Distances from a tip in the other coordinate at which its flanks are entered: far enough to continue, and near enough for
 # a chord to the tip. A factor of ten either way changes nothing.
 _APPROACH = 1e-4 * np.array([1 / 64, 1 / 16, 1 / 4, 1.0])
-
-
-@dataclass(frozen=True)
-class Curve:
-    """Points ``(n, 2)`` in coordinates along a zero curve; ``closed`` if it returns to its start."""
-
-    points: np.ndarray
-    closed: bool
 
 
 class Field:
@@ -60,8 +50,8 @@ class Field:
         return self.patches.at(*place), gradient
 
 
-def trace(field: Field, seeds: np.ndarray) -> list[Curve]:
-    """The zero curve through each of ``seeds`` ``(M, 2)`` (in coordinates), followed to the rim or around."""
+def trace(field: Field, seeds: np.ndarray) -> list[np.ndarray]:
+    """Points ``(n, 2)`` of the zero curve through each of ``seeds`` ``(M, 2)``, in coordinates, to the rim or around."""
     start = field.to_unit(np.asarray(seeds, float).reshape(-1, 2))
     both, sense = np.concatenate([start, start]), np.repeat([1.0, -1.0], len(start))
     paths, returned = _follow(field, both, sense)
@@ -69,12 +59,12 @@ def trace(field: Field, seeds: np.ndarray) -> list[Curve]:
     for i in range(len(start)):
         ahead, behind = paths[i], paths[i + len(start)]
         points = ahead if returned[i] else np.concatenate([behind[::-1], ahead[1:]])
-        curves.append(Curve(field.to_coordinates(points), bool(returned[i])))
+        curves.append(field.to_coordinates(points))
     return curves
 
 
-def trace_tips(field: Field, tips: np.ndarray, horizontal: int) -> list[Curve]:
-    """The zero curves through ``tips`` ``(M, 2)``, where the derivative along ``horizontal`` vanishes.
+def trace_tips(field: Field, tips: np.ndarray, horizontal: int) -> list[np.ndarray]:
+    """Points of the zero curves through ``tips`` ``(M, 2)``, where the derivative along ``horizontal`` vanishes.
 
     A tip may be so sharp (radius 1e-7 of the domain) that no step leads around it. The flanks are therefore entered a
     little away from it, where f f_hh < 0, by Newton's method along ``horizontal``, and followed from there.
@@ -86,13 +76,13 @@ def trace_tips(field: Field, tips: np.ndarray, horizontal: int) -> list[Curve]:
     # Away from the tip: the tangent in the direction from the tip to the flank.
     away = start - np.concatenate([top, top])
     sense = np.sign(-gradient[:, 1] * away[:, 0] + gradient[:, 0] * away[:, 1])
-    paths, returned = _follow(field, start, sense)
+    paths, _ = _follow(field, start, sense)
     curves = []
     for i, point in enumerate(top):
         left, right = (np.concatenate([flanks[k, i], paths[i + k * len(top)][1:]]) for k in range(2))
         points = np.concatenate([left[::-1], point[None], right])
         points = points[np.isfinite(points).all(axis=1)]
-        curves.append(Curve(field.to_coordinates(points), bool(returned[i])))
+        curves.append(field.to_coordinates(points))
     return curves
 
 

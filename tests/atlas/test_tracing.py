@@ -56,9 +56,9 @@ def test_a_curve_is_traced_both_ways_from_its_seed():
     """The parabola h = (2 v^2 - 1)/5 from near its vertex to the rim."""
     field = tracing.Field(one_patch([[0.0, 0.0, -0.2], [1.0, 0.0, 0.0]]))
     (curve,) = tracing.trace(field, np.array([[-0.21, 0.0]]))
-    h, v = curve.points.T
-    assert h == pytest.approx((2 * v**2 - 1) / 5, abs=1e-12) and not curve.closed
-    assert np.abs(np.diff(curve.points, axis=0)).max() < 0.04 and (np.diff(v) > 0).all() == (v[0] < 0)
+    h, v = curve.T
+    assert h == pytest.approx((2 * v**2 - 1) / 5, abs=1e-12)
+    assert np.abs(np.diff(curve, axis=0)).max() < 0.04 and (np.diff(v) > 0).all() == (v[0] < 0)
     assert sorted([v[0], v[-1]]) == [-1.0, 1.0]
 
 
@@ -66,17 +66,17 @@ def test_a_closed_curve_ends_where_it_began():
     """The circle of radius 1/2, from near it."""
     field = tracing.Field(one_patch([[0.75, 0.0, 0.5], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]))
     (curve,) = tracing.trace(field, np.array([[0.51, 0.0]]))
-    assert curve.closed and np.array_equal(curve.points[0], curve.points[-1])
-    assert np.linalg.norm(curve.points, axis=1) == pytest.approx(np.full(len(curve.points), 0.5), abs=1e-12)
+    assert np.array_equal(curve[0], curve[-1])
+    assert np.linalg.norm(curve, axis=1) == pytest.approx(np.full(len(curve), 0.5), abs=1e-12)
     # Around once.
-    assert np.linalg.norm(np.diff(curve.points, axis=0), axis=1).sum() == pytest.approx(np.pi, rel=1e-3)
+    assert np.linalg.norm(np.diff(curve, axis=0), axis=1).sum() == pytest.approx(np.pi, rel=1e-3)
 
 
 def test_the_other_edge_of_a_narrow_tongue_is_another_curve():
     """h^2 = 1e-8: the edges are nearer to each other than chords are to curves."""
     field = tracing.Field(one_patch([[0.5 - 1e-8, 0.0], [0.0, 0.0], [0.5, 0.0]]))
     v = np.linspace(-1.0, 1.0, 101)
-    edge = tracing.Curve(np.stack([np.full(101, 1e-4), v], axis=-1), False)
+    edge = np.stack([np.full(101, 1e-4), v], axis=-1)
     seeds = np.array([[1e-4, 0.013], [-1e-4, 0.013], [0.5, 0.013]])
     assert boundaries._contains(field, edge, seeds).tolist() == [True, False, False]
 
@@ -84,14 +84,14 @@ def test_the_other_edge_of_a_narrow_tongue_is_another_curve():
 def test_parts_that_bound_nothing_are_left_out():
     points = {"beta": np.arange(5.0), "Omega": np.arange(5.0)}
     limiting = np.array([True, True, False, True, True])
-    curve = boundaries.Boundary("pair", points, points, limiting, False)
+    curve = boundaries.Boundary("pair", points, limiting)
     assert [part["beta"].tolist() for part in curve.segments()] == [[0.0, 1.0], [3.0, 4.0]]
 
 
 def test_a_path_ends_on_the_rim():
     """Straight across, both ends are on it; bent, the last step is corrected along it."""
     (curve,) = tracing.trace(tracing.Field(one_patch([[-0.3, 0.0], [1.0, 0.0]])), np.array([[0.3, 0.1]]))
-    assert sorted(curve.points[[0, -1], 1]) == [-1.0, 1.0]
+    assert sorted(curve[[0, -1], 1]) == [-1.0, 1.0]
 
     def field(y):
         slope = np.stack([np.ones(len(y)), -0.6 * (y[:, 1] - 1)], axis=-1)
@@ -121,8 +121,8 @@ def test_points_lie_on_the_edges_of_a_narrow_slanted_tongue(foot, width):
     values = (h - 0.3 * v - 0.3 * v**2) ** 2 - width * (v - foot)
     field = tracing.Field(one_patch(analysis @ values @ analysis.T))
     (curve,) = tracing.trace_tips(field, np.array([[0.3 * foot + 0.3 * foot**2, foot]]), 0)
-    value, gradient = field(field.to_unit(curve.points))
-    h, v = curve.points.T
+    value, gradient = field(field.to_unit(curve))
+    h, v = curve.T
     top = np.argmin(np.abs(v - foot))
     assert (np.abs(value) / np.linalg.norm(gradient, axis=1))[np.arange(len(v)) != top].max() < 1e-9
     side = np.sign(h - 0.3 * v - 0.3 * v**2)
