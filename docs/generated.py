@@ -18,7 +18,6 @@ import gallery
 import drivetrain_jax as dt
 from drivetrain_jax._quantities import Parameter, Variable
 from drivetrain_jax.analysis import Analysis, Outcome, get_analysis
-from drivetrain_jax.runs.toml import entries
 from drivetrain_jax.systems import System, get_system, system_names
 from drivetrain_jax.view.style import symbol
 
@@ -70,8 +69,12 @@ def parameters(system: str) -> str:
     rows = [_parameter_row(p) for p in get_system(system).parameters]
     text = table(("symbol", "name", "meaning", "unit", "allowed", "default"), rows)
     presets = get_system(system).presets
-    listed = [(f"`{name}`", ", ".join(f"`{entry}`" for entry in entries(given))) for name, given in presets.items()]
+    listed = [(f"`{name}`", ", ".join(_entry(*item) for item in given.items())) for name, given in presets.items()]
     return text + ("\n" + table(("preset", "values"), listed) if listed else "")
+
+
+def _entry(name: str, value: Any) -> str:
+    return f"`{name} = {list(value) if isinstance(value, tuple) else value}`"
 
 
 def _parameter_row(parameter: Parameter) -> tuple[str, ...]:

@@ -35,3 +35,15 @@ def markdown(head: Sequence[str], rows: Rows) -> str:
     """A Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def inventory(system: str, **found: str) -> str:
+    """The section that names every equation, figure, table and conclusion of the paper, from inventory/<system>.txt.
+
+    A line has five cells; ``{name}`` stands for a value of ``found``, computed for the page.
+    """
+    lines = (Path(__file__).parent / "inventory" / f"{system}.txt").read_text().splitlines()
+    rows = [[cell.strip().format(**found) for cell in line.split(" | ")] for line in lines]
+    head = ("place", "where it is computed", "the paper", "ours", "agreement, or the reason")
+    text = "Files without a folder of their own stand in `drivetrain_jax/`.\n"
+    return f"## Every equation, figure, table and conclusion\n\n{text}\n{markdown(head, rows)}"

@@ -91,9 +91,19 @@ def test_units_and_certificates(swept):
     np.testing.assert_allclose(swept.separation_margin[1:, 0], swept.critical_speed[1:, 0] / 6000 - 1, rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("preset", "pulsations"), [("paper_solid", [748.52, 2519.79]), ("paper_tube", [1062.53, 4004.91])]
+)
+def test_uniform_bars_of_section_4(preset, pulsations):
+    """Both printed digits after the point, with one moment of area for the solid bar here and in the shaft."""
+    found = dt.critical_speeds(Bicardan(**PRESETS[preset]), outputs=["angular_frequency"], modes=2)
+    np.testing.assert_allclose(found.angular_frequency, pulsations, atol=0.0055)
+    assert PRESETS["paper_solid"]["EI"][0] == PRESETS["paper_fitted"]["EI"][0] == pytest.approx(2.1e11 * 3.06e-7)
+
+
 def test_section_4(swept):
-    """p1, p2 as printed, and conclusion 3: the amplitude at D for f_A = 1 drops 4.35 times."""
-    np.testing.assert_allclose(swept.angular_frequency[1, :2], [876.66, 2827.37], atol=0.006)
+    """Critical speeds as printed (with 3.14 for pi), and conclusion 3: the amplitude at D for f_A = 1 drops 4.35 times."""
+    np.testing.assert_allclose(swept.angular_frequency[1, :2] * 30 / 3.14, [8375.78, 27013.15], atol=0.02)
     at_D = swept.mode_shape[1:3, 0, -1] / swept.mode_shape[1:3, 0, 0]
     assert abs(float(at_D[0] / at_D[1]) - 4.3476) < 1e-4
 
