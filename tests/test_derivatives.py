@@ -47,11 +47,10 @@ def bicardan(rng):
 
 def planetary(rng):
     values = dt.Planetary().values
-    numbers = {
-        n: x * np.exp(rng.normal(0, 0.4)) for n, x in values.items() if n not in ("planet_angle", "pressure_angle")
-    }
-    angles = tuple(np.arange(4) * np.pi / 2 + rng.uniform(-0.2, 0.2, 4))
-    return dt.Planetary(planet_angle=angles, pressure_angle=rng.uniform(0.3, 0.5), **numbers)
+    numbers = {n: x * np.exp(rng.normal(0, 0.4)) for n, x in values.items() if n[:2] in ("m_", "I_", "k_")}
+    numbers |= {name: 1e8 * np.exp(rng.normal(0, 0.4)) for name in ("k_sx", "k_ry")}
+    numbers |= {name: rng.uniform(0.3, 0.5) for name in ("pressure_angle", "pressure_angle_s")}
+    return dt.Planetary(planet_angle=tuple(np.arange(4) * np.pi / 2 + rng.uniform(-0.2, 0.2, 4)), **numbers)
 
 
 def rattle(rng):
@@ -149,7 +148,7 @@ def _by(values, name, q):
 
 MODES = [f"planet_angle[{i}]" for i in range(4)] + [
     *("m_s", "m_r", "m_c", "m_p", "I_s", "I_r", "I_c", "I_p", "k_sp", "k_rp", "k_p", "k_s", "k_r", "k_c", "k_su"),
-    *("k_ru", "k_cu", "pressure_angle"),
+    *("k_ru", "k_cu", "k_sx", "k_ry", "pressure_angle", "pressure_angle_s"),
 ]
 
 

@@ -291,11 +291,14 @@ def _check_together(model: Model, fixed: Mapping[str, Value]) -> None:
 
 
 def _check_path(scene: Scene) -> None:
-    """Check that the path is an axis of the scene, or a fixed number: a line of one value."""
+    """Check that the path is an axis of the scene, or, unless an option names it, a fixed number: a line of one value."""
     name, names = scene.path_axis, [axis.name for axis in scene.axes]
+    if name is None:
+        return
     if name in names and scene.zipped:
         raise InputError(f"points.{name}: {scene.analysis.name} uses it as a path; allowed is an axis or a fixed value")
-    if name is not None and name not in names and not isinstance(scene.fixed.get(name), (int, float)):
+    fixed = isinstance(scene.fixed.get(name), (int, float)) and name not in scene.request.options.values()
+    if name not in names and not fixed:
         allowed = f"allowed is one of {', '.join(names)}" if names else "the scene has no axes"
         raise InputError(f"options: {name!r} is not an axis of the scene; {allowed}")
 

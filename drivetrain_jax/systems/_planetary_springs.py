@@ -53,17 +53,26 @@ def _lanes(*arrays: Any) -> tuple[int, ...]:
     return jnp.broadcast_shapes(*(jnp.shape(array) for array in arrays))
 
 
+def _complete(values: Values) -> dict[str, Any]:
+    """The numbers among ``values``, with those derived from others: pressure angles, and bearings by direction."""
+    numbers = {name: value for name, value in values.items() if not isinstance(value, str)}
+    angles = {f"pressure_angle_{body}": numbers["pressure_angle"] for body in "rs"}
+    bearings = {f"k_{body}{axis}": numbers[f"k_{body}"] for body in "crs" for axis in "xy"}
+    return angles | bearings | numbers
+
+
 def _spread(values: Values) -> dict[str, Any]:
     """All parameters as arrays of one common shape ``(...)``; those of the planets and their angles ``(N, ...)``."""
     count = len(values["planet_angle"])
-    entries = [entry for value in values.values() for entry in (value if isinstance(value, tuple) else (value,))]
+    complete = _complete(values)
+    entries = [entry for value in complete.values() for entry in (value if isinstance(value, tuple) else (value,))]
     shape = _lanes(*entries)
 
     def spread(value: Any) -> Array:
         return jnp.broadcast_to(jnp.asarray(value, float), shape)
 
     spread_values: dict[str, Any] = {}
-    for name, value in values.items():
+    for name, value in complete.items():
         if name in PER_PLANET or name == "planet_angle":
             whole = value if isinstance(value, tuple) else (value,) * count
             spread_values[name] = jnp.stack([spread(entry) for entry in whole])
@@ -72,13 +81,20 @@ def _spread(values: Values) -> dict[str, Any]:
     return spread_values
 
 
-def _extensions(directions: Array, pressure_angle: Array) -> tuple[Array, Array]:
+def _extensions(p: Mapping[str, Array], directions: Array) -> tuple[Array, Array]:
     """``B`` of planets whose (1, cos psi, sin psi) are the rows of ``directions`` (n, 3, ...), and its part for one
     planet's own coordinates (4, 3, ...). Rows: springs by kind, then planet; then the bearings of the bodies."""
     n, lanes = directions.shape[0], directions.shape[2:]
-    weights = jnp.stack([jnp.ones_like(pressure_angle), jnp.cos(pressure_angle), jnp.sin(pressure_angle)])
-    central = sum(w * part[(...,) + (None,) * len(lanes)] for w, part in zip(weights, _CENTRAL_PARTS, strict=True))
-    own = sum(w * part[(...,) + (None,) * len(lanes)] for w, part in zip(weights, _PLANET_PARTS, strict=True))
+    # Rows: two bearings of a planet, which have no pressure angle, and its meshes.
+    angle = jnp.stack([p["pressure_angle_r"]] * 3 + [p["pressure_angle_s"]])
+    weights = (jnp.ones_like(angle), jnp.cos(angle), jnp.sin(angle))
+    central, own = (
+        sum(
+            w.reshape(4, *(1,) * (part.ndim - 1), *lanes) * part[(...,) + (None,) * len(lanes)]
+            for w, part in zip(weights, parts, strict=True)
+        )
+        for parts in (_CENTRAL_PARTS, _PLANET_PARTS)
+    )
     coupling = sum(directions[None, :, None, i] * central[:, None, :, i] for i in range(3))  # pyright: ignore[reportIndexIssue]
     eye = np.eye(n).reshape(1, n, n, 1, *(1,) * len(lanes))
     planets = (eye * own[:, None, None]).reshape(4 * n, _PER_PLANET * n, *lanes)  # pyright: ignore[reportIndexIssue]
@@ -90,7 +106,7 @@ def _extensions(directions: Array, pressure_angle: Array) -> tuple[Array, Array]
 def _stiffness_and_mass(p: Mapping[str, Array], n: int) -> tuple[Array, Array]:
     """Stiffness (4n + 9, ...) and mass (9 + 3n, ...) of ``n`` planets."""
     springs = [p["k_p"][:n], p["k_p"][:n], p["k_rp"][:n], p["k_sp"][:n]]
-    bearings = jnp.stack([p[f"k_{body}{kind}"] for body in "crs" for kind in ("", "", "u")])
+    bearings = jnp.stack([p[f"k_{body}{kind}"] for body in "crs" for kind in "xyu"])
     bodies = jnp.stack([p[f"{kind}_{body}"] for body in "crs" for kind in ("m", "m", "I")])
     planets = jnp.stack([p["m_p"][:n], p["m_p"][:n], p["I_p"][:n]], axis=1)
     planets = planets.reshape(_PER_PLANET * n, *planets.shape[2:])
@@ -161,7 +177,7 @@ def _reduced_blocks(p: Mapping[str, Array], frame: Array, directions: Array, bal
     ``frame`` (N, N, ...) starts with span{1, cos psi, sin psi}, in which ``directions`` (3, 3, ...) is that basis.
     """
     n = frame.shape[0]
-    extensions, own = _extensions(directions, p["pressure_angle"])
+    extensions, own = _extensions(p, directions)
     stiffness, mass = _stiffness_and_mass(p, 3)
     factor, basis = weighted_factor(extensions, stiffness, mass), _embed(frame[:, :3])
     family, polar = _families(3)
@@ -185,12 +201,16 @@ def coordinate_names(n: int) -> tuple[str, ...]:
     return central + tuple(f"{kind}_{i}" for i in range(1, n + 1) for kind in ("xi", "eta", "u"))
 
 
+def _body_names(n: int) -> tuple[str, ...]:
+    return (*BODIES, *(f"planet_{i + 1}" for i in range(n)))
+
+
 def plane_springs(values: Values) -> SpringSystem:
     """The gear as masses and springs, eqs (1)-(7), with its decomposition (8)-(9) if all planets are alike."""
     p, n = _spread(values), len(values["planet_angle"])
     angles = p["planet_angle"]
     directions = jnp.stack([jnp.ones_like(angles), jnp.cos(angles), jnp.sin(angles)], axis=1)
-    extensions, _ = _extensions(directions, p["pressure_angle"])
+    extensions, _ = _extensions(p, directions)
     stiffness, mass = _stiffness_and_mass(p, n)
     family, polar = _families(n)
     alike = identical_planets(values)
@@ -206,6 +226,70 @@ def plane_springs(values: Values) -> SpringSystem:
         balanced = known and float(spacing(values["planet_angle"])) <= _BALANCED
         blocks = _reduced_blocks(p, frame, triangle[:3], balanced)
     names, bodies = coordinate_names(n), np.repeat(np.arange(3 + n), 3)
-    body_names = (*BODIES, *(f"planet_{i + 1}" for i in range(n)))
     asymmetry = jnp.maximum(spacing(tuple(angles)), _inequality(p))
-    return SpringSystem(extensions, stiffness, mass, blocks, whole, asymmetry, names, body_names, bodies, len(FAMILIES))
+    return SpringSystem(
+        extensions, stiffness, mass, blocks, whole, asymmetry, names, _body_names(n), bodies, len(FAMILIES)
+    )
+
+
+def _rotations(p: Mapping[str, Array], directions: Array) -> Array:
+    """``B`` (2n + 3, 3 + n, ...) of the rotational model, eqs (13)-(14), with one factor in ``directions`` (n, ...) for
+    each planet. Rows: meshes with the ring, meshes with the sun, bearings of the bodies."""
+    n, lanes = directions.shape[0], directions.shape[1:]
+    one, none = jnp.ones(lanes), jnp.zeros(lanes)
+    ring, sun = (-jnp.cos(p[f"pressure_angle_{body}"]) for body in "rs")
+    central = jnp.stack([jnp.stack([ring, one, none]), jnp.stack([sun, none, one])])
+    coupling = (directions[None, :, None] * central[:, None]).reshape(2 * n, 3, *lanes)
+    constant = np.vstack([np.hstack([np.zeros((2 * n, 3)), np.vstack([-np.eye(n), np.eye(n)])]), np.eye(3, 3 + n)])
+    springs = jnp.broadcast_to(constant.reshape(*constant.shape, *(1,) * len(lanes)), (*constant.shape, *lanes))
+    return springs.at[: 2 * n, :3].set(coupling)
+
+
+def _rotational_blocks(p: Mapping[str, Array], stiffness: Any, mass: Any) -> tuple[Block, ...]:
+    """The blocks of identical planets in the rotational model: the bodies with the mean planet, and planets alone."""
+    n, lanes = p["I_p"].shape[0], p["I_p"].shape[1:]
+    frame, triangle = orthonormal_frame(jnp.ones((n, 1, *lanes)))
+    embedded = jnp.zeros((3 + n, 3 + n, *lanes)).at[3:, 3:].set(frame)
+    embedded = embedded.at[np.arange(3), np.arange(3)].set(1.0)
+    factor = weighted_factor(_rotations(p, triangle[:1, 0]), stiffness(1), mass(1))
+    blocks = [Block(factor, np.full(4, ROTATIONAL), np.zeros(4, bool), embedded[:, :4, None])]
+    if n > 1:
+        alone = jnp.sqrt(jnp.stack([p["k_rp"][:1], p["k_sp"][:1]]) / p["I_p"][:1]) * jnp.array([-1.0, 1.0]).reshape(
+            2, 1, *(1,) * len(lanes)
+        )
+        blocks.append(Block(alone, np.full(1, PLANET), np.zeros(1, bool), embedded[:, None, 4:]))
+    return tuple(blocks)
+
+
+def rotational_springs(values: Values) -> SpringSystem:
+    """The gear with rotations alone, eqs (13)-(14): all centres are held, and the carrier carries those of the planets."""
+    p, n = _spread(values), len(values["planet_angle"])
+    lanes = p["planet_angle"].shape[1:]
+
+    def stiffness(count: int) -> Array:
+        return jnp.concatenate([p["k_rp"][:count], p["k_sp"][:count], jnp.stack([p[f"k_{body}u"] for body in "crs"])])
+
+    def mass(count: int) -> Array:
+        bodies = jnp.stack([p["I_c"] + jnp.sum(p["m_p"], axis=0), p["I_r"], p["I_s"]])
+        return jnp.concatenate([bodies, p["I_p"][:count]])
+
+    extensions = _rotations(p, jnp.ones((n, *lanes)))
+    identity = jnp.broadcast_to(np.eye(3 + n).reshape(3 + n, 3 + n, *(1,) * len(lanes)), (3 + n, 3 + n, *lanes))
+    mean = orthonormal_frame(jnp.sqrt(p["I_p"])[:, None])[0]
+    family = np.array([ROTATIONAL] * 4 + [PLANET] * (n - 1))
+    factor = weighted_factor(extensions, stiffness(n), mass(n))
+    whole = Block(factor, family, np.zeros(3 + n, bool), identity[:, :, None], identity.at[3:, 3:].set(mean))
+    blocks = _rotational_blocks(p, stiffness, mass) if identical_planets(values) else (whole,)
+    names = (*(f"u_{body}" for body in "crs"), *(f"u_{i + 1}" for i in range(n)))
+    return SpringSystem(
+        extensions,
+        stiffness(n),
+        mass(n),
+        blocks,
+        whole,
+        _inequality(p),
+        names,
+        _body_names(n),
+        np.arange(3 + n),
+        len(FAMILIES),
+    )

@@ -18,7 +18,7 @@ from typing import Any
 from drivetrain_jax._wording import counted
 from drivetrain_jax.systems._base import Number, System, parameter, serves
 from drivetrain_jax.systems._modal import SpringSystem
-from drivetrain_jax.systems._planetary_springs import FAMILIES, PER_PLANET, plane_springs
+from drivetrain_jax.systems._planetary_springs import FAMILIES, PER_PLANET, plane_springs, rotational_springs
 
 
 def check(fixed: Mapping[str, Any]) -> None:
@@ -37,8 +37,13 @@ def _mass(long_name: str, default: float, **more: Any) -> Any:
     return parameter("kg", long_name, default=default, lower=0.0, open_lower=True, **more)
 
 
-def _stiffness(long_name: str, default: float, **more: Any) -> Any:
+def _stiffness(long_name: str, default: float | None, **more: Any) -> Any:
     return parameter("N/m", long_name, default=default, lower=0.0, **more)
+
+
+def _pressure_angle(long_name: str, **more: Any) -> Any:
+    limit = {"lower": -math.pi / 2, "upper": math.pi / 2, "open_lower": True, "open_upper": True}
+    return parameter("rad", long_name, **limit, **more)
 
 
 # Two turns, more than anyone needs: angles in degrees are refused.
@@ -86,18 +91,21 @@ class Planetary(System):
     k_su: Number = _stiffness("rotational stiffness of the sun's bearing", 0.0)
     k_ru: Number = _stiffness("rotational stiffness of the ring's bearing", 1e9)
     k_cu: Number = _stiffness("rotational stiffness of the carrier's bearing", 0.0)
-    pressure_angle: Number = parameter(
-        "rad",
-        "pressure angle of both meshes",
-        symbol="α",
-        default=math.radians(24.6),
-        lower=-math.pi / 2,
-        upper=math.pi / 2,
-        open_lower=True,
-        open_upper=True,
+    pressure_angle: Number = _pressure_angle("pressure angle of both meshes", symbol="α", default=math.radians(24.6))
+    pressure_angle_s: Number | None = _pressure_angle("pressure angle of the sun's meshes", derived="pressure_angle")
+    pressure_angle_r: Number | None = _pressure_angle("pressure angle of the ring's meshes", derived="pressure_angle")
+    k_sx: Number | None = _stiffness("bearing stiffness of the sun along x", None, derived="k_s")
+    k_sy: Number | None = _stiffness("bearing stiffness of the sun along y", None, derived="k_s")
+    k_rx: Number | None = _stiffness("bearing stiffness of the ring along x", None, derived="k_r")
+    k_ry: Number | None = _stiffness("bearing stiffness of the ring along y", None, derived="k_r")
+    k_cx: Number | None = _stiffness("bearing stiffness of the carrier along x", None, derived="k_c")
+    k_cy: Number | None = _stiffness("bearing stiffness of the carrier along y", None, derived="k_c")
+    model: str = parameter(
+        "1", "degrees of freedom: plane motion, or rotations alone", default="plane", choices=("plane", "rotational")
     )
 
     @serves("modes", check=check)
     def springs(self) -> SpringSystem:
-        """The gear as masses and springs, eqs (1)-(7), with its decomposition (8)-(9) if all planets are alike."""
-        return plane_springs(self.values)
+        """The gear as masses and springs, with its decomposition into invariant blocks if all planets are alike."""
+        build = rotational_springs if self.model == "rotational" else plane_springs
+        return build(self.values)

@@ -47,29 +47,30 @@ def matrices(p: Mapping[str, Any], functions: Any = math) -> tuple[list[float], 
     Written from the equations of motion (1)-(12) of the paper with their signs corrected: one row per force balance.
     ``functions`` offers ``sin`` and ``cos``: ``math`` or ``mpmath``.
     """
-    sin, cos, a, angles = functions.sin, functions.cos, p["pressure_angle"], p["planet_angle"]
+    sin, cos, angles = functions.sin, functions.cos, p["planet_angle"]
     n = len(angles)
     size = 9 + 3 * n
-    stiffness = [[0 * sin(a) for _ in range(size)] for _ in range(size)]
+    stiffness = [[0 * sin(angles[0]) for _ in range(size)] for _ in range(size)]
     mass = [p[f"{kind}_{body}"] for body in "crs" for kind in ("m", "m", "I")]
     for i, (m, inertia) in enumerate(zip(_per_planet(p["m_p"], n), _per_planet(p["I_p"], n), strict=True)):
         mass += [m, m, inertia]
         _add_planet(stiffness, p, i, sin, cos)
     for body, first in zip("crs", (0, 3, 6), strict=True):
-        for offset, name in enumerate((f"k_{body}", f"k_{body}", f"k_{body}u")):
-            stiffness[first + offset][first + offset] += p[name]
+        for offset, axis in enumerate("xyu"):
+            stiffness[first + offset][first + offset] += p.get(f"k_{body}{axis}", p.get(f"k_{body}"))
     return mass, stiffness
 
 
 def _add_planet(stiffness: list[list[Any]], p: Mapping[str, Any], i: int, sin: Any, cos: Any) -> None:
     """The bearing and the two meshes of planet ``i``: force of each times its direction on every body it touches."""
-    a, angle, at, n = p["pressure_angle"], p["planet_angle"][i], 9 + 3 * i, len(p["planet_angle"])
-    ring, sun = angle + a, angle - a
+    angle, at, n = p["planet_angle"][i], 9 + 3 * i, len(p["planet_angle"])
+    r, s = (p.get(f"pressure_angle_{body}", p["pressure_angle"]) for body in "rs")
+    ring, sun = angle + r, angle - s
     meshes = (
         ("k_p", {0: cos(angle), 1: sin(angle), at: -1}),
         ("k_p", {0: -sin(angle), 1: cos(angle), 2: 1, at + 1: -1}),
-        ("k_rp", {3: -sin(ring), 4: cos(ring), 5: 1, at: sin(a), at + 1: -cos(a), at + 2: -1}),
-        ("k_sp", {6: -sin(sun), 7: cos(sun), 8: 1, at: -sin(a), at + 1: -cos(a), at + 2: 1}),
+        ("k_rp", {3: -sin(ring), 4: cos(ring), 5: 1, at: sin(r), at + 1: -cos(r), at + 2: -1}),
+        ("k_sp", {6: -sin(sun), 7: cos(sun), 8: 1, at: -sin(s), at + 1: -cos(s), at + 2: 1}),
     )
     for name, direction in meshes:
         k = _per_planet(p[name], n)[i]

@@ -143,7 +143,7 @@ def test_a_number_may_stand_for_a_list():
     scene = {"system": "toy", "analysis": "follow", "fixed": {"b": 1.0}, "options": {"track": "weight"}}
     along = dt.run(scene | {"axes": {"weight": {"values": [2.0, 5.0]}}})
     assert along["load"].values.tolist() == [[2.0, 4.0, 6.0], [7.0, 14.0, 21.0]]
-    ds = dt.run(scene | {"axes": {"b": {"values": [1.0]}}, "fixed": {"weight": 2.0, "stiffness": float("inf")}})
+    ds = dt.run(scene | {"axes": {"weight": {"values": [2.0]}}, "fixed": {"b": 1.0, "stiffness": float("inf")}})
     assert ds["load"].values.tolist() == [[2.0, 4.0, 6.0]]
     assert json.loads(ds.attrs["fixed_parameters"])["stiffness"]["value"] == "inf"
 

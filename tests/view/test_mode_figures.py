@@ -12,6 +12,7 @@ from matplotlib.colors import to_hex
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis.modes.figure import type_colours
 from drivetrain_jax.analysis.modes.planetary_gear import displacements
+from drivetrain_jax.systems._planetary_springs import coordinate_names
 from drivetrain_jax.view import plot
 
 TYPES = ("rigid", "rotational", "translational", "planet", "coupled")
@@ -63,7 +64,8 @@ def shapes(planets: int = 3) -> xr.Dataset:
     size = 9 + 3 * planets
     frequency = np.array([[0.0, 5.0, 5.0, *range(10, 10 + size - 3)]], float)
     kinds = np.full((1, size), 2, "int8")
-    return result(1, natural_frequency=frequency, mode_type=kinds, mode_shape=np.eye(size)[None])
+    found = result(1, natural_frequency=frequency, mode_type=kinds, mode_shape=np.eye(size)[None])
+    return found.assign_coords(dof=list(coordinate_names(planets)))
 
 
 def test_one_gear_for_every_frequency():
@@ -87,10 +89,25 @@ def test_the_caption_says_which_angle_varies(name, attrs):
 
 
 def test_displacements_are_scaled_together():
-    central, planets = displacements([0.0] * 9 + [1.0, 0.0, -2.0] + [0.5] * 3)
+    shape = dict(zip(coordinate_names(2), [0.0] * 9 + [1.0, 0.0, -2.0] + [0.5] * 3, strict=True))
+    central, planets = displacements(shape, 2)
     assert (central == 0).all()
     assert np.abs(planets).max() == pytest.approx(0.28)
     assert planets[0, 2] / planets[1, 0] == pytest.approx(-4)
+
+
+def test_without_translations_the_carrier_carries_the_planets():
+    central, planets = displacements({"u_c": 1.0, "u_r": 0.0, "u_s": -2.0, "u_1": 0.5, "u_2": 0.0}, 2)
+    np.testing.assert_allclose(central, 0.14 * np.array([[0, 0, 1], [0, 0, 0], [0, 0, -2]]))
+    np.testing.assert_allclose(planets, 0.14 * np.array([[0, 1, 0.5], [0, 1, 0]]))
+
+
+def test_a_coupled_mode_shows_its_dominant_family():
+    found = shapes().assign(mode_type=(("k_p", "mode"), np.full((1, 18), 4, "int8"), crossing().mode_type.attrs))
+    family = {"flag_values": np.arange(4, dtype="int8"), "flag_meanings": "rotational translational planet none"}
+    found["dominant_family"] = ("k_p", "mode"), np.ones((1, 18), "int8"), family
+    found["dominant_share"] = ("k_p", "mode"), np.full((1, 18), 0.99984)
+    assert plot(found).axes[0].get_title() == "0.0 Hz, 99.98 % translational"
 
 
 @pytest.mark.parametrize(

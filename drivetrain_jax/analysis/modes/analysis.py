@@ -40,6 +40,9 @@ VARIABLES = (
     Variable("natural_frequency", "Hz", "natural frequency", ("mode",)),
     Variable("natural_frequency_error", "Hz", "estimated bound of the error of natural_frequency", ("mode",)),
     Variable("mode_type", "1", "type of the mode", ("mode",), "int8"),
+    Variable("dominant_family", "1", "family with the largest share of the mode", ("mode",), "int8"),
+    Variable("dominant_share", "1", "share of the mode in this family", ("mode",), lower=0.0),
+    Variable("multiplicity", "1", "number of modes with this frequency", ("mode",), "int32"),
     Variable("participation", "1", "share of the mode in each family", ("mode", "family")),
     Variable("kinetic_energy", "1", "share of the mode's kinetic energy in each body", ("mode", "body")),
     # Without a unit where the modal mass has one: UDUNITS knows no root of a kilogram.
@@ -174,6 +177,9 @@ def _results(build: Build, request: Request, values: Mapping[str, Any], lanes: i
         modes = system_modes(model, request.method, count, shapes)
         largest = largest_frequency(model, count)
         results = _frequencies(modes.frequency, modes.found, modes.participation)
+        dominant = jnp.where(modes.found, jnp.argmax(modes.participation, axis=1), model.families)
+        results["dominant_family"] = dominant.astype(jnp.int8)
+        results["dominant_share"] = jnp.max(results["participation"], axis=1)
         results["mode_type"] = jnp.where(
             modes.found, mode_types(modes.frequency, modes.label, largest), model.families + 1
         )
@@ -183,8 +189,9 @@ def _results(build: Build, request: Request, values: Mapping[str, Any], lanes: i
             results["mode_shape"] = jnp.swapaxes(vectors / jnp.sqrt(mass), 0, 1)
             results["kinetic_energy"] = _by_body(vectors, model.bodies)
             results["vectors"] = vectors
-        if followed:
-            results["equal"] = one_frequency(modes.frequency, largest)
+        equal = one_frequency(modes.frequency, largest)
+        results["multiplicity"] = jnp.where(modes.found, jnp.sum(equal, axis=1), 0).astype(jnp.int32)
+        results["equal"] = equal
         kept = {*request.outputs, "outcome"} | ({"vectors", "equal"} if followed else set())
         return {name: value for name, value in results.items() if name in kept}
 
@@ -308,15 +315,16 @@ def _derivatives(
 
 def _of_system(system: type[System]) -> dict[str, Any]:
     """The types of modes are those of the system's families."""
-    types = mode_type_names(system.mode_families)
-    return {"variables": tuple(replace(v, flags=types) if v.name == "mode_type" else v for v in VARIABLES)}
+    families = system.mode_families
+    flags = {"mode_type": mode_type_names(families), "dominant_family": (*families, "none")}
+    return {"variables": tuple(replace(v, flags=flags.get(v.name, v.flags)) for v in VARIABLES)}
 
 
 ANALYSIS = Analysis(
     name="modes",
     title="natural frequencies and modes",
     variables=VARIABLES,
-    default_outputs=("natural_frequency", "mode_type"),
+    default_outputs=("natural_frequency", "mode_type", "dominant_family", "dominant_share"),
     methods={"auto": ("track",), "full": ("track",)},
     method_titles={
         "auto": "by the invariant blocks of a symmetry, if there is one",

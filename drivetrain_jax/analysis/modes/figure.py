@@ -124,6 +124,15 @@ def _distinct(frequency: np.ndarray) -> list[tuple[int, int]]:
     return [(i, j - i) for i, j in zip(start, [*start[1:], len(frequency)], strict=True)]
 
 
+def _dominant(dataset: xr.Dataset, mode: int) -> str:
+    """The dominant family of a coupled mode with its share, if stored."""
+    if not {"dominant_family", "dominant_share"} <= set(dataset):
+        return "coupled"
+    names = dataset["dominant_family"].attrs["flag_meanings"].split()
+    share = float(dataset["dominant_share"].values[mode])
+    return f"{100 * share:.4g} % {names[int(dataset['dominant_family'].values[mode])]}"
+
+
 def _shapes(dataset: xr.Dataset) -> Figure:
     cells.require(dataset, "natural_frequency", "mode_shape")
     angles, types, colours = _angles(dataset), _types(dataset), type_colours(dataset)
@@ -136,10 +145,12 @@ def _shapes(dataset: xr.Dataset) -> Figure:
     panels = Panels(rows, _COLUMNS, height=_GEAR_HEIGHT, margins=margins)
     flat = [axes for row in panels.axes for axes in row]
     for axes, (mode, count) in zip(flat, drawn, strict=False):
-        draw_gear(axes, dataset["mode_shape"].transpose("mode", "dof").values[mode], angles)
+        shape = dataset["mode_shape"].transpose("mode", "dof").values[mode]
+        draw_gear(axes, dict(zip(dataset["dof"].values, shape, strict=True)), angles)
         multiple = f" ×{count}" if count > 1 else ""
         kind = str(types[mode])
-        axes.set_title(f"{frequency[mode]:.1f} Hz{multiple}, {kind}", size=8, color=colours[kind], pad=1.5)
+        named = _dominant(dataset, mode) if kind == "coupled" else kind
+        axes.set_title(f"{frequency[mode]:.1f} Hz{multiple}, {named}", size=8, color=colours[kind], pad=1.5)
     for axes in flat[len(drawn) :]:
         axes.axis("off")
     left_out = len(_distinct(frequency)) - len(drawn)

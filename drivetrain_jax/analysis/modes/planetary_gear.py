@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,17 +16,23 @@ BODY_COLOURS = {"ring": "#7a7a7a", "carrier": "#2f7d4f", "sun": "#c8553d", "plan
 _CIRCLE = np.linspace(0, 2 * np.pi, 73)
 
 
-def displacements(shape: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+def displacements(shape: Mapping[str, float], planets: int) -> tuple[np.ndarray, np.ndarray]:
     """``[x, y, u]`` of carrier, ring and sun (3, 3) and ``[xi, eta, u]`` of the planets (N, 3) of one mode shape, scaled
-    so that the largest translation or rim movement is 0.28 of the carrier's radius."""
-    values = np.asarray(shape, float).reshape(-1, 3)
-    scaled = values * (_LARGEST / max(np.abs(values).max(), 1e-300))
-    return scaled[:3], scaled[3:]
+    so that the largest translation or rim movement is 0.28 of the carrier's radius.
+
+    Bodies without translations stay in place, and the carrier carries the centres of the planets.
+    """
+    central = [[shape.get(f"x_{body}", 0.0), shape.get(f"y_{body}", 0.0), shape[f"u_{body}"]] for body in "crs"]
+    moved = [
+        [shape.get(f"xi_{i}", 0.0), shape.get(f"eta_{i}", shape["u_c"]), shape[f"u_{i}"]] for i in range(1, planets + 1)
+    ]
+    scale = _LARGEST / max(np.abs(central).max(), np.abs(moved).max(), 1e-300)
+    return scale * np.array(central), scale * np.array(moved)
 
 
-def draw_gear(axes: Axes, shape: Sequence[float], angles: Sequence[float]) -> None:
+def draw_gear(axes: Axes, shape: Mapping[str, float], angles: Sequence[float]) -> None:
     """Draw the bodies at rest and displaced; a radius on each shows its rotation. Axes are scaled equally and hidden."""
-    (carrier, ring, sun), planets = displacements(shape)
+    (carrier, ring, sun), planets = displacements(shape, len(angles))
     _body(axes, np.zeros(2), ring, RING, BODY_COLOURS["ring"], mark=False)
     for angle in np.arange(3) * 2 * np.pi / 3 + np.pi / 6:
         _tick(axes, ring, RING, angle)

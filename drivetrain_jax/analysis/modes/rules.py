@@ -10,6 +10,7 @@ RULES = Declared(
         within("natural_frequency", 0.0),
         within("participation", 0.0, 1.0),
         sums_to_one("participation", "family"),
+        within("dominant_share", 0.0, 1.0),
         within("kinetic_energy", 0.0, 1.0),
         sums_to_one("kinetic_energy", "body"),
         within("mac", 0.0, 1.0),
