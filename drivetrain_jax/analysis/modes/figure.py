@@ -125,12 +125,10 @@ def _distinct(frequency: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _dominant(dataset: xr.Dataset, mode: int) -> str:
-    """The dominant family of a coupled mode with its share, if stored."""
-    if not {"dominant_family", "dominant_share"} <= set(dataset):
-        return "coupled"
+    """The second line of a title: the dominant family of a coupled mode with its share, cut and not rounded to 100 %."""
     names = dataset["dominant_family"].attrs["flag_meanings"].split()
-    share = float(dataset["dominant_share"].values[mode])
-    return f"{100 * share:.4g} % {names[int(dataset['dominant_family'].values[mode])]}"
+    share = np.floor(1e4 * float(dataset["dominant_share"].values[mode])) / 100
+    return f"\n{share:.2f} % {names[int(dataset['dominant_family'].values[mode])]}"
 
 
 def _shapes(dataset: xr.Dataset) -> Figure:
@@ -141,7 +139,9 @@ def _shapes(dataset: xr.Dataset) -> Figure:
         raise InputError("natural_frequency = nan: nothing to plot; the point has no result")
     drawn = _distinct(frequency)[:_MOST_SHAPES]
     rows = -(-len(drawn) // _COLUMNS)
-    margins = Margins(left=0.15, right=0.15, between_rows=0.28, between_columns=0.05, bottom=0.45)
+    shares = {"dominant_family", "dominant_share"} <= set(dataset) and bool((types == "coupled").any())
+    between, top = (0.42, 1.0) if shares else (0.28, 0.85)
+    margins = Margins(left=0.15, right=0.15, top=top, between_rows=between, between_columns=0.05, bottom=0.45)
     panels = Panels(rows, _COLUMNS, height=_GEAR_HEIGHT, margins=margins)
     flat = [axes for row in panels.axes for axes in row]
     for axes, (mode, count) in zip(flat, drawn, strict=False):
@@ -149,8 +149,8 @@ def _shapes(dataset: xr.Dataset) -> Figure:
         draw_gear(axes, dict(zip(dataset["dof"].values, shape, strict=True)), angles)
         multiple = f" ×{count}" if count > 1 else ""
         kind = str(types[mode])
-        named = _dominant(dataset, mode) if kind == "coupled" else kind
-        axes.set_title(f"{frequency[mode]:.1f} Hz{multiple}, {named}", size=8, color=colours[kind], pad=1.5)
+        named = _dominant(dataset, mode) if kind == "coupled" and shares else f", {kind}"
+        axes.set_title(f"{frequency[mode]:.1f} Hz{multiple}{named}", size=8, color=colours[kind], pad=1.5)
     for axes in flat[len(drawn) :]:
         axes.axis("off")
     left_out = len(_distinct(frequency)) - len(drawn)
