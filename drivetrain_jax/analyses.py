@@ -58,9 +58,11 @@ def forced(system: System, *, outputs: Sequence[str] | None = None, **options: A
 
 
 def history(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
-    """Twist ``phi`` [rad] and ``velocity`` [rad/s] at ``times`` [s], or at ``num`` times from 0 to ``stop``.
+    """The components of the state at ``times`` [s], or at ``num`` times from 0 to ``stop``.
 
-    Args as of :func:`floquet`; each output has the shape of the times and is differentiable.
+    Args as of :func:`floquet`. ``Tripod``: ``phi`` [rad], ``velocity`` [rad/s]. ``Rattle``: ``u`` [m], ``v`` [m/s]; also
+    ``acceleration``, ``event_time`` [s] and so on; method "slow_flow" gives ``amplitude`` and ``phase``. Outputs over time
+    are differentiable, except by "slow_flow".
 
     >>> import drivetrain_jax as dt
     >>> shaft = dt.Tripod(element="input", beta=0.157, zeta=0.0016)
@@ -114,7 +116,7 @@ def frequency_response(system: System, *, outputs: Sequence[str] | None = None, 
     """Response along the frequencies ``system.omega`` (L,), swept up and down: ``u_max`` (L, 2) and so on.
 
     Args as of :func:`floquet`; the frequencies are concrete numbers. Options ``method`` ("exact", "harmonic_balance",
-    "multiple_scales", "describing_function"). No derivatives.
+    "multiple_scales", "averaging", "describing_function"). No derivatives.
 
     >>> import drivetrain_jax as dt, numpy as np
     >>> gears = dt.Rattle(omega=np.linspace(0.5, 0.9, 3), **dt.Rattle.presets["table1"])
@@ -153,7 +155,8 @@ def critical_speeds(system: System, *, outputs: Sequence[str] | None = None, **o
 def modes(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
     """Natural frequencies [Hz] of a planetary gear, rising, with the type of each mode.
 
-    Args as of :func:`floquet`; outputs also ``participation``, ``mode_shape``, ``kinetic_energy``. ``natural_frequency`` is
+    Args as of :func:`floquet`; outputs also ``dominant_family`` with ``dominant_share`` (default), ``multiplicity``,
+    ``participation``, ``mode_shape``, ``kinetic_energy``. ``natural_frequency`` is
     differentiable; NaN where a parameter splits frequencies that are equal.
 
     >>> import drivetrain_jax as dt

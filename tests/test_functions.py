@@ -80,6 +80,7 @@ SYSTEMS = {
 # Results that the system, or the method that is used here, does not have.
 ABSENT = {
     "cardan floquet": ["floquet_exponent"],
+    "rattle history": ["amplitude", "phase"],
     "rattle frequency_response": ["residual", "peak_amplitude", "peak_frequency", "backbone_amplitude", "fit_range"],
 }
 OPTIONS = {

@@ -37,7 +37,8 @@ class Model:
     match each other. ``fixed`` holds those that do not vary; a list is whole also if one entry varies. ``smooth`` declares
     the coordinates of an atlas. None: the parameters themselves, and an atlas only on request (``method = "auto"`` makes
     none). ``results`` declares the variables of an analysis whose results are the system's own (``parameters``), and
-    ``default_outputs`` names those computed by default (empty: all).
+    ``default_outputs`` names those computed by default (empty: all). ``returns`` is the class of the model if it is not the
+    usual one of the analysis (``history``: a flow).
     """
 
     build: Callable[[Values], Any]
@@ -46,6 +47,7 @@ class Model:
     smooth: Smoothness | None = None
     results: tuple[Variable, ...] = ()
     default_outputs: tuple[str, ...] = ()
+    returns: type | None = None
 
 
 def numeric(*values: Any) -> tuple[Any, ...]:
@@ -100,7 +102,7 @@ class System(eqx.Module):
 
     Roles: ``speed`` (or excitation frequency), which figures draw horizontally and which is the path of
     ``frequency_response``; ``angle`` and ``damping`` of design questions; ``initial_displacement`` and ``initial_rate`` of
-    ``steady_state``; ``half_play`` and ``planets``, the angles of the planets, of figures.
+    ``steady_state`` and ``history``; ``half_play`` and ``planets``, the angles of the planets, of figures.
     """
 
     name: ClassVar[str]

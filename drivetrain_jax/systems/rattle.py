@@ -66,6 +66,7 @@ class Rattle(System):
 
     @serves("frequency_response", "basins", parameters=_MOTION)
     @serves("steady_state")
+    @serves("history", returns=PiecewiseLinearOscillator)
     def oscillator(self) -> PiecewiseLinearOscillator:
         """The oscillator in units of its mass."""
         return PiecewiseLinearOscillator(

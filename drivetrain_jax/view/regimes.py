@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -50,3 +52,17 @@ def draw_threshold(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: s
         handles += axes.plot(dataset[horizontal], line, color=PREDICTION, linewidth=1.3, label=label)
     axes.set(xlim=limits[0], ylim=limits[1])
     return handles
+
+
+def draw_flanks(dataset: xr.Dataset, over_time: Axes, portrait: Axes) -> list[Line2D]:
+    """Draw both flanks of the play over time and in the phase portrait; the legend entry, none without a known play."""
+    play = cells.role(dataset, "half_play")
+    half = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get(play, {}).get("value")
+    half = dataset[play].item() if play in dataset.coords else half
+    if half is None:
+        return []
+    style = {"color": FRAME_GREY, "linewidth": 0.8, "linestyle": (0, (2, 2))}
+    lines = [over_time.axhline(side, label="flanks", **style) for side in (half, -half)]
+    for side in (half, -half):
+        portrait.axvline(side, **style)
+    return lines[:1]

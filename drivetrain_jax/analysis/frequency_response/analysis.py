@@ -81,10 +81,11 @@ METHODS = {
     "exact": ("rtol", "most_periods"),
     "harmonic_balance": ("harmonics", "subharmonic", "samples"),
     "multiple_scales": ("fit_range",),
+    "averaging": ("fit_range",),
     "describing_function": (),
 }
 # Results that not every method provides.
-_CLOSED = ("multiple_scales", "describing_function")
+_CLOSED = ("multiple_scales", "averaging", "describing_function")
 _APPROXIMATE = ("harmonic_balance", *_CLOSED)
 _ONLY = {
     **dict.fromkeys(("period_multiple", "state_error"), ("exact",)),
@@ -92,7 +93,7 @@ _ONLY = {
     "residual": _APPROXIMATE,
     "fold_frequency": ("exact", *_CLOSED),
     **dict.fromkeys(("peak_amplitude", "peak_frequency", "backbone_amplitude"), _CLOSED),
-    "fit_range": ("multiple_scales",),
+    "fit_range": ("multiple_scales", "averaging"),
 }
 _SPECIAL = frozenset(("fold_frequency", "doubling_frequency"))
 # Lines of a chunk: for a map of 200 lines, equally many for two cores.
@@ -198,6 +199,7 @@ ANALYSIS = Analysis(
         "exact": "exact motion from impact to impact, followed along the path",
         "harmonic_balance": "a chosen number of harmonics",
         "multiple_scales": "closed form for a cubic spring, as published",
+        "averaging": "the same closed form: averaging gives the equation of multiple scales",
         "describing_function": "bias and fundamental alone",
     },
     options=OPTIONS,

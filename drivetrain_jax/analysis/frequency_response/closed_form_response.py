@@ -22,7 +22,10 @@ from drivetrain_jax.analysis.numerics.amplitude_roots import follow, refined
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 FOLDS = 4
-BRANCHES = {"multiple_scales": multiple_scales.MOST_ROOTS, "describing_function": describing_function.MOST_ROOTS}
+BRANCHES = {
+    **dict.fromkeys(("multiple_scales", "averaging"), multiple_scales.MOST_ROOTS),
+    "describing_function": describing_function.MOST_ROOTS,
+}
 _SAMPLES = 128
 _LARGEST_STEP, _MOST_PARTS = 0.005, 16
 
@@ -100,7 +103,7 @@ def response(
     Outcome ``NOT_CONVERGED`` where no amplitude exists: resonance without damping, or a fit without stiffness.
     """
     omega = np.asarray(model.omega)
-    scales = method == "multiple_scales"
+    scales = method != "describing_function"
     curves = of_multiple_scales(model, shape, fit_range) if scales else of_describing_function(model, shape)
     fine, places = refined(omega, _LARGEST_STEP, _MOST_PARTS)
     every = jax.lax.map(curves.motions, jnp.asarray(fine))

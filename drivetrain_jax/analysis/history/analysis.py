@@ -31,10 +31,11 @@ from drivetrain_jax.analysis._base import (
     Solver,
     forward_derivatives,
 )
+from drivetrain_jax.analysis.history import piecewise
 from drivetrain_jax.analysis.history.integration import NUM, has_finite_start, integrated, requested_times
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.analysis.numerics.predictions import predicted
-from drivetrain_jax.systems import Flow, System
+from drivetrain_jax.systems import Flow, PiecewiseLinearOscillator, System
 
 # Largest number of strobes.
 _MAX_STROBES = 2_000_000
@@ -69,6 +70,11 @@ def _period(build: Callable[..., Flow], size: int, values: Mapping[str, Any]) ->
     return jnp.asarray(flow.period)
 
 
+def _has_play(system: type[System]) -> bool:
+    """True if the model is an oscillator with play and no flow."""
+    return system.models["history"].returns is PiecewiseLinearOscillator
+
+
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     name = f"diffrax: {request.options['solver']}"
     solve, effort = partial(_solve, system, request), partial(_effort, system, request)
@@ -80,12 +86,27 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
 
 
 def _of_system(system: type[System]) -> dict[str, Any]:
-    """The components of the state, and their errors."""
+    """The components of the state, and their errors; for an oscillator with play also its methods."""
+    names = tuple(c.name for c in system.state)
+    if _has_play(system):
+        shared = tuple(
+            o for o in ANALYSIS.options if o.name in {o for used in piecewise.METHODS.values() for o in used}
+        )
+        return {
+            "variables": piecewise.variables(system),
+            "default_outputs": names,
+            "methods": piecewise.METHODS,
+            "method_titles": piecewise.TITLES,
+            "options": (*shared, *piecewise.OPTIONS),
+            "solvers": piecewise.solvers,
+            "dimensions": piecewise.dimensions,
+            "derivatives": piecewise.derivatives,
+        }
     values = tuple(Variable(c.name, c.units, c.long_name, ("time",)) for c in system.state)
     errors = tuple(
         Variable(f"{c.name}_error", c.units, f"estimated absolute error of {c.name}", ("time",)) for c in system.state
     )
-    return {"variables": values + errors, "default_outputs": tuple(c.name for c in system.state)}
+    return {"variables": values + errors, "default_outputs": names}
 
 
 ANALYSIS = Analysis(

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.view import cells
+from drivetrain_jax.view import cells, regimes
 from drivetrain_jax.view.figure_layout import DPI, WIDTH, NotebookFigure, wrap_caption, write_title
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, caption, coordinate_text, state, symbol, units_of
 
@@ -98,6 +98,7 @@ def _draw(history: xr.Dataset, along: Axes, rate: Axes, portrait: Axes) -> None:
     portrait.set_xlabel(_label(history, first))
     for axes in (along, rate) if history.sizes["time"] > 1 else ():
         axes.set_xlim(history["time"].values[0], history["time"].values[-1])
+    regimes.draw_flanks(history, along, portrait)
     if not np.isfinite(x).any():
         for axes in (along, rate, portrait):
             axes.text(0.5, 0.5, "no values", transform=axes.transAxes, ha="center", va="center", color=FRAME_GREY)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 
 import matplotlib
 import numpy as np
@@ -199,15 +198,7 @@ def _motion(dataset: xr.Dataset) -> Figure:
         Line2D([], [], linestyle="", marker="o", markersize=4, color=LINE_COLOURS[1], label="start of a drive period")
     )
     history.plot(part[0], u[0], "o", markersize=4, color=LINE_COLOURS[1])
-    play = cells.role(dataset, "half_play")
-    half = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get(play, {}).get("value")
-    half = dataset[play].item() if play in dataset.coords else half
-    if half is not None:
-        style = {"color": FRAME_GREY, "linewidth": 0.8, "linestyle": (0, (2, 2))}
-        for side in (half, -half):
-            flank = history.axhline(side, label="flanks", **style)
-            portrait.axvline(side, **style)
-        handles.append(flank)
+    handles += regimes.draw_flanks(dataset, history, portrait)
     history.set_xlim(0, 1)
     panels.label_axes("part of the motion's period [1]", variable_label(u))
     # On the left, clear of a power of ten at the right end.

@@ -1,0 +1,165 @@
+"""Time histories of oscillators with play: the exact motion with its events, and the averaged one.
+
+Method ``exact``: the closed form of each linear region from flank to flank, right within rounding at any time.
+
+Method ``slow_flow``: amplitude a and phase beta of ``u = a cos(omega t - beta)`` by the averaged equations of
+:mod:`~drivetrain_jax.analysis.frequency_response.multiple_scales`, with ``u' = -w0 a sin(omega t - beta)``. The complex
+amplitude ``z = a exp(i beta)`` has no singularity at rest:
+
+    z' = (-mu + i (omega - w0 - g |z|^2)) z + i F.
+
+Outcome: ``NOT_FINITE`` without a finite motion (resonance without damping; a fit with l1 <= 0); ``STEP_LIMIT`` for more
+events than any motion that does not graze; ``slow_flow`` also ``TOLERANCE_NOT_MET``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax.analysis._base import Outcome, Request, Solver, forward_derivatives
+from drivetrain_jax.analysis.frequency_response.multiple_scales import cubic_fit, self_consistent_range, slow_flow
+from drivetrain_jax.analysis.history.integration import has_finite_start, integrated, requested_times
+from drivetrain_jax.analysis.impacts.length_unit import measured
+from drivetrain_jax.analysis.impacts.timed_motion import timed_motion
+from drivetrain_jax.analysis.numerics.lanes import over_lanes
+from drivetrain_jax.analysis.numerics.predictions import predicted
+from drivetrain_jax.systems import Flow, PiecewiseLinearOscillator, System
+
+_TIMES = ("times", "stop", "num")
+METHODS = {"exact": (*_TIMES, "most_events"), "slow_flow": (*_TIMES, "rtol", "solver", "fit_range")}
+TITLES = {
+    "exact": "exact motion from impact to impact",
+    "slow_flow": "averaged equations of amplitude and phase (multiple scales give the same)",
+}
+OPTIONS = (
+    Parameter("most_events", "1", "length of the list of events", default=256, lower=1, upper=1e6, integer=True),
+    Parameter("fit_range", "m", "range R of the cubic fit (0: its own peak amplitude)", default=0.0, lower=0.0),
+)
+_FLANKS = ("drive", "back", "none")
+_EXACT = (
+    Variable("acceleration", "m/s2", "relative acceleration", ("time",)),
+    Variable("event_time", "s", "time at which contact is made or lost", ("event",)),
+    Variable("event_flank", "1", "flank of the event", ("event",), "int8", _FLANKS),
+    Variable("event_velocity", "m/s", "relative velocity at the event", ("event",)),
+    Variable("event_count", "1", "number of events, also beyond the list", dtype="int32"),
+)
+_AVERAGED = (
+    Variable("amplitude", "m", "amplitude of the averaged motion", ("time",)),
+    Variable("phase", "rad", "lag of the averaged motion behind the drive", ("time",)),
+)
+_STARTS = ("initial_displacement", "initial_rate")
+_MAX_PERIODS, _CHUNK = 2_000_000, 64
+
+
+def variables(system: type[System]) -> tuple[Variable, ...]:
+    """The state of ``system``, and what the methods add."""
+    own = (Variable(c.name, c.units, c.long_name, ("time",)) for c in system.state)
+    return (*own, *_EXACT, *_AVERAGED)
+
+
+def dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    """Times and events; ``InputError`` for a result that the method does not give."""
+    del system, fixed
+    for variable in _AVERAGED if request.method == "exact" else _EXACT:
+        if variable.name in request.outputs:
+            other = next(method for method in METHODS if method != request.method)
+            raise InputError(
+                f"outputs: method {request.method} does not give {variable.name}; allowed for it is {other}"
+            )
+    events = tuple(range(1, request.options.get("most_events", 0) + 1))
+    return Dimension("time", "time", requested_times(request), "s"), Dimension("event", "number of the event", events)
+
+
+def solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
+    """The solver of the method."""
+    effort = partial(_effort, system, request)
+    if request.method == "exact":
+        return (Solver("exact", partial(_exact, system, request), effort, chunk=_CHUNK, lengthy=True),)
+    solve = over_lanes(partial(_averaged, system, request))
+    return (Solver("slow flow", solve, effort, chunk=16, march=True, lengthy=True),)
+
+
+def derivatives(
+    system: type[System], request: Request, parameters: Any, constants: Any, results: Mapping[str, Array]
+) -> Mapping[str, Array]:
+    """Jacobians of the exact motion without its events. The range of the averaged one is found by bisection."""
+    known = {name: x for name, x in results.items() if not name.startswith("event")}
+    exact = request.method == "exact"
+    return forward_derivatives(solvers, system, request, parameters, constants, known) if exact else {}
+
+
+def _effort(system: type[System], request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Predicted steps, shape (N,): periods and requested times; infinite beyond the limit."""
+    times = requested_times(request)
+    periods = times[-1] / predicted(_period, (system.models["history"].build,), columns)
+    return np.where(periods <= _MAX_PERIODS, np.ceil(periods) + len(times), np.inf)
+
+
+def _period(build: Any, values: Mapping[str, Any]) -> Array:
+    return jnp.asarray(build(values).period)
+
+
+def _exact(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+    """The requested results of a batch, lanes last; ``effort`` only orders the batches."""
+    del effort
+    times = np.array(requested_times(request))
+    model: PiecewiseLinearOscillator = system.models["history"].build(values)
+    given = [values[system.role(role)] for role in _STARTS]
+    shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in (*vars(model).values(), *given)))
+    scaled, unit = measured(model)
+    u0, v0 = (jnp.broadcast_to(jnp.asarray(x, float) / unit, shape or (1,)) for x in given)
+    u, v, events, stuck = timed_motion(scaled, u0, v0, times, request.options["most_events"])
+    finite = jnp.all(jnp.isfinite(u), axis=0)
+    outcome = jnp.where(stuck, Outcome.STEP_LIMIT, jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE))
+    names = tuple(c.name for c in system.state)
+    results = dict(zip(names, (u * unit, v * unit), strict=True))
+    results["acceleration"] = model.field(times[:, None], jnp.stack([u * unit, v * unit]))[1]
+    results |= {"event_time": events.time, "event_flank": events.flank, "event_velocity": events.velocity * unit}
+    results |= {"event_count": events.number, "outcome": outcome.astype(jnp.int8)}
+    wanted = {name: results[name] for name in (*request.outputs, "outcome")}
+    return {name: x.reshape(*x.shape[:-1], *shape) for name, x in wanted.items()}
+
+
+def averaged_flow(
+    model: PiecewiseLinearOscillator, fit_range: Array | None, u0: Array, v0: Array
+) -> tuple[Flow, Array]:
+    """The flow of ``(Re z, Im z)`` from the state ``(u0, v0)``, and w0; without ``fit_range`` by its own peak amplitude."""
+    reach = self_consistent_range(model, ()) if fit_range is None else fit_range
+    slow = slow_flow(model, cubic_fit(model, reach))
+    drive, detuning = jnp.sign(model.B1) * slow.drive, model.omega - slow.frequency
+
+    def field(_: Any, y: Any) -> tuple[Any, Any]:
+        real, imaginary = y
+        drift = detuning - slow.bend * (real**2 + imaginary**2)
+        return -slow.decay * real - drift * imaginary, drift * real - slow.decay * imaginary + drive
+
+    return Flow(field, (u0, v0 / slow.frequency), model.period), slow.frequency
+
+
+def _averaged(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+    """The requested results of one point."""
+    del effort
+    model: PiecewiseLinearOscillator = system.models["history"].build(values)
+    u0, v0 = (jnp.asarray(values[system.role(role)], float) for role in _STARTS)
+    scaled, unit = measured(model)
+    given = request.options["fit_range"]
+    flow, frequency = averaged_flow(scaled, jnp.asarray(given / unit) if given > 0 else None, u0 / unit, v0 / unit)
+    found = integrated(flow, request)
+    real, imaginary = found.states.T * unit
+    turned = model.omega * jnp.asarray(requested_times(request))
+    cosine, sine = jnp.cos(turned), jnp.sin(turned)
+    u, v = real * cosine + imaginary * sine, frequency * (imaginary * cosine - real * sine)
+    results = dict(zip((c.name for c in system.state), (u, v), strict=True))
+    results |= {"amplitude": jnp.hypot(real, imaginary), "phase": jnp.arctan2(imaginary, real)}
+    outcome = jnp.where(found.excess <= 1, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
+    failed = jnp.where(has_finite_start(flow), Outcome.STEP_LIMIT, Outcome.NOT_FINITE)
+    outcome = jnp.where(found.healthy, outcome, failed).astype(jnp.int8)
+    return {name: results[name] for name in request.outputs} | {"outcome": outcome}
