@@ -53,7 +53,8 @@ def judged_tiles(
     kernel: Callable[[bool], Any],
     rtol: float,
 ) -> Iterator[tuple[Tile, Cells]]:
-    """Yield every tile with the results of its cells, in order; ``axes`` are those of the grid, in parameters.
+    """Yield every tile with the results of its cells, ``(R, C)`` or ``(k, R, C)``, in order; ``axes`` are those of the
+    grid, in parameters.
 
     ``kernel(dense)`` is that of :func:`tile_kernel`.
     """
@@ -63,12 +64,17 @@ def judged_tiles(
     def work(tile: Tile) -> Cells:
         cells = tile.columns if tile.spread is None else tile.spread
         values = {name: axis[i] for name, axis, i in zip(names, axes, tile.index, strict=True)}
-        for name, size in zip(names[-2:], (len(tile.first), cells.shape[1]), strict=True):
-            values[name] = filled_up(values[name], size)
+        places, rows, columns = (1, *(len(i) for i in tile.index[-3:]))[-3:]
+        values[names[-1]] = filled_up(values[names[-1]], cells.shape[1])
+        values[names[-2]] = filled_up(np.tile(filled_up(values[names[-2]], tile.rows), places), len(tile.first))
+        for name in names[-3:-2]:
+            values[name] = filled_up(np.repeat(values[name], tile.rows), len(tile.first))
         factors = (tile.first, tile.columns) if tile.spread is None else (tile.first, tile.columns, tile.spread)
         found = kernel(tile.spread is not None)(*factors, errors_of(tile.panel), values, constants, rtol)
-        rows, columns = (len(i) for i in tile.index[-2:])
-        return {name: np.asarray(x)[:rows, :columns] for name, x in found.items()}
+        shape = (places, tile.rows, -1)[-min(len(names), 3) :]
+        return {
+            name: np.asarray(x)[: places * tile.rows].reshape(shape)[..., :rows, :columns] for name, x in found.items()
+        }
 
     return in_threads(tiles, work)
 
@@ -99,14 +105,17 @@ def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
     ``kind``: ``dense`` or ``sparse`` like the tile, ``undamped`` for sparse tiles with cells that may be Hamiltonian.
     """
 
-    def bind(values: Mapping, fixed: Mapping, row: Array) -> FloquetModel:
-        leading = {name: values[name][0] for name in names[:-2]}
-        return build({**fixed, **leading, names[-2]: row, names[-1]: values[names[-1]]})
+    # The last two of them vary from row to row.
+    of_rows = names[-3:-1]
+
+    def bind(values: Mapping, fixed: Mapping, row: Mapping) -> FloquetModel:
+        leading = {name: values[name][0] for name in names[:-3]}
+        return build({**fixed, **leading, **row, names[-1]: values[names[-1]]})
 
     # Row by row, because the intermediate results of a row fit into the cache. The last product is inside the loop: a row
     # of a larger result would be copied at every use.
     def sparse(first, columns, errors, values, fixed, rtol):
-        def row(inputs: tuple[Array, Array]) -> dict[str, Array]:
+        def row(inputs: tuple[Array, dict[str, Array]]) -> dict[str, Array]:
             weights, value = inputs
             model, phi = bind(values, fixed, value), weights @ columns
             log_d = jnp.broadcast_to(model.reduced.log_determinant(), phi.shape[1:])  # pyright: ignore[reportOptionalCall]
@@ -114,20 +123,20 @@ def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
             exact = exact_verdict(model, parts, errors[0]) if kind == "undamped" else None
             return judged(quartic.coefficients(parts, log_d, errors[1:]), rtol, exact)
 
-        return by_rows(row, (first, values[names[-2]]))
+        return by_rows(row, (first, {name: values[name] for name in of_rows}))
 
     def dense(first, columns, spread, errors, values, fixed, rtol):
         parts = quartic.blocks(jnp.moveaxis(first @ columns, 1, 0))
         at_nodes, rounding = (jnp.stack(x, axis=1) for x in quartic.invariants(parts))
         bounds = errors[1:] + _SPREAD * jnp.max(rounding, axis=-1) + _left_out(at_nodes)
 
-        def row(inputs: tuple[Array, Array, Array]) -> dict[str, Array]:
+        def row(inputs: tuple[Array, Array, dict[str, Array]]) -> dict[str, Array]:
             e, bounds, value = inputs
             lanes = e @ spread
             log_d = jnp.broadcast_to(bind(values, fixed, value).reduced.log_determinant(), lanes.shape[1:])  # pyright: ignore[reportOptionalCall]
             return judged(quartic.with_determinant(lanes, bounds, log_d), rtol)
 
-        return by_rows(row, (at_nodes, bounds, values[names[-2]]))
+        return by_rows(row, (at_nodes, bounds, {name: values[name] for name in of_rows}))
 
     return jax.jit(dense if kind == "dense" else sparse, compiler_options=compiler_options())
 

@@ -17,6 +17,8 @@ from drivetrain_jax.atlas.panels import Atlas, Panel, chebyshev, position
 
 # Upper limit of the size of the first product of a block of scattered points.
 _WORKING_SET = 1 << 22
+# Points of a line that are evaluated at a time, and points per line from which on lines are worth their tensors.
+_LINE, _SHARED = 1 << 10, 2
 
 
 def values_at(
@@ -54,6 +56,34 @@ def scattered(tensor: Array, weights: Sequence[Array]) -> Array:
     for w in reversed(weights[1:]):
         values = jnp.sum(values * w, axis=-2)
     return values
+
+
+def on_lines(panel: Panel, x: np.ndarray) -> np.ndarray:
+    """Values ``(m, N)`` at points in coordinates ``(N, d)``, many of which share all coordinates but the last two: the
+    tensor of these two is made once for each place of the others."""
+    t, d = position(panel, x), x.shape[1]
+    values = np.empty((panel.coefficients.shape[-1], len(x)))
+
+    def fill(coefficients: np.ndarray, chosen: np.ndarray, k: int) -> None:
+        if k < d - 2:
+            for place in np.unique(t[chosen, k]):
+                reduced = np.tensordot(chebyshev(place, len(coefficients)), coefficients, axes=(0, 0))
+                fill(reduced, chosen[t[chosen, k] == place], k + 1)
+            return
+        first, second = coefficients.shape[:2]
+        for part in np.array_split(chosen, -(-len(chosen) // _LINE)):
+            rows = chebyshev(t[part, k], first) @ coefficients.reshape(first, -1)
+            values[:, part] = np.einsum(
+                "pnm,pn->mp", rows.reshape(len(part), second, -1), chebyshev(t[part, -1], second)
+            )
+
+    fill(panel.coefficients, np.arange(len(x)), 0)
+    return values
+
+
+def share_lines(x: np.ndarray) -> bool:
+    """True if points in coordinates are few times as many as the places of all their coordinates but the last two."""
+    return x.shape[1] > 2 and _SHARED * len(np.unique(x[:, :-2], axis=0)) <= len(x)
 
 
 def block_size(atlas: Atlas) -> int:

@@ -212,5 +212,7 @@ def _fix(box: Panel | Gap, k: int, x: float) -> Panel | Gap:
     if isinstance(box, Gap):
         return Gap(lower, upper, box.reason)
     weights = chebyshev(position_between(box.lower[k], box.upper[k], x), box.degrees[k])
-    coefficients = np.tensordot(weights, box.coefficients, axes=(0, k))
-    return replace(box, lower=lower, upper=upper, coefficients=coefficients)
+    before, after = box.coefficients.shape[:k], box.coefficients.shape[k + 1 :]
+    # Unlike `tensordot`, it copies nothing.
+    coefficients = weights @ box.coefficients.reshape(*before, len(weights), -1)
+    return replace(box, lower=lower, upper=upper, coefficients=coefficients.reshape(*before, *after))

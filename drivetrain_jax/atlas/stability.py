@@ -82,10 +82,23 @@ class StabilityAtlas:
         number, size = self.atlas.find(x), evaluation.block_size(self.atlas)
         for k in range(len(self.atlas.panels)):
             mine = np.flatnonzero(number == k)
-            for part in (mine[i : i + size] for i in range(0, len(mine), size)):
-                for name, value in self._judged(k, points[part], x[part], size, tuple(outputs)).items():
+            if not mine.size:
+                continue
+            phi = self._phi(k, x[mine], size)
+            for start in range(0, len(mine), size):
+                part = mine[start : start + size]
+                for name, value in self._judged(k, points[part], phi[:, start : start + size], tuple(outputs)).items():
                     found[name][part] = value[: len(part)]
         return found
+
+    def _phi(self, number: int, x: np.ndarray, size: int) -> np.ndarray:
+        """Values ``(m, N)`` of a panel at points in coordinates, filled up to a multiple of ``size``."""
+        panel = self.atlas.panels[number]
+        if evaluation.share_lines(x):
+            return np.pad(evaluation.on_lines(panel, x), ((0, 0), (0, -len(x) % size)), mode="edge")
+        degrees = evaluation.common_degrees(self.atlas.panels)
+        weights = (evaluation.point_weights(panel, x[i : i + size], degrees, size) for i in range(0, len(x), size))
+        return np.concatenate([_scattered(self._tensors[number], each) for each in weights], axis=1)
 
     def blank(self, shape: tuple[int, ...], outputs: Sequence[str] = DEFAULT_OUTPUTS) -> dict[str, np.ndarray]:
         """Results by name, and ``outcome``, of unknown points."""
@@ -199,16 +212,14 @@ class StabilityAtlas:
                 found[name][tuple(part.T)] = value
 
     def _judged(
-        self, number: int, points: np.ndarray, x: np.ndarray, size: int, outputs: tuple[str, ...]
+        self, number: int, points: np.ndarray, phi: np.ndarray, outputs: tuple[str, ...]
     ) -> dict[str, np.ndarray]:
-        panel = self.atlas.panels[number]
-        weights = evaluation.point_weights(panel, x, evaluation.common_degrees(self.atlas.panels), size)
-        columns = np.pad(points, ((0, size - len(points)), (0, 0)), mode="edge")
+        """Results of lanes ``phi`` ``(m, N)``, of which the first are those of ``points``."""
+        columns = np.pad(points, ((0, phi.shape[1] - len(points)), (0, 0)), mode="edge")
         values = {name: columns[:, k] for k, name in enumerate(self.atlas.parameters)}
         kernel = _point_kernel(self.build, outputs, self.rtol, self._closed_form)
-        phi = _scattered(self._tensors[number], weights)
         with _JUDGING:
-            found = kernel(phi, charts.errors_of(panel), values, self.atlas.fixed)
+            found = kernel(phi, charts.errors_of(self.atlas.panels[number]), values, self.atlas.fixed)
         return {name: np.moveaxis(np.asarray(value), -1, 0) for name, value in found.items()}
 
 
@@ -223,10 +234,11 @@ def _store(found: Mapping[str, np.ndarray], tile: Tile, cells: charts.Cells) -> 
     for name, values in found.items():
         part = values[place]
         part[...] = cells[name].reshape(part.shape)
-    unsure = np.argwhere(cells["unsure"]) if cells["unsure"].any() else np.empty((0, 2), int)
+    own = cells["unsure"].ndim
+    unsure = np.argwhere(cells["unsure"]) if cells["unsure"].any() else np.empty((0, own), int)
     first = [i[0] for i in tile.index]
-    leading = np.broadcast_to(np.array(first[:-2], int), (len(unsure), len(first) - 2))
-    return np.concatenate([leading, unsure + first[-2:]], axis=1)
+    leading = np.broadcast_to(np.array(first[:-own], int), (len(unsure), len(first) - own))
+    return np.concatenate([leading, unsure + first[-own:]], axis=1)
 
 
 _scattered = jax.jit(evaluation.scattered, compiler_options=compiler_options())

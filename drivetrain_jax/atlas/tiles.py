@@ -9,8 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import groupby, islice
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -27,15 +30,17 @@ _SPAN = 11.0
 _DENSE = 2 / 3
 # Widths are multiples of a step. Cost of a cell with and without nodes, and of a row of a tile, in cells; least saving of a
 # width over the one that divides the cells evenly, so that most charts of a size share one kernel.
+# Cells of a tile of several rectangles: small tiles cost as much time in Python as in their kernel.
+_CELLS = 1 << 16
 _STEP, _COSTS, _ROW, _WORTH = 16, {True: 1.0, False: 1.6}, 100, 0.95
 
 
 @dataclass(frozen=True)
 class Tile:
-    """A rectangle of a grid within one panel.
+    """A rectangle of a grid within one panel, or several at neighbouring places along the axis before the last two.
 
-    ``index`` are the positions along each axis of the grid: one number for each leading axis, arrays for the last two.
-    ``first`` ``(R, m, n)`` is the contracted tensor of the panel in each row, ``columns`` ``(n, C)`` are T_j at the cells.
+    ``index`` are the positions along each axis of the grid: one number for each other axis. ``first`` ``(R, m, n)`` is the
+    contracted tensor of the panel in each row, ``rows`` of them for each place. ``columns`` ``(n, C)`` are T_j at the cells.
     In a dense tile ``columns`` ``(n, NODES)`` are T_j at the nodes, and ``spread`` ``(NODES, C)`` interpolates from the
     nodes to the cells.
     """
@@ -43,6 +48,7 @@ class Tile:
     panel: Panel
     index: tuple[np.ndarray, ...]
     first: Array
+    rows: int
     columns: np.ndarray
     spread: np.ndarray | None
 
@@ -59,7 +65,8 @@ class _Band:
 def tiles(
     atlas: Atlas, axes: Sequence[np.ndarray], most: tuple[int, int], *, rows: int | None = None, dense: bool = True
 ) -> Iterator[Tile]:
-    """Tiles of at most ``most`` cells that cover the panels' part of the grid of ``axes``, two or more, in coordinates.
+    """Tiles of at most ``most`` cells that cover the panels' part of the grid of ``axes``, two or more, in coordinates;
+    where rectangles are small, of several rectangles.
 
     ``axes`` rise. Tiles overlap on faces that panels share: the last one belongs to the panel of :meth:`Atlas.find`.
     Without ``dense`` no tile has nodes. A part of a chart of ``rows`` rows has tiles of the same shape as all other parts.
@@ -69,23 +76,48 @@ def tiles(
     degrees = common_degrees(atlas.panels)[-2:]
     # An even number of rows of tiles, so two cores finish at the same time.
     shape = _shared(rows or len(axes[-2]), most[0], 8, 2), _width(atlas, axes[-1], most[1], dense)
-    for panel, groups in _assigned(atlas, axes):
+    assigned = list(_assigned(atlas, axes))
+    largest = max((len(groups[-2]) for _, groups in assigned), default=0)
+    for panel, groups in assigned:
         bands = _kinds_first(list(_bands(panel, axes[-1], groups[-1], degrees[1], shape[1], dense)))
-        for fixed, reduced in _reductions(panel, axes, groups[:-2]):
-            tensor = padded_tensor(reduced, degrees)
-            for start in range(0, len(groups[-2]), shape[0]):
-                chosen = groups[-2][start : start + shape[0]]
-                weights = filled_up(chebyshev(_positions(panel, -2, axes[-2][chosen]), degrees[0]), shape[0])
-                first = _first_product(weights, tensor)
+        rows, places, total = _stacked(axes, len(groups[-2]), largest, shape)
+        for fixed, reduced in _runs(_reductions(panel, axes, groups[:-2]), places):
+            tensors = filled_up(np.stack([padded_tensor(each, degrees) for each in reduced]), places)
+            for start in range(0, len(groups[-2]), rows):
+                chosen = groups[-2][start : start + rows]
+                weights = filled_up(chebyshev(_positions(panel, -2, axes[-2][chosen]), degrees[0]), rows)
+                first = _first_product(weights, tensors, total)
                 for band in bands:
-                    index = (*(np.array([i]) for i in fixed), chosen, band.chosen)
-                    yield Tile(panel, index, first, band.columns, band.spread)
+                    yield Tile(panel, (*fixed, chosen, band.chosen), first, rows, band.columns, band.spread)
 
 
-@jax.jit
-def _first_product(weights: Array, tensor: Array) -> Array:
-    """``(R, n_1)`` times ``(n_1, m, n)``, without NumPy, whose BLAS threads would compete with the worker threads."""
-    return (weights @ tensor.reshape(len(tensor), -1)).reshape(-1, *tensor.shape[1:])
+def _stacked(axes: Sequence[np.ndarray], count: int, largest: int, shape: tuple[int, int]) -> tuple[int, int, int]:
+    """Rows of a rectangle, number of rectangles of a tile, and rows of a tile, for a panel of ``count`` rows; ``largest``
+    is the number of rows of the largest panel."""
+    rows, most = (-(-n // 8) * 8 for n in (count, largest))
+    places = min(_CELLS // (most * shape[1]), len(axes[-3]) if len(axes) > 2 else 1)
+    if places < 2:
+        return shape[0], 1, shape[0]
+    return rows, places * most // rows, places * most
+
+
+def _runs(
+    reductions: Iterator[tuple[tuple[int, ...], Panel]], most: int
+) -> Iterator[tuple[tuple[np.ndarray, ...], list[Panel]]]:
+    """Positions along the leading axes, and the panels there: up to ``most`` that differ along the last of these axes."""
+    for _, line in groupby(reductions, key=lambda reduction: reduction[0][:-1]):
+        while run := list(islice(line, most)):
+            places, panels = zip(*run, strict=True)
+            yield tuple(np.unique(each) for each in zip(*places, strict=True)), list(panels)
+
+
+@partial(jax.jit, static_argnames="total")
+def _first_product(weights: Array, tensors: Array, total: int) -> Array:
+    """``(R, n_1)`` times each of ``(k, n_1, m, n)``, filled up to ``(total, m, n)``, without NumPy, whose BLAS threads
+    would compete with the worker threads."""
+    k, n, *rest = tensors.shape
+    found = jnp.einsum("rn,knx->krx", weights, tensors.reshape(k, n, -1)).reshape(-1, *rest)
+    return jnp.pad(found, ((0, total - len(found)), (0, 0), (0, 0)))
 
 
 def _reductions(

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _GAPS = ("solve", "nan")
 # Cells of a chunk where Dask is left to choose, and most along one axis.
-_CHUNK, _LONGEST = 1 << 19, 1 << 10
+_CHUNK, _LONGEST = 1 << 18, 1 << 10
 
 
 class AtlasEntrypoint(BackendEntrypoint):
@@ -91,7 +91,8 @@ def _opened(path: str, grid: Any, solve: bool) -> xr.Dataset:
     # Broadcast numbers take no memory.
     blank = {name: np.broadcast_to(value, (*shape, *value.shape)) for name, value in point.items()}
     dataset = to_dataset(atlas.scene_on(axes), blank, {})
-    chunks = _chunks(axes)
+    degrees = np.max([(0,) * len(axes), *(panel.degrees for panel in atlas.stability.atlas.panels)], axis=0)
+    chunks = _chunks(axes, dict(zip(atlas.parameters, degrees.tolist(), strict=True)))
     for name, value in point.items():
         variable = dataset[name].variable
         data = indexing.LazilyIndexedArray(AtlasArray(cells, name, value.shape, value.dtype))
@@ -104,10 +105,11 @@ def _opened(path: str, grid: Any, solve: bool) -> xr.Dataset:
     return dataset.assign_coords({name: ((), value, atlas.labels(name)) for name, value in fixed.items()})
 
 
-def _chunks(axes: dict[str, Any]) -> dict[str, int]:
+def _chunks(axes: dict[str, Any], degrees: dict[str, int]) -> dict[str, int]:
     """Chunks of one size each way: those of another size would have kernels of their own. They reach far along the two
-    longest axes, whose cells are evaluated together."""
-    longest = sorted(axes, key=lambda name: -len(axes[name]))
+    longest axes, whose cells are evaluated together; of axes as long as each other along those of low ``degrees``, which
+    take less work."""
+    longest = sorted(axes, key=lambda name: (-len(axes[name]), degrees[name]))
     chunks, left = {}, _CHUNK
     for name in longest:
         length = len(axes[name])

@@ -120,6 +120,7 @@ def _points(job: Job, atlas: StabilityAtlas, buffer: ResultBuffer) -> Iterator[t
 def _blocks(job: Job, atlas: StabilityAtlas, buffer: ResultBuffer) -> Iterator[tuple[tuple[slice, ...], Results]]:
     """Yield positions in the grid block by block, and the filled arrays of ``buffer`` there."""
     axes = {axis.name: axis.values for axis in job.grid.axes}
+    atlas = atlas.slice({name: float(axes[name][0]) for name in _single(axes, atlas.atlas.parameters)})
     lengths = {name: len(axes[name]) for name in atlas.atlas.parameters}
     longest = sorted(lengths, key=lambda name: lengths[name])[-2:]
     # Rows and columns of a tile are the last two. Of axes as long as each other their order decides, which stays.
@@ -133,6 +134,12 @@ def _blocks(job: Job, atlas: StabilityAtlas, buffer: ResultBuffer) -> Iterator[t
         places = {n: _in_atlas_order(a, names, tuple(axes)) for n, a in arrays.items()}
         atlas.on_grid(values, outputs, places, rows=sizes[-2] if len(sizes) > 1 else None)
         yield place, arrays
+
+
+def _single(axes: Mapping[str, np.ndarray], parameters: Sequence[str]) -> list[str]:
+    """The parameters that have one value; at least two others remain."""
+    single = [name for name in parameters if len(axes[name]) == 1]
+    return single[: max(len(parameters) - 2, 0)]
 
 
 def _cut(lengths: Sequence[int]) -> Iterator[tuple[slice, ...]]:

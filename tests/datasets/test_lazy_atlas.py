@@ -14,6 +14,8 @@ import pytest
 import xarray as xr
 
 import drivetrain_jax as dt
+from drivetrain_jax.atlas import charts, evaluation, interpolation
+from drivetrain_jax.atlas.panels import position
 from drivetrain_jax.datasets import lazy
 from drivetrain_jax.runs import rounds
 from drivetrain_jax.runs.atlas_file import StoredAtlas
@@ -137,12 +139,62 @@ def test_chunks_that_dask_chooses_are_of_one_size(file):
     assert opened(file, 300, chunks={})["verdict"].chunks == ((300,), (300,))
 
 
-def test_chunks_agree_along_an_axis_that_predictions_depend_on(tmp_path):
+@pytest.fixture(scope="module")
+def deep(tmp_path_factory):
+    """An atlas of three parameters."""
+    path = tmp_path_factory.mktemp("deep") / "atlas.nc"
     axes = ATLAS["axes"] | {"mu": {"start": 0.9, "stop": 1.1}}
-    dt.run(ATLAS | {"axes": axes, "fixed": {"zeta": 0.001, "alpha": 1.0, "gamma": 100.0}}, out=tmp_path / "a.nc")
-    found = opened(tmp_path / "a.nc", 200, chunks={})
+    dt.run(ATLAS | {"axes": axes, "fixed": {"zeta": 0.001, "alpha": 1.0, "gamma": 100.0}}, out=path)
+    return path
+
+
+def test_chunks_agree_along_an_axis_that_predictions_depend_on(deep):
+    found = opened(deep, {"beta": 200, "Omega": 200, "mu": 150}, chunks={})
     assert found.drivetrain.resonances().dims == ("mu", "resonance")
     assert found.chunks["mu"] == found["verdict"].chunksizes["mu"] and len(found.chunks["mu"]) > 10
+
+
+def test_chunks_of_even_axes_reach_along_those_of_low_degree(deep):
+    (panel, *_), names = dt.open_atlas(deep).stability.atlas.panels, ("beta", "Omega", "mu")
+    chunks = opened(deep, 400, chunks={})["verdict"].chunksizes
+    shortest = min(names, key=lambda name: chunks[name][0])
+    assert panel.degrees[names.index(shortest)] == max(panel.degrees)
+
+
+def test_many_small_rectangles_are_evaluated_together(deep, monkeypatch):
+    """With the numbers of single points, also where eigenvalues decide."""
+    stability, calls, shared = dt.open_atlas(deep).stability, [], []
+    judged_tiles, on_lines = charts.judged_tiles, evaluation.on_lines
+
+    def counting(tiles, *more):
+        calls.append(tiles := list(tiles))
+        return judged_tiles(iter(tiles), *more)
+
+    monkeypatch.setattr(charts, "judged_tiles", counting)
+    monkeypatch.setattr(evaluation, "on_lines", lambda panel, x: shared.append(len(x)) or on_lines(panel, x))
+    axes = [
+        np.linspace(*ends, n) for ends, n in zip(((0.0, 0.6), (1.38, 1.46), (0.95, 1.05)), (20, 40, 33), strict=True)
+    ]
+    found = stability.on_grid(axes)
+    (tiles,) = calls
+    assert len(tiles) < 20 * len(stability.atlas.panels) / 2 and max(len(tile.index[0]) for tile in tiles) > 1
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    alone = stability.at(points)
+    error = found["spectral_radius_error"].ravel() + alone["spectral_radius_error"]
+    assert (abs(found["spectral_radius"].ravel() - alone["spectral_radius"]) <= error).all()
+    assert (found["outcome"].ravel() == alone["outcome"]).all() and (found["verdict"] == 1).any()
+    both = (found["verdict"].ravel() < 2) & (alone["verdict"] < 2)
+    assert both.mean() > 0.99 and (found["verdict"].ravel() == alone["verdict"])[both].all()
+    slow = stability.by_eigenvalues(points[-200:], ["spectral_radius", "spectral_radius_error"])
+    assert shared
+    error = slow["spectral_radius_error"] + alone["spectral_radius_error"][-200:]
+    assert (abs(slow["spectral_radius"] - alone["spectral_radius"][-200:]) <= error).all()
+    x = stability.atlas.to_coordinates(points[:2000])
+    inside = x[stability.atlas.find(x) == 0]
+    panel = stability.atlas.panels[0]
+    exact = interpolation.evaluate(panel.coefficients, position(panel, inside))
+    np.testing.assert_allclose(on_lines(panel, inside).T, exact, rtol=0, atol=1e-12 * abs(exact).max())
+    assert evaluation.share_lines(x) and not evaluation.share_lines(np.random.default_rng(0).random((50, 3)))
 
 
 def test_arrays_travel_without_what_they_hold(file, expected):
