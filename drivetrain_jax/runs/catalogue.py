@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter, Variable
@@ -13,6 +11,7 @@ from drivetrain_jax._wording import aligned, written
 from drivetrain_jax.analysis import analyses_of, get_analysis
 from drivetrain_jax.runs import shipped
 from drivetrain_jax.runs.scene import find_system
+from drivetrain_jax.runs.toml import entries
 from drivetrain_jax.systems import System, system_names
 
 
@@ -40,16 +39,10 @@ def describe(name: str) -> str:
         lines += aligned([(p.name, f"[{p.units}]", p.long_name, p.allowed) for p in system.physical.quantities])
     if system.presets:
         lines += ["", "Presets, to copy into a scene"]
-        lines += aligned([(preset, _preset(values)) for preset, values in system.presets.items()])
+        lines += aligned([(preset, ", ".join(entries(values))) for preset, values in system.presets.items()])
     for analysis in analyses_of(system):
         lines += ["", *_analysis_lines(analysis, system)]
     return "\n".join([*lines, *_scene_lines(system)]) + "\n"
-
-
-def _preset(values: Mapping[str, Any]) -> str:
-    """``name = value`` for every parameter, as lines of TOML: Python writes numbers, lists and words in the same way."""
-    plain = {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
-    return ", ".join(f"{name} = {value!r}" for name, value in plain.items())
 
 
 def _analysis_lines(name: str, system: type[System]) -> list[str]:

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import NoneType
 from typing import Any
 
 import msgspec
 import numpy as np
-import tomli_w
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import nearest, shown
 from drivetrain_jax.runs import shipped
 
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 # Characters that an attribute of a result cannot store.
 _NO_TEXT = re.compile("[\0\ud800-\udfff]")
 # Largest number of bits of an integer: more than a scene needs, less than Python's limit for printing.
@@ -185,13 +186,36 @@ def parse_value(text: str) -> Any:
 
 
 def write(tree: Mapping[str, Any]) -> str:
-    """TOML text of ``tree``. None entries are left out, because TOML has no null."""
-    return tomli_w.dumps(_without_none(tree), indent=2)
+    """TOML text of ``tree``: plain entries first, then its tables with inline subtables. None entries are left out,
+    because TOML has no null."""
+    lines = entries({name: value for name, value in tree.items() if not isinstance(value, Mapping)})
+    for name, table in tree.items():
+        if isinstance(table, Mapping):
+            lines += ["", f"[{_key(name)}]", *entries(table)]
+    return "\n".join(lines) + "\n"
 
 
-def _without_none(tree: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        name: _without_none(value) if isinstance(value, Mapping) else value
-        for name, value in tree.items()
-        if value is not None
-    }
+def entries(table: Mapping[str, Any]) -> list[str]:
+    """``name = value`` for every entry of ``table``."""
+    return [f"{_key(name)} = {_value(value)}" for name, value in table.items() if value is not None]
+
+
+def _key(name: str) -> str:
+    return name if _BARE_KEY.fullmatch(name) else _quoted(name)
+
+
+def _quoted(text: str) -> str:
+    # TOML requires an escape for one control character that JSON does not escape.
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return _quoted(value)
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(entries(value)) + " }"
+    if isinstance(value, Sequence):
+        return "[" + ", ".join(_value(entry) for entry in value) + "]"
+    return repr(value)
