@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 # Most characters of a value that a message repeats.
@@ -30,19 +29,6 @@ def written(value: Any) -> str:
     if isinstance(value, tuple):
         return "[" + ", ".join(map(written, value)) + "]"
     return f"{value:.10g}" if isinstance(value, float) else str(value)
-
-
-def json_value(value: Any) -> Any:
-    """``value`` in the types of JSON; a number that is not finite is None, a complex one has its two parts."""
-    if isinstance(value, Mapping):
-        return {name: json_value(entry) for name, entry in value.items()}
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, (list, tuple)):
-        return [json_value(entry) for entry in value]
-    if isinstance(value, complex):
-        return {"real": json_value(value.real), "imag": json_value(value.imag)}
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -16,7 +16,6 @@ import jax
 import numpy as np
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._wording import json_value
 from drivetrain_jax.analysis import OUTCOME, get_analysis
 from drivetrain_jax.analysis.numerics.kernels import options_for_few
 from drivetrain_jax.analysis.numerics.lanes import Constants
@@ -49,7 +48,7 @@ class Reply:
 
     def to_json(self) -> str:
         """``data`` as one JSON object; numbers that are not finite become null."""
-        return json.dumps(json_value(self.data), allow_nan=False)
+        return json.dumps(_plain(self.data), allow_nan=False)
 
 
 def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
@@ -314,3 +313,15 @@ def _from_one(radius: float) -> str:
     """A spectral radius near 1 as its distance from 1, to keep its digits."""
     apart = radius - 1
     return f"{radius:.6g}" if not 0 < abs(apart) < _CLOSE else f"1 {'+' if apart > 0 else '-'} {abs(apart):.1e}"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _plain(v) for name, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, complex):
+        return {"real": _plain(value.real), "imag": _plain(value.imag)}
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -12,7 +12,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Variable
-from drivetrain_jax._wording import aligned, json_value, nearest, shown, written
+from drivetrain_jax._wording import aligned, nearest, shown, written
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, get_analysis
 from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.job import Job
@@ -64,11 +64,11 @@ class PointResult:
 
     def to_json(self) -> str:
         """The answer as one JSON object; numbers that are not finite are null."""
-        values = {n: {"value": json_value(v), "units": self.variables[n].units} for n, v in self.values.items()}
+        values = {n: {"value": _plain(v), "units": self.variables[n].units} for n, v in self.values.items()}
         for name, value in self.values.items():
             if flags := self.variables[name].flags:
                 values[name]["meaning"] = _meaning(flags, value)
-        parameters = {n: {"value": json_value(v), "units": self.parameter_units[n]} for n, v in self.parameters.items()}
+        parameters = {n: {"value": _plain(v), "units": self.parameter_units[n]} for n, v in self.parameters.items()}
         head = {"system": self.system, "analysis": self.analysis, "method": self.method}
         answer = {**head, "parameters": parameters, "outcome": self.outcome.name.lower(), "values": values}
         return json.dumps(answer, allow_nan=False)
@@ -112,6 +112,17 @@ class PointResult:
             head = name if variable.units == "1" else f"{name} [{variable.units}]"
             columns.append([head, *(_text(variable, value) for value in self.values[name])])
         return aligned(list(zip(*columns, strict=True)))
+
+
+def _plain(value: Any) -> Any:
+    """Words, numbers and lists as JSON types."""
+    if isinstance(value, str):
+        return value
+    if np.iscomplexobj(value):
+        return {"real": _plain(np.real(value)), "imag": _plain(np.imag(value))}
+    if np.ndim(value):
+        return [_plain(entry) for entry in value]
+    return np.asarray(value).item() if np.isfinite(value) else None
 
 
 def _meaning(flags: Sequence[str], value: Any) -> Any:
