@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 import drivetrain_jax as dt
-from benchmarks.validation.cardan_conclusions import conclusions_section, index_section, orbit_section
-from benchmarks.validation.document import Page, markdown
+from benchmarks.validation.cardan_conclusions import found, orbit_section
+from benchmarks.validation.document import Page, inventory, markdown
 from tests.oracles.cardan_orbit_reference import linear_response, nonlinear_orbit
 from tests.oracles.cardan_paper import (
     PRINTED_FREQUENCIES,
@@ -243,9 +243,8 @@ def page(full: bool) -> Page:
             frequencies_section(),
             equations_section(1 if full else 2),
             trends_section(),
-            conclusions_section(),
             forced_section(),
             orbit_section(),
-            index_section(),
+            inventory("cardan", **found()),
         ),
     )

@@ -14,7 +14,7 @@ from scipy.optimize import root
 
 import drivetrain_jax as dt
 from benchmarks.validation import tripod_chaos
-from benchmarks.validation.document import Page, markdown
+from benchmarks.validation.document import Page, inventory, markdown
 from drivetrain_jax import Tripod, floquet
 from tests.oracles import tripod_reference as oracle
 
@@ -237,5 +237,5 @@ def page(full: bool) -> Page:
         "Validation of the double-tripod driveshaft",
         "Bugaru & Vasile 2022 against this package; the reconstructed equations are in "
         "[theory/tripod.md](../theory/tripod.md).",
-        (*sections, *tripod_chaos.sections(full)),
+        (*sections, *tripod_chaos.sections(full), inventory("tripod")),
     )
