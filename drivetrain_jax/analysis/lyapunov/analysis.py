@@ -32,8 +32,10 @@ from drivetrain_jax.analysis.lyapunov.growth_record import (
     SETTLED,
     Record,
     block_mean,
+    mean_growth,
     record_growth,
     running_mean,
+    weighted_mean,
 )
 from drivetrain_jax.analysis.lyapunov.march_steps import LEAST, MOST, contraction, needed_steps
 from drivetrain_jax.analysis.lyapunov.paper_estimator import paper_estimator
@@ -79,34 +81,38 @@ _CHUNK = 64
 
 
 class Spectrum(NamedTuple):
-    """Exponents in falling order and their errors, ``(m, ...)``; ``order``: place of each in the record."""
+    """Exponents in falling order and their errors, ``(m, ...)``; ``order``: place of each in the record; ``weighted``: true
+    where they are weighted means, ``(...)``."""
 
     values: Array
     errors: Array
     order: Array
+    weighted: Array
 
 
 def spectrum_of(record: Record) -> Spectrum:
     """Exponents after the transient. For an unbounded motion: means over the recorded time, errors NaN."""
-    values, errors = mean_rate(record, record.growth)
+    values, errors, weighted = mean_growth(record, record.span)
+    values = jnp.where(record.bounded, values, _until_the_end(record, record.growth))
+    errors = jnp.where(record.bounded, errors, jnp.nan)
     order = jnp.argsort(-values, axis=0)
-    return Spectrum(*(jnp.take_along_axis(x, order, axis=0) for x in (values, errors)), order)  # pyright: ignore[reportCallIssue]
+    return Spectrum(*(jnp.take_along_axis(x, order, axis=0) for x in (values, errors)), order, weighted)  # pyright: ignore[reportCallIssue]
 
 
-def mean_rate(record: Record, series: Array) -> tuple[Array, Array]:
-    """Mean rate of ``series`` (SEGMENTS, m, ...) after the transient, and its error (NaN for an unbounded motion)."""
-    values, errors = block_mean(series, record.used, record.span)
-    partial_mean = running_mean(series, record.used, record.span)
-    last = jnp.arange(SEGMENTS).reshape(-1, *(1,) * values.ndim) == record.used - 1
-    until = jnp.sum(jnp.where(last, partial_mean, 0.0), axis=0)
-    until = jnp.where(record.used > 0, until, jnp.nan)
-    return jnp.where(record.bounded, values, until), jnp.where(record.bounded, errors, jnp.nan)
+def _until_the_end(record: Record, series: Array) -> Array:
+    """Mean rate of ``series`` (SEGMENTS, m, ...) over the recorded time."""
+    means = running_mean(series, record.used, record.span)
+    last = jnp.arange(SEGMENTS).reshape(-1, *(1,) * (series.ndim - 1)) == record.used - 1
+    return jnp.where(record.used > 0, jnp.sum(jnp.where(last, means, 0.0), axis=0), jnp.nan)
 
 
 def sum_rule_residual(record: Record, spectrum: Spectrum) -> Array:
-    """Sum of the exponents minus the divergence averaged over the same time; the phases add nothing to either."""
-    mean, _ = mean_rate(record, record.contraction[:, None])
-    return jnp.sum(spectrum.values, axis=0) - mean[0]
+    """Sum of the exponents minus the divergence averaged alike; the phases add nothing to either."""
+    series = record.contraction[:, None]
+    plain, _ = block_mean(series, record.used, record.span)
+    weighted, _ = weighted_mean(series, record.contraction_moment[:, None], record.used, record.span)
+    mean = jnp.where(spectrum.weighted, weighted, plain)
+    return jnp.sum(spectrum.values, axis=0) - jnp.where(record.bounded, mean, _until_the_end(record, series))[0]
 
 
 class Run(NamedTuple):
@@ -201,7 +207,7 @@ def analyse(flow: Flow, request: Request) -> dict[str, Array]:
 
 def _outcome(fine: Record, found: Findings, target: float) -> Array:
     """The outcome of every member, int8."""
-    values, errors, _ = found.spectrum
+    values, errors = found.spectrum.values, found.spectrum.errors
     met = found.resolved & ((target == 0) | ~fine.bounded | (jnp.max(errors, axis=0) <= target))
     outcome = jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
     return jnp.where(jnp.all(jnp.isfinite(values), axis=0), outcome, Outcome.NOT_FINITE).astype(jnp.int8)

@@ -106,8 +106,13 @@ def _draw_curves(axes: Axes, dataset: xr.Dataset, key: str, name: str) -> None:
         if key == "lyapunov_spectrum" and "lyapunov_standard_error" in dataset:
             band = 3 * dataset["lyapunov_standard_error"].isel({own[0]: k}).values
             axes.fill_between(x, values - band, values + band, color=_COLOURS[k], alpha=0.2, linewidth=0)
+    columns = variable.sizes[own[0]] if own else 0
+    if key == "paper_estimator":
+        # Its criterion (39) is about the sum.
+        axes.plot(x, variable.sum(own[0], skipna=False), color=FRAME_GREY, linestyle="--", label="sum")
+        columns += 1
     if own:
-        axes.legend(title=own[0], ncols=variable.sizes[own[0]], loc="best", fontsize=7.5, title_fontsize=7.5)
+        axes.legend(title=own[0], ncols=columns, loc="best", fontsize=7.5, title_fontsize=7.5)
 
 
 def _verdict_strip(axes: Axes, dataset: xr.Dataset, name: str) -> list[Artist]:
