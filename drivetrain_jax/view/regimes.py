@@ -54,15 +54,39 @@ def draw_threshold(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: s
     return handles
 
 
-def draw_flanks(dataset: xr.Dataset, over_time: Axes, portrait: Axes) -> list[Line2D]:
-    """Draw both flanks of the play over time and in the phase portrait; the legend entry, none without a known play."""
+def draw_bands(dataset: xr.Dataset, name: str, *panels: Axes) -> list[Patch]:
+    """Shade the values of the axis ``name`` by regime, if stored; the legend entries of the regimes that occur."""
+    if "regime" not in dataset:
+        return []
+    order = np.argsort(dataset[name].values)
+    codes = dataset["regime"].where(dataset["outcome"] < FIRST_FAILURE, FAILED).values[order]
+    edges = cells.cell_edges(dataset[name].values[order])
+    for axes in panels:
+        for code, left, right in zip(codes, edges, edges[1:], strict=False):
+            axes.axvspan(left, right, facecolor=COLOURS[int(code)], alpha=0.35, linewidth=0, zorder=0)
+    present = sorted({int(code) for code in codes if code < FAILED})
+    return [
+        Patch(facecolor=COLOURS[k], alpha=0.35, edgecolor=FRAME_GREY, linewidth=0.6, label=_NAMES[k]) for k in present
+    ]
+
+
+def half_play(dataset: xr.Dataset) -> float | None:
+    """Half the play, if it is known and does not vary."""
     play = cells.role(dataset, "half_play")
     half = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get(play, {}).get("value")
-    half = dataset[play].item() if play in dataset.coords else half
+    if play in dataset.coords:
+        return dataset[play].item() if dataset[play].ndim == 0 else None
+    return half
+
+
+def draw_flanks(dataset: xr.Dataset, *horizontal: Axes, portrait: Axes | None = None) -> list[Line2D]:
+    """Draw both flanks of the play as horizontal lines, in a phase portrait as vertical ones; the legend entry, none
+    without a known play."""
+    half = half_play(dataset)
     if half is None:
         return []
     style = {"color": FRAME_GREY, "linewidth": 0.8, "linestyle": (0, (2, 2))}
-    lines = [over_time.axhline(side, label="flanks", **style) for side in (half, -half)]
-    for side in (half, -half):
-        portrait.axvline(side, **style)
+    lines = [axes.axhline(side, label="flanks", **style) for axes in horizontal for side in (half, -half)]
+    for side in (half, -half) if portrait else ():
+        portrait.axvline(side, **style)  # pyright: ignore[reportOptionalMemberAccess]
     return lines[:1]

@@ -3,10 +3,12 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.colors import to_hex
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.basins import figure as basins
 from drivetrain_jax.view import plot
+from drivetrain_jax.view.regimes import COLOURS
 
 FIXED = json.dumps({"b": {"value": 0.17, "units": "m", "long_name": "half the backlash"}})
 ROLES = json.dumps({"speed": "omega", "initial_displacement": "u0", "initial_rate": "v0", "half_play": "b"})
@@ -114,12 +116,32 @@ def test_curves_tell_failures_from_motions_that_are_not_periodic():
     dataset = result({"omega": [0.5, 1.0, 1.5]}, u_max=[1.0, 2.0, np.nan], period_multiple=[1, 0, 0])
     dataset["outcome"][2] = 2
     figure = plot(dataset)
-    assert labels(figure) == ["u_max", "non-periodic", "failed (1)"]
+    assert labels(figure) == ["u_max", "non-periodic", "flanks", "failed (1)"]
     np.testing.assert_array_equal(figure.axes[1].lines[0].get_ydata(), [1, 0, np.nan])
     (crosses,) = [line for line in figure.axes[0].lines if line.get_label() == "failed (1)"]
     assert crosses.get_xdata().tolist() == [1.5]
     dataset["outcome"][:] = 2
-    assert labels(plot(dataset)) == ["u_max", "failed (3)"]
+    assert labels(plot(dataset)) == ["u_max", "flanks", "failed (3)"]
+
+
+def test_curves_show_both_flanks_and_bands_of_the_regimes():
+    """Impact velocity and contact fraction of both flanks; every value of the axis is a band in the colour of its regime."""
+    omega, by_flank = [0.5, 1.0, 1.5], np.array([[1.0, np.nan], [2.0, 0.5], [3.0, 0.7]])
+    dataset = result({"omega": omega}, u_max=[1.0, 2.0, 3.0], regime=[1, 2, 0])
+    for name in ("impact_velocity", "contact_fraction"):
+        dataset[name] = ("omega", "flank"), by_flank, {"units": "1", "long_name": name}
+    dataset = dataset.assign_coords(flank=["drive", "back"])
+    figure = plot(dataset)
+    named = ["u_max", "flanks", "drive flank", "back flank", "no separation", "single-sided", "double-sided"]
+    assert labels(figure) == named
+    extremes, *others = figure.axes
+    assert sorted(line.get_ydata()[0] for line in extremes.lines if line.get_label() == "flanks") == [-0.17, 0.17]
+    for axes in others:
+        np.testing.assert_array_equal([line.get_ydata() for line in axes.lines], by_flank.T)
+    for axes in figure.axes:
+        shown = [to_hex(band.get_facecolor()) for band in axes.patches]
+        assert shown == [COLOURS[k] for k in (1, 2, 0)]
+        assert [band.get_x() for band in axes.patches] == [0.25, 0.75, 1.25]
 
 
 def test_a_single_value_of_the_axis_is_said_to_be_one():

@@ -98,7 +98,7 @@ def _draw(history: xr.Dataset, along: Axes, rate: Axes, portrait: Axes) -> None:
     portrait.set_xlabel(_label(history, first))
     for axes in (along, rate) if history.sizes["time"] > 1 else ():
         axes.set_xlim(history["time"].values[0], history["time"].values[-1])
-    regimes.draw_flanks(history, along, portrait)
+    regimes.draw_flanks(history, along, portrait=portrait)
     if not np.isfinite(x).any():
         for axes in (along, rate, portrait):
             axes.text(0.5, 0.5, "no values", transform=axes.transAxes, ha="center", va="center", color=FRAME_GREY)

@@ -39,8 +39,9 @@ def plot(dataset: xr.Dataset) -> Figure:
     """The figure of a ``steady_state`` result, by its axes.
 
     - none: time history and phase portrait of the motion (needs ``u_history`` and ``v_history``); - one: extremes, period
-    multiple and growth along it; - the initial state: basins of the attractors with the share of each; - any other two: the
-    regime and the largest displacement, with a predicted threshold.
+    multiple, growth, impact velocity and contact fraction of both flanks along it, over bands of the regimes; - the initial
+    state: basins of the attractors with the share of each; - any other two: the regime and the largest displacement, with a
+    predicted threshold.
 
     Axes of one value count as fixed. Raises :class:`InputError` for other axes, and if variables are missing.
     """
@@ -84,43 +85,56 @@ def _maps(dataset: xr.Dataset, names: list[str]) -> Figure:
 def _curves(dataset: xr.Dataset, name: str) -> Figure:
     extremes = cells.require_any(dataset, "u_max", "u_min")
     scalars = [key for key in ("period_multiple", "spectral_radius", "lyapunov_exponent") if key in dataset]
-    panels = Panels(1 + len(scalars), height=1.75, margins=Margins(right=0.3, left=1.0), share_y=False)
-    stack = [row[0] for row in panels.axes]
-    handles: list[Artist] = []
-    other = regimes.COLOURS[regimes.NON_PERIODIC]
+    by_flank = [key for key in ("impact_velocity", "contact_fraction") if key in dataset]
+    panels = Panels(1 + len(scalars) + len(by_flank), height=1.75, margins=Margins(right=0.3, left=1.0), share_y=False)
+    first, *stack = [row[0] for row in panels.axes]
     known = dataset["outcome"] < FIRST_FAILURE
-    wandering = known & (dataset["period_multiple"] == 0) if "period_multiple" in dataset else known & False
-    for key, colour in zip(extremes, LINE_COLOURS, strict=False):
-        label = dataset[key].attrs.get("long_name", key)
-        handles += _dots(stack[0], dataset[name], dataset[key].where(known & ~wandering), colour, label)
-        _dots(stack[0], dataset[name], dataset[key].where(wandering), other, "")
-    if bool(wandering.any()):
-        handles.append(
-            Line2D(
-                [],
-                [],
-                linestyle="",
-                marker="o",
-                markersize=3,
-                color=other,
-                label="non-periodic",
-            )
-        )
-    panels.label_row(stack[0], f"extremes of the displacement [{units_of(dataset[extremes[0]])}]")
-    for axes, key in zip(stack[1:], scalars, strict=True):
-        _dots(axes, dataset[name], dataset[key].where(known), LINE_COLOURS[0], "")
+    handles = _extremes(first, dataset, name, extremes)
+    panels.label_row(first, f"extremes of the displacement [{units_of(dataset[extremes[0]])}]")
+    for axes, key in zip(stack, [*scalars, *by_flank], strict=True):
+        values = dataset[key].where(known)
+        if key in by_flank:
+            entries = _flanks(axes, dataset[name], values)
+            handles += entries if key == by_flank[0] else []
+        else:
+            _dots(axes, dataset[name], values, LINE_COLOURS[0], "")
         panels.label_row(axes, variable_label(dataset[key]))
         if key == "period_multiple":
             axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         limit = {"spectral_radius": 1.0, "lyapunov_exponent": 0.0}.get(key)
         if limit is not None:
             axes.axhline(limit, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)))
-    cells.fit_axis(stack[0], "x", dataset[name].values)
-    handles += cells.draw_failures(stack[0], dataset, name)
+    handles += regimes.draw_bands(dataset, name, first, *stack)
+    cells.fit_axis(first, "x", dataset[name].values)
+    handles += cells.draw_failures(first, dataset, name)
     panels.label_axes(axis_label(dataset[name]))
     panels.titles(dataset)
     panels.legend(handles)
     return panels.figure
+
+
+def _extremes(axes: Axes, dataset: xr.Dataset, name: str, extremes: list[str]) -> list[Artist]:
+    """Draw the extremes, those of non-periodic motions in a colour of their own, and both flanks."""
+    handles: list[Artist] = []
+    other = regimes.COLOURS[regimes.NON_PERIODIC]
+    known = dataset["outcome"] < FIRST_FAILURE
+    wandering = known & (dataset["period_multiple"] == 0) if "period_multiple" in dataset else known & False
+    for key, colour in zip(extremes, LINE_COLOURS, strict=False):
+        label = dataset[key].attrs.get("long_name", key)
+        handles += _dots(axes, dataset[name], dataset[key].where(known & ~wandering), colour, label)
+        _dots(axes, dataset[name], dataset[key].where(wandering), other, "")
+    if bool(wandering.any()):
+        style = {"linestyle": "", "marker": "o", "markersize": 3, "color": other}
+        handles.append(Line2D([], [], label="non-periodic", **style))  # pyright: ignore[reportArgumentType]
+    return [*handles, *regimes.draw_flanks(dataset, axes)]
+
+
+def _flanks(axes: Axes, x: xr.DataArray, y: xr.DataArray) -> list[Line2D]:
+    """Draw the values of both flanks."""
+    handles = []
+    for colour, flank in zip(LINE_COLOURS, y["flank"].values, strict=False):
+        handles += _dots(axes, x, y.sel(flank=flank), colour, f"{flank} flank")
+    return handles
 
 
 def _dots(axes: Axes, x: xr.DataArray, y: xr.DataArray, colour: str, label: str) -> list[Line2D]:
@@ -198,7 +212,7 @@ def _motion(dataset: xr.Dataset) -> Figure:
         Line2D([], [], linestyle="", marker="o", markersize=4, color=LINE_COLOURS[1], label="start of a drive period")
     )
     history.plot(part[0], u[0], "o", markersize=4, color=LINE_COLOURS[1])
-    handles += regimes.draw_flanks(dataset, history, portrait)
+    handles += regimes.draw_flanks(dataset, history, portrait=portrait)
     history.set_xlim(0, 1)
     panels.label_axes("part of the motion's period [1]", variable_label(u))
     # On the left, clear of a power of ten at the right end.
