@@ -97,7 +97,7 @@ class SeriesNodes:
         parts = np.maximum(np.ceil(self._parts * steps), self._least)
         order = np.argsort(-parts, kind="stable")
         chunks = [order[i : i + _LANES] for i in range(0, len(order), _LANES)]
-        # Requested outside of threads, which would compile it twice.
+        # Requested before the threads start: each of them would compile it again.
         kernel, pool = _kernel(self._key, len(x)), threads(usable_cores(), "tile")
         pending = [
             pool.submit(self._along, kernel, {n: c[chosen] for n, c in columns.items()}, end, parts[chosen[0]], x)  # pyright: ignore[reportArgumentType]

@@ -156,7 +156,7 @@ class StabilityAtlas:
 
     @property
     def _multipliers(self) -> int:
-        # Reading the panels takes no time.
+        # The shape of the panels tells it without a solve.
         return round(self.atlas.panels[0].coefficients.shape[-1] ** 0.5) if self.atlas.panels else self._form.size
 
     @cached_property

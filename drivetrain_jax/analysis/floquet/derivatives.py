@@ -26,7 +26,7 @@ from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 TIED = 1e-11
 # Relative error of the matrix Z by the steps for 1e-11: the largest at 600 random cardan shafts was 2.5e-12.
 _MATRIX_ERROR = 3e-12
-# Derivatives p'(s) of multipliers in units of the spectral radius, below which these are not simple.
+# Below this |p'(s)|, in units of the spectral radius, a multiplier s does not count as simple.
 _SIMPLE = 1e-7
 
 Build = Callable[[Any], FloquetModel]

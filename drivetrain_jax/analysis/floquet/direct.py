@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from drivetrain_jax.analysis.floquet.propagator import Propagator
     from drivetrain_jax.systems import LinearPeriodic
 
-# Doublings of the predicted number of steps that a batch may take, and the steps at which there is no further one.
+# A batch may double its predicted number of steps this often, and not beyond this number of steps.
 _MAX_REFINEMENTS = 6
 _MAX_STEPS = 2**20
 # The explicit scheme is stable for decays of up to this much in a step.

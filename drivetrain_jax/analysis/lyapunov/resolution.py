@@ -59,8 +59,8 @@ def resolved(spectrum: Array, error: Array, residual: Array, period: Any, coarse
     """Flags where the exponents sum to the divergence and a positive largest one is confirmed by twice the step; shape
     (...).
 
-    ``coarse``, ``coarse_error``: the largest one with twice the step. Unbounded motions have no significant exponent: only
-    the sum counts for them.
+    ``coarse`` is the largest exponent found with twice the step, ``coarse_error`` its error. Unbounded motions have no
+    significant exponent: only the sum counts for them.
     """
     same = same_exponent(spectrum[0], error[0], coarse, coarse_error)
     return adds_up(spectrum, error, residual, period) & (same | ~significant(spectrum, error))

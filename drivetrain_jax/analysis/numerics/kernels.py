@@ -30,8 +30,8 @@ FULL_WIDTH = 8
 _APART = {"inlineable": "false"}
 # XLA does this by default for loops over less than half a kilobyte.
 _ONE_KERNEL = {**_APART, "xla_cpu_small_call": "true"}
-# Operations that may be part of such a kernel. Sorting, scattering, calls of libraries and (by their new emitters) sums
-# and maxima over an axis may not.
+# Operations that may be part of such a kernel. Not among them are sorting, scattering, calls of libraries, and sums and
+# maxima over an axis (XLA compiles these in another way).
 _ELEMENTWISE = """
     abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy cos cosh
     div eq erf erfc exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max min mul ne neg not
