@@ -5,13 +5,17 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import distributed
 
 from benchmarks.timing import PROCESSES, interleaved, median
 from drivetrain_jax._machine import usable_cores
@@ -151,27 +155,55 @@ class Place:
     over_threads: float
 
 
+@contextmanager
+def dask_cluster(folder: Path) -> Iterator[str]:
+    """The address of a scheduler with single-threaded workers, each started by a command of its own."""
+    file = folder / "scheduler.json"
+    common = ["--no-dashboard", "--scheduler-file", str(file)]
+    worker = ["dask_worker", "--nthreads", "1", "--local-directory", str(folder), *common]
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-m", f"distributed.cli.{name}", *options],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for name, *options in (["dask_scheduler", "--port", "0", *common], *[worker] * PROCESSES)
+    ]
+    try:
+        while not file.exists():
+            time.sleep(0.05)
+        address = json.loads(file.read_text())["address"]
+        with distributed.Client(address, set_as_default=False) as client:
+            client.wait_for_workers(PROCESSES)
+        yield address
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+        file.unlink(missing_ok=True)
+
+
 def places(points: int, repeats: int, folder: Path) -> list[Place]:
-    """Threads, processes that the run starts, and a Dask cluster that is there and has compiled; the same cores."""
-    import distributed
-
+    """Threads, processes that the run starts, and a Dask cluster in its first run, whose workers import and compile, and
+    after it; the same cores."""
     content, out = scene(points), folder / "places.nc"
-    with distributed.LocalCluster(
-        n_workers=PROCESSES, threads_per_worker=1, processes=True, dashboard_address=None
-    ) as cluster:
 
-        def job(executor: Executor) -> Callable[[], Any]:
-            return lambda: run_to_file(content, out, fresh=True, executor=executor)
+    def job(executor: Executor) -> Callable[[], Any]:
+        return lambda: run_to_file(content, out, fresh=True, executor=executor)
 
+    with dask_cluster(folder) as address:
+        on_dask, workers = job(make_executor(dask=address)), f"{PROCESSES} workers of a Dask cluster"
+        first = seconds(on_dask)
         jobs = {
             f"{PROCESSES} threads": job(Threads(PROCESSES)),
             f"{PROCESSES} processes, their start included": job(make_executor(workers=PROCESSES)),
-            f"{PROCESSES} workers of a Dask cluster": job(make_executor(dask=cluster.scheduler_address)),
+            f"{workers}, again": on_dask,
         }
         for run in jobs.values():
             run()
         found = {name: median(times) for name, times in interleaved(jobs, repeats).items()}
     threads = next(iter(found.values()))
+    found[f"{workers}, first run"] = first
     return [Place(name, points, value, value / threads - 1) for name, value in found.items()]
 
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import logging
+import pickle
 import re
 import uuid
+from collections import deque
 from collections.abc import Generator, Iterable
 from contextlib import ExitStack
+from itertools import islice
+from operator import length_hint
 from typing import Any
 
 from drivetrain_jax._errors import InputError, RetryableError
@@ -18,6 +22,12 @@ _PATIENCE = "10s"
 _LOCAL = re.compile(r"local:([1-9]\d*)")
 # Loggers of Dask that report the death of a scheduler or worker; the run reports it in one line.
 _TALKATIVE = ("distributed", "tornado", "asyncio")
+# Seconds of work and bytes of results of one request: it costs client, scheduler and worker some milliseconds.
+_SECONDS, _BYTES = 1.0, 1 << 24
+# Factor by which requests grow from one to the next.
+_GROWTH = 4
+# Requests per worker that the remaining tasks make at least, so that all workers end at the same time.
+_FEWEST = 4
 
 
 class Cluster(Executor):
@@ -45,21 +55,32 @@ class Cluster(Executor):
         distributed = _distributed()
         if self._client is None:
             self._client = _connect(distributed, self._address, self._connection)
-        parcel, remaining, running = Parcel.of(computation), iter(tasks), {}
+        parcel, running = Parcel.of(computation), {}
+        workers = max(sum(self._client.nthreads().values()), 1)
+        requests = _Requests(tasks, workers)
         finished = distributed.as_completed(loop=self._client.loop)
-        room = IN_FLIGHT * max(sum(self._client.nthreads().values()), 1)
         # A random part of the key: another run on the same scheduler uses the same numbers.
         run = uuid.uuid4().hex
         while True:
-            while len(running) < room and (task := next(remaining, None)) is not None:
-                future = self._client.submit(worker.compute, parcel, task, key=f"chunk-{task.number}-{run}")
-                running[future.key] = task
+            while len(running) < IN_FLIGHT * workers and (request := requests.take()):
+                key = f"chunk-{request[0].number}-{len(request)}-{run}"
+                future = self._client.submit(worker.compute_all, parcel, request, key=key)
+                running[future.key] = request
                 finished.add(future)
             if not running:
                 return
             future = next(finished)
-            yield running.pop(future.key), _result(distributed, future)
+            request, found = running.pop(future.key), _result(distributed, future)
             future.release()
+            if found is None:
+                if len(request) > 1:
+                    requests.divide(request)
+                else:
+                    yield request[0], None
+                continue
+            packed, seconds = found
+            requests.learn(len(request), len(packed), seconds)
+            yield from zip(request, pickle.loads(packed), strict=True)
 
     def close(self) -> None:
         """Disconnect, and end a local cluster."""
@@ -67,7 +88,34 @@ class Cluster(Executor):
         self._connection.close()
 
 
-def _result(distributed: Any, future: Any) -> Results | None:
+class _Requests:
+    """Tasks in requests of about ``_SECONDS`` of work, fewer towards the end if the number of tasks is known."""
+
+    def __init__(self, tasks: Iterable[Any], workers: int) -> None:
+        self._tasks, self._workers = iter(tasks), workers
+        self._alone: deque[Any] = deque()
+        # Without that number, tasks are requested one by one.
+        self._size, self._most = 1, 1 << 20 if length_hint(self._tasks) else 1
+
+    def take(self) -> tuple[Any, ...]:
+        """The tasks of the next request; none if all are taken."""
+        if self._alone:
+            return (self._alone.popleft(),)
+        share = -(-length_hint(self._tasks) // (_FEWEST * self._workers))
+        return tuple(islice(self._tasks, max(1, min(self._size, share))))
+
+    def divide(self, request: Iterable[Any]) -> None:
+        """Request these tasks one by one: one of them kills workers."""
+        self._alone.extend(request)
+
+    def learn(self, count: int, size: int, seconds: float) -> None:
+        """Choose the size of the next requests from a finished one: its number of tasks, bytes of results, and seconds."""
+        wanted = count * min(_SECONDS / max(seconds, 1e-9), _BYTES / max(size, 1))
+        # In steps, because the first tasks of a worker compile, and results may differ in size.
+        self._size = max(1, min(int(wanted), max(self._size, _GROWTH * count), self._most))
+
+
+def _result(distributed: Any, future: Any) -> tuple[bytes, float] | None:
     try:
         return future.result()
     except distributed.KilledWorker:

@@ -176,7 +176,7 @@ class Job:
 
     def ordered(self, numbers: Iterable[int]) -> Iterator[Chunk]:
         """Yield the chunks with these numbers in the order of computation, each created on demand."""
-        return map(self.plan.chunk, self.plan.ordered(numbers))
+        return iter(_Chunks(self.plan, self.plan.ordered(numbers)))
 
     def prepare(self, kernels: Set[tuple[int, int]]) -> None:
         """Start compiling kernels (position of the solver, chunk size) in parallel, without waiting."""
@@ -200,6 +200,19 @@ class Job:
             solver = self.solvers[chunk.solver].name
             kind = RetryableError if _is_retryable(error) else ChunkError
             raise kind(f"chunk {chunk.number} ({solver}): {type(error).__name__}: {error}") from error
+
+
+class _Chunks:
+    """Chunks of a plan that are created one by one; an iterator of it knows how many are left."""
+
+    def __init__(self, plan: Plan, numbers: np.ndarray) -> None:
+        self._plan, self._numbers = plan, numbers
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def __getitem__(self, position: int) -> Chunk:
+        return self._plan.chunk(self._numbers[position])
 
 
 def _restored(problem: Problem, route: Route, full_size: bool) -> Job:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import pickle
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -45,3 +48,9 @@ def prepare(parcel: Parcel) -> int:
 def compute(parcel: Parcel, task: Any) -> Results:
     """Results of ``task``, without planning. Raises :class:`Mismatch`, or any error of the computation."""
     return _unpacked(parcel).compute(task)
+
+
+def compute_all(parcel: Parcel, tasks: Sequence[Any]) -> tuple[bytes, float]:
+    """The results of ``tasks``, pickled as one piece: Dask sends each array of an object by itself. And the seconds."""
+    begin = time.monotonic()
+    return pickle.dumps([dict(compute(parcel, task)) for task in tasks]), time.monotonic() - begin

@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ import xarray as xr
 import drivetrain_jax as dt
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.runs import toml
+from drivetrain_jax.runs import cluster, toml
 from drivetrain_jax.runs.cluster import Cluster
 from drivetrain_jax.runs.executor import Threads, run_threads
 from drivetrain_jax.runs.executors import make_executor
@@ -206,6 +207,56 @@ def test_runs_on_one_scheduler_do_not_share_chunks(monkeypatch):
             assert len(found) == 3
             for wanted, got in found:
                 np.testing.assert_array_equal(got, wanted)
+
+
+class Numbers:
+    """Forty tasks whose number is known in advance."""
+
+    def __len__(self):
+        return 40
+
+    def __getitem__(self, number):
+        return Chunk(range(40)[number], 0, 1, np.array([number]), 1)
+
+
+def test_requests_of_several_tasks_lose_only_the_one_that_kills_workers(monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    compute_all, take, requests = cluster.worker.compute_all, cluster._Requests.take, []
+
+    def taken(self):
+        requests.append([task.number for task in take(self)])
+        return tuple(map(Numbers().__getitem__, requests[-1]))
+
+    def deadly(parcel, tasks):
+        if any(task.number == 17 for task in tasks):
+            raise distributed.KilledWorker("task", SimpleNamespace(address="tcp://"), 3)
+        return compute_all(parcel, tasks)
+
+    monkeypatch.setattr(cluster._Requests, "take", taken)
+    monkeypatch.setattr(cluster.worker, "compute_all", deadly)
+    monkeypatch.setattr(cluster.worker, "compute", lambda _, chunk: {"points": chunk.points})
+    options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
+    with distributed.LocalCluster(**options) as started, closing(Cluster(started.scheduler_address)) as executor:
+        found = {chunk.number: results for chunk, results in executor.run(Digest("d"), Numbers())}
+    assert found.pop(17) is None and found == {n: {"points": n} for n in range(40) if n != 17}
+    requests = [request for request in requests if request]
+    assert len(requests) < 30 and [17] in requests and max(map(len, requests)) > 3
+    # Small at the start, and again at the end, so that all workers end at the same time.
+    assert len(requests[0]) == len(requests[-1]) == 1
+
+
+def test_requests_are_as_long_as_a_second_and_as_large_as_the_network_likes():
+    requests = cluster._Requests(range(100_000), 2)
+    assert requests.take() == (0,)
+    for _ in range(9):
+        count = len(requests.take())
+        requests.learn(count, 8, 0.01 * count)
+    assert len(requests.take()) == 100
+    requests.learn(100, 1 << 25, 1.0)
+    assert len(requests.take()) == 50
+    unknown = cluster._Requests(iter(x for x in range(9)), 1)
+    unknown.learn(1, 8, 0.001)
+    assert unknown.take() == (0,) and unknown.take() == (1,)
 
 
 @pytest.mark.parametrize(("values", "ahead"), [(1, 32), (1 << 20, 2)])
