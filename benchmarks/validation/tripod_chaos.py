@@ -226,7 +226,7 @@ def _pair(values: Sequence[float], digits: int = 4) -> str:
 def sections(full: bool) -> tuple[str, ...]:
     """The chaos part of the tripod's page."""
     return (
-        spectra_section(full),
+        spectra_section(),
         estimator_section(),
         independent_section(),
         controls_section(full),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -90,10 +92,14 @@ def test_outputs_without_a_figure_are_named():
 
 def section(count: int, spread: float) -> xr.Dataset:
     turn = np.linspace(0, 20, count)
+    state = [
+        {"name": "phi", "units": "rad", "long_name": "twist", "symbol": ""},
+        {"name": "v", "units": "rad/s", "long_name": "rate", "symbol": "", "scale": 1e3},
+    ]
     points = np.stack([6e-5 + spread * np.cos(turn), spread * np.sin(turn)], axis=-1)
     return xr.Dataset(
         {"section": (("strobe", "state"), points), "outcome": ((), np.int8(0)), "distinct_points": ((), 1)},
-        attrs={"analysis": "poincare", "title": "made up"},
+        attrs={"analysis": "poincare", "title": "made up", "state": json.dumps(state)},
     )
 
 
