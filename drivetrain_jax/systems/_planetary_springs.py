@@ -86,8 +86,8 @@ def _extensions(p: Mapping[str, Array], directions: Array) -> tuple[Array, Array
     planet's own coordinates (4, 3, ...). Rows: springs by kind, then planet; then the bearings of the bodies."""
     n, lanes = directions.shape[0], directions.shape[2:]
     # Rows: two bearings of a planet, which have no pressure angle, and its meshes.
-    angle = jnp.stack([p["pressure_angle_r"]] * 3 + [p["pressure_angle_s"]])
-    weights = (jnp.ones_like(angle), jnp.cos(angle), jnp.sin(angle))
+    angle, meshes = jnp.stack([p["pressure_angle_r"], p["pressure_angle_s"]]), np.array([0, 0, 0, 1])
+    weights = (jnp.ones((4, *lanes)), jnp.cos(angle)[meshes], jnp.sin(angle)[meshes])
     central, own = (
         sum(
             w.reshape(4, *(1,) * (part.ndim - 1), *lanes) * part[(...,) + (None,) * len(lanes)]
