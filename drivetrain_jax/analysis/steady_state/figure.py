@@ -125,7 +125,7 @@ def _extremes(axes: Axes, dataset: xr.Dataset, name: str, extremes: list[str]) -
         _dots(axes, dataset[name], dataset[key].where(wandering), other, "")
     if bool(wandering.any()):
         style = {"linestyle": "", "marker": "o", "markersize": 3, "color": other}
-        handles.append(Line2D([], [], label="non-periodic", **style))  # pyright: ignore[reportArgumentType]
+        handles.append(Line2D([], [], label="non-periodic", **style))
     return [*handles, *regimes.draw_flanks(dataset, axes)]
 
 
