@@ -12,6 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._errors import ChunkError, InputError
+from drivetrain_jax._precision import use_double_precision
 from drivetrain_jax._registration import register_accessor
 
 if TYPE_CHECKING:
@@ -111,4 +112,5 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
+use_double_precision()
 register_accessor()

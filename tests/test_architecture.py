@@ -117,48 +117,6 @@ def test_figures_and_rules_do_without_jax():
     assert python(f"import sys, {', '.join(names)}; print('jax' in sys.modules)") == "False"
 
 
-# Names a folder to jax and computes nothing.
-WITHOUT_NUMBERS = "drivetrain_jax.runs.compile_cache"
-
-
-def test_every_module_with_jax_sets_double_precision():
-    """Each alone and first, in a process of its own: forked from one that has loaded the libraries and computed nothing.
-
-    A folder that sets double precision does so for all its modules, because it is imported before them.
-    """
-    code = f"""
-import builtins, importlib, os
-import diffrax, h5py, jax, matplotlib.figure, scipy.integrate, xarray
-
-load, with_jax = builtins.__import__, False
-
-def watched(name, scope=None, *others):
-    global with_jax
-    loaded = load(name, scope, *others)
-    if (scope or {{}}).get("__name__", "").startswith("drivetrain_jax"):
-        with_jax |= name.partition(".")[0] in ("jax", "diffrax", "equinox", "lineax", "optimistix")
-        if jax.config.jax_enable_x64:
-            os._exit(0)
-    return loaded
-
-builtins.__import__ = watched
-assert not jax.config.jax_enable_x64
-right = ()
-for name in {modules("")}:
-    if name.startswith(right):
-        continue
-    child = os.fork()
-    if child == 0:
-        importlib.import_module(name)
-        os._exit(1 + with_jax)
-    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    right += (f"{{name}}.",) * (status == 0)
-    if status not in (0, 1):
-        print(name)
-"""
-    assert python(code) == WITHOUT_NUMBERS
-
-
 def scenes() -> dict[tuple[str, str], dict]:
     """The first scene of ``sweeps/`` for every analysis of every system of the package, with its default results."""
     found: dict[tuple[str, str], dict] = {}

@@ -209,6 +209,19 @@ def test_a_chart_of_gradients():
     assert float(chart.slope[1]) == pytest.approx(-4.592945, abs=1e-6)
 
 
+@pytest.mark.parametrize("first", ["import jax, drivetrain_jax as dt", "import drivetrain_jax as dt, jax"])
+def test_the_first_use_may_be_inside_a_traced_function(first):
+    code = f"""
+{first}
+@jax.jit
+def radius(omega):
+    return dt.floquet(dt.Cardan(beta=0.3, Omega=omega, zeta=1e-3, alpha=1.0, mu=1.0, gamma=100.0)).spectral_radius
+found = radius(1.416)
+assert found.dtype == "float64" and abs(found - 1.0319354931451954) < 1e-9, found
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_who_embeds_the_package_may_keep_single_precision():
     code = """
 import os

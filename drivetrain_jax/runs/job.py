@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Set
 from concurrent.futures import Future
@@ -15,6 +14,7 @@ import jax
 import numpy as np
 
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
+from drivetrain_jax._precision import use_double_precision
 from drivetrain_jax._threads import threads
 from drivetrain_jax.analysis import Solver
 from drivetrain_jax.runs import compile_cache
@@ -102,7 +102,7 @@ class Job:
     def solvers(self) -> tuple[Solver, ...]:
         """The solvers that a plan chooses from."""
         # Before the first kernel, which the plan may need.
-        _use_double_precision()
+        _check_double_precision()
         compile_cache.enable()
         solvers = self.problem.analysis.solvers(self.problem.system, self.problem.request)
         return tuple(map(for_device, solvers))
@@ -219,10 +219,10 @@ def _restored(problem: Problem, route: Route, full_size: bool) -> Job:
     return Job(problem, route, full_size=full_size)
 
 
-def _use_double_precision() -> None:
-    """Set jax to double precision again, unless the environment variable leaves that to the caller."""
-    if not jax.config.jax_enable_x64 and os.environ.get("DRIVETRAIN_JAX_ENABLE_X64") != "0":  # pyright: ignore[reportAttributeAccessIssue]
-        jax.config.update("jax_enable_x64", True)
+def _check_double_precision() -> None:
+    """Set jax to double precision again, unless that is left to the caller."""
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        use_double_precision()
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise InputError("jax_enable_x64 = False: set by the context of this call; allowed is jax.enable_x64(True)")
 

@@ -3,16 +3,8 @@
 
 from __future__ import annotations
 
-import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
-
-import jax
-
-# Double precision is turned on only here: every module that computes imports this package first. The environment variable
-# leaves the choice to the caller.
-if os.environ.get("DRIVETRAIN_JAX_ENABLE_X64") != "0":
-    jax.config.update("jax_enable_x64", True)
 
 from drivetrain_jax._plugins import SYSTEMS, load_plugin, plugin_names
 from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable

@@ -109,7 +109,7 @@ def _draw_curves(axes: Axes, dataset: xr.Dataset, key: str, name: str) -> None:
     columns = variable.sizes[own[0]] if own else 0
     if key == "paper_estimator":
         # Its criterion (39) is about the sum.
-        axes.plot(x, variable.sum(own[0], skipna=False), color=FRAME_GREY, linestyle="--", label="sum")
+        axes.plot(x, variable.values.sum(axis=-1), color=FRAME_GREY, linestyle="--", label="sum")
         columns += 1
     if own:
         axes.legend(title=own[0], ncols=columns, loc="best", fontsize=7.5, title_fontsize=7.5)
