@@ -164,3 +164,16 @@ def modes(system: System, *, outputs: Sequence[str] | None = None, **options: An
     727.27
     """
     return analyse("modes", system, outputs, options)
+
+
+def harmonic_response(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
+    """Steady vibration of a planetary gear under harmonic transmission errors and torques, over the frequency.
+
+    Args as of :func:`floquet`; options ``stop`` [Hz] with ``start`` and ``num``, ``damping_ratio`` of all modes. Outputs
+    ``amplitude`` (num, dofs) [m] (default) and ``phase`` [rad]. No derivatives.
+
+    >>> import drivetrain_jax as dt
+    >>> dt.harmonic_response(dt.Planetary(e_s=1e-6), stop=3000.0, num=101).amplitude.shape
+    (101, 21)
+    """
+    return analyse("harmonic_response", system, outputs, options)

@@ -120,9 +120,9 @@ def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapp
     values = {key: value for key, value in system.values.items() if key in model.parameters}
     try:
         request = make_request(type(system), analysis, [outputs] if isinstance(outputs, str) else outputs, options)
-        analysis.dimensions(type(system), request, values)
         if model.check:
             model.check(values)
+        analysis.dimensions(type(system), request, values)
     except ValueError as error:
         # The tables of a scene are no concern of someone who gave none.
         raise InputError(re.sub(r"^(fixed|options)\.", "", str(error))) from None

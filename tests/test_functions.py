@@ -85,6 +85,7 @@ ABSENT = {
 }
 OPTIONS = {
     "history": {"stop": 1e-3, "num": 5}, "critical_speeds": {"operating_max": 3000.0}, "modes": {"track": "k_p"},
+    "harmonic_response": {"stop": 1e3, "num": 5},
 }  # fmt: skip
 
 

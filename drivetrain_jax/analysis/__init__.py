@@ -27,6 +27,7 @@ _BUILT_IN = (
     "poincare",
     "parameters",
     "modes",
+    "harmonic_response",
     "steady_state",
     "basins",
     "critical_speeds",

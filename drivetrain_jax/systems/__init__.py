@@ -11,7 +11,7 @@ from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
 from drivetrain_jax.resonances import Family, Resonances
 from drivetrain_jax.systems._base import Model, System, parameter, serves
 from drivetrain_jax.systems._flow import Flow
-from drivetrain_jax.systems._modal import Block, SpringSystem
+from drivetrain_jax.systems._modal import Block, DrivenSprings, SpringSystem
 from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator
 from drivetrain_jax.systems._rows import dense
 from drivetrain_jax.systems._shaft import Shaft
@@ -33,6 +33,7 @@ __all__ = [
     "Component",
     "Coordinate",
     "Dimension",
+    "DrivenSprings",
     "Family",
     "FloquetModel",
     "Flow",

@@ -1,4 +1,4 @@
-"""Masses joined by springs: the model of the analysis ``modes``."""
+"""Masses joined by springs: the models of the analyses ``modes`` and ``harmonic_response``."""
 
 from __future__ import annotations
 
@@ -49,6 +49,16 @@ class SpringSystem(eqx.Module):
     body_names: tuple[str, ...] = eqx.field(static=True)
     bodies: np.ndarray
     families: int = eqx.field(static=True)
+
+
+class DrivenSprings(eqx.Module):
+    """``M q'' + B^T diag(k) (B q - e) = f`` with harmonic errors e of the springs and forces f.
+
+    ``force`` (dofs, ...), complex, is ``B^T diag(k) e + f``: amplitude times ``exp(i phase)`` for each coordinate.
+    """
+
+    springs: SpringSystem
+    force: Array
 
 
 def weighted_factor(extensions: Array, stiffness: Array, mass: Array) -> Array:

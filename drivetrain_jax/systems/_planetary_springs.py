@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.systems._base import Values
-from drivetrain_jax.systems._modal import Block, SpringSystem, weighted_factor
+from drivetrain_jax.systems._modal import Block, DrivenSprings, SpringSystem, weighted_factor
 
 BODIES = ("carrier", "ring", "sun")
 _CENTRAL = 9
@@ -22,6 +22,7 @@ _BALANCED = 4e-16
 
 
 PER_PLANET = ("m_p", "I_p", "k_sp", "k_rp", "k_p")
+ERRORS = ("e_s", "e_r", "phase_s", "phase_r")
 
 # Extensions of the springs (rows: bearing radially, tangentially, mesh with ring, with sun) per unit of the central
 # coordinates, as coefficients of (1, cos psi, sin psi), times (1, cos a, sin a) of the pressure angle: (2)-(5).
@@ -293,3 +294,34 @@ def rotational_springs(values: Values) -> SpringSystem:
         np.arange(3 + n),
         len(FAMILIES),
     )
+
+
+def driven_springs(values: Values, springs: SpringSystem) -> DrivenSprings:
+    """The gear ``springs`` with transmission errors of its meshes and torques on its bodies, eq (15)."""
+    n, names = len(values["planet_angle"]), springs.dofs
+    given = [_entries(values[name], n) for name in ERRORS] + [jnp.asarray(values[f"T_{body}"]) for body in "crs"]
+    lanes = _lanes(springs.mass[0], *(x[0] for x in given[: len(ERRORS)]), *given[len(ERRORS) :])
+
+    def spread(array: Array, own: int) -> Array:
+        """``array`` with ``own`` axes before those of the lanes."""
+        missing = (1,) * (len(lanes) - array.ndim + own)
+        return jnp.broadcast_to(
+            array.reshape(array.shape[:own] + missing + array.shape[own:]), array.shape[:own] + lanes
+        )
+
+    sun, ring, sun_phase, ring_phase = (spread(x, 1) for x in given[: len(ERRORS)])
+    errors = jnp.concatenate([ring * jnp.exp(1j * ring_phase), sun * jnp.exp(1j * sun_phase)])
+    # Rows of the springs: the ring's meshes before the sun's, then the bearings of the bodies.
+    end = springs.stiffness.shape[0] - (_CENTRAL if len(names) > 3 + n else 3)
+    meshes = slice(end - 2 * n, end)
+    forces = spread(springs.stiffness[meshes], 1) * errors
+    force = jnp.sum(spread(springs.extensions[meshes], 2) * forces[:, None], axis=0)
+    for body, torque in zip("crs", given[len(ERRORS) :], strict=True):
+        force = force.at[names.index(f"u_{body}")].add(spread(torque, 0))
+    return DrivenSprings(springs, force)
+
+
+def _entries(value: Any, count: int) -> Array:
+    """A number for all planets, or a list of one for each, as an array (count, ...)."""
+    whole = value if isinstance(value, tuple) else (value,) * count
+    return jnp.stack(jnp.broadcast_arrays(*(jnp.asarray(entry, float) for entry in whole)))

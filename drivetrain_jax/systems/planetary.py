@@ -17,14 +17,21 @@ from typing import Any
 
 from drivetrain_jax._wording import counted
 from drivetrain_jax.systems._base import Number, System, parameter, serves
-from drivetrain_jax.systems._modal import SpringSystem
-from drivetrain_jax.systems._planetary_springs import FAMILIES, PER_PLANET, plane_springs, rotational_springs
+from drivetrain_jax.systems._modal import DrivenSprings, SpringSystem
+from drivetrain_jax.systems._planetary_springs import (
+    ERRORS,
+    FAMILIES,
+    PER_PLANET,
+    driven_springs,
+    plane_springs,
+    rotational_springs,
+)
 
 
 def check(fixed: Mapping[str, Any]) -> None:
     """Lists of one length: one entry per planet. Raises ``ValueError`` with one line."""
     angles = fixed.get("planet_angle")
-    for name in PER_PLANET:
+    for name in (*PER_PLANET, *ERRORS):
         value = fixed.get(name)
         if isinstance(value, tuple) and angles is not None and len(value) != len(angles):
             raise ValueError(
@@ -46,10 +53,20 @@ def _pressure_angle(long_name: str, **more: Any) -> Any:
     return parameter("rad", long_name, **limit, **more)
 
 
+def _error(units: str, long_name: str, default: float) -> Any:
+    return parameter(units, f"{long_name}", default=default, listed=True, broadcast=True)
+
+
 # Two turns, more than anyone needs: angles in degrees are refused.
 _LARGEST_ANGLE = 4 * math.pi
 _EACH = {"listed": True, "broadcast": True}
 Numbers = tuple[Number, ...]
+# Parameters of masses and springs; the others excite them.
+_OF_SPRINGS = (
+    "planet_angle", *PER_PLANET, *(f"{kind}_{body}" for kind in ("m", "I", "k") for body in "src"),
+    *(f"k_{body}{axis}" for body in "src" for axis in "uxy"), "pressure_angle", "pressure_angle_s", "pressure_angle_r",
+    "model",
+)  # fmt: skip
 
 
 class Planetary(System):
@@ -104,8 +121,21 @@ class Planetary(System):
         "1", "degrees of freedom: plane motion, or rotations alone", default="plane", choices=("plane", "rotational")
     )
 
-    @serves("modes", check=check)
+    e_s: Numbers | Number = _error("m", "transmission error of a mesh with the sun", 1e-6)
+    e_r: Numbers | Number = _error("m", "transmission error of a mesh with the ring", 0.0)
+    phase_s: Numbers | Number = _error("rad", "phase of the error of a mesh with the sun", 0.0)
+    phase_r: Numbers | Number = _error("rad", "phase of the error of a mesh with the ring", 0.0)
+    T_s: Number = parameter("N", "torque on the sun over its base radius", default=0.0)
+    T_r: Number = parameter("N", "torque on the ring over its base radius", default=0.0)
+    T_c: Number = parameter("N", "torque on the carrier over its radius", default=0.0)
+
+    @serves("modes", check=check, parameters=_OF_SPRINGS)
     def springs(self) -> SpringSystem:
         """The gear as masses and springs, with its decomposition into invariant blocks if all planets are alike."""
         build = rotational_springs if self.model == "rotational" else plane_springs
-        return build(self.values)
+        return build({name: value for name, value in self.values.items() if name in _OF_SPRINGS})
+
+    @serves("harmonic_response", check=check)
+    def driven(self) -> DrivenSprings:
+        """The gear under harmonic transmission errors of its meshes and torques on its bodies."""
+        return driven_springs(self.values, self.springs())

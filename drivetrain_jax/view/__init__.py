@@ -25,6 +25,7 @@ _DRAWN = (
     "poincare",
     "parameters",
     "modes",
+    "harmonic_response",
     "frequency_response",
     "steady_state",
     "basins",

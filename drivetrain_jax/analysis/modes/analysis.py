@@ -32,7 +32,7 @@ from drivetrain_jax.analysis.modes.mode_types import (
 from drivetrain_jax.analysis.modes.tracking import follow
 from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lane_count, path_entry, with_path
 from drivetrain_jax.analysis.numerics.singular_values import EPS, Bidiagonal, bidiagonal_form, bidiagonal_values
-from drivetrain_jax.systems import Block, SpringSystem, System
+from drivetrain_jax.systems import Block, Model, SpringSystem, System
 
 Build = Callable[[Mapping[str, Any]], SpringSystem]
 
@@ -255,21 +255,25 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     return (Solver("singular values", solve, chunk=chunk, short_loops=True),)
 
 
+def described(model: Model, fixed: Mapping[str, Any]) -> Any:
+    """What ``model`` returns, for its names and sizes: these do not depend on varying parameters."""
+    values = {name: fixed.get(name, 1.0) for name in model.parameters}
+    found: list[Any] = []
+    jax.eval_shape(lambda: found.append(model.build(values)))
+    return found[0]
+
+
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     """Modes counted from 1, families, bodies and coordinates."""
     followed = sorted(_FOLLOWED & set(request.outputs))
     if followed and not request.options["track"]:
         raise InputError(f"outputs: {followed[0]!r} needs the option track; allowed is the name of an axis")
-    model = system.models["modes"]
-    # Names and sizes do not depend on varying parameters.
-    values = {name: fixed.get(name, 1.0) for name in model.parameters}
-    described: list[SpringSystem] = []
-    jax.eval_shape(lambda: described.append(model.build(values)))
+    springs: SpringSystem = described(system.models["modes"], fixed)
     return (
-        Dimension("mode", "number of the mode", tuple(range(1, len(described[0].dofs) + 1))),
+        Dimension("mode", "number of the mode", tuple(range(1, len(springs.dofs) + 1))),
         Dimension("family", "family of modes", system.mode_families),
-        Dimension("body", "body", described[0].body_names),
-        Dimension("dof", "coordinate", described[0].dofs),
+        Dimension("body", "body", springs.body_names),
+        Dimension("dof", "coordinate", springs.dofs),
     )
 
 

@@ -1,0 +1,1 @@
+"""Steady vibration under harmonic forces."""
