@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import pickle
 import re
 import uuid
 from collections import deque
@@ -78,9 +77,9 @@ class Cluster(Executor):
                 else:
                     yield request[0], None
                 continue
-            packed, seconds = found
-            requests.learn(len(request), len(packed), seconds)
-            yield from zip(request, pickle.loads(packed), strict=True)
+            layout, data, seconds = found
+            requests.learn(len(request), len(data), seconds)
+            yield from zip(request, worker.unpacked(layout, data), strict=True)
 
     def close(self) -> None:
         """Disconnect, and end a local cluster."""
@@ -115,7 +114,7 @@ class _Requests:
         self._size = max(1, min(int(wanted), max(self._size, _GROWTH * count), self._most))
 
 
-def _result(distributed: Any, future: Any) -> tuple[bytes, float] | None:
+def _result(distributed: Any, future: Any) -> tuple[worker.Layout, bytes, float] | None:
     try:
         return future.result()
     except distributed.KilledWorker:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
-import pickle
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from math import prod
 from typing import Any
+
+import numpy as np
 
 from drivetrain_jax._errors import ChunkError
 from drivetrain_jax.runs.executor import Computation, Results
@@ -50,7 +52,25 @@ def compute(parcel: Parcel, task: Any) -> Results:
     return _unpacked(parcel).compute(task)
 
 
-def compute_all(parcel: Parcel, tasks: Sequence[Any]) -> tuple[bytes, float]:
-    """The results of ``tasks``, pickled as one piece: Dask sends each array of an object by itself. And the seconds."""
+# Name, type and shape of every array of the results of each task.
+Layout = list[list[tuple[str, str, tuple[int, ...]]]]
+
+
+def compute_all(parcel: Parcel, tasks: Sequence[Any]) -> tuple[Layout, bytes, float]:
+    """The results of ``tasks`` as one piece, because Dask sends each array of an object by itself. And the seconds."""
     begin = time.monotonic()
-    return pickle.dumps([dict(compute(parcel, task)) for task in tasks]), time.monotonic() - begin
+    found = [compute(parcel, task) for task in tasks]
+    layout = [[(name, array.dtype.str, array.shape) for name, array in results.items()] for results in found]
+    data = b"".join(array.tobytes() for results in found for array in results.values())
+    return layout, data, time.monotonic() - begin
+
+
+def unpacked(layout: Layout, data: bytes) -> Iterator[Results]:
+    """The results that :func:`compute_all` sent."""
+    buffer, at = bytearray(data), 0
+    for arrays in layout:
+        results = {}
+        for name, kind, shape in arrays:
+            results[name] = np.frombuffer(buffer, kind, prod(shape), at).reshape(shape)
+            at += results[name].nbytes
+        yield results

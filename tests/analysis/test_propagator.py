@@ -241,6 +241,8 @@ def test_bound_holds_for_stiff_systems_without_a_determinant(rates):
             stiffness_of(system),
             2.5e-11,
             IMPLICIT_ORDER,
+            2,
+            0.0,
         )
     )(jnp.int32(8))
     real, imaginary = eigenvalues(z.matrix)
@@ -265,6 +267,7 @@ def test_a_fourfold_coarser_solution_tells_the_same_error(steps):
             1e-8,
             EXPLICIT_ORDER,
             ratio,
+            0.0,
         )
 
     two, four = (jax.jit(solve, static_argnums=0)(ratio) for ratio in (2, 4))

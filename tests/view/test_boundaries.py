@@ -53,7 +53,7 @@ def test_a_name_does_not_cover_another():
 
 def test_a_chart_tells_which_way_tongues_open():
     point, error = {"zeta": 0.01, "Omega": 0.7}, {"zeta": 1e-9, "Omega": 1e-9}
-    tips = tuple(Tip("H21", "+1", 0.0, point, error, opens) for opens in (False, True))
-    found = _tips(Tips(tips, (), 0, True), get_system("cardan"), ("zeta", "Omega"))
+    tips = tuple(Tip("H21", "+1", point, error, opens) for opens in (False, True))
+    found = _tips(Tips(tips, ()), get_system("cardan"), ("zeta", "Omega"))
     dims, values, attrs = found["tip_opens"]
     assert dims == "tip" and values.tolist() == [0, 1] and attrs["long_name"].endswith("as zeta rises")

@@ -65,7 +65,7 @@ def _map(dataset: xr.Dataset, name: str) -> Figure:
     largest = dataset["amplitude"].max("dof")
     panels = Panels(height=3.0, margins=Margins(right=1.1))
     axes = panels.axes[0][0]
-    field = np.log10(largest.where(largest > 0))
+    field = largest.copy(data=np.log10(largest.where(largest > 0).values))
     mesh = cells.draw_cells(axes, field, "frequency", name, cmap="cividis")
     panels.colorbar(axes, mesh, rf"$\log_{{10}}$ of the largest {variable_label(dataset['amplitude'])}")
     panels.label_axes(axis_label(dataset["frequency"]), axis_label(dataset[name]))
