@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis.history.figure import _thinned
 from drivetrain_jax.view import plot
 from drivetrain_jax.view.style import axis_label, symbol, value_text, written_units
 
@@ -135,3 +136,17 @@ def test_units_as_people_write_them(units, text):
     assert written_units(units) == text
     assert value_text("a", 1.5, units) == ("$a$ = 1.5" if units == "1" else f"$a$ = 1.5 {text}")
     assert axis_label(xr.DataArray(0.0, name="a", attrs={"units": units, "long_name": "b"})) == f"b ($a$) [{text}]"
+
+
+def test_many_turns_are_thinned_between_their_envelopes():
+    """In space only: 10 turns are drawn whole, of 300 turns 24 with a line through all maxima and one through all minima."""
+    assert len(plot(history()).axes[-1].lines) == 1
+    time = np.linspace(0, 1, 30_001)
+    decay, angle = np.exp(-2 * time), 600 * np.pi * time
+    curve = np.stack([decay * np.cos(angle), -600 * np.pi * decay * np.sin(angle), time])
+    turns, (above, below) = _thinned(curve)
+    shown = np.isfinite(turns[0])
+    assert 0.07 < shown.mean() < 0.09 and (turns[:, shown] == curve[:, shown]).all()
+    assert abs(above.shape[1] - 300) <= 1 and abs(below.shape[1] - 300) <= 1
+    np.testing.assert_allclose(above[0], np.exp(-2 * above[2]), rtol=2e-3)
+    np.testing.assert_allclose(below[0], -np.exp(-2 * below[2]), rtol=2e-3)

@@ -19,6 +19,8 @@ from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, caption, 
 _LINE: dict[str, Any] = {"color": LINE_COLOURS[0], "linewidth": 0.6, "markersize": 3.5}
 _MOST_ROWS = 8
 _CAPTION_LINES = 2
+# Turns that the 3-D curve shows in full. More of them are a blot of ink.
+_MOST_TURNS = 24
 
 
 def plot(dataset: xr.Dataset) -> Figure:
@@ -106,7 +108,11 @@ def _draw(history: xr.Dataset, along: Axes, rate: Axes, portrait: Axes) -> None:
 
 def _draw_space(history: xr.Dataset, space: Axes3D) -> None:
     shown = [*_components(history), "time"]
-    space.plot(*(history[name].values for name in shown), **_line(history))
+    curve = np.stack([history[name].values for name in shown])
+    turns, envelope = _thinned(curve)
+    space.plot(*turns, **_line(history))
+    for extremes in envelope:
+        space.plot(*extremes, color=FRAME_GREY, linewidth=0.8)
     space.set(**{f"{axis}label": _label(history, name) for axis, name in zip("xyz", shown, strict=True)})
     space.tick_params(labelsize=6.5, pad=-2)
     axis: Any
@@ -117,6 +123,19 @@ def _draw_space(history: xr.Dataset, space: Axes3D) -> None:
     space.locator_params(nbins=4)
     space.view_init(elev=22, azim=-58)
     space.set_box_aspect((1, 1, 0.8), zoom=0.92)  # pyright: ignore[reportArgumentType]
+
+
+def _thinned(curve: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The curve (3, T) of displacement, rate and time with ``_MOST_TURNS`` of its turns, NaN between them, and the lines
+    through its extremes; the curve itself and no lines if it has few turns."""
+    rises = curve[1] > 0
+    maxima, minima = (np.flatnonzero((rises[:-1] == up) & (rises[1:] != up)) for up in (True, False))
+    if len(maxima) <= 2 * _MOST_TURNS:
+        return curve, []
+    turn = np.searchsorted(maxima, np.arange(curve.shape[1]))
+    kept = np.unique(np.linspace(0, len(maxima), _MOST_TURNS).astype(int))
+    at_rest = curve * np.array([[1], [0], [1]])
+    return np.where(np.isin(turn, kept), curve, np.nan), [at_rest[:, maxima], at_rest[:, minima]]
 
 
 def _figure(dataset: xr.Dataset, height: float) -> Figure:
