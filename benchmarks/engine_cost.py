@@ -1,4 +1,4 @@
-"""What the engine costs beside its kernels: time, memory, bytes, and the other places where chunks may be computed.
+"""Cost of the engine beside its kernels: time, memory, bytes, and the other places where chunks may be computed.
 
 ``python -m benchmarks.scaling`` runs all of it and writes docs/scaling.md.
 """
@@ -77,14 +77,14 @@ def cheap_scene(points: int) -> dict[str, Any]:
 
 
 def seconds(job: Callable[[], Any]) -> float:
-    """How long ``job`` takes."""
+    """Duration of ``job``."""
     begin = time.perf_counter()
     job()
     return time.perf_counter() - begin
 
 
 def cpu_seconds(job: Callable[[], Any]) -> float:
-    """How long all threads of this process compute for ``job``."""
+    """Time that all threads of this process compute for ``job``."""
     begin = time.process_time()
     job()
     return time.process_time() - begin

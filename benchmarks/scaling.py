@@ -1,4 +1,4 @@
-"""What the engine costs beside its kernels, and what large sweeps would cost: measured figures and a small simulation.
+"""Cost of the engine beside its kernels, and of large sweeps: measured figures and a small simulation.
 
 ``python -m benchmarks.scaling`` measures and writes the tables of docs/scaling.md, and results/ scaling.csv, overhead.csv,
 places.csv and memory.csv; ``--points`` makes it smaller, and with ``--quick`` or ``--out`` the page is left alone.
@@ -89,7 +89,7 @@ def hashing() -> float:
 
 @dataclass(frozen=True)
 class Load:
-    """What the simulation finds for one sweep on ``workers`` cores."""
+    """Result of the simulation for one sweep on ``workers`` cores."""
 
     points: float
     workers: int
@@ -136,7 +136,7 @@ def loads(cost: Costs, counts: Sequence[int] = (2, 16, 128, 1024, 4096)) -> list
 
 
 def rows_of(cost: Costs) -> list[dict[str, str]]:
-    """What does not depend on the number of workers."""
+    """Costs that do not depend on the number of workers."""
     rows = []
     for points in (1e9, 1e12):
         size = points * cost.result_bytes_per_point

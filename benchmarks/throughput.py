@@ -234,7 +234,7 @@ def reference_radius(columns: Columns) -> np.ndarray:
 
 
 def notes(columns: Columns, repeats: int, sample: int, rtol: float | None) -> list[str]:
-    """How far the reference can be trusted (against ``direct`` too at a given ``rtol``), and the package's memory."""
+    """Accuracy of the reference (against ``direct`` too at a given ``rtol``), and the package's memory."""
     import drivetrain_jax as dt
 
     reference = reference_radius(columns)

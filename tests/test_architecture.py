@@ -1,4 +1,4 @@
-"""What holds the package together: who imports what, double precision, and kernels that may run side by side."""
+"""Structure of the package: imports, sizes of files and functions, and kernels that may run side by side."""
 
 from __future__ import annotations
 

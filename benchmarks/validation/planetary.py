@@ -259,7 +259,7 @@ def _with_centres_held(angles: Sequence[float]) -> np.ndarray:
 
 
 def dominant() -> str:
-    """What coupled modes mostly are."""
+    """Dominant families of coupled modes."""
     rows = []
     for title, degrees in (
         ("five planets, one 3 degrees off", (0, 75, 144, 216, 288)),

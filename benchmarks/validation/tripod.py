@@ -148,7 +148,7 @@ def histories_section() -> str:
 
 
 def readings_section() -> str:
-    """Where the two readings of the printed torque sums matter: histories, not stability."""
+    """Both readings of the printed torque sums: they change histories, not stability."""
     rows = []
     for equation, zeta, chi in HISTORIES[::3]:
         name = oracle.EQUATIONS[equation]

@@ -49,7 +49,7 @@ def test_exact_sweeps_meet_the_reference(exact):
 
 
 def test_folds_and_period_doublings_of_the_branch(exact):
-    """Those of the reference, which are all there are on the branch within the line."""
+    """The branch has all folds and doublings of the reference within the line, and no others."""
     for output, kind in (("fold_frequency", "fold"), ("doubling_frequency", "PD")):
         expected = sorted(s["omega"] for s in REFERENCE["specials"]["table1"] if s["type"] == kind)
         found = exact[output].values

@@ -220,7 +220,7 @@ def test_a_neighbour_that_needs_more_steps_changes_little(hard):
 
 
 def test_steps_that_are_given_are_taken():
-    """Where the field needs others, and where it needs none but these."""
+    """In a field that needs more steps, and in one that needs no more."""
     points = {"excitation_frequency": [3066.5] * 4, "zeta": [0.0016, 0.01, 0.1, 0.5]}
     ours, same, fewer = (tripod(points, OUTPUTS[:3], max_time=0.02, **n) for n in ({}, {"steps": 48}, {"steps": 8}))
     for name in OUTPUTS[:3]:

@@ -109,7 +109,7 @@ def test_explicit_scheme_is_one_step_of_dop853():
 
 @pytest.mark.parametrize("decay", [1e2, 1e5, 1e8, 1e12])
 def test_implicit_scheme_is_l_stable(decay):
-    """What decays at once must be gone after one panel, not stay with modulus one as in a symmetric scheme."""
+    """A component that decays at once must be gone after one panel, not stay with modulus one as in a symmetric scheme."""
     system = LinearPeriodic(lambda t: ((-decay + 0 * t, 0), (0, -1.0 + 0 * t)), 1.0)
     phi = full(propagator(system, jnp.int32(1), 1, Radau))
     assert abs(phi[0, 0]) <= 10 / decay

@@ -259,7 +259,7 @@ def test_boundary_curves_are_boundaries(atlas, curves):
 
 
 def test_only_what_bounds_the_stable_region_is_limiting(chart):
-    """Where tongues overlap, the boundary of one runs on inside the other."""
+    """The boundary of a tongue runs on inside another one that overlaps it."""
     criteria, inside = Criteria.of(chart.atlas, CARDAN), 0
     for curve in boundaries(chart.atlas, CARDAN):
         x = chart.atlas.to_coordinates(np.stack([curve.points["beta"], curve.points["Omega"]], axis=-1))

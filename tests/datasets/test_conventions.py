@@ -96,7 +96,7 @@ def checker():
     suite = CheckSuite()
 
     def messages(path: Path) -> list[str]:
-        """What the checker requires and the file lacks."""
+        """Requirements of the checker that the file does not meet."""
         dataset = suite.load_dataset(str(path))
         try:
             (groups, failed), *_ = suite.run_all(dataset, ["cf:1.11"]).values()

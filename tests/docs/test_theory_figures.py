@@ -27,7 +27,7 @@ def rows(page: str, head: str) -> list[list[str]]:
 
 
 def rounds_to(value: float, printed: str) -> bool:
-    """Whether ``printed`` is ``value`` to its digits."""
+    """True if ``printed`` is ``value`` to its digits."""
     return abs(value - float(printed)) <= 0.501 * 10.0 ** -len(printed.partition(".")[2])
 
 

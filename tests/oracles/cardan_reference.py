@@ -90,17 +90,11 @@ def stacked_monodromy(
 
     Points are grouped by stiffness (``Omega``, then ``beta``), because a batch steps as its hardest point does.
     """
-    columns = np.broadcast_arrays(*(np.atleast_1d(np.asarray(p[name], float)) for name in NAMES))
-    out = np.empty((columns[0].size, 4, 4))
-    order = np.lexsort((columns[0], columns[1]))
-    for start in range(0, order.size, batch):
-        chosen = order[start : start + batch]
-        point = {name: column[chosen] for name, column in zip(NAMES, columns, strict=True)}
-        phi = _solve(
-            _stacked_field(point, matrices), np.repeat(np.eye(4)[:, :, None], chosen.size, axis=2), method, rtol, atol
-        )
-        out[chosen] = np.moveaxis(phi, -1, 0)
-    return out
+
+    def solve(point: Parameters, identity: np.ndarray) -> np.ndarray:
+        return np.moveaxis(_solve(_stacked_field(point, matrices), identity, method, rtol, atol), -1, 0)
+
+    return _in_batches(solve, p, batch)
 
 
 def stacked_half_period_monodromy(
@@ -110,15 +104,23 @@ def stacked_half_period_monodromy(
 
     The state is (theta1, theta1', theta2, omega2) with omega2 = theta2' + (eta theta1)', which needs no eta''.
     """
+
+    def solve(point: Parameters, identity: np.ndarray) -> np.ndarray:
+        phi = _solve(_half_period_field(point), identity, method, rtol, atol, period=PERIOD / 2)
+        return from_half_period(np.swapaxes(phi, 0, 1), point)
+
+    return _in_batches(solve, p, batch)
+
+
+def _in_batches(solve: Callable[[Parameters, np.ndarray], np.ndarray], p: Parameters, batch: int) -> np.ndarray:
+    """Results (N, 4, 4) of ``solve(point, identity)`` for groups of up to ``batch`` points of similar stiffness."""
     columns = np.broadcast_arrays(*(np.atleast_1d(np.asarray(p[name], float)) for name in NAMES))
     out = np.empty((columns[0].size, 4, 4))
     order = np.lexsort((columns[0], columns[1]))
     for start in range(0, order.size, batch):
         chosen = order[start : start + batch]
         point = {name: column[chosen] for name, column in zip(NAMES, columns, strict=True)}
-        identity = np.repeat(np.eye(4)[:, :, None], chosen.size, axis=2)
-        phi = _solve(_half_period_field(point), identity, method, rtol, atol, period=PERIOD / 2)
-        out[chosen] = from_half_period(np.swapaxes(phi, 0, 1), point)
+        out[chosen] = solve(point, np.repeat(np.eye(4)[:, :, None], chosen.size, axis=2))
     return out
 
 

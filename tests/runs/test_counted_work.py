@@ -78,7 +78,7 @@ COUNTS = {
 
 
 def complaint(name: str, found: int) -> str:
-    """What is wrong with ``found`` by the stored count; nothing if it is within bounds."""
+    """The excess of ``found`` over the stored count in words; empty if it is within bounds."""
     stored = COUNTS[name]
     if found > 1.1 * stored:
         return f"{name}: {found}, stored is {stored}"

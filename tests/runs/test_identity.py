@@ -1,4 +1,4 @@
-"""What changes the digest of a scene, and what does not."""
+"""Changes that alter the digest of a scene, and changes that do not."""
 
 from __future__ import annotations
 

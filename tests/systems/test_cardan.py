@@ -302,7 +302,7 @@ def test_systems_are_found_by_name():
     ],
 )
 def test_predicted_steps_are_enough_and_not_many_more(point, rtol):
-    """What decays asks for stability more than for accuracy: it takes no steps like an oscillation as fast as that."""
+    """A decay needs stability more than accuracy: fewer steps than an oscillation of the same rate."""
     shaft = cardan.Cardan(alpha=1.0, mu=1.0, gamma=100.0, **point)
     form, predicted = shaft.floquet_model().reduced, int(shaft.explicit_steps(rtol))
     exact = assemble(form, propagator(form, jnp.int32(8 * predicted)).matrix)
@@ -318,7 +318,7 @@ def test_predicted_steps_are_enough_and_not_many_more(point, rtol):
 
 @pytest.mark.parametrize("rtol", [1e-7, 1e-9, 1e-10])
 def test_slow_points_meet_their_tolerance_in_predicted_steps(rtol):
-    """What is a little too few is found out by twice as many: a block of points then takes 2.6 times as long."""
+    """If the steps are slightly too few, the march is repeated with twice as many: 2.6 times the time of a block."""
     for omega, beta in ((0.006, 0.9), (0.01, 0.3), (0.03, 0.1)):
         point = {"beta": beta, "Omega": omega, "zeta": 1e-3, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
         shaft = cardan.Cardan(**point)
