@@ -213,6 +213,14 @@ def test_least_chi_n_that_makes_the_element_unstable(case):
     assert bend < 0 and abs(along / bend) < 1e-4
 
 
+def test_least_chi_n_at_the_lowest_damping_of_the_paper():
+    """The tip lies 6.68 times above the nonuniformity .0026 that the paper states (docs/theory/tripod.md)."""
+    chi_n = 0.0173632641
+    radius, (slope, _) = radius_and_slopes(chi_n, 3066.2178899, 0.0016)
+    assert abs(radius - 1) / slope < 2e-10
+    assert round(chi_n / 0.0026, 2) == 6.68
+
+
 @pytest.mark.parametrize("case", REFERENCE["critical_chi_n_at_2_Omega"], ids=lambda case: str(case["zeta"]))
 def test_edge_of_the_tongue_at_twice_the_natural_frequency(case):
     constants = dt.point("tripod", "parameters", element="input", beta=NINE_DEGREES, outputs="resonance_frequency")

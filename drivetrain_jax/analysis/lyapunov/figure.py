@@ -33,6 +33,8 @@ KIND_COLOURS = ("#ffffff", "#cfe3f3", "#7fb2d9", "#d1771e", "#5b1020", "#b0b0b0"
 _COLOURS = (*LINE_COLOURS, "#3f8f5f", "#7a4fa0", "#999933", "#333333")
 _HEIGHT = 1.9
 _CURVES = ("lyapunov_spectrum", "paper_estimator", "sum_rule_residual", "chaos_k01")
+# Their sum is drawn as well: the mean divergence of the flow, and the subject of the paper's criterion (39).
+_SUMMED = ("lyapunov_spectrum", "paper_estimator")
 _MOST_COLUMNS = 4
 
 
@@ -107,8 +109,7 @@ def _draw_curves(axes: Axes, dataset: xr.Dataset, key: str, name: str) -> None:
             band = 3 * dataset["lyapunov_standard_error"].isel({own[0]: k}).values
             axes.fill_between(x, values - band, values + band, color=_COLOURS[k], alpha=0.2, linewidth=0)
     columns = variable.sizes[own[0]] if own else 0
-    if key == "paper_estimator":
-        # Its criterion (39) is about the sum.
+    if key in _SUMMED:
         axes.plot(x, variable.values.sum(axis=-1), color=FRAME_GREY, linestyle="--", label="sum")
         columns += 1
     if own:
