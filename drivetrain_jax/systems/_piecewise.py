@@ -19,6 +19,7 @@ class PiecewiseLinearOscillator(eqx.Module):
 
     ``damping`` is c/I [1/s], ``stiffness`` k/I [1/s^2], ``alpha`` the stiffness within the play over that outside [1],
     ``b`` half the play [m], ``B0`` and ``B1`` mean and amplitude of the drive [m/s^2], ``omega`` its frequency [rad/s].
+    ``underdamped``: True states that free motion oscillates in every region, so kernels omit the overdamped flow.
     """
 
     damping: Any
@@ -28,6 +29,12 @@ class PiecewiseLinearOscillator(eqx.Module):
     B0: Any
     B1: Any
     omega: Any
+    underdamped: bool = eqx.field(static=True, default=False)
+
+    @property
+    def oscillates(self) -> Any:
+        """True where free motion is underdamped in contact and within the play."""
+        return (self.damping / 2) ** 2 < self.stiffness * jnp.minimum(1.0, self.alpha)
 
     @property
     def period(self) -> Any:

@@ -31,7 +31,7 @@ def request(**options):
 @pytest.fixture(scope="module")
 def steady():
     """The kernel over all parameters, for up to 64 points at a time."""
-    (solver,) = ANALYSIS.solvers(get_system("rattle"), request(most_periods=800))
+    solver, _ = ANALYSIS.solvers(get_system("rattle"), request(most_periods=800))
     compiled = jax.jit(lambda columns: solver.solve(columns, jnp.int32(1)))
 
     def solve(cases):
@@ -144,6 +144,21 @@ def test_a_lane_alone_is_the_lane_in_its_batch(steady):
     together, alone = steady(cases), steady(cases[4:5])
     for name, values in alone.items():
         np.testing.assert_array_equal(values[..., 0], together[name][..., 4], name)
+
+
+def test_underdamped_motions_have_a_faster_solver_with_the_same_results(steady):
+    """Without a spring in the gap, or with strong damping, the free motion does not oscillate everywhere."""
+    names = ("u_max", "u_min", "spectral_radius", "period_multiple")
+    both = ANALYSIS.solvers(get_system("rattle"), Request(names, "exact", request(most_periods=800).options))
+    edge = {"k": 4.0, "I": 1.0, "alpha": 0.25, "c": 2.0}
+    damped = [TABLE1 | {"omega": 0.7} | change for change in ({"alpha": 0.0}, {"c": 1.01}, {"c": 0.99}, edge)]
+    table = {name: np.array([float(case.get(name, 0.0)) for case in damped]) for name in NAMES}
+    assert np.isfinite(both[1].effort(table)).tolist() == [False, False, True, False]
+    cases = [case for case in from_orbits() if case["alpha"] > (case["c"] / 2) ** 2][:16]
+    table = {name: jnp.array([float(case.get(name, 0.0)) for case in cases]) for name in NAMES}
+    found, general = jax.jit(lambda columns: both[1].solve(columns, jnp.int32(1)))(table), steady(cases)
+    for name in names:
+        np.testing.assert_allclose(found[name], general[name], rtol=1e-11, atol=1e-13, err_msg=name)
 
 
 def test_an_undamped_motion_does_not_settle_and_says_so(steady):

@@ -16,6 +16,7 @@ motion that does not graze.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -33,7 +34,7 @@ from drivetrain_jax.analysis.impacts.motion import PHASE, REGIME, REGIMES
 from drivetrain_jax.analysis.impacts.orbit_derivatives import orbit_jacobians
 from drivetrain_jax.analysis.impacts.orbit_history import history
 from drivetrain_jax.analysis.numerics.lanes import Constants
-from drivetrain_jax.systems import PiecewiseLinearOscillator, System
+from drivetrain_jax.systems import System
 
 SAMPLES = 512
 DIMENSIONS = (
@@ -87,10 +88,12 @@ _CHUNK = 4096
 _STARTS = ("initial_displacement", "initial_rate")
 
 
-def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+def _solve(
+    system: type[System], request: Request, underdamped: bool, values: Mapping[str, Any], effort: Array
+) -> dict[str, Array]:
     """The requested results of a batch of points, the batch as last axis; ``effort`` is not used."""
     del effort
-    model: PiecewiseLinearOscillator = system.models["steady_state"].build(values)
+    model = replace(system.models["steady_state"].build(values), underdamped=underdamped)
     start = [values[system.role(role)] for role in _STARTS]
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in (*vars(model).values(), *start)))
     count = int(np.prod(shape, dtype=int))
@@ -111,7 +114,15 @@ def _solve(system: type[System], request: Request, values: Mapping[str, Any], ef
 
 
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
-    return (Solver("exact", partial(_solve, system, request), chunk=_CHUNK),)
+    """The solver of all motions, and a faster one of motions whose free part oscillates."""
+
+    def effort(columns: Mapping[str, Any]) -> np.ndarray:
+        return np.where(system.models["steady_state"].build(columns).oscillates, 1.0, np.inf)
+
+    return (
+        Solver("exact", partial(_solve, system, request, False), chunk=_CHUNK, unit_cost=1.15),
+        Solver("underdamped", partial(_solve, system, request, True), effort, chunk=_CHUNK),
+    )
 
 
 def _derivatives(
