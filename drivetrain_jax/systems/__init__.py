@@ -12,7 +12,7 @@ from drivetrain_jax.resonances import Family, Resonances
 from drivetrain_jax.systems._base import Model, System, parameter, serves
 from drivetrain_jax.systems._flow import Flow
 from drivetrain_jax.systems._modal import Block, DrivenSprings, SpringSystem
-from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator
+from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator, UnderdampedOscillator
 from drivetrain_jax.systems._rows import dense
 from drivetrain_jax.systems._shaft import Shaft
 from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness
@@ -48,6 +48,7 @@ __all__ = [
     "Smoothness",
     "SpringSystem",
     "System",
+    "UnderdampedOscillator",
     "Variable",
     "dense",
     "get_system",

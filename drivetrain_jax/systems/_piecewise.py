@@ -19,7 +19,6 @@ class PiecewiseLinearOscillator(eqx.Module):
 
     ``damping`` is c/I [1/s], ``stiffness`` k/I [1/s^2], ``alpha`` the stiffness within the play over that outside [1],
     ``b`` half the play [m], ``B0`` and ``B1`` mean and amplitude of the drive [m/s^2], ``omega`` its frequency [rad/s].
-    ``underdamped``: True states that free motion oscillates in every region, so kernels omit the overdamped flow.
     """
 
     damping: Any
@@ -29,7 +28,6 @@ class PiecewiseLinearOscillator(eqx.Module):
     B0: Any
     B1: Any
     omega: Any
-    underdamped: bool = eqx.field(static=True, default=False)
 
     @property
     def oscillates(self) -> Any:
@@ -58,3 +56,7 @@ class PiecewiseLinearOscillator(eqx.Module):
     def switching(self, state: Array) -> Array:
         """Declared discontinuities of the derivative: distances ``(u - b, u + b)`` to the flanks, shape ``(2, ...)``."""
         return jnp.stack(jnp.broadcast_arrays(state[0] - self.b, state[0] + self.b))
+
+
+class UnderdampedOscillator(PiecewiseLinearOscillator):
+    """One whose free motion oscillates in contact and within the play: kernels omit the overdamped flow."""

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax.systems import PiecewiseLinearOscillator
+from drivetrain_jax.systems import PiecewiseLinearOscillator, UnderdampedOscillator
 from drivetrain_jax.systems.trigonometry import sincos
 
 _TINY = 1e-150
@@ -46,7 +46,7 @@ def piece(oscillator: PiecewiseLinearOscillator, stiffness: Array) -> Piece:
     """The region of this stiffness. The harmonic response of an undamped region at resonance is not finite."""
     h, omega = oscillator.damping / 2, oscillator.omega
     q = stiffness - h**2
-    overdamped = jnp.zeros_like(q, bool) if oscillator.underdamped else q < 0
+    overdamped = jnp.zeros_like(q, bool) if isinstance(oscillator, UnderdampedOscillator) else q < 0
     root = jnp.maximum(jnp.sqrt(jnp.abs(q)), _TINY)
     # The slow root from the product of both, which is K: no cancellation.
     slow = jnp.where(overdamped, -stiffness / jnp.maximum(h + root, _TINY), -h)

@@ -16,7 +16,6 @@ motion that does not graze.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -34,7 +33,7 @@ from drivetrain_jax.analysis.impacts.motion import PHASE, REGIME, REGIMES
 from drivetrain_jax.analysis.impacts.orbit_derivatives import orbit_jacobians
 from drivetrain_jax.analysis.impacts.orbit_history import history
 from drivetrain_jax.analysis.numerics.lanes import Constants
-from drivetrain_jax.systems import System
+from drivetrain_jax.systems import PiecewiseLinearOscillator, System, UnderdampedOscillator
 
 SAMPLES = 512
 DIMENSIONS = (
@@ -93,7 +92,8 @@ def _solve(
 ) -> dict[str, Array]:
     """The requested results of a batch of points, the batch as last axis; ``effort`` is not used."""
     del effort
-    model = replace(system.models["steady_state"].build(values), underdamped=underdamped)
+    model: PiecewiseLinearOscillator = system.models["steady_state"].build(values)
+    model = UnderdampedOscillator(**vars(model)) if underdamped else model
     start = [values[system.role(role)] for role in _STARTS]
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in (*vars(model).values(), *start)))
     count = int(np.prod(shape, dtype=int))
