@@ -143,6 +143,15 @@ def _add_plot(subparsers: Any) -> None:
     command.add_argument("--cells", type=int, metavar="N", help="cells per axis for an atlas (default: 800)")
 
 
+def _add_report(subparsers: Any) -> None:
+    command = _command(
+        subparsers, "report", commands.report, "write a report on results: one HTML file that prints well"
+    )
+    command.add_argument("files", metavar="FILE.nc", type=_path, nargs="+", help="results, one section each")
+    command.add_argument("--out", required=True, metavar="REPORT.html", type=_path, help="page to write")
+    command.add_argument("--title", metavar="TEXT", help="heading (default: the title of the scene)")
+
+
 def _add_point(subparsers: Any) -> None:
     command = _command(subparsers, "point", commands.point, "compute one point")
     command.add_argument("system", metavar="SYSTEM", help="name from `drivetrain list`")
@@ -189,6 +198,7 @@ _COMMANDS = (
     _add_verify,
     _add_export,
     _add_plot,
+    _add_report,
     _add_point,
     _add_query,
     _add_design,

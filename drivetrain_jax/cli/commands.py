@@ -119,13 +119,8 @@ def export(options: argparse.Namespace) -> int:
 def plot(options: argparse.Namespace) -> int:
     """Draw the figure of one result, or of several results together."""
     from drivetrain_jax.datasets.figure import plot
-    from drivetrain_jax.store.files import write_atomic
 
-    out = options.out
-    if not out.parent.is_dir():
-        raise InputError(f"out = {str(out)!r}: the folder does not exist; allowed is a file in an existing folder")
-    if out.suffix.lower() not in _FIGURES:
-        raise InputError(f"out = {str(out)!r}: allowed is a name that ends in {', '.join(_FIGURES)}")
+    _check_out(options.out, _FIGURES)
     part = ranges(options.part, "--part") or None
     try:
         figure = plot(options.files, part=part, cells=options.cells)
@@ -135,12 +130,34 @@ def plot(options: argparse.Namespace) -> int:
         _refuse_damaged(options.files)
         raise
     image = io.BytesIO()
-    figure.savefig(image, format=out.suffix[1:].lower())
+    figure.savefig(image, format=options.out.suffix[1:].lower())
+    _write(options.out, image.getbuffer())
+    return OK
+
+
+def report(options: argparse.Namespace) -> int:
+    """Write one HTML file about results."""
+    _check_out(options.out, (".html",))
+    from drivetrain_jax.report import report
+
+    _write(options.out, report(options.files, options.title).encode())
+    return OK
+
+
+def _check_out(out: Path, endings: tuple[str, ...]) -> None:
+    if not out.parent.is_dir():
+        raise InputError(f"out = {str(out)!r}: the folder does not exist; allowed is a file in an existing folder")
+    if out.suffix.lower() not in endings:
+        raise InputError(f"out = {str(out)!r}: allowed is a name that ends in {', '.join(endings)}")
+
+
+def _write(out: Path, data: bytes | memoryview) -> None:
+    from drivetrain_jax.store.files import write_atomic
+
     try:
-        write_atomic(out, image.getbuffer(), out.with_name(f"{out.name}.tmp"))
+        write_atomic(out, data, out.with_name(f"{out.name}.tmp"))
     except OSError as error:
         raise InputError(f"out = {str(out)!r}: {error.strerror}; allowed is a file that can be written") from None
-    return OK
 
 
 def _refuse_damaged(files: list[Path]) -> None:

@@ -15,6 +15,7 @@ import pytest
 import xarray as xr
 
 import drivetrain_jax as dt
+from drivetrain_jax.report.statements import axes_table, statements
 from drivetrain_jax.runs import job
 from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import Problem, result_variables
@@ -85,6 +86,15 @@ def computed(path: Path, out: Path | None = None) -> xr.Dataset:
 def opened(path: Path, **options: Any) -> xr.Dataset:
     with xr.open_dataset(path, engine="h5netcdf", **options) as dataset:
         return dataset.load()
+
+
+def test_a_report_says_something_of_every_result(result):
+    dataset = opened(result)
+    if dataset.attrs["analysis"] != "atlas":
+        said = statements(dataset)
+        assert any(f"{dataset.outcome.size:,} point" in sentence for sentence in said)
+        assert all(sentence.endswith(".") and "nan" not in sentence.split() for sentence in said), said
+        assert axes_table(dataset) or dataset.outcome.ndim == 0
 
 
 @pytest.fixture(scope="module")
