@@ -1,6 +1,6 @@
-"""The gallery: every scene of sweeps/ computed (or resumed), drawn, and listed on one page; `make gallery`.
+"""Compute (or resume) and draw every scene of sweeps/, and list all figures on one page; `make gallery`.
 
-A scene that is complete and a figure that is newer than its result and the code that draws it are left alone.
+Skips complete scenes, and figures that are newer than their results and the drawing code.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from drivetrain_jax.systems import get_system, system_names
 SCENES = Path(__file__).parents[1] / "sweeps"
 PACKAGE = Path(drivetrain_jax.__file__).parent
 CELLS = 600
-# Charts of an atlas over more parameters than a figure has: what is fixed in each, as for `drivetrain plot --part`.
+# Charts of an atlas over more than two parameters: title -> fixed parameters, as for `drivetrain plot --part`.
 PARTS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
     "cardan_atlas_4d": {
         "Figs 2 and 3 from the four-parameter atlas": {"mu": 1.0, "alpha": 1.0},
@@ -43,7 +43,7 @@ PARTS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
 
 @dataclass(frozen=True)
 class Item:
-    """One figure: the scenes it shows (several methods of one analysis share a title), and what is fixed of an atlas."""
+    """One figure: its scenes (methods of one analysis share a title), and the fixed parameters if it shows an atlas."""
 
     title: str
     system: str
@@ -76,7 +76,7 @@ def items(folder: Path) -> list[Item]:
 
 
 def compute(scene: Path, folder: Path) -> Path:
-    """The result of a scene; what other code or another scene has left there is replaced."""
+    """Compute or resume a scene and return the path of its result; a stale result is replaced."""
     out = folder / f"{scene.stem}.nc"
     with progress_line() as show:
         run_to_file(scene, out, fresh=status(scene, out).state == "stale", report=show)
@@ -84,7 +84,7 @@ def compute(scene: Path, folder: Path) -> Path:
 
 
 def draw(item: Item, results: Sequence[Path], figure: Path) -> None:
-    """Write the figure unless it is newer than all that it comes from."""
+    """Write the figure unless it is newer than its results and the drawing code."""
     code = [*PACKAGE.glob("view/*.py"), Path(__file__)]
     if any(tomllib.loads(scene.read_text())["analysis"] == "atlas" for scene in item.scenes):
         code += [*PACKAGE.glob("atlas/*.py"), PACKAGE / "runs" / "atlas_chart.py"]
@@ -98,7 +98,7 @@ def draw(item: Item, results: Sequence[Path], figure: Path) -> None:
 
 
 def answered(title: str) -> str:
-    """What of its source a figure answers: the figures, tables and sections that its title names."""
+    """The figures, tables and sections of the source that a title names."""
     return ", ".join(re.findall(r"(?:Figs?\.?|Tables?|section) \d+\w?(?:(?:,| and| to) \d+)*", title))
 
 
@@ -139,7 +139,7 @@ def entry(item: Item, results: Sequence[Path], problem: str) -> Iterator[str]:
 
 
 def render(item: Item, folder: Path) -> tuple[list[Path], str]:
-    """Results and figure of one item, and what went wrong, if anything did."""
+    """Compute and draw one item; returns the paths of its results and an error message, empty without an error."""
     results: list[Path] = []
     try:
         results = [compute(scene, folder) for scene in item.scenes]
