@@ -46,7 +46,7 @@ class Precision:
         return min(good, key=lambda rung: rung.seconds_per_point, default=None)
 
     def judgement(self, region: str, method: str) -> Judgement | None:
-        """Holds, degrades, fails or SILENT; None if the method was not tried there."""
+        """The judgement of a method in a region; None if the method was not tried there."""
         rungs = self.ladder(region, method)
         return judge(rungs) if rungs else None
 
@@ -70,12 +70,12 @@ def conclusions(found: dict[str, Precision]) -> list[str]:
 def losses(found: dict[str, Precision]) -> str:
     """A sentence that lists the regions where a rival is faster; empty without any."""
     behind = {system: _compared(precision).lost for system, precision in found.items()}
-    told = "; ".join(f"`{system}`: {', '.join(regions)}" for system, regions in behind.items() if regions)
-    return f"Regions where a rival is faster (error {GOAL:g}, one core): {told}." if told else ""
+    told = " ".join(f"`{system}`: {'; '.join(regions)}." for system, regions in behind.items() if regions)
+    return f"Regions where a rival is faster (error {GOAL:g}, one core). {told}" if told else ""
 
 
 class _Compared(NamedTuple):
-    """Regions sorted by the fastest method, each with its rival."""
+    """Regions grouped by the fastest method, each with its fastest rival."""
 
     won: list[str]
     level: list[str]
@@ -108,13 +108,14 @@ def _compared(precision: Precision) -> _Compared:
 def _winners(precision: Precision) -> str:
     won, level, lost, alone, nobody = _compared(precision)
     parts = [
-        f"fastest in {', '.join(won)}" if won else "",
-        f"the only one to reach it in {', '.join(alone)}" if alone else "",
-        f"equal within {LEVEL - 1:.0%} in {', '.join(level)}" if level else "",
-        f"**slower** in {', '.join(lost)}" if lost else "",
-        f"like all others short of it in {', '.join(nobody)}" if nobody else "",
+        ("The package is fastest in", won),
+        ("Only the package reaches this error in", alone),
+        (f"The package equals a rival within {LEVEL - 1:.0%} in", level),
+        ("The package is **slower** in", lost),
+        ("No method reaches this error in", nobody),
     ]
-    return f"`{precision.system}` at an error of {GOAL:g}, one core: the package is {'; '.join(filter(None, parts))}."
+    told = " ".join(f"{words}: {'; '.join(regions)}." for words, regions in parts if regions)
+    return f"Regions of `{precision.system}` (error {GOAL:g}, one core). {told}"
 
 
 def silent(systems: Iterable[Precision]) -> dict[str, list[str]]:
@@ -139,7 +140,7 @@ def _silence(systems: Sequence[Precision]) -> list[str]:
         if own
         else f"No method of the package fails silently in any region measured ({names})."
     )
-    return [first, f"Rivals that fail silently: {'; '.join(rivals)}."] if rivals else [first]
+    return [first, f"Rivals that fail silently (regions): {'; '.join(rivals)}."] if rivals else [first]
 
 
 def section(folder: Path, images: str, system: str, found: dict[str, Precision]) -> str:
@@ -154,8 +155,8 @@ def section(folder: Path, images: str, system: str, found: dict[str, Precision])
             title,
             f"![Error against time per point, one panel for each region]({images}{name}.png)",
             f"Time per point (error) at the fastest setting with an error of at most {GOAL:g} at every point. "
-            f"`only`: the smallest error, where no setting reaches {GOAL:g}. Bold: the fastest of each region, and all "
-            f"within {LEVEL - 1:.0%} of it.",
+            f"`only`: the smallest error, if no setting reaches {GOAL:g}. Bold: the fastest method of each region, and all "
+            f"methods within {LEVEL - 1:.0%} of it.",
             _times_table(precision),
             "At the extremes:",
             _extremes_table(precision),

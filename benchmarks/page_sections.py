@@ -10,7 +10,7 @@ Files = Mapping[str, ResultFile | None]
 _DAMPING = (
     "At (beta, Omega) = (1, 0.1), one core. At strong damping `direct` changes to an implicit scheme (Radau IIA); its cost "
     "is independent of damping. An explicit scheme, such as a Taylor series, needs steps as short as the fastest decay. "
-    "The difference is that of the two spectral radii."
+    "The last column compares the two spectral radii."
 )
 _SCALING = {
     "batches": (
@@ -28,14 +28,14 @@ _SCALING = {
 
 
 def damping_sentence(file: ResultFile | None) -> str:
-    """The ratio of speeds of `direct` and heyoka for each damping."""
+    """A sentence that compares the speeds of `direct` and heyoka at each damping."""
     told: list[str] = []
     rates: dict[str, dict[str, float]] = {}
     for row in file.rows if file else ():
         rates.setdefault(row["zeta"], {})[row["method"].partition(",")[0]] = float(row["us_per_point"])
     for zeta, spent in rates.items():
         told.append(f"{against(spent['heyoka batch'] / spent['package'], 'heyoka batch')} at zeta = {float(zeta):g}")
-    words = "At strong damping it changes to an implicit scheme, whose cost is independent of damping"
+    words = "At strong damping `direct` changes to an implicit scheme, whose cost is independent of damping"
     return f"At Omega = 0.1, `direct` is {', '.join(told)}. {words}." if told else ""
 
 

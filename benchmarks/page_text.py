@@ -87,12 +87,14 @@ def text_of(folder: Path, page: Path) -> str:
 
 
 _METHOD = (
-    f"Each region is one parameter set and its neighbours. `holds`: the method reaches an error of at most {GOAL:g}; at "
-    "every setting the error is at most 1,000 times the tolerance, or the method reports the failure. `degrades`, `fails`: "
-    "the method does not reach it, and the cell shows what the user sees. **SILENT**: the result is lost, or its error "
-    "exceeds 1,000 times the tolerance (or 0.1), without any report. A method with a number of steps has no tolerance: "
-    "only its finest setting counts as silent, at an error of 0.1. In brackets after `holds`: reports of coarser settings. "
-    "`-`: not tried, or no answer. Methods of this package start with `package`."
+    "Each region is one parameter set and its neighbours. Methods of this package start with `package`. In the tables:\n\n"
+    f"- `holds`: the method reaches an error of at most {GOAL:g}, and none of its settings is silent. In brackets: outcomes "
+    "and warnings that it reports at some settings.\n"
+    "- `degrades`: the method does not reach this error at every point. `fails`: its error is above 0.1, or it has no "
+    "answer. The cell shows the smallest error and what the method reports.\n"
+    "- **SILENT**: the method reports nothing, but points are lost, or the error exceeds 1,000 times the tolerance or 0.1. "
+    "A method with a number of steps has no tolerance: only its finest setting can be silent, at an error above 0.1.\n"
+    "- `-`: not tried, or no answer."
 )
 
 
@@ -118,7 +120,7 @@ def conclusions(files: Files, precise: dict[str, page_precision.Precision]) -> l
 
 
 def family(row: Row) -> str:
-    """The family of a row of throughput.csv: the longest prefix that matches."""
+    """The family of a row of throughput.csv: the longest matching prefix in ``CHART``."""
     return max((name for name in CHART if row["method"].startswith(name)), key=len, default="")
 
 
@@ -148,7 +150,8 @@ def _chart_sentence(file: ResultFile | None) -> str:
         if not name.startswith("drivetrain_jax")
     ]
     told = f"{count(_rate(own))} cells/s (largest error {small(own['max_error'])}, with a bound for every cell)"
-    return f"Chart of the cardan shaft, largest error at most {GOAL:g}: `direct` computes {told}; {', '.join(rivals)}."
+    compared = f" `direct` is {', '.join(rivals)}." if rivals else ""
+    return f"Chart of the cardan shaft, largest error at most {GOAL:g}: `direct` computes {told}.{compared}"
 
 
 def _cold_sentence(file: ResultFile | None, atlas: ResultFile | None) -> str:
@@ -199,10 +202,10 @@ def planetary_sentence(file: ResultFile | None) -> str:
     for planets in dict.fromkeys(row["planets"] for row in file.rows):
         rates = {row["method"]: float(row["gears_per_s"]) for row in file.rows if row["planets"] == planets}
         rival = max(rate for method, rate in rates.items() if method.startswith("numpy"))
-        told.append(f"{planets} planets {times(rates['package'] / rival)}")
+        told.append(f"{times(rates['package'] / rival)} for {planets} planets")
     off = max(float(row["rigid_Hz"]) for row in file.rows if row["method"].startswith("numpy eigvalsh"))
     rivals = f"singular values, or eigenvalues with an error of up to {small(off)} Hz at frequency 0"
-    return f"Planetary gears, speed relative to the faster NumPy batch ({rivals}), all cores: {', '.join(told)}."
+    return f"Planetary gears, speed relative to the faster NumPy batch ({rivals}) on all cores: {', '.join(told)}."
 
 
 def rattle_sentence(file: ResultFile | None) -> str:
@@ -240,7 +243,7 @@ def _outputs_sentence(file: ResultFile | None) -> str:
         told.setdefault(row["system"], []).append(f"{times(float(row['times_the_first']))} ({row['outputs']})")
     words = "; ".join(f"`{system}` {', '.join(sets)}" for system, sets in told.items())
     return (
-        f"Only requested outputs are computed. Time per point relative to the first outputs of a system: {words}."
+        f"A kernel computes only the requested outputs. Time per point relative to the first outputs of a system: {words}."
         if told
         else ""
     )
@@ -281,7 +284,7 @@ def _chart_section(file: ResultFile | None) -> str:
         rows.append([f"**{cell}**" if chosen else cell for cell in cells])
     head = ["method", "cells/s", "largest error", "median error", "times SciPy RK45"]
     text = f"Bold: the fastest setting of each family with an error of at most {GOAL:g}."
-    return f"{'; '.join(file.notes)}.\n\n{text}\n\n{markdown(head, rows)}"
+    return f"Conditions: {'; '.join(file.notes)}.\n\n{text}\n\n{markdown(head, rows)}"
 
 
 def machines(files: Files) -> list[str]:
