@@ -3,9 +3,11 @@
 This layer uses no files and no scenes: it requests solves, receives values, and returns arrays.
 
 - :func:`construct`: any :class:`Quantity` over a :class:`Domain`, as a coroutine of rounds of solves; :func:`run` drives
-it. - :func:`values_at`: the functions anywhere, with bounds, by direct solves in gaps. - :func:`floquet_rounds`: the
-construction for the propagator of a periodic system; :func:`stability_atlas` evaluates it. - :func:`to_arrays`,
-:func:`from_arrays`: the arrays of a file.
+  this coroutine.
+- :func:`values_at`: the functions anywhere, with bounds, by direct solves in gaps.
+- :func:`floquet_rounds`: the construction for the propagator of a periodic system; :func:`stability_atlas` evaluates the
+  resulting atlas.
+- :func:`to_arrays`, :func:`from_arrays`: the arrays of a file.
 """
 
 from __future__ import annotations

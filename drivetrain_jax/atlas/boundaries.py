@@ -111,8 +111,8 @@ def _contains(field: Field, curve: np.ndarray, seeds: np.ndarray) -> np.ndarray:
     distance = np.linalg.norm(y[:-1] + t[..., None] * step - target[:, None], axis=2)
     best = np.argmin(distance, axis=1)
     distance, t = (a[np.arange(len(seeds)), best] for a in (distance, t))
-    # The chord of a step that turns by less than a quarter stays within a thirtieth of its length from the curve. The other
-    # edge of a narrow tongue may be as near, but has the opposite gradient.
+    # The chord of a step that turns by less than a quarter is at most a thirtieth of its length away from the curve. The
+    # other edge of a narrow tongue may be as near, but has the opposite gradient.
     _, at_seed = field(target)
     _, at_curve = field(y[best + (t > 0.5)])
     near = distance < 0.04 * np.sqrt(size[best]) + 1e-9
@@ -149,7 +149,7 @@ def _limiting(criteria: Criteria, x: np.ndarray, kind: str) -> np.ndarray:
 
 
 def _polish(criteria: Criteria, field: Field, kind: str, x: np.ndarray) -> np.ndarray:
-    """Points with ln|sigma| = 0 near ``x``, or ``x`` itself if the multiplier is not simple there."""
+    """Points with ln|sigma| = 0 near ``x``; ``x`` itself if the multiplier is not simple there."""
     if criteria.conservative:
         return x
     scale = field.upper - field.lower

@@ -17,8 +17,10 @@ TROUBLED_DEPTH, _MAX_DEPTH = 2, 12
 
 
 class Source(Protocol):
-    """Supplies the values at nodes without solves: in lines along the coordinate ``axis``, at multiples of
-    ``positions``."""
+    """Supplies the values at nodes without solves, in lines along the coordinate ``axis``.
+
+    A line with a multiple of ``positions`` nodes costs no more than one with fewer.
+    """
 
     axis: int
     positions: int
@@ -45,7 +47,7 @@ class Settings:
     source: Source | None = None
 
     def limit(self, values: np.ndarray) -> float:
-        """Largest allowed error of the values, from a sample ``(N, m)`` of them."""
+        """Largest allowed error of the values, from a sample ``(N, m)``."""
         return self.tolerance * float(np.min(self.quantity.scale(values)))
 
 
@@ -64,7 +66,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Box:
-    """A box in coordinates, the ``splits`` per coordinate that led to it, and ``known`` solves of its ancestors."""
+    """A box in coordinates, the number of ``splits`` along each of them, and the ``known`` solves of its ancestors."""
 
     lower: np.ndarray
     upper: np.ndarray

@@ -26,7 +26,7 @@ from drivetrain_jax.atlas.panels import Panel, chebyshev
 from drivetrain_jax.atlas.tiles import NODES, Tile, filled_up
 from drivetrain_jax.systems import FloquetModel
 
-# Most rows and columns of a tile. The columns of a row are the lanes of all loops; a row this short stays in one task.
+# Most rows and columns of a tile. The columns of a row are the lanes of all loops; XLA computes so short a row in one task.
 ROWS, COLUMNS = 64, 512
 # Tasks per core that are queued.
 _AHEAD = 2
@@ -53,10 +53,9 @@ def judged_tiles(
     kernel: Callable[[bool], Any],
     rtol: float,
 ) -> Iterator[tuple[Tile, Cells]]:
-    """Yield every tile with the results of its cells, ``(R, C)`` or ``(k, R, C)``, in order; ``axes`` are those of the
-    grid, in parameters.
+    """Yield every tile with the results of its cells, ``(R, C)`` or ``(k, R, C)``, in order.
 
-    ``kernel(dense)`` is that of :func:`tile_kernel`.
+    ``axes`` are the axes of the grid in parameters; ``kernel(dense)`` returns the kernel of :func:`tile_kernel`.
     """
 
     constants = {name: jnp.asarray(value) for name, value in fixed.items()}
@@ -100,12 +99,12 @@ def in_threads(pieces: Iterable[T], work: Callable[[T], R]) -> Iterator[tuple[T,
 
 @lru_cache(maxsize=32)
 def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
-    """The kernel of results ``(R, C)`` of a tile, see :func:`judged`.
+    """The kernel that computes the results ``(R, C)`` of a tile, see :func:`judged`.
 
     ``kind``: ``dense`` or ``sparse`` like the tile, ``undamped`` for sparse tiles with cells that may be Hamiltonian.
     """
 
-    # The last two of them vary from row to row.
+    # Parameters that vary from row to row.
     of_rows = names[-3:-1]
 
     def bind(values: Mapping, fixed: Mapping, row: Mapping) -> FloquetModel:
@@ -158,11 +157,11 @@ def exact_verdict(model: FloquetModel, phi: quartic.Blocks, value_error: Array) 
 
 
 def judged(c: quartic.Coefficients, rtol: Array, exact: Array | None = None) -> dict[str, Array]:
-    """Results of lanes by name, and flags ``unsure`` of lanes to compute again by eigenvalues; ``exact``: verdicts of
-    Hamiltonian lanes.
+    """Results of lanes by name, and flags ``unsure`` of lanes to compute again by eigenvalues.
 
-    The intervals of all other lanes do not contain 1. One kernel: thirty small ones repeat the computation of the
-    coefficients, and take up to a quarter longer to run and half as long again to compile.
+    ``exact`` holds the verdicts of Hamiltonian lanes. The interval of rho of every other lane without the flag excludes 1.
+    All results come from one kernel: thirty small kernels repeat the computation of the coefficients, and take up to a
+    quarter longer to run and half as long again to compile.
     """
     return in_one_kernel(_judged)(c, rtol, exact)
 

@@ -16,8 +16,8 @@ from drivetrain_jax.atlas.windows import Crossing, Interval, Line, Range
 
 Direct = Callable[[Mapping[str, np.ndarray]], np.ndarray]
 
-# Distance of a check from the end of a window in error bounds, and its minimum relative to the range of the parameter; then
-# both for the end of an interval, where direct solves must resolve the sign of rho - 1.
+# Distance of a check from the end of a window, in error bounds, and its minimum relative to the range of the parameter. The
+# last number is this minimum at the end of an interval, where direct solves must resolve the sign of rho - 1.
 _BOUNDS, _PART, _BESIDE = 10.0, 1e-6, 1e-9
 # Points of a range at which a check solves, and points at which it searches the maximum on the surrogate.
 _SAMPLES, DENSE = 101, 801
@@ -66,9 +66,11 @@ class End:
 
 
 def check_ends(ends: list[End], line: Line, criteria: Criteria, direct: Direct) -> Check | None:
-    """Direct solves just inside all ``ends`` of stable intervals of ``line``, over the whole other coordinate, and just
-    beyond. Beyond, they lie on the ridge of the tongue at the crossing, else at the crossing; both also at the maximum
-    of the surrogate. None without ends."""
+    """Check all ``ends`` of stable intervals of ``line`` by direct solves just inside and just beyond; None without ends.
+
+    Inside, the solves cover the whole range of the other coordinate. Beyond, they lie on the ridge of the tongue at the
+    crossing, or at the crossing itself without a ridge. On both sides one solve is at the maximum of the surrogate.
+    """
     part = criteria.atlas
     k = part.parameters.index(line.parameter)
     other, span = part.parameters[1 - k], float(part.upper[k] - part.lower[k])
@@ -123,8 +125,7 @@ def _worst(criteria: Criteria, k: int, value: float) -> float:
 
 
 def check_window(safe: Range, interval: Interval, line: Line, criteria: Criteria, direct: Direct) -> Check:
-    """Direct solves within ``safe``, a part of the stable ``interval``, and in the unstable intervals of ``line`` next
-    to it."""
+    """Check ``safe``, a part of the stable ``interval``, by direct solves in it and in the unstable intervals next to it."""
     part = criteria.atlas
     span = float(part.upper[0] - part.lower[0])
     outer = []
@@ -132,7 +133,7 @@ def check_window(safe: Range, interval: Interval, line: Line, criteria: Criteria
         if crossing:
             value = crossing.value + side * max(_BOUNDS * crossing.error, _PART * span)
             outer += [value] if _unstable(line, value) else []
-    # Without a margin the crossings belong to the window: step inside by as much.
+    # Without a margin the window ends at the crossings: keep the same distance from them inside.
     step = _PART * span
     inner = np.linspace(safe[0] + step, safe[1] - step, _SAMPLES)
     rho = _solve(direct, part, {line.parameter: np.append(inner, outer)})

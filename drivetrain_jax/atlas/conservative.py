@@ -1,9 +1,10 @@
-"""Stability without damping, where multipliers lie on the unit circle and no margin separates them from it.
+"""Stability without damping, where stable multipliers lie exactly on the unit circle.
 
 If Phi = [[A, B], [C, D]] is symplectic, (sigma + 1/sigma)/2 = 1 + 2 m with the eigenvalues m of M = B^T C, and
 det M = det B det C, det(I + M) = det A det D. All multipliers lie on the unit circle, apart from each other, if and only
-if m_1 != m_2 are real with -1 < m < 0: then every motion stays bounded. The signs of the four determinants are known
-wherever their own errors allow, although their products vanish to second order at the tip of a tongue.
+if m_1 != m_2 are real with -1 < m < 0: then every motion stays bounded. At the tip of a tongue the products of the
+determinants vanish to second order. The signs of the four single determinants are therefore used: each is known wherever
+the determinant exceeds its own error.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def verdict(phi: Blocks, value_error: Array) -> Array:
     m_error = delta * (jnp.sqrt(square_norm(phi.b)) + jnp.sqrt(square_norm(phi.c)) + delta)
     m_norm = jnp.sqrt(square_norm(m))
     pair = _sign(spread**2 + 4 * m[0][1] * m[1][0], 8 * m_error * (m_norm + m_error) + 16 * EPS * m_norm**2)
-    # For two real m with equal signs, and equal signs of 1 + m, the mean shows where they lie.
+    # If both real m have one sign, and both 1 + m have one sign, the mean of m shows which signs these are.
     inside = _sign(-trace, 2 * m_error) * _sign(2 + trace, 2 * m_error)
     stable = (at_one > 0) & (at_minus_one > 0) & (pair > 0) & (inside > 0)
     unstable = (at_one < 0) | (at_minus_one < 0) | (pair < 0)

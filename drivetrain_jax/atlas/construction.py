@@ -5,10 +5,10 @@ failed. It returns the :class:`~drivetrain_jax.atlas.Atlas`. Solves may report a
 the bounds of the panels then include it. The construction is deterministic: equal values give equal requests, so a run can
 be replayed from stored answers. Every box passes these steps:
 
-1. probes along lines on its edges, refined until the Chebyshev coefficients of each coordinate are resolved; 2. a tensor
-grid with some more nodes per coordinate than the worst line needs, and held-out points; 3. acceptance, if the truncated
-tail (extrapolated from the last pairs of slabs) and the errors at all held-out points are    small enough; else growth by
-the slope of the tail (at most twice), else a split in two halves.
+1. probes along lines on its edges, refined until the Chebyshev coefficients of each coordinate are resolved;
+2. a tensor grid with some more nodes per coordinate than the worst line needs, and held-out points;
+3. acceptance, if the truncated tail (extrapolated from the last pairs of slabs) and the errors at all held-out points are
+   small enough; else growth by the slope of the tail (at most twice), else a split in two halves.
 
 A cheap ``Source`` of nodes replaces the probes: tensors then grow until their coefficients have fallen. Held-out points are
 always solved.
@@ -34,7 +34,7 @@ from drivetrain_jax.atlas.quantity import Quantity
 from drivetrain_jax.systems import Coordinate
 
 Rounds = Generator[np.ndarray, np.ndarray, Atlas]
-# A box with its construction, and the points that it requests, or their values (None at the start).
+# A box, its construction, and the points that it requests, or the values at these points (None at the start).
 _Open = tuple[Box, Refinement, np.ndarray]
 _Answered = tuple[Box, Refinement, np.ndarray | None]
 MAX_SOLVES, MAX_NODES = 400_000, 128
@@ -79,7 +79,7 @@ class Domain:
 
 
 class SolveCache:
-    """Cache of solved points: none is requested twice (neighbouring boxes share the lines on their common face)."""
+    """Cache of solved points, so that none is solved twice: neighbouring boxes share the lines on their common face."""
 
     def __init__(self) -> None:
         self._numbers: dict[bytes, int] = {}
@@ -230,7 +230,7 @@ def _with_solver_errors(atlas: Atlas, settings: Settings, cache: SolveCache, siz
 
 
 def refine(box: Box, settings: Settings) -> Refinement:
-    """Yield requests for values at points in coordinates; returns the panel, gap or halves of the box."""
+    """Yield points in coordinates at which values are needed; returns the panel, gap or halves of the box."""
     refinement = BoxRefinement(box, settings)
     if settings.source:
         return (yield from fit_given(refinement, settings.source))

@@ -10,9 +10,9 @@ because p = (sigma^2 - P sigma + 1)(sigma^2 - Q sigma + d) if and only if g = 0.
 analytic across the boundary; all three are positive where the system is stable. g is the product of all
 1 - sigma_i sigma_j (i < j) over (1 - d)^2.
 
-Without dissipation d = 1 and a = c, the pair's function tends to b's discriminant a^2/4 - b + 2 only if the dissipation
-is set to zero before the limit is taken (with vanishing dissipation the boundary may be another one). p(-1) and p(+1)
-then factor: with Phi = [[A, B], [C, D]] the edges are the zeros of det A and det D (multiplier -1), det B and det C (+1).
+Without dissipation d = 1 and a = c. The function of the pair is then the discriminant a^2/4 - b + 2. This is not the limit
+of g for vanishing dissipation, which may give another boundary. p(-1) and p(+1) then factor: with Phi = [[A, B], [C, D]]
+the edges are the zeros of det A and det D (multiplier -1), det B and det C (+1).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ PLUS, MINUS, PAIR = "+1", "-1", "pair"
 # A zero bounds the stable region only if no multiplier grows. A growth rate above this value counts as real.
 LIMITING = 1e-6
 _STATES = 4
-# Points per call of the determinant: few shapes need few compilations.
+# Points per call of the determinant: few sizes, so few compilations.
 _BLOCKS = (64, 512, 4096)
 
 
@@ -118,11 +118,11 @@ class Criteria:
         return np.stack([1 - a + b - c + d, 1 + a + b + c + d, 1 + d - b + product])
 
     def errors(self, panel: Panel, phi: np.ndarray, log_determinant: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Error bounds of the functions from the (statistical) errors of ``panel`` and rounding: |error| <= first +
-        |second|.
+        """Error bounds of the functions in two parts, ``(k, ...)`` each: |error| <= first + |second|.
 
-        Both have shape ``(k, ...)``; the second is smooth. For the pair g = 1 + d - b + a^2/4 - W^2/4, W = P - Q. The error
-        of W is large, but W vanishes where two pairs meet: the second part is W times half its error.
+        They follow from the (statistical) errors of ``panel`` and from rounding. The second part is smooth, and 0 except
+        for the pair, g = 1 + d - b + a^2/4 - W^2/4, W = P - Q. It is W times half the error of W: this error is large, but W
+        vanishes where two pairs meet.
         """
         z = monodromy(phi)
         a, _, c = invariants(z)
@@ -152,8 +152,10 @@ class Criteria:
         return np.abs(self.eigenvalues(x)).max(axis=1, initial=0.0) if len(x) else np.empty(0)
 
     def stable(self, x: np.ndarray) -> np.ndarray:
-        """Flags of stable points of the surrogate, ``(N, d) -> (N,)``: all multipliers inside the unit circle, or
-        without dissipation on it and distinct. Errors are not considered here."""
+        """Flags of stable points of the surrogate, ``(N, d) -> (N,)``, without regard to its error.
+
+        All multipliers are inside the unit circle; without dissipation they are on it and distinct.
+        """
         if not self.conservative:
             return self.spectral_radius(x) < 1
         phi = self.propagator(x)

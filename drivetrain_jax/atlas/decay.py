@@ -9,9 +9,9 @@ import numpy as np
 
 from drivetrain_jax.atlas.interpolation import envelope
 
-# A plateau this far below the largest coefficient is rounding or noise of the solves, not an oscillation.
+# Coefficients that stop falling below this fraction of the largest one are rounding or noise, not an oscillation.
 _NOISE = 1e-6
-# The same for the last coefficients of a tensor, relative to the allowed truncation error.
+# The last coefficients of a tensor are rounding below this fraction of the allowed truncation error.
 _ROUNDING = 1e-2
 
 
@@ -44,8 +44,10 @@ def needed(sizes: np.ndarray, limit: float) -> int | None:
 
 
 def foreseen(sizes: np.ndarray, limit: float) -> int | None:
-    """As :func:`needed`, or by the slope of the last half if that adds less than a third. Overestimates superexponential
-    decay."""
+    """Number of polynomials as of :func:`needed`, else extrapolated by the slope of the last half.
+
+    None if the extrapolation adds a third or more. It overestimates the number for superexponential decay.
+    """
     tail, n = envelope(sizes), len(sizes)
     if tail[-3] <= limit:
         return needed(sizes, limit)
@@ -82,7 +84,7 @@ def is_algebraic(sizes: np.ndarray) -> bool:
 def remainder(sizes: np.ndarray, limit: float) -> float:
     """Sum of the truncated coefficients, extrapolated from the last pairs; inf if these do not fall.
 
-    Coefficients that stopped falling far below ``limit`` are rounding: the sum is then 0.
+    Last coefficients far below ``limit`` are rounding: the result is then the larger one of the last two.
     """
     before, last = max(sizes[-4:-2], default=np.inf), max(sizes[-2:])
     if last < _ROUNDING * limit:

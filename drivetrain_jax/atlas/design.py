@@ -32,14 +32,16 @@ from drivetrain_jax.atlas.windows import (
 )
 from drivetrain_jax.systems import System
 
-# Largest gap by rounding between an undecided range and the end of the error that covers it.
+# Largest distance, relative, between an undecided range and the end of its covering error that counts as rounding.
 _ROUNDING = 4 * np.finfo(float).eps
 
 
 @dataclass(frozen=True)
 class Answer:
-    """``value`` of ``parameter`` with a bound of its ``error``. The value is None if the ``safe_end`` of the atlas, from
-    which stability must reach to it, is unstable; ``stable`` may then contain other intervals.
+    """The ``value`` of ``parameter`` up to which the system is stable from ``safe_end``, with a bound of its ``error``.
+
+    ``safe_end`` is an end of the atlas. If the system is unstable there, the value is None, and ``stable`` may contain other
+    intervals.
 
     ``limit`` is the crossing that determines the value. It is None at the end of the atlas (error 0) and at the start of an
     undecided range (error NaN). ``intervals`` lists all stable and unstable ranges, ``undecided`` those that errors leave
@@ -183,7 +185,7 @@ def _uncovered(undecided: Iterable[Range], crossings: Iterable[Crossing]) -> lis
 
 
 def _reach(crossing: Crossing) -> float:
-    """The reach of a known error, with a tolerance for rounding."""
+    """The error of a crossing, 0 if it is unknown, with a tolerance for rounding."""
     return float(np.nan_to_num(crossing.error)) + _ROUNDING * abs(crossing.value)
 
 

@@ -17,7 +17,7 @@ from drivetrain_jax.atlas.panels import Atlas, Panel, chebyshev, position
 
 # Upper limit of the size of the first product of a block of scattered points.
 _WORKING_SET = 1 << 22
-# Points of a line that are evaluated at a time, and points per line from which on lines are worth their tensors.
+# Points of a line that are evaluated at a time, and mean number of points per line above which lines save time.
 _LINE, _SHARED = 1 << 10, 2
 
 
@@ -26,8 +26,8 @@ def values_at(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The functions of ``atlas`` at points ``(N, d)`` (parameters): values ``(N, m)`` and bounds ``(N,)``.
 
-    The bound is that of the panel for the norm of the error, without rounding at evaluation. Points in gaps or outside go
-    to ``solve(points) -> values``, as in the construction, and have the bound 0; without ``solve`` they are NaN. Raises
+    A bound limits the norm of the error of the panel, without rounding at evaluation. Points in gaps or outside are solved
+    by ``solve(points) -> values``, as in the construction, and have the bound 0; without ``solve`` they are NaN. Raises
     ``ValueError`` if there is neither a panel nor ``solve``.
     """
     points = np.asarray(points, float)
@@ -59,8 +59,10 @@ def scattered(tensor: Array, weights: Sequence[Array]) -> Array:
 
 
 def on_lines(panel: Panel, x: np.ndarray) -> np.ndarray:
-    """Values ``(m, N)`` at points in coordinates ``(N, d)``, many of which share all coordinates but the last two: the
-    tensor of these two is made once for each place of the others."""
+    """Values ``(m, N)`` at points in coordinates ``(N, d)``, many of which share all coordinates but the last two.
+
+    The tensor of the last two coordinates is made once for each combination of the others.
+    """
     t, d = position(panel, x), x.shape[1]
     values = np.empty((panel.coefficients.shape[-1], len(x)))
 
@@ -82,7 +84,7 @@ def on_lines(panel: Panel, x: np.ndarray) -> np.ndarray:
 
 
 def share_lines(x: np.ndarray) -> bool:
-    """True if points in coordinates are few times as many as the places of all their coordinates but the last two."""
+    """True if on average at least ``_SHARED`` of the points ``x`` share all coordinates but the last two."""
     return x.shape[1] > 2 and _SHARED * len(np.unique(x[:, :-2], axis=0)) <= len(x)
 
 
