@@ -30,8 +30,10 @@ class Source(Protocol):
         ...
 
     def start(self, axes: Sequence[np.ndarray]) -> Callable[[], np.ndarray]:
-        """Start computing the grid of ``axes`` (coordinates); returns a function that waits for its values ``(N, m)``,
-        points in C order, NaN for missing ones."""
+        """Start computing the grid of ``axes`` (coordinates); returns a function that waits for the values ``(N, m)``.
+
+        Points are in C order; missing values are NaN.
+        """
         ...
 
 

@@ -227,7 +227,7 @@ def _extreme(atlas: Atlas, system: type[System], speeds: Range, side: float, dir
     answer = _from_safe_end(line, part, side)
     if direct is None:
         return answer
-    # The values to check: the limit of a value, otherwise both ends of every stable interval.
+    # Ends to check: the end that is the answer; without an answer both ends of every stable interval.
     stated = answer.stable if answer.value is None else (line.intervals[-1 if side > 0 else 0],)
     sides = (1.0, -1.0) if answer.value is None else (side,)
     ends = [End.of(interval, inward) for interval in stated for inward in sides]
@@ -235,7 +235,7 @@ def _extreme(atlas: Atlas, system: type[System], speeds: Range, side: float, dir
 
 
 def _from_safe_end(line: Line, part: Atlas, side: float) -> Answer:
-    """The value and the crossing up to which it is stable from the end on that ``side``."""
+    """The answer without a check: the value up to which ``line`` is stable, from the end on that ``side``."""
     k = part.parameters.index(line.parameter)
     safe, other = (float(x[k]) for x in ((part.upper, part.lower) if side > 0 else (part.lower, part.upper)))
     answer = Answer(line.parameter, None, math.nan, None, line.intervals, line.undecided, False, safe)
@@ -250,6 +250,6 @@ def _from_safe_end(line: Line, part: Atlas, side: float) -> Answer:
 
 
 def _doubted(line: Line, value: float, limit: Crossing | None, side: float) -> bool:
-    """True if an undecided range reaches the safe side of ``value``, beyond its error if a crossing limits it."""
+    """True if an undecided range reaches the safe side of ``value``, beyond the error of the crossing ``limit`` if given."""
     reached = max((max(side * a, side * b) for a, b in line.undecided), default=-math.inf)
     return reached > side * value + _reach(limit) if limit else reached >= side * value

@@ -138,7 +138,7 @@ class _Bundle:
         return np.where(low + high > 0, 1.0, -1.0), np.maximum(low, -high)
 
     def _along_valley(self, sign: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coefficients in v of sign f and of f_h on the line h = const where f_h vanishes about."""
+        """Coefficients in v of sign f and of f_h on the line h = const along which f_h is about 0."""
         width = self.f.upper[:, self.h] - self.f.lower[:, self.h]
         middle = np.zeros(len(self.f))
         first, second = (self._line(p, self.h, middle)[0] for p in (self.f_h, self.f_hh))

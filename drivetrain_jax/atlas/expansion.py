@@ -18,7 +18,7 @@ from jax import Array
 from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
 from drivetrain_jax.atlas.panels import Atlas, Panel, chebyshev, position
 
-# Polynomials of a panel per box and coordinate. With many coordinates the boxes would take more memory than they save work.
+# Polynomials of a panel per box and coordinate. Boxes are larger with many coordinates, to limit the memory of all boxes.
 _PER_BOX, _PER_LARGE_BOX = 6, 12
 _FEW_COORDINATES = 2
 # Largest truncation error relative to the panel's error, or to its values if that is more.
@@ -27,8 +27,11 @@ _PART, _ROUNDING = 1e-4, np.finfo(float).eps / 8
 
 @dataclass(frozen=True)
 class Cell:
-    """Points of one box: ``tensor`` ``(n_2, ..., n_d, m, n_1)``, numbers ``index`` of the points, and their ``place`` in
-    [-1, 1]^d, ``(d, N)``. ``left_out`` bounds the norm of the truncation error."""
+    """The points of one box: their numbers ``index`` and their ``place`` in [-1, 1]^d, ``(d, N)``.
+
+    ``tensor`` ``(n_2, ..., n_d, m, n_1)`` holds the coefficients of the box; ``left_out`` bounds the norm of its truncation
+    error.
+    """
 
     panel: Panel
     tensor: Array

@@ -70,10 +70,10 @@ def known_checks(refinement: BoxRefinement) -> Sample:
 def judge(
     refinement: BoxRefinement, tensor: np.ndarray, values: np.ndarray, checks: Sample, spare: float = 0.5
 ) -> tuple[Panel | None, np.ndarray, float]:
-    """The panel if it is accurate enough; the truncation error of each coordinate over its limit, half the tolerance; that
-    limit.
+    """The panel (None if inaccurate), the truncation error of each coordinate relative to its limit, and this limit.
 
-    Errors at the held-out points may use the fraction ``spare`` of the tolerance.
+    The limit is half the allowed error of the values. Errors at the held-out points may use the fraction ``spare`` of the
+    tolerance.
     """
     quantity, tolerance = refinement.settings.quantity, refinement.settings.tolerance
     t = refinement.box.position(checks.x)
@@ -102,7 +102,7 @@ def _without(tensor: np.ndarray, negligible: float) -> np.ndarray:
 
 
 def grown(tensor: np.ndarray, tails: np.ndarray, limit: float) -> list[int]:
-    """More nodes where the tail is too large; a few everywhere if only the held-out points exceed the limit."""
+    """Numbers of nodes, larger where the tail is too large; all a little larger if only held-out points exceed the limit."""
     degrees = list(tensor.shape[:-1])
     if tails.max() <= 1:
         return [n + max(2, n // 10) for n in degrees]

@@ -14,7 +14,7 @@ from drivetrain_jax.atlas.series import series_nodes
 from drivetrain_jax.atlas.stability import StabilityAtlas
 from drivetrain_jax.systems import LinearPeriodic, Smoothness, System
 
-# Ratio of the tolerance of direct solves to that of the atlas, as far as rounding allows.
+# Ratio of the tolerance of direct solves to that of the atlas, and the smallest tolerance that rounding allows.
 _SHARPER, _FINEST = 3e-2, 1e-13
 
 

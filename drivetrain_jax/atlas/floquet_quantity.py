@@ -33,7 +33,7 @@ def floquet_quantity(form: LinearPeriodic) -> Quantity:
         return phi if x is None else x @ np.swapaxes(phi, 1, 2) @ x @ phi
 
     def scale(values: np.ndarray) -> np.ndarray:
-        # |dZ| <= 2 |Phi| |dPhi| where Z is a product of two.
+        # |dZ| <= 2 |Phi| |dPhi| where Z is a product of two factors Phi.
         size = np.linalg.norm(monodromy(values), axis=(1, 2))
         return size if x is None else size / (2 * np.linalg.norm(values, axis=1))
 
@@ -44,8 +44,10 @@ def floquet_quantity(form: LinearPeriodic) -> Quantity:
 
 
 def _characteristic_coefficients(z: np.ndarray) -> np.ndarray:
-    """As :func:`characteristic_coefficients`, ``(N, n, n) -> (N, n)``, without JAX, which would trace every step for few
-    points."""
+    """As :func:`characteristic_coefficients`, ``(N, n, n) -> (N, n)``, in NumPy.
+
+    JAX would trace every step, which does not pay for few points.
+    """
     power, found = z, []
     for k in range(1, z.shape[1] + 1):
         found.append(-np.trace(power, axis1=1, axis2=2) / k)

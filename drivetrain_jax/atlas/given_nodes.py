@@ -17,16 +17,16 @@ from drivetrain_jax.atlas.interpolation import analysis_matrix, coefficients, en
 
 # Number of lines at the start, and of lines that probe the need of a coordinate.
 _LINES, _PROBES = 32, 64
-# Nodes beyond those that the coefficients need, because edges do not show everything. Along lines: nodes beyond the radians
-# in units of their cube root.
+# Further nodes beyond those that the edges need, because edges do not show everything. Further nodes along lines beyond one
+# per radian, in units of the cube root of the radians.
 _SPARE, _BEYOND = 2, 10.0
-# Number of boxes along lines up to which cutting is cheaper.
+# Most boxes along a line: cutting a box into more of them does not pay.
 _MOST_BOXES = 100
 _MAX_GROWTHS = 8
 
 
 def fit_given(refinement: BoxRefinement, source: Source) -> Refinement:
-    """A panel with nodes from ``source``, compared with solves, or the halves or gap of the box instead."""
+    """A panel with nodes from ``source`` that agrees with solves, or the halves or gap of the box instead."""
     d, most = len(refinement.box.lower), MAX_NUMBERS // refinement.settings.quantity.size
     most_along, checks = refinement.settings.max_nodes, None
     radians = source.radians(refinement.box.lower, refinement.box.upper)
@@ -46,7 +46,7 @@ def fit_given(refinement: BoxRefinement, source: Source) -> Refinement:
         degrees = _suited(degrees, source)
         waiting = source.start(refinement.box.axes(degrees))
         if checks is None:
-            # In parallel with the nodes.
+            # Held-out points are solved while the source computes the nodes.
             solved = yield from refinement.solve(_held_out(d))
             if not np.isfinite(solved).all():
                 return refinement.failed(solved)
@@ -76,7 +76,7 @@ def _suited(degrees: list[int], source: Source) -> list[int]:
 
 
 def _probed(refinement: BoxRefinement, source: Source, degrees: list[int]) -> list[int]:
-    """Nodes that each coordinate needs along the edges of the box; ``degrees`` where values are missing."""
+    """Number of nodes that each coordinate needs along the edges of the box; ``degrees`` if values are missing."""
     box, d = refinement.box, len(refinement.box.lower)
     ends = [np.array(pair) for pair in zip(box.lower, box.upper, strict=True)]
     counts = [degrees[k] if k == source.axis else _PROBES for k in range(d)]
@@ -100,7 +100,7 @@ def _probed(refinement: BoxRefinement, source: Source, degrees: list[int]) -> li
 
 
 def _resized(tensor: np.ndarray, tails: np.ndarray, limit: float) -> list[int]:
-    """More nodes where the tail is too large, and only the needed ones elsewhere."""
+    """Numbers of nodes: larger where the tail is too large, only as large as needed elsewhere."""
     more = zip(tensor.shape, grown(tensor, tails, limit), tails, strict=False)
     return [
         count if tail > 1 else min(n, _needed(slabs(tensor, k), limit) + _SPARE)

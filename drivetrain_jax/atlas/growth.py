@@ -60,8 +60,11 @@ def growth(criteria: Criteria, x: np.ndarray, kinds: list[str], *, second: bool 
 
 
 def limiting(criteria: Criteria, x: np.ndarray, own: Growth) -> np.ndarray:
-    """Flags ``(N,)`` where no multiplier grows at ``x`` except ``own``, which are on the unit circle up to their rates.
-    With little damping the rates within a tongue are small."""
+    """Flags ``(N,)`` of points ``x`` at which no multiplier except ``own`` grows.
+
+    The multipliers ``own`` are on the unit circle up to their rates. With little damping growth rates within a tongue are
+    small.
+    """
     largest = growth(criteria, x, ["largest"] * len(x))
     with np.errstate(invalid="ignore"):
         bound = np.fmin(np.abs(own.rate) + own.error + largest.error, LIMITING)
@@ -105,7 +108,7 @@ def _choose(sigma: np.ndarray, kinds: list[str]) -> np.ndarray:
         PLUS: np.abs(sigma - 1),
         MINUS: np.abs(sigma + 1),
         "largest": -np.abs(sigma),
-        # One of the two of a pair, by the sign of its imaginary part.
+        # Of a conjugate pair only the multiplier with positive imaginary part.
         "pair": np.abs(np.abs(sigma) - 1) + np.where(sigma.imag > 0, 0.0, 1e3),  # pyright: ignore[reportAttributeAccessIssue]
     }
     distance = np.stack([targets[kind][i] for i, kind in enumerate(kinds)]) if kinds else np.empty((0, 4))

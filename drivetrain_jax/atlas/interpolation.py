@@ -10,8 +10,8 @@ from scipy.fft import dctn
 
 from drivetrain_jax.atlas.panels import chebyshev
 
-# Largest first product of a block of points; size below which OpenBLAS starts no threads. Its threads spin for a tenth of a
-# second on cores that solves and charts need.
+# Most numbers in the first product of a block of points. Size of a product below which OpenBLAS starts no threads; these
+# would spin for a tenth of a second on cores that solves and charts need.
 _WORKING_SET, _ONE_THREAD = 1 << 22, 1 << 18
 
 

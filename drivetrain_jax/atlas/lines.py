@@ -15,10 +15,10 @@ from drivetrain_jax.atlas.interpolation import envelope
 
 # Points of a line at first; each refinement doubles the intervals.
 _LINE = 17
-# Resolution of a line relative to the tolerance, and further nodes of the tensor, because lines along the edges do not show
-# everything. Fewer with three coordinates and more, where every node counts and there are more lines.
+# Resolution of a line relative to the tolerance, and number of further nodes of the tensor, because lines along the edges do
+# not show everything. The second pair is for three or more coordinates, with more lines and costlier nodes.
 _THOROUGH, _MANY = (1 / 8, 2), (1 / 2, 0)
-# Most lines at which a coordinate is probed.
+# Most lines along which a coordinate is probed.
 _MAX_LINES = 8
 
 Probe = Generator[np.ndarray, np.ndarray, Parts | list[int]]
@@ -55,7 +55,7 @@ def _along(corner: np.ndarray, axis: int, t: np.ndarray) -> np.ndarray:
 
 
 def probe(refinement: BoxRefinement) -> Probe:
-    """Nodes that each coordinate needs according to lines along the edges, or the halves or gap of the box instead."""
+    """Number of nodes that each coordinate needs along the edges, or the halves or gap of a box with an unresolved line."""
     d = len(refinement.box.lower)
     places = [(axis, corner) for axis in range(d) for corner in _corners(d, axis)]
     t = np.concatenate([_along(corner, axis, decay.lobatto(_LINE)) for axis, corner in places])

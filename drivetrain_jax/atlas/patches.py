@@ -24,7 +24,7 @@ _TAIL = 3e-14
 _MAX_PATCHES = 8_000
 # Relative enlargement of boxes, so that a root on a face is inside.
 MARGIN = 0.25
-# Off the middle, so that a root is rarely on the face between two boxes.
+# Offset of a cut from the middle of a box, relative to half its width: a root is then rarely on the face between two boxes.
 _CUT = 0.0271
 
 
@@ -86,7 +86,7 @@ class Patches:
         return flat[0] - rest, flat[0] + rest
 
     def __call__(self, t: np.ndarray) -> np.ndarray:
-        """Values at positions ``t`` in [-1, 1]^d, one a patch, ``(N, d) -> (N,)``."""
+        """Values at one position ``t`` in [-1, 1]^d per patch, ``(N, d) -> (N,)``."""
         total = self.coefficients
         for axis in range(self.dimension):
             total = np.einsum("i...n,ni->...n", total, chebyshev(t[:, axis], total.shape[0]))

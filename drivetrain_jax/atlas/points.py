@@ -25,8 +25,10 @@ LANES, ROWS = 128, 16
 def judged_cells(
     expansion: Expansion, points: np.ndarray, x: np.ndarray, atlas: Atlas, kernel: Any, rtol: float
 ) -> Iterator[tuple[np.ndarray, Cells]]:
-    """Yield numbers of points and their results, block by block. ``points`` ``(N, d)`` are parameters, ``x``
-    coordinates; ``kernel`` is that of :func:`point_kernel`."""
+    """Yield numbers of points and their results, block by block.
+
+    ``points`` ``(N, d)`` are the parameters, ``x`` ``(N, d)`` the coordinates; ``kernel`` comes from :func:`point_kernel`.
+    """
     block = LANES * ROWS
 
     def work(part: tuple[Cell, int]) -> Cells:
@@ -54,8 +56,10 @@ def judged_cells(
 
 @lru_cache(maxsize=16)
 def point_kernel(build: Build, undamped: bool, few: bool) -> Any:
-    """Results ``(LANES ROWS,)`` of a block of points, those of the first ``rows`` rows, as :func:`charts.judged` gives them.
-    ``undamped``: points may be Hamiltonian; ``few``: they are of one row at most."""
+    """The kernel that computes the results ``(LANES ROWS,)`` of a block of points, as :func:`charts.judged` gives them.
+
+    It fills the first ``rows`` rows. ``undamped``: points may be Hamiltonian; ``few``: a block has one row at most.
+    """
 
     def kernel(tensor, place, rows, errors, left_out, values, fixed, rtol):
         count = max((*tensor.shape[:-2], tensor.shape[-1]))

@@ -86,7 +86,7 @@ def _bisect(patches: Patches, slope: Patches) -> tuple[np.ndarray, np.ndarray, n
 
 
 def merge(intervals: np.ndarray) -> np.ndarray:
-    """Intervals ``(K, 2)``, rising; those that touch or overlap are joined."""
+    """Intervals ``(K, 2)`` in rising order, with those that touch or overlap joined."""
     merged: list[list[float]] = []
     for a, b in intervals[np.argsort(intervals[:, 0])]:
         if merged and a <= merged[-1][1]:

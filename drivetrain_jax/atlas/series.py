@@ -64,7 +64,7 @@ class SeriesNodes:
         self._system, self._domain, self._series = system, domain, series
         self.axis = domain.parameters.index(series.parameter)
         target = max(_SHARPER * tolerance, _LEAST)
-        # Of the last term, which is kept; the truncated ones are far smaller.
+        # Limit of the last kept term; the truncated terms are far smaller.
         self._left_out = 10 * target
         self._parts = _PARTS - _SPARED * min(math.log10(target / _LEAST), _MOST_SPARED)
         self._least = 1 + math.ceil(_DECAY * decay)
@@ -75,8 +75,10 @@ class SeriesNodes:
         self._key = (system.models["floquet"].build, series, names, words, shapes)
 
     def radians(self, lower: np.ndarray, upper: np.ndarray) -> float:
-        """About half the angle through which propagators turn on a line between two corners, from its steps; infinite
-        for too many."""
+        """About half the angle through which propagators turn on a line between two corners, from its number of steps.
+
+        Infinite if the line needs too many steps.
+        """
         pairs = [np.array(pair) for pair in zip(lower, upper, strict=True)]
         end = max(pairs[self.axis], key=abs)
         _, steps = self._lines([pair if k != self.axis else np.array([end]) for k, pair in enumerate(pairs)])
@@ -86,10 +88,9 @@ class SeriesNodes:
         return _RADIANS * most * float(np.ptp(pairs[self.axis])) / (2 * abs(end)) if end else 0.0
 
     def start(self, axes: Sequence[np.ndarray]) -> Callable[[], np.ndarray]:
-        """Start computing the grid of ``axes``; returns a function that waits for its values ``(N, n n)``, points in C
-        order.
+        """Start computing the grid of ``axes``; returns a function that waits for the values ``(N, n n)``.
 
-        Values are NaN on lines along which the series does not converge.
+        Points are in C order. Values are NaN on lines along which the series does not converge.
         """
         x = axes[self.axis]
         end = max(x, key=abs)
@@ -118,7 +119,7 @@ class SeriesNodes:
         return values
 
     def _lines(self, axes: Sequence[np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """The parameters of all lines on a grid, without that of the series, and the steps for its value in ``axes``."""
+        """The parameters of all lines on a grid, except the one of the series, and the number of steps of each line."""
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
         columns = dict(zip(self._domain.parameters, self._domain.points(grid).T, strict=True))
         steps = explicit_effort(self._system, {**self._domain.fixed, **columns}, _STEPS_AT)

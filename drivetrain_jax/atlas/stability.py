@@ -33,7 +33,7 @@ from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
 DEFAULT_OUTPUTS = ("spectral_radius", "spectral_radius_error", "verdict")
 _FAST = frozenset(DEFAULT_OUTPUTS)
-# A kernel requested while another thread compiles it would be compiled twice.
+# Held during a call: a kernel requested while another thread compiles it would be compiled twice.
 _JUDGING = Lock()
 
 
@@ -77,7 +77,7 @@ class StabilityAtlas:
         return found
 
     def by_eigenvalues(self, points: np.ndarray, outputs: Sequence[str]) -> dict[str, np.ndarray]:
-        """As :meth:`at`, all points by the eigenvalues of Z."""
+        """As :meth:`at`, but all points by the eigenvalues of Z."""
         x, found = self.atlas.to_coordinates(points), self.blank((len(points),), outputs)
         number, size = self.atlas.find(x), evaluation.block_size(self.atlas)
         for k in range(len(self.atlas.panels)):
@@ -121,12 +121,11 @@ class StabilityAtlas:
         *,
         rows: int | None = None,
     ) -> dict[str, np.ndarray]:
-        """Results by name on the grid of ``axes``, one per parameter of the atlas, in its order, and ``outcome``; written
-        to ``out`` if given.
+        """Results by name, and ``outcome``, on the grid of ``axes``, one per parameter of the atlas in its order.
 
-        The last two axes should be the longest, because their cells are computed together. Cells that no panel covers are
-        marked as in :meth:`at`. For a part of a chart, ``rows`` is the length of the chart's last axis but one, so that all
-        parts share their kernels.
+        The results are written to ``out`` if it is given. The last two axes should be the longest, because their cells are
+        computed together. Cells that no panel covers are marked as in :meth:`at`. For a part of a chart, ``rows`` is the
+        length of the chart's last axis but one, so that all parts share their kernels.
         """
         axes = [np.asarray(axis, float) for axis in axes]
         shape = tuple(len(axis) for axis in axes)
@@ -156,7 +155,7 @@ class StabilityAtlas:
 
     @property
     def _multipliers(self) -> int:
-        # The shape of the panels tells it without a solve.
+        # The shape of the panels gives the number without building the form.
         return round(self.atlas.panels[0].coefficients.shape[-1] ** 0.5) if self.atlas.panels else self._form.size
 
     @cached_property
@@ -181,7 +180,7 @@ class StabilityAtlas:
     def _fill(self, found: dict[str, np.ndarray], axes: list[np.ndarray], rows: int | None) -> None:
         """Fill ``found`` tile by tile, then compute cells again for which the closed form is not accurate enough."""
         names, undamped = self.atlas.parameters, self._may_be_undamped(np.ix_(*axes))
-        # What no tile covers. To write nothing into all other arrays as well would take a tenth of the time of a chart.
+        # Mark the cells that no tile covers by the outcome alone: blanking all arrays takes a tenth of the time of a chart.
         found[OUTCOME.name][...] = Outcome.LOST
         coordinates = [c.forward(axis) for c, axis in zip(self.atlas.coordinates, axes, strict=True)]
 
@@ -229,7 +228,7 @@ def _nothing(name: str, values: np.ndarray) -> float | int:
 
 
 def _store(found: Mapping[str, np.ndarray], tile: Tile, cells: charts.Cells) -> np.ndarray:
-    """Put the results of a tile in their place; the cells to be judged again, as positions along each axis ``(N, d)``."""
+    """Store the results of a tile; returns the cells to compute again, as positions along each axis ``(N, d)``."""
     place = tuple(slice(i[0], i[-1] + 1) for i in tile.index)
     for name, values in found.items():
         part = values[place]
@@ -246,7 +245,7 @@ _scattered = jax.jit(evaluation.scattered, compiler_options=compiler_options())
 
 @lru_cache(maxsize=16)
 def _point_kernel(build: Build, outputs: tuple[str, ...], rtol: float, closed_form: bool) -> Any:
-    """Results of scattered points by eigenvalues, from Phi: takes seconds to compile, so no atlas has one of its own."""
+    """The kernel of scattered points, by eigenvalues from Phi; all atlases share it, because compiling takes seconds."""
 
     def kernel(phi, errors, values, fixed):
         everything = {**fixed, **values}
@@ -261,8 +260,10 @@ def _point_kernel(build: Build, outputs: tuple[str, ...], rtol: float, closed_fo
 
 
 def _sharper(phi: Array, model: FloquetModel, errors: Array, found: dict[str, Array]) -> dict[str, Array]:
-    """Verdicts also where the interval of rho holds 1, but no multiplier can cross the unit circle (Schur-Cohn), and the
-    exact results of Hamiltonian lanes."""
+    """Results with more verdicts, and with the exact results of Hamiltonian lanes.
+
+    Where the interval of rho contains 1, there is a verdict if no multiplier can cross the unit circle (Schur-Cohn).
+    """
     parts, log_d = quartic.blocks(phi), jnp.broadcast_to(model.reduced.log_determinant(), phi.shape[1:])  # pyright: ignore[reportOptionalCall]
     rho, error, verdict = (found[name] for name in DEFAULT_OUTPUTS)
     settled = quartic.nothing_crosses(quartic.coefficients(parts, log_d, errors[1:, None]), log_d)

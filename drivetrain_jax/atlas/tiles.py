@@ -28,10 +28,10 @@ NODES = 24
 _SPAN = 11.0
 # Fraction of the width of a tile above which nodes are used: other tiles cost half as much again, but are always full.
 _DENSE = 2 / 3
-# Widths are multiples of a step. Cost of a cell with and without nodes, and of a row of a tile, in cells; least saving of a
-# width over the one that divides the cells evenly, so that most charts of a size share one kernel.
 # Cells of a tile of several rectangles: small tiles cost as much time in Python as in their kernel.
 _CELLS = 1 << 16
+# Widths are multiples of a step. Cost of a cell with and without nodes, and of a row of a tile, in cells. A width is chosen
+# over the one that divides the cells evenly below this ratio of costs, so that most charts of a size share one kernel.
 _STEP, _COSTS, _ROW, _WORTH = 16, {True: 1.0, False: 1.6}, 100, 0.95
 
 
@@ -39,10 +39,10 @@ _STEP, _COSTS, _ROW, _WORTH = 16, {True: 1.0, False: 1.6}, 100, 0.95
 class Tile:
     """A rectangle of a grid within one panel, or several at neighbouring places along the axis before the last two.
 
-    ``index`` are the positions along each axis of the grid: one number for each other axis. ``first`` ``(R, m, n)`` is the
-    contracted tensor of the panel in each row, ``rows`` of them for each place. ``columns`` ``(n, C)`` are T_j at the cells.
-    In a dense tile ``columns`` ``(n, NODES)`` are T_j at the nodes, and ``spread`` ``(NODES, C)`` interpolates from the
-    nodes to the cells.
+    ``index`` holds the positions along each axis of the grid: one position along each leading axis, except that several
+    rectangles have several along the last leading axis. ``first`` ``(R, m, n)`` is the contracted tensor of the panel in
+    each row; each rectangle has ``rows`` rows. ``columns`` ``(n, C)`` are T_j at the cells. In a dense tile ``columns``
+    ``(n, NODES)`` are T_j at the nodes, and ``spread`` ``(NODES, C)`` interpolates from the nodes to the cells.
     """
 
     panel: Panel
@@ -65,11 +65,10 @@ class _Band:
 def tiles(
     atlas: Atlas, axes: Sequence[np.ndarray], most: tuple[int, int], *, rows: int | None = None, dense: bool = True
 ) -> Iterator[Tile]:
-    """Tiles of at most ``most`` cells that cover the panels' part of the grid of ``axes``, two or more, in coordinates;
-    where rectangles are small, of several rectangles.
+    """Yield tiles of at most ``most`` rows and columns that cover the panels' part of the grid of ``axes``.
 
-    ``axes`` rise. Tiles overlap on faces that panels share: the last one belongs to the panel of :meth:`Atlas.find`.
-    Without ``dense`` no tile has nodes. A part of a chart of ``rows`` rows has tiles of the same shape as all other parts.
+    ``axes`` are two or more rising arrays in coordinates. Where rectangles are small, a tile has several of them. Tiles overlap on faces that panels share: the last one belongs to the panel of :meth:`Atlas.find`. Without ``dense`` no tile
+    has nodes. A part of a chart of ``rows`` rows has tiles of the same shape as all other parts.
     """
     if not atlas.panels:
         return
@@ -92,8 +91,10 @@ def tiles(
 
 
 def _stacked(axes: Sequence[np.ndarray], count: int, largest: int, shape: tuple[int, int]) -> tuple[int, int, int]:
-    """Rows of a rectangle, number of rectangles of a tile, and rows of a tile, for a panel of ``count`` rows; ``largest``
-    is the number of rows of the largest panel."""
+    """Rows of a rectangle, number of rectangles of a tile, and rows of a tile, for a panel of ``count`` rows.
+
+    ``largest`` is the number of rows of the largest panel.
+    """
     rows, most = (-(-n // 8) * 8 for n in (count, largest))
     places = min(_CELLS // (most * shape[1]), len(axes[-3]) if len(axes) > 2 else 1)
     if places < 2:
@@ -104,7 +105,7 @@ def _stacked(axes: Sequence[np.ndarray], count: int, largest: int, shape: tuple[
 def _runs(
     reductions: Iterator[tuple[tuple[int, ...], Panel]], most: int
 ) -> Iterator[tuple[tuple[np.ndarray, ...], list[Panel]]]:
-    """Positions along the leading axes, and the panels there: up to ``most`` that differ along the last of these axes."""
+    """Yield positions along the leading axes, and up to ``most`` panels there that differ along the last of these axes."""
     for _, line in groupby(reductions, key=lambda reduction: reduction[0][:-1]):
         while run := list(islice(line, most)):
             places, panels = zip(*run, strict=True)
@@ -113,8 +114,10 @@ def _runs(
 
 @partial(jax.jit, static_argnames="total")
 def _first_product(weights: Array, tensors: Array, total: int) -> Array:
-    """``(R, n_1)`` times each of ``(k, n_1, m, n)``, filled up to ``(total, m, n)``, without NumPy, whose BLAS threads
-    would compete with the worker threads."""
+    """``(R, n_1)`` times each of ``(k, n_1, m, n)``, filled up to ``(total, m, n)``.
+
+    The BLAS threads of NumPy would compete with the worker threads.
+    """
     k, n, *rest = tensors.shape
     found = jnp.einsum("rn,knx->krx", weights, tensors.reshape(k, n, -1)).reshape(-1, *rest)
     return jnp.pad(found, ((0, total - len(found)), (0, 0), (0, 0)))
@@ -123,7 +126,7 @@ def _first_product(weights: Array, tensors: Array, total: int) -> Array:
 def _reductions(
     panel: Panel, axes: Sequence[np.ndarray], groups: Sequence[np.ndarray]
 ) -> Iterator[tuple[tuple[int, ...], Panel]]:
-    """Cells of the leading coordinates, and the panel of the last two there.
+    """Yield the position of each cell of the leading axes, and the panel of the last two coordinates there.
 
     Cells that share their first coordinates share the products with the whole tensor, which cost most.
     """
@@ -141,15 +144,19 @@ def _reductions(
 
 
 def _shared(count: int, most: int, step: int, multiple: int = 1) -> int:
-    """The size of pieces, a multiple of ``step`` and at most ``most``, so that their number is a multiple of another;
-    padding costs as much as cells."""
+    """Size of the pieces of ``count`` cells, a multiple of ``step``, at most ``most``, and with little padding.
+
+    The number of pieces is a multiple of ``multiple``. Padding costs as much as cells.
+    """
     pieces = -(-count // (most * multiple)) * multiple
     return -(-count // (pieces * step)) * step
 
 
 def _width(atlas: Atlas, axis: np.ndarray, most: int, dense: bool) -> int:
-    """The cheapest width of tiles for a row of the grid. It depends only on the last axis, so parts of a chart share
-    kernels."""
+    """The cheapest width of tiles for a row of the grid.
+
+    It depends on the last axis alone, so parts of a chart share kernels.
+    """
     even = _shared(len(axis), most, _STEP)
     panels = {(panel.lower[-1], panel.upper[-1], panel.degrees[-1]): panel for panel in atlas.panels}.values()
     rooms = [_room(panel, _positions(panel, -1, axis[_covered(panel, -1, axis)])) for panel in panels]
@@ -164,13 +171,13 @@ def _width(atlas: Atlas, axis: np.ndarray, most: int, dense: bool) -> int:
 
 
 def _room(panel: Panel, t: np.ndarray) -> np.ndarray:
-    """Number of cells from each one that a tile with nodes may span, by the panel's degree."""
+    """Number of cells that a tile with nodes may span from each cell on, limited by the degree of the panel."""
     angle = -np.arccos(t)
     return np.searchsorted(angle, angle + _SPAN / panel.degrees[-1], side="right") - np.arange(len(t))
 
 
 def _cuts(room: np.ndarray, width: int, dense: bool) -> Iterator[tuple[int, int, bool]]:
-    """Ranges ``start, end`` of at most ``width`` neighbouring cells, and flags of those with nodes."""
+    """Yield ``start, end`` of ranges of at most ``width`` neighbouring cells, and whether a range has nodes."""
     count = np.minimum(room, width)
     with_nodes = dense & (count >= max(_DENSE * width, 2 * NODES))
     start = 0
@@ -181,10 +188,10 @@ def _cuts(room: np.ndarray, width: int, dense: bool) -> Iterator[tuple[int, int,
 
 
 def _bands(panel: Panel, axis: np.ndarray, cells: np.ndarray, degree: int, width: int, dense: bool) -> Iterator[_Band]:
-    """The cells of a panel along the last axis, cut."""
+    """Yield the cells of a panel along the last axis, cut into bands."""
     t = _positions(panel, -1, axis[cells])
     for start, end, with_nodes in _cuts(_room(panel, t), width, dense):
-        # Equal cells leave no space for nodes.
+        # Cells at one position span no interval for nodes.
         band = _dense if with_nodes and t[end - 1] > t[start] else _sparse
         yield band(cells[start:end], t[start:end], degree, width)
 
@@ -218,7 +225,7 @@ def _positions(panel: Panel, k: int, x: np.ndarray) -> np.ndarray:
 
 
 def _assigned(atlas: Atlas, axes: Sequence[np.ndarray]) -> Iterator[tuple[Panel, list[np.ndarray]]]:
-    """For each panel, the first one last, the positions along each axis that it covers, faces included."""
+    """Yield the panels, last one first, with the positions along each axis that the panel covers, faces included."""
     for panel in reversed(atlas.panels):
         groups = [_covered(panel, k, x) for k, x in enumerate(axes)]
         if all(len(g) for g in groups):

@@ -24,7 +24,8 @@ from drivetrain_jax.atlas.undamped import undamped_tips
 from drivetrain_jax.systems import Resonances, System
 
 _POLISH = 8
-# Largest relative distance of the foot of a ridge from its prediction, and its ratio to that of the next one.
+# Largest relative distance of the foot of a ridge from its prediction, and least distance of the next prediction relative
+# to the nearest one.
 _NEAR, _CLEAR = 0.02, 3.0
 _HIGHEST_ORDER = 60
 # Number of undecided boxes from which tips are searched, largest error of their tips relative to the rectangle, and
@@ -56,7 +57,7 @@ class Tip:
 class Tips:
     """All tips, in rising order of the other parameter; ``undecided`` boxes of parameters that may contain more.
 
-    At zero damping tongues have no width at their tips: these are then predicted by theory. ``searches`` can be
+    At zero damping tongues have no width at their tips: the tips are then predicted by theory. ``searches`` can be
     reused by :func:`~drivetrain_jax.atlas.boundaries.boundaries` of the same atlas.
     """
 
@@ -109,8 +110,10 @@ def polish(
 
 
 def suspected(criteria: Criteria, kind: str, h: int, boxes: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, Growth]:
-    """Tips that Newton's method finds from ``undecided`` boxes: none of the ``known`` ones, and inside the rectangle
-    within their bounds."""
+    """Tips that Newton's method finds from undecided ``boxes``, without the ``known`` ones.
+
+    They are inside the rectangle and have error bounds below ``_LARGEST_ERROR``.
+    """
     low, high = criteria.atlas.corners
     starts = boxes[np.linspace(0, len(boxes) - 1, min(len(boxes), _MAX_STARTS)).astype(int)].mean(axis=1)
     x, rates = polish(criteria, starts.reshape(-1, 2), kind, h)
@@ -158,8 +161,10 @@ def _describe(criteria: Criteria, kind: str, h: int, points: tuple, opens: np.nd
 
 
 def _errors(rates: Growth, h: int) -> np.ndarray:
-    """Bounds of the coordinates' errors: along v the error of the rate over its slope, along h the shift that lowers the
-    maximum by it."""
+    """Bounds of the errors of the coordinates, ``(N, 2)``.
+
+    Along v the bound is the error of the rate over its slope; along h it is the shift of the maximum by that error.
+    """
     v = 1 - h
     errors = np.empty(rates.gradient.shape)
     with np.errstate(all="ignore"):

@@ -11,8 +11,8 @@ import numpy as np
 
 from drivetrain_jax.atlas.patches import Patches
 
-# Longest, shortest and first step, largest turn and correction of a step, growth of the steps. The shortest, first and
-# growth affect only the number of steps: turn and correction decide if a step is accepted.
+# Longest, shortest and first step, largest turn and correction of a step, growth of the steps. Turn and correction decide if
+# a step is accepted. Shortest and first step and growth affect only the number of steps.
 _LONGEST, _SHORTEST, _FIRST = 0.015, 1e-7, 1e-5
 _TURN, _CORRECTION, _GROWTH = 0.25, 0.15, 1.6
 _NEWTON, _MAX_STEPS = 3, 800
@@ -51,7 +51,7 @@ class Field:
 
 
 def trace(field: Field, seeds: np.ndarray) -> list[np.ndarray]:
-    """Points ``(n, 2)`` of the zero curve through each of ``seeds`` ``(M, 2)``, in coordinates, to the rim or around."""
+    """Points ``(n, 2)`` of the zero curve through each of ``seeds`` ``(M, 2)``, in coordinates, to the rim or all around."""
     start = field.to_unit(np.asarray(seeds, float).reshape(-1, 2))
     both, sense = np.concatenate([start, start]), np.repeat([1.0, -1.0], len(start))
     paths, returned = _follow(field, both, sense)
@@ -87,7 +87,7 @@ def trace_tips(field: Field, tips: np.ndarray, horizontal: int) -> list[np.ndarr
 
 
 def _flank(field: Field, top: np.ndarray, h: int, side: float) -> np.ndarray:
-    """Points on one flank of each tip, ``(M, k, 2)``, away from it in the other coordinate like squares."""
+    """Points on one flank of each tip, ``(M, k, 2)``, at the distances ``_APPROACH`` in the coordinate other than ``h``."""
     v, bend = 1 - h, field.bend(h)
 
     def curvature(y: np.ndarray) -> np.ndarray:

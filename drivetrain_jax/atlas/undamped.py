@@ -1,8 +1,8 @@
 """Tongues without damping: their tips are the resonances themselves, where they have no width.
 
 With Phi = [[A, B], [C, D]] the two edges of a tongue of multiplier -1 are a zero of det A and one of det D, of +1 those of
-det B and det C; both pass through the resonance at the foot. A tongue is confirmed where the two have separated by
-more than their errors. A pair collides where the discriminant is negative beyond its error on the ridge.
+det B and det C; both edges pass through the resonance at the foot. A tongue is confirmed where its edges have separated
+by more than their errors. A pair collides where the discriminant is negative beyond its error on the ridge.
 """
 
 from __future__ import annotations

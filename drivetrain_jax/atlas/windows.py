@@ -66,9 +66,9 @@ class Interval:
 class Line:
     """``intervals`` that alternate between stable and unstable, and the ``undecided`` ranges.
 
-    If a change lies in an undecided range that no error covers, one interval ends, and the next one begins, with that
-    range. The first and last interval also end there if the range reaches an end of the atlas. Without intervals all is
-    undecided.
+    If a change lies in an undecided range that no error covers, one interval ends where that range begins, and the next one
+    begins where it ends. An undecided range at an end of the atlas also shortens the first or last interval. Without
+    intervals everything is undecided.
     """
 
     parameter: str
@@ -122,7 +122,7 @@ def stability_over_range(atlas: Atlas, system: type[System], along: str) -> Line
             x, rates = polish(criteria, search.points, kind, h)
             error = rates.error / np.abs(rates.gradient[:, v])
             likely, _ = suspected(criteria, kind, h, search.undecided, x)
-            # The range in which they are searched is their error.
+            # Without an error of their own: `_one_change` takes the undecided range as their error.
             suspects += _crossings(atlas, likely, np.zeros(len(likely)), v, kind)
         changes += _crossings(atlas, x, error, v, kind)
         undecided += [tuple(sorted(map(float, parameters_at(atlas, box)[:, v]))) for box in search.undecided]
@@ -250,10 +250,10 @@ def _line(
 
 
 def _one_change(candidates: list[Crossing], between: Range, rising: bool, widest: float) -> Crossing | None:
-    """The change of stability ``between`` two tested parts, the upper one stable if ``rising``: the candidate nearest to
-    the stable part, with an error that covers everything between.
+    """The change of stability ``between`` two tested parts, the upper one stable if ``rising``.
 
-    None without a candidate, or if the undecided range is wider than the errors of the nearest ones and ``widest``.
+    It is the candidate nearest to the stable part, with an error that covers everything between the parts. None without a
+    candidate, or if the undecided range is wider than ``widest`` and than the errors of the nearest candidates.
     """
     if not candidates:
         return None
@@ -271,9 +271,9 @@ def _one_change(candidates: list[Crossing], between: Range, rising: bool, widest
 
 
 def _tested(lower: Any, upper: Any, undecided: Iterable[Range]) -> tuple[list, list]:
-    """The decided parts between two candidates (values, bounds of errors) in which stability is tested, and the others.
+    """The decided parts between two candidates (values, bounds of errors): those to test, and those too narrow for it.
 
-    The others are no wider than the errors and count to them.
+    A narrow part that reaches a candidate is extended by the error of this candidate.
     """
     (a, error), (b, other) = lower, upper = [tuple(map(float, np.nan_to_num(end))) for end in (lower, upper)]
     least = _least(lower, upper)
@@ -321,7 +321,7 @@ def _opposite(crossing: Crossing | None) -> Crossing | None:
 
 
 def _clipped(interval: Interval, lower: float, upper: float) -> Interval | None:
-    """The parts between the ends of the atlas."""
+    """The part of ``interval`` from ``lower`` to ``upper``; None without one."""
     if interval.upper <= lower or interval.lower >= upper:
         return None
     if interval.lower < lower:
