@@ -65,9 +65,10 @@ class _Band:
 def tiles(
     atlas: Atlas, axes: Sequence[np.ndarray], most: tuple[int, int], *, rows: int | None = None, dense: bool = True
 ) -> Iterator[Tile]:
-    """Yield tiles of at most ``most`` rows and columns that cover the panels' part of the grid of ``axes``.
+    """Yield tiles that cover the panels' part of the grid of ``axes``, two or more rising arrays in coordinates.
 
-    ``axes`` are two or more rising arrays in coordinates. Where rectangles are small, a tile has several of them. Tiles overlap on faces that panels share: the last one belongs to the panel of :meth:`Atlas.find`. Without ``dense`` no tile
+    A tile has at most ``most`` rows and columns. Where rectangles are small, a tile has several of them and more rows. Tiles
+    overlap on faces that panels share: the last tile belongs to the panel of :meth:`Atlas.find`. Without ``dense`` no tile
     has nodes. A part of a chart of ``rows`` rows has tiles of the same shape as all other parts.
     """
     if not atlas.panels:

@@ -34,7 +34,9 @@ _STORAGE = ("h5py",)
 
 
 class ResultBuffer:
-    """Results of all points of a grid, filled chunk by chunk. A point that is never filled has the outcome step limit.
+    """Results of all points of a grid, filled chunk by chunk.
+
+    A point that is never filled has no value and the outcome ``step_limit``.
 
     ``arrays`` holds all values: the axes in scene order (or the points), then the dimensions of the result.
     ``allocate(template)`` returns such arrays for a labelled result (default: in memory).
@@ -65,8 +67,10 @@ class ResultBuffer:
         self.release_after(results)
 
     def block(self, place: tuple[slice, ...], like: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Views of the arrays at a block of the grid, or a row of the points, to be overwritten. ``like``: results of
-        one point."""
+        """Views of the arrays at a block of the grid, or a range of the points, to be overwritten.
+
+        ``like`` holds the results of one point.
+        """
         self._lay_out_for(like, blank=False)
         return {name: values[place] for name, values in self.arrays.items()}
 
@@ -108,7 +112,7 @@ class ResultBuffer:
         self._lost.clear()
 
     def lay_out(self, *, blank: bool = True) -> Mapping[str, np.ndarray]:
-        """The arrays, created if nothing has been filled; their content is undefined without ``blank``."""
+        """The arrays, which are created if nothing has been filled; without ``blank`` new arrays have undefined content."""
         if not self.arrays:
             self._complete_sizes()
             sweep = self._grid.result_shape
@@ -148,7 +152,7 @@ def failures(outcome: np.ndarray) -> int:
 
 
 def missing_value(variable: Variable) -> float | int:
-    """The value of a result that is missing."""
+    """The value that marks a missing result of ``variable``."""
     if variable.name == OUTCOME.name:
         return Outcome.STEP_LIMIT
     # Integers have no NaN: a flag uses its last code (undecided, none).
@@ -198,7 +202,7 @@ def _axis_coordinates(scene: Scene) -> list[Coordinate]:
 
 
 def _drawn(system: type[System]) -> dict[str, str]:
-    """Declarations of the system for figures: its state and its families of resonances."""
+    """Attributes that figures need: the state of the system and its families of resonances."""
     families = system.resonances.families if system.resonances else ()
     attrs = {
         "state": [vars(component) for component in system.state],

@@ -29,7 +29,7 @@ from drivetrain_jax.systems import System
 
 # Distance of a spectral radius from 1 below which the distance itself is printed.
 _CLOSE = 1e-3
-# Text for the end of a stable interval that is not a change of stability.
+# Text after the end of a stable interval, by kind of end (`_kind`).
 _BEYOND = {"crossing": "", "atlas": " (the end of the atlas)", "undecided": " (undecided beyond)"}
 
 
@@ -96,9 +96,11 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
 
 
 def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Reply:
-    """The least damping above which a range of speeds is stable. If the largest damping of the atlas is unstable, the
-    answer lists the stable ranges of damping. For a cardan shaft in physical units only the ratio ``c2/c1`` of the given
-    dampings is used, and the answer is ``c1``. Raises as :func:`query`."""
+    """The least damping above which a range of speeds is stable.
+
+    If the largest damping of the atlas is unstable, the answer lists the stable ranges of damping. For a cardan shaft in
+    physical units only the ratio ``c2/c1`` of the given dampings is used, and the answer is ``c1``. Raises as :func:`query`.
+    """
     speed, damping = roles_of(atlas, "speed", "damping")
     asked = AtlasQuery.of(atlas, given, ranges=(speed,), free=(damping,))
     answer = design.least_damping(
@@ -108,8 +110,10 @@ def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Rep
 
 
 def widest_angle(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Reply:
-    """The widest joint angle below which a range of speeds is stable. If the smallest angle of the atlas is unstable,
-    the answer lists the stable ranges of angle. Raises as :func:`query`."""
+    """The widest joint angle below which a range of speeds is stable.
+
+    If the smallest angle of the atlas is unstable, the answer lists the stable ranges of angle. Raises as :func:`query`.
+    """
     speed, angle = roles_of(atlas, "speed", "angle")
     asked = AtlasQuery.of(atlas, given, ranges=(speed,), free=(angle,))
     answer = design.widest_angle(
@@ -158,11 +162,11 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
 
 
 def _kind(atlas: StoredAtlas, name: str, end: float, crossing: Crossing | None) -> str:
-    """The end of a stable interval: a ``crossing``, the end of the ``atlas``, or ``undecided``."""
+    """The kind of the end of a stable interval: ``crossing``, ``atlas`` (the end of the atlas) or ``undecided``."""
     if crossing:
         return "crossing"
     low, high = atlas.ranges[name]
-    # The modulus of an angle is compared.
+    # Angles are without signs here.
     return "atlas" if abs(end) in {abs(low), abs(high), *([0.0] if low < 0 < high else [])} else "undecided"
 
 
@@ -234,17 +238,17 @@ def _elsewhere(safe: str, asked: AtlasQuery, answer: design.Answer) -> list[str]
 
 
 def radius_gradient(system: type[System], values: Mapping[str, float]) -> dict[str, float] | None:
-    """Derivatives of the spectral radius by all parameters of ``system``, which ``values`` holds; None without gradient."""
+    """Derivatives of the spectral radius by all parameters of ``system`` at ``values``; None without a gradient."""
     names = system.models["floquet"].parameters
     found = np.asarray(_compiled_gradient(system, names)({name: float(values[name]) for name in names}))
-    # Leaves of a dictionary are in the order of the alphabet.
+    # JAX orders the leaves of a dictionary by key.
     slopes = dict(zip(sorted(names), map(float, found), strict=True))
     return {name: slopes[name] for name in names} if np.isfinite(found).all() else None
 
 
 @lru_cache(maxsize=8)
 def _compiled_gradient(system: type[System], names: tuple[str, ...]) -> Callable[[dict[str, float]], jax.Array]:
-    """The rule of ``jax.grad(floquet)`` alone: tracing the value too would take twice the time."""
+    """The derivative rule of :func:`~drivetrain_jax.floquet` alone: tracing the value as well takes twice the time."""
     analysis = get_analysis("floquet").for_system(system)
     request = make_request(system, analysis, ["spectral_radius"], {})
 

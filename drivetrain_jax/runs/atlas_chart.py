@@ -77,7 +77,7 @@ def _curves(
     signs = _signs(panels)
     tips = None
     if system.resonances is not None and system.resonances.axis in ranges:
-        # Tongues widen with the angle. They close with increasing damping, at their tip.
+        # Tongues open at their tips with increasing angle, and close there with increasing damping.
         tips = find_tips(panels, system, opening=system.roles.get("angle") in ranges)
     segments = [
         _within({name: sign * segment[name] for name, sign in side.items()}, ranges)

@@ -18,7 +18,7 @@ _WORTHWHILE = 100_000
 _SHARE = 1 / 8
 # Direct solves of the cheapest atlas with one, two, ... parameters.
 _FEWEST = (100, 500, 2_000, 8_000)
-# Sample of points whose effort estimates that of all.
+# Number of random points from whose effort the effort of all points is estimated.
 _SAMPLE = 4096
 # Target relative error below which rounding prevents panels from being accepted.
 _FINEST = 1e-12
@@ -37,8 +37,8 @@ def atlas_ranges(scene: Scene) -> Ranges:
 def choose_atlas(scene: Scene) -> tuple[Ranges, int | None] | None:
     """Ranges of the atlas that ``scene`` is evaluated from, and the largest number of its solves (None: its own limit).
 
-    None if the scene neither asks for an atlas nor ``auto`` predicts a lower cost. Raises :class:`InputError` if it asks
-    for one and varies too many parameters.
+    None if the scene does not request an atlas and ``auto`` predicts no lower cost with one. Raises :class:`InputError` if
+    a scene that requests an atlas varies too many parameters.
     """
     if scene.analysis.name != "floquet" or scene.request.method not in ("auto", "atlas"):
         return None
@@ -62,10 +62,10 @@ def choose_atlas(scene: Scene) -> tuple[Ranges, int | None] | None:
 
 
 def _affordable_solves(scene: Scene, grid: Grid, ranges: Ranges) -> int:
-    """Number of direct solves of an atlas that cost a share of those of all points.
+    """Number of direct solves of an atlas that cost ``_SHARE`` of the direct solves of all points.
 
     A node costs more than a point: its tolerance is tighter, and nodes are even in the coordinates of the atlas, such as
-    1/Omega, where expensive points are rare.
+    1/Omega, so more nodes than points lie where solves are expensive.
     """
     from drivetrain_jax.runs.rounds import node_job
 

@@ -92,7 +92,7 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
     label = "dataset" if dataset is source else f"file = {str(source)!r}"
     if dataset.attrs.get("analysis") != ANALYSIS.name:
         raise InputError(f"{label}: holds the analysis {dataset.attrs.get('analysis')!r}; allowed is an atlas")
-    # The bounds hold only for the panels as written, and damage would not be visible otherwise.
+    # The bounds hold only for the panels as written, and damaged values look like any others.
     if isinstance(source, (str, Path)) and (changed := checksums.damaged(Path(source))):
         raise InputError(
             f"{label}: damaged ({checksums.named(changed)}); allowed is to restore it or to run its scene again"
@@ -219,10 +219,10 @@ class StoredAtlas:
         return xr.Dataset(data, labels | coords, found.attrs)
 
     def grid(self, **values: Any) -> xr.Dataset:
-        """Results on the outer product of arrays, as a scene with these axes would compute; numbers fix a parameter.
+        """Results on the outer product of arrays, as of a scene with these axes; a number fixes its parameter.
 
-        The dimensions have the order in which the arrays are given; a number is a coordinate without a dimension. Raises as
-        a call does.
+        The dimensions have the order in which the arrays are given; a number is a coordinate without a dimension. Raises
+        the errors of a call.
         """
         self._names(values)
         given = {name: np.asarray(self._checked(name, values), float) for name in values}
@@ -238,7 +238,7 @@ class StoredAtlas:
         return to_dataset(part.scene_on(axes), part.arrays(axes), {}).assign_coords(scalars)
 
     def slice(self, values: Mapping[str, float]) -> StoredAtlas:
-        """The atlas of the remaining parameters where those in ``values`` have these values, which lie within its ranges."""
+        """The atlas of the remaining parameters, with those in ``values`` fixed at values within their ranges."""
         return replace(self, stability=self.stability.slice(values)) if values else self
 
     def arrays(
@@ -255,12 +255,12 @@ class StoredAtlas:
         return buffer.lay_out()
 
     def scene_on(self, columns: Mapping[str, np.ndarray], *, zipped: bool = False) -> Scene:
-        """The ``floquet`` scene whose results :meth:`arrays` gives."""
+        """The ``floquet`` scene with the results of :meth:`arrays`."""
         return self._scene(columns, self.fixed, self.request, zipped)
 
     @property
     def request(self) -> Request:
-        """The results that a point has, and how they are found."""
+        """The request of the ``floquet`` analysis: its outputs and options."""
         return Request(self.scene.request.outputs, "atlas", self.scene.request.options)
 
     def radius(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:

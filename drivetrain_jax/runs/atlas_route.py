@@ -16,7 +16,7 @@ from drivetrain_jax.store.schema import Labelled
 
 
 class AtlasRoute(Route):
-    """Builds an atlas. Its solves are counted, but are not points of a grid."""
+    """Builds an atlas; progress counts its solves, which are not points of a grid."""
 
     name = "an atlas"
 

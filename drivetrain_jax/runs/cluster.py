@@ -21,11 +21,11 @@ _PATIENCE = "10s"
 _LOCAL = re.compile(r"local:([1-9]\d*)")
 # Loggers of Dask that report the death of a scheduler or worker; the run reports it in one line.
 _TALKATIVE = ("distributed", "tornado", "asyncio")
-# Seconds of work and bytes of results of one request: it costs client, scheduler and worker some milliseconds.
+# Seconds of work and bytes of results per request: each request costs client, scheduler and worker some milliseconds.
 _SECONDS, _BYTES = 1.0, 1 << 24
 # Factor by which requests grow from one to the next.
 _GROWTH = 4
-# Requests per worker that the remaining tasks make at least, so that all workers end at the same time.
+# Least number of requests per worker for the remaining tasks, so that all workers end at the same time.
 _FEWEST = 4
 
 
@@ -93,22 +93,22 @@ class _Requests:
     def __init__(self, tasks: Iterable[Any], workers: int) -> None:
         self._tasks, self._workers = iter(tasks), workers
         self._alone: deque[Any] = deque()
-        # Without that number, tasks are requested one by one.
+        # Tasks of unknown number are requested one by one.
         self._size, self._most = 1, 1 << 20 if length_hint(self._tasks) else 1
 
     def take(self) -> tuple[Any, ...]:
-        """The tasks of the next request; none if all are taken."""
+        """The tasks of the next request; empty at the end."""
         if self._alone:
             return (self._alone.popleft(),)
         share = -(-length_hint(self._tasks) // (_FEWEST * self._workers))
         return tuple(islice(self._tasks, max(1, min(self._size, share))))
 
     def divide(self, request: Iterable[Any]) -> None:
-        """Request these tasks one by one: one of them kills workers."""
+        """Request these tasks one by one, because one of them kills workers."""
         self._alone.extend(request)
 
     def learn(self, count: int, size: int, seconds: float) -> None:
-        """Choose the size of the next requests from a finished one: its number of tasks, bytes of results, and seconds."""
+        """Choose the size of the next requests from a finished one, by its tasks, bytes of results, and seconds."""
         wanted = count * min(_SECONDS / max(seconds, 1e-9), _BYTES / max(size, 1))
         # In steps, because the first tasks of a worker compile, and results may differ in size.
         self._size = max(1, min(int(wanted), max(self._size, _GROWTH * count), self._most))

@@ -15,7 +15,7 @@ from drivetrain_jax._threads import threads
 Results = Mapping[str, np.ndarray]
 # Tasks per worker: one is computed while the other waits, so no worker idles during writing.
 IN_FLIGHT = 2
-# Upper limits of tasks, and of bytes of results, per thread: small chunks are computed faster than stored.
+# Upper limits of queued tasks and of their bytes of results per thread: small chunks are computed faster than stored.
 _MOST_AHEAD, _BYTES_AHEAD = 32, 1 << 23
 
 

@@ -18,8 +18,10 @@ from drivetrain_jax.runs.scene import Scene, restore_scene
 
 
 def differences(stored: Mapping[str, Any], job: Job) -> list[str]:
-    """Differences of stored work from that of ``job``: scene (TOML), package version, ``numerics``,
-    ``numerics_detail``."""
+    """Differences of stored work from that of ``job``, as text.
+
+    ``stored`` holds the scene (TOML), the package version, ``numerics`` and ``numerics_detail``.
+    """
     try:
         scene = restore_scene(stored.get("scene"))
     except InputError as error:
@@ -28,13 +30,15 @@ def differences(stored: Mapping[str, Any], job: Job) -> list[str]:
 
 
 def not_valid(error: InputError) -> str:
-    """The reason why stored work has no scene."""
+    """The text that the scene of stored work is not valid."""
     return f"its scene is not valid now ({' '.join(str(error).split())})"
 
 
 def differences_of(scene: Scene, stored: Mapping[str, Any], job: Job, *, points: bool = True) -> list[str]:
-    """Like :func:`differences`, for work of ``scene``. Without ``points``, axes and fixed values may differ, and results
-    may be more than requested."""
+    """Like :func:`differences`, for work of ``scene``.
+
+    Without ``points``, axes and fixed values may differ, and the work may have more results than requested.
+    """
     found = list(_of_scenes(scene, job.scene, points))
     if stored.get("drivetrain_jax_version") != drivetrain_jax.__version__:
         found.append(f"drivetrain_jax is {drivetrain_jax.__version__}, was {stored.get('drivetrain_jax_version')}")

@@ -61,7 +61,7 @@ class Source:
     is_covered: bool
 
     def blocks(self, names: Sequence[str]) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-        """Yield our points and their results in blocks, so nothing is loaded as a whole."""
+        """Yield our points and their results in blocks, so that no result is loaded as a whole."""
         arrays = {name: sweep_first(map_variable(self.path, name), self.grid) for name in names}
         for start in range(0, self.ours.size, _BLOCK):
             place = self.grid.place(self.theirs[start : start + _BLOCK])
@@ -131,8 +131,10 @@ def combined(job: Job, found: Iterable[Source]) -> ReusedPoints:
 
 
 def find(job: Job, path: Path) -> Source:
-    """The points of ``job`` that the result at ``path`` contains, without lost ones. Raises :class:`NotReusable`, or
-    :class:`InputError` if there is no readable result."""
+    """The points of ``job`` that the result at ``path`` contains, without lost ones.
+
+    Raises :class:`NotReusable`, or :class:`InputError` if there is no readable result.
+    """
     if not path.is_file():
         raise NotReusable(f"reuse = {str(path)!r}: {_no_file(path)}")
     names = ("scene", "digest", "drivetrain_jax_version", "numerics", "numerics_detail")
@@ -178,7 +180,7 @@ def _no_file(path: Path) -> str:
 
 
 def _check_intact(path: Path) -> None:
-    """Raise :class:`Damaged` for a damaged source: the new checksums would hide the damage."""
+    """Raise :class:`Damaged` for a damaged source: the checksums of the new result would hide the damage."""
     try:
         wrong = checksums.damaged(path)
     except InputError:
@@ -227,7 +229,7 @@ def _same_fixed(scene: Scene, other: Scene) -> bool:
 
 
 def _value(scene: Scene, name: str) -> float | None:
-    """The fixed number in place of the axis ``name`` of another scene, None without one."""
+    """The fixed number of ``scene`` for ``name``, an axis of another scene; None without one."""
     base, entry = entry_of(name)
     value = scene.fixed.get(base)
     if entry is not None:
@@ -291,7 +293,7 @@ def _positions(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     nearest = np.where(abs(rising[left] - wanted) < abs(rising[right] - wanted), left, right)
     sought, place = np.unique(np.asarray(wanted, float), return_inverse=True)
     own, other = _extents(rising)[nearest], _extents(sought)[place]
-    # Inner values of an axis have its rounding errors, its ends have none; use the smaller tolerance of both axes.
+    # The ends of an axis are exact, its inner values have rounding errors; use the smaller tolerance of the two axes.
     extent = np.where((own > 0) & (other > 0), np.minimum(own, other), np.maximum(own, other))
     room = _ROUNDINGS * (abs(rising[nearest]) + extent)
     return np.where(abs(rising[nearest] - wanted) <= room, order[nearest], -1)
@@ -305,7 +307,7 @@ def _extents(rising: np.ndarray) -> np.ndarray:
 
 
 def _same_rows(grid: Grid, other: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of equal rows of two lists of points that vary the same parameters; every common row is in a pair."""
+    """Pairs of equal rows of two lists of points that vary the same parameters; each common row is in at least one pair."""
     names = [axis.name for axis in grid.axes]
     if sorted(names) != sorted(axis.name for axis in other.axes):
         return np.empty(0, np.int64), np.empty(0, np.int64)

@@ -19,7 +19,7 @@ from drivetrain_jax.store.provenance import digest, source_digest, versions
 
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "numpy", "scipy")
 _ROOT = Path(drivetrain_jax.__file__).parent
-# Folders and files of this package that compute numbers, and the files in them that only read results.
+# Folders and files of this package that compute numbers, and files in these folders that only read results.
 _FOLDERS = ("resonances", "systems", "analysis", "atlas")
 _ENGINE = ("atlas_choice", "kernel", "over", "plan", "point_grid", "rounds", "through_atlas")
 _FILES = ("_quantities", *(f"runs/{name}" for name in _ENGINE))
@@ -27,13 +27,13 @@ _READERS = ("figure.py", "rules.py")
 
 
 def numerics_of(scene: Problem, route: str) -> dict[str, Any]:
-    """The route to the result, the numeric code, the package versions, and the instruction set: all that affects the bits.
+    """Everything that affects the bits: route, numeric code, package versions, and instruction set.
 
-    The code is that of this package, and of the packages that the system and the analysis come from.
+    The code includes this package, and the packages of the system and of the analysis.
     """
     sources = dict(_own_sources())
     for function in (scene.analysis.model(scene.system).build, scene.analysis.solvers):
-        # Neither a partial nor what is wrapped around a method has a source of its own.
+        # A partial, or a wrapper around a method, has no source of its own.
         file = inspect.getsourcefile(inspect.unwrap(getattr(function, "func", function)))
         sources |= _sources_of(_package_of(Path(file))) if file else {}
     return {
@@ -47,7 +47,7 @@ def numerics_of(scene: Problem, route: str) -> dict[str, Any]:
     }
 
 
-# Cached: the code that runs is the one that was imported, not one that is edited since.
+# Cached: later edits of the files do not change the imported code.
 @cache
 def _own_sources() -> dict[str, str]:
     """Digests of the numeric code of this package, by folder or file."""
@@ -60,7 +60,7 @@ def _own_sources() -> dict[str, str]:
 
 @cache
 def _sources_of(package: Path) -> dict[str, str]:
-    """Digest of a package (a folder or one file) by its name; none of this package."""
+    """Digest of a package (a folder or one file) by its name; empty for this package."""
     if package == _ROOT or not package.exists():
         return {}
     files = package.rglob("*.py") if package.is_dir() else [package]

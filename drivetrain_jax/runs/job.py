@@ -31,20 +31,20 @@ if TYPE_CHECKING:
     from drivetrain_jax.store.chunks import Part
     from drivetrain_jax.store.schema import Labelled
 
-# Kernels that are compiled at the same time.
+# Most kernels that are compiled in parallel.
 _SIDE_BY_SIDE = 8
 
 
 class Route(Protocol):
     """The way from a job to its result, chosen once by :func:`~drivetrain_jax.runs.resolve.resolve`."""
 
-    # Name of the way, which affects the bits.
+    # Name of the route; a part of the digest, because the route affects the bits.
     name: str
-    # True if points are solved one by one, and can be shown, reused and written so.
+    # True if points are solved one by one, so that partial results can be opened, reused and written.
     is_pointwise: bool = False
 
     def total(self, job: Job, done: int) -> int:
-        """Number of results, of which ``done`` are there."""
+        """Number of all results, given that ``done`` of them exist."""
         return done
 
     def bytes_needed(self, job: Job, on_disk: bool) -> int:
@@ -82,7 +82,7 @@ class Job:
     """A problem and the route to its result. Plan and kernels are created on first use.
 
     ``points`` restricts the plan to these points of the grid; for ``full_size`` see :func:`make_plan`. Jobs are equal if
-    they have the same digest. A pickled job has no points of its own: it computes given chunks.
+    they have the same digest. A pickled job lacks ``points``: it only computes given chunks.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Job:
 
     @property
     def scene(self) -> Scene:
-        """The scene that the job is resolved from; the solves of an atlas have none."""
+        """The scene of the job; jobs of the solves of an atlas have none."""
         assert isinstance(self.problem, Scene)
         return self.problem
 
@@ -133,12 +133,12 @@ class Job:
 
     @cached_property
     def numerics_detail(self) -> dict[str, Any]:
-        """The parts of that digest."""
+        """The entries whose digest is ``numerics``."""
         return numerics_of(self.problem, self.route.name)
 
     @property
     def numerics_attrs(self) -> dict[str, str]:
-        """Digest and parts as attributes of a result or plan."""
+        """``numerics`` and ``numerics_detail`` as attributes of a result or plan."""
         return {"numerics": self.numerics, "numerics_detail": json.dumps(self.numerics_detail)}
 
     @property
@@ -203,7 +203,7 @@ class Job:
 
 
 class _Chunks:
-    """Chunks of a plan that are created one by one; an iterator of it knows how many are left."""
+    """Chunks of a plan, created one by one; iterators over them have a length hint."""
 
     def __init__(self, plan: Plan, numbers: np.ndarray) -> None:
         self._plan, self._numbers = plan, numbers
@@ -220,7 +220,7 @@ def _restored(problem: Problem, route: Route, full_size: bool) -> Job:
 
 
 def _check_double_precision() -> None:
-    """Set jax to double precision again, unless that is left to the caller."""
+    """Turn on double precision in jax again, unless the caller has the choice."""
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         use_double_precision()
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
@@ -228,5 +228,5 @@ def _check_double_precision() -> None:
 
 
 def _is_retryable(error: Exception) -> bool:
-    # XLA reports lack of memory by an exception of its own.
+    # XLA raises its own exception for lack of memory.
     return isinstance(error, (OSError, MemoryError)) or "RESOURCE_EXHAUSTED" in str(error)

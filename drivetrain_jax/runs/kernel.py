@@ -23,7 +23,7 @@ from drivetrain_jax.runs.scene import Problem, result_variables
 from drivetrain_jax.systems import System
 
 _LAPACK = threading.Lock()
-# Below this number of points and this predicted work (in units of the plan), computing takes less time than optimising the
+# Up to this number of points and this predicted cost (in units of the plan), computing takes less time than optimising the
 # kernels.
 _FEW, _LIGHT = 128, 3e4
 # GPU chunk size: 64 times the CPU size, at most 32,768.
@@ -69,7 +69,7 @@ def _batch(
     own = {v.name: len(v.dims) + (grid.path is not None) for v in variables}
 
     def batch(columns: Mapping[str, Any], numbers: Mapping[str, Any], effort: Array) -> dict[str, Array]:
-        # A result that depends on nothing that varies comes without lanes.
+        # A result that does not depend on the varying parameters has no lanes yet.
         solved = solver.solve(grid.bind(columns, numbers), effort)
         results = {name: jnp.asarray(value) for name, value in solved.items()}
         spread = {n: v if v.ndim > own[n] else v[..., None] for n, v in results.items()}
@@ -127,11 +127,11 @@ class _Key:
 
 
 def kernel_of(problem: Problem, grid: Grid, solver: Solver, size: int, few: bool = False) -> Kernel:
-    """The kernel of ``solver`` for chunks of ``size`` points of ``problem``, made if no problem before needed the same.
+    """The kernel of ``solver`` for chunks of ``size`` points of ``problem``, shared by all problems with the same key.
 
     For ``few`` see :func:`compile_kernel`.
     """
-    # What varies is an argument of the kernel, so one value of each axis is enough to keep.
+    # Varying parameters are arguments of the kernel, so the key keeps one value of each axis.
     axes = tuple(replace(axis, values=axis.values[:1]) for axis in grid.axes)
     request, numbers = problem.request, grid.numbers
     structure = (
@@ -155,6 +155,9 @@ def _compiled(key: _Key, size: int, few: bool) -> Kernel:
 
 
 def _turn(compiled: Any) -> AbstractContextManager[object]:
-    """The lock that a call needs. LAPACK calls of XLA wait for the thread pool that they run in, so two such kernels can
-    block each other forever (seen with jax 0.10.2 on two cores)."""
+    """The lock that a call needs.
+
+    LAPACK calls of XLA wait for their own thread pool, so two such kernels can block each other forever (seen with jax
+    0.10.2 on two cores).
+    """
     return _LAPACK if 'custom_call_target="lapack_' in compiled.as_text() else nullcontext()

@@ -10,13 +10,13 @@ from typing import Any
 
 from drivetrain_jax.runs.work import Progress, Report
 
-# Seconds before a bar appears, and between two states of it.
+# Seconds before a bar appears, and between its updates.
 _PATIENCE, _STEP = 0.5, 0.2
 
 
 @contextmanager
 def shown_progress(report: Report | None) -> Iterator[Report | None]:
-    """``report`` itself or, where none is given in a notebook, one that shows a bar in the cell that is running."""
+    """Yield ``report``; if it is None in a notebook, yield a report that shows a bar in the running cell."""
     if report is not None or not _in_notebook():
         yield report
         return
@@ -34,7 +34,7 @@ def _in_notebook() -> bool:
 
 
 class _Bar:
-    """Points done, rate and time; a run that is over sooner than it could be read shows none."""
+    """A bar with points done, rate and time; a run of less than ``_PATIENCE`` shows none."""
 
     def __init__(self) -> None:
         self._begin = self._shown = time.monotonic()
@@ -64,7 +64,7 @@ class _Bar:
 
 def _html(progress: Progress, seconds: float) -> str:
     done = progress.computed + progress.reused
-    # The cost grows evenly in time; where it is not known, points are counted.
+    # The cost grows evenly in time; points are counted if it is unknown.
     part, whole = (progress.cost, progress.total_cost) if progress.total_cost else (done, max(progress.total, 1))
     failed = f", {progress.failed} failed" if progress.failed else ""
     rate = progress.computed / max(seconds, 1e-9)

@@ -24,7 +24,7 @@ from drivetrain_jax.store.files import behind_link
 
 
 class OutputState:
-    """The result file ``out`` and the folder of its parts, seen by the scene of ``job``.
+    """The result file ``out`` and the folder of its parts, compared with the scene of ``job``.
 
     ``state`` is ``absent``, ``partial``, ``complete`` or ``stale`` (a result or parts of another scene or version). Raises
     :class:`InputError` if nothing can be written there, or if a file there is not a result of this package.
@@ -63,7 +63,7 @@ class OutputState:
         if self.present == self.digest:
             return "stale" if self._rearranged else "complete"
         if self.parts.holds_work():
-            # Parts that replace another result belong to that result only.
+            # Parts that replace a result are only valid for the replacement of that result.
             return "partial" if _same(self.parts.plan(), self.plan(), ("digest", "replaces", "store")) else "stale"
         if self.present is None:
             return "absent"
@@ -87,7 +87,7 @@ class OutputState:
         """True if a run resumes the present parts. A ``fresh`` run resumes only parts of a fresh run."""
         if not fresh:
             return self.parts.holds_work()
-        # Parts already contained in the result, left by a run that was killed before it deleted them, do not count.
+        # A run that was killed before it deleted its parts may leave parts that the result already contains.
         names = ("digest", "replaces", "replaces_written", "store", "reuses", "fresh")
         return _same(self.parts.plan(), self.plan(reused, fresh), names)
 
@@ -121,7 +121,7 @@ class OutputState:
 
     @property
     def _grows(self) -> bool:
-        """True if the present result is a part of this scene's, so replacing it loses nothing."""
+        """True if this scene contains all points of the present result, so replacing it loses nothing."""
         return self._shared is not None and self._shared.is_covered
 
     @property
@@ -224,7 +224,7 @@ def _same(one: Mapping[str, Any], other: Mapping[str, Any], names: Iterable[str]
 
 
 def _check_name(out: Path, parts: PartsFolder) -> None:
-    """Check the length of the name; the folder of the parts has the longest."""
+    """Check the length of the longest name, that of the folder of the parts."""
     try:
         parts.path.exists()
     except OSError as error:

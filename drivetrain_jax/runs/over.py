@@ -81,7 +81,7 @@ def _scene_table(
         raise InputError(
             f"system: got a {type(system).__name__}; allowed is a system such as drivetrain_jax.Cardan(...)"
         )
-    # An empty list is the default "none".
+    # An empty list stands for a default of none.
     fixed = {key: _plain(value) for key, value in system.values.items() if key not in over and value != ()}
     axes = {
         key: value if isinstance(value, Mapping) else {"values": _numbers(key, value)} for key, value in over.items()
@@ -142,7 +142,7 @@ def _function_scene(
 
 
 class _Once:
-    """A function that equals any other one; a digest compares what they compute."""
+    """A function that compares equal to any other; the digest in the cache key distinguishes functions."""
 
     def __init__(self, call: Callable[..., Any]) -> None:
         self.call = call

@@ -61,7 +61,7 @@ def _open_partial(path: Path) -> xr.Dataset:
 
 
 def _finished(job: Job, output: OutputState) -> Iterator[tuple[np.ndarray, Mapping[str, np.ndarray]]]:
-    """Points and results that are finished, reused ones included."""
+    """Yield finished points and their results, reused ones included."""
     reused = output.reused_before()
     yield from reused.blocks([variable.name for variable in ResultBuffer(job.scene, job.grid).variables])
     plan = remaining(job, reused).plan

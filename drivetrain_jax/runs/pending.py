@@ -9,12 +9,12 @@ import numpy as np
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.store.schema import Labelled
 
-# Code of such points. A finished result never has it.
+# Code of these points, which no finished result contains.
 PENDING = len(Outcome)
 
 
 def with_pending(result: Labelled) -> Labelled:
-    """``result`` with the meaning of that code."""
+    """``result`` with the meaning of the code ``PENDING`` added."""
     outcome = result.data[OUTCOME.name]
     meanings = f"{outcome.attrs['flag_meanings']} pending"
     codes = np.arange(PENDING + 1, dtype=OUTCOME.dtype)

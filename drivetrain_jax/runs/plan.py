@@ -32,8 +32,9 @@ _LANES = 16
 
 @dataclass(frozen=True)
 class Group:
-    """The points of one solver, by falling effort in each block, in chunks of ``chunk`` points. The last chunk of a block
-    may be shorter; it costs as much as a full one and has the least effort.
+    """The points of one solver, by falling effort in each block, in chunks of ``chunk`` points.
+
+    The last chunk of a block may be shorter; it costs as much as a full one and has the least effort.
 
     ``index`` is the position of the solver, ``size`` the number of points, ``efforts`` the largest effort within each
     chunk, and ``firsts[b]`` the first chunk of block b (one entry more than blocks).
@@ -197,8 +198,8 @@ class _EffortCounter:
 def chunk_size(largest: int, count: int, lengthy: bool = False) -> int:
     """Points per chunk for ``count`` points, at most ``largest``; fewer in small scenes, to give all cores work.
 
-    Sizes are few, so that another count seldom needs another kernel: 1, 16 and further powers of two. Points that are
-    ``lengthy`` are not padded to 16.
+    Sizes are 1, 16 and larger powers of two, so that another count seldom needs another kernel. ``lengthy`` points, which
+    take long, may also have the sizes 2 to 8.
     """
     share = count if count <= _LANES else -(-count // _MIN_CHUNKS)
     least = 1 if lengthy or count == 1 else _LANES
@@ -234,7 +235,7 @@ def _cheapest(solvers: Sequence[Solver], grid: Grid, points: np.ndarray) -> tupl
         own = np.broadcast_to(np.asarray(solver.effort(columns), float), points.shape)
         with np.errstate(over="ignore"):
             own_cost = own * solver.unit_cost
-        # NaN and infinity are never smaller.
+        # False for a cost of NaN or infinity.
         less = own_cost < cost
         best[less], cost, effort = index, np.where(less, own_cost, cost), np.where(less, own, effort)
     return best, np.ceil(np.clip(effort, 0, _MAX_EFFORT)).astype(np.int64)

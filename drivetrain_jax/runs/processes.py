@@ -17,7 +17,7 @@ from drivetrain_jax.runs import worker
 from drivetrain_jax.runs.executor import IN_FLIGHT, Computation, Executor, Results
 from drivetrain_jax.runs.worker import Parcel
 
-# Number of crashes after which a task is given up.
+# Number of crashes after which a task is lost.
 ATTEMPTS = 3
 
 

@@ -63,7 +63,7 @@ def build_atlas(
 
 
 def _note(atlas: Atlas) -> str:
-    """The note for the user on the gaps of ``atlas``."""
+    """The note about the gaps of ``atlas`` for the user."""
     if not atlas.gaps:
         return ""
     have = f"{counted(len(atlas.panels), 'panel', 'panels')} and {counted(len(atlas.gaps), 'gap', 'gaps')}"
@@ -72,7 +72,7 @@ def _note(atlas: Atlas) -> str:
 
 
 def node_job(scene: Scene, ranges: Mapping[str, tuple[float, float]], count: int) -> Job:
-    """The job of ``count`` solves for an atlas of ``scene``, distributed like those of its construction."""
+    """The job of ``count`` solves for an atlas of ``scene``, spread over ``ranges`` like the nodes of its panels."""
     fixed = fixed_of(scene, ranges)
     domain = floquet_domain(scene.system, ranges, fixed)
     spread = np.cos(np.pi * np.random.default_rng(0).random((count, len(ranges))))

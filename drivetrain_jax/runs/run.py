@@ -65,12 +65,13 @@ def run(
         threads: number of threads of this process (default: the usable cores).
         workers: number of processes instead of threads. A script needs the guard ``if __name__ == "__main__"``.
         dask: Dask cluster instead of threads: ``tcp://host:port``, or ``local:N`` processes.
-        reuse: path(s) of results whose common points are reused, only with ``out``; a part of this result there always is.
+        reuse: path(s) of results whose common points are reused; needs ``out``. Unless ``fresh``, a result at ``out`` that
+            is a part of this result is reused without it.
         report: called with the :class:`Progress` after every chunk; by default a notebook shows a bar.
 
-    Raises: :class:`InputError` with one line that names the field, the value and what is allowed, before anything is
-    computed or written; :class:`Incomplete` if the run failed. Finished chunks are kept, and the message says if the same
-    call may get further (a full disk, too little memory, a worker that died).
+    Raises: :class:`InputError` with one line that names the field, the value and the allowed values, before anything is
+    computed or written; :class:`Incomplete` if the run failed. Finished chunks are kept. The message says whether the same
+    call may resume (after a full disk, too little memory, or a dead worker).
 
     >>> import drivetrain_jax as dt
     >>> axes = {"k_sp": {"values": [4e8, 5e8]}}
@@ -148,7 +149,7 @@ def _into(
     except (RetryableError, OSError, MemoryError) as error:
         raise Incomplete(f"{error or type(error).__name__}; the same command resumes", progress) from error
     except ChunkError as error:
-        # The same command would fail again.
+        # No "the same command resumes": it would fail again.
         raise Incomplete(str(error), progress) from error
     finally:
         parts.close()

@@ -1,4 +1,4 @@
-"""Code of the workers that write a Zarr store: batches of chunks are stored in parts, shards are put together from parts."""
+"""Code of the workers that write a Zarr store: they store batches of chunks in parts, and assemble shards from parts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.chunks import Part, PartsFolder
 from drivetrain_jax.store.zarr_store import Shards
 
-# Results of a batch and of a shard beside outcomes: the name of the part, and the seconds that writing the shard took.
+# Names of results of a task: the name of the part of a batch, and the seconds that writing a shard took.
 PART, SECONDS = "part", "seconds"
 
 
@@ -35,7 +35,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class Assembly:
-    """A shard to be put together from parts, and its points that are lost. It is unfinished unless ``whole``."""
+    """A shard to assemble from ``parts``, and its ``lost`` points. It is unfinished unless ``whole``."""
 
     number: int
     shard: int

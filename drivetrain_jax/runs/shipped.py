@@ -1,4 +1,4 @@
-"""Scenes that the package brings, by name: ``quickstart`` is ``sweeps/quickstart.toml``."""
+"""Scenes of the package by name: ``quickstart`` is ``sweeps/quickstart.toml``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import drivetrain_jax
 from drivetrain_jax._wording import did_you_mean
 
-# In a checkout a link to the folder at its top; the wheel holds the files.
+# In a checkout this is a link to the folder at the top; in a wheel it contains the files.
 FOLDER = Path(drivetrain_jax.__file__).parent / "sweeps"
 
 
@@ -17,7 +17,7 @@ def names() -> list[str]:
 
 
 def scene_file(source: Path) -> Path:
-    """The packaged file if ``source`` is the name of a scene and no file here is called so, else ``source``."""
+    """The packaged file if ``source`` is the name of a scene and not of an existing file, else ``source``."""
     return FOLDER / f"{source}.toml" if str(source) in names() and not source.is_file() else source
 
 

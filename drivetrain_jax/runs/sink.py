@@ -14,7 +14,7 @@ from drivetrain_jax.runs.work import Progress, Report
 
 
 class Sink(Protocol):
-    """Writes the result of a job to a path, and knows the result that is there."""
+    """Writes the result of a job to a path, and reads the present result there."""
 
     store: str
 

@@ -1,4 +1,4 @@
-"""The state of a result file, seen by its scene."""
+"""The state of a result file compared with its scene."""
 
 from __future__ import annotations
 

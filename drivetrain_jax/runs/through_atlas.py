@@ -54,7 +54,7 @@ class ThroughAtlas(PointsRoute):
         return {"atlas_solves": atlas.atlas.solves, "atlas_panels": panels, "atlas_uncovered": uncovered}
 
     def _prepare_judging(self, job: Job) -> None:
-        """Compile the kernel that decides single cells, which takes seconds: of this many cells some need it."""
+        """Compile the kernel that decides single cells, which takes seconds: some cells of a large grid need it."""
         if job.grid.size < _LARGE:
             return
         scene = job.scene
@@ -63,7 +63,7 @@ class ThroughAtlas(PointsRoute):
 
 
 def _lay_out(job: Job, buffer: ResultBuffer) -> None:
-    """Create the output file while the solves run; for a small file this would delay the solves.
+    """Create a large output file while the solves run; for a small file this would delay the solves.
 
     The thread that fills memory must also allocate it, to reuse memory that earlier results have freed.
     """
@@ -81,10 +81,10 @@ def evaluate(
     *,
     solve: bool = True,
 ) -> int:
-    """All points of ``job`` into ``buffer`` from ``atlas``; those that it does not cover are counted, and solved unless
-    ``solve`` is false.
+    """Fill all points of ``job`` into ``buffer`` from ``atlas``; returns the number of points that it does not cover.
 
-    A resumed run evaluates again, because that is faster than reading. For ``first`` see :meth:`Work.do`.
+    Uncovered points are solved unless ``solve`` is false. A resumed run evaluates again, because that is faster than
+    reading. For ``first`` see :meth:`Work.do`.
     """
     uncovered: list[np.ndarray] = []
     filled = _points if job.scene.zipped else _blocks
@@ -123,7 +123,7 @@ def _blocks(job: Job, atlas: StabilityAtlas, buffer: ResultBuffer) -> Iterator[t
     atlas = atlas.slice({name: float(axes[name][0]) for name in _single(axes, atlas.atlas.parameters)})
     lengths = {name: len(axes[name]) for name in atlas.atlas.parameters}
     longest = sorted(lengths, key=lambda name: lengths[name])[-2:]
-    # Rows and columns of a tile are the last two. Of axes as long as each other their order decides, which stays.
+    # The longest axes come last, as rows and columns of tiles. Axes of equal length keep their order.
     atlas = atlas.ordered(sorted(lengths, key=lambda name: (name in longest, name not in longest and lengths[name])))
     names, outputs = atlas.atlas.parameters, job.scene.request.outputs
     sizes = [lengths[name] for name in names]
@@ -143,7 +143,7 @@ def _single(axes: Mapping[str, np.ndarray], parameters: Sequence[str]) -> list[s
 
 
 def _cut(lengths: Sequence[int]) -> Iterator[tuple[slice, ...]]:
-    """Blocks of a grid of about ``_BLOCK`` cells at most, whole along as many of the last axes as possible."""
+    """Yield blocks of at most about ``_BLOCK`` cells of a grid, whole along as many of the last axes as possible."""
     whole = len(lengths) - 1
     while whole > 0 and math.prod(lengths[whole:]) <= _BLOCK:
         whole -= 1
@@ -158,8 +158,10 @@ def _cut(lengths: Sequence[int]) -> Iterator[tuple[slice, ...]]:
 
 
 def _in_atlas_order(values: np.ndarray, names: Sequence[str], axes: Sequence[str]) -> np.ndarray:
-    """A view of results over the ``axes`` of the scene as results over the parameters ``names`` of an atlas; other axes
-    have one value."""
+    """A view of results over the ``axes`` of the scene as results over the parameters ``names`` of an atlas.
+
+    All other axes have one value.
+    """
     present = [name for name in axes if name in names]
     order = [present.index(name) for name in names]
     values = np.squeeze(values, axis=tuple(k for k, name in enumerate(axes) if name not in names))

@@ -27,10 +27,7 @@ _MOST_WAITING = 1 << 25
 
 @dataclass
 class Progress:
-    """Progress of a run: ``computed``, ``reused`` and ``failed`` count things of ``kind``; costs are in units of the plan.
-
-    ``note`` is a further remark.
-    """
+    """Progress of a run: counts of results of this ``kind``, and costs in units of the plan; ``note`` is a remark."""
 
     total: int
     computed: int = 0
@@ -61,9 +58,8 @@ class Receiver(Protocol):
 class Work:
     """Runs chunks on the executor and reports progress.
 
-    With ``parts`` (open) it stores finished chunks there and reuses stored ones.
-    Leaving the context ends the workers. By an exception it also writes the chunks in memory; otherwise the result
-    contains them.
+    With ``parts`` (open) it stores finished chunks there and reuses stored ones. Leaving the context ends the workers. After
+    an exception it also writes the chunks in memory; otherwise the result contains them.
     """
 
     def __init__(self, executor: Executor, report: Report | None = None, parts: PartsFolder | None = None) -> None:
@@ -74,7 +70,7 @@ class Work:
 
     @property
     def elapsed(self) -> float:
-        """Computing time in s, with that of reused parts."""
+        """Computing time in s, including the time that reused parts took."""
         return round(self._seconds + time.monotonic() - self._begin, 3)
 
     def __enter__(self) -> Work:
@@ -154,8 +150,10 @@ class Work:
 
 
 class _PartWriter:
-    """Writes finished chunks in parts of a quarter of a second, or longer on a slow disk. Without ``parts`` it only
-    reports when a part is due."""
+    """Writes finished chunks in a part every quarter of a second, or less often on a slow disk.
+
+    Without ``parts`` it writes nothing, and only reports when a part is due.
+    """
 
     def __init__(self, parts: PartsFolder | None) -> None:
         self._parts = parts

@@ -57,7 +57,7 @@ Layout = list[list[tuple[str, str, tuple[int, ...]]]]
 
 
 def compute_all(parcel: Parcel, tasks: Sequence[Any]) -> tuple[Layout, bytes, float]:
-    """The results of ``tasks`` as one piece, because Dask sends each array of an object by itself. And the seconds."""
+    """The results of ``tasks`` as layout and one piece of bytes, and the seconds; Dask would send each array separately."""
     begin = time.monotonic()
     found = [compute(parcel, task) for task in tasks]
     layout = [[(name, array.dtype.str, array.shape) for name, array in results.items()] for results in found]

@@ -1,7 +1,7 @@
 """Runs whose workers write a Zarr store themselves, so no results pass through the driver.
 
-Workers first store batches of chunks in parts. The chunks of a batch lie all over a block of the grid, so a shard is put
-together from parts when its blocks are complete, by one worker; every few seconds also what there is of the others.
+Workers first store batches of chunks in parts. The chunks of a batch are scattered over a block of the grid, so one worker
+assembles a shard from parts when its blocks are complete. Every few seconds unfinished shards are written as well.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.schema import Labelled
 from drivetrain_jax.store.zarr_store import Shards
 
-# A run has batches of up to so many chunks, but at least so many batches where chunks allow it: work for many workers.
+# Most chunks of a batch, and least number of batches where there are enough chunks, to give many workers work.
 _MOST_CHUNKS, _FEWEST_BATCHES = 64, 8
-# Shortest time in s between two views of unfinished shards, and the smallest ratio of that time to the time of writing them.
+# Shortest time in s between two writings of unfinished shards, and the smallest ratio of this time to that of the writing.
 _INTERVAL, _RATIO = 2.0, 20.0
 
 
 class ZarrSink(Sink):
-    """The result as a Zarr store. Its points are not reused, and checksums cover its layout."""
+    """The result as a Zarr store. Checksums cover its layout, and its points are not reused."""
 
     store = "zarr"
 
@@ -54,7 +54,7 @@ class ZarrSink(Sink):
 
     @property
     def held(self) -> Path:
-        """Path of the present result: a run sets a store aside just before it moves the new one into place."""
+        """Path of the present result: a run moves this store aside just before it moves the new one into place."""
         former = self._parts.path / zarr_store.FORMER
         return former if not self._out.exists() and former.exists() else self._out
 
@@ -64,7 +64,7 @@ class ZarrSink(Sink):
         return (self.held / "zarr.json").stat().st_mtime_ns if self.held.exists() else None
 
     def check_place(self) -> None:
-        """Raise :class:`InputError` unless there is nothing or a store."""
+        """Raise :class:`InputError` if there is something other than a store at the path."""
         if self.held.is_dir() and not zarr_store.is_store(self.held):
             raise InputError(f"out = {str(self._out)!r}: is a folder; allowed is the path of a file")
         if self._out.is_file():
@@ -151,7 +151,7 @@ class _ShardedRun:
         progress.computed += job.unsolvable
         progress.failed += job.unsolvable
         missing = np.flatnonzero(self._part_of < 0)
-        # Blocks whose chunks are all there, and shards with results that are not written yet.
+        # Number of missing chunks of each block, and shards with results that are not written yet.
         self._left = np.bincount(job.plan.block_of[missing], minlength=job.plan.blocks.count)
         marked = zarr_store.done(self.path)
         self._unwritten = {
@@ -201,7 +201,7 @@ class _ShardedRun:
             yield Batch(next(self._numbers), tuple(map(self._job.plan.chunk, numbers[start : start + size])))
 
     def _due(self, final: bool = False) -> Iterator[Assembly]:
-        """Shards that are complete, and from time to time the others; all that are not written if ``final``."""
+        """Yield complete shards, at intervals also incomplete ones; if ``final``, all that are not written."""
         show = time.monotonic() - self._shown >= self._interval
         for shard in sorted((self._unwritten if final else self._changed) - self._busy):
             blocks, (begin, count) = self._blocks(shard), self._ranges[shard]
@@ -220,7 +220,7 @@ class _ShardedRun:
             self._shown = time.monotonic()
 
     def _run(self, executor: Executor, writer: ShardWriter, tasks: Iterator[Batch | Assembly]) -> list[Batch]:
-        """Have ``tasks`` done; returns batches that crash every process."""
+        """Run ``tasks`` on the executor; returns the batches that crash every process."""
         crashed = []
         with closing(executor.run(writer, tasks)) as finished:
             for task, results in finished:
