@@ -18,12 +18,13 @@ def plugin_names(group: str) -> tuple[str, ...]:
 def load_plugin(group: str, name: str, wanted: str, is_wanted: Callable[[Any], bool] = callable) -> Any:
     """The object of the entry point ``name``; None without one.
 
-    ``ImportError`` with one line if its package fails, or if it is not a ``wanted`` one of this name.
+    Raises ``ImportError`` with one line if its package fails, or if the object is not of the kind ``wanted`` or has another
+    name.
     """
     for entry in entry_points(group=group, name=name):
         try:
             found = entry.load()
-        # Any exception of another package.
+        # Code of another package may raise anything.
         except Exception as error:
             raise ImportError(f"{entry.value} cannot be loaded: {type(error).__name__}: {error}") from error
         if not is_wanted(found):

@@ -9,7 +9,7 @@ import sys
 def use_double_precision() -> None:
     """Turn on double precision in jax, or in the jax that this process will import.
 
-    The package does so when it is imported, not when it first computes: that may be inside a function that jax is tracing.
+    The package calls this at its import, because its first computation may be inside a function that jax is tracing.
     """
     if os.environ.get("DRIVETRAIN_JAX_ENABLE_X64") == "0":
         return

@@ -1,4 +1,4 @@
-"""Registers the accessor once xarray is there: ``import drivetrain_jax`` alone does not import xarray."""
+"""Registration of the accessor after xarray is imported: ``import drivetrain_jax`` alone does not import xarray."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _register() -> None:
 
 
 class _AfterXarray:
-    """Finds xarray by the other finders, and registers the accessor after it has been imported.
+    """Import finder that leaves xarray to the other finders, and registers the accessor after its import.
 
     It does not inherit from :class:`importlib.abc.MetaPathFinder`, whose import takes longer than that of this package.
     """

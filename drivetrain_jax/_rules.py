@@ -32,7 +32,7 @@ def within(name: str, lower: float = -np.inf, upper: float = np.inf) -> Rule:
 
 
 def ordered(name: str, dim: str, falling: bool = False, key: Callable = lambda values: values) -> Rule:
-    """``name`` rises (falls) along ``dim`` up to rounding; ``key`` is the compared quantity."""
+    """``name`` rises (or falls) along ``dim`` up to rounding; ``key`` computes the compared quantity."""
 
     def broken(ds: xr.Dataset) -> xr.DataArray:
         step = key(ds[name]).diff(dim)

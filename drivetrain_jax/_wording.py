@@ -15,7 +15,7 @@ def clipped(text: str) -> str:
 
 
 def shown(value: Any) -> str:
-    """A given value as a message repeats it."""
+    """The text of a given value in a message."""
     return clipped(" ".join(repr(value).split("\n")))
 
 

@@ -12,7 +12,7 @@ from drivetrain_jax.systems import System
 
 @dataclass(frozen=True)
 class AnalysisFunction:
-    """The analysis ``name`` as a function, like :func:`floquet`: for the analyses of other packages."""
+    """The analysis ``name`` of another package as a function, like :func:`floquet`."""
 
     name: str
 

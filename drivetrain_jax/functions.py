@@ -1,9 +1,9 @@
 """An analysis as a pure function of a system, under ``jax.jit``, ``jax.vmap`` and ``jax.grad`` as well.
 
 A function takes one system, whose numbers may be traced, and returns a :class:`Result`, a pytree of the requested variables
-and ``outcome``. Called with concrete numbers it chooses the cheapest solver, as a scene does; traced numbers take the first
-one. Under ``jax.vmap`` all lanes go through the kernels of a sweep, those of similar effort together. Derivatives are
-forward Jacobians contracted with the tangents, so that both modes work; where there is no derivative, they are NaN.
+and ``outcome``. Concrete numbers are solved by the cheapest solver, as in a scene, traced numbers by the first one. Under
+``jax.vmap`` the kernels of a sweep solve all lanes, lanes of similar effort together. Derivatives are forward Jacobians
+contracted with the tangents, so forward and reverse mode both work. A missing derivative is NaN.
 """
 
 from __future__ import annotations
@@ -67,9 +67,9 @@ class Result(eqx.Module):
 
 @dataclass(frozen=True)
 class _Job:
-    """Everything about a call but its numbers: two equal jobs are one compilation.
+    """Everything about a call except its numbers: equal jobs share one compilation.
 
-    With ``single`` the path has one value, and is no dimension of the results.
+    With ``single`` the path has one value and is not a dimension of the results.
     """
 
     analysis: Analysis
@@ -84,7 +84,7 @@ class _Job:
 
     @property
     def solvers(self) -> tuple[Solver, ...]:
-        """All candidates for the work."""
+        """All solvers that a call can choose from."""
         return self.analysis.solvers(self.system, self.request)
 
     def own_dims(self, name: str) -> int:
@@ -124,7 +124,7 @@ def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapp
             model.check(values)
         analysis.dimensions(type(system), request, values)
     except ValueError as error:
-        # The tables of a scene are no concern of someone who gave none.
+        # Without a scene the names of its tables mean nothing to the caller.
         raise InputError(re.sub(r"^(fixed|options)\.", "", str(error))) from None
     along = analysis.path_axis(type(system), request)
     leaf = None if along is None else path_entry(values, along)
@@ -151,7 +151,7 @@ def _path(name: str, values: Any) -> np.ndarray:
 
 
 def _concrete(job: _Job, parameters: Any) -> dict[str, Array]:
-    """By the solver that predicts the least cost, compiled once for all numbers."""
+    """The results by the solver with the least predicted cost, compiled once for all numbers."""
     columns = eqx.combine(jax.tree.map(lambda x: np.asarray(x)[None], parameters), job.constants.tree)
     efforts = [float(np.max(np.asarray(solver.effort(columns), float))) for solver in job.solvers]
     costs = [effort * solver.unit_cost for effort, solver in zip(efforts, job.solvers, strict=True)]
@@ -166,7 +166,7 @@ def _concrete(job: _Job, parameters: Any) -> dict[str, Array]:
 @lru_cache(maxsize=64)
 def _compiled(job: _Job, index: int) -> Callable[..., dict[str, Array]]:
     solver = job.solvers[index]
-    # Compiled without optimising where a call takes milliseconds: whoever makes many compiles them himself.
+    # Without optimisation if a call takes milliseconds: a user with many calls compiles them by `jax.jit`.
     options = compiler_options(1, march=solver.march) if solver.lengthy else options_for_few()
     return jax.jit(partial(_solve, job, index), compiler_options=options)
 
@@ -195,7 +195,7 @@ def _pure(job: _Job) -> Callable[[Any], dict[str, Array]]:
 
 
 def _tangent(name: str, result: Array, jacobians: Mapping[str, Array], direction: Array) -> Any:
-    """The tangent of one result: error estimates count as constants, a result without derivative gives NaN."""
+    """The tangent of one result: 0 for error estimates, NaN for a result without a derivative."""
     if not jnp.issubdtype(result.dtype, jnp.inexact):
         return np.zeros(result.shape, jax.dtypes.float0)
     if name in jacobians:
@@ -206,9 +206,10 @@ def _tangent(name: str, result: Array, jacobians: Mapping[str, Array], direction
 
 
 def _product(jacobian: Array, direction: Array) -> Array:
-    """``jacobian @ direction``, in which zeros win against NaN, also transposed: NaN stays with its result and parameter.
+    """``jacobian @ direction``, in which 0 times NaN is 0, also when transposed.
 
-    The product is the solution x of ``x = (jacobian @ direction, direction)``, for which jax takes a transpose as given.
+    A NaN thus affects only its own result and parameter. The product is written as the solution x of
+    ``x = (jacobian @ direction, direction)``, because jax accepts a given transpose of a linear solve.
     """
     count = len(jacobian)
 
@@ -225,7 +226,7 @@ def _product(jacobian: Array, direction: Array) -> Array:
 
 
 def _solve(job: _Job, index: int, parameters: Any, effort: Array | None) -> dict[str, Array]:
-    """One point by solver number ``index``; without ``effort`` it is predicted for every lane."""
+    """The results of one point by solver number ``index``; without ``effort`` the effort is predicted for every lane."""
     solver = job.solvers[index]
 
     def of_lanes(constants: Constants, parameters: Any, effort: Array) -> dict[str, Array]:
@@ -255,7 +256,7 @@ def _solve(job: _Job, index: int, parameters: Any, effort: Array | None) -> dict
 
 
 def _with_lanes(result: Array, own: int, lanes: int) -> Array:
-    """``result`` with the lanes as last axis, also if it depends on nothing that varies."""
+    """``result`` with the lanes as last axis, also if it does not depend on the varying parameters."""
     result = jnp.asarray(result)
     result = result if result.ndim > own else result[..., None]
     return jnp.broadcast_to(result, (*result.shape[:-1], lanes))

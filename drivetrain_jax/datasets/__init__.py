@@ -1,1 +1,1 @@
-"""Results and atlases as xarray sees them: the backend that opens an atlas as a lazy Dataset, the accessor, the figures."""
+"""Results and atlases in xarray: the backend that opens an atlas as a lazy Dataset, the accessor, and the figures."""

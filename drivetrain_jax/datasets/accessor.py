@@ -27,7 +27,7 @@ class DrivetrainAccessor:
         self._dataset = dataset
 
     def plot(self, *others: xr.Dataset | str | Path, **options: Any) -> Figure:
-        """The figure that suits the result; arguments as of :func:`drivetrain_jax.plot`."""
+        """The figure of the result; arguments as of :func:`drivetrain_jax.plot`."""
         from drivetrain_jax.datasets.figure import plot
 
         return plot(self._dataset, *others, **options)
@@ -63,7 +63,7 @@ class DrivetrainAccessor:
         return query(open_atlas(file), values)
 
     def resonances(self) -> xr.DataArray:
-        """The resonances that the system predicts along an axis of the result, such as ``resonance_Omega``, by their labels.
+        """The resonances that the system predicts along an axis of the result, such as ``resonance_Omega``, with labels.
 
         Raises: InputError if the system predicts none along the axes of this result.
         """
@@ -122,7 +122,7 @@ def _scalars(name: str, entry: dict[str, Any]) -> list[tuple[str, Any, dict[str,
 
 
 def _in_words(variable: xr.Variable) -> xr.Variable:
-    """A variable of codes with their meanings in place of them, found as they are asked for; an empty word for others."""
+    """A variable of codes as words, looked up lazily; a code without a meaning becomes an empty word."""
     words = _Words(variable)
     attrs = {name: value for name, value in variable.attrs.items() if not name.startswith("flag_")}
     encoding = {name: sizes for name, sizes in variable.encoding.items() if name == "preferred_chunks"}

@@ -1,6 +1,7 @@
 """The engine ``drivetrain`` of xarray: opens an atlas as a lazy Dataset.
 
-xarray loads this module whenever it looks for an engine, so what computes is imported when an atlas is opened.
+xarray imports this module whenever it looks for an engine. Modules that compute are therefore imported later, when an atlas
+is opened.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _GAPS = ("solve", "nan")
-# Cells of a chunk where Dask is left to choose, and most along one axis.
+# Most cells of a chunk of automatic size, and most cells along one axis.
 _CHUNK, _LONGEST = 1 << 18, 1 << 10
 
 
 class AtlasEntrypoint(BackendEntrypoint):
-    """An atlas on any grid: cells are evaluated when they are touched."""
+    """Opens an atlas on any grid; cells are evaluated when they are accessed."""
 
     description: ClassVar[str] = "Open a stability atlas of drivetrain_jax on any grid"
     url: ClassVar[str] = ""
@@ -48,20 +49,20 @@ class AtlasEntrypoint(BackendEntrypoint):
         grid: Any = None,
         gaps: str = "solve",
     ) -> xr.Dataset:
-        """The results of the atlas in a file on a grid, lazily.
+        """The results of an atlas file on a grid, evaluated lazily.
 
         Args:
             filename_or_obj: path of the file.
             drop_variables: names of results to leave out.
-            grid: by the name of a parameter a number of values between the ends of the atlas, ``(start, stop, num)``, a row
-                of values, or one value, a float; or one number of values for all parameters. Default: 512.
+            grid: a mapping from names of parameters to a number of values between the ends of the atlas, ``(start, stop,
+                num)``, a row of values, or one value (a float); or one number of values for all parameters. Default: 512.
             gaps: cells in a gap of the atlas are solved directly (``solve``), or have no value and the outcome ``gap``
                 (``nan``).
 
-        Returns: a Dataset with the names and attributes of a ``floquet`` result. One selection is evaluated at once,
-        so that another selection may give other last digits to a cell, within its ``spectral_radius_error``.
+        Returns: a Dataset with the names and attributes of a ``floquet`` result. The cells of a selection are evaluated
+        together, so a cell may have other last digits in another selection, within its ``spectral_radius_error``.
 
-        Raises: InputError for what is no atlas or damaged, and for a grid that reaches beyond the atlas.
+        Raises: InputError for a file that is not an atlas or is damaged, and for a grid that reaches beyond the atlas.
         """
         if not isinstance(filename_or_obj, (str, os.PathLike)):
             kind = type(filename_or_obj).__name__
@@ -106,9 +107,11 @@ def _opened(path: str, grid: Any, solve: bool) -> xr.Dataset:
 
 
 def _chunks(axes: dict[str, Any], degrees: dict[str, int]) -> dict[str, int]:
-    """Chunks of one size each way: those of another size would have kernels of their own. They reach far along the two
-    longest axes, whose cells are evaluated together; of axes as long as each other along those of low ``degrees``, which
-    take less work."""
+    """Sizes of chunks by axis, equal for all chunks where possible, because each size needs its own kernels.
+
+    Chunks are long along the two longest axes, whose cells are evaluated together. Among axes of equal length, those with
+    low ``degrees`` come first, which take less work.
+    """
     longest = sorted(axes, key=lambda name: (-len(axes[name]), degrees[name]))
     chunks, left = {}, _CHUNK
     for name in longest:

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 # Analyses whose figures show predicted resonances.
 _PREDICTED = ("floquet", "forced", "frequency_response", "steady_state")
-# Cells each way in the chart of an atlas.
+# Default number of cells along each axis in the chart of an atlas.
 CELLS = 800
-# Cells that a figure may have: matplotlib takes some hundred bytes for each.
+# Most cells of a figure: matplotlib needs some hundred bytes for each.
 _MOST_CELLS = 100_000_000
 
 
@@ -30,13 +30,13 @@ def plot(
     part: Mapping[str, float | tuple[float, float]] | None = None,
     cells: int | None = None,
 ) -> Figure:
-    """The figure that suits the analysis of a result.
+    """The figure of a result, chosen by its analysis.
 
     Args:
         result: a dataset, the path of a result file, or a list of them; an atlas is drawn with its boundaries and tips.
         others: results of the same analysis by other methods, drawn into the same axes (``frequency_response``).
-        part: of an atlas, what its chart shows: a number or ``(low, high)`` by the name of a parameter.
-        cells: of an atlas, the number of cells each way (800).
+        part: the part of an atlas to show: a number or ``(low, high)`` by the name of a parameter.
+        cells: the number of cells of an atlas along each axis (default 800).
 
     Returns: a matplotlib figure that shows itself in a notebook and belongs to no window: ``figure.savefig("chart.png")``.
 
@@ -94,13 +94,13 @@ def _chart(
 ) -> xr.Dataset:
     from drivetrain_jax.runs.atlas_chart import chart
 
-    # From its file an atlas is checked for damage.
+    # An atlas is checked for damage if it is opened from its file.
     place = Path(source) if isinstance(source, (str, Path)) else dataset
     return chart(place, part or {}, CELLS if cells is None else cells)
 
 
 def _with_resonances(dataset: xr.Dataset) -> xr.Dataset:
-    """``dataset`` with the predicted resonances of its system; older files hold them."""
+    """``dataset`` with the predicted resonances of its system, which older files already contain."""
     from drivetrain_jax.datasets.resonances import LABELS, resonances
 
     if dataset.attrs.get("analysis") not in _PREDICTED or LABELS in dataset.coords:
@@ -110,8 +110,10 @@ def _with_resonances(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _loaded(dataset: xr.Dataset) -> xr.Dataset:
-    """``dataset`` in memory, so that cells of an atlas are evaluated once; dimensions along which results were joined are
-    numbered."""
+    """``dataset`` in memory, so that cells of an atlas are evaluated once.
+
+    Dimensions without a coordinate, along which results were joined, are numbered.
+    """
     if "outcome" not in dataset:
         return dataset
     outcome = dataset["outcome"]

@@ -1,4 +1,4 @@
-"""The grid on which an atlas is opened: values of each of its parameters, as ``grid=`` gives them."""
+"""The grid on which an atlas is opened: values of each of its parameters, from the option ``grid``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import shown
 from drivetrain_jax.runs.atlas_file import StoredAtlas
 
-# Values of a parameter for which nothing is given.
+# Number of values of a parameter that the grid does not name.
 _DEFAULT = 512
 _ALLOWED = "a number of values (1000), (START, STOP, NUM), a row of values, or one value (0.5)"
 
@@ -20,10 +20,10 @@ def grid_values(atlas: StoredAtlas, grid: Any) -> tuple[dict[str, np.ndarray], d
     """Axes ``(N,)`` in the order of the atlas's parameters, and the values of the parameters that do not vary.
 
     Args:
-        grid: by the name of a parameter a number of values between the ends of the atlas, ``(start, stop, num)``, a row of
-            values, or one value, a float; or one number of values for all parameters. Default: 512.
+        grid: a mapping from names of parameters to a number of values between the ends of the atlas, ``(start, stop, num)``,
+            a row of values, or one value (a float); or one number of values for all parameters. Default: 512.
 
-    Raises: InputError for what is none of these and for values outside the atlas.
+    Raises: InputError for any other ``grid``, and for values outside the atlas.
     """
     given = dict.fromkeys(atlas.parameters, grid) if _is_count(grid) else grid
     given = {} if given is None else given

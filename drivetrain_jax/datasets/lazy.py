@@ -1,4 +1,4 @@
-"""Results of an atlas file as lazy arrays: a cell is evaluated when it is asked for, and no other."""
+"""Results of an atlas file as lazy arrays: only requested cells are evaluated."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.atlas_file import StoredAtlas, open_atlas
 
-# The outcome of a cell in a gap of the atlas that is not solved. No file has it.
+# The outcome of a cell in a gap of the atlas that is not solved. No file contains this code.
 GAP = len(Outcome)
-# Bytes of results that are kept: the variables of a selection are mostly asked for one after another, each of them once.
+# Bytes of the cache of results: the variables of a selection are usually requested one after another, each of them once.
 _KEPT = 24_000_000
-# Cells of an outer product that may be evaluated for each point asked for, before points are evaluated one by one.
+# Ratio of the cells of an outer product to the requested points above which the points are evaluated one by one.
 _SPARE = 4
 
 Key = tuple[int | slice | np.ndarray, ...]
 
 
 class AtlasGrid:
-    """Results of the atlas in a file on the outer product of ``axes``, ``fixed`` being the other parameters.
+    """Results of an atlas file on the outer product of ``axes``; the other parameters are ``fixed``.
 
-    It holds no more than the path and the axes, so that it can be sent to another process, which opens the file itself.
+    A pickle contains only the path and the grid, so another process opens the file itself.
     """
 
     def __init__(self, path: str, axes: Mapping[str, np.ndarray], fixed: Mapping[str, float], solve: bool) -> None:
@@ -66,7 +66,7 @@ class AtlasGrid:
         return self._taken(("block", *columns), name, lambda: self._evaluated(columns))
 
     def points(self, positions: Sequence[np.ndarray], name: str) -> np.ndarray:
-        """The result ``name`` at points, given by positions along each axis, of one shape."""
+        """The result ``name`` at points, given by their positions along each axis, arrays of equal shape."""
         shape = positions[0].shape
         columns = [axis[part].reshape(-1) for axis, part in zip(self.axes.values(), positions, strict=True)]
 
@@ -87,7 +87,7 @@ class AtlasGrid:
         return {name: values[0] for name, values in found.items()}
 
     def _taken(self, parts: tuple, name: str, evaluated: Callable[[], Mapping[str, np.ndarray]]) -> np.ndarray:
-        """One of the results of a selection; the others are kept for a while."""
+        """One result of a selection; the other results stay in the cache until they are requested or dropped."""
         key = tuple(part.tobytes() if isinstance(part, np.ndarray) else part for part in parts)
         with self._lock:
             if name in self._kept.get(key, ()):
@@ -139,7 +139,7 @@ def _length(part: slice | np.ndarray, size: int) -> int:
 
 
 def _spread_out(key: Key, shape: tuple[int, ...]) -> list[np.ndarray]:
-    """Positions along each axis that broadcast against each other: those of slices follow those of arrays."""
+    """Positions along each axis that broadcast against each other; the dimensions of slices follow those of arrays."""
     slices = [k for k in key if isinstance(k, slice)]
     ahead = next(k.ndim for k in key if isinstance(k, np.ndarray))
     positions, number = [], 0

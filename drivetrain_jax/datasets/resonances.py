@@ -1,4 +1,4 @@
-"""Predicted resonances of the system of a result, computed from its scene whenever a figure or a user asks."""
+"""Predicted resonances of the system of a result, computed on demand from its parameters."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ BUILT_IN = {
 
 
 def resonances(dataset: xr.Dataset) -> xr.DataArray | None:
-    """The predicted resonances of the system of ``dataset`` along the axis that they are values of; None without any.
+    """The predicted resonances of the system of ``dataset``, values of one of its axes; None without any.
 
-    Returns: ``resonance_AXIS`` with the dimension ``resonance`` (labels), after the axes that the predictions depend on.
+    Returns: ``resonance_AXIS``; its dimensions are the axes that the predictions depend on, then ``resonance`` (labels).
     """
     predicted = _predicted(str(dataset.attrs.get("system")))
     if predicted is None or predicted.axis not in dataset.dims or is_joined(dataset):
@@ -60,7 +60,7 @@ def _predicted(system: str) -> Resonances | None:
 
 
 def _value(dataset: xr.Dataset, name: str) -> Any:
-    """The values of a parameter along its axis, or its value everywhere; None without either."""
+    """The values of a parameter along its axis, or its fixed value; None without either."""
     if name in dataset.coords and dataset[name].dims in ((), (name,)):
         return dataset[name].values
     swept = {scene_key(coordinate).partition("[")[0] for coordinate in dataset.coords.values() if coordinate.ndim}

@@ -37,7 +37,7 @@ _BUILT_IN = (
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of a rule: number of points it was applied to, number of points that break it, and the first of these."""
+    """Result of a rule: number of checked points, number of points that break the rule, and the first of these."""
 
     rule: str
     points: int

@@ -19,8 +19,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class Report:
-    """``lines`` for the reader; ``problem`` is the first problem, empty without one. ``complete`` is false for
-    unfinished work."""
+    """The ``lines`` of a report; ``problem`` is the first problem, empty without one.
+
+    ``complete`` is false for unfinished work.
+    """
 
     lines: tuple[str, ...]
     problem: str = ""

@@ -1,4 +1,4 @@
-"""Resonances that systems predict. Figures of stored results draw them, so this package does without jax."""
+"""Resonances that systems predict. This package does not import jax, because figures of stored results need none."""
 
 from __future__ import annotations
 

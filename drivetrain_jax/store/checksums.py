@@ -1,7 +1,7 @@
 """Checksums of a finished result: of each variable as a reader sees it, and of the attributes of the file.
 
-They are computed once, when the file is complete. HDF5's own filter (fletcher32) needs chunked storage, which cannot be
-memory-mapped, and does not cover attributes and labels.
+The checksums are computed once, when the file is complete. HDF5's own filter (fletcher32) needs chunked storage, which
+cannot be memory-mapped, and does not cover attributes and labels.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ATTRIBUTE = "checksums"
 # The name of the root group stands for the attributes of the file.
 FILE = "/"
 _BLOCK = 1 << 24
-# Bytes above which threads are faster: they run in parallel only while hashing.
+# Bytes above which threads save time: only hashing runs in parallel.
 _LARGE = 1 << 22
 # Exceptions of h5py for a damaged file structure.
 BROKEN = (OSError, KeyError, ValueError, RuntimeError, TypeError, OverflowError)
@@ -43,8 +43,10 @@ def seal(file: h5py.File) -> None:
 
 
 def checksums(file: h5py.File) -> dict[str, str]:
-    """blake2b (128 bits) of each variable, with type, dimensions and attributes, and of the attributes of ``file`` and of
-    its groups."""
+    """Checksums by name (blake2b, 128 bits) of each variable, and of the attributes of ``file`` and of its groups.
+
+    The checksum of a variable includes its type, dimensions and attributes.
+    """
     variables = _variables(file)
     if sum(variable.nbytes for variable in variables.values()) < _LARGE:
         digests = [_of_variable(variable) for variable in variables.values()]
@@ -58,8 +60,10 @@ def checksums(file: h5py.File) -> dict[str, str]:
 
 
 def damaged(path: Path) -> list[str] | None:
-    """Names of the damaged variables (``/``: attributes) of the result at ``path``; None if it has no checksums. Raises
-    :class:`InputError` if the file cannot be read."""
+    """Names of the damaged variables (``/``: attributes) of the result at ``path``; None if it has no checksums.
+
+    Raises :class:`InputError` if the file cannot be read.
+    """
     try:
         with h5py.File(path, "r") as file:
             stored = file.attrs.get(ATTRIBUTE)
@@ -88,7 +92,7 @@ def _groups(file: h5py.File) -> dict[str, h5py.Group]:
 
 
 def _parsed(stored: Any) -> dict[str, str]:
-    """The stored table; a damaged table equals nothing."""
+    """The stored table of checksums; empty if it is damaged, so that nothing matches."""
     try:
         table = json.loads(stored)
     except (ValueError, TypeError):
@@ -106,7 +110,7 @@ def _of_variable(variable: h5py.Dataset) -> str:
 
 
 def _dimension(variable: h5py.Dataset, axis: int) -> str | None:
-    """Name of a dimension in the file, read from its first scale; h5py would look it up three times."""
+    """Name of a dimension in the file, read from its first scale, because h5py would look it up three times."""
     if not h5py.h5ds.get_num_scales(variable.id, axis):
         return variable.dims[axis].label
     scales: list[h5py.h5d.DatasetID] = []

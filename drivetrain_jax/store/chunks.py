@@ -1,5 +1,4 @@
-"""Unfinished work: the folder ``FILE.nc.parts/`` with files of finished chunks, which are complete and verified, or
-ignored.
+"""Unfinished work: the folder ``FILE.nc.parts/`` with files of finished chunks; incomplete files are ignored.
 
 A part is one HDF5 image, made in memory and written at once. Its name contains the digest of its content. A damaged part is
 detected on reading, and its chunks are computed again.
@@ -30,8 +29,10 @@ Arrays = Mapping[str, np.ndarray]
 
 
 class Part:
-    """Finished chunks: their numbers, point counts, results (points first), computing time in s, and perhaps the
-    ``points``. A part that has been read has the ``name`` of its file."""
+    """Finished chunks: their numbers, point counts, results (points first), computing time in s, and optional ``points``.
+
+    A part that has been read has the ``name`` of its file.
+    """
 
     def __init__(
         self,
@@ -61,7 +62,7 @@ class Part:
 
     def to_bytes(self) -> bytes:
         """The HDF5 image."""
-        # HDF5 keeps one open file of a name, and threads write at once.
+        # A name per thread: HDF5 keeps one open file per name, and threads write at the same time.
         with h5py.File(f"part {get_ident()}", "w", driver="core", backing_store=False) as file:
             file["chunks"], file["sizes"] = self.chunks, self.sizes
             file.attrs["seconds"] = self.seconds
@@ -86,7 +87,7 @@ class PartsFolder:
     """The parts of the result ``out``. Writing needs an open folder (``open``, ``close``), reading does not."""
 
     def __init__(self, out: Path) -> None:
-        # One folder, and so one lock, for all names of a file.
+        # All links to a file share one folder, and so one lock.
         out = behind_link(out)
         self.out, self.path = out, out.parent / f"{out.name}.parts"
         # Path at which the result grows.
@@ -95,8 +96,10 @@ class PartsFolder:
         self._lock: FileLock | None = None
 
     def plan(self) -> dict[str, Any]:
-        """The plan of the parts: ``digest``, ``replaces`` (digest of the result that they will replace), and further
-        entries of the run. Empty without a readable plan."""
+        """The plan of the parts; empty without a readable plan.
+
+        It has the entries ``digest``, ``replaces`` (digest of the result that the parts will replace), and others of the run.
+        """
         try:
             content = json.loads(self._plan.read_text())
         except (OSError, ValueError):
@@ -104,8 +107,10 @@ class PartsFolder:
         return content if isinstance(content, dict) else {}
 
     def open(self) -> None:
-        """Create and lock the folder. Raises ``InputError`` if another run has locked it or it cannot be created.
-        Changes no content."""
+        """Create and lock the folder, without a change of its content.
+
+        Raises :class:`InputError` if another run has locked the folder, or if it cannot be created.
+        """
         while True:
             self._make()
             lock = FileLock(self.path / "lock", timeout=0)

@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 
 # Upper limit of the bytes of a variable's attributes.
 _LABELS = 1 << 16
-# Bytes of the block in front of HDF5 that a preface takes: the least that HDF5 looks behind.
+# Bytes of the user block in front of HDF5 that holds a preface: the smallest size that HDF5 allows.
 _USER_BLOCK = 512
 
 
 class ResultFile:
     """A result that grows on disk next to its final path, so memory does not grow with it.
 
-    ``lay_out`` gives its data variables as arrays mapped from the file ``temporary``, to be filled in any order; ``finish``
-    puts it into place. Leaving the context without that deletes it. A ``preface`` stands in front of HDF5.
+    ``lay_out`` returns its data variables as arrays mapped from the file ``temporary``, to be filled in any order.
+    ``finish`` moves the file into place; leaving the context without it deletes the file. A ``preface`` precedes HDF5.
     """
 
     def __init__(self, temporary: Path, preface: bytes = b"") -> None:
@@ -67,7 +67,7 @@ class ResultFile:
 
 
 def write_result(result: Labelled, path: Path, temporary: Path, preface: bytes = b"") -> None:
-    """Write ``result`` to ``path`` in one step; ``temporary`` is where it grows. A full disk leaves ``path`` alone."""
+    """Write ``result`` to ``temporary``, and move it to ``path`` in one step. A full disk leaves ``path`` unchanged."""
     with ResultFile(temporary, preface) as file:
         for name, array in file.lay_out(result).items():
             array[...] = result.data[name].values
@@ -108,8 +108,10 @@ def release(arrays: Iterable[np.ndarray]) -> None:
 
 
 def read_attribute(path: Path, name: str) -> str | None:
-    """A global attribute of the result at ``path``, or one of its details; None if missing. ``InputError`` if the file is
-    not readable."""
+    """A global attribute of the result at ``path``, or one of its details; None if it is missing.
+
+    Raises :class:`InputError` if the file is not readable.
+    """
     try:
         with h5py.File(path, "r") as file:
             # Older files have no group of details.

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-# First bytes of the file of an atlas, in a user block of HDF5: xarray then finds the engine that evaluates it. Every reader
-# of HDF5 and netCDF looks for the file behind it.
+# First bytes of an atlas file, in a user block of HDF5, by which xarray finds the engine of this package. Readers of HDF5
+# and netCDF skip the user block.
 ATLAS_PREFACE = b"An atlas of drivetrain_jax, HDF5 from byte 512 on.\n"
 
 

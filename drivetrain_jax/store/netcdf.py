@@ -1,6 +1,6 @@
 """Write labelled results in the netCDF4 format: HDF5 with the dimensions, types and hidden attributes that readers expect.
 
-h5py writes it: h5netcdf looks up every object for each of its properties and takes three times as long.
+The writer uses h5py, because h5netcdf looks up every object for each of its properties and takes three times as long.
 https://docs.unidata.ucar.edu/netcdf-c/current/file_format_specifications.html
 """
 
@@ -21,7 +21,7 @@ _COMPLEX = {"complex64": "_PFNC_FLOAT_COMPLEX_TYPE", "complex128": "_PFNC_DOUBLE
 
 
 def head(result: Labelled) -> bytes:
-    """A file with everything of ``result`` except its data: attributes, dimensions and coordinates."""
+    """The bytes of a file with all of ``result`` except its data: attributes, dimensions and coordinates."""
     aside = _aside(result)
     with h5py.File("head", "w", driver="core", backing_store=False, track_order=True) as file:
         file.attrs["_NCProperties"] = np.bytes_(_MADE_BY)
@@ -90,7 +90,7 @@ def _make_scale(file: h5py.File, dim: str, number: int, size: int) -> h5py.Datas
 
 
 def _growth(shape: tuple[int, ...]) -> dict[str, tuple[int | None, ...]]:
-    """In netCDF a dimension of length 0 is unlimited."""
+    """The option ``maxshape`` of a variable: in netCDF a dimension of length 0 is unlimited."""
     return {} if all(shape) else {"maxshape": tuple(size or None for size in shape)}
 
 

@@ -32,7 +32,7 @@ def now() -> str:
 def command() -> str:
     """The program that runs, with its arguments."""
     program = Path(sys.argv[0]).name
-    # A string of code and a prompt have no name; a notebook's server is not the user's command.
+    # A prompt or ``python -c`` has no program name, and in a notebook the program is the kernel, not the user's command.
     if program in ("", "-", "-c") or program.startswith("ipykernel"):
         return "notebook" if program.startswith("ipykernel") else "python"
     return shlex.join([program, *sys.argv[1:]])

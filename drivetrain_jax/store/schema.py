@@ -14,14 +14,16 @@ if TYPE_CHECKING:
     import xarray as xr
 
 CONVENTIONS = "CF-1.11"
-# Long attributes, which would fill the display of a dataset: a file holds them in a group of this name.
+# Long attributes, which would fill the display of a dataset, and the group of the file that holds them.
 DETAILS, GROUP = frozenset({"numerics_detail"}), "provenance"
 
 
 @dataclass(frozen=True)
 class Coordinate:
-    """Values of a parameter or prediction along dimensions of the result. ``parameter``: its key in the scene, if that is
-    another name."""
+    """Values of a parameter or prediction along dimensions of the result.
+
+    ``parameter`` is the key of the parameter in the scene if it differs from ``name``.
+    """
 
     name: str
     dims: tuple[str, ...]
@@ -122,7 +124,7 @@ def _variable_attrs(variable: Variable) -> dict[str, Any]:
     """CF attributes; flag values have the type of the variable, as CF requires."""
     attrs = _labels(variable.units, variable.long_name)
     if ", " in variable.units:
-        # CF knows one unit a variable.
+        # CF allows one unit per variable.
         attrs = _labels("1", f"{variable.long_name} [{variable.units}]") | {"units_of_components": variable.units}
     if variable.flags:
         attrs["flag_values"] = np.arange(len(variable.flags), dtype=variable.dtype)

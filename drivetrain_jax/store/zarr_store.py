@@ -37,9 +37,9 @@ Place = tuple[slice, ...]
 
 @dataclass(frozen=True)
 class Shards:
-    """The shards of a sweep of this ``shape``, numbered in C order, of ``lengths`` along its axes (the last may be less).
+    """The shards of a sweep of this ``shape``, numbered in C order; the last shard along an axis may be shorter.
 
-    Points of a shard are consecutive in C order; a path axis is whole.
+    A shard has ``lengths`` along the axes. Its points are consecutive in C order; a path axis is whole.
     """
 
     shape: tuple[int, ...]
@@ -79,7 +79,7 @@ def is_store(path: Path) -> bool:
 def create(path: Path, template: Labelled, shards: Shards, fills: Mapping[str, float]) -> None:
     """Create an empty store for ``template``, whose data are ignored. Raises ``OSError`` without enough space."""
     zarr = _zarr()
-    # Words of any length: those of a fixed one have no specification yet.
+    # As strings of variable length: Zarr has no specification of strings of fixed length yet.
     coords = {
         n: replace(c, values=c.values.astype(object)) if c.values.dtype.kind == "U" else c
         for n, c in template.coords.items()
@@ -194,7 +194,7 @@ def seal(path: Path, attrs: Mapping[str, Any], labels: Mapping[str, Mapping[str,
     root = _root(path, "r+")
     for name, own in labels.items():
         root[name].attrs.update({key: v.tolist() if hasattr(v, "tolist") else v for key, v in own.items()})
-    # Written anew, because the attributes of a growing store have no checksum; xarray lists the coordinates in one.
+    # Replace the attributes, because those of a growing store have no checksum; xarray needs the list of coordinates.
     kept = {name: value for name, value in root.attrs.items() if name == "coordinates"}
     root.attrs.put({**kept, **{name: value for name, value in attrs.items() if name not in DETAILS}})
     root[GROUP].attrs.put({name: value for name, value in attrs.items() if name in DETAILS})
@@ -206,13 +206,13 @@ def seal(path: Path, attrs: Mapping[str, Any], labels: Mapping[str, Mapping[str,
 def _consolidate(path: Path) -> None:
     """Copy the metadata of all arrays into those of the store, where xarray looks first."""
     with warnings.catch_warnings():
-        # Not yet a part of the specification of Zarr 3; other readers leave the copy alone.
+        # Consolidated metadata are not yet in the specification of Zarr 3; other readers ignore the copy.
         warnings.simplefilter("ignore")
         _zarr().consolidate_metadata(path)
 
 
 def is_sealed(path: Path) -> bool:
-    """True if all but the shards of a finished store is intact; :class:`InputError` if it is not a result."""
+    """True if a finished store is intact apart from its shards; :class:`InputError` if it is not a result."""
     attrs = attributes(path)
     if "digest" not in attrs:
         raise InputError(f"store = {str(path)!r}: not a result of drivetrain_jax; give one of --store zarr")
@@ -254,7 +254,7 @@ def _damaged(path: Path) -> InputError:
 
 
 def _root(path: Path, mode: str = "r") -> Any:
-    """The store by the metadata of every array, not by the copy of them."""
+    """The store, opened by the metadata of every array and not by their consolidated copy."""
     return _zarr().open_group(path, mode=mode, use_consolidated=False)
 
 
