@@ -1,14 +1,14 @@
-"""Every study of the benchmarks, one process after the other, and the page that is written from their results.
+"""Run every study of the benchmarks in a process of its own, one after the other, and write the page of their results.
 
     python -m benchmarks [--quick] [--out FOLDER] [--peers PYTHON] [SYSTEM ...]
 
 A full run rewrites benchmarks/results/, docs/benchmarks.md and the measured part of README.md. With ``--quick``, or
-another ``--out``, files and page go to that folder. A study whose peer is not installed is left out, and said so; one
-that fails does not stop the others. An interrupt leaves the files of unfinished studies, and the page, as they were.
-``drivetrain bench`` and ``make bench`` run this.
+another ``--out``, files and page go to that folder. A study whose peer is not installed is skipped with a message. A study
+that fails does not stop the others. An interrupt leaves the files of unfinished studies, and the page, unchanged.
+``drivetrain bench`` and ``make bench`` run this module.
 
-``--quick`` takes the chart at equal error and the work-precision of every system, with fewer settings, regions and points;
-all that is about rates alone or sizes it leaves out, unless a SYSTEM is asked for.
+``--quick`` runs the chart at equal error and the work-precision of every system, with fewer settings, regions and points.
+It skips studies of rates alone and of sizes, unless a SYSTEM is given.
 """
 
 from __future__ import annotations
@@ -29,16 +29,19 @@ from drivetrain_jax.cli.replies import WRONG_INPUT, one_line
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "benchmarks.md"
-# What a shell reports of a process that an interrupt ends.
+# Exit code in a shell of a process that an interrupt ends.
 INTERRUPTED = 130
 SYSTEMS = ("cardan", "bicardan", "planetary", "rattle", "tripod")
 
 
 @dataclass(frozen=True)
 class Study:
-    """A module of benchmarks/: what it is about, the package it cannot do without, its option for an interpreter that has
-    the peers, its arguments in a full run (chosen so that all studies together stay under half an hour), and whether a
-    quick run of all systems takes it."""
+    """A ``module`` of benchmarks/ about a ``system``.
+
+    ``needs`` is a package that it requires, ``peer_option`` its option for an interpreter with the peers. ``full`` are its
+    arguments in a full run, chosen so that all studies together take less than half an hour. ``quick`` is true if a quick
+    run of all systems includes it.
+    """
 
     module: str
     system: str
@@ -75,7 +78,7 @@ def command(study: Study, quick: bool, folder: Path, peers: str | None) -> list[
 
 
 def run(studies: Sequence[Study], quick: bool, folder: Path, peers: str | None) -> int:
-    """Run ``studies``; returns how many failed."""
+    """Run ``studies``; returns the number of those that failed."""
     failed = 0
     begin = time.perf_counter()
     for number, study in enumerate(studies, 1):
@@ -95,7 +98,7 @@ def run(studies: Sequence[Study], quick: bool, folder: Path, peers: str | None) 
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the studies of the systems given, then write the page."""
+    """Run the studies of the given systems, then write the page."""
     known = parser(__doc__)
     known.add_argument("systems", nargs="*", metavar="SYSTEM", help=", ".join(SYSTEMS))
     known.add_argument("--peers", metavar="PYTHON", help="interpreter of an environment with ROSS and pynamicalsys")

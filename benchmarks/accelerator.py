@@ -1,10 +1,11 @@
-"""Points a second on an accelerator beside all cores of the same machine, and how far the two results differ.
+"""Points a second on an accelerator and on all cores of the same machine, and the difference of the two results.
 
     python -m benchmarks.accelerator      # results/accelerator.csv; needs a jax with the accelerator's plugin
 
-Scenes like those of benchmarks.batches, one or two per system, from the scene to the result in memory. A process of its own
-for each of the two devices runs every scene once, which compiles (``first_s``), and three times more (the median counts).
-Differences are relative to the largest value of a result; of a Lyapunov spectrum, whose trajectories separate, none is told.
+The scenes are like those of benchmarks.batches, one or two per system, and are timed from the scene to the result in memory.
+For each of the two devices a process of its own runs every scene once, which compiles (``first_s``), and three times more;
+rates are medians of these three. Differences are relative to the largest value of a result. Lyapunov spectra have none,
+because their trajectories separate.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _NOT_COMPARED = ("verdict", "lyapunov_spectrum")
 
 
 def scenes(quick: bool) -> dict[str, dict[str, Any]]:
-    """What is run."""
+    """The scenes by name."""
     few = 100 if quick else 1
     chart = cells(1_000_000 // few)
     return {
@@ -45,7 +46,7 @@ def scenes(quick: bool) -> dict[str, dict[str, Any]]:
 
 
 def measure(folder: Path, quick: bool) -> None:
-    """Run all scenes in this process; seconds and the device's name go to ``folder``/times.json, results beside it."""
+    """Run all scenes in this process; seconds and the name of the device go to ``folder``/times.json, results to .npz."""
     import jax
 
     import drivetrain_jax as dt
@@ -66,14 +67,14 @@ def measure(folder: Path, quick: bool) -> None:
 
 
 def difference(first: Path, second: Path) -> float:
-    """The largest difference of two files of results, relative to the largest value of each; NaN if none is compared."""
+    """The largest difference of two result files, relative to the largest value of each result; NaN if none is compared."""
     with np.load(first) as a, np.load(second) as b:
         compared = (name for name in a.files if name not in _NOT_COMPARED)
         return max((float(np.nanmax(np.abs(a[n] - b[n])) / np.nanmax(np.abs(a[n]))) for n in compared), default=np.nan)
 
 
 def row(number: int, name: str, told: Sequence[dict[str, Any]], folders: Sequence[Path]) -> dict[str, Any]:
-    """A line of accelerator.csv from the accelerator's times and results and those of the cores."""
+    """A line of accelerator.csv, from times and results of the accelerator and of the cores."""
     device, cores = (one[name] for one in told)
     return {
         "scene": name,
@@ -87,7 +88,7 @@ def row(number: int, name: str, told: Sequence[dict[str, Any]], folders: Sequenc
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Measure, print and write; on a machine without an accelerator a line that says so."""
+    """Measure, print and write; on a machine without an accelerator only print a message."""
     options = parser(__doc__)
     options.add_argument("--measure", type=Path, help="only run the scenes, in this process")
     chosen = options.parse_args(argv)

@@ -1,26 +1,26 @@
-"""Cells per second of the atlas from nothing to a file, against rivals on samples of the same cells, in one run.
+"""Cells per second of the atlas and of rivals on samples of the same cells, in one run.
 
     python -m benchmarks.atlas [--cells 30000 1000000 4000000 20000000] [--repeats 3]    # writes results/atlas.csv
 
 Chart: that of benchmarks.throughput, beta in [0, 1.5] x Omega in [0.1, 2], base case, spectral radius with its bound and
 verdict. Times of the package for each number of cells:
 
-    evaluation    the grid from an atlas that is there (its kernels compiled)
+    evaluation    the grid from an existing atlas (its kernels compiled)
     points        as many cells at random places, one million at most
-    construction  the atlas alone: nodes, direct solves and fits. It does not depend on the number of cells
-    warm          atlas, grid and result in memory: nodes and direct solves included, compilation not
-    file          the same into a file, flushed to the disk (not read back)
+    construction  the atlas alone: nodes, direct solves and fits; independent of the number of cells
+    warm          atlas, grid and result in memory: nodes and direct solves included, compilation excluded
+    file          as `warm`, into a file, flushed to the disk (not read back)
     cold          the whole command `drivetrain run`: import, compilation, solves, evaluation, file
 
-What `warm` takes beyond `construction` and `evaluation` is the checking of the scene, the digest of the code and the
-labelled result.
+`warm` also includes the checking of the scene, the digest of the code and the labelled result, which neither `construction`
+nor `evaluation` includes.
 
 Last row: an atlas over four parameters (sweeps/cardan_atlas_4d.toml) opened and sliced to a chart of 1000 x 1000 cells.
 
-Rivals compute a sample of the cells (heyoka 20,000, SciPy 200) on both cores, in turns with the package; their time for
-all cells is extrapolated, which favours none of them: they do not depend on the number of cells. Errors are those of the
-spectral radius relative to heyoka at 1e-15 on the sample, bounds those that the package states there. The package's rtol is
-the one at which its largest error is about that of heyoka's fastest setting.
+Rivals compute a sample of the cells (heyoka 20,000, SciPy 200) on both cores, in turns with the package. Their time for
+all cells is extrapolated, which favours none of them: their time per cell does not depend on the number of cells. Errors
+are those of the spectral radius relative to heyoka at 1e-15 on the sample; bounds are those of the package there. The rtol
+of the package is chosen so that its largest error is about that of heyoka's fastest setting.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def package_jobs(cells: int, folder: Path) -> dict[str, Callable[[], Any]]:
 
 
 def four_parameters(folder: Path) -> dict[str, Any]:
-    """The row of the atlas over four parameters."""
+    """The row about the atlas over four parameters."""
     import drivetrain_jax as dt
 
     path, axes_of_chart = (

@@ -1,16 +1,18 @@
-"""Atlases of the cardan shaft attacked where they are weakest: is the true error ever larger than the bound beside it?
+"""Attack atlases of the cardan shaft where they are weakest, to find true errors larger than their bounds.
 
     python -m benchmarks.atlas_attack                     # every case; writes results/atlas_attack.csv after each
-    python -m benchmarks.atlas_attack --only base wide    # these anew, the rows of the others stay
+    python -m benchmarks.atlas_attack --only base wide    # only these cases; the rows of the others stay
     python -m benchmarks.atlas_attack --quick             # few cells, to a temporary folder; --cells N: of each kind
 
-Of each case: the relative error of Z at random points of its ranges; the error of rho at random cells of a grid, at the
-cells nearest to rho = 1 and at those with the widest bound, against direct solves with rtol = 1e-14; of each the cells
-whose error is the largest part of their bound once more against values to 30 digits, which share no code with the package
-(tests.oracles.cardan_precise_reference). An error may exceed its bound by 2e-14 of the value where both sides are rounded,
-and by nothing against 30 digits. With more than two parameters random points stand in for the grid.
+Each case measures the relative error of Z at random points of its ranges. It measures the error of rho against direct solves
+with rtol = 1e-14 at three kinds of cells: random cells of a grid, the cells nearest to rho = 1, and those with the widest
+bound. Of each kind, the cells with the largest ratio of error to bound are compared again with values to 30 digits, which
+share no code with the package (tests.oracles.cardan_precise_reference). Against direct solves an error may exceed its bound
+by 2e-14 of the value, because both sides are rounded; against 30 digits it may not exceed its bound. With more than two
+parameters random points replace the grid.
 
-Where rho = 1 by decree (no damping) direct solves are wrong by the root of rounding: there they must only come near 1.
+Without damping the package sets rho = 1 in stable cells. Direct solves there have an error of the root of rounding, and must
+only be near 1.
 """
 
 from __future__ import annotations
@@ -35,14 +37,14 @@ if TYPE_CHECKING:
 
 NAME = "atlas_attack"
 STABLE, UNSTABLE, UNDECIDED = 0, 1, 2
-# Of the value: what direct solves and the eigenvalues of their Z may be wrong by themselves.
+# Relative error allowed to the direct solves themselves, including the eigenvalues of their Z.
 ROUNDING = 2e-14
-# How far direct solves may put multipliers off the circle that lie on it.
+# Largest distance from 1 of direct solves whose multipliers are on the unit circle.
 _NEAR = 1e-6
-# With more parameters than two: cells of a grid for one random point.
+# With more than two parameters: number of grid cells that one random point replaces.
 _PART = 30
 KINDS = ("random", "nearest", "widest")
-# Beside beta and Omega: what some case changes, or has as an axis.
+# Parameters other than beta and Omega that a case changes or has as an axis.
 _OTHERS = ("zeta", "alpha", "mu")
 
 Results = Mapping[str, np.ndarray]
@@ -50,7 +52,7 @@ Results = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Case:
-    """An atlas: ranges of its parameters, its tolerance, and what differs from the base case."""
+    """An atlas: ranges of its parameters, its tolerance, and its changes of the base case."""
 
     name: str
     ranges: Mapping[str, tuple[float, float]]
@@ -72,7 +74,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Size:
-    """How much of a case is tried: cells of each kind, cells of the grid along each axis, cells compared with 30 digits."""
+    """Numbers of a case: cells of each kind, cells of the grid along each axis, and cells compared with 30 digits."""
 
     cells: int = 10_000
     side: int = 3000
@@ -100,18 +102,18 @@ CASES = (
 
 
 def violations(found: Results, radius: np.ndarray) -> np.ndarray:
-    """Whether the spectral radius lies further from ``radius`` than its bound, and rounding, allow."""
+    """Flags of cells whose spectral radius is further from ``radius`` than its bound and rounding allow."""
     return np.abs(found["spectral_radius"] - radius) > found["spectral_radius_error"] + ROUNDING * radius
 
 
 def wrong(found: Results, radius: np.ndarray) -> np.ndarray:
-    """Whether a verdict contradicts ``radius``."""
+    """Flags of cells whose verdict contradicts ``radius``."""
     stable, unstable = found["verdict"] == STABLE, found["verdict"] == UNSTABLE
     return (stable & (radius > 1 + ROUNDING)) | (unstable & (radius < 1 - ROUNDING))
 
 
 def hardest(found: Results, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Cells nearest to rho = 1 (on neither side by decree) and cells with the widest bound, as indices of the flat array."""
+    """Flat indices of the cells nearest to rho = 1, without those set to 1, and of the cells with the widest bound."""
     radius = found["spectral_radius"].reshape(-1)
     distance = np.where(radius == 1, np.inf, np.abs(radius - 1))
     return _smallest(distance, count), _smallest(-found["spectral_radius_error"].reshape(-1), count)
@@ -124,7 +126,7 @@ def _smallest(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def relative_error_of_z(atlas: StabilityAtlas, points: np.ndarray) -> np.ndarray:
-    """Error of Z at ``points`` against direct solves, over its norm."""
+    """Error of Z at ``points`` against direct solves, relative to the norm of Z."""
     from drivetrain_jax.atlas.interpolation import evaluate
     from drivetrain_jax.atlas.panels import position
     from tests.oracles.atlas_direct import monodromy, propagators
@@ -140,7 +142,7 @@ def relative_error_of_z(atlas: StabilityAtlas, points: np.ndarray) -> np.ndarray
 
 @dataclass(frozen=True)
 class Candidates:
-    """Cells of a grid, or points, with their results, all flat."""
+    """Cells of a grid, or points, with their results as flat arrays."""
 
     place: Callable[[np.ndarray], np.ndarray]
     found: Results
@@ -151,7 +153,7 @@ class Candidates:
 
 
 def candidates(atlas: StabilityAtlas, side: int) -> Candidates:
-    """``side`` x ``side`` cells over the ranges of the atlas, or random points, fewer, as each takes longer."""
+    """``side`` x ``side`` cells over the ranges of the atlas, or fewer random points, each of which takes longer."""
     from tests.oracles.atlas_direct import random_points
 
     if len(atlas.atlas.parameters) > 2:
@@ -169,7 +171,7 @@ def candidates(atlas: StabilityAtlas, side: int) -> Candidates:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What came of some cells: errors and their largest part of the bound, how many broke a bound or had a wrong verdict."""
+    """Errors of some cells, the largest ratio of error to bound, and numbers of violated bounds and wrong verdicts."""
 
     error: np.ndarray
     ratio: float
@@ -178,7 +180,7 @@ class Comparison:
 
 
 def against_direct(points: np.ndarray, found: Results, radius: np.ndarray) -> Comparison:
-    """Cells against direct solves."""
+    """The comparison of cells with direct solves."""
     decreed = found["spectral_radius"] == 1
     judged = (found["verdict"] != UNDECIDED) & ~decreed
     error = np.abs(found["spectral_radius"] - radius)
@@ -193,21 +195,21 @@ def against_direct(points: np.ndarray, found: Results, radius: np.ndarray) -> Co
 
 
 def worst(found: Results, radius: np.ndarray, count: int) -> np.ndarray:
-    """The cells whose error is the largest part of their bound."""
+    """Indices of the cells with the largest ratio of error to bound."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.abs(found["spectral_radius"] - radius) / found["spectral_radius_error"]
     return np.argsort(-np.where(np.isfinite(ratio), ratio, -1))[:count]
 
 
 def precise_radius(point: Mapping[str, float]) -> float:
-    """To 30 digits, by a program of its own."""
+    """Spectral radius to 30 digits, by code independent of the package."""
     return float(precise.spectral_radius(point))
 
 
 def against_precise(
     atlas: StabilityAtlas, points: np.ndarray, found: Results, pool: Executor | None = None
 ) -> Comparison:
-    """Cells against values without rounding; nothing is allowed beyond the bound."""
+    """The comparison of cells with values to 30 digits; no error may exceed its bound."""
     names, fixed = atlas.atlas.parameters, atlas.atlas.fixed
     given = [{**fixed, **dict(zip(names, point, strict=True))} for point in points.tolist()]
     exact = np.array(list((pool.map if pool else map)(precise_radius, given)))
@@ -244,7 +246,7 @@ def attack(case: Case, size: Size, atlas: StabilityAtlas, pool: Executor | None 
 
 
 def description(case: Case, atlas: StabilityAtlas) -> dict[str, Any]:
-    """What a case is, and what its atlas takes."""
+    """Columns that describe a case and the size of its atlas."""
     from drivetrain_jax.atlas import to_arrays
 
     ranges = {name: f"{low:g}..{high:g}" for name, (low, high) in case.ranges.items()}
@@ -261,7 +263,7 @@ def description(case: Case, atlas: StabilityAtlas) -> dict[str, Any]:
 
 
 def merged(rows: Iterable[Mapping[str, Any]], new: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """``rows`` with ``new`` in place of the one of its case, in the order of the cases."""
+    """``rows`` with ``new`` in place of the row of the same case, in the order of the cases."""
     kept = {row["case"]: row for row in rows} | {new["case"]: new}
     return [kept[case.name] for case in CASES if case.name in kept]
 

@@ -3,12 +3,12 @@
     python -m benchmarks.batches [--quick] [--out FOLDER]     # batches.csv, outputs.csv, cold_start.csv and batches.png
 
 "width": points a second of one kernel compiled for chunks of that many points, on one core. "points" and "cores": a
-process of its own runs the scene from start to file, twice; the second run counts, peak memory is that of the process.
-What was not run is extrapolated from the last two numbers of points, and says so. "planets": gears a second by number of
-planets, 3N + 9 frequencies each. "outputs": time per point with these outputs over that with the first set; kernels take
-turns. "parameters varied": the same points, all parameters but two being columns of the kernel, not constants. "cold
-start": a small scene in a new process, cut into import, compilation, computation and file, with an empty folder of compiled
-code, with the one that this has filled, and with none (``DRIVETRAIN_JAX_CACHE``, docs/sharp_edges.md).
+process of its own runs the scene from start to file twice; the second run counts, and peak memory is that of the process.
+The largest number of points is extrapolated from the last two measured ones, and marked as such. "planets": gears a second
+by number of planets, 3N + 9 frequencies each. "outputs": time per point relative to the first set of outputs; kernels take
+turns. "parameters varied": the same points, with all parameters but two as columns of the kernel instead of constants. "cold
+start": a small scene in a new process, divided into import, compilation, computation and file, with an empty, a filled and
+no folder of compiled code (``DRIVETRAIN_JAX_CACHE``, docs/sharp_edges.md).
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from benchmarks.timing import at_once, interleaved, median, parser, results_fold
 
 _POINTS, _QUICK_POINTS = (100, 1_000, 10_000, 100_000, 1_000_000), (100, 10_000)
 _EXTRAPOLATED = 10_000_000
-# One process: arguments are the scene, the output, the number of cores, and how often it runs to a file. If that is once, a
-# first and a second run in memory come before it. Prints seconds and MB.
+# Code of the process: arguments are the scene, the output, the number of cores, and the number of runs to a file. A single
+# run to a file follows two runs in memory. Prints seconds and MB.
 _CHILD = """
 import json, os, sys, time
 scene, out, cores, runs = json.loads(sys.argv[1]), sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
@@ -68,7 +68,7 @@ print(json.dumps({"import_s": imported - start, "compile_s": compiled - imported
 
 
 def child(scene: Mapping[str, Any], cores: int, cache: str, runs: int = 2) -> dict[str, float]:
-    """Seconds and peak memory of a process that runs ``scene`` to a file with these cores; ``cache``: of compiled code."""
+    """Seconds and peak memory of a process that runs ``scene`` to a file; ``cache`` is the folder of compiled code."""
     own = dict(os.environ) | {"DRIVETRAIN_JAX_CACHE": cache}
     with tempfile.TemporaryDirectory() as folder:
         words = [sys.executable, "-c", _CHILD, json.dumps(scene), f"{folder}/out", str(cores), str(runs)]
@@ -77,7 +77,7 @@ def child(scene: Mapping[str, Any], cores: int, cache: str, runs: int = 2) -> di
 
 
 def kernel_job(scene: Mapping[str, Any], width: int | None = None) -> tuple[Any, int]:
-    """``job()`` runs one full chunk of ``scene``; and its number of points, ``width`` or that of the plan."""
+    """A function that runs one full chunk of ``scene``, and the number of its points, ``width`` or that of the plan."""
     from drivetrain_jax.runs.kernel import kernel_of
     from drivetrain_jax.runs.resolve import resolve
     from drivetrain_jax.runs.scene import load_scene
@@ -144,7 +144,7 @@ def by_points(quick: bool, cache: str) -> list[dict[str, Any]]:
 
 
 def by_outputs(quick: bool, repeats: int) -> list[dict[str, Any]]:
-    """Time per point by what is asked for."""
+    """Time per point for each set of outputs."""
     rows = []
     for (system, first), sets in OUTPUTS.items():
         if quick and system != "bicardan":

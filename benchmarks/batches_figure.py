@@ -43,7 +43,7 @@ def _rates(ax: Any, rows: Rows, by: str, label: str) -> None:
     if by in ("width", "points"):
         ax.set(xscale="log", yscale="log")
     else:
-        # From nothing, so that twice as many look twice as high.
+        # The axis starts at 0, so that twice the rate is twice as high.
         ax.set_ylim(0, 1.08 * max((row["points_per_s"] for row in rows), default=1))
         ax.set_xticks(sorted({row["number"] for row in rows}))
     ax.grid(alpha=0.25)

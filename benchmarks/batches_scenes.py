@@ -54,13 +54,13 @@ def motion(analysis: str, outputs: tuple[str, ...], count: int = 128, **options:
     return _scene("tripod", analysis, list(outputs), {"zeta": (0.01, 0.02, count)}, _TRIPOD, **options)
 
 
-# Planets of the gear that the widths are about.
+# Number of planets of the gear in the measurements by width.
 FOUR = 4
 WIDTHS = {"cardan": cells(_MANY), "planetary": gears(FOUR), "bicardan": shafts()}
 
 
 def _varied() -> Scene:
-    """The points of ``cells``, the four constants as columns."""
+    """The points of ``cells`` with the four constants as columns."""
     chart = cells(_MANY)
     grid = np.meshgrid(*(np.linspace(a["start"], a["stop"], a["num"]) for a in chart["axes"].values()), indexing="ij")
     columns = {name: values.ravel().tolist() for name, values in zip(chart["axes"], grid, strict=True)}
@@ -68,7 +68,7 @@ def _varied() -> Scene:
     return {key: chart[key] for key in ("system", "analysis", "outputs", "options")} | {"points": columns}
 
 
-# By system and the set that the others are compared with.
+# Sets of outputs by system and by the set that the others are compared with.
 OUTPUTS: dict[tuple[str, str], dict[str, Scene]] = {
     ("cardan", "spectral_radius"): {
         "spectral_radius": cells(_MANY, ("spectral_radius",)),

@@ -2,14 +2,14 @@
 
     python -m benchmarks.chaos [--pynamicalsys PYTHON] [--quick]   # writes results/chaos.csv, chaos_precision.csv and .png
 
-Lorenz (10, 28, 8/3) with three tangent vectors, made orthonormal every half time unit, and the double tripod (29) at
-3066.5 Hz with two, made orthonormal at every strobe: ours with equal steps, the others adaptive. What is timed of the
-package is its own march with the divergence and the records of every segment (``record_growth``), 64 members at a time in
-each of two threads; the others run in two spawned processes, SciPy member by member, heyoka.py eight members in a batch,
-the vectors of 256 made orthonormal together. Methods take turns, so that a change in the machine's load hits all alike
-(pynamicalsys comes after them); rates are medians. Errors are those of state and tangent vectors after one time unit of
-Lorenz' system (from points of the attractor) and after 16 strobes of the tripod, relative to their size, root mean
-square, against SciPy at 1e-13. Methods are compared at the error that SciPy's DOP853 has at tolerance 1e-10.
+The motions are Lorenz (10, 28, 8/3) with three tangent vectors, orthonormalised every half time unit, and the double tripod
+(29) at 3066.5 Hz with two, orthonormalised at every strobe. The package takes equal steps, the others are adaptive. The
+package is timed with the divergence and the records of every segment (``record_growth``), 64 members at a time in each of
+two threads. The others run in two spawned processes: SciPy member by member, heyoka.py eight members in a batch, with the
+vectors of 256 members orthonormalised together. Methods take turns, so that a change in the machine's load affects all
+alike (pynamicalsys comes after them); rates are medians. Errors are those of state and tangent vectors after one time unit
+of Lorenz' system (from points of the attractor) and after 16 strobes of the tripod, relative to their size, root mean
+square, against SciPy at 1e-13. Methods are compared at the error of SciPy's DOP853 at tolerance 1e-10.
 ``PYTHON`` is an interpreter that has pynamicalsys (it needs other versions than this package).
 """
 
@@ -46,7 +46,7 @@ from tests.oracles.chaos_reference import (
 matplotlib.use("Agg")
 
 LANES = 64
-# heyoka.py's lanes are eight whatever the number of its members; more of them share the cost of NumPy's calls.
+# Members of a run of heyoka.py, which has eight lanes; more members share the cost of NumPy's calls.
 MEMBERS = 256
 STEPS = {"Lorenz": (32, 40, 48, 56, 64, 72), "tripod": (6, 8, 12, 16, 24)}
 TOLERANCES = (1e-6, 1e-8, 1e-9, 1e-10, 1e-12)
@@ -98,7 +98,7 @@ def _compiled(function: Callable, *arguments: Any) -> Any:
 
     from drivetrain_jax._machine import instruction_set
 
-    # As the package's engine compiles.
+    # The compiler options of the package's engine.
     options = {"xla_cpu_prefer_vector_width": 512} if "avx512f" in instruction_set() else None
     return jax.jit(function).lower(*arguments).compile(options)
 
@@ -199,8 +199,10 @@ def heyoka_rate(case: str, count: int, tolerance: float) -> float:
 
 
 def pynamicalsys_rate(python: str, units: float, rounds: int) -> float:
-    """Time units per second of two processes of the interpreter ``python``, each the median of its rounds. They start once
-    and run after the others: their compilation takes longer than everything that they are to do."""
+    """Time units per second of two processes of the interpreter ``python``, each the median of its rounds.
+
+    The processes start once and run after the other methods, because their compilation takes longer than their work.
+    """
     command = [python, "-c", _PYNAMICALSYS, str(units), str(rounds)]
     processes = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(PROCESSES)]
     return sum(units / median(json.loads(process.communicate()[0])["seconds"]) for process in processes)
@@ -251,8 +253,10 @@ def peers(
 
 
 def tripod_contenders(pool: Executor, quick: bool) -> list[Contender]:
-    """The package, SciPy and heyoka.py over their settings; rates in strobes. Starts of the size of the tangent vectors, so
-    that the error is one of both."""
+    """The package, SciPy and heyoka.py over their settings; rates in strobes.
+
+    Starts have the size of the tangent vectors, so that the error weighs both alike.
+    """
     starts = np.random.default_rng(0).uniform(-0.3, 0.3, (8, 2))
     rates = tripod_field(CONSTANTS | TRIPOD)
     exact = scipy_flow(starts, STROBES * _PERIOD, 1e-13, rates)
@@ -272,7 +276,7 @@ def tripod_contenders(pool: Executor, quick: bool) -> list[Contender]:
 
 
 def compared(contenders: Sequence[Contender]) -> list[dict[str, Any]]:
-    """The best rate of every method at the error of SciPy at the tolerance ``COMPARED``, and how often SciPy's that is."""
+    """The best rate of every method at the error of SciPy at the tolerance ``COMPARED``, also relative to SciPy."""
     rows = []
     for case in dict.fromkeys(c.case for c in contenders):
         own = [c for c in contenders if c.case == case]
@@ -329,7 +333,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given.pynamicalsys:
         peer = pynamicalsys_rate(given.pynamicalsys, units, rounds)
         scipy = next(row for row in summary if row["method"] == "SciPy DOP853")["per_s"]
-        # It gives exponents and no states, so that its error of a state is not known.
+        # pynamicalsys returns exponents and no states, so the error of its states is unknown.
         summary.append({"case": "Lorenz at its own tolerance", "method": "pynamicalsys", "setting": "tolerance 1e-10",
                         "error": math.nan, "per_s": peer, "times_scipy": peer / scipy})  # fmt: skip
     print(table(rows), table(summary), sep="\n\n")

@@ -2,8 +2,8 @@
 
     python -m benchmarks.critical_speeds [--shafts 16384] [--repeats 5] [--ross PYTHON]   # results/critical_speeds.csv
 
-Six critical speeds of random shafts of three segments (those of the paper, every parameter within a factor of 1.5,
-supports from 1e5 to 1e9 N/m). The package runs as its engine does, compiled beforehand, on the chunks of its plan by
+Each method computes six critical speeds of random shafts of three segments (those of the paper, every parameter within a
+factor of 1.5, supports from 1e5 to 1e9 N/m). The engine of the package, compiled beforehand, runs the chunks of its plan in
 two threads. SciPy scans the determinant of the transfer matrices and applies Brent's method
 (tests/oracles/bicardan_reference.py), point by point in two processes. The critical-speed map over 20 support
 stiffnesses is computed by the package and by ``Rotor.run_ucs`` of ROSS (``ross-rotordynamics``, extra ``peers``; it
@@ -100,7 +100,7 @@ def scipy_roots(columns: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def scipy_job(pool: Any, columns: Mapping[str, np.ndarray]) -> Callable[[], np.ndarray]:
-    """The same shafts dealt out to the workers."""
+    """A job of SciPy on all shafts, distributed over the workers of ``pool``."""
     deals = [np.arange(start, columns["k_A"].size, PROCESSES) for start in range(PROCESSES)]
     hands = [take(columns, deal) for deal in deals]
 
@@ -114,7 +114,7 @@ def scipy_job(pool: Any, columns: Mapping[str, np.ndarray]) -> Callable[[], np.n
 
 
 def map_columns() -> dict[str, np.ndarray]:
-    """The paper's shaft on 20 pairs of equal supports; the tube with its true area, as ROSS has it."""
+    """The paper's shaft on 20 pairs of equal supports, with the true area of the tube, as in ROSS."""
     area = math.pi / 4 * np.array([50e-3**2, 50e-3**2 - 45e-3**2, 30e-3**2])
     values = PRESETS["paper"] | {"rhoA": tuple(7800 * area)}
     columns = {f"{name}[{i}]": np.full(20, values[name][i]) for name in _LISTS for i in range(3)}

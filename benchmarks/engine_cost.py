@@ -1,6 +1,6 @@
-"""Cost of the engine beside its kernels: time, memory, bytes, and the other places where chunks may be computed.
+"""Cost of the engine in addition to its kernels: time, memory, bytes, and the cost of other executors.
 
-``python -m benchmarks.scaling`` runs all of it and writes docs/scaling.md.
+``python -m benchmarks.scaling`` runs these measurements and writes docs/scaling.md.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from drivetrain_jax.runs.run import run_to_file
 from drivetrain_jax.runs.scene import load_scene
 from tests.oracles.cardan_reference import BASE_CASE
 
-# A sweep of one output, run by a process of its own; prints its largest resident memory in MB, with the pages of mapped
-# files, and without them, and the seconds that it took.
+# Code of a process that runs a sweep of one output. It prints the largest resident memory in MB with and without the pages
+# of mapped files, and the seconds.
 _ONE_OUTPUT = """
 import sys, time
 from pathlib import Path
@@ -69,7 +69,7 @@ def scene(points: int) -> dict[str, Any]:
 
 
 def cheap_scene(points: int) -> dict[str, Any]:
-    """The cheapest analysis with one output: what it costs is the engine."""
+    """The cheapest analysis with one output, whose cost is that of the engine."""
     side = max(round(points**0.5), 2)
     axes = {name: {"start": 0.0, "stop": 1.0, "num": side} for name in ("beta", "velocity0")}
     fixed = {"element": "input", "zeta": 0.01}
@@ -84,7 +84,7 @@ def seconds(job: Callable[[], Any]) -> float:
 
 
 def cpu_seconds(job: Callable[[], Any]) -> float:
-    """Time that all threads of this process compute for ``job``."""
+    """CPU time of all threads of this process for ``job``."""
     begin = time.process_time()
     job()
     return time.process_time() - begin
@@ -99,8 +99,10 @@ def bare(job: Job) -> None:
 
 @dataclass(frozen=True)
 class Overhead:
-    """Seconds and CPU seconds of the engine (scene to file) and of its kernels, in turns, bytes of the file, and seconds
-    of a process that finds the run finished."""
+    """Seconds and CPU seconds of the engine (scene to file) and of its kernels alone, measured in turns.
+
+    ``resume_s`` are the seconds of a process that finds the run finished.
+    """
 
     points: int
     engine_s: float
@@ -117,12 +119,15 @@ class Overhead:
 
     @property
     def cpu_ratio(self) -> float:
-        """The same of CPU seconds, which the load of the machine changes less."""
+        """The same ratio of CPU seconds, which depends less on the load of the machine."""
         return self.engine_cpu_s / self.kernels_cpu_s - 1
 
 
 def overhead(points: int, repeats: int, folder: Path) -> Overhead:
-    """Kernels are compiled before the clock starts in both; a finished run is resumed in a process of its own."""
+    """Measure the engine and its kernels, both compiled before the clock starts.
+
+    A separate process resumes the finished run.
+    """
     out, content = folder / "overhead.nc", scene(points)
     engine = resolve(load_scene(content))
     warm = scene(min(points, 50_000))
@@ -131,7 +136,7 @@ def overhead(points: int, repeats: int, folder: Path) -> Overhead:
     wall: dict[str, list[float]] = {"engine": [], "kernels": []}
     cpu: dict[str, list[float]] = {"engine": [], "kernels": []}
     jobs = {"kernels": lambda: bare(engine), "engine": lambda: run_to_file(content, out, fresh=True)}
-    # Planned beforehand: planning is work of the engine.
+    # Plan before the clock starts: planning belongs to the engine, not to the kernels.
     _ = engine.plan
     for _ in range(repeats):
         for name, job in jobs.items():
@@ -147,7 +152,7 @@ def overhead(points: int, repeats: int, folder: Path) -> Overhead:
 
 @dataclass(frozen=True)
 class Place:
-    """Seconds of one run into a file, where its chunks are computed, and over those of threads."""
+    """Seconds of a run into a file on one executor, and their excess over those of threads, as a fraction."""
 
     where: str
     points: int
@@ -157,7 +162,7 @@ class Place:
 
 @contextmanager
 def dask_cluster(folder: Path) -> Iterator[str]:
-    """The address of a scheduler with single-threaded workers, each started by a command of its own."""
+    """Yield the address of a scheduler with single-threaded workers, each started by a command of its own."""
     file = folder / "scheduler.json"
     common = ["--no-dashboard", "--scheduler-file", str(file)]
     worker = ["dask_worker", "--nthreads", "1", "--local-directory", str(folder), *common]
@@ -184,8 +189,10 @@ def dask_cluster(folder: Path) -> Iterator[str]:
 
 
 def places(points: int, repeats: int, folder: Path) -> list[Place]:
-    """Threads, processes that the run starts, and a Dask cluster in its first run, whose workers import and compile, and
-    after it; the same cores."""
+    """Measure threads, processes that the run starts, and a Dask cluster, on the same cores.
+
+    The first run on the cluster is separate, because its workers then import and compile.
+    """
     content, out = scene(points), folder / "places.nc"
 
     def job(executor: Executor) -> Callable[[], Any]:
@@ -209,7 +216,7 @@ def places(points: int, repeats: int, folder: Path) -> list[Place]:
 
 @dataclass(frozen=True)
 class Memory:
-    """Largest resident memory (MB) of a sweep of one output, with and without pages of mapped files, and its seconds."""
+    """Largest resident memory (MB) of a sweep of one output, with and without pages of mapped files, and the seconds."""
 
     points: int
     resident_mb: float
@@ -218,7 +225,7 @@ class Memory:
 
 
 def memory(counts: Sequence[int], folder: Path) -> list[Memory]:
-    """Each in a process of its own."""
+    """The memory of sweeps of these numbers of points, each in a process of its own."""
     found = []
     for count in counts:
         content, out = cheap_scene(count), folder / "memory.nc"
@@ -232,13 +239,13 @@ def memory(counts: Sequence[int], folder: Path) -> list[Memory]:
 
 
 def slope(found: Sequence[Memory]) -> float:
-    """Bytes that the largest resident memory grows by for each point, between the two largest sweeps."""
+    """Growth of the largest resident memory in bytes per point, between the two largest sweeps."""
     small, large = found[-2:]
     return (large.resident_mb - small.resident_mb) * 2**20 / (large.points - small.points)
 
 
 def rows_of(found: Overhead) -> list[Mapping[str, Any]]:
-    """For a table."""
+    """The row of a table of overhead."""
     return [
         {
             "points": found.points,
@@ -253,7 +260,7 @@ def rows_of(found: Overhead) -> list[Mapping[str, Any]]:
 
 
 def rows_of_places(found: Sequence[Place]) -> list[Mapping[str, Any]]:
-    """For a table."""
+    """The rows of a table of executors."""
     return [
         {
             "where": p.where,

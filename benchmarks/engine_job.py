@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 Results = dict[str, np.ndarray]
-# One thread compiles a kernel, others that want the same wait for it.
+# Locks by kernel: one thread compiles a kernel, and others that need it wait.
 _COMPILING: defaultdict[str, Lock] = defaultdict(Lock)
 
 
@@ -23,9 +23,9 @@ def columns_scene(
 
 
 def engine_job(scene: Mapping[str, Any], threads: int = 1) -> Callable[[], Results]:
-    """``job()`` computes every point of ``scene`` as ``dt.run`` does, with ``threads``; results by name, points first.
+    """A function that computes every point of ``scene`` as ``dt.run`` does, with ``threads``; results by name, points first.
 
-    The kernels are compiled by this call, unless another scene of the process has had the same.
+    This call compiles the kernels, unless another scene of the process shares them.
     """
     from drivetrain_jax.runs.executor import run_threads
     from drivetrain_jax.runs.kernel import kernel_of
@@ -55,7 +55,7 @@ def engine_job(scene: Mapping[str, Any], threads: int = 1) -> Callable[[], Resul
 
 
 def told(outcome: np.ndarray) -> str:
-    """The outcomes other than success, by name: how the package says that something is wrong."""
+    """The names of the outcomes other than success, by which the package reports failures."""
     from drivetrain_jax.analysis import Outcome
 
     return ", ".join(Outcome(code).name.lower() for code in np.unique(outcome) if code)

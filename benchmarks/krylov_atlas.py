@@ -3,10 +3,10 @@
     python -m benchmarks.krylov_atlas
 
 The determinant Psi(q, k) (docs/theory/bicardan.md), q = sqrt(p), grows like exp(phase), phase = q sum of
-l (rhoA/EI)^(1/4): divided by that it is a smooth function of the phase and of ln k, k the stiffness of both supports. It is
-taken from the compound form, because the plain product of transfer matrices loses exp(phase) in accuracy. The construction
-is the one that the Floquet analysis uses; it knows nothing of shafts. The zeros of the atlas along the phase are the natural
-frequencies for any k.
+l (rhoA/EI)^(1/4). Psi exp(-phase) is a smooth function of the phase and of ln k, where k is the stiffness of both supports.
+The determinant comes from the compound form, because the plain product of transfer matrices loses a factor exp(phase) in
+accuracy. The construction is that of the Floquet analysis, and contains nothing about shafts. The zeros of the atlas along
+the phase are the natural frequencies for any k.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _PRESET = get_system("bicardan").presets["paper_fitted"]
 
 
 def domain(ranges: Mapping[str, tuple[float, float]] = RANGES) -> Domain:
-    """Phase and the logarithm of the stiffness."""
+    """The domain of the atlas: the phase, and the stiffness by its logarithm."""
     same = Coordinate("phase", np.asarray, np.asarray, lambda x: np.ones_like(np.asarray(x, float)))
     logarithm = Coordinate("ln k", np.log, np.exp, lambda k: 1 / np.asarray(k))
     lower, upper = zip(*ranges.values(), strict=True)
@@ -44,7 +44,7 @@ def shaft(k: jax.Array) -> Shaft:
 
 
 def total_length() -> float:
-    """Phase over q."""
+    """The sum of l (rhoA/EI)^(1/4) over the segments, the phase divided by q."""
     length, stiffness, mass = (np.array(_PRESET[name]) for name in ("length", "EI", "rhoA"))
     return float(np.sum(length * (mass / stiffness) ** 0.25))
 
@@ -81,7 +81,7 @@ def natural_frequencies(atlas: Atlas, k: float) -> np.ndarray:
 
 
 def main() -> None:
-    """Build the atlas and print its size, its errors and the frequencies it gives."""
+    """Build the atlas, and print its size, its errors and its natural frequencies."""
     argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     atlas = run(construct(domain(), Quantity(1), TOLERANCE), determinant)
     rng = np.random.default_rng(0)

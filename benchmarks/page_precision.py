@@ -22,7 +22,7 @@ TITLES = {
 
 
 class Precision:
-    """The rungs of one system, by region and method."""
+    """The rungs (settings of methods) of one system, by region and method."""
 
     def __init__(self, system: str, rungs: Sequence[Rung]) -> None:
         self.system = system

@@ -1,11 +1,11 @@
-"""heyoka.py's batch Taylor integrator on the cardan shaft, as strong as we could make it.
+"""heyoka.py's batch Taylor integrator on the cardan shaft, in the fastest forms that we found.
 
     python -m benchmarks.peers            # formulations, batch sizes and tolerances: results/heyoka.csv, damping.csv
 
-Three forms are offered to it. All integrate the four columns of the fundamental matrix as 16 state variables
+It integrates three forms. All integrate the four columns of the fundamental matrix as 16 state variables
 (theta1, theta1', theta2, omega2) per column, where omega2 = theta2' + (eta theta1)' is the absolute speed of the
-second disk: with it the equations, damping included, need three products of power series a column, fewer than any
-other form we found, and they carry no eta''.
+second disk. In these variables the equations, damping included, need three products of power series a column and no eta'';
+no other form that we found needs so few.
 
     full  the period [0, pi] in tau
     half  [0, pi/2] in tau and Z ~ N0 Phi^T N1 Phi, N = T^T X T with the reversor X of docs/theory/cardan.md
@@ -88,7 +88,7 @@ def radius_in_worker(columns: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def monodromy_in_worker(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The same up to the matrices, which are dropped; NaNs of shape ``(N,)``. Shows what the eigenvalues cost."""
+    """NaNs of shape ``(N,)`` after the same matrices, without eigenvalues, to measure the cost of the eigenvalues."""
     return np.full(len(_worker.monodromy(columns)), np.nan)
 
 
@@ -149,7 +149,7 @@ def _similar_effort(p: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def against_damping(quick: bool) -> list[dict[str, Any]]:
-    """Microseconds a point of heyoka and of ``direct`` at a few dampings, one core, and how far their radii differ."""
+    """Microseconds a point of heyoka and of ``direct`` at a few dampings on one core, and the difference of their radii."""
     rows, size = [], 256
     heyoka = HeyokaBatch("half", 1e-9, 8)
     for zeta in (0.1, 10.0) if quick else (0.1, 10.0, 100.0, 1000.0):
@@ -174,8 +174,10 @@ def against_damping(quick: bool) -> list[dict[str, Any]]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Rate and error of every form, batch size and tolerance on random cells of the chart, and against damping; one
-    core."""
+    """Measure rate and error of every form, batch size and tolerance on random cells of the chart, and against damping.
+
+    All methods run on one core.
+    """
     options = parser(__doc__).parse_args(arguments)
     rng = np.random.default_rng(0)
     columns = take(chart(30_000), rng.choice(30_000 - 1, 1024 if options.quick else 8192, replace=False))

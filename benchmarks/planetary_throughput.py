@@ -2,10 +2,10 @@
 
     python -m benchmarks.planetary_throughput [--gears 20000] [--repeats 5] [--quick]
 
-Writes results/planetary_throughput.csv. Every gear has its own mesh and bearing stiffness and its own place of the
-second planet; the result is all 9 + 3N frequencies. The package runs as its engine does, compiled beforehand; LAPACK
-gets the finished matrices (their assembly is not in its time) cut into as many parts as there are threads. Both use
-both cores. Errors are relative, the largest over all modes that move, against 50 digits on a few gears.
+Writes results/planetary_throughput.csv. Every gear has its own mesh and bearing stiffness and its own position of the
+second planet; the result is all 9 + 3N frequencies. The engine of the package is compiled beforehand. LAPACK gets the
+finished matrices, whose assembly is not timed, divided into as many parts as there are threads. Both use both cores. Errors
+are relative, the largest over all modes of nonzero frequency, against 50 digits on a few gears.
 """
 
 from __future__ import annotations
@@ -50,8 +50,10 @@ def package_job(planets: int, columns: Mapping[str, np.ndarray], method: str) ->
 
 
 def lapack_job(matrices: np.ndarray, solve: Callable[[np.ndarray], np.ndarray]) -> Job:
-    """``solve`` on parts of ``matrices`` in as many threads as there are cores; LAPACK runs outside the interpreter
-    lock."""
+    """A job that applies ``solve`` to parts of ``matrices`` in one thread per core.
+
+    LAPACK releases the interpreter lock.
+    """
     parts = np.array_split(matrices, 4 * PROCESSES)
 
     def job() -> np.ndarray:
@@ -77,7 +79,7 @@ def one_gear(p: Mapping[str, Any], index: int) -> dict[str, Any]:
 
 
 def contenders(planets: int, count: int) -> tuple[dict[str, Job], dict[str, int], dict[str, Any]]:
-    """Jobs, gears in each, and the parameters of the gears."""
+    """Jobs by name, the number of gears of each, and the parameters of the gears."""
     columns = gears(planets, count)
     p = parameters(planets, columns)
     factors = extension_matrix(p)

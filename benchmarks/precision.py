@@ -1,16 +1,16 @@
-"""Error against run time of every method of a system, region by region, and what each does at the extremes.
+"""Error against run time of every method of a system, region by region, and its behaviour at the extremes.
 
 A study (``benchmarks/precision_<system>.py``) lists contenders: one method at one setting on the points of one region.
-``measure`` prepares all of them first (compile time is kept apart; two are compiled at a time), judges their first answers
-against the study's reference, and then times them in turns: up to ``REPEATS`` times, as often as ``SPENT`` seconds allow,
-so that a slow contender costs its first answer and no more. The CSV says with ``timed`` of how many runs each median is.
+``measure`` first prepares all of them (two compile at a time; compile time is separate) and compares their first results
+with the study's reference. It then times them in turns, up to ``REPEATS`` times and as often as ``SPENT`` seconds allow, so
+that a slow contender runs only once. The column ``timed`` of the CSV is the number of runs of each median.
 
     python -m benchmarks.precision_cardan [--quick] [--out FOLDER]     # writes precision_cardan.csv and .png
 
-``error`` is the largest relative error of the points that were answered, NaN if none was; ``failed`` counts points
-without a usable answer; ``noticed`` says how a user learns of the failure: the name of an outcome, a warning, an
-exception. ``judge`` reads a method's rungs in a region and says whether it holds, degrades, fails or is SILENT: wrong
-by more than ``PATIENCE`` times the tolerance that it was given, and nothing says so.
+``error`` is the largest relative error of the points with a result, NaN without any; ``failed`` counts points without a
+usable result; ``noticed`` is the way in which a user learns of the failure: the name of an outcome, a warning, an
+exception. ``judge`` classifies a method by its rungs in a region: it holds, degrades, fails, or is SILENT, which means
+wrong by more than ``PATIENCE`` times its tolerance without any notice.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from typing import Any, NamedTuple
 from benchmarks.timing import RESULTS, at_once, interleaved, median, write_csv
 
 REPEATS, SPENT = 9, 0.3
-# Global errors of a tolerance per step are commonly ten to some hundred tolerances.
+# Largest error in tolerances that is no failure: the global error is commonly ten to some hundred tolerances of a step.
 PATIENCE = 1e3
-# What a method without a tolerance (a number of steps) must reach at its finest setting, or say that it did not.
+# Largest error of a method without a tolerance (with a number of steps) at its finest setting that needs no notice.
 USELESS = 0.1
 GOAL = 1e-9
 
@@ -55,7 +55,7 @@ class Rung:
 
 
 class Judged(NamedTuple):
-    """Largest relative error of the answered points, number of failed ones, and how a user learns of it."""
+    """Largest relative error of the points with a result, number of failed points, and the notice to the user."""
 
     error: float
     failed: int = 0
@@ -64,7 +64,7 @@ class Judged(NamedTuple):
 
 @dataclass(frozen=True)
 class Contender:
-    """A method at a setting: ``prepare`` compiles and returns the job, ``error_of`` judges the job's result."""
+    """A method at a setting: ``prepare`` compiles and returns the job, ``error_of`` compares its result."""
 
     system: str
     region: str
@@ -85,7 +85,7 @@ class _Trial:
 
 
 def measure(contenders: Sequence[Contender], repeats: int = REPEATS, spent: float = SPENT) -> list[Rung]:
-    """One rung a contender: all compiled and judged first, then timed in turns, medians."""
+    """One rung per contender: all are compiled and compared first, then timed in turns; times are medians."""
     prepared = at_once([partial(_prepare, contender) for contender in contenders])
     trials = []
     for number, (contender, ready) in enumerate(zip(contenders, prepared, strict=True), 1):
@@ -110,7 +110,7 @@ def _prepare(contender: Contender) -> tuple[Callable[[], Any] | Exception, float
 
 
 def _try(contender: Contender, job: Callable[[], Any] | Exception, compile_s: float) -> _Trial:
-    # An exception or a warning is how the user of that method learns that something is wrong: it is data.
+    # Exceptions and warnings are data: they tell the user of the method that something is wrong.
     start = time.perf_counter()
     try:
         if isinstance(job, Exception):
@@ -150,20 +150,20 @@ def _rung(trial: _Trial, seconds: Sequence[float]) -> Rung:
 
 
 def tolerance(setting: str) -> float | None:
-    """The tolerance that a setting such as ``rtol=1e-9`` promises; None for a number of steps."""
+    """The tolerance of a setting such as ``rtol=1e-9``; None for a number of steps."""
     found = re.search(r"tol(?:erance)?=([0-9.e+-]+)", setting)
     return float(found[1]) if found else None
 
 
 class Judgement(NamedTuple):
-    """``word`` is holds, degrades, fails or SILENT; ``how`` the figures and the notice."""
+    """``word`` is holds, degrades, fails or SILENT; ``how`` gives the errors and the notice."""
 
     word: str
     how: str
 
 
 def judge(rungs: Sequence[Rung]) -> Judgement:
-    """What a method does in a region, from all its rungs there."""
+    """The judgement of a method in a region, from all its rungs there."""
     silent = [rung for rung in rungs if is_silent(rung, rungs)]
     if silent:
         worst = max(silent, key=lambda rung: math.inf if math.isnan(rung.error) else rung.error)
@@ -182,11 +182,11 @@ def judge(rungs: Sequence[Rung]) -> Judgement:
 
 
 def is_silent(rung: Rung, ladder: Sequence[Rung]) -> bool:
-    """Whether nothing tells the user of ``rung`` that its answer is not what was asked for."""
+    """True if ``rung`` is wrong by more than it may be, and the user gets no notice."""
     if rung.noticed:
         return False
     promised = tolerance(rung.setting)
-    # A coarse step promises nothing; the finest one is the method's word.
+    # Of a method without a tolerance only the finest setting must be right.
     unpromised = USELESS if rung is ladder[-1] else math.inf
     allowed = unpromised if promised is None else min(PATIENCE * promised, USELESS)
     return rung.failed > 0 or not rung.error <= allowed
@@ -198,7 +198,7 @@ def _percent(rung: Rung) -> str:
 
 
 def write(name: str, rungs: Sequence[Rung], notes: Sequence[str] = (), folder: Path = RESULTS) -> None:
-    """``<folder>/<name>.csv`` with machine, versions, load and date in its head."""
+    """Write ``<folder>/<name>.csv`` with machine, versions, load and date in its head."""
     write_csv(folder / f"{name}.csv", [asdict(rung) for rung in rungs], notes)
 
 

@@ -2,15 +2,16 @@
 
     python -m benchmarks.precision_bicardan [--quick] [--out FOLDER]     # precision_bicardan.csv and .png
 
-Six frequencies of a shaft of three segments (the 55th to the 60th of "high mode", all 60 being solved for). Every
-region is one shaft and its neighbours, each parameter within 1 %; all points are timed, the error is that of the first
-one, against the paper's determinant in as many digits as it loses (tests/oracles/bicardan_precise_reference.py), whose
-number and place of roots come from finite elements of high degree. A mode of frequency 0 counts by its size over the
-first elastic frequency. The package takes its points in batches, as its engine does, one chunk at a time; "dynamic
-stiffness" bisects those of a batch together with NumPy; the others go shaft by shaft.
+Each method computes six frequencies of a shaft of three segments (in "high mode" all 60, of which the last six count).
+Every region is one shaft and its neighbours, each parameter within 1 %. All points are timed; the error is that of the first
+shaft. The reference is the paper's determinant in enough digits for its cancellation
+(tests/oracles/bicardan_precise_reference.py); finite elements of high degree give the number and place of its roots. The
+error of a mode of frequency 0 is its frequency over the first elastic one. The package solves its points in batches, as its
+engine does, one chunk at a time; "dynamic stiffness" bisects the points of a batch together with NumPy; the other methods
+solve one shaft after another.
 
-Regions: uniform shaft (easy); the paper's (typical); its modes 55 to 60; supports of 1e17 and 10 N/m; of 1e-6 N/m; none;
-two slender ends on a heavy stiff middle, whose frequencies come in pairs 2e-5 apart.
+Regions: uniform shaft (easy); the paper's shaft (typical); modes 55 to 60 of the paper's shaft; supports of 1e17 and 10 N/m;
+supports of 1e-6 N/m; no supports; two slender ends on a heavy stiff middle, whose frequencies come in pairs 2e-5 apart.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def modes_of(region: str) -> tuple[int, ...]:
 
 @cache
 def reference(region: str) -> tuple[np.ndarray, float]:
-    """The frequencies, 0 for modes that cost no energy, and how far the finite elements are from the determinant."""
+    """The frequencies, 0 for rigid modes, and the difference of finite elements and determinant."""
     shaft, modes = REGIONS[region], modes_of(region)
     zeros = 2 if shaft["k_A"] == shaft["k_D"] == 0 else 0
     elastic = tuple(mode for mode in modes if mode > zeros)
@@ -75,7 +76,7 @@ def gathered(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def error_of(region: str, found: np.ndarray) -> Judged:
-    """Of the modes ``found`` of the first shaft."""
+    """The error of the modes ``found`` of the first shaft."""
     exact, _ = reference(region)
     mine = found[np.array(modes_of(region)) - 1]
     scale = np.where(exact > 0, exact, exact[exact > 0][0])
@@ -88,7 +89,7 @@ def error_of(region: str, found: np.ndarray) -> Judged:
 def package(region: str, method: str, lanes: int) -> Contender:
     """A method of the package."""
     columns, modes = neighbours(region, lanes), max(modes_of(region))
-    # All entries vary, so that these decide nothing but the number of segments, and one kernel serves all regions.
+    # Placeholders for the number of segments: all entries vary, so that one kernel serves all regions.
     fixed = {name: [1.0] * 3 for name in _LISTS}
     scene = columns_scene(
         "bicardan", "critical_speeds", ["angular_frequency"], columns, fixed=fixed,
@@ -103,7 +104,7 @@ def package(region: str, method: str, lanes: int) -> Contender:
 
 
 def one_by_one(region: str, method: str, setting: str, solve: Callable[[Mapping[str, Any]], np.ndarray]) -> Contender:
-    """A rival that takes shaft after shaft."""
+    """A rival that solves one shaft after another."""
     columns = neighbours(region, _FEW)
     shafts = [gathered({name: column[i] for name, column in columns.items()}) for i in range(_FEW)]
 
@@ -139,7 +140,7 @@ def contenders_of(region: str, quick: bool) -> list[Contender]:
 
 
 def contenders(quick: bool) -> tuple[Sequence[Contender], Sequence[str]]:
-    """All methods in all regions, and how far the two references are apart."""
+    """All methods in all regions, and the difference of the two references."""
     regions = _QUICK if quick else tuple(REGIONS)
     notes = ["; ".join(f"{region}: finite elements differ from the determinant by {reference(region)[1]:.0e}"
                        for region in regions)]  # fmt: skip

@@ -2,10 +2,10 @@
 
     python -m benchmarks.precision_cardan [--quick] [--out FOLDER]     # precision_cardan.csv and .png
 
-A region is a point (beta, Omega) and a grid of 16 x 32 neighbours within 0.5 %; the error is the largest of its centre
+A region is a point (beta, Omega) and a grid of 16 x 32 neighbours within 0.5 %. The error is the larger one of the centre
 and a corner against 200-bit Taylor series (tests/oracles/cardan_precise_reference.py), which SciPy's DOP853 at 1e-13
-confirms (head of the CSV). Every method runs on one core. The package and heyoka take the whole grid, diffrax and the
-stacked SciPy 64 of its points (Kvaerno5 8), SciPy point by point the two that are compared.
+confirms (head of the CSV). Every method runs on one core. The package and heyoka solve the whole grid, diffrax and the
+stacked SciPy 64 of its points (Kvaerno5 8), and SciPy point by point the two compared points.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ REGIONS: dict[str, dict[str, float]] = {
     "nearly singular, beta 1.55": BASE_CASE | {"beta": 1.55, "Omega": 1.0},
     "ill-conditioned, gamma 1e16": BASE_CASE | {"beta": 1.0, "Omega": 0.5, "gamma": 1e16},
 }
-# beta x Omega: as many as a chunk of the package has lanes.
+# Points of the grid in beta x Omega, as many as a chunk of the package has lanes, and its relative width.
 SHAPE, WIDTH = (16, 32), 0.005
 SIZE = SHAPE[0] * SHAPE[1]
 CENTRE = SHAPE[0] // 2 * SHAPE[1] + SHAPE[1] // 2
@@ -72,7 +72,7 @@ def reference(region: str) -> np.ndarray:
 
 
 def error_of(region: str, radii: np.ndarray, notice: str = "") -> Judged:
-    """Of the first points of ``radii``; every point without a number counts as failed."""
+    """The error of the first points of ``radii``; points without a number count as failed."""
     failed = int(np.sum(~np.isfinite(radii)))
     told_by = notice or ("nan" if failed else "")
     errors = np.abs(radii[:CHECKED] / reference(region) - 1)
@@ -80,7 +80,7 @@ def error_of(region: str, radii: np.ndarray, notice: str = "") -> Judged:
 
 
 def package_error(region: str, rtol: float, results: Mapping[str, np.ndarray]) -> Judged:
-    """The package notices by outcome, and by the bound beside a value that is less exact than asked for."""
+    """The error of a result of the package; notices are outcomes, and bounds that cover an error above ``rtol``."""
     radii, bounds = results["spectral_radius"], results["spectral_radius_error"]
     judged = error_of(region, radii, told(results["outcome"]))
     errors = np.abs(radii - np.pad(reference(region), (0, len(radii) - CHECKED), constant_values=np.nan))[:CHECKED]
@@ -91,7 +91,7 @@ def package_error(region: str, rtol: float, results: Mapping[str, np.ndarray]) -
 
 
 def package(region: str, method: str, rtol: float, count: int = SIZE, **options: Any) -> Contender:
-    """A method that takes points as they come."""
+    """A method of the package for single points."""
     scene = columns_scene(
         "cardan", "floquet", OUTPUTS, columns_of(region, count), options={"method": method, "rtol": rtol, **options}
     )
@@ -147,8 +147,8 @@ def _constant(solver: str, count: int) -> Callable[[Columns, float], Any]:
     from drivetrain_jax.analysis.floquet.propagator import EqualStepSize
     from drivetrain_jax.systems.cardan import Cardan
 
-    # Without a controller to take tolerances from, the root finder of an implicit scheme needs its own. diffrax's usual
-    # one, a chord method, gives up at these: its slope is that of another time.
+    # Without a step size controller the root finder of an implicit scheme needs tolerances of its own. The default chord
+    # method of diffrax fails at these, because its slope is that of another time.
     settings = {"root_finder": optimistix.Newton(rtol=1e-10, atol=1e-12)} if solver == IMPLICIT else {}
 
     def one(values: Mapping[str, Any], step: Any) -> Any:
@@ -199,7 +199,7 @@ def heyoka_batch(region: str, tolerance: float) -> Contender:
 
 
 def tolerances(region: str, method: str, quick: bool) -> tuple[float, ...]:
-    """The ladder of an integrator; implicit ones of order 5 would take minutes a point for more."""
+    """The tolerances of an integrator; tighter ones would take minutes a point with implicit methods of order 5."""
     if quick:
         return (1e-9,)
     if method == IMPLICIT:
@@ -227,7 +227,7 @@ def contenders_of(region: str, quick: bool) -> list[Contender]:
 
 
 def contenders(quick: bool) -> tuple[Sequence[Contender], Sequence[str]]:
-    """All methods in all regions, and how far the two references are apart."""
+    """All methods in all regions, and the difference of the two references."""
     regions = _QUICK if quick else tuple(REGIONS)
     notes = [
         "; ".join(f"{region}: DOP853 at 1e-13 differs from the reference by {_apart(region):.0e}" for region in regions)

@@ -1,4 +1,4 @@
-"""Work-precision figures: one panel a region, error across, seconds per point up, one line a method."""
+"""Work-precision figures: one panel per region and one line per method, seconds per point against error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from benchmarks.timing import RESULTS, provenance
 
 matplotlib.use("Agg")
 
-# Okabe and Ito's colours from dark to light, each with a marker and a dash of its own: legible without the colours.
+# Okabe and Ito's colours from dark to light, each with its own marker and dash, so that lines differ without colours.
 COLOURS = ("#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 MARKERS = ("o", "s", "^", "D", "v", "P", "<", ">", "h", "*", "p", "d", "8")
 DASHES = ("-", "--", "-.", ":")
@@ -24,7 +24,7 @@ COLUMNS = 4
 
 
 def draw(name: str, rungs: Sequence[Rung], folder: Path = RESULTS) -> None:
-    """``<folder>/<name>.png``: points that failed or have no answer are hollow, at the right edge if without error."""
+    """Write ``<folder>/<name>.png``; settings with failed points are hollow, and at the right edge without an error."""
     import matplotlib.pyplot as plt
 
     regions = list(dict.fromkeys(rung.region for rung in rungs))

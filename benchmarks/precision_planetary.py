@@ -2,19 +2,19 @@
 
     python -m benchmarks.precision_planetary [--quick] [--out FOLDER]     # precision_planetary.csv and .png
 
-All frequencies of a gear. Every region is one gear and its neighbours, masses and stiffnesses within 1 %; all points are
-timed, the error is that of the first one, the largest over its modes, against eigenvalues in 50 digits (mpmath) of matrices
-that were assembled another way (tests/oracles/planetary_reference.py). A mode of frequency 0 counts by its size over the
-lowest other one. No method has a setting, so that each is one point.
+Each method computes all frequencies of a gear. Every region is one gear and its neighbours, masses and stiffnesses within
+1 %. All points are timed; the error is that of the first gear, the largest over its modes. The reference is eigenvalues in
+50 digits (mpmath) of matrices that were assembled in another way (tests/oracles/planetary_reference.py). The error of a mode
+of frequency 0 is its frequency over the lowest other one. No method has a setting, so each is one point.
 
-"reduced" is the package's default, which splits the equations of identical planets; "whole" its singular values of the
-whole; "vectors" its Jacobi rotations, which shapes and types come from. "svd" is NumPy's of the very matrix that the
-package decomposes, "eigh" NumPy's of its square; "stiffness and mass" SciPy's generalised eigenvalues gear by gear, and
-"refined" the same with ``|G v|`` of the eigenvectors v in place of the root of the eigenvalue, which puts back what
-forming the square took. Matrices of NumPy's methods are finished before the clock starts.
+"reduced" is the package's default, which splits the equations of identical planets. "whole" is its singular values of the
+whole matrix, and "vectors" its Jacobi rotations, which also give shapes and types. "svd" is NumPy's decomposition of the
+same matrix, "eigh" NumPy's eigenvalues of its square. "stiffness and mass" is SciPy's generalised eigenvalues gear by gear;
+"refined" uses ``|G v|`` of its eigenvectors v instead of the root of the eigenvalue, which recovers the digits that the
+square loses. Matrices of NumPy's methods are finished before the clock starts.
 
-The package says with every frequency how far it may be off (``natural_frequency_error``); where that is more than 1e-9 of
-a frequency this counts as a notice, unless the true error is larger, which is then stated as silent.
+The package gives a bound of the error of every frequency (``natural_frequency_error``). A bound of more than 1e-9 of the
+frequency counts as a notice, unless the true error is larger than the bound, which counts as silent.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from tests.oracles.planetary_reference import (
 )
 
 _LANES, _FEW = 1024, 8
-# Everything but the angles varies, so that gears of one number of planets share a kernel.
+# All parameters except the angles vary, so that gears with equal numbers of planets share a kernel.
 _VARIED = tuple(TABLE_2)
 _FOUR = ("equal planets", "zero stiffness", "ill-conditioned 1e16")
 
@@ -79,7 +79,7 @@ def reference(region: str) -> np.ndarray:
 
 
 def neighbours(region: str, count: int) -> dict[str, np.ndarray]:
-    """Columns of the masses and stiffnesses: those of the region first, then within 1 %."""
+    """Columns of the masses and stiffnesses: the gear of the region first, then gears within 1 % of it."""
     rng = np.random.default_rng(2)
     return {name: REGIONS[region][name] * np.r_[1.0, rng.uniform(0.99, 1.01, count - 1)] for name in _VARIED}
 
@@ -121,7 +121,7 @@ def refined_frequencies(gear: Mapping[str, Any]) -> np.ndarray:
     """Frequencies in Hz from the eigenvectors of SciPy by Rayleigh's quotient in its factored form, rising."""
     mass, stiffness = matrices(gear)
     _, vectors = eigh(np.array(stiffness, float), np.diag(mass))
-    # Of unit modal mass, so that the quotient is |G M^(1/2) v|^2, a sum of squares without cancellation.
+    # The modal mass is 1, so the quotient is |G M^(1/2) v|^2, a sum of squares without cancellation.
     strain = extension_matrix(gear) @ (np.sqrt(mass)[:, None] * vectors)
     return np.sort(np.linalg.norm(strain, axis=0)) / (2 * math.pi)
 
@@ -146,7 +146,7 @@ def rivals(region: str, lanes: int) -> list[Contender]:
 
 
 def contenders(quick: bool) -> tuple[Sequence[Contender], Sequence[str]]:
-    """All methods in all regions, and how far NumPy's singular values are from the reference."""
+    """All methods in all regions, and the difference of NumPy's singular values from the reference."""
     lanes = 256 if quick else _LANES
     regions = _FOUR if quick else tuple(REGIONS)
     found, distances = [], []
@@ -155,7 +155,7 @@ def contenders(quick: bool) -> tuple[Sequence[Contender], Sequence[str]]:
             package(region, "reduced", "auto", _SPECTRUM, lanes),
             package(region, "whole", "full", _SPECTRUM, lanes),
         ]
-        # Shapes take long to compile: one number of planets stands for all.
+        # Mode shapes take long to compile, so they are measured for one number of planets.
         if not quick and region in _FOUR:
             found.append(package(region, "vectors", "full", [*_SPECTRUM, "mode_type"], lanes))
         found += rivals(region, lanes)

@@ -2,12 +2,12 @@
 
     python -m benchmarks.precision_rattle [--quick] [--out FOLDER]     # precision_rattle.csv and .png
 
-Every region is one gear pair with an initial state; integrators follow it over ten drive periods. The error is that of
-(u, v) at the end over the size of the motion (amplitude, and amplitude times omega), against the solution in extended
-precision, event by event (tests/oracles/rattle_reference.py). The closed form takes 256 lanes at once, diffrax 8, SciPy one
-after another; lanes are equal. Harmonic balance gives an orbit and no transient: its error is the distance of its state at
-the start of a period from the orbit next to it (Newton iterations on the map of one period, checked in extended precision);
-it says by its ``residual`` what it leaves unbalanced, which counts as a notice from 1e-6 of the drive on.
+Every region is one gear pair with an initial state, integrated over ten drive periods. The error is that of (u, v) at the
+end relative to the size of the motion (amplitude, and amplitude times omega), against the solution in extended precision,
+event by event (tests/oracles/rattle_reference.py). The closed form solves 256 equal lanes at once, diffrax 8, and SciPy one
+after another. Harmonic balance gives an orbit and no transient. Its error is the distance of its state at the start of a
+period from the nearest orbit (Newton iterations on the map of one period, checked in extended precision). Its ``residual``
+counts as a notice from 1e-6 of the drive on.
 
 Regions: always in contact (easy); contact on both flanks (typical); a separation by 5e-8 of the backlash (near-grazing);
 contact stiffness 1e6; damping 1e-4; chaos, where ten periods stretch errors several thousand times.
@@ -83,20 +83,20 @@ def reference(region: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def error_of(region: str, states: np.ndarray) -> Judged:
-    """Of the first of ``states`` (2, lanes)."""
+    """The error of the first lane of ``states`` (2, lanes)."""
     exact, size = reference(region)
     error = float(np.max(np.abs(states[:, 0] - exact) / size))
     return Judged(error) if math.isfinite(error) else Judged(math.nan, 1, "nan")
 
 
 def arrays(values: dict[str, float], lanes: int) -> dict[str, np.ndarray]:
-    """Equal lanes."""
+    """The values as arrays of equal lanes."""
     return {name: np.full(lanes, values[name]) for name in _NAMES}
 
 
 @once
 def marching(lanes: int) -> Callable[..., Any]:
-    """The closed form, compiled for this many lanes: states, transition matrix (2, 2) and whether they arrived."""
+    """The closed form, compiled for this many lanes: states, transition matrices (2, 2), and flags of finished lanes."""
 
     def run(values: dict[str, jax.Array], u: jax.Array, v: jax.Array, periods: jax.Array) -> tuple:
         made = prepare(Rattle.models["basins"].build(values))
@@ -123,7 +123,7 @@ def integrating(events: bool) -> Callable[..., Any]:
 
 @once
 def balancing(harmonics: int) -> Callable[..., Any]:
-    """Harmonic balance from rest at one frequency, compiled: state at tau = 0, the residual, whether it balances."""
+    """Harmonic balance from rest at one frequency, compiled: state at tau = 0, residual, and a flag of success."""
     basis = Basis(harmonics)
 
     def run(values: dict[str, jax.Array]) -> tuple:
@@ -138,8 +138,7 @@ def balancing(harmonics: int) -> Callable[..., Any]:
 
 
 def nearest_orbit(values: dict[str, float], state: np.ndarray) -> np.ndarray | None:
-    """The orbit of period one next to ``state``, by Newton iterations; None if there is none that extended precision
-    confirms."""
+    """The orbit of period one nearest to ``state``, by Newton iterations; None unless extended precision confirms it."""
     step, here = marching(1), np.array(state, float)
     for _ in range(12):
         there, matrix, _ = step(arrays(values, 1), here[:1], here[1:], np.ones(1, np.int32))

@@ -12,7 +12,7 @@ Contenders = Callable[[bool], tuple[Sequence[Contender], Sequence[str]]]
 
 
 def study(name: str, doc: str, contenders: Contenders, argv: Sequence[str] | None) -> None:
-    """The ``main`` of a study: ``contenders(quick)`` gives what competes and the notes for the head of the CSV."""
+    """Run a study: ``contenders(quick)`` returns the contenders, and the notes for the head of the CSV."""
     options = parser(doc).parse_args(argv)
     folder = results_folder(options)
     given, notes = contenders(options.quick)

@@ -2,17 +2,17 @@
 
     python -m benchmarks.precision_tripod [--quick] [--out FOLDER]     # precision_tripod.csv and .png
 
-(29) of the input element from rest over 1,000 strobes (stiff and slow excitation 128, the chaotic control 40). Times are
-per strobe of one motion; the error is that of (phi, phi'/Omega) at the last strobe over the size of the motion, against
-a Taylor integration by heyoka.py at 1e-19 in extended precision (SciPy's DOP853 at 3e-14 where heyoka.py is not
-installed); how far these two are apart over the first strobes stands in the head of the CSV.
+The equation is (29) of the input element, from rest over 1,000 strobes (stiff and slow excitation 128, the chaotic control
+40). Times are per strobe of one motion. The error is that of (phi, phi'/Omega) at the last strobe relative to the size of
+the motion, against a Taylor integration by heyoka.py at 1e-19 in extended precision (SciPy's DOP853 at 3e-14 if heyoka.py
+is not installed). The head of the CSV gives the difference of these two references over the first strobes.
 
-"fixed steps" is the package's ``poincare``, 64 motions at a time; "adaptive 5(4)" the pair that it offers to show what
-loose tolerances do; "history" its diffrax path, whose rtol is one for the motion and whose steps keep a hundredth of it.
+"fixed steps" is the package's ``poincare``, 64 motions at a time. "adaptive 5(4)" is its pair for demonstrations of loose
+tolerances. "history" is its diffrax path, whose rtol applies to the motion; its steps have a hundredth of this tolerance.
 SciPy integrates one motion, heyoka.py a batch of 8 equal ones, in the dimensionless time Omega t.
 
-Regions: damping 0.05 (easy); the paper's (typical); 1 % below the tip of the principal tongue (chi_n 0.01736); overdamped,
-zeta = 30; damping 1e-12; excitation at 200 Hz, 15 natural periods a strobe; the chaotic control of
+Regions: damping 0.05 (easy); the paper's damping (typical); 1 % below the tip of the principal tongue (chi_n 0.01736);
+overdamped, zeta = 30; damping 1e-12; excitation at 200 Hz, 15 natural periods a strobe; the chaotic control of
 docs/validation/tripod.md.
 """
 
@@ -35,7 +35,7 @@ from benchmarks.timing import once
 from tests.oracles.tripod_reference import NINE_DEGREES, Shaft, shaft
 
 _OMEGA = shaft("input").omega
-# Everything that differs between regions, so that they share kernels.
+# All parameters that differ between regions, so that the regions share kernels.
 _PAPER = {
     "zeta": 0.0016, "chi_n": 0.0026, "excitation_frequency": 3066.5, "M_AEM": 2550.0, "chi_AEM": 0.05, "motor_order": 6.0,
 }  # fmt: skip
@@ -62,16 +62,16 @@ class Region:
 
     @property
     def period(self) -> float:
-        """Of a strobe, in the time Omega t."""
+        """The period of a strobe in the time Omega t."""
         return _OMEGA / self.parameters["excitation_frequency"]
 
     @property
     def beginning(self) -> Region:
-        """The same over fewer strobes, where a second reference costs seconds and not a minute."""
+        """The same region over fewer strobes, for a second reference in seconds instead of a minute."""
         return replace(self, strobes=max(self.strobes // 8, 40))
 
 
-# In the order of ``_PAPER``, so that its kernels are the same.
+# In the order of ``_PAPER``, so that the kernels are the same.
 _CONTROL = _PAPER | {
     "zeta": 0.03, "chi_n": 0.3, "M_AEM": 8.4e4 * 2550.0, "chi_AEM": 0.5, "excitation_frequency": _OMEGA / math.pi,
     "motor_order": 0.618 * _OMEGA / (100 * math.pi),
@@ -86,7 +86,7 @@ REGIONS = {
     "chaotic control": Region(_CONTROL, 40),
 }
 _LANES, _LEAST = 64, 128
-# heyoka.py's: as many numbers as a vector of AVX-512 has; 4 and 16 are slower.
+# Batch size of heyoka.py: as many numbers as an AVX-512 vector holds; 4 and 16 are slower.
 _BATCH = 8
 
 
@@ -119,7 +119,7 @@ def by_scipy(region: Region, method: str, rtol: float) -> np.ndarray:
 
 
 def _equations() -> list[tuple[Any, Any]]:
-    """(29) for heyoka.py, its constants being parameters."""
+    """(29) for heyoka.py, with its constants as parameters."""
     import heyoka as hy
 
     phi, rate = hy.make_vars("phi", "rate")
@@ -150,7 +150,7 @@ def _taylor(tolerance: float) -> Any:
 
 @once
 def _extended() -> Any:
-    """The same with the numbers of 80 bits that processors of the kind x86 have; elsewhere these may be doubles."""
+    """The same integrator in the 80-bit numbers of x86 processors; on other processors these may be doubles."""
     import heyoka as hy
 
     zeros, tolerance = np.zeros(11, np.longdouble), np.longdouble(1e-19)
@@ -168,7 +168,7 @@ def by_heyoka(region: Region, tolerance: float) -> np.ndarray:
 
 
 def in_extended_precision(region: Region) -> np.ndarray:
-    """State at the last strobe, rounded once, at the end."""
+    """State at the last strobe in extended precision, rounded to double at the end."""
     integrator = _extended()
     integrator.time = np.longdouble(0.0)
     integrator.state[:], integrator.pars[:] = 0.0, _constants(region)
@@ -185,23 +185,23 @@ def reference(name: str) -> tuple[np.ndarray, float]:
 
 
 def apart(name: str) -> float:
-    """How far the two references are apart at the end of the beginning, over the size of the motion."""
+    """The difference of the two references at the end of ``beginning``, relative to the size of the motion."""
     region, (_, size) = REGIONS[name].beginning, reference(name)
     return float(np.max(np.abs(by_scipy(region, "DOP853", 3e-14) - in_extended_precision(region)))) / size
 
 
 def error_of(name: str, state: np.ndarray) -> Judged:
-    """Of a state (phi, phi'/Omega)."""
+    """The error of a state (phi, phi'/Omega)."""
     exact, size = reference(name)
     error = float(np.max(np.abs(state - exact))) / size
     return Judged(error) if math.isfinite(error) else Judged(math.nan, 1, "nan")
 
 
 def package(name: str, analysis: str, method: str, setting: str, options: Mapping[str, Any], lanes: int) -> Contender:
-    """A scene of equal motions; the state is that of the last strobe that is compared."""
+    """A method of the package on a scene of equal motions; the last strobe is compared."""
     region = REGIONS[name]
     section = analysis == "poincare"
-    # A section has no fewer strobes than that.
+    # A section has at least ``_LEAST`` strobes.
     first = max(region.strobes - _LEAST, 0)
     marched = first + _LEAST if section else region.strobes
     own = (
@@ -255,7 +255,7 @@ def contenders_of(name: str, quick: bool) -> list[Contender]:
     # Up to what slow excitation (128) and chaos (384) need for nine digits.
     for steps in (12,) if quick else (6, 12, 18, 24, 40, 128, 384):
         found.append(package(name, "poincare", "fixed", f"{steps} steps a strobe", {"steps": steps}, _LANES))
-    # These compile longest.
+    # The path by diffrax compiles longest.
     for rtol in () if quick else (1e-3, 1e-9):
         options = {"rtol": rtol, "atol": 1e-3 * rtol}
         found.append(package(name, "poincare", "adaptive", f"rtol={rtol:g}", options, 4))
@@ -263,7 +263,7 @@ def contenders_of(name: str, quick: bool) -> list[Contender]:
         found.append(package(name, "history", "diffrax", f"rtol={rtol:g}", {"rtol": rtol}, 4))
     ladder = {"DOP853": (1e-6, 1e-9, 1e-12), "RK45": (1e-6,), "LSODA": (1e-6, 1e-9)}
     for method, tolerances in ladder.items():
-        # The one that reaches 1e-9, or the only one: "alone in reaching it" must not come from what was left out.
+        # A quick run keeps the finest setting, because without it a rival would seem not to reach 1e-9.
         for rtol in tolerances[-1:] if quick else tolerances:
             found.append(scipy(name, method, rtol))
     if find_spec("heyoka"):
@@ -273,7 +273,7 @@ def contenders_of(name: str, quick: bool) -> list[Contender]:
 
 
 def contenders(quick: bool) -> tuple[Sequence[Contender], Sequence[str]]:
-    """All methods in all regions, and how far the two references are apart."""
+    """All methods in all regions, and the difference of the two references."""
     names = ("typical", "near a tongue") if quick else tuple(REGIONS)
     if not find_spec("heyoka"):
         return [c for name in names for c in contenders_of(name, quick)], ["the reference is SciPy DOP853 at 3e-14"]

@@ -1,8 +1,8 @@
-"""The oscillator with play integrated by diffrax: the rival of the closed form in the measurements.
+"""The oscillator with play integrated by diffrax, the rival of the closed form in the measurements.
 
-With ``events`` the field is frozen to one linear region and the solver stops at its flank, found by root finding on the
-dense output; integration goes on from there in the next region. Without, the adaptive solver steps across the kinks,
-where its error estimate does not hold.
+With ``events`` the field is frozen to one linear region. The solver stops at the flank of the region, found by root finding
+on the dense output, and continues in the next region. Without ``events`` the adaptive solver steps across the kinks, where
+its error estimate is wrong.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ def _distance(model: PiecewiseLinearOscillator, side: Array, state: Array) -> tu
 def integrate(
     model: PiecewiseLinearOscillator, state: Array, end: Array, *, rtol: float, events: bool, max_steps: int = 100_000
 ) -> tuple[Array, Array]:
-    """``(u, u')`` at the time ``end`` from ``state`` at 0, shape ``(2,)``, and whether it succeeded. For one lane."""
+    """``(u, u')`` of one lane at the time ``end`` from ``state`` at 0, shape ``(2,)``, and a flag of success."""
     solver = diffrax.Dopri8()
-    # A contact that begins and ends within one step would go unseen: steps are short against every oscillation.
+    # Steps are short against every oscillation, because a contact that begins and ends within one step is missed.
     fastest = jnp.maximum(jnp.sqrt(model.stiffness * jnp.maximum(model.alpha, 1.0)), model.omega)
     longest = _LONGEST_ARC / fastest if events else None
     controller = diffrax.PIDController(rtol=rtol, atol=1e-3 * rtol, dtmax=longest)

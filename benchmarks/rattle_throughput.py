@@ -1,13 +1,13 @@
 """Lane-periods per second of the gear-rattle solvers, and their error against run time.
 
 ``python -m benchmarks.rattle_throughput`` writes benchmarks/results/rattle_throughput.csv and .png (``--quick``: a smaller
-table). Contenders are the closed form, diffrax with and without declared events, and SciPy with and
-without, on the same motions (Table 1 of the paper, omega 0.3 .. 1.5, ten drive periods from rest). Every one computes
-on one core at a time: XLA hands these loops to one thread, and SciPy has no other. The error is the largest over a few
-motions against extended precision; runs of which a motion failed are kept and marked.
+table). Contenders are the closed form, and diffrax and SciPy each with and without events, on the same motions (Table 1 of
+the paper, omega 0.3 .. 1.5, ten drive periods from rest). Every contender uses one core: XLA runs these loops in one thread,
+and so does SciPy. The error is the largest over a few motions against extended precision; runs with failed motions are kept
+and marked.
 
-Where the error of a solver with events does not fall with its tolerance (omega = 0.3), a short contact begins and ends
-within one of its steps, at t = 146.9: with steps no longer than 0.05 SciPy finds it. A user does not know of it.
+At omega = 0.3 the error of solvers with events does not fall with the tolerance: a short contact at t = 146.9 begins and
+ends within one step. SciPy finds this contact with steps of at most 0.05. Nothing shows it to a user.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from tests.oracles.rattle_reference import extended, scipy_events, scipy_plain
 
 PERIODS = 10
 TABLE1 = PRESETS["table1"]
-# SciPy is timed on so many of the motions, and errors are those of as many.
+# Number of motions on which SciPy is timed, and from which errors are computed.
 FEW = 8
 EXACT, EVENTS = "exact", "scipy with events"
 
 
 class Size(NamedTuple):
-    """Lanes of the closed form, those of diffrax, tolerances, and runs of which the median counts."""
+    """Numbers of lanes of the closed form and of diffrax, tolerances, and number of runs for the median."""
 
     lanes: int
     diffrax_lanes: int
@@ -49,7 +49,7 @@ FULL, QUICK = Size(1024, 256, (1e-6, 1e-9, 1e-12), 3), Size(256, 16, (1e-9,), 1)
 
 
 class Contender(NamedTuple):
-    """A solver at a tolerance, the frequencies it is run at, and the run: states of shape (2, frequencies)."""
+    """A solver at a tolerance, its frequencies, and its run, which returns states of shape (2, frequencies)."""
 
     name: str
     rtol: float
@@ -89,7 +89,7 @@ def by_scipy(omega: np.ndarray, rtol: float, solver: Callable) -> Callable[[], n
 
 
 def contenders(size: Size) -> list[Contender]:
-    """All of them, compiled."""
+    """All contenders, compiled."""
     omega, some = (np.linspace(0.3, 1.5, lanes) for lanes in (size.lanes, size.diffrax_lanes))
     few = np.linspace(0.3, 1.5, FEW)
     found = [Contender(EXACT, 0.0, omega, exact(omega))]
@@ -104,7 +104,7 @@ def contenders(size: Size) -> list[Contender]:
 
 
 def error_of(omega: np.ndarray, states: np.ndarray) -> tuple[float, int]:
-    """Largest error of a few of the motions that have not failed, and how many of all have."""
+    """Largest error of a few motions that have not failed, and number of all failed motions."""
     chosen = np.unique(np.linspace(0, omega.size - 1, FEW).round().astype(int))
     truth = np.array([extended(TABLE1 | {"omega": float(w)}, 0.0, 0.0, PERIODS)[:2] for w in omega[chosen]]).T
     errors = np.abs(states[:, chosen] - truth).max(axis=0)
@@ -127,7 +127,7 @@ def measure(size: Size) -> list[dict[str, Any]]:
 
 
 def ratio(rows: list[dict[str, Any]]) -> str:
-    """How many times the closed form is faster than SciPy with events, at each of its tolerances."""
+    """Ratio of the speed of the closed form to that of SciPy with events, at each tolerance of SciPy, as text."""
     own = next(row for row in rows if row["solver"] == EXACT)["us_per_lane_period"]
     times = (f"{row['us_per_lane_period'] / own:.0f} at {row['rtol']:g}" for row in rows if row["solver"] == EVENTS)
     return f"{EVENTS} over {EXACT}, time per lane-period: {', '.join(times)}"
@@ -139,7 +139,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     axes = figure.add_axes((0.12, 0.17, 0.84, 0.8))
     for number, name in enumerate(dict.fromkeys(row["solver"] for row in rows)):
         own = [row for row in rows if row["solver"] == name]
-        # Where all have failed there is no error: at the top.
+        # Without an error, because all motions failed, the point is at the top.
         points = [(row["us_per_lane_period"], row["error"] if row["error"] > 0 else 1.0, row["failed"]) for row in own]
         (line,) = axes.loglog(*zip(*((x, y) for x, y, _ in points), strict=True), label=name, **style_of(number))
         for x, y, failed in points:

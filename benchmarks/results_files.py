@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 Row = Mapping[str, str]
-# Ratio of times below which two runs cannot be distinguished.
+# Ratio of times up to which two methods count as equally fast.
 LEVEL = 1.1
 # Marks around the generated part of a page.
 BEGIN = "<!-- Written by `python -m benchmarks.page`; do not edit. -->"
@@ -85,7 +85,7 @@ def times(ratio: float) -> str:
 
 
 def is_level(ratio: float) -> bool:
-    """True if two speeds cannot be distinguished: another run may reverse their order."""
+    """True if two speeds count as equal, because another run may reverse their order."""
     return 1 / LEVEL < ratio < LEVEL
 
 
@@ -103,7 +103,7 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def whole(file: ResultFile | None, name: str, columns: Mapping[str, str], formats: Mapping[str, object]) -> str:
-    """The columns of a file under the headings given, numbers without exponents; ``formats`` name column -> function."""
+    """A table of all rows of a file: ``columns`` map names to headings, ``formats`` map names to format functions."""
     if file is None:
         return not_measured(name)
     as_is = dict.fromkeys(columns, plain) | dict(formats)

@@ -1,7 +1,7 @@
-"""Cost of the engine beside its kernels, and of large sweeps: measured figures and a small simulation.
+"""Cost of the engine in addition to its kernels, and cost of large sweeps: measurements and a small simulation.
 
-``python -m benchmarks.scaling`` measures and writes the tables of docs/scaling.md, and results/ scaling.csv, overhead.csv,
-places.csv and memory.csv; ``--points`` makes it smaller, and with ``--quick`` or ``--out`` the page is left alone.
+``python -m benchmarks.scaling`` measures, and writes the tables of docs/scaling.md and scaling.csv, overhead.csv, places.csv
+and memory.csv in results/. ``--points`` makes the sweep smaller; with ``--quick`` or ``--out`` the page stays unchanged.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from drivetrain_jax.store.chunks import Part
 
 PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
 BEGIN, END = "<!-- scaling: written by python -m benchmarks.scaling -->", "<!-- end of scaling -->"
-# Points of the sweeps whose memory is looked at; a plan keeps up to 4 million sorted points.
+# Numbers of points of the sweeps whose memory is measured; a plan keeps up to 4 million sorted points.
 _MEMORY, _QUICK_MEMORY = (1_000_000, 10_000_000, 100_000_000), (1_000_000, 5_000_000)
 
 
 @dataclass(frozen=True)
 class Costs:
-    """Measured figures of one chunk and one point; all seconds are those of one core."""
+    """Measured costs of one chunk and one point; all seconds are those of one core."""
 
     chunk: int
     compute_s: float
@@ -49,7 +49,7 @@ class Costs:
 
 
 def costs(points: int) -> Costs:
-    """CPU seconds: one core per chunk, as processes have it."""
+    """Measure costs in CPU seconds, because in processes each chunk has one core."""
     engine = resolve(load_scene(scene(points)))
     planning = cpu_seconds(lambda: engine.plan)
     chunks = [engine.plan.chunk(n) for n in range(len(engine.plan.costs))]
@@ -81,7 +81,7 @@ def costs(points: int) -> Costs:
 
 
 def hashing() -> float:
-    """Seconds for one byte of a result when it is sealed."""
+    """Seconds for the checksum of one byte of a result."""
     with h5py.File("hash", "w", driver="core", backing_store=False) as file:
         values = file.create_dataset("x", data=np.random.default_rng(1).random(1 << 22))
         return median([cpu_seconds(lambda: checksums.checksums(file)) for _ in range(3)]) / values.nbytes
@@ -99,8 +99,10 @@ class Load:
 
 
 def simulate(cost: Costs, workers: int, chunks: int = 20_000, seed: int = 1) -> tuple[float, float, float]:
-    """Seconds per chunk, and how busy driver and workers are: ``workers`` with two chunks each, one driver that handles
-    what comes back in the order of its coming and then hands out the next chunk."""
+    """Seconds per chunk, and the shares of time in which driver and workers are busy.
+
+    Each of the ``workers`` has two chunks. One driver handles results in the order of arrival, and then sends the next chunk.
+    """
     rng = np.random.default_rng(seed)
     chunks = max(chunks, 20 * workers)
     shape = 1 / max(cost.spread, 1e-3) ** 2
@@ -161,7 +163,7 @@ def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def page(tables: Mapping[str, str], cost: Costs, simulated: Sequence[Load]) -> str:
-    """The ``tables`` of what was measured, those of what follows, and where they come from."""
+    """The text of the page: the measured ``tables``, the simulated ones, and their sources."""
     where = "; ".join(f"{key}: {value}" for key, value in provenance().items())
     limit = cost.compute_s / cost.handle_s
     chunk_rows = [{"figure": name, "value": value} for name, value in asdict(cost).items()]

@@ -2,11 +2,11 @@
 
     python -m benchmarks.throughput [--cells 30000] [--repeats 5] [--quick]     # writes results/throughput.csv
 
-Chart: beta in [0, 1.5], Omega in [0.1, 2], zeta 0.001, alpha = mu = 1, gamma = 100; the result is the spectral radius,
-of the package with its bound, so the eigenvalues are in every time. All methods may use both cores: the package by
-threads, as its engine does, the peers by two spawned processes that are started, and compiled, beforehand. diffrax gets
-a coarser grid of the same chart, SciPy random cells of it. Errors are relative to heyoka at tolerance 1e-15, which is
-itself compared with SciPy and with ``direct``.
+Chart: beta in [0, 1.5], Omega in [0.1, 2], zeta 0.001, alpha = mu = 1, gamma = 100. The result is the spectral radius, with
+its bound for the package, so every time includes the eigenvalues. All methods may use both cores: the package by the
+threads of its engine, the peers by two spawned processes that are started, and compiled, beforehand. diffrax gets a coarser
+grid of the same chart, SciPy random cells of it. Errors are relative to heyoka at tolerance 1e-15, which is itself compared
+with SciPy and with ``direct``.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ DIFFRAX_TOLERANCES = (1e-5, 1e-6)
 HEYOKA_TOLERANCES = (1e-8, 2e-9, 1e-10)
 RK45_TOLERANCES, DOP853_TOLERANCES, STACKED_TOLERANCES = (1e-9, 3e-11), (1e-9, 1e-10), (1e-9, 2e-12)
 HALF_PERIOD_TOLERANCES = (1e-9, 1e-10)
-# Memory and time from nothing to a result, measured in a process of its own.
+# Code of a process of its own that measures memory and time from the first import to the result.
 _FRESH = """
 import json, resource, sys, time
 start = time.perf_counter()
@@ -69,7 +69,7 @@ print(json.dumps({"seconds": seconds, "megabytes": megabytes, "cells": ds.outcom
 
 @dataclass(frozen=True)
 class Contender:
-    """A method: ``job()`` returns the spectral radii of ``columns``, or NaN if it stops short of them."""
+    """A method: ``job()`` returns the spectral radii of ``columns``, or NaN if it computes no eigenvalues."""
 
     label: str
     job: Callable[[], np.ndarray]
@@ -94,7 +94,7 @@ def scene(columns: Columns, method: str, options: Mapping[str, Any]) -> dict[str
 def package_contender(columns: Columns, method: str, options: Mapping[str, Any]) -> Contender:
     """The package's engine on the whole chart: its plan, kernels and threads as in ``dt.run``, compiled once.
 
-    (``dt.run`` traces and compiles anew in every call; that is in the time of the fresh process.)
+    ``dt.run`` compiles again in a fresh process, whose time is measured separately.
     """
     start = time.perf_counter()
     computed = engine_job(scene(columns, method, options), PROCESSES)
@@ -157,7 +157,7 @@ class SciPyStacked:
 def shared_out(
     mapper: Callable[..., Any], function: Callable[[Columns], np.ndarray], columns: Columns, tasks: int
 ) -> Callable[[], np.ndarray]:
-    """A job that deals the cells out to the workers like cards and puts the answers back in order."""
+    """A job that distributes the cells over the workers in turn, and returns the results in order."""
     deals = [np.arange(start, columns["beta"].size, tasks) for start in range(tasks)]
     hands = [take(columns, deal) for deal in deals]
 
@@ -178,7 +178,7 @@ def fresh_process(columns: Columns) -> dict[str, float]:
 
 
 def contenders(stack: ExitStack, columns: Columns, sample: int, quick: bool) -> list[Contender]:
-    """All methods, warm; ``quick``: the setting of each that reaches an error of 1e-9."""
+    """All methods, compiled; with ``quick`` only the setting of each method that reaches an error of 1e-9."""
     rng = np.random.default_rng(0)
     size = columns["beta"].size
     few, some = (take(columns, rng.choice(size, min(n, size), replace=False)) for n in (sample, 16 * sample))
@@ -201,7 +201,7 @@ def contenders(stack: ExitStack, columns: Columns, sample: int, quick: bool) -> 
 
 
 def measure(cells: int, repeats: int, sample: int, quick: bool = False) -> tuple[list[dict[str, Any]], list[str]]:
-    """Rows of the result table and the notes that belong above it."""
+    """Rows of the result table, and the notes above it."""
     columns = chart(cells)
     with ExitStack() as stack:
         entries = contenders(stack, columns, sample, quick)
@@ -229,12 +229,12 @@ def measure(cells: int, repeats: int, sample: int, quick: bool = False) -> tuple
 
 
 def reference_radius(columns: Columns) -> np.ndarray:
-    """Spectral radii to about 1e-13 (the notes of the result file say how that is checked)."""
+    """Spectral radii to about 1e-13; the notes of the result file give the check of this accuracy."""
     return spectral_radius(_exact("half", 1e-15).monodromy(columns))
 
 
 def notes(columns: Columns, repeats: int, sample: int, rtol: float | None) -> list[str]:
-    """Accuracy of the reference (against ``direct`` too at a given ``rtol``), and the package's memory."""
+    """Accuracy of the reference (also against ``direct`` if ``rtol`` is given), and memory of the package."""
     import drivetrain_jax as dt
 
     reference = reference_radius(columns)

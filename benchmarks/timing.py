@@ -1,4 +1,4 @@
-"""What the benchmarks share: the cells of the chart, spawned workers, interleaved timing, files with provenance."""
+"""Common parts of the benchmarks: cells of the chart, spawned workers, interleaved timing, files with provenance."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _PACKAGES = ("numpy", "scipy", "jax", "diffrax", "heyoka", "drivetrain_jax")
 
 
 def parser(doc: str) -> argparse.ArgumentParser:
-    """The options of every study: ``--quick`` and ``--out FOLDER``."""
+    """The parser with the options of every study, ``--quick`` and ``--out FOLDER``."""
     options = argparse.ArgumentParser(description=doc.splitlines()[0])
     options.add_argument(
         "--quick", action="store_true", help="a small form; its files go to --out or a temporary folder"
@@ -43,7 +43,7 @@ def parser(doc: str) -> argparse.ArgumentParser:
 
 
 def results_folder(options: argparse.Namespace) -> Path:
-    """Where the files of a study go: quick figures never replace those of a full run unless that is asked for."""
+    """The folder for the files of a study; a quick run replaces those of a full run only with ``--out``."""
     if options.out is None and not options.quick:
         return RESULTS
     folder = (options.out or Path(tempfile.mkdtemp(prefix="benchmarks-"))).resolve()
@@ -53,7 +53,7 @@ def results_folder(options: argparse.Namespace) -> Path:
 
 
 def chart(cells: int) -> dict[str, np.ndarray]:
-    """About ``cells`` cells of the chart beta in [0, 1.5] x Omega in [0.1, 2], base case, as columns, 3:4 in shape."""
+    """Columns of about ``cells`` cells of the chart beta in [0, 1.5] x Omega in [0.1, 2], base case, of shape 3:4."""
     rows = max(2, round((cells * 3 / 4) ** 0.5))
     beta, omega = np.linspace(0.0, 1.5, rows), np.linspace(0.1, 2.0, max(2, round(cells / rows)))
     grid = np.meshgrid(beta, omega, indexing="ij")
@@ -76,14 +76,16 @@ def spawned_workers(
 
 
 def at_once(makers: Sequence[Callable[[], Any]]) -> list[Any]:
-    """What ``makers`` return, ``PROCESSES`` of them at work at a time: compilation is most of what they do, and it leaves
-    the interpreter."""
+    """The results of ``makers``, of which ``PROCESSES`` run at a time in threads.
+
+    They mostly compile, which releases the interpreter lock.
+    """
     with ThreadPoolExecutor(PROCESSES) as pool:
         return list(pool.map(lambda make: make(), makers))
 
 
 def once(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``functools.cache`` for several threads: of two that ask for the same, the second waits instead of making it anew."""
+    """``functools.cache`` for several threads: the second of two equal calls waits instead of computing again."""
     kept, locks = cache(function), defaultdict[Any, Lock](Lock)
 
     @wraps(function)
@@ -95,8 +97,10 @@ def once(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def interleaved(jobs: Mapping[str, Callable[[], Any]], repeats: int | Mapping[str, int]) -> dict[str, list[float]]:
-    """Seconds of every job, taken in turns: a change in the machine's load hits all alike. ``repeats`` of each, or as many
-    as it says by name."""
+    """Seconds of ``repeats`` runs of every job, taken in turns, so that the load of the machine affects all alike.
+
+    ``repeats`` may be a mapping by name.
+    """
     counts = dict.fromkeys(jobs, repeats) if isinstance(repeats, int) else repeats
     seconds: dict[str, list[float]] = {name: [] for name in jobs}
     for turn in range(max(counts.values(), default=0)):
@@ -108,7 +112,7 @@ def interleaved(jobs: Mapping[str, Callable[[], Any]], repeats: int | Mapping[st
 
 
 def median(values: Sequence[float]) -> float:
-    """The median: robust against the one repeat that another process disturbed."""
+    """The median, which one disturbed repeat does not change much."""
     return statistics.median(values)
 
 
@@ -139,7 +143,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], notes: Sequence[str
     writer.writeheader()
     writer.writerows({key: significant(value) for key, value in row.items()} for row in rows)
     path.parent.mkdir(exist_ok=True)
-    # Whole or as it was, whenever the study is interrupted.
+    # Renamed at the end: an interrupted study leaves the old file unchanged.
     written = path.with_suffix(".csv.part")
     written.write_text(text.getvalue())
     os.replace(written, path)

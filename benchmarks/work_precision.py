@@ -1,10 +1,10 @@
-"""Why the direct method is what it is: error of the Floquet multipliers against evaluations of H and against time.
+"""Choice of the direct method: error of the Floquet multipliers against evaluations of H and against time.
 
     python -m benchmarks.work_precision      # writes results/work_precision_cardan.csv and .png
 
 Every candidate integrates the half-period form (docs/theory/cardan.md) with fixed steps; rho and the multipliers are
-compared with the 200-bit reference. The figure shows the multipliers: where all of them lie on one circle, damping
-alone decides rho, and a method that keeps quadratic invariants gets it right with wildly wrong phases.
+compared with the 200-bit reference. The figure shows the multipliers, not rho: where all multipliers lie on one circle,
+damping alone determines rho, and a method that keeps quadratic invariants gets rho right with entirely wrong phases.
 
 Explicit: the 12 stages of DOP853 in the clocks
 
@@ -231,7 +231,7 @@ def _timed(compiled: Any, lanes: Values, steps: int) -> tuple[np.ndarray, float]
 
 
 def cheapest(rows: list[dict[str, Any]], tolerance: float = 1e-9) -> list[dict[str, Any]]:
-    """For every point and method: evaluations and time from which the error stays below ``tolerance``."""
+    """Evaluations and time of every method at every point from which on the error stays below ``tolerance``."""
     table = []
     for index in dict.fromkeys(row["point"] for row in rows):
         line: dict[str, Any] = {"point": index}
@@ -246,7 +246,7 @@ def cheapest(rows: list[dict[str, Any]], tolerance: float = 1e-9) -> list[dict[s
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Error against evaluations (top) and against time (bottom), one column a point."""
+    """Draw error against evaluations (top) and against time (bottom), one column per point."""
     import matplotlib.pyplot as plt
     from matplotlib.ticker import NullFormatter
 
@@ -283,7 +283,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure, write the CSV and the figure, print where every method reaches 1e-9."""
+    """Measure, write the CSV and the figure, and print the cost at which every method reaches 1e-9."""
     options = parser(__doc__).parse_args(arguments)
     difference = check_clock()
     if difference > 1e-13:

@@ -1,4 +1,4 @@
-"""Writes the validation pages: see the package's docstring."""
+"""Write the validation pages; see the docstring of the package."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SYSTEMS = ("cardan", "tripod", "bicardan", "planetary", "rattle")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Compute and write the page of every system named, by default of all."""
+    """Compute and write the pages of the given systems, by default of all systems."""
     parser = argparse.ArgumentParser(description=benchmarks.validation.__doc__.splitlines()[0])
     parser.add_argument("systems", nargs="*", metavar="SYSTEM", help=f"one or more of {', '.join(SYSTEMS)}")
     parser.add_argument("--full", action="store_true", help="compare whole charts instead of samples")

@@ -27,7 +27,7 @@ EXACT_MOMENTS = {
     "paper_fitted": (50e-3**4, 50e-3**4 - 45e-3**4, 30e-3**4),
 }
 
-# The three segments with the areas and moments of their diameters, none of them as printed or fitted.
+# The three segments with areas and moments computed from their diameters, not as printed or fitted.
 _AREAS = (50e-3**2, 50e-3**2 - 45e-3**2, 30e-3**2)
 EXACT_SECTIONS = PRESETS["paper"] | {"rhoA": tuple(7800 * math.pi / 4 * x for x in _AREAS)}
 
@@ -116,7 +116,7 @@ def influences() -> dict[str, str]:
 
 
 def _thicker(factor: float) -> Parameters:
-    """Stiffness and mass of the fitted shaft with outer diameters ``factor`` times as large, its bore unchanged."""
+    """Stiffness and mass of the fitted shaft with outer diameters ``factor`` times as large and the same bore."""
     outer, inner = np.array([50e-3, 50e-3, 30e-3]), np.array([0.0, 45e-3, 0.0])
     grown = {}
     for name, power in (("EI", 4), ("rhoA", 2)):
@@ -150,7 +150,7 @@ def conclusions(found: Mapping[str, str]) -> str:
 
 
 def everything(found: Mapping[str, str]) -> str:
-    """Every place of the paper."""
+    """The inventory of the paper."""
     printed = {}
     for key, (preset, _, _) in zip(("solid", "tube", "fitted"), PRINTED.values(), strict=True):
         p = frequencies(PRESETS[preset])

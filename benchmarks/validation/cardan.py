@@ -199,7 +199,7 @@ def _narrow_tongue_row() -> list[str]:
 
 
 def forced_section() -> str:
-    """Forced response and the orbit it stands for; the paper analyses the homogeneous equation only."""
+    """Forced response, and the forced orbit that it approximates; the paper analyses only the homogeneous equation."""
     cases = ((0.8, 1.3), (0.5236, 1.416), (0.5, 0.72))
     points = {"beta": [b for b, _ in cases], "Omega": [o for _, o in cases]}
     about_zero = package_points("floquet", ["spectral_radius"], points).spectral_radius.values

@@ -1,4 +1,4 @@
-"""The statements of Soltan Rezaee & Ghazavi 2014 in numbers, and the orbit that the shaft really follows."""
+"""The statements of Soltan Rezaee & Ghazavi 2014 in numbers, and the forced orbit of the shaft."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def found() -> dict[str, str]:
 
 
 def orbit_section() -> str:
-    """The stability of the forced orbit beside that of rest, and the amplitude."""
+    """Stability of the forced orbit and of rest, and amplitude of the orbit."""
     scene = SCENES / "cardan_orbit_chart.toml"
     orbit = dt.run(scene)
     axes = {name: {"values": orbit[name].values.tolist()} for name in ("beta", "Omega")}

@@ -40,7 +40,7 @@ def markdown(head: Sequence[str], rows: Rows) -> str:
 def inventory(system: str, **found: str) -> str:
     """The section that names every equation, figure, table and conclusion of the paper, from inventory/<system>.txt.
 
-    A line has five cells; ``{name}`` stands for a value of ``found``, computed for the page.
+    A line has five cells; ``{name}`` is replaced by a value of ``found``, which is computed for the page.
     """
     lines = (Path(__file__).parent / "inventory" / f"{system}.txt").read_text().splitlines()
     rows = [[cell.strip().format(**found) for cell in line.split(" | ")] for line in lines]

@@ -34,7 +34,7 @@ TABLE_5_EQUAL = {
     "translational": (743.2, 1102.4, 1896.0, 2276.4, 6986.3, 9647.9),
 }
 TABLE_5_UNEQUAL = (0.0, 1476.7, 1931.2, 2659.7, 7464.5, 11778.1)
-# Angles of the second and third planet with which the column for unequal spacing is missed by least.
+# Angles of the second and third planet whose frequencies are nearest to the column for unequal spacing.
 NEAREST_THREE = (117.77859, 242.20544)
 TABLE_6_EQUAL = {
     "rotational": (0.0, 1567.4, 2006.1, 2614.8, 8065.4, 14253.1),
@@ -76,7 +76,7 @@ def _row(
 
 
 def _by_kind(ds: Any, exact: np.ndarray, printed: dict[str, Sequence[float]], factor: float) -> list[list[str]]:
-    """Distinct frequencies of each kind beside the printed ones, in order."""
+    """Rows of distinct frequencies of each kind and the printed ones, in order."""
     frequency, types = ds.natural_frequency.values, kinds(ds)
     rows = []
     for kind, values in printed.items():
@@ -150,14 +150,16 @@ def table_5() -> str:
 
 
 def _distance_of_unequal_three(angles: Sequence[float], factor: float) -> float:
-    """Largest distance of the column for unequal spacing from the nearest frequencies with planets at 0 and
-    ``angles``."""
+    """Largest distance of the column for unequal spacing from the nearest frequencies of a gear.
+
+    The gear has planets at 0 and ``angles``.
+    """
     found = factor * oracle((0, *angles))
     return max(float(np.abs(found - value).min()) for value in TABLE_5_UNEQUAL)
 
 
 def table_6() -> str:
-    """Five planets, and where the paper's statement about odd numbers does not hold."""
+    """Five planets, and a counterexample to the paper's statement about odd numbers."""
     degrees = tuple(72 * i for i in range(5))
     ds, exact = gear(degrees), oracle(degrees)
     equal = markdown(HEAD, _by_kind(ds, exact, TABLE_6_EQUAL, 1.0))
@@ -206,7 +208,7 @@ def _balanced_five(equal: Any) -> str:
 
 
 def table_7() -> str:
-    """The carrier held by a stiff spring."""
+    """Table 7: the carrier on a stiff spring."""
     parts = []
     for title, degrees, printed in (
         ("Four planets at 0, 80, 180, 260 degrees", PAIRS, TABLE_7_PAIRS),
@@ -231,7 +233,7 @@ def table_7() -> str:
 
 
 def rotational() -> str:
-    """The model of (39) and (40), of which the paper prints no values."""
+    """The model of (39) and (40), for which the paper prints no values."""
     angles = tuple(math.radians(angle) for angle in PAIRS)
     found = dt.modes(dt.Planetary(planet_angle=angles, model="rotational"), outputs=["natural_frequency", "mode_type"])
     exact = _with_centres_held(angles)
@@ -288,7 +290,7 @@ def _shares(degrees: Sequence[float]) -> dict[str, list[float]]:
 
 
 def everything() -> str:
-    """Every place of the paper."""
+    """The inventory of the paper."""
     turning = dt.modes(dt.Planetary(model="rotational"), outputs=["natural_frequency", "mode_type"])
     frequency, types = np.asarray(turning.natural_frequency), np.asarray(turning.mode_type)
     equal, unequal = gear((0, 90, 180, 270)), gear(PAIRS)
@@ -305,7 +307,7 @@ def everything() -> str:
 
 
 def page(full: bool) -> Page:
-    """Everything that the paper prints; there is no larger version."""
+    """The page of the planetary gear; ``full`` has no effect."""
     del full
     introduction = (
         "Shahabi & Sheykh Samani 2016 against this package: natural frequencies of planetary gears with unequally spaced "

@@ -57,13 +57,13 @@ def cubic_folds(l1: float, l2: float) -> list[float]:
 
 
 def package(method: str, outputs: Sequence[str], omega: Sequence[float], **options: Any) -> xr.Dataset:
-    """A line of Table 1."""
+    """The frequency response of the gears of Table 1 by the package."""
     scene = {"system": "rattle", "analysis": "frequency_response", "outputs": list(outputs), "fixed": TABLE_1}
     return dt.run(scene | {"axes": {"omega": {"values": list(omega)}}, "options": {"method": method} | options})
 
 
 def peak_section() -> str:
-    """Peak and folds by every method beside the exact ones."""
+    """Peak and folds by every method, compared with the exact ones."""
     folds = sorted(s["omega"] for s in REFERENCE["specials"]["table1"] if s["type"] == "fold")[-2:]
     rows = [["exact", f"{EXACT_PEAK:.6f}", f"{EXACT_PEAK_FREQUENCY}", *(f"{w:.6f}" for w in folds), "reference"]]
     for reach in (0.0, 1.0):
@@ -114,7 +114,7 @@ def printed_peak(epsilon: float, reach: float, last: str) -> tuple[float, float]
 
 
 def epsilon_section() -> str:
-    """The response equation as printed, which depends on epsilon, in two readings, beside the corrected one."""
+    """The printed response equation, which depends on epsilon, in two readings, and the corrected one."""
     rows = []
     for epsilon in (1.0, 0.1, 0.01, 0.001):
         cells = [f"{a:.4f} at {w:.4f}" for a, w in (printed_peak(epsilon, 1.0, k) for k in READINGS)]
@@ -153,7 +153,7 @@ TIMES = np.linspace(0, 10 * 2 * math.pi / GEARS["omega"], 401)
 
 
 def polar(reach: float) -> np.ndarray:
-    """Amplitude by (42)-(43), as printed but in the variables of (10), at the times, by SciPy."""
+    """Amplitude over time by (42)-(43) as printed, in the variables of (10), integrated by SciPy."""
     l1, l2 = fitted(reach)
     w0, mu = math.sqrt(l1), TABLE_1["c"] / 2
     drive, bend = TABLE_1["B1"] / (2 * w0), 3 * l2 / (8 * w0)
@@ -168,7 +168,7 @@ def polar(reach: float) -> np.ndarray:
 
 
 def transient_section() -> tuple[str, dict[str, str]]:
-    """The exact transient beside the averaged one, and values for the list of all places."""
+    """The exact and the averaged transient, and values for the inventory."""
     gears, times = dt.Rattle(**GEARS), TIMES.tolist()
     exact = dt.history(gears, outputs=["u", "event_count"], times=times)
     rows, found = [], {}
@@ -192,7 +192,7 @@ def transient_section() -> tuple[str, dict[str, str]]:
 
 
 def everything(found: dict[str, str]) -> str:
-    """Every place of the paper."""
+    """The inventory of the paper."""
     l1, l2 = fitted(1.0)
     ds = package("multiple_scales", CURVES, [0.8], fit_range=1.0).isel(omega=0)
     peak, place = 2 * float(ds.peak_amplitude), float(ds.peak_frequency)
@@ -212,7 +212,7 @@ def everything(found: dict[str, str]) -> str:
 
 
 def page(full: bool) -> Page:
-    """The page; nothing in it is shortened, ``full`` makes no difference."""
+    """The page of gear rattle; ``full`` has no effect."""
     del full
     transient, found = transient_section()
     return Page(

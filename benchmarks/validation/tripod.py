@@ -148,7 +148,7 @@ def histories_section() -> str:
 
 
 def readings_section() -> str:
-    """Both readings of the printed torque sums: they change histories, not stability."""
+    """Both readings of the printed torque sums, which differ in histories but not in stability."""
     rows = []
     for equation, zeta, chi in HISTORIES[::3]:
         name = oracle.EQUATIONS[equation]
@@ -251,7 +251,7 @@ def range_section(full: bool) -> str:
     """The largest exponent over the range of the paper."""
     rows = []
     for name, low, high, stated in (("input", 2950.0, 3200.0, 0.0026), ("output", 2650.0, 2950.0, 0.0027)):
-        # The tip of the resonance is narrower than the steps: it is one of the values.
+        # The tip of the resonance is narrower than the steps, so it is added to the values.
         steps = np.linspace(low, high, 501 if full else 101)
         axes = {
             "excitation_frequency": {"values": sorted({*steps.tolist(), oracle.shaft(name).omega / math.pi})},
@@ -269,7 +269,7 @@ def range_section(full: bool) -> str:
 
 
 def page(full: bool) -> Page:
-    """The page; ``full`` takes the range of the paper in fine steps."""
+    """The page; with ``full`` the range of the paper has finer steps."""
     sections = (
         constants_section(),
         angles_section(),

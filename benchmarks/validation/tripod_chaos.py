@@ -18,7 +18,7 @@ from tests.oracles.chaos_reference import scipy_spectrum, tripod_field
 BETA = math.radians(9)
 # Printed values of chi_n and the range of damping ratios for which the paper claims chaos, and the excitation frequency.
 CLAIMS = {"input": (0.0026, (0.0016, 0.0073, 0.011), 3066.5), "output": (0.0027, (0.0016, 0.0064, 0.0104), 2792.0)}
-# Constants of (29) at 9 degrees, chi_n = 0.0026, by ../shared/reference: for the independent computation.
+# Constants of (29) at 9 degrees, chi_n = 0.0026, from ../shared/reference, for the independent computation.
 _CONSTANTS = {
     "Omega": 9633.726700903984,
     "chi": 0.0026,
@@ -83,7 +83,7 @@ FIGURES = (
 
 
 def estimator_section() -> str:
-    """The paper's rule and its criteria (37)-(39) at all of its figures and on three known motions."""
+    """The paper's rule and its criteria (37)-(39), applied to all of its figures and to three known motions."""
     rows, strobes = [], 307
     for figure, element, zeta, published in FIGURES:
         chi, _, frequency = CLAIMS[element]
@@ -110,7 +110,7 @@ def estimator_section() -> str:
 
 
 def _criteria(values: np.ndarray) -> list[str]:
-    """The estimates, and if (37)-(39) hold for them; near 0: a thousandth of the largest."""
+    """The estimates, and whether (37)-(39) hold; values below a thousandth of the largest count as 0."""
     near = bool((abs(values) < 1e-3 * abs(values).max()).any())
     told = ("yes" if holds else "no" for holds in (values.max() > 0, near, values.sum() < 0))
     return [", ".join(f"{value:.6g}" for value in values), *told]
@@ -140,7 +140,7 @@ def _known_motions() -> tuple[tuple[str, Flow, str], ...]:
 
 
 def independent_section() -> str:
-    """Sum and values of the exponents of (29) by SciPy over a short time from rest, and of the package over the same."""
+    """Sum and values of the exponents of (29) by SciPy and by the package, over the same short time from rest."""
     strobes = 320
     scipy = scipy_spectrum(
         tripod_field(_CONSTANTS | {"zeta": 0.0073, "frequency": 3066.5}), np.zeros(2), 1 / 3066.5, strobes, 1e-11

@@ -98,7 +98,7 @@ class PartsFolder:
     def plan(self) -> dict[str, Any]:
         """The plan of the parts; empty without a readable plan.
 
-        It has the entries ``digest``, ``replaces`` (digest of the result to be replaced by the parts), and others of the run.
+        It has the ``digest``, ``replaces`` (the digest of the result that the parts will replace), and more about the run.
         """
         try:
             content = json.loads(self._plan.read_text())
