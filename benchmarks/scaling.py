@@ -101,7 +101,7 @@ class Load:
 def simulate(cost: Costs, workers: int, chunks: int = 20_000, seed: int = 1) -> tuple[float, float, float]:
     """Seconds per chunk, and the shares of time in which driver and workers are busy.
 
-    Each of the ``workers`` has two chunks. One driver handles results in the order of arrival, and then sends the next chunk.
+    Each of the ``workers`` has two chunks. One driver handles results in the order of arrival, and sends the next chunk.
     """
     rng = np.random.default_rng(seed)
     chunks = max(chunks, 20 * workers)
