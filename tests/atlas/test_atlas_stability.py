@@ -48,8 +48,10 @@ def test_first_chart_of_the_theory_page(chart):
 
 
 def equal_to_rounding(points, grid, rtol):
-    """The same closed form at points as on a grid without nodes; rounding, a tenth of the bounds of some 1e-13, grows where
-    multipliers are nearly double."""
+    """Results at points equal those on a grid up to rounding, because both use the same closed form.
+
+    Rounding is a tenth of the bounds of some 1e-13, and grows where multipliers are nearly double.
+    """
     rho, error = points["spectral_radius"], points["spectral_radius_error"]
     difference = np.abs(rho - grid["spectral_radius"])
     assert (difference <= error).all() and (difference <= 0.1 * error + 2e-14 * rho).mean() > 0.99
@@ -73,7 +75,7 @@ def test_grid_equals_points_and_holds_where_it_is_hardest(chart):
 
 
 def dense_axes(atlas, count):
-    """Rows far apart and ``count`` columns, and the part of these for which tiles interpolate between nodes."""
+    """Axes of rows far apart and ``count`` columns, and the fraction of the columns in tiles with nodes."""
     axes = [np.array([0.05, 0.7, 1.1, 1.499]), np.linspace(0.3, 2.0, count)]
     coordinates = [np.sort(c.forward(axis)) for c, axis in zip(atlas.atlas.coordinates, axes, strict=True)]
     cut = list(tiles.tiles(atlas.atlas, coordinates, (8, min(512, count))))
@@ -82,8 +84,7 @@ def dense_axes(atlas, count):
 
 @pytest.mark.parametrize(("count", "most"), [(1076, 5), (1367, 5), (2531, 5), (300, 1), (1, 1)])
 def test_tiles_cover_each_column_once_and_are_few(chart, count, most):
-    """Where columns shared out evenly would leave 34 or 51 of them to a tile of their own, as costly as any, tiles are
-    narrower."""
+    """Tiles are narrower where even widths would leave 34 or 51 columns to a last tile, which costs as much as any other."""
     coordinates = [np.sort(c.forward(x)) for c, x in zip(chart.atlas.coordinates, ([1.0], speeds(count)), strict=True)]
     cut = list(tiles.tiles(chart.atlas, coordinates, (64, 512)))
     widths = {(tile.columns if tile.spread is None else tile.spread).shape[1] for tile in cut}
@@ -93,7 +94,7 @@ def test_tiles_cover_each_column_once_and_are_few(chart, count, most):
 
 
 def test_a_cell_on_a_common_face_has_the_panel_of_a_point():
-    """What the tiles leave in each cell, the later ones over the earlier, is the panel that a point finds."""
+    """Later tiles overwrite earlier ones; the last panel of each cell is the panel of the point there."""
     ends = [(0.0, 0.5), (0.5, 1.0)]
     panels = tuple(
         Panel(np.array([a, c]), np.array([b, d]), np.zeros((2, 2, 16)), 0.0, np.zeros(3))
@@ -148,7 +149,7 @@ def test_dense_columns_are_interpolated_within_their_bounds(chart):
 
 
 def test_too_few_nodes_are_noticed(chart, monkeypatch):
-    """What the nodes leave out is measured: cells for which it is too much are judged again."""
+    """The truncation error of the nodes is measured, and cells with a large one are computed again."""
     monkeypatch.setattr(tiles, "_SPAN", 200.0)
     axes, dense = dense_axes(chart, 400)
     assert dense == 1.0
@@ -173,7 +174,7 @@ def polynomial(sigma):
 
 
 def test_nothing_crosses_the_unit_circle_within_the_errors():
-    """Where it is said that no multiplier crosses, perturbations within the errors leave as many inside."""
+    """In settled lanes, perturbations within the errors do not change the number of multipliers inside the circle."""
     rng, n = np.random.default_rng(4), 4000
     angle, size = np.pi * rng.random((2, n)), np.exp(rng.normal(-0.01, 0.02, (2, n)))
     size[1] = np.where(rng.random(n) < 0.5, 0.97, size[1])
@@ -219,7 +220,7 @@ SPEEDS = {"rise": [0.3, 1.1, 1.9], "fall": [1.9, 1.1, 0.3], "any": [1.9, 0.3, 1.
 @pytest.mark.parametrize("angles", ANGLES)
 @pytest.mark.parametrize("speeds", SPEEDS)
 def test_axes_in_any_order(chart, angles, speeds):
-    """Each with each: 1/Omega falls where Omega rises, and what is even in beta has negative angles out of order."""
+    """1/Omega falls where Omega rises, and an even coordinate of beta changes the order of negative angles."""
     beta, omega = np.array(ANGLES[angles]), np.array(SPEEDS[speeds])
     points = np.stack(np.meshgrid(beta, omega, indexing="ij"), axis=-1).reshape(-1, 2)
     expected = chart.at(np.abs(points))
@@ -236,7 +237,7 @@ def test_points_outside_are_left_to_direct_solves(chart):
     grid = chart.on_grid([np.array([0.5, 0.6]), np.array([1.0, 2.5])])
     assert (grid["outcome"][:, 1] == Outcome.LOST).all() and np.isfinite(grid["spectral_radius"][:, 0]).all()
     assert np.isnan(grid["spectral_radius"][:, 1]).all() and (grid["verdict"][:, 1] == UNDECIDED).all()
-    # Whatever was in the arrays before.
+    # The former content of given arrays does not matter.
     out = {name: np.ones_like(values) for name, values in grid.items()}
     again = chart.on_grid([np.array([0.5, 0.6]), np.array([1.0, 2.5])], out=out)
     assert all(again[name] is out[name] and np.array_equal(out[name], grid[name], equal_nan=True) for name in grid)
@@ -295,7 +296,7 @@ def test_closed_form_on_known_multipliers(kind):
 
 
 def test_bound_covers_multipliers_that_errors_may_make_larger():
-    """A simple one at 1 and two that nearly coincide a little further in: errors move these by their root, beyond 1."""
+    """A simple multiplier is at 1, and two nearly double ones are inside: errors move these by their root, beyond 1."""
     rng, n = np.random.default_rng(5), 300
     inner = 1 - 10.0 ** rng.uniform(-6, -3, n)
     sigma = np.stack([np.ones(n), np.full(n, 0.2), -inner, -inner * (1 - 1e-5)]).astype(complex)
@@ -329,7 +330,7 @@ def test_worst_cells_against_precise_values(chart):
 
 
 def test_the_attack_finds_bounds_that_are_too_narrow(chart, monkeypatch):
-    """Bounds a millionth as wide, and verdicts the other way round, are counted; as they are, none is."""
+    """Violations are counted for bounds a millionth as wide and inverted verdicts, and none for the true ones."""
     case, size = CASES[0], Size(60, 40, 1)
     row = attack(case, size, chart)
     assert [row[name] for name in COUNTS] == [0] * 4 and 0 < row["random_precise"] < 1
@@ -349,8 +350,10 @@ def test_the_attack_finds_bounds_that_are_too_narrow(chart, monkeypatch):
 @pytest.mark.full
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_charts_hold_everywhere(case):
-    """10,000 random points, the 10,000 cells nearest rho = 1 and the 10,000 with the widest bound; of each the 50 worst
-    against precise values."""
+    """No error exceeds its bound at 10,000 random points, 10,000 cells nearest rho = 1 and 10,000 with the widest bound.
+
+    Of each kind the 50 worst are compared with precise values.
+    """
     row = attack(case, Size(side=1500), case.build())
     assert row["solves"] == 64 and row["gaps"] == 0 and row["bytes"] < 10e6
     assert row["z_error"] < case.tolerance

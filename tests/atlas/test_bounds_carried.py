@@ -1,4 +1,4 @@
-"""Errors that are put into an atlas, or left out of an evaluation, must come out as bounds, whichever way is taken."""
+"""On every path of evaluation the bounds include the errors of the atlas and the truncation errors of the evaluation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DENSE, SPARSE = np.linspace(1.0, 1.3, 512), np.linspace(0.3, 2.0, 16)
 
 
 def with_error(atlas, error=ERROR):
-    """The same as if its propagator were known to ``error`` only."""
+    """The same atlas with panels whose bounds are ``error``."""
     panels = tuple(replace(p, value_error=error, derived_error=np.full(3, error)) for p in atlas.atlas.panels)
     return StabilityAtlas(replace(atlas.atlas, panels=panels), atlas.build, atlas.rtol)
 
@@ -47,7 +47,7 @@ def test_the_error_of_a_panel_comes_out_as_a_bound(chart, coarse, way):
 
 
 def test_what_an_expansion_leaves_out_comes_out_as_a_bound(chart, monkeypatch):
-    """Of each box fewer polynomials than are needed."""
+    """Each box has fewer polynomials than needed."""
     monkeypatch.setattr(expansion, "_PART", 1e4)
     poor = StabilityAtlas(chart.atlas, chart.build, chart.rtol)
     points = random_points(chart, 300, seed=3)
@@ -57,7 +57,7 @@ def test_what_an_expansion_leaves_out_comes_out_as_a_bound(chart, monkeypatch):
 
 
 def test_on_a_boundary_a_coarse_atlas_does_not_decide(chart, coarse):
-    """The left edge of S21 by bisection, to rounding."""
+    """The boundary is the left edge of S21, by bisection down to rounding."""
     below, above = 1.3, 1.416
     for _ in range(45):
         middle = (below + above) / 2
@@ -69,14 +69,14 @@ def test_on_a_boundary_a_coarse_atlas_does_not_decide(chart, coarse):
 
 
 def test_undamped_tongue_narrower_than_the_error_is_undecided(undamped):
-    """S21 at beta = 0.001, where an exact atlas finds it."""
+    """At beta = 0.001 an accurate atlas finds S21; an atlas with an error of 1e-5 does not decide."""
     point = np.array([[1e-3, 1.4159846397197]])
     assert undamped.at(point)["verdict"].tolist() == [1]
     assert with_error(undamped, 1e-5).at(point)["verdict"].tolist() == [2]
 
 
 def test_rounding_of_the_coefficients_is_bounded():
-    """The same sums in double precision and in a longer one."""
+    """Sums in double precision are compared with sums in extended precision."""
     phi = np.random.default_rng(6).normal(size=(16, 2000))
     found, bounds = quartic.invariants(quartic.blocks(phi))
     exact = invariants(monodromy(phi.astype(np.longdouble)))

@@ -1,4 +1,4 @@
-"""Construction on functions that are known: rounds, panels, splits, and what is not smooth."""
+"""Construction of atlases of known functions: rounds, panels, splits, and functions that are not smooth."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def stepped(p):
 def test_gap_of_a_function_that_is_not_smooth_is_solved_directly(function):
     atlas = run(construct(SQUARE, Quantity(1), 1e-8), function)
     assert atlas.gaps and atlas.panels and atlas.solves < 20_000
-    # The boxes that were given up hold the kink, and are small against the domain.
+    # The gaps contain the kink and are small compared with the domain.
     assert all("not smooth" in gap.reason and gap.lower[0] <= 0.3 <= gap.upper[0] for gap in atlas.gaps)
     points = sample(SQUARE)
     found, bound = values_at(atlas, points)
@@ -201,7 +201,7 @@ def test_slice_names_what_it_lacks():
 
 
 def test_function_beyond_the_range_of_numbers_ends_as_gaps():
-    """Relative to its least values no coefficient is small enough."""
+    """No coefficient is small enough relative to the smallest values."""
 
     def solve(points):
         return np.exp(-1 / points)

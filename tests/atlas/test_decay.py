@@ -1,4 +1,4 @@
-"""How coefficients fall, and what that says of those that are not there."""
+"""Decay of coefficients, and extrapolation to the truncated ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ def test_a_tail_of_rounding_leaves_nothing_out():
 
 
 def test_a_little_more_than_a_line_shows_is_foreseen():
-    """Of a geometric fall exactly, of a faster one not below; not of a kink, of noise or of what is far away."""
+    """The number is exact for geometric decay and not too small for faster decay.
+
+    It is None for a kink, for noise, and for a limit that is far away.
+    """
     geometric = 0.2 ** np.arange(17.0)
     assert foreseen(geometric, 0.2**20.5) == 21 == needed(0.2 ** np.arange(40.0), 0.2**20.5)
     assert foreseen(geometric, 0.2**30) is None

@@ -43,7 +43,7 @@ def test_widest_angle_is_that_of_the_lowest_tip(atlas):
 
 
 def test_widest_angle_at_the_end_of_the_range(atlas):
-    """Between the tongues the first angle to fail is at an end of the speeds."""
+    """Between tongues the smallest unstable angle is at an end of the range of speeds."""
     answer = widest_angle(atlas, CARDAN, (0.8, 1.3), {}, direct=direct)
     assert answer.limit.point["Omega"] == 1.3 and answer.check.agrees
     beta = np.linspace(0.0, 1.1, 2001)
@@ -76,7 +76,7 @@ def test_no_damping_of_the_atlas_will_do(damped):
 
 
 def test_nothing_is_denied_where_the_safe_end_is_undecided():
-    """With next to no damping and stability lost close to beta = 0, within the errors: small angles will do."""
+    """With very little damping stability ends near beta = 0, within the errors, although small angles are stable."""
     fixed = {**BASE, "zeta": 1e-7, "gamma": 1.0}
     faint = cardan_atlas({"beta": (0.0, 1.5), "Omega": (0.3, 2.0)}, 1e-11, fixed).atlas
     answer = widest_angle(faint, CARDAN, (1.0, 2.0), {}, direct=direct)
@@ -89,7 +89,7 @@ def test_nothing_is_denied_where_the_safe_end_is_undecided():
 
 
 def test_a_part_narrower_than_its_errors_is_not_tested(undamped):
-    """At beta = 0 no multiplier is unstable; where two double roots meet the atlas cannot tell."""
+    """At beta = 0 no multiplier is unstable; the atlas is undecided where two double roots meet."""
     line = stability_along(undamped.atlas.slice({"beta": 0.0}), CARDAN)
     assert [(i.lower, i.upper, i.stable) for i in line.intervals] == [(0.3, 2.0, True)]
     assert line.undecided and max(b - a for a, b in line.undecided) < 1e-5
@@ -103,18 +103,18 @@ def candidates(*values, error=1e-10):
 @pytest.mark.parametrize(
     ("changes", "undecided", "expected"),
     [
-        # The edge twice: one change, wherever of the two.
+        # Two candidates for one edge: one change at either of them.
         (candidates(0.4, 0.4 + 1e-10), [], [(0.0, 0.4, True), (0.4, 1.0, False)]),
-        # Between two candidates nothing is decided: the change is at neither of them for certain.
+        # The whole range between two candidates is undecided: the change may be at either of them.
         (candidates(0.3, 0.5), [(0.29, 0.51)], [(0.0, 0.29, True), (0.51, 1.0, False)]),
-        # Up to the first change, and from it on, nothing is decided.
+        # The whole range below the candidate, above it, or on both sides is undecided.
         (candidates(0.4), [(0.0, 0.4)], [(0.4, 1.0, False)]),
         (candidates(0.4), [(0.4, 1.0)], [(0.0, 0.4, True)]),
         (candidates(0.4), [(0.0, 1.0)], []),
     ],
 )
 def test_a_line_of_candidates(changes, undecided, expected):
-    """Stable below 0.4."""
+    """The line is stable below 0.4."""
     line = _line("beta", (0.0, 1.0), changes, undecided, lambda values: values < 0.4)
     assert [(i.lower, i.upper, i.stable) for i in line.intervals] == [
         (pytest.approx(a), pytest.approx(b), stable) for a, b, stable in expected
@@ -126,13 +126,13 @@ def test_a_line_of_candidates(changes, undecided, expected):
 @pytest.mark.parametrize(
     ("undecided", "suspects", "value", "error"),
     [
-        # The candidate is at the end of what is undecided: the change may be anywhere in it.
+        # The candidate is at an end of the undecided range: the change may be anywhere in this range.
         ((0.3995, 0.4), [], 0.4, 5e-4),
         ((0.4, 0.4004), [], 0.4, 4e-4),
         # A likely tip is nearer to the stable part.
         ((0.3995, 0.4), [0.3998], 0.3998, 3e-4),
         ((0.3995, 0.4), [0.3, 0.5], 0.4, 5e-4),
-        # Too wide a range: all that is known is where it begins.
+        # Too wide a range for an error: it has no crossing.
         ((0.39, 0.4), [0.395], None, None),
     ],
 )
@@ -148,7 +148,7 @@ def test_error_of_a_change_covers_undecided_ranges(undecided, suspects, value, e
         assert (crossing.value, crossing.error) == (value, pytest.approx(error))
 
 
-# Tips that atlases at rtol 1e-11 have, to some 1e-11.
+# Tips of atlases at rtol 1e-11, accurate to some 1e-11.
 H21, S21 = (0.5366555069660, 0.70865547138956), (0.1063331213411, 1.41598816034540)
 
 
@@ -156,7 +156,7 @@ H21, S21 = (0.5366555069660, 0.70865547138956), (0.1063331213411, 1.415988160345
     ("tip", "half", "error"), [(S21, 3e-7, 2e-9), (S21, 3e-6, 1e-7), (H21, 1e-6, 1e-7), (H21, 1e-3, 1e-9)]
 )
 def test_the_widest_angle_between_the_flanks_of_a_tongue(atlas, tip, half, error):
-    """At the ends of so narrow a range of speeds the tongue is no wider than what is undecided at its tip."""
+    """At the ends of so narrow a range of speeds the tongue is no wider than the undecided range at its tip."""
     answer = widest_angle(atlas, CARDAN, (tip[1] - half, tip[1] + half), {}, direct=direct)
     assert abs(answer.value - tip[0]) < 1e-10
     assert 1e-12 < answer.error < error
@@ -174,7 +174,7 @@ def test_a_check_looks_right_inside_the_error(atlas, monkeypatch, beyond, agrees
 
 
 def test_a_check_follows_the_ridge_of_a_narrow_tongue():
-    """With next to no damping the error covers an undecided range; at its end the tongue has left the speed of its tip."""
+    """With very little damping the error covers an undecided range; at its end the tongue is not at the speed of its tip."""
     fixed = {"zeta": 1.0165e-5, "alpha": 0.13975, "mu": 1.0822, "gamma": 1.09888}
     slender = cardan_atlas({"beta": (0.0, 0.8), "Omega": (0.39, 0.43)}, 1e-11, fixed).atlas
     answer = widest_angle(slender, CARDAN, (0.4, 0.42), {}, direct=direct)
@@ -220,7 +220,7 @@ def test_what_is_stable_away_from_an_unstable_safe_end(ask, ranges, fixed, speed
 
     inside, outside = (low * 1.0001, (low + high) / 2, high * 0.9999), (low * 0.9999, high * 1.0001, safe_end)
     assert max(map(largest, inside)) < 1 < min(map(largest, outside))
-    # 101 speeds, that of the crossing and the worst one inside either end, the last two beyond it.
+    # For each end: 101 speeds, the speed of the crossing and the worst one inside, and the last two also beyond.
     assert answer.check.agrees and answer.check.solves == 2 * (103 + 2)
     assert answer.check.inside < 1 < answer.check.beyond
 
@@ -249,12 +249,12 @@ def test_speed_windows_with_a_margin(atlas):
         if window.interval.upper_end:
             assert window.safe[1] == pytest.approx(0.99 * window.interval.upper, rel=1e-6)
         assert window.largest < 1
-    # Narrow windows have no room for a wide margin.
+    # Narrow windows vanish with a wide margin.
     assert len(speed_windows(atlas, CARDAN, {"beta": 1.0}, margin=0.1).windows) < len(windows)
 
 
 def test_what_is_undecided_is_no_safe_speed(atlas):
-    """A gap in the middle of the stable speeds from .772 to 1.247, where the interval is tested otherwise."""
+    """A gap is in the middle of the stable speeds from .772 to 1.247, where an interval is usually tested."""
     below, above = narrow(atlas, {"Omega": (0.3, 0.95)}), narrow(atlas, {"Omega": (1.1, 2.0)})
     corners = np.sort(atlas.to_coordinates(np.array([[0.0, 0.95], [1.1, 1.1]])), axis=0)
     cut = replace(atlas, panels=(*below.panels, *above.panels), gaps=(Gap(*corners, "cut out"),))

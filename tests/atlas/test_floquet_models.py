@@ -1,4 +1,4 @@
-"""What a system declares for its atlas: a model of `floquet` beside it, and coordinates, which it may leave out."""
+"""Declarations of a system for its atlas: a model of `floquet`, which is required, and coordinates, which are optional."""
 
 from __future__ import annotations
 

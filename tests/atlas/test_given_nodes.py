@@ -26,14 +26,14 @@ WAVES = Quantity(2, derived=lambda values: values[:, :1] * values[:, 1:])
 
 
 def waves(points):
-    """Turns by some 20 rad along ``s``, and by a part of that along ``x``."""
+    """A function that turns by some 20 rad along ``s``, and by a fraction of that along ``x``."""
     x, s = points[:, 0], points[:, -1]
     angle = s * (1 + 0.3 * np.sin(2 * x)) + (0.2 * points[:, 1:-1].sum(axis=1))
     return np.stack([np.cos(angle), np.exp(0.3 * x) * np.sin(angle)], axis=1)
 
 
 class Lines:
-    """A source that gives ``function`` along the last coordinate, and notes what it was asked for."""
+    """A source that gives ``function`` along the last coordinate, and records the requested grids."""
 
     positions = 8
 
@@ -56,7 +56,7 @@ def sample(domain=SQUARE, count=2000):
 
 
 def holds(atlas, function=waves, domain=SQUARE):
-    """Whether everything is covered, within its bounds and the tolerance."""
+    """True if all points are covered, with errors within their bounds and the tolerance."""
     points = sample(domain)
     found, bound = values_at(atlas, points)
     error = np.linalg.norm(found - function(points), axis=1)
@@ -68,13 +68,13 @@ def test_only_held_out_points_are_solved_and_bounds_hold():
     atlas = run(construct(SQUARE, WAVES, TOLERANCE, source=source), waves)
     alone = run(construct(SQUARE, WAVES, TOLERANCE), waves)
     assert holds(atlas) and atlas.solves == 64 < alone.solves / 10
-    # What is interpolated is the same function, and no more of it is kept than matters.
+    # Both atlases interpolate the same function, and drop negligible coefficients.
     assert atlas.panels[0].degrees == pytest.approx(alone.panels[0].degrees, abs=4)
     assert all(count[1] % 8 == 0 for count in source.asked)
 
 
 def test_a_tensor_grows_where_it_is_not_resolved():
-    """Twice as fast along the lines as the source thinks, and along x so that 32 nodes are not enough."""
+    """The function turns twice as fast along the lines as the source predicts, and needs more than 32 nodes along x."""
 
     def faster(points):
         return waves(points * [1.0, 2.0])
@@ -91,7 +91,7 @@ def test_lines_that_turn_too_far_are_halved_first():
     source = Lines(domain)
     atlas = run(construct(domain, WAVES, TOLERANCE, source=source), waves)
     assert holds(atlas, domain=domain) and len(atlas.panels) == 2
-    # Two corners are those of both.
+    # Two corners belong to both panels.
     assert atlas.solves == 126
     assert all(source.rate * np.ptp([panel.lower[1], panel.upper[1]]) / 2 < 128 for panel in atlas.panels)
     assert len(source.asked) <= 6
@@ -125,7 +125,7 @@ def test_many_coordinates_are_looked_at_along_the_edges_first():
 
 @pytest.mark.parametrize("domain", [SQUARE, replace(SQUARE, lower=(0.3, 1.0), upper=(0.3, 30.0))], ids=["wide", "thin"])
 def test_nodes_that_are_not_what_is_solved_are_not_used(domain):
-    """A millionth off, they are seen by held-out points, and all nodes are solved instead."""
+    """Held-out points show nodes with a relative error of a millionth; all nodes are then solved instead."""
     source = Lines(domain, lambda points: (1 + 1e-6) * waves(points))
     atlas = run(construct(domain, WAVES, TOLERANCE, source=source), waves)
     assert holds(atlas, domain=domain) and not atlas.gaps and atlas.solves > 64
@@ -152,7 +152,7 @@ def test_boxes_are_halved_down_to_a_kink_which_is_a_gap():
 
 @pytest.mark.parametrize("told", [True, False])
 def test_bounds_include_what_all_solves_are_wrong_by(told):
-    """Nodes and solves wrong alike, which no held-out point can show, but solves know it."""
+    """Nodes and solves have the same error, which held-out points cannot show, but which solves may report."""
 
     def off(points):
         return (1 + 1e-7) * waves(points)
@@ -219,7 +219,7 @@ def test_grid_is_in_c_order_for_any_order_of_parameters():
 
 
 def test_a_coordinate_may_be_negative(monkeypatch):
-    """-1/Omega: the same lines, from their other ends."""
+    """The coordinate -1/Omega gives the same lines from their other ends."""
     axes = [np.array([0.3, 1.2]), np.linspace(0.5, 5.0, 48)]
     one = series_nodes(CARDAN, domain_of(RANGES), 1e-11)
     forward, inverse = (lambda x: -1 / np.asarray(x),) * 2
@@ -234,7 +234,7 @@ def test_a_coordinate_may_be_negative(monkeypatch):
 
 
 def test_parts_by_predicted_steps_are_short_enough():
-    """Random shafts, with the number of parts that an atlas takes for each, against three times as many."""
+    """Random shafts with the number of parts of an atlas are compared with three times as many parts."""
     lanes, random = 16, np.random.default_rng(1)
     columns = {
         "beta": random.uniform(0.0, 1.55, lanes),
@@ -266,7 +266,7 @@ def test_lines_that_leave_out_too_much_are_computed_again(monkeypatch):
 
 @pytest.mark.parametrize("wrong", [Series("mu", first=2), Series("Omega", first=1), Series("zeta", first=2)])
 def test_a_wrong_declaration_costs_time_and_no_digit(monkeypatch, wrong):
-    """What is no power series in mu, has other entries without 1/Omega, or is quadratic in zeta."""
+    """The propagator is not a power series in mu, has other entries without 1/Omega, or is quadratic in zeta."""
     model = CARDAN.models["atlas"]
     smooth = Smoothness(model.smooth.coordinates, series=wrong)
     monkeypatch.setitem(CARDAN.models, "atlas", replace(model, smooth=smooth))

@@ -38,7 +38,7 @@ def test_error_lies_within_tolerance_and_bound(atlas):
 
 
 def test_it_is_the_determinant_of_the_paper(atlas):
-    """The two differ by the shares of the supports and a power of the frequency, from the units of the states."""
+    """The determinants differ by factors of the supports and a power of the frequency, from the units of the states."""
     phase, k = np.array([1.5, 2.6, 4.1, 5.2]), np.full(4, 2e7)
     bar, q = shaft(jnp.array(k)), phase / total_length()
     plain = np.asarray(plain_determinant(bar, jnp.array(q))) * np.exp(-phase)

@@ -1,4 +1,4 @@
-"""Tables of docs/theory: tips of the base case, and how many polynomials each coordinate of the angle needs."""
+"""Tables of docs/theory: tips of the base case, and numbers of polynomials for each coordinate of the angle."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_tips_of_the_page():
 
 
 def needed(forward, backward, top: float, speed: float, count: int = 96) -> int:
-    """Polynomials up to the last coefficient above 1e-11 of the largest entry of Phi."""
+    """Number of polynomials up to the last coefficient above 1e-11 of the largest entry of Phi."""
     nodes = np.pi * (np.arange(count) + 0.5) / count
     x = forward(top) * (1 + np.cos(nodes)) / 2
     phi = propagators({**BASE, "beta": backward(x), "Omega": speed}, 1e-14)
@@ -45,5 +45,5 @@ def test_polynomials_that_the_coordinates_of_the_angle_need():
     for top, *printed in rows:
         for (forward, backward), number in zip(COORDINATES, printed, strict=True):
             found = max(needed(forward, backward, float(top), speed) for speed in (0.1, 0.3, 1.0))
-            # The last coefficient may lie at the limit.
+            # The last coefficient may be at the limit.
             assert abs(found - int(number)) <= 1

@@ -17,7 +17,7 @@ BETA = np.pi / 6
 
 @pytest.fixture(scope="module")
 def stiffnesses():
-    """Part of Fig. 7, in which C+2 has a gap."""
+    """The atlas of the part of Fig. 7 in which C+2 has a gap."""
     return cardan_atlas({"mu": (4.0, 6.5), "Omega": (0.62, 0.72)}, 1e-11, {**BASE, "beta": BETA}).atlas
 
 
@@ -27,11 +27,10 @@ def combination(mu):
 
 
 def meeting(beta, omega, mu, steps=13):
-    """Omega where two pairs of multipliers meet without damping, and the discriminant there, followed from ``beta`` to 0.04
-    times it in ``steps``.
+    """Omega at which two pairs of multipliers meet without damping, and the discriminant there.
 
-    The discriminant of sigma + 1/sigma is least there, and negative by the square of the growth: samples and parabolas on
-    direct solves, no atlas.
+    The point is followed from ``beta`` down to 0.04 ``beta`` in ``steps``. It is the minimum of the discriminant of
+    sigma + 1/sigma, which is minus the square of the growth. The minimum comes from parabolas through direct solves.
     """
     x = np.linspace(-1, 1, 5)
     for angle in beta * np.linspace(1.0, 0.04, 13)[:steps]:
@@ -55,20 +54,20 @@ def test_tips_over_the_stiffness_ratio_have_the_resonance_name(stiffnesses):
 
 
 def test_the_coupling_of_c2_passes_zero_within_its_gap():
-    """Without damping the growth falls to nothing from either side: at 5.5 it is a tenth of that one further on."""
+    """Without damping the growth falls to 0 from both sides: at mu = 5.5 it is less than a tenth of that at 4.5 and 6.5."""
     growth = [np.sqrt(max(-meeting(BETA, combination(mu), mu, 1)[1], 0.0)) for mu in (4.5, 5.5, 6.5)]
     assert growth[1] < 0.1 * min(growth[0], growth[2])
 
 
 def test_orders_suffice_for_every_resonance_of_an_atlas(stiffnesses):
-    """Over the stiffness ratio the fastest are at its upper end: S217 is 4.60/33."""
+    """Over the stiffness ratio the fastest resonances are at its upper end: S217 is at 4.60/33."""
     wide = replace(stiffnesses, lower=np.array([1.0, 0.139]), upper=np.array([20.0, 2.0]))
     speed = float(natural_frequencies(20.0, 100.0)[1]) / 33
     assert naming._name(wide, CARDAN, "-1", wide.to_coordinates(np.array([20.0, speed]))) == "S217"
 
 
 def test_each_tongue_over_the_stiffness_ratio_has_one_curve(stiffnesses):
-    """From rim to rim through its tip: seeds on the rim are recognised as its ends."""
+    """A curve runs from rim to rim through its tip, and seeds on the rim are recognised as its ends."""
     curves = boundaries(stiffnesses, CARDAN)
     assert sorted(float(curve.points["mu"].max()) for curve in curves) == pytest.approx([5.015, 6.5], abs=1e-3)
     for curve in curves:

@@ -1,4 +1,4 @@
-"""Tips of tongues: found by exclusion, polished, named; against independent root finding on direct solves."""
+"""Tips of tongues: exclusion, polish and names, compared with independent root finding on direct solves."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from drivetrain_jax.runs.atlas_answers import radius_gradient
 from tests.oracles.atlas_direct import BASE, CARDAN, cardan_atlas, monodromy, propagators
 from tests.oracles.cardan_reference import monodromy as reference_monodromy
 
-# By root finding on direct solves (`direct_tip` below, at rtol 1e-14): beta, Omega. That of C-1, where two multipliers
-# nearly coincide, by the same on values to 30 digits (tests.oracles.cardan_precise_reference).
+# beta and Omega of the tips by root finding on direct solves (`direct_tip` below, at rtol 1e-14). For C-1, where two
+# multipliers nearly coincide, the values have 30 digits (tests.oracles.cardan_precise_reference).
 TIPS = {
     "S11": (0.0237682936, 0.0706222355),
     "S21": (0.1063331213, 1.4159881603),
@@ -62,7 +62,7 @@ def rate(beta, omega, **others):
 
 
 def direct_tip(beta, omega, shift=1e-5, narrowed=4, **others):
-    """The tip near (beta, omega): the largest rate over Omega is 0. Samples and parabolas on direct solves, no atlas."""
+    """The tip near (beta, omega), where the largest rate over Omega is 0, by parabolas through direct solves."""
     start, beta = beta, beta * (1 + shift)
 
     def peak(beta, omega):
@@ -116,7 +116,7 @@ def test_tips_against_root_finding_on_direct_solves(tips, name):
 @pytest.mark.full
 @pytest.mark.parametrize("name", list(TIPS))
 def test_reference_tips(name):
-    # Next to a double multiplier rates are rounded to 1e-8 or so: the parabola has to be wider than for narrow tongues.
+    # Near a double multiplier rates have errors of some 1e-8, so the parabola must be wider than for narrow tongues.
     beta, omega = direct_tip(TIPS[name][0], TIPS[name][1], narrowed=1 if name == "C-1" else 4)
     assert TIPS[name] == (pytest.approx(beta, abs=2e-10), pytest.approx(omega, abs=1e-8))
 
@@ -162,7 +162,7 @@ def test_derivatives_of_the_growth_rate(atlas):
 
 
 def test_exclusion_finds_what_it_should(atlas):
-    """A tongue that is cut off by the lower rim has no tip in the rectangle; one box more and it has."""
+    """The tip is found in a rectangle that contains it, and not in one whose lower rim is above it."""
     from drivetrain_jax.atlas.windows import narrow
 
     for low, expected in ((0.5, 1), (0.54, 0)):
@@ -188,7 +188,7 @@ def test_a_large_error_leaves_boxes_undecided(atlas):
 
 
 def test_a_tip_that_cannot_be_proved_is_listed_as_such(atlas):
-    """Newton's method on the multiplier still finds the tip of the surrogate, with a bound of how far off it may be."""
+    """Newton's method on the multiplier still finds the tip of the surrogate, with a bound of its error."""
     from drivetrain_jax.atlas.windows import narrow
 
     part = narrow(atlas, {"beta": (0.05, 0.2), "Omega": (1.38, 1.45)})
@@ -214,7 +214,7 @@ def test_a_name_belongs_to_a_resonance_of_the_same_multiplier(atlas):
     foot = atlas.to_coordinates(np.array([0.0, TIPS["S21"][1]]))
     assert naming._name(atlas, CARDAN, "-1", foot) == "S21"
     assert naming._name(atlas, CARDAN, "+1", foot) == ""
-    # Nor does one that is far from all, or as near to C+10 as to C-9.
+    # There is no name far from all resonances, or as near to C+10 as to C-9.
     assert naming._name(atlas, CARDAN, "-1", foot * [1, 1.03]) == ""
     assert naming._name(atlas, CARDAN, "pair", np.array([0.0, 1 / 0.07454])) == ""
     assert naming._name(atlas, CARDAN, "-1", np.array([0.0, np.nan])) == ""
@@ -249,17 +249,17 @@ def test_boundary_curves_are_boundaries(atlas, curves):
         x = atlas.to_coordinates(points[curve.limiting])
         assert np.abs(criteria.spectral_radius(x) - 1).max() < 1e-8
         lowest.append(points[:, 0].min())
-        # Connected: no step is longer than a fiftieth of the rectangle.
+        # The curve is connected: no step is longer than a fiftieth of the rectangle.
         step = np.diff(atlas.to_coordinates(points), axis=0) / np.ptp(
             atlas.to_coordinates([atlas.lower, atlas.upper]), axis=0
         )
         assert np.abs(step).max() < 0.02
-    # Every tongue has its one curve, through its tip, and none is left over.
+    # Every tongue has one curve, through its tip, and there are no other curves.
     assert sorted(lowest) == pytest.approx(sorted(beta for beta, _ in TIPS.values()), abs=1e-6)
 
 
 def test_only_what_bounds_the_stable_region_is_limiting(chart):
-    """The boundary of a tongue runs on inside another one that overlaps it."""
+    """The boundary of a tongue continues inside another tongue that overlaps it."""
     criteria, inside = Criteria.of(chart.atlas, CARDAN), 0
     for curve in boundaries(chart.atlas, CARDAN):
         x = chart.atlas.to_coordinates(np.stack([curve.points["beta"], curve.points["Omega"]], axis=-1))
@@ -271,7 +271,7 @@ def test_only_what_bounds_the_stable_region_is_limiting(chart):
 
 
 def test_curves_enclose_what_is_unstable(atlas, curves):
-    """Verdicts of random points against the number of curves crossed on the way from beta = 0."""
+    """Random points are unstable if the path from beta = 0 crosses an odd number of curves."""
     generator = np.random.default_rng(3)
     points = atlas.lower + (atlas.upper - atlas.lower) * generator.random((300, 2))
     radius = np.exp(rate(points[:, 0], points[:, 1]))
@@ -308,7 +308,7 @@ def test_undamped_boundaries_separate_bounded_and_growing_motion(undamped):
 
 
 def test_limits_without_damping_allow_for_a_loose_atlas():
-    """Multipliers that meet on the unit circle leave it by the root of the atlas's error; other tongues lead farther."""
+    """Multipliers that meet on the unit circle leave it by the root of the atlas's error, in other tongues by more."""
     fixed = {**BASE, "zeta": 0.0, "gamma": 1.0}
     atlas = cardan_atlas({"beta": (0.6, 1.5), "Omega": (0.5, 2.0)}, 1e-3, fixed).atlas
     outside, limiting = [], []
@@ -333,7 +333,7 @@ def test_the_gradient_of_a_tip():
 
 def test_gradients_of_the_radius():
     point = {**BASE, "beta": 0.9, "Omega": 0.71}
-    # Without damping all four lie on the circle, and what is left of derivatives is rounding.
+    # Without damping all four multipliers lie on the circle, and derivatives of the radius are rounding.
     assert radius_gradient(CARDAN, {**point, "beta": 0.3, "Omega": 1.2, "zeta": 0.0}) is None
     for name, slope in radius_gradient(CARDAN, point).items():
         h = 1e-5 * point[name]
@@ -344,7 +344,7 @@ def test_gradients_of_the_radius():
 
 @pytest.mark.parametrize(("inside", "exists"), [(1e-15, False), (1e-10, True)])
 def test_gradient_at_multipliers_equal_to_rounding(inside, exists):
-    """The edge of S21 without damping, in 30 digits: beside it d rho/d Omega = 0.20180 (Omega - edge)^(-1/2)."""
+    """Near the edge of S21 without damping, known to 30 digits, d rho/d Omega = 0.20180 (Omega - edge)^(-1/2)."""
     edge = 1.4001277838891882126
     point = {**BASE, "zeta": 0.0, "beta": 0.3, "Omega": edge + inside}
     found = radius_gradient(CARDAN, point)
@@ -360,7 +360,7 @@ def test_no_gradient_of_a_radius_below_the_smallest_number():
 
 
 def test_with_little_damping_points_in_a_tongue_bound_nothing():
-    """The edge of the tongue of -1 runs through that of a pair, in which multipliers grow by no more than 7e-8."""
+    """The edge of the tongue of -1 runs through the tongue of a pair, in which multipliers grow by at most 7e-8."""
     fixed = {**BASE, "zeta": 1e-5, "mu": 3.0}
     atlas = cardan_atlas({"beta": (1.0, 1.2), "Omega": (1.45, 1.6)}, 1e-11, fixed).atlas
     (minus,) = (b for b in boundaries(atlas, CARDAN) if b.multiplier == "-1")

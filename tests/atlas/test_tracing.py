@@ -1,4 +1,4 @@
-"""Exclusion and tracing on polynomials of which everything is known."""
+"""Exclusion and tracing on known polynomials."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from drivetrain_jax.atlas.patches import Patches, join
 
 
 def one_patch(coefficients, error=0.0):
-    """The polynomial with these coefficients over [-1, 1]^2, known but for this error."""
+    """The polynomial with these coefficients over [-1, 1]^2, with this error."""
     square = np.ones((1, 2))
     return Patches(-square, square, np.array(coefficients)[..., None], np.zeros((1, 1, 1)), np.full(1, error), square)
 
@@ -22,8 +22,10 @@ def one_patch(coefficients, error=0.0):
     [(0.0, 0.0, True), (0.0, 0.3, True), (2.0, 0.0, False), (0.5, 0.7, False), (-0.5, 0.7, False)],
 )
 def test_a_box_without_a_tip_is_not_one_with_a_single_tip(shift, error, expected):
-    """f = h^2 - v has its tip at 0; of f = h^2 - v - 2 the whole floor of the valley is negative; and it may be where an
-    error is larger than f at either end of the floor."""
+    """f = h^2 - v has its tip at 0; for f = h^2 - v - 2 the floor of the valley is negative throughout.
+
+    The floor may also be negative throughout if an error is larger than f at either of its ends.
+    """
     bundle = exclusion._Bundle(one_patch([[0.5 - shift, -1.0], [0.0, 0.0], [0.5, 0.0]], error), 0)
     assert bundle.single().tolist() == [expected]
 
@@ -35,7 +37,7 @@ def test_valley_farther_from_zero_than_its_error_is_excluded(floor, error, expec
 
 
 def test_a_tip_on_the_face_of_two_boxes_is_one_tip():
-    """h^2 - v over v <= 0 and over v >= 0."""
+    """h^2 - v is given over v <= 0 and over v >= 0."""
     halves = [
         replace(one_patch([[0.5 - middle, -0.5], [0.0, 0.0], [0.5, 0.0]], 1e-6), lower=np.array([[-1.0, middle - 0.5]]))
         for middle in (-0.5, 0.5)
@@ -53,7 +55,7 @@ def test_what_trimming_leaves_out_is_added_to_the_error():
 
 
 def test_a_curve_is_traced_both_ways_from_its_seed():
-    """The parabola h = (2 v^2 - 1)/5 from near its vertex to the rim."""
+    """The seed is near the vertex of the parabola h = (2 v^2 - 1)/5, which ends at the rim."""
     field = tracing.Field(one_patch([[0.0, 0.0, -0.2], [1.0, 0.0, 0.0]]))
     (curve,) = tracing.trace(field, np.array([[-0.21, 0.0]]))
     h, v = curve.T
@@ -63,17 +65,17 @@ def test_a_curve_is_traced_both_ways_from_its_seed():
 
 
 def test_a_closed_curve_ends_where_it_began():
-    """The circle of radius 1/2, from near it."""
+    """The seed is near the circle of radius 1/2."""
     field = tracing.Field(one_patch([[0.75, 0.0, 0.5], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]))
     (curve,) = tracing.trace(field, np.array([[0.51, 0.0]]))
     assert np.array_equal(curve[0], curve[-1])
     assert np.linalg.norm(curve, axis=1) == pytest.approx(np.full(len(curve), 0.5), abs=1e-12)
-    # Around once.
+    # The path goes around once.
     assert np.linalg.norm(np.diff(curve, axis=0), axis=1).sum() == pytest.approx(np.pi, rel=1e-3)
 
 
 def test_the_other_edge_of_a_narrow_tongue_is_another_curve():
-    """h^2 = 1e-8: the edges are nearer to each other than chords are to curves."""
+    """The edges of h^2 = 1e-8 are nearer to each other than chords are to curves."""
     field = tracing.Field(one_patch([[0.5 - 1e-8, 0.0], [0.0, 0.0], [0.5, 0.0]]))
     v = np.linspace(-1.0, 1.0, 101)
     edge = np.stack([np.full(101, 1e-4), v], axis=-1)
@@ -89,7 +91,7 @@ def test_parts_that_bound_nothing_are_left_out():
 
 
 def test_a_path_ends_on_the_rim():
-    """Straight across, both ends are on it; bent, the last step is corrected along it."""
+    """A straight path has both ends on the rim; on a bent one the last step is corrected along the rim."""
     (curve,) = tracing.trace(tracing.Field(one_patch([[-0.3, 0.0], [1.0, 0.0]])), np.array([[0.3, 0.1]]))
     assert sorted(curve[[0, -1], 1]) == [-1.0, 1.0]
 
@@ -102,7 +104,7 @@ def test_a_path_ends_on_the_rim():
 
 
 def test_a_path_that_runs_along_the_rim_ends_where_it_is():
-    """Both of its points lie outside by rounding: the line through them meets the rim far away."""
+    """Both points of a step lie outside by rounding, and the line through them meets the rim far away."""
 
     def field(y):
         return np.zeros(len(y)), np.tile([1.0, 0.0], (len(y), 1))
@@ -113,8 +115,10 @@ def test_a_path_that_runs_along_the_rim_ends_where_it_is():
 
 @pytest.mark.parametrize(("foot", "width"), [(-0.5, 1e-6), (0.0, 1e-6), (0.0, 1e-7)])
 def test_points_lie_on_the_edges_of_a_narrow_slanted_tongue(foot, width):
-    """(h - 0.3 v - 0.3 v^2)^2 = width (v - foot), slanted at its tip but for the first: slow convergence must not pass for a
-    point of the curve, nor both flanks lie on one edge."""
+    """The tongue is (h - 0.3 v - 0.3 v^2)^2 = width (v - foot), slanted at its tip except in the first case.
+
+    A point of slow convergence must not count as a point of the curve, and the flanks must lie on different edges.
+    """
     t = np.cos(np.pi * (np.arange(8) + 0.5) / 8)
     analysis = np.linalg.inv(np.polynomial.chebyshev.chebvander(t, 7))
     h, v = np.meshgrid(t, t, indexing="ij")
@@ -131,7 +135,7 @@ def test_points_lie_on_the_edges_of_a_narrow_slanted_tongue(foot, width):
 
 
 def test_steps_turn_by_what_chords_can_represent():
-    """A circle on which the turn limits the step: no step may turn by more than a quarter, none need turn by far less."""
+    """On this circle the turn limits the step: no step turns by more than a quarter, and none by far less."""
     radius = 0.02
 
     def field(y):
@@ -142,14 +146,16 @@ def test_steps_turn_by_what_chords_can_represent():
     angle = np.unwrap(np.arctan2(path[:, 1] - 0.5, path[:, 0] - 0.5))
     assert abs(angle[-1] - angle[0]) == pytest.approx(2 * np.pi)
     turns = np.abs(np.diff(angle))[-30:-2]
-    # It grows by 1.6 from below a twelfth of a radian.
+    # A step grows by 1.6 while it turns by less than a twelfth of a radian.
     assert turns.min() > 1 / 12 and turns.max() < 1.65 / 12
 
 
 @pytest.mark.parametrize(("shift", "end"), [(0.0015, 1.0), (0.004, 0.6)])
 def test_a_curve_beside_the_tangent_is_another_one(shift, end):
-    """A straight line that goes on elsewhere from v = 0.6, by a tenth and by a quarter of the longest step: with the same
-    tangent, only the size of the correction tells."""
+    """A straight line jumps at v = 0.6 by a tenth or a quarter of the longest step.
+
+    The tangent stays the same, so only the size of the correction shows the jump.
+    """
 
     def field(y):
         return y[:, 0] - 0.5 - shift * (y[:, 1] > 0.6), np.tile([1.0, 0.0], (len(y), 1))
@@ -159,7 +165,7 @@ def test_a_curve_beside_the_tangent_is_another_one(shift, end):
 
 
 def test_a_path_ends_where_the_function_does():
-    """Values only below v = 0.7: the step is divided until it is nothing, in few more evaluations."""
+    """The function has values only below v = 0.7: the step is divided down to the shortest one in few evaluations."""
     asked = []
 
     def field(y):
