@@ -63,7 +63,7 @@ def equal_to_rounding(points, grid, rtol):
     ).all()
 
 
-def test_grid_equals_points_and_holds_where_it_is_hardest(chart):
+def test_grid_equals_points_and_direct_solves_at_the_hardest_cells(chart):
     axes = [np.linspace(0.0, 1.5, 301), np.linspace(0.3, 2.0, 257)]
     found = chart.on_grid(axes)
     for chosen in (*hardest(found, 500), np.arange(0, found["verdict"].size, 157)):
@@ -197,7 +197,7 @@ def test_nothing_crosses_the_unit_circle_within_the_errors():
     assert (now != inside)[~settled].any()
 
 
-def test_it_decides_more_than_the_interval_of_the_radius():
+def test_schur_cohn_decides_more_than_the_interval_of_the_radius():
     """Two pairs near each other: the bound of rho is wide, but their product cannot reach the circle."""
     sigma = np.array([(1 - 2.3e-8) * np.exp(0.2995j), (1 - 8.6e-3) * np.exp(0.3154j)])
     e1, e2, e3, d = polynomial(np.concatenate([sigma, sigma.conj()])[:, None])

@@ -39,14 +39,14 @@ WAYS = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_the_error_of_a_panel_comes_out_as_a_bound(chart, coarse, way):
+def test_bounds_include_the_error_of_a_panel(chart, coarse, way):
     sharp, wide = WAYS[way](chart), WAYS[way](coarse)
     bound = wide["spectral_radius_error"]
     assert wide["spectral_radius"] == pytest.approx(sharp["spectral_radius"], rel=1e-9)
     assert (bound >= sharp["spectral_radius_error"]).all() and (bound > ERROR / 10).mean() > 0.99
 
 
-def test_what_an_expansion_leaves_out_comes_out_as_a_bound(chart, monkeypatch):
+def test_bounds_include_the_truncation_error_of_an_expansion(chart, monkeypatch):
     """Each box has fewer polynomials than needed."""
     monkeypatch.setattr(expansion, "_PART", 1e4)
     poor = StabilityAtlas(chart.atlas, chart.build, chart.rtol)
@@ -56,7 +56,7 @@ def test_what_an_expansion_leaves_out_comes_out_as_a_bound(chart, monkeypatch):
     assert np.median(found["spectral_radius_error"]) > 1e-8
 
 
-def test_on_a_boundary_a_coarse_atlas_does_not_decide(chart, coarse):
+def test_a_coarse_atlas_is_undecided_on_a_boundary(chart, coarse):
     """The boundary is the left edge of S21, by bisection down to rounding."""
     below, above = 1.3, 1.416
     for _ in range(45):

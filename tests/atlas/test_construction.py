@@ -70,7 +70,7 @@ def test_one_three_and_four_parameters():
             assert np.abs(values(slice_, rest) - values(atlas, points)).max() < 1e-13
 
 
-def test_rounds_are_deterministic_and_ask_for_nothing_twice():
+def test_rounds_are_deterministic_and_request_no_point_twice():
     def questions():
         asked, rounds = [], construct(SQUARE, Quantity(2), TOLERANCE, max_nodes=20)
         points = next(rounds)
@@ -135,7 +135,7 @@ def test_gap_of_a_function_that_is_not_smooth_is_solved_directly(function):
     assert (bound[~known] == 0).all()
 
 
-def test_nothing_but_gaps():
+def test_an_atlas_may_consist_of_gaps():
     def rough(p):
         return np.sign(np.sin(40 * p[:, :1])) * np.sign(np.sin(40 * p[:, 1:]))
 
@@ -162,7 +162,7 @@ def test_failed_solves_leave_a_gap():
     assert not everywhere.panels and len(everywhere.gaps) == 1
 
 
-def test_noise_above_the_tolerance_is_named():
+def test_a_gap_names_noise_above_the_tolerance():
     rng = np.random.default_rng(0)
     atlas = run(construct(SQUARE, Quantity(2), 1e-12), lambda p: waves(p) + 1e-9 * rng.standard_normal((len(p), 2)))
     assert not atlas.panels and "scatter" in atlas.gaps[0].reason
@@ -192,7 +192,7 @@ def test_arrays_and_back():
     assert np.array_equal(values(again, sample(SQUARE)), values(atlas, sample(SQUARE)))
 
 
-def test_slice_names_what_it_lacks():
+def test_slice_outside_the_domain_is_refused():
     atlas = run(construct(SQUARE, Quantity(2), 1e-6), waves)
     with pytest.raises(KeyError, match="z"):
         atlas.slice({"z": 1.0})

@@ -8,14 +8,14 @@ import pytest
 from drivetrain_jax.atlas.decay import foreseen, needed, remainder
 
 
-def test_a_tail_of_rounding_leaves_nothing_out():
+def test_a_tail_of_rounding_is_not_extrapolated():
     falling = 10.0 ** -np.arange(12.0)
     assert remainder(falling, 1e-9) == pytest.approx(1e-10 / 99, rel=1e-9)
     flat = np.concatenate([falling, np.full(6, 1e-13)])
     assert remainder(flat, 1e-9) == 1e-13 and remainder(flat, 1e-12) == np.inf
 
 
-def test_a_little_more_than_a_line_shows_is_foreseen():
+def test_foreseen_extrapolates_by_less_than_a_third():
     """The number is exact for geometric decay and not too small for faster decay.
 
     It is None for a kink, for noise, and for a limit that is far away.

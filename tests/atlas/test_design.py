@@ -65,17 +65,17 @@ def test_least_damping(damped):
     assert largest(answer.value * (1 - 1e-3)) > 1 > largest(answer.value * (1 + 1e-3))
 
 
-def test_any_damping_will_do_where_there_is_no_tongue(damped):
+def test_least_damping_is_0_without_a_tongue(damped):
     answer = least_damping(damped, CARDAN, (0.9, 1.1), {}, direct=direct)
     assert answer.value == 0.0 and answer.limit is None and answer.check.agrees
 
 
-def test_no_damping_of_the_atlas_will_do(damped):
+def test_no_least_damping_if_the_largest_is_unstable(damped):
     answer = least_damping(narrow(damped, {"zeta": (0.0, 0.01)}), CARDAN, (1.3, 1.6), {}, direct=direct)
     assert answer.value is None and answer.check is None and answer.certain
 
 
-def test_nothing_is_denied_where_the_safe_end_is_undecided():
+def test_an_undecided_safe_end_gives_an_uncertain_answer():
     """With very little damping stability ends near beta = 0, within the errors, although small angles are stable."""
     fixed = {**BASE, "zeta": 1e-7, "gamma": 1.0}
     faint = cardan_atlas({"beta": (0.0, 1.5), "Omega": (0.3, 2.0)}, 1e-11, fixed).atlas
@@ -113,7 +113,7 @@ def candidates(*values, error=1e-10):
         (candidates(0.4), [(0.0, 1.0)], []),
     ],
 )
-def test_a_line_of_candidates(changes, undecided, expected):
+def test_intervals_between_candidates(changes, undecided, expected):
     """The line is stable below 0.4."""
     line = _line("beta", (0.0, 1.0), changes, undecided, lambda values: values < 0.4)
     assert [(i.lower, i.upper, i.stable) for i in line.intervals] == [
@@ -165,7 +165,7 @@ def test_the_widest_angle_between_the_flanks_of_a_tongue(atlas, tip, half, error
 
 
 @pytest.mark.parametrize(("beyond", "agrees"), [(0.0, True), (5e-9, False)])
-def test_a_check_looks_right_inside_the_error(atlas, monkeypatch, beyond, agrees):
+def test_a_check_refutes_an_error_that_is_too_small(atlas, monkeypatch, beyond, agrees):
     value = S21[0] + beyond
     limit = Crossing(value, 1e-9, "-1", {"beta": value, "Omega": S21[1]})
     intervals = (Interval(0.0, value, True, None, limit), Interval(value, 1.1, False, limit, None))
@@ -206,7 +206,7 @@ def test_a_check_follows_the_ridge_of_a_narrow_tongue():
         ),
     ],
 )
-def test_what_is_stable_away_from_an_unstable_safe_end(ask, ranges, fixed, speeds, ends, safe_end):
+def test_stable_interval_away_from_an_unstable_safe_end(ask, ranges, fixed, speeds, ends, safe_end):
     answer = ask(cardan_atlas(ranges, 1e-9, {**BASE, **fixed}).atlas, CARDAN, speeds, {}, direct=direct)
     assert answer.value is None and np.isnan(answer.error) and answer.certain and answer.safe_end == safe_end
     (interval,) = answer.stable
@@ -253,7 +253,7 @@ def test_speed_windows_with_a_margin(atlas):
     assert len(speed_windows(atlas, CARDAN, {"beta": 1.0}, margin=0.1).windows) < len(windows)
 
 
-def test_what_is_undecided_is_no_safe_speed(atlas):
+def test_an_undecided_range_is_no_safe_speed(atlas):
     """A gap is in the middle of the stable speeds from .772 to 1.247, where an interval is usually tested."""
     below, above = narrow(atlas, {"Omega": (0.3, 0.95)}), narrow(atlas, {"Omega": (1.1, 2.0)})
     corners = np.sort(atlas.to_coordinates(np.array([[0.0, 0.95], [1.1, 1.1]])), axis=0)
@@ -267,7 +267,7 @@ def test_what_is_undecided_is_no_safe_speed(atlas):
     assert len(found.windows) == len(whole.windows) + 1 and all(w.largest < 1 for w in found.windows)
 
 
-def test_windows_cover_what_is_stable(atlas):
+def test_windows_cover_the_stable_speeds(atlas):
     line = stability_along(atlas.slice({"beta": 1.0}), CARDAN)
     omega = np.linspace(0.3, 2.0, 1201)
     rho = direct({**{k: np.full(1201, v) for k, v in BASE.items()}, "beta": np.full(1201, 1.0), "Omega": omega})
@@ -302,7 +302,7 @@ def test_narrow_keeps_the_function(atlas):
 @pytest.mark.parametrize(
     ("undecided", "certain"), [((0.5, 0.6), True), ((0.05, 0.06), False), ((0.0999, 0.1), True), ((0.0995, 0.1), False)]
 )
-def test_only_what_is_undecided_on_the_safe_side_leaves_doubt(atlas, monkeypatch, undecided, certain):
+def test_undecided_ranges_on_the_safe_side_make_an_answer_uncertain(atlas, monkeypatch, undecided, certain):
     limit = Crossing(0.1, 1e-4, "-1", {"beta": 0.1, "Omega": 1.4})
     intervals = (Interval(0.0, 0.1, True, None, limit), Interval(0.1, 1.1, False, limit, None))
     monkeypatch.setattr(design, "stability_over_range", lambda *_: Line("beta", intervals, (undecided,)))

@@ -98,13 +98,13 @@ def test_lines_that_turn_too_far_are_halved_first():
 
 
 @pytest.mark.parametrize("rate", [np.inf, np.nan, 1e5])
-def test_lines_that_would_have_to_be_cut_too_often_are_solved(rate):
+def test_lines_with_too_many_boxes_are_solved(rate):
     source = Lines(rate=rate)
     atlas = run(construct(SQUARE, WAVES, TOLERANCE, source=source), waves)
     assert holds(atlas) and not source.asked
 
 
-def test_many_coordinates_are_looked_at_along_the_edges_first():
+def test_many_coordinates_are_probed_along_the_edges_first():
     domain = Domain(
         ("x", "y", "z", "s"),
         (-1.0, 0.0, 0.0, 1.0),
@@ -124,7 +124,7 @@ def test_many_coordinates_are_looked_at_along_the_edges_first():
 
 
 @pytest.mark.parametrize("domain", [SQUARE, replace(SQUARE, lower=(0.3, 1.0), upper=(0.3, 30.0))], ids=["wide", "thin"])
-def test_nodes_that_are_not_what_is_solved_are_not_used(domain):
+def test_nodes_that_differ_from_solves_are_not_used(domain):
     """Held-out points show nodes with a relative error of a millionth; all nodes are then solved instead."""
     source = Lines(domain, lambda points: (1 + 1e-6) * waves(points))
     atlas = run(construct(domain, WAVES, TOLERANCE, source=source), waves)
@@ -151,7 +151,7 @@ def test_boxes_are_halved_down_to_a_kink_which_is_a_gap():
 
 
 @pytest.mark.parametrize("told", [True, False])
-def test_bounds_include_what_all_solves_are_wrong_by(told):
+def test_bounds_include_the_common_error_of_all_solves(told):
     """Nodes and solves have the same error, which held-out points cannot show, but which solves may report."""
 
     def off(points):
@@ -256,7 +256,7 @@ def test_parts_by_predicted_steps_are_short_enough():
         assert np.abs(found - exact).max() < 1e-13 * np.abs(exact).max()
 
 
-def test_lines_that_leave_out_too_much_are_computed_again(monkeypatch):
+def test_lines_with_large_truncation_errors_are_computed_again(monkeypatch):
     monkeypatch.setattr(series_module, "_PARTS", 0.04)
     atlas = cardan_atlas(RANGES, 1e-11)
     points = random_points(atlas, 300)
@@ -265,7 +265,7 @@ def test_lines_that_leave_out_too_much_are_computed_again(monkeypatch):
 
 
 @pytest.mark.parametrize("wrong", [Series("mu", first=2), Series("Omega", first=1), Series("zeta", first=2)])
-def test_a_wrong_declaration_costs_time_and_no_digit(monkeypatch, wrong):
+def test_a_wrong_declaration_costs_time_but_no_accuracy(monkeypatch, wrong):
     """The propagator is not a power series in mu, has other entries without 1/Omega, or is quadratic in zeta."""
     model = CARDAN.models["atlas"]
     smooth = Smoothness(model.smooth.coordinates, series=wrong)

@@ -37,7 +37,7 @@ def test_error_lies_within_tolerance_and_bound(atlas):
     assert atlas.solves < 8000
 
 
-def test_it_is_the_determinant_of_the_paper(atlas):
+def test_the_atlas_agrees_with_the_determinant_of_the_paper(atlas):
     """The determinants differ by factors of the supports and a power of the frequency, from the units of the states."""
     phase, k = np.array([1.5, 2.6, 4.1, 5.2]), np.full(4, 2e7)
     bar, q = shaft(jnp.array(k)), phase / total_length()
@@ -50,7 +50,7 @@ def test_it_is_the_determinant_of_the_paper(atlas):
     assert power == pytest.approx(np.full(3, round(power[0])), abs=1e-6)
 
 
-def test_its_zeros_are_the_natural_frequencies(atlas):
+def test_zeros_of_the_atlas_are_the_natural_frequencies(atlas):
     stiffness = np.array([1e5, 2e7, 1e10])
     expected = np.asarray(find_roots(shaft(jnp.array(stiffness)), 4).q) ** 2
     for k, frequencies in zip(stiffness, expected.T, strict=True):

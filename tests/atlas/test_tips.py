@@ -161,7 +161,7 @@ def test_derivatives_of_the_growth_rate(atlas):
         assert (above.gradient - below.gradient) / (2 * h) == pytest.approx(exact.hessian[:, axis], rel=1e-4, abs=1e-7)
 
 
-def test_exclusion_finds_what_it_should(atlas):
+def test_exclusion_finds_a_tip_only_inside_the_rectangle(atlas):
     """The tip is found in a rectangle that contains it, and not in one whose lower rim is above it."""
     from drivetrain_jax.atlas.windows import narrow
 
@@ -258,7 +258,7 @@ def test_boundary_curves_are_boundaries(atlas, curves):
     assert sorted(lowest) == pytest.approx(sorted(beta for beta, _ in TIPS.values()), abs=1e-6)
 
 
-def test_only_what_bounds_the_stable_region_is_limiting(chart):
+def test_only_points_on_the_stable_region_are_limiting(chart):
     """The boundary of a tongue continues inside another tongue that overlaps it."""
     criteria, inside = Criteria.of(chart.atlas, CARDAN), 0
     for curve in boundaries(chart.atlas, CARDAN):
@@ -270,7 +270,7 @@ def test_only_what_bounds_the_stable_region_is_limiting(chart):
     assert inside > 20
 
 
-def test_curves_enclose_what_is_unstable(atlas, curves):
+def test_curves_enclose_the_unstable_region(atlas, curves):
     """Random points are unstable if the path from beta = 0 crosses an odd number of curves."""
     generator = np.random.default_rng(3)
     points = atlas.lower + (atlas.upper - atlas.lower) * generator.random((300, 2))
@@ -359,7 +359,7 @@ def test_no_gradient_of_a_radius_below_the_smallest_number():
     assert radius_gradient(CARDAN, point) is None
 
 
-def test_with_little_damping_points_in_a_tongue_bound_nothing():
+def test_with_little_damping_points_in_a_tongue_are_not_limiting():
     """The edge of the tongue of -1 runs through the tongue of a pair, in which multipliers grow by at most 7e-8."""
     fixed = {**BASE, "zeta": 1e-5, "mu": 3.0}
     atlas = cardan_atlas({"beta": (1.0, 1.2), "Omega": (1.45, 1.6)}, 1e-11, fixed).atlas

@@ -21,7 +21,7 @@ def one_patch(coefficients, error=0.0):
     ("shift", "error", "expected"),
     [(0.0, 0.0, True), (0.0, 0.3, True), (2.0, 0.0, False), (0.5, 0.7, False), (-0.5, 0.7, False)],
 )
-def test_a_box_without_a_tip_is_not_one_with_a_single_tip(shift, error, expected):
+def test_single_is_true_only_for_boxes_with_one_tip(shift, error, expected):
     """f = h^2 - v has its tip at 0; for f = h^2 - v - 2 the floor of the valley is negative throughout.
 
     The floor may also be negative throughout if an error is larger than f at either of its ends.
@@ -47,7 +47,7 @@ def test_a_tip_on_the_face_of_two_boxes_is_one_tip():
     assert found.points == pytest.approx(np.zeros((1, 2)), abs=1e-12) and not len(found.undecided)
 
 
-def test_what_trimming_leaves_out_is_added_to_the_error():
+def test_the_error_includes_trimmed_coefficients():
     patch = one_patch([[1.0, 0.5, 0.0, 0.0, 0.0, 1e-4]], 0.1)
     trimmed = patch.trim()
     assert trimmed.coefficients.shape[1] < 6
@@ -83,7 +83,7 @@ def test_the_other_edge_of_a_narrow_tongue_is_another_curve():
     assert boundaries._contains(field, edge, seeds).tolist() == [True, False, False]
 
 
-def test_parts_that_bound_nothing_are_left_out():
+def test_segments_leave_out_points_that_are_not_limiting():
     points = {"beta": np.arange(5.0), "Omega": np.arange(5.0)}
     limiting = np.array([True, True, False, True, True])
     curve = boundaries.Boundary("pair", points, limiting)
@@ -103,7 +103,7 @@ def test_a_path_ends_on_the_rim():
     assert end == pytest.approx([0.5, 1.0], abs=1e-12)
 
 
-def test_a_path_that_runs_along_the_rim_ends_where_it_is():
+def test_a_path_along_the_rim_ends_there():
     """Both points of a step lie outside by rounding, and the line through them meets the rim far away."""
 
     def field(y):
@@ -134,7 +134,7 @@ def test_points_lie_on_the_edges_of_a_narrow_slanted_tongue(foot, width):
     assert v[0] == v[-1] == 1.0
 
 
-def test_steps_turn_by_what_chords_can_represent():
+def test_turns_of_steps_are_limited():
     """On this circle the turn limits the step: no step turns by more than a quarter, and none by far less."""
     radius = 0.02
 
@@ -151,7 +151,7 @@ def test_steps_turn_by_what_chords_can_represent():
 
 
 @pytest.mark.parametrize(("shift", "end"), [(0.0015, 1.0), (0.004, 0.6)])
-def test_a_curve_beside_the_tangent_is_another_one(shift, end):
+def test_a_large_correction_belongs_to_another_curve(shift, end):
     """A straight line jumps at v = 0.6 by a tenth or a quarter of the longest step.
 
     The tangent stays the same, so only the size of the correction shows the jump.
@@ -164,7 +164,7 @@ def test_a_curve_beside_the_tangent_is_another_one(shift, end):
     assert path[-1, 1] == pytest.approx(end, abs=1e-6)
 
 
-def test_a_path_ends_where_the_function_does():
+def test_a_path_ends_where_the_function_is_undefined():
     """The function has values only below v = 0.7: the step is divided down to the shortest one in few evaluations."""
     asked = []
 
