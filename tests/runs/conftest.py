@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 @pytest.fixture(autouse=True)
 def toys(monkeypatch):
-    """The toy system and its analyses, under their names."""
+    """Register the toy system and its analyses under their names."""
     import toy
 
     monkeypatch.setitem(os.environ, "DRIVETRAIN_JAX_CACHE", "0")
@@ -20,7 +20,7 @@ def toys(monkeypatch):
 
 @pytest.fixture
 def grid_scene():
-    """A scene with both solvers at work, some points that fail, and a short last chunk."""
+    """A scene that uses both solvers, with some failing points and a short last chunk."""
     return {
         "system": "toy",
         "analysis": "toy",

@@ -1,4 +1,4 @@
-"""A damped Mathieu oscillator of another package, in whose computation a process can be made to die."""
+"""A damped Mathieu oscillator of another package, whose computation can kill its process."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System, paramet
 
 
 def _perhaps_die(deadly: np.ndarray, folder: str) -> np.ndarray:
-    """Dies where ``deadly`` is 1; where it is 2 only once, which a file in ``folder`` remembers."""
+    """Kill this process if ``deadly`` is 1 anywhere, or once if it is 2, which a file in ``folder`` records."""
     once = Path(folder) / "died"
     if np.any(deadly == 1) or (np.any(deadly == 2) and not once.exists()):
         once.touch()
@@ -25,7 +25,7 @@ def _perhaps_die(deadly: np.ndarray, folder: str) -> np.ndarray:
 
 
 def _perhaps_die_at_start() -> None:
-    """In a spawned process, the first so many times (``FRAGILE_AT_START``)."""
+    """Kill a spawned process at its start, the first ``FRAGILE_AT_START`` times."""
     if multiprocessing.parent_process() is not None:
         starts = Path(os.environ["FRAGILE_FOLDER"]) / "starts"
         count = len(starts.read_text()) if starts.exists() else 0
@@ -51,7 +51,7 @@ class Fragile(System):
     @serves("floquet")
     def floquet_model(self) -> FloquetModel:
         zero = 0.0
-        # Compiled code alone is dangerous; plans are made with plain arrays.
+        # Only compiled code kills the process; plans use plain arrays.
         if isinstance(self.delta, jax.core.Tracer):
             folder = os.environ["FRAGILE_FOLDER"]
             sort = jnp.asarray(self.deadly) + 0 * self.delta

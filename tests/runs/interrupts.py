@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def stop_after(calls):
-    """A report that interrupts the run when it is called once more than ``calls`` times."""
+    """A report that interrupts the run after ``calls`` calls."""
     left = iter(range(calls + 1))
 
     def report(progress):

@@ -1,4 +1,4 @@
-"""Questions to an atlas where it is loose, undamped, without panels, or reaches over the angle 0."""
+"""Questions to an atlas that is loose, undamped, without panels, or has angles of both signs."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_the_widest_angle_has_no_sign(beta):
 
 
 def test_boundaries_lie_on_both_sides_of_the_angle_0():
-    """Stable between the edges of S21 at a speed beside its tip, unstable beyond them, on either side."""
+    """At a speed next to the tip of S21 the system is stable between the edges at both signs of the angle."""
     atlas, at = atlas_of((-0.2, 0.3), (1.3, 1.5)), {"beta": -0.15, "Omega": 1.42}
     nearest = atlas_answers.query(atlas, at).data["nearest"]["beta"]
     below, above = nearest["below"]["value"], nearest["above"]["value"]
@@ -76,7 +76,7 @@ def test_boundaries_lie_on_both_sides_of_the_angle_0():
 
 @pytest.mark.parametrize(("J1", "k1"), [(2.0, 1000.0), (2e-9, 3.7), (1e-170, 1e-170)])
 def test_the_ends_of_an_atlas_may_be_asked_for_in_other_units(J1, k1):
-    """Converted, or copied from the message that names them, they miss the ends by a rounding."""
+    """Converted ends, or ends copied from a message, differ from the ends of the atlas by a rounding."""
     atlas, critical = atlas_of((0.0, 0.3), (1.3, 1.5)), 2 * np.sqrt(J1) * np.sqrt(k1)
     shaft = PhysicalShaft(J1, 100 * J1, k1, k1, 0.001 * critical, 0.001 * critical)
     data = {name: getattr(shaft, name) for name in ("J1", "J2", "k1", "k2", "c1", "c2")}
@@ -90,7 +90,7 @@ def test_the_ends_of_an_atlas_may_be_asked_for_in_other_units(J1, k1):
 
 @pytest.mark.parametrize("axes", [("Omega", "beta", "mu"), ("mu", "beta", "Omega"), ("beta", "mu", "Omega")])
 def test_tiles_lie_along_the_longest_axes_of_a_chart(monkeypatch, axes):
-    """A chart may have few values of the last two parameters of its atlas: tiles then held as few cells."""
+    """A chart may have few values of the last two parameters of its atlas; tiles must not become small by that."""
     ranges = {"beta": (0.2, 0.5), "Omega": (1.3, 1.5), "mu": (1.0, 1.1)}
     table = {name: dict(zip(("start", "stop"), ranges[name], strict=True)) for name in axes}
     fixed = {"zeta": 0.001, "alpha": 1.0, "gamma": 100.0}
@@ -198,7 +198,7 @@ def test_a_change_that_may_hide_in_an_undecided_range_is_not_denied():
 
 
 def test_next_to_no_damping_is_not_none():
-    """Without damping S21 reaches down to the angle 0, with this little of it down to .0001 only."""
+    """Without damping S21 reaches down to the angle 0, with very little damping only down to .0001."""
     atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
     point = {"beta": 0.00005, "Omega": 1.4159846397}
     assert atlas_answers.query(atlas, point).data["meanings"]["verdict"] == "unstable"
@@ -309,7 +309,7 @@ def test_an_atlas_without_a_panel_answers_what_it_can(monkeypatch):
     ],
 )
 def test_gradients_at_extremes(point):
-    """Against differences of direct solves, with steps that are small against the phase and the distance to pi/2."""
+    """Gradients equal differences of direct solves, with steps small against the phase and the distance to pi/2."""
     point = {"alpha": 1.0, "mu": 1.0, "gamma": 100.0} | point
     gradient = atlas_answers.radius_gradient(CARDAN, point)
     for name in ("beta", "Omega", "zeta"):
@@ -341,7 +341,7 @@ def test_distance_from_one_is_not_lost_among_digits(radius, text):
     "name", ["lower", "panel_lower", "panel_degrees", "value_error", "derived_error", "coefficients", "kept", "scene"]
 )
 def test_a_part_of_an_atlas_is_refused(name):
-    """Without the bits that say which coefficients were kept, all would be 0, and every shaft stable."""
+    """Without the bits that mark the kept coefficients, all coefficients would be 0, and every shaft stable."""
     whole = panels((0.2, 0.3), (1.3, 1.5))
     attrs = {key: value for key, value in whole.attrs.items() if key != name}
     part = whole.drop_vars(name, errors="ignore").drop_attrs().assign_attrs(attrs)

@@ -112,11 +112,11 @@ def test_points_and_multipliers_through_an_atlas():
 def test_auto_takes_an_atlas_where_points_are_many(monkeypatch, direct):
     assert "atlas_solves" not in dt.run(floquet("auto")).attrs
     monkeypatch.setattr(atlas_choice, "_WORTHWHILE", 500)
-    # An eighth of the effort of 533 points is that of some 30 solves: no atlas of two parameters is to be had for that.
+    # An eighth of the effort of 533 points is that of some 30 solves, too few for an atlas of two parameters.
     assert "atlas_solves" not in dt.run(floquet("auto")).attrs
     monkeypatch.setattr(atlas_choice, "_FEWEST", (1, 1))
     found = dt.run(floquet("auto"))
-    # Tried all the same, it stops at the first round, and all points are solved directly.
+    # A forced attempt stops at the first round, and all points are solved directly.
     assert found.attrs["atlas_uncovered"] == 533
     same_arrays(found, direct)
     monkeypatch.setattr(atlas_choice, "_SHARE", 10.0)
@@ -136,8 +136,10 @@ def test_the_way_that_auto_takes_is_named_where_it_keeps_a_result_from_growing(m
 
 @pytest.mark.parametrize(("slowest", "fastest", "tried"), [(0.1, 2.0, True), (0.005, 2.0, False), (1e-9, 1e-8, False)])
 def test_auto_counts_the_effort_of_solves_not_their_number(slowest, fastest, tried):
-    """Down to Omega = .005 a node costs some fifty cells: that many cells are cheaper one by one. Below 1e-8 no solver can
-    do any."""
+    """At Omega down to .005 a node costs as much as some fifty cells, so direct solves are cheaper.
+
+    Below 1e-8 no solver can compute a cell.
+    """
     axes = {"beta": {"start": 0.0, "stop": 1.5, "num": 400}, "Omega": {"start": slowest, "stop": fastest, "num": 400}}
     assert (atlas_choice.choose_atlas(load_scene(floquet("auto", axes))) is not None) is tried
 
@@ -160,14 +162,14 @@ def test_gaps_of_an_atlas_are_told(monkeypatch, tmp_path):
 
 
 def interrupted_run(scene, out, reports):
-    """A run that is stopped after this many reports."""
+    """Start a run and interrupt it after this many reports."""
     with pytest.raises(Interrupted):
         run_to_file(scene, out, report=stop_after(reports))
 
 
 @pytest.mark.parametrize(("scene", "chunks"), [(ATLAS, 1), (AT_ONE_SPEED, 1), (AT_ONE_SPEED, 3), (AT_ONE_SPEED, 6)])
 def test_an_interrupted_atlas_is_resumed_with_the_same_bits(tmp_path, scene, chunks):
-    """Within the only round of solves, and within the first and later ones of an atlas whose nodes are solved."""
+    """The interrupt is in the only round of solves, or in the first or a later round of an atlas with solved nodes."""
     out, whole = tmp_path / "a.nc", dt.run(scene)
     interrupted_run(scene, out, chunks)
     assert not out.exists() and (tmp_path / "a.nc.parts").is_dir()
@@ -182,7 +184,7 @@ def test_an_interrupted_atlas_is_resumed_with_the_same_bits(tmp_path, scene, chu
 def test_an_interrupted_chart_is_resumed_with_the_same_bits(tmp_path, monkeypatch):
     out, scene = tmp_path / "a.nc", floquet("atlas")
     interrupted_run(scene, out, 2)
-    # The file may be laid out after the last solve is there.
+    # The file may be laid out after the last solve has finished.
     slowly = lambda _, table: (time.sleep(1.0), table.lay_out(blank=False))  # noqa: E731
     monkeypatch.setattr(through_atlas, "_lay_out", slowly)
     progress = run_to_file(scene, out)
@@ -206,7 +208,7 @@ def test_solves_are_kept_when_a_chart_fails_after_them(tmp_path, monkeypatch):
 
 
 def test_the_solves_of_an_atlas_run_on_workers(stored, monkeypatch):
-    """With the bits of threads, and none in this process."""
+    """All solves run on workers, none in this process, and have the same bits as in threads."""
     monkeypatch.setattr(Job, "compute", None)
     same_arrays(dt.run(ATLAS, workers=2), stored)
 
@@ -267,7 +269,7 @@ def test_an_atlas_without_a_panel_has_all_its_points_solved(monkeypatch, tmp_pat
 
 
 def test_values_that_are_one_in_the_coordinates_of_an_atlas():
-    """Speeds a rounding apart, and angles whose squares vanish."""
+    """The speeds differ by a rounding, and the squares of the angles underflow."""
     for axes in (
         {"beta": {"values": [0.1, 0.3]}, "Omega": {"values": [1.9, 1.9000000000000001]}},
         {"beta": {"start": 0.0, "stop": 1e-170, "num": 3}, "Omega": {"values": [1.3, 1.4]}},
@@ -278,7 +280,7 @@ def test_values_that_are_one_in_the_coordinates_of_an_atlas():
 
 
 def test_what_is_not_finite_is_never_called_stable(atlas):
-    """Compiled, the largest of moduli that are all NaN is -inf: less than 1."""
+    """In compiled code the largest of moduli that are all NaN is -inf, which is less than 1."""
     panels = tuple(replace(panel, coefficients=np.nan * panel.coefficients) for panel in atlas.stability.atlas.panels)
     lost = replace(atlas.stability, atlas=replace(atlas.stability.atlas, panels=panels))
     for outputs in (["spectral_radius", "verdict"], ["spectral_radius", "verdict", "floquet_multiplier"]):
@@ -552,7 +554,7 @@ def test_panels_that_are_not_those_written_answer_nothing(file, tmp_path, capsys
     ("lengths", "rows"), [((3873, 5164), 384), ((173, 174), 173), ((100_000, 100), 20_928), ((5, 3000, 1500), 1344)]
 )
 def test_blocks_of_a_grid_cover_it_once(lengths, rows):
-    """With as many rows each, whole tiles of them, but for the last."""
+    """Blocks have equal numbers of rows, whole tiles of them, except the last block."""
     blocks = list(through_atlas._cut(lengths))
     places = [tuple(part.start for part in block) for block in blocks]
     sizes = [[part.stop - part.start for part in block] for block in blocks]
@@ -562,7 +564,7 @@ def test_blocks_of_a_grid_cover_it_once(lengths, rows):
 
 
 def test_what_judges_cells_is_compiled_before_the_atlas_is_there(monkeypatch):
-    """In a large chart, while the solves are compiled; afterwards nothing is left to compile for it."""
+    """A large chart compiles this kernel while the solves compile, and no other one afterwards."""
     from drivetrain_jax.atlas import stability
 
     made = []

@@ -1,7 +1,8 @@
-"""Work that is counted, not timed: it may not grow by more than a tenth without a reason.
+"""Counts of work, which are exact where times are not: no count may change by more than a tenth without a reason.
 
-One scene for each system: operations traced, steps and evaluations made, kernels compiled, bytes written. A change that
-needs more has to say why and store the new number here; one that needs much less, too, so that it is not lost again.
+One scene per system counts traced operations, steps, evaluations, compiled kernels, and written bytes. A change that needs
+more must give the reason and store the new number here. A change that needs much less must store its number as well, so
+that a later increase is noticed.
 """
 
 from __future__ import annotations
@@ -52,27 +53,27 @@ SCENES: dict[str, dict[str, Any]] = {
     },
 }  # fmt: skip
 COUNTS = {
-    # Operations in the trace of one chunk, nested ones once: what computes more than is asked for has more of them.
-    # 600 of those of cardan are the loop of diffrax.
+    # Operations in the trace of one chunk, nested ones once; results that nobody requests would add to them. 600 of those of
+    # cardan are the loop of diffrax.
     "operations cardan": 5793,
     "operations bicardan": 846,
     "operations rattle": 4424,
     # Steps that the plan predicts for the 1,550 cells of the chart, padding included.
     "predicted steps cardan": 135_168,
-    # One panel: nodes come from power series. Near the limit of rounding, where nodes that are a little less exact would not
-    # be accepted.
+    # One panel, whose nodes come from power series. It is near the limit of rounding, so slightly worse nodes would be
+    # rejected.
     "solves cardan, mu = 20": 64,
-    # 144 brackets together, 22 steps until the last of them is closed.
+    # 144 brackets in parallel, 22 steps until the last one is closed.
     "evaluations bicardan": 3168,
-    # QR sweeps of two chunks, each with its slowest lane: 18 singular values.
+    # QR sweeps of two chunks for 18 singular values, each chunk with the sweeps of its slowest lane.
     "sweeps planetary": 27,
     # 16 lanes over ten periods of the drive: 14 steps a period.
     "steps rattle": 2226,
-    # 31 strobes, 23 steps each at the tolerance of a default history and 18 in the run that tells the error.
+    # 31 strobes, 23 steps each at the tolerance of a default history and 18 in the run that estimates the error.
     "steps tripod": 1294,
     # One kernel, nothing else: shapes, padding and files are NumPy's.
     "compilations bicardan": 1,
-    # Of which 1,152 are the frequencies: the rest is the scene, units, names and versions.
+    # 1,152 of these bytes are frequencies, the others the scene, units, names and versions.
     "bytes bicardan": 20_691,
 }
 
@@ -115,7 +116,7 @@ def test_solves_of_an_atlas():
 
 @pytest.fixture
 def tally() -> Callable[[Any], None]:
-    """Adds up in ``tally.total`` what a kernel reports while it runs."""
+    """A function that adds the amounts reported by a running kernel in ``tally.total``."""
 
     def add(amount: Any) -> None:
         jax.debug.callback(lambda n: setattr(add, "total", add.total + int(n)), amount)
@@ -126,7 +127,7 @@ def tally() -> Callable[[Any], None]:
 
 @pytest.fixture
 def compilations() -> Iterator[list[str]]:
-    """Events of the compiler while the test runs."""
+    """A list of the compiler's events during the test."""
     events: list[str] = []
 
     def heard(event: str, duration: float, **_: Any) -> None:

@@ -1,4 +1,4 @@
-"""The same chunks in threads, in processes and on a Dask cluster; what remains when one of them dies."""
+"""Equal results of threads, processes and a Dask cluster, and results after the death of one of them."""
 
 from __future__ import annotations
 
@@ -180,13 +180,13 @@ def test_scheduler_and_workers_of_their_own(drivetrain, package, tmp_path):
 
 @dataclass
 class Digest:
-    """A computation that nobody asks for results."""
+    """A computation with a digest alone, which is never computed."""
 
     digest: str
 
 
 def test_runs_on_one_scheduler_do_not_share_chunks(monkeypatch):
-    """A grown result and the whole scene have one digest, and other points under the same numbers."""
+    """A grown result and its whole scene have the same digest, but different points under the same chunk numbers."""
     distributed = pytest.importorskip("distributed")
 
     def slow(_, chunk):
@@ -210,7 +210,7 @@ def test_runs_on_one_scheduler_do_not_share_chunks(monkeypatch):
 
 
 class Numbers:
-    """Forty tasks whose number is known in advance."""
+    """Forty tasks with a known length."""
 
     def __len__(self):
         return 40
@@ -241,7 +241,7 @@ def test_requests_of_several_tasks_lose_only_the_one_that_kills_workers(monkeypa
     assert found.pop(17) is None and found == {n: {"points": n} for n in range(40) if n != 17}
     requests = [request for request in requests if request]
     assert len(requests) < 30 and [17] in requests and max(map(len, requests)) > 3
-    # Small at the start, and again at the end, so that all workers end at the same time.
+    # Requests are small at the start, and small again at the end, so that all workers end at the same time.
     assert len(requests[0]) == len(requests[-1]) == 1
 
 
@@ -272,13 +272,13 @@ def test_threads_are_handed_many_chunks_only_where_results_are_small(values, ahe
     next(finished)
     assert len(begun) == 2
     next(finished)
-    # The first one is done.
+    # One task is finished, and ``ahead`` tasks are queued.
     assert len(begun) == 1 + ahead
     assert sorted(number for number, _ in finished) == sorted({*range(100)} - {0, 1})
 
 
 def test_threads_are_kept_but_for_those_of_a_run_that_was_left():
-    """A chunk that still runs after an interrupt does not hold up the next run."""
+    """A chunk that still runs after an interrupt does not delay the next run."""
     result, stop = {"value": np.zeros(1)}, threading.Event()
 
     def threads_of_a_run():
@@ -326,7 +326,7 @@ def _engine():
 
 
 def test_a_process_that_dies_between_two_chunks_is_replaced():
-    """When nothing is in flight nobody's result tells of its death: the points that are left must not be forgotten."""
+    """Without a chunk in flight no result reports the death; the remaining points must still be computed."""
     seen = []
 
     def report(progress):

@@ -1,4 +1,4 @@
-"""Larger scenes take over what smaller ones have computed: which points, which values, and when not."""
+"""Larger scenes reuse the points of smaller ones: which points, which values, and which results are refused."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def counts(progress):
 
 
 def agree(path, large):
-    """The grown result is the one of a run of its own, in every number that does not depend on neighbours."""
+    """The grown result equals that of a single run, in every number that does not depend on neighbours."""
     grown, alone = opened(path), dt.run(large)
     for name in (*NAMES, "outcome", *alone.coords):
         np.testing.assert_array_equal(grown[name].values, alone[name].values, err_msg=name)
@@ -108,7 +108,7 @@ def test_roundings_of_an_even_axis_are_no_difference(old, new):
 
 
 def test_values_are_taken_not_computed(tmp_path):
-    """Marked values survive: nothing of what is reused was computed again."""
+    """Marked values survive, so reused points were not computed again."""
     path = tmp_path / "r.nc"
     run_to_file(SMALL, path)
     with h5py.File(path, "r+") as file:
@@ -324,7 +324,7 @@ def test_the_former_result_has_to_be_one(tmp_path):
 
 
 def turned(path, **changes):
-    """A copy as xarray writes it, with other points or another order."""
+    """A copy written by xarray with fewer points or in another order."""
     opened(path).isel(**changes).to_netcdf(path.with_name("turned.nc"), engine="h5netcdf")
     return path.with_name("turned.nc")
 
@@ -429,7 +429,7 @@ def test_points_that_are_there_twice(tmp_path):
 
 
 def small_and_interrupted(path, **more):
-    """A small result, and unfinished work that is to replace it."""
+    """Write a small result, and unfinished work that will replace it."""
     run_to_file(SMALL, path)
     with pytest.raises(Interrupted) as stopped:
         run_to_file(LARGE, path, executor=Threads(1), report=stop_after(2), **more)
@@ -443,7 +443,7 @@ def test_an_interrupted_fresh_run_is_resumed_with_and_without_fresh(tmp_path, ag
     done = small_and_interrupted(path, fresh=True)
     assert (status(LARGE, path).state, status(LARGE, path).done) == ("partial", done)
     assert counts(run_to_file(LARGE, path, fresh=again)) == (322, 322 - done, done)
-    # Finished: fresh means anew again.
+    # After the run has finished, fresh computes everything again.
     assert counts(run_to_file(LARGE, path, fresh=True)) == (322, 322, 0)
 
 
@@ -453,7 +453,7 @@ def test_fresh_drops_work_that_was_begun_otherwise(tmp_path):
     assert counts(run_to_file(LARGE, path, fresh=True)) == (322, 322, 0)
     run_to_file(SMALL, tmp_path / "s.nc")
     small_and_interrupted(tmp_path / "t.nc", fresh=True)
-    # Other points would be taken than those that the work was begun with.
+    # The unfinished work was started with other reused points.
     assert counts(run_to_file(LARGE, tmp_path / "t.nc", fresh=True, reuse=[tmp_path / "s.nc"])) == (322, 300, 22)
 
 

@@ -87,7 +87,7 @@ def test_the_code_of_systems_analyses_and_engine_decides():
     parts = code(BASE)
     own = {"_quantities.py", "systems", "analysis", "analysis/numerics", "analysis/floquet", "atlas", "runs/kernel.py"}
     assert own < set(parts) and len(set(parts.values())) == len(parts)
-    # The code of a test's system is this one file.
+    # The code of a system of a test is this file alone.
     assert parts["toy.py"] == source_digest({"toy.py": Path(toy.__file__)})
 
 

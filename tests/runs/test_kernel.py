@@ -45,7 +45,7 @@ def test_precision_that_was_unset_is_set_again(unset_precision):
     expected = dt.run(TWO).mean_inertia
     unset_precision()
     assert dt.run(TWO).mean_inertia.equals(expected)
-    # A context reaches this thread alone, not those that compute.
+    # A context of jax affects only this thread, not the threads that compute.
     unset_precision()
     with jax.enable_x64(True):
         assert dt.run(TWO).mean_inertia.equals(expected)
@@ -57,7 +57,7 @@ def test_a_call_within_single_precision_is_refused():
 
 
 def test_full_vector_width_only_where_there_is_avx512(monkeypatch):
-    # Of jaxlib 0.10; another one is asked, see below.
+    # Assume the options of jaxlib 0.10; the next test asks another version.
     monkeypatch.setattr(kernels, "compiler_knows", lambda option, value: True)
     monkeypatch.setattr(kernels, "instruction_set", lambda: {"x86_64", "avx2"})
     assert kernels.compiler_options() == {}
@@ -66,7 +66,7 @@ def test_full_vector_width_only_where_there_is_avx512(monkeypatch):
     assert kernels.compiler_options(march=True) == {}
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     assert kernels.compiler_options() == {"xla_cpu_prefer_vector_width": 512}
-    # Four lanes at full width: tens of gigabytes (seen with jax 0.10.2).
+    # At full width the compiler needs tens of gigabytes for four lanes (seen with jax 0.10.2).
     assert kernels.compiler_options(4) == {}
     assert kernels.compiler_options(4, march=True) == {"xla_cpu_use_fusion_emitters": False}
     assert kernels.compiler_options(4, short_loops=True) == {"xla_backend_optimization_level": 1}
@@ -75,7 +75,7 @@ def test_full_vector_width_only_where_there_is_avx512(monkeypatch):
 def test_options_that_another_compiler_does_not_know_are_left_out(monkeypatch):
     monkeypatch.setattr(kernels.jaxlib, "__version__", "0.99.0")
     kernels.compiler_knows.cache_clear()
-    # The one that is installed is asked.
+    # The installed compiler is asked.
     assert kernels.compiler_knows("xla_backend_optimization_level", 0)
     assert not kernels.compiler_knows("xla_cpu_no_such_option", 1)
     monkeypatch.setattr(kernels, "compiler_knows", lambda option, value: option != "xla_cpu_use_fusion_emitters")
@@ -99,7 +99,7 @@ GEARS = {
 
 @pytest.mark.parametrize("scene", [chart("direct"), chart("atlas"), GEARS], ids=["march", "tiles", "matrices"])
 def test_an_accelerator_gets_wide_batches_and_gives_the_same_results(monkeypatch, scene):
-    """The code path of an accelerator (wide chunks, all lanes at once, no marks), run on the CPU."""
+    """The code path of an accelerator (wide chunks, all lanes at once, no compiler marks) runs on the CPU."""
     expected, solver = dt.run(scene), resolve(load_scene(scene)).solvers[0]
     caches = kernel._compiled, charts.tile_kernel
     with monkeypatch.context() as patch:
@@ -147,7 +147,7 @@ def test_cache_is_off_if_unwanted_or_impossible(tmp_path, setting):
 
 
 def test_kernels_with_lapack_calls_take_turns():
-    """Two of them at a time can wait for each other for ever."""
+    """Two such kernels at a time can block each other forever."""
     matrix = jax.ShapeDtypeStruct((8, 4, 4), float)
     with_lapack = jax.jit(jnp.linalg.eigvals).lower(matrix).compile()
     without = jax.jit(jnp.sin).lower(matrix).compile()
@@ -156,7 +156,7 @@ def test_kernels_with_lapack_calls_take_turns():
 
 
 def test_scenes_of_few_points_are_compiled_without_optimising(monkeypatch):
-    """Not those whose points take long, nor rounds of an atlas: their kernels serve further ones."""
+    """Scenes of lengthy points and rounds of an atlas are optimised, the latter because later rounds share their kernels."""
     given = []
     monkeypatch.setattr(kernel, "compile_kernel", lambda *of: given.append(of[-1]) or object())
     kernel._compiled.cache_clear()

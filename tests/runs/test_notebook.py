@@ -14,7 +14,7 @@ from drivetrain_jax.runs import notebook
 
 @pytest.fixture
 def shown(monkeypatch):
-    """The states that a notebook cell shows one after another, by a stand-in for IPython."""
+    """A list of the states that a notebook cell shows, recorded by a substitute for IPython."""
     states = []
     ipython, display = ModuleType("IPython"), ModuleType("IPython.display")
     ipython.get_ipython = lambda: SimpleNamespace(kernel=object())

@@ -1,4 +1,4 @@
-"""Unfinished work is opened and drawn; what is not there yet says so."""
+"""Opening and drawing unfinished work, whose missing points are pending."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def compare(partial, whole):
 
 
 def test_what_is_done_is_there_and_the_rest_is_pending(grid_scene, tmp_path, monkeypatch):
-    # Every chunk is written at once.
+    # Every chunk is written immediately.
     monkeypatch.setattr(work, "_SHORTEST", 0.0)
     path, whole = tmp_path / "r.nc", dt.run(grid_scene)
     seen = []

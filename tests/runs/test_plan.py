@@ -50,8 +50,10 @@ def test_plan_does_not_depend_on_how_effort_is_predicted(grid_scene, monkeypatch
 
 
 def test_blocks_are_sorted_one_by_one(grid_scene, monkeypatch):
-    """Each point once, in the block where it lies and with the solver that it has in one block; chunks are whole but for
-    the last of a block, and come block by block."""
+    """Each point occurs once, in its block, and with the same solver as without blocks.
+
+    Chunks are full except the last one of a block, and are ordered block by block.
+    """
     whole = chunks_of(grid_scene)
     solver = {point: chunk.solver for chunk in whole for point in chunk.points}
     monkeypatch.setattr("drivetrain_jax.runs.plan._BLOCK", 50)
@@ -72,7 +74,7 @@ def test_blocks_are_sorted_one_by_one(grid_scene, monkeypatch):
 
 
 def test_a_plan_keeps_little(monkeypatch):
-    """Memory grows by the share that a point has of its chunk, not by the point."""
+    """Memory grows with the number of chunks, not with the number of points."""
     monkeypatch.setattr("drivetrain_jax.runs.plan._BLOCK", 1 << 12)
     monkeypatch.setattr("drivetrain_jax.runs.plan._PIECE", 1 << 10)
 
@@ -101,7 +103,7 @@ def test_a_plan_keeps_little(monkeypatch):
     ],
 )
 def test_absurd_efforts(effort, planned):
-    """Infinite, overflowing or undefined cost: no solver; efforts stay within what a counter can hold."""
+    """Points of infinite, overflowing or undefined cost have no solver, and efforts stay in the range of a counter."""
     grid = Grid.of(load_scene({"system": "toy", "analysis": "toy", "points": {"a": [1.0, 2.0]}}))
     plan = make_plan([Solver("s", None, lambda columns: np.array(effort), unit_cost=1e291)], grid)
     assert plan.size == planned

@@ -33,7 +33,7 @@ def expected_value(a, b, n=3, length=(1.0, 2.0, 3.0)):
 
 
 def assert_same(one, two):
-    """Arrays, coordinates, attributes of variables: everything but the provenance."""
+    """Arrays, coordinates and attributes of variables are equal; the provenance is not compared."""
     for name in one.variables:
         a, b = one[name], two[name]
         assert a.dims == b.dims and a.dtype == b.dtype and a.values.tobytes() == b.values.tobytes(), name
@@ -186,7 +186,7 @@ def test_resonances_depend_on_the_axes_among_their_parameters():
     assert ds.isel(b=1).drivetrain.resonances().values.tolist() == [3, 1.5]
     fixed = dt.run({"system": "toy", "analysis": "toy", "axes": {"a": {"values": [1, 2]}}})
     assert fixed.drivetrain.resonances().values.tolist() == [2.0, 1.0]
-    # Nobody knows in what results along a dimension of the user's differ.
+    # The parameters along a dimension of the user are unknown.
     for other in (
         dt.run({"system": "toy", "analysis": "toy", "points": {"a": [1, 2]}}),
         xr.concat([fixed, fixed], "run"),
@@ -424,7 +424,7 @@ def test_full_disk_leaves_a_resumable_run(grid_scene, tmp_path, monkeypatch):
 
 
 def test_fresh_does_not_go_on_with_parts_that_the_result_was_made_from(grid_scene, tmp_path, monkeypatch):
-    """The run is killed after it has put the new result into place and before it has deleted its parts."""
+    """The run is killed after it has moved the new result into place and before it has deleted its parts."""
     path = tmp_path / "r.nc"
     run_to_file(grid_scene, path)
     close = PartsFolder.close
@@ -516,8 +516,8 @@ def test_memory_does_not_grow_with_the_results(tmp_path):
         )
 
     small, large = megabytes(100), megabytes(600)
-    # Pages of mapped files included. 500,000 more points of 49 bytes are 24 MB; what is left is the slack of the allocator
-    # and some tens of bytes for each chunk, of 16 or 32 points here and of 512 in large sweeps.
+    # Pages of mapped files are included. 500,000 more points of 49 bytes are 24 MB. The allowed growth is the slack of the
+    # allocator, and some tens of bytes for each chunk of 16 or 32 points (512 in large sweeps).
     assert large - small < 500_000 * 24 / 2**20
     assert (tmp_path / "600.nc").stat().st_size > 600_000 * 49
 
@@ -527,7 +527,7 @@ SLOW = {"system": "toy", "analysis": "slow", "axes": {"a": {"start": 0, "stop": 
 
 @pytest.fixture
 def slow_process(tmp_path):
-    """Starts ``drivetrain run`` on a scene of about 2.5 s in a process of its own."""
+    """A function that starts ``drivetrain run`` on a scene of about 2.5 s in a process of its own, and the result path."""
     scene = tmp_path / "slow.toml"
     scene.write_text(toml.write(SLOW))
     out = tmp_path / "r.nc"
@@ -580,7 +580,7 @@ def test_signal_stops_promptly_and_loses_nothing(slow_process, sent):
 
 
 def test_impatient_interrupts_lose_nothing_either(slow_process):
-    """Finished chunks are written after the first interrupt; further ones do not cut that short."""
+    """Finished chunks are written after the first interrupt, and further interrupts do not stop this."""
     start, out = slow_process
     process = start()
     wait_for_parts(out, 1, process)

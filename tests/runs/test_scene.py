@@ -89,7 +89,7 @@ def test_mapping_may_hold_what_is_like_a_list(values):
 def test_an_axis_may_be_a_row_of_values(tmp_path, values):
     scene = load_scene({**GOOD, "axes": {"a": values}})
     assert scene.axes[0].values.tolist() == [0, 0.5, 1]
-    # The text is that of a scene file, whoever reads it.
+    # The text of a scene is that of a scene file, whatever its source.
     assert "a = { values = [0.0, 0.5, 1.0] }" in scene.text.replace("[0,", "[0.0,")
     changed = load_scene(GOOD, {"axes.a": values})
     assert changed.axes[0].values.tolist() == [0, 0.5, 1] and changed.text == scene.text
@@ -116,7 +116,7 @@ def test_text_of_a_changed_scene_gives_that_scene(tmp_path):
     ],
 )
 def test_text_of_a_mapping_gives_its_scene(tmp_path, given, of):
-    """Other processes, and results that grow, have only the text."""
+    """Other processes and growing results have only the text of a scene."""
     path, scene = tmp_path / "s.toml", load_scene(changed(**given))
     path.write_text(scene.text)
     assert of(scene) and of(load_scene(path)) and load_scene(path, {"outputs": None}).request == scene.request

@@ -1,4 +1,4 @@
-"""Zarr stores that workers write: the same result as the HDF5 file, resumable, damage found."""
+"""Zarr stores that workers write: results equal to the HDF5 file, resumption, and detection of damage."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def identical(one, two):
 
 
 def large(scene):
-    """Enough chunks for shards of several."""
+    """A scene with enough chunks for several shards."""
     return scene | {"axes": {"b": {"start": 1.0, "stop": 9.0, "num": 40}, "a": {"start": 0.0, "stop": 10.0, "num": 41}}}
 
 
@@ -75,7 +75,7 @@ def test_export_is_bit_identical_to_the_file(grid_scene, tmp_path, which):
     export(tmp_path / "r.zarr", tmp_path / "exported.nc")
     ours, exported = opened(tmp_path / "direct.nc"), opened(tmp_path / "exported.nc")
     identical(ours, exported)
-    # A new version then says what differs, and can grow either.
+    # A later version can then report differences, and can extend either file.
     details = [read_attribute(tmp_path / name, "numerics_detail") for name in ("direct.nc", "exported.nc")]
     assert details[0] == details[1] is not None
     assert verify(tmp_path / "exported.nc").problem == "" == verify(tmp_path / "r.zarr").problem
@@ -86,7 +86,7 @@ def test_export_is_bit_identical_to_the_file(grid_scene, tmp_path, which):
 
 
 def as_file(path):
-    """The Dataset of a store or a file, without what differs from run to run."""
+    """The Dataset of a store or a file, without the attributes that differ from run to run."""
     if path.is_dir():
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -111,7 +111,7 @@ def test_xarray_opens_a_store_as_the_file(grid_scene, tmp_path, which, monkeypat
 
 
 def test_a_growing_store_opens_and_has_what_is_computed(grid_scene, tmp_path, monkeypatch):
-    """Also where a shard is not complete; what is missing has no value."""
+    """Incomplete shards are written as well; missing points have no value."""
     from drivetrain_jax.runs import zarr_sink
 
     monkeypatch.setattr(zarr_sink, "_INTERVAL", 0.0)
@@ -142,7 +142,7 @@ SLOW = {
 
 
 def test_a_store_whose_run_is_killed_opens_and_is_resumed(tmp_path):
-    """Twice, by SIGKILL; no batch that was stored is lost, and the result has the bits of the file."""
+    """After two kills by SIGKILL no stored batch is lost, and the result has the bits of the file."""
     (tmp_path / "scene.toml").write_text(toml.write(SLOW))
     path, parts = tmp_path / "r.zarr", tmp_path / "r.zarr.parts"
     command = [sys.executable, toy.__file__, "run", str(tmp_path / "scene.toml"), "--out", str(path), "--store", "zarr"]
@@ -164,7 +164,7 @@ def test_a_store_whose_run_is_killed_opens_and_is_resumed(tmp_path):
 
 
 def test_points_of_several_blocks_and_shards(grid_scene, tmp_path, monkeypatch):
-    """Shards are written when the blocks that they lie in are complete, each once."""
+    """Each shard is written once, when the blocks that it overlaps are complete."""
     monkeypatch.setattr("drivetrain_jax.runs.plan._BLOCK", 300)
     monkeypatch.setattr(zarr_store, "_MOST_POINTS", 100)
     written, write = [], zarr_store.write
@@ -180,7 +180,7 @@ def test_interrupted_damaged_and_resumed(grid_scene, tmp_path):
     scene, path, pool = large(grid_scene), tmp_path / "r.zarr", threads(1, "chunk")
     with pytest.raises(Interrupted) as stopped:
         to_store(scene, path, executor=Threads(1), report=stop_after(3))
-    # In a process of its own the thread would be gone.
+    # The thread of the interrupted run must end, as it would with its process.
     pool.shutdown()
     done, found = stopped.value.progress.computed, status(scene, path)
     assert 0 < done <= found.done < 1640 and found.state == "partial" and not path.exists()
@@ -289,7 +289,7 @@ def test_a_changed_coordinate_is_found(grid_scene, tmp_path):
 
 
 def test_a_store_of_an_earlier_version_is_one_line(grid_scene, tmp_path, capsys):
-    """Its points are in the order of computation."""
+    """The points of such a store are in the order of computation."""
     import zarr
 
     path = tmp_path / "r.zarr"

@@ -1,4 +1,4 @@
-"""A system and analyses that compile in no time, to test the engine with; ``drivetrain`` over them when run as a script."""
+"""A system and analyses that compile fast, for tests of the engine; as a script this module is ``drivetrain`` with them."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ LARGE = 5.0
 
 
 def _solve(values: dict, effort, outputs: tuple[str, ...], bonus: float) -> dict:
-    """``a > 9`` has no value. The batch, if any, is the last axis."""
+    """The results of a point, or of a batch along the last axis; ``a > 9`` has no value."""
     a, b = jnp.asarray(values["a"]), values["b"]
     bonus = bonus + values.get("derived", 2 * a) - 2 * a
     total = a + b * values["n"] + sum(x * 10.0**k for k, x in enumerate(values["length"])) + bonus
@@ -66,7 +66,7 @@ def _solve(values: dict, effort, outputs: tuple[str, ...], bonus: float) -> dict
 
 
 def _solvers(system: System, request) -> tuple[Solver, ...]:
-    """Small ``a`` is cheaper with the broadcasting solver, large ``a`` impossible for it."""
+    """Two solvers: small ``a`` is cheaper with the broadcasting one, large ``a`` is impossible for it."""
     small = Solver(
         "broadcasting",
         lambda values, effort: _solve(values, effort, request.outputs, 0.0),
@@ -103,7 +103,7 @@ def _broken_solvers(system: System, request) -> tuple[Solver, ...]:
 
 
 def _line_solvers(system: System, request) -> tuple[Solver, ...]:
-    """Running sums along the path ``b``: impossible if a line were cut."""
+    """A solver of running sums along the path ``b``, which need the whole line."""
 
     def solve(values: dict, effort) -> dict:
         running = jnp.cumsum(values["b"]) * values["a"]
@@ -114,7 +114,7 @@ def _line_solvers(system: System, request) -> tuple[Solver, ...]:
 
 
 def _follow_solvers(system: System, request) -> tuple[Solver, ...]:
-    """Sums of ``weight * length`` along the path, the batch as last axis; ``stiffness`` may be infinite."""
+    """A solver of sums of ``weight * length`` along the path; the batch is the last axis, ``stiffness`` may be infinite."""
 
     def solve(values: dict, effort) -> dict:
         pieces, weight = values["length"], values["weight"]

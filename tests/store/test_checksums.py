@@ -1,4 +1,4 @@
-"""Checksums of a finished file: whatever changes what a reader sees is found, and named."""
+"""Checksums of a finished file: every change that a reader would see is found and named."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_change_is_named(path, change, named):
 
 
 def test_large_variables_are_checked_to_their_end(path, monkeypatch):
-    """Values are read some at a time; what comes out does not depend on how many."""
+    """Checksums do not depend on the size of the blocks in which values are read."""
     with h5py.File(path, "r+") as file:
         whole = checksums.checksums(file)
         monkeypatch.setattr(checksums, "_BLOCK", 100)
@@ -74,7 +74,7 @@ def test_a_file_of_another_origin_has_none(tmp_path):
 
 
 def seen(path):
-    """What a reader sees, None if it cannot read; bytes, so that NaN and -0 count."""
+    """The content that a reader sees, as bytes so that NaN and -0 count; None if it cannot read the file."""
     try:
         ds = open_result(path)
     except InputError:
@@ -93,7 +93,7 @@ def test_a_flipped_bit_in_the_name_of_the_checksums_is_one_line(path):
 
 
 def test_every_flipped_bit_that_a_reader_could_see_is_found(path):
-    """Bytes that nothing reads (gaps of the format) may change unnoticed: the contents are what they were."""
+    """Only bytes that no reader reads (gaps of the format) may change unnoticed."""
     whole, content = path.read_bytes(), seen(path)
     rng = np.random.default_rng(7)
     found = 0

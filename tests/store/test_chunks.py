@@ -1,4 +1,4 @@
-"""Parts: complete, verified, or ignored."""
+"""Parts are complete and verified, or ignored."""
 
 from __future__ import annotations
 

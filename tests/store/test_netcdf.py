@@ -1,4 +1,4 @@
-"""Files in the netCDF4 format: for every reader the same as what h5netcdf writes of the same result."""
+"""Files in the netCDF4 format: for every reader equal to the file that h5netcdf writes of the same result."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OWN = {"_NCProperties", "checksums"}
 
 @pytest.fixture
 def result():
-    """Dimensions with and without coordinates, one of them empty; texts, codes, complex numbers, a coordinate aside."""
+    """A result with and without coordinates, an empty dimension, texts, codes, complex numbers, an auxiliary coordinate."""
     x = Coordinate("x", ("x",), np.array([1.0, 2.0]), "m", "place")
     time = Coordinate("t0", ("x",), np.array([0.0, 5.0]), "s", "instant")
     results = [
@@ -38,13 +38,13 @@ def path(result, tmp_path):
 
 
 def kind(of):
-    """A type of HDF5, and whether it has a name in the file."""
+    """A type of HDF5, and a flag for a named type of the file."""
     text = of.get_cset() if isinstance(of, h5py.h5t.TypeStringID) else None
     return str(of.dtype), of.get_class(), text, of.committed()
 
 
 def shown(file, key, value):
-    """The value of an attribute; whatever stands for a dimension or a variable by the name of that."""
+    """The value of an attribute, with references to dimensions and variables replaced by their names."""
     if isinstance(value, h5py.Reference):
         return file[value].name
     if key.startswith("_Netcdf4"):
@@ -52,13 +52,13 @@ def shown(file, key, value):
         return [numbers[number] for number in np.atleast_1d(value)]
     if isinstance(value, (np.ndarray, np.void)):
         parts = [shown(file, key, part) for part in value]
-        # The order in which variables were linked to a dimension does not count.
+        # The order of the links between variables and a dimension does not matter.
         return sorted(parts) if key == "REFERENCE_LIST" and isinstance(value, np.ndarray) else parts
     return repr(value)
 
 
 def listing(path):
-    """All that there is in a file, by name: types, shapes, values, and attributes with the hidden ones."""
+    """The content of a file by name: types, shapes, values, and all attributes, hidden ones included."""
     with h5py.File(path) as file:
         found = {}
         for name, item in {"/": file, **file}.items():
@@ -75,7 +75,7 @@ def listing(path):
 def test_the_file_is_what_h5netcdf_writes(result, path, tmp_path):
     result.to_dataset().to_netcdf(tmp_path / "x.nc", engine="h5netcdf")
     ours, theirs = listing(path), listing(tmp_path / "x.nc")
-    # The coordinate that is aside is told to those who do not look at the variables as well.
+    # Our file also lists the auxiliary coordinate in a global attribute.
     assert ours.pop("/@coordinates")[2] == "'t0'"
     assert ours == theirs
 
@@ -83,7 +83,7 @@ def test_the_file_is_what_h5netcdf_writes(result, path, tmp_path):
 def test_netcdf4_reads_what_was_written(result, path):
     with netCDF4.Dataset(path, auto_complex=True) as file:
         assert {name: dim.size for name, dim in file.dimensions.items()} == result.sizes
-        # Numbered alike in every process.
+        # The order of dimensions is the same in every process.
         assert list(file.dimensions) == ["x", "k", "number", "none", "a", "b"]
         assert file.data_model == "NETCDF4" and file.wall_time_s == 1.5 and file.solves == 3 and file.none == ""
         for name, entry in {**result.coords, **result.data}.items():

@@ -1,4 +1,4 @@
-"""Datasets and their file: labels, CF attributes, never half a file."""
+"""Datasets and their files: labels, CF attributes, and files that are complete or absent."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_round_trip_by_plain_xarray(result, tmp_path):
 
 
 def test_long_details_are_in_a_group(result, tmp_path):
-    """Datasets do not show them; they are read from older files, too, which hold them among the attributes."""
+    """Datasets lack them; they are also read from older files, which have them among the global attributes."""
     path, long = tmp_path / "r.nc", "x" * 5000
     detailed = result.with_attrs(numerics_detail=long)
     write_result(detailed, path, tmp_path / "tmp")
@@ -88,7 +88,7 @@ def test_a_variable_without_entries(tmp_path):
 
 
 def resident():
-    """Megabytes of this process that are pages of files."""
+    """Resident memory of this process in pages of files, in MB."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return sum(int(line.split()[1]) / 1024 for line in lines if line.startswith(("RssFile", "RssShmem")))
 
