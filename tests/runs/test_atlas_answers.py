@@ -75,7 +75,7 @@ def test_boundaries_lie_on_both_sides_of_the_angle_0():
 
 
 @pytest.mark.parametrize(("J1", "k1"), [(2.0, 1000.0), (2e-9, 3.7), (1e-170, 1e-170)])
-def test_the_ends_of_an_atlas_may_be_asked_for_in_other_units(J1, k1):
+def test_the_ends_of_an_atlas_may_be_given_in_other_units(J1, k1):
     """Converted ends, or ends copied from a message, differ from the ends of the atlas by a rounding."""
     atlas, critical = atlas_of((0.0, 0.3), (1.3, 1.5)), 2 * np.sqrt(J1) * np.sqrt(k1)
     shaft = PhysicalShaft(J1, 100 * J1, k1, k1, 0.001 * critical, 0.001 * critical)
@@ -115,7 +115,7 @@ def test_tiles_lie_along_the_longest_axes_of_a_chart(monkeypatch, axes):
 
 
 @pytest.mark.parametrize("number", [np.float32, np.float64, np.array])
-def test_numbers_of_numpy_are_numbers(number):
+def test_numbers_of_numpy_are_accepted(number):
     atlas, speeds = atlas_of((-0.2, 0.3), (1.3, 1.5)), (1.3125, 1.5)
     found = atlas_answers.query(atlas, {"beta": number(0.25), "Omega": number(1.375)}).data
     assert found == atlas_answers.query(atlas, {"beta": 0.25, "Omega": 1.375}).data
@@ -143,7 +143,7 @@ def test_a_chart_over_the_angle_0_has_curves_and_tips_on_both_sides():
     assert np.nanmax(part["boundary_beta"].values) < -0.1
 
 
-def test_a_chart_looks_for_its_tips_once(monkeypatch):
+def test_a_chart_searches_its_tips_once(monkeypatch):
     source, searched = panels((0.0, 0.3), (1.3, 1.5)), []
 
     def counted(patches, number, horizontal):
@@ -183,21 +183,21 @@ def test_an_undecided_range_that_hides_a_change_ends_a_window(rtol, beta):
     assert atlas.radius({"beta": np.full(speeds.size, beta), "Omega": speeds, **columns(speeds.size)}).max() < 1
 
 
-def test_the_nearest_change_beside_an_undecided_range():
+def test_the_nearest_change_next_to_an_undecided_range():
     atlas = atlas_of((0.0, 1.3), (0.15, 2.0), rtol=1e-5)
     below = atlas_answers.query(atlas, {"beta": 0.894981, "Omega": 0.752}).data["nearest"]["Omega"]["below"]
     exact = atlas_answers.query(atlas_of((0.0, 1.3), (0.15, 2.0)), {"beta": 0.894981, "Omega": 0.752})
     assert abs(below["value"] - exact.data["nearest"]["Omega"]["below"]["value"]) < below["error"] < 1e-3
 
 
-def test_a_change_that_may_hide_in_an_undecided_range_is_not_denied():
+def test_no_change_is_stated_with_undecided_ranges_as_exception():
     atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
     nearest = design.Nearest("Omega", 1.0, None, None, ((0.9, 1.1),))
     assert atlas_answers._reach(atlas, nearest) == "none from 0.3 to 2, except undecided ranges:"
     assert atlas_answers._reach(atlas, replace(nearest, undecided=())) == "none from 0.3 to 2"
 
 
-def test_next_to_no_damping_is_not_none():
+def test_very_little_damping_is_not_zero_damping():
     """Without damping S21 reaches down to the angle 0, with very little damping only down to .0001."""
     atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
     point = {"beta": 0.00005, "Omega": 1.4159846397}
@@ -206,7 +206,7 @@ def test_next_to_no_damping_is_not_none():
         atlas_answers.query(atlas, {**point, "zeta": 1e-9})
 
 
-def test_only_what_is_certain_is_denied():
+def test_an_answer_without_a_value_states_if_it_is_certain():
     crowded = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=1e-7)
     assert "\n  no beta found; whether there is one is undecided\n" in str(
         atlas_answers.widest_angle(crowded, {"Omega": (1.3, 1.5)})
@@ -236,7 +236,7 @@ def test_stable_intervals_away_from_the_safe_end_are_listed():
 @pytest.mark.parametrize(
     ("speeds", "kind", "value"), [((1.3, 1.5), "crossing", S21[0]), ((1.415, 1.417), "undecided", 0.1062824374)]
 )
-def test_an_answer_says_what_ends_it(speeds, kind, value):
+def test_an_answer_names_the_kinds_of_its_ends(speeds, kind, value):
     """On a loose atlas the tip of S21 is undecided from .10628 to .10640, in a narrow range of speeds to .11255."""
     reply = atlas_answers.widest_angle(atlas_of((0.0, 1.3), (0.15, 2.0), rtol=1e-5), {"Omega": speeds})
     found = json.loads(reply.to_json())
@@ -252,7 +252,7 @@ def test_an_answer_says_what_ends_it(speeds, kind, value):
         assert found["error"] is None and value < S21[0] and " (undecided beyond)\n  not certain" in str(reply)
 
 
-def test_windows_say_what_ends_them():
+def test_windows_name_the_kinds_of_their_ends():
     found = atlas_answers.speed_windows(atlas_of((0.0, 1.3), (0.15, 2.0), rtol=1e-5), {"beta": 0.894981})
     windows = json.loads(found.to_json())["windows"]
     kinds = [[end["kind"] for end in window["ends"]] for window in windows]
@@ -273,7 +273,7 @@ def test_answers_without_damping_agree_with_direct_solves():
     assert len(windows) >= 5 and all(window["check"]["agrees"] for window in windows)
 
 
-def test_without_damping_tips_are_where_the_angle_is_0():
+def test_without_damping_tips_are_at_the_angle_0():
     source = panels((0.0, 1.2), (0.3, 2.0), zeta=0.0)
     assert {"S21", "H21", "C+1"} <= set(chart(source, {}, 20)["tip"].values)
     both = chart(panels((-0.3, 0.2), (1.3, 1.5), zeta=0.0), {}, 20)
@@ -281,7 +281,7 @@ def test_without_damping_tips_are_where_the_angle_is_0():
     assert chart(source, {"beta": (0.9, 1.2)}, 20)["tip"].size == 0
 
 
-def test_an_atlas_without_a_panel_answers_what_it_can(monkeypatch):
+def test_an_atlas_without_a_panel_answers_by_direct_solves(monkeypatch):
     monkeypatch.setattr(rounds, "MAX_SOLVES", 10)
     source = panels((0.0, 0.5), (0.001, 0.002), rtol=1e-8)
     atlas = dt.open_atlas(source)
@@ -333,7 +333,7 @@ def test_steps_of_a_gradient_are_found_where_the_system_predicts_none():
 @pytest.mark.parametrize(
     ("radius", "text"), [(1 - 2.04e-10, "1 - 2.0e-10"), (1 + 5e-7, "1 + 5.0e-07"), (0.9, "0.9"), (1.0, "1")]
 )
-def test_distance_from_one_is_not_lost_among_digits(radius, text):
+def test_distance_from_one_keeps_its_digits(radius, text):
     assert _from_one(radius) == text
 
 

@@ -109,7 +109,7 @@ def test_points_and_multipliers_through_an_atlas():
     np.testing.assert_allclose(modulus.max("multiplier"), found["spectral_radius"], rtol=1e-12)
 
 
-def test_auto_takes_an_atlas_where_points_are_many(monkeypatch, direct):
+def test_auto_uses_an_atlas_for_many_points(monkeypatch, direct):
     assert "atlas_solves" not in dt.run(floquet("auto")).attrs
     monkeypatch.setattr(atlas_choice, "_WORTHWHILE", 500)
     # An eighth of the effort of 533 points is that of some 30 solves, too few for an atlas of two parameters.
@@ -123,7 +123,7 @@ def test_auto_takes_an_atlas_where_points_are_many(monkeypatch, direct):
     assert_agree(dt.run(floquet("auto")), direct)
 
 
-def test_the_way_that_auto_takes_is_named_where_it_keeps_a_result_from_growing(monkeypatch, tmp_path):
+def test_the_message_names_another_route_of_auto(monkeypatch, tmp_path):
     path = tmp_path / "r.nc"
     run_to_file(floquet("auto"), path)
     for name, value in (("_WORTHWHILE", 600), ("_FEWEST", (1, 1))):
@@ -144,14 +144,14 @@ def test_auto_counts_the_effort_of_solves_not_their_number(slowest, fastest, tri
     assert (atlas_choice.choose_atlas(load_scene(floquet("auto", axes))) is not None) is tried
 
 
-def test_what_an_atlas_does_not_cover_is_solved(monkeypatch, direct):
+def test_points_outside_an_atlas_are_solved(monkeypatch, direct):
     monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
     found = dt.run(floquet("atlas"))
     assert found.attrs["atlas_uncovered"] == 533 and found.attrs["atlas_panels"] == 0
     same_arrays(found, direct)
 
 
-def test_gaps_of_an_atlas_are_told(monkeypatch, tmp_path):
+def test_gaps_of_an_atlas_are_noted(monkeypatch, tmp_path):
     assert run_to_file(floquet("atlas"), tmp_path / "whole.nc").note == ""
     monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
     told = (
@@ -227,7 +227,7 @@ def test_the_function_of_the_parameters(atlas, direct):
     assert line["spectral_radius"].dims == ("Omega",) and float(line["beta"] if "beta" in line.coords else 0.31) == 0.31
 
 
-def test_numbers_for_all_parameters_no_points_and_shapes_that_do_not_fit(atlas):
+def test_single_points_empty_arrays_and_wrong_shapes(atlas):
     point = atlas.grid(beta=0.31, Omega=1.2)
     assert point["spectral_radius"].shape == ()
     assert float(point["spectral_radius"]) == float(atlas(beta=0.31, Omega=1.2)["spectral_radius"])
@@ -246,7 +246,7 @@ def test_an_atlas_of_another_range_is_refused(tmp_path):
         run_to_file(ATLAS, tmp_path / "a.nc", overrides={"axes.beta.stop": 0.5})
 
 
-def test_arrays_with_labels_keep_them_and_are_never_stretched_to_fit(atlas):
+def test_labelled_arrays_keep_their_labels_and_must_agree(atlas):
     grid = atlas.grid(beta=[0.1, 0.31], Omega=[1.1, 1.2, 1.3])
     outer = atlas(beta=grid["beta"], Omega=grid["Omega"])
     assert outer.indexes.keys() == {"beta", "Omega"} and outer["beta"].attrs["units"] == "rad"
@@ -268,7 +268,7 @@ def test_an_atlas_without_a_panel_has_all_its_points_solved(monkeypatch, tmp_pat
         same_arrays(found, exact)
 
 
-def test_values_that_are_one_in_the_coordinates_of_an_atlas():
+def test_values_that_coincide_in_the_coordinates_of_an_atlas():
     """The speeds differ by a rounding, and the squares of the angles underflow."""
     for axes in (
         {"beta": {"values": [0.1, 0.3]}, "Omega": {"values": [1.9, 1.9000000000000001]}},
@@ -279,7 +279,7 @@ def test_values_that_are_one_in_the_coordinates_of_an_atlas():
         np.testing.assert_allclose(found["spectral_radius"], exact["spectral_radius"], rtol=1e-11)
 
 
-def test_what_is_not_finite_is_never_called_stable(atlas):
+def test_points_that_are_not_finite_are_never_stable(atlas):
     """In compiled code the largest of moduli that are all NaN is -inf, which is less than 1."""
     panels = tuple(replace(panel, coefficients=np.nan * panel.coefficients) for panel in atlas.stability.atlas.panels)
     lost = replace(atlas.stability, atlas=replace(atlas.stability.atlas, panels=panels))
@@ -382,7 +382,7 @@ def test_the_same_point_in_physical_units(atlas):
         atlas_answers.query(atlas, {**shaft, "speed": rpm, "angle": 10.0, "beta": 0.1})
 
 
-def test_what_is_asked_for_is_not_given(atlas):
+def test_the_parameter_of_the_answer_is_not_given(atlas):
     shaft = {"J1": 2.0, "J2": 200.0, "k1": 1000.0, "k2": 1000.0, "c1": 0.0894427191, "c2": 0.0894427191}
     refused = "is the answer; allowed is to leave it out"
     with pytest.raises(dt.InputError, match=f"^Omega = 1.1:1.2: {refused}$"):
@@ -533,7 +533,7 @@ def test_a_zoom_on_the_command_line(file, capsys):
     assert code == 2 and err == "drivetrain: Omega = 3: allowed is a number or LOW:HIGH, 1 <= Omega <= 2\n"
 
 
-def test_panels_that_are_not_those_written_answer_nothing(file, tmp_path, capsys):
+def test_damaged_panels_are_refused(file, tmp_path, capsys):
     damaged, figure = tmp_path / "damaged.nc", tmp_path / "f.png"
     shutil.copy(file, damaged)
     with h5py.File(damaged, "r+") as store:
@@ -563,7 +563,7 @@ def test_blocks_of_a_grid_cover_it_once(lengths, rows):
     assert {size[-2] for size in sizes} <= {rows, lengths[-2] % rows}
 
 
-def test_what_judges_cells_is_compiled_before_the_atlas_is_there(monkeypatch):
+def test_the_kernel_of_single_cells_compiles_during_the_solves(monkeypatch):
     """A large chart compiles this kernel while the solves compile, and no other one afterwards."""
     from drivetrain_jax.atlas import stability
 

@@ -1,4 +1,4 @@
-"""Counts of work, which are exact where times are not: no count may change by more than a tenth without a reason.
+"""Counts of work, which are exact where times are not: no count may grow by more than a tenth without a reason.
 
 One scene per system counts traced operations, steps, evaluations, compiled kernels, and written bytes. A change that needs
 more must give the reason and store the new number here. A change that needs much less must store its number as well, so

@@ -110,7 +110,7 @@ def test_processes_and_dask_give_the_same_bits_as_threads(drivetrain, tmp_path):
         assert other.attrs["digest"] == reference.attrs["digest"]
 
 
-def test_a_chunk_that_kills_every_process_is_all_that_is_lost(drivetrain, tmp_path):
+def test_only_the_chunk_that_kills_every_process_is_lost(drivetrain, tmp_path):
     scene = SCENE | {"axes": {"delta": {"start": 0.1, "stop": 2.0, "num": 96}, "deadly": {"values": [0, 1]}}}
     error = finished(drivetrain(scene, "deadly", "--workers", "1"))
     ds = arrays(tmp_path / "deadly.nc")
@@ -130,7 +130,7 @@ def test_a_chunk_whose_process_dies_once_is_computed_again(drivetrain, tmp_path)
 
 
 @pytest.mark.parametrize(("deaths", "code"), [("1", 0), ("9", 3)])
-def test_a_process_that_dies_while_it_gets_ready_is_started_again(drivetrain, package, deaths, code):
+def test_a_process_that_dies_at_its_start_is_started_again(drivetrain, package, deaths, code):
     package["FRAGILE_AT_START"] = deaths
     scene = SCENE | {"axes": {"delta": {"start": 0.1, "stop": 2.0, "num": 40}}}
     error = finished(drivetrain(scene, "starts", "--workers", "1"), code)
@@ -153,7 +153,7 @@ def test_no_process_outlives_the_driver(drivetrain, tmp_path, sent):
     assert "failed=0" in resumed and "reused=0" not in resumed
 
 
-def test_scheduler_and_workers_of_their_own(drivetrain, package, tmp_path):
+def test_external_scheduler_and_workers(drivetrain, package, tmp_path):
     pytest.importorskip("distributed")
     command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"]
     file = tmp_path / "scheduler.json"
@@ -245,7 +245,7 @@ def test_requests_of_several_tasks_lose_only_the_one_that_kills_workers(monkeypa
     assert len(requests[0]) == len(requests[-1]) == 1
 
 
-def test_requests_are_as_long_as_a_second_and_as_large_as_the_network_likes():
+def test_size_of_requests_follows_their_time_and_bytes():
     requests = cluster._Requests(range(100_000), 2)
     assert requests.take() == (0,)
     for _ in range(9):
@@ -260,7 +260,7 @@ def test_requests_are_as_long_as_a_second_and_as_large_as_the_network_likes():
 
 
 @pytest.mark.parametrize(("values", "ahead"), [(1, 32), (1 << 20, 2)])
-def test_threads_are_handed_many_chunks_only_where_results_are_small(values, ahead):
+def test_threads_queue_many_chunks_only_if_results_are_small(values, ahead):
     results, begun = {"value": np.zeros(values)}, []
 
     def chunks():
@@ -277,7 +277,7 @@ def test_threads_are_handed_many_chunks_only_where_results_are_small(values, ahe
     assert sorted(number for number, _ in finished) == sorted({*range(100)} - {0, 1})
 
 
-def test_threads_are_kept_but_for_those_of_a_run_that_was_left():
+def test_threads_are_reused_except_after_an_interrupt():
     """A chunk that still runs after an interrupt does not delay the next run."""
     result, stop = {"value": np.zeros(1)}, threading.Event()
 
@@ -309,7 +309,7 @@ def test_threads_are_kept_but_for_those_of_a_run_that_was_left():
         ({"dask": "tcp://127.0.0.1:1"}, "dask = 'tcp://127.0.0.1:1': no scheduler answers"),
     ],
 )
-def test_wrong_place_is_one_clear_line(options, message, monkeypatch):
+def test_wrong_executor_is_one_clear_line(options, message, monkeypatch):
     monkeypatch.setattr("drivetrain_jax.runs.cluster._PATIENCE", "1s")
     if "dask" in options:
         pytest.importorskip("distributed")
@@ -344,7 +344,7 @@ def test_a_process_that_dies_between_two_chunks_is_replaced():
     assert (ds.outcome.values == Outcome.SUCCESS).all()
 
 
-def test_chunks_that_never_come_back_are_missed(monkeypatch):
+def test_missing_chunks_are_an_error(monkeypatch):
     monkeypatch.setattr(Threads, "run", lambda *_: (chunk for chunk in ()))
     with pytest.raises(dt.Incomplete, match=r"^1 chunk returned no result"):
         dt.run(cardan_scene({"beta": {"values": [0.1, 0.2]}, "Omega": {"values": [1.0]}}))

@@ -80,7 +80,7 @@ def test_only_new_points_are_computed(tmp_path, large, new):
         ([1.0, 2.0, 1e16], [2.5], 0),
     ],
 )
-def test_values_far_apart_do_not_blur_small_ones(tmp_path, old, new, shared):
+def test_distant_values_do_not_widen_the_tolerance_of_small_ones(tmp_path, old, new, shared):
     path, large = tmp_path / "r.nc", scene({"b": new}, {"a": 1.0})
     run_to_file(scene({"b": old}, {"a": 1.0}), path)
     if shared:
@@ -101,13 +101,13 @@ def test_values_far_apart_do_not_blur_small_ones(tmp_path, old, new, shared):
         (np.linspace(-1, 1, 21), np.array([0.0])),
     ],
 )
-def test_roundings_of_an_even_axis_are_no_difference(old, new):
+def test_axis_values_equal_to_rounding_are_the_same(old, new):
     few, many = sorted((old, new), key=len)
     assert (_positions(many, few) >= 0).all()
     assert (_positions(few, many) >= 0).sum() == len(few)
 
 
-def test_values_are_taken_not_computed(tmp_path):
+def test_values_are_reused_not_computed(tmp_path):
     """Marked values survive, so reused points were not computed again."""
     path = tmp_path / "r.nc"
     run_to_file(SMALL, path)
@@ -192,7 +192,7 @@ def test_a_result_of_one_point_or_line_is_refused(tmp_path, small, large):
 
 
 @pytest.mark.parametrize("order", [("a", "b"), ("b", "a")])
-def test_lines_are_taken_whole(tmp_path, order):
+def test_lines_are_reused_whole(tmp_path, order):
     path, b = tmp_path / "r.nc", [1.0, 4.0, 9.0]
 
     def line(**axes):
@@ -241,7 +241,7 @@ def test_an_interrupted_growth_resumes_and_keeps_the_former_result(tmp_path):
         assert variable.values.tobytes() == opened(undisturbed)[name].values.tobytes()
 
 
-def test_unfinished_work_is_resumed_only_with_the_same_points_taken(tmp_path):
+def test_unfinished_work_is_resumed_only_with_the_same_reused_points(tmp_path):
     small, path = tmp_path / "small.nc", tmp_path / "r.nc"
     run_to_file(SMALL, small)
     calls = iter(range(3))
@@ -279,7 +279,7 @@ def test_lost_points_are_computed_again(tmp_path):
         ({"fixed": {"n": 4}}, "holds none of the points"),
     ],
 )
-def test_what_differs_in_more_than_points_is_refused(tmp_path, change, reason):
+def test_results_that_differ_in_more_than_points_are_refused(tmp_path, change, reason):
     run_to_file(SMALL, tmp_path / "small.nc")
     with pytest.raises(InputError, match=reason):
         run_to_file(LARGE | change, tmp_path / "r.nc", reuse=[tmp_path / "small.nc"])
@@ -299,7 +299,7 @@ def test_other_numerics_are_refused(tmp_path, monkeypatch):
     assert found.state == "stale" and "diffrax is 0, was" in found.reason and "--fresh" in found.reason
 
 
-def test_the_former_result_has_to_be_one(tmp_path):
+def test_paths_without_a_result_are_refused(tmp_path):
     (tmp_path / "store").mkdir()
     (tmp_path / "store" / "zarr.json").touch()
     for name, what in (
@@ -339,7 +339,7 @@ def turned(path, **changes):
     ],
     ids=["mirrored", "cut", "mirrored results", "one value"],
 )
-def test_a_rearranged_copy_is_neither_taken_nor_called_complete(tmp_path, change):
+def test_a_rearranged_copy_is_neither_reused_nor_complete(tmp_path, change):
     run_to_file(SMALL, tmp_path / "r.nc")
     copy = turned(tmp_path / "r.nc", **change)
     before = copy.read_bytes()
@@ -378,7 +378,7 @@ def test_damaged_values_do_not_enter_another_result(tmp_path):
         run_to_file(LARGE, tmp_path / "new.nc", reuse=[path])
 
 
-def test_damage_that_came_during_an_interrupted_growth_is_named(tmp_path):
+def test_damage_during_an_interrupted_growth_is_named(tmp_path):
     path = tmp_path / "r.nc"
     run_to_file(SMALL, path)
     with pytest.raises(Interrupted):
@@ -406,7 +406,7 @@ POINTS = {"system": "toy", "analysis": "toy", "outputs": NAMES, "points": {"a": 
     ],
     ids=["one point twice", "one value under two labels", "fewer results", "fewer results of the same points"],
 )
-def test_what_only_the_former_result_has_is_not_dropped(tmp_path, small, large):
+def test_points_of_the_former_result_alone_are_not_dropped(tmp_path, small, large):
     path = tmp_path / "r.nc"
     run_to_file(small, path)
     before = path.read_bytes()
@@ -418,7 +418,7 @@ def test_what_only_the_former_result_has_is_not_dropped(tmp_path, small, large):
     assert status(large, path).state == "complete"
 
 
-def test_points_that_are_there_twice(tmp_path):
+def test_duplicate_points(tmp_path):
     path = tmp_path / "r.nc"
     run_to_file(POINTS | {"points": {"a": [1.0, 1.0], "b": [1.0, 1.0]}}, path)
     grid = scene({"a": [1.0, 3.0], "b": [1.0]})
@@ -447,7 +447,7 @@ def test_an_interrupted_fresh_run_is_resumed_with_and_without_fresh(tmp_path, ag
     assert counts(run_to_file(LARGE, path, fresh=True)) == (322, 322, 0)
 
 
-def test_fresh_drops_work_that_was_begun_otherwise(tmp_path):
+def test_fresh_drops_other_unfinished_work(tmp_path):
     path = tmp_path / "r.nc"
     small_and_interrupted(path)
     assert counts(run_to_file(LARGE, path, fresh=True)) == (322, 322, 0)
@@ -457,7 +457,7 @@ def test_fresh_drops_work_that_was_begun_otherwise(tmp_path):
     assert counts(run_to_file(LARGE, tmp_path / "t.nc", fresh=True, reuse=[tmp_path / "s.nc"])) == (322, 300, 22)
 
 
-def test_an_interrupted_fresh_run_of_a_finished_scene_outlives_a_look_at_it(tmp_path):
+def test_reading_a_result_keeps_an_interrupted_fresh_run(tmp_path):
     path = tmp_path / "r.nc"
     run_to_file(LARGE, path)
     with pytest.raises(Interrupted) as stopped:

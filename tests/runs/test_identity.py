@@ -69,7 +69,7 @@ def test_order_of_axes_matters():
     assert digest(BASE | {"axes": axes}) != digest(BASE | {"axes": dict(reversed(axes.items()))})
 
 
-def test_numerics_decide(monkeypatch):
+def test_numerics_change_the_digest(monkeypatch):
     before = digest(BASE)
     for name, value in (("instruction_set", lambda: {"z80"}), ("versions", lambda packages: {"jax": "9"})):
         with monkeypatch.context() as patch:
@@ -83,7 +83,7 @@ def code(scene):
     return resolve(load_scene(scene)).numerics_detail["sources"]
 
 
-def test_the_code_of_systems_analyses_and_engine_decides():
+def test_the_code_of_systems_analyses_and_engine_changes_the_digest():
     parts = code(BASE)
     own = {"_quantities.py", "systems", "analysis", "analysis/numerics", "analysis/floquet", "atlas", "runs/kernel.py"}
     assert own < set(parts) and len(set(parts.values())) == len(parts)
@@ -111,7 +111,7 @@ def test_a_changed_file_changes_the_digest_and_a_figure_does_not(monkeypatch, tm
     assert {name for name in before if changed[name] != before[name]} == {"analysis/floquet"}
 
 
-def test_the_whole_package_of_a_system_from_elsewhere_decides(tmp_path):
+def test_the_whole_package_of_an_external_system_changes_the_digest(tmp_path):
     package = tmp_path / "gears"
     (package / "laws").mkdir(parents=True)
     for name in ("__init__.py", "shaft.py", "laws/__init__.py", "laws/stiffness.py"):
@@ -124,7 +124,7 @@ def test_the_whole_package_of_a_system_from_elsewhere_decides(tmp_path):
     assert identity._sources_of(package) != before
 
 
-def test_the_route_decides():
+def test_the_route_changes_the_digest():
     axes = {"beta": {"start": 0.0, "stop": 1.0, "num": 3}, "Omega": {"start": 1.0, "stop": 2.0, "num": 3}}
     scene = {"system": "cardan", "analysis": "floquet", "axes": axes, "fixed": CARDAN}
     atlas, direct = (
@@ -133,7 +133,7 @@ def test_the_route_decides():
     assert {name for name in atlas if atlas[name] != direct[name]} == {"route"}
 
 
-def test_chunk_size_decides(monkeypatch):
+def test_chunk_size_changes_the_digest(monkeypatch):
     from dataclasses import replace
 
     scene = load_scene(BASE)

@@ -41,7 +41,7 @@ TWO = {
 }
 
 
-def test_precision_that_was_unset_is_set_again(unset_precision):
+def test_double_precision_is_turned_on_again(unset_precision):
     expected = dt.run(TWO).mean_inertia
     unset_precision()
     assert dt.run(TWO).mean_inertia.equals(expected)
@@ -56,7 +56,7 @@ def test_a_call_within_single_precision_is_refused():
         dt.run(TWO)
 
 
-def test_full_vector_width_only_where_there_is_avx512(monkeypatch):
+def test_full_vector_width_only_with_avx512(monkeypatch):
     # Assume the options of jaxlib 0.10; the next test asks another version.
     monkeypatch.setattr(kernels, "compiler_knows", lambda option, value: True)
     monkeypatch.setattr(kernels, "instruction_set", lambda: {"x86_64", "avx2"})
@@ -72,7 +72,7 @@ def test_full_vector_width_only_where_there_is_avx512(monkeypatch):
     assert kernels.compiler_options(4, short_loops=True) == {"xla_backend_optimization_level": 1}
 
 
-def test_options_that_another_compiler_does_not_know_are_left_out(monkeypatch):
+def test_options_unknown_to_the_compiler_are_left_out(monkeypatch):
     monkeypatch.setattr(kernels.jaxlib, "__version__", "0.99.0")
     kernels.compiler_knows.cache_clear()
     # The installed compiler is asked.
@@ -139,7 +139,7 @@ def test_compiled_code_is_kept_in_a_private_folder(tmp_path):
 
 
 @pytest.mark.parametrize("setting", ["0", "a file"])
-def test_cache_is_off_if_unwanted_or_impossible(tmp_path, setting):
+def test_cache_is_off_by_setting_or_without_a_folder(tmp_path, setting):
     if setting == "a file":
         (tmp_path / "file").touch()
         setting = str(tmp_path / "file")
@@ -177,7 +177,7 @@ def test_scenes_of_few_points_are_compiled_without_optimising(monkeypatch):
     assert given == [True, False, False, False, False]
 
 
-def test_other_numbers_compile_nothing():
+def test_other_fixed_numbers_need_no_compilation():
     dt.run(chart("direct"))
     before = kernel._compiled.cache_info().misses
     other = chart("direct") | {"fixed": {"mu": 2.0, "alpha": 1.5, "zeta": 0.002, "gamma": 3.0}}

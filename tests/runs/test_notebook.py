@@ -38,7 +38,7 @@ def test_a_notebook_shows_a_bar(shown, grid_scene, tmp_path):
     assert len(shown) > before
 
 
-def test_a_report_of_the_caller_is_the_only_one(shown, grid_scene):
+def test_a_report_of_the_caller_replaces_the_bar(shown, grid_scene):
     reports = []
     dt.run(grid_scene, report=reports.append)
     assert reports and not shown

@@ -25,7 +25,7 @@ def compare(partial, whole):
     assert "unfinished" in partial.attrs["title"] and partial["outcome"].attrs["flag_meanings"].endswith(" pending")
 
 
-def test_what_is_done_is_there_and_the_rest_is_pending(grid_scene, tmp_path, monkeypatch):
+def test_finished_points_have_values_and_others_are_pending(grid_scene, tmp_path, monkeypatch):
     # Every chunk is written immediately.
     monkeypatch.setattr(work, "_SHORTEST", 0.0)
     path, whole = tmp_path / "r.nc", dt.run(grid_scene)
@@ -50,7 +50,7 @@ def test_after_an_interrupt(grid_scene, tmp_path):
     assert sorted(p.name for p in tmp_path.rglob("*")) == before
 
 
-def test_points_taken_from_another_result_are_there(grid_scene, tmp_path):
+def test_points_reused_from_another_result_have_values(grid_scene, tmp_path):
     small, path = tmp_path / "small.nc", tmp_path / "r.nc"
     run_to_file(grid_scene | {"axes": grid_scene["axes"] | {"b": {"values": [3.0]}}}, small)
     with pytest.raises(Interrupted) as stopped:

@@ -73,7 +73,7 @@ def test_blocks_are_sorted_one_by_one(grid_scene, monkeypatch):
         assert np.array_equal(np.diff(group.firsts), -(-counts // group.chunk)) and group.size == counts.sum()
 
 
-def test_a_plan_keeps_little(monkeypatch):
+def test_memory_of_a_plan_grows_with_its_chunks(monkeypatch):
     """Memory grows with the number of chunks, not with the number of points."""
     monkeypatch.setattr("drivetrain_jax.runs.plan._BLOCK", 1 << 12)
     monkeypatch.setattr("drivetrain_jax.runs.plan._PIECE", 1 << 10)
@@ -102,7 +102,7 @@ def test_a_plan_keeps_little(monkeypatch):
         ([-1.0, 0.0], 2),
     ],
 )
-def test_absurd_efforts(effort, planned):
+def test_extreme_efforts(effort, planned):
     """Points of infinite, overflowing or undefined cost have no solver, and efforts stay in the range of a counter."""
     grid = Grid.of(load_scene({"system": "toy", "analysis": "toy", "points": {"a": [1.0, 2.0]}}))
     plan = make_plan([Solver("s", None, lambda columns: np.array(effort), unit_cost=1e291)], grid)

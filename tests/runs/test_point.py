@@ -81,7 +81,7 @@ def test_one_output_may_be_a_word():
         dt.point("toy", "toy", a=6.0, outputs="all")
 
 
-def test_lists_stand_side_by_side():
+def test_lists_are_printed_side_by_side():
     result = dt.point("planetary", "modes", outputs=["natural_frequency", "mode_type"])
     lines = repr(result).splitlines()
     assert lines[1] == "  outcome = success" and lines[2].split() == ["mode", "natural_frequency", "[Hz]", "mode_type"]
@@ -107,7 +107,7 @@ def test_json():
     assert dict(result) == {"value": result.value, "sign": 1}
 
 
-def test_words_lists_and_options():
+def test_texts_lists_and_options():
     assert dt.point("toy", "toy", a=1.0, kind="fancy", length=[1.0], method="other", knob=2.0).value == 8.5
 
 

@@ -109,7 +109,7 @@ def test_axis_that_the_analysis_does_not_use_and_integer_axis():
     np.testing.assert_allclose(ds["value"][0], expected_value(1.0, 2.0, n=ds["n"].values))
 
 
-def test_a_result_that_nothing_varied_is_spread():
+def test_a_result_that_does_not_vary_fills_the_axis():
     ds = dt.run({"system": "toy", "analysis": "toy", "axes": {"unused": {"values": [1.0, 2.0]}}, "fixed": {"a": 1.0}})
     assert ds["value"].values.tolist() == [expected_value(1.0, 2.0)] * 2
 
@@ -155,7 +155,7 @@ def test_a_derived_parameter_may_be_left_out_given_or_swept():
     assert (ds["value"].values[0] - expected_value(1.0, 2.0)).tolist() == [0.0, 3.0]
 
 
-def test_points_that_no_solver_can_do_end_as_step_limit(tmp_path):
+def test_points_that_no_solver_can_compute_have_the_outcome_step_limit(tmp_path):
     scene = {
         "system": "toy",
         "analysis": "toy",
@@ -281,7 +281,7 @@ def test_interrupted_replacement_keeps_the_old_result_and_resumes(grid_scene, tm
     assert status(other, path).state == "complete" and os.listdir(tmp_path) == ["r.nc"]
 
 
-def test_work_is_not_resumed_over_a_result_that_came_meanwhile(grid_scene, tmp_path):
+def test_work_is_not_resumed_over_a_newer_result(grid_scene, tmp_path):
     path, meanwhile = tmp_path / "r.nc", tmp_path / "s.nc"
     run_to_file(grid_scene | {"fixed": {"n": 4}}, path)
     with pytest.raises(KeyboardInterrupt):
@@ -295,7 +295,7 @@ def test_work_is_not_resumed_over_a_result_that_came_meanwhile(grid_scene, tmp_p
     assert path.read_bytes() == before
 
 
-def test_a_finished_result_is_read_beside_unfinished_work_of_another_scene(grid_scene, tmp_path):
+def test_a_finished_result_is_read_despite_unfinished_work_of_another_scene(grid_scene, tmp_path):
     path, other = tmp_path / "r.nc", grid_scene | {"fixed": {"n": 4}}
     run_to_file(grid_scene, path)
     with pytest.raises(KeyboardInterrupt) as stopped:
@@ -304,7 +304,7 @@ def test_a_finished_result_is_read_beside_unfinished_work_of_another_scene(grid_
     assert run_to_file(other, path).reused == stopped.value.progress.computed > 0
 
 
-def test_what_a_finished_run_could_not_delete_is_deleted(grid_scene, tmp_path):
+def test_remains_of_a_finished_run_are_deleted(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     run_to_file(grid_scene, path)
     digest = dt.open_result(path).attrs["digest"]
@@ -318,7 +318,7 @@ def test_what_a_finished_run_could_not_delete_is_deleted(grid_scene, tmp_path):
         assert os.listdir(tmp_path) == ["r.nc"]
 
 
-def test_an_address_without_a_scheduler_costs_no_work(grid_scene, tmp_path, monkeypatch):
+def test_an_address_without_a_scheduler_loses_no_work(grid_scene, tmp_path, monkeypatch):
     monkeypatch.setattr("drivetrain_jax.runs.cluster._PATIENCE", "1s")
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt) as stopped:
@@ -328,7 +328,7 @@ def test_an_address_without_a_scheduler_costs_no_work(grid_scene, tmp_path, monk
     assert run_to_file(grid_scene, path).reused == stopped.value.progress.computed > 0
 
 
-def test_a_run_that_ends_between_the_look_and_the_lock_is_noticed(grid_scene, tmp_path, monkeypatch):
+def test_a_run_that_ends_between_check_and_lock_is_noticed(grid_scene, tmp_path, monkeypatch):
     path, other, open_folder = tmp_path / "r.nc", grid_scene | {"fixed": {"n": 4}}, PartsFolder.open
 
     def late(folder):
@@ -354,7 +354,7 @@ def test_a_finished_result_in_a_folder_without_write_permission_is_read(grid_sce
     assert os.listdir(tmp_path) == ["r.nc"]
 
 
-def test_a_link_stays_one_and_has_the_lock_of_its_file(grid_scene, tmp_path):
+def test_a_link_stays_a_link_and_has_the_lock_of_its_file(grid_scene, tmp_path):
     (tmp_path / "data").mkdir()
     path, link = tmp_path / "data" / "r.nc", tmp_path / "link.nc"
     link.symlink_to(path)
@@ -398,7 +398,7 @@ def test_failing_chunk_leaves_a_resumable_run(tmp_path):
         (ValueError("no such shape"), False),
     ],
 )
-def test_only_what_may_pass_is_said_to_be_resumed_by_the_same_command(grid_scene, tmp_path, monkeypatch, error, passes):
+def test_only_errors_that_may_vanish_offer_the_same_command(grid_scene, tmp_path, monkeypatch, error, passes):
     def kernel(*_):
         raise error
 
@@ -423,7 +423,7 @@ def test_full_disk_leaves_a_resumable_run(grid_scene, tmp_path, monkeypatch):
     assert not list(Path(f"{path}.parts").glob("*.tmp"))
 
 
-def test_fresh_does_not_go_on_with_parts_that_the_result_was_made_from(grid_scene, tmp_path, monkeypatch):
+def test_fresh_does_not_resume_parts_of_the_present_result(grid_scene, tmp_path, monkeypatch):
     """The run is killed after it has moved the new result into place and before it has deleted its parts."""
     path = tmp_path / "r.nc"
     run_to_file(grid_scene, path)
@@ -448,7 +448,7 @@ def test_fresh_does_not_go_on_with_parts_that_the_result_was_made_from(grid_scen
     assert run_to_file(grid_scene, path).reused == 123 and os.listdir(tmp_path) == ["r.nc"]
 
 
-def test_a_short_run_that_ends_well_keeps_nothing_on_the_way(grid_scene, tmp_path, monkeypatch):
+def test_a_short_run_without_failure_writes_no_parts(grid_scene, tmp_path, monkeypatch):
     written = []
     monkeypatch.setattr(PartsFolder, "write", lambda _, part: written.append(part))
     monkeypatch.setattr(work, "_SHORTEST", 60.0)
@@ -466,7 +466,7 @@ def test_result_too_large_for_the_memory_is_refused_at_once(grid_scene, monkeypa
         dt.run(grid_scene)
 
 
-def test_a_disk_without_room_is_told_before_anything_is_computed(grid_scene, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_at_the_first_results(grid_scene, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
@@ -579,7 +579,7 @@ def test_signal_stops_promptly_and_loses_nothing(slow_process, sent):
     assert found.done > 0 and "Traceback" not in stderr
 
 
-def test_impatient_interrupts_lose_nothing_either(slow_process):
+def test_repeated_interrupts_lose_nothing(slow_process):
     """Finished chunks are written after the first interrupt, and further interrupts do not stop this."""
     start, out = slow_process
     process = start()

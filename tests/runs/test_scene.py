@@ -69,7 +69,7 @@ def test_mapping_may_hold_numpy_values():
 @pytest.mark.parametrize(
     "values", [xr.DataArray([0.0, 0.5, 1.0]), xr.DataArray([0.0, 0.5, 1.0]).to_series(), range(3), (0.0, 0.5, 1.0)]
 )
-def test_mapping_may_hold_what_is_like_a_list(values):
+def test_mapping_may_hold_sequences(values):
     scene = load_scene({**GOOD, "axes": {"a": {"values": values}}, "fixed": {"b": xr.DataArray(1.5)}})
     assert scene.axes[0].values.tolist() == list(values) and scene.fixed["b"] == 1.5
 
@@ -115,7 +115,7 @@ def test_text_of_a_changed_scene_gives_that_scene(tmp_path):
         ({"title": "\x7f, \x01 and \t"}, lambda s: s.title == "\x7f, \x01 and \t"),
     ],
 )
-def test_text_of_a_mapping_gives_its_scene(tmp_path, given, of):
+def test_text_of_a_mapping_is_its_scene(tmp_path, given, of):
     """Other processes and growing results have only the text of a scene."""
     path, scene = tmp_path / "s.toml", load_scene(changed(**given))
     path.write_text(scene.text)
@@ -331,7 +331,7 @@ def test_wrong_file_is_one_clear_line(tmp_path, content, part):
         load_scene(path)
 
 
-def test_a_table_within_itself_is_one_clear_line():
+def test_a_recursive_table_is_one_clear_line():
     tree = {}
     tree["fixed"] = tree
     with pytest.raises(InputError, match="scene = a table: not valid TOML: nested too deeply"):
@@ -339,7 +339,7 @@ def test_a_table_within_itself_is_one_clear_line():
 
 
 @pytest.mark.parametrize("overrides", [{5: 1}, {"": 1}, [1], "fixed.a"])
-def test_overrides_that_are_none_are_one_clear_line(overrides):
+def test_wrong_overrides_are_one_clear_line(overrides):
     with pytest.raises(InputError, match=r"overrides = .*allowed is a table by dotted keys"):
         load_scene(GOOD, overrides)
 
@@ -350,6 +350,6 @@ def test_a_byte_order_mark_and_line_ends_of_windows_are_read(tmp_path):
     assert load_scene(path).axes[0].values.tolist() == load_scene(GOOD).axes[0].values.tolist()
 
 
-def test_huge_axis_is_refused_before_it_is_made():
+def test_huge_axis_is_refused_before_it_is_created():
     with pytest.raises(InputError, match="allowed is up to 2000000000"):
         load_scene(changed(axes={"a": {"start": 0, "stop": 1, "num": 10**15}}))

@@ -110,7 +110,7 @@ def test_xarray_opens_a_store_as_the_file(grid_scene, tmp_path, which, monkeypat
         assert file[name].dtype == store[name].dtype and file[name].values.tobytes() == store[name].values.tobytes()
 
 
-def test_a_growing_store_opens_and_has_what_is_computed(grid_scene, tmp_path, monkeypatch):
+def test_a_growing_store_opens_with_the_computed_points(grid_scene, tmp_path, monkeypatch):
     """Incomplete shards are written as well; missing points have no value."""
     from drivetrain_jax.runs import zarr_sink
 
@@ -230,7 +230,7 @@ def test_damage_of_the_attributes_is_found(tmp_path, capsys, name, how):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["r.zarr"]
 
 
-def test_attributes_that_were_damaged_while_the_store_grew_are_made_anew(grid_scene, tmp_path):
+def test_damaged_attributes_of_a_growing_store_are_replaced(grid_scene, tmp_path):
     scene, path, pool = large(grid_scene), tmp_path / "r.zarr", threads(1, "chunk")
     with pytest.raises(Interrupted):
         to_store(scene, path, executor=Threads(1), report=stop_after(2))
@@ -253,7 +253,7 @@ def test_export_leaves_unfinished_work_alone(grid_scene, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["group", "array", "text", "attributes"])
-def test_what_is_no_store_is_one_line(tmp_path, capsys, kind):
+def test_a_path_without_a_store_is_one_line(tmp_path, capsys, kind):
     import zarr
 
     path = tmp_path / "r.zarr"
@@ -302,7 +302,7 @@ def test_a_store_of_an_earlier_version_is_one_line(grid_scene, tmp_path, capsys)
         to_store(grid_scene, path)
 
 
-def test_points_that_no_solver_can_do_are_counted(tmp_path):
+def test_points_that_no_solver_can_compute_are_counted(tmp_path):
     scene = {"system": "toy", "analysis": "toy", "options": {"method": "hopeless"}}
     scene["axes"] = {"a": {"start": 0.0, "stop": 10.0, "num": 11}}
     first = to_store(scene, tmp_path / "r.zarr")
@@ -336,7 +336,7 @@ def test_unfinished_work_is_opened_and_counted(grid_scene, tmp_path):
         ("value", lambda file: file.write_text(json.dumps(json.loads(file.read_text()) | {"shape": [1]}))),
     ],
 )
-def test_an_unfinished_store_with_damaged_metadata_is_made_anew(grid_scene, tmp_path, name, damage):
+def test_an_unfinished_store_with_damaged_metadata_is_replaced(grid_scene, tmp_path, name, damage):
     path, scene = tmp_path / "r.zarr", large(grid_scene)
     with pytest.raises(Interrupted):
         to_store(scene, path, executor=Threads(1), report=stop_after(3))
@@ -347,7 +347,7 @@ def test_an_unfinished_store_with_damaged_metadata_is_made_anew(grid_scene, tmp_
 
 
 @pytest.mark.parametrize("name", ["value", "shards"])
-def test_a_shard_that_is_gone_is_found(grid_scene, tmp_path, name):
+def test_a_missing_shard_is_found(grid_scene, tmp_path, name):
     to_store(grid_scene, tmp_path / "r.zarr")
     next(p for p in (tmp_path / "r.zarr").rglob("*") if p.is_file() and f"/{name}/c/" in p.as_posix()).unlink()
     assert "damaged" in verify(tmp_path / "r.zarr").problem
@@ -360,7 +360,7 @@ def test_a_store_that_workers_wrote_elsewhere_is_not_finished(grid_scene, tmp_pa
     assert not (tmp_path / "r.zarr").exists()
 
 
-def test_fresh_replaces_and_a_kill_between_keeps_the_former(grid_scene, tmp_path, monkeypatch):
+def test_fresh_replaces_a_store_and_a_kill_keeps_the_former_one(grid_scene, tmp_path, monkeypatch):
     path, other = tmp_path / "r.zarr", grid_scene | {"fixed": {"n": 4}}
     to_store(grid_scene, path)
     with pytest.raises(InputError, match=r"fixed.n is 4, was 3; --fresh replaces it"):
@@ -372,7 +372,7 @@ def test_fresh_replaces_and_a_kill_between_keeps_the_former(grid_scene, tmp_path
     assert status(other, path).state == "complete" and [p.name for p in tmp_path.iterdir()] == ["r.zarr"]
 
 
-def test_looking_while_a_store_is_replaced_moves_nothing(grid_scene, tmp_path, monkeypatch):
+def test_reading_while_a_store_is_replaced_moves_nothing(grid_scene, tmp_path, monkeypatch):
     path, other, seen = tmp_path / "r.zarr", grid_scene | {"fixed": {"n": 4}}, []
     to_store(grid_scene, path)
     rename = Path.rename
@@ -392,7 +392,7 @@ def test_looking_while_a_store_is_replaced_moves_nothing(grid_scene, tmp_path, m
     assert status(other, path).state == "complete" and [p.name for p in tmp_path.iterdir()] == ["r.zarr"]
 
 
-def test_a_run_puts_a_former_store_back_unless_another_is_at_work(grid_scene, tmp_path):
+def test_a_run_restores_a_former_store_unless_another_run_is_working(grid_scene, tmp_path):
     path = tmp_path / "r.zarr"
     to_store(grid_scene, path)
     parts = PartsFolder(path)

@@ -68,7 +68,7 @@ def test_large_variables_are_checked_to_their_end(path, monkeypatch):
     assert checksums.damaged(path) == ["z"]
 
 
-def test_a_file_of_another_origin_has_none(tmp_path):
+def test_a_file_of_another_program_has_no_checksums(tmp_path):
     xr.Dataset({"x": 1.0}).to_netcdf(tmp_path / "f.nc", engine="h5netcdf")
     assert checksums.damaged(tmp_path / "f.nc") is None
 

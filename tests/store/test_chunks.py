@@ -26,7 +26,7 @@ def folder(tmp_path):
     parts.close()
 
 
-def test_what_is_written_is_read(folder):
+def test_written_parts_are_read(folder):
     folder.write(part())
     folder.write(part(7))
     chunks = {number: results for found in folder.read() for number, results in found}
@@ -69,7 +69,7 @@ def test_one_run_at_a_time(folder, tmp_path):
     again.close()
 
 
-def test_start_forgets_and_close_may_remove(folder):
+def test_start_deletes_parts_and_close_may_delete_the_folder(folder):
     folder.write(part())
     folder.start({"digest": "def", "replaces": "abc"})
     assert list(folder.read()) == [] and folder.plan()["digest"] == "def"

@@ -99,7 +99,7 @@ def test_a_scalar_without_any_dimension(tmp_path):
         assert (again["f"].item(), again["z"].item(), dict(again.sizes)) == (np.pi, 2j, {})
 
 
-def test_data_are_in_one_piece_and_have_their_room(result, path):
+def test_data_are_contiguous_and_allocated(result, path):
     with h5py.File(path) as file:
         for name, entry in result.data.items():
             variable = file[name]

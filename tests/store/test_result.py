@@ -94,7 +94,7 @@ def resident():
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory is looked up in /proc")
-def test_what_is_released_takes_no_memory_and_is_not_lost(tmp_path):
+def test_released_pages_take_no_memory_and_are_not_lost(tmp_path):
     blank = np.broadcast_to(np.zeros(()), (1 << 22,))
     template = Labelled.build(("x",), [], [], [(Variable("f", "s", "duration"), blank)], {"digest": "abc"})
     with ResultFile(tmp_path / "tmp") as file:
@@ -129,7 +129,7 @@ def test_a_failure_keeps_the_old_file(tmp_path, monkeypatch, step):
         ("r", "anything", "is a folder; give a result written by `drivetrain run`$"),
     ],
 )
-def test_a_folder_is_told_what_it_is(tmp_path, name, file, told):
+def test_the_message_about_a_folder_names_its_kind(tmp_path, name, file, told):
     (tmp_path / name).mkdir()
     (tmp_path / name / file).write_text("{}")
     with pytest.raises(InputError, match=told):
@@ -187,7 +187,7 @@ def test_the_command_that_runs(monkeypatch, argv, told):
     assert provenance.command() == told
 
 
-def test_provenance_tells_machine_and_versions():
+def test_provenance_has_machine_and_versions():
     assert "cores" in machine() and "/" not in machine().split("Python")[1]
     assert provenance.versions(["numpy"]) == {"numpy": np.__version__}
     assert usable_cores() >= 1 and physical_memory() > 1e8
