@@ -110,7 +110,7 @@ def _prepare(contender: Contender) -> tuple[Callable[[], Any] | Exception, float
 
 
 def _try(contender: Contender, job: Callable[[], Any] | Exception, compile_s: float) -> _Trial:
-    # Exceptions and warnings are data: they tell the user of the method that something is wrong.
+    # Exceptions and warnings are data, because they notify the user of the method.
     start = time.perf_counter()
     try:
         if isinstance(job, Exception):

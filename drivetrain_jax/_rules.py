@@ -15,7 +15,7 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Rule:
-    """``broken(dataset)`` is true where the rule ``text`` is broken. It needs all of ``variables``."""
+    """A rule with its ``text``: ``broken(dataset)`` is true where it is broken, and needs all of ``variables``."""
 
     text: str
     variables: tuple[str, ...]

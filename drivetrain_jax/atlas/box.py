@@ -39,8 +39,11 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of all boxes. ``value_of`` converts solved numbers to values of the quantity ``(N, m)``; with a
-    ``source`` only held-out points are solved."""
+    """Settings of all boxes.
+
+    ``value_of`` converts solved numbers to values of the quantity ``(N, m)``. With a ``source`` only held-out points are
+    solved.
+    """
 
     quantity: Quantity
     tolerance: float

@@ -4,7 +4,7 @@ The atlas may have more parameters than a question names: ``at`` gives their val
 the speed, the angle or the damping (``roles``). The check ``direct`` is a function from columns of all parameters, a
 mapping of names to arrays ``(N,)``, to spectral radii ``(N,)`` computed without the atlas.
 
-All raise ``KeyError`` for parameters that the atlas lacks, and ``ValueError`` for values outside its domain. They raise
+All questions raise ``KeyError`` for parameters that the atlas lacks, ``ValueError`` for values outside its domain, and
 :class:`InputError` for an atlas without panels or boundaries, or with the wrong free parameters.
 """
 
@@ -89,8 +89,10 @@ class Windows:
 
 @dataclass(frozen=True)
 class Nearest:
-    """The nearest known changes of stability ``below`` and ``above`` a value of ``parameter``, None at the end of the
-    atlas. Further ones may lie in the ``undecided`` ranges."""
+    """The nearest known changes of stability ``below`` and ``above`` a value of ``parameter``.
+
+    They are None at the end of the atlas. Further changes may lie in the ``undecided`` ranges.
+    """
 
     parameter: str
     value: float

@@ -35,7 +35,7 @@ class Patches:
     The error is at most ``floor`` ``(N,)`` plus the modulus of a function given by ``lever`` ``(m, ..., m, N)``.
 
     ``roughness`` ``(N, d)`` bounds how much faster than a polynomial of the patch's degree the error may vary along each
-    coordinate: the error of a derivative is taken as ``error`` times it.
+    coordinate: the error of a derivative is ``error`` times ``roughness``.
     """
 
     lower: np.ndarray

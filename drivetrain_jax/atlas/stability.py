@@ -1,6 +1,6 @@
 """Stability from an atlas of the propagator: spectral radius with its bound and verdict, on grids and at points.
 
-Most cells of a grid and most points are decided in closed form (``charts``, ``points``). If its bound is too wide or gives
+Most cells of a grid and most points are decided in closed form (``charts``, ``points``). If the bound is too wide or gives
 no verdict, the eigenvalues of Z decide, and the test of Schur and Cohn where the interval of rho contains 1. Without
 damping the verdict is that of ``conservative``. All other results, and all results of systems without a closed form, come
 from the eigenvalues.

@@ -3,7 +3,7 @@
 A tip is a point of the stability boundary where the boundary function and its derivative along the speed (the axis of the
 system's predicted resonances) vanish. Tips are found by exclusion (:mod:`~drivetrain_jax.atlas.exclusion`) and polished on
 the whole surrogate with the multiplier itself (ln|sigma| = 0, d ln|sigma|/d speed = 0). The name is the resonance at the
-foot of the ridge. Along a parameter that moves the resonances no tongue grows, and the resonance at the tip is used.
+foot of the ridge. Along a parameter that moves the resonances a tongue has no foot; its name is the resonance at the tip.
 """
 
 from __future__ import annotations

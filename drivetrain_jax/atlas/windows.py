@@ -42,8 +42,10 @@ class Crossing:
 
 @dataclass(frozen=True)
 class Interval:
-    """An interval of a parameter; ``lower_end`` and ``upper_end`` are None at an end of the atlas or of an undecided
-    range."""
+    """An interval of a parameter.
+
+    ``lower_end`` and ``upper_end`` are None at an end of the atlas or of an undecided range.
+    """
 
     lower: float
     upper: float
@@ -143,8 +145,10 @@ def stability_over_range(atlas: Atlas, system: type[System], along: str) -> Line
 
 
 def narrow(atlas: Atlas, bounds: Mapping[str, tuple[float, float]]) -> Atlas:
-    """The part of ``atlas`` within ``bounds``; ``ValueError`` for bounds that leave its domain, ``KeyError`` for unknown
-    names."""
+    """The part of ``atlas`` within ``bounds``.
+
+    Raises ``ValueError`` for bounds outside its domain, and ``KeyError`` for unknown names.
+    """
     lower, upper = atlas.lower.copy(), atlas.upper.copy()
     for name, (a, b) in bounds.items():
         if name not in atlas.parameters:

@@ -80,7 +80,7 @@ def _opened(path: Path) -> xr.Dataset:
 
     if path.exists() or not PartsFolder(path).holds_work():
         return open_result(path)
-    # Local import: it loads jax, which a complete result does not need.
+    # Local import: the module imports jax, which a complete result does not need.
     from drivetrain_jax.runs import partial
 
     return partial.open_result(path)

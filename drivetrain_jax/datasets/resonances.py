@@ -49,7 +49,7 @@ def resonances(dataset: xr.Dataset) -> xr.DataArray | None:
 def _predicted(system: str) -> Resonances | None:
     if system in BUILT_IN:
         return BUILT_IN[system]
-    # Local import: it loads jax.
+    # Local import: the module imports jax.
     from drivetrain_jax.runs.scene import find_system
 
     try:

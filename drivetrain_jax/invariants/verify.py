@@ -96,7 +96,7 @@ def _verify_store(path: Path) -> Report:
 
 
 def _verify_parts(parts: PartsFolder) -> Report:
-    """Report damaged parts. They are not an error, because a resumed run computes their chunks again."""
+    """The report on parts; damaged ones are no error, because a resumed run computes their chunks again."""
     present, intact = parts.count(), sum(1 for _ in parts.read())
     lines = [f"unfinished: {intact} of {present} parts are intact"]
     if intact < present:

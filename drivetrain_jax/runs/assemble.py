@@ -92,7 +92,7 @@ class ResultBuffer:
         """Get the lengths of system-dependent dimensions from the solver if no point has a result."""
         if all(self._sizes[dim] for variable in self.variables for dim in variable.dims):
             return
-        # Imported here: this module imports jax and the present one.
+        # Local import: `kernel` imports jax and this module.
         from drivetrain_jax.runs.kernel import result_shapes
 
         scene = self._scene

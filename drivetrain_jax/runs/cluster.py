@@ -1,4 +1,4 @@
-"""Workers of a Dask cluster: this process plans and writes, they return arrays."""
+"""Workers of a Dask cluster, which return arrays to this process; this process plans and writes."""
 
 from __future__ import annotations
 

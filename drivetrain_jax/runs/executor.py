@@ -33,7 +33,7 @@ class Computation(Protocol):
 
 
 class Executor(Protocol):
-    """Computes tasks. It does not affect the numbers, and starts its workers on first use."""
+    """Computes tasks, without effect on the numbers; workers start on first use."""
 
     # True if the computation itself runs, not a copy of it.
     in_process: bool = False

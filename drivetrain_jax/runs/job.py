@@ -1,4 +1,4 @@
-"""A job: a scene resolved once into its route, solvers, plan and kernels. It computes single chunks."""
+"""A job: a scene resolved once into its route, solvers, plan and kernels, which computes single chunks."""
 
 from __future__ import annotations
 

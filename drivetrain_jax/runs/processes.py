@@ -22,7 +22,7 @@ ATTEMPTS = 3
 
 
 class Processes(Executor):
-    """Spawned processes, each on one core. They stay for the next run until ``close``, or until this process ends."""
+    """Spawned processes, each on one core, which stay for the next run until ``close`` or the end of this process."""
 
     def __init__(self, count: int) -> None:
         self._count = count

@@ -1,4 +1,4 @@
-"""Code of a worker process: it checks a computation once and computes its tasks."""
+"""Code of a worker process, which checks a computation once and computes its tasks."""
 
 from __future__ import annotations
 
