@@ -66,7 +66,7 @@ def run(
         workers: number of processes instead of threads. A script needs the guard ``if __name__ == "__main__"``.
         dask: Dask cluster instead of threads: ``tcp://host:port``, or ``local:N`` processes.
         reuse: path(s) of results whose common points are reused; needs ``out``. Unless ``fresh``, a result at ``out`` that
-            is a part of this result is reused without it.
+            is a part of this result is always reused.
         report: called with the :class:`Progress` after every chunk; by default a notebook shows a bar.
 
     Raises: :class:`InputError` with one line that names the field, the value and the allowed values, before anything is
