@@ -124,9 +124,16 @@ def _add_verify(subparsers: Any) -> None:
 
 
 def _add_export(subparsers: Any) -> None:
-    command = _command(subparsers, "export", commands.export, "write a Zarr store as one HDF5 file")
-    command.add_argument("store", metavar="STORE", type=_path, help="result of `drivetrain run --store zarr`")
-    command.add_argument("file", metavar="FILE.nc", type=_path, help="file to write")
+    command = _command(subparsers, "export", commands.export, "write a Zarr store as one HDF5 file, or a result as CSV")
+    command.add_argument("store", metavar="RESULT", type=_path, help="a Zarr store, or with --csv any result on a grid")
+    command.add_argument("file", metavar="FILE.nc", nargs="?", type=_path, help="HDF5 file to write")
+    command.add_argument(
+        "--csv",
+        nargs="?",
+        const="",
+        metavar="TABLE.csv",
+        help="write a table (default: RESULT.csv): one row a point, units in the header, codes as words",
+    )
 
 
 def _add_plot(subparsers: Any) -> None:

@@ -109,7 +109,18 @@ def verify(options: argparse.Namespace) -> int:
 
 
 def export(options: argparse.Namespace) -> int:
-    """Write a Zarr store as one HDF5 file."""
+    """Write a Zarr store as one HDF5 file, or a result as a table."""
+    if options.csv is not None:
+        from drivetrain_jax.datasets.table import write_csv
+
+        if options.file:
+            raise InputError(f"FILE.nc = {str(options.file)!r}: not used with --csv; allowed is --csv TABLE.csv")
+        out = Path(options.csv or options.store.with_suffix(".csv"))
+        _check_out(out, (".csv",))
+        sys.stderr.write(f"points: {write_csv(options.store, out)} exported\n")
+        return OK
+    if options.file is None:
+        raise InputError("FILE.nc: missing; allowed is a new file, or --csv for a table")
     from drivetrain_jax.runs.export import export
 
     sys.stderr.write(f"points: {export(options.store, options.file)} exported\n")

@@ -89,7 +89,7 @@ class DrivetrainAccessor:
         self._analysis()
         dataset = self._dataset
         coded = {name: v for name, v in dataset.variables.items() if "flag_meanings" in v.attrs}
-        named = dataset.assign({name: _in_words(variable) for name, variable in coded.items()})
+        named = dataset.assign({name: in_words(variable) for name, variable in coded.items()})
         fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}"))
         return named.assign_coords(
             {
@@ -121,7 +121,7 @@ def _scalars(name: str, entry: dict[str, Any]) -> list[tuple[str, Any, dict[str,
     return [(f"{name}_{i}", number, labels | {"parameter": f"{name}[{i}]"}) for i, number in enumerate(value)]
 
 
-def _in_words(variable: xr.Variable) -> xr.Variable:
+def in_words(variable: xr.Variable) -> xr.Variable:
     """A variable of codes as words, looked up lazily; a code without a meaning becomes an empty word."""
     words = _Words(variable)
     attrs = {name: value for name, value in variable.attrs.items() if not name.startswith("flag_")}

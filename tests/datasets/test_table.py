@@ -1,0 +1,67 @@
+"""Results as CSV: one row a point, and nothing lost."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import drivetrain_jax as dt
+from drivetrain_jax.cli import main
+from drivetrain_jax.datasets import table
+
+SHAFT = {"length": [0.3, 1.2, 0.3], "EI": [8e4, 5e4, 8e4], "rhoA": [20.0, 15.0, 20.0], "k_A": 5e6}
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    out = tmp_path_factory.mktemp("table") / "shaft.nc"
+    axes = {"length[1]": {"values": [1.2, 1.3]}, "k_D": {"start": 1e5, "stop": 1e7, "num": 3}}
+    scene = {"system": "bicardan", "analysis": "critical_speeds", "axes": axes, "fixed": SHAFT, "options": {"modes": 2}}
+    dt.run(scene, out=out)
+    return out
+
+
+@pytest.mark.parametrize("rows", [table._ROWS, 4])
+def test_every_number_is_in_its_column(file, monkeypatch, rows):
+    monkeypatch.setattr(table, "_ROWS", rows)
+    assert main(["export", str(file), "--csv"]) == 0
+    found, dataset = pd.read_csv(file.with_suffix(".csv")), dt.open_result(file)
+    assert list(found.columns[:2]) == ["length[1] [m]", "k_D [N/m]"]
+    assert len(found) == dataset.outcome.size == 6
+    for mode in (1, 2):
+        values = dataset.critical_speed.sel(mode=mode).values
+        np.testing.assert_array_equal(found[f"critical_speed_{mode} [rpm]"], values.ravel())
+    np.testing.assert_array_equal(found["k_D [N/m]"], np.tile(dataset.k_D.values, 2))
+    assert (found.outcome == "success").all()
+
+
+def test_complex_numbers_have_two_columns(tmp_path):
+    shaft = dt.Cardan(beta=0.3, Omega=1.4, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)
+    over = {"Omega": [1.2, 1.415]}
+    chart = dt.sweep(dt.floquet, shaft, over=over, outputs=["floquet_multiplier"], out=tmp_path / "m.nc")
+    assert main(["export", str(tmp_path / "m.nc"), "--csv", str(tmp_path / "t.csv")]) == 0
+    found = pd.read_csv(tmp_path / "t.csv")
+    for k in range(4):
+        values = found[f"floquet_multiplier_{k + 1}_real"] + 1j * found[f"floquet_multiplier_{k + 1}_imag"]
+        np.testing.assert_array_equal(values, chart.floquet_multiplier[:, k])
+
+
+def test_samples_of_a_history_are_rows(tmp_path):
+    shaft = dt.Tripod(element="input", beta=0.157, zeta=0.0016)
+    over = {"zeta": [0.0016, 0.01]}
+    found = dt.sweep(dt.history, shaft, over=over, outputs=["phi"], stop=0.001, num=40, out=tmp_path / "h.nc")
+    assert main(["export", str(tmp_path / "h.nc"), "--csv"]) == 0
+    rows = pd.read_csv(tmp_path / "h.csv")
+    assert list(rows.columns) == ["zeta", "time [s]", "phi [rad]", "outcome"]
+    np.testing.assert_array_equal(rows["phi [rad]"], found.phi.values.ravel())
+    np.testing.assert_array_equal(rows["time [s]"], np.tile(found.time.values, 2))
+
+
+def test_wrong_names_leave_nothing_behind(file, tmp_path, capsys):
+    for arguments, word in (
+        ([str(file), "--csv", str(tmp_path / "t.txt")], "ends in .csv"),
+        ([str(file), str(tmp_path / "t.nc"), "--csv"], "not used with --csv"),
+        ([str(file)], "FILE.nc: missing"),
+    ):
+        assert main(["export", *arguments]) == 2
+        assert word in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
