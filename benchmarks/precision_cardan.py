@@ -74,9 +74,9 @@ def reference(region: str) -> np.ndarray:
 def error_of(region: str, radii: np.ndarray, notice: str = "") -> Judged:
     """The error of the first points of ``radii``; points without a number count as failed."""
     failed = int(np.sum(~np.isfinite(radii)))
-    told_by = notice or ("nan" if failed else "")
+    remark = notice or ("nan" if failed else "")
     errors = np.abs(radii[:CHECKED] / reference(region) - 1)
-    return Judged(float(np.nanmax(errors)) if np.isfinite(errors).any() else np.nan, failed, told_by)
+    return Judged(float(np.nanmax(errors)) if np.isfinite(errors).any() else np.nan, failed, remark)
 
 
 def package_error(region: str, rtol: float, results: Mapping[str, np.ndarray]) -> Judged:

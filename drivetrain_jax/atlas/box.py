@@ -16,7 +16,7 @@ from drivetrain_jax.atlas.quantity import Quantity
 TROUBLED_DEPTH, _MAX_DEPTH = 2, 12
 
 
-class Source(Protocol):
+class NodeSource(Protocol):
     """Supplies the values at nodes without solves, in lines along the coordinate ``axis``.
 
     A line with a multiple of ``positions`` nodes costs no more than one with fewer.
@@ -49,7 +49,7 @@ class Settings:
     tolerance: float
     max_nodes: int
     value_of: Callable[[np.ndarray], np.ndarray] = lambda solved: solved
-    source: Source | None = None
+    source: NodeSource | None = None
 
     def limit(self, values: np.ndarray) -> float:
         """Largest allowed error of the values, from a sample ``(N, m)``."""

@@ -34,7 +34,7 @@ UNDECIDED = 2
 # Factor by which interpolation between nodes may amplify rounding.
 _SPREAD = 4.0
 
-# Results of cells by name, and flags of the cells to compute again by eigenvalues (`judged`).
+# Results of cells by name, and flags of the cells to compute again by eigenvalues (`results_of_coefficients`).
 Cells = dict[str, np.ndarray]
 T = TypeVar("T")
 R = TypeVar("R")
@@ -45,7 +45,7 @@ def errors_of(panel: Panel) -> np.ndarray:
     return np.array([panel.value_error, *panel.derived_error])
 
 
-def judged_tiles(
+def evaluated_tiles(
     tiles: Iterator[Tile],
     axes: Sequence[np.ndarray],
     names: Sequence[str],
@@ -99,7 +99,7 @@ def in_threads(pieces: Iterable[T], work: Callable[[T], R]) -> Iterator[tuple[T,
 
 @lru_cache(maxsize=32)
 def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
-    """The kernel that computes the results ``(R, C)`` of a tile, see :func:`judged`.
+    """The kernel that computes the results ``(R, C)`` of a tile, see :func:`results_of_coefficients`.
 
     ``kind``: ``dense`` or ``sparse`` like the tile, ``undamped`` for sparse tiles with cells that may be Hamiltonian.
     """
@@ -120,7 +120,7 @@ def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
             log_d = jnp.broadcast_to(model.reduced.log_determinant(), phi.shape[1:])  # pyright: ignore[reportOptionalCall]
             parts = quartic.blocks(phi)
             exact = exact_verdict(model, parts, errors[0]) if kind == "undamped" else None
-            return judged(quartic.coefficients(parts, log_d, errors[1:]), rtol, exact)
+            return results_of_coefficients(quartic.coefficients(parts, log_d, errors[1:]), rtol, exact)
 
         return by_rows(row, (first, {name: values[name] for name in of_rows}))
 
@@ -133,7 +133,7 @@ def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
             e, bounds, value = inputs
             lanes = e @ spread
             log_d = jnp.broadcast_to(bind(values, fixed, value).reduced.log_determinant(), lanes.shape[1:])  # pyright: ignore[reportOptionalCall]
-            return judged(quartic.with_determinant(lanes, bounds, log_d), rtol)
+            return results_of_coefficients(quartic.with_determinant(lanes, bounds, log_d), rtol)
 
         return by_rows(row, (at_nodes, bounds, {name: values[name] for name in of_rows}))
 
@@ -156,17 +156,17 @@ def exact_verdict(model: FloquetModel, phi: quartic.Blocks, value_error: Array) 
     )
 
 
-def judged(c: quartic.Coefficients, rtol: Array, exact: Array | None = None) -> dict[str, Array]:
+def results_of_coefficients(c: quartic.Coefficients, rtol: Array, exact: Array | None = None) -> dict[str, Array]:
     """Results of lanes by name, and flags ``unsure`` of lanes to compute again by eigenvalues.
 
     ``exact`` holds the verdicts of Hamiltonian lanes. The interval of rho of every other lane without the flag excludes 1.
     All results come from one kernel: thirty small kernels repeat the computation of the coefficients, and take up to a
     quarter longer to run and half as long again to compile.
     """
-    return in_one_kernel(_judged)(c, rtol, exact)
+    return in_one_kernel(_results_of_coefficients)(c, rtol, exact)
 
 
-def _judged(c: quartic.Coefficients, rtol: Array, exact: Array | None) -> dict[str, Array]:
+def _results_of_coefficients(c: quartic.Coefficients, rtol: Array, exact: Array | None) -> dict[str, Array]:
     rho, error, unsure = quartic.spectral_radius(c)
     # A bound at the limit of rounding cannot be improved.
     unsure = (unsure & (error > 4 * quartic.EPS)) | ~(jnp.abs(rho - 1) > error)

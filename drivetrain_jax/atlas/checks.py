@@ -18,7 +18,7 @@ Direct = Callable[[Mapping[str, np.ndarray]], np.ndarray]
 
 # Distance of a check from the end of a window, in error bounds, and its minimum relative to the range of the parameter. The
 # last number is this minimum at the end of an interval, where direct solves must resolve the sign of rho - 1.
-_BOUNDS, _PART, _BESIDE = 10.0, 1e-6, 1e-9
+_BOUNDS, _PART, _LEAST = 10.0, 1e-6, 1e-9
 # Points of a range at which a check solves, and points at which it searches the maximum on the surrogate.
 _SAMPLES, DENSE = 101, 801
 # Largest distance of direct solves from the unit circle that counts as on it.
@@ -47,12 +47,12 @@ class Check:
 
 @dataclass(frozen=True)
 class End:
-    """An end ``value`` of a stable interval of length ``room`` on the ``inward`` side (a sign)."""
+    """An end ``value`` of a stable interval of length ``length`` on the ``inward`` side (a sign)."""
 
     value: float
     crossing: Crossing | None
     inward: float
-    room: float
+    length: float
 
     @classmethod
     def of(cls, interval: Interval, inward: float) -> End:
@@ -62,7 +62,7 @@ class End:
     def step(self, span: float) -> float:
         """Distance of the check from the end: outside the error, over a range of length ``span``."""
         error = self.crossing.error if self.crossing else 0.0
-        return max(error, _BESIDE * span) if math.isfinite(error) else _PART * span
+        return max(error, _LEAST * span) if math.isfinite(error) else _PART * span
 
 
 def check_ends(ends: list[End], line: Line, criteria: Criteria, direct: Direct) -> Check | None:
@@ -79,7 +79,7 @@ def check_ends(ends: list[End], line: Line, criteria: Criteria, direct: Direct) 
     points, outer = [], []
     for end in ends:
         step = end.step(span)
-        inner, value = end.value + end.inward * min(step, end.room / 2), end.value - end.inward * step
+        inner, value = end.value + end.inward * min(step, end.length / 2), end.value - end.inward * step
         near, far = (_along_ridge(criteria, patches, k, end.crossing, x, other) for x in (inner, value))
         points += [(x, inner) for x in (*within, *near, _worst(criteria, k, inner))]
         if end.crossing and _unstable(line, value):

@@ -10,7 +10,7 @@ be replayed from stored answers. Every box passes these steps:
 3. acceptance, if the truncated tail (extrapolated from the last pairs of slabs) and the errors at all held-out points are
    small enough; else growth by the slope of the tail (at most twice), else a split in two halves.
 
-A cheap ``Source`` of nodes replaces the probes: tensors then grow until their coefficients have fallen. Held-out points are
+A cheap ``NodeSource`` replaces the probes: tensors then grow until their coefficients have fallen. Held-out points are
 always solved.
 
 A box with failed solves, or with coefficients that fall like a power (a kink), is halved at most twice along each
@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivetrain_jax.atlas.box import TROUBLED_DEPTH, Box, BoxRefinement, Refinement, Settings, Source
+from drivetrain_jax.atlas.box import TROUBLED_DEPTH, Box, BoxRefinement, NodeSource, Refinement, Settings
 from drivetrain_jax.atlas.fitting import fit
 from drivetrain_jax.atlas.given_nodes import fit_given
 from drivetrain_jax.atlas.lines import probe
@@ -131,7 +131,7 @@ def construct(
     quantity: Quantity,
     tolerance: float,
     *,
-    source: Source | None = None,
+    source: NodeSource | None = None,
     max_nodes: int = MAX_NODES,
     max_solves: int = MAX_SOLVES,
 ) -> Rounds:

@@ -38,7 +38,7 @@ def fit(refinement: BoxRefinement, degrees: list[int]) -> Refinement:
         x = np.concatenate([checks.x, refinement.box.place(extra)])
         checks = Sample(x, np.concatenate([checks.values, fresh]))
         tensor = coefficients(values, degrees)
-        panel, tails, limit = judge(refinement, tensor, values, checks)
+        panel, tails, limit = accept_panel(refinement, tensor, values, checks)
         if panel is not None:
             return (panel,)
         if any(decay.is_noise(slabs(tensor, k)) for k in range(d) if tails[k] > 1 and degrees[k] > 24):
@@ -67,7 +67,7 @@ def known_checks(refinement: BoxRefinement) -> Sample:
     return Sample(x[chosen], values[chosen])
 
 
-def judge(
+def accept_panel(
     refinement: BoxRefinement, tensor: np.ndarray, values: np.ndarray, checks: Sample, spare: float = 0.5
 ) -> tuple[Panel | None, np.ndarray, float]:
     """The panel (None if inaccurate), the truncation error of each coordinate relative to its limit, and this limit.

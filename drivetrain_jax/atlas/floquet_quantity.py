@@ -55,7 +55,7 @@ def _characteristic_coefficients(z: np.ndarray) -> np.ndarray:
     return np.stack(found, axis=-1)
 
 
-def judge(
+def results_of_propagator(
     phi: Array, build: Build, values: Mapping[str, Any], errors: Array, outputs: tuple[str, ...], rtol: float
 ) -> dict[str, Array]:
     """Results of the floquet analysis for lanes of ``Phi``, its entries by rows ``(n n, N)``, by eigenvalues of Z.

@@ -11,8 +11,8 @@ from itertools import product
 import numpy as np
 
 from drivetrain_jax.atlas import decay
-from drivetrain_jax.atlas.box import BoxRefinement, Refinement, Source
-from drivetrain_jax.atlas.fitting import HELD_OUT, MAX_NUMBERS, grown, judge, known_checks, scattered, unresolved
+from drivetrain_jax.atlas.box import BoxRefinement, NodeSource, Refinement
+from drivetrain_jax.atlas.fitting import HELD_OUT, MAX_NUMBERS, accept_panel, grown, known_checks, scattered, unresolved
 from drivetrain_jax.atlas.interpolation import analysis_matrix, coefficients, envelope, slabs
 
 # Number of lines at the start, and of lines that probe the need of a coordinate.
@@ -25,7 +25,7 @@ _MOST_BOXES = 100
 _MAX_GROWTHS = 8
 
 
-def fit_given(refinement: BoxRefinement, source: Source) -> Refinement:
+def fit_given(refinement: BoxRefinement, source: NodeSource) -> Refinement:
     """A panel with nodes from ``source`` that agrees with solves, or the halves or gap of the box instead."""
     d, most = len(refinement.box.lower), MAX_NUMBERS // refinement.settings.quantity.size
     most_along, checks = refinement.settings.max_nodes, None
@@ -55,7 +55,7 @@ def fit_given(refinement: BoxRefinement, source: Source) -> Refinement:
         if not np.isfinite(values).all():
             return refinement.trouble("no values at the nodes")
         tensor = coefficients(values, degrees)
-        panel, tails, limit = judge(refinement, tensor, values, checks, spare=1.0)
+        panel, tails, limit = accept_panel(refinement, tensor, values, checks, spare=1.0)
         if panel is not None:
             return (panel,)
         if tails.max() <= 1:
@@ -70,12 +70,12 @@ def _held_out(d: int) -> np.ndarray:
     return np.concatenate([corners, scattered(HELD_OUT - len(corners), d)])
 
 
-def _suited(degrees: list[int], source: Source) -> list[int]:
+def _suited(degrees: list[int], source: NodeSource) -> list[int]:
     """``degrees``, rounded up where more nodes cost nothing."""
     return [-(-n // source.positions) * source.positions if k == source.axis else n for k, n in enumerate(degrees)]
 
 
-def _probed(refinement: BoxRefinement, source: Source, degrees: list[int]) -> list[int]:
+def _probed(refinement: BoxRefinement, source: NodeSource, degrees: list[int]) -> list[int]:
     """Number of nodes that each coordinate needs along the edges of the box; ``degrees`` if values are missing."""
     box, d = refinement.box, len(refinement.box.lower)
     ends = [np.array(pair) for pair in zip(box.lower, box.upper, strict=True)]

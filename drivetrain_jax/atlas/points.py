@@ -13,7 +13,7 @@ from jax import Array
 
 from drivetrain_jax.analysis.floquet import quartic
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, in_one_kernel, options_for_few
-from drivetrain_jax.atlas.charts import Cells, errors_of, exact_verdict, in_threads, judged
+from drivetrain_jax.atlas.charts import Cells, errors_of, exact_verdict, in_threads, results_of_coefficients
 from drivetrain_jax.atlas.expansion import Cell, Expansion
 from drivetrain_jax.atlas.floquet_quantity import Build
 from drivetrain_jax.atlas.panels import Atlas
@@ -22,7 +22,7 @@ from drivetrain_jax.atlas.panels import Atlas
 LANES, ROWS = 128, 16
 
 
-def judged_cells(
+def evaluated_cells(
     expansion: Expansion, points: np.ndarray, x: np.ndarray, atlas: Atlas, kernel: Any, rtol: float
 ) -> Iterator[tuple[np.ndarray, Cells]]:
     """Yield numbers of points and their results, block by block.
@@ -56,7 +56,7 @@ def judged_cells(
 
 @lru_cache(maxsize=16)
 def point_kernel(build: Build, undamped: bool, few: bool) -> Any:
-    """The kernel that computes the results ``(LANES ROWS,)`` of a block of points, as :func:`charts.judged` gives them.
+    """The kernel of the results ``(LANES ROWS,)`` of a block of points, see :func:`charts.results_of_coefficients`.
 
     It fills the first ``rows`` rows. ``undamped``: points may be Hamiltonian; ``few``: a block has one row at most.
     """
@@ -74,7 +74,7 @@ def point_kernel(build: Build, undamped: bool, few: bool) -> Any:
             log_d = jnp.broadcast_to(model.reduced.log_determinant(), (LANES,))  # pyright: ignore[reportOptionalCall]
             parts = quartic.blocks(phi)
             exact = exact_verdict(model, parts, errors[0] + left_out) if undamped else None
-            return judged(quartic.coefficients(parts, log_d, errors[1:, None], left_out), rtol, exact)
+            return results_of_coefficients(quartic.coefficients(parts, log_d, errors[1:, None], left_out), rtol, exact)
 
         def store(i: Array, results: dict[str, Array]) -> dict[str, Array]:
             return {

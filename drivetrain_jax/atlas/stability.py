@@ -25,9 +25,9 @@ from drivetrain_jax.analysis.floquet.results import VARIABLES
 from drivetrain_jax.analysis.numerics.kernels import compiler_options
 from drivetrain_jax.atlas import charts, evaluation
 from drivetrain_jax.atlas.expansion import Expansion
-from drivetrain_jax.atlas.floquet_quantity import Build, judge
+from drivetrain_jax.atlas.floquet_quantity import Build, results_of_propagator
 from drivetrain_jax.atlas.panels import Atlas
-from drivetrain_jax.atlas.points import LANES, judged_cells, point_kernel
+from drivetrain_jax.atlas.points import LANES, evaluated_cells, point_kernel
 from drivetrain_jax.atlas.tiles import Tile, tiles
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
@@ -67,7 +67,7 @@ class StabilityAtlas:
         x, found = self.atlas.to_coordinates(points), self.blank((len(points),), outputs)
         kernel = point_kernel(self.build, self._may_be_undamped(points.T), len(points) <= LANES)
         unsure = [np.empty(0, int)]
-        for index, results in judged_cells(self._expansion, points, x, self.atlas, kernel, self.rtol):
+        for index, results in evaluated_cells(self._expansion, points, x, self.atlas, kernel, self.rtol):
             for name, values in found.items():
                 values[index] = results[name]
             unsure.append(index[results["unsure"]])
@@ -87,7 +87,9 @@ class StabilityAtlas:
             phi = self._phi(k, x[mine], size)
             for start in range(0, len(mine), size):
                 part = mine[start : start + size]
-                for name, value in self._judged(k, points[part], phi[:, start : start + size], tuple(outputs)).items():
+                for name, value in self._exact_results(
+                    k, points[part], phi[:, start : start + size], tuple(outputs)
+                ).items():
                     found[name][part] = value[: len(part)]
         return found
 
@@ -191,7 +193,7 @@ class StabilityAtlas:
         cut = tiles(self.atlas, coordinates, (charts.ROWS, charts.COLUMNS), rows=rows, dense=not undamped)
         again = [
             _store(found, tile, cells)
-            for tile, cells in charts.judged_tiles(cut, axes, names, self.atlas.fixed, kernel, self.rtol)
+            for tile, cells in charts.evaluated_tiles(cut, axes, names, self.atlas.fixed, kernel, self.rtol)
         ]
         self._repair(found, axes, np.concatenate([np.empty((0, len(axes)), int), *again]))
         if (lost := found[OUTCOME.name] == Outcome.LOST).any():
@@ -210,7 +212,7 @@ class StabilityAtlas:
             for name, value in self.by_eigenvalues(points, outputs).items():
                 found[name][tuple(part.T)] = value
 
-    def _judged(
+    def _exact_results(
         self, number: int, points: np.ndarray, phi: np.ndarray, outputs: tuple[str, ...]
     ) -> dict[str, np.ndarray]:
         """Results of lanes ``phi`` ``(m, N)``, of which the first are those of ``points``."""
@@ -251,8 +253,8 @@ def _point_kernel(build: Build, outputs: tuple[str, ...], rtol: float, closed_fo
         everything = {**fixed, **values}
         lanes = jnp.broadcast_to(errors[1:, None], (len(errors) - 1, phi.shape[-1]))
         if not (closed_form and _FAST & set(outputs)):
-            return judge(phi, build, everything, lanes, outputs, rtol)
-        found = judge(phi, build, everything, lanes, tuple({*outputs, *DEFAULT_OUTPUTS}), rtol)
+            return results_of_propagator(phi, build, everything, lanes, outputs, rtol)
+        found = results_of_propagator(phi, build, everything, lanes, tuple({*outputs, *DEFAULT_OUTPUTS}), rtol)
         found |= _sharper(phi, build(everything), errors, found)
         return {name: found[name] for name in (*outputs, "outcome")}
 

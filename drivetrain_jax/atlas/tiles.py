@@ -160,10 +160,10 @@ def _width(atlas: Atlas, axis: np.ndarray, most: int, dense: bool) -> int:
     """
     even = _shared(len(axis), most, _STEP)
     panels = {(panel.lower[-1], panel.upper[-1], panel.degrees[-1]): panel for panel in atlas.panels}.values()
-    rooms = [_room(panel, _positions(panel, -1, axis[_covered(panel, -1, axis)])) for panel in panels]
+    all_spans = [_spans(panel, _positions(panel, -1, axis[_covered(panel, -1, axis)])) for panel in panels]
 
     def cost(width: int) -> float:
-        cuts = (cut for room in rooms for cut in _cuts(room, width, dense))
+        cuts = (cut for spans in all_spans for cut in _cuts(spans, width, dense))
         return sum(_COSTS[with_nodes] * width + _ROW for _, _, with_nodes in cuts)
 
     widths = range(most // 3 // _STEP * _STEP, min(most, even + most // 4) + 1, _STEP)
@@ -171,19 +171,19 @@ def _width(atlas: Atlas, axis: np.ndarray, most: int, dense: bool) -> int:
     return best if cost(best) < _WORTH * cost(even) else even
 
 
-def _room(panel: Panel, t: np.ndarray) -> np.ndarray:
+def _spans(panel: Panel, t: np.ndarray) -> np.ndarray:
     """Number of cells that a tile with nodes may span from each cell on, limited by the degree of the panel."""
     angle = -np.arccos(t)
     return np.searchsorted(angle, angle + _SPAN / panel.degrees[-1], side="right") - np.arange(len(t))
 
 
-def _cuts(room: np.ndarray, width: int, dense: bool) -> Iterator[tuple[int, int, bool]]:
+def _cuts(spans: np.ndarray, width: int, dense: bool) -> Iterator[tuple[int, int, bool]]:
     """Yield ``start, end`` of ranges of at most ``width`` neighbouring cells, and whether a range has nodes."""
-    count = np.minimum(room, width)
+    count = np.minimum(spans, width)
     with_nodes = dense & (count >= max(_DENSE * width, 2 * NODES))
     start = 0
-    while start < len(room):
-        end = min(start + int(count[start] if with_nodes[start] else width), len(room))
+    while start < len(spans):
+        end = min(start + int(count[start] if with_nodes[start] else width), len(spans))
         yield start, end, bool(with_nodes[start])
         start = end
 
@@ -191,7 +191,7 @@ def _cuts(room: np.ndarray, width: int, dense: bool) -> Iterator[tuple[int, int,
 def _bands(panel: Panel, axis: np.ndarray, cells: np.ndarray, degree: int, width: int, dense: bool) -> Iterator[_Band]:
     """Yield the cells of a panel along the last axis, cut into bands."""
     t = _positions(panel, -1, axis[cells])
-    for start, end, with_nodes in _cuts(_room(panel, t), width, dense):
+    for start, end, with_nodes in _cuts(_spans(panel, t), width, dense):
         # Cells at one position span no interval for nodes.
         band = _dense if with_nodes and t[end - 1] > t[start] else _sparse
         yield band(cells[start:end], t[start:end], degree, width)

@@ -63,7 +63,7 @@ class AtlasGrid:
     def block(self, key: Key, name: str) -> np.ndarray:
         """The result ``name`` where ``key`` has a position, a slice or a row of positions for each axis."""
         columns = [axis[part] for axis, part in zip(self.axes.values(), key, strict=True)]
-        return self._taken(("block", *columns), name, lambda: self._evaluated(columns))
+        return self._cached(("block", *columns), name, lambda: self._evaluated(columns))
 
     def points(self, positions: Sequence[np.ndarray], name: str) -> np.ndarray:
         """The result ``name`` at points, given by their positions along each axis, arrays of equal shape."""
@@ -74,7 +74,7 @@ class AtlasGrid:
             found = self.atlas.arrays(dict(zip(self.axes, columns, strict=True)), zipped=True, solve=self.solve)
             return {name: values.reshape(shape + values.shape[1:]) for name, values in found.items()}
 
-        return self._taken(("points", shape, *columns), name, evaluated)
+        return self._cached(("points", shape, *columns), name, evaluated)
 
     def _evaluated(self, columns: list[np.ndarray]) -> Mapping[str, np.ndarray]:
         by_name = dict(zip(self.axes, columns, strict=True))
@@ -86,7 +86,7 @@ class AtlasGrid:
         found = self.atlas.arrays(single, zipped=True, solve=self.solve)
         return {name: values[0] for name, values in found.items()}
 
-    def _taken(self, parts: tuple, name: str, evaluated: Callable[[], Mapping[str, np.ndarray]]) -> np.ndarray:
+    def _cached(self, parts: tuple, name: str, evaluated: Callable[[], Mapping[str, np.ndarray]]) -> np.ndarray:
         """One result of a selection; the other results stay in the cache until they are requested or dropped."""
         key = tuple(part.tobytes() if isinstance(part, np.ndarray) else part for part in parts)
         with self._lock:

@@ -83,7 +83,7 @@ def _columns(dataset: xr.Dataset) -> Iterator[tuple[str, np.ndarray]]:
             ]
             column, header = values[(..., *entry)], "_".join((name, *labels))
             if column.dtype.kind == "c":
-                yield f"{header}_real{units}", column.real
-                yield f"{header}_imag{units}", column.imag
+                yield f"{header}_real{units}", np.real(column)
+                yield f"{header}_imag{units}", np.imag(column)
             else:
                 yield header + units, column

@@ -137,7 +137,7 @@ def _about_numbers(dataset: xr.Dataset, variable: xr.DataArray) -> Iterator[str]
         if not np.isfinite(part.values).any():
             continue
         finite = np.ma.masked_invalid(part.values)
-        label = f", {own[0].replace('_', ' ')} {_label(variable, own[0], k)}" if own else ""
+        label = f", {str(own[0]).replace('_', ' ')} {_label(variable, own[0], k)}" if own else ""
         low, high = (np.unravel_index(int(f()), part.shape) for f in (finite.argmin, finite.argmax))
         name = _capital(str(variable.attrs.get("long_name", variable.name)))
         if part.values[low] == part.values[high]:

@@ -47,7 +47,7 @@ class Damaged(NotReusable):
 
 
 @dataclass(frozen=True)
-class Source:
+class ReusableResult:
     """Results in the file ``path`` of another scene: its points ``theirs[i]`` equal our points ``ours[i]``.
 
     ``is_covered`` is true if our scene contains all of its points and results, so replacing it loses nothing.
@@ -75,7 +75,7 @@ class Source:
 class ReusedPoints:
     """The points reused from ``sources``, which are disjoint."""
 
-    sources: tuple[Source, ...]
+    sources: tuple[ReusableResult, ...]
 
     @property
     def points(self) -> np.ndarray:
@@ -119,7 +119,7 @@ def remaining(job: Job, reused: ReusedPoints) -> Job:
     return job.only(np.flatnonzero(left))
 
 
-def combined(job: Job, found: Iterable[Source]) -> ReusedPoints:
+def combined(job: Job, found: Iterable[ReusableResult]) -> ReusedPoints:
     """The points of ``job`` that these results contain, each from the first result that has it."""
     free = np.ones(job.grid.size, bool)
     sources = []
@@ -130,7 +130,7 @@ def combined(job: Job, found: Iterable[Source]) -> ReusedPoints:
     return ReusedPoints(tuple(source for source in sources if source.ours.size))
 
 
-def find(job: Job, path: Path) -> Source:
+def find(job: Job, path: Path) -> ReusableResult:
     """The points of ``job`` that the result at ``path`` contains, without lost ones.
 
     Raises :class:`NotReusable`, or :class:`InputError` if there is no readable result.
@@ -157,7 +157,7 @@ def find(job: Job, path: Path) -> Source:
     # Several of our points may equal one of theirs, and the reverse.
     is_covered = wanted and np.unique(theirs).size == grid.size
     ours, first = np.unique(ours, return_index=True)
-    return Source(path, str(attrs["digest"]), grid, theirs[first], ours, is_covered)
+    return ReusableResult(path, str(attrs["digest"]), grid, theirs[first], ours, is_covered)
 
 
 def _same_computation(path: Path, attrs: Mapping[str, Any], job: Job) -> Scene:

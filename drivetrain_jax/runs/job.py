@@ -26,7 +26,7 @@ from drivetrain_jax.runs.scene import Problem, Scene
 from drivetrain_jax.store.provenance import digest
 
 if TYPE_CHECKING:
-    from drivetrain_jax.runs.growing import NotReusable, ReusedPoints, Source
+    from drivetrain_jax.runs.growing import NotReusable, ReusableResult, ReusedPoints
     from drivetrain_jax.runs.work import Progress, Work
     from drivetrain_jax.store.chunks import Part
     from drivetrain_jax.store.schema import Labelled
@@ -63,7 +63,7 @@ class Route(Protocol):
         """Names of the variables of the result at ``path`` whose layout differs from that of the job."""
         return []
 
-    def common_points(self, job: Job, path: Path) -> Source | NotReusable | None:
+    def common_points(self, job: Job, path: Path) -> ReusableResult | NotReusable | None:
         """Points of the job in the result at ``path``, the reason why it has none, or None for a result without points."""
         return None
 

@@ -15,7 +15,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import clipped
 from drivetrain_jax.runs.assemble import failures
 from drivetrain_jax.runs.explain import differences
-from drivetrain_jax.runs.growing import NO_REUSE, Damaged, NotReusable, ReusedPoints, Source, combined, find
+from drivetrain_jax.runs.growing import NO_REUSE, Damaged, NotReusable, ReusableResult, ReusedPoints, combined, find
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.sink import Sink
 from drivetrain_jax.runs.sinks import make_sink
@@ -111,13 +111,13 @@ class OutputState:
         return self.sink.rearranged(self.job)
 
     @cached_property
-    def _found(self) -> Source | NotReusable | None:
+    def _found(self) -> ReusableResult | NotReusable | None:
         """The points of this scene that the present result contains, or the reason why it has none."""
         return None if self.present is None else self.sink.common_points(self.job)
 
     @property
-    def _shared(self) -> Source | None:
-        return self._found if isinstance(self._found, Source) else None
+    def _shared(self) -> ReusableResult | None:
+        return self._found if isinstance(self._found, ReusableResult) else None
 
     @property
     def _grows(self) -> bool:

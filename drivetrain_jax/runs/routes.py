@@ -7,7 +7,7 @@ from pathlib import Path
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.analysis.atlas.solves import PROPAGATOR
 from drivetrain_jax.runs.assemble import ResultBuffer, bytes_per_point, failures, labelled
-from drivetrain_jax.runs.growing import NO_REUSE, NotReusable, ReusedPoints, Source, find, remaining
+from drivetrain_jax.runs.growing import NO_REUSE, NotReusable, ReusableResult, ReusedPoints, find, remaining
 from drivetrain_jax.runs.job import Job, Route
 from drivetrain_jax.runs.layout import rearranged
 from drivetrain_jax.runs.work import Progress, Work
@@ -45,7 +45,7 @@ class PointsRoute(Route):
         """Names of the variables of the result at ``path`` whose layout differs from that of the job."""
         return rearranged(path, job.scene, job.grid)
 
-    def common_points(self, job: Job, path: Path) -> Source | NotReusable | None:
+    def common_points(self, job: Job, path: Path) -> ReusableResult | NotReusable | None:
         """Points of the job in the result at ``path``, or the reason why it has none."""
         try:
             return find(job, path)

@@ -65,8 +65,7 @@ def run(
         threads: number of threads of this process (default: the usable cores).
         workers: number of processes instead of threads. A script needs the guard ``if __name__ == "__main__"``.
         dask: Dask cluster instead of threads: ``tcp://host:port``, or ``local:N`` processes.
-        reuse: path(s) of results whose common points are reused; needs ``out``. Unless ``fresh``, a result at ``out`` that
-            is a part of this result is always reused.
+        reuse: path(s) of results whose common points are reused; needs ``out``. A smaller result at ``out`` always is.
         report: called with the :class:`Progress` after every chunk; by default a notebook shows a bar.
 
     Raises: :class:`InputError` with one line that names the field, the value and the allowed values, before anything is

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from drivetrain_jax.runs.executor import Executor
-from drivetrain_jax.runs.growing import NotReusable, ReusedPoints, Source
+from drivetrain_jax.runs.growing import NotReusable, ReusableResult, ReusedPoints
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.work import Progress, Report
 
@@ -48,7 +48,7 @@ class Sink(Protocol):
         """Names of the variables of the present result whose layout differs from that of ``job``."""
         return []
 
-    def common_points(self, job: Job) -> Source | NotReusable | None:
+    def common_points(self, job: Job) -> ReusableResult | NotReusable | None:
         """Points of ``job`` in the present result, the reason why it has none, or None if they cannot be reused."""
         return None
 

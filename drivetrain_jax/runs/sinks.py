@@ -10,7 +10,7 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.runs.executor import Executor
-from drivetrain_jax.runs.growing import NotReusable, ReusedPoints, Source
+from drivetrain_jax.runs.growing import NotReusable, ReusableResult, ReusedPoints
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.sink import Sink
 from drivetrain_jax.runs.work import Progress, Report, Work
@@ -55,7 +55,7 @@ class Hdf5Sink(Sink):
         """Names of the variables of the present result whose layout differs from that of ``job``."""
         return job.route.rearranged(job, self.held)
 
-    def common_points(self, job: Job) -> Source | NotReusable | None:
+    def common_points(self, job: Job) -> ReusableResult | NotReusable | None:
         """Points of ``job`` in the present result, or the reason why it has none."""
         return job.route.common_points(job, self.held)
 

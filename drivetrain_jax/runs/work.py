@@ -123,7 +123,7 @@ class Work:
     def _compute(self, job: Job, numbers: np.ndarray, batch: _Batch, progress: Progress) -> None:
         costs = job.plan.costs
         progress.cost, progress.total_cost = 0.0, float(costs[numbers].sum())
-        self._tell(progress)
+        self._report(progress)
         missing = len(numbers)
         if self.executor.in_process:
             job.prepare(job.plan.kernels(numbers))
@@ -140,11 +140,11 @@ class Work:
                     progress.failed += failures(results[OUTCOME.name])
                 progress.computed += count
                 progress.cost += float(costs[chunk.number])
-                self._tell(progress)
+                self._report(progress)
         if missing:
             raise RetryableError(f"{counted(missing, 'chunk', 'chunks')} returned no result")
 
-    def _tell(self, progress: Progress) -> None:
+    def _report(self, progress: Progress) -> None:
         if self.report:
             self.report(progress)
 

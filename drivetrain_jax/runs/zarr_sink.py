@@ -161,7 +161,7 @@ class _ShardedRun:
         }
         self._changed = set(self._unwritten)
         progress.total_cost = float(job.plan.costs[missing].sum())
-        self._tell()
+        self._report_progress()
         writer = ShardWriter(job, os.path.abspath(self._parts.out), self._shards)
         crashed = self._run(executor, writer, self._tasks(job.plan.ordered(missing)))
         self._one_by_one(executor, [chunk for batch in crashed for chunk in batch.chunks])
@@ -263,7 +263,7 @@ class _ShardedRun:
         self._progress.cost += float(plan.costs[numbers].sum())
         self._progress.computed += outcome.size
         self._progress.failed += failures(outcome)
-        self._tell()
+        self._report_progress()
 
     def _blocks(self, shard: int) -> slice:
         """The blocks of the plan that a shard overlaps."""
@@ -275,6 +275,6 @@ class _ShardedRun:
         """First point and number of points of every shard, rising."""
         return [points_of(self._job, self._shards.place(k)) for k in range(self._shards.count)]
 
-    def _tell(self) -> None:
+    def _report_progress(self) -> None:
         if self._report:
             self._report(self._progress)

@@ -164,13 +164,13 @@ def test_chunks_of_even_axes_reach_along_those_of_low_degree(deep):
 def test_many_small_rectangles_are_evaluated_together(deep, monkeypatch):
     """With the numbers of single points, also where eigenvalues decide."""
     stability, calls, shared = dt.open_atlas(deep).stability, [], []
-    judged_tiles, on_lines = charts.judged_tiles, evaluation.on_lines
+    evaluated_tiles, on_lines = charts.evaluated_tiles, evaluation.on_lines
 
     def counting(tiles, *more):
         calls.append(tiles := list(tiles))
-        return judged_tiles(iter(tiles), *more)
+        return evaluated_tiles(iter(tiles), *more)
 
-    monkeypatch.setattr(charts, "judged_tiles", counting)
+    monkeypatch.setattr(charts, "evaluated_tiles", counting)
     monkeypatch.setattr(evaluation, "on_lines", lambda panel, x: shared.append(len(x)) or on_lines(panel, x))
     axes = [
         np.linspace(*ends, n) for ends, n in zip(((0.0, 0.6), (1.38, 1.46), (0.95, 1.05)), (20, 40, 33), strict=True)
