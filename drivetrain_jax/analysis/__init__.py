@@ -1,6 +1,6 @@
 """The analyses by name. Each one solves a single point, independent of grids, files and figures.
 
-Other packages add theirs through the entry point group ``drivetrain_jax.analyses``; each entry point names an
+Other packages add analyses through the entry point group ``drivetrain_jax.analyses``; each entry point names an
 :class:`Analysis`.
 """
 
@@ -51,7 +51,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # The figure and the rules of an analysis are within this package, and need no jax.
+    # Imported on first use: figures and rules are submodules of this package and must import without jax.
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{'numerics.lanes' if name == 'over_lanes' else '_base'}"), name)
@@ -75,13 +75,13 @@ def get_analysis(name: str) -> Analysis:
 
 
 def analyses_of(system: type[System]) -> tuple[str, ...]:
-    """Names of the analyses that ``system`` serves, also through the model of another one (``Analysis.uses``)."""
+    """Names of the analyses of ``system``: those it has a model for, and those that use such a model (``Analysis.uses``)."""
     served = dict.fromkeys(system.models)
     for name in plugin_names(ANALYSES):
         try:
             uses = get_analysis(name).uses
         except ImportError:
-            # A package that fails spoils no other analysis; get_analysis says why it fails.
+            # Skip a package that fails to import; get_analysis reports its error.
             continue
         served |= dict.fromkeys([name] if uses in system.models else [])
     return tuple(served)

@@ -37,7 +37,7 @@ OUTCOME = Variable(
     "outcome", "1", "outcome of the computation", dtype="int8", flags=tuple(o.name.lower() for o in Outcome)
 )
 RTOL = Parameter("rtol", "1", "target relative error of the results", default=1e-10, lower=1e-14, upper=1e-2)
-# Solvers of diffrax for the option: explicit ones of order 8 and 5, and a stiff one.
+# Allowed values of the option `solver`: three explicit solvers of diffrax of order 8 and 5, and a stiff one.
 DIFFRAX_SOLVERS = ("Dopri8", "Dopri5", "Tsit5", "Kvaerno5")
 # Upper limit of simulated time (30 years, in s), and of steps (11 days at a microsecond each).
 MOST_SECONDS, MOST_STEPS = 1e9, 1e12
@@ -57,16 +57,16 @@ class Solver:
     """One way to compute the requested results of one point.
 
     ``solve(values, effort)`` returns every requested variable and ``outcome``, with the lanes as LAST axis. ``values``
-    holds all parameters of the model: varying ones as JAX arrays of lanes ``(N,)``, the others as numbers. From a function
-    of one point :func:`~drivetrain_jax.analysis.numerics.lanes.over_lanes` makes a ``solve``. A path axis is a NumPy array
-    ``(L,)``; results then have the path as FIRST axis, and ``chunk`` counts lines.
+    holds all parameters of the model: varying ones as JAX arrays of lanes ``(N,)``, the others as numbers.
+    :func:`~drivetrain_jax.analysis.numerics.lanes.over_lanes` makes a ``solve`` from a function of one point. A path axis
+    is a NumPy array ``(L,)``; results then have the path as FIRST axis, and ``chunk`` counts lines.
 
-    ``effort`` is a traced integer, the largest ``effort(columns)`` in the batch (columns: NumPy arrays ``(N,)``; result: a
-    number of steps, default equal for all points). The engine assigns every point to the solver with the smallest ``effort
-    * unit_cost``, and runs batches of ``chunk`` points of similar effort. ``steps(values)`` predicts the effort of every
-    lane from traced values, if ``solve`` uses it. ``march`` marks integrations in time, ``short_loops`` loops over some
-    tens of lanes; both have other compiler options (``numerics.kernels.compiler_options``). One point of a ``lengthy``
-    solver takes as long as a compilation.
+    The argument ``effort`` of ``solve`` is a traced integer, the largest ``effort(columns)`` in the batch.
+    ``effort(columns)`` returns a number of steps for NumPy arrays ``(N,)``; by default it is equal for all points. The
+    engine assigns every point to the solver with the smallest ``effort * unit_cost``, and runs batches of ``chunk`` points
+    of similar effort. ``steps(values)`` predicts the effort of every lane from traced values, if ``solve`` uses it.
+    ``march`` marks integrations in time, ``short_loops`` loops over some tens of lanes; both select other compiler options
+    (``numerics.kernels.compiler_options``). One point of a ``lengthy`` solver takes as long as a compilation.
     """
 
     name: str
@@ -93,7 +93,7 @@ def forward_derivatives(
     constants: Any,
     results: Mapping[str, Array],
 ) -> dict[str, Array]:
-    """Jacobians by forward differentiation of the first of ``solvers`` itself, see :class:`Analysis`."""
+    """Jacobians by forward differentiation through the first of ``solvers``, see :class:`Analysis`."""
     solve = solvers(system, request)[0].solve
     names = [n for n, x in results.items() if jnp.issubdtype(x.dtype, jnp.inexact) and not n.endswith("_error")]
 
@@ -119,8 +119,8 @@ class Analysis:
     (arrays; ``constants`` hold the rest); ``results`` include ``derivative_outputs(outputs)``. ``path_axis(system,
     request)`` names the axis that is computed as a whole, if any. A ``continuous`` analysis accepts ranges for axes and
     returns a function of the parameters instead of values on a grid. ``of_system(system)`` returns the fields that depend
-    on the system, by name, for example its ``variables``. An analysis with ``uses`` takes the model for the analysis of
-    this name, so that the systems need not know it.
+    on the system, by name, for example its ``variables``. ``uses`` names another analysis whose models this analysis
+    works with, so that systems need no model for it.
     """
 
     name: str
@@ -153,7 +153,7 @@ class Analysis:
         return {v.name: v for v in self.variables}[name]
 
 
-# One object for each system: kernels are cached by it.
+# Cached, because kernels are cached by the identity of the analysis.
 @lru_cache(maxsize=256)
 def _for_system(analysis: Analysis, system: type[System]) -> Analysis:
     own = analysis.of_system(system)

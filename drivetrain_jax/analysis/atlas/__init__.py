@@ -1,1 +1,1 @@
-"""The stability atlas as an analysis: its solves."""
+"""The stability atlas as an analysis: solves at the nodes of its panels."""

@@ -3,7 +3,7 @@
 ``Phi`` is a smooth function of the parameters; multipliers and spectral radius are not. The direct solvers of ``floquet``
 compute it with two step sizes, whose difference estimates its error.
 
-Scenes know it only as ``atlas`` (``analysis/atlas/analysis.py``), so this analysis and its model have that name.
+Scenes name the analysis ``atlas`` (``analysis/atlas/analysis.py``), so these solves and their model have the same name.
 """
 
 from __future__ import annotations

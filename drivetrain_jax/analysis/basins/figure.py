@@ -50,7 +50,7 @@ def _followed(x: np.ndarray, size: np.ndarray, exists: np.ndarray, multiple: np.
     from its last two sizes to the nearest attractor of its period multiple. It ends after two misses.
     """
     branch, followed = np.full(size.shape, -1), []
-    # Attractors without a size do not repeat: they count as one.
+    # All non-periodic motions are one attractor, which has no size.
     size = np.where(np.isfinite(size), size, np.inf)
     for i, row in enumerate(size):
         here = np.flatnonzero(exists[i])

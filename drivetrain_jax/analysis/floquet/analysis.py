@@ -1,8 +1,8 @@
 """Floquet analysis of a linear periodic system: multipliers, spectral radius with error bound, and verdict of one point.
 
 ``direct`` integrates the system's reduced form by diffrax with solvers for linear periodic terms: an explicit scheme of
-order 8, or an L-stable implicit one where that needs fewer operations. ``atlas`` evaluates a whole scene from polynomials
-compared with direct solves (see ``drivetrain_jax.atlas``), and solves points in gaps. ``auto`` chooses the cheaper one.
+order 8, or an L-stable implicit scheme where it needs fewer operations. ``atlas`` evaluates a whole scene from polynomials
+compared with direct solves (see ``drivetrain_jax.atlas``), and solves points in gaps. ``auto`` chooses the cheaper method.
 ``diffrax`` uses one of diffrax's own solvers: in equal steps for the reduced form, or in adaptive steps for the system as
 published over its full period (``form = "published"``), with other coordinates, clock and factorisation.
 """
@@ -43,13 +43,13 @@ def _direct_solvers(system: type[System], request: Request) -> tuple[Solver, ...
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     if request.method != "diffrax":
         return _direct_solvers(system, request)
-    # diffrax takes as long to import as jax, and is not needed to read a result.
+    # diffrax takes as long to import as jax, and readers of results do not need it.
     from drivetrain_jax.analysis.floquet.diffrax_solvers import diffrax_solvers
 
     return diffrax_solvers(system, request)
 
 
-# Relative error for which the steps of derivatives are predicted: they lose some digits against the multipliers.
+# Target of the predicted steps of derivatives, tight because derivatives lose some digits against multipliers.
 _DERIVATIVES = 1e-11
 
 
@@ -58,7 +58,7 @@ def _derivatives(
 ) -> dict[str, Array]:
     """Jacobians of multipliers, exponents and spectral radius; NaN where multipliers coalesce.
 
-    They need no ``results``, so that a gradient alone computes no value.
+    ``results`` are not used, so a gradient alone computes no values.
     """
     del results
     from drivetrain_jax.analysis.floquet.derivatives import monodromy_change, multiplier_change, radius_change

@@ -1,8 +1,9 @@
 """Derivatives of Floquet multipliers by the parameters of a system.
 
-With ``Phi' = A Phi`` the derivative by a parameter p obeys ``(d Phi/dp)' = A d Phi/dp + (dA/dp) Phi``: both are the
-propagator of a linear periodic system of twice the size, which is integrated like any other one, with the parameters as
-lanes. Of a simple multiplier, with ``p(s) = det(s I - Z)`` and the adjugate B of ``s I - Z``, ``d s = tr(B dZ) / p'(s)``.
+With ``Phi' = A Phi`` the derivative by a parameter p obeys ``(d Phi/dp)' = A d Phi/dp + (dA/dp) Phi``. Both equations
+together are a linear periodic system of twice the size, integrated like any other system, with the parameters as lanes.
+A simple multiplier s moves by ``ds = tr(B dZ) / p'(s)``, where ``p(s) = det(s I - Z)`` and B is the adjugate of
+``s I - Z``.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
-# Moduli that differ only by rounding, as all multipliers without damping.
+# Relative difference below which two moduli are equal up to rounding, as all moduli are without damping.
 TIED = 1e-11
-# Relative error of the matrix Z by the steps for 1e-11: the largest at 600 random cardan shafts was 2.5e-12.
+# Relative error of Z with the steps predicted for 1e-11: the largest at 600 random cardan shafts was 2.5e-12.
 _MATRIX_ERROR = 3e-12
 # Below this |p'(s)|, in units of the spectral radius, a multiplier s does not count as simple.
 _SIMPLE = 1e-7
@@ -41,7 +42,7 @@ class Change(NamedTuple):
 
 
 class _Varied(eqx.Module):
-    """A system and its derivative along a direction of its parameters as one system, with the span as unit of time."""
+    """One linear system of twice the size: a system and its derivative along ``direction``. The unit of time is the span."""
 
     parameters: Any
     direction: Any
@@ -49,7 +50,7 @@ class _Varied(eqx.Module):
     constants: Constants = eqx.field(static=True)
 
     def rows(self, s: Any) -> tuple[tuple[Any, ...], ...]:
-        """``((A, 0), (dA, A))`` at the part s of the span."""
+        """``((A, 0), (dA, A))`` at the fraction s of the span."""
         zeros: list[list[bool]] = []
 
         def entries(parameters: Any) -> list[Array]:
@@ -79,7 +80,7 @@ def reduced_form(build: Build, parameters: Any, constants: Constants) -> LinearP
 def monodromy_change(
     build: Build, parameters: Any, constants: Constants, steps: Array, solver: type[EqualSteps] = Order8
 ) -> Change:
-    """The monodromy matrix of one point and its derivatives by all ``parameters``, a pytree of P numbers, by ``steps``."""
+    """The monodromy matrix of one point in ``steps`` steps, and its derivatives by all ``parameters``, P numbers as pytree."""
     leaves, tree = jax.tree.flatten(parameters)
 
     def along(direction: Array) -> Change:
@@ -100,8 +101,11 @@ def monodromy_change(
 
 
 def multiplier_change(change: Change) -> tuple[Array, Array, Array]:
-    """Multipliers by falling modulus ``(n,)`` and their derivatives ``(n, P)``, both over ``exp(log_scale)``, NaN where a
-    multiplier is not simple; and the relative error of the first multiplier, which grows where multipliers coalesce."""
+    """Multipliers by falling modulus ``(n,)``, their derivatives ``(n, P)``, and the relative error of the first multiplier.
+
+    Multipliers and derivatives are in units of ``exp(log_scale)``. A derivative is NaN where its multiplier is not simple.
+    The error grows where multipliers coalesce.
+    """
     z, n = change.z, len(change.z)
     sigma = sort_multipliers(*(x[..., None] for x in eigenvalues(z)))[:, 0]
     rho = jnp.abs(sigma[0])
@@ -120,8 +124,10 @@ def multiplier_change(change: Change) -> tuple[Array, Array, Array]:
 
 
 def radius_change(sigma: Array, moved: Array, error: Array | float) -> Array:
-    """Derivatives of the spectral radius ``(P,)`` from multipliers and theirs; NaN where more than one multiplier and its
-    conjugate have the largest modulus within ``error``, which is relative."""
+    """Derivatives of the spectral radius ``(P,)`` from the multipliers ``sigma`` and their derivatives ``moved``.
+
+    NaN where the largest modulus is shared, within the relative ``error``, by more than one multiplier and its conjugate.
+    """
     modulus = jnp.abs(sigma)
     apart = jnp.abs(sigma - jnp.conj(sigma[0]))
     # Real multipliers are their own conjugate.

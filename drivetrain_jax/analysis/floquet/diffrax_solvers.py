@@ -21,16 +21,18 @@ from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last, over_l
 from drivetrain_jax.systems import LinearPeriodic, System
 
 MAX_STEPS = 200_000
-# Passed to `compare` as the reduction of the error, it cancels that function's safety factor: the error is the difference
-# between two tolerances a decade apart, as it is.
+# Cancels the safety factor of `compare`: the error is the plain difference between two tolerances a decade apart.
 _REDUCTION = 4.0
-# The bound of a spectral radius is up to a hundred times that of its matrix; at most ten tolerances are a success.
+# Ratio of rtol to the target of the matrix: the bound of a spectral radius is up to a hundred times the bound of its
+# matrix, and succeeds up to ten tolerances.
 _MARGIN = 40
 
 
 def diffrax_solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
-    """Equal steps for the reduced form; adaptive ones for the published form, and for solvers that iterate in each step:
-    these take the tolerance of their iteration from that of the steps."""
+    """The solver of the method ``diffrax``: in equal steps for the reduced form, adaptive for the published form.
+
+    Implicit solvers are always adaptive, because their iteration needs the tolerance of the steps.
+    """
     solver = getattr(diffrax, request.options["solver"])
     adaptive = request.options["form"] == "published" or issubclass(solver, diffrax.AbstractImplicitSolver)
     return (adaptive_steps if adaptive else equal_steps)(system, request)
@@ -108,7 +110,7 @@ def equal_step_propagator(form: LinearPeriodic, solver: diffrax.AbstractSolver, 
     if isinstance(form.rows, eqx.Module | jax.tree_util.Partial):
         matrix = lanes_last(_integrated, Constants((rest, solver)), arrays, steps)
     else:
-        # Nothing is known of the arrays that another function may depend on.
+        # Any other function may depend on unknown arrays.
         matrix = _integrated(Constants((rest, solver)), arrays, steps)[..., 0]
     return Propagator(matrix, jnp.zeros(()), jnp.ones(()))
 

@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from drivetrain_jax.analysis.floquet.propagator import Propagator
     from drivetrain_jax.systems import LinearPeriodic
 
-# A batch may double its predicted number of steps this often, and not beyond this number of steps.
+# Most doublings of the predicted number of steps of a batch, and most steps.
 _MAX_REFINEMENTS = 6
 _MAX_STEPS = 2**20
 # The explicit scheme is stable for decays of up to this much in a step.
 _STABLE = 6.0
-# Rounding of the entries of A, in units of the last place: half of it was too little where points were sought that break it.
+# Rounding of the entries of A, in units of the last place. A search for the worst points showed that half is too little.
 _ENTRIES = 16
 
 
@@ -39,10 +39,10 @@ class Monodromy(NamedTuple):
     """``Z = exp(log_scale) matrix`` (up to similarity), ``(n, n, ...)``.
 
     The coefficients a_k of ``matrix``'s characteristic polynomial are wrong by at most ``error`` times the k-th power of
-    its spectral radius; ``met`` says that this is the target or the limit of rounding. ``residual`` is det Z minus its
-    exact value (Liouville) in units of the n-th power of a lower bound of the spectral radius; 0 if that is not known.
-    ``change`` is the estimated error of ``matrix``, entry by entry: four times the finer result's distance to the limit of
-    the two, where there were two.
+    its spectral radius. ``met`` is true if this error is within the target or the limit of rounding. ``residual`` is det Z
+    minus its exact value (Liouville) in units of the n-th power of a lower bound of the spectral radius; 0 if the exact
+    value is not known. ``change`` is the error of ``matrix`` entry by entry, with a safety factor of four: the distance of
+    the finer result from the limit extrapolated from both results. It is None without a second result.
     """
 
     matrix: Array
@@ -65,7 +65,7 @@ def assemble(system: LinearPeriodic, phi: Array) -> Array:
 
 
 def _reversed(start: Array, end: Array, phi: Array) -> Array:
-    # Without a varying parameter there is one matrix for all lanes.
+    # If no parameter of the reversal varies, its matrix is the same for all lanes.
     start, end = (each.reshape(*each.shape, *(1,) * (phi.ndim - each.ndim)) for each in (start, end))
     return matmul(matmul(start, jnp.swapaxes(phi, 0, 1)), matmul(end, phi))
 
@@ -97,8 +97,10 @@ def _balance(size: Array) -> Array:
 
 
 def stiffness_of(system: LinearPeriodic, shape: tuple[int, ...] = ()) -> Array:
-    """Largest rate times the span in every lane, of batch shape ``shape``: max |a_ij a_ji|^(1/2), which no scaling of states
-    changes, in the mean over 16 instants."""
+    """Largest rate times the span in every lane, for the batch shape ``shape``.
+
+    The rate is max |a_ij a_ji|^(1/2), which no scaling of states changes, averaged over 16 instants.
+    """
     rows = system.rows(*system.basis((jnp.arange(16) + 0.5)[:, None] * system.span / 16))
     pairs = [jnp.abs(jnp.asarray(row[j] * rows[j][i], float)) for i, row in enumerate(rows) for j in range(i + 1)]
     largest = jnp.broadcast_to(reduce(jnp.maximum, pairs), (16, *(shape or (1,))))
@@ -107,7 +109,7 @@ def stiffness_of(system: LinearPeriodic, shape: tuple[int, ...] = ()) -> Array:
 
 def stable_steps(system: LinearPeriodic) -> Array:
     """Steps with which the explicit scheme is stable in all lanes; ``-tr A`` at 5 instants bounds the rates of decay."""
-    # Only the diagonal is computed, of all instants at once.
+    # Only the diagonal is used: the compiler drops the other entries.
     rows = system.rows(*system.basis(jnp.arange(5)[:, None] * system.span / 4))
     rate = -sum(jnp.asarray(row[i], float) for i, row in enumerate(rows))
     return jnp.nanmax(rate, initial=0.0) * system.span / _STABLE
@@ -149,7 +151,7 @@ def compare(
         exact = jnp.exp(system.log_determinant() - n * log_scale)
         residual = ((-1) ** n * a_fine[-1] - exact) / scale**n
     truncation = jnp.maximum(truncation, jnp.abs(residual))
-    # Eightfold growth is well within the assumed rounding of the products, if their size is only estimated.
+    # Without a reversal the size of the products is only estimated, and their assumed rounding covers eightfold growth.
     growth = jnp.maximum(fine.growth / (8 if system.reversal is None else 1), 1.0)
     unit = np.finfo(float).eps * norm / scale
     at_the_end = (4 + jnp.sqrt(steps)) * unit

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from drivetrain_jax.analysis.floquet.propagator import Propagator
     from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
-# Ratio of the explicit steps to those of the coarser solution for the error estimate, up to this rtol, if the system
-# predicts its steps. For other systems so few steps may not show the order of the scheme.
+# Ratio of the steps of the two explicit solutions behind an error estimate, and the loosest target for it. The ratio needs a
+# system that predicts its steps: elsewhere so few steps may not show the order of the scheme.
 _RATIO, _FINE = 4, 1e-8
 
 Form = Callable[["FloquetModel"], "LinearPeriodic"]
@@ -44,10 +44,10 @@ def direct_solvers(
     chunks: tuple[int, int] = (512, 64),
     stiff: Form | None = None,
 ) -> tuple[Solver, ...]:
-    """Solvers that give ``results(model, monodromy)`` from the monodromy matrix of ``form(model)``.
+    """Solvers that return ``results(model, monodromy)`` from the monodromy matrix of ``form(model)``.
 
-    ``rtol`` predicts the effort, ``target`` is the error that every point is refined to. ``stiff(model)`` is the form for
-    the implicit scheme, and for the explicit one where damping is strong; None if it is no other one.
+    ``rtol`` predicts the effort; every point is refined to the error ``target``. ``stiff(model)`` is the form for the
+    implicit scheme, and for the explicit scheme where damping is strong; with None both use ``form``.
     """
     solve = partial(_solve, system, target, results)
 
@@ -81,9 +81,10 @@ def direct_solvers(
 
 
 class _ExplicitSteps:
-    """Steps of the explicit scheme by march: ``short``, ``long`` or ``damped`` (the other form); inf in the other two.
+    """Steps of the explicit scheme for the three kinds of march: ``short``, ``long`` and ``damped`` (the form ``stiff``).
 
-    The last request is cached, because the solvers of a plan request the same columns in turn.
+    A point has its steps in one kind and inf in the others. The last request is cached, because the solvers of a plan
+    request the same columns in turn.
     """
 
     def __init__(self, system: type[System], rtol: float, has_stiff: bool) -> None:
@@ -110,7 +111,7 @@ def _solve(
     effort: Array,
     explicit: bool,
 ) -> dict[str, Array]:
-    # diffrax takes as long to import as jax, and is not needed to read a result.
+    # diffrax takes as long to import as jax, and readers of results do not need it.
     from drivetrain_jax.analysis.floquet.propagator import PIECES, Order8, Radau, propagator
 
     scheme = Order8 if explicit else Radau
@@ -119,7 +120,7 @@ def _solve(
     periodic = form(model)
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in values.values() if not isinstance(x, str)))
     least = stable_steps(periodic) if explicit else 0.0
-    # Errors grow on the way where modes decay at rates that differ by much, and by other ones later than at first.
+    # The growth of errors is measured in more pieces where damping is strong: there modes decay at very different rates.
     pieces = jnp.clip(least, 1, PIECES).astype(effort.dtype) if explicit else PIECES
 
     def propagate(steps: Array, pieces: Array) -> Propagator:

@@ -18,17 +18,17 @@ from drivetrain_jax.systems import System
 if TYPE_CHECKING:
     from drivetrain_jax.systems import FloquetModel
 
-# Below this many explicit steps the implicit scheme is never the cheaper one.
+# Explicit steps up to which the implicit scheme is never cheaper.
 _STIFF = 600
-# Marches of more explicit steps are long: they have separate batches, because rounding grows with the steps. A stiff point
-# needs at least this ratio of steps to those of its oscillation.
+# Explicit steps beyond which a march is long: long marches have separate batches, because rounding grows with the steps.
+# Least ratio of explicit steps to the steps of the oscillation at which a point with a long march counts as stiff.
 LONG, _OSCILLATES = 10_000, 10.0
-# Beyond these a scheme does not start: the point is left to the other one, or ends as STEP_LIMIT.
+# Most explicit steps and most implicit panels: beyond, a point is left to the other scheme, or ends as STEP_LIMIT.
 _MAX_EXPLICIT, _MAX_PANELS = 1_000_000, 20_000
-# A model without a value somewhere in its span is solved all the same: that makes the outcome NOT_FINITE.
+# Steps of a model that is NaN somewhere in its span: it is solved all the same, so that its outcome becomes NOT_FINITE.
 _TO_FIND_NO_VALUE = 64
-# Ratio of the time of one implicit panel to one explicit step, per point. Full batches would have 150; but few points share
-# a chunk, and unneeded steps cost a point accuracy too.
+# Ratio of the time of one implicit panel to one explicit step, per point. It is 150 in full batches, but few points share a
+# chunk, and more steps than necessary also cost accuracy.
 PANEL_COST = 50.0
 # Nodes and weights of a quadrature over [0, 1].
 _NODES, _WEIGHTS = ((x + a) / 2 for x, a in zip(np.polynomial.legendre.leggauss(8), (1, 0), strict=True))
@@ -56,16 +56,16 @@ def traced_steps(build: Build, values: Mapping[str, Any], rtol: float) -> Array:
 
 
 def strongly_damped(system: type[System], columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Flags of points where the explicit scheme also uses the ``stiff`` form of the model, ``(N,)``."""
+    """True at points where the explicit scheme uses the ``stiff`` form of the model too, ``(N,)``."""
     build = system.models["floquet"].build
     strong = build(columns).strongly_damped() if _knows(build, "strongly_damped", columns) else False
     return np.broadcast_to(strong, count_of(columns))
 
 
 def implicit_effort(system: type[System], columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
-    """Panels of the implicit scheme, ``(N,)``: it must resolve oscillations; decay costs it nothing.
+    """Panels of the implicit scheme, ``(N,)``, which must resolve oscillations but not decay.
 
-    Infinite where oscillation makes an explicit march long: that costs a twentieth, and is as exact.
+    Infinite where oscillation makes an explicit march long: the explicit march costs a twentieth and is as accurate.
     """
     explicit = _explicit_steps(system, columns, rtol)
     effort = np.full(explicit.shape, np.inf)
@@ -86,7 +86,7 @@ def _explicit_steps(system: type[System], columns: Mapping[str, np.ndarray], rto
     if _knows(build, "explicit_steps", columns):
         steps = build(columns).explicit_steps(rtol)
     else:
-        # Systems that predict none: from the size of A^2.
+        # A system without a prediction: estimate the steps from the size of A^2.
         phase = predicted(_phase, (build,), columns)
         steps = _steps_of(phase, rtol)
         steps = np.where(np.isnan(steps), _TO_FIND_NO_VALUE, steps)
@@ -94,13 +94,13 @@ def _explicit_steps(system: type[System], columns: Mapping[str, np.ndarray], rto
 
 
 def _steps_of(phase: np.ndarray | Array, rtol: float) -> np.ndarray:
-    """Steps of the explicit scheme for an oscillation through ``phase``."""
+    """Steps of the explicit scheme for an oscillation through the angle ``phase``."""
     with np.errstate(over="ignore"):
         return (4 + 2.5 * phase**1.1) * (1e-9 / rtol) ** (1 / 9)
 
 
 def _knows(build: Build, fact: str, columns: Mapping[str, Any]) -> bool:
-    """True if the model provides this ``fact``, found without computing it."""
+    """True if the model has the optional attribute ``fact``, found without computing its value."""
     words, numbers = split(columns)
     leaves, tree = jax.tree.flatten(numbers)
     return _known(build, fact, words, tree, len(leaves))
@@ -117,7 +117,7 @@ def _known(build: Build, fact: str, words: Words, tree: Any, count: int) -> bool
 
 
 def _phase(build: Build, values: Mapping[str, Any]) -> Array:
-    """The mean of |A^2|^(1/2) dt over the span at 16 instants, or half of the largest."""
+    """Angle of the oscillation: the span times the mean of |A^2|^(1/2) at 16 instants, or times half of the largest."""
     a = _matrices(build, tuple((k + 0.5) / 16 for k in range(16)), values)
     rates = jnp.sqrt(jnp.linalg.norm(a @ a, axis=(1, 2)))
     return jnp.maximum(jnp.mean(rates), jnp.max(rates) / 2)
@@ -132,7 +132,7 @@ def _frequency_phase(system: type[System], columns: Mapping[str, Any]) -> np.nda
 
 
 def _matrices(build: Build, places: tuple[float, ...], values: Mapping[str, Any]) -> Array:
-    """The span times ``A`` of one point where the clock is at these ``places`` in [0, 1] of it, ``(K, n, n)``."""
+    """The span times ``A`` of one point at the fractions ``places`` of the span, ``(K, n, n)``."""
     form = build(values).reduced
     return form.span * jax.vmap(form.matrix)(form.span * jnp.array(places))
 

@@ -129,12 +129,12 @@ def _notes(stable: bool, shown: int, count: int) -> str:
 
 def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
     cells.require_any(dataset, "verdict")
-    # Axes of few values run across, if that leaves two.
+    # Axes of few values run across the figure, if two other axes remain.
     long = [name for name in names if dataset.sizes[name] > _FEW]
     horizontal = cells.horizontal_axis(dataset, long if len(long) > 1 else names)
     vertical = max((name for name in names if name != horizontal), key=lambda name: dataset.sizes[name])
     sliced = [name for name in names if name not in (horizontal, vertical)]
-    # Labels are drawn only over the first row, so an axis on which the predictions depend runs across.
+    # Only the first row has labels of the resonances, so an axis that changes their positions runs across.
     dependent = dataset.coords.get(f"resonance_{horizontal}", xr.DataArray(0)).dims
     sliced.sort(key=lambda name: name not in dependent)
     count = math.prod(dataset.sizes[name] for name in sliced)
@@ -144,7 +144,7 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
         [dataset.isel({across: column} | ({down: row} if down else {})) for column in _spread(dataset, across)]
         for row in (_spread(dataset, down) if down else [0])
     ]
-    # Regions without a boundary are blank: show the distance from it instead.
+    # If all is stable there is no boundary to draw: show the spectral radius instead.
     plain = "spectral_radius" in dataset and bool((cells.states(dataset) == cells.STABLE).all())
     margins = Margins(right=1.05 if plain else 0.25, top=1.12, between_rows=0.32, between_columns=0.16)
     height = _SMALL_PANEL if len(slices) > 1 else _PANEL

@@ -8,9 +8,10 @@ bracket the spectral radius rho of the true matrix:
 - about the origin with radius rho + r: with s_i the multiplier nearest to z and d_i = rho + r - |s_i| <= |z - s_i|,
   |p(z)| >= min_i d_i prod_(j != i) max(d_j, |s_i - s_j|/2), where |s_i - s_j| - d_i may replace half the gap if d_i is
   below 1/32 of the smallest one (the product then grows with |z - s_i|). No true multiplier lies further out;
-- about the dominant multiplier s_1 with radius r, where |p(z)| >= r prod_(j != 1) ||s_1 - s_j| - r|: a true one lies inside.
+- about the dominant multiplier s_1 with radius r, where |p(z)| >= r prod_(j != 1) ||s_1 - s_j| - r|: a true multiplier
+  lies inside.
 
-Near a double multiplier (the edge of every tongue) this gives the honest square root of the coefficients' error.
+Near a double multiplier (the edge of every tongue) the bound is of the size of the square root of the coefficients' error.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from drivetrain_jax.analysis.numerics.linear_algebra import matmul
 
 VERDICTS = ("stable", "unstable", "undecided")
 
-# Radii at which the circles are tried, relative to the spectral radius: four a decade from rounding up to 10, a little
-# below powers of ten, so that the rung that belongs to a decimal tolerance meets it.
+# Radii of the circles relative to the spectral radius: four per decade from rounding up to 10, 1 % below powers of ten so
+# that a bound can meet a decimal tolerance.
 _LADDER = 0.99 * 10.0 ** (np.arange(-64, 5) / 4)
 
 
@@ -57,8 +58,8 @@ def root_scale(coefficients: Array) -> Array:
 def sort_multipliers(real: Array, imaginary: Array) -> Array:
     """The multipliers ``real + i imaginary`` by falling modulus, ``(n, ...) -> (n, ...)`` complex.
 
-    Moduli that agree to 1e-9 count as equal and are put in rising order of the argument, so that a conjugate pair does
-    not change places with the last bits.
+    Multipliers whose moduli agree to 1e-9 are in rising order of the argument, so that rounding never swaps a conjugate
+    pair.
     """
     modulus = jnp.hypot(real, imaginary)
     rank = jnp.round(-modulus / jnp.max(modulus, axis=0), 9)
@@ -86,7 +87,7 @@ def spectral_radius_bound(real: Array, imaginary: Array, error: Array) -> Array:
 
 
 def _circle_around_all(modulus: Array, x: Array, y: Array, eps: Callable[[Array], Array]) -> Array:
-    """Least rung r such that no zero leaves ``|z| <= 1 + r``; the multipliers ``x + i y`` are in units of rho."""
+    """Smallest r of the ladder such that ``|z| <= 1 + r`` holds all zeros; multipliers ``x + i y`` are in units of rho."""
     n, ladder = len(x), jnp.asarray(_LADDER)
     gap = jnp.hypot(x[:, None] - x, y[:, None] - y)
     closest = jnp.stack([jnp.min(jnp.delete(gap[i], i, axis=0), axis=0, initial=jnp.inf) for i in range(n)])
@@ -100,7 +101,7 @@ def _circle_around_all(modulus: Array, x: Array, y: Array, eps: Callable[[Array]
         return jnp.min(jnp.stack(products), axis=0) > eps(r)
 
     def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
-        # The condition is monotone in r: bisection for the first rung that meets it.
+        # The condition is monotone in r: bisect for the first radius that meets it.
         low, high = bracket
         middle = (low + high) // 2
         met = outside(ladder[middle])
@@ -112,13 +113,13 @@ def _circle_around_all(modulus: Array, x: Array, y: Array, eps: Callable[[Array]
 
 
 def _circle_around_largest(modulus: Array, x: Array, y: Array, eps: Callable[[Array], Array]) -> Array:
-    """Least rung r such that a zero stays within r of the largest multiplier."""
+    """Smallest r of the ladder such that a zero lies within r of the largest multiplier."""
     n, ladder = len(x), jnp.asarray(_LADDER)
     x1, y1, top = x[0], y[0], modulus[0]
     for j in range(1, n):
         larger = modulus[j] > top
         x1, y1, top = (jnp.where(larger, new, old) for new, old in ((x[j], x1), (y[j], y1), (modulus[j], top)))
-    # With the dominant multiplier's own distance, which is 0, the product over all j has the factor r.
+    # The dominant multiplier has the distance 0 from itself, so the product over all j has the factor r.
     distances = jnp.hypot(x - x1, y - y1)
 
     def descend(k: int, inner: Array) -> Array:

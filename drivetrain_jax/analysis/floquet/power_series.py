@@ -1,12 +1,12 @@
-"""Propagators of a linear periodic system along a coordinate x, as power series in x: a line for the price of a few solves.
+"""Propagators of a linear periodic system along a coordinate x, as power series in x: a line costs as much as a few solves.
 
-Let ``A(t, x) = A0(t) + x A1(t)``, where ``A0`` only leads from the ``first`` states to the others, the states
-``y~ = (I - G) y`` with ``G' = A0`` obey ``y~' = x B y~``, ``B = (I - G) A1 (I + G)``. Over a part of the span, at whose
-start ``G = 0``, the propagator is
+Let ``A(t, x) = A0(t) + x A1(t)``, where ``A0`` only leads from the ``first`` states to the others. The states
+``y~ = (I - G) y`` with ``G' = A0`` obey ``y~' = x B y~``, ``B = (I - G) A1 (I + G)``. Over a part of the span, with
+``G = 0`` at its start, the propagator is
 
     (I + G) sum_k x^k D_k,  D_k' = B D_(k-1),  D_0 = I and D_k = 0 for k > 0 at the start:
 
-nothing has to be solved. The span is cut into equal parts, so short that few terms are enough; integrals are those of
+No equation has to be solved. The span is cut into equal parts, so short that few terms are enough. Integrals are those of
 Radau's collocation, whose last node is the end of the part.
 """
 
@@ -32,10 +32,10 @@ Form = Callable[[Any], LinearPeriodic]
 def propagators_along(form: Form, ends: Array, first: int, lanes: int, parts: Array, x: Array) -> tuple[Array, Array]:
     """``Phi`` of ``lanes`` lines at the P positions ``x``, ``(P, n, n, lanes)``, and the truncation error, ``(lanes,)``.
 
-    ``form(p)`` is the system where the coordinate's parameter is p; ``ends`` ``(2,)`` are its values where the coordinate is
-    0 and where it is 1 in the units of ``x``; ``|x| <= 1``. The span is cut into ``parts`` (a traced integer). The
-    truncation error is the size of the last term relative to the largest one, in the worst part; it is infinite if ``A0``
-    has entries that do not lead from the ``first`` states to the others.
+    ``form(p)`` is the system for the value p of the coordinate's parameter. ``ends`` ``(2,)`` are the values of p at
+    ``x = 0`` and ``x = 1``; ``|x| <= 1``. The span is cut into ``parts`` (a traced integer). The truncation error is the
+    size of the last term relative to the largest term, in the worst part. It is infinite if ``A0`` has entries that do not
+    lead from the ``first`` states to the others.
     """
     weights, places = radau_iia(NODES)
     system = form(ends[0])

@@ -1,10 +1,10 @@
 """Propagators of linear periodic systems by diffrax, with two solvers of equal steps: explicit of order 8, or L-stable.
 
-Both give ``Phi`` over ``[0, span]`` of a :class:`~drivetrain_jax.systems.LinearPeriodic` with the number of steps as a
+Both return ``Phi`` over ``[0, span]`` of a :class:`~drivetrain_jax.systems.LinearPeriodic` with the number of steps as a
 traced integer, so that one compilation serves every accuracy. A step of diffrax is a piece of the span, and a piece is many
-steps of the scheme. Under ``jax.vmap`` the explicit scheme marches blocks of lanes as one kernel each, keeps every matrix as
-rows of shape ``(n, lanes)`` and evaluates the entries of ``A`` at all stages of a step together, what they share once
-(:mod:`~drivetrain_jax.analysis.numerics.staged`).
+steps of the scheme. Under ``jax.vmap`` the explicit scheme marches each block of lanes as one kernel and keeps every matrix
+as rows of shape ``(n, lanes)``. It evaluates the entries of ``A`` at all stages of a step together, so that common
+expressions are computed once (:mod:`~drivetrain_jax.analysis.numerics.staged`).
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from drivetrain_jax.systems import LinearPeriodic
 class Propagator(NamedTuple):
     """``Phi = exp(log_scale) matrix``, shape ``(n, n, ...)``.
 
-    ``growth`` is how much larger at the end an error is that was made on the way than one made there, the root of the mean
-    square of ``|Phi(T, t)| |Phi(t, 0)| / |Phi(T, 0)|`` (1 at t = T) over the ends of the pieces.
+    ``growth`` is the factor by which earlier errors have grown at the end T, against errors made at T: the root mean square
+    of ``|Phi(T, t)| |Phi(t, 0)| / |Phi(T, 0)|`` (1 at t = T) over the ends t of the pieces.
     """
 
     matrix: Array
@@ -41,14 +41,14 @@ class Propagator(NamedTuple):
     growth: Array
 
 
-# Order of the explicit scheme; stages of the implicit one, and the least order of its errors (the stage order, which stiff
-# problems have instead of the classical order 15).
+# Order of the explicit scheme; stages of the implicit scheme, and its order for stiff problems (the stage order, instead of
+# the classical order 15).
 EXPLICIT_ORDER, STAGES, IMPLICIT_ORDER = 8, 8, 8
 # Lanes per block: the data of a step fit into the innermost caches.
 LANES = 32
 # States whose largest entry is beyond exp(70), or below exp(-70), are scaled: far from overflow, even squared.
 _FAR = 70.0
-# Pieces of the span between which the growth of errors is looked at, at most.
+# Most pieces of the span; the growth of errors is measured between pieces.
 PIECES = 16
 
 Rows = list[Array]
@@ -58,8 +58,8 @@ _NOTHING = Constants(())
 class _Record(NamedTuple):
     """``y(t) = exp(log_scale) state``, and the covariance at t of errors made at the ends of all steps so far.
 
-    ``C' = P C P^T + |y|^2 I`` with the propagator P of a step sums these up: errors that are as large as ``y`` where they
-    are made, and know nothing of each other.
+    Errors are independent, and each is as large as ``y`` at its time. With the propagator P of a step the covariance obeys
+    ``C' = P C P^T + |y|^2 I``.
     """
 
     log_scale: Array
@@ -69,7 +69,8 @@ class _Record(NamedTuple):
 class EqualSteps(diffrax.AbstractSolver):
     """A solver of linear periodic terms: each step of diffrax is ``count`` equal steps of its scheme.
 
-    The state is a vector or a matrix of vectors. Far from 1 it is scaled; the logarithm is in the solver's state.
+    The state is a vector or a matrix of vectors. A state far from 1 is scaled, and the solver's state holds the logarithm
+    of the scale.
     """
 
     count: Any
@@ -82,7 +83,7 @@ class EqualSteps(diffrax.AbstractSolver):
         return self.ORDER
 
     def init(self, terms: LinearPeriodic, t0: Any, t1: Any, y0: Array, args: Any) -> _Record:
-        """Nothing scaled, and no errors."""
+        """The record at the start: no scaling and no errors."""
         return _Record(jnp.zeros(()), jnp.zeros((len(y0), len(y0))))
 
     def func(self, terms: LinearPeriodic, t0: Any, y0: Array, args: Any) -> Array:
@@ -117,11 +118,11 @@ class Order8(EqualSteps):
 
     def piece(self, terms: LinearPeriodic, t0: Any, t1: Any) -> tuple[Array, Array]:
         """See :class:`EqualSteps`."""
-        # Other parts of the term are not used.
+        # The other fields of the term are not used.
         arrays, rest = eqx.partition(LinearPeriodic(terms.rows, 0.0, terms.basis), eqx.is_array)
         shared = jnp.asarray(t0, float), jnp.asarray(t1, float), self.count
         if not jax.tree.leaves(arrays) or not isinstance(terms.rows, eqx.Module | jax.tree_util.Partial):
-            # Numbers alone, or a function that may depend on arrays of which nothing is known.
+            # No arrays to batch, or a function that may depend on unknown arrays.
             matrix, log_scale = _march(terms, *shared)
             return matrix[..., 0], log_scale[0]
         return lanes_last(_block, Constants(rest), arrays, shared, LANES)
@@ -172,7 +173,7 @@ def propagator(
 ) -> Propagator:
     """``Phi`` of one point by ``steps`` equal steps (or panels) of ``solver``, a multiple of ``pieces``.
 
-    The growth is looked at between so many ``pieces`` of the span, up to ``PIECES``.
+    The growth of errors is measured between the ``pieces`` of the span, at most ``PIECES``.
     """
     n = system.size
     end = diffrax.diffeqsolve(

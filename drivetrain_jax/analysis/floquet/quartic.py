@@ -1,4 +1,4 @@
-"""Spectral radius and its error in closed form for four states and a reversor: all that a chart needs of most cells.
+"""Spectral radius and its error in closed form for four states and a reversor, enough for most cells of a chart.
 
 With Phi = [[A, B], [C, D]] in 2 x 2 blocks and the reversor X = [[0, I], [I, 0]],
 
@@ -25,8 +25,8 @@ Matrix = list[list[Array]]
 
 EPS = float(np.finfo(float).eps)
 _NEWTON_STEPS = 9
-# Roundings in a coefficient, in units of eps times its natural size. An error of Phi, in units of |Phi|, weighs no more: by
-# |dZ| <= 2 |Phi| |dPhi| e_1, e_2, e_3 change by at most 4, 10, 12 times |Phi| |dPhi| |Z|^(k-1).
+# Roundings in a coefficient, in units of eps times its natural size. The factor also covers an error of Phi, in units of
+# |Phi|: as |dZ| <= 2 |Phi| |dPhi|, the coefficients e_1, e_2, e_3 change by at most 4, 10, 12 times |Phi| |dPhi| |Z|^(k-1).
 _ROUNDINGS = 16.0
 
 
@@ -76,7 +76,7 @@ def _sum(a: Matrix, b: Matrix) -> Matrix:
 
 
 def invariants(phi: Blocks, left_out: Array | float = 0.0) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """``e1, e2, e3`` by principal minors, and bounds of their errors by rounding and by that of Phi, ``left_out``."""
+    """``e1, e2, e3`` by principal minors, and bounds of their errors by rounding and by the error ``left_out`` of Phi."""
     a, b, c, d = phi
     s = _sum(transposed_product(d, a), transposed_product(b, c))
     upper, lower = transposed_product(d, b), transposed_product(c, a)
@@ -85,7 +85,7 @@ def invariants(phi: Blocks, left_out: Array | float = 0.0) -> tuple[tuple[Array,
     (s11, s12), (s21, s22) = s
     e1 = 2 * (s11 + s22)
     e2 = 2 * determinant(s) + s11**2 - u11 * v11 + s22**2 - u22 * v22 + 2 * (s11 * s22 - u12 * v12)
-    # Principal minors without the first or the second row; the reversor makes the other two equal to them.
+    # Principal minors without the first or the second row; by the reversor the other two minors have the same values.
     first = s22 * (s11 * s22 - s12 * s21) - u12 * (v12 * s22 - v22 * s21) + u22 * (v12 * s12 - v22 * s11)
     second = s11 * (s11 * s22 - s12 * s21) - u11 * (v11 * s22 - v12 * s21) + u12 * (v11 * s12 - v12 * s11)
     size = sum(square_norm(block) for block in phi)
@@ -102,8 +102,10 @@ def with_determinant(e: Sequence[Array] | Array, errors: Sequence[Array] | Array
 
 
 def coefficients(phi: Blocks, log_d: Array, derived_error: Array, left_out: Array | float = 0.0) -> Coefficients:
-    """Characteristic coefficients of ``phi``; ``derived_error`` ``(3, ...)`` is that of the interpolation, ``left_out`` see
-    :func:`invariants`."""
+    """Characteristic coefficients of ``phi``, with the error ``derived_error`` ``(3, ...)`` of the interpolation.
+
+    For ``left_out`` see :func:`invariants`.
+    """
     e, rounding = invariants(phi, left_out)
     return with_determinant(e, [derived_error[k] + rounding[k] for k in range(3)], log_d)
 
@@ -116,11 +118,11 @@ def _cubic_root(p2: Array, p1: Array, p0: Array) -> Array:
     """
     bend = -p2 / 3
     concave = (bend > 0) & (((bend + p2) * bend + p1) * bend + p0 > 0)
-    # Where w >= 1/4, w^2 <= m2 w + m1 - 4 p0 with the magnitudes m of negative coefficients. A step costs less than a
-    # square root or a quotient for a tighter bound.
+    # Where w >= 1/4, w^2 <= m2 w + m1 - 4 p0 with the magnitudes m of negative coefficients. Another Newton step costs less
+    # than the square root or the quotient of a tighter bound.
     m2, m1 = jnp.maximum(-p2, 0.0), jnp.maximum(-p1, 0.0)
     bound = jnp.maximum((m2 + jnp.sqrt(m2**2 + 4 * (m1 - 4 * p0))) / 2, 0.25)
-    # If p2 > 0, w^3 may be left out.
+    # If p2 > 0, the quadratic without w^3 bounds the root as well.
     root = jnp.sqrt(jnp.maximum(p1**2 - 4 * p2 * p0, 0.0))
     top, bottom = jnp.where(p1 > 0, -2 * p0, root - p1), jnp.where(p1 > 0, p1 + root, 2 * p2)
     bound = jnp.where((p2 > 0) & (top < bound * bottom), top / bottom, bound)
@@ -152,7 +154,7 @@ class _Factor(NamedTuple):
         return jnp.abs(self.half) - self.gap
 
     def difference(self, other: _Factor) -> tuple[Array, Array]:
-        """``slope, offset``: at a root sigma of this factor the other one has the value slope sigma + offset."""
+        """``slope, offset``: at a root sigma of this factor the ``other`` factor has the value slope sigma + offset."""
         return 2 * (self.half - other.half), (other.m - self.m) * (other.m + self.m)
 
     def where(self, condition: Array, other: _Factor) -> _Factor:
@@ -168,7 +170,7 @@ def factors(c: Coefficients) -> tuple[_Factor, _Factor]:
     w = _cubic_root((16 - e) / 16, (plus - minus - e) / 16, -minus / 16)
     cosh, sinh = jnp.sqrt(1 + w), jnp.sqrt(w)
     total = (a + g) / (2 * cosh)
-    # a - g = 2 sinh(u) (p1 - p2) as well: of the two ways to the difference the one that divides by the larger number.
+    # a - g = 2 sinh(u) (p1 - p2) as well: of the two formulas for the difference use the one with the larger divisor.
     difference = jnp.sqrt(jnp.maximum(total**2 - 4 * (b - 2 * (1 + 2 * w)), 0.0))
     quotient = (a - g) / (2 * jnp.where(sinh > 0, sinh, 1.0))
     difference = jnp.where(sinh > difference, quotient, jnp.where(a < g, -difference, difference))
@@ -200,13 +202,14 @@ def _at_real(factor: _Factor, modulus: Array, slope: Array, offset: Array) -> Ar
 
 
 def spectral_radius(c: Coefficients, split: tuple[_Factor, _Factor] | None = None) -> tuple[Array, Array, Array]:
-    """``rho``, a bound of its error, and whether the bound is much wider than it need be (or not a number).
+    """``rho``, a bound of its error, and True where the bound is much wider than necessary or not a number.
 
-    ``split`` are the :func:`factors` of ``c`` where they are known.
+    ``split`` are the :func:`factors` of ``c``, if known.
 
-    Smith's discs: with eps(sigma) = sum_k error_k |sigma|^(4-k), the true multipliers lie in the union of the discs about
-    the computed ones s_i with radius 4 eps(s_i)/prod_(j != i) |s_i - s_j|, in each connected part as many as centres. The
-    dominant disc, or the pair of them, must lie further out than the others; then its radius bounds the error.
+    The bound uses Smith's discs. With eps(sigma) = sum_k error_k |sigma|^(4-k), the true multipliers lie in the union of
+    discs about the computed multipliers s_i with radius 4 eps(s_i)/prod_(j != i) |s_i - s_j|; each connected part has as
+    many multipliers as centres. If the dominant disc, or pair of discs, lies further out than the others, its radius bounds
+    the error.
     """
     one, two = split or factors(c)
     errors = _unexplained(c, one, two)
@@ -219,7 +222,7 @@ def spectral_radius(c: Coefficients, split: tuple[_Factor, _Factor] | None = Non
     at_top = jnp.where(top.real, _at_real(top, rho, slope, offset), jnp.sqrt(_square_at_pair(top, slope, offset)))
     radius = eps / (top.gap * at_top)
     lower = rho - radius
-    # The discs of the others end below: eps/(gap value) < lower - modulus.
+    # The other discs lie further in if eps/(gap value) < lower - modulus.
     room, sibling, least = (lower - m) * other.gap, (lower - top.small) * top.gap, (lower - other.small) * other.gap
     pair = (room > 0) & (eps**2 < room**2 * _square_at_pair(other, slope, offset))
     real = (eps < room * _at_real(other, m, slope, offset)) & (
@@ -234,11 +237,10 @@ def spectral_radius(c: Coefficients, split: tuple[_Factor, _Factor] | None = Non
 
 
 def nothing_crosses(c: Coefficients, log_d: Array) -> Array:
-    """True if no polynomial within the errors has a root on the unit circle: the number of roots inside is then the same
-    for all.
+    """True if no polynomial within the errors has a root on the unit circle, so that all have as many roots inside it.
 
-    None of p(1), p(-1) and g = 1 + d - e2 + e1^2/4 - w^2/4, w = (e1 + e1 d - 2 e3)/(1 - d), may vanish: p = (sigma^2 - P
-    sigma + 1)(sigma^2 - Q sigma + d) is the same as g = 0, and w = P - Q.
+    None of p(1), p(-1) and g = 1 + d - e2 + e1^2/4 - w^2/4, w = (e1 + e1 d - 2 e3)/(1 - d), may vanish. The equation g = 0
+    is equivalent to p = (sigma^2 - P sigma + 1)(sigma^2 - Q sigma + d) with w = P - Q.
     """
     e1, e2, e3, d = c.e1, c.e2, c.e3, jnp.exp(log_d)
     d1, d2, d3, dd = c.errors

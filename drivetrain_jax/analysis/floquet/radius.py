@@ -32,18 +32,18 @@ def radius_by_eigenvalues(spectrum: Spectrum, error: Array) -> Radius:
 
 
 def radius_in_closed_form(z: Array, error: Array, scale: Array, tolerance: float) -> Radius:
-    """The same of ``z`` ``(4, 4, N)``, with eigenvalues only for lanes where the closed form is insufficient.
+    """Spectral radius and bound of ``z`` ``(4, 4, N)``, by eigenvalues only in lanes where the closed form is insufficient.
 
-    It is insufficient if its bound is not tight, exceeds ``tolerance`` rho, or does not show the side of 1 of ``scale``
-    rho.
+    The closed form is insufficient if its bound is not tight, exceeds ``tolerance`` rho, or leaves open on which side of 1
+    ``scale`` rho lies.
     """
     a = characteristic_coefficients(z)
-    # The determinant of the matrix itself, although the exact one may be known: multipliers that nearly meet are moved
-    # far less by a change of the matrix than by one of a single coefficient.
+    # Use the determinant of the matrix even if the exact value is known: multipliers that nearly meet move far less with
+    # the matrix than with a single coefficient.
     c = quartic.Coefficients(-a[0], a[1], -a[2], jnp.sqrt(jnp.sqrt(a[3])), (0.0,) * 4)  # pyright: ignore[reportArgumentType]
     split = quartic.factors(c)
     size, norm = jnp.maximum(split[0].large, split[1].large), jnp.sqrt(jnp.sum(z**2, axis=(0, 1)))
-    # The recursion that gives a_k multiplies k matrices.
+    # The recursion for a_k multiplies k matrices.
     errors = tuple(error * size**k + _ROUNDINGS * quartic.EPS * norm**k for k in (1, 2, 3, 4))
     rho, bound, unsure = quartic.spectral_radius(c._replace(errors=errors), split)
     certain = ~unsure & (bound <= tolerance * rho) & (jnp.abs(scale * rho - 1) > scale * bound)

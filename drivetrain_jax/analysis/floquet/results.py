@@ -39,16 +39,17 @@ MULTIPLIERS = {"floquet_multiplier", "floquet_exponent"}
 
 
 def lacks(system: type[System]) -> dict[str, str]:
-    """The result that systems whose time has no unit lack, see :class:`~drivetrain_jax.analysis.Analysis`."""
+    """Results that a system does not support and the reason: ``floquet_exponent`` needs a time in seconds."""
     if system.time_units == "s":
         return {}
     return {"floquet_exponent": f"a rate in 1/s, and the time of {system.name} has no unit"}
 
 
 def _with_product(multipliers: Array, logarithms: Array, log_product: Array) -> tuple[Array, Array]:
-    """Two multipliers and the logarithms of their moduli, the second ones from those of the product.
+    """Two multipliers and the logarithms of their moduli, the smaller multiplier from the product of both.
 
-    As an eigenvalue the smaller one has the absolute error of the larger one: with strong damping it is nothing but that.
+    The product is used where the moduli differ by more than a factor of two. As an eigenvalue the smaller multiplier has the absolute error of the larger one; with strong damping this error
+    exceeds its value.
     """
     apart = logarithms[0] - logarithms[1] > math.log(2)
     second = jnp.where(apart, jnp.exp(log_product) / multipliers[0], multipliers[1])

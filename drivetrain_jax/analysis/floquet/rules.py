@@ -15,7 +15,7 @@ def _all_multipliers(compare: Callable[[xr.DataArray, xr.Dataset], xr.DataArray]
 
 def _liouville(ds: xr.Dataset) -> xr.DataArray:
     """True where the residual contradicts the bound: a coefficient's error e moves the largest of n roots by e/2^n."""
-    # Unless all multipliers are stored, n is four, as for cardan. A larger n misses errors, a smaller one invents them.
+    # If the multipliers are not stored, n is four as for cardan. A larger n misses errors, a smaller n reports false ones.
     n = ds.sizes.get("multiplier", 4)
     return abs(ds["liouville_residual"]) > 2**n * ds["spectral_radius_error"] / ds["spectral_radius"]
 

@@ -12,13 +12,13 @@ from jax import Array
 from drivetrain_jax.analysis._base import Outcome
 from drivetrain_jax.analysis.forced.orbit import MAX_STEPS, Field, controller
 
-# Nearer to an end of a step than this part of it, the continuous extension is as accurate as the step.
+# Fraction of a step next to its ends within which the continuous extension is as accurate as the step.
 EDGE = 0.01
 
 
 class _Peaks(NamedTuple):
-    """State of the loop of :func:`amplitudes`: the step ``[t0, t1]`` to try from ``y``, the components ``aimed`` (k,)
-    whose peak it is to end at, and the largest so far with their times ``when``."""
+    """State of the loop of :func:`amplitudes`: the next step ``[t0, t1]`` from ``y``, flags ``aimed`` (k,) of the components
+    whose peak is at ``t1``, and the largest values so far with their times ``when``."""
 
     t0: Array
     t1: Array
@@ -38,7 +38,7 @@ def amplitudes(
     """Largest ``|y_i|`` over a period for the components ``indices``, their times, the state at its end, and an ``Outcome``.
 
     Every accepted step of the integration is searched for a peak, so that none is missed however fast the solution
-    oscillates. A step with a new largest value is taken again, to end at that peak: the solver's continuous extension
+    oscillates. A step with a new largest value is repeated so that it ends at the peak: the solver's continuous extension
     is ten to a hundred times less accurate than its steps.
     """
     import diffrax
@@ -53,7 +53,7 @@ def amplitudes(
 
     def advance(s: _Peaks) -> _Peaks:
         y1, error, dense, state, _ = solver.step(term, s.t0, s.t1, s.y, None, s.solver, s.made_jump)
-        # Derivatives ignore the ends of steps: at a peak the solution is stationary in time.
+        # The ends of steps are not differentiated: at a peak the solution is stationary in time.
         adapted = control.adapt_step_size(s.t0, s.t1, *fixed((s.y, y1)), None, fixed(error), order, s.control)  # pyright: ignore[reportArgumentType]
         keep, t0, t1, jump, controlled, result = adapted
         # An empty step ends the loop: the controller has stopped.
@@ -92,8 +92,8 @@ def _at_start(t1: Array, start: Array, indices: tuple[int, ...], solver: Any, co
 
 
 def _larger_peaks(s: _Peaks, found: _Found, keep: Any) -> tuple[tuple[Array, Array], Array, Array]:
-    """Largest values and their times after a step that is kept; flags of the components whose new largest value comes first
-    within it, and that time: the step is then taken again, to end there."""
+    """Largest values and their times after an accepted step, flags of the components with the first new peak in the step,
+    and the time of this peak: the step is repeated to end there."""
     largest = _larger((s.largest, s.when), (found.at_end, s.t1))
     new = keep & ~jnp.any(s.aimed) & (found.value > largest[0]) & (jnp.abs(found.place - 0.5) < 0.5 - EDGE)
     nearest = jax.lax.stop_gradient(jnp.min(jnp.where(new, found.place, 1.0)))
@@ -118,8 +118,8 @@ def _peaks_on_step(
 ) -> _Found:
     """Largest ``|y_i|`` on a step, at its end and where the derivative changes sign in between.
 
-    The derivative is taken as a cubic from y' and y'' at both ends; the remaining derivative d at the point found is
-    removed by the parabola y - d^2/(2 y'').
+    A cubic through y' and y'' at both ends interpolates the derivative. The parabola y - d^2/(2 y'') removes the derivative
+    d that remains at its root.
     """
     h = t1 - t0
 
@@ -142,13 +142,13 @@ def _peaks_on_step(
 
 
 def _vertex(y: Array, slope: Array, curve: Array) -> tuple[Array, Array]:
-    """Value at the vertex of the parabola through a point, and how far ahead it is; the point itself on a line."""
+    """Value at the vertex of the parabola through a point, and the time to it; without curvature the point itself and 0."""
     shift = jnp.where(curve == 0, 0.0, -slope / jnp.where(curve == 0, 1.0, curve))
     return y + slope * shift / 2, shift
 
 
 def _cubic_root(p0: Array, p1: Array, d0: Array, d1: Array) -> tuple[Array, Array]:
-    """Root on [0, 1] of the cubic with end values ``p`` of opposite sign and end slopes ``d``; whether there is one."""
+    """Root on [0, 1] of the cubic with end values ``p`` of opposite sign and end slopes ``d``, and True if it has one."""
     a, b = 2 * (p0 - p1) + d0 + d1, 3 * (p1 - p0) - 2 * d0 - d1
     inside = p0 * p1 < 0
     left, right = jnp.zeros_like(p0), jnp.ones_like(p0)

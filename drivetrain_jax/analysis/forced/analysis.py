@@ -1,12 +1,12 @@
 """Forced response: periodic solution of the linearised system, and the nonlinear periodic orbit with its multipliers.
 
-Linear, over one period T from rest, by variational equations: ``y(T; y0) = r + Z y0``, hence ``y0 = (I - Z)^-1 r``.
-Nonlinear: Newton shooting along growing forcing (:func:`~drivetrain_jax.analysis.forced.orbit.shoot`). Of several orbits
-it returns the first one on this path.
+Linear: the variational equations over one period T from rest give ``y(T; y0) = r + Z y0``, hence ``y0 = (I - Z)^-1 r``.
+Nonlinear: Newton shooting along growing forcing (:func:`~drivetrain_jax.analysis.forced.orbit.shoot`). If several orbits
+exist, the result is the first one on this path.
 
 Outcome: ``TOLERANCE_NOT_MET`` if the estimated error of a state exceeds ``rtol`` times its largest entry; ``NOT_CONVERGED``
-if I - Z is singular to working accuracy or no nonlinear orbit was found. Only missing results are NaN then: a finite linear
-response and ``condition`` are kept if the orbit was not found.
+if I - Z is singular to working accuracy or no nonlinear orbit was found. Only missing results are NaN: without an orbit, a
+finite linear response and ``condition`` are kept.
 """
 
 from __future__ import annotations
@@ -49,27 +49,27 @@ PERIODIC, ORBITS = PEAKS | {"periodic_state"}, ORBIT_PEAKS | {"orbit_state"}
 
 Build = Callable[[Mapping[str, Any]], ForcedModel]
 
-# Tolerances of the integrations relative to ``rtol``. The integration that closes the period is the more accurate one, to
-# estimate the error of the first.
+# Tolerances of the first and the closing integration relative to ``rtol``, and the smallest tolerance. The closing
+# integration is more accurate, because it estimates the error of the first.
 TRANSITION_SHARPNESS, CLOSING_SHARPNESS, SHARPEST = 0.1, 0.001, 1e-14
-# Ratio of the error of an integration to its tolerance. With it errors covered the true ones at 256 random points and four
-# rtol; without it they were up to 27 times too small.
+# Assumed ratio of the error of the closing integration to its tolerance. At 256 random points and four rtol the estimates
+# then covered the true errors; without this term they were up to 27 times too small.
 CLOSING_ERROR = 0.1
 # Loosest ``rtol`` for these tolerances: (I - Z)^-1 multiplies their errors by up to its condition.
 LOOSEST = 1e-6
-# I - Z counts as singular if its condition times the error of Z reaches ``NOT_FOUND``. This is the largest error assumed
-# for Z: a looser request must not lose an answer, whose error the closing of the period shows.
+# Largest assumed error of Z. I - Z counts as singular if its condition times this error reaches ``NOT_FOUND``. A looser
+# request assumes no larger error, because the closing integration shows the error of the solution.
 SINGULAR_SHARPNESS = 1e-11
 # Relative error above which a periodic solution counts as not found.
 NOT_FOUND = 1e-2
 FORCING_SAMPLES = 64
-# Points of a chunk: of the linear response; of orbits, where one orbit with hundreds of corrections delays the others.
+# Points per chunk: of the linear response, and of orbits. One orbit with hundreds of corrections delays all in its chunk.
 CHUNK, ORBITS_CHUNK = 128, 16
 
 
 class Response(NamedTuple):
     """Periodic solution of the linear system: ``state`` (n,), absolute ``error``, ``amplitude`` and its ``phase`` (None
-    unless requested), and the map over one period behind it."""
+    unless requested), and the map over one period."""
 
     state: Array
     error: Array
@@ -100,8 +100,8 @@ def _mapped(model: ForcedModel, n: int, rtol: float) -> tuple[Transition, Array,
 def linear_response(model: ForcedModel, n: int, rtol: float, with_amplitude: bool) -> Response:
     """Periodic solution of ``y' = linear(t, y)``; ``n`` is the size of the state.
 
-    ``y0 = (I - Z)^-1 r`` is integrated over another period; its closing error times (I - Z)^-1 corrects it. The stored
-    error is that correction plus (I - Z)^-1 times the possible error of the second integration.
+    ``y0 = (I - Z)^-1 r`` is integrated over another period. The closing error times (I - Z)^-1 corrects ``y0``. The stored
+    error is this correction plus (I - Z)^-1 times the assumed error of the closing integration.
     """
     step, unit, forcing = _mapped(model, n, rtol)
     # Without a solution there is nothing to integrate.
@@ -125,8 +125,8 @@ def linear_response(model: ForcedModel, n: int, rtol: float, with_amplitude: boo
 def _closed(
     model: ForcedModel, field: Field, start: Array, matrix: Array, sharp: float, with_amplitude: bool
 ) -> tuple[tuple[Array | None, Array | None], Array, Array]:
-    """Largest displacements over a period from ``start``, of order one, and their phases (None unless requested); the
-    correction of ``start`` by the closing error; and the outcome. ``matrix`` is the transition."""
+    """Largest displacements over a period and their phases (None unless requested), the correction of ``start`` by the
+    closing error, and the outcome. ``start`` is of order one; ``matrix`` is the transition."""
     if with_amplitude:
         largest, phase, end, closed = amplitudes(field, start, model.period, model.displacements, sharp)
     else:
@@ -155,11 +155,14 @@ def _condition(matrix: Array) -> Array:
 def nonlinear_orbit(
     model: ForcedModel, response: Response, rtol: float, with_amplitude: bool
 ) -> tuple[Orbit, Array | None, Array | None]:
-    """Nonlinear periodic orbit on the path that starts along ``response`` (NaN with its outcome if there is none), and
-    its amplitude and the phase of that (None unless requested)."""
+    """Nonlinear periodic orbit on the path that starts along ``response``, its amplitude, and the phase of the amplitude.
+
+    Without a ``response`` the orbit is NaN and has the outcome of ``response``. Amplitude and phase are None unless
+    requested.
+    """
     usable = response.outcome < Outcome.NOT_CONVERGED
     start = jnp.where(usable, response.state, 0.0)
-    # Nonlinearity matters for states of order one; smaller responses are their own unit.
+    # Nonlinearity matters for states of order one; a smaller response is measured in units of its own size.
     unit = jnp.minimum(size_of(start), 1.0)
     orbit = shoot(in_units_of(unit, model.field), start / unit, model.period, _sharpness(rtol, TRANSITION_SHARPNESS))
     outcome = jnp.where(usable, orbit.outcome, response.outcome)
@@ -237,7 +240,7 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     return (Solver("diffrax", solve, steps, chunk=chunk, march=True, short_loops=True),)
 
 
-# Results that need second derivatives along the motion: the first solver itself is differentiated.
+# Results whose derivatives need second derivatives of the field: they come from differentiating the first solver.
 _SECOND = frozenset(("condition", "orbit_spectral_radius"))
 
 
@@ -250,7 +253,7 @@ def _derivative_outputs(outputs: tuple[str, ...]) -> tuple[str, ...]:
 def _derivatives(
     system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Jacobians of states and amplitudes by the variational equations, of all else by differentiating the solver."""
+    """Jacobians of states and amplitudes by the variational equations, and of the other results through the solver."""
     build, found = system.models["forced"].build, {}
     second = tuple(name for name in request.outputs if name in _SECOND)
     if second:

@@ -137,7 +137,7 @@ def _draw_decades(axes: Axes, field: xr.DataArray, horizontal: str, vertical: st
 
 
 def _split(variable: xr.DataArray, names: list[str]) -> list[xr.DataArray]:
-    """The variable over the axes alone, one for each entry of its own dimension, named in the long name."""
+    """One variable over the axes for each entry of the variable's own dimension; the long name names the entry."""
     own = [dim for dim in variable.dims if dim not in names]
     if not own:
         return [variable]

@@ -1,6 +1,6 @@
 """Periodic orbits of forced systems: transition over a period and Newton shooting with continuation.
 
-Everything is for one point and follows the variational equations, never automatic differentiation through a solver.
+All functions work on one point. Derivatives come from the variational equations, never from differentiating a solver.
 """
 
 from __future__ import annotations
@@ -21,23 +21,24 @@ if TYPE_CHECKING:
 Field = Callable[[Any, Array], Array]
 
 MAX_STEPS = 65536
-# Absolute tolerance over relative tolerance, for unknowns of order one. Small, because components of one solution may
-# differ by the ratio of forcing and natural frequency.
+# Absolute tolerance over relative tolerance, for unknowns of order one. It is small, because components of one solution
+# may differ by the ratio of forcing and natural frequency.
 ATOL_RATIO = 1e-6
-# Shortest step over period: a field that is not finite is noticed at once instead of after MAX_STEPS rejections.
+# Shortest step over period: a field that is not finite then fails at once instead of after MAX_STEPS rejections.
 STEP_RATIO = 1e-10
 
 MAX_CORRECTIONS = 300
 SHORTEST_STRIDE = 1e-5
-# Forcing reversed to this multiple: the path is not expected back.
+# Value of lambda at which the search ends: with the forcing reversed, the path is not expected to return.
 TURNED_AWAY = -1.0
-# A stride is kept if its first correction is below this part of it and the tangent turns by less than this cosine.
+# A stride is kept if its first correction is below this fraction of the stride, and if the cosine of the angle between the
+# tangents exceeds this number.
 FIRST_CORRECTION = 0.3
 TURN = 0.8
-# Largest last correction of an orbit on the way; looser ones prevent the long strides between bends.
+# Largest last correction of a waypoint; a looser goal prevents long strides between bends.
 WAYPOINT_GOAL = 1e-4
 WAYPOINT_RTOL = 1e-9
-# Corrections this small that no longer shrink have reached the limit of the arithmetic.
+# Size below which corrections that no longer shrink are at the limit of rounding.
 STALLED = 1e-6
 
 
@@ -111,7 +112,7 @@ def integrate(field: Field, start: Array, period: Array | float, rtol: Array | f
 
 
 def transition(field: Field, start: Array, period: Array | float, rtol: Array | float) -> Transition:
-    """Map over one period about ``start`` (entries of order one) and its derivative, by the variational equations."""
+    """Map over one period at ``start`` (entries of order one) and its derivative, by the variational equations."""
     columns = jnp.concatenate([start[:, None], jnp.eye(start.size)], axis=1)
     end, outcome = integrate(variational(field), columns, period, rtol)
     return Transition(end[:, 0], end[:, 1:], outcome)
@@ -123,11 +124,11 @@ def newton_step(step: Transition, start: Array) -> Array:
 
 
 class _Path(NamedTuple):
-    """State of the loop of :func:`shoot`, points being ``x = (y, lambda)``, shape (n + 1,).
+    """State of the loop of :func:`shoot`; points are ``x = (y, lambda)``, shape (n + 1,).
 
-    ``waypoint`` and ``tangent`` are the last orbit found and the direction of the path there, ``stride`` the length to
-    go, ``last`` whether that leads to lambda = 1; ``point`` is the iterate, ``correction`` its last change, ``count``
-    the number of changes since the prediction.
+    ``waypoint`` is the last orbit found, ``tangent`` the direction of the path there, ``stride`` the length of the next
+    step along the path, and ``last`` is true if this step ends at lambda = 1. ``point`` is the iterate, ``correction`` its
+    last change, ``count`` the number of changes since the prediction.
     """
 
     waypoint: Array
@@ -143,15 +144,14 @@ class _Path(NamedTuple):
 
 
 def shoot(field: Field, response: Array, period: float, rtol: float) -> Orbit:
-    """Periodic orbit of ``y' = field(t, y)`` on the path from rest along growing forcing (errors: ``Outcome`` only).
+    """Periodic orbit of ``y' = field(t, y)`` on the path from rest along growing forcing; failures only set the ``Outcome``.
 
     The orbits of ``y' = field(t, y) - (1 - lambda) field(t, 0)`` form a path (y, lambda) that starts at (0, 0) in the
-    direction ``(response, 1)``, where ``response`` (n,) is the periodic solution of the forced linear system. It is
-    followed by its arc length, hence around folds, until it meets lambda = 1; the first stride leads there at once
-    where the response is small. Newton's method corrects each prediction. A stride is halved when the first
-    correction is not small against it, a later one exceeds half the previous one or the path turns, so that neither
-    another path nor a wild initial state is reached. An orbit that is not on this path is not found. States should be
-    of order one.
+    direction ``(response, 1)``, where ``response`` (n,) is the periodic solution of the forced linear system. The
+    continuation is by arc length, hence around folds, until lambda = 1. If the response is small, the first stride ends
+    there. Newton's method corrects each prediction. A stride is halved if its first correction is not small against the
+    stride, if a later correction exceeds half the previous one, or if the path turns. The iteration thus stays on the path.
+    An orbit that is not on this path is not found. States should be of order one.
     """
     n = response.size
 
@@ -164,7 +164,7 @@ def shoot(field: Field, response: Array, period: float, rtol: float) -> Orbit:
         return ~s.found & onwards & (s.total < MAX_CORRECTIONS)
 
     def correct(s: _Path) -> _Path:
-        # In a batch the loop runs until the last lane is done: finished lanes wait without steps.
+        # In a batch the loop runs until the last lane is done: finished lanes integrate over an empty span.
         span = jnp.where(running(s), period, 0.0)
         step = transition(extended, s.point, span, jnp.where(s.last, rtol, WAYPOINT_RTOL))
         # Either lambda is fixed at 1, or the correction is normal to the path.
@@ -184,9 +184,9 @@ def shoot(field: Field, response: Array, period: float, rtol: float) -> Orbit:
 
 
 def _predict(waypoint: Array, tangent: Array, stride: Array, total: Array, matrix: Array) -> _Path:
-    """A new stride, not beyond lambda = 1."""
+    """State of the loop at the start of a new stride, which ends at lambda = 1 at the latest."""
     left = 1 - waypoint[-1]
-    # A stride that would all but reach lambda = 1 goes there.
+    # A stride that almost reaches lambda = 1 ends there.
     last = stride * tangent[-1] >= (1 - 1e-6) * left
     stride = jnp.where(last, left / jnp.where(last, tangent[-1], 1.0), stride)
     point = waypoint + stride * tangent
@@ -207,7 +207,7 @@ def _predict(waypoint: Array, tangent: Array, stride: Array, total: Array, matri
 
 
 def _judge(s: _Path, delta: Array, direction: Array, step: Transition, rtol: float) -> _Path:
-    """The next action after a correction: another one, the next stride, or a shorter one."""
+    """State of the loop after a correction: for another correction, the next stride, or a shorter stride."""
     point = s.point + delta
     change = jnp.max(jnp.abs(delta))
     shrinking = (change <= 0.5 * s.correction) & (direction @ s.tangent >= TURN)
@@ -217,7 +217,7 @@ def _judge(s: _Path, delta: Array, direction: Array, step: Transition, rtol: flo
     close = sound & jnp.where(s.last, settled, shrinking & (change <= WAYPOINT_GOAL))
     n = point.size - 1
     total, matrix = s.total + 1, step.matrix[:n, :n]
-    # A waypoint beyond lambda = 1 is not kept: it only corrects the direction in which lambda = 1 is sought.
+    # A waypoint beyond lambda = 1 is not kept: it only corrects the direction of the stride to lambda = 1.
     beyond = point[n] >= 1
     secant = (point - s.waypoint) / jnp.linalg.norm(point - s.waypoint)
     waypoint = jnp.where(close & ~beyond, point, s.waypoint)

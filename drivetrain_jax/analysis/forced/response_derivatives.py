@@ -1,8 +1,8 @@
 """Derivatives of a periodic solution of ``y' = f(t, y; p)``, and of its largest displacements, by the variational equations.
 
-Over the part s of the period T, the columns ``V = dy/dy0`` and ``S = dy/dp`` at fixed ``y0`` obey ``V' = T f_y V`` and
+With s = t/T as time, the columns ``V = dy/dy0`` and ``S = dy/dp`` at fixed ``y0`` obey ``V' = T f_y V`` and
 ``S' = T f_y S + d(T f)/dp``. The start moves by ``dy0 = (I - V(1))^-1 S(1) dp``. At a peak the solution is stationary in
-time, so that its height moves by ``V dy0 + S dp`` there.
+time, so that its height moves by ``V dy0 + S dp``.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ def periodic_slopes(
 ) -> PeriodicSlopes:
     """Derivatives of the periodic solution through ``state`` by all ``parameters``, a pytree of P numbers.
 
-    ``field(parameters, s, y)`` returns ``T f`` at the part s of the period. ``peaks`` holds the parts of the period at which
-    the displacements with these indices have their largest modulus. NaN where the integration fails.
+    ``field(parameters, s, y)`` returns ``T f`` at the fraction s of the period. ``peaks`` holds the fractions of the period
+    at which displacements have their largest modulus, and the indices of these displacements. NaN where the integration
+    fails.
     """
     import diffrax
 
