@@ -80,7 +80,7 @@ def reduced_form(build: Build, parameters: Any, constants: Constants) -> LinearP
 def monodromy_change(
     build: Build, parameters: Any, constants: Constants, steps: Array, solver: type[EqualSteps] = Order8
 ) -> Change:
-    """The monodromy matrix of one point in ``steps`` steps, and its derivatives by all ``parameters``, P numbers as pytree."""
+    """The monodromy matrix of one point in ``steps`` steps, and its derivatives by ``parameters``, a pytree of P numbers."""
     leaves, tree = jax.tree.flatten(parameters)
 
     def along(direction: Array) -> Change:

@@ -48,8 +48,8 @@ def lacks(system: type[System]) -> dict[str, str]:
 def _with_product(multipliers: Array, logarithms: Array, log_product: Array) -> tuple[Array, Array]:
     """Two multipliers and the logarithms of their moduli, the smaller multiplier from the product of both.
 
-    The product is used where the moduli differ by more than a factor of two. As an eigenvalue the smaller multiplier has the absolute error of the larger one; with strong damping this error
-    exceeds its value.
+    The product is used where the moduli differ by more than a factor of two: as an eigenvalue the smaller multiplier has the
+    absolute error of the larger one, and with strong damping this error exceeds its value.
     """
     apart = logarithms[0] - logarithms[1] > math.log(2)
     second = jnp.where(apart, jnp.exp(log_product) / multipliers[0], multipliers[1])

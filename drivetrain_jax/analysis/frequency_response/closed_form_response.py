@@ -1,7 +1,7 @@
 """Frequency response in closed form: multiple scales and describing function, with peak, folds, backbone, stability.
 
-Both return all amplitudes at a frequency, and the motion ``u = m + A cos(omega t - phi)`` of each; a sweep selects among
-them. Results are arrays ``(L, own dimensions, ...)``, the path first, the batch last.
+Both methods return all amplitudes at a frequency, and the motion ``u = m + A cos(omega t - phi)`` of each amplitude; a
+sweep selects one of them. Results are arrays ``(L, own dimensions, ...)``, the path first, the batch last.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _LARGEST_STEP, _MOST_PARTS = 0.005, 16
 
 
 class OneTerm(NamedTuple):
-    """Motions ``bias + amplitude cos(omega t - phase)``, averaged ``rate`` of growth of small disturbances."""
+    """Motions ``bias + amplitude cos(omega t - phase)``, and the averaged growth ``rate`` of small disturbances."""
 
     bias: Array
     amplitude: Array
@@ -40,9 +40,12 @@ class OneTerm(NamedTuple):
 
 
 class Curves(NamedTuple):
-    """A response as a whole: ``motions(omega)`` (K, ...), rising amplitudes filled up with infinity; ``peak`` amplitude
-    and frequency, ``folds`` (frequencies), ``backbone(omega)`` (the largest amplitude on it at every frequency, (L, ...)),
-    and the range of the fit."""
+    """A response as a whole.
+
+    ``motions(omega)`` (K, ...) have rising amplitudes, infinite after the last motion. ``peak`` holds amplitude and
+    frequency, ``folds`` frequencies. ``backbone(omega)`` (L, ...) is the largest amplitude of the backbone at every
+    frequency, ``fit_range`` the range of the fit.
+    """
 
     motions: Callable[[Any], OneTerm]
     peak: tuple[Array, Array]
@@ -52,7 +55,7 @@ class Curves(NamedTuple):
 
 
 def of_multiple_scales(model: PiecewiseLinearOscillator, shape: tuple[int, ...], fit_range: Array | None) -> Curves:
-    """The corrected closed form of the paper; without ``fit_range`` [m] the self-consistent one is taken."""
+    """Response by the corrected closed form of the paper, for ``fit_range`` [m] or else the self-consistent range."""
     own = multiple_scales.self_consistent_range(model, shape) if fit_range is None else fit_range
     fit = multiple_scales.cubic_fit(model, jnp.broadcast_to(own, shape))
     flow = multiple_scales.slow_flow(model, fit)
@@ -64,7 +67,7 @@ def of_multiple_scales(model: PiecewiseLinearOscillator, shape: tuple[int, ...],
         return OneTerm(0 * finite, amplitude, phase, multiple_scales.decay_rate(flow, omega, finite))
 
     def backbone(omega: Array) -> Array:
-        # A linear spring has free motions of one frequency only, of any amplitude.
+        # A linear spring has free motions of any amplitude at one frequency.
         bends = flow.bend != 0
         detuning = omega.reshape(-1, *(1,) * len(shape)) - flow.frequency
         return jnp.where(bends, jnp.sqrt(detuning / jnp.where(bends, flow.bend, 1.0)), jnp.nan)
@@ -73,7 +76,7 @@ def of_multiple_scales(model: PiecewiseLinearOscillator, shape: tuple[int, ...],
 
 
 def of_describing_function(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Curves:
-    """Bias and fundamental."""
+    """Response by the describing function: bias and fundamental."""
     bones = describing_function.skeleton(model, shape)
 
     def motions(omega: Any) -> OneTerm:
@@ -111,7 +114,7 @@ def response(
     at_values = OneTerm(*(part[places] for part in every))
     chosen = OneTerm(*(jnp.take_along_axis(part, index, axis=1) for part in at_values))
     frequency = jnp.asarray(omega).reshape(-1, 1, *(1,) * len(shape))
-    # A drive of negative amplitude is one that comes half a period late.
+    # A drive of negative amplitude is a positive drive that lags by half a period.
     late = jnp.where(chosen.phase > 0, chosen.phase - jnp.pi, chosen.phase + jnp.pi)
     chosen = chosen._replace(phase=jnp.where(jnp.asarray(model.B1) < 0, late, chosen.phase))
     results = _of_sweeps(model, chosen, index, frequency, outputs) | _of_branches(at_values)
@@ -124,7 +127,7 @@ def response(
 def _of_sweeps(
     model: PiecewiseLinearOscillator, motion: OneTerm, index: Array, omega: Array, outputs: tuple[str, ...]
 ) -> dict[str, Array]:
-    """Results of the motions that the sweeps up and down are at, ``(L, 2, ...)``."""
+    """Results of the motions of the sweeps up and down, ``(L, 2, ...)``."""
     exists = jnp.isfinite(motion.amplitude)
     bias, amplitude = (jnp.where(exists, x, jnp.nan) for x in (motion.bias, motion.amplitude))
     high, low = bias + amplitude, bias - amplitude

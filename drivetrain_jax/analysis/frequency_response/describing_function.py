@@ -8,10 +8,10 @@ With ``p = (b - m)/A``, ``q = (b + m)/A`` and the moments h0, h1 of a clipped co
     [(kappa - omega^2)^2 + (c' omega)^2] A^2 = B1^2                         the response
 
 For a given A the response is quadratic in omega^2: two arms ``omega^2 = kappa - c'^2/2 -+ sqrt(B1^2/A^2 - c'^2 kappa +
-c'^4/4)`` that meet at the peak, on either side of the backbone ``omega^2 = kappa``. Folds are their turning points. With
-heavy damping (``kappa < c'^2/2``) they would meet at no real frequency: the upper arm then ends at omega = 0, at the
-static amplitude ``kappa A = B1``, the largest of all.
-The approximation is the harmonic balance with one harmonic, integrals exact. All functions broadcast over a trailing
+c'^4/4)`` that meet at the peak, on either side of the backbone ``omega^2 = kappa``. Folds are turning points of the arms.
+With heavy damping (``kappa < c'^2/2``) the arms meet at no real frequency: the upper arm then ends at omega = 0, with the
+largest amplitude, the static one ``kappa A = B1``.
+The approximation is the harmonic balance with one harmonic and exact integrals. All functions broadcast over a trailing
 batch; ``A`` may have more leading axes.
 """
 
@@ -29,8 +29,8 @@ from drivetrain_jax.analysis.frequency_response.equivalent_stiffness import Poin
 from drivetrain_jax.analysis.numerics.amplitude_roots import bisect, first_marks, sign_changes, take
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
-# Amplitudes at which the arms are sampled to find their folds: logarithmic, within these limits in units of the motions'
-# size, beyond which the play is felt no more or the arms are those of one power; and where there is no amplitude.
+# Sampling of the arms to find their folds: number of logarithmic amplitudes, and their limits in units of the size of the
+# motions; beyond the limits the arms have no folds. _HUGE: amplitude, in the same unit, that counts as infinite.
 _NODES, _NEAR, _FAR, _HUGE = 320, 1e-9, 1e4, 1e9
 _FOLDS_PER_ARM = 4
 MOST_ROOTS = 5
@@ -44,7 +44,7 @@ def _discriminant(model: PiecewiseLinearOscillator, amplitude: Array, stiffness:
 
 
 def arm_slope(model: PiecewiseLinearOscillator, amplitude: Array, point: Point, sign: float) -> Array:
-    """``d(omega^2)/dA`` along an arm, times the root in its equation: zero at a fold."""
+    """``d(omega^2)/dA`` along an arm, times the square root in its equation; zero at a fold."""
     root = jnp.sqrt(jnp.maximum(_discriminant(model, amplitude, point.stiffness), 0.0))
     half = -((model.B1 / amplitude) ** 2) / amplitude - model.damping**2 * point.slope / 2
     return point.slope * root + sign * half
@@ -57,17 +57,17 @@ def arm(model: PiecewiseLinearOscillator, amplitude: Array, point: Point, sign: 
 
 
 def _length(model: PiecewiseLinearOscillator) -> Array:
-    """A length of the size of the motions, positive: half the play and the displacements under static drives."""
+    """A positive length of the size of the motions: half the play plus the displacements under static drives."""
     length = model.b + (jnp.abs(model.B0) + jnp.abs(model.B1)) / model.stiffness
     return jnp.where(length > 0, length, 1.0)
 
 
 def peak(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Array:
-    """Largest amplitude over all frequencies; a huge one if there is none.
+    """Largest amplitude over all frequencies; a huge number if amplitudes are unbounded.
 
-    It is where the smallest value that the response equation takes at any frequency vanishes: where the arms meet, or with
-    heavier damping the static amplitude, which the response approaches as the frequency falls to 0. This smallest
-    value rises with the amplitude, because ``kappa A`` does.
+    At the peak the minimum of the response equation over all frequencies vanishes. The arms meet there or, with heavier
+    damping, the peak is the static amplitude at the frequency 0. The minimum rises with the amplitude, because ``kappa A``
+    does.
     """
     unit = _length(model)
 
@@ -82,21 +82,24 @@ def peak(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Array:
 
 
 def _first_contact(model: PiecewiseLinearOscillator) -> Array:
-    """Amplitude at which the static motion first reaches a flank; below it the oscillator is linear."""
+    """Amplitude at which the motion about the static position reaches a flank; below it the oscillator is linear."""
     force, play = jnp.abs(model.B0) / model.stiffness, model.alpha * model.b
     within = model.b - force / jnp.where(model.alpha > 0, model.alpha, 1.0)
     return jnp.where(force <= play, within, force - play)
 
 
 def _resonance(model: PiecewiseLinearOscillator, stiffness: Array) -> Array:
-    """Frequency at which the response equation takes its smallest value for an amplitude: 0 with heavy damping."""
+    """Frequency at which the response equation has its minimum for an amplitude; 0 with heavy damping."""
     return jnp.sqrt(jnp.maximum(stiffness - model.damping**2 / 2, 0.0))
 
 
 class Skeleton(NamedTuple):
-    """All that does not depend on the frequency: rising ``amplitudes`` (K, ...) from 0 to the ``peak``, with the ``points``
-    and the ``arms`` (omega^2 of the lower and of the upper one) there, such that either arm is monotone between
-    neighbours; ``folds`` (8, ...), amplitudes, NaN where there are fewer; ``limit``, beyond which there is no amplitude."""
+    """The part of the response that does not depend on the frequency.
+
+    ``amplitudes`` (K, ...) rise from 0 to the ``peak``, with the ``points`` and the ``arms`` (omega^2 of the lower and of
+    the upper arm) at each amplitude. Both arms are monotone between neighbours. ``folds`` (8, ...) are amplitudes, NaN
+    after the last fold. Amplitudes beyond ``limit`` count as infinite.
+    """
 
     amplitudes: Array
     points: Point
@@ -107,7 +110,7 @@ class Skeleton(NamedTuple):
 
 
 def _nodes(model: PiecewiseLinearOscillator, end: Array, far: float = _FAR) -> Array:
-    """Rising amplitudes from where the play is first felt to ``end``, logarithmic up to ``far`` lengths of the motions."""
+    """Rising amplitudes from the first contact with a flank to ``end``, logarithmic up to ``far`` sizes of the motions."""
     unit = _length(model)
     last = jnp.minimum(end, far * unit)
     first = jnp.clip(_first_contact(model), _NEAR * unit, last / 2)
@@ -116,7 +119,7 @@ def _nodes(model: PiecewiseLinearOscillator, end: Array, far: float = _FAR) -> A
 
 
 def _half_width(model: PiecewiseLinearOscillator, amplitude: Array, stiffness: Array, end: Array) -> Array:
-    """Half the distance of the arms in omega^2: none at the ``end`` where they meet, also in rounding."""
+    """Half the distance of the arms in omega^2, exactly 0 at the ``end`` where they meet."""
     half = jnp.sqrt(jnp.maximum(_discriminant(model, amplitude, stiffness), 0.0))
     return jnp.where((amplitude >= end) & (_resonance(model, stiffness) > 0), 0.0, half)
 
@@ -148,15 +151,15 @@ def skeleton(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Skelet
     safe = jnp.maximum(amplitudes, _TINY)
     points = point_at(model, safe, bias_of(model, safe))
     centre, half = points.stiffness - model.damping**2 / 2, _half_width(model, safe, points.stiffness, top)
-    # Rest is below every amplitude, also of an oscillator that is not driven.
+    # The amplitude 0 lies below every solution, also without a drive.
     half = half.at[0].set(jnp.inf)
     return Skeleton(amplitudes, points, (centre - half, centre + half), top, found, limit)
 
 
 def peak_of(model: PiecewiseLinearOscillator, bones: Skeleton) -> tuple[Array, Array]:
-    """Largest amplitude and the frequency ``sqrt(kappa - c'^2/2)`` where it is reached; infinite without damping.
+    """Largest amplitude (infinite without damping) and its frequency ``sqrt(kappa - c'^2/2)``.
 
-    With damping too heavy for a resonance: the static amplitude and 0.
+    With damping too heavy for a resonance, the static amplitude and the frequency 0.
     """
     point = point_at(model, bones.peak, bias_of(model, bones.peak))
     amplitude = jnp.where(bones.peak < bones.limit, bones.peak, jnp.inf)
@@ -164,7 +167,7 @@ def peak_of(model: PiecewiseLinearOscillator, bones: Skeleton) -> tuple[Array, A
 
 
 def fold_frequencies(model: PiecewiseLinearOscillator, bones: Skeleton) -> Array:
-    """Frequencies of the folds, ``(2 n, ...)``: those of the lower arm, then those of the upper one."""
+    """Frequencies of the folds, ``(2 n, ...)``: first of the lower arm, then of the upper arm."""
     half = bones.folds.shape[0] // 2
     point = point_at(model, bones.folds, bias_of(model, bones.folds))
     sides = [arm(model, bones.folds, point, sign) for sign in (-1.0, 1.0)]
@@ -174,8 +177,8 @@ def fold_frequencies(model: PiecewiseLinearOscillator, bones: Skeleton) -> Array
 def backbone(model: PiecewiseLinearOscillator, shape: tuple[int, ...], omega: Array) -> Array:
     """Largest amplitude of the undamped, undriven motion of each frequency ``(L,)``, ``kappa(A) = omega^2``, ``(L, ...)``.
 
-    NaN if none, as beyond the frequency to which that of large motions tends. The backbone does not depend on the drive,
-    and continues beyond the peak.
+    NaN if no motion has the frequency, as beyond the limit frequency of large motions. The backbone does not depend on the
+    drive, and continues beyond the peak.
     """
     free = replace(model, B1=0.0)
     amplitudes = _nodes(free, jnp.broadcast_to(_HUGE * _length(free), shape), _HUGE)
@@ -206,7 +209,7 @@ def response_residual(model: PiecewiseLinearOscillator, omega: Array, amplitude:
 
 
 def _interpolated(amplitudes: Array, points: Point, mask: Array) -> tuple[Array, Array, Callable[[Array], Array]]:
-    """Bracket that ``mask`` marks, and the equivalent stiffness within it as a cubic through values and slopes."""
+    """Ends of the bracket marked by ``mask``, and its equivalent stiffness as a cubic through values and slopes."""
     low, high = take(mask, amplitudes[:-1]), take(mask, amplitudes[1:])
     ends = [take(mask, part[s]) for part in (points.stiffness, points.slope) for s in _ENDS]
     k0, k1, d0, d1 = ends
@@ -221,7 +224,7 @@ def _interpolated(amplitudes: Array, points: Point, mask: Array) -> tuple[Array,
 
 
 def _bias_between(points: Point, mask: Array, part: Array) -> Array:
-    """Bias at a part of the bracket that ``mask`` marks."""
+    """Bias at the fraction ``part`` of the bracket marked by ``mask``, by linear interpolation."""
     first, last = (take(mask, points.bias[s]) for s in _ENDS)
     return first + (last - first) * part
 
@@ -229,19 +232,19 @@ def _bias_between(points: Point, mask: Array, part: Array) -> Array:
 def _arm_gap(
     model: PiecewiseLinearOscillator, square: Array, amplitude: Array, stiffness: Array, sign: Array
 ) -> tuple[Array, Array]:
-    """``omega^2`` less that of the arm at an amplitude, and half the distance of the arms."""
+    """``omega^2`` minus the value of the arm at an amplitude, and half the distance of the arms."""
     half = jnp.sqrt(jnp.maximum(_discriminant(model, amplitude, stiffness), 0.0))
     return square - stiffness + model.damping**2 / 2 - sign * half, half
 
 
 def _brackets(bones: Skeleton, square: Array) -> tuple[Array, Array, Array]:
-    """Intervals of the skeleton where an arm crosses ``omega^2``, as a mask; the arm (-1, 1); and flags where the gap
-    rises.
+    """Mask of the intervals of the skeleton where an arm crosses ``omega^2``, the arm (-1 or 1), and a sign.
 
-    Each arm separately: at light damping both may pass a frequency between the same two amplitudes.
+    The sign is that of the slope of the gap (:func:`_arm_gap`) between ``omega^2`` and the arm.
+    The arms are separate: at light damping both may cross a frequency between the same two amplitudes.
     """
     lower, upper = bones.arms
-    # At the peak, where the arms meet, one of the two holds.
+    # At the peak, where the arms meet, exactly one condition holds.
     crossed = jnp.stack([lower >= square, upper < square], axis=1)
     changes = crossed[1:] != crossed[:-1]
     both = first_marks(changes.reshape(-1, *changes.shape[2:]), MOST_ROOTS)
@@ -252,7 +255,7 @@ def _brackets(bones: Skeleton, square: Array) -> tuple[Array, Array, Array]:
 
 
 def roots(model: PiecewiseLinearOscillator, bones: Skeleton, omega: Array) -> tuple[Array, Point]:
-    """All amplitudes at one frequency, rising, ``(MOST_ROOTS, ...)``, infinite where there are fewer; and the points."""
+    """All amplitudes at one frequency, rising, ``(MOST_ROOTS, ...)``, infinite after the last one, and their points."""
     square = omega**2
     mask, sign, turned = _brackets(bones, square)
     low, high, stiffness = _interpolated(bones.amplitudes, bones.points, mask)
@@ -274,7 +277,7 @@ def roots(model: PiecewiseLinearOscillator, bones: Skeleton, omega: Array) -> tu
         bend = model.B1**2 / amplitude**3 + model.damping**2 * point.slope / 2
         slope = -point.slope + sign * bend / jnp.maximum(half, _TINY)
         trial = amplitude - gap / jnp.where(slope != 0, slope, jnp.inf)
-        # Converged iterates may leave the bracket by their rounding.
+        # Rounding may put converged iterates just outside the bracket.
         slack = 4e-16 * amplitude
         inside = (trial >= low - slack) & (trial <= high + slack)
         return low, high, jnp.maximum(jnp.where(inside, trial, (low + high) / 2), _TINY), bias
@@ -284,7 +287,7 @@ def roots(model: PiecewiseLinearOscillator, bones: Skeleton, omega: Array) -> tu
     order = jnp.argsort(jnp.where(exists, found, jnp.inf), axis=0)
     found, bias, exists = (jnp.take_along_axis(part, order, axis=0) for part in (found, bias, exists))
     point = point_at(model, found, improved(model, found, bias))
-    # Without drive there is rest alone.
+    # Without drive the only motion is rest.
     driven = model.B1 != 0
     number = jnp.arange(MOST_ROOTS).reshape(-1, *(1,) * (found.ndim - 1))
     amplitude = jnp.where(driven, found, 0.0)

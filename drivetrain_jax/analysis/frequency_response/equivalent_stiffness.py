@@ -35,7 +35,7 @@ def moments(x: Array) -> tuple[Array, Array]:
 
 
 def imbalance(model: PiecewiseLinearOscillator, amplitude: Array, bias: Array) -> tuple[Array, Array]:
-    """Mean force less mean drive over k', and its derivative with respect to the bias (not negative)."""
+    """Mean force minus mean drive, over k', and its derivative with respect to the bias (not negative)."""
     p, q = (model.b - bias) / amplitude, (model.b + bias) / amplitude
     beyond, before = moments(p)[0], moments(q)[0]
     force = model.alpha * bias + (1 - model.alpha) * amplitude * (beyond - before)
@@ -44,7 +44,7 @@ def imbalance(model: PiecewiseLinearOscillator, amplitude: Array, bias: Array) -
 
 
 def improved(model: PiecewiseLinearOscillator, amplitude: Array, bias: Array) -> Array:
-    """One Newton step of the bias; where the mean force does not depend on it (free within the play) it stays."""
+    """Bias after one Newton step; unchanged where the mean force does not depend on the bias (free within the play)."""
     value, slope = imbalance(model, amplitude, bias)
     return bias - jnp.where(slope > 0, value / jnp.where(slope > 0, slope, 1.0), 0.0)
 

@@ -205,7 +205,7 @@ def _draw_branches(axes: Axes, result: xr.Dataset, look: _Look) -> None:
 
 
 def _joined(x: np.ndarray, y: np.ndarray, stable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The pieces of ``y``, extended at both ends to the nearest of ``stable`` (L, n), where they meet in a fold."""
+    """The pieces of ``y``, extended at both ends to the nearest of the ``stable`` motions (L, n): they meet in a fold."""
     xs: list[float] = []
     ys: list[float] = []
     near = _NEAR * np.nanmax(stable, initial=0.0)
@@ -230,7 +230,7 @@ def _draw_backbones(axes: Axes, results: list[xr.Dataset]) -> list[Line2D]:
     height = axes.get_ylim()[1]
     for each in with_backbone:
         amplitude = each["backbone_amplitude"].values
-        # Beyond a motion far outside, the line does not return.
+        # Break the line at steps larger than the height of the axes.
         line = _broken(_along(each).values, amplitude, np.abs(np.diff(amplitude)) > height)
         axes.plot(*line, **style, color=_METHODS[each.attrs["method"]].colour, scaley=False)
     return [Line2D([], [], **style, color=FRAME_GREY, label="backbone")] if with_backbone else []
@@ -249,14 +249,14 @@ def _draw_missing(axes: Axes, results: list[xr.Dataset]) -> list[Line2D]:
 
 
 def _meanings(results: list[xr.Dataset]) -> list[Line2D]:
-    """The legend entry of the dashed lines, if there may be any."""
+    """The legend entry of the dashed lines, if results may have unstable motions."""
     if not any("stability" in r for r in results):
         return []
     return [Line2D([], [], color=FRAME_GREY, linewidth=1.2, linestyle=DASHES, label="unstable")]
 
 
 def _entries(result: xr.Dataset, look: _Look) -> list[Line2D]:
-    """Legend entries of one result; the exact sweeps have one each."""
+    """Legend entries of one result; an exact result has one entry for each sweep."""
     style = {"color": look.colour, "linewidth": look.width}
     if look is not _METHODS["exact"]:
         return [Line2D([], [], **style, label=_label(result, look))]
@@ -270,7 +270,7 @@ def _lag(result: xr.Dataset) -> xr.DataArray:
 
 
 def _angle_axis(axes: Axes, longer: bool) -> None:
-    """Set an angle axis of half a turn, or of a full turn for larger lags, as behind a drive of negative amplitude."""
+    """Set an angle axis of half a turn, or of a full turn for larger lags, such as with a drive of negative amplitude."""
     quarters = 5 if longer else 3
     axes.set_ylim(-_ANGLE_MARGIN, (quarters - 1) * np.pi / 2 + _ANGLE_MARGIN)
     labels = ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"]

@@ -2,10 +2,10 @@
 
 ``u = x0 + sum_j (x_{2j-1} cos j tau + x_{2j} sin j tau)``, j = 1..J, tau = omega t/m, for harmonics of the drive up to
 J/m and subharmonics of order m. The spring force is evaluated at samples of u and projected on the same functions.
-Plain sampling of a force with kinks is accurate to second order in the sample distance only. Here every flank that is
-crossed between two samples is located on the cubic through their values and rates, and the force is integrated up to it
-with the weights of cubic interpolation (:func:`contact_weights`): third order better, and the Jacobian, which is the
-projection of the contact itself, comes from the same weights. Coefficients have shape ``(n, ...)``, n = 2 J + 1.
+Plain sampling of a force with kinks is accurate to second order in the sample distance only. Here every crossing of a flank
+is located on the cubic through the values and rates of the neighbouring samples. The force is integrated up to the crossing
+with the weights of cubic interpolation (:func:`contact_weights`), which gains three orders. The same weights give the
+Jacobian, which is the projection of the contact. Coefficients have shape ``(n, ...)``, n = 2 J + 1.
 """
 
 from __future__ import annotations
@@ -29,8 +29,10 @@ _WHOLE = (-1 / 24, 13 / 24, 13 / 24, -1 / 24)
 
 @dataclass(frozen=True)
 class Basis:
-    """``harmonics`` of the drive with subharmonics of order ``order``, evaluated at ``samples`` points of the period
-    of the subharmonic."""
+    """Basis functions: ``harmonics`` of the drive with subharmonics of order ``order``, and their samples.
+
+    ``samples`` counts the points per period of the drive; 0 is a number suited to ``harmonics``.
+    """
 
     harmonics: int
     order: int = 1
@@ -38,7 +40,7 @@ class Basis:
 
     @property
     def highest(self) -> int:
-        """J, the harmonics of the base frequency."""
+        """J, the number of harmonics of the base frequency."""
         return self.harmonics * self.order
 
     @property
@@ -48,10 +50,10 @@ class Basis:
 
     @cached_property
     def count(self) -> int:
-        """Samples of the base period; the option counts them per period of the drive."""
+        """Number of samples per base period, the period of the subharmonic."""
         if self.samples:
             return self.samples * self.order
-        # Fewer, and a contact between two samples that comes and goes interrupts the branch.
+        # With fewer samples, a contact that appears and vanishes between two samples interrupts the branch.
         return self.order * max(64, 1 << (20 * self.harmonics - 1).bit_length())
 
     @cached_property
@@ -61,17 +63,17 @@ class Basis:
 
     @cached_property
     def values(self) -> np.ndarray:
-        """The functions at the samples, (M, n)."""
+        """The basis functions at the samples, (M, n)."""
         return self.at(2 * np.pi * np.arange(self.count) / self.count)
 
     @cached_property
     def rates(self) -> np.ndarray:
-        """Their derivatives with respect to tau, (M, n)."""
+        """Derivatives of the basis functions with respect to tau at the samples, (M, n)."""
         return self.values @ self.derivative
 
     @cached_property
     def derivative(self) -> np.ndarray:
-        """The derivative with respect to tau of coefficients, (n, n)."""
+        """Matrix of the derivative with respect to tau on coefficients, (n, n)."""
         matrix = np.zeros((self.size, self.size))
         for j in range(1, self.highest + 1):
             matrix[2 * j - 1, 2 * j], matrix[2 * j, 2 * j - 1] = j, -j
@@ -84,7 +86,7 @@ class Basis:
 
     @cached_property
     def products(self) -> tuple[np.ndarray, ...]:
-        """Coefficients of the Jacobian in moments of the contact: entry = a p[i] + b p[k], each of shape (n, n)."""
+        """Coefficients that give the Jacobian from moments p of the contact: entry = a p[i] + b p[k], all (n, n)."""
         j, k = np.meshgrid(self.orders, self.orders, indexing="ij")
         sine = (np.arange(self.size) % 2 == 0) & (self.orders > 0)
         row, column = np.meshgrid(sine, sine, indexing="ij")
@@ -98,20 +100,22 @@ class Basis:
 
     @cached_property
     def moments(self) -> np.ndarray:
-        """Means against cos 0..2J and sin 0..2J, (4J + 2, M)."""
+        """Matrix from samples to their means with cos 0..2J and sin 0..2J, (4J + 2, M)."""
         angle = np.outer(np.arange(2 * self.highest + 1), 2 * np.pi * np.arange(self.count) / self.count)
         return np.concatenate([np.cos(angle), np.sin(angle)]) / self.count
 
     def at(self, tau: np.ndarray) -> np.ndarray:
-        """The functions at ``tau`` (M,), shape (M, n)."""
+        """The basis functions at ``tau`` (M,), shape (M, n)."""
         angle = np.outer(tau, self.orders)
         even = np.arange(self.size) % 2 == 0
         return np.where(even & (self.orders > 0), np.sin(angle), np.cos(angle))
 
 
 class Contact(NamedTuple):
-    """Samples ``u`` of a motion (M, ...), where the flanks ``b`` and ``-b`` are crossed within the interval after each
-    sample (fraction, meaningful where the sign changes), and the weights of either contact."""
+    """Samples ``u`` (M, ...) of a motion, its crossings of the flanks ``b`` and ``-b``, and the weights of either contact.
+
+    A crossing is a fraction of the interval after each sample, meaningful where the sign of the distance changes.
+    """
 
     u: Array
     crossings: tuple[Array, Array]
@@ -130,7 +134,7 @@ def _part(theta: Array) -> tuple[Array, ...]:
 
 
 def _crossing(d0: Array, d1: Array, rate0: Array, rate1: Array) -> Array:
-    """Zero in [0, 1] of the cubic with these end values and rates, by Newton steps from the chord."""
+    """Zero in [0, 1] of the cubic with the end values d0, d1 and end rates, by Newton steps from the zero of the chord."""
     change = d1 - d0
     theta = jnp.clip(d0 / jnp.where(change != 0, -change, 1.0), 0.0, 1.0)
     a, b = rate0 - change, change - rate1
@@ -141,14 +145,15 @@ def _crossing(d0: Array, d1: Array, rate0: Array, rate1: Array) -> Array:
         slope = change + (1 - 2 * theta) * bend + theta * (1 - theta) * (b - a)
         return jnp.clip(theta - value / jnp.where(slope != 0, slope, 1.0), 0.0, 1.0)
 
-    # The result of a loop is stored; XLA would compute an expression again for each of the four weights.
+    # A loop stores its result; XLA would evaluate an expression again for each of the four weights.
     return jax.lax.fori_loop(0, _CROSSING_STEPS, newton, theta)
 
 
 def contact_weights(distance: Array, rate: Array) -> tuple[Array, Array]:
-    """Weights w, ``mean(w g)`` = mean of g over the part of the period where ``distance > 0``, and the crossings.
+    """Weights w for means over the part of the period where ``distance > 0``, and the crossings of 0.
 
-    ``distance`` and its ``rate`` per sample are given at the samples (M, ...) of a period.
+    ``mean(w g)`` is the integral of g over this part, divided by the period. ``distance`` and its ``rate`` per sample are
+    given at the samples (M, ...) of a period.
     """
     after, rate_after = jnp.roll(distance, -1, axis=0), jnp.roll(rate, -1, axis=0)
     theta = _crossing(distance, after, rate, rate_after)
@@ -161,7 +166,7 @@ def contact_weights(distance: Array, rate: Array) -> tuple[Array, Array]:
 
 
 def contact(model: PiecewiseLinearOscillator, basis: Basis, x: Array) -> Contact:
-    """The motion with coefficients ``x`` at the samples."""
+    """Samples, crossings and contact weights of the motion with coefficients ``x``."""
     u = jnp.tensordot(basis.values, x, 1)
     rate = jnp.tensordot(basis.rates, x, 1) * (2 * np.pi / basis.count)
     distances = jnp.stack([u - model.b, -u - model.b], axis=1)
@@ -205,8 +210,12 @@ def jacobian(model: PiecewiseLinearOscillator, basis: Basis, omega: Array, touch
 
 
 class Balanced(NamedTuple):
-    """Coefficients, the last Newton step over their size, whether it is negligible, and whether the Jacobian has a
-    negative determinant, as between two folds: the slow motion of the balance (:func:`drift`) then leaves it."""
+    """Coefficients ``x`` of a balanced motion, and its quality.
+
+    ``step`` is the last Newton step over the size of ``x``; ``converged`` is true if it is negligible. ``saddle`` is true if
+    the Jacobian has a negative determinant, as between two folds: the slow motion of the balance (:func:`drift`) then
+    leaves this motion.
+    """
 
     x: Array
     step: Array
@@ -214,13 +223,14 @@ class Balanced(NamedTuple):
     saddle: Array
 
 
-# Relative step that is negligible, and the least part of a Newton step that is tried.
+# Relative step that is negligible, and the least fraction of a Newton step.
 _TOLERANCE, _LEAST_PART = 1e-11, 1 / 16
 
 
 class _Iteration(NamedTuple):
-    """Best coefficients so far, the Newton step from there, its part that is tried, the residual there, the size of the
-    step, and whether the determinant is negative."""
+    """State of the Newton iterations: ``best`` coefficients so far, with their Newton step ``change``, their residual
+    ``unbalanced`` and the sign of their determinant (``saddle``). The next trial is a ``part`` of the Newton step, whose
+    relative size is ``step``."""
 
     count: Array  # pyright: ignore[reportIncompatibleMethodOverride]
     best: Array
@@ -232,9 +242,9 @@ class _Iteration(NamedTuple):
 
 
 def balance(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array, iterations: int = 20) -> Balanced:
-    """Newton iterations from ``x`` at fixed ``omega`` until every lane has converged, at most ``iterations``.
+    """The balanced motion near ``x`` at fixed ``omega``, by Newton iterations until every lane converges, or ``iterations``.
 
-    A step that increases the residual is halved: the Jacobian of a force with kinks may change at once.
+    A step that increases the residual is halved, because the Jacobian of a force with kinks may change abruptly.
     """
 
     def norm(v: Array) -> Array:
@@ -248,7 +258,7 @@ def balance(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Arr
         change, negative = solve_oriented(jacobian(model, basis, omega, touch), force[:, None])
         change = change[:, 0]
         usable = jnp.all(jnp.isfinite(change), axis=0)
-        # A step so small that the residual is rounding need not decrease it.
+        # After a small step the residual is rounding, and need not decrease.
         better = (unbalanced < state.unbalanced) | (state.part <= _LEAST_PART) | (state.step <= 1e-7)
         size = norm(trial) + norm(change)
         step = norm(change) / jnp.where(size > 0, size, 1.0)
@@ -279,11 +289,11 @@ _DRIFT_STEPS = 40
 
 
 def drift(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array) -> Array:
-    """Coefficients after the slow motion of the balance itself from ``x``, which ends at a stable balance.
+    """Coefficients after the slow motion of the balance from ``x``, which tends to a stable balanced motion.
 
-    Slowly varying coefficients satisfy ``(2 omega/m D + c') x' = -residual``, D the derivative with respect to tau; the
-    steps are implicit Euler steps of half a drive period. With few harmonics the balance may differ from the motion that
-    settles, too far for Newton iterations.
+    Slowly varying coefficients satisfy ``(2 omega/m D + c') x' = -residual``, where D is the derivative with respect to
+    tau. The steps are implicit Euler steps of half a drive period. With few harmonics the balanced motion may be too far
+    from the settled motion for Newton iterations alone.
     """
     tail = (1,) * (x.ndim - 1)
     turn = jnp.asarray(basis.derivative).reshape(basis.size, basis.size, *tail)

@@ -1,8 +1,8 @@
-"""The branch of balanced motions through a given one, by arc-length continuation: it passes folds and keeps the
-unstable motions.
+"""The branch of balanced motions through a given motion, stable or not, by arc-length continuation through folds.
 
-Points lie on the curve of ``(x/scale, omega/width)``; a step goes along the tangent and Newton iterations on the plane
-across it lead back. Every lane has its own step length, shortened where they fail and lengthened where they are quick.
+The branch is a curve of points ``(x/scale, omega/width)``. A step goes along the tangent; Newton iterations in the plane
+across the tangent lead back to the curve. Every lane has its own step length, shortened where the iterations fail and
+lengthened where they converge quickly.
 """
 
 from __future__ import annotations
@@ -18,16 +18,18 @@ from drivetrain_jax.analysis.impacts.branch_sections import Course, sections
 from drivetrain_jax.analysis.numerics.linear_algebra import solve
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
-# Attempts to advance; step lengths in units of the scaled curve; iterations of a step.
+# Most steps, failed ones included; first, shortest and longest step in scaled units; Newton iterations per step.
 _ATTEMPTS, _FIRST, _SHORTEST, _LONGEST, _CORRECTIONS = 1500, 0.02, 1e-6, 0.08, 5
-# Largest correction that is left, and cosines of the turn of the tangent: at most, and for a longer step.
+# Largest last correction; least cosine of the turn of the tangent for a step to be kept, and for a longer next step.
 _CLOSED, _LEAST_COSINE, _STRAIGHT = 1e-9, 0.97, 0.996
 _POLISH = 8
 
 
 class Branch(NamedTuple):
-    """Points of a branch: coefficients ``(S, n, ...)``, frequencies ``(S, ...)``, NaN after its end, and whether it has
-    reached the far end of the frequencies."""
+    """Points of a branch: coefficients ``(S, n, ...)`` and frequencies ``(S, ...)``, NaN after the last point.
+
+    ``complete`` is true if the branch has reached the far end of the frequencies.
+    """
 
     x: Array
     omega: Array
@@ -63,7 +65,7 @@ def _normalised(vector: Array) -> Array:
 def _advance(
     model: PiecewiseLinearOscillator, basis: Basis, units: tuple[Array, Array], front: _Front
 ) -> tuple[Array, Array, Array, Array]:
-    """A trial step: point, tangent there, whether it closed, whether it was quick."""
+    """Point and tangent after a trial step, and two flags: the iterations converged, and they converged quickly."""
     guess = front.point + front.length * front.tangent
 
     def correct(_: Any, state: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -85,9 +87,9 @@ def _advance(
 
 
 def trace(model: PiecewiseLinearOscillator, basis: Basis, x: Array, start: float, stop: float, scale: Array) -> Branch:
-    """The branch through the balanced motion ``x`` (n, N) at the frequency ``start``, followed towards ``stop``.
+    """The branch through the balanced motion ``x`` (n, N) at the frequency ``start``, continued towards ``stop``.
 
-    It ends where it leaves the frequencies on either side, or after a fixed number of attempts.
+    The branch ends where it leaves the range of frequencies on either side, or after a fixed number of steps.
     """
     lanes = x.shape[1:]
     width = abs(stop - start)
@@ -129,8 +131,10 @@ def trace(model: PiecewiseLinearOscillator, basis: Basis, x: Array, start: float
 def at_frequency(
     model: PiecewiseLinearOscillator, basis: Basis, branch: Course, omega: Array, count: int
 ) -> tuple[Array, Array, Array, Array]:
-    """Up to ``count`` motions of the branch at ``omega``, in its order, balanced: ``(count, n, ...)``; flags of existing
-    ones, of saddles of the balance, and if these are all."""
+    """Up to ``count`` balanced motions at ``omega`` in the order of the branch, ``(count, n, ...)``, and three flags.
+
+    The flags mark existing motions, saddles of the balance, and lanes whose motions are all found.
+    """
     guess, exists, every = sections(branch, omega, count)
 
     def improved(x: Array) -> tuple[Array, Array, Array]:

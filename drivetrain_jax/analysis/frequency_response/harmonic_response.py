@@ -1,4 +1,4 @@
-"""Frequency response by harmonic balance: sweeps up and down, and all motions on the branch that they start from.
+"""Frequency response by harmonic balance: sweeps up and down, and all motions on the branch on which the sweeps start.
 
 Results are arrays ``(L, own dimensions, ...)``, the path first, the batch last.
 """
@@ -25,11 +25,11 @@ from drivetrain_jax.systems import PiecewiseLinearOscillator
 BRANCHES = 7
 _LARGEST_STEP, _MOST_PARTS = 0.02, 8
 _EXTREME_STEPS = 3
-# The branch begins a little above the highest frequency and ends below the lowest, so that it crosses both.
+# The branch begins at the highest frequency over this ratio and ends at the lowest frequency times it, so it crosses both.
 _BEFORE = 0.999
-# Growth below this counts as stable: at a multiplier 1 within rounding.
+# Rounding of a spectral radius: up to 1 plus this number a motion counts as stable.
 _MARGIN = 1e-9
-# Ratio to the largest coefficient below which subharmonics are remains of the iterations.
+# Ratio to the largest coefficient below which a subharmonic is an error of the iterations.
 _VANISHING = 1e-8
 
 
@@ -69,7 +69,7 @@ def extreme(basis: Basis, x: Array, samples: Array, sign: float) -> Array:
 
 
 def repetitions(basis: Basis, x: Array) -> Array:
-    """Number of repetitions of the motion within the base period: with subharmonics kept, it may not use them."""
+    """Number of repetitions of the motion within the base period: more than one if its subharmonics vanish."""
     size = jnp.max(jnp.abs(x[1:]), axis=0)
     times = jnp.ones(x.shape[1:])
     for count in (n for n in range(2, basis.order + 1) if basis.order % n == 0):
@@ -81,9 +81,9 @@ def repetitions(basis: Basis, x: Array) -> Array:
 def describe(
     model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array, exists: Array, saddle: Array
 ) -> Described:
-    """The motion with coefficients ``x`` (n, ...); NaN where it does not exist.
+    """Results of the motion with coefficients ``x`` (n, ...); NaN where it does not exist.
 
-    A ``saddle`` of the balance is unstable also where the disturbances of its few harmonics do not grow.
+    A ``saddle`` of the balance counts as unstable, even if disturbances of the motion do not grow.
     """
     touch = contact(model, basis, x)
     half = half_trace(model, basis, omega, touch)
@@ -108,8 +108,8 @@ def response(
 ) -> dict[str, Array]:
     """The requested results of a line of frequencies ``model.omega`` (L,) of oscillators of the batch ``shape``.
 
-    Outcome ``NOT_CONVERGED`` where a sweep has no balanced motion, ``TOLERANCE_NOT_MET`` where the requested branch could
-    not be followed to the lowest frequency, or has more motions than are stored.
+    The outcome is ``NOT_CONVERGED`` where a sweep has no balanced motion. It is ``TOLERANCE_NOT_MET`` where the requested
+    branch did not reach the lowest frequency, or has more motions than the results hold.
     """
     omega = np.asarray(model.omega)
     lanes = shape or (1,)
@@ -125,7 +125,7 @@ def response(
     outcome = jnp.where(jnp.all(balanced, axis=1), Outcome.SUCCESS, Outcome.NOT_CONVERGED)
     results = described._asdict()
     if any(name.startswith("branch_") for name in outputs):
-        # Motions are simplest at the highest frequency.
+        # The branch starts at the highest frequency, where motions are simplest.
         first = swept_x[int(np.argmax(omega)), 1]
         found, complete = _branches(model, basis, omega, first)
         results |= found
@@ -137,8 +137,10 @@ def response(
 def _sweeps(
     model: PiecewiseLinearOscillator, basis: Basis, omega: np.ndarray, lanes: tuple[int, ...]
 ) -> tuple[Array, Array, Array]:
-    """Coefficients ``(L, 2, n, N)`` of the sweeps up and down, in parallel, and flags of balanced motions and of
-    saddles."""
+    """Coefficients ``(L, 2, n, N)`` of the sweeps up and down, with flags of balanced motions and of saddles.
+
+    Both sweeps run in parallel.
+    """
     fine, places = refined(omega, _LARGEST_STEP, _MOST_PARTS)
     twice = jax.tree.map(lambda field: jnp.tile(field, 2), {k: v for k, v in vars(model).items() if k != "omega"})
     both = PiecewiseLinearOscillator(**twice, omega=None)
@@ -154,10 +156,10 @@ def _sweeps(
 def _branches(
     model: PiecewiseLinearOscillator, basis: Basis, omega: np.ndarray, first: Array
 ) -> tuple[dict[str, Array], Array]:
-    """Extremes and stability ``(L, branch, N)`` of the motions on the branch of ``first``, by rising extremes, and
-    whether these are all that it has at a frequency, ``(L, N)``.
+    """Extremes and stability ``(L, branch, N)`` of the motions on the branch of ``first``, by rising extremes.
 
-    The branch is followed from the highest frequency to the lowest.
+    The second result ``(L, N)`` is true if these are all motions of the branch at a frequency. The continuation runs from
+    the highest frequency to the lowest.
     """
     lanes = first.shape[1:]
     start, stop = float(omega.max()) / _BEFORE, _BEFORE * float(omega.min())

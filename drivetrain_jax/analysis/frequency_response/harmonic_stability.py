@@ -1,7 +1,7 @@
-"""Stability of a motion given by harmonics: the exact transition matrix of the disturbances along it.
+"""Stability of a motion given by harmonics, from the exact transition matrix of disturbances along the motion.
 
-A disturbance obeys ``y'' + c' y' + k' s(t) y = 0`` with s = 1 in contact and alpha within the play, constant between
-the crossings of the flanks: its transition over the period is a product of closed-form matrices. Hill's infinite
+A disturbance obeys ``y'' + c' y' + k' s(t) y = 0`` with s = 1 in contact and s = alpha within the play. As s is constant
+between crossings of the flanks, the transition over the period is a product of closed-form matrices. Hill's infinite
 determinant converges to the same multipliers; their product is ``exp(-c' T)`` exactly.
 """
 
@@ -37,10 +37,10 @@ def _product(later: Rows, earlier: Rows) -> Rows:
 
 
 def _ordered_product(matrices: Rows) -> Rows:
-    """Product of the matrices along the first axis, the last one leftmost.
+    """Product of the matrices along the first axis, the last matrix leftmost.
 
-    In parallel blocks, then the blocks: loops with stored results, because XLA would recompute the terms of one long
-    expression for every use.
+    Blocks are multiplied in parallel, then their products. Loops store their results; in one long expression XLA would
+    recompute the terms for every use.
     """
     tail = matrices[0].shape[1:]
     one, zero = jnp.ones(tail), jnp.zeros(tail)
@@ -62,13 +62,13 @@ def _ordered_product(matrices: Rows) -> Rows:
 def half_trace(model: PiecewiseLinearOscillator, basis: Basis, omega: Array, touch: Contact) -> Array:
     """Half the trace of the transition over the base period, divided by ``exp(-c' T/2)``.
 
-    The multipliers over that factor are ``h -+ sqrt(h^2 - 1)``: beyond 1 a fold has been passed, below -1 the period
-    doubles; between, both have the modulus of the factor.
+    With the half trace h, the multipliers over that factor are ``h -+ sqrt(h^2 - 1)``. For h between -1 and 1 both have the
+    modulus of the factor. An unstable motion has h > 1 beyond a fold, and h < -1 beyond a period doubling.
     """
     span = 2 * np.pi * basis.order / (omega * basis.count)
     here = jnp.abs(touch.u) > model.b
     after = jnp.roll(here, -1, axis=0)
-    # With the damping taken off as exp(-c' t/2), the stiffness is k' s - c'^2/4.
+    # In z = exp(c' t/2) y the damping vanishes and the stiffness is k' s - c'^2/4.
     first, last = (
         model.stiffness * jnp.where(contact, 1.0, model.alpha) - model.damping**2 / 4 for contact in (here, after)
     )

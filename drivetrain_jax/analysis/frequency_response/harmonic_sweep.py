@@ -1,9 +1,10 @@
 """Slow sweeps of the drive's frequency by harmonic balance.
 
-At each frequency Newton iterations start from the motion at the last one. The motion is abandoned, as in an experiment, if
-the iterations lose it, if it jumps, or if it becomes unstable within the basis (a fold; a doubled period, if subharmonics
-are kept). The equation of motion is then integrated until it has settled, and the settled motion is balanced, starting from
-the drift of the balance. If this fails, the motion of the Newton iterations is kept and its instability reported.
+At each frequency Newton iterations start from the motion at the previous frequency. As in an experiment, the sweep leaves a
+motion if the iterations diverge, if the motion jumps, or if it becomes unstable within the basis (a fold, or a doubled
+period with subharmonics in the basis). The equation of motion is then integrated until it has settled. From the settled
+motion the drift of the balance and Newton iterations lead to a balanced motion. If this fails, the motion of the first
+Newton iterations is kept and marked as unstable.
 """
 
 from __future__ import annotations
@@ -19,21 +20,21 @@ from drivetrain_jax.analysis.frequency_response.harmonic_balance import Balanced
 from drivetrain_jax.analysis.frequency_response.harmonic_stability import half_trace, spectral_radius
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
-# Transients: until disturbances have decayed by this factor, within these limits; steps per radian of the stiffest
-# motion and per drive period. They only have to land in a basin, not to be accurate.
+# Length of transients: until disturbances have decayed by this factor, within limits in drive periods. Steps: per radian of
+# the stiffest motion, within limits per drive period. Low accuracy is enough to reach the right basin.
 _SETTLED, _PERIODS = 1e-4, (24, 400)
 _PER_RADIAN, _STEPS = 4.0, (64, 4000)
-# A change of the motion between two frequencies that counts as a jump, over its size.
+# Change of the motion between two frequencies, relative to its size, beyond which it is a jump.
 _JUMP = 0.35
 _MARGIN = 1e-7
 _PUSH = 0.05
-# Attempts at one frequency: the passage past a fold is slow close to it.
+# Attempts at one frequency: close to a fold the drift is slow.
 _WAITS = 8
 
 
 class Swept(NamedTuple):
-    """A motion on the way: coefficients ``(n, ...)``, the half trace of its transition, whether it is balanced, and
-    whether it is a saddle of the balance."""
+    """A motion of the sweep: coefficients ``(n, ...)``, half trace of its transition, and flags of balanced motions and of
+    saddles of the balance."""
 
     x: Array
     half: Array
@@ -42,7 +43,7 @@ class Swept(NamedTuple):
 
 
 def _effort(model: PiecewiseLinearOscillator, basis: Basis, omega: Array) -> tuple[Array, Array]:
-    """Base periods for settling, and steps between two samples, of each lane, independent of its batch."""
+    """Base periods for settling, and steps between two samples; both depend on the lane alone, not on its batch."""
     fastest = jnp.sqrt(model.stiffness * jnp.maximum(model.alpha, 1.0)) / omega
     steps = jnp.clip(2 * np.pi * _PER_RADIAN * fastest, *_STEPS)
     decay = -np.log(_SETTLED) * omega / (np.pi * jnp.maximum(model.damping, 1e-12 * omega))
@@ -53,11 +54,11 @@ def _effort(model: PiecewiseLinearOscillator, basis: Basis, omega: Array) -> tup
 def settle(
     model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array, wanted: Array | bool = True
 ) -> Array:
-    """Coefficients of the motion some time after it was in the state of ``x`` at tau = 0, where this is ``wanted``."""
+    """Coefficients of the motion after a transient from the state of ``x`` at tau = 0, in the ``wanted`` lanes."""
     lanes = x.shape[1:]
     start = jnp.asarray(basis.at(np.zeros(1))[0]), jnp.asarray((basis.at(np.zeros(1)) @ basis.derivative)[0])
     u, v = jnp.tensordot(start[0], x, 1), jnp.tensordot(start[1], x, 1) * omega / basis.order
-    # A motion that repeats exactly never leaves an unstable orbit: a push lets disturbances grow.
+    # An exactly periodic motion never leaves an unstable orbit: a small offset lets disturbances grow.
     u = u + _PUSH * jnp.sqrt(jnp.sum(x[1:] ** 2, axis=0))
     sampled = Basis(basis.harmonics, basis.order, max(_STEPS[0], 1 << (2 * basis.harmonics).bit_length()))
     effort = (jnp.where(wanted, number, 0) for number in _effort(model, sampled, omega))
@@ -99,10 +100,10 @@ def _runge_kutta(
 
 
 def _checked(model: PiecewiseLinearOscillator, basis: Basis, found: Balanced, omega: Array) -> tuple[Swept, Array]:
-    """A balanced motion with its half trace, and a flag if it is an attractor within the basis."""
+    """A balanced motion with its half trace, and a flag: true if it is an attractor within the basis."""
     half = half_trace(model, basis, omega, contact(model, basis, found.x))
     growth = spectral_radius(model, basis, omega, half)
-    # Without subharmonics a doubled period cannot be followed.
+    # Without subharmonics the basis has no motion of doubled period.
     followed = (half > 1) | (basis.order > 1)
     attracts = found.converged & ~found.saddle & ~((growth > 1 + _MARGIN) & followed)
     return Swept(found.x, half, found.converged, found.saddle), attracts
@@ -113,11 +114,14 @@ def _kept(condition: Array, first: Swept, second: Swept) -> Swept:
 
 
 def step(model: PiecewiseLinearOscillator, basis: Basis, before: Swept, omega: Array) -> tuple[Swept, Swept]:
-    """The motion at ``omega``, from the one at a frequency near by: for the next step, and as a result."""
+    """Two versions of the motion at ``omega``: the start of the next step and the result.
+
+    Both follow from the motion ``before`` at the previous frequency, and differ where the result is not balanced.
+    """
     size = jnp.sqrt(jnp.sum(before.x[1:] ** 2, axis=0))
 
     def waited(count: Array, lost: Array, seed: Array, now: Swept) -> Array:
-        # The motion settles once; past a fold that only the balance has, it would come back to it every time.
+        # Integrate once only: past a fold of the balance that the exact motion lacks, it would return there every time.
         start = jax.lax.cond(count == 1, lambda seed: settle(model, basis, seed, omega, lost), lambda seed: seed, seed)
         found = drift(model, basis, jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, seed), omega)
         return jnp.where(lost, jnp.where(jnp.all(jnp.isfinite(found), axis=0), found, seed), now.x)
@@ -129,7 +133,7 @@ def step(model: PiecewiseLinearOscillator, basis: Basis, before: Swept, omega: A
         there, attracts = _checked(model, basis, balance(model, basis, seed, omega), omega)
         change = jnp.sqrt(jnp.sum((there.x - before.x)[1:] ** 2, axis=0))
         jumped = ~again & before.balanced & (change > _JUMP * size)
-        # The settled motion replaces the lost one unless it is no better.
+        # The settled motion replaces the lost one if it attracts, or if the lost one is not balanced.
         taken = jnp.where(again, lost & (attracts | ~now.balanced), True)
         return count + 1, lost & (~attracts | jumped), seed, _kept(taken, there, now)
 

@@ -20,7 +20,8 @@ _HEIGHT = 2.3
 def plot(dataset: xr.Dataset, names: list[str]) -> Figure:
     """``u_max`` and ``regime``, if stored, over the axes ``names``; one column for each sweep.
 
-    A predicted end of the motion without separation is drawn over them. Raises :class:`InputError` if neither is stored.
+    The predicted limit of motion without separation is drawn over the maps. Raises :class:`InputError` if neither variable
+    is stored.
     """
     shown = cells.require_any(dataset, "u_max", "regime")
     horizontal = cells.speed_axis(dataset, names)

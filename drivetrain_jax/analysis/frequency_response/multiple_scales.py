@@ -1,7 +1,7 @@
-"""First-order multiple scales (= averaging) of the oscillator with play, its spring replaced by a cubic polynomial.
+"""First-order multiple scales (= averaging) of the oscillator with play, with a cubic polynomial for its spring.
 
 Least squares on ``[-R, R]`` (:func:`cubic_fit`) give ``k'/I f_s(u) ~ l1 u + l2 u^3``, w0 = sqrt(l1). Near ``omega = w0``
-the motion is ``u = a cos(omega t - beta)`` whose amplitude and phase drift slowly,
+the motion is ``u = a cos(omega t - beta)`` with slowly drifting amplitude and phase,
 
     a' = -mu a + F sin(beta),   a beta' = (delta - g a^2) a + F cos(beta),
     mu = c/(2 I),   F = B1/(2 w0),   delta = omega - w0,   g = 3 l2/(8 w0),
@@ -44,12 +44,12 @@ class SlowFlow(NamedTuple):
 
 
 def _share(r: Array) -> Array:
-    """Share by which the play reduces l1: ``(45 r - 50 r^3 + 21 r^5)/16``, 1 at r = 1."""
+    """Fraction ``(45 r - 50 r^3 + 21 r^5)/16`` that multiplies 1 - alpha in the reduction of l1 by the play; 1 at r = 1."""
     return r * (45 - r**2 * (50 - 21 * r**2)) / 16
 
 
 def cubic_fit(model: PiecewiseLinearOscillator, fit_range: Array) -> Cubic:
-    """Least-squares cubic of the spring on ``[-R, R]``; with r = b/R (at most 1, the spring is linear below):
+    """Least-squares cubic of the spring on ``[-R, R]``; with r = b/R, or r = 1 for R < b, where the spring is linear:
 
     ``l1 = k' [1 - (1 - alpha)(45 r/16 - 25 r^3/8 + 21 r^5/16)]``, ``l2 = k' (1 - alpha)(35/16) r (1 - r^2)^2/R^2``.
     """
@@ -64,10 +64,10 @@ def cubic_fit(model: PiecewiseLinearOscillator, fit_range: Array) -> Cubic:
 
 
 def _turning_ratios(alpha: Array) -> Array:
-    """Ratios ``r = b/R`` where ``l1/r^2`` turns, ``(2, ...)`` with the shape of ``alpha`` behind: zeros of
-    ``(1 - alpha)(45 r + 50 r^3 - 63 r^5)/16 - 2``.
+    """Ratios ``r = b/R`` of the extremes of ``l1/r^2``, ``(2, ...)`` followed by the shape of ``alpha``.
 
-    The left side is largest at r = 0.8275; where it is negative even there ``l1/r^2`` falls all the way.
+    They are the zeros of ``(1 - alpha)(45 r + 50 r^3 - 63 r^5)/16 - 2``, which is largest at r = 0.8275. Where this maximum
+    is negative, ``l1/r^2`` falls everywhere.
     """
     soft = 1 - alpha
 
@@ -80,9 +80,9 @@ def _turning_ratios(alpha: Array) -> Array:
 
 
 def self_consistent_range(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Array:
-    """The range that equals the peak amplitude it gives: ``R c' sqrt(l1(R)) = B1``, infinite without damping.
+    """The range of the fit that equals the resulting peak amplitude: ``R c' sqrt(l1(R)) = B1``, infinite without damping.
 
-    The largest one where there are several (alpha near 0); NaN where l1 is not positive (alpha = 0 within the play).
+    If there are several ranges (alpha near 0), the largest. NaN where l1 is not positive (alpha = 0 within the play).
     """
     target = jnp.abs(model.B1) / jnp.where(model.damping > 0, model.damping, 1.0) + jnp.zeros(shape)
     play = jnp.where(model.b > 0, model.b, 1.0)
@@ -98,7 +98,7 @@ def self_consistent_range(model: PiecewiseLinearOscillator, shape: tuple[int, ..
     turning = _turning_ratios(model.alpha + jnp.zeros(shape))
     ends = jnp.concatenate([least[None], turning, jnp.ones((1, *shape))])
     log_r = jnp.log(ends)
-    # At rest, r = 0, the excess is that of contact.
+    # The excess is positive at the lower end, as for contact alone.
     mask = sign_changes((excess(log_r) > 0).at[0].set(True), 1)
     r = jnp.exp(bisect(lambda x: -excess(x), take(mask, log_r[:-1]), take(mask, log_r[1:]))[0])
     beyond = model.b / jnp.where(r > 0, r, 1.0)
@@ -116,9 +116,9 @@ def slow_flow(model: PiecewiseLinearOscillator, fit: Cubic) -> SlowFlow:
 
 
 def peak(flow: SlowFlow) -> tuple[Array, Array]:
-    """Largest amplitude ``F/mu`` (infinite without damping) and the frequency ``w0 + g a^2`` where it is reached.
+    """Largest amplitude ``F/mu`` (infinite without damping) and its frequency ``w0 + g a^2``.
 
-    A softening spring may put that below 0: then the largest amplitude is that of the limit ``omega -> 0``, and 0.
+    A softening spring may make this frequency negative: the result is then the amplitude in the limit ``omega -> 0``, and 0.
     """
     amplitude = jnp.where(flow.decay > 0, flow.drive / jnp.where(flow.decay > 0, flow.decay, 1.0), jnp.inf)
     frequency = flow.frequency + jnp.where(flow.bend != 0, flow.bend * amplitude**2, 0.0)
@@ -157,14 +157,14 @@ def response_residual(flow: SlowFlow, omega: Array, rho: Array) -> Array:
 def roots(flow: SlowFlow, omega: Array) -> Array:
     """All amplitudes at one frequency, rising, ``(MOST_ROOTS, ...)``, infinite where there are fewer.
 
-    The cubic is monotone between its stationary points, known in closed form: one bisection for each piece, of log rho,
-    which may be smaller than its bounds by any factor.
+    The cubic is monotone between its stationary points, which are known in closed form: one bisection for each piece. It
+    bisects log rho, because rho may be smaller than its bounds by any factor.
     """
     delta, square = omega - flow.frequency, flow.drive**2
     bends = flow.bend != 0
     bend = jnp.where(bends, flow.bend, 1.0)
     spread = jnp.sqrt(jnp.maximum(delta**2 - 3 * flow.decay**2, 0.0))
-    # The smaller one from the product of both: no digits cancel.
+    # The smaller stationary point comes from the product of both, so that no digits cancel.
     far = (2 * delta + jnp.where(delta < 0, -spread, spread)) / (3 * bend)
     near = (delta**2 + flow.decay**2) / (3 * bend**2) / jnp.where(far != 0, far, 1.0)
     damped = square / jnp.where(flow.decay > 0, flow.decay, 0.0) ** 2
@@ -176,14 +176,14 @@ def roots(flow: SlowFlow, omega: Array) -> Array:
     def residual(log_rho: Array) -> Array:
         return response_residual(flow, omega, jnp.exp(log_rho))
 
-    # The ends hold all roots between them, also in rounding.
+    # All roots lie between the ends: set the signs there, whatever the rounding.
     positive = (residual(points) > 0).at[0].set(False).at[-1].set(True)
     mask = sign_changes(positive, MOST_ROOTS)
     turned = jnp.where(take(mask, positive[1:], 1.0) > 0, 1.0, -1.0)
     found = bisect(lambda x: turned * residual(x), take(mask, points[:-1]), take(mask, points[1:]))
     amplitude = jnp.where(jnp.any(mask, axis=1), jnp.exp(found / 2), jnp.inf)
     alone = jnp.full_like(amplitude, jnp.inf)
-    # A linear spring has one amplitude, infinite at resonance without damping; without drive there is rest alone.
+    # A linear spring has one amplitude, infinite at resonance without damping; without drive the only motion is rest.
     linear = alone.at[0].set(flow.drive / jnp.hypot(delta, flow.decay))
     amplitude = jnp.where(bends, amplitude, linear)
     return jnp.where(square == 0, alone.at[0].set(0.0), amplitude)

@@ -7,8 +7,8 @@ from drivetrain_jax.analysis.steady_state.rules import MOTION
 
 RULES = Declared(
     (*MOTION, in_order("branch_u_min", "branch_u_max"), ordered("fold_frequency", "fold")),
-    # There are more places than branches and folds; a motion at rest has no phase, and some frequencies have no
-    # backbone.
+    # NaN is allowed: the dimensions of branches and folds are longer than most points need, a motion at rest has no phase,
+    # and some frequencies have no backbone.
     gaps=(
         "phase",
         "branch_u_max",

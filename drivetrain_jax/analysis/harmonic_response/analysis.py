@@ -5,7 +5,7 @@
 with modes phi_m of unit modal mass, the same damping ratio zeta for all, and the complex amplitudes f of the forces. No
 stiffness matrix is formed, so stiff and soft springs side by side lose no digits.
 
-Outcome: ``NOT_FINITE`` if an amplitude is infinite (an undamped mode at its frequency); only that one is NaN.
+Outcome: ``NOT_FINITE`` if an amplitude is infinite (an undamped mode at its frequency); only this amplitude is NaN.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def _solve(system: type[System], request: Request, values: Mapping[str, Any], ef
     weight = 1 / jnp.sqrt(_in_lanes(model.springs.mass, lanes))
     shapes = weight[:, None] * modes.vectors  # pyright: ignore[reportOperatorIssue]
     driven = jnp.sum(shapes * _in_lanes(model.force, lanes)[:, None], axis=0)
-    # A rigid mode has a frequency of rounding.
+    # The computed frequency of a rigid mode is rounding.
     own = jnp.where(is_rigid(modes.frequency, largest_frequency(model.springs, lanes)), 0.0, modes.frequency)
     omega = 2 * math.pi * jnp.asarray(_frequencies(request))[:, None, None]
     gain = driven / (own**2 - omega**2 + 2j * damping * own * omega)

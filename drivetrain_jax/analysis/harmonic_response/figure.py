@@ -44,7 +44,7 @@ def _lines(dataset: xr.Dataset) -> Figure:
     bodies = list(dict.fromkeys(dof.partition("_")[2] for dofs in kinds.values() for dof in dofs))
     colours = {body: _COLOURS[i % len(_COLOURS)] for i, body in enumerate(bodies)}
     handles: dict[str, Artist] = {}
-    # Coordinates that do not respond have amplitudes of rounding.
+    # The amplitude of a coordinate that does not respond is rounding.
     smallest = _ROUNDING * float(amplitude.max())
     for (axes,), (kind, dofs) in zip(panels.axes, kinds.items(), strict=True):
         for dof in dofs:

@@ -2,8 +2,8 @@
 
 diffrax integrates adaptively between strobes and requested times, so every value is the end of a step (no interpolation).
 Angles of the clocks are computed from whole strobes: they are as accurate after 50,000 strobes as at the start. Errors are
-differences from a run with ten times the tolerance and up to twice the step; this run is always made. If errors exceed
-``rtol`` times the size of the motion (its largest component), runs with tighter tolerances follow.
+differences from a second run with ten times the tolerance and up to twice the step. If errors exceed ``rtol`` times the
+size of the motion (its largest component), runs with tighter tolerances follow.
 
 Outcome: ``TOLERANCE_NOT_MET`` if an error still exceeds ``rtol`` times the size of the motion; ``STEP_LIMIT`` if the
 integrator needed too many steps (earlier values are kept), ``NOT_FINITE`` if the field is not finite at the start.

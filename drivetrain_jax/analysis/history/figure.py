@@ -19,7 +19,7 @@ from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, caption, 
 _LINE: dict[str, Any] = {"color": LINE_COLOURS[0], "linewidth": 0.6, "markersize": 3.5}
 _MOST_ROWS = 8
 _CAPTION_LINES = 2
-# Turns that the 3-D curve shows in full. More of them are a blot of ink.
+# Largest number of turns of the 3-D curve, to keep it legible.
 _MOST_TURNS = 24
 
 
@@ -126,8 +126,11 @@ def _draw_space(history: xr.Dataset, space: Axes3D) -> None:
 
 
 def _thinned(curve: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The curve (3, T) of displacement, rate and time with ``_MOST_TURNS`` of its turns, NaN between them, and the lines
-    through its extremes; the curve itself and no lines if it has few turns."""
+    """The curve (3, T) of displacement, rate and time, thinned to ``_MOST_TURNS`` turns with NaN between them, and the lines
+    through its extremes.
+
+    A curve of few turns is unchanged and has no such lines.
+    """
     rises = curve[1] > 0
     maxima, minima = (np.flatnonzero((rises[:-1] == up) & (rises[1:] != up)) for up in (True, False))
     if len(maxima) <= 2 * _MOST_TURNS:

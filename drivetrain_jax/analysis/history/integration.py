@@ -20,14 +20,15 @@ NUM = Parameter(
     "num", "1", "number of equally spaced times from 0 to stop", default=1001, lower=2, upper=1e7, integer=True
 )
 
-# Tolerances of the steps relative to that of the result: errors of steps accumulate over the memory of the damped motion.
+# Tolerance of the steps over rtol, ratio of the coarser run, and tightest tolerance. Tight, because errors of steps
+# accumulate over the memory of the damped motion.
 _SHARPNESS, _COARSER, _SHARPEST = 0.01, 10.0, 1e-15
-# Longest steps of the accurate run relative to those of the other, at first a segment: with one step per segment both runs
-# would be equal and show no error. Every further try starts with the steps of the last one.
+# Ratio of the longest steps of the accurate run to those of the coarser run, which are one segment at first: with one step
+# per segment both runs would agree and show no error. Every further attempt shortens both by this ratio.
 _PART = 0.5
-# Settings of further tries: fraction of rtol as next target, tightest tolerance, number of tries.
+# Further attempts: fraction of rtol as next target, tightest tolerance, number of attempts.
 _RESERVE, _SHARPEST_AGAIN, _MOST_ATTEMPTS = 0.3, 1e-14, 3
-# Steps of one segment (at most a strobe) and of a whole history.
+# Most steps of one segment (at most a strobe) and of a whole history.
 _MAX_SEGMENT, _MAX_STEPS = 4096, 20_000_000
 
 
@@ -44,7 +45,8 @@ class _Place(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """States (T, n) by steps of ``tolerance``, their estimated ``error``, and its ``excess`` over the allowed one."""
+    """States (T, n) by steps of ``tolerance``, their estimated ``error``, and the ratio ``excess`` of the largest error to
+    the allowed error."""
 
     tolerance: Array
     states: Array
@@ -55,9 +57,9 @@ class _Found(NamedTuple):
 
 
 def requested_times(request: Request) -> tuple[float, ...]:
-    """The times of the options: ``times``, or ``num`` equal steps from 0 to ``stop``, ends included.
+    """The times of the options: ``times``, or ``num`` equally spaced times from 0 to ``stop``, ends included.
 
-    :class:`InputError` if both or neither are given, or ``times`` does not rise.
+    Raises :class:`InputError` if both or neither are given, or if ``times`` does not rise.
     """
     times, stop, num = (request.options[name] for name in ("times", "stop", "num"))
     if times and stop:
@@ -72,7 +74,7 @@ def requested_times(request: Request) -> tuple[float, ...]:
 
 
 def size_of(flow: Flow) -> Array:
-    """Estimated size of the motion, per component: the initial state, and its change within a radian."""
+    """Estimated size of a component of the motion: the initial state plus its change within a radian."""
     start = _start(flow)
     rate = flow.vector(0, 0.0, start)
     fastest = 2 * np.pi / flow.period if flow.fastest is None else flow.fastest
@@ -124,11 +126,10 @@ def _ahead(place: _Place, target: tuple[Array, Array]) -> Array:
 def trajectory(
     flow: Flow, times: Array, tolerance: Any, part: Any, solver: diffrax.AbstractSolver
 ) -> tuple[Array, Array, Array]:
-    """States at the rising ``times``, shape ``(len(times), n)``, the largest component, and a flag if the step limit was
-    kept; NaN beyond it.
+    """States at the rising ``times``, shape ``(len(times), n)``, the largest component, and a flag of success.
 
-    ``tolerance`` bounds the error of a step relative to the state and to :func:`size_of`, ``part`` its length relative to
-    the segment, which is at most a strobe.
+    States after a failure or beyond the step limit are NaN. ``tolerance`` bounds the error of a step relative to the state
+    and to :func:`size_of`; ``part`` bounds the length of a step relative to its segment, which is at most a strobe.
     """
     controller = diffrax.PIDController(rtol=tolerance, atol=jnp.maximum(tolerance * size_of(flow), 1e-300))
     turns = times / flow.period
@@ -137,7 +138,7 @@ def trajectory(
     def advance(place: _Place, target: tuple[Array, Array]) -> _Place:
         strobe, fraction = target
         last = place.strobe == strobe
-        # In a batch, lanes that have finished or failed wait for the others: they must not take steps.
+        # In a batch the loop runs until the last lane is done: finished or failed lanes integrate over an empty span.
         end = jnp.where(_ahead(place, target), jnp.where(last, fraction, 1.0), place.fraction)
         y, reached, steps, well = _segment(flow, solver, controller, part, place, end)
         total = place.steps + steps
@@ -162,10 +163,10 @@ def trajectory(
 
 
 def _twice(flow: Flow, times: Array, tolerance: Array, attempts: Array, request: Request) -> _Found:
-    """The states at ``times``, with their difference from a run at a tolerance ``_COARSER`` times as large."""
+    """The states at ``times``, and as their error the difference from a run at ``_COARSER`` times the tolerance."""
     solver = getattr(diffrax, request.options["solver"])()
     settings = tolerance * jnp.array([1.0, _COARSER]), _PART**attempts * jnp.array([_PART, 1.0])
-    # One after the other in one loop: compiled once.
+    # Both runs in one loop, so that they are compiled once.
     runs, reached, healthy = jax.lax.map(lambda setting: trajectory(flow, times, *setting, solver), settings)  # pyright: ignore[reportCallIssue]
     error = jnp.abs(runs[0] - runs[1])
     largest = jnp.max(error)

@@ -1,6 +1,6 @@
-"""Time histories of oscillators with play: the exact motion with its events, and the averaged one.
+"""Time histories of oscillators with play: the exact motion with its events, and the averaged motion.
 
-Method ``exact``: the closed form of each linear region from flank to flank, right within rounding at any time.
+Method ``exact``: the closed form of each linear region from flank to flank, exact up to rounding at any time.
 
 Method ``slow_flow``: amplitude a and phase beta of ``u = a cos(omega t - beta)`` by the averaged equations of
 :mod:`~drivetrain_jax.analysis.frequency_response.multiple_scales`, with ``u' = -w0 a sin(omega t - beta)``. The complex
@@ -9,7 +9,7 @@ amplitude ``z = a exp(i beta)`` has no singularity at rest:
     z' = (-mu + i (omega - w0 - g |z|^2)) z + i F.
 
 Outcome: ``NOT_FINITE`` without a finite motion (resonance without damping; a fit with l1 <= 0); ``STEP_LIMIT`` for more
-events than any motion that does not graze; ``slow_flow`` also ``TOLERANCE_NOT_MET``.
+events than a motion can have unless it grazes a flank; ``slow_flow`` also ``TOLERANCE_NOT_MET``.
 """
 
 from __future__ import annotations
@@ -60,13 +60,13 @@ _MAX_PERIODS, _CHUNK = 2_000_000, 64
 
 
 def variables(system: type[System]) -> tuple[Variable, ...]:
-    """The state of ``system``, and what the methods add."""
+    """Variables of the state of ``system``, and those that the methods add."""
     own = (Variable(c.name, c.units, c.long_name, ("time",)) for c in system.state)
     return (*own, *_EXACT, *_AVERAGED)
 
 
 def dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
-    """Times and events; ``InputError`` for a result that the method does not give."""
+    """Dimensions of times and events; raises ``InputError`` for a result that the method does not compute."""
     del system, fixed
     for variable in _AVERAGED if request.method == "exact" else _EXACT:
         if variable.name in request.outputs:
@@ -90,7 +90,10 @@ def solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
 def derivatives(
     system: type[System], request: Request, parameters: Any, constants: Any, results: Mapping[str, Array]
 ) -> Mapping[str, Array]:
-    """Jacobians of the exact motion without its events. The range of the averaged one is found by bisection."""
+    """Jacobians of the exact motion, without its events.
+
+    The averaged motion has none, because bisection finds the range of its fit.
+    """
     known = {name: x for name, x in results.items() if not name.startswith("event")}
     exact = request.method == "exact"
     return forward_derivatives(solvers, system, request, parameters, constants, known) if exact else {}
@@ -131,7 +134,10 @@ def _exact(system: type[System], request: Request, values: Mapping[str, Any], ef
 def averaged_flow(
     model: PiecewiseLinearOscillator, fit_range: Array | None, u0: Array, v0: Array
 ) -> tuple[Flow, Array]:
-    """The flow of ``(Re z, Im z)`` from the state ``(u0, v0)``, and w0; without ``fit_range`` by its own peak amplitude."""
+    """The flow of ``(Re z, Im z)`` from the state ``(u0, v0)``, and w0.
+
+    Without ``fit_range`` the range of the fit is the self-consistent one, the peak amplitude.
+    """
     reach = self_consistent_range(model, ()) if fit_range is None else fit_range
     slow = slow_flow(model, cubic_fit(model, reach))
     drive, detuning = jnp.sign(model.B1) * slow.drive, model.omega - slow.frequency
