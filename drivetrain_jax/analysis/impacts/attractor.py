@@ -1,13 +1,13 @@
 """From initial conditions to attractors of a piecewise linear oscillator, many points at a time.
 
-A *job* is a sequence of points, each started where the last one ended: a single point for a steady state, a line of drive
-frequencies for an up or down sweep. ``width`` lanes process the queue of jobs, each at its own pace, so a lane that settles
-slowly, or never, does not delay the others.
+A *job* is a sequence of points: a single point for a steady state, a line of drive frequencies for an up or down sweep.
+Each point starts from the state at which the previous point ended. ``width`` lanes process the queue of jobs, each at its
+own pace, so a lane that settles slowly, or never, does not delay the others.
 
 A lane settles period by period and from time to time tries Newton shooting from its state: ``z <- z + (1 - M)^-1 (F^m(z) -
-z)`` with the exact transition matrix M over m periods, m being a number of periods after which the motion nearly recurs. An
-orbit is accepted as the attractor only if all its multipliers lie inside the unit circle, and the motion itself, continued
-from the start of the search, approaches it (:mod:`~drivetrain_jax.analysis.impacts.attractor_approach`).
+z)``, where M is the exact transition matrix over m periods and the motion nearly recurs after m periods. An orbit is
+accepted as the attractor under two conditions: all its multipliers lie inside the unit circle, and the motion, continued
+from the start of the search, approaches the orbit (:mod:`~drivetrain_jax.analysis.impacts.attractor_approach`).
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ from drivetrain_jax.analysis.impacts.piecewise_march import (
 from drivetrain_jax.analysis.impacts.plane_map import Matrix, newton_correction
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
-# Newton: largest number of corrections, relative size of a last one, and size below which rounding may end it.
+# Newton: most corrections, relative size of the last correction, and size below which corrections may stall by rounding.
 _CORRECTIONS, _CONVERGED, _ROUNDING = 12, 1e-11, 1e-7
-# Largest ratio of a correction to the one before: 2/3 at worst near an orbit whose period is about to double.
+# Largest ratio of successive corrections: 2/3 at worst near an orbit whose period is about to double.
 _SHRINKING = 0.75
 # A search fails at this multiple of the usual velocity, or of the steps for settling.
 _ASTRAY, _COSTLY = 3.0, 4
@@ -61,10 +61,10 @@ _EPS = np.finfo(float).eps
 class Attractors(NamedTuple):
     """The attractor of each point, every field of shape ``(points,)``.
 
-    ``u, v``: state at the start of a drive period; ``multiple``: number of periods m after which it recurs (0 if not within
-    32); ``matrix``: transition matrix over these; ``error``: estimated absolute error of u; ``periods``: drive periods run;
-    ``exponent``: Lyapunov exponent per unit of time, meaningful if ``multiple`` is 0; ``stalled``: 1 if stopped because of
-    its number of steps or because it is not finite, else 0.
+    ``u, v``: state at the start of a drive period; ``multiple``: number of periods m after which the state recurs (0 if not
+    within 32); ``matrix``: transition matrix over m periods; ``error``: estimated absolute error of u; ``periods``: drive
+    periods run; ``exponent``: Lyapunov exponent per unit of time, meaningful if ``multiple`` is 0; ``stalled``: 1 if the
+    motion was stopped because of its number of steps or because it is not finite, else 0.
     """
 
     u: Array
@@ -86,7 +86,7 @@ def averaged(periods: Any) -> Any:
 
 
 def take(oscillator: PiecewiseLinearOscillator, index: Array) -> PiecewiseLinearOscillator:
-    """The oscillators number ``index``; fields common to all stay scalars."""
+    """The oscillators at the positions ``index``; fields common to all stay scalars."""
     chosen = {f.name: getattr(oscillator, f.name) for f in fields(oscillator)}
     return replace(oscillator, **{name: x[index] if jnp.ndim(x) else x for name, x in chosen.items()})
 
@@ -141,7 +141,7 @@ def _shoot(
 
 
 def _taken_off(lanes: Lanes, motion: Motion) -> Array:
-    """The largest harmonic response subtracted from the displacement; it limits the accuracy of a step."""
+    """Largest harmonic response that steps subtract from the displacement, which limits their accuracy."""
     here = locate(lanes, motion.u)
     own, contact, gap = (jnp.hypot(piece.cosine, piece.sine) for piece in (here.region, lanes.contact, lanes.gap))
     return jnp.where(stays(lanes, here, motion), own, jnp.maximum(contact, gap))
@@ -157,7 +157,7 @@ class _Work(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """The work: the points ``visits`` of all jobs in turn, ``length`` of each, from the states ``origin``."""
+    """The input: the points ``visits`` of all jobs in turn, ``length`` per job, and the initial states ``origin``."""
 
     oscillator: PiecewiseLinearOscillator
     visits: Array
@@ -171,9 +171,9 @@ def attractors(
 ) -> Attractors:
     """Attractors reached at the points of every job.
 
-    ``oscillator`` holds scalars or arrays over all points; ``route``, shape ``(jobs, length)``, the points that each
-    job visits, in order; ``u0, v0``, shape ``(jobs,)``, the states it starts from. Each next point starts from the
-    state that the last one ended on. Results have the shape ``(jobs, length)``.
+    ``oscillator`` holds scalars or arrays over all points. ``route``, shape ``(jobs, length)``, lists the points of each
+    job in order; ``u0, v0``, shape ``(jobs,)``, are the initial states of the jobs. Each later point starts from the final
+    state of the previous one. Results have the shape ``(jobs, length)``.
     """
     jobs, length = route.shape
     width = min(width, jobs)
@@ -191,7 +191,7 @@ def attractors(
 
 
 def _tick(task: _Task, work: _Work) -> _Work:
-    """Advance all lanes by a few steps; those that have ended a period or a search continue with the next task."""
+    """Advance all lanes by a few steps; lanes at the end of a period or of a search continue with the next task."""
     lane, history = work.lane, work.history
     total = task.visits.size
     working = lane.job < total // task.length
@@ -224,13 +224,13 @@ def _tick(task: _Task, work: _Work) -> _Work:
 
 
 def _most_steps(lane: Lane, lanes: Lanes) -> Array:
-    """Steps after which a lane is stopped: it moves from event to event without progress."""
+    """Steps after which a lane is stopped, because it moves from event to event without progress."""
     searching = lane.searching & (lane.count > 0)
     return lane.multiple * jnp.where(searching, _COSTLY * lane.cost + 500, usual_steps(lanes))
 
 
 def _result(lane: Lane, reached: Array, stalled: Array, span: Array) -> Attractors:
-    """The result of a finished lane; ``span`` is the time of growth of its tangent if it has not settled."""
+    """The result of a finished lane; ``span`` is the time over which the tangent of an unsettled lane has grown."""
     orbit = lane.orbit
     return Attractors(
         u=jnp.where(reached, orbit.u, lane.latest[0]),

@@ -1,8 +1,8 @@
 """Decide if a motion approaches a periodic orbit that Newton's method found from one of its states.
 
-Newton's method may converge to an orbit whose basin does not contain the state. One recurrence predicted by the
-linearisation about the orbit proves nothing, because the remainder is a vector that vanishes at some points. So the motion
-itself is continued. With M the transition matrix about the orbit ``z*``, rho its spectral radius and m the period multiple,
+Newton's method may converge to an orbit whose basin does not contain the state. One recurrence that agrees with the
+linearisation about the orbit proves nothing, because the remainder is a vector that vanishes at some points. Therefore the
+motion is continued. With M the transition matrix about the orbit ``z*``, rho its spectral radius and m the period multiple,
 every recurrence must satisfy
 
     |F^m(z) - z* - M (z - z*)| <= 0.02 (1 - rho) |z - z*|
@@ -10,11 +10,11 @@ every recurrence must satisfy
 until the visited points enclose the rest of the way. With complex multipliers of argument theta the motion passes through
 all directions within ``max(2 pi/theta, pi/(pi - theta))`` recurrences. The gaps between these directions, at most 120
 degrees, count as closed after the distance has shrunk by ``cos(gap/2)``. With real multipliers the faster component must
-have shrunk by a factor of 30 relative to the other. In any case it is enough that the distance has shrunk by that factor.
+have shrunk by a factor of 30 relative to the other. In any case a decrease of the distance by this factor is enough.
 
-Near a fold or a period doubling rho is nearly 1, and this would take thousands of periods. The motion then moves slowly
-along one line, the direction of the slow multiplier. The map itself shows that this line contains nothing else: from each
-of eight points between the orbit and the motion, one recurrence (two if the multiplier is negative) must lead nearer to the
+Near a fold or a period doubling rho is nearly 1, and this test would need thousands of periods. The motion then moves slowly
+along one line, the direction of the slow multiplier. The map shows that no other orbit lies on this line: from each of
+eight points between the orbit and the motion, one recurrence (two if the multiplier is negative) must lead nearer to the
 orbit.
 """
 
@@ -33,15 +33,16 @@ REMAINDER = 0.02
 # Relative distance at which the motion has arrived.
 _ARRIVED = 1e-9
 _DECAY = np.log(30.0)
-# Slow: modulus of the slow multiplier, ratio of the fast one to it, and relative distance from the slow line.
+# A slow approach: least modulus of the slow multiplier, largest ratio of the fast multiplier to the slow one, and largest
+# distance of the motion from the slow line relative to its distance from the orbit.
 _SLOW, _APART, _OFF = 0.9, 0.9, 0.1
-# Points of the line, and their least contraction as a fraction of 1 - rho.
+# Number of points tested on the slow line, and their least contraction as a fraction of 1 - rho.
 PROBES, _PULL = 8, 0.2
 
 
 class Orbit(NamedTuple):
-    """An orbit through ``u, v``, each field ``(width,)``: its transition ``matrix`` over its period, the logarithm of
-    the determinant of that, and the estimated ``error`` of u."""
+    """An orbit through ``u, v``, each field ``(width,)``: the transition ``matrix`` over its period, the logarithm of the
+    determinant of the matrix, and the estimated ``error`` of u."""
 
     u: Array
     v: Array
@@ -71,7 +72,7 @@ def recurrences(orbit: Orbit) -> Array:
 
 
 def obeys(orbit: Orbit, before: tuple[Array, Array], after: tuple[Array, Array], omega: Array) -> tuple[Array, Array]:
-    """Flags where ``after``, one recurrence after ``before``, agrees with the linearisation; flags where it has arrived."""
+    """Flags where ``after``, one recurrence after ``before``, agrees with the linearisation, and flags of arrival."""
     rho = spectral_radius(orbit.matrix, orbit.log_determinant)
     away = (before[0] - orbit.u, before[1] - orbit.v)
     ahead = apply(orbit.matrix, *away)
@@ -83,7 +84,7 @@ def obeys(orbit: Orbit, before: tuple[Array, Array], after: tuple[Array, Array],
 
 
 def along(orbit: Orbit, away: tuple[Array, Array]) -> tuple[Array, Array]:
-    """The part of ``away`` along the slow line: the projection ``(M - mu_fast)/(mu_slow - mu_fast)`` (real mu only)."""
+    """Component of ``away`` along the slow line: the projection ``(M - mu_fast)/(mu_slow - mu_fast)`` (real mu only)."""
     half = (orbit.matrix[0] + orbit.matrix[3]) / 2
     root = jnp.sqrt(jnp.maximum(half**2 - jnp.exp(orbit.log_determinant), 0.0))
     slow, fast = jnp.where(half < 0, half - root, half + root), jnp.where(half < 0, half + root, half - root)
@@ -104,9 +105,9 @@ def creeps(orbit: Orbit, state: tuple[Array, Array], omega: Array) -> Array:
 
 
 def doubled(orbit: Orbit) -> tuple[Orbit, Array]:
-    """The orbit, over two of its periods where its slow multiplier is negative; flags of these.
+    """The orbit, over two periods where its slow multiplier is negative, and flags of these lanes.
 
-    Over one period a motion near such an orbit changes sides, and may approach from one side only.
+    Over one period a motion near such an orbit changes sides, and the orbit may attract from one side only.
     """
     a, b, c, d = orbit.matrix
     negative = a + d < 0
@@ -122,8 +123,8 @@ def probe(orbit: Orbit, state: tuple[Array, Array], number: Array) -> tuple[Arra
 
 
 def pulled(orbit: Orbit, state: tuple[Array, Array], place: Array, after: tuple[Array, Array], omega: Array) -> Array:
-    """Flags where ``after``, a recurrence after the point ``place`` of the line to ``state``, is nearer on the same
-    side."""
+    """Flags where ``after``, one recurrence after the point ``place`` of the line to ``state``, lies nearer to the orbit on
+    the same side."""
     rho = spectral_radius(orbit.matrix, orbit.log_determinant)
     unit = along(orbit, (state[0] - orbit.u, state[1] - orbit.v))
     there = along(orbit, (after[0] - orbit.u, after[1] - orbit.v))

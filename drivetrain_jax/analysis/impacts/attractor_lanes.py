@@ -1,7 +1,7 @@
 """Lanes on their way to attractors: they settle period by period, start searches, and confirm the results.
 
-A *lane* processes one point at a time. It stores the states of the last 33 periods, to guess the number of periods after
-which the motion recurs, and accumulates the growth of a tangent for the Lyapunov exponent.
+A *lane* processes one point at a time. It stores the states of the last 33 periods to guess the period multiple, and
+accumulates the growth of a tangent for the Lyapunov exponent.
 """
 
 from __future__ import annotations
@@ -18,37 +18,37 @@ from drivetrain_jax.analysis.impacts.piecewise_march import Motion
 from drivetrain_jax.analysis.impacts.plane_map import apply
 
 MOST_PERIODS = 32
-# Ratio of recurrences that count as equally good.
+# Ratios to the best recurrence up to which another one counts as equally good: generous and narrow.
 _NEAR, _NARROW = 30.0, 1.5
-# Recurrences for which a found orbit is kept while the motion does not yet satisfy its linearisation.
+# Recurrences for which an orbit is kept although the motion does not yet satisfy the linearisation about it.
 _PATIENCE = 8
 _ROWS = np.arange(MOST_PERIODS + 1, dtype=np.int32)[:, None]
 
 
 class Lane(NamedTuple):
-    """State of the lanes, each field ``(width, ...)``: job and place in it, the motion, and the search in progress."""
+    """State of the lanes, each field ``(width, ...)``: job, place in the job, motion, and search in progress."""
 
     job: Array
     place: Array
     motion: Motion
     count: Array  # periods settled  # pyright: ignore[reportIncompatibleMethodOverride]
     due: Array  # periods after which the next search starts
-    latest: tuple[Array, Array]  # state after these
+    latest: tuple[Array, Array]  # state after the settled periods
     tangent: tuple[Array, Array]
     growth: Array  # logarithm of the growth of the tangent
-    cost: Array  # most steps that a settled period has taken
+    cost: Array  # largest number of steps of a settled period
     searching: Array
     multiple: Array
     corrections: Array
     second: Array  # candidate to try if this period multiple fails
     guess: tuple[Array, Array]
-    first: tuple[Array, Array]  # F^m of the state the search started from
+    first: tuple[Array, Array]  # F^m of the initial state of the search
     change: Array  # size of the last correction
     approaching: Array
-    orbit: Orbit  # what the motion approaches
+    orbit: Orbit  # the orbit that the motion approaches
     begun: Array  # periods settled when the approach began
-    held: Array  # recurrences since then
-    probing: Array  # number of the point of the slow line that is tried, -1: none
+    held: Array  # successive recurrences that agree with the linearisation
+    probing: Array  # number of the point on the slow line under test, -1: none
 
 
 def select(condition: Array, new: Any, old: Any) -> Any:
@@ -57,9 +57,11 @@ def select(condition: Array, new: Any, old: Any) -> Any:
 
 
 def candidates(lane: Lane, history: Array, omega: Array) -> tuple[Array, Array]:
-    """Two guesses at the period multiple: the smallest m after which the motion recurs to within a factor of the best
-    recurrence, for a generous factor and for a narrow one. Row ``n % 33`` of ``history``, shape ``(33, 2 width)``, has
-    displacements and velocities after n periods."""
+    """Two guesses at the period multiple, for a generous and for a narrow factor.
+
+    A guess is the smallest m whose recurrence is within this factor of the best one. Row ``n % 33`` of ``history``, shape
+    ``(33, 2 width)``, holds displacements and velocities after n periods.
+    """
     u, v = lane.latest
     distance = jnp.abs(history[:, : u.size] - u) + jnp.abs(history[:, u.size :] - v) / omega
     age = (lane.count - _ROWS) % (MOST_PERIODS + 1)
@@ -92,7 +94,7 @@ def restart(lane: Lane, going: Array, u: Array, v: Array, periods: Array | int) 
 
 
 def settle(lane: Lane, now: Array, forget: int, omega: Array) -> Lane:
-    """One more period settled in the lanes ``now``; at the period number ``forget`` the growth restarts."""
+    """The lanes after one more settled period in the lanes ``now``; at period ``forget`` the growth restarts from 0."""
     motion = lane.motion
     count = lane.count + 1
     tangent = apply(motion.matrix, *lane.tangent)
@@ -123,7 +125,7 @@ def search(lane: Lane, now: Array, multiple: Array, second: Array) -> Lane:
 
 
 def resume(lane: Lane, failed: Array) -> Lane:
-    """After a failed search: the second candidate if there is one, else continue settling."""
+    """The lanes after failed searches: they try the second candidate if there is one, else continue settling."""
     lane = lane._replace(probing=jnp.where(failed, -1, lane.probing))
     again = failed & (lane.second != lane.multiple)
     back = failed & ~again
@@ -133,7 +135,7 @@ def resume(lane: Lane, failed: Array) -> Lane:
 
 
 def approach(lane: Lane, now: Array, orbit: Orbit) -> Lane:
-    """Lanes ``now`` have found an orbit from their latest state: the motion continues from there towards it."""
+    """The lanes after an orbit was found in the lanes ``now``: the motion continues from the latest state."""
     begun = lane._replace(
         searching=jnp.zeros_like(now),
         approaching=jnp.ones_like(now),
@@ -145,7 +147,7 @@ def approach(lane: Lane, now: Array, orbit: Orbit) -> Lane:
 
 
 def confirm(lane: Lane, now: Array, history: Array, omega: Array) -> tuple[Lane, Array]:
-    """Lanes ``now``, a period further; second: those that have approached their orbit for long enough.
+    """The lanes after a period in the lanes ``now``, and flags of lanes that have approached their orbit for long enough.
 
     If the motion does not satisfy the linearisation about the orbit, counting restarts; a new search may follow.
     """
@@ -158,10 +160,10 @@ def confirm(lane: Lane, now: Array, history: Array, omega: Array) -> tuple[Lane,
 
 
 def try_line(lane: Lane, now: Array, orbit: Orbit, omega: Array) -> tuple[Lane, Array, Array]:
-    """Lanes ``now`` have found an orbit that they approach slowly, or have run from a point of the line to it.
+    """The lanes with the next point on the slow line, flags of success and flags of failure.
 
-    They continue with the next point. Second: lanes whose points all approached the orbit; third: lanes with one that did
-    not.
+    Lanes ``now`` have found an orbit that they approach slowly, or have run from a point on the line. A lane succeeds if
+    all its points approached the orbit, and fails at the first point that did not.
     """
     begins = now & (lane.probing < 0)
     twice, negative = doubled(orbit)

@@ -1,7 +1,7 @@
 """Motions of a branch at a given frequency, from points along the branch.
 
-Between its points the branch is a cubic (Hermite's, with the slopes of parabolas through three points), cut in two where it
-turns back in frequency. Next to a fold both of its sides are thus found, each near its own motion.
+Between two points the branch is a Hermite cubic with the slopes of parabolas through three points. The cubic is cut in two
+where it turns back in frequency, so that the motions on both sides of a fold are found.
 """
 
 from __future__ import annotations
@@ -20,8 +20,11 @@ _SAME = 1e-9
 
 
 class Course(NamedTuple):
-    """Points of a branch and slopes per interval at both of its ends; ``nodes``: frequencies at the points and, between
-    them, at the cut of each interval, which is at the part ``cut`` of it."""
+    """Points of a branch, and the slopes at both ends of each interval.
+
+    ``cut`` is the fraction of each interval at which it is cut. ``nodes`` are the frequencies at the points and, between
+    them, at the cuts.
+    """
 
     points: Array
     slopes: tuple[Array, Array]
@@ -44,7 +47,7 @@ def course(points: Array, scale: Array) -> Course:
     length = jnp.sqrt(jnp.sum((rise / scale) ** 2, axis=1, keepdims=True))
     rate = rise / jnp.where(length > 0, length, 1.0)
     inner = (length[1:] * rate[:-1] + length[:-1] * rate[1:]) / (length[1:] + length[:-1])
-    # At both ends the slope of the chord.
+    # At both ends of the branch, use the slope of the chord.
     inner = jnp.where(jnp.isfinite(inner), inner, rate[:-1])
     slope = jnp.concatenate([rate[:1], inner, rate[-1:]])
     slopes = (slope[:-1] * length, slope[1:] * length)
@@ -64,8 +67,10 @@ def course(points: Array, scale: Array) -> Course:
 
 
 def sections(branch: Course, omega: Array, count: int) -> tuple[Array, Array, Array]:
-    """Up to ``count`` positions of the branch at ``omega``, in its order: ``(count, n, N)``, flags of existing ones, and
-    flags if these are all."""
+    """Up to ``count`` positions of the branch at ``omega`` in its order, ``(count, n, N)``, and two flags.
+
+    The flags mark existing positions, and lanes in which these are all positions.
+    """
     above = branch.nodes > omega
     changes = sign_changes(above, count) & jnp.isfinite(branch.nodes[1:])
     every = jnp.sum((above[1:] != above[:-1]) & jnp.isfinite(branch.nodes[1:]), axis=0) <= count
@@ -98,7 +103,7 @@ def sections(branch: Course, omega: Array, count: int) -> tuple[Array, Array, Ar
 def distinct(high: Array, low: Array) -> Array:
     """True if all motions with these extremes, ``(count, ...)`` by rising ``high`` and NaN after the last, are different.
 
-    Two positions of a branch corrected to one motion mean that another one is missing.
+    If two positions of a branch lead to the same motion, another motion is missing.
     """
     size = jnp.maximum(jnp.abs(high), jnp.abs(low))[1:]
     same = (jnp.abs(jnp.diff(high, axis=0)) <= _SAME * size) & (jnp.abs(jnp.diff(low, axis=0)) <= _SAME * size)

@@ -1,8 +1,8 @@
-"""All orbits of the drive's period on the branch that a sweep starts on, stable or not, with its folds and doublings.
+"""All orbits of the drive's period on the branch of a sweep, stable or not, with the folds and period doublings.
 
-The branch is followed by arc length through the first motion of period one that the sweep up meets, both ways to the
-ends of the line (:mod:`~drivetrain_jax.analysis.impacts.orbit_branch`); orbits at the frequencies of the line are corrected
-by Newton's method. Orbits of longer periods and branches that are closed in themselves are not on it.
+The branch runs through the first motion of period one of the sweep up. Continuation by arc length goes both ways to the
+ends of the line (:mod:`~drivetrain_jax.analysis.impacts.orbit_branch`). Newton's method corrects the orbits at the
+frequencies of the line. Orbits of longer periods and closed branches are not included.
 """
 
 from __future__ import annotations
@@ -34,9 +34,11 @@ def branch(
     """Results of the branches through ``first = (u, v, omega)``, shape ``(3, N)``, over the rising ``omega`` (L,).
 
     ``branch_u_max, branch_u_min, branch_stability``, shape ``(L, 7, N)``, by rising largest displacement; if ``special``,
-    ``fold_frequency`` and ``doubling_frequency``, shape ``(L, 16, N)``, the largest 16 within the line, rising. Second,
-    shape ``(L, N)``: true if the branch was followed out of the line both ways (to the highest frequency at least one way),
-    all its orbits were found, and it has no more orbits, folds or doublings than these. NaN in ``first``: no branch.
+    ``fold_frequency`` and ``doubling_frequency``, shape ``(L, 16, N)``, the largest 16 within the line, rising. A lane with
+    NaN in ``first`` has no branch.
+
+    The second result, shape ``(L, N)``, is true if the branch is complete: it left the line both ways (to the highest
+    frequency at least one way), all its orbits were found, and it has no more orbits, folds or doublings than the results.
     """
     low, high = float(omega[0]), float(omega[-1])
     own = {name: jnp.tile(v, 2) for name, v in vars(model).items() if name != "omega" and jnp.ndim(v)}
@@ -66,7 +68,7 @@ def branch(
 
 
 def _ended(omega: Array, limits: tuple[float, float]) -> Array:
-    """True if a branch has been followed until it left the limits."""
+    """True if the branch has left the limits."""
     return jnp.any((omega > limits[1]) | (omega < limits[0]), axis=0)
 
 
@@ -81,8 +83,10 @@ def _along(values: Array, omega: np.ndarray) -> Array:
 
 
 def _ordered(results: dict[str, Array], exists: Array) -> tuple[dict[str, Array], Array]:
-    """By rising largest displacement along the second axis, existing ones first; flags if each position of the branch
-    has its own orbit."""
+    """Results by rising largest displacement along the second axis, missing ones last, and flags of complete points.
+
+    A point is complete if each position of the branch has its own orbit, and all of them fit into the results.
+    """
     order = jnp.argsort(results["branch_u_max"], axis=1)
     ordered = {name: jnp.take_along_axis(x, order, axis=1) for name, x in results.items()}
     high, low = (jnp.moveaxis(ordered[name], 1, 0) for name in ("branch_u_max", "branch_u_min"))
@@ -144,13 +148,15 @@ def _described(model: PiecewiseLinearOscillator, states: Array, exists: Array, w
 def _special(
     model: PiecewiseLinearOscillator, found: Branch, limits: tuple[float, float]
 ) -> tuple[dict[str, Array], Array]:
-    """Frequencies of folds and period doublings within the limits, ``(16, N)``, rising, NaN after the last; and flags if
-    these are all of the branches."""
+    """Frequencies of folds and period doublings within the limits, ``(16, N)``, rising, NaN after the last one.
+
+    The second result is true if the branches have no others.
+    """
     tests = jnp.stack([fold_test(found.matrix), doubling_test(found.matrix)])
     changes = (tests[:, 1:] * tests[:, :-1] < 0).transpose(1, 0, 2)
     lanes = changes.shape[2]
 
-    # The highest ones, and one more to detect further ones.
+    # One more than the results hold, to detect further ones.
     above = jnp.maximum(found.x[1:, 2], found.x[:-1, 2])[:, None]
     above = jnp.where(changes, above, -jnp.inf)
     place = jnp.argsort(-above, axis=0)[: SPECIAL + 1]
@@ -169,7 +175,7 @@ def _special(
     omega = x[2].reshape(place.shape)
     lost = jnp.any(exists & jnp.isnan(omega), axis=(0, 1)).reshape(2, -1).any(axis=0)
     omega = jnp.where((omega >= limits[0]) & (omega <= limits[1]), omega, jnp.nan)
-    # Both ways of the branch together; the highest, then rising.
+    # Join both ways of the branch, select the highest frequencies, then sort them.
     omega = jnp.moveaxis(omega.reshape(-1, 2, 2, lanes // 2), 2, 0).reshape(-1, 2, lanes // 2)
     falling = -jnp.sort(-jnp.where(jnp.isnan(omega), -jnp.inf, omega), axis=0)
     more = jnp.any(jnp.isfinite(falling[SPECIAL]), axis=0)

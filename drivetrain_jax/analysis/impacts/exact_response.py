@@ -1,7 +1,7 @@
 """Results of exact motions of an oscillator with play: single points, and sweeps of the drive's frequency up and down.
 
-:func:`sweeps` serves the method ``exact`` of the analysis ``frequency_response``: ``model.omega`` has shape ``(L,)``, the
-other fields are scalars or have one shape ``(N,)``; results have the frequencies first, then the direction (up, down), then
+:func:`sweeps` is the method ``exact`` of the analysis ``frequency_response``. ``model.omega`` has the shape ``(L,)``; the
+other fields are scalars or have the shape ``(N,)``. Results have the frequencies first, then the direction (up, down), then
 the lanes.
 """
 
@@ -25,11 +25,11 @@ from drivetrain_jax.systems import PiecewiseLinearOscillator
 NON_PERIODIC = REGIMES.index("non_periodic")
 # Results that need integrals over the motion.
 INTEGRALS = frozenset(("u_mean", "u_rms", "phase"))
-# Growth of a tangent (its logarithm) that only chaos explains, lasting or transient: shear alone gives the logarithm of the
+# Logarithmic growth of a tangent that only chaos explains, lasting or transient: shear makes a tangent grow in proportion to
 # time.
 _WILD = 20.0
-# Lanes computed at a time: enough to fill the vector units, few enough to wait little for the slowest. Sweeps are long jobs
-# of very different length.
+# Lanes computed at a time: enough to fill the vector units, but few lanes wait for the slowest. Sweeps have fewer lanes,
+# because they are long jobs of very different length.
 WIDTH, _SWEEP_WIDTH = 64, 32
 
 
@@ -75,7 +75,7 @@ def describe(
 
 
 def periodic_results(oscillator: PiecewiseLinearOscillator, seen: Measures) -> dict[str, Array]:
-    """Extremes, means, contacts and impacts over the periods followed, and the multipliers and Lyapunov exponent of a motion
+    """Extremes, means, contacts and impacts over the measured periods, and the multipliers and Lyapunov exponent of a motion
     with this period."""
     span = seen.periods * oscillator.period
     mean, square, cosine, sine = (integral / span for integral in seen.integrals)
@@ -83,7 +83,7 @@ def periodic_results(oscillator: PiecewiseLinearOscillator, seen: Measures) -> d
     log_determinant = -oscillator.damping * span
     half, determinant = (seen.matrix[0] + seen.matrix[3]) / 2, jnp.exp(log_determinant)
     root = jnp.sqrt((half**2 - determinant).astype(complex))
-    # The larger of both first, the other one from the product.
+    # The larger multiplier first; the smaller one from the product loses no digits.
     first = half + jnp.where(half < 0, -root, root)
     rho = spectral_radius(seen.matrix, log_determinant)
     return {
@@ -113,12 +113,12 @@ def points_of(model: PiecewiseLinearOscillator, length: int, lanes: int) -> Piec
 def sweeps(
     model: PiecewiseLinearOscillator, *, most_periods: int = 1000, rtol: float = 1e-10, integrals: bool = True
 ) -> dict[str, Array]:
-    """Sweeps of the drive's frequency up and down, from rest, each frequency starting on the motion at the last one.
+    """Results of sweeps of the drive's frequency up and down from rest; each frequency starts on the previous motion.
 
-    ``model.omega``: shape ``(L,)``, rising; other fields scalars or ``(N,)``. Gives what :func:`describe` does, in the
-    shape ``(L, 2, N)`` (direction up, down), ``(L, 2, 2, N)`` where that has a leading axis (flank, multiplier, state)
-    of its own; without lanes the last axis is missing. A frequency at which the motion has not settled
-    after ``most_periods`` drive periods hands on the state it is in.
+    ``model.omega`` has the shape ``(L,)`` and rises; other fields are scalars or have the shape ``(N,)``. The results are
+    those of :func:`describe` in the shape ``(L, 2, N)`` (direction up, down), or ``(L, 2, 2, N)`` for results with their own
+    axis (flank, multiplier, state). Without lanes the last axis is missing. If a motion has not settled after
+    ``most_periods`` drive periods, the next frequency starts from its last state.
     """
     shape = jnp.broadcast_shapes(*(jnp.shape(getattr(model, n)) for n in ("damping", "stiffness", "alpha", "b")))
     shape = jnp.broadcast_shapes(shape, jnp.shape(model.B0), jnp.shape(model.B1))
@@ -142,7 +142,7 @@ def sweeps(
 
 
 def worst(outcome: Array) -> Array:
-    """The outcome of both directions together, ``(L, 2, ...) -> (L, ...)``."""
+    """The worse outcome of both directions, ``(L, 2, ...) -> (L, ...)``."""
     return jnp.max(outcome, axis=1)
 
 

@@ -26,9 +26,9 @@ _LARGEST = 1000
 
 
 def measured(model: PiecewiseLinearOscillator) -> tuple[PiecewiseLinearOscillator, Array | np.ndarray]:
-    """``model`` with lengths in a unit of its own, and this unit [m], of the common shape of all fields but omega."""
+    """``model`` with lengths in its own unit, and this unit [m] in the common shape of all fields but omega."""
     fields = (model.b, model.B0, model.B1, model.stiffness)
-    # Fixed values of a scene stay constants of the kernel.
+    # Fixed values of a scene stay NumPy arrays, constants of the kernel.
     xp = jnp if any(isinstance(x, Array) for x in fields) else np
     b, B0, B1, stiffness = (xp.asarray(x, float) for x in fields)
     drive = xp.maximum(xp.abs(B0), xp.abs(B1))
@@ -41,5 +41,5 @@ def measured(model: PiecewiseLinearOscillator) -> tuple[PiecewiseLinearOscillato
 
 
 def restored(results: Mapping[str, Array], unit: Array | np.ndarray) -> dict[str, Array]:
-    """``results``, whose last axis is that of ``unit``, with lengths in metres."""
+    """``results`` with lengths in metres; their last axis is that of ``unit``."""
     return {name: x * unit if name in _LENGTHS else x for name, x in results.items()}

@@ -19,7 +19,7 @@ _ROUNDING = 1e-13
 def regime(model: PiecewiseLinearOscillator, high: Array, low: Array) -> Array:
     """Number of flanks (u = b, u = -b) at which contact is made and lost between the extremes, as int8.
 
-    0 is no separation (or, without contact, motion within the play), 1 single-sided, 2 double-sided rattle.
+    0 is motion without separation or, without contact, within the play; 1 is single-sided and 2 double-sided rattle.
     """
     drive_side = (low < model.b) & (model.b < high) & (model.b > 0)
     back_side = (low < -model.b) & (-model.b < high) & (model.b > 0)
@@ -27,8 +27,10 @@ def regime(model: PiecewiseLinearOscillator, high: Array, low: Array) -> Array:
 
 
 def phase_lag(cosine: Array, sine: Array, size: Array) -> Array:
-    """Lag of the fundamental ``cosine cos(omega t) + sine sin(omega t)`` of a motion with displacements up to ``size``,
-    NaN where it is rounding."""
+    """Lag of the fundamental ``cosine cos(omega t) + sine sin(omega t)`` of a motion with displacements up to ``size``.
+
+    NaN where the fundamental is rounding.
+    """
     return jnp.where(jnp.hypot(cosine, sine) > _ROUNDING * size, jnp.arctan2(sine, cosine), jnp.nan)
 
 

@@ -2,8 +2,8 @@
 
 A point of a branch is ``x = (u, v, omega)`` with ``F^m(u, v; omega) = (u, v)``, F being the map over one drive period.
 Branches run through folds and along unstable orbits, and do not end where an orbit loses its stability. Folds
-(``det(1 - M) = 0``) and period doublings (``det(1 + M) = 0``) are located between the points that they separate.
-All functions act on lanes: fields of the oscillator and the components of x have one shape ``(N,)``.
+(``det(1 - M) = 0``) and period doublings (``det(1 + M) = 0``) are located between neighbouring points of a branch.
+All functions act on lanes: fields of the oscillator and components of x have the same shape ``(N,)``.
 """
 
 from __future__ import annotations
@@ -20,18 +20,19 @@ from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, star
 from drivetrain_jax.analysis.impacts.plane_map import Matrix
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
-# Newton: most corrections; size of the last one, over the scale; relative difference for the derivative to omega.
+# Newton: most corrections; last correction over the scale; relative difference for the derivative by omega.
 _CORRECTIONS, _CONVERGED, _DIFFERENCE = 8, 1e-12, 1e-6
-# A step is shortened if it fails and lengthened if it takes few corrections.
+# Factors on the step length after a failure and after few corrections, and the number of corrections that counts as few.
 _SHORTER, _LONGER, _FEW = 0.4, 1.4, 4
 _SHORTEST, _CLOSED, _LEAST_COSINE = 1e-7, 1e-9, 0.8
 # Largest distance of a point from its guess relative to the step; on an arc that turns by acos(0.8) it is tan(acos(0.8)/2).
 _ASIDE = 1 / 3
-# Limits so that no special point hides between two points: largest deviation of the trace from the line through the last
-# two, relative to the distance of a multiplier from 1 or -1; least such distance; part of the longest step always accepted.
+# Limits so that no pair of folds or doublings hides between two points: largest deviation of the trace from the line through
+# the last two points, relative to the smallest test value (``det(1 -+ M)``); least such value; fraction of the longest step
+# up to which steps are always accepted.
 _BENT, _LEAST_DISTANCE, _FINE = 0.25, 0.02, 0.01
 _MOST_STEPS = 100_000
-# Locating a special point: most steps, and the last one relative to the chord.
+# Locating a fold or doubling: most steps, and size of the last step relative to the chord.
 _ROOT_STEPS, _LOCATED = 40, 1e-13
 
 
@@ -52,7 +53,7 @@ class _Solved(NamedTuple):
 
 
 def _map(model: PiecewiseLinearOscillator, multiple: int, x: Array) -> tuple[Array, Matrix, Array]:
-    """``F^m`` of the state, its transition matrix, and its derivative to omega by a forward difference."""
+    """``F^m`` of the state, its transition matrix, and its derivative by omega from a forward difference."""
     omega = jnp.concatenate([x[2], x[2] * (1 + _DIFFERENCE)])
     twice = {name: jnp.tile(value, 2) for name, value in vars(model).items() if jnp.ndim(value)}
     lanes = prepare(replace(model, **(twice | {"omega": omega})))
@@ -84,7 +85,7 @@ def _solve_3(rows: tuple[tuple[Array, Array, Array], ...], right: tuple[Array, A
 
 
 def _on_plane(model: PiecewiseLinearOscillator, multiple: int, guess: Array, normal: Array, scale: Array) -> _Solved:
-    """The orbit on the plane through ``guess`` with this normal (in units of ``scale``), by Newton's method."""
+    """The orbit on the plane through ``guess`` with the given ``normal`` (in units of ``scale``), by Newton's method."""
     lanes = guess.shape[1]
 
     def going(state: tuple[Array, _Solved]) -> Array:
@@ -112,7 +113,7 @@ def _on_plane(model: PiecewiseLinearOscillator, multiple: int, guess: Array, nor
 
 
 def _tangent(solved: _Solved, before: Array, scale: Array) -> Array:
-    """Unit tangent of the branch in units of ``scale``, pointing the way of ``before``."""
+    """Unit tangent of the branch in units of ``scale``, in the direction of the tangent ``before``."""
     m, d = solved.matrix, solved.derivative
     # Orthogonal to both rows of (M - 1, dF/domega).
     first = jnp.stack([(m[0] - 1) * scale[0], m[1] * scale[1], d[0] * scale[2]])
@@ -123,9 +124,10 @@ def _tangent(solved: _Solved, before: Array, scale: Array) -> Array:
 
 
 def scale_of(model: PiecewiseLinearOscillator, x: Array, highest: float = np.inf) -> Array:
-    """Units in which the branch through ``x`` is measured, ``(3, N)``: size of its state, that times omega, omega.
+    """Units for ``(u, v, omega)`` on the branch through ``x``, ``(3, N)``: size of its state, size times omega, and omega.
 
-    A branch up to the frequency ``highest`` is measured with the geometric mean of both, or it would take too many steps.
+    For a branch up to the frequency ``highest`` the geometric mean of both frequencies replaces omega: otherwise there would
+    be too many steps.
     """
     usual = jnp.sqrt(x[2] * highest) if np.isfinite(highest) else x[2]
     size = jnp.abs(x[0]) + jnp.abs(x[1]) / x[2] + model.b
@@ -155,9 +157,9 @@ def follow(
 ) -> Branch:
     """The branch of orbits of ``multiple`` drive periods through ``x = (u, v, omega)``, shape ``(3, N)``.
 
-    ``x`` is a guess for the first point, which has its frequency; ``direction`` (+1, -1), a number or of shape
-    ``(N,)``, is the way omega goes at first. It ends beyond ``limits`` of omega and after ``attempts`` steps, good or
-    bad. ``longest`` is the longest step, in units of :func:`scale_of`.
+    ``x`` is a guess for the first point, whose frequency is kept. ``direction`` (+1, -1), a number or of shape ``(N,)``, is
+    the initial direction of omega. The branch ends beyond the ``limits`` of omega or after ``attempts`` steps, failed ones
+    included. ``longest`` is the longest step, in units of :func:`scale_of`.
     """
     scale = scale_of(model, x, limits[1])
     rise = jnp.zeros_like(x).at[2].set(direction)
@@ -201,7 +203,7 @@ def _going(front: _Front, limits: tuple[float, float]) -> Array:
 
 
 def _straight(front: _Front, there: _Solved) -> Array:
-    """True if the trace changes steadily enough, so that no two special points hide between the last point and the next."""
+    """True if the trace changes so steadily that no pair of folds or doublings hides between the last two points."""
     old, new = front.solved.matrix, there.matrix
     bent = jnp.abs(new[0] + new[3] - old[0] - old[3] - front.slope * front.length)
     tests = jnp.stack([test(matrix) for test in (fold_test, doubling_test) for matrix in (old, new)])
@@ -247,11 +249,11 @@ def locate(
     tests: tuple[Array, Array],
     doubling: Array,
 ) -> Array:
-    """``x`` at the folds or (where ``doubling``) period doublings between two points of a branch each.
+    """``x`` at a fold or (where ``doubling``) a period doubling between two points of a branch, in every lane.
 
-    ``ends``: x before and after, shape ``(3, N)`` each, between which the test changes sign; ``tests``: its values
-    there. By the Illinois variant of the secant method on planes across the chord; NaN where the ends are, and where it
-    has led to no orbit between them.
+    ``ends`` are x before and after the sign change of the test, shape ``(3, N)`` each; ``tests`` are the values of the test
+    there. The method is the Illinois variant of the secant method on planes across the chord. NaN where the ends are NaN,
+    and where no orbit was found between them.
     """
     chord = ends[1] - ends[0]
     scale = jnp.abs(ends[0]) + jnp.abs(ends[1])

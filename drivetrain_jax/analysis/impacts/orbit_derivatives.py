@@ -1,7 +1,7 @@
 """Derivatives of the results of a periodic motion of an oscillator with play.
 
-The motion F over the period is differentiated along the orbit, by the state at its start and by the oscillator. The orbit
-moves by ``dz = (1 - dF/dz)^-1 dF/dp dp``, and every result moves with it.
+The map F over the period is differentiated along the orbit, by the state z at its start and by the fields p of the
+oscillator. The orbit moves by ``dz = (1 - dF/dz)^-1 dF/dp dp``. Every result depends on both z and p.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 _FIELDS = tuple(field.name for field in fields(PiecewiseLinearOscillator))
-# Fields that end at zero: the oscillator is another one beyond, and has other formulas there.
+# Fields whose range ends at zero: there the oscillator has other formulas, and no derivative.
 _ENDS = np.array([name in ("alpha", "b") for name in _FIELDS])
 
 
@@ -37,8 +37,10 @@ def orbit_jacobians(
     names: tuple[str, ...],
     samples: int,
 ) -> dict[str, Array]:
-    """Jacobians ``(..., P)`` of the results ``names`` by all ``parameters``, numbers; ``results`` hold ``orbit_state`` and
-    ``period_multiple``. NaN for a motion that is not periodic."""
+    """Jacobians ``(..., P)`` of the results ``names`` by all ``parameters`` (numbers).
+
+    ``results`` hold ``orbit_state`` and ``period_multiple``. NaN for a motion that is not periodic.
+    """
 
     def model(parameters: Any) -> PiecewiseLinearOscillator:
         return build(eqx.combine(parameters, constants.tree))
@@ -75,5 +77,5 @@ def _vector(oscillator: PiecewiseLinearOscillator) -> Array:
 
 
 def _chained(slopes: Array, by_parameter: Array) -> Array:
-    """``slopes @ by_parameter``, in which zeros win against NaN."""
+    """``slopes @ by_parameter``, with 0 for products of 0 and NaN."""
     return jnp.sum(jnp.where(by_parameter == 0, 0.0, slopes[..., None] * by_parameter), axis=-2)

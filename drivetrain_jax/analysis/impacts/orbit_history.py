@@ -1,4 +1,4 @@
-"""A motion of a piecewise linear oscillator at equally spaced times, exact within rounding."""
+"""A motion of a piecewise linear oscillator at equally spaced times, exact up to rounding."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ def history(
 ) -> tuple[Array, Array]:
     """Displacement and velocity at ``samples`` times, shape ``(samples, N)`` each, from the state ``(u, v)``.
 
-    The times divide ``multiple`` drive periods (32 where it is 0) into equal parts and begin with the start. A lane
-    that is not finite waits; one that needs more steps than any motion over these periods becomes NaN.
+    The times divide ``multiple`` drive periods (32 where it is 0) into equal parts; the first time is the start. A lane that
+    is not finite stops. A lane that needs more steps than any motion over these periods becomes NaN.
     """
     lanes = prepare(oscillator)
     zero = jnp.zeros(u.shape)
     lanes = jax.tree.map(lambda x: x + zero, lanes)
     periods = jnp.where(multiple > 0, multiple, MOST_PERIODS).astype(jnp.int32)
     span = periods * lanes.period / samples
-    # A step more at every time.
+    # Every time costs one more step.
     most = 2 * periods * usual_steps(lanes) + samples
 
     def to_next(motion: Motion, _: None) -> tuple[Motion, tuple[Array, Array]]:

@@ -1,7 +1,7 @@
 """Measures of a motion of a piecewise linear oscillator over its period: extremes, means, contacts and impacts.
 
-The motion is followed by exact steps that also stop at every reversal of the velocity, so every extreme is the end of a
-step. Means are Gauss-Legendre sums over the steps, with 8 nodes on at most two radians of the fastest motion.
+The exact steps also stop at every reversal of the velocity, so every extreme is the end of a step. Means are Gauss-Legendre
+sums over the steps, with 8 nodes on at most two radians of the fastest motion.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from drivetrain_jax.systems.trigonometry import sincos
 
 _NODES, _WEIGHTS = (x.tolist() for x in np.polynomial.legendre.leggauss(8))
 _LONGEST_ARC = 2.0
-# Relative size below which a motion is rounding, and of a difference that still counts as recurrence.
+# Relative size below which a motion is rounding, and relative difference up to which a state counts as recurring.
 _ROUNDING, _RECURRENCE = 1e-13, 1e-7
 _FEW = 8
 
 
 class Measures(NamedTuple):
-    """Sums over the periods followed, shape ``(N,)`` each; pairs are for the driving and the back flank.
+    """Sums over the measured periods, shape ``(N,)`` each; pairs are for the driving and the back flank.
 
-    ``periods``: drive periods followed; ``high, low``: extremes of u; ``integrals``: of u, u^2, u cos(omega t) and
-    u sin(omega t); ``contact``: time in contact; ``impacts``: number of times that a flank is reached; ``speed``:
-    largest velocity at which it is; ``side``: region of the last step; ``matrix``: transition matrix; ``end``: the last u
-    and v; ``complete``: 1, or 0 if given up.
+    ``periods``: measured drive periods; ``high, low``: extremes of u; ``integrals``: of u, u^2, u cos(omega t) and
+    u sin(omega t); ``contact``: time in contact; ``impacts``: number of times that a flank is reached; ``speed``: largest
+    velocity at an impact; ``side``: region of the last step; ``matrix``: transition matrix; ``end``: the last u and v;
+    ``complete``: 1, or 0 if the motion needed too many steps or was not finite.
     """
 
     periods: Array
@@ -73,18 +73,20 @@ def _fresh(u: Array, side: Array) -> Measures:
 
 
 def _reversal(motion: Motion, rate: Derivatives, size: tuple[Array, Array]) -> Bound:
-    """Distance of the velocity from a change of sign; infinite without motion."""
+    """Bound of the velocity's distance from a change of sign; infinite without motion."""
     v, a = motion.v, rate.acceleration
     sign = jnp.where(v != 0, jnp.sign(v), jnp.sign(a))
     still = jnp.abs(v) * size[1] + jnp.abs(a) <= _ROUNDING * size[0]
-    # An infinite value with a slope would be a quotient of infinities.
+    # An infinite value needs the slope 0: otherwise the root is a quotient of infinities.
     slope = jnp.where(still, 0.0, sign * a)
     return Bound(jnp.where(still, jnp.inf, jnp.abs(v)), slope, sign * rate.jerk, rate.snap_bound)
 
 
 def _crossing(lanes: Lanes, side: Array, last: Array, motion: Motion) -> Array:
-    """Zero, with the derivative of the time at which the lane passed from the region ``last`` to ``side``: steps end at the
-    same times for neighbouring motions, and flanks are reached at others."""
+    """Zero, with the derivative of the time at which the lane passed from the region ``last`` to ``side``.
+
+    Steps of neighbouring motions end at the same times, but the motions reach the flanks at different times.
+    """
     passed = (side != last) & (motion.v != 0)
     late = ((side + last) * lanes.flank - motion.u) / jnp.where(passed, motion.v, 1.0)
     return jnp.where(passed, late - jax.lax.stop_gradient(late), 0.0)
@@ -110,7 +112,7 @@ def _integrals(lanes: Lanes, here: Here, motion: Motion, d: Array) -> tuple[Arra
 
 
 def _watched(lanes: Lanes, motion: Motion, so_far: Measures, integrals: bool) -> tuple[Motion, Measures]:
-    """One step that ends at the next event or reversal at the latest, and the measures with it."""
+    """The motion and its measures after one step, which ends at the next event or reversal at the latest."""
     here = locate(lanes, motion.u)
     region = here.region
     rest = lanes.period - motion.time
@@ -127,14 +129,14 @@ def _watched(lanes: Lanes, motion: Motion, so_far: Measures, integrals: bool) ->
         moves = free > _ROUNDING * region.rate**2 * extent
         d = jnp.where(moves, jnp.minimum(d, _LONGEST_ARC / jnp.maximum(region.rate, 1e-300)), d)
     d = jnp.maximum(d, least_step(lanes, here, motion, rate))
-    # Derivatives ignore the ends of steps, which change no measure, except for the end of the period.
+    # The ends of steps do not affect the measures and are not differentiated, except for the end of the period.
     d = jnp.where(d >= rest, rest, jax.lax.stop_gradient(d))
     moved = advance(lanes, here, motion, d)
-    # A flank is reached if a step begins beyond it. Compiled code may round the end of a step differently in two uses:
-    # counted at the end, an impact was missed or counted twice.
+    # An impact counts where a step begins beyond the flank. Compiled code may round the end of a step differently in two
+    # uses, so that a count at the end of steps would miss impacts or count them twice.
     before, last = here.side, so_far.side
     hits = tuple((before == side) & (last != side) for side in (1.0, -1.0))
-    # Without backlash the whole line is in contact, with the flank loaded by the mean drive.
+    # Without backlash contact is permanent, with the flank loaded by the mean drive.
     held = (before == 1) | ((before == 2) & (lanes.mean >= 0)), (before == -1) | ((before == 2) & (lanes.mean < 0))
     later = _crossing(lanes, before, last, motion)
     speed = jnp.abs(motion.v + rate.acceleration * later)
@@ -142,8 +144,8 @@ def _watched(lanes: Lanes, motion: Motion, so_far: Measures, integrals: bool) ->
     spans = tuple(jnp.where(on, d, 0.0) + x for on, x in zip(held, moved_over, strict=True))
     added = _integrals(lanes, here, motion, d) if integrals else (jnp.zeros_like(d),) * 4
     return moved, so_far._replace(
-        # Not by maximum: compiled code may round u differently in its two uses, and the derivative of a tie counts twice.
-        # A motion that is not finite has no extreme.
+        # No maximum: compiled code may round u differently in its two uses, and the derivative of a tie would count twice.
+        # A displacement that is not finite makes the extreme NaN.
         high=jnp.where(moved.u <= so_far.high, so_far.high, moved.u),
         low=jnp.where(moved.u >= so_far.low, so_far.low, moved.u),
         integrals=tuple(a + b for a, b in zip(so_far.integrals, added, strict=True)),
@@ -155,7 +157,7 @@ def _watched(lanes: Lanes, motion: Motion, so_far: Measures, integrals: bool) ->
 
 
 class _Task(NamedTuple):
-    """The motions to follow; ``first``: u, v, most periods, and a flag if a recurrence ends them, ``(4, N)``."""
+    """The motions to measure; ``first`` ``(4, N)``: u, v, most periods, and 1 if a recurrence ends the motion, else 0."""
 
     oscillator: PiecewiseLinearOscillator
     first: Array
@@ -163,9 +165,9 @@ class _Task(NamedTuple):
 
 
 class _Work(NamedTuple):
-    """Lanes that each follow the motion ``index``, the next one in the ``queue``, and the stored results.
+    """State of the loop: each lane measures the motion ``index``; ``queue`` is the next motion, ``store`` holds results.
 
-    ``renewed``: flags of lanes that have just started another motion.
+    ``renewed`` marks lanes that have just started another motion.
     """
 
     index: Array  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -181,8 +183,8 @@ def measure(
 ) -> Measures:
     """Measures of the motions that start from ``(u, v)``, shape ``(N,)``.
 
-    A motion is followed until its state recurs, at most for ``multiple`` periods, so that ``periods`` is the smallest
-    period multiple; where ``multiple`` is 0, for 32 periods. ``integrals`` are zero unless asked for.
+    The measures run until the state recurs, at most for ``multiple`` periods, so that ``periods`` is the smallest period
+    multiple. Where ``multiple`` is 0, they run for 32 periods. Without ``integrals`` the integrals are zero.
     """
     count = u.size
     width = min(width, count)
@@ -198,7 +200,7 @@ def measure(
 
 
 def _tick(task: _Task, work: _Work) -> _Work:
-    """Advance all lanes by a few steps; those whose motion is finished store it and take the next one of the queue."""
+    """Advance all lanes by a few steps; a lane with a finished motion stores its measures and starts the next motion."""
     count = task.first.shape[1]
     here = jnp.minimum(work.index, count - 1)
     u, v, periods, recurs = task.first[:, here]
@@ -222,7 +224,7 @@ def _tick(task: _Task, work: _Work) -> _Work:
 
 
 def _few_steps(lanes: Lanes, periods: Array, pair: tuple[Motion, Measures], integrals: bool) -> tuple[Motion, Measures]:
-    """Some steps; a lane waits at the end of each period for the test of recurrence."""
+    """The motion and its measures after a few steps; a lane waits at the end of a period for the test of recurrence."""
 
     def one(_: Array, pair: tuple[Motion, Measures]) -> tuple[Motion, Measures]:
         motion, so_far = pair

@@ -1,7 +1,7 @@
 """Closed-form flow of a :class:`~drivetrain_jax.systems.PiecewiseLinearOscillator` within one linear region, and the
-longest step that is certain to stay in it. All functions act on lanes: arrays of one shape ``(N,)``.
+longest step that certainly stays in the region. All functions act on lanes: arrays of one shape ``(N,)``.
 
-Within a region ``u'' + C u' + K u = F + B1 cos(omega t)``. With the harmonic response ``q`` taken off, ``x = u - q``
+Within a region ``u'' + C u' + K u = F + B1 cos(omega t)``. With the harmonic response ``q`` subtracted, ``x = u - q``
 and ``y = x'``, and with the step response P and impulse response S = P' of the homogeneous equation,
 
     x(t + d) = x + S y + P (F - K x),    y(t + d) = S' y + S (F - K x),    S' = 1 - K P - C S.
@@ -22,14 +22,14 @@ from drivetrain_jax.systems import PiecewiseLinearOscillator, UnderdampedOscilla
 from drivetrain_jax.systems.trigonometry import sincos
 
 _TINY = 1e-150
-# The Taylor series of the step response is used where |root| d is below this, with so many terms.
+# Largest |root| d for the Taylor series of the step response, and its number of terms.
 _SHORT, _TERMS = 0.5, 14
 
 
 class Piece(NamedTuple):
-    """Constants of one linear region: ``K``, half the damping ``h = C/2``, ``root = sqrt(|K - h^2|)``, whether it is
-    overdamped, its roots ``slow`` and ``fast`` (both -h if it oscillates), the modulus ``rate`` of the larger root, and
-    the harmonic response ``cosine cos(omega t) + sine sin(omega t)``."""
+    """Constants of one linear region: ``K``, half the damping ``h = C/2``, ``root = sqrt(|K - h^2|)``, a flag of
+    overdamping, the roots ``slow`` and ``fast`` (both -h if the region oscillates), the modulus ``rate`` of the larger root,
+    and the harmonic response ``cosine cos(omega t) + sine sin(omega t)``."""
 
     stiffness: Array
     half_damping: Array
@@ -48,7 +48,7 @@ def piece(oscillator: PiecewiseLinearOscillator, stiffness: Array) -> Piece:
     q = stiffness - h**2
     overdamped = jnp.zeros_like(q, bool) if isinstance(oscillator, UnderdampedOscillator) else q < 0
     root = jnp.maximum(jnp.sqrt(jnp.abs(q)), _TINY)
-    # The slow root from the product of both, which is K: no cancellation.
+    # The slow root follows from the product K of both roots, without cancellation.
     slow = jnp.where(overdamped, -stiffness / jnp.maximum(h + root, _TINY), -h)
     fast = jnp.where(overdamped, -(h + root), -h)
     rate = jnp.where(overdamped, h + root, jnp.sqrt(stiffness))
@@ -129,9 +129,9 @@ def _parabola_root(bound: Bound, span: Array) -> Array:
 def certain_span(bounds: tuple[Bound, ...], likely: Array, limit: Array) -> Array:
     """A time up to which none of ``bounds`` falls below zero, at most ``limit``; the search starts at ``likely``.
 
-    On ``[0, s]`` the cubic lies above a parabola, whose first root is certain as far as it does not exceed ``s``. Trial
-    spans that narrow down make it sharp to third order: repeated, this is a Newton iteration that approaches a zero
-    from one side and cannot pass it.
+    On ``[0, s]`` the cubic lies above a parabola, so the smaller one of ``s`` and the first root of the parabola is certain.
+    A second trial with a smaller ``s`` makes the root accurate to third order. Repeated steps are a Newton iteration that
+    approaches a zero from one side and cannot pass it.
     """
     best, span = jnp.zeros_like(limit), jnp.minimum(likely, limit)
     for _ in range(_TRIALS):

@@ -1,10 +1,10 @@
 """Motion of a piecewise linear oscillator over drive periods: every lane moves from event to event at its own pace.
 
 Each pass of the loop advances every lane by one exact step (:mod:`~drivetrain_jax.analysis.impacts.piecewise_flow`) that
-certainly stays within its linear region. Steps therefore shrink towards a flank like Newton iterates. They cannot miss a
-crossing; near a grazing contact a least step carries the lane over the flank. The excess, 1e-12 of the shortest time scale,
-changes the velocity by a relative 1e-24, because the force is continuous. The transition matrix, which it changes by 1e-12,
-is corrected.
+certainly stays within its linear region. Steps therefore shrink towards a flank like Newton iterates and cannot miss a
+crossing. A step has a least length, which carries the lane over the flank. The excess, 1e-12 of the shortest time scale,
+changes the velocity by a relative 1e-24, because the force is continuous. Its effect of 1e-12 on the transition matrix is
+corrected.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from drivetrain_jax.analysis.impacts.piecewise_flow import (
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 from drivetrain_jax.systems.trigonometry import sincos
 
-# Least step over the shortest time scale, and over the period (rounding of the time).
+# Least step: ratio to the shortest time scale, and to the period (rounding of the time).
 _LEAST_STEP, _LEAST_PART = 1e-12, 1e-15
 # Longest step, as a phase of the drive.
 _LONGEST_PHASE = 1.5
 _LIKELY_ARC = 2.5
-# Distance from a flank, in half backlashes, at which a lane is carried over it; a lane at rest there moves by this fraction
-# of its motion.
+# Distance from a flank, in half backlashes, within which a lane is carried over it; longest such step of a slow lane, in
+# radians of the region's fastest motion.
 _ON_FLANK, _RESTING_ARC = 4e-16, 0.1
 _FEW = 8
 
@@ -53,7 +53,7 @@ class Lanes(NamedTuple):
 
 
 def prepare(oscillator: PiecewiseLinearOscillator) -> Lanes:
-    """Constants of the lanes. Without backlash the flanks are out of reach of |u| and the whole line is in contact."""
+    """Constants of the lanes. Without backlash the position of the flanks is negative and contact is permanent."""
     stiffness, b = jnp.asarray(oscillator.stiffness), jnp.asarray(oscillator.b)
     contact, gap = piece(oscillator, stiffness), piece(oscillator, oscillator.alpha * stiffness)
     period = jnp.asarray(oscillator.period)
@@ -95,7 +95,7 @@ def start(lanes: Lanes, u: Array, v: Array, periods: Array) -> Motion:
 
 
 class Here(NamedTuple):
-    """The region a lane is in (``side`` +1, 0, -1; 2 without backlash) with its constants and constant force."""
+    """The region of a lane (``side`` +1, 0, -1; 2 without backlash), the constants of the region, and its constant force."""
 
     side: Array
     region: Piece
@@ -103,7 +103,7 @@ class Here(NamedTuple):
 
 
 def locate(lanes: Lanes, u: Array) -> Here:
-    """Region of displacement ``u``: outside the flanks in contact, up to and on them in the gap."""
+    """Region of the displacement ``u``: in contact beyond the flanks; in the gap between them, flanks included."""
     linear = lanes.flank < 0
     side = jnp.where(u > lanes.flank, 1.0, jnp.where(u < -lanes.flank, -1.0, 0.0))
     region = choose(linear | (side != 0), lanes.contact, lanes.gap)
@@ -122,8 +122,11 @@ class Derivatives(NamedTuple):
 
 
 def derivatives(lanes: Lanes, here: Here, motion: Motion, limit: Array) -> Derivatives:
-    """Derivatives at the present time. ``w = u''`` obeys the same equation with the drive ``-omega^2 B1 cos(omega t)``,
-    so that ``sqrt(w'^2 + K w^2)`` grows by at most ``omega^2 |B1|`` per unit of time; likewise its derivative."""
+    """Derivatives at the current time, and their bounds.
+
+    ``w = u''`` obeys the same equation with the drive ``-omega^2 B1 cos(omega t)``. Hence ``sqrt(w'^2 + K w^2)`` grows by at
+    most ``omega^2 |B1|`` per unit of time, and the same expression in ``w'`` by at most ``omega^3 |B1|``.
+    """
     damping, stiffness = 2 * here.region.half_damping, here.region.stiffness
     omega, drive = lanes.omega, lanes.amplitude
     a = here.force - damping * motion.v - stiffness * motion.u + drive * motion.cosine
@@ -135,7 +138,7 @@ def derivatives(lanes: Lanes, here: Here, motion: Motion, limit: Array) -> Deriv
 
 
 def flank_bounds(lanes: Lanes, side: Array, motion: Motion, rate: Derivatives) -> tuple[Bound, Bound]:
-    """Distances of the lane from leaving its region on either side (infinite without a flank)."""
+    """Bounds of the distances to the flanks on either side of the region (infinite without a flank)."""
     b, u, v, a, jerk = lanes.flank, motion.u, motion.v, rate.acceleration, rate.jerk_bound
     inside, sign = side == 0, jnp.where(side == 0, -1.0, side)
     near = jnp.where(inside, b - u, sign * u - b)
@@ -147,10 +150,12 @@ def flank_bounds(lanes: Lanes, side: Array, motion: Motion, rate: Derivatives) -
 
 
 def _overdue(lanes: Lanes, here: Here, u: Array, v: Array, d: Array) -> Array:
-    """Time that a step of length ``d`` ending in ``(u, v)`` was really in contact if the region ``here`` is the gap;
-    negative in the other direction."""
+    """Time in contact at the end of a step from the gap (``here``), or minus the time in the gap of a step from contact.
+
+    The step has the length ``d`` and ends in ``(u, v)``.
+    """
     over = jnp.abs(u) - lanes.flank
-    # A lane that is turned back at the flank may be over it during the whole step; one at rest there is not.
+    # A lane that reverses at the flank may be beyond it during the whole step; a lane at rest on the flank is not.
     late = jnp.minimum(jnp.abs(over) / jnp.maximum(jnp.abs(v), 1e-300), d)
     late = jnp.where(jnp.abs(over) > _ON_FLANK * lanes.flank, late, 0.0)
     left = (jnp.abs(here.side) == 1) & (over < 0)
@@ -158,7 +163,7 @@ def _overdue(lanes: Lanes, here: Here, u: Array, v: Array, d: Array) -> Array:
 
 
 def advance(lanes: Lanes, here: Here, motion: Motion, d: Array) -> Motion:
-    """``motion`` after the time ``d``, all of it in the region ``here``; a period that ends is counted."""
+    """``motion`` after the time ``d`` in the region ``here``, with the end of a period counted."""
     region, omega = here.region, lanes.omega
     step, impulse, rate = responses(region, d)
     ends = d >= lanes.period - motion.time
@@ -183,7 +188,7 @@ def advance(lanes: Lanes, here: Here, motion: Motion, d: Array) -> Motion:
 
 
 def likely_span(here: Here) -> Array:
-    """A first guess of the length of a step within the region: a large part of its oscillation."""
+    """First guess of the length of a step: a large part of an oscillation of the region."""
     return _LIKELY_ARC / jnp.maximum(here.region.rate, 1e-300)
 
 
@@ -202,8 +207,7 @@ def stays(lanes: Lanes, here: Here, motion: Motion) -> Array:
 
 
 def least_step(lanes: Lanes, here: Here, motion: Motion, rate: Derivatives) -> Array:
-    """The least step. On a flank, up to rounding, it is long enough to leave it even for a slow lane, which would
-    otherwise never move."""
+    """The least step. On a flank, up to rounding, it is long enough to move even a slow lane off the flank."""
     way = jnp.maximum(_ON_FLANK * jnp.abs(lanes.flank), 1e-300)
     longest = _RESTING_ARC / jnp.maximum(here.region.rate, 1e-300)
     pull = jnp.abs(rate.acceleration) + longest * rate.jerk_bound
@@ -213,7 +217,7 @@ def least_step(lanes: Lanes, here: Here, motion: Motion, rate: Derivatives) -> A
 
 
 def next_step(lanes: Lanes, here: Here, motion: Motion) -> Array:
-    """The longest certain step within the region ``here`` (or the least step) within the period."""
+    """The longest step that certainly stays in the region ``here``, at least the least step, within the period."""
     rest = lanes.period - motion.time
     limit = jnp.minimum(rest, _LONGEST_PHASE / lanes.omega)
     rate = derivatives(lanes, here, motion, limit)
@@ -223,7 +227,7 @@ def next_step(lanes: Lanes, here: Here, motion: Motion) -> Array:
 
 
 def step(lanes: Lanes, motion: Motion) -> Motion:
-    """``motion`` one certain step on in the lanes that still have periods to go and are finite."""
+    """``motion`` after one step in the finite lanes with remaining periods."""
     here = locate(lanes, motion.u)
     moved = advance(lanes, here, motion, next_step(lanes, here, motion))
     active = (motion.left > 0) & jnp.isfinite(motion.u)
@@ -231,18 +235,20 @@ def step(lanes: Lanes, motion: Motion) -> Motion:
 
 
 def few_steps(lanes: Lanes, motion: Motion) -> Motion:
-    """``motion`` a fixed small number of steps on."""
+    """``motion`` after a fixed small number of steps."""
     return jax.lax.fori_loop(0, _FEW, lambda _, moving: step(lanes, moving), motion)
 
 
 def usual_steps(lanes: Lanes) -> Array:
-    """A number of steps above the need of any drive period (measured: 5 for an oscillation, up to 15 for a crossing)."""
+    """Number of steps that no drive period exceeds (measured: 5 per oscillation, up to 15 per crossing)."""
     return 2000 + 100 * lanes.period * jnp.maximum(lanes.contact.rate, lanes.gap.rate) / (2 * np.pi)
 
 
 def march(lanes: Lanes, motion: Motion, most_steps: int) -> Motion:
-    """``motion`` after its remaining periods. A lane that needs more than ``most_steps`` steps keeps periods ``left``;
-    lanes that are finished or not finite wait."""
+    """``motion`` after its remaining periods.
+
+    A lane that needs more than ``most_steps`` steps keeps periods ``left``. Lanes that are finished or not finite wait.
+    """
 
     def going(motion: Motion) -> Array:
         return jnp.any((motion.left > 0) & (motion.steps < most_steps) & jnp.isfinite(motion.u))

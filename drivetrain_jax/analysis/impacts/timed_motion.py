@@ -1,5 +1,4 @@
-"""A motion of a piecewise linear oscillator from any start: its states at given times, exact within rounding, and its
-events."""
+"""States at given times and events of a motion of a piecewise linear oscillator from any start, exact up to rounding."""
 
 from __future__ import annotations
 
@@ -26,8 +25,10 @@ DRIVE, BACK, NO_EVENT = range(3)
 
 
 class Events(NamedTuple):
-    """Contacts made and lost, in order: ``time``, number of the ``flank`` and ``velocity``, shape ``(events, N)``, NaN and
-    ``NO_EVENT`` behind the last one, and their ``number`` (N,), which may exceed the length of the list."""
+    """Contacts made and lost, in order: ``time``, number of the ``flank`` and ``velocity``, shape ``(events, N)``.
+
+    After the last event, entries are NaN and ``NO_EVENT``. The ``number`` (N,) of events may exceed the length of the list.
+    """
 
     time: Array
     flank: Array
@@ -45,10 +46,10 @@ class _Walk(NamedTuple):
 def timed_motion(
     oscillator: PiecewiseLinearOscillator, u: Array, v: Array, times: np.ndarray, most_events: int
 ) -> tuple[Array, Array, Events, Array]:
-    """Displacement and velocity ``(T, N)`` at the rising ``times`` from the state ``(u, v)`` at t = 0, the first
-    ``most_events`` events, and flags ``(N,)`` of lanes that needed more steps than any motion that does not graze.
+    """Displacement and velocity ``(T, N)`` at the rising ``times``, the first ``most_events`` events, and flags ``(N,)``.
 
-    Times are counted in whole periods and a fraction, so that the phase of the drive does not drift.
+    The motion starts in the state ``(u, v)`` at t = 0. A flag marks a lane that needed too many steps, which only a grazing
+    motion does. Times are counted in whole periods and a fraction, so that the phase of the drive does not drift.
     """
     lanes = jax.tree.map(lambda x: x + jnp.zeros(u.shape), prepare(oscillator))
     turns = jnp.asarray(times)[:, None] / lanes.period
@@ -75,10 +76,10 @@ def timed_motion(
 
 
 def _moved(lanes: Lanes, walk: _Walk, target: tuple[Array, Array], active: Array) -> _Walk:
-    """One step on in the ``active`` lanes, at most to the ``target``, periods and time within the last one."""
+    """The march after one step of the ``active`` lanes, at most to the ``target``: whole periods and the time after them."""
     motion, (whole, part) = walk.motion, target
     here = locate(lanes, motion.u)
-    # Where a step ends within a region, or on a flank, has no influence on the motion, and its derivative may be infinite.
+    # The end of a step does not influence the motion, and its derivative may be infinite: it is not differentiated.
     d = next_step(*jax.lax.stop_gradient((lanes, here, motion)))
     d = jnp.where(d >= lanes.period - motion.time, lanes.period - motion.time, d)
     d = jnp.where(-motion.left == whole, jnp.minimum(d, part - motion.time), d)
@@ -92,7 +93,7 @@ def _moved(lanes: Lanes, walk: _Walk, target: tuple[Array, Array], active: Array
 
 
 def _recorded(events: Events, crosses: Array, time: Array, flank: Array, velocity: Array) -> Events:
-    """``events`` with one more in the lanes that cross a flank; without room it is only counted."""
+    """``events`` with one more event in the lanes that cross a flank; when the list is full, the event is only counted."""
     length = events.time.shape[0]
     place = jnp.where(crosses, events.number, length), jnp.arange(crosses.shape[0])
     return Events(
