@@ -1,16 +1,16 @@
 """Lyapunov spectra by the variational equations, with error estimates and a verdict.
 
-Exponents are natural logarithms per second, in falling order. Phases of the flow are left out (their exponents are always
-zero). The paper's estimator is available under its own name.
+Exponents are natural logarithms per second, in falling order. Phases of the flow are left out, because their exponents are
+always zero. The paper's estimator is available under its own name.
 
 The number of steps is predicted for every point (see :mod:`~drivetrain_jax.analysis.lyapunov.march_steps`) unless
 ``steps`` is given; a batch uses the largest number of its members.
 
 Outcome: ``SUCCESS``, or ``TOLERANCE_NOT_MET`` if the standard error exceeds the target at ``max_time`` or the steps are too
-few: the exponents do not sum to the mean divergence, or a positive one changes with half the steps. The verdict is then
-``undecided``. For a motion that leaves all bounds the verdict says so, and its exponents are those of the time before,
-without an error (NaN). ``NOT_FINITE`` if it leaves too soon for exponents, ``STEP_LIMIT`` if ``max_time`` is more than 1e12
-steps, or a strobe is predicted to need more than 1e5.
+few: the exponents do not sum to the mean divergence, or a positive exponent changes with half the steps. With too few steps
+the verdict is ``undecided``. The exponents of an unbounded motion are means until it leaves the bounds, without an error
+(NaN). ``NOT_FINITE`` if a motion leaves the bounds too soon for exponents; ``STEP_LIMIT`` if ``max_time`` is more than 1e12
+steps, or if a strobe is predicted to need more than 1e5 steps.
 """
 
 from __future__ import annotations
@@ -81,8 +81,11 @@ _CHUNK = 64
 
 
 class Spectrum(NamedTuple):
-    """Exponents in falling order and their errors, ``(m, ...)``; ``order``: place of each in the record; ``weighted``: true
-    where they are weighted means, ``(...)``."""
+    """Exponents in falling order and their errors, ``(m, ...)``.
+
+    ``order`` (m, ...) is the place of each exponent in the record. ``weighted`` (...) is true where the exponents are
+    weighted means.
+    """
 
     values: Array
     errors: Array
@@ -107,7 +110,7 @@ def _until_the_end(record: Record, series: Array) -> Array:
 
 
 def sum_rule_residual(record: Record, spectrum: Spectrum) -> Array:
-    """Sum of the exponents minus the divergence averaged alike; the phases add nothing to either."""
+    """Sum of the exponents minus the divergence, averaged in the same way; the phases add nothing to either."""
     series = record.contraction[:, None]
     plain, _ = block_mean(series, record.used, record.span)
     weighted, _ = weighted_mean(series, record.contraction_moment[:, None], record.used, record.span)
@@ -116,15 +119,18 @@ def sum_rule_residual(record: Record, spectrum: Spectrum) -> Array:
 
 
 class Run(NamedTuple):
-    """Records with the step and with twice the step (empty if not needed)."""
+    """Records with the step and with twice the step; the second is empty where it is not needed."""
 
     fine: Record
     coarse: Record
 
 
 def run_twice(flow: Flow, steps: Any, max_time: float, target: float) -> Run:
-    """The growth with ``steps`` and ``steps // 2`` per strobe, the latter for members with a positive largest exponent
-    beyond its error. One compiled loop serves both."""
+    """Records of growth with ``steps`` and with ``steps // 2`` per strobe.
+
+    The second march is for members whose largest exponent is positive beyond its error. Both marches share one compiled
+    loop.
+    """
 
     def one(active: Array, steps: Array) -> tuple[Array, Record]:
         record = record_growth(flow, steps, max_time, target, active)
@@ -147,7 +153,7 @@ class Findings(NamedTuple):
 
 
 def findings_of(run: Run, period: Any) -> Findings:
-    """The results of both marches, compared with each other."""
+    """The spectra of both marches, the residual of the sum rule, and the result of their comparison."""
     spectrum, coarse = spectrum_of(run.fine), spectrum_of(run.coarse)
     residual = sum_rule_residual(run.fine, spectrum)
     sound = resolved(spectrum.values, spectrum.errors, residual, period, coarse.values[0], coarse.errors[0])
@@ -191,13 +197,13 @@ def analyse(flow: Flow, request: Request) -> dict[str, Array]:
     spectrum = found.spectrum
     results |= _of_spectrum(run.fine, found)
     if wanted & _SECTION:
-        # Unforced motion that does not decay is decided by K.
+        # The verdict needs K if the motion grows, or if it is unforced.
         needed = spectrum.values[0] > STANDARD_ERRORS * spectrum.errors[0]
         needed = jnp.ones_like(needed) if "chaos_k01" in wanted or not flow.turns else needed
         rate = spectrum.values[0] + STANDARD_ERRORS * spectrum.errors[0]
         seen = sample(flow, steps, run.fine, rate, needed)
         results["verdict"] = judge(evidence_of(flow, run.fine, found, seen), autonomous=not flow.turns)
-        # K is meaningless for a few repeating points, and is not used there.
+        # The test is meaningless for a few repeating points: K is set to 0, its limit for regular motion.
         repeating = seen.multiple > 0
         results["chaos_k01"] = jnp.where(repeating, 0.0, seen.k01)
         results["period_multiple"] = seen.multiple.astype(jnp.int32)
@@ -226,15 +232,15 @@ def _of_spectrum(fine: Record, found: Findings) -> dict[str, Array]:
 
 
 def _effort(system: type[System], request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Predicted steps, shape (N,): those of a whole run, or of the strobes until the mean contraction has settled the
-    motion, and of the strobes after that.
+    """Predicted steps, shape (N,), of the run and of the strobes after it.
 
-    Infinite above the limit of a whole run.
+    A run with a target for the standard error ends early if contraction settles the motion before ``max_time``. Infinite
+    above the limit of a whole run.
     """
     options, longest = request.options, request.options["max_time"]
     rate, period, needed = predicted(_march, (system.models["lyapunov"].build,), columns)
     steps = np.where(needed <= MOST, needed, np.inf) if options["steps"] is None else options["steps"]
-    # Without a rate the field has no value; the march will find that.
+    # A rate of NaN means that the field has no value; the march then ends as NOT_FINITE.
     settling = SETTLED / np.fmax(rate, SETTLED / longest) if options["standard_error"] > 0 else longest
     strobes = np.maximum(np.clip(settling, longest / 4, longest) / period, SEGMENTS)
     following = SAMPLES if _SECTION & set(request.outputs) else 0

@@ -33,13 +33,13 @@ KIND_COLOURS = ("#ffffff", "#cfe3f3", "#7fb2d9", "#d1771e", "#5b1020", "#b0b0b0"
 _COLOURS = (*LINE_COLOURS, "#3f8f5f", "#7a4fa0", "#999933", "#333333")
 _HEIGHT = 1.9
 _CURVES = ("lyapunov_spectrum", "paper_estimator", "sum_rule_residual", "chaos_k01")
-# Their sum is drawn as well: the mean divergence of the flow, and the subject of the paper's criterion (39).
+# Variables whose sum is drawn too: the mean divergence of the flow, which is the subject of the paper's criterion (39).
 _SUMMED = ("lyapunov_spectrum", "paper_estimator")
 _MOST_COLUMNS = 4
 
 
 def plot(dataset: xr.Dataset) -> Figure:
-    """The exponents over one axis, over two axes as maps (a third one of up to four values as columns), or over time.
+    """The exponents over one axis, over two axes as maps (columns for a third axis of up to four values), or over time.
 
     Over one axis: spectrum with bands of three standard errors, the paper's estimator, the sum rule's residual and K, if
     stored, with the verdict as a coloured strip. A single point shows the convergence history. Raises :class:`InputError`

@@ -1,6 +1,6 @@
 """Decide if a field can be chaotic: two components without forcing cannot (Poincare and Bendixson).
 
-A clock may turn without effect: its equation does not contain it, or the amplitude of its forcing is zero.
+A clock may turn without effect: the field does not contain it, or the amplitude of its forcing is zero.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from jax import Array
 
 from drivetrain_jax.systems import Flow
 
-# Fractions of a strobe at which the clocks are tested; none is a symmetry zero of a harmonic's derivative.
+# Fractions of a strobe at which the clocks are tested; at none of them the derivative of a harmonic vanishes by symmetry.
 _FRACTIONS = tuple((k + 0.37) / 8 for k in range(8))
-# A phase is a clock that is carried as a component.
+# Number of components of a flow that cannot be chaotic without a clock; a phase is a clock among the components.
 _PLANAR = 2
 
 
 def driven(flow: Flow, y: tuple[Array, ...]) -> Array:
-    """Flags where the field at ``y`` depends on any of its clocks, shape (...). Small amplitudes count."""
+    """Flags where the field at ``y`` depends on any of its clocks, shape (...), however small the amplitude."""
     felt = [_felt(flow, y, number) for number in range(len(flow.turns))]
     return jnp.any(jnp.stack([jnp.zeros(jnp.shape(y[0]), bool), *felt]), axis=0)
 

@@ -1,8 +1,8 @@
 """Growth of tangent vectors along a trajectory, recorded in segments of equal time (Benettin's method).
 
-Benettin, Galgani, Giorgilli & Strelcyn, Meccanica 15 (1980): tangent vectors are carried by the linearised flow and
+Benettin, Galgani, Giorgilli & Strelcyn, Meccanica 15 (1980): tangent vectors move with the linearised flow and are
 orthonormalised after every strobe, or more often if rounding requires it. The mean logarithms of the Gram-Schmidt lengths
-are the Lyapunov exponents. A record has a fixed number of segments for any time, so its memory does not grow.
+are the Lyapunov exponents. A record has a fixed number of segments, so its memory does not grow with the time.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ SEGMENTS = 64
 _CHECKS = (SEGMENTS // 4, SEGMENTS // 2, SEGMENTS)
 # The first quarter of the record is transient; the rest is averaged in blocks.
 _DISCARD, BLOCKS = 4, 12
-# Number of standard errors above which a change between the halves is drift, not scatter of the blocks.
+# Number of standard errors above which the difference of the halves is drift, not scatter of the blocks.
 _DRIFTS = 5.0
-# Windows of weighted means, as parts of the time. The first one gives the value; what the others change, its error.
+# Windows of weighted means, as fractions of the time: the first gives the value, its difference from the others the error.
 _WINDOWS = ((0.5, 1.0), (0.375, 0.875), (0.25, 0.75))
 _SAFETY = 3.0
-# A weighted mean is taken if its error is below this part of that of the blocks.
+# Ratio of the error of a weighted mean to the error of the blocks below which the weighted mean is used.
 _SHARPER = 0.1
-# A decaying motion is followed until its transient has fallen by e to this power.
+# Logarithm of the factor by which the transient of a decaying motion must have fallen before the march ends.
 SETTLED = 12.0
 # Size of a component above which the motion is unbounded.
 BOUND = 1e6
@@ -50,10 +50,10 @@ class Record(NamedTuple):
     """Records of each segment; the first axis of every record counts segments.
 
     ``growth``: logarithmic growth of the orthonormal vectors, ``(SEGMENTS, m, ...)``; ``contraction``: integral of the
-    divergence, ``(SEGMENTS, ...)``; ``growth_moment``, ``contraction_moment``: the same, each strobe times its place in the
-    segment, from -1/2 to 1/2; ``size``: largest component (without phases and angles) at a strobe; ``used``: number
-    of valid segments, ``(...)``; ``bounded``: true if the state stayed finite and within ``BOUND``; ``state`` and
-    ``strobe``: end of the march; ``span``: duration of a segment.
+    divergence, ``(SEGMENTS, ...)``; ``growth_moment``, ``contraction_moment``: the same sums with each strobe weighted by
+    its place in the segment, from -1/2 to 1/2; ``size``: largest component (without phases and angles) at a strobe;
+    ``used``: number of valid segments, ``(...)``; ``bounded``: true if the state stayed finite and within ``BOUND``;
+    ``state`` and ``strobe``: end of the march; ``span``: duration of a segment.
     """
 
     growth: Array
@@ -88,7 +88,7 @@ def strobes_per_segment(flow: Flow, max_time: float) -> Array:
 
 
 def state_size(flow: Flow, y: Vector) -> Array:
-    """Largest component in absolute value of those that a bounded motion keeps bounded."""
+    """Largest modulus of the components without phases and angles, which grow even if the motion is bounded."""
     kept = [abs(x) for i, x in enumerate(y) if i not in (*flow.phases, *flow.cyclic)] or [abs(x) for x in y]
     return reduce(jnp.maximum, kept)
 
@@ -96,7 +96,7 @@ def state_size(flow: Flow, y: Vector) -> Array:
 def record_growth(flow: Flow, steps: Any, max_time: float, target: float, active: Array) -> Record:
     """March until every member's standard error is below ``target``, at most ``max_time``, with ``steps`` per strobe.
 
-    A decaying motion is also followed until its transient is below e^-12. Each member stops on its own: its record does not
+    A decaying motion also continues until its transient is below e^-12. Each member stops on its own: its record does not
     depend on the other members, except for rounding if one of them is orthonormalised within strobes. Members that are not
     ``active`` do not start.
     """
@@ -142,7 +142,7 @@ def _grown(flow: Flow, steps: Any, parts: Array) -> Callable[[Array, Frame], tup
 
 
 def _segment(flow: Flow, steps: Any, parts: Array, length: Array) -> Callable[[_March, Array], _March]:
-    """The march over one segment, at most ``longest`` strobes, as one kernel: it has no sums or maxima over an axis."""
+    """The march over one segment of at most ``longest`` strobes, as one kernel: it has no sums or maxima over an axis."""
     advance = _grown(flow, steps, parts)
 
     def strobe(carry: tuple) -> tuple:
@@ -196,8 +196,8 @@ def block_size(used: Array) -> Array:
 def block_mean(series: Array, used: Array, span: Array) -> tuple[Array, Array]:
     """Mean rate of ``series`` (per segment) after the transient and its standard error, both ``(m, ...)``.
 
-    The first quarter of the ``used`` segments is discarded. The rest makes 12 blocks; the error is the larger one of
-    those of 12 and of 6 block means, so that correlation from block to block enlarges it, together with the drift.
+    The first quarter of the ``used`` segments is discarded. The other segments make 12 blocks. The error is the larger
+    standard error of 12 and of 6 block means, which covers correlation between blocks, combined with the drift.
     """
     index = jnp.arange(SEGMENTS).reshape(-1, *(1,) * (series.ndim - 1))
     first = used // _DISCARD
@@ -212,9 +212,9 @@ def block_mean(series: Array, used: Array, span: Array) -> tuple[Array, Array]:
 def weighted_mean(series: Array, moments: Array, used: Array, span: Array) -> tuple[Array, Array]:
     """Mean rate of ``series`` (per segment) with smooth weights, and its error, both ``(m, ...)``.
 
-    The weights exp(-1/(x (1 - x))) of the part x of a window make the averages of periodic and quasi-periodic motion
-    converge faster than any power of the time (Das, Saiki, Sander & Yorke, Nonlinearity 30, 2017). With the ``moments``
-    they vary linearly within a segment. An alignment of the vectors that has not decayed shows in the earlier windows.
+    With the weights exp(-1/(x (1 - x))) at the fraction x of a window, the averages of periodic and quasi-periodic motion
+    converge faster than any power of the time (Das, Saiki, Sander & Yorke, Nonlinearity 30, 2017). The ``moments`` let the
+    weights vary linearly within a segment. Vectors that have not yet aligned enlarge the error, through the earlier windows.
     """
     middle = (jnp.arange(SEGMENTS).reshape(-1, *(1,) * (series.ndim - 1)) + 0.5) / jnp.maximum(used, 1)
     means = []
@@ -229,9 +229,9 @@ def weighted_mean(series: Array, moments: Array, used: Array, span: Array) -> tu
 
 
 def mean_growth(record: Record | _March, span: Array) -> tuple[Array, Array, Array]:
-    """Mean rates of the vectors, their errors, both ``(m, ...)``, and if the means are weighted, ``(...)``.
+    """Mean rates of the vectors and their errors, both ``(m, ...)``, and flags of weighted means, ``(...)``.
 
-    They are where that is much sharper, for all vectors at once, and the largest rate is not positive beyond its error.
+    Means are weighted where this makes the errors of all vectors much smaller and no rate is positive beyond its error.
     """
     plain, errors = block_mean(record.growth, record.used, span)
     weighted, sharp = weighted_mean(record.growth, record.growth_moment, record.used, span)
@@ -242,12 +242,11 @@ def mean_growth(record: Record | _March, span: Array) -> tuple[Array, Array, Arr
 def drift(means: Array) -> Array:
     """Change from the first half of the block means to the second, minus the part explained by their scatter.
 
-    For a vector that grows in proportion to time the rates fall like 1/t, and differ from their limit by more than they
-    scatter.
+    The rates of a vector that grows in proportion to time fall like 1/t, further from their limit than they scatter.
     """
     half = BLOCKS // 2
     change = jnp.mean(means[:half], axis=0) - jnp.mean(means[half:], axis=0)
-    # A drift hardly changes neighbours: half the mean square of their differences is the variance of a single block.
+    # Drift hardly affects differences of neighbours: half their mean square is the variance of a single block.
     chance = jnp.mean(jnp.diff(means, axis=0) ** 2, axis=0) / half
     return jnp.sqrt(jnp.maximum(change**2 - _DRIFTS**2 * chance, 0.0))
 

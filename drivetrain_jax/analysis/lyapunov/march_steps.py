@@ -1,9 +1,9 @@
 """Steps per strobe for a march of tangent vectors, and the number of orthonormalisations within a strobe.
 
-Both are predicted before the march from the largest angular frequency of the flow and its divergence at the start. A step
-of length h turns by y = rho h at the fastest rate rho. DOP853 then changes the logarithm of an amplitude by 2.4e-8 y^10
-with little damping (its stability function on the imaginary axis), and by less than 4e-7 of the decay with strong damping.
-For exponents only the ratio to the decay matters.
+Both numbers are predicted before the march from the largest angular frequency of the flow and its divergence at the start.
+A step of length h turns by y = rho h at the fastest rate rho. By its stability function on the imaginary axis, DOP853
+changes the logarithm of an amplitude by 2.4e-8 y^10 with little damping, and by less than 4e-7 of the decay with strong
+damping. For exponents only the ratio to the decay matters.
 """
 
 from __future__ import annotations
@@ -16,17 +16,16 @@ from jax import Array
 from drivetrain_jax.analysis.lyapunov.variational import batch_shape, divergence, initial_state
 from drivetrain_jax.systems import Flow
 
-# Steps per strobe of a flow without known frequency, fewest steps of others, and the limit above which a march is not
-# started unless requested.
+# Fewest steps per strobe, also those of a flow without a known frequency; most steps unless the option `steps` is given.
 LEAST, MOST = 48, 100_000
 # Damping of an amplitude by one step that turns by a radian; it grows with the tenth power of the angle.
 _DAMPING, _POWER = 2.4e-8, 10
-# Largest relative change of an exponent by the steps, and of the logarithm of an amplitude within a strobe: a hundredth of
-# the detected error (see ``resolution``).
+# Largest change by the steps: of an exponent relative to its size, and of the logarithm of an amplitude within a strobe.
+# Both are a hundredth of the errors that ``resolution`` detects.
 _CHANGE, _ROUNDING = 1e-5, 1e-11
 # Longest step in radians of the fastest motion.
 _LONGEST = 1.4
-# Of vectors that separate by more than e to this power, the shorter one is lost in the rounding of the longer one.
+# Logarithm of the largest ratio of two vectors before an orthonormalisation, to keep the shorter one clear of rounding.
 _PARTING = 12.0
 
 
@@ -43,18 +42,18 @@ def needed_steps(flow: Flow) -> Array:
     volume = jnp.abs(contraction(flow))
     rate = jnp.maximum(flow.fastest, volume)
     angle = rate * flow.period
-    # Of all steps of a strobe together, over its angle.
+    # Tolerated change of the logarithm of an amplitude per radian.
     tolerated = jnp.maximum(_CHANGE * volume / flow.size / rate, _ROUNDING / angle)
     longest = jnp.minimum((tolerated / _DAMPING) ** (1 / (_POWER - 1)), _LONGEST)
     steps = jnp.ceil(angle / longest)
-    # A field without a value is marched too, which gives the outcome NOT_FINITE.
+    # A field of NaN is marched too, and ends as NOT_FINITE.
     return jnp.where(jnp.isnan(steps), LEAST, jnp.maximum(steps, LEAST))
 
 
 def needed_parts(flow: Flow, steps: Any) -> Array:
     """Parts of a strobe after which vectors are orthonormalised, an integer for the batch, at most ``steps``.
 
-    Vectors separate no faster than volume contracts if none of them grows.
+    If no vector grows, vectors separate no faster than volume contracts.
     """
     parts = jnp.ceil(jnp.abs(contraction(flow)) * flow.period / _PARTING)
     return jnp.clip(jnp.max(jnp.where(jnp.isnan(parts), 1.0, parts)), 1, steps).astype(jnp.int64)

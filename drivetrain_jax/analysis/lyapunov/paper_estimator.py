@@ -3,12 +3,14 @@
     L_j = (1/T_f) sum_i log10(|Delta_j(T_i+1)| / |Delta(T_f)|)
 
 for every component j, the clock that defines the strobe included; T_i are the strobes up to T_f. On every interval
-(T_i, T_i+1) the second trajectory starts anew, at the first one plus a perturbation proportional to it. The base is 10,
-the ratio compares each time with the END, one component with a norm of mixed units, and the sum grows with the number of
-T_i: the result is inversely proportional to their distance.
+(T_i, T_i+1) the second trajectory restarts from the first one plus a perturbation proportional to it.
 
-The paper does not print the length of an interval; here it is one strobe. An interval at whose end a component has no
-distance is left out: the first one of a flow with a clock, which starts at 0.
+The estimator is no exponent for four reasons: its base is 10; its ratio compares each time with the END; it compares one
+component with a norm of mixed units; and its sum grows with the number of T_i, so that the result is inversely proportional
+to their distance.
+
+The paper does not print the length of an interval; here it is one strobe. An interval at whose end a component has the
+distance 0 is left out. This is the first interval of a flow with a clock, which starts at 0.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from jax import Array
 from drivetrain_jax.analysis.lyapunov.variational import Frame, initial_state, one_kernel, strobe_map
 from drivetrain_jax.systems import Flow
 
-# Share of every component by which it is perturbed.
+# Relative perturbation of every component.
 PERTURBATION = 1e-5
 
 
@@ -42,7 +44,7 @@ def paper_estimator(flow: Flow, steps: Any, max_time: float) -> Array:
     strobes = jnp.broadcast_to(jnp.ceil(jnp.asarray(max_time / flow.period)).astype(jnp.int64), zero.shape)
 
     def distances(k: Array, state: tuple, after: tuple) -> Array:
-        """Of all components at the end of interval ``k`` from ``state`` to ``after``."""
+        """Distances of all components at the end of interval ``k`` from ``state`` to ``after``."""
         ahead = 2 * np.pi * PERTURBATION * k
         moved = strobe_map(replace(flow, field=_shifted(flow, ahead)), steps)
         other = moved(k, Frame(tuple(x * (1 + PERTURBATION) for x in state))).state

@@ -1,8 +1,8 @@
-"""Decide if the steps resolve the motion; without that exponents are wrong even with small standard errors.
+"""Decide if the steps resolve the motion; otherwise exponents are wrong even with small standard errors.
 
-Two tests. The exponents must sum to the mean divergence, which is known without them; steps that damp or excite an
-oscillation, or that miss a fast decay, violate this. And the largest exponent must be the same with twice the step: steps
-that perturb phases keep the sum, because they hardly change volume.
+There are two tests. First, the exponents must sum to the mean divergence, which is known independently. Steps that damp or
+excite an oscillation, or that miss a fast decay, fail this test. Second, the largest exponent must be the same with twice
+the step. Steps that perturb phases fail only this test, because they hardly change volume.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from jax import Array
 import drivetrain_jax.systems  # noqa: F401  double precision
 
 STANDARD_ERRORS = 3.0
-# Residual of the sum rule relative to the largest exponent.
+# Largest residual of the sum rule relative to the largest exponent.
 SUM_RULE = 1e-3
 # Ratio to the largest exponent below which an exponent is zero.
 _ZERO = 1e-6
 # Largest change of volume within a strobe by rounding and steps, if all exponents are nearly zero.
 _VOLUME = 1e-9
-# Relative agreement of two step sizes that suffices for any standard error.
+# Relative difference of two step sizes that counts as agreement, whatever the standard errors.
 _AGREEMENT = 0.1
 
 
@@ -46,7 +46,7 @@ def same_exponent(value: Array, error: Array, other: Array, other_error: Array) 
 
 
 def zero_floor(spectrum: Array) -> Array:
-    """Largest size of a zero exponent for any standard error, shape (...)."""
+    """Size up to which an exponent counts as zero, whatever its standard error, shape (...)."""
     return _ZERO * jnp.max(jnp.abs(spectrum), axis=0)
 
 
@@ -56,11 +56,10 @@ def significant(spectrum: Array, error: Array) -> Array:
 
 
 def resolved(spectrum: Array, error: Array, residual: Array, period: Any, coarse: Array, coarse_error: Array) -> Array:
-    """Flags where the exponents sum to the divergence and a positive largest one is confirmed by twice the step; shape
-    (...).
+    """Flags where the exponents sum to the divergence and twice the step confirms a positive largest exponent, shape (...).
 
-    ``coarse`` is the largest exponent found with twice the step, ``coarse_error`` its error. Unbounded motions have no
-    significant exponent: only the sum counts for them.
+    ``coarse`` is the largest exponent with twice the step, ``coarse_error`` its error. Unbounded motions have no significant
+    exponent, so only the sum rule applies to them.
     """
     same = same_exponent(spectrum[0], error[0], coarse, coarse_error)
     return adds_up(spectrum, error, residual, period) & (same | ~significant(spectrum, error))

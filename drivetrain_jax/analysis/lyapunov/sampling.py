@@ -14,14 +14,14 @@ from drivetrain_jax.analysis.lyapunov.variational import batch_shape, initial_st
 from drivetrain_jax.analysis.lyapunov.zero_one_test import largest_k01
 from drivetrain_jax.systems import Flow
 
-# Strobes after the run for the verdict and the 0-1 test, and the longest period searched among them.
+# Strobes after the run for the verdict and the 0-1 test, and the longest period in strobes that is searched.
 SAMPLES, LONGEST = 1024, 512
-# Relative tolerance for repetition; transient below which a motion that does not repeat is called so.
+# Relative tolerance for repetition; relative transient below which a motion counts as not repeating.
 _REPEATED, _UNSETTLED = 1e-9, 1e-4
-# Factor on the bound of the transient from its exponent: for a near-degenerate pair the exponents are known only to about
-# the inverse of the time, for any standard error.
+# Factor on the bound of the transient from its exponent: the exponents of a near-degenerate pair are known only to about the
+# inverse of the time, whatever their standard errors.
 _MARGIN = 1e3
-# Largest number of further samples, if the transient could hide or imitate a repetition.
+# Largest number of samples; more than one are taken if the transient could hide or imitate a repetition.
 _MOST_LOOKS = 16
 
 
@@ -34,8 +34,8 @@ class Sampling(NamedTuple):
 
 
 class _Look(NamedTuple):
-    """One sample of ``SAMPLES`` strobes: its number, the state after it and its strobe, the first section of all, and
-    the results of every member."""
+    """State of the loop over samples of ``SAMPLES`` strobes: number of samples, state and strobe after the last sample,
+    section of the first sample, and results of every member."""
 
     number: Array
     state: tuple
@@ -46,10 +46,10 @@ class _Look(NamedTuple):
 
 
 def sample(flow: Flow, steps: Any, record: Record, rate: Array, k01_for: Array) -> Sampling:
-    """Follow the motion for ``SAMPLES`` strobes; K of the members of ``k01_for``, otherwise 0.
+    """Period and K of the motion over ``SAMPLES`` strobes after the run; K is 0 for members without ``k01_for``.
 
-    ``rate``: the largest exponent within its error, shape (...). Decaying motions are followed until the transient is small
-    enough to determine their period.
+    ``rate`` is an upper bound of the largest exponent, shape (...). For decaying motions, samples continue until the
+    transient is small enough to determine the period.
     """
     watched = [i for i in range(flow.size) if i not in (*flow.phases, *flow.cyclic)] or [0]
     shape = batch_shape(flow)
@@ -62,7 +62,7 @@ def sample(flow: Flow, steps: Any, record: Record, rate: Array, k01_for: Array) 
         section = states[:, jnp.array(watched)]
         left = transient_left(flow, record, rate, seen.strobe + SAMPLES // 2)
         multiple, settled = repetition(section, left)
-        # Earlier results stay, so a member does not depend on the time of the others.
+        # Settled results stay, so a member does not depend on the number of samples for the others.
         multiple, settled = (
             jnp.where(seen.settled, *pair) for pair in ((seen.multiple, multiple), (seen.settled, settled))
         )
@@ -91,8 +91,8 @@ def transient_left(flow: Flow, record: Record, rate: Array, strobe: Array) -> Ar
 def repetition(section: Array, left: Array) -> tuple[Array, Array]:
     """Strobes after which ``section`` repeats to rounding (0: none), and a flag if a transient cannot explain this.
 
-    ``left``: bound of the transient. A repetition within that bound, but not to rounding, is uncertain: a slow drift along
-    a torus looks the same.
+    ``left`` is a bound of the transient. A repetition within this bound, but not to rounding, is uncertain: a slow drift
+    along a torus looks the same.
     """
     scale = jnp.max(jnp.abs(section), axis=(0, 1))
     left = left / jnp.where(scale > 0, scale, 1.0)

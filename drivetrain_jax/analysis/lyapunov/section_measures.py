@@ -19,8 +19,8 @@ def period_multiple(section: Array, tolerance: Array, longest: int) -> Array:
     """Smallest p <= ``longest`` with |y(k) - y(k - p)| within ``tolerance`` of the largest |y|; 0 if there is none.
 
     ``section`` has shape ``(T, n, ...)`` with T >= longest + 64; the comparison runs over the last 64 strobes. p is the
-    number of distinct points of a periodic motion. One scale serves all components, as one of them may vanish at the
-    strobes. Leading axes of ``tolerance`` before those of the batch are kept: one answer for each.
+    number of distinct points of a periodic motion. All components share one scale, because a component may vanish at the
+    strobes. Leading axes of ``tolerance`` before the batch axes are kept, with one result for each entry.
     """
     scale = jnp.max(jnp.abs(section), axis=(0, 1))
     scale = jnp.where(scale > 0, scale, 1.0)
@@ -42,9 +42,9 @@ def period_multiple(section: Array, tolerance: Array, longest: int) -> Array:
 def torus_residual(section: Array, angle: Array | None) -> Array:
     """Largest distance of the section from a smooth closed curve over ``angle``, over the largest |y|, ``(n, ...)``.
 
-    ``section`` ``(T, n, ...)``, ``angle`` ``(T, ...)`` in [rad]: the curve is the trigonometric polynomial of degree
-    ``HARMONICS`` that fits best, found by conjugate gradients on the normal equations (a short section is fitted by the
-    smallest one). Without an angle the curve is a point, the mean.
+    ``section`` has shape ``(T, n, ...)``, ``angle`` ``(T, ...)`` is in rad. The curve is the best-fitting trigonometric
+    polynomial of degree ``HARMONICS``, found by conjugate gradients on the normal equations; for a short section this is the
+    fit with the smallest coefficients. Without an angle the curve is a point, the mean.
     """
     scale = jnp.max(jnp.abs(section), axis=(0, 1))
     scale = jnp.where(scale > 0, scale, 1.0)

@@ -1,8 +1,8 @@
 """Trajectories of a flow and of tangent vectors, by equal steps of the explicit scheme of order 8 (DOP853).
 
-A state is a tuple of components, each of the shape of the batch. The results of a stage are stored before the next one
+A state is a tuple of components, each of the shape of the batch. The results of a stage are stored before the next stage
 begins (see :mod:`~drivetrain_jax.analysis.numerics.kernels`); for batches of 32 to 64 members they fit into the innermost
-caches. Time enters through :meth:`Flow.angles` of a counted strobe, so nothing drifts in a long march.
+caches. Time enters through :meth:`Flow.angles` of a counted strobe, so the angles do not drift in a long march.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Vector = tuple[Array, ...]
 
 
 class Frame(NamedTuple):
-    """A point of a trajectory, tangent vectors there, and the integral of the divergence since some time.
+    """A point of a trajectory, its tangent vectors, and the integral of the divergence since a chosen time.
 
     ``tangents``: components of the m vectors, each ``(m, ...)``; () if there are none.
     """
@@ -33,14 +33,14 @@ class Frame(NamedTuple):
 
 
 def batch_shape(flow: Flow) -> tuple[int, ...]:
-    """Shape of the batch that the parameters of ``flow`` span."""
+    """Shape of the batch: the common shape of the parameters of ``flow``."""
     rates = jax.eval_shape(lambda: [jnp.asarray(r) for r in flow.field(flow.angles(0, 0.0), flow.start)])
     shapes = [jnp.shape(x) for x in (*flow.start, flow.period, *flow.turns)]
     return jnp.broadcast_shapes(*(r.shape for r in rates), *shapes)  # pyright: ignore[reportReturnType]
 
 
 def initial_state(flow: Flow) -> Vector:
-    """``flow.start`` as arrays of the shape of the batch."""
+    """``flow.start`` as arrays in the shape of the batch."""
     shape = batch_shape(flow)
     return tuple(jnp.broadcast_to(jnp.asarray(x, float), shape) for x in flow.start)
 
@@ -48,7 +48,8 @@ def initial_state(flow: Flow) -> Vector:
 def initial_frame(flow: Flow) -> Frame:
     """The initial state and unit vectors along every component that is not a phase.
 
-    Displacements without phases stay so: their exponents are those of the flow without the zeros of the phases.
+    A displacement that starts without a phase component never gets one. The exponents are therefore those of the flow
+    without the zeros of its phases.
     """
     state = initial_state(flow)
     moving = jnp.array([i for i in range(flow.size) if i not in flow.phases])
@@ -59,7 +60,7 @@ def initial_frame(flow: Flow) -> Frame:
 
 
 def one_kernel(flow: Flow) -> Callable[[Callable], Callable]:
-    """The mark :func:`in_one_kernel` for a march of ``flow``, or none if the field has unsuitable operations."""
+    """:func:`in_one_kernel` for a march of ``flow``, or the identity if the field has unsuitable operations."""
 
     def rates(y: Vector) -> Any:
         angles = flow.angles(0, 0.0)
@@ -71,10 +72,10 @@ def one_kernel(flow: Flow) -> Callable[[Callable], Callable]:
 def strobe_map(flow: Flow, steps: Any) -> Callable[..., Frame]:
     """The map ``(strobe, frame) -> frame one strobe later`` by ``steps`` equal steps (an integer, may be traced).
 
-    ``(strobe, frame, first, last)``: by the steps from ``first`` to before ``last`` only.
+    The map ``(strobe, frame, first, last)`` makes only the steps ``first`` to ``last - 1``.
 
-    ``y' = f(t, y)``, ``v' = (df/dy) v`` for every tangent vector (products with the Jacobian by forward
-    differentiation) and, if the frame carries it, the integral of ``div f``.
+    It integrates ``y' = f(t, y)``, ``v' = (df/dy) v`` for every tangent vector (by forward differentiation) and, if the
+    frame has it, the integral of ``div f``.
     """
     h = flow.period / steps
 
@@ -128,7 +129,7 @@ def _slopes(flow: Flow, contracts: bool, angles: tuple, at: Frame) -> Frame:
     if not at.tangents:
         return Frame(field(*at.state), (), contraction)
     rates, push = jax.linearize(field, *at.state)
-    # The factors of the linear map are shared with the rates and the divergence.
+    # The closure shares the factors of the linear map with the rates and the divergence.
     linear, factors = jax.closure_convert(push, *at.state)
 
     def pushed(tangents: Vector, factors: list[Array]) -> Vector:
@@ -147,7 +148,7 @@ def divergence(flow: Flow, angles: tuple, y: Vector) -> Array:
 
 
 def orthonormal(tangents: Vector) -> tuple[Vector, Array]:
-    """Modified Gram-Schmidt of m vectors, components ``(m, ...)``: orthonormal ones, logarithms of the lengths (m, ...)."""
+    """Orthonormal vectors by modified Gram-Schmidt, components ``(m, ...)``, and logarithms of the lengths ``(m, ...)``."""
     basis: list[Vector] = []
     logs = []
     for vector in zip(*tangents, strict=True):

@@ -1,8 +1,8 @@
 """The kind of a motion, by a rule that a diffuse picture or a single number cannot satisfy.
 
-There is no verdict if the steps do not resolve the motion. Chaotic requires all of: the motion is bounded, its field can be
-chaotic, the largest exponent exceeds three standard errors and agrees for two step sizes, the exponents sum to the mean
-divergence, and the 0-1 test gives K > 0.9. Exponents of phases are ignored.
+The verdict is undecided if the steps do not resolve the motion. A chaotic motion meets all of these conditions: it is
+bounded, its field can be chaotic, the largest exponent exceeds three standard errors and agrees for two step sizes, the
+exponents sum to the mean divergence, and the 0-1 test gives K > 0.9. Exponents of phases are ignored.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from drivetrain_jax.analysis.lyapunov.growth_record import SEGMENTS
 from drivetrain_jax.analysis.lyapunov.resolution import STANDARD_ERRORS, SUM_RULE, significant, zero_floor
 
 CHAOTIC_K = 0.9
-# Growth in proportion to time, as at a double multiplier, is a factor of four over the averaged three quarters. Exponential
-# growth is distinguished by twice its logarithm.
+# Least logarithmic growth that counts as exponential, over the averaged three quarters of the time: twice that of growth in
+# proportion to time, as at a double multiplier, which is a factor of four.
 _TELLING = 2 * math.log(4)
 
 
 class Verdict(IntEnum):
-    """Kinds of motion. Fixed point, periodic and quasi-periodic refer to the strobes of a forced system (a fixed point
-    of the section has the period of the strobe), and to the motion itself without forcing."""
+    """Kinds of motion. Fixed point, periodic and quasi-periodic describe the section of a forced system, whose fixed points
+    have the period of the strobe, and the motion itself of an unforced system."""
 
     FIXED_POINT = 0
     PERIODIC = 1
@@ -38,11 +38,11 @@ class Verdict(IntEnum):
 class Evidence(NamedTuple):
     """Input of the verdict; ``m`` exponents without phases, in falling order.
 
-    ``spectrum``, ``error`` (m, ...): exponents and standard errors; ``coarse``, ``coarse_error`` (...): the largest one
-    with twice the step; ``sum_residual``: of the sum rule; ``k01``: of the 0-1 test; ``bounded``; ``growing``: see
-    :func:`grows`; ``multiple``: strobes until the motion repeats, 0 if it does not within the sample; ``settled``: true if
-    the transient is small enough to decide; ``resolved``: see :func:`~.resolution.resolved`; ``roomy``: true if the field
-    can be chaotic.
+    ``spectrum``, ``error`` (m, ...): exponents and standard errors; ``coarse``, ``coarse_error`` (...): the largest exponent
+    with twice the step, and its error; ``sum_residual``: residual of the sum rule; ``k01``: K of the 0-1 test;
+    ``bounded``: true if the motion stays bounded; ``growing``: see :func:`grows`; ``multiple``: strobes until the motion
+    repeats, 0 if it does not within the sample; ``settled``: true if the transient is small enough to decide;
+    ``resolved``: see :func:`~.resolution.resolved`; ``roomy``: true if the field can be chaotic.
     """
 
     spectrum: Array
@@ -62,8 +62,8 @@ class Evidence(NamedTuple):
 def grows(size: Array, used: Array, span: Array, largest: Array) -> Array:
     """Flags where the motion grew about as fast as its largest exponent, or stayed at an unstable rest.
 
-    ``size`` (SEGMENTS, ...): largest component in each segment. A bounded attractor also has a positive exponent, but its
-    size does not follow it. Growth that is also possible in proportion to time does not count.
+    ``size`` (SEGMENTS, ...): largest component in each segment. A chaotic attractor also has a positive exponent, but its
+    size does not grow. Growth so small that it may be in proportion to time does not count.
     """
     index = jnp.arange(SEGMENTS).reshape(-1, *(1,) * used.ndim)
     last = jnp.maximum(used - 1, 0)
@@ -86,20 +86,20 @@ def judge(evidence: Evidence, autonomous: bool) -> Array:
 
 
 def _unstable(evidence: Evidence) -> Array:
-    """Flags of unbounded motions that left by their exponent: a torque may drive a stable system beyond the bounds."""
+    """Flags of motions that grow by a positive exponent; a torque may also drive a stable system beyond the bounds."""
     left = ~evidence.bounded & (evidence.spectrum[0] > 0)
     return left | (significant(evidence.spectrum, evidence.error) & evidence.growing)
 
 
 def _chaotic(evidence: Evidence) -> Array:
-    """All conditions of chaos, for motions whose largest exponent is positive."""
+    """Flags where all conditions of chaos hold, for motions whose largest exponent is positive."""
     chaotic = evidence.bounded & evidence.roomy & (evidence.k01 > CHAOTIC_K)
     chaotic &= evidence.coarse > STANDARD_ERRORS * evidence.coarse_error
     return chaotic & (evidence.sum_residual <= SUM_RULE * jnp.max(jnp.abs(evidence.spectrum), axis=0))
 
 
 def _forced(evidence: Evidence) -> Array:
-    """Kind of an attracting motion, by the strobes after which it repeats."""
+    """Kind of an attracting motion, from the number of strobes after which it repeats."""
     decays = evidence.spectrum[0] < -STANDARD_ERRORS * evidence.error[0] - zero_floor(evidence.spectrum)
     kind = jnp.where(evidence.multiple > 1, Verdict.PERIODIC, Verdict.QUASI_PERIODIC)
     kind = jnp.where(evidence.multiple == 1, Verdict.FIXED_POINT, kind)
@@ -107,8 +107,10 @@ def _forced(evidence: Evidence) -> Array:
 
 
 def _autonomous(evidence: Evidence) -> Array:
-    """Kind of an unforced motion. One exponent is zero along any motion that is not at rest, and no motion in a plane is
-    a torus; a motion without other exponents there is degenerate, or drifts too slowly to decide."""
+    """Kind of an unforced motion by its zero exponents: none at rest, one of a periodic motion, more of a torus.
+
+    A plane has no torus: a motion in a plane with two zero exponents is degenerate, or drifts too slowly to decide.
+    """
     zeros = jnp.abs(evidence.spectrum) <= STANDARD_ERRORS * evidence.error + zero_floor(evidence.spectrum)
     count = jnp.sum(zeros, axis=0)
     torus = jnp.where(evidence.roomy, Verdict.QUASI_PERIODIC, Verdict.UNDECIDED)

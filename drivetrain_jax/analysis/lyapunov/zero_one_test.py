@@ -27,14 +27,14 @@ _BLOCK = 32
 def chaos_k01(series: Array) -> Array:
     """K of ``series``, shape ``(T, ...)`` -> ``(...)``: near 0 if regular, near 1 if chaotic; 0 for a constant series.
 
-    Displacements over 1 to T/10 samples. At least about 1000 samples are needed, not closer than the series' own time
-    scale (oversampled flows look regular).
+    The displacements extend over 1 to T/10 samples. The test needs about 1000 samples, whose distance is not below the time
+    scale of the series: oversampled flows look regular.
     """
     angles = _RANGE[0] + (_RANGE[1] - _RANGE[0]) * (jnp.arange(_ANGLES) + 0.5) / _ANGLES
     mean = jnp.mean(series, axis=0)
     size = jnp.max(jnp.abs(series - mean), axis=0)
     constant = ~(size > 1e-12 * jnp.abs(mean))
-    # The test does not depend on the scale of the observable; an offset only adds to the part that is removed.
+    # The test does not depend on the scale of the observable, and an offset only adds to the oscillating part.
     scaled = (series - mean) / jnp.where(constant, 1.0, size)
     values = jax.lax.map(partial(_correlations, angles), _blocks(scaled))
     values = jnp.moveaxis(values, 1, 0).reshape(_ANGLES, -1)[:, : math.prod(size.shape)]
@@ -42,7 +42,7 @@ def chaos_k01(series: Array) -> Array:
 
 
 def _blocks(series: Array) -> Array:
-    """``(T, ...)`` in blocks of ``_BLOCK`` series, ``(blocks, T, _BLOCK)``, the last one padded with zeros."""
+    """``(T, ...)`` in blocks of ``_BLOCK`` series, ``(blocks, T, _BLOCK)``, the last block padded with zeros."""
     flat = series.reshape(len(series), -1)
     flat = jnp.pad(flat, ((0, 0), (0, -flat.shape[1] % _BLOCK)))
     return jnp.moveaxis(flat.reshape(len(series), -1, _BLOCK), 1, 0)
@@ -56,8 +56,8 @@ def _correlations(angles: Array, series: Array) -> Array:
 def largest_k01(section: Array) -> Array:
     """The largest K of the components of ``section``, shape ``(T, n, ...)`` -> ``(...)``.
 
-    All components of a regular motion are regular. A slow component of a chaotic motion needs a longer record than a fast
-    one.
+    The largest is the right one: all components of a regular motion are regular, and a slow component of a chaotic motion
+    needs a longer record than a fast component.
     """
     return jnp.max(chaos_k01(section), axis=0)
 

@@ -1,7 +1,7 @@
 """Natural frequencies and modes of masses joined by springs: values, families, shapes, and modes tracked along an axis.
 
-Frequencies come from singular values (:mod:`singular_values`), vectors from :mod:`singular_vectors`. Both use the factor
-``diag(sqrt k) B M^(-1/2)``: the stiffness matrix, which would square the condition, is never formed.
+Frequencies come from singular values (:mod:`singular_values`), modes from singular vectors (:mod:`singular_vectors`) of the
+factor ``diag(sqrt k) B M^(-1/2)``. The stiffness matrix is never formed, because it would square the condition.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ VARIABLES = (
     Variable("multiplicity", "1", "number of modes with this frequency", ("mode",), "int32"),
     Variable("participation", "1", "share of the mode in each family", ("mode", "family")),
     Variable("kinetic_energy", "1", "share of the mode's kinetic energy in each body", ("mode", "body")),
-    # Without a unit where the modal mass has one: UDUNITS knows no root of a kilogram.
+    # The unit is 1, because UDUNITS has no square root of a kilogram.
     Variable("mode_shape", "1", "mode shape of modal mass 1 kg", ("mode", "dof")),
     Variable("branch", "1", "number of the branch of the mode along the track", ("mode",), "int32"),
     Variable("mac", "1", "assurance criterion of the mode with its branch at the previous point", ("mode",)),
@@ -58,8 +58,8 @@ _CACHE = 1 << 16
 
 
 class Modes(NamedTuple):
-    """Modes of the whole system, rising: angular ``frequency`` (n, N), mass-weighted ``vectors`` (dofs, n, N) or None,
-    ``participation`` (n, families, N), ``label`` of the family (n, N), ``found`` (N,)."""
+    """Modes of the whole system by rising frequency: angular ``frequency`` (n, N), mass-weighted ``vectors`` (dofs, n, N) or
+    None, ``participation`` (n, families, N), ``label`` of the family (n, N), ``found`` (N,)."""
 
     frequency: Array
     vectors: Array | None
@@ -92,7 +92,7 @@ def _spectrum(build: Build, method: str, values: Mapping[str, Any], lanes: int) 
 
 
 def _first_lane(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters with arrays reduced to their first entry: enough to get all shapes."""
+    """The parameters with arrays reduced to their first entry, from which all shapes follow."""
 
     def first(value: Any) -> Any:
         if isinstance(value, tuple):
@@ -109,7 +109,7 @@ def _in_lanes(array: Array, lanes: int) -> Array:
 
 
 def largest_frequency(model: SpringSystem, lanes: int) -> Array:
-    """An upper bound of the angular frequencies, (N,), above the largest by a factor of 5 at most: Frobenius norm."""
+    """Upper bound of the angular frequencies, (N,): the Frobenius norm, at most 5 times the largest frequency."""
     return jnp.sqrt(jnp.sum(_in_lanes(model.whole.factor, lanes) ** 2, axis=(0, 1)))
 
 
@@ -153,18 +153,18 @@ def _lift(block: Block, part: BlockModes, lanes: int) -> Array:
 
 
 def _canonical(vectors: Array) -> Array:
-    """The sign by which the largest entry of every column is positive."""
+    """``vectors`` with signs that make the largest entry of every column positive."""
     largest = jnp.take_along_axis(vectors, jnp.argmax(jnp.abs(vectors) - 1e-9 * _places(vectors), 0)[None], axis=0)
     return vectors * jnp.where(largest < 0, -1.0, 1.0)
 
 
 def _places(vectors: Array) -> np.ndarray:
-    """Row numbers: of entries equal up to rounding, the first counts as the largest."""
+    """Row numbers, to select the first of entries that are equal up to rounding."""
     return np.arange(vectors.shape[0]).reshape(-1, 1, 1)
 
 
 def _results(build: Build, request: Request, values: Mapping[str, Any], lanes: int) -> dict[str, Array]:
-    """The requested results of every lane, without those along a track; for these, mass-weighted vectors."""
+    """The requested results of every lane; instead of results along a track, the mass-weighted vectors for them."""
     wanted = set(request.outputs)
     followed = bool(request.options["track"])
     if wanted <= _SPECTRUM:
@@ -205,9 +205,9 @@ def _by_body(vectors: Array, bodies: np.ndarray) -> Array:
 
 
 def _frequencies(frequency: Array, found: Array, participation: Array | None) -> dict[str, Array]:
-    """Frequency, its error and outcome; NaN for missing ones."""
+    """Frequency, its error and outcome; NaN for missing modes."""
     value = jnp.where(found, frequency / (2 * math.pi), jnp.nan)
-    # Backward error of orthogonal transformations, in practice a tenth of it; the same for every mode of a point.
+    # Backward error of orthogonal transformations, equal for all modes of a point; true errors are about a tenth of it.
     error = 4 * EPS * math.sqrt(frequency.shape[0]) * value[-1]
     results = {"natural_frequency": value, "natural_frequency_error": jnp.broadcast_to(error, value.shape)}
     if participation is not None:
@@ -218,7 +218,7 @@ def _frequencies(frequency: Array, found: Array, participation: Array | None) ->
 
 
 def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
-    """All requested results, lanes last; along a track its points first."""
+    """All requested results, lanes last; with a track, its points first."""
     del effort
     track, lanes = request.options["track"], lane_count(values, request.options["track"])
     wanted = (*request.outputs, "outcome")
@@ -239,8 +239,7 @@ def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Ar
 
 
 def _along(values: np.ndarray) -> tuple[Any, Any]:
-    """Positions of the values of a track in rising order, and back to the listed order: neighbours are compared in any
-    listed order."""
+    """Positions that sort the values of a track, so that neighbours are compared, and positions that restore their order."""
     steps = np.diff(values)
     if (steps > 0).all() or (steps < 0).all():
         return slice(None), slice(None)
@@ -256,7 +255,7 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
 
 
 def described(model: Model, fixed: Mapping[str, Any]) -> Any:
-    """The object that ``model`` returns, for its names and sizes: these do not depend on varying parameters."""
+    """The object that ``model`` returns, for its names and sizes, which do not depend on varying parameters."""
     values = {name: fixed.get(name, 1.0) for name in model.parameters}
     found: list[Any] = []
     jax.eval_shape(lambda: found.append(model.build(values)))
@@ -277,7 +276,7 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
     )
 
 
-# Rounding of derivatives within a cluster: relative to these, and to the largest of all modes.
+# Rounding of derivatives within a cluster: relative to these derivatives, and to the largest derivative of all modes.
 _ROUNDING, _OF_LARGEST = 1e-8, 1e-13
 
 
@@ -286,8 +285,9 @@ def _derivatives(
 ) -> dict[str, Array]:
     """Jacobian of the frequencies, ``df = u^T (dK - (2 pi f)^2 dM) u / (8 pi^2 f)`` with modes u of unit modal mass.
 
-    It is formed spring by spring, without a stiffness matrix. A parameter splits equal frequencies along the eigenvalues of
-    ``u_i^T (dK - (2 pi f)^2 dM) u_j``, and sets a rigid mode in motion as sqrt(k): NaN in both cases.
+    It is formed spring by spring, without a stiffness matrix. NaN in two cases: where a parameter splits equal frequencies
+    (along the eigenvalues of ``u_i^T (dK - (2 pi f)^2 dM) u_j``), and where the frequency of a rigid mode rises from zero
+    like sqrt(k).
     """
     del request, results
 
@@ -301,7 +301,7 @@ def _derivatives(
     shapes = modes.vectors[..., 0] / jnp.sqrt(here.mass)[:, None]  # pyright: ignore[reportOptionalSubscript]
 
     def excess(parameters: Any) -> Array:
-        """Zero but for rounding; its derivatives at fixed shapes are those of ``(2 pi f)^2``."""
+        """Zero up to rounding; its derivatives at fixed shapes are those of ``(2 pi f)^2``."""
         springs = model(parameters)
         stretched = springs.extensions @ shapes
         elastic = stretched.T @ (springs.stiffness[:, None] * stretched)
@@ -318,7 +318,7 @@ def _derivatives(
 
 
 def _of_system(system: type[System]) -> dict[str, Any]:
-    """The types of modes are those of the system's families."""
+    """The variables, with types of modes from the families of the system."""
     families = system.mode_families
     flags = {"mode_type": mode_type_names(families), "dominant_family": (*families, "none")}
     return {"variables": tuple(replace(v, flags=flags.get(v.name, v.flags)) for v in VARIABLES)}

@@ -18,7 +18,7 @@ from drivetrain_jax.view import cells
 from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import FRAME_GREY, STYLE, axis_label, scene_key, variable_label
 
-# Rigid modes, families in their order, coupled modes.
+# Colours of rigid modes, of the families in their order, and of coupled modes.
 _RIGID, _FAMILIES, _COUPLED = "#9a9a9a", ("#16324f", "#d1771e", "#3f8f5f", "#7a4fa0", "#999933"), "#a0308c"
 _CURVES_HEIGHT, _GEAR_HEIGHT = 4.4, 1.62
 _COLUMNS, _MOST_SHAPES = 4, 16
@@ -95,14 +95,14 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
 
 
 def _segments(x: np.ndarray, curve: np.ndarray, colours: list[str]) -> LineCollection:
-    """Draw one branch through points with these ``colours``; a piece between two of them has that of its end."""
+    """One branch through points with these ``colours``; a piece between two points has the colour of its end."""
     points = np.stack([x, curve], axis=-1)
     return LineCollection(
         list(np.stack([points[:-1], points[1:]], axis=1)),
         colors=colours[1:],
         linewidths=1.1,
         capstyle="round",
-        # Rounding of single pieces to whole pixels would make steps.
+        # Snapping single pieces to whole pixels would make steps.
         snap=False,
     )
 
@@ -125,7 +125,7 @@ def _distinct(frequency: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _dominant(dataset: xr.Dataset, mode: int) -> str:
-    """The second line of a title: the dominant family of a coupled mode with its share, cut and not rounded to 100 %."""
+    """Second line of a title: the dominant family of a coupled mode and its share, truncated and not rounded to 100 %."""
     names = dataset["dominant_family"].attrs["flag_meanings"].split()
     share = np.floor(1e4 * float(dataset["dominant_share"].values[mode])) / 100
     return f"\n{share:.2f} % {names[int(dataset['dominant_family'].values[mode])]}"

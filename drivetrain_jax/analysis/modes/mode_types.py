@@ -1,9 +1,9 @@
-"""Modes of one block of a spring system with the families that the system declares, or a mixture of them.
+"""Modes of one block of a spring system, with the family of each mode or its shares of several families.
 
-Eigenvectors of a multiple frequency are arbitrary within its space. They are rotated until they diagonalise the operator
-whose eigenvalue is the number of the family, so a pure mode in the space becomes a vector. Eigenvectors of different
-frequencies stay unchanged, however close the frequencies are. Only the name of a mode may come from a vector rotated within
-a wider cluster.
+Eigenvectors of a multiple frequency are arbitrary within their space. They are rotated until they diagonalise the operator
+whose eigenvalue is the number of the family, so that a pure mode in the space becomes an eigenvector. Eigenvectors of
+different frequencies stay unchanged, however close the frequencies are. Only the type of a mode may come from a vector
+rotated within a wider cluster.
 """
 
 from __future__ import annotations
@@ -19,19 +19,20 @@ from drivetrain_jax.analysis.numerics.singular_values import EPS, singular_value
 from drivetrain_jax.analysis.numerics.singular_vectors import jacobi_vectors
 from drivetrain_jax.systems import Block
 
-# Code of a rigid mode; those of the families follow, then that of a coupled mode.
+# Code of a rigid mode; then follow the codes of the families and of a coupled mode.
 RIGID = 0
-# A mode belongs to a family if less than this share of it lies outside.
+# Largest share of a mode outside a family for which the mode belongs to the family.
 PURITY = 1e-6
 # Rounding units of the largest angular frequency within which frequencies count as equal.
 _ROUNDING = 64
-# Distance within which angular frequencies form a cluster, relative: their modes are named, followed and differentiated
+# Relative distance of neighbours in a cluster of angular frequencies, whose modes are typed, tracked and differentiated
 # together.
 CLUSTER = 5e-8
-# Up to this asymmetry the families are uncoupled but for nearly equal frequencies: wider clusters are named together.
+# Asymmetry up to which the families are coupled only at nearly equal frequencies; modes of wider clusters are then typed
+# together.
 SYMMETRIC = 2e-9
 _CLUSTER_IF_SYMMETRIC = 5e-5
-# Weight of motions along x relative to the numbers of the families: these come first.
+# Weight of motions along x, below the distance 1 of the numbers of the families, which take precedence.
 _POLARISATION = 0.5
 
 
@@ -55,8 +56,8 @@ def mode_type_names(families: tuple[str, ...]) -> tuple[str, ...]:
 def block_modes(block: Block, largest: Array, asymmetry: Array, families: int) -> BlockModes:
     """Modes of ``block`` (lanes (N,)) by rising frequency; ``largest`` is the system's largest angular frequency.
 
-    The frequencies do not depend on the vectors: ``|G v|`` would err with a vector that was turned, and for a rigid
-    mode by the roundings of all rotations that made it.
+    The frequencies are singular values and not norms ``|G v|`` of the factor times a vector: errors of rotated vectors, and
+    for rigid modes the rounding of all rotations, would enter the norms.
     """
     frequency, values_found = singular_values(block.factor)
     vectors, vectors_found = jacobi_vectors(block.factor)
@@ -81,21 +82,21 @@ def _in_frame(block: Block, vectors: Array) -> Array:
 
 
 def clusters(frequency: Array, tolerance: Array) -> Array:
-    """Flags of modes i and j in one cluster, (n, n, ...): neighbours at most ``tolerance`` (n - 1, ...) apart."""
+    """Flags of modes i and j in the same cluster, (n, n, ...): neighbours at most ``tolerance`` (n - 1, ...) apart."""
     apart = (frequency[1:] - frequency[:-1] > tolerance).astype(jnp.int32)
     number = jnp.concatenate([jnp.zeros_like(apart[:1]), jnp.cumsum(apart, axis=0)])
     return number[:, None] == number[None]
 
 
 def one_frequency(frequency: Array, largest: Array) -> Array:
-    """Flags of modes (n, n, ...) in one cluster of the system whose largest frequency is ``largest`` (...)."""
+    """Flags of modes (n, n, ...) in the same cluster, in a system whose largest frequency is ``largest`` (...)."""
     return clusters(frequency, jnp.maximum(CLUSTER * frequency[1:], _ROUNDING * EPS * largest))
 
 
 def _turned(block: Block, vectors: Array, near: Array, further: np.ndarray | float) -> Array:
-    """``vectors`` turned within clusters ``near`` until they are as pure as they can be.
+    """``vectors`` rotated within the clusters ``near`` so that they are as pure as possible.
 
-    ``further`` weighs the columns of the frame within each family. No vector leaves its place by more than it must.
+    ``further`` weighs the columns of the frame within each family. Vectors move no more than necessary.
     """
     weights = 1.0 + block.family + further
     if len(set(weights)) == 1:
@@ -107,7 +108,7 @@ def _turned(block: Block, vectors: Array, near: Array, further: np.ndarray | flo
         operator = jnp.where(near, looped_matmul(jnp.swapaxes(amplitudes, 0, 1), weighted), 0.0)
         return looped_matmul(vectors, jacobi_vectors(operator)[0])
 
-    # Neighbours suffice: a cluster without two of them has one member. Most gears without symmetry have no others.
+    # A cluster of several modes has neighbours. Most gears without symmetry have no such cluster and need no rotation.
     neighbours = jnp.diagonal(near, offset=1)
     return lax.cond(jnp.any(neighbours), turn, lambda: vectors)
 
@@ -123,13 +124,10 @@ def _label(participation: Array) -> Array:
 
 
 def mode_types(frequency: Array, label: Array, largest: Array) -> Array:
-    """Codes of the types, int8 (n, ...), from those of the families.
-
-    Rigid is what moves at no frequency that differs from zero by more than rounding.
-    """
+    """Codes of the types, int8 (n, ...), from the codes of the families and the rigid modes."""
     return jnp.where(is_rigid(frequency, largest), RIGID, label).astype(jnp.int8)
 
 
 def is_rigid(frequency: Array, largest: Array) -> Array:
-    """Flags of modes whose frequency is rounding of the largest one."""
+    """Flags of modes whose frequency is zero up to rounding of the largest frequency."""
     return frequency <= _ROUNDING * EPS * largest

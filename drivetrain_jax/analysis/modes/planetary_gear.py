@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from drivetrain_jax.view.style import FRAME_GREY
 
-# Radii relative to that of the carrier, from the paper's base radii 77.4, 100.3, 275 and 176.8 mm.
+# Radii relative to the radius of the carrier, from the paper's base radii 77.4, 100.3, 275 and 176.8 mm.
 SUN, PLANET, RING, CARRIER = 77.4 / 176.8, 100.3 / 176.8, 275 / 176.8, 1.0
 _LARGEST = 0.28
 BODY_COLOURS = {"ring": "#7a7a7a", "carrier": "#2f7d4f", "sun": "#c8553d", "planet": "#1f4e79"}
@@ -17,10 +17,10 @@ _CIRCLE = np.linspace(0, 2 * np.pi, 73)
 
 
 def displacements(shape: Mapping[str, float], planets: int) -> tuple[np.ndarray, np.ndarray]:
-    """``[x, y, u]`` of carrier, ring and sun (3, 3) and ``[xi, eta, u]`` of the planets (N, 3) of one mode shape, scaled
-    so that the largest translation or rim movement is 0.28 of the carrier's radius.
+    """``[x, y, u]`` of carrier, ring and sun (3, 3) and ``[xi, eta, u]`` of the planets (N, 3) of one mode shape.
 
-    Bodies without translations stay in place, and the carrier carries the centres of the planets.
+    The largest translation or rim movement is scaled to 0.28 of the carrier's radius. Bodies without translations stay in
+    place, and the centres of the planets move with the carrier.
     """
     central = [[shape.get(f"x_{body}", 0.0), shape.get(f"y_{body}", 0.0), shape[f"u_{body}"]] for body in "crs"]
     moved = [

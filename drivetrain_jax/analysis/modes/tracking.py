@@ -1,8 +1,7 @@
-"""Following modes along a path by the modal assurance criterion (MAC): which mode of a point continues which of the
-last.
+"""Branches of modes along a path, by the modal assurance criterion (MAC) between neighbouring points.
 
-Neighbours in frequency that exchange their order keep their branches; at a veering, where two modes turn into each
-other, the branch goes with the shape. Modes of one frequency are compared as a space.
+Modes that exchange their order in frequency keep their branches. At a veering, where two modes exchange their shapes, the
+branch goes with the shape. Modes of a multiple frequency are compared as a space.
 """
 
 from __future__ import annotations
@@ -12,21 +11,21 @@ from jax import Array, lax
 
 from drivetrain_jax.analysis.numerics.linear_algebra import looped_matmul
 
-# Share in the space of its new frequency below which the shape of a branch is replaced.
+# Share of a branch's shape in the space of its new frequency below which the shape of the new mode replaces it.
 _CARRIED = 0.25
-# Among the modes of one space, whose MAC are equal, the nearest vector is taken.
+# Weight of the distance of single vectors, which decides between the modes of one space: their MAC are equal.
 _OWN = 1e-3
 
 
 def follow(vectors: Array, same: Array) -> tuple[Array, Array]:
     """``branch`` and ``mac``, both ``(L, n, ...)``, of modes along a path of ``L`` points.
 
-    ``vectors`` (L, m, n, ...): orthonormal shapes as columns (mass-weighted, or sampled so that they are orthonormal);
-    ``same`` (L, n, n, ...): flags of modes of a point with equal frequencies. ``branch`` (int32) is the number, from 1, of
-    the mode at the first point that each mode continues. ``mac``, from 0 to 1, is the share of the branch's previous shape
-    in the space of the mode (1 at the first point). Every branch continues at every point; pairs are formed by falling MAC.
-    Where ``vectors`` are not finite, ``mac`` is NaN and the order by frequency is kept. Such points are skipped: the points
-    on both sides are neighbours, and the first point is the first finite one.
+    ``vectors`` (L, m, n, ...) are orthonormal shapes as columns, for example mass-weighted shapes. ``same`` (L, n, n, ...)
+    marks modes of equal frequency at a point. ``branch`` (int32) is the number, from 1, of the mode at the first point that
+    each mode continues. ``mac``, from 0 to 1, is the share of the branch's previous shape in the space of the mode (1 at the
+    first point). Every branch continues at every point; pairs are formed by falling MAC. A point with ``vectors`` that are
+    not finite has the order by frequency and a ``mac`` of NaN. Such points are skipped: the points on both sides are
+    neighbours, and the first point is the first finite one.
     """
     n = vectors.shape[2]
     numbers = jnp.arange(1, n + 1, dtype=jnp.int32).reshape(n, *(1,) * (vectors.ndim - 3))
@@ -55,7 +54,7 @@ def follow(vectors: Array, same: Array) -> tuple[Array, Array]:
 
 
 def _pair(score: Array) -> Array:
-    """One-to-one choice (n, n, ...) of 0 and 1 by falling ``score`` (branches, modes, ...)."""
+    """Permutation matrix (n, n, ...) that pairs branches and modes by falling ``score`` (branches, modes, ...)."""
     n, lanes = score.shape[0], score.shape[2:]
     number = jnp.arange(n * n).reshape(n, n, *(1,) * len(lanes))
 
@@ -70,8 +69,7 @@ def _pair(score: Array) -> Array:
 
 
 def _carry(overlap: Array, shapes: Array, equal: Array, chosen: Array) -> Array:
-    """The shapes of the branches at this point: each continued within the space of its mode, as far as it is in
-    there."""
+    """Shapes of the branches at this point: the projection of each shape on the space of its mode, if large enough."""
     inside = jnp.sum(chosen[:, :, None] * equal[None], axis=1) * overlap
     size = jnp.sum(inside**2, axis=1)
     keep = size > _CARRIED
