@@ -1,8 +1,8 @@
-"""Stationary amplitudes of one-term approximations: all of them at a frequency, and those that a slow sweep meets.
+"""Stationary amplitudes of one-term approximations: all amplitudes at a frequency, and those of a slow sweep.
 
 Both closed-form approximations of a forced oscillator end in one equation for the amplitude A of the fundamental,
-``residual(A, omega) = 0``, which is negative at A = 0 and positive for large A. The averaged amplitude grows where it
-is negative and falls where it is positive: the first, third, ... root is stable, every second one a saddle.
+``residual(A, omega) = 0``. The residual is negative at A = 0 and positive for large A. The averaged amplitude grows where
+the residual is negative and falls where it is positive: the first, third, ... root is stable, every second root a saddle.
 Arrays have the batch as their trailing axes ``(...)``.
 """
 
@@ -32,7 +32,7 @@ def refined(omega: np.ndarray, largest: float, most: int) -> tuple[np.ndarray, n
 
 
 def bisect(function: Callable[[Array], Array], low: Array, high: Array, halvings: int = _HALVINGS) -> Array:
-    """The point between ``low`` and ``high`` where ``function`` changes from not positive to positive."""
+    """The point between ``low`` and ``high`` at which ``function`` becomes positive."""
 
     def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bracket
@@ -67,8 +67,8 @@ def follow(roots: Array) -> Array:
 
     ``roots`` rise along K and are padded with infinity; frequencies rise along L. A sweep starts from rest. Between folds
     the number of roots is constant, and the sweep keeps its position among them, even on steep branches. At the first
-    frequency past a fold the amplitude moves as the averaged motion: to the next root above if the residual at the old
-    amplitude is negative, to the next one below if it is positive.
+    frequency past a fold the amplitude changes like the averaged motion: to the next root above if the residual at the old
+    amplitude is negative, to the next root below if it is positive.
     """
     size = roots.shape[1]
 

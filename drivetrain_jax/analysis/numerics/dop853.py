@@ -3,7 +3,7 @@
 ``y_(n+1) = y_n + h sum_i B_i k_i`` with ``k_i = f(t_n + C_i h, y_n + h sum_(j<i) A_ij k_j)``.
 
 Source: Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, 2nd ed. (1993), II.5, and their dop853.f. SciPy
-has the same numbers, but takes a third of a second to load.
+has the same numbers, but its import costs a third of a second.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 STAGES = 12
-# Weights of the slopes that are not 0, by their number: for each stage, and for the step.
+# Nonzero weights of the slopes by their number, for each stage and for the step.
 _STAGE_WEIGHTS = (
     {},
     {0: 0.05260015195876773},

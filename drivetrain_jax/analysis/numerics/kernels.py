@@ -1,9 +1,9 @@
 """Compile kernels for the CPU, in particular marches of many small operations.
 
-XLA recomputes an intermediate value for every result that needs it, and calls a kernel for each result: a step of a
-Runge-Kutta method is computed several times, or costs more in calls than in arithmetic. :func:`stored` and
-:func:`in_one_kernel` mark functions for the compiler. The marks change numbers only by rounding; a compiler that does not
-know them ignores them.
+XLA recomputes an intermediate value for every result that needs it, and calls a kernel for each result. A step of a
+Runge-Kutta method is then computed several times, or costs more in calls than in arithmetic. :func:`stored` and
+:func:`in_one_kernel` mark functions for the compiler. The marks change numbers only by rounding, and a compiler that does
+not know a mark ignores it.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ R = TypeVar("R")
 
 # Numbers in a vector of AVX-512.
 FULL_WIDTH = 8
-# A call that is not inlined is not fused with its neighbours either: its results are computed once and stored.
+# A call that is not inlined is not fused with its neighbours either, so its results are computed once and stored.
 _APART = {"inlineable": "false"}
-# XLA does this by default for loops over less than half a kilobyte.
+# One kernel for a call with its loops; by default XLA makes one only of loops over less than half a kilobyte.
 _ONE_KERNEL = {**_APART, "xla_cpu_small_call": "true"}
-# Operations that may be part of such a kernel. Not among them are sorting, scattering, calls of libraries, and sums and
-# maxima over an axis (XLA compiles these in another way).
+# Operations that may be part of such a kernel. Sorting, scattering, library calls, and sums and maxima over an axis may not:
+# XLA compiles these in another way.
 _ELEMENTWISE = """
     abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy cos cosh
     div eq erf erfc exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max min mul ne neg not
@@ -45,19 +45,20 @@ _KNOWN = {*_ELEMENTWISE.split(), *_STRUCTURE.split()}
 
 
 def on_cpu() -> bool:
-    """True if this process computes on a CPU. An accelerator needs other batches and no marks."""
+    """True if this process computes on a CPU; an accelerator needs other batches and no marks."""
     return jax.default_backend() == "cpu"
 
 
 def compiler_options(lanes: int = FULL_WIDTH, *, march: bool = False, short_loops: bool = False) -> dict[str, Any]:
     """Compiler options for full vector width; XLA's default is half of AVX-512, which is 1.6 times slower.
 
-    Not for fewer ``lanes`` than a vector: compiling a march of four lanes then takes tens of gigabytes (jax 0.10.2). A
-    ``march`` uses the older of two code generators, which compiles twice as fast and makes most marches no slower (charts,
-    determinants, impacts and adaptive steps in lockstep would be slower, by up to a factor of two).
+    With fewer ``lanes`` than a vector the width keeps its default: a march of four lanes would take tens of gigabytes to
+    compile (jax 0.10.2). A ``march`` uses the older of two code generators, which compiles twice as fast and makes most
+    marches no slower. Exceptions are charts, determinants, impacts and adaptive steps in lockstep, which would be up to
+    twice as slow.
 
-    Loops over some tens of lanes (``short_loops``) use a lower level of optimisation: the highest one unrolls them into
-    scalar operations that do not fit into the cache. Marches of tangent vectors stay at the highest: with few lanes any
+    Loops over some tens of lanes (``short_loops``) use a lower level of optimisation: the highest level unrolls them into
+    scalar operations that do not fit into the cache. Marches of tangent vectors keep the highest level: with few lanes any
     other level needs tens of gigabytes to compile.
     """
     options: dict[str, Any] = {}
@@ -71,7 +72,7 @@ def compiler_options(lanes: int = FULL_WIDTH, *, march: bool = False, short_loop
 
 
 def options_for_few() -> dict[str, Any]:
-    """For kernels that run for milliseconds: compiled without optimising. Long ones would run several times as long."""
+    """Compiler options without optimisation, for kernels of milliseconds; longer kernels would run several times as long."""
     return _applicable({"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False})
 
 
@@ -83,9 +84,9 @@ def _applicable(options: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def compiler_knows(option: str, value: Any) -> bool:
-    """True if XLA accepts an option, which any release of jaxlib may remove: kernels are then slower, not missing.
+    """True if XLA accepts an option. A release of jaxlib may remove an option; kernels are then slower, but still compile.
 
-    Options of jaxlib 0.10 are listed, because asking takes as long as a small compilation.
+    For jaxlib 0.10 the result is known without a trial, which takes as long as a small compilation.
     """
     if jaxlib.__version__.startswith("0.10."):  # pyright: ignore[reportPrivateImportUsage]
         return True
@@ -102,9 +103,9 @@ def stored(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def in_one_kernel(function: Callable[..., R]) -> Callable[..., R]:
-    """``function``, loops and all, as a single kernel: for batches that fit into the innermost cache.
+    """``function`` with its loops as a single kernel, for batches that fit into the innermost cache.
 
-    Everything in it has to pass :func:`suits_one_kernel`.
+    The function must pass :func:`suits_one_kernel`.
     """
     if not on_cpu():
         return function
@@ -121,11 +122,11 @@ def in_one_kernel(function: Callable[..., R]) -> Callable[..., R]:
 
 
 def _using_all(closed: Any, certain: Array, values: list[Array]) -> list[Array]:
-    """Results of ``closed`` for its captured values and its arguments, all of which are read.
+    """Results of ``closed`` for its captured values and its arguments, computed so that all inputs are read.
 
     XLA aborts the process for a kernel with unused inputs (jax 0.10.2), for example the time of a march whose field does
-    not depend on it, or everything if the march takes no steps. The values, and that ``certain`` is true, are therefore
-    hidden from the compiler.
+    not depend on it, or all inputs of a march without steps. The compiler must therefore know neither the values nor that
+    ``certain`` is true.
     """
     captured = len(closed.consts)
     first, *others = jax.core.eval_jaxpr(closed.jaxpr, values[:captured], *values[captured:])
@@ -154,7 +155,7 @@ def _marked(function: Callable, marks: dict[str, str]) -> Callable:
 
 
 def _operations(jaxpr: Any) -> Iterator[str]:
-    """Names of all operations, those of nested functions included."""
+    """Names of all operations, including those of nested functions."""
     for equation in jaxpr.eqns:
         yield equation.primitive.name
         for value in equation.params.values():

@@ -1,4 +1,4 @@
-"""Batches as the last axis: functions of one point under ``jax.vmap``, and lanes that are computed in parts."""
+"""Batches as the last axis: functions of one point under ``jax.vmap``, and lanes in blocks."""
 
 from __future__ import annotations
 
@@ -21,21 +21,20 @@ Values = Mapping[str, Any]
 
 
 def path_entry(values: Values, name: str) -> Any:
-    """The values of the parameter ``name``, or of one entry of a list, ``planet_angle[1]``."""
+    """The values of the parameter ``name``, or of one entry of a list such as ``planet_angle[1]``."""
     match = re.fullmatch(r"(.+)\[(\d+)\]", name)
     return values[match.group(1)][int(match.group(2))] if match else values[name]
 
 
 def lane_count(values: Values, path: str = "") -> int:
-    """Length of the arrays among ``values``, 1 if there are none; the path axis, if there is one, does not count."""
+    """Length of the arrays among ``values`` without the path axis; 1 without arrays."""
     along = path_entry(values, path) if path else None
     lengths = [np.shape(leaf)[0] for leaf in jax.tree.leaves(values) if np.ndim(leaf) and leaf is not along]
     return max(lengths, default=1)
 
 
 def with_path(values: Values, path: str, lanes: int) -> tuple[dict[str, Any], int]:
-    """``values`` for every point of the path times every lane, in this order flattened to one axis; length of the
-    path."""
+    """``values`` for every point of the path and every lane, flattened in this order to one axis, and the path's length."""
     along = path_entry(values, path)
     length = np.shape(along)[0]
 
@@ -48,10 +47,10 @@ def with_path(values: Values, path: str, lanes: int) -> tuple[dict[str, Any], in
 
 
 def in_blocks(function: Callable[[Any, int], Any], values: Any, lanes: int, size: int) -> Any:
-    """``function(values, count)`` of ``lanes`` lanes, ``size`` at a time; its results have the lanes as last axis.
+    """``function(values, count)`` of ``lanes`` lanes in blocks of ``size``; its results have the lanes as last axis.
 
-    The arrays among ``values`` whose last axis are the lanes are cut; other values stay whole. ``size`` lanes fit into the
-    caches of a core; an accelerator computes all lanes at once.
+    Arrays among ``values`` with the lanes as last axis are cut into blocks; other values stay whole. ``size`` lanes fit into
+    the caches of a core; an accelerator computes all lanes at once.
     """
     count = -(-lanes // size)
     leaves, tree = jax.tree.flatten(values)
@@ -82,7 +81,7 @@ def _padded(array: Array, lanes: int) -> Array:
 
 
 class Constants:
-    """A hashable pytree: the part of a traced function's arguments that is no array."""
+    """A hashable pytree, for the arguments of a traced function that are no traced arrays."""
 
     def __init__(self, tree: Any) -> None:
         self.tree = tree
@@ -103,15 +102,15 @@ def lanes_last(
     """``function(constants, varying, shared)`` of one point; under ``jax.vmap``, even nested, one call for all lanes.
 
     ``function`` has the lanes as an additional last axis of every array in ``varying`` and of its results. Values common to
-    all lanes have a last axis of 1, numbers none. ``shared`` applies to all lanes: of different integers the largest
-    counts, other values become an array of lanes. With ``size``, that many lanes are computed at a time, and ``function``
-    is traced only for this number, once for equal ``constants`` (a batch that fits into one vector is computed as a whole).
+    all lanes have a last axis of length 1; numbers have none. ``shared`` applies to all lanes: different integers become
+    their maximum, other values an array of lanes. With ``size``, ``function`` runs on blocks of this number of lanes and is
+    traced only for this number, once for equal ``constants``. A batch that fits into one vector is computed as a whole.
     """
     at_once = partial(_at_once, function, constants)
 
     @custom_vmap
     def call(varying: Any, shared: Any) -> Any:
-        # The usual size of a batch: a single point would need another trace.
+        # A single point is padded to a block, because it would need another trace.
         return at_once(varying, shared, size)
 
     @call.def_vmap
@@ -146,7 +145,7 @@ def _at_once(
 
 
 def _merged(batch: int, lanes: int, x: Array, own: bool) -> Array:
-    """A varying array with the batch, its first axis if it has its ``own`` values for each entry, among the lanes."""
+    """A varying array with the batch merged into the lanes; the batch is its first axis if it has its ``own`` values."""
     if own:
         x = jnp.broadcast_to(x, (*x.shape[:-1], lanes))
         return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], batch * lanes)
@@ -154,7 +153,7 @@ def _merged(batch: int, lanes: int, x: Array, own: bool) -> Array:
 
 
 def _common(batch: int, lanes: int, x: Array, own: bool) -> Array:
-    """A shared value for the whole batch: the largest of different integers, an array of lanes of other values."""
+    """A shared value for the whole batch: the maximum of different integers, or an array of lanes of other values."""
     if own and jnp.issubdtype(x.dtype, jnp.integer):
         return jnp.max(x)
     if own:
@@ -163,7 +162,7 @@ def _common(batch: int, lanes: int, x: Array, own: bool) -> Array:
 
 
 def _traced_once(function: Callable[[Any, Any, Any], Any], constants: Constants, varying: Any, shared: Any) -> Any:
-    """``function(constants, varying, shared)`` by a trace that is kept, which jax does not do across transformations."""
+    """``function(constants, varying, shared)`` by a cached trace; jax caches no traces across transformations."""
     leaves, tree = jax.tree.flatten((varying, shared))
     kinds = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves)
     closed, results = _trace(function, constants, tree, kinds)
@@ -180,10 +179,10 @@ def _trace(
 
 
 def over_lanes(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """``function(values, effort)`` of one point, for values of which JAX arrays hold one number for each lane.
+    """``function(values, effort)`` of one point as a function of lanes, with the lanes as last axis of its results.
 
-    Its results have the lanes as last axis, if there are any. All other ``values``, NumPy arrays included, apply to
-    all lanes.
+    JAX arrays among ``values`` hold one number for each lane. All other ``values``, NumPy arrays included, apply to all
+    lanes. Without arrays there is no axis of lanes.
     """
 
     def all_lanes(values: Any, effort: Any) -> Any:
@@ -196,17 +195,19 @@ def over_lanes(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]
 
 
 def by_rows(function: Callable[[Any], Any], rows: Any) -> Any:
-    """``function`` of every entry along the first axis of ``rows``, one by one, so that intermediate values stay in the
-    caches; on an accelerator all at once."""
+    """``function`` of every entry along the first axis of ``rows``.
+
+    Entries are computed one by one, so that intermediate values stay in the caches; on an accelerator all at once.
+    """
     return lax.map(function, rows) if on_cpu() else jax.vmap(function)(rows)
 
 
 def evaluated_once(certain: Array, function: Callable[[], Any]) -> Any:
-    """``function()``, computed once and kept in memory, where XLA for CPUs would compute it again for every entry of
-    every array that depends on it: a conditional is a border that fusion does not cross.
+    """``function()``, computed once and kept in memory.
 
-    ``certain`` is a condition that holds whenever it is evaluated, but is not known to the compiler. Results may rely on
-    the single evaluation, which the marks of :mod:`~drivetrain_jax.analysis.numerics.kernels` do not promise.
+    XLA for CPUs would otherwise compute it again for every entry of every array that depends on it. Fusion does not cross a
+    conditional. ``certain`` is a condition that always holds, which the compiler does not know. Results may rely on the
+    single evaluation, which the marks of :mod:`~drivetrain_jax.analysis.numerics.kernels` do not guarantee.
     """
     shapes = jax.eval_shape(function)
     return lax.cond(certain, function, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))

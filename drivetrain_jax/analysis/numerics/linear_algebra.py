@@ -1,9 +1,11 @@
-"""Small dense linear algebra without LAPACK calls: these, made from concurrent kernels, can wait for each other in
-XLA's thread pool forever (seen with jax 0.10.2 on two cores).
+"""Small dense linear algebra without LAPACK calls.
+
+LAPACK calls from concurrent kernels can wait for each other forever in XLA's thread pool (seen with jax 0.10.2 on two
+cores).
 
 ``eigenvalues`` reduces to Hessenberg form by Householder reflections and applies the QR iteration with Wilkinson's
-complex shift, deflating from the bottom (Golub & Van Loan, Matrix Computations, 7.4-7.5): backward stable. All lanes of
-a batch go through the same sweeps, so the arithmetic vectorises. Complex numbers are pairs of real arrays.
+complex shift and deflation from the bottom (Golub & Van Loan, Matrix Computations, 7.4-7.5), which is backward stable. All
+lanes of a batch go through the same sweeps, so the arithmetic vectorises. Complex numbers are pairs of real arrays.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ def matmul(a: Array, b: Array) -> Array:
 
 
 def looped_matmul(a: Array, b: Array | np.ndarray) -> Array:
-    """The same for matrices of ten rows and more, for which that would be long to compile."""
+    """:func:`matmul` as a loop, for matrices of ten rows and more, which ``matmul`` would take long to compile."""
 
     def add(j: Array, total: Array) -> Array:
         column = jax.lax.dynamic_index_in_dim(a, j, 1, keepdims=False)
@@ -47,7 +49,7 @@ def solve(a: Array, b: Array) -> Array:
 
 
 def solve_oriented(a: Array, b: Array) -> tuple[Array, Array]:
-    """The same, and whether the determinant of ``a`` is negative, ``(...)``."""
+    """Solution of ``a x = b`` as in :func:`solve`, and flags of a negative determinant of ``a``, ``(...)``."""
     n = a.shape[0]
     number = jnp.arange(n).reshape(n, *(1,) * (a.ndim - 2))
 
@@ -106,13 +108,13 @@ def hessenberg(a: Array) -> Array:
 
 
 def _pair(a: Complex, b: Complex, c: Complex, d: Complex) -> tuple[Complex, Complex]:
-    """Eigenvalues of [[a, b], [c, d]]; the second is the nearer to ``d``."""
+    """Eigenvalues of [[a, b], [c, d]]; the second one is nearer to ``d``."""
     half = ((a[0] - d[0]) / 2, (a[1] - d[1]) / 2)
     off, square = _multiply(b, c), _multiply(half, half)
     root = _square_root((square[0] + off[0], square[1] + off[1]))
     sign = jnp.where(half[0] * root[0] + half[1] * root[1] < 0, -1.0, 1.0)
     far = (half[0] + sign * root[0], half[1] + sign * root[1])
-    # d - bc/far rather than d + half - root: no cancellation.
+    # d - bc/far, because d + half - root would cancel.
     size = far[0] ** 2 + far[1] ** 2
     quotient = tuple(x / jnp.where(size > 0, size, 1.0) for x in _conjugate_multiply(far, off))
     return (d[0] + far[0], d[1] + far[1]), (d[0] - quotient[0], d[1] - quotient[1])
@@ -150,7 +152,7 @@ def _sweep(h: Complex, shift: Complex, size: Array) -> Complex:
     active = jnp.arange(n) < size
     h = _add_to_diagonal(h, (-shift[0], -shift[1]), active)
     rows, rotations = [(h[0][i], h[1][i]) for i in range(n)], []
-    # Stored: otherwise each rotation would be recomputed for everything that depends on it, and compiled as often.
+    # Stored, because XLA would otherwise recompute and recompile each rotation for everything that depends on it.
     for k in range(n - 1):
         x, y = rows[k], rows[k + 1]
         rows[k], rows[k + 1], *rotation = stored(_turn_rows)(x, y, *((r[0][k], r[1][k]) for r in (x, y)), active[k + 1])  # pyright: ignore[reportCallIssue]
@@ -169,7 +171,7 @@ def _size(a: Complex) -> Array:
 def eigenvalues(a: Array) -> tuple[Array, Array]:
     """Real and imaginary parts of the eigenvalues of ``a``, ``(n, n, ...) -> (n, ...)`` each, in no particular order.
 
-    Lanes that are not finite give NaN and do not delay the others.
+    Lanes that are not finite return NaN and do not delay the others.
     """
     reduced = hessenberg(a)
     h = (reduced, jnp.zeros_like(reduced))
@@ -182,7 +184,7 @@ def eigenvalues(a: Array) -> tuple[Array, Array]:
 
 
 def _deflated(h: Complex) -> Complex:
-    """``h`` after QR steps that decouple, in every lane, one row after the other from below, down to two.
+    """``h`` after QR steps that decouple one row after the other from below, in every lane, until two rows are left.
 
     One loop for all sizes, because compiling a loop takes seconds.
     """
@@ -198,7 +200,7 @@ def _deflated(h: Complex) -> Complex:
 
         def sweep() -> tuple:
             shift = _pair(*(_entry(corner, i, j) for i in (0, 1) for j in (0, 1)))[1]
-            # Every tenth sweep an arbitrary shift breaks a cycle.
+            # An arbitrary shift in every tenth sweep breaks cycles.
             kick = jnp.where(count % 10 == 9, 0.75, 0.0) * coupling
             return size, count + 1, _sweep(h, (shift[0] + kick, shift[1] - kick / 2), size)
 

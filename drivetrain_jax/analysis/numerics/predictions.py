@@ -13,7 +13,7 @@ from jax import Array
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.numerics.kernels import options_for_few
 
-# Points that are evaluated together: of few, and of many.
+# Points per evaluation, for few points and for many.
 _FEW, _MANY = 32, 2048
 
 Words = tuple[tuple[str, str], ...]
@@ -23,9 +23,9 @@ Columns = Mapping[str, Any]
 def predicted(function: Callable[..., Array], given: tuple[Hashable, ...], columns: Columns) -> np.ndarray:
     """``function(*given, values)`` of every point, shape ``(..., N)``.
 
-    ``columns`` are the values of N points: numbers as arrays of shape ``(N,)``, or one for all; words; and tuples of
-    numbers. ``values`` are those of one point. The function is compiled once for all numbers: run operation by operation,
-    each of these would be compiled, which takes longer than a small scene does. It may raise :class:`InputError`.
+    ``columns`` are the values of N points: numbers as arrays of shape ``(N,)`` or one number for all points, words, and
+    tuples of numbers. ``values`` are the values of one point. The function is compiled once as a whole: compiling its
+    operations one by one would take longer than a small scene. It may raise :class:`InputError`.
     """
     words, numbers = split(columns)
     count = count_of(columns)
@@ -34,7 +34,7 @@ def predicted(function: Callable[..., Array], given: tuple[Hashable, ...], colum
     found = []
     for start in range(0, count, together):
         size = min(together, count - start)
-        # The last block is filled up with its last point.
+        # The last block is padded with its last point.
         places = np.minimum(np.arange(start, start + together), count - 1)
         found.append(_called(call, taken(numbers, places))[..., :size])
     return np.concatenate(found, axis=-1)
@@ -56,7 +56,7 @@ def taken(columns: Columns, places: np.ndarray) -> Columns:
 
 
 def split(columns: Columns) -> tuple[Words, dict[str, Any]]:
-    """The words among values, and the numbers."""
+    """The words and the numbers among the values."""
     numbers = {name: value for name, value in columns.items() if not isinstance(value, str)}
     return tuple((name, value) for name, value in columns.items() if name not in numbers), numbers
 
@@ -65,7 +65,7 @@ def _called(call: Callable[[Columns], Array], block: Columns) -> np.ndarray:
     try:
         return np.asarray(call(block))
     except InputError as error:
-        # Without the notes that jax adds to an exception.
+        # Drop the notes that jax adds to an exception.
         raise InputError(*error.args) from None
 
 

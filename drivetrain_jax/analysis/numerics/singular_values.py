@@ -1,9 +1,9 @@
 """Singular values of many small matrices at once, without LAPACK: matrices of shape ``(m, n, N)``, lanes last.
 
 Householder bidiagonalisation, then the implicit QR iteration on the bidiagonal matrix (Golub & Van Loan, Matrix
-Computations, 8.6; Demmel & Kahan, SIAM J. Sci. Stat. Comput. 11, 873, 1990). The singular values never pass through
-squares, so small ones keep their digits. Every lane works on its own unreduced block; the
-sweeps of all lanes run through the same instructions, which vectorise over the lanes.
+Computations, 8.6; Demmel & Kahan, SIAM J. Sci. Stat. Comput. 11, 873, 1990). The singular values are never squared, so
+small values keep their digits. Every lane works on its own unreduced block; the sweeps of all lanes run through the same
+instructions, which vectorise over the lanes.
 """
 
 from __future__ import annotations
@@ -17,21 +17,24 @@ from jax import Array, lax
 from drivetrain_jax.analysis.numerics.lanes import evaluated_once
 
 EPS = float(np.finfo(float).eps)
-# Matrices are scaled to entries of order one; smaller values than these affect no digit.
+# Values (and their squares) that affect no digit, because matrices are scaled to entries of order one.
 _TINY, _TINY_SQUARE = 1e-150, 1e-300
-# Off-diagonal entries below this count as zero; squares of larger ones do not underflow.
+# Off-diagonal entries below this count as zero; squares of larger entries do not underflow.
 _NEGLIGIBLE = 1e-140
-# QR sweeps per singular value: less than two are needed on average, LAPACK allows six per value and column.
+# Most QR sweeps per singular value: fewer than two are needed on average, and LAPACK allows six per value and column.
 _SWEEPS_PER_VALUE = 12
-# Each stage of the reduction works on the rows and columns that the ones before have left.
+# Columns per stage of the reduction; each stage works on the rows and columns that earlier stages have left.
 _STAGE = 9
 # Terms of a sum that are added in one pass over the memory.
 _TERMS = 8
 
 
 class Bidiagonal(NamedTuple):
-    """Bidiagonal matrices with the singular values of ``scale`` times less: ``diagonal`` and ``upper`` (n, N), the last
-    entry of ``upper`` being zero; ``finite`` (N,) is false where the original had an entry that is not finite."""
+    """Bidiagonal matrices whose singular values times ``scale`` are those of the original matrices.
+
+    ``diagonal`` and ``upper`` have shape (n, N); the last entry of ``upper`` is zero. ``finite`` (N,) is false where the
+    original has an entry that is not finite.
+    """
 
     diagonal: Array
     upper: Array
@@ -43,7 +46,7 @@ def singular_values(*blocks: Array) -> tuple[Array, Array]:
     """Singular values of block-diagonal matrices: ``(n, N)`` rising, and flags if all were found, ``(N,)``.
 
     ``blocks`` have shapes ``(m_i, n_i, N)`` with ``m_i >= n_i``; ``n`` is the sum of ``n_i``. Backward stable: errors are
-    of the order of the rounding unit times the largest singular value. A lane with an entry that is not finite gives NaN
+    of the order of the rounding unit times the largest singular value. A lane with an entry that is not finite returns NaN
     and does not delay the others.
     """
     values, found = bidiagonal_values(bidiagonal_form(*blocks))
@@ -51,9 +54,9 @@ def singular_values(*blocks: Array) -> tuple[Array, Array]:
 
 
 def bidiagonal_form(*blocks: Array) -> Bidiagonal:
-    """One bidiagonal matrix with the singular values of all ``blocks``, in the rows of each its own."""
+    """One bidiagonal matrix with the singular values of all ``blocks``; each block has its own rows."""
     size = jnp.max(jnp.stack([jnp.max(jnp.abs(block), axis=(0, 1)) for block in blocks]), axis=0)
-    # Said for every entry: a maximum need not carry NaN along.
+    # Test every entry, because a maximum may lose NaN.
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(block), axis=(0, 1)) for block in blocks]), axis=0)
     scale = jnp.where(finite & (size > 0), size, 1.0)
     pairs = [_bidiagonalise(jnp.where(finite, block / scale, 0.0)) for block in blocks]
@@ -61,10 +64,9 @@ def bidiagonal_form(*blocks: Array) -> Bidiagonal:
 
 
 def _reflector(x: Array, place: Array) -> tuple[Array, Array, Array, Array]:
-    """``v``, ``2/|v|^2``, the new leading entry of the reflection that clears ``x`` below its leading entry, and the
-    old one.
+    """``v`` and ``2/|v|^2`` of the reflection that clears ``x`` below its leading entry, and this entry after and before.
 
-    ``x`` (n, N) vanishes above the entry that ``place`` (n, 1) marks.
+    ``place`` (n, 1) marks the leading entry of ``x`` (n, N), which vanishes above it.
     """
     leading = jnp.sum(jnp.where(place, x, 0.0), axis=0)
     square = jnp.sum(x * x, axis=0)
@@ -78,8 +80,8 @@ def _reflector(x: Array, place: Array) -> tuple[Array, Array, Array, Array]:
 def _combination(weights: Array, a: Array, axis: int) -> Array:
     """``sum_i weights[i] a[i]`` over the rows (``axis`` 0) or columns (1) of ``a`` (m, n, N), weights (m or n, N).
 
-    Some terms at a time: written as a sum of slices it vectorises over the lanes, which a reduction does not; all in
-    one expression would take long to compile.
+    A sum of slices vectorises over the lanes, unlike a reduction. It adds some terms at a time, because a single expression
+    would take long to compile.
     """
     count = a.shape[axis]
     rest = count % _TERMS if count >= 2 * _TERMS else count
@@ -106,7 +108,7 @@ def _reduce_row_and_column(k: Array, state: tuple[Array, Array, Array]) -> tuple
     v, factor, new_diagonal, leading = evaluated_once(certain, column)
     w = evaluated_once(certain, lambda: factor * _combination(v, a, 0))
 
-    # Once: where the row has nothing but rounding left, two evaluations of it would give two different reflections.
+    # Evaluate once: where the row is only rounding, two evaluations would give two different reflections.
     y = evaluated_once(
         certain, lambda: lax.dynamic_index_in_dim(a, k, 0, keepdims=False) - (leading - new_diagonal) * w
     )
@@ -148,7 +150,7 @@ def _smaller_value(f: Array, g: Array, h: Array) -> Array:
 def _rotation(f: Array, g: Array) -> tuple[Array, Array, Array]:
     """``c``, ``s`` and ``r`` with [c, s; -s, c] (f, g) = (r, 0); the identity where both are negligible.
 
-    Orthogonal in any case: it turns other numbers, too, which are not.
+    The rotation is always orthogonal, because it also applies to entries that are not negligible.
     """
     square = f * f + g * g
     some = square > _NEGLIGIBLE**2
@@ -157,13 +159,13 @@ def _rotation(f: Array, g: Array) -> tuple[Array, Array, Array]:
 
 
 def _split(pairs: Array) -> tuple[Array, Array, Array]:
-    """Clear negligible upper entries; first and last row of the lowest unreduced block (both 0 if there is none).
+    """``pairs`` without negligible upper entries, and first and last row of the lowest unreduced block (0 if none).
 
-    Row ``j`` of ``pairs`` (n + 1, 2, N) holds the upper entry above the diagonal entry ``j``, and that entry.
+    Row ``j`` of ``pairs`` (n + 1, 2, N) holds the upper entry above the diagonal entry ``j``, and the diagonal entry.
     """
     upper, diagonal = pairs[1:, 0], jnp.abs(pairs[:, 1])
     coupled = jnp.abs(upper) > EPS * (diagonal[:-1] + diagonal[1:]) + _NEGLIGIBLE
-    # Row by row: a reduction over the rows would not vectorise over the lanes.
+    # Loop over the rows: a reduction would not vectorise over the lanes.
     last = first = jnp.zeros(pairs.shape[-1], int)
     for row in range(1, len(coupled) + 1):
         last = jnp.where(coupled[row - 1], row, last)
@@ -174,7 +176,7 @@ def _split(pairs: Array) -> tuple[Array, Array, Array]:
 
 
 def _shifted_start(pairs: Array, first: Array, last: Array) -> Array:
-    """The leading entry of the first rotation: B^T B - shift^2 over its own first diagonal entry's root."""
+    """Leading entry of the first rotation: that of ``B^T B - shift^2``, divided by the leading entry of B."""
 
     def entry(column: int, row: Array) -> Array:
         return jnp.take_along_axis(pairs[:, column], jnp.maximum(row, 0)[None], axis=0, mode="clip")[0]
@@ -202,7 +204,7 @@ def _sweep(pairs: Array, first: Array, last: Array) -> Array:
         f, g, right = jnp.where(top, start, f), jnp.where(top, upper, s * upper), jnp.where(top, upper, c * upper)
         c, s, r = _rotation(f, g)
         above = jnp.where(inside & ~top, r, above)
-        # Once: where f and g are nothing but rounding, two evaluations would give two different rotations.
+        # Evaluate once: where f and g are only rounding, two evaluations would give two different rotations.
         f, g = evaluated_once(k >= 0, lambda: (c * here + s * right, s * below))
         right, corner = c * right - s * here, c * below
         c, s, r = _rotation(f, g)
@@ -212,19 +214,19 @@ def _sweep(pairs: Array, first: Array, last: Array) -> Array:
 
     above, here = row(pairs, begin)
     zero = jnp.zeros(lanes)
-    # Read from one array and written to another: one for both would be copied in every step.
+    # Read from one array and write to another: a single array would be copied in every step.
     swept, _, _, _, above, here = lax.fori_loop(begin, end, step, (pairs, zero, zero, zero, above, here))
     return lax.dynamic_update_index_in_dim(swept, jnp.stack([above, here]), end, 0)
 
 
 def bidiagonal_values(form: Bidiagonal) -> tuple[Array, Array]:
-    """Singular values ``(n, N)``, those of every block in its own rows but in no order, and whether all were found.
+    """Singular values ``(n, N)``, of every block in its own rows but in no order, and flags if all were found.
 
-    NaN in lanes where they were not, or that are not finite.
+    Lanes that are not finite, or whose values were not found, are NaN.
     """
     n, lanes = form.diagonal.shape
     zero = jnp.zeros((1, lanes))
-    # An exact zero would hide the shift from the rows below it.
+    # An exact zero would stop the effect of the shift on the rows below.
     diagonal = jnp.where(jnp.abs(form.diagonal) < _TINY, _TINY, form.diagonal)
     above = jnp.concatenate([zero, form.upper[:-1], zero])
     pairs, first, last = _split(jnp.stack([above, jnp.concatenate([diagonal, zero])], axis=1))

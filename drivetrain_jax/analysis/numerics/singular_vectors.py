@@ -1,8 +1,8 @@
 """Right singular vectors of many small matrices at once, without LAPACK: one-sided Jacobi rotations, lanes last.
 
 Hestenes' method (Golub & Van Loan, Matrix Computations, 8.6.3) with the pairs of a round-robin tournament: all pairs of
-a round are disjoint and rotate together. The vectors are products of rotations, hence orthonormal to rounding also
-within clusters and for singular values that are zero.
+a round are disjoint and rotate together. The vectors are products of rotations, hence orthonormal up to rounding, even
+within clusters and for singular values of zero.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ _MAX_SWEEPS = 30
 
 
 def jacobi_vectors(a: Array) -> tuple[Array, Array]:
-    """``V`` (n, n, N), orthonormal, with orthogonal columns of ``a V`` in no order, and whether that is so, ``(N,)``.
+    """Orthonormal ``V`` (n, n, N) such that ``a V`` has orthogonal columns, in no order, and flags of convergence ``(N,)``.
 
     ``a`` has shape ``(m, n, N)``. Columns of a block-diagonal ``a`` are not mixed across the blocks. A lane with an
-    entry that is not finite ends as the identity, not converged.
+    entry that is not finite returns the identity, not converged.
     """
     m, n, lanes = a.shape
     finite = jnp.all(jnp.isfinite(a), axis=(0, 1))
@@ -31,7 +31,7 @@ def jacobi_vectors(a: Array) -> tuple[Array, Array]:
         return identity, finite
     half = (n + 1) // 2
     padded = jnp.concatenate([columns, jnp.zeros((2 * half - n, m + n, lanes))])
-    # Smaller values are rounding of the largest column and need not become orthogonal.
+    # Smaller columns are rounding of the largest column and need not become orthogonal.
     noise = EPS * n * jnp.sqrt(jnp.max(jnp.sum(padded[:, :m] ** 2, axis=1), axis=0))
 
     def round_of_pairs(_: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -49,7 +49,7 @@ def jacobi_vectors(a: Array) -> tuple[Array, Array]:
     def unfinished(state: tuple[Array, ...]) -> Array:
         return (state[0] < _MAX_SWEEPS) & jnp.any(state[3])
 
-    # Players 0..h-1 sit above h..2h-1; after a full tournament everyone is back in place.
+    # Columns 0..h-1 face columns h..2h-1; after a full tournament every column is back in its place.
     start = (jnp.int32(0), padded[:half], padded[half:], jnp.ones(lanes, bool))
     _, top, bottom, rotated = lax.while_loop(unfinished, sweep, start)
     vectors = jnp.concatenate([top, bottom])[:n, m:]
@@ -57,7 +57,7 @@ def jacobi_vectors(a: Array) -> tuple[Array, Array]:
 
 
 def _rotate(top: Array, bottom: Array, m: int, noise: Array) -> tuple[Array, Array, Array]:
-    """Make facing columns orthogonal in their first ``m`` entries; returns flags of the lanes that needed it."""
+    """Columns rotated so that facing columns are orthogonal in their first ``m`` entries, and flags of rotated lanes."""
     x, y = top[:, :m], bottom[:, :m]
     a, b, product = jnp.sum(x * x, axis=1), jnp.sum(y * y, axis=1), jnp.sum(x * y, axis=1)
     sizes = jnp.sqrt(a) * jnp.sqrt(b)

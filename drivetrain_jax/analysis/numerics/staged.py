@@ -1,9 +1,9 @@
-"""A function of an argument that changes and of values that do not, split so that nothing is computed twice.
+"""A function of changing and of fixed values, split so that nothing is computed twice.
 
-A march evaluates the entries of its matrix at every stage of every step, for every lane. :func:`staged` takes such a
-function apart: what does not depend on the argument is computed once, before the march; what depends on it and is used
-by several results is computed once for each evaluation and stored (see :mod:`~drivetrain_jax.analysis.numerics.kernels`).
-The operations are the function's own, in their order.
+A march evaluates the entries of its matrix at every stage of every step, for every lane. :func:`staged` splits such a
+function. Values that do not depend on the argument are computed once, before the march. Values that depend on the argument
+and are used by several results are computed once for each evaluation and stored (see
+:mod:`~drivetrain_jax.analysis.numerics.kernels`). The operations of the function and their order do not change.
 """
 
 from __future__ import annotations
@@ -18,15 +18,14 @@ from jax.extend.core import ClosedJaxpr, DebugInfo, Jaxpr, JaxprEqn, Literal, Va
 
 from drivetrain_jax.analysis.numerics.kernels import stored
 
-# Operations that only change the shape. Done before the march they would only enlarge its input.
+# Operations that only change the shape. Before the march they would only enlarge its input.
 _SHAPING = {"broadcast_in_dim", "reshape", "expand_dims", "squeeze"}
 
 
 class Staged(NamedTuple):
     """``function(*arguments) = moving(fixed, *arguments)``, as a list of arrays.
 
-    ``fixed`` holds one array for each shape: duplicate inputs of a kernel, and inputs that it finds equal, crash the
-    compiler of jax 0.10.2.
+    ``fixed`` holds one array for each shape, because duplicate or equal inputs of a kernel crash the compiler of jax 0.10.2.
     """
 
     fixed: list[Array]
@@ -74,8 +73,11 @@ def _split(jaxpr: Jaxpr) -> tuple[list[JaxprEqn], list[JaxprEqn]]:
 
 
 def _shared_once(equations: Sequence[JaxprEqn], results: Iterable[Any]) -> list[tuple[list[Var], list[Var], Callable]]:
-    """``(inputs, outputs, function)`` of the parts of ``equations``, in order: one for each value that is a result or is
-    used by more than one part, together with all that only this part uses."""
+    """``(inputs, outputs, function)`` of the parts of ``equations``, in order.
+
+    There is one part for each value that is a result or is used by several parts. It includes all values that no other part
+    uses.
+    """
     wanted = _variables(results)
     if any(len(equation.outvars) != 1 for equation in equations):
         return [_part(equations, [v for v in wanted if any(v in e.outvars for e in equations)])]

@@ -1,4 +1,4 @@
-"""Steps of diffrax that are longest a given part of the interval, and the largest state that they meet."""
+"""Steps of diffrax up to a given fraction of the interval, with a record of the largest state."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import diffrax
 import jax.numpy as jnp
 from jax import Array
 
-# State of the controller of the steps, largest component so far, and the longest step.
+# State of the step-size controller, largest component so far, and longest step.
 _State = tuple[Any, Array, Array]
 
 
 class WatchedSteps(diffrax.AbstractAdaptiveStepSizeController[_State, None]):
-    """The steps of ``controller``, at most ``part`` of the interval ``length``; a first step of more than half of
-    ``length`` is multiplied by ``part``.
+    """The steps of ``controller``, at most the fraction ``part`` of the interval ``length``.
 
-    With ``part`` 1 they are the steps of ``controller``. With less they differ even if one or two steps take the whole
-    interval, where the tolerance does not matter.
+    A first step of more than half of the longest step is multiplied by ``part``. With ``part`` 1 the steps are those of
+    ``controller``. A smaller ``part`` changes the steps even if one or two of them cover the whole interval, where a change
+    of the tolerance has no effect.
     """
 
     controller: diffrax.PIDController
@@ -50,7 +50,7 @@ class WatchedSteps(diffrax.AbstractAdaptiveStepSizeController[_State, None]):
         """End of the first step, and the state."""
         end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         longest, step = self.part * self.length, end - t0
-        # A short first step depends on the tolerance, or others do that follow it: to halve it would only cost.
+        # If the first step is short, it or later steps depend on the tolerance: shortening it would only add cost.
         step = jnp.where(step < longest / 2, step, jnp.minimum(self.part * step, longest))
         return t0 + step, (state, jnp.max(jnp.abs(y0)), longest)
 
@@ -67,5 +67,5 @@ class WatchedSteps(diffrax.AbstractAdaptiveStepSizeController[_State, None]):
 
 
 def largest_met(solution: diffrax.Solution) -> Array:
-    """Largest component in absolute value of the states at the ends of the steps; saved with ``controller_state=True``."""
+    """Largest modulus of a component at the ends of the steps; ``solution`` must have ``controller_state=True``."""
     return solution.controller_state[1]  # pyright: ignore[reportOptionalSubscript]

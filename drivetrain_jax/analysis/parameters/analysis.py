@@ -34,7 +34,7 @@ def _solve(system: type[System], request: Request, values: Mapping[str, Any], ef
         return jnp.stack([jnp.asarray(constants[name](k), float) for k in numbers])
 
     results = {name: value(name) for name in request.outputs}
-    # With the dimension of the modes, if only of length 1, before that of the batch.
+    # Every result gets an axis of modes before the batch, of length 1 if it has none.
     finite = [jnp.isfinite(x if name in with_modes else x[None]) for name, x in results.items()]
     whole = jnp.stack(jnp.broadcast_arrays(*(jnp.all(x, axis=0) for x in finite)))
     outcome = jnp.where(jnp.all(whole, axis=0), Outcome.SUCCESS, Outcome.NOT_FINITE)

@@ -48,7 +48,7 @@ def _curves(dataset: xr.Dataset, name: str, shown: list[str]) -> Figure:
         variable = dataset[key].where(dataset["outcome"] < FIRST_FAILURE).transpose(name, ...)
         axes.plot(dataset[name], variable.values.reshape(dataset.sizes[name], -1), color=LINE_COLOURS[0])
         axes.margins(x=0)
-        # Few digits, because the label has a fixed position.
+        # Few ticks have few digits, and the label has a fixed position.
         axes.locator_params(axis="y", nbins=4)
         panels.label_row(axes, variable_label(variable))
     panels.label_axes(axis_label(dataset[name]))

@@ -1,19 +1,20 @@
 """Poincare sections: the state at every strobe, 50,000 strobes and more, and measures that distinguish a curve from a
 cloud.
 
-Time is a counted strobe plus a fraction, so that the angles of the clocks do not drift. The method ``fixed`` takes equal
-steps of order 8. The method ``adaptive`` shows the effect of loose tolerances: the pair of Dormand & Prince of orders 5 and
-4 with the usual control of ``rtol`` and ``atol``.
+Time is a counted strobe plus a fraction, so that the angles of the clocks do not drift. The method ``fixed`` makes equal
+steps of order 8. The method ``adaptive`` shows the effect of loose tolerances: it is the pair of Dormand & Prince of orders
+5 and 4 with the usual control by ``rtol`` and ``atol``.
 
-Both methods estimate their errors. Some strobes, including the first ones, are repeated with finer equal steps (twice as
-many as ``fixed``, 96 after ``adaptive``): ``strobe_error`` is the error within one strobe of the section. The whole motion
-is repeated with equal steps (a quarter as many, 48 after ``adaptive``; after ``fixed`` twice as many in doubtful cases):
-``section_error`` is the accumulated error since the start. See :mod:`~drivetrain_jax.analysis.poincare.section_error`.
+Both methods estimate their errors. ``strobe_error`` is the error within one strobe of the section: some strobes, including
+the first ones, are repeated with finer equal steps (twice as many as ``fixed``, 96 after ``adaptive``). ``section_error`` is
+the accumulated error since the start: the whole motion is repeated with equal steps (a quarter as many, 48 after
+``adaptive``; after ``fixed`` twice as many in doubtful cases). See
+:mod:`~drivetrain_jax.analysis.poincare.section_error`.
 
-Outcome: ``TOLERANCE_NOT_MET`` if ``section_error`` exceeds 1e-6 or ten times ``rtol``, or is unknown. This holds for every
-long section of a chaotic motion: errors grow to the size of the motion. ``strobe_error`` then shows if its strobes are
-right. ``NOT_FINITE`` if the state overflowed; earlier strobes are kept. ``STEP_LIMIT``: the adaptive method needed too many
-steps within a strobe, or all strobes are more than 1e12 equal steps.
+Outcome: ``TOLERANCE_NOT_MET`` if ``section_error`` exceeds 1e-6 or ten times ``rtol``, or is unknown. Every long section of
+a chaotic motion has this outcome, because errors grow to the size of the motion; ``strobe_error`` then shows if its strobes
+are right. ``NOT_FINITE`` if the state overflowed; earlier strobes are kept. ``STEP_LIMIT`` if the adaptive method needed too
+many steps within a strobe, or if all strobes together are more than 1e12 equal steps.
 """
 
 from __future__ import annotations
@@ -54,23 +55,23 @@ OPTIONS = (
     Parameter("rtol", "1", "relative tolerance of a step", default=1e-3, lower=1e-14, upper=1e-1),
     Parameter("atol", "1", "absolute tolerance of a step", default=1e-6, lower=0.0, open_lower=True),
 )
-# Relative distance below which points are equal; longest period that is searched.
+# Relative distance below which points are equal; longest period of the search.
 _DISTINCT, _LONGEST = 1e-9, 8192
 # Most strobes of the 0-1 test, and fewest for a motion that does not repeat: K of smooth curves of three harmonics is up to
-# 0.99 with 128, 0.93 with 256 and 0.13 with 512.
+# 0.99 with 128 strobes, 0.93 with 256 and 0.13 with 512.
 _SAMPLES, _FEWEST_SAMPLES = 2000, 512
 _MAX_STEPS = 4096
-# Error above which the outcome reports it, and the steps that check the adaptive method.
+# Error above which the outcome is TOLERANCE_NOT_MET, and the steps that check the adaptive method.
 _TOLERATED = 1e-6
 _ADAPTIVE_CHECKS = Steps(96, 48)
 # The fewest steps that show the accumulation of errors.
 _FEWEST = 6
-# Numbers of a chunk's sections, and points of a chunk at most.
+# Most numbers in the sections of a chunk, and most points of a chunk.
 _NUMBERS, _CHUNK = 1 << 23, 64
 
 
 class Section(NamedTuple):
-    """States at the strobes, shape ``(strobes, n, ...)``, those at the first discarded ones, and the outcome."""
+    """States at the strobes, shape ``(strobes, n, ...)``, states at the first discarded strobes, and the outcome."""
 
     states: Array
     early: Array
@@ -121,7 +122,7 @@ def checking_steps(request: Request) -> Steps:
 
 
 def tolerated(request: Request) -> float:
-    """Largest error that is not a failure."""
+    """Largest error for the outcome ``SUCCESS``."""
     return min(_TOLERATED, 10 * request.options["rtol"]) if request.method == "adaptive" else _TOLERATED
 
 
@@ -141,7 +142,7 @@ def measures(flow: Flow, states: Array, request: Request) -> dict[str, Array]:
 
 
 def _k01(section: Array, distinct: Array) -> Array:
-    """K of the section; its limit if it repeats, because a short record of few points may look like diffusion."""
+    """K of the section, or its limit 0 if the section repeats: a short record of few points may look like diffusion."""
     enough = len(section) >= _FEWEST_SAMPLES
     k01 = largest_k01(section) if enough else jnp.full(section.shape[2:], jnp.nan)
     return jnp.where(distinct > 0, 0.0, k01)

@@ -15,16 +15,16 @@ from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, coordinat
 
 _FIRST = 1000
 _MOST_ROWS = 6
-# Width below which a section is drawn as a point, and least height of a panel, relative to the usual size of a component.
+# Width below which a section is drawn as a point, and least height of a panel, both relative to the size of a component.
 _NARROW, _LOW = 1e-9, 1e-3
 _HEIGHT = 2.6
 
 
 def plot(dataset: xr.Dataset) -> Figure:
-    """The section with all strobes, and the first 1000 alone if there are more; one row for each of up to six values of one
-    axis.
+    """The section with all strobes, and with the first 1000 alone if there are more.
 
-    Raises :class:`InputError` for more axes or values, and unless ``section`` is stored.
+    One axis of up to six values gives one row for each value. Raises :class:`InputError` for more axes or values, and
+    unless ``section`` is stored.
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
@@ -70,7 +70,7 @@ def _draw_row(row: list[Axes], part: xr.Dataset, name: str | None) -> None:
 
 
 def _scale(dataset: xr.Dataset) -> float:
-    """Usual size of the second component over that of the first."""
+    """Ratio of the usual size of the second component to that of the first."""
     return state(dataset)[1].get("scale", 1.0) if len(state(dataset)) > 1 else 1.0
 
 
@@ -83,7 +83,7 @@ def _is_point(points: np.ndarray, scale: float) -> bool:
 
 
 def _widen(axes: Axes, which: str, values: np.ndarray, least: float) -> None:
-    """Limits that do not magnify rounding errors to the height of the panel."""
+    """Widen the limits so that rounding errors do not fill the panel."""
     if not values.size:
         return
     size = max(_NARROW * np.abs(values).max(), least)

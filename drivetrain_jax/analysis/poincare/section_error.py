@@ -1,15 +1,17 @@
 """Errors of a section: the error within one strobe, and the accumulated error over the memory of the motion.
 
-Errors of strobes are carried on: a damped motion forgets them, an undamped one accumulates them, and close to a tongue they
-grow for hundreds of strobes. Some strobes are repeated with finer equal steps, which gives the error of one strobe. The
-whole motion, discarded strobes included, is repeated once with other equal steps. As long as the two differ by at most a
-tenth of the section, the error of the section relates to this distance at most as the error of a strobe relates to the
-change of the same strobe by the other steps; few steps are enough for that. The ratio varies: a violent start is resolved
-worse than the motion it settles to, and may dominate the error. So the first strobes from the start are also repeated, and
-the largest ratio counts. If the error may still matter, or the other steps diverge although every strobe is right, more
-steps are tried; the distance from these is the error.
+A damped motion forgets the errors of its strobes, an undamped motion accumulates them, and close to a tongue they grow for
+hundreds of strobes. Some strobes are repeated with finer equal steps, which gives the error of one strobe. The whole
+motion, discarded strobes included, is repeated once with other equal steps, which may be few. Let r be the ratio of the
+error of a strobe to the change of this strobe by the other steps. As long as both motions differ by at most a tenth of the
+section, the error of the section is at most r times their distance.
 
-A chaotic motion has another section for every number of steps: only the error of one strobe is meaningful.
+The ratio r varies: steps resolve a violent start worse than the settled motion, and the start may dominate the error.
+Therefore the first strobes from the start are also repeated, and the largest ratio counts. If the error may still matter, or
+the other steps diverge although every strobe is right, the motion is repeated with more steps, and the distance is the
+error.
+
+The section of a chaotic motion differs for every number of steps: only the error of one strobe is meaningful.
 """
 
 from __future__ import annotations
@@ -25,17 +27,17 @@ from drivetrain_jax.analysis.lyapunov.growth_record import discarded, sampled
 from drivetrain_jax.analysis.lyapunov.variational import Frame, initial_state, one_kernel, strobe_map
 from drivetrain_jax.systems import Flow
 
-# Strobes of the section, and first strobes from the start, that are repeated.
+# Number of repeated strobes: of the section, and from the start.
 _TAKEN_AGAIN, EARLY = 8, 16
-# Relative distances from the section up to which errors are proportional.
+# Relative distance from the section up to which errors are proportional.
 _PROPORTIONAL = 0.1
-# Changes of strobes below this fraction of the largest one do not affect the section: their ratio may be that of rounding.
-# Estimates above this fraction of the tolerance are repeated with more steps.
+# Fraction of the largest change below which the change of a strobe is ignored, as its ratio may be that of rounding;
+# fraction of the tolerance above which an estimate is repeated with more steps.
 _CONSIDERABLE, _DOUBTFUL = 0.01, 0.1
 
 
 class _Strobes(NamedTuple):
-    """Strobes to repeat: their numbers, shape ``(K,)``, and the states at their ends, ``(K, n, ...)``."""
+    """Strobes to repeat: their numbers, shape ``(K,)``, and the states at their begin and end, ``(K, n, ...)``."""
 
     number: np.ndarray
     begin: Array
@@ -43,8 +45,10 @@ class _Strobes(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Equal steps per strobe: of single strobes, of the whole motion, and (0: none) of the whole motion in doubtful
-    cases, where they are no fewer than those of single strobes."""
+    """Equal steps per strobe: of single strobes, of the whole motion, and of the whole motion in doubtful cases.
+
+    The third number is 0 (no repetition) or at least the first one.
+    """
 
     strobe: int
     motion: int
@@ -59,11 +63,12 @@ def watched(flow: Flow) -> np.ndarray:
 def section_errors(
     flow: Flow, states: Array, early: Array, first: int, steps: Steps, tolerated: float
 ) -> tuple[Array, Array]:
-    """Errors of single strobes and of the whole of ``states``, shape ``(T, n, ...)``, relative to the largest value (a
-    tenth or more: another section; NaN: unknown). The states follow the first ``first`` strobes from the start. ``early``:
-    states after the first ``min(first, EARLY)`` of those strobes, as in the section.
+    """Errors of single strobes and of the whole section ``states``, shape ``(T, n, ...)``, relative to its largest value.
 
-    A second march is made only of motions whose strobe errors are within ``tolerated`` or that the first march follows.
+    An error of a tenth or more means another section; NaN is unknown. The states follow after ``first`` strobes from the
+    start; ``early`` holds the states after the first ``min(first, EARLY)`` of those strobes, by the same steps.
+
+    Only motions whose strobe errors are within ``tolerated``, or that agree with the first march, have a second march.
     """
     size = jnp.max(jnp.abs(states[:, watched(flow)]), axis=(0, 1))
     size = jnp.where(size == 0, 1.0, size)

@@ -1,16 +1,16 @@
 """Steady state of an oscillator with play: the attractor reached from given initial conditions, or a chaotic motion.
 
-The motion is exact within rounding (closed form in each linear region), and so are its extremes, multipliers and contacts.
-An orbit found by Newton shooting is accepted only if the motion has come so close that its linearisation governs the rest
-(:mod:`~drivetrain_jax.analysis.impacts.attractor`).
+The motion is exact up to rounding (closed form in each linear region), and so are its extremes, multipliers and contacts.
+An orbit found by Newton shooting is accepted only if the motion has come so close that the linearisation about the orbit
+governs the rest of the way (:mod:`~drivetrain_jax.analysis.impacts.attractor`).
 
-A motion that has not settled within ``most_periods`` drive periods is ``non_periodic``, a success, if neighbours separated
-by a factor of exp(20) over the last three quarters of that time, as only chaos does. It may be a chaotic attractor or a
-long transient, which a finite time cannot distinguish; more ``most_periods`` may show its end.
+A motion that has not settled within ``most_periods`` drive periods is ``non_periodic``, a success, if neighbouring motions
+separated by a factor of exp(20) over the last three quarters of that time, which only chaos explains. A finite time cannot
+distinguish a chaotic attractor from a long transient; a larger ``most_periods`` may show the end of a transient.
 
 Outcome: ``NOT_CONVERGED`` if the motion has neither settled nor separated; ``TOLERANCE_NOT_MET`` if the estimated error of
-the orbit exceeds ``rtol`` times its largest displacement; ``STEP_LIMIT`` if the motion has more events per period than any
-motion that does not graze.
+the orbit exceeds ``rtol`` times its largest displacement; ``STEP_LIMIT`` if the motion has more events per period than a
+motion can have unless it grazes a flank.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ WAIT = Parameter(
     upper=1e8,
     integer=True,
 )
-# Points of a chunk: enough that few lanes are left working when the queue is empty.
+# Points per chunk: so many that the lanes are busy until the queue is nearly empty.
 _CHUNK = 4096
 
 
@@ -114,7 +114,7 @@ def _solve(
 
 
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
-    """The solver of all motions, and a faster one of motions whose free part oscillates."""
+    """The solver for all motions, and a faster solver for motions whose free part oscillates."""
 
     def effort(columns: Mapping[str, Any]) -> np.ndarray:
         return np.where(system.models["steady_state"].build(columns).oscillates, 1.0, np.inf)

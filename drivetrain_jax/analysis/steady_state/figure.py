@@ -38,10 +38,11 @@ _SAME = 1e-5
 def plot(dataset: xr.Dataset) -> Figure:
     """The figure of a ``steady_state`` result, by its axes.
 
-    - none: time history and phase portrait of the motion (needs ``u_history`` and ``v_history``); - one: extremes, period
-    multiple, growth, impact velocity and contact fraction of both flanks along it, over bands of the regimes; - the initial
-    state: basins of the attractors with the share of each; - any other two: the regime and the largest displacement, with a
-    predicted threshold.
+    - none: time history and phase portrait of the motion (needs ``u_history`` and ``v_history``);
+    - one: extremes, period multiple, growth, impact velocity and contact fraction of both flanks along the axis, over bands
+      of the regimes;
+    - the initial state: basins of the attractors with the share of each;
+    - any other two: the regime and the largest displacement, with a predicted threshold.
 
     Axes of one value count as fixed. Raises :class:`InputError` for other axes, and if variables are missing.
     """
@@ -114,7 +115,7 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
 
 
 def _extremes(axes: Axes, dataset: xr.Dataset, name: str, extremes: list[str]) -> list[Artist]:
-    """Draw the extremes, those of non-periodic motions in a colour of their own, and both flanks."""
+    """Draw the extremes, with a separate colour for non-periodic motions, and both flanks."""
     handles: list[Artist] = []
     other = regimes.COLOURS[regimes.NON_PERIODIC]
     known = dataset["outcome"] < FIRST_FAILURE
@@ -215,7 +216,7 @@ def _motion(dataset: xr.Dataset) -> Figure:
     handles += regimes.draw_flanks(dataset, history, portrait=portrait)
     history.set_xlim(0, 1)
     panels.label_axes("part of the motion's period [1]", variable_label(u))
-    # On the left, clear of a power of ten at the right end.
+    # At the left, clear of a power of ten at the right end.
     portrait.set_xlabel(variable_label(u), loc="left")
     portrait.set_ylabel(variable_label(v))
     panels.titles(dataset)

@@ -12,7 +12,7 @@ def _rms_too_large(ds: xr.Dataset) -> xr.DataArray:
     return ds["u_rms"] > largest * (1 + 1e-9)
 
 
-# Also rules of frequency responses.
+# Rules of motions, shared with frequency responses.
 MOTION = (
     in_order("u_min", "u_max"),
     within("u_rms", 0.0),
@@ -28,6 +28,6 @@ RULES = Declared(
         within("impacts", 0.0),
         within("contact_fraction", 0.0, 1.0),
     ),
-    # A motion that never repeats has no multipliers, a motion at rest no phase.
+    # NaN is allowed: a motion that never repeats has no multipliers, and a motion at rest has no phase.
     gaps=("phase", "spectral_radius", "floquet_multiplier", "state_error"),
 )
