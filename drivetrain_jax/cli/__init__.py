@@ -18,11 +18,11 @@ __all__ = ["main"]
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code: 0 done, 2 wrong input, 3 incomplete and resumable, 130 interrupted."""
     if arguments is None:
-        # Default garbage collection takes a third of a second and frees little: most objects live until the end.
+        # Collect garbage rarely: the default takes a third of a second and frees little, as most objects live until the end.
         gc.set_threshold(50_000)
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
-            # The parent process closed this stream and reads no output.
+            # The parent process has closed this stream, so no one reads its output.
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     options = parser().parse_args(arguments)
     try:
@@ -34,14 +34,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(one_line(str(error)))
         return INCOMPLETE
     except BrokenPipeError:
-        # The reader of standard output has closed it (``drivetrain list | head``): write no message.
+        # The reader has closed standard output (``drivetrain list | head``): exit without a message.
         drop_output()
         return OK
     except KeyboardInterrupt:
         return INTERRUPTED
     finally:
         if arguments is None:
-            # The work is finished: a signal during the exit could only change the exit code.
+            # The work is finished: ignore signals, which could only change the exit code.
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, signal.SIG_IGN)
             # Skip Python's garbage collection at exit, which takes a third of a second.

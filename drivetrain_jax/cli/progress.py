@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def progress_line() -> Iterator[Callable[[Progress], None]]:
-    """A progress bar that the yielded function updates. Its length follows the predicted cost of the points."""
+    """Show a progress bar; yields the function that updates it. Its length is the predicted cost of the finished points."""
     columns = (
         BarColumn(),
         TextColumn("{task.fields[counts]}"),
@@ -32,7 +32,7 @@ def progress_line() -> Iterator[Callable[[Progress], None]]:
     begin = time.monotonic()
 
     def report(progress: Progress) -> None:
-        # Created at the first report, because wrong input must print a single line.
+        # Started at the first report, because wrong input must print a single line.
         bar.start()
         done = progress.computed + progress.reused
         rate = progress.computed / max(time.monotonic() - begin, 1e-9)
@@ -43,7 +43,7 @@ def progress_line() -> Iterator[Callable[[Progress], None]]:
     try:
         yield report
     except InputError:
-        # Wrong input found during the run, such as a scheduler that does not answer: remove the bar.
+        # Remove the bar if the run fails on wrong input, such as a scheduler that does not answer.
         bar.live.transient = True
         bar.live.stop()
         raise

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-# Time in s after a signal in which further signals are ignored, so that finished chunks are written.
+# Time [s] after a signal during which further signals are ignored, so that finished chunks are written.
 _GRACE = 2.0
 
 
@@ -46,6 +46,6 @@ def stop_on_signals() -> Iterator[Callable[[], None]]:
         for number, handler in handlers.items():
             # The handler was not set by Python, so it cannot be restored.
             signal.signal(number, handler or signal.SIG_DFL)
-        # After a signal the hook stays: errors of unfinished work are not shown.
+        # After a signal the hook stays, to hide errors of unfinished work.
         if not caught:
             sys.unraisablehook = before

@@ -1,5 +1,8 @@
-"""The drivetrain systems, found by name; other packages add theirs through the entry point group
-``drivetrain_jax.systems`` (each entry point names a class, a :class:`~drivetrain_jax.systems._base.System`)."""
+"""The drivetrain systems by name.
+
+Other packages add systems through the entry point group ``drivetrain_jax.systems``; each entry point names a subclass of
+:class:`~drivetrain_jax.systems._base.System`.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +62,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # Imported here: that module imports diffrax, which takes as long as jax and is not needed to read a result.
+    # Imported on first use: the module imports diffrax, which takes as long as jax and which readers of results do not need.
     if name in ("FloquetModel", "ForcedModel", "LinearPeriodic"):
         return getattr(import_module("drivetrain_jax.systems._periodic"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

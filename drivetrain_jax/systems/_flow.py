@@ -28,16 +28,16 @@ class Flow(eqx.Module):
 
     - ``start``: components of ``y`` at t = 0.
     - ``period``: time between two strobes.
-    - ``turns``: turns of each clock per strobe. A clock that defines the strobe has the number 1; its angle is then the
+    - ``turns``: turns of each clock per strobe. A clock that defines the strobe has the integer 1; its angle is then the
       same for every member of a batch.
     - ``scale``: factor from one unit of each component to the reported units.
-    - ``divergence(angles, y)``: trace of the field's Jacobian in closed form, if known: its mean is the sum of all
+    - ``divergence(angles, y)``: trace of the field's Jacobian in closed form, if known. Its mean is the sum of all
       Lyapunov exponents.
     - ``phases``: components with a constant rate. Their exponents are always 0, so the verdict ignores them. (The clocks
       are not components.)
-    - ``cyclic``: components that are angles, known up to whole turns: they may grow although the motion is bounded.
-    - ``fastest``: largest angular frequency of the motion, from which step sizes follow, if known. Without it ``lyapunov``
-      takes 48 steps per strobe by default.
+    - ``cyclic``: components that are angles up to whole turns. They may grow although the motion is bounded.
+    - ``fastest``: largest angular frequency of the motion, if known; step sizes follow from it. Without ``fastest``,
+      ``lyapunov`` makes 48 steps per strobe by default.
     """
 
     field: Callable[[Components, Any], Components]
@@ -58,13 +58,13 @@ class Flow(eqx.Module):
     def angles(self, strobe: Any, fraction: Any) -> Components:
         """Angles of the clocks at ``(strobe + fraction) * period``, in [rad], reduced by the whole turns up to ``strobe``.
 
-        ``strobe`` is an integer (array), ``fraction`` a number (array), usually in [0, 1]. The error is that of one
-        rounding of the reduced angle as long as no clock has made more than 2^27 turns.
+        ``strobe`` is an integer (array), ``fraction`` a number (array), usually in [0, 1]. The error is one rounding of the
+        reduced angle, as long as no clock has made more than 2^27 turns.
         """
         return tuple(2 * math.pi * (_turned(turns, strobe) + turns * fraction) for turns in self.turns)
 
     def vector(self, strobe: Any, fraction: Any, y: Array) -> Array:
-        """``y'`` as one array of shape ``(n, ...)`` for ``y`` of that shape."""
+        """``y'`` as one array of shape ``(n, ...)`` for ``y`` of the same shape."""
         return jnp.stack(jnp.broadcast_arrays(*self.field(self.angles(strobe, fraction), y)))
 
 
@@ -72,7 +72,7 @@ def _turned(turns: Any, strobe: Any) -> Any:
     """Fractional part of ``turns * strobe``."""
     if isinstance(turns, int):
         return 0.0
-    # The product with the upper part has no rounding, that with the lower part is small.
+    # The product with the upper part is exact; the product with the lower part is small.
     upper = jnp.round(turns * _SPLIT) / _SPLIT
     whole = upper * strobe
     return (whole - jnp.floor(whole)) + (turns - upper) * strobe

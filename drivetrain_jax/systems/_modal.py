@@ -11,10 +11,10 @@ from jax import Array
 class Block(eqx.Module):
     """An invariant part of a spring system: its natural angular frequencies are the singular values of ``factor``.
 
-    ``factor``: shape (rows, n, ...), rows >= n. ``basis`` (dofs, n, copies, ...) embeds the part into the mass-weighted
-    coordinates ``M^(1/2) q``, orthonormally; every frequency occurs ``copies`` times. ``family`` (n,) is the family of
-    each column of the orthonormal ``frame`` (n, n, ...), None for the identity. ``polar`` (n,) marks columns that are
-    motions along x: within pairs of equal frequencies they single out one vector.
+    ``factor`` has shape (rows, n, ...), rows >= n. The orthonormal ``basis`` (dofs, n, copies, ...) embeds the part into the
+    mass-weighted coordinates ``M^(1/2) q``; every frequency occurs ``copies`` times. ``family`` (n,) is the family of each
+    column of the orthonormal ``frame`` (n, n, ...), which is None for the identity. ``polar`` (n,) marks columns that are
+    motions along x, to make the vectors of a pair of equal frequencies unique.
     """
 
     factor: Array
@@ -25,7 +25,7 @@ class Block(eqx.Module):
 
     @property
     def copies(self) -> int:
-        """Multiplicity of each of its frequencies."""
+        """Multiplicity of each frequency."""
         return self.basis.shape[2]
 
 
@@ -34,9 +34,9 @@ class SpringSystem(eqx.Module):
 
     ``extensions`` (springs, dofs, ...) is ``B``: the extension of each spring per unit of each coordinate;
     ``stiffness`` (springs, ...), ``mass`` (dofs, ...). ``blocks`` are an exact decomposition into invariant parts;
-    ``whole`` is the system as one block. ``asymmetry`` (...), from 0 to 1, measures all that couples the families;
-    ``dofs`` and ``body_names`` name coordinates and bodies; ``bodies`` (dofs,) gives the number of the body of each
-    coordinate. ``families`` is the number of families of modes.
+    ``whole`` is the system as one block. ``asymmetry`` (...), from 0 to 1, measures the coupling of the families. ``dofs``
+    and ``body_names`` name coordinates and bodies; ``bodies`` (dofs,) is the number of the body of each coordinate.
+    ``families`` is the number of families of modes.
     """
 
     extensions: Array

@@ -33,14 +33,14 @@ SWAP = _tuples(np.kron(np.array([[0.0, 1.0], [1.0, 0.0]]), np.eye(2)))
 class LinearPeriodic(diffrax.AbstractTerm):
     """The linear system ``x' = A(t) x`` over one interval ``[0, span]`` of its clock ``t``: a term for any diffrax solver.
 
-    ``basis(t)`` returns the functions of the clock alone (they are shared by all points of a batch) and
-    ``rows(*basis(t))`` the matrix as nested tuples; an entry that vanishes identically is the integer ``0``.
-    Without ``reversor`` the interval is the period and the monodromy matrix is the propagator ``Phi`` itself.
-    With the reversor ``X`` (``X X = I``) the interval is half the period and the monodromy matrix is similar to
-    ``X Phi^T X Phi``; with ``reversal()``, two matrices ``(R0, R1)`` as rows, to ``R0 Phi^T R1 Phi``.
-    ``log_determinant()`` is the exact logarithm of its determinant (Liouville's formula), if known.
+    ``basis(t)`` returns the functions of the clock alone, which all points of a batch share. ``rows(*basis(t))`` is the
+    matrix as nested tuples; an entry that vanishes identically is the integer ``0``. Without ``reversor`` the interval is
+    the period and the monodromy matrix is the propagator ``Phi`` itself. With the reversor ``X`` (``X X = I``) the interval
+    is half the period and the monodromy matrix is similar to ``X Phi^T X Phi``. With ``reversal()``, two matrices
+    ``(R0, R1)`` as rows, the monodromy matrix is similar to ``R0 Phi^T R1 Phi``. ``log_determinant()`` is the exact
+    logarithm of the determinant of the monodromy matrix (Liouville's formula), if known.
 
-    It is a pytree if its functions are, such as the bound methods of an Equinox module.
+    The term is a pytree if its functions are pytrees, such as the bound methods of an Equinox module.
     """
 
     rows: Callable[..., Rows]
@@ -72,7 +72,7 @@ class LinearPeriodic(diffrax.AbstractTerm):
     def vf(self, t: Any, y: Any, args: Any) -> Array:
         """``A(t) y`` of a state or a matrix of states ``y``."""
         del args
-        # Entry by entry: under vmap, small matrix products are slower than their sums.
+        # Written as sums: under vmap small matrix products are slower.
         rows = self.rows(*self.basis(t))
         return jnp.stack([sum(a * y[j] for j, a in enumerate(row) if not _vanishes(a)) + 0 * y[0] for row in rows])
 
@@ -92,10 +92,10 @@ class FloquetModel(eqx.Module):
     ``natural`` is the system as published, over its full period in its own time. ``reduced`` is an equivalent form (same
     multipliers) that is cheaper or better conditioned; both may be the same object. ``explicit_steps(rtol)`` predicts the
     number of steps of ``reduced`` by the explicit scheme of order 8, from parameters as NumPy arrays of shape ``(N,)`` or
-    traced; None leaves the prediction to the analysis. ``hamiltonian()`` is true where ``reduced`` is a Hamiltonian system,
-    whose multipliers come in pairs sigma, 1/sigma; None if it never is. ``stiff`` is a form for strong damping, whose slow
-    modes are not differences of large entries; None if ``reduced`` is as good. The implicit scheme always uses it, the
-    explicit one where ``strongly_damped()`` is true; None means never.
+    traced arrays; None leaves the prediction to the analysis. ``hamiltonian()`` is true where ``reduced`` is a Hamiltonian
+    system, whose multipliers come in pairs sigma, 1/sigma; None means nowhere. ``stiff`` is a form for strong damping, whose
+    slow modes are not differences of large entries; None if ``reduced`` is as good. The implicit scheme always uses
+    ``stiff``, the explicit scheme where ``strongly_damped()`` is true; None means nowhere.
     """
 
     natural: LinearPeriodic

@@ -1,4 +1,4 @@
-"""A driven oscillator whose spring has a play: linear in each of three regions, continuous where they meet.
+"""A driven oscillator with a play in its spring: linear in each of three regions, continuous between them.
 
 Equation: ``u'' + damping u' + stiffness f_s(u) = B0 + B1 cos(omega t)`` with
 ``f_s = u - (1 - alpha) b`` for ``u > b``, ``alpha u`` for ``|u| <= b``, ``u + (1 - alpha) b`` for ``u < -b``.
@@ -17,8 +17,9 @@ from jax import Array
 class PiecewiseLinearOscillator(eqx.Module):
     """The equation in the module's docstring; every field is a number or an array, all of one common shape ``(...)``.
 
-    ``damping`` is c/I [1/s], ``stiffness`` k/I [1/s^2], ``alpha`` the stiffness within the play over that outside [1],
-    ``b`` half the play [m], ``B0`` and ``B1`` mean and amplitude of the drive [m/s^2], ``omega`` its frequency [rad/s].
+    ``damping`` is c/I [1/s], ``stiffness`` k/I [1/s^2], ``alpha`` the stiffness within the play over the stiffness in
+    contact [1], ``b`` half the play [m], ``B0`` and ``B1`` mean and amplitude of the drive [m/s^2], ``omega`` the frequency
+    of the drive [rad/s].
     """
 
     damping: Any
@@ -40,23 +41,24 @@ class PiecewiseLinearOscillator(eqx.Module):
         return 2 * np.pi / self.omega
 
     def restoring(self, u: Any) -> Array:
-        """``f_s(u)``, same units as ``u``, shape of ``u`` and the parameters broadcast."""
-        # u minus the force lost in the play: exact for b = 0 and continuous in floating point.
+        """``f_s(u)`` in the units of ``u``, in the common shape of ``u`` and the parameters."""
+        # u minus the force lost in the play is exact for b = 0 and continuous in floating point.
         return u - (1 - self.alpha) * jnp.clip(u, -self.b, self.b)
 
     def field(self, t: Any, state: Array) -> Array:
         """``(u', u'')`` of ``state = (u, u')``, shape ``(2, ...)``.
 
-        Continuous, but its derivative jumps where :meth:`switching` changes sign: integrators must locate these.
+        The field is continuous, but its derivative jumps where :meth:`switching` changes sign: integrators must locate the
+        jumps.
         """
         u, v = state
         drive = self.B0 + self.B1 * jnp.cos(self.omega * t)
         return jnp.stack(jnp.broadcast_arrays(v, drive - self.damping * v - self.stiffness * self.restoring(u)))
 
     def switching(self, state: Array) -> Array:
-        """Declared discontinuities of the derivative: distances ``(u - b, u + b)`` to the flanks, shape ``(2, ...)``."""
+        """Distances ``(u - b, u + b)`` to the flanks, where the derivative jumps, shape ``(2, ...)``."""
         return jnp.stack(jnp.broadcast_arrays(state[0] - self.b, state[0] + self.b))
 
 
 class UnderdampedOscillator(PiecewiseLinearOscillator):
-    """One whose free motion oscillates in contact and within the play: kernels omit the overdamped flow."""
+    """An oscillator whose free motion oscillates in contact and within the play, so that kernels omit the overdamped flow."""

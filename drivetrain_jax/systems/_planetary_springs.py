@@ -17,7 +17,7 @@ _CENTRAL = 9
 _PER_PLANET = 3
 FAMILIES = ("rotational", "translational", "planet")
 ROTATIONAL, TRANSLATIONAL, PLANET = range(3)
-# Below this the sum of the planets' unit vectors is zero up to the rounding of the angles.
+# Largest value of :func:`spacing` that is zero up to the rounding of the angles.
 _BALANCED = 4e-16
 
 
@@ -34,7 +34,7 @@ for _row, _x, _sign in ((2, 3, 1.0), (3, 6, -1.0)):
     _CENTRAL_PARTS[0, _row, _x + 2, 0] = _CENTRAL_PARTS[1, _row, _x + 1, 1] = 1.0
     _CENTRAL_PARTS[1, _row, _x, 2] = -1.0
     _CENTRAL_PARTS[2, _row, _x, 1] = _CENTRAL_PARTS[2, _row, _x + 1, 2] = -_sign
-# The same for the coordinates of the planet itself.
+# The same coefficients per unit of the coordinates of the planet itself.
 _PLANET_PARTS = np.zeros((3, 4, _PER_PLANET))
 _PLANET_PARTS[0, 0, 0] = _PLANET_PARTS[0, 1, 1] = _PLANET_PARTS[0, 2, 2] = -1.0
 _PLANET_PARTS[0, 3, 2] = 1.0
@@ -55,7 +55,7 @@ def _lanes(*arrays: Any) -> tuple[int, ...]:
 
 
 def _complete(values: Values) -> dict[str, Any]:
-    """The numbers among ``values``, with those derived from others: pressure angles, and bearings by direction."""
+    """The numbers among ``values``, completed by derived pressure angles and bearing stiffnesses by direction."""
     numbers = {name: value for name, value in values.items() if not isinstance(value, str)}
     angles = {f"pressure_angle_{body}": numbers["pressure_angle"] for body in "rs"}
     bearings = {f"k_{body}{axis}": numbers[f"k_{body}"] for body in "crs" for axis in "xy"}
@@ -63,7 +63,7 @@ def _complete(values: Values) -> dict[str, Any]:
 
 
 def _spread(values: Values) -> dict[str, Any]:
-    """All parameters as arrays of one common shape ``(...)``; those of the planets and their angles ``(N, ...)``."""
+    """All parameters as arrays of one common shape ``(...)``; parameters of the planets have the shape ``(N, ...)``."""
     count = len(values["planet_angle"])
     complete = _complete(values)
     entries = [entry for value in complete.values() for entry in (value if isinstance(value, tuple) else (value,))]
@@ -83,8 +83,11 @@ def _spread(values: Values) -> dict[str, Any]:
 
 
 def _extensions(p: Mapping[str, Array], directions: Array) -> tuple[Array, Array]:
-    """``B`` of planets whose (1, cos psi, sin psi) are the rows of ``directions`` (n, 3, ...), and its part for one
-    planet's own coordinates (4, 3, ...). Rows: springs by kind, then planet; then the bearings of the bodies."""
+    """``B`` of n planets, and its part (4, 3, ...) for the own coordinates of one planet.
+
+    The rows of ``directions`` (n, 3, ...) are (1, cos psi, sin psi) of the planets. The rows of ``B`` are the springs by
+    kind, then by planet, then the bearings of the bodies.
+    """
     n, lanes = directions.shape[0], directions.shape[2:]
     # Rows: two bearings of a planet, which have no pressure angle, and its meshes.
     angle, meshes = jnp.stack([p["pressure_angle_r"], p["pressure_angle_s"]]), np.array([0, 0, 0, 1])
@@ -117,7 +120,7 @@ def _stiffness_and_mass(p: Mapping[str, Array], n: int) -> tuple[Array, Array]:
 def orthonormal_frame(columns: Array) -> tuple[Array, Array]:
     """``Q`` (n, n, ...) and ``R`` (n, k, ...) with ``columns`` (n, k, ...) = Q R, by Householder reflections.
 
-    Dependent columns are no exception: ``Q`` stays orthonormal.
+    ``Q`` is orthonormal even if columns are dependent.
     """
     n, k = columns.shape[:2]
     frame = jnp.broadcast_to(np.eye(n).reshape(n, n, *(1,) * (columns.ndim - 2)), (n, n, *columns.shape[2:]))
@@ -140,7 +143,7 @@ def _families(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _embed(frame: Array, inertia_frame: Array | None = None) -> Array:
-    """The matrix (9 + 3N, 9 + 3k, ...): identity on the central coordinates, ``frame`` (N, k, ...) on the planets'."""
+    """The matrix (9 + 3N, 9 + 3k, ...): the identity for the central coordinates, ``frame`` (N, k, ...) for the planets."""
     n, k, lanes = frame.shape[0], frame.shape[1], frame.shape[2:]
     other = frame if inertia_frame is None else inertia_frame
     planets = jnp.zeros((n, _PER_PLANET, k, _PER_PLANET, *lanes))
@@ -172,17 +175,17 @@ def _inequality(p: Mapping[str, Array]) -> Array:
 
 
 def _reduced_blocks(p: Mapping[str, Array], frame: Array, directions: Array, balanced: bool) -> tuple[Block, ...]:
-    """The blocks of identical planets: rotation with translation (apart if ``balanced``), and the planets alone
-    (8)-(9).
+    """The blocks (8)-(9) of identical planets: rotation with translation (separate if ``balanced``), and planets alone.
 
-    ``frame`` (N, N, ...) starts with span{1, cos psi, sin psi}, in which ``directions`` (3, 3, ...) is that basis.
+    The first columns of ``frame`` (N, N, ...) span {1, cos psi, sin psi}; ``directions`` (3, 3, ...) are the components of
+    these three vectors in the frame.
     """
     n = frame.shape[0]
     extensions, own = _extensions(p, directions)
     stiffness, mass = _stiffness_and_mass(p, 3)
     factor, basis = weighted_factor(extensions, stiffness, mass), _embed(frame[:, :3])
     family, polar = _families(3)
-    # A row acts on rotations if it is the first of its kind (spring on the mean motion), or a rotational bearing.
+    # A row belongs to rotation if it is the first of its kind (spring on the mean motion), or a rotational bearing.
     rows = np.concatenate([np.arange(12) % 3 > 0, np.arange(_CENTRAL) % 3 < 2]).astype(int)
     parts = [(rows == kind, family == kind) for kind in (0, 1)] if balanced else [(rows >= 0, family >= 0)]
     blocks = [
@@ -234,8 +237,11 @@ def plane_springs(values: Values) -> SpringSystem:
 
 
 def _rotations(p: Mapping[str, Array], directions: Array) -> Array:
-    """``B`` (2n + 3, 3 + n, ...) of the rotational model, eqs (13)-(14), with one factor in ``directions`` (n, ...) for
-    each planet. Rows: meshes with the ring, meshes with the sun, bearings of the bodies."""
+    """``B`` (2n + 3, 3 + n, ...) of the rotational model, eqs (13)-(14).
+
+    ``directions`` (n, ...) holds a factor for each planet. The rows are meshes with the ring, meshes with the sun, and
+    bearings of the bodies.
+    """
     n, lanes = directions.shape[0], directions.shape[1:]
     one, none = jnp.ones(lanes), jnp.zeros(lanes)
     ring, sun = (-jnp.cos(p[f"pressure_angle_{body}"]) for body in "rs")
@@ -263,7 +269,7 @@ def _rotational_blocks(p: Mapping[str, Array], stiffness: Any, mass: Any) -> tup
 
 
 def rotational_springs(values: Values) -> SpringSystem:
-    """The gear with rotations alone, eqs (13)-(14): all centres are held, and the carrier carries those of the planets."""
+    """The gear with rotations alone, eqs (13)-(14): centres are fixed, and those of the planets move with the carrier."""
     p, n = _spread(values), len(values["planet_angle"])
     lanes = p["planet_angle"].shape[1:]
 
@@ -303,7 +309,7 @@ def driven_springs(values: Values, springs: SpringSystem) -> DrivenSprings:
     lanes = _lanes(springs.mass[0], *(x[0] for x in given[: len(ERRORS)]), *given[len(ERRORS) :])
 
     def spread(array: Array, own: int) -> Array:
-        """``array`` with ``own`` axes before those of the lanes."""
+        """``array`` in the shape of the lanes, with its ``own`` axes first."""
         missing = (1,) * (len(lanes) - array.ndim + own)
         return jnp.broadcast_to(
             array.reshape(array.shape[:own] + missing + array.shape[own:]), array.shape[:own] + lanes
@@ -311,7 +317,7 @@ def driven_springs(values: Values, springs: SpringSystem) -> DrivenSprings:
 
     sun, ring, sun_phase, ring_phase = (spread(x, 1) for x in given[: len(ERRORS)])
     errors = jnp.concatenate([ring * jnp.exp(1j * ring_phase), sun * jnp.exp(1j * sun_phase)])
-    # Rows of the springs: the ring's meshes before the sun's, then the bearings of the bodies.
+    # Order of the springs: meshes with the ring, meshes with the sun, bearings of the bodies.
     end = springs.stiffness.shape[0] - (_CENTRAL if len(names) > 3 + n else 3)
     meshes = slice(end - 2 * n, end)
     forces = spread(springs.stiffness[meshes], 1) * errors
@@ -322,6 +328,6 @@ def driven_springs(values: Values, springs: SpringSystem) -> DrivenSprings:
 
 
 def _entries(value: Any, count: int) -> Array:
-    """A number for all planets, or a list of one for each, as an array (count, ...)."""
+    """A number for all planets, or a list of one number per planet, as an array (count, ...)."""
     whole = value if isinstance(value, tuple) else (value,) * count
     return jnp.stack(jnp.broadcast_arrays(*(jnp.asarray(entry, float) for entry in whole)))

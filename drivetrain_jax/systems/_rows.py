@@ -1,4 +1,4 @@
-"""Matrices as nested tuples of their entries, in which an entry that vanishes identically is the integer ``0``."""
+"""Matrices as nested tuples of entries; an entry that vanishes identically is the integer ``0``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,6 @@ Rows = tuple[tuple[Any, ...], ...]
 
 
 def dense(rows: Rows) -> Array:
-    """The matrix of these rows, ``(n, n, ...)``."""
+    """The matrix of ``rows`` as an array, ``(n, n, ...)``."""
     shape = jnp.broadcast_shapes(*(jnp.shape(entry) for row in rows for entry in row))
     return jnp.stack([jnp.stack([jnp.broadcast_to(entry, shape) for entry in row]) for row in rows])

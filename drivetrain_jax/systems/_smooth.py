@@ -1,4 +1,4 @@
-"""Variables in which the results of a model are smooth: the declaration of a system for its atlas."""
+"""Coordinates in which the results of a model are smooth, declared by a system for its atlas."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ Function = Callable[[Any], np.ndarray]
 class Coordinate:
     """A monotone function of one parameter in which polynomials converge fast; NumPy functions of arrays.
 
-    ``forward`` maps the parameter to the coordinate, ``inverse`` back, ``slope`` is the derivative of ``forward``. If
-    ``even``, both signs of the parameter give the same coordinate (and results), and ``inverse`` the positive one.
+    ``forward`` maps the parameter to the coordinate, ``inverse`` maps back, and ``slope`` is the derivative of ``forward``.
+    If ``even``, both signs of the parameter have the same coordinate and results, and ``inverse`` returns the positive sign.
     """
 
     name: str
@@ -35,7 +35,7 @@ def identity(name: str) -> Coordinate:
 class Series:
     """``A(t) = A0(t) + x A1(t)`` with the coordinate x of ``parameter``, for the reduced form of a ``FloquetModel``.
 
-    ``A0`` only leads from the ``first`` states to the others: ``A0[i, j] = 0`` unless ``i >= first > j``. The propagator is
+    ``A0`` leads only from the ``first`` states to the others: ``A0[i, j] = 0`` unless ``i >= first > j``. The propagator is
     then a power series in x whose terms are integrals.
     """
 
@@ -45,9 +45,9 @@ class Series:
 
 @dataclass(frozen=True)
 class Smoothness:
-    """Coordinates by parameter in which the results of a model are smooth; one that is missing is its own coordinate.
+    """Coordinates by parameter in which the results of a model are smooth; a missing parameter is its own coordinate.
 
-    With ``series`` the nodes of an atlas over its parameter are not solved one by one.
+    With ``series`` an atlas solves all its nodes along the parameter of the series together.
     """
 
     coordinates: Mapping[str, Coordinate]

@@ -1,7 +1,7 @@
 """Constants of one element of the double-tripod driveshaft, in closed form: the model of the analysis ``parameters``.
 
-Equation numbers are those of the source that :mod:`~drivetrain_jax.systems.tripod` names. Everything broadcasts over
-parameters of any common shape. SI units, angles in rad.
+Equation numbers are those of the source of :mod:`~drivetrain_jax.systems.tripod`. All functions broadcast over parameters
+of any common shape. SI units, angles in rad.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def joint_amplitude(values: Values) -> Array:
 
 
 def midshaft_frequency(values: Values) -> Array:
-    """nu_1 = sqrt(G/rho)/(2 L_DM2) [Hz], (24): the fundamental; the others are its multiples."""
+    """nu_1 = sqrt(G/rho)/(2 L_DM2) [Hz], (24): the fundamental frequency, of which the others are multiples."""
     return jnp.sqrt(values["G"] / values["rho"]) / (2 * values["L_DM2"])
 
 
@@ -130,7 +130,7 @@ SHOWN = (
 
 
 def constants(values: Values) -> dict[str, Any]:
-    """The values of ``RESULTS`` by name; that of ``midshaft_frequency`` is a function of the number of the mode."""
+    """The values of ``RESULTS`` by name; the value of ``midshaft_frequency`` is a function of the number of the mode."""
     element = element_of(values)
     midshaft = midshaft_frequency(values)
     mean = values["M_AEM"] if values["element"] == "input" else -values["M_MS"]

@@ -1,6 +1,6 @@
 """Default parameters of the double-tripod driveshaft from the paper, and conflicts between them.
 
-Tables 1, 2 and 4 of the source that :mod:`~drivetrain_jax.systems.tripod` names.
+Tables 1, 2 and 4 of the source of :mod:`~drivetrain_jax.systems.tripod`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ GEOMETRY: Mapping[str, Mapping[str, float]] = {
         "chi_B": 0.24,
     },
 }
-# The value the paper states and uses at beta = 9 deg; neither its text nor its formulas give it.
+# Values of chi_n that the paper states and uses at beta = 9 deg; neither its text nor its formulas yield them.
 STATED_CHI = {"input": 0.0026, "output": 0.0027}
 EQUATIONS = {"input": ("25", "29"), "output": ("26", "30")}
 CHI_SOURCES = ("derived", "printed_formula", "printed_value")
@@ -60,18 +60,18 @@ def positive(units: str, long_name: str, default: float | None = None, **more: A
 
 
 def geometry(values: Values) -> dict[str, Any]:
-    """The dimensions of the element: the given ones, the paper's for the others."""
+    """The dimensions of the element: the given values, completed by those of the paper."""
     return {name: values.get(name, paper) for name, paper in GEOMETRY[values["element"]].items()}
 
 
 def check_motion(fixed: Values) -> None:
-    """``ValueError`` if the equation is not one of the element's, or chi_n is given twice."""
+    """Raise ``ValueError`` if the element does not have the equation, or if chi_n is given twice."""
     _check_equation(fixed, EQUATIONS[fixed["element"]])
     check_chi(fixed)
 
 
 def check_parametric(fixed: Values) -> None:
-    """``ValueError`` if the equation is not the element's (29) or (30), or chi_n is given twice."""
+    """Raise ``ValueError`` if the equation is not (29) or (30) as the element has it, or if chi_n is given twice."""
     _check_equation(fixed, EQUATIONS[fixed["element"]][1:])
     check_chi(fixed)
 
@@ -86,6 +86,6 @@ def _check_equation(fixed: Values, allowed: tuple[str, ...]) -> None:
 
 
 def check_chi(fixed: Values) -> None:
-    """``ValueError`` if chi_n is given although it is to be taken from the paper."""
+    """Raise ``ValueError`` if chi_n is given although the option asks for the value of the paper."""
     if "chi_n" in fixed and fixed["chi_source"] != "derived":
         raise ValueError(f"chi_n = {fixed['chi_n']:g}: given together with chi_source; allowed is one of the two")

@@ -5,7 +5,7 @@ effective parameters on system stability", Modares Mechanical Engineering 14(12)
 are those of docs/theory/cardan.md, which lists where the printed equations had to be corrected.
 
 Nondimensional time tau = Omega0 t; Omega = Omega0 sqrt(J1/k1), zeta = c1/(2 sqrt(k1 J1)), alpha = c2/c1,
-mu = k2/k1, gamma = J2/J1; the prime is d/dtau. Everything broadcasts over parameters of any common shape.
+mu = k2/k1, gamma = J2/J1; the prime is d/dtau. All functions broadcast over parameters of any common shape.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 OPEN = {"open_lower": True, "open_upper": True}
 POSITIVE = {"lower": 0.0, "open_lower": True}
-# Decay over half a period from which on the stiff form has no larger errors than the reduced one, in the median of random
-# points with equal steps; those of rounding are smaller.
+# Decay over half a period beyond which the errors of the stiff form are not larger than those of the reduced form, in the
+# median of random points with equal steps; its rounding errors are smaller.
 _STRONG = 10.0
 
 _BASE_CASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
@@ -46,7 +46,7 @@ def speed_ratio(beta: Any, phi: Any) -> tuple[Array, Array, Array]:
     """
     c, s2 = jnp.cos(beta), jnp.sin(beta) ** 2
     across, along = jnp.sin(phi), jnp.cos(phi)
-    # Eq. (1) as a sum of squares: its difference loses 1/c^2 units of rounding where eta is largest.
+    # The denominator of eq. (1) as a sum of squares: the difference loses 1/c^2 units of rounding where eta is largest.
     d = along**2 + (c * across) ** 2
     sine, cosine = 2 * across * along, (along - across) * (along + across)
     return c / d, c * s2 * sine / d**2, c * s2 * (2 * cosine / d**2 + 2 * s2 * sine**2 / d**3)
@@ -56,8 +56,8 @@ def _inverse_square(x: Any) -> np.ndarray:
     return 1 / np.asarray(x) ** 2
 
 
-# Phi is entire in 1/Omega, mu, alpha, zeta and 1/sqrt(gamma), and in ln sec(beta) as well: eta has its poles where
-# sin(tau)^2 = 1/sin(beta)^2, which the path of integration can avoid, and cos(beta) = 0 or infinity lies infinitely far off.
+# Phi is entire in 1/Omega, mu, alpha, zeta, 1/sqrt(gamma) and ln sec(beta). The last holds because the path of integration
+# can avoid the poles of eta, sin(tau)^2 = 1/sin(beta)^2, and because cos(beta) = 0 or infinity is infinitely far away.
 SMOOTH = Smoothness(
     {
         "beta": Coordinate(
@@ -74,7 +74,7 @@ SMOOTH = Smoothness(
             "1/sqrt(gamma)", lambda x: 1 / np.sqrt(x), _inverse_square, lambda x: -0.5 / (np.sqrt(x) * np.asarray(x))
         ),
     },
-    # Without 1/Omega only the gyroscopic terms are left, by which q acts on P.
+    # For 1/Omega = 0 only the gyroscopic terms are left, which lead from q to P.
     series=Series("Omega", first=2),
 )
 
@@ -182,7 +182,7 @@ class Cardan(System):
         eta, w, deta = clock(cos2psi, sin2psi, self.beta)
         sw, damping = w / self.Omega, 2 * self.zeta
         n21, n22, d = -root_mu * eta, root_mu * g, sw * damping
-        # The joint moves the second twist when it turns the first one, and the damper feels it.
+        # Through the joint the first twist changes the second one, on which the damper acts.
         turned, felt = -root_mu * deta, alpha * damping * deta
         return (
             (0, 0, sw, 0),
@@ -192,7 +192,7 @@ class Cardan(System):
         )
 
     def _stiff_reversal(self) -> tuple[Rows, Rows]:
-        """``R0`` and ``R1`` of the rows above, eq. (13b): eta is cos(beta) at the start and 1/cos(beta) at the end."""
+        """``R0`` and ``R1`` of the stiff form, eq. (13b); eta is cos(beta) at the start and 1/cos(beta) at the end."""
         alpha, mu, damping = self.alpha, self.mu, 2 * self.zeta
         root_mu, g, eta = jnp.sqrt(mu), 1 / jnp.sqrt(self.gamma), jnp.cos(self.beta)
         n21, n22 = -root_mu * eta, root_mu * g
@@ -220,12 +220,12 @@ class Cardan(System):
         """Predicted steps of the order-8 scheme for the reduced form, as floats of the batch's shape.
 
         For oscillation log n is a fitted quadratic in the logarithms of the phase over the half period (by Simpson's rule)
-        and of 1/cos(beta), the steepness of the variation; beyond a phase of 13 n grows like its power 1.09 to 1.14, so
-        that even blocks of slow points rarely need more. For decay log n is linear in the logarithm of the largest decay
-        over the half period, with a slope that falls with rtol, as long as the scheme is stable. The two add like the sides
-        of a right angle. Fitted to 6,000 random points with zeta from 1e-4 to 300 and rtol from 1e-5 to 1e-11: 1.6 times
-        the need in the median, four times where both matter. The prediction affects the cost and never the accuracy, which
-        is checked.
+        and of 1/cos(beta), the steepness of the variation. Beyond a phase of 13, n grows like the phase to the power 1.09 to
+        1.14, so that even blocks of slow points rarely need more. For decay log n is linear in the logarithm of the largest
+        decay over the half period, with a slope that falls with rtol, as long as the scheme is stable. The two numbers add
+        in quadrature. Fitted to 6,000 random points with zeta from 1e-4 to 300 and rtol from 1e-5 to 1e-11: 1.6 times the
+        need in the median, four times where both matter. The prediction affects the cost, but never the accuracy, which the
+        solver tests.
         """
         xp, beta, speed, mu, gamma = numeric(self.beta, self.Omega, self.mu, self.gamma)
         with np.errstate(over="ignore"):
@@ -266,7 +266,7 @@ class Cardan(System):
     @serves("atlas", smooth=SMOOTH)
     @serves("floquet")
     def floquet_model(self) -> FloquetModel:
-        """The linearised shaft in its own coordinates and time, and two forms of it over half a period."""
+        """The linearised shaft in its own coordinates and time, and two equivalent forms over half a period."""
         from drivetrain_jax.systems._periodic import SWAP, FloquetModel, LinearPeriodic
 
         exact = self.log_determinant

@@ -1,4 +1,4 @@
-"""Clock of the cardan shaft's reduced equations, and the steps that they need in it.
+"""Clock of the cardan shaft's reduced equations, and predicted numbers of steps in this clock.
 
 Equation numbers are those of docs/theory/cardan.md.
 """
@@ -13,18 +13,19 @@ from jax import Array
 
 
 def clock_basis(psi: Any) -> tuple[Array, Array]:
-    """Functions of the clock psi alone, of which the reduced equations are made."""
+    """``cos 2 psi`` and ``sin 2 psi``, the only functions of the clock psi in the reduced equations."""
     return jnp.cos(2 * psi), jnp.sin(2 * psi)
 
 
 def clock(cos2psi: Any, sin2psi: Any, beta: Any) -> tuple[Any, Any, Any]:
     """``eta``, ``dtau/dpsi`` and ``deta/dpsi`` in the clock psi, eqs (11)-(12).
 
-    Two Landen steps lead from tau to psi: tan(chi) = sqrt(cos beta) tan(tau) spreads the poles of eta near pi/2 over
-    0 and pi/2, tan(2 chi) = kappa tan(2 psi), kappa^2 = 1 - r^2, r = tan(beta/2)^2, moves these away from the axis.
+    Two Landen steps lead from tau to psi. The first, tan(chi) = sqrt(cos beta) tan(tau), distributes the poles of eta near
+    pi/2 to 0 and pi/2. The second, tan(2 chi) = kappa tan(2 psi) with kappa^2 = 1 - r^2 and r = tan(beta/2)^2, moves these
+    poles away from the axis.
     """
     c, r = jnp.cos(beta), jnp.tan(beta / 2) ** 2
-    # 1 - r = 2 c/(1 + c), and 1 -+ r cos(2 chi) below are sums of positive terms: no cancellation next to pi/2.
+    # 1 - r = 2 c/(1 + c) and 1 -+ r cos(2 chi) are sums of positive terms here, without cancellation near beta = pi/2.
     one_minus_r = 2 * c / (1 + c)
     kappa2 = one_minus_r * (1 + r)
     root = jnp.sqrt(cos2psi**2 + kappa2 * sin2psi**2)
@@ -34,7 +35,7 @@ def clock(cos2psi: Any, sin2psi: Any, beta: Any) -> tuple[Any, Any, Any]:
     first_half = cos2psi > 0
     minus = one_minus_r * root + r * jnp.where(first_half, small, large)
     plus = one_minus_r * root + r * jnp.where(first_half, large, small)
-    # One division for eta = minus/plus, w = dtau/dpsi and deta/dpsi.
+    # A single division for eta = minus/plus, w = dtau/dpsi and deta/dpsi.
     inverse = 1 / (minus * plus * root)
     inverse_plus = minus * root * inverse
     eta = minus * inverse_plus
@@ -46,7 +47,7 @@ def oscillation_steps(xp: Any, phase: Any, sharpness: Any, digits: float) -> Any
     """Steps of order 8 for the ``phase`` over half a period; fitted, see ``Cardan.explicit_steps``."""
     x, bend = xp.log(phase), 2.57
     capped = xp.minimum(x, bend)
-    # Beyond 1e-10 rounding dominates, and so many steps would move points to the implicit scheme.
+    # Limited, because rounding dominates beyond 1e-10, and more steps would move points to the implicit scheme.
     power = 1.13 + 0.01 * digits if digits <= 1 else 1.1
     log_steps = 0.59 * capped + 0.1 * capped**2 + power * (x - capped)
     return xp.exp(log_steps + (0.59 - 0.13 * capped - 0.034 * sharpness) * sharpness + 1.7 + 0.26 * digits)

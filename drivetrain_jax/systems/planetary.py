@@ -29,7 +29,7 @@ from drivetrain_jax.systems._planetary_springs import (
 
 
 def check(fixed: Mapping[str, Any]) -> None:
-    """Lists of one length: one entry per planet. Raises ``ValueError`` with one line."""
+    """Raise ``ValueError`` unless all lists have the same length, one entry per planet."""
     angles = fixed.get("planet_angle")
     for name in (*PER_PLANET, *ERRORS):
         value = fixed.get(name)
@@ -57,11 +57,11 @@ def _error(units: str, long_name: str, default: float) -> Any:
     return parameter(units, f"{long_name}", default=default, listed=True, broadcast=True)
 
 
-# Two turns, more than anyone needs: angles in degrees are refused.
+# Largest angle, two turns: larger numbers are probably degrees.
 _LARGEST_ANGLE = 4 * math.pi
 _EACH = {"listed": True, "broadcast": True}
 Numbers = tuple[Number, ...]
-# Parameters of masses and springs; the others excite them.
+# Parameters of masses and springs; all others are excitations.
 _OF_SPRINGS = (
     "planet_angle", *PER_PLANET, *(f"{kind}_{body}" for kind in ("m", "I", "k") for body in "src"),
     *(f"k_{body}{axis}" for body in "src" for axis in "uxy"), "pressure_angle", "pressure_angle_s", "pressure_angle_r",
@@ -70,7 +70,7 @@ _OF_SPRINGS = (
 
 
 class Planetary(System):
-    """The gear of the module's docstring; what belongs to a planet is one number for all, or a list with one for each.
+    """The gear of the module's docstring; a parameter of planets is one number for all, or a list with one per planet.
 
     >>> Planetary().springs().mass.shape
     (21,)

@@ -1,4 +1,4 @@
-"""Gear rattle: two spur gears meshing with backlash, driven by a mean torque and a harmonic one.
+"""Gear rattle: two spur gears meshing with backlash, driven by a mean torque and a harmonic torque.
 
 Source: M. Rezaee, A. Farshidianfar, "Solving the nonlinear equations of rattling vibration of two meshing gears with
 damping by multiple scales and averaging" (in Persian). docs/theory/rattle.md lists where the printed equations had to
@@ -8,8 +8,8 @@ be corrected.
 I_y r_x^2)`` the equivalent mass, and ``B0 + B1 cos(omega t) = M_x r_x/I_x + M_y r_y/I_y`` an acceleration:
 ``u'' + (c/I) u' + (k/I) f_s(u) = B0 + B1 cos(omega t)`` with the spring of
 :class:`~drivetrain_jax.systems.PiecewiseLinearOscillator`. With r in m, u and b are lengths, k, c
-and I the stiffness, damping and mass along the line of action. Table 1 gives b as 10 deg, read as the number pi/18: the
-equation is homogeneous in u, b, B0 and B1, so that any unit of length will do.
+and I the stiffness, damping and mass along the line of action. Table 1 lists b as 10 deg, read here as the number pi/18: the
+equation is homogeneous in u, b, B0 and B1, so that any unit of length is valid.
 """
 
 from __future__ import annotations

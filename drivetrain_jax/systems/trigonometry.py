@@ -1,8 +1,8 @@
-"""Sine and cosine of many angles at once: XLA's own for double precision on the CPU work on one lane at a time.
+"""Sine and cosine of many angles at once; XLA's own functions for double precision on the CPU work on one lane at a time.
 
-Argument reduction by three parts of pi/2 (Cody & Waite) and the polynomials of fdlibm (``__kernel_sin``,
-``__kernel_cos``; S. Moshier, Sun Microsystems 1993): within 1.6 units in the last place of the larger of sine and cosine
-for angles up to 2^20, five to eight times faster than ``jnp.sin`` where they are fused with what surrounds them.
+The method is argument reduction by three parts of pi/2 (Cody & Waite) with the polynomials of fdlibm (``__kernel_sin``,
+``__kernel_cos``; S. Moshier, Sun Microsystems 1993). Errors are within 1.6 units in the last place of the larger of sine and
+cosine, for angles up to 2^20. Fused with other operations the functions are five to eight times faster than ``jnp.sin``.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def sincos(x: Any) -> tuple[Array, Array]:
     z = r * r
     sine = r + r * z * horner(_SINE, z)
     cosine = 1.0 - (0.5 * z - z * z * horner(_COSINE, z))
-    # quarter mod 4 in floating point: integer vectors of 64 bits are slower.
+    # quarter mod 4 in floating point, because vectors of 64-bit integers are slower.
     turn = quarter - 4.0 * jnp.floor(0.25 * quarter)
     odd = (turn == 1.0) | (turn == 3.0)
     first, second = jnp.where(odd, cosine, sine), jnp.where(odd, sine, cosine)

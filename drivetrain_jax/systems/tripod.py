@@ -104,7 +104,7 @@ class _Motion(eqx.Module):
         return omega * rate, drive - omega * (2 * self.zeta * jnp.sqrt(g) * rate + g * phi)
 
     def divergence(self, angles: Components, y: Components) -> Any:
-        """The trace of its Jacobian."""
+        """Trace of the Jacobian of :meth:`field`."""
         return -2 * self.zeta * self.element.frequency * jnp.sqrt(self._ratio(angles, 1 - 2 * sin(y[0]) ** 2))
 
 
@@ -113,7 +113,7 @@ def flow_model(values: Values) -> Flow:
 
     phi'' + 2 zeta Omega sqrt(g) phi' + Omega^2 g phi = (M/Ibar)(1 + ripple)(1 - 3 A_TJ sin 3 phi)/(1 + chi_n cos 2 phi)
     with g at 2 phi, (25)-(26), or at Theta = 2 pi f t, (29)-(30). The clocks are Theta and, for the input element, the
-    motor's. If no equation is given it is (29) or (30).
+    angle of the motor. The default equation is (29) or (30).
     """
     name = values["element"]
     equation = values.get("equation", EQUATIONS[name][1])
@@ -142,17 +142,17 @@ def flow_model(values: Values) -> Flow:
 
 
 def history_model(values: Values) -> Flow:
-    """Like :func:`flow_model`, but (25) or (26) if no equation is given."""
+    """Like :func:`flow_model`, with (25) or (26) as default equation."""
     return flow_model({"equation": EQUATIONS[values["element"]][0], **values})
 
 
-# Equally spaced angles: the rule converges like the distance of the nearest zero or pole of g from the real axis,
-# to rounding for coefficients up to 0.99.
+# Number of equally spaced angles of the quadrature. Its rate of convergence is the distance of the nearest zero or pole of g
+# from the real axis; for coefficients up to 0.99 the error is rounding.
 _NODES = 256
 
 
 class _Parametric(eqx.Module):
-    """phi'' + 2 zeta Omega sqrt(g) phi' + Omega^2 g phi = 0 with g at Theta, in a time in which Omega is ``speed``."""
+    """phi'' + 2 zeta Omega sqrt(g) phi' + Omega^2 g phi = 0 with g at Theta, in the time in which Omega is ``speed``."""
 
     element: Element
     zeta: Any
@@ -171,7 +171,7 @@ class _Parametric(eqx.Module):
     def log_determinant(self) -> Array:
         """Exact ``log det Z`` over one period (Liouville): -2 zeta Omega T <sqrt g>, the mean over Theta."""
         decay = 2 * self.zeta * self.element.frequency / self.excitation_frequency
-        # g is even: the nodes 2 pi k/_NODES from 0 to pi, the ends with weight 1/2.
+        # g is even: use the nodes 2 pi k/_NODES from 0 to pi, the ends with weight 1/2.
         cosines = [math.cos(2 * math.pi * k / _NODES) for k in range(_NODES // 2 + 1)]
         weights = [1 / _NODES if k in (0, _NODES // 2) else 2 / _NODES for k in range(_NODES // 2 + 1)]
         shape = (-1, *(1,) * jnp.ndim(decay + self.element.chi_n))
@@ -202,7 +202,7 @@ def floquet_model(values: Values) -> FloquetModel:
 
 
 class Tripod(System):
-    """One element of the driveshaft; geometry and torques default to the paper's values for it.
+    """One element of the driveshaft; geometry and torques default to the paper's values for this element.
 
     >>> import jax.numpy as jnp
     >>> shaft = Tripod(element="input", beta=0.157, zeta=0.0016)

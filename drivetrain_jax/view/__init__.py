@@ -1,4 +1,4 @@
-"""Figures of results: a matplotlib Figure from a Dataset, without jax and the package that computed it.
+"""Figures of results: a matplotlib Figure from a Dataset, without jax or the code that computed it.
 
 Other packages add figures of their analyses through the entry point group ``drivetrain_jax.figures``; each entry point names
 a function from a Dataset to a Figure.
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-# Analyses with a figure of their own, analysis/NAME/figure.py.
+# Analyses with a figure, analysis/NAME/figure.py.
 _DRAWN = (
     "floquet",
     "forced",
@@ -31,7 +31,7 @@ _DRAWN = (
     "basins",
     "critical_speeds",
 )
-# Analyses of which several results may share a figure.
+# Analyses whose results may share a figure.
 _OVERLAYS = ("frequency_response",)
 
 __all__ = ["plot"]

@@ -61,9 +61,9 @@ def _draw_undecided(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: 
 
 
 def _name(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> None:
-    """Draw names outside of the tongues, or next to the tip if a name would cover another one or the frame; else none."""
+    """Draw the names of tips outside of the tongues, or next to the tips; omit names that overlap or leave the frame."""
     x, y = (dataset[f"tip_{name}"].values for name in (horizontal, vertical))
-    # Tongues open upwards in charts without this variable.
+    # Without this variable all tongues open upwards.
     opens = dataset["tip_opens"].values if "tip_opens" in dataset.coords else np.ones(len(x))
     tips, names = np.stack([x, y], axis=-1), dataset["tip"].values.astype(str)
     scale = 72 / axes.figure.dpi

@@ -26,8 +26,10 @@ _NO_PARAMETERS = ("point", _PENDING)
 
 
 def prepare(dataset: xr.Dataset) -> xr.Dataset:
-    """``dataset`` with rising axes in units of a handy size; axes of one value become scalar coordinates. Infinite axis
-    values are dropped and recorded in the attribute ``left_out``."""
+    """``dataset`` with rising axes in units with suitable prefixes.
+
+    Axes of one value become scalar coordinates. Infinite axis values are dropped and recorded in the attribute ``left_out``.
+    """
     dataset = _finite(dataset)
     single = {name: 0 for name in dataset["outcome"].dims if dataset.sizes[name] == 1}
     dataset = with_prefixes(dataset.isel(single))
@@ -47,7 +49,7 @@ def _finite(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _with_pending(dataset: xr.Dataset) -> xr.Dataset:
-    """``dataset`` with a coordinate that marks pending cells; it stays with every variable."""
+    """``dataset`` with a coordinate that marks pending cells, and that every variable keeps."""
     outcome = dataset["outcome"]
     if not outcome.ndim or not str(outcome.attrs.get("flag_meanings", "")).endswith(" pending"):
         return dataset
@@ -73,7 +75,7 @@ def require(dataset: xr.Dataset, *names: str) -> None:
 
 
 def require_any(dataset: xr.Dataset, *names: str) -> list[str]:
-    """The stored ones of ``names``; raises :class:`InputError` without any."""
+    """Those of ``names`` that are stored; raises :class:`InputError` if none is."""
     if not (found := [name for name in names if name in dataset]):
         stored = ", ".join(str(name) for name in dataset.data_vars)
         raise InputError(f"outputs = {stored}: nothing to plot; the figure needs {' or '.join(names)}")
@@ -90,18 +92,18 @@ def require_values(variable: xr.DataArray, positive: bool = False) -> None:
 
 
 def horizontal_axis(dataset: xr.Dataset, names: list[str]) -> str:
-    """The axis of ``names`` with predicted resonances, else the speed, else the last one."""
+    """The axis of ``names`` with predicted resonances, else the speed, else the last axis."""
     return next((name for name in names if f"resonance_{name}" in dataset.coords), speed_axis(dataset, names))
 
 
 def speed_axis(dataset: xr.Dataset, names: list[str]) -> str:
-    """The axis of ``names`` that the system calls its speed (attribute ``roles``), else the last one."""
+    """The axis of ``names`` that is the speed of the system (attribute ``roles``), else the last axis."""
     speed = role(dataset, "speed")
     return speed if speed in names else names[-1]
 
 
 def role(dataset: xr.Dataset, name: str) -> str:
-    """The parameter with the role ``name`` in the system (attribute ``roles``); empty without one."""
+    """The parameter with the role ``name`` in the system (attribute ``roles``), or an empty string."""
     return json.loads(dataset.attrs.get("roles", "{}")).get(name, "")
 
 
@@ -173,8 +175,8 @@ def fit_axis(axes: Axes, which: str, values: np.ndarray) -> None:
 
 
 def plain_decades(axes: Axes, which: str) -> None:
-    """Plain numbers at 1, 2, 5 (only 1 over many decades) along a logarithmic axis; powers of ten if plain numbers are
-    long."""
+    """Set plain numbers at 1, 2, 5 (over many decades only at 1) along a logarithmic axis, or powers of ten if plain numbers
+    are long."""
     low, high = getattr(axes, f"get_{which}lim")()
     side = getattr(axes, f"{which}axis")
     side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
@@ -227,7 +229,7 @@ def _state_patch(code: int, note: str) -> Patch:
     return Patch(**colours, linewidth=0.6, hatch=STATE_HATCHES[code], label=STATE_NAMES[code] + note)
 
 
-# Below this growth log10(rho) the scale is linear: narrow tongues differ from 1 by 1e-5 and less.
+# Growth log10(rho) below which the scale is linear, because rho of narrow tongues differs from 1 by 1e-5 and less.
 LINEAR_GROWTH = 1e-4
 # Position between no growth (0) and largest growth (1), and colour; lightness falls monotonically. White is reserved for
 # cells without a value.
@@ -238,7 +240,8 @@ _GROWTH = ((0.25, "#f3b562"), (0.55, "#c8553d"), (1.0, "#2d0a2b"))
 def draw_growth(axes: Axes, radius: xr.DataArray, horizontal: str, vertical: str) -> tuple[QuadMesh, str, str]:
     """Draw ``log10`` of a spectral radius as cells; returns label and ``extend`` of its colour bar.
 
-    Pale colours decay, paler ones faster; orange to black grows. Missing values have the colour of failed cells.
+    Pale colours are decay, paler colours faster decay; orange to black is growth. Missing values have the colour of failed
+    cells.
     """
     with np.errstate(divide="ignore"):
         growth: Any = np.log10(radius)

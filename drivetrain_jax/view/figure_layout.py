@@ -47,20 +47,20 @@ class Margins:
 
 
 class NotebookFigure(Figure):
-    """A figure that a notebook shows where it ends a cell, without pyplot."""
+    """A figure that a notebook shows as the result of a cell, without pyplot."""
 
     def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
         image = io.BytesIO()
         self.savefig(image, format="png")
         width, height = self.get_size_inches()
-        # As large as a figure of pyplot, with all dots for screens that have them.
+        # As large as a figure of pyplot, with full resolution for dense screens.
         return image.getvalue(), {"width": round(width * _NOTEBOOK_DPI), "height": round(height * _NOTEBOOK_DPI)}
 
 
 class Panels:
     """A figure of ``rows x columns`` equal panels with title, caption and legend.
 
-    ``axes[row][column]`` share the horizontal axis, and the vertical one too if ``share_y``.
+    ``axes[row][column]`` share the horizontal axis, and with ``share_y`` the vertical axis.
     """
 
     def __init__(
@@ -94,13 +94,13 @@ class Panels:
         bar.tick_params(labelsize=7.5)
 
     def label_axes(self, horizontal: str, vertical: str = "") -> None:
-        """Add one label for all horizontal axes and one for all vertical ones, wrapped to the extent of the panels."""
+        """Add one label for all horizontal axes and one for all vertical axes, wrapped to the extent of the panels."""
         self._label_side([row[0] for row in self.axes], vertical)
         first, last = self.axes[0][0].get_position(), self.axes[-1][-1].get_position()
         x, y = (first.x0 + last.x1) / 2, last.y0 - 0.36 / self.figure.get_figheight()
         text = _wrap(horizontal, (last.x1 - first.x0) * WIDTH)
         self.figure.text(x, y, text, ha="center", va="center", size=_LABEL_SIZE)
-        # All columns share a power of ten, written at the right end, clear of the label.
+        # All columns share a power of ten, which stands at the right end, clear of the label.
         for row in self.axes:
             for axes in row[:-1]:
                 axes.xaxis.get_offset_text().set_visible(False)
@@ -158,13 +158,13 @@ class Panels:
 
 
 def _left_of_numbers(axes: Axes) -> float:
-    """Right end of a label that clears the numbers of the vertical axis, relative to the figure's width."""
+    """Right end of a label left of the numbers of the vertical axis, relative to the figure's width."""
     box = axes.yaxis.get_tightbbox()
     return box.x0 / axes.figure.bbox.width - _CLEAR / WIDTH if box else 1.0
 
 
 def write_title(figure: Figure, dataset: xr.Dataset, left: float) -> None:
-    """Write the scene's title from ``left`` (inches) on; too long a title is set smaller, then cut."""
+    """Write the scene's title from ``left`` (inches) on; a title that is too long is set smaller, then truncated."""
     title, room = str(dataset.attrs.get("title", "")), WIDTH - left - 0.1
     size = max(min(_TITLE_SIZE, _TITLE_SIZE * room / max(_title_length(title), 1e-9)), _SMALLEST_TITLE)
     limit = 1.001 * room * _TITLE_SIZE / size
@@ -177,7 +177,7 @@ def write_title(figure: Figure, dataset: xr.Dataset, left: float) -> None:
 
 
 def _title_length(title: str) -> float:
-    """Length in inches of a title of full size, with a margin for pixel rounding of letters."""
+    """Length in inches of a title at full size, with a margin for pixel rounding of letters."""
     # A title is free text, in which a dollar sign need not begin a formula.
     title = title.replace("$", r"\$")
     bold = FontProperties(family=STYLE["font.sans-serif"], weight="bold")
@@ -186,7 +186,7 @@ def _title_length(title: str) -> float:
 
 
 def _wrap(text: str, inches: float) -> str:
-    # A minus sign stays with its operands.
+    # Do not break next to a minus sign.
     words = text.replace(" - ", "\u00a0-\u00a0").split(" ")
     return "\n".join(
         _fill(words, max(inches, 20 * _INCHES_PER_LETTER), lambda line: len(_plain(line)) * _INCHES_PER_LETTER)
@@ -194,7 +194,7 @@ def _wrap(text: str, inches: float) -> str:
 
 
 def _fill(parts: Sequence[str], inches: float, length: Callable[[str], float]) -> list[str]:
-    """``parts`` in lines of ``inches``, without breaking any."""
+    """``parts`` joined to lines of ``inches``, without a break within a part."""
     lines = [parts[0]]
     for part in parts[1:]:
         longer = f"{lines[-1]} {part}"
@@ -206,8 +206,8 @@ def _fill(parts: Sequence[str], inches: float, length: Callable[[str], float]) -
 
 
 def wrap_caption(text: str, inches: float, lines: int) -> str:
-    """``text`` in at most ``lines`` lines, broken between its parts (never within a formula); an ellipsis replaces the
-    rest."""
+    """``text`` in at most ``lines`` lines, broken between its parts and never within a formula; an ellipsis ends a text
+    that is too long."""
     wrapped = _fill(re.split(r"(?<=[,;]) (?![^\[]*\])", text), inches, _caption_length)
     if len(wrapped) > lines:
         wrapped = [*wrapped[: lines - 1], f"{wrapped[lines - 1].rstrip(',;')}, {_ELLIPSIS}"]

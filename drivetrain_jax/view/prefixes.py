@@ -1,4 +1,4 @@
-"""Forces, stiffnesses and pressures with the prefix that users write: 85 MN/m for 8.5e7 N/m."""
+"""Forces, stiffnesses and pressures with the usual prefix: 85 MN/m for 8.5e7 N/m."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _PREFIXED = re.compile(r"(N|Pa)(?![A-Za-z])")
 
 
 def prefixed(values: Any, units: str) -> tuple[float, str]:
-    """The number that ``values`` are divided by for a handy size, and the unit they have then.
+    """The divisor of ``values`` for a unit with a suitable prefix, and this unit.
 
-    The median of the moduli decides, without zeros and infinity: ends of an axis may lie decades apart.
+    The prefix suits the median of the moduli without zeros and infinity, because the ends of an axis may lie decades apart.
     """
     size = np.abs(np.asarray(values, float))
     size = size[np.isfinite(size) & (size > 0)]
@@ -28,7 +28,7 @@ def prefixed(values: Any, units: str) -> tuple[float, str]:
 
 
 def with_prefixes(dataset: xr.Dataset) -> xr.Dataset:
-    """``dataset`` with its axes and results in units of a handy size."""
+    """``dataset`` with its axes and results in units with suitable prefixes."""
     found: dict[Hashable, tuple[float, str]] = {}
     changed = {}
     for name, variable in sorted(dataset.variables.items(), key=lambda item: len(str(item[0]))):
@@ -36,7 +36,7 @@ def with_prefixes(dataset: xr.Dataset) -> xr.Dataset:
         # A scalar coordinate belongs to the fixed parameters, whose captions choose prefixes themselves.
         if variable.dtype.kind != "f" or not (_PREFIXED.match(units) and (variable.ndim or name in dataset.data_vars)):
             continue
-        # Results of one unit may share an axis of the figure; so do the axis NAME and `boundary_NAME` or `tip_NAME_error`.
+        # One prefix for results of the same unit, which may share an axis, and for NAME, `boundary_NAME`, `tip_NAME_error`.
         axes = [axis for axis, (_, known) in found.items() if f"_{axis}" in str(name) and known.endswith(units)]
         key = units if name in dataset.data_vars else (axes or [name])[-1]
         factor, written = found.setdefault(key, prefixed(variable.values, units))

@@ -16,7 +16,7 @@ from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.style import FRAME_GREY, PREDICTION, STATE_COLOURS
 
-# Lightness falls with the number of flanks; non-periodic and failed cells differ in hue.
+# The lightness of the colours falls with the number of flanks; non-periodic and failed cells differ in hue.
 _NAMES = ("no separation", "single-sided", "double-sided", "non-periodic", "failed")
 COLOURS = ("#ffffff", "#9cc3e0", "#33517c", "#f2b632", STATE_COLOURS[cells.FAILED])
 NON_PERIODIC, FAILED = 3, 4
@@ -40,7 +40,7 @@ def legend(dataset: xr.Dataset) -> list[Patch]:
 
 
 def draw_threshold(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Line2D]:
-    """Draw the predicted end of the motion without separation, if stored as a curve over the horizontal axis."""
+    """Draw the predicted limit of motion without separation, if stored as a curve over the horizontal axis."""
     name = f"resonance_{vertical}"
     if name not in dataset.coords or horizontal not in dataset[name].dims:
         return []
@@ -55,7 +55,7 @@ def draw_threshold(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: s
 
 
 def draw_bands(dataset: xr.Dataset, name: str, *panels: Axes) -> list[Patch]:
-    """Shade the values of the axis ``name`` by regime, if stored; the legend entries of the regimes that occur."""
+    """Shade the values of the axis ``name`` by regime, if stored; returns legend entries of the regimes that occur."""
     if "regime" not in dataset:
         return []
     order = np.argsort(dataset[name].values)
@@ -71,7 +71,7 @@ def draw_bands(dataset: xr.Dataset, name: str, *panels: Axes) -> list[Patch]:
 
 
 def half_play(dataset: xr.Dataset) -> float | None:
-    """Half the play, if it is known and does not vary."""
+    """Half the play, or None if it is unknown or varies."""
     play = cells.role(dataset, "half_play")
     half = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get(play, {}).get("value")
     if play in dataset.coords:
@@ -80,8 +80,10 @@ def half_play(dataset: xr.Dataset) -> float | None:
 
 
 def draw_flanks(dataset: xr.Dataset, *horizontal: Axes, portrait: Axes | None = None) -> list[Line2D]:
-    """Draw both flanks of the play as horizontal lines, in a phase portrait as vertical ones; the legend entry, none
-    without a known play."""
+    """Draw both flanks of the play as horizontal lines, and as vertical lines in a phase portrait.
+
+    Returns the legend entry, or nothing if the play is unknown.
+    """
     half = half_play(dataset)
     if half is None:
         return []

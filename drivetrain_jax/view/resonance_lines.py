@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from drivetrain_jax.view.style import PREDICTION
 
 _DASHES = {"solid": "-", "dashed": (0, (5, 2)), "dashdot": (0, (5, 1.5, 1, 1.5))}
-# Type size of the labels, space for each along the edges, leader and largest shift from the line, in points.
+# In points: type size of the labels, space per label along the edges, leader, and largest shift from the line.
 _FONT = 7.5
 _SPACING_ACROSS = 14.5
 _SPACING_UP = 9.5
@@ -26,8 +26,8 @@ _MAX_SHIFT = 24.0
 
 @dataclass(frozen=True)
 class Prediction:
-    """One predicted line: values of the horizontal axis, and of the vertical axis unless it is straight; name and line
-    style of its family."""
+    """One predicted line: values of the horizontal axis, values of the vertical axis unless the line is vertical, and name
+    and line style of its family."""
 
     label: str
     x: np.ndarray
@@ -37,7 +37,7 @@ class Prediction:
 
     @property
     def order(self) -> int:
-        """Last digit of the label, 0 without one."""
+        """Last digit of the label, or 0."""
         digits = re.findall(r"\d", self.label)
         return int(digits[-1]) if digits else 0
 
@@ -45,7 +45,7 @@ class Prediction:
 def predictions(
     dataset: xr.Dataset, horizontal: str, vertical: str | None = None, forced: bool = False
 ) -> list[Prediction]:
-    """Predicted lines over ``horizontal`` (``forced``: of families that the forcing excites); none without predictions."""
+    """Predicted lines over ``horizontal``, with ``forced`` only of families that the forcing excites; [] without any."""
     name = f"resonance_{horizontal}"
     if name not in dataset.coords:
         return []
@@ -63,7 +63,7 @@ def predictions(
 
 
 def _family(label: str, families: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The declared family of ``label``: the one with the longest prefix, else one named by its first letter."""
+    """The declared family of ``label`` with the longest matching prefix, else a family named by the first letter."""
     prefixes = [prefix for prefix in families if label.startswith(prefix)]
     return families[max(prefixes, key=len)] if prefixes else {"name": label[:1]}
 
@@ -96,7 +96,7 @@ def draw(axes: Axes, lines: list[Prediction]) -> list[Line2D]:
 def label(axes: Axes, lines: list[Prediction]) -> None:
     """Label lines at the upper or right edge of ``axes``, without overlaps.
 
-    Lines of low order come first; a label that would move far from its line is left out.
+    Lines of low order take precedence. A label that would move far from its line is left out.
     """
     scale = 72 / axes.figure.dpi
     for edge, spacing, side in ((_top_exit, _SPACING_ACROSS, 0), (_right_exit, _SPACING_UP, 1)):
@@ -105,7 +105,7 @@ def label(axes: Axes, lines: list[Prediction]) -> None:
         along = [axes.transData.transform(point)[side] * scale for _, point in ends]
         box = axes.bbox
         limits = (box.xmin, box.xmax) if side == 0 else (box.ymin, box.ymax)
-        # Labels may extend over the corners by one width.
+        # Labels may extend beyond the corners by one width.
         span = (limits[0] * scale - spacing, limits[1] * scale + spacing)
         kept, positions = _place(along, spacing, span)
         for index, position in zip(kept, positions, strict=True):
@@ -123,7 +123,7 @@ def _place(wanted: list[float], spacing: float, span: tuple[float, float]) -> tu
         trial = sorted([*kept, index], key=lambda i: wanted[i])
         target = np.array([wanted[i] for i in trial])
         offsets = spacing * np.arange(len(trial))
-        # Positions p with p[i+1] - p[i] >= spacing: isotonic regression of p[i] - i * spacing.
+        # Nearest positions p with p[i+1] - p[i] >= spacing: isotonic regression of p[i] - i * spacing.
         spread = np.clip(isotonic_regression(target - offsets).x, span[0], span[1] - offsets[-1]) + offsets
         if np.abs(spread - target).max() <= _MAX_SHIFT:
             kept, positions = trial, spread

@@ -22,7 +22,7 @@ STYLE: dict[Any, Any] = {
     "axes.titlesize": 8.5,
     "axes.linewidth": 0.7,
     "axes.formatter.useoffset": False,
-    # Numbers of five digits would overlap the axis label: show powers of ten as a factor.
+    # Show powers of ten as a factor, because numbers of five digits would overlap the axis label.
     "axes.formatter.limits": (-3, 4),
     "axes.formatter.use_mathtext": True,
     "xtick.labelsize": 8.0,
@@ -35,7 +35,7 @@ STYLE: dict[Any, Any] = {
     "hatch.linewidth": 0.5,
 }
 
-# Lightness 100, 27, 76, 50: the four states differ in grey.
+# The lightness of the four colours is 100, 27, 76, 50, so that the states differ in grey.
 STATE_NAMES = ("stable", "unstable", "undecided", "failed")
 STATE_COLOURS = ("#ffffff", "#33415c", "#f2b632", "#d1495b")
 STATE_HATCHES = ("", "", "////", "xxxx")
@@ -60,9 +60,9 @@ _PRODUCTS = {"EI": "$EI$", "rhoA": r"$\rho A$", "rhoI": r"$\rho I$", "kGA": r"$\
 
 
 def symbol(name: str) -> str:
-    """``name`` as a formula: Greek letters by name, an index as subscript (``k_A``, ``k_joint``), else unchanged.
+    """``name`` as a formula, with Greek letters and an index as subscript (``k_A``, ``k_joint``), else unchanged.
 
-    Entries of a list are counted from 0, as in scenes: ``m_p[1]`` is m_p,1.
+    Entries of a list are numbered from 0, as in scenes: ``m_p[1]`` is m_p,1.
     """
     if match := re.fullmatch(r"(.+)\[(\d+)\]", name):
         head, number = symbol(match[1]), match[2]
@@ -105,17 +105,17 @@ def variable_label(variable: xr.DataArray) -> str:
 
 
 def units_of(variable: xr.DataArray) -> str:
-    """The unit of a result as figures write it."""
+    """The unit of a result in the notation of figures."""
     return written_units(str(variable.attrs.get("units", "1")))
 
 
 def written_units(units: str) -> str:
-    """A unit of UDUNITS as people write it: ``kg m²`` for ``kg m2``."""
+    """A unit of UDUNITS in common notation: ``kg m²`` for ``kg m2``."""
     return re.sub(r"(?<=[A-Za-z])-?\d+", lambda power: power[0].translate(_SUPERSCRIPTS), units)
 
 
 def value_text(name: str, value: object, units: str = "1") -> str:
-    """``symbol = value units``, with a prefix of the unit; a list of more than six entries is given by its length."""
+    """``symbol = value units``, with a prefix of the unit; a list of more than six entries is shortened to its length."""
     entries = value if isinstance(value, (list, tuple)) else [value]
     if len(entries) > _MOST_ENTRIES:
         return f"{symbol(name)}: {len(entries)} values"
@@ -134,7 +134,7 @@ def coordinate_text(coordinate: xr.DataArray) -> str:
 def caption(dataset: xr.Dataset) -> str:
     """One line with the fixed parameters of the scene, then scalar coordinates; defaults are left out.
 
-    Joined results may differ in what their scenes fix: only their coordinates are shown.
+    Joined results may differ in their fixed parameters, so only their coordinates are shown.
     """
     fixed, given = json.loads(dataset.attrs.get("fixed_parameters", "{}")), _given(dataset)
     named = set().union(*given.values())
@@ -149,7 +149,7 @@ def caption(dataset: xr.Dataset) -> str:
 
 
 def _says_something(name: str, coordinate: xr.DataArray, fixed: dict[str, object]) -> bool:
-    """False for a number in a list of points, and for an entry of a list that is written out as a whole."""
+    """False for the number of a point in a list, and for an entry of a list that is shown as a whole."""
     whole = scene_key(coordinate).partition("[")[0]
     return name != "point" and (whole == name or whole not in fixed)
 
