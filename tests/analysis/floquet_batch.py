@@ -1,4 +1,4 @@
-"""The solvers of the floquet analysis over many points, jitted once for every tolerance: what the engine does, in short."""
+"""The solvers of the floquet analysis over many points, jitted once for all tolerances, as a short form of the engine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from drivetrain_jax.analysis import Request, Solver, get_analysis
 from drivetrain_jax.systems import System, get_system
 
 ANALYSIS, CARDAN = get_analysis("floquet"), get_system("cardan")
-# Cardan has no time in seconds, which exponents need.
+# All results of cardan: exponents need a time in seconds, which it does not have.
 EVERYTHING = tuple(v.name for v in ANALYSIS.variables if v.name != "floquet_exponent")
 BASE = dict(CARDAN.presets["base"])
 STABLE, UNSTABLE, UNDECIDED = 0, 1, 2
@@ -24,7 +24,7 @@ def request(method: str, rtol: float, outputs=EVERYTHING, **options) -> Request:
 
 
 class FloquetBatch:
-    """Results by name, the points as first axis, of arrays of parameters; points by falling cost of their solver."""
+    """Results by name for arrays of parameters, with the points as first axis, by falling cost of their solver."""
 
     def __init__(
         self, method="direct", system: System = CARDAN, outputs=EVERYTHING, chunk=(256, 8, 256, 64), **options

@@ -11,7 +11,7 @@ from drivetrain_jax.systems import Flow
 
 
 def spread(lanes: int, *start: float) -> tuple:
-    """Initial states around ``start``, no two alike."""
+    """Different initial states around ``start``."""
     return tuple(jnp.asarray(x + 0.01 * np.cos(np.arange(lanes) * (i + 1.0))) for i, x in enumerate(start))
 
 
@@ -26,7 +26,7 @@ def roessler(lanes: int) -> Flow:
     def field(_, y):
         return -y[1] - y[2], y[0] + 0.2 * y[1], 0.2 + y[2] * (y[0] - 5.7)
 
-    # All around the attractor: its phases mix slowly, and members in step would share the error of an unfinished turn.
+    # Start all around the attractor: its phases mix slowly, and members in phase would share the error of a partial turn.
     turn = 2 * math.pi * np.arange(lanes) / lanes
     return Flow(field, (jnp.asarray(6 * np.cos(turn)), jnp.asarray(6 * np.sin(turn)), 0.0), period=2.0)
 
@@ -40,7 +40,7 @@ OSCILLATORS = {
 
 
 def oscillators(lanes: int) -> Flow:
-    """All of ``OSCILLATORS`` in one batch, ``lanes`` of each, one after the other."""
+    """All of ``OSCILLATORS`` in one batch, ``lanes`` of each in sequence."""
 
     def column(name: str):
         return jnp.asarray(np.repeat([p.get(name, 0.0) for p in OSCILLATORS.values()], lanes))
@@ -57,7 +57,7 @@ def oscillators(lanes: int) -> Flow:
 
 
 def linear(damping, stiffness, torque: float = 1.0) -> Flow:
-    """x'' + damping x' + stiffness x = torque, strobed without being forced."""
+    """x'' + damping x' + stiffness x = torque, with a strobe but without forcing."""
     damping, stiffness = jnp.asarray(damping), jnp.asarray(stiffness)
 
     def field(_, y):
@@ -67,7 +67,7 @@ def linear(damping, stiffness, torque: float = 1.0) -> Flow:
 
 
 def van_der_pol(lanes: int) -> Flow:
-    """A limit cycle."""
+    """Van der Pol's oscillator, which has a limit cycle."""
 
     def field(_, y):
         return y[1], (1 - y[0] ** 2) * y[1] - y[0]

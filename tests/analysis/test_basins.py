@@ -1,4 +1,4 @@
-"""Shares of initial conditions against the values of the note."""
+"""Shares of initial conditions against the published values of the theory note."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +9,7 @@ from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.basins.analysis import shares
 from drivetrain_jax.systems.rattle import PRESETS
 
-# Share of the high branch, initial conditions in [-1, 1]^2.
+# Share of the high branch by omega, for initial conditions in [-1, 1]^2.
 NOTE = {0.76: 0.976, 0.80: 0.84, 0.84: 0.67, 0.87: 0.41}
 # Rounding of the note.
 ROUNDING = {0.76: 0.0005, 0.80: 0.005, 0.84: 0.005, 0.87: 0.005}
@@ -26,7 +26,7 @@ def found():
 
 
 def test_shares_of_the_high_branch(found):
-    """Within three standard errors of the expected share, and the rounding of the note."""
+    """Shares agree within three standard errors plus the rounding of the note."""
     expected, rounding = np.array(list(NOTE.values())), np.array(list(ROUNDING.values()))
     distance = np.abs(found.sel(attractor=1).basin_fraction.values - expected)
     assert np.all(distance < 3 * np.sqrt(expected * (1 - expected) / 1000) + rounding)
@@ -49,7 +49,7 @@ TRANSIENT = {
 
 
 def test_chaos_beside_periodic_motions_may_be_a_transient():
-    """Whatever the time, what has not ended yet is unsettled, and the more time, the less of it."""
+    """Motions that are still chaotic count as unsettled; their number falls with ``most_periods``."""
     left = []
     for periods in (1000, 8000):
         scene = {"system": "rattle", "analysis": "basins", "fixed": TRANSIENT}
@@ -67,7 +67,7 @@ def sorted_motions(high, multiple, outcome):
 
 
 def test_motions_are_sorted_into_attractors():
-    """One has failed, and the two that are not periodic may end on one of the others."""
+    """Three motions count as unsettled: one has failed, and the two non-periodic ones may be transients."""
     found = sorted_motions(
         [1.0, 2.0, 1.0, 5.0, np.nan, 1.0, 7.0], [1, 2, 1, 0, 0, 2, 0], [0, 0, 0, 0, Outcome.NOT_CONVERGED, 0, 0]
     )
@@ -84,7 +84,7 @@ def test_non_periodic_motions_alone_are_one_attractor():
 
 
 def test_gears_at_rest_are_one_attractor():
-    """Whatever the frequency, which nothing moves at."""
+    """Without a drive amplitude all motions come to rest, at any frequency."""
     scene = {"system": "rattle", "analysis": "basins", "fixed": PRESETS["table1"] | {"B1": 0.0}}
     found = dt.run(scene | {"axes": {"omega": {"values": [0.9, 0.9719, 1.2]}}, "options": {"samples": 128}})
     assert (found.outcome == Outcome.SUCCESS).all() and (found.unsettled_fraction == 0).all()

@@ -1,4 +1,4 @@
-"""A frequency at which the branch has more motions than are given says so, and only that one."""
+"""The outcome marks only those frequencies at which the branch has more motions than the results hold."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +13,7 @@ from drivetrain_jax.analysis.impacts.branch_sections import distinct
 from drivetrain_jax.systems import rattle
 from tests.quick_jit import quick_jit
 
-# Of Table 1: at .8 there are three motions.
+# Frequencies of Table 1; at .8 there are three motions.
 OMEGAS = np.array([0.65, 0.8, 0.95])
 OPTIONS = {
     "exact": {"rtol": 1e-10, "most_periods": 1000},

@@ -50,7 +50,7 @@ def lanes(cases) -> dict[str, np.ndarray]:
 
 @cache
 def compiled(method: str, omegas: tuple[float, ...], shape: tuple[int, ...], fit_range: float | None, outputs=OUTPUTS):
-    """The response at these frequencies; other parameters are arguments."""
+    """The compiled response at ``omegas``, as a function of the other parameters."""
 
     def run(values):
         model = Rattle.models["basins"].build(values | {"omega": np.array(omegas)})
@@ -100,7 +100,7 @@ def test_multiple_scales_of_table_1():
 
 @pytest.mark.parametrize("damping", [1e-8, 1e-11, 1e-14])
 def test_multiple_scales_at_hardly_any_damping(damping):
-    """Away from resonance the amplitude does not feel the damping, however far off the peak is."""
+    """Away from resonance the amplitude does not depend on the damping, however distant the peak is."""
     cases = ({"c": damping, "alpha": 1.0}, {"c": damping})
     found = solve("multiple_scales", cases=cases)
     low = (found["branch_u_max"] - found["branch_u_min"])[:, 0] / 2
@@ -116,7 +116,7 @@ def test_multiple_scales_at_hardly_any_damping(damping):
 
 
 def test_folds_and_peak_are_at_frequencies_of_a_drive():
-    """A fitted cubic may bend below zero; there is no drive, and of no damping no second fold."""
+    """A cubic fit may bend to negative frequencies, which have no folds; without damping there is no second fold."""
     cases = ({"alpha": 3.0, "c": 0.01, "B1": 1.0}, {"c": 0.0})
     found = solve("multiple_scales", np.geomspace(1e-6, 3.0, 60), cases, fit_range=0.8)
     folds = found["fold_frequency"][0]
@@ -128,7 +128,7 @@ def test_folds_and_peak_are_at_frequencies_of_a_drive():
 
 @pytest.mark.parametrize("alpha", [0.0, 0.1, 0.15, 0.2, 0.3])
 def test_the_largest_self_consistent_range_is_taken(alpha):
-    """Against a dense scan from large ranges down, also next to where two of them merge."""
+    """The range agrees with a dense scan from large ranges down, also where two ranges nearly merge."""
     for ratio in (0.01, 0.4, 0.55, 0.65, 0.68, 0.69, 0.71, 0.72, 0.8, 0.9, 0.95):
         stiffness = 1 - (1 - alpha) * float(multiple_scales._share(ratio))
         if stiffness <= 0:
@@ -156,8 +156,8 @@ def test_self_consistent_range_is_the_peak_it_gives(scales):
 
 @pytest.mark.parametrize("name", ["B1", "b", "c", "alpha", "k"])
 def test_one_parameter_may_vary_alone(name):
-    """One, two or three lanes of one parameter, the others numbers: as with arrays of all parameters."""
-    # With 1.3 times this drive the largest of three ranges that give their own peak is nearly twice the next one.
+    """One to three lanes of a single parameter, with numbers for the others, give the same as arrays of all parameters."""
+    # With 1.3 times this drive there are three self-consistent ranges, the largest nearly twice the next one.
     table, factors = TABLE1 | {"alpha": 0.15, "B1": 0.0023}, np.array([0.9, 1.0, 1.3])
     cases = [table | {name: table[name] * factor} for factor in factors]
 
@@ -172,7 +172,7 @@ def test_one_parameter_may_vary_alone(name):
 
 
 def settled(epsilon: float, sigma: float, start: float) -> float:
-    """Amplitude that the cubic system settles to, from ``start`` in the phase of the averaged motion."""
+    """Settled amplitude of the cubic system, from the amplitude ``start`` in the phase of the averaged motion."""
     mu, drive = 0.2, 0.5
 
     def rate(t, y):
@@ -189,7 +189,7 @@ def settled(epsilon: float, sigma: float, start: float) -> float:
 
 
 def test_cubic_system_meets_averaged_amplitudes_to_first_order():
-    """Independent of the averaging: errors halve with epsilon, and the middle amplitude divides the others."""
+    """Integration in time: errors halve with epsilon, and the middle amplitude separates the basins of the others."""
     sigma, errors = 0.55, []
     flow = multiple_scales.SlowFlow(jnp.array(0.0), jnp.array(0.2), jnp.array(0.25), jnp.array(0.375))
     low, middle, high = (float(a) for a in multiple_scales.roots(flow, jnp.array(sigma)))
@@ -240,7 +240,7 @@ def assert_balanced(values, omega, bias, amplitude, rtol=1e-9):
 
 
 def test_amplitudes_on_both_sides_of_a_narrow_resonance():
-    """At light damping both arms pass a frequency within a thousandth of an amplitude."""
+    """At light damping both arms cross a frequency within a thousandth of an amplitude."""
     values = {"B0": 0.14, "B1": 1.4e-4, "b": 0.63, "c": 1.2e-4, "alpha": 0.0}
     omegas = np.array([0.53, 0.59, 0.66, 0.74])
     found = solve("describing_function", omegas, (values,))
@@ -256,7 +256,7 @@ def test_amplitudes_on_both_sides_of_a_narrow_resonance():
 
 
 def test_weak_drives_next_to_a_flank():
-    """At rest on the flank the motions are as large as the drive, however weak: the two stiffnesses of a bilinear spring."""
+    """About a rest on the flank the spring is bilinear, so amplitudes are proportional to the drive, however weak."""
     weak = {"B0": 0.05, "b": 0.5, "alpha": 0.1, "c": 0.05}
     cases = tuple(weak | {"B1": drive} for drive in (1e-3, 1e-4, 1e-5, 1e-7))
     found = solve("describing_function", np.array([0.3, 0.45, 0.7]), cases)
@@ -336,7 +336,7 @@ def test_limits_without_drive_damping_or_stiffness(scales, describing):
 
 
 def test_peak_is_the_largest_amplitude_with_heavy_damping():
-    """Without a resonance the amplitude falls from its static value: of a linear spring B1/k', at the frequency 0."""
+    """Without a resonance the amplitude falls from its static value at the frequency 0, B1/k' for a linear spring."""
     cases = ({"alpha": 1.0, "c": 1.9}, {"alpha": 1.0, "c": 2.5}, {"c": 1.5}, {"alpha": 0.0, "B0": 0.0, "c": 3.0})
     cases += ({"c": 0.8}, {"alpha": 3.0, "b": 0.05, "B1": 0.2, "c": 1.0})
     found = solve("describing_function", np.geomspace(1e-3, 3.0, 400), cases)
@@ -350,7 +350,7 @@ def test_peak_is_the_largest_amplitude_with_heavy_damping():
 
 @pytest.mark.parametrize("case", [{}, {"alpha": 0.0}, {"alpha": 3.0, "B0": 0.0}, {"B0": 0.3}])
 def test_the_backbone_is_the_largest_free_motion(case):
-    """Against a scan of amplitudes; it goes on beyond the peak, as the drive has no part in it."""
+    """The backbone agrees with a scan of amplitudes; it does not depend on the drive and continues beyond the peak."""
     omegas = np.array([0.3, 0.65, 0.85, 0.9, 0.99, 0.99999, 1.3])
     small, large = (
         solve("describing_function", omegas, ({**case, "B1": b},))["backbone_amplitude"] for b in (1e-3, 0.5)
@@ -367,7 +367,7 @@ def test_the_backbone_is_the_largest_free_motion(case):
 
 
 def test_a_linear_spring_has_no_backbone(scales):
-    """Its free motions have one frequency and any amplitude; at 1.3, above it, there is none."""
+    """Free motions of a linear spring have any amplitude at one frequency, and no amplitude at others."""
     assert np.isnan(scales["backbone_amplitude"][..., 2]).all()
     assert np.isfinite(scales["backbone_amplitude"][-1, 0])
 
@@ -393,7 +393,7 @@ def test_sweeps_follow_their_branch():
 
 @pytest.mark.parametrize("case", [{"c": 0.005, "B1": 0.003}, {"c": 0.001, "B1": 6e-4}])
 def test_a_sweep_stays_on_a_steep_branch_up_to_its_fold(case):
-    """A narrow peak bends to higher frequencies: a sweep up has its largest amplitude wherever there are three."""
+    """A narrow peak bends to higher frequencies: wherever there are three amplitudes, a sweep up has the largest."""
     found = solve("multiple_scales", np.linspace(0.4, 1.0, 121), (case,))
     motions = found["branch_u_max"][..., 0]
     three = np.isfinite(motions).sum(axis=1) == 3

@@ -40,7 +40,7 @@ def eight(shafts: Shaft):
 
 
 def lanes(parameters: list[Mapping]) -> Shaft:
-    """Shafts of one number of segments, side by side."""
+    """Shafts with the same number of segments as lanes."""
     values = [complete(p) for p in parameters]
 
     def column(name: str) -> np.ndarray:
@@ -57,7 +57,7 @@ def named(case: Mapping) -> dict:
 
 @pytest.fixture(scope="module")
 def solved() -> dict[str, tuple]:
-    """Per case: p, certified, estimated error, number of zero modes."""
+    """By case: p, flags of certified modes, estimated error, number of zero modes."""
     results = {}
     for segments in {len(case["l"]) for case in CASES.values()}:
         names = [name for name, case in CASES.items() if len(case["l"]) == segments]
@@ -117,7 +117,7 @@ def _krylov(f: tuple, d: tuple) -> mpmath.matrix:
 
 
 def random_shaft(rng: np.random.Generator, segments: int) -> dict:
-    """Contrasts to 1e4, supports absent, from 1e2 to 1e14, now and then one at a joint."""
+    """A shaft with contrasts up to 1e4; supports are absent or from 1e2 to 1e14, a few of them at joints."""
 
     def support() -> float:
         return 0.0 if rng.random() < 0.2 else 10 ** rng.uniform(2, 14)
@@ -195,7 +195,7 @@ def test_extensions_against_finite_elements(name):
 
 
 def test_shear_and_rotary_inertia_lower_the_tube():
-    """-1 % on the first and -3.3 % on the second frequency on the paper's supports, -3.9 % on stiff ones."""
+    """They lower the first frequency by 1 %, the second by 3.3 % on the paper's supports and by 3.9 % on stiff supports."""
     area, moment = 3.6e-4, 1.055e-7
     shear = {"kGA": (0.53 * 8.1e10 * area,) * 3, "rhoI": (7800 * moment,) * 3}
     for supports, expected in (({}, (-0.00990, -0.03268)), ({"k_A": 1e14, "k_D": 1e14}, (-0.01033, -0.03919))):
@@ -214,7 +214,7 @@ def test_coinciding_frequencies_are_all_found():
 
 
 def test_lanes_do_not_disturb_each_other(solved):
-    """A lane without numbers is NaN and not certified; the others have the bits they have without it."""
+    """A lane of NaN results in NaN, not certified; the other lanes are bitwise equal to those without it."""
     names = [name for name, case in CASES.items() if len(case["l"]) == 3]
     bad = [named(CASES[name]) for name in names]
     bad[-1] |= {"EI": [math.nan] * 3}
@@ -226,7 +226,7 @@ def test_lanes_do_not_disturb_each_other(solved):
 
 @pytest.mark.parametrize("z", [1e-3, 0.3, 1.99, 2.01, 7.0, 40.0])
 def test_compound_is_the_exponential(z):
-    """Both forms of the segment against ``exp(z B)`` with 60 digits, entry by entry relative to its column."""
+    """Both forms of the segment agree with ``exp(z B)`` in 60 digits; errors are relative to the column of an entry."""
     for s, t, functions in ((0.0, 0.0, compound), (0.0, 0.0, None), (0.3, 0.1, None), (3.0, 2.0, None)):
         own = functions(jnp.array(z)) if functions else general(jnp.array(z), jnp.array(s), jnp.array(t))
         with mpmath.workdps(60):
@@ -238,7 +238,7 @@ def test_compound_is_the_exponential(z):
             column = own.propagate(tuple(jnp.array(float(i == j)) for i in range(5)))
             for i in range(5):
                 if z < 1:
-                    # Small entries matter: soft supports balance them against large ones.
+                    # Small entries matter, because soft supports balance them against large entries.
                     tolerance = 2e-14 * abs(float(exact[i, j])) + 1e-30
                 else:
                     tolerance = 2e-14 * max(abs(float(exact[k, j])) for k in range(5))
@@ -246,7 +246,7 @@ def test_compound_is_the_exponential(z):
 
 
 def test_count_grows_by_one_through_every_frequency():
-    """Also next to the poles of the segments' stiffness, where the count has nothing to hold on to."""
+    """The count is right even next to the poles of the stiffness of segments, where the stiffness alone cannot give it."""
     uniform = Bicardan.of(PRESETS["paper_tube"]).shaft()
     q = eight(everything(PRESETS["paper_tube"]))[0].q
     clamped = jnp.array([4.730040744862704, 7.853204624095838]) / (0.3 * (2.808 / 22155.0) ** 0.25)
@@ -263,13 +263,13 @@ ARGUMENTS = {name: jnp.array(PAPER[name]) for name in ("length", "EI", "rhoA")} 
     "m": jnp.array([1.0, 2.0, 0.5, 0.7]),
     "k_hinge": jnp.array([3e4, 1e5]),
 }
-# Exponents of a length with which a parameter has to grow for similar shafts, and whether it is a stiffness.
+# Power of the length with which each parameter grows in similar shafts.
 SCALING = {"length": 1, "EI": 0, "rhoA": 0, "k": -3, "m": 1, "k_hinge": -1, "kGA": -2, "rhoI": 2}
 STIFFNESSES, MASSES = ("EI", "k", "k_hinge", "kGA"), ("rhoA", "m", "rhoI")
 
 
 def angular_frequencies(arguments: Mapping[str, jax.Array], modes: int = 6) -> jax.Array:
-    """Of the shaft whose springs and masses are listed from A to D."""
+    """Angular frequencies of the shaft whose springs and masses are listed from A to D."""
     lists = {name: tuple(x) for name, x in arguments.items()}
     for kind in ("k", "m"):
         first, *lists[f"{kind}_joint"], last = lists.pop(kind, (0.0,) * (len(arguments["length"]) + 1))
@@ -290,7 +290,7 @@ def jacobians() -> tuple[np.ndarray, dict[str, np.ndarray]]:
 
 
 def check_identities(p: np.ndarray, rows: Mapping[str, np.ndarray], arguments: Mapping[str, jax.Array]) -> None:
-    """p scales like a mass^(-1/2), like a stiffness^(1/2), and like length^(-2) from shaft to similar shaft."""
+    """Assert Euler's identities: p scales like mass^(-1/2), stiffness^(1/2), and length^(-2) of similar shafts."""
     total = {name: (rows[name] * np.asarray(arguments[name])).sum(axis=1) / p for name in rows}
     np.testing.assert_allclose(sum(total[name] for name in MASSES if name in total), -0.5, atol=1e-12)
     np.testing.assert_allclose(sum(total[name] for name in STIFFNESSES if name in total), 0.5, atol=1e-12)
@@ -298,8 +298,8 @@ def check_identities(p: np.ndarray, rows: Mapping[str, np.ndarray], arguments: M
 
 
 def check_differences(p: np.ndarray, rows: Mapping[str, np.ndarray], arguments: Mapping[str, jax.Array]) -> None:
-    """Differences of fourth order in the logarithm of each parameter, all perturbed shafts side by side, and a
-    one-sided difference for the spring that is not there."""
+    """Compare with fourth-order differences in the logarithm of each parameter, and with a one-sided difference for the
+    absent spring."""
     h, multiples, spring = 1e-3, np.array([-2, -1, 1, 2]), np.array([1e3, 2e3])
     places = [(name, e) for name, x in arguments.items() for e in range(len(x)) if float(x[e]) > 0]
     columns = {name: np.repeat(np.asarray(x)[:, None], 4 * len(places) + 2, axis=1) for name, x in arguments.items()}
@@ -326,7 +326,7 @@ def test_gradients_against_finite_differences(jacobians):
 
 @pytest.mark.full
 def test_gradients_obey_the_energy_formula():
-    """dp/dk = f^2/(2 p G), also for k = 0, with the mode shape integrated numerically."""
+    """dp/dk = f^2/(2 p G), also for k = 0, with G from the numerically integrated mode shape."""
     arguments = {name: ARGUMENTS[name] for name in ("length", "EI", "rhoA", "k")}
     rows, p = (jax.tree.map(np.asarray, x) for x in jax.jit(jax.jacrev(twice, has_aux=True))(arguments))
     x = np.linspace(0.0, 1.0, 9101)
@@ -341,7 +341,7 @@ def test_gradients_obey_the_energy_formula():
 
 @pytest.mark.full
 def test_gradients_of_a_shaft_with_shear_and_rotary_inertia():
-    """Forwards here, backwards in the fixture."""
+    """Forward mode; the fixture uses reverse mode."""
     arguments = ARGUMENTS | {"kGA": jnp.array([4e7, 2e7, 3e7]), "rhoI": jnp.array([2e-3, 1e-3, 3e-3])}
     rows, p = jax.jit(jax.jacfwd(twice, has_aux=True))(arguments)
     results = np.asarray(p), {name: np.asarray(row) for name, row in rows.items()}
@@ -357,7 +357,7 @@ def spans(EI: jax.Array) -> dict[str, jax.Array]:
 
 
 def test_gradients_of_parts_that_are_independent():
-    """No part hides another."""
+    """Each frequency has derivatives by its own span alone; equal spans have none."""
 
     def both(EI: jax.Array) -> tuple[jax.Array, jax.Array]:
         p = angular_frequencies(spans(EI), 3)
@@ -373,14 +373,14 @@ def test_gradients_of_parts_that_are_independent():
 
 
 def test_no_derivative_where_modes_end_in_a_multiple_frequency():
-    """Two equal hinged spans over rigid supports: asked for one mode, the second is still there."""
+    """Two equal hinged spans over rigid supports: a request for one mode must notice that the second has its frequency."""
     slope = jax.jit(jax.grad(lambda EI: angular_frequencies(spans(EI), 1)[0]))
     assert np.isnan(np.asarray(slope(jnp.array([1.0, 1.0])))).all()
     np.testing.assert_allclose(slope(jnp.array([1.0, 1.0 + 1e-9])), [np.pi**2 / 2, 0.0], atol=1e-5)
 
 
 def test_a_zero_mode_stays_but_for_a_spring_that_would_hold_it():
-    """A free shaft: its rigid modes have no derivatives by the supports, by all else these are zero."""
+    """Rigid modes of a free shaft have no derivatives by the supports; their other derivatives are zero."""
     free = dt.Bicardan(**PAPER | {"k_A": 0.0, "k_D": 0.0})
     rows = jax.jit(jax.jacfwd(lambda s: dt.critical_speeds(s, modes=3).critical_speed))(free)
     for name, slope in rows.values.items():

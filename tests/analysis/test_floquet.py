@@ -1,4 +1,4 @@
-"""The floquet analysis through its solvers: against SciPy, against itself, and on invariants of the equations."""
+"""The solvers of the floquet analysis against SciPy, against each other, and against invariants of the equations."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def diffrax():
 
 @pytest.fixture(scope="module")
 def sample(direct):
-    """Random points with their results, and sharper ones to compare with."""
+    """Random points, their results, and results with a tighter tolerance for comparison."""
     points = random_points(2000, 13)
     return points, direct(points), direct(points, rtol=1e-13)
 
@@ -55,7 +55,7 @@ def assert_three_ways_agree(points: dict[str, np.ndarray], direct: FloquetBatch,
     ours = direct(points)
     assert (ours["outcome"] <= Outcome.TOLERANCE_NOT_MET).all()
     general = diffrax(points, rtol=1e-11)
-    # Spectral radii reach down to 1e-10 here: a larger absolute tolerance would be what is compared.
+    # Spectral radii reach down to 1e-10, and a larger absolute tolerance would exceed them.
     oracle = spectral_radius(stacked_monodromy(points, 1e-12, 1e-15, batch=25))
     np.testing.assert_allclose(ours["spectral_radius"], oracle, rtol=1e-9)
     np.testing.assert_allclose(general["spectral_radius"], oracle, rtol=1e-9)
@@ -75,7 +75,7 @@ def test_direct_diffrax_and_scipy_agree_on_500_points(direct):
 def assert_bound_holds(found: dict[str, np.ndarray], sharp: dict[str, np.ndarray]) -> None:
     rho, exact = found["spectral_radius"], sharp["spectral_radius"]
     assert (np.abs(rho - exact) <= found["spectral_radius_error"]).all()
-    # Zero would be no bound, and 1e-9 for an easy point no use.
+    # A bound must not be zero, and must be small at easy points.
     assert (found["spectral_radius_error"] >= 4 * np.finfo(float).eps * rho).all()
     assert np.median(found["spectral_radius_error"] / rho) < 1e-10
     wrong = (found["verdict"] == STABLE) & (exact > 1) | (found["verdict"] == UNSTABLE) & (exact < 1)
@@ -108,7 +108,7 @@ CROSSING_RADIUS = np.array([2.19580758985809508e-18, 1.0515487833445584448e-44, 
 
 @pytest.mark.parametrize("rtol", [1e-7, 1e-10, 1e-12])
 def test_bound_counts_rounding_that_grows_on_the_way(direct, rtol):
-    """One mode survives the first half of the span and another one the second: rounding in between grows 1e4 times."""
+    """One mode survives the first half of the span, another one the second half: rounding grows 1e4 times in between."""
     found = direct(CROSSING, rtol=rtol)
     error = np.abs(found["spectral_radius"] - CROSSING_RADIUS)
     assert (error <= found["spectral_radius_error"]).all(), error / found["spectral_radius_error"]
@@ -126,7 +126,7 @@ STIFF_AND_SOFT = (
 
 @pytest.mark.parametrize("rtol", [1e-5, 1e-10, 1e-13])
 def test_bound_counts_rounding_that_both_step_sizes_share(direct, rtol):
-    """The stiffness of a soft mode is the difference of entries five hundred times as large."""
+    """The stiffness of a soft mode is a difference of entries that are five hundred times larger."""
     beta, omega, exact = map(np.array, zip(*STIFF_AND_SOFT, strict=True))
     shaft = {"zeta": 0.11912450176186314, "alpha": 45.51311106679596, "mu": 520.8626364709467}
     found = direct({"beta": beta, "Omega": omega, **shaft, "gamma": 0.9443277346781929}, rtol=rtol)
@@ -136,7 +136,7 @@ def test_bound_counts_rounding_that_both_step_sizes_share(direct, rtol):
     assert found["verdict"].tolist() == [STABLE, UNDECIDED, UNDECIDED]
 
 
-# Columns as above; taken by the implicit scheme at a tolerance of 1e-13.
+# Columns as above; points that the implicit scheme solves at a tolerance of 1e-13.
 TOO_LONG_TO_MARCH = (
     (1.1752422858416216, 0.1533373642851158, 0.000031524877051342704379),
     (1.177266820356422, 0.15211986425991417, 0.000036121927451657249321),
@@ -173,7 +173,7 @@ RADII = np.array([1.4146604913796845e-19, 1.2510611059620708e-06, 2.760897344063
 
 @pytest.mark.parametrize("rtol", [1e-9, 1e-10, 1e-13])
 def test_slow_modes_beside_fast_ones_keep_their_digits(direct, rtol):
-    """The first was the largest multiple of its bound, 13, among points sought for it in the reduced form."""
+    """In a search of the reduced form for the worst point, the first point had the largest ratio of error to bound, 13."""
     found = direct({name: np.array(values) for name, values in SLOW_BESIDE_FAST.items()}, rtol=rtol)
     error, bound = np.abs(found["spectral_radius"] - RADII), found["spectral_radius_error"]
     assert (error <= bound / 2).all(), error / bound
@@ -181,7 +181,7 @@ def test_slow_modes_beside_fast_ones_keep_their_digits(direct, rtol):
 
 
 def test_slow_modes_lose_their_digits_in_the_reduced_form():
-    """The first point by the implicit scheme, whose truncation error is nothing with so many steps."""
+    """The first point by the implicit scheme, which has no truncation error with this many steps."""
     model = CARDAN.models["floquet"].build({name: values[0] for name, values in SLOW_BESIDE_FAST.items()})
 
     def error(form: LinearPeriodic) -> float:
@@ -193,7 +193,7 @@ def test_slow_modes_lose_their_digits_in_the_reduced_form():
 
 
 def test_errors_that_cancel_in_the_product_do_not_deceive(direct):
-    """Z is nearly of rank one here, and with 11 and 22 steps its largest multiplier is wrong by the same amount."""
+    """Z is nearly of rank one, and with 11 and with 22 steps its largest multiplier has the same error."""
     easy = (1.0563183658089397, 2.7349631755532484, 0.5761121672699921, 10.00834660652285, 0.0793118790, 49.2510470811)
     hard = (1.430161738887235, 2.831786623776442, 0.6559498501124649, 6.079785878549506, 0.07667072270795319)
     points = np.array([(*hard, 51.92629177049027), easy]).T
@@ -241,7 +241,7 @@ def test_sign_of_the_joint_angle_does_not_matter(direct):
 
 
 def physical_monodromy(machine: dict[str, float]) -> np.ndarray:
-    """Over half a turn of the flywheel, in seconds: rotations of the two disks instead of the twists of the shafts."""
+    """Monodromy matrix over half a turn of the flywheel, in seconds and for the rotations of the two disks."""
     m, beta = machine, machine["beta"]
 
     def field(t: float, y: np.ndarray) -> np.ndarray:
@@ -259,7 +259,7 @@ def physical_monodromy(machine: dict[str, float]) -> np.ndarray:
 
 
 def test_unit_of_time_does_not_matter(direct):
-    """One machine, its clock running at three rates: J in kg m^2, k in J, c in J s, in units of another time."""
+    """The same machine (J in kg m^2, k in J, c in J s) in three units of time."""
     machine = {"J1": 0.3, "J2": 4.2, "k1": 55.0, "k2": 80.0, "c1": 0.4, "c2": 0.9, "Omega0": 12.0, "beta": 0.8}
     groups = {
         "beta": 0.8,
@@ -297,7 +297,7 @@ def test_damping_can_destabilise(direct):
 
 
 def test_tip_of_the_first_subharmonic_tongue(direct):
-    """S11 begins at beta = 0.0238, where the grids of the paper show nothing; its tip is found by refining a local one."""
+    """S11 begins at beta = 0.0238, which the grids of the paper do not show; a refined local grid finds the tip."""
     low, high = 0.02, 0.03
     for _ in range(4):
         beta = np.linspace(low, high, 64)
@@ -319,7 +319,7 @@ def base_chart(stride: int) -> dict[str, np.ndarray]:
 
 
 def test_unstable_part_of_the_base_chart(direct):
-    """Every fourth angle and speed; SciPy's DOP853 (rtol 1e-11) finds 473 of these 1900 cells unstable, none near 1."""
+    """Every fourth angle and speed: SciPy's DOP853 (rtol 1e-11) finds 473 of 1900 cells unstable, and no radius near 1."""
     found = direct(base_chart(4))
     assert np.bincount(found["verdict"], minlength=3).tolist() == [1900 - 473, 473, 0]
 
@@ -340,7 +340,7 @@ def test_liouville_residual_is_small_where_the_result_is_good(sample):
 
 
 def test_liouville_residual_shows_too_few_steps():
-    """Two step sizes that both miss the motion: the determinant tells, and the error is never below what it shows."""
+    """If both step sizes miss the motion, the determinant shows it, and the error is at least this residual."""
     values = BASE | {"beta": 1.2, "Omega": 0.1, "zeta": 0.001}
     form = CARDAN.models["floquet"].build(values).reduced
 
@@ -379,7 +379,7 @@ def test_any_diffrax_solver_gives_the_same(direct, solver):
 
 
 def test_what_cannot_be_computed_is_marked(direct):
-    """Overflow in one lane: NaN, undecided and a code, while its neighbour is as good as ever."""
+    """A lane that is not finite is NaN, undecided and has an outcome; its neighbour stays accurate."""
     points = BASE | {"beta": np.array([0.5, 0.5]), "Omega": np.array([1.2, 1.2]), "mu": np.array([np.nan, 1.0])}
     padded = {name: np.pad(np.broadcast_to(x, 2), (0, 254), mode="edge") for name, x in points.items()}
     found = {name: np.asarray(x) for name, x in direct.kernel(0)(padded, np.int64(20), 1e-10).items()}
@@ -389,7 +389,7 @@ def test_what_cannot_be_computed_is_marked(direct):
     assert found["spectral_radius"][1] == pytest.approx(exact, rel=1e-10)
 
 
-# A system of another package, plain in every respect: two states, one form, no reversor, no prediction of steps.
+# A minimal system of another package: two states, one form, no reversor, no prediction of steps.
 MATHIEU = '''
 import math
 
@@ -462,7 +462,7 @@ def test_any_linear_periodic_system_is_analysed(other_package, method):
     rho, bound = (ds[name].values.reshape(2, -1) for name in ("spectral_radius", "spectral_radius_error"))
     verdict = ds.verdict.values.reshape(2, -1)
     inside = slice(len(stable), len(stable) + len(tongue))
-    # Undamped: the circle between the tongues, off it inside, double multipliers at the edges.
+    # Undamped: multipliers on the unit circle between the tongues, off it inside, double at the edges.
     assert (verdict[0, : len(stable)] == UNDECIDED).all()
     assert (verdict[0, inside] == UNSTABLE).all() and (rho[0, inside] > 1.1).all()
     assert (verdict[0, inside.stop :] == UNDECIDED).all()
@@ -484,7 +484,7 @@ def test_point_beyond_every_scheme_has_an_outcome(extreme):
 
 
 def test_strong_damping_where_only_the_speed_varies():
-    """The matrices that close the period are then one for all lanes."""
+    """The matrices of the reversal do not depend on the speed, and are the same for all lanes."""
     fixed = {"beta": 0.5, "zeta": 1.0, "alpha": 1.0, "mu": 1.0, "gamma": 1.0}
     scene = {"system": "cardan", "analysis": "floquet", "fixed": fixed, "outputs": ["spectral_radius"]}
     options = {"options": {"method": "direct", "rtol": 1e-10}}

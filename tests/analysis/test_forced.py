@@ -50,9 +50,9 @@ def point():
 
 
 class Disks:
-    """The same machine in the rotations of its disks: theta1 and the driven disk's lag D = angle - tau.
+    """The same machine in other coordinates: theta1 and the lag D = angle - tau of the driven disk.
 
-    The joint turns its output by atan(c tan(phi)), so neither eta' nor eta'' appears in the nonlinear equations.
+    The output angle of the joint is atan(c tan(phi)), so neither eta' nor eta'' appears in the nonlinear equations.
     """
 
     def __init__(self, **given):
@@ -81,7 +81,8 @@ class Disks:
         return [y[2], y[3], self.ratio(tau + y[0]) * second - first, -second / self.p["gamma"]]
 
     def linear(self, tau, y):
-        """About theta = 0, ``y[1]`` measured from the lag of the rigid joint, whose second derivative forces."""
+        """Linear field about theta = 0; ``y[1]`` is relative to the lag of the rigid joint, whose second derivative is the
+        forcing."""
         step = 1e-30
         eta = self.ratio(tau)
         slope = _complex_ratio(self.c, tau + 1j * step).imag / step
@@ -199,7 +200,7 @@ def test_nonlinear_orbit_against_scipy(point, beta, omega, zeta):
 
 
 def test_branch_followed_around_folds(point):
-    """At the forced resonance (linear amplitude 17 rad) several orbits exist; short strides all along give this one."""
+    """At the forced resonance (linear amplitude 17 rad) several orbits exist; short strides lead to this one."""
     state = point(beta=0.5, Omega=0.709)["orbit_state"]
     np.testing.assert_allclose(state, (-0.033234763, 0.029779093, 0.983894762, -0.745979437), atol=2e-9)
 
@@ -236,7 +237,7 @@ def test_error_beyond_the_target_is_reported(point):
 
 
 def test_lost_orbit_keeps_the_linear_response(point, monkeypatch):
-    """(0.5, 0.72) takes several corrections; with one there is no orbit."""
+    """The orbit needs several corrections, so a limit of one correction loses it."""
     monkeypatch.setattr(orbit, "MAX_CORRECTIONS", 1)
     solve = quick_jit(lambda v: solver(("periodic_state", "orbit_state", "orbit_state_error")).solve(v, 0))
     result = solve({k: np.float64(v) for k, v in (BASE | {"beta": 0.5, "Omega": 0.72}).items()})
@@ -304,13 +305,13 @@ def test_field_that_is_not_finite():
 
 
 def test_no_orbit_without_restoring_force():
-    """y'' = 1 + sin t drifts: the linear problem is singular and Newton has nothing to find."""
+    """y'' = 1 + sin t drifts: the linear problem is singular, and no orbit exists."""
     found = shoot(lambda t, y: jnp.stack([y[1], 1 + jnp.sin(t)]), jnp.array([1.0, 0.0]), 2 * math.pi, 1e-10)
     assert found.outcome == Outcome.NOT_CONVERGED
 
 
 def test_lanes_that_wait_take_no_steps():
-    """One lane needs few corrections of many steps, the other one many of few: a batch must not take many of many."""
+    """One lane needs few corrections of many steps, the other many corrections of few steps; a batch adds no more work."""
     calls = []
 
     def orbit_of(stiffness, force):
@@ -352,7 +353,7 @@ def test_looser_target_is_met():
 )
 @pytest.mark.parametrize("rtol", [1e-4, 1e-6])
 def test_stated_error_of_the_orbit_bounds_the_true_one(given, rtol):
-    """The last Newton correction, which is no error, is up to 2e5 times smaller."""
+    """The last Newton correction is no estimate of the error: it is up to 2e5 times smaller."""
     given = {"beta": 0.3} | given
     values = {k: np.float64(v) for k, v in (BASE | given).items()}
     found = compiled(("orbit_state", "orbit_state_error"), rtol)(values)
@@ -366,7 +367,7 @@ def test_stated_error_of_the_orbit_bounds_the_true_one(given, rtol):
 
 @pytest.mark.parametrize("omega", [2.64, 3.0])
 def test_amplitude_of_the_smaller_shaft_meets_the_target(omega):
-    """It is some 30 times smaller than the other; read from between the steps it missed by 2e-7 and 1e-8."""
+    """This amplitude is about 30 times smaller than the other; from interpolated steps its errors were 2e-7 and 1e-8."""
     values = {k: np.float64(v) for k, v in (BASE | {"beta": 0.3, "Omega": omega}).items()}
     found = compiled(("amplitude", "orbit_amplitude", "orbit_state"), 1e-8)(values)
     disks = Disks(beta=0.3, Omega=omega)
@@ -380,7 +381,7 @@ def test_amplitude_of_the_smaller_shaft_meets_the_target(omega):
 
 
 def test_root_of_a_straight_line():
-    """Newton's method is there at once and must stay."""
+    """Newton's method finds the root in one step, and must keep it."""
     x, inside = _cubic_root(*jnp.array([-1.0, 1.0, 2.0, 2.0]))
     assert inside and x == 0.5
 
@@ -397,7 +398,7 @@ def test_loosest_request_has_an_answer():
 
 
 def test_error_covers_that_of_the_second_integration():
-    """A condition of 300 and a loose tolerance (extrapolation in extended precision with two numbers of steps)."""
+    """A condition of 300 with a loose tolerance; reference: extrapolation of two numbers of steps in extended precision."""
     shaft = {"beta": 1.406319971883954, "Omega": 5.025357952450546, "zeta": 0.028807120682004222, "alpha": 0.0}
     shaft |= {"mu": 1.000570502262628, "gamma": 9.05935896640445}
     outputs = ["periodic_state", "periodic_state_error", "amplitude"]

@@ -1,4 +1,4 @@
-"""The analysis through the engine: methods on the same axes, order of the path, results that a method lacks."""
+"""The analysis in the engine: methods on the same axes, order of the path, results that a method does not have."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from drivetrain_jax.systems.rattle import PRESETS
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "rattle.json").read_text())
 STEADY = {case["name"]: case for case in REFERENCE["steady"]}
-# Neither rising nor falling.
+# Frequencies in no order.
 OMEGAS = [0.8, 0.6, 0.7, 0.9]
 
 
@@ -57,7 +57,7 @@ def test_folds_and_period_doublings_of_the_branch(exact):
         assert np.isnan(found[:, len(expected) :]).all()
 
 
-# Table 1 with c = .02: the 16 highest of 28 folds from .05 on, and all doublings; root finding with a flow of its own.
+# Table 1 with c = .02: the 16 highest of 28 folds above .05, and all doublings, by root finding with an independent flow.
 LIGHTLY_DAMPED = {
     "fold_frequency": [
         0.1084329346, 0.1097529355, 0.1272030868, 0.1287217594, 0.1517450130, 0.1539605314, 0.1788804262, 0.1869507587,
@@ -72,7 +72,7 @@ LIGHTLY_DAMPED = {
 
 @pytest.mark.parametrize(("lowest", "outcome"), [(0.05, Outcome.TOLERANCE_NOT_MET), (0.1, Outcome.SUCCESS)])
 def test_where_the_line_begins_decides_no_fold_or_doubling(lowest, outcome):
-    """Pairs that lie close together are not stepped over; where there are more than 16, these are the highest."""
+    """Close pairs are not missed; of more than 16 the results are the highest."""
     scene = {"system": "rattle", "analysis": "frequency_response", "outputs": list(LIGHTLY_DAMPED)}
     axes = {"omega": {"start": lowest, "stop": 2.0, "num": 3}}
     found = dt.run(scene | {"axes": axes, "fixed": PRESETS["table1"] | {"c": 0.02}, "options": {"method": "exact"}})
@@ -92,13 +92,13 @@ def test_the_exact_branch_has_the_saddles_between_folds(exact):
     up, down = (near[name].sel(sweep_direction="up") for name in ("u_max", "u_min"))
     np.testing.assert_allclose(near.branch_u_max.sel(branch=3), up, rtol=0, atol=1e-12)
     np.testing.assert_allclose(near.branch_u_min.sel(branch=3), down, rtol=0, atol=1e-12)
-    # Where the period has doubled, the simple orbit is unstable and the sweep is elsewhere.
+    # Beyond the period doubling the simple orbit is unstable, and the sweep is on another motion.
     doubled = (omega > 1.2425788605) & (omega < 1.9590767455)
     assert (exact.branch_stability.values[doubled, 0] == 1).all()
 
 
 def test_direction_without_a_motion_is_absent_and_the_other_kept():
-    """Without a mean torque nothing holds the mass within the play: what the sweep down meets there attracts nothing."""
+    """Without a mean torque no force acts within the play: at some frequencies the sweep down finds no attractor."""
     fixed = {"B0": 0.0, "B1": 0.03, "b": 0.05, "alpha": 0.0, "c": 0.05, "k": 1.0, "I": 1.0}
     axes = {"omega": {"start": 0.7, "stop": 0.9, "num": 5}}
     outputs = ["u_max", "stability"]

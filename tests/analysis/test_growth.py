@@ -1,4 +1,4 @@
-"""The record of growth: means, standard errors, memory, and how the march is compiled."""
+"""The record of growth: means, standard errors, memory, and compilation of the march."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ SPAN = 2.0
 
 
 def mean_and_error(series: np.ndarray, used: int = SEGMENTS) -> tuple[np.ndarray, np.ndarray]:
-    """Of ``series`` (SEGMENTS, N), one exponent."""
+    """Mean and standard error of ``series`` (SEGMENTS, N), one exponent for each of N members."""
     mean, error = block_mean(jnp.asarray(series)[:, None], jnp.full(series.shape[1], used), jnp.float64(SPAN))
     return np.asarray(mean)[0], np.asarray(error)[0]
 
 
 def test_standard_error_of_independent_segments():
-    """48 segments count: the error is sigma/sqrt(48) per duration of a segment; the larger of two estimates is 9 %
-    more on average."""
+    """The error of 48 segments is sigma/sqrt(48) per duration of a segment; the larger of two estimates is 9 % more on
+    average."""
     series = 3.0 + 0.5 * np.random.default_rng(1).standard_normal((SEGMENTS, 4000))
     mean, error = mean_and_error(series)
     exact = 0.5 / math.sqrt(48) / SPAN
@@ -37,7 +37,8 @@ def test_standard_error_of_independent_segments():
 
 
 def test_standard_error_sees_slow_fluctuations():
-    """Of segments that agree in fours (one block) the error is twice that of independent ones; in eights 2.8 times."""
+    """Equal segments in groups of four (one block) double the error of independent segments; groups of eight make it 2.8
+    times larger."""
     noise = np.random.default_rng(2).standard_normal((SEGMENTS // 8, 4000))
     mean, error = mean_and_error(np.repeat(noise, 8, axis=0))
     assert np.sqrt(np.mean(error**2)) > 0.85 * mean.std()
@@ -50,7 +51,7 @@ def test_transient_is_discarded():
 
 
 def test_growth_in_proportion_to_time_is_within_its_error():
-    """Its exponent is zero, the mean over the last three quarters ln 4/(0.75 T): five standard errors of blocks."""
+    """The exponent is zero, but the mean over the last three quarters is ln 4/(0.75 T), five standard errors of blocks."""
     edges = np.log(np.arange(SEGMENTS + 1.0).clip(0.5))
     mean, error = mean_and_error(np.diff(edges)[:, None])
     time = SEGMENTS * SPAN
@@ -59,7 +60,7 @@ def test_growth_in_proportion_to_time_is_within_its_error():
 
 
 def test_a_drift_is_told_from_scatter():
-    """Independent segments have none of 99 in 100 cases; of a change by ten of its own standard errors most is found."""
+    """99 % of independent series have no drift; most of a change by ten standard errors is found."""
     series = np.random.default_rng(3).standard_normal((SEGMENTS, 4000)) / math.sqrt(48) / SPAN
     means = series[SEGMENTS // 4 :].reshape(12, 4, -1).mean(axis=1)
     found = np.asarray(drift(jnp.asarray(means)))
@@ -75,7 +76,7 @@ def damped(max_time: float, lanes: int = 4):
 
 
 def test_memory_does_not_grow_with_the_number_of_strobes():
-    """The same record, and the same room to work in, for 64 strobes and for 64,000."""
+    """The record and the working memory have the same size for 64 strobes and for 64,000."""
     sizes = []
     for max_time in (64.0, 64_000.0):
         compiled = jax.jit(damped(max_time)).lower().compile()
@@ -85,7 +86,7 @@ def test_memory_does_not_grow_with_the_number_of_strobes():
 
 
 def test_sum_rule_sees_a_wrong_divergence():
-    """The residual is that of the field's own divergence, or of the one that the flow claims."""
+    """The residual is zero for the true divergence of the field, and the error of a wrong one."""
     flow = flows.linear(np.full(2, 0.2), np.ones(2))
     for claimed, residual in ((-0.2, 0.0), (-0.25, 0.05)):
         record = record_growth(replace(flow, divergence=lambda *_, c=claimed: c), 12, 64.0, 0.0, jnp.ones(2, bool))
@@ -93,10 +94,9 @@ def test_sum_rule_sees_a_wrong_divergence():
 
 
 def test_marks_of_the_compiler_change_rounding_only(monkeypatch):
-    """The march of Lorenz' system for a short time, with the marks and without.
+    """A short march of Lorenz' system agrees with and without the marks.
 
-    The third vector shrinks to a thousandth of the others within a strobe: what is left of it has lost three to four
-    digits.
+    The third vector shrinks to a thousandth of the others within a strobe, and loses three to four digits.
     """
     flow, active = flows.lorenz(33), jnp.ones(33, bool)
 
@@ -122,7 +122,7 @@ def test_marked_functions_compute_what_they_are():
 @pytest.mark.parametrize("start", [(jnp.sin, jnp.cos), (jnp.sin, jnp.sin), (jnp.zeros_like, jnp.zeros_like)])
 @pytest.mark.parametrize("steps", [0, 3])
 def test_a_kernel_may_be_given_what_it_does_not_use(start, steps):
-    """The compiler aborted the process: over the time of a field without a clock, over all of a march of no steps."""
+    """The compiler once aborted the process for unused inputs: a time without a clock, or all inputs of no steps."""
     unused = jnp.linspace(0.0, 1.0, 8)
 
     def march(x, y, z, time):
@@ -138,7 +138,7 @@ def test_a_kernel_may_be_given_what_it_does_not_use(start, steps):
 
 
 def test_a_field_that_sorts_does_without_the_single_kernel():
-    """Its operations cannot be part of one: it is slower, and no less right."""
+    """Sorting cannot be part of a single kernel: the march is slower, but as accurate."""
     plain = flows.linear(np.full(3, 0.2), np.ones(3))
 
     def field(angles, y):

@@ -55,7 +55,7 @@ def linear(values, omega):
 
 
 def test_jacobian_is_the_derivative_up_to_the_quadrature():
-    """Weights move with the crossings; that term vanishes with the fourth power of the sample distance."""
+    """The Jacobian neglects that weights move with the crossings, an effect of fourth order in the sample distance."""
     model, omega, errors = model_of(({},), 0.8), jnp.array([0.8]), []
     x = jnp.asarray(np.random.default_rng(1).normal(size=(17, 1)) * 0.2)
     for samples in (256, 1024):
@@ -86,7 +86,7 @@ def test_error_falls_with_the_harmonics():
 
 
 def test_stability_is_that_of_the_exact_motion():
-    """Multipliers, 31 harmonics, of the attractor; and of a motion that has lost its stability to a doubled period."""
+    """With 31 harmonics the multipliers of the balanced motion are those of the exact attractor."""
     model, basis = model_of(({},), 0.7), hb.Basis(31)
     case = STEADY["T1 w.7 double-sided"]
     omega = jnp.array([0.7])
@@ -107,15 +107,15 @@ def test_sweeps_of_table_1(swept):
         assert swept["stability"][row, direction, 0] == 0
     between = (OMEGAS > 0.7539) & (OMEGAS < 0.8743)
     np.testing.assert_array_equal(swept["u_max"][:, 0, 0] - swept["u_max"][:, 1, 0] > 1e-9, between)
-    # The period doubles at 0.44, which a basis without subharmonics can report but not follow.
+    # The period doubles at 0.44; a basis without subharmonics can report the instability, but has no such motion.
     assert swept["stability"][1, 0, 0] == 1
     assert (swept["outcome"][:, 0] == 0).all()
-    # Every sweep is balanced; the branch of alpha = 0 may be too long to be followed to its end, and says so.
+    # Every sweep is balanced; the branch of alpha = 0 may be too long, which sets TOLERANCE_NOT_MET.
     assert (swept["outcome"] <= 1).all()
 
 
 def test_branch_passes_the_folds(swept):
-    """The sweeps lie on the continued branch, whose middle motions are unstable."""
+    """The sweeps lie on the branch, whose middle motions are unstable."""
     between = (OMEGAS > 0.7539) & (OMEGAS < 0.8743)
     count = np.isfinite(swept["branch_u_max"][..., 0]).sum(axis=1)
     np.testing.assert_array_equal(count, np.where(between, 3, 1))
@@ -146,7 +146,7 @@ def test_folds_of_the_branch():
 
 @pytest.mark.parametrize(("begin", "end"), [(0.163, 0.05), (0.05, 0.163)])
 def test_branch_passes_contacts_that_come_and_go(begin, end):
-    """Seven harmonics have several folds near .12, where short contacts appear."""
+    """With seven harmonics the branch has several folds near .12, where short contacts appear."""
     model, basis = model_of(({},), begin), hb.Basis(7)
 
     @quick_jit
@@ -170,7 +170,7 @@ def test_linear_limits_are_exact(swept):
 
 
 def test_one_harmonic_is_the_describing_function():
-    """Each balanced motion is one of the closed form; with alpha = 0 several are stable, and rest leads elsewhere."""
+    """Each balanced motion is one of the motions of the closed form; with alpha = 0 several of them are stable."""
     cases = ({}, {"alpha": 0.0}, {"alpha": 1.5})
 
     def run(values):
@@ -201,7 +201,7 @@ def test_any_number_of_samples(samples):
 
 
 def test_spectral_radius_is_over_the_period_of_the_motion():
-    """However many subharmonics are kept: simple motions at .7 and .9, a doubled period at .45."""
+    """The radius does not depend on the order of subharmonics: simple motions at .7 and .9, a doubled period at .45."""
     omegas = np.array([0.44, 0.45, 0.7, 0.9])
 
     def run(values, order):
@@ -234,7 +234,7 @@ def test_subharmonics_follow_a_doubled_period():
 
 
 def test_a_lane_does_not_depend_on_the_others():
-    """Where a sweep loses its motion the equation is integrated: as finely and as long as the lane itself needs."""
+    """Where a sweep loses its motion, the length and steps of the integration depend on the lane alone."""
     omegas = np.array([0.7, 0.8, 0.9])
 
     def run(values):
@@ -250,7 +250,7 @@ def test_a_lane_does_not_depend_on_the_others():
 
 @pytest.mark.parametrize("harmonics", [1, 2])
 def test_what_lies_between_two_folds_is_a_saddle(harmonics):
-    """Also where the disturbances of few harmonics are damped: as the describing function has it."""
+    """The motion is a saddle even if disturbances with few harmonics decay, in agreement with the describing function."""
     omegas = np.linspace(0.65, 0.95, 31)
     cases = ({"c": 0.01, "B1": 0.006}, {"c": 0.01, "B1": 0.006, "B0": 0.0})
 

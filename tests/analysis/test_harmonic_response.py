@@ -18,7 +18,7 @@ FOUR = {"planet_angle": tuple(np.arange(4) * np.pi / 2)}
 
 
 def forces(torques: dict[str, float]) -> np.ndarray:
-    """Of ERRORS on the coordinates: stiffness times error along the direction of each mesh, body by body."""
+    """Forces of ERRORS on the coordinates: stiffness times error along the direction of each mesh, and ``torques``."""
     a, force = TABLE_2["pressure_angle"], np.zeros(9 + 3 * len(ANGLES), complex)
     sin, cos = np.sin, np.cos
     for i, angle in enumerate(ANGLES):
@@ -45,7 +45,7 @@ def test_it_is_the_dense_solution():
     )
     mass, stiffness = (np.array(x, float) for x in matrices(TABLE_2 | {"planet_angle": ANGLES}))
     squares, shapes = eigh(stiffness, np.diag(mass))
-    # The first mode is rigid: its frequency of rounding must not damp it.
+    # The first mode is rigid: the rounding of its frequency must not damp it.
     own = np.where(np.arange(len(squares)) > 0, np.sqrt(abs(squares)), 0.0)
     damper = np.diag(mass) @ shapes @ np.diag(2 * damping * own) @ shapes.T @ np.diag(mass)
     for amplitude, phase, frequency in zip(found.amplitude, found.phase, np.linspace(100, 12e3, 40), strict=True):
@@ -56,7 +56,7 @@ def test_it_is_the_dense_solution():
 
 @pytest.mark.parametrize(("order", "silent"), [(0, ("x_", "y_")), (1, ("u_c", "u_r", "u_s"))])
 def test_mesh_phases_choose_the_modes(order, silent):
-    """Equal planets in phase excite rotations, those one turn apart translations alone."""
+    """Equal planets in phase excite rotations alone; phases of one turn around the gear excite translations alone."""
     gear = dt.Planetary(**FOUR, phase_s=tuple(order * angle for angle in FOUR["planet_angle"]))
     chart = dt.sweep(dt.harmonic_response, gear, over={"k_p": [1e8]}, start=100.0, stop=12e3, num=50)
     largest = chart.amplitude.max(("k_p", "frequency"))

@@ -91,7 +91,7 @@ LONG |= {"phi0": 1e-3, "excitation_frequency": 1000.0}
 
 @pytest.mark.parametrize("rtol", [1e-3, 1e-6])
 def test_long_memory_meets_the_target(rtol):
-    """1500 undamped oscillations: with steps for a short memory it is missed 12 to 26 times."""
+    """1500 undamped oscillations: steps for a short memory exceed the target 12 to 26 times."""
     omega = float(dt.point("tripod", "parameters", element="input", beta=0.157, chi_n=0.0).natural_angular_frequency)
     found = dt.run(scene({"times": [1.0], "rtol": rtol}, fixed=LONG, outputs=["phi"]))
     assert found.outcome.attrs["flag_meanings"].split()[int(found.outcome)] == "success"
@@ -109,7 +109,7 @@ def test_long_memory_meets_the_target(rtol):
     ],
 )
 def test_errors_of_strobes_of_one_step_are_told(solver, frequency, rtol, end):
-    """One step a strobe is good for any tolerance of a step, and its errors add up: beyond the target in some cases."""
+    """One step per strobe meets any tolerance of a step, but its errors add up, in some cases beyond the target."""
     fixed = LONG | {"equation": "25", "excitation_frequency": frequency}
     omega = float(dt.point("tripod", "parameters", element="input", beta=0.157, chi_n=0.0).natural_angular_frequency)
     found = dt.run(scene({"times": [end / 2, end], "rtol": rtol, "solver": solver}, fixed=fixed))
@@ -127,7 +127,8 @@ SMALL_PHI = [1.2821017705e-06, 9.8387921093e-05, 4.1201858577e-05]
 
 
 def test_errors_are_judged_by_what_the_motion_reaches():
-    """A torque good for a static twist of 16,000 rad is held within 1e-4 rad; reference: extrapolation, quadruple."""
+    """A torque with a static twist of 16,000 rad moves the shaft by 1e-4 rad; reference: extrapolation in quadruple
+    precision."""
     fixed = {"element": "input", "equation": "29", "torque_reading": "harmonic", "beta": 1.5707788521486836}
     fixed |= {"zeta": 1.836882956274104e-10, "chi_n": -0.3682093308629297, "velocity0": 0.06097371567118005}
     fixed |= {"M_AEM": 33521620.341835044, "G": 6263419.058853511, "rho": 177.70386264775507}
@@ -147,7 +148,7 @@ def test_outcome_does_not_depend_on_the_outputs():
 
 @pytest.mark.parametrize("end", [0.75, pytest.param(16.5, marks=pytest.mark.full)])
 def test_phase_does_not_drift(end):
-    """Excitation at 3200 Hz and motor at 300 Hz repeat after 32 strobes: so does the settled motion."""
+    """Excitation at 3200 Hz and motor at 300 Hz repeat after 32 strobes, and so does the settled motion."""
     fixed = FIXED | {"equation": "29", "zeta": 0.03, "chi_n": 0.3, "excitation_frequency": 3200.0}
     options = {"times": [0.5, end], "rtol": 1e-11}
     ds = dt.run(scene(options, fixed=fixed, outputs=["phi", "velocity"]))
@@ -185,7 +186,7 @@ def test_hopelessly_many_strobes_are_not_begun():
 
 
 class Lorenz(System):
-    """Three components, which the system names itself."""
+    """A system with three components under its own names."""
 
     name = "lorenz"
     title = "Lorenz"

@@ -1,4 +1,4 @@
-"""The equation of rattle is homogeneous in its lengths: so are the results, however small or large."""
+"""The equation of rattle is homogeneous in its lengths, and so are the results for any size of lengths."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def assert_homogeneous(found, expected, size, lengths):
         scale = size if name in lengths else 1.0
         wanted = expected[name].values
         assert np.isfinite(wanted).any(), name
-        # Where a motion passes through 0 rounding is relative to the motion.
+        # Near zeros of a motion rounding is relative to the size of the motion.
         np.testing.assert_allclose(
             found[name].values / scale, wanted, rtol=1e-12, atol=1e-14 * np.nanmax(np.abs(wanted)), err_msg=name
         )

@@ -1,4 +1,4 @@
-"""Dense linear algebra without LAPACK against NumPy's, which has it."""
+"""Dense linear algebra without LAPACK against NumPy's LAPACK."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ COUNT = 40
 
 
 def similar(rng, diagonal_form: np.ndarray) -> np.ndarray:
-    """Matrix with the given Jordan form, in random orthogonal coordinates: as ill-conditioned as the form."""
+    """Matrix with the given Jordan form in random orthogonal coordinates, which keep its condition."""
     q = np.linalg.qr(rng.standard_normal(diagonal_form.shape))[0]
     return q @ diagonal_form @ q.T
 
 
 def graded(rng, n: int) -> np.ndarray:
-    """Entries over 16 decades: multipliers of a strongly damped system."""
+    """Matrix with entries over 16 decades, as for the multipliers of a strongly damped system."""
     scale = 10.0 ** -np.linspace(0, 16 if n > 1 else 0, n)
     return rng.standard_normal((n, n)) * np.sqrt(scale[:, None] * scale)
 
@@ -43,7 +43,7 @@ def family(kind: str, n: int, seed: int) -> np.ndarray:
     if kind == "double":
         return similar(rng, np.diag([1.5] * min(n, 2) + list(rng.uniform(-1, 1, max(n - 2, 0)))))
     if kind == "rotation":
-        # A permutation: unshifted QR makes no progress on it.
+        # A permutation, on which unshifted QR makes no progress.
         return np.roll(np.eye(n), 1, axis=0)
     if kind == "diagonal":
         return np.diag(rng.standard_normal(n))
@@ -59,7 +59,7 @@ def spectra(request):
     n = request.param
     matrices = {kind: np.stack([family(kind, n, seed) for seed in range(COUNT)]) for kind in KINDS}
     batch = np.concatenate([np.full((1, n, n), np.nan), *matrices.values(), np.full((1, n, n), np.inf)])
-    # Unrolled for every size: optimising it would take longer than all these tests.
+    # Not optimised: the code is unrolled for every size, and optimisation would take longer than all these tests.
     compiled = jax.jit(eigenvalues, compiler_options={"xla_backend_optimization_level": 0})
     real, imaginary = compiled(jnp.moveaxis(batch, 0, -1))
     values = np.asarray(real + 1j * imaginary).T
@@ -70,7 +70,7 @@ def spectra(request):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_eigenvalues_are_backward_stable(spectra, kind):
-    """Each is an eigenvalue of a matrix within rounding: the smallest singular value of A - lambda I is that small."""
+    """Each value is an eigenvalue of a matrix within rounding: the smallest singular value of A - lambda I is rounding."""
     matrices, values = spectra[kind]
     n = matrices.shape[-1]
     norm = np.maximum(np.linalg.norm(matrices, axis=(1, 2)), np.finfo(float).tiny)
@@ -80,7 +80,7 @@ def test_eigenvalues_are_backward_stable(spectra, kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_eigenvalues_are_all_found_and_once(spectra, kind):
-    """Paired with NumPy's; a defective pair is only determined to the root of the rounding."""
+    """The values pair with NumPy's; a defective pair is determined only to the square root of the rounding."""
     matrices, values = spectra[kind]
     tolerance = {"defective": 1e-6, "random": 1e-11, "graded": 1e-11}.get(kind, 1e-13)
     for matrix, found in zip(matrices, values, strict=True):
@@ -133,7 +133,7 @@ def test_solve(n):
 
 @pytest.mark.parametrize("small", [0.0, 1e-17])
 def test_solve_pivots(small):
-    """Without exchange of rows the first pivot is zero, or so small that it swamps the rest."""
+    """Without an exchange of rows the first pivot is zero, or so small that the other entries lose their digits."""
     a = np.array([[small, 1.0, 0.0], [1.0, 1.0, 2.0], [3.0, 0.0, small]])
     b = np.array([[1.0], [4.0], [3.0]])
     np.testing.assert_allclose(solve(jnp.asarray(a), jnp.asarray(b)), [[1.0], [1.0], [1.0]], rtol=1e-14)

@@ -36,7 +36,7 @@ LITERATURE = {
     "pendulum": (0.1400, -0.1900),
 }
 
-# Standard errors of the means that keep the bounds sharp.
+# Largest standard errors of the means, to keep the comparison sharp.
 LARGEST_ERROR = {"lorenz": 1.5e-3, "roessler": 1.5e-3, "ueda": 2e-3, "two_wells": 2e-3, "pendulum": 2e-3}
 
 
@@ -49,13 +49,13 @@ def request(outputs: tuple[str, ...], max_time: float, steps: int, target: float
 
 
 def results(flow: Flow, *options) -> dict:
-    """Results of ``flow``; ``options`` of ``request``."""
+    """Results of ``flow`` for the arguments ``options`` of ``request``."""
     return {name: np.asarray(value) for name, value in jax.jit(lambda: analyse(flow, request(*options)))().items()}
 
 
 @cache
 def batch(name: str) -> dict:
-    """Time and steps per strobe as each needs them."""
+    """Results of the flow ``name`` with suitable time and steps per strobe."""
     sizes = {"lorenz": (1024.0, 16), "roessler": (4096.0, 32), "oscillators": (4000.0, 64)}
     return results(getattr(flows, name)(LANES), OUTPUTS, *sizes[name])
 
@@ -69,7 +69,7 @@ def known(name: str) -> dict:
 
 @pytest.mark.parametrize("name", LITERATURE)
 def test_literature_values_within_standard_errors(name):
-    """Three standard errors of the mean over independent members; the literature value is rounded to 4 digits."""
+    """Means over independent members agree within three standard errors; literature values are rounded to 4 digits."""
     spectrum = known(name)["lyapunov_spectrum"]
     error = spectrum.std(axis=1, ddof=1) / math.sqrt(spectrum.shape[1])
     np.testing.assert_array_less(np.abs(spectrum.mean(axis=1) - LITERATURE[name]), 3 * error + 1e-4)
@@ -78,14 +78,14 @@ def test_literature_values_within_standard_errors(name):
 
 @pytest.mark.parametrize("name", LITERATURE)
 def test_block_error_is_no_smaller_than_the_scatter(name):
-    """Never much too small; larger where the exponents of neighbouring blocks are anticorrelated."""
+    """The error is never much smaller than the scatter, and larger if neighbouring blocks are anticorrelated."""
     scatter = known(name)["lyapunov_spectrum"].std(axis=1, ddof=1)
     assert (np.median(known(name)["lyapunov_standard_error"], axis=1) > 0.6 * scatter).all()
 
 
 @pytest.mark.parametrize("name", LITERATURE)
 def test_chaos_is_recognised(name):
-    """Roessler's attractor turns almost evenly: 1024 strobes mix its phase in the third component only."""
+    """Roessler's attractor turns almost uniformly: within 1024 strobes only the third component shows its chaos."""
     kinds, k01 = known(name)["verdict"], np.median(known(name)["chaos_k01"])
     assert (kinds == Verdict.CHAOTIC).mean() > 0.9
     assert k01 > 0.97
@@ -98,14 +98,14 @@ def test_exponents_add_up_to_the_mean_divergence(name):
 
 @pytest.fixture(scope="module")
 def linear():
-    """Results over damping and stiffness, compiled once."""
+    """Results of linear oscillators as a function of damping and stiffness, compiled once."""
     compiled = jax.jit(lambda *p: analyse(flows.linear(*p), request(OUTPUTS, 400.0, 12, 1e-2)))
     return lambda *p: {name: np.asarray(value) for name, value in compiled(*map(np.asarray, p)).items()}
 
 
 @pytest.fixture(scope="module")
 def linear_motions(linear):
-    """Decay rates -0.1 and -0.9; a complex pair -0.1 +- i; a slow decay; growth that overflows."""
+    """Oscillators with exponents -0.1 and -0.9, with a pair -0.1 +- i, with a slow decay, and with overflowing growth."""
     return linear([1.0, 0.2, 0.01, -0.5], [0.09, 1.01, 1.0, 1.0])
 
 
@@ -115,7 +115,7 @@ def test_linear_oscillator_under_constant_torque_stands_still(linear_motions):
 
 
 def test_degenerate_pair_is_still_a_fixed_point(linear_motions):
-    """A complex pair has one exponent; the two that Gram-Schmidt finds differ, their sum does not."""
+    """A complex pair has a double exponent; Gram-Schmidt yields two different values with the exact sum."""
     ours, error = (linear_motions[name][:, 1] for name in ("lyapunov_spectrum", "lyapunov_standard_error"))
     assert ours.sum() == pytest.approx(-0.2, rel=1e-9)
     assert (np.abs(ours + 0.1) < 3 * error + 1e-9).all()
@@ -130,7 +130,7 @@ def test_what_leaves_all_bounds_is_unstable_and_stops_nobody(linear_motions):
 
 
 def test_what_leaves_at_once_has_no_exponents():
-    """A success would promise a value."""
+    """Without a value the outcome must not be a success."""
     ours = dt.run(
         {
             "system": "tripod",
@@ -145,13 +145,13 @@ def test_what_leaves_at_once_has_no_exponents():
 
 
 def test_what_has_no_value_where_it_starts_is_not_left_out():
-    """A point without a prediction of how soon it settles was taken for one that is not worth beginning."""
+    """A point whose settling time could not be predicted was once skipped."""
     ours = tripod({"chi_n": [-0.6, 0.0026], "zeta": [0.01, 0.01]}, OUTPUTS[:1], max_time=0.02, standard_error=0.5)
     assert ours.outcome.values[0] == Outcome.NOT_FINITE
 
 
 def tripod(points: dict, outputs: tuple = OUTPUTS[:4], fixed: dict | None = None, **options):
-    """Points of the input element, unless ``fixed`` says otherwise."""
+    """Results of points of the input element, or of other parameters in ``fixed``."""
     scene = {"system": "tripod", "analysis": "lyapunov", "outputs": list(outputs), "points": points, "options": options}
     return dt.run(scene | {"fixed": {"element": "input", "beta": 0.157} | (fixed or {})})
 
@@ -171,20 +171,20 @@ _UNRESOLVED = (
 
 
 def test_too_few_steps_are_told():
-    """Forty-eight steps for up to 77 periods of the shaft; a decay that is over within the first step."""
+    """48 steps are too few for up to 77 periods of the shaft, and for a decay within the first step."""
     points = {"excitation_frequency": [case[0] for case in _UNRESOLVED], "zeta": [case[1] for case in _UNRESOLVED]}
     ours = tripod(points, max_time=1.0, steps=48)
     assert ours.outcome.values.tolist() == [case[3] for case in _UNRESOLVED]
     assert (ours.verdict.values[:-2] == Verdict.UNDECIDED).all()
-    # What is wrong is as much as the residual says, of motions that left, too.
+    # The residual equals the error of the sum, even for motions that left the bounds.
     found = ours.lyapunov_spectrum.values.sum(axis=1) - [case[2] for case in _UNRESOLVED]
     given = ours.outcome.values != Outcome.NOT_FINITE
     np.testing.assert_allclose(ours.sum_rule_residual.values[given], found[given], rtol=1e-3, atol=0.01)
     assert not broken(ours)
 
 
-# Excitation frequency [Hz] and damping ratio: 48 steps damp or feed the oscillation, or the fast decay is over within few of
-# them, or within a strobe by far more than rounding bears.
+# Excitation frequency [Hz] and damping ratio: 48 steps damp or excite the oscillation, or are too few for a fast decay, or a
+# strobe shrinks volume by more than rounding allows.
 _HARD = ((20.0, 1e-4), (36.0, 0.0016), (120.0, 0.0016), (100.0, 0.3), (30.0, 1.5), (500.0, 3.0), (3066.5, 30.0))
 
 
@@ -196,7 +196,7 @@ def hard():
 
 
 def test_steps_follow_the_field(hard):
-    """Whatever is asked for: the exponents are those of Floquet theory (one decay of a pair, whose sum is exact)."""
+    """By default the exponents are those of Floquet theory (a pair has a common decay, whose sum is exact)."""
     points, ours = hard
     scene = {"system": "tripod", "analysis": "floquet", "outputs": ["floquet_exponent", "outcome"], "points": points}
     exact = dt.run(scene | {"fixed": {"element": "input", "beta": 0.157, "chi_n": 0.01}})
@@ -210,7 +210,7 @@ def test_steps_follow_the_field(hard):
 
 
 def test_a_neighbour_that_needs_more_steps_changes_little(hard):
-    """The batch marches by as many as one of its members needs."""
+    """A batch marches with the largest number of steps that any member needs."""
     points, ours = hard
     first = {name: values[:3] for name, values in points.items()}
     alone = tripod(first, OUTPUTS[:4], {"chi_n": 0.01}, max_time=0.5)
@@ -220,7 +220,7 @@ def test_a_neighbour_that_needs_more_steps_changes_little(hard):
 
 
 def test_steps_that_are_given_are_taken():
-    """In a field that needs more steps, and in one that needs no more."""
+    """A given number of steps is used, even if the field needs more."""
     points = {"excitation_frequency": [3066.5] * 4, "zeta": [0.0016, 0.01, 0.1, 0.5]}
     ours, same, fewer = (tripod(points, OUTPUTS[:3], max_time=0.02, **n) for n in ({}, {"steps": 48}, {"steps": 8}))
     for name in OUTPUTS[:3]:
@@ -231,7 +231,7 @@ def test_steps_that_are_given_are_taken():
 
 
 def test_decay_beyond_rounding_within_a_strobe_is_found():
-    """By e to the 63 here: of vectors made orthonormal once a strobe nothing is left."""
+    """The decay within a strobe is e^-63: vectors orthonormalised once per strobe would lose all digits."""
     ours = tripod({"excitation_frequency": [3066.5], "zeta": [10.0]}, OUTPUTS[:4], max_time=0.5, steps=192)
     assert ours.lyapunov_spectrum.values.sum() == pytest.approx(-192674.6, rel=1e-6)
     assert ours.outcome.values.tolist() == [Outcome.SUCCESS]
@@ -246,7 +246,7 @@ def test_more_steps_than_usual_are_taken_only_on_request():
 
 
 def test_steps_of_a_flow_are_predicted_from_what_it_tells():
-    """Nothing: 48. Its frequency: more where a strobe has more turns, and where damping is weak."""
+    """Without a known frequency there are 48 steps, otherwise more with more turns per strobe and with weak damping."""
 
     def steps(fastest: float | None, damping: float, period: float) -> float:
         flow = Flow(lambda _, y: (y[1], -y[0] - damping * y[1]), (1.0, 0.0), period, fastest=fastest)
@@ -271,7 +271,7 @@ PLANAR = {
 def test_steps_do_not_make_chaos():
     fixed = {"element": "output", "equation": "26"}
     ours = tripod({name: [value] for name, value in PLANAR.items()}, OUTPUTS, fixed, max_time=0.3)
-    # What a chaotic motion shows is there.
+    # The exponent looks like that of a chaotic motion.
     assert ours.lyapunov_spectrum.values[0, 0] > 1000
     assert abs(ours.sum_rule_residual.values[0]) < 1 and ours.chaos_k01.values[0] > 0.8
     assert ours.verdict.values.tolist() == [Verdict.UNDECIDED]
@@ -280,7 +280,7 @@ def test_steps_do_not_make_chaos():
 
 @pytest.mark.full
 def test_steps_that_disagree_are_told_whatever_is_asked_for():
-    """The verdict need not be among the outputs."""
+    """The outcome does not depend on the requested outputs, such as the verdict."""
     point = {name: [value] for name, value in PLANAR.items()}
     ours = tripod(point, OUTPUTS[:1], {"element": "output", "equation": "26"}, max_time=0.05)
     assert ours.outcome.values.tolist() == [Outcome.TOLERANCE_NOT_MET]
@@ -299,7 +299,7 @@ def test_steps_that_disagree_are_told_whatever_is_asked_for():
     ],
 )
 def test_chaos_needs_a_third_dimension(changed, possible):
-    """A clock that is felt is one."""
+    """A clock on which the field depends counts as a dimension."""
     system = get_system("tripod")
     values = {p.name: p.default for p in system.parameters if p.default is not None}
     values |= {
@@ -315,7 +315,7 @@ def test_chaos_needs_a_third_dimension(changed, possible):
 
 
 def test_room_for_chaos_is_a_matter_of_each_member():
-    """Three components have it, two that nothing forces have not, nor with a force of no amplitude."""
+    """Three components may be chaotic; two without forcing, or with a forcing of amplitude 0, may not."""
     state = (jnp.ones(2), jnp.ones(2))
     forced = Flow(lambda angles, y: (y[1], jnp.array([0.0, 1e-9]) * jnp.cos(angles[0])), state, 1.0, turns=(1,))
     assert may_be_chaotic(forced, state).tolist() == [False, True]
@@ -334,7 +334,7 @@ _TONGUE_EDGE = (
 
 @pytest.mark.parametrize("max_time", [pytest.param(0.1, marks=pytest.mark.full), 1.0])
 def test_a_double_multiplier_is_no_instability(max_time):
-    """Vectors grow in proportion to time there, or to time and a decay."""
+    """At a double multiplier vectors grow in proportion to time, or to time and a decay."""
     names = ("zeta", "excitation_frequency", "M_AEM", "phi0")
     points = dict(zip(names, map(list, zip(*(case[:4] for case in _TONGUE_EDGE), strict=True)), strict=True))
     ours = tripod(points, fixed={"beta": 0.0, "chi_n": 0.3}, max_time=max_time, steps=16)
@@ -345,7 +345,7 @@ def test_a_double_multiplier_is_no_instability(max_time):
 
 
 def test_members_do_not_depend_on_their_neighbours(linear, linear_motions):
-    """The slow one runs to the end, the others stop before; once more among its like."""
+    """The slow member runs to the end and the others stop earlier; among equal members its results are the same."""
     alike = linear([0.01] * 4, [1.0] * 4)
     for name in OUTPUTS:
         np.testing.assert_array_equal(alike[name][..., 2], linear_motions[name][..., 2])
@@ -358,7 +358,7 @@ def test_limit_cycle_is_periodic():
 
 
 def test_a_slow_drift_in_a_plane_is_no_torus():
-    """x'' = 0 and x'' = 1e-8 x: both exponents are zero as far as the time tells."""
+    """x'' = 0 and x'' = 1e-8 x: the time is too short to distinguish either exponent from zero."""
     stiffness = jnp.array([0.0, 1e-8])
     flow = Flow(lambda _, y: (y[1], stiffness * y[0]), (jnp.ones(2), jnp.zeros(2)), period=1.0)
     ours = results(flow, OUTPUTS, 3000.0, 12)
@@ -390,7 +390,7 @@ ALL_DAMPINGS = (0.0016, 0.0064, 0.0114)
     ],
 )
 def test_regular_motion_has_the_exponents_of_floquet(element, dampings, max_time):
-    """Weighted means: within 1e-6 of the larger exponent; plain ones of 1 s are off by 1e-3."""
+    """Weighted means are within 1e-6 of the larger exponent; plain means over 1 s have errors of 1e-3."""
     frequency, chi_n = (3066.5, 0.0026) if element == "input" else (2792.0, 0.0027)
     fixed = {"element": element, "beta": math.radians(9), "chi_n": chi_n, "excitation_frequency": frequency}
     scene = {"system": "tripod", "points": {"zeta": list(dampings)}, "fixed": fixed}
@@ -409,13 +409,13 @@ def by_the_paper(element: str, zeta: float, strobes: int) -> np.ndarray:
 
 
 class TestPaperEstimator:
-    """The paper's rule: equal to independent computations of (31)-(36), and wrong on known answers."""
+    """The paper's estimator equals independent computations of (31)-(36), and is wrong for systems with known exponents."""
 
     @pytest.mark.parametrize(
         ("strobes", "expected"), [(307, (-22587.20, -10361.95, -1311.025)), (154, (-21779.65, -10317.94, -1293.414))]
     )
     def test_its_own_criterion_fails_at_fig_17(self, strobes, expected):
-        """RK4 by an independent author; the largest of all three is negative, so that (37) fails."""
+        """Reference: RK4 by an independent author. The largest of all three is negative, so that criterion (37) fails."""
         np.testing.assert_allclose(by_the_paper("input", 0.0016, strobes), expected, rtol=0, atol=5.1e-3)
 
     @pytest.mark.parametrize("element", ["input", "output"])
@@ -426,7 +426,7 @@ class TestPaperEstimator:
 
     @pytest.mark.parametrize("interval", [1.0, 0.1])
     def test_it_is_positive_for_a_damped_linear_oscillator(self, interval):
-        """The distance is proportional to the motion itself; the true exponents are -0.1, at any interval."""
+        """The distance is proportional to the motion; the true exponents are -0.1 for any interval."""
         flow = replace(flows.linear([0.2], [1.0], torque=0.0), period=interval)
         ours = results(flow, ("paper_estimator",), 100.0, 12)["paper_estimator"]
         rate, times = math.sqrt(1 - 0.1**2), np.arange(1, round(100 / interval) + 1) * interval
@@ -438,7 +438,7 @@ class TestPaperEstimator:
         assert (expected * interval > 1).all()
 
     def test_it_is_negative_for_a_chaotic_system(self):
-        """At every strobe of 0.05; with ten times the interval it is something else again."""
+        """The estimator is negative with strobes every 0.05, and differs with ten times the interval."""
         flow = flows.lorenz(1)
         short, long = (
             results(replace(flow, period=interval), ("paper_estimator",), 200.0, 12)["paper_estimator"][:, 0]
@@ -450,7 +450,7 @@ class TestPaperEstimator:
 
 @pytest.fixture(scope="module")
 def controls():
-    """(29) at the paper's settings, and homogeneous with chi_n around the parametric threshold."""
+    """Results of (29) at the paper's settings, and without torque for chi_n around the parametric threshold."""
     outputs = [*OUTPUTS[:4], "period_multiple"]
     points = {"M_AEM": [2550.0, 0.0, 0.0, 0.0], "chi_n": [0.0026, 0.01, 0.025, 0.05]}
     fixed = {"element": "input", "beta": math.radians(9), "zeta": 0.0016, "excitation_frequency": 3066.5}
@@ -476,7 +476,7 @@ def test_runs_that_never_end_are_not_begun():
 
 
 def test_no_chaos_at_the_papers_settings(controls):
-    """Exponents of ../shared: Floquet -13.108684, -17.719175; from rest the transient of the frame is still visible."""
+    """Floquet exponents are -13.108684 and -17.719175; the alignment of the vectors from the start is still visible."""
     ours, error = controls.lyapunov_spectrum.values[0], controls.lyapunov_standard_error.values[0]
     assert (np.abs(ours - [-13.108683687, -17.719175397]) < 3 * error).all()
     assert ours.sum() == pytest.approx(-30.827859084, abs=1e-6)
@@ -501,16 +501,16 @@ def test_sum_rule_of_the_tripod(controls):
 _M = 2550.0
 FORCED = (
     (3000.0, 0.1, 6.0, _M, 0.0, Verdict.PERIODIC, 10),
-    (3066.5, 0.1, 6.133, _M, 0.0, Verdict.PERIODIC, 10),  # its exponents come out too low by 2 in 15
+    (3066.5, 0.1, 6.133, _M, 0.0, Verdict.PERIODIC, 10),  # its computed exponents are too low by 2 in 15
     (3000.03, 0.1, 6.0, _M, 0.0, Verdict.QUASI_PERIODIC, 0),  # repeats after 100001, nearly after 10
     (2718.281828, 1e-5, 6.0, _M, 0.0, Verdict.QUASI_PERIODIC, 0),  # a torus thinner than the transient
     (2718.281828, 0.0, 6.0, _M, 0.0, Verdict.FIXED_POINT, 1),
-    (3000.0, 0.1, 6.0, 0.0, 1e-3, Verdict.UNDECIDED, 0),  # nothing but the transient
+    (3000.0, 0.1, 6.0, 0.0, 1e-3, Verdict.UNDECIDED, 0),  # a transient alone
 )
 
 
 def test_a_slow_drift_along_a_torus_is_no_period():
-    """Nor is what the transient covers: whether the strobes repeat is known from the frequencies."""
+    """The frequencies determine if the strobes repeat; neither a slow drift nor a transient may count as a period."""
     names = ("excitation_frequency", "chi_AEM", "motor_order", "M_AEM", "phi0")
     points = dict(zip(names, map(list, zip(*(case[:5] for case in FORCED), strict=True)), strict=True))
     fixed = {"element": "input", "beta": math.radians(9), "zeta": 0.0016}
@@ -518,12 +518,12 @@ def test_a_slow_drift_along_a_torus_is_no_period():
     ours = dt.run(scene | {"points": points, "options": {"max_time": 0.6, "steps": 12}})
     assert ours.verdict.values.tolist() == [case[5] for case in FORCED]
     assert ours.period_multiple.values.tolist() == [case[6] for case in FORCED]
-    # Of what does not repeat K is that of a record.
+    # K is 0 only for motions that repeat.
     assert ((ours.chaos_k01 == 0) == (ours.period_multiple > 0)).all()
 
 
 def test_repetition_is_told_from_the_transient_only():
-    """Period 3 exactly; to 1e-6 only; not at all. A transient of 1e-5 may be hiding either of the first two."""
+    """Series repeat after 3 strobes exactly, to 1e-6, or not at all; a transient of 1e-5 may hide the second kind."""
     k = jnp.arange(1024.0)
     exact = jnp.cos(2 * jnp.pi * (k % 3) / 3)
     series = jnp.stack([exact, exact + 1e-6 * jnp.cos(0.1 * k**2), jnp.cos(jnp.sqrt(2.0) * k)], axis=-1)[:, None]
@@ -535,7 +535,7 @@ def test_repetition_is_told_from_the_transient_only():
 
 @pytest.mark.full
 def test_bounded_chaos_of_the_tripod():
-    """The unphysical control of the theory note: L1 = 1218 +- 12 by an independent computation, K = 0.997."""
+    """An unphysical control of the theory note: L1 = 1218 +- 12 by an independent computation, K = 0.997."""
     omega = 9633.726700903984
     fixed = {"element": "input", "beta": math.radians(9), "zeta": 0.03, "chi_n": 0.3, "M_AEM": 8.4e4 * 2550.0}
     fixed |= {"chi_AEM": 0.5, "excitation_frequency": omega / math.pi, "motor_order": 0.618 * omega / (100 * math.pi)}

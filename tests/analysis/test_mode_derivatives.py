@@ -1,4 +1,4 @@
-"""Derivatives of the natural frequencies against differences of the 50-digit oracle, and identities they obey."""
+"""Derivatives of the natural frequencies against differences of the 50-digit oracle and against identities."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def moved(p: dict, name: str, entry: int | None, step: float) -> dict:
 
 
 def difference(p: dict, name: str, entry: int | None) -> np.ndarray:
-    """Central difference of the oracle, of error 1e-9 and less."""
+    """Central difference of the oracle, with an error of at most 1e-9."""
     value = p[name] if entry is None else p[name][entry]
     step = 1e4 if value == 0 else 1e-6 * max(abs(value), 1.0 if "angle" in name else 0.0)
     if value == 0:
@@ -64,12 +64,12 @@ def test_against_differences(jacobian, name):
     entry = 1 if isinstance(UNEQUAL[name], tuple) else None
     ours = np.asarray(jacobian[name] if entry is None else jacobian[name][entry])
     exact = difference(UNEQUAL, name, entry)
-    # The rigid mode turns into a spring-mass mode, f = sqrt(k)/..., of which there is no derivative at k = 0.
+    # The rigid mode becomes a spring-mass mode, f = sqrt(k)/..., which has no derivative at k = 0.
     np.testing.assert_allclose(ours[1:], exact[1:], rtol=2e-6, atol=2e-7 * np.abs(exact[1:]).max())
 
 
 def test_planets_that_differ_slightly():
-    """Planet modes 1.5e-7 apart, more than a cluster is wide: value and derivative of each are its own."""
+    """Planet modes are 1.5e-7 apart, more than the width of a cluster: each has its own value and derivative."""
     listed = tuple(1e8 * (1 + 1e-5 * x) for x in (0, 0.3, -0.5, 0.9, -0.2, 0.6))
     p = TABLE_2 | {"planet_angle": tuple(2 * np.pi * i / 6 for i in range(6)), "k_p": listed}
     rows, value = reversed_jacobian(dt.Planetary(**p))
@@ -94,7 +94,7 @@ def test_scaling_of_all_stiffnesses(jacobian, frequencies):
 
 
 def test_masses_of_a_stiff_gear():
-    """Derivatives by a mass where springs are nearly rigid, whose forces cancel."""
+    """Derivatives by a mass with nearly rigid springs, whose forces cancel."""
     stiff = UNEQUAL | {"k_rp": 1e20}
     rows, frequency = reversed_jacobian(dt.Planetary(**stiff))
     frequency, slope = np.asarray(frequency), np.asarray(rows.m_r)
@@ -110,7 +110,7 @@ def test_turning_the_gear_changes_nothing(jacobian, frequencies):
 
 
 def test_only_a_parameter_splitting_a_doublet_has_no_derivative():
-    """Equal spacing: a bearing of all planets keeps the translational doublets, an angle splits all six of them."""
+    """With equal spacing the common bearing of planets keeps the translational doublets; an angle splits all six."""
     rows, f = reversed_jacobian(dt.Planetary(**EQUAL))
     near = np.diff(np.asarray(f)) < 1e-6 * np.asarray(f)[1:]
     doublets = np.r_[near, False] | np.r_[False, near]
@@ -122,7 +122,7 @@ def test_only_a_parameter_splitting_a_doublet_has_no_derivative():
 
 
 def test_a_rigid_mode_stays_but_for_a_spring_that_would_hold_it(jacobian):
-    """There its frequency grows as sqrt(k), and those of all other modes have derivatives."""
+    """For such a spring the frequency grows like sqrt(k); all other modes have derivatives."""
     for name in NAMES:
         slopes = np.stack(jax.tree.leaves(jacobian[name]))
         assert np.isfinite(slopes[:, 1:]).all()

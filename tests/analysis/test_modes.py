@@ -20,7 +20,7 @@ MODES = ["natural_frequency", "mode_type", "participation"]
 
 
 def run_angles(angles: np.ndarray, outputs: list[str], method: str = "auto", **fixed):
-    """One point per row of ``angles`` (points, N); the same kernel serves every set of rows of one length."""
+    """Modes of one point per row of ``angles`` (points, N); sets with the same number of planets share a kernel."""
     columns = {f"planet_angle[{i}]": angles[:, i].tolist() for i in range(angles.shape[1])}
     return dt.run(
         {
@@ -40,7 +40,7 @@ def random_angles(rng: np.random.Generator, count: int, n: int) -> np.ndarray:
 
 @pytest.mark.parametrize("n", [n if n == 5 else pytest.param(n, marks=pytest.mark.full) for n in range(3, 13)])
 def test_random_spacings_have_the_right_count_of_planet_modes(n):
-    """Three planet modes N - 3 times, one rigid rotation, and nothing pure beside them."""
+    """There are three planet modes N - 3 times and one rigid rotation."""
     count = 30
     ds = run_angles(random_angles(np.random.default_rng(n), count, n), MODES)
     types, frequency = ds.mode_type.values, ds.natural_frequency.values
@@ -55,7 +55,7 @@ def test_random_spacings_have_the_right_count_of_planet_modes(n):
 
 
 def test_labels_do_not_flip_with_tiny_changes_of_spacing():
-    """Random changes of 1e-9 to 1e-12 rad, about equal and about balanced unequal spacing of five planets."""
+    """Random changes of 1e-9 to 1e-12 rad around equal and around balanced unequal spacing of five planets."""
     rng = np.random.default_rng(5)
     spacings = np.array([np.arange(5) * 2 * math.pi / 5, np.radians([0, 30, 120, 210, 240])])
     shifts = rng.uniform(-1, 1, (2, 12, 5)) * np.logspace(-9, -12, 12)[None, :, None]
@@ -71,12 +71,12 @@ def test_labels_do_not_flip_with_tiny_changes_of_spacing():
 
 
 def test_labels_at_an_accidental_crossing_of_families():
-    """Where a rotational and a translational frequency agree to 1e-7, 1e-9 rad mixes their vectors, not their
+    """If a rotational and a translational frequency agree to 1e-7, a change of 1e-9 rad mixes the vectors but not the
     labels."""
     base = TABLE_2 | {"planet_angle": tuple(np.radians([0, 80, 180, 260]))}
 
     def distance(k_cu: float) -> float:
-        """From the rising rotational frequency to 1e-7 below the translational one."""
+        """Distance of the rising rotational frequency from a target 1e-7 below the translational frequency."""
         below, above = natural_frequencies(base | {"k_cu": k_cu})[2:4]
         other = 1084.96362568457
         return (below if abs(above - other) < abs(below - other) else above) - other * (1 - 1e-7)
@@ -91,8 +91,8 @@ def test_labels_at_an_accidental_crossing_of_families():
 
 
 def test_the_papers_odd_claim_is_false_both_ways():
-    """Coupled where it says rotational; and rotational modes as for equal spacing with five unequally spaced
-    planets."""
+    """Modes are coupled where the paper claims rotational ones, and five unequally spaced planets have the rotational
+    modes of equal spacing."""
     angles = np.radians([[0, 72, 144, 252, 324], [0, 30, 120, 210, 240], [0, 72, 144, 216, 288]])
     ds = run_angles(angles, MODES)
     unequal, balanced, equal = ds.mode_type.values
@@ -108,7 +108,7 @@ LISTS = {"m_p": [0.6, 0.66, 0.7], "k_p": [1e8, 2e8, 1.5e8], "k_rp": [4e8, 5e8, 6
 
 @pytest.fixture(scope="module")
 def shapes():
-    """Three planets that differ: shapes, participation and energies by the full system."""
+    """Shapes, participation and energies of a gear with three different planets, by the full system."""
     fixed = {"planet_angle": [0.0, 1.9, 4.0], **LISTS}
     outputs = ["natural_frequency", "mode_shape", "kinetic_energy", "mode_type", "participation"]
     return dt.run({"system": "planetary", "analysis": "modes", "outputs": outputs, "fixed": fixed})
@@ -133,14 +133,14 @@ FULL = ["natural_frequency", "natural_frequency_error", "mode_shape", "mode_type
 
 
 def nearly_equal(name: str, spread: float) -> dict:
-    """Six equally spaced planets that differ in one parameter."""
+    """Parameters of six equally spaced planets that differ in the parameter ``name``."""
     listed = tuple(TABLE_2[name] * (1 + spread * x) for x in (0, 0.3, -0.5, 0.9, -0.2, 0.6))
     return TABLE_2 | {"planet_angle": SIX, name: listed}
 
 
 def assert_modes(p: dict, frequency: np.ndarray, bound: np.ndarray, shapes: np.ndarray) -> None:
-    """Frequencies within their bound of 50 digits; shapes that solve the equations of motion, each one the mode of an
-    independent eigensolution where the gap to its neighbours determines it."""
+    """Assert that frequencies agree with the 50-digit oracle within their bound, that shapes solve the equations of motion,
+    and that well-separated shapes agree with an independent eigensolution."""
     assert (np.abs(frequency - np.array(exact_frequencies(p))) <= bound).all()
     mass, stiffness = (np.array(x, float) for x in matrices(p))
     vectors = shapes.T * np.sqrt(mass)[:, None]
@@ -156,7 +156,7 @@ def assert_modes(p: dict, frequency: np.ndarray, bound: np.ndarray, shapes: np.n
 
 @pytest.mark.parametrize("name", ["k_p", "m_p", "k_sp"])
 def test_planets_that_differ_slightly_have_modes_of_their_own(name):
-    """Planet modes split by less than 5e-5: turned towards their family they would be no modes."""
+    """Planet modes are split by less than 5e-5; rotated towards their family they would no longer be modes."""
     gears = [nearly_equal(name, spread) for spread in (1e-3, 1e-5, 1e-7)]
     columns = {f"{name}[{i}]": [gear[name][i] for gear in gears] for i in range(6)}
     scene = {"system": "planetary", "analysis": "modes", "points": columns}
@@ -168,7 +168,7 @@ def test_planets_that_differ_slightly_have_modes_of_their_own(name):
     )
     for i, gear in enumerate(gears):
         assert_modes(gear, *(ds[key].values[i] for key in FULL[:3]))
-    # A spread of 1e-5 puts less than its square outside the family.
+    # With a spread of 1e-5 the share outside the family is below the square of the spread.
     assert [(ds.mode_type.values[1:] == kind).sum(1).tolist() for kind in (PLANET, RIGID)] == [[9, 9], [1, 1]]
 
 
@@ -179,7 +179,7 @@ def test_unequal_planets_at_one_angle():
 
 
 def test_followed_frequencies_are_those_of_each_point():
-    """From equal planets to one that differs by 1e-5."""
+    """The path leads from equal planets to one planet that differs by 1e-5."""
     scene = {
         "system": "planetary",
         "analysis": "modes",
@@ -202,15 +202,14 @@ def test_energies_and_participation_are_shares(shapes):
 
 
 def test_rigid_rotation_turns_everything_alike(shapes):
-    """u of all central bodies is that of the carrier but for the sun and ring, which mesh with freely turning
-    planets."""
+    """No central body moves sideways in the rigid rotation."""
     assert int(shapes.mode_type[0]) == RIGID
     q = shapes.mode_shape.values[0]
     assert np.abs(q[[0, 1, 3, 4, 6, 7]]).max() < 1e-9 * np.abs(q).max()
 
 
 def test_fixed_angles_that_do_not_balance_are_not_taken_apart():
-    """Angles that the scene fixes decide before compilation whether rotation and translation are separate problems."""
+    """Fixed angles decide before compilation if rotation and translation are separate problems."""
     angles = np.radians([0, 60, 180, 270])
     scene = {"system": "planetary", "analysis": "modes", "outputs": ["natural_frequency"]}
     found = dt.run(scene | {"fixed": {"planet_angle": angles.tolist()}}).natural_frequency.values
@@ -237,7 +236,7 @@ def test_few_planets(n):
 
 
 def test_a_planet_without_bearing_turns_no_frequency():
-    """The bidiagonal form has exact zeros, and entries of nothing but what stands for them."""
+    """The bidiagonal form has exact zeros, and entries that are only their substitutes."""
     angles = np.linspace(0, 3, 301)[:, None]
     ds = run_angles(angles, ["natural_frequency", "natural_frequency_error"], k_p=0.0)
     exact = np.array(exact_frequencies(TABLE_2 | {"planet_angle": (0.0,), "k_p": 0.0}))
@@ -272,7 +271,7 @@ def test_twenty_planets_and_huge_contrasts():
         ):
             exact = np.array(exact_frequencies(TABLE_2 | springs | {"planet_angle": tuple(row)}))
             assert (np.abs(line - exact) <= bound).all()
-            # Orthogonal transformations err by roundings of the largest frequency, here 3e6 times the smallest.
+            # Orthogonal transformations have errors of the rounding of the largest frequency, 3e6 times the smallest.
             assert np.abs(line - exact).max() < 40 * np.finfo(float).eps * exact[-1]
             assert springs or np.abs(line[1:] / exact[1:] - 1).max() < 1e-11
 
@@ -300,7 +299,7 @@ def test_tracks_follow_neighbours_in_any_order_of_points(order):
 
 
 def test_branches_keep_their_type_where_frequencies_cross(tracked):
-    """The rotation of the held carrier rises through translational modes; every branch stays what it is."""
+    """The rotational mode of the held carrier crosses translational modes; every branch keeps its type."""
     types, branch = tracked.mode_type.values, tracked.branch.values
     for line_types, line_branch in zip(types, branch, strict=True):
         order = np.argsort(line_branch, axis=1)
@@ -319,7 +318,7 @@ def test_mac_is_high_and_frequencies_stay_rising(tracked):
 
 
 def test_rigid_modes_are_followed_as_one_space():
-    """A gear without any bearing has 13 of them, whose vectors are arbitrary at every point: the space moves little."""
+    """A gear without bearings has 13 rigid modes; their vectors are arbitrary at each point, but the space moves little."""
     free = dict.fromkeys(("k_p", "k_s", "k_r", "k_c", "k_su", "k_ru", "k_cu"), 0.0)
     scene = {"system": "planetary", "analysis": "modes", "outputs": ["mode_type", "branch", "mac"]}
     angles = {"pressure_angle": {"start": 0.1, "stop": 1.2, "num": 9}}
@@ -345,7 +344,7 @@ def test_refusals():
 
 
 def test_a_path_begins_where_there_are_shapes():
-    """Without vectors at the first point the second is the first: no share of what is not there."""
+    """Without vectors at the first point the path begins at the second, where the MAC is 1."""
     vectors = np.stack([np.full((2, 2), np.nan), np.eye(2), np.full((2, 2), np.nan), np.eye(2)[:, ::-1]])
     same = np.broadcast_to(np.eye(2, dtype=bool), (4, 2, 2))
     branch, mac = (np.asarray(x) for x in follow(jnp.asarray(vectors), jnp.asarray(same)))

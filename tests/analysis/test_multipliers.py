@@ -1,4 +1,4 @@
-"""The error bound of the spectral radius, tried on polynomials whose roots are known, and what is drawn from it."""
+"""The error bound of the spectral radius for polynomials with known roots, and the verdict from it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ERRORS = (1e-15, 1e-13, 1e-11, 1e-8, 1e-5, 1e-3, 0.05)
 
 
 def closed_under_conjugation(rng, kind: str) -> np.ndarray:
-    """Four roots of a real quartic, of modulus about one and less."""
+    """Four roots of a real quartic, with moduli up to about one."""
     pair = lambda r, phi: [r * np.exp(1j * phi), r * np.exp(-1j * phi)]  # noqa: E731
     phi, split = rng.uniform(0.1, 3.0, 2), 10.0 ** rng.uniform(-12, -1)
     sign = rng.choice([-1.0, 1.0])
@@ -90,7 +90,7 @@ def bound():
 def pairs(request):
     """Roots, and the roots of polynomials whose coefficients differ by random signs times ``error rho^k``.
 
-    How far the two polynomials really differ is measured on their roots, so no root finder has to be exact.
+    The difference of the two polynomials is computed from their roots, so no root finder has to be exact.
     """
     rng = np.random.default_rng(KINDS.index(request.param))
     size = 10.0 ** rng.uniform(-3, 3, (COUNT, 1))
@@ -105,7 +105,7 @@ def pairs(request):
 
 
 def test_bound_is_never_violated(pairs, bound):
-    """Either set of roots may be the computed one."""
+    """The bound holds with either set of roots as the computed one."""
     _, roots, other, asked = pairs
     exact, changed = exact_coefficients(roots), exact_coefficients(other)
     true, found = np.abs(roots).max(axis=1), np.abs(other).max(axis=1)
@@ -121,7 +121,7 @@ def test_bound_is_never_violated(pairs, bound):
 
 
 def test_bound_of_a_multiple_root_is_the_root_of_the_error(bound):
-    """The worst case is attained: the bound is within a decade of what this very change of the coefficients does."""
+    """A change of the coefficients by ``error`` moves a multiple root by a root of ``error``; the bound is of this size."""
     for error in (1e-12, 1e-8):
         double = np.array([[-1.0, -1.0, 0.3, 0.2]], complex)
         limit = float(bound(double, np.array([error]))[0])
@@ -131,7 +131,7 @@ def test_bound_of_a_multiple_root_is_the_root_of_the_error(bound):
 
 
 def test_bound_is_not_absurd_for_separated_roots(bound):
-    """Against the largest first-order change that coefficients of this error can make in a modulus near the top."""
+    """The bound is at most 100 times the largest first-order change of a modulus by coefficients of this error."""
     rng = np.random.default_rng(0)
     roots = np.stack([closed_under_conjugation(rng, "separated") for _ in range(COUNT)])
     gaps = np.abs(roots[:, :1] - roots[:, 1:])

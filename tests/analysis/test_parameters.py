@@ -39,7 +39,7 @@ def test_every_constant_over_the_joint_angle():
     np.testing.assert_allclose(ds.mean_inertia, [row["Ibar3"] for row in rows], rtol=1e-12)
     expected = REFERENCE["elements9"]["3"]
     np.testing.assert_allclose(ds.torsional_stiffness[9], expected["kt"], rtol=1e-12)
-    # The midshaft does not know the joint angle, but has a line for each.
+    # The midshaft frequency does not depend on the joint angle, but has a row for each angle.
     assert ds.midshaft_frequency.dims == ("beta", "mode")
     np.testing.assert_allclose(ds.midshaft_frequency, np.tile(REFERENCE["nu_k_Hz"], (10, 1)), rtol=1e-12)
     assert ds["mode"].values.tolist() == [1, 2, 3, 4, 5]
@@ -48,7 +48,7 @@ def test_every_constant_over_the_joint_angle():
 
 
 class Spring(System):
-    """Its results, one of them by mode, are its own; a traced parameter must do."""
+    """A system with results of its own, one of them by mode; its parameters may be traced."""
 
     name = "spring"
     title = "Spring"

@@ -30,7 +30,7 @@ def columns(cases):
 
 @pytest.mark.parametrize("stiffness", [0.0, 1e-9, 0.01, 0.25, 0.2500001, 1.0, 1e6])
 def test_step_response_solves_its_equation(stiffness):
-    """Against the doubling formulas, which hold for every linear equation, from a step on which the series holds."""
+    """The responses agree with the closed form in 60 digits, for short and long steps."""
     mp = pytest.importorskip("mpmath")
     model = Rattle.models["basins"].build(TABLE1 | {"c": 1.0, "omega": 1.0})
     for d in (1e-6, 0.01, 0.3, 0.7, 3.0, 20.0):
@@ -44,7 +44,7 @@ def test_step_response_solves_its_equation(stiffness):
             step = (1 - rate - impulse) / k if k else t + mp.exp(-t) - 1
             expected = [float(mp.re(x)) for x in (step, impulse, rate)]
         size = [min(d * d, 1 / max(stiffness, 1e-300)), min(d, 1 / max(stiffness, 1e-300) ** 0.5), 1.0]
-        # The phase sqrt(K) d is known to its rounding only.
+        # The phase sqrt(K) d has the error of its rounding.
         slack = 1e-15 * (4 + stiffness**0.5 * d)
         assert np.all(np.abs(np.subtract(got, expected)) <= slack * np.array(size) * 4), (d, got, expected)
 
@@ -89,7 +89,7 @@ def random_against_oracle(count, seed):
     exact = np.array([extended(*case)[:2] for case in cases])
     norm = np.sqrt(sum(np.square(entry) for entry in motion.matrix))
     error = np.maximum(np.abs(motion.u - exact[:, 0]), np.abs(motion.v - exact[:, 1]))
-    # Where damping has wiped out the start, the state is known to the rounding of displacements and velocities near 1.
+    # Where damping has erased the start, the error is the rounding of displacements and velocities near 1.
     bad = np.flatnonzero(error > 1e-8 * norm + 1e-15)
     assert bad.size == 0, [(cases[i], error[i], norm[i]) for i in bad[:3]]
     return error / np.maximum(norm, 1.0)
@@ -108,7 +108,7 @@ def test_5000_random_cases_against_the_event_solver():
 
 @pytest.mark.parametrize("excess", [0.0, 1e-15, 1e-12, 1e-9, 1e-6, -1e-12, -1e-6])
 def test_grazing_contact(excess):
-    """Orbits without separation that come as near to the flank as ``excess`` times their amplitude."""
+    """Orbits that pass the flank, or stay clear of it, by ``excess`` times their amplitude."""
     values = TABLE1 | {"omega": 2.0, "k": 1e4, "b": 0.1, "B0": 500.0}
     response = 1.0 / complex(1e4 - 4.0, 0.1)
     margin = values["B0"] / 1e4 - values["alpha"] * values["b"]
@@ -139,7 +139,7 @@ def test_a_lane_that_is_not_finite_does_not_hold_up_the_others():
 
 
 def test_a_history_is_right_however_far_apart_its_times_are():
-    """More than 10,000 steps lie between them; an event solver written for this has -.3245944 after half a period."""
+    """More than 10,000 steps lie between two times; an independent event solver has -.3245944 after half a period."""
     slow = Rattle.models["basins"].build(TABLE1 | {"omega": 1e-4, "c": 1e-3, "alpha": 0.0, "B1": 0.2})
     u, v, one = jnp.array([0.5]), jnp.array([0.1]), jnp.array([1])
     far, near = (np.asarray(history(slow, u, v, one, samples)[0])[:, 0] for samples in (2, 64))

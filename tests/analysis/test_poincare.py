@@ -26,12 +26,12 @@ def section(outputs: list[str], **options) -> object:
 
 @pytest.fixture(scope="module")
 def motor():
-    """800 strobes are 45 decay times of the transient at this damping."""
+    """Sections after 800 strobes, which are 45 decay times of the transient at this damping."""
     return section(["section", "torus_residual", "distinct_points", "chaos_k01"], strobes=1024, discard=800, steps=24)
 
 
 def test_input_element_ends_on_a_torus(motor):
-    """A smooth function of the angle of the motor's torque; the periodic case as well."""
+    """The section is a smooth function of the angle of the motor's torque, also in the periodic case."""
     assert motor.section.dims == ("excitation_frequency", "strobe", "state")
     assert motor.torus_residual.values[1].max() < 1e-6
     assert motor.distinct_points.values.tolist() == [10, 0]
@@ -42,7 +42,7 @@ def test_regular_motion_does_not_diffuse(motor):
 
 
 def test_a_section_that_repeats_has_k_zero():
-    """Five points, for which 128 strobes alone give K = 0.94."""
+    """The section has five points, for which the plain test over 128 strobes gives K = 0.94."""
     scene = {"system": "tripod", "analysis": "poincare", "outputs": ["section", "chaos_k01"]}
     fixed = {"element": "input", "beta": 0.157, "zeta": 0.05, "chi_n": 0.2, "excitation_frequency": 500.0}
     found = dt.run(scene | {"fixed": fixed | {"equation": "29"}, "options": {"strobes": 128, "discard": 500}})
@@ -52,7 +52,7 @@ def test_a_section_that_repeats_has_k_zero():
 
 
 def test_few_strobes_that_do_not_repeat_tell_nothing_of_chaos():
-    """A torus, for which 512 strobes suffice and fewer may give any K."""
+    """A torus needs 512 strobes; fewer may give any K."""
     found = [section(["chaos_k01"], strobes=n, discard=800, steps=24).chaos_k01.values for n in (511, 512)]
     np.testing.assert_array_equal(np.isnan(found), [[False, True], [False, False]])
     assert found[0][0] == 0 and abs(found[1][1]) < 0.1
@@ -65,7 +65,7 @@ def test_section_repeats_exactly(motor):
 
 
 def test_loose_tolerances_blur_the_section(motor):
-    """What differs from the equal steps of order 8, over the extent of the section; the loose one says so itself."""
+    """The loose section differs from equal steps of order 8 by more than its extent, and its outcome shows it."""
     extent = np.ptp(motor.section.values[1, :, 0])
     found = {}
     for rtol, atol in ((1e-3, 1e-6), (1e-9, 1e-12)):
@@ -74,7 +74,7 @@ def test_loose_tolerances_blur_the_section(motor):
         missed = ours.section_error > min(1e-6, 10 * rtol)
         np.testing.assert_array_equal(ours.outcome, np.where(missed, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS))
         assert ((ours.strobe_error > 1e-6) == (rtol == 1e-3)).all()
-        # Errors of steps have added up over the decay time of the motion.
+        # Errors of steps add up over the decay time of the motion.
         assert (ours.section_error > ours.strobe_error).all()
         found[rtol] = np.abs(ours.section.values[1, :, 0] - motor.section.values[1, :128, 0]).max() / extent
     assert found[1e-3] > 1
@@ -82,7 +82,7 @@ def test_loose_tolerances_blur_the_section(motor):
 
 
 def test_steps_that_are_too_long_are_noticed():
-    """Four natural half periods a strobe: the estimate is of the size of the difference from eight times the steps."""
+    """With four natural half periods per strobe, the estimate is of the size of the change by eight times the steps."""
     scene = {"system": "tripod", "analysis": "poincare", "outputs": ["section", "strobe_error"]}
     scene |= {"fixed": FIXED | {"excitation_frequency": 1500.0}}
     coarse, fine = (dt.run(scene | {"options": {"strobes": 128, "discard": 800, "steps": n}}) for n in (6, 48))
@@ -109,7 +109,7 @@ INPUT_ELEMENT = {"element": "input", "equation": "25"}
     ],
 )
 def test_errors_of_a_violent_start_are_told(fixed, start, discard):
-    """They were made in the first strobe, or in discarded ones; all strobes of the section are right to 1e-8."""
+    """The errors come from the first strobe or from discarded strobes; single strobes of the section are right to 1e-8."""
     fixed = fixed | {"beta": 0.157, "phi0": start[0], "velocity0": start[1]}
     scene = {"system": "tripod", "analysis": "poincare", "outputs": ["section", "section_error"], "fixed": fixed}
     ours, finer = (dt.run(scene | {"options": {"strobes": 128, "discard": discard, "steps": n}}) for n in (48, 192))
@@ -124,7 +124,7 @@ def test_errors_of_a_violent_start_are_told(fixed, start, discard):
 
 
 def test_a_violent_neighbour_does_not_matter():
-    """It asks for a second march, which its neighbour does not take part in."""
+    """A member that needs a second march does not change its neighbour."""
     scene = {"system": "tripod", "analysis": "poincare", "outputs": ["section_error"]}
     scene |= {"fixed": OUTPUT_ELEMENT | {"beta": 0.157}, "options": {"strobes": 128, "discard": 0, "steps": 24}}
     speeds = [1e3, 105714.28571428572]
@@ -135,7 +135,7 @@ def test_a_violent_neighbour_does_not_matter():
 
 
 class TestZeroOne:
-    """Gottwald & Melbourne 2009: the logistic map on both sides of chaos, and a constant."""
+    """The test of Gottwald & Melbourne 2009 for regular and chaotic series of the logistic map, and for a constant."""
 
     @staticmethod
     def logistic(rates) -> np.ndarray:
@@ -155,7 +155,7 @@ class TestZeroOne:
         np.testing.assert_allclose(np.asarray(chaos_k01(jnp.asarray(series))), 0.0, atol=0.05)
 
     def test_it_is_its_definition(self):
-        """Walks, mean square displacements and correlations written out with NumPy."""
+        """K equals walks, mean square displacements and correlations by plain NumPy."""
         series = self.logistic([3.7, 3.95])[:400, 0]
         centred, n, values = series - series.mean(), np.arange(1, 401), []
         for angle in math.pi / 5 + 3 * math.pi / 5 * (np.arange(100) + 0.5) / 100:
@@ -187,7 +187,7 @@ def test_torus_residual_sees_noise():
 
 
 def test_a_parameter_of_the_field_may_vary():
-    """And nothing be discarded: a march of no steps uses nothing that it is given (see ``in_one_kernel``)."""
+    """Nothing is discarded either, so that a march of no steps has unused inputs (see ``in_one_kernel``)."""
     others = {name: value for name, value in FIXED.items() if name != "zeta"}
     scene = {
         "system": "tripod",

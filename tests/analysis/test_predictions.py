@@ -1,4 +1,4 @@
-"""What is predicted from parameters before anything is computed."""
+"""Predictions from parameters before a computation."""
 
 from __future__ import annotations
 

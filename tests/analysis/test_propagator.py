@@ -78,7 +78,7 @@ def test_explicit_scheme_converges_with_its_order():
 
 
 def test_implicit_scheme_keeps_its_order_on_a_stiff_problem():
-    """The stage order 8 is what is left of the classical 15, and the error estimate of ``compare`` rests on it."""
+    """On stiff problems the classical order 15 falls to the stage order 8, which the error estimate of ``compare`` uses."""
     rates = (-1e5, 0.5)
     propagate, exact = implicit(rotating(rates)), rotating_exactly(rates)
     assert IMPLICIT_ORDER == 8
@@ -96,7 +96,7 @@ def test_coefficients_are_those_of_scipy():
 
 
 def test_explicit_scheme_is_one_step_of_dop853():
-    """Stage by stage the tableau of SciPy, which has its own stepping."""
+    """One step equals the stages of SciPy's tableau."""
     rates = (-0.5, 1.5)
     field = rotating(rates).matrix
     a, b, c, k = DOP853.A, DOP853.B, DOP853.C, []
@@ -109,7 +109,7 @@ def test_explicit_scheme_is_one_step_of_dop853():
 
 @pytest.mark.parametrize("decay", [1e2, 1e5, 1e8, 1e12])
 def test_implicit_scheme_is_l_stable(decay):
-    """A component that decays at once must be gone after one panel, not stay with modulus one as in a symmetric scheme."""
+    """A fast-decaying component must vanish after one panel; in a symmetric scheme it would keep the modulus one."""
     system = LinearPeriodic(lambda t: ((-decay + 0 * t, 0), (0, -1.0 + 0 * t)), 1.0)
     phi = full(propagator(system, jnp.int32(1), 1, Radau))
     assert abs(phi[0, 0]) <= 10 / decay
@@ -117,7 +117,7 @@ def test_implicit_scheme_is_l_stable(decay):
 
 
 def test_growth_of_what_is_made_on_the_way():
-    """Two modes decay by e^-24 each, but not at the same time: what one lost half-way the other one has yet to lose.
+    """Two modes decay by e^-24 each, but at different times, so that errors made on the way grow relative to the result.
 
     |Phi(T, t)| |Phi(t, 0)|/|Phi(T, 0)| follows from the integral of the rates, 24 (t -+ sin(2 pi t)/(2 pi)).
     """
@@ -147,7 +147,7 @@ def test_constant_coefficients(n):
 
 
 def test_batch_and_structural_zeros():
-    """An oscillator of many frequencies; lanes do not know of each other, zeros may be the integer 0."""
+    """Oscillators of many frequencies as lanes: lanes are independent, and zeros may be the integer 0."""
 
     def rows(frequency, t):
         return (0, 1.0), (-(frequency**2), 0)
@@ -190,14 +190,14 @@ def test_solver_takes_any_state_of_any_linear_term_both_ways(solver):
 
 
 def test_clock_functions_reach_the_rows():
-    """x' = cos(t) x through ``basis``; a wrong node would show at once."""
+    """x' = cos(t) x with the cosine from ``basis``, which would reveal a wrong node."""
     system = LinearPeriodic(lambda cosine: ((cosine,),), SPAN, basis=lambda t: (jnp.cos(t),))
     for found in (propagator(system, jnp.int32(20)), propagator(system, jnp.int32(3), 3, Radau)):
         assert full(found).item() == pytest.approx(math.exp(math.sin(SPAN)), rel=1e-13)
 
 
 def test_log_scale_saves_what_underflows():
-    """e^-2000 is below the smallest float64; the ratio of the two decays survives beside the scale."""
+    """e^-2000 is below the smallest float64; the matrix keeps the ratio of both decays, the scale the rest."""
     system = LinearPeriodic(lambda t: ((-1000.0 + 0 * t, 0), (0, -1000.5 + 0 * t)), 2.0)
     found = propagator(system, jnp.int32(2000), 16, Radau)
     assert float(jnp.exp(found.log_scale)) == 0
@@ -208,7 +208,7 @@ def test_log_scale_saves_what_underflows():
 
 
 def test_radau_coefficients():
-    """Collocation: exact for polynomials up to the stage order; the last node is 1, the last row the quadrature weights."""
+    """Collocation is exact for polynomials up to the stage order; the last node is 1, the last row holds the weights."""
     for stages in (2, 3, 8):
         a, c = radau_iia(stages)
         assert c[-1] == 1 and (np.diff(c) > 0).all() and c[0] > 0
@@ -220,7 +220,7 @@ def test_radau_coefficients():
 
 
 def test_half_period_is_completed_by_the_reversor():
-    """Mathieu's equation is even about the middle of its period: X Phi^T X Phi of a half has its multipliers."""
+    """Mathieu's equation is even about the middle of its period, so X Phi^T X Phi of half a period has its multipliers."""
     rows = lambda t: ((0, 1.0), (-(1.3 - 2 * 0.4 * jnp.cos(2 * t)), 0))  # noqa: E731
     exchange = np.array([[0.0, 1.0], [1.0, 0.0]])
     half, whole = LinearPeriodic(rows, math.pi / 2, reversor=exchange), LinearPeriodic(rows, math.pi)
@@ -230,7 +230,7 @@ def test_half_period_is_completed_by_the_reversor():
 
 @pytest.mark.parametrize("rates", [(-1e3, 0.5), (-1e6, 0.5), (-1e8, -0.1), (-1e9, 0.5)])
 def test_bound_holds_for_stiff_systems_without_a_determinant(rates):
-    """And is no larger than the rounding of the entries makes it, which no scheme escapes."""
+    """The bound is of the size of the rounding of the entries, which no scheme avoids."""
     system, exact = rotating(rates), np.abs(np.linalg.eigvals(rotating_exactly(rates))).max()
     z = jax.jit(
         lambda n: direct_monodromy(
@@ -254,7 +254,7 @@ def test_bound_holds_for_stiff_systems_without_a_determinant(rates):
 
 @pytest.mark.parametrize("steps", [24, 30, 48])
 def test_a_fourfold_coarser_solution_tells_the_same_error(steps):
-    """Both estimates hold and agree."""
+    """The estimates from coarser solutions with a half and a quarter of the steps hold and agree."""
     system, exact = rotating((-3.0, 0.5)), rotating_exactly((-3.0, 0.5))
 
     def solve(ratio):
@@ -279,7 +279,7 @@ def test_a_fourfold_coarser_solution_tells_the_same_error(steps):
 
 
 def test_the_coarser_solution_of_a_damped_system_is_stable():
-    """Else it would tell nothing, and a third propagator would have to."""
+    """Otherwise the coarser solution is useless, and a third propagator is necessary."""
     system, counts = rotating((-300.0, 0.5)), []
 
     def propagate(steps, pieces):

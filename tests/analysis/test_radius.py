@@ -12,7 +12,7 @@ ERROR, TOLERANCE = 1e-10, 1e-6
 
 
 def matrices(multipliers: np.ndarray, seed: int = 0) -> jnp.ndarray:
-    """Real matrices ``(4, 4, N)`` with the eigenvalues ``(N, 4)``: two conjugate pairs or real ones each."""
+    """Real matrices ``(4, 4, N)`` with the eigenvalues ``(N, 4)``, each half a conjugate pair or two real numbers."""
     rng = np.random.default_rng(seed)
     blocks = np.zeros((len(multipliers), 4, 4))
     for k in (0, 2):
@@ -26,7 +26,7 @@ def matrices(multipliers: np.ndarray, seed: int = 0) -> jnp.ndarray:
 
 
 def samples(count: int = 3000) -> np.ndarray:
-    """Two pairs, a pair and two real ones of one sign, four real ones; moduli from 1e-3 to 3."""
+    """Eigenvalues with moduli from 1e-3 to 3: two pairs, a pair and two real numbers of one sign, or four real numbers."""
     rng = np.random.default_rng(1)
     modulus, angle = 10.0 ** rng.uniform(-3, 0.5, (count, 4)), rng.uniform(0, np.pi, (count, 2))
     pairs = [modulus[:, k] * np.exp(1j * angle[:, k]) for k in (0, 1)]
@@ -56,7 +56,7 @@ def test_bound_holds_and_is_a_few_times_that_of_eigenvalues():
 
 
 def test_a_negative_determinant_is_left_to_the_eigenvalues():
-    """Two quadratics with positive constants cannot have it."""
+    """The closed form has two quadratics with positive constants, which cannot have a negative determinant."""
     z = matrices(np.array([[2.0, -0.5, 0.3, 0.1], [2.0, 0.5, 0.3, 0.1]], complex))
     rho, bound = radii(z)
     np.testing.assert_allclose(rho, 2.0, rtol=1e-13)
@@ -64,7 +64,7 @@ def test_a_negative_determinant_is_left_to_the_eigenvalues():
 
 
 def test_lanes_do_not_depend_on_each_other():
-    """Nor on whether one of them has to be judged by eigenvalues, or is no number at all."""
+    """Lanes do not change if another lane needs eigenvalues or is NaN."""
     z = matrices(samples(30))
     negative = matrices(np.array([[2.0, -0.5, 0.3, 0.1]], complex))
     alone = radii(z)
@@ -75,7 +75,7 @@ def test_lanes_do_not_depend_on_each_other():
 
 
 def test_meeting_multipliers_have_the_root_of_the_error_as_bound():
-    """A pair on its way to a double multiplier: honest, and not infinite."""
+    """The bound of a pair that approaches a double multiplier holds and stays finite."""
     for gap in (1e-3, 1e-6, 0.0):
         rho, bound = radii(matrices(np.array([[1.2 + gap, 1.2 - gap, 0.2 + 0.1j, 0.2 - 0.1j]])))
         assert abs(rho[0] - 1.2 - gap) <= bound[0] <= 1e-4

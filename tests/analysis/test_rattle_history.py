@@ -1,4 +1,4 @@
-"""Histories of oscillators with play: exact motion with its events, and averaged amplitude and phase."""
+"""Histories of oscillators with play: the exact motion with its events, and averaged amplitude and phase."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def exact(values, times, outputs=("u", "v"), **options):
 
 @pytest.mark.parametrize("case", REFERENCE, ids=lambda case: case["name"])
 def test_transients_of_the_reference(case):
-    """State after whole periods, on the way of which all crossings are counted."""
+    """State after whole periods, and the number of crossings until then."""
     values = case["params"] | {"u0": float(case["u0"]), "v0": float(case["v0"])}
     period = 2 * math.pi / values["omega"]
     found = exact(values, [0.3 * period, case["periods"] * period], ["u", "v", "event_count"])
@@ -74,7 +74,7 @@ def test_the_acceleration_is_that_of_the_vector_field():
 
 
 def test_requested_times_do_not_change_the_motion():
-    """Within rounding of the motion of a hundred periods, also at times that end or begin a drive period."""
+    """The state after a hundred periods is the same up to rounding, even if times coincide with ends of drive periods."""
     period = 2 * math.pi / 0.86
     few = exact(GEARS, [50 * period, 100 * period])
     many = exact(GEARS, np.arange(1, 401) * period / 4)
@@ -92,7 +92,7 @@ def test_a_batch_is_its_points():
 
 
 def test_derivatives_by_every_parameter():
-    """Against central differences at times after many contacts, and through periods of the drive."""
+    """Derivatives agree with central differences after many contacts and drive periods."""
     times = (5.0, 40.0)
     slopes = jax.jacrev(lambda g: dt.history(g, times=list(times)).u)(dt.Rattle(**GEARS))
     for name, value in GEARS.items():
@@ -115,7 +115,7 @@ def averaged(times, **options):
 
 @pytest.mark.parametrize("reach", [0.0, 1.0])
 def test_slow_flow_against_the_polar_equations(reach):
-    """(42), (43) by SciPy, from the amplitude and phase of the start."""
+    """The slow flow agrees with (42), (43) by SciPy, from the amplitude and phase of the start."""
     times = np.linspace(0, 120, 31)
     found = averaged(times, fit_range=reach)
     model = dt.Rattle(**GEARS).oscillator()
@@ -145,7 +145,7 @@ def test_slow_flow_against_the_polar_equations(reach):
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_the_slow_flow_settles_at_the_response(sign):
-    """Amplitude and phase of a branch of ``frequency_response``, for a drive of either sign."""
+    """The final amplitude and phase are those of a branch of ``frequency_response``, for a drive of either sign."""
     values = GEARS | {"B1": sign * TABLE1["B1"]}
     found = dt.history(dt.Rattle(**values), outputs=AVERAGED, method="slow_flow", times=[1500.0])
     line = dt.Rattle(**{name: x for name, x in values.items() if name not in ("u0", "v0")})

@@ -35,7 +35,7 @@ def test_a_rotation_and_a_chain():
     angle = 2.0 * X * (1.5 + 1.5**2 / 2)
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     assert found[2] == pytest.approx(np.moveaxis(turn, -1, 0), abs=1e-13)
-    # Where x = 0 only P' = g q is left.
+    # At x = 0 only P' = g q is left.
     assert found[0, 2] == pytest.approx(np.array([[1.0, 0.0], [2.25, 1.0]]), abs=1e-14)
     assert (np.linalg.det(found) == pytest.approx(1.0, abs=1e-12)) and left_out.max() < 1e-12
 
@@ -46,7 +46,7 @@ def test_fewer_parts_leave_out_more_and_say_so():
     for parts in (20, 30, 45):
         found, left_out = along(chain, (0.0, 20.0), 1, parts)
         error = np.abs(found - exact).max()
-        # The last term is there: what is left out is the next one, and what time nodes leave out.
+        # The error consists of the next term and of the truncation by the time nodes.
         assert error < 0.1 * before and error < 100 * left_out.max()
         before = error
     assert before < 1e-10
@@ -57,7 +57,7 @@ def test_entries_elsewhere_where_the_coordinate_is_0_are_noticed():
         return LinearPeriodic(lambda t: ((0, parameter), (-parameter, jnp.array([0.0, -0.1, 0.0]))), 1.0)
 
     assert np.isinf(along(friction, (0.0, 1.0), 1, 4)[1]).tolist() == [False, True, False]
-    # That one leads from the second state to the first.
+    # Here the constant part leads from the second state to the first.
     assert np.isinf(along(lambda p: LinearPeriodic(lambda t: ((0, 1 + p), (-p, 0)), 1.0), (0.0, 1.0), 1, 4)[1]).all()
 
 
@@ -66,7 +66,7 @@ def test_entries_elsewhere_where_the_coordinate_is_0_are_noticed():
     [({}, 1.569), ({"zeta": 0.0}, 1.57), ({"zeta": 0.1, "alpha": 3.0}, 1.3), ({"mu": 20.0, "gamma": 0.5}, 1.55)],
 )
 def test_lines_of_the_cardan_shaft_against_direct_solves(change, steepest):
-    """Steep angles, strong damping and speeds down to 0.05."""
+    """Propagators agree with direct solves at steep angles, with strong damping and at speeds down to 0.05."""
     fixed = {**BASE, **change}
     beta, omega = np.array([0.0, 1.0, steepest]), 0.05
     build = CARDAN.models["floquet"].build
@@ -86,7 +86,7 @@ def test_lines_of_the_cardan_shaft_against_direct_solves(change, steepest):
 
 
 def test_very_slow_speeds_are_marched_explicitly_and_apart():
-    """Omega = 0.001: 21,000 steps, of which the implicit scheme would make 26 times the work. Against power series."""
+    """Omega = 0.001 needs 21,000 steps; the implicit scheme would cost 26 times as much. Reference: power series."""
     omega = [1.0, 1e-3, 1.1e-3]
     scene = {
         "system": "cardan",
@@ -114,6 +114,6 @@ def test_very_slow_speeds_are_marched_explicitly_and_apart():
     assert float(left_out[0]) < 1e-13
     assert (np.abs(found.spectral_radius - exact) <= found.spectral_radius_error).all()
     assert found.spectral_radius.values == pytest.approx(exact, abs=1e-11)
-    # The long marches of the others leave the first one as exact as it is alone.
+    # Long marches of other points do not affect the accuracy of the first point.
     alone = dt.run(scene | {"points": {"Omega": omega[:1]}})
     assert float(found.spectral_radius_error[0]) == pytest.approx(float(alone.spectral_radius_error[0]), rel=1e-3)

@@ -20,7 +20,7 @@ from drivetrain_jax.systems import Shaft
 from tests.oracles.bicardan_reference import complete, matrices
 
 INF = math.inf
-# Pieces more than modes: no mode of a single span is at rest at all nodes.
+# More pieces per segment than modes, so that no mode of a single span is at rest at all nodes.
 MODES, PIECES = 5, 7
 SUPPORTED = {"k_A": INF, "k_D": INF}
 EQUAL = {"length": (1.0, 1.0), "EI": (1.0, 1.0), "rhoA": (1.0, 1.0)}
@@ -46,7 +46,7 @@ CASES = {
     },
     "elastic joint on a support": EQUAL | SUPPORTED | {"length": (1.498,) * 2, "k_joint": 875.0, "k_hinge": 0.296},
     "Timoshenko": EQUAL | SUPPORTED | SHEAR | {"EI": (1.0, 4.0), "k_hinge": 1.0, "k_joint": 100.0},
-    # At the joint slope and shear force, scaled, are larger than deflection and moment.
+    # At the joint the scaled slope and shear force are larger than deflection and moment.
     "soft joint with a heavy mass": EQUAL
     | {
         "EI": (10.0, 10.0),
@@ -65,7 +65,7 @@ CASES = {
 
 
 def random_shaft(rng: np.random.Generator, segments: int) -> dict:
-    """Contrasts to 100, joints and supports of every kind."""
+    """A shaft with contrasts up to 100, and joints and supports of every kind."""
 
     def stiffness() -> float:
         return float(rng.choice([0.0, INF, *10 ** rng.uniform(-1, 4, 2)]))
@@ -79,7 +79,7 @@ def random_shaft(rng: np.random.Generator, segments: int) -> dict:
 
 
 def in_pieces(v: Mapping) -> dict:
-    """The same shaft with every segment cut into equal ones, so that it has nodes between its joints."""
+    """The same shaft with every segment cut into equal pieces, so that it has nodes between its joints."""
     cut = {name: np.repeat(v[name], PIECES) for name in ("length", "EI", "rhoA", "kGA", "rhoI")}
     cut["length"] = cut["length"] / PIECES
     for name, none in (("k_joint", 0.0), ("m_joint", 0.0), ("k_hinge", INF)):
@@ -89,7 +89,7 @@ def in_pieces(v: Mapping) -> dict:
 
 
 def elements(values: Mapping) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies [rad/s] of one mode more than ``MODES``, and the deflections at the nodes, modes first."""
+    """Frequencies [rad/s] of ``MODES + 1`` modes and deflections at the nodes, modes first, by finite elements."""
     v = in_pieces(complete(values))
     nodes = len(v["length"]) + 1
     rigid = np.isinf(np.r_[v["k_A"], v["k_joint"], v["k_D"]])
@@ -105,7 +105,7 @@ def elements(values: Mapping) -> tuple[np.ndarray, np.ndarray]:
 
 
 def everything(values: Mapping) -> Shaft:
-    """The shaft with every field present, so that shafts of one number of segments share a kernel."""
+    """The shaft with every field present, so that shafts with the same number of segments share a kernel."""
     v = complete(values)
     k, m = (np.r_[v[f"{what}_A"], v[f"{what}_joint"], v[f"{what}_D"]] for what in ("k", "m"))
     return Shaft(v["length"], v["EI"], v["rhoA"], k, m, v["k_hinge"], v["kGA"], v["rhoI"])
@@ -124,8 +124,7 @@ def solve(shaft: Shaft, x: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def compare(shafts: Mapping[str, Mapping], tolerance: float) -> int:
-    """Compares all modes but those of frequency 0 and those whose frequency is nearly that of a neighbour; their
-    number."""
+    """Compare all modes except those of frequency 0 and those close to a neighbour; return the number of compared modes."""
     shapes = [everything(values) for values in shafts.values()]
     batch = jax.tree.map(lambda *fields: jnp.stack(fields), *shapes)
     p, found = (np.asarray(x) for x in solve(batch, jnp.stack([jnp.asarray(places(v)) for v in shafts.values()])))
@@ -146,7 +145,7 @@ def compare(shafts: Mapping[str, Mapping], tolerance: float) -> int:
 
 @pytest.mark.parametrize("segments", [2, 4])
 def test_shapes_against_finite_elements(segments):
-    """Named cases and random ones: the amplitude and the sign of every part."""
+    """Amplitude and sign of every part, for named and for random cases."""
     rng = np.random.default_rng(segments)
     shafts = {name: values for name, values in CASES.items() if len(values["length"]) == segments}
     named = len(shafts)
@@ -181,7 +180,7 @@ def exact_segment(v: Mapping, i: int, p: mp.mpf, x: mp.mpf) -> mp.matrix:
 
 
 def exact_node(v: Mapping, i: int, p: mp.mpf) -> mp.matrix:
-    """Joint and support in front of segment i, or the support at the end; "rigid" and "hinge" to 30 digits."""
+    """Transfer matrix of joint and support in front of segment i, or of the end; rigid and hinged to 30 digits."""
     k, m = (np.r_[v[f"{what}_A"], v[f"{what}_joint"], v[f"{what}_D"]][i] for what in ("k", "m"))
     turns = mp.mpf(v["k_hinge"][i - 1]) if 0 < i < len(v["length"]) else mp.inf
     hinge, support = mp.eye(4), mp.eye(4)
@@ -218,7 +217,7 @@ def exact_shape(v: Mapping, p: float, x: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("name", WEAK)
 def test_shapes_of_weakly_coupled_parts(name):
-    """Also what hardly moves, and what is at rest, is known to rounding of the largest deflection."""
+    """Parts that hardly move, or are at rest, are accurate to the rounding of the largest deflection."""
     values = complete(WEAK[name])
     x = np.linspace(0.0, 1.0, 41)
     p, found = (np.asarray(y) for y in solve(*(jax.tree.map(lambda y: y[None], (everything(values), jnp.asarray(x))))))
@@ -228,7 +227,7 @@ def test_shapes_of_weakly_coupled_parts(name):
 
 
 def test_a_mode_that_turns_without_deflection():
-    """Between hinges on rigid supports theta is constant and f = 0 at p^2 = kGA/rhoI; its shape is no rounding."""
+    """Between hinges on rigid supports theta is constant and f = 0 at p^2 = kGA/rhoI; the shape is exactly 0."""
     span = EQUAL | SUPPORTED | {"kGA": (20.0, 50.0), "rhoI": (0.2, 0.01), "k_hinge": 0.0, "k_joint": INF}
     answer = dt.point("bicardan", "critical_speeds", outputs=["angular_frequency", "mode_shape"], **span)
     turning = np.abs(answer.angular_frequency - math.sqrt(20.0 / 0.2)) < 1e-9

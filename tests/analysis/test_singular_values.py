@@ -29,7 +29,7 @@ ROWS, COLUMNS = 12, 9
 
 
 def random_matrices() -> np.ndarray:
-    """(lanes, rows, columns): dense, rank deficient, with double values, zero, graded in rows, with tiny entries."""
+    """Matrices (lanes, rows, columns): dense, rank deficient, with double values, graded, in blocks, tiny, huge, zero."""
     rng = np.random.default_rng(3)
     dense = rng.standard_normal((8, ROWS, COLUMNS))
     deficient = dense @ np.diag([1, 1, 1, 1, 1, 1, 1, 0, 0]) @ np.linalg.qr(rng.standard_normal((COLUMNS, COLUMNS)))[0]
@@ -74,8 +74,11 @@ def test_rotations_are_orthogonal_however_small_the_numbers():
 
 @pytest.mark.parametrize("few", [False, True], ids=["optimised", "few"])
 def test_coincident_values_however_it_is_compiled(few):
-    """A gear with twelve planets: entries of nothing but rounding all over. Evaluated twice, differently rounded, they would
-    give rotations that are none: errors of 1e-7 where nothing was optimised."""
+    """The form of a gear with twelve planets has many entries of pure rounding.
+
+    Two evaluations with different rounding would give rotations that are not orthogonal: errors were 1e-7 without
+    optimisation.
+    """
     case = json.loads((Path(__file__).parents[1] / "reference" / "planetary.json").read_text())["N12_random"]
     parameters = case_parameters(case)
     parameters["planet_angle"] = tuple(parameters["planet_angle"])
@@ -89,7 +92,7 @@ def test_coincident_values_however_it_is_compiled(few):
 
 
 def test_a_wide_batch():
-    """Some thousand lanes at once: the compiler fuses and cuts loops differently there."""
+    """With some thousand lanes the compiler fuses and splits loops differently."""
     a = np.random.default_rng(4).standard_normal((5000, 7, 5))
     values, found = map(np.asarray, jax.jit(singular_values)(jnp.asarray(np.moveaxis(a, 0, -1))))
     exact = np.linalg.svd(a, compute_uv=False)[:, ::-1].T
@@ -148,7 +151,7 @@ def test_in_blocks_gives_what_the_whole_gives():
 
 
 def rotating(angles: np.ndarray) -> np.ndarray:
-    """(L, 3, 3): two shapes turn by ``angles``, the third stays."""
+    """Shapes (L, 3, 3): two turn by ``angles``, the third stays."""
     c, s, o = np.cos(angles), np.sin(angles), 0 * angles
     return np.stack([np.stack([c, s, o], 1), np.stack([-s, c, o], 1), np.stack([o, o, o + 1], 1)], axis=2)
 

@@ -1,4 +1,4 @@
-"""A function taken apart gives the same numbers; what does not change, and what is shared, is computed once."""
+"""A split function returns the same numbers; fixed and shared values are computed once."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_same_numbers_and_nothing_twice():
     found = counts(split.moving, split.fixed, TIMES)
     assert found["sqrt"] == 1
     assert "sin" not in found and "exp" not in found, "they do not depend on the time"
-    # The lanes of beta and the numbers mu and exp(mu).
+    # One array for the lanes of beta, and one for the numbers mu and exp(mu).
     assert sorted(array.shape for array in split.fixed) == [(1, LANES), (2,)]
 
 

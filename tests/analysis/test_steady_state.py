@@ -30,7 +30,7 @@ def request(**options):
 
 @pytest.fixture(scope="module")
 def steady():
-    """The kernel over all parameters, for up to 64 points at a time."""
+    """The compiled solver over all parameters, for up to 64 points."""
     solver, _ = ANALYSIS.solvers(get_system("rattle"), request(most_periods=800))
     compiled = jax.jit(lambda columns: solver.solve(columns, jnp.int32(1)))
 
@@ -80,7 +80,7 @@ def test_multipliers_obey_liouville(steady):
 
 
 def test_the_attractor_is_the_one_that_the_motion_reaches(steady):
-    """Against the motion itself, followed until nothing changes any more."""
+    """The attractor agrees with the motion itself after 480 periods."""
     rng = np.random.default_rng(5)
     cases = []
     for _ in range(48):
@@ -95,7 +95,7 @@ def test_the_attractor_is_the_one_that_the_motion_reaches(steady):
         return march(lanes, start(lanes, values["u0"], values["v0"], jnp.full(48, 480, jnp.int32)), 100_000)
 
     motion = settled(table)
-    # 480 is a multiple of every short period: the motion is back at the phase of the orbit up to a shift.
+    # Compare motions of period one only: others may be shifted by whole drive periods.
     periodic = np.isin(found["period_multiple"], (1,))
     assert periodic.sum() > 35
     assert np.abs(found["orbit_state"][0] - motion.u)[periodic].max() < 1e-6
@@ -108,12 +108,12 @@ def test_chaos_is_non_periodic_with_its_exponent(steady):
     np.testing.assert_array_equal(found["period_multiple"], 0)
     np.testing.assert_array_equal(found["regime"], 3)
     np.testing.assert_array_equal(found["outcome"], Outcome.SUCCESS)
-    # An average over 600 periods only.
+    # Averages over only 600 periods.
     np.testing.assert_allclose(found["lyapunov_exponent"], [0.057, 0.097], atol=0.02)
 
 
 def test_the_exponent_of_chaos_is_the_mean_growth_of_a_tangent():
-    """Whether or not most_periods is a multiple of 4; few enough periods for rounding to matter little."""
+    """The exponent is right even if most_periods is no multiple of 4; few periods keep rounding small."""
     case, most = TABLE1 | {"alpha": 0.0, "B1": 0.2, "omega": 1.2}, 67
     scene = {"system": "rattle", "analysis": "steady_state", "outputs": ["lyapunov_exponent", "regime"]}
     found = dt.run(scene | {"points": {k: [v] for k, v in case.items()}, "options": {"most_periods": most}})
@@ -133,7 +133,7 @@ def test_the_exponent_of_chaos_is_the_mean_growth_of_a_tangent():
 
 
 def test_what_is_said_of_chaos_leaves_room_for_a_transient():
-    """No finite time tells it from an attractor."""
+    """No finite time distinguishes a chaotic transient from an attractor."""
     said = {variable.name: variable.long_name for variable in ANALYSIS.variables}
     assert "not periodic within most_periods" in said["period_multiple"]
     assert "possibly a transient" in said["regime"]
@@ -147,7 +147,7 @@ def test_a_lane_alone_is_the_lane_in_its_batch(steady):
 
 
 def test_underdamped_motions_have_a_faster_solver_with_the_same_results(steady):
-    """Without a spring in the gap, or with strong damping, the free motion does not oscillate everywhere."""
+    """Without a spring in the gap, or with strong damping, the solver for oscillating free motion does not apply."""
     names = ("u_max", "u_min", "spectral_radius", "period_multiple")
     both = ANALYSIS.solvers(get_system("rattle"), Request(names, "exact", request(most_periods=800).options))
     edge = {"k": 4.0, "I": 1.0, "alpha": 0.25, "c": 2.0}
@@ -180,19 +180,19 @@ def test_sweeps_jump_where_the_folds_are():
 
 
 def test_a_motion_beside_a_period_doubling_is_found(steady):
-    """A doubled period just after it has doubled: left alone, the motion has not arrived after 2,000 periods."""
+    """Just beyond a period doubling a motion without Newton's method does not arrive within 2,000 periods."""
     found = steady([TABLE1 | {"omega": 0.1 + 15 * 2.4 / 159, "B1": 0.0005 + 50 * 0.0995 / 79}])
     assert found["outcome"][0] <= Outcome.TOLERANCE_NOT_MET and found["period_multiple"][0] > 0
     assert 0.98 < found["spectral_radius"][0] < 1
 
 
-# Initial states (u0, v0) at omega = .755, whose motion comes near the low orbit and then goes to the high one.
+# Initial states (u0, v0) at omega = .755 whose motion comes near the low orbit and then ends on the high one.
 DECEPTIVE = (
     (0.5215775691669651, -0.6393525366740063),
     (-0.20141797302680953, -0.4049613732416695),
     (0.0822821066084174, -0.6127611172405938),
 )
-# Slow multipliers with little damping, -.974 +- .043 i: the motion leaves again after long obedience to the linearisation.
+# Slow multipliers with little damping, -.974 +- .043 i: the motion agrees with the linearisation for long and then leaves.
 SLOWLY_TURNING = {
     "B0": 0.03536850717732474, "B1": 0.19509840689750588, "b": 0.28155540255385003, "c": 0.010425846488197542,
     "alpha": 0.40617438718382726, "omega": 1.2927647146195436, "u0": 0.8661239613011145, "v0": 0.8055098434824857,
@@ -200,7 +200,7 @@ SLOWLY_TURNING = {
 
 
 def test_initial_states_lead_where_the_motion_goes(steady):
-    """Beside the fold at .75385 the basin of the low motion is small: against the motions, run for 600 periods."""
+    """Near the fold at .75385 the basin of the low motion is small; reference: the motions after 600 periods."""
     place = np.linspace(-0.9, 0.9, 7)
     cases = [TABLE1 | {"omega": 0.755, "u0": u, "v0": v} for u, v in DECEPTIVE]
     cases += [TABLE1 | {"omega": 0.757, "u0": float(u), "v0": float(v)} for u in place for v in place]
@@ -216,7 +216,7 @@ def test_initial_states_lead_where_the_motion_goes(steady):
 
 
 def test_a_motion_that_obeys_and_then_leaves_is_not_taken(steady):
-    """It obeys the linearisation for 13 periods, at distances from .13 down to .1, and then ends elsewhere."""
+    """The motion agrees with the linearisation for 13 periods, at distances from .13 to .1, and then ends elsewhere."""
     found = steady([TABLE1 | SLOWLY_TURNING])
     assert found["outcome"][0] == Outcome.NOT_CONVERGED or abs(found["orbit_state"][0, 0] + 0.06712527) > 0.1
 
@@ -229,7 +229,7 @@ def test_an_undamped_drive_at_resonance_has_no_value(steady):
 
 @pytest.mark.parametrize("ripple", [0.0, 1e-13, 1e-12])
 def test_gears_at_rest_under_load_are_a_steady_state(steady, ripple):
-    """u = (1 - alpha) b + B0/(k/I), at which the velocity is rounding."""
+    """Gears rest at u = (1 - alpha) b + B0/(k/I), with a velocity of rounding."""
     still = TABLE1 | {"B1": ripple}
     found = steady([still | {"omega": omega} for omega in (1 / 3, *np.linspace(0.1, 5, 60))])
     assert np.all(found["outcome"] == Outcome.SUCCESS) and np.all(found["period_multiple"] == 1)
@@ -239,7 +239,7 @@ def test_gears_at_rest_under_load_are_a_steady_state(steady, ripple):
 
 
 def test_a_motion_without_a_fundamental_has_no_phase(steady):
-    """A hundredfold of the rounding of a motion at rest is enough of a ripple to tell the phase of."""
+    """A ripple of a hundred times the rounding of a motion at rest already has a phase."""
     omegas = np.linspace(0.2, 3.0, 30)
     none, some = (steady([TABLE1 | {"B1": ripple, "omega": omega} for omega in omegas]) for ripple in (0.0, 1e-11))
     assert np.isnan(none["phase"]).all() and np.all(none["outcome"] == Outcome.SUCCESS)
@@ -252,7 +252,7 @@ GENTLE = {"omega": 1.35, "B0": 0.25, "b": 1.0, "c": 0.02, "alpha": 0.25, "k": 1.
 
 @pytest.mark.parametrize(("drive", "above"), [(1e-5, 4.7868552319e-5), (1e-6, 4.786855232e-6), (1e-7, 4.78685528e-7)])
 def test_a_flank_is_passed_however_gently(drive, above):
-    """About a rest on the flank motions are alike at any scale (Taylor series with 64 bits)."""
+    """About a rest on the flank motions are similar at any scale; reference: Taylor series with 64 bits."""
     found = dt.point(
         "rattle", "steady_state", **GENTLE, B1=drive, u0=1 + 2 * drive, outputs=["u_max", "spectral_radius"]
     )
@@ -272,7 +272,7 @@ def test_a_motion_far_smaller_than_the_gap_has_its_extremes():
 
 
 def test_transition_matrix_changes_at_the_flank():
-    """Stiff contacts after long flights, of which each multiplies what a step is late (128-bit Taylor series)."""
+    """Stiff contacts after long flights amplify the delay of each step at a flank; reference: 128-bit Taylor series."""
     stiff = {"omega": 0.16774254954145118, "B0": 0.6614757353230992, "B1": 2.8471279515012524, "b": 2.034211854040951}
     stiff |= {"c": 0.12066008631247528, "alpha": 0.0, "k": 6027.824857365027, "I": 0.14705915661446092}
     start = {"u0": 0.4651093238943746, "v0": 0.9787693424178078}
@@ -281,7 +281,7 @@ def test_transition_matrix_changes_at_the_flank():
 
 
 def test_slow_drive_without_a_spring_in_the_gap_shows_rounding():
-    """The response that is taken off is 3e5 times the motion (integrated by Taylor series with 64 bits)."""
+    """The subtracted harmonic response is 3e5 times the motion; reference: Taylor series with 64 bits."""
     slow = {"omega": 5e-5, "B0": 0.01, "B1": 0.03, "b": math.pi / 18, "c": 1e-3, "alpha": 0.0, "k": 1.0, "I": 1.0}
     found = dt.point("rattle", "steady_state", **slow, most_periods=64, outputs=["u_rms", "state_error"])
     assert abs(found.u_rms - 0.1941257696104358) < found.state_error < 1e-8
@@ -290,7 +290,7 @@ def test_slow_drive_without_a_spring_in_the_gap_shows_rounding():
 
 @pytest.mark.parametrize("outputs", [["impacts"], ["impacts", "u_rms"]])
 def test_every_impact_is_counted_once(outputs):
-    """Against the samples of the motion: a few in a hundred were missed or counted twice, others for other outputs."""
+    """Impacts agree with samples of the motion, for any outputs; a few percent were once missed or counted twice."""
     scene = {"system": "rattle", "analysis": "steady_state", "fixed": TABLE1}
     scene |= {"axes": {"omega": {"start": 0.1, "stop": 3.0, "num": 120}}}
     found, sampled = (dt.run(scene | {"outputs": names}) for names in (outputs, ["u_history"]))

@@ -1,4 +1,4 @@
-"""The verdict's rule: every piece of evidence counts."""
+"""The rule of the verdict: every piece of evidence counts."""
 
 from __future__ import annotations
 
@@ -59,13 +59,13 @@ def test_growth_is_not_chaos(changed):
     ],
 )
 def test_nothing_is_said_of_what_is_not_resolved(changed):
-    """Nor of exponents that are no numbers; what a torque drives beyond the bounds is not unstable."""
+    """Unresolved motions, exponents of NaN, and motions that a torque drives beyond the bounds are undecided."""
     assert verdict(CHAOTIC, **changed) == Verdict.UNDECIDED
 
 
 @pytest.mark.parametrize(("error", "residual", "good"), [(1e-3, 2e-3, True), (1e-3, 4e-3, False), (5e-3, 4e-3, True)])
 def test_exponents_add_up_to_their_size_or_error(error, residual, good):
-    """A thousandth of the largest exponent, 3, or the largest standard error."""
+    """The residual may be a thousandth of the largest exponent, 3, or the largest standard error."""
     errors = jnp.array([1e-3, error])
     assert bool(adds_up(jnp.array([-1.0, -3.0]), errors, jnp.array(-residual), 1.0)) is good
     assert not adds_up(jnp.array([-1.0, -3.0]), errors, jnp.array(jnp.nan), 1.0)
@@ -80,7 +80,7 @@ def test_two_step_sizes_agree_to_a_tenth_or_three_errors(other, error, good):
 
 
 def test_a_motion_that_left_agrees_to_a_tenth():
-    """Its error is not known."""
+    """The error of a motion that left the bounds is unknown, so exponents may differ by a tenth."""
     assert [bool(same_exponent(1.0, 0.1, other, jnp.nan)) for other in (1.05, 1.2, jnp.nan)] == [True, False, False]
 
 

@@ -1,5 +1,7 @@
-"""Direct solves of the cardan shaft's propagator, jitted once for all tolerances and parameter sets: what the engine does,
-in short. An atlas from them, and the spectral radius beside it."""
+"""Direct solves of the cardan shaft's propagator, an atlas from them, and spectral radii for comparison.
+
+The solves are jitted once for all tolerances and parameter sets, as a short form of the engine.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,7 @@ _SIZES = (512, 16, 64)
 
 
 def solvers(rtol: float) -> Sequence[Any]:
-    """The solvers of ``direct`` for the propagator."""
+    """The solvers of the method ``direct`` for the propagator."""
     return ANALYSIS.solvers(CARDAN, Request(OUTPUTS, "direct", {"rtol": rtol}))
 
 
@@ -39,12 +41,12 @@ def _batch(index: int) -> Callable[..., jax.Array]:
 
 
 def propagators(columns: Mapping[str, Any], rtol: float = 1e-13) -> np.ndarray:
-    """``(N, 16)`` for arrays of parameters."""
+    """Propagators ``(N, 16)`` for arrays of parameters."""
     return solves(columns, rtol)[:, :16]
 
 
 def solves(columns: Mapping[str, Any], rtol: float) -> np.ndarray:
-    """The same with their errors behind them, ``(N, 32)``; points of similar effort are solved together."""
+    """Propagators followed by their errors, ``(N, 32)``; points of similar effort are solved together."""
     given = np.broadcast_arrays(*(np.atleast_1d(np.asarray(columns[name], float)) for name in NAMES))
     points = dict(zip(NAMES, given, strict=True))
     efforts = np.stack([np.asarray(s.effort(points), float) * s.unit_cost for s in solvers(rtol)])
@@ -78,7 +80,7 @@ def cardan_atlas(
 
 
 def monodromy(phi: np.ndarray) -> np.ndarray:
-    """``Z = X Phi^T X Phi`` of ``(N, 16)``, ``(N, 4, 4)``."""
+    """``Z = X Phi^T X Phi``, ``(N, 4, 4)``, from propagators ``(N, 16)``."""
     x = CARDAN.models["floquet"].build({**BASE, "beta": 0.3, "Omega": 1.0}).reduced.reversor
     matrix = phi.reshape(-1, 4, 4)
     return x @ np.swapaxes(matrix, 1, 2) @ x @ matrix
@@ -92,6 +94,6 @@ def direct_radius(atlas: StabilityAtlas, points: np.ndarray, rtol: float = 1e-14
 
 
 def random_points(atlas: StabilityAtlas, count: int, seed: int = 0) -> np.ndarray:
-    """Points anywhere within the ranges of the atlas."""
+    """Random points within the ranges of the atlas."""
     lower, upper = atlas.atlas.lower, atlas.atlas.upper
     return lower + (upper - lower) * np.random.default_rng(seed).random((count, len(lower)))

@@ -1,9 +1,9 @@
-"""Frequencies of the stepped shaft to 30 digits and more: the paper's determinant in as many digits as it loses.
+"""Frequencies of the stepped shaft to 30 digits and more, from the paper's determinant with enough additional digits.
 
-``Psi(p)``, (25) of the paper, loses ``exp(tau)`` in accuracy, tau being the sum of all phases: mpmath carries that many
-digits more. Number and place of the frequencies come from finite elements of high degree
-(:func:`tests.oracles.bicardan_reference.finite_elements`), so that none is missed where two lie next to each other; the two
-methods share nothing, and the result says how far they differ.
+``Psi(p)``, (25) of the paper, loses the factor ``exp(tau)`` in accuracy, where tau is the sum of all phases; mpmath works
+with that many more digits. Number and position of the frequencies come from finite elements of high degree
+(:func:`tests.oracles.bicardan_reference.finite_elements`), so that close frequencies are not missed. The two methods are
+independent, and the result includes their difference.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from tests.oracles.bicardan_reference import finite_elements
 
 DIGITS = 40
-# Part of the highest frequency below which double precision leaves the finite elements no digits to compare.
+# Fraction of the highest frequency below which finite elements in double precision have no digits left to compare.
 _COMPARED = 1e-4
 
 
@@ -42,8 +42,8 @@ def determinant(q: Any, p: Mapping[str, Any]) -> Any:
 def precise_frequencies(
     p: Mapping[str, Any], modes: tuple[int, ...], bubbles: int = 30, digits: int = DIGITS
 ) -> tuple[list[Any], float]:
-    """Angular frequencies with the numbers ``modes`` (from 1; elastic ones) as mpmath numbers, and the largest relative
-    distance of the finite elements from them (of those that are not below 1e-4 of the highest)."""
+    """Angular frequencies of the elastic ``modes`` (numbered from 1) as mpmath numbers, and the largest relative difference
+    from the finite elements (for frequencies above 1e-4 of the highest one)."""
     rough = finite_elements(p, max(modes), bubbles)
     tau = max(rough) ** 0.5 * sum(
         length * (rhoA / EI) ** 0.25 for length, EI, rhoA in zip(p["length"], p["EI"], p["rhoA"], strict=True)

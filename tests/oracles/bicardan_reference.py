@@ -3,10 +3,10 @@
     (EI f'')'' = p^2 rhoA f in each segment, springs k_A, k_D (k_joint) and masses at its ends; with shear and rotary
     inertia (kGA (f' - theta))' = -p^2 rhoA f, (EI theta')' + kGA (f' - theta) = -p^2 rhoI theta.
 
-``finite_elements`` shares nothing with the package: Galerkin's method with one element of high degree per segment, its
-matrices by Gauss quadrature, eigenvalues by LAPACK. ``determinant_roots`` is what one writes from the paper with NumPy
-and SciPy: the product of 4x4 transfer matrices, a scan for changes of sign, Brent's method. Both take the parameters of
-the system by name.
+``finite_elements`` is independent of the package: Galerkin's method with one element of high degree per segment, matrices
+by Gauss quadrature, eigenvalues by LAPACK. ``determinant_roots`` is the plain implementation of the paper with NumPy and
+SciPy: the product of 4x4 transfer matrices, a scan for changes of sign, Brent's method. Both take the parameters of the
+system by name.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Element = tuple[np.ndarray, np.ndarray]
 
 
 def complete(parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """All parameters, what is not given set to "none", lists as arrays."""
+    """All parameters, with missing ones set to no effect and lists as arrays."""
     n = len(parameters["length"])
     defaults = {"k_joint": 0.0, "m_joint": 0.0, "k_hinge": np.inf, "kGA": np.inf, "rhoI": 0.0, "m_A": 0.0, "m_D": 0.0}
     values = {**defaults, **parameters}
@@ -39,15 +39,15 @@ def complete(parameters: Mapping[str, Any]) -> dict[str, Any]:
 def _bubbles(power: int, count: int, x: np.ndarray, derivative: int) -> np.ndarray:
     """Derivatives of the functions whose derivative of the order ``power`` is ``P_k``, k = power, power + 1, ...
 
-    They vanish at both ends with ``power - 1`` derivatives, and their bending (stretching) is orthogonal: after scaling
-    by its diagonal the stiffness matrix is well conditioned, and the low frequencies keep their digits.
+    The functions vanish at both ends with ``power - 1`` derivatives, and their bending (stretching) is orthogonal. After
+    scaling by its diagonal the stiffness matrix is well conditioned, and the low frequencies keep their digits.
     """
     series = [legendre.legint(row, power - derivative, lbnd=-1) for row in np.eye(count + power)[power:]]
     return np.array([legendre.legval(x, c) for c in series]).reshape(count, -1)
 
 
 def _euler_element(length: float, EI: float, rhoA: float, bubbles: int) -> Element:
-    """Stiffness and mass for the unknowns f, theta in front, f, theta behind, bubbles."""
+    """Stiffness and mass of a slender element for the unknowns f, theta in front, f, theta behind, bubbles."""
     x, weight = legendre.leggauss(bubbles + 6)
     half = length / 2
     hermite = np.array(
@@ -64,7 +64,7 @@ def _euler_element(length: float, EI: float, rhoA: float, bubbles: int) -> Eleme
 
 
 def _timoshenko_element(length: float, EI: float, rhoA: float, kGA: float, rhoI: float, bubbles: int) -> Element:
-    """The same with an independent rotation; unknowns f, theta in front, f, theta behind, bubbles of f, of theta."""
+    """Stiffness and mass of a Timoshenko element; unknowns f, theta in front, f, theta behind, bubbles of f, of theta."""
     x, weight = legendre.leggauss(bubbles + 4)
     half = length / 2
     linear = [np.array([(1 - x) / 2, (1 + x) / 2]), np.array([-0.5 + 0 * x, 0.5 + 0 * x])]
@@ -94,7 +94,7 @@ def matrices(parameters: Mapping[str, Any], bubbles: int) -> Element:
     timoshenko = np.any(np.isfinite(v["kGA"])) or np.any(v["rhoI"] > 0)
     free = np.isfinite(v["k_hinge"])
     own = 2 * bubbles if timoshenko else bubbles
-    # f at the nodes, then theta in front of and behind every node (one unknown where the joint is rigid), then bubbles.
+    # Unknowns: f at the nodes, then theta in front of and behind every node (one if the joint is rigid), then bubbles.
     theta_before, theta_behind, count = np.zeros(n + 1, int), np.zeros(n + 1, int), n + 1
     for node in range(n + 1):
         theta_before[node] = theta_behind[node] = count
@@ -122,19 +122,19 @@ def matrices(parameters: Mapping[str, Any], bubbles: int) -> Element:
 
 
 def finite_elements(parameters: Mapping[str, Any], modes: int, bubbles: int = 14) -> np.ndarray:
-    """The first ``modes`` natural angular frequencies [rad/s]; zero modes come out small instead of 0."""
+    """The first ``modes`` natural angular frequencies [rad/s]; zero modes are small numbers instead of 0."""
     K, M = matrices(parameters, bubbles)
     v = complete(parameters)
     shift = (np.pi / np.sum(v["length"])) ** 4 * np.min(v["EI"]) / np.max(v["rhoA"])
     values = _lowest(K, M, shift, modes)
-    # The smallest that is not a zero mode is the best shift: what is far below it drowns in rounding.
+    # The smallest value that is no zero mode is the best shift: values far below the shift are lost in rounding.
     elastic = values[values > 1e-9 * values[-1]]
     values = _lowest(K, M, elastic[0], modes)
     return np.sqrt(np.maximum(values, 0.0))
 
 
 def _lowest(K: np.ndarray, M: np.ndarray, shift: float, modes: int) -> np.ndarray:
-    """Smallest eigenvalues of ``K - lambda M`` as the largest of ``M - mu (K + shift M)``."""
+    """Smallest eigenvalues of ``K - lambda M``, from the largest eigenvalues of ``M - mu (K + shift M)``."""
     stiff = K + shift * M
     scale = 1 / np.sqrt(np.diag(stiff))
     size = len(K)
@@ -148,9 +148,9 @@ def _lowest(K: np.ndarray, M: np.ndarray, shift: float, modes: int) -> np.ndarra
 
 
 def transfer_determinant(p: float, parameters: Mapping[str, Any]) -> float:
-    """Psi(p) of the paper, (25), from plain transfer matrices; for k_A = 0 too. Parameters are Python's own floats."""
+    """Psi(p) of the paper, (25), from plain transfer matrices, also for k_A = 0; parameters are Python floats."""
     k_A, k_D = parameters["k_A"], parameters["k_D"]
-    # The two columns that the left end leaves free, entry by entry: small arrays of NumPy take several times as long.
+    # The two free columns at the left end, entry by entry: small NumPy arrays take several times as long.
     columns = ((0.0, 1.0, 0.0, 0.0), (1.0, 0.0, 0.0, k_A))
     for length, EI, rhoA in zip(parameters["length"], parameters["EI"], parameters["rhoA"], strict=True):
         alpha = (p * p * rhoA / EI) ** 0.25

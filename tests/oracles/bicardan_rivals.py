@@ -1,7 +1,7 @@
-"""What engineers take for a stepped shaft: Hermite finite elements and the dynamic stiffness matrix, by NumPy and SciPy.
+"""The usual methods for a stepped shaft, Hermite finite elements and the dynamic stiffness matrix, by NumPy and SciPy.
 
-Both take the parameters ``length``, ``EI``, ``rhoA``, ``k_A``, ``k_D`` of the system by name. Nothing here comes from the
-package.
+Both methods take the parameters ``length``, ``EI``, ``rhoA``, ``k_A``, ``k_D`` of the system by name. The code is
+independent of the package.
 
 Finite elements: cubic deflection on every element, ``K u = p^2 M u`` with (f, theta) at the nodes. Dynamic stiffness: the
 exact relation between (f, theta) and (F, -M) at the ends of a segment of phase ``z = length (p^2 rhoA/EI)^(1/4)``,
@@ -22,7 +22,7 @@ from scipy.linalg import eigh
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import eigsh
 
-# Up to so many unknowns, or with so large a share of all modes asked for, dense LAPACK is the faster one.
+# Number of unknowns up to which dense LAPACK is faster, and share of all modes from which it is faster.
 _DENSE, _SHARE = 60, 0.2
 _HERMITE_STIFFNESS = np.array([[12, 6, -12, 6], [6, 4, -6, 2], [-12, -6, 12, -6], [6, 2, -6, 4]], float)
 _HERMITE_MASS = np.array([[156, 22, 54, -13], [22, 4, 13, -3], [54, 13, 156, -22], [-13, -3, -22, 4]]) / 420
@@ -47,14 +47,14 @@ def hermite_matrices(p: Mapping[str, Any], elements: int) -> tuple[csc_array, cs
 
 
 def hermite_frequencies(p: Mapping[str, Any], modes: int, elements: int) -> np.ndarray:
-    """The first ``modes`` angular frequencies; NaN for those that the elements do not have."""
+    """The first ``modes`` angular frequencies; NaN for modes that the elements do not have."""
     k, m = hermite_matrices(p, elements)
     size = k.shape[0]
     found = min(modes, size)
     if size <= _DENSE or found > _SHARE * size:
         values = eigh(k.toarray(), m.toarray(), eigvals_only=True, subset_by_index=[0, found - 1])
     else:
-        # A shift below all values: K alone is singular where the shaft is free.
+        # Shift below all values, because K alone is singular for a free shaft.
         shift = (np.pi / np.sum(p["length"])) ** 4 * np.min(p["EI"]) / np.max(p["rhoA"])
         values = np.sort(eigsh(k, found, m, sigma=-shift, return_eigenvectors=False))
     return np.r_[np.sqrt(np.maximum(values, 0.0)), np.full(modes - found, np.nan)]
@@ -70,7 +70,7 @@ def dynamic_stiffness(p: Mapping[str, Any], q: np.ndarray) -> tuple[np.ndarray, 
     clamped = np.zeros(q.shape)
     for i, (length, EI, rhoA) in enumerate(zip(p["length"], p["EI"], p["rhoA"], strict=True)):
         z = q * length * (rhoA / EI) ** 0.25
-        # Hyperbolic functions over exp(z), which cancels.
+        # Hyperbolic functions divided by exp(z), a factor that cancels.
         s, c, e = np.sin(z), np.cos(z), np.exp(-z)
         ch, sh = (1 + e * e) / 2, (1 - e * e) / 2
         delta = e - c * ch
@@ -97,16 +97,16 @@ def dynamic_stiffness(p: Mapping[str, Any], q: np.ndarray) -> tuple[np.ndarray, 
 def count_below(p: Mapping[str, Any], q: np.ndarray) -> np.ndarray:
     """The number of natural frequencies below ``q^2`` [rad/s]."""
     matrix, clamped = dynamic_stiffness(p, q)
-    # Scaled to a unit diagonal, which leaves the signs and keeps what is small beside what is large.
+    # Scale to a unit diagonal, which keeps the signs and does not lose small entries next to large ones.
     size = np.sqrt(np.abs(np.diagonal(matrix, axis1=-2, axis2=-1)))
     values = np.linalg.eigvalsh(matrix / (size[..., None] * size[..., None, :]))
     return clamped + np.sum(values < 0, axis=-1)
 
 
 def dynamic_stiffness_frequencies(p: Mapping[str, Any], modes: int, rtol: float) -> np.ndarray:
-    """The first ``modes`` angular frequencies ``(modes, ...)``, all of all shafts bisected together.
+    """The first ``modes`` angular frequencies ``(modes, ...)`` of all shafts, bisected together.
 
-    A frequency below ``1e-6`` of the first clamped one counts as 0.
+    A frequency below ``1e-6`` of the first clamped frequency counts as 0.
     """
     total = sum(length * (r / e) ** 0.25 for length, e, r in zip(p["length"], p["EI"], p["rhoA"], strict=True))
     index = np.arange(1, modes + 1).reshape(modes, *(1,) * np.ndim(total))

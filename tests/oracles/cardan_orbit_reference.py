@@ -3,8 +3,8 @@
     theta1'' = eta T - d theta1' - s theta1,   theta2'' = -eta_phi (1 + theta1')^2 - eta theta1'' - T/gamma,
     T = alpha d theta2' + mu s theta2,   s = 1/Omega^2,   d = 2 zeta/Omega,   eta, eta_phi at phi = tau + theta1;
 
-the linear response is that of the same equations to first order in theta1, theta2 and their rates.
-Independent of drivetrain_jax like :mod:`tests.oracles.cardan_reference`; states are (theta1, theta2, theta1', theta2').
+The linear response obeys the same equations to first order in theta1, theta2 and their rates. The code is independent of
+drivetrain_jax, like :mod:`tests.oracles.cardan_reference`; states are (theta1, theta2, theta1', theta2').
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def nonlinear_field(tau: float, y: np.ndarray, p: Mapping[str, float]) -> list[f
 
 
 def linear_field(tau: float, y: np.ndarray, p: Mapping[str, float]) -> list[float]:
-    """theta'' + E theta' + P theta = (0, -eta')."""
+    """Right-hand side of theta'' + E theta' + P theta = (0, -eta')."""
     theta1, theta2, rate1, rate2 = y
     ((e11, e12), (e21, e22)), ((k11, k12), (k21, k22)) = damping_and_stiffness(tau, p)
     forcing = -speed_ratio(tau, p["cos_beta"], p["sin2_beta"])[1]

@@ -1,4 +1,4 @@
-"""Tables and equations as the cardan paper prints them, by NumPy and SciPy: Soltan Rezaee & Ghazavi 2014."""
+"""Tables and equations as printed in the cardan paper (Soltan Rezaee & Ghazavi 2014), by NumPy and SciPy."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def predicted_speeds(frequencies: Sequence[float]) -> dict[str, float]:
 
 
 def printed_matrices(eta_term: float) -> Matrices:
-    """The paper's (15) with P21 = ``eta_term`` eta/Omega^2: +1 as printed, -1 with that sign alone corrected."""
+    """The paper's (15) with P21 = ``eta_term`` eta/Omega^2: +1 as printed, -1 with only this sign corrected."""
 
     def matrices(tau: float, p: Mapping[str, Any]) -> tuple[Pair, Pair]:
         (row1, (_, e22)), (k1, (_, k22)) = damping_and_stiffness(tau, p)
@@ -66,7 +66,7 @@ def base_chart(stride: int) -> dict[str, np.ndarray]:
 
 
 def unstable_fraction(matrices: Matrices, stride: int) -> tuple[float, float]:
-    """Fraction of unstable cells by SciPy, and the fraction of these that "or Re(sigma) <= 0" calls stable."""
+    """Fraction of unstable cells by SciPy, and the fraction of these cells that count as stable by "or Re(sigma) <= 0"."""
     multipliers = np.linalg.eigvals(stacked_monodromy(base_chart(stride), 1e-8, 1e-8, batch=256, matrices=matrices))
     outside = np.abs(multipliers) > 1 + 1e-7
     unstable = outside.any(axis=1)

@@ -2,14 +2,14 @@
 
     python -m tests.oracles.cardan_precise_reference 1.5 0.1        # beta Omega [zeta alpha mu gamma]
 
-Nothing here comes from drivetrain_jax or from SciPy. In theta1, v1 = theta1', phi = theta2 + eta theta1 and w = phi'
-the linearised equations need no derivative of eta,
+The code is independent of drivetrain_jax and SciPy. In theta1, v1 = theta1', phi = theta2 + eta theta1 and w = phi' the
+linearised equations need no derivative of eta,
 
     v1' = -2 zeta s v1 - s^2 theta1 + eta T,    w' = -T/gamma,    s = 1/Omega,
     T = 2 alpha zeta s (w - (eta theta1)') + mu s^2 (phi - eta theta1).
 
-Their Taylor coefficients follow from two products of power series for each column of the fundamental matrix; the step is
-a fixed part of the distance to the nearest pole of eta. Numbers are integers over 2^BITS.
+Taylor coefficients follow from two products of power series for each column of the fundamental matrix. The step is a fixed
+fraction of the distance to the nearest pole of eta. Numbers are integers over 2^BITS.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _DIGITS = 60
 
 
 def spectral_radius(point: Mapping[str, float]) -> mpmath.mpf:
-    """The spectral radius over the period pi, of parameters that are taken to be exact as they are stored."""
+    """The spectral radius over the period pi; the stored parameters count as exact."""
     with mpmath.workdps(_DIGITS):
         z = mpmath.matrix(4, 4)
         for j, column in enumerate(_propagate(point)):
@@ -91,7 +91,7 @@ def _speed_ratio(tau: mpmath.mpf, h: mpmath.mpf, c: mpmath.mpf, s2: mpmath.mpf) 
 
 
 def _advance(column: list[int], eta: np.ndarray, h: int, constants: list[int]) -> list[int]:
-    """One column over a step ``h``; coefficients carry powers of it."""
+    """One column after a step ``h``; its coefficients include powers of ``h``."""
     damping1, stiffness1, damping2, stiffness2, softness = constants
     theta, v, phi, w, u, torque = (np.zeros(ORDER + 2, dtype=object) for _ in range(6))
     theta[0], v[0], phi[0], w[0] = column
@@ -109,7 +109,7 @@ def _advance(column: list[int], eta: np.ndarray, h: int, constants: list[int]) -
 
 
 def main() -> None:
-    """Print the spectral radius of the point given."""
+    """Print the spectral radius of the point in the arguments."""
     known = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     for name, default in (
         ("beta", None),

@@ -1,6 +1,6 @@
-"""The cardan shaft written plainly with NumPy and SciPy: the oracle of the tests and the baseline of the benchmarks.
+"""The cardan shaft in plain NumPy and SciPy: the oracle of the tests and the baseline of the benchmarks.
 
-Nothing here comes from drivetrain_jax. The equations are the linearised ones in the paper's own coordinates,
+The code is independent of drivetrain_jax. The equations are the linearised ones in the paper's coordinates,
 
     theta'' + E(tau) theta' + P(tau) theta = 0,    u = (theta1, theta2, theta1', theta2'),    period pi,
 
@@ -31,13 +31,13 @@ Matrices = Callable[[float, Parameters], tuple[Pair, Pair]]
 def speed_ratio(tau: float, c: Any, s2: Any) -> tuple[Any, Any, Any]:
     """``eta = c/(1 - s2 sin(tau)^2)``, c = cos(beta), s2 = sin(beta)^2, and its first two derivatives in ``tau``."""
     d = 1 - s2 * math.sin(tau) ** 2
-    # Derivatives of d, then the quotient rule.
+    # Derivatives of the denominator d, then the quotient rule.
     d1, d2 = -s2 * math.sin(2 * tau), -2 * s2 * math.cos(2 * tau)
     return c / d, -c * d1 / d**2, c * (2 * d1**2 / d**3 - d2 / d**2)
 
 
 def damping_and_stiffness(tau: float, p: Parameters) -> tuple[Pair, Pair]:
-    """The checked ``E`` and ``P``; the printed ones lack eta'', half of eta' and a sign (docs/validation/cardan.md).
+    """The correct ``E`` and ``P``; the printed matrices lack eta'', half of eta' and a sign (docs/validation/cardan.md).
 
     Besides the six parameters ``p`` holds ``cos_beta`` and ``sin2_beta``, computed once and not at every ``tau``.
     """
@@ -64,7 +64,7 @@ def monodromy(
 
     lower = a.reshape(-1)[8:]
 
-    # One trajectory of 16 components, Python floats in the coefficients: what a careful user of solve_ivp writes.
+    # One trajectory of 16 components with Python floats in the coefficients, as a careful user of solve_ivp writes it.
     def field(tau: float, y: np.ndarray) -> np.ndarray:
         ((e11, e12), (e21, e22)), ((k11, k12), (k21, k22)) = matrices(tau, point)
         lower[:] = (-k11, -k12, -e11, -e12, -k21, -k22, -e21, -e22)
@@ -86,9 +86,9 @@ def stacked_monodromy(
     batch: int = 512,
     matrices: Matrices = damping_and_stiffness,
 ) -> np.ndarray:
-    """Monodromy matrices, shape ``(N, 4, 4)``, of all points, ``batch`` of them at a time as one state of solve_ivp.
+    """Monodromy matrices, shape ``(N, 4, 4)``, of all points, with ``batch`` points as one state of solve_ivp.
 
-    Points are grouped by stiffness (``Omega``, then ``beta``), because a batch steps as its hardest point does.
+    Points are grouped by stiffness (``Omega``, then ``beta``), because the hardest point determines the steps of a batch.
     """
 
     def solve(point: Parameters, identity: np.ndarray) -> np.ndarray:
@@ -100,7 +100,7 @@ def stacked_monodromy(
 def stacked_half_period_monodromy(
     p: Parameters, rtol: float = 1e-10, atol: float = 1e-10, method: str = "DOP853", batch: int = 512
 ) -> np.ndarray:
-    """Matrices similar to the monodromy matrices, from half the period as heyoka and the package get it.
+    """Matrices similar to the monodromy matrices, from half the period like the results of heyoka and of the package.
 
     The state is (theta1, theta1', theta2, omega2) with omega2 = theta2' + (eta theta1)', which needs no eta''.
     """

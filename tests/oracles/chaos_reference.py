@@ -15,18 +15,18 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 SIGMA, RHO, BETA = 10.0, 28.0, 8 / 3
-# Interval between two orthonormalisations of Lorenz' system.
+# Interval between orthonormalisations of Lorenz' system.
 INTERVAL = 0.5
 
 
 def lorenz(_: float, w: np.ndarray) -> list[float]:
-    """Lorenz' system and three tangent vectors, 12 numbers: the state, then the vectors one after another."""
-    # Python's own floats are faster than NumPy's.
+    """Rates of Lorenz' system with three tangent vectors, 12 numbers: the state, then one vector after the other."""
+    # Python floats are faster than NumPy floats.
     return _lorenz_rates(w.tolist())
 
 
 def _lorenz_rates(w: Sequence[Any]) -> list[Any]:
-    """Rates of numbers, or of heyoka's variables."""
+    """Rates for numbers, or for heyoka's variables."""
     x, y, z = w[:3]
     rates = [SIGMA * (y - x), x * (RHO - z) - y, x * y - BETA * z]
     for k in (3, 6, 9):
@@ -55,7 +55,7 @@ def scipy_flow(starts: np.ndarray, duration: float, tolerance: float, field: Cal
 
 
 def scipy_spectrum(field: Callable, start: np.ndarray, interval: float, count: int, tolerance: float) -> np.ndarray:
-    """Exponents by Benettin's method: ``count`` intervals, QR after each; ``field(t, w)`` carries the tangent vectors."""
+    """Exponents by Benettin's method with QR after each of ``count`` intervals; ``field(t, w)`` includes tangent vectors."""
     n = len(start)
     w, total = np.concatenate([start, np.eye(n).ravel()]), np.zeros(n)
     for k in range(count):
@@ -80,13 +80,13 @@ class HeyokaFlow:
         )
 
     def flow(self, starts: np.ndarray, duration: float) -> np.ndarray:
-        """States and tangent vectors after ``duration``, one row per start; their number a multiple of the batch."""
+        """States and tangent vectors after ``duration``, a row per start; their number is a multiple of the batch."""
         members = self._members(starts)
         self._advance(members, 0.0, duration)
         return members.transpose(0, 2, 1).reshape(len(starts), -1)
 
     def spectrum(self, starts: np.ndarray, interval: float, count: int) -> np.ndarray:
-        """Exponents ``(N, n)`` of all starts over ``count`` intervals; as many are made orthonormal together."""
+        """Exponents ``(N, n)`` of all starts over ``count`` intervals; all starts are orthonormalised together."""
         members = self._members(starts)
         total = np.zeros((self.n, *members[:, 0].shape))
         for k in range(count):
@@ -111,7 +111,7 @@ class HeyokaFlow:
 
 
 def _orthonormalise(vectors: np.ndarray) -> np.ndarray:
-    """Gram and Schmidt's method in place on ``(..., vector, component, batch)``; lengths ``(vector, ..., batch)``."""
+    """Gram-Schmidt in place on ``(..., vector, component, batch)``; returns the lengths ``(vector, ..., batch)``."""
     lengths = []
     for i in range(vectors.shape[-3]):
         own = vectors[..., i, :, :]
@@ -145,7 +145,7 @@ def tripod_field(p: Mapping[str, float]) -> Callable[[float, np.ndarray], list[f
 
 
 def _tripod_rates(p: Mapping[str, float], t: Any, w: Sequence[Any], functions: Any) -> list[Any]:
-    """Rates of numbers, or of heyoka's variables; ``functions`` offers ``sin``, ``cos`` and ``sqrt``."""
+    """Rates for numbers, or for heyoka's variables; ``functions`` has ``sin``, ``cos`` and ``sqrt``."""
     cos, sin = functions.cos, functions.sin
     omega, chi, a_tj = p["Omega"], p["chi"], p["A_TJ"]
     phi, v = w[0], w[1]
@@ -153,7 +153,7 @@ def _tripod_rates(p: Mapping[str, float], t: Any, w: Sequence[Any], functions: A
     g = (1 + p["c1"] * x) / ((1 + p["c2"] * x) * (1 + chi * x))
     ripple, weight = 0.5 * wave, 0.5
     for _ in range(5):
-        # cos 2x from cos x.
+        # cos 2x follows from cos x.
         wave, weight = 2 * wave * wave - 1, weight / 2
         ripple += weight * wave
     drive = p["F_over_I"] / omega * (1 + p["chi_T"] * ripple)

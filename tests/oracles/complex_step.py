@@ -1,7 +1,7 @@
-"""Derivatives by complex steps, ``df/dp = Im f(p + ih)/h``, through plain NumPy and SciPy: nothing here differentiates.
+"""Derivatives by complex steps, ``df/dp = Im f(p + ih)/h``, in plain NumPy and SciPy without automatic differentiation.
 
-Every function takes the parameters ``values`` and the ``names`` of those to differentiate by, and returns derivatives with
-the names as last axis. Lane j of an integration carries the step of parameter j.
+Every function takes the parameters ``values`` and the ``names`` of the parameters to differentiate by, and returns
+derivatives with the names as last axis. Lane j of an integration has a step in parameter j.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
-# The error of the step is its square.
+# Relative step, whose error is its square.
 STEP = 1e-9
 _TOLERANCES = {"method": "DOP853", "rtol": 3e-14, "atol": 1e-16}
 
@@ -23,7 +23,7 @@ Field = Callable[[float, np.ndarray, Values], Sequence[np.ndarray]]
 
 
 def lanes(values: Values, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Complex parameters ``(P,)``; lane j has the relative step of ``names[j]``."""
+    """Complex parameters ``(P,)``; lane j has the relative step in ``names[j]``."""
     numbers = {name: value for name, value in values.items() if not isinstance(value, str)}
     complexes = {name: np.full(len(names), value, complex) for name, value in numbers.items()}
     for j, name in enumerate(names):
@@ -49,13 +49,13 @@ def flow(field: Field, start: np.ndarray, values: Values, times: Sequence[float]
 
 
 def columns_of(n: int, values: Values) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Unit states ``(n, n, P)`` and the parameters with an axis for them."""
+    """Unit states ``(n, n, P)``, and the parameters with an axis for the states."""
     count = len(next(iter(values.values())))
     return np.repeat(np.eye(n, dtype=complex)[:, :, None], count, axis=2), dict(values)
 
 
 def radius_slopes(matrices: np.ndarray, values: Values, names: Sequence[str]) -> tuple[np.ndarray, float]:
-    """Derivatives of the spectral radius of ``matrices`` (n, n, P), and the distance of the next modulus, relative."""
+    """Derivatives of the spectral radius of ``matrices`` (n, n, P), and the relative distance of the next modulus."""
     sigma, right = np.linalg.eig(matrices[..., 0].real)
     k = int(np.argmax(np.abs(sigma)))
     left = np.linalg.inv(right)[k]
@@ -76,7 +76,7 @@ def _ratio(values: Values, phase: Any) -> tuple[Any, Any, Any]:
 
 
 def cardan_linear(tau: float, y: np.ndarray, p: Values, forcing: float = 1.0) -> list[Any]:
-    """Right-hand side of the linearised shaft; without ``forcing`` the homogeneous one."""
+    """Right-hand side of the linearised shaft, homogeneous without ``forcing``."""
     x1, x2, r1, r2 = y
     eta, d1, d2 = _ratio(p, tau)
     s, d, inertia = 1 / p["Omega"] ** 2, 2 * p["zeta"] / p["Omega"], eta**2 + 1 / p["gamma"]
@@ -87,7 +87,7 @@ def cardan_linear(tau: float, y: np.ndarray, p: Values, forcing: float = 1.0) ->
 
 
 def cardan_nonlinear(tau: float, y: np.ndarray, p: Values) -> list[Any]:
-    """Right-hand side of the shaft itself."""
+    """Right-hand side of the nonlinear shaft."""
     x1, x2, r1, r2 = y
     eta, d1, _ = _ratio(p, tau + x1)
     s, d = 1 / p["Omega"] ** 2, 2 * p["zeta"] / p["Omega"]
@@ -159,7 +159,7 @@ def _stiffness_ratio(p: Values, k: Values, x: Any) -> Any:
 
 
 def tripod_monodromy(values: Values, names: Sequence[str]) -> np.ndarray:
-    """``(2, 2, P)`` over ``1/excitation_frequency``, in the state (phi, V/omega)."""
+    """Monodromy matrix ``(2, 2, P)`` over ``1/excitation_frequency``, in the state (phi, V/omega)."""
     stepped = lanes(values, names)
     start, _ = columns_of(2, stepped)
     k = tripod_constants(stepped)
@@ -193,7 +193,7 @@ def tripod_history(values: Values, names: Sequence[str], times: Sequence[float])
 class RattleOrbit:
     """A periodic orbit of u'' + (c/I) u' + (k/I) f(u) = B0 + B1 cos(omega t) through ``state`` at t = 0.
 
-    ``crossings`` are the times at which flanks are passed in ``multiple`` periods, ``sides`` the regions between them.
+    ``crossings`` are the times of flank crossings in ``multiple`` periods, ``sides`` the regions between them.
     """
 
     def __init__(self, values: Values, state: np.ndarray, multiple: int) -> None:
@@ -219,7 +219,7 @@ class RattleOrbit:
                     lambda x, a=a, here=here, level=level: (expm(x * a) @ here)[0] - level, 0, step, xtol=1e-15
                 )
                 w, t = expm(inside * a) @ w, t + inside
-                # A hair beyond the flank, so that the next region begins inside.
+                # Slightly beyond the flank, so that the next region begins inside.
                 side = int(np.sign(level)) if side == 0 else 0
                 crossings.append(t)
                 sides.append(side)

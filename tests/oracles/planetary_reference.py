@@ -1,11 +1,12 @@
-"""The planetary gear once more, independently of the package: forces assembled entry by entry with NumPy, eigenvalues
-by SciPy or, to any number of digits, by mpmath. Oracle of the tests and rival of the benchmark.
+"""The planetary gear independently of the package: oracle of the tests and rival of the benchmark.
+
+Forces are assembled entry by entry with NumPy; eigenvalues are from SciPy or, to any number of digits, from mpmath.
 
     M q'' + K q = 0,  K = sum over springs of k d d^T,  f = sqrt(lambda(K, M))/(2 pi),
 
 with d the extension of a spring per unit of the coordinates q = [x, y, u] of carrier, ring, sun, [xi, eta, u] of planets.
-The stiffness matrix here is the one of the differential equations of motion, written body by body, whereas the package
-works with the extensions of the springs; both agree only if both are right.
+The stiffness matrix comes from the equations of motion, body by body, whereas the package uses the extensions of the
+springs; both agree only if both are right.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ TABLE_2 = {
     **{"k_sp": 5e8, "k_rp": 5e8, "k_p": 1e8, "k_s": 1e8, "k_r": 1e8, "k_c": 1e8, "k_su": 0.0, "k_ru": 1e9, "k_cu": 0.0},
     "pressure_angle": math.radians(24.6),
 }
-# Names in tests/reference/planetary.json, and here.
+# Names in tests/reference/planetary.json, and names in this module.
 _SHORT = {"ms": "m_s", "mr": "m_r", "mc": "m_c", "mp": "m_p", "Is": "I_s", "Ir": "I_r", "Ic": "I_c", "Ip": "I_p"}
 _SHORT |= {"ksp": "k_sp", "krp": "k_rp", "kp": "k_p", "ks": "k_s", "kr": "k_r", "kc": "k_c"}
 _SHORT |= {"ksu": "k_su", "kru": "k_ru", "kcu": "k_cu"}
@@ -62,7 +63,7 @@ def matrices(p: Mapping[str, Any], functions: Any = math) -> tuple[list[float], 
 
 
 def _add_planet(stiffness: list[list[Any]], p: Mapping[str, Any], i: int, sin: Any, cos: Any) -> None:
-    """The bearing and the two meshes of planet ``i``: force of each times its direction on every body it touches."""
+    """The bearing and the two meshes of planet ``i``: the force of each times its direction on every body."""
     angle, at, n = p["planet_angle"][i], 9 + 3 * i, len(p["planet_angle"])
     r, s = (p.get(f"pressure_angle_{body}", p["pressure_angle"]) for body in "rs")
     ring, sun = angle + r, angle - s
@@ -80,7 +81,7 @@ def _add_planet(stiffness: list[list[Any]], p: Mapping[str, Any], i: int, sin: A
 
 
 def natural_frequencies(p: Mapping[str, Any]) -> np.ndarray:
-    """Natural frequencies in Hz, rising, by LAPACK from mass and stiffness matrices: good to about eps f_max^2/f."""
+    """Natural frequencies in Hz, rising, by LAPACK from mass and stiffness matrices, with errors of about eps f_max^2/f."""
     mass, stiffness = matrices(p)
     values = eigh(np.array(stiffness, float), np.diag(mass), eigvals_only=True)
     return np.sqrt(np.maximum(values, 0)) / (2 * math.pi)
@@ -105,10 +106,10 @@ def exact_frequencies(p: Mapping[str, Any], digits: int = 50) -> list[float]:
 
 
 def extension_matrix(p: Mapping[str, Any]) -> np.ndarray:
-    """``diag(sqrt k) B M^(-1/2)``, shape (..., 4N + 9, 3N + 9), its singular values over 2 pi being the frequencies.
+    """``diag(sqrt k) B M^(-1/2)``, shape (..., 4N + 9, 3N + 9), whose singular values over 2 pi are the frequencies.
 
-    Parameters may be arrays of one common shape ``(...)`` (and ``planet_angle`` a list of such): the very matrices
-    that the package decomposes, for LAPACK.
+    These are the matrices that the package decomposes, for LAPACK. Parameters may be arrays of one common shape ``(...)``
+    (and ``planet_angle`` a list of such arrays).
     """
     angles = np.moveaxis(np.stack(np.broadcast_arrays(*p["planet_angle"])), 0, -1)
     a, n = np.asarray(p["pressure_angle"])[..., None], angles.shape[-1]

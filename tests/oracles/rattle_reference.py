@@ -1,10 +1,10 @@
-"""Independent solvers of the gear-rattle equation: oracle of the tests and rivals of the benchmarks. No jax in here.
+"""Independent solvers of the gear-rattle equation without jax: oracle of the tests and rivals of the benchmarks.
 
     u'' + (c/I) u' + (k/I) f(u) = B0 + B1 cos(omega t),
     f = u - (1 - alpha) b for u > b, alpha u for |u| <= b, u + (1 - alpha) b for u < -b.
 
-``extended`` goes from event to event in extended precision (80 bits): the general solution of each region from its
-complex roots, events bracketed by dense samples of u and of its extremes, then bisected. ``scipy_events`` integrates
+``extended`` goes from event to event in extended precision (80 bits). The general solution of each region comes from its
+complex roots; events are bracketed by dense samples of u and of its extremes, then bisected. ``scipy_events`` integrates
 each region with SciPy and its event location. ``scipy_plain`` integrates across the kinks.
 """
 
@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 
 Real = np.longdouble
 Complex = np.clongdouble
-# Samples per radian of the fastest motion, and how many are taken at a time.
+# Samples per radian of the fastest motion, and samples per evaluation.
 _DENSITY, _BATCH = 6, 256
 
 
@@ -58,7 +58,7 @@ class _Region:
         return at
 
     def acceleration(self, at: Callable, elapsed: np.longdouble) -> np.longdouble:
-        """Slope of the velocity of ``at``, by a central difference that is as good as its use as a Newton slope."""
+        """Slope of the velocity of ``at`` by a central difference, accurate enough for Newton's method."""
         h = Real(1e-7) / self.pace
         return (at(elapsed + h)[1] - at(elapsed - h)[1]) / (2 * h)
 
@@ -70,8 +70,10 @@ class _Region:
 
 
 def _zero(function: Callable, low: np.longdouble, high: np.longdouble) -> np.longdouble:
-    """A zero of ``function`` (which returns value and slope) between ``low`` and ``high``, where it changes sign, from
-    the side of ``high``: Newton's iteration, bisection where that leaves the bracket."""
+    """A zero of ``function`` (which returns value and slope) between ``low`` and ``high``, where it changes sign.
+
+    The method is Newton's iteration, with bisection where it leaves the bracket; the result is on the side of ``high``.
+    """
     sign = np.sign(function(low)[0])
     guess = (low + high) / 2
     for _ in range(100):
@@ -118,7 +120,7 @@ def _exit(at: Callable, region: _Region, bounds: tuple, span: np.longdouble) -> 
 
 
 def _leave(at: Callable, flank: np.longdouble, low: np.longdouble, high: np.longdouble) -> np.longdouble:
-    """The exit within the first sample: at its start the motion may stand on this very flank."""
+    """The exit within the first sample, at the start of which the motion may be on this flank."""
     outside = np.sign(at(high)[0] - flank)
     for _ in range(80):
         middle = (low + high) / 2
@@ -165,7 +167,7 @@ def extended(values: Mapping[str, float], u0: float, v0: float, periods: int) ->
 
 
 def field(values: Mapping[str, float], side: int | None = None) -> Callable:
-    """``(u', u'')``; with ``side`` given, of the linear region on that side throughout."""
+    """``(u', u'')``; with ``side`` the linear region on this side applies everywhere."""
     mass, b, alpha = values["I"], values["b"], values["alpha"]
     c, k, mean, drive, omega = values["c"] / mass, values["k"] / mass, values["B0"], values["B1"], values["omega"]
 
@@ -188,7 +190,7 @@ def scipy_plain(
 def scipy_events(
     values: Mapping[str, float], u0: float, v0: float, periods: int, rtol: float, method: str = "DOP853"
 ) -> tuple[float, float]:
-    """State after ``periods`` drive periods, each region integrated by itself up to a terminal event."""
+    """State after ``periods`` drive periods, with a separate integration of each region up to a terminal event."""
     b, end = values["b"], 2 * math.pi / values["omega"] * periods
     t, state = 0.0, [u0, v0]
     side = 1 if u0 > b else -1 if u0 < -b else 0
@@ -213,7 +215,7 @@ def scipy_events(
 
 
 def random_case(rng: np.random.Generator) -> tuple[dict[str, float], float, float, int]:
-    """Parameters over the whole range of the model, initial state and number of periods.
+    """Random parameters over the whole range of the model, initial states and numbers of periods.
 
     alpha 0..2 (each of 0 and 1 in a tenth of the cases), k 1..1e6, b 0..1 (0 in 3 %), c 1e-3..1, some overdamped.
     """
@@ -224,7 +226,7 @@ def random_case(rng: np.random.Generator) -> tuple[dict[str, float], float, floa
     if rng.random() < 0.1:
         c = 2 * math.sqrt(stiffness) * 10 ** rng.uniform(-0.3, 0.5)
     values = {
-        # Motions very much faster than the drive would take the oracle for ever.
+        # Limit the frequency ratio: motions much faster than the drive would take the oracle too long.
         "omega": 0.25 * stiffness**0.2 * 10 ** rng.uniform(0, 1.2),
         "B0": rng.uniform(-0.1, 0.3),
         "B1": rng.uniform(0, 0.5),

@@ -1,12 +1,11 @@
-"""The double-tripod driveshaft written plainly with NumPy and SciPy: the oracle of the tests and the baseline of the
-benchmarks.
+"""The double-tripod driveshaft in plain NumPy and SciPy: the oracle of the tests and the baseline of the benchmarks.
 
     phi'' + 2 zeta Omega sqrt(g) phi' + Omega^2 g phi = (M/I)(1 + chi ripple)(1 - 3 A sin 3 phi)/(1 + chi_n cos 2 phi),
     g = (1 + c1 x)/((1 + c2 x)(1 + chi_n x)),  x = cos 2 phi in (25), (26), cos Theta in (29), (30), Theta' = 2 pi f.
 
-Nothing here comes from drivetrain_jax. State ``(phi, V)`` in rad and rad/s, time in seconds, the phase Theta taken from
-the time itself. ``k_t/I`` is formed from the moments of area, not from the paper's coefficients c1..c4, unless chi_n is
-prescribed: then the coefficients follow from it.
+The code is independent of drivetrain_jax. The state is ``(phi, V)`` in rad and rad/s, the time is in seconds, and the phase
+Theta is computed from the time. ``k_t/I`` comes from the moments of area and not from the paper's coefficients c1..c4,
+except for a given chi_n, from which the coefficients follow.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 RHO, G, LENGTH = 7850.0, 77.3e9, 0.940
 NINE_DEGREES = math.radians(9)
-# L_B, L_A, R, d_A, d_C, S_B, mean and nonuniformity of the bell's moments; torque and its nonuniformity.
+# By element: L_B, L_A, R, d_A, d_C, S_B, mean and nonuniformity of the bell's moments; torque and its nonuniformity.
 TABLES = {
     "input": (0.190, 0.130, 0.070, 0.054, 0.098, 0.0076, 1.4645e-5, 0.22, 2550.0, 0.05),
     "output": (0.209, 0.143, 0.077, 0.059, 0.108, 0.0092, 2.1442e-5, 0.24, -2100.0, 0.15),
@@ -87,7 +86,7 @@ def ratio(s: Shaft, x: Any) -> Any:
 def acceleration(
     s: Shaft, equation: str, zeta: float, frequency: float, motor: float, t: float, y: Sequence, ahead: float = 0.0
 ) -> float:
-    """phi'' of the equation; ``frequency`` [Hz] and ``ahead`` [rad] belong to Theta, ``motor`` [rad/s] to the motor."""
+    """phi'' of the equation; Theta has the ``frequency`` [Hz] and the offset ``ahead`` [rad], ``motor`` is in rad/s."""
     phi, rate = y
     g = ratio(s, 2 * math.pi * frequency * t + ahead if equation in ("29", "30") else 2 * phi)
     if equation in ("25", "29"):
@@ -118,7 +117,7 @@ def history(
     def field(t: float, y: Sequence) -> tuple[float, float]:
         return y[1], acceleration(s, equation, zeta, frequency, motor, t, y)
 
-    # The rate is larger than the twist by Omega, and so is its tolerance.
+    # The rate is larger than the twist by the factor Omega, and so is its tolerance.
     tolerance = np.array([atol, atol * s.omega])
     return solve_ivp(field, (0, max(times)), start, "DOP853", t_eval=times, rtol=rtol, atol=tolerance).y
 
@@ -150,7 +149,7 @@ def determinant(element: str, zeta: float, frequency: float, chi_n: float | None
 
 
 def critical_nonuniformity(element: str, zeta: float) -> tuple[float, float]:
-    """Least chi_n on the edge of the principal tongue and its frequency [Hz], by brentq inside a bounded search."""
+    """Smallest chi_n on the edge of the principal tongue and its frequency [Hz], by brentq within a bounded search."""
     s = shaft(element)
     guess = 4 * zeta / ((s.c1 - s.c2 - s.chi_n) / s.chi_n)
     centre = s.omega / math.pi
@@ -169,9 +168,9 @@ def critical_nonuniformity(element: str, zeta: float) -> tuple[float, float]:
 
 
 def paper_estimator(equation: str, zeta: float, chi_n: float, frequency: float, strobes: int) -> np.ndarray:
-    """(31)-(36) for (29) or (30) from rest, of twist, rate of twist and Theta [1/s].
+    """The estimator (31)-(36) for (29) or (30) from rest, of twist, rate of twist and Theta [1/s].
 
-    On every interval between strobes the second solution starts from the first one times 1 + 1e-5, Theta included.
+    On every interval between strobes the second solution starts from the first solution times 1 + 1e-5, Theta included.
     """
     s, share, motor = shaft(EQUATIONS[equation], chi_n=chi_n), 1e-5, 600 * math.pi
 

@@ -1,4 +1,4 @@
-"""The bicardanic shaft as a system: what is refused, and how a scene reaches the numbers."""
+"""The bicardanic shaft as a system: refused parameters, and results through scenes."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_what_is_absent_is_left_out():
 
 @pytest.fixture(scope="module")
 def swept():
-    """k_D swept through 0 and infinity, with everything that can be asked for."""
+    """k_D swept through 0 and infinity, with all outputs."""
     outputs = ["natural_frequency", "angular_frequency", "critical_speed", "count_certified", "relative_error"]
     return dt.run(
         {
@@ -95,14 +95,14 @@ def test_units_and_certificates(swept):
     ("preset", "pulsations"), [("paper_solid", [748.52, 2519.79]), ("paper_tube", [1062.53, 4004.91])]
 )
 def test_uniform_bars_of_section_4(preset, pulsations):
-    """Both printed digits after the point, with one moment of area for the solid bar here and in the shaft."""
+    """Results agree in both printed decimals, with one moment of area for the solid bar and its segment of the shaft."""
     found = dt.critical_speeds(Bicardan(**PRESETS[preset]), outputs=["angular_frequency"], modes=2)
     np.testing.assert_allclose(found.angular_frequency, pulsations, atol=0.0055)
     assert PRESETS["paper_solid"]["EI"][0] == PRESETS["paper_fitted"]["EI"][0] == pytest.approx(2.1e11 * 3.06e-7)
 
 
 def test_section_4(swept):
-    """Critical speeds as printed (with 3.14 for pi), and conclusion 3: the amplitude at D for f_A = 1 drops 4.35 times."""
+    """Critical speeds as printed (with 3.14 for pi), and conclusion 3: the amplitude at D for f_A = 1 falls 4.35 times."""
     np.testing.assert_allclose(swept.angular_frequency[1, :2] * 30 / 3.14, [8375.78, 27013.15], atol=0.02)
     at_D = swept.mode_shape[1:3, 0, -1] / swept.mode_shape[1:3, 0, 0]
     assert abs(float(at_D[0] / at_D[1]) - 4.3476) < 1e-4
@@ -113,7 +113,8 @@ def test_rising_stiffness_raises_every_frequency(swept):
 
 
 def test_mode_shapes(swept):
-    """Mode j has j - 1 nodes, largest deflection 1; without k_D it turns about A, and a rigid support holds D."""
+    """Mode j has j - 1 nodes and the largest deflection 1; without k_D mode 1 is a rotation about A; a rigid support
+    holds D."""
     shapes = swept.mode_shape.values
     np.testing.assert_allclose(np.abs(shapes).max(axis=-1), 1.0, rtol=3e-16)
     changes = (np.diff(np.sign(shapes[1]), axis=-1) != 0).sum(axis=-1)
@@ -123,7 +124,7 @@ def test_mode_shapes(swept):
 
 
 def test_mode_shapes_are_orthogonal_with_their_rayleigh_quotient(swept):
-    """In the mass of the shaft, by numerical integration over the stored stations."""
+    """Modes are orthogonal in the mass of the shaft, by numerical integration over the stored stations."""
     x = swept.x.values
     ends = np.cumsum(FIXED["length"]) / sum(FIXED["length"])
     mass = np.array(FIXED["rhoA"])[np.minimum(np.searchsorted(ends, x), 2)]
@@ -143,7 +144,7 @@ def test_an_entry_and_an_addition_as_axes():
 
 
 def test_the_determinant_dies_near_mode_12(swept):
-    """It is right for the first modes, of a rigid support too, and the count exposes what is left of it at mode 13."""
+    """The determinant is right for the first modes, even with a rigid support; the count exposes its error at mode 13."""
     result = dt.run(
         {
             **SCENE,

@@ -1,4 +1,4 @@
-"""The cardan equations against their derivation, in 40 digits where float64 would hide what is compared."""
+"""The cardan equations against their derivation, in 40 digits where float64 would hide differences."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def relative(found, exact) -> float:
 
 @pytest.fixture(scope="module")
 def model_matrices():
-    """``A`` of the natural, of the reduced and of the stiff form at one instant of the clock of each."""
+    """``A`` of the natural, the reduced and the stiff form, each at an instant of its clock."""
 
     @jax.jit
     def both(values, tau, psi):
@@ -162,7 +162,7 @@ def test_the_stiff_form_runs_back_as_the_reduced_one_does(point):
 
 @pytest.mark.parametrize("beta", [0.0, 0.4, -1.2, 1.5, NEAR_PERPENDICULAR])
 def test_clock_runs_through_the_speed_ratio(beta, model_matrices):
-    """eta and dtau/dpsi as read off the undamped reduced matrix; they are even about the middle of the half period."""
+    """eta and dtau/dpsi from entries of the undamped reduced matrix; both are even about the middle of the half period."""
     v = {"beta": beta, "Omega": 1.0, "zeta": 0.0, "alpha": 0.0, "mu": 1.0, "gamma": 1.0}
     for psi in (0.05, 0.6, 1.3, math.pi / 2):
         matrix = model_matrices(v, psi=psi)[1]
@@ -176,7 +176,7 @@ def test_clock_runs_through_the_speed_ratio(beta, model_matrices):
 
 
 def test_speed_ratio_and_its_derivatives():
-    """To rounding where eta is largest, too, up to joints that all but jam."""
+    """eta is exact to rounding even at its maximum, and for joints that nearly jam."""
     for beta in (0.0, 0.3, -0.9, 1.5, 1.55, NEAR_PERPENDICULAR):
         for phi in (-1.0, 0.0, 0.4, 1.55, 1.57, 3.0):
             with mp.workdps(60):
@@ -212,7 +212,7 @@ def test_natural_frequencies():
 @pytest.mark.parametrize("mu", [1e-12, 1e-3, 1.0, 50.0, 1e12])
 @pytest.mark.parametrize("gamma", [1e-12, 1e-3, 1.0, 100.0, 1e12])
 def test_natural_frequencies_are_eigenvalues(mu, gamma):
-    """Eigenvalues of the stiffness matrix e1 e1^T + mu G G^T of eq. (9) at beta = 0; float64 would not see the small one."""
+    """Squares are eigenvalues of e1 e1^T + mu G G^T of eq. (9) at beta = 0; float64 would lose the small eigenvalue."""
     with mp.workdps(60):
         g = 1 / mp.sqrt(mp.mpf(gamma))
         stiffness = mp.matrix([[1 + mp.mpf(mu), -mu * g], [-mu * g, mu * g * g]])
@@ -302,7 +302,7 @@ def test_systems_are_found_by_name():
     ],
 )
 def test_predicted_steps_are_enough_and_not_many_more(point, rtol):
-    """A decay needs stability more than accuracy: fewer steps than an oscillation of the same rate."""
+    """A decay is limited by stability and not by accuracy, and needs fewer steps than an oscillation of the same rate."""
     shaft = cardan.Cardan(alpha=1.0, mu=1.0, gamma=100.0, **point)
     form, predicted = shaft.floquet_model().reduced, int(shaft.explicit_steps(rtol))
     exact = assemble(form, propagator(form, jnp.int32(8 * predicted)).matrix)
@@ -311,14 +311,14 @@ def test_predicted_steps_are_enough_and_not_many_more(point, rtol):
         z = assemble(form, propagator(form, jnp.int32(steps)).matrix)
         return float(jnp.linalg.norm(z - exact) / jnp.max(jnp.abs(jnp.linalg.eigvals(exact))))
 
-    # Overflow is an error as well.
+    # An overflow counts as an error.
     assert error(predicted) < rtol and not error(predicted // 4) <= rtol
     assert stable_steps(form) < predicted
 
 
 @pytest.mark.parametrize("rtol", [1e-7, 1e-9, 1e-10])
 def test_slow_points_meet_their_tolerance_in_predicted_steps(rtol):
-    """If the steps are slightly too few, the march is repeated with twice as many: 2.6 times the time of a block."""
+    """Slightly too few steps would repeat the march with twice as many, and cost 2.6 times the time of a block."""
     for omega, beta in ((0.006, 0.9), (0.01, 0.3), (0.03, 0.1)):
         point = {"beta": beta, "Omega": omega, "zeta": 1e-3, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
         shaft = cardan.Cardan(**point)

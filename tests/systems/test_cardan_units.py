@@ -38,7 +38,7 @@ def test_values():
 
 
 def test_multipliers_are_those_of_the_equations_in_seconds():
-    """Eqs (2)-(3) linearised in SI units and integrated over half a revolution of the flywheel."""
+    """Reference: eqs (2)-(3) linearised in SI units and integrated over half a revolution of the flywheel."""
     j1, j2, k1, k2, c1, c2 = (DATA[name] for name in ("J1", "J2", "k1", "k2", "c1", "c2"))
     speed, angle = DATA["speed"] * 2 * math.pi / 60, math.radians(DATA["angle"])
 

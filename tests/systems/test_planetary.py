@@ -1,4 +1,4 @@
-"""The planetary gear: what is refused, its rotational model, and parameters that are derived unless given."""
+"""The planetary gear: refused parameters, the rotational model, and parameters with derived defaults."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def frequencies(gear: dt.Planetary) -> np.ndarray:
 
 
 def of_rotations(p: dict) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies in Hz and mass matrix of the plane gear under eta_n = u_c and without other translations."""
+    """Frequencies in Hz and mass matrix of the plane gear with eta_n = u_c and all other translations held."""
     mass, stiffness = (np.array(x, float) for x in matrices(p))
     n = len(p["planet_angle"])
     constraint = np.zeros((9 + 3 * n, 3 + n))
@@ -46,7 +46,7 @@ def test_lists_have_one_entry_per_planet():
 
 
 def test_rotations_of_four_planets():
-    """Four distinct frequencies, and one of the planets alone, three times: (39), (40)."""
+    """Four frequencies are distinct, and the frequency of planets alone is triple: (39), (40)."""
     found = dt.modes(dt.Planetary(model="rotational"), outputs=EVERYTHING)
     degenerate = math.sqrt(1e9 / 0.61) / (2 * math.pi)
     expected = [0, 2120.62, degenerate, degenerate, degenerate, 6635.21, 12554.33]
@@ -54,7 +54,7 @@ def test_rotations_of_four_planets():
     np.testing.assert_allclose(found.natural_frequency[2:5], degenerate, rtol=1e-14)
     assert found.mode_type.tolist() == [0, 1, 3, 3, 3, 1, 1]
     assert found.multiplicity.tolist() == [1, 1, 3, 3, 3, 1, 1]
-    # Distinct: everything turns, all planets alike. Degenerate: the planets alone, and their sum is at rest.
+    # Distinct frequencies: all bodies turn, all planets alike. Degenerate: only planets turn, and their sum is zero.
     shapes = np.asarray(found.mode_shape)
     np.testing.assert_allclose(shapes[[1, 5, 6], 3:], shapes[[1, 5, 6], 3:4] * np.ones((1, 4)), rtol=1e-9)
     assert (np.abs(shapes[[1, 5, 6]]) > 1e-2).all()
@@ -101,7 +101,7 @@ def test_derived_parameters_follow_until_they_are_given():
 
 
 def test_bearings_by_direction_split_doublets_and_keep_the_families():
-    """Equal spacing: k_sx alone splits every translational pair; rotational and planet modes stay as they are."""
+    """With equal spacing k_sx splits every translational pair; rotational and planet modes do not change."""
     equal, split = (dt.modes(dt.Planetary(**more), outputs=EVERYTHING) for more in ({}, {"k_sx": 2e8}))
     assert sorted(equal.multiplicity.tolist()) == [1] * 9 + [2] * 12
     assert split.multiplicity.tolist() == [1] * 21
@@ -129,7 +129,7 @@ def test_derivatives_by_the_new_parameters():
 
 
 def test_one_of_five_planets_3_degrees_off():
-    """Nearly all modes are coupled by the exact label; the dominant family with its share tells what they are."""
+    """By the exact label nearly all modes are coupled; the dominant family and its share characterise them."""
     angles = tuple(np.radians([0, 75, 144, 216, 288]))
     found = dt.modes(dt.Planetary(planet_angle=angles))
     coupled = np.asarray(found.mode_type) == 4

@@ -34,7 +34,7 @@ def test_at_the_threshold_the_orbit_touches_the_flank():
     response = b1 / complex(1.0 - 4.0, 0.05 * 2.0)
     mean = values["B0"] + (1 - values["alpha"]) * values["b"]
     assert mean - abs(response) == pytest.approx(values["b"], rel=1e-14)
-    # A mean drive that does not hold the teeth in contact has none.
+    # A mean drive that does not hold the teeth in contact has no threshold.
     assert np.isnan(rattle_threshold(values | {"B0": 0.04})[0])
 
 

@@ -1,4 +1,4 @@
-"""Sine and cosine over many lanes against NumPy's and the exact ones."""
+"""Sine and cosine over many lanes against NumPy and exact values."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def test_constants_at_nine_degrees(name, k):
 
 
 def test_coefficients_are_those_of_the_moments_of_area():
-    """k_t/I at any twist, formed from J_A and J_B as in appendix A, is Omega^2 g exactly."""
+    """k_t/I at any twist, computed from J_A and J_B as in appendix A, equals Omega^2 g."""
     for name in ("input", "output"):
         e = tripod.element_of(INPUT | {"element": name})
         for phi in np.linspace(0, math.pi, 7):
@@ -69,7 +69,7 @@ def test_where_chi_n_comes_from():
         )
         assert float(value.chi_n) == given.chi_n == stated
         assert float(value.c_stiffness) == float(given.c_stiffness)
-    # A given value enters c1..c4 too.
+    # A given chi_n enters c1..c4 too.
     given = tripod.element_of(INPUT | {"chi_n": 0.0026})
     assert float(given.c_stiffness) == pytest.approx(REFERENCE["params"]["c1"], rel=1e-12)
     assert float(given.c_inertia) == pytest.approx(REFERENCE["params"]["c2"], rel=1e-12)
@@ -112,7 +112,7 @@ def test_readings_of_the_torque_sums():
 
 
 def test_phase_does_not_drift():
-    """The motor's angle after 50,000 strobes, against rational arithmetic; the time alone would be off by 1e-11."""
+    """The motor's angle after 50,000 strobes agrees with rational arithmetic; from the time it would be off by 1e-11."""
     flow = tripod.flow_model(INPUT | {"excitation_frequency": 3066.5})
     turns = Fraction(float(flow.turns[1]))
     for strobe in (1, 12_345, 50_000, 5_000_000):
@@ -185,7 +185,7 @@ def test_equation_may_be_a_number():
 
 
 def test_coefficients_beyond_one_are_an_outcome():
-    """c1 reaches 1 at chi_n = 0.4987: the stiffness then vanishes during a turn and the model ends."""
+    """c1 reaches 1 at chi_n = 0.4987; beyond, the stiffness vanishes during a turn and the model is not valid."""
     point = dt.point("tripod", "floquet", element="input", beta=NINE_DEGREES, zeta=0.01, chi_n=0.6)
     assert point.outcome.name == "NOT_FINITE"
     assert math.isnan(point.spectral_radius)
@@ -204,7 +204,7 @@ def radius_and_slopes(chi_n, frequency, zeta):
 
 @pytest.mark.parametrize("case", REFERENCE["critical_chi_n"], ids=lambda case: str(case["zeta"]))
 def test_least_chi_n_that_makes_the_element_unstable(case):
-    """The tip of the principal tongue: the radius is 1, and largest over the frequency. Newton's steps are the errors."""
+    """At the tip of the principal tongue the radius is 1, and largest over the frequency; errors are Newton steps."""
     chi_n, frequency, zeta = (case[name] for name in ("chi_n", "excitation_frequency_Hz", "zeta"))
     radius, (slope, along) = radius_and_slopes(chi_n, frequency, zeta)
     assert abs(radius - 1) / slope < 1e-12

@@ -16,7 +16,7 @@ NAMES = {"length": "l", "EI": "EI", "rhoA": "rhoA", "k_A": "kA", "k_D": "kD"}
 
 
 def case(name: str) -> tuple[dict, np.ndarray]:
-    """Parameters, and the first four frequencies that are not zero modes."""
+    """Parameters, and the first four frequencies, with zeros for zero modes."""
     given = CASES[name]
     zeros = given["zero_modes"]
     values = [float(given["p_rad_per_s"][str(k)]) for k in range(zeros + 1, 5)]
@@ -59,5 +59,5 @@ def test_forty_digits(name):
     shaft, exact = case(name)
     found, distance = precise_frequencies(shaft, (1, 2, 3, 4), bubbles=14)
     np.testing.assert_allclose([float(value) for value in found], exact, rtol=1e-15)
-    # The elements lose what the stiffness of the supports is below that of the shaft.
+    # The elements lose the digits by which the stiffness of the supports is below that of the shaft.
     assert distance < 1e-6

@@ -1,4 +1,4 @@
-"""Conclusions of the cardan paper, in numbers that an audit of the paper gave."""
+"""Conclusions of the cardan paper, as numbers from an audit of the paper."""
 
 from pathlib import Path
 
@@ -14,18 +14,18 @@ def unstable(scene: str) -> np.ndarray:
 
 
 def test_a_stiffer_driven_shaft_is_not_always_less_stable():
-    """Up to 30 degrees, mu = 0.25, 1, 2, 5, 10, 20; the audit used another grid."""
+    """Unstable fractions up to 30 degrees for mu = 0.25, 1, 2, 5, 10, 20; the audit used another grid."""
     shares = unstable("cardan_stiffness").mean(axis=(1, 2))
     np.testing.assert_allclose(shares, [0.0115, 0.0177, 0.0468, 0.0490, 0.0804, 0.0044], rtol=0, atol=8e-4)
 
 
 def test_damping_helps_less_at_high_speed():
-    """By quarters of rising speed, from alpha = 1 to 20."""
+    """Change of the unstable fraction from alpha = 1 to 20, in quarters of rising speed."""
     base, damped = (unstable(name).reshape(151, 4, 50).mean(axis=(0, 2)) for name in ("cardan_fig3", "cardan_fig4"))
     np.testing.assert_allclose(100 * (damped / base - 1), [-14.2, -3.5, -3.6, -0.7], rtol=0, atol=0.06)
 
 
 def test_figures_3_and_6_do_not_start_alike():
-    """Common part of both unstable sets for Omega up to 0.35."""
+    """Both unstable sets have only a fifth in common for Omega up to 0.35."""
     first, sixth = (unstable(name)[:, :35] for name in ("cardan_fig3", "cardan_fig6"))
     assert abs((first & sixth).sum() / (first | sixth).sum() - 0.20) < 0.01

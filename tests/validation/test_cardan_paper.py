@@ -1,4 +1,4 @@
-"""What the cardan paper states, against the package and against SciPy: equations, criterion, damping, forced orbit."""
+"""Claims of the cardan paper against the package and SciPy: equations, criterion, damping, forced orbit."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_forced_response_and_orbit(beta, Omega, about_orbit):
     ds = dt.run(scene).isel(point=0)
     state, amplitude = linear_response(p)
     np.testing.assert_allclose(ds.periodic_state, state, rtol=1e-7, atol=1e-9)
-    # SciPy's maximum is taken on 4001 instants.
+    # SciPy's maximum is over 4001 instants.
     np.testing.assert_allclose(ds.amplitude, amplitude, rtol=1e-5)
     state, amplitude, rho = nonlinear_orbit(p)
     np.testing.assert_allclose(ds.orbit_state, state, rtol=1e-7, atol=1e-9)

@@ -19,7 +19,7 @@ STABLE, UNSTABLE, UNDECIDED = 0, 1, 2
 
 
 def extremes(point: dict) -> int:
-    """How many parameters are at the limit of what the direct method promises; one at a time it promises 1e-9."""
+    """Number of parameters at the limits of the direct method, which guarantees 1e-9 for one of them at a time."""
     at_limit = (
         point["beta"] >= 1.55,
         point["Omega"] <= 0.01,
@@ -46,7 +46,7 @@ def failures(bad: np.ndarray) -> list[str]:
 
 
 def test_every_point_is_computed(result):
-    """Where several parameters are extreme the bound may exceed the target, which the outcome then says."""
+    """With several extreme parameters the bound may exceed the target, which the outcome then shows."""
     names = result.outcome.attrs["flag_meanings"].split()
     allowed = {0, names.index("tolerance_not_met")}
     assert set(result.outcome.values.tolist()) <= allowed
@@ -105,7 +105,7 @@ def test_the_oracle_itself(index):
 
 
 def test_random_points_agree_with_scipy():
-    """Seeded subset of the comparison of 500 random points, through both of SciPy's formulations."""
+    """A seeded subset of the comparison of 500 random points, by both formulations in SciPy."""
     rng = np.random.default_rng(20)
     columns = {"beta": rng.uniform(0, 1.5, 32), "Omega": rng.uniform(0.1, 2, 32)}
     columns |= {"alpha": rng.uniform(0.1, 20, 32), "mu": 10 ** rng.uniform(-1, 1.3, 32)}

@@ -1,4 +1,4 @@
-"""Natural frequencies and resonance speeds of the cardan paper, eqs (23)-(26) and Tables 1-2: exact beside printed."""
+"""Natural frequencies and resonance speeds of the cardan paper, eqs (23)-(26) and Tables 1-2: exact and printed values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from drivetrain_jax.resonances import cardan
 from tests.oracles.cardan_paper import PRINTED_FREQUENCIES, PRINTED_SPEEDS, natural_frequencies, predicted_speeds
 
 EXACT = (0.070622235012, 1.415984639720)
-# The two printed speeds that the printed frequencies do not give: .072/2 = .036 and 1.422/2 = .711.
+# The two printed speeds that contradict the printed frequencies: .072/2 = .036 and 1.422/2 = .711.
 MISPRINTS = {"H11", "H21"}
 
 

@@ -1,4 +1,4 @@
-"""Frequencies and types of modes against the reference values, and the oracle of the other tests against them."""
+"""Frequencies and types of modes, and the oracle of other tests, against the reference values."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def by_count() -> dict[int, list[str]]:
 
 
 def run_cases(names: list[str], outputs: tuple[str, ...], method: str = "auto"):
-    """All cases of one number of planets in one run: every parameter and every angle varies."""
+    """All cases with the same number of planets in one run, in which every parameter and every angle varies."""
     listed = [case_parameters(CASES[name]) for name in names]
     columns = {key: [p[key] for p in listed] for key in listed[0] if key != "planet_angle"}
     columns |= {
@@ -55,7 +55,7 @@ def spectrum(name: str):
     return spectra(len(CASES[name]["psi_deg"]))[name]
 
 
-# One kernel for every number of planets: two of them in the short form.
+# Cases by number of planets, which need a kernel each: the short form has two numbers.
 NAMES = [
     pytest.param(name, marks=() if len(case["psi_deg"]) in (4, 12) else pytest.mark.full)
     for name, case in CASES.items()
@@ -84,7 +84,7 @@ def test_error_estimate_holds_and_is_useful(name):
 
 
 def types_by_frequency(frequencies: list[str], types: list[str]) -> list[tuple[str, str]]:
-    """Pairs in rising order; among modes of one frequency, to every digit of the reference, the order means nothing."""
+    """Pairs in rising order of frequency and then of type, because the order within a multiple frequency is arbitrary."""
     return sorted(zip(frequencies, types, strict=True), key=lambda pair: (float(pair[0]), pair[1]))
 
 
@@ -127,7 +127,7 @@ def test_the_oracle_itself(name):
 
 
 def test_matrix_agrees_only_roughly_where_stiffnesses_differ():
-    """What forming K costs: the reason for working with singular values."""
+    """Forming K loses digits, which is why the package uses singular values."""
     case = CASES["N4_mesh1e16"]
     exact = np.array([float(f) for f in case["f_Hz"]])
     assert np.abs(natural_frequencies(case_parameters(case))[1:] / exact[1:] - 1).max() > 1e-9

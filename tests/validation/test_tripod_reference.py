@@ -19,7 +19,7 @@ FLOQUET = {key: case for key, case in REFERENCE["floquet_vs_benettin"].items() i
 
 @pytest.mark.parametrize("equation", ["25", "26", "29", "30"])
 def test_states(equation):
-    """phi and V of every reference history, to 1e-8 of their scale."""
+    """phi and V agree with every reference history to 1e-8 of their scale."""
     cases = [case for case in REFERENCE["states"] if case["eq"] == equation]
     times = sorted({case["t"] for case in cases})
     columns = {"zeta": "zeta", "chi_n": "chi", "excitation_frequency": "eta_Hz", "phi0": "phi0", "velocity0": "V0"}
@@ -94,7 +94,7 @@ def test_no_instability_in_the_range_of_the_paper():
 
 
 def test_critical_nonuniformity_separates_stable_from_unstable():
-    """Just below the tip no frequency is unstable, just above it the frequency of the tip is."""
+    """Just below the tip no frequency is unstable; just above the tip its frequency is unstable."""
     case = REFERENCE["critical_chi_n"][0]
     tip = {"zeta": case["zeta"], "excitation_frequency": case["excitation_frequency_Hz"]}
     columns = {"chi_n": [case["chi_n"] - 1e-7, case["chi_n"] + 1e-7]}

@@ -20,7 +20,7 @@ FAMILIES = {
 
 
 def unstable(beta: float | np.ndarray, omega: float | np.ndarray) -> np.ndarray:
-    """One V-shaped tongue with its tip at (0.2, 1.0)."""
+    """True within a V-shaped tongue with its tip at (0.2, 1.0)."""
     return np.asarray(beta) > 0.2 + 2 * np.abs(np.asarray(omega) - 1.0)
 
 

@@ -1,4 +1,4 @@
-"""Names of the tips of tongues: on which side of them they stand."""
+"""Positions of the names of tips of tongues."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.view import results
 
 
 def tipped(beta: list[float], opens: list[int] | None, omega: list[float]):
-    """The chart of one tongue, beta upwards from 0 to 1, with tips at these places."""
+    """The chart of one tongue, with beta upwards from 0 to 1 and tips at these points."""
     names = [f"S{number}" for number in range(1, len(beta) + 1)]
     dataset = results.chart().assign_coords(
         tip=("tip", names),
@@ -26,7 +26,7 @@ def tipped(beta: list[float], opens: list[int] | None, omega: list[float]):
 
 def sides(dataset) -> dict[tuple[float, float], tuple[int, int]]:
     """Direction from each named tip to its name."""
-    # Names of predicted lines have leaders.
+    # Names of predicted lines have leaders, those of tips have none.
     names = [text for text in plot(dataset).axes[0].texts if text.arrow_patch is None]
     return {tuple(map(float, name.xy)): tuple(int(np.sign(x)) for x in name.xyann) for name in names}
 

@@ -1,4 +1,4 @@
-"""Cells end halfway between their values, on any axis."""
+"""Cells end halfway between their values on any axis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of Lyapunov spectra and Poincare sections, from made-up results."""
+"""Figures of Lyapunov spectra and Poincare sections, from synthetic results."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ KINDS = "fixed_point periodic quasi_periodic parametrically_unstable chaotic und
 
 
 def lyapunov(**sizes: int) -> xr.Dataset:
-    """Exponents over the axes ``sizes``, one point chaotic and one without values."""
+    """Exponents over the axes ``sizes``, with a chaotic point and a point without values."""
     axes = tuple(sizes)
     shape = tuple(sizes.values())
     spectrum = np.stack([np.full(shape, -1.0), np.full(shape, -2.0)], axis=-1)
@@ -114,7 +114,7 @@ def test_a_short_section_is_drawn_once():
 
 
 def test_a_point_is_drawn_as_a_point():
-    """Rounding errors are not blown up to the height of the panel."""
+    """Rounding errors do not fill the panel."""
     axes = plot(section(300, 1e-17)).axes[0]
     assert np.ptp(axes.get_xlim()) > 1e-6
     assert np.ptp(axes.get_ylim()) > 1e-5

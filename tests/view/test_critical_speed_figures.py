@@ -1,4 +1,4 @@
-"""Figures of critical speeds: what is drawn on which scale, and what is refused."""
+"""Figures of critical speeds: scales, bands, and refused results."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_a_rigid_support_has_no_place_on_the_axis_and_is_told(swept, points):
     ],
 )
 def test_operating_speeds_are_a_band(swept, variable, low, drawn):
-    """In the units of what is shown, and down to the lower edge from standstill, which a logarithmic axis cannot show."""
+    """The band is in the units of the axis; from standstill, which a logarithmic axis lacks, it begins at the lower edge."""
     options = json.dumps({"operating_min": low, "operating_max": 9e3})
     figure = plot(swept.rename(critical_speed=variable).assign_attrs(options=options))
     (band,) = [patch for patch in figure.axes[0].patches if patch.get_label() == "operating speeds"]
@@ -92,7 +92,7 @@ def test_without_operating_speeds_there_is_no_band(swept):
 
 
 def test_maps_show_where_a_mode_meets_the_operating_speeds():
-    """Critical speeds k_A + k_D + 10 mode: mode 1 meets both ends, mode 2 the upper one, mode 3 none."""
+    """Critical speeds are k_A + k_D + 10 mode: mode 1 meets both limits, mode 2 the upper limit, mode 3 none."""
     k = np.linspace(1.0, 9.0, 9)
     values = k[:, None, None] + k[:, None] + 10 * np.arange(1, 4)
     data = {

@@ -1,4 +1,4 @@
-"""Figures of frequency response: what is drawn full, dashed and dotted, and what is refused."""
+"""Figures of frequency response: solid, dashed and dotted lines, and refused results."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def variable(dims, values, units="m", **attrs):
 
 
 def line(method: str = "multiple_scales", branches: bool = True) -> xr.Dataset:
-    """A hardening line: the sweep up jumps down at 1.2, the sweep down jumps up at 0.8, a saddle in between."""
+    """A hardening line: the sweep up jumps down at 1.2, the sweep down jumps up at 0.8, and a saddle lies in between."""
     up = np.where(OMEGA < 1.2, OMEGA, 0.2)
     down = np.where(OMEGA < 0.8, OMEGA, 0.2)
     both = np.stack([up, down], axis=1)
@@ -62,7 +62,7 @@ def with_fixed(dataset: xr.Dataset, **values: float) -> xr.Dataset:
 
 
 def test_results_in_one_figure_differ_only_by_method():
-    """The heading tells the parameters once, and the legend a method."""
+    """The heading shows the parameters once, and each legend entry a different method."""
     first = with_fixed(line(), B1=0.03)
     plot(first, with_fixed(line("exact"), B1=0.03))
     with pytest.raises(InputError, match=r"B1 = 0\.02: allowed is the value of the first result, 0\.03"):
@@ -98,7 +98,7 @@ def test_saddles_are_dashed_and_reach_the_branches_they_meet():
     dashed = [item for item in lines_of(plot(line()).axes[0], "--") if np.isfinite(item.get_ydata()).any()]
     (saddle,) = dashed
     y = saddle.get_ydata()[np.isfinite(saddle.get_ydata())]
-    # One more point at either end, on the branch that the saddles meet there.
+    # One more point at either end, on the branch that meets the saddles.
     assert len(y) == ((OMEGA >= 0.8) & (OMEGA < 1.2)).sum() + 2
     assert y[0] == pytest.approx(0.2)
     assert y[-1] == pytest.approx(OMEGA[OMEGA < 1.2][-1])
@@ -141,7 +141,7 @@ def test_what_cannot_be_drawn_is_refused():
 
 @pytest.mark.parametrize(("phase", "ticks"), [(-1e-15, 3), (np.pi + 1e-15, 3), (-0.05, 5), (-3.0, 5)])
 def test_every_phase_lies_within_its_panel(phase, ticks):
-    """Without damping rounding leaves a lag a little below none; a negative amplitude of the drive adds half a turn."""
+    """Without damping rounding may make a lag slightly negative; a drive of negative amplitude adds half a turn."""
     dataset = line()
     dataset["phase"][...] = phase
     axes = plot(dataset).axes[1]

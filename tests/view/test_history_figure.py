@@ -139,7 +139,7 @@ def test_units_as_people_write_them(units, text):
 
 
 def test_many_turns_are_thinned_between_their_envelopes():
-    """In space only: 10 turns are drawn whole, of 300 turns 24 with a line through all maxima and one through all minima."""
+    """The 3-D curve shows all of 10 turns, but only 24 of 300 turns, with lines through all maxima and all minima."""
     assert len(plot(history()).axes[-1].lines) == 1
     time = np.linspace(0, 1, 30_001)
     decay, angle = np.exp(-2 * time), 600 * np.pi * time

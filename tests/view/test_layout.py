@@ -1,4 +1,4 @@
-"""Where labels, powers of ten and legends of a figure stand."""
+"""Positions of labels, powers of ten and legends of a figure."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_the_label_is_clear_of_the_numbers(top, whole):
 
 @pytest.mark.parametrize("columns", [1, 2])
 def test_wide_numbers_leave_room_for_a_label_of_two_lines(columns):
-    """0.99975 and the like: the panels become narrower, and keep their right end and their gaps."""
+    """With numbers such as 0.99975 the panels become narrower, but keep their right end and their gaps."""
     with matplotlib.rc_context(STYLE):
         panels, before = (Panels(1, columns, height=1.5) for _ in range(2))
         panels.axes[0][0].set_ylim(0.99905, 1.00005)

@@ -1,4 +1,4 @@
-"""Figures of modes: what is drawn, in which colour, and what is refused."""
+"""Figures of modes: curves, shapes, colours, and refused results."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_one_gear_for_every_frequency():
     ("name", "attrs"), [("planet_angle_1", {"parameter": "planet_angle[1]"}), ("planet_angle[1]", {})]
 )
 def test_the_caption_says_which_angle_varies(name, attrs):
-    """In files of today, and in older ones, whose dimensions are named as in scenes."""
+    """The caption is right for current files, and for older files, whose dimensions have the names of scenes."""
     swept = crossing().rename(k_p=name)
     swept[name].attrs.update(attrs)
     figure = plot(swept)

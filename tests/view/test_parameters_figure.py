@@ -57,7 +57,7 @@ def test_more_axes_are_an_input_error():
 
 
 def test_caption_leaves_defaults_out():
-    """Only what the scene itself fixes is repeated in the figure."""
+    """The caption shows only parameters that the scene fixes."""
     fixed = '{"beta": {"value": 0.1, "units": "rad"}, "rho": {"value": 7850.0, "units": "kg/m3"}}'
     dataset = xr.Dataset(attrs={"fixed_parameters": fixed, "scene": "[fixed]\nbeta = 0.1\n"})
     assert caption(dataset) == r"$\beta$ = 0.1 rad"

@@ -56,7 +56,7 @@ def test_curves_mark_failed_points():
 
 
 def test_a_response_of_zero_is_drawn():
-    """A straight joint forces nothing; a logarithmic scale has no zero."""
+    """A straight joint has no forcing and a response of zero, which a logarithmic scale cannot show."""
     dataset = results.forced(Omega=OMEGA)
     dataset.amplitude[:] = 0
     amplitude = panels(plot(dataset))[0]

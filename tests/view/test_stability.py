@@ -1,4 +1,4 @@
-"""Stability charts: what is drawn is what is stored."""
+"""Stability charts show the stored results."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def meshes(figure) -> list[QuadMesh]:
 
 
 def panels(figure) -> list:
-    """Axes that are no colour bars."""
+    """Axes of ``figure`` without colour bars."""
     return [axes for axes in figure.axes if axes.get_label() != "colour bar"]
 
 
@@ -96,7 +96,7 @@ def test_colours_of_growth_darken_all_the_way():
 
 
 def test_marginal_cells_do_not_look_unstable():
-    """rho = 1 + rounding, as without damping, has the colour of rho = 1."""
+    """A radius of 1 + rounding, as without damping, has the colour of rho = 1."""
     dataset = results.chart()
     dataset["spectral_radius"] = xr.where(dataset.spectral_radius < 1, 1 + 1e-12, dataset.spectral_radius)
     dataset.spectral_radius.attrs["long_name"] = "spectral radius"
@@ -139,7 +139,7 @@ def test_labels_of_close_lines_are_kept_apart():
 
 
 def _across(text) -> float:
-    """Where the point is that a text belongs to, in points."""
+    """Horizontal position of the point that a text annotates, in points."""
     return text.axes.transData.transform(text.xy)[0] * 72 / text.axes.figure.dpi
 
 
@@ -151,7 +151,7 @@ def test_labels_stand_above_the_chart_however_it_is_written(given, monkeypatch):
 
     def watched(text, renderer):
         draw(text, renderer)
-        # Without its leader, in parts of the panel: across, and upwards.
+        # Extent of the text without its leader, as fractions of the panel: across, and upwards.
         if text in axes.texts:
             box = Text.get_window_extent(text, renderer)
             seen[text.get_text()] = axes.transAxes.inverted().transform([(box.x0 + box.x1) / 2, box.y0])
@@ -220,7 +220,7 @@ def test_four_axes_give_nine_slices():
 
 
 def test_a_range_without_a_boundary_shows_how_far_it_is_from_one():
-    """Blank panels would say nothing: the spectral radius, the axis of three values across, ticks clear of each other."""
+    """Instead of blank panels the figure shows the spectral radius, with the axis of three values across and clear ticks."""
     dataset = results.grid(np.zeros((11, 8, 3), int), "speed", "zeta", "chi")
     axes = {
         "speed": np.linspace(2950, 3200, 11),

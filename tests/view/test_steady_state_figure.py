@@ -45,7 +45,7 @@ def test_a_map_shows_regimes_and_the_threshold():
 
 
 def test_an_attractor_keeps_its_colour_where_a_larger_one_ends():
-    """Results are in order of size: the smaller one is the second, then the first; chaos has no size."""
+    """Results are in order of size, so the smaller attractor is the second and later the first; chaos has no size."""
     nan = np.nan
     size = np.array([[0.5, 0.3, nan], [0.55, 0.29, nan], [0.28, nan, nan], [nan, 0.27, nan]])
     share = np.array([[0.6, 0.4, nan], [0.5, 0.5, nan], [0.9, 0.1, nan], [0.2, 0.8, nan]])
@@ -59,11 +59,11 @@ def test_an_attractor_keeps_its_colour_where_a_larger_one_ends():
         ([1.0, np.nan, 1.0], [1, 0, 1], [0, -1, 0]),
         ([1.0, np.nan, np.nan, 1.0], [1, 0, 0, 1], [0, -1, -1, 1]),
         ([1.0, 1.0, 1.0], [1, 4, 1], [0, 1, 0]),
-        # A third more each time: only the straight line foresees it.
+        # A third more each time: only the straight line predicts it.
         ([1.0, 1.2, 1.55, 2.0], [1, 1, 1, 1], [0, 0, 0, 0]),
         ([1.0, 1.0, 1.55], [1, 1, 1], [0, 0, 1]),
         ([0.0, 0.0, 1.0], [1, 1, 1], [0, 0, 1]),
-        # The peak, which the straight line overshoots.
+        # A peak, which the straight line overshoots.
         ([1.0, 1.2, 1.5, 1.8, 1.6], [1, 1, 1, 1, 1], [0, 0, 0, 0, 0]),
     ],
 )
@@ -81,7 +81,7 @@ def test_slopes_are_over_the_axis_and_not_over_its_numbers():
 
 
 def basin(multiple):
-    """Four values of omega with one attractor each, of one size."""
+    """Four values of omega with one attractor each, all of the same size."""
     size = np.full((4, 1), 0.5)
     dataset = result({"omega": [1.0, 2.0, 3.0, 4.0]}).assign_attrs(analysis="basins")
     dataset["attractor_u_max"] = (("omega", "attractor"), size, {"units": "m"})
@@ -112,7 +112,7 @@ def test_curves_mark_what_is_not_periodic():
 
 
 def test_curves_tell_failures_from_motions_that_are_not_periodic():
-    """Failed points have the period multiple 0, too."""
+    """Failed points have the period multiple 0 like non-periodic motions, but other marks."""
     dataset = result({"omega": [0.5, 1.0, 1.5]}, u_max=[1.0, 2.0, np.nan], period_multiple=[1, 0, 0])
     dataset["outcome"][2] = 2
     figure = plot(dataset)
@@ -125,7 +125,7 @@ def test_curves_tell_failures_from_motions_that_are_not_periodic():
 
 
 def test_curves_show_both_flanks_and_bands_of_the_regimes():
-    """Impact velocity and contact fraction of both flanks; every value of the axis is a band in the colour of its regime."""
+    """Impact velocity and contact fraction have both flanks; every value of the axis is a band in its regime's colour."""
     omega, by_flank = [0.5, 1.0, 1.5], np.array([[1.0, np.nan], [2.0, 0.5], [3.0, 0.7]])
     dataset = result({"omega": omega}, u_max=[1.0, 2.0, 3.0], regime=[1, 2, 0])
     for name in ("impact_velocity", "contact_fraction"):
@@ -155,7 +155,7 @@ def test_a_motion_shows_history_and_phase_portrait():
     dataset["u_history"] = (("omega", "sample"), np.sin(2 * np.pi * part)[None])
     dataset["v_history"] = (("omega", "sample"), np.cos(2 * np.pi * part)[None])
     figure = plot(dataset)
-    # The portrait is closed.
+    # The phase portrait is a closed curve.
     portrait = figure.axes[1].lines[0]
     assert portrait.get_xdata()[0] == portrait.get_xdata()[-1] and "flanks" in labels(figure)
 
