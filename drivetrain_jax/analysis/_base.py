@@ -112,7 +112,7 @@ class Analysis:
     ``methods`` maps each method to the names of its options, the default method first; ``options`` describes the options
     and ``method_titles`` the methods. ``solvers(system, request)`` returns the candidates of the requested method.
     ``dimensions(system, request, fixed)`` describes the dimensions of the results besides those of the sweep; ``fixed``
-    holds the parameters that do not vary (a list is whole also if one entry varies). It raises
+    holds the parameters that do not vary (a list is complete even if one entry varies). ``dimensions`` raises
     :class:`~drivetrain_jax._errors.InputError` if request and parameters do not match. ``lacks(system)`` maps the results
     and methods that a system does not support to the reason. ``derivatives(system, request, parameters, constants,
     results)`` returns Jacobians ``(..., P)`` of differentiable results at one point with respect to all P ``parameters``

@@ -75,7 +75,7 @@ def require(dataset: xr.Dataset, *names: str) -> None:
 
 
 def require_any(dataset: xr.Dataset, *names: str) -> list[str]:
-    """Those of ``names`` that are stored; raises :class:`InputError` if none is."""
+    """The stored variables among ``names``; raises :class:`InputError` if none is stored."""
     if not (found := [name for name in names if name in dataset]):
         stored = ", ".join(str(name) for name in dataset.data_vars)
         raise InputError(f"outputs = {stored}: nothing to plot; the figure needs {' or '.join(names)}")

@@ -195,7 +195,7 @@ def test_extensions_against_finite_elements(name):
 
 
 def test_shear_and_rotary_inertia_lower_the_tube():
-    """They lower the first frequency by 1 %, the second by 3.3 % on the paper's supports and by 3.9 % on stiff supports."""
+    """The first frequency falls by 1 %, the second by 3.3 % on the paper's supports and by 3.9 % on stiff supports."""
     area, moment = 3.6e-4, 1.055e-7
     shear = {"kGA": (0.53 * 8.1e10 * area,) * 3, "rhoI": (7800 * moment,) * 3}
     for supports, expected in (({}, (-0.00990, -0.03268)), ({"k_A": 1e14, "k_D": 1e14}, (-0.01033, -0.03919))):

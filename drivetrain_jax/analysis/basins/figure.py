@@ -47,7 +47,7 @@ def _followed(x: np.ndarray, size: np.ndarray, exists: np.ndarray, multiple: np.
     """Branch numbers of attractors ``(values of the axis, attractors)``, -1 for none.
 
     Results are ordered by size, so the number of an attractor changes where a larger one appears. A branch is extrapolated
-    from its last two sizes to the nearest attractor of its period multiple. It ends after two misses.
+    from its last two sizes to the nearest attractor of its period multiple. A branch ends after two misses.
     """
     branch, followed = np.full(size.shape, -1), []
     # All non-periodic motions are one attractor, which has no size.

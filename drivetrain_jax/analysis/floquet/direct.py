@@ -42,7 +42,7 @@ class Monodromy(NamedTuple):
     its spectral radius. ``met`` is true if this error is within the target or the limit of rounding. ``residual`` is det Z
     minus its exact value (Liouville) in units of the n-th power of a lower bound of the spectral radius; 0 if the exact
     value is not known. ``change`` is the error of ``matrix`` entry by entry, with a safety factor of four: the distance of
-    the finer result from the limit extrapolated from both results. It is None without a second result.
+    the finer result from the limit extrapolated from both results, or None without a second result.
     """
 
     matrix: Array
@@ -126,11 +126,11 @@ def compare(
 ) -> Monodromy:
     """Monodromy matrix of ``fine`` and its error; ``stiffness`` as of :func:`stiffness_of`.
 
-    ``reduction`` is the error of ``coarse`` over that of ``fine``, minus one. The propagators are compared too, because the
-    errors of a product of nearly rank one may be small by accident, relative to its norm. Rounding of the matrix products
-    accumulates like the square root of ``steps``. Rounding during the march grows until its end by the factor from
-    ``fine``, but never so much that it would not show in ``coarse``. Rounding of the entries of A is equal in both
-    propagators: it shifts exponents by `_ENTRIES` units of the ``stiffness``.
+    ``reduction`` is the error of ``coarse`` over the error of ``fine``, minus one. The propagators are compared too, because
+    the errors of a product of nearly rank one may be small by accident, relative to its norm. Rounding of the matrix
+    products accumulates like the square root of ``steps``. Rounding during the march grows until its end by the factor
+    ``fine.growth``, but at most to the difference from ``coarse``. Rounding of the entries of A is equal in both propagators
+    and shifts exponents by `_ENTRIES` units of the ``stiffness``.
     """
     other = jnp.exp(coarse.log_scale - fine.log_scale) * coarse.matrix
     z_fine, z_coarse, norm = _assembled(system, fine.matrix, other)
@@ -192,8 +192,8 @@ def direct_monodromy(
     """Refine from ``steps`` predicted steps (traced integer) until the error of every lane is at most ``rtol``.
 
     ``propagate(steps, pieces)`` returns the propagator of ``system`` with batch shape ``shape``, by a scheme of order
-    ``order``, in up to ``most_pieces``. ``stiffness`` is that of :func:`stiffness_of`. A lane that overflows gets two
-    doublings to recover and then no longer delays the others. After six doublings the error is reported, whatever it is. For
+    ``order``, in up to ``most_pieces``. ``stiffness`` is the result of :func:`stiffness_of`. A lane that overflows has two
+    doublings to recover and then no longer delays the others. After six doublings the error may exceed ``rtol``. For
     ``ratio`` and ``least`` see :func:`_first_steps`.
     """
     begin, predicted, pieces = _first_steps(steps, ratio, least, most_pieces)

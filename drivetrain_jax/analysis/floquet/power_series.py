@@ -34,7 +34,7 @@ def propagators_along(form: Form, ends: Array, first: int, lanes: int, parts: Ar
 
     ``form(p)`` is the system for the value p of the coordinate's parameter. ``ends`` ``(2,)`` are the values of p at
     ``x = 0`` and ``x = 1``; ``|x| <= 1``. The span is cut into ``parts`` (a traced integer). The truncation error is the
-    size of the last term relative to the largest term, in the worst part. It is infinite if ``A0`` has entries that do not
+    size of the last term relative to the largest term, in the worst part, and infinite if ``A0`` has entries that do not
     lead from the ``first`` states to the others.
     """
     weights, places = radau_iia(NODES)

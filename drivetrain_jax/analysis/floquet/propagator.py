@@ -3,7 +3,7 @@
 Both return ``Phi`` over ``[0, span]`` of a :class:`~drivetrain_jax.systems.LinearPeriodic` with the number of steps as a
 traced integer, so that one compilation serves every accuracy. A step of diffrax is a piece of the span, and a piece is many
 steps of the scheme. Under ``jax.vmap`` the explicit scheme marches each block of lanes as one kernel and keeps every matrix
-as rows of shape ``(n, lanes)``. It evaluates the entries of ``A`` at all stages of a step together, so that common
+as rows of shape ``(n, lanes)``. The entries of ``A`` at all stages of a step are evaluated together, so that common
 expressions are computed once (:mod:`~drivetrain_jax.analysis.numerics.staged`).
 """
 

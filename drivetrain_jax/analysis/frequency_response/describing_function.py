@@ -134,7 +134,7 @@ def skeleton(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Skelet
     folds = []
     for sign in (-1.0, 1.0):
         slope = arm_slope(model, nodes, points, sign)
-        # Where the arms meet the root vanishes: use the sign of the other term, to avoid rounding.
+        # The root vanishes where the arms meet: use the sign of the other term, to avoid rounding.
         slope = jnp.where(meet, -sign, slope)
         mask = sign_changes(slope > 0, _FOLDS_PER_ARM)
         low, high, start = take(mask, nodes[:-1]), take(mask, nodes[1:]), take(mask, slope[:-1])
@@ -240,7 +240,7 @@ def _arm_gap(
 def _brackets(bones: Skeleton, square: Array) -> tuple[Array, Array, Array]:
     """Mask of the intervals of the skeleton where an arm crosses ``omega^2``, the arm (-1 or 1), and a sign.
 
-    The sign is that of the slope of the gap (:func:`_arm_gap`) between ``omega^2`` and the arm.
+    The last result is the sign of the slope of the gap (:func:`_arm_gap`) between ``omega^2`` and the arm.
     The arms are separate: at light damping both may cross a frequency between the same two amplitudes.
     """
     lower, upper = bones.arms

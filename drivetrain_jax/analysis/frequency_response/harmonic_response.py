@@ -108,8 +108,8 @@ def response(
 ) -> dict[str, Array]:
     """The requested results of a line of frequencies ``model.omega`` (L,) of oscillators of the batch ``shape``.
 
-    The outcome is ``NOT_CONVERGED`` where a sweep has no balanced motion. It is ``TOLERANCE_NOT_MET`` where the requested
-    branch did not reach the lowest frequency, or has more motions than the results hold.
+    The outcome is ``NOT_CONVERGED`` where a sweep has no balanced motion, and ``TOLERANCE_NOT_MET`` where the requested
+    branch did not reach the lowest frequency or has more motions than the results hold.
     """
     omega = np.asarray(model.omega)
     lanes = shape or (1,)

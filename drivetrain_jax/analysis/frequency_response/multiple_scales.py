@@ -66,8 +66,8 @@ def cubic_fit(model: PiecewiseLinearOscillator, fit_range: Array) -> Cubic:
 def _turning_ratios(alpha: Array) -> Array:
     """Ratios ``r = b/R`` of the extremes of ``l1/r^2``, ``(2, ...)`` followed by the shape of ``alpha``.
 
-    They are the zeros of ``(1 - alpha)(45 r + 50 r^3 - 63 r^5)/16 - 2``, which is largest at r = 0.8275. Where this maximum
-    is negative, ``l1/r^2`` falls everywhere.
+    The ratios are the zeros of ``(1 - alpha)(45 r + 50 r^3 - 63 r^5)/16 - 2``, which is largest at r = 0.8275. If this
+    maximum is negative, ``l1/r^2`` falls everywhere.
     """
     soft = 1 - alpha
 
@@ -157,8 +157,8 @@ def response_residual(flow: SlowFlow, omega: Array, rho: Array) -> Array:
 def roots(flow: SlowFlow, omega: Array) -> Array:
     """All amplitudes at one frequency, rising, ``(MOST_ROOTS, ...)``, infinite where there are fewer.
 
-    The cubic is monotone between its stationary points, which are known in closed form: one bisection for each piece. It
-    bisects log rho, because rho may be smaller than its bounds by any factor.
+    The cubic is monotone between its stationary points, which are known in closed form: one bisection for each piece. The
+    bisection is in log rho, because rho may be smaller than its bounds by any factor.
     """
     delta, square = omega - flow.frequency, flow.drive**2
     bends = flow.bend != 0

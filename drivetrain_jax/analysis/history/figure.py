@@ -26,8 +26,8 @@ _MOST_TURNS = 24
 def plot(dataset: xr.Dataset) -> Figure:
     """Displacement and rate over time, phase portrait, and for a single history the 3-D curve of both over time.
 
-    These are the first two components of the state. One history: four panels. One axis or ``[points]``: a row of three
-    panels for each of up to eight values. A history without values has empty panels with a note. Raises
+    Displacement and rate are the first two components of the state. One history has four panels. One axis or ``[points]``
+    has a row of three panels for each of up to eight values. A history without values has empty panels with a note. Raises
     :class:`InputError` for more axes or values, and unless both components are stored.
     """
     with matplotlib.rc_context(STYLE):

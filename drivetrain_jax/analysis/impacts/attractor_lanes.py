@@ -1,6 +1,6 @@
 """Lanes on their way to attractors: they settle period by period, start searches, and confirm the results.
 
-A *lane* processes one point at a time. It stores the states of the last 33 periods to guess the period multiple, and
+A *lane* processes one point at a time, stores the states of the last 33 periods to guess the period multiple, and
 accumulates the growth of a tangent for the Lyapunov exponent.
 """
 

@@ -184,7 +184,7 @@ def measure(
     """Measures of the motions that start from ``(u, v)``, shape ``(N,)``.
 
     The measures run until the state recurs, at most for ``multiple`` periods, so that ``periods`` is the smallest period
-    multiple. Where ``multiple`` is 0, they run for 32 periods. Without ``integrals`` the integrals are zero.
+    multiple, or for 32 periods where ``multiple`` is 0. Without ``integrals`` the integrals are zero.
     """
     count = u.size
     width = min(width, count)

@@ -7,8 +7,8 @@ and ``y = x'``, and with the step response P and impulse response S = P' of the 
     x(t + d) = x + S y + P (F - K x),    y(t + d) = S' y + S (F - K x),    S' = 1 - K P - C S.
 
 ``[[1 - K P, S], [-K S, S']]`` is the transition matrix; its determinant is ``exp(-C d)``. Neither K = 0 nor critical
-damping is singular in this form. As the spring force is continuous, the transition matrix of a motion is the product
-of those of its steps.
+damping is singular in this form. As the spring force is continuous, the transition matrix of a motion is the product of
+the transition matrices of its steps.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The estimator (31)-(36) of Bugaru & Vasile 2022. It is not a Lyapunov exponent.
+"""The estimator (31)-(36) of Bugaru & Vasile 2022, which is not a Lyapunov exponent.
 
     L_j = (1/T_f) sum_i log10(|Delta_j(T_i+1)| / |Delta(T_f)|)
 
@@ -10,7 +10,7 @@ component with a norm of mixed units; and its sum grows with the number of T_i, 
 to their distance.
 
 The paper does not print the length of an interval; here it is one strobe. An interval at whose end a component has the
-distance 0 is left out. This is the first interval of a flow with a clock, which starts at 0.
+distance 0 is left out, such as the first interval of a flow with a clock, which starts at 0.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ def adds_up(spectrum: Array, error: Array, residual: Array, period: Any) -> Arra
 def same_exponent(value: Array, error: Array, other: Array, other_error: Array) -> Array:
     """Flags where two step sizes give the same exponent: within three combined standard errors or a tenth.
 
-    Within a tenth if an error is NaN, as for an unbounded motion; never if a value is NaN.
+    If an error is NaN, as for an unbounded motion, only the tenth counts. The flag is false if a value is NaN.
     """
     allowed = jnp.fmax(STANDARD_ERRORS * jnp.hypot(error, other_error), _AGREEMENT * jnp.abs(value))
     return jnp.abs(value - other) <= allowed

@@ -74,8 +74,8 @@ def strobe_map(flow: Flow, steps: Any) -> Callable[..., Frame]:
 
     The map ``(strobe, frame, first, last)`` makes only the steps ``first`` to ``last - 1``.
 
-    It integrates ``y' = f(t, y)``, ``v' = (df/dy) v`` for every tangent vector (by forward differentiation) and, if the
-    frame has it, the integral of ``div f``.
+    The steps integrate ``y' = f(t, y)``, ``v' = (df/dy) v`` for every tangent vector (by forward differentiation) and, if
+    the frame has it, the integral of ``div f``.
     """
     h = flow.period / steps
 

@@ -285,9 +285,9 @@ def _derivatives(
 ) -> dict[str, Array]:
     """Jacobian of the frequencies, ``df = u^T (dK - (2 pi f)^2 dM) u / (8 pi^2 f)`` with modes u of unit modal mass.
 
-    It is formed spring by spring, without a stiffness matrix. NaN in two cases: where a parameter splits equal frequencies
-    (along the eigenvalues of ``u_i^T (dK - (2 pi f)^2 dM) u_j``), and where the frequency of a rigid mode rises from zero
-    like sqrt(k).
+    The Jacobian is formed spring by spring, without a stiffness matrix. Entries are NaN in two cases: where a parameter
+    splits equal frequencies (along the eigenvalues of ``u_i^T (dK - (2 pi f)^2 dM) u_j``), and where the frequency of a
+    rigid mode rises from zero like sqrt(k).
     """
     del request, results
 

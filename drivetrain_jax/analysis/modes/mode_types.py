@@ -1,7 +1,7 @@
 """Modes of one block of a spring system, with the family of each mode or its shares of several families.
 
-Eigenvectors of a multiple frequency are arbitrary within their space. They are rotated until they diagonalise the operator
-whose eigenvalue is the number of the family, so that a pure mode in the space becomes an eigenvector. Eigenvectors of
+Eigenvectors of a multiple frequency are arbitrary within their space. A rotation makes them diagonalise the operator whose
+eigenvalue is the number of the family, so that a pure mode in the space becomes an eigenvector. Eigenvectors of
 different frequencies stay unchanged, however close the frequencies are. Only the type of a mode may come from a vector
 rotated within a wider cluster.
 """

@@ -25,7 +25,7 @@ def predicted(function: Callable[..., Array], given: tuple[Hashable, ...], colum
 
     ``columns`` are the values of N points: numbers as arrays of shape ``(N,)`` or one number for all points, words, and
     tuples of numbers. ``values`` are the values of one point. The function is compiled once as a whole: compiling its
-    operations one by one would take longer than a small scene. It may raise :class:`InputError`.
+    operations one by one would take longer than a small scene. ``function`` may raise :class:`InputError`.
     """
     words, numbers = split(columns)
     count = count_of(columns)

@@ -75,8 +75,7 @@ def _split(jaxpr: Jaxpr) -> tuple[list[JaxprEqn], list[JaxprEqn]]:
 def _shared_once(equations: Sequence[JaxprEqn], results: Iterable[Any]) -> list[tuple[list[Var], list[Var], Callable]]:
     """``(inputs, outputs, function)`` of the parts of ``equations``, in order.
 
-    There is one part for each value that is a result or is used by several parts. It includes all values that no other part
-    uses.
+    There is one part for each value that is a result or is used by several parts, with all values that only this part uses.
     """
     wanted = _variables(results)
     if any(len(equation.outvars) != 1 for equation in equations):
