@@ -61,4 +61,4 @@ class PiecewiseLinearOscillator(eqx.Module):
 
 
 class UnderdampedOscillator(PiecewiseLinearOscillator):
-    """An oscillator whose free motion oscillates in contact and within the play, so that kernels omit the overdamped flow."""
+    """An oscillator whose free motion oscillates in contact and within the play; kernels omit the overdamped flow."""
