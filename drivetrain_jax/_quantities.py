@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
+from decimal import Decimal
+from numbers import Real
 from typing import Any
 
+from drivetrain_jax import _units
 from drivetrain_jax._wording import shown
 
 # First code of ``outcome`` without a value.
@@ -20,6 +24,7 @@ class Parameter:
     ``lower`` and ``upper`` are inclusive unless the matching ``open_*`` flag is set; ``infinite`` admits infinity. The
     value is one of the words ``choices``, any word (``text``), a list of numbers in the range (``listed``, default ``()``:
     none), or, with ``broadcast``, also one number for all entries. ``symbol`` is its form in formulas.
+    Values above ``usual`` are warned of, because they were probably meant in mm. A number may be a text with a unit.
     """
 
     name: str
@@ -38,6 +43,7 @@ class Parameter:
     infinite: bool = False
     text: bool = False
     symbol: str = ""
+    usual: float = math.inf
 
     @property
     def is_number(self) -> bool:
@@ -88,14 +94,39 @@ class Parameter:
         return self._check_number(value, self.name)
 
     def _check_number(self, value: object, label: str) -> float | int:
+        if isinstance(value, str):
+            value = self._in_units(value, label)
+        elif isinstance(value, Decimal) or (isinstance(value, Real) and not isinstance(value, (bool, int, float))):
+            value = float(value)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise ValueError(f"{label} = {shown(value)}: allowed is a number, {self.allowed}")
+        if not self._is_within(value) or (self.integer and value != int(value)):
+            raise ValueError(f"{label} = {value!r}: allowed is {self.allowed_in_units}{self._meant(value)}")
+        if value > self.usual:
+            usual = f"more than {self.usual:g} {self.units}"
+            warnings.warn(f'{label} = {value:.10g} {self.units}: {usual}; is "{value:.10g} mm" meant?', stacklevel=2)
+        return int(value) if self.integer else float(value)
+
+    def _is_within(self, value: float) -> bool:
         below = value <= self.lower if self.open_lower else value < self.lower
         above = value >= self.upper if self.open_upper else value > self.upper
-        finite = math.isfinite(value) or (self.infinite and value == math.inf)
-        if not finite or below or above or (self.integer and value != int(value)):
-            raise ValueError(f"{label} = {value!r}: allowed is {self.allowed_in_units}")
-        return int(value) if self.integer else float(value)
+        return not (below or above) and (math.isfinite(value) or (self.infinite and value == math.inf))
+
+    def _in_units(self, text: str, label: str) -> float:
+        """The number that ``text`` writes with a unit, or ``ValueError`` with one line."""
+        try:
+            return _units.number(text, self.units)
+        except _units.UnitError as error:
+            if _units.split(text) is None:
+                raise ValueError(f"{label} = {shown(text)}: allowed is a number, {self.allowed}") from None
+            unit = "a number without unit" if self.units == "1" else f"a number in {self.units} or in a unit like it"
+            raise ValueError(f"{label} = {shown(text)}: {error}; allowed is {unit}, {self.allowed}") from None
+
+    def _meant(self, value: float) -> str:
+        """A question, if ``value`` would be in the range as an angle in degrees."""
+        if self.units != "rad" or not math.isfinite(value) or not self._is_within(math.radians(value)):
+            return ""
+        return f'; did you mean "{value:.10g} deg"?'
 
 
 @dataclass(frozen=True)

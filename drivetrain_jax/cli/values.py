@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import clipped
 
@@ -33,17 +34,22 @@ def assignments(texts: Sequence[str], field: str) -> dict[str, Any]:
 
 
 def ranges(texts: Sequence[str], field: str) -> dict[str, Any]:
-    """A mapping from ``name=value`` words; values are numbers or pairs ``LOW:HIGH``."""
+    """A mapping from ``name=value`` words; values are numbers or pairs ``LOW:HIGH``, texts if they have units."""
     return {name: _number_or_range(name, value) for name, value in assignments(texts, field).items()}
 
 
 def _number_or_range(name: str, value: Any) -> Any:
-    try:
-        if isinstance(value, str):
-            low, high = (float(end) for end in value.split(":"))
-            return low, high
-        if not isinstance(value, bool):
-            return float(value)
-    except (TypeError, ValueError):
-        pass
-    raise InputError(f"{name} = {value!r}: allowed is a number or LOW:HIGH")
+    if isinstance(value, str):
+        ends = [_units.split(end) for end in value.split(":")]
+        known = [end for end in ends if end is not None]
+        if len(known) == len(ends) <= 2:
+            # 0:18deg is a range in degrees.
+            numbers = [_written(number, unit or known[-1][1]) for number, unit in known]
+            return numbers[0] if len(numbers) == 1 else tuple(numbers)
+    elif isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    raise InputError(f"{name} = {value!r}: allowed is a number or LOW:HIGH, with or without units (200:4000rpm)")
+
+
+def _written(number: float, unit: str) -> float | str:
+    return f"{number!r} {unit}" if unit else number

@@ -174,7 +174,7 @@ def labelled(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str,
     sweep_dims = ("point",) if scene.zipped else tuple(axis.dim for axis in scene.axes)
     results = [(v, arrays[v.name]) for v in result_variables(scene)]
     return Labelled.build(
-        sweep_dims, _axis_coordinates(scene), scene.dimensions, results, result_attrs(scene) | dict(attrs)
+        sweep_dims, axis_coordinates(scene), scene.dimensions, results, result_attrs(scene) | dict(attrs)
     )
 
 
@@ -183,17 +183,19 @@ def to_dataset(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[st
     return labelled(scene, arrays, attrs).to_dataset()
 
 
-def _axis_coordinates(scene: Scene) -> list[Coordinate]:
+def axis_coordinates(scene: Scene) -> list[Coordinate]:
+    """The axes as the scene gives them, and the parameters that vary along them."""
     coordinates = [
         Coordinate(
-            axis.dim,
+            part.own_dim,
             ("point",) if scene.zipped else (axis.dim,),
-            axis.values,
-            axis.parameter.units,
-            axis.long_name,
-            "" if axis.name == axis.dim else axis.name,
+            part.values,
+            part.parameter.units,
+            part.long_name,
+            "" if part.name == part.own_dim else part.name,
         )
         for axis in scene.axes
+        for part in (*axis.given, *axis.together)
     ]
     if scene.zipped:
         numbers = np.arange(len(scene.axes[0].values))
@@ -209,6 +211,21 @@ def _drawn(system: type[System]) -> dict[str, str]:
         "resonance_families": {f.prefix: {k: v for k, v in vars(f).items() if k != "prefix"} for f in families},
     }
     return {name: json.dumps(value) for name, value in attrs.items() if value}
+
+
+def _roles(scene: Scene) -> dict[str, str]:
+    """The roles of the system; an axis given in physical data takes the role of its parameter."""
+    given = {axis.name: axis.dim for axis in scene.axes if axis.given}
+    return {role: given.get(name, name) for role, name in scene.system.roles.items()}
+
+
+def _physical(scene: Scene) -> dict[str, str]:
+    """The physical data of a scene that do not vary."""
+    if not scene.data or scene.system.physical is None:
+        return {}
+    known = {name: (value, scene.system.physical.quantity(name)) for name, value in scene.data.items()}
+    about = {n: {"value": value, "units": q.units, "long_name": q.long_name} for n, (value, q) in known.items()}
+    return {"physical_data": json.dumps(about)}
 
 
 def result_attrs(scene: Scene) -> dict[str, str]:
@@ -232,13 +249,14 @@ def result_attrs(scene: Scene) -> dict[str, str]:
         "history": f"{created}: {provenance.command()}",
         **cited,
         "system": scene.system.name,
-        "roles": json.dumps(dict(scene.system.roles)),
+        "roles": json.dumps(_roles(scene)),
         **_drawn(scene.system),
         "analysis": scene.analysis.name,
         "method": scene.request.method,
         "options": json.dumps(dict(scene.request.options)),
         "scene": scene.text,
         "fixed_parameters": json.dumps(fixed),
+        **_physical(scene),
         "drivetrain_jax_version": version,
         "versions": ", ".join(f"{name} {number}" for name, number in installed.items()),
         "machine": machine(),

@@ -22,7 +22,7 @@ from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.analysis.request import make_request
 from drivetrain_jax.atlas import design
 from drivetrain_jax.atlas.criteria import has_boundaries
-from drivetrain_jax.atlas.windows import Crossing, Interval
+from drivetrain_jax.atlas.windows import Crossing, Interval, narrow
 from drivetrain_jax.runs.atlas_file import StoredAtlas
 from drivetrain_jax.runs.atlas_question import AtlasQuery, Range, number, roles_of
 from drivetrain_jax.systems import System
@@ -30,7 +30,12 @@ from drivetrain_jax.systems import System
 # Distance of a spectral radius from 1 below which the distance itself is printed.
 _CLOSE = 1e-3
 # Text after the end of a stable interval, by kind of end (`_kind`).
-_BEYOND = {"crossing": "", "atlas": " (the end of the atlas)", "undecided": " (undecided beyond)"}
+_BEYOND = {
+    "crossing": "",
+    "range": " (the end of the range)",
+    "atlas": " (the end of the atlas)",
+    "undecided": " (undecided beyond)",
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -99,7 +104,7 @@ def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Rep
     """The least damping above which a range of speeds is stable.
 
     If the largest damping of the atlas is unstable, the answer lists the stable ranges of damping. For a cardan shaft in
-    physical units only the ratio ``c2/c1`` of the given dampings is used, and the answer is ``c1``. Raises as :func:`query`.
+    physical units the answer is ``c1``; of given dampings only the ratio ``c2/c1`` is used. Raises as :func:`query`.
     """
     speed, damping = roles_of(atlas, "speed", "damping")
     asked = AtlasQuery.of(atlas, given, ranges=(speed,), free=(damping,))
@@ -123,18 +128,19 @@ def widest_angle(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Repl
 
 
 def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float = 0.0) -> Reply:
-    """The stable ranges of speed, shortened by ``margin`` times the speed at either end. Raises as :func:`query`."""
+    """The stable ranges of speed, shortened by ``margin`` times the speed at either end, within a range of speeds if one is
+    given. Raises as :func:`query`."""
     if not 0 <= margin < 1:
         raise InputError(f"margin = {margin!r}: allowed is 0 <= margin < 1")
     (speed,) = roles_of(atlas, "speed")
-    asked = AtlasQuery.of(atlas, given, ranges=(), free=(speed,))
-    found = design.speed_windows(
-        atlas.stability.atlas, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.radius
-    )
+    asked = AtlasQuery.of(atlas, given, ranges=(), free=(speed,), within=(speed,))
+    panels = atlas.stability.atlas
+    part = narrow(panels, {speed: asked.values[speed]}) if speed in asked.values else panels
+    found = design.speed_windows(part, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.radius)
     lines = [f"safe speeds, {asked.heading()}, margin {margin:g}"]
     for w in found.windows:
         ends = " to ".join(
-            asked.named(speed, value) + _BEYOND[_kind(atlas, speed, *end)]
+            asked.named(speed, value) + _BEYOND[_kind(asked, speed, *end)]
             for value, end in zip(w.safe, w.interval.ends, strict=True)
         )
         lines.append(f"  {ends}; largest spectral radius {_from_one(w.largest)} at {speed} = {number(w.where)}")
@@ -161,11 +167,14 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
     return Reply("\n".join(lines), data)
 
 
-def _kind(atlas: StoredAtlas, name: str, end: float, crossing: Crossing | None) -> str:
-    """The kind of the end of a stable interval: ``crossing``, ``atlas`` (the end of the atlas) or ``undecided``."""
+def _kind(asked: AtlasQuery, name: str, end: float, crossing: Crossing | None) -> str:
+    """The kind of the end of a stable interval: ``crossing``, ``range`` (the end of the given range), ``atlas`` (the end of
+    the atlas) or ``undecided``."""
     if crossing:
         return "crossing"
-    low, high = atlas.ranges[name]
+    low, high = asked.atlas.ranges[name]
+    if end in np.atleast_1d(asked.values.get(name, ())) and end not in (low, high):
+        return "range"
     # Angles are without signs here.
     return "atlas" if abs(end) in {abs(low), abs(high), *([0.0] if low < 0 < high else [])} else "undecided"
 
@@ -175,7 +184,7 @@ def _ends(asked: AtlasQuery, name: str, interval: Interval) -> list[dict[str, An
     return [
         {
             "value": value,
-            "kind": _kind(asked.atlas, name, value, crossing),
+            "kind": _kind(asked, name, value, crossing),
             "error": crossing.error if crossing else None,
             "multiplier": crossing.multiplier if crossing else None,
         }
@@ -185,7 +194,7 @@ def _ends(asked: AtlasQuery, name: str, interval: Interval) -> list[dict[str, An
 
 def _bounded(asked: AtlasQuery, name: str, value: float, crossing: Crossing | None) -> str:
     """One end of a stable interval as text, with its error."""
-    bound = f" +- {crossing.error:.1e}" if crossing else _BEYOND[_kind(asked.atlas, name, value, crossing)]
+    bound = f" +- {crossing.error:.1e}" if crossing else _BEYOND[_kind(asked, name, value, crossing)]
     return asked.named(name, value) + bound
 
 
@@ -201,7 +210,7 @@ def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: des
         none = "of the atlas is sufficient" if answer.certain else "found; whether there is one is undecided"
         lines.append(f"  no {name} {none}")
     if answer.limit:
-        where = ", ".join(f"{n} = {number(v)}" for n, v in answer.limit.point.items())
+        where = ", ".join(asked.named(n, v) for n, v in answer.limit.point.items())
         lines.append(f"  limit: multiplier {answer.limit.multiplier} at {where}")
     if answer.check:
         lines += [] if answer.certain else ["  not certain: undecided ranges are wider than the errors"]
@@ -297,6 +306,7 @@ def _crossing(asked: AtlasQuery, name: str, crossing: Crossing | None) -> dict[s
         "error": crossing.error,
         "multiplier": crossing.multiplier,
         "point": dict(crossing.point),
+        "physical_point": asked.physical(crossing.point),
     }
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import json
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -12,14 +14,19 @@ import numpy as np
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Parameter
+from drivetrain_jax._units import factor
 from drivetrain_jax.atlas.boundaries import boundaries
 from drivetrain_jax.atlas.criteria import has_boundaries
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.tips import Tips, find_tips
 from drivetrain_jax.atlas.windows import narrow
 from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, open_atlas
+from drivetrain_jax.runs.axes import in_unit
+from drivetrain_jax.runs.physical import in_parameters
 from drivetrain_jax.systems import System
 
+Convert = Callable[[Any], Any]
 # Values of each parameter that is not an axis of the chart.
 _SLICES = 3
 
@@ -36,7 +43,8 @@ def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, flo
     if not 2 <= cells <= 20_000:
         raise InputError(f"cells = {cells}: allowed is 2 <= cells <= 20000")
     atlas = open_atlas(source)
-    ranges = _ranges(atlas, part)
+    views = _physical_views(atlas, part)
+    ranges = _ranges(atlas, atlas.in_parameters(part))
     fixed = {name: value for name, value in ranges.items() if not isinstance(value, tuple)}
     shown = _shown(atlas.scene.system, [name for name in ranges if name not in fixed])
     if not shown:
@@ -47,9 +55,49 @@ def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, flo
         if name in shown
     }
     dataset = atlas.grid(**axes, **fixed)
-    if len(shown) != 2 or not has_boundaries(atlas.stability.atlas, atlas.scene.system):
-        return dataset
-    return dataset.assign_coords(_curves(atlas, fixed, {n: ranges[n] for n in shown}))
+    if len(shown) == 2 and has_boundaries(atlas.stability.atlas, atlas.scene.system):
+        dataset = dataset.assign_coords(_curves(atlas, fixed, {n: ranges[n] for n in shown}))
+    for name, (quantity, convert) in views.items():
+        dataset = _in_physical_units(dataset, name, quantity, convert)
+    return dataset
+
+
+def _physical_views(atlas: StoredAtlas, part: Mapping[str, Any]) -> dict[str, tuple[Parameter, Convert]]:
+    """For each parameter that the scene or ``part`` gives in physical data: the quantity, and the way to its values."""
+    given, _ = in_parameters(atlas.scene.system, part, atlas.scene.data)
+    if given is None:
+        return {}
+    swept = {axis.name: axis.shown.parameter.units for axis in atlas.scene.axes if axis.given}
+    views: dict[str, tuple[Parameter, Convert]] = {}
+    for name in atlas.parameters:
+        found = given.back(name)
+        if found is not None and (name in swept or found[0].name in part):
+            quantity, back = found
+            unit = swept.get(name, quantity.units)
+            views[name] = (in_unit(quantity, unit), partial(_back, back, factor(quantity.units, unit)))
+    return views
+
+
+def _back(back: Convert, size: float, values: Any) -> Any:
+    return back(values) * size
+
+
+def _in_physical_units(dataset: xr.Dataset, name: str, quantity: Parameter, convert: Convert) -> xr.Dataset:
+    """``dataset`` with the parameter ``name``, its boundaries and its tips also, or instead, as physical data."""
+    other, about = quantity.name, {"units": quantity.units}
+    coords = {}
+    for prefix, suffix in (("boundary_", ""), ("tip_", ""), ("tip_", "_error"), ("undecided_", "")):
+        if (old := f"{prefix}{name}{suffix}") in dataset.coords:
+            values, label = dataset[old], dataset[old].attrs["long_name"].replace(name, other)
+            # The conversions are linear.
+            coords[f"{prefix}{other}{suffix}"] = (values.dims, convert(values.values), {**about, "long_name": label})
+            dataset = dataset.drop_vars(old)
+    own = dataset[name]
+    coords[other] = (own.dims, convert(own.values), {**about, "long_name": quantity.long_name})
+    dataset = dataset.assign_coords(coords)
+    roles = {role: other if p == name else p for role, p in json.loads(dataset.attrs["roles"]).items()}
+    dataset = dataset.assign_attrs(roles=json.dumps(roles))
+    return dataset.swap_dims({name: other}) if own.ndim else dataset
 
 
 def _ranges(atlas: StoredAtlas, part: Mapping[str, Any]) -> dict[str, Any]:

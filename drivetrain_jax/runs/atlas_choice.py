@@ -26,11 +26,12 @@ _FINEST = 1e-12
 
 def atlas_ranges(scene: Scene) -> Ranges:
     """Lowest and highest value of every parameter that varies, those with the fewest values first."""
-    lengths = {axis.name: len(axis.values) for axis in scene.axes}
-    varying = [axis for axis in scene.axes if axis.values.min() < axis.values.max()]
+    parts = [part for axis in scene.axes for part in axis.together]
+    lengths = {part.name: len(part.values) for part in parts}
+    varying = [part for part in parts if part.values.min() < part.values.max()]
     return {
-        axis.name: (float(axis.values.min()), float(axis.values.max()))
-        for axis in sorted(varying, key=lambda axis: lengths[axis.name])
+        part.name: (float(part.values.min()), float(part.values.max()))
+        for part in sorted(varying, key=lambda part: lengths[part.name])
     }
 
 
@@ -43,6 +44,14 @@ def choose_atlas(scene: Scene) -> tuple[Ranges, int | None] | None:
     if scene.analysis.name != "floquet" or scene.request.method not in ("auto", "atlas"):
         return None
     ranges = atlas_ranges(scene)
+    several = None if scene.zipped else next((axis for axis in scene.axes if axis.also), None)
+    if several is not None:
+        if scene.request.method == "atlas":
+            names = ", ".join(part.name for part in several.together)
+            raise InputError(
+                f"options.method = 'atlas': axes.{several.shown.name} changes {names} together; allowed are auto and direct"
+            )
+        return None
     if scene.request.method == "atlas":
         if len(ranges) > MAX_RANGES:
             allowed = f"allowed are at most {MAX_RANGES}"

@@ -21,6 +21,7 @@ from drivetrain_jax.runs.assemble import ResultBuffer, result_attrs, to_dataset
 from drivetrain_jax.runs.axes import Axis
 from drivetrain_jax.runs.executor import Threads
 from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.physical import in_parameters
 from drivetrain_jax.runs.routes import DIRECT
 from drivetrain_jax.runs.scene import Scene, restore_scene
 from drivetrain_jax.runs.through_atlas import evaluate
@@ -50,6 +51,8 @@ _VARIABLES = {
 # Every atlas has a domain, and panels, gaps or both.
 _DOMAIN, _GAPS = ("lower", "upper"), ("gap_lower", "gap_upper", "gap_reason")
 _PANELS = tuple(name for name in _VARIABLES if name not in (*_DOMAIN, *_GAPS))
+# Relative tolerance within which a value equals a fixed parameter of an atlas.
+SAME_FIXED = 5e-4
 _ATTRIBUTES = ("scene", "coordinates_of_panels", "tolerance", "solves")
 
 
@@ -202,6 +205,7 @@ class StoredAtlas:
         """
         import xarray as xr
 
+        values = self.in_parameters(values)
         checked = {name: self._checked(name, values) for name in self._names(values)}
         columns = dict(zip(checked, _broadcast(checked), strict=True))
         whole = columns[self.parameters[0]]
@@ -224,6 +228,7 @@ class StoredAtlas:
         The dimensions have the order in which the arrays are given; a number is a coordinate without a dimension. Raises
         the errors of a call.
         """
+        values = self.in_parameters(values)
         self._names(values)
         given = {name: np.asarray(self._checked(name, values), float) for name in values}
         axes = {name: column for name, column in given.items() if column.ndim}
@@ -275,6 +280,16 @@ class StoredAtlas:
         Work(Threads()).do(job, buffer, Progress(job.total))
         return buffer.lay_out()["spectral_radius"]
 
+    def in_parameters(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """``values`` with parameters of the atlas for physical data, and numbers for texts; fixed ones must agree."""
+        given, found = in_parameters(self.scene.system, values, self.scene.data)
+        if given is None:
+            return dict(values)
+        for name, value in found.items():
+            if name in self.fixed and name not in values:
+                check_same(name, value, self.fixed[name])
+        return {name: value for name, value in found.items() if name not in self.fixed or name in values}
+
     def _names(self, values: Mapping[str, Any]) -> tuple[str, ...]:
         for name in values:
             if name not in self.parameters:
@@ -301,6 +316,13 @@ class StoredAtlas:
         fixed = dict(scene.fixed) | {name: value for name, value in fixed.items() if name not in axes}
         floquet = get_analysis("floquet").for_system(system)
         return Scene(system, floquet, request, columns, zipped, fixed, scene.title, scene.text)
+
+
+def check_same(name: str, value: Any, fixed: float) -> None:
+    """Raise :class:`InputError` unless ``value`` is the ``fixed`` one of the atlas, which may be typed with four digits."""
+    if isinstance(value, tuple) or not np.allclose(value, fixed, rtol=SAME_FIXED, atol=0):
+        made = f"the atlas is made for {name} = {fixed:.10g}"
+        raise InputError(f"{name} = {as_given(value)}: {made}; allowed is that value")
 
 
 def as_given(value: Any) -> str:

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given
-from drivetrain_jax.runs.physical import nondimensional
+from drivetrain_jax.runs import toml
+from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, check_same
+from drivetrain_jax.runs.physical import GivenData, in_parameters
 
 Range = tuple[float, float]
-# Relative tolerance within which a value equals a fixed parameter, or an end of a range: values converted from other units,
-# or copied from a message, are rounded.
+# Relative tolerance within which a value equals an end of a range: values converted from other units, or copied from a
+# message, are rounded.
 _SAME = 1e-9
 
 
@@ -37,17 +38,26 @@ class AtlasQuery:
 
     atlas: StoredAtlas
     values: Mapping[str, Any]
-    shaft: Any
+    shaft: GivenData | None
 
     @classmethod
     def of(
-        cls, atlas: StoredAtlas, given: Mapping[str, Any], ranges: tuple[str, ...], free: tuple[str, ...] = ()
+        cls,
+        atlas: StoredAtlas,
+        given: Mapping[str, Any],
+        ranges: tuple[str, ...],
+        free: tuple[str, ...] = (),
+        within: tuple[str, ...] = (),
     ) -> AtlasQuery:
-        """Check the given values; ``ranges`` names parameters that need a range, ``free`` those that are the answer."""
-        shaft, values = nondimensional(atlas.scene.system, given)
+        """Check the given values; ``ranges`` names parameters that need a range, ``free`` those that are the answer, which a
+        range ``within`` the atlas may restrict."""
+        given = {name: _plain(value) for name, value in given.items()}
+        shaft, values = in_parameters(atlas.scene.system, given, atlas.scene.data)
         for name, value in given.items():
-            if _meant(name, value, shaft) in free:
-                raise InputError(f"{name} = {as_given(value)}: is the answer; allowed is to leave it out")
+            meant = shaft.parameter_of(name) if shaft else name
+            if meant in free and not (meant in within and isinstance(value, tuple)):
+                allowed = "allowed is to leave it out" + (", or LOW:HIGH" if meant in within else "")
+                raise InputError(f"{name} = {as_given(value)}: is the answer; {allowed}")
         for name in (*ranges, *free):
             if name not in atlas.parameters:
                 raise InputError(
@@ -55,19 +65,17 @@ class AtlasQuery:
                 )
         for name, value in values.items():
             if name in atlas.fixed and name not in free:
-                _check_same(name, value, atlas.fixed[name])
-        own = {
-            name: _within(value, atlas.ranges[name])
-            for name, value in values.items()
-            if name in atlas.parameters and name not in free
-        }
+                check_same(name, value, atlas.fixed[name])
+        kept = {name for name in atlas.parameters if name not in free or name in within}
+        own = {name: _within(value, atlas.ranges[name]) for name, value in values.items() if name in kept}
         for name in values:
             if name not in atlas.parameters and name not in atlas.fixed:
                 physical = atlas.scene.system.physical
                 atlas.refuse(name, values[name], *atlas.fixed, *(physical.names if physical else ()))
         for name in atlas.parameters:
-            if name not in free:
-                _check_range(_Words.of(atlas, shaft, name), atlas.ranges[name], own.get(name), name in ranges)
+            if name not in free or name in own:
+                words = _Words.of(atlas, None if name in given else shaft, name)
+                _check_range(words, atlas.ranges[name], own.get(name), name in (*ranges, *within))
         return cls(atlas, own, shaft)
 
     def numbers(self) -> dict[str, float]:
@@ -91,19 +99,22 @@ class AtlasQuery:
     def physical(self, values: Mapping[str, float | Range]) -> dict[str, Any]:
         """``values`` in the physical units of the input; empty without physical input."""
         found = {}
-        for name, value in values.items() if self.shaft else ():
+        if self.shaft is None:
+            return found
+        for name, value in values.items():
             ends = [self.shaft.quantity(name, end) for end in (value if isinstance(value, tuple) else (value,))]
-            if ends[0] is not None:
-                numbers = [number for _, number, _ in ends]
-                found[ends[0][0]] = {"value": numbers if isinstance(value, tuple) else numbers[0], "units": ends[0][2]}
+            known = [end for end in ends if end is not None]
+            if known:
+                numbers = [number for _, number, _ in known]
+                found[known[0][0]] = {
+                    "value": numbers if isinstance(value, tuple) else numbers[0],
+                    "units": known[0][2],
+                }
         return found
 
 
-def _meant(name: str, value: Any, shaft: Any) -> str:
-    """The parameter that ``name`` stands for, itself or as physical data."""
-    if shaft is None or name not in shaft.operation:
-        return name
-    return shaft.parameter(name, value[0] if isinstance(value, tuple) else value)[0]
+def _plain(value: Any) -> Any:
+    return tuple(map(_plain, value)) if isinstance(value, tuple) else toml.plain(value)
 
 
 def _within(value: Any, ends: Range) -> Any:
@@ -113,13 +124,6 @@ def _within(value: Any, ends: Range) -> Any:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return value
     return next((end for end in ends if math.isclose(value, end, rel_tol=_SAME)), value)
-
-
-def _check_same(name: str, value: Any, fixed: float) -> None:
-    if isinstance(value, tuple) or not math.isclose(value, fixed, rel_tol=_SAME):
-        raise InputError(
-            f"{name} = {as_given(value)}: the atlas is made for {name} = {number(fixed)}; allowed is that value"
-        )
 
 
 @dataclass(frozen=True)
@@ -133,7 +137,7 @@ class _Words:
     @classmethod
     def of(cls, atlas: StoredAtlas, shaft: Any, name: str) -> _Words:
         physical: list[Any] = [shaft.quantity(name, end) for end in atlas.ranges[name]] if shaft else [None, None]
-        if physical[0] is None or physical[0][0] not in shaft.operation:
+        if physical[0] is None:
             return cls(name, atlas.allowed(name))
         (label, low, units), (_, high, _) = physical
         allowed = f"{low:.10g} <= {label} <= {high:.10g}, in {units}"

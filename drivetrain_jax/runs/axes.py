@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import msgspec
 import numpy as np
 
+from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter
+from drivetrain_jax.analysis.request import checked
 
 MAX_POINTS = 2_000_000_000
 # Largest number of parameters of an atlas.
@@ -17,35 +20,97 @@ MAX_RANGES = 4
 _SCALES = ("lin", "log")
 
 
-class AxisTable(msgspec.Struct, forbid_unknown_fields=True):
-    """The keys of one axis: ``start, stop, num`` and ``scale``, or ``values``."""
+class WrittenAxis(msgspec.Struct, forbid_unknown_fields=True):
+    """The keys of one axis: ``start, stop, num`` and ``scale``, or ``values``; texts are numbers with units."""
 
-    start: float | int | None = None
-    stop: float | int | None = None
+    start: float | int | str | None = None
+    stop: float | int | str | None = None
     num: int | None = None
     scale: str | None = None
-    values: list[float | int] | None = None
+    values: list[float | int | str] | None = None
+
+
+@dataclass(frozen=True)
+class AxisTable:
+    """The keys of one axis with numbers alone."""
+
+    start: float | None
+    stop: float | None
+    num: int | None
+    scale: str | None
+    values: list[float] | None
 
 
 @dataclass(frozen=True)
 class Axis:
-    """A varying parameter, or entry ``entry`` of a list. ``name`` is its key in the scene: ``Omega``, ``length[1]``."""
+    """A varying parameter, or entry ``entry`` of a list. ``name`` is its key in the scene: ``Omega``, ``length[1]``.
+
+    ``given`` holds the physical quantities (several for points) that the parameter follows from, in the units of the scene;
+    the first one then names the dimension. Other parameters that follow from them vary ``also``.
+    """
 
     name: str
     parameter: Parameter
     entry: int | None
     values: np.ndarray
+    given: tuple[Axis, ...] = ()
+    also: tuple[Axis, ...] = ()
+
+    @property
+    def own_dim(self) -> str:
+        """Name of the coordinate: ``length_1``, letters, digits and underscores as CF asks."""
+        return re.sub(r"\W+", "_", self.name).strip("_")
 
     @property
     def dim(self) -> str:
-        """Name of the dimension and of the coordinate: ``length_1``, letters, digits and underscores as CF asks."""
-        return re.sub(r"\W+", "_", self.name).strip("_")
+        """Name of the dimension."""
+        return self.shown.own_dim
+
+    @property
+    def shown(self) -> Axis:
+        """The axis as the scene gives it."""
+        return self.given[0] if self.given else self
+
+    @property
+    def together(self) -> tuple[Axis, ...]:
+        """All parameters that vary along this axis, itself the first."""
+        return (self, *self.also)
 
     @property
     def long_name(self) -> str:
         """Long name of the parameter, with the position of a swept entry, counted from 0."""
         label = self.parameter.long_name
         return label if self.entry is None else f"{label}, entry {self.entry}"
+
+
+def in_units(spec: WrittenAxis, parameter: Parameter, *, keep: bool) -> tuple[AxisTable, Parameter]:
+    """The keys of an axis with numbers for texts such as ``"200 rpm"``, and the parameter in the unit of the numbers.
+
+    That is its own unit or, with ``keep``, the unit of the first text. Raises :class:`InputError` for a text that is none.
+    """
+    texts = [v for v in (spec.start, spec.stop, *(spec.values or ())) if isinstance(v, str)]
+    for text in texts:
+        checked(parameter, text, "axes.")
+    split = _units.split(texts[0]) if keep and texts else None
+    described = in_unit(parameter, split[1]) if split else parameter
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, str):
+            return _units.number(value, described.units)
+        if value is None or described is parameter:
+            return value
+        return value * _units.factor(parameter.units, described.units)
+
+    values = None if spec.values is None else [plain(value) for value in spec.values]
+    return AxisTable(plain(spec.start), plain(spec.stop), spec.num, spec.scale, values), described
+
+
+def in_unit(parameter: Parameter, unit: str) -> Parameter:
+    """``parameter`` with its range in another unit."""
+    if unit == parameter.units:
+        return parameter
+    size = _units.factor(unit, parameter.units)
+    return replace(parameter, units=unit, lower=parameter.lower / size, upper=parameter.upper / size)
 
 
 def entry_of(name: str) -> tuple[str, int | None]:

@@ -35,8 +35,9 @@ def describe(name: str) -> str:
     lines = [f"{system.name}: {system.title}", f"  {system.source}", "", "Parameters"]
     lines += aligned([_parameter_row(p) for p in system.parameters])
     if system.physical:
-        lines += ["", "Physical data, accepted by point, query and design"]
-        lines += aligned([(p.name, f"[{p.units}]", p.long_name, p.allowed) for p in system.physical.quantities])
+        lines += ["", 'Physical data, which parameters follow from; any number may have a unit: "18 deg", "1500 rpm"']
+        lines += aligned([_quantity_row(p) for p in system.physical.quantities])
+        lines += aligned([(c.parameter, f"= {c.formula}") for c in system.physical.conversions])
     if system.presets:
         lines += ["", "Presets, to copy into a scene"]
         lines += aligned([(preset, ", ".join(entries(values))) for preset, values in system.presets.items()])
@@ -70,6 +71,11 @@ def _parameter_row(parameter: Parameter) -> tuple[str, ...]:
     default = "required" if parameter.default is None else f"default {given}"
     default = f"default {parameter.derived}" if parameter.derived else default
     return parameter.name, f"[{parameter.units}]", parameter.long_name, default, parameter.allowed
+
+
+def _quantity_row(quantity: Parameter) -> tuple[str, ...]:
+    default = "" if quantity.default is None else f"default {written(quantity.default)}"
+    return quantity.name, f"[{quantity.units}]", quantity.long_name, default, quantity.allowed
 
 
 def _variable_row(variable: Variable, default: bool) -> tuple[str, ...]:

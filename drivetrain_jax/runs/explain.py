@@ -69,7 +69,7 @@ def _of_tables(table: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> It
 
 
 def _of_axes(theirs: Scene, ours: Scene) -> Iterator[str]:
-    old, new = ({axis.name: axis.values for axis in scene.axes} for scene in (theirs, ours))
+    old, new = ({axis.shown.name: axis.shown.values for axis in scene.axes} for scene in (theirs, ours))
     if list(old) != list(new) or theirs.zipped != ours.zipped:
         kinds = ["points" if scene.zipped else "axes" for scene in (ours, theirs)]
         yield f"{kinds[0]} are {', '.join(new) or 'none'}, {kinds[1]} were {', '.join(old) or 'none'}"

@@ -194,6 +194,9 @@ def _same_points(scene: Scene, grid: Grid, our_scene: Scene, our_grid: Grid) -> 
     nothing = np.empty(0, np.int64), np.empty(0, np.int64)
     if not (_same_lines(grid, our_grid) and _same_fixed(scene, our_scene)):
         return nothing
+    if any(axis.also for axis in (*grid.axes, *our_grid.axes)):
+        # Positions are compared by one parameter an axis.
+        return nothing
     if grid.zipped and our_grid.zipped:
         return _same_rows(grid, our_grid)
     if grid.zipped:

@@ -83,7 +83,11 @@ def scene_content(scene: Problem) -> dict[str, Any]:
         "outputs": request.outputs,
         "method": request.method,
         "options": dict(request.options),
-        "axes": [[axis.name, axis.values] for axis in scene.axes],
+        "axes": [
+            [part.name, part.parameter.units, part.values]
+            for axis in scene.axes
+            for part in (*axis.given, *axis.together)
+        ],
         "zipped": scene.zipped,
         "fixed": dict(scene.fixed),
     }

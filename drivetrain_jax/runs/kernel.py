@@ -75,7 +75,7 @@ def _batch(
         spread = {n: v if v.ndim > own[n] else v[..., None] for n, v in results.items()}
         return {n: jnp.broadcast_to(v, (*v.shape[:-1], chunk)) for n, v in spread.items()}
 
-    columns = {axis.name: jax.ShapeDtypeStruct((chunk,), axis.values.dtype) for axis in grid.axes}
+    columns = {part.name: jax.ShapeDtypeStruct((chunk,), part.values.dtype) for part in grid.varying}
     return batch, (columns, _arrays(grid.numbers), jax.ShapeDtypeStruct((), np.int64))
 
 
@@ -132,7 +132,7 @@ def kernel_of(problem: Problem, grid: Grid, solver: Solver, size: int, few: bool
     For ``few`` see :func:`compile_kernel`.
     """
     # Varying parameters are arguments of the kernel, so the key keeps one value of each axis.
-    axes = tuple(replace(axis, values=axis.values[:1]) for axis in grid.axes)
+    axes = tuple(replace(part, values=part.values[:1], given=(), also=()) for part in grid.varying)
     request, numbers = problem.request, grid.numbers
     structure = (
         request.outputs,

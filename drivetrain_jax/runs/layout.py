@@ -8,6 +8,7 @@ from typing import Any, cast
 import h5py
 import numpy as np
 
+from drivetrain_jax.runs.assemble import axis_coordinates
 from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import Scene, result_variables
 
@@ -25,7 +26,7 @@ def rearranged(path: Path, scene: Scene, grid: Grid) -> list[str]:
 
 def _rearranged(path: Path, scene: Scene, grid: Grid) -> list[str]:
     dims = ("point",) if scene.zipped else tuple(axis.dim for axis in scene.axes)
-    expected = {axis.dim: axis.values for axis in scene.axes}
+    expected = {c.name: c.values for c in axis_coordinates(scene) if c.name != "point"}
     with cast(Any, h5py.File(path, "r")) as file:
         for own in scene.dimensions:
             if own.name in file:

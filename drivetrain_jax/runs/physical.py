@@ -1,46 +1,164 @@
-"""Convert physical data to the parameters of nondimensional systems."""
+"""Physical data of a scene or of a question, converted to the parameters of the system."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import fields
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
+from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.runs import toml
-from drivetrain_jax.systems import System
+from drivetrain_jax._quantities import Parameter
+from drivetrain_jax.analysis.request import checked
+from drivetrain_jax.runs.axes import Axis, entry_of
+from drivetrain_jax.systems import PhysicalData, System
+from drivetrain_jax.systems._physical import Along
+
+# The axis of the values of points.
+_POINT = "points"
 
 
-def nondimensional(system: type[System], given: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
-    """The physical data of ``system`` in ``given`` (None without any), and all values as its parameters.
+def described(system: type[System]) -> dict[str, Parameter]:
+    """The parameters of ``system`` and its physical data by name."""
+    data = system.physical.quantities if system.physical else ()
+    return {each.name: each for each in (*data, *system.parameters)}
 
-    A value is a number (of Python or NumPy) or a range, a pair of numbers. Raises :class:`InputError` if data are missing
-    or out of range, or repeat a given parameter.
+
+def with_parameters(
+    system: type[System], axes: tuple[Axis, ...], zipped: bool, fixed: Mapping[str, Any]
+) -> tuple[tuple[Axis, ...], dict[str, Any], dict[str, Any]]:
+    """The axes and the fixed values of a scene with the parameters of ``system`` in place of physical data; and these data.
+
+    Raises :class:`InputError` for data that are missing, not used, or given together with what follows from them.
     """
-    given = {name: _plain(value) for name, value in given.items()}
     physical = system.physical
-    if physical is None or not any(name in physical.names for name in given):
-        return None, given
-    data = [f.name for f in fields(physical)]
-    missing = [name for name in data if name not in given]
-    if missing:
-        raise InputError(f"{missing[0]}: missing; physical units need all of {', '.join(data)}")
-    shaft = physical(**{name: given[name] for name in data})
-    converted = dict(shaft.parameters)
-    for name in physical.operation:
-        if name in given:
-            ends = given[name] if isinstance(given[name], tuple) else (given[name],)
-            pairs = [shaft.parameter(name, end) for end in ends]
-            numbers = tuple(value for _, value in pairs)
-            converted[pairs[0][0]] = numbers if isinstance(given[name], tuple) else numbers[0]
-    others = {name: value for name, value in given.items() if name not in physical.names}
-    for name in others:
-        if name in converted:
-            raise InputError(f"{name} = {others[name]!r}: is given in physical units, too; allowed is one of the two")
-    return shaft, {**converted, **others}
+    swept = [axis for axis in axes if physical and entry_of(axis.name)[0] in physical.names]
+    if physical is None or not (swept or any(name in physical.names for name in fixed)):
+        return axes, dict(fixed), {}
+    known = _known(system, axes, zipped, fixed)
+    everything, used = physical.converted(known), physical.used(known)
+    found = {name: value for name, value in everything.items() if name not in physical.names}
+    for name in known:
+        if name in physical.names and name not in used:
+            uses = [
+                f"{each.parameter} needs {', '.join(each.needs)}" for each in physical.conversions if name in each.needs
+            ]
+            raise InputError(f"{name}: nothing follows from it ({'; '.join(uses)}); allowed is to leave it out")
+    constant = {name: _first(value) for name, value in found.items() if not isinstance(value, Along)}
+    others = {name: value for name, value in fixed.items() if name not in physical.names}
+    data = {name: value for name, value in {**fixed, **everything}.items() if name in physical.names}
+    return _converted_axes(system, axes, zipped, swept, found), others | constant, data
 
 
-def _plain(value: Any) -> Any:
+def _known(system: type[System], axes: tuple[Axis, ...], zipped: bool, fixed: Mapping[str, Any]) -> dict[str, Any]:
+    """All given values in the units of their parameters or quantities."""
+    known, units = dict(fixed), described(system)
+    for axis in axes:
+        base, entry = entry_of(axis.name)
+        size = (
+            _units.factor(axis.parameter.units, units[base].units) if axis.parameter.units != units[base].units else 1
+        )
+        value = Along(_POINT if zipped else axis.name, axis.values * size)
+        if entry is None:
+            known[base] = value
+        elif isinstance(whole := known.get(base), tuple) and entry < len(whole):
+            known[base] = (*whole[:entry], value, *whole[entry + 1 :])
+    return known
+
+
+def _converted_axes(
+    system: type[System], axes: tuple[Axis, ...], zipped: bool, swept: list[Axis], found: Mapping[str, Any]
+) -> tuple[Axis, ...]:
+    """``axes`` with the parameters that vary in place of the quantities, and those that vary with other parameters."""
+    columns: dict[str, list[Axis]] = {}
+    for name, value in found.items():
+        entries = [(i, v) for i, v in enumerate(value)] if isinstance(value, tuple) else [(None, value)]
+        for entry, values in entries:
+            if isinstance(values, Along):
+                key = name if entry is None else f"{name}[{entry}]"
+                columns.setdefault(values.axis, []).append(Axis(key, system.parameter(name), entry, values.values))
+    if zipped:
+        plain = [axis for axis in axes if axis not in swept]
+        return (*plain, *_joined(columns.get(_POINT, []), swept))
+    converted = []
+    for axis in axes:
+        follow = columns.get(axis.name, [])
+        converted += _joined(follow, [axis]) if axis in swept else [replace(axis, also=tuple(follow))]
+    return tuple(converted)
+
+
+def _joined(columns: list[Axis], given: list[Axis]) -> list[Axis]:
+    """One axis of all ``columns``, which follow from the quantities ``given``."""
+    for axis in columns:
+        for extreme in (axis.values.min(), axis.values.max()):
+            checked(replace(axis.parameter, name=axis.name, listed=False), float(extreme), "axes.")
+    return [replace(columns[0], given=tuple(given), also=tuple(columns[1:]))] if columns else []
+
+
+def _first(value: Any) -> Any:
+    """A list without the entries that vary: the first value stands for them."""
     if isinstance(value, tuple):
-        return tuple(map(_plain, value))
-    return toml.plain(value)
+        return tuple(_first(entry) for entry in value)
+    return float(value.values[0]) if isinstance(value, Along) else value
+
+
+@dataclass(frozen=True)
+class GivenData:
+    """Physical ``data`` of a question; with them its answer is in physical units, too."""
+
+    physical: PhysicalData
+    data: Mapping[str, Any]
+
+    def quantity(self, parameter: str, value: float) -> tuple[str, float, str] | None:
+        """Name, value and unit of the quantity behind a value of ``parameter``, None without one."""
+        found = self.back(parameter)
+        return None if found is None else (found[0].name, float(found[1](value)), found[0].units)
+
+    def back(self, parameter: str) -> tuple[Parameter, Callable[[Any], Any]] | None:
+        """The quantity behind ``parameter`` and the function that gives its values, None without one."""
+        return self.physical.back(parameter, self.data)
+
+    def parameter_of(self, name: str) -> str:
+        """The parameter that ``name`` stands for: itself, or the only one that follows from it."""
+        follow = [each.parameter for each in self.physical.conversions if name in each.needs]
+        return follow[0] if len(follow) == 1 else name
+
+
+def in_parameters(
+    system: type[System], given: Mapping[str, Any], known: Mapping[str, Any]
+) -> tuple[GivenData | None, dict[str, Any]]:
+    """The values of a question, numbers, ranges (pairs) or arrays, as parameters; and its physical data, None without any.
+
+    ``known`` are physical data of the scene, which the question need not repeat.
+    """
+    allowed, physical = described(system), system.physical
+    written = any(isinstance(end, str) for value in given.values() for end in _ends(value))
+    names = physical.names if physical else ()
+    values = {n: _numbers(allowed[n], v, n in names) if n in allowed else v for n, v in given.items()}
+    if physical is None or not (written or known or any(name in names for name in given)):
+        return None, values
+    replaced = {each.needs[0] for each in physical.conversions if each.parameter in values}
+    data = {name: value for name, value in known.items() if name not in replaced} | values
+    pool = {n: Along(n, np.array(v)) if isinstance(v, tuple) else v for n, v in data.items()}
+    found = {n: v for n, v in physical.converted(pool).items() if n not in names}
+    converted = {n: tuple(v.values.tolist()) if isinstance(v, Along) else v for n, v in found.items()}
+    return GivenData(physical, data), {n: v for n, v in values.items() if n not in names} | converted
+
+
+def _ends(value: Any) -> tuple[Any, ...]:
+    return value if isinstance(value, tuple) else (value,)
+
+
+def _numbers(parameter: Parameter, value: Any, physical: bool) -> Any:
+    """``value`` with numbers for texts. The range of physical data is checked; that of parameters is the atlas's."""
+    if isinstance(value, tuple):
+        return tuple(_numbers(parameter, end, physical) for end in value)
+    if isinstance(value, list) and any(isinstance(entry, str) for entry in value):
+        return np.array([checked(parameter, entry, "") for entry in value])
+    if np.ndim(value):
+        for extreme in (np.min(value), np.max(value)) if physical and np.size(value) else ():
+            checked(parameter, float(extreme), "")
+        return value
+    return checked(parameter, value, "") if physical or isinstance(value, str) else value

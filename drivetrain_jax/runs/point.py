@@ -14,11 +14,12 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax._wording import aligned, nearest, shown, written
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, get_analysis
+from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.job import Job
-from drivetrain_jax.runs.physical import nondimensional
+from drivetrain_jax.runs.physical import described
 from drivetrain_jax.runs.resolve import resolve
-from drivetrain_jax.runs.scene import find_system, load_scene, system_and_analysis
+from drivetrain_jax.runs.scene import load_scene, system_and_analysis
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class PointResult:
     """Results of one point, by attribute or by name: ``result.spectral_radius`` or ``result["spectral_radius"]``.
 
     ``outcome`` is the outcome of the point (results are NaN unless ``outcome.has_value``), ``units`` the units by name,
-    ``labels`` the entries of each dimension of the results.
+    ``labels`` the entries of each dimension of the results, ``physical`` the given physical data and their units.
     """
 
     system: str
@@ -38,6 +39,7 @@ class PointResult:
     variables: Mapping[str, Variable] = field(repr=False)
     parameter_units: Mapping[str, str] = field(repr=False)
     labels: Mapping[str, Sequence[Any]] = field(repr=False)
+    physical: Mapping[str, tuple[Any, str]] = field(default_factory=dict, repr=False)
 
     @property
     def units(self) -> dict[str, str]:
@@ -70,6 +72,9 @@ class PointResult:
                 values[name]["meaning"] = _meaning(flags, value)
         parameters = {n: {"value": _plain(v), "units": self.parameter_units[n]} for n, v in self.parameters.items()}
         head = {"system": self.system, "analysis": self.analysis, "method": self.method}
+        if self.physical:
+            parameters_given = {n: {"value": _plain(v), "units": units} for n, (v, units) in self.physical.items()}
+            head |= {"physical": parameters_given}
         answer = {**head, "parameters": parameters, "outcome": self.outcome.name.lower(), "values": values}
         return json.dumps(answer, allow_nan=False)
 
@@ -83,6 +88,9 @@ class PointResult:
         plain = [name for name in self.values if name not in (*listed, *matrices)]
         width = max(map(len, (*plain, "outcome")))
         lines = [f"{self.system} {self.analysis} (method {self.method}), {given}"]
+        if self.physical:
+            data = (_with_units(f"{n} = {written(v)}", units) for n, (v, units) in self.physical.items())
+            lines.append(f"  from {', '.join(data)}")
         for name in plain:
             text = _text(self.variables[name], self.values[name])
             lines.append(f"  {name:{width}} = {_with_units(text, self.variables[name].units)}")
@@ -156,7 +164,7 @@ def point(system: str, analysis: str, *, outputs: Sequence[str] | None = None, *
     >>> print(f"{found.spectral_radius:.8f}", found.outcome.name)
     1.03193549 SUCCESS
     """
-    tree = _tree(system, analysis, nondimensional(find_system(system), given)[1])
+    tree = _tree(system, analysis, {name: toml.plain(value) for name, value in given.items()})
     if outputs is not None:
         outputs = [outputs] if isinstance(outputs, str) else outputs
         tree["outputs"] = list(outputs) if isinstance(outputs, Iterable) else outputs
@@ -174,13 +182,16 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
     if analysis.continuous:
         others = ", ".join(name for name in analyses_of(system) if not get_analysis(name).continuous)
         raise InputError(f"analysis = {analysis_name!r}: needs ranges; allowed at a point is one of {others}")
-    parameters = {p.name: p for p in system.parameters}
+    parameters = described(system)
     options = {o.name: given.get(o.name, o.default) for o in analysis.options}
     path = analysis.path_axis(system, Request((), given.get("method", next(iter(analysis.methods))), options))
     tree: dict[str, Any] = {"system": system_name, "analysis": analysis_name, "points": {}, "fixed": {}, "options": {}}
     names = (*parameters, "method", *(o.name for o in analysis.options))
     # A parameter that varies cannot be an output of the scene.
-    numbers = {p.name for p in system.parameters if p.is_number} - {path, *(v.name for v in analysis.variables)}
+    numbers = {p.name for p in parameters.values() if p.is_number} - {path, *(v.name for v in analysis.variables)}
+    if path is not None and system.physical:
+        # What the path follows from is fixed like the path itself.
+        numbers -= {name for each in system.physical.conversions if each.parameter == path for name in each.needs}
     for name, value in given.items():
         if name not in names:
             raise InputError(f"{name} = {shown(value)}: unknown{nearest(name, names)}")
@@ -206,7 +217,7 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
     first = (0,) * len(job.grid.result_shape)
     values = {v.name: buffer.lay_out()[v.name][first] for v in buffer.variables}
     outcome = Outcome(int(values.pop(OUTCOME.name)))
-    parameters = {a.parameter.name: a.values[0].item() for a in scene.axes} | dict(scene.fixed)
+    parameters = {p.parameter.name: p.values[0].item() for a in scene.axes for p in a.together} | dict(scene.fixed)
     ordered = {p.name: parameters[p.name] for p in scene.system.parameters if p.name in parameters}
     return PointResult(
         system=scene.system.name,
@@ -218,7 +229,17 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
         variables={v.name: v for v in buffer.variables},
         parameter_units={p.name: p.units for p in scene.system.parameters},
         labels=_labels(job, values, buffer),
+        physical=_physical(job),
     )
+
+
+def _physical(job: Job) -> dict[str, tuple[Any, str]]:
+    """The given physical data with their units."""
+    scene, found = job.scene, {}
+    for axis in scene.axes:
+        found |= {given.name: (given.values[0].item(), given.parameter.units) for given in axis.given}
+    known = described(scene.system)
+    return found | {name: (value, known[name].units) for name, value in scene.data.items()}
 
 
 def _labels(job: Job, values: Mapping[str, Any], buffer: ResultBuffer) -> dict[str, Sequence[Any]]:

@@ -52,6 +52,11 @@ class Grid:
         return lengths[:1] if self.zipped else lengths
 
     @property
+    def varying(self) -> tuple[Axis, ...]:
+        """All parameters that vary along ``axes``."""
+        return tuple(part for axis in self.axes for part in axis.together)
+
+    @property
     def size(self) -> int:
         """Number of points, or of lines if there is a path."""
         return math.prod(self.shape)
@@ -81,8 +86,9 @@ class Grid:
     def columns(self, points: np.ndarray) -> dict[str, np.ndarray]:
         """Values of the varying parameters at ``points`` by axis name, each of the shape of ``points``."""
         if self.zipped:
-            return {axis.name: axis.values[points] for axis in self.axes}
-        return {axis.name: axis.values[i] for axis, i in zip(self.axes, self.place(points), strict=False)}
+            return {part.name: part.values[points] for axis in self.axes for part in axis.together}
+        places = zip(self.axes, self.place(points), strict=False)
+        return {part.name: part.values[i] for axis, i in places for part in axis.together}
 
     def bind(self, columns: Mapping[str, Any], numbers: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
         """All parameters of the model: the fixed ones, ``columns`` of the varying ones, and the path as a whole.
@@ -90,7 +96,7 @@ class Grid:
         ``numbers`` replace fixed ones.
         """
         values: dict[str, Any] = {**self.fixed, **numbers}
-        varying = [(axis, columns[axis.name]) for axis in self.axes]
+        varying = [(part, columns[part.name]) for part in self.varying]
         if self.path is not None:
             varying.append((self.path, self.path.values))
         for axis, value in varying:

@@ -87,7 +87,8 @@ def _tolerance(scene: Scene) -> float:
 
 def fixed_of(scene: Scene, ranges: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
     """The parameters of the propagator that are not in ``ranges``, and their values."""
-    fixed = {**scene.fixed} | {a.name: a.values[0].item() for a in scene.axes if a.name not in ranges}
+    varying = [part for axis in scene.axes for part in axis.together if part.name not in ranges]
+    fixed = {**scene.fixed} | {part.name: part.values[0].item() for part in varying}
     return {name: fixed[name] for name in scene.system.models[ANALYSIS.name].parameters if name in fixed}
 
 

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._machine import physical_memory
-from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax._wording import clipped, did_you_mean, nearest, shown
+from drivetrain_jax._quantities import Dimension, Variable
+from drivetrain_jax._wording import did_you_mean, nearest, shown
 from drivetrain_jax.analysis import OUTCOME, Analysis, Request, analyses_of, get_analysis
 from drivetrain_jax.analysis.request import checked, make_request
 from drivetrain_jax.runs import toml
-from drivetrain_jax.runs.axes import MAX_POINTS, MAX_RANGES, Axis, AxisTable, check_count, entry_of, spread
+from drivetrain_jax.runs.axes import Axis
+from drivetrain_jax.runs.physical import described, with_parameters
+from drivetrain_jax.runs.scene_axes import axes_of, unknown_parameter
 from drivetrain_jax.systems import Model, System, get_system, system_names
-
-# Bytes per value of an axis while it is created and checked.
-_BYTES = 32
 
 Value = float | int | str | tuple[float, ...]
 
@@ -73,10 +69,11 @@ def _restored(kind: type[Problem], values: dict[str, Any]) -> Problem:
 
 @dataclass(frozen=True, eq=False)
 class Scene(Problem):
-    """A checked scene; ``text`` is the scene in TOML."""
+    """A checked scene; ``text`` is the scene in TOML, ``data`` its physical data that do not vary."""
 
     title: str
     text: str
+    data: Mapping[str, Any] = field(default_factory=dict)
 
 
 def result_variables(problem: Problem) -> tuple[Variable, ...]:
@@ -107,10 +104,13 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
     table = toml.converted(tree, _SceneTable, "")
     system, analysis = system_and_analysis(table.system, table.analysis)
     request = make_request(system, analysis, table.outputs, table.options, {*table.axes, *table.points})
-    axes, zipped = _axes(table, system, analysis)
-    fixed = _fixed(table, system, analysis, axes)
+    swept, zipped = axes_of(table.axes, table.points, system, analysis)
+    axes, given, data = with_parameters(system, swept, zipped, _given(table, system, swept))
+    fixed = _fixed(system, analysis, axes, given, "points" if table.points else "axes")
     title = table.title or f"{system.title}: {analysis.title}"
-    scene = Scene(system, analysis, request, axes, zipped, fixed, title, text)
+    scene = Scene(system, analysis, request, axes, zipped, fixed, title, text, data)
+    if analysis.continuous:
+        _check_single(scene)
     _check_path(scene)
     # The analysis checks that request and parameters match.
     _ = scene.dimensions
@@ -152,133 +152,55 @@ def system_and_analysis(system_name: str, analysis_name: str) -> tuple[type[Syst
     return system, analysis.for_system(system)
 
 
-def _axes(table: _SceneTable, system: type[System], analysis: Analysis) -> tuple[tuple[Axis, ...], bool]:
-    """The varying parameters; their values are counted before they are computed."""
-    if table.axes and table.points:
-        raise InputError("points: given together with axes; allowed is one of the two")
-    if analysis.continuous:
-        _check_ranges(table, analysis)
-    for where, name in [("axes", n) for n in table.axes] + [("points", n) for n in table.points]:
-        _swept_parameter(system, where, name)
-    if table.points:
-        return _points(table, system), True
-    specs = {name: _axis_table(name, value) for name, value in table.axes.items()}
-    counts = {name: check_count(name, spec, analysis.continuous) for name, spec in specs.items()}
-    total = math.prod(counts.values())
-    if total > MAX_POINTS:
-        raise InputError(f"axes: {clipped(str(total))} points; allowed is up to {MAX_POINTS}")
-    most, present = max(counts.values(), default=0), physical_memory()
-    if most * _BYTES > present:
-        name = max(counts, key=lambda name: counts[name])
-        raise InputError(f"axes.{name}.num = {most}: allowed with this memory is up to {int(present / _BYTES)}")
-    return tuple(_axis(system, name, spec) for name, spec in specs.items()), False
+def _check_single(scene: Scene) -> None:
+    """Check that every range changes one parameter."""
+    for axis in scene.axes:
+        if axis.also:
+            names = ", ".join(part.name for part in axis.together)
+            raise InputError(f"axes.{axis.shown.name}: changes {names} together; an atlas allows one parameter a range")
 
 
-def _check_ranges(table: _SceneTable, analysis: Analysis) -> None:
-    if table.points:
-        raise InputError(f"points: {analysis.name} needs ranges; allowed are axes with start and stop")
-    if not 1 <= len(table.axes) <= MAX_RANGES:
-        raise InputError(f"axes: {len(table.axes)} are given; {analysis.name} allows 1 to {MAX_RANGES}")
-
-
-def _axis_table(name: str, given: Any) -> AxisTable:
-    if isinstance(given, list):
-        given = {"values": given}
-    if not isinstance(given, Mapping):
-        allowed = "allowed is a table { start, stop, num } or { values }, or a row of values"
-        raise InputError(f"axes.{name} = {shown(given)}: {allowed}")
-    if isinstance(num := given.get("num"), float) and num.is_integer():
-        # Options and parameters also accept 1e3 for 1000.
-        given = {**given, "num": int(num)}
-    return toml.converted(given, AxisTable, f"axes.{name}.")
-
-
-def _axis(system: type[System], name: str, spec: AxisTable) -> Axis:
-    parameter, entry = _swept_parameter(system, "axes", name)
-    scalar = _scalar(parameter, name)
-    for value in spec.values if spec.values is not None else (spec.start, spec.stop):
-        checked(scalar, value, "axes.")
-    values = spread(spec, f"axes.{name}")
-    if parameter.integer:
-        for value in values:
-            checked(scalar, float(value), "axes.")
-    return Axis(name, parameter, entry, values.astype(np.int64) if parameter.integer else values)
-
-
-def _points(table: _SceneTable, system: type[System]) -> tuple[Axis, ...]:
-    """Columns of parameter values of equal length."""
-    for name, values in table.points.items():
-        if not isinstance(values, list):
-            raise InputError(f"points.{name} = {shown(values)}: allowed is a list of numbers")
-    lengths = {name: len(values) for name, values in table.points.items()}
-    if len(set(lengths.values())) > 1 or not all(lengths.values()):
-        listed = ", ".join(f"{name} has {length}" for name, length in lengths.items())
-        raise InputError(f"points: {listed}; allowed are lists of one length, at least 1")
-    columns = []
-    for name, values in table.points.items():
-        parameter, entry = _swept_parameter(system, "points", name)
-        scalar = _scalar(parameter, name)
-        numbers = [checked(scalar, value, "points.") for value in values]
-        columns.append(Axis(name, parameter, entry, np.array(numbers)))
-    return tuple(columns)
-
-
-def _scalar(parameter: Parameter, name: str) -> Parameter:
-    """The range of one number of ``parameter``, under the name of its axis."""
-    return replace(parameter, name=name, listed=False, broadcast=False)
-
-
-def _swept_parameter(system: type[System], where: str, name: str) -> tuple[Parameter, int | None]:
-    """The parameter of the axis ``name``, and the position of a list entry."""
-    base, entry = entry_of(name)
-    known = {p.name: p for p in system.parameters}
-    parameter = known.get(base)
-    if parameter is None:
-        raise InputError(f"{where}.{name}: {_unknown(system, base)}")
-    if parameter.choices or parameter.text:
-        raise InputError(f"{where}.{name}: a word cannot vary; allowed is to fix it: {parameter.allowed}")
-    if not parameter.is_number and entry is None:
-        raise InputError(
-            f'{where}.{name}: a list cannot vary as a whole; allowed is one entry, for example "{name}[0]"'
-        )
-    if entry is not None and not parameter.listed:
-        raise InputError(f"{where}.{name}: {base} is not a list; allowed is {base}")
-    return parameter, entry
-
-
-def _unknown(system: type[System], name: str) -> str:
-    """The message for an unknown parameter ``name``, with the allowed names."""
-    known = [p.name for p in system.parameters]
-    if system.physical and name in system.physical.names:
-        return f"physical units are for point, query and design; allowed in a scene is {', '.join(known)}"
-    return f"unknown parameter{nearest(name, known)}"
-
-
-def _fixed(table: _SceneTable, system: type[System], analysis: Analysis, axes: tuple[Axis, ...]) -> dict[str, Value]:
-    """The parameters that do not vary: given ones, then defaults of those that the analysis uses."""
-    known = {p.name: p for p in system.parameters}
+def _given(table: _SceneTable, system: type[System], axes: tuple[Axis, ...]) -> dict[str, Any]:
+    """The checked values of ``[fixed]``, parameters and physical data."""
+    known = described(system)
     whole = {axis.name for axis in axes if axis.entry is None}
     for name, value in table.fixed.items():
         if name not in known:
-            raise InputError(f"fixed.{name} = {shown(value)}: {_unknown(system, name)}")
+            raise InputError(f"fixed.{name} = {shown(value)}: {unknown_parameter(system, name)}")
         if name in whole:
             where = "points" if table.points else "axes"
             raise InputError(f"fixed.{name} = {shown(value)}: also in [{where}]; allowed is one of the two")
+    names = [name for name in known if name in table.fixed]
+    return {name: checked(known[name], table.fixed[name], "fixed.") for name in names}
+
+
+def _fixed(
+    system: type[System], analysis: Analysis, axes: tuple[Axis, ...], given: Mapping[str, Any], where: str
+) -> dict[str, Value]:
+    """The parameters that do not vary: ``given`` ones, then defaults of those that the analysis uses."""
+    whole = {part.name for axis in axes for part in axis.together if part.entry is None}
     fixed: dict[str, Any] = {}
     used, missing = analysis.model(system).parameters, []
     for parameter in system.parameters:
-        if parameter.name in table.fixed:
-            fixed[parameter.name] = checked(parameter, table.fixed[parameter.name], "fixed.")
+        if parameter.name in given:
+            fixed[parameter.name] = checked(parameter, _listed(given[parameter.name]), "fixed.")
         elif parameter.name in used and parameter.name not in whole and not parameter.derived:
             fixed[parameter.name] = parameter.default
             missing += [parameter] if parameter.default is None else []
     if missing:
         others = f" (missing too: {', '.join(p.name for p in missing[1:])})" if missing[1:] else ""
-        raise InputError(f"fixed.{missing[0].name}: missing; allowed is {missing[0].allowed_in_units}{others}")
+        data = system.physical.source(missing[0].name) if system.physical else ""
+        either = f", or physical data: {data}" if data else ""
+        raise InputError(f"fixed.{missing[0].name}: missing; allowed is {missing[0].allowed_in_units}{either}{others}")
     for axis in axes:
-        _check_entry(axis, fixed, "points" if table.points else "axes")
+        for part in axis.together:
+            _check_entry(part, fixed, where)
     _check_together(analysis.model(system), fixed)
     return fixed
+
+
+def _listed(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _check_together(model: Model, fixed: Mapping[str, Value]) -> None:
@@ -295,6 +217,12 @@ def _check_path(scene: Scene) -> None:
     name, names = scene.path_axis, [axis.name for axis in scene.axes]
     if name is None:
         return
+    for axis in scene.axes:
+        if name in (part.name for part in axis.together) and axis.also:
+            others = ", ".join(part.name for part in axis.together if part.name != name)
+            raise InputError(
+                f"axes.{axis.shown.name}: {others} would change along the path {name}; allowed is {name} alone"
+            )
     if name in names and scene.zipped:
         raise InputError(f"points.{name}: {scene.analysis.name} uses it as a path; allowed is an axis or a fixed value")
     fixed = isinstance(scene.fixed.get(name), (int, float)) and name not in scene.request.options.values()

@@ -171,7 +171,7 @@ def _toml_types(match: re.Match[str]) -> str:
 
 
 def parse_value(text: str) -> Any:
-    """A TOML value; other text is a number in short form (``.3``) or a plain string (``diffrax``)."""
+    """A TOML value; other text is a number in short form (``.3``), a plain string (``18deg``) or a list of these."""
     try:
         content = tomllib.loads(f"value = {text}")
     except ValueError:
@@ -182,7 +182,10 @@ def parse_value(text: str) -> Any:
     try:
         return float(text)
     except ValueError:
-        return text
+        pass
+    if (inner := text.strip()).startswith("[") and inner.endswith("]") and not set(inner[1:-1]) & set("[]{}\"'"):
+        return [parse_value(entry.strip()) for entry in inner[1:-1].split(",")]
+    return text
 
 
 def write(tree: Mapping[str, Any]) -> str:

@@ -15,6 +15,7 @@ from drivetrain_jax.resonances import Family, Resonances
 from drivetrain_jax.systems._base import Model, System, parameter, serves
 from drivetrain_jax.systems._flow import Flow
 from drivetrain_jax.systems._modal import Block, DrivenSprings, SpringSystem
+from drivetrain_jax.systems._physical import Conversion, PhysicalData
 from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator, UnderdampedOscillator
 from drivetrain_jax.systems._rows import dense
 from drivetrain_jax.systems._shaft import Shaft
@@ -34,6 +35,7 @@ _BUILT_IN = {
 __all__ = [
     "Block",
     "Component",
+    "Conversion",
     "Coordinate",
     "Dimension",
     "DrivenSprings",
@@ -44,6 +46,7 @@ __all__ = [
     "LinearPeriodic",
     "Model",
     "Parameter",
+    "PhysicalData",
     "PiecewiseLinearOscillator",
     "Resonances",
     "Series",

@@ -21,7 +21,9 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
+from drivetrain_jax._wording import nearest
 from drivetrain_jax.resonances import Resonances, Values
+from drivetrain_jax.systems._physical import PhysicalData
 from drivetrain_jax.systems._smooth import Smoothness
 
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -93,12 +95,12 @@ class System(eqx.Module):
     Traced values are not checked.
 
     Class attributes: ``name``, ``title`` and ``source``; ``presets``, named parameter sets of the source; ``resonances``,
-    the predicted ones; ``time_units``, the unit of time in its equations (``1``: nondimensional); ``physical``, which
-    converts physical data to parameters and back (pattern: ``cardan_units.PhysicalShaft``), None if the parameters are
-    physical; ``roles``, the names of the parameters that analyses and figures ask for, see below; ``state``, the components
-    of its state, and ``displacements``, the dimension of those whose amplitudes ``forced`` reports; ``mode_families``, names
-    of the families of ``modes`` by their codes. ``parameters`` and ``models`` follow from fields and methods. A model for
-    ``atlas`` without one for ``floquet``, or for ``history`` or ``forced`` without ``state``, raises ``ValueError``.
+    the predicted ones; ``time_units``, the unit of time in its equations (``1``: nondimensional); ``physical``, the
+    physical data that parameters follow from, None without any; ``roles``, the names of the parameters that analyses and
+    figures ask for, see below; ``state``, the components of its state, and ``displacements``, the dimension of those whose
+    amplitudes ``forced`` reports; ``mode_families``, names of the families of ``modes`` by their codes. ``parameters`` and
+    ``models`` follow from fields and methods. A model for ``atlas`` without one for ``floquet``, or for ``history`` or
+    ``forced`` without ``state``, raises ``ValueError``.
 
     Roles: ``speed`` (or excitation frequency), which figures draw horizontally and which is the path of
     ``frequency_response``; ``angle`` and ``damping`` of design questions; ``initial_displacement`` and ``initial_rate`` of
@@ -111,7 +113,7 @@ class System(eqx.Module):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({})
     resonances: ClassVar[Resonances | None] = None
     time_units: ClassVar[str] = "1"
-    physical: ClassVar[Any] = None
+    physical: ClassVar[PhysicalData | None] = None
     roles: ClassVar[Mapping[str, str]] = MappingProxyType({})
     state: ClassVar[tuple[Component, ...]] = ()
     displacements: ClassVar[Dimension | None] = None
@@ -151,6 +153,24 @@ class System(eqx.Module):
         """The parameters by name, those left out that are to be derived from others."""
         named = {each.name: getattr(self, each.name) for each in self.parameters}
         return {name: value for name, value in named.items() if value is not None}
+
+    @classmethod
+    def from_physical(cls, **data: Any) -> Any:
+        """The system whose parameters follow from physical ``data``; parameters may be among them.
+
+        >>> from drivetrain_jax import Cardan
+        >>> print(round(Cardan.from_physical(J1=2, J2=0.5, k1=6e4, k2=4e4, c1=0.3, c2=0.2, speed=1425, angle=12).Omega, 4))
+        0.8616
+        """
+        if cls.physical is None:
+            raise InputError(f"system = {cls.name!r}: has no physical data; allowed is {cls.__name__}(...)")
+        known = {each.name: each for each in (*cls.physical.quantities, *cls.parameters)}
+        for name in data:
+            if name not in known:
+                raise InputError(f"{name}: unknown{nearest(name, known)}")
+        given = {name: _admitted(known[name], value) for name, value in data.items()}
+        found = given | cls.physical.converted(given)
+        return cls(**{name: value for name, value in found.items() if name not in cls.physical.names})
 
     @classmethod
     def role(cls, name: str) -> str:

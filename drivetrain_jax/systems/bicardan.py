@@ -17,6 +17,7 @@ from typing import Any
 from drivetrain_jax._wording import counted
 from drivetrain_jax.systems._base import Number, System, parameter, serves
 from drivetrain_jax.systems._shaft import Shaft, stack
+from drivetrain_jax.systems.bicardan_units import PHYSICAL
 
 _PER_SEGMENT, _PER_JOINT = ("EI", "rhoA", "kGA", "rhoI"), ("k_joint", "m_joint", "k_hinge")
 
@@ -62,8 +63,9 @@ class Bicardan(System):
     title = "Bicardanic shaft on elastic supports"
     source = "Bulac, Fiabilitate si Durabilitate, Supplement 1/2012"
     presets = PRESETS
+    physical = PHYSICAL
 
-    length: Numbers = parameter("m", "lengths of the segments, from A to D", open_lower=True, **_LIST)
+    length: Numbers = parameter("m", "lengths of the segments, from A to D", usual=100.0, open_lower=True, **_LIST)
     EI: Numbers = parameter("N m2", "bending stiffness of the segments", open_lower=True, **_LIST)
     rhoA: Numbers = parameter("kg/m", "mass per length of the segments", symbol="ρA", open_lower=True, **_LIST)
     k_A: Number = parameter("N/m", "stiffness of the support at A", lower=0.0, infinite=True)

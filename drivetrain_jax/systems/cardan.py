@@ -24,7 +24,7 @@ from drivetrain_jax.systems._base import Number, System, numeric, parameter, ser
 from drivetrain_jax.systems._rows import Rows
 from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness
 from drivetrain_jax.systems.cardan_clock import clock, clock_basis, decay_steps, oscillation_steps
-from drivetrain_jax.systems.cardan_units import PhysicalShaft
+from drivetrain_jax.systems.cardan_units import PHYSICAL
 
 if TYPE_CHECKING:
     from drivetrain_jax.systems._periodic import FloquetModel, ForcedModel
@@ -93,7 +93,7 @@ class Cardan(System):
     source = "Soltan Rezaee & Ghazavi, Modares Mechanical Engineering 14(12), 2014, 163-170"
     presets = PRESETS
     resonances = RESONANCES
-    physical = PhysicalShaft
+    physical = PHYSICAL
     roles = MappingProxyType({"speed": "Omega", "angle": "beta", "damping": "zeta"})
     state = (
         Component("theta1", "rad", "twist of the driving shaft"),

@@ -1,117 +1,57 @@
-"""Physical data of a cardan shaft in SI and workshop units, converted to the nondimensional parameters of ``cardan``.
-
-    Omega = Omega0 sqrt(J1/k1), zeta = c1/(2 sqrt(k1 J1)), alpha = c2/c1, mu = k2/k1, gamma = J2/J1     eq. (7)
-
-Source: docs/theory/cardan.md. With c1 = 0 alpha has no meaning; it is then 0, and c2 must be 0.
-"""
+"""Physical data of a cardan shaft and the parameters of ``cardan``, eq. (7) of docs/theory/cardan.md."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from typing import Any
+
+import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter
+from drivetrain_jax.systems._physical import POSITIVE, RPM, Conversion, PhysicalData
 
-PHYSICAL = (
-    Parameter("J1", "kg m2", "inertia of the driving disk", lower=0.0, open_lower=True),
-    Parameter("J2", "kg m2", "inertia of the driven disk", lower=0.0, open_lower=True),
-    Parameter("k1", "N m/rad", "stiffness of the driving shaft", lower=0.0, open_lower=True),
-    Parameter("k2", "N m/rad", "stiffness of the driven shaft", lower=0.0, open_lower=True),
-    Parameter("c1", "N m s/rad", "damping of the driving shaft", lower=0.0),
-    Parameter("c2", "N m s/rad", "damping of the driven shaft", lower=0.0),
-    Parameter("speed", "rpm", "speed of the driving shaft", lower=0.0, open_lower=True),
-    Parameter("angle", "deg", "joint angle", lower=-90.0, upper=90.0, open_lower=True, open_upper=True),
+
+def _alpha(c2: Any, c1: Any) -> Any:
+    # Without damping of the driving shaft the ratio has no meaning.
+    if np.any((np.asarray(c1) == 0) & (np.asarray(c2) != 0)):
+        raise InputError(f"c2 = {c2!r}: allowed is 0 if c1 = 0 (alpha = c2/c1)")
+    return np.divide(c2, np.where(np.asarray(c1) == 0, 1.0, c1))
+
+
+def _unit_of_damping(j1: Any, k1: Any) -> Any:
+    # Square roots one by one, because in some units the product overflows.
+    return 2 * np.sqrt(k1) * np.sqrt(j1)
+
+
+PHYSICAL = PhysicalData(
+    (
+        Parameter("J1", "kg m2", "inertia of the driving disk", **POSITIVE),
+        Parameter("J2", "kg m2", "inertia of the driven disk", **POSITIVE),
+        Parameter("k1", "N m/rad", "stiffness of the driving shaft", **POSITIVE),
+        Parameter("k2", "N m/rad", "stiffness of the driven shaft", **POSITIVE),
+        Parameter("c1", "N m s/rad", "damping of the driving shaft", lower=0.0),
+        Parameter("c2", "N m s/rad", "damping of the driven shaft", lower=0.0),
+        Parameter("speed", "rpm", "speed of the driving shaft", **POSITIVE),
+        Parameter("angle", "deg", "joint angle", lower=-90.0, upper=90.0, open_lower=True, open_upper=True),
+    ),
+    (
+        Conversion("beta", ("angle",), np.radians, "angle", np.degrees),
+        Conversion(
+            "Omega",
+            ("speed", "J1", "k1"),
+            lambda speed, j1, k1: speed * RPM / np.sqrt(k1 / j1),
+            "speed sqrt(J1/k1)",
+            lambda omega, j1, k1: omega * np.sqrt(k1 / j1) / RPM,
+        ),
+        Conversion(
+            "zeta",
+            ("c1", "J1", "k1"),
+            lambda c1, j1, k1: c1 / _unit_of_damping(j1, k1),
+            "c1/(2 sqrt(k1 J1))",
+            lambda zeta, j1, k1: zeta * _unit_of_damping(j1, k1),
+        ),
+        Conversion("alpha", ("c2", "c1"), _alpha, "c2/c1"),
+        Conversion("mu", ("k2", "k1"), lambda k2, k1: k2 / k1, "k2/k1", lambda mu, k1: mu * k1),
+        Conversion("gamma", ("J2", "J1"), lambda j2, j1: j2 / j1, "J2/J1", lambda gamma, j1: gamma * j1),
+    ),
 )
-_RPM = 2 * math.pi / 60
-
-
-@dataclass(frozen=True)
-class PhysicalShaft:
-    """A cardan shaft in physical units: J in kg m^2, k in N m/rad, c in N m s/rad.
-
-    Raises :class:`~drivetrain_jax.InputError` for a value out of range.
-    """
-
-    J1: float
-    J2: float
-    k1: float
-    k2: float
-    c1: float
-    c2: float
-    # Operating conditions, given with the physical data; and the names of all data.
-    operation: ClassVar[tuple[str, ...]] = ("speed", "angle")
-    quantities: ClassVar[tuple[Parameter, ...]] = PHYSICAL
-    names: ClassVar[tuple[str, ...]] = tuple(p.name for p in PHYSICAL)
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            _check(field.name, getattr(self, field.name))
-        if self.c1 == 0 and self.c2 != 0:
-            raise InputError(f"c2 = {self.c2!r}: allowed is 0 if c1 = 0 (alpha = c2/c1)")
-
-    @property
-    def base_frequency(self) -> float:
-        """sqrt(k1/J1), rad/s: the unit of Omega."""
-        return math.sqrt(self.k1 / self.J1)
-
-    @property
-    def critical_damping(self) -> float:
-        """2 sqrt(k1 J1), N m s/rad: the unit of zeta."""
-        # Square roots one by one, because in some units the product overflows.
-        return 2 * math.sqrt(self.k1) * math.sqrt(self.J1)
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """zeta, alpha, mu and gamma."""
-        return {
-            "zeta": self.c1 / self.critical_damping,
-            "alpha": self.c2 / self.c1 if self.c1 else 0.0,
-            "mu": self.k2 / self.k1,
-            "gamma": self.J2 / self.J1,
-        }
-
-    def at(self, speed: float, angle: float) -> dict[str, float]:
-        """All six parameters at ``speed`` in rpm and ``angle`` in degrees."""
-        return {"beta": self.beta(angle), "Omega": self.omega(speed), **self.parameters}
-
-    def omega(self, speed: float) -> float:
-        """Omega of a speed in rpm."""
-        return _check("speed", speed) * _RPM / self.base_frequency
-
-    def beta(self, angle: float) -> float:
-        """beta of an angle in degrees."""
-        return math.radians(_check("angle", angle))
-
-    def speed(self, omega: float) -> float:
-        """Speed in rpm of a value of Omega."""
-        return omega * self.base_frequency / _RPM
-
-    def angle(self, beta: float) -> float:
-        """Angle in degrees of a value of beta."""
-        return math.degrees(beta)
-
-    def damping(self, zeta: float) -> float:
-        """c1 in N m s/rad of a value of zeta."""
-        return zeta * self.critical_damping
-
-    def parameter(self, name: str, value: float) -> tuple[str, float]:
-        """The nondimensional parameter of ``speed`` in rpm or ``angle`` in degrees."""
-        return ("Omega", self.omega(value)) if name == "speed" else ("beta", self.beta(value))
-
-    def quantity(self, parameter: str, value: float) -> tuple[str, float, str] | None:
-        """Name, value and unit of the physical quantity behind Omega, beta or zeta, None for another parameter."""
-        if parameter == "Omega":
-            return "speed", self.speed(value), "rpm"
-        if parameter == "beta":
-            return "angle", self.angle(value), "deg"
-        return ("c1", self.damping(value), "N m s/rad") if parameter == "zeta" else None
-
-
-def _check(name: str, value: float) -> float:
-    parameter: Any = next(p for p in PHYSICAL if p.name == name)
-    try:
-        return float(parameter.check(value))
-    except ValueError as error:
-        raise InputError(str(error)) from None

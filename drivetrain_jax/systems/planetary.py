@@ -26,6 +26,7 @@ from drivetrain_jax.systems._planetary_springs import (
     plane_springs,
     rotational_springs,
 )
+from drivetrain_jax.systems.planetary_units import PHYSICAL
 
 
 def check(fixed: Mapping[str, Any]) -> None:
@@ -81,6 +82,7 @@ class Planetary(System):
     source = "A. Shahabi, F. Sheykh Samani, Modares Mechanical Engineering 16(12), 2016"
     roles = MappingProxyType({"planets": "planet_angle"})
     mode_families = FAMILIES
+    physical = PHYSICAL
 
     planet_angle: Numbers = parameter(
         "rad",

@@ -24,6 +24,7 @@ from drivetrain_jax._quantities import Component
 from drivetrain_jax.resonances.rattle import THRESHOLD
 from drivetrain_jax.systems._base import Number, System, parameter, serves
 from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator
+from drivetrain_jax.systems.rattle_units import PHYSICAL
 
 # Table 1 of the paper: b = 10 deg.
 PRESETS = {"table1": {"B0": 0.05, "B1": 0.03, "b": math.pi / 18, "c": 0.05, "alpha": 0.25, "k": 1.0, "I": 1.0}}
@@ -47,6 +48,7 @@ class Rattle(System):
     source = "Rezaee & Farshidianfar (in Persian); corrections in docs/theory/rattle.md"
     presets = PRESETS
     resonances = THRESHOLD
+    physical = PHYSICAL
     roles = MappingProxyType({"speed": "omega", "initial_displacement": "u0", "initial_rate": "v0", "half_play": "b"})
     state = (
         Component("u", "m", "relative displacement"),

@@ -20,7 +20,7 @@ from drivetrain_jax.runs.atlas_answers import _from_one
 from drivetrain_jax.runs.atlas_chart import chart
 from drivetrain_jax.runs.atlas_file import StoredAtlas
 from drivetrain_jax.systems import get_system
-from drivetrain_jax.systems.cardan_units import PhysicalShaft
+from drivetrain_jax.systems.cardan_units import PHYSICAL
 
 S21 = (0.1063331213, 1.4159881603)
 CARDAN = get_system("cardan")
@@ -78,9 +78,9 @@ def test_boundaries_lie_on_both_sides_of_the_angle_0():
 def test_the_ends_of_an_atlas_may_be_given_in_other_units(J1, k1):
     """Converted ends, or ends copied from a message, differ from the ends of the atlas by a rounding."""
     atlas, critical = atlas_of((0.0, 0.3), (1.3, 1.5)), 2 * np.sqrt(J1) * np.sqrt(k1)
-    shaft = PhysicalShaft(J1, 100 * J1, k1, k1, 0.001 * critical, 0.001 * critical)
-    data = {name: getattr(shaft, name) for name in ("J1", "J2", "k1", "k2", "c1", "c2")}
-    ends = shaft.speed(1.3), shaft.speed(1.5)
+    data = {"J1": J1, "J2": 100 * J1, "k1": k1, "k2": k1, "c1": 0.001 * critical, "c2": 0.001 * critical}
+    _, speed_of = PHYSICAL.back("Omega", data)
+    ends = float(speed_of(1.3)), float(speed_of(1.5))
     exact = atlas_answers.widest_angle(atlas, {"Omega": (1.3, 1.5)}).data["value"]
     for speed in (ends, tuple(float(f"{end:.10g}") for end in ends)):
         assert atlas_answers.widest_angle(atlas, {**data, "speed": speed}).data["value"] == exact

@@ -9,18 +9,15 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from drivetrain_jax import InputError
-from drivetrain_jax.systems.cardan_units import PhysicalShaft
+from drivetrain_jax.systems.cardan import Cardan
+from drivetrain_jax.systems.cardan_units import PHYSICAL
 from tests.oracles.cardan_reference import monodromy
 
 DATA = {"J1": 0.5, "J2": 3.0, "k1": 2e4, "k2": 5e3, "c1": 3.0, "c2": 1.5, "speed": 1500.0, "angle": 35.0}
 
 
-def shaft_of(data):
-    return PhysicalShaft(*(data[name] for name in ("J1", "J2", "k1", "k2", "c1", "c2")))
-
-
 def converted(data):
-    return shaft_of(data).at(data["speed"], data["angle"])
+    return Cardan.from_physical(**data).values
 
 
 def test_values():
@@ -64,10 +61,10 @@ def test_multipliers_are_those_of_the_equations_in_seconds():
 
 
 def test_way_back():
-    shaft = shaft_of(DATA)
-    assert shaft.speed(shaft.omega(1234.5)) == pytest.approx(1234.5)
-    assert shaft.angle(shaft.beta(-20.0)) == pytest.approx(-20.0)
-    assert shaft.damping(shaft.parameters["zeta"]) == pytest.approx(3.0)
+    found = converted(DATA)
+    for parameter, quantity in {"Omega": "speed", "beta": "angle", "zeta": "c1", "mu": "k2", "gamma": "J2"}.items():
+        described, back = PHYSICAL.back(parameter, DATA)
+        assert described.name == quantity and back(found[parameter]) == pytest.approx(DATA[quantity])
 
 
 @pytest.mark.parametrize(

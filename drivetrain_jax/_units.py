@@ -1,0 +1,106 @@
+"""Numbers written with a unit: ``"18 deg"`` as radians, ``"1500 rpm"`` as rad/s.
+
+An angle is a dimension of its own here: rpm, Hz and rad/s measure one thing (1 Hz is one turn a second, 60 rpm), and 1/s
+another. Only the radian of a stiffness or damping may be left out (N m for N m/rad).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from functools import cache, lru_cache
+from typing import Any
+
+_NUMBER = re.compile(r"\s*([+-]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?inf)\s*(.*?)\s*", re.DOTALL)
+# The units of engineers, in the language of pint; a plural s and prefixes are understood.
+_UNITS = (
+    *("giga- = 1e9 = G-", "mega- = 1e6 = M-", "kilo- = 1e3 = k-", "centi- = 1e-2 = c-", "deci- = 1e-1 = d-"),
+    *("milli- = 1e-3 = m-", "micro- = 1e-6 = µ- = μ- = u-", "nano- = 1e-9 = n-"),
+    *("meter = [length] = m = metre", "second = [time] = s = sec", "gram = [mass] = g", "radian = [angle] = rad"),
+    *("inch = 0.0254 meter = in = inches", "foot = 0.3048 meter = ft = feet", "thou = 0.001 inch"),
+    *("minute = 60 second = min", "hour = 3600 second = h", "day = 86400 second"),
+    *("tonne = 1e6 gram = t", "pound = 453.59237 gram = lb", "ounce = 28.349523125 gram = oz"),
+    *(
+        f"degree = {math.pi / 180!r} radian = deg = °",
+        "arcminute = degree / 60 = arcmin",
+        "arcsecond = degree / 3600 = arcsec",
+    ),
+    *(f"gon = {math.pi / 200!r} radian", f"turn = {2 * math.pi!r} radian = _ = rev = revolution = cycle"),
+    *("rpm = turn / minute", "rps = turn / second", "cpm = turn / minute", "hertz = turn / second = Hz"),
+    *("newton = kilogram * meter / second ** 2 = N", "kilogram_force = 9.80665 newton = kgf = kp"),
+    *("pound_force = 4.4482216152605 newton = lbf", "joule = newton * meter = J", "watt = joule / second = W"),
+    *("pascal = newton / meter ** 2 = Pa", "bar = 1e5 pascal", "psi = pound_force / inch ** 2"),
+    "percent = 0.01",
+)
+# Spellings that would be read as other units, or not at all.
+_SPELLINGS = (
+    (re.compile(r"(?<![A-Za-z])(?:[Uu]|r|tr)/min\b"), "rpm"),
+    (re.compile(r"%"), "percent"),
+    # A degree to some and 1/400 of a turn to others; a giga-radian to pint.
+    (re.compile(r"\b[Gg]rad\b"), "?"),
+    # kNm and Nmm are products; a prefix stays with its own unit.
+    (re.compile(r"\b([kM]?N)(m?m)\b"), r"\1*\2"),
+    (re.compile(r"(?<=[A-Za-z²³])[·.](?=[A-Za-z])"), "*"),
+    # m2, s-2 and m/s2 as powers.
+    (re.compile(r"(?<=[A-Za-z])(-?\d+)"), r"^\1"),
+)
+
+
+class UnitError(ValueError):
+    """Raised for a text that is no number with a unit of the kind wanted; the message is the reason."""
+
+
+def split(text: str) -> tuple[float, str] | None:
+    """The number and the unit (which may be empty) at which ``text`` begins and ends; None without a number."""
+    found = _NUMBER.fullmatch(text)
+    return (float(found.group(1)), found.group(2)) if found else None
+
+
+def number(text: str, units: str) -> float:
+    """The number in ``units`` that ``text`` writes in a unit of its own.
+
+    Raises :class:`UnitError` for a text without number or unit, an unknown unit, and a unit of another dimension.
+    """
+    parts = split(text)
+    if parts is None:
+        raise UnitError("not a number with a unit")
+    value, unit = parts
+    if not unit:
+        raise UnitError("a number in quotes")
+    return value * factor(unit, units)
+
+
+@lru_cache(maxsize=256)
+def factor(unit: str, units: str) -> float:
+    """The number of ``units`` that one ``unit`` is. Raises :class:`UnitError` as :func:`number` does."""
+    given, wanted = _parsed(unit), _parsed("" if units == "1" else units)
+    if given.dimensionality != wanted.dimensionality and "/rad" in units:
+        given = given / _parsed("rad")
+    if given.dimensionality != wanted.dimensionality:
+        raise UnitError(f"{unit} does not measure that")
+    exact = float((given / wanted).to_base_units().magnitude)
+    # A power of ten is written exactly, whatever way led to it.
+    short = float(f"{exact:.12g}")
+    return short if math.isclose(short, exact, rel_tol=1e-15) else exact
+
+
+def _parsed(unit: str) -> Any:
+    spelt = unit
+    for pattern, plain in _SPELLINGS:
+        spelt = pattern.sub(plain, spelt)
+    registry = _registry()
+    try:
+        # Anything but a product of units, a number among them, is no unit.
+        return 1 * registry.parse_units(spelt)
+    except Exception as error:
+        raise UnitError(f"{unit!r} is not a unit") from error
+
+
+@cache
+def _registry() -> Any:
+    # Local import: pint takes half a second, and most input has no units.
+    import pint
+
+    registry = pint.UnitRegistry(None)
+    registry.load_definitions(_UNITS)
+    return registry
