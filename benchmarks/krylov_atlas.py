@@ -19,8 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import brentq
 
-from drivetrain_jax.analysis.critical_speeds.compound import Scales, planes
+from drivetrain_jax.analysis.critical_speeds.compound import planes
 from drivetrain_jax.analysis.critical_speeds.frequency_roots import find_roots
+from drivetrain_jax.analysis.critical_speeds.segments import Scales
 from drivetrain_jax.atlas import Atlas, Domain, Quantity, construct, run, values_at
 from drivetrain_jax.systems import Coordinate, Shaft, get_system
 

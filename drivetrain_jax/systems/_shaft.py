@@ -14,11 +14,15 @@ class Shaft(NamedTuple):
     Every field is an array whose first axis counts segments, nodes or joints; further axes are lanes and broadcast
     against each other. ``None`` leaves an effect out of the computation altogether.
 
-    ``length`` [m], ``EI`` [N m^2], ``rhoA`` [kg/m]: shape ``(n, ...)``, positive. ``k`` [N/m]: springs to ground at the
-    nodes, ``(n + 1, ...)``, 0 to infinity (a rigid support). ``m`` [kg]: lumped masses at the nodes, ``(n + 1, ...)``.
+    ``length`` [m], ``EI`` [N m^2]: shape ``(n, ...)``, positive. ``rhoA`` [kg/m]: ``(n, ...)``, 0 for a segment without
+    mass. ``k`` [N/m]: springs to ground at the nodes, ``(n + 1, ...)``, 0 to infinity (a rigid support). ``m`` [kg]: lumped
+    masses at the nodes, ``(n + 1, ...)``.
     ``k_hinge`` [N m/rad]: rotational stiffness of the joints, ``(n - 1, ...)``, 0 (a hinge) to infinity (rigid).
     ``kGA`` [N]: shear stiffness ``(n, ...)``, infinity for a segment without shear; ``rhoI`` [kg m]: rotary inertia per
     length ``(n, ...)``. With one of these two a segment is a Timoshenko beam, otherwise an Euler-Bernoulli beam.
+    ``k_rot`` [N m/rad]: rotational springs to ground at the nodes, ``(n + 1, ...)``, 0 between the ends, up to infinity (a
+    clamped end). ``inertia`` [kg m^2]: rotary inertia of discs at the nodes, ``(n + 1, ...)``; half of it sits on each side
+    of an elastic joint.
     """
 
     length: Any
@@ -29,6 +33,8 @@ class Shaft(NamedTuple):
     k_hinge: Any = None
     kGA: Any = None
     rhoI: Any = None
+    k_rot: Any = None
+    inertia: Any = None
 
     @property
     def segments(self) -> int:

@@ -3,9 +3,9 @@
 Source: I. Bulac, "Vibrations of the bicardanic transmissions with elastic supports", Fiabilitate si Durabilitate,
 Supplement 1/2012. Equation numbers are those of docs/theory/bicardan.md, which lists the printed errors.
 
-The paper's model is a Bernoulli-Euler shaft in segments with springs k_A, k_D at its ends. Supports and masses at the
-joints, joints with finite rotational stiffness, masses at the ends, shear and rotary inertia are additions; their
-defaults mean "none".
+The paper's model is a Bernoulli-Euler shaft in segments with springs k_A, k_D at its ends. Supports, masses and rotary
+inertias at the joints, joints with finite rotational stiffness, masses, rotary inertias and rotational springs at the
+ends, shear and rotary inertia of the segments are additions; their defaults mean "none". A segment may have no mass.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from drivetrain_jax.systems._base import Number, System, parameter, serves
 from drivetrain_jax.systems._shaft import Shaft, stack
 from drivetrain_jax.systems.bicardan_units import PHYSICAL
 
-_PER_SEGMENT, _PER_JOINT = ("EI", "rhoA", "kGA", "rhoI"), ("k_joint", "m_joint", "k_hinge")
+_PER_SEGMENT, _PER_JOINT = ("EI", "rhoA", "kGA", "rhoI"), ("k_joint", "m_joint", "k_hinge", "I_joint")
 
 _SUPPORTS = {"k_A": 85e6, "k_D": 20e6}
 _REAL = {"length": (0.07, 0.59, 0.25), "rhoA": (15.288, 2.808, 5.5068), **_SUPPORTS}
@@ -34,7 +34,7 @@ PRESETS = {
 
 
 def check(fixed: Mapping[str, Any]) -> None:
-    """``ValueError`` unless the lists have one entry per segment, or per joint between two segments."""
+    """``ValueError`` unless the lists have one entry per segment or joint, and only segments with mass rotary inertia."""
     segments = len(fixed["length"])
     for names, needed, what in ((_PER_SEGMENT, segments, "segment"), (_PER_JOINT, segments - 1, "joint")):
         for name in names:
@@ -44,6 +44,18 @@ def check(fixed: Mapping[str, Any]) -> None:
                     f"{name} = {list(value)}: {counted(len(value), 'entry', 'entries')} where length has {segments}; "
                     f"allowed is one per {what}, {needed}"
                 )
+    mass, rotary = (_entries(fixed.get(name, ()), segments, none) for name, none in (("rhoA", 1.0), ("rhoI", 0.0)))
+    for i, (each, own) in enumerate(zip(mass, rotary, strict=True)):
+        # Traced values are not checked.
+        if isinstance(each, (int, float)) and isinstance(own, (int, float)) and each == 0 and own > 0:
+            raise ValueError(f"rhoI[{i}] = {own:g}: allowed is 0 for a segment without mass (rhoA[{i}] = 0)")
+
+
+def _entries(value: Any, count: int, none: float) -> tuple[Any, ...]:
+    """One entry for each of ``count`` places from a list, one number for all of them, or an empty list."""
+    if not isinstance(value, tuple):
+        return (value,) * count
+    return value or (none,) * count
 
 
 _LIST = {"listed": True, "lower": 0.0}
@@ -67,7 +79,7 @@ class Bicardan(System):
 
     length: Numbers = parameter("m", "lengths of the segments, from A to D", usual=100.0, open_lower=True, **_LIST)
     EI: Numbers = parameter("N m2", "bending stiffness of the segments", open_lower=True, **_LIST)
-    rhoA: Numbers = parameter("kg/m", "mass per length of the segments", symbol="ρA", open_lower=True, **_LIST)
+    rhoA: Numbers = parameter("kg/m", "mass per length of the segments, 0: without mass", symbol="ρA", **_LIST)
     k_A: Number = parameter("N/m", "stiffness of the support at A", lower=0.0, infinite=True)
     k_D: Number = parameter("N/m", "stiffness of the support at D", lower=0.0, infinite=True)
     k_joint: Numbers | Number = parameter(
@@ -83,6 +95,13 @@ class Bicardan(System):
         "N", "shear stiffness of the segments, inf: no shear", open_lower=True, infinite=True, **_NONE
     )
     rhoI: Numbers | Number = parameter("kg m", "rotary inertia per length of the segments", symbol="ρI", **_NONE)
+    k_rot_A: Number = parameter("N m/rad", "rotational stiffness to ground at A", default=0.0, lower=0.0, infinite=True)
+    k_rot_D: Number = parameter("N m/rad", "rotational stiffness to ground at D", default=0.0, lower=0.0, infinite=True)
+    I_A: Number = parameter("kg m2", "rotary inertia of a disc or yoke at A", default=0.0, lower=0.0)
+    I_D: Number = parameter("kg m2", "rotary inertia of a disc or yoke at D", default=0.0, lower=0.0)
+    I_joint: Numbers | Number = parameter(
+        "kg m2", "rotary inertias at the joints, half on each side of an elastic joint", **_NONE
+    )
 
     @serves("critical_speeds", check=check)
     def shaft(self) -> Shaft:
@@ -94,16 +113,15 @@ class Bicardan(System):
         segments = len(length)
 
         def entries(name: str, count: int, none: float) -> tuple[Any, ...]:
-            value = getattr(self, name)
-            if not isinstance(value, tuple):
-                return (value,) * count
-            return value or (none,) * count
+            return _entries(getattr(self, name), count, none)
 
         def unless(items: tuple[Any, ...], none: float) -> Any:
             return None if all(isinstance(x, (int, float)) and x == none for x in items) else stack(items)
 
         supports = (self.k_A, *entries("k_joint", segments - 1, 0.0), self.k_D)
         masses = (self.m_A, *entries("m_joint", segments - 1, 0.0), self.m_D)
+        springs = (self.k_rot_A, *(0.0,) * (segments - 1), self.k_rot_D)
+        inertias = (self.I_A, *entries("I_joint", segments - 1, 0.0), self.I_D)
         return Shaft(
             stack(length),
             stack(entries("EI", segments, 0.0)),
@@ -113,4 +131,6 @@ class Bicardan(System):
             unless(entries("k_hinge", segments - 1, math.inf), math.inf),
             unless(entries("kGA", segments, math.inf), math.inf),
             unless(entries("rhoI", segments, 0.0), 0.0),
+            unless(springs, 0.0),
+            unless(inertias, 0.0),
         ).arrays()

@@ -227,11 +227,16 @@ def test_lanes_do_not_disturb_each_other(solved):
 @pytest.mark.parametrize("z", [1e-3, 0.3, 1.99, 2.01, 7.0, 40.0])
 def test_compound_is_the_exponential(z):
     """Both forms of the segment agree with ``exp(z B)`` in 60 digits; errors are relative to the column of an entry."""
-    for s, t, functions in ((0.0, 0.0, compound), (0.0, 0.0, None), (0.3, 0.1, None), (3.0, 2.0, None)):
-        own = functions(jnp.array(z)) if functions else general(jnp.array(z), jnp.array(s), jnp.array(t))
+    kinds = [(1.0, 0.0, 0.0, compound), (1.0, 0.0, 0.0, None), (1.0, 0.3, 0.1, None), (1.0, 3.0, 2.0, None)]
+    kinds += [(0.0, 0.0, 0.0, compound), (0.0, 0.0, 0.0, None), (0.0, 3.0, 0.0, None)]
+    # Series hold for other masses as well.
+    kinds += [(0.4, 0.0, 0.0, compound), (0.4, 0.3, 0.1, None)] if z < 1 else []
+    for r, s, t, functions in kinds:
+        given = jnp.array(z), jnp.array(r)
+        own = functions(*given) if functions else general(*given, jnp.array(s), jnp.array(t))
         with mpmath.workdps(60):
             B = mpmath.matrix(
-                [[0, 1, 0, s, 0], [-t, 0, -2, 0, s], [0, 0, 0, -1, 0], [-1, 0, 0, 0, 1], [0, -1, 0, -t, 0]]
+                [[0, 1, 0, s, 0], [-t, 0, -2, 0, s], [0, 0, 0, -1, 0], [-r, 0, 0, 0, 1], [0, -r, 0, -t, 0]]
             )
             exact = mpmath.expm(B * mpmath.mpf(z)) * mpmath.exp(-mpmath.mpf(float(own.growth)))
         for j in range(5):
@@ -242,7 +247,7 @@ def test_compound_is_the_exponential(z):
                     tolerance = 2e-14 * abs(float(exact[i, j])) + 1e-30
                 else:
                     tolerance = 2e-14 * max(abs(float(exact[k, j])) for k in range(5))
-                assert abs(float(column[i]) - float(exact[i, j])) <= tolerance, (s, t, i, j)
+                assert abs(float(column[i]) - float(exact[i, j])) <= tolerance, (r, s, t, i, j)
 
 
 def test_count_grows_by_one_through_every_frequency():
@@ -265,7 +270,8 @@ ARGUMENTS = {name: jnp.array(PAPER[name]) for name in ("length", "EI", "rhoA")} 
 }
 # Power of the length with which each parameter grows in similar shafts.
 SCALING = {"length": 1, "EI": 0, "rhoA": 0, "k": -3, "m": 1, "k_hinge": -1, "kGA": -2, "rhoI": 2}
-STIFFNESSES, MASSES = ("EI", "k", "k_hinge", "kGA"), ("rhoA", "m", "rhoI")
+SCALING |= {"k_rot": -1, "inertia": 3}
+STIFFNESSES, MASSES = ("EI", "k", "k_hinge", "kGA", "k_rot"), ("rhoA", "m", "rhoI", "inertia")
 
 
 def angular_frequencies(arguments: Mapping[str, jax.Array], modes: int = 6) -> jax.Array:

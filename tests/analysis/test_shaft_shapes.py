@@ -59,6 +59,24 @@ CASES = {
     },
     "soft joint on a stiff support": EQUAL
     | {"EI": (1.0, 0.1), "rhoA": (10.0, 0.1), "k_A": 100.0, "k_joint": 1000.0, "k_D": 0.1, "k_hinge": 0.1},
+    "discs at elastic joints": FOUR
+    | SUPPORTED
+    | {"I_A": 0.3, "I_joint": (0.0, 2.0, 0.5), "I_D": 0.1, "m_joint": (0.0, 1.0, 2.0), "k_hinge": (3.0, 20.0, 0.0)},
+    "clamped with a disc": EQUAL | {"k_A": INF, "k_rot_A": INF, "k_D": 0.0, "k_rot_D": 4.0, "I_joint": 1.0, "I_D": 0.2},
+    "a segment without mass": FOUR | SUPPORTED | {"rhoA": (1.0, 0.0, 2.0, 0.0), "k_rot_D": INF, "I_joint": 0.1},
+    "no mass but discs": FOUR
+    | {
+        "rhoA": (0.0,) * 4,
+        "k_A": 3.0,
+        "k_D": 9.0,
+        "k_rot_A": 1.0,
+        "m_joint": (1.0, 0.5, 2.0),
+        "I_joint": (0.1, 0.0, 0.3),
+    },
+    "shear without mass": EQUAL
+    | SUPPORTED
+    | SHEAR
+    | {"rhoA": (0.0, 1.0), "rhoI": (0.0, 0.03), "I_A": 0.3, "I_joint": 0.2},
     "one joint of three": FOUR | SUPPORTED | {"k_hinge": (INF, 291.0, INF)},
     "hinges over rigid supports": FOUR | SUPPORTED | {"k_hinge": (0.0, 2.0, 0.0), "k_joint": (0.0, INF, 0.0)},
 }
@@ -78,11 +96,26 @@ def random_shaft(rng: np.random.Generator, segments: int) -> dict:
     }
 
 
+def random_discs(rng: np.random.Generator, segments: int) -> dict:
+    """The same with rotary inertias, rotational springs, and segments without mass."""
+    shaft = random_shaft(rng, segments)
+    return shaft | {
+        "rhoA": shaft["rhoA"] * rng.choice([0.0, 1.0, 1.0], segments),
+        **{name: float(rng.choice([0.0, INF, 10 ** rng.uniform(-1, 2)])) for name in ("k_rot_A", "k_rot_D")},
+        **{name: float(rng.choice([0.0, 10 ** rng.uniform(-2, 1)])) for name in ("I_A", "I_D")},
+        "I_joint": rng.choice([0.0, 1.0], segments - 1) * 10 ** rng.uniform(-2, 1, segments - 1),
+        # Every node moves mass, so that every mechanism has a frequency.
+        "m_joint": 10 ** rng.uniform(-1, 1, segments - 1),
+        "m_A": 0.1,
+        "m_D": 0.2,
+    }
+
+
 def in_pieces(v: Mapping) -> dict:
     """The same shaft with every segment cut into equal pieces, so that it has nodes between its joints."""
     cut = {name: np.repeat(v[name], PIECES) for name in ("length", "EI", "rhoA", "kGA", "rhoI")}
     cut["length"] = cut["length"] / PIECES
-    for name, none in (("k_joint", 0.0), ("m_joint", 0.0), ("k_hinge", INF)):
+    for name, none in (("k_joint", 0.0), ("m_joint", 0.0), ("I_joint", 0.0), ("k_hinge", INF)):
         cut[name] = np.full(len(cut["length"]) - 1, none)
         cut[name][PIECES - 1 :: PIECES] = v[name]
     return dict(v) | cut
@@ -93,10 +126,7 @@ def elements(values: Mapping) -> tuple[np.ndarray, np.ndarray]:
     v = in_pieces(complete(values))
     nodes = len(v["length"]) + 1
     rigid = np.isinf(np.r_[v["k_A"], v["k_joint"], v["k_D"]])
-    springs = {name: np.where(np.isinf(v[name]), 0.0, v[name]) for name in ("k_A", "k_joint", "k_D")}
-    K, M = matrices(v | springs, 4)
-    kept = np.r_[~rigid, np.ones(len(K) - nodes, bool)]
-    K, M = K[np.ix_(kept, kept)], M[np.ix_(kept, kept)]
+    K, M = matrices(v, 4)
     stiff = K + M
     inverse, vectors = eigh(M, stiff, subset_by_index=[len(M) - MODES - 1, len(M) - 1])
     shapes = np.zeros((MODES + 1, nodes))
@@ -108,7 +138,9 @@ def everything(values: Mapping) -> Shaft:
     """The shaft with every field present, so that shafts with the same number of segments share a kernel."""
     v = complete(values)
     k, m = (np.r_[v[f"{what}_A"], v[f"{what}_joint"], v[f"{what}_D"]] for what in ("k", "m"))
-    return Shaft(v["length"], v["EI"], v["rhoA"], k, m, v["k_hinge"], v["kGA"], v["rhoI"])
+    inertia = np.r_[v["I_A"], v["I_joint"], v["I_D"]]
+    k_rot = np.r_[v["k_rot_A"], np.zeros(len(v["k_joint"])), v["k_rot_D"]]
+    return Shaft(v["length"], v["EI"], v["rhoA"], k, m, v["k_hinge"], v["kGA"], v["rhoI"], k_rot, inertia)
 
 
 def places(values: Mapping) -> np.ndarray:
@@ -133,7 +165,7 @@ def compare(shafts: Mapping[str, Mapping], tolerance: float) -> int:
         frequencies, expected = elements(values)
         for j in range(MODES):
             apart = np.abs(np.delete(frequencies, j) - frequencies[j]).min() > 1e-3 * frequencies[j]
-            if p[i, j] == 0 or not apart:
+            if p[i, j] == 0 or not apart or np.isinf(p[i, j]):
                 continue
             assert abs(p[i, j] / frequencies[j] - 1) < 1e-6, (name, j)
             shape = expected[j] / expected[j][np.argmax(np.abs(expected[j]))]
@@ -150,7 +182,8 @@ def test_shapes_against_finite_elements(segments):
     shafts = {name: values for name, values in CASES.items() if len(values["length"]) == segments}
     named = len(shafts)
     shafts |= {f"random {i}": random_shaft(rng, segments) for i in range(20)}
-    assert compare(shafts, 1e-6) > 4 * 20 + 2 * named
+    shafts |= {f"random discs {i}": random_discs(rng, segments) for i in range(20)}
+    assert compare(shafts, 1e-6) > 4 * 40 + 2 * named
 
 
 UNLIKE = {"length": (1.0, 0.7, 1.3), "EI": (1.0, 2.0, 0.6), "rhoA": (1.0, 0.8, 1.7)}
@@ -162,6 +195,9 @@ WEAK = {
     "all kinds, with shear": UNLIKE
     | {"kGA": (20.0, 5.0, 90.0), "rhoI": (0.01, 0.3, 0.03), "k_A": 20.0, "k_D": 21.0, "m_D": 0.2}
     | {"k_joint": (6e4, INF), "k_hinge": (0.0, 8e-4), "m_joint": (0.0, 2.0)},
+    "discs, clamped, a segment without mass": UNLIKE
+    | {"rhoA": (1.0, 0.0, 1.7), "I_D": 0.3, "I_joint": (0.2, 1e3), "k_hinge": (0.1, 3e4)}
+    | {"k_A": INF, "k_rot_A": INF, "k_D": 2.0, "k_rot_D": 1.0},
 }
 
 
@@ -170,6 +206,8 @@ def exact_segment(v: Mapping, i: int, p: mp.mpf, x: mp.mpf) -> mp.matrix:
     EI, mass, rotary = (mp.mpf(v[name][i]) * scale for name, scale in (("EI", 1), ("rhoA", p * p), ("rhoI", p * p)))
     shear = 1 / mp.mpf(v["kGA"][i])
     A = mp.matrix([[0, 1, 0, shear], [0, 0, -1 / EI, 0], [0, rotary, 0, 1], [-mass, 0, 0, 0]])
+    if mass == 0:
+        return mp.eye(4) + x * A + x**2 / 2 * A**2 + x**3 / 6 * A**3
     half, product = (mass * shear + rotary / EI) / 2, mass / EI - mass * shear * rotary / EI
     root = mp.sqrt(half * half + product)
     a, b = mp.sqrt(root - half), mp.sqrt(root + half)
@@ -182,10 +220,15 @@ def exact_segment(v: Mapping, i: int, p: mp.mpf, x: mp.mpf) -> mp.matrix:
 def exact_node(v: Mapping, i: int, p: mp.mpf) -> mp.matrix:
     """Transfer matrix of joint and support in front of segment i, or of the end; rigid and hinged to 30 digits."""
     k, m = (np.r_[v[f"{what}_A"], v[f"{what}_joint"], v[f"{what}_D"]][i] for what in ("k", "m"))
-    turns = mp.mpf(v["k_hinge"][i - 1]) if 0 < i < len(v["length"]) else mp.inf
-    hinge, support = mp.eye(4), mp.eye(4)
+    inner = 0 < i < len(v["length"])
+    turns = mp.mpf(v["k_hinge"][i - 1]) if inner else mp.inf
+    k_rot = mp.mpf(0 if inner else v["k_rot_A" if i == 0 else "k_rot_D"])
+    hinge, support, turned = mp.eye(4), mp.eye(4), mp.eye(4)
     hinge[1, 2], support[3, 0] = -1 / max(turns, mp.mpf("1e-30")), min(mp.mpf(k), mp.mpf("1e30")) - p * p * mp.mpf(m)
-    return support * hinge
+    inertia = mp.mpf(np.r_[v["I_A"], v["I_joint"], v["I_D"]][i])
+    # Half of it on each side of the joint; at an end both halves turn together.
+    turned[2, 1] = (p * p * inertia - min(k_rot, mp.mpf("1e30"))) / 2
+    return support * turned * hinge * turned
 
 
 def exact_shape(v: Mapping, p: float, x: np.ndarray) -> np.ndarray:

@@ -1,7 +1,8 @@
 """Independent references for the stepped shaft: finite elements of high degree, and the paper's determinant.
 
-    (EI f'')'' = p^2 rhoA f in each segment, springs k_A, k_D (k_joint) and masses at its ends; with shear and rotary
-    inertia (kGA (f' - theta))' = -p^2 rhoA f, (EI theta')' + kGA (f' - theta) = -p^2 rhoI theta.
+    (EI f'')'' = p^2 rhoA f in each segment, springs k_A, k_D (k_joint), rotational springs, masses and rotary inertias at
+    its ends; with shear and rotary inertia (kGA (f' - theta))' = -p^2 rhoA f, (EI theta')' + kGA (f' - theta) = -p^2 rhoI
+    theta. rhoA may be 0.
 
 ``finite_elements`` is independent of the package: Galerkin's method with one element of high degree per segment, matrices
 by Gauss quadrature, eigenvalues by LAPACK. ``determinant_roots`` is the plain implementation of the paper with NumPy and
@@ -20,7 +21,7 @@ from numpy.polynomial import legendre
 from scipy.linalg import eigh
 from scipy.optimize import brentq
 
-_LISTS = ("length", "EI", "rhoA", "k_joint", "m_joint", "k_hinge", "kGA", "rhoI")
+_LISTS = ("length", "EI", "rhoA", "k_joint", "m_joint", "k_hinge", "kGA", "rhoI", "I_joint")
 Element = tuple[np.ndarray, np.ndarray]
 
 
@@ -28,8 +29,9 @@ def complete(parameters: Mapping[str, Any]) -> dict[str, Any]:
     """All parameters, with missing ones set to no effect and lists as arrays."""
     n = len(parameters["length"])
     defaults = {"k_joint": 0.0, "m_joint": 0.0, "k_hinge": np.inf, "kGA": np.inf, "rhoI": 0.0, "m_A": 0.0, "m_D": 0.0}
+    defaults |= {"k_rot_A": 0.0, "k_rot_D": 0.0, "I_A": 0.0, "I_joint": 0.0, "I_D": 0.0}
     values = {**defaults, **parameters}
-    sizes = {"k_joint": n - 1, "m_joint": n - 1, "k_hinge": n - 1}
+    sizes = dict.fromkeys(("k_joint", "m_joint", "k_hinge", "I_joint"), n - 1)
     return {
         name: np.broadcast_to(np.asarray(value, float), sizes.get(name, n)) if name in _LISTS else float(value)
         for name, value in values.items()
@@ -87,7 +89,8 @@ def _timoshenko_element(length: float, EI: float, rhoA: float, kGA: float, rhoI:
 def matrices(parameters: Mapping[str, Any], bubbles: int) -> Element:
     """Stiffness and mass of the whole shaft.
 
-    Shear or rotary inertia in any segment make all of them Timoshenko elements; ``kGA`` must then be finite.
+    Shear or rotary inertia in any segment make all of them Timoshenko elements; ``kGA`` must then be finite. Unknowns that a
+    rigid support or a clamped end holds are left out.
     """
     v = complete(parameters)
     n = len(v["length"])
@@ -111,21 +114,29 @@ def matrices(parameters: Mapping[str, Any], bubbles: int) -> Element:
         index = np.r_[i, theta_behind[i], i + 1, theta_before[i + 1], count + i * own + np.arange(own)]
         K[np.ix_(index, index)] += k
         M[np.ix_(index, index)] += m
-    springs = np.r_[v["k_A"], v["k_joint"], v["k_D"]]
-    masses = np.r_[v["m_A"], v["m_joint"], v["m_D"]]
-    K[np.arange(n + 1), np.arange(n + 1)] += springs
-    M[np.arange(n + 1), np.arange(n + 1)] += masses
+    springs, loads = np.zeros(len(K)), np.zeros(len(K))
+    springs[: n + 1] = np.r_[v["k_A"], v["k_joint"], v["k_D"]]
+    springs[[theta_behind[0], theta_before[n]]] = v["k_rot_A"], v["k_rot_D"]
+    loads[: n + 1] = np.r_[v["m_A"], v["m_joint"], v["m_D"]]
+    loads[[theta_behind[0], theta_before[n]]] = v["I_A"], v["I_D"]
+    for j, inertia in enumerate(v["I_joint"]):
+        loads[theta_before[j + 1]] += inertia / 2
+        loads[theta_behind[j + 1]] += inertia / 2
+    K += np.diag(np.where(np.isinf(springs), 0.0, springs))
+    M += np.diag(loads)
     for j in np.flatnonzero(free):
         pair = [theta_before[j + 1], theta_behind[j + 1]]
         K[np.ix_(pair, pair)] += v["k_hinge"][j] * np.array([[1, -1], [-1, 1]])
-    return K, M
+    kept = np.isfinite(springs)
+    return K[np.ix_(kept, kept)], M[np.ix_(kept, kept)]
 
 
 def finite_elements(parameters: Mapping[str, Any], modes: int, bubbles: int = 14) -> np.ndarray:
     """The first ``modes`` natural angular frequencies [rad/s]; zero modes are small numbers instead of 0."""
     K, M = matrices(parameters, bubbles)
     v = complete(parameters)
-    shift = (np.pi / np.sum(v["length"])) ** 4 * np.min(v["EI"]) / np.max(v["rhoA"])
+    mass = max(np.max(v["rhoA"]), np.max(np.r_[v["m_A"], v["m_joint"], v["m_D"]]) / np.sum(v["length"]))
+    shift = (np.pi / np.sum(v["length"])) ** 4 * np.min(v["EI"]) / mass
     values = _lowest(K, M, shift, modes)
     # The smallest value that is no zero mode is the best shift: values far below the shift are lost in rounding.
     elastic = values[values > 1e-9 * values[-1]]

@@ -26,14 +26,22 @@ def refusal(**changes) -> str:
     return str(error.value)
 
 
-@pytest.mark.parametrize("name", ["length", "EI", "rhoA"])
-@pytest.mark.parametrize("value", [0.0, -1.0])
+@pytest.mark.parametrize(
+    ("name", "value"), [("length", 0.0), ("length", -1.0), ("EI", 0.0), ("EI", -1.0), ("rhoA", -1.0)]
+)
 def test_entries_must_be_positive(name, value):
     message = refusal(**{name: [FIXED[name][0], value, FIXED[name][2]]})
-    assert f"{name}[1] = {value}" in message and f"0 < {name}[i]" in message
+    assert f"{name}[1] = {value}" in message and f"0 {'<=' if name == 'rhoA' else '<'} {name}[i]" in message
 
 
-@pytest.mark.parametrize("name", ["EI", "rhoA", "kGA", "rhoI", "k_joint", "m_joint", "k_hinge"])
+def test_a_segment_without_mass_has_no_rotary_inertia():
+    message = refusal(rhoA=[15.0, 0.0, 5.0], rhoI=[0.0, 0.1, 0.0])
+    assert message == "fixed.rhoI[1] = 0.1: allowed is 0 for a segment without mass (rhoA[1] = 0)"
+    assert "rhoI[1] = 2" in refusal(rhoA=[15.0, 0.0, 5.0], rhoI=2.0)
+    load_scene({**SCENE, "fixed": FIXED | {"rhoA": [15.0, 0.0, 5.0], "rhoI": [0.1, 0.0, 0.1]}})
+
+
+@pytest.mark.parametrize("name", ["EI", "rhoA", "kGA", "rhoI", "k_joint", "m_joint", "k_hinge", "I_joint"])
 def test_lists_must_fit_the_segments(name):
     message = refusal(**{name: [1.0] * 5})
     assert f"fixed.{name} = " in message and "5 entries" in message
@@ -47,6 +55,8 @@ def test_supports_may_be_absent_or_rigid_but_not_negative():
 def test_the_determinant_knows_no_additions():
     options = {"method": "krylov_determinant"}
     assert "allowed is the method certified" in refusal(m_joint=[1.0, 1.0], options=options)
+    assert "allowed is the method certified" in refusal(k_rot_A=1.0, options=options)
+    assert "allowed is rhoA[i] > 0" in refusal(rhoA=[15.0, 0.0, 5.0], options=options)
 
 
 def test_a_margin_needs_operating_speeds():
@@ -64,6 +74,7 @@ def test_operating_speeds_in_the_wrong_order_are_refused():
 def test_what_is_absent_is_left_out():
     plain = Bicardan.of(PRESETS["paper"]).shaft()
     assert plain.m is None and plain.k_hinge is None and not plain.is_timoshenko
+    assert plain.k_rot is None and plain.inertia is None
     assert Bicardan.of(PRESETS["paper"] | {"m_D": 1.0}).shaft().m is not None
 
 

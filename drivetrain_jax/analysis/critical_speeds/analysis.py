@@ -8,7 +8,10 @@ its roots with the right number.
 Modes are numbered by frequency and not followed along an axis. The frequencies of a shaft in one plane between separated
 ends are simple (except with a hinge on, or almost on, a rigid support), so curves of equal number do not cross.
 
-Outcome: ``NOT_FINITE`` if parameters give no finite equations, ``NOT_CONVERGED`` if a frequency was not found (NaN),
+A shaft without mass in its segments has as many frequencies as masses and inertias; further ones are infinite.
+
+Outcome: ``NOT_FINITE`` if parameters give no finite equations (also if a part moves freely and has no mass),
+``NOT_CONVERGED`` if a frequency was not found (NaN),
 ``TOLERANCE_NOT_MET`` if a root of ``krylov_determinant`` is not certified.
 """
 
@@ -31,7 +34,7 @@ from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.critical_speeds import frequency_roots as shaft_roots
 from drivetrain_jax.analysis.critical_speeds import krylov as shaft_krylov
 from drivetrain_jax.analysis.critical_speeds.frequency_roots import Roots, frequency_derivatives
-from drivetrain_jax.analysis.critical_speeds.mechanisms import mechanism_shapes, zero_modes
+from drivetrain_jax.analysis.critical_speeds.mechanisms import is_undefined, mechanism_shapes, zero_modes
 from drivetrain_jax.analysis.critical_speeds.shapes import mode_shapes, normalised
 from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.systems import Shaft, System
@@ -59,7 +62,10 @@ _OPTION_NAMES = tuple(option.name for option in OPTIONS)
 # Per rad/s.
 _UNITS = {"angular_frequency": 1.0, "natural_frequency": 1 / (2 * math.pi), "critical_speed": 30 / math.pi}
 # Parameters that the paper's method does not include.
-_ADDITIONS = ("k_joint", "m_A", "m_D", "m_joint", "k_hinge", "kGA", "rhoI")
+_ADDITIONS = (
+    *("k_joint", "m_A", "m_D", "m_joint", "k_hinge", "kGA", "rhoI"),
+    *("k_rot_A", "k_rot_D", "I_A", "I_D", "I_joint"),
+)
 # Roots of all modes of a chunk together, small enough for the cache.
 _ROOTS_PER_CHUNK = 12288
 _STATIONS_PER_CHUNK = 1 << 18
@@ -85,6 +91,8 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
                 raise InputError(
                     f"{given}: not in the equations of krylov_determinant; allowed is the method certified"
                 )
+        if 0.0 in np.ravel(fixed.get("rhoA", ())):
+            raise InputError("fixed.rhoA: krylov_determinant needs mass in every segment; allowed is rhoA[i] > 0")
     low, high = options["operating_min"], options["operating_max"]
     if high < low or (high == 0 and "separation_margin" in request.outputs):
         raise InputError(
@@ -99,16 +107,18 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
 
 
 def _shapes(shaft: Shaft, roots: Roots, stations: int) -> Array:
-    """Shapes of zero modes and of the others; NaN for missing frequencies."""
+    """Shapes of zero modes and of the others; NaN for missing frequencies, 0 for infinite ones."""
     modes, lanes = roots.q.shape[0], roots.q.shape[1:]
     x = jnp.linspace(0.0, 1.0, stations)
-    elastic = mode_shapes(shaft, jnp.where(roots.q > 0, roots.q, 1.0), x)
+    finite = jnp.isfinite(roots.q)
+    elastic = mode_shapes(shaft, jnp.where(finite & (roots.q > 0), roots.q, 1.0), x)
+    elastic = jnp.where(jnp.isinf(roots.q)[:, None], 0.0, elastic)
     index = jnp.arange(modes).reshape(modes, *(1,) * len(lanes))
     mechanisms = mechanism_shapes(shaft, x)
     row = jnp.broadcast_to(jnp.minimum(index, len(mechanisms) - 1), (modes, *lanes))
     rigid = normalised(jnp.take_along_axis(mechanisms, row[:, None], axis=0))
     shape = jnp.where((index < zero_modes(shaft))[:, None], rigid, elastic)
-    return jnp.where(jnp.isfinite(roots.q)[:, None], shape, jnp.nan)
+    return jnp.where(jnp.isnan(roots.q)[:, None], jnp.nan, shape)
 
 
 def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
@@ -119,6 +129,7 @@ def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Ar
     roots = (shaft_roots if certified else shaft_krylov).find_roots(shaft, options["modes"])
     p = roots.q**2
     finite = jnp.all(jnp.isfinite(shaft.length) & jnp.isfinite(shaft.EI) & jnp.isfinite(shaft.rhoA), axis=0)
+    finite = finite & ~is_undefined(shaft)
     missing, doubtful = jnp.any(jnp.isnan(roots.q), axis=0), ~jnp.all(roots.certified, axis=0)
     outcome = jnp.where(missing, Outcome.NOT_CONVERGED, jnp.where(doubtful, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS))
     results = {

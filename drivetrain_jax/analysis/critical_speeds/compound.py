@@ -9,6 +9,7 @@ which are, up to sign, the 2x2 minors of two states (Pluecker coordinates; the s
 u = (1, 0, 0, 0, 0). With q = sqrt(p), in units that make all matrices free of p (theta/q, M/q^2, F/q^3):
 
 - support and lumped mass: S11 += kappa, kappa = k/q^3 - m q, that is u3 += kappa u0, u4 += kappa u1;
+- rotational spring and rotary inertia: S22 += kappa, kappa = k_rot/q - I q^3, that is u1 += kappa u0, u4 += kappa u3;
 - joint with the rotational stiffness k_hinge: u0 += (q/k_hinge) u1, u3 += (q/k_hinge) u4;
 - segment: u -> exp(z B) u in coordinates scaled by its own alpha and EI, see :mod:`shaft_functions`.
 
@@ -32,29 +33,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from drivetrain_jax.analysis.critical_speeds.segments import LastNode, Segment, segments_of
 from drivetrain_jax.analysis.critical_speeds.waves import Compound, General, Plane, compound, general, sign_of
 from drivetrain_jax.systems import Shaft
 
 # Halvings of a Timoshenko segment: enough for a million half waves.
 _MAX_LEVELS = 22
-
-
-class Scales(NamedTuple):
-    """Quantities of the segments alone: ``beta = l (rhoA/EI)^(1/4)``, so that z = q beta, and the units of S22, S12
-    and S11: ``e1 = b EI``, ``e2 = b^2 EI``, ``e3 = b^3 EI`` with ``b = (rhoA/EI)^(1/4)``; shape ``(n, ...)`` each."""
-
-    beta: Array
-    b: Array
-    e1: Array
-    e2: Array
-    e3: Array
-
-    @classmethod
-    def of(cls, shaft: Shaft) -> Scales:
-        """The scales of ``shaft``."""
-        b = jnp.sqrt(jnp.sqrt(shaft.rhoA / shaft.EI))
-        e1 = b * shaft.EI
-        return cls(shaft.length * b, b, e1, b * e1, b * b * e1)
 
 
 class Value(NamedTuple):
@@ -71,32 +55,17 @@ class _State(NamedTuple):
     count: Array  # pyright: ignore[reportIncompatibleMethodOverride]
 
 
-class _Segment(NamedTuple):
-    """A segment with the node in front of it: the slices over which the propagation runs."""
-
-    beta: Array
-    e1: Array
-    e2: Array
-    e3: Array
-    k: Array
-    unit: Array
-    m: Array | None
-    k_hinge: Array | None
-    turn: Array | None
-    shear: Array | None
-    rotary: Array | None
-
-
 def characteristic(shaft: Shaft, q: Array, counting: bool = True) -> Value:
     """The characteristic function at ``q = sqrt(p)``, ``p`` in rad/s.
 
     ``q`` has shape ``(..., *lanes)`` and the fields of ``shaft`` ``(n, *lanes)``; results have the shape of ``q``.
     """
-    segments, last = _segments(shaft)
+    # Faint instead of no mass: the same digits without multiplications by r.
+    segments, last = segments_of(shaft, faint=True)
     zero = q * 0 * segments.beta[0]
     start = _State((zero + 1, zero, zero, zero, zero), zero + 1, zero)
 
-    def step(state: _State, segment: _Segment) -> tuple[_State, None]:
+    def step(state: _State, segment: Segment) -> tuple[_State, None]:
         u, sign, count = _enter(state, segment, q)
         functions = functions_of(segment, q)
         behind = functions.propagate(u)
@@ -133,11 +102,11 @@ def planes(shaft: Shaft, q: Array) -> tuple[Plane, Plane, Array, Array]:
     passed where the plane from the right has not. It is common because the units of supports and joints are those of
     both sides: the mirrored shaft has the same.
     """
-    segments, _ = _segments(shaft)
+    segments, _ = segments_of(shaft)
     zero = q * 0 * segments.beta[0]
     start = _State((zero + 1, zero, zero, zero, zero), zero + 1, zero)
 
-    def step(carry: tuple[_State, Array], segment: _Segment) -> Any:
+    def step(carry: tuple[_State, Array], segment: Segment) -> Any:
         state, logarithm = carry
         front = _enter(state, segment, q).u
         functions = functions_of(segment, q)
@@ -150,53 +119,31 @@ def planes(shaft: Shaft, q: Array) -> tuple[Plane, Plane, Array, Array]:
     return jax.lax.scan(step, (start, zero), segments)[1]
 
 
-def functions_of(segment: _Segment, q: Array) -> Compound | General:
+def functions_of(segment: Segment, q: Array) -> Compound | General:
     """The scaled compound of a segment at ``q``."""
-    z = q * segment.beta
+    z, r = q * segment.beta, 1.0 if segment.r is None else segment.r
     if segment.shear is None:
-        return compound(z)
-    return general(z, q * q * segment.shear, q * q * segment.rotary)  # pyright: ignore[reportOperatorIssue]
+        return compound(z, r)
+    return general(z, r, q * q * segment.shear, q * q * segment.rotary)  # pyright: ignore[reportOperatorIssue]
 
 
-def _segments(shaft: Shaft) -> tuple[_Segment, tuple[Array, Array | None, Array, Array, Array]]:
-    """The segments, each with the node in front of it, and the last node: k, m, unit of k and the scales e1, e3."""
-    scales = Scales.of(shaft)
-    unit = jnp.concatenate([scales.e3[:1], between(scales.e3), scales.e3[-1:]])
-    hinges = turn = None
-    if shaft.k_hinge is not None:
-        hinges = jnp.concatenate([jnp.full_like(shaft.k_hinge[:1], jnp.inf), shaft.k_hinge])
-        turn = jnp.concatenate([scales.e1[:1], between(scales.e1)])
-    shear = rotary = None
-    if shaft.is_timoshenko:
-        square = scales.b * scales.b
-        shear = jnp.zeros_like(square) if shaft.kGA is None else square * shaft.EI / shaft.kGA
-        rotary = jnp.zeros_like(square) if shaft.rhoI is None else square * shaft.rhoI / shaft.rhoA
-    m = None if shaft.m is None else shaft.m[:-1]
-    own = scales.beta, scales.e1, scales.e2, scales.e3
-    segments = _Segment(*own, shaft.k[:-1], unit[:-1], m, hinges, turn, shear, rotary)
-    last = (shaft.k[-1], None if shaft.m is None else shaft.m[-1], unit[-1], scales.e1[-1], scales.e3[-1])
-    return segments, last
-
-
-def between(scale: Array) -> Array:
-    """The mean of both sides at every joint."""
-    return (scale[1:] + scale[:-1]) / 2
-
-
-def _enter(state: _State, segment: _Segment, q: Array) -> _State:
-    """Across the joint and the support in front of ``segment``, and into its coordinates."""
+def _enter(state: _State, segment: Segment, q: Array) -> _State:
+    """Across the joint, its inertias and the support in front of ``segment``, and into its coordinates."""
     u, sign, count = state
+    if segment.inertia_before is not None:
+        u = _across_rotation(u, None, segment.inertia_before, segment.turn, q)
     if segment.k_hinge is not None:
         u = _across_hinge(u, segment.k_hinge, segment.turn, q)  # pyright: ignore[reportArgumentType]
         after = sign_of(u[0])
         count, sign = count + 0.5 * (1 - after * sign), after
+    u = _across_rotation(u, segment.k_rot, segment.inertia, segment.turn, q)
     u = _across_support(u, segment.k, segment.m, segment.unit, q)
     u0, u1, u2, u3, u4 = u
     e1, e2, e3 = segment.e1, segment.e2, segment.e3
     return _State((u0, u1 / e1, u2 / e2, u3 / e3, u4 / (e1 * e3)), sign, count)
 
 
-def _out_of(u: Plane, segment: _Segment) -> Plane:
+def _out_of(u: Plane, segment: Segment) -> Plane:
     u0, u1, u2, u3, u4 = u
     e1, e2, e3 = segment.e1, segment.e2, segment.e3
     return u0, u1 * e1, u2 * e2, u3 * e3, u4 * (e1 * e3)
@@ -204,10 +151,20 @@ def _out_of(u: Plane, segment: _Segment) -> Plane:
 
 def support_shares(k: Array, m: Array | None, unit: Array, q: Array) -> tuple[Array, Array]:
     """1 and kappa = k/q^3 - m q, both over 1 + |kappa|/unit: finite for a rigid support too."""
+    return _shares(k, q * q * q, None if m is None else m * q, unit)
+
+
+def rotation_shares(k_rot: Array | None, inertia: Array | None, unit: Array, q: Array) -> tuple[Array, Array]:
+    """1 and kappa = k_rot/q - I q^3, both over 1 + |kappa|/unit."""
+    load = None if inertia is None else inertia * (q * q * q)
+    return _shares(jnp.zeros_like(unit) if k_rot is None else k_rot, q, load, unit)
+
+
+def _shares(k: Array, per: Array, load: Array | None, unit: Array) -> tuple[Array, Array]:
     rigid = jnp.isinf(k)
-    kappa = jnp.where(rigid, 0.0, k) / (q * q * q)
-    if m is not None:
-        kappa = kappa - m * q
+    kappa = jnp.where(rigid, 0.0, k) / per
+    if load is not None:
+        kappa = kappa - load
     share = 1 / (1 + jnp.abs(kappa) / unit)
     return jnp.where(rigid, 0.0, share), jnp.where(rigid, unit, kappa * share)
 
@@ -227,6 +184,15 @@ def _across_support(u: Plane, k: Array, m: Array | None, unit: Array, q: Array) 
     return keep * u0, keep * u1, keep * u2, keep * u3 + add * u0, keep * u4 + add * u1
 
 
+def _across_rotation(u: Plane, k_rot: Array | None, inertia: Array | None, unit: Array | None, q: Array) -> Plane:
+    """S22 += k_rot/q - I q^3, everything times a factor; nothing to do without both."""
+    if k_rot is None and inertia is None:
+        return u
+    keep, add = rotation_shares(k_rot, inertia, unit, q)  # pyright: ignore[reportArgumentType]
+    u0, u1, u2, u3, u4 = u
+    return keep * u0, keep * u1 + add * u0, keep * u2, keep * u3, keep * u4 + add * u3
+
+
 def _across_hinge(u: Plane, k_hinge: Array, unit: Array, q: Array) -> Plane:
     """u0 += (q/k_hinge) u1, u3 += (q/k_hinge) u4, everything times a factor."""
     keep, add = hinge_shares(k_hinge, unit, q)
@@ -234,18 +200,21 @@ def _across_hinge(u: Plane, k_hinge: Array, unit: Array, q: Array) -> Plane:
     return keep * u0 + add * u1, keep * u1, keep * u2, keep * u3 + add * u4, keep * u4
 
 
-def _end(state: _State, last: tuple[Array, Array | None, Array, Array, Array], q: Array, counting: bool) -> Value:
-    """Psi behind the last support, and the inertia of the last pivot, which is S itself."""
-    k, m, unit, e1, e3 = last
-    u0, u1, u2, u3, u4 = _across_support(state.u, k, m, unit, q)
+def _end(state: _State, last: LastNode, q: Array, counting: bool) -> Value:
+    """Psi behind the last node, and the inertia of the last pivot, which is S itself."""
+    e1, e3 = last.e1, last.e3
+    u0, u1, u2, u3, u4 = u = _across_support(state.u, last.k, last.m, last.unit, q)
+    # A clamped end leaves Psi alone of all entries, so that they are compared in front of the rotational spring.
+    size = jnp.sqrt(u0**2 + (u1 / e1) ** 2 + (u2**2 / (e1 * e3)) + (u3 / e3) ** 2 + (u4 / (e1 * e3)) ** 2)
+    _, u1, _, u3, u4 = _across_rotation(u, last.k_rot, last.inertia, e1, q)
     u1, u3, u4 = u1 / e1, u3 / e3, u4 / (e1 * e3)
-    psi = u4 / jnp.sqrt(u0**2 + u1**2 + (u2**2 / (e1 * e3)) + u3**2 + u4**2)
+    psi = u4 / size
     if not counting:
         return Value(psi, None)
     return Value(psi, state.count + _negative(sign_of(u4) * state.sign, (u1 + u3) * state.sign))
 
 
-def clamped_count(segment: _Segment, functions: Compound | General, q: Array) -> tuple[Array, Array]:
+def clamped_count(segment: Segment, functions: Compound | General, q: Array) -> tuple[Array, Array]:
     """J0, the clamped-clamped natural frequencies of a segment below p, and the sign of Q that belongs to it."""
     if isinstance(functions, Compound):
         # The frequencies cos z ch z = 1 lie next to z = (n + 1/2) pi: between them (-1)^floor(z/pi) is far from a jump.
@@ -270,7 +239,7 @@ def _count_by_halving(z: Array, whole: General) -> tuple[Array, Array]:
 
     def double(level: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         count, sign = state
-        w = general(z * 2.0 ** (level - levels), s, t).propagate(clamped)
+        w = general(z * 2.0 ** (level - levels), whole.r, s, t).propagate(clamped)
         k11, k22 = sign_of(w[3]) * sign, sign_of(w[1]) * sign
         return 2 * count + 0.5 * (1 - k11) + 0.5 * (1 - k22), k11 * k22
 

@@ -2,7 +2,8 @@
 
 The j-th frequency is where the count N passes from below j to j or more. Every step keeps a bracket with N(low) < j <=
 N(high), so that no frequency can be missed and none invented. The upper end comes from the clamped-clamped frequencies
-of the segments, each of which has at least ``z/pi - 1.6`` of them below z, the lower one from falling powers of 4. Once
+of the segments, each of which has at least ``z/pi - 1.6`` of them below z (without any mass in segments from a sum of
+stiffness over mass), the lower one from falling powers of 4. Once
 a bracket holds one frequency alone, steps follow Psi (interpolation, truncation and projection: Oliveira & Takahashi,
 ACM TOMS 47 (2020) 5, never more than one step worse than bisection); in clusters they bisect. All modes of all lanes go
 through the same ``COMMON_STEPS``; the few brackets that are open then go on by themselves, to ``MAX_STEPS`` at most. A
@@ -21,8 +22,14 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis._base import stacked
-from drivetrain_jax.analysis.critical_speeds.compound import Scales, characteristic, pairings
-from drivetrain_jax.analysis.critical_speeds.mechanisms import zero_modes
+from drivetrain_jax.analysis.critical_speeds.compound import characteristic, pairings
+from drivetrain_jax.analysis.critical_speeds.mechanisms import (
+    highest_frequency,
+    is_undefined,
+    number_of_modes,
+    zero_modes,
+)
+from drivetrain_jax.analysis.critical_speeds.segments import Scales
 from drivetrain_jax.systems import Shaft
 
 MAX_STEPS = 90
@@ -44,8 +51,8 @@ _ZERO = 1e-9
 
 class Roots(NamedTuple):
     """``q = sqrt(p)`` of the natural frequencies p [rad/s], rising; the relative ``width`` of the brackets of p;
-    whether the count certifies each: ``(modes, *lanes)``. A zero mode has the exact q = 0; what was not found is
-    NaN."""
+    whether the count certifies each: ``(modes, *lanes)``. A zero mode has the exact q = 0, a mode that a shaft without
+    mass in its segments does not have is infinite, and what was not found is NaN."""
 
     q: Array
     width: Array
@@ -69,11 +76,14 @@ class _Brackets(NamedTuple):
 
 
 def _start(shaft: Shaft, modes: int) -> _Brackets:
-    beta = Scales.of(shaft).beta
-    lanes = shaft.lanes
+    lanes, massive = shaft.lanes, shaft.rhoA > 0
+    total = jnp.sum(jnp.where(massive, Scales.of(shaft).beta, 0.0), axis=0)
+    # NaN where rhoA is NaN: such a lane has no bracket.
+    total = total + 0.0 * jnp.sum(shaft.rhoA, axis=0)
     index = jnp.arange(1, modes + 1).reshape(modes, *(1,) * len(lanes))
-    high = math.pi * (index + _CLAMPED_DEFICIT * shaft.segments) / jnp.sum(beta, axis=0)
-    high = jnp.broadcast_to(high, (modes, *lanes))
+    high = math.pi * (index + _CLAMPED_DEFICIT * shaft.segments) / jnp.where(total == 0, 1.0, total)
+    high = jnp.where(total == 0, highest_frequency(shaft), high)
+    high = jnp.where(is_undefined(shaft), jnp.nan, jnp.broadcast_to(high, (modes, *lanes)))
     zero = jnp.zeros_like(high)
     return _Brackets(zero, high, zero - 1, zero + jnp.inf, zero, zero, zero + 1 / _NEAR, zero > 0, zero, zero)
 
@@ -118,8 +128,9 @@ def _step(shaft: Shaft, index: Array, b: _Brackets) -> _Brackets:
 def _search(shaft: Shaft, modes: int) -> _Brackets:
     brackets = _start(shaft, modes)
     index = jnp.arange(1, modes + 1).reshape(modes, *(1,) * (brackets.high.ndim - 1))
-    # Zero modes are known; their brackets are closed from the start. So are those of lanes that are not finite.
-    known = (index <= zero_modes(shaft)) | ~jnp.isfinite(brackets.high)
+    # Zero modes are known; their brackets are closed from the start. So are those of lanes that are not finite, and of
+    # modes that a shaft without mass in segments does not have.
+    known = (index <= zero_modes(shaft)) | (index > number_of_modes(shaft)) | ~jnp.isfinite(brackets.high)
     brackets = brackets._replace(low=jnp.where(known, brackets.high, brackets.low))
 
     room = int(_FEW * brackets.high.size)
@@ -167,13 +178,13 @@ def find_roots(shaft: Shaft, modes: int) -> Roots:
     :func:`frequency_derivatives`."""
     brackets = _search(shaft, modes)
     index = jnp.arange(1, modes + 1).reshape(modes, *(1,) * (brackets.high.ndim - 1))
-    zero = (index <= zero_modes(shaft)) & jnp.isfinite(brackets.high)
-    certified = (
-        _closed(brackets) & (brackets.low > 0) & (brackets.count_low >= 0) & jnp.isfinite(brackets.high)
-    ) | zero
+    finite = jnp.isfinite(brackets.high)
+    zero, absent = (index <= zero_modes(shaft)) & finite, (index > number_of_modes(shaft)) & finite
+    certified = (_closed(brackets) & (brackets.low > 0) & (brackets.count_low >= 0) & finite) | zero | absent
     q = jnp.where(zero, 0.0, 0.5 * (brackets.low + brackets.high))
     width = jnp.where(zero, 0.0, 2 * (brackets.high - brackets.low) / brackets.high)
-    return Roots(jnp.where(certified, q, jnp.nan), width, certified)
+    q = jnp.where(absent, jnp.inf, jnp.where(certified, q, jnp.nan))
+    return Roots(q, jnp.where(absent, 0.0, width), certified)
 
 
 def frequency_derivatives(build: Callable[[Any], Shaft], parameters: Any, q: Array) -> Array:
@@ -182,9 +193,10 @@ def frequency_derivatives(build: Callable[[Any], Shaft], parameters: Any, q: Arr
     With Psi, the closed form of the characteristic function, ``dp = -(dPsi/dparameter) / (dPsi/dp)``: one evaluation for
     each parameter, whatever the number of steps that found p: the energy formulas of docs/theory/bicardan.md, (12).
     A zero mode has the derivative 0, but none by the stiffness of a spring that could hold it, where p grows as sqrt(k). A
-    multiple frequency has none (NaN); beside another one at the relative distance d the error is of the order of eps/d.
+    multiple frequency and an infinite one have none (NaN); beside another one at the relative distance d the error is of the
+    order of eps/d.
     """
-    shaft, moving = build(parameters), q > 0
+    shaft, moving = build(parameters), (q > 0) & jnp.isfinite(q)
     safe = jnp.where(moving, q, 1.0)
     psi, along_q = jax.jvp(lambda x: pairings(shaft, x), (safe,), (jnp.ones_like(safe),))
     along = stacked(jax.jacfwd(lambda p: pairings(build(p), safe))(parameters))
@@ -193,23 +205,24 @@ def frequency_derivatives(build: Callable[[Any], Shaft], parameters: Any, q: Arr
     along_q, along = (
         jnp.take_along_axis(x, i, axis=0)[0] for x, i in ((along_q, section), (along, section[..., None]))
     )
-    slope = jnp.where(_multiple(shaft, q)[:, None], jnp.nan, -2 * q[:, None] * along / along_q[:, None])
+    none = _multiple(shaft, q) | ~jnp.isfinite(q)
+    slope = jnp.where(none[:, None], jnp.nan, -2 * safe[:, None] * along / along_q[:, None])
 
     def missing(parameters: Any) -> Array:
         """Stiffness of all springs and hinges that are not there."""
         springs = build(parameters)
-        present = [x for x in (springs.k, springs.k_hinge) if x is not None]
+        present = [x for x in (springs.k, springs.k_hinge, springs.k_rot) if x is not None]
         return jnp.concatenate([jnp.where(x == 0, x, 0.0) for x in present])
 
     held = jnp.any(stacked(jax.jacfwd(missing)(parameters)) != 0, axis=0)
-    return jnp.where(jnp.isnan(q) | moving, slope.T, jnp.where(held[:, None], jnp.nan, 0.0)).T
+    return jnp.where(q == 0, jnp.where(held[:, None], jnp.nan, 0.0), slope.T).T
 
 
 def _multiple(shaft: Shaft, q: Array) -> Array:
     """Flags of the frequencies that agree with a neighbour to rounding, including the one after the last."""
     near = q[1:] - q[:-1] <= _MULTIPLE * q[1:]
     none = jnp.zeros_like(q[:1], bool)
-    above = jnp.where(q[-1:] > 0, q[-1:] * (1 + _MULTIPLE), 1.0)
+    above = jnp.where((q[-1:] > 0) & jnp.isfinite(q[-1:]), q[-1:] * (1 + _MULTIPLE), 1.0)
     beyond = (q[-1:] > 0) & (characteristic(shaft, above).count > len(q))  # pyright: ignore[reportOptionalOperand]
     return jnp.concatenate([none, near]) | jnp.concatenate([near, beyond])
 
@@ -220,7 +233,8 @@ def relative_error(shaft: Shaft, roots: Roots) -> Array:
     The same equations run from D to A round differently: how far their zero lies away shows the rounding of both. Added
     to it are the width of the bracket and the rounding of p itself.
     """
-    safe = jnp.where(roots.q > 0, roots.q, 1.0)
+    elastic = (roots.q > 0) & jnp.isfinite(roots.q)
+    safe = jnp.where(elastic, roots.q, 1.0)
     mirrored = shaft.mirrored()
     value, slope = jax.jvp(lambda q: pairings(mirrored, q), (safe,), (jnp.ones_like(safe),))
     shifts = jnp.abs(value / (slope * safe))
@@ -229,4 +243,4 @@ def relative_error(shaft: Shaft, roots: Roots) -> Array:
     shift = jnp.where(shifts[-1] < _ZERO, shifts[-1], jnp.min(shifts, axis=0))
     # In a cluster Psi is flat, and its zero is inaccurate: use only the bracket.
     shift = jnp.where(jnp.isfinite(shift), jnp.minimum(shift, 1.0), 0.0)
-    return jnp.where(roots.q > 0, 2 * shift + roots.width + 2 * np.finfo(float).eps, 0.0)
+    return jnp.where(elastic, 2 * shift + roots.width + 2 * np.finfo(float).eps, 0.0)

@@ -15,9 +15,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax.analysis.critical_speeds.compound import Scales, characteristic
+from drivetrain_jax.analysis.critical_speeds.compound import characteristic
 from drivetrain_jax.analysis.critical_speeds.frequency_roots import Roots
 from drivetrain_jax.analysis.critical_speeds.mechanisms import zero_modes
+from drivetrain_jax.analysis.critical_speeds.segments import Scales
 from drivetrain_jax.systems import Shaft
 from drivetrain_jax.systems.trigonometry import sincos
 

@@ -1,10 +1,13 @@
 """Motions of a shaft that cost no energy: how many there are, and their shapes.
 
-They exist where springs or rotational stiffness are missing altogether, and have the exact frequency 0, whatever the
-other parameters. They are combinations of ``1``, ``x`` and, for each joint that is a hinge, ``max(0, x - x_joint)``.
+They exist where springs or rotational stiffness are missing altogether, and have the exact frequency 0 if they move
+mass, whatever the other parameters. They are combinations of ``1``, ``x`` and, for each joint that is a hinge,
+``max(0, x - x_joint)``.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -16,29 +19,124 @@ from drivetrain_jax.systems import Shaft
 _NOTHING = 1e-9
 
 
-def zero_modes(shaft: Shaft) -> Array:
-    """Number of mechanisms (modes of frequency 0), shape of the lanes, from the missing springs and hinges.
+class _Held(NamedTuple):
+    """Flags of the nodes at which a motion is held: the deflection, the rotation in front of the joint and behind it."""
 
-    From left to right the motions (f, theta) without energy form the plane, a line or nothing. A support removes the
-    motions with f != 0. A line with f = 0 is a rotation about this section. A hinge without stiffness frees theta, and a
-    rotation that ends there is a separate mode.
+    deflection: Array
+    before: Array
+    behind: Array
+
+
+def zero_modes(shaft: Shaft) -> Array:
+    """Number of mechanisms (modes of frequency 0), shape of the lanes, from the missing springs and hinges."""
+    held = shaft.k > 0
+    turning = jnp.zeros_like(held) if shaft.k_rot is None else shaft.k_rot > 0
+    return _free_motions(shaft, _Held(held, turning, turning))
+
+
+def is_undefined(shaft: Shaft) -> Array:
+    """True if a mechanism moves no mass, or a segment has rotary inertia without mass: no frequency is defined then.
+
+    Such a mechanism remains where everything that has mass is held. Shape of the lanes.
+    """
+    massive = shaft.rhoA > 0
+    none = jnp.zeros_like(massive[:1])
+    deflection = jnp.concatenate([massive, none]) | jnp.concatenate([none, massive]) | (shaft.k > 0)
+    turning = jnp.zeros_like(deflection) if shaft.k_rot is None else shaft.k_rot > 0
+    if shaft.m is not None:
+        deflection = deflection | (shaft.m > 0)
+    if shaft.inertia is not None:
+        turning = turning | (shaft.inertia > 0)
+    weightless = _free_motions(shaft, _Held(deflection, turning, turning)) > 0
+    return weightless if shaft.rhoI is None else weightless | jnp.any(~massive & (shaft.rhoI > 0), axis=0)
+
+
+def _free_motions(shaft: Shaft, held: _Held) -> Array:
+    """Number of motions that cost no energy.
+
+    From left to right the motions (f, theta) without energy form the plane, a line or nothing. A line with f = 0 is a
+    rotation about this section (``turning``), one with theta = 0 a translation (``sliding``). What holds f or theta
+    reduces the plane to such a line, and removes every line but the one that has none of it. A hinge without stiffness
+    frees theta, and a rotation that ends there is a separate mode.
     """
     lanes = shaft.lanes
-    dimension, turning, found = jnp.full(lanes, 2), jnp.zeros(lanes, bool), jnp.zeros(lanes, int)
+    dimension, found = jnp.full(lanes, 2), jnp.zeros(lanes, int)
+    turning = sliding = jnp.zeros(lanes, bool)
+
+    def hold(flag: Array, dimension: Array, own: Array, other: Array) -> tuple[Array, Array, Array]:
+        moved = flag & ~(own & (dimension == 1))
+        own = jnp.where(moved, dimension == 2, own)
+        return jnp.where(moved, jnp.maximum(dimension - 1, 0), dimension), own, other & ~moved
+
     for node in range(shaft.segments + 1):
+        dimension, sliding, turning = hold(held.before[node], dimension, sliding, turning)
         if shaft.k_hinge is not None and 0 < node < shaft.segments:
             free = shaft.k_hinge[node - 1] == 0
             found = found + (free & ((dimension == 2) | turning))
-            line = free & (dimension == 1) & ~turning
-            turning = jnp.where(free & (dimension == 0), True, turning)
-            dimension = jnp.where(line, 2, jnp.where(free & (dimension == 0), 1, dimension))
-        held = shaft.k[node] > 0
-        moved = held & ~turning
-        turning = jnp.where(moved & (dimension == 2), True, turning)
-        dimension = jnp.where(moved, jnp.maximum(dimension - 1, 0), dimension)
+            dimension = jnp.where(free & ~turning, jnp.minimum(dimension + 1, 2), dimension)
+            turning, sliding = turning | (free & (dimension == 1)), sliding & ~free
+        dimension, sliding, turning = hold(held.behind[node], dimension, sliding, turning)
+        dimension, turning, sliding = hold(held.deflection[node], dimension, turning, sliding)
         if node < shaft.segments:
             turning = jnp.zeros_like(turning)
     return found + dimension
+
+
+def number_of_modes(shaft: Shaft) -> Array:
+    """Number of natural frequencies, zero modes included, shape of the lanes: infinite if a segment has mass."""
+    moving = _moving(shaft)
+    count = jnp.sum(moving.deflection, axis=0) + jnp.sum(moving.before, axis=0) + jnp.sum(moving.behind, axis=0)
+    return jnp.where(jnp.any(shaft.rhoA > 0, axis=0), jnp.inf, count)
+
+
+def _moving(shaft: Shaft) -> _Held:
+    """Flags of the motions of the nodes that have a mass of their own; the whole inertia of a rigid joint is behind it."""
+    none = jnp.zeros(shaft.k.shape, bool)
+    deflection = none if shaft.m is None else (shaft.m > 0) & jnp.isfinite(shaft.k)
+    if shaft.inertia is None:
+        return _Held(deflection, none, none)
+    behind = shaft.inertia > 0
+    if shaft.k_rot is not None:
+        behind = behind & jnp.isfinite(shaft.k_rot)
+    if shaft.k_hinge is None:
+        return _Held(deflection, none, behind)
+    edge = jnp.zeros((1, *shaft.k_hinge.shape[1:]), bool)
+    elastic = jnp.concatenate([edge, jnp.isfinite(shaft.k_hinge), edge])
+    return _Held(deflection, behind & elastic, behind)
+
+
+def highest_frequency(shaft: Shaft) -> Array:
+    """A bound of ``q = sqrt(p)`` of all frequencies of a shaft whose segments have no mass, shape of the lanes.
+
+    No eigenvalue p^2 exceeds the sum of stiffness over mass of the motions of single nodes with mass.
+    """
+    shear, bend = 12 * shaft.EI / shaft.length**3, 4 * shaft.EI / shaft.length
+    none = jnp.zeros_like(shear[:1])
+
+    def at_nodes(x: Array) -> Array:
+        return jnp.concatenate([x, none]) + jnp.concatenate([none, x])
+
+    total = jnp.zeros(shaft.lanes)
+    if shaft.m is not None:
+        total = total + jnp.sum(_ratio(at_nodes(shear) + _finite(shaft.k), shaft.m), axis=0)
+    if shaft.inertia is not None:
+        turned = at_nodes(bend)
+        if shaft.k_rot is not None:
+            turned = turned + _finite(shaft.k_rot)
+        if shaft.k_hinge is not None:
+            edge = jnp.zeros_like(shaft.k_hinge[:1])
+            turned = turned + 2 * jnp.concatenate([edge, _finite(shaft.k_hinge), edge])
+        # Half of the inertia is on each side of a joint.
+        total = total + jnp.sum(_ratio(2 * turned, shaft.inertia), axis=0)
+    return 2 * jnp.sqrt(jnp.sqrt(total))
+
+
+def _finite(stiffness: Array) -> Array:
+    return jnp.where(jnp.isinf(stiffness), 0.0, stiffness)
+
+
+def _ratio(stiffness: Array, mass: Array) -> Array:
+    return jnp.where(mass > 0, stiffness / jnp.where(mass > 0, mass, 1.0), 0.0)
 
 
 def mechanism_shapes(shaft: Shaft, x: Array) -> Array:
@@ -53,7 +151,7 @@ def mechanism_shapes(shaft: Shaft, x: Array) -> Array:
     ends = ends / ends[-1]
     at_ends = _motions(shaft, ends, ends)
     combination = _unrestrained(shaft, at_ends)
-    mass = _masses(shaft, at_ends, _motions(shaft, (ends[1:] + ends[:-1]) / 2, ends))
+    mass = _masses(shaft, at_ends, ends)
     columns, found = [], []
     for k in range(combination.shape[1]):
         vector = combination[:, k]
@@ -79,35 +177,56 @@ def _motions(shaft: Shaft, x: Array, ends: Array) -> Array:
 
 
 def _unrestrained(shaft: Shaft, at_ends: Array) -> Array:
-    """Combinations of the motions without deflection at the supports, as columns; those used up are 0."""
+    """Combinations of the motions that no support and no rotational spring holds, as columns; those used up are 0."""
     count, lanes = at_ends.shape[1], at_ends.shape[2:]
     unit = jnp.eye(count).reshape(count, count, *(1,) * len(lanes))
     used = jnp.any(at_ends != 0, axis=0)
     columns = unit * jnp.where(used, 1.0, 0.0)
     for node in range(len(at_ends)):
-        deflection = sum(at_ends[node, i] * columns[i] for i in range(count))
-        largest = jnp.argmax(jnp.abs(deflection), axis=0)[None]
-        pivot = jnp.take_along_axis(deflection, largest, axis=0)
-        taken = jnp.take_along_axis(columns, largest[None], axis=1)
-        held = (shaft.k[node] > 0) & (jnp.abs(pivot) > _NOTHING)
-        reduced = columns - taken * (deflection / jnp.where(held, pivot, 1.0))[None]
-        chosen = jnp.arange(count).reshape(count, *(1,) * len(lanes)) == largest
-        columns = jnp.where(held[None], jnp.where(chosen[None], 0.0, reduced), columns)
+        columns = _without(columns, at_ends[node], shaft.k[node] > 0)
+    if shaft.k_rot is not None:
+        # Slopes over the whole length of the shaft are of order one.
+        part = shaft.length / jnp.sum(shaft.length, axis=0)
+        for node, (left, right), span in ((0, (0, 1), 0), (-1, (-2, -1), -1)):
+            slope = (at_ends[right] - at_ends[left]) / part[span]
+            columns = _without(columns, slope, shaft.k_rot[node] > 0)
     return columns
 
 
-def _masses(shaft: Shaft, at_ends: Array, at_middles: Array) -> Array:
+def _without(columns: Array, row: Array, held: Array) -> Array:
+    """The combinations ``columns`` of motions for which ``row @ columns`` is 0, if ``held``; the one used up is 0."""
+    count, lanes = columns.shape[0], columns.shape[2:]
+    value = sum(row[i] * columns[i] for i in range(count))
+    largest = jnp.argmax(jnp.abs(value), axis=0)[None]
+    pivot = jnp.take_along_axis(value, largest, axis=0)
+    taken = jnp.take_along_axis(columns, largest[None], axis=1)
+    held = held & (jnp.abs(pivot) > _NOTHING)
+    reduced = columns - taken * (value / jnp.where(held, pivot, 1.0))[None]
+    chosen = jnp.arange(count).reshape(count, *(1,) * len(lanes)) == largest
+    return jnp.where(held[None], jnp.where(chosen[None], 0.0, reduced), columns)
+
+
+def _masses(shaft: Shaft, at_ends: Array, ends: Array) -> Array:
     """Mass matrix of the motions (Simpson's rule, exact for their products), shape ``(motions, motions, *lanes)``."""
 
     def squares(rows: Array) -> Array:
         return rows[:, :, None] * rows[:, None]
 
+    at_middles = _motions(shaft, (ends[1:] + ends[:-1]) / 2, ends)
     weight = (shaft.rhoA * shaft.length)[:, None, None] / 6
     total = weight * (squares(at_ends[1:]) + 4 * squares(at_middles) + squares(at_ends[:-1]))
     mass = jnp.sum(total, axis=0)
     if shaft.m is not None:
         mass = mass + jnp.sum(shaft.m[:, None, None] * squares(at_ends), axis=0)
-    return mass
+    if shaft.rhoI is None and shaft.inertia is None:
+        return mass
+    # The slope is one in a segment; half of the inertia at a joint turns with the segment on each side.
+    rotary = jnp.zeros_like(shaft.length) if shaft.rhoI is None else shaft.rhoI * shaft.length
+    if shaft.inertia is not None:
+        joints = 0.5 * shaft.inertia[1:-1]
+        rotary = rotary + jnp.concatenate([shaft.inertia[:1], joints]) + jnp.concatenate([joints, shaft.inertia[-1:]])
+    slope = (at_ends[1:] - at_ends[:-1]) / shaft.length[:, None]
+    return mass + jnp.sum(rotary[:, None, None] * squares(slope), axis=0)
 
 
 def _product(a: Array, mass: Array, b: Array) -> Array:

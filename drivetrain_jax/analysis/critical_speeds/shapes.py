@@ -10,6 +10,7 @@ also where the product has lost a part that hardly moves, or is at rest.
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -18,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.critical_speeds.compound import Scales, between, hinge_shares, planes, support_shares
+from drivetrain_jax.analysis.critical_speeds.compound import hinge_shares, planes, rotation_shares, support_shares
+from drivetrain_jax.analysis.critical_speeds.segments import Scales, between, split_inertia
 from drivetrain_jax.analysis.critical_speeds.waves import Plane, Waves, even_and_odd
 from drivetrain_jax.analysis.numerics.linear_algebra import matmul
 from drivetrain_jax.systems import Shaft
@@ -71,7 +73,8 @@ class _Segments(NamedTuple):
 
     With the rotation ``(cosine, sine)`` the state falls into two pairs with ``alpha' = beta``, ``beta' = r^2 alpha``:
     ``alpha = sine F - cosine theta``, ``beta = sine f - cosine M`` with ``r^2 = -trigonometric2``, and ``alpha = sine
-    theta + cosine F``, ``beta = cosine f + sine M`` with ``r^2 = hyperbolic2``. ``z`` is the phase of a whole segment.
+    theta + cosine F``, ``beta = cosine f + sine M`` with ``r^2 = hyperbolic2``. ``z`` is the phase of a whole segment. A
+    segment without mass (``massless``) has no waves: its deflection is a cubic, with the ``shear`` number.
     """
 
     z: Array
@@ -79,6 +82,8 @@ class _Segments(NamedTuple):
     sine: Array
     trigonometric2: Array
     hyperbolic2: Array
+    shear: Array
+    massless: Array
 
     @classmethod
     def of(cls, shaft: Shaft, q: Array) -> _Segments:
@@ -87,13 +92,15 @@ class _Segments(NamedTuple):
         square = (q * scales.b[:, None]) ** 2
         none = jnp.zeros_like(square)
         s = none if shaft.kGA is None else square * (shaft.EI / shaft.kGA)[:, None]
-        t = none if shaft.rhoI is None else square * (shaft.rhoI / shaft.rhoA)[:, None]
+        massless = shaft.rhoA == 0
+        t = none if shaft.rhoI is None else square * (shaft.rhoI / jnp.where(massless, 1.0, shaft.rhoA))[:, None]
         half = (s - t) / 2
         root = jnp.sqrt(half * half + 1)
         ratio = jnp.where(half > 0, half + root, 1 / (root - half))
         size = jnp.sqrt(1 + ratio * ratio)
         waves = Waves.of(s, t)
-        return cls(q * scales.beta[:, None], 1 / size, ratio / size, waves.trigonometric2, waves.hyperbolic2)
+        z, pair = q * scales.beta[:, None], (waves.trigonometric2, waves.hyperbolic2)
+        return cls(z, 1 / size, ratio / size, *pair, s, massless[:, None])
 
     def split(self, v: Array) -> tuple[Array, Array, Array, Array]:
         """alpha and beta of the trigonometric and of the hyperbolic pair."""
@@ -110,6 +117,11 @@ class _Segments(NamedTuple):
     def long(self) -> Array:
         """True if the hyperbolic pair is treated as a falling and a rising wave."""
         return self.number * self.z > 1
+
+    def cubic(self, xi: Array) -> tuple[Array, Array, Array, Array]:
+        """Deflection at the phase ``xi`` of a segment without mass, as a form of the state in front of it."""
+        half = 0.5 * xi * xi
+        return jnp.ones_like(half), xi, half, xi * (half / 3 - self.shear)
 
 
 class _Links(NamedTuple):
@@ -148,13 +160,27 @@ def _along_segments(w: _Segments) -> _Links:
         jnp.where(long, falling, unit * alpha_h),
         unit * jnp.where(long, rising, beta_h / size),
     )
-    return _Links(jnp.stack(before, axis=1), jnp.stack(behind, axis=1))
+    waves = _Links(jnp.stack(before, axis=1), jnp.stack(behind, axis=1))
+    return jax.tree.map(partial(jnp.where, w.massless[:, None]), _without_mass(w), waves)
+
+
+def _without_mass(w: _Segments) -> _Links:
+    """The four components of the state behind a segment without mass, each over the sum of its coefficients."""
+    one, o = jnp.ones_like(w.z), jnp.zeros_like(w.z)
+    deflection = w.cubic(w.z)
+    rows = (deflection, (o, one, w.z, deflection[2]), (o, o, one, w.z), (o, o, o, one))
+    size = jnp.stack([sum(jnp.abs(x) for x in row) for row in rows], axis=1)
+    before = jnp.stack([jnp.concatenate(row, axis=1) for row in rows], axis=1)
+    own = jnp.eye(4).reshape(1, 4, 4, *(1,) * (w.z.ndim - 2))
+    return _Links(before / size, own / size)
 
 
 def _across_joints(shaft: Shaft, q: Array) -> _Links:
-    """Across the joint and the support in front of every segment; in front of the first one anything.
+    """Across the joint, its inertias and the support in front of every segment; in front of the first one anything.
 
-    ``f`` and ``M`` pass, ``theta + M/k_hinge`` and ``F - k f`` become theta and F, each times what keeps it finite.
+    ``f`` passes. ``theta + M/k_hinge`` and ``F - k f`` become theta and F. The moment within the joint is ``M + kappa
+    theta`` in front and ``M - kappa theta`` behind it (kappa: that of the rotary inertia there). Each is multiplied by what
+    keeps it finite.
     """
     scales = Scales.of(shaft)
 
@@ -164,26 +190,33 @@ def _across_joints(shaft: Shaft, q: Array) -> _Links:
     def joints(x: Array) -> Array:
         return jnp.concatenate([x[:1], x])[:, None]
 
-    b, e1, e2, e3 = (joints(between(x)) if shaft.segments > 1 else x[:, None] for x in scales[1:])
+    b, e1, e2, e3 = (joints(between(x)) if shaft.segments > 1 else x[:, None] for x in scales[1:5])
     masses = None if shaft.m is None else shaft.m[:-1, None]
     keep, reaction = support_shares(shaft.k[:-1, None], masses, e3, q)
     hold, turn = (
         (1.0, 0.0) if shaft.k_hinge is None or shaft.segments == 1 else hinge_shares(joints(shaft.k_hinge), e1, q)
     )
+    inertias = (None if x is None else x[: shaft.segments, None] for x in split_inertia(shaft))
+    (pass_1, kappa_1), (pass_2, kappa_2) = (
+        (1.0, 0.0) if x is None else rotation_shares(None, x, e1, q) for x in inertias
+    )
 
-    def forms(theta: Array, moment: Array, force: Array, turn: Any, reaction: Any) -> Array:
-        theta, moment, force = theta[:, None] / b, moment[:, None] / e2, force[:, None] / e3
+    def forms(units: tuple[Array, ...], turn: Any, hold: Any, kappa: Any, reaction: Any) -> Array:
+        theta, moment, force = (unit[:, None] for unit in units)
         rows = (
             (1.0, 0.0, 0.0, 0.0),
-            (0.0, hold * theta, turn * e2 / b * moment, 0.0),
-            (0.0, 0.0, moment, 0.0),
-            (-reaction / e3, 0.0, 0.0, keep * force),
+            (0.0, hold * (theta / b), turn * e2 / b * (moment / e2), 0.0),
+            (0.0, kappa * theta / e2, pass_1 * pass_2 * (moment / e2), 0.0),
+            (-reaction / e3, 0.0, 0.0, keep * (force / e3)),
         )
         entries = jnp.broadcast_arrays(*(jnp.asarray(x, float) for row in rows for x in row), keep)
         return jnp.stack(entries[:-1], axis=1).reshape(len(keep), 4, 4, *keep.shape[1:])
 
     units = scales.b, scales.e2, scales.e3
-    return _Links(forms(*(last(x) for x in units), turn, reaction), forms(*units, 0.0, 0.0))  # pyright: ignore[reportCallIssue]
+    before = forms(
+        tuple(last(x) for x in units), turn * pass_1, hold * pass_1 + turn * kappa_1, pass_2 * kappa_1, reaction
+    )
+    return _Links(before, forms(units, 0.0, hold * pass_1, -pass_1 * kappa_2, 0.0))
 
 
 def _next_state(plane: Array, link: _Links, state: Array) -> Array:
@@ -257,7 +290,8 @@ def _deflection(w: _Segments, front: Array, behind: Array, xi: Array) -> Array:
     rising = 0.5 * (beta_end + mu * alpha_end) * jnp.exp(-mu * (w.z - xi))
     ch, sh, growth = even_and_odd(w.hyperbolic2, jnp.where(long, 0.0, xi))
     short = (beta_h * ch + w.hyperbolic2 * alpha_h * sh) * jnp.exp(growth)
-    return w.sine * trigonometric + w.cosine * jnp.where(long, falling + rising, short)
+    waves = w.sine * trigonometric + w.cosine * jnp.where(long, falling + rising, short)
+    return jnp.where(w.massless, sum(a * v for a, v in zip(w.cubic(xi), front, strict=True)), waves)
 
 
 def mode_shapes(shaft: Shaft, q: Array, x: Array) -> Array:
