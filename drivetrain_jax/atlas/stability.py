@@ -62,7 +62,7 @@ class StabilityAtlas:
         Points that no panel covers are NaN, undecided, and have the outcome ``LOST``: solve them directly.
         """
         points = np.atleast_2d(np.asarray(points, float))
-        if not (self._closed_form and _FAST.issuperset(outputs) and self.atlas.panels):
+        if not (self.closed_form and _FAST.issuperset(outputs) and self.atlas.panels):
             return self.by_eigenvalues(points, outputs)
         x, found = self.atlas.to_coordinates(points), self.blank((len(points),), outputs)
         kernel = point_kernel(self.build, self._may_be_undamped(points.T), len(points) <= LANES)
@@ -132,7 +132,7 @@ class StabilityAtlas:
         axes = [np.asarray(axis, float) for axis in axes]
         shape = tuple(len(axis) for axis in axes)
         found = self._empty(shape, outputs) if out is None else dict(out)
-        if self._closed_form and _FAST.issuperset(outputs) and len(axes) > 1:
+        if self.closed_form and _FAST.issuperset(outputs) and len(axes) > 1:
             self._tile(found, axes, rows)
             return found
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
@@ -158,7 +158,7 @@ class StabilityAtlas:
     @property
     def _multipliers(self) -> int:
         # The shape of the panels gives the number without building the form.
-        return round(self.atlas.panels[0].coefficients.shape[-1] ** 0.5) if self.atlas.panels else self._form.size
+        return round(self.atlas.panels[0].coefficients.shape[-1] ** 0.5) if self.atlas.panels else self.form.size
 
     @cached_property
     def _expansion(self) -> Expansion:
@@ -171,13 +171,15 @@ class StabilityAtlas:
         return [jnp.asarray(evaluation.padded_tensor(panel, degrees)) for panel in self.atlas.panels]
 
     @cached_property
-    def _form(self) -> LinearPeriodic:
+    def form(self) -> LinearPeriodic:
+        """The reduced form in the middle of the domain."""
         middle = dict(zip(self.atlas.parameters, (self.atlas.lower + self.atlas.upper) / 2, strict=True))
         return self.build({**self.atlas.fixed, **middle}).reduced
 
     @cached_property
-    def _closed_form(self) -> bool:
-        return self._form.exchanges_halves and self._form.log_determinant is not None
+    def closed_form(self) -> bool:
+        """True if cells are decided by the closed form of four states with a reversor."""
+        return self.form.exchanges_halves and self.form.log_determinant is not None
 
     def _fill(self, found: dict[str, np.ndarray], axes: list[np.ndarray], rows: int | None) -> None:
         """Fill ``found`` tile by tile, then compute cells again for which the closed form is not accurate enough."""
@@ -218,7 +220,7 @@ class StabilityAtlas:
         """Results of lanes ``phi`` ``(m, N)``, of which the first are those of ``points``."""
         columns = np.pad(points, ((0, phi.shape[1] - len(points)), (0, 0)), mode="edge")
         values = {name: columns[:, k] for k, name in enumerate(self.atlas.parameters)}
-        kernel = _point_kernel(self.build, outputs, self.rtol, self._closed_form)
+        kernel = _point_kernel(self.build, outputs, self.rtol, self.closed_form)
         with _JUDGING:
             found = kernel(phi, charts.errors_of(self.atlas.panels[number]), values, self.atlas.fixed)
         return {name: np.moveaxis(np.asarray(value), -1, 0) for name, value in found.items()}

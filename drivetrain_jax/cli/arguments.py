@@ -186,6 +186,14 @@ def _add_design(subparsers: Any) -> None:
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
 
+def _add_explore(subparsers: Any) -> None:
+    command = _command(
+        subparsers, "explore", commands.explore, "write a page that evaluates a stored atlas in a browser"
+    )
+    command.add_argument("file", metavar="ATLAS.nc", type=_path, help='result of a scene with analysis = "atlas"')
+    command.add_argument("--out", required=True, metavar="PAGE.html", type=_path, help="page to write (.html)")
+
+
 def _add_bench(subparsers: Any) -> None:
     command = _command(
         subparsers, "bench", commands.bench, "measure error and run time, compared with peers (source checkout only)"
@@ -209,6 +217,7 @@ _COMMANDS = (
     _add_point,
     _add_query,
     _add_design,
+    _add_explore,
     _add_bench,
 )
 

@@ -18,6 +18,7 @@ from drivetrain_jax.cli.signals import stop_on_signals
 from drivetrain_jax.cli.values import assignments, ranges
 
 _FIGURES = (".png", ".pdf", ".svg")
+_PAGES = (".html", ".htm")
 
 
 def list_systems(options: argparse.Namespace) -> int:
@@ -116,7 +117,7 @@ def export(options: argparse.Namespace) -> int:
         if options.file:
             raise InputError(f"FILE.nc = {str(options.file)!r}: not used with --csv; allowed is --csv TABLE.csv")
         out = Path(options.csv or options.store.with_suffix(".csv"))
-        _check_out(out, (".csv",))
+        _check_place(out, (".csv",))
         sys.stderr.write(f"points: {write_csv(options.store, out)} exported\n")
         return OK
     if options.file is None:
@@ -131,7 +132,7 @@ def plot(options: argparse.Namespace) -> int:
     """Draw the figure of one result, or of several results together."""
     from drivetrain_jax.datasets.figure import plot
 
-    _check_out(options.out, _FIGURES)
+    _check_place(options.out, _FIGURES)
     part = ranges(options.part, "--part") or None
     try:
         figure = plot(options.files, part=part, cells=options.cells)
@@ -148,14 +149,24 @@ def plot(options: argparse.Namespace) -> int:
 
 def report(options: argparse.Namespace) -> int:
     """Write one HTML file about results."""
-    _check_out(options.out, (".html",))
+    _check_place(options.out, _PAGES)
     from drivetrain_jax.report import report
 
     _write(options.out, report(options.files, options.title).encode())
     return OK
 
 
-def _check_out(out: Path, endings: tuple[str, ...]) -> None:
+def explore(options: argparse.Namespace) -> int:
+    """Write the explorer's page of an atlas."""
+    from drivetrain_jax.runs.atlas_file import open_atlas
+
+    _check_place(options.out, _PAGES)
+    _write(options.out, open_atlas(options.file).explore().text.encode())
+    return OK
+
+
+def _check_place(out: Path, endings: tuple[str, ...]) -> None:
+    """Raise :class:`InputError` for a file that could not be written, before anything is computed."""
     if not out.parent.is_dir():
         raise InputError(f"out = {str(out)!r}: the folder does not exist; allowed is a file in an existing folder")
     if out.suffix.lower() not in endings:

@@ -16,8 +16,10 @@ from drivetrain_jax._errors import InputError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from drivetrain_jax.explore import Page
     from drivetrain_jax.invariants.verify import Report
     from drivetrain_jax.runs.atlas_answers import Reply
+    from drivetrain_jax.runs.atlas_file import StoredAtlas
 
 
 class DrivetrainAccessor:
@@ -53,14 +55,17 @@ class DrivetrainAccessor:
         Raises: InputError for a result on a grid, and for values outside the atlas.
         """
         from drivetrain_jax.runs.atlas_answers import query
-        from drivetrain_jax.runs.atlas_file import open_atlas
 
-        if self._analysis() == "atlas":
-            return query(open_atlas(self._dataset), values)
-        file = self._file()
-        if file is None or self._dataset.attrs.get("method") != "atlas":
-            raise InputError("query: the result holds values on a grid; allowed for an atlas, opened from its file")
-        return query(open_atlas(file), values)
+        return query(self._atlas("query"), values)
+
+    def explore(self) -> Page:
+        """The explorer of an atlas: an HTML page that evaluates it in the browser, which a notebook shows.
+
+        Returns: the page; ``text`` is its HTML, one file that loads nothing.
+
+        Raises: InputError for a result on a grid.
+        """
+        return self._atlas("explore").explore()
 
     def resonances(self) -> xr.DataArray:
         """The resonances that the system predicts along an axis of the result, such as ``resonance_Omega``, with labels.
@@ -105,6 +110,17 @@ class DrivetrainAccessor:
         if analysis is None:
             raise InputError("dataset: has no attribute 'analysis'; allowed is a result of drivetrain_jax")
         return analysis
+
+    def _atlas(self, method: str) -> StoredAtlas:
+        """The atlas that this dataset holds or is drawn from; ``method`` asks for it."""
+        from drivetrain_jax.runs.atlas_file import open_atlas
+
+        if self._analysis() == "atlas":
+            return open_atlas(self._dataset)
+        file = self._file()
+        if file is None or self._dataset.attrs.get("method") != "atlas":
+            raise InputError(f"{method}: the result holds values on a grid; allowed for an atlas, opened from its file")
+        return open_atlas(file)
 
     def _file(self) -> Path | None:
         """The file that the dataset was opened from, if it is still there."""

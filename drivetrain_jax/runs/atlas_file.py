@@ -33,6 +33,8 @@ from drivetrain_jax.store.schema import Entry, Labelled
 if TYPE_CHECKING:
     import xarray as xr
 
+    from drivetrain_jax.explore import Page
+
 # Variables of the file: name, dimensions, meaning. Boxes are in the coordinates named by the attribute.
 _VARIABLES = {
     "lower": (("parameter",), "lower end of the domain, in the parameter's unit"),
@@ -241,6 +243,17 @@ class StoredAtlas:
         part = self.slice(fixed)
         scalars = {name: ((), value, self.labels(name)) for name, value in fixed.items()}
         return to_dataset(part.scene_on(axes), part.arrays(axes), {}).assign_coords(scalars)
+
+    def explore(self) -> Page:
+        """The explorer: an HTML page that evaluates the atlas in the browser, which a notebook shows.
+
+        Returns: the page; ``text`` is its HTML, one file that loads nothing.
+
+        Raises: InputError for a system whose coordinates the page cannot compute.
+        """
+        from drivetrain_jax.explore import explore
+
+        return explore(self)
 
     def slice(self, values: Mapping[str, float]) -> StoredAtlas:
         """The atlas of the remaining parameters, with those in ``values`` fixed at values within their ranges."""

@@ -1,0 +1,215 @@
+// An atlas as a function: panels, points, slices. Python: atlas/panels.py, atlas/stability.py, atlas/floquet_quantity.py.
+import { EPS, characteristic, eigenvalues, product, radiusBound } from "./linear.js";
+import { conservativeVerdict, invariants, nothingCrosses, radius } from "./quartic.js";
+
+// Relative tolerance for points outside a box by rounding of their coordinate.
+const SLACK = 8 * EPS;
+export const STABLE = 0, UNSTABLE = 1, UNDECIDED = 2, GAP = 3;
+const FORMS = {
+  "x": (x) => x,
+  "1/x": (x) => 1 / x,
+  "1/sqrt(x)": (x) => 1 / Math.sqrt(x),
+  "sqrt(x)": Math.sqrt,
+  "x^2": (x) => x * x,
+  "ln(x)": Math.log,
+  "ln sec(x)": (x) => -Math.log1p(-2 * Math.sin(x / 2) ** 2),
+};
+
+/** Float64Array from base64. */
+export function decode(text) {
+  const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  return new Float64Array(bytes.buffer);
+}
+
+/** The atlas of the page's data (explore/pack.py). */
+export function openAtlas(data) {
+  const m = data.size * data.size, all = decode(data.coefficients);
+  const bits = Uint8Array.from(atob(data.kept), (c) => c.charCodeAt(0));
+  let bit = 0, used = 0;
+  const panels = data.panels.map((panel) => {
+    const count = panel.degrees.reduce((a, b) => a * b, 1), index = [];
+    for (let i = 0; i < count; i++, bit++) if (bits[bit >> 3] & (128 >> (bit & 7))) index.push(i);
+    const coefficients = all.subarray(used * m, (used += index.length) * m);
+    // Places of the kept coefficients along each coordinate.
+    const places = panel.degrees.map(() => new Int32Array(index.length));
+    index.forEach((flat, i) => {
+      for (let k = places.length - 1; k >= 0; k--) {
+        places[k][i] = flat % panel.degrees[k];
+        flat = Math.floor(flat / panel.degrees[k]);
+      }
+    });
+    const log = panel.log && { ...panel.log, coefficients: decode(panel.log.coefficients) };
+    return { ...panel, coefficients, places, log };
+  });
+  return { ...data, panels, forward: data.parameters.map((p) => FORMS[p.form]) };
+}
+
+export const between = (box, k, x) =>
+  x >= box.lower[k] - SLACK * Math.max(Math.abs(box.lower[k]), Math.abs(box.upper[k])) &&
+  x <= box.upper[k] + SLACK * Math.max(Math.abs(box.lower[k]), Math.abs(box.upper[k]));
+
+/** Position of `x` in [-1, 1] along the coordinate k of a box. */
+export function position(box, k, x) {
+  const t = (x - box.lower[k] - (box.upper[k] - x)) / (box.upper[k] - box.lower[k]);
+  return Math.min(Math.max(t, -1), 1);
+}
+
+/** T_0 .. T_(n-1) at `t`. */
+export function chebyshev(t, n) {
+  const angle = Math.acos(t), found = new Float64Array(n);
+  for (let j = 0; j < n; j++) found[j] = Math.cos(j * angle);
+  return found;
+}
+
+/** Sum of a dense tensor over all coordinates but those in `axes`, whose order the result has. */
+function contractDense(coefficients, degrees, weights, axes) {
+  const shape = axes.map((k) => degrees[k]), out = new Float64Array(shape.reduce((a, b) => a * b, 1));
+  for (let i = 0; i < coefficients.length; i++) {
+    let w = coefficients[i], rest = i;
+    const place = degrees.map(() => 0);
+    for (let k = degrees.length - 1; k >= 0; k--) (place[k] = rest % degrees[k]), (rest = Math.floor(rest / degrees[k]));
+    place.forEach((j, k) => axes.includes(k) || (w *= weights[k][j]));
+    out[axes.reduce((at, k) => at * degrees[k] + place[k], 0)] += w;
+  }
+  return out;
+}
+
+/** A panel over the coordinates `axes` only, at the positions `t` of the others. */
+function contract(panel, t, axes, m) {
+  const others = panel.degrees.map((_, k) => k).filter((k) => !axes.includes(k));
+  const weights = panel.degrees.map((n, k) => (axes.includes(k) ? null : chebyshev(t[k], n)));
+  const degrees = axes.map((k) => panel.degrees[k]);
+  const tensor = new Float64Array(degrees.reduce((a, b) => a * b, 1) * m), c = panel.coefficients;
+  for (let i = 0, at = 0; at < c.length; i++) {
+    let w = 1, to = 0;
+    for (let k = 0; k < others.length; k++) w *= weights[others[k]][panel.places[others[k]][i]];
+    for (let k = 0; k < axes.length; k++) to = to * degrees[k] + panel.places[axes[k]][i];
+    to *= m;
+    for (let e = 0; e < m; e++, at++) tensor[to + e] += w * c[at];
+  }
+  const log = panel.log && contractLog(panel.log, t, axes);
+  const [lower, upper] = [panel.lower, panel.upper].map((x) => axes.map((k) => x[k]));
+  return { ...panel, lower, upper, degrees, tensor, log };
+}
+
+function contractLog(log, t, axes) {
+  const weights = log.degrees.map((n, k) => (axes.includes(k) ? null : chebyshev(t[k], n)));
+  const coefficients = contractDense(log.coefficients, log.degrees, weights, axes);
+  return { error: log.error, degrees: axes.map((k) => log.degrees[k]), coefficients };
+}
+
+/** Coordinates of `values`, a number for each parameter. */
+const coordinates = (atlas, values) => atlas.forward.map((f, k) => f(values[k]));
+
+/** The atlas over the parameters `axes` (numbers, slowest first); `values` are those of all parameters. */
+export function slice(atlas, values, axes) {
+  const x = coordinates(atlas, values);
+  const others = atlas.parameters.map((_, k) => k).filter((k) => !axes.includes(k));
+  const panels = atlas.panels
+    .filter((panel) => others.every((k) => between(panel, k, x[k])))
+    .map((panel) => contract(panel, x.map((v, k) => position(panel, k, v)), axes, atlas.size * atlas.size));
+  return { atlas, axes, values: Float64Array.from(values), panels, forward: axes.map((k) => atlas.forward[k]) };
+}
+
+/** True if the system is Hamiltonian at `values`. */
+export function isHamiltonian(atlas, values) {
+  return atlas.hamiltonian === true || (atlas.hamiltonian || []).some(([k, value]) => values[k] === value);
+}
+
+/** Results of `phi` by the eigenvalues of Z. */
+function byEigenvalues(atlas, panel, phi, log) {
+  const n = atlas.size;
+  let z = phi;
+  if (atlas.reversor) {
+    const turned = new Float64Array(n * n), x = Float64Array.from(atlas.reversor);
+    for (let i = 0; i < n; i++) for (let j = 0; j < n; j++) turned[i * n + j] = phi[j * n + i];
+    z = product(product(x, product(turned, x, n), n), phi, n);
+  }
+  const a = characteristic(z, n), [re, im] = eigenvalues(z, n);
+  const rho = Math.max(...re.map((v, i) => Math.hypot(v, im[i])));
+  let relative = 0;
+  panel.derived_error.forEach((error, k) => (relative = Math.max(relative, error / rho ** (k + 1))));
+  if (log !== null) relative = Math.max(relative, Math.abs(((-1) ** n * a[n - 1] - Math.exp(log)) / rho ** n));
+  const square = phi.reduce((sum, v) => sum + v * v, 0);
+  const bound = radiusBound(re, im, relative + (8 * EPS * square ** (atlas.halves / 2)) / rho);
+  return { spectral_radius: rho, spectral_radius_error: bound, verdict: decide(rho, bound) };
+}
+
+const decide = (rho, error) => (rho + error < 1 ? STABLE : rho - error > 1 ? UNSTABLE : UNDECIDED);
+
+const work = new Float64Array(6), three = new Float64Array(3);
+
+/** Bounds of e1, e2, e3 and of the determinant from those of a panel and of rounding. */
+function errorsOf(panel, rounding, log) {
+  const d = panel.derived_error, kappa4 = Math.exp(log);
+  return [d[0] + rounding[3], d[1] + rounding[4], d[2] + rounding[5], determinantError(log, panel.log.error) * kappa4];
+}
+
+/** Relative error of exp(log). */
+export const determinantError = (log, error) => 8 * EPS * (1 + Math.abs(log)) + error;
+
+/** Results from Phi (n x n entries by rows) and log det Z at one point of a panel. */
+function judge(atlas, panel, phi, log, hamiltonian) {
+  if (!atlas.closed_form) return byEigenvalues(atlas, panel, phi, log);
+  invariants(phi, 0, work);
+  const [e1, e2, e3] = work, d = errorsOf(panel, work, log);
+  radius(e1, e2, e3, Math.exp(log / 4), ...d, three);
+  let [rho, error, wide] = three, verdict = decide(rho, error);
+  if ((wide && error > 4 * EPS) || !(Math.abs(rho - 1) > error)) {
+    const better = byEigenvalues(atlas, panel, phi, log);
+    ({ spectral_radius: rho, spectral_radius_error: error, verdict } = better);
+    if (verdict === UNDECIDED && nothingCrosses(e1, e2, e3, log, ...d)) verdict = rho < 1 ? STABLE : UNSTABLE;
+  }
+  if (hamiltonian) {
+    verdict = conservativeVerdict(phi, 0, panel.value_error);
+    // Bounded motion without damping: all multipliers lie on the unit circle.
+    if (verdict === STABLE) [rho, error] = [1, 4 * EPS];
+  }
+  return { spectral_radius: rho, spectral_radius_error: error, verdict };
+}
+
+const nothing = () => ({ spectral_radius: NaN, spectral_radius_error: NaN, verdict: UNDECIDED, covered: false });
+
+/** Results at coordinates `x` of a slice; `values` are those of all parameters. */
+function atCoordinates(part, x, values) {
+  const { atlas } = part, m = atlas.size * atlas.size;
+  const panel = part.panels.find((p) => x.every((v, k) => between(p, k, v)));
+  if (!panel) return nothing();
+  let phi = panel.tensor, log = panel.log;
+  const t = x.map((v, k) => position(panel, k, v));
+  t.forEach((place, k) => {
+    const weights = chebyshev(place, panel.degrees[k]), length = phi.length / weights.length;
+    const next = new Float64Array(length);
+    for (let j = 0, at = 0; j < weights.length; j++)
+      for (let e = 0; e < length; e++, at++) next[e] += weights[j] * phi[at];
+    phi = next;
+  });
+  if (log) log = contractLog(log, t, []).coefficients[0];
+  return { ...judge(atlas, panel, phi.subarray(0, m), log ?? null, isHamiltonian(atlas, values)), covered: true };
+}
+
+/** Results at a point of a slice: a value for each of its axes. */
+export function atPoint(part, point) {
+  const { atlas } = part, values = Array.from(part.values);
+  part.axes.forEach((k, i) => (values[k] = point[i]));
+  return inDomain(atlas, values) ? atCoordinates(part, coordinates(part, point), values) : nothing();
+}
+
+const inDomain = (atlas, values) => atlas.parameters.every((p, k) => values[k] >= p.lower && values[k] <= p.upper);
+
+/** Results at `values`, an object of numbers by name; a name that is missing or unknown throws. */
+export function evaluate(atlas, values) {
+  const names = atlas.parameters.map((p) => p.name);
+  for (const name of names)
+    if (typeof values[name] !== "number") throw new Error(`${name}: missing; needed are ${names.join(", ")}`);
+  for (const name of Object.keys(values))
+    if (!names.includes(name)) throw new Error(`${name}: not a parameter of the atlas, which has ${names.join(", ")}`);
+  const point = names.map((name) => values[name]);
+  if (!inDomain(atlas, point)) return nothing();
+  const x = coordinates(atlas, point);
+  const panel = atlas.panels.find((p) => x.every((v, k) => between(p, k, v)));
+  if (!panel) return nothing();
+  const one = contract(panel, x.map((v, k) => position(panel, k, v)), [], atlas.size * atlas.size);
+  const log = one.log ? one.log.coefficients[0] : null;
+  return { ...judge(atlas, panel, one.tensor, log, isHamiltonian(atlas, point)), covered: true };
+}
