@@ -61,6 +61,38 @@ export function chebyshev(t, n) {
   return found;
 }
 
+/** out[c] = sum_n weights[at + n] source[from + n length + c] for the `length` first c, eight sums at a time in registers. */
+export function combine(source, from, length, weights, at, n, out) {
+  let c = 0;
+  for (; c + 8 <= length; c += 8) {
+    let s0 = 0, s1 = 0, s2 = 0, s3 = 0, s4 = 0, s5 = 0, s6 = 0, s7 = 0;
+    for (let j = 0, o = from + c; j < n; j++, o += length) {
+      const w = weights[at + j];
+      s0 += w * source[o];
+      s1 += w * source[o + 1];
+      s2 += w * source[o + 2];
+      s3 += w * source[o + 3];
+      s4 += w * source[o + 4];
+      s5 += w * source[o + 5];
+      s6 += w * source[o + 6];
+      s7 += w * source[o + 7];
+    }
+    out[c] = s0;
+    out[c + 1] = s1;
+    out[c + 2] = s2;
+    out[c + 3] = s3;
+    out[c + 4] = s4;
+    out[c + 5] = s5;
+    out[c + 6] = s6;
+    out[c + 7] = s7;
+  }
+  for (; c < length; c++) {
+    let sum = 0;
+    for (let j = 0, o = from + c; j < n; j++, o += length) sum += weights[at + j] * source[o];
+    out[c] = sum;
+  }
+}
+
 /** Sum of a dense tensor over all coordinates but those in `axes`, whose order the result has. */
 function contractDense(coefficients, degrees, weights, axes) {
   const shape = axes.map((k) => degrees[k]), out = new Float64Array(shape.reduce((a, b) => a * b, 1));
@@ -178,10 +210,8 @@ function atCoordinates(part, x, values) {
   let phi = panel.tensor, log = panel.log;
   const t = x.map((v, k) => position(panel, k, v));
   t.forEach((place, k) => {
-    const weights = chebyshev(place, panel.degrees[k]), length = phi.length / weights.length;
-    const next = new Float64Array(length);
-    for (let j = 0, at = 0; j < weights.length; j++)
-      for (let e = 0; e < length; e++, at++) next[e] += weights[j] * phi[at];
+    const weights = chebyshev(place, panel.degrees[k]), next = new Float64Array(phi.length / weights.length);
+    combine(phi, 0, next.length, weights, 0, weights.length, next);
     phi = next;
   });
   if (log) log = contractLog(log, t, []).coefficients[0];
