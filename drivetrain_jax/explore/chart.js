@@ -3,12 +3,12 @@ import { GAP, STABLE, UNDECIDED, UNSTABLE, chebyshev, decode } from "./evaluate.
 
 export const THEMES = {
   light: {
-    paper: "#ffffff", ink: "#1b1f24", muted: "#555555", accent: "#0b6cb8", boundary: "#000000", band: "rgba(11,132,216,.16)",
+    paper: "#ffffff", ink: "#1b1f24", muted: "#555555", accent: "#0b6cb8", prediction: "#0b84d8", boundary: "#000000", band: "rgba(11,132,216,.16)",
     verdicts: [[255, 255, 255], [51, 65, 92], [242, 182, 50], [214, 214, 214]], stripe: [150, 150, 150],
     decay: [[208, 224, 239], [238, 244, 249]],
   },
   dark: {
-    paper: "#14171b", ink: "#e8eaed", muted: "#a5adb6", accent: "#6cbcff", boundary: "#ffffff", band: "rgba(108,188,255,.2)",
+    paper: "#14171b", ink: "#e8eaed", muted: "#a5adb6", accent: "#6cbcff", prediction: "#4aa8ff", boundary: "#ffffff", band: "rgba(108,188,255,.2)",
     verdicts: [[32, 38, 46], [143, 168, 216], [242, 182, 50], [72, 72, 72]], stripe: [130, 130, 130],
     decay: [[44, 58, 72], [26, 32, 40]],
   },

@@ -15,29 +15,34 @@ const FORMS = {
   "ln sec(x)": (x) => -Math.log1p(-2 * Math.sin(x / 2) ** 2),
 };
 
+/** Bytes from base64. */
+function bytesOf(text) {
+  const letters = atob(text), bytes = new Uint8Array(letters.length);
+  for (let i = 0; i < bytes.length; i++) bytes[i] = letters.charCodeAt(i);
+  return bytes;
+}
+
 /** Float64Array from base64. */
-export function decode(text) {
-  const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-  return new Float64Array(bytes.buffer);
+export const decode = (text) => new Float64Array(bytesOf(text).buffer);
+
+/** Places along each coordinate of the coefficients whose bits, from number `first` on, are set. */
+function keptPlaces(bits, first, degrees) {
+  const count = degrees.reduce((a, b) => a * b, 1), index = [];
+  for (let i = 0; i < count; i++) if (bits[(first + i) >> 3] & (128 >> ((first + i) & 7))) index.push(i);
+  const places = degrees.map(() => new Int32Array(index.length));
+  for (let k = degrees.length - 1, step = 1; k >= 0; step *= degrees[k--])
+    for (let i = 0; i < index.length; i++) places[k][i] = Math.floor(index[i] / step) % degrees[k];
+  return { count, places };
 }
 
 /** The atlas of the page's data (explore/pack.py). */
 export function openAtlas(data) {
-  const m = data.size * data.size, all = decode(data.coefficients);
-  const bits = Uint8Array.from(atob(data.kept), (c) => c.charCodeAt(0));
+  const m = data.size * data.size, all = decode(data.coefficients), bits = bytesOf(data.kept);
   let bit = 0, used = 0;
   const panels = data.panels.map((panel) => {
-    const count = panel.degrees.reduce((a, b) => a * b, 1), index = [];
-    for (let i = 0; i < count; i++, bit++) if (bits[bit >> 3] & (128 >> (bit & 7))) index.push(i);
-    const coefficients = all.subarray(used * m, (used += index.length) * m);
-    // Places of the kept coefficients along each coordinate.
-    const places = panel.degrees.map(() => new Int32Array(index.length));
-    index.forEach((flat, i) => {
-      for (let k = places.length - 1; k >= 0; k--) {
-        places[k][i] = flat % panel.degrees[k];
-        flat = Math.floor(flat / panel.degrees[k]);
-      }
-    });
+    const { count, places } = keptPlaces(bits, bit, panel.degrees);
+    const coefficients = all.subarray(used * m, (used += places[0].length) * m);
+    bit += count;
     const log = panel.log && { ...panel.log, coefficients: decode(panel.log.coefficients) };
     return { ...panel, coefficients, places, log };
   });
@@ -181,7 +186,7 @@ function errorsOf(panel, rounding, log) {
 export const determinantError = (log, error) => 8 * EPS * (1 + Math.abs(log)) + error;
 
 /** Results from Phi (n x n entries by rows) and log det Z at one point of a panel. */
-function judge(atlas, panel, phi, log, hamiltonian) {
+export function judge(atlas, panel, phi, log, hamiltonian) {
   if (!atlas.closed_form) return byEigenvalues(atlas, panel, phi, log);
   invariants(phi, 0, work);
   const [e1, e2, e3] = work, d = errorsOf(panel, work, log);

@@ -1,7 +1,8 @@
 // A slice of an atlas on a grid. As in Python (atlas/tiles.py, atlas/charts.py), the coefficients e1, e2, e3 of the
 // characteristic polynomial are computed at Chebyshev nodes of small boxes, and interpolated from there to the cells.
 import {
-  GAP, STABLE, UNDECIDED, UNSTABLE, atPoint, between, chebyshev, combine, determinantError, isHamiltonian, position,
+  GAP, STABLE, UNDECIDED, UNSTABLE, atPoint, between, chebyshev, combine, determinantError, isHamiltonian, judge,
+  position,
 } from "./evaluate.js";
 import { EPS } from "./linear.js";
 import { invariants, radius } from "./quartic.js";
@@ -90,15 +91,15 @@ export function blank(columns, rows) {
 export function onGrid(part, xs, ys) {
   const out = blank(xs.length, ys.length), { atlas } = part;
   const free = atlas.hamiltonian === true || (atlas.hamiltonian || []).length > 0;
-  if (!atlas.closed_form || (free && mayBeHamiltonian(part, xs, ys))) {
-    cellByCell(part, xs, ys, out);
-    return out;
-  }
   const u = Float64Array.from(xs, part.forward[1]), v = Float64Array.from(ys, part.forward[0]);
-  const unsure = [];
+  const single = !atlas.closed_form || (free && mayBeHamiltonian(part, xs, ys)), unsure = [];
   // Panels share faces, where the first one counts.
   for (const panel of [...part.panels].reverse()) {
     const columns = pieces(panel, 1, u).map(byNode), rows = pieces(panel, 0, v);
+    if (single) {
+      for (const band of rows) for (const piece of columns) cellByCell(part, panel, band, piece, { u, v, xs, ys, out });
+      continue;
+    }
     for (const band of rows) fillBand(panel, band, columns, { u, v, out, unsure });
   }
   for (const i of unsure) store(out, i, atPoint(part, [ys[Math.floor(i / xs.length)], xs[i % xs.length]]));
@@ -126,8 +127,23 @@ function mayBeHamiltonian(part, xs, ys) {
   return any(ys, part.axes[0]);
 }
 
-function cellByCell(part, xs, ys, out) {
-  ys.forEach((y, r) => xs.forEach((x, c) => store(out, r * xs.length + c, atPoint(part, [y, x]))));
+/** The cells of a box one by one from Phi: of systems without the closed form, or that may be Hamiltonian. */
+function cellByCell(part, panel, band, piece, { u, v, xs, ys, out }) {
+  const { atlas } = part, [ny, nx] = panel.degrees, m = atlas.size * atlas.size, logs = panel.log && logRows(panel, band, v);
+  const t = u.subarray(piece.start, piece.end).map((x) => position(panel, 1, x)), weights = table(t, nx);
+  const mx = panel.log?.degrees[1], logWeights = panel.log && table(t, mx), log = new Float64Array(1), values = Array.from(part.values);
+  const row = new Float64Array(nx * m), phi = new Float64Array(m);
+  for (let r = band.start; r < band.end; r++) {
+    combine(panel.tensor, 0, nx * m, chebyshev(position(panel, 0, v[r]), ny), 0, ny, row);
+    values[part.axes[0]] = ys[r];
+    for (let c = 0; c < t.length; c++) {
+      combine(row, 0, m, weights, c * nx, nx, phi);
+      if (logs) combine(logWeights, c * mx, 1, logs, (r - band.start) * mx, mx, log);
+      values[part.axes[1]] = xs[piece.start + c];
+      const result = judge(atlas, panel, phi, logs ? log[0] : null, isHamiltonian(atlas, values));
+      store(out, r * out.columns + piece.start + c, { ...result, covered: true });
+    }
+  }
 }
 
 /** The cells of one band of rows: panel rows first, then box by box, whose numbers stay in the cache. */

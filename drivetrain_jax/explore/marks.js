@@ -2,7 +2,7 @@
 import { THEMES, extremes, growthColour, ticks, tickText } from "./chart.js";
 import { labelText, shown } from "./text.js";
 
-export const MARGIN = { left: 66, right: 18, top: 34, bottom: 50 };
+export const MARGIN = { left: 66, right: 36, top: 34, bottom: 50 };
 const DASHES = { solid: [], dashed: [5, 3], dashdot: [6, 2, 1, 2] };
 // Least distance of two labels of resonances in pixels, and most points of a line.
 const ROOM = 24, POINTS = 65;
@@ -47,7 +47,7 @@ function axisMarks(axis, box, theme, across) {
 
 function resonanceMarks(lines, box, theme) {
   const list = [], taken = [];
-  for (const { line, points } of lines) list.push({ path: placed(points, box), stroke: theme.accent, width: 1, dash: DASHES[line] || [], inside: true });
+  for (const { line, points } of lines) list.push({ path: placed(points, box), stroke: theme.prediction, width: 1, dash: DASHES[line] || [], inside: true });
   // Low orders, which are the last digit of a label, are named first.
   const named = [...lines].sort((a, b) => Number(a.label.at(-1)) - Number(b.label.at(-1)) || 0);
   for (const { label, points, across } of named) {
@@ -55,7 +55,7 @@ function resonanceMarks(lines, box, theme) {
     const at = across ? box.x + part * box.w : box.y + (1 - part) * box.h;
     if (!(part >= 0 && part <= 1) || taken.some((other) => Math.abs(other - at) < ROOM)) continue;
     taken.push(at);
-    list.push({ text: labelText(label), at: across ? [at, box.y - 8] : [box.x + box.w - 4, at - 3], anchor: across ? "middle" : "end", fill: theme.accent });
+    list.push({ text: labelText(label), at: across ? [at, box.y - 8] : [box.x + box.w + 5, at + 4], anchor: across ? "middle" : "start", fill: theme.accent });
   }
   return list;
 }

@@ -52,7 +52,11 @@ const start = () => {
     resonances: resonances(atlas),
     speed: atlas.parameters.findIndex((p) => p.role === "speed"),
     theme: () => (dark.matches && !app.printing ? "dark" : "light"),
-    caption: (k) => (atlas.parameters[k].symbol === atlas.parameters[k].long_name ? "" : `${atlas.parameters[k].symbol}, `) + atlas.parameters[k].long_name,
+    caption: (k) => {
+      const { symbol, long_name: name } = atlas.parameters[k];
+      // In rpm it is the speed itself, not its ratio to a frequency.
+      return unitOf(atlas.parameters[k], app.state.units).unit === "rpm" ? name.split(" over ")[0] : `${symbol}, ${name}`;
+    },
     written: (k, value) => {
       const { unit, factor } = unitOf(atlas.parameters[k], app.state.units);
       return shown(value * factor, 6) + (unit === "°" ? unit : unit && ` ${unit}`);
@@ -72,6 +76,15 @@ const start = () => {
   });
   return app;
 };
+
+/** Put the state into the address; a page within another one (`srcdoc`) has none. */
+function remember(text) {
+  try {
+    history.replaceState(null, "", `#${text}`);
+  } catch {
+    // The state is then that of the page alone.
+  }
+}
 
 /** What charts and controls do to the state. */
 function actions(app) {
@@ -124,7 +137,7 @@ function actions(app) {
     rest() {
       clearTimeout(app.timer);
       app.timer = setTimeout(() => {
-        history.replaceState(null, "", `#${toHash(atlas, app.state)}`);
+        remember(toHash(atlas, app.state));
         app.refine();
         app.measure();
       }, REST);

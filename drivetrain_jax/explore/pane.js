@@ -98,9 +98,12 @@ function paintCells(app, pane, list, theme) {
     return [(grid.lower[g] - app.state.lower[k]) / span, (grid.upper[g] - app.state.lower[k]) / span];
   });
   const [y0, y1] = at.length > 1 ? at[0] : [0, 1], [x0, x1] = at.at(-1);
-  const layer = create("canvas", { width: Math.max(box.w, 1), height: Math.max(box.h, 1) }), inner = layer.getContext("2d");
-  inner.imageSmoothingEnabled = false;
-  inner.drawImage(pane.picture, x0 * box.w, (1 - y1) * box.h, (x1 - x0) * box.w, (y1 - y0) * box.h);
+  const [w, h] = [box.w, box.h].map((length) => Math.max(Math.round(length * (window.devicePixelRatio || 1)), 1));
+  const layer = create("canvas", { width: w, height: h }), inner = layer.getContext("2d");
+  // Cells larger than a pixel keep their edges, smaller ones are averaged.
+  inner.imageSmoothingEnabled = (x1 - x0) * w < grid.columns;
+  inner.imageSmoothingQuality = "high";
+  inner.drawImage(pane.picture, x0 * w, (1 - y1) * h, (x1 - x0) * w, (y1 - y0) * h);
   paint(target, list, layer);
 }
 
@@ -133,7 +136,7 @@ function describe(app, pane, theme, growth) {
   pane.heading.textContent = [state.panes.length > 1 ? "AB"[pane.number] : "", others.join(", ")].filter(Boolean).join(": ");
   pane.map.value = own.map;
   const colours = growth ? [] : THEMES[theme].verdicts.slice(0, 3).map((c, i) => [`rgb(${c})`, ["stable", "unstable", "undecided"][i]]);
-  colours.push([`repeating-linear-gradient(45deg, rgb(${THEMES[theme].stripe}) 0 2px, rgb(${THEMES[theme].verdicts[3]}) 2px 5px)`, "no panel: not covered"]);
+  if (app.atlas.gaps.length) colours.push([`repeating-linear-gradient(45deg, rgb(${THEMES[theme].stripe}) 0 2px, rgb(${THEMES[theme].verdicts[3]}) 2px 5px)`, "no panel: not covered"]);
   pane.legend.replaceChildren(...colours.map(([background, word]) => {
     const swatch = create("i");
     swatch.style.background = background;

@@ -26,18 +26,11 @@ class Browser:
         to_browser, self._write = os.pipe()
         self._read, from_browser = os.pipe()
 
-        def place_pipes() -> None:
-            # Chromium reads from descriptor 3 and writes to 4. Numbers that may be in the way are moved first.
-            ends = os.dup(to_browser), os.dup(from_browser)
-            os.dup2(ends[0], 3)
-            os.dup2(ends[1], 4)
-
+        command = [CHROMIUM, *options, f"--user-data-dir={profile}", f"--window-size={width},{height}", "about:blank"]
+        # Chromium reads from descriptor 3 and writes to 4; a shell puts them there.
+        shell = ["bash", "-c", f'exec "$@" 3<&{to_browser} 4>&{from_browser}', "chromium", *command]
         self._process = subprocess.Popen(
-            [CHROMIUM, *options, f"--user-data-dir={profile}", f"--window-size={width},{height}", "about:blank"],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            preexec_fn=place_pipes,
-            close_fds=False,
+            shell, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, pass_fds=(to_browser, from_browser)
         )
         os.close(to_browser)
         os.close(from_browser)

@@ -32,7 +32,6 @@ SCENES: dict[str, dict[str, Any]] = {
         },
         "options": {"rtol": 1e-7},
     },
-    "undamped": {"axes": {"beta": {"start": 0.0, "stop": 1.2}, "Omega": SPEED}, "fixed": {"zeta": 0.0}},
     "mathieu": {
         "system": "mathieu",
         "axes": {"q": {"start": 0.0, "stop": 1.0}, "Omega": {"start": 0.5, "stop": 2.0}},
