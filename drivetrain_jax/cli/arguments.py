@@ -164,6 +164,7 @@ def _add_point(subparsers: Any) -> None:
     command.add_argument("system", metavar="SYSTEM", help="name from `drivetrain list`")
     command.add_argument("analysis", metavar="ANALYSIS", help="name from `drivetrain list SYSTEM`")
     _add_given(command, "parameters in the units of `drivetrain list SYSTEM`, options, and outputs=NAME,NAME")
+    _add_data(command)
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
 
@@ -243,3 +244,9 @@ def _add_scene(command: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         help="replace an entry of the scene: fixed.zeta=0.002",
     )
+    _add_data(command)
+
+
+def _add_data(command: argparse.ArgumentParser) -> None:
+    text = "table of parameters (.csv, .xlsx), a column each: length [mm]; the command line overrides it"
+    command.add_argument("--data", metavar="TABLE", type=_path, help=text)

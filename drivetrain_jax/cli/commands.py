@@ -54,12 +54,26 @@ def run(options: argparse.Namespace) -> int:
     return code
 
 
+def _overrides(options: argparse.Namespace) -> dict[str, Any]:
+    """Entries of the scene that the command line replaces."""
+    return {f"fixed.{name}": value for name, value in _tabulated(options).items()} | assignments(options.set, "--set")
+
+
+def _tabulated(options: argparse.Namespace) -> dict[str, Any]:
+    """The values of the table ``--data``."""
+    if options.data is None:
+        return {}
+    from drivetrain_jax.runs.data_table import read_table
+
+    return read_table(options.data)
+
+
 def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[Any, int, str]:
     """Counts, exit code, and the message for the user."""
     from drivetrain_jax.runs.executors import make_executor
     from drivetrain_jax.runs.run import Incomplete, run_to_file
 
-    overrides = assignments(options.set, "--set")
+    overrides = _overrides(options)
     with _progress_line(options.quiet) as show:
 
         def report(progress: Any) -> None:
@@ -95,7 +109,7 @@ def status(options: argparse.Namespace) -> int:
     """Print how much of a scene is computed."""
     from drivetrain_jax.runs.status import status
 
-    return _answer(status(options.scene, options.out, assignments(options.set, "--set")), options)
+    return _answer(status(options.scene, options.out, _overrides(options)), options)
 
 
 def verify(options: argparse.Namespace) -> int:
@@ -196,7 +210,7 @@ def point(options: argparse.Namespace) -> int:
     """Print the results of one point."""
     from drivetrain_jax.runs.point import point
 
-    given = assignments(options.given, "point")
+    given = _tabulated(options) | assignments(options.given, "point")
     for name in ("system", "analysis"):
         if name in given:
             raise InputError(f"{name} = {given[name]!r}: given twice; allowed is once, in front of the values")
