@@ -109,8 +109,12 @@ def _draw_curves(axes: Axes, dataset: xr.Dataset, key: str, name: str) -> None:
             band = 3 * dataset["lyapunov_standard_error"].isel({own[0]: k}).values
             axes.fill_between(x, values - band, values + band, color=_COLOURS[k], alpha=0.2, linewidth=0)
     columns = variable.sizes[own[0]] if own else 0
-    if key in _SUMMED:
-        axes.plot(x, variable.values.sum(axis=-1), color=FRAME_GREY, linestyle="--", label="sum")
+    if own and key in _SUMMED:
+        total = variable.values.sum(axis=-1)
+        # A constant line far below would hide where the exponents part.
+        constant = key == "lyapunov_spectrum" and np.ptp(total) < 1e-3 * np.abs(total).max()
+        text = f"sum {total.mean():.4g} throughout" if constant else "sum"
+        axes.plot(*(([], []) if constant else (x, total)), color=FRAME_GREY, linestyle="--", label=text)
         columns += 1
     if own:
         axes.legend(title=own[0], ncols=columns, loc="best", fontsize=7.5, title_fontsize=7.5)
