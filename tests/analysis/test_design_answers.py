@@ -1,0 +1,45 @@
+"""What verdicts and critical speeds mean for a design, against closed forms and printed values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivetrain_jax.analysis.critical_speeds.margins import required_margin, separation_margins
+from drivetrain_jax.analysis.floquet.growth import growth
+
+
+def test_growth_follows_an_exponential():
+    """x = exp(a t) with a = 0.7 and -0.7 1/s, multiplier over a period of 0.3 s, a turn of 0.6 s."""
+    a, period, turn = np.array([0.7, -0.7]), 0.3, 0.6
+    found = growth(np.exp(a * period), period, turn)
+    np.testing.assert_allclose(found.rate, a, rtol=1e-14)
+    np.testing.assert_allclose(found.per_turn, np.exp(a * turn), rtol=1e-14)
+    np.testing.assert_allclose(np.exp(a[0] * found.time_to_double[0]), 2.0, rtol=1e-14)
+    np.testing.assert_allclose(np.exp(a[1] * found.time_to_halve[1]), 0.5, rtol=1e-14)
+    np.testing.assert_allclose(found.turns_to_double[0] * turn, found.time_to_double[0], rtol=1e-14)
+    assert np.isinf(found.time_to_double[1]) and np.isinf(found.turns_to_halve[0])
+
+
+def test_neither_growth_nor_an_immediate_end_divides_by_zero():
+    found = growth([1.0, 0.0, np.nan], 1.0, 1.0)
+    assert np.isinf(found.time_to_double[0]) and np.isinf(found.time_to_halve[0]) and found.time_to_halve[1] == 0.0
+    assert np.isnan(found.rate[2]) and np.isnan(found.time_to_double[2]) and np.isnan(found.turns_to_halve[2])
+
+
+def test_required_margin_of_api_617():
+    """None below 2.5; from there 17 (1 - 1/(AF - 1.5)) percent, and 10 more above the range; at most 17 and 27."""
+    np.testing.assert_allclose(required_margin([1.0, 2.49, 2.5, 3.5, 1e9], False), [0, 0, 0, 0.085, 0.17], atol=1e-9)
+    np.testing.assert_allclose(required_margin([1.0, 2.49, 2.5, 3.5, 1e9], True), [0, 0, 0.1, 0.185, 0.27], atol=1e-9)
+
+
+def test_margins_of_a_stepped_shaft():
+    """Critical speeds 3646, 8088 rpm against 3000-4500 rpm: the first is within."""
+    found = separation_margins([2400.0, 3646.0, 8088.0, np.inf], 3000.0, 4500.0, [0.2, 0.0, 0.8, 0.2])
+    np.testing.assert_allclose(found.actual, [0.2, 0.0, 8088 / 4500 - 1, np.inf])
+    assert found.kept.tolist() == [True, False, False, True]
+
+
+def test_operating_speeds_must_be_a_range():
+    with pytest.raises(ValueError, match="lowest = 5: allowed is 0 < lowest <= highest = 3"):
+        separation_margins([1.0], 5.0, 3.0, 0.1)
