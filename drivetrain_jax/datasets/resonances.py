@@ -31,6 +31,8 @@ def resonances(dataset: xr.Dataset) -> xr.DataArray | None:
     predicted = _predicted(str(dataset.attrs.get("system")))
     if predicted is None or predicted.axis not in dataset.dims or is_joined(dataset):
         return None
+    if any(name in dataset.coords or _value(dataset, name) is not None for name in predicted.without):
+        return None
     values = {name: _value(dataset, name) for name in predicted.parameters}
     if any(value is None for value in values.values()):
         return None

@@ -33,7 +33,8 @@ class Resonances:
     ``values(parameters)`` maps the values of ``parameters`` (scalars or arrays of shape ``(...)``) to an array of shape
     ``(..., len(labels))``. ``multipliers`` gives for each label the multiplier that meets the unit circle there, ``+1``,
     ``-1`` or ``pair``, if known. ``up_to(k)`` returns the same predictions for the orders 1 to k. ``families`` say how
-    figures draw them; the family of a label is the one with the longest prefix.
+    figures draw them; the family of a label is the one with the longest prefix. Nothing is predicted for a result that has
+    one of the parameters ``without``.
     """
 
     axis: str
@@ -44,3 +45,4 @@ class Resonances:
     multipliers: tuple[str, ...] = ()
     up_to: Callable[[int], Resonances] | None = None
     families: tuple[Family, ...] = ()
+    without: tuple[str, ...] = ()

@@ -28,4 +28,6 @@ THRESHOLD = Resonances(
     ("no separation ends",),
     rattle_threshold,
     "amplitude at which the orbit without separation ends",
+    # The amplitude is not B1 alone then.
+    without=("unbalance",),
 )

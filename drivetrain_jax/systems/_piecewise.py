@@ -6,6 +6,7 @@ Equation: ``u'' + damping u' + stiffness f_s(u) = B0 + B1 cos(omega t)`` with
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -20,6 +21,9 @@ class PiecewiseLinearOscillator(eqx.Module):
     ``damping`` is c/I [1/s], ``stiffness`` k/I [1/s^2], ``alpha`` the stiffness within the play over the stiffness in
     contact [1], ``b`` half the play [m], ``B0`` and ``B1`` mean and amplitude of the drive [m/s^2], ``omega`` the frequency
     of the drive [rad/s].
+
+    An ``unbalance`` [m] adds ``unbalance omega^2`` to B1 along a range of frequencies. The equation itself, and all that
+    solves it at one frequency, take :meth:`at`. The number 0.0 stands for none.
     """
 
     damping: Any
@@ -29,6 +33,20 @@ class PiecewiseLinearOscillator(eqx.Module):
     B0: Any
     B1: Any
     omega: Any
+    unbalance: Any = 0.0
+
+    @property
+    def follows(self) -> bool:
+        """True if the amplitude of the drive depends on its frequency."""
+        return not (isinstance(self.unbalance, float) and self.unbalance == 0.0)
+
+    def amplitude(self, omega: Any) -> Any:
+        """``B1 + unbalance omega^2`` [m/s^2]."""
+        return self.B1 + self.unbalance * omega**2 if self.follows else self.B1
+
+    def at(self, omega: Any) -> PiecewiseLinearOscillator:
+        """The oscillator at the frequency ``omega``, its whole amplitude in B1."""
+        return replace(self, omega=omega, B1=self.amplitude(omega), unbalance=0.0)
 
     @property
     def oscillates(self) -> Any:

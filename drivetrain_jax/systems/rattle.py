@@ -5,7 +5,8 @@ damping by multiple scales and averaging" (in Persian). docs/theory/rattle.md li
 be corrected.
 
 ``u = r_x theta_x - r_y theta_y`` is the relative displacement along the line of action, ``I = I_x I_y/(I_x r_y^2 +
-I_y r_x^2)`` the equivalent mass, and ``B0 + B1 cos(omega t) = M_x r_x/I_x + M_y r_y/I_y`` an acceleration:
+I_y r_x^2)`` the equivalent mass, and ``B0 + B1 cos(omega t) = M_x r_x/I_x + M_y r_y/I_y`` an acceleration. With an
+``unbalance`` e its amplitude is ``B1 + e omega^2``. The equation is
 ``u'' + (c/I) u' + (k/I) f_s(u) = B0 + B1 cos(omega t)`` with the spring of
 :class:`~drivetrain_jax.systems.PiecewiseLinearOscillator`. With r in m, u and b are lengths, k, c
 and I the stiffness, damping and mass along the line of action. Table 1 lists b as 10 deg, read here as the number pi/18: the
@@ -31,7 +32,7 @@ PRESETS = {"table1": {"B0": 0.05, "B1": 0.03, "b": math.pi / 18, "c": 0.05, "alp
 
 
 POSITIVE = {"lower": 0.0, "open_lower": True}
-_MOTION = ("omega", "B0", "B1", "b", "c", "alpha", "k", "I")
+_MOTION = ("omega", "B0", "B1", "b", "c", "alpha", "k", "I", "unbalance")
 
 
 class Rattle(System):
@@ -63,14 +64,20 @@ class Rattle(System):
     alpha: Number = parameter("1", "stiffness within the backlash over that in contact", symbol="α", lower=0.0)
     k: Number = parameter("N/m", "stiffness in contact", **POSITIVE)
     I: Number = parameter("kg", "equivalent mass", **POSITIVE)  # noqa: E741
+    unbalance: Number | None = parameter("m", "unbalance: adds unbalance omega^2 to B1", derived="none")
     u0: Number = parameter("m", "relative displacement at t = 0", default=0.0)
     v0: Number = parameter("m/s", "relative velocity at t = 0", default=0.0)
 
-    @serves("frequency_response", "basins", parameters=_MOTION)
+    @serves("basins", parameters=_MOTION)
     @serves("steady_state")
     @serves("history", returns=PiecewiseLinearOscillator)
     def oscillator(self) -> PiecewiseLinearOscillator:
         """The oscillator in units of its mass."""
+        return self.along_frequencies().at(self.omega)
+
+    @serves("frequency_response", parameters=_MOTION)
+    def along_frequencies(self) -> PiecewiseLinearOscillator:
+        """The same with the unbalance apart, so that the drive follows its frequency."""
         return PiecewiseLinearOscillator(
             damping=self.c / self.I,
             stiffness=self.k / self.I,
@@ -79,6 +86,7 @@ class Rattle(System):
             B0=self.B0,
             B1=self.B1,
             omega=self.omega,
+            unbalance=0.0 if self.unbalance is None else self.unbalance,
         )
 
     def vector_field(self, t: Any, y: Array) -> Array:

@@ -95,6 +95,8 @@ _ONLY = {
     **dict.fromkeys(("peak_amplitude", "peak_frequency", "backbone_amplitude"), _CLOSED),
     "fit_range": ("multiple_scales", "averaging"),
 }
+# Closed forms of curves whose drive has one amplitude.
+_OF_ONE_DRIVE = frozenset(("peak_amplitude", "peak_frequency", "fold_frequency"))
 _SPECIAL = frozenset(("fold_frequency", "doubling_frequency"))
 # Lines of a chunk: for a map of 200 lines, equally many for two cores.
 _CHUNK = 50
@@ -102,11 +104,17 @@ _CHUNK = 50
 
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     """Directions, branches and folds; ``InputError`` for a result that the method does not provide, or too few samples."""
-    del system, fixed
+    del system
     for name in request.outputs:
         if request.method not in _ONLY.get(name, (request.method,)):
             methods = ", ".join(_ONLY[name])
             raise InputError(f"outputs: method {request.method} does not give {name}; allowed for it is {methods}")
+    for name in () if fixed.get("unbalance") is None else _OF_ONE_DRIVE.intersection(request.outputs):
+        if request.method != "exact":
+            raise InputError(
+                f"outputs: {request.method} gives {name} for a drive of one amplitude; "
+                f"allowed with an unbalance are the other results, or the method exact for fold_frequency"
+            )
     samples, harmonics = (request.options.get(name, 0) for name in ("samples", "harmonics"))
     if 0 < samples <= 2 * harmonics:
         allowed = f"0 (by the harmonics) or at least {2 * harmonics + 1}, which tell {harmonics} harmonics apart"
@@ -123,7 +131,7 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
 
 def _shape(model: PiecewiseLinearOscillator) -> tuple[int, ...]:
     """Shape of the batch: of all fields but the frequency."""
-    fields = (model.damping, model.stiffness, model.alpha, model.b, model.B0, model.B1)
+    fields = (model.damping, model.stiffness, model.alpha, model.b, model.B0, model.B1, model.unbalance)
     return jnp.broadcast_shapes(*(jnp.shape(field) for field in fields))
 
 

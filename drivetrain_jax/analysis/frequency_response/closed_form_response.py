@@ -44,14 +44,14 @@ class Curves(NamedTuple):
 
     ``motions(omega)`` (K, ...) have rising amplitudes, infinite after the last motion. ``peak`` holds amplitude and
     frequency, ``folds`` frequencies. ``backbone(omega)`` (L, ...) is the largest amplitude of the backbone at every
-    frequency, ``fit_range`` the range of the fit.
+    frequency, ``fit_range(omega)`` the range of the fit there.
     """
 
     motions: Callable[[Any], OneTerm]
     peak: tuple[Array, Array]
     folds: Array
     backbone: Callable[[Array], Array]
-    fit_range: Array
+    fit_range: Callable[[Array], Array]
 
 
 def of_multiple_scales(model: PiecewiseLinearOscillator, shape: tuple[int, ...], fit_range: Array | None) -> Curves:
@@ -72,7 +72,9 @@ def of_multiple_scales(model: PiecewiseLinearOscillator, shape: tuple[int, ...],
         detuning = omega.reshape(-1, *(1,) * len(shape)) - flow.frequency
         return jnp.where(bends, jnp.sqrt(detuning / jnp.where(bends, flow.bend, 1.0)), jnp.nan)
 
-    return Curves(motions, multiple_scales.peak(flow), multiple_scales.folds(flow)[1], backbone, fit.fit_range)
+    return Curves(
+        motions, multiple_scales.peak(flow), multiple_scales.folds(flow)[1], backbone, _everywhere(fit.fit_range)
+    )
 
 
 def of_describing_function(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Curves:
@@ -90,7 +92,27 @@ def of_describing_function(model: PiecewiseLinearOscillator, shape: tuple[int, .
         describing_function.peak_of(model, bones),
         describing_function.fold_frequencies(model, bones),
         partial(describing_function.backbone, model, shape),
-        jnp.full(shape, jnp.nan),
+        _everywhere(jnp.full(shape, jnp.nan)),
+    )
+
+
+def _everywhere(value: Array) -> Callable[[Array], Array]:
+    return lambda omega: jnp.broadcast_to(value, (omega.size, *value.shape))
+
+
+def _of_each(curves_at: Callable[[PiecewiseLinearOscillator], Curves], model: PiecewiseLinearOscillator) -> Curves:
+    """Every frequency with its own amplitude of the drive. Peak and folds belong to curves of one amplitude: NaN."""
+    none = jnp.full(jnp.shape(curves_at(model.at(1.0)).peak[0]), jnp.nan)
+
+    def along(part: Callable[[Curves], Callable[[Array], Array]]) -> Callable[[Array], Array]:
+        return lambda omega: jax.lax.map(lambda w: part(curves_at(model.at(w)))(w[None])[0], omega)
+
+    return Curves(
+        lambda omega: curves_at(model.at(omega)).motions(omega),
+        (none, none),
+        none[None],
+        along(lambda curves: curves.backbone),
+        along(lambda curves: curves.fit_range),
     )
 
 
@@ -107,7 +129,11 @@ def response(
     """
     omega = np.asarray(model.omega)
     scales = method != "describing_function"
-    curves = of_multiple_scales(model, shape, fit_range) if scales else of_describing_function(model, shape)
+
+    def curves_at(model: PiecewiseLinearOscillator) -> Curves:
+        return of_multiple_scales(model, shape, fit_range) if scales else of_describing_function(model, shape)
+
+    curves = _of_each(curves_at, model) if model.follows else curves_at(model)
     fine, places = refined(omega, _LARGEST_STEP, _MOST_PARTS)
     every = jax.lax.map(curves.motions, jnp.asarray(fine))
     index = follow(every.amplitude)[places]
@@ -116,7 +142,7 @@ def response(
     frequency = jnp.asarray(omega).reshape(-1, 1, *(1,) * len(shape))
     # A drive of negative amplitude is a positive drive that lags by half a period.
     late = jnp.where(chosen.phase > 0, chosen.phase - jnp.pi, chosen.phase + jnp.pi)
-    chosen = chosen._replace(phase=jnp.where(jnp.asarray(model.B1) < 0, late, chosen.phase))
+    chosen = chosen._replace(phase=jnp.where(jnp.asarray(model.amplitude(frequency)) < 0, late, chosen.phase))
     results = _of_sweeps(model, chosen, index, frequency, outputs) | _of_branches(at_values)
     results |= _of_curves(curves, jnp.asarray(omega), shape)
     exists = jnp.all(jnp.isfinite(chosen.amplitude), axis=1)
@@ -144,7 +170,7 @@ def _of_sweeps(
     if "residual" in outputs:
         angle = (2 * np.pi * np.arange(_SAMPLES) / _SAMPLES).reshape(-1, *(1,) * amplitude.ndim)
         cosine, sine = (amplitude * f(angle - motion.phase) for f in (jnp.cos, jnp.sin))
-        drive = model.B0 + model.B1 * jnp.cos(angle)
+        drive = model.B0 + model.amplitude(omega) * jnp.cos(angle)
         results["residual"] = imbalance(model, (bias + cosine, -omega * sine, -(omega**2) * cosine), drive)
     return results
 
@@ -174,5 +200,5 @@ def _of_curves(curves: Curves, omega: Array, shape: tuple[int, ...]) -> dict[str
         "peak_frequency": along(curves.peak[1]),
         "fold_frequency": along(jnp.concatenate([folds, missing])),
         "backbone_amplitude": curves.backbone(omega),
-        "fit_range": along(curves.fit_range),
+        "fit_range": curves.fit_range(omega),
     }

@@ -191,8 +191,10 @@ def residual(
     beyond = above * (touch.u - model.b) + below * (touch.u + model.b)
     spring = model.alpha * x + (1 - model.alpha) * jnp.tensordot(basis.projection, beyond, 1)
     force, by_omega = linear_part(model, basis, x, omega)
-    force = (force + model.stiffness * spring).at[0].add(-model.B0).at[2 * basis.order - 1].add(-model.B1)
-    return force, by_omega
+    force, drive = force + model.stiffness * spring, 2 * basis.order - 1
+    if model.follows:
+        by_omega = by_omega.at[drive].add(-2 * model.unbalance * omega)
+    return force.at[0].add(-model.B0).at[drive].add(-model.amplitude(omega)), by_omega
 
 
 def jacobian(model: PiecewiseLinearOscillator, basis: Basis, omega: Array, touch: Contact) -> Array:

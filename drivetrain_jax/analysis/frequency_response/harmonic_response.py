@@ -93,7 +93,7 @@ def describe(
     rate = jnp.tensordot(basis.rates, x, 1) * base
     acceleration = jnp.tensordot(-basis.values * basis.orders**2, x, 1) * base**2
     angle = (2 * np.pi * basis.order * np.arange(basis.count) / basis.count).reshape(-1, *(1,) * (x.ndim - 1))
-    unbalanced = imbalance(model, (touch.u, rate, acceleration), model.B0 + model.B1 * jnp.cos(angle))
+    unbalanced = imbalance(model, (touch.u, rate, acceleration), model.B0 + model.amplitude(omega) * jnp.cos(angle))
     cosine, sine = x[2 * basis.order - 1], x[2 * basis.order]
     rms = jnp.sqrt(x[0] ** 2 + jnp.sum(x[1:] ** 2, axis=0) / 2)
     stability = jnp.where((radius > 1 + _MARGIN) | saddle, UNSTABLE, STABLE)
@@ -113,7 +113,10 @@ def response(
     """
     omega = np.asarray(model.omega)
     lanes = shape or (1,)
-    fields = {name: jnp.broadcast_to(value, lanes) for name, value in vars(model).items() if name != "omega"}
+    own = {name: value for name, value in vars(model).items() if name != "omega"}
+    if not model.follows:
+        del own["unbalance"]
+    fields = {name: jnp.broadcast_to(value, lanes) for name, value in own.items()}
     model = PiecewiseLinearOscillator(**fields, omega=None)
     swept_x, balanced, saddle = _sweeps(model, basis, omega, lanes)
 
@@ -142,7 +145,7 @@ def _sweeps(
     Both sweeps run in parallel.
     """
     fine, places = refined(omega, _LARGEST_STEP, _MOST_PARTS)
-    twice = jax.tree.map(lambda field: jnp.tile(field, 2), {k: v for k, v in vars(model).items() if k != "omega"})
+    twice = {name: jnp.tile(value, 2) for name, value in vars(model).items() if name != "omega" and jnp.ndim(value)}
     both = PiecewiseLinearOscillator(**twice, omega=None)
     paths = np.repeat(np.stack([fine, fine[::-1]], axis=1), lanes[0], axis=1)
     swept = sweep(both, basis, jnp.asarray(paths))

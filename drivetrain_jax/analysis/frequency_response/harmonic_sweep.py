@@ -88,7 +88,7 @@ def _runge_kutta(
     """One step of the classical Runge-Kutta scheme."""
 
     def rate(t: Array, u: Array, v: Array) -> tuple[Array, Array]:
-        drive = model.B0 + model.B1 * jnp.cos(omega * t)
+        drive = model.B0 + model.amplitude(omega) * jnp.cos(omega * t)
         return v, drive - model.damping * v - model.stiffness * model.restoring(u)
 
     u, v = state

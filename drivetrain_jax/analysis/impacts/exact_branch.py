@@ -75,7 +75,7 @@ def _ended(omega: Array, limits: tuple[float, float]) -> Array:
 def _points(model: PiecewiseLinearOscillator, omega: np.ndarray, lanes: int) -> PiecewiseLinearOscillator:
     """The oscillators of all points, frequencies first."""
     own = {k: jnp.tile(v, omega.size) for k, v in vars(model).items() if k != "omega" and jnp.ndim(v)}
-    return replace(model, omega=jnp.asarray(np.repeat(omega, lanes)), **own)
+    return replace(model, **own).at(jnp.asarray(np.repeat(omega, lanes)))
 
 
 def _along(values: Array, omega: np.ndarray) -> Array:

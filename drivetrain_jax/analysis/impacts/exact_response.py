@@ -106,10 +106,10 @@ def periodic_results(oscillator: PiecewiseLinearOscillator, seen: Measures) -> d
 def points_of(model: PiecewiseLinearOscillator, length: int, lanes: int) -> PiecewiseLinearOscillator:
     """The oscillators of all points, frequencies first: fields of shape ``(length * lanes,)``, or scalars."""
     omega = jnp.broadcast_to(jnp.asarray(model.omega).reshape(-1, 1), (length, lanes)).reshape(-1)
-    names = ("damping", "stiffness", "alpha", "b", "B0", "B1")
+    names = ("damping", "stiffness", "alpha", "b", "B0", "B1", "unbalance")
     own = {name: getattr(model, name) for name in names}
     tiled = {name: jnp.tile(value, length) for name, value in own.items() if jnp.ndim(value)}
-    return replace(model, omega=omega, **tiled)
+    return replace(model, **tiled).at(omega)
 
 
 def sweeps(
@@ -123,7 +123,7 @@ def sweeps(
     ``most_periods`` drive periods, the next frequency starts from its last state.
     """
     shape = jnp.broadcast_shapes(*(jnp.shape(getattr(model, n)) for n in ("damping", "stiffness", "alpha", "b")))
-    shape = jnp.broadcast_shapes(shape, jnp.shape(model.B0), jnp.shape(model.B1))
+    shape = jnp.broadcast_shapes(shape, jnp.shape(model.B0), jnp.shape(model.B1), jnp.shape(model.unbalance))
     length, lanes = jnp.size(model.omega), int(np.prod(shape, dtype=int))
     points = points_of(model, length, lanes)
     up = np.arange(length * lanes, dtype=np.int32).reshape(length, lanes).T

@@ -29,15 +29,23 @@ def measured(model: PiecewiseLinearOscillator) -> tuple[PiecewiseLinearOscillato
     """``model`` with lengths in its own unit, and this unit [m] in the common shape of all fields but omega."""
     fields = (model.b, model.B0, model.B1, model.stiffness)
     # Fixed values of a scene stay NumPy arrays, constants of the kernel.
-    xp = jnp if any(isinstance(x, Array) for x in fields) else np
+    xp = jnp if any(isinstance(x, Array) for x in (*fields, model.unbalance)) else np
     b, B0, B1, stiffness = (xp.asarray(x, float) for x in fields)
     drive = xp.maximum(xp.abs(B0), xp.abs(B1))
+    if model.follows:
+        drive = xp.maximum(drive, xp.abs(model.unbalance) * xp.max(xp.asarray(model.omega)) ** 2)
     static = xp.frexp(drive)[1] - xp.frexp(stiffness)[1]
     none = -10 * _LARGEST
     exponent = xp.maximum(xp.where(b > 0, xp.frexp(b)[1], none), xp.where(drive > 0, static, none))
     exponent = xp.where(exponent == none, 0, xp.clip(exponent, -_LARGEST, _LARGEST))
     unit, inverse = (xp.ldexp(xp.ones(exponent.shape), power) for power in (exponent, -exponent))
-    return replace(model, b=b * inverse, B0=B0 * inverse, B1=B1 * inverse), unit
+    return replace(
+        model,
+        b=b * inverse,
+        B0=B0 * inverse,
+        B1=B1 * inverse,
+        unbalance=model.unbalance * inverse if model.follows else 0.0,
+    ), unit
 
 
 def restored(results: Mapping[str, Array], unit: Array | np.ndarray) -> dict[str, Array]:

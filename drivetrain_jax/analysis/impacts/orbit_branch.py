@@ -55,8 +55,8 @@ class _Solved(NamedTuple):
 def _map(model: PiecewiseLinearOscillator, multiple: int, x: Array) -> tuple[Array, Matrix, Array]:
     """``F^m`` of the state, its transition matrix, and its derivative by omega from a forward difference."""
     omega = jnp.concatenate([x[2], x[2] * (1 + _DIFFERENCE)])
-    twice = {name: jnp.tile(value, 2) for name, value in vars(model).items() if jnp.ndim(value)}
-    lanes = prepare(replace(model, **(twice | {"omega": omega})))
+    twice = {name: jnp.tile(value, 2) for name, value in vars(model).items() if name != "omega" and jnp.ndim(value)}
+    lanes = prepare(replace(model, **twice).at(omega))
     begun = start(lanes, jnp.tile(x[0], 2), jnp.tile(x[1], 2), jnp.asarray(multiple, jnp.int32))
     end = march(lanes, begun, _MOST_STEPS)
     half = x.shape[1]

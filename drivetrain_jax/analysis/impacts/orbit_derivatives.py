@@ -24,7 +24,8 @@ from drivetrain_jax.analysis.impacts.orbit_measures import measure
 from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
-_FIELDS = tuple(field.name for field in fields(PiecewiseLinearOscillator))
+# At one frequency the unbalance is part of B1.
+_FIELDS = tuple(field.name for field in fields(PiecewiseLinearOscillator) if field.name != "unbalance")
 # Fields whose range ends at zero: there the oscillator has other formulas, and no derivative.
 _ENDS = np.array([name in ("alpha", "b") for name in _FIELDS])
 
