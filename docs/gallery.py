@@ -97,6 +97,16 @@ def draw(item: Item, results: Sequence[Path], figure: Path) -> None:
     drivetrain_jax.plot(*datasets).savefig(figure)
 
 
+def explore(item: Item, results: Sequence[Path], folder: Path) -> None:
+    """Write the page of an atlas beside its first figure, if there is none yet or the result or its code is newer."""
+    if item.number > 1 or tomllib.loads(item.scenes[0].read_text())["analysis"] != "atlas":
+        return
+    page = folder / f"{item.scenes[0].stem}.html"
+    newest = max(path.stat().st_mtime for path in (results[0], *PACKAGE.glob("explore/*"), *PACKAGE.glob("atlas/*.py")))
+    if not page.exists() or page.stat().st_mtime < newest:
+        page.write_text(drivetrain_jax.open_atlas(results[0]).explore().text)
+
+
 def answered(title: str) -> str:
     """The figures, tables and sections of the source that a title names."""
     return ", ".join(re.findall(r"(?:Figs?\.?|Tables?|section) \d+\w?(?:(?:,| and| to) \d+)*", title))
@@ -130,6 +140,9 @@ def entry(item: Item, results: Sequence[Path], problem: str) -> Iterator[str]:
     yield (f"Answers: {answer} of {source}." if answer else "Beyond the source.") + "\n"
     yield "\n\n".join(filter(None, map(remarks, item.scenes))) + "\n"
     yield f"{problem}\n" if problem else f"![{item.title}]({item.name}.png)\n"
+    page = f"{item.scenes[0].stem}.html"
+    if results and (results[0].parent / page).exists():
+        yield f"[The atlas as a page]({page}), by `drivetrain explore`.\n"
     runs = [f"$ drivetrain run sweeps/{path.name} --out {path.stem}.nc" for path in item.scenes]
     files = " ".join(f"{path.stem}.nc" for path in item.scenes)
     part = "".join(f" {name}={value:.10g}" for name, value in item.part.items())
@@ -147,6 +160,7 @@ def render(item: Item, folder: Path) -> tuple[list[Path], str]:
         return results, f"Not finished: {error}."
     try:
         draw(item, results, folder / f"{item.name}.png")
+        explore(item, results, folder)
     except InputError as error:
         return results, f"No figure: {error}."
     return results, ""

@@ -191,7 +191,7 @@ function drawing(app) {
     compute: () => run(quick()),
     async refine() {
       const state = toHash(atlas, app.state), most = app.panes.reduce((m, pane) => Math.max(m, frame(...Object.values(size(pane))).w * (devicePixelRatio || 1)), 0);
-      for (const n of SIZES.filter((n) => n > app.level && n < 1.6 * most)) {
+      for (const n of SIZES.filter((n, i) => n > app.level && SIZES[i - 1] < most)) {
         while (app.busy) await new Promise((resolve) => setTimeout(resolve, 20));
         if (toHash(atlas, app.state) !== state) return;
         await run(n);
