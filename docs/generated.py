@@ -106,6 +106,18 @@ def value_text(value: Any) -> str:
     return f"{value:.10g}" if isinstance(value, float) else str(value)
 
 
+def physical(system: str) -> str:
+    """The physical data of a system, and the formulas of the parameters that follow from them."""
+    data = get_system(system).physical
+    rows = [
+        (f"`{q.name}`", q.long_name, q.units, f"`{q.allowed}`", "" if q.default is None else value_text(q.default))
+        for q in data.quantities
+    ]
+    formulas = [(f"`{each.parameter}`", f"`{each.formula}`") for each in data.conversions]
+    given = table(("physical data", "meaning", "unit", "allowed", "default"), rows)
+    return f"{given}\n{table(('parameter', 'follows from the data as'), formulas)}"
+
+
 def analyses(system: str) -> str:
     """The analyses of a system: results, methods and options of each."""
     served = get_system(system)
@@ -167,7 +179,8 @@ def figures() -> str:
     return table(("system", "figure", "scenes in `sweeps/`"), rows)
 
 
-SOURCES = {f.__name__.replace("_", "-"): f for f in (parameters, analyses, scenes, outcomes, file_contents, figures)}
+_TABLES = (parameters, physical, analyses, scenes, outcomes, file_contents, figures)
+SOURCES = {f.__name__.replace("_", "-"): f for f in _TABLES}
 
 
 def written(text: str) -> str:

@@ -12,6 +12,7 @@ from functools import cache, lru_cache
 from typing import Any
 
 _NUMBER = re.compile(r"\s*([+-]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?inf)\s*(.*?)\s*", re.DOTALL)
+_PRODUCT = re.compile(r"[\w\s*/^.·°%()²³⁴⁻¹-]+")
 # The units of engineers, in the language of pint; a plural s and prefixes are understood.
 _UNITS = (
     *("giga- = 1e9 = G-", "mega- = 1e6 = M-", "kilo- = 1e3 = k-", "centi- = 1e-2 = c-", "deci- = 1e-1 = d-"),
@@ -90,6 +91,8 @@ def _parsed(unit: str) -> Any:
         spelt = pattern.sub(plain, spelt)
     registry = _registry()
     try:
+        if unit and not _PRODUCT.fullmatch(unit):
+            raise ValueError(unit)
         # Anything but a product of units, a number among them, is no unit.
         return 1 * registry.parse_units(spelt)
     except Exception as error:
@@ -101,6 +104,7 @@ def _registry() -> Any:
     # Local import: pint takes half a second, and most input has no units.
     import pint
 
-    registry = pint.UnitRegistry(None)
+    empty: Any = None
+    registry = pint.UnitRegistry(empty)
     registry.load_definitions(_UNITS)
     return registry

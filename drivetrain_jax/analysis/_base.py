@@ -120,7 +120,8 @@ class Analysis:
     request)`` names the axis that is computed as a whole, if any. A ``continuous`` analysis accepts ranges for axes and
     returns a function of the parameters instead of values on a grid. ``of_system(system)`` returns the fields that depend
     on the system, by name, for example its ``variables``. ``uses`` names another analysis whose models this analysis
-    works with, so that systems need no model for it.
+    works with, so that systems need no model for it. ``patience`` names the option that limits an iteration: a larger
+    value may help a point that has not converged.
     """
 
     name: str
@@ -139,6 +140,12 @@ class Analysis:
     method_titles: Mapping[str, str] = field(default_factory=dict)
     of_system: Callable[[type[System]], Mapping[str, Any]] = lambda _: {}
     uses: str = ""
+    patience: str = ""
+
+    def remedy(self, request: Request) -> str:
+        """The option that may help a point that has not converged, as text; empty without one."""
+        value = request.options.get(self.patience)
+        return "" if value is None else f"a larger {self.patience} than {value} may help"
 
     def for_system(self, system: type[System]) -> Analysis:
         """The analysis of ``system``, with the fields that it declares."""

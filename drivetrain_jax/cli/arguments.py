@@ -6,6 +6,7 @@ import argparse
 import errno
 import os
 import re
+import sys
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -20,6 +21,12 @@ class _Parser(argparse.ArgumentParser):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(allow_abbrev=False, **options)
+        self._words: list[str] = []
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Parse, and keep the words for messages."""
+        self._words = list(sys.argv[1:] if args is None else args)
+        return super().parse_known_args(args, namespace)
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Parse; values may follow options, and the command itself reports an unknown argument."""
@@ -35,7 +42,15 @@ class _Parser(argparse.ArgumentParser):
         return options
 
     def error(self, message: str) -> NoReturn:
-        self.exit(WRONG_INPUT, one_line(f"{_reworded(message)}; see {self.prog} --help"))
+        reworded = _reworded(message)
+        if message.startswith("the following arguments are required: "):
+            known = re.findall(r"--[a-z]+", self.format_help())
+            typed = [word.partition("=")[0] for word in self._words if word.startswith("--")]
+            # A misspelt option is why another one is missing.
+            strange = next((word for word in typed if word not in known and did_you_mean(word, known)), None)
+            if strange:
+                reworded = f"{strange}: not an argument of this command{did_you_mean(strange, known)}"
+        self.exit(WRONG_INPUT, one_line(f"{reworded}; see {self.prog} --help"))
 
 
 def _reworded(message: str) -> str:
@@ -61,7 +76,8 @@ def _path(text: str) -> Path:
         if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
             reason = f"{clipped(text)!r}: {error.strerror}; allowed is a path that the system can open"
             raise argparse.ArgumentTypeError(reason) from None
-    return Path(text)
+    # The shell leaves the ~ of --out=~/r.nc alone.
+    return Path(text).expanduser()
 
 
 def parser() -> argparse.ArgumentParser:

@@ -29,7 +29,38 @@ def resonances(dataset: xr.Dataset) -> xr.DataArray | None:
     Returns: ``resonance_AXIS``; its dimensions are the axes that the predictions depend on, then ``resonance`` (labels).
     """
     predicted = _predicted(str(dataset.attrs.get("system")))
-    if predicted is None or predicted.axis not in dataset.dims or is_joined(dataset):
+    if predicted is None or is_joined(dataset):
+        return None
+    # Axes given in physical data: the predictions are those along their parameters.
+    given = {name: str(c.dims[0]) for name, c in dataset.coords.items() if c.ndim == 1 and c.dims[0] != name}
+    given = {str(n): dim for n, dim in given.items() if n in (predicted.axis, *predicted.parameters) and dim in dataset}
+    found = _along_parameters(dataset.swap_dims({dim: name for name, dim in given.items()}), predicted)
+    return None if found is None else _along_given(found, dataset, given, predicted.axis)
+
+
+def _along_given(found: xr.DataArray, dataset: xr.Dataset, given: dict[str, str], axis: str) -> xr.DataArray:
+    """``found`` along the axes of the dataset, as values of the quantity that is given in place of ``axis``."""
+    swapped = {name: dim for name, dim in given.items() if name in found.dims}
+    own = {dim: (name, dataset[dim].values, dataset[dim].attrs) for name, dim in swapped.items()}
+    found = found.assign_coords(own).swap_dims(swapped)
+    found = found.drop_vars(list(swapped))
+    if axis not in given:
+        return found
+    quantity = dataset[given[axis]]
+    order = np.argsort(dataset[axis].values)
+    known = dataset[axis].values[order], quantity.values[order]
+    # Quantity and parameter are proportional, or else known within the axis alone.
+    ratio = known[1][-1] / known[0][-1]
+    if np.allclose(known[1], ratio * known[0], rtol=1e-12, atol=0):
+        values = found.values * ratio
+    else:
+        values = np.interp(found.values, *known, left=np.nan, right=np.nan)
+    attrs = found.attrs | {"units": quantity.attrs["units"]}
+    return xr.DataArray(values, found.coords, found.dims, f"{LABELS}_{given[axis]}", attrs)
+
+
+def _along_parameters(dataset: xr.Dataset, predicted: Resonances) -> xr.DataArray | None:
+    if predicted.axis not in dataset.dims:
         return None
     if any(name in dataset.coords or _value(dataset, name) is not None for name in predicted.without):
         return None

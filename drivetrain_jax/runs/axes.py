@@ -110,7 +110,8 @@ def in_unit(parameter: Parameter, unit: str) -> Parameter:
     if unit == parameter.units:
         return parameter
     size = _units.factor(unit, parameter.units)
-    return replace(parameter, units=unit, lower=parameter.lower / size, upper=parameter.upper / size)
+    limits = {name: getattr(parameter, name) / size for name in ("lower", "upper", "usual")}
+    return replace(parameter, units=unit, **limits)
 
 
 def entry_of(name: str) -> tuple[str, int | None]:

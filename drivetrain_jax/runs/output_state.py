@@ -22,6 +22,9 @@ from drivetrain_jax.runs.sinks import make_sink
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.files import behind_link
 
+# Endings of files of other kinds, which a netCDF file would only confuse.
+_OTHER_FILES = {".csv", ".html", ".json", ".mat", ".npy", ".npz", ".pdf", ".png", ".svg", ".toml", ".txt", ".xlsx"}
+
 
 class OutputState:
     """The result file ``out`` and the folder of its parts, compared with the scene of ``job``.
@@ -224,7 +227,9 @@ def _same(one: Mapping[str, Any], other: Mapping[str, Any], names: Iterable[str]
 
 
 def _check_name(out: Path, parts: PartsFolder) -> None:
-    """Check the length of the longest name, that of the folder of the parts."""
+    """Check the ending and the length of the name; the folder of the parts has the longest."""
+    if out.suffix.lower() in _OTHER_FILES:
+        raise InputError(f"out = {clipped(str(out))!r}: a result is a netCDF file; allowed is a name that ends in .nc")
     try:
         parts.path.exists()
     except OSError as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analysis_names
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
+from drivetrain_jax.analysis.request import checked
 from drivetrain_jax.runs.axes import Axis, entry_of
 from drivetrain_jax.runs.run import run
 from drivetrain_jax.runs.scene import Scene
@@ -48,7 +50,8 @@ def sweep(
         function: an analysis such as :func:`drivetrain_jax.floquet`, or any JAX function of a pytree that returns an array,
             a dict of arrays, or the result of an analysis.
         system: the pytree; values that are not in ``over`` stay fixed.
-        over: values ``(N,)`` by name of a parameter, an entry of a list (``"length[1]"``), a key or an attribute.
+        over: values ``(N,)`` by name of a parameter, an entry of a list (``"length[1]"``), a key or an attribute. A value
+            may be a text with a unit, ``"18 deg"``.
         out: a netCDF file. The next call resumes unfinished work, and only reads a finished result.
         outputs: variables to compute; default: the default of the analysis, or all.
         options: options of the analysis, or keyword arguments of the function.
@@ -82,10 +85,10 @@ def _scene_table(
             f"system: got a {type(system).__name__}; allowed is a system such as drivetrain_jax.Cardan(...)"
         )
     # An empty list stands for a default of none.
-    fixed = {key: _plain(value) for key, value in system.values.items() if key not in over and value != ()}
-    axes = {
-        key: value if isinstance(value, Mapping) else {"values": _numbers(key, value)} for key, value in over.items()
-    }
+    conversions = system.physical.conversions if system.physical else ()
+    replaced = {*over, *(each.parameter for each in conversions if each.needs[0] in over)}
+    fixed = {key: _plain(value) for key, value in system.values.items() if key not in replaced and value != ()}
+    axes = {key: value if isinstance(value, Mapping) else {"values": _row(key, value)} for key, value in over.items()}
     table = {"system": system.name, "analysis": name, "axes": axes, "fixed": fixed, "options": dict(options)}
     return table if outputs is None else table | {"outputs": [outputs] if isinstance(outputs, str) else list(outputs)}
 
@@ -94,6 +97,12 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
         return [_plain(entry) for entry in value]
     return value if isinstance(value, str) else float(value)
+
+
+def _row(name: str, values: Any) -> list[Any]:
+    """Numbers, and texts such as ``"18 deg"``, which the scene converts."""
+    written = isinstance(values, (list, tuple)) and any(isinstance(value, str) for value in values)
+    return list(values) if written else _numbers(name, values)
 
 
 def _numbers(name: str, values: Any) -> list[float]:
@@ -116,7 +125,14 @@ def _function_scene(
     options: Mapping[str, Any],
 ) -> Scene:
     """The scene of a user's function: its parameters vary, and a fixed word identifies the computation."""
-    values = {name: np.array(_numbers(name, given)) for name, given in over.items()}
+    known = {p.name: p for p in system.parameters} if isinstance(system, System) else {}
+    values = {}
+    for name, given in over.items():
+        row, described = _row(name, given), known.get(entry_of(name)[0])
+        if described and any(isinstance(value, str) for value in row):
+            scalar = replace(described, name=name, listed=False, broadcast=False)
+            row = [checked(scalar, value, "over.") for value in row]
+        values[name] = np.array(_numbers(name, row))
     name = re.sub(r"\W", "_", getattr(function, "__name__", "function")).strip("_") or "value"
 
     def one(point: Mapping[str, Any]) -> dict[str, Array]:

@@ -37,7 +37,7 @@ def open_result(path: str | Path) -> xr.Dataset:
     Traceback (most recent call last):
     drivetrain_jax._errors.InputError: file = 'missing.nc': does not exist; give a result written by `drivetrain run`
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     if path.exists() or not PartsFolder(path).holds_work():
         return consolidate.open_result(path)
     return _open_partial(path)

@@ -40,6 +40,7 @@ class PointResult:
     parameter_units: Mapping[str, str] = field(repr=False)
     labels: Mapping[str, Sequence[Any]] = field(repr=False)
     physical: Mapping[str, tuple[Any, str]] = field(default_factory=dict, repr=False)
+    remedy: str = field(default="", repr=False)
 
     @property
     def units(self) -> dict[str, str]:
@@ -94,7 +95,8 @@ class PointResult:
         for name in plain:
             text = _text(self.variables[name], self.values[name])
             lines.append(f"  {name:{width}} = {_with_units(text, self.variables[name].units)}")
-        lines.append(f"  {'outcome':{width}} = {self.outcome.name.lower()}")
+        hint = f" ({self.remedy})" if self.remedy and self.outcome == Outcome.NOT_CONVERGED else ""
+        lines.append(f"  {'outcome':{width}} = {self.outcome.name.lower()}{hint}")
         for (dim,) in dict.fromkeys(self.variables[name].dims for name in listed):
             lines += self._table(dim, [name for name in listed if self.variables[name].dims == (dim,)])
         for name in matrices:
@@ -230,6 +232,7 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
         parameter_units={p.name: p.units for p in scene.system.parameters},
         labels=_labels(job, values, buffer),
         physical=_physical(job),
+        remedy=scene.analysis.remedy(scene.request),
     )
 
 

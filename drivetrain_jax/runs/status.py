@@ -23,8 +23,8 @@ from drivetrain_jax.runs.scene import load_scene
 class Status:
     """Counts of the points at ``out``, and the state: absent, partial, complete or stale (another scene).
 
-    ``failed_by_outcome`` counts the points without a value by outcome. ``reason`` is the error message that a run would
-    give, empty without one.
+    ``failed_by_outcome`` counts the points without a value by outcome; ``remedy`` says what may help those that have not
+    converged. ``reason`` is the error message that a run would give, empty without one.
     """
 
     total: int
@@ -33,10 +33,12 @@ class Status:
     state: str
     failed_by_outcome: Mapping[str, int] = field(default_factory=dict)
     reason: str = ""
+    remedy: str = ""
 
     def __str__(self) -> str:
         lines = [f"{self.state}: {self.done} of {self.total} points done, {self.failed} without a value"]
-        lines += [f"  {name}: {count}" for name, count in self.failed_by_outcome.items()]
+        hints = {"not_converged": f" ({self.remedy})" if self.remedy else ""}
+        lines += [f"  {name}: {count}{hints.get(name, '')}" for name, count in self.failed_by_outcome.items()]
         return "\n".join([*lines, *([f"  a run would stop: {self.reason}"] if self.reason else [])])
 
     def to_json(self) -> str:
@@ -60,7 +62,8 @@ def status(
     except InputError as error:
         return Status(total, 0, 0, "stale", reason=str(error))
     done = output.points(found.done) if output.state == "complete" else found.done
-    return Status(job.route.total(job, done), done, found.failed, output.state, found.by_outcome)
+    remedy = job.scene.analysis.remedy(job.scene.request)
+    return Status(job.route.total(job, done), done, found.failed, output.state, found.by_outcome, remedy=remedy)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,8 @@ import os
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
+from decimal import Decimal
+from fractions import Fraction
 from pathlib import Path
 from types import NoneType
 from typing import Any
@@ -46,13 +48,15 @@ def _read(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] |
     elif not isinstance(source, (str, os.PathLike)):
         raise InputError(f"scene = {shown(source)}: allowed is the path of a scene file, or a table")
     else:
-        text = _text(Path(source))
+        text = _text(Path(source).expanduser())
         try:
             tree = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
             end = f"at line {len(text.splitlines())}, the end of the file"
             reason = str(error).replace("at end of document", end)
-            reason += "; words stand in quotes" if reason.startswith("Invalid value") else ""
+            reason += "; words and numbers with units stand in quotes, numbers begin with a digit" * (
+                reason.startswith("Invalid value")
+            )
             raise InputError(f"scene = {str(source)!r}: not valid TOML: {reason}") from None
         except ValueError:
             raise InputError(f"scene = {str(source)!r}: a number of too many digits; allowed are up to 4300") from None
@@ -64,6 +68,9 @@ def _read(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] |
             )
         for key, value in overrides.items():
             _replace(tree, key, plain(value))
+            if key.startswith("axes.") and isinstance(fixed := tree.get("fixed"), dict):
+                # The axis takes the place of the fixed value.
+                fixed.pop(key.split(".")[1], None)
     _check(tree, "scene")
     return tree, write(_with_axes_as_tables(tree)) if text is None else text
 
@@ -82,6 +89,10 @@ def plain(value: Any) -> Any:
         return {key: plain(entry) for key, entry in value.items()}
     if hasattr(value, "tolist"):
         return value.tolist()
+    if isinstance(value, (Decimal, Fraction)):
+        return float(value)
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
     if hasattr(value, "__array__"):
         # Labelled arrays of xarray have no tolist.
         return np.asarray(value).tolist()

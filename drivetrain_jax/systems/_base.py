@@ -9,6 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from decimal import Decimal
+from numbers import Complex
+from os import PathLike
 from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar
 
@@ -29,6 +32,8 @@ from drivetrain_jax.systems._smooth import Smoothness
 Method = TypeVar("Method", bound=Callable[..., Any])
 Number = float | Array | np.ndarray
 _PARAMETER, _SERVES = "parameter", "_serves"
+# What people give as a value, right or wrong.
+_DATA = (Complex, Decimal, str, bytes, list, tuple, dict, set, PathLike)
 
 
 @dataclass(frozen=True)
@@ -220,7 +225,7 @@ def _admitted(described: Parameter, value: Any) -> Any:
 def _number(described: Parameter, value: Any) -> Any:
     if isinstance(value, jax.core.Tracer) or not hasattr(value, "dtype"):
         # A placeholder of a transformation, such as a shape, is no number either.
-        return _checked(described, value) if isinstance(value, (int, float, str, list, tuple)) else value
+        return _checked(described, value) if isinstance(value, _DATA) or hasattr(value, "columns") else value
     whole = np.asarray(value)
     if whole.dtype.kind not in "iuf":
         raise InputError(

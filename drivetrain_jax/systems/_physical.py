@@ -75,7 +75,7 @@ class PhysicalData:
             if each.needs[0] not in known or each.needs[0] in defaults:
                 continue
             missing = [name for name in each.needs if name not in known]
-            if each.parameter in given and (missing or each.optional):
+            if each.parameter in given and each.optional:
                 continue
             if each.parameter in given:
                 given_text = _shown(given[each.parameter])

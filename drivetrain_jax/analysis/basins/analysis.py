@@ -133,6 +133,7 @@ ANALYSIS = Analysis(
         "exact": "exact motion from impact to impact, from random initial states",
     },
     options=OPTIONS,
+    patience="most_periods",
     solvers=_solvers,
     dimensions=lambda *_: (
         Dimension("attractor", "number of the attractor, by falling displacement", tuple(range(1, ATTRACTORS + 1))),

@@ -211,6 +211,7 @@ ANALYSIS = Analysis(
         "describing_function": "bias and fundamental alone",
     },
     options=OPTIONS,
+    patience="most_periods",
     solvers=_solvers,
     dimensions=_dimensions,
     path_axis=lambda system, _: system.role("speed"),

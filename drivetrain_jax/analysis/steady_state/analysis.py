@@ -145,6 +145,7 @@ ANALYSIS = Analysis(
         "exact": "exact motion from impact to impact, until it repeats",
     },
     options=(RTOL, WAIT),
+    patience="most_periods",
     solvers=_solvers,
     dimensions=lambda *_: DIMENSIONS,
     derivatives=_derivatives,

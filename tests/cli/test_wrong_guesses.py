@@ -1,0 +1,230 @@
+"""What people type by mistake: each is answered in one line that helps, with exit code 2, and nothing is written."""
+
+from __future__ import annotations
+
+import os
+from decimal import Decimal
+from fractions import Fraction
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import drivetrain_jax as dt
+from drivetrain_jax.cli import main
+
+SCENE = """
+system = "cardan"
+analysis = "floquet"
+[axes]
+beta = { start = 0.1, stop = 0.3, num = 3 }
+Omega = { start = 1.0, stop = 1.4, num = 3 }
+[fixed]
+zeta = 0.001
+alpha = 1.0
+mu = 1.0
+gamma = 100.0
+"""
+POINT = "point cardan floquet beta=0.3 Omega=1.4 zeta=0.001 alpha=1 mu=1 gamma=100"
+TRUCK = "point cardan floquet J1=2 J2=0.5 k1=6e4 k2=4e4 c1=0.3 c2=0.1 speed=1425 angle=12"
+RATTLE = "point rattle steady_state omega=0.7 B0=0.05 B1=0.03 b=0.17 c=0.05 alpha=0.25 k=1 I=1"
+SHAFT = "point bicardan critical_speeds length=[0.3,0.3] EI=[1e4,1e4] rhoA=[15,15] k_A=1e6 k_D=1e6"
+RUN = "run scene.toml --out r.nc"
+
+GUESSES = [
+    # Commands and options.
+    ("runn scene.toml --out r.nc", "did you mean run?"),
+    ("calculate scene.toml", "allowed is list, run"),
+    ("run scene.toml --output r.nc", "--output: not an argument of this command (did you mean --out?)"),
+    ("run scene.toml --outfile=r.nc", "did you mean --out?"),
+    ("run scene.toml", "--out: missing"),
+    ("run --out r.nc", "SCENE.toml: missing"),
+    ("run scene.toml --out r.nc --thread 2", "did you mean --threads?"),
+    ("run scene.toml --out r.nc --worker 2", "did you mean --workers?"),
+    ("run scene.toml --out r.nc --overwrite", "--overwrite: not an argument"),
+    ("run scene.toml --out r.nc --threads two", "--threads = 'two': allowed is an integer"),
+    ("run scene.toml --out r.nc --threads 0", "threads = 0"),
+    ("run scene.toml --out r.nc --store hdf", "did you mean hdf5?"),
+    ("run scene.toml --out q.txt", "a result is a netCDF file; allowed is a name that ends in .nc"),
+    ("run scene.toml --out q.csv", "allowed is a name that ends in .nc"),
+    ("run scene.toml --out q.png", "allowed is a name that ends in .nc"),
+    ("run scene.toml --out nowhere/r.nc", "the folder 'nowhere' does not exist"),
+    ("run scene.toml --out ~/nowhere/at/all/r.nc", "does not exist; allowed is a file in an existing folder"),
+    ("run scene.tml --out r.nc", "give the path of a scene file"),
+    ("run ~/no_scene.toml --out r.nc", "no_scene.toml'"),
+    ("run quickstrt --out r.nc", "did you mean quickstart?"),
+    ("run cardan --out r.nc", "give the path of a scene file"),
+    ("run . --out r.nc", "give the path of a scene file"),
+    ("plot r.nc --out r.png", "file = 'r.nc': does not exist"),
+    ("plot scene.toml --out r.png", "scene.toml"),
+    ("plot r.nc --output r.png", "did you mean --out?"),
+    ("plot r.nc --out r.txt", "allowed is a name that ends in .png, .pdf, .svg"),
+    ("plot r.nc --out r", "allowed is a name that ends in .png, .pdf, .svg"),
+    ("status scene.toml", "--out: missing"),
+    ("verify scene.toml", "scene.toml"),
+    ("query r.nc beta=0.1", "does not exist"),
+    ("query scene.toml beta=0.1", "scene.toml"),
+    ("query r.nc beta", "beta"),
+    ("design stable r.nc", "allowed is least-damping, widest-angle, speed-windows"),
+    ("design least_damping r.nc Omega=1:2", "did you mean least-damping?"),
+    ("design speed-windows r.nc --margin much", "--margin = 'much': allowed is a number"),
+    ("list cardn", "did you mean cardan?"),
+    ("list Cardan", "did you mean cardan?"),
+    # Scenes changed on the command line.
+    (f"{RUN} --set zeta=0.1", "did you mean fixed.zeta?"),
+    (f"{RUN} --set fixed.zeta", "allowed is name=value"),
+    (f"{RUN} --set fixed.zeta=", "allowed is name=value"),
+    (f"{RUN} --set fixed.zeta=1j", "fixed.zeta = '1j'"),
+    (f"{RUN} --set fixed.zeta=1/1000", "fixed.zeta = '1/1000'"),
+    (f"{RUN} --set fixed.zeta=0,001", "fixed.zeta = '0,001'"),
+    (f"{RUN} --set fixed.zeta=-0.1", "allowed is 0 <= zeta"),
+    (f"{RUN} --set fixed.zeta=[0.1,0.2]", "fixed.zeta = [0.1, 0.2]: allowed is a number"),
+    (f"{RUN} --set fixed.zeta=true", "fixed.zeta = True: allowed is a number"),
+    (f"{RUN} --set fixed.zeta=nan", "allowed is 0 <= zeta"),
+    (f"{RUN} --set fixed.damping=0.1", "unknown parameter"),
+    (f"{RUN} --set fixed.Zeta=0.1", "did you mean zeta?"),
+    (f"{RUN} --set fixed.j1=2", "did you mean J1?"),
+    (f"{RUN} --set fixed.beta=0.1", "also in [axes]"),
+    (f"{RUN} --set axes.beta.step=0.1", "unknown key"),
+    (f"{RUN} --set axes.beta.num=0", "empty axis"),
+    (f"{RUN} --set axes.beta.num=many", "axes.beta.num = 'many'"),
+    (f"{RUN} --set axes.beta=18", "allowed is a table { start, stop, num } or { values }"),
+    (f"{RUN} --set axes.beta.stop=30", 'did you mean "30 deg"?'),
+    (f"{RUN} --set axes.beta.stop=30rpm", "rpm does not measure that; allowed is a number in rad"),
+    (f"{RUN} --set axes.beta.start=0:1", "':1' is not a unit"),
+    (f"{RUN} --set axes.Omega.start=1000rpm", "allowed is a number without unit"),
+    (f"{RUN} --set axes.Omega.scale=logarithmic", "allowed is one of lin, log"),
+    (f"{RUN} --set axes.speed=[100,200]", "Omega = axis Omega: given besides speed, J1, k1"),
+    (f"{RUN} --set outputs=[radius]", "is not a result of floquet"),
+    (f"{RUN} --set analysis=stability", "allowed for cardan is one of floquet"),
+    (f"{RUN} --set analysis=modes", "allowed for cardan is one of"),
+    (f"{RUN} --set system=carden", "did you mean cardan?"),
+    (f"{RUN} --set options.tol=1e-6", "not used by method auto"),
+    (f"{RUN} --set options.rtol=0", "allowed is 1e-14 <= rtol"),
+    (f"{RUN} --set options.method=exact", "options.method = 'exact'"),
+    # Points.
+    (POINT.replace("beta=0.3", "beta=18"), 'in rad; did you mean "18 deg"?'),
+    (POINT.replace("beta=0.3", "beta=18degrees_of_arc"), "'degrees_of_arc' is not a unit; allowed is a number in rad"),
+    (POINT.replace("beta=0.3", "beta=18angle"), "'angle' is not a unit"),
+    (POINT.replace("beta=0.3", "beta=18Grad"), "'Grad' is not a unit"),
+    (POINT.replace("beta=0.3", "beta=18kg"), "kg does not measure that"),
+    (POINT.replace("beta=0.3", "beta=95"), "in rad"),
+    (POINT.replace("beta=0.3", "beta=deg"), "allowed is a number"),
+    (POINT.replace("beta=0.3", "angle_deg=18"), "unknown (did you mean angle?)"),
+    (POINT.replace("beta=0.3", "Beta=0.3"), "unknown (did you mean beta?)"),
+    (POINT.replace("beta=0.3", ""), "beta: missing; allowed is"),
+    (POINT.replace("beta=0.3", "beta 0.3"), "beta"),
+    (POINT.replace("beta=0.3", "beta==0.3"), "beta"),
+    (POINT.replace("beta=0.3", "--beta=0.3"), "--beta=0.3: not an argument"),
+    (POINT.replace("beta=0.3", "beta=0.3+0.1j"), "beta = '0.3+0.1j'"),
+    (POINT.replace("Omega=1.4", "Omega=1500rpm"), "rpm does not measure that; allowed is a number without unit"),
+    (POINT.replace("Omega=1.4", "speed=1500"), "J1: missing"),
+    (POINT.replace("zeta=0.001", "zeta=0.1%%"), "is not a unit"),
+    (f"{POINT} beta=0.2", "beta is given twice"),
+    (f"{POINT} angle=12", "given besides angle; allowed is one of the two"),
+    (f"{POINT} J1=2", "J1: nothing follows from it"),
+    (POINT.replace("floquet", "stability"), "allowed for cardan is one of floquet"),
+    (POINT.replace("floquet", "atlas"), "allowed at a point is one of"),
+    (POINT.replace("cardan", "shaft"), "system = 'shaft': unknown"),
+    (f"{POINT} outputs=radius", "is not a result of floquet"),
+    (f"{POINT} tolerance=1e-6", "unknown"),
+    (TRUCK.replace("angle=12", "angle=120"), "angle = 120: allowed is -90 < angle < 90, in deg"),
+    (TRUCK.replace("angle=12", "angle=12rpm"), "rpm does not measure that; allowed is a number in deg"),
+    (TRUCK.replace("speed=1425", "speed=fast"), "speed = 'fast': allowed is a number"),
+    (TRUCK.replace("speed=1425", "speed=23.75/s"), "'/s' is not a unit"),
+    (TRUCK.replace("speed=1425", "speed=-1425"), "allowed is 0 < speed < inf, in rpm"),
+    (TRUCK.replace("J1=2", "J1=2kg"), "kg does not measure that; allowed is a number in kg m2"),
+    (TRUCK.replace("k1=6e4", "k1=6e4N/m"), "N/m does not measure that; allowed is a number in N m/rad"),
+    (TRUCK.replace("c1=0.3", "c1=0"), "allowed is 0 if c1 = 0"),
+    (TRUCK.replace("c1=0.3", ""), "c1: missing; alpha = c2/c1 needs c1"),
+    (RATTLE.replace("omega=0.7", "omega=0.7deg"), "allowed is a number in rad/s"),
+    (RATTLE.replace("omega=0.7", "frequency=0.7"), "unknown"),
+    (RATTLE.replace("b=0.17", "backlash=-1mm"), "allowed is 0 <= backlash < inf, in m"),
+    (RATTLE.replace("c=0.05", "damping_ratio=0.05 c=1"), "c = 1: given besides damping_ratio, k, I"),
+    (SHAFT.replace("[1e4,1e4]", "1e4"), "allowed is a list of numbers"),
+    (SHAFT.replace("[1e4,1e4]", "[1e4]"), "EI = [10000.0]: 1 entry where length has 2"),
+    (SHAFT.replace("[0.3,0.3]", "[300mm,300kg]"), "length[1] = '300 kg'".replace("300 kg", "300kg")),
+    (SHAFT.replace("EI=[1e4,1e4]", "outer_diameter=[60mm,60mm] material=iron"), "one of steel, aluminium, titanium"),
+    (SHAFT.replace("EI=[1e4,1e4]", "outer_diameter=[60mm,60mm]"), "E: missing"),
+    (SHAFT.replace("EI=[1e4,1e4]", "outer_diameter=60mm inner_diameter=70mm E=2e11"), "less than outer_diameter"),
+    ("point planetary modes teeth=[20,72]", "those of sun, planet and ring"),
+    ("point planetary modes planet_angle=[0,120,240]", 'did you mean "120 deg"?'),
+]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(SCENE)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("command", "answer"), GUESSES, ids=[command for command, _ in GUESSES])
+def test_a_guess_is_answered_in_one_line(folder, capsys, command, answer):
+    try:
+        code = main(command.split())
+    except SystemExit as stop:
+        code = stop.code
+    out, err = capsys.readouterr()
+    lines = [line for line in err.splitlines() if not line.startswith("points: ")]
+    assert code == 2 and out == "" and len(lines) == 1 and answer in lines[0], (code, out, err)
+    assert os.listdir(folder) == ["scene.toml"]
+
+
+def test_there_are_a_hundred():
+    assert len(GUESSES) >= 100 and len({command for command, _ in GUESSES}) == len(GUESSES)
+
+
+BASE = {"beta": 0.3, "Omega": 1.4, "zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+TABLE = pd.DataFrame({"beta": [0.1, 0.2]})
+
+
+@pytest.mark.parametrize("value", [0.3 + 0.1j, TABLE, Path("beta.csv"), {"beta": 0.3}, b"0.3", {0.3}, "0.3"])
+def test_what_is_no_number_is_refused_by_name(value):
+    for call in (dt.Cardan, partial(dt.point, "cardan", "floquet")):
+        with pytest.raises(dt.InputError, match=r"^beta") as error:
+            call(**{**BASE, "beta": value})
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("value", [Fraction(1, 2), Decimal("0.5"), np.float32(0.5), np.array(0.5), "0.5 rad"])
+def test_every_number_is_one(value):
+    assert float(dt.Cardan(**{**BASE, "beta": value}).beta) == 0.5
+    scene = {"system": "cardan", "analysis": "floquet", "axes": {"Omega": [1.0]}, "fixed": {**BASE, "beta": value}}
+    del scene["fixed"]["Omega"]
+    from drivetrain_jax.runs.scene import load_scene
+
+    assert load_scene(scene).fixed["beta"] == 0.5
+
+
+def test_columns_and_lists_are_axes():
+    shaft = dt.Cardan(**BASE)
+    for values in ([0.1, 0.2], (Fraction(1, 10), Fraction(1, 5)), TABLE["beta"], np.array([0.1, 0.2])):
+        assert dt.sweep(lambda s: s.beta, shaft, over={"beta": values}).beta.values.tolist() == [0.1, 0.2]
+    for values in (TABLE, [1j], [[0.1]], 0.1, Path("beta.csv"), None):
+        with pytest.raises(dt.InputError, match=r"^over\.beta"):
+            dt.sweep(lambda s: s.beta, shaft, over={"beta": values})
+
+
+def test_an_axis_takes_the_place_of_a_fixed_value():
+    from drivetrain_jax.runs.scene import load_scene
+
+    scene = load_scene("scene.toml", {"axes.zeta": [0.0, 0.001]})
+    assert [axis.name for axis in scene.axes] == ["beta", "Omega", "zeta"] and "zeta" not in scene.fixed
+
+
+def test_a_home_folder_may_be_written_as_one(monkeypatch, folder, capsys):
+    monkeypatch.setenv("HOME", str(folder))
+    assert main(["status", "~/scene.toml", "--out=~/r.nc"]) == 0
+    assert "absent: 0 of 9" in capsys.readouterr().out
+    with pytest.raises(dt.InputError, match=str(folder)):
+        dt.open_result("~/r.nc")
+
+
+def test_a_point_that_has_not_converged_names_the_option():
+    gears = {"omega": 0.7, "B0": 0.05, "B1": 0.03, "b": 0.17, "c": 1e-5, "alpha": 0.25, "k": 1.0, "I": 1.0}
+    found = dt.point("rattle", "steady_state", **gears, most_periods=64)
+    assert found.outcome.name == "NOT_CONVERGED"
+    assert "not_converged (a larger most_periods than 64 may help)" in repr(found)

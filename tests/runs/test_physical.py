@@ -1,0 +1,181 @@
+"""Physical data in scenes: axes, points and fixed values, of every system."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import drivetrain_jax as dt
+from drivetrain_jax.runs.scene import load_scene
+
+# A truck's propeller shaft.
+TRUCK = {"J1": 2, "J2": 0.5, "k1": "6e4 N m/rad", "k2": 4e4, "c1": 0.3464, "c2": 0.1414}
+GEARS = {
+    **{"J_x": 0.02, "J_y": 0.08, "r_x": "50 mm", "r_y": "100 mm", "torque_mean": 50, "torque_amplitude": 30},
+    **{"order": 2, "backlash": "0.1 mm", "mesh_stiffness": 2e8, "damping_ratio": 0.05, "alpha": 0},
+}
+SHAFT = {
+    **{"length": ["300 mm", "1200 mm", "300 mm"], "outer_diameter": ["60 mm", "90 mm", "60 mm"]},
+    **{"inner_diameter": [0, "82 mm", 0], "material": "steel", "k_A": 5e6, "k_D": 5e6},
+}
+
+
+def cardan(analysis="floquet", **tables):
+    return {"system": "cardan", "analysis": analysis, **tables}
+
+
+def refused(scene):
+    with pytest.raises(dt.InputError) as error:
+        load_scene(scene)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_a_chart_in_rpm_and_degrees(tmp_path):
+    edges = [1421, 1422, 1429, 1430, 2270, 2271, 2288, 2289, 3126, 3127, 3142, 3143]
+    scene = cardan(axes={"angle": ["12 deg"], "speed": {"values": edges}}, fixed=TRUCK)
+    dt.run(scene, out=tmp_path / "r.nc")
+    chart = xr.open_dataset(tmp_path / "r.nc", engine="h5netcdf")
+    assert chart.verdict.dims == ("angle", "speed") and chart.speed.attrs["units"] == "rpm"
+    assert chart.verdict.values[0].tolist() == [0, 1, 1, 0] * 3
+    assert chart.Omega.dims == ("speed",) and chart.beta.dims == ("angle",)
+    assert chart.Omega.values == pytest.approx(np.array(edges) * math.pi / 30 * math.sqrt(2 / 6e4), rel=1e-14)
+    assert json.loads(chart.attrs["roles"]) == {"speed": "speed", "angle": "angle", "damping": "zeta"}
+    assert json.loads(chart.attrs["physical_data"])["J2"]["value"] == 0.5
+    again = dt.run(scene, out=tmp_path / "r.nc")
+    assert again.attrs["digest"] == chart.attrs["digest"]
+
+
+def test_an_axis_keeps_the_unit_in_which_it_is_given():
+    scene = load_scene(
+        cardan(axes={"speed": {"start": "10 Hz", "stop": "3000 rpm", "num": 3}}, fixed=TRUCK | {"angle": 12})
+    )
+    (axis,) = scene.axes
+    assert axis.shown.values.tolist() == [10, 30, 50] and axis.shown.parameter.units == "Hz"
+    assert axis.values == pytest.approx(np.array([10, 30, 50]) * 2 * math.pi * math.sqrt(2 / 6e4), rel=1e-14)
+
+
+def test_one_quantity_may_change_several_parameters():
+    scene = cardan("forced", axes={"J1": [1.0, 2.0]}, fixed=TRUCK | {"angle": 12, "speed": 1000}, outputs=["amplitude"])
+    del scene["fixed"]["J1"]
+    found = dt.run(scene)
+    assert found.amplitude.dims == ("J1", "shaft")
+    assert all(found[name].dims == ("J1",) for name in ("Omega", "zeta", "gamma"))
+    for i, inertia in enumerate((1.0, 2.0)):
+        alone = dt.forced(
+            dt.Cardan.from_physical(**TRUCK | {"J1": inertia}, angle=12, speed=1000), outputs=["amplitude"]
+        )
+        assert found.amplitude.values[i] == pytest.approx(np.asarray(alone.amplitude), rel=1e-9)
+
+
+def test_points_may_vary_any_data():
+    points = {"speed": [1425, 1000], "J1": [2.0, 1.0], "angle": ["12 deg", 10]}
+    fixed = {name: value for name, value in TRUCK.items() if name != "J1"}
+    found = dt.run(cardan(points=points, fixed=fixed, outputs=["spectral_radius"]))
+    assert found.spectral_radius.dims == ("point",) and found.J1.values.tolist() == [2.0, 1.0]
+    assert found.angle.attrs["units"] == "deg" and found.gamma.values.tolist() == [0.25, 0.5]
+    one = dt.point("cardan", "floquet", **fixed, J1=1.0, speed=1000, angle=10).spectral_radius
+    assert found.spectral_radius.values[1] == pytest.approx(one, rel=1e-9)
+
+
+def test_what_is_wrong_with_data_of_a_scene():
+    speed = {"speed": [100, 200]}
+    assert refused(cardan(axes=speed, fixed={"angle": 3})).startswith(
+        "J1: missing; Omega = speed sqrt(J1/k1) needs J1 and"
+    )
+    both = refused(
+        cardan(axes=speed | {"J1": [1, 2]}, fixed={n: v for n, v in TRUCK.items() if n != "J1"} | {"angle": 3})
+    )
+    assert both == "axes.J1: changes Omega together with speed; allowed is one of them as an axis, or both in [points]"
+    assert "allowed is one of the two" in refused(cardan(axes=speed, fixed=TRUCK | {"angle": 3, "beta": 0.1}))
+    unused = {"beta": 0.1, "Omega": 1.0, "zeta": 0.0, "alpha": 1.0, "mu": 1.0, "gamma": 1.0, "J1": 2}
+    assert refused(cardan(axes={}, fixed=unused)).startswith("J1: nothing follows from it (Omega needs speed, J1, k1;")
+    assert "or physical data: angle" in refused(cardan(axes=speed, fixed=TRUCK))
+    ranges = {"c1": {"start": 0.1, "stop": 1}}
+    fixed = {name: value for name, value in TRUCK.items() if name != "c1"} | {"angle": 3, "speed": 100}
+    assert refused(cardan("atlas", axes=ranges, fixed=fixed)).startswith(
+        "axes.c1: changes zeta, alpha together; an atlas"
+    )
+    with pytest.raises(dt.InputError, match=r"axes\.c1 changes zeta, alpha together; allowed are auto and direct"):
+        dt.run(cardan(axes={"c1": [0.1, 0.2]}, fixed=fixed, options={"method": "atlas"}))
+
+
+def test_gears_rest_where_the_mean_torque_presses_them():
+    """Without a harmonic torque: u = b + T/(r_x k). The parameters: two rigid gears, the load balances the mean torque."""
+    gears = dt.Rattle.from_physical(**GEARS, speed=3000)
+    assert gears.omega == pytest.approx(2 * 100 * math.pi) and gears.b == pytest.approx(5e-5)
+    assert 1 / gears.I == pytest.approx(0.05**2 / 0.02 + 0.1**2 / 0.08)
+    assert gears.B1 == pytest.approx(30 * 0.05 / 0.02) and gears.c == pytest.approx(2 * 0.05 * math.sqrt(2e8 * gears.I))
+    found = dt.point(
+        "rattle", "steady_state", **GEARS | {"torque_amplitude": 0}, speed=3000, outputs=["u_max", "u_min"]
+    )
+    assert [found.u_max, found.u_min] == pytest.approx([5e-5 + 50 / (0.05 * 2e8)] * 2, rel=1e-9)
+
+
+def test_two_gears_move_as_the_oscillator():
+    """The accelerations of both gears in contact, from Newton's law with the load torque on the driven one."""
+    gears, u, v = dt.Rattle.from_physical(**GEARS, speed=3000), 7e-5, 1e-3
+    force = 2e8 * (u - 5e-5) + gears.c * v
+    t, load = 0.3, 50 * 0.1 / 0.05
+    driving = (50 + 30 * math.cos(gears.omega * t) - 0.05 * force) / 0.02
+    driven = (0.1 * force - load) / 0.08
+    found = gears.vector_field(t, np.array([u, v]))
+    assert float(found[1]) == pytest.approx(0.05 * driving - 0.1 * driven, rel=1e-12)
+
+
+def test_a_frequency_response_over_the_speed():
+    scene = {"system": "rattle", "analysis": "frequency_response", "fixed": GEARS, "outputs": ["u_max"]}
+    found = dt.run({**scene, "axes": {"speed": {"start": 600, "stop": 6000, "num": 5}}})
+    assert found.u_max.dims == ("speed", "sweep_direction")
+    assert found.omega.values == pytest.approx(found.speed.values * 2 * math.pi / 30, rel=1e-14)
+    message = refused({**scene, "axes": {"k": [1e8, 2e8]}, "fixed": GEARS | {"speed": 600}})
+    assert message == "k = axis k: given besides mesh_stiffness; allowed is one of the two"
+
+
+def test_a_stepped_steel_shaft():
+    found = dt.point("bicardan", "critical_speeds", **SHAFT, modes=3, outputs=["critical_speed"])
+    assert found.critical_speed == pytest.approx([3646, 8088, 13019], rel=2e-4)
+    shaft = dt.Bicardan.from_physical(**SHAFT)
+    second = math.pi / 64 * (0.09**4 - 0.082**4)
+    assert shaft.EI[1] == pytest.approx(2.1e11 * second) and shaft.rhoI[1] == pytest.approx(7850 * second)
+    assert shaft.rhoA[0] == pytest.approx(7850 * math.pi / 4 * 0.06**2)
+    # Cowper: 6 (1 + nu)/(7 + 6 nu) of a solid circle.
+    assert shaft.kGA[0] == pytest.approx(7.8 / 8.8 * 2.1e11 / 2.6 * math.pi / 4 * 0.06**2)
+    euler = dt.Bicardan.from_physical(**{n: v for n, v in SHAFT.items() if n != "material"}, E="210 GPa", density=7850)
+    assert euler.kGA == () and euler.rhoI == () and euler.EI == pytest.approx(shaft.EI)
+
+
+def test_one_diameter_may_vary():
+    scene = {"system": "bicardan", "analysis": "critical_speeds", "axes": {"outer_diameter[1]": ["90 mm", "100 mm"]}}
+    found = dt.run({**scene, "fixed": SHAFT, "options": {"modes": 1}, "outputs": ["critical_speed"]})
+    assert found.critical_speed.dims == ("outer_diameter_1", "mode") and found.outer_diameter_1.values.tolist() == [
+        90,
+        100,
+    ]
+    assert found.EI_1.dims == ("outer_diameter_1",) and found.EI_1.attrs["parameter"] == "EI[1]"
+    wide = dt.point("bicardan", "critical_speeds", **SHAFT | {"outer_diameter": [0.06, 0.1, 0.06]}, modes=1)
+    assert found.critical_speed.values[1] == pytest.approx(wide.critical_speed, rel=1e-9)
+
+
+def test_a_length_that_looks_like_millimetres_is_warned_of():
+    with pytest.warns(UserWarning, match=r'^length\[1\] = 900 m: more than 100 m; is "900 mm" meant\?$'):
+        dt.Bicardan(length=[0.3, 900], EI=[1e4, 1e4], rhoA=[15, 15], k_A=1e6, k_D=1e6)
+
+
+def test_teeth_give_orders_and_phases():
+    found = dt.run(
+        {"system": "planetary", "analysis": "modes", "fixed": {"teeth": [20, 26, 72]}, "axes": {"k_sp": [5e8]}}
+    )
+    data = json.loads(found.attrs["physical_data"])
+    assert data["carrier_order"]["value"] == 72 and data["sun_order"]["value"] == pytest.approx(72 * 20 / 92)
+    angles = [0.0, 1.0, 2.1, 4.4]
+    gear = dt.Planetary.from_physical(teeth=[20, 26, 72], planet_angle=angles)
+    turns = np.array([np.exp(1j * np.array(gear.phase_s)), np.exp(1j * np.array(gear.phase_r))])
+    assert turns == pytest.approx(np.exp(1j * np.outer([-20, 72], angles)))
+    assert "teeth = [20, 60, 72]" in refused(
+        {"system": "planetary", "analysis": "modes", "fixed": {"teeth": [20, 60, 72]}, "axes": {"k_sp": [5e8]}}
+    )
