@@ -97,4 +97,5 @@ def test_no_threshold_is_drawn_over_the_amplitude_of_an_unbalance():
     scene = {"system": "rattle", "analysis": "steady_state", "outputs": ["u_max"], "axes": {"B1": [0.01, 0.02, 0.03]}}
     fixed = {name: value for name, value in by_hand(0.7).items() if name != "B1"} | {"omega": 0.7}
     assert dt.run(scene | {"fixed": fixed}).drivetrain.resonances() is not None
-    assert dt.run(scene | {"fixed": fixed | {"unbalance": 0.01}}).drivetrain.resonances() is None
+    with pytest.raises(InputError, match="none are predicted"):
+        dt.run(scene | {"fixed": fixed | {"unbalance": 0.01}}).drivetrain.resonances()
