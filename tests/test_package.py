@@ -67,8 +67,10 @@ def test_the_wheel_holds_the_scenes_and_the_marker_of_types(wheel):
 
 
 def test_every_module_is_in_the_wheel(wheel):
-    held = {name for name in zipfile.ZipFile(wheel).namelist() if name.endswith(".py")}
-    assert held == {str(path.relative_to(ROOT)) for path in (ROOT / "drivetrain_jax").rglob("*.py")}
+    endings = (".py", ".js", ".css", ".html")
+    held = {name for name in zipfile.ZipFile(wheel).namelist() if name.endswith(endings)}
+    files = [path for path in (ROOT / "drivetrain_jax").rglob("*") if path.suffix in endings]
+    assert held == {str(path.relative_to(ROOT)) for path in files} and len(files) > 250
 
 
 def test_scenes_run_by_name_in_an_empty_folder(installed, tmp_path):
