@@ -216,7 +216,7 @@ function coefficientsOf(panel, band, piece, rows) {
   return { e, bounds };
 }
 
-/** What interpolation between the rows of a box leaves out. */
+/** The error of interpolation between the rows of a box. */
 function betweenRows(e, at, width, piece) {
   let most = 0;
   for (let c = 0; c < width; c++) most = Math.max(most, leftOut(e, at + c, 3 * width));

@@ -86,7 +86,7 @@ function remember(text) {
   }
 }
 
-/** What charts and controls do to the state. */
+/** Changes of the state that charts and controls ask for. */
 function actions(app) {
   const { atlas } = app, of = (k) => atlas.parameters[k];
   const clamp = (k, value) => Math.min(Math.max(value, of(k).lower), of(k).upper);

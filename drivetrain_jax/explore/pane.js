@@ -39,7 +39,7 @@ function axesOf(app, pane) {
   return [{ factor: 1, lower: low - room, upper: high + room, label: "spectral radius" }, ...axes];
 }
 
-/** What the marks of a chart are made from. */
+/** The contents of a chart: axes, curves, lines, bands. */
 export function chartOf(app, pane) {
   const [ay, ax] = axesOf(app, pane), { grid } = pane, line = ay.k === undefined;
   const part = (axis, value) => (value - axis.lower) / (axis.upper - axis.lower);

@@ -98,7 +98,7 @@ class Browser:
             time.sleep(0.03)
 
     def problems(self) -> list[str]:
-        """What the page has thrown or complained about, and what it has asked of a network."""
+        """Exceptions and complaints of the page, and its requests to a network."""
         found = []
         for event in self.events:
             method, params = event.get("method"), event.get("params", {})

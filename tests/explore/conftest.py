@@ -88,7 +88,7 @@ def atlases(tmp_path_factory):
 
 
 def node(*arguments: Any) -> Any:
-    """What ``ask.mjs`` prints, from JSON; skips the test without Node."""
+    """The answer of ``ask.mjs``, from JSON; skips the test without Node."""
     if NODE is None:
         pytest.skip("no node on this machine: the modules of the page are tested where there is one")
     done = subprocess.run([NODE, str(SCRIPT), *map(str, arguments)], capture_output=True, text=True, check=False)
