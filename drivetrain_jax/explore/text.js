@@ -14,7 +14,7 @@ export function labelText(label) {
   return parts[1] + sign + [...parts[3]].map((digit) => "₀₁₂₃₄₅₆₇₈₉"[digit]).join("");
 }
 
-/** How a parameter is shown: its unit and the factor from the atlas's number to the reader's. */
+/** The unit in which a parameter is shown, and the factor from the atlas's number to the reader's. */
 export function unitOf(parameter, units) {
   if (parameter.units === "rad" && units.angle === "deg") return { unit: "°", factor: 180 / Math.PI };
   const base = baseFrequency(units);
