@@ -34,7 +34,7 @@ class OutputState:
     """
 
     def __init__(self, out: Path, job: Job, store: str | None = None) -> None:
-        self.out = out = behind_link(out)
+        self.out = out = behind_link(out.expanduser())
         self.parts = PartsFolder(out)
         _check_name(out, self.parts)
         _check_parts(out, self.parts.path)

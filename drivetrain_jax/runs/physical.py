@@ -11,6 +11,7 @@ import numpy as np
 from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter
+from drivetrain_jax._wording import shown
 from drivetrain_jax.analysis.request import checked
 from drivetrain_jax.runs.axes import Axis, entry_of
 from drivetrain_jax.systems import PhysicalData, System
@@ -157,8 +158,12 @@ def _numbers(parameter: Parameter, value: Any, physical: bool) -> Any:
         return tuple(_numbers(parameter, end, physical) for end in value)
     if isinstance(value, list) and any(isinstance(entry, str) for entry in value):
         return np.array([checked(parameter, entry, "") for entry in value])
-    if np.ndim(value):
-        for extreme in (np.min(value), np.max(value)) if physical and np.size(value) else ():
-            checked(parameter, float(extreme), "")
-        return value
-    return checked(parameter, value, "") if physical or isinstance(value, str) else value
+    if not physical or isinstance(value, (str, int, float)):
+        return checked(parameter, value, "") if physical or isinstance(value, str) else value
+    try:
+        numbers = np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{parameter.name} = {shown(value)}: allowed are numbers, {parameter.allowed}") from None
+    for extreme in (numbers.min(), numbers.max()) if numbers.size else ():
+        checked(parameter, float(extreme), "")
+    return value if hasattr(value, "ndim") else numbers

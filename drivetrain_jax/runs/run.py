@@ -83,9 +83,8 @@ def run(
     with shown_progress(report) as shown:
         if out is None:
             return _in_memory(_job(scene, overrides, on_disk=False), executor, shown)
-        out = Path(out).expanduser()
-        run_to_file(scene, out, overrides=overrides, fresh=fresh, executor=executor, reuse=reuse, report=shown)
-    return open_result(out)
+        run_to_file(scene, Path(out), overrides=overrides, fresh=fresh, executor=executor, reuse=reuse, report=shown)
+    return open_result(Path(out))
 
 
 def run_to_file(

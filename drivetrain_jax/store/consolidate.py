@@ -147,6 +147,7 @@ def open_result(path: Path) -> xr.Dataset:
     """The result at ``path``, loaded into memory; ``InputError`` if it is missing or not readable."""
     import xarray as xr
 
+    path = path.expanduser()
     if not path.exists():
         raise InputError(f"file = {str(path)!r}: does not exist; give a result written by `drivetrain run`")
     read_attribute(path, "digest")

@@ -319,7 +319,7 @@ def test_a_file_of_other_coordinates_is_refused(stored):
         ({"beta": 0.3}, "Omega: missing; allowed is 1 <= Omega <= 2"),
         ({"beta": 0.3, "Omega": 2.5}, "Omega = 2.5: allowed is 1 <= Omega <= 2"),
         ({"beta": [0.3, np.nan], "Omega": 1.5}, "beta = nan: allowed is 0 <= beta <= 0.6, in rad"),
-        ({"beta": "0.3", "Omega": 1.5}, "beta = '0.3': allowed are numbers"),
+        ({"beta": "deg", "Omega": 1.5}, "beta = 'deg': allowed is a number, -1.570796327 < beta < 1.570796327"),
         ({"beta": None, "Omega": 1.5}, "beta = None: allowed are numbers"),
         ({"beta": [[0.1], [0.1, 0.2]], "Omega": 1.5}, "beta = [[0.1], [0.1, 0.2]]: allowed are numbers"),
         (
@@ -383,12 +383,28 @@ def test_the_same_point_in_physical_units(atlas):
 def test_the_parameter_of_the_answer_is_not_given(atlas):
     shaft = {"J1": 2.0, "J2": 200.0, "k1": 1000.0, "k2": 1000.0, "c1": 0.0894427191, "c2": 0.0894427191}
     refused = "is the answer; allowed is to leave it out"
-    with pytest.raises(dt.InputError, match=f"^Omega = 1.1:1.2: {refused}$"):
-        atlas_answers.speed_windows(atlas, {"beta": 0.31, "Omega": (1.1, 1.2)})
-    with pytest.raises(dt.InputError, match=f"^speed = 250:260: {refused}$"):
-        atlas_answers.speed_windows(atlas, {**shaft, "angle": 10.0, "speed": (250.0, 260.0)})
+    with pytest.raises(dt.InputError, match=f"^Omega = 1.1: {refused}, or LOW:HIGH$"):
+        atlas_answers.speed_windows(atlas, {"beta": 0.31, "Omega": 1.1})
+    with pytest.raises(dt.InputError, match=f"^speed = 250: {refused}, or LOW:HIGH$"):
+        atlas_answers.speed_windows(atlas, {**shaft, "angle": 10.0, "speed": 250.0})
     with pytest.raises(dt.InputError, match=f"^angle = 20: {refused}$"):
         atlas_answers.widest_angle(atlas, {**shaft, "speed": (250.0, 260.0), "angle": 20.0})
+
+
+def test_a_range_of_speeds_restricts_the_windows(atlas):
+    (window,) = atlas_answers.speed_windows(atlas, {"beta": "0.31 rad", "Omega": (1.1, 1.2)}).data["windows"]
+    assert window["safe"] == [1.1, 1.2] and [end["kind"] for end in window["ends"]] == ["range", "range"]
+    assert window["check"]["agrees"]
+
+
+def test_physical_arrays_and_four_digits(atlas):
+    """A fixed parameter may be typed with four digits: mu = 1.0002 is the 1 of the atlas."""
+    shaft = {"J1": 2.0, "J2": 200.0, "k1": 1000.0, "k2": 1000.2, "c1": 0.08944, "c2": 0.08944}
+    found = atlas(**shaft, speed=np.array([250.0, 260.0]), angle="10 deg")
+    exact = np.array([250.0, 260.0]) * np.pi / 30 / np.sqrt(500)
+    assert found.Omega.values == pytest.approx(exact) and found.beta.values == pytest.approx(np.radians(10))
+    with pytest.raises(dt.InputError, match=r"^mu = 1\.002: the atlas is made for mu = 1"):
+        atlas(**shaft | {"k2": 1002.0}, speed=250.0, angle=10)
 
 
 def test_design_answers_are_checked_by_direct_solves(atlas):
