@@ -83,7 +83,7 @@ def _section(path: Path, number: int) -> Section:
     return Section(
         title=str(attrs.get("title") or path.name),
         file=path.name,
-        statements=[*answers, *statements(handy)],
+        statements=[*answers, *statements(handy, ranges=not answers)],
         axes=axes_table(handy),
         fixed=fixed_table(dataset),
         values=values_table(handy),

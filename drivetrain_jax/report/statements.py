@@ -22,10 +22,10 @@ _MOST = 8
 _PLAIN = ("_error", "_residual", "_number", "_certified")
 
 
-def statements(dataset: xr.Dataset) -> list[str]:
-    """Sentences about ``dataset``, verdicts first."""
+def statements(dataset: xr.Dataset, ranges: bool = True) -> list[str]:
+    """Sentences about ``dataset``, verdicts first; without ``ranges`` only the shares of verdicts."""
     coded = [v for v in _coded(dataset) if v.name != "outcome"]
-    said = [sentence for variable in coded for sentence in _about_codes(dataset, variable)]
+    said = [sentence for variable in coded for sentence in _about_codes(dataset, variable, ranges)]
     said += [sentence for variable in _numbers(dataset) for sentence in _about_numbers(dataset, variable)]
     return [*said, *_about_outcome(dataset), *_about_errors(dataset)]
 
@@ -42,8 +42,9 @@ def axes_table(dataset: xr.Dataset) -> list[tuple[str, ...]]:
 
 
 def fixed_table(dataset: xr.Dataset) -> list[tuple[str, ...]]:
-    """Rows of the fixed parameters: name, meaning, value, unit."""
-    fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}"))
+    """Rows of the physical data and of the fixed parameters: name, meaning, value, unit."""
+    attrs = dataset.attrs
+    fixed = json.loads(attrs.get("physical_data", "{}")) | json.loads(attrs.get("fixed_parameters", "{}"))
     return [
         (name, entry.get("long_name", ""), _digits(entry["value"]), written_units(entry.get("units", "1")))
         for name, entry in fixed.items()
@@ -83,7 +84,7 @@ def _meanings(variable: xr.DataArray) -> dict[int, str]:
     return dict(zip(np.atleast_1d(variable.attrs.get("flag_values", [])).tolist(), words, strict=False))
 
 
-def _about_codes(dataset: xr.Dataset, variable: xr.DataArray) -> Iterator[str]:
+def _about_codes(dataset: xr.Dataset, variable: xr.DataArray, ranges: bool) -> Iterator[str]:
     """The share of every meaning, and the ranges of the speed or of the only axis that have it."""
     meanings = _meanings(variable)
     name = str(variable.attrs.get("long_name", variable.name))

@@ -25,6 +25,7 @@ from drivetrain_jax.atlas.criteria import has_boundaries
 from drivetrain_jax.atlas.windows import Crossing, Interval, narrow
 from drivetrain_jax.runs.atlas_file import StoredAtlas
 from drivetrain_jax.runs.atlas_question import AtlasQuery, Range, number, roles_of
+from drivetrain_jax.runs.growth_text import growth_at, growth_lines
 from drivetrain_jax.systems import System
 
 # Distance of a spectral radius from 1 below which the distance itself is printed.
@@ -74,19 +75,18 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
     slopes = radius_gradient(atlas.scene.system, {**atlas.fixed, **point})
     panels, system = atlas.stability.atlas, atlas.scene.system
     nearest = design.nearest_boundaries(panels, system, point) if has_boundaries(panels, system) else ()
-    lines = [f"{system.name} atlas, {asked.heading()}", *rows, *_gradient_lines(atlas, slopes)]
+    grows = growth_at(asked, results)
+    lines = [f"{system.name} atlas, {asked.heading()}", *rows, *growth_lines(grows), *_gradient_lines(atlas, slopes)]
     lines += ["nearest change of stability"] if nearest or not panels.panels else []
     lines += [] if panels.panels else [f"  unknown: the atlas has no panel ({panels.gaps[0].reason})"]
-    for each in nearest:
-        sides = [_side(asked, each.parameter, each.value, c) for c in (each.below, each.above) if c]
-        lines.append(f"  {each.parameter:<24} {'; '.join(sides) or _reach(atlas, each)}")
-        lines += [f"  {'':<24} undecided from {number(a)} to {number(b)}" for a, b in each.undecided]
+    lines += [line for each in nearest for line in _nearest_lines(asked, each)]
     data = {
         "system": atlas.scene.system.name,
         "parameters": {**atlas.fixed, **point},
         "physical": asked.physical(point),
         "values": results,
         "meanings": {n: variables[n].flags[int(v)] for n, v in results.items() if variables[n].flags},
+        **({"growth": grows} if grows else {}),
         "gradient": slopes,
         "nearest": {
             each.parameter: {
@@ -283,6 +283,12 @@ def _gradient_lines(atlas: StoredAtlas, slopes: Mapping[str, float] | None) -> l
             for name, value in slopes.items()
         ),
     ]
+
+
+def _nearest_lines(asked: AtlasQuery, nearest: design.Nearest) -> list[str]:
+    sides = [_side(asked, nearest.parameter, nearest.value, c) for c in (nearest.below, nearest.above) if c]
+    lines = [f"  {nearest.parameter:<24} {'; '.join(sides) or _reach(asked.atlas, nearest)}"]
+    return lines + [f"  {'':<24} undecided from {number(a)} to {number(b)}" for a, b in nearest.undecided]
 
 
 def _side(asked: AtlasQuery, name: str, value: float, crossing: Crossing) -> str:

@@ -100,8 +100,9 @@ class System(eqx.Module):
     Traced values are not checked.
 
     Class attributes: ``name``, ``title`` and ``source``; ``presets``, named parameter sets of the source; ``resonances``,
-    the predicted ones; ``time_units``, the unit of time in its equations (``1``: nondimensional); ``physical``, the
-    physical data that parameters follow from, None without any; ``roles``, the names of the parameters that analyses and
+    the predicted ones; ``time_units``, the unit of time in its equations (``1``: nondimensional); ``periods_per_turn``, the
+    number of their periods in a turn of the shaft (0: unknown); ``physical``, the physical data that parameters follow from,
+    None without any; ``roles``, the names of the parameters that analyses and
     figures ask for, see below; ``state``, the components of its state, and ``displacements``, the dimension of those whose
     amplitudes ``forced`` reports; ``mode_families``, names of the families of ``modes`` by their codes. ``parameters`` and
     ``models`` follow from fields and methods. A model for ``atlas`` without one for ``floquet``, or for ``history`` or
@@ -118,6 +119,7 @@ class System(eqx.Module):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({})
     resonances: ClassVar[Resonances | None] = None
     time_units: ClassVar[str] = "1"
+    periods_per_turn: ClassVar[int] = 0
     physical: ClassVar[PhysicalData | None] = None
     roles: ClassVar[Mapping[str, str]] = MappingProxyType({})
     state: ClassVar[tuple[Component, ...]] = ()

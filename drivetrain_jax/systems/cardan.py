@@ -89,6 +89,7 @@ class Cardan(System):
     """
 
     name = "cardan"
+    periods_per_turn = 2
     title = "Cardan (Hooke-joint) shaft"
     source = "Soltan Rezaee & Ghazavi, Modares Mechanical Engineering 14(12), 2014, 163-170"
     presets = PRESETS

@@ -136,7 +136,11 @@ def caption(dataset: xr.Dataset) -> str:
 
     Joined results may differ in their fixed parameters, so only their coordinates are shown.
     """
-    fixed, given = json.loads(dataset.attrs.get("fixed_parameters", "{}")), _given(dataset)
+    given = _given(dataset)
+    # Physical data are shown as they were given, in place of the parameters that follow from them.
+    fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}")) | json.loads(
+        dataset.attrs.get("physical_data", "{}")
+    )
     named = set().union(*given.values())
     scalars = {
         str(name): c for name, c in dataset.coords.items() if c.ndim == 0 and _says_something(str(name), c, fixed)
