@@ -191,7 +191,7 @@ def _fixed(
         others = f" (missing too: {', '.join(p.name for p in missing[1:])})" if missing[1:] else ""
         data = system.physical.source(missing[0].name) if system.physical else ""
         either = f", or physical data: {data}" if data else ""
-        raise InputError(f"fixed.{missing[0].name}: missing; allowed is {missing[0].allowed_in_units}{either}{others}")
+        raise InputError(f"fixed.{missing[0].name}: missing; allowed is {missing[0].allowed_in_units}{others}{either}")
     for axis in axes:
         for part in axis.together:
             _check_entry(part, fixed, where)
