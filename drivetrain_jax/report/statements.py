@@ -93,7 +93,7 @@ def _about_codes(dataset: xr.Dataset, variable: xr.DataArray, ranges: bool) -> I
         return
     shares = {word: float(np.mean(variable.values == code)) for code, word in meanings.items()}
     yield f"{_capital(name)}: " + ", ".join(f"{word} {_share(share)}" for word, share in shares.items() if share) + "."
-    axis = _main_axis(dataset, variable)
+    axis = _main_axis(dataset, variable) if ranges else None
     if shares.get("undecided"):
         yield "Undecided points lie closer to the limit than their error bound: compute them again with a smaller rtol."
     if axis is None:
