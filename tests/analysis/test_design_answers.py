@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivetrain_jax.analysis.critical_speeds.margins import required_margin, separation_margins
+import drivetrain_jax as dt
+from drivetrain_jax.analysis.critical_speeds.margins import required_margin
 from drivetrain_jax.analysis.floquet.growth import growth
 
 
@@ -29,17 +30,21 @@ def test_neither_growth_nor_an_immediate_end_divides_by_zero():
 
 def test_required_margin_of_api_617():
     """None below 2.5; from there 17 (1 - 1/(AF - 1.5)) percent, and 10 more above the range; at most 17 and 27."""
-    np.testing.assert_allclose(required_margin([1.0, 2.49, 2.5, 3.5, 1e9], False), [0, 0, 0, 0.085, 0.17], atol=1e-9)
-    np.testing.assert_allclose(required_margin([1.0, 2.49, 2.5, 3.5, 1e9], True), [0, 0, 0.1, 0.185, 0.27], atol=1e-9)
+    factors = np.array([1.0, 2.49, 2.5, 3.5, 1e9])
+    np.testing.assert_allclose(required_margin(2999.0, 3000.0, factors), [0, 0, 0, 0.085, 0.17], atol=1e-9)
+    np.testing.assert_allclose(required_margin(8000.0, 3000.0, factors), [0, 0, 0.1, 0.185, 0.27], atol=1e-9)
 
 
 def test_margins_of_a_stepped_shaft():
-    """Critical speeds 3646, 8088 rpm against 3000-4500 rpm: the first is within."""
-    found = separation_margins([2400.0, 3646.0, 8088.0, np.inf], 3000.0, 4500.0, [0.2, 0.0, 0.8, 0.2])
-    np.testing.assert_allclose(found.actual, [0.2, 0.0, 8088 / 4500 - 1, np.inf])
-    assert found.kept.tolist() == [True, False, False, True]
-
-
-def test_operating_speeds_must_be_a_range():
-    with pytest.raises(ValueError, match="lowest = 5: allowed is 0 < lowest <= highest = 3"):
-        separation_margins([1.0], 5.0, 3.0, 0.1)
+    """The critical speeds 3646, 8088 rpm against 3000-4500 rpm: the first is within."""
+    shaft = dt.Bicardan(
+        length=(0.3, 1.2, 0.3), EI=(133596.0, 210268.0, 133596.0), rhoA=(22.2, 8.48, 22.2), k_A=5e6, k_D=5e6
+    )
+    outputs = ["critical_speed", "separation_margin", "required_margin"]
+    options = {"operating_min": 3000.0, "operating_max": 4500.0, "amplification": 10.0, "modes": 2}
+    found = dt.critical_speeds(shaft, outputs=outputs, **options)
+    assert 3000 < found.critical_speed[0] < 4500 < found.critical_speed[1]
+    np.testing.assert_allclose(found.separation_margin, [0.0, found.critical_speed[1] / 4500 - 1], rtol=1e-14)
+    np.testing.assert_allclose(found.required_margin, 0.25, rtol=1e-14)
+    with pytest.raises(dt.InputError, match=r"^amplification: missing; required_margin needs"):
+        dt.critical_speeds(shaft, outputs=outputs, **(options | {"amplification": 0.0}))

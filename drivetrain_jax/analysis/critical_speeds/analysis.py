@@ -34,6 +34,7 @@ from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.critical_speeds import frequency_roots as shaft_roots
 from drivetrain_jax.analysis.critical_speeds import krylov as shaft_krylov
 from drivetrain_jax.analysis.critical_speeds.frequency_roots import Roots, frequency_derivatives
+from drivetrain_jax.analysis.critical_speeds.margins import required_margin, separation_margin
 from drivetrain_jax.analysis.critical_speeds.mechanisms import is_undefined, mechanism_shapes, zero_modes
 from drivetrain_jax.analysis.critical_speeds.shapes import mode_shapes, normalised
 from drivetrain_jax.analysis.numerics.lanes import Constants
@@ -50,6 +51,7 @@ VARIABLES = (
     Variable(
         "separation_margin", "1", "distance of the critical speed from the operating speeds, over them", ("mode",)
     ),
+    Variable("required_margin", "1", "distance that API 617 requires for the given amplification factor", ("mode",)),
     Variable("mode_shape", "1", "deflection of the mode, largest +1", ("mode", "x")),
 )
 OPTIONS = (
@@ -57,6 +59,7 @@ OPTIONS = (
     Parameter("stations", "1", "number of points of a mode shape", default=101, lower=2, upper=10001, integer=True),
     Parameter("operating_min", "rpm", "lowest operating speed", default=0.0, lower=0.0),
     Parameter("operating_max", "rpm", "highest operating speed (0: not given)", default=0.0, lower=0.0),
+    Parameter("amplification", "1", "amplification factor at the critical speeds", default=0.0, lower=0.0),
 )
 _OPTION_NAMES = tuple(option.name for option in OPTIONS)
 # Per rad/s.
@@ -73,15 +76,6 @@ _STATIONS_PER_CHUNK = 1 << 18
 Build = Callable[[Mapping[str, Any]], Shaft]
 
 
-def separation_margin(speed: Array, lowest: float, highest: float) -> Array:
-    """Distance of ``speed`` from the operating range [lowest, highest] over its nearer end; 0 within.
-
-    A critical speed below gives ``(lowest - n)/lowest``, one above ``(n - highest)/highest`` (as in API 617).
-    """
-    below = (lowest - speed) / (lowest if lowest > 0 else 1.0)
-    return jnp.maximum(jnp.maximum(below, (speed - highest) / highest), 0.0)
-
-
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     options = request.options
     if request.method == "krylov_determinant":
@@ -94,11 +88,14 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
         if 0.0 in np.ravel(fixed.get("rhoA", ())):
             raise InputError("fixed.rhoA: krylov_determinant needs mass in every segment; allowed is rhoA[i] > 0")
     low, high = options["operating_min"], options["operating_max"]
-    if high < low or (high == 0 and "separation_margin" in request.outputs):
+    margins = [name for name in ("separation_margin", "required_margin") if name in request.outputs]
+    if high < low or (high == 0 and margins):
         raise InputError(
-            f"options.operating_max = {high:g}: allowed for separation_margin is a speed > 0, at least "
-            f"operating_min = {low:g}"
+            f"options.operating_max = {high:g}: allowed for {margins[0] if margins else 'the operating speeds'} is a "
+            f"speed > 0, at least operating_min = {low:g}"
         )
+    if "required_margin" in margins and options["amplification"] == 0:
+        raise InputError("options.amplification: missing; required_margin needs the amplification factor, at least 1")
     dimensions = [Dimension("mode", "number of the mode", tuple(range(1, options["modes"] + 1)))]
     if "mode_shape" in request.outputs:
         x = tuple(float(value) for value in np.linspace(0.0, 1.0, options["stations"]))
@@ -142,6 +139,9 @@ def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Ar
     if "separation_margin" in request.outputs:
         low, high = options["operating_min"], options["operating_max"]
         results["separation_margin"] = separation_margin(results["critical_speed"], low, high)
+    if "required_margin" in request.outputs:
+        low, factor = options["operating_min"], options["amplification"]
+        results["required_margin"] = required_margin(results["critical_speed"], low, factor)
     if "mode_shape" in request.outputs:
         results["mode_shape"] = _shapes(shaft, roots, options["stations"])
     return {name: results[name] for name in (*request.outputs, "outcome")}
