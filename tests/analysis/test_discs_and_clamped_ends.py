@@ -22,6 +22,7 @@ from drivetrain_jax.systems import Shaft
 from tests.analysis.test_critical_speeds import check_identities
 from tests.analysis.test_shaft_shapes import everything, exact_node, exact_segment, random_discs
 from tests.oracles.bicardan_reference import complete, finite_elements, matrices
+from tests.sizes import full_after
 
 INF = math.inf
 MODES = 8
@@ -76,7 +77,7 @@ def counted(shaft: Shaft, q: jax.Array) -> jax.Array | None:
     return characteristic(shaft.arrays(), q).count
 
 
-@pytest.mark.parametrize("name", ENDS)
+@pytest.mark.parametrize("name", full_after(4, ENDS))
 def test_ends_of_a_uniform_bar(name):
     values, expected = ENDS[name]
     q, certified, _, zeros, _ = solve(bar(values))
@@ -97,7 +98,7 @@ def exact_frequency(v: Mapping, p: float) -> mp.mpf:
     return mp.findroot(determinant, ends, verify=False)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", full_after(4, CASES))
 def test_discs_springs_and_segments_without_mass(name):
     """Finite elements give the number of frequencies and their values, transfer matrices in 120 digits their digits."""
     values = CASES[name]
@@ -126,6 +127,7 @@ def test_a_disc_in_closed_form():
     assert np.all(np.isinf(q[2:]))
 
 
+@pytest.mark.full
 def test_no_root_is_missed_or_false():
     rng = np.random.default_rng(3)
     for _ in range(50):
@@ -138,6 +140,7 @@ def test_no_root_is_missed_or_false():
         assert near.all() and np.all(elements[:zeros] <= 1e-4 * elements[-1]), (values, q**2, elements)
 
 
+@pytest.mark.full
 def test_count_steps_by_one_at_every_frequency():
     for name in ("discs at elastic joints", "clamped, elastic joints", "no mass but discs, free", "shear"):
         shaft = everything(CASES[name])
@@ -146,7 +149,7 @@ def test_count_steps_by_one_at_every_frequency():
         assert np.all(above - below == 1) and np.all(np.diff(below) == 1), name
 
 
-@pytest.mark.parametrize("large", [1e12, 1e30, 1e100])
+@pytest.mark.parametrize("large", full_after(1, [1e100, 1e30, 1e12]))
 def test_limits_are_reached(large):
     """A stiff rotational spring clamps. A large inertia does so as well, apart from its own low frequency."""
     clamped = solve(everything(SHAFT | {"k_rot_A": INF, "k_D": INF, "k_rot_D": INF}))[0]
@@ -159,6 +162,7 @@ def test_limits_are_reached(large):
     assert 0 < heavy[0] < 1e3 * large**-0.25
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("rhoA", [1e-6, 1e-20])
 def test_frequencies_are_continuous_at_a_segment_without_mass(rhoA):
     for values in (DISCS, TWO_DISCS | {"I_joint": (0.4, 0.9), "rhoA": (0.0,) * 3}):
@@ -211,6 +215,7 @@ def test_gradients_obey_the_sum_identities(jacobians):
     check_identities(p, rows, ARGUMENTS)
 
 
+@pytest.mark.full
 def test_gradients_against_finite_differences(jacobians):
     """Fourth order in the logarithm; one-sided, from small steps, where a parameter is 0: a mass, a spring, an inertia."""
     p, rows = jacobians

@@ -11,6 +11,7 @@ import drivetrain_jax as dt
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.frequency_response.harmonic_balance import Basis, contact, residual
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
+from tests.sizes import full_after
 
 # So damped that every frequency has one motion; the teeth separate above 0.4 rad/s.
 GEARS = PRESETS["table1"] | {"c": 0.3, "B1": 0.0, "unbalance": 0.2}
@@ -18,8 +19,8 @@ FREQUENCIES = [0.4, 0.6, 0.8, 0.9, 1.0, 1.15]
 OUTPUTS = ["u_max", "u_min", "u_rms", "phase"]
 METHODS = {
     "exact": {},
-    "harmonic_balance": {"harmonics": 7},
     "multiple_scales": {},
+    "harmonic_balance": {"harmonics": 7},
     "averaging": {"fit_range": 0.3},
     "describing_function": {},
 }
@@ -37,7 +38,7 @@ def by_hand(omega: float) -> dict:
     return values
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", full_after(2, METHODS))
 def test_every_frequency_is_that_of_its_own_amplitude(method):
     """Also outside of scenes, and for a B1 of its own."""
     found = response(FREQUENCIES, method, B1=0.01)
@@ -67,7 +68,7 @@ def test_the_exact_response_is_that_of_steady_states():
                 np.testing.assert_allclose(found[name].sel(omega=omega), getattr(state, name), rtol=1e-10, err_msg=name)
 
 
-@pytest.mark.parametrize("method", ["exact", "harmonic_balance"])
+@pytest.mark.parametrize("method", full_after(1, ["exact", "harmonic_balance"]))
 def test_branches_follow_the_amplitude_between_the_frequencies(method):
     """Lightly damped: the motions that the sweeps find lie on the branch, and two of them coexist somewhere."""
     found = response(

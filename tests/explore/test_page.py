@@ -254,6 +254,7 @@ def count(pane):
 
 
 @needs_chromium
+@pytest.mark.full
 def test_two_charts_compare_two_dampings(browser, atlases, tmp_path):
     page = tmp_path / "three.html"
     page.write_text(atlases("three").explore().text)
@@ -274,6 +275,7 @@ def test_two_charts_compare_two_dampings(browser, atlases, tmp_path):
 
 
 @needs_chromium
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["one", "four", "mathieu"])
 def test_atlases_of_other_parameters_are_drawn(browser, atlases, tmp_path, name):
     page = tmp_path / f"{name}.html"
@@ -294,6 +296,7 @@ def test_hostile_words_run_nothing(browser, atlases, tmp_path):
 
 
 @needs_chromium
+@pytest.mark.full
 def test_the_page_works_in_a_frame_and_without_workers(browser, atlases, tmp_path):
     """A notebook shows a frame; its policy may forbid workers."""
     shown = atlases("two").explore()._repr_html_()
