@@ -228,14 +228,17 @@ def _physical(scene: Scene) -> dict[str, str]:
     return {"physical_data": json.dumps(about)}
 
 
+def _finite(value: Any) -> Any:
+    """``value`` for JSON, which has no infinity; the word "inf" is read by every parser of numbers."""
+    return str(value) if value == math.inf else value
+
+
 def result_attrs(scene: Scene) -> dict[str, str]:
     """Attributes of the result that do not depend on the single run."""
     fixed: dict[str, Any] = {}
     for name, value in scene.fixed.items():
         parameter = scene.system.parameter(name)
-        # JSON has no infinity; the word "inf" is read by every parser of numbers.
-        plain = str(value) if value == math.inf else value
-        fixed[name] = {"value": plain, "units": parameter.units, "long_name": parameter.long_name}
+        fixed[name] = {"value": _finite(value), "units": parameter.units, "long_name": parameter.long_name}
     installed, created, version = (
         provenance.versions((*PACKAGES, *_STORAGE)),
         provenance.now(),
@@ -253,7 +256,7 @@ def result_attrs(scene: Scene) -> dict[str, str]:
         **_drawn(scene.system),
         "analysis": scene.analysis.name,
         "method": scene.request.method,
-        "options": json.dumps(dict(scene.request.options)),
+        "options": json.dumps({name: _finite(value) for name, value in scene.request.options.items()}),
         "scene": scene.text,
         "fixed_parameters": json.dumps(fixed),
         **_physical(scene),

@@ -51,7 +51,7 @@ VARIABLES = (
     Variable(
         "separation_margin", "1", "distance of the critical speed from the operating speeds, over them", ("mode",)
     ),
-    Variable("required_margin", "1", "distance that API 617 requires for the given amplification factor", ("mode",)),
+    Variable("required_margin", "1", "separation margin that API 617 requires for the amplification factor", ("mode",)),
     Variable("mode_shape", "1", "deflection of the mode, largest +1", ("mode", "x")),
 )
 OPTIONS = (
@@ -59,7 +59,14 @@ OPTIONS = (
     Parameter("stations", "1", "number of points of a mode shape", default=101, lower=2, upper=10001, integer=True),
     Parameter("operating_min", "rpm", "lowest operating speed", default=0.0, lower=0.0),
     Parameter("operating_max", "rpm", "highest operating speed (0: not given)", default=0.0, lower=0.0),
-    Parameter("amplification", "1", "amplification factor at the critical speeds", default=0.0, lower=0.0),
+    Parameter(
+        "amplification",
+        "1",
+        "amplification factor at the critical speeds (inf: undamped)",
+        default=math.inf,
+        lower=1.0,
+        infinite=True,
+    ),
 )
 _OPTION_NAMES = tuple(option.name for option in OPTIONS)
 # Per rad/s.
@@ -94,8 +101,6 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
             f"options.operating_max = {high:g}: allowed for {margins[0] if margins else 'the operating speeds'} is a "
             f"speed > 0, at least operating_min = {low:g}"
         )
-    if "required_margin" in margins and options["amplification"] == 0:
-        raise InputError("options.amplification: missing; required_margin needs the amplification factor, at least 1")
     dimensions = [Dimension("mode", "number of the mode", tuple(range(1, options["modes"] + 1)))]
     if "mode_shape" in request.outputs:
         x = tuple(float(value) for value in np.linspace(0.0, 1.0, options["stations"]))

@@ -27,7 +27,7 @@ def required_margin(speed: Any, lowest: float, amplification: Any) -> Array:
     """The margin that API 617 requires of a critical ``speed`` with this ``amplification`` factor AF.
 
     ``17 (1 - 1/(AF - 1.5))`` percent below the operating range, 10 more within and above it, none for AF < 2.5. Models of
-    this package have no damping: the factor comes from a measurement or a damped model.
+    this package have no damping; a factor comes from a measurement or a damped model.
 
     >>> print(required_margin([1000.0, 9000.0], lowest=3000.0, amplification=10.0))
     [0.15 0.25]
