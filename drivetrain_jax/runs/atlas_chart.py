@@ -21,7 +21,8 @@ from drivetrain_jax.atlas.criteria import has_boundaries
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.tips import Tips, find_tips
 from drivetrain_jax.atlas.windows import narrow
-from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, open_atlas
+from drivetrain_jax.runs.atlas_file import StoredAtlas, open_atlas
+from drivetrain_jax.runs.atlas_values import as_given
 from drivetrain_jax.runs.axes import in_unit
 from drivetrain_jax.runs.physical import in_parameters
 from drivetrain_jax.systems import System

@@ -18,6 +18,7 @@ from drivetrain_jax.atlas import Atlas, StabilityAtlas, from_arrays, stability_a
 from drivetrain_jax.atlas.floquet import floquet_domain
 from drivetrain_jax.runs import compile_cache
 from drivetrain_jax.runs.assemble import ResultBuffer, result_attrs, to_dataset
+from drivetrain_jax.runs.atlas_values import as_given, broadcast, check_same
 from drivetrain_jax.runs.axes import Axis
 from drivetrain_jax.runs.executor import Threads
 from drivetrain_jax.runs.job import Job
@@ -53,8 +54,6 @@ _VARIABLES = {
 # Every atlas has a domain, and panels, gaps or both.
 _DOMAIN, _GAPS = ("lower", "upper"), ("gap_lower", "gap_upper", "gap_reason")
 _PANELS = tuple(name for name in _VARIABLES if name not in (*_DOMAIN, *_GAPS))
-# Relative tolerance within which a value equals a fixed parameter of an atlas.
-SAME_FIXED = 5e-4
 _ATTRIBUTES = ("scene", "coordinates_of_panels", "tolerance", "solves")
 
 
@@ -209,7 +208,7 @@ class StoredAtlas:
 
         values = self.in_parameters(values)
         checked = {name: self._checked(name, values) for name in self._names(values)}
-        columns = dict(zip(checked, _broadcast(checked), strict=True))
+        columns = dict(zip(checked, broadcast(checked), strict=True))
         whole = columns[self.parameters[0]]
         shape, dims = whole.shape, whole.dims
         flat = {name: np.asarray(column.values, float).reshape(-1) for name, column in columns.items()}
@@ -329,35 +328,3 @@ class StoredAtlas:
         fixed = dict(scene.fixed) | {name: value for name, value in fixed.items() if name not in axes}
         floquet = get_analysis("floquet").for_system(system)
         return Scene(system, floquet, request, columns, zipped, fixed, scene.title, scene.text)
-
-
-def check_same(name: str, value: Any, fixed: float) -> None:
-    """Raise :class:`InputError` unless ``value`` is the ``fixed`` one of the atlas, which may be typed with four digits."""
-    if isinstance(value, tuple) or not np.allclose(value, fixed, rtol=SAME_FIXED, atol=0):
-        made = f"the atlas is made for {name} = {fixed:.10g}"
-        raise InputError(f"{name} = {as_given(value)}: {made}; allowed is that value")
-
-
-def as_given(value: Any) -> str:
-    """A number or a range as text: ``1.3:1.5``."""
-    ends = value if isinstance(value, tuple) else (value,)
-    return ":".join(f"{end:.10g}" if isinstance(end, (int, float)) else shown(end) for end in ends)
-
-
-def _broadcast(given: Mapping[str, Any]) -> tuple[xr.DataArray, ...]:
-    """Arrays of one shape: unlabelled ones are broadcast by position, then all by dimension names."""
-    import xarray as xr
-
-    plain = {name: np.asarray(v, float) for name, v in given.items() if not isinstance(v, xr.DataArray)}
-    try:
-        plain = dict(zip(plain, np.broadcast_arrays(*plain.values()), strict=True))
-        labelled: dict[str, Any] = {
-            n: xr.DataArray(v, dims=("point",) if v.ndim == 1 else None) for n, v in plain.items()
-        }
-        arrays = [labelled.get(name, value) for name, value in given.items()]
-        # The default of `broadcast` is the union of labels, with NaN for missing ones.
-        return xr.broadcast(*xr.align(*arrays, join="exact", copy=False))
-    except ValueError:
-        shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in given.items())
-        allowed = "arrays that broadcast against each other, of the same labels along a dimension that they share"
-        raise InputError(f"shapes {shapes}: allowed are {allowed}") from None

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from tests.explore.conftest import columns, node
+from tests.sizes import full_after
 
 UNDECIDED = 2
+LARGE_GRIDS = (("three", (0, 1)), ("three", (2, 0)), ("four", (3, 2)))
 
 
 @pytest.fixture(scope="session")
@@ -56,7 +58,7 @@ def agree(ours, theirs):
     return int(((verdict != UNDECIDED) & (theirs[2] == UNDECIDED)).sum())
 
 
-@pytest.mark.parametrize("name", ["one", "two", "three", "four", "mathieu"])
+@pytest.mark.parametrize("name", full_after(3, ["one", "two", "mathieu", "three", "four"]))
 def test_points_have_the_values_and_verdicts_of_python(atlases, pages, tmp_path, name):
     points = chosen(atlases(name), 500, 100)
     lost = agree(columns(atlases(name), points), by_node(pages(name), points, tmp_path))
@@ -72,7 +74,8 @@ def test_many_points_have_the_values_and_verdicts_of_python(atlases, pages, tmp_
 
 
 @pytest.mark.parametrize(
-    ("name", "axes"), [("two", (0, 1)), ("two", (1, 0)), ("three", (0, 1)), ("three", (2, 0)), ("four", (3, 2))]
+    ("name", "axes"),
+    [("two", (0, 1)), ("two", (1, 0)), *(pytest.param(*case, marks=pytest.mark.full) for case in LARGE_GRIDS)],
 )
 def test_grids_have_the_values_and_verdicts_of_python(atlases, pages, tmp_path, name, axes):
     """A grid goes through nodes and interpolation; the undamped one, at zeta = 0 of `three`, through every cell."""
@@ -86,6 +89,7 @@ def test_grids_have_the_values_and_verdicts_of_python(atlases, pages, tmp_path, 
     assert agree(columns(atlas, points), theirs) <= 1
 
 
+@pytest.mark.full
 def test_without_damping_verdicts_are_exact(atlases, pages, tmp_path):
     """At zeta = 0, in an atlas over the damping: rho = 1 exactly wherever the motion is bounded."""
     points = chosen(atlases("three"), 300, 10)
