@@ -198,4 +198,6 @@ def _share(share: float) -> str:
 def _digits(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return ", ".join(map(_digits, value))
+    if isinstance(value, (float, np.floating)) and np.isnan(value):
+        return "no value"
     return f"{value:.6g}" if isinstance(value, (int, float, np.number)) else str(value)
