@@ -145,6 +145,7 @@ def export(options: argparse.Namespace) -> int:
 def plot(options: argparse.Namespace) -> int:
     """Draw the figure of one result, or of several results together."""
     from drivetrain_jax.datasets.figure import plot
+    from drivetrain_jax.store.checksums import refuse_damaged
 
     _check_place(options.out, _FIGURES)
     part = ranges(options.part, "--part") or None
@@ -153,7 +154,9 @@ def plot(options: argparse.Namespace) -> int:
     except InputError:
         raise
     except (LookupError, ValueError):
-        _refuse_damaged(options.files)
+        # Damage may be why the figure failed.
+        for file in options.files:
+            refuse_damaged(file)
         raise
     image = io.BytesIO()
     figure.savefig(image, format=options.out.suffix[1:].lower())
@@ -194,16 +197,6 @@ def _write(out: Path, data: bytes | memoryview) -> None:
         write_atomic(out, data, out.with_name(f"{out.name}.tmp"))
     except OSError as error:
         raise InputError(f"out = {str(out)!r}: {error.strerror}; allowed is a file that can be written") from None
-
-
-def _refuse_damaged(files: list[Path]) -> None:
-    """Raise :class:`InputError` if one of these results is damaged: damage may be why the figure failed."""
-    from drivetrain_jax.store import checksums
-
-    for file in files:
-        if file.is_file() and (changed := checksums.damaged(file)):
-            what = f"damaged ({checksums.named(changed)})"
-            raise InputError(f"file = {str(file)!r}: {what}; allowed is to restore it or to compute it again") from None
 
 
 def point(options: argparse.Namespace) -> int:

@@ -12,8 +12,6 @@ from drivetrain_jax.runs import atlas_answers as answers
 from drivetrain_jax.runs.atlas_chart import chart
 from drivetrain_jax.runs.atlas_file import StoredAtlas, open_atlas
 
-_ENDS = {"crossing": "", "range": "", "atlas": " (end of the atlas)", "undecided": " (undecided beyond)"}
-
 
 def atlas_answers(path: Path, cells: int) -> tuple[list[str], xr.Dataset]:
     """Sentences of the design questions that need no further values, and the chart of the atlas at ``path``."""
@@ -41,7 +39,7 @@ def _windows(found: Mapping[str, Any], speed: str, atlas: StoredAtlas) -> list[s
     said = []
     for window in found["windows"]:
         low, high = _written(window["physical"], speed, window["safe"], atlas)
-        kinds = [_ENDS[end["kind"]] for end in window["ends"]]
+        kinds = [answers.BEYOND[end["kind"]] for end in window["ends"]]
         said.append(f"Stable from {low}{kinds[0]} to {high}{kinds[1]}; {_confirmed(window['check'])}.")
     return said or ["No speed within the atlas is stable."]
 

@@ -28,7 +28,7 @@ _PROVENANCE = (
 
 
 class Section(NamedTuple):
-    """What the page shows of one result."""
+    """Content of the page about one result."""
 
     title: str
     file: str
@@ -64,9 +64,7 @@ def report(results: Sequence[str | Path], title: str | None = None) -> str:
 
 
 def _section(path: Path, number: int) -> Section:
-    if changed := checksums.damaged(path) if path.is_file() else None:
-        what = f"damaged ({checksums.named(changed)})"
-        raise InputError(f"file = {str(path)!r}: {what}; allowed is to restore it or to compute it again")
+    checksums.refuse_damaged(path)
     dataset = open_result(path)
     analysis = dataset.attrs.get("analysis")
     if analysis is None:

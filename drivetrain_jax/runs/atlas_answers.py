@@ -31,7 +31,7 @@ from drivetrain_jax.systems import System
 # Distance of a spectral radius from 1 below which the distance itself is printed.
 _CLOSE = 1e-3
 # Text after the end of a stable interval, by kind of end (`_kind`).
-_BEYOND = {
+BEYOND = {
     "crossing": "",
     "range": " (the end of the range)",
     "atlas": " (the end of the atlas)",
@@ -140,7 +140,7 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
     lines = [f"safe speeds, {asked.heading()}, margin {margin:g}"]
     for w in found.windows:
         ends = " to ".join(
-            asked.named(speed, value) + _BEYOND[_kind(asked, speed, *end)]
+            asked.named(speed, value) + BEYOND[_kind(asked, speed, *end)]
             for value, end in zip(w.safe, w.interval.ends, strict=True)
         )
         lines.append(f"  {ends}; largest spectral radius {_from_one(w.largest)} at {speed} = {number(w.where)}")
@@ -194,7 +194,7 @@ def _ends(asked: AtlasQuery, name: str, interval: Interval) -> list[dict[str, An
 
 def _bounded(asked: AtlasQuery, name: str, value: float, crossing: Crossing | None) -> str:
     """One end of a stable interval as text, with its error."""
-    bound = f" +- {crossing.error:.1e}" if crossing else _BEYOND[_kind(asked, name, value, crossing)]
+    bound = f" +- {crossing.error:.1e}" if crossing else BEYOND[_kind(asked, name, value, crossing)]
     return asked.named(name, value) + bound
 
 

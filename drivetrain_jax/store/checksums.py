@@ -77,6 +77,13 @@ def damaged(path: Path) -> list[str] | None:
     return sorted(name for name in {*wanted, *found} if wanted.get(name) != found.get(name))
 
 
+def refuse_damaged(path: Path) -> None:
+    """Raise :class:`InputError` if ``path`` is a file whose checksums show damage."""
+    if path.is_file() and (changed := damaged(path)):
+        what = f"damaged ({named(changed)})"
+        raise InputError(f"file = {str(path)!r}: {what}; allowed is to restore it or to compute it again") from None
+
+
 def named(names: list[str]) -> str:
     """The names from :func:`damaged` as text."""
     return ", ".join("attributes of the file" if name == FILE else name for name in names)

@@ -1,4 +1,4 @@
-"""What verdicts and critical speeds mean for a design, against closed forms and printed values."""
+"""Growth and separation margins against closed forms and printed values."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def test_neither_growth_nor_an_immediate_end_divides_by_zero():
 
 
 def test_required_margin_of_api_617():
-    """None below 2.5; from there 17 (1 - 1/(AF - 1.5)) percent, and 10 more above the range; at most 17 and 27."""
+    """None below 2.5; from there 17 (1 - 1/(AF - 1.5)) percent, and 10 more above the range; at most 16 and 26."""
     factors = np.array([1.0, 2.49, 2.5, 3.5, 1e9])
-    np.testing.assert_allclose(required_margin(2999.0, 3000.0, factors), [0, 0, 0, 0.085, 0.17], atol=1e-9)
-    np.testing.assert_allclose(required_margin(8000.0, 3000.0, factors), [0, 0, 0.1, 0.185, 0.27], atol=1e-9)
+    np.testing.assert_allclose(required_margin(2999.0, 3000.0, factors), [0, 0, 0, 0.085, 0.16], atol=1e-9)
+    np.testing.assert_allclose(required_margin(8000.0, 3000.0, factors), [0, 0, 0.1, 0.185, 0.26], atol=1e-9)
 
 
 def test_margins_of_a_stepped_shaft():
@@ -48,4 +48,4 @@ def test_margins_of_a_stepped_shaft():
     # Without damping the largest margins are required.
     del options["amplification"]
     undamped = dt.critical_speeds(shaft, outputs="required_margin", **options)
-    np.testing.assert_allclose(undamped.required_margin, 0.27, rtol=1e-14)
+    np.testing.assert_allclose(undamped.required_margin, 0.26, rtol=1e-14)

@@ -1,4 +1,4 @@
-"""What people type by mistake: each is answered in one line that helps, with exit code 2, and nothing is written."""
+"""Mistakes that people type: each is answered in one line that helps, with exit code 2, and nothing is written."""
 
 from __future__ import annotations
 

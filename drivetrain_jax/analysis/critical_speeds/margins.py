@@ -9,8 +9,8 @@ from jax import Array
 
 # Amplification factor below which a critical speed counts as critically damped (API 617, API 684).
 _DAMPED = 2.5
-# Margins of a speed below the range as the factor grows, and the addition for a speed above it.
-_LARGEST, _ABOVE = 0.17, 0.1
+# Factor of the formula, largest margin of a speed below the range, and the addition for a speed above it.
+_FACTOR, _LARGEST, _ABOVE = 0.17, 0.16, 0.1
 
 
 def separation_margin(speed: Any, lowest: float, highest: float) -> Array:
@@ -26,12 +26,12 @@ def separation_margin(speed: Any, lowest: float, highest: float) -> Array:
 def required_margin(speed: Any, lowest: float, amplification: Any) -> Array:
     """The margin that API 617 requires of a critical ``speed`` with this ``amplification`` factor AF.
 
-    ``17 (1 - 1/(AF - 1.5))`` percent below the operating range, 10 more within and above it, none for AF < 2.5. Models of
-    this package have no damping; a factor comes from a measurement or a damped model.
+    ``17 (1 - 1/(AF - 1.5))`` percent, at most 16, below the operating range; 10 more within and above it; none for AF < 2.5.
+    Models of this package have no damping; a factor comes from a measurement or a damped model.
 
     >>> print(required_margin([1000.0, 9000.0], lowest=3000.0, amplification=10.0))
     [0.15 0.25]
     """
     factor, above = jnp.asarray(amplification, float), jnp.asarray(speed, float) >= lowest
-    required = _LARGEST * (1 - 1 / jnp.maximum(factor - 1.5, 1.0)) + jnp.where(above, _ABOVE, 0.0)
-    return jnp.where(factor < _DAMPED, 0.0, required)
+    below = jnp.minimum(_FACTOR * (1 - 1 / jnp.maximum(factor - 1.5, 1.0)), _LARGEST)
+    return jnp.where(factor < _DAMPED, 0.0, below + jnp.where(above, _ABOVE, 0.0))
