@@ -33,7 +33,8 @@ def resonances(dataset: xr.Dataset) -> xr.DataArray | None:
         return None
     # Axes given in physical data: the predictions are those along their parameters.
     given = {name: str(c.dims[0]) for name, c in dataset.coords.items() if c.ndim == 1 and c.dims[0] != name}
-    given = {str(n): dim for n, dim in given.items() if n in (predicted.axis, *predicted.parameters) and dim in dataset}
+    used = (predicted.axis, *predicted.parameters)
+    given = {str(n): dim for n, dim in given.items() if n in used and dim in dataset and dim != "point"}
     found = _along_parameters(dataset.swap_dims({dim: name for name, dim in given.items()}), predicted)
     return None if found is None else _along_given(found, dataset, given, predicted.axis)
 

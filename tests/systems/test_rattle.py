@@ -40,15 +40,7 @@ def test_at_the_threshold_the_orbit_touches_the_flank():
 
 def test_parameters_and_ranges():
     system = get_system("rattle")
-    assert [p.name for p in system.parameters if p.default is None] == [
-        "omega",
-        "B0",
-        "B1",
-        "b",
-        "c",
-        "alpha",
-        "k",
-        "I",
-    ]
+    needed = [p.name for p in system.parameters if p.default is None]
+    assert needed == ["omega", "B0", "B1", "b", "c", "alpha", "k", "I", "unbalance"]
     with pytest.raises(ValueError, match="0 < k"):
         system.parameter("k").check(0.0)

@@ -30,6 +30,7 @@ from drivetrain_jax.analysis.critical_speeds.mechanisms import (
     zero_modes,
 )
 from drivetrain_jax.analysis.critical_speeds.segments import Scales
+from drivetrain_jax.analysis.numerics.kernels import stored
 from drivetrain_jax.systems import Shaft
 
 MAX_STEPS = 90
@@ -111,7 +112,8 @@ def _closed(b: _Brackets) -> Array:
 
 def _step(shaft: Shaft, index: Array, b: _Brackets) -> _Brackets:
     q = _trial(b)
-    value = characteristic(shaft, q)
+    # Computed once for all uses: near a root two kernels may round to different counts, and the ends would contradict.
+    value = stored(characteristic)(shaft, q)
     above = value.count >= index  # pyright: ignore[reportOptionalOperand]
     shrink = jnp.where((b.low == 0) & above, b.shrink * b.shrink, b.shrink)
     low, high = jnp.where(above, b.low, q), jnp.where(above, q, b.high)

@@ -19,6 +19,7 @@ from drivetrain_jax.analysis.critical_speeds.compound import characteristic
 from drivetrain_jax.analysis.critical_speeds.frequency_roots import Roots
 from drivetrain_jax.analysis.critical_speeds.mechanisms import zero_modes
 from drivetrain_jax.analysis.critical_speeds.segments import Scales
+from drivetrain_jax.analysis.numerics.kernels import stored
 from drivetrain_jax.systems import Shaft
 from drivetrain_jax.systems.trigonometry import sincos
 
@@ -85,7 +86,7 @@ def find_roots(shaft: Shaft, modes: int) -> Roots:
     def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = 0.5 * (low + high)
-        same = (determinant(shaft, middle) > 0) == sign
+        same = (stored(determinant)(shaft, middle) > 0) == sign
         return jnp.where(same, middle, low), jnp.where(same, high, middle)
 
     low, high = jax.lax.fori_loop(0, _BISECTIONS, halve, (low, high))

@@ -7,8 +7,9 @@ mass, whatever the other parameters. They are combinations of ``1``, ``x`` and, 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -60,25 +61,30 @@ def _free_motions(shaft: Shaft, held: _Held) -> Array:
     frees theta, and a rotation that ends there is a separate mode.
     """
     lanes = shaft.lanes
-    dimension, found = jnp.full(lanes, 2), jnp.zeros(lanes, int)
-    turning = sliding = jnp.zeros(lanes, bool)
 
     def hold(flag: Array, dimension: Array, own: Array, other: Array) -> tuple[Array, Array, Array]:
         moved = flag & ~(own & (dimension == 1))
         own = jnp.where(moved, dimension == 2, own)
         return jnp.where(moved, jnp.maximum(dimension - 1, 0), dimension), own, other & ~moved
 
-    for node in range(shaft.segments + 1):
-        dimension, sliding, turning = hold(held.before[node], dimension, sliding, turning)
-        if shaft.k_hinge is not None and 0 < node < shaft.segments:
-            free = shaft.k_hinge[node - 1] == 0
+    def across(state: tuple[Array, Array, Array], node: tuple[_Held, Array | None]) -> Any:
+        (dimension, found, sliding), (at, free) = state, node
+        turning = jnp.zeros(lanes, bool)
+        dimension, sliding, turning = hold(at.before, dimension, sliding, turning)
+        if free is not None:
             found = found + (free & ((dimension == 2) | turning))
             dimension = jnp.where(free & ~turning, jnp.minimum(dimension + 1, 2), dimension)
             turning, sliding = turning | (free & (dimension == 1)), sliding & ~free
-        dimension, sliding, turning = hold(held.behind[node], dimension, sliding, turning)
-        dimension, turning, sliding = hold(held.deflection[node], dimension, turning, sliding)
-        if node < shaft.segments:
-            turning = jnp.zeros_like(turning)
+            dimension, sliding, turning = hold(at.behind, dimension, sliding, turning)
+        dimension, _, sliding = hold(at.deflection, dimension, turning, sliding)
+        return (dimension, found, sliding), None
+
+    free = None
+    if shaft.k_hinge is not None:
+        edge = jnp.zeros((1, *shaft.k_hinge.shape[1:]), bool)
+        free = jnp.concatenate([edge, shaft.k_hinge == 0, edge])
+    start = jnp.full(lanes, 2), jnp.zeros(lanes, int), jnp.zeros(lanes, bool)
+    (dimension, found, _), _ = jax.lax.scan(across, start, (held, free))
     return found + dimension
 
 

@@ -26,7 +26,7 @@ from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solv
 from drivetrain_jax.analysis.frequency_response import closed_form_response, harmonic_response
 from drivetrain_jax.analysis.frequency_response.harmonic_balance import Basis
 from drivetrain_jax.analysis.impacts import exact_branch, exact_response
-from drivetrain_jax.analysis.impacts.length_unit import measured, restored
+from drivetrain_jax.analysis.impacts.length_unit import from_scaled_length, to_scaled_length
 from drivetrain_jax.analysis.impacts.motion import PHASE, REGIME, REGIMES, STABILITY
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System
 
@@ -140,7 +140,7 @@ def _solve(
 ) -> dict[str, Array]:
     """A line; ``effort`` only orders the batches."""
     del effort
-    model, unit = measured(build(values))
+    model, unit = to_scaled_length(build(values))
     options, shape = request.options, _shape(model)
     if request.method == "exact":
         results = _exact(model, request)
@@ -151,7 +151,7 @@ def _solve(
         given = options.get("fit_range", 0.0)
         fit_range = given / unit if given > 0 else None
         results = closed_form_response.response(model, request.method, fit_range, shape, request.outputs)
-    return restored(results, unit)
+    return from_scaled_length(results, unit)
 
 
 def _exact(model: PiecewiseLinearOscillator, request: Request) -> dict[str, Array]:

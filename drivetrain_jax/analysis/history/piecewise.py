@@ -27,7 +27,7 @@ from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import Outcome, Request, Solver, forward_derivatives
 from drivetrain_jax.analysis.frequency_response.multiple_scales import cubic_fit, self_consistent_range, slow_flow
 from drivetrain_jax.analysis.history.integration import has_finite_start, integrated, requested_times
-from drivetrain_jax.analysis.impacts.length_unit import measured
+from drivetrain_jax.analysis.impacts.length_unit import to_scaled_length
 from drivetrain_jax.analysis.impacts.timed_motion import timed_motion
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.analysis.numerics.predictions import predicted
@@ -117,7 +117,7 @@ def _exact(system: type[System], request: Request, values: Mapping[str, Any], ef
     model: PiecewiseLinearOscillator = system.models["history"].build(values)
     given = [values[system.role(role)] for role in _STARTS]
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in (*vars(model).values(), *given)))
-    scaled, unit = measured(model)
+    scaled, unit = to_scaled_length(model)
     u0, v0 = (jnp.broadcast_to(jnp.asarray(x, float) / unit, shape or (1,)) for x in given)
     u, v, events, stuck = timed_motion(scaled, u0, v0, times, request.options["most_events"])
     finite = jnp.all(jnp.isfinite(u), axis=0)
@@ -155,7 +155,7 @@ def _averaged(system: type[System], request: Request, values: Mapping[str, Any],
     del effort
     model: PiecewiseLinearOscillator = system.models["history"].build(values)
     u0, v0 = (jnp.asarray(values[system.role(role)], float) for role in _STARTS)
-    scaled, unit = measured(model)
+    scaled, unit = to_scaled_length(model)
     given = request.options["fit_range"]
     flow, frequency = averaged_flow(scaled, jnp.asarray(given / unit) if given > 0 else None, u0 / unit, v0 / unit)
     found = integrated(flow, request)

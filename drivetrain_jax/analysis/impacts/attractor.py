@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.impacts.attractor_approach import Orbit, attracts, creeps, obeys
+from drivetrain_jax.analysis.impacts.attractor_approach import Orbit, attracts, is_slow, linearisation_holds
 from drivetrain_jax.analysis.impacts.attractor_lanes import (
     MOST_PERIODS,
     Lane,
@@ -132,7 +132,7 @@ def _shoot(
     error = change + _EPS * rounding * (1 + inverse)
     orbit = Orbit(*guess, motion.matrix, -local.damping * lane.multiple * 2 * np.pi / omega, error)
     stable = now & converged & attracts(orbit)
-    slow = stable & creeps(orbit, lane.latest, omega) & ~obeys(orbit, lane.latest, first, omega)[0]
+    slow = stable & is_slow(orbit, lane.latest, omega) & ~linearisation_holds(orbit, lane.latest, first, omega)[0]
     corrected = lane._replace(
         guess=guess, first=first, change=change, corrections=lane.corrections + now.astype(jnp.int32)
     )

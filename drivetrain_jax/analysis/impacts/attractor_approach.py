@@ -71,7 +71,9 @@ def recurrences(orbit: Orbit) -> Array:
     return jnp.maximum(jnp.ceil(needed), 2.0)
 
 
-def obeys(orbit: Orbit, before: tuple[Array, Array], after: tuple[Array, Array], omega: Array) -> tuple[Array, Array]:
+def linearisation_holds(
+    orbit: Orbit, before: tuple[Array, Array], after: tuple[Array, Array], omega: Array
+) -> tuple[Array, Array]:
     """Flags where ``after``, one recurrence after ``before``, agrees with the linearisation, and flags of arrival."""
     rho = spectral_radius(orbit.matrix, orbit.log_determinant)
     away = (before[0] - orbit.u, before[1] - orbit.v)
@@ -92,7 +94,7 @@ def along(orbit: Orbit, away: tuple[Array, Array]) -> tuple[Array, Array]:
     return tuple((m - fast * x) / (slow - fast) for m, x in zip(moved, away, strict=True))  # pyright: ignore[reportReturnType]
 
 
-def creeps(orbit: Orbit, state: tuple[Array, Array], omega: Array) -> Array:
+def is_slow(orbit: Orbit, state: tuple[Array, Array], omega: Array) -> Array:
     """Flags where the motion in ``state`` moves slowly towards the orbit along the slow line."""
     half = (orbit.matrix[0] + orbit.matrix[3]) / 2
     rho, real = spectral_radius(orbit.matrix, orbit.log_determinant), half**2 > jnp.exp(orbit.log_determinant)
@@ -122,7 +124,9 @@ def probe(orbit: Orbit, state: tuple[Array, Array], number: Array) -> tuple[Arra
     return place, (orbit.u + place * (state[0] - orbit.u), orbit.v + place * (state[1] - orbit.v))
 
 
-def pulled(orbit: Orbit, state: tuple[Array, Array], place: Array, after: tuple[Array, Array], omega: Array) -> Array:
+def is_attracted(
+    orbit: Orbit, state: tuple[Array, Array], place: Array, after: tuple[Array, Array], omega: Array
+) -> Array:
     """Flags where ``after``, one recurrence after the point ``place`` of the line to ``state``, lies nearer to the orbit on
     the same side."""
     rho = spectral_radius(orbit.matrix, orbit.log_determinant)

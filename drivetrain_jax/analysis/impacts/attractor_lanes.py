@@ -13,7 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.impacts.attractor_approach import PROBES, Orbit, doubled, obeys, probe, pulled, recurrences
+from drivetrain_jax.analysis.impacts.attractor_approach import (
+    PROBES,
+    Orbit,
+    doubled,
+    is_attracted,
+    linearisation_holds,
+    probe,
+    recurrences,
+)
 from drivetrain_jax.analysis.impacts.piecewise_march import Motion
 from drivetrain_jax.analysis.impacts.plane_map import apply
 
@@ -154,7 +162,7 @@ def confirm(lane: Lane, now: Array, history: Array, omega: Array) -> tuple[Lane,
     due = now & lane.approaching & (lane.count > lane.begun) & ((lane.count - lane.begun) % lane.multiple == 0)
     row = (lane.count - lane.multiple) % (MOST_PERIODS + 1)
     past = jnp.where(jnp.concatenate([row, row]) == _ROWS, history, 0.0).sum(axis=0)
-    ok, arrived = obeys(lane.orbit, (past[: row.size], past[row.size :]), lane.latest, omega)
+    ok, arrived = linearisation_holds(lane.orbit, (past[: row.size], past[row.size :]), lane.latest, omega)
     held = jnp.where(due, jnp.where(ok, lane.held + 1, 0), lane.held)
     return lane._replace(held=held), due & ok & (arrived | (held >= recurrences(lane.orbit)))
 
@@ -171,7 +179,7 @@ def try_line(lane: Lane, now: Array, orbit: Orbit, omega: Array) -> tuple[Lane, 
     multiple = jnp.where(begins & negative, 2 * lane.multiple, lane.multiple)
     lane = lane._replace(orbit=select(begins, select(negative, twice, orbit), lane.orbit), multiple=multiple)
     place, _ = probe(lane.orbit, lane.latest, lane.probing)
-    good = pulled(lane.orbit, lane.latest, place, (lane.motion.u, lane.motion.v), omega)
+    good = is_attracted(lane.orbit, lane.latest, place, (lane.motion.u, lane.motion.v), omega)
     number = lane.probing + now.astype(jnp.int32)
     failed = now & ~begins & ~good
     through = now & ~begins & good & (number >= PROBES)

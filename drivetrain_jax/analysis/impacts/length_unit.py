@@ -25,7 +25,7 @@ _LENGTHS = frozenset((
 _LARGEST = 1000
 
 
-def measured(model: PiecewiseLinearOscillator) -> tuple[PiecewiseLinearOscillator, Array | np.ndarray]:
+def to_scaled_length(model: PiecewiseLinearOscillator) -> tuple[PiecewiseLinearOscillator, Array | np.ndarray]:
     """``model`` with lengths in its own unit, and this unit [m] in the common shape of all fields but omega."""
     fields = (model.b, model.B0, model.B1, model.stiffness)
     # Fixed values of a scene stay NumPy arrays, constants of the kernel.
@@ -48,6 +48,6 @@ def measured(model: PiecewiseLinearOscillator) -> tuple[PiecewiseLinearOscillato
     ), unit
 
 
-def restored(results: Mapping[str, Array], unit: Array | np.ndarray) -> dict[str, Array]:
+def from_scaled_length(results: Mapping[str, Array], unit: Array | np.ndarray) -> dict[str, Array]:
     """``results`` with lengths in metres; their last axis is that of ``unit``."""
     return {name: x * unit if name in _LENGTHS else x for name, x in results.items()}

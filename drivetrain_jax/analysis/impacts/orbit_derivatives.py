@@ -18,7 +18,7 @@ from jax import Array
 
 from drivetrain_jax.analysis._base import stacked
 from drivetrain_jax.analysis.impacts.exact_response import INTEGRALS, periodic_results
-from drivetrain_jax.analysis.impacts.length_unit import measured, restored
+from drivetrain_jax.analysis.impacts.length_unit import from_scaled_length, to_scaled_length
 from drivetrain_jax.analysis.impacts.orbit_history import history
 from drivetrain_jax.analysis.impacts.orbit_measures import measure
 from drivetrain_jax.analysis.numerics.lanes import Constants
@@ -46,7 +46,7 @@ def orbit_jacobians(
     def model(parameters: Any) -> PiecewiseLinearOscillator:
         return build(eqx.combine(parameters, constants.tree))
 
-    scaled, unit = measured(model(parameters))
+    scaled, unit = to_scaled_length(model(parameters))
     lengths = jnp.array([unit if name in ("b", "B0", "B1") else 1.0 for name in _FIELDS])
     by_parameter = stacked(jax.jacfwd(lambda p: _vector(model(p)) / lengths)(parameters))
     periodic = results["period_multiple"] > 0
@@ -70,7 +70,7 @@ def orbit_jacobians(
         slopes["orbit_state"] = state
     ended = (_vector(scaled) == 0) & _ENDS
     slopes = {name: _chained(jnp.where(ended | ~periodic, jnp.nan, x), by_parameter) for name, x in slopes.items()}
-    return restored(slopes, unit)
+    return from_scaled_length(slopes, unit)
 
 
 def _vector(oscillator: PiecewiseLinearOscillator) -> Array:

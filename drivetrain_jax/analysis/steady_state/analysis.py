@@ -28,7 +28,7 @@ from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.impacts.attractor import attractors
 from drivetrain_jax.analysis.impacts.exact_response import INTEGRALS, WIDTH, describe
-from drivetrain_jax.analysis.impacts.length_unit import measured, restored
+from drivetrain_jax.analysis.impacts.length_unit import from_scaled_length, to_scaled_length
 from drivetrain_jax.analysis.impacts.motion import PHASE, REGIME, REGIMES
 from drivetrain_jax.analysis.impacts.orbit_derivatives import orbit_jacobians
 from drivetrain_jax.analysis.impacts.orbit_history import history
@@ -97,7 +97,7 @@ def _solve(
     start = [values[system.role(role)] for role in _STARTS]
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in (*vars(model).values(), *start)))
     count = int(np.prod(shape, dtype=int))
-    model, unit = measured(model)
+    model, unit = to_scaled_length(model)
     u0, v0 = (jnp.broadcast_to(jnp.asarray(x, float) / unit, (count,)) for x in start)
     route = jnp.arange(count, dtype=jnp.int32)[:, None]
     found = attractors(model, route, u0, v0, most_periods=request.options["most_periods"], width=WIDTH)
@@ -109,7 +109,7 @@ def _solve(
         u, v = (jnp.where(known, x, jnp.nan) for x in (flat.u, flat.v))
         sampled = history(model, u, v, results["period_multiple"], SAMPLES)
         results |= dict(zip(("u_history", "v_history"), sampled, strict=True))
-    wanted = restored({name: results[name] for name in (*request.outputs, "outcome")}, unit)
+    wanted = from_scaled_length({name: results[name] for name in (*request.outputs, "outcome")}, unit)
     return {name: x.reshape(*x.shape[:-1], *shape) for name, x in wanted.items()}
 
 
