@@ -15,7 +15,7 @@ atlas: $(VENV)/installed  ## the quickstart atlas and its figure, in out/
 	$(BIN)/drivetrain plot $(OUT)/quickstart.nc --out $(OUT)/quickstart.png
 
 test: $(VENV)/installed-test lint  ## all tests in their short form
-	$(BIN)/python -m pytest -n 2 -m "not full"
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not full"
 
 validate: $(VENV)/installed-test  ## the comparisons at full size
 	$(BIN)/python -m pytest -m full

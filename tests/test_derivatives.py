@@ -16,6 +16,7 @@ from tests.oracles import complex_step
 from tests.oracles.bicardan_precise_reference import determinant
 from tests.oracles.planetary_reference import matrices
 from tests.quick_jit import quick_jit
+from tests.sizes import but_full
 
 POINTS = 20
 CARDAN_NAMES = ("beta", "Omega", "zeta", "alpha", "mu", "gamma")
@@ -215,7 +216,7 @@ def entry(system, name):
     return getattr(system, name)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", but_full(CASES, "cardan orbit"))
 def test_derivatives_at_random_points(case):
     """Each entry within 1e-6 of the largest logarithmic derivative of its result."""
     draw, function, oracle, names = CASES[case]
@@ -287,7 +288,7 @@ FURTHER = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", FURTHER)
+@pytest.mark.parametrize("case", but_full(FURTHER, "condition and orbit_spectral_radius"))
 def test_derivatives_equal_differences(case):
     """Central differences of order four."""
     function, system, names, step, rtol = FURTHER[case]
@@ -311,6 +312,7 @@ def test_a_state_alone_has_the_derivatives_that_it_has_with_its_amplitude():
         np.testing.assert_allclose(getattr(alone, name), getattr(found, name)[:4], rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.full
 def test_both_modes_agree():
     check_grads(floquet_radius, (SHAFT,), order=1, modes=("fwd", "rev"), eps=1e-5)
 

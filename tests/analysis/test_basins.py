@@ -25,6 +25,7 @@ def found():
     return run(samples=1000, seed=3)
 
 
+@pytest.mark.full
 def test_shares_of_the_high_branch(found):
     """Shares agree within three standard errors plus the rounding of the note."""
     expected, rounding = np.array(list(NOTE.values())), np.array(list(ROUNDING.values()))
@@ -48,6 +49,7 @@ TRANSIENT = {
 }  # fmt: skip
 
 
+@pytest.mark.full
 def test_chaos_beside_periodic_motions_may_be_a_transient():
     """Motions that are still chaotic count as unsettled; their number falls with ``most_periods``."""
     left = []

@@ -362,6 +362,7 @@ def spans(EI: jax.Array) -> dict[str, jax.Array]:
     return {"length": ones, "EI": EI, "rhoA": ones, "k": jnp.full(count + 1, jnp.inf), "k_hinge": jnp.zeros(count - 1)}
 
 
+@pytest.mark.full
 def test_gradients_of_parts_that_are_independent():
     """Each frequency has derivatives by its own span alone; equal spans have none."""
 

@@ -210,6 +210,7 @@ def jacobians() -> tuple[np.ndarray, dict[str, np.ndarray]]:
     return np.asarray(p), {name: np.asarray(row) for name, row in rows.items()}
 
 
+@pytest.mark.full
 def test_gradients_obey_the_sum_identities(jacobians):
     p, rows = jacobians
     check_identities(p, rows, ARGUMENTS)

@@ -203,6 +203,7 @@ def test_errors_that_cancel_in_the_product_do_not_deceive(direct):
     assert (error <= loose["spectral_radius_error"]).all()
 
 
+@pytest.mark.full
 def test_what_underflows_is_not_exactly_zero(direct):
     point = BASE | {"beta": np.array([0.0]), "Omega": 0.001, "zeta": 1.0, "gamma": 1.0}
     for rtol in (1e-3, 1e-10):

@@ -310,6 +310,7 @@ def test_no_orbit_without_restoring_force():
     assert found.outcome == Outcome.NOT_CONVERGED
 
 
+@pytest.mark.full
 def test_lanes_that_wait_take_no_steps():
     """One lane needs few corrections of many steps, the other many corrections of few steps; a batch adds no more work."""
     calls = []

@@ -85,6 +85,7 @@ def test_memory_does_not_grow_with_the_number_of_strobes():
     assert sizes[0] == sizes[1]
 
 
+@pytest.mark.full
 def test_sum_rule_sees_a_wrong_divergence():
     """The residual is zero for the true divergence of the field, and the error of a wrong one."""
     flow = flows.linear(np.full(2, 0.2), np.ones(2))

@@ -54,6 +54,7 @@ def linear(values, omega):
     return values["B1"] / np.hypot(stiffness - omega**2, damping * omega)
 
 
+@pytest.mark.full
 def test_jacobian_is_the_derivative_up_to_the_quadrature():
     """The Jacobian neglects that weights move with the crossings, an effect of fourth order in the sample distance."""
     model, omega, errors = model_of(({},), 0.8), jnp.array([0.8]), []

@@ -78,6 +78,7 @@ def test_an_undamped_free_gear_has_no_amplitude_at_rest():
     assert np.isnan(found.amplitude[0]).any() and np.isfinite(found.amplitude[1:]).all()
 
 
+@pytest.mark.full
 def test_a_batch_equals_its_points():
     sizes = jnp.array([1e-6, 2e-6, 5e-6])
     options = {"start": 100.0, "stop": 3e3, "num": 20}

@@ -39,6 +39,7 @@ def test_a_steady_state(size):
     assert_homogeneous(found, expected, size, lengths)
 
 
+@pytest.mark.full
 def test_a_response_and_its_branch():
     lengths = ["u_max", "u_min", "u_rms", "branch_u_max", "branch_u_min"]
     scene = {"axes": {"omega": {"start": 0.7, "stop": 0.9, "num": 3}}, "options": {"method": "exact"}}
@@ -71,6 +72,7 @@ def test_an_approximate_response(method, options, own, size):
     assert_homogeneous(response(size), response(1.0), size, lengths)
 
 
+@pytest.mark.full
 def test_basins():
     lengths, outputs = ["attractor_u_max", "attractor_u_min"], ["basin_fraction", "attractor_multiple"]
     found, expected = (

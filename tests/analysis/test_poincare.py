@@ -51,6 +51,7 @@ def test_a_section_that_repeats_has_k_zero():
     assert found.chaos_k01 == 0
 
 
+@pytest.mark.full
 def test_few_strobes_that_do_not_repeat_tell_nothing_of_chaos():
     """A torus needs 512 strobes; fewer may give any K."""
     found = [section(["chaos_k01"], strobes=n, discard=800, steps=24).chaos_k01.values for n in (511, 512)]
@@ -64,6 +65,7 @@ def test_section_repeats_exactly(motor):
     assert len(np.unique(np.round(points[:, 0] / np.abs(points[:, 0]).max(), 7))) == 10
 
 
+@pytest.mark.full
 def test_loose_tolerances_blur_the_section(motor):
     """The loose section differs from equal steps of order 8 by more than its extent, and its outcome shows it."""
     extent = np.ptp(motor.section.values[1, :, 0])
@@ -81,6 +83,7 @@ def test_loose_tolerances_blur_the_section(motor):
     assert found[1e-9] < 1e-2
 
 
+@pytest.mark.full
 def test_steps_that_are_too_long_are_noticed():
     """With four natural half periods per strobe, the estimate is of the size of the change by eight times the steps."""
     scene = {"system": "tripod", "analysis": "poincare", "outputs": ["section", "strobe_error"]}
@@ -123,6 +126,7 @@ def test_errors_of_a_violent_start_are_told(fixed, start, discard):
     assert finer.outcome == Outcome.SUCCESS
 
 
+@pytest.mark.full
 def test_a_violent_neighbour_does_not_matter():
     """A member that needs a second march does not change its neighbour."""
     scene = {"system": "tripod", "analysis": "poincare", "outputs": ["section_error"]}
@@ -164,6 +168,7 @@ class TestZeroOne:
             values.append(np.corrcoef(distance, np.arange(1, 41))[0, 1])
         assert float(chaos_k01(jnp.asarray(series))) == pytest.approx(np.median(values), abs=1e-10)
 
+    @pytest.mark.full
     def test_scale_and_offset_do_not_matter(self):
         series = self.logistic([3.97])
         np.testing.assert_allclose(chaos_k01(jnp.asarray(1e-4 * series + 5)), chaos_k01(jnp.asarray(series)), atol=1e-6)
@@ -186,6 +191,7 @@ def test_torus_residual_sees_noise():
     assert 1e-4 < noisy < 1e-2
 
 
+@pytest.mark.full
 def test_a_parameter_of_the_field_may_vary():
     """Nothing is discarded either, so that a march of no steps has unused inputs (see ``in_one_kernel``)."""
     others = {name: value for name, value in FIXED.items() if name != "zeta"}

@@ -72,6 +72,7 @@ def test_the_page_is_true(tmp_path):
     assert (project / "chart.png").stat().st_size > 20_000
 
 
+@pytest.mark.full
 def test_a_new_analysis_serves_the_systems_of_the_package(tmp_path):
     project, answers, _ = executed(ANALYSIS, tmp_path)
     assert "Analysis settling: settling time" in answers and "remaining share" in answers

@@ -188,7 +188,15 @@ def test_a_range_of_speeds_without_extent_has_a_widest_angle():
     assert atlas(beta=[beta - margin, beta + margin], Omega=1.4)["verdict"].values.tolist() == [0, 1]
 
 
-@pytest.mark.parametrize(("rtol", "beta"), [(1e-5, 0.894981), (1e-5, 0.788523), (1e-4, 0.549493), (1e-4, 0.871812)])
+@pytest.mark.parametrize(
+    ("rtol", "beta"),
+    [
+        pytest.param(1e-5, 0.894981, marks=pytest.mark.full),
+        pytest.param(1e-5, 0.788523, marks=pytest.mark.full),
+        (1e-4, 0.549493),
+        pytest.param(1e-4, 0.871812, marks=pytest.mark.full),
+    ],
+)
 def test_an_undecided_range_that_hides_a_change_ends_a_window(rtol, beta):
     atlas = atlas_of((0.0, 1.3), (0.15, 2.0), rtol=rtol)
     windows = atlas_answers.speed_windows(atlas, {"beta": beta}).data["windows"]
@@ -295,6 +303,7 @@ def test_without_damping_tips_are_at_the_angle_0():
     assert chart(source, {"beta": (0.9, 1.2)}, 20)["tip"].size == 0
 
 
+@pytest.mark.full
 def test_an_atlas_without_a_panel_answers_by_direct_solves(monkeypatch):
     monkeypatch.setattr(rounds, "MAX_SOLVES", 10)
     source = panels((0.0, 0.5), (0.001, 0.002), rtol=1e-8)

@@ -120,6 +120,7 @@ def test_only_the_chunk_that_kills_every_process_is_lost(drivetrain, tmp_path):
     assert f"computed={ds.outcome.size} reused=0 failed={lost.sum()}" in error
 
 
+@pytest.mark.full
 def test_a_chunk_whose_process_dies_once_is_computed_again(drivetrain, tmp_path):
     scene = SCENE | {"axes": {"delta": {"start": 0.1, "stop": 2.0, "num": 40}}}
     assert "failed=0" in finished(drivetrain(scene | {"fixed": {"deadly": 2}}, "once", "--workers", "1"))
@@ -129,6 +130,7 @@ def test_a_chunk_whose_process_dies_once_is_computed_again(drivetrain, tmp_path)
     np.testing.assert_allclose(once, never, rtol=1e-7)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("deaths", "code"), [("1", 0), ("9", 3)])
 def test_a_process_that_dies_at_its_start_is_started_again(drivetrain, package, deaths, code):
     package["FRAGILE_AT_START"] = deaths
@@ -325,6 +327,7 @@ def _engine():
     return resolve(load_scene({"system": "cardan", "analysis": "floquet", "fixed": point}))
 
 
+@pytest.mark.full
 def test_a_process_that_dies_between_two_chunks_is_replaced():
     """Without a chunk in flight no result reports the death; the remaining points must still be computed."""
     seen = []

@@ -97,7 +97,14 @@ GEARS = {
 }
 
 
-@pytest.mark.parametrize("scene", [chart("direct"), chart("atlas"), GEARS], ids=["march", "tiles", "matrices"])
+@pytest.mark.parametrize(
+    "scene",
+    [
+        pytest.param(chart("direct"), id="march"),
+        pytest.param(chart("atlas"), id="tiles", marks=pytest.mark.full),
+        pytest.param(GEARS, id="matrices", marks=pytest.mark.full),
+    ],
+)
 def test_an_accelerator_gets_wide_batches_and_gives_the_same_results(monkeypatch, scene):
     """The code path of an accelerator (wide chunks, all lanes at once, no compiler marks) runs on the CPU."""
     expected, solver = dt.run(scene), resolve(load_scene(scene)).solvers[0]

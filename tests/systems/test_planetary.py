@@ -108,6 +108,7 @@ def test_bearings_by_direction_split_doublets_and_keep_the_families():
     np.testing.assert_array_equal(np.bincount(split.mode_type, minlength=5), [1, 5, 12, 3, 0])
 
 
+@pytest.mark.full
 def test_derivatives_by_the_new_parameters():
     """Central differences of the model with rotations, and of bearings by direction and both pressure angles."""
     rotational = {"model": "rotational", "pressure_angle_s": 0.4, "pressure_angle_r": 0.3, "k_cu": 1e8}
