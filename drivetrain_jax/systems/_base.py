@@ -40,12 +40,12 @@ _DATA = (Complex, Decimal, str, bytes, list, tuple, dict, set, PathLike)
 class Model:
     """The service of a system for one analysis: ``build(values)`` returns the model from the values of ``parameters``.
 
-    ``check(fixed)`` raises ``ValueError`` with one line, ``name = value: allowed is ...``, if parameters in range do not
-    match each other. ``fixed`` holds the values that do not vary, and a whole list even if one of its entries varies.
-    ``smooth`` declares the coordinates of an atlas. None: the parameters themselves, and an atlas only on request (``method = "auto"`` makes
-    none). ``results`` declares the variables of an analysis whose results are the system's own (``parameters``), and
-    ``default_outputs`` names those computed by default (empty: all). ``returns`` is the class of the model if it is not the
-    usual one of the analysis (``history``: a flow).
+    ``check(fixed)`` raises ``ValueError`` with one line, ``name = value: allowed is ...``, if parameters in range do
+    not match each other. ``fixed`` holds the values that do not vary, and a whole list even if one of its entries
+    varies. ``smooth`` declares the coordinates of an atlas. None: the parameters themselves, and an atlas only on
+    request (``method = "auto"`` makes none). ``results`` declares the variables of an analysis whose results are the
+    system's own (``parameters``), and ``default_outputs`` names those computed by default (empty: all). ``returns`` is
+    the class of the model if it is not the usual one of the analysis (``history``: a flow).
     """
 
     build: Callable[[Values], Any]
