@@ -63,6 +63,7 @@ def test_a_negative_determinant_is_left_to_the_eigenvalues():
     assert (bound < 1e-8).all()
 
 
+@pytest.mark.full
 def test_lanes_do_not_depend_on_each_other():
     """Lanes do not change if another lane needs eigenvalues or is NaN."""
     z = matrices(samples(30))

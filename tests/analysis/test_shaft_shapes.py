@@ -175,7 +175,7 @@ def compare(shafts: Mapping[str, Mapping], tolerance: float) -> int:
     return compared
 
 
-@pytest.mark.parametrize("segments", [2, 4])
+@pytest.mark.parametrize("segments", [2, pytest.param(4, marks=pytest.mark.full)])
 def test_shapes_against_finite_elements(segments):
     """Amplitude and sign of every part, for named and for random cases."""
     rng = np.random.default_rng(segments)

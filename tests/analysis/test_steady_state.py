@@ -167,6 +167,7 @@ def test_an_undamped_motion_does_not_settle_and_says_so(steady):
     assert found["outcome"][1] == Outcome.SUCCESS
 
 
+@pytest.mark.full
 def test_sweeps_jump_where_the_folds_are():
     omega = np.arange(0.74, 0.885, 0.002)
     found = jax.jit(lambda w: sweeps(Rattle.models["basins"].build(TABLE1 | {"omega": w})))(omega)

@@ -56,6 +56,7 @@ def test_every_frequency_is_that_of_its_own_amplitude(method):
             )
 
 
+@pytest.mark.full
 def test_the_exact_response_is_that_of_steady_states():
     found = response(FREQUENCIES, "exact", ["u_max", "u_min", "u_rms", "regime"])
     assert len(set(found.regime.values[:, 0].tolist())) > 1

@@ -19,12 +19,14 @@ def test_a_stiffer_driven_shaft_is_not_always_less_stable():
     np.testing.assert_allclose(shares, [0.0115, 0.0177, 0.0468, 0.0490, 0.0804, 0.0044], rtol=0, atol=8e-4)
 
 
+@pytest.mark.full
 def test_damping_helps_less_at_high_speed():
     """Change of the unstable fraction from alpha = 1 to 20, in quarters of rising speed."""
     base, damped = (unstable(name).reshape(151, 4, 50).mean(axis=(0, 2)) for name in ("cardan_fig3", "cardan_fig4"))
     np.testing.assert_allclose(100 * (damped / base - 1), [-14.2, -3.5, -3.6, -0.7], rtol=0, atol=0.06)
 
 
+@pytest.mark.full
 def test_figures_3_and_6_do_not_start_alike():
     """Both unstable sets have only a fifth in common for Omega up to 0.35."""
     first, sixth = (unstable(name)[:, :35] for name in ("cardan_fig3", "cardan_fig6"))
