@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from drivetrain_jax.analysis.floquet.radius import has_closed_form, radius_by_eigenvalues, radius_in_closed_form
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
