@@ -162,7 +162,10 @@ class Job:
 
     @cached_property
     def _small(self) -> bool:
-        return not self._full_size and is_small(self.grid, self.solvers)
+        def plan() -> Plan:
+            return self.plan if self._points is None else make_plan(self.solvers, self.grid)
+
+        return not self._full_size and is_small(self.grid, plan)
 
     @property
     def total(self) -> int:

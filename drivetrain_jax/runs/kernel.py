@@ -17,7 +17,7 @@ from jax import Array
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import Analysis, Solver
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, on_cpu, options_for_few
-from drivetrain_jax.runs.plan import make_plan
+from drivetrain_jax.runs.plan import Plan
 from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import Problem, result_variables
 from drivetrain_jax.systems import System
@@ -109,9 +109,9 @@ def for_device(solver: Solver) -> Solver:
     return solver if on_cpu() else replace(solver, chunk=max(solver.chunk, min(_WIDER * solver.chunk, _WIDEST)))
 
 
-def is_small(grid: Grid, solvers: Sequence[Solver]) -> bool:
-    """True if the whole grid is so cheap that its kernels are not worth optimising."""
-    return bool(grid.size * grid.path_length <= _FEW and make_plan(solvers, grid).costs.sum() <= _LIGHT)
+def is_small(grid: Grid, plan: Callable[[], Plan]) -> bool:
+    """True if the whole grid, of which ``plan`` makes the plan, is so cheap that its kernels are not worth optimising."""
+    return bool(grid.size * grid.path_length <= _FEW and plan().costs.sum() <= _LIGHT)
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,7 @@ from jax import Array
 
 from drivetrain_jax.analysis._base import Solver
 from drivetrain_jax.analysis.floquet.direct import Monodromy, direct_monodromy, stable_steps, stiffness_of
-from drivetrain_jax.analysis.floquet.effort import (
-    LONG,
-    PANEL_COST,
-    explicit_effort,
-    implicit_effort,
-    strongly_damped,
-    traced_steps,
-)
+from drivetrain_jax.analysis.floquet.effort import LONG, PANEL_COST, efforts, traced_steps
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.systems import System
 
@@ -62,42 +55,46 @@ def direct_solvers(
             short_loops=True,
         )
 
-    steps = _ExplicitSteps(system, rtol, stiff is not None)
+    predicted = _Efforts(system, rtol, stiff is not None)
 
     implicit = Solver(
         "direct: Radau IIA of 8 stages",
         over_lanes(lambda values, effort: solve(stiff or form, values, effort, False)),
-        lambda columns: implicit_effort(system, columns, rtol),
+        predicted.of("implicit"),
         unit_cost=PANEL_COST,
         chunk=chunks[1],
         march=True,
         short_loops=True,
     )
-    plain = explicit("", form, lambda columns: steps(columns)["short"])
-    long = explicit(", long marches", form, lambda columns: steps(columns)["long"])
+    plain = explicit("", form, predicted.of("short"))
+    long = explicit(", long marches", form, predicted.of("long"))
     if stiff is None:
         return plain, implicit, long
-    return plain, implicit, explicit(", form for strong damping", stiff, lambda columns: steps(columns)["damped"]), long
+    return plain, implicit, explicit(", form for strong damping", stiff, predicted.of("damped")), long
 
 
-class _ExplicitSteps:
-    """Steps of the explicit scheme for the three kinds of march: ``short``, ``long`` and ``damped`` (the form ``stiff``).
+class _Efforts:
+    """Efforts of the ``implicit`` scheme and of three kinds of explicit march: ``short``, ``long`` and ``damped``.
 
-    A point has its steps in one kind and inf in the others. The last request is cached, because the solvers of a plan
-    request the same columns in turn.
+    A damped march uses the form ``stiff``. A point has its steps in one kind of march and inf in the others. The last
+    request is cached, because the solvers of a plan request the same columns in turn.
     """
 
     def __init__(self, system: type[System], rtol: float, has_stiff: bool) -> None:
         self._system, self._rtol, self._has_stiff = system, rtol, has_stiff
         self._last: tuple[Mapping[str, Any], Mapping[str, np.ndarray]] = ({}, {})
 
-    def __call__(self, columns: Mapping[str, Any]) -> Mapping[str, np.ndarray]:
+    def of(self, kind: str) -> Callable[[Mapping[str, Any]], np.ndarray]:
+        """The efforts of ``kind`` as a function of the columns."""
+        return lambda columns: self._all(columns)[kind]
+
+    def _all(self, columns: Mapping[str, Any]) -> Mapping[str, np.ndarray]:
         asked, found = self._last
         if asked is not columns:
-            steps = explicit_effort(self._system, columns, self._rtol)
-            damped = strongly_damped(self._system, columns) if self._has_stiff else np.zeros(steps.shape, bool)
+            steps, damped, panels = efforts(self._system, columns, self._rtol)
+            damped = damped & self._has_stiff
             kinds = {"short": ~damped & (steps <= LONG), "long": ~damped & (steps > LONG), "damped": damped}
-            found = {kind: np.where(mine, steps, np.inf) for kind, mine in kinds.items()}
+            found = {kind: np.where(mine, steps, np.inf) for kind, mine in kinds.items()} | {"implicit": panels}
             self._last = columns, found
         return found
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -37,9 +37,31 @@ _PLACES = tuple(_NODES.tolist())
 Build = Callable[..., "FloquetModel"]
 
 
+class Efforts(NamedTuple):
+    """Predicted efforts of N points, ``(N,)`` each: ``steps`` of the explicit scheme and ``panels`` of the implicit one, inf
+    where there would be too many; ``damped`` where the explicit scheme uses the ``stiff`` form of the model too."""
+
+    steps: np.ndarray
+    damped: np.ndarray
+    panels: np.ndarray
+
+
+def efforts(system: type[System], columns: Mapping[str, Any], rtol: float) -> Efforts:
+    """Predicted efforts of both schemes from one model."""
+    build = system.models["floquet"].build
+    facts = _facts(build, columns)
+    model = build(columns) if facts else None
+    steps = _explicit_steps(build, model if "explicit_steps" in facts else None, columns, rtol)
+    damped = model.strongly_damped() if model is not None and "strongly_damped" in facts else False
+    panels = _panels(system, steps, columns, rtol)
+    return Efforts(_up_to(_MAX_EXPLICIT, steps), np.broadcast_to(damped, steps.shape), _up_to(_MAX_PANELS, panels))
+
+
 def explicit_effort(system: type[System], columns: Mapping[str, Any], rtol: float) -> np.ndarray:
     """Steps of the explicit scheme, ``(N,)``; inf where there would be too many."""
-    return _up_to(_MAX_EXPLICIT, _explicit_steps(system, columns, rtol))
+    build = system.models["floquet"].build
+    model = build(columns) if "explicit_steps" in _facts(build, columns) else None
+    return _up_to(_MAX_EXPLICIT, _explicit_steps(build, model, columns, rtol))
 
 
 def traced_steps(build: Build, values: Mapping[str, Any], rtol: float) -> Array:
@@ -55,19 +77,11 @@ def traced_steps(build: Build, values: Mapping[str, Any], rtol: float) -> Array:
     return jnp.clip(even, 2, _MAX_EXPLICIT).astype(jnp.int64)
 
 
-def strongly_damped(system: type[System], columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """True at points where the explicit scheme uses the ``stiff`` form of the model too, ``(N,)``."""
-    build = system.models["floquet"].build
-    strong = build(columns).strongly_damped() if _knows(build, "strongly_damped", columns) else False
-    return np.broadcast_to(strong, count_of(columns))
-
-
-def implicit_effort(system: type[System], columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
-    """Panels of the implicit scheme, ``(N,)``, which must resolve oscillations but not decay.
+def _panels(system: type[System], explicit: np.ndarray, columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
+    """Panels of the implicit scheme, which must resolve oscillations but not decay; ``explicit``: the explicit steps.
 
     Infinite where oscillation makes an explicit march long: the explicit march costs a twentieth and is as accurate.
     """
-    explicit = _explicit_steps(system, columns, rtol)
     effort = np.full(explicit.shape, np.inf)
     stiff = np.flatnonzero(explicit > _STIFF)
     if stiff.size:
@@ -78,17 +92,17 @@ def implicit_effort(system: type[System], columns: Mapping[str, np.ndarray], rto
         steps = explicit[stiff]
         slow = (steps > LONG) & (steps <= _MAX_EXPLICIT) & (steps < _OSCILLATES * _steps_of(phase, rtol))
         effort[stiff] = np.where(slow, np.inf, panels)
-    return _up_to(_MAX_PANELS, effort)
+    return effort
 
 
-def _explicit_steps(system: type[System], columns: Mapping[str, np.ndarray], rtol: float) -> np.ndarray:
-    build = system.models["floquet"].build
-    if _knows(build, "explicit_steps", columns):
-        steps = build(columns).explicit_steps(rtol)
+def _explicit_steps(
+    build: Build, model: FloquetModel | None, columns: Mapping[str, np.ndarray], rtol: float
+) -> np.ndarray:
+    """Steps that the ``model`` predicts; without one they are estimated from the size of A^2."""
+    if model is not None and model.explicit_steps is not None:
+        steps = model.explicit_steps(rtol)
     else:
-        # A system without a prediction: estimate the steps from the size of A^2.
-        phase = predicted(_phase, (build,), columns)
-        steps = _steps_of(phase, rtol)
+        steps = _steps_of(predicted(_phase, (build,), columns), rtol)
         steps = np.where(np.isnan(steps), _TO_FIND_NO_VALUE, steps)
     return np.broadcast_to(2 * np.ceil(steps / 2), count_of(columns))
 
@@ -99,21 +113,22 @@ def _steps_of(phase: np.ndarray | Array, rtol: float) -> np.ndarray:
         return (4 + 2.5 * phase**1.1) * (1e-9 / rtol) ** (1 / 9)
 
 
-def _knows(build: Build, fact: str, columns: Mapping[str, Any]) -> bool:
-    """True if the model has the optional attribute ``fact``, found without computing its value."""
+def _facts(build: Build, columns: Mapping[str, Any]) -> frozenset[str]:
+    """The optional attributes that the model has, found without computing their values."""
     words, numbers = split(columns)
     leaves, tree = jax.tree.flatten(numbers)
-    return _known(build, fact, words, tree, len(leaves))
+    return _known(build, words, tree, len(leaves))
 
 
 @lru_cache(maxsize=32)
-def _known(build: Build, fact: str, words: Words, tree: Any, count: int) -> bool:
+def _known(build: Build, words: Words, tree: Any, count: int) -> frozenset[str]:
     def model(leaves: list[Array]) -> None:
-        known.append(getattr(build({**dict(words), **jax.tree.unflatten(tree, leaves)}), fact) is not None)
+        built = build({**dict(words), **jax.tree.unflatten(tree, leaves)})
+        known.extend(fact for fact in ("explicit_steps", "strongly_damped") if getattr(built, fact) is not None)
 
-    known: list[bool] = []
+    known: list[str] = []
     jax.eval_shape(model, [jax.ShapeDtypeStruct((), float)] * count)
-    return known[0]
+    return frozenset(known)
 
 
 def _phase(build: Build, values: Mapping[str, Any]) -> Array:
