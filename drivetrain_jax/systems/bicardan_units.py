@@ -57,9 +57,9 @@ PHYSICAL = PhysicalData(
         Parameter("density", "kg/m3", "density of the segments", **POSITIVE, **_EACH),
     ),
     (
-        Conversion("E", ("material",), lambda name: MATERIALS[name][0], "of the material", optional=True),
-        Conversion("G", ("material",), lambda name: MATERIALS[name][1], "of the material", optional=True),
-        Conversion("density", ("material",), lambda name: MATERIALS[name][2], "of the material", optional=True),
+        Conversion("E", ("material",), lambda name: MATERIALS[name][0], "that of the material", optional=True),
+        Conversion("G", ("material",), lambda name: MATERIALS[name][1], "that of the material", optional=True),
+        Conversion("density", ("material",), lambda name: MATERIALS[name][2], "that of the material", optional=True),
         Conversion(
             "EI",
             (*_SECTION, "E"),
