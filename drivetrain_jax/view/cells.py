@@ -256,4 +256,4 @@ def draw_growth(axes: Axes, radius: xr.DataArray, horizontal: str, vertical: str
     extend = "min" if bool((growth < low).any()) else "neither"
     # A radius of 0 is the fastest decay, not a missing value.
     mesh = draw_cells(axes, growth.clip(min=low), horizontal, vertical, cmap=cmap, norm=norm)
-    return mesh, f"$\\log_{{10}}$ of the {radius.attrs.get('long_name', 'spectral radius')} [1]", extend
+    return mesh, f"$\\log_{{10}}$ of the {radius.attrs.get('long_name', 'spectral radius')}", extend

@@ -29,6 +29,8 @@ _LABEL_LINE = 0.16
 _INCHES_PER_LETTER = 0.068
 _CLEAR = 0.07
 _INCHES_PER_ENTRY = 0.45
+# The place in a paper at either end of a title: it says nothing to a reader without the paper.
+_PAPER = re.compile(r"[^:]*\b(?:Figs?\.?|Tables?|section) \d[^:]*: |, (?:Figs?\.?|Tables?) \d.*$")
 _TITLE_SIZE, _SMALLEST_TITLE, _ELLIPSIS = 10.5, 7.0, "\u2026"
 _CAPTION_SIZE, _CAPTION_TOP, _CAPTION_LINE = 8, 0.32, 0.14
 
@@ -163,9 +165,15 @@ def _left_of_numbers(axes: Axes) -> float:
     return box.x0 / axes.figure.bbox.width - _CLEAR / WIDTH if box else 1.0
 
 
+def shown_title(dataset: xr.Dataset) -> str:
+    """The scene's title without the number of a figure or table of a paper."""
+    title = _PAPER.sub("", str(dataset.attrs.get("title", "")))
+    return title[:1].upper() + title[1:]
+
+
 def write_title(figure: Figure, dataset: xr.Dataset, left: float) -> None:
     """Write the scene's title from ``left`` (inches) on; a title that is too long is set smaller, then truncated."""
-    title, room = str(dataset.attrs.get("title", "")), WIDTH - left - 0.1
+    title, room = shown_title(dataset), WIDTH - left - 0.1
     size = max(min(_TITLE_SIZE, _TITLE_SIZE * room / max(_title_length(title), 1e-9)), _SMALLEST_TITLE)
     limit = 1.001 * room * _TITLE_SIZE / size
     if _title_length(title) > limit:

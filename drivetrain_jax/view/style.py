@@ -96,12 +96,17 @@ def axis_label(coordinate: xr.DataArray) -> str:
     """``long name (symbol) [units]`` of a swept parameter, without a symbol that repeats the long name."""
     name, long_name = scene_key(coordinate), _long_name(coordinate)
     mark = "" if name.replace("_", " ") == long_name else f" ({symbol(name)})"
-    return f"{long_name}{mark} [{units_of(coordinate)}]"
+    return f"{long_name}{mark}{in_brackets(units_of(coordinate))}"
 
 
 def variable_label(variable: xr.DataArray) -> str:
     """``long name [units]`` of a result."""
-    return f"{_long_name(variable)} [{units_of(variable)}]"
+    return f"{_long_name(variable)}{in_brackets(units_of(variable))}"
+
+
+def in_brackets(units: str) -> str:
+    """`` [units]`` as a label ends with, or nothing for a pure number."""
+    return "" if units in ("1", "") else f" [{written_units(units)}]"
 
 
 def units_of(variable: xr.DataArray) -> str:

@@ -102,7 +102,23 @@ def test_a_title_is_never_wider_than_the_figure(letters, cut):
     assert extent.x1 <= figure.bbox.x1 and title.get_text().endswith("\u2026") == cut
 
 
-@pytest.mark.parametrize("text", [r"cost $\foo$ of a gear", r"from $5 to $6_{", r"a \$ and $\beta$ " + "W" * 300])
+@pytest.mark.parametrize(
+    ("title", "text"),
+    [
+        ("Fig. 3: joint angle and speed", "Joint angle and speed"),
+        ("Table 3, Figs 4 and 5: four planets", "Four planets"),
+        ("Frequency response, Figs 2 and 3", "Frequency response"),
+        ("Paper 2012, section 4: the shaft", "The shaft"),
+        ("Input element: stability", "Input element: stability"),
+    ],
+)
+def test_a_title_needs_no_paper(title, text):
+    figure = Panels(height=2.0).figure
+    write_title(figure, xr.Dataset(attrs={"title": title}), 0.75)
+    assert figure.texts[0].get_text() == text
+
+
+@pytest.mark.parametrize("text", [r"Cost $\foo$ of a gear", r"From $5 to $6_{", r"A \$ and $\beta$ " + "W" * 300])
 def test_a_title_is_text_and_no_formula(text):
     figure = Panels(height=2.0).figure
     write_title(figure, xr.Dataset(attrs={"title": text}), 0.75)

@@ -135,7 +135,9 @@ def test_greek_letters_with_an_index(name, text):
 def test_units_as_people_write_them(units, text):
     assert written_units(units) == text
     assert value_text("a", 1.5, units) == ("$a$ = 1.5" if units == "1" else f"$a$ = 1.5 {text}")
-    assert axis_label(xr.DataArray(0.0, name="a", attrs={"units": units, "long_name": "b"})) == f"b ($a$) [{text}]"
+    assert axis_label(xr.DataArray(0.0, name="a", attrs={"units": units, "long_name": "b"})) == (
+        "b ($a$)" if units == "1" else f"b ($a$) [{text}]"
+    )
 
 
 def test_many_turns_are_thinned_between_their_envelopes():

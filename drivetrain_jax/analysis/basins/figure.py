@@ -122,7 +122,7 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
     upper.set_ylim(bottom=min(0.0, float(dataset["attractor_u_max"].min())))
     lower.set_ylim(-0.03, 1.03)
     panels.label_row(upper, variable_label(dataset["attractor_u_max"]))
-    panels.label_row(lower, "share of the initial states [1]")
+    panels.label_row(lower, "share of the initial states")
     panels.label_axes(axis_label(dataset[name]))
     panels.titles(dataset)
     panels.legend(handles)

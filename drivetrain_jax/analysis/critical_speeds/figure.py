@@ -237,7 +237,7 @@ def _shapes(dataset: xr.Dataset) -> Figure:
         axes.fill_between(x, shape, color=colour, alpha=0.15, linewidth=0)
         axes.set(xlim=(0.0, 1.0), ylim=(-1.25, 1.25), yticks=(-1.0, 0.0, 1.0))
         axes.set_title(_name(dataset, index), loc="left", pad=3, color=FRAME_GREY, size=8)
-    panels.label_axes(variable_label(dataset["x"]), "deflection, largest 1 [1]")
+    panels.label_axes(variable_label(dataset["x"]), "deflection, largest 1")
     panels.titles(dataset)
     return panels.figure
 

@@ -240,7 +240,7 @@ def _multipliers(dataset: xr.Dataset) -> Figure:
     values = dataset["floquet_multiplier"].values
     dots = axes.plot(values.real, values.imag, "o", color=LINE_COLOURS[0], markersize=5, label="Floquet multipliers")  # pyright: ignore[reportAttributeAccessIssue]
     axes.set_aspect("equal", adjustable="datalim")
-    panels.label_axes("real part of the multiplier [1]", "imaginary part [1]")
+    panels.label_axes("real part of the multiplier", "imaginary part")
     panels.titles(dataset)
     panels.legend([*dots, *circle])
     return panels.figure

@@ -22,6 +22,7 @@ from drivetrain_jax.view.style import (
     STATE_COLOURS,
     STYLE,
     axis_label,
+    in_brackets,
     units_of,
     variable_label,
 )
@@ -72,7 +73,7 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
             )
     if amplitudes:
         own = next(dim for dim in dataset[amplitudes[0]].dims if dim != name)
-        both = f"amplitude of the {own}s [{units_of(dataset[amplitudes[0]])}]"
+        both = f"amplitude of the {own}s{in_brackets(units_of(dataset[amplitudes[0]]))}"
         panels.label_row(stack[0], both if len(amplitudes) > 1 else variable_label(dataset[amplitudes[0]]))
     cells.fit_axis(stack[0], "x", dataset[name].values)
     lines = resonances.predictions(dataset, name, forced=True)

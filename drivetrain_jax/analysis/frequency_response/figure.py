@@ -45,7 +45,7 @@ _METHODS = {
     "multiple_scales": _Look("multiple scales", "#7b3294", 1.3),
     "averaging": _Look("averaging", "#7b3294", 1.3),
     "describing_function": _Look("describing function", "#2a9d5c", 1.3),
-    "harmonic_balance": _Look("harmonic balance", "#d1771e", 2.6),
+    "harmonic_balance": _Look("harmonic balance", "#d1771e", 1.3),
     "exact": _Look("exact", "#111111", 0.8),
 }
 

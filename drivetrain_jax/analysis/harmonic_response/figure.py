@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.figure_layout import Margins, Panels
-from drivetrain_jax.view.style import LINE_COLOURS, STYLE, axis_label, units_of, variable_label
+from drivetrain_jax.view.style import LINE_COLOURS, STYLE, axis_label, in_brackets, units_of, variable_label
 
 _HEIGHT, _ROUNDING = 1.5, 1e-12
 _COLOURS = (*LINE_COLOURS, "#3f8f5f", "#7a4fa0", "#999933", "#333333", "#a0308c")
@@ -53,7 +53,7 @@ def _lines(dataset: xr.Dataset) -> Figure:
             (handles[body],) = axes.semilogy(
                 amplitude["frequency"], values, color=colours[body], label=body, linewidth=0.9
             )
-        panels.label_row(axes, f"{kind} [{units_of(amplitude)}]")
+        panels.label_row(axes, f"{kind}{in_brackets(units_of(amplitude))}")
     panels.axes[0][0].set_xlim(*amplitude["frequency"].values[[0, -1]])
     panels.label_axes(axis_label(amplitude["frequency"]))
     panels.titles(dataset)

@@ -14,7 +14,17 @@ from mpl_toolkits.mplot3d import Axes3D
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells, regimes
 from drivetrain_jax.view.figure_layout import DPI, WIDTH, NotebookFigure, wrap_caption, write_title
-from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, caption, coordinate_text, state, symbol, units_of
+from drivetrain_jax.view.style import (
+    FRAME_GREY,
+    LINE_COLOURS,
+    STYLE,
+    caption,
+    coordinate_text,
+    in_brackets,
+    state,
+    symbol,
+    units_of,
+)
 
 _LINE: dict[str, Any] = {"color": LINE_COLOURS[0], "linewidth": 0.6, "markersize": 3.5}
 _MOST_ROWS = 8
@@ -170,7 +180,7 @@ def _label(dataset: xr.Dataset, name: str) -> str:
     """``symbol [units]`` of a component or the time."""
     symbols = {c["name"]: c["symbol"] for c in state(dataset)}
     mark = "$t$" if name == "time" else symbols.get(name) or symbol(name)
-    return f"{mark} [{units_of(dataset[name])}]"
+    return f"{mark}{in_brackets(units_of(dataset[name]))}"
 
 
 def _entry(history: xr.Dataset, name: str) -> str:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.figure_layout import Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, coordinate_text, state, written_units
+from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, coordinate_text, in_brackets, state
 
 _FIRST = 1000
 _MOST_ROWS = 6
@@ -46,7 +46,7 @@ def plot(dataset: xr.Dataset) -> Figure:
 def _labels(dataset: xr.Dataset) -> list[str]:
     """Names and units of the two components."""
     described = state(dataset)[:2] or [{"long_name": f"component {i}", "units": "1"} for i in (1, 2)]
-    return [f"{c['long_name']} at the strobes [{written_units(c['units'])}]" for c in described]
+    return [f"{c['long_name']} at the strobes{in_brackets(c['units'])}" for c in described]
 
 
 def _draw_row(row: list[Axes], part: xr.Dataset, name: str | None) -> None:

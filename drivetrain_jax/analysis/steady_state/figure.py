@@ -215,7 +215,7 @@ def _motion(dataset: xr.Dataset) -> Figure:
     history.plot(part[0], u[0], "o", markersize=4, color=LINE_COLOURS[1])
     handles += regimes.draw_flanks(dataset, history, portrait=portrait)
     history.set_xlim(0, 1)
-    panels.label_axes("part of the motion's period [1]", variable_label(u))
+    panels.label_axes("part of the motion's period", variable_label(u))
     # At the left, clear of a power of ten at the right end.
     portrait.set_xlabel(variable_label(u), loc="left")
     portrait.set_ylabel(variable_label(v))
