@@ -11,7 +11,7 @@ from matplotlib.colors import to_hex
 
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis.modes.figure import type_colours
-from drivetrain_jax.analysis.modes.planetary_gear import displacements
+from drivetrain_jax.analysis.modes.planetary_gear import displacements, drawn_radii
 from drivetrain_jax.systems._planetary_springs import coordinate_names
 from drivetrain_jax.view import plot
 
@@ -58,6 +58,36 @@ def test_without_branches_points_are_dots():
     axes, of = plot(crossing().drop_vars("branch")).axes[0], type_colours(crossing())
     shown = {to_hex(line.get_color()): line.get_xdata().size for line in axes.lines}
     assert shown[of["rotational"]] == shown[of["translational"]] == 6
+
+
+def test_a_coupled_branch_has_the_colour_of_its_dominant_family():
+    found = crossing()
+    family = {"flag_values": np.arange(4, dtype="int8"), "flag_meanings": "rotational translational planet none"}
+    found["dominant_family"] = found["mode_type"].dims, np.maximum(found["mode_type"].values - 1, 0), family
+    found["mode_type"] = found["mode_type"].where(found["mode_type"] == 0, 4).astype("int8")
+    figure, of = plot(found), type_colours(found)
+    colours = [{to_hex(colour) for colour in curve.get_colors()} for curve in figure.axes[0].collections]
+    assert colours == [{of["rotational"]}, {of["translational"]}]
+    assert any("dominant family" in text.get_text() for text in figure.texts)
+
+
+def test_a_split_of_three_hertz_is_drawn_in_hertz():
+    x = np.arange(6.0)
+    frequency = np.stack([0 * x, 1000 + x, 1003 + x, 5000 + 100 * x, 5000 + 100 * x], axis=1)
+    upper, lower = plot(result(6, natural_frequency=frequency)).axes
+    np.testing.assert_allclose(lower.lines[0].get_ydata(), 3.0)
+    # A double frequency that never splits, and far neighbours, have no line.
+    assert [line.get_label() for line in lower.lines] == ["modes 2 and 3"]
+    assert lower.get_ylabel() == upper.get_ylabel() == "" and lower.get_yscale() == "log"
+
+
+@pytest.mark.parametrize("angles", [np.arange(6) * np.pi / 3, [0.0, 1.1, 3.0], [0.0, 2.0, 4.0]])
+def test_planets_at_rest_do_not_overlap(angles):
+    sun, planet, ring = drawn_radii(angles)
+    centres = np.exp(1j * np.asarray(angles))
+    distances = np.abs(centres[:, None] - centres)[~np.eye(len(centres), dtype=bool)]
+    assert distances.min() > 2 * planet and sun + planet == pytest.approx(1, abs=0.01)
+    assert ring - planet == pytest.approx(1, abs=0.02)
 
 
 def shapes(planets: int = 3) -> xr.Dataset:

@@ -8,6 +8,7 @@ from itertools import cycle
 import matplotlib
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -16,7 +17,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.modes.planetary_gear import BODY_COLOURS, draw_gear
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.figure_layout import Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, STYLE, axis_label, scene_key, variable_label
+from drivetrain_jax.view.style import FRAME_GREY, STYLE, axis_label, in_brackets, scene_key, variable_label
 
 # Colours of rigid modes, of the families in their order, and of coupled modes.
 _RIGID, _FAMILIES, _COUPLED = "#9a9a9a", ("#16324f", "#d1771e", "#3f8f5f", "#7a4fa0", "#999933"), "#a0308c"
@@ -24,6 +25,8 @@ _CURVES_HEIGHT, _GEAR_HEIGHT = 4.4, 1.62
 _COLUMNS, _MOST_SHAPES = 4, 16
 # Relative difference below which frequencies are one multiple frequency, with one shape drawn.
 _SAME = 1e-8
+# Relative distances at which neighbours are close, and at which they are two frequencies; least distance of names in points.
+_NEAR, _SPLIT, _LINE = 0.01, 1e-6, 7.5
 
 
 def plot(dataset: xr.Dataset) -> Figure:
@@ -57,20 +60,29 @@ def type_colours(dataset: xr.Dataset) -> dict[str, str]:
     return {rigid: _RIGID, **dict(zip(families, cycle(_FAMILIES), strict=False)), coupled: _COUPLED}
 
 
-def _types(dataset: xr.Dataset) -> np.ndarray:
-    """Type of every mode by name; all modes are coupled if the variable is missing."""
+def _types(dataset: xr.Dataset, dominant: bool = False) -> np.ndarray:
+    """Type of every mode by name, or with ``dominant`` the dominant family of a coupled mode, if stored.
+
+    All modes are coupled if the variable is missing.
+    """
     if "mode_type" not in dataset:
         return np.full(dataset["natural_frequency"].shape, "coupled")
-    return np.array(_meanings(dataset))[dataset["mode_type"].values]
+    types = np.array(_meanings(dataset))[dataset["mode_type"].values]
+    if not (dominant and "dominant_family" in dataset):
+        return types
+    families = np.array(dataset["dominant_family"].attrs["flag_meanings"].split())
+    return np.where(types == "coupled", families[dataset["dominant_family"].values], types)
 
 
 def _curves(dataset: xr.Dataset, name: str) -> Figure:
     cells.require(dataset, "natural_frequency")
     cells.require_values(dataset["natural_frequency"], positive=True)
     dataset = dataset.transpose(name, ...)
-    x, frequency, types = dataset[name].values, dataset["natural_frequency"].values, _types(dataset)
-    colours = type_colours(dataset)
-    panels = Panels(1, height=_CURVES_HEIGHT, margins=Margins(right=0.3, left=0.9, top=0.6))
+    x, frequency = dataset[name].values, dataset["natural_frequency"].values
+    types, colours = _types(dataset, dominant=True), type_colours(dataset)
+    close = _close(frequency)
+    height = _CURVES_HEIGHT / (1 + bool(close))
+    panels = Panels(1 + bool(close), height=height, margins=Margins(right=0.6, left=0.9, top=0.6), share_y=False)
     axes = panels.axes[0][0]
     moving = np.where(frequency > 1e-6 * np.nanmax(frequency), frequency, np.nan)
     if "branch" in dataset:
@@ -85,13 +97,44 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
             axes.plot(x[rows], moving[rows, modes], ".", markersize=2.5, color=colour)
     axes.set(yscale="log", ylim=(0.93 * np.nanmin(moving), 1.07 * np.nanmax(moving)))
     cells.plain_decades(axes, "y")
+    if close:
+        _draw_distances(panels.axes[1][0], x, frequency, close)
+        panels.label_row(panels.axes[1][0], f"distance of close modes{in_brackets('Hz')}")
     cells.fit_axis(axes, "x", x)
-    panels.label_axes(axis_label(dataset[name]), variable_label(dataset["natural_frequency"]))
-    panels.titles(dataset)
+    panels.label_row(axes, variable_label(dataset["natural_frequency"]))
+    panels.label_axes(axis_label(dataset[name]))
+    mixed = "coupled" in _types(dataset) and "coupled" not in types
+    panels.titles(dataset, "coupled modes in the colour of their dominant family" if mixed else "")
     shown = [kind for kind in colours if (types[np.isfinite(moving)] == kind).any()]
     if "mode_type" in dataset:
         panels.legend([Line2D([], [], color=colours[kind], label=kind) for kind in shown])
     return panels.figure
+
+
+def _close(frequency: np.ndarray) -> list[int]:
+    """Lower modes of neighbours that come closer than 1 % somewhere, and are not one multiple frequency everywhere."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        apart = np.diff(frequency, axis=1) / frequency[:, 1:]
+    near = (np.nanmin(apart, axis=0, initial=np.inf) < _NEAR) & (np.nanmax(apart, axis=0, initial=0.0) > _SPLIT)
+    return np.flatnonzero(near & (np.nanmin(frequency, axis=0)[:-1] > 0)).tolist()
+
+
+def _draw_distances(axes: Axes, x: np.ndarray, frequency: np.ndarray, close: list[int]) -> None:
+    """Draw the distances of neighbours in Hz: the splits and veerings that the axis of the frequencies cannot show."""
+    ends = []
+    for colour, mode in zip(matplotlib.colormaps["viridis"](np.linspace(0, 0.8, len(close))), close, strict=True):
+        distance = frequency[:, mode + 1] - frequency[:, mode]
+        distance = np.where(distance > _SPLIT * frequency[:, mode + 1], distance, np.nan)
+        axes.plot(x, distance, color=colour, label=f"modes {mode + 1} and {mode + 2}")
+        ends.append((distance[-1], f"{mode + 1}, {mode + 2}", colour))
+    axes.set_yscale("log")
+    cells.plain_decades(axes, "y")
+    taken = -np.inf
+    for end, text, colour in sorted(ends, key=lambda e: e[0]):
+        height = axes.transData.transform((x[-1], end))[1] * 72 / axes.figure.dpi if np.isfinite(end) else -np.inf
+        if height > taken + _LINE:
+            axes.annotate(text, (x[-1], end), (3, 0), textcoords="offset points", va="center", size=7, color=colour)
+            taken = height
 
 
 def _segments(x: np.ndarray, curve: np.ndarray, colours: list[str]) -> LineCollection:
@@ -134,7 +177,7 @@ def _dominant(dataset: xr.Dataset, mode: int) -> str:
 def _shapes(dataset: xr.Dataset) -> Figure:
     cells.require(dataset, "natural_frequency", "mode_shape")
     angles, types, colours = _angles(dataset), _types(dataset), type_colours(dataset)
-    frequency = dataset["natural_frequency"].values
+    families, frequency = _types(dataset, dominant=True), dataset["natural_frequency"].values
     if not np.isfinite(frequency).all():
         raise InputError("natural_frequency = nan: nothing to plot; the point has no result")
     drawn = _distinct(frequency)[:_MOST_SHAPES]
@@ -148,9 +191,9 @@ def _shapes(dataset: xr.Dataset) -> Figure:
         shape = dataset["mode_shape"].transpose("mode", "dof").values[mode]
         draw_gear(axes, dict(zip(dataset["dof"].values, shape, strict=True)), angles)
         multiple = f" ×{count}" if count > 1 else ""
-        kind = str(types[mode])
+        kind, family = str(types[mode]), str(families[mode])
         named = _dominant(dataset, mode) if kind == "coupled" and shares else f", {kind}"
-        axes.set_title(f"{frequency[mode]:.1f} Hz{multiple}{named}", size=8, color=colours[kind], pad=1.5)
+        axes.set_title(f"{frequency[mode]:.1f} Hz{multiple}{named}", size=8, color=colours[family], pad=1.5)
     for axes in flat[len(drawn) :]:
         axes.axis("off")
     left_out = len(_distinct(frequency)) - len(drawn)

@@ -12,6 +12,8 @@ from drivetrain_jax.view.style import FRAME_GREY
 # Radii relative to the radius of the carrier, from the paper's base radii 77.4, 100.3, 275 and 176.8 mm.
 SUN, PLANET, RING, CARRIER = 77.4 / 176.8, 100.3 / 176.8, 275 / 176.8, 1.0
 _LARGEST = 0.28
+# Largest radius of a planet relative to half the distance of neighbours, so that planets at rest do not touch.
+_CLEAR = 0.94
 BODY_COLOURS = {"ring": "#7a7a7a", "carrier": "#2f7d4f", "sun": "#c8553d", "planet": "#1f4e79"}
 _CIRCLE = np.linspace(0, 2 * np.pi, 73)
 
@@ -30,18 +32,27 @@ def displacements(shape: Mapping[str, float], planets: int) -> tuple[np.ndarray,
     return scale * np.array(central), scale * np.array(moved)
 
 
+def drawn_radii(angles: Sequence[float]) -> tuple[float, float, float]:
+    """Radii of sun, planets and ring: the paper's ratio, or smaller planets where neighbours at ``angles`` would overlap."""
+    turned = np.sort(np.mod(angles, 2 * np.pi))
+    gaps = np.diff(np.append(turned, turned[0] + 2 * np.pi))
+    planet = min(PLANET, _CLEAR * CARRIER * np.sin(min(gaps.min(), np.pi) / 2))
+    return (SUN, PLANET, RING) if planet == PLANET else (CARRIER - planet, planet, CARRIER + planet)
+
+
 def draw_gear(axes: Axes, shape: Mapping[str, float], angles: Sequence[float]) -> None:
     """Draw the bodies at rest and displaced; a radius on each shows its rotation. Axes are scaled equally and hidden."""
     (carrier, ring, sun), planets = displacements(shape, len(angles))
-    _body(axes, np.zeros(2), ring, RING, BODY_COLOURS["ring"], mark=False)
+    sun_radius, planet_radius, ring_radius = drawn_radii(angles)
+    _body(axes, np.zeros(2), ring, ring_radius, BODY_COLOURS["ring"], mark=False)
     for angle in np.arange(3) * 2 * np.pi / 3 + np.pi / 6:
-        _tick(axes, ring, RING, angle)
+        _tick(axes, ring, ring_radius, angle)
     _carrier(axes, carrier, angles)
-    _body(axes, np.zeros(2), sun, SUN, BODY_COLOURS["sun"])
+    _body(axes, np.zeros(2), sun, sun_radius, BODY_COLOURS["sun"])
     for angle, (radial, tangential, rotation) in zip(angles, planets, strict=True):
         outward, along = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
         move = (*(radial * outward + tangential * along), rotation)
-        _body(axes, CARRIER * outward, move, PLANET, BODY_COLOURS["planet"], angle)
+        _body(axes, CARRIER * outward, move, planet_radius, BODY_COLOURS["planet"], angle)
     axes.set(aspect="equal", xlim=(-1.9, 1.9), ylim=(-1.9, 1.9))
     axes.axis("off")
 
