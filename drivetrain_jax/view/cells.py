@@ -18,7 +18,7 @@ from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, N
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view.prefixes import with_prefixes
-from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STATE_HATCHES, STATE_NAMES, STATES, scene_key, symbol
+from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STATE_HATCHES, STATE_NAMES, scene_key, symbol
 
 STABLE, UNSTABLE, UNDECIDED, FAILED = range(4)
 _PENDING, _PENDING_COLOUR = "pending", "#c4c4c4"
@@ -186,8 +186,9 @@ def plain_decades(axes: Axes, which: str) -> None:
 
 
 def draw_states(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> QuadMesh:
-    """Draw the regions of the verdict."""
-    return draw_cells(axes, states(dataset), horizontal, vertical, cmap=STATES, vmin=-0.5, vmax=3.5)
+    """Draw the regions of the verdict; stable cells are transparent, so that lines below the cells show there alone."""
+    cmap = ListedColormap((f"{STATE_COLOURS[STABLE]}00", *STATE_COLOURS[1:]), name="states over lines")
+    return draw_cells(axes, states(dataset), horizontal, vertical, cmap=cmap, vmin=-0.5, vmax=3.5)
 
 
 def state_legend(dataset: xr.Dataset) -> list[Patch]:
@@ -229,31 +230,36 @@ def _state_patch(code: int, note: str) -> Patch:
     return Patch(**colours, linewidth=0.6, hatch=STATE_HATCHES[code], label=STATE_NAMES[code] + note)
 
 
-# Growth log10(rho) below which the scale is linear, because rho of narrow tongues differs from 1 by 1e-5 and less.
-LINEAR_GROWTH = 1e-4
+# Growth log10(rho) below which the scale is linear, because log10(rho) of light damping is -1e-5.
+LINEAR_GROWTH = 1e-6
+# Largest growth with a colour of its own, the same in every figure: a factor of 10 in a period.
+LARGEST_GROWTH = 1.0
 # Position between no growth (0) and largest growth (1), and colour; lightness falls monotonically. White is reserved for
 # cells without a value.
-_DECAY, _NEUTRAL = "#eef4f9", "#d0e0ef"
+_DECAY, _NEUTRAL = "#f3f9e4", "#a9cbe5"
 _GROWTH = ((0.25, "#f3b562"), (0.55, "#c8553d"), (1.0, "#2d0a2b"))
 
 
 def draw_growth(axes: Axes, radius: xr.DataArray, horizontal: str, vertical: str) -> tuple[QuadMesh, str, str]:
-    """Draw ``log10`` of a spectral radius as cells; returns label and ``extend`` of its colour bar.
+    """Draw ``log10`` of a spectral radius as cells, and its contour at 0; returns label and ``extend`` of its colour bar.
 
-    Pale colours are decay, paler colours faster decay; orange to black is growth. Missing values have the colour of failed
-    cells.
+    A colour means the same growth in every figure. Blue to pale yellow is decay, paler colours faster decay; orange to black
+    is growth. Missing values have the colour of failed cells.
     """
     with np.errstate(divide="ignore"):
         growth: Any = np.log10(radius)
-    finite = growth.values[np.isfinite(growth.values)]
-    high = max(float(finite.max(initial=0.0)), 10 * LINEAR_GROWTH)
-    low = min(max(float(finite.min(initial=0.0)), -1.0), -LINEAR_GROWTH)
+    low, high = -LARGEST_GROWTH, LARGEST_GROWTH
     norm = SymLogNorm(LINEAR_GROWTH, linscale=0.5, vmin=low, vmax=high, base=10)
     zero = float(norm(0.0))
     stops = [(0.0, _DECAY), (zero, _NEUTRAL), *((zero + part * (1 - zero), colour) for part, colour in _GROWTH)]
     cmap = LinearSegmentedColormap.from_list("growth", stops, N=1024)
     cmap = cmap.with_extremes(bad=STATE_COLOURS[FAILED])
-    extend = "min" if bool((growth < low).any()) else "neither"
+    below, above = bool((growth < low).any()), bool((growth > high).any())
+    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
     # A radius of 0 is the fastest decay, not a missing value.
-    mesh = draw_cells(axes, growth.clip(min=low), horizontal, vertical, cmap=cmap, norm=norm)
+    mesh = draw_cells(axes, growth.clip(low, high), horizontal, vertical, cmap=cmap, norm=norm)
+    if min(growth.shape) > 1 and bool((growth > 0).any()) and bool((growth < 0).any()):
+        x, y = (growth[name].values for name in (horizontal, vertical))
+        drawn = growth.clip(low, high).transpose(vertical, horizontal).values
+        axes.contour(x, y, drawn, [0.0], colors=FRAME_GREY, linewidths=0.5)
     return mesh, f"$\\log_{{10}}$ of the {radius.attrs.get('long_name', 'spectral radius')}", extend

@@ -77,18 +77,22 @@ def label_text(label: str) -> str:
     return rf"${family}^{{{sign}}}_{{{index}}}$" if sign else rf"${family}_{{{index}}}$"
 
 
-def draw(axes: Axes, lines: list[Prediction]) -> list[Line2D]:
-    """Draw the lines that cross ``axes``, keeping its limits; returns one legend handle per family."""
+def draw(axes: Axes, lines: list[Prediction], below: bool = False) -> list[Line2D]:
+    """Draw the lines that cross ``axes``, keeping its limits; returns one legend handle per family.
+
+    Lines ``below`` the cells leave tongues of one cell visible.
+    """
     low, high = axes.get_xlim()
     handles: dict[str, Line2D] = {}
+    order: dict[str, Any] = {"zorder": -1} if below else {}
     for line in lines:
         if line.x.max() < low or line.x.min() > high:
             continue
         style = {"color": PREDICTION, "linewidth": 0.7, "linestyle": line.dashes, "alpha": 0.9}
         if line.y is None:
-            axes.axvline(line.x[0], **style)
+            axes.axvline(line.x[0], **style, **order)
         else:
-            axes.plot(line.x, line.y, scalex=False, scaley=False, **style)
+            axes.plot(line.x, line.y, scalex=False, scaley=False, **style, **order)
         handles.setdefault(line.family, Line2D([], [], **style, label=line.family))
     return list(handles.values())
 

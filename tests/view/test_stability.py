@@ -13,6 +13,7 @@ import pytest
 import xarray as xr
 from matplotlib.collections import PolyCollection, QuadMesh
 from matplotlib.colors import to_hex
+from matplotlib.contour import ContourSet
 from matplotlib.text import Annotation, Text
 
 from drivetrain_jax._errors import InputError
@@ -184,15 +185,48 @@ def test_one_axis_gives_radius_error_band_limit_and_verdict():
     code = results.unstable(0.5, omega).astype(int)
     dataset = results.with_axes(results.grid(code, "Omega"), Omega=omega)
     axes = panels(plot(dataset))[0]
-    np.testing.assert_array_equal(axes.lines[0].get_ydata(), dataset.spectral_radius)
-    assert list(axes.lines[1].get_ydata()) == [1, 1]
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), dataset.spectral_radius - 1)
+    assert list(axes.lines[1].get_ydata()) == [0, 0]
     (band,) = (
         artist for artist in axes.collections if isinstance(artist, PolyCollection) and not isinstance(artist, QuadMesh)
     )
     heights = band.get_paths()[0].vertices[:, 1]
-    assert (heights.min(), heights.max()) == pytest.approx((0.989, 1.251))
+    assert (heights.min(), heights.max()) == pytest.approx((-0.011, 0.251))
     (strip,) = (artist for artist in axes.collections if isinstance(artist, QuadMesh))
     assert (strip.get_array() == cells.UNSTABLE).sum() == code.sum()
+
+
+def test_a_radius_close_to_one_is_told_from_one():
+    omega = np.linspace(0.5, 1.5, 101)
+    dataset = results.with_axes(results.grid(np.zeros(101, int), "Omega"), Omega=omega)
+    dataset["spectral_radius"] = dataset["spectral_radius"] * 0 + 1 - 1e-5
+    axes = panels(plot(dataset.drop_vars("spectral_radius_error")))[0]
+    place = axes.transAxes.inverted().transform(axes.transData.transform([(1.0, -1e-5), (1.0, 0.0)]))[:, 1]
+    assert place[1] - place[0] > 0.1 and axes.get_yscale() == "symlog"
+
+
+def test_colours_of_growth_are_the_same_in_every_figure():
+    mild, strong = results.chart(), results.chart()
+    strong["spectral_radius"] = strong["spectral_radius"] ** 30
+    first, second = (meshes(plot(each))[1] for each in (mild, strong))
+    for growth in (-0.5, -1e-3, 0.0, 1e-2, 0.7):
+        assert first.to_rgba(growth) == second.to_rgba(growth)
+
+
+def test_growth_has_a_contour_at_zero_on_the_boundary():
+    (contour,) = (each for each in panels(plot(results.chart()))[1].collections if isinstance(each, ContourSet))
+    assert list(contour.levels) == [0.0]
+    omega, beta = np.concatenate([path.vertices for path in contour.get_paths()]).T
+    inside = beta > 0.3
+    assert np.abs(beta - (0.2 + 2 * np.abs(omega - 1.0)))[inside].max() < 0.06
+
+
+def test_predicted_lines_leave_narrow_tongues_visible():
+    axes = panels(plot(results.chart()))[0]
+    (mesh,) = (each for each in axes.collections if isinstance(each, QuadMesh))
+    assert max(line.get_zorder() for line in axes.lines) < mesh.get_zorder()
+    opaque = mesh.to_rgba(np.arange(4.0))[:, 3]
+    assert list(opaque) == [0, 1, 1, 1]
 
 
 def test_axis_of_one_value_counts_as_fixed():
@@ -257,7 +291,7 @@ def test_points_along_one_parameter_are_a_curve():
     )
     line = panels(plot(dataset))[0].lines[0]
     assert list(line.get_xdata()) == [1, 2, 3]
-    assert list(line.get_ydata()) == [1.25, 0.99, 0.99]
+    np.testing.assert_allclose(line.get_ydata(), [0.25, -0.01, -0.01])
 
 
 def test_single_point_shows_its_multipliers():

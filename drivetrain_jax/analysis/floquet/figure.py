@@ -26,6 +26,7 @@ from drivetrain_jax.view.style import (
     LINE_COLOURS,
     STATE_COLOURS,
     STATE_NAMES,
+    STATES,
     STYLE,
     axis_label,
     coordinate_text,
@@ -34,6 +35,8 @@ from drivetrain_jax.view.style import (
 
 _PANEL = 2.45
 _SMALL_PANEL = 1.35
+# Distance of a spectral radius from 1 that rounding can make.
+_ROUNDING = 1e-12
 # Largest number of values of an axis across a figure of small panels.
 _FEW = 4
 
@@ -42,8 +45,8 @@ def plot(dataset: xr.Dataset) -> Figure:
     """The chart of a ``floquet`` result, by number of swept axes.
 
     - none: the multipliers in the complex plane;
-    - one: the spectral radius with its error band and the limit 1;
-    - two: regions of the verdict and a map of ``log10(spectral radius)``, if stored;
+    - one: the distance of the spectral radius from 1 with its error band;
+    - two: regions of the verdict and a map of ``log10(spectral radius)`` with its contour at 0, if stored;
     - more: regions of the verdict for the first, middle and last value of two further axes;
     - ``[points]``: the points coloured by their verdict.
 
@@ -78,7 +81,7 @@ def _chart(dataset: xr.Dataset, names: list[str]) -> Figure:
             panels.colorbar(axes, mesh, label, extend=extend)
     # Only over the upper panel, so that narrow tongues stay visible in the map below.
     lines = resonances.predictions(dataset, horizontal, vertical)
-    handles += resonances.draw(panels.axes[0][0], lines)
+    handles += resonances.draw(panels.axes[0][0], lines, below="verdict" in shown)
     panels.label_axes(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
     resonances.label(panels.axes[0][0], lines)
     panels.titles(dataset)
@@ -91,23 +94,28 @@ def _curve(dataset: xr.Dataset, name: str, marker: str = "") -> Figure:
     panels = Panels(height=3.0, margins=Margins(right=0.3))
     axes = panels.axes[0][0]
     x, radius = dataset[name].values, dataset["spectral_radius"]
+    excess = radius - 1
     handles = axes.plot(
-        x, radius, color=LINE_COLOURS[0], marker=marker, markersize=3, label="spectral radius", zorder=3
+        x, excess, color=LINE_COLOURS[0], marker=marker, markersize=3, label="spectral radius", zorder=3
     )
     if "spectral_radius_error" in dataset:
         error = dataset["spectral_radius_error"]
         band = axes.fill_between(
-            x, radius - error, radius + error, color=LINE_COLOURS[0], alpha=0.3, linewidth=0, label="error band"
+            x, excess - error, excess + error, color=LINE_COLOURS[0], alpha=0.3, linewidth=0, label="error band"
         )
         handles.append(band)  # pyright: ignore[reportArgumentType]
-    handles.append(axes.axhline(1, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)), label="limit of stability"))
+    handles.append(axes.axhline(0, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)), label="limit of stability"))
+    size = np.abs(excess.values[np.isfinite(excess.values) & (excess.values != 0)])
+    # Linear below the smallest distances from 1, so that 1 - 1e-5 is told from 1.
+    linear = 10.0 ** np.floor(np.log10(max(np.quantile(size, 0.1), _ROUNDING))) if size.size else 1.0
+    axes.set_yscale("symlog", linthresh=linear)
     cells.fit_axis(axes, "x", x)
     if "verdict" in dataset:
         _draw_strip(axes, dataset, name)
         handles += cells.state_legend(dataset)
     lines = resonances.predictions(dataset, name)
     resonances.draw(axes, lines)
-    panels.label_axes(axis_label(dataset[name]), variable_label(radius))
+    panels.label_axes(axis_label(dataset[name]), f"{variable_label(radius)} minus 1")
     resonances.label(axes, lines)
     panels.titles(dataset)
     panels.legend(handles)
@@ -116,10 +124,11 @@ def _curve(dataset: xr.Dataset, name: str, marker: str = "") -> Figure:
 
 def _draw_strip(axes: Axes, dataset: xr.Dataset, name: str) -> None:
     """Draw the verdict as a strip along the foot of the panel."""
-    low, high = axes.get_ylim()
-    axes.set_ylim(low - 0.06 * (high - low), high)
-    cells.draw_strip(axes, cells.states(dataset), name, (0, 0.035), cmap=cells.STATES, vmin=-0.5, vmax=3.5)
-    axes.axhline(axes.get_ylim()[0] + 0.035 * np.ptp(axes.get_ylim()), color=FRAME_GREY, linewidth=0.5)
+    scale = axes.yaxis.get_transform()
+    low, high = scale.transform(axes.get_ylim())
+    axes.set_ylim(*scale.inverted().transform([low - 0.06 * (high - low), high]))
+    cells.draw_strip(axes, cells.states(dataset), name, (0, 0.035), cmap=STATES, vmin=-0.5, vmax=3.5)
+    axes.plot([0, 1], [0.035, 0.035], transform=axes.transAxes, color=FRAME_GREY, linewidth=0.5)
 
 
 def _notes(stable: bool, shown: int, count: int) -> str:
@@ -157,7 +166,7 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
         else:
             cells.draw_states(axes, panel, horizontal, vertical)
         lines = resonances.predictions(panel, horizontal, vertical)
-        predicted = max(predicted, resonances.draw(axes, lines), key=len)
+        predicted = max(predicted, resonances.draw(axes, lines, below=not plain), key=len)
         first_row = axes in panels.axes[0]
         if first_row:
             labels.append((axes, [line for line in lines if line.order == 1]))
