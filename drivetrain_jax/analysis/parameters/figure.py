@@ -7,6 +7,7 @@ import textwrap
 import matplotlib
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from drivetrain_jax._errors import InputError
@@ -16,6 +17,8 @@ from drivetrain_jax.view.figure_layout import DPI, WIDTH, Margins, NotebookFigur
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, axis_label, caption, units_of, variable_label
 
 _HEIGHT, _MOST_CURVES = 1.8, 8
+# Least range of a vertical axis relative to its values.
+_LEAST_RANGE = 0.01
 # Line spacing of the table, line spacing of the caption (inches), and letters per line of the caption.
 _ROW, _CAPTION, _LETTERS = 0.24, 0.15, 105
 
@@ -48,12 +51,21 @@ def _curves(dataset: xr.Dataset, name: str, shown: list[str]) -> Figure:
         variable = dataset[key].where(dataset["outcome"] < FIRST_FAILURE).transpose(name, ...)
         axes.plot(dataset[name], variable.values.reshape(dataset.sizes[name], -1), color=LINE_COLOURS[0])
         axes.margins(x=0)
+        _widen(axes)
         # Few ticks have few digits, and the label has a fixed position.
         axes.locator_params(axis="y", nbins=4)
         panels.label_row(axes, variable_label(variable))
     panels.label_axes(axis_label(dataset[name]))
     panels.titles(dataset)
     return panels.figure
+
+
+def _widen(axes: Axes) -> None:
+    """Widen the vertical axis to 1 % of the values at least, so that a change of 0.03 % does not look like a cliff."""
+    low, high = axes.get_ylim()
+    missing = _LEAST_RANGE * max(abs(low), abs(high)) - (high - low)
+    if missing > 0:
+        axes.set_ylim(low - missing / 2, high + missing / 2)
 
 
 def _table(dataset: xr.Dataset, shown: list[str]) -> Figure:
@@ -81,10 +93,10 @@ def _lines(variable: xr.DataArray) -> list[tuple[str, str, str]]:
     units = units_of(variable)
     units = "" if units == "1" else units
     if not variable.dims:
-        return [(label, f"{variable.item():.10g}", units)]
+        return [(label, f"{variable.item():.6g}", units)]
     (own,) = variable.dims
     entries = variable[own].values if own in variable.coords else np.arange(variable.size)
     return [
-        (f"{label}, {own} {entry}", f"{value:.10g}", units)
+        (f"{label}, {own} {entry}", f"{value:.6g}", units)
         for entry, value in zip(entries, variable.values, strict=True)
     ]
