@@ -113,6 +113,21 @@ def test_several_methods_share_the_axes():
     assert len({item.get_color() for item in figure.axes[0].lines}) >= 4
 
 
+def test_short_unstable_pieces_are_no_gaps_and_methods_equally_wide():
+    result = line("harmonic_balance")
+    result["stability"] = xr.zeros_like(result["u_max"]).astype("int8").drop_attrs()
+    result["stability"][{"omega": slice(3, 5)}] = 1
+    pale = [each for each in plot(result).axes[0].lines if each.get_alpha() == 0.3]
+    assert len(pale) == 2 and all(each.get_linestyle() == "-" for each in pale)
+    assert all(np.isfinite(each.get_ydata()).sum() >= 2 for each in pale)
+    widths = {
+        each.get_linewidth()
+        for m in ("describing_function", "harmonic_balance")
+        for each in plot(line(m)).axes[0].lines
+    }
+    assert max(widths) == 1.3
+
+
 def test_map_of_two_axes():
     single = line(branches=False)
     pair = xr.concat([single, single], dim="B1", data_vars="all").assign_coords(

@@ -21,6 +21,7 @@ from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STYLE, axis_lab
 DASHES = (0, (3, 1.6))
 _HEIGHT = 2.9
 _UNSTABLE = 1
+_PALE = 0.3
 # A step of a sweep is a jump if it exceeds these ratios to the range of the values and to the neighbouring steps.
 _JUMP, _STEEPER = 0.04, 6.0
 # Margin above and below the angles of the phase; rounding tolerance of an angle.
@@ -162,6 +163,9 @@ def _draw_sweeps(
         for kind, style in ((~unstable, "-"), (unstable, DASHES)):
             broken = _broken(omega, np.where(_grown(kind), y, np.nan), jumps[direction])
             axes.plot(*broken, color=look.colour, linewidth=look.width, linestyle=style, solid_capstyle="butt")
+            if style is DASHES and kind.any():
+                # A pale line below the dashes: a short unstable piece would look like a gap.
+                axes.plot(*broken, color=look.colour, linewidth=look.width, alpha=_PALE, zorder=1.5)
         for i in np.flatnonzero(jumps[direction]):
             axes.plot(omega[i : i + 2], y[i : i + 2], color=look.colour, linewidth=0.7, linestyle=":")
         if look is _METHODS["exact"]:
