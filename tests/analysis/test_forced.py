@@ -278,6 +278,12 @@ def test_effort_grows_with_oscillations():
     assert steps.shape == (3,) and np.all(np.diff(steps) > 0)
 
 
+def test_a_field_that_overflows_needs_infinitely_many_steps():
+    columns = {k: np.full(3, v) for k, v in (BASE | {"beta": 0.5}).items()}
+    columns |= {"Omega": np.array([1e-200, 0.5, 0.5]), "zeta": np.array([0.01, 1.7e308, 0.01])}
+    assert list(np.isinf(solver().effort(columns))) == [True, True, False]
+
+
 def test_a_model_of_one_displacement_is_refused():
     model = ForcedModel(lambda t, y: y, lambda t, y: y, 1.0, (0,))
     with pytest.raises(InputError, match=r"^system: its model has 1 displacements; allowed is 2, as it says$"):

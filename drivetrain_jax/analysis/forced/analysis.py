@@ -215,10 +215,14 @@ def _solve(build: Build, n: int, request: Request, values: Mapping[str, Any], ef
 
 
 def predicted_steps(build: Build, n: int, moving: int, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Steps of one integration, shape (N,), from the mean spectral radius of the linear field over three phases."""
+    """Steps of one integration, shape (N,), from the mean spectral radius of the linear field over three phases.
+
+    Infinite where the field is not finite.
+    """
     matrices = np.moveaxis(predicted(_matrices, (build, n, moving), columns), -1, 0)
-    rates = np.abs(np.linalg.eigvals(matrices)).max(axis=-1)
-    return np.ceil(20 + 2 * np.mean(rates, axis=-1)).astype(np.int64)
+    finite = np.all(np.isfinite(matrices), axis=(1, 2, 3))
+    rates = np.abs(np.linalg.eigvals(np.where(finite[:, None, None, None], matrices, 0.0))).max(axis=-1)
+    return np.where(finite, np.ceil(20 + 2 * np.mean(rates, axis=-1)), np.inf)
 
 
 def _matrices(build: Build, n: int, moving: int, values: Mapping[str, Any]) -> Array:
