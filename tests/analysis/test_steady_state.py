@@ -228,6 +228,14 @@ def test_an_undamped_drive_at_resonance_has_no_value(steady):
     assert found["outcome"][2] == Outcome.SUCCESS
 
 
+def test_an_unstable_orbit_or_an_overflow_is_no_steady_state(steady):
+    """Far from the origin rounding hides that the orbit is unstable: its spectral radius is 1.2066."""
+    far = {"alpha": 0.1, "k": 1.0, "I": 1.0, "c": 0.05, "B1": 1.0, "omega": 1.9, "b": 1e7, "B0": 1e6, "u0": 1e7}
+    found = steady([TABLE1 | far, TABLE1 | {"omega": 0.7, "B1": 1.7e308}])
+    assert list(found["outcome"]) == [Outcome.NOT_CONVERGED, Outcome.NOT_FINITE]
+    assert np.isnan(found["u_max"]).all() and not found["period_multiple"].any()
+
+
 @pytest.mark.parametrize("ripple", [0.0, 1e-13, 1e-12])
 def test_gears_at_rest_under_load_are_a_steady_state(steady, ripple):
     """Gears rest at u = (1 - alpha) b + B0/(k/I), with a velocity of rounding."""

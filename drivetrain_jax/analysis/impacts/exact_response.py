@@ -8,6 +8,7 @@ the lanes.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +35,12 @@ WIDTH, _SWEEP_WIDTH = 64, 32
 
 
 def describe(
-    oscillator: PiecewiseLinearOscillator, found: Attractors, *, rtol: float, integrals: bool = True
+    oscillator: PiecewiseLinearOscillator,
+    found: Attractors,
+    *,
+    rtol: float,
+    integrals: bool = True,
+    largest: Any = jnp.inf,
 ) -> dict[str, Array]:
     """All results of the motions ``found``, every field of shape ``(N,)`` as those of ``oscillator``.
 
@@ -45,8 +51,8 @@ def describe(
     A motion that recurs within 32 periods is measured over its period. A motion that does not recur, but whose tangent has
     grown by exp(20) over the last three quarters of the run, is non-periodic (``period_multiple`` 0) and measured over 32
     drive periods. Such a motion may still be a transient to a periodic motion, with the exponent of the transient chaos. Any
-    other motion has not settled. ``outcome`` is TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its
-    size.
+    other motion has not settled, nor has an orbit whose measured spectral radius exceeds 1. ``outcome`` is TOLERANCE_NOT_MET
+    where the estimated error of u exceeds ``rtol`` times its size, and NOT_FINITE where its size exceeds ``largest``.
     """
     seen = measure(oscillator, found.u, found.v, found.multiple, width=WIDTH, integrals=integrals)
     periodic = found.multiple > 0
@@ -54,12 +60,13 @@ def describe(
     wild = ~periodic & (growth > _WILD)
     size = jnp.maximum(jnp.abs(seen.high), jnp.abs(seen.low))
     outcome = jnp.where(periodic & ~(found.error <= rtol * size), Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
-    outcome = jnp.where(periodic | wild, outcome, Outcome.NOT_CONVERGED)
+    results = periodic_results(oscillator, seen)
+    unstable = periodic & (results["spectral_radius"] > 1)
+    outcome = jnp.where((periodic | wild) & ~unstable, outcome, Outcome.NOT_CONVERGED)
     outcome = jnp.where((found.stalled > 0) | (seen.complete == 0), Outcome.STEP_LIMIT, outcome)
-    finite = jnp.isfinite(found.u) & jnp.isfinite(seen.high + seen.low)
+    finite = jnp.isfinite(found.u) & jnp.isfinite(seen.high + seen.low) & (size <= largest)
     outcome = jnp.where(finite, outcome, Outcome.NOT_FINITE)
     known = outcome < Outcome.NOT_CONVERGED
-    results = periodic_results(oscillator, seen)
     for name in ("floquet_multiplier", "spectral_radius"):
         results[name] = jnp.where(periodic, results[name], jnp.nan)
     results["lyapunov_exponent"] = jnp.where(periodic, results["lyapunov_exponent"], found.exponent)

@@ -103,7 +103,8 @@ def _solve(
     found = attractors(model, route, u0, v0, most_periods=request.options["most_periods"], width=WIDTH)
     flat = jax.tree.map(lambda x: x[:, 0], found)
     integrals = not INTEGRALS.isdisjoint(request.outputs)
-    results = describe(model, flat, rtol=request.options["rtol"], integrals=integrals)
+    largest = np.finfo(float).max / jnp.maximum(unit, 1.0)
+    results = describe(model, flat, rtol=request.options["rtol"], integrals=integrals, largest=largest)
     if not HISTORIES.isdisjoint(request.outputs):
         known = results["outcome"] < Outcome.NOT_CONVERGED
         u, v = (jnp.where(known, x, jnp.nan) for x in (flat.u, flat.v))
