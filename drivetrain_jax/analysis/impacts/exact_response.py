@@ -29,6 +29,8 @@ INTEGRALS = frozenset(("u_mean", "u_rms", "phase"))
 # Logarithmic growth of a tangent that only chaos explains, lasting or transient: shear makes a tangent grow in proportion to
 # time.
 _WILD = 20.0
+# Excess of the spectral radius over 1 that is no rounding: a motion without damping has 1.
+_UNSTABLE = 1e-6
 # Lanes computed at a time: enough to fill the vector units, but few lanes wait for the slowest. Sweeps have fewer lanes,
 # because they are long jobs of very different length.
 WIDTH, _SWEEP_WIDTH = 64, 32
@@ -50,9 +52,10 @@ def describe(
 
     A motion that recurs within 32 periods is measured over its period. A motion that does not recur, but whose tangent has
     grown by exp(20) over the last three quarters of the run, is non-periodic (``period_multiple`` 0) and measured over 32
-    drive periods. Such a motion may still be a transient to a periodic motion, with the exponent of the transient chaos. Any
-    other motion has not settled, nor has an orbit whose measured spectral radius exceeds 1. ``outcome`` is TOLERANCE_NOT_MET
-    where the estimated error of u exceeds ``rtol`` times its size, and NOT_FINITE where its size exceeds ``largest``.
+    drive periods. Such a motion may still be a transient to a periodic motion, with the exponent of the transient chaos.
+    Any other motion has not settled, nor has an orbit whose measured spectral radius exceeds 1 by more than rounding.
+    ``outcome`` is TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its size, and NOT_FINITE where
+    its size exceeds ``largest``.
     """
     seen = measure(oscillator, found.u, found.v, found.multiple, width=WIDTH, integrals=integrals)
     periodic = found.multiple > 0
@@ -61,7 +64,7 @@ def describe(
     size = jnp.maximum(jnp.abs(seen.high), jnp.abs(seen.low))
     outcome = jnp.where(periodic & ~(found.error <= rtol * size), Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
     results = periodic_results(oscillator, seen)
-    unstable = periodic & (results["spectral_radius"] > 1)
+    unstable = periodic & (results["spectral_radius"] > 1 + _UNSTABLE)
     outcome = jnp.where((periodic | wild) & ~unstable, outcome, Outcome.NOT_CONVERGED)
     outcome = jnp.where((found.stalled > 0) | (seen.complete == 0), Outcome.STEP_LIMIT, outcome)
     finite = jnp.isfinite(found.u) & jnp.isfinite(seen.high + seen.low) & (size <= largest)

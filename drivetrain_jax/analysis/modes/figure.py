@@ -99,7 +99,7 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
     cells.plain_decades(axes, "y")
     if close:
         _draw_distances(panels.axes[1][0], x, frequency, close)
-        panels.label_row(panels.axes[1][0], f"distance of close modes{in_brackets('Hz')}")
+        panels.label_row(panels.axes[1][0], f"distance of close modes (numbers at the right){in_brackets('Hz')}")
     cells.fit_axis(axes, "x", x)
     panels.label_row(axes, variable_label(dataset["natural_frequency"]))
     panels.label_axes(axis_label(dataset[name]))
