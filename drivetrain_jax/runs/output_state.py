@@ -20,7 +20,7 @@ from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.sink import Sink
 from drivetrain_jax.runs.sinks import make_sink
 from drivetrain_jax.store.chunks import PartsFolder
-from drivetrain_jax.store.files import behind_link
+from drivetrain_jax.store.files import behind_link, move_folder
 
 # Endings of files of other kinds, which a netCDF file would only confuse.
 _OTHER_FILES = {".csv", ".html", ".json", ".mat", ".npy", ".npz", ".pdf", ".png", ".svg", ".toml", ".txt", ".xlsx"}
@@ -56,7 +56,7 @@ class OutputState:
         self.parts.open()
         try:
             if self.sink.held != self.out:
-                self.sink.held.rename(self.out)
+                move_folder(self.sink.held, self.out)
         finally:
             self.parts.close()
 
@@ -64,7 +64,7 @@ class OutputState:
     def state(self) -> str:
         """``absent``, ``partial``, ``complete`` or ``stale``."""
         if self.present == self.digest:
-            return "stale" if self._rearranged else "complete"
+            return "stale" if self._rearranged or self._damage else "complete"
         if self.parts.holds_work():
             # Parts that replace a result are only valid for the replacement of that result.
             return "partial" if _same(self.parts.plan(), self.plan(), ("digest", "replaces", "store")) else "stale"
@@ -107,6 +107,11 @@ class OutputState:
                     f"out = {str(self.out)!r}: the folder {str(folder)!r} is not writable; "
                     "allowed is a file in a writable folder"
                 )
+
+    @cached_property
+    def _damage(self) -> str:
+        """The damaged parts of the present result of this scene, or of one whose digest is damaged; empty without damage."""
+        return self.sink.damage() if self.present in (self.digest, "") else ""
 
     @cached_property
     def _rearranged(self) -> list[str]:
@@ -177,10 +182,11 @@ class OutputState:
     @property
     def obstacle(self) -> str:
         """The reason why a run stops or would stop; empty without one."""
-        if self.present == self.digest:
+        if self.present == self.digest and self._rearranged:
             return f"a result that was changed in order or shape after it was written ({', '.join(self._rearranged)})"
-        if isinstance(self._found, Damaged):
-            return f"a damaged result ({self._found.what})"
+        what = self._damage or (self._found.what if isinstance(self._found, Damaged) else "")
+        if what:
+            return f"a damaged result ({what})"
         if self.parts.holds_work():
             stored, what = self.parts.plan(), "unfinished work"
             if self.present != stored.get("replaces"):

@@ -44,6 +44,10 @@ class Sink(Protocol):
         """Digest of the present result; None if that is not a result."""
         return self.attribute("digest")
 
+    def damage(self) -> str:
+        """The damaged parts of the present result, by its checksums; empty without damage."""
+        ...
+
     def rearranged(self, job: Job) -> list[str]:
         """Names of the variables of the present result whose layout differs from that of ``job``."""
         return []

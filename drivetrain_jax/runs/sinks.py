@@ -14,7 +14,7 @@ from drivetrain_jax.runs.growing import NotReusable, ReusableResult, ReusedPoint
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.sink import Sink
 from drivetrain_jax.runs.work import Progress, Report, Work
-from drivetrain_jax.store import zarr_store
+from drivetrain_jax.store import checksums, zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.consolidate import read_attribute, read_variable
 
@@ -51,6 +51,11 @@ class Hdf5Sink(Sink):
             what = "not a readable netCDF4/HDF5 file; allowed is a new file or a result of drivetrain_jax"
             raise InputError(f"out = {str(self.held)!r}: {what}") from None
 
+    def damage(self) -> str:
+        """The damaged parts of the present result; empty without damage."""
+        changed = checksums.damaged(self.held)
+        return "its checksums are gone" if changed is None else checksums.named(changed)
+
     def rearranged(self, job: Job) -> list[str]:
         """Names of the variables of the present result whose layout differs from that of ``job``."""
         return job.route.rearranged(job, self.held)
@@ -75,7 +80,7 @@ def make_sink(out: Path, parts: PartsFolder, store: str | None) -> Sink:
     """The sink for ``hdf5`` or ``zarr``; by default the form of the present result."""
     if store is None:
         held = out if out.exists() else parts.path / zarr_store.FORMER
-        store = ZARR if zarr_store.is_store(held) else parts.plan().get("store")
+        store = ZARR if zarr_store.is_store(held) or zarr_store.was_store(held) else parts.plan().get("store")
     if store == ZARR:
         from drivetrain_jax.runs.zarr_sink import ZarrSink
 

@@ -35,6 +35,7 @@ from drivetrain_jax.runs.sink import Sink
 from drivetrain_jax.runs.work import Progress, Report
 from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
+from drivetrain_jax.store.files import flush_tree, move_folder
 from drivetrain_jax.store.schema import Labelled
 from drivetrain_jax.store.zarr_store import Shards
 
@@ -61,11 +62,12 @@ class ZarrSink(Sink):
     @property
     def written(self) -> int | None:
         """Time at which the present result was written, by the clock of its file system."""
-        return (self.held / "zarr.json").stat().st_mtime_ns if self.held.exists() else None
+        file = self.held / "zarr.json"
+        return file.stat().st_mtime_ns if file.exists() else None
 
     def check_place(self) -> None:
         """Raise :class:`InputError` if there is something other than a store at the path."""
-        if self.held.is_dir() and not zarr_store.is_store(self.held):
+        if self.held.is_dir() and not (zarr_store.is_store(self.held) or zarr_store.was_store(self.held)):
             raise InputError(f"out = {str(self._out)!r}: is a folder; allowed is the path of a file")
         if self._out.is_file():
             allowed = "allowed for store = 'zarr' is a new path, or such a store"
@@ -84,6 +86,19 @@ class ZarrSink(Sink):
     def attribute(self, name: str) -> Any:
         """A global attribute of the present result."""
         return zarr_store.attributes(self.held).get(name)
+
+    def digest(self) -> Any:
+        """Digest of the present result; empty if the metadata of a store are damaged."""
+        try:
+            return super().digest()
+        except InputError:
+            if not zarr_store.was_store(self.held):
+                raise
+            return ""
+
+    def damage(self) -> str:
+        """The damaged parts of the present result; empty without damage."""
+        return zarr_store.damage(self.held)
 
     def outcomes(self) -> np.ndarray:
         """Outcomes of all points of the present result."""
@@ -109,11 +124,12 @@ class ZarrSink(Sink):
         final = run.template
         attrs = {**final.attrs, "wall_time_s": round(time.monotonic() - run.begin, 3)}
         zarr_store.seal(run.path, attrs, {OUTCOME.name: final.data[OUTCOME.name].attrs})
+        flush_tree(run.path)
         former = self._parts.path / zarr_store.FORMER
         if self._out.exists():
             shutil.rmtree(former, ignore_errors=True)
-            self._out.rename(former)
-        run.path.rename(self._out)
+            move_folder(self._out, former)
+        move_folder(run.path, self._out)
 
 
 class _ShardedRun:
@@ -169,15 +185,18 @@ class _ShardedRun:
             self._run(executor, writer, self._due(final=True))
 
     def _create(self) -> None:
-        if zarr_store.is_store(self.path) and zarr_store.matches(self.path, self.template, self._shards):
-            return
+        """Create the store from the plan, unless a stopped run has left exactly that."""
         # Moved in one step, so the store at this path is always whole.
         half = self.path.with_name("half")
-        for folder in (self.path, half):
-            shutil.rmtree(folder, ignore_errors=True)
+        shutil.rmtree(half, ignore_errors=True)
         fills = {v.name: missing_value(v) for v in result_variables(self._job.scene)} | {OUTCOME.name: PENDING}
         zarr_store.create(half, with_pending(self.template), self._shards, fills)
-        half.rename(self.path)
+        if zarr_store.matches(self.path, half):
+            shutil.rmtree(half)
+            return
+        shutil.rmtree(self.path, ignore_errors=True)
+        flush_tree(half)
+        move_folder(half, self.path)
 
     def _reuse(self) -> None:
         for part in self._parts.read(repair=True):

@@ -23,7 +23,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.store.files import behind_link, write_atomic
+from drivetrain_jax.store.files import behind_link, sync_folder, write_atomic
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -129,6 +129,7 @@ class PartsFolder:
     def _make(self) -> None:
         try:
             self.path.mkdir(exist_ok=True)
+            sync_folder(self.path.parent)
         except OSError as error:
             # A full disk may have space later.
             if error.errno in (errno.ENOSPC, errno.EDQUOT):

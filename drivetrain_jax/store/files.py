@@ -43,11 +43,26 @@ def move_into_place(temporary: Path, path: Path) -> None:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    _sync_folder(path.parent)
+    sync_folder(path.parent)
 
 
-def _sync_folder(folder: Path) -> None:
-    """Make the renaming durable; systems that cannot open a folder skip this."""
+def flush_tree(folder: Path) -> None:
+    """Flush all files and folders below ``folder`` to disk, and ``folder`` itself."""
+    for path, _, names in os.walk(folder, topdown=False):
+        for name in names:
+            flush(Path(path, name))
+        sync_folder(Path(path))
+
+
+def move_folder(folder: Path, path: Path) -> None:
+    """Rename the flushed ``folder`` to ``path``, which must not exist, and make the renaming durable."""
+    folder.rename(path)
+    for parent in {path.parent, folder.parent}:
+        sync_folder(parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make new names in ``folder`` durable; systems that cannot open a folder skip this."""
     try:
         handle = os.open(folder, os.O_RDONLY)
     except OSError:

@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._wording import counted
+from drivetrain_jax.store.files import flush, sync_folder
 from drivetrain_jax.store.provenance import digest
 from drivetrain_jax.store.schema import DETAILS, GROUP, Labelled
 
@@ -71,6 +73,11 @@ class Shards:
         return tuple(slice(a, min(a + n, size)) for a, n, size in zip(starts, self.lengths, self.shape, strict=True))
 
 
+def was_store(path: Path) -> bool:
+    """True if the folders at ``path`` are those of a store, whose metadata may be damaged."""
+    return (path / _OF_SHARDS).is_dir() and (path / "outcome").is_dir()
+
+
 def is_store(path: Path) -> bool:
     """True if there is a Zarr v3 group at ``path``."""
     return (path / "zarr.json").is_file()
@@ -116,17 +123,11 @@ def shards_of(path: Path) -> Shards:
         raise _damaged(path) from None
 
 
-def matches(path: Path, template: Labelled, shards: Shards) -> bool:
-    """True if the store at ``path`` has the layout of :func:`create`."""
+def matches(path: Path, empty: Path) -> bool:
+    """True if the store at ``path`` has readable checksums, and the metadata and coordinates of the ``empty`` one."""
     try:
-        root = _root(path)
-        own = root[_OF_SHARDS].shape == (shards.count,) and set(template.coords) <= set(root.array_keys())
-        return own and all(
-            (root[name].shape, root[name].dtype, root[name].chunks[: len(shards.shape)])
-            == (entry.values.shape, entry.values.dtype, shards.lengths)
-            for name, entry in template.data.items()
-        )
-    except _BROKEN:
+        return done(path).shape == done(empty).shape and digest(_layout(path)) == digest(_layout(empty))
+    except (InputError, *_BROKEN):
         return False
 
 
@@ -137,12 +138,28 @@ def result_shapes(path: Path) -> dict[str, tuple[int, ...]]:
 
 
 def write(path: Path, place: Place, arrays: Mapping[str, np.ndarray], shard: int | None) -> None:
-    """Write the results of a shard, and mark number ``shard`` done if given."""
+    """Write the results of a shard, and mark number ``shard`` done if given, after its results are flushed to disk."""
     root = _root(path, "r+")
     for name, values in arrays.items():
         root[name][(*place, ...)] = values
     if shard is not None:
+        for name in arrays:
+            first = [part.start // length for part, length in zip(place, root[name].chunks, strict=False)]
+            _flush_chunk(path, root[name], (*first, *[0] * (root[name].ndim - len(first))))
         root[_OF_SHARDS][shard] = _checksum(arrays)
+        _flush_chunk(path, root[_OF_SHARDS], (shard,))
+
+
+def _flush_chunk(path: Path, array: Any, index: tuple[int, ...]) -> None:
+    """Flush the file of a chunk, if it has one, and the folders above it up to the store."""
+    file = path / array.path / array.metadata.encode_chunk_key(index)
+    if file.exists():
+        flush(file)
+    for folder in file.parents:
+        if folder.exists():
+            sync_folder(folder)
+        if folder == path:
+            return
 
 
 def done(path: Path) -> np.ndarray:
@@ -211,6 +228,15 @@ def _consolidate(path: Path) -> None:
         _zarr().consolidate_metadata(path)
 
 
+def damage(path: Path) -> str:
+    """The damaged parts of the finished store at ``path``, by all its checksums; empty without damage."""
+    try:
+        wrong = [*intact(path)].count(False) if is_sealed(path) else -1
+    except InputError:
+        wrong = -1
+    return "its metadata" if wrong < 0 else counted(wrong, "shard", "shards") if wrong else ""
+
+
 def is_sealed(path: Path) -> bool:
     """True if a finished store is intact apart from its shards; :class:`InputError` if it is not a result."""
     attrs = attributes(path)
@@ -226,8 +252,13 @@ def is_sealed(path: Path) -> bool:
 
 def _digest(path: Path) -> str:
     """Digest of attributes, metadata and coordinates."""
+    attrs = {name: value for name, value in _root(path).attrs.items() if name != SEAL}
+    return digest([attrs, *_layout(path)])
+
+
+def _layout(path: Path) -> list[dict[str, Any]]:
+    """Metadata of all groups and arrays, the consolidated attributes, and the coordinates."""
     root = _root(path)
-    attrs = {name: value for name, value in root.attrs.items() if name != SEAL}
     results = set(root[_CHECKSUMS].attrs[_RESULTS])
     files = sorted({path / GROUP, path / _CHECKSUMS, path / _OF_SHARDS, *(path / name for name in root.array_keys())})
     metadata = {file.relative_to(path).as_posix(): json.loads((file / "zarr.json").read_text()) for file in files}
@@ -235,7 +266,7 @@ def _digest(path: Path) -> str:
     copy = _zarr().open_group(path, mode="r")
     copied = {name: dict(copy[name].attrs) for name in sorted(root.array_keys())}
     labels = {name: values.tolist() if values.dtype.kind in ("O", "T") else values for name, values in coords.items()}
-    return digest([attrs, metadata, copied, labels])
+    return [metadata, copied, labels]
 
 
 def _checksum(arrays: Mapping[str, np.ndarray]) -> int:
