@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, RetryableError
 from drivetrain_jax.runs.assemble import labelled
 from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import restore_scene, result_variables
@@ -20,7 +20,8 @@ from drivetrain_jax.store.consolidate import ResultFile, release
 def export(store: Path, out: Path) -> int:
     """Write the result in the Zarr ``store`` to the new file ``out``, shard by shard; returns the number of points.
 
-    Raises :class:`InputError` if ``store`` is not a sound Zarr store, or if ``out`` exists or cannot be written.
+    Raises :class:`InputError` if ``store`` is not a sound Zarr store, or if ``out`` exists, and :class:`RetryableError` after
+    an I/O error.
     """
     if not zarr_store.is_store(store):
         raise InputError(f"store = {str(store)!r}: not a Zarr store; give one of `drivetrain run --store zarr`")
@@ -43,9 +44,7 @@ def export(store: Path, out: Path) -> int:
             _fill(store, file.lay_out(labelled(scene, zeros, kept)))
             file.finish(out)
     except OSError as error:
-        raise InputError(
-            f"out = {str(out)!r}: {error.strerror or error}; allowed is a disk with enough free space"
-        ) from None
+        raise RetryableError(f"out = {str(out)!r}: {error}; the same command tries again") from None
     finally:
         parts.close(remove=ours)
     return math.prod(Grid.of(scene).result_shape)

@@ -14,7 +14,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.store import checksums, netcdf
-from drivetrain_jax.store.files import flush, move_into_place
+from drivetrain_jax.store.files import flush, move_into_place, naming
 from drivetrain_jax.store.schema import GROUP, Labelled
 
 if TYPE_CHECKING:
@@ -47,15 +47,16 @@ class ResultFile:
 
         Raises ``OSError`` if the disk lacks space, before anything is computed.
         """
-        places = _write_frame(template, self._temporary, self._preface)
-        with open(self._temporary, "r+b") as file:
-            mapped = mmap.mmap(file.fileno(), 0)
+        with naming(self._temporary):
+            places = _write_frame(template, self._temporary, self._preface)
+            with open(self._temporary, "r+b") as file:
+                mapped = mmap.mmap(file.fileno(), 0)
         data = {name: entry.values for name, entry in template.data.items()}
         return {n: np.ndarray(data[n].shape, data[n].dtype, mapped, at) for n, at in places.items()}
 
     def finish(self, path: Path, **attrs: str | float) -> None:
         """Change these attributes, add checksums, flush to disk, and move the file to ``path`` in one step."""
-        with ThreadPoolExecutor(1) as aside:
+        with naming(self._temporary), ThreadPoolExecutor(1) as aside:
             # Start writing the mapped pages now; computing the checksums reads them meanwhile.
             written = aside.submit(flush, self._temporary)
             with h5py.File(self._temporary, "r+") as file:

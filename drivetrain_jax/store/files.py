@@ -3,11 +3,41 @@
 from __future__ import annotations
 
 import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 # First bytes of an atlas file, in a user block of HDF5, by which xarray finds the engine of this package. Readers of HDF5
 # and netCDF skip the user block.
 ATLAS_PREFACE = b"An atlas of drivetrain_jax, HDF5 from byte 512 on.\n"
+
+
+# The error number inside a message of HDF5, which raises RuntimeError, KeyError or ValueError for a failed system call.
+_ERRNO = re.compile(r"\berrno = (\d+)")
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Raise an I/O error inside the context as ``OSError`` with its reason and ``path``, those inside HDF5 too."""
+    try:
+        yield
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError) as error:
+        number = _errno(error)
+        if number is None:
+            raise
+        raise OSError(number, os.strerror(number), str(path)) from error
+
+
+def _errno(error: BaseException | None) -> int | None:
+    """The number of the system call that failed in ``error``, or before it."""
+    while error is not None:
+        if found := _ERRNO.search(str(error)):
+            return int(found.group(1))
+        if isinstance(error, OSError) and error.errno:
+            return error.errno
+        error = error.__context__
+    return None
 
 
 def behind_link(path: Path) -> Path:
@@ -21,7 +51,7 @@ def write_atomic(path: Path, data: bytes | memoryview, temporary: Path) -> None:
     An existing file is replaced in one step or not at all.
     """
     try:
-        with open(temporary, "wb") as file:
+        with naming(temporary), open(temporary, "wb") as file:
             file.write(data)
     except BaseException:
         temporary.unlink(missing_ok=True)
@@ -31,7 +61,7 @@ def write_atomic(path: Path, data: bytes | memoryview, temporary: Path) -> None:
 
 def flush(path: Path) -> None:
     """Flush the whole file to disk, memory maps included."""
-    with open(path, "rb+") as file:
+    with naming(path), open(path, "rb+") as file:
         os.fsync(file.fileno())
 
 
