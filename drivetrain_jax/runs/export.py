@@ -20,8 +20,8 @@ from drivetrain_jax.store.consolidate import ResultFile, release
 def export(store: Path, out: Path) -> int:
     """Write the result in the Zarr ``store`` to the new file ``out``, shard by shard; returns the number of points.
 
-    Raises :class:`InputError` if ``store`` is not a sound Zarr store, or if ``out`` exists, and :class:`RetryableError` after
-    an I/O error.
+    Raises :class:`InputError` if ``store`` is not a sound Zarr store, or if ``out`` exists, and :class:`RetryableError`
+    after an I/O error.
     """
     if not zarr_store.is_store(store):
         raise InputError(f"store = {str(store)!r}: not a Zarr store; give one of `drivetrain run --store zarr`")

@@ -46,16 +46,14 @@ def describe(
 ) -> dict[str, Array]:
     """All results of the motions ``found``, every field of shape ``(N,)`` as those of ``oscillator``.
 
-    Results have the names of the variables and the shape ``(N,)``. ``impacts``, ``impact_velocity`` and ``contact_fraction``
-    (of the driving and the back flank), ``orbit_state`` and (complex) ``floquet_multiplier`` have the shape ``(2, N)``.
-    Unknown values are NaN (``stability``: absent).
+    ``impacts``, ``impact_velocity`` and ``contact_fraction`` (of the driving and the back flank), ``orbit_state`` and (complex)
+    ``floquet_multiplier`` have the shape ``(2, N)``. Unknown values are NaN (``stability``: absent).
 
-    A motion that recurs within 32 periods is measured over its period. A motion that does not recur, but whose tangent has
-    grown by exp(20) over the last three quarters of the run, is non-periodic (``period_multiple`` 0) and measured over 32
-    drive periods. Such a motion may still be a transient to a periodic motion, with the exponent of the transient chaos.
-    Any other motion has not settled, nor has an orbit whose measured spectral radius exceeds 1 by more than rounding.
-    ``outcome`` is TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its size, and NOT_FINITE where
-    its size exceeds ``largest``.
+    A motion that recurs within 32 periods is measured over its period. A motion that does not, but whose tangent has grown by
+    exp(20) over the last three quarters of the run, is non-periodic (``period_multiple`` 0) and measured over 32 drive
+    periods. It may still be a transient to a periodic motion. Any other motion has not settled, nor has an orbit whose
+    spectral radius exceeds 1. ``outcome`` is TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its
+    size, and NOT_FINITE where its size exceeds ``largest``.
     """
     seen = measure(oscillator, found.u, found.v, found.multiple, width=WIDTH, integrals=integrals)
     periodic = found.multiple > 0
