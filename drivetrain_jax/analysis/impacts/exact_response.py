@@ -46,14 +46,14 @@ def describe(
 ) -> dict[str, Array]:
     """All results of the motions ``found``, every field of shape ``(N,)`` as those of ``oscillator``.
 
-    ``impacts``, ``impact_velocity`` and ``contact_fraction`` (of the driving and the back flank), ``orbit_state`` and (complex)
-    ``floquet_multiplier`` have the shape ``(2, N)``. Unknown values are NaN (``stability``: absent).
+    Impacts and contact (of the driving and the back flank), ``orbit_state`` and ``floquet_multiplier`` have the shape
+    ``(2, N)``. Unknown values are NaN (``stability``: absent).
 
-    A motion that recurs within 32 periods is measured over its period. A motion that does not, but whose tangent has grown by
-    exp(20) over the last three quarters of the run, is non-periodic (``period_multiple`` 0) and measured over 32 drive
-    periods. It may still be a transient to a periodic motion. Any other motion has not settled, nor has an orbit whose
-    spectral radius exceeds 1. ``outcome`` is TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its
-    size, and NOT_FINITE where its size exceeds ``largest``.
+    A motion that recurs within 32 periods is measured over its period. A motion that does not, but whose tangent has
+    grown by exp(20) over the last three quarters of the run, is non-periodic (``period_multiple`` 0), or still a transient,
+    and measured over 32 drive periods. Any other motion has not settled, nor has an orbit whose spectral radius exceeds 1.
+    ``outcome`` is TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its size, and NOT_FINITE where
+    its size exceeds ``largest``.
     """
     seen = measure(oscillator, found.u, found.v, found.multiple, width=WIDTH, integrals=integrals)
     periodic = found.multiple > 0
