@@ -46,8 +46,7 @@ def describe(
 ) -> dict[str, Array]:
     """All results of the motions ``found``, every field of shape ``(N,)`` as those of ``oscillator``.
 
-    Impacts and contact (of the driving and the back flank), ``orbit_state`` and ``floquet_multiplier`` have the shape
-    ``(2, N)``. Unknown values are NaN (``stability``: absent).
+    Impacts, contacts, states and multipliers are pairs, ``(2, N)``. Unknown values are NaN (``stability``: absent).
 
     A motion that recurs within 32 periods is measured over its period. A motion that does not, but whose tangent has
     grown by exp(20) over the last three quarters of the run, is non-periodic (``period_multiple`` 0), or still a transient,
