@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.impacts.attractor_approach import Orbit, attracts, is_slow, linearisation_holds
+from drivetrain_jax.analysis.impacts.attractor_approach import Orbit, attracts, is_slow, linearisation_holds, reach
 from drivetrain_jax.analysis.impacts.attractor_lanes import (
     MOST_PERIODS,
     Lane,
@@ -120,24 +120,31 @@ def _shoot(
     du, dv = newton_correction(motion.matrix, motion.u - u, motion.v - v)
     guess = (u + du, v + dv)
     change = jnp.abs(du) + jnp.abs(dv) / omega
-    size = jnp.abs(guess[0]) + jnp.abs(guess[1]) / omega
-    stuck = (change <= _ROUNDING * size) & (change > lane.change / 2)
+    rounding = _rounding(lanes, motion, guess, omega)
+    size = reach(*guess, local.b, omega)
+    stuck = (change <= _ROUNDING * size + rounding) & (change > lane.change / 2)
     converged = (change <= _CONVERGED * size) | stuck
     astray = ~(_speed(local, *guess) <= _ASTRAY * (_speed(local, *lane.latest) + _usual_speed(local)))
     going = now & ~converged & (lane.corrections < _CORRECTIONS) & ~astray & (change <= _SHRINKING * lane.change)
-    # Rounding of the state after m periods, in u and v, and its effect on the u of the orbit.
-    by_u, by_v = (newton_correction(motion.matrix, 1.0 - k + 0 * u, k * omega)[0] for k in (0.0, 1.0))
-    inverse = jnp.abs(by_u) + jnp.abs(by_v)
-    rounding = 32 * size * jnp.sqrt(motion.steps.astype(float)) + 2 * _taken_off(lanes, motion)
-    error = change + _EPS * rounding * (1 + inverse)
-    orbit = Orbit(*guess, motion.matrix, -local.damping * lane.multiple * 2 * np.pi / omega, error)
+    orbit = Orbit(*guess, motion.matrix, -local.damping * lane.multiple * 2 * np.pi / omega, change + rounding)
     stable = now & converged & attracts(orbit)
-    slow = stable & is_slow(orbit, lane.latest, omega) & ~linearisation_holds(orbit, lane.latest, first, omega)[0]
+    slow = (
+        stable & is_slow(orbit, lane.latest, omega) & ~linearisation_holds(orbit, lane.latest, first, local.b, omega)[0]
+    )
     corrected = lane._replace(
         guess=guess, first=first, change=change, corrections=lane.corrections + now.astype(jnp.int32)
     )
     lane = restart(select(going, corrected, lane), going, *guess, lane.multiple)
     return lane, _Verdict(stable & ~slow, slow, orbit, now & ~going & ~stable)
+
+
+def _rounding(lanes: Lanes, motion: Motion, state: tuple[Array, Array], omega: Array) -> Array:
+    """Effect on the u of an orbit of rounding the motion over its period."""
+    by_u, by_v = (newton_correction(motion.matrix, 1.0 - k + 0 * motion.u, k * omega)[0] for k in (0.0, 1.0))
+    inverse = jnp.abs(by_u) + jnp.abs(by_v)
+    size = jnp.abs(state[0]) + jnp.abs(state[1]) / omega
+    rounding = 32 * size * jnp.sqrt(motion.steps.astype(float)) + 2 * _taken_off(lanes, motion)
+    return _EPS * rounding * (1 + inverse)
 
 
 def _taken_off(lanes: Lanes, motion: Motion) -> Array:
@@ -206,7 +213,7 @@ def _tick(task: _Task, work: _Work) -> _Work:
     after, verdict = _shoot(lane, shot, local, lanes, omega)
     settles = ready & ~lane.searching & ~broken
     after = settle(after, settles, task.most_periods - averaged(task.most_periods), omega)
-    after, reached = confirm(after, settles, history, omega)
+    after, reached = confirm(after, settles, history, local.b, omega)
     history = record(history, settles, after)
     first, second = candidates(after, history, omega)
     after = search(after, settles & (after.held == 0) & (after.count >= after.due), first, second)

@@ -20,7 +20,7 @@ orbit.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -30,7 +30,7 @@ from drivetrain_jax.analysis.impacts.plane_map import Matrix, apply, spectral_ra
 
 # Tolerated remainder of the linearisation relative to the contraction 1 - rho.
 REMAINDER = 0.02
-# Relative distance at which the motion has arrived.
+# Distance at which the motion has arrived, relative to its distance from the flank.
 _ARRIVED = 1e-9
 _DECAY = np.log(30.0)
 # A slow approach: least modulus of the slow multiplier, largest ratio of the fast multiplier to the slow one, and largest
@@ -71,8 +71,13 @@ def recurrences(orbit: Orbit) -> Array:
     return jnp.maximum(jnp.ceil(needed), 2.0)
 
 
+def reach(u: Array, v: Array, flank: Any, omega: Array) -> Array:
+    """Size of a motion through ``(u, v)``, from the flank: at a wide backlash the motion may be small and far from the origin."""
+    return jnp.abs(jnp.abs(u) - flank) + jnp.abs(v) / omega
+
+
 def linearisation_holds(
-    orbit: Orbit, before: tuple[Array, Array], after: tuple[Array, Array], omega: Array
+    orbit: Orbit, before: tuple[Array, Array], after: tuple[Array, Array], flank: Any, omega: Array
 ) -> tuple[Array, Array]:
     """Flags where ``after``, one recurrence after ``before``, agrees with the linearisation, and flags of arrival."""
     rho = spectral_radius(orbit.matrix, orbit.log_determinant)
@@ -80,8 +85,7 @@ def linearisation_holds(
     ahead = apply(orbit.matrix, *away)
     rest = jnp.abs(after[0] - orbit.u - ahead[0]) + jnp.abs(after[1] - orbit.v - ahead[1]) / omega
     distance = jnp.abs(away[0]) + jnp.abs(away[1]) / omega
-    size = jnp.abs(orbit.u) + jnp.abs(orbit.v) / omega
-    arrived = distance <= _ARRIVED * size
+    arrived = distance <= _ARRIVED * reach(orbit.u, orbit.v, flank, omega) + orbit.error
     return (rest <= REMAINDER * (1 - rho) * distance) | arrived, arrived
 
 

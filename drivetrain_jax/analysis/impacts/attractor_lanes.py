@@ -154,7 +154,7 @@ def approach(lane: Lane, now: Array, orbit: Orbit) -> Lane:
     return restart(select(now, begun, lane), now, *lane.latest, 1)
 
 
-def confirm(lane: Lane, now: Array, history: Array, omega: Array) -> tuple[Lane, Array]:
+def confirm(lane: Lane, now: Array, history: Array, flank: Any, omega: Array) -> tuple[Lane, Array]:
     """The lanes after a period in the lanes ``now``, and flags of lanes that have approached their orbit for long enough.
 
     If the motion does not satisfy the linearisation about the orbit, counting restarts; a new search may follow.
@@ -162,7 +162,7 @@ def confirm(lane: Lane, now: Array, history: Array, omega: Array) -> tuple[Lane,
     due = now & lane.approaching & (lane.count > lane.begun) & ((lane.count - lane.begun) % lane.multiple == 0)
     row = (lane.count - lane.multiple) % (MOST_PERIODS + 1)
     past = jnp.where(jnp.concatenate([row, row]) == _ROWS, history, 0.0).sum(axis=0)
-    ok, arrived = linearisation_holds(lane.orbit, (past[: row.size], past[row.size :]), lane.latest, omega)
+    ok, arrived = linearisation_holds(lane.orbit, (past[: row.size], past[row.size :]), lane.latest, flank, omega)
     held = jnp.where(due, jnp.where(ok, lane.held + 1, 0), lane.held)
     return lane._replace(held=held), due & ok & (arrived | (held >= recurrences(lane.orbit)))
 

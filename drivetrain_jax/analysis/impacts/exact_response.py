@@ -29,6 +29,8 @@ INTEGRALS = frozenset(("u_mean", "u_rms", "phase"))
 # Logarithmic growth of a tangent that only chaos explains, lasting or transient: shear makes a tangent grow in proportion to
 # time.
 _WILD = 20.0
+# Error of u, relative to the distance from the flanks, that may confuse one attractor with another.
+_DECIDES = 1e-3
 # Excess of the spectral radius over 1 that is no rounding: a motion without damping has 1.
 _UNSTABLE = 1e-6
 # Lanes computed at a time: enough to fill the vector units, but few lanes wait for the slowest. Sweeps have fewer lanes,
@@ -51,15 +53,18 @@ def describe(
     A motion that recurs within 32 periods is measured over its period. A motion that does not, but whose tangent has
     grown by exp(20) over the last three quarters of the run, is non-periodic (``period_multiple`` 0), or still a transient,
     and measured over 32 drive periods. Any other motion has not settled, nor has an orbit whose spectral radius exceeds 1.
-    ``outcome`` is TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its size, and NOT_FINITE where
-    its size exceeds ``largest``.
+    ``outcome`` is TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its size, or a thousandth of the
+    largest distance from the flanks, and NOT_FINITE where its size exceeds ``largest``.
     """
     seen = measure(oscillator, found.u, found.v, found.multiple, width=WIDTH, integrals=integrals)
     periodic = found.multiple > 0
     growth = found.exponent * averaged(found.periods) * oscillator.period
     wild = ~periodic & (growth > _WILD)
     size = jnp.maximum(jnp.abs(seen.high), jnp.abs(seen.low))
-    outcome = jnp.where(periodic & ~(found.error <= rtol * size), Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
+    # Far from the origin, at a wide backlash, the motion may be much smaller than u.
+    away = jnp.maximum(jnp.abs(jnp.abs(seen.high) - oscillator.b), jnp.abs(jnp.abs(seen.low) - oscillator.b))
+    exact = (found.error <= rtol * size) & (found.error <= _DECIDES * away)
+    outcome = jnp.where(periodic & ~exact, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
     results = periodic_results(oscillator, seen)
     unstable = periodic & (results["spectral_radius"] > 1 + _UNSTABLE)
     outcome = jnp.where((periodic | wild) & ~unstable, outcome, Outcome.NOT_CONVERGED)

@@ -211,8 +211,9 @@ def _tick(task: _Task, work: _Work) -> _Work:
     ended = motion.left <= periods - 1 - so_far.periods
     so_far = so_far._replace(periods=so_far.periods + ended)
     distance = jnp.abs(motion.u - u) + jnp.abs(motion.v - v) / lanes.omega
-    size = jnp.abs(so_far.high) + jnp.abs(so_far.low) + jnp.abs(u) + jnp.abs(v) / lanes.omega
-    back = (recurs > 0) & (distance <= _RECURRENCE * size)
+    # Not the size of u: at a wide backlash the motion about a flank is far from the origin.
+    extent = so_far.high - so_far.low + jnp.abs(v) / lanes.omega
+    back = (recurs > 0) & (distance <= _RECURRENCE * extent + _ROUNDING * jnp.abs(u))
     broken = ~jnp.isfinite(motion.u) | (motion.steps > 2 * periods * usual_steps(lanes))
     done = (work.index < count) & (broken | (ended & (back | (motion.left <= 0))))
     result = so_far._replace(matrix=motion.matrix, end=(motion.u, motion.v), complete=jnp.where(broken, 0.0, 1.0))

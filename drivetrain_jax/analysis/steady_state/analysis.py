@@ -9,8 +9,8 @@ separated by a factor of exp(20) over the last three quarters of that time, whic
 distinguish a chaotic attractor from a long transient; a larger ``most_periods`` may show the end of a transient.
 
 Outcome: ``NOT_CONVERGED`` if the motion has neither settled nor separated; ``TOLERANCE_NOT_MET`` if the estimated error of
-the orbit exceeds ``rtol`` times its largest displacement; ``STEP_LIMIT`` if the motion has more events per period than a
-motion can have unless it grazes a flank.
+the orbit exceeds ``rtol`` times its largest displacement, or a thousandth of its largest distance from the flanks;
+``STEP_LIMIT`` if the motion has more events per period than a motion can have unless it grazes a flank.
 """
 
 from __future__ import annotations
