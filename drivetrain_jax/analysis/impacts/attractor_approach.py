@@ -72,7 +72,7 @@ def recurrences(orbit: Orbit) -> Array:
 
 
 def reach(u: Array, v: Array, flank: Any, omega: Array) -> Array:
-    """Size of a motion through ``(u, v)``, from the flank: at a wide backlash the motion may be small and far from the origin."""
+    """Size of a motion through ``(u, v)``, from the flank: at a wide backlash the motion may be far from the origin."""
     return jnp.abs(jnp.abs(u) - flank) + jnp.abs(v) / omega
 
 
