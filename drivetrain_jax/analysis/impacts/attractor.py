@@ -122,7 +122,7 @@ def _shoot(
     change = jnp.abs(du) + jnp.abs(dv) / omega
     rounding = _rounding(lanes, motion, guess, omega)
     size = reach(*guess, local.b, omega)
-    stuck = (change <= _ROUNDING * size + rounding) & (change > lane.change / 2)
+    stuck = (change <= _ROUNDING * size + 64 * _EPS * jnp.abs(guess[0])) & (change > lane.change / 2)
     converged = (change <= _CONVERGED * size) | stuck
     astray = ~(_speed(local, *guess) <= _ASTRAY * (_speed(local, *lane.latest) + _usual_speed(local)))
     going = now & ~converged & (lane.corrections < _CORRECTIONS) & ~astray & (change <= _SHRINKING * lane.change)
