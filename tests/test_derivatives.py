@@ -216,7 +216,7 @@ def entry(system, name):
     return getattr(system, name)
 
 
-@pytest.mark.parametrize("case", but_full(CASES, "cardan orbit"))
+@pytest.mark.parametrize("case", but_full(CASES, "cardan orbit", "cardan forced"))
 def test_derivatives_at_random_points(case):
     """Each entry within 1e-6 of the largest logarithmic derivative of its result."""
     draw, function, oracle, names = CASES[case]
@@ -304,6 +304,7 @@ def test_derivatives_equal_differences(case):
         np.testing.assert_allclose(found, slope, rtol=rtol, atol=rtol * np.abs(slope).max(), err_msg=name)
 
 
+@pytest.mark.full
 def test_a_state_alone_has_the_derivatives_that_it_has_with_its_amplitude():
     shaft = dt.Cardan(**SHAFT.values | {"Omega": 1.0})
     alone = quick_jit(jax.jacrev(lambda s: dt.forced(s, outputs=["periodic_state"]).periodic_state))(shaft)

@@ -36,6 +36,7 @@ def test_shares_of_the_high_branch(found):
     assert (found.attractor_multiple.values[:, :2] == 1).all()
 
 
+@pytest.mark.full
 def test_the_seed_decides():
     one, again, other = (run(samples=128, seed=seed).basin_fraction.values for seed in (3, 3, 4))
     np.testing.assert_array_equal(again, one)

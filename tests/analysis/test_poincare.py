@@ -153,6 +153,7 @@ class TestZeroOne:
         values = np.asarray(jax.jit(chaos_k01)(self.logistic([3.55, 3.97, 4.0 - 1e-9])))
         np.testing.assert_allclose(values, [0.0, 1.0, 1.0], atol=0.02)
 
+    @pytest.mark.full
     def test_quasi_periodic_and_constant(self):
         n = np.arange(2000)
         series = np.stack([np.cos(math.sqrt(2) * n), np.full(2000, 3.7)], axis=1)

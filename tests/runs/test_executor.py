@@ -139,7 +139,7 @@ def test_a_process_that_dies_at_its_start_is_started_again(drivetrain, package, 
     assert ("computed=40 reused=0 failed=0" if code == 0 else "crash during their start") in error
 
 
-@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("sent", [pytest.param(signal.SIGINT, marks=pytest.mark.full), signal.SIGKILL])
 def test_no_process_outlives_the_driver(drivetrain, tmp_path, sent):
     scene = SCENE | {"axes": {"delta": {"start": 0.1, "stop": 2.0, "num": 150_000}}}
     driver = drivetrain(scene, "stopped", "--workers", "2")
@@ -155,6 +155,7 @@ def test_no_process_outlives_the_driver(drivetrain, tmp_path, sent):
     assert "failed=0" in resumed and "reused=0" not in resumed
 
 
+@pytest.mark.full
 def test_external_scheduler_and_workers(drivetrain, package, tmp_path):
     pytest.importorskip("distributed")
     command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"]

@@ -3,12 +3,14 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import drivetrain_jax as dt
 
 SCENE = Path(__file__).parents[2] / "sweeps" / "cardan_4d.toml"
 
 
+@pytest.mark.full
 def test_whole_grid_agrees_and_no_cell_is_flagged():
     by_diffrax = dt.run(SCENE)
     direct = dt.run(SCENE, overrides={"options.method": "direct"})

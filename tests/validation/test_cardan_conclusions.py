@@ -14,6 +14,7 @@ def unstable(scene: str) -> np.ndarray:
     return dt.run(SWEEPS / f"{scene}.toml", overrides={"outputs": ["verdict"]}).verdict.values == 1
 
 
+@pytest.mark.full
 def test_a_stiffer_driven_shaft_is_not_always_less_stable():
     """Unstable fractions up to 30 degrees for mu = 0.25, 1, 2, 5, 10, 20; the audit used another grid."""
     shares = unstable("cardan_stiffness").mean(axis=(1, 2))
