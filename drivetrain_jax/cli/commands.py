@@ -154,9 +154,9 @@ def plot(options: argparse.Namespace) -> int:
     except InputError:
         raise
     except (LookupError, ValueError):
-        # Damage may be why the figure failed.
+        # What another program has changed may be why the figure failed.
         for file in options.files:
-            refuse_damaged(file)
+            refuse_damaged(file, rewritten=True)
         raise
     image = io.BytesIO()
     figure.savefig(image, format=options.out.suffix[1:].lower())
@@ -186,6 +186,9 @@ def _check_place(out: Path, endings: tuple[str, ...]) -> None:
     """Raise :class:`InputError` for a file that could not be written, before anything is computed."""
     if not out.parent.is_dir():
         raise InputError(f"out = {str(out)!r}: the folder does not exist; allowed is a file in an existing folder")
+    if out.exists() and not out.is_file():
+        what = "is a folder" if out.is_dir() else "not a regular file"
+        raise InputError(f"out = {str(out)!r}: {what}; allowed is a new file, or one to replace")
     if out.suffix.lower() not in endings:
         raise InputError(f"out = {str(out)!r}: allowed is a name that ends in {', '.join(endings)}")
 

@@ -51,7 +51,7 @@ def verify(path: Path) -> Report:
     if zarr_store.is_store(path):
         return _verify_store(path)
     if not path.is_file():
-        what = "is a folder" if path.is_dir() else "does not exist"
+        what = "is a folder" if path.is_dir() else "not a regular file" if path.exists() else "does not exist"
         raise InputError(f"file = {str(path)!r}: {what}; give a result written by `drivetrain run`")
     damaged = checksums.damaged(path)
     if damaged:

@@ -8,9 +8,11 @@ from typing import Any, cast
 import h5py
 import numpy as np
 
+from drivetrain_jax._errors import InputError
 from drivetrain_jax.runs.assemble import axis_coordinates
 from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import Scene, result_variables
+from drivetrain_jax.store import gate
 
 
 def rearranged(path: Path, scene: Scene, grid: Grid) -> list[str]:
@@ -20,14 +22,14 @@ def rearranged(path: Path, scene: Scene, grid: Grid) -> list[str]:
     """
     try:
         return _rearranged(path, scene, grid)
-    except (OSError, KeyError, ValueError, RuntimeError, TypeError):
+    except InputError:
         return ["its structure"]
 
 
 def _rearranged(path: Path, scene: Scene, grid: Grid) -> list[str]:
     dims = ("point",) if scene.zipped else tuple(axis.dim for axis in scene.axes)
     expected = {c.name: c.values for c in axis_coordinates(scene) if c.name != "point"}
-    with cast(Any, h5py.File(path, "r")) as file:
+    with cast(Any, gate.opened(path)) as file:
         for own in scene.dimensions:
             if own.name in file:
                 expected[own.name] = np.asarray(own.labels(file[own.name].size))

@@ -17,7 +17,7 @@ from drivetrain_jax.runs.output_state import OutputState
 from drivetrain_jax.runs.pending import PENDING, with_pending
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import restore_scene
-from drivetrain_jax.store import consolidate
+from drivetrain_jax.store import checksums, consolidate
 from drivetrain_jax.store.chunks import PartsFolder
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def open_result(path: str | Path) -> xr.Dataset:
     If only unfinished work in ``FILE.nc.parts/`` exists, missing points have the outcome ``pending`` and no value; the
     attribute ``points_done`` counts the others. A running computation is not disturbed.
 
-    Raises :class:`InputError` if there is neither, or if the work belongs to other code.
+    Raises :class:`InputError` if there is neither, if the result is damaged, or if the work belongs to other code.
 
     >>> import drivetrain_jax as dt
     >>> dt.open_result("missing.nc")
@@ -39,6 +39,7 @@ def open_result(path: str | Path) -> xr.Dataset:
     """
     path = Path(path).expanduser()
     if path.exists() or not PartsFolder(path).holds_work():
+        checksums.refuse_damaged(path)
         return consolidate.open_result(path)
     return _open_partial(path)
 

@@ -122,7 +122,7 @@ def restore_scene(text: object) -> Scene:
     try:
         return load_scene(tomllib.loads(str(text)))
     except tomllib.TOMLDecodeError as error:
-        raise InputError(str(error)) from None
+        raise InputError(f"scene: not valid TOML: {error}") from None
 
 
 def find_system(name: str) -> type[System]:

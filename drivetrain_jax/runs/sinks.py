@@ -36,8 +36,9 @@ class Hdf5Sink(Sink):
 
     def check_place(self) -> None:
         """Raise :class:`InputError` if the path is a folder."""
-        if self.held.is_dir():
-            raise InputError(f"out = {str(self.held)!r}: is a folder; allowed is the path of a file")
+        if self.held.exists() and not self.held.is_file():
+            what = "is a folder" if self.held.is_dir() else "not a regular file"
+            raise InputError(f"out = {str(self.held)!r}: {what}; allowed is the path of a file")
 
     def attribute(self, name: str) -> Any:
         """A global attribute of the present result."""

@@ -78,7 +78,7 @@ def _counts(output: OutputState) -> _Counts:
     for outcome in _outcomes(output):
         done += outcome.size
         failed += failures(outcome)
-        codes.update(dict(enumerate(np.bincount(outcome.ravel(), minlength=len(Outcome)).tolist())))
+        codes.update(dict(zip(*(part.tolist() for part in np.unique(outcome, return_counts=True)), strict=True)))
     by_outcome = {o.name.lower(): codes[o] for o in Outcome if not o.has_value and codes[o]}
     return _Counts(done, failed, by_outcome)
 

@@ -19,10 +19,13 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import nearest, shown
 from drivetrain_jax.runs import shipped
+from drivetrain_jax.store.files import read_regular
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 # Characters that an attribute of a result cannot store.
 _NO_TEXT = re.compile("[\0\ud800-\udfff]")
+# Largest scene file in bytes.
+_MOST_BYTES = 1 << 26
 # Largest number of bits of an integer: more than a scene needs, less than Python's limit for printing.
 _MOST_BITS = 10_000
 
@@ -121,7 +124,7 @@ def _check(value: Any, field: str) -> None:
 def _text(path: Path) -> str:
     try:
         # Editors on Windows put a byte order mark first.
-        return shipped.scene_file(path).read_bytes().decode("utf-8-sig")
+        return read_regular(shipped.scene_file(path), _MOST_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"scene = {str(path)!r}: not a text file in UTF-8") from None
     except ValueError:

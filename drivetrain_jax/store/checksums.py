@@ -18,6 +18,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._machine import usable_cores
+from drivetrain_jax.store import gate
 
 ATTRIBUTE = "checksums"
 # The name of the root group stands for the attributes of the file.
@@ -25,8 +26,6 @@ FILE = "/"
 _BLOCK = 1 << 24
 # Bytes above which threads save time: only hashing runs in parallel.
 _LARGE = 1 << 22
-# Exceptions of h5py for a damaged file structure.
-BROKEN = (OSError, KeyError, ValueError, RuntimeError, TypeError, OverflowError)
 # Attributes by which the netCDF library links dimensions and variables; the links are checked by name.
 _LINKS = frozenset({"DIMENSION_LIST", "REFERENCE_LIST", "CLASS", "NAME", "_Netcdf4Dimid", "_Netcdf4Coordinates"})
 
@@ -64,24 +63,30 @@ def damaged(path: Path) -> list[str] | None:
 
     Raises :class:`InputError` if the file cannot be read.
     """
-    try:
-        with h5py.File(path, "r") as file:
-            stored = file.attrs.get(ATTRIBUTE)
-            if stored is None:
-                return None
-            wanted, found = _parsed(stored), checksums(file)
-    except (*BROKEN, MemoryError):
-        raise InputError(
-            f"file = {str(path)!r}: not a readable netCDF4/HDF5 file, or damaged in its structure"
-        ) from None
+    with gate.opened(path) as file:
+        stored = file.attrs.get(ATTRIBUTE)
+        if stored is None:
+            return None
+        wanted, found = _parsed(stored), checksums(file)
     return sorted(name for name in {*wanted, *found} if wanted.get(name) != found.get(name))
 
 
-def refuse_damaged(path: Path) -> None:
-    """Raise :class:`InputError` if ``path`` is a file whose checksums show damage."""
-    if path.is_file() and (changed := damaged(path)):
+def refuse_damaged(path: Path, *, rewritten: bool = False) -> None:
+    """Raise :class:`InputError` if ``path`` is a file whose checksums show damage.
+
+    A copy that another program has written keeps the checksums as an attribute like any other, perhaps with other values.
+    It is compared only if ``rewritten``.
+    """
+    if path.is_file() and (rewritten or not _rewritten(path)) and (changed := damaged(path)):
         what = f"damaged ({named(changed)})"
         raise InputError(f"file = {str(path)!r}: {what}; allowed is to restore it or to compute it again") from None
+
+
+def _rewritten(path: Path) -> bool:
+    """True if another program, such as h5netcdf, has written the file."""
+    with gate.opened(path) as file:
+        maker = np.asarray(file.attrs.get("_NCProperties", b"")).tobytes()
+    return bool(maker) and not maker.startswith(b"version=2,h5py=")
 
 
 def named(names: list[str]) -> str:

@@ -23,7 +23,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.store.files import behind_link, sync_folder, write_atomic
+from drivetrain_jax.store.files import behind_link, read_regular, sync_folder, write_atomic
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -101,7 +101,7 @@ class PartsFolder:
         It has the ``digest``, ``replaces`` (the digest of the result that the parts will replace), and more about the run.
         """
         try:
-            content = json.loads(self._plan.read_text())
+            content = json.loads(read_regular(self._plan))
         except (OSError, ValueError):
             return {}
         return content if isinstance(content, dict) else {}
@@ -209,7 +209,7 @@ class PartsFolder:
 
 def _read_intact(path: Path) -> Part | None:
     try:
-        data = path.read_bytes()
+        data = read_regular(path)
     except OSError:
         return None
     if _content_digest(data) != path.stem.partition("-")[2]:

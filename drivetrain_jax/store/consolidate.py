@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.store import checksums, netcdf
+from drivetrain_jax.store import checksums, gate, netcdf
 from drivetrain_jax.store.files import flush, move_into_place, naming
 from drivetrain_jax.store.schema import GROUP, Labelled
 
@@ -65,6 +65,7 @@ class ResultFile:
                 checksums.seal(file)
             written.result()
         move_into_place(self._temporary, path)
+        gate.trust(path)
 
 
 def write_result(result: Labelled, path: Path, temporary: Path, preface: bytes = b"") -> None:
@@ -81,6 +82,8 @@ def _write_frame(template: Labelled, path: Path, preface: bytes) -> Mapping[str,
     The head is built in memory with reserved space for later additions, because HDF5 may crash the process on a full disk.
     """
     head = (preface.ljust(_USER_BLOCK, b"\0") if preface else b"") + netcdf.head(template)
+    # A pipe of this name would wait for a reader.
+    path.unlink(missing_ok=True)
     path.write_bytes(head)
     _reserve(path, len(head) + sum(entry.values.nbytes + _LABELS for entry in template.data.values()))
     with h5py.File(path, "r+") as file:
@@ -113,34 +116,25 @@ def read_attribute(path: Path, name: str) -> str | None:
 
     Raises :class:`InputError` if the file is not readable.
     """
-    try:
-        with h5py.File(path, "r") as file:
-            # Older files have no group of details.
-            holds = file[GROUP] if name not in file.attrs and GROUP in file else file
-            value = holds.attrs.get(name)
-            return value.decode() if isinstance(value, bytes) else value
-    except checksums.BROKEN:
-        raise _unreadable(path) from None
+    with gate.opened(path) as file:
+        # Older files have no group of details.
+        holds = file[GROUP] if name not in file.attrs and GROUP in file else file
+        value = holds.attrs.get(name)
+        return value.decode() if isinstance(value, bytes) else value
 
 
 def read_variable(path: Path, name: str) -> np.ndarray:
     """One variable of the result at ``path``, without loading the others; ``InputError`` if it cannot be read."""
-    try:
-        with h5py.File(path, "r") as file:
-            return cast(h5py.Dataset, file[name])[()]
-    except checksums.BROKEN:
-        raise _unreadable(path) from None
+    with gate.opened(path) as file:
+        return cast(h5py.Dataset, file[name])[()]
 
 
 def map_variable(path: Path, name: str) -> np.ndarray:
     """Like :func:`read_variable`, but as a memory map where the storage of the variable allows that."""
-    try:
-        with h5py.File(path, "r") as file:
-            variable = cast(h5py.Dataset, file[name])
-            if variable.chunks is None and (offset := variable.id.get_offset()) is not None and variable.size:
-                return np.memmap(path, variable.dtype, "r", offset, variable.shape)
-    except checksums.BROKEN:
-        raise _unreadable(path) from None
+    with gate.opened(path) as file:
+        variable = cast(h5py.Dataset, file[name])
+        if variable.chunks is None and (offset := variable.id.get_offset()) is not None and variable.size:
+            return np.memmap(path, variable.dtype, "r", offset, variable.shape)
     return read_variable(path, name)
 
 
@@ -155,17 +149,8 @@ def open_result(path: Path) -> xr.Dataset:
     try:
         with xr.open_dataset(path, engine="h5netcdf") as dataset:
             result = dataset.load()
-    except checksums.BROKEN:
-        raise _unreadable(path) from None
+    except (AttributeError, *gate.BROKEN):
+        raise gate.unreadable(path, "") from None
     if "analysis" not in result.attrs:
         raise InputError(f"file = {str(path)!r}: not a result of drivetrain_jax; give one written by `drivetrain run`")
     return result
-
-
-def _unreadable(path: Path) -> InputError:
-    if path.suffix == ".parts":
-        return InputError(f"file = {str(path)!r}: a folder of unfinished work; give {str(path.with_suffix(''))!r}")
-    if (path / "zarr.json").is_file():
-        return InputError(f"file = {str(path)!r}: a Zarr store; give the file that `drivetrain export` makes of it")
-    what = "is a folder" if path.is_dir() else "not a readable netCDF4/HDF5 file"
-    return InputError(f"file = {str(path)!r}: {what}; give a result written by `drivetrain run`")

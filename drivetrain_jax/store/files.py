@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import math
 import os
 import re
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,11 +48,25 @@ def behind_link(path: Path) -> Path:
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
+def read_regular(path: Path, most: float = math.inf) -> bytes:
+    """The content of the regular file ``path``; ``OSError`` for a pipe, a device, or more than ``most`` bytes."""
+    # Opening a pipe without this flag waits for a writer.
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0))) as file:
+        found = os.fstat(file.fileno())
+        if not stat.S_ISREG(found.st_mode):
+            raise OSError(errno.EINVAL, "not a regular file", str(path))
+        if found.st_size > most:
+            raise OSError(errno.EFBIG, f"larger than {most / 2**20:.0f} MB", str(path))
+        return file.read()
+
+
 def write_atomic(path: Path, data: bytes | memoryview, temporary: Path) -> None:
     """Write ``data`` to ``path``: to ``temporary`` (same file system), flushed to disk, then renamed.
 
     An existing file is replaced in one step or not at all.
     """
+    # A pipe of this name would wait for a reader.
+    temporary.unlink(missing_ok=True)
     try:
         with naming(temporary), open(temporary, "wb") as file:
             file.write(data)

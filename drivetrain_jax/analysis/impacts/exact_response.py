@@ -61,9 +61,7 @@ def describe(
     growth = found.exponent * averaged(found.periods) * oscillator.period
     wild = ~periodic & (growth > _WILD)
     size = jnp.maximum(jnp.abs(seen.high), jnp.abs(seen.low))
-    # Far from the origin, at a wide backlash, the motion may be much smaller than u.
-    away = jnp.maximum(jnp.abs(jnp.abs(seen.high) - oscillator.b), jnp.abs(jnp.abs(seen.low) - oscillator.b))
-    exact = (found.error <= rtol * size) & (found.error <= _DECIDES * away)
+    exact = (found.error <= rtol * size) & (found.error <= _DECIDES * _away(oscillator, seen))
     outcome = jnp.where(periodic & ~exact, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
     results = periodic_results(oscillator, seen)
     unstable = periodic & (results["spectral_radius"] > 1 + _UNSTABLE)
@@ -72,8 +70,7 @@ def describe(
     finite = jnp.isfinite(found.u) & jnp.isfinite(seen.high + seen.low) & (size <= largest)
     outcome = jnp.where(finite, outcome, Outcome.NOT_FINITE)
     known = outcome < Outcome.NOT_CONVERGED
-    for name in ("floquet_multiplier", "spectral_radius"):
-        results[name] = jnp.where(periodic, results[name], jnp.nan)
+    results |= {name: jnp.where(periodic, results[name], jnp.nan) for name in ("floquet_multiplier", "spectral_radius")}
     results["lyapunov_exponent"] = jnp.where(periodic, results["lyapunov_exponent"], found.exponent)
     state = jnp.stack([found.u, found.v])
     results |= {"orbit_state": state, "state_error": jnp.where(periodic, found.error, jnp.nan)}
@@ -86,6 +83,12 @@ def describe(
         "periods_settled": found.periods,
         "outcome": outcome.astype(jnp.int8),
     }
+
+
+def _away(oscillator: PiecewiseLinearOscillator, seen: Measures) -> Array:
+    """Largest distance from the flanks: far from the origin, at a wide backlash, it is much smaller than u."""
+    high, low = (jnp.abs(jnp.abs(u) - oscillator.b) for u in (seen.high, seen.low))
+    return jnp.maximum(high, low)
 
 
 def periodic_results(oscillator: PiecewiseLinearOscillator, seen: Measures) -> dict[str, Array]:

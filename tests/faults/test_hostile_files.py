@@ -1,0 +1,172 @@
+"""Damaged and hostile files: refused in one line and in seconds, whatever HDF5 would do with them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+import drivetrain_jax as dt
+from drivetrain_jax import InputError
+from drivetrain_jax.cli import main
+from drivetrain_jax.runs import toml
+from drivetrain_jax.runs.run import run_to_file
+from drivetrain_jax.runs.status import status
+from drivetrain_jax.store import checksums, gate
+
+pytestmark = pytest.mark.usefixtures("toys")
+
+SCENE = {"system": "toy", "analysis": "toy", "outputs": ["value"], "axes": {"a": {"values": [1.0, 2.0, 3.0]}}}
+
+
+@pytest.fixture
+def path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(toml.write(SCENE))
+    run_to_file(SCENE, tmp_path / "r.nc")
+    return tmp_path / "r.nc"
+
+
+def replaced(path, change):
+    """The file without its former variable ``value``, changed."""
+    with h5py.File(path, "r+") as file:
+        del file["value"]
+        change(file)
+
+
+def plugin(file):
+    kept = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    kept.set_chunk((3,))
+    kept.set_filter(32015, h5py.h5z.FLAG_OPTIONAL, ())
+    h5py.h5d.create(file.id, b"value", h5py.h5t.NATIVE_DOUBLE, h5py.h5s.create_simple((3,)), kept)
+
+
+def virtual(file):
+    layout = h5py.VirtualLayout((3,), "f8")
+    layout[:] = h5py.VirtualSource("other.nc", "value", shape=(3,))
+    file.create_virtual_dataset("value", layout)
+
+
+HOSTILE = {
+    "8 TB": lambda f: f.create_dataset("value", (1000, 10**9), "f8", chunks=(1000, 1000)),
+    "8 TB in one block": lambda f: f.create_dataset("value", (1000, 10**9), "f8"),
+    "link": lambda f: f.__setitem__("value", h5py.SoftLink("/a")),
+    "link to a file": lambda f: f.__setitem__("value", h5py.ExternalLink("/etc/passwd", "/")),
+    "values in a file": lambda f: f.create_dataset("value", (3,), "f8", external=[("/etc/passwd", 0, 24)]),
+    "virtual": virtual,
+    "plugin": plugin,
+    "objects": lambda f: [f.create_group(f"value{k}") for k in range(gate._OBJECTS + 1)],
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_a_hostile_file_is_refused_by_every_reader(path, capsys, kind):
+    replaced(path, HOSTILE[kind])
+    begin = time.monotonic()
+    for words in (["verify", "r.nc"], ["plot", "r.nc", "--out", "f.png"], ["run", "scene.toml", "--out", "r.nc"]):
+        assert main(words) == 2
+        said = capsys.readouterr().err
+        assert "not a readable netCDF4/HDF5 file" in said and len(said.splitlines()) == 1, said
+    with pytest.raises(InputError, match="not a readable"):
+        dt.open_result(path)
+    assert time.monotonic() - begin < 20
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"), [("import time; time.sleep(60)", "takes longer"), ("import os; os.abort()", "crashes")]
+)
+def test_a_file_in_which_hdf5_hangs_or_crashes_is_refused(path, monkeypatch, code, reason):
+    os.utime(path, (1, 1))
+    monkeypatch.setattr(gate, "_SCAN", code)
+    monkeypatch.setattr(gate, "_PATIENCE", 0.5)
+    with pytest.raises(InputError, match=rf"not a readable .*damaged in its structure \(reading it {reason}"):
+        dt.open_result(path)
+
+
+def test_a_sound_file_is_scanned_once_and_an_own_one_never(path, monkeypatch):
+    calls, scanned = [], gate._scanned
+    monkeypatch.setattr(gate, "_scanned", lambda *words: calls.append(words) or scanned(*words))
+    dt.open_result(path)
+    assert len(calls) == 0
+    copy = shutil.copy(path, "copy.nc")
+    for _ in range(2):
+        assert np.isfinite(dt.open_result(copy)["value"]).all()
+    assert len(calls) == 1
+
+
+def test_an_unknown_outcome_is_counted(path):
+    with h5py.File(path, "r+") as file:
+        file["outcome"][0] = -1
+        checksums.seal(file)
+    found = status(SCENE, path)
+    assert (found.state, found.done, found.failed) == ("complete", 3, 0)
+
+
+def test_changed_values_are_not_opened_and_not_drawn(path):
+    with h5py.File(path, "r+") as file:
+        file["value"][0] += 1.0
+    for reader in (dt.open_result, dt.plot):
+        with pytest.raises(InputError, match=r"damaged \(value\); allowed is to restore it or to compute it again"):
+            reader(path)
+
+
+def test_a_selection_that_xarray_has_written_is_opened(path):
+    part = dt.open_result(path).isel(a=slice(2))
+    part.to_netcdf("part.nc", engine="h5netcdf")
+    assert checksums.ATTRIBUTE in part.attrs and dt.open_result("part.nc").identical(part)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        "run X --out n.nc",
+        "status X --out n.nc",
+        "run scene.toml --out X",
+        "status scene.toml --out X",
+        "verify X",
+        "plot X --out f.png",
+        "plot r.nc --out X",
+        "point cardan floquet --data X",
+    ],
+)
+def test_what_is_no_regular_file_is_refused(path, capsys, kind, words):
+    special = Path("x.png" if words.endswith("--out X") and words.startswith("plot") else "x.nc")
+    if kind == "pipe":
+        os.mkfifo(special)
+    else:
+        special.symlink_to("/dev/zero")
+    assert main(words.replace("X", str(special)).split()) == 2
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1 and ("regular file" in said or ".csv" in said), said
+    assert special.exists() and not special.is_file()
+
+
+def test_a_scene_of_more_than_64_mb_is_refused(path, capsys):
+    with open("large.toml", "wb") as file:
+        file.truncate((1 << 26) + 1)
+    assert main(["run", "large.toml", "--out", "n.nc"]) == 2
+    assert "scene = 'large.toml': larger than 64 MB" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["plan.json", "00000000-x.h5", "result.tmp", "plan.tmp"])
+def test_a_pipe_among_the_parts_stops_nothing(path, name):
+    parts = Path("n.nc.parts")
+    parts.mkdir()
+    os.mkfifo(parts / name)
+    status(SCENE, "n.nc")
+    assert run_to_file(SCENE, Path("n.nc"), fresh=True).computed == 3 and not parts.exists()
+
+
+@pytest.mark.parametrize("scene", ['"x"', '"title = 1"', "3", "[]", "null"])
+def test_a_damaged_plan_is_one_line(path, capsys, scene):
+    parts = Path("n.nc.parts")
+    parts.mkdir()
+    (parts / "plan.json").write_text(f'{{"scene": {scene}, "digest": 3, "reused_files": 4}}')
+    for words in (["plot", "n.nc", "--out", "f.png"], ["run", "scene.toml", "--out", "n.nc"]):
+        assert main(words) == 2 and len(capsys.readouterr().err.splitlines()) == 1
