@@ -73,3 +73,31 @@ def van_der_pol(lanes: int) -> Flow:
         return y[1], (1 - y[0] ** 2) * y[1] - y[0]
 
     return Flow(field, spread(lanes, 1.0, 1.0), period=1.7)
+
+
+def damped(forcing=lambda angles: 0.0, turns: tuple = (1,), damping: float = 0.2, stiffness: float = 1.3) -> Flow:
+    """x'' + damping x' + stiffness x = forcing."""
+
+    def field(angles, y):
+        return y[1], forcing(angles) - damping * y[1] - stiffness * y[0]
+
+    return Flow(field, spread(1, 0.5, 1.0), period=1.9, turns=turns)
+
+
+def mathieu(depth: float) -> Flow:
+    """x'' + 0.1 x' + (1 + depth cos 2 t) x = 0, unstable for a depth above 0.2."""
+
+    def field(angles, y):
+        return y[1], -0.1 * y[1] - (1 + depth * jnp.cos(angles[0])) * y[0]
+
+    return Flow(field, spread(1, 0.5, 1.0), period=math.pi, turns=(1,))
+
+
+def stuart_landau(*rates: float) -> Flow:
+    """Oscillators z' = (1 + i rate) z - |z|^2 z, each with a limit cycle."""
+
+    def field(_, y):
+        pairs = ((y[i], y[i + 1], rate) for i, rate in zip(range(0, len(y), 2), rates, strict=True))
+        return tuple(x for a, b, w in pairs for x in ((1 - a * a - b * b) * a - w * b, (1 - a * a - b * b) * b + w * a))
+
+    return Flow(field, spread(1, *(0.6, 0.3) * len(rates)), period=1.7)

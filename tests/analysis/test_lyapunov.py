@@ -552,3 +552,49 @@ def test_bounded_chaos_of_the_tripod():
     assert abs(spectrum[0] - 1218) < 3 * math.hypot(error[0], 12)
     assert spectrum.sum() == pytest.approx(-558.382, abs=1.0)
     assert int(ours.verdict) == Verdict.CHAOTIC
+
+
+# Motions whose kind is known: the flow, the time of the run, the verdict and the period in strobes.
+_GOLDEN = (math.sqrt(5) - 1) / 2
+KNOWN = {
+    "decay to rest": (lambda: flows.damped(), 40.0, Verdict.FIXED_POINT, 1),
+    "slow decay to rest": (lambda: flows.damped(damping=0.02), 600.0, Verdict.FIXED_POINT, 1),
+    "overdamped decay": (lambda: flows.damped(damping=9.0), 40.0, Verdict.FIXED_POINT, 1),
+    "decay with modulated stiffness": (lambda: flows.mathieu(0.1), 200.0, Verdict.FIXED_POINT, 1),
+    "parametric instability": (lambda: flows.mathieu(0.3), 200.0, Verdict.PARAMETRICALLY_UNSTABLE, None),
+    "rest under a load": (lambda: flows.damped(lambda a: 0.7), 300.0, Verdict.FIXED_POINT, 1),
+    "response of the strobe's period": (lambda: flows.damped(lambda a: jnp.cos(a[0])), 300.0, Verdict.FIXED_POINT, 1),
+    "small response": (lambda: flows.damped(lambda a: 1e-6 * jnp.cos(a[0])), 400.0, Verdict.FIXED_POINT, 1),
+    "response of three periods": (
+        lambda: flows.damped(lambda a: jnp.cos(a[1]), turns=(1, 1 / 3)), 300.0, Verdict.PERIODIC, 3,
+    ),
+    "response of two incommensurate periods": (
+        lambda: flows.damped(lambda a: jnp.cos(a[0]) + jnp.cos(a[1]), turns=(1, _GOLDEN)), 300.0, Verdict.QUASI_PERIODIC, 0,
+    ),
+    "small response of two incommensurate periods": (
+        lambda: flows.damped(lambda a: 1e-6 * jnp.cos(a[1]), turns=(1, _GOLDEN)), 400.0, Verdict.QUASI_PERIODIC, 0,
+    ),
+    "unforced decay": (lambda: flows.damped(turns=()), 300.0, Verdict.FIXED_POINT, None),
+    "unforced growth": (lambda: flows.damped(turns=(), damping=-0.1), 300.0, Verdict.PARAMETRICALLY_UNSTABLE, None),
+    "centre": (lambda: flows.damped(turns=(), damping=0.0), 300.0, Verdict.UNDECIDED, None),
+    "limit cycle": (lambda: flows.stuart_landau(1.0), 100.0, Verdict.PERIODIC, None),
+    "torus": (lambda: flows.stuart_landau(1.0, _GOLDEN), 300.0, Verdict.QUASI_PERIODIC, None),
+}  # fmt: skip
+_SHORT = "decay to rest", "small response", "limit cycle"
+
+
+@pytest.mark.parametrize("name", but_full(KNOWN, *(KNOWN.keys() - set(_SHORT))))
+def test_the_kind_of_a_known_motion(name):
+    build, max_time, verdict, multiple = KNOWN[name]
+    ours = results(build(), ("verdict", "period_multiple"), max_time, 24)
+    assert ours["verdict"].tolist() == [verdict]
+    assert multiple is None or ours["period_multiple"].tolist() == [multiple]
+
+
+@pytest.mark.full
+def test_a_tripod_shaft_without_torque_comes_to_rest():
+    ours = tripod(
+        {"zeta": [1.6e-3, 1e-6]}, fixed={"M_AEM": 0.0, "beta": 0.3, "phi0": 0.5, "velocity0": 1.0}, max_time=10.0
+    )
+    assert ours.verdict.values.tolist() == [Verdict.FIXED_POINT, Verdict.PARAMETRICALLY_UNSTABLE]
+    assert (ours.lyapunov_standard_error < 1e-5).all()

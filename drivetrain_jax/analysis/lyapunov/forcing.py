@@ -12,7 +12,7 @@ from jax import Array
 from drivetrain_jax.systems import Flow
 
 # Fractions of a strobe at which the clocks are tested; at none of them the derivative of a harmonic vanishes by symmetry.
-_FRACTIONS = tuple((k + 0.37) / 8 for k in range(8))
+FRACTIONS = tuple((k + 0.37) / 8 for k in range(8))
 # Number of components of a flow that cannot be chaotic without a clock; a phase is a clock among the components.
 _PLANAR = 2
 
@@ -25,8 +25,8 @@ def driven(flow: Flow, y: tuple[Array, ...]) -> Array:
 
 def _felt(flow: Flow, y: tuple[Array, ...], number: int) -> Array:
     """True where a turn of one clock changes any rate."""
-    shape = (len(_FRACTIONS), *jnp.shape(y[0]))
-    angles = flow.angles(0, jnp.asarray(_FRACTIONS).reshape(-1, *(1,) * jnp.ndim(y[0])))
+    shape = (len(FRACTIONS), *jnp.shape(y[0]))
+    angles = flow.angles(0, jnp.asarray(FRACTIONS).reshape(-1, *(1,) * jnp.ndim(y[0])))
 
     def rates(angle: Array) -> Array:
         turned = (*angles[:number], angle, *angles[number + 1 :])

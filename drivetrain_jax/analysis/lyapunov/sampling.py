@@ -8,9 +8,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from drivetrain_jax.analysis.lyapunov.forcing import FRACTIONS
 from drivetrain_jax.analysis.lyapunov.growth_record import Record, sampled, state_size
 from drivetrain_jax.analysis.lyapunov.section_measures import period_multiple
 from drivetrain_jax.analysis.lyapunov.variational import batch_shape, initial_state
+from drivetrain_jax.analysis.lyapunov.verdict import TELLING
 from drivetrain_jax.analysis.lyapunov.zero_one_test import largest_k01
 from drivetrain_jax.systems import Flow
 
@@ -62,6 +64,9 @@ def sample(flow: Flow, steps: Any, record: Record, rate: Array, k01_for: Array) 
         section = states[:, jnp.array(watched)]
         left = transient_left(flow, record, rate, seen.strobe + SAMPLES // 2)
         multiple, settled = repetition(section, left)
+        # At rest the section repeats in the limit only: its own size decays.
+        rests = decays & _comes_to_rest(flow, record, rate, jnp.max(jnp.abs(section), axis=(0, 1)), seen.strobe)
+        multiple, settled = jnp.where(rests, 1, multiple), settled | rests
         # Settled results stay, so a member does not depend on the number of samples for the others.
         multiple, settled = (
             jnp.where(seen.settled, *pair) for pair in ((seen.multiple, multiple), (seen.settled, settled))
@@ -86,6 +91,19 @@ def transient_left(flow: Flow, record: Record, rate: Array, strobe: Array) -> Ar
     """Bound on the size of the transient at a strobe: a multiple of the largest state, decayed at ``rate``."""
     largest = jnp.maximum(jnp.max(record.size, axis=0), state_size(flow, initial_state(flow)))
     return _MARGIN * largest * jnp.exp(jnp.minimum(rate, 0.0) * strobe * flow.period)
+
+
+def _comes_to_rest(flow: Flow, record: Record, rate: Array, size: Array, strobe: Array) -> Array:
+    """Flags of motions towards a rest at 0: the field vanishes there, and the motion has shrunk by at least half the decay
+    that the bound ``rate`` of the largest exponent says. ``size`` is that at ``strobe``, shape (...)."""
+    still = [x if i in flow.phases else jnp.zeros_like(x) for i, x in enumerate(record.state)]
+    rates = jnp.stack([flow.vector(0, fraction, jnp.stack(still)) for fraction in FRACTIONS])
+    moving = jnp.array([i for i in range(flow.size) if i not in flow.phases])
+    first = record.used // 4
+    begin = jnp.take_along_axis(record.size, first[None], axis=0)[0]
+    decay = -rate * (strobe * flow.period - first * record.span)
+    shrunk = jnp.where(begin > 0, size / jnp.where(begin > 0, begin, 1.0), 0.0)
+    return jnp.all(rates[:, moving] == 0, axis=(0, 1)) & (decay > TELLING) & (shrunk < jnp.exp(-decay / 2))
 
 
 def repetition(section: Array, left: Array) -> tuple[Array, Array]:

@@ -20,7 +20,7 @@ from drivetrain_jax.analysis.lyapunov.resolution import STANDARD_ERRORS, SUM_RUL
 CHAOTIC_K = 0.9
 # Least logarithmic growth that counts as exponential, over the averaged three quarters of the time: twice that of growth in
 # proportion to time, as at a double multiplier, which is a factor of four.
-_TELLING = 2 * math.log(4)
+TELLING = 2 * math.log(4)
 
 
 class Verdict(IntEnum):
@@ -71,7 +71,7 @@ def grows(size: Array, used: Array, span: Array, largest: Array) -> Array:
     time = (last - used // 4) * span
     ratio = jnp.log(jnp.where((begin > 0) & (end > 0), end / jnp.where(begin > 0, begin, 1.0), 1.0))
     at_rest = jnp.max(size, axis=0) == 0
-    return (at_rest | (ratio > 0.5 * largest * time)) & (largest * time > _TELLING)
+    return (at_rest | (ratio > 0.5 * largest * time)) & (largest * time > TELLING)
 
 
 def judge(evidence: Evidence, autonomous: bool) -> Array:
