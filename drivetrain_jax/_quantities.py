@@ -24,7 +24,8 @@ class Parameter:
     ``lower`` and ``upper`` are inclusive unless the matching ``open_*`` flag is set; ``infinite`` admits infinity. The
     value is one of the words ``choices``, any word (``text``), a list of numbers in the range (``listed``, default ``()``:
     none), or, with ``broadcast``, also one number for all entries. ``symbol`` is its form in formulas.
-    Values above ``usual`` are warned of, because they were probably meant in mm. A number may be a text with a unit.
+    With ``or_zero`` 0 is allowed below ``lower``. Values above ``usual`` are warned of, because they were probably meant in
+    mm. A number may be a text with a unit.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Parameter:
     text: bool = False
     symbol: str = ""
     usual: float = math.inf
+    or_zero: bool = False
 
     @property
     def is_number(self) -> bool:
@@ -66,6 +68,7 @@ class Parameter:
             right = " < inf"
         listed = "[i]" if self.listed else ""
         either = " (or one number for all)" if self.listed and self.broadcast else ""
+        either += ", or 0" if self.or_zero else ""
         if left or right:
             return f"{kind}{left}{self.name}{listed}{right}{either}"
         return f"{self.name} is a finite {kind or 'number'}".rstrip()
@@ -110,6 +113,8 @@ class Parameter:
     def _is_within(self, value: float) -> bool:
         below = value <= self.lower if self.open_lower else value < self.lower
         above = value >= self.upper if self.open_upper else value > self.upper
+        if self.or_zero and value == 0:
+            return True
         return not (below or above) and (math.isfinite(value) or (self.infinite and value == math.inf))
 
     def _in_units(self, text: str, label: str) -> float:

@@ -58,6 +58,8 @@ def _entries(value: Any, count: int, none: float) -> tuple[Any, ...]:
     return value or (none,) * count
 
 
+# Stiffnesses [N m2] and masses per length [kg/m] beyond this range may overflow or underflow on the way to frequencies.
+_RANGE = {"listed": True, "lower": 1e-60, "upper": 1e60}
 _LIST = {"listed": True, "lower": 0.0}
 _NONE = {"default": (), "broadcast": True, **_LIST}
 Numbers = tuple[Number, ...]
@@ -77,9 +79,13 @@ class Bicardan(System):
     presets = PRESETS
     physical = PHYSICAL
 
-    length: Numbers = parameter("m", "lengths of the segments, from A to D", usual=100.0, open_lower=True, **_LIST)
-    EI: Numbers = parameter("N m2", "bending stiffness of the segments", open_lower=True, **_LIST)
-    rhoA: Numbers = parameter("kg/m", "mass per length of the segments, 0: without mass", symbol="ρA", **_LIST)
+    length: Numbers = parameter(
+        "m", "lengths of the segments, from A to D", usual=100.0, listed=True, lower=1e-30, upper=1e30
+    )
+    EI: Numbers = parameter("N m2", "bending stiffness of the segments", **_RANGE)
+    rhoA: Numbers = parameter(
+        "kg/m", "mass per length of the segments, 0: without mass", symbol="ρA", or_zero=True, **_RANGE
+    )
     k_A: Number = parameter("N/m", "stiffness of the support at A", lower=0.0, infinite=True)
     k_D: Number = parameter("N/m", "stiffness of the support at D", lower=0.0, infinite=True)
     k_joint: Numbers | Number = parameter(

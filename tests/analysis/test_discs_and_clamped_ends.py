@@ -3,7 +3,9 @@ forms and transfer matrices in 60 digits."""
 
 from __future__ import annotations
 
+import itertools
 import math
+import warnings
 from collections.abc import Mapping
 
 import jax
@@ -271,3 +273,31 @@ def test_results_obey_their_rules(tmp_path):
         and not np.isinf(result.angular_frequency.isel(rhoA_0=1)).any()
     )
     assert dt.open_result(tmp_path / "discs.nc").drivetrain.verify().problem == ""
+
+
+def test_frequencies_at_the_ends_of_the_range_follow_the_scaling_law():
+    """Frequencies go with sqrt(EI/rhoA)/length^2."""
+    names = "length[0]", "length[1]", "EI[0]", "EI[1]", "rhoA[0]", "rhoA[1]"
+    ends = [(1.0, 1.0, 1.0), *itertools.product((1e-29, 1e29), (1e-59, 1e59), (1e-59, 1e59))]
+    columns = np.array([(2 * x, x, 3 * y, y, 5 * z, z) for x, y, z in ends]).T.tolist()
+    fixed = {"length": [1.0] * 2, "EI": [1.0] * 2, "rhoA": [1.0] * 2, "k_A": INF, "k_D": INF}
+    scene = {"system": "bicardan", "analysis": "critical_speeds", "outputs": ["natural_frequency"], "fixed": fixed}
+    with warnings.catch_warnings(action="ignore"):
+        found = dt.run(scene | {"points": dict(zip(names, columns, strict=True))})
+    law = np.array([math.sqrt(y) / math.sqrt(z) / x**2 for x, y, z in ends])[:, None]
+    first = found.natural_frequency.values[0]
+    np.testing.assert_allclose(
+        found.natural_frequency.values / law, np.broadcast_to(first, (9, len(first))), rtol=1e-12
+    )
+
+
+def test_a_vanishing_mass_of_the_segments_changes_nothing_until_it_is_refused():
+    shaft = {"length": (0.25,) * 4, "EI": (6e4, 12e4, 12e4, 6e4), "k_A": INF, "k_D": INF}
+    shaft |= {"m_joint": (0.0, 400 / 9.81, 0.0), "outputs": ["critical_speed"]}
+    for mass in (1e-9, 1e-30, 1e-60, 0.0):
+        found = dt.point("bicardan", "critical_speeds", **shaft, rhoA=(mass,) * 4)
+        assert found.critical_speed[0] == pytest.approx(3383.848186, rel=1e-9)
+    with pytest.raises(
+        dt.InputError, match=r"rhoA\[0\] = 1e-180: allowed is 1e-60 <= rhoA\[i\] <= 1e\+60, or 0, in kg/m"
+    ):
+        dt.point("bicardan", "critical_speeds", **shaft, rhoA=(1e-180,) * 4)
