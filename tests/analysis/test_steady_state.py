@@ -334,3 +334,11 @@ def test_every_impact_is_counted_once(outputs):
     side = np.where(u > TABLE1["b"], 1, np.where(u < -TABLE1["b"], -1, 0))
     counted = [np.sum((side == flank) & (np.roll(side, 1, axis=1) != flank), axis=1) for flank in (1, -1)]
     np.testing.assert_array_equal(found.impacts, np.transpose(counted))
+
+
+def test_a_motion_of_far_too_many_steps_is_not_begun(steady):
+    """A period that is 1e8 times the oscillator's would hold up a whole batch for minutes."""
+    usual = TABLE1 | {"omega": 1.0}
+    found = steady([usual, *(usual | {name: value} for name, value in (("c", 1e8), ("omega", 1e-8), ("I", 1e-16)))])
+    assert list(found["outcome"]) == [Outcome.SUCCESS] + [Outcome.STEP_LIMIT] * 3
+    assert np.isnan(found["u_max"][1:]).all()

@@ -40,11 +40,11 @@ from drivetrain_jax.analysis.impacts.attractor_lanes import (
 from drivetrain_jax.analysis.impacts.piecewise_march import (
     Lanes,
     Motion,
+    allowed_steps,
     few_steps,
     locate,
     prepare,
     stays,
-    usual_steps,
 )
 from drivetrain_jax.analysis.impacts.plane_map import Matrix, newton_correction
 from drivetrain_jax.systems import PiecewiseLinearOscillator
@@ -55,6 +55,8 @@ _CORRECTIONS, _CONVERGED, _ROUNDING = 12, 1e-11, 1e-7
 _SHRINKING = 0.75
 # A search fails at this multiple of the usual velocity, or of the steps for settling.
 _ASTRAY, _COSTLY = 3.0, 4
+# A lane stops at these steps in all, and as many more for each of ``most_periods``, so that it never holds up the others.
+_BUDGET, _PER_PERIOD = 1e7, 200
 _EPS = np.finfo(float).eps
 
 
@@ -208,6 +210,7 @@ def _tick(task: _Task, work: _Work) -> _Work:
     omega = lanes.omega + jnp.zeros(place.shape)
     lane = lane._replace(motion=few_steps(lanes, lane.motion))
     broken = ~jnp.isfinite(lane.motion.u) | (lane.motion.steps > _most_steps(lane, lanes))
+    broken |= lane.cost.astype(float) * lane.count > _BUDGET + _PER_PERIOD * task.most_periods
     ready = working & ((lane.motion.left <= 0) | broken)
     shot, probed = (ready & lane.searching & ~broken & (on == (lane.probing >= 0)) for on in (False, True))
     after, verdict = _shoot(lane, shot, local, lanes, omega)
@@ -233,7 +236,7 @@ def _tick(task: _Task, work: _Work) -> _Work:
 def _most_steps(lane: Lane, lanes: Lanes) -> Array:
     """Steps after which a lane is stopped, because it moves from event to event without progress."""
     searching = lane.searching & (lane.count > 0)
-    return lane.multiple * jnp.where(searching, _COSTLY * lane.cost + 500, usual_steps(lanes))
+    return lane.multiple * jnp.where(searching, _COSTLY * lane.cost + 500, allowed_steps(lanes))
 
 
 def _result(lane: Lane, reached: Array, stalled: Array, span: Array) -> Attractors:

@@ -22,6 +22,7 @@ from drivetrain_jax.analysis.impacts.piecewise_march import (
     Lanes,
     Motion,
     advance,
+    allowed_steps,
     derivatives,
     flank_bounds,
     least_step,
@@ -29,7 +30,6 @@ from drivetrain_jax.analysis.impacts.piecewise_march import (
     locate,
     prepare,
     start,
-    usual_steps,
 )
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 from drivetrain_jax.systems.trigonometry import sincos
@@ -214,7 +214,7 @@ def _tick(task: _Task, work: _Work) -> _Work:
     # Not the size of u: at a wide backlash the motion about a flank is far from the origin.
     extent = so_far.high - so_far.low + jnp.abs(v) / lanes.omega
     back = (recurs > 0) & (distance <= _RECURRENCE * extent + _ROUNDING * jnp.abs(u))
-    broken = ~jnp.isfinite(motion.u) | (motion.steps > 2 * periods * usual_steps(lanes))
+    broken = ~jnp.isfinite(motion.u) | (motion.steps > 2 * periods * allowed_steps(lanes))
     done = (work.index < count) & (broken | (ended & (back | (motion.left <= 0))))
     result = so_far._replace(matrix=motion.matrix, end=(motion.u, motion.v), complete=jnp.where(broken, 0.0, 1.0))
     rows = jnp.stack(jax.tree.leaves(result)).astype(float)

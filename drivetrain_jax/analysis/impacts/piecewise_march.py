@@ -32,6 +32,8 @@ _LEAST_STEP, _LEAST_PART = 1e-12, 1e-15
 # Longest step, as a phase of the drive.
 _LONGEST_PHASE = 1.5
 _LIKELY_ARC = 2.5
+# Most steps of a drive period: a point that needs as many takes tens of seconds.
+_MOST_STEPS = 2e7
 # Distance from a flank, in half backlashes, within which a lane is carried over it; longest such step of a slow lane, in
 # radians of the region's fastest motion.
 _ON_FLANK, _RESTING_ARC = 4e-16, 0.1
@@ -242,6 +244,12 @@ def few_steps(lanes: Lanes, motion: Motion) -> Motion:
 def usual_steps(lanes: Lanes) -> Array:
     """Number of steps that no drive period exceeds (measured: 5 per oscillation, up to 15 per crossing)."""
     return 2000 + 100 * lanes.period * jnp.maximum(lanes.contact.rate, lanes.gap.rate) / (2 * np.pi)
+
+
+def allowed_steps(lanes: Lanes) -> Array:
+    """:func:`usual_steps`, or 0 where that is so much that the motion is not begun."""
+    steps = usual_steps(lanes)
+    return jnp.where(steps <= _MOST_STEPS, steps, 0.0)
 
 
 def march(lanes: Lanes, motion: Motion, most_steps: int) -> Motion:
