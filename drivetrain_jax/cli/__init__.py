@@ -10,7 +10,16 @@ from collections.abc import Sequence
 
 from drivetrain_jax._errors import ChunkError, InputError
 from drivetrain_jax.cli.arguments import parser
-from drivetrain_jax.cli.replies import INCOMPLETE, INTERRUPTED, OK, WRONG_INPUT, drop_output, one_line
+from drivetrain_jax.cli.replies import (
+    INCOMPLETE,
+    INTERRUPTED,
+    OK,
+    WRONG_INPUT,
+    backend_error,
+    drop_output,
+    one_line,
+)
+from drivetrain_jax.cli.signals import leave_on_interrupt
 
 __all__ = ["main"]
 
@@ -20,6 +29,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         # Collect garbage rarely: the default takes a third of a second and frees little, as most objects live until the end.
         gc.set_threshold(50_000)
+        # Figures are written to files, so a window system of the user's choice is not needed, and may be missing.
+        os.environ["MPLBACKEND"] = "agg"
+        leave_on_interrupt(INTERRUPTED)
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             # The parent process has closed this stream, so no one reads its output.
@@ -33,6 +45,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ChunkError as error:
         sys.stderr.write(one_line(str(error)))
         return INCOMPLETE
+    except (RuntimeError, AssertionError):
+        if (text := backend_error()) is None:
+            raise
+        sys.stderr.write(one_line(text))
+        return WRONG_INPUT
     except BrokenPipeError:
         # The reader has closed standard output (``drivetrain list | head``): exit without a message.
         drop_output()

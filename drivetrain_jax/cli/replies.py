@@ -32,3 +32,18 @@ def drop_output() -> None:
 def one_line(message: str) -> str:
     """``message`` on one line, with the name of the command in front."""
     return f"drivetrain: {' '.join(message.split())}\n"
+
+
+def backend_error() -> str | None:
+    """The message if jax cannot use the machines that ``JAX_PLATFORMS`` names; None if it can."""
+    wanted = os.environ.get("JAX_PLATFORMS")
+    if not wanted or "jax" not in sys.modules:
+        return None
+    try:
+        sys.modules["jax"].devices()
+    # jax raises either, depending on the name.
+    except (RuntimeError, AssertionError):
+        return (
+            f"JAX_PLATFORMS = {wanted!r}: jax cannot use it on this machine; allowed is cpu, or to unset the variable"
+        )
+    return None

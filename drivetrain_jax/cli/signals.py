@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,14 +15,37 @@ from typing import Any
 _GRACE = 2.0
 
 
+# Time [s] that Python has to end a command after Ctrl-C.
+_PATIENCE = 1.0
+
+
+def leave_on_interrupt(code: int) -> None:
+    """End the process with the exit ``code`` a second after Ctrl-C, unless Python does so first.
+
+    Python raises ``KeyboardInterrupt`` between its own instructions only, and a compilation takes many seconds.
+    """
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+
+    def watch() -> None:
+        while signal.SIGINT not in os.read(reader, 64):
+            pass
+        time.sleep(_PATIENCE)
+        os._exit(code)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 @contextmanager
 def stop_on_signals() -> Iterator[Callable[[], None]]:
     """Raise ``KeyboardInterrupt`` on Ctrl-C and SIGTERM inside the context.
 
     Yields a function that raises it again after a signal, because a destructor or a C callback may swallow the first
     one. The traceback that Python prints in that case is hidden. Further signals are ignored for two seconds, so that
-    finished chunks are written.
+    finished chunks are written, and :func:`leave_on_interrupt` has no effect.
     """
+    waker = signal.set_wakeup_fd(-1)
     caught: list[float] = []
     before = sys.unraisablehook
 
@@ -43,6 +68,7 @@ def stop_on_signals() -> Iterator[Callable[[], None]]:
     try:
         yield check
     finally:
+        signal.set_wakeup_fd(waker)
         for number, handler in handlers.items():
             # The handler was not set by Python, so it cannot be restored.
             signal.signal(number, handler or signal.SIG_DFL)

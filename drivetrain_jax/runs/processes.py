@@ -12,19 +12,24 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
-from drivetrain_jax._errors import RetryableError
+from drivetrain_jax._errors import InputError, RetryableError
 from drivetrain_jax.runs import worker
 from drivetrain_jax.runs.executor import IN_FLIGHT, Computation, Executor, Results
 from drivetrain_jax.runs.worker import Parcel
 
 # Number of crashes after which a task is lost.
 ATTEMPTS = 3
+# Exit code of a process that the script of its parent would start again.
+_NO_GUARD = 78
 
 
 class Processes(Executor):
     """Spawned processes, each on one core, which stay for the next run until ``close`` or the end of this process."""
 
     def __init__(self, count: int) -> None:
+        if getattr(multiprocessing.current_process(), "_inheriting", False):
+            # A process imports the script of its parent. Without a guard the script starts the run again.
+            os._exit(_NO_GUARD)
         self._count = count
         self._slots: list[_Slot] = []
 
@@ -134,6 +139,11 @@ class _Slot:
         try:
             self._ready.result()
         except BrokenProcessPool:
+            if any(process.exitcode == _NO_GUARD for process in self._processes):
+                where = 'below the line `if __name__ == "__main__":` of the script, which each process imports'
+                raise InputError(
+                    f"workers: the call starts the run again in each process; allowed is {where}"
+                ) from None
             self._stillborn += 1
             if self._stillborn >= ATTEMPTS:
                 raise RetryableError("worker processes crash during their start") from None

@@ -306,6 +306,7 @@ def test_threads_are_reused_except_after_an_interrupt():
         ({"threads": "2"}, "threads = '2': allowed is threads >= 1, an integer"),
         ({"threads": True}, "threads = True: allowed is threads >= 1, an integer"),
         ({"workers": 1.5}, "workers = 1.5: allowed is workers >= 1, an integer"),
+        ({"workers": 100_000}, "workers = 100000: allowed is workers <= "),
         ({"dask": 5}, "dask = 5: allowed is tcp://HOST:PORT or local:N"),
         ({"threads": 1, "workers": 1}, "threads: given together with workers"),
         ({"dask": "localhost"}, "dask = 'localhost': allowed is tcp://HOST:PORT or local:N"),
@@ -318,6 +319,16 @@ def test_wrong_executor_is_one_clear_line(options, message, monkeypatch):
         pytest.importorskip("distributed")
     with pytest.raises(InputError, match=message.replace("(", r"\(")):
         list(make_executor(**options).run(_engine(), [0]))
+
+
+def test_a_script_without_guard_is_told_so(tmp_path):
+    """Each process imports the script, which would start the run again."""
+    script = tmp_path / "script.py"
+    script.write_text("import drivetrain_jax as dt\ndt.run('quickstart', workers=2)\n")
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, timeout=120)
+    last = done.stderr.splitlines()[-1]
+    assert done.returncode == 1 and last.endswith("of the script, which each process imports")
+    assert "workers: the call starts the run again in each process" in last and "bootstrapping" not in done.stderr
 
 
 def _engine():
