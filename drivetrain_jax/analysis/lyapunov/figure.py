@@ -29,7 +29,7 @@ from drivetrain_jax.view.style import (
 )
 
 # In the order of the flags of the verdict; lightness falls from regular to irregular, undecided is grey.
-KIND_COLOURS = ("#ffffff", "#cfe3f3", "#7fb2d9", "#d1771e", "#5b1020", "#b0b0b0")
+KIND_COLOURS = ("#e6f0f7", "#b5d3ea", "#6ea6d0", "#d1771e", "#5b1020", "#b0b0b0")
 _COLOURS = (*LINE_COLOURS, "#3f8f5f", "#7a4fa0", "#999933", "#333333")
 _HEIGHT = 1.9
 _CURVES = ("lyapunov_spectrum", "paper_estimator", "sum_rule_residual", "chaos_k01")
