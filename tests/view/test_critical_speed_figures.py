@@ -169,3 +169,22 @@ def test_what_does_not_fit_gives_way_to_an_ellipsis():
     lines = wrap_caption(text, 2.0, 2).split("\n")
     assert len(lines) == 2 and lines[1].endswith(", …") and lines[0].endswith(",")
     assert wrap_caption(text, 100.0, 2) == text and wrap_caption("", 2.0, 2) == ""
+
+
+def test_shapes_are_drawn_over_the_shaft_with_its_points():
+    fixed = {"length": [0.3, 1.2, 0.5], "EI": [16.0, 256.0, 1.0], "k_A": 5e6, "k_D": np.inf, "k_joint": [0.0, 2e6]}
+    fixed |= {"m_joint": [8.0, 0.0], "k_hinge": [1e5, np.inf], "I_D": 0.1}
+    data = {
+        "mode_shape": (("mode", "x"), np.ones((3, 5))),
+        "critical_speed": speeds(np.array([1e3, 2e3, 3e3]), ("mode",)),
+    }
+    shapes = result(data | {"outcome": ((), np.int8(0))}, {}).assign_coords(x=np.linspace(0, 1, 5))
+    shapes.attrs["fixed_parameters"] = json.dumps({name: {"value": value} for name, value in fixed.items()})
+    figure = plot(shapes)
+    axes = figure.axes[0]
+    boxes = [(box.get_x(), box.get_width(), box.get_height()) for box in axes.patches]
+    np.testing.assert_allclose(boxes, [(0, 0.3, 0.15), (0.3, 1.2, 0.3), (1.5, 0.5, 0.075)])
+    points = {line.get_marker(): list(line.get_xdata()) for line in axes.get_lines()}
+    assert points["^"] == [0.0, 1.5, 2.0] and points["s"] == [0.3, 2.0] and points["o"] == [0.3]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["support", "mass", "hinge"]
+    assert list(axes.get_lines()[-1].get_xdata()) == [0.0, 0.5, 1.0, 1.5, 2.0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import textwrap
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -15,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 
 from drivetrain_jax._errors import InputError
@@ -40,6 +42,13 @@ _LETTERS = 32
 _LABEL_HEIGHT = 8.0
 # Ratio to the other frequencies below which a frequency counts as zero; a logarithmic axis cannot show zero.
 _NEGLIGIBLE = 1e-9
+# Height of the shaft's segment of greatest stiffness, in units of the largest deflection; symbols of its points.
+_THICKNESS = 0.3
+_SYMBOLS: dict[str, dict[str, Any]] = {
+    "support": {"marker": "^", "markersize": 6, "markerfacecolor": "white"},
+    "mass": {"marker": "s", "markersize": 5, "markerfacecolor": FRAME_GREY},
+    "hinge": {"marker": "o", "markersize": 4, "markerfacecolor": "white"},
+}
 
 
 def plot(dataset: xr.Dataset) -> Figure:
@@ -229,24 +238,81 @@ def _ticks(low: float, high: float) -> np.ndarray:
 def _shapes(dataset: xr.Dataset) -> Figure:
     count = min(dataset.sizes["mode"], _MOST_SHAPES)
     panels = Panels(count, height=_SHAPE_HEIGHT, margins=Margins(right=0.3, between_rows=0.3))
-    x = dataset["x"].values
+    shaft = _Shaft.of(dataset)
+    x = dataset["x"].values * shaft.total
     for (axes,), index, colour in zip(panels.axes, range(count), _colours(count), strict=True):
         shape = dataset["mode_shape"].isel(mode=index).values
+        shaft.draw(axes)
         axes.axhline(0.0, color=FRAME_GREY, linewidth=0.6)
         axes.plot(x, shape, color=colour)
         axes.fill_between(x, shape, color=colour, alpha=0.15, linewidth=0)
-        axes.set(xlim=(0.0, 1.0), ylim=(-1.25, 1.25), yticks=(-1.0, 0.0, 1.0))
+        axes.set(xlim=(-0.02 * shaft.total, 1.02 * shaft.total), ylim=(-1.25, 1.25), yticks=(-1.0, 0.0, 1.0))
         axes.set_title(_name(dataset, index), loc="left", pad=3, color=FRAME_GREY, size=8)
-    panels.label_axes(variable_label(dataset["x"]), "deflection, largest 1")
+    label = "distance from A [m]" if shaft.edges else variable_label(dataset["x"])
+    panels.label_axes(label, "deflection, largest 1")
     panels.titles(dataset)
+    panels.legend(shaft.legend())
     return panels.figure
 
 
+class _Shaft(NamedTuple):
+    """The shaft behind its mode shapes: ends of the segments [m], their thickness, and the places of its points.
+
+    Without stored lengths there are no ``edges``, and ``total`` is 1.
+    """
+
+    total: float
+    edges: list[float]
+    thickness: list[float]
+    points: dict[str, list[float]]
+
+    @classmethod
+    def of(cls, dataset: xr.Dataset) -> _Shaft:
+        """The shaft of the fixed parameters of a result."""
+        fixed = {
+            name: entry["value"] for name, entry in json.loads(dataset.attrs.get("fixed_parameters", "{}")).items()
+        }
+        if not {"length", "EI"} <= fixed.keys():
+            return cls(1.0, [], [], {})
+        edges = [0.0, *np.cumsum(fixed["length"]).tolist()]
+
+        def ends(name: str, none: float) -> list[float]:
+            joints = fixed.get(f"{name}_joint", [])
+            joints = joints if isinstance(joints, list) else [joints] * (len(edges) - 2)
+            return [fixed.get(f"{name}_A", none), *(joints or [none] * (len(edges) - 2)), fixed.get(f"{name}_D", none)]
+
+        hinges = fixed.get("k_hinge", [])
+        hinges = hinges if isinstance(hinges, list) else [hinges] * (len(edges) - 2)
+        points = {
+            "support": [x for x, k in zip(edges, ends("k", 0.0), strict=True) if k > 0],
+            "mass": [x for x, *m in zip(edges, ends("m", 0.0), ends("I", 0.0), strict=True) if max(m) > 0],
+            "hinge": [x for x, k in zip(edges[1:-1], hinges, strict=False) if k < math.inf],
+        }
+        # The stiffness of a round shaft goes with the fourth power of its diameter.
+        diameters = np.asarray(fixed["EI"]) ** 0.25
+        return cls(edges[-1], edges, (_THICKNESS * diameters / diameters.max()).tolist(), points)
+
+    def draw(self, axes: Axes) -> None:
+        """Draw the segments as grey boxes about the axis, and the symbols of the points."""
+        for left, right, height in zip(self.edges, self.edges[1:], self.thickness, strict=False):
+            box = (left, -height / 2), right - left, height
+            axes.add_patch(Rectangle(*box, facecolor=FRAME_GREY, alpha=0.2, edgecolor="none"))
+        for name, places in self.points.items():
+            level = -0.45 * _THICKNESS - 0.2 if name == "support" else 0.0
+            style = _SYMBOLS[name] | {"linestyle": "none", "color": FRAME_GREY}
+            axes.plot(places, [level] * len(places), clip_on=False, **style)
+
+    def legend(self) -> list[Artist]:
+        """Entries for the symbols that are drawn."""
+        style = {"linestyle": "none", "color": FRAME_GREY}
+        return [Line2D([], [], label=name, **_SYMBOLS[name] | style) for name, places in self.points.items() if places]
+
+
 def _name(dataset: xr.Dataset, index: int) -> str:
-    """``mode 1: critical speed 8371.54 rpm``, with stored quantities only."""
+    """``mode 1: critical speed 8371.5 rpm``, with stored quantities only."""
     text = f"mode {dataset['mode'].values[index]}"
     shown = next((name for name in _FREQUENCIES if name in dataset), None)
     if shown is None:
         return text
     field = dataset[shown]
-    return f"{text}: {field.attrs.get('long_name', shown)} {field.values[index]:.6g} {units_of(field)}"
+    return f"{text}: {field.attrs.get('long_name', shown)} {field.values[index]:.5g} {units_of(field)}"
