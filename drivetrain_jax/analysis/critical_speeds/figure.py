@@ -299,13 +299,14 @@ class _Shaft(NamedTuple):
             axes.add_patch(Rectangle(*box, facecolor=FRAME_GREY, alpha=0.2, edgecolor="none"))
         for name, places in self.points.items():
             level = -0.45 * _THICKNESS - 0.2 if name == "support" else 0.0
-            style = _SYMBOLS[name] | {"linestyle": "none", "color": FRAME_GREY}
-            axes.plot(places, [level] * len(places), clip_on=False, **style)
+            axes.plot(
+                places, [level] * len(places), clip_on=False, linestyle="none", color=FRAME_GREY, **_SYMBOLS[name]
+            )
 
     def legend(self) -> list[Artist]:
         """Entries for the symbols that are drawn."""
-        style = {"linestyle": "none", "color": FRAME_GREY}
-        return [Line2D([], [], label=name, **_SYMBOLS[name] | style) for name, places in self.points.items() if places]
+        drawn = (name for name, places in self.points.items() if places)
+        return [Line2D([], [], linestyle="none", color=FRAME_GREY, label=name, **_SYMBOLS[name]) for name in drawn]
 
 
 def _name(dataset: xr.Dataset, index: int) -> str:
