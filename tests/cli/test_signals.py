@@ -87,8 +87,9 @@ def test_a_command_that_is_over_cannot_be_stopped(monkeypatch, capsys):
 
 def test_a_command_ends_soon_after_an_interrupt_of_a_compiler():
     """Python itself would see the interrupt only after the compilation; a long hash stands for it."""
-    busy = "import hashlib; from drivetrain_jax.cli.signals import leave_on_interrupt; leave_on_interrupt(130); "
-    busy += "print(1, flush=True); hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)"
+    busy = "import hashlib, threading; from drivetrain_jax.cli.signals import leave_on_interrupt; leave_on_interrupt(130); "
+    # The line is printed while the hash is computed.
+    busy += "threading.Timer(0.5, lambda: print(1, flush=True)).start(); hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)"
     with subprocess.Popen([sys.executable, "-c", busy], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None and process.stdout.readline() == b"1\n"
         begin = time.monotonic()
@@ -96,13 +97,14 @@ def test_a_command_ends_soon_after_an_interrupt_of_a_compiler():
         assert process.wait(20) == 130 and time.monotonic() - begin < 5
 
 
+@pytest.mark.full
 def test_a_point_is_interrupted(tmp_path):
     """A new value compiles: the cache on disk is empty."""
     command = [sys.executable, "-m", "drivetrain_jax.cli", "point", "cardan", "forced", "beta=.4", "Omega=1.2"]
     command += ["zeta=.001", "alpha=1", "mu=1", "gamma=100"]
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path)}
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment) as process:
-        time.sleep(4)
+        time.sleep(3)
         begin = time.monotonic()
         process.send_signal(signal.SIGINT)
         _, said = process.communicate(timeout=30)
