@@ -288,7 +288,7 @@ FURTHER = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", but_full(FURTHER, "condition and orbit_spectral_radius"))
+@pytest.mark.parametrize("case", but_full(FURTHER, "condition and orbit_spectral_radius", "measures of rattle"))
 def test_derivatives_equal_differences(case):
     """Central differences of order four."""
     function, system, names, step, rtol = FURTHER[case]
