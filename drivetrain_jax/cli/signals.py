@@ -15,15 +15,13 @@ from typing import Any
 _GRACE = 2.0
 
 
-# Time [s] that Python has to end a command after Ctrl-C.
-_PATIENCE = 1.0
-
-
 def leave_on_interrupt(code: int) -> None:
-    """End the process with the exit ``code`` a second after Ctrl-C, unless Python does so first.
+    """End the process with the exit ``code`` as soon as Ctrl-C is pressed.
 
-    Python raises ``KeyboardInterrupt`` between its own instructions only, and a compilation takes many seconds.
+    Python itself would raise ``KeyboardInterrupt`` between its own instructions only, and a compilation takes many seconds.
+    An import or a destructor might also turn it into a traceback.
     """
+    signal.signal(signal.SIGINT, lambda *_: os._exit(code))
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
@@ -31,7 +29,6 @@ def leave_on_interrupt(code: int) -> None:
     def watch() -> None:
         while signal.SIGINT not in os.read(reader, 64):
             pass
-        time.sleep(_PATIENCE)
         os._exit(code)
 
     threading.Thread(target=watch, daemon=True).start()
