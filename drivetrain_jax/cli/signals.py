@@ -1,4 +1,4 @@
-"""Handle Ctrl-C and SIGTERM during a run."""
+"""Handle Ctrl-C and SIGTERM: a run stops in order, other commands end at once."""
 
 from __future__ import annotations
 

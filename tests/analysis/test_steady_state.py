@@ -11,7 +11,8 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import Outcome, Request, get_analysis
-from drivetrain_jax.analysis.impacts.attractor import Attractors
+from drivetrain_jax.analysis.impacts import attractor
+from drivetrain_jax.analysis.impacts.attractor import Attractors, attractors
 from drivetrain_jax.analysis.impacts.exact_response import describe, sweeps
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
 from drivetrain_jax.systems import PiecewiseLinearOscillator, get_system
@@ -342,3 +343,20 @@ def test_a_motion_of_far_too_many_steps_is_not_begun(steady):
     found = steady([usual, *(usual | {name: value} for name, value in (("c", 1e8), ("omega", 1e-8), ("I", 1e-16)))])
     assert list(found["outcome"]) == [Outcome.SUCCESS] + [Outcome.STEP_LIMIT] * 3
     assert np.isnan(found["u_max"][1:]).all()
+
+
+def test_a_motion_stops_at_a_number_of_steps_in_all(monkeypatch):
+    """Chaos never settles; without a budget it would end with ``most_periods``."""
+    chaos = TABLE1 | {"alpha": 0.0, "B1": 0.2, "omega": 1.2, "u0": 0.0, "v0": 0.0}
+    model = Rattle.models["steady_state"].build({name: jnp.full(1, chaos[name]) for name in NAMES})
+    point, rest = jnp.zeros((1, 1), jnp.int32), jnp.zeros(1)
+
+    def stalled():
+        found = attractors(model, point, rest, rest, most_periods=300, width=1)
+        return found.stalled.item(), found.periods.item()
+
+    assert stalled() == (0, 300)
+    monkeypatch.setattr(attractor, "_BUDGET", 500)
+    monkeypatch.setattr(attractor, "_PER_PERIOD", 1)
+    stopped, periods = stalled()
+    assert stopped == 1 and 0 < periods < 300

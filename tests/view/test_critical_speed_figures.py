@@ -188,3 +188,6 @@ def test_shapes_are_drawn_over_the_shaft_with_its_points():
     assert points["^"] == [0.0, 1.5, 2.0] and points["s"] == [0.3, 2.0] and points["o"] == [0.3]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["support", "mass", "hinge"]
     assert list(axes.get_lines()[-1].get_xdata()) == [0.0, 0.5, 1.0, 1.5, 2.0]
+    # Axes of one value are parts of the shaft, too.
+    shorter = plot(shapes.assign_coords({"length[1]": 0.2, "k_A": 0.0})).axes[0]
+    assert list(shorter.get_lines()[0].get_xdata()) == [0.5, 1.0]

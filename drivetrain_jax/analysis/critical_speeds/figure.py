@@ -28,6 +28,7 @@ from drivetrain_jax.view.style import (
     STATE_COLOURS,
     STYLE,
     axis_label,
+    scene_key,
     units_of,
     variable_label,
 )
@@ -268,10 +269,16 @@ class _Shaft(NamedTuple):
 
     @classmethod
     def of(cls, dataset: xr.Dataset) -> _Shaft:
-        """The shaft of the fixed parameters of a result."""
-        fixed = {
-            name: entry["value"] for name, entry in json.loads(dataset.attrs.get("fixed_parameters", "{}")).items()
-        }
+        """The shaft of the fixed parameters of a result, axes of one value among them."""
+        fixed = {name: x["value"] for name, x in json.loads(dataset.attrs.get("fixed_parameters", "{}")).items()}
+        for coordinate in dataset.coords.values():
+            name, _, place = scene_key(coordinate).rstrip("]").partition("[")
+            if coordinate.ndim or coordinate.dtype.kind != "f":
+                continue
+            if not place:
+                fixed[name] = float(coordinate)
+            elif int(place) < len(fixed.get(name, [])):
+                fixed[name][int(place)] = float(coordinate)
         if not {"length", "EI"} <= fixed.keys():
             return cls(1.0, [], [], {})
         edges = [0.0, *np.cumsum(fixed["length"]).tolist()]

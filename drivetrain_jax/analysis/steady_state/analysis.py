@@ -11,7 +11,8 @@ distinguish a chaotic attractor from a long transient; a larger ``most_periods``
 Outcome: ``NOT_CONVERGED`` if the motion has neither settled nor separated; ``TOLERANCE_NOT_MET`` if the estimated error of
 the orbit exceeds ``rtol`` times its largest displacement, or a thousandth of its largest distance from the flanks;
 ``STEP_LIMIT`` if the motion has more events per period than a motion can have unless it grazes a flank, or if a drive period
-may need more than 2e7 steps (``c = 2e5`` or ``omega = 5e-6`` with k = I = 1).
+may need more than 2e7 steps (``c = 2e5`` or ``omega = 5e-6`` with k = I = 1). A motion also stops at 1e7 steps in all, and
+200 more for each of ``most_periods``.
 """
 
 from __future__ import annotations
