@@ -24,8 +24,6 @@ from drivetrain_jax.systems import System
 if TYPE_CHECKING:
     import xarray as xr
 
-# Assumed length of a dimension that depends on the system, for the memory estimate.
-_USUAL_SIZE = 4
 # Bytes of the plan per point; an upper limit for small chunks.
 _PLANNED = 4
 # Bytes of mapped results kept in memory; values blanked at a time.
@@ -88,18 +86,6 @@ class ResultBuffer:
                 self._sizes |= zip(reversed(variable.dims), reversed(results[variable.name].shape), strict=False)
             self.lay_out(blank=blank)
 
-    def _complete_sizes(self) -> None:
-        """Get the lengths of system-dependent dimensions from the solver if no point has a result."""
-        if all(self._sizes[dim] for variable in self.variables for dim in variable.dims):
-            return
-        # Local import: `kernel` imports jax and this module.
-        from drivetrain_jax.runs.kernel import result_shapes
-
-        scene = self._scene
-        shapes = result_shapes(scene, self._grid, scene.analysis.solvers(scene.system, scene.request)[0])
-        for variable in self.variables:
-            self._sizes |= zip(reversed(variable.dims), reversed(shapes[variable.name]), strict=False)
-
     def lose(self, points: np.ndarray) -> None:
         """Mark these points as lost: their worker crashed three times."""
         self._lost.append(points)
@@ -114,7 +100,9 @@ class ResultBuffer:
     def lay_out(self, *, blank: bool = True) -> Mapping[str, np.ndarray]:
         """The arrays, which are created if nothing has been filled; without ``blank`` new arrays have undefined content."""
         if not self.arrays:
-            self._complete_sizes()
+            if not all(self._sizes[dim] for variable in self.variables for dim in variable.dims):
+                # No point has a result, but the solver knows these lengths.
+                self._sizes |= dimension_sizes(self._scene, self._grid)
             sweep = self._grid.result_shape
             shapes = {v: (*sweep, *(self._sizes[dim] for dim in v.dims)) for v in self.variables}
             if self._allocate is None:
@@ -159,14 +147,22 @@ def missing_value(variable: Variable) -> float | int:
     return len(variable.flags) - 1 if variable.flags else 0 if np.dtype(variable.dtype).kind in "iu" else np.nan
 
 
+def dimension_sizes(scene: Scene, grid: Grid) -> dict[str, int]:
+    """Lengths of the dimensions of the results besides those of the sweep, those that depend on the system included."""
+    sizes, variables = {d.name: len(d.values) for d in scene.dimensions}, result_variables(scene)
+    if not all(sizes[dim] for variable in variables for dim in variable.dims):
+        # Local import: `kernel` imports jax and this module.
+        from drivetrain_jax.runs.kernel import result_shapes
+
+        shapes = result_shapes(scene, grid, scene.analysis.solvers(scene.system, scene.request)[0])
+        for variable in variables:
+            sizes |= zip(reversed(variable.dims), reversed(shapes[variable.name]), strict=False)
+    return sizes
+
+
 def bytes_per_point(scene: Scene, on_disk: bool) -> int:
     """Bytes of memory per point during a run: the plan, and the results unless they are in a file."""
-    if on_disk:
-        return _PLANNED
-    sizes = {d.name: len(d.values) or _USUAL_SIZE for d in scene.dimensions}
-    return _PLANNED + sum(
-        np.dtype(v.dtype).itemsize * math.prod(sizes[dim] for dim in v.dims) for v in result_variables(scene)
-    )
+    return _PLANNED if on_disk else _PLANNED + scene.result_bytes
 
 
 def labelled(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str, str | float]) -> Labelled:

@@ -22,7 +22,7 @@ _ROOT = Path(drivetrain_jax.__file__).parent
 # Folders and files of this package that compute numbers, and files in these folders that only read results.
 _FOLDERS = ("resonances", "systems", "analysis", "atlas")
 _ENGINE = ("atlas_choice", "kernel", "over", "plan", "point_grid", "rounds", "through_atlas")
-_FILES = ("_quantities", *(f"runs/{name}" for name in _ENGINE))
+_FILES = ("_quantities", "store/shards", *(f"runs/{name}" for name in _ENGINE))
 _READERS = ("figure.py", "rules.py")
 
 

@@ -6,7 +6,7 @@ import json
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Set
 from concurrent.futures import Future
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -92,6 +92,8 @@ class Job:
         self._points, self._full_size = points, full_size
         self._kernels: dict[tuple[int, int], Future[Kernel]] = {}
         self._lock = threading.Lock()
+        # The part of the plan for one block, with chunks numbered from 0, made without the rest of the plan.
+        self.block_plan = lru_cache(maxsize=4)(self._block_plan)
 
     @cached_property
     def grid(self) -> Grid:
@@ -159,6 +161,10 @@ class Job:
     def plan(self) -> Plan:
         """Solver and chunk of every point."""
         return make_plan(self.solvers, self.grid, self._points, full_size=self._full_size)
+
+    def _block_plan(self, block: int) -> Plan:
+        full_size = self._full_size or self.grid.shards.count > 1
+        return make_plan(self.solvers, self.grid, np.arange(*self.grid.block(block)), full_size=full_size)
 
     @cached_property
     def _small(self) -> bool:

@@ -65,10 +65,13 @@ def _finished(job: Job, output: OutputState) -> Iterator[tuple[np.ndarray, Mappi
     """Yield finished points and their results, reused ones included."""
     reused = output.reused_before()
     yield from reused.blocks([variable.name for variable in ResultBuffer(job.scene, job.grid).variables])
-    plan = remaining(job, reused).plan
+    rest = remaining(job, reused)
     for part in output.parts.read():
+        if part.points is not None:
+            yield part.points, part.results
+            continue
         for number, results in part:
-            yield plan.chunk(number).points, results
+            yield rest.plan.chunk(number).points, results
 
 
 def _labelled(job: Job, buffer: ResultBuffer, done: np.ndarray) -> xr.Dataset:

@@ -17,9 +17,10 @@ from drivetrain_jax._machine import usable_cores
 from drivetrain_jax._threads import in_double_precision
 from drivetrain_jax.analysis import Solver
 from drivetrain_jax.runs.point_grid import Grid
+from drivetrain_jax.store.shards import MOST_POINTS
 
-# Points sorted together, and points whose effort is predicted together (small enough for the cache).
-_BLOCK, _PIECE = 1 << 18, 1 << 15
+# Points whose effort is predicted together (small enough for the cache).
+_PIECE = 1 << 15
 # Number of sorted blocks that are kept.
 _KEPT = 16
 _BITS, _POSITION = np.uint64(32), np.uint64(2**32 - 1)
@@ -100,15 +101,6 @@ class Plan:
         counts = [np.diff(group.firsts) for group in self.groups]
         return np.concatenate([np.empty(0, int), *(np.repeat(np.arange(len(n)), n) for n in counts)])
 
-    @property
-    def block_size(self) -> int:
-        """Number of consecutive points in a block."""
-        return _BLOCK
-
-    def chunks_of(self, blocks: slice) -> np.ndarray:
-        """Numbers of the chunks in these blocks."""
-        return np.flatnonzero((self.block_of >= blocks.start) & (self.block_of < blocks.stop))
-
     def chunk(self, number: int) -> Chunk:
         """Chunk number ``number``."""
         if not 0 <= number < self._firsts[-1]:
@@ -122,12 +114,15 @@ class Plan:
 
 
 class Blocks:
-    """The points of a plan in blocks, each sorted on demand."""
+    """The points of a plan in blocks, each sorted on demand: the shards of the grid, or equal shares of ``points``."""
 
     def __init__(self, solvers: Sequence[Solver], grid: Grid, points: np.ndarray | None) -> None:
         self._solvers, self._grid, self._points = solvers, grid, points
-        self._size = grid.size if points is None else len(points)
-        self.count = -(-self._size // _BLOCK)
+        if points is None:
+            self._starts = grid.starts
+        else:
+            self._starts = np.append(np.arange(0, len(points), MOST_POINTS), len(points))
+        self.count = len(self._starts) - 1
         self._kept: dict[int, tuple[list[np.ndarray], list[np.ndarray]]] = {}
 
     def efforts(self, block: int) -> Sequence[np.ndarray]:
@@ -136,7 +131,7 @@ class Blocks:
 
     def points(self, block: int, solver: int, part: slice) -> np.ndarray:
         """A part of the points of a solver in ``block``."""
-        return self._number(self._sorted(block)[0][solver][part].astype(np.int64) + block * _BLOCK)
+        return self._number(self._sorted(block)[0][solver][part].astype(np.int64) + self._starts[block])
 
     def _number(self, positions: np.ndarray) -> np.ndarray:
         return positions if self._points is None else self._points[positions]
@@ -150,7 +145,7 @@ class Blocks:
 
     def _sort(self, block: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """For each solver its points, numbered within the block, and their efforts."""
-        start, stop = block * _BLOCK, min((block + 1) * _BLOCK, self._size)
+        start, stop = self._starts[block : block + 2]
         pieces = [self._number(np.arange(i, min(i + _PIECE, stop))) for i in range(start, stop, _PIECE)]
         found = [_cheapest(self._solvers, self._grid, pieces[0])]
         if len(pieces) > 1:
@@ -211,9 +206,11 @@ def make_plan(
 ) -> Plan:
     """Assign every one of ``points`` (default: all of ``grid``) to the solver with the smallest predicted cost.
 
-    ``full_size`` keeps the chunk size for few points, so further plans need no other kernels.
+    ``full_size`` keeps the chunk size for few points, so further plans need no other kernels. A plan of several blocks does
+    so, because a worker plans one block without knowing the others.
     """
     blocks, counters = Blocks(solvers, grid, points), [_EffortCounter(solver) for solver in solvers]
+    full_size = full_size or blocks.count > 1
     for block in range(blocks.count):
         for counter, efforts in zip(counters, blocks.efforts(block), strict=True):
             counter.add(efforts)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from drivetrain_jax.runs.axes import Axis
 from drivetrain_jax.runs.scene import Problem, Value
+from drivetrain_jax.store.shards import Shards
 
 
 @dataclass(frozen=True)
@@ -19,7 +21,7 @@ class Grid:
     """Points numbered from 0 in C order of ``axes`` (``shape``), or one point per entry of ``axes`` if ``zipped``.
 
     With a path axis each point is a line: ``axes`` lacks ``path``. ``path_position`` is its position among the axes of the
-    scene, or None for a line of one fixed value.
+    scene, or None for a line of one fixed value. ``result_bytes`` is the size of the results at a point.
     """
 
     axes: tuple[Axis, ...]
@@ -29,6 +31,7 @@ class Grid:
     numbers: Mapping[str, float]
     path: Axis | None = None
     path_position: int | None = None
+    result_bytes: int = 8
 
     @classmethod
     def of(cls, scene: Problem) -> Grid:
@@ -37,13 +40,14 @@ class Grid:
         name = scene.path_axis
         numbers = {n: value for n, value in _numbers(scene).items() if n != name}
         if name is None:
-            return cls(scene.axes, scene.zipped, scene.fixed, parameters, numbers)
+            return cls(scene.axes, scene.zipped, scene.fixed, parameters, numbers, result_bytes=scene.result_bytes)
         position = next((i for i, axis in enumerate(scene.axes) if axis.name == name), None)
         if position is None:
             path = Axis(name, scene.system.parameter(name), None, np.array([scene.fixed[name]]))
-            return cls(scene.axes, scene.zipped, scene.fixed, parameters, numbers, path)
+            return cls(scene.axes, scene.zipped, scene.fixed, parameters, numbers, path, None, scene.result_bytes)
         others = scene.axes[:position] + scene.axes[position + 1 :]
-        return cls(others, scene.zipped, scene.fixed, parameters, numbers, scene.axes[position], position)
+        path = scene.axes[position]
+        return cls(others, scene.zipped, scene.fixed, parameters, numbers, path, position, scene.result_bytes)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -77,6 +81,21 @@ class Grid:
         if self.path_position is None:
             return self.shape
         return (*self.shape[: self.path_position], self.path_length, *self.shape[self.path_position :])
+
+    @cached_property
+    def shards(self) -> Shards:
+        """The boxes in which points are planned, and which a Zarr store stores as its shards."""
+        return Shards.of(self.result_shape, self.path_position, self.result_bytes)
+
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """First point of every block (shard), and the number of all points."""
+        return self.shards.starts(self.path_position)
+
+    def block(self, number: int) -> tuple[int, int]:
+        """First point of a block, and the first one after it."""
+        first, stop = self.starts[number : number + 2]
+        return int(first), int(stop)
 
     def place(self, points: np.ndarray) -> tuple[Any, ...]:
         """Index of ``points`` in an array of shape ``shape``."""

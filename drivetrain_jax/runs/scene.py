@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Variable
@@ -23,6 +25,8 @@ from drivetrain_jax.runs.scene_axes import axes_of, unknown_parameter
 from drivetrain_jax.systems import Model, System, get_system, system_names
 
 Value = float | int | str | tuple[float, ...]
+# Assumed length of a dimension that depends on the system.
+_USUAL_SIZE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +54,12 @@ class Problem:
     def path_axis(self) -> str | None:
         """Name of the axis that the analysis computes as a whole, if any."""
         return self.analysis.path_axis(self.system, self.request)
+
+    @property
+    def result_bytes(self) -> int:
+        """Bytes of the results at a point; dimensions of unknown length count as short ones."""
+        sizes = {d.name: len(d.values) or _USUAL_SIZE for d in self.dimensions}
+        return sum(np.dtype(v.dtype).itemsize * math.prod(sizes[dim] for dim in v.dims) for v in result_variables(self))
 
     @staticmethod
     def find_analysis(name: str) -> Analysis:

@@ -1,17 +1,17 @@
-"""Code of the workers that write a Zarr store: they store batches of chunks in parts, and assemble shards from parts."""
+"""Code of the workers that write a Zarr store: they plan blocks, store finished chunks in parts, and assemble shards."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from drivetrain_jax._errors import RetryableError
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.runs.assemble import missing_value
+from drivetrain_jax.runs.assemble import failures, missing_value
 from drivetrain_jax.runs.executor import Results
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.pending import PENDING
@@ -19,18 +19,33 @@ from drivetrain_jax.runs.plan import Chunk
 from drivetrain_jax.runs.scene import result_variables
 from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.chunks import Part, PartsFolder
-from drivetrain_jax.store.zarr_store import Shards
+from drivetrain_jax.store.shards import MOST_POINTS, Place
 
-# Names of results of a task: the name of the part of a batch, and the seconds that writing a shard took.
-PART, SECONDS = "part", "seconds"
+# Names of the results of each share.
+FOUND = ("next", "chunks", "part", "written", "points", "failed")
 
 
 @dataclass(frozen=True)
-class Batch:
-    """Chunks that one worker computes and stores together."""
+class Share:
+    """The chunks ``start``, ``start + step``, ... of a block of the plan, without those in ``finished``.
+
+    ``points`` is an estimate of their number of points.
+    """
+
+    block: int
+    start: int
+    step: int
+    points: int
+    finished: Collection[int] = ()
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Shares that a worker computes one after the other. After ``seconds`` it stores what is finished, and returns."""
 
     number: int
-    chunks: tuple[Chunk, ...]
+    shares: tuple[Share, ...]
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -46,49 +61,90 @@ class Assembly:
 
 @dataclass(frozen=True)
 class ShardWriter:
-    """Computes batches and assembles shards of the result ``out``, which every worker must see under this name."""
+    """Computes shares and assembles shards of the result ``out``, which every worker must see under this name.
+
+    A block of the plan is a shard of the store. Only counts and names of files return to the driver.
+    """
 
     job: Job
     out: str
-    shards: Shards
 
     @property
     def digest(self) -> str:
-        """Digest of the job."""
-        return self.job.digest
+        """Digest of job and path: a worker keeps the writer for other runs of the same job."""
+        return f"{self.job.digest} {self.out}"
 
-    def compute(self, task: Batch | Assembly, /) -> Results:
-        """Store a batch in a part, and return its outcomes and the name of the part; or write a shard."""
-        return self._solve(task) if isinstance(task, Batch) else self._assemble(task)
+    def compute(self, task: Shares | Assembly, /) -> Results:
+        """Compute chunks of shares and store them in parts, or write a shard."""
+        return self._solve(task) if isinstance(task, Shares) else self._assemble(task)
 
-    def _solve(self, batch: Batch) -> Results:
-        begin = time.monotonic()
-        results = [self.job.compute(chunk) for chunk in batch.chunks]
-        part = joined_part(batch.chunks, results, time.monotonic() - begin)
-        name = PartsFolder(Path(self.out)).write(part)
-        return {OUTCOME.name: part.results[OUTCOME.name], PART: np.array(name)}
+    def _solve(self, task: Shares) -> Results:
+        """The results ``FOUND`` for each of the first shares, and the ``seconds`` of all."""
+        begin, found = time.monotonic(), []
+        for share in task.shares:
+            if found and time.monotonic() - begin > task.seconds:
+                break
+            found.append(self._solve_share(share, begin + task.seconds))
+        joined = {name: np.array(column) for name, column in zip(FOUND, zip(*found, strict=True), strict=True)}
+        return joined | {"seconds": np.array(time.monotonic() - begin)}
+
+    def _solve_share(self, share: Share, end: float) -> tuple[int, int, str, bool, int, int]:
+        """Next chunk, number of chunks of the block, name of the part (empty without one), ``written``, points, failures.
+
+        A share that is a whole block is ``written``: its shard is in the store.
+        """
+        begin, plan = time.monotonic(), self.job.block_plan(share.block)
+        chunks, results, position = [], [], share.start
+        while position < len(plan.costs) and not (results and time.monotonic() > end):
+            if position not in share.finished:
+                chunks.append(chunk_of(self.job, share.block, position))
+                results.append(self.job.compute(chunks[-1]))
+            position += share.step
+        part = joined_part(chunks, results, time.monotonic() - begin) if chunks else None
+        alone = (share.start, share.step, len(share.finished)) == (0, 1, 0)
+        if written := alone and position >= len(plan.costs):
+            self._write(share.block, [part] if part else [], np.empty(0, int), whole=True)
+        # A resumed run counts the points of a written shard from the store.
+        name = PartsFolder(Path(self.out)).write(part) if part and not written else ""
+        outcome = part.results[OUTCOME.name] if part else np.empty(0, OUTCOME.dtype)
+        unsolvable = count_unsolvable(self.job, share)
+        points, failed = outcome.size + unsolvable, failures(outcome) + unsolvable
+        return position, len(plan.costs), name, written, points, failed
 
     def _assemble(self, task: Assembly) -> Results:
-        parts, grid = PartsFolder(Path(self.out)), self.job.grid
-        store, place = parts.path / zarr_store.UNFINISHED, self.shards.place(task.shard)
-        started, (begin, count) = time.monotonic(), points_of(self.job, place)
+        begin, parts = time.monotonic(), PartsFolder(Path(self.out))
+        self._write(task.shard, map(parts.read_one, task.parts), task.lost, task.whole)
+        return {"seconds": np.array(time.monotonic() - begin)}
+
+    def _write(self, shard: int, parts: Iterable[Part | None], lost: np.ndarray, whole: bool) -> None:
+        """Write a shard from parts of its block, with the outcome "pending" for missing points unless it is ``whole``."""
+        grid, store = self.job.grid, PartsFolder(Path(self.out)).path / zarr_store.UNFINISHED
+        place, (begin, stop) = grid.shards.place(shard), grid.block(shard)
         line = () if grid.path is None else (grid.path_length,)
-        rows = {}
+        rows, shapes = {}, zarr_store.result_shapes(store)
         for variable in result_variables(self.job.scene):
-            own = zarr_store.result_shapes(store)[variable.name][len(self.shards.shape) :]
-            blank = missing_value(variable) if task.whole or variable.name != OUTCOME.name else PENDING
-            rows[variable.name] = np.full((count, *line, *own), blank, variable.dtype)
-        for name in task.parts:
-            part = parts.read_one(name)
+            own = shapes[variable.name][len(grid.result_shape) :]
+            blank = missing_value(variable) if whole or variable.name != OUTCOME.name else PENDING
+            rows[variable.name] = np.full((stop - begin, *line, *own), blank, variable.dtype)
+        for part in parts:
             if part is None or part.points is None:
-                raise RetryableError(f"{name} among the parts is damaged")
-            inside = (begin <= part.points) & (part.points < begin + count)
+                raise RetryableError("one of the parts is damaged")
             for name, values in part.results.items():
-                rows[name][part.points[inside] - begin] = values[inside]
-        rows[OUTCOME.name][task.lost - begin] = Outcome.LOST
+                rows[name][part.points - begin] = values
+        rows[OUTCOME.name][lost - begin] = Outcome.LOST
         arrays = {name: _on_grid(self.job, place, values) for name, values in rows.items()}
-        zarr_store.write(store, place, arrays, task.shard if task.whole else None)
-        return {SECONDS: np.array(time.monotonic() - started)}
+        zarr_store.write(store, place, arrays, shard if whole else None)
+
+
+def chunk_of(job: Job, block: int, position: int) -> Chunk:
+    """A chunk of a block, with a number that no other block uses."""
+    return replace(job.block_plan(block).chunk(position), number=block * MOST_POINTS + position)
+
+
+def count_unsolvable(job: Job, share: Share) -> int:
+    """Number of results of a block that no solver can compute; they belong to its first share."""
+    first, stop = job.grid.block(share.block)
+    return 0 if share.start else (stop - first - job.block_plan(share.block).size) * job.grid.path_length
 
 
 def joined_part(chunks: Sequence[Chunk], results: list[Results], seconds: float) -> Part:
@@ -98,14 +154,7 @@ def joined_part(chunks: Sequence[Chunk], results: list[Results], seconds: float)
     return Part([c.number for c in chunks], [p.size for p in points], joined, seconds, np.concatenate(points))
 
 
-def points_of(job: Job, place: zarr_store.Place) -> tuple[int, int]:
-    """First point and number of points of a block of the sweep."""
-    block = [part for axis, part in enumerate(place) if axis != job.grid.path_position]
-    begin = np.ravel_multi_index([p.start for p in block], job.grid.shape) if block else 0
-    return int(begin), int(np.prod([p.stop - p.start for p in block], dtype=int))
-
-
-def _on_grid(job: Job, place: zarr_store.Place, values: np.ndarray) -> np.ndarray:
+def _on_grid(job: Job, place: Place, values: np.ndarray) -> np.ndarray:
     """Results of the points of a block in the layout of the result."""
     grid, position = job.grid, job.grid.path_position
     if grid.path_is_fixed:

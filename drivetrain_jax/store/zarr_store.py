@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,54 +22,15 @@ from drivetrain_jax._wording import counted
 from drivetrain_jax.store.files import flush, sync_folder
 from drivetrain_jax.store.provenance import digest
 from drivetrain_jax.store.schema import DETAILS, GROUP, Labelled
+from drivetrain_jax.store.shards import Place, Shards
 
 # Folder among the parts in which a store grows, and the one for a store while another one replaces it.
 UNFINISHED, FORMER = "store", "former"
 # Digest of everything in a store except its shards: an attribute.
 SEAL = "checksum"
 _CHECKSUMS, _OF_SHARDS, _RESULTS = "checksums", "checksums/shards", "results"
-# Upper limits of the points of a shard, and of its bytes.
-_MOST_POINTS, _MOST_BYTES = 1 << 18, 1 << 28
 # Exceptions of decoding, which depend on the position of the damage.
 _BROKEN = (ValueError, OSError, KeyError, RuntimeError, TypeError, AttributeError, IndexError, ArithmeticError)
-
-Place = tuple[slice, ...]
-
-
-@dataclass(frozen=True)
-class Shards:
-    """The shards of a sweep of this ``shape``, numbered in C order; the last shard along an axis may be shorter.
-
-    A shard has ``lengths`` along the axes. Its points are consecutive in C order; a path axis is whole.
-    """
-
-    shape: tuple[int, ...]
-    lengths: tuple[int, ...]
-
-    @classmethod
-    def of(cls, shape: tuple[int, ...], path: int | None, row_bytes: int) -> Shards:
-        """Shards of a sweep with its path along axis number ``path``, and ``row_bytes`` of results at a point."""
-        whole = 1 if path is None else shape[path]
-        room, lengths = max(1, min(_MOST_POINTS, _MOST_BYTES // max(row_bytes, 1)) // whole), []
-        for axis in reversed(range(len(shape))):
-            lengths.insert(0, shape[axis] if axis == path else min(shape[axis], room))
-            room = room if axis == path else max(1, room // shape[axis])
-        return cls(shape, tuple(lengths))
-
-    @property
-    def _counts(self) -> tuple[int, ...]:
-        return tuple(-(-size // length) for size, length in zip(self.shape, self.lengths, strict=True))
-
-    @property
-    def count(self) -> int:
-        """Number of shards."""
-        return math.prod(self._counts)
-
-    def place(self, shard: int) -> Place:
-        """The block of the sweep that a shard covers."""
-        at = np.unravel_index(shard, self._counts) if self.shape else ()
-        starts = [int(i) * length for i, length in zip(at, self.lengths, strict=True)]
-        return tuple(slice(a, min(a + n, size)) for a, n, size in zip(starts, self.lengths, self.shape, strict=True))
 
 
 def was_store(path: Path) -> bool:

@@ -16,7 +16,7 @@ from drivetrain_jax._threads import threads
 from drivetrain_jax.runs.executor import Threads
 from drivetrain_jax.runs.run import Interrupted, run_to_file
 from drivetrain_jax.runs.status import status
-from drivetrain_jax.store import zarr_store
+from drivetrain_jax.store import shards, zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
 
 pytest.importorskip("zarr")
@@ -76,7 +76,7 @@ def test_a_store_is_on_the_disk_before_it_gets_its_name(tmp_path, monkeypatch, f
 
 
 def test_a_shard_is_on_the_disk_before_it_counts(tmp_path, monkeypatch, flushed):
-    monkeypatch.setattr(zarr_store, "_MOST_POINTS", 82)
+    monkeypatch.setattr(shards, "MOST_POINTS", 82)
     counted, replace = [], Path.replace
 
     def look(self, target):

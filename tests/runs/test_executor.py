@@ -15,6 +15,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from drivetrain_jax.runs.cluster import Cluster
 from drivetrain_jax.runs.executor import Threads, run_threads
 from drivetrain_jax.runs.executors import make_executor
 from drivetrain_jax.runs.plan import Chunk
+from drivetrain_jax.runs.run import run_to_file
 
 HERE = Path(__file__).parent
 SCENE = {
@@ -61,6 +63,22 @@ def drivetrain(package, tmp_path):
         return subprocess.Popen([*command, "--quiet", *options], env=package, stderr=subprocess.PIPE, text=True)
 
     return start
+
+
+def test_two_stores_of_one_scene_are_written_by_the_same_workers(tmp_path):
+    """Workers keep the computation of the last run, which must not decide where the next one writes."""
+    scene = {"system": "planetary", "analysis": "modes", "outputs": ["natural_frequency"]}
+    scene["axes"] = {"k_sp": {"start": 4e8, "stop": 5e8, "num": 40}}
+    executor = make_executor(workers=1)
+    try:
+        for name, store in (("a.nc", "hdf5"), ("b.zarr", "zarr"), ("c.zarr", "zarr")):
+            with mock.patch.object(executor, "close"):
+                assert run_to_file(scene, tmp_path / name, executor=executor, store=store).computed == 40
+    finally:
+        executor.close()
+    reference = arrays(tmp_path / "a.nc").natural_frequency.values
+    for name in ("b.zarr", "c.zarr"):
+        assert xr.open_zarr(tmp_path / name).natural_frequency.values.tobytes() == reference.tobytes()
 
 
 def finished(process, code=0):
@@ -110,10 +128,12 @@ def test_processes_and_dask_give_the_same_bits_as_threads(drivetrain, tmp_path):
         assert other.attrs["digest"] == reference.attrs["digest"]
 
 
-def test_only_the_chunk_that_kills_every_process_is_lost(drivetrain, tmp_path):
+@pytest.mark.parametrize("store", ["hdf5", pytest.param("zarr", marks=pytest.mark.full)])
+def test_only_the_chunk_that_kills_every_process_is_lost(drivetrain, tmp_path, store):
     scene = SCENE | {"axes": {"delta": {"start": 0.1, "stop": 2.0, "num": 96}, "deadly": {"values": [0, 1]}}}
-    error = finished(drivetrain(scene, "deadly", "--workers", "1"))
-    ds = arrays(tmp_path / "deadly.nc")
+    error = finished(drivetrain(scene, "deadly", "--workers", "1", "--store", store))
+    path = tmp_path / "deadly.nc"
+    ds = arrays(path) if store == "hdf5" else xr.open_zarr(path).load()
     lost = ds.outcome.values == Outcome.LOST
     assert lost[:, 1].any() and np.isnan(ds.spectral_radius.values[lost]).all()
     assert (ds.outcome.values[~lost] == Outcome.SUCCESS).all() and (~lost).any()

@@ -56,7 +56,7 @@ def test_blocks_are_sorted_one_by_one(grid_scene, monkeypatch):
     """
     whole = chunks_of(grid_scene)
     solver = {point: chunk.solver for chunk in whole for point in chunk.points}
-    monkeypatch.setattr("drivetrain_jax.runs.plan._BLOCK", 50)
+    monkeypatch.setattr("drivetrain_jax.store.shards.MOST_POINTS", 50)
     plan = engine(grid_scene).plan
     chunks = [plan.chunk(number) for number in range(len(plan.costs))]
     assert sorted(np.concatenate([c.points for c in chunks])) == sorted(solver)
@@ -64,18 +64,18 @@ def test_blocks_are_sorted_one_by_one(grid_scene, monkeypatch):
     assert (
         {(c.solver, c.size) for c in chunks} == {(c.solver, c.size) for c in whole} == plan.kernels(range(len(chunks)))
     )
-    blocks = [set((c.points // 50).tolist()) for c in chunks]
+    blocks = [set((c.points // 41).tolist()) for c in chunks]
     assert all(len(block) == 1 for block in blocks) and max(max(block) for block in blocks) > 1
     order = [(*blocks[number], -plan.costs[number]) for number in plan.ordered(range(len(chunks)))]
     assert order == sorted(order)
     for group in plan.groups:
-        counts = np.bincount([point // 50 for point, index in solver.items() if index == group.index], minlength=3)
+        counts = np.bincount([point // 41 for point, index in solver.items() if index == group.index], minlength=3)
         assert np.array_equal(np.diff(group.firsts), -(-counts // group.chunk)) and group.size == counts.sum()
 
 
 def test_memory_of_a_plan_grows_with_its_chunks(monkeypatch):
     """Memory grows with the number of chunks, not with the number of points."""
-    monkeypatch.setattr("drivetrain_jax.runs.plan._BLOCK", 1 << 12)
+    monkeypatch.setattr("drivetrain_jax.store.shards.MOST_POINTS", 1 << 12)
     monkeypatch.setattr("drivetrain_jax.runs.plan._PIECE", 1 << 10)
 
     def kept(rows):

@@ -489,10 +489,11 @@ import resource, sys, threading, toy
 from pathlib import Path
 toy.names()
 from drivetrain_jax.runs import assemble, plan, work
+from drivetrain_jax.store import shards
 from drivetrain_jax.runs.run import run_to_file
 
 # As if the sweep were as many times larger.
-plan._BLOCK, plan._PIECE, assemble._RESIDENT, assemble._ROWS = 1 << 13, 1 << 12, 1 << 20, 1 << 17
+shards.MOST_POINTS, plan._PIECE, assemble._RESIDENT, assemble._ROWS = 1 << 13, 1 << 12, 1 << 20, 1 << 17
 # What waits to be written is not what is looked for.
 work._LONGEST = work._SHORTEST
 

@@ -19,15 +19,16 @@ from interrupts import stop_after
 import drivetrain_jax as dt
 from drivetrain_jax import InputError
 from drivetrain_jax._threads import threads
+from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.cli import main
 from drivetrain_jax.invariants.verify import verify
 from drivetrain_jax.runs import toml
-from drivetrain_jax.runs.executor import Threads
+from drivetrain_jax.runs.executor import Executor, Threads
 from drivetrain_jax.runs.export import export
 from drivetrain_jax.runs.pending import PENDING
 from drivetrain_jax.runs.run import Incomplete, Interrupted, run_to_file
 from drivetrain_jax.runs.status import status
-from drivetrain_jax.store import zarr_store
+from drivetrain_jax.store import shards, zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.consolidate import read_attribute
 
@@ -100,7 +101,7 @@ def as_file(path):
 
 @pytest.mark.parametrize("which", ["grid", "line", "one", "fixed path", "points"])
 def test_xarray_opens_a_store_as_the_file(grid_scene, tmp_path, which, monkeypatch):
-    monkeypatch.setattr(zarr_store, "_MOST_POINTS", 50)
+    monkeypatch.setattr(shards, "MOST_POINTS", 50)
     scenes = {"grid": large(grid_scene), "line": LINE, "one": ONE, "fixed path": FIXED_PATH, "points": POINTS}
     run_to_file(scenes[which], tmp_path / "r.nc")
     to_store(scenes[which], tmp_path / "r.zarr")
@@ -108,6 +109,18 @@ def test_xarray_opens_a_store_as_the_file(grid_scene, tmp_path, which, monkeypat
     xr.testing.assert_identical(file, store)
     for name in file.data_vars:
         assert file[name].dtype == store[name].dtype and file[name].values.tobytes() == store[name].values.tobytes()
+
+
+class InTurn(Executor):
+    """Computes one task after the other, so that nothing is written while the test reads."""
+
+    in_process = True
+
+    def run(self, computation, tasks):
+        return ((task, computation.compute(task)) for task in tasks)
+
+    def close(self):
+        pass
 
 
 def test_a_growing_store_opens_with_the_computed_points(grid_scene, tmp_path, monkeypatch):
@@ -121,7 +134,7 @@ def test_a_growing_store_opens_with_the_computed_points(grid_scene, tmp_path, mo
     def look(progress):
         seen.append((progress.computed, as_file(tmp_path / "r.zarr.parts" / "store")))
 
-    to_store(scene, path, executor=Threads(1), report=look)
+    to_store(scene, path, executor=InTurn(), report=look)
     whole, counts = dt.run(scene), []
     for computed, found in seen:
         there = (found.outcome != PENDING).values
@@ -164,9 +177,8 @@ def test_a_store_whose_run_is_killed_opens_and_is_resumed(tmp_path):
 
 
 def test_points_of_several_blocks_and_shards(grid_scene, tmp_path, monkeypatch):
-    """Each shard is written once, when the blocks that it overlaps are complete."""
-    monkeypatch.setattr("drivetrain_jax.runs.plan._BLOCK", 300)
-    monkeypatch.setattr(zarr_store, "_MOST_POINTS", 100)
+    """Each shard is written once, when its block is complete."""
+    monkeypatch.setattr(shards, "MOST_POINTS", 100)
     written, write = [], zarr_store.write
     monkeypatch.setattr(zarr_store, "write", lambda *a: written.append(a[3]) or write(*a))
     scene = large(grid_scene)
@@ -174,6 +186,49 @@ def test_points_of_several_blocks_and_shards(grid_scene, tmp_path, monkeypatch):
     assert sorted(written) == list(range(20)) and zarr_store.shards_of(tmp_path / "r.zarr").count == 20
     run_to_file(scene, tmp_path / "r.nc")
     xr.testing.assert_identical(as_file(tmp_path / "r.nc"), as_file(tmp_path / "r.zarr"))
+
+
+@pytest.mark.parametrize("executor", [InTurn(), Threads(3)])
+def test_the_remaining_chunks_of_a_share_are_divided(grid_scene, tmp_path, monkeypatch, executor):
+    """Shares that end after one chunk compute every chunk once, on any number of workers."""
+    from drivetrain_jax.runs import shard_writer, zarr_sink
+
+    computed, compute = [], shard_writer.Job.compute
+    monkeypatch.setattr(zarr_sink, "_SECONDS", 1e-6)
+    monkeypatch.setattr(shard_writer.Job, "compute", lambda job, c: computed.append(c.number) or compute(job, c))
+    monkeypatch.setattr(shards, "MOST_POINTS", 900)
+    scene = large(grid_scene)
+    found = to_store(scene, tmp_path / "r.zarr", executor=executor)
+    assert sorted(set(computed)) == sorted(computed) and found.computed == 1640
+    run_to_file(scene, tmp_path / "r.nc")
+    xr.testing.assert_identical(as_file(tmp_path / "r.nc"), as_file(tmp_path / "r.zarr"))
+
+
+class Crashing(InTurn):
+    """Every task with the first chunk of block 70 crashes its worker."""
+
+    def __init__(self):
+        self.crashed = []
+
+    def run(self, computation, tasks):
+        for task in tasks:
+            blocks = [share.block for share in getattr(task, "shares", ())]
+            number = getattr(task, "size", None) and task.number
+            if crash := 70 in blocks or number == 70 * shards.MOST_POINTS:
+                self.crashed.append(len(blocks))
+            yield task, None if crash else computation.compute(task)
+
+
+def test_only_the_chunk_that_crashes_its_worker_is_lost(grid_scene, tmp_path, monkeypatch):
+    """The shares of a task that crashes are tried alone, then the chunks of the crashing share."""
+    monkeypatch.setattr("drivetrain_jax.store.shards.Shards.of", lambda *_: shards.Shards((40, 41), (1, 20)))
+    scene, executor = large(grid_scene), Crashing()
+    found = to_store(scene, tmp_path / "r.zarr", executor=executor)
+    assert (found.computed, found.failed) == (1640, int((as_file(tmp_path / "r.zarr").outcome != 0).sum()))
+    ours, whole = as_file(tmp_path / "r.zarr"), dt.run(scene)
+    lost = ours.outcome.values == Outcome.LOST
+    assert executor.crashed[0] > 1 and executor.crashed[1:] == [1, 0]
+    assert 0 < lost.sum() <= 20 and ours.value.values[~lost].tobytes() == whole.value.values[~lost].tobytes()
 
 
 def test_interrupted_damaged_and_resumed(grid_scene, tmp_path):
@@ -428,16 +483,18 @@ def test_the_command_line(tmp_path, monkeypatch, capsys):
     [
         ((), None, ()),
         ((7,), None, (7,)),
-        ((1000, 1000), None, (262, 1000)),
-        ((3, 2, 1_000_000), None, (1, 1, 1 << 18)),
+        ((1000, 1000), None, (250, 1000)),
+        ((3, 2, 1_000_000), None, (1, 1, 250_000)),
+        ((10, 262_145), None, (1, 131_073)),
         ((500, 400, 300), 1, (2, 400, 300)),
         ((2, 1_000_000), 1, (1, 1_000_000)),
     ],
 )
 def test_shards_cover_the_sweep_once(shape, path, lengths):
-    shards = zarr_store.Shards.of(shape, path, 8)
-    assert shards.lengths == lengths
-    seen = np.zeros(shape, np.int8)
-    for shard in range(shards.count):
-        seen[shards.place(shard)] += 1
-    assert (seen == 1).all()
+    found = shards.Shards.of(shape, path, 8)
+    assert found.lengths == lengths
+    seen, starts, inside = np.zeros(shape, np.int8), found.starts(path), 1 if path is None else shape[path]
+    for shard in range(found.count):
+        seen[found.place(shard)] += 1
+        assert starts[shard] * inside == seen.sum() - seen[found.place(shard)].size
+    assert (seen == 1).all() and starts[-1] * inside == seen.size
