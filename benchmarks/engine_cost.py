@@ -5,17 +5,23 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
+import os
 import subprocess
 import sys
+import tempfile
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import distributed
+import numpy as np
 
 from benchmarks.timing import PROCESSES, interleaved, median
 from drivetrain_jax._machine import usable_cores
@@ -26,6 +32,9 @@ from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.run import run_to_file
 from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.runs.shard_writer import FOUND, ShardWriter, Share, Shares
+from drivetrain_jax.runs.zarr_sink import ShardedRun
+from drivetrain_jax.store.chunks import PartsFolder
 from tests.oracles.cardan_reference import BASE_CASE
 
 # Code of a process that runs a sweep of one output. It prints the largest resident memory in MB with and without the pages
@@ -186,6 +195,67 @@ def dask_cluster(folder: Path) -> Iterator[str]:
             process.kill()
             process.wait()
         file.unlink(missing_ok=True)
+
+
+@dataclass(frozen=True)
+class _Counts:
+    """A computation whose tasks return what a worker of a Zarr run returns."""
+
+    digest: str = "counts"
+
+    def compute(self, task: Any, /) -> Mapping[str, np.ndarray]:
+        return {
+            "seconds": np.zeros(()),
+            "part": np.array(["x" * 40]),
+            **dict.fromkeys(FOUND[:2] + FOUND[3:], np.ones(1)),
+        }
+
+
+def request_cost(count: int = 2000) -> float:
+    """CPU seconds of a request: the larger one of this process and Dask's scheduler.
+
+    Generators, because tasks of known number are requested together.
+    """
+    tasks = (Shares(number, (Share(number, 0, 1, 1),), 1.0) for number in itertools.count())
+    with tempfile.TemporaryDirectory() as folder, dask_cluster(Path(folder)) as address:
+        executor = make_executor(dask=address)
+        with closing(executor):
+            deque(executor.run(_Counts(), (task for task in itertools.islice(tasks, 100))), maxlen=0)
+            scheduler = _scheduler_seconds()
+            own = cpu_seconds(
+                lambda: deque(executor.run(_Counts(), (task for task in itertools.islice(tasks, count))), maxlen=0)
+            )
+            return max(own, _scheduler_seconds() - scheduler) / count
+
+
+def _scheduler_seconds() -> float:
+    """CPU seconds so far of the children of this process that are Dask schedulers."""
+    ticks = 0
+    for folder in Path("/proc").glob("[0-9]*"):
+        fields = (folder / "stat").read_text().rpartition(")")[2].split() if folder.exists() else []
+        if fields and int(fields[1]) == os.getpid() and b"dask_scheduler" in (folder / "cmdline").read_bytes():
+            ticks += int(fields[11]) + int(fields[12])
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def block_cost() -> tuple[int, float, float]:
+    """Points of a block, CPU seconds of a worker that plans, computes and writes it, and the share of the kernels."""
+    job, whole = resolve(load_scene(scene(10_000_000))), 0.0
+    middle = job.grid.shards.count // 2
+    with tempfile.TemporaryDirectory() as folder:
+        parts = PartsFolder(Path(folder) / "r.zarr")
+        parts.open()
+        ShardedRun(job, parts, job.route.progress(job), None).create()
+        writer = ShardWriter(job, str(parts.out))
+        # The first block compiles the kernels.
+        for block in (middle, middle + 1):
+            task = Shares(0, (Share(block, 0, 1, 1),), math.inf)
+            whole = cpu_seconds(lambda task=task: writer.compute(task))
+        parts.close()
+    plan, (first, stop) = job.block_plan(middle + 1), job.grid.block(middle + 1)
+    chunks = [plan.chunk(number) for number in range(len(plan.costs))]
+    kernels = cpu_seconds(lambda: deque(map(job.compute, chunks), maxlen=0))
+    return stop - first, whole, kernels / whole
 
 
 def places(points: int, repeats: int, folder: Path) -> list[Place]:

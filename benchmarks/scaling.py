@@ -21,6 +21,7 @@ from benchmarks import engine_cost
 from benchmarks.engine_cost import Memory, cpu_seconds, scene
 from benchmarks.results_files import between_marks
 from benchmarks.timing import RESULTS, median, parser, provenance, results_folder, significant, write_csv
+from drivetrain_jax.runs import zarr_sink
 from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.executor import IN_FLIGHT
 from drivetrain_jax.runs.resolve import resolve
@@ -36,7 +37,11 @@ _MEMORY, _QUICK_MEMORY = (1_000_000, 10_000_000, 100_000_000), (1_000_000, 5_000
 
 @dataclass(frozen=True)
 class Costs:
-    """Measured costs of one chunk and one point; all seconds are those of one core."""
+    """Measured costs of one chunk, point, block and request; all seconds are CPU seconds.
+
+    With ``--store zarr`` a worker plans, computes and writes a ``block`` in ``block_s``, of which the kernels take the share
+    ``block_kernels``. A request takes ``request_s`` of the driver or of Dask's scheduler, whichever has more work.
+    """
 
     chunk: int
     compute_s: float
@@ -46,6 +51,10 @@ class Costs:
     handle_s: float
     checksum_s_per_byte: float
     result_bytes_per_point: float
+    block: int
+    block_s: float
+    block_kernels: float
+    request_s: float
 
 
 def costs(points: int) -> Costs:
@@ -77,6 +86,8 @@ def costs(points: int) -> Costs:
         handling,
         hashing(),
         per_point,
+        *engine_cost.block_cost(),
+        engine_cost.request_cost(),
     )
 
 
@@ -88,9 +99,21 @@ def hashing() -> float:
 
 
 @dataclass(frozen=True)
+class Task:
+    """Work that a worker gets at once: points, seconds and their spread, seconds of the driver, share of the kernels."""
+
+    points: float
+    seconds: float
+    spread: float
+    driver_s: float
+    kernels: float
+
+
+@dataclass(frozen=True)
 class Load:
     """Result of the simulation for one sweep on ``workers`` cores."""
 
+    store: str
     points: float
     workers: int
     hours: float
@@ -98,42 +121,52 @@ class Load:
     workers_busy: float
 
 
-def simulate(cost: Costs, workers: int, chunks: int = 20_000, seed: int = 1) -> tuple[float, float, float]:
-    """Seconds per chunk, and the shares of time in which driver and workers are busy.
+def task_of(cost: Costs, store: str, workers: int) -> Task:
+    """A chunk for a result file that the driver writes; whole blocks for a store that workers write."""
+    if store == "hdf5":
+        return Task(cost.chunk, cost.compute_s, cost.spread, cost.handle_s, 1.0)
+    blocks = max(round(max(zarr_sink.SECONDS, IN_FLIGHT * workers / zarr_sink.PER_SECOND) / cost.block_s), 1)
+    spread = cost.spread / (blocks * cost.block / cost.chunk) ** 0.5
+    return Task(blocks * cost.block, blocks * cost.block_s, spread, cost.request_s, cost.block_kernels)
 
-    Each of the ``workers`` has two chunks. One driver handles results in the order of arrival, and sends the next chunk.
+
+def simulate(task: Task, workers: int, tasks: int = 20_000, seed: int = 1) -> tuple[float, float, float]:
+    """Seconds per task, and the shares of time in which the driver is busy and the workers run kernels.
+
+    Each of the ``workers`` has two tasks. One driver handles results in the order of arrival, and sends the next task.
     """
     rng = np.random.default_rng(seed)
-    chunks = max(chunks, 20 * workers)
-    shape = 1 / max(cost.spread, 1e-3) ** 2
-    times = rng.gamma(shape, cost.compute_s / shape, chunks)
+    tasks = max(tasks, 20 * workers)
+    shape = 1 / max(task.spread, 1e-3) ** 2
+    times = rng.gamma(shape, task.seconds / shape, tasks)
     free = np.zeros(workers)
     queue: list[tuple[float, int]] = []
     started = 0
     for _ in range(IN_FLIGHT):
-        for worker in range(min(workers, chunks - started)):
+        for worker in range(min(workers, tasks - started)):
             free[worker] += times[started]
             heapq.heappush(queue, (free[worker], worker))
             started += 1
     driver = busy = 0.0
     while queue:
         finished, worker = heapq.heappop(queue)
-        driver = max(driver, finished) + cost.handle_s
-        busy += cost.handle_s
-        if started < chunks:
+        driver = max(driver, finished) + task.driver_s
+        busy += task.driver_s
+        if started < tasks:
             free[worker] = max(free[worker], driver) + times[started]
             heapq.heappush(queue, (free[worker], worker))
             started += 1
-    return driver / chunks, busy / driver, float(times.sum() / (workers * driver))
+    return driver / tasks, busy / driver, float(task.kernels * times.sum() / (workers * driver))
 
 
 def loads(cost: Costs, counts: Sequence[int] = (2, 16, 128, 1024, 4096)) -> list[Load]:
-    """Sweeps of 1e9 and 1e12 points."""
+    """Sweeps of 1e12 points, in 500 scenes or more."""
     found = []
-    for workers in counts:
-        per_chunk, driver, busy = simulate(cost, workers)
-        for points in (1e9, 1e12):
-            found.append(Load(points, workers, points / cost.chunk * per_chunk / 3600, driver, busy))
+    for store in ("hdf5", "zarr"):
+        for workers in counts:
+            task = task_of(cost, store, workers)
+            per_task, driver, busy = simulate(task, workers)
+            found.append(Load(store, 1e12, workers, 1e12 / task.points * per_task / 3600, driver, busy))
     return found
 
 
@@ -169,11 +202,11 @@ def page(tables: Mapping[str, str], cost: Costs, simulated: Sequence[Load]) -> s
     chunk_rows = [{"figure": name, "value": value} for name, value in asdict(cost).items()]
     load_rows = [
         {
-            "points": f"{load.points:.0e}",
+            "--store": load.store,
             "workers (cores)": load.workers,
             "time": f"{load.hours:,.2g} h",
             "driver busy": f"{100 * load.driver_busy:.0f} %",
-            "workers busy": f"{100 * load.workers_busy:.0f} %",
+            "kernels on the workers": f"{100 * load.workers_busy:.0f} %",
         }
         for load in simulated
     ]
@@ -185,9 +218,9 @@ def page(tables: Mapping[str, str], cost: Costs, simulated: Sequence[Load]) -> s
             markdown(chunk_rows),
             "### Sweeps: size",
             markdown(rows_of(cost)),
-            "### Sweeps: time and load",
+            "### A sweep of 1e12 points: time and load",
             markdown(load_rows),
-            f"The single writer keeps up with about {limit:,.0f} cores (computing over handling of one chunk).",
+            f"The writer of an HDF5 file keeps up with about {limit:,.0f} cores (computing over handling of one chunk).",
         ]
     )
 
@@ -219,7 +252,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         found = engine_cost.overhead(points, repeats, folder)
-        elsewhere = engine_cost.places(min(points, 200_000), repeats, folder)
+        elsewhere = engine_cost.places(points, repeats, folder)
         memory = engine_cost.memory(_QUICK_MEMORY if options.quick else _MEMORY, folder)
     cost = costs(min(points, 200_000))
     simulated = loads(cost)

@@ -51,7 +51,7 @@ from drivetrain_jax.store.shards import MOST_POINTS
 # Least number of shares at the start, to give several workers work, and most shares of the remaining chunks of one share.
 _FEWEST_SHARES, _MOST_PIECES = 8, 64
 # Shortest duration of a task in s, and most tasks per second (two for each worker are in flight).
-_SECONDS, _PER_SECOND = 2.0, 200.0
+SECONDS, PER_SECOND = 2.0, 200.0
 # Shortest time in s between two writings of unfinished shards, and the smallest ratio of this time to that of the writing.
 _INTERVAL, _RATIO = 2.0, 20.0
 
@@ -119,12 +119,12 @@ class ZarrSink(Sink):
         self, job: Job, executor: Executor, report: Report | None, progress: Progress, reused: ReusedPoints
     ) -> None:
         """Compute and assemble what is missing, and move the store into place."""
-        run = _ShardedRun(job, self._parts, progress, report)
+        run = ShardedRun(job, self._parts, progress, report)
         with closing(executor):
             run.compute(executor)
         self._finish(run)
 
-    def _finish(self, run: _ShardedRun) -> None:
+    def _finish(self, run: ShardedRun) -> None:
         """Move the store into place. A former one is set aside first, because a directory cannot be replaced in one step.
 
         Raises :class:`ChunkError` if a shard that a worker reported as written is missing.
@@ -143,7 +143,7 @@ class ZarrSink(Sink):
         move_folder(run.path, self._out)
 
 
-class _ShardedRun:
+class ShardedRun:
     """Progress of shares and shards, known to the driver alone. A block of the plan is a shard of the store."""
 
     def __init__(self, job: Job, parts: PartsFolder, progress: Progress, report: Report | None) -> None:
@@ -175,7 +175,7 @@ class _ShardedRun:
 
     def compute(self, executor: Executor) -> None:
         """Compute the missing chunks, and write all shards."""
-        self._create()
+        self.create()
         written = self._reuse_shards()
         self._reuse_parts(written)
         self._blocks.extend(np.flatnonzero(~written).tolist())
@@ -187,7 +187,7 @@ class _ShardedRun:
             for share in crashed:
                 self._one_by_one(executor, share)
 
-    def _create(self) -> None:
+    def create(self) -> None:
         """Create the store from the plan, unless a stopped run has left exactly that."""
         # Moved in one step, so the store at this path is always whole.
         half = self.path.with_name("half")
@@ -262,7 +262,7 @@ class _ShardedRun:
     @property
     def _seconds(self) -> float:
         """Duration of a task: with many workers so long that the scheduler keeps up."""
-        return max(_SECONDS, self._running / _PER_SECOND)
+        return max(SECONDS, self._running / PER_SECOND)
 
     def _divide(self, share: Share, begin: int, count: int) -> None:
         """Queue ``count`` shares of the chunks of ``share`` from ``begin`` on."""

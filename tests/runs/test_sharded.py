@@ -194,7 +194,7 @@ def test_the_remaining_chunks_of_a_share_are_divided(grid_scene, tmp_path, monke
     from drivetrain_jax.runs import shard_writer, zarr_sink
 
     computed, compute = [], shard_writer.Job.compute
-    monkeypatch.setattr(zarr_sink, "_SECONDS", 1e-6)
+    monkeypatch.setattr(zarr_sink, "SECONDS", 1e-6)
     monkeypatch.setattr(shard_writer.Job, "compute", lambda job, c: computed.append(c.number) or compute(job, c))
     monkeypatch.setattr(shards, "MOST_POINTS", 900)
     scene = large(grid_scene)
