@@ -33,7 +33,7 @@ from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.run import run_to_file
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.runs.shard_writer import FOUND, ShardWriter, Share, Shares
-from drivetrain_jax.runs.zarr_sink import ShardedRun
+from drivetrain_jax.runs.sharded_run import ShardedRun
 from drivetrain_jax.store.chunks import PartsFolder
 from tests.oracles.cardan_reference import BASE_CASE
 

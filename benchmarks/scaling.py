@@ -21,7 +21,7 @@ from benchmarks import engine_cost
 from benchmarks.engine_cost import Memory, cpu_seconds, scene
 from benchmarks.results_files import between_marks
 from benchmarks.timing import RESULTS, median, parser, provenance, results_folder, significant, write_csv
-from drivetrain_jax.runs import zarr_sink
+from drivetrain_jax.runs import sharded_run
 from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.executor import IN_FLIGHT
 from drivetrain_jax.runs.resolve import resolve
@@ -125,7 +125,7 @@ def task_of(cost: Costs, store: str, workers: int) -> Task:
     """A chunk for a result file that the driver writes; whole blocks for a store that workers write."""
     if store == "hdf5":
         return Task(cost.chunk, cost.compute_s, cost.spread, cost.handle_s, 1.0)
-    blocks = max(round(max(zarr_sink.SECONDS, IN_FLIGHT * workers / zarr_sink.PER_SECOND) / cost.block_s), 1)
+    blocks = max(round(max(sharded_run.SECONDS, IN_FLIGHT * workers / sharded_run.PER_SECOND) / cost.block_s), 1)
     spread = cost.spread / (blocks * cost.block / cost.chunk) ** 0.5
     return Task(blocks * cost.block, blocks * cost.block_s, spread, cost.request_s, cost.block_kernels)
 

@@ -21,6 +21,16 @@ def pytest_configure(config):
         os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 
+@pytest.fixture(autouse=True, scope="session")
+def no_stored_programs():
+    """A test that replaces code must not leave its program to later runs; processes that tests start do store programs."""
+    from drivetrain_jax.runs import compile_cache
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compile_cache, "programs", lambda: None)
+        yield
+
+
 def resident() -> int:
     """Resident memory of this process in bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096

@@ -26,6 +26,8 @@ from drivetrain_jax.atlas.windows import Crossing, Interval, narrow
 from drivetrain_jax.runs.atlas_file import StoredAtlas
 from drivetrain_jax.runs.atlas_question import AtlasQuery, Range, number, roles_of
 from drivetrain_jax.runs.growth_text import growth_at, growth_lines
+from drivetrain_jax.runs.identity import program_identity
+from drivetrain_jax.runs.programs import lowered
 from drivetrain_jax.systems import System
 
 # Distance of a spectral radius from 1 below which the distance itself is printed.
@@ -249,7 +251,7 @@ def _elsewhere(safe: str, asked: AtlasQuery, answer: design.Answer) -> list[str]
 def radius_gradient(system: type[System], values: Mapping[str, float]) -> dict[str, float] | None:
     """Derivatives of the spectral radius by all parameters of ``system`` at ``values``; None without a gradient."""
     names = system.models["floquet"].parameters
-    found = np.asarray(_compiled_gradient(system, names)({name: float(values[name]) for name in names}))
+    found = np.asarray(_compiled_gradient(system, names)({name: np.float64(values[name]) for name in names}))
     # JAX orders the leaves of a dictionary by key.
     slopes = dict(zip(sorted(names), map(float, found), strict=True))
     return {name: slopes[name] for name in names} if np.isfinite(found).all() else None
@@ -266,7 +268,8 @@ def _compiled_gradient(system: type[System], names: tuple[str, ...]) -> Callable
         constants = Constants(dict.fromkeys(names))
         return analysis.derivatives(system, request, parameters, constants, {})["spectral_radius"]
 
-    return jax.jit(slopes, compiler_options=options_for_few())
+    kinds = ({name: np.float64(0.0) for name in names},)
+    return lowered(slopes, kinds, program_identity(system, analysis, "gradient")).compile(options_for_few())
 
 
 def _gradient_lines(atlas: StoredAtlas, slopes: Mapping[str, float] | None) -> list[str]:

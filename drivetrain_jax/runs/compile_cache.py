@@ -32,6 +32,13 @@ def enable() -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
+def programs() -> Path | None:
+    """The folder of stored programs; None without a cache, or with one that the user has configured."""
+    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    wanted = os.environ.get(_VARIABLE, "")
+    return Path(folder) / "programs" if wanted != "0" and folder == str(_folder(wanted)) else None
+
+
 def _folder(wanted: str) -> Path:
     """One folder per instruction set and jax version, because compiled code is not portable."""
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")

@@ -13,9 +13,10 @@ import jax
 
 import drivetrain_jax
 from drivetrain_jax._machine import instruction_set
-from drivetrain_jax.analysis import Solver
+from drivetrain_jax.analysis import Analysis, Solver
 from drivetrain_jax.runs.scene import Problem
 from drivetrain_jax.store.provenance import digest, source_digest, versions
+from drivetrain_jax.systems import System
 
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "numpy", "scipy")
 _ROOT = Path(drivetrain_jax.__file__).parent
@@ -26,16 +27,14 @@ _FILES = ("_quantities", "store/shards", *(f"runs/{name}" for name in _ENGINE))
 _READERS = ("figure.py", "rules.py")
 
 
-def numerics_of(scene: Problem, route: str) -> dict[str, Any]:
+def numerics_of(system: type[System], analysis: Analysis, route: str) -> dict[str, Any]:
     """Everything that affects the bits: route, numeric code, package versions, and instruction set.
 
     The code includes this package, and the packages of the system and of the analysis.
     """
     sources = dict(_own_sources())
-    for function in (scene.analysis.model(scene.system).build, scene.analysis.solvers):
-        # A partial, or a wrapper around a method, has no source of its own.
-        file = inspect.getsourcefile(inspect.unwrap(getattr(function, "func", function)))
-        sources |= _sources_of(_package_of(Path(file))) if file else {}
+    for file in _files(system, analysis):
+        sources |= _sources_of(_package_of(file)) if file else {}
     return {
         "route": route,
         "sources": sources,
@@ -45,6 +44,24 @@ def numerics_of(scene: Problem, route: str) -> dict[str, Any]:
         "flags": os.environ.get("XLA_FLAGS", ""),
         "instructions": " ".join(sorted(instruction_set())),
     }
+
+
+def program_identity(system: type[System], analysis: Analysis, content: object) -> str:
+    """Digest of everything that affects a compiled program; empty if the code has no file, as in a notebook."""
+    files = _files(system, analysis)
+    if not all(file and file.exists() for file in files):
+        return ""
+    return digest([numerics_of(system, analysis, ""), system.name, analysis.name, drivetrain_jax.__version__, content])
+
+
+def _files(system: type[System], analysis: Analysis) -> list[Path | None]:
+    """Files of the code of a system and of an analysis."""
+    found: list[Path | None] = []
+    for function in (analysis.model(system).build, analysis.solvers):
+        # A partial, or a wrapper around a method, has no source of its own.
+        file = inspect.getsourcefile(inspect.unwrap(getattr(function, "func", function)))
+        found.append(Path(file) if file else None)
+    return found
 
 
 # Cached: later edits of the files do not change the imported code.

@@ -136,7 +136,7 @@ class Job:
     @cached_property
     def numerics_detail(self) -> dict[str, Any]:
         """The entries whose digest is ``numerics``."""
-        return numerics_of(self.problem, self.route.name)
+        return numerics_of(self.problem.system, self.problem.analysis, self.route.name)
 
     @property
     def numerics_attrs(self) -> dict[str, str]:

@@ -17,8 +17,10 @@ from jax import Array
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import Analysis, Solver
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, on_cpu, options_for_few
+from drivetrain_jax.runs.identity import program_identity
 from drivetrain_jax.runs.plan import Plan
 from drivetrain_jax.runs.point_grid import Grid
+from drivetrain_jax.runs.programs import lowered
 from drivetrain_jax.runs.scene import Problem, result_variables
 from drivetrain_jax.systems import System
 
@@ -91,16 +93,20 @@ def result_shapes(problem: Problem, grid: Grid, solver: Solver) -> dict[str, tup
     return {v.name: shapes[v.name].shape[:-1] for v in variables}
 
 
-def compile_kernel(solver: Solver, grid: Grid, chunk: int, variables: Sequence[Variable], few: bool = False) -> Kernel:
+def compile_kernel(
+    solver: Solver, grid: Grid, chunk: int, variables: Sequence[Variable], few: bool = False, identity: str = ""
+) -> Kernel:
     """Compile ``solver`` for chunks of ``chunk`` points of ``grid``; without optimisation for ``few`` points.
+
+    For ``identity`` see :func:`~drivetrain_jax.runs.programs.lowered`.
 
     Varying parameters, the ``numbers`` of the grid and the effort are arguments of the compiled code. Other fixed
     parameters, the values along a path and options are constants of it.
     """
     batch, kinds = _batch(solver, grid, chunk, variables)
-    lowered = jax.jit(batch).lower(*kinds)
+    program = lowered(batch, kinds, identity)
     options = compiler_options(chunk, march=solver.march, short_loops=solver.short_loops)
-    compiled = lowered.compile(options_for_few() if few else options)
+    compiled = program.compile(options_for_few() if few else options)
     return Kernel(compiled, chunk, tuple(variables), _turn(compiled))
 
 
@@ -151,7 +157,9 @@ def kernel_of(problem: Problem, grid: Grid, solver: Solver, size: int, few: bool
 
 @lru_cache(maxsize=64)
 def _compiled(key: _Key, size: int, few: bool) -> Kernel:
-    return compile_kernel(key.solver, key.grid, size, key.variables, few)
+    content = [key.structure, [[v.name, v.dims, v.dtype] for v in key.variables], size]
+    identity = program_identity(key.system, key.analysis, repr(content))
+    return compile_kernel(key.solver, key.grid, size, key.variables, few, identity)
 
 
 def _turn(compiled: Any) -> AbstractContextManager[object]:

@@ -165,7 +165,7 @@ def test_kernels_with_lapack_calls_take_turns():
 def test_scenes_of_few_points_are_compiled_without_optimising(monkeypatch):
     """Scenes of lengthy points and rounds of an atlas are optimised, the latter because later rounds share their kernels."""
     given = []
-    monkeypatch.setattr(kernel, "compile_kernel", lambda *of: given.append(of[-1]) or object())
+    monkeypatch.setattr(kernel, "compile_kernel", lambda *of: given.append(of[4]) or object())
     kernel._compiled.cache_clear()
     cases = (
         (128, {}, False),

@@ -125,10 +125,10 @@ class InTurn(Executor):
 
 def test_a_growing_store_opens_with_the_computed_points(grid_scene, tmp_path, monkeypatch):
     """Incomplete shards are written as well; missing points have no value."""
-    from drivetrain_jax.runs import zarr_sink
+    from drivetrain_jax.runs import sharded_run
 
-    monkeypatch.setattr(zarr_sink, "_INTERVAL", 0.0)
-    monkeypatch.setattr(zarr_sink, "_RATIO", 0.0)
+    monkeypatch.setattr(sharded_run, "_INTERVAL", 0.0)
+    monkeypatch.setattr(sharded_run, "_RATIO", 0.0)
     scene, path, seen = large(grid_scene), tmp_path / "r.zarr", []
 
     def look(progress):
@@ -191,10 +191,10 @@ def test_points_of_several_blocks_and_shards(grid_scene, tmp_path, monkeypatch):
 @pytest.mark.parametrize("executor", [InTurn(), Threads(3)])
 def test_the_remaining_chunks_of_a_share_are_divided(grid_scene, tmp_path, monkeypatch, executor):
     """Shares that end after one chunk compute every chunk once, on any number of workers."""
-    from drivetrain_jax.runs import shard_writer, zarr_sink
+    from drivetrain_jax.runs import shard_writer, sharded_run
 
     computed, compute = [], shard_writer.Job.compute
-    monkeypatch.setattr(zarr_sink, "SECONDS", 1e-6)
+    monkeypatch.setattr(sharded_run, "SECONDS", 1e-6)
     monkeypatch.setattr(shard_writer.Job, "compute", lambda job, c: computed.append(c.number) or compute(job, c))
     monkeypatch.setattr(shards, "MOST_POINTS", 900)
     scene = large(grid_scene)

@@ -1,0 +1,80 @@
+"""Stored programs of kernels: later processes trace nothing, and no damaged or foreign program is used."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from drivetrain_jax.runs.identity import program_identity
+from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.systems.planetary import Planetary
+
+# Prints the results of two points and the number of traced programs.
+POINT = """
+import drivetrain_jax as dt
+from drivetrain_jax.runs import programs
+traced, export = [], programs.export.export
+programs.export.export = lambda *a: traced.append(1) or export(*a)
+for k_sp in (4e8, 4.5e8):
+    scene = {"system": "planetary", "analysis": "modes", "fixed": {"k_sp": k_sp}}
+    print(dt.run(scene).natural_frequency.values.tobytes().hex())
+print(len(traced))
+"""
+CALLBACK = """
+import jax, jax.numpy as jnp, numpy as np
+from drivetrain_jax.runs import compile_cache, programs
+compile_cache.enable()
+def called(x):
+    return jax.pure_callback(lambda v: np.asarray(v) + 1, jax.ShapeDtypeStruct((3,), x.dtype), x)
+kinds = (jax.ShapeDtypeStruct((3,), np.float64),)
+print(programs.lowered(called, kinds, "name").compile()(jnp.zeros(3)))
+"""
+
+
+def lines(script, folder):
+    environment = os.environ | {"DRIVETRAIN_JAX_CACHE": str(folder)}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    return done.stdout.split()
+
+
+def stored(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("programs/*"))
+
+
+def test_a_later_process_traces_nothing_and_gets_the_same_bits(tmp_path):
+    first = lines(POINT, tmp_path)
+    assert first[-1] == "1" and len(stored(tmp_path)) == 1
+    assert lines(POINT, tmp_path) == [*first[:-1], "0"]
+    # Without a cache nothing is stored, and the bits are the same.
+    assert lines(POINT, "0") == [*first[:-1], "0"]
+
+
+@pytest.mark.parametrize(
+    "damage", [pytest.param("cut", marks=pytest.mark.full), "bit", pytest.param("empty", marks=pytest.mark.full)]
+)
+def test_a_damaged_program_is_replaced(tmp_path, damage):
+    first = lines(POINT, tmp_path)
+    (file,) = stored(tmp_path)
+    data = file.read_bytes()
+    changed = bytearray(data)
+    changed[len(data) // 2] ^= 8
+    file.write_bytes({"cut": data[:-100], "bit": bytes(changed), "empty": b""}[damage])
+    assert lines(POINT, tmp_path) == first and len(stored(tmp_path)[0].read_bytes()) == len(data)
+
+
+def test_a_program_that_calls_python_is_not_stored(tmp_path):
+    assert lines(CALLBACK, tmp_path) == ["[1.", "1.", "1.]"] and stored(tmp_path) == []
+
+
+def test_identity_follows_the_content_and_the_code(monkeypatch):
+    analysis = load_scene({"system": "planetary", "analysis": "modes"}).analysis
+    one, other = (program_identity(Planetary, analysis, content) for content in ("a", "b"))
+    assert one and other and one != other
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
+    assert program_identity(Planetary, analysis, "a") != one
+    monkeypatch.setattr("inspect.getsourcefile", lambda _: "<stdin>")
+    assert program_identity(Planetary, analysis, "a") == ""
