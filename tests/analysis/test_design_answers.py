@@ -7,6 +7,7 @@ import numpy as np
 import drivetrain_jax as dt
 from drivetrain_jax.analysis.critical_speeds.margins import required_margin
 from drivetrain_jax.analysis.floquet.growth import growth
+from tests.oracles.bicardan_reference import finite_elements
 
 
 def test_growth_follows_an_exponential():
@@ -49,3 +50,38 @@ def test_margins_of_a_stepped_shaft():
     del options["amplification"]
     undamped = dt.critical_speeds(shaft, outputs="required_margin", **options)
     np.testing.assert_allclose(undamped.required_margin, 0.26, rtol=1e-14)
+
+
+def test_two_discs_of_a_finite_element_model_are_point_data():
+    """A 1.5 m shaft of 50 mm on 1 MN/m carries discs of 70 by 280 mm: 96.289, 296.492, 764.685 rad/s."""
+    disc, shaft = np.array([0.28, 0.05]), {"E": "211 GPa", "G": "81.2 GPa", "density": 7810.0}
+    mass = 7810 * 0.07 * np.pi / 4 * (disc[0] ** 2 - disc[1] ** 2)
+    inertia = mass * ((disc**2).sum() / 16 + 0.07**2 / 12)
+    data = shaft | {"length": ["500 mm"] * 3, "outer_diameter": ["50 mm"] * 3, "k_A": "1 MN/m", "k_D": "1 MN/m"}
+    data |= {"m_joint": [mass, mass], "I_joint": [inertia, inertia], "outputs": ["angular_frequency"], "modes": 3}
+    found = dt.point("bicardan", "critical_speeds", **data)
+    np.testing.assert_allclose(found.angular_frequency, [96.289, 296.492, 764.685], atol=6e-4)
+    given = {name: value for name, value in found.parameters.items() if value != ()}
+    np.testing.assert_allclose(finite_elements(given, 3), found.angular_frequency, rtol=1e-9)
+
+
+def test_two_discs_on_segments_without_mass_in_closed_form():
+    """Discs alike at a third of a simply supported shaft: the even and the odd motion, two frequencies each."""
+    EI, third, mass, inertia, end = 6.5e4, 0.5, 32.6, 0.178, np.inf
+    shaft = dt.Bicardan(
+        length=(third,) * 3,
+        EI=(EI,) * 3,
+        rhoA=(0.0,) * 3,
+        k_A=end,
+        k_D=end,
+        m_joint=(mass,) * 2,
+        I_joint=(inertia,) * 2,
+    )
+    found = dt.critical_speeds(shaft, outputs=["angular_frequency"], modes=4).angular_frequency
+    # Half a shaft: its outer part bends as a bar that is pinned at A, its inner part between rotations of one kind.
+    outer = np.array([[3, -3 * third], [-3 * third, 3 * third**2]]) * EI / third**3
+    even = outer + np.array([[0, 0], [0, 2]]) * EI / third
+    odd = outer + np.array([[24, 12 * third], [12 * third, 6 * third**2]]) * EI / third**3
+    scale = np.diag([mass**-0.5, inertia**-0.5])
+    expected = np.sqrt([np.linalg.eigvalsh(scale @ stiffness @ scale) for stiffness in (even, odd)])
+    np.testing.assert_allclose(found, np.sort(expected.ravel()), rtol=1e-12)
