@@ -80,6 +80,39 @@ class DrivetrainAccessor:
             raise InputError("resonances: none are predicted along these axes; allowed is a chart that has some")
         return found
 
+    def orders(self) -> xr.DataArray:
+        """The speeds [rpm] at which orders of the excitation meet the natural frequencies, with a dimension ``order``.
+
+        Orders are those of the mesh and of the planets (``planetary`` with ``teeth``), or of unbalance and joints.
+
+        >>> import drivetrain_jax as dt
+        >>> gear = {"system": "planetary", "analysis": "modes", "fixed": {"teeth": [20, 26, 72]}}
+        >>> print(dt.run(gear).drivetrain.orders().sel(order="mesh order 1", mode=2).round(1).item())
+        606.1
+
+        Raises: InputError for a result without frequencies, or of a system whose orders are not known.
+        """
+        from drivetrain_jax.resonances.orders import FREQUENCIES, in_hertz, stored_orders
+
+        self._analysis()
+        orders = stored_orders(self._dataset.attrs)
+        name = next((name for name in FREQUENCIES if name in self._dataset), None)
+        if orders is None or name is None:
+            raise InputError(
+                "orders: not known; allowed is a result with frequencies, of a planetary gear with its teeth"
+            )
+        found = self._dataset[name]
+        order = xr.DataArray(list(orders.per_turn), dims="order", name="order", attrs={"long_name": "order"})
+        attrs = {"units": "rpm", "long_name": f"speed of the {orders.shaft} at which the order meets the mode"}
+        dims = (*found.dims, "order")
+        return xr.DataArray(
+            orders.speeds(in_hertz(found.values, found.attrs["units"])),
+            {**found.coords, "order": order},
+            dims,
+            "order_speed",
+            attrs,
+        )
+
     def named(self) -> xr.Dataset:
         """The result with words for codes, and with the values that do not vary, defaults included, as coordinates.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -103,4 +104,5 @@ def _svg(source: Path | xr.Dataset, number: int) -> str:
     with mpl.rc_context({"svg.hashsalt": f"figure {number}"}):
         figure.savefig(image, format="svg", metadata={"Date": None})
     text = image.getvalue()
-    return text[text.index("<svg") :]
+    # Names such as `axes_1` are those of every figure, and a page may have each only once.
+    return re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>figure{number}-", text[text.index("<svg") :])

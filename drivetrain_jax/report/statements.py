@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from drivetrain_jax.resonances.orders import FREQUENCIES, in_hertz, operating_range, stored_orders
 from drivetrain_jax.view.style import scene_key, units_of, written_units
 
 # A result of so few points is also shown as a table of all its values.
@@ -27,7 +28,7 @@ def statements(dataset: xr.Dataset, ranges: bool = True) -> list[str]:
     coded = [v for v in _coded(dataset) if v.name != "outcome"]
     said = [sentence for variable in coded for sentence in _about_codes(dataset, variable, ranges)]
     said += [sentence for variable in _numbers(dataset) for sentence in _about_numbers(dataset, variable)]
-    return [*said, *_about_outcome(dataset), *_about_errors(dataset)]
+    return [*said, *_about_orders(dataset), *_about_outcome(dataset), *_about_errors(dataset)]
 
 
 def axes_table(dataset: xr.Dataset) -> list[tuple[str, ...]]:
@@ -164,6 +165,25 @@ def _about_errors(dataset: xr.Dataset) -> Iterator[str]:
             middle, largest = np.nanmedian(variable.values), np.nanmax(variable.values)
             name = _capital(variable.attrs.get("long_name", name))
             yield f"{name}: median {middle:.2g}, at most {largest:.2g}{_unit(variable)}."
+
+
+def _about_orders(dataset: xr.Dataset) -> Iterator[str]:
+    """Speeds at which orders of the excitation meet the modes of a single point, within the operating range if given."""
+    name = next((name for name in FREQUENCIES if name in dataset), None)
+    orders = stored_orders(dataset.attrs)
+    if name is None or orders is None or dataset["outcome"].size != 1:
+        return
+    speeds = orders.speeds(in_hertz(dataset[name].values.reshape(-1), dataset[name].attrs["units"]))
+    operating = operating_range(json.loads(dataset.attrs.get("options", "{}")))
+    if operating:
+        low, high = operating
+        for sentence in orders.within(speeds, low, high):
+            yield f"From {low:g} to {high:g} rpm of the {orders.shaft}: {sentence}."
+        return
+    for order, column in zip(orders.per_turn, speeds.T, strict=True):
+        met = [f"{speed:.6g}" for speed in column[np.isfinite(column)]]
+        more = f" and {len(met) - _MOST} more speeds" if len(met) > _MOST else ""
+        yield f"{_capital(order)} meets modes at {', '.join(met[:_MOST])}{more} rpm of the {orders.shaft}."
 
 
 def _place(dataset: xr.Dataset, variable: xr.DataArray, place: tuple[Any, ...]) -> str:

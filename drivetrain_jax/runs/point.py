@@ -17,6 +17,7 @@ from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, get_
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.order_crossings import OrderCrossings, order_crossings
 from drivetrain_jax.runs.physical import described
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene, system_and_analysis
@@ -41,6 +42,12 @@ class PointResult:
     labels: Mapping[str, Sequence[Any]] = field(repr=False)
     physical: Mapping[str, tuple[Any, str]] = field(default_factory=dict, repr=False)
     remedy: str = field(default="", repr=False)
+    orders: OrderCrossings | None = field(default=None, repr=False)
+
+    @property
+    def crossings(self) -> dict[str, np.ndarray]:
+        """Speeds [rpm] at which orders of the excitation meet the modes, by order; empty if no order is known."""
+        return self.orders.columns if self.orders else {}
 
     @property
     def units(self) -> dict[str, str]:
@@ -77,6 +84,9 @@ class PointResult:
             parameters_given = {n: {"value": _plain(v), "units": units} for n, (v, units) in self.physical.items()}
             head |= {"physical": parameters_given}
         answer = {**head, "parameters": parameters, "outcome": self.outcome.name.lower(), "values": values}
+        if self.orders:
+            speeds = {name: _plain(speed) for name, speed in self.crossings.items()}
+            answer |= {"crossings": {"shaft": self.orders.orders.shaft, "units": "rpm", "values": speeds}}
         return json.dumps(answer, allow_nan=False)
 
     def __repr__(self) -> str:
@@ -101,6 +111,7 @@ class PointResult:
             lines += self._table(dim, [name for name in listed if self.variables[name].dims == (dim,)])
         for name in matrices:
             lines += self._matrix(name)
+        lines += self.orders.lines() if self.orders else []
         return "\n".join(lines)
 
     def _matrix(self, name: str) -> list[str]:
@@ -233,6 +244,7 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
         labels=_labels(job, values, buffer),
         physical=_physical(job),
         remedy=scene.analysis.remedy(scene.request),
+        orders=order_crossings(scene, ordered, values),
     )
 
 

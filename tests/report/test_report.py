@@ -50,8 +50,8 @@ def test_one_page_joins_results_and_needs_nothing_else(files, tmp_path):
     out = tmp_path / "report.html"
     assert main(["report", *map(str, files), "--out", str(out), "--title", "Two & one"]) == 0
     page = Page(out.read_text())
-    # One point of a shaft has no figure, but all its values in a table.
-    assert (page.count["section"], page.count["svg"]) == (2, 1)
+    # One point of a shaft is an interference diagram, and all its values are in a table.
+    assert (page.count["section"], page.count["svg"]) == (2, 2)
     assert "script" not in page.count and not page.outside
     assert len(set(page.ids)) == len(page.ids)
     text = " ".join(page.words)
@@ -60,6 +60,7 @@ def test_one_page_joins_results_and_needs_nothing_else(files, tmp_path):
     assert "Unstable at Omega = 1.41 to 1.415." in text
     first = float(dt.open_result(files[1]).critical_speed[0])
     assert f"Critical speed: {first:.6g}" in text and f"{first:.6g}" in page.words
+    assert f"Order 2 (joints) meets modes at {first / 2:.6g}, " in text
 
 
 def test_a_report_is_the_same_each_time(files):

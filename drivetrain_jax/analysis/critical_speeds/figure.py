@@ -13,14 +13,15 @@ import xarray as xr
 from matplotlib import ticker
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import LogNorm, Normalize, to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.view import cells
+from drivetrain_jax.resonances.orders import stored_orders
+from drivetrain_jax.view import cells, interference
 from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import (
     FRAME_GREY,
@@ -56,8 +57,9 @@ def plot(dataset: xr.Dataset) -> Figure:
     """Curves of the frequencies of all modes along one axis, maps of the first modes over two axes, or the mode shapes.
 
     Along a logarithmic axis (support stiffness) both axes are logarithmic: the critical-speed map. A list of points is
-    drawn along its first parameter. Uncertified frequencies are crossed. Raises :class:`InputError` for more than two axes,
-    and if no variable that can be drawn is stored or has a value.
+    drawn along its first parameter. A single point without shapes is an interference diagram. Uncertified frequencies are
+    crossed. Raises :class:`InputError` for more than two axes, and if no variable that can be drawn is stored or has a
+    value.
     """
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
@@ -65,6 +67,11 @@ def plot(dataset: xr.Dataset) -> Figure:
         if not names and "mode_shape" in dataset:
             return _shapes(dataset)
         shown = next((name for name in _FREQUENCIES if name in dataset), None)
+        orders = stored_orders(dataset.attrs)
+        if shown and not names and orders:
+            cells.require_values(dataset[shown], positive=True)
+            colours = [to_hex(colour) for colour in _colours(dataset.sizes["mode"])]
+            return interference.draw(dataset, orders, colours, {})
         if shown is None or not names:
             stored = ", ".join(str(name) for name in dataset.data_vars)
             needed = "an axis and one of " + ", ".join(_FREQUENCIES) if names else "mode_shape, or an axis"

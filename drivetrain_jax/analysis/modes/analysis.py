@@ -32,6 +32,7 @@ from drivetrain_jax.analysis.modes.mode_types import (
 from drivetrain_jax.analysis.modes.tracking import follow
 from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lane_count, path_entry, with_path
 from drivetrain_jax.analysis.numerics.singular_values import EPS, Bidiagonal, bidiagonal_form, bidiagonal_values
+from drivetrain_jax.resonances.orders import operating_range
 from drivetrain_jax.systems import Block, Model, SpringSystem, System
 
 Build = Callable[[Mapping[str, Any]], SpringSystem]
@@ -264,6 +265,7 @@ def described(model: Model, fixed: Mapping[str, Any]) -> Any:
 
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     """Modes counted from 1, families, bodies and coordinates."""
+    operating_range(request.options)
     followed = sorted(_FOLLOWED & set(request.outputs))
     if followed and not request.options["track"]:
         raise InputError(f"outputs: {followed[0]!r} needs the option track; allowed is the name of an axis")
@@ -324,17 +326,22 @@ def _of_system(system: type[System]) -> dict[str, Any]:
     return {"variables": tuple(replace(v, flags=flags.get(v.name, v.flags)) for v in VARIABLES)}
 
 
+OPTIONS = (
+    Parameter("track", "1", "axis along which modes are tracked", default="", text=True),
+    Parameter("operating_min", "rpm", "lowest operating speed of the carrier", default=0.0, lower=0.0),
+    Parameter("operating_max", "rpm", "highest operating speed of the carrier (0: not given)", default=0.0, lower=0.0),
+)
 ANALYSIS = Analysis(
     name="modes",
     title="natural frequencies and modes",
     variables=VARIABLES,
     default_outputs=("natural_frequency", "mode_type", "dominant_family", "dominant_share"),
-    methods={"auto": ("track",), "full": ("track",)},
+    methods=dict.fromkeys(("auto", "full"), tuple(option.name for option in OPTIONS)),
     method_titles={
         "auto": "by the invariant blocks of a symmetry, if there is one",
         "full": "always the whole matrix",
     },
-    options=(Parameter("track", "1", "axis along which modes are tracked", default="", text=True),),
+    options=OPTIONS,
     solvers=_solvers,
     dimensions=_dimensions,
     derivatives=_derivatives,

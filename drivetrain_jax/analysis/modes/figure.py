@@ -15,7 +15,8 @@ from matplotlib.lines import Line2D
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.modes.planetary_gear import BODY_COLOURS, draw_gear
-from drivetrain_jax.view import cells
+from drivetrain_jax.resonances.orders import Orders, stored_orders
+from drivetrain_jax.view import cells, interference
 from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import FRAME_GREY, STYLE, axis_label, in_brackets, scene_key, variable_label
 
@@ -32,6 +33,7 @@ _NEAR, _SPLIT, _LINE = 0.01, 1e-6, 7.5
 def plot(dataset: xr.Dataset) -> Figure:
     """Frequencies over one axis, coloured by the type of the mode, or the mode shapes of a single point.
 
+    A single point without shapes is an interference diagram, if the numbers of teeth are known.
     Curves follow the stored ``branch``, so colours do not change where frequencies cross or veer; without it every point is
     a dot. Zero frequencies are not visible on the logarithmic scale. Axes of one value count as fixed. Raises
     :class:`InputError` for more than one axis, and if needed variables are not stored or have no value.
@@ -39,6 +41,8 @@ def plot(dataset: xr.Dataset) -> Figure:
     with matplotlib.rc_context(STYLE):
         dataset = cells.prepare(dataset)
         names = cells.sweep_axes(dataset)
+        if names == [] and "mode_shape" not in dataset and (orders := stored_orders(dataset.attrs)):
+            return _interference(dataset, orders)
         if names == []:
             return _shapes(dataset)
         if len(names) == 1 and names != ["point"]:
@@ -109,6 +113,15 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
     if "mode_type" in dataset:
         panels.legend([Line2D([], [], color=colours[kind], label=kind) for kind in shown])
     return panels.figure
+
+
+def _interference(dataset: xr.Dataset, orders: Orders) -> Figure:
+    cells.require(dataset, "natural_frequency")
+    cells.require_values(dataset["natural_frequency"], positive=True)
+    types, colours = _types(dataset, dominant=True).tolist(), type_colours(dataset)
+    kinds = {kind: colour for kind, colour in colours.items() if kind in types and kind != "rigid"}
+    kinds = kinds if "mode_type" in dataset else {}
+    return interference.draw(dataset, orders, [colours[kind] for kind in types], kinds)
 
 
 def _close(frequency: np.ndarray) -> list[int]:

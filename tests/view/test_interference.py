@@ -1,0 +1,108 @@
+"""Orders of an excitation: crossings with natural frequencies in answers, diagrams and reports, by hand formulas."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import drivetrain_jax as dt
+from drivetrain_jax.cli import main
+from drivetrain_jax.report.statements import statements
+from drivetrain_jax.resonances.orders import orders_of
+
+ANGLES = ["0 deg", "72 deg", "144 deg", "219 deg", "288 deg"]
+GEAR = {"planet_angle": ANGLES, "teeth": [20, 26, 72]}
+SHAFT = {"length": [0.3, 1.2, 0.3], "outer_diameter": [0.06, 0.09, 0.06], "inner_diameter": [0, 0.082, 0]}
+SHAFT |= {"material": "steel", "k_A": 5e6, "k_D": 5e6}
+RANGE = {"operating_min": 3000.0, "operating_max": 4500.0}
+
+
+@pytest.fixture(scope="module")
+def gear():
+    return dt.run({"system": "planetary", "analysis": "modes", "fixed": GEAR, "title": "Five planets"})
+
+
+@pytest.fixture(scope="module")
+def shaft():
+    options = {"modes": 3} | RANGE
+    return dt.run({"system": "bicardan", "analysis": "critical_speeds", "fixed": SHAFT, "options": options})
+
+
+def test_five_planets_meet_the_mesh_at_590_593_and_892_rpm():
+    """A carrier at n rpm excites by 72 n/60 Hz, and its planets pass 5 times a turn."""
+    found = dt.point("planetary", "modes", outputs=["natural_frequency"], **GEAR)
+    first = found.crossings["mesh order 1"]
+    assert np.isnan(first[0]) and np.round(first[1:4]).tolist() == [590, 593, 892]
+    frequency = found.natural_frequency[1:]
+    for name, times in (("mesh order 1", 72), ("mesh order 2", 144), ("mesh order 3", 216), ("planet pass", 5)):
+        np.testing.assert_allclose(found.crossings[name][1:] * times / 60, frequency, rtol=1e-14)
+    assert "  2     590.472" in repr(found) and "speed of the carrier at which an order meets the mode" in repr(found)
+    stored = json.loads(found.to_json())["crossings"]
+    assert stored["values"]["mesh order 1"][:2] == [None, pytest.approx(first[1])] and stored["units"] == "rpm"
+
+
+def test_without_teeth_no_order_is_known():
+    found = dt.point("planetary", "modes", outputs=["natural_frequency"])
+    assert found.crossings == {} and "order" not in repr(found) and "crossings" not in found.to_json()
+    assert orders_of("cardan", {}) is None
+
+
+def test_joints_meet_a_critical_speed_at_half_of_it(capsys):
+    words = [f"{name}={json.dumps(value)}" for name, value in (SHAFT | RANGE).items()]
+    assert main(["point", "bicardan", "critical_speeds", "modes=3", *words]) == 0
+    out = capsys.readouterr().out
+    assert "from 3000 to 4500 rpm: order 1 meets mode 1 at 3646.5 rpm" in out
+    # The second critical speed, 8087.84 rpm, is out of the range, but not for the second order.
+    assert "from 3000 to 4500 rpm: order 2 (joints) meets mode 2 at 4043.92 rpm" in out
+
+
+def test_no_crossing_in_the_range_is_an_answer_too():
+    found = dt.point("planetary", "modes", outputs=["natural_frequency"], operating_max=50.0, **GEAR)
+    assert "from 0 to 50 rpm: no order meets a natural frequency" in repr(found)
+    with pytest.raises(dt.InputError, match="operating_max = 0: allowed is a speed of at least operating_min = 10"):
+        dt.point("planetary", "modes", operating_min=10.0, **GEAR)
+
+
+def test_the_diagram_crosses_every_order_with_every_mode(gear):
+    axes = gear.drivetrain.plot().axes[0]
+    assert axes.get_xscale() == axes.get_yscale() == "log"
+    dots = [np.array(line.get_data()) for line in axes.lines if line.get_marker() == "o"]
+    lines = [np.array(line.get_data()) for line in axes.lines if "/turn)" in str(line.get_label())]
+    assert len(dots) == len(lines) == 4 and all(d.shape == (2, 23) for d in dots)
+    for (speeds, frequency), (ends, heights) in zip(dots, lines, strict=True):
+        np.testing.assert_allclose(frequency, gear.natural_frequency[1:], rtol=1e-14)
+        np.testing.assert_allclose((heights / ends)[0], frequency / speeds, rtol=1e-12)
+    assert "590–593" in [text.get_text() for text in axes.texts]
+
+
+def test_with_an_operating_range_the_diagram_shows_its_surroundings(shaft):
+    figure = shaft.drivetrain.plot()
+    axes = figure.axes[0]
+    assert axes.get_xlim() == (0, 1.4 * 4500) and axes.get_xscale() == "linear"
+    assert "4044" in [text.get_text() for text in axes.texts]
+    assert "operating speeds" in [text.get_text() for text in figure.legends[0].get_texts()]
+    # Order 2 reaches 210 Hz; the third mode, at 217 Hz, is not shown.
+    assert axes.get_ylim()[1] < 217
+
+
+def test_mode_shapes_are_drawn_if_they_are_stored():
+    scene = {"system": "planetary", "analysis": "modes", "fixed": GEAR, "outputs": ["natural_frequency", "mode_shape"]}
+    assert len(dt.run(scene).drivetrain.plot().axes) > 4
+
+
+def test_a_report_names_the_crossings(gear, shaft):
+    (sentence,) = [s for s in statements(gear) if s.startswith("Mesh order 1 ")]
+    assert sentence.startswith("Mesh order 1 meets modes at 590.472, 592.899, 892.225, ") and "carrier" in sentence
+    assert "From 3000 to 4500 rpm of the shaft: order 2 (joints) meets mode 2 at 4043.92 rpm." in statements(shaft)
+
+
+def test_crossings_along_an_axis():
+    scene = {"system": "planetary", "analysis": "modes", "outputs": ["natural_frequency"], "axes": {"k_p": [1e8, 2e8]}}
+    found = dt.run(scene | {"fixed": {"teeth": [20, 26, 72]}})
+    speeds = found.drivetrain.orders()
+    assert speeds.dims == ("k_p", "mode", "order") and speeds.attrs["units"] == "rpm"
+    np.testing.assert_allclose(speeds.sel(order="planet pass", k_p=2e8)[1:] * 4 / 60, found.natural_frequency[1, 1:])
+    with pytest.raises(dt.InputError, match="orders: not known"):
+        dt.run(scene).drivetrain.orders()
