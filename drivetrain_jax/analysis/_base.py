@@ -121,7 +121,8 @@ class Analysis:
     returns a function of the parameters instead of values on a grid. ``of_system(system)`` returns the fields that depend
     on the system, by name, for example its ``variables``. ``uses`` names another analysis whose models this analysis
     works with, so that systems need no model for it. ``patience`` names the option that limits an iteration: a larger
-    value may help a point that has not converged.
+    value may help a point that has not converged. ``undecided`` says what may decide an undecided verdict, with options in
+    braces.
     """
 
     name: str
@@ -141,6 +142,11 @@ class Analysis:
     of_system: Callable[[type[System]], Mapping[str, Any]] = lambda _: {}
     uses: str = ""
     patience: str = ""
+    undecided: str = ""
+
+    def advice(self, request: Request) -> str:
+        """What may decide an undecided verdict, as text; empty if nothing is known."""
+        return self.undecided.format(**request.options)
 
     def remedy(self, request: Request) -> str:
         """The option that may help a point that has not converged, as text; empty without one."""

@@ -7,28 +7,22 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
-import jax
 import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, get_analysis
-from drivetrain_jax.analysis.numerics.kernels import options_for_few
-from drivetrain_jax.analysis.numerics.lanes import Constants
-from drivetrain_jax.analysis.request import make_request
+from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
 from drivetrain_jax.atlas import design
 from drivetrain_jax.atlas.criteria import has_boundaries
 from drivetrain_jax.atlas.windows import Crossing, Interval, narrow
 from drivetrain_jax.runs.atlas_file import StoredAtlas
 from drivetrain_jax.runs.atlas_question import AtlasQuery, Range, number, roles_of
 from drivetrain_jax.runs.growth_text import growth_at, growth_lines
-from drivetrain_jax.runs.identity import program_identity
-from drivetrain_jax.runs.programs import lowered
-from drivetrain_jax.systems import System
+from drivetrain_jax.runs.sensitivities import gradient_lines, limit_line, radius_gradient, radius_sensitivities
 
 # Distance of a spectral radius from 1 below which the distance itself is printed.
 _CLOSE = 1e-3
@@ -74,11 +68,14 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
         f"  {name:<24} {', '.join(map(variables[name].written, np.atleast_1d(value)))}"
         for name, value in results.items()
     ]
+    if int(results.get("verdict", 0)) == VERDICTS.index("undecided"):
+        rows.append(f"  {'':<24} {get_analysis('floquet').advice(atlas.request)}")
     slopes = radius_gradient(atlas.scene.system, {**atlas.fixed, **point})
+    effects = None if slopes is None else radius_sensitivities(asked, slopes)
     panels, system = atlas.stability.atlas, atlas.scene.system
     nearest = design.nearest_boundaries(panels, system, point) if has_boundaries(panels, system) else ()
     grows = growth_at(asked, results)
-    lines = [f"{system.name} atlas, {asked.heading()}", *rows, *growth_lines(grows), *_gradient_lines(atlas, slopes)]
+    lines = [f"{system.name} atlas, {asked.heading()}", *rows, *growth_lines(grows, sign=""), *gradient_lines(effects)]
     lines += ["nearest change of stability"] if nearest or not panels.panels else []
     lines += [] if panels.panels else [f"  unknown: the atlas has no panel ({panels.gaps[0].reason})"]
     lines += [line for each in nearest for line in _nearest_lines(asked, each)]
@@ -90,6 +87,7 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
         "meanings": {n: variables[n].flags[int(v)] for n, v in results.items() if variables[n].flags},
         **({"growth": grows} if grows else {}),
         "gradient": slopes,
+        "sensitivities": [each._asdict() for each in effects or ()],
         "nearest": {
             each.parameter: {
                 "below": _crossing(asked, each.parameter, each.below),
@@ -139,7 +137,7 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
     panels = atlas.stability.atlas
     part = narrow(panels, {speed: asked.values[speed]}) if speed in asked.values else panels
     found = design.speed_windows(part, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.radius)
-    lines = [f"safe speeds, {asked.heading()}, margin {margin:g}"]
+    lines, sensitivities = [f"safe speeds, {asked.heading()}, margin {margin:g}"], []
     for w in found.windows:
         ends = " to ".join(
             asked.named(speed, value) + BEYOND[_kind(asked, speed, *end)]
@@ -147,6 +145,9 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
         )
         lines.append(f"  {ends}; largest spectral radius {_from_one(w.largest)} at {speed} = {number(w.where)}")
         lines.append(f"    {_checked(w.check)}")  # pyright: ignore[reportArgumentType]
+        effects = [limit_line(asked, speed, limit, f"    at {place}: ") for place, limit in _places(w.interval)]
+        lines += [text for text, _ in effects if text]
+        sensitivities.append([found for _, found in effects])
     data = {
         "question": "speed_windows",
         "parameters": {**atlas.fixed, **asked.values},
@@ -156,17 +157,32 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
                 "safe": list(w.safe),
                 "physical": asked.physical({speed: w.safe}),
                 "ends": _ends(asked, speed, w.interval),
+                "sensitivities": effects,
                 "largest": w.largest,
                 "where": w.where,
                 "check": _check(w.check),
             }
-            for w in found.windows
+            for w, effects in zip(found.windows, sensitivities, strict=True)
         ],
         "undecided": [list(r) for r in found.undecided],
     }
     lines += [] if found.windows else ["  none within the atlas"]
-    lines += [f"  undecided from {number(a)} to {number(b)}" for a, b in found.undecided]
+    lines += _undecided(found.undecided)
     return Reply("\n".join(lines), data)
+
+
+def _undecided(ranges: Iterable[Range]) -> list[str]:
+    """Undecided ranges as text, with what to do."""
+    found = [f"  undecided from {number(a)} to {number(b)}" for a, b in ranges]
+    remedy = (
+        "  undecided ranges: `drivetrain point` solves a value there directly; a smaller rtol of the atlas narrows them"
+    )
+    return [*found, remedy] if found else []
+
+
+def _places(interval: Interval) -> tuple[tuple[str, Crossing | None], ...]:
+    """The crossings at both ends of a stable interval, by name."""
+    return ("the lower end", interval.lower_end), ("the upper end", interval.upper_end)
 
 
 def _kind(asked: AtlasQuery, name: str, end: float, crossing: Crossing | None) -> str:
@@ -214,10 +230,12 @@ def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: des
     if answer.limit:
         where = ", ".join(asked.named(n, v) for n, v in answer.limit.point.items())
         lines.append(f"  limit: multiplier {answer.limit.multiplier} at {where}")
+    effect, sensitivities = limit_line(asked, name, answer.limit, "  ")
+    lines += [effect] if effect else []
     if answer.check:
         lines += [] if answer.certain else ["  not certain: undecided ranges are wider than the errors"]
         lines.append(f"  {_checked(answer.check)}")
-    lines += [f"  undecided from {number(a)} to {number(b)}" for a, b in answer.undecided]
+    lines += _undecided(answer.undecided)
     data = {
         "question": title.replace(" ", "_"),
         "parameters": {**asked.atlas.fixed, **asked.values},
@@ -227,6 +245,7 @@ def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: des
         "error": answer.error,
         "certain": answer.certain,
         "limit": _crossing(asked, name, answer.limit),
+        "sensitivities": sensitivities,
         "intervals": [
             {"physical": asked.physical({name: (i.lower, i.upper)}), "ends": _ends(asked, name, i)}
             for i in answer.stable
@@ -246,46 +265,6 @@ def _elsewhere(safe: str, asked: AtlasQuery, answer: design.Answer) -> list[str]
         lower, upper = (_bounded(asked, name, *each) for each in interval.ends)
         lines.append(f"  stable from {lower} to {upper}")
     return lines
-
-
-def radius_gradient(system: type[System], values: Mapping[str, float]) -> dict[str, float] | None:
-    """Derivatives of the spectral radius by all parameters of ``system`` at ``values``; None without a gradient."""
-    names = system.models["floquet"].parameters
-    found = np.asarray(_compiled_gradient(system, names)({name: np.float64(values[name]) for name in names}))
-    # JAX orders the leaves of a dictionary by key.
-    slopes = dict(zip(sorted(names), map(float, found), strict=True))
-    return {name: slopes[name] for name in names} if np.isfinite(found).all() else None
-
-
-@lru_cache(maxsize=8)
-def _compiled_gradient(system: type[System], names: tuple[str, ...]) -> Callable[[dict[str, float]], jax.Array]:
-    """The derivative rule of :func:`~drivetrain_jax.floquet` alone: tracing the value as well takes twice the time."""
-    analysis = get_analysis("floquet").for_system(system)
-    request = make_request(system, analysis, ["spectral_radius"], {})
-
-    def slopes(parameters: dict[str, jax.Array]) -> jax.Array:
-        assert analysis.derivatives is not None
-        constants = Constants(dict.fromkeys(names))
-        return analysis.derivatives(system, request, parameters, constants, {})["spectral_radius"]
-
-    kinds = ({name: np.float64(0.0) for name in names},)
-    return lowered(slopes, kinds, program_identity(system, analysis, "gradient")).compile(options_for_few())
-
-
-def _gradient_lines(atlas: StoredAtlas, slopes: Mapping[str, float] | None) -> list[str]:
-    if slopes is None:
-        return [
-            "gradient of spectral_radius",
-            "  none: two multipliers have the largest modulus, within the errors, or it cannot be computed",
-        ]
-    units = {name: atlas.scene.system.parameter(name).units for name in slopes}
-    return [
-        "gradient of spectral_radius",
-        *(
-            f"  {name:<24} {value:.6g}{'' if units[name] == '1' else f' per {units[name]}'}"
-            for name, value in slopes.items()
-        ),
-    ]
 
 
 def _nearest_lines(asked: AtlasQuery, nearest: design.Nearest) -> list[str]:

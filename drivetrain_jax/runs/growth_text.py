@@ -1,34 +1,66 @@
-"""Growth or decay of small disturbances in an answer: per second and per turn, where physical data give the speed."""
+"""Growth or decay of small disturbances in an answer: per turn, and per second where the speed in rpm is known."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drivetrain_jax import _units
 from drivetrain_jax.analysis.floquet.growth import growth
-from drivetrain_jax.runs.atlas_question import AtlasQuery
+from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
+from drivetrain_jax.systems import System
+
+if TYPE_CHECKING:
+    from drivetrain_jax.runs.atlas_question import AtlasQuery
 
 
 def growth_at(asked: AtlasQuery, results: Mapping[str, Any]) -> dict[str, float]:
-    """The growth that ``spectral_radius`` means at the point of the question; empty without a speed in rpm."""
+    """The growth that ``spectral_radius`` means at the point of the question; empty if it is not known."""
     system = asked.atlas.scene.system
-    speed = system.roles.get("speed", "")
-    known = asked.physical({speed: {**asked.atlas.fixed, **asked.values}[speed]}) if system.periods_per_turn else {}
+    point = {**asked.atlas.fixed, **asked.values}
+    known = asked.physical({name: value for name, value in point.items() if name == system.roles.get("speed")})
     turns = next((found["value"] for found in known.values() if found["units"] == "rpm"), None)
-    if turns is None or "spectral_radius" not in results:
+    return growth_of(system, point, results, turns)
+
+
+def growth_of(
+    system: type[System], point: Mapping[str, Any], results: Mapping[str, Any], turns: float | None
+) -> dict[str, float]:
+    """The growth at a ``point`` (parameters); ``turns`` is the speed [rpm], if known, of a shaft whose time has no unit."""
+    radius = results.get("spectral_radius")
+    frequency = point.get(system.roles.get("speed", "")) if system.time_units == "s" else None
+    # An undecided radius is 1 within its error, and so is its growth 0.
+    undecided = int(results.get("verdict", 0)) == VERDICTS.index("undecided")
+    if radius is None or undecided or not (frequency or system.periods_per_turn):
         return {}
-    turn = 60 / turns
-    found = growth(results["spectral_radius"], turn / system.periods_per_turn, turn)
-    return {name: float(value) for name, value in found._asdict().items() if np.isfinite(value)}
+    # A period takes 1/frequency seconds; otherwise the unit of time is the turn.
+    turn = 60 / turns if turns else 1.0
+    found = growth(radius, 1 / frequency if frequency else turn / system.periods_per_turn, turn)._asdict()
+    names = ("rate", "time") if frequency else ("rate", "per", "time", "turns") if turns else ("per", "turns")
+    return {n: float(x) for n, x in found.items() if np.isfinite(x) and n.startswith(names)}
 
 
-def growth_lines(found: Mapping[str, float]) -> list[str]:
-    """The growth as text."""
+def speed_in_rpm(system: type[System], physical: Mapping[str, tuple[Any, str]]) -> float | None:
+    """The speed [rpm] among physical data with their units; None without one."""
+    needs = system.physical.source(system.roles.get("speed", "")) if system.physical else ""
+    value, units = physical.get(needs.partition(",")[0], (None, ""))
+    return None if value is None else value * _units.factor(units, "rpm")
+
+
+def growth_lines(found: Mapping[str, float], width: int = 24, sign: str = "= ") -> list[str]:
+    """The growth as text, after a word of this ``width`` and a ``sign``."""
     if not found:
         return []
-    word = "growth" if found["rate"] > 0 else "decay"
-    way = "double" if "time_to_double" in found else "halve" if "time_to_halve" in found else ""
-    ends = f"; {way}s in {found[f'time_to_{way}']:.4g} s, {found[f'turns_to_{way}']:.4g} turns" if way else ""
-    return [f"  {word:<24} {abs(found['rate']):.4g} 1/s, by a factor {found['per_turn']:.6g} per turn{ends}"]
+    grows = found["rate"] > 0 if "rate" in found else found["per_turn"] > 1
+    way = "double" if grows else "halve"
+    rate = f"{abs(found['rate']):.4g} 1/s" if "rate" in found else ""
+    per_turn = f"by a factor {found['per_turn']:.6g} per turn" if "per_turn" in found else ""
+    seconds = f"{found[f'time_to_{way}']:.4g} s" if f"time_to_{way}" in found else ""
+    turns = f"{found[f'turns_to_{way}']:.4g} turns" if f"turns_to_{way}" in found else ""
+    ends = ", ".join(text for text in (seconds, turns) if text)
+    word = "growth" if grows else "decay"
+    return [
+        f"  {word:<{width}} {sign}{', '.join(filter(None, (rate, per_turn)))}{f'; {way}s in {ends}' if ends else ''}"
+    ]

@@ -16,6 +16,7 @@ from drivetrain_jax._wording import aligned, nearest, shown, written
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, get_analysis
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
+from drivetrain_jax.runs.growth_text import growth_lines, growth_of, speed_in_rpm
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.order_crossings import OrderCrossings, order_crossings
 from drivetrain_jax.runs.physical import described
@@ -28,7 +29,8 @@ class PointResult:
     """Results of one point, by attribute or by name: ``result.spectral_radius`` or ``result["spectral_radius"]``.
 
     ``outcome`` is the outcome of the point (results are NaN unless ``outcome.has_value``), ``units`` the units by name,
-    ``labels`` the entries of each dimension of the results, ``physical`` the given physical data and their units.
+    ``labels`` the entries of each dimension of the results, ``physical`` the given physical data and their units,
+    ``growth`` what a spectral radius means: rate [1/s], factor per turn, time and turns to double or to halve.
     """
 
     system: str
@@ -42,7 +44,9 @@ class PointResult:
     labels: Mapping[str, Sequence[Any]] = field(repr=False)
     physical: Mapping[str, tuple[Any, str]] = field(default_factory=dict, repr=False)
     remedy: str = field(default="", repr=False)
+    advice: str = field(default="", repr=False)
     orders: OrderCrossings | None = field(default=None, repr=False)
+    growth: Mapping[str, float] = field(default_factory=dict, repr=False)
 
     @property
     def crossings(self) -> dict[str, np.ndarray]:
@@ -84,6 +88,8 @@ class PointResult:
             parameters_given = {n: {"value": _plain(v), "units": units} for n, (v, units) in self.physical.items()}
             head |= {"physical": parameters_given}
         answer = {**head, "parameters": parameters, "outcome": self.outcome.name.lower(), "values": values}
+        if self.growth:
+            answer |= {"growth": dict(self.growth)}
         if self.orders:
             speeds = {name: _plain(speed) for name, speed in self.crossings.items()}
             answer |= {"crossings": {"shaft": self.orders.orders.shaft, "units": "rpm", "values": speeds}}
@@ -104,7 +110,9 @@ class PointResult:
             lines.append(f"  from {', '.join(data)}")
         for name in plain:
             text = _text(self.variables[name], self.values[name])
-            lines.append(f"  {name:{width}} = {_with_units(text, self.variables[name].units)}")
+            hint = f" ({self.advice})" if self.advice and text.startswith("undecided ") else ""
+            lines.append(f"  {name:{width}} = {_with_units(text, self.variables[name].units)}{hint}")
+        lines += growth_lines(self.growth, width)
         hint = f" ({self.remedy})" if self.remedy and self.outcome == Outcome.NOT_CONVERGED else ""
         lines.append(f"  {'outcome':{width}} = {self.outcome.name.lower()}{hint}")
         for (dim,) in dict.fromkeys(self.variables[name].dims for name in listed):
@@ -232,6 +240,7 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
     outcome = Outcome(int(values.pop(OUTCOME.name)))
     parameters = {p.parameter.name: p.values[0].item() for a in scene.axes for p in a.together} | dict(scene.fixed)
     ordered = {p.name: parameters[p.name] for p in scene.system.parameters if p.name in parameters}
+    physical = _physical(job)
     return PointResult(
         system=scene.system.name,
         analysis=scene.analysis.name,
@@ -242,8 +251,10 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
         variables={v.name: v for v in buffer.variables},
         parameter_units={p.name: p.units for p in scene.system.parameters},
         labels=_labels(job, values, buffer),
-        physical=_physical(job),
+        physical=physical,
         remedy=scene.analysis.remedy(scene.request),
+        advice=scene.analysis.advice(scene.request),
+        growth=growth_of(scene.system, ordered, values, speed_in_rpm(scene.system, physical)),
         orders=order_crossings(scene, ordered, values),
     )
 

@@ -108,5 +108,7 @@ ANALYSIS = Analysis(
     solvers=_solvers,
     dimensions=lambda *_: (Dimension("multiplier", "number of the multiplier, by falling modulus", ()),),
     lacks=_lacks,
+    undecided="the spectral radius is 1 within its error: a smaller rtol than {rtol:g} may decide; without damping only "
+    "damping does",
     derivatives=_derivatives,
 )

@@ -278,4 +278,5 @@ ANALYSIS = Analysis(
     options=OPTIONS,
     solvers=_solvers,
     dimensions=_dimensions,
+    undecided="a longer max_time than {max_time:g} s may decide",
 )
