@@ -181,6 +181,7 @@ def _add_point(subparsers: Any) -> None:
     command.add_argument("analysis", metavar="ANALYSIS", help="name from `drivetrain list SYSTEM`")
     _add_given(command, "parameters in the units of `drivetrain list SYSTEM`, options, and outputs=NAME,NAME")
     _add_data(command)
+    _add_amplitude(command)
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
 
@@ -188,6 +189,7 @@ def _add_query(subparsers: Any) -> None:
     command = _command(subparsers, "query", commands.query, "evaluate a stored atlas at one point")
     command.add_argument("file", metavar="FILE.nc", type=_path, help='result of a scene with analysis = "atlas"')
     _add_given(command, "parameters, or physical data")
+    _add_amplitude(command)
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
 
@@ -197,6 +199,7 @@ def _add_design(subparsers: Any) -> None:
     command.add_argument("question", choices=questions, metavar="QUESTION", help=", ".join(questions))
     command.add_argument("file", metavar="FILE.nc", type=_path, help='result of a scene with analysis = "atlas"')
     _add_given(command, "parameters; a range is name=LOW:HIGH")
+    _add_amplitude(command)
     command.add_argument(
         "--margin", type=float, metavar="PART", help="speed-windows: relative distance in speed from every boundary"
     )
@@ -243,6 +246,11 @@ def _command(subparsers: Any, name: str, function: Any, text: str) -> argparse.A
     command = subparsers.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
     command.set_defaults(command=function, parser=command)
     return command
+
+
+def _add_amplitude(command: argparse.ArgumentParser) -> None:
+    text = 'limit of the forced amplitude, such as "2 deg": the answer compares the forced motion with it'
+    command.add_argument("--amplitude", metavar="LIMIT", help=text)
 
 
 def _add_given(command: argparse.ArgumentParser, text: str) -> None:

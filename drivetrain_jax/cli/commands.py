@@ -213,7 +213,8 @@ def point(options: argparse.Namespace) -> int:
     outputs = given.pop("outputs", None)
     if isinstance(outputs, str):
         outputs = outputs.split(",")
-    return _answer(point(options.system, options.analysis, outputs=outputs, **given), options)
+    found = point(options.system, options.analysis, outputs=outputs, amplitude=options.amplitude, **given)
+    return _answer(found, options)
 
 
 def query(options: argparse.Namespace) -> int:
@@ -222,7 +223,7 @@ def query(options: argparse.Namespace) -> int:
     from drivetrain_jax.runs.atlas_file import open_atlas
 
     given = ranges(options.given, "query")
-    return _answer(query(open_atlas(options.file), given), options)
+    return _answer(query(open_atlas(options.file), given, options.amplitude), options)
 
 
 def design(options: argparse.Namespace) -> int:
@@ -235,7 +236,7 @@ def design(options: argparse.Namespace) -> int:
         raise InputError(f"--margin = {options.margin}: not used by {options.question}; allowed for speed-windows")
     given = ranges(options.given, "design")
     question = getattr(atlas_answers, options.question.replace("-", "_"))
-    return _answer(question(open_atlas(options.file), given, **extra), options)
+    return _answer(question(open_atlas(options.file), given, amplitude=options.amplitude, **extra), options)
 
 
 def bench(options: argparse.Namespace) -> int:

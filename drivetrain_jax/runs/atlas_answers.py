@@ -9,6 +9,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from drivetrain_jax.atlas.criteria import has_boundaries
 from drivetrain_jax.atlas.windows import Crossing, Interval, narrow
 from drivetrain_jax.runs.atlas_file import StoredAtlas
 from drivetrain_jax.runs.atlas_question import AtlasQuery, Range, number, roles_of
+from drivetrain_jax.runs.forced_limit import Limit, forced_along
 from drivetrain_jax.runs.growth_text import growth_at, growth_lines
 from drivetrain_jax.runs.sensitivities import gradient_lines, limit_line, radius_gradient, radius_sensitivities
 
@@ -53,12 +55,13 @@ class Reply:
         return json.dumps(_plain(self.data), allow_nan=False)
 
 
-def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
+def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None) -> Reply:
     """Results at one point, the gradient of the spectral radius, and the nearest change of stability along every parameter.
 
     The gradient comes from direct solves, with respect to every parameter of the system. Raises :class:`InputError` for
     names and values outside the atlas, :class:`ChunkError` if a direct solve fails.
     """
+    limit = None if amplitude is None else Limit.of(atlas.scene.system, amplitude)
     asked = AtlasQuery.of(atlas, given, ranges=())
     point = asked.values
     found = atlas(**point)
@@ -79,8 +82,14 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
     lines += ["nearest change of stability"] if nearest or not panels.panels else []
     lines += [] if panels.panels else [f"  unknown: the atlas has no panel ({panels.gaps[0].reason})"]
     lines += [line for each in nearest for line in _nearest_lines(asked, each)]
+    forced = {}
+    if limit:
+        found = atlas.amplitude({name: np.array([value]) for name, value in point.items()})[0]
+        text, forced["forced"] = limit.at_point(found, float(results["spectral_radius"]))
+        lines.append(f"forced amplitude: {text}")
     data = {
         "system": atlas.scene.system.name,
+        **forced,
         "parameters": {**atlas.fixed, **point},
         "physical": asked.physical(point),
         "values": results,
@@ -100,7 +109,7 @@ def query(atlas: StoredAtlas, given: Mapping[str, float]) -> Reply:
     return Reply("\n".join(lines), data)
 
 
-def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Reply:
+def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range], amplitude: Any = None) -> Reply:
     """The least damping above which a range of speeds is stable.
 
     If the largest damping of the atlas is unstable, the answer lists the stable ranges of damping. For a cardan shaft in
@@ -111,10 +120,10 @@ def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Rep
     answer = design.least_damping(
         atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.radius
     )
-    return _answered("least damping", "from {} on", "largest", asked, answer)
+    return _answered("least damping", "from {} on", "largest", asked, answer, amplitude)
 
 
-def widest_angle(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Reply:
+def widest_angle(atlas: StoredAtlas, given: Mapping[str, float | Range], amplitude: Any = None) -> Reply:
     """The widest joint angle below which a range of speeds is stable.
 
     If the smallest angle of the atlas is unstable, the answer lists the stable ranges of angle. Raises as :func:`query`.
@@ -124,10 +133,10 @@ def widest_angle(atlas: StoredAtlas, given: Mapping[str, float | Range]) -> Repl
     answer = design.widest_angle(
         atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.radius
     )
-    return _answered("widest angle", "up to {}", "smallest", asked, answer)
+    return _answered("widest angle", "up to {}", "smallest", asked, answer, amplitude)
 
 
-def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float = 0.0) -> Reply:
+def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float = 0.0, amplitude: Any = None) -> Reply:
     """The stable ranges of speed, shortened by ``margin`` times the speed at either end, within a range of speeds if one is
     given. Raises as :func:`query`."""
     if not 0 <= margin < 1:
@@ -137,8 +146,10 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
     panels = atlas.stability.atlas
     part = narrow(panels, {speed: asked.values[speed]}) if speed in asked.values else panels
     found = design.speed_windows(part, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.radius)
+    limit = None if amplitude is None else Limit.of(atlas.scene.system, amplitude)
+    forced = [forced_along(atlas, limit, w.safe, asked.numbers()) for w in found.windows] if limit else []
     lines, sensitivities = [f"safe speeds, {asked.heading()}, margin {margin:g}"], []
-    for w in found.windows:
+    for k, w in enumerate(found.windows):
         ends = " to ".join(
             asked.named(speed, value) + BEYOND[_kind(asked, speed, *end)]
             for value, end in zip(w.safe, w.interval.ends, strict=True)
@@ -147,7 +158,8 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
         lines.append(f"    {_checked(w.check)}")  # pyright: ignore[reportArgumentType]
         effects = [limit_line(asked, speed, limit, f"    at {place}: ") for place, limit in _places(w.interval)]
         lines += [text for text, _ in effects if text]
-        sensitivities.append([found for _, found in effects])
+        sensitivities.append([effect for _, effect in effects])
+        lines += [f"    {forced[k].text(partial(asked.named, speed))}"] if limit else []
     data = {
         "question": "speed_windows",
         "parameters": {**atlas.fixed, **asked.values},
@@ -165,6 +177,7 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
             for w, effects in zip(found.windows, sensitivities, strict=True)
         ],
         "undecided": [list(r) for r in found.undecided],
+        **({"forced": [each.data for each in forced]} if limit else {}),
     }
     lines += [] if found.windows else ["  none within the atlas"]
     lines += _undecided(found.undecided)
@@ -216,7 +229,7 @@ def _bounded(asked: AtlasQuery, name: str, value: float, crossing: Crossing | No
     return asked.named(name, value) + bound
 
 
-def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: design.Answer) -> Reply:
+def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: design.Answer, amplitude: Any) -> Reply:
     """The answer as text; ``phrase`` names the value, ``safe`` the stable end of the atlas."""
     name = answer.parameter
     lines = [f"{title}, {asked.heading()}"]
@@ -236,6 +249,13 @@ def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: des
         lines += [] if answer.certain else ["  not certain: undecided ranges are wider than the errors"]
         lines.append(f"  {_checked(answer.check)}")
     lines += _undecided(answer.undecided)
+    forced = {}
+    if amplitude is not None and answer.value is not None:
+        (speed,) = roles_of(asked.atlas, "speed")
+        limit, at = Limit.of(asked.atlas.scene.system, amplitude), {**asked.numbers(), name: answer.value}
+        found = forced_along(asked.atlas, limit, asked.values[speed], at)
+        lines.append(f"  {found.text(partial(asked.named, speed))}")
+        forced = {"forced": found.data}
     data = {
         "question": title.replace(" ", "_"),
         "parameters": {**asked.atlas.fixed, **asked.values},
@@ -252,6 +272,7 @@ def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: des
         ],
         "undecided": [list(r) for r in answer.undecided],
         "check": _check(answer.check),
+        **forced,
     }
     return Reply("\n".join(lines), data)
 

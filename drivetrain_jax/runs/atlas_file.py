@@ -14,6 +14,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import counted, did_you_mean, shown
 from drivetrain_jax.analysis import Request, get_analysis
 from drivetrain_jax.analysis.atlas.analysis import ANALYSIS
+from drivetrain_jax.analysis.request import make_request
 from drivetrain_jax.atlas import Atlas, StabilityAtlas, from_arrays, stability_atlas, to_arrays
 from drivetrain_jax.atlas.floquet import floquet_domain
 from drivetrain_jax.runs import compile_cache
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
     from drivetrain_jax.explore import Page
 
 # Variables of the file: name, dimensions, meaning. Boxes are in the coordinates named by the attribute.
+# Relative error of forced amplitudes, which are compared with a limit.
+_AMPLITUDE = 1e-6
 _VARIABLES = {
     "lower": (("parameter",), "lower end of the domain, in the parameter's unit"),
     "upper": (("parameter",), "upper end of the domain, in the parameter's unit"),
@@ -285,12 +288,22 @@ class StoredAtlas:
 
         Raises :class:`ChunkError` if a solve fails.
         """
+        return self._solved(columns, "floquet", Request(("spectral_radius",), "direct", self.scene.request.options))
+
+    def amplitude(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Amplitudes ``(N, displacements)`` of the forced motion by direct solves; ``columns`` holds all parameters."""
+        forced = get_analysis("forced").for_system(self.scene.system)
+        return self._solved(
+            columns, "forced", make_request(self.scene.system, forced, ["amplitude"], {"rtol": _AMPLITUDE})
+        )
+
+    def _solved(self, columns: Mapping[str, np.ndarray], analysis: str, request: Request) -> np.ndarray:
         axes = {name: column for name, column in columns.items() if name in self.parameters}
-        request = Request(("spectral_radius",), "direct", self.scene.request.options)
-        job = Job(self._scene(axes, dict(self.fixed), request, zipped=True), DIRECT)
+        scene = self._scene(axes, dict(self.fixed), request, zipped=True)
+        job = Job(replace(scene, analysis=get_analysis(analysis).for_system(scene.system)), DIRECT)
         buffer = ResultBuffer(job.scene, job.grid)
         Work(Threads()).do(job, buffer, Progress(job.total))
-        return buffer.lay_out()["spectral_radius"]
+        return buffer.lay_out()[request.outputs[0]]
 
     def in_parameters(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """``values`` with parameters of the atlas for physical data, and numbers for texts; fixed ones must agree."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Iterator, KeysView, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from drivetrain_jax._wording import aligned, nearest, shown, written
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, get_analysis
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
+from drivetrain_jax.runs.forced_limit import Limit
 from drivetrain_jax.runs.growth_text import growth_lines, growth_of, speed_in_rpm
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.order_crossings import OrderCrossings, order_crossings
@@ -47,6 +48,7 @@ class PointResult:
     advice: str = field(default="", repr=False)
     orders: OrderCrossings | None = field(default=None, repr=False)
     growth: Mapping[str, float] = field(default_factory=dict, repr=False)
+    forced: tuple[str, Mapping[str, Any]] | None = field(default=None, repr=False)
 
     @property
     def crossings(self) -> dict[str, np.ndarray]:
@@ -90,6 +92,8 @@ class PointResult:
         answer = {**head, "parameters": parameters, "outcome": self.outcome.name.lower(), "values": values}
         if self.growth:
             answer |= {"growth": dict(self.growth)}
+        if self.forced:
+            answer |= {"forced": self.forced[1]}
         if self.orders:
             speeds = {name: _plain(speed) for name, speed in self.crossings.items()}
             answer |= {"crossings": {"shaft": self.orders.orders.shaft, "units": "rpm", "values": speeds}}
@@ -120,6 +124,7 @@ class PointResult:
         for name in matrices:
             lines += self._matrix(name)
         lines += self.orders.lines() if self.orders else []
+        lines += [f"  forced amplitude: {self.forced[0]}"] if self.forced else []
         return "\n".join(lines)
 
     def _matrix(self, name: str) -> list[str]:
@@ -169,12 +174,15 @@ def _text(variable: Variable, value: Any) -> str:
     return variable.written(value)
 
 
-def point(system: str, analysis: str, *, outputs: Sequence[str] | None = None, **given: Any) -> PointResult:
+def point(
+    system: str, analysis: str, *, outputs: Sequence[str] | None = None, amplitude: Any = None, **given: Any
+) -> PointResult:
     """The results of one point.
 
     Args:
         system, analysis: names, see ``drivetrain list``.
         outputs: results to compute; default: those of the analysis.
+        amplitude: limit of the forced amplitude (``"2 deg"``), with which the answer compares the forced motion.
         given: parameters of the system (or its physical data), and options of the analysis (``method``, ``rtol``, ...).
 
     Raises: :class:`InputError` with one line that names the field, the value and what is allowed; :class:`ChunkError` if
@@ -194,7 +202,19 @@ def point(system: str, analysis: str, *, outputs: Sequence[str] | None = None, *
     except InputError as error:
         # Messages name the fields without the tables of a scene.
         raise InputError(re.sub(r"^(points|fixed|options)\.", "", str(error))) from None
-    return _result(job, _compute(job))
+    found = _result(job, _compute(job))
+    return found if amplitude is None else replace(found, forced=_forced(found, given, amplitude))
+
+
+def _forced(found: PointResult, given: Mapping[str, Any], amplitude: Any) -> tuple[str, dict[str, Any]]:
+    """The comparison of the forced motion at the same point with a limit, as text and data."""
+    system = system_and_analysis(found.system, found.analysis)[0]
+    limit, parameters = Limit.of(system, amplitude), {n: x for n, x in given.items() if n in described(system)}
+    known = dict(found.values)
+    for analysis, name in (("forced", "amplitude"), ("floquet", "spectral_radius")):
+        if name not in known:
+            known[name] = point(found.system, analysis, outputs=[name], **parameters)[name]
+    return limit.at_point(known["amplitude"], float(known["spectral_radius"]))
 
 
 def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dict[str, Any]:

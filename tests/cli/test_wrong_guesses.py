@@ -149,6 +149,10 @@ GUESSES = [
     (SHAFT.replace("EI=[1e4,1e4]", "outer_diameter=[60mm,60mm] material=iron"), "one of steel, aluminium, titanium"),
     (SHAFT.replace("EI=[1e4,1e4]", "outer_diameter=[60mm,60mm]"), "E: missing"),
     (SHAFT.replace("EI=[1e4,1e4]", "outer_diameter=60mm inner_diameter=70mm E=2e11"), "less than outer_diameter"),
+    (f"{POINT} --amplitude 2", 'did you mean "2 deg"?'),
+    (f"{POINT} --amplitud 2deg", "did you mean --amplitude?"),
+    (f"{SHAFT} operating_min=4500 operating_max=3000", "at least operating_min = 4500"),
+    ("point planetary modes teeth=[20,26,72] operating_min=500", "at least operating_min = 500"),
     ("point planetary modes teeth=[20,72]", "those of sun, planet and ring"),
     ("point planetary modes planet_angle=[0,120,240]", 'did you mean "120 deg"?'),
 ]
