@@ -9,12 +9,12 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import OUTCOME, get_analysis
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
 from drivetrain_jax.atlas import design
@@ -22,7 +22,7 @@ from drivetrain_jax.atlas.criteria import has_boundaries
 from drivetrain_jax.atlas.windows import Crossing, Interval, narrow
 from drivetrain_jax.runs.atlas_file import StoredAtlas
 from drivetrain_jax.runs.atlas_question import AtlasQuery, Range, number, roles_of
-from drivetrain_jax.runs.forced_limit import Limit, forced_along
+from drivetrain_jax.runs.forced_limit import forced_at, forced_over
 from drivetrain_jax.runs.growth_text import growth_at, growth_lines
 from drivetrain_jax.runs.sensitivities import gradient_lines, limit_line, radius_gradient, radius_sensitivities
 
@@ -61,18 +61,12 @@ def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None)
     The gradient comes from direct solves, with respect to every parameter of the system. Raises :class:`InputError` for
     names and values outside the atlas, :class:`ChunkError` if a direct solve fails.
     """
-    limit = None if amplitude is None else Limit.of(atlas.scene.system, amplitude)
     asked = AtlasQuery.of(atlas, given, ranges=())
     point = asked.values
     found = atlas(**point)
     results = {str(name): v.values[()] for name, v in found.data_vars.items()}
     variables = {v.name: v for v in (*atlas.scene.analysis.variables, OUTCOME)}
-    rows = [
-        f"  {name:<24} {', '.join(map(variables[name].written, np.atleast_1d(value)))}"
-        for name, value in results.items()
-    ]
-    if int(results.get("verdict", 0)) == VERDICTS.index("undecided"):
-        rows.append(f"  {'':<24} {get_analysis('floquet').advice(atlas.request)}")
+    rows = _result_rows(atlas, results, variables)
     slopes = radius_gradient(atlas.scene.system, {**atlas.fixed, **point})
     effects = None if slopes is None else radius_sensitivities(asked, slopes)
     panels, system = atlas.stability.atlas, atlas.scene.system
@@ -82,11 +76,8 @@ def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None)
     lines += ["nearest change of stability"] if nearest or not panels.panels else []
     lines += [] if panels.panels else [f"  unknown: the atlas has no panel ({panels.gaps[0].reason})"]
     lines += [line for each in nearest for line in _nearest_lines(asked, each)]
-    forced = {}
-    if limit:
-        found = atlas.amplitude({name: np.array([value]) for name, value in point.items()})[0]
-        text, forced["forced"] = limit.at_point(found, float(results["spectral_radius"]))
-        lines.append(f"forced amplitude: {text}")
+    compared, forced = forced_at(atlas, amplitude, point, results.get("spectral_radius"))
+    lines += compared
     data = {
         "system": atlas.scene.system.name,
         **forced,
@@ -107,6 +98,17 @@ def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None)
         },
     }
     return Reply("\n".join(lines), data)
+
+
+def _result_rows(atlas: StoredAtlas, results: Mapping[str, Any], variables: Mapping[str, Variable]) -> list[str]:
+    """The results at one point as text, with what may decide an undecided verdict."""
+    rows = [
+        f"  {name:<24} {', '.join(map(variables[name].written, np.atleast_1d(value)))}"
+        for name, value in results.items()
+    ]
+    if int(results.get("verdict", 0)) == VERDICTS.index("undecided"):
+        rows.append(f"  {'':<24} {get_analysis('floquet').advice(atlas.request)}")
+    return rows
 
 
 def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range], amplitude: Any = None) -> Reply:
@@ -146,8 +148,7 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
     panels = atlas.stability.atlas
     part = narrow(panels, {speed: asked.values[speed]}) if speed in asked.values else panels
     found = design.speed_windows(part, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.radius)
-    limit = None if amplitude is None else Limit.of(atlas.scene.system, amplitude)
-    forced = [forced_along(atlas, limit, w.safe, asked.numbers()) for w in found.windows] if limit else []
+    compared, forced = forced_over(atlas, amplitude, [w.safe for w in found.windows], asked.numbers(), asked.named)
     lines, sensitivities = [f"safe speeds, {asked.heading()}, margin {margin:g}"], []
     for k, w in enumerate(found.windows):
         ends = " to ".join(
@@ -156,10 +157,10 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
         )
         lines.append(f"  {ends}; largest spectral radius {_from_one(w.largest)} at {speed} = {number(w.where)}")
         lines.append(f"    {_checked(w.check)}")  # pyright: ignore[reportArgumentType]
-        effects = [limit_line(asked, speed, limit, f"    at {place}: ") for place, limit in _places(w.interval)]
+        effects = [limit_line(asked, speed, limit, f"    at {end}: ") for end, limit in _places(w.interval)]
         lines += [text for text, _ in effects if text]
         sensitivities.append([effect for _, effect in effects])
-        lines += [f"    {forced[k].text(partial(asked.named, speed))}"] if limit else []
+        lines += [f"    {text}" for text in compared[k]]
     data = {
         "question": "speed_windows",
         "parameters": {**atlas.fixed, **asked.values},
@@ -177,7 +178,7 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
             for w, effects in zip(found.windows, sensitivities, strict=True)
         ],
         "undecided": [list(r) for r in found.undecided],
-        **({"forced": [each.data for each in forced]} if limit else {}),
+        **forced,
     }
     lines += [] if found.windows else ["  none within the atlas"]
     lines += _undecided(found.undecided)
@@ -249,13 +250,11 @@ def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: des
         lines += [] if answer.certain else ["  not certain: undecided ranges are wider than the errors"]
         lines.append(f"  {_checked(answer.check)}")
     lines += _undecided(answer.undecided)
-    forced = {}
-    if amplitude is not None and answer.value is not None:
-        (speed,) = roles_of(asked.atlas, "speed")
-        limit, at = Limit.of(asked.atlas.scene.system, amplitude), {**asked.numbers(), name: answer.value}
-        found = forced_along(asked.atlas, limit, asked.values[speed], at)
-        lines.append(f"  {found.text(partial(asked.named, speed))}")
-        forced = {"forced": found.data}
+    found = [] if answer.value is None else [asked.values[asked.atlas.scene.system.roles["speed"]]]
+    compared, forced = forced_over(
+        asked.atlas, amplitude, found, {**asked.numbers(), name: answer.value or 0.0}, asked.named
+    )
+    lines += [f"  {text}" for each in compared for text in each]
     data = {
         "question": title.replace(" ", "_"),
         "parameters": {**asked.atlas.fixed, **asked.values},

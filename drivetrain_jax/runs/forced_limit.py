@@ -150,3 +150,25 @@ def forced_along(atlas: Any, limit: Limit, ends: tuple[float, float], at: Mappin
         excited = [bool(forced) and label.startswith(forced) for label in predicted.labels]
         likely = np.asarray(predicted.values({**atlas.fixed, **at}), float)[np.array(excited)]
     return limit.along(amplitude, *ends, likely)
+
+
+def forced_at(atlas: Any, amplitude: Any, point: Mapping[str, float], radius: Any) -> tuple[list[str], dict[str, Any]]:
+    """The comparison of a stored atlas with a limit at one ``point``, as lines and as data; empty without a limit."""
+    if amplitude is None:
+        return [], {}
+    limit = Limit.of(atlas.scene.system, amplitude)
+    columns = {name: np.array([value]) for name, value in point.items()}
+    radius = atlas.radius(columns)[0] if radius is None else radius
+    text, data = limit.at_point(atlas.amplitude(columns)[0], float(radius))
+    return [f"forced amplitude: {text}"], {"forced": data}
+
+
+def forced_over(
+    atlas: Any, amplitude: Any, ranges: list[Any], at: Mapping[str, float], named: Callable[[str, float], str]
+) -> tuple[list[list[str]], dict[str, Any]]:
+    """The comparison with a limit in ``ranges`` of speed: lines for each, and data; no lines without a limit."""
+    if amplitude is None:
+        return [[] for _ in ranges], {}
+    limit, speed = Limit.of(atlas.scene.system, amplitude), atlas.scene.system.roles["speed"]
+    found = [forced_along(atlas, limit, ends, at) for ends in ranges]
+    return [[each.text(lambda x: named(speed, x))] for each in found], {"forced": [each.data for each in found]}

@@ -41,7 +41,7 @@ def draw(dataset: xr.Dataset, orders: Orders, colours: Sequence[str], kinds: Map
     panels = Panels(height=_HEIGHT, margins=Margins(right=0.6, left=0.9, bottom=1.15))
     axes = panels.axes[0][0]
     low, high = _limits(axes, frequency[shown], speeds[shown], operating, orders)
-    for mode in shown:
+    for mode in shown.tolist():
         axes.axhline(frequency[mode], color=colours[mode], linewidth=0.9)
     handles = [Line2D([], [], color=colour, label=kind) for kind, colour in kinds.items()]
     for k, ((label, times), dashes) in enumerate(zip(orders.per_turn.items(), _DASHES, strict=False)):
