@@ -164,6 +164,7 @@ def _add_plot(subparsers: Any) -> None:
         "--part", nargs="+", default=[], metavar="name=LOW:HIGH", help="part of an atlas: ranges, or name=value"
     )
     command.add_argument("--cells", type=int, metavar="N", help="cells per axis for an atlas (default: 800)")
+    command.add_argument("--units", metavar="rpm,deg", help="units of the axes (default: those of the scene)")
 
 
 def _add_report(subparsers: Any) -> None:

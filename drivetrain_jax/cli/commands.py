@@ -150,7 +150,7 @@ def plot(options: argparse.Namespace) -> int:
     _check_place(options.out, _FIGURES)
     part = ranges(options.part, "--part") or None
     try:
-        figure = plot(options.files, part=part, cells=options.cells)
+        figure = plot(options.files, part=part, cells=options.cells, units=options.units)
     except InputError:
         raise
     except (LookupError, ValueError):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax import view
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import shown
+from drivetrain_jax.datasets.physical_axes import in_physical_data
+from drivetrain_jax.view.units import check_shown, in_given_units, in_units, listed
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -29,6 +31,7 @@ def plot(
     *others: Result,
     part: Mapping[str, float | tuple[float, float]] | None = None,
     cells: int | None = None,
+    units: str | Sequence[str] | None = None,
 ) -> Figure:
     """The figure of a result, chosen by its analysis.
 
@@ -37,10 +40,11 @@ def plot(
         others: results of the same analysis by other methods, drawn into the same axes (``frequency_response``).
         part: the part of an atlas to show: a number or ``(low, high)`` by the name of a parameter.
         cells: the number of cells of an atlas along each axis (default 800).
+        units: units of the axes, ``"rpm,deg"`` or a list (default: those in which the scene gives its axes).
 
     Returns: a matplotlib figure that shows itself in a notebook and belongs to no window: ``figure.savefig("chart.png")``.
 
-    Raises: :class:`~drivetrain_jax.InputError` for a result that has no figure.
+    Raises: :class:`~drivetrain_jax.InputError` for a result that has no figure, and for a unit that fits no axis.
 
     >>> import drivetrain_jax as dt, numpy as np
     >>> shaft = dt.Cardan(beta=0.3, Omega=1.4, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)
@@ -51,15 +55,24 @@ def plot(
     sources = [*result, *others] if isinstance(result, (list, tuple)) else [result, *others]
     if not sources:
         raise InputError("result = []: allowed is a result, or a list of one or more")
+    asked = [] if units is None else listed(units)
     datasets = [_dataset(source) for source in sources]
     if any(dataset.attrs.get("analysis") == "atlas" for dataset in datasets):
         if len(datasets) > 1:
             raise InputError("results: an atlas among several; allowed is an atlas alone")
-        return view.plot(_with_resonances(_chart(sources[0], datasets[0], part, cells)))
+        return _drawn([_chart(sources[0], datasets[0], part, cells)], asked)
     if part is not None or cells is not None:
         field = f"part = {shown(part)}" if part is not None else f"cells = {cells}"
         raise InputError(f"{field}: a result on a grid is drawn whole; allowed for an atlas")
-    return view.plot(*(_with_resonances(_loaded(dataset)) for dataset in datasets))
+    return _drawn([_loaded(dataset) for dataset in datasets], asked)
+
+
+def _drawn(datasets: list[xr.Dataset], asked: list[str]) -> Figure:
+    """The figure of ``datasets``, with axes in the units ``asked`` for, else in those of the scene."""
+    datasets = [_with_resonances(in_physical_data(each, asked) if asked else each) for each in datasets]
+    figure = view.plot(*(in_units(in_given_units(each), asked) for each in datasets))
+    check_shown(figure, asked)
+    return figure
 
 
 def _dataset(source: Any) -> xr.Dataset:

@@ -59,7 +59,7 @@ def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, flo
     if len(shown) == 2 and has_boundaries(atlas.stability.atlas, atlas.scene.system):
         dataset = dataset.assign_coords(_curves(atlas, fixed, {n: ranges[n] for n in shown}))
     for name, (quantity, convert) in views.items():
-        dataset = _in_physical_units(dataset, name, quantity, convert)
+        dataset = in_physical_units(dataset, name, quantity, convert)
     return dataset
 
 
@@ -83,7 +83,7 @@ def _back(back: Convert, size: float, values: Any) -> Any:
     return back(values) * size
 
 
-def _in_physical_units(dataset: xr.Dataset, name: str, quantity: Parameter, convert: Convert) -> xr.Dataset:
+def in_physical_units(dataset: xr.Dataset, name: str, quantity: Parameter, convert: Convert) -> xr.Dataset:
     """``dataset`` with the parameter ``name``, its boundaries and its tips also, or instead, as physical data."""
     other, about = quantity.name, {"units": quantity.units}
     coords = {}

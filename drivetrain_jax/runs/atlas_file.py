@@ -340,4 +340,4 @@ class StoredAtlas:
         columns = tuple(Axis(name, system.parameter(name), None, np.asarray(v, float)) for name, v in axes.items())
         fixed = dict(scene.fixed) | {name: value for name, value in fixed.items() if name not in axes}
         floquet = get_analysis("floquet").for_system(system)
-        return Scene(system, floquet, request, columns, zipped, fixed, scene.title, scene.text)
+        return Scene(system, floquet, request, columns, zipped, fixed, scene.title, scene.text, scene.data)

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from drivetrain_jax.view.units import CONVERTED
+
 _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
 # Units whose first symbol takes a prefix: N, N/m, N m, N m/rad, N m2, N s/m, Pa.
 _PREFIXED = re.compile(r"(N|Pa)(?![A-Za-z])")
@@ -34,7 +36,8 @@ def with_prefixes(dataset: xr.Dataset) -> xr.Dataset:
     for name, variable in sorted(dataset.variables.items(), key=lambda item: len(str(item[0]))):
         units = str(variable.attrs.get("units", ""))
         # A scalar coordinate belongs to the fixed parameters, whose captions choose prefixes themselves.
-        if variable.dtype.kind != "f" or not (_PREFIXED.match(units) and (variable.ndim or name in dataset.data_vars)):
+        wanted = variable.dtype.kind == "f" and CONVERTED not in variable.attrs and _PREFIXED.match(units)
+        if not wanted or not (variable.ndim or name in dataset.data_vars):
             continue
         # One prefix for results of the same unit, which may share an axis, and for NAME, `boundary_NAME`, `tip_NAME_error`.
         axes = [axis for axis, (_, known) in found.items() if f"_{axis}" in str(name) and known.endswith(units)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import xarray as xr
@@ -15,6 +16,7 @@ from matplotlib.patches import Patch
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.style import FRAME_GREY, PREDICTION, STATE_COLOURS
+from drivetrain_jax.view.units import suitable, value_in
 
 # The lightness of the colours falls with the number of flanks; non-periodic and failed cells differ in hue.
 _NAMES = ("no separation", "single-sided", "double-sided", "non-periodic", "failed")
@@ -71,12 +73,13 @@ def draw_bands(dataset: xr.Dataset, name: str, *panels: Axes) -> list[Patch]:
 
 
 def half_play(dataset: xr.Dataset) -> float | None:
-    """Half the play, or None if it is unknown or varies."""
+    """Half the play in the units of the displacement, or None if it is unknown or varies."""
     play = cells.role(dataset, "half_play")
-    half = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get(play, {}).get("value")
+    shown = next((str(v.attrs.get("units", "m")) for n, v in dataset.items() if re.match(r"u(_|$)", str(n))), "m")
     if play in dataset.coords:
-        return dataset[play].item() if dataset[play].ndim == 0 else None
-    return half
+        return float(value_in(dataset[play], shown)) if dataset[play].ndim == 0 else None
+    entry = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get(play, {})
+    return entry["value"] * suitable(entry.get("units", shown), [shown])[0] if "value" in entry else None
 
 
 def draw_flanks(dataset: xr.Dataset, *horizontal: Axes, portrait: Axes | None = None) -> list[Line2D]:

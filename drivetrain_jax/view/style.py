@@ -11,6 +11,7 @@ import xarray as xr
 from matplotlib.colors import ListedColormap
 
 from drivetrain_jax.view.prefixes import prefixed
+from drivetrain_jax.view.units import unit_of, written_units
 
 # Passed to rc_context around every figure; global rcParams stay unchanged.
 STYLE: dict[Any, Any] = {
@@ -51,8 +52,6 @@ _GREEK = {
     *("alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "kappa", "lambda", "mu", "nu", "xi"),
     *("rho", "sigma", "tau", "phi", "chi", "psi", "omega", "Gamma", "Delta", "Theta", "Lambda", "Phi", "Psi", "Omega"),
 }
-
-_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 # Largest length of a list in a caption.
 _MOST_ENTRIES = 6
@@ -114,11 +113,6 @@ def units_of(variable: xr.DataArray) -> str:
     return written_units(str(variable.attrs.get("units", "1")))
 
 
-def written_units(units: str) -> str:
-    """A unit of UDUNITS in common notation: ``kg m²`` for ``kg m2``."""
-    return re.sub(r"(?<=[A-Za-z])-?\d+", lambda power: power[0].translate(_SUPERSCRIPTS), units)
-
-
 def value_text(name: str, value: object, units: str = "1") -> str:
     """``symbol = value units``, with a prefix of the unit; a list of more than six entries is shortened to its length."""
     entries = value if isinstance(value, (list, tuple)) else [value]
@@ -152,7 +146,7 @@ def caption(dataset: xr.Dataset) -> str:
     }
     shown = [] if is_joined(dataset) else [name for name in fixed if name in given["fixed"]]
     varies = {str(name) for name in (*dataset.coords, *dataset.dims)}
-    parts = [_fixed_text(name, _unless_swept(dataset, name, fixed[name])) for name in shown if name not in varies]
+    parts = [_fixed_text(dataset, name, fixed[name]) for name in shown if name not in varies]
     parts += [coordinate_text(coordinate) for name, coordinate in scalars.items() if name in named or name not in fixed]
     return ", ".join([*parts, *([dataset.attrs["left_out"]] if "left_out" in dataset.attrs else [])])
 
@@ -187,10 +181,19 @@ def _unless_swept(dataset: xr.Dataset, name: str, entry: object) -> object:
     return {**entry, "value": shown} if isinstance(entry, dict) else shown
 
 
-def _fixed_text(name: str, entry: object) -> str:
-    if isinstance(entry, dict):
-        return value_text(name, entry.get("value"), str(entry.get("units", "1")))
-    return value_text(name, entry)
+def _fixed_text(dataset: xr.Dataset, name: str, entry: object) -> str:
+    """A fixed value in the unit asked for or given, with an entry that varies marked."""
+    entry = _unless_swept(dataset, name, entry)
+    if not isinstance(entry, dict):
+        return value_text(name, entry)
+    value, (size, units) = entry.get("value"), unit_of(dataset, name, str(entry.get("units", "1")))
+    if size != 1.0:
+        value = [_times(x, size) for x in value] if isinstance(value, list) else _times(value, size)
+    return value_text(name, value, units)
+
+
+def _times(value: object, size: float) -> object:
+    return value * size if isinstance(value, (int, float)) else value
 
 
 def _long_name(variable: xr.DataArray) -> str:

@@ -78,7 +78,9 @@ def test_a_rigid_support_has_no_place_on_the_axis_and_is_told(swept, points):
 def test_operating_speeds_are_a_band(swept, variable, low, drawn):
     """The band is in the units of the axis; from standstill, which a logarithmic axis lacks, it begins at the lower edge."""
     options = json.dumps({"operating_min": low, "operating_max": 9e3})
-    figure = plot(swept.rename(critical_speed=variable).assign_attrs(options=options))
+    renamed = swept.rename(critical_speed=variable).assign_attrs(options=options)
+    renamed[variable].attrs["units"] = "Hz" if variable == "natural_frequency" else "rpm"
+    figure = plot(renamed)
     (band,) = [patch for patch in figure.axes[0].patches if patch.get_label() == "operating speeds"]
     assert band.get_y() + band.get_height() == pytest.approx(drawn[1])
     bottom = figure.axes[0].get_ylim()[0]

@@ -29,13 +29,14 @@ from drivetrain_jax.view.style import (
     STATE_COLOURS,
     STYLE,
     axis_label,
+    in_brackets,
     scene_key,
     units_of,
     variable_label,
 )
+from drivetrain_jax.view.units import suitable, unit_of, value_in
 
-# Value of each frequency unit at a speed of 1 rpm.
-_FREQUENCIES = {"critical_speed": 1.0, "natural_frequency": 1 / 60, "angular_frequency": math.pi / 30}
+_FREQUENCIES = ("critical_speed", "natural_frequency", "angular_frequency")
 _HEIGHT, _SHAPE_HEIGHT, _MAP_HEIGHT = 3.4, 1.15, 2.3
 _MOST_SHAPES, _MOST_MAPS = 6, 4
 # Largest number of letters of a label along one map.
@@ -130,8 +131,11 @@ def _curves(dataset: xr.Dataset, name: str, shown: str) -> Figure:
 def _operating(dataset: xr.Dataset, shown: str) -> tuple[float, float] | None:
     """Lowest and highest operating speed in the units of ``shown``, if stored."""
     options = json.loads(dataset.attrs.get("options", "{}"))
-    low, high = (options.get(f"operating_{end}", 0.0) * _FREQUENCIES[shown] for end in ("min", "max"))
-    return (low, high) if high > 0 else None
+    low, high = (options.get(f"operating_{end}", 0.0) for end in ("min", "max"))
+    if not high > 0:
+        return None
+    rpm = suitable("rpm", [str(dataset[shown].attrs.get("units", "rpm"))])[0]
+    return low * rpm, high * rpm
 
 
 def _draw_range(axes: Axes, operating: tuple[float, float] | None) -> list[Artist]:
@@ -256,15 +260,15 @@ def _shapes(dataset: xr.Dataset) -> Figure:
         axes.fill_between(x, shape, color=colour, alpha=0.15, linewidth=0)
         axes.set(xlim=(-0.02 * shaft.total, 1.02 * shaft.total), ylim=(-1.25, 1.25), yticks=(-1.0, 0.0, 1.0))
         axes.set_title(_name(dataset, index), loc="left", pad=3, color=FRAME_GREY, size=8)
-    label = "distance from A [m]" if shaft.edges else variable_label(dataset["x"])
-    panels.label_axes(label, "deflection, largest 1")
+    distance = f"distance from A{in_brackets(unit_of(dataset, 'length', 'm')[1])}"
+    panels.label_axes(distance if shaft.edges else variable_label(dataset["x"]), "deflection, largest 1")
     panels.titles(dataset)
     panels.legend(shaft.legend())
     return panels.figure
 
 
 class _Shaft(NamedTuple):
-    """The shaft behind its mode shapes: ends of the segments [m], their thickness, and the places of its points.
+    """The shaft behind its mode shapes: ends of the segments (in the unit of the figure), thickness, places of its points.
 
     Without stored lengths there are no ``edges``, and ``total`` is 1.
     """
@@ -277,18 +281,20 @@ class _Shaft(NamedTuple):
     @classmethod
     def of(cls, dataset: xr.Dataset) -> _Shaft:
         """The shaft of the fixed parameters of a result, axes of one value among them."""
-        fixed = {name: x["value"] for name, x in json.loads(dataset.attrs.get("fixed_parameters", "{}")).items()}
+        given = json.loads(dataset.attrs.get("fixed_parameters", "{}"))
+        fixed = {name: x["value"] for name, x in given.items()}
         for coordinate in dataset.coords.values():
             name, _, place = scene_key(coordinate).rstrip("]").partition("[")
             if coordinate.ndim or coordinate.dtype.kind != "f":
                 continue
+            number = float(value_in(coordinate, given.get(name, {}).get("units", "1")))
             if not place:
-                fixed[name] = float(coordinate)
+                fixed[name] = number
             elif int(place) < len(fixed.get(name, [])):
-                fixed[name][int(place)] = float(coordinate)
+                fixed[name][int(place)] = number
         if not {"length", "EI"} <= fixed.keys():
             return cls(1.0, [], [], {})
-        edges = [0.0, *np.cumsum(fixed["length"]).tolist()]
+        edges = [0.0, *np.cumsum(unit_of(dataset, "length", "m")[0] * np.array(fixed["length"])).tolist()]
 
         def ends(name: str, none: float) -> list[float]:
             joints = fixed.get(f"{name}_joint", [])

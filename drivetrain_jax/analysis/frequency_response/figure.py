@@ -16,7 +16,8 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.frequency_response import maps as rattle_maps
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.figure_layout import Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STYLE, axis_label, units_of
+from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STYLE, axis_label, in_brackets, units_of
+from drivetrain_jax.view.units import suitable, value_in
 
 DASHES = (0, (3, 1.6))
 _HEIGHT = 2.9
@@ -130,8 +131,9 @@ def _lines(results: list[xr.Dataset]) -> Figure:
     cells.fit_axis(upper, "x", np.unique(np.concatenate([_along(r).values for r in results])))
     panels.label_row(upper, f"half the peak-to-peak displacement [{units_of(results[0]['u_max'])}]")
     if with_phase:
-        _angle_axis(panels.axes[1][0], any(bool((_lag(each) > np.pi + _ANGLE_MARGIN).any()) for each in results))
-        panels.label_row(panels.axes[1][0], "lag of the fundamental [rad]")
+        angle = units_of(results[0]["phase"])
+        _angle_axis(panels.axes[1][0], angle, any(bool((_lag(each) > np.pi + _ANGLE_MARGIN).any()) for each in results))
+        panels.label_row(panels.axes[1][0], f"lag of the fundamental{in_brackets(angle)}")
     panels.label_axes(axis_label(_along(results[0])))
     panels.titles(results[0])
     panels.legend([*handles, *_meanings(results)])
@@ -145,7 +147,8 @@ def _label(result: xr.Dataset, look: _Look) -> str:
         count = options.get("harmonics")
         return f"{look.label}, {count} harmonic{'s' if count != 1 else ''}"
     if "fit_range" in result:
-        return f"{look.label}, $R$ = {float(result['fit_range'].values.flat[0]):.3g}"
+        fit = result["fit_range"]
+        return f"{look.label}, $R$ = {float(fit.values.flat[0]):.3g} {units_of(fit)}".removesuffix(" 1")
     return look.label
 
 
@@ -269,13 +272,17 @@ def _entries(result: xr.Dataset, look: _Look) -> list[Line2D]:
 
 
 def _lag(result: xr.Dataset) -> xr.DataArray:
-    """The phase modulo a turn, in [0, 1) turns; small negative values from rounding stay."""
-    return (result["phase"] + _ROUNDING) % (2 * np.pi) - _ROUNDING
+    """The phase [rad] modulo a turn, in [0, 1) turns; small negative values from rounding stay."""
+    phase = result["phase"].copy(data=value_in(result["phase"], "rad"))
+    return (phase + _ROUNDING) % (2 * np.pi) - _ROUNDING
 
 
-def _angle_axis(axes: Axes, longer: bool) -> None:
-    """Set an angle axis of half a turn, or of a full turn for larger lags, such as with a drive of negative amplitude."""
+def _angle_axis(axes: Axes, units: str, longer: bool) -> None:
+    """Set an axis of angles in rad, numbered in ``units``: half a turn, or a full turn for larger lags, such as with a drive
+    of negative amplitude."""
     quarters = 5 if longer else 3
     axes.set_ylim(-_ANGLE_MARGIN, (quarters - 1) * np.pi / 2 + _ANGLE_MARGIN)
     labels = ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"]
+    if units != "rad":
+        labels = [f"{k * np.pi / 2 * suitable('rad', [units])[0]:g}" for k in range(5)]
     axes.set_yticks(np.arange(quarters) * np.pi / 2, labels[:quarters])

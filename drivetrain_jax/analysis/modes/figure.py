@@ -18,7 +18,8 @@ from drivetrain_jax.analysis.modes.planetary_gear import BODY_COLOURS, draw_gear
 from drivetrain_jax.resonances.orders import Orders, stored_orders
 from drivetrain_jax.view import cells, interference
 from drivetrain_jax.view.figure_layout import Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, STYLE, axis_label, in_brackets, scene_key, variable_label
+from drivetrain_jax.view.style import FRAME_GREY, STYLE, axis_label, in_brackets, scene_key, units_of, variable_label
+from drivetrain_jax.view.units import value_in
 
 # Colours of rigid modes, of the families in their order, and of coupled modes.
 _RIGID, _FAMILIES, _COUPLED = "#9a9a9a", ("#16324f", "#d1771e", "#3f8f5f", "#7a4fa0", "#999933"), "#a0308c"
@@ -103,7 +104,8 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
     cells.plain_decades(axes, "y")
     if close:
         _draw_distances(panels.axes[1][0], x, frequency, close)
-        panels.label_row(panels.axes[1][0], f"distance of close modes (numbers at the right){in_brackets('Hz')}")
+        units = in_brackets(units_of(dataset["natural_frequency"]))
+        panels.label_row(panels.axes[1][0], f"distance of close modes (numbers at the right){units}")
     cells.fit_axis(axes, "x", x)
     panels.label_row(axes, variable_label(dataset["natural_frequency"]))
     panels.label_axes(axis_label(dataset[name]))
@@ -169,7 +171,7 @@ def _angles(dataset: xr.Dataset) -> list[float]:
     fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get(name)
     if fixed is None:
         raise InputError(f"{name or 'planets'}: missing; the figure of mode shapes needs the angles of planets")
-    varied = {scene_key(c): c for c in dataset.coords.values()}
+    varied = {scene_key(c): value_in(c, "rad") for c in dataset.coords.values() if not c.ndim and c.dtype.kind == "f"}
     angles = enumerate(fixed["value"] if isinstance(fixed, dict) else fixed)
     return [float(varied.get(f"{name}[{i}]", angle)) for i, angle in angles]
 
@@ -194,6 +196,8 @@ def _shapes(dataset: xr.Dataset) -> Figure:
     if not np.isfinite(frequency).all():
         raise InputError("natural_frequency = nan: nothing to plot; the point has no result")
     drawn = _distinct(frequency)[:_MOST_SHAPES]
+    units = units_of(dataset["natural_frequency"])
+    digits = 1 if units == "Hz" or frequency.max() > 1e3 else 4
     rows = -(-len(drawn) // _COLUMNS)
     shares = {"dominant_family", "dominant_share"} <= set(dataset) and bool((types == "coupled").any())
     between, top = (0.42, 1.0) if shares else (0.28, 0.85)
@@ -206,7 +210,7 @@ def _shapes(dataset: xr.Dataset) -> Figure:
         multiple = f" ×{count}" if count > 1 else ""
         kind, family = str(types[mode]), str(families[mode])
         named = _dominant(dataset, mode) if kind == "coupled" and shares else f", {kind}"
-        axes.set_title(f"{frequency[mode]:.1f} Hz{multiple}{named}", size=8, color=colours[family], pad=1.5)
+        axes.set_title(f"{frequency[mode]:.{digits}f} {units}{multiple}{named}", size=8, color=colours[family], pad=1.5)
     for axes in flat[len(drawn) :]:
         axes.axis("off")
     left_out = len(_distinct(frequency)) - len(drawn)

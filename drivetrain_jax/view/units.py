@@ -1,0 +1,145 @@
+"""Figures in the units of the reader: axes, results and fixed values converted, from those asked for or given."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from drivetrain_jax import _units
+from drivetrain_jax._errors import InputError
+
+# The attribute with the units asked for, and the mark of a converted variable, which takes no further prefix.
+ASKED, CONVERTED = "figure_units", "converted"
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def written_units(units: str) -> str:
+    """A unit of UDUNITS in common notation: ``kg m²`` for ``kg m2``."""
+    return re.sub(r"(?<=[A-Za-z])-?\d+", lambda power: power[0].translate(_SUPERSCRIPTS), units)
+
+
+def listed(units: str | Sequence[str]) -> list[str]:
+    """The units of ``"rpm,deg"`` or of a list; raises :class:`InputError` for an unknown one, and for two of one kind."""
+    found = [u.strip() for u in (units.split(",") if isinstance(units, str) else units)]
+    for number, unit in enumerate(found):
+        try:
+            _units.number(f"1 {unit}", unit)
+        except _units.UnitError:
+            raise InputError(f"units = {unit!r}: not a unit; allowed are units such as rpm, deg or mm") from None
+        if twin := next((other for other in found[:number] if size(unit, other)), None):
+            raise InputError(f"units = {unit!r}: measures the same as {twin}; allowed is one of them")
+    return found
+
+
+def size(units: str, unit: str) -> float | None:
+    """The number of ``unit`` that one of ``units`` is; None if they measure different things."""
+    if units in ("1", "") or units == unit:
+        return 1.0 if units == unit else None
+    try:
+        return 1 / _units.factor(unit, units)
+    except _units.UnitError:
+        return None
+
+
+def suitable(units: str, asked: Iterable[str]) -> tuple[float, str]:
+    """The unit among ``asked`` for a value in ``units``, and its factor; 1 and ``units`` without one."""
+    sizes = ((size(units, unit), unit) for unit in asked)
+    return next(((each, unit) for each, unit in sizes if each is not None), (1.0, units))
+
+
+def in_units(dataset: xr.Dataset, asked: Sequence[str]) -> xr.Dataset:
+    """``dataset`` with axes, results and state in the units ``asked`` for, the first that fits each."""
+    changed = {
+        str(name): _changed(variable, *suitable(str(variable.attrs.get("units", "1")), asked))
+        for name, variable in dataset.variables.items()
+        if variable.dtype.kind in "fc"
+    }
+    state = [dict(each) for each in json.loads(dataset.attrs.get("state", "[]"))]
+    sizes = []
+    for component in state:
+        factor, component["units"] = suitable(component["units"], asked)
+        component["scale"] = component.get("scale", 1.0) * factor / (sizes or [factor])[0]
+        sizes.append(factor)
+    for name, variable in dataset.variables.items():
+        # A point of a section: a displacement and a rate.
+        if "units_of_components" in variable.attrs and variable.sizes.get("state") == len(sizes):
+            scaled = variable.values * np.array(sizes).reshape([-1 if d == "state" else 1 for d in variable.dims])
+            changed[str(name)] = xr.Variable(variable.dims, scaled, variable.attrs)
+    attrs = {ASKED: json.dumps(list(asked))} | ({"state": json.dumps(state)} if state else {})
+    return _assigned(dataset, changed).assign_attrs(attrs)
+
+
+def in_given_units(dataset: xr.Dataset) -> xr.Dataset:
+    """``dataset`` with each axis, and what belongs to it, in the unit in which its scene gives it."""
+    changed = {}
+    for axis in dataset.coords.values():
+        if axis.dtype.kind != "f" or (unit := given_unit(dataset, str(axis.attrs.get("parameter", axis.name)))) is None:
+            continue
+        units = str(axis.attrs.get("units", "1"))
+        of_axis = re.compile(rf"(?:boundary_|tip_|undecided_|resonance_)?{re.escape(str(axis.name))}(?:_error)?")
+        for name, variable in dataset.variables.items():
+            if of_axis.fullmatch(str(name)) and variable.attrs.get("units") == units:
+                changed[str(name)] = _changed(variable, *suitable(units, [unit]))
+    return _assigned(dataset, changed)
+
+
+def given_unit(dataset: xr.Dataset, name: str) -> str | None:
+    """The unit of the first text that the scene of ``dataset`` gives for ``name``; None without one."""
+    scene = tomllib.loads(str(dataset.attrs.get("scene", "")))
+    for table in ("axes", "points", "fixed"):
+        entry = scene.get(table, {}).get(name)
+        entries = entry.values() if isinstance(entry, dict) else [entry]
+        flat = (x for each in entries for x in (each if isinstance(each, list) else [each]))
+        found = next((_units.split(x) for x in flat if isinstance(x, str)), None)
+        if found and found[1]:
+            return found[1]
+    return None
+
+
+def unit_of(dataset: xr.Dataset, name: str, units: str) -> tuple[float, str]:
+    """The unit in which figures show the fixed parameter ``name``, stored in ``units``, and its factor."""
+    factor, unit = suitable(units, json.loads(dataset.attrs.get(ASKED, "[]")))
+    given = given_unit(dataset, name) if unit == units else None
+    return suitable(units, [given]) if given else (factor, unit)
+
+
+def value_in(variable: xr.DataArray, units: str) -> Any:
+    """The values of ``variable`` in ``units``, whatever its figure shows."""
+    return variable.values * suitable(str(variable.attrs.get("units", units)), [units])[0]
+
+
+def check_shown(figure: Figure, asked: Iterable[str]) -> None:
+    """Raise :class:`InputError` for a unit that no axis of ``figure`` has."""
+    labels = [" ".join(text.get_text().split()) for text in figure.findobj(Text)]
+    # Frequencies of mode shapes are in the titles of the panels, without brackets.
+    titles = [axes.get_title(side) for axes in figure.axes for side in ("left", "center")]
+    found = [re.findall(r"\[([^\[\]=,]+)\]$", label) for label in labels]
+    found += [re.findall(r"[\d.]+ ([A-Za-z][\w/]*)(?=$|[ ,\n])", title) for title in titles]
+    shown = list(dict.fromkeys(unit for each in found for unit in each))
+    for unit in asked:
+        if written_units(unit) not in shown:
+            kinds = f"units of {', '.join(shown)}" if shown else "none, all axes are dimensionless"
+            raise InputError(
+                f"units = {unit!r}: no axis of the figure measures that; allowed are {kinds} "
+                "(a dimensionless speed needs physical data in the scene)"
+            )
+
+
+def _changed(variable: xr.Variable, factor: float, unit: str) -> xr.Variable:
+    if unit == variable.attrs.get("units", "1"):
+        return variable
+    attrs = {**variable.attrs, "units": unit, CONVERTED: 1}
+    return xr.Variable(variable.dims, variable.values * factor, attrs)
+
+
+def _assigned(dataset: xr.Dataset, changed: dict[str, xr.Variable]) -> xr.Dataset:
+    coords = {name: variable for name, variable in changed.items() if name in dataset.coords}
+    return dataset.assign({n: v for n, v in changed.items() if n not in coords}).assign_coords(coords)

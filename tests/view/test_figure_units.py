@@ -1,0 +1,109 @@
+"""Figures in the units asked for, or in those in which the scene gives its axes."""
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import drivetrain_jax as dt
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.datasets.figure import plot
+from drivetrain_jax.view.units import listed
+from tests.view import results
+
+TRUCK = {"J1": 2.0, "J2": 0.5, "k1": 6e4, "k2": 4e4}
+FIXED = {"zeta": 0.0005, "alpha": 0.408, "mu": 2 / 3, "gamma": 0.25, "beta": 0.2}
+
+
+def texts(figure):
+    return [text.get_text().replace("\n", " ") for text in figure.texts]
+
+
+def panel(figure):
+    return figure.axes[0]
+
+
+def chart(**attrs):
+    return results.chart().drop_vars(("resonance", "resonance_Omega")).assign_attrs(attrs)
+
+
+def test_an_angle_is_drawn_in_degrees():
+    plain, degrees = plot(chart()), plot(chart(), units="deg")
+    assert "joint angle ($\\beta$) [deg]" in texts(degrees)
+    np.testing.assert_allclose(panel(degrees).get_ylim(), np.rad2deg(panel(plain).get_ylim()), rtol=1e-12)
+    np.testing.assert_array_equal(panel(degrees).get_xlim(), panel(plain).get_xlim())
+
+
+def test_a_dimensionless_speed_is_drawn_in_rpm_with_physical_data_only():
+    with pytest.raises(InputError, match=r"units = 'rpm': no axis .* allowed are units of rad \(a dimensionless speed"):
+        plot(chart(), units="rpm")
+    data = {name: {"value": value, "units": "1"} for name, value in TRUCK.items()}
+    fixed = {name: {"value": value, "units": "1"} for name, value in FIXED.items()}
+    given = {"physical_data": json.dumps(data), "fixed_parameters": json.dumps(fixed)}
+    figure = plot(chart(system="cardan", **given), units=["rpm", "deg"])
+    assert "speed of the driving shaft (speed) [rpm]" in texts(figure)
+    natural = np.sqrt(6e4 / 2) * 30 / np.pi
+    np.testing.assert_allclose(panel(figure).get_xlim(), natural * np.array(panel(plot(chart())).get_xlim()), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("units", "reason"),
+    [("kg", "no axis of the figure measures that"), ("deg,", "not a unit"), ("deg,rad", "measures the same as deg"),
+     ("degg", "not a unit")],
+)  # fmt: skip
+def test_a_unit_of_no_axis_is_refused(units, reason):
+    with pytest.raises(InputError, match=rf"units = '.*': {reason}; allowed (is|are) |units = '.*': {reason}"):
+        plot(chart(), units=units)
+
+
+def test_axes_have_the_unit_of_the_scene():
+    text = (
+        '[axes]\nbeta = { start = "0 deg", stop = "30 deg", num = 9 }\nOmega = { start = 0.5, stop = 1.5, num = 11 }\n'
+    )
+    assert "joint angle ($\\beta$) [deg]" in texts(plot(chart(scene=text)))
+    assert "joint angle ($\\beta$) [rad]" in texts(plot(chart(scene=text), units="rad"))
+
+
+def test_fixed_values_have_the_unit_of_the_scene_or_of_the_axes():
+    entry = {"angle": {"value": 0.5, "units": "rad"}, "length": {"value": [0.3, 1.2], "units": "m"}}
+    scene = '[axes]\nbeta = {}\nOmega = {}\n[fixed]\nangle = 0.5\nlength = ["300 mm", 1.2]\n'
+    dataset = chart(fixed_parameters=json.dumps(entry), scene=scene)
+    assert "angle = 0.5 rad, length = [300, 1200] mm" in texts(plot(dataset))
+    assert "angle = 28.6479 deg, length = [300, 1200] mm" in texts(plot(dataset, units="deg"))
+
+
+def test_flanks_and_phase_follow_the_units_of_their_axes():
+    """A gear pair with 0.1 mm backlash: flanks at 50 micrometres from the middle, in any unit."""
+    gears = dt.Rattle(omega=0.9, B0=0.05, B1=0.03, b=5e-5, c=0.05, alpha=0.25, k=1.0, I=1.0)
+    history = dt.sweep(dt.history, gears, over={"omega": [0.9]}, times=np.linspace(0, 1, 5).tolist())
+    along = plot(history, units="um").axes[0]
+    levels = sorted({float(np.asarray(line.get_ydata())[0]) for line in along.lines[1:]})
+    np.testing.assert_allclose(levels, [-50, 50], rtol=1e-12)
+    assert along.get_ylabel() == "$u$ [um]"
+
+
+def test_a_section_has_both_components_converted():
+    state = [
+        {"name": n, "units": u, "long_name": n, "symbol": "", "scale": 1.0} for n, u in (("phi", "rad"), ("v", "rad/s"))
+    ]
+    points = np.array([[0.1, 2.0], [0.2, 3.0], [0.15, 2.5]])
+    dataset = xr.Dataset(
+        {
+            "section": (("strobe", "state"), points, {"units": "1", "units_of_components": "rad, rad/s"}),
+            "torus_residual": ("state", [1e-3, 1e-3], {"units": "1"}),
+            "outcome": ((), 0),
+        },
+        attrs={"analysis": "poincare", "state": json.dumps(state)},
+    )
+    figure = plot(dataset, units="deg,rpm")
+    drawn = panel(figure).collections[0].get_offsets()
+    np.testing.assert_allclose(drawn, points * [180 / np.pi, 30 / np.pi], rtol=1e-12)
+    assert {"phi at the strobes [deg]", "v at the strobes [rpm]"} <= set(texts(figure))
+    assert "distance from a smooth curve 1.0e-03 of the largest value" in [
+        text.get_text() for text in panel(figure).texts
+    ]
+
+
+def test_lists_of_units_are_checked():
+    assert listed("rpm, deg") == ["rpm", "deg"] and listed(("mm",)) == ["mm"]
