@@ -199,14 +199,15 @@ def axis_coordinates(scene: Scene) -> list[Coordinate]:
     return coordinates
 
 
-def _drawn(system: type[System]) -> dict[str, str]:
-    """Attributes that figures need: the state of the system and its families of resonances."""
+def _drawn(system: type[System]) -> dict[str, Any]:
+    """Attributes that figures need: state, families of resonances, periods of the equations in a turn."""
     families = system.resonances.families if system.resonances else ()
     attrs = {
         "state": [vars(component) for component in system.state],
         "resonance_families": {f.prefix: {k: v for k, v in vars(f).items() if k != "prefix"} for f in families},
     }
-    return {name: json.dumps(value) for name, value in attrs.items() if value}
+    shown = {name: json.dumps(value) for name, value in attrs.items() if value}
+    return shown | ({"periods_per_turn": system.periods_per_turn} if system.periods_per_turn else {})
 
 
 def _roles(scene: Scene) -> dict[str, str]:

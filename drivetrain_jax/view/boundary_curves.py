@@ -31,11 +31,8 @@ _SIDES = {
 def draw(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Artist]:
     """Draw boundaries, tips and undecided boxes of ``dataset`` (``boundary_NAME``, ``tip_NAME``, ``undecided_NAME``);
     returns legend handles."""
-    handles: list[Artist] = []
+    handles: list[Artist] = draw_curves(axes, dataset, horizontal, vertical)
     keep: dict[str, Any] = {"scalex": False, "scaley": False}
-    if dataset.sizes.get("boundary"):
-        x, y = (dataset[f"boundary_{name}"] for name in (horizontal, vertical))
-        handles += axes.plot(x, y, color=FRAME_GREY, linewidth=0.6, label="boundary", **keep)
     boxes = _draw_undecided(axes, dataset, horizontal, vertical)
     proved = dataset["tip_proved"].values.astype(bool) if "tip_proved" in dataset.coords else np.empty(0, bool)
     for chosen, label in ((proved, "tip"), (~proved, "not proved")):
@@ -46,6 +43,15 @@ def draw(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> lis
     if proved.size:
         _name(axes, dataset, horizontal, vertical)
     return handles + boxes
+
+
+def draw_curves(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Artist]:
+    """Draw the traced boundaries, if there are any; returns their legend handle."""
+    if not dataset.sizes.get("boundary"):
+        return []
+    x, y = (dataset[f"boundary_{name}"] for name in (horizontal, vertical))
+    style = {"color": FRAME_GREY, "linewidth": 0.6, "label": "boundary", "scalex": False, "scaley": False}
+    return [*axes.plot(x, y, **style)]
 
 
 def _draw_undecided(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Artist]:

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
-from matplotlib.colors import LinearSegmentedColormap, ListedColormap, SymLogNorm
+from matplotlib.colors import ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, NullFormatter
@@ -181,7 +181,8 @@ def plain_decades(axes: Axes, which: str) -> None:
     side = getattr(axes, f"{which}axis")
     side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
     plain = FuncFormatter(lambda value, _: f"{value:g}")
-    side.set_major_formatter(plain if low >= 1e-4 and high < 2e6 else LogFormatterMathtext())
+    # %g writes a million as 1e+06.
+    side.set_major_formatter(plain if low >= 1e-4 and high < 0.99e6 else LogFormatterMathtext())
     side.set_minor_formatter(NullFormatter())
 
 
@@ -228,38 +229,3 @@ def draw_failures(axes: Axes, dataset: xr.Dataset, name: str) -> list[Line2D]:
 def _state_patch(code: int, note: str) -> Patch:
     colours: dict[str, Any] = {"facecolor": STATE_COLOURS[code], "edgecolor": FRAME_GREY}
     return Patch(**colours, linewidth=0.6, hatch=STATE_HATCHES[code], label=STATE_NAMES[code] + note)
-
-
-# Growth log10(rho) below which the scale is linear, because log10(rho) of light damping is -1e-5.
-LINEAR_GROWTH = 1e-6
-# Largest growth with a colour of its own, the same in every figure: a factor of 10 in a period.
-LARGEST_GROWTH = 1.0
-# Position between no growth (0) and largest growth (1), and colour; lightness falls monotonically. White is reserved for
-# cells without a value.
-_DECAY, _NEUTRAL = "#f3f9e4", "#a9cbe5"
-_GROWTH = ((0.25, "#f3b562"), (0.55, "#c8553d"), (1.0, "#2d0a2b"))
-
-
-def draw_growth(axes: Axes, radius: xr.DataArray, horizontal: str, vertical: str) -> tuple[QuadMesh, str, str]:
-    """Draw ``log10`` of a spectral radius as cells, and its contour at 0; returns label and ``extend`` of its colour bar.
-
-    A colour means the same growth in every figure. Blue to pale yellow is decay, paler colours faster decay; orange to black
-    is growth. Missing values have the colour of failed cells.
-    """
-    with np.errstate(divide="ignore"):
-        growth: Any = np.log10(radius)
-    low, high = -LARGEST_GROWTH, LARGEST_GROWTH
-    norm = SymLogNorm(LINEAR_GROWTH, linscale=0.5, vmin=low, vmax=high, base=10)
-    zero = float(norm(0.0))
-    stops = [(0.0, _DECAY), (zero, _NEUTRAL), *((zero + part * (1 - zero), colour) for part, colour in _GROWTH)]
-    cmap = LinearSegmentedColormap.from_list("growth", stops, N=1024)
-    cmap = cmap.with_extremes(bad=STATE_COLOURS[FAILED])
-    below, above = bool((growth < low).any()), bool((growth > high).any())
-    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
-    # A radius of 0 is the fastest decay, not a missing value.
-    mesh = draw_cells(axes, growth.clip(low, high), horizontal, vertical, cmap=cmap, norm=norm)
-    if min(growth.shape) > 1 and bool((growth > 0).any()) and bool((growth < 0).any()):
-        x, y = (growth[name].values for name in (horizontal, vertical))
-        drawn = growth.clip(low, high).transpose(vertical, horizontal).values
-        axes.contour(x, y, drawn, [0.0], colors=FRAME_GREY, linewidths=0.5)
-    return mesh, f"$\\log_{{10}}$ of the {radius.attrs.get('long_name', 'spectral radius')}", extend

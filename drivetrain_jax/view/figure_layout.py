@@ -32,7 +32,7 @@ _INCHES_PER_ENTRY = 0.45
 # The place in a paper at either end of a title: it says nothing to a reader without the paper.
 _PAPER = re.compile(r"[^:]*\b(?:Figs?\.?|Tables?|section) \d[^:]*: |, (?:Figs?\.?|Tables?) \d.*$")
 _TITLE_SIZE, _SMALLEST_TITLE, _ELLIPSIS = 10.5, 7.0, "\u2026"
-_CAPTION_SIZE, _CAPTION_TOP, _CAPTION_LINE = 8, 0.32, 0.14
+_CAPTION_SIZE, _CAPTION_TOP, _CAPTION_LINE, _CAPTION_GAP = 8, 0.32, 0.14, 0.04
 
 
 @dataclass(frozen=True)
@@ -135,13 +135,30 @@ class Panels:
 
     def titles(self, dataset: xr.Dataset, note: str = "") -> None:
         """Add the scene's title and, below it, the fixed parameters (and ``note``)."""
-        total = self.figure.get_figheight()
         left = self.margins.left / WIDTH
-        write_title(self.figure, dataset, self.margins.left)
         text = "; ".join(part for part in (caption(dataset), note) if part)
         room = int((self.margins.top - _CAPTION_TOP) / _CAPTION_LINE)
         text = wrap_caption(text, WIDTH - self.margins.left - 0.1, max(room, 1))
+        if text:
+            self._clear_top(_CAPTION_TOP + _CAPTION_LINE * (text.count("\n") + 1) + _CAPTION_GAP)
+        write_title(self.figure, dataset, self.margins.left)
+        total = self.figure.get_figheight()
         self.figure.text(left, 1 - _CAPTION_TOP / total, text, va="top", size=_CAPTION_SIZE, color=FRAME_GREY)
+
+    def _clear_top(self, inches: float) -> None:
+        """Make the figure taller if labels above the panels reach into its upper ``inches``."""
+        boxes = [box for axes in self.axes[0] if (box := axes.get_tightbbox()) is not None]
+        total = self.figure.get_figheight()
+        missing = inches - (total - max(box.y1 for box in boxes) / self.figure.dpi)
+        if missing <= 0:
+            return
+        self.figure.set_figheight(total + missing)
+        ratio = total / (total + missing)
+        for axes in self.figure.axes:
+            box = axes.get_position()
+            axes.set_position((box.x0, box.y0 * ratio, box.width, box.height * ratio))
+        for text in self.figure.texts:
+            text.set_y(text.get_position()[1] * ratio)
 
     def legend(self, handles: Sequence[Artist]) -> None:
         """Add one legend for the whole figure in the bottom margin, in as many rows as it needs."""

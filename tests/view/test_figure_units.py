@@ -107,3 +107,32 @@ def test_a_section_has_both_components_converted():
 
 def test_lists_of_units_are_checked():
     assert listed("rpm, deg") == ["rpm", "deg"] and listed(("mm",)) == ["mm"]
+
+
+@pytest.mark.parametrize(
+    ("periods", "label", "largest"),
+    [(2, "growth per turn, natural logarithm of the factor", 2 * np.log(1.25)),
+     (0, "$\\log_{10}$ of the spectral radius", np.log10(1.25))],
+)  # fmt: skip
+def test_growth_without_a_speed_in_rpm_is_per_turn_or_period(periods, label, largest):
+    figure = plot(chart(periods_per_turn=periods))
+    bar = next(axes for axes in figure.axes if axes.get_label() == "colour bar")
+    assert bar.get_ylabel().replace("\n", " ") == label
+    assert figure.axes[1].collections[0].get_array().max() == pytest.approx(largest, rel=1e-12)
+    assert 0.0 in bar.get_yticks()
+
+
+def test_growth_at_a_speed_in_rpm_is_per_second():
+    """rho = 1.25 in half a turn at 60 rpm: twice a second."""
+    dataset = chart(periods_per_turn=2)
+    unstable = dataset["spectral_radius"].values == 1.25
+    dataset = dataset.assign_coords(
+        Omega=("Omega", 60 * dataset["Omega"].values, {"units": "rpm", "long_name": "speed"})
+    )
+    figure = plot(dataset, units="Hz")
+    assert "rate of growth [1/s]" in [axes.get_ylabel() for axes in figure.axes]
+    hertz = np.broadcast_to(dataset["Omega"].values / 60, unstable.shape)
+    found = figure.axes[1].collections[0].get_array()
+    np.testing.assert_allclose(found[unstable], 2 * np.log(1.25) * hertz[unstable], rtol=1e-12)
+    curve = plot(dataset.isel(beta=-1)).axes[0].lines[0].get_ydata()
+    np.testing.assert_allclose(curve[unstable[-1]], (2 * np.log(1.25) * hertz)[-1][unstable[-1]], rtol=1e-12)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
+
 import matplotlib
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from drivetrain_jax.view import cells, plot
 from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import STYLE
+from tests.view import results
 
 
 def drawn(panels: Panels) -> Panels:
@@ -79,3 +84,22 @@ def test_a_legend_has_the_rows_that_it_needs(count, rows):
     (legend,) = panels.figure.legends
     heights = {round(text.get_window_extent().y0) for text in legend.get_texts()}
     assert len(heights) == rows and legend.get_window_extent().x1 <= panels.figure.bbox.x1
+
+
+def test_a_long_caption_stays_clear_of_the_labels_of_the_resonances():
+    fixed = {f"x_{k}": {"value": 123.456 + k, "units": "kg"} for k in range(9)}
+    figure = plot(results.chart().assign_attrs(fixed_parameters=json.dumps(fixed)))
+    (caption,) = (text for text in figure.texts if "kg" in text.get_text())
+    assert caption.get_text().count("\n") == 1
+    top = max(label.get_window_extent().y1 for label in figure.axes[0].texts)
+    assert caption.get_window_extent().y0 > top
+    assert figure.axes[0].get_position().height * figure.get_figheight() == pytest.approx(2.45)
+
+
+def test_a_million_on_a_logarithmic_axis_is_a_power_of_ten():
+    axes = Figure().add_subplot()
+    axes.set(xscale="log", xlim=(1e-2, 1e6))
+    cells.plain_decades(axes, "x")
+    axes.figure.draw_without_rendering()
+    labels = [label.get_text() for label in axes.get_xticklabels()]
+    assert "$\\mathdefault{10^{6}}$" in labels and not any("e+" in label for label in labels)

@@ -21,6 +21,7 @@ from drivetrain_jax.view import boundary_curves as boundaries
 from drivetrain_jax.view import cells
 from drivetrain_jax.view import resonance_lines as resonances
 from drivetrain_jax.view.figure_layout import Margins, Panels
+from drivetrain_jax.view.growth import draw_growth, draw_limit, growth_of
 from drivetrain_jax.view.style import (
     FRAME_GREY,
     LINE_COLOURS,
@@ -45,8 +46,8 @@ def plot(dataset: xr.Dataset) -> Figure:
     """The chart of a ``floquet`` result, by number of swept axes.
 
     - none: the multipliers in the complex plane;
-    - one: the distance of the spectral radius from 1 with its error band;
-    - two: regions of the verdict and a map of ``log10(spectral radius)`` with its contour at 0, if stored;
+    - one: the rate of growth, or the distance of the spectral radius from 1, with its error band;
+    - two: regions of the verdict and a map of the growth (per second, turn or period) with its contour at 0, if stored;
     - more: regions of the verdict for the first, middle and last value of two further axes;
     - ``[points]``: the points coloured by their verdict.
 
@@ -75,10 +76,11 @@ def _chart(dataset: xr.Dataset, names: list[str]) -> Figure:
             cells.draw_states(axes, dataset, horizontal, vertical)
             handles += cells.state_legend(dataset)
             handles += boundaries.draw(axes, dataset, horizontal, vertical)
+            _draw_limit(axes, dataset, horizontal, vertical)
         else:
-            radius = dataset[name].where(dataset["outcome"] < FIRST_FAILURE)
-            mesh, label, extend = cells.draw_growth(axes, radius, horizontal, vertical)
-            panels.colorbar(axes, mesh, label, extend=extend)
+            mesh, label, bar = draw_growth(axes, dataset, _radius(dataset), horizontal, vertical)
+            panels.colorbar(axes, mesh, label, **bar)
+            boundaries.draw_curves(axes, dataset, horizontal, vertical)
     # Only over the upper panel, so that narrow tongues stay visible in the map below.
     lines = resonances.predictions(dataset, horizontal, vertical)
     handles += resonances.draw(panels.axes[0][0], lines, below="verdict" in shown)
@@ -89,17 +91,29 @@ def _chart(dataset: xr.Dataset, names: list[str]) -> Figure:
     return panels.figure
 
 
+def _radius(dataset: xr.Dataset) -> xr.DataArray:
+    return dataset["spectral_radius"].where(dataset["outcome"] < FIRST_FAILURE)
+
+
+def _draw_limit(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> None:
+    """Draw the interpolated limit of stability over the cells of the verdict, as over those of the growth."""
+    if "spectral_radius" in dataset:
+        draw_limit(axes, dataset, _radius(dataset), horizontal, vertical)
+
+
 def _curve(dataset: xr.Dataset, name: str, marker: str = "") -> Figure:
     cells.require_any(dataset, "spectral_radius")
     panels = Panels(height=3.0, margins=Margins(right=0.3))
     axes = panels.axes[0][0]
     x, radius = dataset[name].values, dataset["spectral_radius"]
-    excess = radius - 1
-    handles = axes.plot(
-        x, excess, color=LINE_COLOURS[0], marker=marker, markersize=3, label="spectral radius", zorder=3
-    )
+    growth = growth_of(dataset)
+    known = growth.label.endswith("[1/s]")
+    excess, label = (growth.of(radius), growth.label) if known else (radius - 1, f"{variable_label(radius)} minus 1")
+    entry = "rate of growth" if known else "spectral radius"
+    handles = axes.plot(x, excess, color=LINE_COLOURS[0], marker=marker, markersize=3, label=entry, zorder=3)
     if "spectral_radius_error" in dataset:
-        error = dataset["spectral_radius_error"]
+        # The derivative of the logarithm is 1 near the limit of stability.
+        error = dataset["spectral_radius_error"] * (growth.factor if known else 1.0)
         band = axes.fill_between(
             x, excess - error, excess + error, color=LINE_COLOURS[0], alpha=0.3, linewidth=0, label="error band"
         )
@@ -115,7 +129,7 @@ def _curve(dataset: xr.Dataset, name: str, marker: str = "") -> Figure:
         handles += cells.state_legend(dataset)
     lines = resonances.predictions(dataset, name)
     resonances.draw(axes, lines)
-    panels.label_axes(axis_label(dataset[name]), f"{variable_label(radius)} minus 1")
+    panels.label_axes(axis_label(dataset[name]), label)
     resonances.label(axes, lines)
     panels.titles(dataset)
     panels.legend(handles)
@@ -165,6 +179,7 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
             _draw_radius(panels, axes, panel, dataset, (horizontal, vertical))
         else:
             cells.draw_states(axes, panel, horizontal, vertical)
+            _draw_limit(axes, panel, horizontal, vertical)
         lines = resonances.predictions(panel, horizontal, vertical)
         predicted = max(predicted, resonances.draw(axes, lines, below=not plain), key=len)
         first_row = axes in panels.axes[0]

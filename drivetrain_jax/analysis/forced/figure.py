@@ -16,6 +16,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
 from drivetrain_jax.view import resonance_lines as resonances
 from drivetrain_jax.view.figure_layout import Margins, Panels
+from drivetrain_jax.view.growth import draw_growth
 from drivetrain_jax.view.style import (
     FRAME_GREY,
     LINE_COLOURS,
@@ -114,8 +115,8 @@ def _maps(dataset: xr.Dataset, names: list[str], shown: list[str]) -> Figure:
     panels = Panels(len(fields), height=_HEIGHT, margins=Margins(right=1.15))
     for (axes,), field in zip(panels.axes, fields, strict=True):
         if field.name == "orbit_spectral_radius":
-            mesh, label, extend = cells.draw_growth(axes, field, horizontal, vertical)
-            panels.colorbar(axes, mesh, label, extend=extend)
+            mesh, label, bar = draw_growth(axes, dataset, field, horizontal, vertical)
+            panels.colorbar(axes, mesh, label, **bar)
         else:
             mesh = _draw_decades(axes, field, horizontal, vertical)
             panels.colorbar(axes, mesh, variable_label(field))

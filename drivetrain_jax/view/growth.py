@@ -1,0 +1,89 @@
+"""Spectral radii as growth: per second where the speed is known, per turn of the shaft, else per period."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import LinearSegmentedColormap, SymLogNorm
+
+from drivetrain_jax.view.cells import FAILED, draw_cells, role
+from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS
+from drivetrain_jax.view.units import size
+
+# Position between largest decay (-1), none (0) and largest growth (1), and colour; lightness falls monotonically. White is
+# reserved for cells without a value.
+_COLOURS = (
+    (-1.0, "#fbfce0"),
+    (-0.5, "#a9dcc3"),
+    (0.0, "#86b1d6"),
+    (0.12, "#d98e48"),
+    (0.5, "#b8432f"),
+    (1.0, "#2d0a2b"),
+)
+
+
+class Growth(NamedTuple):
+    """``values = factor ln(spectral radius)`` with their ``label``; colours are linear below ``linear`` and end at
+    ``largest``, the same in every figure."""
+
+    factor: xr.DataArray | float
+    label: str
+    linear: float
+    largest: float
+
+    def of(self, radius: xr.DataArray) -> Any:
+        """The growth that a spectral radius means; a radius of 0 is infinite decay."""
+        with np.errstate(divide="ignore"):
+            return np.log(radius) * self.factor
+
+    def norm(self) -> SymLogNorm:
+        """The scale of the colours."""
+        return SymLogNorm(self.linear, linscale=0.5, vmin=-self.largest, vmax=self.largest, base=10)
+
+
+def growth_of(dataset: xr.Dataset) -> Growth:
+    """The growth of small disturbances in ``dataset``, in the most useful unit that its parameters allow."""
+    periods, speed = dataset.attrs.get("periods_per_turn", 0), role(dataset, "speed")
+    axis = dataset.coords.get(speed)
+    turns = None if axis is None else size(str(axis.attrs.get("units", "1")), "rps")
+    if periods and axis is not None and turns is not None:
+        return Growth(axis * turns * periods, "rate of growth [1/s]", 1e-3, 1e2)
+    if periods:
+        return Growth(float(periods), "growth per turn, natural logarithm of the factor", 1e-6, 1e1)
+    return Growth(1 / np.log(10), "$\\log_{10}$ of the spectral radius", 1e-6, 1.0)
+
+
+def draw_growth(
+    axes: Axes, dataset: xr.Dataset, radius: xr.DataArray, horizontal: str, vertical: str
+) -> tuple[QuadMesh, str, dict[str, Any]]:
+    """Draw the growth that ``radius`` means as cells, with its contour at 0; returns label and options of its colour bar.
+
+    A colour means the same growth in every figure with the same label. Pale yellow, green and blue are decay, from fast to
+    none; orange to black is growth. Missing values have the colour of failed cells.
+    """
+    growth = growth_of(dataset)
+    low, high, values = -growth.largest, growth.largest, growth.of(radius)
+    cmap = LinearSegmentedColormap.from_list("growth", [((1 + x) / 2, colour) for x, colour in _COLOURS], N=1024)
+    cmap = cmap.with_extremes(bad=STATE_COLOURS[FAILED])
+    below, above = bool((values < low).any()), bool((values > high).any())
+    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
+    # A radius of 0 is the fastest decay, not a missing value.
+    mesh = draw_cells(axes, values.clip(low, high), horizontal, vertical, cmap=cmap, norm=growth.norm())
+    draw_limit(axes, dataset, radius, horizontal, vertical)
+    decades = 10.0 ** np.arange(np.log10(growth.linear) + 1, np.log10(high) + 0.5)
+    return mesh, growth.label, {"extend": extend, "ticks": [*-decades[::-1], 0.0, *decades]}
+
+
+def draw_limit(axes: Axes, dataset: xr.Dataset, radius: xr.DataArray, horizontal: str, vertical: str) -> None:
+    """Draw the contour of no growth between the cells, unless the boundaries of ``dataset`` are traced."""
+    growth = growth_of(dataset)
+    # On the scale of the colours, so that the contour runs halfway between cells of slow decay and of fast growth.
+    field = growth.of(radius).clip(-growth.largest, growth.largest).transpose(vertical, horizontal)
+    height = growth.norm()(field.values) - 0.5
+    if dataset.sizes.get("boundary") or min(height.shape) < 2 or not (np.nanmin(height) < 0 < np.nanmax(height)):
+        return
+    axes.contour(field[horizontal], field[vertical], height, [0.0], colors=FRAME_GREY, linewidths=0.5)
