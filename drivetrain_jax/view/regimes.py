@@ -72,6 +72,21 @@ def draw_bands(dataset: xr.Dataset, name: str, *panels: Axes) -> list[Patch]:
     ]
 
 
+def draw_sweep_strips(axes: Axes, dataset: xr.Dataset, name: str) -> list[Patch]:
+    """Draw the regimes of both sweeps above the panel, if stored; returns legend entries of the regimes that occur."""
+    if "regime" not in dataset:
+        return []
+    style = {"cmap": ListedColormap(COLOURS, name="regimes"), "vmin": -0.5, "vmax": FAILED + 0.5}
+    codes = dataset["regime"].where(dataset["outcome"] < FIRST_FAILURE, FAILED).sortby(name)
+    for foot, direction in ((1.01, "down"), (1.055, "up")):
+        cells.draw_strip(axes, codes.sel(sweep_direction=direction), name, (foot, foot + 0.035), **style)
+        place = {"transform": axes.transAxes, "va": "center", "size": 6.5, "color": FRAME_GREY}
+        axes.text(1.005, foot + 0.0175, direction, **place)
+    present = np.unique(codes.values).astype(int)
+    frame = {"edgecolor": FRAME_GREY, "linewidth": 0.6}
+    return [Patch(facecolor=COLOURS[k], label=_NAMES[k], **frame) for k in present if k < FAILED]
+
+
 def half_play(dataset: xr.Dataset) -> float | None:
     """Half the play in the units of the displacement, or None if it is unknown or varies."""
     play = cells.role(dataset, "half_play")

@@ -7,10 +7,11 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.collections import QuadMesh
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.frequency_response import figure as frequency_response
-from drivetrain_jax.view import plot
+from drivetrain_jax.view import plot, regimes
 
 OMEGA = np.linspace(0.5, 1.5, 41)
 
@@ -166,3 +167,30 @@ def test_every_phase_lies_within_its_panel(phase, ticks):
     assert drawn.size and ((low < drawn) & (drawn < high)).all()
     np.testing.assert_allclose(np.exp(1j * drawn), np.exp(1j * phase), atol=1e-12)
     assert len(axes.get_yticks()) == ticks and (phase < -0.01) == (drawn.min() > np.pi + 0.01)
+
+
+def test_motions_that_are_not_periodic_are_dots_and_not_unstable():
+    """The exact sweeps flag them as unstable, because they have no stability of their own."""
+    dataset = line("exact", branches=False)
+    wandering = np.stack([(OMEGA > 0.6) & (OMEGA < 0.7), np.zeros(len(OMEGA), bool)], axis=1)
+    dims = ("omega", "sweep_direction")
+    dataset["regime"] = variable(dims, np.where(wandering, 3, 1).astype("int8"), "1")
+    dataset["stability"] = variable(dims, wandering.astype("int8"), "1")
+    figure = plot(dataset)
+    axes = figure.axes[0]
+    assert all(np.isnan(item.get_ydata()).all() for item in lines_of(axes, "--"))
+    amber = regimes.COLOURS[regimes.NON_PERIODIC]
+    dots = [item for item in axes.lines if item.get_color() == amber]
+    drawn = np.concatenate([item.get_ydata() for item in dots])
+    np.testing.assert_allclose(np.sort(drawn[np.isfinite(drawn)]), OMEGA[wandering[:, 0]])
+    assert {"non-periodic", "single-sided"} <= {text.get_text() for text in figure.legends[0].get_texts()}
+
+
+def test_regimes_of_both_sweeps_are_strips_and_half_the_backlash_a_line():
+    dataset = with_fixed(line("exact"), b=0.3)
+    codes = np.stack([np.where(OMEGA < 1.2, 2, 1), np.where(OMEGA < 0.8, 2, 1)], axis=1).astype("int8")
+    dataset["regime"] = variable(("omega", "sweep_direction"), codes, "1")
+    axes = plot(dataset.assign_attrs(roles='{"speed": "omega", "half_play": "b"}')).axes[0]
+    strips = [each.get_array().ravel().tolist() for each in axes.collections if isinstance(each, QuadMesh)]
+    assert strips == [codes[:, 1].tolist(), codes[:, 0].tolist()]
+    assert [item.get_ydata()[0] for item in axes.lines if item.get_label() == "half the backlash"] == [0.3]

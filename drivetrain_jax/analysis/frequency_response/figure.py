@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import matplotlib
 import numpy as np
 import xarray as xr
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.frequency_response import maps as rattle_maps
-from drivetrain_jax.view import cells
+from drivetrain_jax.view import cells, regimes
 from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STYLE, axis_label, in_brackets, units_of
 from drivetrain_jax.view.units import suitable, value_in
@@ -112,7 +113,7 @@ def _fixed_values(result: xr.Dataset) -> dict[str, object]:
 
 def _lines(results: list[xr.Dataset]) -> Figure:
     with_phase = all("phase" in each for each in results)
-    panels = Panels(1 + with_phase, height=_HEIGHT, margins=Margins(right=0.25, top=0.73), share_y=False)
+    panels = Panels(1 + with_phase, height=_HEIGHT, margins=Margins(right=0.4, top=0.73), share_y=False)
     upper = panels.axes[0][0]
     order = list(_METHODS)
     handles = []
@@ -128,6 +129,8 @@ def _lines(results: list[xr.Dataset]) -> Figure:
     upper.set_ylim(0, None)
     handles += _draw_missing(upper, results)
     handles += _draw_backbones(upper, results)
+    handles += _draw_wandering(upper, results)
+    handles += _draw_contact(upper, results)
     cells.fit_axis(upper, "x", np.unique(np.concatenate([_along(r).values for r in results])))
     panels.label_row(upper, f"half the peak-to-peak displacement [{units_of(results[0]['u_max'])}]")
     if with_phase:
@@ -163,6 +166,9 @@ def _draw_sweeps(
         unstable = np.zeros(y.shape, bool)
         if "stability" in result:
             unstable = result["stability"].sel(sweep_direction=direction).values == _UNSTABLE
+        # A motion that is not periodic has no stability; its extremes are dots.
+        wandering = _wandering(result).sel(sweep_direction=direction).values
+        unstable, y = unstable & ~wandering, np.where(wandering, np.nan, y)
         for kind, style in ((~unstable, "-"), (unstable, DASHES)):
             broken = _broken(omega, np.where(_grown(kind), y, np.nan), jumps[direction])
             axes.plot(*broken, color=look.colour, linewidth=look.width, linestyle=style, solid_capstyle="butt")
@@ -241,6 +247,34 @@ def _draw_backbones(axes: Axes, results: list[xr.Dataset]) -> list[Line2D]:
         line = _broken(_along(each).values, amplitude, np.abs(np.diff(amplitude)) > height)
         axes.plot(*line, **style, color=_METHODS[each.attrs["method"]].colour, scaley=False)
     return [Line2D([], [], **style, color=FRAME_GREY, label="backbone")] if with_backbone else []
+
+
+def _wandering(result: xr.Dataset) -> xr.DataArray:
+    """True where a sweep met a motion that is not periodic."""
+    return result["regime"] == regimes.NON_PERIODIC if "regime" in result else result["u_max"].isnull() & False
+
+
+def _draw_wandering(axes: Axes, results: list[xr.Dataset]) -> list[Line2D]:
+    """Draw dots for motions that are not periodic; returns their legend entry."""
+    style = {"linestyle": "", "marker": "o", "markersize": 2.0, "color": regimes.COLOURS[regimes.NON_PERIODIC]}
+    found = False
+    for each in results:
+        amplitude = ((each["u_max"] - each["u_min"]) / 2).where(_wandering(each))
+        for direction in _DIRECTIONS if bool(amplitude.notnull().any()) else ():
+            axes.plot(_along(each), amplitude.sel(sweep_direction=direction), **style)
+            found = True
+    return [Line2D([], [], **style, label="non-periodic")] if found else []
+
+
+def _draw_contact(axes: Axes, results: list[xr.Dataset]) -> list[Artist]:
+    """Draw the regimes of the most exact result above the panel, and half the backlash as a line."""
+    order = list(_METHODS)
+    best = max(results, key=lambda r: order.index(r.attrs.get("method", "exact")))
+    handles: list[Artist] = [*regimes.draw_sweep_strips(axes, best, _path(best))]
+    if (half := regimes.half_play(best)) is not None:
+        style = {"color": "#a8a8a8", "linewidth": 0.9, "zorder": 0.5, "label": "half the backlash"}
+        handles.append(axes.axhline(half, **style))
+    return handles
 
 
 def _draw_missing(axes: Axes, results: list[xr.Dataset]) -> list[Line2D]:
