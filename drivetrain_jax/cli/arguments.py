@@ -158,7 +158,11 @@ def _add_plot(subparsers: Any) -> None:
         "files", metavar="FILE.nc", type=_path, nargs="+", help="results; several methods of one analysis are overlaid"
     )
     command.add_argument(
-        "--out", required=True, metavar="FIGURE", type=_path, help="figure to write (.png, .pdf, .svg)"
+        "--out",
+        required=True,
+        metavar="FIGURE",
+        type=_path,
+        help="figure (.png, .pdf, .svg) or table of constants (.txt, .csv)",
     )
     command.add_argument(
         "--part", nargs="+", default=[], metavar="name=LOW:HIGH", help="part of an atlas: ranges, or name=value"

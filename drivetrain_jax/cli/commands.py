@@ -18,6 +18,8 @@ from drivetrain_jax.cli.signals import stop_on_signals
 from drivetrain_jax.cli.values import assignments, ranges
 
 _FIGURES = (".png", ".pdf", ".svg")
+# Tables of constants, and their separators.
+_TABLES = {".txt": "", ".csv": ","}
 _PAGES = (".html", ".htm")
 
 
@@ -143,11 +145,17 @@ def export(options: argparse.Namespace) -> int:
 
 
 def plot(options: argparse.Namespace) -> int:
-    """Draw the figure of one result, or of several results together."""
+    """Draw the figure of one result or of several results together, or write a table of constants."""
     from drivetrain_jax.datasets.figure import plot
     from drivetrain_jax.store.checksums import refuse_damaged
 
-    _check_place(options.out, _FIGURES)
+    _check_place(options.out, (*_FIGURES, *_TABLES))
+    ending = options.out.suffix.lower()
+    if ending in _TABLES:
+        from drivetrain_jax.datasets.figure import table
+
+        _write(options.out, table(options.files[0], options.units, _TABLES[ending]).encode())
+        return OK
     part = ranges(options.part, "--part") or None
     try:
         figure = plot(options.files, part=part, cells=options.cells, units=options.units)

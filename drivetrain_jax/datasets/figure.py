@@ -67,6 +67,16 @@ def plot(
     return _drawn([_loaded(dataset) for dataset in datasets], asked)
 
 
+def table(path: Path, units: str | None, separator: str = "") -> str:
+    """The constants of a single point as a table of text; raises :class:`InputError` for any other result."""
+    dataset = _loaded(_dataset(path))
+    if dataset.attrs.get("analysis") != "parameters":
+        raise InputError(f"file = {str(path)!r}: has a figure; allowed is a name that ends in .png, .pdf, .svg")
+    from drivetrain_jax.analysis.parameters.figure import table as written
+
+    return written(in_units(in_given_units(dataset), [] if units is None else listed(units)), separator)
+
+
 def _drawn(datasets: list[xr.Dataset], asked: list[str]) -> Figure:
     """The figure of ``datasets``, with axes in the units ``asked`` for, else in those of the scene."""
     datasets = [_with_resonances(in_physical_data(each, asked) if asked else each) for each in datasets]

@@ -11,7 +11,7 @@ import xarray as xr
 from matplotlib.colors import ListedColormap
 
 from drivetrain_jax.view.prefixes import prefixed
-from drivetrain_jax.view.units import unit_of, written_units
+from drivetrain_jax.view.units import SUPERSCRIPTS, unit_of, written_units
 
 # Passed to rc_context around every figure; global rcParams stay unchanged.
 STYLE: dict[Any, Any] = {
@@ -65,8 +65,8 @@ def symbol(name: str) -> str:
     """
     if match := re.fullmatch(r"(.+)\[(\d+)\]", name):
         head, number = symbol(match[1]), match[2]
-        if head == match[1]:
-            return name
+        if not head.endswith("$"):
+            return f"{head}[{number}]"
         return f"{head[:-2]},{number}}}$" if head.endswith("}$") else f"{head[:-1]}_{{{number}}}$"
     if name in _PRODUCTS:
         return _PRODUCTS[name]
@@ -78,7 +78,7 @@ def symbol(name: str) -> str:
         return rf"${head}_{{{index}}}$" if index else f"${head}$"
     if match := re.fullmatch(r"([A-Za-z])_([a-z]{3,})", name):
         return rf"${match[1]}_{{\mathrm{{{match[2]}}}}}$"
-    return name
+    return name.replace("_", " ")
 
 
 def state(dataset: xr.Dataset) -> list[dict[str, Any]]:
@@ -121,8 +121,17 @@ def value_text(name: str, value: object, units: str = "1") -> str:
     factor, units = prefixed([entry for entry in entries if isinstance(entry, (int, float))], units)
     end = f" {written_units(units)}" if units not in ("1", "") else ""
     digits = "{:.5g}" if entries is value else "{:.6g}"
-    text = ", ".join(digits.format(x / factor) if isinstance(x, (int, float)) else str(x) for x in entries)
+    text = ", ".join(
+        power_of_ten(digits.format(x / factor)) if isinstance(x, (int, float)) else str(x) for x in entries
+    )
     return f"{symbol(name)} = [{text}]{end}" if entries is value else f"{symbol(name)} = {text}{end}"
+
+
+def power_of_ten(number: str) -> str:
+    """``1.5×10⁻⁵`` for ``1.5e-05``."""
+    digits, e, exponent = number.partition("e")
+    power = str(int(exponent)).translate(SUPERSCRIPTS) if e else ""
+    return f"{digits}×10{power}" if e else number
 
 
 def coordinate_text(coordinate: xr.DataArray) -> str:

@@ -18,12 +18,12 @@ from drivetrain_jax._errors import InputError
 
 # The attribute with the units asked for, and the mark of a converted variable, which takes no further prefix.
 ASKED, CONVERTED = "figure_units", "converted"
-_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def written_units(units: str) -> str:
     """A unit of UDUNITS in common notation: ``kg m²`` for ``kg m2``."""
-    return re.sub(r"(?<=[A-Za-z])-?\d+", lambda power: power[0].translate(_SUPERSCRIPTS), units)
+    return re.sub(r"(?<=[A-Za-z])-?\d+", lambda power: power[0].translate(SUPERSCRIPTS), units)
 
 
 def listed(units: str | Sequence[str]) -> list[str]:

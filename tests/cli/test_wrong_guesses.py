@@ -60,7 +60,7 @@ GUESSES = [
     ("plot r.nc --out r.png", "file = 'r.nc': does not exist"),
     ("plot scene.toml --out r.png", "scene.toml"),
     ("plot r.nc --output r.png", "did you mean --out?"),
-    ("plot r.nc --out r.txt", "allowed is a name that ends in .png, .pdf, .svg"),
+    ("plot r.nc --out r.doc", "allowed is a name that ends in .png, .pdf, .svg"),
     ("plot r.nc --out r", "allowed is a name that ends in .png, .pdf, .svg"),
     ("status scene.toml", "--out: missing"),
     ("verify scene.toml", "scene.toml"),

@@ -100,7 +100,7 @@ def test_a_section_has_both_components_converted():
     drawn = panel(figure).collections[0].get_offsets()
     np.testing.assert_allclose(drawn, points * [180 / np.pi, 30 / np.pi], rtol=1e-12)
     assert {"phi at the strobes [deg]", "v at the strobes [rpm]"} <= set(texts(figure))
-    assert "distance from a smooth curve 1.0e-03 of the largest value" in [
+    assert "distance from a smooth curve 1.0×10⁻³ of the largest value" in [
         text.get_text() for text in panel(figure).texts
     ]
 

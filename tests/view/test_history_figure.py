@@ -110,7 +110,7 @@ def test_a_long_caption_stays_in_the_figure():
         ("m_p[1]", "$m_{p,1}$"),
         ("EI[0]", "$EI_{0}$"),
         ("m_joint[1]", r"$m_{\mathrm{joint},1}$"),
-        ("planet_angle[1]", "planet_angle[1]"),
+        ("planet_angle[1]", "planet angle[1]"),
     ],
 )
 def test_greek_letters_with_an_index(name, text):

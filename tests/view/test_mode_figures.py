@@ -115,7 +115,7 @@ def test_the_caption_says_which_angle_varies(name, attrs):
     swept[name].attrs.update(attrs)
     figure = plot(swept)
     texts = [text.get_text() for text in figure.texts]
-    assert "planet_angle = [0, varies, 4] rad" in texts and any("planet_angle[1]" in text for text in texts)
+    assert "planet angle = [0, varies, 4] rad" in texts and any("planet angle[1]" in text for text in texts)
 
 
 def test_displacements_are_scaled_together():

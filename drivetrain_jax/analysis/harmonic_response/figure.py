@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import matplotlib
 import numpy as np
 import xarray as xr
@@ -15,6 +17,18 @@ from drivetrain_jax.view.style import LINE_COLOURS, STYLE, axis_label, in_bracke
 
 _HEIGHT, _ROUNDING = 1.5, 1e-12
 _COLOURS = (*LINE_COLOURS, "#3f8f5f", "#7a4fa0", "#999933", "#333333", "#a0308c")
+
+# Bodies and coordinates of the gear by the letters in the names of the coordinates.
+_BODIES = {"c": "carrier", "r": "ring", "s": "sun"}
+_KINDS = {
+    "x": "translation $x$",
+    "y": "translation $y$",
+    "u": "rotation times base radius $u$",
+    "xi": r"radial motion $\xi$",
+    "eta": r"tangential motion $\eta$",
+}
+# Widths of the thinnest line and of the steps to those below, so that equal curves stay visible.
+_THIN, _WIDER = 0.9, 0.8
 
 
 def plot(dataset: xr.Dataset) -> Figure:
@@ -42,7 +56,10 @@ def _lines(dataset: xr.Dataset) -> Figure:
         kinds.setdefault(str(dof).partition("_")[0], []).append(str(dof))
     panels = Panels(len(kinds), height=_HEIGHT, margins=Margins(right=0.3, left=0.95, label=0.6), share_y=False)
     bodies = list(dict.fromkeys(dof.partition("_")[2] for dofs in kinds.values() for dof in dofs))
-    colours = {body: _COLOURS[i % len(_COLOURS)] for i, body in enumerate(bodies)}
+    colours: dict[str, Any] = {body: _COLOURS[i % len(_COLOURS)] for i, body in enumerate(bodies)}
+    planets = [body for body in bodies if body not in _BODIES]
+    # The lowest and widest lines are the lightest.
+    colours |= dict(zip(planets, matplotlib.colormaps["viridis_r"](np.linspace(0.05, 1.0, len(planets))), strict=True))
     handles: dict[str, Artist] = {}
     # The amplitude of a coordinate that does not respond is rounding.
     smallest = _ROUNDING * float(amplitude.max())
@@ -50,10 +67,11 @@ def _lines(dataset: xr.Dataset) -> Figure:
         for dof in dofs:
             body = dof.partition("_")[2]
             values = amplitude.sel(dof=dof).where(lambda x: x > smallest)
-            (handles[body],) = axes.semilogy(
-                amplitude["frequency"], values, color=colours[body], label=body, linewidth=0.9
-            )
-        panels.label_row(axes, f"{kind}{in_brackets(units_of(amplitude))}")
+            below = len(planets) - 1 - planets.index(body) if body in planets else 0
+            style = {"color": colours[body], "linewidth": _THIN + _WIDER * below}
+            name = _BODIES.get(body) or (f"planet {body}" if body.isdigit() else body)
+            (handles[body],) = axes.semilogy(amplitude["frequency"], values, label=name, **style)
+        panels.label_row(axes, f"{_KINDS.get(kind, kind)}{in_brackets(units_of(amplitude))}")
     panels.axes[0][0].set_xlim(*amplitude["frequency"].values[[0, -1]])
     panels.label_axes(axis_label(amplitude["frequency"]))
     panels.titles(dataset)

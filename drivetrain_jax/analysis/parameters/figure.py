@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 
 import matplotlib
@@ -13,8 +14,17 @@ from matplotlib.figure import Figure
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import cells
-from drivetrain_jax.view.figure_layout import DPI, WIDTH, Margins, NotebookFigure, Panels, write_title
-from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, axis_label, caption, units_of, variable_label
+from drivetrain_jax.view.figure_layout import DPI, WIDTH, Margins, NotebookFigure, Panels, shown_title, write_title
+from drivetrain_jax.view.style import (
+    FRAME_GREY,
+    LINE_COLOURS,
+    STYLE,
+    axis_label,
+    caption,
+    power_of_ten,
+    units_of,
+    variable_label,
+)
 
 _HEIGHT, _MOST_CURVES = 1.8, 8
 # Least range of a vertical axis relative to its values.
@@ -82,21 +92,43 @@ def _table(dataset: xr.Dataset, shown: list[str]) -> Figure:
     for k, (label, number, unit) in enumerate(lines):
         y = 1 - (top + _ROW * k) / height
         figure.text(left, y, label, va="center")
-        figure.text(value, y, number, va="center", ha="right")
+        figure.text(value, y, power_of_ten(number), va="center", ha="right")
         figure.text(units, y, unit, va="center", color=FRAME_GREY)
     return figure
 
 
-def _lines(variable: xr.DataArray) -> list[tuple[str, str, str]]:
+def table(dataset: xr.Dataset, separator: str = "") -> str:
+    """The table of a single point as text: aligned under title and parameters, or ``name,value,units`` with a separator.
+
+    Raises :class:`InputError` for a result over an axis.
+    """
+    dataset = cells.prepare(dataset)
+    shown = [str(name) for name in dataset.data_vars if name != "outcome"]
+    if cells.sweep_axes(dataset) or not shown:
+        raise InputError(f"axes = {cells.described_axes(dataset)}: no table; allowed is a figure (.png, .pdf, .svg)")
+    if separator:
+        rows = [("name", "value", "units"), *(row for name in shown for row in _lines(dataset[name], ".17g"))]
+        return "".join(f"{separator.join(_quoted(cell, separator) for cell in row)}\n" for row in rows)
+    lines = [line for name in shown for line in _lines(dataset[name])]
+    widths = [max(len(line[k]) for line in lines) for k in (0, 1)]
+    head = [shown_title(dataset), re.sub(r"[$\\{}]|mathrm", "", caption(dataset)), ""]
+    return "\n".join([*head, *(f"{n:<{widths[0]}}  {v:>{widths[1]}}  {u}".rstrip() for n, v, u in lines), ""])
+
+
+def _quoted(cell: str, separator: str) -> str:
+    return f'"{cell}"' if separator in cell else cell
+
+
+def _lines(variable: xr.DataArray, digits: str = ".6g") -> list[tuple[str, str, str]]:
     """Name, value and unit of a constant, one line for each entry of its own dimension."""
     label = str(variable.attrs.get("long_name", variable.name))
     units = units_of(variable)
     units = "" if units == "1" else units
     if not variable.dims:
-        return [(label, f"{variable.item():.6g}", units)]
+        return [(label, f"{variable.item():{digits}}", units)]
     (own,) = variable.dims
     entries = variable[own].values if own in variable.coords else np.arange(variable.size)
     return [
-        (f"{label}, {own} {entry}", f"{value:.6g}", units)
+        (f"{label}, {own} {entry}", f"{value:{digits}}", units)
         for entry, value in zip(entries, variable.values, strict=True)
     ]

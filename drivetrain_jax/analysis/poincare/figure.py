@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.figure_layout import Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, coordinate_text, in_brackets, state
+from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, coordinate_text, in_brackets, power_of_ten, state
 
 _FIRST = 1000
 _MOST_ROWS = 6
@@ -60,7 +60,8 @@ def _draw_row(row: list[Axes], part: xr.Dataset, name: str | None) -> None:
         axes.tick_params(labelbottom=True)
     notes = [coordinate_text(part[name])] if name else []
     if "torus_residual" in part:
-        notes.append(f"distance from a smooth curve {np.max(part['torus_residual'].values):.1e} of the largest value")
+        distance = power_of_ten(f"{np.max(part['torus_residual'].values):.1e}")
+        notes.append(f"distance from a smooth curve {distance} of the largest value")
     if "distinct_points" in part and part["distinct_points"].item():
         notes.append(f"distinct points: {part['distinct_points'].item()}")
     row[0].text(0.0, 1.08, "; ".join(notes), transform=row[0].transAxes, color=FRAME_GREY, size=7.5)
