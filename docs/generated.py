@@ -38,6 +38,7 @@ ATTRIBUTES = {
     "title": "title of the scene, or of its system and analysis",
     "system": "name of the system",
     "roles": "parameters that are the speed, the angle, the damping, ... (JSON)",
+    "periods_per_turn": "periods of the motion of a system in one turn of its shaft",
     "state": "name, unit, meaning, symbol and scale of every component of the system's state (JSON)",
     "resonance_families": "prefix of the labels, name and line style of the families of predicted resonances (JSON)",
     "analysis": "name of the analysis",
