@@ -7,7 +7,7 @@ import io
 import os
 import sys
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -154,20 +154,23 @@ def plot(options: argparse.Namespace) -> int:
     if ending in _TABLES:
         from drivetrain_jax.datasets.figure import table
 
-        _write(options.out, table(options.files[0], options.units, _TABLES[ending]).encode())
+        with _reading(options.files[0]):
+            text = table(options.files[0], options.units, _TABLES[ending])
+        _write(options.out, text.encode())
         return OK
     part = ranges(options.part, "--part") or None
-    try:
-        figure = plot(options.files, part=part, cells=options.cells, units=options.units)
-    except InputError:
-        raise
-    except (LookupError, ValueError):
-        # What another program has changed may be why the figure failed.
-        for file in options.files:
-            refuse_damaged(file, rewritten=True)
-        raise
     image = io.BytesIO()
-    figure.savefig(image, format=options.out.suffix[1:].lower())
+    with _reading(*options.files):
+        try:
+            figure = plot(options.files, part=part, cells=options.cells, units=options.units)
+        except InputError:
+            raise
+        except (LookupError, ValueError):
+            # What another program has changed may be why the figure failed.
+            for file in options.files:
+                refuse_damaged(file, rewritten=True)
+            raise
+        figure.savefig(image, format=options.out.suffix[1:].lower())
     _write(options.out, image.getbuffer())
     return OK
 
@@ -177,7 +180,9 @@ def report(options: argparse.Namespace) -> int:
     _check_place(options.out, _PAGES)
     from drivetrain_jax.report import report
 
-    _write(options.out, report(options.files, options.title).encode())
+    with _reading(*options.files):
+        page = report(options.files, options.title)
+    _write(options.out, page.encode())
     return OK
 
 
@@ -186,8 +191,20 @@ def explore(options: argparse.Namespace) -> int:
     from drivetrain_jax.runs.atlas_file import open_atlas
 
     _check_place(options.out, _PAGES)
-    _write(options.out, open_atlas(options.file).explore().text.encode())
+    with _reading(options.file):
+        page = open_atlas(options.file).explore().text
+    _write(options.out, page.encode())
     return OK
+
+
+def _reading(*files: Path) -> ExitStack:
+    """A context in which errors of readers are errors of these files."""
+    from drivetrain_jax.store import gate
+
+    stack = ExitStack()
+    for file in files:
+        stack.enter_context(gate.reading(file))
+    return stack
 
 
 def _check_place(out: Path, endings: tuple[str, ...]) -> None:
@@ -231,7 +248,9 @@ def query(options: argparse.Namespace) -> int:
     from drivetrain_jax.runs.atlas_file import open_atlas
 
     given = ranges(options.given, "query")
-    return _answer(query(open_atlas(options.file), given, options.amplitude), options)
+    with _reading(options.file):
+        reply = query(open_atlas(options.file), given, options.amplitude)
+    return _answer(reply, options)
 
 
 def design(options: argparse.Namespace) -> int:
@@ -244,7 +263,9 @@ def design(options: argparse.Namespace) -> int:
         raise InputError(f"--margin = {options.margin}: not used by {options.question}; allowed for speed-windows")
     given = ranges(options.given, "design")
     question = getattr(atlas_answers, options.question.replace("-", "_"))
-    return _answer(question(open_atlas(options.file), given, amplitude=options.amplitude, **extra), options)
+    with _reading(options.file):
+        reply = question(open_atlas(options.file), given, amplitude=options.amplitude, **extra)
+    return _answer(reply, options)
 
 
 def bench(options: argparse.Namespace) -> int:

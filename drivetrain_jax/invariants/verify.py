@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.invariants import Finding, check
-from drivetrain_jax.store import checksums, zarr_store
+from drivetrain_jax.store import checksums, gate, zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.consolidate import open_result, read_attribute
 
@@ -53,6 +53,11 @@ def verify(path: Path) -> Report:
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "not a regular file" if path.exists() else "does not exist"
         raise InputError(f"file = {str(path)!r}: {what}; give a result written by `drivetrain run`")
+    with gate.reading(path):
+        return _verify_file(path)
+
+
+def _verify_file(path: Path) -> Report:
     damaged = checksums.damaged(path)
     if damaged:
         names = checksums.named(damaged)

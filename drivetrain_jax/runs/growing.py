@@ -22,7 +22,7 @@ from drivetrain_jax.runs.explain import differences_of, not_valid
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import Scene, restore_scene
-from drivetrain_jax.store import checksums
+from drivetrain_jax.store import checksums, gate
 from drivetrain_jax.store.consolidate import map_variable, read_attribute
 from drivetrain_jax.store.provenance import digest
 from drivetrain_jax.store.zarr_store import is_store
@@ -137,6 +137,11 @@ def find(job: Job, path: Path) -> ReusableResult:
     """
     if not path.is_file():
         raise NotReusable(f"reuse = {str(path)!r}: {_no_file(path)}")
+    with gate.reading(path):
+        return _find(job, path)
+
+
+def _find(job: Job, path: Path) -> ReusableResult:
     names = ("scene", "digest", "drivetrain_jax_version", "numerics", "numerics_detail")
     attrs = {name: read_attribute(path, name) for name in names}
     if attrs["digest"] is None:

@@ -39,14 +39,14 @@ def _rearranged(path: Path, scene: Scene, grid: Grid) -> list[str]:
     return wrong
 
 
-def _holds(stored: h5py.Dataset | None, values: np.ndarray) -> bool:
-    if stored is None:
+def _holds(stored: h5py.Dataset | h5py.Group | None, values: np.ndarray) -> bool:
+    if not isinstance(stored, h5py.Dataset):
         return False
     words = h5py.check_string_dtype(stored.dtype) is not None
     return np.array_equal((stored.asstr() if words else stored)[()], values)
 
 
-def _lies(stored: h5py.Dataset | None, dims: tuple[str, ...], grid: Grid) -> bool:
-    if stored is None or stored.shape[: len(grid.result_shape)] != grid.result_shape:
+def _lies(stored: h5py.Dataset | h5py.Group | None, dims: tuple[str, ...], grid: Grid) -> bool:
+    if not isinstance(stored, h5py.Dataset) or stored.shape[: len(grid.result_shape)] != grid.result_shape:
         return False
     return [scales[0].name if len(scales) else None for scales in stored.dims] == [f"/{dim}" for dim in dims]

@@ -14,7 +14,7 @@ from drivetrain_jax.runs.growing import NotReusable, ReusableResult, ReusedPoint
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.sink import Sink
 from drivetrain_jax.runs.work import Progress, Report, Work
-from drivetrain_jax.store import checksums, zarr_store
+from drivetrain_jax.store import checksums, gate, zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.consolidate import read_attribute, read_variable
 
@@ -42,7 +42,8 @@ class Hdf5Sink(Sink):
 
     def attribute(self, name: str) -> Any:
         """A global attribute of the present result."""
-        return read_attribute(self.held, name)
+        with gate.reading(self.held):
+            return read_attribute(self.held, name)
 
     def digest(self) -> Any:
         """Digest of the present result."""
@@ -54,12 +55,14 @@ class Hdf5Sink(Sink):
 
     def damage(self) -> str:
         """The damaged parts of the present result; empty without damage."""
-        changed = checksums.damaged(self.held)
+        with gate.reading(self.held):
+            changed = checksums.damaged(self.held)
         return "its checksums are gone" if changed is None else checksums.named(changed)
 
     def rearranged(self, job: Job) -> list[str]:
         """Names of the variables of the present result whose layout differs from that of ``job``."""
-        return job.route.rearranged(job, self.held)
+        with gate.reading(self.held):
+            return job.route.rearranged(job, self.held)
 
     def common_points(self, job: Job) -> ReusableResult | NotReusable | None:
         """Points of ``job`` in the present result, or the reason why it has none."""
@@ -67,7 +70,8 @@ class Hdf5Sink(Sink):
 
     def outcomes(self) -> np.ndarray:
         """Outcomes of all points of the present result."""
-        return read_variable(self.held, OUTCOME.name)
+        with gate.reading(self.held):
+            return read_variable(self.held, OUTCOME.name)
 
     def write(
         self, job: Job, executor: Executor, report: Report | None, progress: Progress, reused: ReusedPoints

@@ -133,7 +133,9 @@ def map_variable(path: Path, name: str) -> np.ndarray:
     """Like :func:`read_variable`, but as a memory map where the storage of the variable allows that."""
     with gate.opened(path) as file:
         variable = cast(h5py.Dataset, file[name])
-        if variable.chunks is None and (offset := variable.id.get_offset()) is not None and variable.size:
+        # The words of a file are references, which only HDF5 can follow.
+        plain = variable.chunks is None and not variable.dtype.hasobject
+        if plain and (offset := variable.id.get_offset()) is not None and variable.size:
             return np.memmap(path, variable.dtype, "r", offset, variable.shape)
     return read_variable(path, name)
 

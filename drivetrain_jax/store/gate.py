@@ -10,6 +10,7 @@ import os
 import stat
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 
 import h5py
 
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import ChunkError, InputError
 
 # Exceptions of h5py for a damaged file structure.
 BROKEN = (OSError, KeyError, ValueError, RuntimeError, TypeError, OverflowError, MemoryError)
@@ -31,8 +32,9 @@ _ROWS = 1 << 12
 _RATIO, _FREE = 1100, 1 << 30
 # Filters that HDF5 itself has: deflate, shuffle, fletcher32, szip, nbit, scale-offset. Others are code loaded from plugins.
 _FILTERS = frozenset({1, 2, 3, 4, 5, 6})
-# States of files that have passed, and the number of them that are remembered.
+# States of files that have passed, the number of them that are remembered, and states that this process has written.
 _passed: dict[tuple[int, ...], None] = {}
+_written: set[tuple[int, ...]] = set()
 _REMEMBERED = 4096
 _SCAN = "import sys; sys.path[:] = sys.argv[2:]; from drivetrain_jax.store import gate; gate.main(sys.argv[1])"
 
@@ -48,10 +50,38 @@ def opened(path: Path) -> Iterator[h5py.File]:
         raise unreadable(path, "") from error
 
 
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Raise any error inside the context as :class:`InputError`, unless this process has written the file at ``path``.
+
+    Checksums show only that a file is as it was sealed. Content that no result has makes readers fail in any way.
+    """
+    try:
+        foreign = _state(os.stat(path)) not in _written
+    except OSError:
+        foreign = False
+    with warnings.catch_warnings():
+        if foreign:
+            # Warnings about such content would only precede the error.
+            warnings.simplefilter("ignore")
+        try:
+            yield
+        except (InputError, ChunkError, BrokenPipeError):
+            raise
+        except Exception as error:
+            if not foreign:
+                raise
+            text = " ".join(str(error).split())[:200]
+            what = f"its content does not fit a result of drivetrain_jax ({type(error).__name__}: {text})"
+            raise InputError(f"file = {str(path)!r}: {what}; give a result written by `drivetrain run`") from error
+
+
 def trust(path: Path) -> None:
     """Remember that this process has written the file at ``path``."""
     with suppress(OSError):
-        _remember(_state(os.stat(path)))
+        state = _state(os.stat(path))
+        _remember(state)
+        _written.add(state)
 
 
 def unreadable(path: Path, reason: str) -> InputError:

@@ -77,6 +77,37 @@ def test_a_hostile_file_is_refused_by_every_reader(path, capsys, kind):
     assert time.monotonic() - begin < 20
 
 
+def with_rank(values):
+    """The variable ``value`` with other values, and no dimensions."""
+    return lambda file: file.create_dataset("value", data=values)
+
+
+UNFIT = {
+    "group": lambda f: f.create_group("value"),
+    "no rank": with_rank(1.0),
+    "two dimensions of no name": with_rank(np.zeros((3, 3))),
+    "words": with_rank(["x", "y", "z"]),
+    "outcome without rank": lambda f: [f.__delitem__("outcome"), f.create_dataset("outcome", data=np.int8(0))],
+    "outcome of words": lambda f: [f.__delitem__("outcome"), f.create_dataset("outcome", data=["x", "y", "z"])],
+    "axis without rank": lambda f: [f.__delitem__("a"), f.create_dataset("a", data=1.0)],
+    "scene is a number": lambda f: f.attrs.__setitem__("scene", 1.5),
+    "analysis is a list": lambda f: f.attrs.__setitem__("analysis", np.arange(3)),
+}
+
+
+@pytest.mark.parametrize("kind", UNFIT)
+def test_sealed_content_of_no_result_is_one_line(path, capsys, kind):
+    replaced(path, UNFIT[kind])
+    with h5py.File(path, "r+") as file:
+        checksums.reserve(file)
+        checksums.seal(file)
+    for words in ("verify r.nc", "plot r.nc --out f.png", "status scene.toml --out r.nc", "run scene.toml --out r.nc"):
+        code = main(words.split())
+        said = capsys.readouterr().err
+        assert code in (0, 2) and len(said.splitlines()) == int(code == 2 or words.startswith("run")), (words, said)
+    assert code == 2
+
+
 @pytest.mark.parametrize(
     ("code", "reason"), [("import time; time.sleep(60)", "takes longer"), ("import os; os.abort()", "crashes")]
 )
