@@ -22,6 +22,7 @@ validate: $(VENV)/installed-test  ## the comparisons at full size
 
 faults: $(VENV)/installed-test  ## real faults at random moments; writes the table of docs/reliability.md
 	$(BIN)/python tests/faults/suite.py
+	$(BIN)/python -m pytest -m full tests/runs/test_resume_machine.py
 
 lint: $(VENV)/installed-test  ## style, formatting, spelling, types, directions of imports
 	$(BIN)/ruff check .

@@ -12,6 +12,10 @@ from pathlib import Path
 
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parent))
+
+from attacks import library
+
 pytest.importorskip("zarr")
 pytestmark = pytest.mark.skipif(
     not sys.platform.startswith("linux") or shutil.which("cc") is None, reason="faults are injected by a C library"
@@ -31,9 +35,7 @@ def counts(line):
 
 
 def test_an_io_error_inside_hdf5_is_one_line_and_costs_nothing(tmp_path):
-    library = tmp_path / "io_error.so"
-    subprocess.run(["cc", "-shared", "-fPIC", "-O1", "-o", library, HERE / "io_error.c", "-ldl"], check=True)
-    environment = os.environ | {"LD_PRELOAD": str(library)}
+    environment = os.environ | {"LD_PRELOAD": str(library(tmp_path))}
     command = [sys.executable, str(HERE / "io_errors.py"), str(tmp_path), json.dumps(CASES)]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=HERE.parents[1])
     records = [json.loads(line) for line in done.stdout.splitlines()]
