@@ -238,24 +238,29 @@ def _scheduler_seconds() -> float:
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
-def block_cost() -> tuple[int, float, float]:
-    """Points of a block, CPU seconds of a worker that plans, computes and writes it, and the share of the kernels."""
-    job, whole = resolve(load_scene(scene(10_000_000))), 0.0
-    middle = job.grid.shards.count // 2
+def block_cost(blocks: int = 5) -> tuple[int, float, float]:
+    """Points of a block, CPU seconds of a worker that plans, computes and writes it, and the share of the kernels.
+
+    Medians of ``blocks`` blocks around the middle of a sweep; each block is computed as a whole and by its kernels alone.
+    """
+    job, whole, kernels = resolve(load_scene(scene(10_000_000))), [], []
+    first = job.grid.shards.count // 2
     with tempfile.TemporaryDirectory() as folder:
         parts = PartsFolder(Path(folder) / "r.zarr")
         parts.open()
         ShardedRun(job, parts, job.route.progress(job), None).create()
         writer = ShardWriter(job, str(parts.out))
         # The first block compiles the kernels.
-        for block in (middle, middle + 1):
+        for block in (first - 1, *range(first, first + blocks)):
             task = Shares(0, (Share(block, 0, 1, 1),), math.inf)
-            whole = cpu_seconds(lambda task=task: writer.compute(task))
+            whole.append(cpu_seconds(lambda task=task: writer.compute(task)))
+            plan = job.block_plan(block)
+            chunks = [plan.chunk(number) for number in range(len(plan.costs))]
+            kernels.append(cpu_seconds(lambda chunks=chunks: deque(map(job.compute, chunks), maxlen=0)))
         parts.close()
-    plan, (first, stop) = job.block_plan(middle + 1), job.grid.block(middle + 1)
-    chunks = [plan.chunk(number) for number in range(len(plan.costs))]
-    kernels = cpu_seconds(lambda: deque(map(job.compute, chunks), maxlen=0))
-    return stop - first, whole, kernels / whole
+    begin, stop = job.grid.block(first)
+    share = median([part / all_ for part, all_ in zip(kernels[1:], whole[1:], strict=True)])
+    return stop - begin, median(whole[1:]), share
 
 
 def places(points: int, repeats: int, folder: Path) -> list[Place]:
