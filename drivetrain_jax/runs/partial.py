@@ -17,6 +17,7 @@ from drivetrain_jax.runs.output_state import OutputState
 from drivetrain_jax.runs.pending import PENDING, with_pending
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import restore_scene
+from drivetrain_jax.runs.shard_writer import block_of
 from drivetrain_jax.store import checksums, consolidate
 from drivetrain_jax.store.chunks import PartsFolder
 
@@ -65,10 +66,14 @@ def _finished(job: Job, output: OutputState) -> Iterator[tuple[np.ndarray, Mappi
     """Yield finished points and their results, reused ones included."""
     reused = output.reused_before()
     yield from reused.blocks([variable.name for variable in ResultBuffer(job.scene, job.grid).variables])
-    rest = remaining(job, reused)
+    rest, written = remaining(job, reused), set[int]()
+    for shard, points, results in output.sink.shards(job):
+        written.add(shard)
+        yield points, results
     for part in output.parts.read():
         if part.points is not None:
-            yield part.points, part.results
+            if block_of(part) not in written:
+                yield part.points, part.results
             continue
         for number, results in part:
             yield rest.plan.chunk(number).points, results

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,8 +19,10 @@ from drivetrain_jax.runs.plan import Chunk
 from drivetrain_jax.runs.scene import result_variables
 from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.chunks import Part, PartsFolder
-from drivetrain_jax.store.shards import MOST_POINTS, Place
+from drivetrain_jax.store.shards import Place
 
+# Numbers that a block reserves for its chunks, more than it can have.
+NUMBERS = 1 << 20
 # Names of the results of each share.
 FOUND = ("next", "chunks", "part", "written", "points", "failed")
 
@@ -29,7 +31,7 @@ FOUND = ("next", "chunks", "part", "written", "points", "failed")
 class Share:
     """The chunks ``start``, ``start + step``, ... of a block of the plan, without those in ``finished``.
 
-    ``points`` is an estimate of their number of points.
+    ``points`` is an estimate of their number of results.
     """
 
     block: int
@@ -138,7 +140,21 @@ class ShardWriter:
 
 def chunk_of(job: Job, block: int, position: int) -> Chunk:
     """A chunk of a block, with a number that no other block uses."""
-    return replace(job.block_plan(block).chunk(position), number=block * MOST_POINTS + position)
+    return replace(job.block_plan(block).chunk(position), number=block * NUMBERS + position)
+
+
+def block_of(part: Part) -> int:
+    """The block of the chunks of a part."""
+    return int(part.chunks[0]) // NUMBERS
+
+
+def written_shards(job: Job, store: Path) -> Iterator[tuple[int, np.ndarray, Results]]:
+    """Yield number, points and results of the intact shards of a store that is not finished."""
+    for shard in np.flatnonzero(zarr_store.done(store)).tolist():
+        found = zarr_store.read(store, job.grid.shards, shard)
+        if found is not None:
+            results = {name: _off_grid(job, job.grid.shards.place(shard), values) for name, values in found.items()}
+            yield shard, np.arange(*job.grid.block(shard)), results
 
 
 def count_unsolvable(job: Job, share: Share) -> int:
@@ -162,3 +178,13 @@ def _on_grid(job: Job, place: Place, values: np.ndarray) -> np.ndarray:
     block = [part.stop - part.start for axis, part in enumerate(place) if axis != position]
     values = values.reshape((*block, *values.shape[1:]))
     return values if position is None else np.moveaxis(values, len(block), position)
+
+
+def _off_grid(job: Job, place: Place, values: np.ndarray) -> np.ndarray:
+    """The inverse of :func:`_on_grid`."""
+    grid, position = job.grid, job.grid.path_position
+    block = [axis for axis in range(len(place)) if axis != position]
+    if position is not None:
+        values = np.moveaxis(values, position, len(block))
+    values = values.reshape(-1, *values.shape[len(block) :])
+    return values[:, None] if grid.path_is_fixed else values

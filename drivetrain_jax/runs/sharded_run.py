@@ -29,20 +29,22 @@ from drivetrain_jax.runs.pending import PENDING, with_pending
 from drivetrain_jax.runs.scene import result_variables
 from drivetrain_jax.runs.shard_writer import (
     FOUND,
+    NUMBERS,
     Assembly,
     ShardWriter,
     Share,
     Shares,
+    block_of,
     chunk_of,
     count_unsolvable,
     joined_part,
+    written_shards,
 )
 from drivetrain_jax.runs.work import Progress, Report
 from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.files import flush_tree, move_folder
 from drivetrain_jax.store.schema import Labelled
-from drivetrain_jax.store.shards import MOST_POINTS
 
 # Least number of shares at the start, to give several workers work, and most shares of the remaining chunks of one share.
 _FEWEST_SHARES, _MOST_PIECES = 8, 64
@@ -112,19 +114,17 @@ class ShardedRun:
 
     def _reuse_shards(self) -> np.ndarray:
         """Count the intact shards of a stopped run; returns their flags."""
-        written = zarr_store.done(self.path)
-        for shard in np.flatnonzero(written).tolist():
-            arrays = zarr_store.read(self.path, self._job.grid.shards, shard)
-            written[shard] = arrays is not None
-            if arrays is not None:
-                self._progress.reused += arrays[OUTCOME.name].size
-                self._progress.failed += failures(arrays[OUTCOME.name])
+        written = np.zeros(self._job.grid.shards.count, bool)
+        for shard, _, results in written_shards(self._job, self.path):
+            written[shard] = True
+            self._progress.reused += results[OUTCOME.name].size
+            self._progress.failed += failures(results[OUTCOME.name])
         return written
 
     def _reuse_parts(self, written: np.ndarray) -> None:
         """Count the chunks of a stopped run in blocks whose shards are not ``written``."""
         for part in self._parts.read(repair=True):
-            block, chunks = part.chunks[0] // MOST_POINTS, set((part.chunks % MOST_POINTS).tolist())
+            block, chunks = block_of(part), set((part.chunks % NUMBERS).tolist())
             # A worker that died after writing a part leaves chunks that another one computes again.
             if part.name is None or written[block] or chunks & self._finished[block]:
                 continue
@@ -164,7 +164,8 @@ class ShardedRun:
         if not self._waiting and self._blocks:
             block = self._blocks.popleft()
             first, stop = self._job.grid.block(block)
-            whole = Share(block, 0, 1, stop - first, frozenset(self._finished.pop(block, ())))
+            points = (stop - first) * self._job.grid.path_length
+            whole = Share(block, 0, 1, points, frozenset(self._finished.pop(block, ())))
             self._divide(whole, 0, max(1, min(_FEWEST_SHARES // self._job.grid.shards.count, stop - first)))
         return bool(self._waiting)
 

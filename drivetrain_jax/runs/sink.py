@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from drivetrain_jax.runs.executor import Executor
+from drivetrain_jax.runs.executor import Executor, Results
 from drivetrain_jax.runs.growing import NotReusable, ReusableResult, ReusedPoints
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.work import Progress, Report
@@ -59,6 +60,10 @@ class Sink(Protocol):
     def outcomes(self) -> np.ndarray:
         """Outcomes of all points of the present result."""
         ...
+
+    def shards(self, job: Job) -> Iterator[tuple[int, np.ndarray, Results]]:
+        """Yield number, points and results of the blocks that unfinished work has written without parts."""
+        return iter(())
 
     def write(
         self, job: Job, executor: Executor, report: Report | None, progress: Progress, reused: ReusedPoints

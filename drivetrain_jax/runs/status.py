@@ -17,6 +17,7 @@ from drivetrain_jax.runs.assemble import failures
 from drivetrain_jax.runs.output_state import OutputState
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.runs.shard_writer import block_of
 
 
 @dataclass(frozen=True)
@@ -89,9 +90,12 @@ def _outcomes(output: OutputState) -> Iterator[np.ndarray]:
         # An atlas has no points.
         yield from () if output.is_function else (output.sink.outcomes(),)
     elif output.state == "partial":
-        seen = set[int]()
+        seen, written = set[int](), set[int]()
+        for shard, _, results in output.sink.shards(output.job):
+            written.add(shard)
+            yield results[OUTCOME.name]
         for part in output.parts.read():
-            if output.job.route.counts(part):
+            if output.job.route.counts(part) and not (written and block_of(part) in written):
                 # An interrupt during writing may leave a chunk in two parts.
                 yield from (results[OUTCOME.name] for number, results in part if number not in seen)
                 seen.update(part.chunks.tolist())

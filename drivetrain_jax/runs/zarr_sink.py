@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,10 @@ import numpy as np
 
 from drivetrain_jax._errors import ChunkError, InputError
 from drivetrain_jax.analysis import OUTCOME
-from drivetrain_jax.runs.executor import Executor
+from drivetrain_jax.runs.executor import Executor, Results
 from drivetrain_jax.runs.growing import ReusedPoints
 from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.shard_writer import written_shards
 from drivetrain_jax.runs.sharded_run import ShardedRun
 from drivetrain_jax.runs.sink import Sink
 from drivetrain_jax.runs.work import Progress, Report
@@ -81,6 +83,11 @@ class ZarrSink(Sink):
     def outcomes(self) -> np.ndarray:
         """Outcomes of all points of the present result."""
         return zarr_store.read_variable(self.held, OUTCOME.name)
+
+    def shards(self, job: Job) -> Iterator[tuple[int, np.ndarray, Results]]:
+        """Yield number, points and results of the shards that unfinished work has written."""
+        store = self._parts.path / zarr_store.UNFINISHED
+        return written_shards(job, store) if store.is_dir() else iter(())
 
     def write(
         self, job: Job, executor: Executor, report: Report | None, progress: Progress, reused: ReusedPoints

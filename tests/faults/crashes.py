@@ -32,7 +32,7 @@ from io_errors import scene
 from drivetrain_jax.cli import main
 from drivetrain_jax.runs import toml, work
 from drivetrain_jax.runs.status import status
-from drivetrain_jax.store import zarr_store
+from drivetrain_jax.store import shards
 
 PATIENCE = 60.0
 # Allowed exit codes of a command whose system call fails.
@@ -241,7 +241,7 @@ def prepare(folder: Path) -> None:
     os.environ["DRIVETRAIN_JAX_CACHE"] = str(folder.parent / "cache")
     toy.names()
     work._SHORTEST = work._LONGEST = 0.0
-    zarr_store._MOST_POINTS = 28
+    shards.MOST_POINTS = 28
 
 
 def places(calls: int, share: int, shares: int, every: int, rng: random.Random) -> list[tuple[str, int]]:

@@ -22,7 +22,7 @@ from drivetrain_jax._threads import threads
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.cli import main
 from drivetrain_jax.invariants.verify import verify
-from drivetrain_jax.runs import toml
+from drivetrain_jax.runs import shard_writer, sharded_run, toml
 from drivetrain_jax.runs.executor import Executor, Threads
 from drivetrain_jax.runs.export import export
 from drivetrain_jax.runs.pending import PENDING
@@ -62,6 +62,7 @@ LINE = {
     "analysis": "line",
     "axes": {"b": {"values": [1.0, 4.0]}, "a": {"start": 0, "stop": 9, "num": 9}},
 }
+LINE_A = {"a": {"start": 0, "stop": 9, "num": 9}}
 ONE = {"system": "toy", "analysis": "toy", "outputs": ["value", "wave"], "fixed": {"a": 1.0}}
 FIXED_PATH = LINE | {"axes": {"a": {"values": [1.0, 2.0]}}, "fixed": {"b": 5.0}}
 POINTS = {"system": "toy", "analysis": "toy", "points": {"a": [1.0, 8.0, 9.5], "b": [1.0, 2.0, 3.0]}}
@@ -125,8 +126,6 @@ class InTurn(Executor):
 
 def test_a_growing_store_opens_with_the_computed_points(grid_scene, tmp_path, monkeypatch):
     """Incomplete shards are written as well; missing points have no value."""
-    from drivetrain_jax.runs import sharded_run
-
     monkeypatch.setattr(sharded_run, "_INTERVAL", 0.0)
     monkeypatch.setattr(sharded_run, "_RATIO", 0.0)
     scene, path, seen = large(grid_scene), tmp_path / "r.zarr", []
@@ -191,8 +190,6 @@ def test_points_of_several_blocks_and_shards(grid_scene, tmp_path, monkeypatch):
 @pytest.mark.parametrize("executor", [InTurn(), Threads(3)])
 def test_the_remaining_chunks_of_a_share_are_divided(grid_scene, tmp_path, monkeypatch, executor):
     """Shares that end after one chunk compute every chunk once, on any number of workers."""
-    from drivetrain_jax.runs import shard_writer, sharded_run
-
     computed, compute = [], shard_writer.Job.compute
     monkeypatch.setattr(sharded_run, "SECONDS", 1e-6)
     monkeypatch.setattr(shard_writer.Job, "compute", lambda job, c: computed.append(c.number) or compute(job, c))
@@ -214,7 +211,7 @@ class Crashing(InTurn):
         for task in tasks:
             blocks = [share.block for share in getattr(task, "shares", ())]
             number = getattr(task, "size", None) and task.number
-            if crash := 70 in blocks or number == 70 * shards.MOST_POINTS:
+            if crash := 70 in blocks or number == 70 * shard_writer.NUMBERS:
                 self.crashed.append(len(blocks))
             yield task, None if crash else computation.compute(task)
 
@@ -229,6 +226,28 @@ def test_only_the_chunk_that_crashes_its_worker_is_lost(grid_scene, tmp_path, mo
     lost = ours.outcome.values == Outcome.LOST
     assert executor.crashed[0] > 1 and executor.crashed[1:] == [1, 0]
     assert 0 < lost.sum() <= 20 and ours.value.values[~lost].tobytes() == whole.value.values[~lost].tobytes()
+
+
+@pytest.mark.parametrize("which", ["grid", "line"])
+def test_written_shards_of_unfinished_work_are_counted_opened_and_resumed(grid_scene, tmp_path, monkeypatch, which):
+    """A worker writes a whole block without a part."""
+    monkeypatch.setattr(shards, "MOST_POINTS", 60)
+    scene = {"grid": large(grid_scene), "line": LINE | {"axes": {"b": {"start": 1, "stop": 9, "num": 40}, **LINE_A}}}[
+        which
+    ]
+    path, whole = tmp_path / "r.zarr", dt.run(scene)
+    name = next(iter(whole.data_vars))
+    with pytest.raises(Interrupted):
+        to_store(scene, path, executor=InTurn(), report=stop_after(6))
+    parts = PartsFolder(path)
+    assert zarr_store.done(parts.path / zarr_store.UNFINISHED).sum() > 3
+    found, partial = status(scene, path), dt.open_result(path)
+    there = (partial["outcome"] != PENDING).values
+    assert 0 < found.done == there.sum() == partial.attrs["points_done"] < whole.outcome.size
+    assert partial[name].values[there].tobytes() == whole[name].values[there].tobytes()
+    progress = to_store(scene, path)
+    assert (progress.reused, progress.computed) == (found.done, whole.outcome.size - found.done)
+    assert as_file(path)[name].values.tobytes() == whole[name].values.tobytes()
 
 
 def test_interrupted_damaged_and_resumed(grid_scene, tmp_path):
