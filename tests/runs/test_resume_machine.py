@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import toy
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule, run_state_machine_as_test
 
@@ -59,7 +59,9 @@ class ResumeMachine(RuleBasedStateMachine):
         assert progress.computed + progress.reused == progress.total == 2 * self.count and progress.failed == 0
         assert progress.reused >= before
         found = status(self.scene, self.path)
-        assert (found.state, found.done) == ("complete", 2 * self.count) and not self.parts.path.exists()
+        assert (found.state, found.done) == ("complete", 2 * self.count)
+        # Parts of an interrupted ``--fresh`` stay beside a complete result: only ``--fresh`` resumes them.
+        assert progress.computed == 0 or not self.parts.path.exists()
         value = dt.open_result(self.path)["value"].values
         np.testing.assert_allclose(value, self.expected(), rtol=1e-14)
         self.held = (self.count, self.number)
@@ -156,12 +158,12 @@ def intervals(monkeypatch):
     monkeypatch.setattr(work, "_LONGEST", 0.0)
 
 
-HOW = {"deadline": None, "suppress_health_check": list(HealthCheck), "database": None}
+HOW = {"deadline": None, "suppress_health_check": list(HealthCheck), "database": None, "phases": (Phase.generate,)}
 
 
 def test_no_order_of_events_gives_a_wrong_value():
     run_state_machine_as_test(
-        ResumeMachine, settings=settings(max_examples=2, stateful_step_count=10, derandomize=True, **HOW)
+        ResumeMachine, settings=settings(max_examples=6, stateful_step_count=10, derandomize=True, **HOW)
     )
 
 
