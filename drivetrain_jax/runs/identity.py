@@ -47,9 +47,11 @@ def numerics_of(system: type[System], analysis: Analysis, route: str) -> dict[st
 
 
 def program_identity(system: type[System], analysis: Analysis, content: object) -> str:
-    """Digest of everything that affects a compiled program; empty if the code has no file, as in a notebook."""
-    files = _files(system, analysis)
-    if not all(file and file.exists() for file in files):
+    """Digest of everything that affects a program; empty for code outside of this package.
+
+    Such code may depend on more than its files, such as the arguments of a script.
+    """
+    if not all(file and _package_of(file) == _ROOT for file in _files(system, analysis)):
         return ""
     return digest([numerics_of(system, analysis, ""), system.name, analysis.name, drivetrain_jax.__version__, content])
 

@@ -127,6 +127,7 @@ class _Key:
     system: type[System]
     analysis: Analysis
     structure: tuple[Any, ...]
+    is_named: bool = field(compare=False)
     variables: tuple[Variable, ...] = field(compare=False)
     grid: Grid = field(compare=False)
     solver: Solver = field(compare=False)
@@ -151,14 +152,15 @@ def kernel_of(problem: Problem, grid: Grid, solver: Solver, size: int, few: bool
         solver.name,
     )
     variables = result_variables(problem)
-    key = _Key(problem.system, problem.analysis, structure, variables, replace(grid, axes=axes), solver)
+    lean = replace(grid, axes=axes)
+    key = _Key(problem.system, problem.analysis, structure, problem.is_named, variables, lean, solver)
     return _compiled(key, size, few)
 
 
 @lru_cache(maxsize=64)
 def _compiled(key: _Key, size: int, few: bool) -> Kernel:
     content = [key.structure, [[v.name, v.dims, v.dtype] for v in key.variables], size]
-    identity = program_identity(key.system, key.analysis, repr(content))
+    identity = program_identity(key.system, key.analysis, repr(content)) if key.is_named else ""
     return compile_kernel(key.solver, key.grid, size, key.variables, few, identity)
 
 

@@ -66,6 +66,15 @@ class Problem:
         """The analysis of this name."""
         return get_analysis(name)
 
+    @property
+    def is_named(self) -> bool:
+        """True if the names of system and analysis determine both; False for a function that a user sweeps."""
+        try:
+            system = find_system(self.system.name)
+            return system is self.system and self.find_analysis(self.analysis.name).for_system(system) == self.analysis
+        except (InputError, KeyError):
+            return False
+
     def __reduce__(self) -> tuple[Any, ...]:
         names = {"system": self.system.name, "analysis": self.analysis.name}
         return _restored, (type(self), {f.name: getattr(self, f.name) for f in fields(self)} | names)

@@ -18,6 +18,7 @@ from drivetrain_jax.runs.atlas_question import AtlasQuery
 from drivetrain_jax.runs.identity import program_identity
 from drivetrain_jax.runs.physical import described
 from drivetrain_jax.runs.programs import lowered
+from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.systems import System
 
 # Relative step of central differences of the conversions of physical data, and step at 0. Part of the largest effect below
@@ -149,4 +150,5 @@ def _compiled_gradient(system: type[System], names: tuple[str, ...]) -> Callable
         return analysis.derivatives(system, request, parameters, constants, {})["spectral_radius"]
 
     kinds = ({name: np.float64(0.0) for name in names},)
-    return lowered(slopes, kinds, program_identity(system, analysis, "gradient")).compile(options_for_few())
+    identity = program_identity(system, analysis, "gradient") if find_system(system.name) is system else ""
+    return lowered(slopes, kinds, identity).compile(options_for_few())

@@ -35,9 +35,11 @@ print(programs.lowered(called, kinds, "name").compile()(jnp.zeros(3)))
 """
 
 
-def lines(script, folder):
+def lines(script, folder, *arguments):
     environment = os.environ | {"DRIVETRAIN_JAX_CACHE": str(folder)}
-    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script, *arguments], env=environment, capture_output=True, text=True, check=True
+    )
     return done.stdout.split()
 
 
@@ -76,5 +78,20 @@ def test_identity_follows_the_content_and_the_code(monkeypatch):
     assert one and other and one != other
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
     assert program_identity(Planetary, analysis, "a") != one
-    monkeypatch.setattr("inspect.getsourcefile", lambda _: "<stdin>")
+    monkeypatch.setattr("inspect.getsourcefile", lambda _: "/elsewhere/system.py")
     assert program_identity(Planetary, analysis, "a") == ""
+
+
+# Sweeps two functions of one name, and prints what they give.
+FUNCTION = """
+import sys
+import drivetrain_jax as dt
+factor = float(sys.argv[1])
+print(dt.sweep(lambda point: {"y": factor * point["a"]}, {"a": 1.0}, over={"a": [1.0, 2.0]}).y.values.tolist())
+"""
+
+
+def test_functions_of_a_user_are_not_stored(tmp_path):
+    """Two processes sweep functions of one name and one file."""
+    assert lines(FUNCTION, tmp_path, "2") == ["[2.0,", "4.0]"] and stored(tmp_path) == []
+    assert lines(FUNCTION, tmp_path, "3") == ["[3.0,", "6.0]"]
