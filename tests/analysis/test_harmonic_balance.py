@@ -170,6 +170,7 @@ def test_linear_limits_are_exact(swept):
     np.testing.assert_allclose(swept["u_max"][..., 5], swept["u_min"][..., 5], rtol=1e-12)
 
 
+@pytest.mark.full
 def test_one_harmonic_is_the_describing_function():
     """Each balanced motion is one of the motions of the closed form; with alpha = 0 several of them are stable."""
     cases = ({}, {"alpha": 0.0}, {"alpha": 1.5})

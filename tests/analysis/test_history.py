@@ -140,6 +140,7 @@ def test_errors_are_judged_by_what_the_motion_reaches():
     assert found.outcome == Outcome.SUCCESS
 
 
+@pytest.mark.full
 def test_outcome_does_not_depend_on_the_outputs():
     options = {"times": [1.0], "rtol": 1e-13}
     outcomes = [int(dt.run(scene(options, fixed=LONG, outputs=o)).outcome) for o in (["phi"], ["phi", "phi_error"])]

@@ -30,6 +30,7 @@ def motor():
     return section(["section", "torus_residual", "distinct_points", "chaos_k01"], strobes=1024, discard=800, steps=24)
 
 
+@pytest.mark.full
 def test_input_element_ends_on_a_torus(motor):
     """The section is a smooth function of the angle of the motor's torque, also in the periodic case."""
     assert motor.section.dims == ("excitation_frequency", "strobe", "state")
@@ -149,6 +150,7 @@ class TestZeroOne:
             series.append(x)
         return np.array(series[500:])
 
+    @pytest.mark.full
     def test_logistic_map(self):
         values = np.asarray(jax.jit(chaos_k01)(self.logistic([3.55, 3.97, 4.0 - 1e-9])))
         np.testing.assert_allclose(values, [0.0, 1.0, 1.0], atol=0.02)

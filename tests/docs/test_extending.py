@@ -54,6 +54,7 @@ def executed(text: str, folder: Path) -> tuple[Path, str, Callable[..., str]]:
     return project, answers + python(*test[1:]), python
 
 
+@pytest.mark.full
 def test_the_page_is_true(tmp_path):
     project, answers, python = executed(SYSTEM, tmp_path)
     assert "angle of both joints" in answers

@@ -29,6 +29,7 @@ def test_a_crash_at_a_system_call_loses_nothing(tmp_path, kind):
     assert all(record["calls"] > 40 for record in found)
 
 
+@pytest.mark.full
 def test_damaged_files_and_scenes_are_refused_in_one_line(tmp_path):
     found = attacks.files(tmp_path, SEED, {"bytes": 12, "sealed": 12, "scene": 6}, shares=1)
     assert attacks.bad(found) == []

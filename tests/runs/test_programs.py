@@ -56,7 +56,12 @@ def test_a_later_process_traces_nothing_and_gets_the_same_bits(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "damage", [pytest.param("cut", marks=pytest.mark.full), "bit", pytest.param("empty", marks=pytest.mark.full)]
+    "damage",
+    [
+        pytest.param("cut", marks=pytest.mark.full),
+        pytest.param("bit", marks=pytest.mark.full),
+        pytest.param("empty", marks=pytest.mark.full),
+    ],
 )
 def test_a_damaged_program_is_replaced(tmp_path, damage):
     first = lines(POINT, tmp_path)

@@ -513,7 +513,9 @@ def test_shards_cover_the_sweep_once(shape, path, lengths):
     found = shards.Shards.of(shape, path, 8)
     assert found.lengths == lengths
     seen, starts, inside = np.zeros(shape, np.int8), found.starts(path), 1 if path is None else shape[path]
+    before = 0
     for shard in range(found.count):
+        assert starts[shard] * inside == before
         seen[found.place(shard)] += 1
-        assert starts[shard] * inside == seen.sum() - seen[found.place(shard)].size
+        before += seen[found.place(shard)].size
     assert (seen == 1).all() and starts[-1] * inside == seen.size
