@@ -168,6 +168,9 @@ def attributes(path: Path) -> dict[str, Any]:
 
 def seal(path: Path, attrs: Mapping[str, Any], labels: Mapping[str, Mapping[str, Any]]) -> None:
     """Write the attributes of the finished store and the ``labels`` of variables, and add the digest of everything else."""
+    # Temporary files of workers that were killed.
+    for file in path.rglob("*.partial"):
+        file.unlink()
     root = _root(path, "r+")
     for name, own in labels.items():
         root[name].attrs.update({key: v.tolist() if hasattr(v, "tolist") else v for key, v in own.items()})
