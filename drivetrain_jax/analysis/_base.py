@@ -145,7 +145,7 @@ class Analysis:
     undecided: str = ""
 
     def advice(self, request: Request) -> str:
-        """What may decide an undecided verdict, as text; empty if nothing is known."""
+        """Advice on an undecided verdict, as text; empty without one."""
         return self.undecided.format(**request.options)
 
     def remedy(self, request: Request) -> str:

@@ -35,7 +35,8 @@ def lowered(function: Callable[..., Any], kinds: tuple[Any, ...], identity: str)
             program = export.export(jax.jit(function))(*kinds)
             _write(path, bytes(program.serialize()))
         except (NotImplementedError, ValueError):
-            # A call of Python code, or of a library whose interface may change, cannot be stored.
+            # A call of Python code, or of a library whose interface may change, cannot be stored. An error of the function
+            # itself is raised again here.
             return jax.jit(function).lower(*kinds)
     return jax.jit(program.call).lower(*kinds)
 

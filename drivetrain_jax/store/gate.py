@@ -66,7 +66,7 @@ def reading(path: Path) -> Iterator[None]:
             warnings.simplefilter("ignore")
         try:
             yield
-        except (InputError, ChunkError, BrokenPipeError):
+        except (InputError, ChunkError, MemoryError, BrokenPipeError):
             raise
         except Exception as error:
             if not foreign:

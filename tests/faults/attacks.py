@@ -31,7 +31,7 @@ def library(folder: Path) -> Path:
 
 
 def records(words: Sequence[object], **environment: str) -> list[Record]:
-    """What a program of this folder prints."""
+    """The records that a program of this folder prints."""
     command = [sys.executable, *map(str, words)]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=os.environ | QUICK | environment)
     found = [json.loads(line) for line in done.stdout.splitlines()]

@@ -73,7 +73,7 @@ FAULTS |= {"I/O error": (errno.EIO, False), "full disk": (errno.ENOSPC, False)}
 
 @dataclass
 class Ended:
-    """How a fork ended: the exit code of the command or minus the signal, its lines, what ``look`` returned."""
+    """The end of a fork: the exit code of the command or minus the signal, its lines, and the result of ``look``."""
 
     code: int
     lines: list[str]
@@ -221,7 +221,7 @@ def inject(shop: Workshop, name: str, at: int, rng: random.Random) -> dict:
 
 
 def judged(ended: Ended, number: int, lost: bool) -> list[str]:
-    """What is not allowed about the end of the command with the fault."""
+    """The problems of the end of a command with a fault."""
     if any("Traceback" in line for line in ended.lines):
         return ["traceback: " + " | ".join(ended.lines[-3:])]
     if number <= 0:

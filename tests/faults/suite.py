@@ -68,7 +68,7 @@ def main() -> int:
 
 
 def attack(folder: Path, seed: int, every: int) -> tuple[bool, list[str]]:
-    """Whether all attacks in forks ended well, and the lines of the page."""
+    """True if all attacks in forks ended well, and the lines of the page."""
     begin = time.monotonic()
     crashed = attacks.crashes(folder, seed, every)
     between = time.monotonic()

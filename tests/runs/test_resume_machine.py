@@ -67,7 +67,7 @@ class ResumeMachine(RuleBasedStateMachine):
         self.held = (self.count, self.number)
 
     def allowed(self):
-        """Whether a run without ``fresh`` may begin, and the points that it finds."""
+        """True if a run without ``fresh`` may begin, and the number of points that it finds."""
         found = status(self.scene, self.path)
         return found.state != "stale", found.done
 
