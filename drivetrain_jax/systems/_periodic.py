@@ -65,6 +65,13 @@ class LinearPeriodic(diffrax.AbstractTerm):
         """True if there are four states, and the reversor exchanges the first two with the others."""
         return self.reversor == SWAP
 
+    def entries(self, *basis: Any) -> dict[tuple[int, int], Array]:
+        """The entries of ``A`` that do not vanish identically, by row and column."""
+        rows = self.rows(*basis)
+        return {
+            (i, j): jnp.asarray(x, float) for i, row in enumerate(rows) for j, x in enumerate(row) if not _vanishes(x)
+        }
+
     def matrix(self, t: Any) -> Array:
         """``A(t)``, shape ``(n, n, ...)``."""
         return dense(self.rows(*self.basis(t)))

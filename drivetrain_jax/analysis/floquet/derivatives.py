@@ -51,23 +51,22 @@ class _Varied(eqx.Module):
 
     def rows(self, s: Any) -> tuple[tuple[Any, ...], ...]:
         """``((A, 0), (dA, A))`` at the fraction s of the span."""
-        zeros: list[list[bool]] = []
+        sizes: list[int] = []
 
-        def entries(parameters: Any) -> list[Array]:
+        def entries(parameters: Any) -> dict[tuple[int, int], Array]:
             form = reduced_form(self.build, parameters, self.constants)
-            rows = form.rows(*form.basis(s * form.span))
-            zeros[:] = [[isinstance(entry, int) and entry == 0 for entry in row] for row in rows]
-            pairs = [pair for row, no in zip(rows, zeros, strict=True) for pair in zip(row, no, strict=True)]
-            return [jnp.asarray(form.span * x, float) for x, zero in pairs if not zero]
+            sizes.append(form.size)
+            return {place: form.span * x for place, x in form.entries(*form.basis(s * form.span)).items()}
 
         both = jax.tree.map(lambda x, dx: tuple(jnp.broadcast_arrays(x, dx)), self.parameters, self.direction)
         given, along = (
             jax.tree.map(lambda pair, i=i: pair[i], both, is_leaf=lambda x: isinstance(x, tuple) and len(x) == 2)
             for i in (0, 1)
         )
-        a, da = map(iter, jax.jvp(entries, (given,), (along,)))
-        upper, lower = ([[0 if zero else next(x) for zero in row] for row in zeros] for x in (a, da))
-        nothing = [0] * len(zeros)
+        a, da = jax.jvp(entries, (given,), (along,))
+        states = range(sizes[0])
+        upper, lower = ([[x.get((i, j), 0) for j in states] for i in states] for x in (a, da))
+        nothing = [0 for _ in states]
         changed = [(*change, *row) for change, row in zip(lower, upper, strict=True)]
         return (*((*row, *nothing) for row in upper), *changed)
 

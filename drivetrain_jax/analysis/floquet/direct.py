@@ -20,6 +20,7 @@ from jax import Array
 
 from drivetrain_jax.analysis.floquet.multipliers import characteristic_coefficients, root_scale
 from drivetrain_jax.analysis.numerics.linear_algebra import matmul
+from drivetrain_jax.analysis.numerics.staged import staged
 from drivetrain_jax.systems import dense
 
 if TYPE_CHECKING:
@@ -101,18 +102,25 @@ def stiffness_of(system: LinearPeriodic, shape: tuple[int, ...] = ()) -> Array:
 
     The rate is max |a_ij a_ji|^(1/2), which no scaling of states changes, averaged over 16 instants.
     """
-    rows = system.rows(*system.basis((jnp.arange(16) + 0.5)[:, None] * system.span / 16))
-    pairs = [jnp.abs(jnp.asarray(row[j] * rows[j][i], float)) for i, row in enumerate(rows) for j in range(i + 1)]
-    largest = jnp.broadcast_to(reduce(jnp.maximum, pairs), (16, *(shape or (1,))))
+    entries = _entries(system, (jnp.arange(16) + 0.5)[:, None] * system.span / 16)
+    pairs = [jnp.abs(entry * entries[j, i]) for (i, j), entry in entries.items() if j <= i and (j, i) in entries]
+    largest = reduce(jnp.maximum, pairs, jnp.zeros((16, *(shape or (1,)))))
     return system.span * jnp.mean(jnp.sqrt(largest), axis=0).reshape(shape)
 
 
 def stable_steps(system: LinearPeriodic) -> Array:
     """Steps with which the explicit scheme is stable in all lanes; ``-tr A`` at 5 instants bounds the rates of decay."""
     # Only the diagonal is used: the compiler drops the other entries.
-    rows = system.rows(*system.basis(jnp.arange(5)[:, None] * system.span / 4))
-    rate = -sum(jnp.asarray(row[i], float) for i, row in enumerate(rows))
+    entries = _entries(system, jnp.arange(5)[:, None] * system.span / 4)
+    rate = -sum((entry for (i, j), entry in entries.items() if i == j), jnp.zeros(()))
     return jnp.nanmax(rate, initial=0.0) * system.span / _STABLE
+
+
+def _entries(system: LinearPeriodic, times: Array) -> dict[tuple[int, int], Array]:
+    """The entries of A at ``times`` ``(K, 1)`` that do not vanish identically; what does not depend on time, once."""
+    basis = system.basis(times)
+    split = staged(system.entries, *basis)
+    return split.moving(split.fixed, *basis)
 
 
 def compare(

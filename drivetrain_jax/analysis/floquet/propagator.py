@@ -52,6 +52,7 @@ _FAR = 70.0
 PIECES = 16
 
 Rows = list[Array]
+Entries = dict[tuple[int, int], Array]
 _NOTHING = Constants(())
 
 
@@ -216,26 +217,14 @@ def _march(system: LinearPeriodic, t0: Array, t1: Array, count: Array) -> tuple[
     """``Phi`` from t0 to t1 of all lanes, the last axis of arrays that vary, by ``count`` steps."""
     varying = jax.tree.leaves((eqx.filter(system, eqx.is_array), t0, t1))
     lanes = max((np.shape(x)[-1] for x in varying if np.ndim(x)), default=1)
-    zeros: list[list[bool]] = []
-
-    def entries(*basis: Array) -> list[Array]:
-        rows = system.rows(*basis)
-        zeros[:] = [[isinstance(entry, int) and entry == 0 for entry in row] for row in rows]
-        return [
-            jnp.asarray(x, float)
-            for row, no in zip(rows, zeros, strict=True)
-            for x, z in zip(row, no, strict=True)
-            if not z
-        ]
-
     times = jnp.zeros((dop853.STAGES, 1))
-    split = staged(entries, *jax.eval_shape(system.basis, times))
+    split = staged(system.entries, *jax.eval_shape(system.basis, times))
     suits = suits_one_kernel(lambda t: system.rows(*system.basis(t)), times)
     mark = in_one_kernel if suits else lambda function: function
 
     def march(count: Array, start: Array, h: Array, fixed: list[Array]) -> Rows:
-        step = partial(_explicit_step, system.basis, partial(split.moving, fixed), tuple(map(tuple, zeros)), start, h)
-        return jax.lax.fori_loop(0, count, step, _identity(len(zeros), lanes))
+        step = partial(_explicit_step, system.basis, partial(split.moving, fixed), start, h)
+        return jax.lax.fori_loop(0, count, step, _identity(system.size, lanes))
 
     rows = mark(march)(count, t0, (t1 - t0) / count, split.fixed)
     return jnp.stack(rows), jnp.zeros(lanes)
@@ -247,8 +236,7 @@ def _identity(n: int, lanes: int) -> Rows:
 
 def _explicit_step(
     basis: Callable[[Array], tuple[Array, ...]],
-    entries: Callable[..., list[Array]],
-    zeros: tuple[tuple[bool, ...], ...],
+    entries: Callable[..., Entries],
     start: Array,
     h: Array,
     number: Array,
@@ -259,14 +247,16 @@ def _explicit_step(
     slopes: list[Rows] = []
     for stage, weights in enumerate(dop853.A):
         state = _advanced(y, h, weights[:stage], slopes)
-        slopes.append(stored(partial(_slopes, zeros, stage))(at_stages, state))
+        slopes.append(stored(partial(_slopes, stage))(at_stages, state))
     return _advanced(y, h, dop853.B, slopes)
 
 
-def _slopes(zeros: tuple[tuple[bool, ...], ...], stage: int, at_stages: list[Array], state: Rows) -> Rows:
-    """``A y`` at one stage; entries that vanish identically are left out."""
-    entries = iter(at_stages)
-    return [sum(_at(next(entries), stage) * x for x, zero in zip(state, row, strict=True) if not zero) for row in zeros]  # pyright: ignore[reportReturnType]
+def _slopes(stage: int, at_stages: Entries, state: Rows) -> Rows:
+    """``A y`` at one stage."""
+    slopes: Rows = [0] * len(state)  # pyright: ignore[reportAssignmentType]
+    for (i, j), entry in at_stages.items():
+        slopes[i] = slopes[i] + _at(entry, stage) * state[j]
+    return slopes
 
 
 def _at(entry: Array, stage: int) -> Array:

@@ -23,18 +23,20 @@ _SHAPING = {"broadcast_in_dim", "reshape", "expand_dims", "squeeze"}
 
 
 class Staged(NamedTuple):
-    """``function(*arguments) = moving(fixed, *arguments)``, as a list of arrays.
+    """``function(*arguments) = moving(fixed, *arguments)``.
 
     ``fixed`` holds one array for each shape, because duplicate or equal inputs of a kernel crash the compiler of jax 0.10.2.
     """
 
     fixed: list[Array]
-    moving: Callable[..., list[Array]]
+    moving: Callable[..., Any]
 
 
-def staged(function: Callable[..., Sequence[Array]], *examples: Any) -> Staged:
+def staged(function: Callable[..., Any], *examples: Any) -> Staged:
     """``function`` split for arguments of the shapes of ``examples``; it may use values of an outer trace."""
-    closed = jax.make_jaxpr(function)(*examples)
+    # A method of a system that holds traced arrays cannot be a key of the cache of traces; a new function can.
+    closed, shapes = jax.make_jaxpr(lambda *arguments: function(*arguments), return_shape=True)(*examples)
+    tree = jax.tree.structure(shapes)
     jaxpr = closed.jaxpr
     before, during = _split(jaxpr)
     needed = _variables(jaxpr.outvars).union(*(_variables(equation.invars) for equation in during))
@@ -48,13 +50,13 @@ def staged(function: Callable[..., Sequence[Array]], *examples: Any) -> Staged:
     fixed = [jnp.stack([values[v] for v in group]) for group in kinds.values()]
     parts = _shared_once(during, jaxpr.outvars)
 
-    def moving(fixed: Sequence[Array], *arguments: Any) -> list[Array]:
+    def moving(fixed: Sequence[Array], *arguments: Any) -> Any:
         values = dict(zip(jaxpr.invars, arguments, strict=True))
         for group, packed in zip(kinds.values(), fixed, strict=True):
             values.update((v, packed[i]) for i, v in enumerate(group))
         for taken, given, run in parts:
             values.update(zip(given, stored(run)(*(values[v] for v in taken)), strict=True))
-        return [v.val if isinstance(v, Literal) else values[v] for v in jaxpr.outvars]
+        return jax.tree.unflatten(tree, [v.val if isinstance(v, Literal) else values[v] for v in jaxpr.outvars])
 
     return Staged(fixed, moving)
 
