@@ -140,7 +140,7 @@ def methods() -> list:
             lacking = {"auto", *offered.lacks(get_system(system))}
             for options in variants if method not in lacking else []:
                 label = f"{system} {analysis} {method} {options.get('solver', '')}".strip()
-                found.append(pytest.param(scene | {"options": options | {"method": method}}, id=label))
+                found.append((label, scene | {"options": options | {"method": method}}))
     return found
 
 
@@ -148,7 +148,20 @@ def test_every_analysis_of_every_system_has_a_scene():
     assert set(scenes()) == {(s, a) for s in system_names() for a in get_system(s).models if a in analysis_names()}
 
 
-@pytest.mark.parametrize("scene", methods())
+# Methods whose kernels are those of another one, or of another system.
+SAME = (
+    "cardan floquet atlas",
+    "cardan atlas direct",
+    "rattle basins exact",
+    "tripod floquet",
+    "tripod poincare adaptive",
+)
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [pytest.param(scene, id=name, marks=[pytest.mark.full] * name.startswith(SAME)) for name, scene in methods()],
+)
 def test_kernels_do_not_call_lapack(scene):
     """Kernels that call it may not run side by side. Only diffrax's implicit solver needs to: the proof that it shows."""
     engine = resolve(load_scene(scene))

@@ -90,7 +90,12 @@ OPTIONS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", [f"{s} {a}" for s in SYSTEMS for a in get_system(s).models if a in dt.__all__])
+SLOW = "cardan forced", "tripod poincare", "tripod lyapunov", "rattle frequency_response"
+
+
+@pytest.mark.parametrize(
+    "case", but_full([f"{s} {a}" for s in SYSTEMS for a in get_system(s).models if a in dt.__all__], *SLOW)
+)
 def test_results_have_the_declared_shapes_and_types(case):
     """Of a batch of three; dimensions of one name have one length, that of their coordinate if there is one."""
     kind, name = case.split()

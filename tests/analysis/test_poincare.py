@@ -105,10 +105,11 @@ INPUT_ELEMENT = {"element": "input", "equation": "25"}
     ("fixed", "start", "discard"),
     [
         (OUTPUT_ELEMENT, (1.0925995030791809, 91428.57142857143), 0),
-        (
+        pytest.param(
             INPUT_ELEMENT | {"zeta": 0.007724415608099983, "chi_n": 0.335893153586345},
             (-2.3362162256755377, -128600.2548853408),
             20,
+            marks=pytest.mark.full,
         ),
     ],
 )

@@ -537,7 +537,8 @@ def test_looking_at_a_result_loads_no_integrator_and_no_tables(folder):
     assert not {"xarray", "pandas", "scipy.integrate", "diffrax", "matplotlib", "rich"} & set(done.stdout.split())
 
 
-@pytest.mark.parametrize("scene", [pytest.param("quickstart.toml", marks=pytest.mark.full), "cardan_atlas.toml"])
+@pytest.mark.full
+@pytest.mark.parametrize("scene", ["quickstart.toml", "cardan_atlas.toml"])
 def test_a_run_writes_its_file_without_tables(folder, scene):
     """A third of the time of a short run would go into loading these packages."""
     path = Path(__file__).parents[2] / "sweeps" / scene

@@ -128,7 +128,8 @@ def test_processes_and_dask_give_the_same_bits_as_threads(drivetrain, tmp_path):
         assert other.attrs["digest"] == reference.attrs["digest"]
 
 
-@pytest.mark.parametrize("store", ["hdf5", pytest.param("zarr", marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("store", ["hdf5", "zarr"])
 def test_only_the_chunk_that_kills_every_process_is_lost(drivetrain, tmp_path, store):
     scene = SCENE | {"axes": {"delta": {"start": 0.1, "stop": 2.0, "num": 96}, "deadly": {"values": [0, 1]}}}
     error = finished(drivetrain(scene, "deadly", "--workers", "1", "--store", store))
@@ -159,7 +160,8 @@ def test_a_process_that_dies_at_its_start_is_started_again(drivetrain, package, 
     assert ("computed=40 reused=0 failed=0" if code == 0 else "crash during their start") in error
 
 
-@pytest.mark.parametrize("sent", [pytest.param(signal.SIGINT, marks=pytest.mark.full), signal.SIGKILL])
+@pytest.mark.full
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL])
 def test_no_process_outlives_the_driver(drivetrain, tmp_path, sent):
     scene = SCENE | {"axes": {"delta": {"start": 0.1, "stop": 2.0, "num": 150_000}}}
     driver = drivetrain(scene, "stopped", "--workers", "2")

@@ -100,7 +100,7 @@ GEARS = {
 @pytest.mark.parametrize(
     "scene",
     [
-        pytest.param(chart("direct"), id="march"),
+        pytest.param(chart("direct"), id="march", marks=pytest.mark.full),
         pytest.param(chart("atlas"), id="tiles", marks=pytest.mark.full),
         pytest.param(GEARS, id="matrices", marks=pytest.mark.full),
     ],
