@@ -28,6 +28,8 @@ _LABEL_SIZE = 8.5
 _LABEL_LINE = 0.16
 _INCHES_PER_LETTER = 0.068
 _CLEAR = 0.07
+# Space below the legend in inches.
+_FOOT = 0.04
 _INCHES_PER_ENTRY = 0.45
 # The place in a paper at either end of a title: it says nothing to a reader without the paper.
 _PAPER = re.compile(r"[^:]*\b(?:Figs?\.?|Tables?|section) \d[^:]*: |, (?:Figs?\.?|Tables?) \d.*$")
@@ -132,6 +134,9 @@ class Panels:
             box = axes.get_position()
             x0, x1 = (right - (right - x) * narrower for x in (box.x0, box.x1))
             axes.set_position((x0, box.y0, x1 - x0, box.height))
+        # Labels of other rows keep their distance from the numbers.
+        for text in self.figure.texts:
+            text.set_x(text.get_position()[0] + (shift if text.get_rotation() else 0.0))
 
     def titles(self, dataset: xr.Dataset, note: str = "") -> None:
         """Add the scene's title and, below it, the fixed parameters (and ``note``)."""
@@ -149,31 +154,41 @@ class Panels:
         """Make the figure taller if labels above the panels reach into its upper ``inches``."""
         boxes = [box for axes in self.axes[0] if (box := axes.get_tightbbox()) is not None]
         total = self.figure.get_figheight()
-        missing = inches - (total - max(box.y1 for box in boxes) / self.figure.dpi)
+        self._grow(inches - (total - max(box.y1 for box in boxes) / self.figure.dpi), 0.0)
+
+    def _grow(self, missing: float, lift: float) -> None:
+        """Make the figure taller by ``missing`` inches, if positive, and lift everything by ``lift`` inches."""
         if missing <= 0:
             return
+        total = self.figure.get_figheight()
         self.figure.set_figheight(total + missing)
-        ratio = total / (total + missing)
+        ratio, rise = total / (total + missing), lift / (total + missing)
         for axes in self.figure.axes:
             box = axes.get_position()
-            axes.set_position((box.x0, box.y0 * ratio, box.width, box.height * ratio))
+            axes.set_position((box.x0, box.y0 * ratio + rise, box.width, box.height * ratio))
         for text in self.figure.texts:
-            text.set_y(text.get_position()[1] * ratio)
+            text.set_y(text.get_position()[1] * ratio + rise)
 
     def legend(self, handles: Sequence[Artist]) -> None:
-        """Add one legend for the whole figure in the bottom margin, in as many rows as it needs."""
+        """Add one legend for the whole figure in the bottom margin, in as many rows as it needs; the figure grows if these
+        reach into the labels above."""
         length = sum(_INCHES_PER_ENTRY + _INCHES_PER_LETTER * len(_plain(handle.get_label())) for handle in handles)
         rows = max(math.ceil(length / (WIDTH - self.margins.left)), 1)
-        self.figure.legend(
+        legend = self.figure.legend(
             handles=handles,
             loc="lower left",
-            bbox_to_anchor=(self.margins.left / WIDTH, 0.04 / self.figure.get_figheight()),
+            bbox_to_anchor=(self.margins.left / WIDTH, _FOOT / self.figure.get_figheight()),
             ncols=max(math.ceil(len(handles) / rows), 1),
             borderaxespad=0.2,
             borderpad=0.0,
             columnspacing=1.4,
             handlelength=2.0,
         )
+        above = [box for axes in self.axes[-1] if (box := axes.get_tightbbox()) is not None]
+        above += [text.get_window_extent() for text in self.figure.texts if not text.get_rotation()]
+        missing = (legend.get_window_extent().y1 - min(box.y0 for box in above)) / self.figure.dpi + _CLEAR
+        self._grow(missing, missing)
+        legend.set_bbox_to_anchor((self.margins.left / WIDTH, _FOOT / self.figure.get_figheight()))
 
 
 def _left_of_numbers(axes: Axes) -> float:

@@ -86,6 +86,33 @@ def test_a_legend_has_the_rows_that_it_needs(count, rows):
     assert len(heights) == rows and legend.get_window_extent().x1 <= panels.figure.bbox.x1
 
 
+@pytest.mark.parametrize("count", [1, 6, 12, 20])
+def test_a_legend_of_many_rows_stays_below_the_label_of_the_axis(count):
+    with matplotlib.rc_context(STYLE):
+        panels = Panels(2, height=1.5)
+        panels.label_axes("frequency of the drive [rad/s]", "displacement [m]")
+        height = panels.axes[0][0].get_tightbbox().height
+        panels.legend([Line2D([], [], label="largest displacement") for _ in range(count)])
+        drawn(panels)
+    label = next(text for text in panels.figure.texts if text.get_text().startswith("frequency"))
+    box = panels.figure.legends[0].get_window_extent()
+    assert 0 < box.y0 < box.y1 < label.get_window_extent().y0
+    assert panels.axes[0][0].get_tightbbox().height == pytest.approx(height, abs=0.1)
+
+
+def test_labels_of_rows_move_with_the_panels():
+    """The last row needs space for three lines; the label of the first row stays next to its numbers."""
+    with matplotlib.rc_context(STYLE):
+        panels = Panels(2, height=1.2)
+        panels.label_row(panels.axes[0][0], "u [m]")
+        panels.label_row(
+            panels.axes[1][0], "largest Lyapunov exponent over the last three quarters of the periods [1/s]"
+        )
+        drawn(panels)
+    first, numbers = panels.figure.texts[0].get_window_extent(), panels.axes[0][0].yaxis.get_tightbbox()
+    assert 0 < numbers.x0 - first.x1 < 0.3 * panels.figure.dpi
+
+
 def test_a_long_caption_stays_clear_of_the_labels_of_the_resonances():
     fixed = {f"x_{k}": {"value": 123.456 + k, "units": "kg"} for k in range(9)}
     figure = plot(results.chart().assign_attrs(fixed_parameters=json.dumps(fixed)))
