@@ -11,7 +11,7 @@ import xarray as xr
 from matplotlib.colors import ListedColormap
 
 from drivetrain_jax.view.prefixes import prefixed
-from drivetrain_jax.view.units import SUPERSCRIPTS, unit_of, written_units
+from drivetrain_jax.view.units import SUPERSCRIPTS, unit_of, value_in, written_units
 
 # Passed to rc_context around every figure; global rcParams stay unchanged.
 STYLE: dict[Any, Any] = {
@@ -185,9 +185,15 @@ def _unless_swept(dataset: xr.Dataset, name: str, entry: object) -> object:
     value = entry.get("value") if isinstance(entry, dict) else entry
     if not isinstance(value, (list, tuple)):
         return entry
-    axes = {scene_key(c): "varies" if c.ndim else c.item() for c in dataset.coords.values()}
+    units = str(entry.get("units", "1")) if isinstance(entry, dict) else "1"
+    axes = {scene_key(c): "varies" if c.ndim else _scalar(c, units) for c in dataset.coords.values()}
     shown = [axes.get(f"{name}[{i}]", number) for i, number in enumerate(value)]
     return {**entry, "value": shown} if isinstance(entry, dict) else shown
+
+
+def _scalar(coordinate: xr.DataArray, units: str) -> object:
+    """The value of a scalar coordinate in ``units``."""
+    return float(value_in(coordinate, units)) if coordinate.dtype.kind == "f" else coordinate.item()
 
 
 def _fixed_text(dataset: xr.Dataset, name: str, entry: object) -> str:

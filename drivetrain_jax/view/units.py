@@ -117,12 +117,14 @@ def value_in(variable: xr.DataArray, units: str) -> Any:
 
 
 def check_shown(figure: Figure, asked: Iterable[str]) -> None:
-    """Raise :class:`InputError` for a unit that no axis of ``figure`` has."""
+    """Raise :class:`InputError` for a unit that no axis and no caption of ``figure`` has."""
     labels = [" ".join(text.get_text().split()) for text in figure.findobj(Text)]
     # Frequencies of mode shapes are in the titles of the panels, without brackets.
     titles = [axes.get_title(side) for axes in figure.axes for side in ("left", "center")]
     found = [re.findall(r"\[([^\[\]=,]+)\]$", label) for label in labels]
     found += [re.findall(r"[\d.]+ ([A-Za-z][\w/]*)(?=$|[ ,\n])", title) for title in titles]
+    # Fixed values in captions: `= 0.3 rad, ...` and `= [0, 90] deg; ...`.
+    found += [re.findall(r"= (?:\[[^\]]*\]|[^\s\[=,;]+) ([^=,;]+?)(?=[,;]|$)", label) for label in labels]
     shown = list(dict.fromkeys(unit for each in found for unit in each))
     for unit in asked:
         if written_units(unit) not in shown:

@@ -73,6 +73,24 @@ def test_fixed_values_have_the_unit_of_the_scene_or_of_the_axes():
     assert "angle = 28.6479 deg, length = [300, 1200] mm" in texts(plot(dataset, units="deg"))
 
 
+def test_angles_of_planets_have_the_unit_given_or_asked_for():
+    """The angle of the second planet is an axis of one value, so it is a number of the list, too."""
+    fixed = {"planet_angle": {"value": [0.0, np.pi / 2, np.pi], "units": "rad"}}
+    degrees = '[axes]\nk_p = {}\nk_r = {}\n"planet_angle[1]" = ["93 deg"]\n[fixed]\nplanet_angle = ["0 deg"]\n'
+    radians = '[axes]\nk_p = {}\nk_r = {}\n"planet_angle[1]" = [1.6232]\n[fixed]\nplanet_angle = [0, 1.5708, 3.1416]\n'
+    about = {"units": "rad", "parameter": "planet_angle[1]", "long_name": "angle of the planet, entry 1"}
+    second = xr.DataArray(np.deg2rad(93.0), attrs=about, name="planet_angle_1")
+    for scene, units in ((degrees, None), (degrees, "deg"), (radians, "deg")):
+        dataset = chart(fixed_parameters=json.dumps(fixed), scene=scene).assign_coords(planet_angle_1=second)
+        dataset = dataset.rename(beta="k_p", Omega="k_r")
+        for name in ("k_p", "k_r"):
+            dataset[name].attrs["units"] = "N/m"
+        assert "planet angle = [0, 93, 180] deg" in texts(plot(dataset, units=units))
+    assert "planet angle = [0, 1.6232, 3.1416] rad" in texts(plot(dataset))
+    with pytest.raises(InputError, match=r"units = 'kg': no axis .* N/m, .*rad"):
+        plot(dataset, units="kg")
+
+
 def test_flanks_and_phase_follow_the_units_of_their_axes():
     """A gear pair with 0.1 mm backlash: flanks at 50 micrometres from the middle, in any unit."""
     gears = dt.Rattle(omega=0.9, B0=0.05, B1=0.03, b=5e-5, c=0.05, alpha=0.25, k=1.0, I=1.0)
