@@ -113,6 +113,23 @@ def test_maps_show_where_a_mode_meets_the_operating_speeds():
         np.testing.assert_allclose(np.concatenate(lines.allsegs[0]).sum(axis=1), total)
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert names == ["lowest operating speed", "highest operating speed"]
+    # The joints bend the shaft twice a turn: at 10 rpm they meet the first mode where it is 20 rpm.
+    limits = json.dumps({"operating_min": 0.0, "operating_max": 10.0})
+    figure = plot(dataset.assign_attrs(options=limits, system="bicardan"))
+    (lines,) = [each for each in figure.axes[0].collections if isinstance(each, QuadContourSet)]
+    np.testing.assert_allclose(np.concatenate(lines.allsegs[0]).sum(axis=1), 10.0)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["highest operating speed, order 2 (joints)"]
+
+
+def test_joints_meet_the_modes_at_half_of_their_critical_speeds(swept):
+    figure = plot(swept.assign_attrs(system="bicardan"))
+    curves = [np.asarray(line.get_ydata()) for line in figure.axes[0].get_lines() if len(line.get_xdata()) == 25]
+    assert len(curves) == 6
+    for first, second in zip(curves[:3], curves[3:], strict=True):
+        np.testing.assert_allclose(2 * second, first, rtol=1e-15)
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names[:2] == ["order 1", "order 2 (joints)"]
+    assert [text.get_text() for text in figure.axes[0].texts] == ["mode 1", "mode 2", "mode 3"]
 
 
 def test_two_axes_give_one_map_per_mode(swept):

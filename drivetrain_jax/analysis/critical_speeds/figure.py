@@ -43,6 +43,8 @@ _MOST_SHAPES, _MOST_MAPS = 6, 4
 _LETTERS = 32
 # Least distance between the names of two curves, in points.
 _LABEL_HEIGHT = 8.0
+# Line styles and colours of the orders, from the first on.
+_DASHES, _ORDER_COLOURS = ("solid", (0, (4, 2))), ("black", LINE_COLOURS[1])
 # Ratio to the other frequencies below which a frequency counts as zero; a logarithmic axis cannot show zero.
 _NEGLIGIBLE = 1e-9
 # Height of the shaft's segment of greatest stiffness, in units of the largest deflection; symbols of its points.
@@ -116,26 +118,38 @@ def _curves(dataset: xr.Dataset, name: str, shown: str) -> Figure:
         axes.set_yscale("log")
     else:
         axes.set_ylim(bottom=0.0)
+    _label_curves(axes)
+    higher = _draw_orders(axes, dataset, x, drawn) if shown == "critical_speed" else []
     operating = _draw_range(axes, _operating(dataset, shown))
     if logarithmic:
         cells.plain_decades(axes, "y")
     axes.grid(color=FRAME_GREY, alpha=0.2, linewidth=0.5)
-    _label_curves(axes)
     axes.set_ylabel(variable_label(dataset[shown]))
     panels.label_axes(_every(dataset, abscissa, name))
     panels.titles(dataset)
-    panels.legend([*operating, *_doubtful(axes, dataset, name, x, drawn, order)])
+    panels.legend([*higher, *operating, *_doubtful(axes, dataset, name, x, drawn, order)])
     return panels.figure
+
+
+def _draw_orders(axes: Axes, dataset: xr.Dataset, x: np.ndarray, speeds: np.ndarray) -> list[Artist]:
+    """Draw the speeds at which higher orders meet the modes of ``speeds`` (modes, points); returns legend entries."""
+    orders = stored_orders(dataset.attrs)
+    handles: list[Artist] = []
+    for (label, times), dashes in zip(orders.per_turn.items() if orders else (), _DASHES, strict=False):
+        style = {"linestyle": dashes, "linewidth": 1.2 if times == 1 else 0.7}
+        if times != 1:
+            axes.set_prop_cycle(color=_colours(len(speeds)))
+            axes.plot(x, speeds.T / times, **style)
+        handles.append(Line2D([], [], color=FRAME_GREY, label=label, **style))
+    return handles
 
 
 def _operating(dataset: xr.Dataset, shown: str) -> tuple[float, float] | None:
     """Lowest and highest operating speed in the units of ``shown``, if stored."""
     options = json.loads(dataset.attrs.get("options", "{}"))
     low, high = (options.get(f"operating_{end}", 0.0) for end in ("min", "max"))
-    if not high > 0:
-        return None
     rpm = suitable("rpm", [str(dataset[shown].attrs.get("units", "rpm"))])[0]
-    return low * rpm, high * rpm
+    return (low * rpm, high * rpm) if high > 0 else None
 
 
 def _draw_range(axes: Axes, operating: tuple[float, float] | None) -> list[Artist]:
@@ -205,14 +219,10 @@ def _maps(dataset: xr.Dataset, names: list[str], shown: str) -> Figure:
         cmap = matplotlib.colormaps["viridis"].with_extremes(bad=STATE_COLOURS[cells.FAILED])
         field = field.where(field.isnull() | (field > low), low)
         mesh = cells.draw_cells(axes, field, horizontal, vertical, cmap=cmap, norm=norm)
-        operating |= _draw_limits(
-            axes, dataset[shown].isel(mode=mode), (horizontal, vertical), _operating(dataset, shown)
-        )
-        number = dataset["mode"].values[mode]
-        bar_format = ticker.StrMethodFormatter("{x:g}")
-        panels.colorbar(
-            axes, mesh, f"mode {number}: {variable_label(field)}", format=bar_format, ticks=_ticks(low, high)
-        )
+        operating |= _draw_limits(axes, dataset, shown, mode, (horizontal, vertical))
+        label = f"mode {dataset['mode'].values[mode]}: {variable_label(field)}"
+        bar: dict[str, Any] = {"format": ticker.StrMethodFormatter("{x:g}"), "ticks": _ticks(low, high)}
+        panels.colorbar(axes, mesh, label, **bar)
         panels.figure.axes[-1].yaxis.set_minor_formatter(ticker.NullFormatter())
         axes.set_ylabel(textwrap.fill(axis_label(dataset[vertical]), _LETTERS))
     panels.label_axes(axis_label(dataset[horizontal]))
@@ -221,21 +231,21 @@ def _maps(dataset: xr.Dataset, names: list[str], shown: str) -> Figure:
     return panels.figure
 
 
-def _draw_limits(
-    axes: Axes, field: xr.DataArray, names: tuple[str, str], operating: tuple[float, float] | None
-) -> dict[str, Artist]:
-    """Draw lines where ``field`` equals the lowest or highest operating speed; returns legend entries."""
+def _draw_limits(axes: Axes, dataset: xr.Dataset, shown: str, mode: int, names: tuple[str, str]) -> dict[str, Artist]:
+    """Draw lines where an order meets ``mode`` at the lowest or highest operating speed; returns legend entries."""
+    field, orders = dataset[shown].isel(mode=mode), getattr(stored_orders(dataset.attrs), "per_turn", {"": 1.0})
+    x, y, heights = field[names[0]], field[names[1]], field.transpose(*reversed(names))
     handles: dict[str, Artist] = {}
-    # A white outline keeps the black line visible on the dark end of the map.
+    # A white outline keeps the lines visible on the dark end of the map.
     style = {"linewidth": 1.0, "path_effects": [withStroke(linewidth=2.4, foreground="white")]}
-    for name, speed, dashes in zip(("lowest", "highest"), operating or (), ("dashed", "solid"), strict=False):
-        if not float(field.min()) < speed < float(field.max()):
-            continue
-        x, y = (field[each] for each in names)
-        lines = axes.contour(x, y, field.transpose(*reversed(names)), [speed], colors="black", linestyles=dashes)
-        lines.set(**style)
-        label = f"{name} operating speed"
-        handles[label] = Line2D([], [], color="black", linestyle=dashes, label=label, **style)
+    for (order, times), colour in zip(orders.items(), _ORDER_COLOURS, strict=False):
+        limits = zip(("lowest", "highest"), _operating(dataset, shown) or (), ("dashed", "solid"), strict=False)
+        for name, speed, dashes in limits:
+            if not float(field.min()) < times * speed < float(field.max()):
+                continue
+            axes.contour(x, y, heights, [times * speed], colors=colour, linestyles=dashes).set(**style)
+            label = f"{name} operating speed" + ("" if times == 1 else f", {order}")
+            handles[label] = Line2D([], [], color=colour, linestyle=dashes, label=label, **style)
     return handles
 
 
