@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax._errors import InputError
 from drivetrain_jax.systems._rows import Rows, dense
+
+# Distance from a breakpoint at which its two sides are evaluated, over the span: more than the rounding of a time.
+_ASIDE = 1e-15
 
 
 def _vanishes(entry: Any) -> bool:
@@ -30,6 +37,22 @@ def _tuples(matrix: Any) -> Rows | None:
 SWAP = _tuples(np.kron(np.array([[0.0, 1.0], [1.0, 0.0]]), np.eye(2)))
 
 
+class _Piece(eqx.Module):
+    """The rows of a system between two breakpoints, at the fraction s of the piece, which is the unit of time."""
+
+    rows: Callable[..., Rows]
+    start: Any
+    length: Any
+    aside: Any
+    basis: Callable[[Any], tuple[Any, ...]] = eqx.field(static=True)
+
+    def __call__(self, s: Any) -> Rows:
+        # The ends of a piece are evaluated on its own side of the breakpoints.
+        t = self.start + jnp.clip(s * self.length, self.aside, self.length - self.aside)
+        rows = self.rows(*self.basis(t))
+        return tuple(tuple(0 if _vanishes(entry) else self.length * entry for entry in row) for row in rows)
+
+
 class LinearPeriodic(diffrax.AbstractTerm):
     """The linear system ``x' = A(t) x`` over one interval ``[0, span]`` of its clock ``t``: a term for any diffrax solver.
 
@@ -38,7 +61,8 @@ class LinearPeriodic(diffrax.AbstractTerm):
     the period and the monodromy matrix is the propagator ``Phi`` itself. With the reversor ``X`` (``X X = I``) the interval
     is half the period and the monodromy matrix is similar to ``X Phi^T X Phi``. With ``reversal()``, two matrices
     ``(R0, R1)`` as rows, the monodromy matrix is similar to ``R0 Phi^T R1 Phi``. ``log_determinant()`` is the exact
-    logarithm of the determinant of the monodromy matrix (Liouville's formula), if known.
+    logarithm of the determinant of the monodromy matrix (Liouville's formula), if known. ``breakpoints`` are the instants,
+    rising within the span, at which the matrix jumps or has a kink: steps of integrations end there.
 
     The term is a pytree if its functions are pytrees, such as the bound methods of an Equinox module.
     """
@@ -49,6 +73,40 @@ class LinearPeriodic(diffrax.AbstractTerm):
     reversor: Rows | None = eqx.field(default=None, static=True, converter=_tuples)
     log_determinant: Callable[[], Any] | None = None
     reversal: Callable[[], tuple[Rows, Rows]] | None = None
+    breakpoints: tuple[Any, ...] = ()
+
+    def __check_init__(self) -> None:
+        ends = (0.0, *self.breakpoints, self.span)
+        # Values of a batch are not checked: a lane with a wrong one has no value.
+        if not self.breakpoints or any(isinstance(x, jax.core.Tracer) or np.ndim(x) for x in ends):
+            return
+        for i, value in enumerate(self.breakpoints):
+            if not ends[i] < value < self.span:
+                raise InputError(
+                    f"breakpoints[{i}] = {value:g}: allowed is {ends[i]:g} < breakpoints[{i}] < {self.span:g}"
+                )
+
+    @property
+    def parts(self) -> tuple[LinearPeriodic, ...]:
+        """The system between its breakpoints, in order: one of span 1 for each piece, or the system itself without any.
+
+        A piece of negative length, from a breakpoint outside of the span, is NaN.
+        """
+        if not self.breakpoints:
+            return (self,)
+        ends = [jnp.asarray(x, float) for x in (0.0, *self.breakpoints, self.span)]
+        pieces = []
+        for start, end in pairwise(ends):
+            length = jnp.where(end > start, end - start, jnp.nan)
+            aside = jnp.minimum(_ASIDE * self.span, length / 2)
+            pieces.append(LinearPeriodic(_Piece(self.rows, start, length, aside, self.basis), 1.0))
+        return tuple(pieces)
+
+    @property
+    def is_pytree(self) -> bool:
+        """True if ``rows`` is a pytree; any other function may depend on unknown arrays."""
+        rows = self.rows.rows if isinstance(self.rows, _Piece) else self.rows
+        return isinstance(rows, eqx.Module | jax.tree_util.Partial)
 
     @property
     def halves(self) -> int:

@@ -12,7 +12,9 @@ import pytest
 DOCS = Path(__file__).parents[2] / "docs"
 
 
-@pytest.mark.parametrize(("page", "fewest"), [("jax.md", 15), ("notebooks.md", 25), ("scaling.md", 2)])
+@pytest.mark.parametrize(
+    ("page", "fewest"), [("jax.md", 15), ("notebooks.md", 25), ("scaling.md", 2), ("extending.md", 7)]
+)
 def test_the_examples_of_the_page_run(page, fewest, tmp_path, monkeypatch):
     if page == "scaling.md":
         pytest.importorskip("dask_jobqueue")

@@ -18,7 +18,7 @@ from jax import Array
 
 from drivetrain_jax.analysis.floquet.direct import assemble
 from drivetrain_jax.analysis.floquet.multipliers import sort_multipliers
-from drivetrain_jax.analysis.floquet.propagator import EqualSteps, Order8, propagator
+from drivetrain_jax.analysis.floquet.propagator import EqualSteps, Order8, through
 from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic
@@ -42,19 +42,23 @@ class Change(NamedTuple):
 
 
 class _Varied(eqx.Module):
-    """One linear system of twice the size: a system and its derivative along ``direction``. The unit of time is the span."""
+    """One linear system of twice the size: a system and its derivative along ``direction``, between two breakpoints.
+
+    The unit of time is the span of the ``part``, so that derivatives include the motion of its ends.
+    """
 
     parameters: Any
     direction: Any
     build: Build = eqx.field(static=True)
     constants: Constants = eqx.field(static=True)
+    part: int = eqx.field(static=True)
 
     def rows(self, s: Any) -> tuple[tuple[Any, ...], ...]:
         """``((A, 0), (dA, A))`` at the fraction s of the span."""
         sizes: list[int] = []
 
         def entries(parameters: Any) -> dict[tuple[int, int], Array]:
-            form = reduced_form(self.build, parameters, self.constants)
+            form = reduced_form(self.build, parameters, self.constants).parts[self.part]
             sizes.append(form.size)
             return {place: form.span * x for place, x in form.entries(*form.basis(s * form.span)).items()}
 
@@ -81,11 +85,12 @@ def monodromy_change(
 ) -> Change:
     """The monodromy matrix of one point in ``steps`` steps, and its derivatives by ``parameters``, a pytree of P numbers."""
     leaves, tree = jax.tree.flatten(parameters)
+    parts = len(reduced_form(build, parameters, constants).breakpoints) + 1
 
     def along(direction: Array) -> Change:
         direction = jax.tree.unflatten(tree, list(direction))
-        varied = LinearPeriodic(_Varied(parameters, direction, build, constants).rows, 1.0)
-        found = propagator(varied, steps, 1, solver)
+        varied = [_Varied(parameters, direction, build, constants, part).rows for part in range(parts)]
+        found = through([LinearPeriodic(rows, 1.0) for rows in varied], steps, 1, solver)
         n = len(found.matrix) // 2
         phi, change = found.matrix[:n, :n], found.matrix[n:, :n]
 

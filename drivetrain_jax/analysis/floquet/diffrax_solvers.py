@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import reduce
 from typing import Any
 
 import diffrax
@@ -106,13 +107,17 @@ def equal_step_propagator(form: LinearPeriodic, solver: diffrax.AbstractSolver, 
 
     Under ``jax.vmap`` the lanes are the last axis of a single state, which halves the time of ``solver``.
     """
-    arrays, rest = eqx.partition(LinearPeriodic(form.rows, form.span, form.basis), eqx.is_array)
-    if isinstance(form.rows, eqx.Module | jax.tree_util.Partial):
-        matrix = lanes_last(_integrated, Constants((rest, solver)), arrays, steps)
-    else:
-        # Any other function may depend on unknown arrays.
-        matrix = _integrated(Constants((rest, solver)), arrays, steps)[..., 0]
+    matrices = [_of_part(part, solver, steps) for part in form.parts]
+    matrix = reduce(lambda before, after: after @ before, matrices)
     return Propagator(matrix, jnp.zeros(()), jnp.ones(()))
+
+
+def _of_part(form: LinearPeriodic, solver: diffrax.AbstractSolver, steps: Array) -> Array:
+    arrays, rest = eqx.partition(LinearPeriodic(form.rows, form.span, form.basis), eqx.is_array)
+    if form.is_pytree:
+        return lanes_last(_integrated, Constants((rest, solver)), arrays, steps)
+    # Any other function may depend on unknown arrays.
+    return _integrated(Constants((rest, solver)), arrays, steps)[..., 0]
 
 
 def _integrated(constants: Constants, arrays: LinearPeriodic, steps: Array) -> Array:
@@ -142,19 +147,21 @@ def diffrax_propagator(
     form: LinearPeriodic, solver: diffrax.AbstractSolver, max_steps: int | None = None, **options: Any
 ) -> tuple[Propagator, Array]:
     """The propagator of one point over the span, NaN where the integration failed, and whether it succeeded."""
-    solution = diffrax.diffeqsolve(
-        form,
-        solver,
-        t0=0.0,
-        t1=form.span,
-        dt0=None,
-        y0=jnp.eye(form.size),
-        saveat=diffrax.SaveAt(t1=True),
-        adjoint=diffrax.ForwardMode(),
-        max_steps=max_steps,
-        throw=False,
-        **options,
-    )
-    success = solution.result == diffrax.RESULTS.successful
-    matrix = jnp.where(success, solution.ys[-1], jnp.nan)  # pyright: ignore[reportOptionalSubscript]
-    return Propagator(matrix, jnp.zeros(()), jnp.ones(())), success
+    matrix, success = jnp.eye(form.size), jnp.bool_(True)
+    for part in form.parts:
+        solution = diffrax.diffeqsolve(
+            part,
+            solver,
+            t0=0.0,
+            t1=part.span,
+            dt0=None,
+            y0=matrix,
+            saveat=diffrax.SaveAt(t1=True),
+            adjoint=diffrax.ForwardMode(),
+            max_steps=max_steps,
+            throw=False,
+            **options,
+        )
+        success &= solution.result == diffrax.RESULTS.successful
+        matrix = solution.ys[-1]  # pyright: ignore[reportOptionalSubscript]
+    return Propagator(jnp.where(success, matrix, jnp.nan), jnp.zeros(()), jnp.ones(())), success

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.floquet.propagator import radau_iia
 from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, suits_one_kernel
 from drivetrain_jax.systems import LinearPeriodic
@@ -39,6 +40,8 @@ def propagators_along(form: Form, ends: Array, first: int, lanes: int, parts: Ar
     """
     weights, places = radau_iia(NODES)
     system = form(ends[0])
+    if system.breakpoints:
+        raise InputError(f"breakpoints: got {len(system.breakpoints)}; allowed with Series is none")
     size, length = system.size, system.span / parts
     powers = x[:, None] ** jnp.arange(TERMS + 1)
     leads = ((jnp.arange(size) >= first)[:, None] & (jnp.arange(size) < first))[..., None]

@@ -10,7 +10,7 @@ expressions are computed once (:mod:`~drivetrain_jax.analysis.numerics.staged`).
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from typing import Any, ClassVar, NamedTuple
 
@@ -122,7 +122,7 @@ class Order8(EqualSteps):
         # The other fields of the term are not used.
         arrays, rest = eqx.partition(LinearPeriodic(terms.rows, 0.0, terms.basis), eqx.is_array)
         shared = jnp.asarray(t0, float), jnp.asarray(t1, float), self.count
-        if not jax.tree.leaves(arrays) or not isinstance(terms.rows, eqx.Module | jax.tree_util.Partial):
+        if not jax.tree.leaves(arrays) or not terms.is_pytree:
             # No arrays to batch, or a function that may depend on unknown arrays.
             matrix, log_scale = _march(terms, *shared)
             return matrix[..., 0], log_scale[0]
@@ -174,24 +174,33 @@ def propagator(
 ) -> Propagator:
     """``Phi`` of one point by ``steps`` equal steps (or panels) of ``solver``, a multiple of ``pieces``.
 
-    The growth of errors is measured between the ``pieces`` of the span, at most ``PIECES``.
+    The growth of errors is measured between the ``pieces`` of the span, at most ``PIECES``. Between two breakpoints there
+    are as many steps as in a span without any.
     """
-    n = system.size
-    end = diffrax.diffeqsolve(
-        system,
-        solver(steps // pieces),
-        t0=0.0,
-        t1=system.span,
-        dt0=None,
-        y0=jnp.eye(n),
-        stepsize_controller=EqualStepSize(pieces),
-        saveat=diffrax.SaveAt(t1=True, solver_state=True),
-        adjoint=diffrax.ForwardMode(),
-        max_steps=PIECES,
-        throw=False,
-    )
-    matrix, record = end.ys[0], end.solver_state  # pyright: ignore[reportOptionalSubscript]
-    growth = jnp.sqrt(jnp.trace(record.covariance) / (n * pieces * jnp.sum(matrix**2)))  # pyright: ignore[reportOptionalMemberAccess]
+    return through(system.parts, steps, pieces, solver)
+
+
+def through(parts: Sequence[LinearPeriodic], steps: Array, pieces: Array | int, solver: type[EqualSteps]) -> Propagator:
+    """The :func:`propagator` over the spans of ``parts`` one after another, in ``steps`` steps each."""
+    matrix, record = jnp.eye(parts[0].size), None
+    for part in parts:
+        end = diffrax.diffeqsolve(
+            part,
+            solver(steps // pieces),
+            t0=0.0,
+            t1=part.span,
+            dt0=None,
+            y0=matrix,
+            stepsize_controller=EqualStepSize(pieces),
+            saveat=diffrax.SaveAt(t1=True, solver_state=True),
+            adjoint=diffrax.ForwardMode(),
+            max_steps=PIECES,
+            throw=False,
+            solver_state=record,
+        )
+        matrix, record = end.ys[0], end.solver_state  # pyright: ignore[reportOptionalSubscript]
+    count = len(matrix) * len(parts) * pieces
+    growth = jnp.sqrt(jnp.trace(record.covariance) / (count * jnp.sum(matrix**2)))  # pyright: ignore[reportOptionalMemberAccess]
     return Propagator(matrix, record.log_scale, growth)  # pyright: ignore[reportOptionalMemberAccess]
 
 
