@@ -101,3 +101,23 @@ def stuart_landau(*rates: float) -> Flow:
         return tuple(x for a, b, w in pairs for x in ((1 - a * a - b * b) * a - w * b, (1 - a * a - b * b) * b + w * a))
 
     return Flow(field, spread(1, *(0.6, 0.3) * len(rates)), period=1.7)
+
+
+def forced_cycle(rate: float, drive: float, turn: float = 1.0) -> Flow:
+    """Stuart-Landau's oscillator driven by ``drive cos(turn angle)``: locked, or with a frequency of its own."""
+
+    def field(angles, y):
+        a, b = y
+        drop = 1 - a * a - b * b
+        return drop * a - rate * b + drive * jnp.cos(angles[1]), drop * b + rate * a
+
+    return Flow(field, spread(1, 0.6, 0.3), period=1.7, turns=(1, turn))
+
+
+def algebraic() -> Flow:
+    """x' = -x^3, y' = -y: a strobed decay to rest like 1/sqrt(2 t), whose exponent is zero."""
+
+    def field(_, y):
+        return -(y[0] ** 3), -y[1]
+
+    return Flow(field, spread(1, 0.6, 0.3), period=1.7, turns=(1,))

@@ -581,6 +581,10 @@ KNOWN = {
     "centre": (lambda: flows.damped(turns=(), damping=0.0), 300.0, Verdict.UNDECIDED, None),
     "limit cycle": (lambda: flows.stuart_landau(1.0), 100.0, Verdict.PERIODIC, None),
     "torus": (lambda: flows.stuart_landau(1.0, _GOLDEN), 300.0, Verdict.QUASI_PERIODIC, None),
+    "forced torus": (lambda: flows.forced_cycle(1.0, 0.3), 300.0, Verdict.QUASI_PERIODIC, 0),
+    "locked cycle": (lambda: flows.forced_cycle(3.6, 0.5), 300.0, Verdict.FIXED_POINT, 1),
+    "cycle locked to every second period": (lambda: flows.forced_cycle(1.9, 0.5, 0.5), 300.0, Verdict.PERIODIC, 2),
+    "decay slower than exponential": (lambda: flows.algebraic(), 300.0, Verdict.UNDECIDED, None),
 }  # fmt: skip
 _SHORT = "decay to rest", "small response", "limit cycle"
 

@@ -11,7 +11,8 @@ from drivetrain_jax.analysis.lyapunov.verdict import Evidence, Verdict, judge
 CHAOTIC = Evidence(
     spectrum=jnp.array([1.0, -3.0]), error=jnp.array([0.1, 0.1]), coarse=jnp.array(1.0), coarse_error=jnp.array(0.1),
     sum_residual=jnp.array(1e-6), k01=jnp.array(0.99), bounded=jnp.array(True), growing=jnp.array(False),
-    multiple=jnp.array(0), settled=jnp.array(True), resolved=jnp.array(True), roomy=jnp.array(True),
+    multiple=jnp.array(0), settled=jnp.array(True), returns=jnp.array(False),
+    resolved=jnp.array(True), roomy=jnp.array(True),
 )  # fmt: skip
 REGULAR = CHAOTIC._replace(spectrum=jnp.array([-1.0, -3.0]), k01=jnp.array(0.0))
 
@@ -96,6 +97,25 @@ def test_a_motion_that_left_agrees_to_a_tenth():
 )
 def test_kinds_of_attracting_motion(changed, kind):
     assert verdict(REGULAR, **changed) == kind
+
+
+@pytest.mark.parametrize(
+    ("changed", "kind"),
+    [
+        ({}, Verdict.QUASI_PERIODIC),
+        ({"returns": False}, Verdict.UNDECIDED),
+        ({"spectrum": [0.01, 0.02]}, Verdict.UNDECIDED),
+        ({"spectrum": [-1.0, -3.0]}, Verdict.UNDECIDED),
+        ({"k01": 0.2}, Verdict.UNDECIDED),
+        ({"k01": float("nan")}, Verdict.UNDECIDED),
+        ({"bounded": False, "spectrum": [-0.01, -3.0]}, Verdict.UNDECIDED),
+        ({"spectrum": [1.0, -3.0], "k01": 1.0}, Verdict.CHAOTIC),
+    ],
+)
+def test_a_forced_torus_has_one_zero_exponent_and_returns(changed, kind):
+    """The exponents of the section, with errors of 0.1, and ``settled`` false as for every exponent near 0."""
+    torus = {"spectrum": [0.01, -3.0], "k01": 0.0, "settled": False, "returns": True}
+    assert verdict(REGULAR, **torus | changed) == kind
 
 
 @pytest.mark.parametrize(

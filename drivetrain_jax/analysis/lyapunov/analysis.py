@@ -39,7 +39,7 @@ from drivetrain_jax.analysis.lyapunov.growth_record import (
 )
 from drivetrain_jax.analysis.lyapunov.march_steps import LEAST, MOST, contraction, needed_steps
 from drivetrain_jax.analysis.lyapunov.paper_estimator import paper_estimator
-from drivetrain_jax.analysis.lyapunov.resolution import STANDARD_ERRORS, resolved
+from drivetrain_jax.analysis.lyapunov.resolution import STANDARD_ERRORS, resolved, zero_floor
 from drivetrain_jax.analysis.lyapunov.sampling import SAMPLES, Sampling, sample
 from drivetrain_jax.analysis.lyapunov.variational import batch_shape
 from drivetrain_jax.analysis.lyapunov.verdict import Evidence, Verdict, grows, judge
@@ -166,7 +166,8 @@ def evidence_of(flow: Flow, fine: Record, found: Findings, seen: Sampling) -> Ev
     growing = grows(fine.size, fine.used, fine.span, spectrum.values[0])
     return Evidence(
         spectrum.values, spectrum.errors, coarse.values[0], coarse.errors[0], jnp.abs(found.residual), seen.k01,
-        fine.bounded, growing, seen.multiple, seen.settled, found.resolved, may_be_chaotic(flow, fine.state),
+        fine.bounded, growing, seen.multiple, seen.settled, seen.returns, found.resolved,
+        may_be_chaotic(flow, fine.state),
     )  # fmt: skip
 
 
@@ -197,8 +198,8 @@ def analyse(flow: Flow, request: Request) -> dict[str, Array]:
     spectrum = found.spectrum
     results |= _of_spectrum(run.fine, found)
     if wanted & _SECTION:
-        # The verdict needs K if the motion grows, or if it is unforced.
-        needed = spectrum.values[0] > STANDARD_ERRORS * spectrum.errors[0]
+        # The verdict needs K unless the motion is forced and decays.
+        needed = spectrum.values[0] > -STANDARD_ERRORS * spectrum.errors[0] - zero_floor(spectrum.values)
         needed = jnp.ones_like(needed) if "chaos_k01" in wanted or not flow.turns else needed
         rate = spectrum.values[0] + STANDARD_ERRORS * spectrum.errors[0]
         seen = sample(flow, steps, run.fine, rate, needed)

@@ -20,6 +20,8 @@ from drivetrain_jax.systems import Flow
 SAMPLES, LONGEST = 1024, 512
 # Relative tolerance for repetition; relative transient below which a motion counts as not repeating.
 _REPEATED, _UNSETTLED = 1e-9, 1e-4
+# Distances of close returns, relative to the motion: a torus comes as close as the smaller ones, but later.
+_RETURNS = (0.3, 0.1, 0.03, 0.01)
 # Factor on the bound of the transient from its exponent: the exponents of a near-degenerate pair are known only to about the
 # inverse of the time, whatever their standard errors.
 _MARGIN = 1e3
@@ -28,11 +30,13 @@ _MOST_LOOKS = 16
 
 
 class Sampling(NamedTuple):
-    """Results of the strobes after a run: K of the 0-1 test, the period in strobes, and a flag if the period is certain."""
+    """Results of the strobes after a run: K of the 0-1 test, the period in strobes, and flags if the period is certain and
+    if the motion :func:`returns`."""
 
     k01: Array
     multiple: Array
     settled: Array
+    returns: Array
 
 
 class _Look(NamedTuple):
@@ -84,7 +88,9 @@ def sample(flow: Flow, steps: Any, record: Record, rate: Array, k01_for: Array) 
     good = record.bounded & jnp.all(jnp.isfinite(seen.first), axis=(0, 1))
     k01 = jax.lax.cond(jnp.any(k01_for), largest_k01, lambda x: jnp.zeros(x.shape[2:]), seen.first)
     k01 = jnp.where(k01_for, k01, 0.0)
-    return Sampling(jnp.where(good, k01, jnp.nan), jnp.where(good, seen.multiple, 0), seen.settled)
+    multiple = jnp.where(good, seen.multiple, 0)
+    back = jax.lax.cond(jnp.any(k01_for), returns, lambda x: jnp.zeros(x.shape[2:], bool), seen.first)
+    return Sampling(jnp.where(good, k01, jnp.nan), multiple, seen.settled, good & (multiple == 0) & back)
 
 
 def transient_left(flow: Flow, record: Record, rate: Array, strobe: Array) -> Array:
@@ -104,6 +110,19 @@ def _comes_to_rest(flow: Flow, record: Record, rate: Array, size: Array, strobe:
     decay = -rate * (strobe * flow.period - first * record.span)
     shrunk = jnp.where(begin > 0, size / jnp.where(begin > 0, begin, 1.0), 0.0)
     return jnp.all(rates[:, moving] == 0, axis=(0, 1)) & (decay > TELLING) & (shrunk < jnp.exp(-decay / 2))
+
+
+def returns(section: Array) -> Array:
+    """Flags of motions whose close returns take the longer, the closer they are, shape (...).
+
+    A slow decay towards a period is as close to itself after this period as after any other time.
+    """
+    tolerance = jnp.broadcast_to(
+        jnp.array(_RETURNS).reshape(-1, *(1,) * (section.ndim - 2)), (len(_RETURNS), *section.shape[2:])
+    )
+    after = period_multiple(section, tolerance, LONGEST)
+    first = jnp.min(jnp.where(after > 0, after, LONGEST), axis=0)
+    return jnp.max(after, axis=0) > first
 
 
 def repetition(section: Array, left: Array) -> tuple[Array, Array]:

@@ -42,7 +42,8 @@ class Evidence(NamedTuple):
     with twice the step, and its error; ``sum_residual``: residual of the sum rule; ``k01``: K of the 0-1 test;
     ``bounded``: true if the motion stays bounded; ``growing``: see :func:`grows`; ``multiple``: strobes until the motion
     repeats, 0 if it does not within the sample; ``settled``: true if the transient is small enough to decide;
-    ``resolved``: see :func:`~.resolution.resolved`; ``roomy``: true if the field can be chaotic.
+    ``returns``: true if it comes close to itself again and again without repeating, as on a torus; ``resolved``: see
+    :func:`~.resolution.resolved`; ``roomy``: true if the field can be chaotic.
     """
 
     spectrum: Array
@@ -55,6 +56,7 @@ class Evidence(NamedTuple):
     growing: Array
     multiple: Array
     settled: Array
+    returns: Array
     resolved: Array
     roomy: Array
 
@@ -99,11 +101,23 @@ def _chaotic(evidence: Evidence) -> Array:
 
 
 def _forced(evidence: Evidence) -> Array:
-    """Kind of an attracting motion, from the number of strobes after which it repeats."""
+    """Kind of an attracting motion, from the number of strobes after which it repeats.
+
+    A motion with a frequency of its own has one zero exponent. It is a torus if it also returns, which a decay slower than
+    exponential does not.
+    """
+    zeros = _zeros(evidence)
     decays = evidence.spectrum[0] < -STANDARD_ERRORS * evidence.error[0] - zero_floor(evidence.spectrum)
     kind = jnp.where(evidence.multiple > 1, Verdict.PERIODIC, Verdict.QUASI_PERIODIC)
     kind = jnp.where(evidence.multiple == 1, Verdict.FIXED_POINT, kind)
-    return jnp.where(decays & evidence.settled, kind, Verdict.UNDECIDED)
+    torus = zeros[0] & (jnp.sum(zeros, axis=0) == 1) & evidence.returns & (evidence.k01 < 1 - CHAOTIC_K)
+    kind = jnp.where(decays & evidence.settled, kind, Verdict.UNDECIDED)
+    return jnp.where(torus, Verdict.QUASI_PERIODIC, kind)
+
+
+def _zeros(evidence: Evidence) -> Array:
+    """Flags of exponents that are zero within their errors, (m, ...)."""
+    return jnp.abs(evidence.spectrum) <= STANDARD_ERRORS * evidence.error + zero_floor(evidence.spectrum)
 
 
 def _autonomous(evidence: Evidence) -> Array:
@@ -111,7 +125,7 @@ def _autonomous(evidence: Evidence) -> Array:
 
     A plane has no torus: a motion in a plane with two zero exponents is degenerate, or drifts too slowly to decide.
     """
-    zeros = jnp.abs(evidence.spectrum) <= STANDARD_ERRORS * evidence.error + zero_floor(evidence.spectrum)
+    zeros = _zeros(evidence)
     count = jnp.sum(zeros, axis=0)
     torus = jnp.where(evidence.roomy, Verdict.QUASI_PERIODIC, Verdict.UNDECIDED)
     kind = jnp.where(count == 0, Verdict.FIXED_POINT, jnp.where(count == 1, Verdict.PERIODIC, torus))
