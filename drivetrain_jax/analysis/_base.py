@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Any
 
 import equinox as eqx
@@ -78,6 +78,33 @@ class Solver:
     march: bool = False
     short_loops: bool = False
     lengthy: bool = False
+
+
+def finite_results(
+    results: Mapping[str, Array], *, path: bool = False, gaps: Collection[str] = (), infinite: Collection[str] = ()
+) -> dict[str, Array]:
+    """``results`` with outcome ``NOT_FINITE``, and NaN for all numbers, where a success has no finite value.
+
+    The axes of a result are the ``path`` if there is one, its own, and the lanes. Results in ``gaps`` may be NaN, those in
+    ``infinite`` may be infinite.
+    """
+    outcome = results[OUTCOME.name]
+    real = {name: x for name, x in results.items() if jnp.issubdtype(x.dtype, jnp.inexact)}
+
+    def lost(name: str, x: Array) -> Array:
+        missing = jnp.zeros(x.shape, bool) if name in gaps else jnp.isnan(x)
+        missing |= False if name in infinite else jnp.isinf(x)
+        return jnp.any(missing, axis=tuple(range(path, path + x.ndim - outcome.ndim)))
+
+    broken = reduce(jnp.logical_or, (lost(*each) for each in real.items()), jnp.zeros(outcome.shape, bool))
+    broken &= outcome < Outcome.NOT_CONVERGED
+
+    def kept(x: Array) -> Array:
+        axes = tuple(range(path, path + x.ndim - outcome.ndim))
+        return jnp.where(jnp.expand_dims(broken, axes), jnp.nan, x)
+
+    found = {name: kept(x) for name, x in real.items()}
+    return {**results, **found, OUTCOME.name: jnp.where(broken, jnp.int8(Outcome.NOT_FINITE), outcome)}
 
 
 def stacked(jacobian: Any) -> Array:

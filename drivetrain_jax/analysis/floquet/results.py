@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._quantities import Variable
-from drivetrain_jax.analysis._base import Outcome
+from drivetrain_jax.analysis._base import Outcome, finite_results
 from drivetrain_jax.analysis.floquet.direct import Monodromy
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS, sort_multipliers, verdict
 from drivetrain_jax.analysis.floquet.radius import (
@@ -100,4 +100,6 @@ def results(
         found |= {"spectral_radius_error": bound, "verdict": verdict(rho * size, bound)}
     outcome = jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
     outcome = jnp.where(finite, outcome, Outcome.NOT_FINITE)
-    return {name: found[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}
+    found = {name: found[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}
+    # An unknown error has an infinite bound, but multipliers beyond the largest number have no value.
+    return finite_results(found, infinite=("spectral_radius_error",))

@@ -6,14 +6,15 @@ that follows in time. Methods: the exact solution, harmonic balance (a chosen nu
 paper's closed form for a cubic spring) and the describing function (bias and fundamental). ``residual`` is the rms residual
 of the equation of motion.
 
-Outcome: the worse one of both directions. Results of the other direction are kept.
+Outcome: the worse one of both directions. Results of the other direction are kept. Approximate methods end as ``NOT_FINITE``
+where a frequency, a rate or a ratio of their numbers is beyond 1e70 or, if not 0, below 1e-70: their powers would overflow.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import jax.numpy as jnp
@@ -22,12 +23,13 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver, finite_results
 from drivetrain_jax.analysis.frequency_response import closed_form_response, harmonic_response
 from drivetrain_jax.analysis.frequency_response.harmonic_balance import Basis
+from drivetrain_jax.analysis.frequency_response.rules import RULES
 from drivetrain_jax.analysis.impacts import exact_branch, exact_response
 from drivetrain_jax.analysis.impacts.length_unit import from_scaled_length, to_scaled_length
-from drivetrain_jax.analysis.impacts.motion import PHASE, REGIME, REGIMES, STABILITY
+from drivetrain_jax.analysis.impacts.motion import ABSENT, PHASE, REGIME, REGIMES, STABILITY
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System
 
 SWEEP = ("sweep_direction",)
@@ -98,6 +100,8 @@ _ONLY = {
 # Closed forms of curves whose drive has one amplitude.
 _OF_ONE_DRIVE = frozenset(("peak_amplitude", "peak_frequency", "fold_frequency"))
 _SPECIAL = frozenset(("fold_frequency", "doubling_frequency"))
+# Largest number, in units of length of the motions and of seconds, and inverse of the smallest: fourth powers are finite.
+_LARGE = 1e70
 # Lines of a chunk: for a map of 200 lines, equally many for two cores.
 _CHUNK = 50
 
@@ -151,7 +155,30 @@ def _solve(
         given = options.get("fit_range", 0.0)
         fit_range = given / unit if given > 0 else None
         results = closed_form_response.response(model, request.method, fit_range, shape, request.outputs)
-    return from_scaled_length(results, unit)
+    results = from_scaled_length(results, unit)
+    if request.method != "exact":
+        results |= {"outcome": jnp.where(_in_range(model), results["outcome"], Outcome.NOT_FINITE).astype(jnp.int8)}
+        results |= _without(results["outcome"] == Outcome.NOT_FINITE, results)
+    return finite_results(results, path=True, gaps=RULES.gaps, infinite=("peak_amplitude", "fit_range"))
+
+
+def _in_range(model: PiecewiseLinearOscillator) -> Array:
+    """True for frequencies and lanes in which no product of the closed forms overflows or underflows, ``(L, ...)``."""
+    omega = jnp.asarray(model.omega).reshape(-1, *(1,) * len(_shape(model)))
+    drive = model.amplitude(omega) / model.stiffness
+    numbers = omega, model.damping, jnp.sqrt(model.stiffness), model.alpha, model.B0 / model.stiffness, drive
+    sizes = [jnp.abs(jnp.asarray(x, float)) for x in numbers]
+    return reduce(jnp.logical_and, [(x == 0) | ((x >= 1 / _LARGE) & (x <= _LARGE)) for x in sizes])
+
+
+def _without(lost: Array, results: Mapping[str, Array]) -> dict[str, Array]:
+    """The real ones of ``results``, NaN where ``lost`` ``(L, ...)``, and no motion there."""
+
+    def kept(x: Array, nothing: Any) -> Array:
+        return jnp.where(jnp.expand_dims(lost, tuple(range(1, 1 + x.ndim - lost.ndim))), nothing, x).astype(x.dtype)
+
+    found = {name: kept(x, jnp.nan) for name, x in results.items() if jnp.issubdtype(x.dtype, jnp.inexact)}
+    return found | {name: kept(x, ABSENT) for name, x in results.items() if name.endswith("stability")}
 
 
 def _exact(model: PiecewiseLinearOscillator, request: Request) -> dict[str, Array]:

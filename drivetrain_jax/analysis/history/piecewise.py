@@ -24,7 +24,7 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis._base import Outcome, Request, Solver, forward_derivatives
+from drivetrain_jax.analysis._base import Outcome, Request, Solver, finite_results, forward_derivatives
 from drivetrain_jax.analysis.frequency_response.multiple_scales import cubic_fit, self_consistent_range, slow_flow
 from drivetrain_jax.analysis.history.integration import has_finite_start, integrated, requested_times
 from drivetrain_jax.analysis.impacts.length_unit import to_scaled_length
@@ -55,6 +55,8 @@ _AVERAGED = (
     Variable("amplitude", "m", "amplitude of the averaged motion", ("time",)),
     Variable("phase", "rad", "lag of the averaged motion behind the drive", ("time",)),
 )
+# Lists of events are longer than most motions need.
+_EVENTS = ("event_time", "event_velocity")
 _STARTS = ("initial_displacement", "initial_rate")
 _MAX_PERIODS, _CHUNK = 2_000_000, 64
 
@@ -127,7 +129,7 @@ def _exact(system: type[System], request: Request, values: Mapping[str, Any], ef
     results["acceleration"] = model.field(times[:, None], jnp.stack([u * unit, v * unit]))[1]
     results |= {"event_time": events.time, "event_flank": events.flank, "event_velocity": events.velocity * unit}
     results |= {"event_count": events.number, "outcome": outcome.astype(jnp.int8)}
-    wanted = {name: results[name] for name in (*request.outputs, "outcome")}
+    wanted = finite_results({name: results[name] for name in (*request.outputs, "outcome")}, gaps=_EVENTS)
     return {name: x.reshape(*x.shape[:-1], *shape) for name, x in wanted.items()}
 
 
@@ -168,4 +170,4 @@ def _averaged(system: type[System], request: Request, values: Mapping[str, Any],
     outcome = jnp.where(found.excess <= 1, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
     failed = jnp.where(has_finite_start(flow), Outcome.STEP_LIMIT, Outcome.NOT_FINITE)
     outcome = jnp.where(found.healthy, outcome, failed).astype(jnp.int8)
-    return {name: results[name] for name in request.outputs} | {"outcome": outcome}
+    return finite_results({name: results[name] for name in request.outputs} | {"outcome": outcome})

@@ -112,9 +112,10 @@ def periodic_results(oscillator: PiecewiseLinearOscillator, seen: Measures) -> d
         "impacts": jnp.stack(seen.impacts),
         "impact_velocity": jnp.stack(seen.speed),
         "contact_fraction": jnp.stack(seen.contact) / span,
-        "floquet_multiplier": jnp.stack([first, determinant / first]),
+        "floquet_multiplier": jnp.stack([first, jnp.where(first == 0, 0.0, determinant / first)]),
         "spectral_radius": rho,
-        "lyapunov_exponent": jnp.log(rho) / span,
+        # A radius that underflows has no logarithm.
+        "lyapunov_exponent": jnp.where(rho > 0, jnp.log(rho) / span, jnp.nan),
     }
 
 

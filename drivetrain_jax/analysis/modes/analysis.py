@@ -180,7 +180,7 @@ def _results(build: Build, request: Request, values: Mapping[str, Any], lanes: i
         results = _frequencies(modes.frequency, modes.found, modes.participation)
         dominant = jnp.where(modes.found, jnp.argmax(modes.participation, axis=1), model.families)
         results["dominant_family"] = dominant.astype(jnp.int8)
-        results["dominant_share"] = jnp.max(results["participation"], axis=1)
+        results["dominant_share"] = jnp.sort(results["participation"], axis=1)[:, -1]
         results["mode_type"] = jnp.where(
             modes.found, mode_types(modes.frequency, modes.label, largest), model.families + 1
         )

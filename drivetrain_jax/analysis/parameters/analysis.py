@@ -38,6 +38,8 @@ def _solve(system: type[System], request: Request, values: Mapping[str, Any], ef
     finite = [jnp.isfinite(x if name in with_modes else x[None]) for name, x in results.items()]
     whole = jnp.stack(jnp.broadcast_arrays(*(jnp.all(x, axis=0) for x in finite)))
     outcome = jnp.where(jnp.all(whole, axis=0), Outcome.SUCCESS, Outcome.NOT_FINITE)
+    # An infinite constant has no value.
+    results = {name: jnp.where(jnp.isfinite(x), x, jnp.nan) for name, x in results.items()}
     return results | {"outcome": outcome.astype(jnp.int8)}
 
 

@@ -28,6 +28,7 @@ RULES = Declared(
         within("impacts", 0.0),
         within("contact_fraction", 0.0, 1.0),
     ),
-    # NaN is allowed: a motion that never repeats has no multipliers, and a motion at rest has no phase.
-    gaps=("phase", "spectral_radius", "floquet_multiplier", "state_error"),
+    # NaN is allowed: a motion that never repeats has no multipliers, a motion at rest has no phase, and a spectral radius
+    # that underflows has no exponent.
+    gaps=("phase", "spectral_radius", "floquet_multiplier", "lyapunov_exponent", "state_error"),
 )
