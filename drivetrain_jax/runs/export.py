@@ -12,27 +12,34 @@ from drivetrain_jax._errors import InputError, RetryableError
 from drivetrain_jax.runs.assemble import labelled
 from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import restore_scene, result_variables
-from drivetrain_jax.store import zarr_store
+from drivetrain_jax.store import checksums, zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
-from drivetrain_jax.store.consolidate import ResultFile, release
+from drivetrain_jax.store.consolidate import ResultFile, read_attribute, release
 
 
 def export(store: Path, out: Path) -> int:
-    """Write the result in the Zarr ``store`` to the new file ``out``, shard by shard; returns the number of points.
+    """Write the result in the Zarr ``store`` to the file ``out``, shard by shard; returns the number of points.
 
     Raises :class:`InputError` if ``store`` is not a sound Zarr store, or if ``out`` exists, and :class:`RetryableError`
-    after an I/O error.
+    after an I/O error. The file of an export that was killed after its end stays as it is.
     """
     if not zarr_store.is_store(store):
         raise InputError(f"store = {str(store)!r}: not a Zarr store; give one of `drivetrain run --store zarr`")
-    if out.exists() or not out.parent.is_dir():
-        raise InputError(f"out = {str(out)!r}: allowed is a new file in an existing folder")
+    if not out.parent.is_dir():
+        raise _occupied(out)
     if not zarr_store.is_sealed(store):
         raise _damaged(store, "its attributes are damaged, or it is not finished")
     attrs = zarr_store.attributes(store)
     scene = restore_scene(attrs["scene"])
+    points = math.prod(Grid.of(scene).result_shape)
     kept = {name: value for name, value in attrs.items() if name not in (zarr_store.SEAL, "coordinates")}
     parts, ours = PartsFolder(out), False
+    if out.exists():
+        # An export that is killed after it has moved its file into place leaves its folder.
+        if not parts.path.is_dir() or not _holds(out, attrs["digest"]):
+            raise _occupied(out)
+        parts.discard(attrs["digest"])
+        return points
     try:
         parts.open()
         if parts.holds_work():
@@ -47,7 +54,15 @@ def export(store: Path, out: Path) -> int:
         raise RetryableError(f"out = {str(out)!r}: {error}; the same command tries again") from None
     finally:
         parts.close(remove=ours)
-    return math.prod(Grid.of(scene).result_shape)
+    return points
+
+
+def _holds(out: Path, digest: str) -> bool:
+    """True if ``out`` is an intact result with this digest."""
+    try:
+        return out.is_file() and read_attribute(out, "digest") == digest and checksums.damaged(out) == []
+    except InputError:
+        return False
 
 
 def _fill(store: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -60,6 +75,10 @@ def _fill(store: Path, arrays: Mapping[str, np.ndarray]) -> None:
         for name, values in results.items():
             arrays[name][shards.place(shard)] = values
         release(arrays.values())
+
+
+def _occupied(out: Path) -> InputError:
+    return InputError(f"out = {str(out)!r}: allowed is a new file in an existing folder")
 
 
 def _damaged(store: Path, what: str) -> InputError:

@@ -82,7 +82,7 @@ def crash_table(found: Sequence[Record]) -> list[str]:
         sums = [sum(r.get(name, 0) for r in group) for name in ("twice", "lost", "wrong")]
         cells = [kind, calls, *(seen[name] for name in faults), sums[0], codes, *sums[1:]]
         lines.append(f"| {' | '.join(map(str, [*cells, sum(bool(r['problem']) for r in group)]))} |")
-    return lines
+    return [*lines, "", most_memory(found)]
 
 
 def file_table(found: Sequence[Record]) -> list[str]:
@@ -94,5 +94,16 @@ def file_table(found: Sequence[Record]) -> list[str]:
         text = ", ".join(f"{count} times {code}" for code, count in sorted(codes.items()))
         wrong, problems = sum(r["wrong"] for r in group), sum(bool(r["problem"]) for r in group)
         lines.append(f"| {title} | {len(group)} | {text} | {wrong} | {problems} |")
-    memory = max((record["memory"] for record in found if record["kind"] == "memory"), default=0.0)
-    return [*lines, "", f"Most memory of a process: {memory:.2f} GB."]
+    return [*lines, "", most_memory(found)]
+
+
+def most_memory(found: Sequence[Record]) -> str:
+    """The largest resident memory of the processes."""
+    return f"Most memory of a process: {max((record.get('memory', 0.0) for record in found), default=0.0):.2f} GB."
+
+
+def numbers(found: Sequence[Record]) -> str:
+    """Numbers of injections by kind, and of those with a problem."""
+    counts = Counter("crashes at system calls" if "fault" in r else TITLES.get(r["kind"], "") for r in found)
+    named = ", ".join(f"{count} {name}" for name, count in counts.items() if name)
+    return f"{named}; {len(bad(found))} with a problem"

@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -24,10 +25,13 @@ from drivetrain_jax._machine import machine
 from drivetrain_jax.store.provenance import now
 
 EACH = (
-    "Killed and cut off before every call that changes a file or a folder, the others at one of four: half a write, and "
-    "errors that stay. Then the same command runs again; a quarter of these are killed once more first. Wrong: differs in "
-    "a bit from an undisturbed run."
+    "Killed and cut off before {calls} that changes a file or a folder, the others at a quarter of these: half a write, and "
+    "errors that stay. Power cut: what was not flushed is lost. Then the same command runs again; a quarter of these are "
+    "killed once more first. Wrong: differs in a bit from an undisturbed run. Other problems: tracebacks, hangs over "
+    "60 s, exit codes that are not documented, more than two lines, a folder that stays."
 )
+# The calls that are attacked, for values of ``--every``.
+CALLS = {1: "every call", 2: "every second call"}
 FILES = (
     "Results with one to eight changed bytes or cut off; results with objects, types, shapes and attributes changed, and "
     "checksums that fit; random scenes. Three commands read each result. Wrong: read without an error, with other values. "
@@ -40,9 +44,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--points", type=int, default=250_000, help="size of the chart")
     parser.add_argument("--seed", type=int, default=int.from_bytes(os.urandom(3), "big"), help="default: drawn anew")
-    parser.add_argument(
-        "--every", type=int, default=1, help="one of so many system calls is attacked, and of the files"
-    )
+    parser.add_argument("--every", type=int, default=1, help="one of so many system calls is attacked")
     parser.add_argument("--page", type=Path, default=PAGE)
     parser.add_argument(
         "--only", nargs="*", default=[], help="kinds with this in their name; the page stays as it is then"
@@ -59,27 +61,35 @@ def main() -> int:
         turns = [k for turn in range(max(k[2] for k in chosen)) for k in chosen if turn < k[2]]
         records = [inject(bench, kind, function) for kind, function, _, _ in turns]
         head = heading(bench, records, time.monotonic() - begin)
-        good, attacked = (True, []) if options.only else attack(Path(folder), options.seed, options.every)
-    if not options.only:
-        write("faults", "\n".join([head, "", *table(records), "", *attacked]), options.page)
+        lines, attacked = [head, "", *table(records)], list[attacks.Record]()
+        for found, text in () if options.only else attack(Path(folder), options.seed, options.every):
+            lines += ["", *text]
+            attacked += found
+            # What is known is kept if the suite is stopped.
+            write("faults", "\n".join(lines), options.page)
     bad = [r for r in records if r.lost or r.wrong or r.orphans or r.problem]
     sys.stderr.write(f"{len(records)} injections, {len(bad)} with a problem\n")
-    return int(bool(bad) or not good)
+    if attacked:
+        sys.stderr.write(f"{attacks.numbers(attacked)}\n")
+    return int(bool(bad) or bool(attacks.bad(attacked)))
 
 
-def attack(folder: Path, seed: int, every: int) -> tuple[bool, list[str]]:
-    """True if all attacks in forks ended well, and the lines of the page."""
+def attack(folder: Path, seed: int, every: int) -> Iterator[tuple[list[attacks.Record], list[str]]]:
+    """Yield the records of the attacks in forks, and their lines of the page."""
     begin = time.monotonic()
     crashed = attacks.crashes(folder, seed, every)
-    between = time.monotonic()
-    damaged = attacks.files(folder, seed, {kind: count // every for kind, count in attacks.FILES.items()})
-    bad = attacks.bad([*crashed, *damaged])
-    for record in bad:
+    text = EACH.format(calls=CALLS.get(every, f"one of {every} calls"))
+    yield crashed, [_heading(crashed, begin, text), *attacks.crash_table(crashed)]
+    begin = time.monotonic()
+    damaged = attacks.files(folder, seed)
+    yield damaged, [_heading(damaged, begin, FILES), *attacks.file_table(damaged)]
+
+
+def _heading(found: list[attacks.Record], begin: float, text: str) -> str:
+    """Numbers, minutes and meaning of the columns; problems are told on standard error."""
+    for record in attacks.bad(found):
         sys.stderr.write(f"{json.dumps(record)}\n")
-    minutes = [f"{(b - a) / 60:.0f} minutes" for a, b in ((begin, between), (between, time.monotonic()))]
-    head = f"{len(crashed)} injections in {minutes[0]}. Power cut: what was not flushed is lost. {EACH}"
-    tables = [*attacks.crash_table(crashed), "", f"{FILES} {minutes[1]}.", "", *attacks.file_table(damaged)]
-    return not bad, [head, "", *tables]
+    return f"{attacks.numbers(found)}; {(time.monotonic() - begin) / 60:.0f} minutes, {now()[:10]}. {text}\n"
 
 
 def inject(bench: Bench, kind: str, function) -> Record:

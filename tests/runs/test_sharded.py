@@ -87,6 +87,28 @@ def test_export_is_bit_identical_to_the_file(grid_scene, tmp_path, which):
     assert to_store(scene, tmp_path / "r.zarr").reused == direct.total
 
 
+def test_an_export_that_was_killed_at_its_end_is_finished_by_the_same_command(tmp_path, capsys):
+    words = ["export", str(tmp_path / "r.zarr"), str(tmp_path / "e.nc")]
+    to_store(POINTS, tmp_path / "r.zarr")
+    assert main(words) == 0
+    data, folder = (tmp_path / "e.nc").read_bytes(), tmp_path / "e.nc.parts"
+    folder.mkdir()
+    (folder / "lock").touch()
+    assert status(POINTS, tmp_path / "e.nc").state == "complete"
+    assert main(words) == 0 and "points: 3 exported" in capsys.readouterr().err
+    assert (tmp_path / "e.nc").read_bytes() == data and not folder.exists()
+    # Anything else at that path is refused and stays: a damaged result, and the result of another store.
+    changed = bytearray(data)
+    changed[data.index(opened(tmp_path / "e.nc").value.values.tobytes())] ^= 1
+    to_store(ONE, tmp_path / "s.zarr")
+    for content, store in ((bytes(changed), "r.zarr"), (data, "s.zarr"), (b"x", "r.zarr")):
+        (tmp_path / "e.nc").write_bytes(content)
+        folder.mkdir(exist_ok=True)
+        assert main(["export", str(tmp_path / store), str(tmp_path / "e.nc")]) == 2
+        assert capsys.readouterr().err.endswith("allowed is a new file in an existing folder\n")
+        assert (tmp_path / "e.nc").read_bytes() == content and folder.exists()
+
+
 def as_file(path):
     """The Dataset of a store or a file, without the attributes that differ from run to run."""
     if path.is_dir():
