@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import socket
 import uuid
 from collections import deque
 from collections.abc import Generator, Iterable
@@ -17,7 +18,10 @@ from drivetrain_jax.runs import worker
 from drivetrain_jax.runs.executor import IN_FLIGHT, Computation, Executor, Results
 from drivetrain_jax.runs.worker import Parcel
 
-_PATIENCE = "10s"
+# Seconds until a scheduler has accepted a connection, and until it has answered. A busy one may answer late.
+_ACCEPTED, _ANSWERED = 2.0, 10.0
+# Upper limit of the bytes of a scheduler's greeting, which has some hundreds.
+_GREETING = 1 << 20
 _LOCAL = re.compile(r"local:([1-9]\d*)")
 # Loggers of Dask that report the death of a scheduler or worker; the run reports it in one line.
 _TALKATIVE = ("distributed", "tornado", "asyncio")
@@ -131,9 +135,28 @@ def _connect(distributed: Any, address: str, stack: ExitStack) -> Any:
         )
         address = stack.enter_context(cluster).scheduler_address
     try:
-        return stack.enter_context(distributed.Client(address, timeout=_PATIENCE, set_as_default=False))
-    except (OSError, ValueError) as error:
+        _listen(distributed, address)
+        return stack.enter_context(distributed.Client(address, timeout=_ANSWERED, set_as_default=False))
+    except (OSError, ValueError, TypeError) as error:
+        # Dask raises TypeError if a TLS address lacks certificates.
         raise InputError(f"dask = {address!r}: no scheduler answers there; {type(error).__name__}") from None
+
+
+def _listen(distributed: Any, address: str) -> None:
+    """Raise ``OSError`` unless something accepts a connection at ``address``, and greets as a scheduler does.
+
+    A client of Dask repeats a refused connection until its time is over, waits without end for a silent server, and takes
+    the first bytes of another one for a size in memory.
+    """
+    if address.startswith(("tcp://", "tls://")):
+        place = distributed.comm.get_address_host_port(address)
+        with socket.create_connection(place, timeout=_ACCEPTED) as connection:
+            connection.settimeout(_ANSWERED)
+            # With TLS the client speaks first. Dask sends the size of its greeting, in 8 bytes.
+            if address.startswith("tcp://"):
+                size = int.from_bytes(connection.recv(8, socket.MSG_WAITALL), "little")
+                if not 0 < size < _GREETING:
+                    raise ConnectionError
 
 
 def _distributed() -> Any:

@@ -335,8 +335,7 @@ def test_threads_are_reused_except_after_an_interrupt():
         ({"dask": "tcp://127.0.0.1:1"}, "dask = 'tcp://127.0.0.1:1': no scheduler answers"),
     ],
 )
-def test_wrong_executor_is_one_clear_line(options, message, monkeypatch):
-    monkeypatch.setattr("drivetrain_jax.runs.cluster._PATIENCE", "1s")
+def test_wrong_executor_is_one_clear_line(options, message):
     if "dask" in options:
         pytest.importorskip("distributed")
     with pytest.raises(InputError, match=message.replace("(", r"\(")):

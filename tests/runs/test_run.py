@@ -318,8 +318,7 @@ def test_remains_of_a_finished_run_are_deleted(grid_scene, tmp_path):
         assert os.listdir(tmp_path) == ["r.nc"]
 
 
-def test_an_address_without_a_scheduler_loses_no_work(grid_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("drivetrain_jax.runs.cluster._PATIENCE", "1s")
+def test_an_address_without_a_scheduler_loses_no_work(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt) as stopped:
         run_to_file(grid_scene, path, executor=Threads(1), report=stop_after(2))
