@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import toy
+import xarray as xr
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule, run_state_machine_as_test
@@ -19,6 +20,7 @@ from drivetrain_jax.runs import work
 from drivetrain_jax.runs.executor import Threads
 from drivetrain_jax.runs.run import Interrupted, run_to_file
 from drivetrain_jax.runs.status import status
+from drivetrain_jax.store import shards, zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
 
 COUNTS, NUMBERS = (8, 24, 40), (3, 4)
@@ -27,10 +29,12 @@ COUNTS, NUMBERS = (8, 24, 40), (3, 4)
 class ResumeMachine(RuleBasedStateMachine):
     """One output, and the scene that the user wants there."""
 
+    store, name = "hdf5", "r.nc"
+
     def __init__(self):
         super().__init__()
         self.folder = Path(tempfile.mkdtemp(prefix="machine-"))
-        self.path = self.folder / "work" / "r.nc"
+        self.path = self.folder / "work" / self.name
         self.path.parent.mkdir()
         self.parts = PartsFolder(self.path)
         self.held = None
@@ -52,7 +56,7 @@ class ResumeMachine(RuleBasedStateMachine):
         return a + b * self.number + 321.0
 
     def start(self, **how):
-        return run_to_file(self.scene, self.path, executor=Threads(1), **how)
+        return run_to_file(self.scene, self.path, executor=Threads(1), store=self.store, **how)
 
     def judge(self, progress, before):
         """A run that ends has every point, right values, and computes no finished point again."""
@@ -62,9 +66,12 @@ class ResumeMachine(RuleBasedStateMachine):
         assert (found.state, found.done) == ("complete", 2 * self.count)
         # Parts of an interrupted ``--fresh`` stay beside a complete result: only ``--fresh`` resumes them.
         assert progress.computed == 0 or not self.parts.path.exists()
-        value = dt.open_result(self.path)["value"].values
+        value = self.opened()["value"].values
         np.testing.assert_allclose(value, self.expected(), rtol=1e-14)
         self.held = (self.count, self.number)
+
+    def opened(self):
+        return dt.open_result(self.path)
 
     def allowed(self):
         """True if a run without ``fresh`` may begin, and the number of points that it finds."""
@@ -151,22 +158,39 @@ class ResumeMachine(RuleBasedStateMachine):
         }
 
 
+class StoreMachine(ResumeMachine):
+    """The same with a Zarr store of several shards."""
+
+    store, name = "zarr", "r.zarr"
+
+    def opened(self):
+        assert zarr_store.damage(self.path) == ""
+        return xr.open_zarr(self.path, consolidated=False).load()
+
+
 @pytest.fixture(autouse=True)
 def intervals(monkeypatch):
     toy.names(monkeypatch.setattr)
     monkeypatch.setattr(work, "_SHORTEST", 0.0)
     monkeypatch.setattr(work, "_LONGEST", 0.0)
+    monkeypatch.setattr(shards, "MOST_POINTS", 28)
 
 
 HOW = {"deadline": None, "suppress_health_check": list(HealthCheck), "database": None, "phases": (Phase.generate,)}
 
 
-def test_no_order_of_events_gives_a_wrong_value():
-    run_state_machine_as_test(
-        ResumeMachine, settings=settings(max_examples=6, stateful_step_count=10, derandomize=True, **HOW)
-    )
+MACHINES = pytest.mark.parametrize("machine", [ResumeMachine, StoreMachine])
 
 
+@MACHINES
+def test_no_order_of_events_gives_a_wrong_value(machine):
+    pytest.importorskip("zarr")
+    short = settings(max_examples=6, stateful_step_count=10, derandomize=True, **HOW)
+    run_state_machine_as_test(machine, settings=short)
+
+
+@MACHINES
 @pytest.mark.full
-def test_no_long_order_of_events_gives_a_wrong_value():
-    run_state_machine_as_test(ResumeMachine, settings=settings(max_examples=40, stateful_step_count=20, **HOW))
+def test_no_long_order_of_events_gives_a_wrong_value(machine):
+    pytest.importorskip("zarr")
+    run_state_machine_as_test(machine, settings=settings(max_examples=40, stateful_step_count=20, **HOW))
