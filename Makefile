@@ -7,7 +7,7 @@ OUT ?= out
 CONSTRAINTS ?= constraints.txt
 PIP_INSTALL := $(BIN)/python -m pip install --quiet $(addprefix -c ,$(CONSTRAINTS))
 
-.PHONY: atlas test validate faults lint bench validation gallery docs help clean
+.PHONY: atlas test validate faults versions lint bench validation gallery docs help clean
 
 atlas: $(VENV)/installed  ## the quickstart atlas and its figure, in out/
 	@mkdir -p $(OUT)
@@ -23,6 +23,9 @@ validate: $(VENV)/installed-test  ## the comparisons at full size
 faults: $(VENV)/installed-test  ## real faults at random moments; writes the table of docs/reliability.md
 	$(BIN)/python tests/faults/suite.py
 	$(BIN)/python -m pytest -m full tests/runs/test_resume_machine.py
+
+versions: $(VENV)/installed  ## the lowest and the newest versions of all dependencies, on every Python; writes the table of docs/reliability.md
+	$(BIN)/python tests/versions.py
 
 lint: $(VENV)/installed-test  ## style, formatting, spelling, types, directions of imports
 	$(BIN)/ruff check .
