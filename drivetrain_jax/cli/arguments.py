@@ -178,6 +178,8 @@ def _add_report(subparsers: Any) -> None:
     command.add_argument("files", metavar="FILE.nc", type=_path, nargs="+", help="results, one section each")
     command.add_argument("--out", required=True, metavar="REPORT.html", type=_path, help="page to write")
     command.add_argument("--title", metavar="TEXT", help="heading (default: the title of the scene)")
+    command.add_argument("--units", metavar="rpm,deg", help="units of the report (default: those of the scenes)")
+    _add_amplitude(command)
 
 
 def _add_point(subparsers: Any) -> None:

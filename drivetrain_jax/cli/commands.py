@@ -181,7 +181,7 @@ def report(options: argparse.Namespace) -> int:
     from drivetrain_jax.report import report
 
     with _reading(*options.files):
-        page = report(options.files, options.title)
+        page = report(options.files, options.title, options.units, options.amplitude)
     _write(options.out, page.encode())
     return OK
 

@@ -78,11 +78,16 @@ def table(path: Path, units: str | None, separator: str = "") -> str:
 
 
 def _drawn(datasets: list[xr.Dataset], asked: list[str]) -> Figure:
-    """The figure of ``datasets``, with axes in the units ``asked`` for, else in those of the scene."""
-    datasets = [_with_resonances(in_physical_data(each, asked) if asked else each) for each in datasets]
-    figure = view.plot(*(in_units(in_given_units(each), asked) for each in datasets))
+    """The figure of ``datasets``; :class:`InputError` for a unit ``asked`` for that no axis has."""
+    figure = drawn(datasets, asked)
     check_shown(figure, asked)
     return figure
+
+
+def drawn(datasets: list[xr.Dataset], asked: list[str]) -> Figure:
+    """The figure of ``datasets``, with axes in the units ``asked`` for that fit, else in those of the scene."""
+    datasets = [_with_resonances(in_physical_data(each, asked) if asked else each) for each in datasets]
+    return view.plot(*(in_units(in_given_units(each), asked) for each in datasets))
 
 
 def _dataset(source: Any) -> xr.Dataset:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,58 +12,83 @@ import xarray as xr
 from drivetrain_jax.runs import atlas_answers as answers
 from drivetrain_jax.runs.atlas_chart import chart
 from drivetrain_jax.runs.atlas_file import StoredAtlas, open_atlas
+from drivetrain_jax.runs.forced_limit import forced_over
+from drivetrain_jax.runs.physical import in_parameters
+from drivetrain_jax.view.units import unit_of
+
+Writer = Callable[[str, float], str]
+_UNDECIDED = "`drivetrain point` solves a value there directly, and a smaller rtol of the atlas narrows the range"
 
 
-def atlas_answers(path: Path, cells: int) -> tuple[list[str], xr.Dataset]:
-    """Sentences of the design questions that need no further values, and the chart of the atlas at ``path``."""
-    atlas = open_atlas(path)
-    return _design(atlas), chart(path, {}, cells)
+def atlas_answers(
+    path: Path, cells: int, convert: Callable[[xr.Dataset], xr.Dataset], amplitude: Any
+) -> tuple[list[str], xr.Dataset]:
+    """Sentences of the design questions that need no further values, and the chart of the atlas at ``path``.
+
+    ``convert`` puts a chart into the units of the sentences, which compare the forced motion with the limit ``amplitude``.
+    """
+    atlas, drawn = open_atlas(path), chart(path, {}, cells)
+    return _design(atlas, partial(_written, atlas, convert(drawn)), amplitude), drawn
 
 
-def _design(atlas: StoredAtlas) -> list[str]:
+def _design(atlas: StoredAtlas, named: Writer, amplitude: Any) -> list[str]:
     roles, free = dict(atlas.scene.system.roles), set(atlas.ranges)
     speed, angle, damping = (roles.get(name) for name in ("speed", "angle", "damping"))
     if free == {speed}:
-        return _windows(answers.speed_windows(atlas, {}).data, str(speed), atlas)
+        found = answers.speed_windows(atlas, {}).data
+        forced = forced_over(atlas, amplitude, [w["safe"] for w in found["windows"]], {}, named)[0]
+        return [*_windows(found, str(speed), named, forced), *_undecided(found, str(speed), named)]
     for other, question, phrase in (
         (angle, answers.widest_angle, "up to"),
         (damping, answers.least_damping, "from"),
     ):
         if speed in free and free == {speed, other}:
-            found = question(atlas, {str(speed): atlas.ranges[str(speed)]}).data
-            return _limit(found, phrase, atlas)
+            speeds = atlas.ranges[str(speed)]
+            found = question(atlas, {str(speed): speeds}).data
+            name, value = found["parameter"], found["value"]
+            forced = [] if value is None else forced_over(atlas, amplitude, [speeds], {name: value}, named)[0]
+            compared = [_sentence(text) for each in forced for text in each]
+            return [*_limit(found, phrase, named), *compared, *_undecided(found, name, named)]
     return []
 
 
-def _windows(found: Mapping[str, Any], speed: str, atlas: StoredAtlas) -> list[str]:
+def _windows(found: Mapping[str, Any], speed: str, named: Writer, forced: list[list[str]]) -> list[str]:
     """A sentence for each stable range of speed."""
     said = []
-    for window in found["windows"]:
-        low, high = _written(window["physical"], speed, window["safe"], atlas)
+    for window, compared in zip(found["windows"], forced, strict=True):
+        low, high = (named(speed, value) for value in window["safe"])
         kinds = [answers.BEYOND[end["kind"]] for end in window["ends"]]
         said.append(f"Stable from {low}{kinds[0]} to {high}{kinds[1]}; {_confirmed(window['check'])}.")
+        said += map(_sentence, compared)
     return said or ["No speed within the atlas is stable."]
 
 
-def _limit(found: Mapping[str, Any], phrase: str, atlas: StoredAtlas) -> list[str]:
+def _limit(found: Mapping[str, Any], phrase: str, named: Writer) -> list[str]:
     """The answer of a question for one limit that holds over all speeds of the atlas."""
     name = found["parameter"]
     if found["value"] is None:
         return [f"No {name} of the atlas makes all of its speeds stable."]
-    (value,) = _written(found["physical"], name, [found["value"]], atlas)
     confirmed = f"; {_confirmed(found['check'])}" if found["check"] else ""
-    return [f"Stable at all speeds of the atlas {phrase} {value}{confirmed}."]
+    return [f"Stable at all speeds of the atlas {phrase} {named(name, found['value'])}{confirmed}."]
 
 
-def _written(physical: Mapping[str, Any], name: str, values: list[float], atlas: StoredAtlas) -> list[str]:
-    """Values of a parameter, in physical units where the atlas has physical data."""
-    if physical:
-        quantity, found = next(iter(physical.items()))
-        numbers = found["value"] if isinstance(found["value"], list) else [found["value"]]
-        return [f"{quantity} = {number:.6g} {found['units']}" for number in numbers]
-    units = atlas.scene.system.parameter(name).units
-    return [f"{name} = {value:.6g}{'' if units == '1' else f' {units}'}" for value in values]
+def _undecided(found: Mapping[str, Any], name: str, named: Writer) -> list[str]:
+    ranges = [f"{named(name, low)} to {named(name, high)}" for low, high in found["undecided"]]
+    return [f"Undecided from {', '.join(ranges)}: {_UNDECIDED}."] if ranges else []
+
+
+def _written(atlas: StoredAtlas, shown: xr.Dataset, name: str, value: float) -> str:
+    """A value of a parameter in the units of the report, as physical data where the atlas has these."""
+    data = in_parameters(atlas.scene.system, {}, atlas.scene.data)[0]
+    quantity = data.quantity(name, value) if data else None
+    name, value, units = quantity or (name, value, atlas.scene.system.parameter(name).units)
+    size, units = unit_of(shown, name, units)
+    return f"{name} = {value * size:.6g}{'' if units == '1' else f' {units}'}"
 
 
 def _confirmed(check: Mapping[str, Any]) -> str:
     return f"{check['solves']} direct solves {'confirm' if check['agrees'] else 'CONTRADICT'} it"
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,11 +14,14 @@ import matplotlib as mpl
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.datasets.figure import plot
-from drivetrain_jax.report.statements import axes_table, fixed_table, statements, values_table
+from drivetrain_jax.datasets.figure import drawn
+from drivetrain_jax.datasets.physical_axes import in_physical_data
+from drivetrain_jax.report.statements import amplitudes, statements
+from drivetrain_jax.report.tables import Table, axes_table, fixed_table, values_tables
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.consolidate import open_result
 from drivetrain_jax.view.prefixes import with_prefixes
+from drivetrain_jax.view.units import in_given_units, in_units, listed, written_units
 
 # Cells each way of the chart of an atlas: its figure is a vector image.
 _CELLS = 300
@@ -36,67 +40,106 @@ class Section(NamedTuple):
     statements: list[str]
     axes: list[tuple[str, ...]]
     fixed: list[tuple[str, ...]]
-    values: list[tuple[str, ...]]
+    values: list[Table]
     figure: str
     provenance: list[tuple[str, str]]
     scene: str
+    units: set[str]
+    compared: bool
 
 
-def report(results: Sequence[str | Path], title: str | None = None) -> str:
+def report(
+    results: Sequence[str | Path],
+    title: str | None = None,
+    units: str | Sequence[str] | None = None,
+    amplitude: Any = None,
+) -> str:
     """The HTML text of a report about these result files.
 
     Args:
         results: paths of results, atlases among them, each checked against its checksums.
         title: heading of the page; default: the title of the only result, or ``Drivetrain report``.
+        units: units of sentences, tables and figures, ``"rpm,deg"`` or a list (default: those of the scenes).
+        amplitude: limit of the forced amplitude (``"2 deg"``), with which answers compare the forced motion.
 
     Returns: one page of HTML, complete in itself.
 
-    Raises: :class:`~drivetrain_jax.InputError` for a file that is damaged or no result, and without jinja2.
+    Raises: :class:`~drivetrain_jax.InputError` for a file that is damaged or no result, for a unit or a limit that suits
+    none of the results, and without jinja2.
     """
+    asked = [] if units is None else listed(units)
     try:
         import jinja2
     except ImportError:
         raise InputError("report: needs the package jinja2; pip install 'drivetrain_jax[report]'") from None
-    sections = [_section(Path(result), number) for number, result in enumerate(results)]
+    sections = [_section(Path(result), number, asked, amplitude) for number, result in enumerate(results)]
+    _check_used(sections, asked, amplitude)
     heading = title or (sections[0].title if len(sections) == 1 else "Drivetrain report")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(files("drivetrain_jax.report").joinpath("report.html.j2").read_text("utf-8"))
     return template.render(title=heading, sections=sections)
 
 
-def _section(path: Path, number: int) -> Section:
+def _check_used(sections: Iterable[Section], asked: Iterable[str], amplitude: Any) -> None:
+    """Raise :class:`InputError` for units and a limit that no section shows."""
+    found = sorted({written_units(u) for section in sections for u in section.units if u not in ("1", "")})
+    for unit in asked:
+        if written_units(unit) not in found:
+            shown = f"units of {', '.join(found)}" if found else "none, all values are dimensionless"
+            raise InputError(f"units = {unit!r}: nothing in the report measures that; allowed are {shown}")
+    if amplitude is not None and not any(section.compared for section in sections):
+        raise InputError(
+            f"amplitude = {amplitude!r}: no result has a forced motion to compare; allowed with an atlas over the speed, or "
+            "with a result of forced that contains amplitude"
+        )
+
+
+def _section(path: Path, number: int, asked: list[str], amplitude: Any) -> Section:
     checksums.refuse_damaged(path)
     dataset = open_result(path)
     analysis = dataset.attrs.get("analysis")
     if analysis is None:
         raise InputError(f"file = {str(path)!r}: has no attribute 'analysis'; allowed is a result of drivetrain_jax")
-    answers = []
+    answers, convert = [], partial(_in_units, asked)
     if analysis == "atlas":
         # Local import: it loads jax, which other results do not need.
         from drivetrain_jax.report.atlas_section import atlas_answers
 
-        answers, chart = atlas_answers(path, _CELLS)
+        answers, chart = atlas_answers(path, _CELLS, convert, amplitude)
     else:
         chart = dataset.load()
-    attrs, handy = dataset.attrs, with_prefixes(chart)
+    limit = None
+    if amplitude is not None and amplitudes(chart):
+        from drivetrain_jax.runs.forced_limit import Limit
+        from drivetrain_jax.runs.scene import find_system
+
+        limit = Limit.of(find_system(str(dataset.attrs.get("system"))), amplitude)
+    attrs, handy = dataset.attrs, with_prefixes(convert(chart))
+    axes, fixed = axes_table(handy), fixed_table(handy)
     return Section(
         title=str(attrs.get("title") or path.name),
         file=path.name,
-        statements=[*answers, *statements(handy, ranges=not answers)],
-        axes=axes_table(handy),
-        fixed=fixed_table(dataset),
-        values=values_table(handy),
-        figure=_svg(path if analysis == "atlas" else chart, number),
+        statements=[*answers, *statements(handy, not answers, limit)],
+        axes=axes,
+        fixed=fixed,
+        values=values_tables(handy),
+        figure=_svg(chart, number, asked),
         provenance=[(name, str(attrs[name])) for name in _PROVENANCE if name in attrs],
         scene=str(attrs.get("scene", "")).strip(),
+        units={str(v.attrs.get("units", "1")) for v in handy.variables.values()} | {row[-1] for row in fixed},
+        compared=limit is not None or (amplitude is not None and any("orced amplitude" in said for said in answers)),
     )
 
 
-def _svg(source: Path | xr.Dataset, number: int) -> str:
+def _in_units(asked: list[str], dataset: xr.Dataset) -> xr.Dataset:
+    """``dataset`` in the units ``asked`` for, else in those in which its scene gives its axes."""
+    return in_units(in_given_units(in_physical_data(dataset, asked) if asked else dataset), asked)
+
+
+def _svg(source: xr.Dataset, number: int, asked: list[str]) -> str:
     """The figure as an SVG element; empty for an analysis that has none."""
-    options: dict[str, Any] = {"cells": _CELLS} if isinstance(source, Path) else {}
     try:
-        figure = plot(source, **options)
+        figure = drawn([source], asked)
     except InputError:
         return ""
     image = io.StringIO()

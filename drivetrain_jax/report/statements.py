@@ -6,66 +6,54 @@ The statements follow from the labels of the dataset alone, so they serve any an
 from __future__ import annotations
 
 import json
+import math
+import re
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import xarray as xr
 
-from drivetrain_jax.resonances.orders import FREQUENCIES, in_hertz, operating_range, stored_orders
-from drivetrain_jax.view.style import scene_key, units_of, written_units
+from drivetrain_jax.report.tables import coordinates, digits, flag_words, value_text
+from drivetrain_jax.resonances.orders import FREQUENCIES, operating_range, stored_orders
+from drivetrain_jax.view.cells import role
+from drivetrain_jax.view.style import scene_key, units_of
+from drivetrain_jax.view.units import ASKED, size, suitable, value_in
 
-# A result of so few points is also shown as a table of all its values.
-FEW_POINTS, _FEW_VALUES = 12, 240
 # Largest number of intervals and of labels that a statement lists.
 _MOST = 8
 # Results that judge the numerics or number something, so that their extremes say nothing.
 _PLAIN = ("_error", "_residual", "_number", "_certified")
 
 
-def statements(dataset: xr.Dataset, ranges: bool = True) -> list[str]:
-    """Sentences about ``dataset``, verdicts first; without ``ranges`` only the shares of verdicts."""
+class Limit(Protocol):
+    """A largest allowed amplitude."""
+
+    @property
+    def value_text(self) -> float:
+        """The amplitude in the unit ``own``."""
+        ...
+
+    @property
+    def own(self) -> str:
+        """The unit of displacements."""
+        ...
+
+    def written(self, amplitude: float) -> str:
+        """An amplitude as text."""
+        ...
+
+
+def statements(dataset: xr.Dataset, ranges: bool = True, limit: Limit | None = None) -> list[str]:
+    """Sentences about ``dataset``, verdicts first; without ``ranges`` only the shares of verdicts.
+
+    Forced amplitudes among the results are compared with ``limit``.
+    """
     coded = [v for v in _coded(dataset) if v.name != "outcome"]
     said = [sentence for variable in coded for sentence in _about_codes(dataset, variable, ranges)]
+    said += [*_about_growth(dataset), *(_about_limit(dataset, limit) if limit else ())]
     said += [sentence for variable in _numbers(dataset) for sentence in _about_numbers(dataset, variable)]
     return [*said, *_about_orders(dataset), *_about_outcome(dataset), *_about_errors(dataset)]
-
-
-def axes_table(dataset: xr.Dataset) -> list[tuple[str, ...]]:
-    """Rows of the swept parameters: name, meaning, first value, last value, unit, and number of values."""
-    axes = [dataset[d] for d in dataset["outcome"].dims if d in dataset.coords]
-    columns = [c for c in dataset.coords.values() if c.dims == ("point",) and c.name != "point"]
-    return [
-        (scene_key(c), c.attrs.get("long_name", ""), *map(_digits, c.values[[0, -1]]), units_of(c), str(c.size))
-        for c in (columns or axes)
-        if c.size and c.dtype.kind in "fiu"
-    ]
-
-
-def fixed_table(dataset: xr.Dataset) -> list[tuple[str, ...]]:
-    """Rows of the physical data and of the fixed parameters: name, meaning, value, unit."""
-    attrs = dataset.attrs
-    fixed = json.loads(attrs.get("physical_data", "{}")) | json.loads(attrs.get("fixed_parameters", "{}"))
-    return [
-        (name, entry.get("long_name", ""), _digits(entry["value"]), written_units(entry.get("units", "1")))
-        for name, entry in fixed.items()
-    ]
-
-
-def values_table(dataset: xr.Dataset) -> list[tuple[str, ...]]:
-    """Rows of all values of a result of few points: variable, place, value, unit. Empty for a larger result."""
-    rows = []
-    if dataset["outcome"].size > FEW_POINTS:
-        return rows
-    for variable in dataset.data_vars.values():
-        if variable.size > _FEW_VALUES or variable.dtype.kind not in "fiub" or variable.name == "outcome":
-            continue
-        meanings = _meanings(variable)
-        for place in np.ndindex(variable.shape):
-            value = variable.values[place]
-            shown = meanings.get(int(value), "") if meanings else _digits(value)
-            rows.append((str(variable.name), _place(dataset, variable, place), shown, units_of(variable)))
-    return rows if len(rows) <= _FEW_VALUES else []
 
 
 def _coded(dataset: xr.Dataset) -> list[xr.DataArray]:
@@ -80,19 +68,15 @@ def _numbers(dataset: xr.Dataset) -> list[xr.DataArray]:
     ]
 
 
-def _meanings(variable: xr.DataArray) -> dict[int, str]:
-    words = str(variable.attrs.get("flag_meanings", "")).split()
-    return dict(zip(np.atleast_1d(variable.attrs.get("flag_values", [])).tolist(), words, strict=False))
-
-
 def _about_codes(dataset: xr.Dataset, variable: xr.DataArray, ranges: bool) -> Iterator[str]:
     """The share of every meaning, and the ranges of the speed or of the only axis that have it."""
-    meanings = _meanings(variable)
-    name = str(variable.attrs.get("long_name", variable.name))
+    meanings = flag_words(variable)
+    # A remark in brackets explains codes, most of which do not occur.
+    name = re.sub(r" \(.*\)$", "", str(variable.attrs.get("long_name", variable.name)))
     if variable.size == 1:
-        yield f"{_capital(name)}: {meanings.get(int(variable.values.item()), 'unknown')}."
+        yield f"{_capital(name)}: {value_text(variable, variable.values.item()) or 'unknown'}."
         return
-    shares = {word: float(np.mean(variable.values == code)) for code, word in meanings.items()}
+    shares = {word.replace("_", " "): float(np.mean(variable.values == code)) for code, word in meanings.items()}
     yield f"{_capital(name)}: " + ", ".join(f"{word} {_share(share)}" for word, share in shares.items() if share) + "."
     axis = _main_axis(dataset, variable) if ranges else None
     if shares.get("undecided"):
@@ -100,7 +84,7 @@ def _about_codes(dataset: xr.Dataset, variable: xr.DataArray, ranges: bool) -> I
     if axis is None:
         return
     others = [dim for dim in variable.dims if dim != axis.name]
-    for code, word in meanings.items():
+    for code, word in zip(meanings, shares, strict=True):
         everywhere = (variable == code).all(others) if others else variable == code
         if 0 < shares[word] < 1 and bool(everywhere.any()):
             names = " and ".join(scene_key(dataset[dim]) if dim in dataset.coords else str(dim) for dim in others)
@@ -120,7 +104,7 @@ def _ranges(axis: xr.DataArray, holds: np.ndarray) -> str:
     """The runs of sampled values of ``axis`` at which ``holds`` is true."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], holds.astype(np.int8), [0]))))
     runs = [(axis.values[a], axis.values[b - 1]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-    shown = [_digits(a) if a == b else f"{_digits(a)} to {_digits(b)}" for a, b in runs[:_MOST]]
+    shown = [digits(a) if a == b else f"{digits(a)} to {digits(b)}" for a, b in runs[:_MOST]]
     more = f" and {len(runs) - _MOST} more ranges" if len(runs) > _MOST else ""
     return f"{scene_key(axis)} = {', '.join(shown)}{more}{_unit(axis)}"
 
@@ -131,7 +115,7 @@ def _about_numbers(dataset: xr.Dataset, variable: xr.DataArray) -> Iterator[str]
     if len(own) > 1 or (own and variable.sizes[own[0]] > _MOST):
         return
     if dataset["outcome"].size == 1:
-        values = ", ".join(map(_digits, np.atleast_1d(variable.values).ravel()))
+        values = ", ".join(map(digits, np.atleast_1d(variable.values).ravel()))
         yield f"{_capital(variable.attrs.get('long_name', variable.name))}: {values}{_unit(variable)}."
         return
     for k in range(variable.sizes[own[0]] if own else 1):
@@ -143,17 +127,79 @@ def _about_numbers(dataset: xr.Dataset, variable: xr.DataArray) -> Iterator[str]
         low, high = (np.unravel_index(int(f()), part.shape) for f in (finite.argmin, finite.argmax))
         name = _capital(str(variable.attrs.get("long_name", variable.name)))
         if part.values[low] == part.values[high]:
-            yield f"{name}{label}: {_digits(part.values[low])}{_unit(variable)} throughout."
+            yield f"{name}{label}: {digits(part.values[low])}{_unit(variable)} throughout."
             continue
         ends = (
-            f"{_digits(part.values[p])}{_unit(variable)} at {_place(dataset, part, p)}" for p in map(tuple, (low, high))
+            f"{digits(part.values[p])}{_unit(variable)} at {_place(dataset, part, p)}" for p in map(tuple, (low, high))
         )
         yield f"{name}{label}: from {' to '.join(ends)}."
 
 
+def _about_growth(dataset: xr.Dataset) -> Iterator[str]:
+    """The meaning of the verdict: fastest growth or slowest decay in time and per turn, and time to double or halve."""
+    periods = dataset.attrs.get("periods_per_turn", 0)
+    radius = dataset.get("spectral_radius")
+    if radius is None or not periods or not np.isfinite(radius.values).any():
+        return
+    turns = _turns_per_second(dataset)
+    with np.errstate(divide="ignore"):
+        rates = (np.log(radius) * periods * (1.0 if turns is None else turns)).transpose(*radius.dims)
+    place = np.unravel_index(int(np.ma.masked_invalid(rates.values).argmax()), rates.shape)
+    rate, factor = float(rates.values[place]), float(radius.values[place]) ** periods
+    if rate == 0 or not math.isfinite(rate):
+        return
+    per_second = "" if turns is None else f"{abs(rate):.4g} 1/s, "
+    time, turn = math.log(2) / abs(rate), math.log(2) / abs(math.log(factor))
+    seconds = "" if turns is None else f"{time:.4g} s, "
+    where = f" at {text}" if (text := _place(dataset, radius, tuple(map(int, place)))) else ""
+    start, most, ends = (
+        ("Unstable means that a small disturbance grows", "fastest", "doubles")
+        if rate > 0
+        else ("Stable means that every small disturbance dies out", "slowest", "halves")
+    )
+    most = f", {most}{where}" if where else ""
+    yield f"{start}{most}: {per_second}by a factor {factor:.6g} per turn; it {ends} in {seconds}{turn:.4g} turns."
+
+
+def _turns_per_second(dataset: xr.Dataset) -> xr.DataArray | float | None:
+    """The speed of the shaft along its axis, or that of the physical data; None if it has no unit."""
+    axis = dataset.coords.get(role(dataset, "speed"))
+    given = json.loads(dataset.attrs.get("physical_data", "{}")).values()
+    known = [(axis, str(axis.attrs.get("units", "1")))] if axis is not None else []
+    known += [(entry["value"], entry.get("units", "1")) for entry in given]
+    return next((value * factor for value, units in known if (factor := size(units, "rps"))), None)
+
+
+def _about_limit(dataset: xr.Dataset, limit: Limit) -> Iterator[str]:
+    """The largest forced amplitude and its place, compared with the limit; and the speeds within it."""
+    for variable in amplitudes(dataset):
+        found = np.ma.masked_invalid(value_in(variable, limit.own))
+        if not found.count():
+            continue
+        place = tuple(map(int, np.unravel_index(int(found.argmax()), found.shape)))
+        most = f"{limit.written(found[place])} at {_place(dataset, variable, place)}"
+        own = [dim for dim in variable.dims if dim not in dataset["outcome"].dims]
+        within = xr.DataArray(np.asarray(found.filled(np.inf)) <= limit.value, dims=variable.dims).all(own)
+        name, allowed = _capital(variable.attrs.get("long_name", variable.name)), limit.written(limit.value)
+        if bool(within.all()):
+            yield f"{name}: at most {most}, within the limit of {allowed}."
+            continue
+        axis = _main_axis(dataset, dataset["outcome"])
+        inside = within.all([d for d in within.dims if axis is None or d != axis.name])
+        kept = "nowhere" if not bool(within.any()) else f"at {_share(float(within.mean()))} of the points"
+        kept = f"at {_ranges(axis, inside.values)}" if axis is not None and bool(inside.any()) else kept
+        yield f"{name}: up to {most}, above the limit of {allowed}; within it {kept}."
+
+
+def amplitudes(dataset: xr.Dataset) -> list[xr.DataArray]:
+    """The forced amplitudes among the results."""
+    found = [dataset.get(name) for name in ("amplitude", "orbit_amplitude")]
+    return [v for v in found if v is not None and dataset.attrs.get("analysis") == "forced"]
+
+
 def _about_outcome(dataset: xr.Dataset) -> Iterator[str]:
     outcome = dataset["outcome"]
-    counts = {word: int((outcome.values == code).sum()) for code, word in _meanings(outcome).items() if code}
+    counts = {word: int((outcome.values == code).sum()) for code, word in flag_words(outcome).items() if code}
     wrong = ", ".join(f"{word.replace('_', ' ')} {count:,}" for word, count in counts.items() if count)
     points = f"{outcome.size:,} point{'s' if outcome.size != 1 else ''}"
     yield f"{points} computed, with these remarks: {wrong}." if wrong else f"{points} computed, all successfully."
@@ -173,28 +219,26 @@ def _about_orders(dataset: xr.Dataset) -> Iterator[str]:
     orders = stored_orders(dataset.attrs)
     if name is None or orders is None or dataset["outcome"].size != 1:
         return
-    speeds = orders.speeds(in_hertz(dataset[name].values.reshape(-1), dataset[name].attrs["units"]))
+    factor, unit = suitable("rpm", json.loads(dataset.attrs.get(ASKED, "[]")))
+    speeds = orders.speeds(value_in(dataset[name], "Hz").reshape(-1)) * factor
     operating = operating_range(json.loads(dataset.attrs.get("options", "{}")))
     if operating:
-        low, high = operating
-        for sentence in orders.within(speeds, low, high):
-            yield f"From {low:g} to {high:g} rpm of the {orders.shaft}: {sentence}."
+        low, high = (end * factor for end in operating)
+        for sentence in orders.within(speeds, low, high, unit):
+            yield f"From {low:g} to {high:g} {unit} of the {orders.shaft}: {sentence}."
         return
     for order, column in zip(orders.per_turn, speeds.T, strict=True):
         met = [f"{speed:.6g}" for speed in column[np.isfinite(column)]]
         more = f" and {len(met) - _MOST} more speeds" if len(met) > _MOST else ""
-        yield f"{_capital(order)} meets modes at {', '.join(met[:_MOST])}{more} rpm of the {orders.shaft}."
+        yield f"{_capital(order)} meets modes at {', '.join(met[:_MOST])}{more} {unit} of the {orders.shaft}."
 
 
 def _place(dataset: xr.Dataset, variable: xr.DataArray, place: tuple[Any, ...]) -> str:
     """``name = value unit`` for every swept parameter at one place of ``variable``."""
-    texts = []
-    for dim, k in zip(variable.dims, place, strict=True):
-        columns = [c for c in dataset.coords.values() if c.dims == (dim,) and dim == "point" and c.name != "point"]
-        for axis in columns or ([dataset[dim]] if dim in dataset.coords else []):
-            value = axis.values[k]
-            texts.append(f"{scene_key(axis)} = {value if axis.dtype.kind in 'UO' else _digits(value)}{_unit(axis)}")
-    return ", ".join(texts)
+    return ", ".join(
+        f"{name} = {value}{'' if units in ('1', '') else f' {units}'}"
+        for name, value, units in coordinates(dataset, variable, place)
+    )
 
 
 def _label(variable: xr.DataArray, dim: Any, k: int) -> str:
@@ -213,11 +257,3 @@ def _unit(variable: xr.DataArray) -> str:
 def _share(share: float) -> str:
     """A share in percent; a small one is never shown as 0, a large one never as 100."""
     return f"{100 * share:.3g} %" if share in (0, 1) else f"{min(max(100 * share, 0.001), 99.999):.5g} %"
-
-
-def _digits(value: Any) -> str:
-    if isinstance(value, (list, tuple)):
-        return ", ".join(map(_digits, value))
-    if isinstance(value, (float, np.floating)) and np.isnan(value):
-        return "no value"
-    return f"{value:.6g}" if isinstance(value, (int, float, np.number)) else str(value)

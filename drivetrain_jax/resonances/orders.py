@@ -42,14 +42,16 @@ class Orders:
         )
         return np.where(elastic, frequency, np.nan)[..., None] * 60 / np.array(list(self.per_turn.values()))
 
-    def within(self, speeds: np.ndarray, low: float, high: float) -> list[str]:
-        """Sentences about the operating range [``low``, ``high``] rpm: one for each order that meets a mode there.
+    def within(self, speeds: np.ndarray, low: float, high: float, unit: str = "rpm") -> list[str]:
+        """Sentences about the operating range [``low``, ``high``]: one for each order that meets a mode there.
 
-        ``speeds`` (modes, orders) are those of :meth:`speeds`.
+        ``speeds`` (modes, orders) are those of :meth:`speeds`, in ``unit`` as the range is.
         """
         said = []
         for name, column in zip(self.per_turn, speeds.T, strict=True):
-            met = [f"mode {k + 1} at {column[k]:.6g} rpm" for k in np.flatnonzero((column >= low) & (column <= high))]
+            met = [
+                f"mode {k + 1} at {column[k]:.6g} {unit}" for k in np.flatnonzero((column >= low) & (column <= high))
+            ]
             said += [f"{name} meets {', '.join(met)}"] if met else []
         return said or ["no order meets a natural frequency"]
 

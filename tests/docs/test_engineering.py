@@ -48,6 +48,13 @@ def test_every_command_gives_the_answer_of_the_page(tmp_path, monkeypatch, capsy
             shown = capsys.readouterr().out
         if answer or words[0] == "head":
             assert agree(answer, shown), f"{line}\n{shown}"
+    page = Path("report.html").read_text()
+    for answer in (
+        "Stable from speed = 1429.11 rpm to speed = 2270.73 rpm",
+        "by a factor 1.01",
+        "within the limit of 2 deg.",
+    ):
+        assert answer in page
 
 
 @pytest.mark.parametrize("number", ["1422 to 1429, 2271 to 2289 and 3126 to 3142 rpm", "2.534", "3646.5 rpm"])

@@ -9,7 +9,8 @@ import xarray as xr
 import drivetrain_jax as dt
 from drivetrain_jax.cli import main
 from drivetrain_jax.report import report
-from drivetrain_jax.report.statements import statements, values_table
+from drivetrain_jax.report.statements import statements
+from drivetrain_jax.report.tables import values_tables
 from tests.view import results
 
 HOSTILE = "</title><script>alert(1)</script>"
@@ -94,8 +95,76 @@ def test_ranges_of_a_chart_hold_for_all_other_values():
 
 
 def test_few_points_are_tabulated_with_their_places(files):
-    rows = values_table(dt.open_result(files[0]))
-    assert ("verdict", "Omega = 1.415", "unstable", "1") in rows
+    (table,) = values_tables(dt.open_result(files[0]))
+    column = table.head.index("verdict")
+    assert [row[column] for row in table.rows if row[table.head.index("Omega")] == "1.415"] == ["unstable"]
+
+
+TRUCK = {"J1": "2 kg m2", "J2": "0.5 kg m2", "k1": 6e4, "k2": 4e4, "c1": 0.3464, "c2": 0.1414, "angle": "12 deg"}
+
+
+@pytest.fixture(scope="module")
+def truck(tmp_path_factory):
+    """Stability and forced motion of a truck shaft at three speeds: unstable, near a forced resonance, and stable."""
+    folder, speeds = tmp_path_factory.mktemp("truck"), {"speed": {"values": ["1425 rpm", "1560 rpm", "2000 rpm"]}}
+    common = {"system": "cardan", "axes": speeds, "fixed": TRUCK}
+    dt.run(common | {"analysis": "floquet", "outputs": ["spectral_radius", "verdict"]}, out=folder / "stability.nc")
+    dt.run(common | {"analysis": "forced", "outputs": ["amplitude"]}, out=folder / "forced.nc")
+    return folder / "stability.nc", folder / "forced.nc"
+
+
+def test_units_are_those_asked_for_or_those_of_the_scene(truck, tmp_path):
+    out = tmp_path / "report.html"
+    assert main(["report", *map(str, truck), "--out", str(out), "--units", "Hz,mrad"]) == 0
+    text = " ".join(Page(out.read_text()).words)
+    amplitude = dt.open_result(truck[1]).amplitude.values[1]
+    assert "Unstable at speed = 23.75 Hz." in text and "speed [Hz]" in text and "rpm" not in text.split("Scene")[0]
+    assert f"to {1e3 * amplitude[1]:.6g} mrad at speed = 26 Hz" in text and " angle joint angle 209.44 mrad" in _plain(
+        text
+    )
+    text = _plain(" ".join(Page(report(truck)).words))
+    assert "Unstable at speed = 1425 rpm." in text and " angle joint angle 12 deg" in text
+
+
+def test_a_unit_that_nothing_measures_is_refused(truck, tmp_path, capsys):
+    for option, value, words in (
+        ("--units", "kg m", "units = 'kg m': nothing in the report measures that; allowed are units of"),
+        ("--units", "rpm,Hz", "units = 'Hz': measures the same as rpm"),
+        ("--amplitude", "2 deg", "amplitude = '2 deg': no result has a forced motion to compare"),
+        ("--amplitude", "2 mm", "mm does not measure that"),
+    ):
+        files = truck if words.startswith("mm") else truck[:1]
+        assert main(["report", *map(str, files), "--out", str(tmp_path / "r.html"), option, value]) == 2
+        error = capsys.readouterr().err
+        assert words in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_report_says_what_stable_means(truck):
+    point = dt.point("cardan", "floquet", speed="1425 rpm", **TRUCK)
+    text = " ".join(Page(report(truck[:1])).words)
+    growth = point.growth
+    assert (
+        f"fastest at speed = 1425 rpm: {growth['rate']:.4g} 1/s, by a factor {growth['per_turn']:.6g} per turn; "
+        f"it doubles in {growth['time_to_double']:.4g} s, {growth['turns_to_double']:.4g} turns."
+    ) in text
+    stable = dt.open_result(truck[0]).isel(speed=[2])
+    (said,) = [s for s in statements(stable) if s.startswith("Stable means that every small disturbance dies out")]
+    assert "it halves in " in said and " 1/s, by a factor 0.99" in said
+
+
+def test_the_report_compares_the_forced_motion_with_a_limit(truck):
+    amplitude = np.rad2deg(dt.open_result(truck[1]).amplitude.max("shaft").values)
+    assert amplitude[2] < 2 < amplitude[1]
+    text = " ".join(Page(report(truck, amplitude="2 deg")).words)
+    assert f"up to {amplitude[1]:.6g} deg at speed = 1560 rpm, shaft = driven, above the limit of 2 deg" in text
+    inside = ", ".join(f"{speed}" for speed in np.array([1425, 1560, 2000])[amplitude <= 2])
+    assert f"within it at speed = {inside} rpm." in text
+    assert "within the limit of 1.57 rad." in " ".join(Page(report(truck[1:], amplitude=1.57)).words)
+
+
+def _plain(text: str) -> str:
+    return " ".join(text.split())
 
 
 def _described(dataset: xr.Dataset) -> xr.Dataset:
