@@ -124,6 +124,7 @@ class Parameter:
         except _units.UnitError as error:
             if _units.split(text) is None:
                 raise ValueError(f"{label} = {shown(text)}: allowed is a number, {self.allowed}") from None
+            error = f"{error}{_units.misread(text)}"
             unit = "a number without unit" if self.units == "1" else f"a number in {self.units} or in a unit like it"
             raise ValueError(f"{label} = {shown(text)}: {error}; allowed is {unit}, {self.allowed}") from None
 

@@ -39,8 +39,11 @@ _SPELLINGS = (
     (re.compile(r"%"), "percent"),
     # A degree to some and 1/400 of a turn to others; a giga-radian to pint.
     (re.compile(r"\b[Gg]rad\b"), "?"),
-    # kNm and Nmm are products; a prefix stays with its own unit.
-    (re.compile(r"\b([kM]?N)(m?m)\b"), r"\1*\2"),
+    (re.compile(r"\bRPM\b"), "rpm"),
+    # kNm, Nmm, Ns, Nms and kgm2 are products; a prefix stays with its own unit.
+    (re.compile(r"\b([kM]?N)(m?m)(s?)\b"), lambda found: "*".join(filter(None, found.groups()))),
+    (re.compile(r"\b([kM]?N)s\b"), r"\1*s"),
+    (re.compile(r"\bkg(m?m)(?=2|\^2|\*\*2|²)"), r"kg*\1"),
     (re.compile(r"(?<=[A-Za-z²³])[·.](?=[A-Za-z])"), "*"),
     # m2, s-2 and m/s2 as powers.
     (re.compile(r"(?<=[A-Za-z])(-?\d+)"), r"^\1"),
@@ -55,6 +58,16 @@ def split(text: str) -> tuple[float, str] | None:
     """The number and the unit (which may be empty) at which ``text`` begins and ends; None without a number."""
     found = _NUMBER.fullmatch(text)
     return (float(found.group(1)), found.group(2)) if found else None
+
+
+def misread(text: str) -> str:
+    """A remark on what a text that is no number with a unit was meant to be; empty without a guess."""
+    plain = text.replace(" ", "")
+    if comma := re.match(r"[+-]?\d+,\d+(?![\d,.])", plain):
+        return f" (did you mean {comma[0].replace(',', '.')}?)"
+    if quotient := re.fullmatch(r"([\d.]+)/([\d.]+)", plain):
+        return f" (a quotient is written as a number: {float(quotient[1]) / float(quotient[2]):.10g})"
+    return " (a range, where one number is needed)" if re.fullmatch(r"[^:]+:[^:]+", plain) else ""
 
 
 def number(text: str, units: str) -> float:

@@ -7,6 +7,8 @@ from typing import Any
 
 # Most characters of a value that a message repeats.
 _SHOWN = 60
+# Shortest part of a name that stands for it, less one.
+_PART = 4
 
 
 def clipped(text: str) -> str:
@@ -45,7 +47,18 @@ def did_you_mean(name: str, allowed: Iterable[str]) -> str:
     # Compare without case: "Beta" is nearer to beta than to zeta.
     same = [other for other in allowed if other.lower() == name.lower()]
     match = same or difflib.get_close_matches(name, allowed, n=1)
+    # "radius" is less than half of spectral_radius.
+    match = match or [other for other in allowed if len(name) > _PART and name.lower() in other.lower()]
     return f" (did you mean {match[0]}?)" if match else ""
+
+
+def meant(name: str, parameters: Iterable[Any]) -> str:
+    """``(did you mean X?)`` for the parameters with a similar name, else for those whose meaning or unit is ``name``."""
+    known, words = list(parameters), name.lower().replace("_", " ")
+    if guess := did_you_mean(name, [each.name for each in known]):
+        return guess
+    alike = [p.name for p in known if words == p.units or (len(words) > 2 and words in p.long_name.lower())]
+    return f" (did you mean {' or '.join(alike[:4])}?)" if alike else ""
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str:

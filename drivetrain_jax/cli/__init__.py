@@ -6,6 +6,7 @@ import gc
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Sequence
 
 from drivetrain_jax._errors import ChunkError, InputError
@@ -31,6 +32,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         gc.set_threshold(50_000)
         # Figures are written to files, so a window system of the user's choice is not needed, and may be missing.
         os.environ["MPLBACKEND"] = "agg"
+        # A warning of a value, without the line of code that found it.
+        warnings.formatwarning = lambda message, *_, **__: one_line(f"warning: {message}")
         leave_on_interrupt(INTERRUPTED)
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:

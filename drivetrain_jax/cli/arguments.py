@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any, NoReturn
 
-from drivetrain_jax import __version__
+from drivetrain_jax import __version__, _units
 from drivetrain_jax._wording import clipped, did_you_mean, nearest
 from drivetrain_jax.cli import commands
 from drivetrain_jax.cli.replies import WRONG_INPUT, one_line
@@ -37,20 +37,30 @@ class _Parser(argparse.ArgumentParser):
             unknown = [word for word in unknown if word not in values]
         if unknown:
             first = next((word for word in unknown if word.startswith("-")), unknown[0])
-            known = re.findall(r"--[a-z]+", options.parser.format_help()) if first.startswith("-") else ()
-            options.parser.error(f"{first}: not an argument of this command{did_you_mean(first, known)}")
+            known = re.findall(r"--[a-z]+", options.parser.format_help())
+            options.parser.error(f"{first}: not an argument of this command{_meant(first, known)}")
         return options
 
     def error(self, message: str) -> NoReturn:
         reworded = _reworded(message)
         if message.startswith("the following arguments are required: "):
             known = re.findall(r"--[a-z]+", self.format_help())
-            typed = [word.partition("=")[0] for word in self._words if word.startswith("--")]
+            typed = [word.partition("=")[0] for word in self._words if re.match("-+[a-zA-Z]", word)]
             # A misspelt option is why another one is missing.
-            strange = next((word for word in typed if word not in known and did_you_mean(word, known)), None)
+            strange = next((word for word in typed if word not in known and _meant(word, known)), None)
             if strange:
-                reworded = f"{strange}: not an argument of this command{did_you_mean(strange, known)}"
+                reworded = f"{strange}: not an argument of this command{_meant(strange, known)}"
         self.exit(WRONG_INPUT, one_line(f"{reworded}; see {self.prog} --help"))
+
+
+def _meant(word: str, known: list[str]) -> str:
+    """The option that an unknown ``word`` is like; for ``name=value`` the option that changes a scene."""
+    if "--set" in known and (value := re.fullmatch(r"-*((?:fixed|axes|options)\.)?([\w\[\].]+=.+)", word)):
+        return f" (did you mean --set {value.group(1) or 'fixed.'}{value.group(2)}?)"
+    if re.fullmatch("-[a-zA-Z]", word):
+        alike = [option for option in known if option.startswith(f"-{word.lower()}")]
+        return f" (did you mean {alike[0]}?)" if alike else ""
+    return did_you_mean(word, known) if word.startswith("-") else ""
 
 
 def _reworded(message: str) -> str:
@@ -58,14 +68,24 @@ def _reworded(message: str) -> str:
     if choice := re.fullmatch(r"argument ([\w-]+): invalid choice: '(.*)' \(choose from (.*)\)", message):
         field, given, allowed = choice.group(1), choice.group(2), choice.group(3).replace("'", "").split(", ")
         return f"{field} = {given!r}: unknown{nearest(given, allowed)}"
-    if kind := re.fullmatch(r"argument ([\w-]+): invalid (int|float) value: (.*)", message):
+    if kind := re.fullmatch(r"argument ([\w-]+): invalid (int|float|_part) value: (.*)", message):
         return f"{kind.group(1)} = {kind.group(3)}: allowed is {'an integer' if kind.group(2) == 'int' else 'a number'}"
+    if empty := re.fullmatch(r"argument ([\w-]+): expected one argument", message):
+        return f"{empty.group(1)}: its value is missing; a value that begins with - is written {empty.group(1)}=VALUE"
     if place := re.fullmatch(r"argument ([\w.-]+): (.*: .*; allowed is a path .*)", message, re.DOTALL):
         return f"{place.group(1)} = {place.group(2)}"
     if missing := re.fullmatch(r"the following arguments are required: (.*)", message):
         first, *others = missing.group(1).split(", ")
         return f"{first}: missing" + (f" (missing too: {', '.join(others)})" if others else "")
     return message
+
+
+def _part(text: str) -> float:
+    """A part of a whole, such as 0.02 or 2%."""
+    try:
+        return float(text)
+    except ValueError:
+        return _units.number(text, "1")
 
 
 def _path(text: str) -> Path:
@@ -189,6 +209,9 @@ def _add_point(subparsers: Any) -> None:
     _add_given(command, "parameters in the units of `drivetrain list SYSTEM`, options, and outputs=NAME,NAME")
     _add_data(command)
     _add_amplitude(command)
+    command.add_argument(
+        "--sensitivities", action="store_true", help="add those of the spectral radius, largest effect of 1 %% first"
+    )
     command.add_argument("--json", action="store_true", help="as one JSON object")
 
 
@@ -208,7 +231,7 @@ def _add_design(subparsers: Any) -> None:
     _add_given(command, "parameters; a range is name=LOW:HIGH")
     _add_amplitude(command)
     command.add_argument(
-        "--margin", type=float, metavar="PART", help="speed-windows: relative distance in speed from every boundary"
+        "--margin", type=_part, metavar="PART", help="speed-windows: relative distance in speed from every boundary"
     )
     command.add_argument("--json", action="store_true", help="as one JSON object")
 

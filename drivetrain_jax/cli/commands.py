@@ -238,7 +238,8 @@ def point(options: argparse.Namespace) -> int:
     outputs = given.pop("outputs", None)
     if isinstance(outputs, str):
         outputs = outputs.split(",")
-    found = point(options.system, options.analysis, outputs=outputs, amplitude=options.amplitude, **given)
+    asked = {"amplitude": options.amplitude, "sensitivities": options.sensitivities}
+    found = point(options.system, options.analysis, outputs=outputs, **asked, **given)
     return _answer(found, options)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,7 +17,7 @@ def assignments(texts: Sequence[str], field: str) -> dict[str, Any]:
 
     pairs: dict[str, Any] = {}
     for text in texts:
-        name, equals, value = text.partition("=")
+        name, equals, value = (part.strip() for part in text.partition("="))
         if not (name and equals and value):
             raise InputError(f"{field} = {text!r}: allowed is name=value")
         if any("\ud800" <= letter <= "\udfff" for letter in text):
@@ -42,7 +43,8 @@ def _number_or_range(name: str, value: Any) -> Any:
     if isinstance(value, str):
         ends = [_units.split(end) for end in value.split(":")]
         known = [end for end in ends if end is not None]
-        if len(known) == len(ends) <= 2:
+        # 1000-2000 is no number, and its second half no unit.
+        if len(known) == len(ends) <= 2 and not any(re.match(r"[-.,\d]", unit) for _, unit in known):
             # 0:18deg is a range in degrees.
             numbers = [_written(number, unit or known[-1][1]) for number, unit in known]
             return numbers[0] if len(numbers) == 1 else tuple(numbers)

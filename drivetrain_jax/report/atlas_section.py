@@ -21,13 +21,16 @@ _UNDECIDED = "`drivetrain point` solves a value there directly, and a smaller rt
 
 
 def atlas_answers(
-    path: Path, cells: int, convert: Callable[[xr.Dataset], xr.Dataset], amplitude: Any
+    path: Path, cells: tuple[int, int], convert: Callable[[xr.Dataset], xr.Dataset], amplitude: Any
 ) -> tuple[list[str], xr.Dataset]:
     """Sentences of the design questions that need no further values, and the chart of the atlas at ``path``.
 
+    The chart has the first number of ``cells`` for one parameter, the second for more.
+
     ``convert`` puts a chart into the units of the sentences, which compare the forced motion with the limit ``amplitude``.
     """
-    atlas, drawn = open_atlas(path), chart(path, {}, cells)
+    atlas = open_atlas(path)
+    drawn = chart(path, {}, cells[len(atlas.ranges) > 1])
     return _design(atlas, partial(_written, atlas, convert(drawn)), amplitude), drawn
 
 

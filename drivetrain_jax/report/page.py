@@ -23,8 +23,9 @@ from drivetrain_jax.store.consolidate import open_result
 from drivetrain_jax.view.prefixes import with_prefixes
 from drivetrain_jax.view.units import in_given_units, in_units, listed, written_units
 
-# Cells each way of the chart of an atlas: its figure is a vector image.
-_CELLS = 300
+# Cells each way of the chart of an atlas, whose figure is a vector image, and cells of an atlas of one parameter: ranges of
+# instability are narrow.
+_CELLS, _LINE_CELLS = 300, 3000
 # Attributes that say where the numbers come from.
 _PROVENANCE = (
     *("system", "analysis", "method", "options", "references"),
@@ -105,7 +106,7 @@ def _section(path: Path, number: int, asked: list[str], amplitude: Any) -> Secti
         # Local import: it loads jax, which other results do not need.
         from drivetrain_jax.report.atlas_section import atlas_answers
 
-        answers, chart = atlas_answers(path, _CELLS, convert, amplitude)
+        answers, chart = atlas_answers(path, (_LINE_CELLS, _CELLS), convert, amplitude)
     else:
         chart = dataset.load()
     limit = None

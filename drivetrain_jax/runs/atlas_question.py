@@ -66,7 +66,8 @@ class AtlasQuery:
                 )
         for name, value in values.items():
             if name in atlas.fixed and name not in free:
-                check_same(name, value, atlas.fixed[name])
+                source = shaft.physical.source(name) if shaft and name not in given else ""
+                check_same(name, value, atlas.fixed[name], source)
         kept = {name for name in atlas.parameters if name not in free or name in within}
         own = {name: _within(value, atlas.ranges[name]) for name, value in values.items() if name in kept}
         for name in values:

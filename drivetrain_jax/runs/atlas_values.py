@@ -17,11 +17,15 @@ if TYPE_CHECKING:
 SAME_FIXED = 5e-4
 
 
-def check_same(name: str, value: Any, fixed: float) -> None:
-    """Raise :class:`InputError` unless ``value`` is the ``fixed`` one of the atlas, which may be typed with four digits."""
+def check_same(name: str, value: Any, fixed: float, source: str = "") -> None:
+    """Raise :class:`InputError` unless ``value`` is the ``fixed`` one of the atlas, which may be typed with four digits.
+
+    ``source`` names the physical data from which it follows.
+    """
     if isinstance(value, tuple) or not np.allclose(value, fixed, rtol=SAME_FIXED, atol=0):
         made = f"the atlas is made for {name} = {fixed:.10g}"
-        raise InputError(f"{name} = {as_given(value)}: {made}; allowed is that value")
+        given = f"{name} = {as_given(value)}" + (f" (from {source})" if source else "")
+        raise InputError(f"{given}: {made}; allowed is that value")
 
 
 def as_given(value: Any) -> str:

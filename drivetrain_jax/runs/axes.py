@@ -133,6 +133,8 @@ def check_count(name: str, spec: AxisTable, continuous: bool) -> int:
         if any(x is not None for x in (spec.start, spec.stop, spec.num, spec.scale)):
             raise InputError(
                 f"{field}: values given together with start, stop, num or scale; allowed is one of the two"
+                f" ({field} = [...] replaces the whole axis)"
+                f" ({field} = [...] replaces the whole axis)"
             )
         if not spec.values:
             raise InputError(f"{field}.values = []: empty axis; allowed is one value or more")

@@ -23,7 +23,21 @@ from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.files import behind_link, move_folder
 
 # Endings of files of other kinds, which a netCDF file would only confuse.
-_OTHER_FILES = {".csv", ".html", ".json", ".mat", ".npy", ".npz", ".pdf", ".png", ".svg", ".toml", ".txt", ".xlsx"}
+_OTHER_FILES = {
+    ".csv",
+    ".html",
+    ".json",
+    ".mat",
+    ".npy",
+    ".npz",
+    ".pdf",
+    ".png",
+    ".svg",
+    ".toml",
+    ".txt",
+    ".xlsx",
+    ".zip",
+}
 
 
 class OutputState:

@@ -19,6 +19,7 @@ from jax import Array
 from drivetrain_jax import analyses, functions
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax._wording import shown
 from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analysis_names
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.analysis.request import checked
@@ -67,8 +68,11 @@ def sweep(
     >>> chart.verdict.dims, chart.verdict.shape
     (('beta', 'Omega'), (3, 2))
     """
+    if not callable(function):
+        raise InputError(f"function = {shown(function)}: allowed is a function, such as drivetrain_jax.floquet")
     if not isinstance(over, Mapping) or not over:
-        raise InputError("over: empty; allowed are values by the name of a parameter")
+        given = f" = {shown(over)}" if over else ": empty"
+        raise InputError(f"over{given}; allowed are values by the name of a parameter")
     of_another_package = isinstance(function, analyses.AnalysisFunction)
     own = function.name if of_another_package else getattr(function, "__name__", "")
     if of_another_package or (own in analysis_names() and getattr(analyses, own, None) is function):
@@ -229,7 +233,7 @@ def _named(result: Any, name: str) -> dict[str, Array]:
         return {str(key): jnp.asarray(value) for key, value in result.items()}
     try:
         return {name: jnp.asarray(result)}
-    except TypeError:
+    except (TypeError, ValueError):
         kind = type(result).__name__
         raise InputError(f"function: returns a {kind}; allowed is an array or a dict of arrays") from None
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Variable
-from drivetrain_jax._wording import aligned, nearest, shown, written
+from drivetrain_jax._wording import aligned, did_you_mean, meant, shown, written
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, get_analysis
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
@@ -31,7 +31,8 @@ class PointResult:
 
     ``outcome`` is the outcome of the point (results are NaN unless ``outcome.has_value``), ``units`` the units by name,
     ``labels`` the entries of each dimension of the results, ``physical`` the given physical data and their units,
-    ``growth`` what a spectral radius means: rate [1/s], factor per turn, time and turns to double or to halve.
+    ``growth`` what a spectral radius means: rate [1/s], factor per turn, time and turns to double or to halve,
+    ``sensitivities`` those of the spectral radius, largest effect of one percent first (None unless asked for).
     """
 
     system: str
@@ -49,6 +50,8 @@ class PointResult:
     orders: OrderCrossings | None = field(default=None, repr=False)
     growth: Mapping[str, float] = field(default_factory=dict, repr=False)
     forced: tuple[str, Mapping[str, Any]] | None = field(default=None, repr=False)
+    sensitivities: Sequence[Any] | None = field(default=None, repr=False)
+    _effects: Sequence[str] = field(default=(), repr=False)
 
     @property
     def crossings(self) -> dict[str, np.ndarray]:
@@ -94,6 +97,8 @@ class PointResult:
             answer |= {"growth": dict(self.growth)}
         if self.forced:
             answer |= {"forced": self.forced[1]}
+        if self.sensitivities is not None:
+            answer |= {"sensitivities": [each._asdict() for each in self.sensitivities]}
         if self.orders:
             speeds = {name: _plain(speed) for name, speed in self.crossings.items()}
             answer |= {"crossings": {"shaft": self.orders.orders.shaft, "units": "rpm", "values": speeds}}
@@ -125,6 +130,7 @@ class PointResult:
             lines += self._matrix(name)
         lines += self.orders.lines() if self.orders else []
         lines += [f"  forced amplitude: {self.forced[0]}"] if self.forced else []
+        lines += [f"  {line}" for line in self._effects]
         return "\n".join(lines)
 
     def _matrix(self, name: str) -> list[str]:
@@ -175,7 +181,13 @@ def _text(variable: Variable, value: Any) -> str:
 
 
 def point(
-    system: str, analysis: str, *, outputs: Sequence[str] | None = None, amplitude: Any = None, **given: Any
+    system: str,
+    analysis: str,
+    *,
+    outputs: Sequence[str] | None = None,
+    amplitude: Any = None,
+    sensitivities: bool = False,
+    **given: Any,
 ) -> PointResult:
     """The results of one point.
 
@@ -183,6 +195,7 @@ def point(
         system, analysis: names, see ``drivetrain list``.
         outputs: results to compute; default: those of the analysis.
         amplitude: limit of the forced amplitude (``"2 deg"``), with which the answer compares the forced motion.
+        sensitivities: adds those of the spectral radius, by the given physical data or the parameters.
         given: parameters of the system (or its physical data), and options of the analysis (``method``, ``rtol``, ...).
 
     Raises: :class:`InputError` with one line that names the field, the value and what is allowed; :class:`ChunkError` if
@@ -203,6 +216,13 @@ def point(
         # Messages name the fields without the tables of a scene.
         raise InputError(re.sub(r"^(points|fixed|options)\.", "", str(error))) from None
     found = _result(job, _compute(job))
+    if sensitivities:
+        # Local import: a point without sensitivities needs no atlas.
+        from drivetrain_jax.runs.sensitivities import gradient_lines, point_sensitivities
+
+        data = {name: value for name, (value, _) in found.physical.items()}
+        effects = point_sensitivities(job.scene.system, found.parameters, data)
+        found = replace(found, sensitivities=effects or [], _effects=gradient_lines(effects))
     return found if amplitude is None else replace(found, forced=_forced(found, given, amplitude))
 
 
@@ -235,7 +255,8 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
         numbers -= {name for each in system.physical.conversions if each.parameter == path for name in each.needs}
     for name, value in given.items():
         if name not in names:
-            raise InputError(f"{name} = {shown(value)}: unknown{nearest(name, names)}")
+            guess = did_you_mean(name, (*names, "outputs", "amplitude")) or meant(name, parameters.values())
+            raise InputError(f"{name} = {shown(value)}: unknown{guess}; allowed is {', '.join(names)}")
         if name not in parameters:
             tree["options"][name] = value
         elif name in numbers and not isinstance(value, (list, tuple)):

@@ -120,6 +120,8 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
     Raises :class:`InputError` with one line that names the field, what was given and what is allowed.
     """
     tree, text = toml.read(source, overrides)
+    if isinstance(names := tree.get("outputs"), str):
+        tree = {**tree, "outputs": names.split(",")}
     table = toml.converted(tree, _SceneTable, "")
     system, analysis = system_and_analysis(table.system, table.analysis)
     request = make_request(system, analysis, table.outputs, table.options, {*table.axes, *table.points})

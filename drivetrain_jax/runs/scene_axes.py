@@ -12,7 +12,7 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._machine import physical_memory
 from drivetrain_jax._quantities import Parameter
-from drivetrain_jax._wording import clipped, did_you_mean, shown
+from drivetrain_jax._wording import clipped, meant, shown
 from drivetrain_jax.analysis import Analysis
 from drivetrain_jax.analysis.request import checked
 from drivetrain_jax.runs import toml
@@ -144,5 +144,6 @@ def unknown_parameter(system: type[System], name: str) -> str:
     """The message for an unknown parameter ``name``, with the allowed names."""
     data = system.physical.names if system.physical else ()
     own = [p.name for p in system.parameters]
+    guess = meant(name, described(system).values())
     listed = f"; allowed is {', '.join(own)}" + (f", or physical data: {', '.join(data)}" if data else "")
-    return f"unknown parameter{did_you_mean(name, (*own, *data))}{listed}"
+    return f"unknown parameter{guess}{listed}"

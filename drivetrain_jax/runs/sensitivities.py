@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import get_analysis
 from drivetrain_jax.analysis.numerics.kernels import options_for_few
 from drivetrain_jax.analysis.numerics.lanes import Constants
@@ -16,7 +17,7 @@ from drivetrain_jax.analysis.request import make_request
 from drivetrain_jax.atlas.windows import Crossing
 from drivetrain_jax.runs.atlas_question import AtlasQuery
 from drivetrain_jax.runs.identity import program_identity
-from drivetrain_jax.runs.physical import described
+from drivetrain_jax.runs.physical import GivenData, described
 from drivetrain_jax.runs.programs import lowered
 from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.systems import System
@@ -38,7 +39,28 @@ class Sensitivity(NamedTuple):
 def radius_sensitivities(asked: AtlasQuery, slopes: Mapping[str, float]) -> list[Sensitivity]:
     """Sensitivities of the spectral radius at the point of a question; ``slopes`` is its gradient by the parameters."""
     point = {**asked.atlas.fixed, **asked.values}
-    return _of_data(asked, point, "", lambda changes, _: sum(slopes[n] * x for n, x in changes.items() if n in slopes))
+    return _of_radius(asked.atlas.scene.system, asked.shaft, point, slopes)
+
+
+def point_sensitivities(
+    system: type[System], point: Mapping[str, Any], physical: Mapping[str, Any]
+) -> list[Sensitivity] | None:
+    """Sensitivities of the spectral radius at a ``point`` (parameters) that follows from ``physical`` data, if any; None
+    without a gradient. Raises :class:`InputError` for a system without a spectral radius."""
+    if "floquet" not in system.models:
+        raise InputError(f"sensitivities: {system.name} has no spectral radius; allowed for floquet")
+    slopes = radius_gradient(system, point)
+    shaft = GivenData(system.physical, physical) if physical and system.physical else None
+    return None if slopes is None else _of_radius(system, shaft, point, slopes)
+
+
+def _of_radius(
+    system: type[System], shaft: GivenData | None, point: Mapping[str, Any], slopes: Mapping[str, float]
+) -> list[Sensitivity]:
+    def change(changes: Mapping[str, float], _: Any) -> float:
+        return sum(slopes[name] * x for name, x in changes.items() if name in slopes)
+
+    return _of_data(system, shaft, point, "", change)
 
 
 def limit_sensitivities(asked: AtlasQuery, parameter: str, limit: Crossing) -> list[Sensitivity]:
@@ -57,17 +79,20 @@ def limit_sensitivities(asked: AtlasQuery, parameter: str, limit: Crossing) -> l
         back = asked.shaft.physical.back(parameter, data) if asked.shaft else None
         return float(back[1](value)) if back else value
 
-    return _of_data(asked, point, parameter, limit_at)
+    return _of_data(asked.atlas.scene.system, asked.shaft, point, parameter, limit_at)
 
 
 def _of_data(
-    asked: AtlasQuery, point: Mapping[str, float], without: str, answer: Callable[[dict[str, float], Any], float]
+    system: type[System],
+    shaft: GivenData | None,
+    point: Mapping[str, float],
+    without: str,
+    answer: Callable[[dict[str, float], Any], float],
 ) -> list[Sensitivity]:
     """Sensitivities of ``answer(changes of the parameters, data)`` by the physical data, and by parameters without such.
 
     The quantity behind the parameter ``without`` is no datum, because it is the answer.
     """
-    system, shaft = asked.atlas.scene.system, asked.shaft
     data: dict[str, Any] = {name: value for name, value in point.items() if name != without}
     if shaft:
         follow = {each.parameter: each.needs for each in shaft.physical.conversions}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from dataclasses import fields as dataclass_fields
 from decimal import Decimal
 from numbers import Complex
 from os import PathLike
@@ -24,7 +25,7 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
-from drivetrain_jax._wording import nearest
+from drivetrain_jax._wording import meant
 from drivetrain_jax.resonances import Resonances, Values
 from drivetrain_jax.systems._physical import PhysicalData
 from drivetrain_jax.systems._smooth import Smoothness
@@ -143,6 +144,21 @@ class System(eqx.Module):
             if not cls.state or (analysis == "forced" and cls.displacements is None):
                 raise ValueError(f"models of {cls.name}: {analysis} needs state, and forced displacements")
 
+    def __new__(cls, *values: Any, **given: Any) -> Any:
+        """A new system; raises :class:`~drivetrain_jax.InputError` for a name that is no parameter."""
+        if values:
+            raise InputError(
+                f"{cls.__name__}: {len(values)} values without names; allowed is {cls.__name__}(name=value, ...)"
+            )
+        physical = cls.physical.names if cls.physical else ()
+        known = [each.name for each in dataclass_fields(cls)]
+        for name in given:
+            if name in physical:
+                raise InputError(f"{name}: physical data; allowed in {cls.__name__}.from_physical(...)")
+            if name not in known:
+                raise InputError(f"{name}: unknown{meant(name, cls.parameters)}; allowed is {', '.join(known)}")
+        return super().__new__(cls)
+
     def __post_init__(self) -> None:
         for each in self.parameters:
             object.__setattr__(self, each.name, _admitted(each, getattr(self, each.name)))
@@ -174,7 +190,8 @@ class System(eqx.Module):
         known = {each.name: each for each in (*cls.physical.quantities, *cls.parameters)}
         for name in data:
             if name not in known:
-                raise InputError(f"{name}: unknown{nearest(name, known)}")
+                guess = meant(name, known.values())
+                raise InputError(f"{name}: unknown{guess}; allowed is {', '.join(known)}")
         given = {name: _admitted(known[name], value) for name, value in data.items()}
         found = given | cls.physical.converted(given)
         return cls(**{name: value for name, value in found.items() if name not in cls.physical.names})

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shlex
+import subprocess
+import sys
 from decimal import Decimal
 from fractions import Fraction
 from functools import partial
@@ -13,7 +17,9 @@ import pandas as pd
 import pytest
 
 import drivetrain_jax as dt
+from drivetrain_jax import _units
 from drivetrain_jax.cli import main
+from drivetrain_jax.cli.arguments import parser
 
 SCENE = """
 system = "cardan"
@@ -83,7 +89,6 @@ GUESSES = [
     (f"{RUN} --set fixed.zeta=[0.1,0.2]", "fixed.zeta = [0.1, 0.2]: allowed is a number"),
     (f"{RUN} --set fixed.zeta=true", "fixed.zeta = True: allowed is a number"),
     (f"{RUN} --set fixed.zeta=nan", "allowed is 0 <= zeta"),
-    (f"{RUN} --set fixed.damping=0.1", "unknown parameter"),
     (f"{RUN} --set fixed.Zeta=0.1", "did you mean zeta?"),
     (f"{RUN} --set fixed.j1=2", "did you mean J1?"),
     (f"{RUN} --set fixed.beta=0.1", "also in [axes]"),
@@ -155,6 +160,39 @@ GUESSES = [
     ("point planetary modes teeth=[20,26,72] operating_min=500", "at least operating_min = 500"),
     ("point planetary modes teeth=[20,72]", "those of sun, planet and ring"),
     ("point planetary modes planet_angle=[0,120,240]", 'did you mean "120 deg"?'),
+    # Short options, values of the scene without --set, and values left out.
+    ("run scene.toml -o r.nc", "-o: not an argument of this command (did you mean --out?)"),
+    ("-V", "-V: not an argument of this command (did you mean --version?)"),
+    (f"{RUN} -q", "did you mean --quiet?"),
+    (f"{RUN} fixed.zeta=0.1", "did you mean --set fixed.zeta=0.1?"),
+    (f"{RUN} zeta=0.1", "did you mean --set fixed.zeta=0.1?"),
+    (f"{RUN} --axes.beta.num=5", "did you mean --set axes.beta.num=5?"),
+    (f"{RUN} --set", "--set: its value is missing"),
+    (f"{POINT} --amplitude -2deg", "a value that begins with - is written --amplitude=VALUE"),
+    ("design speed-windows r.nc --margin 2rpm", "--margin = '2rpm': allowed is a number"),
+    ("plot r.nc --out f.png --part speed=1000-2000", "allowed is a number or LOW:HIGH"),
+    ("export r.nc out.csv", "a table is written by --csv out.csv"),
+    # Values as people write them.
+    (f"{RUN} --set axes.beta.values=[0.1,0.2]", "axes.beta = [...] replaces the whole axis"),
+    (f"{RUN} --set outputs=all", "'all' is not a result of floquet"),
+    (f"{RUN} --set outputs=verdict,radius", "'radius' is not a result of floquet (did you mean spectral_radius?)"),
+    (f"{RUN} --set fixed.damping=0.1", "did you mean c1 or c2 or zeta or alpha?"),
+    (POINT.replace("beta=0.3", "beta=17,2deg"), "did you mean 17.2?"),
+    (POINT.replace("beta=0.3", "beta=0.1:0.3"), "a range, where one number is needed"),
+    (POINT.replace("mu=1", "mu=1/2"), "a quotient is written as a number: 0.5"),
+    (POINT.replace("mu=1", "mu=inf"), "mu = inf: allowed is 0 < mu < inf"),
+    (POINT.replace("Omega=1.4", "rpm=1500"), "rpm = 1500: unknown (did you mean speed?)"),
+    (POINT.replace("zeta=0.001", "damping=0.001"), "did you mean c1 or c2 or zeta or alpha?"),
+    (f"{POINT} output=verdict", "did you mean outputs?"),
+    (f"{POINT} tol=1e-6", "did you mean rtol?"),
+    (TRUCK.replace("J1=2", "J1=2kgm"), "'kgm' is not a unit"),
+    (TRUCK.replace("k1=6e4", "k1=60kN/m"), "kN/m does not measure that; allowed is a number in N m/rad"),
+    (TRUCK.replace("c1=0.3", "c1=0.3Ns/m"), "Ns/m does not measure that; allowed is a number in N m s/rad"),
+    (TRUCK.replace("angle=12", "joint_angle=12"), "did you mean angle?"),
+    (TRUCK.replace("J1=2", "inertia=2"), "did you mean J1 or J2"),
+    (RATTLE.replace("b=0.17", "stiffness=1"), "stiffness = 1: unknown (did you mean"),
+    (SHAFT.replace("[0.3,0.3]", "0.3,0.3"), "allowed is a list of numbers"),
+    (SHAFT.replace("EI=[1e4,1e4]", "diameter=60mm"), "did you mean outer_diameter?"),
 ]
 
 
@@ -177,8 +215,43 @@ def test_a_guess_is_answered_in_one_line(folder, capsys, command, answer):
     assert os.listdir(folder) == ["scene.toml"]
 
 
+@pytest.mark.parametrize(
+    ("written", "units", "value"),
+    [
+        ("1425 RPM", "rpm", 1425.0),
+        ("2 kgm2", "kg m2", 2.0),
+        ("2 kgm^2", "kg m2", 2.0),
+        ("3 Ns/m", "N s/m", 3.0),
+        ("3 kNs/m", "N s/m", 3000.0),
+        ("0.3 Nms/rad", "N m s/rad", 0.3),
+        ("300 Nmms", "N m s/rad", 0.3),
+        ("60 kNm/rad", "N m/rad", 60000.0),
+    ],
+)
+def test_units_are_read_as_they_are_written(written, units, value):
+    assert _units.number(written, units) == pytest.approx(value, rel=1e-14)
+
+
+def test_spaces_and_percent_are_understood(capsys):
+    assert (
+        main([*shlex.split("point cardan floquet 'beta = 0.3' Omega=1.4 zeta=0.1% alpha=1 mu=1 gamma=100"), "--json"])
+        == 0
+    )
+    assert json.loads(capsys.readouterr().out)["parameters"]["zeta"]["value"] == 0.001
+    options = parser().parse_args(["design", "speed-windows", "r.nc", "--margin", "2%"])
+    assert options.margin == 0.02
+
+
+def test_a_warning_is_one_line_without_code(folder):
+    shaft = "length=[300,300] outer_diameter=[0.06,0.06] material=steel k_A=1e6 k_D=1e6 modes=1"
+    words = [sys.executable, "-m", "drivetrain_jax.cli", "point", "bicardan", "critical_speeds", *shaft.split()]
+    found = subprocess.run(words, capture_output=True, text=True, check=True)
+    lines = found.stderr.splitlines()
+    assert lines[0] == 'drivetrain: warning: length[0] = 300 m: more than 100 m; is "300 mm" meant?' and len(lines) == 2
+
+
 def test_there_are_a_hundred():
-    assert len(GUESSES) >= 100 and len({command for command, _ in GUESSES}) == len(GUESSES)
+    assert len(GUESSES) >= 140 and len({command for command, _ in GUESSES}) == len(GUESSES)
 
 
 BASE = {"beta": 0.3, "Omega": 1.4, "zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
@@ -210,6 +283,25 @@ def test_columns_and_lists_are_axes():
     for values in (TABLE, [1j], [[0.1]], 0.1, Path("beta.csv"), None):
         with pytest.raises(dt.InputError, match=r"^over\.beta"):
             dt.sweep(lambda s: s.beta, shaft, over={"beta": values})
+
+
+def test_calls_that_miss_the_point_are_answered_by_name():
+    shaft = dt.Cardan(**BASE)
+    for call, answer in (
+        (lambda: dt.Cardan(J1=2.0, **BASE), "J1: physical data; allowed in Cardan.from_physical"),
+        (lambda: dt.Cardan(**BASE, Zeta=0.1), r"Zeta: unknown \(did you mean zeta\?\); allowed is beta, Omega"),
+        (lambda: dt.Cardan(0.3, 1.4), r"Cardan: 2 values without names; allowed is Cardan\(name=value"),
+        (lambda: dt.sweep("floquet", shaft, over={"beta": [0.1]}), "function = 'floquet': allowed is a function"),
+        (lambda: dt.sweep(shaft, dt.floquet, over={"beta": [0.1]}), "function = Cardan"),
+        (lambda: dt.sweep(dt.floquet, shaft, over=["beta"]), r"over = \['beta'\]; allowed are values by the name"),
+        (
+            lambda: dt.sweep(lambda s: None, shaft, over={"beta": [0.1]}),
+            "function: returns a NoneType; allowed is an array",
+        ),
+    ):
+        with pytest.raises(dt.InputError, match=answer) as error:
+            call()
+        assert "\n" not in str(error.value)
 
 
 def test_an_axis_takes_the_place_of_a_fixed_value():

@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import brentq
 
 import drivetrain_jax as dt
+from drivetrain_jax.cli import main
 from drivetrain_jax.runs import atlas_answers
 
 DATA = {"J1": 2.0, "J2": 0.5, "k1": 6e4, "k2": 4e4, "c1": 0.3464, "c2": 0.1414, "angle": 12.0}
@@ -90,3 +91,23 @@ def test_undecided_says_what_to_do():
     found = dt.point("cardan", "floquet", **undamped)
     assert found.verdict == 2 and found.growth == {}
     assert "a smaller rtol than 1e-10 may decide; without damping only damping does" in repr(found)
+
+
+def test_a_point_gives_sensitivities_by_its_physical_data_when_asked(capsys):
+    point = DATA | {"speed": 3130.0}
+    words = [f"{name}={value}" for name, value in point.items()]
+    command = ["point", "cardan", "floquet", *words, "outputs=spectral_radius", "--sensitivities"]
+    assert main([*command, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["sensitivities"]
+    assert {each["name"] for each in found} == point.keys()
+    sizes = [abs(each["percent"]) for each in found]
+    assert sizes == sorted(sizes, reverse=True)
+    for each in found:
+        up, down = (radius(point | {each["name"]: point[each["name"]] * (1 + h)}) for h in (1e-5, -1e-5))
+        assert each["percent"] == pytest.approx((up - down) / 2e-5 / 100, rel=1e-3, abs=1e-8), each["name"]
+    assert main(command) == 0
+    assert f"  {found[0]['name']}" in capsys.readouterr().out.split("largest effect of 1 % first\n")[1].splitlines()[0]
+    assert dt.point("cardan", "floquet", **point).sensitivities is None
+    with pytest.raises(dt.InputError, match=r"^sensitivities: bicardan has no spectral radius"):
+        shaft = {"length": [0.3, 0.3], "EI": [1e4, 1e4], "rhoA": [15.0, 15.0], "k_A": 1e6, "k_D": 1e6}
+        dt.point("bicardan", "critical_speeds", modes=1, sensitivities=True, **shaft)
