@@ -12,8 +12,18 @@ import pytest
 DOCS = Path(__file__).parents[2] / "docs"
 
 
+SYSTEMS = [f"systems/{name}.md" for name in ("bicardan", "cardan", "planetary", "rattle", "tripod")]
+
+
 @pytest.mark.parametrize(
-    ("page", "fewest"), [("jax.md", 15), ("notebooks.md", 25), ("scaling.md", 2), ("extending.md", 7)]
+    ("page", "fewest"),
+    [
+        ("jax.md", 15),
+        ("notebooks.md", 25),
+        ("scaling.md", 2),
+        ("extending.md", 7),
+        *(pytest.param(page, 2, marks=pytest.mark.full) for page in SYSTEMS),
+    ],
 )
 def test_the_examples_of_the_page_run(page, fewest, tmp_path, monkeypatch):
     if page == "scaling.md":
