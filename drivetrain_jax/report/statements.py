@@ -30,7 +30,7 @@ class Limit(Protocol):
     """A largest allowed amplitude."""
 
     @property
-    def value_text(self) -> float:
+    def value(self) -> float:
         """The amplitude in the unit ``own``."""
         ...
 
