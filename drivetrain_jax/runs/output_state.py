@@ -19,6 +19,7 @@ from drivetrain_jax.runs.growing import NO_REUSE, Damaged, NotReusable, Reusable
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.sink import Sink
 from drivetrain_jax.runs.sinks import make_sink
+from drivetrain_jax.store import gate
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.files import behind_link, move_folder
 
@@ -230,7 +231,8 @@ class OutputState:
     @property
     def _solves(self) -> int | None:
         value = self.sink.attribute("solves")
-        return None if value is None else int(np.squeeze(value))
+        with gate.reading(self.sink.held):
+            return None if value is None else int(np.squeeze(value))
 
 
 def provenance_of(job: Job) -> dict[str, str]:

@@ -108,6 +108,16 @@ def test_sealed_content_of_no_result_is_one_line(path, capsys, kind):
     assert code == 2
 
 
+@pytest.mark.parametrize("solves", ["x", "", np.arange(2)])
+def test_a_sealed_number_of_solves_that_is_none_is_one_line(path, capsys, solves):
+    with h5py.File(path, "r+") as file:
+        file.attrs["solves"] = solves
+        checksums.seal(file)
+    for command, code in (("status", 0), ("run", 2)):
+        assert main([command, "scene.toml", "--out", "r.nc"]) == code
+        assert "does not fit a result" in "".join(capsys.readouterr())
+
+
 @pytest.mark.parametrize(
     ("code", "reason"), [("import time; time.sleep(60)", "takes longer"), ("import os; os.abort()", "crashes")]
 )
