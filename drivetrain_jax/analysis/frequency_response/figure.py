@@ -126,7 +126,8 @@ def _lines(results: list[xr.Dataset]) -> Figure:
         if with_phase:
             _draw_sweeps(panels.axes[1][0], each, _lag(each), look, jumps)
         handles += _entries(each, look)
-    upper.set_ylim(0, None)
+    # The margin of matplotlib is a share of the range, which is small for a flat curve.
+    upper.set_ylim(0, 1.03 * upper.get_ylim()[1])
     handles += _draw_missing(upper, results)
     handles += _draw_backbones(upper, results)
     handles += _draw_wandering(upper, results)
@@ -271,7 +272,7 @@ def _draw_contact(axes: Axes, results: list[xr.Dataset]) -> list[Artist]:
     order = list(_METHODS)
     best = max(results, key=lambda r: order.index(r.attrs.get("method", "exact")))
     handles: list[Artist] = [*regimes.draw_sweep_strips(axes, best, _path(best))]
-    if (half := regimes.half_play(best)) is not None:
+    if (half := regimes.half_play(best)) is not None and half < axes.get_ylim()[1]:
         style = {"color": "#a8a8a8", "linewidth": 0.9, "zorder": 0.5, "label": "half the backlash"}
         handles.append(axes.axhline(half, **style))
     return handles
