@@ -10,12 +10,9 @@ from benchmarks.results_files import ResultFile, Row, between_marks, count, load
 from benchmarks.timing import RESULTS
 
 README = Path(__file__).resolve().parents[1] / "README.md"
-NAMES = (
-    "throughput", "critical_speeds", "planetary_throughput", "rattle_throughput", "chaos", "atlas", "memory", "overhead",
-)  # fmt: skip
-OWN = "drivetrain_jax direct"
+NAMES = ("throughput", "critical_speeds", "atlas")
 LABELS = {
-    OWN: "**`direct`**",
+    "drivetrain_jax direct": "**`direct`**",
     "heyoka batch": "heyoka (compiled Taylor integrator)",
     "scipy DOP853 stacked, half period": "SciPy DOP853, whole grid as one state, half a period",
     "scipy DOP853 stacked": "SciPy DOP853, whole grid as one state",
@@ -30,37 +27,24 @@ def section(folder: Path = RESULTS) -> str:
     files = {name: load(folder, name) for name in NAMES}
     told = [
         page_text.critical_sentence(files["critical_speeds"]),
-        page_text.planetary_sentence(files["planetary_throughput"]),
-        page_text.chaos_sentence(files["chaos"]),
-        page_text.rattle_sentence(files["rattle_throughput"]),
         _atlas(files["atlas"]),
-        _memory(files["memory"]),
-        page_text.overhead_sentence(files["overhead"]),
         page_precision.losses(page_precision.load_precision(folder)),
-        _machines(files),
     ]
     return "\n\n".join([*_chart(files["throughput"]), "\n".join(f"- {sentence}" for sentence in told if sentence)])
-
-
-def _machines(files: page_text.Files) -> str:
-    """A sentence that names the machines; empty if all files have the same one."""
-    told = f"{page_text.machine(files)} [The page](docs/benchmarks.md) names the machine of every file."
-    return told if len(page_text.machines(files)) > 1 else ""
 
 
 def _chart(file: ResultFile | None) -> list[str]:
     if file is None:
         return [not_measured("throughput")]
     good = page_text.at_equal_error(file)
-    exact = {name: _most_exact(file, name) for name in LABELS}
-    shown = [row for row in file.rows if page_text.family(row) == OWN or row is good.get(page_text.family(row))]
-    shown += [row for name, row in exact.items() if row and name not in good and row not in shown]
+    exact = [_most_exact(file, name) for name in LABELS if name not in good]
+    shown = [*(row for name, row in good.items() if name in LABELS), *filter(None, exact)]
     rows = [
         [_label(row), count(row["cells_per_s"]), small(row["max_error"])]
         for row in sorted(shown, key=lambda row: -float(row["cells_per_s"]))
     ]
     head = (
-        f"Spectral radius, {file.notes[0]}, without compilation. Each rival is shown at its fastest setting with an error "
+        f"Spectral radius, {file.notes[0]}, without compilation. Each method is shown at its fastest setting with an error "
         f"of at most {GOAL:g}, or at its most accurate setting if it never gets there. Only `direct` gives an error bound "
         "for every cell. " + page_text.machine({"throughput": file})
     )
@@ -93,14 +77,6 @@ def _atlas(file: ResultFile | None) -> str:
 
 
 _KINDS = {"evaluation": "grid cells", "points": "scattered points"}
-
-
-def _memory(file: ResultFile | None) -> str:
-    if file is None:
-        return ""
-    row = max(file.rows, key=lambda row: float(row["points"]))
-    took = f"{seconds(row['seconds'])}, {row['resident_mb']} MB of memory"
-    return f"A sweep of {count(row['points'])} points to a file, cheapest analysis, one result per point: {took}."
 
 
 def written(text: str, folder: Path = RESULTS) -> str:
