@@ -57,6 +57,15 @@ def _with_product(multipliers: Array, logarithms: Array, log_product: Array) -> 
     return jnp.stack([multipliers[0], second]), jnp.stack([logarithms[0], other])
 
 
+def _of_multipliers(z: Monodromy, finite: Array, spectrum: Spectrum, system: LinearPeriodic) -> dict[str, Array]:
+    multipliers = jnp.where(finite, sort_multipliers(*spectrum), jnp.nan)
+    logarithms = jnp.log(jnp.abs(multipliers))
+    if len(multipliers) == 2 and system.log_determinant is not None:
+        multipliers, logarithms = _with_product(multipliers, logarithms, system.log_determinant() - 2 * z.log_scale)
+    exponents = (logarithms + z.log_scale) / system.span
+    return {"floquet_multiplier": multipliers * jnp.exp(z.log_scale), "floquet_exponent": exponents}
+
+
 def results(
     z: Monodromy,
     outputs: tuple[str, ...],
@@ -78,13 +87,8 @@ def results(
 
     found: dict[str, Array] = {}
     if wanted & MULTIPLIERS:
-        real, imaginary = spectrum = eigen()
-        multipliers = jnp.where(finite, sort_multipliers(real, imaginary), jnp.nan)
-        logarithms = jnp.log(jnp.abs(multipliers))
-        if len(multipliers) == 2 and system.log_determinant is not None:
-            multipliers, logarithms = _with_product(multipliers, logarithms, system.log_determinant() - 2 * z.log_scale)
-        found["floquet_multiplier"] = multipliers * size
-        found["floquet_exponent"] = (logarithms + z.log_scale) / system.span
+        spectrum = eigen()
+        found = _of_multipliers(z, finite, spectrum, system)
     if spectrum is None and has_closed_form(z.matrix):
         rho, error = radius_in_closed_form(z.matrix, z.error, size, 10 * rtol)
     else:
