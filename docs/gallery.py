@@ -32,11 +32,11 @@ CELLS = 600
 # Charts of an atlas over more than two parameters: title -> fixed parameters, as for `drivetrain plot --part`.
 PARTS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
     "cardan_atlas_4d": {
-        "Figs 2 and 3 from the four-parameter atlas": {"mu": 1.0, "alpha": 1.0},
-        "Fig. 4 from the four-parameter atlas": {"mu": 1.0, "alpha": 20.0},
-        "Fig. 5 from the four-parameter atlas": {"beta": 0.5235987755982988, "mu": 1.0},
-        "Fig. 6 from the four-parameter atlas": {"mu": 20.0, "alpha": 1.0},
-        "Fig. 7 from the four-parameter atlas": {"beta": 0.5235987755982988, "alpha": 1.0},
+        "Angle over speed, equal shafts, four-parameter atlas": {"mu": 1.0, "alpha": 1.0},
+        "Angle over speed, strongly damped driven shaft, four-parameter atlas": {"mu": 1.0, "alpha": 20.0},
+        "Damping of the driven shaft over speed, four-parameter atlas": {"beta": 0.5235987755982988, "mu": 1.0},
+        "Angle over speed, stiff driven shaft, four-parameter atlas": {"mu": 20.0, "alpha": 1.0},
+        "Stiffness of the driven shaft over speed, four-parameter atlas": {"beta": 0.5235987755982988, "alpha": 1.0},
     }
 }
 
