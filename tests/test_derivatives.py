@@ -332,6 +332,7 @@ def test_where_there_is_no_derivative_there_is_none():
     assert np.isnan(slopes.k_p)
 
 
+@pytest.mark.full
 def test_an_oscillator_at_its_ends_has_no_derivative_by_them():
     """Without backlash, and without a spring in the gap."""
     slopes = quick_jit(jax.jacrev(gears_at_work))

@@ -45,7 +45,9 @@ def replaced(system, name, value):
     return type(system).of(system.values | {name: value})
 
 
-@pytest.mark.parametrize("case", but_full(CASES, "cardan forced", "tripod history", "rattle steady_state"))
+@pytest.mark.parametrize(
+    "case", but_full(CASES, "cardan forced", "tripod history", "rattle steady_state", "planetary modes")
+)
 def test_a_batch_equals_the_loop_and_the_sweep(case):
     function, system, name, values, rtol = CASES[case]
     batch = jax.vmap(lambda x: replaced(system, name, x))(jnp.asarray(values))

@@ -339,7 +339,8 @@ _TONGUE_EDGE = (
 )
 
 
-@pytest.mark.parametrize("max_time", [pytest.param(0.1, marks=pytest.mark.full), 1.0])
+@pytest.mark.full
+@pytest.mark.parametrize("max_time", [0.1, 1.0])
 def test_a_double_multiplier_is_no_instability(max_time):
     """At a double multiplier vectors grow in proportion to time, or to time and a decay."""
     names = ("zeta", "excitation_frequency", "M_AEM", "phi0")

@@ -90,6 +90,7 @@ def test_lines_of_the_cardan_shaft_against_direct_solves(change, steepest):
         assert error.max() < 3e-12
 
 
+@pytest.mark.full
 def test_very_slow_speeds_are_marched_explicitly_and_apart():
     """Omega = 0.001 needs 21,000 steps; the implicit scheme would cost 26 times as much. Reference: power series."""
     omega = [1.0, 1e-3, 1.1e-3]

@@ -40,7 +40,7 @@ class ResumeMachine(RuleBasedStateMachine):
         self.held = None
 
     def teardown(self):
-        shutil.rmtree(self.folder)
+        shutil.rmtree(self.folder, ignore_errors=True)
 
     @initialize(count=st.sampled_from(COUNTS), number=st.sampled_from(NUMBERS))
     def choose(self, count, number):
@@ -111,7 +111,8 @@ class ResumeMachine(RuleBasedStateMachine):
             self.judge(self.start(fresh=fresh, report=report), 0 if fresh else before)
         except Interrupted:
             if kill:
-                shutil.rmtree(self.path.parent)
+                # Not removed: threads may still write there for a moment.
+                self.path.parent.rename(Path(tempfile.mkdtemp(dir=self.folder)) / "killed")
                 copy.rename(self.path.parent)
             now = status(self.scene, self.path)
             assert fresh or now.state == "stale" or now.done >= before

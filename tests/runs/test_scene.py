@@ -147,7 +147,7 @@ WRONG = {
     "unknown analysis": (changed(analysis="ty"), "ty", "allowed for toy is one of toy, slow"),
     "analysis of another system": (changed(system="cardan", analysis="toy"), "toy", "floquet"),
     "wrong type of a key": (changed(title=3), "title = 3", "text"),
-    "wrong type of outputs": (changed(outputs="value"), "outputs", "list"),
+    "wrong type of outputs": (changed(outputs=3), "outputs", "list"),
     "unknown output": (changed(outputs=["valu"]), "valu", "did you mean value?"),
     "no output": (changed(outputs=[]), "outputs = []", "value"),
     "output twice": (changed(outputs=["value", "value"]), "outputs", "once"),
