@@ -22,25 +22,25 @@ _UNDECIDED = "`drivetrain point` solves a value there directly, and a smaller rt
 
 def atlas_answers(
     path: Path, cells: tuple[int, int], convert: Callable[[xr.Dataset], xr.Dataset], amplitude: Any
-) -> tuple[list[str], xr.Dataset]:
-    """Sentences of the design questions that need no further values, and the chart of the atlas at ``path``.
+) -> tuple[list[str], xr.Dataset, bool]:
+    """Sentences of the design questions that need no further values, the chart of the atlas at ``path``, and a flag.
 
-    The chart has the first number of ``cells`` for one parameter, the second for more.
-
-    ``convert`` puts a chart into the units of the sentences, which compare the forced motion with the limit ``amplitude``.
+    The chart has the first number of ``cells`` for one parameter, the second for more. ``convert`` puts a chart into the
+    units of the sentences. The flag is true if they compare the forced motion with the limit ``amplitude``.
     """
     atlas = open_atlas(path)
     drawn = chart(path, {}, cells[len(atlas.ranges) > 1])
-    return _design(atlas, partial(_written, atlas, convert(drawn)), amplitude), drawn
+    said, compared = _design(atlas, partial(_written, atlas, convert(drawn)), amplitude)
+    return said, drawn, compared
 
 
-def _design(atlas: StoredAtlas, named: Writer, amplitude: Any) -> list[str]:
+def _design(atlas: StoredAtlas, named: Writer, amplitude: Any) -> tuple[list[str], bool]:
     roles, free = dict(atlas.scene.system.roles), set(atlas.ranges)
     speed, angle, damping = (roles.get(name) for name in ("speed", "angle", "damping"))
     if free == {speed}:
         found = answers.speed_windows(atlas, {}).data
         forced = forced_over(atlas, amplitude, [w["safe"] for w in found["windows"]], {}, named)[0]
-        return [*_windows(found, str(speed), named, forced), *_undecided(found, str(speed), named)]
+        return [*_windows(found, str(speed), named, forced), *_undecided(found, str(speed), named)], any(forced)
     for other, question, phrase in (
         (angle, answers.widest_angle, "up to"),
         (damping, answers.least_damping, "from"),
@@ -51,8 +51,8 @@ def _design(atlas: StoredAtlas, named: Writer, amplitude: Any) -> list[str]:
             name, value = found["parameter"], found["value"]
             forced = [] if value is None else forced_over(atlas, amplitude, [speeds], {name: value}, named)[0]
             compared = [_sentence(text) for each in forced for text in each]
-            return [*_limit(found, phrase, named), *compared, *_undecided(found, name, named)]
-    return []
+            return [*_limit(found, phrase, named), *compared, *_undecided(found, name, named)], bool(compared)
+    return [], False
 
 
 def _windows(found: Mapping[str, Any], speed: str, named: Writer, forced: list[list[str]]) -> list[str]:

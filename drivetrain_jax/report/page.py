@@ -101,12 +101,12 @@ def _section(path: Path, number: int, asked: list[str], amplitude: Any) -> Secti
     analysis = dataset.attrs.get("analysis")
     if analysis is None:
         raise InputError(f"file = {str(path)!r}: has no attribute 'analysis'; allowed is a result of drivetrain_jax")
-    answers, convert = [], partial(_in_units, asked)
+    answers, compared, convert = [], False, partial(_in_units, asked)
     if analysis == "atlas":
         # Local import: it loads jax, which other results do not need.
         from drivetrain_jax.report.atlas_section import atlas_answers
 
-        answers, chart = atlas_answers(path, (_LINE_CELLS, _CELLS), convert, amplitude)
+        answers, chart, compared = atlas_answers(path, (_LINE_CELLS, _CELLS), convert, amplitude)
     else:
         chart = dataset.load()
     limit = None
@@ -128,7 +128,7 @@ def _section(path: Path, number: int, asked: list[str], amplitude: Any) -> Secti
         provenance=[(name, str(attrs[name])) for name in _PROVENANCE if name in attrs],
         scene=str(attrs.get("scene", "")).strip(),
         units={str(v.attrs.get("units", "1")) for v in handy.variables.values()} | {row[-1] for row in fixed},
-        compared=limit is not None or (amplitude is not None and any("orced amplitude" in said for said in answers)),
+        compared=compared or limit is not None,
     )
 
 

@@ -70,7 +70,7 @@ class _Varied(eqx.Module):
         a, da = jax.jvp(entries, (given,), (along,))
         states = range(sizes[0])
         upper, lower = ([[x.get((i, j), 0) for j in states] for i in states] for x in (a, da))
-        nothing = [0 for _ in states]
+        nothing = [0] * len(states)
         changed = [(*change, *row) for change, row in zip(lower, upper, strict=True)]
         return (*((*row, *nothing) for row in upper), *changed)
 
