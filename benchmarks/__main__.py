@@ -54,6 +54,9 @@ class Study:
 STUDIES = (
     Study("throughput", "cardan", "heyoka", full=("--repeats", "3")),
     Study("precision_cardan", "cardan"),
+    Study("precision_forced", "cardan", quick=False),
+    Study("precision_gradients", "cardan", quick=False),
+    Study("random_points", "cardan", quick=False),
     Study("work_precision", "cardan", quick=False),
     Study("atlas", "cardan", "heyoka", full=("--repeats", "1"), quick=False),
     Study("peers", "cardan", "heyoka", quick=False),
@@ -64,6 +67,7 @@ STUDIES = (
     Study("precision_planetary", "planetary"),
     Study("planetary_throughput", "planetary", full=("--gears", "6000", "--repeats", "3"), quick=False),
     Study("precision_rattle", "rattle"),
+    Study("precision_attractors", "rattle", quick=False),
     Study("rattle_throughput", "rattle", quick=False),
     Study("precision_tripod", "tripod"),
     Study("chaos", "tripod", "heyoka", peer_option="--pynamicalsys", quick=False),

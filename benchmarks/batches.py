@@ -77,13 +77,17 @@ def child(scene: Mapping[str, Any], cores: int, cache: str, runs: int = 2) -> di
 
 
 def kernel_job(scene: Mapping[str, Any], width: int | None = None) -> tuple[Any, int]:
-    """A function that runs one full chunk of ``scene``, and the number of its points, ``width`` or that of the plan."""
+    """A function that runs a chunk of ``scene``, and the number of its points, ``width`` or that of the plan.
+
+    The chunk is the one whose predicted cost is next to the mean: a plan begins with the hardest points.
+    """
     from drivetrain_jax.runs.kernel import kernel_of
     from drivetrain_jax.runs.resolve import resolve
     from drivetrain_jax.runs.scene import load_scene
 
     engine = resolve(load_scene(dict(scene)))
-    chunk = engine.plan.chunk(0)
+    costs = engine.plan.costs
+    chunk = engine.plan.chunk(int(np.argmin(np.abs(costs - costs.mean()))))
     size = width or chunk.size
     kernel = kernel_of(engine.scene, engine.grid, engine.solvers[chunk.solver], size)
     columns = engine.grid.columns(np.resize(chunk.points, size))

@@ -18,6 +18,9 @@ TITLES = {
     "planetary": "Planetary gear: natural frequencies",
     "rattle": "Gear rattle: motion with backlash",
     "tripod": "Double tripod: motion over 1,000 strobes",
+    "forced": "Cardan shaft: forced motion",
+    "gradients": "Cardan shaft: gradient of the spectral radius",
+    "attractors": "Gear rattle: attractors, basins, responses",
 }
 
 
@@ -68,54 +71,60 @@ def conclusions(found: dict[str, Precision]) -> list[str]:
 
 
 def losses(found: dict[str, Precision]) -> str:
-    """A sentence that lists the regions where a rival is faster; empty without any."""
-    behind = {system: _compared(precision).lost for system, precision in found.items()}
-    told = " ".join(f"`{system}`: {'; '.join(regions)}." for system, regions in behind.items() if regions)
-    return f"Regions where a rival is faster (error {GOAL:g}, one core). {told}" if told else ""
+    """A sentence that counts the regions where a rival is faster."""
+    regions = [one for precision in found.values() for one in compared(precision)]
+    behind = [one for one in regions if one.ratio <= 1 / LEVEL]
+    most = max((1 / one.ratio for one in behind if one.ratio > 0), default=1.0)
+    if not regions:
+        return ""
+    where = f"{len(behind)} of {len(regions)} regions (error {GOAL:g}, one core)"
+    return (
+        f"A rival is faster in {where}, up to {times(most)} times."
+        if behind
+        else f"No rival is faster in any of {where}."
+    )
 
 
-class _Compared(NamedTuple):
-    """Regions grouped by the fastest method, each with its fastest rival."""
+class Compared(NamedTuple):
+    """A region, its fastest rival, and the time of the rival over that of the package.
 
-    won: list[str]
-    level: list[str]
-    lost: list[str]
-    alone: list[str]
-    nobody: list[str]
+    The ratio is infinite if no rival reaches the error, 0 if the package does not, NaN if no method does.
+    """
+
+    region: str
+    rival: str
+    ratio: float
 
 
-def _compared(precision: Precision) -> _Compared:
-    won, level, lost, alone, nobody = found = _Compared([], [], [], [], [])
+def compared(precision: Precision) -> list[Compared]:
+    """The package and its fastest rival in every region."""
+    found = []
     for region in precision.regions:
         own, rival = precision.fastest(region, True), precision.fastest(region, False)
-        if own is None and rival is None:
-            nobody.append(region)
-        elif rival is None:
-            alone.append(region)
-        elif own is None:
-            lost.append(f"{region} ({rival.method} alone reaches it)")
-        else:
-            ratio = rival.seconds_per_point / own.seconds_per_point
-            if is_level(ratio):
-                level.append(f"{region} ({rival.method})")
-            elif ratio > 1:
-                won.append(f"{region} ({times(ratio)} times as fast as {rival.method})")
-            else:
-                lost.append(f"{region} ({rival.method} is {times(1 / ratio)} times as fast)")
+        ours, theirs = (rung.seconds_per_point if rung else math.inf for rung in (own, rival))
+        ratio = math.nan if own is rival is None else theirs / ours
+        found.append(Compared(region, rival.method if rival else "", ratio))
     return found
 
 
 def _winners(precision: Precision) -> str:
-    won, level, lost, alone, nobody = _compared(precision)
-    parts = [
-        ("The package is fastest in", won),
-        ("Only the package reaches this error in", alone),
-        (f"The package equals a rival within {LEVEL - 1:.0%} in", level),
-        ("The package is **slower** in", lost),
-        ("No method reaches this error in", nobody),
-    ]
-    told = " ".join(f"{words}: {'; '.join(regions)}." for words, regions in parts if regions)
-    return f"Regions of `{precision.system}` (error {GOAL:g}, one core). {told}"
+    regions = compared(precision)
+    won = [one for one in regions if one.ratio >= LEVEL]
+    finite = [one.ratio for one in won if math.isfinite(one.ratio)]
+    ends = list(dict.fromkeys(times(end(finite)) for end in (min, max))) if finite else []
+    span = f", {' to '.join(ends)} times the fastest rival" if ends else ""
+    alone = [one.region for one in won if math.isinf(one.ratio)]
+    parts = [f"faster in {len(won)} of {len(regions)} regions{span}"] if won else []
+    for words, names in (
+        ("alone in reaching the error in", alone),
+        ("level in", [f"{one.region} ({one.rival})" for one in regions if is_level(one.ratio)]),
+        ("**slower** in", [f"{one.region} ({times(1 / one.ratio)} times, {one.rival})"
+                           for one in regions if 0 < one.ratio <= 1 / LEVEL]),
+        ("behind, without reaching the error, in", [f"{one.region} ({one.rival})" for one in regions if one.ratio == 0]),
+        ("like all rivals above the error in", [one.region for one in regions if math.isnan(one.ratio)]),
+    ):  # fmt: skip
+        parts += [f"{words} {'; '.join(names)}"] if names else []
+    return f"`{precision.system}`: {', '.join(parts)}."
 
 
 def silent(systems: Iterable[Precision]) -> dict[str, list[str]]:
@@ -140,7 +149,7 @@ def _silence(systems: Sequence[Precision]) -> list[str]:
         if own
         else f"No method of the package fails silently in any region measured ({names})."
     )
-    return [first, f"Rivals that fail silently (regions): {'; '.join(rivals)}."] if rivals else [first]
+    return [first, f"Rivals that fail silently: {'; '.join(rivals)}."] if rivals else [first]
 
 
 def section(folder: Path, images: str, system: str, found: dict[str, Precision]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from benchmarks.results_files import ResultFile, against, count, markdown, not_measured, small, whole
+from benchmarks.results_files import ResultFile, count, markdown, not_measured, small, times, whole
 
 Files = Mapping[str, ResultFile | None]
 _DAMPING = (
@@ -27,16 +27,54 @@ _SCALING = {
 }
 
 
-def damping_sentence(file: ResultFile | None) -> str:
-    """A sentence that compares the speeds of `direct` and heyoka at each damping."""
-    told: list[str] = []
-    rates: dict[str, dict[str, float]] = {}
-    for row in file.rows if file else ():
-        rates.setdefault(row["zeta"], {})[row["method"].partition(",")[0]] = float(row["us_per_point"])
-    for zeta, spent in rates.items():
-        told.append(f"{against(spent['heyoka batch'] / spent['package'], 'heyoka batch')} at zeta = {float(zeta):g}")
-    words = "At strong damping `direct` changes to an implicit scheme, whose cost is independent of damping"
-    return f"At Omega = 0.1, `direct` is {', '.join(told)}. {words}." if told else ""
+def warnings(files: Files) -> list[str]:
+    """A line if the files are of several commits, and one if other programs used the machine."""
+    known = {name: file.facts for name, file in files.items() if file}
+    commits = sorted({facts.get("commit", "unknown") for facts in known.values()})
+    loaded = [f"{name} ({load:g})" for name, facts in known.items() if (load := _other_cores(facts)) > _OTHERS]
+    told = []
+    if len(commits) > 1:
+        told.append(f"**Several commits**: {', '.join(commits)}.")
+    if loaded:
+        told.append(f"**Other programs used more than {_OTHERS} cores** during: {', '.join(loaded)}.")
+    return told
+
+
+# Mean number of cores used by other programs from which a measurement counts as disturbed.
+_OTHERS = 0.5
+
+
+def _other_cores(facts: Mapping[str, str]) -> float:
+    number, _, rest = facts.get("load", "").partition(" cores")
+    return float(number) if rest else 0.0
+
+
+def random_sentence(file: ResultFile | None) -> str:
+    """Coverage of the bounds at random points."""
+    if file is None:
+        return ""
+    rows = [row for row in file.rows if row["over_bound"] != "nan"]
+    broken = [row["analysis"] for row in rows if float(row["over_bound"]) > 1]
+    largest = max(rows, key=lambda row: float(row["over_bound"]))
+    total = sum(int(row["compared"]) for row in rows)
+    held = f"**broken** in {', '.join(broken)}" if broken else f"no bound is broken at {total:,} compared random points"
+    most = f"{times(float(largest['over_bound']))} of its bound ({largest['analysis']})"
+    return f"Bounds: {held}; the largest error is {most}."
+
+
+def random_points(file: ResultFile | None) -> str:
+    """Errors, bounds and times at random points."""
+    heads = {
+        "analysis": "analysis", "points": "points", "us_median": "us a point, median", "us_99": "99 %",
+        "compared": "compared", "error_median": "error, median", "error_99": "99 %", "error_max": "largest",
+        "over_bound": "largest error over bound", "not_success": "not success", "outcomes": "outcomes",
+    }  # fmt: skip
+    errors = dict.fromkeys(("error_median", "error_99", "error_max"), small)
+    text = (
+        "Each parameter is drawn on its own over several decades (`benchmarks/random_points.py`). Times are on one core. "
+        "`tolerance_not_met`: the bound is larger than the tolerance, and the result is kept."
+    )
+    return "\n\n".join([text, whole(file, "random_points", heads, errors)])
 
 
 def atlas(file: ResultFile | None) -> str:
@@ -58,8 +96,8 @@ def scaling(files: Files) -> list[str]:
     return [*found, "Sweeps of 1e9 and 1e12 points: [scaling](scaling.md)."]
 
 
-def peers(files: Files, images: str) -> list[str]:
-    """Tables of the peers that work-precision does not cover."""
+def peers(files: Files, images: str, told: Mapping[str, str]) -> list[str]:
+    """Tables of the peers that work-precision does not cover; ``told`` are sentences by the name of the file."""
     shafts = {"method": "method", "shafts_per_s": "shafts/s", "ratio": "times", "max_difference": "largest difference"}
     gears = {"planets": "planets", "method": "method", "gears_per_s": "gears/s", "over_numpy_svd": "times NumPy svd",
              "error": "error", "rigid_Hz": "rigid mode / Hz"}  # fmt: skip
@@ -75,23 +113,36 @@ def peers(files: Files, images: str) -> list[str]:
     damping = {"zeta": "zeta", "method": "method", "us_per_point": "us a point", "difference": "largest difference"}
     heyoka = {"form": "form", "tolerance": "tolerance", "batch": "batch", "monodromies_per_s": "monodromies/s",
               "max_error": "largest error"}  # fmt: skip
-    return [
+    parts = [
         "### Critical speeds: SciPy and ROSS",
+        told["critical_speeds"],
         whole(files["critical_speeds"], "critical_speeds", shafts, {"shafts_per_s": count}),
         "### Planetary gears: NumPy and SciPy",
+        told["planetary_throughput"],
         whole(files["planetary_throughput"], "planetary_throughput", gears, {"gears_per_s": count}),
         "### Gear rattle: diffrax and SciPy with events",
+        told["rattle_throughput"],
         figure(files, "rattle_throughput", images, "Error against time per period of gear rattle"),
         whole(files["rattle_throughput"], "rattle_throughput", periods, {}),
         "### Lyapunov spectra: heyoka, SciPy, pynamicalsys",
+        told["chaos"],
         figure(files, "chaos_precision", images, "Error against rate of Lyapunov spectra"),
         whole(files["chaos"], "chaos", chaos, {"per_s": count}),
         "### heyoka's own forms, batch sizes and tolerances, one core",
         whole(files["heyoka"], "heyoka", heyoka, {"monodromies_per_s": count}),
         "### `direct` and heyoka against damping",
-        *([_DAMPING] if files["damping"] else []),
+        _DAMPING if files["damping"] else "",
         whole(files["damping"], "damping", damping, {"difference": small}),
+        "### Not measured",
+        _NOT_MEASURED,
     ]
+    return [part for part in parts if part]
+
+
+_NOT_MEASURED = (
+    "NLDESA (Mathieu charts in JAX) needs NumPy below 1.25 and SciPy below 1.11, with which this package does not run. CAPD "
+    "(validated integration in C++) is not to be had as a Python package."
+)
 
 
 def figure(files: Files, name: str, images: str, words: str) -> str:
@@ -104,8 +155,8 @@ def sources(files: Files) -> str:
     rows = []
     for name, file in files.items():
         if file is None:
-            rows.append([f"{name}.csv", "not measured", "", "", ""])
+            rows.append([f"{name}.csv", "not measured", "", "", "", ""])
         else:
-            load_text = file.facts.get("load", "").partition(" (")[0]
-            rows.append([f"{name}.csv", file.facts["date"], file.facts["machine"], load_text, file.facts["versions"]])
-    return markdown(["file", "date", "machine", "load 1, 5, 15 min", "versions"], rows)
+            facts = {key: file.facts.get(key, "unknown") for key in ("date", "commit", "machine", "load", "versions")}
+            rows.append([f"{name}.csv", *facts.values()])
+    return markdown(["file", "date", "commit", "machine", "load", "versions"], rows)

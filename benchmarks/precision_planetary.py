@@ -15,6 +15,9 @@ square loses. Matrices of NumPy's methods are finished before the clock starts.
 
 The package gives a bound of the error of every frequency (``natural_frequency_error``). A bound of more than 1e-9 of the
 frequency counts as a notice, unless the true error is larger than the bound, which counts as silent.
+
+In the region of mode shapes every method also returns the shapes, of modal mass 1. The error is the largest distance of a
+shape from that of 50 digits, up to its sign, weighted by the roots of the masses.
 """
 
 from __future__ import annotations
@@ -33,6 +36,7 @@ from benchmarks.precision_study import study
 from tests.oracles.planetary_reference import (
     TABLE_2,
     exact_frequencies,
+    exact_shapes,
     extension_matrix,
     matrices,
     natural_frequencies,
@@ -145,6 +149,58 @@ def rivals(region: str, lanes: int) -> list[Contender]:
     ]
 
 
+_SHAPES = "mode shapes"
+# Three planets at unequal angles: no frequency is double, so every shape is determined.
+_DISTINCT = TABLE_2 | {"planet_angle": (0.0, 1.9, 4.4)}
+
+
+def shape_error(gear: Mapping[str, Any], shapes: np.ndarray, notice: str = "") -> Judged:
+    """The error of ``shapes``, one mode a row, in the degrees of freedom times the roots of their masses."""
+    exact = _weighted_shapes(tuple(gear["planet_angle"]))
+    signs = np.sign(np.sum(exact * shapes, axis=1, keepdims=True))
+    error = float(np.max(np.linalg.norm(signs * shapes - exact, axis=1)))
+    return Judged(error, 0, notice) if math.isfinite(error) else Judged(math.nan, 1, notice or "nan")
+
+
+@cache
+def _weighted_shapes(angles: tuple[float, ...]) -> np.ndarray:
+    return exact_shapes(TABLE_2 | {"planet_angle": angles})
+
+
+def shapes(lanes: int) -> list[Contender]:
+    """The package, NumPy and SciPy with mode shapes."""
+    gear, columns = _DISTINCT, neighbours("equal planets", lanes)
+    scene = columns_scene("planetary", "modes", ["natural_frequency", "mode_shape"], columns,
+                          fixed={"planet_angle": list(gear["planet_angle"])})  # fmt: skip
+    together = {k: v for k, v in gear.items() if k != "planet_angle"} | columns
+    factors = extension_matrix(together | {"planet_angle": [np.full(lanes, angle) for angle in gear["planet_angle"]]})
+    squares = np.swapaxes(factors, 1, 2) @ factors
+    roots = np.sqrt(matrices(gear)[0])
+
+    def scipy_job() -> np.ndarray:
+        mass, stiffness = matrices(gear)
+        return eigh(np.array(stiffness, float), np.diag(mass))[1]
+
+    def judged(results: Mapping[str, np.ndarray]) -> Judged:
+        return shape_error(gear, roots * results["mode_shape"][0], told(results["outcome"][:1]))
+
+    def contender(method: str, points: int, prepare: Callable[[], Any], error: Callable[[Any], Judged]) -> Contender:
+        return Contender("planetary", _SHAPES, method, "double", points, prepare, error)
+
+    def numpy_job(decompose: Callable, given: np.ndarray) -> Callable[[], Callable[[], Any]]:
+        return lambda: lambda: decompose(given)
+
+    return [
+        contender("package, vectors", lanes, lambda: engine_job(scene), judged),
+        contender("numpy, svd", lanes, numpy_job(np.linalg.svd, factors),
+                  lambda f: shape_error(gear, f[2][0][::-1])),
+        contender("numpy, eigh", lanes, numpy_job(np.linalg.eigh, squares),
+                  lambda f: shape_error(gear, f[1][0].T)),
+        contender("scipy, eigh of stiffness and mass", 1, lambda: scipy_job,
+                  lambda f: shape_error(gear, (roots[:, None] * f).T)),
+    ]  # fmt: skip
+
+
 def contenders(quick: bool) -> tuple[Sequence[Contender], Sequence[str]]:
     """All methods in all regions, and the difference of NumPy's singular values from the reference."""
     lanes = 256 if quick else _LANES
@@ -162,6 +218,7 @@ def contenders(quick: bool) -> tuple[Sequence[Contender], Sequence[str]]:
         exact = reference(region)
         singular = _svd(extension_matrix(REGIONS[region])[None])[0]
         distances.append(f"{region}: {np.abs(singular - exact).max() / exact[-1]:.0e}")
+    found += [] if quick else shapes(lanes)
     note = f"singular values (NumPy) differ from the reference, over the largest frequency, by {'; '.join(distances)}"
     return found, [note]
 

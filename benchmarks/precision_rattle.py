@@ -36,9 +36,9 @@ from drivetrain_jax.systems.rattle import PRESETS, Rattle
 from tests.oracles.rattle_reference import extended, scipy_events, scipy_plain
 
 PERIODS = 10
-_TABLE1 = PRESETS["table1"] | {"omega": 0.76}
+TABLE1 = PRESETS["table1"] | {"omega": 0.76}
 REGIONS: dict[str, tuple[dict[str, float], tuple[float, float]]] = {}
-_LANES, _DIFFRAX_LANES, _FEW = 256, 8, 2
+_LANES, DIFFRAX_LANES, _FEW = 256, 8, 2
 _MOST_STEPS, _NOTICED = 100_000, 1e-6
 
 
@@ -54,19 +54,19 @@ def _touching(values: dict[str, float], depth: float) -> tuple[dict[str, float],
     return values | {"omega": math.sqrt(square)}, state
 
 
-_FREE_PLAY = _TABLE1 | {"alpha": 0.0}
+FREE_PLAY = TABLE1 | {"alpha": 0.0}
 REGIONS |= {
-    "easy": (_FREE_PLAY | {"omega": 2.0}, (0.2145, 0.0007)),
-    "typical": (_TABLE1, (0.42853695, 0.22067533)),
-    "near-grazing": _touching(_FREE_PLAY, 5e-8 * _FREE_PLAY["b"]),
+    "easy": (FREE_PLAY | {"omega": 2.0}, (0.2145, 0.0007)),
+    "typical": (TABLE1, (0.42853695, 0.22067533)),
+    "near-grazing": _touching(FREE_PLAY, 5e-8 * FREE_PLAY["b"]),
     "stiff contact, k = 1e6": (
-        _FREE_PLAY | {"k": 1e6, "c": 50.0, "B1": 0.1, "omega": 100.0},
+        FREE_PLAY | {"k": 1e6, "c": 50.0, "B1": 0.1, "omega": 100.0},
         (0.17450704, 0.00104055),
     ),
-    "light damping": (_TABLE1 | {"c": 1e-4}, (0.0, 0.0)),
-    "chaotic": (_FREE_PLAY | {"B1": 0.2, "omega": 1.171}, (0.0, 0.0)),
+    "light damping": (TABLE1 | {"c": 1e-4}, (0.0, 0.0)),
+    "chaotic": (FREE_PLAY | {"B1": 0.2, "omega": 1.171}, (0.0, 0.0)),
 }
-_NAMES = tuple(_TABLE1)
+_NAMES = tuple(TABLE1)
 _QUICK = ("typical", "near-grazing", "chaotic")
 
 
@@ -103,7 +103,7 @@ def marching(lanes: int) -> Callable[..., Any]:
         motion = march(made, start(made, u, v, periods), _MOST_STEPS)
         return jnp.stack([motion.u, motion.v]), jnp.stack(motion.matrix), motion.left == 0
 
-    example = arrays(_TABLE1, lanes)
+    example = arrays(TABLE1, lanes)
     return jax.jit(run).lower(example, example["b"], example["b"], np.zeros(lanes, np.int32)).compile()
 
 
@@ -111,14 +111,14 @@ def marching(lanes: int) -> Callable[..., Any]:
 def integrating(events: bool) -> Callable[..., Any]:
     """diffrax over a batch, compiled once for all regions and tolerances."""
 
-    def one(values: dict[str, jax.Array], state: jax.Array, rtol: jax.Array) -> jax.Array:
-        end = PERIODS * 2 * jnp.pi / values["omega"]
+    def one(values: dict[str, jax.Array], state: jax.Array, rtol: jax.Array, periods: jax.Array) -> jax.Array:
+        end = periods * 2 * jnp.pi / values["omega"]
         found, done = integrate(Rattle.models["basins"].build(values), state, end, rtol=rtol, events=events)
         return jnp.where(done, found, jnp.nan)
 
-    example = arrays(_TABLE1, _DIFFRAX_LANES)
-    batch = jax.jit(jax.vmap(one, in_axes=(0, 0, None)))
-    return batch.lower(example, np.zeros((_DIFFRAX_LANES, 2)), 1e-6).compile()
+    example = arrays(TABLE1, DIFFRAX_LANES)
+    batch = jax.jit(jax.vmap(one, in_axes=(0, 0, None, None)))
+    return batch.lower(example, np.zeros((DIFFRAX_LANES, 2)), 1e-6, 1.0).compile()
 
 
 @once
@@ -134,7 +134,7 @@ def balancing(harmonics: int) -> Callable[..., Any]:
         v = values["omega"] * jnp.sum(basis.orders[2::2, None] * x[2::2], axis=0)
         return jnp.stack([x[0] + jnp.sum(x[1::2], axis=0), v]), described.residual, good
 
-    return jax.jit(run).lower(arrays(_TABLE1, 1)).compile()
+    return jax.jit(run).lower(arrays(TABLE1, 1)).compile()
 
 
 def nearest_orbit(values: dict[str, float], state: np.ndarray) -> np.ndarray | None:
@@ -167,14 +167,14 @@ def closed_form(region: str) -> Contender:
 def by_diffrax(region: str, events: bool, rtol: float) -> Contender:
     """diffrax as a careful user would set it up."""
     values, state = REGIONS[region]
-    batch = (arrays(values, _DIFFRAX_LANES), np.tile(state, (_DIFFRAX_LANES, 1)), rtol)
+    batch = (arrays(values, DIFFRAX_LANES), np.tile(state, (DIFFRAX_LANES, 1)), rtol, float(PERIODS))
 
     def prepared() -> Callable[[], np.ndarray]:
         run = integrating(events)
         return lambda: np.asarray(run(*batch)).T
 
     name = "diffrax with events" if events else "diffrax across the kinks"
-    return Contender("rattle", region, name, f"rtol={rtol:g}", _DIFFRAX_LANES, prepared, partial(error_of, region))
+    return Contender("rattle", region, name, f"rtol={rtol:g}", DIFFRAX_LANES, prepared, partial(error_of, region))
 
 
 def by_scipy(region: str, events: bool, rtol: float) -> Contender:

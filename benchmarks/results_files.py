@@ -14,12 +14,12 @@ LEVEL = 1.1
 # Marks around the generated part of a page.
 BEGIN = "<!-- Written by `python -m benchmarks.page`; do not edit. -->"
 END = "<!-- End of the generated part. -->"
-_PROVENANCE = ("date", "machine", "load", "versions", "accelerator")
+_PROVENANCE = ("date", "commit", "machine", "load", "versions", "accelerator")
 
 
 @dataclass(frozen=True)
 class ResultFile:
-    """A CSV file of results: ``facts`` (date, machine, load, versions), ``notes`` from its head, ``rows``."""
+    """A CSV file of results: ``facts`` (date, commit, machine, load, versions), ``notes`` from its head, ``rows``."""
 
     name: str
     facts: Mapping[str, str]

@@ -8,7 +8,9 @@ import datetime
 import io
 import os
 import platform
+import resource
 import statistics
+import subprocess
 import tempfile
 import time
 from collections import defaultdict
@@ -122,11 +124,12 @@ def significant(value: Any, digits: int = 3) -> Any:
 
 
 def provenance() -> dict[str, str]:
-    """Date, processor, load and versions, for the head of every result file."""
+    """Date, commit, processor, load by other programs and versions, for the head of every result file."""
     return {
         "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "commit": _commit(),
         "machine": f"{_processor()}, {os.cpu_count()} cores",
-        "load": ", ".join(f"{load:.2f}" for load in os.getloadavg()) + " (1, 5, 15 min, at the end of the run)",
+        "load": _other_load(),
         "accelerator": "none" if not list(Path("/dev").glob("nvidia[0-9]*")) else "NVIDIA GPU",
         "versions": ", ".join([f"python {platform.python_version()}", *(f"{p} {_version(p)}" for p in _PACKAGES)]),
     }
@@ -156,6 +159,47 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(
         "  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip() for line in cells
     )
+
+
+def _commit() -> str:
+    """The commit of the code that runs, with a remark if its files differ from it."""
+    here = Path(__file__).parent
+    try:
+        commit, changes = (
+            subprocess.run(["git", *words], cwd=here, check=True, capture_output=True, text=True).stdout.strip()
+            for words in (
+                ["rev-parse", "--short", "HEAD"],
+                ["status", "--porcelain", "--", "../drivetrain_jax", "*.py"],
+            )
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return f"{commit} with changes" if changes else commit
+
+
+def _busy_seconds() -> float:
+    """CPU seconds of all programs of the machine that are not of this process and its ended children."""
+    fields = Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]
+    user, nice, system, _, _, irq, softirq, steal = (int(field) for field in fields[:8])
+    own = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK") - sum(
+        usage.ru_utime + usage.ru_stime for usage in own
+    )
+
+
+def _other_load() -> str:
+    """Mean number of cores that other programs used since the start of the study."""
+    try:
+        spent = _busy_seconds() - _BUSY_AT_START
+    except OSError:
+        return "unknown"
+    return f"{max(spent, 0.0) / (time.monotonic() - _START):.2f} cores by other programs"
+
+
+try:
+    _START, _BUSY_AT_START = time.monotonic(), _busy_seconds()
+except OSError:
+    _START, _BUSY_AT_START = time.monotonic(), 0.0
 
 
 def _version(package: str) -> str:

@@ -13,16 +13,26 @@ import numpy as np
 import pytest
 
 import drivetrain_jax
-from benchmarks import page_precision
+from benchmarks import (
+    page_precision,
+    page_sections,
+    precision_attractors,
+    precision_forced,
+    precision_planetary,
+)
 from benchmarks.page_text import NAMES, PAGE, conclusions, text_of
 from benchmarks.precision import Contender, Judged, Rung, judge, measure, read, write
-from benchmarks.results_files import against, not_measured, plain
-from benchmarks.timing import RESULTS, at_once, once, write_csv
+from benchmarks.ratio_figure import ratios
+from benchmarks.results_files import ResultFile, against, not_measured, plain
+from benchmarks.timing import RESULTS, at_once, once, provenance, write_csv
 from drivetrain_jax import cli
 from tests.oracles.bicardan_precise_reference import determinant
 from tests.oracles.bicardan_reference import transfer_determinant
+from tests.oracles.cardan_orbit_reference import nonlinear_orbit
 from tests.oracles.cardan_reference import BASE_CASE, monodromy, spectral_radius, stacked_half_period_monodromy
 from tests.oracles.chaos_reference import _orthonormalise
+from tests.oracles.planetary_reference import extension_matrix
+from tests.oracles.rattle_reference import scipy_events
 
 
 def rung(setting="rtol=1e-9", error=1e-10, failed=0, noticed=""):
@@ -71,6 +81,56 @@ def test_a_silent_failure_stands_at_the_head_of_the_page(tmp_path, error, fails)
     assert page_precision.silent(found) == expected | {"method": ["cardan easy"]}
     head = text_of(tmp_path, tmp_path / "benchmarks.md").partition("## The cardan chart")[0]
     assert "method (cardan easy)" in head and ("package, direct (cardan easy)" in head) is fails
+
+
+def test_comparisons_with_the_best_rival():
+    """Slower, faster, alone and level, in the figure's ratios and in words."""
+    rungs = []
+    for region, own, rival in (("a", 2e-5, 1e-5), ("b", 1e-5, 3e-5), ("c", 1e-5, None), ("d", 1e-5, 1.05e-5)):
+        rungs.append(replace(rung(), region=region, method="package, direct", seconds_per_point=own))
+        error = 1e-10 if rival else 1e-3
+        rungs.append(replace(rung(error=error), region=region, method="rival", seconds_per_point=rival or 1e-6))
+    precise = {"cardan": page_precision.Precision("cardan", rungs)}
+    found = {one.region: one.ratio for one in page_precision.compared(precise["cardan"])}
+    assert found == {"a": pytest.approx(0.5), "b": pytest.approx(3), "c": math.inf, "d": pytest.approx(1.05)}
+    assert "A rival is faster in 1 of 4 regions" in page_precision.losses(precise)
+    told = page_precision.conclusions(precise)[0]
+    assert "faster in 2 of 4 regions, 3 times" in told and "**slower** in a (2 times, rival)" in told
+    assert [one.ratio for one in ratios(dict.fromkeys(NAMES), precise)[page_precision.TITLES["cardan"]]] == [
+        *found.values()
+    ]
+
+
+def test_files_of_several_commits_or_of_a_loaded_machine_are_named():
+    def file(commit, load):
+        return ResultFile("x", {"commit": commit, "load": f"{load} cores by other programs"}, (), ())
+
+    assert page_sections.warnings({"a": file("1", 0.1), "b": file("1", 0.4), "c": None}) == []
+    several, loaded = page_sections.warnings({"a": file("1", 0.1), "b": file("2", 0.8)})
+    assert "1, 2" in several and "b (0.8)" in loaded and "a (" not in loaded
+
+
+def test_results_name_their_commit_and_the_load_by_others():
+    facts = provenance()
+    assert re.fullmatch(r"([0-9a-f]{7,}( with changes)?)|unknown", facts["commit"])
+    assert re.fullmatch(r"\d+\.\d\d cores by other programs|unknown", facts["load"])
+
+
+def test_rivals_of_the_forced_motion_and_of_attractors_find_it():
+    """The references of the new studies, against each other."""
+    region = precision_forced.REGIONS["orbit"]
+    found = precision_forced.scipy_shooting(region, 1e-9)
+    np.testing.assert_allclose(found, nonlinear_orbit(region.point)[0], rtol=0, atol=1e-9 * np.abs(found).max())
+    values = precision_attractors.REGIONS["attractor, both flanks"]
+    periods = precision_attractors.periods_to(values, 1e-6)
+    states = np.array([scipy_events(values, 0.0, 0.0, periods, 1e-7)])
+    assert precision_attractors.error_of("attractor, both flanks", states).error < 1e-5
+
+
+def test_exact_shapes_are_those_of_lapack():
+    gear = precision_planetary.TABLE_2 | {"planet_angle": (0.0, 1.9, 4.4)}
+    squares = extension_matrix(gear).T @ extension_matrix(gear)
+    assert precision_planetary.shape_error(gear, np.linalg.eigh(squares)[1].T).error < 1e-11
 
 
 def test_a_page_without_any_file_says_so(tmp_path):

@@ -20,7 +20,8 @@ from tests.oracles.cardan_reference import PERIOD, damping_and_stiffness, speed_
 _TOLERANCES = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14}
 
 
-def _geometry(p: Mapping[str, float]) -> dict[str, float]:
+def geometry(p: Mapping[str, float]) -> dict[str, float]:
+    """``p`` with the cosine and the squared sine of the joint angle, as the fields need it."""
     return {**p, "cos_beta": math.cos(p["beta"]), "sin2_beta": math.sin(p["beta"]) ** 2}
 
 
@@ -49,7 +50,7 @@ def linear_field(tau: float, y: np.ndarray, p: Mapping[str, float]) -> list[floa
 
 def linear_response(p: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
     """Periodic state at tau = 0 and amplitude (max |theta1|, max |theta2| over the period) of the linear system."""
-    point = _geometry(p)
+    point = geometry(p)
     r = _flow(linear_field, np.zeros(4), point)
     # The field is affine: differences from the response to the forcing alone are the monodromy matrix.
     z = np.stack([_flow(linear_field, column, point) - r for column in np.eye(4)], axis=1)
@@ -62,7 +63,7 @@ def nonlinear_orbit(p: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, flo
 
     Newton on the return map with its Jacobian by fourth-order differences (error of the multipliers about 1e-9).
     """
-    point = _geometry(p)
+    point = geometry(p)
     y = linear_response(p)[0]
     for _ in range(12):
         jacobian = _jacobian(y, point)

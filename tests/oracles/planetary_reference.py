@@ -92,17 +92,30 @@ def exact_frequencies(p: Mapping[str, Any], digits: int = 50) -> list[float]:
     from mpmath import mp
 
     with mp.workdps(digits):
-        lifted = {
-            name: [mp.mpf(entry) for entry in value] if np.ndim(value) else mp.mpf(value) for name, value in p.items()
-        }
-        mass, stiffness = matrices(lifted, mp)
-        size = len(mass)
-        scaled = mp.matrix(size, size)
-        for row in range(size):
-            for column in range(size):
-                scaled[row, column] = stiffness[row][column] / mp.sqrt(mass[row] * mass[column])
-        values = mp.eigsy(scaled, eigvals_only=True)
+        values = mp.eigsy(_scaled(p), eigvals_only=True)
         return [float(mp.sqrt(max(value, mp.mpf(0))) / (2 * mp.pi)) for value in values]
+
+
+def exact_shapes(p: Mapping[str, Any], digits: int = 50) -> np.ndarray:
+    """Orthonormal eigenvectors of ``M^(-1/2) K M^(-1/2)``, one a row, by rising frequency, rounded once at the end."""
+    from mpmath import mp
+
+    with mp.workdps(digits):
+        return np.array(mp.eigsy(_scaled(p))[1].T.tolist(), float)
+
+
+def _scaled(p: Mapping[str, Any]) -> Any:
+    """``M^(-1/2) K M^(-1/2)`` in the working precision of mpmath."""
+    from mpmath import mp
+
+    lifted = {
+        name: [mp.mpf(entry) for entry in value] if np.ndim(value) else mp.mpf(value) for name, value in p.items()
+    }
+    mass, stiffness = matrices(lifted, mp)
+    size = len(mass)
+    return mp.matrix(
+        [[stiffness[row][column] / mp.sqrt(mass[row] * mass[column]) for column in range(size)] for row in range(size)]
+    )
 
 
 def extension_matrix(p: Mapping[str, Any]) -> np.ndarray:
