@@ -217,7 +217,10 @@ def entry(system, name):
 
 
 @pytest.mark.parametrize(
-    "case", but_full(CASES, "cardan orbit", "cardan forced", "tripod history", "rattle steady_state")
+    "case",
+    but_full(
+        CASES, "cardan orbit", "cardan forced", "tripod history", "rattle steady_state", "bicardan critical_speeds"
+    ),
 )
 def test_derivatives_at_random_points(case):
     """Each entry within 1e-6 of the largest logarithmic derivative of its result."""

@@ -20,7 +20,7 @@ from drivetrain_jax.analysis.floquet.direct import assemble, compare
 from drivetrain_jax.analysis.floquet.propagator import EXPLICIT_ORDER, Radau, propagator
 from drivetrain_jax.systems import LinearPeriodic, get_system, system_names
 from tests.oracles.cardan_reference import monodromy, spectral_radius, stacked_monodromy
-from tests.sizes import full_after
+from tests.sizes import but_full, full_after
 
 RANGES = {"Omega": (0.05, 5), "zeta": (1e-4, 1), "alpha": (0.1, 20), "mu": (0.1, 20), "gamma": (0.1, 1e3)}
 
@@ -173,6 +173,7 @@ RADII = np.array([1.4146604913796845e-19, 1.2510611059620708e-06, 2.760897344063
 
 
 @pytest.mark.parametrize("rtol", full_after(1, [1e-9, 1e-10, 1e-13]))
+@pytest.mark.full
 def test_slow_modes_beside_fast_ones_keep_their_digits(direct, rtol):
     """In a search of the reduced form for the worst point, the first point had the largest ratio of error to bound, 13."""
     found = direct({name: np.array(values) for name, values in SLOW_BESIDE_FAST.items()}, rtol=rtol)
@@ -235,6 +236,7 @@ def test_multipliers_and_their_largest_modulus(sample):
         assert np.abs(computed - expected).max() <= 1e-9 * max(1, np.abs(multipliers[0])) ** 4
 
 
+@pytest.mark.full
 def test_sign_of_the_joint_angle_does_not_matter(direct):
     points = random_points(64, 17)
     found, mirrored = direct(points), direct(points | {"beta": -points["beta"]})
@@ -373,7 +375,7 @@ def test_only_what_is_asked_for_is_returned(method, outputs):
             )
 
 
-@pytest.mark.parametrize("solver", ["Tsit5", "Kvaerno5"])
+@pytest.mark.parametrize("solver", but_full(["Tsit5", "Kvaerno5"], "Kvaerno5"))
 def test_any_diffrax_solver_gives_the_same(direct, solver):
     batch = FloquetBatch("diffrax", outputs=("spectral_radius",), chunk=(2,), solver=solver)
     points = BASE | {"beta": np.array([0.5, 1.1]), "Omega": np.array([1.2, 0.6]), "zeta": np.array([0.001, 0.3])}
@@ -485,6 +487,7 @@ def test_point_beyond_every_scheme_has_an_outcome(extreme):
     assert point.verdict == 2
 
 
+@pytest.mark.full
 def test_strong_damping_where_only_the_speed_varies():
     """The matrices of the reversal do not depend on the speed, and are the same for all lanes."""
     fixed = {"beta": 0.5, "zeta": 1.0, "alpha": 1.0, "mu": 1.0, "gamma": 1.0}

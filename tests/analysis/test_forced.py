@@ -247,6 +247,7 @@ def test_lost_orbit_keeps_the_linear_response(point, monkeypatch):
     np.testing.assert_allclose(result["periodic_state"], expected, rtol=1e-9)
 
 
+@pytest.mark.full
 def test_batch_equals_loop(point):
     rng = np.random.default_rng(2)
     columns = {"beta": rng.uniform(-1.0, 1.0, 6), "Omega": rng.uniform(0.2, 2, 6), "zeta": np.full(6, 0.01)}

@@ -74,6 +74,7 @@ LIGHTLY_DAMPED = {
     ("lowest", "outcome"),
     [pytest.param(0.05, Outcome.TOLERANCE_NOT_MET, marks=pytest.mark.full), (0.1, Outcome.SUCCESS)],
 )
+@pytest.mark.full
 def test_where_the_line_begins_decides_no_fold_or_doubling(lowest, outcome):
     """Close pairs are not missed; of more than 16 the results are the highest."""
     scene = {"system": "rattle", "analysis": "frequency_response", "outputs": list(LIGHTLY_DAMPED)}

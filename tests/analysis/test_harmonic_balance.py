@@ -202,6 +202,7 @@ def test_any_number_of_samples(samples):
     np.testing.assert_allclose(ours["spectral_radius"], fine["spectral_radius"], rtol=1e-3)
 
 
+@pytest.mark.full
 def test_spectral_radius_is_over_the_period_of_the_motion():
     """The radius does not depend on the order of subharmonics: simple motions at .7 and .9, a doubled period at .45."""
     omegas = np.array([0.44, 0.45, 0.7, 0.9])

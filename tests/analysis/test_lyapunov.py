@@ -68,7 +68,7 @@ def known(name: str) -> dict:
     return {key: value[..., first : first + LANES] for key, value in batch("oscillators").items()}
 
 
-@pytest.mark.parametrize("name", but_full(LITERATURE, "roessler", "ueda", "two_wells"))
+@pytest.mark.parametrize("name", but_full(LITERATURE, "lorenz", "roessler", "ueda", "two_wells"))
 def test_literature_values_within_standard_errors(name):
     """Means over independent members agree within three standard errors; literature values are rounded to 4 digits."""
     spectrum = known(name)["lyapunov_spectrum"]
@@ -77,14 +77,14 @@ def test_literature_values_within_standard_errors(name):
     assert error.max() < LARGEST_ERROR[name]
 
 
-@pytest.mark.parametrize("name", but_full(LITERATURE, "roessler"))
+@pytest.mark.parametrize("name", but_full(LITERATURE, "lorenz", "roessler"))
 def test_block_error_is_no_smaller_than_the_scatter(name):
     """The error is never much smaller than the scatter, and larger if neighbouring blocks are anticorrelated."""
     scatter = known(name)["lyapunov_spectrum"].std(axis=1, ddof=1)
     assert (np.median(known(name)["lyapunov_standard_error"], axis=1) > 0.6 * scatter).all()
 
 
-@pytest.mark.parametrize("name", but_full(LITERATURE, "roessler"))
+@pytest.mark.parametrize("name", but_full(LITERATURE, "lorenz", "roessler"))
 def test_chaos_is_recognised(name):
     """Roessler's attractor turns almost uniformly: within 1024 strobes only the third component shows its chaos."""
     kinds, k01 = known(name)["verdict"], np.median(known(name)["chaos_k01"])
@@ -92,7 +92,7 @@ def test_chaos_is_recognised(name):
     assert k01 > 0.97
 
 
-@pytest.mark.parametrize("name", but_full(LITERATURE, "roessler", "ueda", "two_wells"))
+@pytest.mark.parametrize("name", but_full(LITERATURE, "lorenz", "roessler", "ueda", "two_wells"))
 def test_exponents_add_up_to_the_mean_divergence(name):
     assert np.abs(known(name)["sum_rule_residual"]).max() < 1e-6
 
@@ -235,6 +235,7 @@ def test_steps_that_are_given_are_taken():
         tripod(points, steps=0)
 
 
+@pytest.mark.full
 def test_decay_beyond_rounding_within_a_strobe_is_found():
     """The decay within a strobe is e^-63: vectors orthonormalised once per strobe would lose all digits."""
     ours = tripod({"excitation_frequency": [3066.5], "zeta": [10.0]}, OUTPUTS[:4], max_time=0.5, steps=192)
@@ -365,6 +366,7 @@ def test_limit_cycle_is_periodic():
     assert np.abs(ours["lyapunov_spectrum"][0]).max() < 1e-3
 
 
+@pytest.mark.full
 def test_a_slow_drift_in_a_plane_is_no_torus():
     """x'' = 0 and x'' = 1e-8 x: the time is too short to distinguish either exponent from zero."""
     stiffness = jnp.array([0.0, 1e-8])

@@ -113,6 +113,7 @@ INPUT_ELEMENT = {"element": "input", "equation": "25"}
         ),
     ],
 )
+@pytest.mark.full
 def test_errors_of_a_violent_start_are_told(fixed, start, discard):
     """The errors come from the first strobe or from discarded strobes; single strobes of the section are right to 1e-8."""
     fixed = fixed | {"beta": 0.157, "phi0": start[0], "velocity0": start[1]}

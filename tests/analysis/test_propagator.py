@@ -146,6 +146,7 @@ def test_constant_coefficients(n):
         np.testing.assert_allclose(full(found), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
+@pytest.mark.full
 def test_batch_and_structural_zeros():
     """Oscillators of many frequencies as lanes: lanes are independent, and zeros may be the integer 0."""
 

@@ -43,6 +43,7 @@ def meeting(beta, omega, mu, steps=13):
     return omega, value - slope**2 / (4 * bend)
 
 
+@pytest.mark.full
 def test_tips_over_the_stiffness_ratio_have_the_resonance_name(stiffnesses):
     """C+2 closes and opens again. Its ridge leaves the rectangle long before the least stiffness."""
     tips = naming.find_tips(stiffnesses, CARDAN, opening=False).tips

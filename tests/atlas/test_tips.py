@@ -354,6 +354,7 @@ def test_gradient_at_multipliers_equal_to_rounding(inside, exists):
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.full
 def test_no_gradient_of_a_radius_below_the_smallest_number():
     point = {**BASE, "zeta": 1.0, "gamma": 1.0, "beta": 0.3, "Omega": 0.001}
     assert radius_gradient(CARDAN, point) is None

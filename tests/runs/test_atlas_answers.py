@@ -332,6 +332,7 @@ def test_an_atlas_without_a_panel_answers_by_direct_solves(monkeypatch):
         {"beta": 0.4, "Omega": 1.2, "zeta": 1e-7},
     ],
 )
+@pytest.mark.full
 def test_gradients_at_extremes(point):
     """Gradients equal differences of direct solves, with steps small against the phase and the distance to pi/2."""
     point = {"alpha": 1.0, "mu": 1.0, "gamma": 100.0} | point

@@ -116,6 +116,7 @@ def wait_until(condition, seconds=60):
         time.sleep(0.05)
 
 
+@pytest.mark.full
 def test_processes_and_dask_give_the_same_bits_as_threads(drivetrain, tmp_path):
     distributed = pytest.importorskip("distributed")
     assert distributed.__version__

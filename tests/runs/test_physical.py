@@ -59,6 +59,7 @@ def test_an_axis_keeps_the_unit_in_which_it_is_given():
     assert axis.values == pytest.approx(np.array([10, 30, 50]) * 2 * math.pi * math.sqrt(2 / 6e4), rel=1e-14)
 
 
+@pytest.mark.full
 def test_one_quantity_may_change_several_parameters():
     scene = cardan("forced", axes={"J1": [1.0, 2.0]}, fixed=TRUCK | {"angle": 12, "speed": 1000}, outputs=["amplitude"])
     del scene["fixed"]["J1"]
