@@ -7,7 +7,6 @@ Other packages add systems through the entry point group ``drivetrain_jax.system
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._plugins import SYSTEMS, load_plugin, plugin_names
 from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
@@ -15,14 +14,12 @@ from drivetrain_jax.resonances import Family, Resonances
 from drivetrain_jax.systems._base import Model, System, parameter, serves
 from drivetrain_jax.systems._flow import Flow
 from drivetrain_jax.systems._modal import Block, DrivenSprings, SpringSystem
+from drivetrain_jax.systems._periodic import FloquetModel, ForcedModel, LinearPeriodic
 from drivetrain_jax.systems._physical import Conversion, PhysicalData
 from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator, UnderdampedOscillator
 from drivetrain_jax.systems._rows import dense
 from drivetrain_jax.systems._shaft import Shaft
 from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness
-
-if TYPE_CHECKING:
-    from drivetrain_jax.systems._periodic import FloquetModel, ForcedModel, LinearPeriodic
 
 _BUILT_IN = {
     "cardan": "Cardan",
@@ -62,13 +59,6 @@ __all__ = [
     "serves",
     "system_names",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    # Imported on first use: the module imports diffrax, which takes as long as jax and which readers of results do not need.
-    if name in ("FloquetModel", "ForcedModel", "LinearPeriodic"):
-        return getattr(import_module("drivetrain_jax.systems._periodic"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def system_names() -> tuple[str, ...]:

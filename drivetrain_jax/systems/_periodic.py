@@ -6,7 +6,6 @@ from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.core
@@ -53,8 +52,8 @@ class _Piece(eqx.Module):
         return tuple(tuple(0 if _vanishes(entry) else self.length * entry for entry in row) for row in rows)
 
 
-class LinearPeriodic(diffrax.AbstractTerm):
-    """The linear system ``x' = A(t) x`` over one interval ``[0, span]`` of its clock ``t``: a term for any diffrax solver.
+class LinearPeriodic(eqx.Module):
+    """The linear system ``x' = A(t) x`` over one interval ``[0, span]`` of its clock ``t``.
 
     ``basis(t)`` returns the functions of the clock alone, which all points of a batch share. ``rows(*basis(t))`` is the
     matrix as nested tuples; an entry that vanishes identically is the integer ``0``. Without ``reversor`` the interval is
@@ -64,7 +63,8 @@ class LinearPeriodic(diffrax.AbstractTerm):
     logarithm of the determinant of the monodromy matrix (Liouville's formula), if known. ``breakpoints`` are the instants,
     rising within the span, at which the matrix jumps or has a kink: steps of integrations end there.
 
-    The term is a pytree if its functions are pytrees, such as the bound methods of an Equinox module.
+    The system is a pytree if its functions are pytrees, such as the bound methods of an Equinox module. Its term for any
+    solver of diffrax is ``diffrax.ODETerm(system.vf)``.
     """
 
     rows: Callable[..., Rows]
@@ -140,15 +140,6 @@ class LinearPeriodic(diffrax.AbstractTerm):
         # Written as sums: under vmap small matrix products are slower.
         rows = self.rows(*self.basis(t))
         return jnp.stack([sum(a * y[j] for j, a in enumerate(row) if not _vanishes(a)) + 0 * y[0] for row in rows])
-
-    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
-        """The time between ``t0`` and ``t1``."""
-        del kwargs
-        return t1 - t0
-
-    def prod(self, vf: Any, control: Any) -> Any:
-        """``vf`` times the time."""
-        return vf * control
 
 
 class FloquetModel(eqx.Module):

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,13 +23,11 @@ from jax.tree_util import Partial
 from drivetrain_jax._quantities import Component, Dimension
 from drivetrain_jax.resonances.cardan import RESONANCES
 from drivetrain_jax.systems._base import Number, System, numeric, parameter, serves
+from drivetrain_jax.systems._periodic import SWAP, FloquetModel, ForcedModel, LinearPeriodic
 from drivetrain_jax.systems._rows import Rows
 from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness
 from drivetrain_jax.systems.cardan_clock import clock, clock_basis, decay_steps, oscillation_steps
 from drivetrain_jax.systems.cardan_units import PHYSICAL
-
-if TYPE_CHECKING:
-    from drivetrain_jax.systems._periodic import FloquetModel, ForcedModel
 
 OPEN = {"open_lower": True, "open_upper": True}
 POSITIVE = {"lower": 0.0, "open_lower": True}
@@ -270,7 +268,6 @@ class Cardan(System):
     @serves("floquet")
     def floquet_model(self) -> FloquetModel:
         """The linearised shaft in its own coordinates and time, and two equivalent forms over half a period."""
-        from drivetrain_jax.systems._periodic import SWAP, FloquetModel, LinearPeriodic
 
         def own(method: Callable[..., Any]) -> Partial:
             # A tenth of the time of a bound method of a module.
@@ -292,6 +289,4 @@ class Cardan(System):
     @serves("forced")
     def forced_model(self) -> ForcedModel:
         """The nonlinear shaft, and its linearisation with the forcing (0, -eta')."""
-        from drivetrain_jax.systems._periodic import ForcedModel
-
         return ForcedModel(self.vector_field, self.linear_field, math.pi, displacements=(0, 1))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from jax import Array
 from drivetrain_jax._quantities import Component
 from drivetrain_jax.systems._base import Number, System, Values, parameter, serves
 from drivetrain_jax.systems._flow import Components, Flow
+from drivetrain_jax.systems._periodic import FloquetModel, LinearPeriodic
 from drivetrain_jax.systems._rows import Rows
 from drivetrain_jax.systems._tripod_element import (
     RESULTS,
@@ -45,9 +46,6 @@ from drivetrain_jax.systems._tripod_parameters import (
     positive,
 )
 from drivetrain_jax.systems.trigonometry import cos, sin
-
-if TYPE_CHECKING:
-    from drivetrain_jax.systems._periodic import FloquetModel
 
 
 def _octaves(cosine: Any, count: int) -> list[Any]:
@@ -190,8 +188,6 @@ def floquet_model(values: Values) -> FloquetModel:
     """
     element = element_of(values)
     omega, frequency = element.frequency, excitation_frequency(values, element)
-
-    from drivetrain_jax.systems._periodic import FloquetModel, LinearPeriodic
 
     natural = _Parametric(element, values["zeta"], omega, frequency)
     reduced = _Parametric(element, values["zeta"], omega / (2 * math.pi * frequency), frequency)

@@ -16,7 +16,7 @@ from jax import Array
 from drivetrain_jax.analysis._base import Outcome, Request, Solver
 from drivetrain_jax.analysis.floquet.direct import compare, direct_monodromy, stable_steps, stiffness_of
 from drivetrain_jax.analysis.floquet.effort import explicit_effort, traced_steps
-from drivetrain_jax.analysis.floquet.propagator import EqualStepSize, Propagator
+from drivetrain_jax.analysis.floquet.propagator import EqualStepSize, LinearTerm, Propagator
 from drivetrain_jax.analysis.floquet.results import NEED_ERROR, results
 from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last, over_lanes
 from drivetrain_jax.systems import LinearPeriodic, System
@@ -150,7 +150,7 @@ def diffrax_propagator(
     matrix, success = jnp.eye(form.size), jnp.bool_(True)
     for part in form.parts:
         solution = diffrax.diffeqsolve(
-            part,
+            LinearTerm(part),
             solver,
             t0=0.0,
             t1=part.span,

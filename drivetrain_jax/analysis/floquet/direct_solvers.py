@@ -108,7 +108,7 @@ def _solve(
     effort: Array,
     explicit: bool,
 ) -> dict[str, Array]:
-    # diffrax takes as long to import as jax, and readers of results do not need it.
+    # Local import: diffrax takes as long as jax, and only tracing needs it.
     from drivetrain_jax.analysis.floquet.propagator import PIECES, Order8, Radau, propagator
 
     scheme = Order8 if explicit else Radau

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.analysis.floquet.propagator import radau_iia
 from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, suits_one_kernel
+from drivetrain_jax.analysis.numerics.radau import radau_iia
 from drivetrain_jax.systems import LinearPeriodic
 
 # Nodes of a part and powers of x: both have about the same truncation error.

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
@@ -25,6 +25,7 @@ from drivetrain_jax.analysis.numerics import dop853
 from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, stored, suits_one_kernel
 from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last
 from drivetrain_jax.analysis.numerics.linear_algebra import matmul, solve
+from drivetrain_jax.analysis.numerics.radau import radau_iia
 from drivetrain_jax.analysis.numerics.staged import staged
 from drivetrain_jax.systems import LinearPeriodic
 
@@ -67,6 +68,25 @@ class _Record(NamedTuple):
     covariance: Array
 
 
+class LinearTerm(diffrax.AbstractTerm):
+    """A linear periodic system as a term of diffrax."""
+
+    system: LinearPeriodic
+
+    def vf(self, t: Any, y: Any, args: Any) -> Array:
+        """``A(t) y``."""
+        return self.system.vf(t, y, args)
+
+    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
+        """The time between ``t0`` and ``t1``."""
+        del kwargs
+        return t1 - t0
+
+    def prod(self, vf: Any, control: Any) -> Any:
+        """``vf`` times the time."""
+        return vf * control
+
+
 class EqualSteps(diffrax.AbstractSolver):
     """A solver of linear periodic terms: each step of diffrax is ``count`` equal steps of its scheme.
 
@@ -76,40 +96,40 @@ class EqualSteps(diffrax.AbstractSolver):
 
     count: Any
     ORDER: ClassVar[int]
-    term_structure: ClassVar = LinearPeriodic
+    term_structure: ClassVar = LinearTerm
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
-    def order(self, terms: LinearPeriodic) -> int:
+    def order(self, terms: LinearTerm) -> int:
         """Order of the errors, for stiff problems too."""
         return self.ORDER
 
-    def init(self, terms: LinearPeriodic, t0: Any, t1: Any, y0: Array, args: Any) -> _Record:
+    def init(self, terms: LinearTerm, t0: Any, t1: Any, y0: Array, args: Any) -> _Record:
         """The record at the start: no scaling and no errors."""
         return _Record(jnp.zeros(()), jnp.zeros((len(y0), len(y0))))
 
-    def func(self, terms: LinearPeriodic, t0: Any, y0: Array, args: Any) -> Array:
+    def func(self, terms: LinearTerm, t0: Any, y0: Array, args: Any) -> Array:
         """``A(t) y``."""
         return terms.vf(t0, y0, args)
 
     def step(
-        self, terms: LinearPeriodic, t0: Any, t1: Any, y0: Array, args: Any, solver_state: _Record, made_jump: Any
+        self, terms: LinearTerm, t0: Any, t1: Any, y0: Array, args: Any, solver_state: _Record, made_jump: Any
     ) -> tuple[Array, None, dict[str, Array], _Record, diffrax.RESULTS]:
         """The state at t1."""
         del args, made_jump
-        term, forwards = _unwrapped(terms)
-        given = (*self.piece(term, forwards * t0, forwards * t1), y0.reshape(len(y0), -1), solver_state)
+        system, forwards = _unwrapped(terms)
+        given = (*self.piece(system, forwards * t0, forwards * t1), y0.reshape(len(y0), -1), solver_state)
         y1, record = lanes_last(_onward, _NOTHING, given, ())
         y1 = y1.reshape(y0.shape)
         return y1, None, {"y0": y0, "y1": y1}, record, diffrax.RESULTS.successful
 
     @abc.abstractmethod
-    def piece(self, terms: LinearPeriodic, t0: Any, t1: Any) -> tuple[Array, Array]:
+    def piece(self, system: LinearPeriodic, t0: Any, t1: Any) -> tuple[Array, Array]:
         """The propagator from t0 to t1 as a matrix ``(n, n)`` and the logarithm of its factor."""
 
 
 def _unwrapped(terms: Any) -> tuple[LinearPeriodic, Any]:
-    """The term that diffrax has wrapped, and 1, or -1 if it solves backwards."""
-    return (terms, 1) if isinstance(terms, LinearPeriodic) else (terms.term, terms.direction)
+    """The system of a term that diffrax may have wrapped, and 1, or -1 if it solves backwards."""
+    return (terms.system, 1) if isinstance(terms, LinearTerm) else (terms.term.system, terms.direction)
 
 
 class Order8(EqualSteps):
@@ -117,14 +137,14 @@ class Order8(EqualSteps):
 
     ORDER: ClassVar = EXPLICIT_ORDER
 
-    def piece(self, terms: LinearPeriodic, t0: Any, t1: Any) -> tuple[Array, Array]:
+    def piece(self, system: LinearPeriodic, t0: Any, t1: Any) -> tuple[Array, Array]:
         """See :class:`EqualSteps`."""
-        # The other fields of the term are not used.
-        arrays, rest = eqx.partition(LinearPeriodic(terms.rows, 0.0, terms.basis), eqx.is_array)
+        # The other fields of the system are not used.
+        arrays, rest = eqx.partition(LinearPeriodic(system.rows, 0.0, system.basis), eqx.is_array)
         shared = jnp.asarray(t0, float), jnp.asarray(t1, float), self.count
-        if not jax.tree.leaves(arrays) or not terms.is_pytree:
+        if not jax.tree.leaves(arrays) or not system.is_pytree:
             # No arrays to batch, or a function that may depend on unknown arrays.
-            matrix, log_scale = _march(terms, *shared)
+            matrix, log_scale = _march(system, *shared)
             return matrix[..., 0], log_scale[0]
         return lanes_last(_block, Constants(rest), arrays, shared, LANES)
 
@@ -138,15 +158,15 @@ class Radau(EqualSteps):
 
     ORDER: ClassVar = IMPLICIT_ORDER
 
-    def piece(self, terms: LinearPeriodic, t0: Any, t1: Any) -> tuple[Array, Array]:
+    def piece(self, system: LinearPeriodic, t0: Any, t1: Any) -> tuple[Array, Array]:
         """See :class:`EqualSteps`. The product is rescaled after each panel, so that strong damping does not underflow.
 
         The stage values solve ``Y_i - h sum_j a_ij A(t_j) Y_j = I``; the last one is the panel's propagator.
         """
         a, c = radau_iia(STAGES)
-        h, n = (t1 - t0) / self.count, terms.size
+        h, n = (t1 - t0) / self.count, system.size
         right = jnp.tile(jnp.eye(n), (STAGES, 1))
-        at_nodes = jax.vmap(terms.matrix)
+        at_nodes = jax.vmap(system.matrix)
 
         def body(step: Array, carry: tuple) -> tuple:
             product, log_scale = carry
@@ -185,7 +205,7 @@ def through(parts: Sequence[LinearPeriodic], steps: Array, pieces: Array | int, 
     matrix, record = jnp.eye(parts[0].size), None
     for part in parts:
         end = diffrax.diffeqsolve(
-            part,
+            LinearTerm(part),
             solver(steps // pieces),
             t0=0.0,
             t1=part.span,
@@ -282,26 +302,3 @@ def _advanced(y: Rows, h: Array, weights: Any, slopes: list[Rows]) -> Rows:
         return [x + h * sum(w * k[i] for (w, _), k in zip(terms, used, strict=True)) for i, x in enumerate(y)]
 
     return stored(moved)(y, h, *(slope for _, slope in terms))
-
-
-@lru_cache
-def radau_iia(stages: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients ``(A, c)`` of the Radau IIA collocation scheme of order ``2 stages - 1``.
-
-    The nodes are the zeros of P_s - P_(s-1) shifted to [0, 1]; A[i, j] = int_0^c_i l_j, by Gauss quadrature of the
-    Lagrange polynomials in product form (Hairer & Wanner, Solving ODEs II, IV.5).
-    """
-    basis = np.polynomial.legendre.Legendre.basis
-    polynomial = basis(stages) - basis(stages - 1)
-    x = np.sort(polynomial.roots().real)
-    for _ in range(3):
-        x = x - polynomial(x) / polynomial.deriv()(x)
-    c = (x + 1) / 2
-    c[-1] = 1.0
-    nodes, weights = np.polynomial.legendre.leggauss(stages)
-    points = c[:, None] * (nodes + 1) / 2
-    lagrange = np.ones((stages, *points.shape))
-    for j in range(stages):
-        for k in set(range(stages)) - {j}:
-            lagrange[j] *= (points - c[k]) / (c[j] - c[k])
-    return np.einsum("jiq,q->ij", lagrange, weights / 2) * c[:, None], c
