@@ -20,7 +20,7 @@ from drivetrain_jax.analysis.numerics.kernels import compiler_options, on_cpu, o
 from drivetrain_jax.runs.identity import program_identity
 from drivetrain_jax.runs.plan import Plan
 from drivetrain_jax.runs.point_grid import Grid
-from drivetrain_jax.runs.programs import lowered
+from drivetrain_jax.runs.programs import calls, compiled
 from drivetrain_jax.runs.scene import Problem, result_variables
 from drivetrain_jax.systems import System
 
@@ -98,16 +98,15 @@ def compile_kernel(
 ) -> Kernel:
     """Compile ``solver`` for chunks of ``chunk`` points of ``grid``; without optimisation for ``few`` points.
 
-    For ``identity`` see :func:`~drivetrain_jax.runs.programs.lowered`.
+    For ``identity`` see :func:`~drivetrain_jax.runs.programs.compiled`.
 
     Varying parameters, the ``numbers`` of the grid and the effort are arguments of the compiled code. Other fixed
     parameters, the values along a path and options are constants of it.
     """
     batch, kinds = _batch(solver, grid, chunk, variables)
-    program = lowered(batch, kinds, identity)
     options = compiler_options(chunk, march=solver.march, short_loops=solver.short_loops)
-    compiled = program.compile(options_for_few() if few else options)
-    return Kernel(compiled, chunk, tuple(variables), _turn(compiled))
+    function = compiled(batch, kinds, options_for_few() if few else options, identity)
+    return Kernel(function, chunk, tuple(variables), _turn(function))
 
 
 def for_device(solver: Solver) -> Solver:
@@ -164,10 +163,10 @@ def _compiled(key: _Key, size: int, few: bool) -> Kernel:
     return compile_kernel(key.solver, key.grid, size, key.variables, few, identity)
 
 
-def _turn(compiled: Any) -> AbstractContextManager[object]:
+def _turn(kernel: jax.stages.Compiled) -> AbstractContextManager[object]:
     """The lock that a call needs.
 
     LAPACK calls of XLA wait for their own thread pool, so two such kernels can block each other forever (seen with jax
     0.10.2 on two cores).
     """
-    return _LAPACK if 'custom_call_target="lapack_' in compiled.as_text() else nullcontext()
+    return _LAPACK if calls(kernel, "lapack_") else nullcontext()

@@ -1,62 +1,82 @@
-"""Programs of kernels on disk, so that a later process traces nothing: it only compiles, or finds the compiled code."""
+"""Compiled kernels on disk: later processes neither trace nor compile."""
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable
+import pickle
+import secrets
+import zlib
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import jax
-from jax import export
+import jax.numpy as jnp
+from jax.experimental import serialize_executable
 
 from drivetrain_jax.runs import compile_cache
 from drivetrain_jax.store.files import write_atomic
+from drivetrain_jax.store.provenance import digest
 
-# Number of programs that are kept; one takes some 200 kB.
+# Number of kernels that are kept; one takes some 300 kB.
 _MOST = 256
 _DIGEST = 16
 
 
-def lowered(function: Callable[..., Any], kinds: tuple[Any, ...], identity: str) -> jax.stages.Lowered:
-    """``function`` lowered for arguments of these ``kinds``.
+def compiled(
+    function: Callable[..., Any], kinds: tuple[Any, ...], options: Mapping[str, Any], identity: str
+) -> jax.stages.Compiled:
+    """``function`` compiled with ``options`` of the compiler for arguments of these ``kinds``.
 
-    ``identity`` is a digest of everything that the program depends on; an empty one keeps nothing on disk.
+    ``identity`` is a digest of everything else that the kernel depends on; an empty one keeps nothing on disk.
     """
     folder = compile_cache.programs() if identity else None
-    if folder is None:
-        return jax.jit(function).lower(*kinds)
-    path = folder / identity
-    program = _read(path)
-    if program is None:
-        try:
-            program = export.export(jax.jit(function))(*kinds)
-            _write(path, bytes(program.serialize()))
-        except (NotImplementedError, ValueError):
-            # A call of Python code, or of a library whose interface may change, cannot be stored. An error of the function
-            # itself is raised again here.
-            return jax.jit(function).lower(*kinds)
-    return jax.jit(program.call).lower(*kinds)
+    path = folder / digest([identity, dict(options)]) if folder else None
+    if path is None:
+        return jax.jit(function).lower(*kinds).compile(dict(options))
+    found = _read(path)
+    if found is None:
+        # A new name, which JAX's own cache cannot know: what it returns cannot be stored again (jax 0.10.2).
+        named = lambda *arguments: function(*arguments)  # noqa: E731
+        named.__name__ = f"kernel_{secrets.token_hex(8)}"
+        found = jax.jit(named).lower(*kinds).compile(dict(options))
+        _write(path, found)
+    return found
 
 
-def _read(path: Path) -> export.Exported | None:
-    """The program at ``path``; None if there is none, or if it is damaged."""
-    with suppress(OSError, ValueError, TypeError):
+def calls(kernel: jax.stages.Compiled, target: str) -> bool:
+    """True if ``kernel`` calls a library function whose name begins with ``target``."""
+    return f'custom_call_target="{target}' in (kernel.as_text() or "")
+
+
+def _read(path: Path) -> jax.stages.Compiled | None:
+    """The kernel at ``path``; None if there is none, or if it is damaged."""
+    with suppress(OSError, ValueError, TypeError, zlib.error, pickle.UnpicklingError, jax.errors.JaxRuntimeError):
         data = path.read_bytes()
         if hashlib.blake2b(data[_DIGEST:], digest_size=_DIGEST).digest() == data[:_DIGEST]:
             path.touch()
-            return export.deserialize(bytearray(data[_DIGEST:]))
+            has_lapack, *content = pickle.loads(zlib.decompress(data[_DIGEST:]))
+            if has_lapack:
+                # JAX loads LAPACK, which takes a quarter of a second, when it lowers the first call.
+                jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), float))
+            return serialize_executable.deserialize_and_load(*content, execution_devices=jax.devices()[:1])
     return None
 
 
-def _write(path: Path, data: bytes) -> None:
-    """Store a program, and delete those that have not been used for the longest time. A full disk is no error."""
-    with suppress(OSError):
+def _write(path: Path, kernel: jax.stages.Compiled) -> None:
+    """Store a kernel, and delete those that have not been used for the longest time. A full disk is no error."""
+    if calls(kernel, "xla_ffi_python") or calls(kernel, "xla_python"):
+        # A call of Python code cannot be stored.
+        return
+    # A backend may be unable to store its kernels.
+    with suppress(OSError, ValueError, NotImplementedError, jax.errors.JaxRuntimeError):
         path.parent.mkdir(mode=0o700, exist_ok=True)
-        content = hashlib.blake2b(data, digest_size=_DIGEST).digest() + data
-        write_atomic(path, content, path.with_name(f"{path.name}.{os.getpid()}.tmp"))
+        content = pickle.dumps((calls(kernel, "lapack_"), *serialize_executable.serialize(kernel)))
+        data = zlib.compress(content, 1)
+        data = hashlib.blake2b(data, digest_size=_DIGEST).digest() + data
+        write_atomic(path, data, path.with_name(f"{path.name}.{os.getpid()}.tmp"))
         programs = sorted(path.parent.iterdir(), key=lambda file: file.stat().st_mtime)
         for file in programs[:-_MOST]:
             file.unlink(missing_ok=True)

@@ -18,7 +18,7 @@ from drivetrain_jax.atlas.windows import Crossing
 from drivetrain_jax.runs.atlas_question import AtlasQuery
 from drivetrain_jax.runs.identity import program_identity
 from drivetrain_jax.runs.physical import GivenData, described
-from drivetrain_jax.runs.programs import lowered
+from drivetrain_jax.runs.programs import compiled
 from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.systems import System
 
@@ -176,4 +176,4 @@ def _compiled_gradient(system: type[System], names: tuple[str, ...]) -> Callable
 
     kinds = ({name: np.float64(0.0) for name in names},)
     identity = program_identity(system, analysis, "gradient") if find_system(system.name) is system else ""
-    return lowered(slopes, kinds, identity).compile(options_for_few())
+    return compiled(slopes, kinds, options_for_few(), identity)
