@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-from scipy.fft import dctn
 
 from drivetrain_jax.atlas.panels import chebyshev
 
@@ -42,6 +41,8 @@ def coefficients(values: np.ndarray, degrees: Sequence[int]) -> np.ndarray:
     """Coefficients ``(n_1, ..., n_d, m)`` from the values at ``tensor_nodes(degrees)``, ``(prod(degrees), m)``."""
     axes = tuple(range(len(degrees)))
     # Matrix products are faster, but their rounding keeps tails from falling: up to five times the solves at 1e-11.
+    from scipy.fft import dctn  # Local import: a quarter of a second that readers of an atlas do not need.
+
     tensor = dctn(values.reshape(*degrees, -1), axes=axes) / np.prod(degrees)  # pyright: ignore[reportOperatorIssue]
     for axis in axes:
         first = [slice(None)] * tensor.ndim

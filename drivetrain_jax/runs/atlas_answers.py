@@ -63,8 +63,8 @@ def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None)
     """
     asked = AtlasQuery.of(atlas, given, ranges=())
     point = asked.values
-    found = atlas(**point)
-    results = {str(name): v.values[()] for name, v in found.data_vars.items()}
+    columns = {name: np.array([value]) for name, value in point.items()}
+    results = {name: values[0] for name, values in atlas.arrays(columns, zipped=True).items()}
     variables = {v.name: v for v in (*atlas.scene.analysis.variables, OUTCOME)}
     rows = _result_rows(atlas, results, variables)
     slopes = radius_gradient(atlas.scene.system, {**atlas.fixed, **point})

@@ -29,7 +29,7 @@ from drivetrain_jax.runs.scene import Scene, restore_scene
 from drivetrain_jax.runs.through_atlas import evaluate
 from drivetrain_jax.runs.work import Progress, Work
 from drivetrain_jax.store import checksums
-from drivetrain_jax.store.consolidate import open_result
+from drivetrain_jax.store.consolidate import open_result, read_plain
 from drivetrain_jax.store.schema import Entry, Labelled
 
 if TYPE_CHECKING:
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 
     from drivetrain_jax.explore import Page
 
-# Variables of the file: name, dimensions, meaning. Boxes are in the coordinates named by the attribute.
 # Relative error of forced amplitudes, which are compared with a limit.
 _AMPLITUDE = 1e-6
+# Variables of the file: name, dimensions, meaning. Boxes are in the coordinates named by the attribute.
 _VARIABLES = {
     "lower": (("parameter",), "lower end of the domain, in the parameter's unit"),
     "upper": (("parameter",), "upper end of the domain, in the parameter's unit"),
@@ -95,47 +95,54 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
     0
     """
     compile_cache.enable()
-    dataset = open_result(Path(source)) if isinstance(source, (str, Path)) else source
-    label = "dataset" if dataset is source else f"file = {str(source)!r}"
-    if dataset.attrs.get("analysis") != ANALYSIS.name:
-        raise InputError(f"{label}: holds the analysis {dataset.attrs.get('analysis')!r}; allowed is an atlas")
-    # The bounds hold only for the panels as written, and damaged values look like any others.
-    if isinstance(source, (str, Path)) and (changed := checksums.damaged(Path(source))):
-        raise InputError(
-            f"{label}: damaged ({checksums.named(changed)}); allowed is to restore it or to run its scene again"
-        )
-    if missing := _missing(dataset):
+    label = f"file = {str(source)!r}" if isinstance(source, (str, Path)) else "dataset"
+    arrays, attrs = _content(source, label)
+    if missing := _missing(arrays, attrs):
         raise InputError(f"{label}: lacks {missing[0]}; allowed is the whole result of a scene of an atlas")
-    scene = restore_scene(dataset.attrs["scene"])
-    names = tuple(str(name) for name in dataset["parameter"].values)
-    ranges = dict(zip(names, zip(dataset["lower"].values, dataset["upper"].values, strict=True), strict=True))
+    scene = restore_scene(attrs["scene"])
+    names, ends = tuple(map(str, arrays["parameter"])), zip(arrays["lower"], arrays["upper"], strict=True)
+    ranges = dict(zip(names, ends, strict=True))
     domain = floquet_domain(scene.system, ranges, scene.fixed)
-    if [c.name for c in domain.coordinates] != json.loads(dataset.attrs["coordinates_of_panels"]):
+    if [c.name for c in domain.coordinates] != json.loads(attrs["coordinates_of_panels"]):
         raise InputError(f"{label}: made by another version of {scene.system.name}; allowed is to run its scene again")
-    d, arrays = len(names), {name: dataset[name].values for name in _VARIABLES if name in dataset}
-    if "gap_lower" in dataset:
-        arrays["gap_reason"] = dataset["gap_reason"].values
-    blank = {name: np.empty((0, d)) for name in ("panel_lower", "panel_upper", "gap_lower", "gap_upper")}
-    blank |= {"panel_degrees": np.empty((0, d), int), "gap_reason": np.empty(0), "kept": np.empty(0, np.uint8)}
+    blank = {name: np.empty((0, len(names))) for name in ("panel_lower", "panel_upper", "gap_lower", "gap_upper")}
+    blank |= {"panel_degrees": np.empty((0, len(names)), int), "gap_reason": np.empty(0), "kept": np.empty(0, np.uint8)}
     arrays = blank | {"coefficients": np.empty((0, 0))} | arrays
     used = {name: scene.fixed[name] for name in scene.system.models["atlas"].parameters if name in scene.fixed}
-    tolerance, solves = dataset.attrs["tolerance"], dataset.attrs["solves"]
-    atlas = from_arrays(arrays, names, domain.coordinates, used, tolerance, solves)
+    atlas = from_arrays(arrays, names, domain.coordinates, used, attrs["tolerance"], attrs["solves"])
     return StoredAtlas(scene, stability_atlas(atlas, scene.system, scene.request.options["rtol"]))
 
 
-def _missing(dataset: xr.Dataset) -> list[str]:
-    """Names of the variables of :func:`to_labelled` that ``dataset`` lacks."""
-    gaps = any(name in dataset for name in _GAPS)
-    panels = not gaps or any(name in dataset for name in _PANELS)
-    needed = (*_DOMAIN, *(_PANELS if panels else ()), *(_GAPS if gaps else ()))
-    missing = [name for name in needed if name not in dataset]
-    missing += [name for name in _ATTRIBUTES if name not in dataset.attrs]
+def _content(source: str | Path | xr.Dataset, label: str) -> tuple[dict[str, np.ndarray], Mapping[str, Any]]:
+    """Variables and attributes of an atlas; :class:`InputError` for another result, or for a damaged file."""
+    path = Path(source).expanduser() if isinstance(source, (str, Path)) else None
+    changed = checksums.damaged(path) if path and path.exists() else None
+    if path and changed == []:
+        arrays, attrs = read_plain(path)
+    else:
+        dataset: xr.Dataset = open_result(path) if path else source  # pyright: ignore[reportAssignmentType]
+        attrs = dataset.attrs
+        arrays = {n: dataset[n].values for n in (*_VARIABLES, "parameter", "gap_reason") if n in dataset}
+    if attrs.get("analysis") != ANALYSIS.name:
+        raise InputError(f"{label}: holds the analysis {attrs.get('analysis')!r}; allowed is an atlas")
+    # The bounds hold only for the panels as written.
+    if changed:
+        raise InputError(f"{label}: damaged ({checksums.named(changed)}); allowed is to restore it or to run it again")
+    return arrays, attrs
+
+
+def _missing(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any]) -> list[str]:
+    """Names of the variables and attributes of :func:`to_labelled` that are missing."""
+    gaps = any(name in arrays for name in _GAPS)
+    panels = not gaps or any(name in arrays for name in _PANELS)
+    needed = ("parameter", *_DOMAIN, *(_PANELS if panels else ()), *(_GAPS if gaps else ()))
+    missing = [name for name in needed if name not in arrays]
+    missing += [name for name in _ATTRIBUTES if name not in attrs]
     if missing or not panels:
         return missing
-    bits = np.unpackbits(np.asarray(dataset["kept"].values, np.uint8))
-    missing += ["some of kept"] if bits.size < dataset["panel_degrees"].prod("parameter").sum() else []
-    missing += ["some of coefficients"] if dataset.sizes["coefficient"] != bits.sum() else []
+    bits = np.unpackbits(np.asarray(arrays["kept"], np.uint8))
+    missing += ["some of kept"] if bits.size < arrays["panel_degrees"].prod(axis=-1).sum() else []
+    missing += ["some of coefficients"] if len(arrays["coefficients"]) != bits.sum() else []
     return missing
 
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import h5py
 import numpy as np
@@ -138,6 +138,25 @@ def map_variable(path: Path, name: str) -> np.ndarray:
         if plain and (offset := variable.id.get_offset()) is not None and variable.size:
             return np.memmap(path, variable.dtype, "r", offset, variable.shape)
     return read_variable(path, name)
+
+
+def read_plain(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """All variables and global attributes of the result at ``path`` as this package wrote them, without xarray.
+
+    Raises :class:`InputError` if the file is not readable.
+    """
+    with gate.opened(path) as file:
+        variables = {name: each for name, each in file.items() if isinstance(each, h5py.Dataset)}
+        strings = {name for name, each in variables.items() if h5py.check_string_dtype(each.dtype)}
+        arrays = {n: np.asarray((each.asstr() if n in strings else each)[()]) for n, each in variables.items()}
+        return arrays, {name: _plain(value) for name, value in file.attrs.items()}
+
+
+def _plain(value: Any) -> Any:
+    """An attribute as text or number; netCDF stores a number as an array of one."""
+    if isinstance(value, bytes):
+        return value.decode()
+    return value[0] if np.shape(value) == (1,) else value
 
 
 def open_result(path: Path) -> xr.Dataset:
