@@ -16,6 +16,7 @@ import xarray as xr
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter
 from drivetrain_jax._units import factor
+from drivetrain_jax.atlas import to_arrays
 from drivetrain_jax.atlas.boundaries import boundaries
 from drivetrain_jax.atlas.criteria import has_boundaries
 from drivetrain_jax.atlas.panels import Atlas
@@ -24,7 +25,11 @@ from drivetrain_jax.atlas.windows import narrow
 from drivetrain_jax.runs.atlas_file import StoredAtlas, open_atlas
 from drivetrain_jax.runs.atlas_values import as_given
 from drivetrain_jax.runs.axes import in_unit
+from drivetrain_jax.runs.identity import program_identity
 from drivetrain_jax.runs.physical import in_parameters
+from drivetrain_jax.runs.programs import remembered
+from drivetrain_jax.runs.scene import find_system
+from drivetrain_jax.store.provenance import source_digest
 from drivetrain_jax.systems import System
 
 Convert = Callable[[Any], Any]
@@ -57,7 +62,7 @@ def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, flo
     }
     dataset = atlas.grid(**axes, **fixed)
     if len(shown) == 2 and has_boundaries(atlas.stability.atlas, atlas.scene.system):
-        dataset = dataset.assign_coords(_curves(atlas, fixed, {n: ranges[n] for n in shown}))
+        dataset = dataset.assign_coords(_stored_curves(atlas, fixed, {n: ranges[n] for n in shown}))
     for name, (quantity, convert) in views.items():
         dataset = in_physical_units(dataset, name, quantity, convert)
     return dataset
@@ -116,6 +121,23 @@ def _shown(system: type[System], names: list[str]) -> list[str]:
     """The parameters with the two of the chart first: the axis of the resonances, or the speed without resonances."""
     axis = system.resonances.axis if system.resonances else system.roles.get("speed")
     return sorted(names, key=lambda name: name != axis)
+
+
+def _stored_curves(
+    atlas: StoredAtlas, fixed: Mapping[str, float], ranges: Mapping[str, tuple[float, float]]
+) -> dict[str, Any]:
+    """:func:`_curves`, traced once for this atlas, this part of it and this code, and then kept in the user's cache."""
+    system, floquet = atlas.scene.system, atlas.scene_on({}).analysis
+    known = find_system(system.name) is system
+    panels = atlas.stability.atlas
+    content = {
+        # Words as such: an array of objects has no content of its own.
+        "panels": {n: x.tolist() if x.dtype == object else x for n, x in to_arrays(panels).items()},
+        "given": [panels.parameters, dict(panels.fixed), panels.tolerance, dict(fixed), dict(ranges)],
+        "code": source_digest({"atlas_chart.py": Path(__file__)}),
+    }
+    identity = program_identity(system, floquet, content) if known else ""
+    return remembered(partial(_curves, atlas, fixed, ranges), identity)
 
 
 def _curves(

@@ -1,4 +1,4 @@
-"""Compiled kernels on disk: later processes neither trace nor compile."""
+"""Compiled kernels, and curves of charts, on disk: later processes neither trace nor compile."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +20,12 @@ from drivetrain_jax.runs import compile_cache
 from drivetrain_jax.store.files import write_atomic
 from drivetrain_jax.store.provenance import digest
 
-# Number of kernels that are kept; one takes some 300 kB.
+# Number of files that are kept; one takes some 300 kB.
 _MOST = 256
 _DIGEST = 16
+# Errors of a file that is missing, damaged or of no use here.
+_UNUSABLE = (OSError, ValueError, TypeError, zlib.error, pickle.UnpicklingError, jax.errors.JaxRuntimeError)
+T = TypeVar("T")
 
 
 def compiled(
@@ -51,29 +54,52 @@ def calls(kernel: jax.stages.Compiled, target: str) -> bool:
     return f'custom_call_target="{target}' in (kernel.as_text() or "")
 
 
+def remembered(compute: Callable[[], T], identity: str) -> T:
+    """``compute()``, plain data that is stored on disk under ``identity``, as kernels are."""
+    folder = compile_cache.programs() if identity else None
+    if folder is None:
+        return compute()
+    with suppress(*_UNUSABLE):
+        return pickle.loads(_content(folder / identity))
+    found = compute()
+    _store(folder / identity, pickle.dumps(found))
+    return found
+
+
 def _read(path: Path) -> jax.stages.Compiled | None:
     """The kernel at ``path``; None if there is none, or if it is damaged."""
-    with suppress(OSError, ValueError, TypeError, zlib.error, pickle.UnpicklingError, jax.errors.JaxRuntimeError):
-        data = path.read_bytes()
-        if hashlib.blake2b(data[_DIGEST:], digest_size=_DIGEST).digest() == data[:_DIGEST]:
-            path.touch()
-            has_lapack, *content = pickle.loads(zlib.decompress(data[_DIGEST:]))
-            if has_lapack:
-                # JAX loads LAPACK, which takes a quarter of a second, when it lowers the first call.
-                jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), float))
-            return serialize_executable.deserialize_and_load(*content, execution_devices=jax.devices()[:1])
+    with suppress(*_UNUSABLE):
+        has_lapack, *content = pickle.loads(_content(path))
+        if has_lapack:
+            # JAX loads LAPACK, which takes a quarter of a second, when it lowers the first call.
+            jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), float))
+        return serialize_executable.deserialize_and_load(*content, execution_devices=jax.devices()[:1])
     return None
 
 
 def _write(path: Path, kernel: jax.stages.Compiled) -> None:
-    """Store a kernel, and delete those that have not been used for the longest time. A full disk is no error."""
+    """Store a kernel if that is possible."""
     if calls(kernel, "xla_ffi_python") or calls(kernel, "xla_python"):
         # A call of Python code cannot be stored.
         return
     # A backend may be unable to store its kernels.
-    with suppress(OSError, ValueError, NotImplementedError, jax.errors.JaxRuntimeError):
+    with suppress(ValueError, NotImplementedError, jax.errors.JaxRuntimeError):
+        _store(path, pickle.dumps((calls(kernel, "lapack_"), *serialize_executable.serialize(kernel))))
+
+
+def _content(path: Path) -> bytes:
+    """The content of a stored file; ``ValueError`` if it is damaged."""
+    data = path.read_bytes()
+    if hashlib.blake2b(data[_DIGEST:], digest_size=_DIGEST).digest() != data[:_DIGEST]:
+        raise ValueError(f"{path.name}: damaged")
+    path.touch()
+    return zlib.decompress(data[_DIGEST:])
+
+
+def _store(path: Path, content: bytes) -> None:
+    """Store a file, and delete those that have not been used for the longest time. A full disk is no error."""
+    with suppress(OSError):
         path.parent.mkdir(mode=0o700, exist_ok=True)
-        content = pickle.dumps((calls(kernel, "lapack_"), *serialize_executable.serialize(kernel)))
         data = zlib.compress(content, 1)
         data = hashlib.blake2b(data, digest_size=_DIGEST).digest() + data
         write_atomic(path, data, path.with_name(f"{path.name}.{os.getpid()}.tmp"))

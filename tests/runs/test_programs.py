@@ -103,3 +103,56 @@ def test_functions_of_a_user_are_not_stored(tmp_path):
     """Two processes sweep functions of one name and one file."""
     assert lines(FUNCTION, tmp_path, "2") == ["[2.0,", "4.0]"] and stored(tmp_path) == []
     assert lines(FUNCTION, tmp_path, "3") == ["[3.0,", "6.0]"]
+
+
+# Packages that would take half of the time of an answer.
+HEAVY = {"diffrax", "scipy", "xarray", "pandas", "matplotlib", "dask", "pint"}
+# Runs a command; prints the numbers of compilations and of traced charts, and the imported packages.
+COMMAND = """
+import sys
+from types import SimpleNamespace
+from drivetrain_jax.cli import main
+import jax
+events, traced, chart = [], [], SimpleNamespace(_curves=None)
+if sys.argv[1] == "plot":
+    import drivetrain_jax.runs.atlas_chart as chart
+trace = chart._curves
+chart._curves = lambda *a: traced.append(1) or trace(*a)
+jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: events.append(event))
+stdout, sys.stdout = sys.stdout, sys.stderr
+assert main(sys.argv[1:]) == 0
+compiled = events.count("/jax/core/compile/backend_compile_duration") - events.count(
+    "/jax/compilation_cache/cache_retrieval_time_sec"
+)
+print(compiled, len(traced), *sys.modules, file=stdout)
+"""
+SHAFT = ["zeta=0.001", "alpha=1", "mu=1", "gamma=100"]
+
+
+def test_answers_import_nothing_heavy():
+    code = """if True:
+        import sys
+        import drivetrain_jax.runs.atlas_answers, drivetrain_jax.runs.point
+        from drivetrain_jax.systems.cardan import Cardan
+        Cardan(beta=0.3, Omega=1.0, zeta=0.0, alpha=1.0, mu=1.0, gamma=1.0).floquet_model()
+        print(*sys.modules)"""
+    assert not HEAVY & set(lines(code, "0"))
+
+
+@pytest.mark.full
+def test_a_second_answer_neither_compiles_nor_imports_much(tmp_path):
+    scene = Path(__file__).parents[2] / "sweeps" / "cardan_atlas.toml"
+    file, figures = str(tmp_path / "atlas.nc"), [str(tmp_path / f"{i}.png") for i in range(3)]
+    small = ["axes.beta.stop=0.2", "axes.Omega.start=1.0", "axes.Omega.stop=1.2"]
+    lines(COMMAND, tmp_path, "run", str(scene), "--out", file, *(word for each in small for word in ("--set", each)))
+    point = ["point", "cardan", "floquet", "beta=0.1", "Omega=1.1", *SHAFT]
+    for command in (point, ["query", file, "beta=0.1", "Omega=1.1"]):
+        assert int(lines(COMMAND, tmp_path, *command)[0]) > 0
+        compiled, _, *modules = lines(COMMAND, tmp_path, *command)
+        assert compiled == "0" and not HEAVY & set(modules)
+    assert lines(COMMAND, tmp_path, "plot", file, "--out", figures[0])[1] == "1"
+    # The curves of a read-only atlas are kept as well, but not those of another part of it.
+    Path(file).chmod(0o444)
+    assert lines(COMMAND, tmp_path, "plot", file, "--out", figures[1])[:2] == ["0", "0"]
+    assert Path(figures[0]).read_bytes() == Path(figures[1]).read_bytes()
+    assert lines(COMMAND, tmp_path, "plot", file, "--part", "beta=0.1:0.2", "--out", figures[2])[1] == "1"
