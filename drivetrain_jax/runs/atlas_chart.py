@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -19,6 +19,7 @@ from drivetrain_jax._units import factor
 from drivetrain_jax.atlas import to_arrays
 from drivetrain_jax.atlas.boundaries import boundaries
 from drivetrain_jax.atlas.criteria import has_boundaries
+from drivetrain_jax.atlas.exclusion import Search
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.tips import Tips, find_tips
 from drivetrain_jax.atlas.windows import narrow
@@ -40,11 +41,11 @@ _SLICES = 3
 def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, float]], cells: int) -> xr.Dataset:
     """The ``floquet`` result on ``cells`` values of each of two parameters of the atlas in ``source``.
 
-    ``part`` fixes parameters (numbers) or restricts them (ranges). Any further parameter gets three values. A chart of two
-    parameters also has the stability boundaries (``boundary_NAME``, segments separated by NaN), the tips of the tongues
-    (``tip_NAME``, their names, ``tip_NAME_error``, ``tip_opens``, ``tip_proved``) and boxes that may contain more tips
-    (``undecided_NAME``), if the system has them. Raises :class:`InputError` for values outside the atlas,
-    :class:`ChunkError` if a direct solve in a gap fails.
+    ``part`` fixes parameters (numbers) or restricts them (ranges). Any further parameter gets three values. The chart also
+    has the stability boundaries (``boundary_NAME``, segments separated by NaN, for each value of the further parameters),
+    if the system has them. A chart of two parameters has the tips of the tongues as well (``tip_NAME``, their names,
+    ``tip_NAME_error``, ``tip_opens``, ``tip_proved``), and boxes that may contain more tips (``undecided_NAME``). Raises
+    :class:`InputError` for values outside the atlas, :class:`ChunkError` if a direct solve in a gap fails.
     """
     if not 2 <= cells <= 20_000:
         raise InputError(f"cells = {cells}: allowed is 2 <= cells <= 20000")
@@ -61,8 +62,9 @@ def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, flo
         if name in shown
     }
     dataset = atlas.grid(**axes, **fixed)
-    if len(shown) == 2 and has_boundaries(atlas.stability.atlas, atlas.scene.system):
-        dataset = dataset.assign_coords(_stored_curves(atlas, fixed, {n: ranges[n] for n in shown}))
+    if len(shown) > 1 and has_boundaries(atlas.stability.atlas, atlas.scene.system):
+        plane, slices = {n: ranges[n] for n in shown[:2]}, {n: axes[n] for n in axes if n not in shown[:2]}
+        dataset = dataset.assign_coords(_stored_curves(atlas, fixed, plane, slices))
     for name, (quantity, convert) in views.items():
         dataset = in_physical_units(dataset, name, quantity, convert)
     return dataset
@@ -124,20 +126,24 @@ def _shown(system: type[System], names: list[str]) -> list[str]:
 
 
 def _stored_curves(
-    atlas: StoredAtlas, fixed: Mapping[str, float], ranges: Mapping[str, tuple[float, float]]
+    atlas: StoredAtlas,
+    fixed: Mapping[str, float],
+    ranges: Mapping[str, tuple[float, float]],
+    slices: Mapping[str, np.ndarray],
 ) -> dict[str, Any]:
-    """:func:`_curves`, traced once for this atlas, this part of it and this code, and then kept in the user's cache."""
+    """The curves of a chart, traced once for this atlas, this part of it and this code, and then kept in the user's cache."""
     system, floquet = atlas.scene.system, atlas.scene_on({}).analysis
     known = find_system(system.name) is system
     panels = atlas.stability.atlas
     content = {
         # Words as such: an array of objects has no content of its own.
         "panels": {n: x.tolist() if x.dtype == object else x for n, x in to_arrays(panels).items()},
-        "given": [panels.parameters, dict(panels.fixed), panels.tolerance, dict(fixed), dict(ranges)],
+        "given": [panels.parameters, dict(panels.fixed), panels.tolerance, dict(fixed), dict(ranges), dict(slices)],
         "code": source_digest({"atlas_chart.py": Path(__file__)}),
     }
     identity = program_identity(system, floquet, content) if known else ""
-    return remembered(partial(_curves, atlas, fixed, ranges), identity)
+    trace = partial(_curves_of_slices, slices=slices) if slices else _curves
+    return remembered(partial(trace, atlas, fixed, ranges), identity)
 
 
 def _curves(
@@ -150,21 +156,51 @@ def _curves(
     if system.resonances is not None and system.resonances.axis in ranges:
         # Tongues open at their tips with increasing angle, and close there with increasing damping.
         tips = find_tips(panels, system, opening=system.roles.get("angle") in ranges)
-    segments = [
-        _within({name: sign * segment[name] for name, sign in side.items()}, ranges)
-        for curve in boundaries(panels, system, tips.searches if tips else ())
-        for segment in curve.segments()
-        for side in signs
-    ]
-    coordinates: dict[str, Any] = {}
-    for name in ranges:
-        about = {"units": system.parameter(name).units}
-        parts = [np.append(segment[name], np.nan) for segment in segments]
-        values = np.concatenate(parts) if parts else np.empty(0)
-        coordinates[f"boundary_{name}"] = ("boundary", values, {**about, "long_name": f"boundary of stability, {name}"})
+    curves = _boundary(panels, system, ranges, tips.searches if tips else ())
+    coordinates = _labelled(system, curves)
     if tips is None:
         return coordinates
     return coordinates | _tips(_on_all_sides(tips, signs, ranges), system, ranges)
+
+
+def _curves_of_slices(
+    atlas: StoredAtlas,
+    fixed: Mapping[str, float],
+    ranges: Mapping[str, tuple[float, float]],
+    slices: Mapping[str, np.ndarray],
+) -> dict[str, tuple]:
+    """The boundaries over ``ranges`` for every combination of the values of ``slices``, padded with NaN to one length."""
+    whole, system = atlas.stability.atlas, atlas.scene.system
+    parts = [whole.slice({**fixed, **dict(zip(slices, point, strict=True))}) for point in product(*slices.values())]
+    found = [_boundary(narrow(part, ranges), system, ranges) for part in parts]
+    shape = (*map(len, slices.values()), max(curve[name].size for curve in found for name in ranges))
+    padded = {name: np.full(shape, np.nan) for name in ranges}
+    for place, curve in zip(np.ndindex(shape[:-1]), found, strict=True):
+        for name, values in curve.items():
+            padded[name][place][: values.size] = values
+    return _labelled(system, padded, *slices)
+
+
+def _boundary(
+    panels: Atlas, system: type[System], ranges: Mapping[str, tuple[float, float]], searches: Sequence[Search] = ()
+) -> dict[str, np.ndarray]:
+    """The stability boundary within ``ranges``, segments separated by NaN; empty in a gap of the atlas."""
+    segments = [
+        _within({name: sign * segment[name] for name, sign in side.items()}, ranges)
+        for curve in (boundaries(panels, system, searches) if panels.panels else ())
+        for segment in curve.segments()
+        for side in _signs(panels)
+    ]
+    return {name: np.concatenate([np.empty(0), *(np.append(s[name], np.nan) for s in segments)]) for name in ranges}
+
+
+def _labelled(system: type[System], curves: Mapping[str, np.ndarray], *dims: str) -> dict[str, tuple]:
+    """Points of ``curves`` as coordinates along ``dims`` and ``boundary``."""
+    coordinates: dict[str, tuple] = {}
+    for name, values in curves.items():
+        about = {"units": system.parameter(name).units, "long_name": f"boundary of stability, {name}"}
+        coordinates[f"boundary_{name}"] = ((*dims, "boundary"), values, about)
+    return coordinates
 
 
 def _signs(atlas: Atlas) -> list[dict[str, float]]:

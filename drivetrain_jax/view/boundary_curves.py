@@ -47,11 +47,18 @@ def draw(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> lis
 
 def draw_curves(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Artist]:
     """Draw the traced boundaries, if there are any; returns their legend handle."""
-    if not dataset.sizes.get("boundary"):
+    if not traced(dataset, horizontal, vertical):
         return []
     x, y = (dataset[f"boundary_{name}"] for name in (horizontal, vertical))
     style = {"color": FRAME_GREY, "linewidth": 0.6, "label": "boundary", "scalex": False, "scaley": False}
     return [*axes.plot(x, y, **style)]
+
+
+def traced(dataset: xr.Dataset, horizontal: str, vertical: str) -> bool:
+    """True if ``dataset`` has boundaries over these two axes."""
+    return (
+        all(f"boundary_{name}" in dataset.coords for name in (horizontal, vertical)) and dataset.sizes["boundary"] > 0
+    )
 
 
 def _draw_undecided(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Artist]:

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import LinearSegmentedColormap, SymLogNorm
 
+from drivetrain_jax.view.boundary_curves import traced
 from drivetrain_jax.view.cells import FAILED, draw_cells, role
 from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS
 from drivetrain_jax.view.units import size
@@ -84,6 +85,7 @@ def draw_limit(axes: Axes, dataset: xr.Dataset, radius: xr.DataArray, horizontal
     # On the scale of the colours, so that the contour runs halfway between cells of slow decay and of fast growth.
     field = growth.of(radius).clip(-growth.largest, growth.largest).transpose(vertical, horizontal)
     height = growth.norm()(field.values) - 0.5
-    if dataset.sizes.get("boundary") or min(height.shape) < 2 or not (np.nanmin(height) < 0 < np.nanmax(height)):
+    crossed = min(height.shape) > 1 and np.nanmin(height) < 0 < np.nanmax(height)
+    if traced(dataset, horizontal, vertical) or not crossed:
         return
     axes.contour(field[horizontal], field[vertical], height, [0.0], colors=FRAME_GREY, linewidths=0.5)

@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.contour import ContourSet
 
 import drivetrain_jax as dt
 from drivetrain_jax.atlas import design, stability
@@ -172,6 +173,26 @@ def test_a_chart_searches_its_tips_once(monkeypatch):
     curves = boundaries(dt.open_atlas(source).stability.atlas, CARDAN)
     length = sum(len(segment["beta"]) for curve in curves for segment in curve.segments())
     assert np.isfinite(drawn["boundary_beta"]).sum() == length
+
+
+def test_every_slice_of_a_chart_has_its_own_curve():
+    axes = {"beta": (0.05, 0.3), "alpha": (0.5, 4.0), "Omega": (1.35, 1.48)}
+    scene = {"axes": {name: {"start": low, "stop": high} for name, (low, high) in axes.items()}}
+    fixed = {"zeta": 0.001, "mu": 1.0, "gamma": 100.0}
+    source = dt.run({"system": "cardan", "analysis": "atlas", "fixed": fixed, **scene})
+    drawn = chart(source, {}, 20)
+    assert drawn["boundary_beta"].dims == ("alpha", "boundary") and "tip" not in drawn.coords
+    for alpha in drawn["alpha"].values:
+        beta, omega = (drawn[f"boundary_{name}"].sel(alpha=alpha).dropna("boundary") for name in ("beta", "Omega"))
+        rho = dt.open_atlas(source)(beta=beta.values, Omega=omega.values, alpha=alpha).spectral_radius.values
+        np.testing.assert_allclose(rho, 1.0, rtol=0, atol=1e-7)
+        assert len(beta) > 10
+    assert beta.min() == chart(source, {"alpha": 4.0}, 4)["boundary_beta"].min()
+    panels = dt.plot(source, cells=20).axes
+    lines = [[line.get_xdata() for line in axes.lines if line.get_label() == "boundary"] for axes in panels]
+    np.testing.assert_array_equal(np.array(lines)[:, 0], drawn["boundary_Omega"].values)
+    # The contour of the cells is not drawn next to the curve.
+    assert not [each for axes in panels for each in axes.collections if isinstance(each, ContourSet)]
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

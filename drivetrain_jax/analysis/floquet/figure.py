@@ -168,17 +168,20 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
         for row in (_spread(dataset, down) if down else [0])
     ]
     # If all is stable there is no boundary to draw: show the spectral radius instead.
-    plain = "spectral_radius" in dataset and bool((cells.states(dataset) == cells.STABLE).all())
+    curves = boundaries.traced(dataset, horizontal, vertical)
+    plain = "spectral_radius" in dataset and not curves and bool((cells.states(dataset) == cells.STABLE).all())
     margins = Margins(right=1.05 if plain else 0.25, top=1.12, between_rows=0.32, between_columns=0.16)
     height = _SMALL_PANEL if len(slices) > 1 else _PANEL
     panels = Panels(len(slices), len(slices[0]), height=height, margins=margins)
     predicted: list[Line2D] = []
+    limit: list[Artist] = []
     labels: list[tuple[Axes, list[resonances.Prediction]]] = []
     for panel, axes in zip(chain(*slices), chain(*panels.axes), strict=True):
         if plain:
             _draw_radius(panels, axes, panel, dataset, (horizontal, vertical))
         else:
             cells.draw_states(axes, panel, horizontal, vertical)
+            limit = boundaries.draw_curves(axes, panel, horizontal, vertical)
             _draw_limit(axes, panel, horizontal, vertical)
         lines = resonances.predictions(panel, horizontal, vertical)
         predicted = max(predicted, resonances.draw(axes, lines, below=not plain), key=len)
@@ -192,7 +195,7 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
     for axes, lines in labels:
         resonances.label(axes, lines)
     panels.titles(dataset, _notes(plain, len(slices) * len(slices[0]), count))
-    panels.legend(predicted if plain else [*cells.state_legend(dataset), *predicted])
+    panels.legend(predicted if plain else [*cells.state_legend(dataset), *limit, *predicted])
     return panels.figure
 
 
