@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.collections import QuadMesh
+from matplotlib.collections import LineCollection, QuadMesh
 from matplotlib.colors import LinearSegmentedColormap, SymLogNorm
 
 from drivetrain_jax.view.boundary_curves import traced
-from drivetrain_jax.view.cells import FAILED, draw_cells, role
+from drivetrain_jax.view.cells import FAILED, cell_edges, draw_cells, role
 from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS
 from drivetrain_jax.view.units import size
 
@@ -61,7 +61,7 @@ def growth_of(dataset: xr.Dataset) -> Growth:
 def draw_growth(
     axes: Axes, dataset: xr.Dataset, radius: xr.DataArray, horizontal: str, vertical: str
 ) -> tuple[QuadMesh, str, dict[str, Any]]:
-    """Draw the growth that ``radius`` means as cells, with its contour at 0; returns label and options of its colour bar.
+    """Draw the growth that ``radius`` means as cells, with the limit of stability; returns label and options of the bar.
 
     A colour means the same growth in every figure with the same label. Pale yellow, green and blue are decay, from fast to
     none; orange to black is growth. Missing values have the colour of failed cells.
@@ -80,12 +80,20 @@ def draw_growth(
 
 
 def draw_limit(axes: Axes, dataset: xr.Dataset, radius: xr.DataArray, horizontal: str, vertical: str) -> None:
-    """Draw the contour of no growth between the cells, unless the boundaries of ``dataset`` are traced."""
-    growth = growth_of(dataset)
-    # On the scale of the colours, so that the contour runs halfway between cells of slow decay and of fast growth.
-    field = growth.of(radius).clip(-growth.largest, growth.largest).transpose(vertical, horizontal)
-    height = growth.norm()(field.values) - 0.5
-    crossed = min(height.shape) > 1 and np.nanmin(height) < 0 < np.nanmax(height)
-    if traced(dataset, horizontal, vertical) or not crossed:
+    """Draw the limit of stability along the edges of the cells, where the colours end, unless the boundary is traced."""
+    if traced(dataset, horizontal, vertical):
         return
-    axes.contour(field[horizontal], field[vertical], height, [0.0], colors=FRAME_GREY, linewidths=0.5)
+    x, y = (cell_edges(radius[name].values.astype(float)) for name in (horizontal, vertical))
+    # Without the bound of the error, so that the line surrounds the cells with the verdict unstable.
+    field = (radius - dataset.get("spectral_radius_error", 0.0)).transpose(vertical, horizontal).values
+    up, across = np.nonzero(_changes(field, 1)), np.nonzero(_changes(field, 0))
+    segments = [np.stack([x[up[1] + 1], y[up[0]], x[up[1] + 1], y[up[0] + 1]], axis=-1)]
+    segments += [np.stack([x[across[1]], y[across[0] + 1], x[across[1] + 1], y[across[0] + 1]], axis=-1)]
+    lines = LineCollection(np.concatenate(segments).reshape(-1, 2, 2), colors=FRAME_GREY, linewidths=0.5)  # pyright: ignore[reportArgumentType]
+    axes.add_collection(lines, autolim=False)
+
+
+def _changes(field: np.ndarray, axis: int) -> np.ndarray:
+    """True where one of two neighbours along ``axis`` is unstable and the other is not; False next to a missing value."""
+    first, second = np.delete(field, -1, axis), np.delete(field, 0, axis)
+    return ((first > 1) != (second > 1)) & np.isfinite(first) & np.isfinite(second)

@@ -11,9 +11,8 @@ import matplotlib
 import numpy as np
 import pytest
 import xarray as xr
-from matplotlib.collections import PolyCollection, QuadMesh
+from matplotlib.collections import LineCollection, PolyCollection, QuadMesh
 from matplotlib.colors import to_hex
-from matplotlib.contour import ContourSet
 from matplotlib.text import Annotation, Text
 
 from drivetrain_jax._errors import InputError
@@ -213,12 +212,19 @@ def test_colours_of_growth_are_the_same_in_every_figure():
         assert first.to_rgba(growth) == second.to_rgba(growth)
 
 
-def test_growth_has_a_contour_at_zero_on_the_boundary():
-    (contour,) = (each for each in panels(plot(results.chart()))[1].collections if isinstance(each, ContourSet))
-    assert list(contour.levels) == [0.0]
-    omega, beta = np.concatenate([path.vertices for path in contour.get_paths()]).T
-    inside = beta > 0.3
-    assert np.abs(beta - (0.2 + 2 * np.abs(omega - 1.0)))[inside].max() < 0.06
+def test_the_limit_runs_where_the_colours_end():
+    dataset = results.chart()
+    grows = results.unstable(dataset["beta"].values[:, None], dataset["Omega"].values[None])
+    expected = {(x, y + 0.5) for y, x in np.argwhere(np.diff(grows, axis=0))}
+    expected |= {(x + 0.5, y) for y, x in np.argwhere(np.diff(grows, axis=1))}
+    for axes in panels(plot(dataset)):
+        (lines,) = (each for each in axes.collections if isinstance(each, LineCollection))
+        middles = np.mean(lines.get_segments(), axis=1)
+        # In cells from the middle of the first one.
+        found = (middles - [0.5, 0.0]) / [0.025, 0.05]
+        assert len(found) == len(expected) and {tuple(pair) for pair in np.round(2 * found) / 2} == expected
+        sides = np.ptp(lines.get_segments(), axis=1) / [0.025, 0.05]
+        np.testing.assert_allclose(sides, np.round(2 * found[:, ::-1]) % 2, atol=1e-9)
 
 
 def test_predicted_lines_leave_narrow_tongues_visible():

@@ -47,7 +47,7 @@ def plot(dataset: xr.Dataset) -> Figure:
 
     - none: the multipliers in the complex plane;
     - one: the rate of growth, or the distance of the spectral radius from 1, with its error band;
-    - two: regions of the verdict and a map of the growth (per second, turn or period) with its contour at 0, if stored;
+    - two: regions of the verdict and a map of the growth (per second, turn or period), both with the limit of stability;
     - more: regions of the verdict for the first, middle and last value of two further axes;
     - ``[points]``: the points coloured by their verdict.
 
@@ -96,7 +96,7 @@ def _radius(dataset: xr.Dataset) -> xr.DataArray:
 
 
 def _draw_limit(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> None:
-    """Draw the interpolated limit of stability over the cells of the verdict, as over those of the growth."""
+    """Draw the limit of stability over the cells of the verdict, as over those of the growth."""
     if "spectral_radius" in dataset:
         draw_limit(axes, dataset, _radius(dataset), horizontal, vertical)
 
