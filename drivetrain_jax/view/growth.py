@@ -27,6 +27,10 @@ _COLOURS = (
 )
 
 
+# Distance of a spectral radius from 1 that rounding can make.
+_ROUNDING = 1e-12
+
+
 class Growth(NamedTuple):
     """``values = factor ln(spectral radius)`` with their ``label``; colours are linear below ``linear`` and end at
     ``largest``, the same in every figure."""
@@ -91,6 +95,14 @@ def draw_limit(axes: Axes, dataset: xr.Dataset, radius: xr.DataArray, horizontal
     segments += [np.stack([x[across[1]], y[across[0] + 1], x[across[1] + 1], y[across[0] + 1]], axis=-1)]
     lines = LineCollection(np.concatenate(segments).reshape(-1, 2, 2), colors=FRAME_GREY, linewidths=0.5)  # pyright: ignore[reportArgumentType]
     axes.add_collection(lines, autolim=False)
+
+
+def scale_around_limit(axes: Axes, excess: xr.DataArray) -> None:
+    """Set a logarithmic scale on both sides of the limit 0: it tells a spectral radius of 1 - 1e-5 from 1."""
+    size = np.abs(excess.values[np.isfinite(excess.values) & (excess.values != 0)])
+    # Linear below the smallest values.
+    linear = 10.0 ** np.floor(np.log10(max(np.quantile(size, 0.1), _ROUNDING))) if size.size else 1.0
+    axes.set_yscale("symlog", linthresh=linear)
 
 
 def _changes(field: np.ndarray, axis: int) -> np.ndarray:

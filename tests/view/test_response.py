@@ -21,9 +21,17 @@ def test_amplitude_of_both_shafts_over_one_axis():
     assert set(first.get_ydata()) == {0.1}
     assert set(second.get_ydata()) == {0.2}
     assert amplitude.get_yscale() == "log"
-    assert [set(line.get_ydata()) for line in orbit.lines[:2]] == [{1.1}, {1}]
+    assert [set(line.get_ydata()) for line in orbit.lines[:2]] == [{1.1 - 1}, {0}]
     assert legend(figure) == ["driving shaft, linear", "driven shaft, linear", "limit of stability", "harmonic $H$"]
-    assert {"amplitude [rad]", "spectral radius of the orbit", "speed ($\\Omega$)"} <= set(texts(figure))
+    assert {"amplitude [rad]", "spectral radius of the orbit minus 1", "speed ($\\Omega$)"} <= set(texts(figure))
+
+
+def test_an_orbit_close_to_its_limit_is_told_from_it():
+    dataset = results.forced(Omega=OMEGA)
+    dataset.orbit_spectral_radius[:] = 1 - 1e-5
+    orbit = panels(plot(dataset))[1]
+    place = orbit.transAxes.inverted().transform(orbit.transData.transform([(1.0, -1e-5), (1.0, 0.0)]))[:, 1]
+    assert place[1] - place[0] > 0.1
 
 
 def test_only_harmonic_speeds_are_predicted_for_a_response():

@@ -171,3 +171,12 @@ def test_a_motion_without_values_is_refused():
     dataset = dataset.assign({name: ("sample", empty) for name in ("u_history", "v_history")})
     with pytest.raises(InputError, match="u_history = nan: nothing to plot"):
         plot(dataset)
+
+
+def test_a_motion_close_to_its_limit_is_told_from_it():
+    ones = np.ones(4)
+    radius = {"spectral_radius": [0.3, 1 - 1e-4, 1 - 1e-5, 1 - 1e-5]}
+    figure = plot(result({"omega": [0.1, 0.2, 0.3, 0.4]}, u_max=ones, u_min=-ones, **radius))
+    axes = figure.axes[1]
+    place = axes.transAxes.inverted().transform(axes.transData.transform([(0.3, -1e-5), (0.3, 0.0)]))[:, 1]
+    assert place[1] - place[0] > 0.1 and any(text.get_text().endswith("minus 1") for text in figure.texts)

@@ -21,7 +21,7 @@ from drivetrain_jax.view import boundary_curves as boundaries
 from drivetrain_jax.view import cells
 from drivetrain_jax.view import resonance_lines as resonances
 from drivetrain_jax.view.figure_layout import Margins, Panels
-from drivetrain_jax.view.growth import draw_growth, draw_limit, growth_of
+from drivetrain_jax.view.growth import draw_growth, draw_limit, growth_of, scale_around_limit
 from drivetrain_jax.view.style import (
     FRAME_GREY,
     LINE_COLOURS,
@@ -36,8 +36,6 @@ from drivetrain_jax.view.style import (
 
 _PANEL = 2.45
 _SMALL_PANEL = 1.35
-# Distance of a spectral radius from 1 that rounding can make.
-_ROUNDING = 1e-12
 # Largest number of values of an axis across a figure of small panels.
 _FEW = 4
 
@@ -119,10 +117,7 @@ def _curve(dataset: xr.Dataset, name: str, marker: str = "") -> Figure:
         )
         handles.append(band)  # pyright: ignore[reportArgumentType]
     handles.append(axes.axhline(0, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)), label="limit of stability"))
-    size = np.abs(excess.values[np.isfinite(excess.values) & (excess.values != 0)])
-    # Linear below the smallest distances from 1, so that 1 - 1e-5 is told from 1.
-    linear = 10.0 ** np.floor(np.log10(max(np.quantile(size, 0.1), _ROUNDING))) if size.size else 1.0
-    axes.set_yscale("symlog", linthresh=linear)
+    scale_around_limit(axes, excess)
     cells.fit_axis(axes, "x", x)
     if "verdict" in dataset:
         _draw_strip(axes, dataset, name)

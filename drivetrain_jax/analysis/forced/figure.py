@@ -16,7 +16,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import cells
 from drivetrain_jax.view import resonance_lines as resonances
 from drivetrain_jax.view.figure_layout import Margins, Panels
-from drivetrain_jax.view.growth import draw_growth
+from drivetrain_jax.view.growth import draw_growth, scale_around_limit
 from drivetrain_jax.view.style import (
     FRAME_GREY,
     LINE_COLOURS,
@@ -34,7 +34,7 @@ _HEIGHT = 2.1
 
 
 def plot(dataset: xr.Dataset) -> Figure:
-    """Amplitudes of the displacements, and the orbit's spectral radius and the condition if stored.
+    """Amplitudes of the displacements, and the orbit's spectral radius minus 1 and the condition if stored.
 
     Over one axis as curves (solid: linear response, dashed: nonlinear orbit), over two axes as maps. Failed points are
     crosses at the foot of the curves, or coloured cells of the maps. Axes of one value count as fixed. Raises
@@ -64,13 +64,16 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
     if amplitudes:
         handles += _draw_amplitudes(stack[0], dataset, name, amplitudes)
     for axes, key in zip(stack[rows - len(scalars) :], scalars, strict=True):
-        axes.plot(dataset[name], dataset[key], color=LINE_COLOURS[0])
-        panels.label_row(axes, variable_label(dataset[key]))
         if key == "condition":
+            axes.plot(dataset[name], dataset[key], color=LINE_COLOURS[0])
+            panels.label_row(axes, variable_label(dataset[key]))
             _set_decades(axes, dataset[key])
         else:
+            scale_around_limit(axes, dataset[key] - 1)
+            axes.plot(dataset[name], dataset[key] - 1, color=LINE_COLOURS[0])
+            panels.label_row(axes, f"{variable_label(dataset[key])} minus 1")
             handles.append(
-                axes.axhline(1, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)), label="limit of stability")
+                axes.axhline(0, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)), label="limit of stability")
             )
     if amplitudes:
         own = next(dim for dim in dataset[amplitudes[0]].dims if dim != name)

@@ -19,6 +19,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import cells, regimes
 from drivetrain_jax.view.figure_layout import WIDTH, Margins, Panels
+from drivetrain_jax.view.growth import scale_around_limit
 from drivetrain_jax.view.style import (
     ATTRACTOR_COLOURS,
     FRAME_GREY,
@@ -93,18 +94,20 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
     handles = _extremes(first, dataset, name, extremes)
     panels.label_row(first, f"extremes of the displacement [{units_of(dataset[extremes[0]])}]")
     for axes, key in zip(stack, [*scalars, *by_flank], strict=True):
-        values = dataset[key].where(known)
+        label, values = variable_label(dataset[key]), dataset[key].where(known)
         if key in by_flank:
             entries = _flanks(axes, dataset[name], values)
             handles += entries if key == by_flank[0] else []
         else:
+            if key == "spectral_radius":
+                label, values = f"{label} minus 1", values - 1
+                scale_around_limit(axes, values)
             _dots(axes, dataset[name], values, LINE_COLOURS[0], "")
-        panels.label_row(axes, variable_label(dataset[key]))
+        panels.label_row(axes, label)
         if key == "period_multiple":
             axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
-        limit = {"spectral_radius": 1.0, "lyapunov_exponent": 0.0}.get(key)
-        if limit is not None:
-            axes.axhline(limit, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)))
+        if key in ("spectral_radius", "lyapunov_exponent"):
+            axes.axhline(0, color=FRAME_GREY, linewidth=0.8, linestyle=(0, (2, 2)))
     handles += regimes.draw_bands(dataset, name, first, *stack)
     cells.fit_axis(first, "x", dataset[name].values)
     handles += cells.draw_failures(first, dataset, name)
