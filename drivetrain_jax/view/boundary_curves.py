@@ -74,7 +74,7 @@ def _draw_undecided(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: 
 
 
 def _name(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> None:
-    """Draw the names of tips outside of the tongues, or next to the tips; omit names that overlap or leave the frame."""
+    """Draw the names of tips outside of the tongues, or next to the tips; omit names that overlap, repeat or leave it."""
     x, y = (dataset[f"tip_{name}"].values for name in (horizontal, vertical))
     # Without this variable all tongues open upwards.
     opens = dataset["tip_opens"].values if "tip_opens" in dataset.coords else np.ones(len(x))
@@ -82,8 +82,12 @@ def _name(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> No
     scale = 72 / axes.figure.dpi
     low, high = axes.bbox.min * scale + _ROOM / 2, axes.bbox.max * scale - _ROOM / 2  # pyright: ignore[reportOperatorIssue]
     taken: list[np.ndarray] = []
+    named: list[tuple[str, np.ndarray]] = []
     for name, tip, up in zip(names, tips, opens, strict=True):
         mark = axes.transData.transform(tip) * scale
+        # Unproved tips may lie within their errors of each other.
+        if any(name == other and (np.abs(mark - at) < _ROOM / 2).all() for other, at in named):
+            continue
         sides = [(across, rise if up else -rise) for across, rise in _SIDES]
         middles = {side: mark + np.array(side) * (0.7, 1.0) * _ROOM for side in sides}
         inside = {side: at for side, at in middles.items() if ((at >= low) & (at <= high)).all()}
@@ -92,6 +96,7 @@ def _name(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> No
         if side is None:
             continue
         taken.append(middles[side])
+        named.append((name, mark))
         aligned, level = _SIDES[side]
         axes.annotate(
             label_text(name),

@@ -51,6 +51,11 @@ def test_a_name_does_not_cover_another():
     assert found == {(1.0, 0.5): DOWN, (1.0, 0.52): RIGHT}
 
 
+def test_two_tips_in_one_place_share_a_name():
+    both = tipped([0.5, 0.501, 0.9], [1, 1, 1], [1.0, 1.0, 1.0]).assign_coords(tip=("tip", ["C-1", "C-1", "C-1"]))
+    assert sides(both) == {(1.0, 0.5): DOWN, (1.0, 0.9): DOWN}
+
+
 def test_a_chart_tells_which_way_tongues_open():
     point, error = {"zeta": 0.01, "Omega": 0.7}, {"zeta": 1e-9, "Omega": 1e-9}
     tips = tuple(Tip("H21", "+1", point, error, opens) for opens in (False, True))
