@@ -90,8 +90,8 @@ def _check_used(sections: Iterable[Section], asked: Iterable[str], amplitude: An
             raise InputError(f"units = {unit!r}: nothing in the report measures that; allowed are {shown}")
     if amplitude is not None and not any(section.compared for section in sections):
         raise InputError(
-            f"amplitude = {amplitude!r}: no result has a forced motion to compare; allowed with an atlas over the speed, or "
-            "with a result of forced that contains amplitude"
+            f"amplitude = {amplitude!r}: no result has a forced motion to compare; allowed with an atlas over the speed, a "
+            "result of floquet of a system with a forced response, or a result of forced that contains amplitude"
         )
 
 
@@ -109,18 +109,19 @@ def _section(path: Path, number: int, asked: list[str], amplitude: Any) -> Secti
         answers, chart, compared = atlas_answers(path, (_LINE_CELLS, _CELLS), convert, amplitude)
     else:
         chart = dataset.load()
-    limit = None
-    if amplitude is not None and amplitudes(chart):
-        from drivetrain_jax.runs.forced_limit import Limit
-        from drivetrain_jax.runs.scene import find_system
+    limit, moved = None, chart
+    if amplitude is not None and (analysis == "floquet" or amplitudes(chart)):
+        # Local import: it loads jax.
+        from drivetrain_jax.report.forced_section import forced_motion, limit_of
 
-        limit = Limit.of(find_system(str(dataset.attrs.get("system"))), amplitude)
+        limit = limit_of(chart, amplitude)
+        moved = forced_motion(chart) if limit and analysis == "floquet" else chart
     attrs, handy = dataset.attrs, with_prefixes(convert(chart))
     axes, fixed = axes_table(handy), fixed_table(handy)
     return Section(
         title=str(attrs.get("title") or path.name),
         file=path.name,
-        statements=[*answers, *statements(handy, not answers, limit)],
+        statements=[*answers, *statements(handy, not answers, limit, with_prefixes(convert(moved)))],
         axes=axes,
         fixed=fixed,
         values=values_tables(handy),

@@ -44,14 +44,16 @@ class Limit(Protocol):
         ...
 
 
-def statements(dataset: xr.Dataset, ranges: bool = True, limit: Limit | None = None) -> list[str]:
+def statements(
+    dataset: xr.Dataset, ranges: bool = True, limit: Limit | None = None, moved: xr.Dataset | None = None
+) -> list[str]:
     """Sentences about ``dataset``, verdicts first; without ``ranges`` only the shares of verdicts.
 
-    Forced amplitudes among the results are compared with ``limit``.
+    Forced amplitudes in ``moved`` (default: among the results) are compared with ``limit``.
     """
     coded = [v for v in _coded(dataset) if v.name != "outcome"]
     said = [sentence for variable in coded for sentence in _about_codes(dataset, variable, ranges)]
-    said += [*_about_growth(dataset), *(_about_limit(dataset, limit) if limit else ())]
+    said += [*_about_growth(dataset), *(_about_limit(dataset if moved is None else moved, limit) if limit else ())]
     said += [sentence for variable in _numbers(dataset) for sentence in _about_numbers(dataset, variable)]
     return [*said, *_about_orders(dataset), *_about_outcome(dataset), *_about_errors(dataset)]
 
@@ -188,7 +190,9 @@ def _about_limit(dataset: xr.Dataset, limit: Limit) -> Iterator[str]:
         inside = within.all([d for d in within.dims if axis is None or d != axis.name])
         kept = "nowhere" if not bool(within.any()) else f"at {_share(float(within.mean()))} of the points"
         kept = f"at {_ranges(axis, inside.values)}" if axis is not None and bool(inside.any()) else kept
-        yield f"{name}: up to {most}, above the limit of {allowed}; within it {kept}."
+        # A point without a value is not within the limit.
+        side = "above" if found[place] > limit.value else "within"
+        yield f"{name}: up to {most}, {side} the limit of {allowed}; within it {kept}."
 
 
 def amplitudes(dataset: xr.Dataset) -> list[xr.DataArray]:

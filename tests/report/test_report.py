@@ -126,15 +126,15 @@ def test_units_are_those_asked_for_or_those_of_the_scene(truck, tmp_path):
     assert "Unstable at speed = 1425 rpm." in text and " angle joint angle 12 deg" in text
 
 
-def test_a_unit_that_nothing_measures_is_refused(truck, tmp_path, capsys):
+def test_a_unit_that_nothing_measures_is_refused(truck, files, tmp_path, capsys):
     for option, value, words in (
         ("--units", "kg m", "units = 'kg m': nothing in the report measures that; allowed are units of"),
         ("--units", "rpm,Hz", "units = 'Hz': measures the same as rpm"),
         ("--amplitude", "2 deg", "amplitude = '2 deg': no result has a forced motion to compare"),
         ("--amplitude", "2 mm", "mm does not measure that"),
     ):
-        files = truck if words.startswith("mm") else truck[:1]
-        assert main(["report", *map(str, files), "--out", str(tmp_path / "r.html"), option, value]) == 2
+        results = {"2 mm": truck, "2 deg": files[1:]}.get(value, truck[:1])
+        assert main(["report", *map(str, results), "--out", str(tmp_path / "r.html"), option, value]) == 2
         error = capsys.readouterr().err
         assert words in error and error.count("\n") == 1
     assert not list(tmp_path.iterdir())
@@ -161,6 +161,16 @@ def test_the_report_compares_the_forced_motion_with_a_limit(truck):
     inside = ", ".join(f"{speed}" for speed in np.array([1425, 1560, 2000])[amplitude <= 2])
     assert f"within it at speed = {inside} rpm." in text
     assert "within the limit of 1.57 rad." in " ".join(Page(report(truck[1:], amplitude=1.57)).words)
+
+
+def test_the_report_compares_the_forced_motion_of_a_stability_result(truck):
+    stable, amplitude = truck[0], np.rad2deg(dt.open_result(truck[1]).amplitude.values)
+    text = _plain(" ".join(Page(report([stable], amplitude="2 deg")).words))
+    assert f"where stable: up to {amplitude[1].max():.6g} deg at speed = 1560 rpm, shaft = driven, above" in text
+    assert "of 2 deg; within it at speed = 2000 rpm." in text
+    # At 1425 rpm the shaft is unstable: no amplitude is within a limit there.
+    text = _plain(" ".join(Page(report([stable], amplitude="1.5 rad")).words))
+    assert "within the limit of 1.5 rad; within it at speed = 1560 to 2000 rpm." in text
 
 
 def _plain(text: str) -> str:
