@@ -1,11 +1,13 @@
 """Compute (or resume) and draw every scene of sweeps/, and list all figures on one page; `make gallery`.
 
-Skips complete scenes, and figures that are newer than their results and the drawing code.
+Skips complete scenes, and figures that are newer than their results and the drawing code. The constants of a single point
+are a table, on the page and as CSV.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import re
 import sys
 import tomllib
@@ -20,6 +22,7 @@ import drivetrain_jax
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.cli.progress import progress_line
+from drivetrain_jax.datasets.figure import table
 from drivetrain_jax.runs.atlas_chart import chart
 from drivetrain_jax.runs.run import Incomplete, run_to_file
 from drivetrain_jax.runs.status import status
@@ -85,16 +88,29 @@ def compute(scene: Path, folder: Path) -> Path:
 
 def draw(item: Item, results: Sequence[Path], figure: Path) -> None:
     """Write the figure unless it is newer than its results and the drawing code."""
-    code = [*PACKAGE.glob("view/*.py"), Path(__file__)]
+    code = [*PACKAGE.glob("view/*.py"), *PACKAGE.glob("analysis/*/figure.py"), Path(__file__)]
     if any(tomllib.loads(scene.read_text())["analysis"] == "atlas" for scene in item.scenes):
         code += [*PACKAGE.glob("atlas/*.py"), PACKAGE / "runs" / "atlas_chart.py"]
     newest = max(path.stat().st_mtime for path in (*results, *code))
     if figure.exists() and figure.stat().st_mtime > newest:
         return
     datasets = [open_result(path) for path in results]
+    if datasets[0].attrs["analysis"] == "parameters" and datasets[0]["outcome"].size == 1:
+        figure.with_suffix(".csv").write_text(table(results[0], None, ","))
+        return
     if datasets[0].attrs["analysis"] == "atlas":
         datasets = [chart(ds, item.part, CELLS).assign_attrs(title=item.title) for ds in datasets]
     drivetrain_jax.plot(*datasets).savefig(figure)
+
+
+def shown(item: Item, folder: Path) -> str:
+    """The figure of an item, or its table of constants, as Markdown."""
+    values = folder / f"{item.name}.csv"
+    if not values.exists():
+        return f"![{item.title}]({item.name}.png)\n"
+    head, *rows = csv.reader(values.read_text().splitlines())
+    lines = [head, ["---"] * len(head), *([name, f"{float(value):.6g}", units] for name, value, units in rows)]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines) + f"\n\n[The table as CSV]({values.name})\n"
 
 
 def explore(item: Item, results: Sequence[Path], folder: Path) -> None:
@@ -139,14 +155,15 @@ def entry(item: Item, results: Sequence[Path], problem: str) -> Iterator[str]:
     yield f"### {item.title}\n"
     yield (f"Answers: {answer} of {source}." if answer else "Beyond the source.") + "\n"
     yield "\n\n".join(filter(None, map(remarks, item.scenes))) + "\n"
-    yield f"{problem}\n" if problem else f"![{item.title}]({item.name}.png)\n"
+    yield f"{problem}\n" if problem else shown(item, results[0].parent)
     page = f"{item.scenes[0].stem}.html"
     if results and (results[0].parent / page).exists():
         yield f"[The atlas as a page]({page}), by `drivetrain explore`.\n"
     runs = [f"$ drivetrain run sweeps/{path.name} --out {path.stem}.nc" for path in item.scenes]
     files = " ".join(f"{path.stem}.nc" for path in item.scenes)
     part = "".join(f" {name}={value:.10g}" for name, value in item.part.items())
-    runs.append(f"$ drivetrain plot {files} --out {item.name}.png" + (f" --part{part}" if part else ""))
+    ending = "csv" if results and (results[0].parent / f"{item.name}.csv").exists() else "png"
+    runs.append(f"$ drivetrain plot {files} --out {item.name}.{ending}" + (f" --part{part}" if part else ""))
     yield "\n".join(["```console", *runs, "```\n"])
     yield "; ".join(counts(open_result(path)) for path in results if path.exists()) + ".\n"
 

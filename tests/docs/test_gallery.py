@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -52,6 +53,20 @@ def test_only_changed_figures_are_made_again(folders, monkeypatch):
     assert gallery.main(arguments) == 0
     second = state(out)
     assert {name for name in first if first[name] != second[name]} == {"b.nc", "b.png"}
+
+
+def test_constants_of_one_point_are_a_table(folders, monkeypatch):
+    scenes, out = folders
+    monkeypatch.setenv("DRIVETRAIN_JAX_CACHE", "0")
+    (scenes / "a.toml").write_text(
+        re.sub(r"\[axes]\n.*\n\[fixed]", "[fixed]\nbeta = 0.1", SCENE.format(title="Constants", num=3))
+    )
+    (scenes / "b.toml").unlink()
+    assert gallery.main(["--scenes", str(scenes), str(out)]) == 0
+    assert set(state(out)) == {"a.nc", "a.csv"}
+    value = float(gallery.open_result(out / "a.nc")["natural_angular_frequency"])
+    page = (out / "index.md").read_text()
+    assert f" | {value:.6g} | rad/s |" in page and "--out a.csv" in page and "a.png" not in page
 
 
 def test_every_scene_has_its_place():

@@ -51,7 +51,7 @@ VARIABLES = (
     Variable("lyapunov_standard_error", "1/s", "standard error of the exponent, from block means", ("exponent",)),
     Variable("lyapunov_history", "1/s", "exponent averaged up to this time", ("segment", "exponent")),
     Variable("sum_rule_residual", "1/s", "sum of the exponents minus the mean divergence"),
-    Variable("paper_estimator", "1/s", "the paper's (31)-(36), not a Lyapunov exponent", ("component",)),
+    Variable("paper_estimator", "1/s", "published estimate of the exponents, not a Lyapunov exponent", ("component",)),
     Variable("chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic; 0 if the section repeats"),
     Variable("period_multiple", "1", "strobes after which the motion repeats (0: not found)", dtype="int32"),
     Variable(
