@@ -141,7 +141,9 @@ def _add_run(subparsers: Any) -> None:
         type=_path,
         help="reuse the common points of this result; a smaller result at --out is always reused",
     )
-    command.add_argument("--store", choices=("hdf5", "zarr"), default="hdf5", help="zarr: workers write a Zarr store")
+    command.add_argument(
+        "--store", choices=("hdf5", "zarr"), help="zarr: workers write a Zarr store (default if so named)"
+    )
     command.add_argument("--quiet", action="store_true", help="print only the last line")
 
 

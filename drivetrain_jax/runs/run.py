@@ -83,7 +83,8 @@ def run(
     with shown_progress(report) as shown:
         if out is None:
             return _in_memory(_job(scene, overrides, on_disk=False), executor, shown)
-        run_to_file(scene, Path(out), overrides=overrides, fresh=fresh, executor=executor, reuse=reuse, report=shown)
+        more: dict[str, Any] = {"executor": executor, "reuse": reuse, "report": shown}
+        run_to_file(scene, Path(out), overrides=overrides, fresh=fresh, store="hdf5", **more)
     return open_result(Path(out))
 
 
@@ -95,15 +96,16 @@ def run_to_file(
     fresh: bool = False,
     executor: Executor | None = None,
     reuse: str | Path | Sequence[str | Path] = (),
-    store: str = "hdf5",
+    store: str | None = None,
     report: Report | None = None,
 ) -> Progress:
     """Like :func:`run` with ``out``, but returns the counts instead of the result.
 
-    ``store`` is ``hdf5``, or ``zarr`` if workers write a Zarr store (see :mod:`.zarr_sink`).
+    ``store`` is ``hdf5``, or ``zarr`` if workers write a Zarr store (see :mod:`.zarr_sink`); by default the name of ``out``
+    decides.
     """
     job = _job(scene, overrides, on_disk=True)
-    output = OutputState(out, job, store)
+    output = OutputState(out, job, _store(out, store))
     output.sink.check_job(job)
     output.restore()
     if not fresh and output.state == "complete":
@@ -116,6 +118,15 @@ def run_to_file(
     executor = executor or Threads()
     executor.check()
     return _into(output, output.reused_points(_paths(reuse), fresh), fresh, executor, report)
+
+
+def _store(out: Path, given: str | None) -> str:
+    """The store for ``out``, ``hdf5`` or ``zarr``; :class:`InputError` for an HDF5 file with the name of a Zarr store."""
+    named = out.suffix.lower() == ".zarr"
+    if named and given == "hdf5":
+        allowed = f"allowed is a name such as {out.stem}.nc, or `drivetrain run --store zarr`"
+        raise InputError(f"out = {str(out)!r}: names a Zarr store; {allowed}")
+    return given or ("zarr" if named else "hdf5")
 
 
 def _paths(reuse: str | Path | Sequence[str | Path]) -> Sequence[str | Path]:

@@ -26,7 +26,7 @@ from drivetrain_jax.runs import shard_writer, sharded_run, toml
 from drivetrain_jax.runs.executor import Executor, Threads
 from drivetrain_jax.runs.export import export
 from drivetrain_jax.runs.pending import PENDING
-from drivetrain_jax.runs.run import Incomplete, Interrupted, run_to_file
+from drivetrain_jax.runs.run import Incomplete, Interrupted, run, run_to_file
 from drivetrain_jax.runs.status import status
 from drivetrain_jax.store import shards, zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
@@ -85,6 +85,15 @@ def test_export_is_bit_identical_to_the_file(grid_scene, tmp_path, which):
     found = status(scene, tmp_path / "r.zarr")
     assert (found.state, found.done, found.failed) == ("complete", direct.total, direct.failed)
     assert to_store(scene, tmp_path / "r.zarr").reused == direct.total
+
+
+def test_the_name_chooses_the_store(tmp_path):
+    run_to_file(ONE, tmp_path / "r.zarr")
+    assert zarr_store.is_store(tmp_path / "r.zarr") and status(ONE, tmp_path / "r.zarr").state == "complete"
+    for refused in (lambda out: run_to_file(ONE, out, store="hdf5"), lambda out: run(ONE, out)):
+        with pytest.raises(InputError, match=r"names a Zarr store; allowed is a name such as s\.nc"):
+            refused(tmp_path / "s.zarr")
+    assert [path.name for path in tmp_path.iterdir()] == ["r.zarr"]
 
 
 def test_an_export_that_was_killed_at_its_end_is_finished_by_the_same_command(tmp_path, capsys):
