@@ -131,7 +131,7 @@ def _stored_curves(
     ranges: Mapping[str, tuple[float, float]],
     slices: Mapping[str, np.ndarray],
 ) -> dict[str, Any]:
-    """The curves of a chart, traced once for this atlas, this part of it and this code, and then kept in the user's cache."""
+    """The curves of a chart, traced once for this atlas, part and code, and then kept in the user's cache."""
     system, floquet = atlas.scene.system, atlas.scene_on({}).analysis
     known = find_system(system.name) is system
     panels = atlas.stability.atlas
