@@ -150,13 +150,19 @@ def _listen(distributed: Any, address: str) -> None:
     """
     if address.startswith(("tcp://", "tls://")):
         place = distributed.comm.get_address_host_port(address)
-        with socket.create_connection(place, timeout=_ACCEPTED) as connection:
+        with ExitStack() as stack:
+            connection = stack.enter_context(socket.create_connection(place, timeout=_ACCEPTED))
             connection.settimeout(_ANSWERED)
-            # With TLS the client speaks first. Dask sends the size of its greeting, in 8 bytes.
-            if address.startswith("tcp://"):
-                size = int.from_bytes(connection.recv(8, socket.MSG_WAITALL), "little")
-                if not 0 < size < _GREETING:
-                    raise ConnectionError
+            if address.startswith("tls://"):
+                context = distributed.Security().get_connection_args("client").get("ssl_context")
+                # Without certificates Dask itself refuses the address.
+                if context is None:
+                    return
+                connection = stack.enter_context(context.wrap_socket(connection))
+            # Dask sends the size of its greeting, in 8 bytes.
+            size = int.from_bytes(stack.enter_context(connection.makefile("rb")).read(8), "little")
+            if not 0 < size < _GREETING:
+                raise ConnectionError
 
 
 def _distributed() -> Any:

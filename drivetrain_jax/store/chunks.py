@@ -109,11 +109,14 @@ class PartsFolder:
     def open(self) -> None:
         """Create and lock the folder, without a change of its content.
 
-        Raises :class:`InputError` if another run has locked the folder, or if it cannot be created.
+        Raises :class:`InputError` if another run has locked the folder, or if it cannot be created or locked.
         """
+        file = self.path / "lock"
         while True:
             self._make()
-            lock = FileLock(self.path / "lock", timeout=0)
+            if os.path.lexists(file) and (file.is_symlink() or not file.is_file()):
+                raise InputError(f"out = {str(file)!r}: allowed is a regular file; remove it")
+            lock = FileLock(file, timeout=0)
             try:
                 lock.acquire()
             except Timeout:
@@ -121,7 +124,7 @@ class PartsFolder:
             except FileNotFoundError:
                 continue
             # Another run may have removed the folder between mkdir and lock.
-            if os.path.exists(self.path / "lock"):
+            if os.path.exists(file):
                 self._lock = lock
                 return
             lock.release()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import socket
 import time
 from pathlib import Path
 
@@ -202,6 +203,24 @@ def test_a_pipe_among_the_parts_stops_nothing(path, name):
     os.mkfifo(parts / name)
     status(SCENE, "n.nc")
     assert run_to_file(SCENE, Path("n.nc"), fresh=True).computed == 3 and not parts.exists()
+
+
+def bind(path):
+    with socket.socket(socket.AF_UNIX) as one:
+        one.bind(str(path))
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, lambda lock: lock.symlink_to("n.nc"), bind])
+def test_a_lock_that_is_no_file_is_refused(path, capsys, make):
+    lock = Path("n.nc.parts", "lock")
+    lock.parent.mkdir()
+    make(lock)
+    status(SCENE, "n.nc")
+    for more in ([], ["--fresh"]):
+        assert main(["run", "scene.toml", "--out", "n.nc", *more]) == 2
+        said = capsys.readouterr().err
+        assert said == f"drivetrain: out = {str(lock)!r}: allowed is a regular file; remove it\n"
+    assert os.path.lexists(lock)
 
 
 @pytest.mark.parametrize("scene", ['"x"', '"title = 1"', "3", "[]", "null"])

@@ -15,6 +15,7 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 
+from drivetrain_jax._errors import InputError
 from drivetrain_jax.cli import main
 from drivetrain_jax.runs import cluster, identity, toml, worker
 from drivetrain_jax.runs.resolve import resolve
@@ -93,17 +94,43 @@ def test_a_wrong_address_is_refused_soon(tmp_path, capsys, monkeypatch, where):
     assert spent < 3 and [p.name for p in tmp_path.iterdir()] == ["scene.toml"]
 
 
-@pytest.mark.full
-@pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl for a certificate")
-def test_a_cluster_with_tls_refuses_other_clients_and_other_workers(tmp_path):
-    pytest.importorskip("distributed")
-    key, cert = str(tmp_path / "key.pem"), str(tmp_path / "cert.pem")
+needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl for a certificate")
+
+
+def certificate(folder):
+    """Files of a new key and its certificate, and the settings with which Dask uses them."""
+    key, cert = str(folder / "key.pem"), str(folder / "cert.pem")
     make = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-subj", "/CN=dask", "-days", "2"]
     subprocess.run([*make, "-keyout", key, "-out", cert], check=True, capture_output=True)
-    prefix = "DASK_DISTRIBUTED__COMM__"
-    tls = {f"{prefix}REQUIRE_ENCRYPTION": "True", f"{prefix}TLS__CA_FILE": cert}
-    for part in ("SCHEDULER", "WORKER", "CLIENT"):
-        tls |= {f"{prefix}TLS__{part}__KEY": key, f"{prefix}TLS__{part}__CERT": cert}
+    own = {
+        f"tls.{role}.{name}": x
+        for role in ("scheduler", "worker", "client")
+        for name, x in (("key", key), ("cert", cert))
+    }
+    return {
+        f"distributed.comm.{name}": x for name, x in ({"require-encryption": True, "tls.ca-file": cert} | own).items()
+    }
+
+
+@needs_openssl
+@pytest.mark.parametrize("where", [closed, silent, talkative])
+def test_a_wrong_address_with_tls_is_refused_soon(tmp_path, monkeypatch, where):
+    distributed, dask = pytest.importorskip("distributed"), pytest.importorskip("dask")
+    monkeypatch.setattr(cluster, "_ANSWERED", 1.0)
+    monkeypatch.setattr(distributed, "Client", lambda *_, **__: pytest.fail("a client waits"))
+    with where() as address, dask.config.set(certificate(tmp_path)), ExitStack() as stack:
+        address, begin = address.replace("tcp", "tls"), time.monotonic()
+        with pytest.raises(InputError, match=f"dask = '{address}': no scheduler answers there"):
+            cluster._connect(distributed, address, stack)
+        assert time.monotonic() - begin < 3
+
+
+@pytest.mark.full
+@needs_openssl
+def test_a_cluster_with_tls_refuses_other_clients_and_other_workers(tmp_path):
+    pytest.importorskip("distributed")
+    settings = certificate(tmp_path)
+    tls = {f"DASK_{name}".upper().replace(".", "__").replace("-", "_"): str(x) for name, x in settings.items()}
     (tmp_path / "scene.toml").write_text(toml.write(SCENE))
     file = tmp_path / "scheduler.json"
 
