@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from drivetrain_jax.analysis.critical_speeds.mechanisms import highest_frequency
 from drivetrain_jax.systems import Shaft
 
-# Mass of a segment without mass over the mean mass, where it need only be negligible: its effect is of this order.
-_FAINT = 1e-48
+# Phase of a segment without mass over that of all others, where it need only be negligible: its effect is the fourth power.
+_FAINT = 1e-12
 
 
 class Scales(NamedTuple):
@@ -19,7 +20,7 @@ class Scales(NamedTuple):
     and S11: ``e1 = b EI``, ``e2 = b^2 EI``, ``e3 = b^3 EI`` with ``b = (rhoA/EI)^(1/4)``; shape ``(n, ...)`` each.
 
     A segment without mass takes the mean of all segments for ``rhoA``; results do not depend on it. ``r`` is the mass of
-    a segment over the one in its ``b``: 0 there, else 1. ``faint`` takes so small a part of it that r = 1 is right as well.
+    a segment over the one in its ``b``: 0 there, else 1. ``faint`` takes so short a phase that r = 1 is right as well.
     """
 
     beta: Array
@@ -32,8 +33,13 @@ class Scales(NamedTuple):
     @classmethod
     def of(cls, shaft: Shaft, faint: bool = False) -> Scales:
         """The scales of ``shaft``."""
-        massless, mean = shaft.rhoA == 0, _mean_mass(shaft.rhoA) * (_FAINT if faint else 1.0)
+        massless, mean = shaft.rhoA == 0, _mean_mass(shaft.rhoA)
         b = jnp.sqrt(jnp.sqrt(jnp.where(massless, mean, shaft.rhoA) / shaft.EI))
+        if faint:
+            phase = jnp.sum(jnp.where(massless, 0.0, shaft.length * b), axis=0)
+            highest = jnp.where(phase > 0, 1.0, highest_frequency(shaft))
+            phase = jnp.where(phase > 0, phase, 1 / jnp.where(highest == 0, 1.0, highest))
+            b = jnp.where(massless, _FAINT * jnp.minimum(b, phase / shaft.length), b)
         e1 = b * shaft.EI
         # Not the number 0: derivatives by rhoA pass here.
         return cls(shaft.length * b, b, e1, b * e1, b * b * e1, jnp.where(massless, shaft.rhoA / mean, 1.0))
