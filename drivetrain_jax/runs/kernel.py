@@ -28,6 +28,8 @@ _LAPACK = threading.Lock()
 # Up to this number of points and this predicted cost (in units of the plan), computing takes less time than optimising the
 # kernels.
 _FEW, _LIGHT = 128, 3e4
+# Kernels that a process keeps, of up to 40 MB each. Every list of fixed values and every path has its own.
+_KEPT = 16
 # GPU chunk size: 64 times the CPU size, at most 32,768.
 _WIDER, _WIDEST = 64, 1 << 15
 
@@ -156,7 +158,7 @@ def kernel_of(problem: Problem, grid: Grid, solver: Solver, size: int, few: bool
     return _compiled(key, size, few)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=_KEPT)
 def _compiled(key: _Key, size: int, few: bool) -> Kernel:
     content = [key.structure, [[v.name, v.dims, v.dtype] for v in key.variables], size]
     identity = program_identity(key.system, key.analysis, repr(content)) if key.is_named else ""

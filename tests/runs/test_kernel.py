@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import stat
 import subprocess
 import sys
+import weakref
 from dataclasses import replace
 
 import jax
@@ -193,3 +195,23 @@ def test_other_fixed_numbers_need_no_compilation():
     beta, omega = float(found.beta[7]), float(found.Omega[11])
     point = dt.point("cardan", "floquet", beta=beta, Omega=omega, **other["fixed"])
     assert float(found.spectral_radius[7, 11]) == pytest.approx(point["spectral_radius"].item(), rel=1e-9)
+
+
+def test_kernels_of_lists_and_paths_are_bounded(monkeypatch):
+    """Every fixed list is a constant of its own kernel: 20 lists compile 20, of which the latest stay in memory."""
+    made, original = [], kernel.compile_kernel
+
+    def counted(*of):
+        found = original(*of)
+        made.append(weakref.ref(found.compiled))
+        return found
+
+    monkeypatch.setattr(kernel, "compile_kernel", counted)
+    kernel._compiled.cache_clear()
+    scene = {"system": "toy", "analysis": "toy", "outputs": ["value"], "axes": {"a": {"values": [1.0, 2.0]}}}
+    lists = [[float(i), 2.0, 3.0] for i in range(1, 21)]
+    for length in (*lists, *lists[-16:]):
+        assert dt.run(scene | {"fixed": {"length": length, "b": 1.5 + length[0]}}).value[0] > 0
+    gc.collect()
+    assert len(made) == len(lists)
+    assert sum(each() is not None for each in made) == kernel._KEPT == 16
