@@ -8,8 +8,8 @@ from the eigenvalues.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from threading import Lock
 from typing import Any
@@ -22,7 +22,7 @@ from jax import Array
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.analysis.floquet import quartic
 from drivetrain_jax.analysis.floquet.results import VARIABLES
-from drivetrain_jax.analysis.numerics.kernels import compiler_options
+from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
 from drivetrain_jax.atlas import charts, evaluation
 from drivetrain_jax.atlas.expansion import Expansion
 from drivetrain_jax.atlas.floquet_quantity import Build, results_of_propagator
@@ -41,20 +41,22 @@ _JUDGING = Lock()
 class StabilityAtlas:
     """An atlas of the propagator of the reduced form of ``build(values)``, and the results that follow from it.
 
-    ``rtol`` is the target that determines outcomes.
+    ``rtol`` is the target that determines outcomes. ``keep(kernel, options, name)`` returns a kernel that does the same, and
+    may keep its compiled code for later processes.
     """
 
     atlas: Atlas
     build: Build
     rtol: float
+    keep: Callable[[Any, Mapping[str, Any], str], Any] = lambda kernel, _, __: kernel
 
     def slice(self, values: Mapping[str, float]) -> StabilityAtlas:
         """The atlas of the remaining parameters; raises as :meth:`Atlas.slice`."""
-        return StabilityAtlas(self.atlas.slice(values), self.build, self.rtol)
+        return replace(self, atlas=self.atlas.slice(values))
 
     def ordered(self, parameters: Sequence[str]) -> StabilityAtlas:
         """The atlas with the parameters in this order."""
-        return StabilityAtlas(self.atlas.ordered(parameters), self.build, self.rtol)
+        return replace(self, atlas=self.atlas.ordered(parameters))
 
     def at(self, points: np.ndarray, outputs: Sequence[str] = DEFAULT_OUTPUTS) -> dict[str, np.ndarray]:
         """Results by name at points ``(N, d)`` in the order of ``atlas.parameters``, points first, and ``outcome``.
@@ -65,7 +67,9 @@ class StabilityAtlas:
         if not (self.closed_form and _FAST.issuperset(outputs) and self.atlas.panels):
             return self.by_eigenvalues(points, outputs)
         x, found = self.atlas.to_coordinates(points), self.blank((len(points),), outputs)
-        kernel = point_kernel(self.build, self._may_be_undamped(points.T), len(points) <= LANES)
+        undamped, few = self._may_be_undamped(points.T), len(points) <= LANES
+        options = options_for_few() if few else compiler_options()
+        kernel = self.keep(point_kernel(self.build, undamped, few), options, f"points {undamped}")
         unsure = [np.empty(0, int)]
         for index, results in evaluated_cells(self._expansion, points, x, self.atlas, kernel, self.rtol):
             for name, values in found.items():
@@ -190,7 +194,7 @@ class StabilityAtlas:
 
         def kernel(dense: bool) -> Any:
             kind = "undamped" if undamped else "dense" if dense else "sparse"
-            return charts.tile_kernel(self.build, names, kind)
+            return self.keep(charts.tile_kernel(self.build, names, kind), compiler_options(), f"tile {names} {kind}")
 
         cut = tiles(self.atlas, coordinates, (charts.ROWS, charts.COLUMNS), rows=rows, dense=not undamped)
         again = [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -24,6 +25,7 @@ from drivetrain_jax.runs.axes import Axis
 from drivetrain_jax.runs.executor import Threads
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.physical import in_parameters
+from drivetrain_jax.runs.programs import kept
 from drivetrain_jax.runs.routes import DIRECT
 from drivetrain_jax.runs.scene import Scene, restore_scene
 from drivetrain_jax.runs.through_atlas import evaluate
@@ -53,7 +55,6 @@ _VARIABLES = {
     "gap_lower": (("gap", "parameter"), "lower corner of a box without a panel, in coordinates"),
     "gap_upper": (("gap", "parameter"), "upper corner of a box without a panel, in coordinates"),
 }
-
 # Every atlas has a domain, and panels, gaps or both.
 _DOMAIN, _GAPS = ("lower", "upper"), ("gap_lower", "gap_upper", "gap_reason")
 _PANELS = tuple(name for name in _VARIABLES if name not in (*_DOMAIN, *_GAPS))
@@ -110,7 +111,8 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
     arrays = blank | {"coefficients": np.empty((0, 0))} | arrays
     used = {name: scene.fixed[name] for name in scene.system.models["atlas"].parameters if name in scene.fixed}
     atlas = from_arrays(arrays, names, domain.coordinates, used, attrs["tolerance"], attrs["solves"])
-    return StoredAtlas(scene, stability_atlas(atlas, scene.system, scene.request.options["rtol"]))
+    stability = stability_atlas(atlas, scene.system, scene.request.options["rtol"])
+    return StoredAtlas(scene, replace(stability, keep=partial(kept, scene.system)))
 
 
 def _content(source: str | Path | xr.Dataset, label: str) -> tuple[dict[str, np.ndarray], Mapping[str, Any]]:
@@ -125,7 +127,6 @@ def _content(source: str | Path | xr.Dataset, label: str) -> tuple[dict[str, np.
         arrays = {n: dataset[n].values for n in (*_VARIABLES, "parameter", "gap_reason") if n in dataset}
     if attrs.get("analysis") != ANALYSIS.name:
         raise InputError(f"{label}: holds the analysis {attrs.get('analysis')!r}; allowed is an atlas")
-    # The bounds hold only for the panels as written.
     if changed:
         raise InputError(f"{label}: damaged ({checksums.named(changed)}); allowed is to restore it or to run it again")
     return arrays, attrs
@@ -275,9 +276,8 @@ class StoredAtlas:
 
         Without ``solve`` a point in a gap has no value and the outcome ``LOST``.
         """
-        scene = self.scene_on(columns, zipped=zipped)
-        job = Job(scene, DIRECT)
-        buffer = ResultBuffer(scene, job.grid)
+        job = Job(self.scene_on(columns, zipped=zipped), DIRECT)
+        buffer = ResultBuffer(job.scene, job.grid)
         evaluate(job, buffer, self.stability, Work(Threads()), Progress(job.total), solve=solve)
         return buffer.lay_out()
 

@@ -6,19 +6,26 @@ import hashlib
 import os
 import pickle
 import secrets
+import threading
 import zlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.experimental import serialize_executable
 
+from drivetrain_jax.analysis import get_analysis
 from drivetrain_jax.runs import compile_cache
+from drivetrain_jax.runs.identity import program_identity
+from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.store.files import write_atomic
 from drivetrain_jax.store.provenance import digest
+from drivetrain_jax.systems import System
 
 # Number of files that are kept; one takes some 300 kB.
 _MOST = 256
@@ -47,6 +54,39 @@ def compiled(
         found = jax.jit(named).lower(*kinds).compile(dict(options))
         _write(path, found)
     return found
+
+
+def kept(system: type[System], kernel: Any, options: Mapping[str, Any], name: str) -> Callable[..., Any]:
+    """``kernel``, a function of ``jax.jit`` with these ``options`` of the compiler, with its compiled code on disk.
+
+    Without a cache, and for a system of another package, it is ``kernel`` itself.
+    """
+    if compile_cache.programs() is None or find_system(system.name) is not system:
+        return kernel
+    identity = program_identity(system, get_analysis("floquet").for_system(system), name)
+    return _Kept(kernel, tuple(options.items()), identity) if identity else kernel
+
+
+@lru_cache(maxsize=64)
+class _Kept:
+    """A kernel that is compiled by :func:`compiled`, once for all arguments of the same kinds."""
+
+    def __init__(self, kernel: Any, options: tuple[tuple[str, Any], ...], identity: str) -> None:
+        self._kernel, self._options, self._identity = kernel, dict(options), identity
+        self._compiled: dict[tuple[Any, ...], jax.stages.Compiled] = {}
+        self._lock = threading.Lock()
+
+    def __call__(self, *arguments: Any) -> Any:
+        """The results of the kernel."""
+        arguments = jax.tree.map(np.asarray, arguments)
+        leaves, tree = jax.tree.flatten(arguments)
+        kinds = tuple((x.shape, x.dtype.str) for x in leaves)
+        with self._lock:
+            if (tree, kinds) not in self._compiled:
+                identity = digest([self._identity, str(tree), kinds])
+                kernel = compiled(self._kernel.__wrapped__, arguments, self._options, identity)
+                self._compiled[tree, kinds] = kernel
+        return self._compiled[tree, kinds](*arguments)
 
 
 def calls(kernel: jax.stages.Compiled, target: str) -> bool:
