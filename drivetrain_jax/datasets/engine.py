@@ -54,8 +54,9 @@ class AtlasEntrypoint(BackendEntrypoint):
         Args:
             filename_or_obj: path of the file.
             drop_variables: names of results to leave out.
-            grid: a mapping from names of parameters to a number of values between the ends of the atlas, ``(start, stop,
-                num)``, a row of values, or one value (a float); or one number of values for all parameters. Default: 512.
+            grid: a mapping from names of parameters, or of physical data, to a number of values between the ends of the
+                atlas, ``(start, stop, num)``, a row of values, or one value (a float); or one number of values for all
+                parameters. Default: 512.
             gaps: cells in a gap of the atlas are solved directly (``solve``), or have no value and the outcome ``gap``
                 (``nan``).
 
@@ -80,10 +81,12 @@ def _opened(path: str, grid: Any, solve: bool) -> xr.Dataset:
     from xarray.core import indexing
 
     from drivetrain_jax.analysis import OUTCOME
-    from drivetrain_jax.datasets.grid import grid_values
+    from drivetrain_jax.datasets.grid import grid_values, in_atlas_parameters
     from drivetrain_jax.datasets.lazy import GAP, AtlasArray, AtlasGrid, whole
     from drivetrain_jax.runs.assemble import to_dataset
+    from drivetrain_jax.runs.atlas_chart import in_physical_units
 
+    grid, views = in_atlas_parameters(whole(path), grid)
     axes, fixed = grid_values(whole(path), grid)
     cells = AtlasGrid(path, axes, fixed, solve)
     atlas = cells.atlas
@@ -103,7 +106,10 @@ def _opened(path: str, grid: Any, solve: bool) -> xr.Dataset:
         about = dataset[OUTCOME.name].attrs
         about["flag_values"] = np.arange(GAP + 1, dtype=OUTCOME.dtype)
         about["flag_meanings"] += " gap"
-    return dataset.assign_coords({name: ((), value, atlas.labels(name)) for name, value in fixed.items()})
+    dataset = dataset.assign_coords({name: ((), value, atlas.labels(name)) for name, value in fixed.items()})
+    for name, (quantity, convert) in views.items():
+        dataset = in_physical_units(dataset, name, quantity, convert)
+    return dataset
 
 
 def _chunks(axes: dict[str, Any], degrees: dict[str, int]) -> dict[str, int]:

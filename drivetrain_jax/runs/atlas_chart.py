@@ -16,6 +16,7 @@ import xarray as xr
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter
 from drivetrain_jax._units import factor
+from drivetrain_jax._wording import shown as quoted
 from drivetrain_jax.atlas import to_arrays
 from drivetrain_jax.atlas.boundaries import boundaries
 from drivetrain_jax.atlas.criteria import has_boundaries
@@ -47,8 +48,8 @@ def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, flo
     ``tip_NAME_error``, ``tip_opens``, ``tip_proved``), and boxes that may contain more tips (``undecided_NAME``). Raises
     :class:`InputError` for values outside the atlas, :class:`ChunkError` if a direct solve in a gap fails.
     """
-    if not 2 <= cells <= 20_000:
-        raise InputError(f"cells = {cells}: allowed is 2 <= cells <= 20000")
+    if not isinstance(cells, (int, np.integer)) or isinstance(cells, bool) or not 2 <= cells <= 20_000:
+        raise InputError(f"cells = {quoted(cells)}: allowed is a whole number, 2 <= cells <= 20000")
     atlas = open_atlas(source)
     views = _physical_views(atlas, part)
     ranges = _ranges(atlas, atlas.in_parameters(part))

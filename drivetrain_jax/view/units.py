@@ -15,6 +15,7 @@ from matplotlib.text import Text
 
 from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._wording import shown
 
 # The attribute with the units asked for, and the mark of a converted variable, which takes no further prefix.
 ASKED, CONVERTED = "figure_units", "converted"
@@ -28,7 +29,10 @@ def written_units(units: str) -> str:
 
 def listed(units: str | Sequence[str]) -> list[str]:
     """The units of ``"rpm,deg"`` or of a list; raises :class:`InputError` for an unknown one, and for two of one kind."""
-    found = [u.strip() for u in (units.split(",") if isinstance(units, str) else units)]
+    listing = units.split(",") if isinstance(units, str) else units
+    if not isinstance(listing, (list, tuple)) or not all(isinstance(unit, str) for unit in listing):
+        raise InputError(f'units = {shown(units)}: allowed are units such as "rpm,deg", or a list of them')
+    found = [unit.strip() for unit in listing]
     for number, unit in enumerate(found):
         try:
             _units.number(f"1 {unit}", unit)

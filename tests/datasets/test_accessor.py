@@ -139,6 +139,13 @@ def test_what_plot_takes(folder, chart):
         (["atlas.nc", "chart.nc"], {}, "results: an atlas among several; allowed is an atlas alone"),
         (["chart.nc"], {"cells": 5}, "cells = 5: a result on a grid is drawn whole; allowed for an atlas"),
         ([], {}, "result = []: allowed is a result, or a list of one or more"),
+        (["chart.nc"], {"units": 5}, 'units = 5: allowed are units such as "rpm,deg", or a list of them'),
+        (
+            ["chart.nc"],
+            {"units": ["rpm", 5]},
+            "units = ['rpm', 5]: allowed are units such as \"rpm,deg\", or a list of them",
+        ),
+        (["atlas.nc"], {"cells": "many"}, "cells = 'many': allowed is a whole number, 2 <= cells <= 20000"),
         ([5], {}, "result: got a int; allowed is a Dataset, the path of a result, or a list of them"),
     ],
 )

@@ -216,6 +216,22 @@ def test_values_of_all_kinds_make_a_grid(file):
     assert set(dropped.data_vars) == {"spectral_radius", "spectral_radius_error"}
 
 
+def test_physical_data_make_a_grid(file, atlas):
+    # 1 rad/s of this shaft is Omega = 0.01.
+    shaft = {"J1": 2.0, "k1": 2e4}
+    speeds = ("1100 rpm", "1700 rpm", 4)
+    found = opened(file, {"speed": speeds, **shaft, "angle": [5.0, 20.0]})
+    assert found["verdict"].dims == ("angle", "speed") and found["speed"].attrs["units"] == "rpm"
+    np.testing.assert_allclose(found["speed"], [1100, 1300, 1500, 1700], rtol=1e-14)
+    np.testing.assert_allclose(found["Omega"], found["speed"] * np.pi / 30 / 100, rtol=1e-14)
+    plain = atlas.grid(beta=found["beta"].values, Omega=found["Omega"].values)
+    np.testing.assert_array_equal(found["spectral_radius"], plain["spectral_radius"].values)
+    angle = opened(file, {"beta": ("3 deg", "0.5 rad", 3), "Omega": 5})["beta"].values
+    np.testing.assert_allclose(angle, np.linspace(np.pi / 60, 0.5, 3), rtol=1e-14)
+    with pytest.raises(dt.InputError, match=r"^J1: missing; Omega = speed sqrt\(J1/k1\) needs J1 and k1$"):
+        opened(file, {"speed": (1100.0, 1700.0, 4)})
+
+
 @pytest.mark.parametrize(
     ("grid", "message"),
     [
