@@ -69,8 +69,7 @@ def run(
         report: called with the :class:`Progress` after every chunk; by default a notebook shows a bar.
 
     Raises: :class:`InputError` with one line that names the field, the value and the allowed values, before anything is
-    computed or written; :class:`Incomplete` if the run failed. Finished chunks are kept. The message says whether the same
-    call may resume (after a full disk, too little memory, or a dead worker).
+    computed or written; :class:`Incomplete` if the run failed. Finished chunks stay. It says if the same call may resume.
 
     >>> import drivetrain_jax as dt
     >>> axes = {"k_sp": {"values": [4e8, 5e8]}}

@@ -163,11 +163,9 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
         for row in (_spread(dataset, down) if down else [0])
     ]
     # If all is stable there is no boundary to draw: show the spectral radius instead.
-    curves = boundaries.traced(dataset, horizontal, vertical)
-    plain = "spectral_radius" in dataset and not curves and bool((cells.states(dataset) == cells.STABLE).all())
+    plain = _is_stable(dataset) and not boundaries.traced(dataset, horizontal, vertical)
     margins = Margins(right=1.05 if plain else 0.25, top=1.12, between_rows=0.32, between_columns=0.16)
-    height = _SMALL_PANEL if len(slices) > 1 else _PANEL
-    panels = Panels(len(slices), len(slices[0]), height=height, margins=margins)
+    panels = Panels(len(slices), len(slices[0]), height=_SMALL_PANEL if len(slices) > 1 else _PANEL, margins=margins)
     predicted: list[Line2D] = []
     limit: list[Artist] = []
     labels: list[tuple[Axes, list[resonances.Prediction]]] = []
@@ -192,6 +190,11 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
     panels.titles(dataset, _notes(plain, len(slices) * len(slices[0]), count))
     panels.legend(predicted if plain else [*cells.state_legend(dataset), *limit, *predicted])
     return panels.figure
+
+
+def _is_stable(dataset: xr.Dataset) -> bool:
+    """True if all cells are stable and have a spectral radius."""
+    return "spectral_radius" in dataset and bool((cells.states(dataset) == cells.STABLE).all())
 
 
 def _clear_ticks(axes: Axes) -> list[float]:
