@@ -8,7 +8,7 @@ from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis._base import Request
 from drivetrain_jax.analysis.frequency_response import analysis as frequency_response
 from drivetrain_jax.analysis.frequency_response import harmonic_branch, harmonic_response
-from drivetrain_jax.analysis.impacts import exact_branch
+from drivetrain_jax.analysis.impacts import exact_branch, orbit_branch
 from drivetrain_jax.analysis.impacts.branch_sections import distinct
 from drivetrain_jax.systems import rattle
 from tests.quick_jit import quick_jit
@@ -46,6 +46,11 @@ def test_a_motion_that_cannot_be_corrected(method, module, name, monkeypatch):
     number, outcome = branch(method)
     assert number[1] < 3
     np.testing.assert_array_equal(outcome == Outcome.TOLERANCE_NOT_MET, number < [1, 3, 1])
+
+
+def test_a_branch_of_too_many_steps_is_not_complete(monkeypatch):
+    monkeypatch.setattr(orbit_branch, "_BUDGET", 500.0)
+    np.testing.assert_array_equal(branch("exact")[1], Outcome.TOLERANCE_NOT_MET)
 
 
 def test_two_places_that_are_corrected_to_one_motion():

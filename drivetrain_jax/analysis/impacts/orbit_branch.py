@@ -31,7 +31,8 @@ _ASIDE = 1 / 3
 # the last two points, relative to the smallest test value (``det(1 -+ M)``); least such value; fraction of the longest step
 # up to which steps are always accepted.
 _BENT, _LEAST_DISTANCE, _FINE = 0.25, 0.02, 0.01
-_MOST_STEPS = 100_000
+# Most steps of the motion over a period, and of all motions of a branch.
+_MOST_STEPS, _BUDGET = 100_000, 5e6
 # Locating a fold or doubling: most steps, and size of the last step relative to the chord.
 _ROOT_STEPS, _LOCATED = 40, 1e-13
 
@@ -50,10 +51,11 @@ class _Solved(NamedTuple):
     derivative: Array
     corrections: Array
     change: Array
+    steps: Array
 
 
-def _map(model: PiecewiseLinearOscillator, multiple: int, x: Array) -> tuple[Array, Matrix, Array]:
-    """``F^m`` of the state, its transition matrix, and its derivative by omega from a forward difference."""
+def _map(model: PiecewiseLinearOscillator, multiple: int, x: Array) -> tuple[Array, Matrix, Array, Array]:
+    """``F^m`` of the state, its transition matrix, its derivative by omega from a forward difference, and the steps."""
     omega = jnp.concatenate([x[2], x[2] * (1 + _DIFFERENCE)])
     twice = {name: jnp.tile(value, 2) for name, value in vars(model).items() if name != "omega" and jnp.ndim(value)}
     lanes = prepare(replace(model, **twice).at(omega))
@@ -63,7 +65,7 @@ def _map(model: PiecewiseLinearOscillator, multiple: int, x: Array) -> tuple[Arr
     state = jnp.stack([end.u, end.v])
     derivative = (state[:, half:] - state[:, :half]) / (omega[half:] - omega[:half])
     missing = jnp.where(end.left[:half] > 0, jnp.nan, 0.0)
-    return state[:, :half] + missing, tuple(entry[:half] for entry in end.matrix), derivative
+    return state[:, :half] + missing, tuple(entry[:half] for entry in end.matrix), derivative, end.steps[:half]
 
 
 def _solve_3(rows: tuple[tuple[Array, Array, Array], ...], right: tuple[Array, Array, Array]) -> Array:
@@ -94,7 +96,7 @@ def _on_plane(model: PiecewiseLinearOscillator, multiple: int, guess: Array, nor
 
     def correct(state: tuple[Array, _Solved]) -> tuple[Array, _Solved]:
         count, old = state
-        end, m, derivative = _map(model, multiple, old.x)
+        end, m, derivative, steps = _map(model, multiple, old.x)
         rows = (
             (m[0] - 1, m[1], derivative[0]),
             (m[2], m[3] - 1, derivative[1]),
@@ -104,11 +106,11 @@ def _on_plane(model: PiecewiseLinearOscillator, multiple: int, guess: Array, nor
         step = _solve_3(rows, (old.x[0] - end[0], old.x[1] - end[1], along))  # pyright: ignore[reportArgumentType]
         change = jnp.max(jnp.abs(step / scale), axis=0)
         open_ = old.change > _CONVERGED
-        new = _Solved(old.x + step, m, derivative, old.corrections + 1, change)
+        new = _Solved(old.x + step, m, derivative, old.corrections + 1, change, old.steps + steps)
         return count + 1, jax.tree.map(lambda a, b: jnp.where(open_, a, b), new, old)
 
     zero = jnp.zeros(lanes)
-    first = _Solved(guess, (zero,) * 4, jnp.zeros((2, lanes)), jnp.zeros(lanes, jnp.int32), zero + jnp.inf)
+    first = _Solved(guess, (zero,) * 4, jnp.zeros((2, lanes)), jnp.zeros(lanes, jnp.int32), zero + jnp.inf, zero)
     return jax.lax.while_loop(going, correct, (jnp.asarray(0), first))[1]
 
 
@@ -135,14 +137,15 @@ def scale_of(model: PiecewiseLinearOscillator, x: Array, highest: float = np.inf
 
 
 class _Front(NamedTuple):
-    """The last orbit, the tangent there, the length of the next step, the number of the orbit on the branch, and the
-    last change of the trace of the transition matrix."""
+    """The last orbit, the tangent there, the length of the next step, the number of the orbit on the branch, the last
+    change of the trace of the transition matrix, and the steps of all motions."""
 
     solved: _Solved
     tangent: Array
     length: Array
     number: Array
     slope: Array
+    spent: Array
 
 
 def follow(
@@ -158,8 +161,8 @@ def follow(
     """The branch of orbits of ``multiple`` drive periods through ``x = (u, v, omega)``, shape ``(3, N)``.
 
     ``x`` is a guess for the first point, whose frequency is kept. ``direction`` (+1, -1), a number or of shape ``(N,)``, is
-    the initial direction of omega. The branch ends beyond the ``limits`` of omega or after ``attempts`` steps, failed ones
-    included. ``longest`` is the longest step, in units of :func:`scale_of`.
+    the initial direction of omega. The branch ends beyond the ``limits`` of omega, after ``attempts`` steps, failed ones
+    included, or when its motions have taken 5e6 steps. ``longest`` is the longest step, in units of :func:`scale_of`.
     """
     scale = scale_of(model, x, limits[1])
     rise = jnp.zeros_like(x).at[2].set(direction)
@@ -170,7 +173,9 @@ def follow(
 
     def step(state: tuple[Array, _Front, Array]) -> tuple[Array, _Front, Array]:
         count, front, store = state
-        guess = front.solved.x + front.length * front.tangent * scale
+        # A branch that has ended does not move.
+        going = _going(front, limits)
+        guess = jnp.where(going, front.solved.x + front.length * front.tangent * scale, jnp.nan)
         there = _on_plane(model, multiple, guess, front.tangent, scale)
         aside = jnp.sqrt(jnp.sum(((there.x - guess) / scale) ** 2, axis=0))
         near = (aside <= _ASIDE * front.length) & ((front.length <= _FINE * longest) | _straight(front, there))
@@ -186,6 +191,7 @@ def follow(
         jnp.full(lanes.shape, longest),
         jnp.zeros_like(lanes),
         jnp.zeros(lanes.shape),
+        first.steps,
     )
     *_, store = jax.lax.while_loop(unfinished, step, (jnp.asarray(1), begin, store))
     return Branch(store[:, :3], tuple(store[:, 3 + k] for k in range(4)))
@@ -199,7 +205,8 @@ def _row(solved: _Solved) -> Array:
 def _going(front: _Front, limits: tuple[float, float]) -> Array:
     """Flags of branches that have not ended."""
     omega = front.solved.x[2]
-    return (omega >= limits[0]) & (omega <= limits[1]) & (front.length > _SHORTEST)
+    inside = (omega >= limits[0]) & (omega <= limits[1])
+    return inside & (front.length > _SHORTEST) & (front.spent <= _BUDGET)
 
 
 def _straight(front: _Front, there: _Solved) -> Array:
@@ -229,6 +236,7 @@ def _moved(
         jnp.where(good, longer, _SHORTER * front.length),
         front.number + moved,
         jnp.where(moved, slope, front.slope),
+        front.spent + there.steps,
     )
 
 
