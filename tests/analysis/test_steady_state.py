@@ -11,9 +11,10 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import Outcome, Request, get_analysis
-from drivetrain_jax.analysis.impacts import attractor
+from drivetrain_jax.analysis.impacts import attractor, exact_response
 from drivetrain_jax.analysis.impacts.attractor import Attractors, attractors
 from drivetrain_jax.analysis.impacts.exact_response import describe, sweeps
+from drivetrain_jax.analysis.impacts.orbit_measures import measure
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
 from drivetrain_jax.systems import PiecewiseLinearOscillator, get_system
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
@@ -360,3 +361,17 @@ def test_a_motion_stops_at_a_number_of_steps_in_all(monkeypatch):
     monkeypatch.setattr(attractor, "_PER_PERIOD", 1)
     stopped, periods = stalled()
     assert stopped == 1 and 0 < periods < 300
+
+
+def test_searches_count_as_steps_and_stopped_motions_are_not_measured(monkeypatch):
+    """The first search is stopped, before a period has settled."""
+    slow = TABLE1 | {"alpha": 0.0, "omega": 1e-3, "u0": 0.0, "v0": 0.0}
+    model = Rattle.models["steady_state"].build({name: jnp.full(1, slow[name]) for name in NAMES})
+    monkeypatch.setattr(attractor, "_BUDGET", 100)
+    monkeypatch.setattr(attractor, "_PER_PERIOD", 0)
+    found = attractors(model, jnp.zeros((1, 1), jnp.int32), jnp.zeros(1), jnp.zeros(1), most_periods=64, width=1)
+    assert (found.stalled.item(), found.periods.item()) == (1, 0)
+    measured = []
+    monkeypatch.setattr(exact_response, "measure", lambda *of, **more: measured.append(of[1]) or measure(*of, **more))
+    result = exact_response.describe(model, jax.tree.map(lambda x: x[:, 0], found), rtol=1e-10)
+    assert np.isnan(measured[0]).all() and result["outcome"] == Outcome.STEP_LIMIT and np.isnan(result["u_max"])

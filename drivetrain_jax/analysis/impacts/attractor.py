@@ -38,6 +38,7 @@ from drivetrain_jax.analysis.impacts.attractor_lanes import (
     try_line,
 )
 from drivetrain_jax.analysis.impacts.piecewise_march import (
+    FEW,
     Lanes,
     Motion,
     allowed_steps,
@@ -55,8 +56,9 @@ _CORRECTIONS, _CONVERGED, _ROUNDING = 12, 1e-11, 1e-7
 _SHRINKING = 0.75
 # A search fails at this multiple of the usual velocity, or of the steps for settling.
 _ASTRAY, _COSTLY = 3.0, 4
-# A lane stops at these steps in all, and as many more for each of ``most_periods``, so that it never holds up the others.
-_BUDGET, _PER_PERIOD = 1e7, 200
+# Most steps of a point, searches included, and more for each of ``most_periods``. Of 64 points with drives down to 1e-3 of
+# the natural frequency and damping down to 1e-4, 62 need at most 5e5, and the others do not repeat within 2e6.
+_BUDGET, _PER_PERIOD = 4e5, 100
 _EPS = np.finfo(float).eps
 
 
@@ -66,7 +68,7 @@ class Attractors(NamedTuple):
     ``u, v``: state at the start of a drive period; ``multiple``: number of periods m after which the state recurs (0 if not
     within 32); ``matrix``: transition matrix over m periods; ``error``: estimated absolute error of u; ``periods``: drive
     periods run; ``exponent``: Lyapunov exponent per unit of time, meaningful if ``multiple`` is 0; ``stalled``: 1 if the
-    motion was stopped because of its number of steps or because it is not finite, else 0.
+    motion was stopped because of its number of steps, 2 because it is not finite, else 0.
     """
 
     u: Array
@@ -208,9 +210,9 @@ def _tick(task: _Task, work: _Work) -> _Work:
     local = take(task.oscillator, task.visits[place])
     lanes = prepare(local)
     omega = lanes.omega + jnp.zeros(place.shape)
-    lane = lane._replace(motion=few_steps(lanes, lane.motion))
+    lane = lane._replace(motion=few_steps(lanes, lane.motion), spent=lane.spent + FEW)
     broken = ~jnp.isfinite(lane.motion.u) | (lane.motion.steps > _most_steps(lane, lanes))
-    broken |= lane.cost.astype(float) * lane.count > _BUDGET + _PER_PERIOD * task.most_periods
+    broken |= lane.spent > _BUDGET + _PER_PERIOD * task.most_periods
     ready = working & ((lane.motion.left <= 0) | broken)
     shot, probed = (ready & lane.searching & ~broken & (on == (lane.probing >= 0)) for on in (False, True))
     after, verdict = _shoot(lane, shot, local, lanes, omega)
@@ -250,7 +252,7 @@ def _result(lane: Lane, reached: Array, stalled: Array, span: Array) -> Attracto
         error=jnp.where(reached, orbit.error, jnp.nan),
         periods=lane.count,
         exponent=lane.growth / span,
-        stalled=stalled,
+        stalled=jnp.where(stalled, jnp.where(jnp.isfinite(lane.motion.u), 1, 2), 0),
     )
 
 

@@ -45,6 +45,7 @@ class Lane(NamedTuple):
     tangent: tuple[Array, Array]
     growth: Array  # logarithm of the growth of the tangent
     cost: Array  # largest number of steps of a settled period
+    spent: Array  # steps in all, of searches too
     searching: Array
     multiple: Array
     corrections: Array
@@ -203,6 +204,7 @@ def enter(lane: Lane, now: Array, job: Array, place: Array, u: Array, v: Array, 
         tangent=(zero + 0.6, zero + 0.8),
         growth=zero,
         cost=jnp.zeros_like(lane.count),
+        spent=zero,
     )
     return search(select(now, fresh, lane), now, hint, hint)
 
@@ -222,6 +224,7 @@ def blank(width: int) -> Lane:
         tangent=pair,
         growth=real,
         cost=whole,
+        spent=real,
         searching=flag,
         multiple=whole + 1,
         corrections=whole,

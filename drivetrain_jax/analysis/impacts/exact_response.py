@@ -56,7 +56,10 @@ def describe(
     ``outcome`` is TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its size, or a thousandth of the
     largest distance from the flanks, and NOT_FINITE where its size exceeds ``largest``.
     """
-    seen = measure(oscillator, found.u, found.v, found.multiple, width=WIDTH, integrals=integrals)
+    # A motion that was stopped for its number of steps has long periods: it is not measured.
+    stopped = found.stalled == 1
+    begin = jnp.where(stopped, jnp.nan, found.u)
+    seen = measure(oscillator, begin, found.v, found.multiple, width=WIDTH, integrals=integrals)
     periodic = found.multiple > 0
     growth = found.exponent * averaged(found.periods) * oscillator.period
     wild = ~periodic & (growth > _WILD)
@@ -67,7 +70,7 @@ def describe(
     unstable = periodic & (results["spectral_radius"] > 1 + _UNSTABLE)
     outcome = jnp.where((periodic | wild) & ~unstable, outcome, Outcome.NOT_CONVERGED)
     outcome = jnp.where((found.stalled > 0) | (seen.complete == 0), Outcome.STEP_LIMIT, outcome)
-    finite = jnp.isfinite(found.u) & jnp.isfinite(seen.high + seen.low) & (size <= largest)
+    finite = jnp.isfinite(found.u) & (stopped | (jnp.isfinite(seen.high + seen.low) & (size <= largest)))
     outcome = jnp.where(finite, outcome, Outcome.NOT_FINITE)
     known = outcome < Outcome.NOT_CONVERGED
     results |= {name: jnp.where(periodic, results[name], jnp.nan) for name in ("floquet_multiplier", "spectral_radius")}

@@ -37,7 +37,8 @@ _MOST_STEPS = 2e7
 # Distance from a flank, in half backlashes, within which a lane is carried over it; longest such step of a slow lane, in
 # radians of the region's fastest motion.
 _ON_FLANK, _RESTING_ARC = 4e-16, 0.1
-_FEW = 8
+# Steps between two looks at the lanes.
+FEW = 8
 
 
 class Lanes(NamedTuple):
@@ -238,7 +239,7 @@ def step(lanes: Lanes, motion: Motion) -> Motion:
 
 def few_steps(lanes: Lanes, motion: Motion) -> Motion:
     """``motion`` after a fixed small number of steps."""
-    return jax.lax.fori_loop(0, _FEW, lambda _, moving: step(lanes, moving), motion)
+    return jax.lax.fori_loop(0, FEW, lambda _, moving: step(lanes, moving), motion)
 
 
 def usual_steps(lanes: Lanes) -> Array:
