@@ -238,7 +238,7 @@ def _summary(
 def main(argv: Sequence[str] | None = None) -> None:
     """Measure, print and write."""
     options = parser(__doc__).parse_args(argv)
-    count, compared = (512, 8) if options.quick else (4096, 200)
+    count, compared = (512, 8) if options.quick else (4096, 100)
     # A forced motion costs a thousand times as much as a frequency.
     counts = {"cardan, forced": count // 8}
     rows = [row_of(name, make(counts.get(name, count)), compared) for name, make in STUDIES.items()]
