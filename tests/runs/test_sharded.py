@@ -285,7 +285,7 @@ def test_written_shards_of_unfinished_work_are_counted_opened_and_resumed(grid_s
 
 
 def test_interrupted_damaged_and_resumed(grid_scene, tmp_path):
-    scene, path, pool = large(grid_scene), tmp_path / "r.zarr", threads(1, "chunk")
+    scene, path, pool = large(grid_scene), tmp_path / "r.store", threads(1, "chunk")
     with pytest.raises(Interrupted) as stopped:
         to_store(scene, path, executor=Threads(1), report=stop_after(3))
     # The thread of the interrupted run must end, as it would with its process.
@@ -294,7 +294,7 @@ def test_interrupted_damaged_and_resumed(grid_scene, tmp_path):
     assert 0 < done <= found.done < 1640 and found.state == "partial" and not path.exists()
     with pytest.raises(InputError, match="unfinished work of --store zarr"):
         run_to_file(scene, path)
-    file = next((tmp_path / "r.zarr.parts").glob("*.h5"))
+    file = next((tmp_path / "r.store.parts").glob("*.h5"))
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 4
     file.write_bytes(data)
@@ -517,14 +517,16 @@ def test_the_command_line(tmp_path, monkeypatch, capsys):
     (tmp_path / "scene.toml").write_text(toml.write(POINTS))
     assert main(["run", "scene.toml", "--out", "r.zarr", "--store", "zarr", "--quiet"]) == 0
     assert main(["export", "r.zarr", "e.nc"]) == 0 and main(["verify", "r.zarr"]) == 0
-    assert opened("e.nc").equals(dt.run(POINTS))
+    assert opened("e.nc").equals(dt.run(POINTS)) and main(["run", "scene.toml", "--out", "r.zarr", "--quiet"]) == 0
+    (tmp_path / "d").mkdir()
     capsys.readouterr()
     for arguments, part in [
         (["export", "nothing", "f.nc"], "not a Zarr store"),
         (["export", "r.zarr", "e.nc"], "allowed is a new file"),
         (["export", "r.zarr", "nowhere/e.nc"], "allowed is a new file"),
         (["run", "scene.toml", "--out", "e.nc", "--store", "zarr"], "is a file"),
-        (["run", "scene.toml", "--out", "r.zarr"], "is a folder"),
+        (["run", "scene.toml", "--out", "d"], "is a folder"),
+        (["run", "scene.toml", "--out", "r.zarr", "--store", "hdf5"], "names a Zarr store"),
         (["run", "scene.toml", "--out", "f.zarr", "--store", "zarr", "--reuse", "e.nc"], "reuse: given together"),
     ]:
         assert main(arguments) == 2
