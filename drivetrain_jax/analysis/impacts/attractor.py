@@ -68,7 +68,7 @@ class Attractors(NamedTuple):
     ``u, v``: state at the start of a drive period; ``multiple``: number of periods m after which the state recurs (0 if not
     within 32); ``matrix``: transition matrix over m periods; ``error``: estimated absolute error of u; ``periods``: drive
     periods run; ``exponent``: Lyapunov exponent per unit of time, meaningful if ``multiple`` is 0; ``stalled``: 1 if the
-    motion was stopped because of its number of steps, 2 because it is not finite, else 0.
+    motion was stopped because of its number of steps (it is not measured), 2 because it is not finite, else 0.
     """
 
     u: Array

@@ -56,13 +56,11 @@ def describe(
     ``outcome`` is TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its size, or a thousandth of the
     largest distance from the flanks, and NOT_FINITE where its size exceeds ``largest``.
     """
-    # A motion that was stopped for its number of steps has long periods: it is not measured.
     stopped = found.stalled == 1
-    begin = jnp.where(stopped, jnp.nan, found.u)
-    seen = measure(oscillator, begin, found.v, found.multiple, width=WIDTH, integrals=integrals)
+    u, v = jnp.where(stopped, jnp.nan, found.u), found.v
+    seen = measure(oscillator, u, v, found.multiple, width=WIDTH, integrals=integrals)
     periodic = found.multiple > 0
-    growth = found.exponent * averaged(found.periods) * oscillator.period
-    wild = ~periodic & (growth > _WILD)
+    wild = ~periodic & (found.exponent * averaged(found.periods) * oscillator.period > _WILD)
     size = jnp.maximum(jnp.abs(seen.high), jnp.abs(seen.low))
     exact = (found.error <= rtol * size) & (found.error <= _DECIDES * _away(oscillator, seen))
     outcome = jnp.where(periodic & ~exact, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
@@ -75,8 +73,7 @@ def describe(
     known = outcome < Outcome.NOT_CONVERGED
     results |= {name: jnp.where(periodic, results[name], jnp.nan) for name in ("floquet_multiplier", "spectral_radius")}
     results["lyapunov_exponent"] = jnp.where(periodic, results["lyapunov_exponent"], found.exponent)
-    state = jnp.stack([found.u, found.v])
-    results |= {"orbit_state": state, "state_error": jnp.where(periodic, found.error, jnp.nan)}
+    results |= {"orbit_state": jnp.stack([found.u, found.v]), "state_error": jnp.where(periodic, found.error, jnp.nan)}
     results = {name: jnp.where(known, value, jnp.nan) for name, value in results.items()}
     kind = jnp.where(periodic, regime(oscillator, seen.high, seen.low), NON_PERIODIC)
     return results | {

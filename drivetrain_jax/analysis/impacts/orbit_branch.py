@@ -173,9 +173,7 @@ def follow(
 
     def step(state: tuple[Array, _Front, Array]) -> tuple[Array, _Front, Array]:
         count, front, store = state
-        # A branch that has ended does not move.
-        going = _going(front, limits)
-        guess = jnp.where(going, front.solved.x + front.length * front.tangent * scale, jnp.nan)
+        guess = jnp.where(_going(front, limits), front.solved.x + front.length * front.tangent * scale, jnp.nan)
         there = _on_plane(model, multiple, guess, front.tangent, scale)
         aside = jnp.sqrt(jnp.sum(((there.x - guess) / scale) ** 2, axis=0))
         near = (aside <= _ASIDE * front.length) & ((front.length <= _FINE * longest) | _straight(front, there))
@@ -203,7 +201,7 @@ def _row(solved: _Solved) -> Array:
 
 
 def _going(front: _Front, limits: tuple[float, float]) -> Array:
-    """Flags of branches that have not ended."""
+    """Flags of branches that have not ended; the others do not move."""
     omega = front.solved.x[2]
     inside = (omega >= limits[0]) & (omega <= limits[1])
     return inside & (front.length > _SHORTEST) & (front.spent <= _BUDGET)
