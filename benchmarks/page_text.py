@@ -12,9 +12,11 @@ from pathlib import Path
 from benchmarks import page_precision, page_sections, ratio_figure
 from benchmarks.precision import GOAL
 from benchmarks.results_files import (
+    CHART,
     ResultFile,
     Row,
     against,
+    at_equal_error,
     count,
     load,
     markdown,
@@ -32,16 +34,6 @@ NAMES = (
     "chaos_precision", "damping", "batches", "outputs", "cold_start", "overhead", "scaling", "accelerator",
     "precision_forced", "precision_gradients", "precision_attractors", "random_points",
 )  # fmt: skip
-# Families of the chart: prefix of the label -> name in a sentence.
-CHART = {
-    "drivetrain_jax direct": "`direct`",
-    "heyoka batch": "heyoka batch",
-    "scipy DOP853 stacked, half period": "SciPy DOP853 on the stacked grid over half a period",
-    "scipy DOP853 stacked": "SciPy DOP853 on the stacked grid",
-    "scipy DOP853": "SciPy DOP853 point by point",
-    "scipy RK45": "SciPy RK45 point by point, the paper's method",
-    "drivetrain_jax diffrax": "`diffrax`",
-}
 _FLOWS = {"Lorenz": "Lorenz' system", "tripod": "the double tripod"}
 
 Files = dict[str, ResultFile | None]
@@ -132,22 +124,6 @@ def conclusions(files: Files, precise: dict[str, page_precision.Precision]) -> l
         _accelerator_sentence(files["accelerator"]),
     ]
     return [sentence for sentence in found if sentence]
-
-
-def family(row: Row) -> str:
-    """The family of a row of throughput.csv: the longest matching prefix in ``CHART``."""
-    return max((name for name in CHART if row["method"].startswith(name)), key=len, default="")
-
-
-def at_equal_error(file: ResultFile) -> dict[str, Row]:
-    """The fastest setting with an error of at most 1e-9 of each family, in the order of ``CHART``."""
-    best: dict[str, Row] = {}
-    for name in CHART:
-        rows = [r for r in file.rows if family(r) == name and "without" not in r["method"]]
-        good = [row for row in rows if float(row["max_error"]) <= GOAL]
-        if good:
-            best[name] = max(good, key=lambda row: float(row["cells_per_s"]))
-    return best
 
 
 def _rate(row: Row) -> float:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import matplotlib
 
 from benchmarks import page_precision
-from benchmarks.results_files import LEVEL, ResultFile, times
+from benchmarks.results_files import CHART, LEVEL, ResultFile, at_equal_error, times
 
 matplotlib.use("Agg")
 
@@ -44,8 +44,6 @@ def ratios(files: Files, precise: Mapping[str, page_precision.Precision]) -> dic
 
 
 def _charts(files: Files) -> list[Ratio]:
-    from benchmarks.page_text import CHART, at_equal_error
-
     rows = []
     chart = at_equal_error(files["throughput"]) if files["throughput"] else {}
     own = chart.pop("drivetrain_jax direct", None)

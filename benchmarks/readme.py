@@ -6,7 +6,19 @@ from pathlib import Path
 
 from benchmarks import page_precision, page_text
 from benchmarks.precision import GOAL
-from benchmarks.results_files import ResultFile, Row, between_marks, count, load, markdown, not_measured, seconds, small
+from benchmarks.results_files import (
+    ResultFile,
+    Row,
+    at_equal_error,
+    between_marks,
+    count,
+    family,
+    load,
+    markdown,
+    not_measured,
+    seconds,
+    small,
+)
 from benchmarks.timing import RESULTS
 
 README = Path(__file__).resolve().parents[1] / "README.md"
@@ -36,7 +48,7 @@ def section(folder: Path = RESULTS) -> str:
 def _chart(file: ResultFile | None) -> list[str]:
     if file is None:
         return [not_measured("throughput")]
-    good = page_text.at_equal_error(file)
+    good = at_equal_error(file)
     exact = [_most_exact(file, name) for name in LABELS if name not in good]
     shown = [*(row for name, row in good.items() if name in LABELS), *filter(None, exact)]
     rows = [
@@ -52,11 +64,11 @@ def _chart(file: ResultFile | None) -> list[str]:
 
 
 def _label(row: Row) -> str:
-    return f"{LABELS[page_text.family(row)]}, {row['method'].rpartition(', ')[2]}"
+    return f"{LABELS[family(row)]}, {row['method'].rpartition(', ')[2]}"
 
 
 def _most_exact(file: ResultFile, name: str) -> Row | None:
-    rows = [row for row in file.rows if page_text.family(row) == name]
+    rows = [row for row in file.rows if family(row) == name]
     return min(rows, key=lambda row: float(row["max_error"]), default=None)
 
 

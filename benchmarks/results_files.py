@@ -8,12 +8,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.precision import GOAL
+
 Row = Mapping[str, str]
 # Ratio of times up to which two methods count as equally fast.
 LEVEL = 1.1
 # Marks around the generated part of a page.
 BEGIN = "<!-- Written by `python -m benchmarks.page`; do not edit. -->"
 END = "<!-- End of the generated part. -->"
+# Families of the chart: prefix of the label -> name in a sentence.
+CHART = {
+    "drivetrain_jax direct": "`direct`",
+    "heyoka batch": "heyoka batch",
+    "scipy DOP853 stacked, half period": "SciPy DOP853 on the stacked grid over half a period",
+    "scipy DOP853 stacked": "SciPy DOP853 on the stacked grid",
+    "scipy DOP853": "SciPy DOP853 point by point",
+    "scipy RK45": "SciPy RK45 point by point, the paper's method",
+    "drivetrain_jax diffrax": "`diffrax`",
+}
 _PROVENANCE = ("date", "commit", "machine", "load", "versions", "accelerator")
 
 
@@ -39,6 +51,22 @@ def load(folder: Path, name: str) -> ResultFile | None:
     notes = [line for line, (key, _, _) in zip(head, pairs, strict=True) if key not in _PROVENANCE]
     rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
     return ResultFile(name, facts, notes, rows)
+
+
+def family(row: Row) -> str:
+    """The family of a row of throughput.csv: the longest matching prefix in ``CHART``."""
+    return max((name for name in CHART if row["method"].startswith(name)), key=len, default="")
+
+
+def at_equal_error(file: ResultFile) -> dict[str, Row]:
+    """The fastest setting with an error of at most 1e-9 of each family, in the order of ``CHART``."""
+    best: dict[str, Row] = {}
+    for name in CHART:
+        rows = [r for r in file.rows if family(r) == name and "without" not in r["method"]]
+        good = [row for row in rows if float(row["max_error"]) <= GOAL]
+        if good:
+            best[name] = max(good, key=lambda row: float(row["cells_per_s"]))
+    return best
 
 
 def count(value: str | float) -> str:
