@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import io
+import json
 import os
-import pickle
 import secrets
 import threading
 import zlib
@@ -12,12 +13,13 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental import serialize_executable
+from jax.tree_util import PyTreeDef, default_registry
 
 from drivetrain_jax.analysis import get_analysis
 from drivetrain_jax.runs import compile_cache
@@ -31,8 +33,9 @@ from drivetrain_jax.systems import System
 _MOST = 256
 _DIGEST = 16
 # Errors of a file that is missing, damaged or of no use here.
-_UNUSABLE = (OSError, ValueError, TypeError, zlib.error, pickle.UnpicklingError, jax.errors.JaxRuntimeError)
-T = TypeVar("T")
+_UNUSABLE = (OSError, ValueError, TypeError, KeyError, zlib.error, jax.errors.JaxRuntimeError)
+# Coordinates of xarray by name: dimensions, values, attributes.
+Coordinates = dict[str, tuple[Any, np.ndarray, dict[str, str]]]
 
 
 def compiled(
@@ -46,7 +49,7 @@ def compiled(
     path = folder / digest([identity, dict(options)]) if folder else None
     if path is None:
         return jax.jit(function).lower(*kinds).compile(dict(options))
-    found = _read(path)
+    found = _read(path, kinds)
     if found is None:
         # A new name, which JAX's own cache cannot know: what it returns cannot be stored again (jax 0.10.2).
         named = lambda *arguments: function(*arguments)  # noqa: E731
@@ -94,26 +97,30 @@ def calls(kernel: jax.stages.Compiled, target: str) -> bool:
     return f'custom_call_target="{target}' in (kernel.as_text() or "")
 
 
-def remembered(compute: Callable[[], T], identity: str) -> T:
-    """``compute()``, plain data that is stored on disk under ``identity``, as kernels are."""
+def remembered(compute: Callable[[], Coordinates], identity: str) -> Coordinates:
+    """``compute()``, stored on disk under ``identity``, as kernels are."""
     folder = compile_cache.programs() if identity else None
     if folder is None:
         return compute()
-    with suppress(*_UNUSABLE):
-        return pickle.loads(_content(folder / identity))
+    path = folder / identity
+    with suppress(*_UNUSABLE), np.load(io.BytesIO(_content(path))) as file:
+        head = json.loads(file["head"].item())
+        return {name: (dims, file[name], about) for name, (dims, about) in head.items()}
     found = compute()
-    _store(folder / identity, pickle.dumps(found))
+    head = json.dumps({name: (dims, about) for name, (dims, _, about) in found.items()})
+    _store(path, _arrays(head=np.array(head), **{name: np.asarray(values) for name, (_, values, _) in found.items()}))
     return found
 
 
-def _read(path: Path) -> jax.stages.Compiled | None:
-    """The kernel at ``path``; None if there is none, or if it is damaged."""
-    with suppress(*_UNUSABLE):
-        has_lapack, *content = pickle.loads(_content(path))
-        if has_lapack:
+def _read(path: Path, kinds: tuple[Any, ...]) -> jax.stages.Compiled | None:
+    """The kernel at ``path`` for arguments of these ``kinds``; None if there is none, or if it is damaged."""
+    with suppress(*_UNUSABLE), np.load(io.BytesIO(_content(path))) as file:
+        if file["lapack"]:
             # JAX loads LAPACK, which takes a quarter of a second, when it lowers the first call.
             jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), float))
-        return serialize_executable.deserialize_and_load(*content, execution_devices=jax.devices()[:1])
+        out = PyTreeDef.deserialize_using_proto(default_registry, file["results"].tobytes())
+        code, given = file["code"].tobytes(), jax.tree.structure((kinds, {}))
+        return serialize_executable.deserialize_and_load(code, given, out, execution_devices=jax.devices()[:1])
     return None
 
 
@@ -122,9 +129,19 @@ def _write(path: Path, kernel: jax.stages.Compiled) -> None:
     if calls(kernel, "xla_ffi_python") or calls(kernel, "xla_python"):
         # A call of Python code cannot be stored.
         return
-    # A backend may be unable to store its kernels.
+    # A backend may be unable to store its kernels, and results of other types than those of Python have no form on disk.
     with suppress(ValueError, NotImplementedError, jax.errors.JaxRuntimeError):
-        _store(path, pickle.dumps((calls(kernel, "lapack_"), *serialize_executable.serialize(kernel))))
+        code, _, out = serialize_executable.serialize(kernel)
+        parts = {"code": code, "results": out.serialize_using_proto()}
+        content = {name: np.frombuffer(part, np.uint8) for name, part in parts.items()}
+        _store(path, _arrays(lapack=np.array(calls(kernel, "lapack_")), **content))
+
+
+def _arrays(**arrays: np.ndarray) -> bytes:
+    """``arrays`` in NumPy's format, which holds no code of Python."""
+    file = io.BytesIO()
+    np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
+    return file.getvalue()
 
 
 def _content(path: Path) -> bytes:
