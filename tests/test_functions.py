@@ -137,7 +137,7 @@ def calls_of_diffeqsolve(monkeypatch, scene) -> list[bool]:
     return calls
 
 
-@pytest.mark.parametrize("analysis", ["floquet", "atlas"])
+@pytest.mark.parametrize("analysis", [pytest.param("floquet", marks=pytest.mark.full), "atlas"])
 def test_diffrax_under_vmap_is_the_engine(monkeypatch, analysis):
     """Of charts, and of the nodes that an atlas solves directly."""
     axes = {"beta": {"start": 0.1, "stop": 1.0}, "Omega": {"start": 0.5, "stop": 1.0}}

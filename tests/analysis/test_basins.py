@@ -86,6 +86,7 @@ def test_non_periodic_motions_alone_are_one_attractor():
     assert found["unsettled_fraction"] == 0 and found["outcome"] == Outcome.SUCCESS
 
 
+@pytest.mark.full
 def test_gears_at_rest_are_one_attractor():
     """Without a drive amplitude all motions come to rest, at any frequency."""
     scene = {"system": "rattle", "analysis": "basins", "fixed": PRESETS["table1"] | {"B1": 0.0}}

@@ -29,7 +29,10 @@ def branch(method):
     return np.isfinite(found["branch_u_max"]).sum(axis=1), np.asarray(found["outcome"])
 
 
-@pytest.mark.parametrize(("method", "module"), [("exact", exact_branch), ("harmonic_balance", harmonic_response)])
+@pytest.mark.parametrize(
+    ("method", "module"),
+    [pytest.param("exact", exact_branch, marks=pytest.mark.full), ("harmonic_balance", harmonic_response)],
+)
 def test_more_motions_than_there_is_room_for(method, module, monkeypatch):
     monkeypatch.setattr(module, "BRANCHES", 2)
     number, outcome = branch(method)
@@ -39,7 +42,10 @@ def test_more_motions_than_there_is_room_for(method, module, monkeypatch):
 
 @pytest.mark.parametrize(
     ("method", "module", "name"),
-    [("exact", exact_branch, "_CORRECTIONS"), ("harmonic_balance", harmonic_branch, "_POLISH")],
+    [
+        pytest.param("exact", exact_branch, "_CORRECTIONS", marks=pytest.mark.full),
+        ("harmonic_balance", harmonic_branch, "_POLISH"),
+    ],
 )
 def test_a_motion_that_cannot_be_corrected(method, module, name, monkeypatch):
     monkeypatch.setattr(module, name, 1)

@@ -386,6 +386,7 @@ def test_no_derivative_where_modes_end_in_a_multiple_frequency():
     np.testing.assert_allclose(slope(jnp.array([1.0, 1.0 + 1e-9])), [np.pi**2 / 2, 0.0], atol=1e-5)
 
 
+@pytest.mark.full
 def test_a_zero_mode_stays_but_for_a_spring_that_would_hold_it():
     """Rigid modes of a free shaft have no derivatives by the supports; their other derivatives are zero."""
     free = dt.Bicardan(**PAPER | {"k_A": 0.0, "k_D": 0.0})

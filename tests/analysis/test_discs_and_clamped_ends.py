@@ -245,6 +245,7 @@ def test_gradients_against_finite_differences(jacobians):
             np.testing.assert_allclose(rows[name][:, e], slopes, atol=1e-6 * size, err_msg=f"{name}[{e}]")
 
 
+@pytest.mark.full
 def test_an_infinite_frequency_and_a_held_zero_mode_have_no_derivative():
     """Two masses on a massless shaft without supports: two zero modes, no third frequency."""
     values = TWO_DISCS | {"rhoA": (0.0,) * 3, "k_A": 0.0, "k_D": 0.0}

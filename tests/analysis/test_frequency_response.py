@@ -101,6 +101,7 @@ def test_the_exact_branch_has_the_saddles_between_folds(exact):
     assert (exact.branch_stability.values[doubled, 0] == 1).all()
 
 
+@pytest.mark.full
 def test_direction_without_a_motion_is_absent_and_the_other_kept():
     """Without a mean torque no force acts within the play: at some frequencies the sweep down finds no attractor."""
     fixed = {"B0": 0.0, "B1": 0.03, "b": 0.05, "alpha": 0.0, "c": 0.05, "k": 1.0, "I": 1.0}

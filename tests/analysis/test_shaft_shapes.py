@@ -176,6 +176,7 @@ def compare(shafts: Mapping[str, Mapping], tolerance: float) -> int:
 
 
 @pytest.mark.parametrize("segments", [2, pytest.param(4, marks=pytest.mark.full)])
+@pytest.mark.full
 def test_shapes_against_finite_elements(segments):
     """Amplitude and sign of every part, for named and for random cases."""
     rng = np.random.default_rng(segments)

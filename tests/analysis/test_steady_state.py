@@ -318,6 +318,7 @@ def test_transition_matrix_changes_at_the_flank():
     assert found.spectral_radius == pytest.approx(0.41481220923, abs=1e-7)
 
 
+@pytest.mark.full
 def test_slow_drive_without_a_spring_in_the_gap_shows_rounding():
     """The subtracted harmonic response is 3e5 times the motion; reference: Taylor series with 64 bits."""
     slow = {"omega": 5e-5, "B0": 0.01, "B1": 0.03, "b": math.pi / 18, "c": 1e-3, "alpha": 0.0, "k": 1.0, "I": 1.0}
@@ -326,7 +327,7 @@ def test_slow_drive_without_a_spring_in_the_gap_shows_rounding():
     assert found.outcome == Outcome.TOLERANCE_NOT_MET
 
 
-@pytest.mark.parametrize("outputs", [["impacts"], ["impacts", "u_rms"]])
+@pytest.mark.parametrize("outputs", [["impacts"], pytest.param(["impacts", "u_rms"], marks=pytest.mark.full)])
 def test_every_impact_is_counted_once(outputs):
     """Impacts agree with samples of the motion, for any outputs; a few percent were once missed or counted twice."""
     scene = {"system": "rattle", "analysis": "steady_state", "fixed": TABLE1}
@@ -346,6 +347,7 @@ def test_a_motion_of_far_too_many_steps_is_not_begun(steady):
     assert np.isnan(found["u_max"][1:]).all()
 
 
+@pytest.mark.full
 def test_a_motion_stops_at_a_number_of_steps_in_all(monkeypatch):
     """Chaos never settles; without a budget it would end with ``most_periods``."""
     chaos = TABLE1 | {"alpha": 0.0, "B1": 0.2, "omega": 1.2, "u0": 0.0, "v0": 0.0}
