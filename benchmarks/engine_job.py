@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from threading import Lock
@@ -22,10 +23,11 @@ def columns_scene(
     return {"system": system, "analysis": analysis, "outputs": outputs, "points": points, **rest}
 
 
-def engine_job(scene: Mapping[str, Any], threads: int = 1) -> Callable[[], Results]:
+def engine_job(scene: Mapping[str, Any], threads: int = 1, spent: np.ndarray | None = None) -> Callable[[], Results]:
     """A function that computes every point of ``scene`` as ``dt.run`` does, with ``threads``; results by name, points first.
 
-    This call compiles the kernels, unless another scene of the process shares them.
+    This call compiles the kernels, unless another scene of the process shares them. ``spent`` takes the seconds of each
+    point: those of its chunk, divided evenly.
     """
     from drivetrain_jax.runs.executor import run_threads
     from drivetrain_jax.runs.kernel import kernel_of
@@ -39,7 +41,11 @@ def engine_job(scene: Mapping[str, Any], threads: int = 1) -> Callable[[], Resul
         kernels = {group.index: kernel_of(engine.scene, grid, group.solver, group.chunk) for group in plan.groups}
 
     def work(chunk: Any) -> Mapping[str, np.ndarray]:
-        return kernels[chunk.solver](grid.columns(chunk.points), grid.numbers, chunk.effort)
+        columns, begin = grid.columns(chunk.points), time.perf_counter()
+        values = kernels[chunk.solver](columns, grid.numbers, chunk.effort)
+        if spent is not None:
+            spent[chunk.points] = (time.perf_counter() - begin) / chunk.points.size
+        return values
 
     def job() -> Results:
         found: Results = {}

@@ -135,35 +135,32 @@ def differences(region: str, rtol: float) -> np.ndarray:
     return np.array([[(radius(name, 1) - radius(name, -1)) / (2 * h * values[name]) for name in NAMES]])
 
 
+def _contender(region: str, method: str, rtol: float, prepare: Callable[[], Any], count: int = _LANES) -> Contender:
+    return Contender("gradients", region, method, f"rtol={rtol:g}", count, prepare, partial(error_of, region))
+
+
+def _batch(points: np.ndarray, make: Callable[[], Callable[..., Any]]) -> Callable[[], np.ndarray]:
+    """A job that returns the gradients at ``points``; ``make`` compiles values and gradients."""
+    run = make()
+    return lambda: np.asarray(jax.block_until_ready(run(points))[1])
+
+
 def contenders(quick: bool) -> tuple[Sequence[Contender], Sequence[str]]:
     """All methods in all regions."""
     found = []
     for region in _QUICK if quick else REGIONS:
         points = np.stack([columns_of(region, _LANES)[name] for name in NAMES], axis=1)
-        judged = partial(error_of, region)
-
-        def add(
-            method: str, rtol: float, prepare: Callable[[], Any], count: int = _LANES, region=region, judged=judged
-        ) -> None:
-            found.append(Contender("gradients", region, method, f"rtol={rtol:g}", count, prepare, judged))
-
-        def called(make: Callable[[], Callable], points: np.ndarray = points) -> Callable[[], Callable[[], np.ndarray]]:
-            def prepare() -> Callable[[], np.ndarray]:
-                run = make()
-                return lambda: np.asarray(jax.block_until_ready(run(points))[1])
-
-            return prepare
-
-        for rtol in (1e-9,) if quick else (1e-6, 1e-9, 1e-12):
-            add("package, floquet", rtol, called(partial(_package, rtol)))
+        batch, add = partial(_batch, points), partial(_contender, region)
+        own = (1e-9,) if quick else (1e-6, 1e-9, 1e-12)
+        found += [add("package, floquet", rtol, partial(batch, partial(_package, rtol))) for rtol in own]
         for rtol in (1e-10,) if quick else (1e-6, 1e-8, 1e-10, 1e-12):
             for forward in (False, True):
                 name = f"diffrax Dopri8, {'forward' if forward else 'reverse'} mode"
-                add(name, rtol, called(partial(_diffrax, rtol, forward)))
+                found.append(add(name, rtol, partial(batch, partial(_diffrax, rtol, forward))))
             job = partial(differences, region, rtol)
-            add("scipy, central differences", rtol, lambda job=job: job, 1)
+            found.append(add("scipy, central differences", rtol, lambda job=job: job, 1))
         if find_spec("gradsolve") and region == "typical" and not quick:
-            add("gradsolve, tsit5_replay", 1e-10, partial(_gradsolve, points, 1e-10))
+            found.append(add("gradsolve, tsit5_replay", 1e-10, partial(_gradsolve, points, 1e-10)))
     return found, [] if find_spec("gradsolve") else ["gradsolve is not installed: left out"]
 
 

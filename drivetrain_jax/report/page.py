@@ -109,19 +109,22 @@ def _section(path: Path, number: int, asked: list[str], amplitude: Any) -> Secti
         answers, chart, compared = atlas_answers(path, (_LINE_CELLS, _CELLS), convert, amplitude)
     else:
         chart = dataset.load()
-    limit, moved = None, chart
+    limit = moved = None
     if amplitude is not None and (analysis == "floquet" or amplitudes(chart)):
         # Local import: it loads jax.
         from drivetrain_jax.report.forced_section import forced_motion, limit_of
 
         limit = limit_of(chart, amplitude)
-        moved = forced_motion(chart) if limit and analysis == "floquet" else chart
+        moved = forced_motion(chart) if limit and analysis == "floquet" else None
     attrs, handy = dataset.attrs, with_prefixes(convert(chart))
     axes, fixed = axes_table(handy), fixed_table(handy)
     return Section(
         title=str(attrs.get("title") or path.name),
         file=path.name,
-        statements=[*answers, *statements(handy, not answers, limit, with_prefixes(convert(moved)))],
+        statements=[
+            *answers,
+            *statements(handy, not answers, limit, None if moved is None else with_prefixes(convert(moved))),
+        ],
         axes=axes,
         fixed=fixed,
         values=values_tables(handy),
