@@ -61,25 +61,34 @@ def _derivatives(
     ``results`` are not used, so a gradient alone computes no values.
     """
     del results
-    from drivetrain_jax.analysis.floquet.derivatives import monodromy_change, multiplier_change, radius_change
+    from drivetrain_jax.analysis.floquet.derivatives import monodromy, multipliers, shares_modulus
 
     build = system.models["floquet"].build
-
-    def model(parameters: Any) -> Any:
-        return build(eqx.combine(parameters, constants.tree))
-
     steps = traced_steps(build, eqx.combine(parameters, constants.tree), _DERIVATIVES)
-    change = monodromy_change(build, parameters, constants, steps)
-    sigma, moved, error = multiplier_change(change)
-    scale = jnp.exp(change.log_scale)
+    z, log_scale, pull = monodromy(build, parameters, constants, steps)
+    sigma, by_entry, error = multipliers(z)
+    scale, n = jnp.exp(log_scale), len(sigma)
+    unit = sigma / jnp.abs(sigma)
     # A radius that underflows has no derivative either.
-    slope = jnp.where(scale * jnp.abs(sigma[0]) > 0, radius_change(sigma, moved, error), jnp.nan)
-    found = {"spectral_radius": scale * slope, "floquet_multiplier": scale * moved}
+    known = (scale * jnp.abs(sigma[0]) > 0) & ~shares_modulus(sigma, error)
+    if not {"floquet_multiplier", "floquet_exponent"} & set(request.outputs):
+        slope = pull((jnp.conj(unit[0]) * by_entry[0]).real[None])[0]
+        return {"spectral_radius": jnp.where(known, scale * slope, jnp.nan)}
+    slopes = pull(jnp.concatenate([by_entry.real, by_entry.imag]))
+    moved = slopes[:n] + 1j * slopes[n:]
+    outward = (jnp.conj(unit)[:, None] * moved).real
+    found = {"spectral_radius": jnp.where(known, scale * outward[0], jnp.nan), "floquet_multiplier": scale * moved}
     if "floquet_exponent" in request.outputs:
-        period, longer = jax.value_and_grad(lambda p: jnp.asarray(model(p).natural.span, float))(parameters)
-        rates = (jnp.log(jnp.abs(sigma)) + change.log_scale) / period
-        slopes = (jnp.conj(sigma)[:, None] * moved).real / jnp.abs(sigma)[:, None] ** 2
-        found["floquet_exponent"] = (slopes - rates[:, None] * jnp.stack(jax.tree.leaves(longer))) / period
+
+        def period(parameters: Any) -> Array:
+            return jnp.asarray(build(eqx.combine(parameters, constants.tree)).natural.span, float)
+
+        span, longer = jax.value_and_grad(period)(parameters)
+        modulus = jnp.abs(sigma)
+        rates = (jnp.log(modulus) + log_scale) / span
+        found["floquet_exponent"] = (
+            outward / modulus[:, None] - rates[:, None] * jnp.stack(jax.tree.leaves(longer))
+        ) / span
     return found
 
 

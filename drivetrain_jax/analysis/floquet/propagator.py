@@ -144,13 +144,13 @@ class Order8(EqualSteps):
         shared = jnp.asarray(t0, float), jnp.asarray(t1, float), self.count
         if not jax.tree.leaves(arrays) or not system.is_pytree:
             # No arrays to batch, or a function that may depend on unknown arrays.
-            matrix, log_scale = _march(system, *shared)
+            matrix, log_scale = explicit_march(system, *shared)
             return matrix[..., 0], log_scale[0]
         return lanes_last(_block, Constants(rest), arrays, shared, LANES)
 
 
 def _block(rest: Constants, arrays: LinearPeriodic, shared: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-    return _march(eqx.combine(arrays, rest.tree), *shared)
+    return explicit_march(eqx.combine(arrays, rest.tree), *shared)
 
 
 class Radau(EqualSteps):
@@ -200,7 +200,9 @@ def propagator(
     return through(system.parts, steps, pieces, solver)
 
 
-def through(parts: Sequence[LinearPeriodic], steps: Array, pieces: Array | int, solver: type[EqualSteps]) -> Propagator:
+def through(
+    parts: Sequence[LinearPeriodic], steps: Array, pieces: Array | int = 1, solver: type[EqualSteps] = Order8
+) -> Propagator:
     """The :func:`propagator` over the spans of ``parts`` one after another, in ``steps`` steps each."""
     matrix, record = jnp.eye(parts[0].size), None
     for part in parts:
@@ -242,24 +244,25 @@ def _moved(piece: Array, state: Array, covariance: Array) -> tuple[Array, Array]
     return matmul(piece, state), matmul(matmul(piece, covariance), jnp.swapaxes(piece, 0, 1))
 
 
-def _march(system: LinearPeriodic, t0: Array, t1: Array, count: Array) -> tuple[Array, Array]:
+def explicit_march(system: LinearPeriodic, t0: Array, t1: Array, count: Array | int) -> tuple[Array, Array]:
     """``Phi`` from t0 to t1 of all lanes, the last axis of arrays that vary, by ``count`` steps."""
     varying = jax.tree.leaves((eqx.filter(system, eqx.is_array), t0, t1))
     lanes = max((np.shape(x)[-1] for x in varying if np.ndim(x)), default=1)
-    times = jnp.zeros((dop853.STAGES, 1))
+    times = jnp.zeros((dop853.STAGES, np.size(t0)))
     split = staged(system.entries, *jax.eval_shape(system.basis, times))
     suits = suits_one_kernel(lambda t: system.rows(*system.basis(t)), times)
     mark = in_one_kernel if suits else lambda function: function
 
-    def march(count: Array, start: Array, h: Array, fixed: list[Array]) -> Rows:
+    def march(count: Array | int, start: Array, h: Array, fixed: list[Array]) -> Rows:
         step = partial(_explicit_step, system.basis, partial(split.moving, fixed), start, h)
-        return jax.lax.fori_loop(0, count, step, _identity(system.size, lanes))
+        return jax.lax.fori_loop(0, count, step, identity(system.size, lanes))
 
     rows = mark(march)(count, t0, (t1 - t0) / count, split.fixed)
     return jnp.stack(rows), jnp.zeros(lanes)
 
 
-def _identity(n: int, lanes: int) -> Rows:
+def identity(n: int, lanes: int) -> Rows:
+    """The rows of the unit matrix."""
     return [jnp.concatenate([jnp.full((1, lanes), float(i == j)) for j in range(n)]) for i in range(n)]
 
 
@@ -275,12 +278,12 @@ def _explicit_step(
     at_stages = entries(*basis(start + (number + jnp.asarray(dop853.C)[:, None]) * h))
     slopes: list[Rows] = []
     for stage, weights in enumerate(dop853.A):
-        state = _advanced(y, h, weights[:stage], slopes)
-        slopes.append(stored(partial(_slopes, stage))(at_stages, state))
-    return _advanced(y, h, dop853.B, slopes)
+        state = advanced(y, h, weights[:stage], slopes)
+        slopes.append(stored(partial(slopes_at, stage))(at_stages, state))
+    return advanced(y, h, dop853.B, slopes)
 
 
-def _slopes(stage: int, at_stages: Entries, state: Rows) -> Rows:
+def slopes_at(stage: int, at_stages: Entries, state: Rows) -> Rows:
     """``A y`` at one stage."""
     slopes: Rows = [0] * len(state)  # pyright: ignore[reportAssignmentType]
     for (i, j), entry in at_stages.items():
@@ -292,7 +295,7 @@ def _at(entry: Array, stage: int) -> Array:
     return entry[min(stage, entry.shape[0] - 1)] if entry.ndim > 1 else entry
 
 
-def _advanced(y: Rows, h: Array, weights: Any, slopes: list[Rows]) -> Rows:
+def advanced(y: Rows, h: Array, weights: Any, slopes: list[Rows]) -> Rows:
     """``y + h sum(weights * slopes)``."""
     terms = [(float(w), slope) for w, slope in zip(weights, slopes, strict=True) if w != 0]
     if not terms:
