@@ -13,6 +13,7 @@ import sys
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -129,10 +130,13 @@ def answered(title: str) -> str:
 
 
 def remarks(scene: Path) -> str:
-    """The comments at the head of a scene."""
-    lines = scene.read_text().splitlines()
-    head = lines[: next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))]
-    return " ".join(line.lstrip("# ") for line in head)
+    """The comments at the head of a scene as paragraphs; indented lines are code."""
+    head = [line.removeprefix("#") for line in takewhile(lambda x: x.startswith("#"), scene.read_text().splitlines())]
+    blocks = [(code, list(lines)) for code, lines in groupby(head, lambda line: line.startswith("     "))]
+    texts = [
+        "\n".join(["```text", *map(str.strip, x), "```"]) if code else " ".join(map(str.strip, x)) for code, x in blocks
+    ]
+    return "\n\n".join(texts)
 
 
 def counts(dataset: xr.Dataset) -> str:
@@ -148,13 +152,14 @@ def counts(dataset: xr.Dataset) -> str:
     return ", ".join([*parts, *(f"{name} {count:,}" for name, count in failed.items() if count)])
 
 
-def entry(item: Item, results: Sequence[Path], problem: str) -> Iterator[str]:
-    """The page's text for one figure."""
+def entry(item: Item, results: Sequence[Path], problem: str, remarked: bool) -> Iterator[str]:
+    """The page's text for one figure; scenes that are ``remarked`` on above need no remarks."""
     source = get_system(item.system).source.partition(";")[0]
     answer = answered(item.title)
     yield f"### {item.title}\n"
     yield (f"Answers: {answer} of {source}." if answer else "Beyond the source.") + "\n"
-    yield "\n\n".join(filter(None, map(remarks, item.scenes))) + "\n"
+    if not remarked:
+        yield "\n\n".join(filter(None, map(remarks, item.scenes))) + "\n"
     yield f"{problem}\n" if problem else shown(item, results[0].parent)
     page = f"{item.scenes[0].stem}.html"
     if results and (results[0].parent / page).exists():
@@ -196,11 +201,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     unfinished = 0
     for number, item in enumerate(chosen, 1):
         sys.stderr.write(f"[{number}/{len(chosen)}] {item.title}\n")
-        if not number - 1 or item.system != chosen[number - 2].system:
+        if number == 1 or item.system != chosen[number - 2].system:
             text.append(f"## {get_system(item.system).title}\n")
         results, problem = render(item, given.folder)
         unfinished += problem.startswith("Not finished")
-        text += entry(item, results, problem)
+        remarked = number > 1 and item.scenes == chosen[number - 2].scenes
+        text += entry(item, results, problem, remarked)
     if not given.names:
         (given.folder / "index.md").write_text("\n".join(text))
     return 1 if unfinished else 0

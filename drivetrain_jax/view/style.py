@@ -24,7 +24,7 @@ STYLE: dict[Any, Any] = {
     "axes.linewidth": 0.7,
     "axes.formatter.useoffset": False,
     # Show powers of ten as a factor, because numbers of five digits would overlap the axis label.
-    "axes.formatter.limits": (-3, 4),
+    "axes.formatter.limits": (-3, 5),
     "axes.formatter.use_mathtext": True,
     "xtick.labelsize": 8.0,
     "ytick.labelsize": 8.0,
@@ -128,10 +128,11 @@ def value_text(name: str, value: object, units: str = "1") -> str:
 
 
 def power_of_ten(number: str) -> str:
-    """``1.5×10⁻⁵`` for ``1.5e-05``."""
+    """``1.5×10⁻⁵`` for ``1.5e-05``, and ``10⁻⁶`` for ``1e-06``."""
     digits, e, exponent = number.partition("e")
     power = str(int(exponent)).translate(SUPERSCRIPTS) if e else ""
-    return f"{digits}×10{power}" if e else number
+    factor = "" if digits == "1" else f"{digits}×"
+    return f"{factor}10{power}" if e else number
 
 
 def coordinate_text(coordinate: xr.DataArray) -> str:
