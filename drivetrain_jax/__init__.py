@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from drivetrain_jax.systems.rattle import Rattle
     from drivetrain_jax.systems.tripod import Tripod
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOME = {
     "datasets.figure": ("plot",),

@@ -68,8 +68,8 @@ Numbers = tuple[Number, ...]
 class Bicardan(System):
     """The stepped shaft of the module's docstring: segments from A to D, joints between them.
 
-    >>> from drivetrain_jax.systems.bicardan import PRESETS
-    >>> Bicardan(**PRESETS["paper"]).shaft().segments
+    >>> from drivetrain_jax import Bicardan
+    >>> Bicardan(**Bicardan.presets["paper"]).shaft().segments
     3
     """
 

@@ -83,6 +83,7 @@ class Cardan(System):
     """The shaft of eqs (2)-(3): see the module's docstring. Parameters are numbers or arrays of any common shape.
 
     >>> import jax.numpy as jnp
+    >>> from drivetrain_jax import Cardan
     >>> shaft = Cardan(beta=0.3, Omega=1.416, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)
     >>> print(shaft.vector_field(0.5, jnp.zeros(4)).round(6))
     [ 0.        0.        0.       -0.073111]

@@ -73,6 +73,7 @@ _OF_SPRINGS = (
 class Planetary(System):
     """The gear of the module's docstring; a parameter of planets is one number for all, or a list with one per planet.
 
+    >>> from drivetrain_jax import Planetary
     >>> Planetary().springs().mass.shape
     (21,)
     """

@@ -39,7 +39,8 @@ class Rattle(System):
     """The oscillator of the module's docstring.
 
     >>> import jax.numpy as jnp
-    >>> gears = Rattle(omega=0.7, **PRESETS["table1"])
+    >>> from drivetrain_jax import Rattle
+    >>> gears = Rattle(omega=0.7, **Rattle.presets["table1"])
     >>> print(gears.vector_field(0.0, jnp.array([0.2, 0.0])).round(6))
     [0.     0.0109]
     """

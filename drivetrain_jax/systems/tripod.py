@@ -201,6 +201,7 @@ class Tripod(System):
     """One element of the driveshaft; geometry and torques default to the paper's values for this element.
 
     >>> import jax.numpy as jnp
+    >>> from drivetrain_jax import Tripod
     >>> shaft = Tripod(element="input", beta=0.157, zeta=0.0016)
     >>> print(shaft.vector_field(0.0, jnp.array([0.01, 0.0])).shape)
     (2,)
