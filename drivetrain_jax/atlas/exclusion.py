@@ -44,7 +44,7 @@ class Search:
 
 
 def critical_points(patches: tuple[Patches, ...], number: int, horizontal: int) -> Search:
-    """Every zero of function ``number`` and of its derivative along ``horizontal`` where no other function is negative.
+    """Common zeros of the function ``number`` and its derivative along ``horizontal``, where no other function is negative.
 
     ``patches`` holds all functions over the same boxes. If another function is negative throughout a box, the system is
     unstable there, and the box is left out.

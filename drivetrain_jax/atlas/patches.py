@@ -215,7 +215,7 @@ def _cover(criteria: Criteria, panel: Panel) -> tuple[Patches, ...]:
 
 
 def _roughness(panel: Panel, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Bernstein's and Markov's inequality for the error of a panel: of twice its degree, as Phi enters quadratically."""
+    """Bernstein's and Markov's inequalities bound the error of a panel at twice its degree, because Phi enters squared."""
     half = (panel.upper - panel.lower) / 2
     reach = np.maximum(np.abs(lower - panel.lower - half), np.abs(upper - panel.lower - half)) / half
     degree = 2.0 * np.array(panel.degrees)

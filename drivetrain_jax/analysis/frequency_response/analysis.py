@@ -172,7 +172,7 @@ def _in_range(model: PiecewiseLinearOscillator) -> Array:
 
 
 def _without(lost: Array, results: Mapping[str, Array]) -> dict[str, Array]:
-    """The real ones of ``results``, NaN where ``lost`` ``(L, ...)``, and no motion there."""
+    """``results`` with NaN, or ``ABSENT`` for stabilities, at the frequencies that are ``lost`` ``(L, ...)``."""
 
     def kept(x: Array, nothing: Any) -> Array:
         return jnp.where(jnp.expand_dims(lost, tuple(range(1, 1 + x.ndim - lost.ndim))), nothing, x).astype(x.dtype)

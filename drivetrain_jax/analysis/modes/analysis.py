@@ -256,7 +256,7 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
 
 
 def described(model: Model, fixed: Mapping[str, Any]) -> Any:
-    """The object that ``model`` returns, for its names and sizes, which do not depend on varying parameters."""
+    """The object that ``model`` builds, traced only: its names and sizes do not depend on varying parameters."""
     values = {name: fixed.get(name, 1.0) for name in model.parameters}
     found: list[Any] = []
     jax.eval_shape(lambda: found.append(model.build(values)))
