@@ -22,6 +22,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._printing import printed
 from drivetrain_jax._wording import did_you_mean
 from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analyses_of, get_analysis
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
@@ -50,6 +51,9 @@ class Result(eqx.Module):
         if name.startswith("_") or name == "variables" or name not in self.variables:
             raise AttributeError(f"no result {name!r}; there is {', '.join(vars(self).get('variables', ()))}")
         return self.variables[name]
+
+    def __repr__(self) -> str:
+        return f"Result({', '.join(f'{name}={printed(x)}' for name, x in self.variables.items())})"
 
     def __getitem__(self, name: str) -> Array:
         return self.variables[name]

@@ -24,6 +24,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._printing import printed
 from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
 from drivetrain_jax._wording import meant
 from drivetrain_jax.resonances import Resonances, Values
@@ -162,6 +163,9 @@ class System(eqx.Module):
     def __post_init__(self) -> None:
         for each in self.parameters:
             object.__setattr__(self, each.name, _admitted(each, getattr(self, each.name)))
+
+    def __repr__(self) -> str:
+        return printed(self)
 
     @classmethod
     def of(cls, values: Values) -> Any:
