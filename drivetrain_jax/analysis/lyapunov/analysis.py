@@ -4,13 +4,15 @@ Exponents are natural logarithms per second, in falling order. Phases of the flo
 always zero. The paper's estimator is available under its own name.
 
 The number of steps is predicted for every point (see :mod:`~drivetrain_jax.analysis.lyapunov.march_steps`) unless
-``steps`` is given; a batch uses the largest number of its members.
+``steps`` is given; members of a batch with similar numbers use the largest of them (see
+:mod:`~drivetrain_jax.analysis.lyapunov.step_groups`).
 
 Outcome: ``SUCCESS``, or ``TOLERANCE_NOT_MET`` if the standard error exceeds the target at ``max_time`` or the steps are too
 few: the exponents do not sum to the mean divergence, or a positive exponent changes with half the steps. With too few steps
 the verdict is ``undecided``. The exponents of an unbounded motion are means until it leaves the bounds, without an error
-(NaN). ``NOT_FINITE`` if a motion leaves the bounds too soon for exponents; ``STEP_LIMIT`` if ``max_time`` is more than 1e12
-steps, or if a strobe is predicted to need more than 1e5 steps.
+(NaN). ``NOT_FINITE`` if the field is not finite at the start or a motion leaves the bounds too soon for exponents.
+``STEP_LIMIT`` if a strobe is predicted to need more than 1e5 steps, or the run more than 2e7 for each second of ``max_time``
+(at least for one second; given ``steps`` raise this limit).
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis._base import MOST_SECONDS, MOST_STEPS, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis._base import MOST_SECONDS, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.lyapunov.forcing import may_be_chaotic
 from drivetrain_jax.analysis.lyapunov.growth_record import (
     SEGMENTS,
@@ -37,11 +39,11 @@ from drivetrain_jax.analysis.lyapunov.growth_record import (
     running_mean,
     weighted_mean,
 )
-from drivetrain_jax.analysis.lyapunov.march_steps import LEAST, MOST, contraction, needed_steps
+from drivetrain_jax.analysis.lyapunov.march_steps import LEAST, contraction, needed_steps
 from drivetrain_jax.analysis.lyapunov.paper_estimator import paper_estimator
 from drivetrain_jax.analysis.lyapunov.resolution import STANDARD_ERRORS, resolved, zero_floor
 from drivetrain_jax.analysis.lyapunov.sampling import SAMPLES, Sampling, sample
-from drivetrain_jax.analysis.lyapunov.variational import batch_shape
+from drivetrain_jax.analysis.lyapunov.step_groups import by_groups, is_short_enough, starts
 from drivetrain_jax.analysis.lyapunov.verdict import Evidence, Verdict, grows, judge
 from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.systems import Flow, System
@@ -125,8 +127,8 @@ class Run(NamedTuple):
     coarse: Record
 
 
-def run_twice(flow: Flow, steps: Any, max_time: float, target: float) -> Run:
-    """Records of growth with ``steps`` and with ``steps // 2`` per strobe.
+def run_twice(flow: Flow, steps: Any, max_time: float, target: float, members: Array) -> Run:
+    """Records of growth of the ``members`` with ``steps`` and with ``steps // 2`` per strobe.
 
     The second march is for members whose largest exponent is positive beyond its error. Both marches share one compiled
     loop.
@@ -135,10 +137,9 @@ def run_twice(flow: Flow, steps: Any, max_time: float, target: float) -> Run:
     def one(active: Array, steps: Array) -> tuple[Array, Record]:
         record = record_growth(flow, steps, max_time, target, active)
         found = spectrum_of(record)
-        return record.bounded & (found.values[0] > STANDARD_ERRORS * found.errors[0]), record
+        return active & record.bounded & (found.values[0] > STANDARD_ERRORS * found.errors[0]), record
 
-    start = jnp.ones(batch_shape(flow), bool)
-    _, both = jax.lax.scan(one, start, jnp.stack([jnp.asarray(steps), jnp.maximum(steps // 2, 1)]))
+    _, both = jax.lax.scan(one, members, jnp.stack([jnp.asarray(steps), jnp.maximum(steps // 2, 1)]))
     return Run(*(jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1)))
 
 
@@ -177,23 +178,28 @@ def _solve(system: type[System], request: Request, values: Mapping[str, Any], ef
     return analyse(system.models["lyapunov"].build(values), request)
 
 
-def steps_of(flow: Flow, request: Request) -> Any:
-    """Steps per strobe: the given number, or the largest need of all members."""
-    given = request.options["steps"]
-    return jnp.max(needed_steps(flow)).astype(jnp.int64) if given is None else given
-
-
 def analyse(flow: Flow, request: Request) -> dict[str, Array]:
     """The requested results of ``flow`` and ``outcome``, the batch as last axis."""
+    blank = {"verdict": Verdict.UNDECIDED, "period_multiple": 0, "outcome": Outcome.STEP_LIMIT}
+    return by_groups(flow, request, _following(request), partial(_march, flow, request), blank)
+
+
+def _following(request: Request) -> int:
+    """Strobes after the run."""
+    return SAMPLES if _SECTION & set(request.outputs) else 0
+
+
+def _march(flow: Flow, request: Request, steps: Any, members: Array) -> dict[str, Array]:
+    """The requested results of the ``members`` and ``outcome``, with ``steps`` per strobe."""
     wanted, options = set(request.outputs), request.options
-    steps, max_time, target = steps_of(flow, request), options["max_time"], options["standard_error"]
+    max_time, target = options["max_time"], options["standard_error"]
     results: dict[str, Array] = {}
     if "paper_estimator" in wanted:
-        results["paper_estimator"] = paper_estimator(flow, steps, max_time)
+        results["paper_estimator"] = paper_estimator(flow, steps, max_time, members)
     if wanted == {"paper_estimator"}:
         finite = jnp.all(jnp.isfinite(results["paper_estimator"]), axis=0)
         return results | {"outcome": jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE).astype(jnp.int8)}
-    run = run_twice(flow, steps, max_time, target)
+    run = run_twice(flow, steps, max_time, target, members)
     found = findings_of(run, flow.period)
     spectrum = found.spectrum
     results |= _of_spectrum(run.fine, found)
@@ -202,7 +208,7 @@ def analyse(flow: Flow, request: Request) -> dict[str, Array]:
         needed = spectrum.values[0] > -STANDARD_ERRORS * spectrum.errors[0] - zero_floor(spectrum.values)
         needed = jnp.ones_like(needed) if "chaos_k01" in wanted or not flow.turns else needed
         rate = spectrum.values[0] + STANDARD_ERRORS * spectrum.errors[0]
-        seen = sample(flow, steps, run.fine, rate, needed)
+        seen = sample(flow, steps, run.fine, rate, needed & members, members)
         results["verdict"] = judge(evidence_of(flow, run.fine, found, seen), autonomous=not flow.turns)
         # The test is meaningless for a few repeating points: K is set to 0, its limit for regular motion.
         repeating = seen.multiple > 0
@@ -236,22 +242,23 @@ def _effort(system: type[System], request: Request, columns: Mapping[str, np.nda
     """Predicted steps, shape (N,), of the run and of the strobes after it.
 
     A run with a target for the standard error ends early if contraction settles the motion before ``max_time``. Infinite
-    above the limit of a whole run.
+    above the limits of :mod:`~drivetrain_jax.analysis.lyapunov.step_groups`.
     """
     options, longest = request.options, request.options["max_time"]
-    rate, period, needed = predicted(_march, (system.models["lyapunov"].build,), columns)
-    steps = np.where(needed <= MOST, needed, np.inf) if options["steps"] is None else options["steps"]
-    # A rate of NaN means that the field has no value; the march then ends as NOT_FINITE.
+    rate, period, steps, started = predicted(_prediction, (system.models["lyapunov"].build,), columns)
+    steps = steps if options["steps"] is None else options["steps"]
     settling = SETTLED / np.fmax(rate, SETTLED / longest) if options["standard_error"] > 0 else longest
     strobes = np.maximum(np.clip(settling, longest / 4, longest) / period, SEGMENTS)
-    following = SAMPLES if _SECTION & set(request.outputs) else 0
-    return np.where(steps * longest / period <= MOST_STEPS, np.ceil(steps * (strobes + following)), np.inf)
+    short = is_short_enough(steps, longest / period, _following(request), request)
+    effort = np.where(short, np.ceil(steps * (strobes + _following(request))), np.inf)
+    return np.where(started, effort, 1.0)
 
 
-def _march(build: Callable[..., Flow], values: Mapping[str, Any]) -> Array:
-    """Mean rate of contraction of one point at its start, its period, and the number of steps."""
+def _prediction(build: Callable[..., Flow], values: Mapping[str, Any]) -> Array:
+    """Mean rate of contraction of one point at its start, its period, the number of steps, and 1 if it starts."""
     flow = build(values)
-    return jnp.stack([contraction(flow) / flow.size, jnp.asarray(flow.period, float), needed_steps(flow)])
+    rate = contraction(flow) / flow.size
+    return jnp.stack([rate, jnp.asarray(flow.period, float), needed_steps(flow), jnp.asarray(starts(flow), float)])
 
 
 def _dimensions(*_: Any) -> tuple[Dimension, ...]:

@@ -109,7 +109,7 @@ def record_growth(flow: Flow, steps: Any, max_time: float, target: float, active
         frame, jnp.zeros(shape, jnp.int64), active, jnp.ones(shape, bool), jnp.int64(0),
         growth, record, growth, record, record, jnp.zeros(shape, jnp.int64),
     )  # fmt: skip
-    segment = one_kernel(flow)(_segment(flow, steps, needed_parts(flow, steps), length))
+    segment = one_kernel(flow)(_segment(flow, steps, needed_parts(flow, steps, active), length))
     span = length * flow.period
 
     def body(march: _March) -> _March:

@@ -50,10 +50,10 @@ def needed_steps(flow: Flow) -> Array:
     return jnp.where(jnp.isnan(steps), LEAST, jnp.maximum(steps, LEAST))
 
 
-def needed_parts(flow: Flow, steps: Any) -> Array:
-    """Parts of a strobe after which vectors are orthonormalised, an integer for the batch, at most ``steps``.
+def needed_parts(flow: Flow, steps: Any, active: Array) -> Array:
+    """Parts of a strobe after which vectors are orthonormalised, an integer for all ``active`` members, at most ``steps``.
 
     If no vector grows, vectors separate no faster than volume contracts.
     """
     parts = jnp.ceil(jnp.abs(contraction(flow)) * flow.period / _PARTING)
-    return jnp.clip(jnp.max(jnp.where(jnp.isnan(parts), 1.0, parts)), 1, steps).astype(jnp.int64)
+    return jnp.clip(jnp.max(jnp.where(jnp.isnan(parts) | ~active, 1.0, parts)), 1, steps).astype(jnp.int64)

@@ -35,8 +35,8 @@ def component_count(flow: Flow) -> int:
     return flow.size + bool(flow.turns)
 
 
-def paper_estimator(flow: Flow, steps: Any, max_time: float) -> Array:
-    """L_j in 1/s, shape ``(component_count(flow), ...)``, over ``max_time``."""
+def paper_estimator(flow: Flow, steps: Any, max_time: float, members: Array) -> Array:
+    """L_j of the ``members`` in 1/s, shape ``(component_count(flow), ...)``, over ``max_time``."""
     scale = flow.scale or (1.0,) * flow.size
     base = initial_state(flow)
     zero = jnp.zeros_like(base[0])
@@ -64,7 +64,7 @@ def paper_estimator(flow: Flow, steps: Any, max_time: float) -> Array:
         return jax.lax.fori_loop(0, count, body, start)
 
     start = (Frame(base), jnp.zeros((component_count(flow), *zero.shape)), zero, zero)
-    _, total, counted, last = one_kernel(flow)(march)(start, jnp.max(strobes))
+    _, total, counted, last = one_kernel(flow)(march)(start, jnp.max(jnp.where(members, strobes, 0)))
     return (total - counted * last) / (strobes * flow.period)
 
 

@@ -27,6 +27,8 @@ _RETURNS = (0.3, 0.1, 0.03, 0.01)
 _MARGIN = 1e3
 # Largest number of samples; more than one are taken if the transient could hide or imitate a repetition.
 _MOST_LOOKS = 16
+# Steps after which no further sample begins: 16 samples have less up to 1200 steps per strobe.
+_MOST_SAMPLED = 20_000_000
 
 
 class Sampling(NamedTuple):
@@ -51,17 +53,19 @@ class _Look(NamedTuple):
     settled: Array
 
 
-def sample(flow: Flow, steps: Any, record: Record, rate: Array, k01_for: Array) -> Sampling:
+def sample(flow: Flow, steps: Any, record: Record, rate: Array, k01_for: Array, members: Array) -> Sampling:
     """Period and K of the motion over ``SAMPLES`` strobes after the run; K is 0 for members without ``k01_for``.
 
-    ``rate`` is an upper bound of the largest exponent, shape (...). For decaying motions, samples continue until the
-    transient is small enough to determine the period.
+    ``rate`` is an upper bound of the largest exponent, shape (...). For decaying ``members``, samples continue until the
+    transient is small enough to determine the period, or up to a number of steps. Without a bounded member there is no
+    sample.
     """
     watched = [i for i in range(flow.size) if i not in (*flow.phases, *flow.cyclic)] or [0]
     shape = batch_shape(flow)
+    most = jnp.clip(_MOST_SAMPLED // (steps * SAMPLES), 1, _MOST_LOOKS)
     decays = jnp.zeros(shape, bool)
     if flow.turns:
-        decays = record.bounded & (rate < 0)
+        decays = members & record.bounded & (rate < 0)
 
     def look(seen: _Look) -> _Look:
         states, state = sampled(flow, steps, seen.state, seen.strobe, SAMPLES)
@@ -79,7 +83,8 @@ def sample(flow: Flow, steps: Any, record: Record, rate: Array, k01_for: Array) 
         return _Look(seen.number + 1, state, seen.strobe + SAMPLES, first, multiple, settled)
 
     def unsettled(seen: _Look) -> Array:
-        return (seen.number == 0) | ((seen.number < _MOST_LOOKS) & jnp.any(decays & ~seen.settled))
+        again = (seen.number < most) & jnp.any(decays & ~seen.settled)
+        return jnp.where(seen.number == 0, jnp.any(members & record.bounded), again)
 
     blank = jnp.zeros((SAMPLES, len(watched), *shape))
     nothing = jnp.zeros(shape, jnp.int64)
