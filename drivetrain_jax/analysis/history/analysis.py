@@ -3,10 +3,11 @@
 diffrax integrates adaptively between strobes and requested times, so every value is the end of a step (no interpolation).
 Angles of the clocks are computed from whole strobes: they are as accurate after 50,000 strobes as at the start. Errors are
 differences from a second run with ten times the tolerance and up to twice the step. If errors exceed ``rtol`` times the
-size of the motion (its largest component), runs with tighter tolerances follow.
+size of the motion (its largest component), runs with tighter tolerances follow, unless a run is long already.
 
 Outcome: ``TOLERANCE_NOT_MET`` if an error still exceeds ``rtol`` times the size of the motion; ``STEP_LIMIT`` if the
-integrator needed too many steps (earlier values are kept), ``NOT_FINITE`` if the field is not finite at the start.
+integrator needed too many steps (earlier values are kept), or if the history has more than 2e5 strobes for each second (at
+least for one second) or more than 2e6; ``NOT_FINITE`` if the field is not finite at the start.
 """
 
 from __future__ import annotations
@@ -32,13 +33,10 @@ from drivetrain_jax.analysis._base import (
     forward_derivatives,
 )
 from drivetrain_jax.analysis.history import piecewise
-from drivetrain_jax.analysis.history.integration import NUM, has_finite_start, integrated, requested_times
+from drivetrain_jax.analysis.history.integration import NUM, has_finite_start, integrated, limits_of, requested_times
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.systems import Flow, PiecewiseLinearOscillator, System
-
-# Largest number of strobes.
-_MAX_STROBES = 2_000_000
 
 
 def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
@@ -60,7 +58,7 @@ def _effort(system: type[System], request: Request, columns: Mapping[str, np.nda
     """Predicted segments, shape (N,): strobes and requested times; infinite beyond the limit."""
     times = requested_times(request)
     strobes = times[-1] / predicted(_period, (system.models["history"].build, len(system.state)), columns)
-    return np.where(strobes <= _MAX_STROBES, np.ceil(strobes) + len(times), np.inf)
+    return np.where(strobes <= limits_of(request).strobes, np.ceil(strobes) + len(times), np.inf)
 
 
 def _period(build: Callable[..., Flow], size: int, values: Mapping[str, Any]) -> Array:

@@ -28,8 +28,15 @@ _SHARPNESS, _COARSER, _SHARPEST = 0.01, 10.0, 1e-15
 _PART = 0.5
 # Further attempts: fraction of rtol as next target, tightest tolerance, number of attempts.
 _RESERVE, _SHARPEST_AGAIN, _MOST_ATTEMPTS = 0.3, 1e-14, 3
-# Most steps of one segment (at most a strobe) and of a whole history.
-_MAX_SEGMENT, _MAX_STEPS = 4096, 20_000_000
+# Most steps of one segment (at most a strobe).
+_MAX_SEGMENT = 4096
+# Most strobes and steps of a history of up to a second, or for each second of it, and of any history: 2e5 strobes take a
+# minute on one core. At 3000 Hz the driveshaft takes 3e3 strobes and 5e4 steps in a second; solvers of order 5 take up to
+# 20 times as many.
+_STROBES, _MAX_STROBES = 200_000, 2_000_000
+_STEPS, _MAX_STEPS = {"Dopri8": 1_000_000}, 20_000_000
+# Least number of steps for each requested time; fraction of the most steps above which a run is not repeated.
+_STEPS_TO_TIME, _REPEATABLE = 100, 0.1
 
 
 class _Place(NamedTuple):
@@ -45,8 +52,8 @@ class _Place(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """States (T, n) by steps of ``tolerance``, their estimated ``error``, and the ratio ``excess`` of the largest error to
-    the allowed error."""
+    """States (T, n) by ``steps`` of ``tolerance``, their estimated ``error``, and the ratio ``excess`` of the largest error
+    to the allowed error."""
 
     tolerance: Array
     states: Array
@@ -54,6 +61,22 @@ class _Found(NamedTuple):
     excess: Array
     healthy: Array
     attempts: Array
+    steps: Array
+
+
+class Limits(NamedTuple):
+    """Most strobes and most steps of a run over a whole history."""
+
+    strobes: float
+    steps: float
+
+
+def limits_of(request: Request) -> Limits:
+    """The limits of the requested history."""
+    times = requested_times(request)
+    seconds = max(1.0, times[-1])
+    steps = max(_STEPS.get(request.options["solver"], _MAX_STEPS) * seconds, _STEPS_TO_TIME * len(times))
+    return Limits(min(_STROBES * seconds, _MAX_STROBES), min(steps, _MAX_STEPS))
 
 
 def requested_times(request: Request) -> tuple[float, ...]:
@@ -124,16 +147,24 @@ def _ahead(place: _Place, target: tuple[Array, Array]) -> Array:
 
 
 def trajectory(
-    flow: Flow, times: Array, tolerance: Any, part: Any, solver: diffrax.AbstractSolver
-) -> tuple[Array, Array, Array]:
-    """States at the rising ``times``, shape ``(len(times), n)``, the largest component, and a flag of success.
+    flow: Flow,
+    times: Array,
+    tolerance: Any,
+    part: Any,
+    solver: diffrax.AbstractSolver,
+    limits: Limits,
+    begins: Any = True,
+) -> tuple[Array, Array, Array, Array]:
+    """States at the rising ``times``, shape ``(len(times), n)``, the largest component, a flag of success, and the steps.
 
     States after a failure or beyond the step limit are NaN. ``tolerance`` bounds the error of a step relative to the state
-    and to :func:`size_of`; ``part`` bounds the length of a step relative to its segment, which is at most a strobe.
+    and to :func:`size_of`; ``part`` bounds the length of a step relative to its segment, which is at most a strobe. Without
+    ``begins`` the run fails at once.
     """
     controller = diffrax.PIDController(rtol=tolerance, atol=jnp.maximum(tolerance * size_of(flow), 1e-300))
     turns = times / flow.period
-    strobes = jnp.floor(turns).astype(jnp.int64)
+    few = turns[-1] <= limits.strobes
+    strobes = jnp.where(few, jnp.floor(turns), 0.0).astype(jnp.int64)
 
     def advance(place: _Place, target: tuple[Array, Array]) -> _Place:
         strobe, fraction = target
@@ -142,7 +173,7 @@ def trajectory(
         end = jnp.where(_ahead(place, target), jnp.where(last, fraction, 1.0), place.fraction)
         y, reached, steps, well = _segment(flow, solver, controller, part, place, end)
         total = place.steps + steps
-        healthy = place.healthy & well & (total <= _MAX_STEPS) & jnp.all(jnp.isfinite(y))
+        healthy = place.healthy & well & (total <= limits.steps) & jnp.all(jnp.isfinite(y))
         return _Place(
             jnp.where(last, strobe, place.strobe + 1),
             jnp.where(last, fraction, 0.0),
@@ -157,32 +188,41 @@ def trajectory(
         return place, jnp.where(place.healthy, place.y, jnp.nan)
 
     start = _start(flow)
-    rest = _Place(jnp.int64(0), jnp.zeros(()), start, jnp.max(jnp.abs(start)), jnp.int64(0), has_finite_start(flow))
+    healthy = begins & has_finite_start(flow) & few
+    rest = _Place(jnp.int64(0), jnp.zeros(()), start, jnp.max(jnp.abs(start)), jnp.int64(0), healthy)
     place, states = jax.lax.scan(to, rest, (strobes, turns - strobes))
-    return states, place.reached, place.healthy
+    return states, place.reached, place.healthy, place.steps
 
 
 def _twice(flow: Flow, times: Array, tolerance: Array, attempts: Array, request: Request) -> _Found:
     """The states at ``times``, and as their error the difference from a run at ``_COARSER`` times the tolerance."""
-    solver = getattr(diffrax, request.options["solver"])()
+    solver, limits = getattr(diffrax, request.options["solver"])(), limits_of(request)
     settings = tolerance * jnp.array([1.0, _COARSER]), _PART**attempts * jnp.array([_PART, 1.0])
-    # Both runs in one loop, so that they are compiled once.
-    runs, reached, healthy = jax.lax.map(lambda setting: trajectory(flow, times, *setting, solver), settings)  # pyright: ignore[reportCallIssue]
+
+    def run(begins: Array, setting: tuple[Array, Array]) -> tuple[Array, tuple[Array, ...]]:
+        states, reached, healthy, steps = trajectory(flow, times, *setting, solver, limits, begins)
+        some = jnp.any(jnp.isfinite(states[:, 0]) & (times > 0))
+        return healthy | some, (states, reached, healthy, steps)
+
+    # Both runs in one loop, so that they are compiled once. Without a value there is no error either.
+    _, (runs, reached, healthy, steps) = jax.lax.scan(run, jnp.bool_(True), settings)
     error = jnp.abs(runs[0] - runs[1])
     largest = jnp.max(error)
     excess = jnp.where(largest == 0, 0.0, largest / (request.options["rtol"] * reached[0]))
-    return _Found(tolerance, runs[0], error, excess, healthy[0], attempts + jnp.int8(1))
+    return _Found(tolerance, runs[0], error, excess, healthy[0], attempts + jnp.int8(1), steps[0])
 
 
 def integrated(flow: Flow, request: Request) -> _Found:
     """States and errors at the requested times, from tighter runs if the first ones miss ``rtol``."""
     times = jnp.asarray(requested_times(request))
+    limits = limits_of(request)
 
     def sharper(found: _Found) -> Array:
         return found.tolerance * _RESERVE / found.excess
 
     def missed(found: _Found) -> Array:
         hopeful = (found.excess > 1) & (sharper(found) >= _SHARPEST_AGAIN) & (found.attempts < _MOST_ATTEMPTS)
+        hopeful &= found.steps <= _REPEATABLE * limits.steps
         return (found.attempts == 0) | (found.healthy & hopeful)
 
     def attempt(found: _Found) -> _Found:
@@ -195,5 +235,5 @@ def integrated(flow: Flow, request: Request) -> _Found:
 
     nothing = jnp.full((len(times), flow.size), jnp.nan)
     tolerance = jnp.asarray(max(_SHARPNESS * request.options["rtol"], _SHARPEST))
-    start = _Found(tolerance, nothing, nothing, jnp.asarray(jnp.nan), jnp.bool_(False), jnp.int8(0))
+    start = _Found(tolerance, nothing, nothing, jnp.asarray(jnp.nan), jnp.bool_(False), jnp.int8(0), jnp.int64(0))
     return jax.lax.while_loop(missed, attempt, start)
