@@ -28,6 +28,9 @@ ATOL_RATIO = 1e-6
 STEP_RATIO = 1e-10
 
 MAX_CORRECTIONS = 300
+# Steps of all corrections after which the search ends; without this limit an extreme search takes up to 2e7. A usual
+# correction takes 50 to 1000 steps, a usual search up to a hundred corrections.
+MAX_SEARCH = 400_000
 SHORTEST_STRIDE = 1e-5
 # Value of lambda at which the search ends: with the forcing reversed, the path is not expected to return.
 TURNED_AWAY = -1.0
@@ -43,11 +46,13 @@ STALLED = 1e-6
 
 
 class Transition(NamedTuple):
-    """State ``end`` (n,) after a period, its derivative ``matrix`` (n, n) by the start, and an ``Outcome``."""
+    """State ``end`` (n,) after a period, its derivative ``matrix`` (n, n) by the start, an ``Outcome``, and the number of
+    ``steps``."""
 
     end: Array
     matrix: Array
     outcome: Array
+    steps: Array | int = 0
 
 
 class Orbit(NamedTuple):
@@ -91,6 +96,11 @@ def controller(period: float, rtol: Array | float) -> diffrax.PIDController:
 
 def integrate(field: Field, start: Array, period: Array | float, rtol: Array | float) -> tuple[Array, Array]:
     """State after one period from ``start`` at t = 0, by Dopri8 with error control, and an ``Outcome``."""
+    return _integrated(field, start, period, rtol)[:2]
+
+
+def _integrated(field: Field, start: Array, period: Array | float, rtol: Array | float) -> tuple[Array, Array, Array]:
+    """The results of :func:`integrate`, and the number of steps."""
     import diffrax
 
     solution = diffrax.diffeqsolve(
@@ -108,14 +118,15 @@ def integrate(field: Field, start: Array, period: Array | float, rtol: Array | f
     end = solution.ys[-1]  # pyright: ignore[reportOptionalSubscript]
     limited = solution.result == diffrax.RESULTS.max_steps_reached
     failed = (solution.result != diffrax.RESULTS.successful) | ~jnp.all(jnp.isfinite(end))
-    return end, jnp.where(limited, Outcome.STEP_LIMIT, jnp.where(failed, Outcome.NOT_FINITE, Outcome.SUCCESS))
+    outcome = jnp.where(limited, Outcome.STEP_LIMIT, jnp.where(failed, Outcome.NOT_FINITE, Outcome.SUCCESS))
+    return end, outcome, solution.stats["num_steps"]
 
 
 def transition(field: Field, start: Array, period: Array | float, rtol: Array | float) -> Transition:
     """Map over one period at ``start`` (entries of order one) and its derivative, by the variational equations."""
     columns = jnp.concatenate([start[:, None], jnp.eye(start.size)], axis=1)
-    end, outcome = integrate(variational(field), columns, period, rtol)
-    return Transition(end[:, 0], end[:, 1:], outcome)
+    end, outcome, steps = _integrated(variational(field), columns, period, rtol)
+    return Transition(end[:, 0], end[:, 1:], outcome, steps)
 
 
 def newton_step(step: Transition, start: Array) -> Array:
@@ -128,7 +139,8 @@ class _Path(NamedTuple):
 
     ``waypoint`` is the last orbit found, ``tangent`` the direction of the path there, ``stride`` the length of the next
     step along the path, and ``last`` is true if this step ends at lambda = 1. ``point`` is the iterate, ``correction`` its
-    last change, ``count`` the number of changes since the prediction.
+    last change, ``count`` the number of changes since the prediction. ``total`` counts all corrections, ``steps`` the steps
+    of their integrations.
     """
 
     waypoint: Array
@@ -141,6 +153,7 @@ class _Path(NamedTuple):
     total: Array
     matrix: Array
     found: Array
+    steps: Array | int = 0
 
 
 def shoot(field: Field, response: Array, period: float, rtol: float) -> Orbit:
@@ -161,7 +174,7 @@ def shoot(field: Field, response: Array, period: float, rtol: float) -> Orbit:
 
     def running(s: _Path) -> Array:
         onwards = (s.last | (s.stride >= SHORTEST_STRIDE)) & (s.waypoint[n] > TURNED_AWAY)
-        return ~s.found & onwards & (s.total < MAX_CORRECTIONS)
+        return ~s.found & onwards & (s.total < MAX_CORRECTIONS) & (s.steps < MAX_SEARCH)
 
     def correct(s: _Path) -> _Path:
         # In a batch the loop runs until the last lane is done: finished lanes integrate over an empty span.
@@ -172,12 +185,14 @@ def shoot(field: Field, response: Array, period: float, rtol: float) -> Orbit:
         system = (jnp.eye(n + 1) - step.matrix).at[n].set(constraint)
         sides = jnp.stack([(step.end - s.point).at[n].set(0.0), jnp.zeros(n + 1).at[n].set(1.0)], axis=1)
         delta, direction = solve(system, sides).T
-        return _judge(s, delta, direction / jnp.linalg.norm(direction), step, rtol)
+        judged = _judge(s, delta, direction / jnp.linalg.norm(direction), step, rtol)
+        return judged._replace(steps=s.steps + step.steps)
 
     ahead = jnp.append(response, 1.0)
     tangent = ahead / jnp.linalg.norm(ahead)
     stride = jnp.minimum(1 / tangent[n], 1.0 + jnp.sqrt(1.0 * n))
     first = _predict(jnp.zeros(n + 1), tangent, stride, jnp.zeros((), int), jnp.full((n, n), jnp.nan))
+    first = first._replace(steps=jnp.zeros_like(first.total))
     s = jax.lax.while_loop(running, correct, first)
     outcome = jnp.where(s.found, Outcome.SUCCESS, Outcome.NOT_CONVERGED)
     return Orbit(s.point[:n], s.matrix, s.correction, outcome, s.total)

@@ -24,6 +24,9 @@ from drivetrain_jax.systems import PiecewiseLinearOscillator
 # the stiffest motion, within limits per drive period. Low accuracy is enough to reach the right basin.
 _SETTLED, _PERIODS = 1e-4, (24, 400)
 _PER_RADIAN, _STEPS = 4.0, (64, 4000)
+# Most steps of all transients of a lane, for each frequency of its path; the next transient does not begin. Usual oscillators
+# take up to 6e4 steps for a transient, extreme ones 1.6e6.
+_MOST_WORK = 100_000
 # Change of the motion between two frequencies, relative to its size, beyond which it is a jump.
 _JUMP = 0.35
 _MARGIN = 1e-7
@@ -113,21 +116,35 @@ def _kept(condition: Array, first: Swept, second: Swept) -> Swept:
     return Swept(*(jnp.where(condition, a, b) for a, b in zip(first, second, strict=True)))
 
 
-def step(model: PiecewiseLinearOscillator, basis: Basis, before: Swept, omega: Array) -> tuple[Swept, Swept]:
-    """Two versions of the motion at ``omega``: the start of the next step and the result.
+def _work(model: PiecewiseLinearOscillator, basis: Basis, omega: Array) -> Array:
+    """Steps of a transient."""
+    periods, steps = _effort(model, basis, omega)
+    return 1.0 * periods * steps * basis.count
 
-    Both follow from the motion ``before`` at the previous frequency, and differ where the result is not balanced.
+
+def step(
+    model: PiecewiseLinearOscillator, basis: Basis, before: Swept, omega: Array, may_settle: Array
+) -> tuple[Swept, Swept, Array]:
+    """Two versions of the motion at ``omega``: the start of the next step and the result; and flags of transients.
+
+    Both follow from the motion ``before`` at the previous frequency, and differ where the result is not balanced. Only lanes
+    that ``may_settle`` have transients.
     """
     size = jnp.sqrt(jnp.sum(before.x[1:] ** 2, axis=0))
 
     def waited(count: Array, lost: Array, seed: Array, now: Swept) -> Array:
         # Integrate once only: past a fold of the balance that the exact motion lacks, it would return there every time.
-        start = jax.lax.cond(count == 1, lambda seed: settle(model, basis, seed, omega, lost), lambda seed: seed, seed)
+        start = jax.lax.cond(
+            (count == 1) & jnp.any(lost & may_settle),
+            lambda seed: jnp.where(may_settle, settle(model, basis, seed, omega, lost & may_settle), seed),
+            lambda seed: seed,
+            seed,
+        )
         found = drift(model, basis, jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, seed), omega)
         return jnp.where(lost, jnp.where(jnp.all(jnp.isfinite(found), axis=0), found, seed), now.x)
 
-    def attempt(state: tuple[Array, Array, Array, Swept]) -> tuple[Array, Array, Array, Swept]:
-        count, lost, seed, now = state
+    def attempt(state: tuple[Array, Array, Array, Array, Swept]) -> tuple[Array, Array, Array, Array, Swept]:
+        count, lost, settled, seed, now = state
         again = count > 0
         seed = jax.lax.cond(again, waited, lambda count, lost, seed, now: seed, count, lost, seed, now)
         there, attracts = _checked(model, basis, balance(model, basis, seed, omega), omega)
@@ -135,16 +152,17 @@ def step(model: PiecewiseLinearOscillator, basis: Basis, before: Swept, omega: A
         jumped = ~again & before.balanced & (change > _JUMP * size)
         # The settled motion replaces the lost one if it attracts, or if the lost one is not balanced.
         taken = jnp.where(again, lost & (attracts | ~now.balanced), True)
-        return count + 1, lost & (~attracts | jumped), seed, _kept(taken, there, now)
+        settled |= (count == 1) & lost & may_settle
+        return count + 1, lost & (~attracts | jumped), settled, seed, _kept(taken, there, now)
 
-    def unfinished(state: tuple[Array, Array, Array, Swept]) -> Array:
+    def unfinished(state: tuple[Array, Array, Array, Array, Swept]) -> Array:
         return (state[0] < _WAITS) & jnp.any(state[1])
 
-    start = (jnp.int32(0), jnp.ones_like(before.balanced), before.x, before)
-    after = jax.lax.while_loop(unfinished, attempt, start)[3]
+    start = (jnp.int32(0), jnp.ones_like(before.balanced), jnp.zeros_like(before.balanced), before.x, before)
+    _, _, settled, _, after = jax.lax.while_loop(unfinished, attempt, start)
     # A motion that could not be balanced is no start for the next one.
     carried = after._replace(x=jnp.where(after.balanced, after.x, before.x))
-    return carried, after
+    return carried, after, settled
 
 
 def sweep(model: PiecewiseLinearOscillator, basis: Basis, omegas: Array) -> Swept:
@@ -153,4 +171,11 @@ def sweep(model: PiecewiseLinearOscillator, basis: Basis, omegas: Array) -> Swep
     first = settle(model, basis, jnp.zeros((basis.size, *lanes)), omegas[0])
     first = jnp.where(jnp.isfinite(first), first, 0.0)
     start = Swept(first, jnp.zeros(lanes), jnp.zeros(lanes, bool), jnp.zeros(lanes, bool))
-    return jax.lax.scan(lambda before, omega: step(model, basis, before, omega), start, omegas)[1]
+    most = _MOST_WORK * len(omegas)
+
+    def onwards(carry: tuple[Swept, Array], omega: Array) -> tuple[tuple[Swept, Array], Swept]:
+        before, spent = carry
+        carried, after, settled = step(model, basis, before, omega, spent < most)
+        return (carried, spent + jnp.where(settled, _work(model, basis, omega), 0.0)), after
+
+    return jax.lax.scan(onwards, (start, jnp.zeros(lanes)), omegas)[1]
