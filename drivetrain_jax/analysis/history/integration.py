@@ -157,9 +157,8 @@ def trajectory(
 ) -> tuple[Array, Array, Array, Array]:
     """States at the rising ``times``, shape ``(len(times), n)``, the largest component, a flag of success, and the steps.
 
-    States after a failure or beyond the step limit are NaN. ``tolerance`` bounds the error of a step relative to the state
-    and to :func:`size_of`; ``part`` bounds the length of a step relative to its segment, which is at most a strobe. Without
-    ``begins`` the run fails at once.
+    States after a failure, beyond the limits or without ``begins`` are NaN. ``tolerance`` bounds the error of a step
+    relative to the state and to :func:`size_of`; ``part`` its length relative to its segment, which is at most a strobe.
     """
     controller = diffrax.PIDController(rtol=tolerance, atol=jnp.maximum(tolerance * size_of(flow), 1e-300))
     turns = times / flow.period
