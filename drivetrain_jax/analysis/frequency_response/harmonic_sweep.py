@@ -24,8 +24,8 @@ from drivetrain_jax.systems import PiecewiseLinearOscillator
 # the stiffest motion, within limits per drive period. Low accuracy is enough to reach the right basin.
 _SETTLED, _PERIODS = 1e-4, (24, 400)
 _PER_RADIAN, _STEPS = 4.0, (64, 4000)
-# Most steps of all transients of a lane, for each frequency of its path; the next transient does not begin. Usual oscillators
-# take up to 6e4 steps for a transient, extreme ones 1.6e6.
+# Steps for each frequency of a path after which no further transient of a lane begins. A transient of a usual oscillator
+# takes up to 6e4 steps, of an extreme one 1.6e6.
 _MOST_WORK = 100_000
 # Change of the motion between two frequencies, relative to its size, beyond which it is a jump.
 _JUMP = 0.35
