@@ -21,6 +21,8 @@ from drivetrain_jax.analysis.floquet.results import NEED_ERROR, results
 from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last, over_lanes
 from drivetrain_jax.systems import LinearPeriodic, System
 
+# Most steps over the span; usual points take up to 1e4. With equal steps, points that are predicted to need more are not
+# begun, and no refinement has more.
 MAX_STEPS = 200_000
 # Cancels the safety factor of `compare`: the error is the plain difference between two tolerances a decade apart.
 _REDUCTION = 4.0
@@ -57,17 +59,19 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
 
         stiffness, least = stiffness_of(model.reduced, shape), stable_steps(model.reduced)
         target = rtol / _MARGIN
-        z = direct_monodromy(model.reduced, propagate, steps, shape, stiffness, target, order, 2, least)
+        z = direct_monodromy(model.reduced, propagate, steps, shape, stiffness, target, order, 2, least, most=MAX_STEPS)
         return results(z, request.outputs, rtol, model.natural)
 
     def effort(columns: Mapping[str, Any]) -> np.ndarray:
         # Fitted for order 8; a lower order needs more steps for a smaller tolerance.
         more = rtol ** (1 / 8 - 1 / solver.order(diffrax.ODETerm(lambda t, y, args: y)))
-        return more * explicit_effort(system, columns, rtol)
+        found = more * explicit_effort(system, columns, rtol)
+        return np.where(found <= MAX_STEPS, found, np.inf)
 
     def steps(values: Mapping[str, Any]) -> Array:
         order = solver.order(diffrax.ODETerm(lambda t, y, args: y))
-        return (rtol ** (1 / 8 - 1 / order) * traced_steps(build, values, rtol)).astype(jnp.int64)
+        found = rtol ** (1 / 8 - 1 / order) * traced_steps(build, values, rtol)
+        return jnp.minimum(found, MAX_STEPS).astype(jnp.int64)
 
     return (Solver(f"diffrax: {request.options['solver']}, equal steps", solve, effort, steps, chunk=256, march=True),)
 
@@ -92,11 +96,14 @@ def adaptive_steps(system: type[System], request: Request) -> tuple[Solver, ...]
         z = compare(form, coarse, fine, jnp.zeros(()), 0.0, rtol, _REDUCTION)
         found = results(z, request.outputs, rtol, model.natural)
         failed = ~(success & success_coarse)
-        return found | {"outcome": jnp.where(failed, jnp.int8(Outcome.STEP_LIMIT), found["outcome"])}
+        lost = jnp.where(has_finite_entries(form), jnp.int8(Outcome.STEP_LIMIT), jnp.int8(Outcome.NOT_FINITE))
+        return found | {"outcome": jnp.where(failed, lost, found["outcome"])}
 
     def effort(columns: Mapping[str, Any]) -> np.ndarray:
-        # Large, not infinite, where the explicit scheme would need too many steps: diffrax tries these points as well.
-        return np.nan_to_num(explicit_effort(system, columns, rtol))
+        # Infinite where equal steps of order 8 would be five times ``MAX_STEPS``: no explicit solver gets there. An implicit
+        # one may.
+        found = explicit_effort(system, columns, rtol)
+        return np.nan_to_num(found) if issubclass(type(solver), diffrax.AbstractImplicitSolver) else found
 
     name = f"diffrax: {request.options['solver']}, {request.options['form']}, adaptive steps"
     return (Solver(name, over_lanes(solve), effort, chunk=256),)
@@ -143,17 +150,24 @@ def _integrated(constants: Constants, arrays: LinearPeriodic, steps: Array) -> A
     return solution.ys[-1]  # pyright: ignore[reportOptionalSubscript]
 
 
+def has_finite_entries(form: LinearPeriodic) -> Array:
+    """True if the matrix of one point is finite at 16 instants, and so is the span."""
+    times = form.span * (jnp.arange(16) + 0.5) / 16
+    return jnp.isfinite(form.span) & jnp.all(jnp.isfinite(jax.vmap(form.matrix)(times)))
+
+
 def diffrax_propagator(
     form: LinearPeriodic, solver: diffrax.AbstractSolver, max_steps: int | None = None, **options: Any
 ) -> tuple[Propagator, Array]:
     """The propagator of one point over the span, NaN where the integration failed, and whether it succeeded."""
-    matrix, success = jnp.eye(form.size), jnp.bool_(True)
+    matrix, success = jnp.eye(form.size), has_finite_entries(form)
     for part in form.parts:
         solution = diffrax.diffeqsolve(
             LinearTerm(part),
             solver,
             t0=0.0,
-            t1=part.span,
+            # Without finite entries every step would be rejected, up to the last one.
+            t1=jnp.where(success, part.span, 0.0),
             dt0=None,
             y0=matrix,
             saveat=diffrax.SaveAt(t1=True),

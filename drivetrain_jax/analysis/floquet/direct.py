@@ -196,13 +196,14 @@ def direct_monodromy(
     ratio: Array | int,
     least: Array | float,
     most_pieces: Array | int = 1,
+    most: int = _MAX_STEPS,
 ) -> Monodromy:
     """Refine from ``steps`` predicted steps (traced integer) until the error of every lane is at most ``rtol``.
 
     ``propagate(steps, pieces)`` returns the propagator of ``system`` with batch shape ``shape``, by a scheme of order
     ``order``, in up to ``most_pieces``. ``stiffness`` is the result of :func:`stiffness_of`. A lane that overflows has two
-    doublings to recover and then no longer delays the others. After six doublings the error may exceed ``rtol``. For
-    ``ratio`` and ``least`` see :func:`_first_steps`.
+    doublings to recover and then no longer delays the others. After six doublings or ``most`` steps the error may exceed
+    ``rtol``. For ``ratio`` and ``least`` see :func:`_first_steps`.
     """
     begin, predicted, pieces = _first_steps(steps, ratio, least, most_pieces)
     zero = jnp.zeros(shape)
@@ -215,7 +216,7 @@ def direct_monodromy(
         count, current, _, result = state
         finite = jnp.all(jnp.isfinite(result.matrix), axis=(0, 1))
         lagging = jnp.where(finite, count < 2 + _MAX_REFINEMENTS, count < 4) & ~result.met
-        return (count < 2) | ((current <= _MAX_STEPS) & jnp.any(lagging))
+        return (count < 2) | ((current <= most) & jnp.any(lagging))
 
     def refine(state: tuple) -> tuple:
         count, current, coarse, _ = state
