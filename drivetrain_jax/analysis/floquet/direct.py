@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 # Most doublings of the predicted number of steps of a batch, and most steps.
 _MAX_REFINEMENTS = 6
-_MAX_STEPS = 2**20
+MAX_STEPS = 2**20
 # The explicit scheme is stable for decays of up to this much in a step.
 _STABLE = 6.0
 # Rounding of the entries of A, in units of the last place. A search for the worst points showed that half is too little.
@@ -196,19 +196,18 @@ def direct_monodromy(
     ratio: Array | int,
     least: Array | float,
     most_pieces: Array | int = 1,
-    most: int = _MAX_STEPS,
+    most: int = MAX_STEPS,
 ) -> Monodromy:
     """Refine from ``steps`` predicted steps (traced integer) until the error of every lane is at most ``rtol``.
 
     ``propagate(steps, pieces)`` returns the propagator of ``system`` with batch shape ``shape``, by a scheme of order
-    ``order``, in up to ``most_pieces``. ``stiffness`` is the result of :func:`stiffness_of`. A lane that overflows has two
-    doublings to recover and then no longer delays the others. After six doublings or ``most`` steps the error may exceed
-    ``rtol``. For ``ratio`` and ``least`` see :func:`_first_steps`.
+    ``order``, in up to ``most_pieces``. For ``stiffness`` see :func:`stiffness_of`, for ``ratio`` and ``least``
+    :func:`_first_steps`. A lane that overflows has two doublings to recover and then no longer delays the others. After
+    six doublings or ``most`` steps the error may exceed ``rtol``.
     """
     begin, predicted, pieces = _first_steps(steps, ratio, least, most_pieces)
     zero = jnp.zeros(shape)
-    # Traced once, not for its shapes and again for its values.
-    propagate = jax.jit(propagate)
+    propagate = jax.jit(propagate)  # traced once, not for its shapes and again for its values
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape), jax.eval_shape(propagate, steps, pieces))
     unknown = Monodromy(blank.matrix, zero, jnp.full(shape, jnp.inf), jnp.zeros(shape, bool), zero, blank.matrix)
 

@@ -11,8 +11,8 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis._base import Solver
-from drivetrain_jax.analysis.floquet.direct import Monodromy, direct_monodromy, stable_steps, stiffness_of
-from drivetrain_jax.analysis.floquet.effort import LONG, PANEL_COST, efforts, traced_steps
+from drivetrain_jax.analysis.floquet.direct import MAX_STEPS, Monodromy, direct_monodromy, stable_steps, stiffness_of
+from drivetrain_jax.analysis.floquet.effort import LONG, MAX_PANELS, PANEL_COST, efforts, traced_steps
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.systems import System
 
@@ -128,5 +128,8 @@ def _solve(
 
     stiffness = stiffness_of(periodic, shape)
     ratio = jnp.where(target <= _FINE, _RATIO, 2) if explicit and model.explicit_steps else 2
-    found = direct_monodromy(periodic, propagate, effort, shape, stiffness, target, scheme.ORDER, ratio, least, pieces)
+    found = direct_monodromy(
+        periodic, propagate, effort, shape, stiffness, target, scheme.ORDER, ratio, least, pieces,
+        most=MAX_STEPS if explicit else 2 * MAX_PANELS,
+    )  # fmt: skip
     return results(model, found)

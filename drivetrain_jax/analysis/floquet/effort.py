@@ -24,7 +24,7 @@ _STIFF = 600
 # Least ratio of explicit steps to the steps of the oscillation at which a point with a long march counts as stiff.
 LONG, _OSCILLATES = 10_000, 10.0
 # Most explicit steps and most implicit panels: beyond, a point is left to the other scheme, or ends as STEP_LIMIT.
-_MAX_EXPLICIT, _MAX_PANELS = 1_000_000, 20_000
+_MAX_EXPLICIT, MAX_PANELS = 1_000_000, 20_000
 # Steps of a model that is NaN somewhere in its span: it is solved all the same, so that its outcome becomes NOT_FINITE.
 _TO_FIND_NO_VALUE = 64
 # Ratio of the time of one implicit panel to one explicit step, per point. It is 150 in full batches, but few points share a
@@ -54,7 +54,7 @@ def efforts(system: type[System], columns: Mapping[str, Any], rtol: float) -> Ef
     steps = _explicit_steps(build, model if "explicit_steps" in facts else None, columns, rtol)
     damped = model.strongly_damped() if model is not None and "strongly_damped" in facts else False
     panels = _panels(system, steps, columns, rtol)
-    return Efforts(_up_to(_MAX_EXPLICIT, steps), np.broadcast_to(damped, steps.shape), _up_to(_MAX_PANELS, panels))
+    return Efforts(_up_to(_MAX_EXPLICIT, steps), np.broadcast_to(damped, steps.shape), _up_to(MAX_PANELS, panels))
 
 
 def explicit_effort(system: type[System], columns: Mapping[str, Any], rtol: float) -> np.ndarray:
