@@ -14,7 +14,7 @@ author = "the authors of drivetrain_jax"
 version = release = drivetrain_jax.__version__
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.doctest",
     "sphinx.ext.napoleon",
@@ -22,6 +22,12 @@ extensions = [
 ]
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]
 myst_heading_anchors = 3
+# Notebooks run once and are kept beside the pages; an error in one stops the build.
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(Path(__file__).parent.parent / "out" / "docs" / "notebooks")
+nb_execution_raise_on_error = True
+nb_execution_timeout = 600
+nb_output_stderr = "remove"
 myst_dmath_double_inline = True
 # Every reference must lead somewhere; names of types in signatures need not.
 nitpicky = False
