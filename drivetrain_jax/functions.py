@@ -115,8 +115,9 @@ def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapp
             f"system: got a {type(system).__name__}; allowed is a system such as drivetrain_jax.Cardan(...)"
         )
     try:
+        # The model first: only a system with one declares what the analysis takes from its class.
+        model = get_analysis(name).model(type(system))
         analysis = get_analysis(name).for_system(type(system))
-        model = analysis.model(type(system))
     except KeyError:
         known = analyses_of(type(system))
         guess = did_you_mean(name, known)
