@@ -26,7 +26,7 @@ from drivetrain_jax.analysis.request import checked
 from drivetrain_jax.runs.axes import Axis, entry_of
 from drivetrain_jax.runs.run import run
 from drivetrain_jax.runs.scene import Scene
-from drivetrain_jax.systems import Model, System
+from drivetrain_jax.systems import Model, System, get_system, system_names
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -87,6 +87,12 @@ def _scene_table(
     if not isinstance(system, System):
         raise InputError(
             f"system: got a {type(system).__name__}; allowed is a system such as drivetrain_jax.Cardan(...)"
+        )
+    # A scene names its system; an unregistered subclass of a registered class would be solved as its parent.
+    if system.name not in system_names() or get_system(system.name) is not type(system):
+        raise InputError(
+            f"system: got {type(system).__name__}, which is not registered; expected an installed system, "
+            f"or a function such as lambda system: drivetrain_jax.{name}(system)"
         )
     # An empty list stands for a default of none.
     conversions = system.physical.conversions if system.physical else ()
