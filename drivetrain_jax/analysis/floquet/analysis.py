@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter
 from drivetrain_jax.analysis._base import DIFFRAX_SOLVERS, RTOL, Analysis, Request, Solver
 from drivetrain_jax.analysis.floquet.direct_solvers import direct_solvers
@@ -53,6 +54,18 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
 _DERIVATIVES = 1e-11
 
 
+@jax.custom_jvp
+def _once(parameters: Any) -> Any:
+    """``parameters``, whose second differentiation raises an error."""
+    return parameters
+
+
+@_once.defjvp
+def _(primals: Any, tangents: Any) -> Any:
+    del primals, tangents
+    raise InputError("floquet: got a second derivative, expected a first; take differences of the gradient")
+
+
 def _derivatives(
     system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
 ) -> dict[str, Array]:
@@ -63,7 +76,7 @@ def _derivatives(
     del results
     from drivetrain_jax.analysis.floquet.derivatives import monodromy, multipliers, shares_modulus
 
-    build = system.models["floquet"].build
+    parameters, build = _once(parameters), system.models["floquet"].build
     steps = traced_steps(build, eqx.combine(parameters, constants.tree), _DERIVATIVES)
     z, log_scale, pull = monodromy(build, parameters, constants, steps)
     sigma, by_entry, error = multipliers(z)
@@ -104,7 +117,7 @@ ANALYSIS = Analysis(
     methods={"auto": ("rtol",), "atlas": ("rtol",), "direct": ("rtol",), "diffrax": ("rtol", "atol", "solver", "form")},
     method_titles={
         "auto": "atlas where that is cheaper, else direct",
-        "atlas": "Chebyshev panels held against direct solves, with their bound",
+        "atlas": "Chebyshev panels compared with direct solves, with their bound",
         "direct": "equal steps of order 8, implicit where that is cheaper",
         "diffrax": "equal steps of a solver of diffrax, or adaptive ones for the equations as published",
     },
