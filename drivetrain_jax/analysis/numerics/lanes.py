@@ -118,6 +118,8 @@ def lanes_last(
         if not any(jax.tree.leaves(batched)):
             results = call(varying, shared)
             return results, jax.tree.map(lambda _: False, results)
+        if not batch:
+            return _empty(call, batched, varying, shared)
         lanes = max(x.shape[-1] for x in jax.tree.leaves(varying))
         merged = jax.tree.map(partial(_merged, batch, lanes), varying, batched[0])
         common = jax.tree.map(partial(_common, batch, lanes), shared, batched[1])
@@ -128,6 +130,18 @@ def lanes_last(
 
     results = call(jax.tree.map(lambda x: jnp.asarray(x)[..., None], varying), shared)
     return jax.tree.map(lambda x: x[..., 0], results)
+
+
+def _empty(call: Callable[[Any, Any], Any], batched: Any, varying: Any, shared: Any) -> tuple[Any, Any]:
+    """The results of no points, for the rule of ``jax.vmap``."""
+
+    def one(x: Array, own: bool) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(x.shape[own:], x.dtype)
+
+    results = jax.eval_shape(
+        call, *(jax.tree.map(one, x, own) for x, own in zip((varying, shared), batched, strict=True))
+    )
+    return jax.tree.map(lambda x: jnp.zeros((0, *x.shape), x.dtype), results), jax.tree.map(lambda _: True, results)
 
 
 def _at_once(
