@@ -26,6 +26,12 @@ from tests.sizes import but_full
 
 BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 SHAFT = dt.Cardan(beta=0.3, Omega=1.416, **BASE)
+
+
+class Unregistered(dt.Cardan):
+    """A subclass that inherits the name of its parent."""
+
+
 GEARS = dt.Rattle(omega=0.7, **dt.Rattle.presets["table1"])
 TRIPOD = dt.Tripod(element="input", beta=0.157, zeta=0.0016, chi_n=0.3)
 
@@ -171,11 +177,14 @@ def test_diffrax_under_vmap_is_the_engine_of_the_tripod(monkeypatch):
         (lambda: dt.floquet(SHAFT, rtoll=1e-9), "rtoll = 1e-09: not used by method auto"),
         (lambda: dt.floquet(SHAFT, outputs="radius"), "outputs: 'radius' is not a result of floquet"),
         (lambda: dt.modes(SHAFT), "modes: unknown to cardan; allowed is one of floquet, atlas, forced"),
+        (lambda: dt.forced(dt.Planetary()), "forced: unknown to planetary; allowed is one of"),
+        (lambda: jax.hessian(lambda s: dt.floquet(s).spectral_radius)(SHAFT), "floquet: got a second derivative"),
         (lambda: dt.floquet(3.0), "system: got a float; allowed is a system"),
         (lambda: dt.floquet(replaced(SHAFT, "beta", jnp.ones(3))), r"parameters of the shape \(3,\)"),
         (lambda: dt.history(dt.Tripod(element="input", beta=0.1, zeta=0.1, equation="26"), stop=1.0), "equation = '26'"),
         (lambda: dt.sweep(dt.floquet, SHAFT, over={}), "over: empty"),
         (lambda: dt.sweep(dt.floquet, SHAFT, over={"bet": [0.1]}), "bet: unknown parameter"),
+        (lambda: dt.sweep(dt.floquet, Unregistered(**SHAFT.values), over={"beta": [0.1]}), "got Unregistered, which is not"),
         (lambda: dt.sweep(dt.floquet, SHAFT, over={"beta": [[0.1]]}), r"over.beta: got an array of the shape \(1, 1\)"),
         (lambda: dt.sweep(lambda p: p["a"], {"a": 1.0}, over={"b": [1.0]}), "over.b: unknown to a dict"),
         (lambda: dt.sweep(lambda p: {"a": p["a"]}, {"a": 1.0}, over={"a": [1.0]}), "over: 'a' names two dimensions"),
@@ -185,6 +194,11 @@ def test_wrong_input_is_one_line(call, message):
     with pytest.raises(dt.InputError, match=message) as raised:
         call()
     assert "\n" not in str(raised.value)
+
+
+def test_an_empty_batch_has_empty_derivatives():
+    slopes = jax.vmap(jax.grad(lambda s: dt.floquet(s).spectral_radius))(jax.tree.map(lambda _: jnp.zeros(0), SHAFT))
+    assert slopes.beta.shape == (0,)
 
 
 def test_any_function_is_swept_resumed_and_refused(tmp_path):
