@@ -315,12 +315,12 @@ class StoredAtlas:
     def in_parameters(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """``values`` with parameters of the atlas for physical data, and numbers for texts; fixed ones must agree."""
         given, found = in_parameters(self.scene.system, values, self.scene.data)
-        if given is None:
-            return dict(values)
-        for name, value in found.items():
-            if name in self.fixed and name not in values:
-                check_same(name, value, self.fixed[name])
-        return {name: value for name, value in found.items() if name not in self.fixed or name in values}
+        found = dict(values) if given is None else found
+        for name in self.fixed.keys() & found.keys():
+            if not np.issubdtype(np.asarray(found[name]).dtype, np.number):
+                self.refuse(name, found[name])
+            check_same(name, found[name], self.fixed[name])
+        return {name: value for name, value in found.items() if name not in self.fixed}
 
     def _names(self, values: Mapping[str, Any]) -> tuple[str, ...]:
         for name in values:

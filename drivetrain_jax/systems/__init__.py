@@ -72,5 +72,7 @@ def get_system(name: str) -> type[System]:
         return getattr(import_module(f"drivetrain_jax.systems.{name}"), _BUILT_IN[name])
     found = load_plugin(SYSTEMS, name, "a system", lambda x: isinstance(x, type) and issubclass(x, System))
     if found is None:
-        raise KeyError(f"system = {name!r}: allowed is one of {', '.join(system_names())}")
+        raise KeyError(
+            f"system = {name!r}: allowed is one of {', '.join(system_names())}, or one that a package registers"
+        )
     return found

@@ -136,6 +136,9 @@ class System(eqx.Module):
         fields = {
             name: own[name].metadata for name in own.get("__annotations__", {}) if hasattr(own.get(name), "metadata")
         }
+        for name, kind in own.get("__annotations__", {}).items():
+            if name not in fields and "ClassVar" not in str(kind):
+                raise TypeError(f"{cls.__name__}.{name}: not a parameter; allowed is {name}: Any = parameter(...)")
         cls.parameters += tuple(replace(m[_PARAMETER], name=name) for name, m in fields.items() if _PARAMETER in m)
         if "models" not in own:
             cls.models = dict(cls.models) | {a: m for method in own.values() for a, m in _models(cls, method).items()}

@@ -116,29 +116,41 @@ class LinearPeriodic(eqx.Module):
     @property
     def size(self) -> int:
         """Number of states."""
-        return len(self.rows(*self.basis(0.0)))
+        return len(self.square_rows(*self.basis(0.0)))
 
     @property
     def exchanges_halves(self) -> bool:
         """True if there are four states, and the reversor exchanges the first two with the others."""
         return self.reversor == SWAP
 
+    def square_rows(self, *basis: Any) -> Rows:
+        """``rows(*basis)``; raises :class:`~drivetrain_jax.InputError` unless they are as many as the entries of each."""
+        rows = self.rows(*basis)
+        if not isinstance(rows, (tuple, list)) or not all(isinstance(row, (tuple, list)) for row in rows):
+            raise InputError(
+                f"rows: {type(rows).__name__}; allowed are tuples of tuples, ((a, b), (c, d)) for two states"
+            )
+        for i, row in enumerate(rows):
+            if len(row) != len(rows):
+                raise InputError(f"rows[{i}]: {len(row)} entries; allowed are {len(rows)}, as many as there are rows")
+        return rows
+
     def entries(self, *basis: Any) -> dict[tuple[int, int], Array]:
         """The entries of ``A`` that do not vanish identically, by row and column."""
-        rows = self.rows(*basis)
+        rows = self.square_rows(*basis)
         return {
             (i, j): jnp.asarray(x, float) for i, row in enumerate(rows) for j, x in enumerate(row) if not _vanishes(x)
         }
 
     def matrix(self, t: Any) -> Array:
         """``A(t)``, shape ``(n, n, ...)``."""
-        return dense(self.rows(*self.basis(t)))
+        return dense(self.square_rows(*self.basis(t)))
 
     def vf(self, t: Any, y: Any, args: Any) -> Array:
         """``A(t) y`` of a state or a matrix of states ``y``."""
         del args
         # Written as sums: under vmap small matrix products are slower.
-        rows = self.rows(*self.basis(t))
+        rows = self.square_rows(*self.basis(t))
         return jnp.stack([sum(a * y[j] for j, a in enumerate(row) if not _vanishes(a)) + 0 * y[0] for row in rows])
 
 

@@ -154,6 +154,18 @@ def test_breakpoints_outside_of_the_period_are_refused(breakpoints, message):
         LinearPeriodic(lambda t: ((0 * t,),), 3.0, breakpoints=breakpoints)
 
 
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (jnp.eye(2), r"rows: \w*Array\w*; allowed are tuples of tuples, \(\(a, b\), \(c, d\)\) for two states"),
+        (((0.0, 1.0), (1.0,)), r"rows\[1\]: 1 entries; allowed are 2, as many as there are rows"),
+    ],
+)
+def test_rows_that_are_no_square_matrix_are_refused(rows, message):
+    with pytest.raises(dt.InputError, match=f"^{message}$"):
+        LinearPeriodic(lambda t: rows, 3.0).matrix(0.0)
+
+
 def test_a_lane_with_a_breakpoint_outside_of_the_period_has_no_value():
     systems = jax.vmap(lambda duty: replace(Meissner(delta=1.0, jump=0.6, zeta=0.01, duty=0.3), duty=duty))
     found = jax.vmap(lambda s: dt.floquet(s, outputs=OUTPUTS).variables)(systems(jnp.array([0.3, 1.2, -0.1])))

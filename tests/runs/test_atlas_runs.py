@@ -328,8 +328,8 @@ def test_a_file_of_other_coordinates_is_refused(stored):
             "allowed is 0 <= beta <= 0.6, in rad; 1 <= Omega <= 2",
         ),
         (
-            {"beta": 0.3, "Omega": 1.5, "mu": 1.0},
-            "mu = 1: the atlas is made for mu = 1; allowed is to leave it out",
+            {"beta": 0.3, "Omega": 1.5, "mu": 1.01},
+            "mu = 1.01: the atlas is made for mu = 1; allowed is that value",
         ),
     ],
 )
@@ -337,6 +337,11 @@ def test_questions_outside_the_atlas(atlas, given, message):
     with pytest.raises(dt.InputError) as error:
         atlas(**given)
     assert str(error.value) == message
+
+
+def test_fixed_values_may_be_given_again(atlas):
+    found = atlas(beta=0.3, Omega=1.5, **atlas.fixed)
+    xr.testing.assert_identical(found, atlas(beta=0.3, Omega=1.5))
 
 
 def test_nearest_boundaries_of_a_point(atlas):
