@@ -27,8 +27,6 @@ LABELS = {
     "drivetrain_jax direct": "**`direct`**",
     "heyoka batch": "heyoka (compiled Taylor integrator)",
     "scipy DOP853 stacked, half period": "SciPy DOP853, whole grid as one state, half a period",
-    "scipy DOP853 stacked": "SciPy DOP853, whole grid as one state",
-    "scipy DOP853": "SciPy DOP853, point by point",
     "scipy RK45": "SciPy RK45, point by point (the paper's method)",
     "drivetrain_jax diffrax": "`diffrax` under vmap",
 }
