@@ -275,5 +275,5 @@ for call in (lambda: dt.critical_speeds(gears), lambda: dt.sweep(dt.critical_spe
 def test_a_result_and_a_gradient_show_their_numbers():
     found = dt.floquet(SHAFT, outputs=["spectral_radius"])
     assert re.fullmatch(r"Result\(outcome=0, spectral_radius=1\.03193549\d+\)", repr(found))
-    assert "zeta=-0.5\n" in repr(jax.grad(lambda s: -0.5 * s.zeta)(SHAFT)).replace(",", "")
+    assert "zeta=-0.5," in repr(jax.grad(lambda s: -0.5 * s.zeta)(SHAFT))
     assert "spectral_radius=f64[2]" in repr(jax.tree.map(lambda x: jnp.stack([x, x]), found))
