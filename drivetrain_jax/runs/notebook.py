@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from typing import Any
 
 from drivetrain_jax.runs.work import Progress, Report
@@ -52,14 +53,13 @@ class _Bar:
             self._show()
 
     def _show(self) -> None:
-        from IPython.display import HTML, display  # pyright: ignore[reportMissingImports]
-
+        shell: Any = import_module("IPython.display")
         self._shown = time.monotonic()
-        content = HTML(_html(self._last, self._shown - self._begin))  # pyright: ignore[reportArgumentType]
+        content = shell.HTML(_html(self._last, self._shown - self._begin))  # pyright: ignore[reportArgumentType]
         if self._display:
             self._display.update(content)
         else:
-            self._display = display(content, display_id=True)
+            self._display = shell.display(content, display_id=True)
 
 
 def _html(progress: Progress, seconds: float) -> str:
