@@ -23,7 +23,7 @@ STYLE: dict[Any, Any] = {
     "axes.titlesize": 8.5,
     "axes.linewidth": 0.7,
     "axes.formatter.useoffset": False,
-    # Show powers of ten as a factor, because numbers of five digits would overlap the axis label.
+    # Show powers of ten as a factor, because numbers of six digits would overlap the axis label.
     "axes.formatter.limits": (-3, 5),
     "axes.formatter.use_mathtext": True,
     "xtick.labelsize": 8.0,

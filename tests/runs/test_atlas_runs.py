@@ -59,7 +59,7 @@ def floquet(method, axes=None, **more):
     }
 
 
-def same_arrays(a, b):
+def assert_same_arrays(a, b):
     assert set(a.variables) == set(b.variables)
     for name in a.variables:
         np.testing.assert_array_equal(a[name].values, b[name].values, err_msg=name)
@@ -118,7 +118,7 @@ def test_auto_uses_an_atlas_for_many_points(monkeypatch, direct):
     found = dt.run(floquet("auto"))
     # A forced attempt stops at the first round, and all points are solved directly.
     assert found.attrs["atlas_uncovered"] == 533
-    same_arrays(found, direct)
+    assert_same_arrays(found, direct)
     monkeypatch.setattr(atlas_choice, "_SHARE", 10.0)
     assert_agree(dt.run(floquet("auto")), direct)
 
@@ -148,7 +148,7 @@ def test_points_outside_an_atlas_are_solved(monkeypatch, direct):
     monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
     found = dt.run(floquet("atlas"))
     assert found.attrs["atlas_uncovered"] == 533 and found.attrs["atlas_panels"] == 0
-    same_arrays(found, direct)
+    assert_same_arrays(found, direct)
 
 
 def test_gaps_of_an_atlas_are_noted(monkeypatch, tmp_path):
@@ -176,7 +176,7 @@ def test_an_interrupted_atlas_is_resumed_with_the_same_bits(tmp_path, scene, chu
     progress = run_to_file(scene, out)
     assert progress.reused > 0 and progress.reused + progress.computed == progress.total == whole.attrs["solves"]
     with xr.open_dataset(out, engine="h5netcdf") as found:
-        same_arrays(found, whole)
+        assert_same_arrays(found, whole)
     again = run_to_file(scene, out)
     assert again.computed == 0 and again.reused == whole.attrs["solves"]
 
@@ -190,7 +190,7 @@ def test_an_interrupted_chart_is_resumed_with_the_same_bits(tmp_path, monkeypatc
     progress = run_to_file(scene, out)
     assert progress.total == progress.computed == 533 and progress.failed == 0
     with xr.open_dataset(out, engine="h5netcdf") as found:
-        same_arrays(found, dt.run(scene))
+        assert_same_arrays(found, dt.run(scene))
 
 
 def test_solves_are_kept_when_a_chart_fails_after_them(tmp_path, monkeypatch):
@@ -210,7 +210,7 @@ def test_solves_are_kept_when_a_chart_fails_after_them(tmp_path, monkeypatch):
 def test_the_solves_of_an_atlas_run_on_workers(stored, monkeypatch):
     """All solves run on workers, none in this process, and have the same bits as in threads."""
     monkeypatch.setattr(Job, "compute", None)
-    same_arrays(dt.run(ATLAS, workers=2), stored)
+    assert_same_arrays(dt.run(ATLAS, workers=2), stored)
 
 
 def test_the_function_of_the_parameters(atlas, direct):
@@ -265,7 +265,7 @@ def test_an_atlas_without_a_panel_has_all_its_points_solved(monkeypatch, tmp_pat
     exact = dt.run(scene | {"options": {"method": "direct"}})
     for found in (dt.run(scene), dt.run(scene, out=tmp_path / "r.nc")):
         assert found.attrs["atlas_panels"] == 0
-        same_arrays(found, exact)
+        assert_same_arrays(found, exact)
 
 
 def test_values_that_coincide_in_the_coordinates_of_an_atlas():

@@ -77,7 +77,8 @@ def _pulled(fixed: Constants, given: tuple[Any, Array, Array], steps: Array) -> 
     lanes = max(x.shape[-1] for x in jax.tree.leaves(given) if x.ndim)
     parameters = jax.tree.map(lambda x: jnp.broadcast_to(x, lanes), parameters)
     before, weights = (jnp.broadcast_to(x, (*x.shape[:-1], lanes)) for x in (before, weights))
-    part = partial(Part, build=fixed.tree[0], constants=fixed.tree[1], number=fixed.tree[2])
+    build, constants, number = fixed.tree
+    part = partial(Part, build=build, constants=constants, number=number)
     blocks = -(-steps // _STEPS)
     long = -(-blocks // _KEPT)
     short = -(-blocks // long)

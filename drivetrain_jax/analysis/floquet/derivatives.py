@@ -29,7 +29,7 @@ _MATRIX_ERROR = 3e-12
 _SIMPLE = 1e-7
 
 
-class Monodromy(NamedTuple):
+class DifferentiableMonodromy(NamedTuple):
     """The monodromy matrix ``exp(log_scale) z``, ``(n, n)``.
 
     ``pull(weights)`` is the gradient ``(F, P)`` of ``sum(weights * z)`` for ``weights`` ``(F, n, n)`` at a fixed log_scale.
@@ -52,7 +52,7 @@ class Multipliers(NamedTuple):
     error: Array
 
 
-def monodromy(build: Build, parameters: Any, constants: Constants, steps: Array) -> Monodromy:
+def monodromy(build: Build, parameters: Any, constants: Constants, steps: Array) -> DifferentiableMonodromy:
     """The monodromy matrix of one point in ``steps`` steps, differentiable by ``parameters``, a pytree of P numbers."""
     form = reduced_form(build, parameters, constants)
     parts = [Part(parameters, build, constants, number) for number in range(len(form.breakpoints) + 1)]
@@ -79,7 +79,7 @@ def monodromy(build: Build, parameters: Any, constants: Constants, steps: Array)
             weights = phis[number].T @ weights
         return jnp.stack(jax.tree.leaves(gradient), axis=1)
 
-    return Monodromy(value, form.halves * log_scale, pull)
+    return DifferentiableMonodromy(value, form.halves * log_scale, pull)
 
 
 def multipliers(z: Array) -> Multipliers:
