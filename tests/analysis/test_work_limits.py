@@ -64,3 +64,33 @@ def test_the_widest_points_end(name):
 @pytest.mark.parametrize("name", CASES)
 def test_wide_batches_end(name, decades):
     assert_ends(name, decades, MANY, seed=1)
+
+
+# Module with the limit, name of the limit, a small value, function, system, options and the outcome at the limit. Options
+# differ from those of other tests, whose compiled functions have the usual limits.
+SHAFT = {"element": "input", "beta": 0.157, "zeta": 0.0016}
+JOINT = {"beta": 0.3, "Omega": 1.1, "zeta": 0.01, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+LIMITS = {
+    "lyapunov": ("lyapunov.step_groups", "MOST_WORK", 1.0, dt.lyapunov, dt.Tripod(**SHAFT), {"max_time": 0.0417}),
+    "history": ("history.integration", "_STROBES", 1.0, dt.history, dt.Tripod(**SHAFT), {"stop": 0.0417, "num": 3}),
+    "poincare": (
+        "poincare.analysis", "_MEAN_STEPS", 0, dt.poincare, dt.Tripod(**SHAFT),
+        {"method": "adaptive", "strobes": 419, "rtol": 1e-11},
+    ),
+    "floquet": (
+        "floquet.diffrax_solvers", "MAX_STEPS", 8, dt.floquet, dt.Cardan(**JOINT), {"method": "diffrax", "rtol": 4.17e-9},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", but_full(LIMITS, "poincare"))
+def test_a_usual_point_beyond_a_small_limit_is_not_finished(name, monkeypatch):
+    module, limit, value, function, system, options = LIMITS[name]
+    monkeypatch.setattr(f"drivetrain_jax.analysis.{module}.{limit}", value)
+    assert function(system, **options).outcome == Outcome.STEP_LIMIT
+
+
+def test_a_search_for_an_orbit_ends_at_its_limit(monkeypatch):
+    monkeypatch.setattr("drivetrain_jax.analysis.forced.orbit.MAX_SEARCH", 1)
+    found = dt.forced(dt.Cardan(**JOINT), outputs=["orbit_state"], rtol=4.17e-8)
+    assert found.outcome == Outcome.NOT_CONVERGED
