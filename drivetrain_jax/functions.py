@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax import _compile_cache
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._printing import printed
 from drivetrain_jax._wording import did_you_mean
@@ -170,6 +171,7 @@ def _concrete(job: _Job, parameters: Any) -> dict[str, Array]:
 
 @lru_cache(maxsize=64)
 def _compiled(job: _Job, index: int) -> Callable[..., dict[str, Array]]:
+    _compile_cache.enable()
     solver = job.solvers[index]
     # Without optimisation if a call takes milliseconds: a user with many calls compiles them by `jax.jit`.
     options = compiler_options(1, march=solver.march) if solver.lengthy else options_for_few()
@@ -179,6 +181,7 @@ def _compiled(job: _Job, index: int) -> Callable[..., dict[str, Array]]:
 @lru_cache(maxsize=64)
 def _pure(job: _Job) -> Callable[[Any], dict[str, Array]]:
     """The function of the parameters, with its derivatives."""
+    _compile_cache.enable()
 
     @jax.custom_jvp
     def solve(parameters: Any) -> dict[str, Array]:

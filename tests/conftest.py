@@ -24,10 +24,10 @@ def pytest_configure(config):
 @pytest.fixture(autouse=True, scope="session")
 def no_stored_programs():
     """A test that replaces code must not leave its program to later runs; processes that tests start do store programs."""
-    from drivetrain_jax.runs import compile_cache
+    from drivetrain_jax import _compile_cache
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compile_cache, "programs", lambda: None)
+        patch.setattr(_compile_cache, "programs", lambda: None)
         yield
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
+from drivetrain_jax import _compile_cache
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import counted, did_you_mean, shown
 from drivetrain_jax.analysis import Request, get_analysis
@@ -18,7 +19,6 @@ from drivetrain_jax.analysis.atlas.analysis import ANALYSIS
 from drivetrain_jax.analysis.request import make_request
 from drivetrain_jax.atlas import Atlas, StabilityAtlas, from_arrays, stability_atlas, to_arrays
 from drivetrain_jax.atlas.floquet import floquet_domain
-from drivetrain_jax.runs import compile_cache
 from drivetrain_jax.runs.assemble import ResultBuffer, result_attrs, to_dataset
 from drivetrain_jax.runs.atlas_values import as_given, broadcast, check_same
 from drivetrain_jax.runs.axes import Axis
@@ -95,7 +95,7 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
     >>> print(atlas(Omega=1.1).verdict.item())
     0
     """
-    compile_cache.enable()
+    _compile_cache.enable(short=True)
     label = f"file = {str(source)!r}" if isinstance(source, (str, Path)) else "dataset"
     arrays, attrs = _content(source, label)
     if missing := _missing(arrays, attrs):

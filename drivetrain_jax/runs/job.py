@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 import jax
 import numpy as np
 
+from drivetrain_jax import _compile_cache
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax._precision import use_double_precision
 from drivetrain_jax._threads import threads
 from drivetrain_jax.analysis import Solver
-from drivetrain_jax.runs import compile_cache
 from drivetrain_jax.runs.identity import numerics_of, scene_digest
 from drivetrain_jax.runs.kernel import Kernel, for_device, is_small, kernel_of
 from drivetrain_jax.runs.plan import Chunk, Plan, make_plan
@@ -105,7 +105,7 @@ class Job:
         """The solvers that a plan chooses from."""
         # Before the first kernel, which the plan may need.
         _check_double_precision()
-        compile_cache.enable()
+        _compile_cache.enable(short=True)
         solvers = self.problem.analysis.solvers(self.problem.system, self.problem.request)
         return tuple(map(for_device, solvers))
 

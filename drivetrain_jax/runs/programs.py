@@ -21,8 +21,8 @@ import numpy as np
 from jax.experimental import serialize_executable
 from jax.tree_util import PyTreeDef, default_registry
 
+from drivetrain_jax import _compile_cache
 from drivetrain_jax.analysis import get_analysis
-from drivetrain_jax.runs import compile_cache
 from drivetrain_jax.runs.identity import program_identity
 from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.store.files import write_atomic
@@ -45,7 +45,7 @@ def compiled(
 
     ``identity`` is a digest of everything else that the kernel depends on; an empty one keeps nothing on disk.
     """
-    folder = compile_cache.programs() if identity else None
+    folder = _compile_cache.programs() if identity else None
     path = folder / digest([identity, dict(options)]) if folder else None
     if path is None:
         return jax.jit(function).lower(*kinds).compile(dict(options))
@@ -64,7 +64,7 @@ def kept(system: type[System], kernel: Any, options: Mapping[str, Any], name: st
 
     Without a cache, and for a system of another package, it is ``kernel`` itself.
     """
-    if compile_cache.programs() is None or find_system(system.name) is not system:
+    if _compile_cache.programs() is None or find_system(system.name) is not system:
         return kernel
     identity = program_identity(system, get_analysis("floquet").for_system(system), name)
     return _Kept(kernel, tuple(options.items()), identity) if identity else kernel
@@ -99,7 +99,7 @@ def calls(kernel: jax.stages.Compiled, target: str) -> bool:
 
 def remembered(compute: Callable[[], Coordinates], identity: str) -> Coordinates:
     """``compute()``, stored on disk under ``identity``, as kernels are."""
-    folder = compile_cache.programs() if identity else None
+    folder = _compile_cache.programs() if identity else None
     if folder is None:
         return compute()
     path = folder / identity

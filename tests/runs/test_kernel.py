@@ -1,12 +1,8 @@
-"""Precision, compiler options and the cache of compiled code."""
+"""Precision and compiler options."""
 
 from __future__ import annotations
 
 import gc
-import os
-import stat
-import subprocess
-import sys
 import weakref
 from dataclasses import replace
 
@@ -121,38 +117,6 @@ def test_an_accelerator_gets_wide_batches_and_gives_the_same_results(monkeypatch
         cache.cache_clear()
     name = next(iter(expected.data_vars))
     assert float(abs(found[name] - expected[name]).max()) < 1e-10 * float(abs(expected[name]).max())
-
-
-SCRIPT = """
-from drivetrain_jax.runs import compile_cache
-import jax
-compile_cache.enable()
-print(jax.config.jax_compilation_cache_dir)
-jax.jit(lambda x: x + 1)(1.0)
-"""
-
-
-def folder_used(**environment):
-    keep = {k: v for k, v in os.environ.items() if k not in ("DRIVETRAIN_JAX_CACHE", "XDG_CACHE_HOME")}
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT], env=keep | environment, capture_output=True, text=True, check=True
-    )
-    assert not done.stderr
-    return done.stdout.strip()
-
-
-def test_compiled_code_is_kept_in_a_private_folder(tmp_path):
-    folder = folder_used(XDG_CACHE_HOME=str(tmp_path))
-    assert folder.startswith(str(tmp_path / "drivetrain_jax")) and len(os.listdir(folder)) > 0
-    assert stat.S_IMODE(os.stat(folder).st_mode) == 0o700
-
-
-@pytest.mark.parametrize("setting", ["0", "a file"])
-def test_cache_is_off_by_setting_or_without_a_folder(tmp_path, setting):
-    if setting == "a file":
-        (tmp_path / "file").touch()
-        setting = str(tmp_path / "file")
-    assert folder_used(DRIVETRAIN_JAX_CACHE=setting, XDG_CACHE_HOME=str(tmp_path)) == "None"
 
 
 def test_kernels_with_lapack_calls_take_turns():

@@ -79,35 +79,39 @@ def _pulled(fixed: Constants, given: tuple[Any, Array, Array], steps: Array) -> 
     before, weights = (jnp.broadcast_to(x, (*x.shape[:-1], lanes)) for x in (before, weights))
     build, constants, number = fixed.tree
     part = partial(Part, build=build, constants=constants, number=number)
+    system = part(parameters).system
     blocks = -(-steps // _STEPS)
     long = -(-blocks // _KEPT)
     short = -(-blocks // long)
     h = 1 / (long * short * _STEPS)
-    whole = partial(explicit_march, part(parameters).system)
 
-    def of_level(level: int, start: Array, length: Array, state: Array, weights: Array) -> tuple[Any, Array]:
-        """Gradients over an interval, and the weights pulled back to its start."""
-        if level == 0:
-            return _pulled_block(part, parameters, start, h, state, weights)
-        count = (short, long)[level - 1]
-        own = length / count
+    def interval(number: Array, carry: tuple[Array, Any, Array]) -> tuple[Array, Any, Array]:
+        """First the states before the long intervals; then, for each of these from the last, before its blocks."""
+        kept, gradient, weights = carry
+        first = number == 0
+        level, k = jnp.where(first, 0, 1), jnp.where(first, 0, long - number)
+        count, length = jnp.where(first, long, short), jnp.where(first, short * _STEPS, _STEPS)
+        start = k * (short * _STEPS * h)
 
-        def onward(k: Array, kept: Array) -> Array:
-            t = start + k * own
-            return kept.at[k + 1].set(matmul(whole(t, t + own, jnp.round(own / h).astype(int))[0], kept[k]))
-
-        kept = jnp.zeros((_KEPT, *state.shape)).at[0].set(state)
-        kept = jax.lax.fori_loop(0, count - 1, onward, kept)
+        def onward(i: Array, kept: Array) -> Array:
+            t = start + i * (length * h)
+            return kept.at[level, i + 1].set(
+                matmul(explicit_march(system, t, t + length * h, length)[0], kept[level, i])
+            )
 
         def back(j: Array, carry: tuple[Any, Array]) -> tuple[Any, Array]:
-            k = count - 1 - j
-            more, weights = of_level(level - 1, start + k * own, own, kept[k], carry[1])
+            block = short - 1 - j
+            t = start + block * (_STEPS * h)
+            more, weights = _pulled_block(part, parameters, t, h, kept[1, block], carry[1])
             return jax.tree.map(jnp.add, carry[0], more), weights
 
-        none = jax.tree.map(lambda x: jnp.zeros((len(weights), *x.shape)), parameters)
-        return jax.lax.fori_loop(0, count, back, (none, weights))
+        kept = jax.lax.fori_loop(0, count - 1, onward, kept.at[level, 0].set(kept[0, k]))
+        gradient, weights = jax.lax.fori_loop(0, jnp.where(first, 0, short), back, (gradient, weights))
+        return kept, gradient, weights
 
-    return of_level(2, jnp.zeros(()), jnp.ones(()), before, weights)[0]
+    kept = jnp.zeros((2, _KEPT, *before.shape)).at[0, 0].set(before)
+    none = jax.tree.map(lambda x: jnp.zeros((len(weights), *x.shape)), parameters)
+    return jax.lax.fori_loop(0, long + 1, interval, (kept, none, weights))[1]
 
 
 def _pulled_block(
@@ -137,9 +141,8 @@ def _pulled_block(
 
     weights, own = jax.lax.scan(back, weights, (each, states), reverse=True)
     own = jnp.moveaxis(own, 0, 3).reshape(len(weights), n, n, -1)
-    found = [in_blocks(gradients, (spread, starts, x), len(starts), _LANES) for x in own]
-    gradient = jax.tree.map(lambda *x: jnp.stack([jnp.sum(folded(each), axis=0) for each in x]), *found)
-    return gradient, weights
+    found = jax.lax.map(lambda x: in_blocks(gradients, (spread, starts, x), len(starts), _LANES), own)
+    return jax.tree.map(lambda x: jnp.sum(folded(x), axis=1), found), weights
 
 
 def _step_gradient(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 from pathlib import Path
@@ -9,27 +10,30 @@ from pathlib import Path
 import jax
 
 from drivetrain_jax._machine import instruction_set
-from drivetrain_jax.store.provenance import digest
 
 _VARIABLE = "DRIVETRAIN_JAX_CACHE"
 _MAX_BYTES = 1 << 29
 
 
-def enable() -> None:
+def enable(*, short: bool = False) -> None:
     """Turn on jax's compilation cache. ``DRIVETRAIN_JAX_CACHE=0`` turns it off; any other value names its folder.
 
-    A cache that the user has configured stays unchanged. Without a writable folder there is no cache.
+    A cache that the user has configured stays unchanged. Without a writable folder there is no cache. With ``short``
+    programs that compile in less than a second are kept too; until then the user's own small programs are not.
     """
     wanted = os.environ.get(_VARIABLE, "")
-    if wanted == "0" or jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
-        return
     folder = _folder(wanted)
-    if not _writable(folder):
+    used = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if wanted == "0" or (used and used != str(folder)):
         return
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_compilation_cache_max_size", _MAX_BYTES)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    if not used:
+        if not _writable(folder):
+            return
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_compilation_cache_max_size", _MAX_BYTES)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    if short:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 
 
 def programs() -> Path | None:
@@ -43,7 +47,8 @@ def _folder(wanted: str) -> Path:
     """One folder per instruction set and jax version, because compiled code is not portable."""
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     root = Path(wanted) if wanted else base / "drivetrain_jax"
-    return root / digest([sorted(instruction_set()), jax.__version__])
+    content = " ".join((*sorted(instruction_set()), jax.__version__))
+    return root / hashlib.blake2b(content.encode(), digest_size=16).hexdigest()
 
 
 def _writable(folder: Path) -> bool:
