@@ -80,6 +80,9 @@ LIMITS = {
     "floquet": (
         "floquet.diffrax_solvers", "MAX_STEPS", 8, dt.floquet, dt.Cardan(**JOINT), {"method": "diffrax", "rtol": 4.17e-9},
     ),
+    "panels": (
+        "floquet.effort", "MAX_PANELS", 8, dt.floquet, dt.Cardan(**JOINT | {"zeta": 1e6, "Omega": 0.01}), {"rtol": 4.17e-9},
+    ),
 }  # fmt: skip
 
 
