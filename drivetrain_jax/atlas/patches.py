@@ -18,9 +18,11 @@ from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes, on_grid
 from drivetrain_jax.atlas.panels import Panel, chebyshev, grid_positions
 
-# Nodes of a patch in each coordinate, tail of the series relative to its size, and the largest number of patches.
+# Nodes of a patch in each coordinate, tail of the series relative to its size, the multiple of it up to which a tail may be
+# rounding, and the largest number of patches.
 NODES = 16
 _TAIL = 3e-14
+_ROUNDING = 1e6
 _MAX_PATCHES = 8_000
 # Relative enlargement of boxes, so that a root on a face is inside.
 MARGIN = 0.25
@@ -198,8 +200,8 @@ def _cover(criteria: Criteria, panel: Panel) -> tuple[Patches, ...]:
         size = np.abs(sample.coefficients).sum(axis=tuple(range(1, len(counts) + 1)))
         with np.errstate(all="ignore"):
             excess = [np.nanmax(tail / np.maximum(_TAIL * size, sample.floor / 8)) for tail in tails]
-        # A tail that does not fall with smaller patches is rounding.
-        rough = [e > 1 and e < b / 2 for e, b in zip(excess, before, strict=True)]
+        # A small tail that does not fall with smaller patches is rounding.
+        rough = [e > 1 and (e < b / 2 or _ROUNDING < e < np.inf) for e, b in zip(excess, before, strict=True)]
         if not any(rough) or np.prod(counts) * 2 > _MAX_PATCHES:
             break
         before = [e if split else b for e, b, split in zip(excess, before, rough, strict=True)]

@@ -63,14 +63,16 @@ def _windows(found: Mapping[str, Any], speed: str, named: Writer, forced: list[l
         kinds = [answers.BEYOND[end["kind"]] for end in window["ends"]]
         said.append(f"Stable from {low}{kinds[0]} to {high}{kinds[1]}; {_confirmed(window['check'])}.")
         said += map(_sentence, compared)
-    return said or ["No speed within the atlas is stable."]
+    none = "No stable speed was found; whether there is one is undecided." if found["undecided"] else ""
+    return said or [none or "No speed within the atlas is stable."]
 
 
 def _limit(found: Mapping[str, Any], phrase: str, named: Writer) -> list[str]:
     """The answer of a question for one limit that holds over all speeds of the atlas."""
     name = found["parameter"]
     if found["value"] is None:
-        return [f"No {name} of the atlas makes all of its speeds stable."]
+        doubt = "" if found["certain"] else " was found; whether there is one is undecided"
+        return [f"No {name} of the atlas{doubt or ' makes all of its speeds stable'}."]
     confirmed = f"; {_confirmed(found['check'])}" if found["check"] else ""
     return [f"Stable at all speeds of the atlas {phrase} {named(name, found['value'])}{confirmed}."]
 

@@ -28,6 +28,7 @@ from drivetrain_jax.runs.sensitivities import gradient_lines, limit_line, radius
 
 # Distance of a spectral radius from 1 below which the distance itself is printed.
 _CLOSE = 1e-3
+_OPEN = "found; whether there is one is undecided"
 # Text after the end of a stable interval, by kind of end (`_kind`).
 BEYOND = {
     "crossing": "",
@@ -180,14 +181,14 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
         "undecided": [list(r) for r in found.undecided],
         **forced,
     }
-    lines += [] if found.windows else ["  none within the atlas"]
-    lines += _undecided(found.undecided)
+    lines += [] if found.windows else [f"  none {_OPEN if found.undecided else 'within the atlas'}"]
+    lines += _undecided(asked, speed, found.undecided)
     return Reply("\n".join(lines), data)
 
 
-def _undecided(ranges: Iterable[Range]) -> list[str]:
+def _undecided(asked: AtlasQuery, name: str, ranges: Iterable[Range]) -> list[str]:
     """Undecided ranges as text, with what to do."""
-    found = [f"  undecided from {number(a)} to {number(b)}" for a, b in ranges]
+    found = [f"  undecided from {asked.named(name, a)} to {asked.named(name, b)}" for a, b in ranges]
     remedy = (
         "  undecided ranges: `drivetrain point` solves a value there directly; a smaller rtol of the atlas narrows them"
     )
@@ -239,8 +240,7 @@ def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: des
     elif answer.stable:
         lines += _elsewhere(safe, asked, answer)
     else:
-        none = "of the atlas is sufficient" if answer.certain else "found; whether there is one is undecided"
-        lines.append(f"  no {name} {none}")
+        lines.append(f"  no {name} {'of the atlas is sufficient' if answer.certain else _OPEN}")
     if answer.limit:
         where = ", ".join(asked.named(n, v) for n, v in answer.limit.point.items())
         lines.append(f"  limit: multiplier {answer.limit.multiplier} at {where}")
@@ -249,7 +249,7 @@ def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: des
     if answer.check:
         lines += [] if answer.certain else ["  not certain: undecided ranges are wider than the errors"]
         lines.append(f"  {_checked(answer.check)}")
-    lines += _undecided(answer.undecided)
+    lines += _undecided(asked, name, answer.undecided)
     found = [] if answer.value is None else [asked.values[asked.atlas.scene.system.roles["speed"]]]
     compared, forced = forced_over(
         asked.atlas, amplitude, found, {**asked.numbers(), name: answer.value or 0.0}, asked.named

@@ -52,6 +52,10 @@ def choose_atlas(scene: Scene) -> tuple[Ranges, int | None] | None:
                 f"options.method = 'atlas': axes.{several.shown.name} changes {names} together; allowed are auto and direct"
             )
         return None
+    if whole := next((name for name in ranges if scene.system.parameter(name).integer), ""):
+        if scene.request.method == "atlas":
+            raise InputError(f"options.method = 'atlas': {whole} is an integer; allowed are auto and direct")
+        return None
     if scene.request.method == "atlas":
         if len(ranges) > MAX_RANGES:
             allowed = f"allowed are at most {MAX_RANGES}"

@@ -314,8 +314,7 @@ class StoredAtlas:
 
     def in_parameters(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """``values`` with parameters of the atlas for physical data, and numbers for texts; fixed ones must agree."""
-        given, found = in_parameters(self.scene.system, values, self.scene.data)
-        found = dict(values) if given is None else found
+        _, found = in_parameters(self.scene.system, values, self.scene.data)
         for name in self.fixed.keys() & found.keys():
             if not np.issubdtype(np.asarray(found[name]).dtype, np.number):
                 self.refuse(name, found[name])

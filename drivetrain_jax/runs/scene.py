@@ -178,7 +178,8 @@ def _check_single(scene: Scene) -> None:
     for axis in scene.axes:
         if axis.also:
             names = ", ".join(part.name for part in axis.together)
-            raise InputError(f"axes.{axis.shown.name}: changes {names} together; an atlas allows one parameter a range")
+            allowed = "allowed in an atlas is one: fix the others in place of their data"
+            raise InputError(f"axes.{axis.shown.name}: changes {names} together; {allowed}")
 
 
 def _given(table: _SceneTable, system: type[System], axes: tuple[Axis, ...]) -> dict[str, Any]:

@@ -43,7 +43,11 @@ def axes_of(
     if analysis.continuous:
         _check_ranges(axes, points, analysis)
     for where, name in [("axes", n) for n in axes] + [("points", n) for n in points]:
-        _swept_parameter(system, where, name)
+        parameter, _ = _swept_parameter(system, where, name)
+        if analysis.continuous and parameter.integer:
+            raise InputError(
+                f"axes.{name}: an integer; allowed for {analysis.name} are parameters with a continuous range"
+            )
     if points:
         return _points(points, system), True
     specs = {name: _axis_table(system, name, value) for name, value in axes.items()}

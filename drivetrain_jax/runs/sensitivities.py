@@ -114,6 +114,8 @@ def _of_data(
 
     names, found = described(system), []
     for name, value in data.items():
+        if names[name].integer:
+            continue
         step = _STEP * abs(value) or _STEP
         slope = (at({**data, name: value + step}) - at({**data, name: value - step})) / (2 * step)
         found.append(Sensitivity(name, names[name].units, slope, slope * value / 100))
@@ -155,12 +157,13 @@ def limit_line(asked: AtlasQuery, parameter: str, limit: Crossing | None, before
 
 
 def radius_gradient(system: type[System], values: Mapping[str, float]) -> dict[str, float] | None:
-    """Derivatives of the spectral radius by all parameters of ``system`` at ``values``; None without a gradient."""
+    """Derivatives of the spectral radius by all parameters of ``system`` at ``values``, integers apart; None without any."""
     names = system.models["floquet"].parameters
     found = np.asarray(_compiled_gradient(system, names)({name: np.float64(values[name]) for name in names}))
     # JAX orders the leaves of a dictionary by key.
     slopes = dict(zip(sorted(names), map(float, found), strict=True))
-    return {name: slopes[name] for name in names} if np.isfinite(found).all() else None
+    real = [name for name in names if not system.parameter(name).integer]
+    return {name: slopes[name] for name in real} if np.isfinite([slopes[name] for name in real]).all() else None
 
 
 @lru_cache(maxsize=8)

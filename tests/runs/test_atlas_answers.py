@@ -296,6 +296,29 @@ def test_an_answer_names_the_kinds_of_its_ends(speeds, kind, value):
         assert found["error"] is None and value < S21[0] and " (undecided beyond)\n  not certain" in str(reply)
 
 
+def test_a_slowly_resolved_boundary_function_is_not_taken_for_rounding():
+    """Of this shaft five patches hardly resolve more than three: all speeds were undecided."""
+    given = {"J1": 1.2, "J2": 0.35, "k1": 3e4, "k2": 2.5e4, "c1": 2.0, "c2": 0.3, "angle": "15 deg"}
+    speed = {"start": "100 rpm", "stop": "4500 rpm"}
+    atlas = dt.open_atlas(dt.run({"system": "cardan", "analysis": "atlas", "axes": {"speed": speed}, "fixed": given}))
+    found = atlas_answers.speed_windows(atlas, {}).data
+    ends = [end["value"] for window in found["windows"] for end in window["ends"]]
+    assert ends[1:-1] == pytest.approx([0.84714, 0.84976, 1.41307, 1.42805, 1.98566, 1.99992], abs=1e-5)
+    assert not found["undecided"]
+
+
+def test_nothing_found_beside_undecided_ranges_is_not_nothing(monkeypatch):
+    atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
+    for undecided, text in (
+        ((), "within the atlas"),
+        (((0.5, 0.6),), "found; whether there is one is undecided\n  undec"),
+    ):
+        monkeypatch.setattr(design, "speed_windows", lambda *_, ends=undecided, **__: design.Windows((), ends))
+        reply = atlas_answers.speed_windows(atlas, {"beta": 0.1})
+        assert f"\n  none {text}" in str(reply)
+    assert str(reply).splitlines()[2] == "  undecided from Omega = 0.5 to Omega = 0.6"
+
+
 def test_windows_name_the_kinds_of_their_ends():
     found = atlas_answers.speed_windows(atlas_of((0.0, 1.3), (0.15, 2.0), rtol=1e-5), {"beta": 0.894981})
     windows = json.loads(found.to_json())["windows"]

@@ -1,0 +1,109 @@
+"""Atlases of a system of another package: units without physical data, and a parameter that is an integer."""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+
+import drivetrain_jax as dt
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.runs import atlas_choice, scene
+from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System, parameter, serves
+
+
+class Pendulum(System):
+    """x'' + 2 zeta omega x' + (1 + depth cos(order tau)) x = 0, tau from 0 to 2 pi."""
+
+    name = "pendulum"
+    title = "Pendulum on a moving support"
+
+    omega: float = parameter("rad/s", "frequency of the support", lower=0.0, open_lower=True)
+    depth: float = parameter("1", "depth of the excitation", lower=0.0)
+    mass: float = parameter("kg", "mass", default=1.0, lower=0.0, open_lower=True)
+    order: int = parameter("1", "periods of the excitation per turn", default=1, lower=1, integer=True)
+
+    @serves("atlas")
+    @serves("floquet")
+    def floquet_model(self):
+        def rows(tau):
+            stiffness = (1 + self.depth * jnp.cos(self.order * tau)) / (self.mass * self.omega**2)
+            return (0, 1.0), (-stiffness, -0.02 + 0 * self.omega)
+
+        form = LinearPeriodic(rows, 2 * math.pi, log_determinant=lambda: -0.04 * math.pi + 0 * self.omega)
+        return FloquetModel(natural=form, reduced=form)
+
+
+SCENE = {
+    "system": "pendulum",
+    "analysis": "atlas",
+    "axes": {"omega": {"start": 0.8, "stop": 1.2}},
+    "fixed": {"depth": 0.3, "mass": 1.0, "order": 1},
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered():
+    with pytest.MonkeyPatch.context() as patch:
+        original = scene.get_system
+        patch.setattr(scene, "get_system", lambda name: Pendulum if name == "pendulum" else original(name))
+        yield
+
+
+@pytest.fixture(scope="module")
+def atlas():
+    return dt.open_atlas(dt.run(SCENE))
+
+
+def test_values_may_have_units(atlas):
+    speed = 1.1 / (2 * math.pi)
+    expected = atlas(omega=1.1).spectral_radius.item()
+    assert atlas(omega=f"{speed} Hz", mass="1000 g").spectral_radius.item() == pytest.approx(expected, rel=1e-12)
+    two = atlas(omega=[f"{speed} Hz", "1 rad/s"])
+    assert two.omega.values == pytest.approx([1.1, 1.0]) and two.spectral_radius[0].item() == pytest.approx(expected)
+    grid = atlas.grid(omega=[f"{speed} Hz", "1 rad/s"])
+    assert np.array_equal(grid.spectral_radius, two.spectral_radius)
+
+
+def test_a_grid_of_the_engine_may_have_units(tmp_path):
+    dt.run(SCENE, out=tmp_path / "a.nc")
+    found = xr.open_dataset(tmp_path / "a.nc", engine="drivetrain", grid={"omega": ("0.14 Hz", "0.16 Hz", 3)})
+    assert found.omega.values == pytest.approx(2 * math.pi * np.array([0.14, 0.15, 0.16]))
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"omega": "4 mm"}, ["omega = '4 mm'", "rad/s"]),
+        ({"omega": 1.1, "mass": "2 kg"}, ["mass = 2: the atlas is made for mass = 1"]),
+        ({"omega": ["1 rad/s", "4 mm"]}, ["'4 mm'", "rad/s"]),
+    ],
+)
+def test_wrong_units_and_other_fixed_values_are_refused(atlas, values, words):
+    with pytest.raises(InputError) as error:
+        atlas(**values)
+    assert all(word in str(error.value) for word in words) and "\n" not in str(error.value)
+
+
+def test_an_integer_is_no_range_of_an_atlas(monkeypatch):
+    """Between integers the motion of this pendulum has no such period, so its multipliers mean nothing."""
+    axes = {"order": {"start": 1, "stop": 3}}
+    fixed = {"omega": 1.1, "depth": 0.3}
+    with pytest.raises(InputError, match=r"axes\.order: an integer; allowed for atlas are"):
+        load_scene(SCENE | {"axes": axes, "fixed": fixed})
+    many = {"order": {"start": 1, "stop": 3, "num": 3}, "omega": {"start": 0.8, "stop": 1.2, "num": 400}}
+    chart = {"system": "pendulum", "analysis": "floquet", "axes": many, "fixed": {"depth": 0.3}}
+    monkeypatch.setattr(atlas_choice, "_WORTHWHILE", 0)
+    assert atlas_choice.choose_atlas(load_scene(chart)) is None
+    with pytest.raises(InputError, match="order is an integer; allowed are auto and direct"):
+        atlas_choice.choose_atlas(load_scene(chart | {"options": {"method": "atlas"}}))
+
+
+def test_an_integer_has_no_sensitivity():
+    point = {"omega": 1.1, "depth": 0.3, "mass": 1.0, "order": 1}
+    found = dt.point("pendulum", "floquet", sensitivities=True, **point)
+    assert {each.name for each in found.sensitivities} == {"omega", "depth", "mass"}
