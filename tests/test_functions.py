@@ -168,6 +168,13 @@ def test_diffrax_under_vmap_is_the_engine_of_the_tripod(monkeypatch):
     assert calls_of_diffeqsolve(monkeypatch, scene)[0]
 
 
+def swept(function, over=None, **options):
+    """A sweep of ``function`` over entries of a dict, by default of ``a``."""
+    return dt.sweep(
+        function, {"a": 1.0, "k": jnp.arange(3.0), "l": [1.0, 2.0]}, over=over or {"a": [0.0, 0.5]}, **options
+    )
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -187,6 +194,7 @@ def test_diffrax_under_vmap_is_the_engine_of_the_tripod(monkeypatch):
         (lambda: dt.sweep(dt.floquet, SHAFT, over={"bet": [0.1]}), "bet: unknown parameter"),
         (lambda: dt.sweep(dt.floquet, Unregistered(**SHAFT.values), over={"beta": [0.1]}), "got Unregistered, which is not"),
         (lambda: dt.sweep(dt.floquet, SHAFT, over={"beta": [[0.1]]}), r"over.beta: got an array of the shape \(1, 1\)"),
+        (lambda: swept(lambda p: {"outcome": p["a"]}), "outcome: the function returns float64 of the shape"),
         (lambda: dt.sweep(lambda p: p["a"], {"a": 1.0}, over={"b": [1.0]}), "over.b: unknown to a dict"),
         (lambda: dt.sweep(lambda p: {"a": p["a"]}, {"a": 1.0}, over={"a": [1.0]}), "over: 'a' names two dimensions"),
     ],

@@ -150,6 +150,7 @@ def _function_scene(
 
     example = {key: jax.ShapeDtypeStruct((), float) for key in values}
     traced, shapes = jax.make_jaxpr(one, return_shape=True)(example)
+    _check_outcome(shapes)
     wanted = [key for key in shapes if key != OUTCOME.name] if outputs is None else list(outputs)
     for key in wanted:
         if key not in shapes:
@@ -242,6 +243,16 @@ def _named(result: Any, name: str) -> dict[str, Array]:
     except (TypeError, ValueError):
         kind = type(result).__name__
         raise InputError(f"function: returns a {kind}; allowed is an array or a dict of arrays") from None
+
+
+def _check_outcome(shapes: Mapping[str, jax.ShapeDtypeStruct]) -> None:
+    """Check that a result called ``outcome`` is a code, because files store it as one."""
+    given = shapes.get(OUTCOME.name)
+    if given is not None and (given.shape or not jnp.issubdtype(given.dtype, jnp.integer)):
+        raise InputError(
+            f"outcome: the function returns {given.dtype} of the shape {given.shape}; allowed is one integer, "
+            f"a code of the outcome from 0 to {max(Outcome)}, or another name"
+        )
 
 
 def _replaced(system: Any, point: Mapping[str, Any]) -> Any:
